@@ -1,0 +1,1 @@
+"""The experiments that compare neighbor searches: run with `python -m experiments`. Nothing imports this package."""

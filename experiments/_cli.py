@@ -1,0 +1,94 @@
+"""The command line."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from experiments._errors import UsageError
+
+app = typer.Typer(help="Compare neighbor searches, and look at the scenes.", no_args_is_help=True, add_completion=False)
+
+Layout = Annotated[str, typer.Argument(help="Name of a layout, such as full, clusters2, corners.")]
+Fill = Annotated[float | None, typer.Option(help="Share of the full domain, above 0 and up to 1.")]
+Spacing = Annotated[float, typer.Option(help="Distance of lattice neighbors [m].")]
+Dim = Annotated[int, typer.Option(min=2, max=3, help="Dimensions.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of random layouts.")]
+
+
+@contextmanager
+def _usage_errors() -> Iterator[None]:
+    """Turn a UsageError into a message and exit code 2."""
+    try:
+        yield
+    except UsageError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(2) from error
+
+
+@app.command()
+def run(
+    config: Annotated[Path, typer.Argument(help="Sweep config, TOML.")],
+    out: Annotated[Path | None, typer.Option(help="Folder of the rows; out/NAME without it.")] = None,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Measure missing, failed and timed-out rows again.")] = False,
+) -> None:
+    """Run a sweep, or go on with it: rows that are there already are not measured again."""
+    with _usage_errors():
+        from experiments import _config, _sweep
+
+        folder = out or Path("out") / config.stem
+        try:
+            rows = _sweep.run(_config.load(config), config.stem, folder, retry_failed)
+        except KeyboardInterrupt:
+            typer.echo("stopped; the same command goes on from here", err=True)
+            raise typer.Exit(130) from None
+        good = sum(row.status == "ok" for row in rows)
+        typer.echo(f"{good} of {len(rows)} rows ok, {len(rows) - good} with a reason; rows in {folder / 'rows.jsonl'}")
+
+
+@app.command()
+def report(folder: Annotated[Path, typer.Argument(help="Folder of a sweep.")]) -> None:
+    """Print the table of a sweep beside the thesis's, and draw its pictures."""
+    with _usage_errors():
+        from experiments import _report
+
+        _report.report(folder)
+
+
+@app.command()
+def show(
+    layout: Layout,
+    fill: Fill = None,
+    spacing: Spacing = 1e-4,
+    dim: Dim = 3,
+    seed: Seed = 0,
+    out: Annotated[Path | None, typer.Option(help="Picture; out/LAYOUT.png without it.")] = None,
+) -> None:
+    """Draw a layout."""
+    with _usage_errors():
+        from experiments import _layouts, _show
+
+        scene = _layouts.make(layout, spacing=spacing, dim=dim, seed=seed, fill=fill)
+        typer.echo(_show.draw(scene, out or Path("out") / f"{layout}.png"))
+
+
+@app.command()
+def export(
+    layout: Layout,
+    out: Annotated[Path, typer.Option(help="File: .csv, .vtp or .vtk.")],
+    fill: Fill = None,
+    spacing: Spacing = 1e-4,
+    dim: Dim = 3,
+    seed: Seed = 0,
+    dtype: Annotated[str, typer.Option(help="float32 or float64.")] = "float32",
+    counts: Annotated[bool, typer.Option("--counts", help="Store the number of neighbors of each point too.")] = False,
+) -> None:
+    """Write the points of a layout to a file, for ParaView or a spreadsheet."""
+    with _usage_errors():
+        from experiments import _export, _layouts
+
+        _export.check(out)
+        scene = _layouts.make(layout, spacing=spacing, dim=dim, seed=seed, fill=fill, dtype=dtype)
+        typer.echo(_export.write(scene, out, counts))

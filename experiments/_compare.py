@@ -1,0 +1,67 @@
+"""Missing and extra pairs of a method against the oracle."""
+
+from typing import Any
+
+import numpy as np
+
+from experiments import _oracle
+from experiments.methods import Found
+
+
+def compare(found: Found, exact: np.ndarray, size: int) -> dict[str, Any]:
+    """Return what a row says about the pairs: how many, and how many are missing or extra.
+
+    All count unordered pairs. In a directed list a pair is found when both directions are there; one direction alone is missing where the
+    oracle has the pair and extra where it has not. A pair given twice, or a particle paired with itself, is extra. Of counts, only the
+    surplus and the deficit of each particle can be seen: half their sums, rounded up.
+
+    Args:
+        found: What the method found.
+        exact: Sorted keys i·n + j of the oracle.
+        size: Number of particles n.
+    """
+    if found.pairs is None:
+        if found.counts is None:
+            raise ValueError("the adapter returned neither pairs nor counts: give one of them")
+        row = _compare_counts(found.counts, exact, size)
+    elif found.directed:
+        row = _compare_directed(*found.pairs, exact, size)
+    else:
+        row = _compare_unordered(*found.pairs, exact, size)
+    return row | {"exact_pairs": len(exact)}
+
+
+def _keys(i: np.ndarray, j: np.ndarray, size: int) -> np.ndarray:
+    """Return the sorted keys min(i, j)·n + max(i, j)."""
+    return np.sort(np.minimum(i, j).astype(np.int64) * size + np.maximum(i, j))
+
+
+def _common(first: np.ndarray, second: np.ndarray) -> int:
+    """Return how many values two arrays without repeats share."""
+    return len(np.intersect1d(first, second, assume_unique=True))
+
+
+def _compare_unordered(i: np.ndarray, j: np.ndarray, exact: np.ndarray, size: int) -> dict[str, Any]:
+    keys = _keys(i, j, size)
+    common = len(exact) if np.array_equal(keys, exact) else _common(np.unique(keys), exact)
+    return {"pairs": len(keys), "missing": len(exact) - common, "extra": len(keys) - common, "compared": "pairs"}
+
+
+def _compare_directed(i: np.ndarray, j: np.ndarray, exact: np.ndarray, size: int) -> dict[str, Any]:
+    ahead, back = (_keys(i[chosen], j[chosen], size) for chosen in (i < j, i > j))
+    row = {"directed_pairs": len(i), "compared": "pairs"}
+    own = len(i) - len(ahead) - len(back)
+    if own == 0 and np.array_equal(ahead, exact) and np.array_equal(back, exact):
+        return row | {"pairs": len(exact), "missing": 0, "extra": 0}
+    there, here = np.unique(ahead), np.unique(back)
+    either = np.union1d(there, here)
+    both = np.intersect1d(there, here, assume_unique=True)
+    repeated = max(len(ahead) - len(there), len(back) - len(here))
+    extra = len(either) - _common(either, exact) + repeated + own
+    return row | {"pairs": len(either), "missing": len(exact) - _common(both, exact), "extra": extra}
+
+
+def _compare_counts(counts: np.ndarray, exact: np.ndarray, size: int) -> dict[str, Any]:
+    surplus = counts.astype(np.int64) - _oracle.count_neighbors(exact, size)
+    missing, extra = (int(-(-np.maximum(part, 0).sum() // 2)) for part in (-surplus, surplus))
+    return {"pairs": int(counts.sum() // 2), "missing": missing, "extra": extra, "compared": "counts"}

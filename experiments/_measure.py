@@ -1,0 +1,65 @@
+"""Time and memory of one search in this process."""
+
+import ctypes
+import gc
+import resource
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+
+class PeakMemory:
+    """Peak resident memory over the moment of creation."""
+
+    def __init__(self) -> None:
+        """Return freed memory to the system, forget the peak so far where the system allows it, and note the start."""
+        gc.collect()
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:
+            trim(0)
+        try:
+            Path("/proc/self/clear_refs").write_text("5")
+            self.source = "VmHWM"
+        except OSError:
+            self.source = "ru_maxrss"
+        self.start = self._read()
+
+    def peak(self) -> int:
+        """Return the peak over the start [bytes]."""
+        return self._read() - self.start
+
+    def _read(self) -> int:
+        if self.source == "VmHWM":
+            lines = Path("/proc/self/status").read_text().splitlines()
+            return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
+        unit = 1 if sys.platform == "darwin" else 1024
+        return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def repeat(search: Callable[[], Any], repeats: int, min_seconds: float, max_repeats: int) -> tuple[Any, list[float]]:
+    """Run a search again and again; return its last result and the time of each run [s].
+
+    Args:
+        search: The search; each result is dropped before the next run, so that memory holds one.
+        repeats: Fewest runs.
+        min_seconds: Runs go on until they took this long together [s] ...
+        max_repeats: ... or until there are so many.
+    """
+    seconds: list[float] = []
+    while True:
+        begin = perf_counter()
+        result = search()
+        seconds.append(perf_counter() - begin)
+        if len(seconds) >= repeats and (sum(seconds) >= min_seconds or len(seconds) >= max_repeats):
+            return result, seconds
+        del result
+
+
+def summarize(seconds: list[float]) -> dict[str, Any]:
+    """Return count, median and the 10th and 90th percentile of the repeats, named as in a row."""
+    p10, median, p90 = (float(value) for value in np.percentile(seconds, (10, 50, 90)))
+    return {"repeats": len(seconds), "seconds": seconds, "median_s": median, "p10_s": p10, "p90_s": p90}

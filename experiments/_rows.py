@@ -1,0 +1,170 @@
+"""Rows: what one measurement says, and the file that they are kept in, one JSON line each."""
+
+import json
+import os
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from experiments._errors import UsageError
+
+STATUSES = ("ok", "missing", "failed", "timeout", "skipped")
+RETRIED = ("missing", "failed", "timeout")
+
+
+@dataclass
+class Row:
+    """One method on one scene, measured in a process of its own. What was not reached is None.
+
+    Attributes:
+        key: Digest of scene, method and way of measuring; rows with the same key replace each other.
+        layout: Name of the layout.
+        method: Name of the adapter.
+        fill_asked: Fill that the config asked for, as a share of the full domain.
+        spacing: Distance of lattice neighbors [m].
+        cutoff_ratio: Cutoff in spacings.
+        dtype: Precision of the positions.
+        dim: Dimensions.
+        seed: Seed of random layouts.
+        status: One of `STATUSES`.
+        reason: Why the status is not ok.
+        fill: Fill that the scene has.
+        cutoff: Cutoff [m], rounded to the dtype.
+        points: Number of particles n.
+        compile_s: Time of all that is done once: compilation, and the capacity where one is needed [s].
+        first_s: First run after that [s].
+        median_s: Median of the repeats, from raw positions to the result [s].
+        p10_s: 10th percentile of the repeats [s].
+        p90_s: 90th percentile of the repeats [s].
+        repeats: Number of timed runs after the first.
+        seconds: All their times [s].
+        peak_bytes: Peak resident memory over the start (imports done, positions made), compilation included.
+        compile_peak_bytes: The same, up to the end of compilation.
+        list_bytes: Size of the result.
+        scratch_bytes: peak_bytes - list_bytes, not below 0.
+        memory_source: VmHWM (reset at the start), or ru_maxrss (cannot be reset: a peak during the imports hides a smaller one).
+        pairs: Unordered pairs that the method found.
+        directed_pairs: Entries (i, j) of a full list.
+        exact_pairs: Unordered pairs of the oracle.
+        missing: Unordered pairs that the oracle has and the method has not.
+        extra: Unordered pairs that the method has and the oracle has not, repeated ones included.
+        compared: `pairs`, or `counts` where a method gives only neighbors per particle.
+        device: Where it ran.
+        versions: Python and the packages.
+        machine: Processor, cores, memory [bytes], operating system.
+        commit: Commit of the project.
+        dirty: Whether the working tree differed from it.
+        config: Name of the config.
+        config_hash: Digest of what the config says.
+        time: When the row was finished, UTC.
+    """
+
+    key: str
+    layout: str
+    method: str
+    fill_asked: float | None
+    spacing: float
+    cutoff_ratio: float
+    dtype: str
+    dim: int
+    seed: int
+    status: str = "failed"
+    reason: str | None = None
+    fill: float | None = None
+    cutoff: float | None = None
+    points: int | None = None
+    compile_s: float | None = None
+    first_s: float | None = None
+    median_s: float | None = None
+    p10_s: float | None = None
+    p90_s: float | None = None
+    repeats: int | None = None
+    seconds: list[float] = field(default_factory=list)
+    peak_bytes: int | None = None
+    compile_peak_bytes: int | None = None
+    list_bytes: int | None = None
+    scratch_bytes: int | None = None
+    memory_source: str | None = None
+    pairs: int | None = None
+    directed_pairs: int | None = None
+    exact_pairs: int | None = None
+    missing: int | None = None
+    extra: int | None = None
+    compared: str | None = None
+    device: str | None = None
+    versions: dict[str, str | None] = field(default_factory=dict)
+    machine: dict[str, Any] = field(default_factory=dict)
+    commit: str | None = None
+    dirty: bool | None = None
+    config: str | None = None
+    config_hash: str | None = None
+    time: str | None = None
+
+    @property
+    def scene_name(self) -> str:
+        """Layout and fill in words, such as `corners 11 %`."""
+        return name_scene(self.layout, self.fill_asked)
+
+    @property
+    def errors(self) -> int | None:
+        """Missing and extra pairs together."""
+        return None if self.missing is None or self.extra is None else self.missing + self.extra
+
+
+def name_scene(layout: str, fill: float | None) -> str:
+    """Return layout and fill in words, such as `corners 11 %`."""
+    return layout if fill is None else f"{layout} {100 * fill:.4g} %"
+
+
+class RowFile:
+    """The rows of a sweep, DIR/rows.jsonl. Whatever was written before a kill stays; half a last line is cut off."""
+
+    def __init__(self, folder: Path) -> None:
+        """Name the file; nothing is read or written yet."""
+        self.path = folder / "rows.jsonl"
+
+    def repair(self) -> None:
+        """End the file with a whole line: complete its last line with a line feed, or cut it off where it is no JSON."""
+        if not self.path.exists():
+            return
+        text = self.path.read_bytes()
+        start = text.rfind(b"\n") + 1
+        if start == len(text):
+            return
+        try:
+            json.loads(text[start:])
+        except ValueError:
+            os.truncate(self.path, start)
+        else:
+            self._write(b"\n")
+
+    def append(self, row: Row) -> None:
+        """Write a row and wait until it is on the disk."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._write(json.dumps(asdict(row), allow_nan=False).encode() + b"\n")
+
+    def _write(self, data: bytes) -> None:
+        with self.path.open("ab") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+
+    def read(self) -> list[Row]:
+        """Return the latest row of each key, in the order of their first appearance; half a last line is passed over.
+
+        Raises:
+            UsageError: A line is no row.
+        """
+        if not self.path.exists():
+            return []
+        known = {item.name for item in fields(Row)}
+        rows: dict[str, Row] = {}
+        lines = self.path.read_text(encoding="utf-8").split("\n")
+        for number, line in enumerate(lines, start=1):
+            try:
+                values = json.loads(line)
+                rows[values["key"]] = Row(**{name: value for name, value in values.items() if name in known})
+            except (ValueError, TypeError, KeyError) as error:
+                if number < len(lines):  # what follows the last line feed is empty, or what a kill left
+                    raise UsageError(f"{self.path}: line {number} is no row ({error}): repair or remove that line") from error
+        return list(rows.values())

@@ -1,0 +1,119 @@
+"""The sweep: a process per row, each row on disk before the next one starts."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from experiments import _machine
+from experiments._config import Config, Spec
+from experiments._rows import RETRIED, Row, RowFile
+
+ROOT = Path(__file__).resolve().parent.parent
+REASON_LENGTH = 600
+
+
+def run(config: Config, name: str, folder: Path, retry_failed: bool = False) -> list[Row]:
+    """Measure every row of the config that the folder does not hold yet, and return all rows of the config.
+
+    Args:
+        config: The sweep.
+        name: Name of the config, kept in the rows.
+        folder: Holds rows.jsonl and the exact pairs.
+        retry_failed: Whether rows that are missing, failed or ran out of time are measured again.
+    """
+    file = RowFile(folder)
+    file.repair()
+    specs = list(config.specs())
+    done = {row.key for row in file.read() if not (retry_failed and row.status in RETRIED)}
+    pending = [spec for spec in specs if spec.key not in done]
+    about = {"machine": _machine.machine(), **_machine.commit(), "config": name, "config_hash": config.hash}
+    with _progress(len(specs)) as progress:
+        bar = progress.add_task("", total=len(specs), completed=len(specs) - len(pending))
+        if len(pending) < len(specs):
+            progress.console.print(f"{len(specs) - len(pending)} of {len(specs)} rows are there already")
+        for spec, opens_scene in _mark_scenes(pending):
+            if opens_scene:
+                progress.update(bar, description=f"{spec.scene_name} · exact pairs")
+                _prepare_oracle(spec, folder, progress.console)
+            progress.update(bar, description=f"{spec.scene_name} · {spec.method}")
+            row = replace(measure(spec, folder), **about)
+            file.append(row)
+            progress.console.print(describe(row), highlight=False, soft_wrap=True)
+            progress.advance(bar)
+    keys = {spec.key for spec in specs}
+    return [row for row in file.read() if row.key in keys]
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[Progress]:
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True), disable=total == 0) as progress:
+        yield progress
+
+
+def _mark_scenes(specs: list[Spec]) -> Iterator[tuple[Spec, bool]]:
+    """Yield each row with whether its scene differs from that of the row before."""
+    previous = None
+    for spec in specs:
+        yield spec, spec.scene_key != previous
+        previous = spec.scene_key
+
+
+def _prepare_oracle(spec: Spec, folder: Path, console: Console) -> None:
+    """Find the exact pairs of a scene before its rows run, so that no row's time limit pays for them."""
+    answer = _ask("oracle", spec, folder)
+    if "reason" in answer:
+        console.print(f"{spec.scene_name}: no exact pairs: {answer['reason']}", highlight=False, markup=False)
+
+
+def measure(spec: Spec, folder: Path) -> Row:
+    """Measure one row in a fresh process; never raises for what happens there."""
+    answer = _ask("measure", spec, folder)
+    asked = {"layout": spec.layout, "method": spec.method, "fill_asked": spec.fill, "spacing": spec.spacing}
+    asked |= {"cutoff_ratio": spec.cutoff_ratio, "dtype": spec.dtype, "dim": spec.dim, "seed": spec.seed}
+    return Row(key=spec.key, **asked, **answer, time=datetime.now(UTC).isoformat(timespec="seconds"))
+
+
+def _ask(do: str, spec: Spec, folder: Path) -> dict[str, Any]:
+    """Run a worker and return its answer, or a status with the reason why there is none."""
+    task = json.dumps({"do": do, "spec": asdict(spec), "oracle": str(folder.resolve() / "oracle")})
+    with tempfile.TemporaryDirectory() as cache:
+        # Kernels are compiled anew in each row: a compile time from a warm cache would mean nothing.
+        environment = os.environ | {"WARP_CACHE_PATH": cache, "JAX_ENABLE_COMPILATION_CACHE": "false"}
+        command = [sys.executable, "-m", "experiments._worker"]
+        try:
+            done = subprocess.run(
+                command, input=task, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=spec.timeout
+            )
+        except subprocess.TimeoutExpired:
+            return {"status": "timeout", "reason": f"not done after {spec.timeout:g} s"}
+    if done.returncode == 0:
+        return json.loads(done.stdout)
+    return {"status": "failed", "reason": _explain_exit(done.returncode, done.stderr)}
+
+
+def _explain_exit(code: int, stderr: str) -> str:
+    """Say how a process ended that gave no answer."""
+    how = f"ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+    return f"the process {how}: {stderr.strip()[-REASON_LENGTH:]}"
+
+
+def describe(row: Row) -> str:
+    """Return a row as a line for the reader."""
+    start = f"{row.scene_name:<17} {row.method:<20} {row.status:<8}"
+    if row.status != "ok":
+        return f"{start}{row.reason}"
+    memory = (row.peak_bytes or 0) / 1e6
+    return f"{start}{row.median_s:9.4f} s {memory:8.1f} MB {row.pairs:>10} pairs, {row.missing} missing, {row.extra} extra"

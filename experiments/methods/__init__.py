@@ -1,0 +1,62 @@
+"""Adapters: one file per method, found by its file name (`scipy_kdtree.py` is the method `scipy-kdtree`).
+
+An adapter is a module with
+
+- `prepare(positions, cutoff)`: do what is needed once (compile, say) and return the search, a callable without arguments whose every call
+  goes from the raw positions to the finished result, waits for it, and builds whatever structure it needs anew;
+- `read(result)`: return what the search found, a `Found`; not timed;
+- optionally `MAX_POINTS`: larger scenes are skipped, with a row that says so;
+- optionally `PACKAGES`: names of distributions whose versions the row shall hold besides the usual ones.
+
+Positions come as NumPy array, shape [n, d], float32 or float64; the cutoff is a float, already rounded to that dtype. An adapter that
+cannot be imported makes a row with status `missing`, one that raises makes a row with status `failed`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a method found, for the comparison with the oracle.
+
+    Attributes:
+        list_bytes: Size of the result itself [bytes].
+        pairs: Indices (i, j) of the pairs, as the method gives them.
+        directed: Whether `pairs` holds both (i, j) and (j, i).
+        counts: Neighbors of each particle without itself, shape [n]; for methods that give no pairs.
+        device: Where it ran.
+    """
+
+    list_bytes: int
+    pairs: tuple[np.ndarray, np.ndarray] | None = None
+    directed: bool = False
+    counts: np.ndarray | None = None
+    device: str = "cpu"
+
+
+class Adapter(Protocol):
+    """The shape of an adapter module."""
+
+    def prepare(self, positions: np.ndarray, cutoff: float) -> Callable[[], Any]:
+        """Return the search over these positions."""
+        ...
+
+    def read(self, result: Any) -> Found:
+        """Return what a search found."""
+        ...
+
+
+def names() -> list[str]:
+    """Return the names of all methods, without importing any."""
+    return sorted(file.stem.replace("_", "-") for file in Path(__file__).parent.glob("[!_]*.py"))
+
+
+def load(name: str) -> Adapter:
+    """Import the adapter of a method; its ImportError is the caller's."""
+    return cast(Adapter, import_module(f"{__name__}.{name.replace('-', '_')}"))

@@ -1,0 +1,16 @@
+"""Find every pair of particles closer than a cutoff: exact, in JAX, inside `jax.jit`, at a cost that follows the particles.
+
+>>> import jax.numpy as jnp, jfrnn
+>>> x = jnp.array([[0.0, 0.0], [0.3, 0.4], [2.0, 0.0]])
+>>> nbrs = jfrnn.search(x, 1.0)
+>>> nbrs.count
+Array([1, 1, 0], dtype=int32)
+>>> [indices.tolist() for indices in nbrs.pairs()]
+[[0, 1], [1, 0]]
+"""
+
+from jfrnn._neighbors import NeighborList
+from jfrnn._search import count, search
+from jfrnn._status import NeighborOverflowError, Status
+
+__all__ = ["NeighborList", "NeighborOverflowError", "Status", "count", "search"]

@@ -1,0 +1,76 @@
+"""The engines of a search: how each finds candidates. What a pair is, and how rows are filled, they share (`_exact`, `_runs`)."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from jfrnn._cells import build_grid, cell_edge, cell_order, grid_coordinates, stencil_runs
+from jfrnn._exact import Cutoff
+from jfrnn._runs import Filter, Points, Runs, count_neighbors, list_neighbors
+
+
+class Options(NamedTuple):
+    """What is static about a search, apart from its capacity."""
+
+    filter: Filter
+    backend: str
+
+
+def neighbor_rows(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options, capacity: int) -> tuple[Array, Array]:
+    """List neighbors: [m, capacity] int32 source indices, unused slots n, and [m] int32 true counts."""
+    m = (sources if queries is None else queries).shape[0]
+    if 0 in (m, sources.shape[0]):
+        return jnp.full((m, capacity), sources.shape[0], jnp.int32), jnp.zeros(m, jnp.int32)
+    return list_neighbors(*_candidates(sources, queries, cutoff, options), cutoff, options.filter, capacity)
+
+
+def neighbor_counts(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options) -> Array:
+    """Count neighbors: [m] int32."""
+    m = (sources if queries is None else queries).shape[0]
+    if 0 in (m, sources.shape[0]):
+        return jnp.zeros(m, jnp.int32)
+    return count_neighbors(*_candidates(sources, queries, cutoff, options), cutoff, options.filter)
+
+
+def _candidates(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options) -> tuple[Points, Points, Runs]:
+    find = _all_sources if options.backend == "brute" else _cell_stencil
+    return find(sources, queries, cutoff)
+
+
+def _all_sources(sources: Array, queries: Array | None, cutoff: Cutoff) -> tuple[Points, Points, Runs]:
+    """Brute force: one run of all sources, O(n·m)."""
+
+    def runs(place: Array) -> tuple[Array, Array]:
+        start = jnp.zeros((place.size, 1), jnp.int32)
+        return start, jnp.full_like(start, sources.shape[0])
+
+    points = _in_order(sources, None)
+    return points, points if queries is None else _in_order(queries, None), runs
+
+
+def _cell_stencil(sources: Array, queries: Array | None, cutoff: Cutoff) -> tuple[Points, Points, Runs]:
+    """Cells: sources and queries sorted by cell; the runs of a query are the rows of cells around its own."""
+    points = sources if queries is None else jnp.concatenate([sources, queries])
+    finite = jnp.isfinite(points).all(axis=1)
+    coords, extent = grid_coordinates(points.T, cell_edge(cutoff.radius), finite)
+    n, total = sources.shape[0], points.shape[0]
+    grid = build_grid(coords[:, :n], finite[:n], extent, total)
+    if queries is None:
+        order = grid.order
+    else:
+        coords, finite = coords[:, n:], finite[n:]
+        order = cell_order(coords, finite, extent, grid.dense)
+    query_coords = coords[:, order]
+
+    def runs(place: Array) -> tuple[Array, Array]:
+        return stencil_runs(grid, query_coords.at[:, place].get(mode="promise_in_bounds"))
+
+    points = _in_order(sources, grid.order)
+    return points, points if queries is None else _in_order(queries, order), runs
+
+
+def _in_order(positions: Array, order: Array | None) -> Points:
+    if order is None:
+        return Points(list(positions.T), lax.iota(jnp.int32, positions.shape[0]))
+    return Points([x[order] for x in positions.T], order)

@@ -1,0 +1,301 @@
+"""Where a pair is decided: `|x_j - x_i| < cutoff` exactly as real arithmetic on the given floats decides it.
+
+Three steps, each exact where it answers and each asked only what the one before left open:
+
+1. `squared_distance` against `Cutoff.inside` and `Cutoff.outside`, in working precision. With u = eps/2, each difference
+   carries a relative error u, each square 3u, the sum of three at most 5u, and r² u more: in all at most 3 eps. Flushed
+   denormals add at most 3·2^-126 to a difference, which is below 2^-28 of any cutoff that `checked_cutoff` lets pass. A band of
+   8 eps on either side is therefore safe whatever the compiler fuses into multiply-adds.
+2. `_sum_sign`: error-free transformations (Dekker 1971; Ogita, Rump & Oishi 2005, doi:10.1137/030601818). Factors are split
+   by integer operations into halves of at most half the mantissa, so that every product is exact and a fused multiply-add
+   gives the same float as a product and a sum.
+3. `_integer_sign`: fixed-point integers as wide as the float format (limbs of 11 bits in int32). No rounding exists there;
+   it answers for coordinates whose exponents lie so far apart that step 2 would underflow or need more terms.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+PointsAt = Callable[[Array | None], tuple[list[Array], list[Array]]]
+
+_LIMB_BITS = 11
+_LIMB_MASK = (1 << _LIMB_BITS) - 1
+_INTEGER_CHUNK = 64  # pairs that one round of the integer test decides
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Cutoff:
+    """A cutoff, rounded once to the dtype of the positions, with all that the pair test derives from it.
+
+    The numbers are operands of the compiled program, not constants in it: one program serves every cutoff.
+
+    Attributes:
+        radius: r.
+        inside: scaled squared distances below this belong to pairs, without doubt.
+        outside: scaled squared distances above this do not, without doubt.
+        unit_scale: power of two, itself a normal float, that brings r into [1, 4).
+        plain_bits: magnitude bits of the smallest coordinate for which step 2 cannot underflow.
+        closed: pairs at exactly r count. Static.
+        scaled: r is so small or large that differences take `unit_scale` before they are squared. Static.
+    """
+
+    radius: np.floating | Array
+    inside: np.floating | Array
+    outside: np.floating | Array
+    unit_scale: np.floating | Array
+    plain_bits: np.unsignedinteger | Array
+    closed: bool = dataclasses.field(metadata={"static": True})
+    scaled: bool = dataclasses.field(metadata={"static": True})
+
+
+def make_cutoff(value: float, dtype: np.dtype, closed: bool) -> Cutoff:
+    """Round a cutoff within `smallest_cutoff` and `largest_cutoff` to a dtype and derive the bounds of the pair test."""
+    finfo = np.finfo(dtype)
+    narrow = dtype == np.float32
+    radius = dtype.type(value)
+    exponent = int(np.frexp(radius)[1]) - 1
+    unit_scale = dtype.type(2.0 ** -min(exponent, -int(finfo.minexp)))
+    scaled = abs(exponent) > (30 if narrow else 400)
+    square = (radius * unit_scale if scaled else radius) ** 2
+    lowest = max(exponent - (35 if narrow else 450), int(finfo.minexp) + finfo.nmant + 1)
+    return Cutoff(
+        radius=radius,
+        inside=square * dtype.type(1 - 8 * finfo.eps),
+        outside=square * dtype.type(1 + 8 * finfo.eps),
+        unit_scale=unit_scale,
+        plain_bits=np.array(2.0**lowest, dtype).view(np.uint32 if narrow else np.uint64)[()],
+        closed=closed,
+        scaled=scaled,
+    )
+
+
+def squared_distance(difference: list[Array], cutoff: Cutoff) -> Array:
+    """Sum the squares of the scaled differences, one array per axis, in working precision (step 1)."""
+    if cutoff.scaled:
+        difference = [component * cutoff.unit_scale for component in difference]
+    total = difference[0] * difference[0]
+    for component in difference[1:]:
+        total = total + component * component
+    return total
+
+
+def is_pair_of(rows: Array, sources: Array, neighbor: Array, cutoff: Cutoff) -> Array:
+    """Decide exactly, for rows [m, d], sources [n, d] and source indices [m, k], which pairs there are: [m, k] bool."""
+    axes = range(sources.shape[1])
+    square = squared_distance([sources[neighbor, axis] - rows[:, axis, None] for axis in axes], cutoff)
+
+    def points(at: Array | None) -> tuple[list[Array], list[Array]]:
+        row = lax.broadcasted_iota(jnp.int32, neighbor.shape, 0)
+        row, source = (row, neighbor) if at is None else (flat_take(row, at), flat_take(neighbor, at))
+        return [rows[row, axis] for axis in axes], [sources[source, axis] for axis in axes]
+
+    surely = square < cutoff.inside
+    return surely | refine((square <= cutoff.outside) & ~surely, points, cutoff)
+
+
+def flat_take(x: Array, at: Array) -> Array:
+    """Return the elements of x at flat indices, which are clipped to its size."""
+    return x.reshape(-1).at[at].get(mode="clip")
+
+
+def refine(doubtful: Array, points: PointsAt, cutoff: Cutoff) -> Array:
+    """Decide the pairs that step 1 left open (steps 2 and 3); False elsewhere. Costs nothing where none is open.
+
+    `points(None)` gives both points of every pair, axis by axis, in the shape of `doubtful`; `points(at)` those of the pairs at
+    the flat indices `at`, so that nobody has to store what is rarely asked for.
+    """
+    decide = functools.partial(_refine_some, points=points, cutoff=cutoff)
+    return lax.cond(jnp.any(doubtful), decide, jnp.zeros_like, doubtful)
+
+
+def _refine_some(doubtful: Array, points: PointsAt, cutoff: Cutoff) -> Array:
+    sign, known = _sum_sign(*points(None), cutoff)
+    verdict = doubtful & known & _sign_is_pair(sign, cutoff)
+    open_pairs = (doubtful & ~known).reshape(-1)
+    chunk = min(_INTEGER_CHUNK, open_pairs.size)
+
+    def decide_chunk(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        verdict, remaining = state
+        (at,) = jnp.nonzero(remaining, size=chunk, fill_value=remaining.size)
+        at = at.astype(jnp.int32)
+        pair = _sign_is_pair(_integer_sign(*points(at), cutoff), cutoff)
+        return verdict.at[at].set(pair, mode="drop"), remaining.at[at].set(False, mode="drop")
+
+    verdict, _ = lax.while_loop(lambda state: jnp.any(state[1]), decide_chunk, (verdict.reshape(-1), open_pairs))
+    return verdict.reshape(doubtful.shape)
+
+
+def _sign_is_pair(sign: Array, cutoff: Cutoff) -> Array:
+    return sign <= 0 if cutoff.closed else sign < 0
+
+
+# --- step 2: error-free transformations -------------------------------------------------------------------------------
+
+
+def _sum_sign(a: list[Array], b: list[Array], cutoff: Cutoff) -> tuple[Array, Array]:
+    """Return the sign of |b - a|² - r² and where it is proven; exact ties of exactly representable differences included."""
+    radius, scale = lax.optimization_barrier((cutoff.radius, cutoff.unit_scale))  # no constants: they could be regrouped
+    terms, slack = [], jnp.zeros_like(a[0])
+    for ak, bk in zip(a, b, strict=True):
+        high, low = _two_difference(bk, ak)
+        high, low = high * scale, low * scale
+        terms += _exact_square(high)
+        tail = 2 * high * low
+        terms.append(tail)
+        slack = slack + (jnp.abs(tail) * jnp.finfo(slack.dtype).eps + 2 * low * low)
+    terms += [-term for term in _exact_square(jnp.broadcast_to(radius * scale, slack.shape))]
+    for _ in range(3):
+        terms = _distill(terms)
+    rest = sum(jnp.abs(term) for term in terms[:-1])
+    bound = 2 * (rest + slack)  # twice: covers the rounding of the sums of absolute values above
+    leading = terms[-1]
+    known = (jnp.abs(leading) > bound) | ((leading == 0) & (bound == 0))
+    normal = [_is_plain(x, cutoff) for x in (*a, *b)]
+    return jnp.sign(leading), functools.reduce(jnp.logical_and, normal, known)
+
+
+def _two_difference(a: Array, b: Array) -> tuple[Array, Array]:
+    """Return fl(a - b) and its rounding error (Knuth 1969)."""
+    difference = a - b
+    b_virtual = a - difference
+    a_virtual = difference + b_virtual
+    return difference, (a - a_virtual) + (b_virtual - b)
+
+
+def _two_sum(a: Array, b: Array) -> tuple[Array, Array]:
+    """Return fl(a + b) and its rounding error (Knuth 1969)."""
+    total = a + b
+    b_virtual = total - a
+    a_virtual = total - b_virtual
+    return total, (a - a_virtual) + (b - b_virtual)
+
+
+def _exact_square(x: Array) -> list[Array]:
+    """Return three floats that sum to x² exactly, smallest first."""
+    high = _half_mantissa(x)
+    low = x - high
+    return [low * low, 2 * high * low, high * high]
+
+
+def _half_mantissa(x: Array) -> Array:
+    """Round x to half its mantissa by integer operations on its bits: 12 bits of 24, 26 of 53."""
+    unsigned, dropped = (jnp.uint32, 12) if x.dtype == jnp.float32 else (jnp.uint64, 27)
+    bits = lax.bitcast_convert_type(x, unsigned)
+    rounded = (bits + unsigned(1 << (dropped - 1))) >> unsigned(dropped) << unsigned(dropped)
+    return lax.bitcast_convert_type(rounded, x.dtype)
+
+
+def _distill(terms: list[Array]) -> list[Array]:
+    """Add the terms up, keeping each rounding error in place: same exact sum, most of it in the last (VecSum)."""
+    result = []
+    total = terms[0]
+    for term in terms[1:]:
+        total, error = _two_sum(total, term)
+        result.append(error)
+    return [*result, total]
+
+
+def _is_plain(x: Array, cutoff: Cutoff) -> Array:
+    """Say where x is 0 or large enough that no product of step 2 underflows."""
+    unsigned = jnp.uint32 if x.dtype == jnp.float32 else jnp.uint64
+    magnitude = lax.bitcast_convert_type(x, unsigned) << unsigned(1) >> unsigned(1)
+    return (magnitude == 0) | (magnitude >= cutoff.plain_bits)
+
+
+# --- step 3: integers as wide as the float format ---------------------------------------------------------------------
+
+
+def _integer_sign(a: list[Array], b: list[Array], cutoff: Cutoff) -> Array:
+    """Return the sign of |b - a|² - r² for [k] pairs of finite points, in integer arithmetic throughout.
+
+    A coordinate fills at most 6 limbs of 11 bits, a difference at most 12, each below 2^12 in magnitude; a limb of the sum of
+    squares collects at most 3·12 products below 2^24 and stays below 2^31.
+    """
+    differences = [_limbs(bk) - _limbs(ak) for ak, bk in zip(a, b, strict=True)]
+    radius = _limbs(jnp.full_like(a[0], cutoff.radius))
+    count = radius.shape[1]
+
+    def add_shifted(i: Array, total: Array) -> Array:
+        squares = -_limb(radius, i) * radius
+        for difference in differences:
+            squares = squares + _limb(difference, i) * difference
+        window = lax.dynamic_slice_in_dim(total, i, count, axis=1)
+        return lax.dynamic_update_slice_in_dim(total, window + squares, i, axis=1)
+
+    total = jnp.zeros((radius.shape[0], 2 * count), jnp.int32)
+    return _sign_of_limbs(lax.fori_loop(0, count, add_shifted, total))
+
+
+def _limb(x: Array, i: Array) -> Array:
+    return lax.dynamic_slice_in_dim(x, i, 1, axis=1)
+
+
+def _sign_of_limbs(total: Array) -> Array:
+    """Carry upwards with floor division: the last carry holds the sign, the remainders tell zero from positive."""
+
+    def carry_on(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        carry, seen = state
+        value = _limb(total, i)[:, 0] + carry
+        return value >> _LIMB_BITS, seen | (value & _LIMB_MASK)
+
+    zero = jnp.zeros(total.shape[0], jnp.int32)
+    carry, seen = lax.fori_loop(0, total.shape[1], carry_on, (zero, zero))
+    return jnp.where(carry < 0, -1, jnp.where((seen != 0) | (carry != 0), 1, 0))
+
+
+def _limbs(x: Array) -> Array:
+    """Write finite floats [k] as signed int32 limbs [k, count], in units of the smallest denormal, lowest limb first."""
+    finfo = jnp.finfo(x.dtype)
+    sign, exponent, high, low = _fields(x)
+    place = jnp.maximum(exponent, 1) - 1
+    width = finfo.nmant + 1
+    count = -(-(finfo.maxexp - finfo.minexp + width) // _LIMB_BITS)
+    shift = jnp.arange(count, dtype=jnp.int32) * _LIMB_BITS - place[:, None]
+    limbs = _shift_right(high[:, None], low[:, None], shift) & np.uint32(_LIMB_MASK)
+    return jnp.where(sign[:, None], -1, 1) * limbs.astype(jnp.int32)
+
+
+def _fields(x: Array) -> tuple[Array, Array, Array, Array]:
+    """Split floats into sign, biased exponent and the mantissa with its leading bit, as high and low uint32 words."""
+    bits = lax.bitcast_convert_type(x, jnp.uint32)
+    top, below = (bits, None) if x.dtype == jnp.float32 else (bits[..., 1], bits[..., 0])
+    nmant = 23 if below is None else 20
+    exponent = ((top >> nmant) & np.uint32(0xFF if below is None else 0x7FF)).astype(jnp.int32)
+    lead = (exponent > 0).astype(jnp.uint32) << nmant
+    mantissa = (top & np.uint32((1 << nmant) - 1)) | lead
+    sign = (top >> 31) == 1
+    if below is None:
+        return sign, exponent, jnp.zeros_like(mantissa), mantissa
+    return sign, exponent, mantissa, below
+
+
+def _shift_right(high: Array, low: Array, shift: Array) -> Array:
+    """Return the low word of (high·2^32 + low) >> shift; a negative shift goes left."""
+
+    def shifted(word: Array, by: Array) -> Array:  # XLA leaves shifts by 32 or more to the hardware: clamp, then mask
+        return jnp.where((by >= 0) & (by < 32), word >> jnp.clip(by, 0, 31).astype(jnp.uint32), np.uint32(0))
+
+    def lifted(word: Array, by: Array) -> Array:
+        return jnp.where((by >= 0) & (by < 32), word << jnp.clip(by, 0, 31).astype(jnp.uint32), np.uint32(0))
+
+    from_low = jnp.where(shift >= 0, shifted(low, shift), lifted(low, -shift))
+    from_high = jnp.where(shift >= 32, shifted(high, shift - 32), lifted(high, 32 - shift))
+    return from_low | from_high
+
+
+def smallest_cutoff(dtype: np.dtype) -> float:
+    """Return the smallest cutoff that keeps flushed denormals inside the band of step 1."""
+    finfo = np.finfo(dtype)
+    return 2.0 ** (finfo.minexp + finfo.nmant + 7)
+
+
+def largest_cutoff(dtype: np.dtype) -> float:
+    """Return the largest cutoff for which a cell edge is still finite."""
+    return 2.0 ** (np.finfo(dtype).maxexp - 1)

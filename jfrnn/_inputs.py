@@ -1,0 +1,103 @@
+"""What a search accepts: every argument checked while tracing, with errors that name it, what came and what to do."""
+
+import math
+from numbers import Real
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+
+from jfrnn._exact import Cutoff, largest_cutoff, make_cutoff, smallest_cutoff
+
+BACKENDS = ("auto", "jax", "brute")
+
+
+def checked_positions(name: str, positions: Any, like: Array | None = None) -> Array:  # noqa: ANN401
+    """Return positions as a float32 or float64 array [n, 2] or [n, 3], of the same kind as `like` where that is given."""
+    if not hasattr(positions, "dtype") or not hasattr(positions, "shape"):
+        raise TypeError(
+            f"{name} must be a JAX or NumPy array of shape [n, 2] or [n, 3], got {type(positions).__name__}: "
+            f"convert it with jnp.asarray({name}, dtype=jnp.float32)."
+        )
+    dtype, shape = np.dtype(positions.dtype), tuple(positions.shape)
+    if dtype not in (np.float32, np.float64):
+        raise TypeError(f"{name} must be float32 or float64, got {dtype}: convert them first, e.g. with .astype(jnp.float32).")
+    if dtype == np.float64 and not jax.config.read("jax_enable_x64"):
+        raise TypeError(
+            f"{name} are float64, but JAX's 64-bit mode is off and would round them to float32 in silence: call "
+            f'jax.config.update("jax_enable_x64", True) at start-up, or pass {name}.astype(np.float32).'
+        )
+    if len(shape) != 2 or shape[1] not in (2, 3):
+        raise ValueError(f"{name} must have shape [n, 2] or [n, 3], one row per particle, got shape {list(shape)}.")
+    if shape[0] > 2**31 - 32:
+        raise ValueError(f"{name} hold {shape[0]} particles, but indices are int32: at most {2**31 - 32}.")
+    if like is not None and (dtype, shape[1]) != (like.dtype, like.shape[1]):
+        raise ValueError(
+            f"{name} must match positions ({like.dtype}, {like.shape[1]} columns), got {dtype} with {shape[1]} columns."
+        )
+    return jnp.asarray(positions)
+
+
+def checked_cutoff(cutoff: Any, dtype: np.dtype, closed: bool) -> Cutoff:  # noqa: ANN401
+    """Return the cutoff, rounded once to the dtype of the positions."""
+    if isinstance(cutoff, Tracer):
+        raise TypeError(
+            "cutoff must be a static number, got a traced value: pass a Python float, or mark the argument with "
+            "jax.jit(..., static_argnames='cutoff')."
+        )
+    if np.ndim(cutoff) != 0:
+        raise ValueError(f"cutoff must be one number, got an array of shape {list(np.shape(cutoff))}.")
+    if isinstance(cutoff, bool) or not (isinstance(cutoff, Real) or hasattr(cutoff, "dtype")):
+        raise TypeError(f"cutoff must be a number, got {type(cutoff).__name__}.")
+    value = float(cutoff)
+    if not (math.isfinite(value) and value > 0):
+        raise ValueError(f"cutoff must be positive and finite, got {value}.")
+    low, high = smallest_cutoff(dtype), largest_cutoff(dtype)
+    if not low <= value <= high:
+        raise ValueError(
+            f"cutoff={value} is outside [{low:.1e}, {high:.1e}], the range in which {dtype} decides pairs exactly: "
+            "choose another unit of length, or float64."
+        )
+    return make_cutoff(value, dtype, checked_flag("closed", closed))
+
+
+def checked_flag(name: str, value: Any) -> bool:  # noqa: ANN401
+    """Return a static bool."""
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    raise TypeError(f"{name} must be True or False, known while tracing, got {_describe(value)}.")
+
+
+def checked_capacity(capacity: Any) -> int:  # noqa: ANN401
+    """Return a static capacity of at least one slot per row."""
+    if isinstance(capacity, bool) or not isinstance(capacity, int | np.integer):
+        raise TypeError(
+            f"capacity must be a static int (slots per row), known while tracing, got {_describe(capacity)}: pass a Python int, "
+            "e.g. nbrs.capacity of an earlier search."
+        )
+    if capacity < 1:
+        raise ValueError(f"capacity must be at least 1, got {capacity}.")
+    return int(capacity)
+
+
+def checked_slack(slack: Any) -> float:  # noqa: ANN401
+    """Return a static factor of at least 1."""
+    if isinstance(slack, bool) or not isinstance(slack, int | float | np.number):
+        raise TypeError(f"slack must be a number of at least 1, known while tracing, got {_describe(slack)}.")
+    if not (math.isfinite(slack) and slack >= 1):
+        raise ValueError(f"slack must be finite and at least 1 (the capacity is slack times the longest row), got {slack}.")
+    return float(slack)
+
+
+def checked_backend(backend: Any) -> str:  # noqa: ANN401
+    """Return the name of a backend."""
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(map(repr, BACKENDS))}, got {backend!r}.")
+    return backend
+
+
+def _describe(value: Any) -> str:  # noqa: ANN401
+    return f"a traced value {value}" if isinstance(value, Tracer) else f"{type(value).__name__} {value!r}"

@@ -1,0 +1,42 @@
+"""What can go wrong with the data of a search: one bit each, and the error that reports it."""
+
+import enum
+
+
+class Status(enum.IntFlag):
+    """Say what a search met in its data; the bits are sticky and `NeighborList.check` turns them into errors."""
+
+    OK = 0
+    ROW_OVERFLOW = 1
+    NONFINITE = 2
+
+    @property
+    def message(self) -> str:
+        """Describe every bit that is set, with the remedy, one sentence each."""
+        return " ".join(text for bit, text in _MESSAGES.items() if bit in self) or "nothing to report."
+
+
+_MESSAGES = {
+    Status.ROW_OVERFLOW: "At least one row of the neighbor list holds more neighbors than `capacity`.",
+    Status.NONFINITE: (
+        "`positions` (or `queries`) hold non-finite coordinates (NaN or infinite): those particles have no neighbors "
+        "in this list. Find them with jnp.isfinite(positions).all(axis=1)."
+    ),
+}
+
+
+class NeighborOverflowError(RuntimeError):
+    """Report that a neighbor list was too small; `required` is the capacity that holds every row.
+
+    Attributes:
+        required: the largest number of neighbors of one row.
+        capacity: the slots per row that the list had.
+    """
+
+    def __init__(self, required: int, capacity: int) -> None:
+        self.required = required
+        self.capacity = capacity
+        super().__init__(
+            f"capacity={capacity} is too small: one row has {required} neighbors. Search again with "
+            f"capacity={required} or more; called outside jax.jit without `capacity`, search counts first and cannot overflow."
+        )

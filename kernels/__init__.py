@@ -1,0 +1,1 @@
+"""Warp kernels and native functions. Imports warp and nothing else."""
