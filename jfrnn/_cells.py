@@ -55,8 +55,8 @@ def cell_coordinate(x: Array, edge: Array) -> Array:
     """
     magnitude = jnp.abs(x)
     quotient = jnp.floor(magnitude / edge)
-    quotient = quotient - (_remainder(magnitude, quotient, edge) < 0)
-    quotient = quotient + (_remainder(magnitude, quotient + 1, edge) >= 0)
+    quotient = jnp.where(_remainder(magnitude, quotient, edge) < 0, quotient - 1, quotient)
+    quotient = jnp.where(_remainder(magnitude, quotient + 1, edge) >= 0, quotient + 1, quotient)
     return jnp.where(x < 0, -1 - quotient, quotient)
 
 
@@ -106,7 +106,9 @@ def _ordered_bits(x: Array) -> Array:
 
 
 def _sort_by(key: Array, payload: Array) -> tuple[Array, Array]:
-    return lax.sort((key, payload), num_keys=1, is_stable=True)  # two operands: XLA's fast sort on every device
+    # two operands: XLA's fast sort on every device
+    ascending, carried = lax.sort((key, payload), num_keys=1, is_stable=True)
+    return ascending, carried
 
 
 def _iota(n: int) -> Array:

@@ -26,6 +26,7 @@ PointsAt = Callable[[Array | None], tuple[list[Array], list[Array]]]
 
 _LIMB_BITS = 11
 _LIMB_MASK = (1 << _LIMB_BITS) - 1
+_UNKNOWN = 2  # a sign that step 2 could not prove
 _INTEGER_CHUNK = 64  # pairs that one round of the integer test decides
 
 
@@ -70,7 +71,7 @@ def make_cutoff(value: float, dtype: np.dtype, closed: bool) -> Cutoff:
         inside=square * dtype.type(1 - 8 * finfo.eps),
         outside=square * dtype.type(1 + 8 * finfo.eps),
         unit_scale=unit_scale,
-        plain_bits=np.array(2.0**lowest, dtype).view(np.uint32 if narrow else np.uint64)[()],
+        plain_bits=np.frombuffer(dtype.type(2.0**lowest).tobytes(), np.uint32 if narrow else np.uint64)[0],
         closed=closed,
         scaled=scaled,
     )
@@ -116,31 +117,23 @@ def refine(doubtful: Array, points: PointsAt, cutoff: Cutoff) -> Array:
 
 
 def _refine_some(doubtful: Array, points: PointsAt, cutoff: Cutoff) -> Array:
-    sign, known = _sum_sign(*points(None), cutoff)
-    verdict = doubtful & known & _sign_is_pair(sign, cutoff)
-    open_pairs = (doubtful & ~known).reshape(-1)
-    chunk = min(_INTEGER_CHUNK, open_pairs.size)
+    signs = jnp.where(doubtful, _sum_sign(*points(None), cutoff), 1).reshape(-1)
+    chunk = min(_INTEGER_CHUNK, signs.size)
 
-    def decide_chunk(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        verdict, remaining = state
-        (at,) = jnp.nonzero(remaining, size=chunk, fill_value=remaining.size)
+    def decide_chunk(signs: Array) -> Array:
+        (at,) = jnp.nonzero(signs == _UNKNOWN, size=chunk, fill_value=signs.size)
         at = at.astype(jnp.int32)
-        pair = _sign_is_pair(_integer_sign(*points(at), cutoff), cutoff)
-        return verdict.at[at].set(pair, mode="drop"), remaining.at[at].set(False, mode="drop")
+        return signs.at[at].set(_integer_sign(*points(at), cutoff), mode="drop")
 
-    verdict, _ = lax.while_loop(lambda state: jnp.any(state[1]), decide_chunk, (verdict.reshape(-1), open_pairs))
-    return verdict.reshape(doubtful.shape)
-
-
-def _sign_is_pair(sign: Array, cutoff: Cutoff) -> Array:
-    return sign <= 0 if cutoff.closed else sign < 0
+    signs = lax.while_loop(lambda signs: jnp.any(signs == _UNKNOWN), decide_chunk, signs)
+    return (signs <= 0 if cutoff.closed else signs < 0).reshape(doubtful.shape)
 
 
 # --- step 2: error-free transformations -------------------------------------------------------------------------------
 
 
-def _sum_sign(a: list[Array], b: list[Array], cutoff: Cutoff) -> tuple[Array, Array]:
-    """Return the sign of |b - a|² - r² and where it is proven; exact ties of exactly representable differences included."""
+def _sum_sign(a: list[Array], b: list[Array], cutoff: Cutoff) -> Array:
+    """Return the sign of |b - a|² - r² where it is proven, ties of representable differences included, else _UNKNOWN; int32."""
     radius, scale = lax.optimization_barrier((cutoff.radius, cutoff.unit_scale))  # no constants: they could be regrouped
     terms, slack = [], jnp.zeros_like(a[0])
     for ak, bk in zip(a, b, strict=True):
@@ -157,8 +150,8 @@ def _sum_sign(a: list[Array], b: list[Array], cutoff: Cutoff) -> tuple[Array, Ar
     bound = 2 * (rest + slack)  # twice: covers the rounding of the sums of absolute values above
     leading = terms[-1]
     known = (jnp.abs(leading) > bound) | ((leading == 0) & (bound == 0))
-    normal = [_is_plain(x, cutoff) for x in (*a, *b)]
-    return jnp.sign(leading), functools.reduce(jnp.logical_and, normal, known)
+    known = functools.reduce(jnp.logical_and, (_is_plain(x, cutoff) for x in (*a, *b)), known)
+    return jnp.where(known, jnp.sign(leading).astype(jnp.int32), _UNKNOWN)
 
 
 def _two_difference(a: Array, b: Array) -> tuple[Array, Array]:
@@ -218,14 +211,14 @@ def _integer_sign(a: list[Array], b: list[Array], cutoff: Cutoff) -> Array:
     A coordinate fills at most 6 limbs of 11 bits, a difference at most 12, each below 2^12 in magnitude; a limb of the sum of
     squares collects at most 3·12 products below 2^24 and stays below 2^31.
     """
-    differences = [_limbs(bk) - _limbs(ak) for ak, bk in zip(a, b, strict=True)]
-    radius = _limbs(jnp.full_like(a[0], cutoff.radius))
-    count = radius.shape[1]
+    dim = len(a)
+    limbs = _limbs(jnp.stack([*a, *b, jnp.full_like(a[0], cutoff.radius)]))  # [2d + 1, k, count]
+    differences, radius = limbs[dim : 2 * dim] - limbs[:dim], limbs[-1]
+    count = limbs.shape[-1]
 
     def add_shifted(i: Array, total: Array) -> Array:
         squares = -_limb(radius, i) * radius
-        for difference in differences:
-            squares = squares + _limb(difference, i) * difference
+        squares = squares + jnp.sum(_limb(differences, i) * differences, axis=0, dtype=jnp.int32)
         window = lax.dynamic_slice_in_dim(total, i, count, axis=1)
         return lax.dynamic_update_slice_in_dim(total, window + squares, i, axis=1)
 
@@ -234,7 +227,7 @@ def _integer_sign(a: list[Array], b: list[Array], cutoff: Cutoff) -> Array:
 
 
 def _limb(x: Array, i: Array) -> Array:
-    return lax.dynamic_slice_in_dim(x, i, 1, axis=1)
+    return lax.dynamic_slice_in_dim(x, i, 1, axis=-1)
 
 
 def _sign_of_limbs(total: Array) -> Array:
@@ -247,19 +240,19 @@ def _sign_of_limbs(total: Array) -> Array:
 
     zero = jnp.zeros(total.shape[0], jnp.int32)
     carry, seen = lax.fori_loop(0, total.shape[1], carry_on, (zero, zero))
-    return jnp.where(carry < 0, -1, jnp.where((seen != 0) | (carry != 0), 1, 0))
+    return jnp.where(carry < 0, -1, ((seen != 0) | (carry != 0)).astype(jnp.int32))
 
 
 def _limbs(x: Array) -> Array:
-    """Write finite floats [k] as signed int32 limbs [k, count], in units of the smallest denormal, lowest limb first."""
+    """Write finite floats [...] as signed int32 limbs [..., count], in units of the smallest denormal, lowest limb first."""
     finfo = jnp.finfo(x.dtype)
     sign, exponent, high, low = _fields(x)
     place = jnp.maximum(exponent, 1) - 1
     width = finfo.nmant + 1
     count = -(-(finfo.maxexp - finfo.minexp + width) // _LIMB_BITS)
-    shift = jnp.arange(count, dtype=jnp.int32) * _LIMB_BITS - place[:, None]
-    limbs = _shift_right(high[:, None], low[:, None], shift) & np.uint32(_LIMB_MASK)
-    return jnp.where(sign[:, None], -1, 1) * limbs.astype(jnp.int32)
+    shift = jnp.arange(count, dtype=jnp.int32) * _LIMB_BITS - place[..., None]
+    limbs = _shift_right(high[..., None], low[..., None], shift) & np.uint32(_LIMB_MASK)
+    return jnp.where(sign[..., None], -1, 1) * limbs.astype(jnp.int32)
 
 
 def _fields(x: Array) -> tuple[Array, Array, Array, Array]:

@@ -38,7 +38,10 @@ def checked_positions(name: str, positions: Any, like: Array | None = None) -> A
         raise ValueError(
             f"{name} must match positions ({like.dtype}, {like.shape[1]} columns), got {dtype} with {shape[1]} columns."
         )
-    return jnp.asarray(positions)
+    if isinstance(positions, Tracer):
+        return jnp.asarray(positions)
+    with jax.ensure_compile_time_eval():  # stay concrete inside jit too: search can then count what it closes over
+        return jnp.asarray(positions)
 
 
 def checked_cutoff(cutoff: Any, dtype: np.dtype, closed: bool) -> Cutoff:  # noqa: ANN401
@@ -93,10 +96,10 @@ def checked_slack(slack: Any) -> float:  # noqa: ANN401
 
 
 def checked_backend(backend: Any) -> str:  # noqa: ANN401
-    """Return the name of a backend."""
+    """Return the name of the engine that a backend stands for."""
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(map(repr, BACKENDS))}, got {backend!r}.")
-    return backend
+    return "jax" if backend == "auto" else backend
 
 
 def _describe(value: Any) -> str:  # noqa: ANN401

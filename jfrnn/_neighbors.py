@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._exact import is_pair_of, make_cutoff
+from jfrnn._exact import Cutoff, is_pair_of, make_cutoff
 from jfrnn._inputs import checked_positions
 from jfrnn._status import NeighborOverflowError, Status
 
@@ -87,13 +87,10 @@ class NeighborList:
         Differentiable: to any order in positions and queries; the mask is a constant. Jit: yes. vmap: yes.
         """
         sources, rows = self._geometry_inputs(positions, queries)
-        neighbor = jnp.minimum(self.idx, max(self.source_count - 1, 0))
         if 0 in (sources.shape[0], *self.idx.shape):
             return jnp.zeros((*self.idx.shape, sources.shape[1]), sources.dtype), jnp.zeros(self.idx.shape, bool)
-        used = lax.broadcasted_iota(jnp.int32, self.idx.shape, 1) < self.count[:, None]
         cutoff = make_cutoff(self.cutoff, np.dtype(sources.dtype), self.closed)
-        mask = used & is_pair_of(lax.stop_gradient(rows), lax.stop_gradient(sources), neighbor, cutoff)
-        return jnp.where(mask[..., None], sources[neighbor] - rows[:, None, :], 0), mask
+        return _vectors(self.idx, self.count, sources, rows, cutoff)
 
     def distances(self, positions: Array, *, queries: Array | None = None) -> tuple[Array, Array]:
         """Compute the distance to every neighbor.
@@ -111,11 +108,7 @@ class NeighborList:
         Differentiable: to any order; the gradient of a distance of 0 is 0. Jit: yes. vmap: yes.
         """
         vectors, mask = self.vectors(positions, queries=queries)
-        largest = lax.stop_gradient(jnp.max(jnp.abs(vectors), axis=-1, initial=0))
-        apart = largest > 0
-        unit = jnp.where(apart, largest, 1)  # squares of very small or large lengths would leave the float range
-        square = jnp.sum((vectors / unit[..., None]) ** 2, axis=-1)
-        return jnp.where(apart, unit * jnp.sqrt(jnp.where(apart, square, 1)), 0), mask
+        return _norms(vectors), mask
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
         """Export the pairs (i, j), row by row, to the host.
@@ -159,3 +152,20 @@ class NeighborList:
         if rows.shape[0] != self.idx.shape[0]:
             raise ValueError(f"queries hold {rows.shape[0]} points, but the list has {self.idx.shape[0]} rows.")
         return sources, rows
+
+
+@jax.jit
+def _vectors(idx: Array, count: Array, sources: Array, rows: Array, cutoff: Cutoff) -> tuple[Array, Array]:
+    used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
+    neighbor = jnp.where(used, idx, 0)
+    mask = used & is_pair_of(lax.stop_gradient(rows), lax.stop_gradient(sources), neighbor, cutoff)
+    return jnp.where(mask[..., None], sources[neighbor] - rows[:, None, :], 0), mask
+
+
+@jax.jit
+def _norms(vectors: Array) -> Array:
+    largest = lax.stop_gradient(jnp.max(jnp.abs(vectors), axis=-1, initial=0))
+    apart = largest > 0
+    unit = jnp.where(apart, largest, 1)  # squares of very small or large lengths would leave the float range
+    square = jnp.sum((vectors / unit[..., None]) ** 2, axis=-1)
+    return jnp.where(apart, unit * jnp.sqrt(jnp.where(apart, square, 1)), 0)

@@ -59,8 +59,8 @@ def search(
         backend: "auto", "jax" (cells, any device) or "brute" (all n·m candidates). "auto" takes "jax".
 
     Returns:
-        A `NeighborList`; `idx` has shape [m, capacity], unused slots hold n. Rows are in no promised order, but the same input gives
-        the same bits.
+        A `NeighborList`; `idx` has shape [m, capacity], unused slots hold n. Rows are in no promised order, but the same input
+        gives the same bits.
 
     Raises:
         TypeError, ValueError: an argument is of the wrong kind, shape or range, or `capacity` is missing under jit.

@@ -68,9 +68,7 @@ def test_full_resolves_the_same_domain(spacing):
     assert (scene.positions.max(axis=0) < scene.lengths).all()
 
 
-@pytest.mark.parametrize(
-    ("n", "size", "fill"), [(2, 12, 0.11), (4, 6, 0.11), (6, 4, 0.11), (5, 8, 0.51), (10, 4, 0.51)]
-)
+@pytest.mark.parametrize(("n", "size", "fill"), [(2, 12, 0.11), (4, 6, 0.11), (6, 4, 0.11), (5, 8, 0.51), (10, 4, 0.51)])
 def test_clusters_are_boxes_inside_their_tiles(n, size, fill):
     sites = site_indices(cases.scene(f"clusters{n}", fill=fill, dtype="float64"))
     for axis, (total, edge) in enumerate(zip(SITES[3], (size, 2 * size, size), strict=True)):

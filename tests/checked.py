@@ -1,0 +1,47 @@
+"""Search, and compare what came back with the oracle as a set of pairs. Shapes and dtypes are checked on the way."""
+
+import numpy as np
+import reference
+from beartype import beartype
+from jax import Array
+from jaxtyping import Bool, Int32, jaxtyped
+
+import jfrnn
+
+
+@jaxtyped(typechecker=beartype)
+def assert_shapes(
+    idx: Int32[Array, "m k"],
+    count: Int32[Array, " m"],
+    status: Int32[Array, ""],
+    required: Int32[Array, ""],
+    overflow: Bool[Array, ""],
+) -> None:
+    """Fail where a field of a list has another shape or dtype than documented."""
+
+
+def found_pairs(nbrs):
+    """Return the pairs of a list after checking its fields, its padding and its counts."""
+    assert_shapes(nbrs.idx, nbrs.count, nbrs.status, nbrs.required, nbrs.overflow)
+    assert not nbrs.overflow
+    assert int(nbrs.required) == int(np.max(nbrs.count, initial=0))
+    return reference.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), nbrs.source_count)
+
+
+def assert_exact(nbrs, positions, cutoff, *, queries=None, **options):
+    """Fail unless the list holds exactly the oracle's pairs."""
+    expected = reference.reference_pairs(positions, cutoff, queries=queries, **options)
+    missing, extra = reference.compare(found_pairs(nbrs), expected)
+    assert (len(missing), len(extra)) == (0, 0), f"missing {sorted(missing)[:5]}, extra {sorted(extra)[:5]} of {len(expected)}"
+
+
+def padded(points, length):
+    """Lengthen points with NaN rows, which take part in no pair, so that inputs of many sizes share one compiled program."""
+    fill = np.full((length - len(points), points.shape[1]), np.nan, points.dtype)
+    return np.concatenate([points, fill])
+
+
+def search_padded(hard_input, length, capacity, **options):
+    """Search a hard case with sources and queries padded to `length` rows."""
+    queries = None if hard_input.queries is None else padded(hard_input.queries, length)
+    return jfrnn.search(padded(hard_input.positions, length), hard_input.cutoff, queries=queries, capacity=capacity, **options)

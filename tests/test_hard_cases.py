@@ -1,0 +1,58 @@
+"""Every backend, dtype and dimension against the oracle on every hard case."""
+
+import checked
+import numpy as np
+import pytest
+from jfrnn.cases.hard import HARD_CASES
+
+import jfrnn
+
+BACKENDS = ("jax", "brute")
+CAPACITY = 704  # the fullest row of all hard cases fits
+
+
+@pytest.fixture(params=BACKENDS)
+def backend(request):
+    return request.param
+
+
+REFUSED = "denormal_lattice"  # its cutoff is a denormal: see test_denormal_cutoff_is_refused
+NAMES = [name for name in HARD_CASES if name != REFUSED]
+
+
+def test_denormal_cutoff_is_refused(dtype, dim, backend):
+    given = HARD_CASES[REFUSED].build(dtype, dim)
+    with pytest.raises(ValueError, match=r"cutoff=.* is outside .* choose another unit of length"):
+        jfrnn.search(given.positions, given.cutoff, backend=backend)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
+def test_hard_case(name, dtype, dim, backend, closed):
+    given = HARD_CASES[name].build(dtype, dim)
+    rows = max(len(given.positions), 0 if given.queries is None else len(given.queries))
+    length = 704 if rows <= 704 else 2048
+    nbrs = checked.search_padded(given, length, CAPACITY, backend=backend, closed=closed)
+    queries = None if given.queries is None else checked.padded(given.queries, length)
+    checked.assert_exact(nbrs, checked.padded(given.positions, length), given.cutoff, queries=queries, closed=closed)
+
+
+@pytest.mark.parametrize("name", ["n_0", "n_1", "n_2", "n_33", "n_65", "no_queries", "no_sources", "queries_fewer"])
+def test_sizes_as_they_are(name, dtype, dim, backend):
+    given = HARD_CASES[name].build(dtype, dim)
+    nbrs = jfrnn.search(given.positions, given.cutoff, queries=given.queries, backend=backend)
+    checked.assert_exact(nbrs, given.positions, given.cutoff, queries=given.queries)
+    nbrs.check()
+    i, j = nbrs.pairs()
+    assert i.dtype == j.dtype == np.int32
+    assert len(i) == len(j) == int(np.sum(nbrs.count))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_every_case_as_it_is(name, dtype, dim, backend):
+    """Eager, unpadded, capacity counted: hundreds of compilations, hence slow."""
+    given = HARD_CASES[name].build(dtype, dim)
+    for options in ({}, {"closed": True}):
+        nbrs = jfrnn.search(given.positions, given.cutoff, queries=given.queries, backend=backend, **options)
+        checked.assert_exact(nbrs, given.positions, given.cutoff, queries=given.queries, **options)

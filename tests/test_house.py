@@ -1,0 +1,74 @@
+"""The rules of the house: who imports whom, what an import costs, what is public, examples that run."""
+
+import ast
+import doctest
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import jfrnn
+
+ROOT = Path(__file__).parent.parent
+ALLOWED = {  # first-party and third-party modules that each folder may import
+    "kernels": {"warp"},
+    "cases": {"numpy"},
+    "jfrnn": {"jax", "numpy", "jfrnn"},
+}
+PUBLIC = {"search", "count", "NeighborList", "NeighborOverflowError", "Status"}
+
+
+def imported_modules(path):
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            yield node.module
+
+
+@pytest.mark.parametrize("folder", ALLOWED)
+def test_imports(folder):
+    files = sorted((ROOT / folder).rglob("*.py"))
+    assert files
+    for path in files:
+        roots = {module.split(".")[0] for module in imported_modules(path)} - set(sys.stdlib_module_names)
+        within = {"jfrnn"} if folder in ("kernels", "cases") else set()  # jfrnn.kernels, jfrnn.cases
+        assert roots <= ALLOWED[folder] | within, f"{path.name} imports {roots - ALLOWED[folder]}"
+        if within:
+            own = f"jfrnn.{folder}"
+            assert all(m.startswith(own) for m in imported_modules(path) if m.split(".")[0] == "jfrnn"), path.name
+
+
+def test_nothing_imports_experiments():
+    for folder in ALLOWED:
+        for path in (ROOT / folder).rglob("*.py"):
+            assert not any(m.split(".")[0] in ("experiments", "notebooks") for m in imported_modules(path)), path.name
+
+
+def test_public_names():
+    assert set(jfrnn.__all__) == PUBLIC
+    assert all(getattr(jfrnn, name).__doc__ for name in PUBLIC)
+
+
+IMPORT = """
+import sys, time
+import jax
+before, modules = time.process_time(), set(sys.modules)
+import jfrnn
+assert not jax._src.xla_bridge.backends_are_initialized(), "importing jfrnn started a device"
+print(sorted(m.split(".")[0] for m in set(sys.modules) - modules))
+"""
+
+
+def test_import_starts_nothing():
+    run = subprocess.run([sys.executable, "-c", IMPORT], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert set(ast.literal_eval(run.stdout)) <= {"jfrnn"}
+
+
+def test_examples_in_docstrings():
+    result = doctest.testmod(jfrnn)
+    assert result.attempted > 0
+    assert result.failed == 0

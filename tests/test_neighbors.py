@@ -1,0 +1,150 @@
+"""`NeighborList`: geometry with gradients of every order, exports, and what it refuses."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from jax.test_util import check_grads
+
+import jfrnn
+
+
+@pytest.fixture
+def points(dim):
+    return jnp.asarray(np.random.default_rng(0).random((40, dim)))
+
+
+def test_distances_and_vectors(points):
+    nbrs = jfrnn.search(points, 0.4)
+    r, mask = nbrs.vectors(points)
+    d, same = nbrs.distances(points)
+    np.testing.assert_array_equal(mask, same)
+    np.testing.assert_array_equal(mask.sum(1), nbrs.count)
+    for i in range(40):
+        j = np.asarray(nbrs.idx[i])[np.asarray(mask[i])]
+        np.testing.assert_array_equal(r[i][mask[i]], points[j] - points[i])
+        np.testing.assert_allclose(d[i][mask[i]], np.linalg.norm(points[j] - points[i], axis=1), rtol=1e-15)
+    assert not r[~mask].any()
+    assert not d[~mask].any()
+
+
+def test_mask_is_the_exact_test_at_the_new_positions(dtype, dim):
+    """The list is wide, the points then move onto a lattice full of ties: the mask must be the oracle's pairs."""
+    grid = np.stack(np.meshgrid(*[np.arange(5)] * dim, indexing="ij"), -1).reshape(-1, dim)
+    lattice = (grid * 1e-4).astype(dtype)
+    nbrs = jfrnn.search(np.zeros_like(lattice), 3e-4)  # everyone lists everyone
+    _, mask = nbrs.distances(jnp.asarray(lattice))
+    i, k = np.nonzero(mask)
+    found = set(zip(i.tolist(), np.asarray(nbrs.idx)[i, k].tolist(), strict=True))
+    assert found == reference.reference_pairs(lattice, 3e-4)
+
+
+def test_distances_do_not_underflow(dtype):
+    tiny = np.array([[0, 0], [3e-25, 4e-25]], dtype)
+    d, mask = jfrnn.search(tiny, 1e-24).distances(tiny)
+    assert mask[0, 0]
+    np.testing.assert_allclose(d[0, 0], 5e-25, rtol=1e-6)
+
+
+def test_queries(points):
+    queries = points[:7] + 0.05
+    nbrs = jfrnn.search(points, 0.4, queries=queries)
+    r, mask = nbrs.vectors(points, queries=queries)
+    i, k = np.nonzero(mask)
+    np.testing.assert_array_equal(r[i, k], points[nbrs.idx[i, k]] - queries[i])
+    np.testing.assert_array_equal(mask.sum(1), nbrs.count)
+
+
+@jax.jit
+def energy(nbrs, x):
+    d, mask = nbrs.distances(x)
+    return jnp.sum(jnp.where(mask, (0.4 - d) ** 3, 0.0))
+
+
+def test_gradients_against_finite_differences(points):
+    nbrs = jfrnn.search(points, 0.4)
+    check_grads(lambda x: energy(nbrs, x), (points,), order=2, modes=("fwd", "rev"), eps=1e-6, rtol=1e-6)
+
+
+def test_gradients_against_brute_force(points):
+    def all_pairs(x):
+        square = jnp.sum((x[:, None] - x) ** 2, -1)
+        near = (square < 0.4**2) & ~jnp.eye(len(x), dtype=bool)
+        return jnp.sum(jnp.where(near, (0.4 - jnp.sqrt(jnp.where(near, square, 1.0))) ** 3, 0.0))
+
+    nbrs = jfrnn.search(points, 0.4)
+    np.testing.assert_allclose(jax.grad(lambda x: energy(nbrs, x))(points), jax.grad(all_pairs)(points), atol=1e-13)
+    direction = jnp.ones_like(points).at[0].set(-2.0)
+    second = [
+        jax.jit(lambda x, f=f: jax.jvp(jax.grad(f), (x,), (direction,))[1])(points) for f in (lambda x: energy(nbrs, x), all_pairs)
+    ]
+    np.testing.assert_allclose(*second, atol=1e-12)
+
+
+def test_gradients_are_finite_at_coincident_points(dim):
+    points = jnp.zeros((3, dim)).at[2, 0].set(0.1)
+    nbrs = jfrnn.search(points, 0.4)
+    value, gradient = jax.value_and_grad(lambda x: energy(nbrs, x))(points)
+    hessian = jax.jit(jax.hessian(lambda x: energy(nbrs, x)))(points)
+    assert np.isfinite(value)
+    assert np.isfinite(gradient).all()
+    assert np.isfinite(hessian).all()
+    assert nbrs.count[0] == 2
+
+
+def test_exports_agree(points):
+    nbrs = jfrnn.search(points, 0.3)
+    i, j = nbrs.pairs()
+    offsets, indices = nbrs.csr()
+    assert (i.dtype, j.dtype, indices.dtype, offsets.dtype) == (np.int32, np.int32, np.int32, np.int64)
+    np.testing.assert_array_equal(indices, j)
+    np.testing.assert_array_equal(np.diff(offsets), nbrs.count)
+    np.testing.assert_array_equal(np.repeat(np.arange(40), np.diff(offsets)), i)
+    assert set(zip(i.tolist(), j.tolist(), strict=True)) == reference.reference_pairs(np.asarray(points), 0.3)
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_lists_without_pairs(n, dim):
+    nbrs = jfrnn.search(np.zeros((n, dim), np.float32), 1.0)
+    assert nbrs.pairs()[0].shape == (0,)
+    assert nbrs.csr()[0].tolist() == [0] * (n + 1)
+    d, mask = nbrs.distances(jnp.zeros((n, dim), jnp.float32))
+    assert d.shape == mask.shape == nbrs.idx.shape
+    assert not mask.any()
+
+
+def test_is_a_pytree_with_static_options(points):
+    nbrs = jfrnn.search(points, 0.3, half=True)
+    leaves, structure = jax.tree.flatten(nbrs)
+    assert len(leaves) == 4
+    again = jax.tree.unflatten(structure, leaves)
+    assert (again.cutoff, again.half, again.capacity, again.source_count) == (0.3, True, nbrs.capacity, 40)
+    with pytest.raises(AttributeError, match="cannot assign"):
+        nbrs.cutoff = 1.0
+
+
+def test_geometry_inside_jit_and_scan(points):
+    nbrs = jfrnn.search(points, 0.4, slack=2.0)
+    moved = jax.jit(lambda nbrs, x: nbrs.distances(x)[0].sum())(nbrs, points)
+    np.testing.assert_allclose(moved, nbrs.distances(points)[0].sum(), rtol=1e-12)
+
+
+def test_refusals(points):
+    nbrs = jfrnn.search(points, 0.4)
+    with pytest.raises(ValueError, match=r"positions hold 39 particles, but the list was made for 40"):
+        nbrs.distances(points[1:])
+    with pytest.raises(ValueError, match="made without queries: leave queries out"):
+        nbrs.vectors(points, queries=points)
+    with pytest.raises(TypeError, match="positions must be float32 or float64"):
+        nbrs.vectors(points.astype(int))
+    asked = jfrnn.search(points, 0.4, queries=points[:3])
+    with pytest.raises(ValueError, match="made with queries: pass queries="):
+        asked.distances(points)
+    with pytest.raises(ValueError, match="queries hold 4 points, but the list has 3 rows"):
+        asked.distances(points, queries=points[:4])
+    with pytest.raises(TypeError, match=r"check\(\) reads values and cannot run inside jax.jit"):
+        jax.jit(lambda x: jfrnn.search(x, 0.4, capacity=40).check())(points)
+    batch = jax.vmap(lambda x: jfrnn.search(x, 0.4, capacity=40))(points[None])
+    with pytest.raises(ValueError, match="index the batch first"):
+        batch.pairs()

@@ -1,0 +1,308 @@
+"""`search` and `count`: options, capacity, jit, batches, and every input error."""
+
+import checked
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+
+import jfrnn
+
+
+def random_points(n, dim, dtype, seed=0):
+    return np.random.default_rng(seed).random((n, dim)).astype(dtype)
+
+
+OPTIONS = [
+    {},
+    {"half": True},
+    {"include_self": True},
+    {"closed": True},
+    {"half": True, "include_self": True},
+    {"half": True, "closed": True},
+]
+
+
+@pytest.mark.parametrize("backend", ["jax", "brute"])
+@pytest.mark.parametrize(("dtype", "dim"), [(np.float32, 3), (np.float64, 2)])
+@pytest.mark.parametrize("options", OPTIONS, ids=lambda o: "+".join(o) or "plain")
+def test_options(options, backend, dtype, dim):
+    points = np.concatenate([random_points(150, dim, dtype), random_points(20, dim, dtype)])  # 20 coincident pairs
+    cutoff = 0.12 if dim == 2 else 0.25
+    nbrs = jfrnn.search(points, cutoff, backend=backend, capacity=40, **options)
+    checked.assert_exact(nbrs, points, cutoff, **options)
+    assert (nbrs.half, nbrs.include_self, nbrs.closed) == tuple(options.get(k, False) for k in ("half", "include_self", "closed"))
+    np.testing.assert_array_equal(jfrnn.count(points, cutoff, backend=backend, **options), nbrs.count)
+    assert nbrs.backend == backend
+
+
+def test_auto_says_what_ran():
+    assert jfrnn.search(X, 1.0, backend="auto").backend == "jax"
+
+
+@pytest.mark.parametrize("backend", ["jax", "brute"])
+@pytest.mark.parametrize(("m", "dtype", "dim"), [(1, np.float32, 2), (7, np.float64, 3), (300, np.float32, 3)])
+def test_queries(m, backend, dtype, dim):
+    points, queries = random_points(150, dim, dtype), 2 * random_points(m, dim, dtype, seed=1) - dtype(0.5)
+    nbrs = jfrnn.search(points, 0.2, queries=queries, backend=backend)
+    checked.assert_exact(nbrs, points, 0.2, queries=queries)
+    np.testing.assert_array_equal(jfrnn.count(points, 0.2, queries=queries, backend=backend), nbrs.count)
+
+
+def test_rows_longer_than_one_group_of_slots():
+    points = random_points(1500, 3, np.float32)
+    nbrs = jfrnn.search(points, 0.6)
+    assert nbrs.capacity > 300
+    checked.assert_exact(nbrs, points, 0.6)
+
+
+def test_more_queries_than_one_block():
+    points = random_points(9000, 2, np.float32)
+    checked.assert_exact(jfrnn.search(points, 0.02), points, 0.02)
+
+
+def test_order_of_the_input_does_not_matter(dim):
+    points = random_points(400, dim, np.float32)
+    shuffled = np.random.default_rng(3).permutation(400)
+    i, j = jfrnn.search(points[shuffled], 0.15).pairs()
+    assert set(zip(shuffled[i].tolist(), shuffled[j].tolist(), strict=True)) == reference.reference_pairs(points, 0.15)
+
+
+def test_same_input_gives_the_same_bits():
+    points = random_points(3000, 3, np.float32)
+    first, second = (jfrnn.search(points, 0.1, capacity=32) for _ in range(2))
+    np.testing.assert_array_equal(first.idx, second.idx)
+
+
+# --- capacity ---------------------------------------------------------------------------------------------------------
+
+
+def test_eager_search_cannot_overflow():
+    points = np.zeros((300, 3), np.float32)  # everyone is everyone's neighbor
+    nbrs = jfrnn.search(points, 1.0)
+    assert int(nbrs.required) == 299
+    assert nbrs.capacity == 300
+    nbrs.check()
+
+
+@pytest.mark.parametrize(("slack", "capacity"), [(1.0, 8), (1.5, 8), (2.0, 16)])
+def test_slack_multiplies_the_longest_row(slack, capacity):
+    points = np.arange(100, dtype=np.float32)[:, None] * np.ones((1, 2), np.float32)
+    nbrs = jfrnn.search(points, 3.0 * 1.5, slack=slack)  # 3 neighbors on either side
+    assert int(nbrs.required) == 6 - 0
+    assert nbrs.capacity == -(-int(6 * slack) // 8) * 8 >= capacity
+
+
+@pytest.mark.parametrize("backend", ["jax", "brute"])
+@pytest.mark.parametrize("capacity", [1, 3, 200])
+def test_overflow_sets_the_bit_and_keeps_true_counts(capacity, backend):
+    points = random_points(300, 2, np.float32)
+    full = jfrnn.search(points, 0.3)
+    nbrs = jax.jit(lambda x: jfrnn.search(x, 0.3, capacity=capacity, backend=backend))(points)
+    required = int(full.required)
+    assert bool(nbrs.overflow) == (required > capacity)
+    assert int(nbrs.required) == required
+    np.testing.assert_array_equal(nbrs.count, full.count)
+    if required > capacity:
+        with pytest.raises(jfrnn.NeighborOverflowError, match=f"capacity={required} or more") as error:
+            nbrs.check()
+        assert (error.value.required, error.value.capacity) == (required, capacity)
+        with pytest.raises(jfrnn.NeighborOverflowError, match="too small"):
+            nbrs.pairs()
+        with pytest.raises(jfrnn.NeighborOverflowError, match="too small"):
+            nbrs.csr()
+    kept = [set(row[: min(c, capacity)].tolist()) for row, c in zip(np.asarray(nbrs.idx), np.asarray(nbrs.count), strict=True)]
+    true = [set(row[:c].tolist()) for row, c in zip(np.asarray(full.idx), np.asarray(full.count), strict=True)]
+    assert all(k <= t and len(k) == min(len(t), capacity) for k, t in zip(kept, true, strict=True))
+
+
+# --- data that no shape can reveal ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("backend", ["jax", "brute"])
+@pytest.mark.parametrize(("dtype", "dim"), [(np.float32, 3), (np.float64, 2)])
+def test_non_finite_positions_set_a_bit_and_spare_the_others(value, backend, dtype, dim):
+    points = random_points(100, dim, dtype)
+    points[17, dim - 1] = value
+    nbrs = jfrnn.search(points, 0.3, backend=backend, include_self=True, capacity=100)
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
+    checked.assert_exact(nbrs, points, 0.3, include_self=True)
+    assert nbrs.count[17] == 0
+    with pytest.raises(ValueError, match="non-finite coordinates"):
+        nbrs.check()
+
+
+def test_non_finite_queries_set_the_bit():
+    queries = np.array([[0.5, np.nan]], np.float32)
+    nbrs = jfrnn.search(random_points(10, 2, np.float32), 0.3, queries=queries)
+    with pytest.raises(ValueError, match="queries"):
+        nbrs.check()
+
+
+def test_all_positions_non_finite(dim):
+    nbrs = jfrnn.search(np.full((40, dim), np.nan, np.float32), 1.0)
+    assert not nbrs.count.any()
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
+
+
+def test_every_status_bit_has_a_message():
+    assert all(bit.message for bit in jfrnn.Status)
+    assert jfrnn.Status.OK.message == "nothing to report."
+
+
+# --- transformations --------------------------------------------------------------------------------------------------
+
+
+def test_jit_traces_once_for_new_positions():
+    traces = []
+
+    @jax.jit
+    def neighbors(x):
+        traces.append(x.shape)
+        return jfrnn.search(x, 0.2, capacity=64)
+
+    for seed in range(3):
+        points = random_points(200, 2, np.float32, seed)
+        checked.assert_exact(neighbors(points), points, 0.2)
+    assert len(traces) == 1
+
+
+def test_one_program_serves_every_cutoff():
+    from jfrnn._search import _search
+
+    points = random_points(77, 2, np.float32)
+    jfrnn.search(points, 0.1, capacity=76)
+    before = _search._cache_size()
+    for cutoff in (0.2, 0.5, 3.0):
+        checked.assert_exact(jfrnn.search(points, cutoff, capacity=76), points, cutoff)
+    assert _search._cache_size() == before
+
+
+def test_closed_over_positions_are_counted_while_tracing():
+    points = random_points(50, 2, np.float32)
+    nbrs = jax.jit(lambda: jfrnn.search(points, 0.2))()
+    checked.assert_exact(nbrs, points, 0.2)
+
+
+@pytest.mark.parametrize("backend", ["jax", "brute"])
+def test_vmap_equals_a_loop(backend):
+    batch = np.stack([random_points(60, 2, np.float32, seed) * 10.0**seed for seed in range(3)]).astype(np.float32)
+    nbrs = jax.vmap(lambda x: jfrnn.search(x, 0.3, capacity=60, backend=backend))(batch)
+    counts = jax.vmap(lambda x: jfrnn.count(x, 0.3, backend=backend))(batch)
+    for k, points in enumerate(batch):
+        one = jax.tree.map(lambda leaf, k=k: leaf[k], nbrs)
+        checked.assert_exact(one, points, 0.3)
+        np.testing.assert_array_equal(counts[k], one.count)
+
+
+def test_scan_and_cond():
+    start = random_points(60, 2, np.float32)
+
+    def step(x, t):
+        count = jax.lax.cond(t > 1, lambda: jfrnn.search(x, 0.2, capacity=60).count, lambda: jfrnn.count(x, 0.1))
+        return x * 1.5, count
+
+    _, counts = jax.lax.scan(step, jnp.asarray(start), jnp.arange(4))
+    x = jnp.asarray(start)
+    for t in range(4):
+        np.testing.assert_array_equal(counts[t], jfrnn.count(x, 0.2 if t > 1 else 0.1))
+        x = x * 1.5
+
+
+# --- memory -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [20_000, 200_000])
+def test_scratch_stays_within_the_stated_bound(n):
+    x = jax.ShapeDtypeStruct((n, 3), jnp.float32)
+    for function in (lambda x: jfrnn.search(x, 0.1, capacity=64), lambda x: jfrnn.count(x, 0.1)):
+        memory = jax.jit(function).lower(x).compile().memory_analysis()
+        assert memory.temp_size_in_bytes <= 64e6 + 100 * n
+
+
+def test_memory_does_not_know_the_box():
+    programs = [
+        jax.jit(lambda x, r=r: jfrnn.search(x, r, capacity=8)).lower(jax.ShapeDtypeStruct((1000, 3), jnp.float32)).compile()
+        for r in (1e-9, 1e9)
+    ]
+    assert len({p.memory_analysis().temp_size_in_bytes for p in programs}) == 1
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+X = np.zeros((4, 3), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("error", "match", "arguments"),
+    [
+        (TypeError, r"positions must be a JAX or NumPy array.*got list", {"positions": [[0.0, 0.0]]}),
+        (TypeError, r"positions must be float32 or float64, got int64", {"positions": np.zeros((4, 3), np.int64)}),
+        (TypeError, r"positions must be float32 or float64, got float16", {"positions": np.zeros((4, 3), np.float16)}),
+        (ValueError, r"positions must have shape \[n, 2\] or \[n, 3\].*got shape \[3\]", {"positions": X[0]}),
+        (ValueError, r"got shape \[4, 1\]", {"positions": X[:, :1]}),
+        (ValueError, r"got shape \[1, 4, 3\]", {"positions": X[None]}),
+        (ValueError, r"cutoff must be positive and finite, got 0", {"cutoff": 0.0}),
+        (ValueError, r"cutoff must be positive and finite, got -1", {"cutoff": -1}),
+        (ValueError, r"cutoff must be positive and finite, got nan", {"cutoff": float("nan")}),
+        (ValueError, r"cutoff must be positive and finite, got inf", {"cutoff": float("inf")}),
+        (ValueError, r"cutoff=1e-40 is outside", {"cutoff": 1e-40}),
+        (ValueError, r"cutoff=3e\+38 is outside", {"cutoff": 3e38}),
+        (ValueError, r"cutoff must be one number, got an array of shape \[4\]", {"cutoff": np.ones(4)}),
+        (TypeError, r"cutoff must be a number, got str", {"cutoff": "1"}),
+        (TypeError, r"cutoff must be a number, got bool", {"cutoff": True}),
+        (ValueError, r"queries must match positions \(float32, 3 columns\), got float64", {"queries": X.astype(np.float64)}),
+        (ValueError, r"queries must match positions .* with 2 columns", {"queries": X[:, :2]}),
+        (ValueError, r"half=True .* cannot be used with queries", {"queries": X, "half": True}),
+        (ValueError, r"include_self=True .* cannot be used with queries", {"queries": X, "include_self": True}),
+        (TypeError, r"half must be True or False, known while tracing, got int 1", {"half": 1}),
+        (TypeError, r"include_self must be True or False", {"include_self": None}),
+        (TypeError, r"closed must be True or False", {"closed": "yes"}),
+        (TypeError, r"capacity must be a static int .* got float 8.0", {"capacity": 8.0}),
+        (ValueError, r"capacity must be at least 1, got 0", {"capacity": 0}),
+        (ValueError, r"slack must be finite and at least 1 .* got 0.5", {"slack": 0.5}),
+        (TypeError, r"slack must be a number", {"slack": "a lot"}),
+        (ValueError, r"backend must be one of 'auto', 'jax', 'brute', got 'cuda'", {"backend": "cuda"}),
+    ],
+)
+def test_input_errors(error, match, arguments):
+    arguments = {"positions": X, "cutoff": 1.0} | arguments
+    with pytest.raises(error, match=match):
+        jfrnn.search(arguments.pop("positions"), arguments.pop("cutoff"), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("error", "match", "function"),
+    [
+        (ValueError, "capacity must be given where positions are traced", lambda x: jfrnn.search(x, 1.0).count),
+        (TypeError, "cutoff must be a static number, got a traced value", lambda x: jfrnn.search(x, x[0, 0], capacity=4).count),
+        (
+            TypeError,
+            "capacity must be a static int .* got a traced value",
+            lambda x: jfrnn.search(x, 1.0, capacity=x.astype(int)[0, 0]),
+        ),
+        (
+            TypeError,
+            "half must be True or False, known while tracing, got a traced",
+            lambda x: jfrnn.count(x, 1.0, half=x[0, 0] > 0),
+        ),
+    ],
+)
+def test_errors_under_jit(error, match, function):
+    with pytest.raises(error, match=match):
+        jax.jit(function)(X)
+
+
+def test_float64_without_x64_is_refused():
+    with jax.enable_x64(False), pytest.raises(TypeError, match="64-bit mode is off and would round them to float32 in silence"):
+        jfrnn.search(X.astype(np.float64), 1.0)
+
+
+def test_float32_works_without_x64(dim):
+    points = random_points(200, dim, np.float32)
+    points[:50] = np.round(points[:50] * 16) / 16  # ties
+    with jax.enable_x64(False):
+        nbrs = jfrnn.search(points, 0.25, capacity=200)
+        checked.assert_exact(nbrs, points, 0.25)
