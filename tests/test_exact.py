@@ -1,0 +1,100 @@
+"""The pair decision alone: any finite floats, by brute force over few points, against the oracle."""
+
+import checked
+import hypothesis
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+import jfrnn
+from jfrnn._exact import _UNKNOWN, _integer_sign, _sum_sign, largest_cutoff, make_cutoff, smallest_cutoff
+
+POINTS = 12
+
+
+def floats(dtype):
+    width = np.dtype(dtype).itemsize * 8
+    return st.one_of(
+        st.floats(allow_nan=False, allow_infinity=False, width=width),
+        st.integers(-64, 64).map(float),
+        st.builds(lambda m, e: float(np.ldexp(dtype(m), e)), st.integers(-9, 9), st.integers(-120, 20)),
+    )
+
+
+def cutoffs(dtype):
+    width = np.dtype(dtype).itemsize * 8
+    low, high = smallest_cutoff(np.dtype(dtype)), largest_cutoff(np.dtype(dtype))
+    return st.one_of(st.floats(low, high, width=width), st.integers(1, 100).map(float))
+
+
+@hypothesis.settings(max_examples=150, deadline=None)
+@hypothesis.given(st.data())
+@pytest.mark.parametrize("backend", ["brute", "jax"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_any_floats(backend, dtype, data):
+    points = data.draw(hnp.arrays(dtype, (POINTS, 3), elements=floats(dtype)))
+    cutoff, closed = data.draw(cutoffs(dtype)), data.draw(st.booleans())
+    nbrs = jfrnn.search(points, cutoff, capacity=POINTS, closed=closed, backend=backend)
+    checked.assert_exact(nbrs, points, cutoff, closed=closed)
+
+
+@hypothesis.settings(max_examples=150, deadline=None)
+@hypothesis.given(st.data())
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_cutoff_is_a_distance_that_occurs(dtype, data):
+    """The cutoff is one pair's distance rounded to the dtype: that pair is within half an ulp of the cutoff."""
+    points = data.draw(hnp.arrays(dtype, (POINTS, 2), elements=floats(dtype)))
+    ulps = data.draw(st.integers(-2, 2))
+    with np.errstate(all="ignore"):
+        distance = np.hypot(*(points[1] - points[0]).astype(np.float64)).astype(dtype)
+    hypothesis.assume(2 * smallest_cutoff(np.dtype(dtype)) < distance < largest_cutoff(np.dtype(dtype)) / 2)
+    cutoff = float(distance + ulps * np.spacing(distance))
+    for closed in (False, True):
+        nbrs = jfrnn.search(points, cutoff, capacity=POINTS, closed=closed)
+        checked.assert_exact(nbrs, points, cutoff, closed=closed)
+
+
+def ulp_pairs(dtype, seed, count=256, scale=1.0, offset=0.0):
+    """Pairs in random directions whose distance is within a few ulp of `scale`."""
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    start = (offset + scale * rng.uniform(-1, 1, (count, 3))).astype(dtype)
+    return start, (start.astype(np.float64) + direction * scale).astype(dtype)
+
+
+@pytest.mark.parametrize("offset", [0.0, -3.0, 1e4])
+def test_every_step_agrees_with_fractions(dtype, offset):
+    a, b = ulp_pairs(dtype, seed=5, offset=offset)
+    cutoff = make_cutoff(1.0, np.dtype(dtype), closed=False)
+    axes = [[jnp.asarray(x) for x in side.T] for side in (a, b)]
+    exact = np.array(
+        [0 if reference.is_pair(p, q, 1.0, closed=True) != reference.is_pair(p, q, 1.0) else 1 - 2 * reference.is_pair(p, q, 1.0)
+         for p, q in zip(a, b, strict=True)]
+    )  # fmt: skip
+    assert {-1, 1} <= set(exact)
+    np.testing.assert_array_equal(jax.jit(_integer_sign)(*axes, cutoff), exact)
+    sign = jax.jit(_sum_sign)(*axes, cutoff)
+    assert np.mean(sign != _UNKNOWN) > 0.99
+    np.testing.assert_array_equal(np.where(sign == _UNKNOWN, exact, sign), exact)
+
+
+def test_exact_ties_are_known_without_integers(dtype):
+    a = jnp.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]], dtype)
+    b = a + jnp.array([1.0, 2.0, 2.0], dtype)
+    sign = _sum_sign(list(a.T), list(b.T), make_cutoff(3.0, np.dtype(dtype), closed=False))
+    np.testing.assert_array_equal(sign, [0, 0])
+
+
+def test_pairs_are_symmetric(dtype):
+    """10 000 shuffled pairs near the cutoff: (i, j) is listed if and only if (j, i) is."""
+    a, b = ulp_pairs(dtype, seed=7, count=1000, scale=0.1)
+    points = np.concatenate([a, b])
+    i, j = jfrnn.search(points, 0.1).pairs()
+    forward = set(zip(i.tolist(), j.tolist(), strict=True))
+    assert len(forward) > 1000
+    assert forward == {(q, p) for p, q in forward}
