@@ -20,10 +20,10 @@ Seed = Annotated[int, typer.Option(min=0, help="Seed of random layouts.")]
 
 @contextmanager
 def _usage_errors() -> Iterator[None]:
-    """Turn a UsageError into a message and exit code 2."""
+    """Turn a UsageError, or a file that cannot be read or written, into a message and exit code 2."""
     try:
         yield
-    except UsageError as error:
+    except (UsageError, OSError) as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(2) from error
 

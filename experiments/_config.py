@@ -6,9 +6,10 @@ import tomllib
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, ValidationInfo, field_validator
+from pydantic_core import ErrorDetails
 
 from experiments import _layouts, methods
 from experiments._errors import UsageError
@@ -72,6 +73,13 @@ class Config(_Table):
             if name not in methods.names():
                 raise ValueError(f"unknown method {name!r}; allowed: {', '.join(methods.names())}")
         return names
+
+    @field_validator("max_repeats")
+    @classmethod
+    def _max_is_no_less(cls, most: int, info: ValidationInfo) -> int:
+        if most < (fewest := info.data.get("repeats", 1)):
+            raise ValueError(f"got {most}; it must not be less than repeats, {fewest}")
+        return most
 
     @property
     def hash(self) -> str:
@@ -145,7 +153,7 @@ def load(path: Path) -> Config:
         raise UsageError("\n".join(f"{path}: {_explain(item)}" for item in error.errors())) from error
 
 
-def _explain(item: Any) -> str:
+def _explain(item: ErrorDetails) -> str:
     """Say in one line which key is wrong, what came, and what is allowed."""
     location = item["loc"]
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location).lstrip(".")
@@ -155,5 +163,5 @@ def _explain(item: Any) -> str:
     if item["type"] == "missing":
         return f"{key}: missing; it must be given"
     if item["type"] == "value_error":
-        return f"{key}: {item['ctx']['error']}"
+        return f"{key}: {item.get('ctx', {}).get('error')}"
     return f"{key}: got {item['input']!r}; {item['msg'][0].lower()}{item['msg'][1:]}"

@@ -1,19 +1,19 @@
 """Names of layouts, and scenes by name with errors for the command line."""
 
 import re
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from experiments._errors import UsageError
 
 if TYPE_CHECKING:
-    from jfrnn.cases import Scene
+    from jfrnn.cases import Scene  # pyright: ignore[reportMissingImports]
 
 NUMBERED = "clustersN"
 
 
 def names() -> list[str]:
     """Return what a layout may be called; `clustersN` stands for any number N of tiles per axis."""
-    from jfrnn import cases
+    from jfrnn import cases  # pyright: ignore[reportAttributeAccessIssue]
 
     return [*(name for name in cases.LAYOUTS if not name.startswith("clusters")), NUMBERED]
 
@@ -23,13 +23,13 @@ def is_layout(name: str) -> bool:
     return bool(re.fullmatch(r"clusters[1-9]\d*", name)) or (name != NUMBERED and name in names())
 
 
-def make(name: str, **options: Any) -> "Scene":
+def make(name: str, **options: float | str | None) -> "Scene":
     """Return a scene of `jfrnn.cases`.
 
     Raises:
         UsageError: There is no such layout, or it cannot be made with these options.
     """
-    from jfrnn import cases
+    from jfrnn import cases  # pyright: ignore[reportAttributeAccessIssue]
 
     if not is_layout(name):
         raise UsageError(f"unknown layout {name!r}; allowed: {', '.join(names())}")

@@ -6,14 +6,20 @@ import resource
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
+import psutil
 
 
 class PeakMemory:
-    """Peak resident memory over the moment of creation."""
+    """Peak resident memory since the moment of creation.
+
+    Attributes:
+        start: Resident memory then [bytes]; the peak of the process so far, where the system cannot forget it.
+        source: VmHWM, or ru_maxrss where the peak cannot be reset.
+    """
 
     def __init__(self) -> None:
         """Return freed memory to the system, forget the peak so far where the system allows it, and note the start."""
@@ -26,18 +32,36 @@ class PeakMemory:
             self.source = "VmHWM"
         except OSError:
             self.source = "ru_maxrss"
-        self.start = self._read()
+        self.start = self.peak()
 
     def peak(self) -> int:
-        """Return the peak over the start [bytes]."""
-        return self._read() - self.start
-
-    def _read(self) -> int:
+        """Return the peak [bytes]."""
         if self.source == "VmHWM":
             lines = Path("/proc/self/status").read_text().splitlines()
             return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
         unit = 1 if sys.platform == "darwin" else 1024
         return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+class Bystanders:
+    """What other processes of the machine do since the moment of creation: a search on all cores is slower beside them."""
+
+    SHORTEST = 0.2  # [s]; the system counts in ticks of 0.01 s for each core
+
+    def __init__(self) -> None:
+        """Note the start."""
+        self._start = self._read()
+
+    def cores(self) -> float | None:
+        """Return how many cores others kept busy, on average; None after too short a time to tell."""
+        wall, busy, own = (now - then for now, then in zip(self._read(), self._start, strict=True))
+        return max(busy - own, 0.0) / wall if wall >= self.SHORTEST else None
+
+    def _read(self) -> tuple[float, float, float]:
+        """Return wall time, busy time of all cores and time of this process [s]."""
+        times = psutil.cpu_times()
+        kinds = ("user", "nice", "system", "irq", "softirq", "steal")
+        return perf_counter(), sum(getattr(times, kind, 0.0) for kind in kinds), process_time()
 
 
 def repeat(search: Callable[[], Any], repeats: int, min_seconds: float, max_repeats: int) -> tuple[Any, list[float]]:

@@ -1,30 +1,30 @@
 """The exact answer at scale: every unordered pair with |x_j - x_i| < cutoff, as exact arithmetic on the given floats decides it.
 
-Independent of the library. A kd-tree gives candidates a little beyond the cutoff; float64 decides those that are clearly inside or outside;
-integers of any length decide the rest.
+Independent of the library. A kd-tree gives candidates a little beyond the cutoff; float64 decides those that are clearly inside or
+outside; integers of any length decide the rest.
 """
 
 import hashlib
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+from numpy.typing import DTypeLike
+from scipy.spatial import KDTree
 
 # The tree's own float64 rounding is below 1e-12 of the cutoff; a millionth more costs nothing and cannot lose a pair.
 CANDIDATE_MARGIN = 1e-6
-# With u = 2^-53: a float64 difference of two given floats is off by u, its square by 3 u, the sum of three squares by 5 u, the squared cutoff
-# by u, each relative. Near the cutoff the comparison is therefore off by less than 6 u (1 + 6 u) r²; 16 u r² is safe.
+# With u = 2^-53: a float64 difference of two given floats is off by u, its square by 3 u, the sum of three squares by 5 u, the
+# squared cutoff by u, each relative. Near the cutoff the comparison is off by less than 6 u (1 + 6 u) r²; 16 u r² is safe.
 DECIDED_MARGIN = 16 * 2.0**-53
 # Squares of lengths in this range neither overflow nor lose bits to denormals.
 SQUARABLE = (1e-140, 1e140)
 CHUNK = 1 << 20
 
 
-def round_cutoff(cutoff: float, dtype: Any) -> float:
+def round_cutoff(cutoff: float, dtype: DTypeLike) -> float:
     """Round the cutoff once to the dtype of the positions."""
-    return float(np.dtype(dtype).type(cutoff))
+    return float(np.asarray(cutoff, dtype))
 
 
 def find_pairs(positions: np.ndarray, cutoff: float) -> np.ndarray:
@@ -44,7 +44,7 @@ def find_pairs(positions: np.ndarray, cutoff: float) -> np.ndarray:
     if not SQUARABLE[0] < cutoff < SQUARABLE[1]:
         raise ValueError(f"cutoff {cutoff!r} is outside {SQUARABLE}: its square is not safe in float64")
     points = positions.astype(np.float64)
-    candidates = cKDTree(points).query_pairs(cutoff * (1 + CANDIDATE_MARGIN), output_type="ndarray")
+    candidates = KDTree(points).query_pairs(cutoff * (1 + CANDIDATE_MARGIN), output_type="ndarray")
     keys = [_decide(points, part, cutoff) for part in np.split(candidates, range(CHUNK, len(candidates), CHUNK))]
     return np.sort(np.concatenate(keys))
 

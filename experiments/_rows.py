@@ -1,7 +1,10 @@
 """Rows: what one measurement says, and the file that they are kept in, one JSON line each."""
 
+import fcntl
 import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -31,18 +34,21 @@ class Row:
         fill: Fill that the scene has.
         cutoff: Cutoff [m], rounded to the dtype.
         points: Number of particles n.
-        compile_s: Time of all that is done once: compilation, and the capacity where one is needed [s].
+        allocate_s: Time to find the capacity of the list, for methods that need one before they search [s].
+        compile_s: Time of what else is done once: compilation [s].
         first_s: First run after that [s].
         median_s: Median of the repeats, from raw positions to the result [s].
         p10_s: 10th percentile of the repeats [s].
         p90_s: 90th percentile of the repeats [s].
         repeats: Number of timed runs after the first.
         seconds: All their times [s].
-        peak_bytes: Peak resident memory over the start (imports done, positions made), compilation included.
-        compile_peak_bytes: The same, up to the end of compilation.
+        others_cores: Cores that other processes of the machine kept busy meanwhile, on average; None below 0.2 s.
+        peak_bytes: Peak resident memory over the start (imports done, positions made), allocation and compilation included.
+        search_bytes: The same over what was resident after compilation: what the search itself takes, at least list_bytes;
+            unknown where the peak cannot be reset.
         list_bytes: Size of the result.
-        scratch_bytes: peak_bytes - list_bytes, not below 0.
-        memory_source: VmHWM (reset at the start), or ru_maxrss (cannot be reset: a peak during the imports hides a smaller one).
+        scratch_bytes: search_bytes - list_bytes.
+        memory_source: VmHWM, reset at both starts; or ru_maxrss, which cannot be: earlier peaks hide later ones.
         pairs: Unordered pairs that the method found.
         directed_pairs: Entries (i, j) of a full list.
         exact_pairs: Unordered pairs of the oracle.
@@ -73,6 +79,7 @@ class Row:
     fill: float | None = None
     cutoff: float | None = None
     points: int | None = None
+    allocate_s: float | None = None
     compile_s: float | None = None
     first_s: float | None = None
     median_s: float | None = None
@@ -80,8 +87,9 @@ class Row:
     p90_s: float | None = None
     repeats: int | None = None
     seconds: list[float] = field(default_factory=list)
+    others_cores: float | None = None
     peak_bytes: int | None = None
-    compile_peak_bytes: int | None = None
+    search_bytes: int | None = None
     list_bytes: int | None = None
     scratch_bytes: int | None = None
     memory_source: str | None = None
@@ -106,6 +114,11 @@ class Row:
         return name_scene(self.layout, self.fill_asked)
 
     @property
+    def scene_key(self) -> tuple[Any, ...]:
+        """What decides the positions and the cutoff."""
+        return (self.layout, self.fill_asked, self.spacing, self.cutoff_ratio, self.dtype, self.dim, self.seed)
+
+    @property
     def errors(self) -> int | None:
         """Missing and extra pairs together."""
         return None if self.missing is None or self.extra is None else self.missing + self.extra
@@ -122,6 +135,23 @@ class RowFile:
     def __init__(self, folder: Path) -> None:
         """Name the file; nothing is read or written yet."""
         self.path = folder / "rows.jsonl"
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other runners off the folder; the system lets go of it when this process ends, however it does.
+
+        Raises:
+            UsageError: Another process runs this sweep now.
+        """
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with (self.path.parent / "lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UsageError(
+                    f"{self.path.parent}: another process fills this folder now; wait for it or take another"
+                ) from None
+            yield
 
     def repair(self) -> None:
         """End the file with a whole line: complete its last line with a line feed, or cut it off where it is no JSON."""
@@ -140,7 +170,6 @@ class RowFile:
 
     def append(self, row: Row) -> None:
         """Write a row and wait until it is on the disk."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
         self._write(json.dumps(asdict(row), allow_nan=False).encode() + b"\n")
 
     def _write(self, data: bytes) -> None:
@@ -164,7 +193,7 @@ class RowFile:
             try:
                 values = json.loads(line)
                 rows[values["key"]] = Row(**{name: value for name, value in values.items() if name in known})
-            except (ValueError, TypeError, KeyError) as error:
+            except (ValueError, TypeError, KeyError, AttributeError) as error:
                 if number < len(lines):  # what follows the last line feed is empty, or what a kill left
                     raise UsageError(f"{self.path}: line {number} is no row ({error}): repair or remove that line") from error
         return list(rows.values())

@@ -34,7 +34,14 @@ def run(config: Config, name: str, folder: Path, retry_failed: bool = False) -> 
         retry_failed: Whether rows that are missing, failed or ran out of time are measured again.
     """
     file = RowFile(folder)
-    file.repair()
+    with file.locked():
+        file.repair()
+        return _run(config, name, file, retry_failed)
+
+
+def _run(config: Config, name: str, file: RowFile, retry_failed: bool) -> list[Row]:
+    """Do the work of `run` with the file of rows at hand."""
+    folder = file.path.parent
     specs = list(config.specs())
     done = {row.key for row in file.read() if not (retry_failed and row.status in RETRIED)}
     pending = [spec for spec in specs if spec.key not in done]
@@ -50,7 +57,7 @@ def run(config: Config, name: str, folder: Path, retry_failed: bool = False) -> 
             progress.update(bar, description=f"{spec.scene_name} · {spec.method}")
             row = replace(measure(spec, folder), **about)
             file.append(row)
-            progress.console.print(describe(row), highlight=False, soft_wrap=True)
+            progress.console.print(describe(row), highlight=False, markup=False, soft_wrap=True)
             progress.advance(bar)
     keys = {spec.key for spec in specs}
     return [row for row in file.read() if row.key in keys]
@@ -115,5 +122,5 @@ def describe(row: Row) -> str:
     start = f"{row.scene_name:<17} {row.method:<20} {row.status:<8}"
     if row.status != "ok":
         return f"{start}{row.reason}"
-    memory = (row.peak_bytes or 0) / 1e6
-    return f"{start}{row.median_s:9.4f} s {memory:8.1f} MB {row.pairs:>10} pairs, {row.missing} missing, {row.extra} extra"
+    memory = (row.peak_bytes if row.search_bytes is None else row.search_bytes) or 0
+    return f"{start}{row.median_s:9.4f} s {memory / 1e6:8.1f} MB {row.pairs:>10} pairs, {row.missing} missing, {row.extra} extra"

@@ -1,10 +1,10 @@
 """Cell-linked lists on the CPU: the classic serial search, kept as the yardstick of the sweep.
 
-The box is cut into cells at least one cutoff wide. `first[cell]` names one particle of a cell, `next[particle]` the following one, -1 ends
-the chain. A particle is compared with the rest of its own chain and with the chains of the 13 cells that lie forward of its own (half
-stencil), so that every unordered pair is met once. Memory follows the box: one int32 per cell, empty or not.
+The box is cut into cells at least one cutoff wide. `first[cell]` names one particle of a cell, `next[particle]` the following one,
+-1 ends the chain. A particle is compared with the rest of its own chain and with the chains of the 13 cells that lie forward of its
+own (half stencil), so that every unordered pair is met once. Memory follows the box: one int32 per cell, empty or not.
 
-Source: J. Peifle (2019), Implementation of a Nearest-Neighbor Search for Particle Simulation in Sparse Computational Domains, chapter 2.
+Source: J. Peifle (2019), Implementation of a Nearest-Neighbor Search for Particle Simulation in Sparse Computational Domains.
 """
 
 from typing import Any
@@ -46,7 +46,8 @@ def link_particles_kernel(
 ):
     """Put each particle at the head of its cell's chain.
 
-    Launch: dim = n particles. `first_out` must hold -1 before; it is exchanged atomically, so the order within a chain is the launch order.
+    Launch: dim = n particles. `first_out` must hold -1 before; it is exchanged atomically, so that chains run backwards through the
+    launch order.
     """
     i = wp.tid()
     cell = cell_of(positions[i], origin, inverse_edge, shape)
@@ -68,8 +69,8 @@ def append_pairs_kernel(
 ):
     """Append each unordered pair closer than the cutoff once; with capacity 0, only count them.
 
-    Launch: dim = n particles. `count_out[0]` is the atomic append counter and goes on counting past the capacity. A CPU launch runs the
-    particles one after the other, so the order of `pairs_out` is the same in every run.
+    Launch: dim = n particles. `count_out[0]` is the atomic append counter and goes on counting past the capacity. A CPU launch runs
+    the particles one after the other, so the order of `pairs_out` is the same in every run.
     """
     i = wp.tid()
     position = positions[i]
@@ -78,7 +79,7 @@ def append_pairs_kernel(
         x = cell[0] + s % 3 - 1
         y = cell[1] + (s / 3) % 3 - 1
         z = cell[2] + s / 9 - 1
-        j = int(-1)
+        j = int(-1)  # noqa: RUF046, UP018 (a plain literal would be a constant, which Warp does not let the loop change)
         if s == OWN_CELL:
             j = next[i]
         elif x >= 0 and x < shape[0] and y >= 0 and y < shape[1] and z < shape[2]:
@@ -105,8 +106,8 @@ def size_grid(lower: list[float], upper: list[float], cutoff: float, epsilon: fl
         ValueError: The box needs more than `MAX_CELLS` cells.
     """
     extent = [high - low for low, high in zip(lower, upper, strict=True)]
-    # Subtraction and scaling each round once, so a cell coordinate c is off by at most 2 eps c. Two particles one cutoff apart stay within
-    # neighboring cells if the edge exceeds the cutoff by the factor 1 + 4 eps c.
+    # Subtraction, the inverse edge and scaling each round once, so a cell coordinate c is off by less than 2 eps c. Two particles
+    # one cutoff apart stay within neighboring cells if the edge exceeds the cutoff by the factor 1 + 4 eps c.
     edge = cutoff * (1.0 + 4.0 * epsilon * (max(extent) / cutoff + 1.0))
     shape = [int(length / edge) + 1 for length in extent]
     cells = shape[0] * shape[1] * shape[2]
@@ -136,8 +137,7 @@ def search_pairs(positions: wp.array, lower: list[float], upper: list[float], cu
     vector = positions.dtype
     scalar = vector._wp_scalar_type_
     edge, shape = size_grid(lower, upper, cutoff, 2.0**-23 if scalar is wp.float32 else 2.0**-52)
-    grid = [vector(*lower), scalar(1.0 / edge), wp.vec3i(*shape)]
-    size = positions.shape[0]
+    grid, size = [vector(*lower), scalar(1.0 / edge), wp.vec3i(*shape)], positions.shape[0]
     first = wp.full(shape[0] * shape[1] * shape[2], -1, dtype=wp.int32, device="cpu")
     following = wp.empty(size, dtype=wp.int32, device="cpu")
     wp.launch(link_particles_kernel, dim=size, inputs=[positions, *grid], outputs=[first, following], device="cpu")

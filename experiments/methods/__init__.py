@@ -2,14 +2,15 @@
 
 An adapter is a module with
 
-- `prepare(positions, cutoff)`: do what is needed once (compile, say) and return the search, a callable without arguments whose every call
-  goes from the raw positions to the finished result, waits for it, and builds whatever structure it needs anew;
+- `prepare(positions, cutoff)`: do what is needed once (compile, say) and return the search, a callable without arguments whose
+  every call goes from the raw positions to the finished result, waits for it, and builds whatever structure it needs anew;
 - `read(result)`: return what the search found, a `Found`; not timed;
+- optionally `allocate(positions, cutoff)`: return the capacity that the scene needs; `prepare` then takes it as third argument;
 - optionally `MAX_POINTS`: larger scenes are skipped, with a row that says so;
 - optionally `PACKAGES`: names of distributions whose versions the row shall hold besides the usual ones.
 
-Positions come as NumPy array, shape [n, d], float32 or float64; the cutoff is a float, already rounded to that dtype. An adapter that
-cannot be imported makes a row with status `missing`, one that raises makes a row with status `failed`.
+Positions come as NumPy array, shape [n, d], float32 or float64; the cutoff is a float, already rounded to that dtype. An adapter
+that cannot be imported makes a row with status `missing`, one that raises makes a row with status `failed`.
 """
 
 from collections.abc import Callable
@@ -43,11 +44,11 @@ class Found:
 class Adapter(Protocol):
     """The shape of an adapter module."""
 
-    def prepare(self, positions: np.ndarray, cutoff: float) -> Callable[[], Any]:
+    def prepare(self, positions: np.ndarray, cutoff: float, *capacity: int) -> Callable[[], Any]:
         """Return the search over these positions."""
         ...
 
-    def read(self, result: Any) -> Found:
+    def read(self, result: object) -> Found:
         """Return what a search found."""
         ...
 

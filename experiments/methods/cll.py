@@ -1,12 +1,12 @@
-"""Cell-linked lists as the thesis used them: half stencil, list of unordered pairs, one thread, working precision, distance < cutoff."""
+"""Cell-linked lists as the thesis used them: half stencil, list of unordered pairs, one thread, distance < cutoff as rounded."""
 
 from collections.abc import Callable
 
 import numpy as np
 import warp as wp
+from jfrnn.kernels import cll  # pyright: ignore[reportMissingImports]
 
 from experiments.methods import Found
-from jfrnn.kernels import cll
 
 
 def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], wp.array]:

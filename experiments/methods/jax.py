@@ -2,8 +2,9 @@
 
 from functools import partial
 
-from experiments.methods._padded import prepare_backend, read
+from experiments.methods._padded import allocate_backend, prepare_backend, read
 
-__all__ = ["prepare", "read"]
+__all__ = ["allocate", "prepare", "read"]
 
+allocate = partial(allocate_backend, backend="jax")
 prepare = partial(prepare_backend, backend="jax")

@@ -3,14 +3,14 @@
 from collections.abc import Callable
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from experiments.methods import Found
 
 
 def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], np.ndarray]:
     """Return a search that builds the tree and lists the pairs."""
-    return lambda: cKDTree(positions).query_pairs(cutoff, output_type="ndarray")
+    return lambda: KDTree(positions).query_pairs(cutoff, output_type="ndarray")
 
 
 def read(result: np.ndarray) -> Found:

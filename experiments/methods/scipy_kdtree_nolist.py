@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from experiments.methods import Found
 
@@ -12,7 +12,7 @@ def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], np.ndarray]:
     """Return a search that builds the tree and counts the points in each ball."""
 
     def search() -> np.ndarray:
-        return cKDTree(positions).query_ball_point(positions, cutoff, return_length=True, workers=1)
+        return KDTree(positions).query_ball_point(positions, cutoff, return_length=True, workers=1)
 
     return search
 

@@ -1,0 +1,69 @@
+"""Points of a layout as a file: .csv for spreadsheets, .vtp and .vtk for ParaView."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from experiments._errors import UsageError
+
+if TYPE_CHECKING:
+    from jfrnn.cases import Scene  # pyright: ignore[reportMissingImports]
+
+ENDINGS = (".csv", ".vtp", ".vtk")
+NEIGHBORS = "neighbors"
+DIGITS = {np.dtype(np.float32): 9, np.dtype(np.float64): 17}  # enough to read the same float back
+
+
+def check(path: Path) -> None:
+    """Refuse a file whose ending names no format.
+
+    Raises:
+        UsageError: It is none of `ENDINGS`.
+    """
+    if path.suffix not in ENDINGS:
+        raise UsageError(f"--out {path}: unknown ending {path.suffix!r}; allowed: {', '.join(ENDINGS)}")
+
+
+def write(scene: "Scene", path: Path, counts: bool = False) -> Path:
+    """Write the points of a scene, and with `counts` the number of neighbors of each, exactly.
+
+    Coordinates are written such that they read back as the same floats. In .vtp and .vtk, 2D points get z = 0, each point is a
+    vertex cell, and spacing and cutoff [m] are field data.
+
+    Args:
+        scene: A scene of `jfrnn.cases`.
+        path: The file; its ending names the format.
+        counts: Whether to store the counts.
+
+    Returns:
+        The path.
+    """
+    neighbors = _count(scene) if counts else None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    (_write_csv if path.suffix == ".csv" else _write_vtk)(scene, path, neighbors)
+    return path
+
+
+def _count(scene: "Scene") -> np.ndarray:
+    from experiments import _oracle
+
+    return _oracle.count_neighbors(_oracle.find_pairs(scene.positions, scene.cutoff), scene.n)
+
+
+def _write_csv(scene: "Scene", path: Path, neighbors: np.ndarray | None) -> None:
+    columns, formats = [scene.positions], [f"%.{DIGITS[scene.positions.dtype]}g"] * scene.dim
+    names = list("xyz"[: scene.dim])
+    if neighbors is not None:
+        columns, formats, names = [*columns, neighbors[:, None]], [*formats, "%d"], [*names, NEIGHBORS]
+    np.savetxt(path, np.hstack(columns), fmt=formats, delimiter=",", header=",".join(names), comments="")
+
+
+def _write_vtk(scene: "Scene", path: Path, neighbors: np.ndarray | None) -> None:
+    import pyvista
+
+    cloud = pyvista.PolyData(np.pad(scene.positions, ((0, 0), (0, 3 - scene.dim))))
+    cloud.field_data["spacing"], cloud.field_data["cutoff"] = [scene.spacing], [scene.cutoff]
+    if neighbors is not None:
+        cloud.point_data[NEIGHBORS] = neighbors
+    cloud.save(path)

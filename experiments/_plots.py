@@ -1,0 +1,215 @@
+"""The pictures of a report, drawn from rows alone: filled marks are ours, hollow ones the thesis's."""
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from statistics import geometric_mean
+
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
+
+from experiments import _table, _thesis
+from experiments._rows import Row
+
+# Colors of M. Okabe and K. Ito, distinct to color-blind eyes too; other methods take those that are left.
+COLORS = {"jax": "#0072B2", "cll": "#D55E00", "scipy-kdtree": "#009E73", "scipy-kdtree-nolist": "#56B4E9", "brute": "#999999"}
+OTHER_COLORS = ("#CC79A7", "#E69F00", "#000000", "#F0E442", "#7F3C8D", "#6B4423")
+MARKERS = {"jax": "o", "cll": "s", "scipy-kdtree": "^", "scipy-kdtree-nolist": "v", "brute": "D"}
+PLAIN = FuncFormatter(lambda number, _: _table.count(int(number)) if number >= 1000 else f"{number:g}")
+Value = Callable[[Row], float | None]
+ThesisValue = Callable[[_thesis.Figures], float]
+
+SECONDS = "time of a search [s], median; bars: 10 % to 90 %"
+MEGABYTES = "peak memory of a search over its start [MB]"
+
+
+def draw_all(rows: list[Row], folder: Path, origin: str) -> list[Path]:
+    """Draw every picture into the folder and return their paths; none where no row has figures.
+
+    Args:
+        rows: Rows of a sweep.
+        folder: Where the pictures go.
+        origin: Machine, versions and date, written below each picture.
+    """
+    good = _table.in_order([row for row in rows if row.status == "ok"])
+    if not good:
+        return []
+
+    def seconds(row: Row) -> float | None:
+        return row.median_s
+
+    def memory(row: Row) -> float | None:
+        return _table.megabytes(row.search_bytes or row.peak_bytes)
+
+    def thesis_seconds(figures: _thesis.Figures) -> float:
+        return figures.seconds
+
+    def thesis_memory(figures: _thesis.Figures) -> float:
+        return figures.megabytes
+
+    pictures = {
+        "runtime_by_layout": _by_layout(good, seconds, thesis_seconds, SECONDS),
+        "memory_by_layout": _by_layout(good, memory, thesis_memory, MEGABYTES),
+        "runtime_by_fill": _by_fill(good, seconds, thesis_seconds, SECONDS.split(";")[0]),
+        "memory_by_fill": _by_fill(good, memory, thesis_memory, MEGABYTES),
+        "speed_against_error": _speed_against_error(good),
+    }
+    paths = []
+    for name, figure in pictures.items():
+        figure.text(0.01, 0.008, origin, fontsize=7, color="0.45", wrap=True)
+        paths.append(folder / f"{name}.png")
+        figure.savefig(paths[-1], dpi=150)
+    return paths
+
+
+def _methods(rows: Iterable[Row]) -> list[str]:
+    """Return the methods of the rows, known ones first."""
+    present = {row.method for row in rows}
+    return [*(name for name in COLORS if name in present), *sorted(present - set(COLORS))]
+
+
+def _color(method: str, methods: list[str]) -> str:
+    others = [name for name in methods if name not in COLORS]
+    return COLORS.get(method) or OTHER_COLORS[others.index(method) % len(OTHER_COLORS)]
+
+
+def _marker(method: str) -> str:
+    return MARKERS.get(method, "P")
+
+
+def _title(label: str) -> str:
+    """Return the label of an axis without what stands behind its unit, as a title."""
+    return f"{label[0].upper()}{label[1:].split(' [')[0]}"
+
+
+def _figure(width: float, height: float, title: str) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(width, height), layout="constrained")
+    figure.get_layout_engine().set(rect=(0, 0.035, 1, 0.965))  # type: ignore[union-attr]
+    axes = figure.add_subplot()
+    axes.set_title(title, loc="left", fontsize=12, fontweight="bold")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(True, which="major", color="0.9", linewidth=0.8)
+    axes.set_axisbelow(True)
+    return figure, axes
+
+
+def _label_logarithmic(axis: Axis) -> None:
+    """Write plain numbers at the powers of ten, and at 2 and 5 times these where the axis is short."""
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,)))
+    axis.set_major_formatter(PLAIN)
+
+
+def _legend(axes: Axes, methods: list[str], thesis: Iterable[tuple[str, str]], *, lines: bool = False) -> None:
+    """Name our methods and the thesis's beside the axes; `thesis` holds pairs of our method and its counterpart."""
+    solid, dashed = ("-", "--") if lines else ("none", "none")
+    handles = [Line2D([], [], color=_color(name, methods), marker=_marker(name), linestyle=solid, label=name) for name in methods]
+    for ours, theirs in thesis:
+        handle = Line2D([], [], color=COLORS[ours], marker=_marker(ours), linestyle=dashed, label=f"thesis: {theirs}")
+        handle.set_markerfacecolor("none")
+        handles.append(handle)
+    axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9)
+
+
+def _theirs(rows: list[Row], value: ThesisValue) -> dict[tuple[str, str], list[tuple[Row, float]]]:
+    """Return the thesis's values on the scenes of these rows, by our method and its counterpart."""
+    scenes = {row.scene_key: row for row in rows}
+    found = defaultdict(list)
+    for ours, theirs in _thesis.COUNTERPARTS.items():
+        for row in scenes.values():
+            if (figures := _thesis.figures(row, theirs)) is not None:
+                found[ours, theirs].append((row, value(figures)))
+    return dict(found)
+
+
+def _by_layout(rows: list[Row], value: Value, thesis_value: ThesisValue, label: str) -> Figure:
+    """Draw a mark per row: scenes downwards, values to the right on a log axis."""
+    names, methods, theirs = _table.name_scenes(rows), _methods(rows), _theirs(rows, thesis_value)
+    places = {key: number for number, key in enumerate(dict.fromkeys(row.scene_key for row in rows))}
+    points = {row.scene_key: row.points or 0 for row in rows}
+    figure, axes = _figure(10.5, 1.8 + 0.52 * len(places), f"{_title(label)}, by layout")
+    for number in range(0, len(places), 2):
+        axes.axhspan(number - 0.5, number + 0.5, color="0.97", zorder=0)
+    offsets = {name: 0.62 * ((number + 0.5) / len(methods) - 0.5) for number, name in enumerate(methods)}
+    for row in rows:
+        if not (middle := value(row)):
+            continue
+        y, color = places[row.scene_key] + offsets[row.method], _color(row.method, methods)
+        if value(row) == row.median_s and row.p10_s and row.p90_s:
+            axes.plot([row.p10_s, row.p90_s], [y, y], color=color, linewidth=1.5)
+        axes.plot(middle, y, color=color, marker=_marker(row.method), markersize=6, linestyle="none")
+    for (ours, _), values in theirs.items():
+        y = [places[row.scene_key] + offsets.get(ours, 0.0) + 0.31 / len(methods) for row, _ in values]  # beside ours, not upon it
+        x = [number for _, number in values]
+        axes.plot(x, y, color=COLORS[ours], marker=_marker(ours), markersize=6, markerfacecolor="none", linestyle="none")
+    labels = [f"{names[key]}\n{_table.count(points[key])} points" for key in places]
+    axes.set_yticks(list(places.values()), labels, fontsize=9)
+    axes.set(xscale="log", ylim=(len(places) - 0.5, -0.5), xlabel=label)
+    _label_logarithmic(axes.xaxis)
+    axes.yaxis.grid(False)
+    _legend(axes, methods, theirs)
+    return figure
+
+
+def _by_fill(rows: list[Row], value: Value, thesis_value: ThesisValue, label: str) -> Figure:
+    """Draw the geometric mean of the layouts that are asked to fill the same, and a bar from the least to the most of them."""
+    methods, theirs = _methods(rows), _theirs(rows, thesis_value)
+    figure, axes = _figure(10.5, 6.0, f"{_title(label)}, by fill (mean and range of the layouts)")
+    shifts = {name: 1.018 ** (number - (len(methods) - 1) / 2) for number, name in enumerate(methods)}
+    for method in methods:
+        mine = [(row, number) for row in rows if row.method == method and (number := value(row))]
+        _draw_over_fill(axes, mine, shifts[method], color=_color(method, methods), marker=_marker(method), linestyle="-")
+    for (ours, _), values in theirs.items():
+        style = {"color": COLORS[ours], "marker": _marker(ours), "markerfacecolor": "white", "linestyle": "--"}
+        _draw_over_fill(axes, values, shifts.get(ours, 1.0), **style)
+    ticks = [number * 10.0**power for power in range(-6, 3) for number in (1, 2, 5) if number * 10**power <= 100]
+    axes.set(xscale="log", yscale="log", xlabel="fill: points / points of the full domain [%]", ylabel=label)
+    axes.xaxis.set_major_locator(FixedLocator(ticks))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(PLAIN)
+    _label_logarithmic(axes.yaxis)
+    fills = [100 * row.fill for row in rows if row.fill]
+    axes.set_xlim(min(fills) / 1.25, max(fills) * 1.25)
+    _legend(axes, methods, theirs, lines=True)
+    return figure
+
+
+def _draw_over_fill(axes: Axes, values: list[tuple[Row, float]], shift: float, **style: str) -> None:
+    """Draw the values of one method; the shift keeps marks of methods apart."""
+    groups = defaultdict(list)
+    for row, number in values:
+        if row.fill:
+            groups[row.fill_asked].append((100 * row.fill, number))
+    means = sorted((geometric_mean(fills), numbers) for fills, numbers in (zip(*group, strict=True) for group in groups.values()))
+    x, y = [shift * fill for fill, _ in means], [geometric_mean(numbers) for _, numbers in means]
+    axes.vlines(
+        x, [min(numbers) for _, numbers in means], [max(numbers) for _, numbers in means], color=style["color"], linewidth=1.5
+    )
+    axes.plot(x, y, markersize=6, linewidth=1.2, **style)  # pyright: ignore[reportArgumentType]
+
+
+def _speed_against_error(rows: list[Row]) -> Figure:
+    """Draw time over missing and extra pairs: exact methods stand on the left edge, fast ones low."""
+    methods = _methods(rows)
+    figure, axes = _figure(10.5, 6.0, "Speed against error: a mark per scene, larger for more points")
+    for row in rows:
+        if row.errors is None or not row.median_s or not row.points:
+            continue
+        size = 15 + 9 * math.log2(max(row.points / 1000, 1))
+        color = _color(row.method, methods)
+        axes.scatter(
+            row.errors, row.median_s, s=size, color=color, marker=_marker(row.method), alpha=0.8, edgecolor="white", linewidths=0.5
+        )
+    axes.set_xscale("symlog", linthresh=1)
+    most = max((row.errors or 0 for row in rows), default=0)
+    axes.set(yscale="log", xlim=(-0.5, max(2.0 * most, 10)), xlabel="missing + extra pairs, against the exact answer")
+    axes.set_ylabel(SECONDS.split(";")[0])
+    axes.axvline(0, color="0.6", linewidth=0.8, zorder=0.5)
+    axes.xaxis.set_major_formatter(PLAIN)
+    _label_logarithmic(axes.yaxis)
+    _legend(axes, methods, [])
+    return figure

@@ -1,0 +1,171 @@
+"""The report of a sweep: reads its rows and nothing else; prints a table, writes report.md, table.csv and pictures."""
+
+import csv
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from experiments import _table
+from experiments._errors import UsageError
+from experiments._rows import Row, RowFile
+
+TITLES = ("scene", "points", "method", "s", "/ cll", "MB", "/ cll", "missing", "extra", "thesis", "s", "/ CLL", "MB", "/ CLL")
+TEXT_COLUMNS = ("scene", "method", "thesis")
+ABSENT = "·"
+NOTEWORTHY_CORES = 0.25  # what other processes take beyond it is said: it slows down the methods that use all cores
+
+NOTES = """\
+- **s**: median time of a search, from raw positions to the finished result, without compilation.
+- **MB**: peak resident memory of the process during the searches, over what was resident after compilation; 10^6 bytes.
+- **/ cll**: divided by the row `cll` of the same scene.
+- **missing**, **extra**: unordered pairs against the exact answer on the given floats, distance < cutoff. Of a method without pair
+  list (`~`), only the surplus and the deficit of each particle can be seen.
+- **thesis**: Table 6.1 of J. Peifle, *Implementation of a Nearest-Neighbor Search for Particle Simulation in Sparse Computational
+  Domains*, KIT, February 2019: the method closest to ours, its total time, the largest resident set of its process, and both
+  divided by its own CLL. Its machine was another, so only ratios compare.
+- `jax` and `brute` use all cores and list both directions of each pair; the others use one thread, and list each pair once.
+- `*`: other processes kept more than a quarter of a core busy meanwhile (`others_cores` in table.csv). Methods on all cores then
+  look slower than they are.
+- table.csv holds all times, compilation included; rows.jsonl all that was measured.
+"""
+
+
+def report(folder: Path) -> None:
+    """Print the table of a sweep and the paths of its pictures; write report.md, table.csv and the pictures into the folder.
+
+    Raises:
+        UsageError: The folder holds no rows.
+    """
+    rows = RowFile(folder).read()
+    if not rows:
+        raise UsageError(f"{folder}: no rows; fill it with `python -m experiments run CONFIG.toml --out {folder}`")
+    from experiments import _plots
+
+    lines = _table.lines(rows)
+    pictures = _plots.draw_all(rows, folder, describe_origin(rows))
+    write_csv(lines, folder / "table.csv")
+    (folder / "report.md").write_text(markdown(rows, lines, pictures), encoding="utf-8")
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console.width = 200
+    console.print(rich_table(lines))
+    console.print(describe_origin(rows), soft_wrap=True)
+    for path in (folder / "report.md", folder / "table.csv", *pictures):
+        console.print(str(path), soft_wrap=True)
+
+
+def describe_origin(rows: Iterable[Row]) -> str:
+    """Say on what, with what, beside what and when the rows were measured, from the rows alone."""
+    rows = list(rows)
+    machines = _distinct(_describe_machine(row.machine) for row in rows if row.machine)
+    packages = ("jax", "scipy", "warp-lang")
+    versions = _distinct(", ".join(f"{name} {row.versions[name]}" for name in packages if row.versions.get(name)) for row in rows)
+    commits = _distinct(f"commit {row.commit[:10]}{' with changes' if row.dirty else ''}" for row in rows if row.commit)
+    others = max((row.others_cores or 0.0 for row in rows), default=0.0)
+    beside = [f"others kept up to {others:.1f} cores busy"] if others > NOTEWORTHY_CORES else []
+    dates = sorted({row.time[:10] for row in rows if row.time})
+    when = " to ".join(dict.fromkeys((dates[0], dates[-1]))) if dates else ""
+    return " · ".join(" / ".join(part) for part in (machines, versions, commits, beside, [when]) if any(part))
+
+
+def _distinct(texts: Iterable[str]) -> list[str]:
+    return [text for text in dict.fromkeys(texts) if text]
+
+
+def _describe_machine(machine: dict[str, Any]) -> str:
+    memory = machine.get("memory_bytes")
+    size = f", {memory / 2**30:.0f} GiB" if memory else ""
+    return f"{machine.get('cpu')}, {machine.get('cores')} cores{size}"
+
+
+def cells(line: dict[str, Any]) -> list[str]:
+    """Return what the printed table shows of a line, a text per entry of `TITLES`."""
+    return [
+        *(line["scene"], _count(line["points"]), line["method"]),
+        *(
+            _busy(line) + _seconds(line["median_s"]),
+            _ratio(line["seconds_to_cll"]),
+            _megabytes(line["search_mb"]),
+            _ratio(line["mb_to_cll"]),
+        ),
+        *(_errors(line, "missing"), _errors(line, "extra"), line["thesis_method"] or ABSENT),
+        *(_seconds(line["thesis_s"], 2), _ratio(line["thesis_s_to_cll"])),
+        *(_megabytes(line["thesis_mb"]), _ratio(line["thesis_mb_to_cll"])),
+    ]
+
+
+def _count(value: int | None) -> str:
+    return ABSENT if value is None else _table.count(value)
+
+
+def _errors(line: dict[str, Any], name: str) -> str:
+    return ("~" if line["compared"] == "counts" else "") + _count(line[name])
+
+
+def _busy(line: dict[str, Any]) -> str:
+    return "*" if (line["others_cores"] or 0.0) > NOTEWORTHY_CORES else ""
+
+
+def _seconds(value: float | None, digits: int = 4) -> str:
+    return ABSENT if value is None else f"{value:.{digits}f}"
+
+
+def _megabytes(value: float | None) -> str:
+    return ABSENT if value is None else f"{value:.1f}"
+
+
+def _ratio(value: float | None) -> str:
+    if value is None:
+        return ABSENT
+    return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
+
+
+def rich_table(lines: list[dict[str, Any]]) -> Table:
+    """Return the printed table, a section per scene; what has no figures says why."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for title in TITLES:
+        table.add_column(title, justify="left" if title in TEXT_COLUMNS else "right", no_wrap=True)
+    previous = None
+    for line in lines:
+        if previous not in (None, line["scene"]):
+            table.add_section()
+        scene, *rest = cells(line)
+        if line["status"] != "ok":
+            rest[2] = line["status"]
+        style = None if line["status"] == "ok" else "dim"
+        texts = [Text(text, "yellow" if is_error else "") for text, is_error in zip(rest, _error_marks(line), strict=True)]
+        table.add_row("" if scene == previous else scene, *texts, style=style)
+        previous = scene
+    return table
+
+
+def _error_marks(line: dict[str, Any]) -> list[bool]:
+    """Return for each entry of `TITLES` but the first whether it tells of wrong pairs."""
+    marks = {6: bool(line["missing"]), 7: bool(line["extra"])}
+    return [marks.get(number, False) for number in range(len(TITLES) - 1)]
+
+
+def write_csv(lines: list[dict[str, Any]], path: Path) -> None:
+    """Write the lines with all their columns."""
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.DictWriter(stream, _table.COLUMNS)
+        writer.writeheader()
+        writer.writerows(lines)
+
+
+def markdown(rows: list[Row], lines: list[dict[str, Any]], pictures: list[Path]) -> str:
+    """Return report.md."""
+    head = [" | ".join(TITLES), " | ".join(":---" if title in TEXT_COLUMNS else "---:" for title in TITLES)]
+    body = [" | ".join(cells(line)) for line in lines]
+    table = [f"| {text} |" for text in (*head, *body)]
+    failed = [line for line in lines if line["status"] != "ok"]
+    unfinished = [f"- {line['scene']}, {line['method']}: {line['status']}: {line['reason']}" for line in failed]
+    reasons = ["## Rows without figures", "", *unfinished, ""] if unfinished else []
+    images = [f"![{path.stem.replace('_', ' ')}]({path.name})" for path in pictures]
+    title = ", ".join(_distinct(row.config or "" for row in rows)) or "rows"
+    return "\n".join([f"# Sweep {title}", "", describe_origin(rows), "", *table, "", NOTES, *reasons, *images, ""])

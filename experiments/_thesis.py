@@ -1,0 +1,51 @@
+"""Table 6.1 of the thesis, and which of its rows belong to a row of ours. Source: reference/README.md."""
+
+import csv
+import math
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from experiments._rows import Row
+
+FILE = Path(__file__).parent / "reference" / "table_6_1.csv"
+COUNTERPARTS = {"cll": "CLL", "scipy-kdtree": "ANN", "scipy-kdtree-nolist": "ANN-NL"}
+SPACING, CUTOFF_RATIO, DIM = 1e-4, 3.0, 3
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What the thesis says about one method on one scene: t_total [s] and the largest resident set of the process [MB]."""
+
+    method: str
+    points: int
+    seconds: float
+    megabytes: float
+
+
+@cache
+def table() -> dict[tuple[str, int, str], Figures]:
+    """Return Table 6.1 by layout, fill in percent and method."""
+    with FILE.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    return {
+        (row["layout"], int(row["fill_percent"]), row["method"]): Figures(
+            row["method"], int(row["points"]), float(row["t_total_s"]), float(row["memory_mb"])
+        )
+        for row in rows
+    }
+
+
+def figures(row: Row, method: str | None = None) -> Figures | None:
+    """Return what the thesis says about the scene of a row, None where it says nothing.
+
+    Args:
+        row: A row of a sweep.
+        method: Method of the thesis; without it, the counterpart of the row's method.
+    """
+    wanted = method or COUNTERPARTS.get(row.method)
+    same_lattice = math.isclose(row.spacing, SPACING) and math.isclose(row.cutoff_ratio, CUTOFF_RATIO) and row.dim == DIM
+    fill = row.fill if row.fill_asked is None else row.fill_asked
+    if wanted is None or fill is None or not same_lattice:
+        return None
+    return table().get((row.layout, int(100 * fill + 1e-9), wanted))

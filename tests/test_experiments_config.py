@@ -1,0 +1,116 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from experiments import _config, _thesis, methods
+from experiments._errors import UsageError
+
+ROOT = Path(__file__).resolve().parent.parent
+CONFIGS = ROOT / "experiments" / "configs"
+
+GOOD = """
+methods = ["scipy-kdtree", "cll"]
+spacing = 5e-4
+repeats = 5
+[[scenes]]
+layouts = ["corners", "clusters7"]
+fills = [0.02, 0.11]
+[[scenes]]
+layouts = ["full"]
+"""
+
+
+def load(tmp_path, text):
+    path = tmp_path / "sweep.toml"
+    path.write_text(text)
+    return _config.load(path)
+
+
+def test_specs_are_the_product_of_scenes_and_methods(tmp_path):
+    config = load(tmp_path, GOOD)
+    specs = list(config.specs())
+    scenes = [("corners", 0.02), ("corners", 0.11), ("clusters7", 0.02), ("clusters7", 0.11), ("full", None)]
+    assert [(spec.layout, spec.fill, spec.method) for spec in specs] == [
+        (layout, fill, method) for layout, fill in scenes for method in ("scipy-kdtree", "cll")
+    ]
+    assert len({spec.key for spec in specs}) == len(specs)
+
+
+def test_a_scene_given_twice_is_measured_once(tmp_path):
+    twice = load(tmp_path, GOOD + '[[scenes]]\nlayouts = ["corners"]\nfills = [0.11]\n')
+    assert list(twice.specs()) == list(load(tmp_path, GOOD).specs())
+
+
+def test_key_and_hash_follow_what_the_config_says(tmp_path):
+    first, same = load(tmp_path, GOOD), load(tmp_path, "# another comment\n" + GOOD)
+    other = load(tmp_path, GOOD.replace("repeats = 5", "repeats = 6"))
+    assert first.hash == same.hash != other.hash
+    keys = [[spec.key for spec in config.specs()] for config in (first, same, other)]
+    assert keys[0] == keys[1]
+    assert not set(keys[0]) & set(keys[2])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("repeats = 5", "repeat = 5", r"sweep\.toml: repeat: unknown key \(value 5\); allowed: methods, scenes, spacing, "),
+        ("fills =", "fill =", r"sweep\.toml: scenes\[0\]\.fill: unknown key \(value \[0\.02, 0\.11\]\); allowed: layouts, fills"),
+        ('"full"', '"fulll"', r"scenes\[1\]\.layouts: unknown layout 'fulll'; allowed: full, corners, .*clustersN"),
+        ('"clusters7"', '"clustersN"', r"scenes\[0\]\.layouts: unknown layout 'clustersN'; allowed: "),
+        ('"cll"', '"ccl"', r"methods: unknown method 'ccl'; allowed: brute, cll, jax, scipy-kdtree, scipy-kdtree-nolist"),
+        ("0.11]", "1.5]", r"scenes\[0\]\.fills\[1\]: got 1\.5; input should be less than or equal to 1"),
+        ("0.02,", "0.0,", r"scenes\[0\]\.fills\[0\]: got 0\.0; input should be greater than 0"),
+        ("repeats = 5", "repeats = 0", r"repeats: got 0; input should be greater than or equal to 1"),
+        ("repeats = 5", "repeats = 5\nmax_repeats = 4", r"max_repeats: got 4; it must not be less than repeats, 5"),
+        ("repeats = 5", 'dtype = "float16"', r"dtype: got 'float16'; input should be 'float32' or 'float64'"),
+        ("repeats = 5", "dim = 4", r"dim: got 4; input should be 2 or 3"),
+        ("spacing = 5e-4", "spacing = inf", r"spacing: got inf; input should be a finite number"),
+        ('methods = ["scipy-kdtree", "cll"]', "", r"methods: missing; it must be given"),
+        ('["full"]', "[]", r"scenes\[1\]\.layouts: got \[\]; "),
+        ("repeats = 5", "repeats = ", r"sweep\.toml: no valid TOML: "),
+    ],
+)
+def test_a_config_error_names_file_key_and_what_is_allowed(tmp_path, old, new, message):
+    assert GOOD.count(old) == 1
+    with pytest.raises(UsageError, match=message) as caught:
+        load(tmp_path, GOOD.replace(old, new))
+    assert str(caught.value).startswith(str(tmp_path / "sweep.toml"))
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_config_that_is_not_there(tmp_path):
+    with pytest.raises(UsageError, match=r"none\.toml: cannot be read \(No such file or directory\)"):
+        _config.load(tmp_path / "none.toml")
+
+
+def test_the_command_ends_with_2_and_no_traceback(tmp_path):
+    path = tmp_path / "sweep.toml"
+    path.write_text(GOOD.replace("repeats = 5", "repeat = 5"))
+    command = [sys.executable, "-m", "experiments", "run", str(path), "--out", str(tmp_path / "out")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith(f"error: {path}: repeat: unknown key (value 5); allowed: methods, ")
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_thesis_config_holds_every_scene_of_table_6_1():
+    specs = list(_config.load(CONFIGS / "thesis.toml").specs())
+    assert {(spec.layout, round(100 * spec.fill)) for spec in specs} == {key[:2] for key in _thesis.table()}
+    assert {spec.method for spec in specs} == set(methods.names())
+    assert len(specs) == 11 * 5
+    assert all(spec.repeats >= 5 and spec.dtype == "float32" for spec in specs)
+
+
+def test_smoke_config_has_every_method():
+    assert set(_config.load(CONFIGS / "smoke.toml").methods) == set(methods.names())
+
+
+def test_help_imports_nothing_heavy():
+    heavy = {"jax", "scipy", "warp", "matplotlib", "pyvista", "pandas", "numpy", "pydantic"}
+    code = f"import sys; from experiments import _cli; print(sorted({heavy} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout == "[]\n"

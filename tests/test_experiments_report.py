@@ -1,0 +1,184 @@
+import csv
+from dataclasses import replace
+
+import pytest
+from matplotlib.image import imread
+from typer.testing import CliRunner
+
+from experiments import _plots, _report, _table, _thesis
+from experiments._cli import app
+from experiments._rows import Row, RowFile
+
+PICTURES = ("runtime_by_layout", "memory_by_layout", "runtime_by_fill", "memory_by_fill", "speed_against_error")
+MACHINE = {"cpu": "Some CPU", "cores": 2, "memory_bytes": 8 * 2**30, "system": "Linux 6"}
+VERSIONS = {"jax": "0.10.2", "scipy": "1.17.1", "warp-lang": None}
+SCENES = (
+    ("corners", 0.02, 7200, 0.0288),
+    ("corners", 0.11, 28158, 0.112632),
+    ("diagonal", 0.11, 29168, 0.116672),
+    ("full", 1.0, 250_000, 1.0),
+)
+
+
+def make_row(scene, method, seconds, megabytes, **options):
+    layout, fill_asked, points, fill = scene
+    row = Row(
+        **{"key": f"{layout} {fill_asked} {method}", "layout": layout, "method": method, "fill_asked": fill_asked, "fill": fill},
+        **{"spacing": 1e-4, "cutoff_ratio": 3.0, "dtype": "float32", "dim": 3, "seed": 0, "status": "ok", "points": points},
+        **{"compile_s": 0.5, "first_s": seconds, "median_s": seconds, "p10_s": 0.9 * seconds, "p90_s": 1.2 * seconds, "repeats": 5},
+        **{"search_bytes": int(1e6 * megabytes), "peak_bytes": int(3e6 * megabytes), "list_bytes": 1000, "scratch_bytes": 2000},
+        **{"pairs": 90, "exact_pairs": 90, "missing": 0, "extra": 0, "compared": "pairs", "machine": MACHINE, "versions": VERSIONS},
+        **{"commit": "0123456789abcdef", "dirty": False, "config": "thesis", "time": "2031-02-03T04:05:06+00:00"},
+    )
+    return replace(row, **options)
+
+
+def make_rows():
+    rows = []
+    for number, scene in enumerate(SCENES, start=1):
+        rows.append(make_row(scene, "jax", 0.5 * number, 40.0 * number))
+        rows.append(
+            make_row(scene, "brute", 0, 0, status="skipped", reason="too many", median_s=None, search_bytes=None, missing=None)
+        )
+        rows.append(make_row(scene, "scipy-kdtree", 0.75 * number, 20.0 * number, extra=300 * number))
+        rows.append(make_row(scene, "cll", 0.25 * number, 10.0 * number, missing=2 * number, extra=7))
+    return rows
+
+
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory):
+    """A folder with nothing but rows, after `report`."""
+    folder = tmp_path_factory.mktemp("reported")
+    for row in reversed(make_rows()):
+        RowFile(folder).append(row)
+    result = CliRunner().invoke(app, ["report", str(folder)], catch_exceptions=False)
+    assert result.exit_code == 0
+    return folder, result.stdout
+
+
+def read_table(folder):
+    with (folder / "table.csv").open(newline="") as stream:
+        lines = list(csv.DictReader(stream))
+    return {(line["scene"], line["method"]): line for line in lines}
+
+
+def test_table_sets_our_figures_beside_the_thesis(reported):
+    table = read_table(reported[0])
+    assert len(table) == 16
+    cll = table["full 100 %", "cll"]
+    assert (cll["median_s"], cll["search_mb"], cll["peak_mb"], cll["missing"], cll["extra"]) == ("1.0", "40.0", "120.0", "8", "7")
+    assert (cll["thesis_method"], cll["thesis_s"], cll["thesis_mb"], cll["thesis_points"]) == ("CLL", "2.14", "116.75", "250000")
+    assert table["diagonal 11 %", "cll"]["thesis_points"] == "29424"
+    tree = table["corners 11 %", "scipy-kdtree"]
+    assert (tree["thesis_method"], tree["thesis_s"]) == ("ANN", "1340.39")
+
+
+def test_ratios_are_those_to_cll_on_either_side(reported):
+    table = read_table(reported[0])
+    for (scene, method), line in table.items():
+        if method in ("jax", "scipy-kdtree", "cll"):
+            seconds, megabytes = {"jax": (2, 4), "scipy-kdtree": (3, 2), "cll": (1, 1)}[method]
+            assert float(line["seconds_to_cll"]) == pytest.approx(seconds), scene
+            assert float(line["mb_to_cll"]) == pytest.approx(megabytes), scene
+    tree = table["corners 2 %", "scipy-kdtree"]
+    assert float(tree["thesis_s_to_cll"]) == pytest.approx(63.40 / 0.02)
+    assert float(tree["thesis_mb_to_cll"]) == pytest.approx(16.02 / 8.84)
+    skipped = table["full 100 %", "brute"]
+    assert (skipped["status"], skipped["reason"], skipped["seconds_to_cll"]) == ("skipped", "too many", "")
+
+
+def test_scenes_of_another_lattice_are_not_compared_with_the_thesis():
+    row = make_row(SCENES[0], "cll", 1.0, 1.0)
+    assert _thesis.figures(row) == _thesis.Figures("CLL", 7200, 0.02, 8.84)
+    for change in (
+        {"spacing": 5e-4},
+        {"cutoff_ratio": 2.0},
+        {"dim": 2},
+        {"fill_asked": 0.03},
+        {"layout": "random"},
+        {"method": "jax"},
+    ):
+        assert _thesis.figures(replace(row, **change)) is None, change
+    assert _thesis.figures(make_row(SCENES[3], "cll", 1.0, 1.0, fill_asked=None)).seconds == 2.14
+
+
+def test_scenes_stand_by_size_and_are_told_apart():
+    rows = make_rows()
+    assert [row.layout for row in _table.in_order(rows[::-1])[::4]] == ["corners", "corners", "diagonal", "full"]
+    other = replace(rows[0], dtype="float64", key="other")
+    names = _table.name_scenes([rows[0], other])
+    assert sorted(names.values()) == ["corners 2 %, float32", "corners 2 %, float64"]
+    assert set(_table.name_scenes([rows[0]]).values()) == {"corners 2 %"}
+
+
+def test_printed_table_and_paths(reported):
+    folder, printed = reported
+    lines = printed.splitlines()
+    assert lines[-5:] == [str(folder / f"{name}.png") for name in PICTURES]
+    full = [line.split() for line in lines if " 250 000 " in line]
+    assert len(full) == 4
+    assert ["cll", "1.0000", "1", "40.0", "1", "8", "7", "CLL", "2.14", "1", "116.8", "1"] in [line[-12:] for line in full]
+    assert "brute skipped" in " ".join(next(line for line in full if "brute" in line))
+    assert "Some CPU, 2 cores, 8 GiB · jax 0.10.2, scipy 1.17.1 · commit 0123456789 · 2031-02-03" in lines
+
+
+def test_markdown_holds_the_table_the_source_the_reasons_and_the_pictures(reported):
+    text = (reported[0] / "report.md").read_text()
+    table = [line for line in text.splitlines() if line.startswith("|")]
+    assert len(table) == 2 + 16
+    assert len({line.count("|") for line in table}) == 1
+    assert (
+        "| corners 11 % | 28 158 | scipy-kdtree | 1.5000 | 3 | 40.0 | 2 | 0 | 600 | ANN | 1340.39 | 16755 | 51.0 | 2.65 |" in table
+    )
+    assert "J. Peifle" in text
+    assert "- full 100 %, brute: skipped: too many" in text
+    assert [f"![{name.replace('_', ' ')}]({name}.png)" in text for name in PICTURES] == [True] * 5
+    assert "Some CPU" in text
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_pictures_show_every_method_in_its_color(reported, name):
+    picture = (255 * imread(reported[0] / f"{name}.png")[..., :3]).round().astype(int)
+    assert min(picture.shape[:2]) >= 400
+    for method in ("jax", "scipy-kdtree", "cll"):
+        wanted = [int(_plots.COLORS[method][place : place + 2], 16) for place in (1, 3, 5)]
+        assert (picture == wanted).all(axis=2).sum() > 60, method
+
+
+def test_times_beside_busy_processes_are_marked():
+    quiet, busy = (_table.lines([make_row(SCENES[0], "cll", 0.5, 1.0, others_cores=cores)])[0] for cores in (0.1, 0.9))
+    assert [_report.cells(line)[3] for line in (quiet, busy)] == ["0.5000", "*0.5000"]
+
+
+def test_origin_names_all_that_differ():
+    rows = make_rows()[:3]
+    rows[1] = replace(rows[1], machine=MACHINE | {"cpu": "Other CPU"}, time="2031-02-09T00:00:00+00:00", dirty=True)
+    text = _report.describe_origin(rows)
+    assert "Some CPU, 2 cores, 8 GiB / Other CPU, 2 cores, 8 GiB" in text
+    assert "commit 0123456789 / commit 0123456789 with changes" in text
+    assert text.endswith("with changes · 2031-02-03 to 2031-02-09")
+    rows[2] = replace(rows[2], others_cores=0.96)
+    assert "with changes · others kept up to 1.0 cores busy · 2031-02-03" in _report.describe_origin(rows)
+
+
+def test_a_sweep_of_one_unknown_method_on_one_scene(tmp_path):
+    RowFile(tmp_path).append(make_row(("random", 0.3, 500, 0.3), "peer", 0.5, 1.0))
+    result = CliRunner().invoke(app, ["report", str(tmp_path)], catch_exceptions=False)
+    assert result.exit_code == 0
+    line = read_table(tmp_path)["random 30 %", "peer"]
+    assert (line["median_s"], line["seconds_to_cll"], line["thesis_s"]) == ("0.5", "", "")
+    assert all((tmp_path / f"{name}.png").exists() for name in PICTURES)
+
+
+def test_a_sweep_without_figures_still_has_its_table(tmp_path):
+    RowFile(tmp_path).append(make_row(SCENES[0], "cll", 0, 0, status="missing", reason="not there", median_s=None, points=None))
+    result = CliRunner().invoke(app, ["report", str(tmp_path)], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert list(tmp_path.glob("*.png")) == []
+    assert "missing: not there" in (tmp_path / "report.md").read_text()
+
+
+def test_a_folder_without_rows(tmp_path):
+    result = CliRunner().invoke(app, ["report", str(tmp_path)])
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"error: {tmp_path}: no rows; fill it with `python -m experiments run CONFIG.toml --out")

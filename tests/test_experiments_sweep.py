@@ -1,0 +1,286 @@
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, fields, replace
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from experiments import _measure, _rows
+from experiments._errors import UsageError
+
+ROOT = Path(__file__).resolve().parent.parent
+KDTREES = 'methods = ["scipy-kdtree", "scipy-kdtree-nolist"]\n'
+QUICK = "spacing = 5e-4\nrepeats = 5\nmin_seconds = 0.0\n"
+CORNERS = '[[scenes]]\nlayouts = ["corners"]\nfills = [0.11]\n'
+
+
+class Sweep:
+    """A folder with a config, and the command that runs it."""
+
+    def __init__(self, folder, config, name="small"):
+        self.config = folder / f"{name}.toml"
+        self.config.write_text(config)
+        self.out = folder / "out"
+
+    @property
+    def file(self):
+        return self.out / "rows.jsonl"
+
+    @property
+    def command(self):
+        return [sys.executable, "-m", "experiments", "run", str(self.config), "--out", str(self.out)]
+
+    def run(self, *options, **environment):
+        """Run to the end; return stdout and what the progress said."""
+        return subprocess.run(
+            [*self.command, *options],
+            cwd=ROOT,
+            env=os.environ | environment,
+            capture_output=True,
+            text=True,
+            timeout=200,
+            check=True,
+        )
+
+    def rows(self):
+        """Return the rows as they stand in the file, each line once."""
+        return [json.loads(line) for line in self.file.read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    """A finished sweep of every method over one scene."""
+    methods = 'methods = ["jax", "brute", "cll", "scipy-kdtree", "scipy-kdtree-nolist"]\n'
+    sweep = Sweep(tmp_path_factory.mktemp("swept"), methods + QUICK + CORNERS)
+    sweep.done = sweep.run()
+    return sweep
+
+
+def test_each_method_gives_a_whole_row(swept):
+    rows = swept.rows()
+    assert [row["method"] for row in rows] == ["jax", "brute", "cll", "scipy-kdtree", "scipy-kdtree-nolist"]
+    assert "5 of 5 rows ok, 0 with a reason" in swept.done.stdout
+    optional = {"reason", "allocate_s", "directed_pairs", "others_cores"}
+    for row in rows:
+        assert set(row) == {field.name for field in fields(_rows.Row)}
+        assert row["status"] == "ok"
+        assert {name for name, value in row.items() if value in (None, [], {})} <= optional, row["method"]
+        assert (row["layout"], row["fill_asked"], row["points"], row["fill"]) == ("corners", 0.11, 256, 0.128)
+        assert (row["spacing"], row["cutoff"], row["dtype"]) == (5e-4, float(np.float32(1.5e-3)), "float32")
+        assert f"corners 11 %      {row['method']}" in swept.done.stderr
+
+
+def test_times_and_memory_of_a_row_fit_together(swept):
+    for row in swept.rows():
+        assert row["repeats"] == len(row["seconds"]) == 5
+        assert row["median_s"] == np.median(row["seconds"])
+        assert 0 < min(row["seconds"]) <= row["p10_s"] <= row["median_s"] <= row["p90_s"] <= max(row["seconds"])
+        assert row["first_s"] > 0
+        assert row["list_bytes"] + row["scratch_bytes"] == row["search_bytes"] <= row["peak_bytes"]
+    jax = swept.rows()[0]
+    assert jax["first_s"] < 0.5 < jax["compile_s"]
+    assert jax["allocate_s"] > 0
+
+
+def test_pairs_of_a_row_are_compared_with_the_exact_ones(swept):
+    rows = {row["method"]: row for row in swept.rows()}
+    exact = rows["jax"]["exact_pairs"]
+    for method, row in rows.items():
+        assert row["exact_pairs"] == exact > 0
+        assert row["pairs"] == exact - row["missing"] + row["extra"], method
+        assert row["compared"] == ("counts" if method == "scipy-kdtree-nolist" else "pairs")
+    assert all(rows[method][error] == 0 for method in ("jax", "brute") for error in ("missing", "extra"))
+    assert rows["jax"]["directed_pairs"] == 2 * exact
+    assert rows["scipy-kdtree"]["extra"] == rows["scipy-kdtree-nolist"]["extra"] > 0  # pairs at exactly the cutoff
+    assert rows["cll"]["missing"] > 0  # float32 decides ties as it rounds
+
+
+def test_a_row_says_where_it_comes_from_but_names_no_host(swept):
+    for row in swept.rows():
+        assert set(row["machine"]) == {"cpu", "cores", "memory_bytes", "system"}
+        assert row["versions"]["python"] == platform.python_version()
+        assert all(row["versions"][name] for name in ("jfrnn", "numpy", "scipy", "jax", "warp-lang"))
+        assert (row["config"], len(row["config_hash"]), len(row["key"])) == ("small", 12, 12)
+        assert datetime.fromisoformat(row["time"]).utcoffset().total_seconds() == 0
+        assert str(Path.home()) not in json.dumps(row)
+    assert len({row["key"] for row in swept.rows()}) == 5
+
+
+def test_a_second_start_runs_nothing_again(swept):
+    before = swept.file.read_bytes()
+    done = swept.run()
+    assert swept.file.read_bytes() == before
+    assert "5 of 5 rows are there already" in done.stderr
+    assert "5 of 5 rows ok" in done.stdout
+
+
+def test_half_a_last_line_is_cut_off_and_measured_again(swept):
+    *kept, last = before = swept.file.read_bytes().splitlines(keepends=True)
+    swept.file.write_bytes(b"".join(kept) + last[: len(last) // 2])
+    done = swept.run()
+    assert "4 of 5 rows are there already" in done.stderr
+    after = swept.file.read_bytes().splitlines(keepends=True)
+    assert after[:-1] == before[:-1]
+    assert json.loads(after[-1])["key"] == json.loads(last)["key"]
+    assert json.loads(after[-1])["status"] == "ok"
+
+
+def test_a_method_that_is_not_installed_gives_a_row_and_the_sweep_goes_on(tmp_path):
+    (tmp_path / "shadow" / "warp").mkdir(parents=True)
+    (tmp_path / "shadow" / "warp" / "__init__.py").write_text("raise ImportError('there is no warp here')")
+    sweep = Sweep(tmp_path, 'methods = ["cll", "scipy-kdtree"]\n' + QUICK + CORNERS)
+    done = sweep.run(PYTHONPATH=str(tmp_path / "shadow"))
+    assert "1 of 2 rows ok, 1 with a reason" in done.stdout
+    missing, good = sweep.rows()
+    assert (missing["method"], missing["status"]) == ("cll", "missing")
+    assert missing["reason"] == "cll cannot be imported: there is no warp here"
+    assert (missing["median_s"], good["method"], good["status"]) == (None, "scipy-kdtree", "ok")
+
+    sweep.run()
+    assert len(sweep.rows()) == 2
+    sweep.run("--retry-failed")
+    assert [(row["method"], row["status"]) for row in sweep.rows()] == [("cll", "missing"), ("scipy-kdtree", "ok"), ("cll", "ok")]
+    assert [row.status for row in _rows.RowFile(sweep.out).read()] == ["ok", "ok"]
+
+
+def test_failed_and_skipped_rows_say_why(tmp_path):
+    scenes = '[[scenes]]\nlayouts = ["full"]\nfills = [0.5]\n[[scenes]]\nlayouts = ["full"]\n'
+    sweep = Sweep(tmp_path, 'methods = ["brute"]\nspacing = 2e-4\ndim = 3\n' + scenes)
+    done = sweep.run()
+    failed, skipped = sweep.rows()
+    assert (failed["status"], skipped["status"], skipped["points"]) == ("failed", "skipped", 31250)
+    assert failed["reason"].startswith("UsageError: layout 'full': fill must be 1 for the layout 'full', got 0.5")
+    assert skipped["reason"] == "31250 points; brute is run up to 20000"
+    assert "0 of 2 rows ok, 2 with a reason" in done.stdout
+
+
+def test_a_row_that_takes_too_long_is_ended(tmp_path):
+    sweep = Sweep(tmp_path, KDTREES + QUICK + "timeout = 0.01\n" + CORNERS)
+    sweep.run()
+    assert [(row["status"], row["reason"]) for row in sweep.rows()] == 2 * [("timeout", "not done after 0.01 s")]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a killed runner takes its worker along on Linux alone")
+def test_kill_9_loses_no_row_and_doubles_none(tmp_path):
+    sweep = Sweep(tmp_path, KDTREES + QUICK + CORNERS)
+    with subprocess.Popen(sweep.command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as runner:
+        deadline = time.monotonic() + 60
+        while not (sweep.file.exists() and sweep.file.read_text().count("\n")) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        workers = wait_for_children(runner.pid, deadline)
+        runner.send_signal(signal.SIGKILL)
+    _, alive = psutil.wait_procs(workers, timeout=10)
+    assert (len(workers), alive) == (1, [])
+    early = sweep.file.read_bytes()
+    assert early.count(b"\n") == 1
+
+    sweep.run()
+    assert sweep.file.read_bytes().startswith(early)
+    assert len({row["key"] for row in sweep.rows()}) == len(sweep.rows()) == 2
+
+
+def wait_for_children(pid, deadline):
+    """Return the worker of a runner, which is between two of them for a moment."""
+    while not (children := psutil.Process(pid).children()) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return children
+
+
+ROW = _rows.Row(key="a", layout="full", method="m", fill_asked=None, spacing=1.0, cutoff_ratio=3.0, dtype="f", dim=3, seed=0)
+
+
+def test_rows_come_back_as_they_were_and_the_latest_of_a_key_counts(tmp_path):
+    file = _rows.RowFile(tmp_path)
+    assert file.read() == []
+    later = replace(ROW, status="ok", seconds=[0.1, 1 / 3])
+    for row in (ROW, replace(ROW, key="b"), later):
+        file.append(row)
+    assert file.read() == [later, replace(ROW, key="b")]
+
+
+@pytest.mark.parametrize("tail", ['{"key": "c", "lay', '{"key": "c"'], ids=["in a word", "before the brace"])
+def test_half_a_line_is_passed_over_and_cut_off(tmp_path, tail):
+    file = _rows.RowFile(tmp_path)
+    file.append(ROW)
+    whole = file.path.read_bytes()
+    file.path.write_bytes(whole + tail.encode())
+    assert file.read() == [ROW]
+    file.repair()
+    assert file.path.read_bytes() == whole
+
+
+def test_a_whole_line_without_its_end_is_kept(tmp_path):
+    file = _rows.RowFile(tmp_path)
+    file.append(ROW)
+    file.path.write_bytes(file.path.read_bytes() + json.dumps(asdict(replace(ROW, key="b"))).encode())
+    file.repair()
+    file.append(replace(ROW, key="c"))
+    assert [row.key for row in file.read()] == ["a", "b", "c"]
+
+
+def test_a_line_that_is_no_row_is_named(tmp_path):
+    file = _rows.RowFile(tmp_path)
+    file.append(ROW)
+    file.path.write_bytes(b"[1, 2]\n" + file.path.read_bytes())
+    with pytest.raises(UsageError, match=r"rows\.jsonl: line 1 is no row .* repair or remove that line"):
+        file.read()
+
+
+def test_a_folder_is_filled_by_one_process_at_a_time(tmp_path):
+    file = _rows.RowFile(tmp_path)
+    with file.locked(), pytest.raises(UsageError, match="another process fills this folder now"), file.locked():
+        pass
+    with file.locked():
+        file.append(ROW)
+    assert file.read() == [ROW]
+
+
+def test_peak_memory_sees_what_came_and_went():
+    memory = _measure.PeakMemory()
+    block = np.ones(10_000_000)
+    del block
+    assert 75e6 < memory.peak() - memory.start < 200e6
+    if memory.source == "VmHWM":
+        after = _measure.PeakMemory()
+        assert after.peak() - after.start < 20e6
+
+
+def test_bystanders_are_other_processes_alone():
+    def watch():
+        """Keep this process busy; return what others and itself took [cores]."""
+        bystanders, begin, worked = _measure.Bystanders(), time.perf_counter(), time.process_time()
+        while (wall := time.perf_counter() - begin) < 0.5:
+            pass
+        return bystanders.cores(), (time.process_time() - worked) / wall
+
+    assert _measure.Bystanders().cores() is None
+    others, own = watch()
+    assert others + own < psutil.cpu_count() + 0.2  # were its own work among it, there would be more than all cores
+    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as spinning:
+        time.sleep(0.2)
+        others, _ = watch()
+        spinning.kill()
+    assert others > 0.25
+
+
+def test_repeats_go_on_until_there_are_enough_and_they_took_long_enough():
+    runs = []
+
+    def search():
+        time.sleep(0.01)
+        runs.append(len(runs))
+        return runs[-1]
+
+    assert _measure.repeat(search, 3, 0.0, 9)[0] == 2
+    result, seconds = _measure.repeat(search, 1, 0.045, 50)
+    assert (result, len(seconds)) == (len(runs) - 1, len(runs) - 3)
+    assert sum(seconds) >= 0.045 > sum(seconds[:-1])
+    assert len(_measure.repeat(search, 1, 60.0, 4)[1]) == 4
