@@ -10,13 +10,18 @@ from jax.test_util import check_grads
 import jfrnn
 
 
+def search(points, cutoff, **options):
+    """Search with one capacity for all tests, so that they share compiled programs."""
+    return jfrnn.search(points, cutoff, capacity=40, **options)
+
+
 @pytest.fixture
 def points(dim):
     return jnp.asarray(np.random.default_rng(0).random((40, dim)))
 
 
 def test_distances_and_vectors(points):
-    nbrs = jfrnn.search(points, 0.4)
+    nbrs = search(points, 0.4)
     r, mask = nbrs.vectors(points)
     d, same = nbrs.distances(points)
     np.testing.assert_array_equal(mask, same)
@@ -49,7 +54,7 @@ def test_distances_do_not_underflow(dtype):
 
 def test_queries(points):
     queries = points[:7] + 0.05
-    nbrs = jfrnn.search(points, 0.4, queries=queries)
+    nbrs = search(points, 0.4, queries=queries)
     r, mask = nbrs.vectors(points, queries=queries)
     i, k = np.nonzero(mask)
     np.testing.assert_array_equal(r[i, k], points[nbrs.idx[i, k]] - queries[i])
@@ -63,7 +68,7 @@ def energy(nbrs, x):
 
 
 def test_gradients_against_finite_differences(points):
-    nbrs = jfrnn.search(points, 0.4)
+    nbrs = search(points, 0.4)
     check_grads(lambda x: energy(nbrs, x), (points,), order=2, modes=("fwd", "rev"), eps=1e-6, rtol=1e-6)
 
 
@@ -73,7 +78,7 @@ def test_gradients_against_brute_force(points):
         near = (square < 0.4**2) & ~jnp.eye(len(x), dtype=bool)
         return jnp.sum(jnp.where(near, (0.4 - jnp.sqrt(jnp.where(near, square, 1.0))) ** 3, 0.0))
 
-    nbrs = jfrnn.search(points, 0.4)
+    nbrs = search(points, 0.4)
     np.testing.assert_allclose(jax.grad(lambda x: energy(nbrs, x))(points), jax.grad(all_pairs)(points), atol=1e-13)
     direction = jnp.ones_like(points).at[0].set(-2.0)
     second = [
@@ -84,7 +89,7 @@ def test_gradients_against_brute_force(points):
 
 def test_gradients_are_finite_at_coincident_points(dim):
     points = jnp.zeros((3, dim)).at[2, 0].set(0.1)
-    nbrs = jfrnn.search(points, 0.4)
+    nbrs = search(points, 0.4)
     value, gradient = jax.value_and_grad(lambda x: energy(nbrs, x))(points)
     hessian = jax.jit(jax.hessian(lambda x: energy(nbrs, x)))(points)
     assert np.isfinite(value)
@@ -94,7 +99,7 @@ def test_gradients_are_finite_at_coincident_points(dim):
 
 
 def test_exports_agree(points):
-    nbrs = jfrnn.search(points, 0.3)
+    nbrs = search(points, 0.3)
     i, j = nbrs.pairs()
     offsets, indices = nbrs.csr()
     assert (i.dtype, j.dtype, indices.dtype, offsets.dtype) == (np.int32, np.int32, np.int32, np.int64)
@@ -131,14 +136,14 @@ def test_geometry_inside_jit_and_scan(points):
 
 
 def test_refusals(points):
-    nbrs = jfrnn.search(points, 0.4)
+    nbrs = search(points, 0.4)
     with pytest.raises(ValueError, match=r"positions hold 39 particles, but the list was made for 40"):
         nbrs.distances(points[1:])
     with pytest.raises(ValueError, match="made without queries: leave queries out"):
         nbrs.vectors(points, queries=points)
     with pytest.raises(TypeError, match="positions must be float32 or float64"):
         nbrs.vectors(points.astype(int))
-    asked = jfrnn.search(points, 0.4, queries=points[:3])
+    asked = search(points, 0.4, queries=points[:3])
     with pytest.raises(ValueError, match="made with queries: pass queries="):
         asked.distances(points)
     with pytest.raises(ValueError, match="queries hold 4 points, but the list has 3 rows"):
