@@ -58,6 +58,19 @@ def report(folder: Annotated[Path, typer.Argument(help="Folder of a sweep.")]) -
 
 
 @app.command()
+def domain(
+    separations: Annotated[list[float] | None, typer.Argument(help="Distances of the blobs [cutoffs]; 10 to 1e6 without.")] = None,
+    points: Annotated[int, typer.Option(min=2, help="Particles in both blobs together.")] = 1000,
+) -> None:
+    """Time a search of two blobs ever further apart: what empty space costs."""
+    with _usage_errors():
+        from experiments import _domain
+
+        table = _domain.domain_table(separations or [10.0, 1e2, 1e3, 1e4, 1e5, 1e6], points)
+        typer.echo(table.to_string(index=False, float_format="%.3g"))
+
+
+@app.command()
 def show(
     layout: Layout,
     fill: Fill = None,
