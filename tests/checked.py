@@ -30,7 +30,11 @@ def found_pairs(nbrs):
 
 def assert_exact(nbrs, positions, cutoff, *, queries=None, **options):
     """Fail unless the list holds exactly the oracle's pairs."""
-    expected = reference.reference_pairs(positions, cutoff, queries=queries, **options)
+    assert_pairs(nbrs, reference.reference_pairs(positions, cutoff, queries=queries, **options))
+
+
+def assert_pairs(nbrs, expected):
+    """Fail unless the list holds exactly these pairs."""
     missing, extra = reference.compare(found_pairs(nbrs), expected)
     assert (len(missing), len(extra)) == (0, 0), f"missing {sorted(missing)[:5]}, extra {sorted(extra)[:5]} of {len(expected)}"
 

@@ -33,8 +33,9 @@ def test_options(options, backend, dtype, dim):
     nbrs = jfrnn.search(points, cutoff, backend=backend, capacity=40, **options)
     checked.assert_exact(nbrs, points, cutoff, **options)
     assert (nbrs.half, nbrs.include_self, nbrs.closed) == tuple(options.get(k, False) for k in ("half", "include_self", "closed"))
-    np.testing.assert_array_equal(jfrnn.count(points, cutoff, backend=backend, **options), nbrs.count)
     assert nbrs.backend == backend
+    if dim == 3:
+        np.testing.assert_array_equal(jfrnn.count(points, cutoff, backend=backend, **options), nbrs.count)
 
 
 def test_auto_says_what_ran():
