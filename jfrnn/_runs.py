@@ -17,6 +17,7 @@ from jfrnn._exact import Cutoff, flat_take, refine, squared_distance
 
 LANES = 16  # candidates per word: hits in its lower half, doubtful ones in its upper half
 _BLOCK_WORDS = 1 << 16
+_BLOCK_SLOTS = 1 << 22  # 16 MB of rows
 _SLOT_GROUP = 128  # slots of a row that are filled at a time
 _DOUBTFUL = 32  # doubtful candidates per row that one round of the exact test takes
 
@@ -39,7 +40,7 @@ class Filter(NamedTuple):
 
 def count_neighbors(sources: Points, queries: Points, runs: Runs, cutoff: Cutoff, keep: Filter) -> Array:
     """Count the neighbors of every query: [m] int32, in the order of the queries' ids."""
-    engine = _Engine(_padded(sources), queries, runs, cutoff, keep)
+    engine = _Engine(_padded(sources), queries, runs, cutoff, keep, capacity=1)
 
     def count_block(b: Array, out: Array) -> Array:
         place, ids = engine.block(b)
@@ -60,7 +61,7 @@ def list_neighbors(
     sources: Points, queries: Points, runs: Runs, cutoff: Cutoff, keep: Filter, capacity: int
 ) -> tuple[Array, Array]:
     """List the neighbors of every query: [m, capacity] int32 source indices, unused slots n, and [m] int32 true counts."""
-    engine = _Engine(_padded(sources), queries, runs, cutoff, keep)
+    engine = _Engine(_padded(sources), queries, runs, cutoff, keep, capacity)
     group = min(_SLOT_GROUP, capacity)
     slots = lax.iota(jnp.int32, group)
 
@@ -112,6 +113,7 @@ class _Engine(NamedTuple):
     runs: Runs
     cutoff: Cutoff
     keep: Filter
+    capacity: int
 
     @property
     def words(self) -> int:
@@ -120,7 +122,7 @@ class _Engine(NamedTuple):
 
     @property
     def block_size(self) -> int:
-        return min(_BLOCK_WORDS // self.words, self.queries.ids.size)
+        return min(_BLOCK_WORDS // self.words, max(_BLOCK_SLOTS // self.capacity, 1), self.queries.ids.size)
 
     @property
     def block_count(self) -> int:

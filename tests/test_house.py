@@ -2,6 +2,7 @@
 
 import ast
 import doctest
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -72,3 +73,16 @@ def test_examples_in_docstrings():
     result = doctest.testmod(jfrnn)
     assert result.attempted > 0
     assert result.failed == 0
+
+
+def test_example_in_the_readme():
+    """Runs in a process of its own, with the 64-bit mode off as a user finds it."""
+    example = (ROOT / "README.md").read_text().split("```python\n")[1].split("```")[0]
+    run = subprocess.run([sys.executable, "-c", example], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+
+
+def test_readme_links_exist():
+    links = re.findall(r"\]\(([^)#]+)\)", (ROOT / "README.md").read_text())
+    assert len(links) > 3
+    assert [link for link in links if "://" not in link and not (ROOT / link).exists()] == []

@@ -215,10 +215,10 @@ def test_scan_and_cond():
 # --- memory -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("n", [20_000, 4_000_000])
-def test_scratch_stays_within_the_stated_bound(n, dtype):
-    x = jax.ShapeDtypeStruct((n, 3), dtype)
-    for function in (lambda x: jfrnn.search(x, 0.1, capacity=64), lambda x: jfrnn.count(x, 0.1)):
+@pytest.mark.parametrize(("n", "capacity"), [(20_000, 64), (20_000, 20_000), (4_000_000, 64)])
+def test_scratch_stays_within_the_stated_bound(n, capacity, dtype, dim):
+    x = jax.ShapeDtypeStruct((n, dim), dtype)
+    for function in (lambda x: jfrnn.search(x, 0.1, capacity=capacity), lambda x: jfrnn.count(x, 0.1)):
         memory = jax.jit(function).lower(x).compile().memory_analysis()
         assert memory.temp_size_in_bytes <= 64e6 + (100 if dtype == np.float32 else 125) * n
 
