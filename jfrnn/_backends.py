@@ -1,13 +1,18 @@
-"""The engines of a search: how each finds candidates. What a pair is, and how rows are filled, they share (`_exact`, `_runs`)."""
+"""The engines of a search: which one answers, and how the array engines find candidates.
+
+What a pair is, and how rows are filled, the array engines share (`_exact`, `_runs`); the Warp engines live in `_warp`.
+"""
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
 
+from jfrnn import _warp
 from jfrnn._cells import build_grid, cell_edge, cell_order, grid_coordinates, stencil_runs
 from jfrnn._exact import Cutoff
 from jfrnn._runs import Filter, Points, Runs, count_neighbors, list_neighbors
+from jfrnn._status import Status
 
 
 class Options(NamedTuple):
@@ -17,20 +22,36 @@ class Options(NamedTuple):
     backend: str
 
 
-def neighbor_rows(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options, capacity: int) -> tuple[Array, Array]:
-    """List neighbors: [m, capacity] int32 source indices, unused slots n, and [m] int32 true counts."""
-    m = (sources if queries is None else queries).shape[0]
-    if 0 in (m, sources.shape[0]):
-        return jnp.full((m, capacity), sources.shape[0], jnp.int32), jnp.zeros(m, jnp.int32)
-    return list_neighbors(*_candidates(sources, queries, cutoff, options), cutoff, options.filter, capacity)
+class Rows(NamedTuple):
+    """Neighbors of m queries: [m, capacity] int32 source indices, unused slots n (None: only counted), and [m] int32 true counts.
+
+    `required` [] int32 is the longest row, `status` [] int32 the bits of `Status`.
+    """
+
+    idx: Array | None
+    count: Array
+    required: Array
+    status: Array
 
 
-def neighbor_counts(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options) -> Array:
-    """Count neighbors: [m] int32."""
-    m = (sources if queries is None else queries).shape[0]
-    if 0 in (m, sources.shape[0]):
-        return jnp.zeros(m, jnp.int32)
-    return count_neighbors(*_candidates(sources, queries, cutoff, options), cutoff, options.filter)
+def neighbors(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options, capacity: int | None) -> Rows:
+    """List the neighbors of every query, or only count them (capacity=None). Integers: no gradient flows through."""
+    sources = lax.stop_gradient(sources)
+    queries = None if queries is None else lax.stop_gradient(queries)
+    n, m = sources.shape[0], (sources if queries is None else queries).shape[0]
+    if options.backend == "warp" and 0 not in (n, m):
+        return Rows(*_warp.neighbors(sources, queries, cutoff, options.filter, capacity))
+    if 0 in (n, m):
+        idx, count = None if capacity is None else jnp.full((m, capacity), n, jnp.int32), jnp.zeros(m, jnp.int32)
+    elif capacity is None:
+        idx, count = None, count_neighbors(*_candidates(sources, queries, cutoff, options), cutoff, options.filter)
+    else:
+        idx, count = list_neighbors(*_candidates(sources, queries, cutoff, options), cutoff, options.filter, capacity)
+    required = jnp.max(count, initial=0)
+    finite = jnp.isfinite(sources).all() & (True if queries is None else jnp.isfinite(queries).all())
+    overflow = False if capacity is None else required > capacity
+    status = jnp.where(overflow, Status.ROW_OVERFLOW.value, 0) | jnp.where(finite, 0, Status.NONFINITE.value)
+    return Rows(idx, count, required, status.astype(jnp.int32))
 
 
 def _candidates(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options) -> tuple[Points, Points, Runs]:

@@ -12,7 +12,7 @@ from jax.core import Tracer
 
 from jfrnn._exact import Cutoff, largest_cutoff, make_cutoff, smallest_cutoff
 
-BACKENDS = ("auto", "jax", "brute")
+BACKENDS = ("auto", "jax", "warp", "hashgrid", "brute")
 
 
 def checked_positions(name: str, positions: Any, like: Array | None = None) -> Array:  # noqa: ANN401

@@ -5,12 +5,11 @@ import math
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._backends import Options, neighbor_counts, neighbor_rows
+from jfrnn._backends import Options, Rows, neighbors
 from jfrnn._exact import Cutoff
 from jfrnn._inputs import (
     checked_backend,
@@ -22,7 +21,6 @@ from jfrnn._inputs import (
 )
 from jfrnn._neighbors import NeighborList
 from jfrnn._runs import Filter
-from jfrnn._status import Status
 
 _CAPACITY_STEP = 8  # eager capacities are rounded up to a multiple, so that similar scenes share one compiled program
 
@@ -75,8 +73,12 @@ def search(
     slack = checked_slack(slack)
     if capacity is None:
         capacity = _counted_capacity(problem, slack)
+    rows = _search(*problem, checked_capacity(capacity))
     return NeighborList(
-        *_search(*problem, checked_capacity(capacity)),
+        rows.idx,
+        rows.count,
+        rows.status,
+        rows.required,
         cutoff=float(problem.cutoff.radius),
         half=problem.options.filter.later_only,
         include_self=queries is None and not problem.options.filter.drop_self,
@@ -167,14 +169,9 @@ def _counted_capacity(problem: _Problem, slack: float) -> int:
 
 @functools.partial(jax.jit, static_argnames="options")
 def _count(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options) -> Array:
-    return neighbor_counts(sources, queries, cutoff, options)
+    return neighbors(sources, queries, cutoff, options, None).count
 
 
 @functools.partial(jax.jit, static_argnames=("options", "capacity"))
-def _search(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options, capacity: int) -> tuple[Array, ...]:
-    """Return idx, count, status and required."""
-    idx, row_count = neighbor_rows(sources, queries, cutoff, options, capacity)
-    required = jnp.max(row_count, initial=0)
-    finite = jnp.isfinite(sources).all() & (True if queries is None else jnp.isfinite(queries).all())
-    status = jnp.where(required > capacity, Status.ROW_OVERFLOW.value, 0) | jnp.where(finite, 0, Status.NONFINITE.value)
-    return idx, row_count, status.astype(jnp.int32), required
+def _search(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options, capacity: int) -> Rows:
+    return neighbors(sources, queries, cutoff, options, capacity)

@@ -1,0 +1,520 @@
+"""Cell search on the CPU: a serial counting sort, then queries on every core, 8 or 16 candidates at a time.
+
+`build` sorts the sources (and the queries, if they are others) by cell. `query` is launched once per thread: the threads hand
+themselves chunks of places from an atomic counter. The sources around a cell are copied once into the first-level cache, as a
+structure of arrays, and serve all queries of that cell.
+"""
+
+import functools
+from typing import NamedTuple
+
+import warp as wp
+from jfrnn.kernels._native import CELLS, EXACT, snippet, table_cells
+
+_HEADER_WORDS = 64
+
+# Where things lie in the scratch: one text, so that `build` and `query` agree; `scratch_words` below is its sum.
+_LAYOUT = r"""
+struct Shared {
+    Grid grid;
+    int finite_queries;
+    int next_chunk;
+};
+constexpr int WIDTH = DOUBLE ? 2 : 1;
+auto up = [](long long words) { return (words + 15) & ~15ll; };
+int* cursor = scratch.data;
+auto take = [&](long long words) { int* here = cursor; cursor += up(words); return here; };
+Shared& shared = *(Shared*)take(64);
+real* axis[3];
+for (int k = 0; k < DIM; ++k)
+    axis[k] = (real*)take(WIDTH * (long long)n);
+int* ids = take(n);
+int* start = take(table + 2);
+int* key = take(n > m ? n : m);
+int* query_ids = own ? ids : take(m);
+int* query_start = own ? start : take(table + 2);
+"""
+
+
+def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -> int:
+    """Return the int32 words of scratch that `build` and `query` need; `width` is 1 for float32 and 2 for float64."""
+    table = table_cells(sources)
+    parts = [_HEADER_WORDS, *[width * sources] * dim, sources, table + 2, max(sources, queries)]
+    if not own:
+        parts += [queries, table + 2]
+    return sum((words + 15) // 16 * 16 for words in parts)
+
+
+# XLA's threads flush denormals to zero: undo that while native code runs.
+_ENTER = r"""
+#if defined(__SSE__)
+const unsigned int float_control = __builtin_ia32_stmxcsr();
+__builtin_ia32_ldmxcsr(float_control & ~0x8040u);
+#elif defined(__aarch64__)
+unsigned long long float_control;
+asm volatile("mrs %0, fpcr" : "=r"(float_control));
+asm volatile("msr fpcr, %0" : : "r"(float_control & ~(1ull << 24)));
+#endif
+"""
+_LEAVE = r"""
+#if defined(__SSE__)
+__builtin_ia32_ldmxcsr(float_control);
+#elif defined(__aarch64__)
+asm volatile("msr fpcr, %0" : : "r"(float_control));
+#endif
+"""
+
+_BUILD = r"""
+real low[3], high[3];
+for (int k = 0; k < DIM; ++k) {
+    low[k] = __builtin_inff();
+    high[k] = -__builtin_inff();
+}
+auto finite_point = [&](const real* p) {
+    bool finite = true;
+    for (int k = 0; k < DIM; ++k)
+        finite = finite && is_finite(p[k]);
+    return finite;
+};
+int finite = 0;
+for (int i = 0; i < n; ++i) {
+    const real* p = positions.data + (long long)DIM * i;
+    if (!finite_point(p))
+        continue;
+    ++finite;
+    for (int k = 0; k < DIM; ++k) {
+        low[k] = p[k] < low[k] ? p[k] : low[k];
+        high[k] = p[k] > high[k] ? p[k] : high[k];
+    }
+}
+if (finite == 0)
+    for (int k = 0; k < DIM; ++k)
+        low[k] = high[k] = 0;
+Grid grid;
+grid.finite = finite;
+lay_out(grid, low, high, table);
+shared.grid = grid;
+shared.next_chunk = 0;
+info.data[0] = 0;
+info.data[1] = finite < n ? 2 : 0;
+
+auto sort = [&](const real* points, int count, int* first, int* order, bool with_axes) {
+    for (int c = 0; c < grid.cells + 2; ++c)
+        first[c] = 0;
+    int outside = 0;
+    for (int i = 0; i < count; ++i) {
+        const real* p = points + (long long)DIM * i;
+        int cell = -1;
+        if (finite_point(p))
+            cell = cell_key(grid, p);
+        else
+            ++outside;
+        key[i] = cell;
+        if (cell >= 0)
+            ++first[cell + 2];
+    }
+    for (int c = 2; c < grid.cells + 2; ++c)
+        first[c] += first[c - 1];
+    int behind = count - outside;
+    for (int i = 0; i < count; ++i) {
+        const int place = key[i] >= 0 ? first[key[i] + 1]++ : behind++;
+        order[place] = i;
+        if (with_axes)
+            for (int k = 0; k < DIM; ++k)
+                axis[k][place] = points[(long long)DIM * i + k];
+    }
+    return count - outside;
+};
+shared.finite_queries = sort(positions.data, n, start, ids, true);
+if (!own) {
+    shared.finite_queries = sort(queries.data, m, query_start, query_ids, false);
+    info.data[1] |= shared.finite_queries < m ? 2 : 0;
+}
+"""
+
+_QUERY = r"""
+#if defined(__AVX512F__) && defined(__AVX512VL__)
+constexpr int LANES = DOUBLE ? 8 : 16;
+#else
+constexpr int LANES = DOUBLE ? 4 : 8;
+#endif
+constexpr int CANDIDATES = DOUBLE ? 1024 : 1536;  // what fits into a first-level cache beside a row
+constexpr int ROWS = 64;
+constexpr int CHUNK = 2048;
+typedef real vec __attribute__((vector_size(LANES * sizeof(real))));
+typedef int ints __attribute__((vector_size(LANES * 4)));
+typedef int eight_ints __attribute__((vector_size(32)));
+typedef bool flags __attribute__((ext_vector_type(LANES)));
+alignas(64) real candidate[3][CANDIDATES + LANES];
+alignas(64) int candidate_ids[CANDIDATES + LANES];
+alignas(64) int row[CANDIDATES + LANES];
+alignas(64) real doubtful[3][CANDIDATES + LANES];
+alignas(64) unsigned short unsure[CANDIDATES / LANES + 4];  // one bit per candidate that step 1 leaves open
+alignas(64) int doubtful_ids[CANDIDATES + LANES];
+const Grid grid = shared.grid;
+const int places = m, finite_places = shared.finite_queries;
+int longest = 0;
+
+struct Below { enum { value = 17 }; };
+struct BelowOrAt { enum { value = 18 }; };
+auto mask_of = [](vec a, real bound, auto comparison) -> unsigned int {  // one bit per lane
+#if defined(__AVX512F__) && defined(__AVX512VL__)
+    typedef float floats __attribute__((vector_size(64)));
+    typedef double doubles __attribute__((vector_size(64)));
+    const vec bounds = vec{} + bound;
+    if constexpr (DOUBLE)
+        return (unsigned char)__builtin_ia32_cmppd512_mask((doubles)a, (doubles)bounds, comparison.value, -1, 4);
+    else
+        return (unsigned short)__builtin_ia32_cmpps512_mask((floats)a, (floats)bounds, comparison.value, -1, 4);
+#else
+    const auto lanes = comparison.value == 18 ? a <= bound : a < bound;
+    const flags f = __builtin_convertvector(lanes, flags);
+    unsigned char bits;
+    __builtin_memcpy(&bits, &f, 1);
+    return LANES == 4 ? bits & 15 : bits;
+#endif
+};
+auto later_mask = [&](int b, int own_id) -> unsigned int {  // candidates whose id is above the query's
+    const ints ids = *(const ints*)(candidate_ids + b);
+    const flags f = __builtin_convertvector(ids > own_id, flags);
+    unsigned short bits = 0;
+    __builtin_memcpy(&bits, &f, LANES == 16 ? 2 : 1);
+    return bits;
+};
+auto square_of = [&](const real* q, int b) -> vec {
+    vec square;
+    for (int k = 0; k < DIM; ++k) {
+        vec d = *(const vec*)(candidate[k] + b) - q[k];
+        if constexpr (SCALED)
+            d *= step_scale;
+#if defined(__FMA__)
+        square = k == 0 ? d * d : __builtin_elementwise_fma(d, d, square);
+#else
+        square = k == 0 ? d * d : square + d * d;
+#endif
+    }
+    return square;
+};
+// stores the lanes of a mask one after the other; up to LANES elements at `to` are overwritten
+auto pack = [&](const auto* from, auto* to, unsigned int mask) {
+#if defined(__AVX512F__) && defined(__AVX512VL__)
+    typedef int ints8 __attribute__((vector_size(32)));
+    typedef int ints16 __attribute__((vector_size(64)));
+    typedef double doubles8 __attribute__((vector_size(64)));
+    if constexpr (sizeof(*from) == 8) {
+        const doubles8 packed = __builtin_ia32_compressdf512_mask(*(const doubles8*)from, doubles8{}, mask);
+        __builtin_memcpy(to, &packed, 64);
+    } else if constexpr (LANES == 8) {
+        const ints8 packed = __builtin_ia32_compresssi256_mask(*(const ints8*)from, ints8{}, mask);
+        __builtin_memcpy(to, &packed, 32);
+    } else {
+        const ints16 packed = __builtin_ia32_compresssi512_mask(*(const ints16*)from, ints16{}, mask);
+        __builtin_memcpy(to, &packed, 64);
+    }
+#else
+    for (; mask; mask &= mask - 1)
+        *to++ = from[__builtin_ctz(mask)];
+#endif
+};
+typedef float floats __attribute__((vector_size(32)));
+typedef double doubles __attribute__((vector_size(64)));
+typedef bool flags8 __attribute__((ext_vector_type(8)));
+auto bits_of_lanes = [](auto lanes) -> unsigned int {
+    const flags8 f = __builtin_convertvector(lanes, flags8);
+    unsigned char bits;
+    __builtin_memcpy(&bits, &f, 1);
+    return bits;
+};
+// candidates of one query among `count` copied ones: how many are pairs, their ids in `row`
+auto scan = [&](const real* q, int own_id, int count, auto only_later) -> int {
+    int hits = 0;
+    auto later = [&](int b) -> unsigned int {
+        return only_later.value ? later_mask(b, own_id) : ~0u;
+    };
+    for (int b = 0, v = 0; b < count; b += LANES, ++v) {
+        const vec square = square_of(q, b);
+        const unsigned int allowed = later(b);
+        const unsigned int hit = mask_of(square, inside, Below{}) & allowed;
+        if constexpr (EXACTLY)
+            unsure[v] = hit ^ (mask_of(square, outside, BelowOrAt{}) & allowed);
+        if constexpr (LIST)
+            pack(candidate_ids + b, row + hits, hit);
+        hits += __builtin_popcount(hit);
+    }
+    if constexpr (!EXACTLY)
+        return hits;
+    const int vectors = (count + LANES - 1) / LANES;
+    for (int e = vectors; e < vectors + 3; ++e)
+        unsure[e] = 0;
+    int doubts = 0;
+    for (int v = 0; v < vectors; v += 4) {
+        unsigned long long four;
+        for (__builtin_memcpy(&four, unsure + v, 8); four;) {
+            const int e = __builtin_ctzll(four) / 16, b = (v + e) * LANES;
+            const unsigned int mask = (four >> (16 * e)) & 0xffff;
+            four &= ~(0xffffull << (16 * e));
+            for (int k = 0; k < DIM; ++k)
+                pack(candidate[k] + b, doubtful[k] + doubts, mask);
+            pack(candidate_ids + b, doubtful_ids + doubts, mask);
+            doubts += __builtin_popcount(mask);
+        }
+    }
+    for (int b = 0; b < doubts; b += 8) {
+        unsigned int left = doubts - b < 8 ? (1u << (doubts - b)) - 1 : 255;
+        if constexpr (!DOUBLE) {  // in twice the precision, eight at a time
+            doubles square;
+            for (int k = 0; k < DIM; ++k) {
+                const doubles d = __builtin_convertvector(*(const floats*)(doubtful[k] + b), doubles) - (double)q[k];
+                square = k == 0 ? d * d : square + d * d;
+            }
+            unsigned int pairs = left & bits_of_lanes(square < doubly_inside);
+            left &= ~pairs & bits_of_lanes(square <= doubly_outside);
+            for (; pairs; pairs &= pairs - 1)
+                row[hits++] = doubtful_ids[b + __builtin_ctz(pairs)];
+        }
+        for (; left; left &= left - 1) {
+            const int c = b + __builtin_ctz(left);
+            real p[3];
+            for (int k = 0; k < DIM; ++k)
+                p[k] = doubtful[k][c];
+            if (exact_pair(q, p))
+                row[hits++] = doubtful_ids[c];
+        }
+    }
+    return hits;
+};
+struct All { enum { value = 0 }; };
+struct Later { enum { value = 1 }; };
+
+// writes slots [from, until) of a row, from `row` while it lasts, then the fill value
+auto write_row = [&](int id, int from, int hits, bool last) {
+    int* out = idx.data + (long long)id * capacity;
+    const int stop = from + hits < capacity ? from + hits : capacity;
+    if (from == 0 && last && (capacity & 7) == 0 && ((unsigned long long)idx.data & 31) == 0) {
+        const eight_ints fill = eight_ints{} + n;
+        int s = 0;
+        for (; s + 8 <= stop; s += 8)
+            __builtin_nontemporal_store(*(const eight_ints*)(row + s), (eight_ints*)(out + s));
+        if (s < stop) {
+            eight_ints mixed = *(const eight_ints*)(row + s);
+            for (int e = 0; e < 8; ++e)
+                mixed[e] = s + e < stop ? mixed[e] : n;
+            __builtin_nontemporal_store(mixed, (eight_ints*)(out + s));
+            s += 8;
+        }
+        for (; s < capacity; s += 8)
+            __builtin_nontemporal_store(fill, (eight_ints*)(out + s));
+        return;
+    }
+    for (int s = from; s < stop; ++s)
+        out[s] = row[s - from];
+    if (last)
+        for (int s = stop; s < capacity; ++s)
+            out[s] = n;
+};
+
+auto position_of = [&](int place, real* q) {
+    for (int k = 0; k < DIM; ++k)
+        q[k] = own ? axis[k][place] : queries.data[(long long)DIM * query_ids[place] + k];
+};
+auto cells_of = [&](const real* q, whole* c) {
+    for (int k = 0; k < DIM; ++k)
+        c[k] = axis_cell(grid, k, q[k]);
+};
+
+// all queries of one cell: places [begin, end), whose bounding box is [low, high]
+auto serve = [&](int begin, int end, const real* low, const real* high) {
+    whole first[3] = {0, 0, 0}, last[3] = {0, 0, 0};
+    for (int k = 0; k < DIM; ++k) {
+        first[k] = axis_cell(grid, k, low[k] - radius);
+        last[k] = axis_cell(grid, k, high[k] + radius);
+        if (grid.dense) {
+            first[k] = first[k] < 0 ? 0 : first[k];
+            last[k] = last[k] >= grid.extent[k] ? grid.extent[k] - 1 : last[k];
+        }
+    }
+    int filled = 0, own_from = 0, own_to = 0, own_at = 0;
+    bool fresh = true;
+    auto flush = [&](bool finished) {
+        for (int e = 0; e < LANES; ++e)
+            for (int k = 0; k < DIM; ++k)
+                candidate[k][filled + e] = __builtin_nanf("");
+        for (int place = begin; place < end; ++place) {
+            real q[3];
+            position_of(place, q);
+            const int id = query_ids[place];
+            const int self = drop_self && place >= own_from && place < own_to ? own_at + place - own_from : -1;
+            if (self >= 0)
+                candidate[0][self] = __builtin_nanf("");
+            const int before = fresh ? 0 : count.data[id];
+            const int hits = later_only ? scan(q, id, filled, Later{}) : scan(q, id, filled, All{});
+            if (self >= 0)
+                candidate[0][self] = q[0];
+            if constexpr (LIST)
+                write_row(id, before, hits, finished);
+            count.data[id] = before + hits;
+            longest = before + hits > longest ? before + hits : longest;
+        }
+        fresh = false;
+        filled = own_from = own_to = 0;
+    };
+    auto copy = [&](int from, int to) {  // sources at places [from, to)
+        while (from < to) {
+            if (filled == CANDIDATES)
+                flush(false);
+            const int room = CANDIDATES - filled, size = to - from < room ? to - from : room;
+            for (int k = 0; k < DIM; ++k)
+                for (int s = 0; s < size; ++s)
+                    candidate[k][filled + s] = axis[k][from + s];
+            for (int s = 0; s < size; ++s)
+                candidate_ids[filled + s] = ids[from + s];
+            const int low_place = from > begin ? from : begin, high_place = from + size < end ? from + size : end;
+            if (own && low_place < high_place) {
+                own_from = low_place;
+                own_to = high_place;
+                own_at = filled + low_place - from;
+            }
+            filled += size;
+            from += size;
+        }
+    };
+    const int length = (int)(last[0] - first[0] + 1);
+    int seen[ROWS], rows = 0;
+    for (whole z = first[2]; z <= last[2] && length > 0; ++z)
+        for (whole y = first[1]; y <= last[1]; ++y) {
+            if (grid.dense) {
+                const int row = row_start(grid, y, z);
+                copy(start[row + first[0]], start[row + last[0] + 1]);
+                continue;
+            }
+            const int begins = ring(row_start(grid, y, z) + ring(first[0], grid.cells), grid.cells);
+            int front = 0, back = 0;  // entries shared with rows that were copied before
+            for (int r = 0; r < rows; ++r) {
+                const int behind = ring(begins - seen[r], grid.cells), ahead = grid.cells - behind;
+                if (behind < length)
+                    front = length - behind > front ? length - behind : front;
+                else if (ahead < length)
+                    back = length - ahead > back ? length - ahead : back;
+            }
+            seen[rows++] = begins;
+            const int size = length - front - back, from = ring(begins + front, grid.cells);
+            if (size <= 0)
+                continue;
+            if (from + size <= grid.cells)
+                copy(start[from], start[from + size]);
+            else {
+                copy(start[from], start[grid.cells]);
+                copy(start[0], start[from + size - grid.cells]);
+            }
+        }
+    flush(true);
+};
+
+for (;;) {
+    const int chunk = __atomic_fetch_add(&shared.next_chunk, 1, __ATOMIC_RELAXED);
+    if ((long long)chunk * CHUNK >= places)
+        break;
+    int place = chunk * CHUNK;
+    const int chunk_end = places - place < CHUNK ? places : place + CHUNK;
+    whole cell[3], other[3];
+    real q[3];
+    auto same_cell = [&](const whole* a, const whole* b) {
+        bool same = true;
+        for (int k = 0; k < DIM; ++k)
+            same = same && a[k] == b[k];
+        return same;
+    };
+    if (place > 0 && place < finite_places) {  // a cell belongs to the chunk that holds its first place
+        position_of(place - 1, q);
+        cells_of(q, cell);
+        for (; place < finite_places; ++place) {
+            position_of(place, q);
+            cells_of(q, other);
+            if (!same_cell(cell, other))
+                break;
+        }
+    }
+    while (place < chunk_end) {
+        if (place >= finite_places) {
+            const int id = query_ids[place++];
+            count.data[id] = 0;
+            if constexpr (LIST)
+                write_row(id, 0, 0, true);
+            continue;
+        }
+        real low[3], high[3];
+        position_of(place, q);
+        cells_of(q, cell);
+        for (int k = 0; k < DIM; ++k)
+            low[k] = high[k] = q[k];
+        int end = place + 1;
+        for (; end < finite_places; ++end) {
+            position_of(end, q);
+            cells_of(q, other);
+            if (!same_cell(cell, other))
+                break;
+            for (int k = 0; k < DIM; ++k) {
+                low[k] = q[k] < low[k] ? q[k] : low[k];
+                high[k] = q[k] > high[k] ? q[k] : high[k];
+            }
+        }
+        serve(place, end, low, high);
+        place = end;
+    }
+}
+int known = __atomic_load_n(&info.data[0], __ATOMIC_RELAXED);
+while (known < longest && !__atomic_compare_exchange_n(&info.data[0], &known, longest, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+}
+if (LIST && longest > capacity)
+    __atomic_fetch_or(&info.data[1], 1, __ATOMIC_RELAXED);
+"""
+
+
+class Kernels(NamedTuple):
+    """The two kernels of a variant, both launched with dim = 1 (`query` once per thread)."""
+
+    build: wp.Kernel
+    query: wp.Kernel
+
+
+@functools.cache
+def cell_kernels(dim: int, double: bool, scaled: bool, lists: bool, exact: bool = True) -> Kernels:
+    """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts alone.
+
+    With exact=False the working precision alone decides (`|d|^2 < r^2 (1 - 8 eps)`): only to measure what exactness costs.
+    """
+    scalar = wp.float64 if double else wp.float32
+    variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}{'' if exact else '_inexact'}"
+    options = {"SCALED": scaled, "LIST": lists, "REACH": 1, "EXACTLY": exact}
+    points = wp.array2d(dtype=scalar)
+    reals, ints, rows = wp.array(dtype=scalar), wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
+
+    def build_native(
+        positions: points, queries: points, cutoff: reals, info: ints, scratch: ints, n: int, m: int, own: int, table: int
+    ): ...
+
+    def query_native(
+        positions: points, queries: points, cutoff: reals, idx: rows, count: ints, info: ints, scratch: ints,
+        n: int, m: int, own: int, table: int, capacity: int, closed: int, drop_self: int, later_only: int,
+    ): ...  # fmt: skip
+
+    for native in (build_native, query_native):
+        native.__name__ = native.__qualname__ = f"{native.__name__}_{variant}"
+    native_text = functools.partial(snippet, "double" if double else "float", dim, CELLS, _LAYOUT, **options)
+    build_function = wp.func_native(_ENTER + native_text(_BUILD) + _LEAVE)(build_native)
+    query_function = wp.func_native(_ENTER + native_text(EXACT, _QUERY) + _LEAVE)(query_native)
+
+    def build(positions: points, queries: points, cutoff: reals, info: ints, scratch: ints, n: int, m: int, own: int, table: int):
+        build_function(positions, queries, cutoff, info, scratch, n, m, own, table)
+
+    def query(
+        positions: points, queries: points, cutoff: reals, idx: rows, count: ints, info: ints, scratch: ints,
+        n: int, m: int, own: int, table: int, capacity: int, closed: int, drop_self: int, later_only: int,
+    ):  # fmt: skip
+        query_function(
+            positions, queries, cutoff, idx, count, info, scratch, n, m, own, table, capacity, closed, drop_self, later_only
+        )
+
+    module = wp.get_module(f"jfrnn.kernels.cells_cpu.{variant}")
+    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
+    return Kernels(wp.kernel(build, module=module), wp.kernel(query, module=module))
