@@ -49,6 +49,21 @@ def run(
 
 
 @app.command()
+def gpu(
+    config: Annotated[Path, typer.Argument(help="GPU config, TOML.")],
+    out: Annotated[Path, typer.Option(help="Folder of the rows.")],
+) -> None:
+    """Decide every hard case on the GPU, then take all timings; rows are added to OUT/rows.jsonl one by one."""
+    with _usage_errors():
+        from experiments import _gpu
+
+        wrong = _gpu.run(_gpu.load(config), out)
+        typer.echo(f"{wrong} wrong; rows in {out / 'rows.jsonl'}")
+        if wrong:
+            raise typer.Exit(1)
+
+
+@app.command()
 def report(folder: Annotated[Path, typer.Argument(help="Folder of a sweep.")]) -> None:
     """Print the table of a sweep beside the thesis's, and draw its pictures."""
     with _usage_errors():
@@ -68,6 +83,18 @@ def domain(
 
         table = _domain.domain_table(separations or [10.0, 1e2, 1e3, 1e4, 1e5, 1e6], points)
         typer.echo(table.to_string(index=False, float_format="%.3g"))
+
+
+@app.command()
+def crossover(
+    out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform.")] = Path("out") / "crossovers",
+    repeats: Annotated[int, typer.Option(min=20, help="Timed runs of each backend.")] = 30,
+) -> None:
+    """Time the backends side by side over sizes and neighbors: what `backend="auto"` goes by."""
+    with _usage_errors():
+        from experiments import _crossover
+
+        typer.echo(_crossover.measure(out, repeats=repeats))
 
 
 @app.command()

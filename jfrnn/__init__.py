@@ -9,8 +9,9 @@ Array([1, 1, 0], dtype=int32)
 [[0, 1], [1, 0]]
 """
 
+from jfrnn._memory import MemoryPlan, memory_plan
 from jfrnn._neighbors import NeighborList
 from jfrnn._search import count, search
 from jfrnn._status import NeighborOverflowError, Status
 
-__all__ = ["NeighborList", "NeighborOverflowError", "Status", "count", "search"]
+__all__ = ["MemoryPlan", "NeighborList", "NeighborOverflowError", "Status", "count", "memory_plan", "search"]

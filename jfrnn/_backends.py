@@ -20,6 +20,7 @@ class Options(NamedTuple):
 
     filter: Filter
     backend: str
+    radius: float | None = None  # of the cutoff, for the one engine that builds its grid from the host: hashgrid
 
 
 class Rows(NamedTuple):
@@ -41,6 +42,8 @@ def neighbors(sources: Array, queries: Array | None, cutoff: Cutoff, options: Op
     n, m = sources.shape[0], (sources if queries is None else queries).shape[0]
     if options.backend == "warp" and 0 not in (n, m):
         return Rows(*_warp.neighbors(sources, queries, cutoff, options.filter, capacity))
+    if options.radius is not None and 0 not in (n, m):
+        return Rows(*_warp.hashgrid_neighbors(sources, queries, cutoff, options.radius, options.filter, capacity))
     if 0 in (n, m):
         idx, count = None if capacity is None else jnp.full((m, capacity), n, jnp.int32), jnp.zeros(m, jnp.int32)
     elif capacity is None:

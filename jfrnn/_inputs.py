@@ -13,6 +13,7 @@ from jax.core import Tracer
 from jfrnn._exact import Cutoff, largest_cutoff, make_cutoff, smallest_cutoff
 
 BACKENDS = ("auto", "jax", "warp", "hashgrid", "brute")
+_MOST_POINTS = 2**31 - 32
 
 
 def checked_positions(name: str, positions: Any, like: Array | None = None) -> Array:  # noqa: ANN401
@@ -32,8 +33,8 @@ def checked_positions(name: str, positions: Any, like: Array | None = None) -> A
         )
     if len(shape) != 2 or shape[1] not in (2, 3):
         raise ValueError(f"{name} must have shape [n, 2] or [n, 3], one row per particle, got shape {list(shape)}.")
-    if shape[0] > 2**31 - 32:
-        raise ValueError(f"{name} hold {shape[0]} particles, but indices are int32: at most {2**31 - 32}.")
+    if shape[0] > _MOST_POINTS:
+        raise ValueError(f"{name} hold {shape[0]} particles, but indices are int32: at most {_MOST_POINTS}.")
     if like is not None and (dtype, shape[1]) != (like.dtype, like.shape[1]):
         raise ValueError(
             f"{name} must match positions ({like.dtype}, {like.shape[1]} columns), got {dtype} with {shape[1]} columns."
@@ -95,11 +96,34 @@ def checked_slack(slack: Any) -> float:  # noqa: ANN401
     return float(slack)
 
 
+def checked_size(name: str, size: Any) -> int:  # noqa: ANN401
+    """Return a number of points that are not there yet."""
+    if isinstance(size, bool) or not isinstance(size, int | np.integer):
+        raise TypeError(f"{name} must be an int, the number of points, got {_describe(size)}.")
+    if not 0 <= size <= _MOST_POINTS:
+        raise ValueError(f"{name} must be a number of points from 0 to {_MOST_POINTS}, got {size}.")
+    return int(size)
+
+
+def checked_kind(dim: Any, dtype: Any) -> tuple[int, np.dtype]:  # noqa: ANN401
+    """Return the dimensions and the dtype of positions that are not there yet."""
+    if isinstance(dim, bool) or not isinstance(dim, int | np.integer) or dim not in (2, 3):
+        raise ValueError(f"dim must be 2 or 3, got {_describe(dim)}.")
+    if np.dtype(dtype) not in (np.float32, np.float64):
+        raise TypeError(f"dtype must be float32 or float64, got {np.dtype(dtype)}.")
+    if np.dtype(dtype) == np.float64 and not jax.config.read("jax_enable_x64"):
+        raise TypeError(
+            "dtype is float64, but JAX's 64-bit mode is off, so that no search can have such positions: call "
+            'jax.config.update("jax_enable_x64", True) at start-up, or pass dtype=np.float32.'
+        )
+    return int(dim), np.dtype(dtype)
+
+
 def checked_backend(backend: Any) -> str:  # noqa: ANN401
-    """Return the name of the engine that a backend stands for."""
+    """Return the name of a backend."""
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(map(repr, BACKENDS))}, got {backend!r}.")
-    return "jax" if backend == "auto" else backend
+    return backend
 
 
 def _describe(value: Any) -> str:  # noqa: ANN401

@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
+from jfrnn._auto import choose_engine
 from jfrnn._backends import Options, Rows, neighbors
 from jfrnn._exact import Cutoff
 from jfrnn._inputs import (
@@ -54,7 +55,9 @@ def search(
         capacity: Slots per row, a static int. Required where positions are traced. Default: `slack` times the longest row,
             rounded up to a multiple of 8.
         slack: Factor >= 1 on the counted capacity, room for later motion.
-        backend: "auto", "jax" (cells, any device) or "brute" (all n·m candidates). "auto" takes "jax".
+        backend: "warp" (cells, compiled kernels, on CPU and NVIDIA GPUs), "hashgrid" (Warp's own `wp.HashGrid`, there too), "jax"
+            (cells, any device), "brute" (all n·m candidates), or "auto": "warp" where it can run, else "jax" with a warning.
+            The platform is that of the positions, where they are traced that of `jax.default_device`.
 
     Returns:
         A `NeighborList`; `idx` has shape [m, capacity], unused slots hold n. Rows are in no promised order, but the same input
@@ -62,10 +65,12 @@ def search(
 
     Raises:
         TypeError, ValueError: an argument is of the wrong kind, shape or range, or `capacity` is missing under jit.
+        ImportError: "warp" or "hashgrid" without the package that they need.
+        RuntimeError: "warp" or "hashgrid" on a platform on which Warp cannot run.
         Overflow of a given capacity and non-finite coordinates are known only from data: `status`, `overflow` and `check` tell.
 
-    Memory: 4 B per slot for the list; besides it at most 64 MB for the block in work and, whatever the box, 100 B per
-    particle (float64: 125 B).
+    Memory: 4 B per slot for the list; besides it, whatever the box, "warp" takes at most 64 B and "hashgrid" 84 B per particle,
+    "jax" and "brute" at most 64 MB for the block in work and 100 B per particle (float64: 125 B). See `memory_plan`.
     Differentiable: the list is topology, without gradient; see `NeighborList.vectors`. Jit: yes, with capacity. vmap: yes, with
     capacity. Source: cell lists (Hockney & Eastwood 1981, ch. 8); strict cutoff (Peifle 2019, §2.2).
     """
@@ -114,9 +119,9 @@ def count(
         Neighbors per row, shape [m], int32. A particle with a non-finite coordinate has none, and is nobody's.
 
     Raises:
-        TypeError, ValueError: an argument is of the wrong kind, shape or range.
+        TypeError, ValueError, ImportError, RuntimeError: as in `search`.
 
-    Memory: at most 64 MB and 100 B per particle (float64: 125 B). Differentiable: no (integers). Jit: yes. vmap: yes.
+    Memory: as in `search`, without the list. Differentiable: no (integers). Jit: yes. vmap: yes.
     """
     problem = _checked_problem(positions, cutoff, queries, half, include_self, closed, backend)
     return _count(*problem)
@@ -149,7 +154,9 @@ def _checked_problem(
         later_only=checked_flag("half", half),
     )
     pair_cutoff = checked_cutoff(cutoff, np.dtype(sources.dtype), closed)
-    return _Problem(sources, queries, pair_cutoff, Options(pair_filter, checked_backend(backend)))
+    engine = choose_engine(checked_backend(backend), sources, queries)
+    radius = float(pair_cutoff.radius) if engine == "hashgrid" else None
+    return _Problem(sources, queries, pair_cutoff, Options(pair_filter, engine, radius))
 
 
 def _counted_capacity(problem: _Problem, slack: float) -> int:

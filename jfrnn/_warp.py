@@ -6,6 +6,7 @@ depends on (JAX's persistent compilation cache sees no more than that name).
 
 import ctypes
 import functools
+import math
 import os
 import sys
 from collections.abc import Callable
@@ -13,9 +14,10 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
-from jax import Array
+import numpy as np
+from jax import Array, lax
 
-from jfrnn._exact import Cutoff
+from jfrnn._exact import Cutoff, make_cutoff
 from jfrnn._runs import Filter
 
 if TYPE_CHECKING:
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 INSTALL = 'pip install "jfrnn[warp]"'
 _PLACES_PER_THREAD = 2048  # below, a second thread costs more than it saves
 _HUGE = 1 << 22  # bytes from which a buffer is worth a request for huge pages
+_PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
 
 
 class Variant(NamedTuple):
@@ -78,7 +81,15 @@ def missing(platform: str) -> str | None:
 
 def neighbors(sources: Array, queries: Array | None, cutoff: Cutoff, keep: Filter, capacity: int | None) -> Result:
     """Search among cells with the Warp kernels; capacity=None only counts."""
-    return _call(_cells_callable, sources, queries, cutoff, keep, capacity, _scratch_words)
+
+    def on(platform: str) -> Callable[..., Result]:
+        def call(sources: Array, queries: Array | None, cutoff: Cutoff) -> Result:
+            make, words = _CELLS[platform]
+            return _call(make, sources, queries, cutoff, keep, capacity, words)
+
+        return call
+
+    return lax.platform_dependent(sources, queries, cutoff, cpu=on("cpu"), cuda=on("cuda"))
 
 
 def _call(
@@ -104,24 +115,75 @@ def _call(
     return Result(idx[0] if lists else None, count, info[0], info[1])
 
 
-def _scratch_words(n: int, m: int, dim: int, width: int, own: bool) -> int:
+def scratch_bytes(engine: str, platform: str, n: int, m: int, dim: int, double: bool, own: bool) -> int:
+    """Return what "warp" or "hashgrid" takes beside its list [B]: the scratch it is given, and what Warp allocates for itself."""
     load_warp()
-    from jfrnn.kernels import cells_cpu
+    if platform not in _PLATFORMS:
+        raise RuntimeError(f"backend={engine!r} runs on the platforms {', '.join(map(repr, _PLATFORMS))}, got {platform!r}.")
+    if 0 in (n, m):
+        return 0
+    width = 2 if double else 1
+    if engine == "warp":
+        return 4 * _CELLS[_PLATFORMS[platform]].scratch_words(n, m, dim, width, own)
+    from jfrnn.kernels import hashgrid
 
-    return cells_cpu.scratch_words(n, m, dim, width, own)
+    # warp/native/hashgrid.cpp: two ints per cell; of each point its cell and its id, room for 1.5 n, twice for the sort
+    grid = 8 * math.prod(hashgrid.grid_shape(n, dim)) + 16 * (3 * n // 2)
+    return 4 * hashgrid.scratch_words(n, m, dim, width, own) + grid
 
 
 # --- cells ------------------------------------------------------------------------------------------------------------
 
 
+class _Engine(NamedTuple):
+    make: Callable[[Variant], Any]
+    scratch_words: Callable[..., int]
+
+
 @functools.cache
-def _cells_callable(variant: Variant) -> Any:  # noqa: ANN401
-    return _register("cells", variant, _run_cells)
+def _cpu_callable(variant: Variant) -> Any:  # noqa: ANN401
+    return _register("cells_cpu", variant, _run_cells_on_cpu)
 
 
-def _register(name: str, variant: Variant, run: Callable[..., None]) -> Any:  # noqa: ANN401
-    """Make a function that XLA calls: positions, queries and cutoff in; [rows,] counts, info and scratch out."""
+@functools.cache
+def _cuda_callable(variant: Variant) -> Any:  # noqa: ANN401
     wp = load_warp()
+    if wp.is_cuda_available():
+        _cuda_kernels(variant).load(wp.get_cuda_device())
+    # Warp records the launches of a call once and replays them: one launch from the host, whatever XLA makes of the call
+    return _register("cells_cuda", variant, _run_cells_on_cuda, wp.JaxCallableGraphMode.WARP)
+
+
+def _cpu_scratch_words(*sizes: Any) -> int:  # noqa: ANN401
+    load_warp()
+    from jfrnn.kernels import cells_cpu
+
+    return cells_cpu.scratch_words(*sizes)
+
+
+def _cuda_scratch_words(*sizes: Any) -> int:  # noqa: ANN401
+    load_warp()
+    from jfrnn.kernels import cells_cuda
+
+    return cells_cuda.scratch_words(*sizes)
+
+
+_CELLS = {"cpu": _Engine(_cpu_callable, _cpu_scratch_words), "cuda": _Engine(_cuda_callable, _cuda_scratch_words)}
+
+
+def _register(
+    name: str,
+    variant: Variant,
+    run: Callable[..., None],
+    graphs: Any = None,  # noqa: ANN401
+    radius: float | None = None,
+) -> Any:  # noqa: ANN401
+    """Make a function that XLA calls: positions, queries and cutoff in; [rows,] counts, info and scratch out.
+
+    `graphs` is Warp's way with CUDA graphs, by default none. One that knows its radius bears it in its name.
+    """
+    wp = load_warp()
+    graphs = wp.JaxCallableGraphMode.NONE if graphs is None else graphs
     scalar = wp.float64 if variant.double else wp.float32
     points, reals = wp.array2d(dtype=scalar), wp.array(dtype=scalar)
     ints, rows = wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
@@ -136,11 +198,41 @@ def _register(name: str, variant: Variant, run: Callable[..., None]) -> Any:  # 
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
     flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
     func.__name__ = "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
+    if radius is not None:
+        func.__name__ += f"_{radius.hex().replace('-', 'minus')}"  # Warp drops what an identifier cannot hold
     func.__qualname__ = func.__name__
-    return wp.jax_callable(func, num_outputs=4 if variant.lists else 3, vmap_method="sequential")
+    return wp.jax_callable(func, num_outputs=4 if variant.lists else 3, graph_mode=graphs, vmap_method="sequential")
 
 
-def _run_cells(
+def _cuda_kernels(variant: Variant) -> Any:  # noqa: ANN401
+    from jfrnn.kernels import cells_cuda
+
+    return cells_cuda.cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, variant.keep.later_only)
+
+
+def _run_cells_on_cuda(
+    variant: Variant,
+    positions: "warp.array",
+    queries: "warp.array",
+    cutoff: "warp.array",
+    idx: "warp.array | None",
+    count: "warp.array",
+    info: "warp.array",
+    scratch: "warp.array",
+) -> None:
+    from jfrnn.kernels import cells_cuda
+
+    wp = load_warp()
+    n, m = positions.shape[0], queries.shape[0]
+    idx, capacity = _rows_or_nothing(idx, count)
+    sizes = [n, m, int(variant.own), cells_cuda.table_cells(n), capacity]
+    arguments = [positions, queries, cutoff, idx, count, info, scratch, *sizes, int(variant.closed), int(variant.keep.drop_self)]
+    for launch in _cuda_kernels(variant).launches(n, m, variant.own):
+        inputs = [*arguments, int(launch.of_queries)]
+        wp.launch(launch.kernel, dim=launch.threads, inputs=inputs, device=count.device, block_dim=launch.block)
+
+
+def _run_cells_on_cpu(
     variant: Variant,
     positions: "warp.array",
     queries: "warp.array",
@@ -151,21 +243,24 @@ def _run_cells(
     scratch: "warp.array",
 ) -> None:
     from jfrnn.kernels import cells_cpu
-    from jfrnn.kernels._native import table_cells
 
     wp = load_warp()
     kernels = cells_cpu.cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists)
     n, m = positions.shape[0], queries.shape[0]
-    sizes = [n, m, int(variant.own), table_cells(n)]
+    idx, capacity = _rows_or_nothing(idx, count)
+    sizes = [n, m, int(variant.own), cells_cpu.table_cells(n)]
     wp.launch(kernels.build, dim=1, inputs=[positions, queries, cutoff, info, scratch, *sizes], device="cpu")
-    if idx is None:
-        idx, capacity = wp.array(ptr=count.ptr, shape=(0, 0), dtype=wp.int32, device="cpu"), 0
-    else:
-        capacity = idx.shape[1]
-        _ask_for_huge_pages(idx.ptr, 4 * m * capacity)
+    _ask_for_huge_pages(idx.ptr, 4 * m * capacity)
     flags = [int(variant.closed), int(variant.keep.drop_self), int(variant.keep.later_only)]
     arguments = [positions, queries, cutoff, idx, count, info, scratch, *sizes, capacity, *flags]
     _on_every_core(lambda: wp.launch(kernels.query, dim=1, inputs=arguments, device="cpu"), -(-m // _PLACES_PER_THREAD))
+
+
+def _rows_or_nothing(idx: "warp.array | None", count: "warp.array") -> tuple["warp.array", int]:
+    """Return the rows and their capacity; without rows something of their kind that nobody writes to."""
+    if idx is not None:
+        return idx, idx.shape[1]
+    return load_warp().array(ptr=count.ptr, shape=(count.shape[0], 1), dtype=count.dtype, device=count.device), 0
 
 
 def _on_every_core(launch: Callable[[], None], most: int) -> None:
@@ -198,3 +293,64 @@ def _ask_for_huge_pages(address: int, size: int) -> None:
 @functools.cache
 def _libc() -> ctypes.CDLL:
     return ctypes.CDLL(None)
+
+
+# --- hash grid --------------------------------------------------------------------------------------------------------
+
+
+def hashgrid_neighbors(
+    sources: Array, queries: Array | None, cutoff: Cutoff, radius: float, keep: Filter, capacity: int | None
+) -> Result:
+    """Search with `wp.HashGrid`; capacity=None only counts. `radius` is the cutoff's, static: the grid is built from the host."""
+    version = load_warp().__version__
+    if tuple(map(int, version.split(".")[:2])) < (1, 19):
+        raise ImportError(
+            f"the backend 'hashgrid' needs warp-lang 1.19: the HashGrid of {version} can list a pair twice. {INSTALL}"
+        )
+    from jfrnn.kernels import hashgrid
+
+    def make(variant: Variant) -> Any:  # noqa: ANN401
+        return _hashgrid_callable(variant, radius)
+
+    return _call(make, sources, queries, cutoff, keep, capacity, hashgrid.scratch_words)
+
+
+@functools.cache
+def _hashgrid_callable(variant: Variant, radius: float) -> Any:  # noqa: ANN401
+    bounds = make_cutoff(radius, np.dtype(np.float64 if variant.double else np.float32), variant.closed)
+    return _register("hashgrid", variant, functools.partial(_run_hashgrid, bounds), radius=radius)
+
+
+def _run_hashgrid(
+    bounds: Cutoff,
+    variant: Variant,
+    positions: "warp.array",
+    queries: "warp.array",
+    cutoff: "warp.array",
+    idx: "warp.array | None",
+    count: "warp.array",
+    info: "warp.array",
+    scratch: "warp.array",
+) -> None:
+    from jfrnn.kernels import hashgrid
+
+    wp = load_warp()
+    n, device = positions.shape[0], count.device
+    kernels = hashgrid.hashgrid_kernels(variant.dim, variant.double, variant.scaled, variant.lists)
+    shape = hashgrid.grid_shape(n, variant.dim)
+    packed = wp.array(ptr=scratch.ptr, shape=n, dtype=wp.vec3d if variant.double else wp.vec3f, device=device)
+    info.zero_()
+    wp.launch(kernels.pack, dim=n, inputs=[positions, cutoff, wp.vec3i(*shape)], outputs=[packed, info], device=device)
+    grid = _hash_grid(str(device), shape, variant.double)
+    grid.build(packed, float(bounds.radius))
+    scalars = [float(x) for x in (bounds.inside, bounds.outside, bounds.unit_scale)]
+    flags = [int(x) for x in (variant.own, variant.closed, variant.keep.drop_self, variant.keep.later_only)]
+    arguments = [grid.id, positions, queries, cutoff, *scalars, *flags]
+    wp.launch(kernels.query, dim=queries.shape[0], inputs=arguments, outputs=[idx, count, info], device=device)
+
+
+@functools.cache
+def _hash_grid(device: str, shape: tuple[int, int, int], double: bool) -> Any:  # noqa: ANN401
+    """Keep one grid per device and shape: launches on a device run one after the other."""
+    wp = load_warp()
+    return wp.HashGrid(*shape, device=device, dtype=wp.float64 if double else wp.float32)

@@ -21,7 +21,7 @@ def snippet(scalar: str, dim: int, *pieces: str, **constants: int) -> str:
     """
     lines = [f"using real = {scalar};", f"using whole = {'long long' if scalar == 'double' else 'int'};"]
     lines += [f"constexpr int DIM = {dim};", f"constexpr bool DOUBLE = {int(scalar == 'double')};"]
-    lines += [f"constexpr int {name} = {int(value)};" for name, value in constants.items()]
+    lines += [f"constexpr int {name} = {int(value)};" for name, value in {"ORDER": 0, **constants}.items()]
     return "\n".join(["", "{", _NO_CONTRACTION, *lines, _PORTABLE, *pieces, "}", ""])
 
 
@@ -39,201 +39,221 @@ _NO_CONTRACTION = """
 _PORTABLE = r"""
 const real radius = cutoff.data[0];
 #if defined(__CUDA_ARCH__)
-auto add = [](double a, double b) { return __dadd_rn(a, b); };
-auto mul = [](double a, double b) { return __dmul_rn(a, b); };
-auto product_error = [](double a, double b, double p) { return __fma_rn(a, b, -p); };
+#define JFRNN_FUNCTION static __device__ __forceinline__
+#define JFRNN_CALL static __device__ __noinline__
 #else
-auto add = [](double a, double b) { return a + b; };
-auto mul = [](double a, double b) { return a * b; };
-auto product_error = [](double a, double b, double p) {
-#if defined(__FMA__) || defined(__aarch64__)
-    return __builtin_fma(a, b, -p);
-#else
-    const double ca = 134217729.0 * a, cb = 134217729.0 * b;  // Veltkamp's split
-    const double ah = ca - (ca - a), bh = cb - (cb - b);
-    const double al = a - ah, bl = b - bh;
-    return al * bl - (((p - ah * bh) - al * bh) - ah * bl);
+#define JFRNN_FUNCTION static
+#define JFRNN_CALL static __attribute__((noinline))
 #endif
-};
-#endif
-auto bits_of = [](real x) -> unsigned long long {
-    if constexpr (DOUBLE) {
-        unsigned long long b;
-        memcpy(&b, &x, 8);
-        return b;
-    } else {
-        unsigned int b;
-        memcpy(&b, &x, 4);
-        return b;
+struct Bits {  // of floats
+    enum { MANTISSA = DOUBLE ? 52 : 23, EXPONENTS = DOUBLE ? 0x7ff : 0xff, BIAS = DOUBLE ? 1023 : 127 };
+    JFRNN_FUNCTION unsigned long long of(real x) {
+        if constexpr (DOUBLE) {
+            unsigned long long b;
+            memcpy(&b, &x, 8);
+            return b;
+        } else {
+            unsigned int b;
+            memcpy(&b, &x, 4);
+            return b;
+        }
+    }
+    JFRNN_FUNCTION int exponent(real x) { return (int)(of(x) >> MANTISSA) & EXPONENTS; }
+    JFRNN_FUNCTION bool finite(real x) { return exponent(x) != EXPONENTS; }
+    JFRNN_FUNCTION double power_of_two(int e) {
+        const unsigned long long b = (unsigned long long)(e + 1023) << 52;
+        double x;
+        memcpy(&x, &b, 8);
+        return x;
+    }
+    // power of two that brings r into [1, 4) and is itself a normal float
+    JFRNN_FUNCTION double unit_scale(real r) {
+        const int e = exponent(r) - BIAS, largest = BIAS - 1;
+        return power_of_two(e > largest ? -largest : -e);
     }
 };
-auto is_finite = [&](real x) { return ((bits_of(x) >> (DOUBLE ? 52 : 23)) & (DOUBLE ? 0x7ff : 0xff)) != (DOUBLE ? 0x7ff : 0xff); };
 """
 
-# Where a pair is decided. Needs `radius` and `closed`. Step 1 belongs to the kernels: working precision against `inside` and
-# `outside`, a band of 8 eps around r^2 (3 eps would do, see jfrnn/_exact.py). `exact_pair` answers for what falls into the band:
-# in twice the precision (float32), then by error-free sums, then in integers as wide as the float format.
+# Where a pair is decided. Step 1 belongs to the kernels: working precision and a band of 8 eps around r^2 (less would do, see
+# jfrnn/_exact.py). `Exact::pair` answers for what falls into the band: in twice the precision (float32), then by error-free sums,
+# then in integers as wide as the float format. It is a call, not inlined, so that what it needs is not held in registers elsewhere.
 EXACT = r"""
-const int radius_exponent = [&] {
-    const int e = (int)(bits_of(radius) >> (DOUBLE ? 52 : 23)) - (DOUBLE ? 1023 : 127);
-    return e;
-}();
-// power of two that brings r into [1, 4) and is itself a normal float
-auto power_of_two = [](int e) -> double {
-    const unsigned long long b = (unsigned long long)(e + 1023) << 52;
-    double x;
-    memcpy(&x, &b, 8);
-    return x;
-};
-const double unit_scale = power_of_two(radius_exponent > (DOUBLE ? 1022 : 126) ? -(DOUBLE ? 1022 : 126) : -radius_exponent);
-const real step_scale = SCALED ? real(unit_scale) : real(1);
+const real step_scale = SCALED ? real(Bits::unit_scale(radius)) : real(1);
 const real step_radius = SCALED ? radius * step_scale : radius;
 const real step_eps = DOUBLE ? real(2.220446049250313e-16) : real(1.1920929e-07f);
-const real inside = step_radius * step_radius * (real(1) - 8 * step_eps);
-const real outside = step_radius * step_radius * (real(1) + 8 * step_eps);
 
-auto two_sum = [&](double a, double b, double& error) {  // Knuth 1969
-    const double s = add(a, b);
-    const double bv = add(s, -a);
-    error = add(add(a, -add(s, -bv)), add(b, -bv));
-    return s;
-};
-
-// sign of |b - a|^2 - r^2 by error-free transformations (Ogita, Rump & Oishi 2005, doi:10.1137/030601818); 2: not proven
-auto sum_sign = [&](const real* a, const real* b) -> int {
-    constexpr int TERMS = 3 * DIM + 2;
-    double term[TERMS];
-    double slack = 0;
-    bool plain = true;
-    const double r = mul(double(radius), unit_scale);
-    const double r2 = mul(r, r);
-    term[0] = -r2;
-    term[1] = -product_error(r, r, r2);
-    const double smallest = power_of_two(radius_exponent - 450 < -970 ? -970 : radius_exponent - 450);
-    for (int k = 0; k < DIM; ++k) {
-        const double ak = double(a[k]), bk = double(b[k]);
-        if constexpr (DOUBLE)
-            plain = plain && (ak == 0 || !(ak > -smallest && ak < smallest)) && (bk == 0 || !(bk > -smallest && bk < smallest));
-        double low;
-        double high = two_sum(bk, -ak, low);
-        high = mul(high, unit_scale);
-        low = mul(low, unit_scale);
-        plain = plain && high > -1e6 && high < 1e6;  // beyond, two_sum may have overflowed
-        const double square = mul(high, high), tail = mul(mul(2, high), low);
-        term[3 * k + 2] = square;
-        term[3 * k + 3] = product_error(high, high, square);
-        term[3 * k + 4] = tail;
-        slack = add(slack, add(mul(tail < 0 ? -tail : tail, 2.220446049250313e-16), mul(mul(2, low), low)));
+struct Exact {
+#if defined(__CUDA_ARCH__)
+    JFRNN_FUNCTION double add(double a, double b) { return __dadd_rn(a, b); }
+    JFRNN_FUNCTION double mul(double a, double b) { return __dmul_rn(a, b); }
+    JFRNN_FUNCTION double product_error(double a, double b, double p) { return __fma_rn(a, b, -p); }
+#else
+    JFRNN_FUNCTION double add(double a, double b) { return a + b; }
+    JFRNN_FUNCTION double mul(double a, double b) { return a * b; }
+    JFRNN_FUNCTION double product_error(double a, double b, double p) {
+#if defined(__FMA__) || defined(__aarch64__)
+        return __builtin_fma(a, b, -p);
+#else
+        const double ca = 134217729.0 * a, cb = 134217729.0 * b;  // Veltkamp's split
+        const double ah = ca - (ca - a), bh = cb - (cb - b);
+        const double al = a - ah, bl = b - bh;
+        return al * bl - (((p - ah * bh) - al * bh) - ah * bl);
+#endif
     }
-    if (!plain)
-        return 2;
-    for (int pass = 0; pass < 3; ++pass) {  // VecSum: the exact sum stays, most of it in the last term
-        double total = term[0];
-        for (int t = 1; t < TERMS; ++t) {
-            double error;
-            total = two_sum(total, term[t], error);
-            term[t - 1] = error;
+#endif
+    JFRNN_FUNCTION double size_of(double x) { return x < 0 ? -x : x; }
+    JFRNN_FUNCTION double two_sum(double a, double b, double& error) {  // Knuth 1969
+        const double s = add(a, b);
+        const double bv = add(s, -a);
+        error = add(add(a, -add(s, -bv)), add(b, -bv));
+        return s;
+    }
+
+    // sign of |b - a|^2 - r^2 by error-free transformations (Ogita, Rump & Oishi 2005, doi:10.1137/030601818); 2: not proven
+    JFRNN_FUNCTION int sum_sign(const real* a, const real* b, real radius) {
+        constexpr int TERMS = 3 * DIM + 2;
+        double term[TERMS];
+        double slack = 0;
+        bool plain = true;
+        const double scale = Bits::unit_scale(radius);
+        const double r = mul(double(radius), scale);
+        const double r2 = mul(r, r);
+        term[0] = -r2;
+        term[1] = -product_error(r, r, r2);
+        const int exponent = Bits::exponent(radius) - Bits::BIAS;
+        const double smallest = Bits::power_of_two(exponent - 450 < -970 ? -970 : exponent - 450);
+#pragma unroll
+        for (int k = 0; k < DIM; ++k) {
+            const double ak = double(a[k]), bk = double(b[k]);
+            if constexpr (DOUBLE)
+                plain = plain && (ak == 0 || !(size_of(ak) < smallest)) && (bk == 0 || !(size_of(bk) < smallest));
+            double low;
+            double high = two_sum(bk, -ak, low);
+            high = mul(high, scale);
+            low = mul(low, scale);
+            plain = plain && size_of(high) < 1e6;  // beyond, two_sum may have overflowed
+            const double square = mul(high, high), tail = mul(mul(2, high), low);
+            term[3 * k + 2] = square;
+            term[3 * k + 3] = product_error(high, high, square);
+            term[3 * k + 4] = tail;
+            slack = add(slack, add(mul(size_of(tail), 2.220446049250313e-16), mul(mul(2, low), low)));
         }
-        term[TERMS - 1] = total;
+        if (!plain)
+            return 2;
+#pragma unroll
+        for (int pass = 0; pass < 3; ++pass) {  // VecSum: the exact sum stays, most of it in the last term
+            double total = term[0];
+#pragma unroll
+            for (int t = 1; t < TERMS; ++t) {
+                double error;
+                total = two_sum(total, term[t], error);
+                term[t - 1] = error;
+            }
+            term[TERMS - 1] = total;
+        }
+        double rest = slack;
+#pragma unroll
+        for (int t = 0; t < TERMS - 1; ++t)
+            rest = add(rest, size_of(term[t]));
+        rest = mul(2, rest);  // twice: covers the rounding of this sum itself
+        const double lead = term[TERMS - 1];
+        return lead > rest ? 1 : lead < -rest ? -1 : lead == 0 && rest == 0 ? 0 : 2;
     }
-    double rest = slack;
-    for (int t = 0; t < TERMS - 1; ++t)
-        rest = add(rest, term[t] < 0 ? -term[t] : term[t]);
-    rest = mul(2, rest);  // twice: covers the rounding of this sum itself
-    const double lead = term[TERMS - 1];
-    if (lead > rest)
-        return 1;
-    if (lead < -rest)
-        return -1;
-    return lead == 0 && rest == 0 ? 0 : 2;
-};
 
-// sign of |b - a|^2 - r^2 in integers: limbs of 24 bits in units of the smallest denormal, only the few that are not zero
-auto integer_sign = [&](const real* a, const real* b) -> int {
-    constexpr int LIMBS = DOUBLE ? 4 : 2;  // limbs that one mantissa can touch
-    constexpr int MANTISSA = DOUBLE ? 52 : 23, EXPONENTS = DOUBLE ? 0x7ff : 0xff;
-    auto first_limb = [&](real x) {
-        const int e = (int)(bits_of(x) >> MANTISSA) & EXPONENTS;
+    // limb i of a float: 24 bits of its integer in units of the smallest denormal
+    JFRNN_FUNCTION int first_limb(real x) {
+        const int e = Bits::exponent(x);
         return ((e > 1 ? e : 1) - 1) / 24;
-    };
-    auto limb = [&](real x, int i) -> long long {
-        const unsigned long long bits = bits_of(x);
-        const int e = (int)(bits >> MANTISSA) & EXPONENTS;
-        const unsigned long long mantissa = (bits & ((1ull << MANTISSA) - 1)) | ((unsigned long long)(e > 0) << MANTISSA);
-        const int shift = 24 * i - ((e > 1 ? e : 1) - 1);
+    }
+    JFRNN_FUNCTION long long limb(real x, int i) {
+        const unsigned long long bits = Bits::of(x), lead = Bits::exponent(x) > 0;
+        const unsigned long long mantissa = (bits & ((1ull << Bits::MANTISSA) - 1)) | (lead << Bits::MANTISSA);
+        const int e = Bits::exponent(x), shift = 24 * i - ((e > 1 ? e : 1) - 1);
         const unsigned long long word = shift <= -24 || shift >= 64 ? 0 : shift >= 0 ? mantissa >> shift : mantissa << -shift;
         const long long value = (long long)(word & 0xffffff);
         return (bits >> (DOUBLE ? 63 : 31)) & 1 ? -value : value;
-    };
-    int lowest = first_limb(radius), highest = lowest;
-    for (int k = 0; k < DIM; ++k) {
-        const int la = first_limb(a[k]), lb = first_limb(b[k]);
-        lowest = la < lowest ? la : lowest;
-        lowest = lb < lowest ? lb : lowest;
-        highest = la > highest ? la : highest;
-        highest = lb > highest ? lb : highest;
     }
-    long long carry = 0, seen = 0;
-    for (int t = 2 * lowest; t < 2 * (highest + LIMBS); ++t) {
-        long long sum = carry;
+    // sign of |b - a|^2 - r^2 in integers: only the few limbs that are not zero are multiplied
+    JFRNN_CALL int integer_sign(real ax, real ay, real az, real bx, real by, real bz, real radius) {
+        constexpr int LIMBS = DOUBLE ? 4 : 2;  // that one mantissa can touch
+        const int lr = first_limb(radius);
+        int lowest = lr, highest = lr;
+#pragma unroll
         for (int k = 0; k < DIM; ++k) {
-            const int la = first_limb(a[k]), lb = first_limb(b[k]);
-            for (int s = 0; s < 2 * LIMBS; ++s) {
-                const int i = s < LIMBS ? la + s : lb + s - LIMBS;
-                if (s >= LIMBS && i >= la && i < la + LIMBS)
-                    continue;  // this limb stood in the first half
-                sum += (limb(b[k], i) - limb(a[k], i)) * (limb(b[k], t - i) - limb(a[k], t - i));
+            const int la = first_limb(k == 0 ? ax : k == 1 ? ay : az), lb = first_limb(k == 0 ? bx : k == 1 ? by : bz);
+            lowest = la < lowest ? la : lowest;
+            lowest = lb < lowest ? lb : lowest;
+            highest = la > highest ? la : highest;
+            highest = lb > highest ? lb : highest;
+        }
+        long long carry = 0, seen = 0;
+        for (int t = 2 * lowest; t < 2 * (highest + LIMBS); ++t) {
+            long long sum = carry;
+            for (int k = 0; k < DIM; ++k) {
+                const real a = k == 0 ? ax : k == 1 ? ay : az, b = k == 0 ? bx : k == 1 ? by : bz;
+                const int la = first_limb(a), lb = first_limb(b);
+                for (int s = 0; s < 2 * LIMBS; ++s) {
+                    const int i = s < LIMBS ? la + s : lb + s - LIMBS;
+                    if (s >= LIMBS && i >= la && i < la + LIMBS)
+                        continue;  // this limb stood in the first half
+                    sum += (limb(b, i) - limb(a, i)) * (limb(b, t - i) - limb(a, t - i));
+                }
             }
+            for (int s = 0; s < LIMBS; ++s)
+                sum -= limb(radius, lr + s) * limb(radius, t - lr - s);
+            seen |= sum & 0xffffff;
+            carry = sum >> 24;
         }
-        for (int s = 0; s < LIMBS; ++s)
-            sum -= limb(radius, first_limb(radius) + s) * limb(radius, t - first_limb(radius) - s);
-        seen |= sum & 0xffffff;
-        carry = sum >> 24;
+        return carry < 0 ? -1 : (seen | carry) != 0;
     }
-    return carry < 0 ? -1 : (seen | carry) != 0;
+
+    // the bounds of float32 pairs in float64: at most 5 of 16 units of 2^-53 are lost in a sum of squares
+    JFRNN_FUNCTION double doubly_inside(real radius) { return double(radius) * double(radius) * (1 - 0x1p-49); }
+    JFRNN_FUNCTION double doubly_outside(real radius) { return double(radius) * double(radius) * (1 + 0x1p-49); }
+
+    JFRNN_CALL bool pair(real ax, real ay, real az, real bx, real by, real bz, real radius, bool closed) {
+        const real a[3] = {ax, ay, az}, b[3] = {bx, by, bz};
+        if constexpr (!DOUBLE) {
+            double square = 0;
+#pragma unroll
+            for (int k = 0; k < DIM; ++k) {
+                const double d = double(b[k]) - double(a[k]);
+                square += d * d;
+            }
+            if (square < doubly_inside(radius))
+                return true;
+            if (square > doubly_outside(radius))
+                return false;
+        }
+        int sign = sum_sign(a, b, radius);
+        if (sign == 2)
+            sign = integer_sign(ax, ay, az, bx, by, bz, radius);
+        return sign < 0 || (sign == 0 && closed);
+    }
 };
-
-// the bounds of float32 pairs in float64: at most 5 of 16 units of 2^-53 are lost in a sum of squares
-const double doubly_inside = double(radius) * double(radius) * (1 - 0x1p-49);
-const double doubly_outside = double(radius) * double(radius) * (1 + 0x1p-49);
-
-auto exact_pair = [&](const real* a, const real* b) -> bool {
-    if constexpr (!DOUBLE) {
-        double square = 0;
-        for (int k = 0; k < DIM; ++k) {
-            const double d = double(b[k]) - double(a[k]);
-            square += d * d;
-        }
-        if (square < doubly_inside)
-            return true;
-        if (square > doubly_outside)
-            return false;
-    }
-    int sign = sum_sign(a, b);
-    if (sign == 2)
-        sign = integer_sign(a, b);
-    return sign < 0 || (sign == 0 && closed);
+auto exact_pair = [&](const real* a, const real* b) {
+    return Exact::pair(a[0], a[1], DIM == 3 ? a[DIM - 1] : 0, b[0], b[1], DIM == 3 ? b[DIM - 1] : 0, radius, closed);
 };
 """
 
-# Which cell a coordinate is in. Needs `radius`.
+# Which cell a coordinate is in: REACH cells fit into a cutoff along y and z, REACH_X along x. Needs `radius`.
 CELLS = r"""
-const real inverse_edge = real(REACH) / radius;
-auto cell_of = [&](real x) -> real {  // a whole float, monotone in x
+const real inverse_edge[3] = {real(REACH_X) / radius, real(REACH) / radius, real(REACH) / radius};
+auto cell_of = [&](int axis, real x) -> real {  // a whole float, monotone in x
 #if defined(__CUDA_ARCH__)
     if constexpr (DOUBLE)
-        return floor(__dmul_rn(x, inverse_edge));
+        return floor(__dmul_rn(x, axis == 0 ? inverse_edge[0] : inverse_edge[1]));
     else
-        return floorf(__fmul_rn(x, inverse_edge));
+        return floorf(__fmul_rn(x, axis == 0 ? inverse_edge[0] : inverse_edge[1]));
 #else
-    return DOUBLE ? real(__builtin_floor(x * inverse_edge)) : real(__builtin_floorf(x * inverse_edge));
+    return DOUBLE ? real(__builtin_floor(x * inverse_edge[axis])) : real(__builtin_floorf(x * inverse_edge[axis]));
 #endif
 };
 // number of a cell, monotone, consecutive for cells that touch: the integer itself, or the bits of floats too large for that
 auto cell_number = [&](real cell) -> whole {
     constexpr real WHOLE = DOUBLE ? real(9007199254740992.0) : real(16777216.0f);
     const real magnitude = cell < 0 ? -cell : cell;
-    const whole beyond = (whole)(bits_of(magnitude) - bits_of(WHOLE)) + (whole)WHOLE;
+    const whole beyond = (whole)(Bits::of(magnitude) - Bits::of(WHOLE)) + (whole)WHOLE;
     const whole number = magnitude < WHOLE ? (whole)magnitude : beyond;
     return cell < 0 ? -number : number;
 };
@@ -258,7 +278,7 @@ auto row_hash = [](long long y, long long z, int cells) -> int {
 };
 // cell along one axis as an integer: dense boxes count from the lowest cell, and everything outside is clamped to one cell beyond
 auto axis_cell = [&](const Grid& grid, int k, real x) -> whole {
-    const real cell = cell_of(x);
+    const real cell = cell_of(k, x);
     if (!grid.dense)
         return cell_number(cell);
     const real from_low = cell - grid.low[k];
@@ -271,12 +291,45 @@ auto ring = [](whole x, int cells) -> int {
     const whole r = x % cells;
     return (int)(r < 0 ? r + cells : r);
 };
+// place of a cell on a space-filling curve, in boxes of 2^bits cells per axis: to be compared with row-major order
+auto curve = [](const Grid& grid, unsigned int x, unsigned int y, unsigned int z) -> int {
+    int bits = 1;
+    for (int k = 0; k < DIM; ++k)
+        while ((1 << bits) < grid.extent[k])
+            ++bits;
+    if (ORDER == 2) {  // Hilbert (Skilling 2004, doi:10.1063/1.1751381)
+        unsigned int c[3] = {z, y, x};
+        for (unsigned int q = 1u << (bits - 1); q > 1; q >>= 1)
+            for (int k = 0; k < 3; ++k)
+                if (c[k] & q)
+                    c[0] ^= q - 1;
+                else {
+                    const unsigned int t = (c[0] ^ c[k]) & (q - 1);
+                    c[0] ^= t;
+                    c[k] ^= t;
+                }
+        c[1] ^= c[0];
+        c[2] ^= c[1];
+        unsigned int t = 0;
+        for (unsigned int q = 1u << (bits - 1); q > 1; q >>= 1)
+            t ^= c[2] & q ? q - 1 : 0;
+        z = c[0] ^ t;
+        y = c[1] ^ t;
+        x = c[2] ^ t;
+    }
+    unsigned int key = 0;  // Morton: the bits of all axes in turn
+    for (int b = 0; b < bits; ++b)
+        key |= (x >> b & 1) << 3 * b | (y >> b & 1) << (3 * b + 1) | (z >> b & 1) << (3 * b + 2);
+    return (int)key;
+};
 auto cell_key = [&](const Grid& grid, const real* p) -> int {  // a finite point; one outside a dense box is sorted into its border
     whole cell[3] = {0, 0, 0};
     for (int k = 0; k < DIM; ++k) {
         const whole c = axis_cell(grid, k, p[k]), end = grid.extent[k] - 1;
         cell[k] = !grid.dense ? c : c < 0 ? 0 : c > end ? end : c;
     }
+    if (ORDER != 0)
+        return curve(grid, (unsigned int)cell[0], (unsigned int)cell[1], (unsigned int)cell[2]);
     const int row = row_start(grid, cell[1], cell[2]);
     return grid.dense ? row + (int)cell[0] : ring(row + ring(cell[0], grid.cells), grid.cells);
 };
@@ -284,10 +337,17 @@ auto cell_key = [&](const Grid& grid, const real* p) -> int {  // a finite point
 auto lay_out = [&](Grid& grid, const real* low, const real* high, int table) {
     double cells = 1;
     for (int k = 0; k < DIM; ++k) {
-        grid.low[k] = cell_of(low[k]);
-        const double extent = double(cell_of(high[k])) - double(grid.low[k]) + 1;
+        grid.low[k] = cell_of(k, low[k]);
+        const double extent = double(cell_of(k, high[k])) - double(grid.low[k]) + 1;
         cells = extent <= table ? cells * extent : 2.0 * table;
         grid.extent[k] = extent <= table ? (int)extent : 1;
+    }
+    if (ORDER != 0) {  // a cube of 2^bits cells per axis; the caller's table must hold it
+        int side = 2;
+        for (int k = 0; k < DIM; ++k)
+            while (side < grid.extent[k])
+                side *= 2;
+        cells = double(side) * side * side;
     }
     grid.dense = cells <= table;
     grid.cells = grid.dense ? (int)cells : table;

@@ -73,7 +73,7 @@ for (int k = 0; k < DIM; ++k) {
 auto finite_point = [&](const real* p) {
     bool finite = true;
     for (int k = 0; k < DIM; ++k)
-        finite = finite && is_finite(p[k]);
+        finite = finite && Bits::finite(p[k]);
     return finite;
 };
 int finite = 0;
@@ -174,9 +174,9 @@ auto mask_of = [](vec a, real bound, auto comparison) -> unsigned int {  // one 
     return LANES == 4 ? bits & 15 : bits;
 #endif
 };
-auto later_mask = [&](int b, int own_id) -> unsigned int {  // candidates whose id is above the query's
+auto later_mask = [&](int b, int own_id) -> unsigned int {  // candidates whose id is above the query's, or its own id
     const ints ids = *(const ints*)(candidate_ids + b);
-    const flags f = __builtin_convertvector(ids > own_id, flags);
+    const flags f = __builtin_convertvector(ids >= own_id + drop_self, flags);
     unsigned short bits = 0;
     __builtin_memcpy(&bits, &f, LANES == 16 ? 2 : 1);
     return bits;
@@ -216,6 +216,8 @@ auto pack = [&](const auto* from, auto* to, unsigned int mask) {
         *to++ = from[__builtin_ctz(mask)];
 #endif
 };
+const real inside = step_radius * step_radius * (1 - 8 * step_eps), outside = step_radius * step_radius * (1 + 8 * step_eps);
+const double doubly_inside = Exact::doubly_inside(radius), doubly_outside = Exact::doubly_outside(radius);
 typedef float floats __attribute__((vector_size(32)));
 typedef double doubles __attribute__((vector_size(64)));
 typedef bool flags8 __attribute__((ext_vector_type(8)));
@@ -485,7 +487,7 @@ def cell_kernels(dim: int, double: bool, scaled: bool, lists: bool, exact: bool 
     """
     scalar = wp.float64 if double else wp.float32
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}{'' if exact else '_inexact'}"
-    options = {"SCALED": scaled, "LIST": lists, "REACH": 1, "EXACTLY": exact}
+    options = {"SCALED": scaled, "LIST": lists, "REACH": 1, "REACH_X": 1, "EXACTLY": exact}
     points = wp.array2d(dtype=scalar)
     reals, ints, rows = wp.array(dtype=scalar), wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
 

@@ -10,7 +10,7 @@ from jfrnn.cases.hard import HARD_CASES
 
 import jfrnn
 
-BACKENDS = ("jax", "brute", "warp")
+BACKENDS = ("jax", "brute", "warp", "hashgrid")
 CAPACITY = 704  # the fullest row of all hard cases fits
 
 

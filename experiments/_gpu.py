@@ -1,0 +1,471 @@
+"""One run on a GPU: every hard case against the oracle first, then all timings, rows written one at a time.
+
+A time counts only where its pairs were checked: lists are compared as sets with the array engine, whose decisions are its own.
+"""
+
+import functools
+import importlib
+import json
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, PositiveFloat, PositiveInt, ValidationError
+from tqdm import tqdm
+
+from experiments import _machine
+from experiments._errors import UsageError
+
+Strict = ConfigDict(extra="forbid", frozen=True)
+
+
+class Exactness(BaseModel):
+    """Which hard cases are decided on the device."""
+
+    model_config = Strict
+    backends: list[Literal["jax", "warp", "hashgrid", "brute"]]
+    dtypes: list[Literal["float32", "float64"]]
+    dims: list[Literal[2, 3]]
+    capacity: PositiveInt
+
+
+class Config(BaseModel):
+    """What is run, see experiments/configs/h200.toml."""
+
+    model_config = Strict
+    seed: int
+    reach_in_spacings: PositiveFloat
+    jitter_in_spacings: PositiveFloat
+    sizes: list[PositiveInt]
+    corners_fill: PositiveFloat
+    counts_only: list[PositiveInt]
+    studied_size: PositiveInt
+    calls: PositiveInt
+    steps: PositiveInt
+    repeats: PositiveInt
+    seconds_per_timing: PositiveFloat
+    exactness: Exactness
+
+
+def load(path: Path) -> Config:
+    """Read a config; raise UsageError that names what is wrong."""
+    try:
+        return Config.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except (tomllib.TOMLDecodeError, ValidationError) as error:
+        raise UsageError(f"{path}: {error}") from error
+
+
+def run(config: Config, folder: Path) -> int:
+    """Run everything and return the number of wrong hard cases; rows go to rows.jsonl."""
+    import jax
+
+    from jfrnn._warp import load_warp
+
+    jax.config.update("jax_enable_x64", True)
+    folder.mkdir(parents=True, exist_ok=True)
+    device = jax.devices()[0]
+    about = {"device": device.device_kind, "versions": _machine.versions() | {"warp-lang": load_warp().__version__}}
+    about |= _machine.commit()
+    wrong = 0
+    with (folder / "rows.jsonl").open("a", encoding="utf-8") as file:
+        for row in tqdm(_rows(config), desc="rows"):
+            wrong += int(row.get("wrong", 0) or 0)
+            file.write(json.dumps({**row, **about, "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())}) + "\n")
+            file.flush()
+    return wrong
+
+
+def _rows(config: Config) -> Iterator[dict[str, Any]]:
+    yield from _memory_rows()
+    yield from _exactness_rows(config.exactness)
+    yield _bandwidth_row(config)
+    for name, n in [("corners", 0), *(("jitter", n) for n in config.sizes)]:
+        points = _corners(config) if name == "corners" else _jitter_lattice(config, n)
+        yield from _scene_rows(config, name, points)
+    yield from _study_rows(config)
+    for n in config.counts_only:
+        yield _count_row(config, n)
+
+
+# --- scenes -----------------------------------------------------------------------------------------------------------
+
+
+def _jitter_lattice(config: Config, n: int) -> np.ndarray:
+    """Return a cubic lattice of spacing 1, every point moved at random, in random order: float32 [about n, 3]."""
+    random = np.random.default_rng(config.seed)
+    side = round(n ** (1 / 3))
+    sites = np.stack(np.meshgrid(*[np.arange(side, dtype=np.float32)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    sites += random.uniform(-config.jitter_in_spacings, config.jitter_in_spacings, sites.shape).astype(np.float32)
+    random.shuffle(sites)
+    return sites
+
+
+def _corners(config: Config) -> np.ndarray:
+    from jfrnn.cases import scene
+
+    random = np.random.default_rng(config.seed)
+    given = scene("corners", fill=config.corners_fill)
+    moved = given.positions / given.spacing + random.uniform(
+        -config.jitter_in_spacings, config.jitter_in_spacings, given.positions.shape
+    )
+    return random.permutation(moved).astype(np.float32)
+
+
+# --- exactness --------------------------------------------------------------------------------------------------------
+
+
+def _exactness_rows(config: Exactness) -> Iterator[dict[str, Any]]:
+    from jfrnn.cases.hard import HARD_CASES
+
+    import jfrnn
+
+    oracle = importlib.import_module("tests.reference")
+    for backend in config.backends:
+        for dtype in config.dtypes:
+            for dim in config.dims:
+                cases, wrong = 0, []
+                for name, case in HARD_CASES.items():
+                    if name == "denormal_lattice":  # a denormal cutoff is refused
+                        continue
+                    given = case.build(dtype, dim)
+                    most = max(len(given.positions), 0 if given.queries is None else len(given.queries))
+                    rows = 704 if most <= 704 else 2048  # shapes shared by many cases: few programs
+                    queries = None if given.queries is None else _padded(given.queries, rows)
+                    for closed in (False, True):
+                        nbrs = jfrnn.search(
+                            _padded(given.positions, rows),
+                            given.cutoff,
+                            queries=queries,
+                            capacity=config.capacity,
+                            closed=closed,
+                            backend=backend,
+                        )
+                        expected = _expected(oracle, name, dtype, dim, closed)
+                        found = oracle.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), nbrs.source_count)
+                        cases += 1
+                        if any(oracle.compare(found, expected)):
+                            wrong.append(f"{name}{'-closed' * closed}")
+                yield {
+                    "kind": "exactness", "method": backend, "dtype": dtype, "dim": dim,
+                    "cases": cases, "wrong": len(wrong), "wrong_cases": wrong,
+                }  # fmt: skip
+
+
+@functools.lru_cache(maxsize=1024)
+def _expected(oracle: Any, name: str, dtype: str, dim: int, closed: bool) -> Any:  # noqa: ANN401
+    from jfrnn.cases.hard import HARD_CASES
+
+    given = HARD_CASES[name].build(dtype, dim)
+    return oracle.reference_pairs(given.positions, given.cutoff, queries=given.queries, closed=closed)
+
+
+def _padded(points: np.ndarray, rows: int) -> np.ndarray:
+    return np.concatenate([points, np.full((rows - len(points), points.shape[1]), np.nan, points.dtype)])
+
+
+# --- memory -----------------------------------------------------------------------------------------------------------
+
+
+def _memory_rows() -> Iterator[dict[str, Any]]:
+    """Compare `memory_plan` with the peak of JAX's allocator and of Warp's pool; first of all, since peaks only rise."""
+    import jax
+
+    import jfrnn
+
+    random = np.random.default_rng(0)
+    blob = random.uniform(0, 8, (50_000, 3))
+    scenes = {f"two blobs, {gap:.0e} cutoffs apart": np.concatenate([blob, blob + np.array([gap, 0, 0])]) for gap in (10.0, 1e6)}
+    scenes["uniform"] = random.uniform(0, 60, (1_000_000, 3))
+    for name, points in scenes.items():
+        x = jax.numpy.asarray(points, jax.numpy.float32)
+        capacity = int(-(-int(jfrnn.count(x, 1.0, backend="warp").max()) // 8) * 8)
+        search = jax.jit(functools.partial(_listed, cutoff=1.0, capacity=capacity, backend="warp"))
+        compiled = search.lower(x).compile().memory_analysis()
+        before = _device_bytes("bytes_in_use")
+        jax.block_until_ready(search(x))
+        plan = jfrnn.memory_plan(len(points), 1.0, capacity, backend="warp")
+        yield {
+            "kind": "memory", "method": "warp", "layout": name, "points": len(points), "capacity": capacity,
+            "planned_bytes": plan.total_bytes, "planned_scratch_bytes": plan.scratch_bytes,
+            "compiled_bytes": compiled.temp_size_in_bytes + compiled.output_size_in_bytes,
+            "peak_bytes": _device_bytes("peak_bytes_in_use") - before, "warp_pool_bytes": _warp_pool_bytes(),
+        }  # fmt: skip
+
+
+def _device_bytes(what: str) -> int:
+    import jax
+
+    return (jax.devices()[0].memory_stats() or {}).get(what, 0)
+
+
+def _warp_pool_bytes() -> int:
+    import warp
+
+    return warp.get_mempool_used_mem_high("cuda:0") if warp.is_cuda_available() else 0
+
+
+# --- timings ----------------------------------------------------------------------------------------------------------
+
+
+def _listed(x: Any, *, cutoff: float, capacity: int, backend: str) -> Any:  # noqa: ANN401
+    import jfrnn
+
+    nbrs = jfrnn.search(x, cutoff, capacity=capacity, backend=backend)
+    return nbrs.idx, nbrs.count
+
+
+def _timed(config: Config, call: Callable[[], Any], calls: int | None = None) -> dict[str, Any]:
+    """Time calls that are not waited for one by one; a repeat ends when the last is done."""
+    import jax
+
+    jax.block_until_ready(call())
+    start = time.perf_counter()
+    jax.block_until_ready(call())
+    once = time.perf_counter() - start
+    calls = calls or max(1, min(config.calls, int(config.seconds_per_timing / config.repeats / max(once, 1e-9))))
+    seconds = []
+    for _ in range(config.repeats):
+        start = time.perf_counter()
+        for _ in range(calls):
+            result = call()
+        jax.block_until_ready(result)
+        seconds.append((time.perf_counter() - start) / calls)
+    return {
+        "median_s": float(np.median(seconds)), "p10_s": float(np.percentile(seconds, 10)),
+        "p90_s": float(np.percentile(seconds, 90)), "repeats": config.repeats, "calls": calls, "seconds": seconds,
+    }  # fmt: skip
+
+
+def _scene_rows(config: Config, layout: str, points: np.ndarray) -> Iterator[dict[str, Any]]:
+    import jax
+    import jax.numpy as jnp
+    from jax import lax
+
+    import jfrnn
+
+    x, cutoff, n = jnp.asarray(points), config.reach_in_spacings, len(points)
+    exact = np.asarray(jfrnn.count(x, cutoff, backend="jax"))
+    capacity = int(-(-int(exact.max()) // 8) * 8)
+    base = {"layout": layout, "points": n, "capacity": capacity, "dtype": "float32", "exact_directed_pairs": int(exact.sum())}
+    listed = functools.partial(_listed, cutoff=cutoff, capacity=capacity)
+
+    for backend in ("warp", "hashgrid"):
+        search = jax.jit(functools.partial(listed, backend=backend))
+        idx, count = search(x)
+        again = search(x)
+        row = {"kind": "call", "method": f"jfrnn {backend}", **base, "directed_pairs": int(np.asarray(count).sum(dtype=np.int64))}
+        row["wrong"] = int((np.asarray(count) != exact).sum())
+        row["same_bits_twice"] = bool((idx == again[0]).all() and (count == again[1]).all())
+        if n <= 1_000_000:
+            row["wrong"] += _different_rows(idx, jax.jit(functools.partial(listed, backend="jax"))(x)[0])
+        del idx, count, again
+        yield row | _timed(config, lambda search=search: search(x))
+    counts = jax.jit(lambda x: jfrnn.count(x, cutoff, backend="warp"))
+    yield {"kind": "call", "method": "jfrnn warp, counts", **base, "directed_pairs": int(counts(x).sum())} | _timed(
+        config, lambda: counts(x)
+    )
+    if n <= 1_000_000:
+
+        def step(x: Any, _: None) -> tuple[Any, Any]:  # noqa: ANN401
+            idx, count = listed(x, backend="warp")
+            return x + 0 * (idx[0, 0] + count[0]).astype(x.dtype), None
+
+        steps = jax.jit(lambda x: lax.scan(step, x, None, length=config.steps)[0])
+        row = _timed(config, lambda: steps(x), calls=3)
+        row["seconds"] = [s / config.steps for s in row["seconds"]]
+        yield {"kind": "scan", "method": "jfrnn warp", **base, **row} | {
+            name: row[name] / config.steps for name in ("median_s", "p10_s", "p90_s")
+        }
+    yield from _peer_rows(config, base, x, cutoff)
+
+
+def _different_rows(one: Any, other: Any) -> int:  # noqa: ANN401
+    """Count the rows of two padded lists that differ as sets."""
+    import jax.numpy as jnp
+
+    different = 0
+    for start in range(0, len(one), 1 << 17):
+        part = slice(start, start + (1 << 17))
+        different += int((jnp.sort(one[part], axis=1) != jnp.sort(other[part], axis=1)).any(axis=1).sum())
+    return different
+
+
+def _peer_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> Iterator[dict[str, Any]]:  # noqa: ANN401
+    for name, make in (("warp HashGrid", _plain_hashgrid), ("nvalchemi 0.5.0 cell_list", _nvalchemi)):
+        row: dict[str, Any] = {"kind": "call", "method": name, **base}
+        try:
+            call, pairs = make(x, cutoff, base["capacity"])
+            yield row | {"directed_pairs": pairs} | _timed(config, call)
+        except Exception as error:  # a peer that is missing or out of memory says so in its row
+            yield row | {"status": "failed", "reason": f"{type(error).__name__}: {error}"[:300]}
+
+
+def _plain_hashgrid(x: Any, cutoff: float, capacity: int) -> tuple[Callable[[], Any], int]:  # noqa: ANN401
+    """Return a call of `wp.HashGrid` as Warp's examples use it, without JAX: build, then one thread per particle."""
+    import warp as wp
+
+    from experiments._hashgrid_plain import list_neighbors_kernel
+
+    points = wp.array(np.asarray(x), dtype=wp.vec3, device="cuda")
+    n = len(points)
+    grid = wp.HashGrid(128, 128, 128, device="cuda")
+    idx, count = wp.empty((n, capacity), dtype=wp.int32, device="cuda"), wp.empty(n, dtype=wp.int32, device="cuda")
+
+    def call() -> None:
+        grid.build(points, cutoff)
+        wp.launch(list_neighbors_kernel, dim=n, inputs=[grid.id, points, cutoff, capacity], outputs=[idx, count], device="cuda")
+
+    call()
+    return _synchronized(call), int(count.numpy().sum(dtype=np.int64))
+
+
+class _synchronized:
+    """A call whose result `jax.block_until_ready` can wait for: Warp's stream."""
+
+    def __init__(self, call: Callable[[], None]) -> None:
+        self._call = call
+
+    def __call__(self) -> "_synchronized":
+        self._call()
+        return self
+
+    def block_until_ready(self) -> "_synchronized":
+        import warp as wp
+
+        wp.synchronize()
+        return self
+
+
+def _nvalchemi(x: Any, cutoff: float, capacity: int) -> tuple[Callable[[], Any], int]:  # noqa: ANN401
+    import jax
+    import jax.numpy as jnp
+    from nvalchemiops.jax.neighbors.cell_list import cell_list, estimate_cell_list_sizes  # pyright: ignore
+
+    low = jnp.min(x, axis=0)
+    lengths = jnp.max(x, axis=0) - low + 2 * cutoff
+    cell, pbc = jnp.diag(lengths)[None], jnp.zeros((1, 3), bool)
+    shifted = x - low + cutoff
+    cells, _, radius = estimate_cell_list_sizes(shifted, cell, cutoff, pbc)
+    search = jax.jit(
+        lambda x: cell_list(
+            x, cutoff, cell, pbc, max_neighbors=capacity, max_total_cells=int(cells), neighbor_search_radius=radius
+        )[:2]
+    )
+    return (lambda: search(shifted)), int(search(shifted)[1].sum())
+
+
+def _count_row(config: Config, n: int) -> dict[str, Any]:
+    """Count neighbors of so many particles that a list of them would not fit: random points, made on the device."""
+    import jax
+
+    import jfrnn
+
+    side = (n / 27.0) ** (1 / 3)  # 27 particles per cube of one cutoff: about 113 neighbors
+    x = jax.random.uniform(jax.random.key(config.seed), (n, 3), jax.numpy.float32, 0, side)
+    counts = jax.jit(lambda x: jfrnn.count(x, 1.0, backend="warp"))
+    total = int(np.asarray(counts(x)).sum(dtype=np.int64))
+    row = {
+        "kind": "call",
+        "method": "jfrnn warp, counts",
+        "layout": "random",
+        "points": n,
+        "dtype": "float32",
+        "directed_pairs": total,
+    }
+    return row | _timed(config, lambda: counts(x), calls=2) | {"peak_bytes": _device_bytes("peak_bytes_in_use")}
+
+
+# --- what the choices cost: kernels alone, on the device's clock ---------------------------------------------------------
+
+
+def _study_rows(config: Config) -> Iterator[dict[str, Any]]:
+    import warp as wp
+    from jfrnn.cases import scene
+
+    if not wp.is_cuda_available():
+        return
+    jitter = _jitter_lattice(config, config.studied_size)
+    given = scene("full")
+    lattice = np.random.default_rng(config.seed).permutation(given.positions).astype(np.float32)
+    for layout, points, cutoff in (("jitter", jitter, config.reach_in_spacings), ("full", lattice, given.cutoff)):
+        capacity, directed = _kernel_time(config, points, cutoff, 0, lists=False)[2:]
+        for what, options in _STUDIED.items():
+            capacity = -(-capacity // 8) * 8
+            seconds, stages, longest, pairs = _kernel_time(config, points, cutoff, capacity, **options)
+            yield {
+                "kind": "study", "method": what, "layout": layout, "points": len(points), "capacity": capacity,
+                "exact_directed_pairs": directed, "directed_pairs": pairs, "longest": longest, "median_s": seconds, **stages,
+            }  # fmt: skip
+
+
+_STUDIED: dict[str, dict[str, Any]] = {
+    "float32, exact, cells of r/4 along x": {},
+    "float32, working precision alone": {"exact": False},
+    "float32, whole rows of cells": {"trim": False},
+    "float64, exact": {"double": True},
+    "float64, working precision alone": {"double": True, "exact": False},
+    "counts alone": {"lists": False},
+    "cells of r": {"reach_x": 1},
+    "cells of r/2": {"reach": 2, "reach_x": 2},
+    "cells of r, row-major": {"reach_x": 1, "trim": False},
+    "cells of r, Morton": {"reach_x": 1, "order": 1},
+    "cells of r, Hilbert": {"reach_x": 1, "order": 2},
+    "cells of r/2, Morton": {"reach": 2, "reach_x": 2, "order": 1},
+    "cells of r/2, Hilbert": {"reach": 2, "reach_x": 2, "order": 2},
+}
+
+
+def _kernel_time(
+    config: Config, points: np.ndarray, cutoff: float, capacity: int, *, lists: bool = True, double: bool = False, **options: int
+) -> tuple[float, dict[str, float], int, int]:
+    """Return the seconds of one search and of each of its kernels, the longest row and the number of directed pairs."""
+    import warp as wp
+    from jfrnn.kernels import cells_cuda  # pyright: ignore
+
+    scalar, n = (wp.float64 if double else wp.float32), len(points)
+    kernels = cells_cuda.cell_kernels(3, double, False, lists, **options)
+    kernels.load("cuda:0")
+    x = wp.array(points.astype(np.float64 if double else np.float32), dtype=scalar, ndim=2, device="cuda")
+    # a space-filling curve fills a cube of 2^k cells per axis
+    side = 1 << max(1, int(np.ptp(points) / cutoff * options.get("reach", 1) + 2).bit_length())
+    table = max(cells_cuda.table_cells(n), side**3 if options.get("order") else 0)
+    scratch = wp.empty(cells_cuda.scratch_words(n, n, 3, 2 if double else 1, True, table), dtype=wp.int32, device="cuda")
+    idx = wp.empty((n, capacity) if lists else (1, 1), dtype=wp.int32, device="cuda")
+    count, info = wp.empty(n, dtype=wp.int32, device="cuda"), wp.empty(2, dtype=wp.int32, device="cuda")
+    radius = wp.array([cutoff], dtype=scalar, device="cuda")
+    arguments = [x, x, radius, idx, count, info, scratch, n, n, 1, table, capacity if lists else 0, 0, 1]
+    launches = kernels.launches(n, n, True, table)
+
+    def measure(until: int) -> float:
+        with wp.ScopedCapture("cuda") as capture:
+            for launch in launches[:until]:
+                inputs = [*arguments, int(launch.of_queries)]
+                wp.launch(launch.kernel, dim=launch.threads, inputs=inputs, device="cuda", block_dim=launch.block)
+        times = []
+        for _ in range(config.repeats):
+            begin, end = wp.Event("cuda", enable_timing=True), wp.Event("cuda", enable_timing=True)
+            wp.record_event(begin)
+            for _ in range(10):
+                wp.capture_launch(capture.graph)
+            wp.record_event(end)
+            times.append(wp.get_event_elapsed_time(begin, end) / 10 * 1e-3)
+        return float(np.median(times))
+
+    until = [measure(k + 1) for k in range(len(launches))]
+    names = ("bounds", "count", "scan", "scatter", "gather", "query")
+    stages = {f"{name}_s": float(s) for name, s in zip(names, np.diff([0.0, *until]), strict=True)}
+    return until[-1], stages, int(info.numpy()[0]), int(count.numpy().sum(dtype=np.int64))
+
+
+def _bandwidth_row(config: Config) -> dict[str, Any]:
+    """Measure the two ceilings: bytes per second of a copy, and float32 operations per second of fused multiply-adds."""
+    import jax
+    import jax.numpy as jnp
+
+    x = jnp.ones(1 << 28, jnp.float32)
+    copy = jax.jit(lambda x: x + 1)
+    seconds = _timed(config, lambda: copy(x), calls=10)["median_s"]
+    return {"kind": "ceiling", "method": "read and write", "bytes_per_s": 2 * x.nbytes / seconds, "median_s": seconds}

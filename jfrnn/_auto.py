@@ -1,0 +1,94 @@
+"""Which engine answers: what "auto" stands for on a platform, and whether a named engine can run there. Decided while tracing."""
+
+import functools
+import inspect
+import warnings
+from typing import NamedTuple
+
+import jax
+from jax import Array
+from jax.core import Tracer
+
+from jfrnn import _warp
+
+WARP_ENGINES = ("warp", "hashgrid")
+
+
+class Crossover(NamedTuple):
+    """From how many sources on Warp is the fastest engine of a platform, and which one is below that."""
+
+    warp_from: int
+    below: str
+
+
+# Measured by `python -m experiments crossover`, rows in experiments/results/crossovers/cpu.csv: compiled searches of random points
+# in 3D. Warp leads from 64 points on; below, the three engines differ by less than a call costs, and Warp compiles 20x sooner.
+_CROSSOVERS = {"cpu": Crossover(0, "warp"), "gpu": Crossover(0, "warp")}
+
+
+def choose_engine(backend: str, sources: Array, queries: Array | None) -> str:
+    """Return the engine that a backend stands for; raise where one that was named cannot run on the platform.
+
+    Raises:
+        ImportError: "warp" or "hashgrid", and Warp is not installed.
+        RuntimeError: "warp" or "hashgrid", and Warp cannot run on the platform.
+    """
+    if backend not in ("auto", *WARP_ENGINES):
+        return backend
+    platform = _platform_of(sources, sources if queries is None else queries)
+    if backend == "auto":
+        return fastest_engine(platform, sources.shape[0])
+    _warp.load_warp()
+    if reason := _what_is_missing(platform):
+        raise RuntimeError(f"backend={backend!r} cannot run on the platform {platform!r}: {reason}. Pass backend='jax'.")
+    return backend
+
+
+def fastest_engine(platform: str, sources: int) -> str:
+    """Return the engine that "auto" takes on a platform for a number of sources; warn once where Warp cannot run."""
+    if not _can_warp(platform):
+        return "jax"
+    warp_from, below = _CROSSOVERS.get(platform, Crossover(0, "warp"))
+    return "warp" if sources >= warp_from else below
+
+
+def default_platform() -> str:
+    """Return the JAX platform on which arrays are made and programs run where nothing else is said."""
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    if device is None:
+        return jax.default_backend()
+    return device if isinstance(device, str) else device.platform
+
+
+def _platform_of(*arrays: Array) -> str:
+    """Return the platform of concrete arrays; traced ones do not know where they will be."""
+    if any(isinstance(x, Tracer) for x in arrays):
+        return default_platform()
+    return next(iter(arrays[0].devices())).platform
+
+
+@functools.cache
+def _what_is_missing(platform: str) -> str | None:
+    return _warp.missing(platform)
+
+
+@functools.cache
+def _can_warp(platform: str) -> bool:
+    reason = _what_is_missing(platform)
+    if reason is None:
+        return True
+    warnings.warn(
+        f"backend='auto' takes the slower engine 'jax' on the platform {platform!r}: {reason}. "
+        "Pass backend='jax' to choose it without this warning.",
+        RuntimeWarning,
+        stacklevel=_level_of_caller(),
+    )
+    return False
+
+
+def _level_of_caller() -> int:
+    """Return the stacklevel that makes a warning name the caller of the library."""
+    frame, level = inspect.currentframe(), 0
+    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] == "jfrnn":
+        frame, level = frame.f_back, level + 1
+    return level

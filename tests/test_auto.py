@@ -1,0 +1,140 @@
+"""Which engine answers: "auto" on every platform, with and without Warp, and engines that are named but cannot run."""
+
+import collections
+import csv
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import jfrnn
+from jfrnn import _auto
+
+ROOT = Path(__file__).parent.parent
+X = np.random.default_rng(0).random((50, 3)).astype(np.float32)
+ROWS = ROOT / "experiments" / "results" / "crossovers" / "cpu.csv"
+
+
+def test_auto_takes_warp_and_says_so():
+    assert jfrnn.search(X, 0.3).backend == "warp"
+    assert jax.jit(lambda x: jfrnn.search(x, 0.3, capacity=50))(X).backend == "warp"
+    assert jfrnn.search(X, 0.3, queries=X[:5]).backend == "warp"
+    np.testing.assert_array_equal(jfrnn.count(X, 0.3), jfrnn.count(X, 0.3, backend="brute"))
+
+
+@pytest.mark.parametrize("backend", ["jax", "brute", "warp", "hashgrid"])
+def test_a_named_engine_is_the_one_that_runs(backend):
+    assert jfrnn.search(X, 0.3, backend=backend).backend == backend
+
+
+def run_without_warp(code):
+    """Run code in a fresh process that cannot import Warp; return its output."""
+    blocker = """
+import sys, warnings
+import numpy as np
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] == "warp":
+            raise ModuleNotFoundError(f"No module named {name!r}")
+
+sys.meta_path.insert(0, Blocker())
+import jfrnn
+X = np.random.default_rng(0).random((50, 3)).astype(np.float32)
+"""
+    done = subprocess.run([sys.executable, "-c", blocker + code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_without_warp_auto_takes_jax_and_warns_once():
+    text = run_without_warp("""
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    print(jfrnn.search(X, 0.3).backend, jfrnn.search(X, 0.2).backend, jfrnn.memory_plan(50, 0.3, 8).backend)
+    print(np.array_equal(jfrnn.count(X, 0.3), jfrnn.count(X, 0.3, backend="brute")))
+print(len(caught), caught[0].category.__name__, caught[0].filename)
+print(caught[0].message)
+""")
+    engines, same, warned, message = text.splitlines()
+    assert engines == "jax jax jax"
+    assert same == "True"
+    assert warned == "1 RuntimeWarning <string>"
+    assert message == (
+        "backend='auto' takes the slower engine 'jax' on the platform 'cpu': the backends 'warp' and 'hashgrid' need the package "
+        "warp-lang (1.18 or 1.19): pip install \"jfrnn[warp]\". Pass backend='jax' to choose it without this warning."
+    )
+
+
+def test_without_warp_named_engines_say_what_to_install():
+    text = run_without_warp("""
+warnings.simplefilter("error")
+for backend in ("warp", "hashgrid"):
+    for call in (jfrnn.search, jfrnn.count, lambda x, r, backend: jfrnn.memory_plan(50, r, 8, backend=backend)):
+        try:
+            call(X, 0.3, backend=backend)
+        except ImportError as error:
+            print(error)
+print(jfrnn.search(X, 0.3, backend="jax").backend, jfrnn.search(X, 0.3, backend="brute").backend)
+""")
+    *messages, engines = text.splitlines()
+    assert messages == 6 * [
+        "the backends 'warp' and 'hashgrid' need the package warp-lang (1.18 or 1.19): pip install \"jfrnn[warp]\""
+    ]
+    assert engines == "jax brute"
+
+
+@pytest.fixture
+def unknown_platform(monkeypatch):
+    """Pretend that JAX makes arrays on a platform for which Warp has no engine."""
+    monkeypatch.setattr(_auto, "default_platform", lambda: "abacus")
+    yield "abacus"
+    for function in (_auto._what_is_missing, _auto._can_warp):
+        function.cache_clear()
+
+
+def test_a_platform_without_warp_falls_back_and_warns_once(unknown_platform):
+    with pytest.warns(RuntimeWarning, match=r"the platform 'abacus': Warp has no engine for .*Pass backend='jax'") as caught:
+        for capacity in (40, 50):
+            assert jax.jit(lambda x, k=capacity: jfrnn.search(x, 0.3, capacity=k))(X).backend == "jax"
+    assert [warning.filename for warning in caught] == [__file__]
+
+
+@pytest.mark.parametrize("backend", ["warp", "hashgrid"])
+def test_a_named_engine_does_not_fall_back(backend, unknown_platform):
+    with pytest.raises(RuntimeError, match=f"backend='{backend}' cannot run on the platform 'abacus': Warp has no engine for"):
+        jax.jit(lambda x: jfrnn.search(x, 0.3, capacity=50, backend=backend))(X)
+
+
+def test_concrete_arrays_know_their_platform(unknown_platform):
+    assert jfrnn.search(jax.numpy.asarray(X), 0.3).backend == "warp"
+
+
+def test_the_default_device_decides_for_traced_arrays():
+    assert _auto.default_platform() == jax.default_backend()
+    for device in ("cpu", jax.devices("cpu")[0]):
+        with jax.default_device(device):
+            assert _auto.default_platform() == "cpu"
+
+
+def test_the_choice_is_the_measured_one():
+    """At every size and number of neighbors that was measured, no engine was much faster than the one that "auto" takes."""
+    scenes = collections.defaultdict(dict)
+    with ROWS.open(newline="") as stream:
+        for row in csv.DictReader(stream):
+            assert (row["missing"], row["extra"]) == ("0", "0")
+            scenes[int(row["n"]), int(row["neighbors"])][row["backend"]] = float(row["median_s"])
+    assert {16, 100_000} <= {n for n, _ in scenes}
+    for (n, _), seconds in scenes.items():
+        fastest = min(seconds.values())
+        assert seconds[_auto.fastest_engine("cpu", n)] < max(1.1 * fastest, fastest + 1e-4), n
+
+
+def test_the_choice_warns_nobody_here():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert _auto.fastest_engine("cpu", 10**6) == "warp"

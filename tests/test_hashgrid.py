@@ -1,0 +1,98 @@
+"""`backend="hashgrid"` where `wp.HashGrid` has its corners: shared buckets, cells beyond 32 bits, NaN, one program per cutoff."""
+
+import re
+
+import checked
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jfrnn.kernels.hashgrid import grid_shape
+
+import jfrnn
+from jfrnn import _warp
+
+
+@pytest.mark.parametrize(
+    ("sources", "dim", "shape"),
+    [
+        (1, 2, (16, 16, 1)),
+        (1, 3, (16, 16, 16)),
+        (2048, 3, (16, 16, 16)),
+        (2049, 3, (32, 16, 16)),
+        (10**6, 3, (128, 128, 128)),
+        (10**6, 2, (2048, 1024, 1)),
+        (2**31 - 32, 2, (4096, 4096, 1)),
+        (2**31 - 32, 3, (256, 256, 256)),
+    ],
+)
+def test_grid_follows_the_particles(sources, dim, shape):
+    assert grid_shape(sources, dim) == shape
+
+
+def test_distant_cells_that_share_a_bucket(dtype, dim):
+    """Blobs whole rounds of the grid apart, on both sides of the origin: every bucket holds particles of all of them."""
+    rng = np.random.default_rng(0)
+    rounds = rng.integers(-3, 4, (400, dim)) * 16 * 0.25
+    points = (rng.random((400, dim)) + rounds).astype(dtype)
+    checked.assert_exact(jfrnn.search(points, 0.25, backend="hashgrid"), points, 0.25)
+
+
+@pytest.mark.parametrize("offset", [-(2**20) - 0.5, 2**20, -(2**31), 2**31, -(2**40), 2**40])
+def test_cells_that_do_not_fit_a_grid(offset, dtype, dim):
+    """In units of the cutoff: where Warp 1.18 clamped, and where cell numbers leave 32 bits."""
+    cutoff = 2.0**-5
+    points = ((np.random.default_rng(1).integers(-9, 9, (200, dim)) / 3 + offset) * cutoff).astype(dtype)
+    checked.assert_exact(jfrnn.search(points, cutoff, backend="hashgrid"), points, cutoff)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_mostly_padding(value, dtype, dim):
+    points = np.random.default_rng(2).random((500, dim)).astype(dtype)
+    points[50:, 0] = value
+    nbrs = jfrnn.search(points, 0.3, backend="hashgrid", include_self=True)
+    checked.assert_exact(nbrs, points, 0.3, include_self=True)
+    assert not nbrs.count[50:].any()
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
+
+
+def test_non_finite_queries():
+    points, queries = np.random.default_rng(3).random((2, 100, 3)).astype(np.float32)
+    queries[7, 1] = np.nan
+    nbrs = jfrnn.search(points, 0.3, queries=queries, backend="hashgrid")
+    checked.assert_exact(nbrs, points, 0.3, queries=queries)
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
+
+
+def test_sizes_and_cutoffs_take_turns():
+    """The grid of one shape serves all: nothing of the last search may be left in it."""
+    for n, cutoff in [(900, 0.1), (3, 2.0), (1000, 0.05), (1, 1.0), (900, 0.2)]:
+        points = np.random.default_rng(n).random((n, 3)).astype(np.float32)
+        checked.assert_exact(jfrnn.search(points, cutoff, backend="hashgrid"), points, cutoff)
+
+
+def test_two_cutoffs_in_one_program():
+    points = np.random.default_rng(4).random((300, 2)).astype(np.float32)
+
+    @jax.jit
+    def both(x):
+        return [jfrnn.search(x, cutoff, capacity=100, backend="hashgrid") for cutoff in (0.1, 0.2)]
+
+    for nbrs, cutoff in zip(both(points), (0.1, 0.2)):
+        checked.assert_exact(nbrs, points, cutoff)
+
+
+def test_the_program_names_the_cutoff():
+    """JAX's persistent compilation cache knows a callable by its name alone."""
+    x = jnp.zeros((5, 3), jnp.float32)
+    names = set()
+    for cutoff in (0.25, 4.0, 0.3, np.nextafter(np.float32(0.3), np.float32(1))):
+        text = jax.jit(lambda x, r=cutoff: jfrnn.count(x, r, backend="hashgrid")).lower(x).as_text()
+        names |= set(re.findall(r"custom_call @(jfrnn_hashgrid_3d_f32_own_dropself_\w+)_0\(", text))
+    assert len(names) == 4
+
+
+def test_warp_1_18_is_refused(monkeypatch):
+    monkeypatch.setattr(_warp.load_warp(), "__version__", "1.18.0")
+    with pytest.raises(ImportError, match=r"needs warp-lang 1\.19: the HashGrid of 1\.18\.0 can list a pair twice"):
+        jfrnn.count(np.zeros((3, 2), np.float32), 1.1875, backend="hashgrid")

@@ -1,0 +1,180 @@
+"""`memory_plan`: what it predicts against what the compiled programs, Warp and the operating system say."""
+
+import dataclasses
+import doctest
+import itertools
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import warp as wp
+
+import jfrnn
+import jfrnn._memory
+from experiments import _measure
+
+ROOT = Path(__file__).parent.parent
+SIZES = [(1000, 40), (30_000, 256), (300_000, 40)]
+
+
+def compiled_bytes(n, capacity, dim, dtype, backend, queries=None, **options):
+    """Return what XLA says of a compiled search: bytes of the result and of temporary arrays."""
+
+    def search(x, q):
+        return jfrnn.search(x, 0.1, queries=q, capacity=capacity, backend=backend, **options)
+
+    points = [None if size is None else jax.ShapeDtypeStruct((size, dim), dtype) for size in (n, queries)]
+    memory = jax.jit(search).lower(*points).compile().memory_analysis()
+    return memory.output_size_in_bytes, memory.temp_size_in_bytes
+
+
+def assert_close(plan, measured):
+    """Fail unless list, scratch and total are within 10 % of what was measured."""
+    predicted = plan.list_bytes, plan.scratch_bytes, plan.total_bytes
+    assert predicted == pytest.approx((*measured, sum(measured)), rel=0.1)
+
+
+@pytest.mark.parametrize("queries", [None, 500, 400_000])
+@pytest.mark.parametrize(("n", "capacity"), SIZES)
+def test_warp_takes_what_was_planned(n, capacity, queries, dim, dtype):
+    plan = jfrnn.memory_plan(n, 0.1, capacity, dim=dim, dtype=dtype, queries=queries, backend="warp")
+    assert_close(plan, compiled_bytes(n, capacity, dim, dtype, "warp", queries))
+
+
+def test_warp_takes_at_most_64_bytes_per_particle(dim, dtype):
+    for (n, capacity), platform in itertools.product([(10, 1), *SIZES, (10**9, 64)], ["cpu", "gpu"]):
+        plan = jfrnn.memory_plan(n, 0.1, capacity, dim=dim, dtype=dtype, backend="warp", platform=platform)
+        assert plan.total_bytes <= 4 * n * capacity + 64 * n + 64_000
+
+
+@pytest.mark.parametrize("backend", ["jax", "brute"])
+@pytest.mark.parametrize(
+    ("n", "capacity", "dim", "dtype", "queries"),
+    [(1000, 40, 3, np.float32, None), (300_000, 256, 2, np.float64, None), (1000, 40, 2, np.float32, 30_000)],
+)
+def test_compiled_engines_take_what_was_planned(n, capacity, dim, dtype, queries, backend):
+    plan = jfrnn.memory_plan(n, 0.1, capacity, dim=dim, dtype=dtype, queries=queries, backend=backend)
+    assert_close(plan, compiled_bytes(n, capacity, dim, dtype, backend, queries, closed=True))
+    assert plan.scratch_bytes <= 64e6 + (100 if dtype == np.float32 else 125) * max(n, queries or 0)
+
+
+@pytest.mark.parametrize(("n", "dim"), [(1000, 2), (30_000, 3), (70_000, 3)])
+def test_hashgrid_takes_what_was_planned(n, dim, dtype):
+    x = np.random.default_rng(0).random((n, dim)).astype(dtype)
+    plan = jfrnn.memory_plan(n, 0.02, 8, dim=dim, dtype=dtype, backend="hashgrid")
+    listed, given = compiled_bytes(n, 8, dim, dtype, "hashgrid")
+    with wp.ScopedMemoryTracker(print=False) as tracker:
+        tracker.clear()
+        jax.block_until_ready(jfrnn.search(x, 0.02, capacity=8, backend="hashgrid"))
+        taken = wp._src.context.runtime.core.wp_alloc_tracker_get_peak_bytes()
+    assert_close(plan, (listed, given + taken))
+    assert plan.scratch_bytes <= 84 * n + 100_000
+
+
+BLOBS = """
+import sys
+import jax, jfrnn
+from jfrnn.cases import scene
+from experiments._measure import PeakMemory
+
+backend, n, separation = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
+blobs = scene("two-blobs", n=n, separation=separation)
+x, search = jax.numpy.asarray(blobs.positions), jax.jit(lambda x: jfrnn.search(x, blobs.cutoff, capacity=8, backend=backend))
+jax.block_until_ready(search(x[:10]))
+compiled = search.lower(x).compile()
+memory = PeakMemory()
+found = jax.block_until_ready(compiled(x))
+print(memory.source, memory.peak() - memory.start, blobs.cutoff, int(found.required))
+"""
+
+
+@pytest.mark.parametrize("backend", ["warp", "hashgrid"])
+def test_two_blobs_cost_the_same_however_far_apart(backend):
+    """Both take what was planned, whatever the box; the nearer ones leave some pages of it untouched.
+
+    Each search runs in a process of its own, which no earlier search has given memory to use again.
+    """
+    n, taken = 200_000, []
+    for separation in ("10", "1e6"):
+        command = [sys.executable, "-c", BLOBS, backend, str(n), separation]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+        source, size, cutoff, required = done.stdout.split()
+        if source != "VmHWM":
+            pytest.skip("this system cannot reset the peak of a process")
+        assert int(required) > 50
+        taken.append(int(size))
+    plan = jfrnn.memory_plan(n, float(cutoff), 8, backend=backend)
+    assert plan == jfrnn.memory_plan(n, 1e6 * float(cutoff), 8, backend=backend)
+    assert plan.list_bytes < min(taken) <= max(taken) < 1.1 * plan.total_bytes
+    assert abs(taken[1] - taken[0]) < 20 * n  # the cell table: 16 B per particle
+
+
+def test_a_plan_allocates_nothing():
+    memory, begin = _measure.PeakMemory(), time.perf_counter()
+    assert jfrnn.memory_plan(2_000_000_000, 0.1, 64, backend="warp").total_bytes > 560e9
+    assert jfrnn.memory_plan(300_000_000, 0.1, 64, backend="brute").total_bytes > 80e9
+    assert memory.peak() - memory.start < 1e9
+    assert time.perf_counter() - begin < 60
+
+
+@pytest.mark.parametrize(("n", "queries"), [(0, None), (0, 5), (5, 0)])
+@pytest.mark.parametrize("backend", ["warp", "hashgrid", "jax"])
+def test_nothing_to_search(n, queries, backend):
+    plan = jfrnn.memory_plan(n, 0.1, 7, queries=queries, backend=backend)
+    assert plan.list_bytes == 32 * (n if queries is None else queries) + 8
+    assert plan.scratch_bytes < 1000
+
+
+def test_auto_plans_the_engine_that_would_run():
+    plan = jfrnn.memory_plan(1000, 0.1, 40)
+    assert plan.backend == jfrnn.search(np.zeros((1000, 3), np.float32), 0.1, capacity=40).backend
+    assert plan == jfrnn.memory_plan(1000, 0.1, 40, backend=plan.backend, platform="cpu")
+    assert plan != jfrnn.memory_plan(1000, 0.1, 40, queries=1000)
+
+
+def test_the_plan_reads_well():
+    plan = jfrnn.MemoryPlan(list_bytes=12_345_678, scratch_bytes=1_000_000, backend="jax")
+    assert str(plan).splitlines() == [
+        "one search with backend='jax', beside the positions:",
+        "  list         12.35 MB",
+        "  scratch       1.00 MB",
+        "  total        13.35 MB",
+    ]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        plan.backend = "warp"
+
+
+def test_example_in_the_docstring():
+    assert doctest.testmod(jfrnn._memory) == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("error", "match", "arguments"),
+    [
+        (TypeError, r"n must be an int, the number of points, got float 1000\.0", {"n": 1e3}),
+        (ValueError, r"n must be a number of points from 0 to 2147483616, got -1", {"n": -1}),
+        (ValueError, r"queries must be a number of points from 0 to 2147483616, got 2147483648", {"queries": 2**31}),
+        (TypeError, r"queries must be an int, the number of points, got bool True", {"queries": True}),
+        (ValueError, r"cutoff must be positive and finite, got 0", {"cutoff": 0.0}),
+        (ValueError, r"capacity must be at least 1, got 0", {"capacity": 0}),
+        (ValueError, r"dim must be 2 or 3, got int 4", {"dim": 4}),
+        (TypeError, r"dtype must be float32 or float64, got int64", {"dtype": np.int64}),
+        (ValueError, r"backend must be one of 'auto', 'jax', 'warp', 'hashgrid', 'brute', got 'cuda'", {"backend": "cuda"}),
+        (RuntimeError, r"platform='abacus' is none that JAX has here.*name backend='warp'", {"platform": "abacus"}),
+        (RuntimeError, r"platform='abacus' is none that JAX has here", {"platform": "abacus", "backend": "jax"}),
+        (RuntimeError, r"backend='warp' runs on .*'cpu', 'gpu', 'cuda', got 'abacus'", {"platform": "abacus", "backend": "warp"}),
+    ],
+)
+def test_input_errors(error, match, arguments):
+    arguments = {"n": 10, "cutoff": 0.1, "capacity": 8} | arguments
+    with pytest.raises(error, match=match):
+        jfrnn.memory_plan(arguments.pop("n"), arguments.pop("cutoff"), arguments.pop("capacity"), **arguments)
+
+
+def test_float64_without_x64_is_refused():
+    with jax.enable_x64(False), pytest.raises(TypeError, match="dtype is float64, but JAX's 64-bit mode is off"):
+        jfrnn.memory_plan(10, 0.1, 8, dtype=np.float64)
