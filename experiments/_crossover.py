@@ -57,15 +57,15 @@ def _rows(n: int, neighbors: int, repeats: int) -> Iterator[dict[str, Any]]:
     backends = [backend for backend in BACKENDS if n <= MOST_POINTS.get(backend, n)]
     searches = {backend: _compile(x, cutoff, capacity, backend) for backend in backends}
     seconds, others = _time_in_turns(searches, x, repeats)
-    versions, commit = _machine.versions(), _machine.commit()
+    versions, commit, device = _machine.versions(), _machine.commit(), next(iter(x.devices()))
     for backend, search in searches.items():
         nbrs = search(x)
         found = _compare.compare(Found(nbrs.idx.nbytes, nbrs.pairs(), directed=True), exact, n)
         times = {name: f"{value:.3e}" for name, value in _measure.summarize(seconds[backend]).items() if name.endswith("_s")}
         yield {
-            **{"platform": x.device.platform, "n": n, "neighbors": neighbors, "mean_count": round(2 * len(exact) / n, 1)},
+            **{"platform": device.platform, "n": n, "neighbors": neighbors, "mean_count": round(2 * len(exact) / n, 1)},
             **{"capacity": capacity, "backend": backend, "repeats": repeats, **times},
-            **{"missing": found["missing"], "extra": found["extra"], "others_cores": others, "device": x.device.device_kind},
+            **{"missing": found["missing"], "extra": found["extra"], "others_cores": others, "device": device.device_kind},
             **{"jax": versions["jax"], "warp": versions["warp-lang"], **commit},
         }
 

@@ -16,9 +16,15 @@ from experiments import _table, _thesis
 from experiments._rows import Row
 
 # Colors of M. Okabe and K. Ito, distinct to color-blind eyes too; other methods take those that are left.
-COLORS = {"jax": "#0072B2", "cll": "#D55E00", "scipy-kdtree": "#009E73", "scipy-kdtree-nolist": "#56B4E9", "brute": "#999999"}
-OTHER_COLORS = ("#CC79A7", "#E69F00", "#000000", "#F0E442", "#7F3C8D", "#6B4423")
-MARKERS = {"jax": "o", "cll": "s", "scipy-kdtree": "^", "scipy-kdtree-nolist": "v", "brute": "D"}
+COLORS = {
+    **{"warp": "#CC79A7", "hashgrid": "#E69F00", "jax": "#0072B2", "cll": "#D55E00"},
+    **{"scipy-kdtree": "#009E73", "scipy-kdtree-nolist": "#56B4E9", "brute": "#999999"},
+}
+OTHER_COLORS = ("#000000", "#F0E442", "#7F3C8D", "#6B4423")
+MARKERS = {
+    **{"warp": "*", "hashgrid": "X", "jax": "o", "cll": "s"},
+    **{"scipy-kdtree": "^", "scipy-kdtree-nolist": "v", "brute": "D"},
+}
 PLAIN = FuncFormatter(lambda number, _: _table.count(int(number)) if number >= 1000 else f"{number:g}")
 Value = Callable[[Row], float | None]
 ThesisValue = Callable[[_thesis.Figures], float]

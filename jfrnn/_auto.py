@@ -15,15 +15,16 @@ WARP_ENGINES = ("warp", "hashgrid")
 
 
 class Crossover(NamedTuple):
-    """From how many sources on Warp is the fastest engine of a platform, and which one is below that."""
+    """From how many sources on Warp is the engine to take on a platform, and which one is below that."""
 
     warp_from: int
-    below: str
+    below: str = "jax"
 
 
-# Measured by `python -m experiments crossover`, rows in experiments/results/crossovers/cpu.csv: compiled searches of random points
-# in 3D. Warp leads from 64 points on; below, the three engines differ by less than a call costs, and Warp compiles 20x sooner.
-_CROSSOVERS = {"cpu": Crossover(0, "warp"), "gpu": Crossover(0, "warp")}
+# `python -m experiments crossover`, rows in experiments/results/crossovers/cpu.csv: compiled searches of 16 to 100 000 random points
+# in 3D with 30 and 108 neighbors. Warp is the fastest from 32 points on, with 2x at 256 and 15x at 100 000 over jax. Of 16 points,
+# brute force saves 30 us of 140 us a call, but takes 1.3 s to compile where Warp takes 0.05 s: it would need 40 000 calls to pay.
+_CROSSOVERS = {"cpu": Crossover(warp_from=0)}
 
 
 def choose_engine(backend: str, sources: Array, queries: Array | None) -> str:
@@ -48,8 +49,8 @@ def fastest_engine(platform: str, sources: int) -> str:
     """Return the engine that "auto" takes on a platform for a number of sources; warn once where Warp cannot run."""
     if not _can_warp(platform):
         return "jax"
-    warp_from, below = _CROSSOVERS.get(platform, Crossover(0, "warp"))
-    return "warp" if sources >= warp_from else below
+    crossover = _CROSSOVERS.get(platform, Crossover(warp_from=0))
+    return "warp" if sources >= crossover.warp_from else crossover.below
 
 
 def default_platform() -> str:

@@ -463,21 +463,20 @@ while (place < stop) {
                 };
                 if (!DOUBLE && ((capacity | before | writes) & 3) == 0) {  // four slots per lane
                     for (int s = 4 * lane; s < writes; s += 128) {
-                        unsigned int four;
-                        asm volatile("ld.shared.u32 %0, [%1];" : "=r"(four) : "r"(list + s));
+                        unsigned int four = 0;
+                        if (s < size)  // beyond the row's neighbors there may be no shared memory
+                            asm volatile("ld.shared.u32 %0, [%1];" : "=r"(four) : "r"(list + s));
                         *(int4*)(out + s) = make_int4(neighbor(s, four & 255), neighbor(s + 1, four >> 8 & 255),
                                                       neighbor(s + 2, four >> 16 & 255), neighbor(s + 3, four >> 24));
                     }
                 } else
                     for (int s = lane; s < writes; s += 32) {
-                        unsigned short number;
-                        if constexpr (DOUBLE) {
+                        unsigned short number = 0;
+                        if (DOUBLE && s < size)
                             asm volatile("ld.shared.u16 %0, [%1];" : "=h"(number) : "r"(list + 2 * s));
-                            out[s] = s < size ? warp.ids[s < size ? number : 0] : n;
-                        } else {
+                        else if (s < size)
                             asm volatile("ld.shared.u8 %0, [%1];" : "=h"(number) : "r"(list + s));
-                            out[s] = neighbor(s, number);
-                        }
+                        out[s] = DOUBLE ? (s < size ? warp.ids[number] : n) : neighbor(s, number);
                     }
             }
         }

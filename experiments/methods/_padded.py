@@ -15,10 +15,14 @@ def allocate_backend(positions: np.ndarray, cutoff: float, backend: str) -> int:
     return int(jfrnn.count(jax.numpy.asarray(positions), cutoff, backend=backend).max())
 
 
-def prepare_backend(positions: np.ndarray, cutoff: float, capacity: int, backend: str) -> Callable[[], jfrnn.NeighborList]:
-    """Compile the search, and return it."""
+def prepare_backend(
+    positions: np.ndarray, cutoff: float, capacity: int, backend: str, kernels: bool = False
+) -> Callable[[], jfrnn.NeighborList]:
+    """Compile the search, and return it; `kernels` of Warp compile when they first run, here on one particle."""
     search = jax.jit(lambda x: jfrnn.search(x, cutoff, capacity=capacity, backend=backend))
     compiled = search.lower(jax.ShapeDtypeStruct(positions.shape, positions.dtype)).compile()
+    if kernels:
+        jax.block_until_ready(search(positions[:1]))
     return lambda: jax.block_until_ready(compiled(jax.numpy.asarray(positions)))
 
 
