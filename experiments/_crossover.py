@@ -27,12 +27,12 @@ COLUMNS = (
 Search = Callable[[jax.Array], jfrnn.NeighborList]
 
 
-def measure(folder: Path, sizes: tuple[int, ...] = SIZES, repeats: int = REPEATS) -> Path:
+def measure(folder: Path, sizes: tuple[int, ...] | None = None, repeats: int = REPEATS) -> Path:
     """Write a table of seconds by size, neighbors and backend, a row at a time, and return its path.
 
     Args:
         folder: Takes a file named after the platform, such as cpu.csv; one that is there is replaced.
-        sizes: Numbers of points.
+        sizes: Numbers of points; `SIZES` without it.
         repeats: Timed runs of each backend, in turns.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -41,7 +41,7 @@ def measure(folder: Path, sizes: tuple[int, ...] = SIZES, repeats: int = REPEATS
         writer = csv.DictWriter(stream, COLUMNS)
         writer.writeheader()
         for neighbors in NEIGHBORS:
-            for n in sizes:
+            for n in sizes or SIZES:
                 for row in _rows(n, neighbors, repeats):
                     writer.writerow(row)
                     stream.flush()

@@ -1,18 +1,17 @@
 """Cell search on CUDA: six launches, no host synchronization, nothing allocated beside the scratch that the caller gives.
 
-    bounds   lowest and highest coordinate per block; clears what the others count in
-    count    every block reduces those bounds to the grid; every particle counts itself in its cell
-    scan     counts to first places, in one pass (Merrill & Garland 2016, decoupled look-back)
-    scatter  indices into their cells, in the order in which they came
-    gather   positions into cell order, ranked by index within a cell: the same order in every run
-    query    a warp of 32 lanes serves a few neighboring queries: 32 candidates at a time, hits get their slots by a vote
+bounds   lowest and highest coordinate per block; clears what the others count in
+count    every block reduces those bounds to the grid; every particle counts itself in its cell
+scan     counts to first places, in one pass (Merrill & Garland 2016, decoupled look-back)
+scatter  indices into their cells, in the order in which they came
+gather   positions into cell order, ranked by index within a cell: the same order in every run
+query    a warp of 32 lanes serves a few neighboring queries: 32 candidates at a time, hits get their slots by a vote
 """
 
 import functools
 from typing import NamedTuple
 
 import warp as wp
-
 from jfrnn.kernels._native import CELLS, EXACT, snippet, table_cells
 
 BLOCK = 256
@@ -303,7 +302,7 @@ for (long long place = thread; place < n; place += threads) {
 """
 
 _QUERY = r"""
-constexpr int KEPT = 768, SLOTS = 160, EACH = DOUBLE ? 2 : 1;  // bytes of a neighbor
+constexpr int KEPT = 720, SLOTS = 184, EACH = DOUBLE ? 2 : 1;  // bytes of a neighbor
 struct Warp {  // what a warp shares
     Place candidates[64];  // a ring of candidates within reach of the group's box
     int ids[LIST ? KEPT : 1];  // of all of them since the rows were last written
@@ -416,8 +415,12 @@ while (place < stop) {
         } else
             reached = cell_number(x);
     }
-    const whole first[3] = {__shfl_sync(ALL, reached, 0), __shfl_sync(ALL, reached, 2), DIM == 3 ? __shfl_sync(ALL, reached, 4) : 0};
-    const whole last[3] = {__shfl_sync(ALL, reached, 1), __shfl_sync(ALL, reached, 3), DIM == 3 ? __shfl_sync(ALL, reached, 5) : 0};
+    whole first[3] = {0, 0, 0}, last[3] = {0, 0, 0};
+#pragma unroll
+    for (int a = 0; a < DIM; ++a) {
+        first[a] = __shfl_sync(ALL, reached, 2 * a);
+        last[a] = __shfl_sync(ALL, reached, 2 * a + 1);
+    }
     const int length = (int)(last[0] - first[0]) + 1, wide = (int)(last[1] - first[1]) + 1;
     const int across = ORDER != 0 ? length : 1;  // on a curve, cells along x are no run
     const int rows = length > 0 && wide > 0 && last[2] >= first[2] ? across * wide * (int)(last[2] - first[2] + 1) : 0;
@@ -432,7 +435,7 @@ while (place < stop) {
         }
         kept = group;
     }
-    // shared memory as the hardware numbers it: the compiler would not move loads of candidates across these stores
+    // shared memory as the hardware numbers it: a store and a step of its address under one predicate
     const unsigned int list_begin = (unsigned int)__cvta_generic_to_shared(warp.neighbors[LIST ? lane : 0]);
     unsigned int list_end = list_begin, marks = 0xffffffff;  // one byte each: neighbors among the first 256, 512, 768 candidates
     auto listed = [&] { return (int)(list_end - list_begin) / (LIST ? EACH : 1); };
@@ -441,10 +444,10 @@ while (place < stop) {
             list_end += over < limit;
         else if constexpr (DOUBLE)
             asm volatile("{.reg .pred p; setp.lt.f64 p, %2, %3; @p st.shared.u16 [%0], %1; @p add.u32 %0, %0, 2;}"
-                         : "+r"(list_end) : "h"((short)number), "d"((double)over), "d"((double)limit));
+                         : "+r"(list_end) : "h"((short)number), "d"((double)over), "d"((double)limit) : "memory");
         else
             asm volatile("{.reg .pred p; setp.lt.f32 p, %2, %3; @p st.shared.u8 [%0], %1; @p add.u32 %0, %0, 1;}"
-                         : "+r"(list_end) : "r"(number), "f"((float)over), "f"((float)limit));
+                         : "+r"(list_end) : "r"(number), "f"((float)over), "f"((float)limit) : "memory");
     };
     auto write_rows = [&](bool finished) {
         __syncwarp();
@@ -465,7 +468,7 @@ while (place < stop) {
                     for (int s = 4 * lane; s < writes; s += 128) {
                         unsigned int four = 0;
                         if (s < size)  // beyond the row's neighbors there may be no shared memory
-                            asm volatile("ld.shared.u32 %0, [%1];" : "=r"(four) : "r"(list + s));
+                            asm volatile("ld.shared.u32 %0, [%1];" : "=r"(four) : "r"(list + s) : "memory");
                         *(int4*)(out + s) = make_int4(neighbor(s, four & 255), neighbor(s + 1, four >> 8 & 255),
                                                       neighbor(s + 2, four >> 16 & 255), neighbor(s + 3, four >> 24));
                     }
@@ -473,9 +476,9 @@ while (place < stop) {
                     for (int s = lane; s < writes; s += 32) {
                         unsigned short number = 0;
                         if (DOUBLE && s < size)
-                            asm volatile("ld.shared.u16 %0, [%1];" : "=h"(number) : "r"(list + 2 * s));
+                            asm volatile("ld.shared.u16 %0, [%1];" : "=h"(number) : "r"(list + 2 * s) : "memory");
                         else if (s < size)
-                            asm volatile("ld.shared.u8 %0, [%1];" : "=h"(number) : "r"(list + s));
+                            asm volatile("ld.shared.u8 %0, [%1];" : "=h"(number) : "r"(list + s) : "memory");
                         out[s] = DOUBLE ? (s < size ? warp.ids[number] : n) : neighbor(s, number);
                     }
             }
@@ -577,13 +580,18 @@ while (place < stop) {
         };
         if (total > 0)
             fetch(0);
+        bool draining = false;  // the rows are full: test what is kept, write them, go on
+        int c0 = 0;
 #pragma unroll 1
-        for (int c0 = 0; c0 < total || (last_rows && tested < kept); c0 += 32) {
+        while (c0 < total || draining || (last_rows && tested < kept)) {
             const int at = next_at;
             const Place candidate = next;
-            bool near = c0 < total && at >= 0;
-            if (c0 + 32 < total)
-                fetch(c0 + 32);
+            bool near = !draining && c0 < total && at >= 0;
+            if (!draining) {
+                c0 += 32;
+                if (c0 < total)
+                    fetch(c0);
+            }
             real square = 0;
 #pragma unroll
             for (int a = 0; a < DIM; ++a) {
@@ -603,9 +611,15 @@ while (place < stop) {
                     warp.ids[number] = id_of(candidate.id);
             }
             kept += __popc(all_near);
-            const bool rest = last_rows && c0 + 32 >= total;
-            if (kept - tested < 32 && !(rest && tested < kept))
+            const bool rest = draining || (last_rows && c0 >= total);
+            if (kept - tested < 32 && !(rest && tested < kept)) {
+                if (draining) {
+                    write_rows(false);
+                    kept = tested = 0;
+                    draining = false;
+                }
                 continue;
+            }
             if (kept - tested + lane < 32)
                 warp.candidates[(kept + lane) % 64] = Place{{NOWHERE, NOWHERE, NOWHERE}, 0};
             __syncwarp();
@@ -654,16 +668,9 @@ while (place < stop) {
             if (LIST && tested % 256 == 0)
                 marks ^= (255 ^ listed()) << (tested / 256 - 1) * 8;
             __syncwarp();
-            if (LIST && (kept > KEPT - 64 || __any_sync(ALL, listed() > SLOTS - 32))) {
-                write_rows(false);
-                // number the candidates anew, by a multiple of the ring; those not tested yet stay
-                const int shift = tested / 64 * 64, waiting = lane < kept - tested ? warp.ids[tested + lane] : 0;
-                __syncwarp();
-                warp.ids[tested - shift + lane] = waiting;
-                kept -= shift;
-                tested -= shift;
-                __syncwarp();
-            }
+            // one more block and what is kept besides must still fit
+            if (LIST && (kept > KEPT - 64 || __any_sync(ALL, listed() > SLOTS - 64)))
+                draining = c0 < total || !last_rows || tested < kept;
         }
         __syncwarp();
     }

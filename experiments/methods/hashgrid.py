@@ -1,0 +1,12 @@
+"""`jfrnn.search` with the backend `hashgrid`: a padded full list inside `jax.jit`, found with `wp.HashGrid` as Warp ships it."""
+
+from functools import partial
+
+import warp as wp  # noqa: F401 - without it this method is missing, which is no failure
+
+from experiments.methods._padded import allocate_backend, prepare_backend, read
+
+__all__ = ["allocate", "prepare", "read"]
+
+allocate = partial(allocate_backend, backend="hashgrid")
+prepare = partial(prepare_backend, backend="hashgrid", kernels=True)

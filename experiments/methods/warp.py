@@ -1,0 +1,12 @@
+"""`jfrnn.search` with the backend `warp`: a padded full list inside `jax.jit`, filled by fused kernels."""
+
+from functools import partial
+
+import warp as wp  # noqa: F401 - without it this method is missing, which is no failure
+
+from experiments.methods._padded import allocate_backend, prepare_backend, read
+
+__all__ = ["allocate", "prepare", "read"]
+
+allocate = partial(allocate_backend, backend="warp")
+prepare = partial(prepare_backend, backend="warp", kernels=True)
