@@ -5,9 +5,11 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import warp
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+warp.config.log_level = warp.LOG_WARNING  # else it prints what it compiles, into doctests too
 
 
 @pytest.fixture(autouse=True)

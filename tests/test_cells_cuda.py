@@ -1,0 +1,48 @@
+"""The CUDA kernels as far as a machine without a GPU can tell: they compile for one, and their memory is what is promised.
+
+What they answer is decided on a GPU: python -m experiments gpu experiments/configs/h200.toml --out DIR.
+"""
+
+import itertools
+
+import pytest
+import warp as wp
+from jfrnn.kernels import cells_cpu, cells_cuda
+
+VARIANTS = [(dim, double, False, lists, False) for dim, double, lists in itertools.product((2, 3), (False, True), (False, True))]
+VARIANTS += [
+    (3, False, scaled, lists, later) for scaled, lists, later in ((True, True, False), (False, True, True), (True, False, True))
+]
+
+
+def compiles(kernels, folder):
+    for module in {kernels.bounds.module, kernels.query.module}:
+        wp.compile_aot_module(module, arch=90, module_dir=folder, use_ptx=True)
+    return list(folder.glob("*.ptx"))
+
+
+@pytest.mark.parametrize(("dim", "double", "scaled", "lists", "later"), VARIANTS)
+def test_variants_compile(dim, double, scaled, lists, later, tmp_path):
+    assert len(compiles(cells_cuda.cell_kernels(dim, double, scaled, lists, later), tmp_path)) == 2
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_space_filling_curves_compile(order, tmp_path):
+    assert compiles(cells_cuda.cell_kernels(3, False, False, True, reach_x=1, order=order), tmp_path)
+
+
+@pytest.mark.parametrize("module", [cells_cpu, cells_cuda], ids=["cpu", "cuda"])
+@pytest.mark.parametrize("n", [10_000, 1_000_000, 100_000_000])
+def test_scratch_is_at_most_64_bytes_per_particle(module, n, dim):
+    for width in (1, 2):
+        fixed = 64 * 1024  # headers and bounds of blocks
+        assert 4 * module.scratch_words(n, n, dim, width, True) <= 64 * n + fixed
+        assert 4 * module.scratch_words(n, n, dim, width, False) <= 64 * (n + n) + fixed
+
+
+def test_queries_of_their_own_are_sorted_too():
+    kernels = cells_cuda.cell_kernels(3, False, False, True)
+    own, others = (kernels.launches(1000, 500, own) for own in (True, False))
+    assert [launch.of_queries for launch in own] == [False] * 6
+    assert [launch.of_queries for launch in others].count(True) == 3
+    assert all(launch.threads % launch.block == 0 for launch in own + others)

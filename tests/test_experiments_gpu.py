@@ -1,0 +1,60 @@
+"""The GPU run, on whatever device is there: its config, its checks and its rows."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import _gpu
+from experiments._errors import UsageError
+
+CONFIG = Path(__file__).parent.parent / "experiments" / "configs" / "h200.toml"
+
+
+@pytest.fixture
+def config():
+    small = {"sizes": [1000], "counts_only": [1000], "studied_size": 1000, "calls": 2, "steps": 2, "repeats": 2}
+    return _gpu.load(CONFIG).model_copy(update=small)
+
+
+def test_config_errors_name_the_key(tmp_path):
+    path = tmp_path / "gpu.toml"
+    path.write_text(CONFIG.read_text().replace("repeats = 5", "repeats = 0\nrepeat = 5"))
+    with pytest.raises(UsageError, match=r"(?s)gpu\.toml.*repeats.*repeat"):
+        _gpu.load(path)
+
+
+def test_rows_of_a_scene_are_checked_and_timed(config):
+    rows = list(_gpu._scene_rows(config, "jitter", _gpu._jitter_lattice(config, 1000)))
+    ours = [row for row in rows if row["method"].startswith("jfrnn")]
+    assert [row["kind"] for row in ours] == ["call", "call", "call", "scan"]
+    assert all(row["median_s"] > 0 for row in ours)
+    assert [row.get("wrong") for row in ours[:2]] == [0, 0]
+    assert all(row["same_bits_twice"] for row in ours[:2])
+    assert all(row["directed_pairs"] == row["exact_directed_pairs"] for row in ours[:3])
+    json.dumps(rows)
+
+
+def test_different_rows_are_counted_as_sets():
+    one = np.array([[1, 2, 3], [4, 5, 9], [6, 9, 9]], np.int32)
+    other = np.array([[3, 1, 2], [4, 9, 5], [7, 9, 9]], np.int32)
+    assert _gpu._different_rows(one, other) == 1
+
+
+def test_an_inexact_answer_is_counted_as_wrong(config, monkeypatch):
+    from jfrnn.cases import hard
+
+    import jfrnn
+
+    monkeypatch.setattr(hard, "HARD_CASES", {"integers_14": hard.HARD_CASES["integers_14"]})
+    part = config.exactness[0].model_copy(update={"dims": [3], "dtypes": ["float32"]})
+    assert [row["wrong"] for row in _gpu._exactness_rows(part)] == [0]
+    search = jfrnn.search
+    monkeypatch.setattr(jfrnn, "search", lambda x, cutoff, **options: search(x, 0.9 * cutoff, **options))
+    assert [row["wrong"] for row in _gpu._exactness_rows(part)] == [2]
+
+
+def test_memory_is_planned_within_a_tenth(monkeypatch):
+    for row in _gpu._memory_rows():
+        assert row["planned_bytes"] == pytest.approx(row["compiled_bytes"], rel=0.1)
