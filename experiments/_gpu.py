@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from experiments import _machine
 from experiments._errors import UsageError
+from jfrnn._warp import kernels_of, load_warp
 
 Strict = ConfigDict(extra="forbid", frozen=True)
 
@@ -63,8 +64,6 @@ def run(config: Config, folder: Path) -> int:
     """Run everything and return the number of wrong hard cases; rows go to rows.jsonl."""
     import jax
 
-    from jfrnn._warp import load_warp
-
     jax.config.update("jax_enable_x64", True)
     folder.mkdir(parents=True, exist_ok=True)
     device = jax.devices()[0]
@@ -106,7 +105,7 @@ def _jitter_lattice(config: Config, n: int) -> np.ndarray:
 
 
 def _corners(config: Config) -> np.ndarray:
-    from jfrnn.cases import scene
+    from jfrnn.cases import scene  # pyright: ignore[reportMissingImports]
 
     random = np.random.default_rng(config.seed)
     given = scene("corners", fill=config.corners_fill)
@@ -120,7 +119,8 @@ def _corners(config: Config) -> np.ndarray:
 
 
 def _exactness_rows(config: Exactness) -> Iterator[dict[str, Any]]:
-    from jfrnn.cases.hard import HARD_CASES
+    import jax
+    from jfrnn.cases.hard import HARD_CASES  # pyright: ignore[reportMissingImports]
 
     import jfrnn
 
@@ -135,7 +135,7 @@ def _exactness_rows(config: Exactness) -> Iterator[dict[str, Any]]:
             rows = 704 if most <= 704 else 2048  # shapes shared by many cases: few programs
             queries = None if given.queries is None else _padded(given.queries, rows)
             options = {"queries": queries, "capacity": config.capacity, "closed": closed, "backend": config.backend}
-            nbrs = jfrnn.search(_padded(given.positions, rows), given.cutoff, **options)
+            nbrs = jfrnn.search(jax.numpy.asarray(_padded(given.positions, rows)), given.cutoff, **options)
             cases += 1
             if not _is_exact(oracle, nbrs, _expected(oracle, name, dtype, dim, closed)):
                 wrong.append(f"{name}{'-closed' * closed}")
@@ -155,7 +155,7 @@ def _is_exact(oracle: Any, nbrs: Any, expected: Any) -> bool:  # noqa: ANN401
 
 @functools.lru_cache(maxsize=1024)
 def _expected(oracle: Any, name: str, dtype: str, dim: int, closed: bool) -> Any:  # noqa: ANN401
-    from jfrnn.cases.hard import HARD_CASES
+    from jfrnn.cases.hard import HARD_CASES  # pyright: ignore[reportMissingImports]
 
     given = HARD_CASES[name].build(dtype, dim)
     return oracle.reference_pairs(given.positions, given.cutoff, queries=given.queries, closed=closed)
@@ -183,7 +183,7 @@ def _memory_rows() -> Iterator[dict[str, Any]]:
         x = jax.numpy.asarray(points, jax.numpy.float32)
         capacity = int(-(-int(jfrnn.count(x, 1.0, backend="warp").max()) // 8) * 8)
         search = jax.jit(functools.partial(_listed, cutoff=1.0, capacity=capacity, backend="warp"))
-        compiled = search.lower(x).compile().memory_analysis()
+        compiled: Any = search.lower(x).compile().memory_analysis()
         before = _device_bytes("bytes_in_use")
         jax.block_until_ready(search(x))
         plan = jfrnn.memory_plan(len(points), 1.0, capacity, backend="warp")
@@ -202,9 +202,8 @@ def _device_bytes(what: str) -> int:
 
 
 def _warp_pool_bytes() -> int:
-    import warp
-
-    return warp.get_mempool_used_mem_high("cuda:0") if warp.is_cuda_available() else 0
+    wp = load_warp()
+    return wp.get_mempool_used_mem_high("cuda:0") if wp.is_cuda_available() else 0
 
 
 # --- timings ----------------------------------------------------------------------------------------------------------
@@ -229,6 +228,7 @@ def _timed(config: Config, call: Callable[[], Any], calls: int | None = None) ->
     seconds = []
     for _ in range(config.repeats):
         start = time.perf_counter()
+        result = None
         for _ in range(calls):
             result = call()
         jax.block_until_ready(result)
@@ -305,9 +305,8 @@ def _peer_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> I
 
 def _plain_hashgrid(x: Any, cutoff: float, capacity: int) -> tuple[Callable[[], Any], int]:  # noqa: ANN401
     """Return a call of `wp.HashGrid` as Warp's examples use it, without JAX: build, then one thread per particle."""
-    import warp as wp
-
-    from experiments._hashgrid_plain import list_neighbors_kernel
+    wp = load_warp()
+    list_neighbors_kernel = kernels_of("hashgrid_plain").list_neighbors_kernel
 
     points = wp.array(np.asarray(x), dtype=wp.vec3, device="cuda")
     n = len(points)
@@ -333,8 +332,7 @@ class _synchronized:
         return self
 
     def block_until_ready(self) -> "_synchronized":
-        import warp as wp
-
+        wp = load_warp()
         wp.synchronize()
         return self
 
@@ -382,8 +380,8 @@ def _count_row(config: Config, n: int) -> dict[str, Any]:
 
 
 def _study_rows(config: Config) -> Iterator[dict[str, Any]]:
-    import warp as wp
-    from jfrnn.cases import scene
+    wp = load_warp()
+    from jfrnn.cases import scene  # pyright: ignore[reportMissingImports]
 
     if not wp.is_cuda_available():
         return
@@ -422,8 +420,8 @@ def _kernel_time(
     config: Config, points: np.ndarray, cutoff: float, capacity: int, *, lists: bool = True, double: bool = False, **options: int
 ) -> tuple[float, dict[str, float], int, int]:
     """Return the seconds of one search and of each of its kernels, the longest row and the number of directed pairs."""
-    import warp as wp
-    from jfrnn.kernels import cells_cuda  # pyright: ignore
+    wp = load_warp()
+    cells_cuda = kernels_of("cells_cuda")
 
     scalar, n = (wp.float64 if double else wp.float32), len(points)
     kernels = cells_cuda.cell_kernels(3, double, False, lists, **options)

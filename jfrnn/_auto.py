@@ -3,7 +3,6 @@
 import functools
 import inspect
 import warnings
-from typing import NamedTuple
 
 import jax
 from jax import Array
@@ -14,17 +13,11 @@ from jfrnn import _warp
 WARP_ENGINES = ("warp", "hashgrid")
 
 
-class Crossover(NamedTuple):
-    """From how many sources on Warp is the engine to take on a platform, and which one is below that."""
-
-    warp_from: int
-    below: str = "jax"
-
-
+# From how many sources on Warp is the engine to take, by platform; below, and where nothing was measured, it is "jax".
 # `python -m experiments crossover`, rows in experiments/results/crossovers/cpu.csv: compiled searches of 16 to 100 000 random
-# points in 3D with 30 and 108 neighbors. No engine is faster than Warp at any size: brute force is level with it up to 32 points and
-# 1.2x slower at 64; jax is 1.2x slower at 16, 3x at 256, 15x at 100 000. Warp compiles sooner too: 0.05 s instead of 1 to 3 s.
-_CROSSOVERS = {"cpu": Crossover(warp_from=0)}
+# points in 3D with 30 and 108 neighbors. No engine is faster than Warp at any size: brute force is level with it up to 32 points,
+# 1.2x slower at 64; jax is 1.2x slower at 16, 3x at 256, 15x at 100 000. Warp compiles sooner too: in 0.05 s instead of 1 to 3 s.
+_WARP_FROM = {"cpu": 0}
 
 
 def choose_engine(backend: str, sources: Array, queries: Array | None) -> str:
@@ -47,10 +40,8 @@ def choose_engine(backend: str, sources: Array, queries: Array | None) -> str:
 
 def fastest_engine(platform: str, sources: int) -> str:
     """Return the engine that "auto" takes on a platform for a number of sources; warn once where Warp cannot run."""
-    if not _can_warp(platform):
-        return "jax"
-    crossover = _CROSSOVERS.get(platform, Crossover(warp_from=0))
-    return "warp" if sources >= crossover.warp_from else crossover.below
+    warp_from = _WARP_FROM.get(platform)
+    return "warp" if warp_from is not None and sources >= warp_from and _can_warp(platform) else "jax"
 
 
 def default_platform() -> str:

@@ -30,7 +30,7 @@ class Rows(NamedTuple):
     """
 
     idx: Array | None
-    count: Array
+    counts: Array
     required: Array
     status: Array
 

@@ -81,7 +81,7 @@ def search(
     rows = _search(*problem, checked_capacity(capacity))
     return NeighborList(
         rows.idx,
-        rows.count,
+        rows.counts,
         rows.status,
         rows.required,
         cutoff=float(problem.cutoff.radius),
@@ -176,7 +176,7 @@ def _counted_capacity(problem: _Problem, slack: float) -> int:
 
 @functools.partial(jax.jit, static_argnames="options")
 def _count(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options) -> Array:
-    return neighbors(sources, queries, cutoff, options, None).count
+    return neighbors(sources, queries, cutoff, options, None).counts
 
 
 @functools.partial(jax.jit, static_argnames=("options", "capacity"))

@@ -6,6 +6,7 @@ depends on (JAX's persistent compilation cache sees no more than that name).
 
 import ctypes
 import functools
+import importlib
 import math
 import os
 import sys
@@ -45,7 +46,7 @@ class Result(NamedTuple):
     """What an engine returns: rows (None where only counted), counts, the longest row and the bits of `Status`."""
 
     idx: Array | None
-    count: Array
+    counts: Array
     required: Array
     status: Array
 
@@ -63,6 +64,12 @@ def load_warp() -> Any:  # noqa: ANN401
     if not hasattr(warp, "jax_callable"):
         raise ImportError(f"the backends 'warp' and 'hashgrid' need warp-lang 1.18 or 1.19, found {warp.__version__}: {INSTALL}")
     return warp
+
+
+def kernels_of(name: str) -> Any:  # noqa: ANN401
+    """Return a module of jfrnn.kernels, which imports Warp."""
+    load_warp()
+    return importlib.import_module(f"jfrnn.kernels.{name}")
 
 
 def missing(platform: str) -> str | None:
@@ -125,8 +132,7 @@ def scratch_bytes(engine: str, platform: str, n: int, m: int, dim: int, double: 
     width = 2 if double else 1
     if engine == "warp":
         return 4 * _CELLS[_PLATFORMS[platform]].scratch_words(n, m, dim, width, own)
-    from jfrnn.kernels import hashgrid
-
+    hashgrid = kernels_of("hashgrid")
     # warp/native/hashgrid.cpp: two ints per cell; of each point its cell and its id, room for 1.5 n, twice for the sort
     grid = 8 * math.prod(hashgrid.grid_shape(n, dim)) + 16 * (3 * n // 2)
     return 4 * hashgrid.scratch_words(n, m, dim, width, own) + grid
@@ -155,17 +161,11 @@ def _cuda_callable(variant: Variant) -> Any:  # noqa: ANN401
 
 
 def _cpu_scratch_words(*sizes: Any) -> int:  # noqa: ANN401
-    load_warp()
-    from jfrnn.kernels import cells_cpu
-
-    return cells_cpu.scratch_words(*sizes)
+    return kernels_of("cells_cpu").scratch_words(*sizes)
 
 
 def _cuda_scratch_words(*sizes: Any) -> int:  # noqa: ANN401
-    load_warp()
-    from jfrnn.kernels import cells_cuda
-
-    return cells_cuda.scratch_words(*sizes)
+    return kernels_of("cells_cuda").scratch_words(*sizes)
 
 
 _CELLS = {"cpu": _Engine(_cpu_callable, _cpu_scratch_words), "cuda": _Engine(_cuda_callable, _cuda_scratch_words)}
@@ -185,16 +185,18 @@ def _register(
     wp = load_warp()
     graphs = wp.JaxCallableGraphMode.NONE if graphs is None else graphs
     scalar = wp.float64 if variant.double else wp.float32
-    points, reals = wp.array2d(dtype=scalar), wp.array(dtype=scalar)
-    ints, rows = wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
+    points, ints = wp.array2d(dtype=scalar), wp.array(dtype=wp.int32)
+    types = {"positions": points, "queries": points, "cutoff": wp.array(dtype=scalar), "idx": wp.array2d(dtype=wp.int32)}
+    types |= {"count": ints, "info": ints, "scratch": ints}
 
-    def list_rows(positions: points, queries: points, cutoff: reals, idx: rows, count: ints, info: ints, scratch: ints) -> None:
+    def list_rows(positions: Any, queries: Any, cutoff: Any, idx: Any, count: Any, info: Any, scratch: Any) -> None:  # noqa: ANN401
         run(variant, positions, queries, cutoff, idx, count, info, scratch)
 
-    def count_rows(positions: points, queries: points, cutoff: reals, count: ints, info: ints, scratch: ints) -> None:
+    def count_rows(positions: Any, queries: Any, cutoff: Any, count: Any, info: Any, scratch: Any) -> None:  # noqa: ANN401
         run(variant, positions, queries, cutoff, None, count, info, scratch)
 
     func = list_rows if variant.lists else count_rows
+    func.__annotations__ = {name: types[name] for name in types if variant.lists or name != "idx"}
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
     flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
     func.__name__ = "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
@@ -205,9 +207,8 @@ def _register(
 
 
 def _cuda_kernels(variant: Variant) -> Any:  # noqa: ANN401
-    from jfrnn.kernels import cells_cuda
-
-    return cells_cuda.cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, variant.keep.later_only)
+    make = kernels_of("cells_cuda").cell_kernels
+    return make(variant.dim, variant.double, variant.scaled, variant.lists, variant.keep.later_only)
 
 
 def _run_cells_on_cuda(
@@ -220,12 +221,10 @@ def _run_cells_on_cuda(
     info: "warp.array",
     scratch: "warp.array",
 ) -> None:
-    from jfrnn.kernels import cells_cuda
-
     wp = load_warp()
     n, m = positions.shape[0], queries.shape[0]
     idx, capacity = _rows_or_nothing(idx, count)
-    sizes = [n, m, int(variant.own), cells_cuda.table_cells(n), capacity]
+    sizes = [n, m, int(variant.own), kernels_of("cells_cuda").table_cells(n), capacity]
     arguments = [positions, queries, cutoff, idx, count, info, scratch, *sizes, int(variant.closed), int(variant.keep.drop_self)]
     for launch in _cuda_kernels(variant).launches(n, m, variant.own):
         inputs = [*arguments, int(launch.of_queries)]
@@ -242,15 +241,14 @@ def _run_cells_on_cpu(
     info: "warp.array",
     scratch: "warp.array",
 ) -> None:
-    from jfrnn.kernels import cells_cpu
-
     wp = load_warp()
-    kernels = cells_cpu.cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists)
+    module = kernels_of("cells_cpu")
+    kernels = module.cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists)
     n, m = positions.shape[0], queries.shape[0]
     idx, capacity = _rows_or_nothing(idx, count)
-    sizes = [n, m, int(variant.own), cells_cpu.table_cells(n)]
+    sizes = [n, m, int(variant.own), module.table_cells(n)]
     wp.launch(kernels.build, dim=1, inputs=[positions, queries, cutoff, info, scratch, *sizes], device="cpu")
-    _ask_for_huge_pages(idx.ptr, 4 * m * capacity)
+    _ask_for_huge_pages(int(idx.ptr or 0), 4 * m * capacity)
     flags = [int(variant.closed), int(variant.keep.drop_self), int(variant.keep.later_only)]
     arguments = [positions, queries, cutoff, idx, count, info, scratch, *sizes, capacity, *flags]
     _on_every_core(lambda: wp.launch(kernels.query, dim=1, inputs=arguments, device="cpu"), -(-m // _PLACES_PER_THREAD))
@@ -307,12 +305,11 @@ def hashgrid_neighbors(
         raise ImportError(
             f"the backend 'hashgrid' needs warp-lang 1.19: the HashGrid of {version} can list a pair twice. {INSTALL}"
         )
-    from jfrnn.kernels import hashgrid
 
     def make(variant: Variant) -> Any:  # noqa: ANN401
         return _hashgrid_callable(variant, radius)
 
-    return _call(make, sources, queries, cutoff, keep, capacity, hashgrid.scratch_words)
+    return _call(make, sources, queries, cutoff, keep, capacity, kernels_of("hashgrid").scratch_words)
 
 
 @functools.cache
@@ -332,10 +329,9 @@ def _run_hashgrid(
     info: "warp.array",
     scratch: "warp.array",
 ) -> None:
-    from jfrnn.kernels import hashgrid
-
     wp = load_warp()
     n, device = positions.shape[0], count.device
+    hashgrid = kernels_of("hashgrid")
     kernels = hashgrid.hashgrid_kernels(variant.dim, variant.double, variant.scaled, variant.lists)
     shape = hashgrid.grid_shape(n, variant.dim)
     packed = wp.array(ptr=scratch.ptr, shape=n, dtype=wp.vec3d if variant.double else wp.vec3f, device=device)
