@@ -58,9 +58,18 @@ def gpu(
         from experiments import _gpu
 
         wrong = _gpu.run(_gpu.load(config), out)
-        typer.echo(f"{wrong} wrong; rows in {out / 'rows.jsonl'}")
+        typer.echo(f"{wrong} wrong; rows in {out / 'rows.jsonl'}; python -m experiments gpu-report {out} makes a table of them")
         if wrong:
             raise typer.Exit(1)
+
+
+@app.command()
+def gpu_report(folder: Annotated[Path, typer.Argument(help="Folder of a GPU run.")]) -> None:
+    """Print the tables of a GPU run, and write them and a picture against the floor beside the rows."""
+    with _usage_errors():
+        from experiments import _gpu_report
+
+        typer.echo(_gpu_report.report(folder))
 
 
 @app.command()

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import _gpu
+from experiments import _gpu, _gpu_report
 from experiments._errors import UsageError
 
 CONFIG = Path(__file__).parent.parent / "experiments" / "configs" / "h200.toml"
@@ -58,3 +58,27 @@ def test_an_inexact_answer_is_counted_as_wrong(config, monkeypatch):
 def test_memory_is_planned_within_a_tenth(monkeypatch):
     for row in _gpu._memory_rows():
         assert row["planned_bytes"] == pytest.approx(row["compiled_bytes"], rel=0.1)
+
+
+def test_report_of_a_run(tmp_path, config):
+    about = {"device": "some GPU", "versions": {"jax": "1", "warp-lang": "2"}, "commit": "abc", "time": "2026-01-01T00:00:00Z"}
+    call = {"kind": "call", "layout": "jitter", "points": 1000, "capacity": 100, "exact_directed_pairs": 5}
+    rows = [
+        {"kind": "ceiling", "method": "read and write", "bytes_per_s": 1e12},
+        {"kind": "exactness", "method": "jfrnn warp", "dtype": "float32", "dim": 3, "cases": 2, "wrong": 0},
+        {**call, "method": "jfrnn warp", "directed_pairs": 5, "median_s": 1e-3},
+        {**call, "method": "a peer", "directed_pairs": 7, "median_s": 4e-3},
+        {**call, "method": "another", "reason": "not installed"},
+    ]
+    (tmp_path / "rows.jsonl").write_text("\n".join(json.dumps(row | about) for row in rows))
+    text = _gpu_report.report(tmp_path)
+    assert "| jitter | 1 000 | a peer | 4 | 4 |" in text  # ms, and four times ours
+    assert "| 2 |  |" in text  # its two pairs too many
+    assert "not installed" in text
+    assert _gpu_report.floor_seconds(rows[2], 1e12) == pytest.approx(1000 * 416 / 1e12)
+    assert (tmp_path / "roofline.png").stat().st_size > 1000
+
+
+def test_report_without_rows_says_what_to_run(tmp_path):
+    with pytest.raises(UsageError, match="run python -m experiments gpu"):
+        _gpu_report.report(tmp_path)

@@ -1,0 +1,115 @@
+"""What the rows of a GPU run say: a table of calls, a table of what the choices cost, and a picture against the floor.
+
+The floor of a search is the bytes that it cannot avoid, positions read once and list and counts written once, over the bandwidth
+that a copy reached in the same run.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from experiments._errors import UsageError
+
+OURS = "jfrnn warp"
+
+
+def report(folder: Path) -> str:
+    """Write report.md and roofline.png beside the rows, and return the text."""
+    path = folder / "rows.jsonl"
+    if not path.exists():
+        raise UsageError(f"{path} does not exist: run python -m experiments gpu CONFIG --out {folder} first")
+    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    text = "\n\n".join([_head(rows), _exactness(rows), _calls(rows), _study(rows), _memory(rows)]) + "\n"
+    (folder / "report.md").write_text(text, encoding="utf-8")
+    _draw(rows, folder / "roofline.png")
+    return text
+
+
+def bandwidth(rows: list[dict[str, Any]]) -> float:
+    """Return the bytes per second that a copy reached."""
+    return next(row["bytes_per_s"] for row in rows if row["kind"] == "ceiling")
+
+
+def floor_seconds(row: dict[str, Any], bytes_per_s: float) -> float:
+    """Return the time that the unavoidable bytes of a search take: 12 B of positions, 4 B per count and per slot."""
+    listed = 0 if row["method"].endswith("counts") else row.get("capacity", 0)
+    return row["points"] * (12 + 4 + 4 * listed) / bytes_per_s
+
+
+def _of(rows: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
+    return [row for row in rows if row["kind"] == kind]
+
+
+def _head(rows: list[dict[str, Any]]) -> str:
+    row = rows[0]
+    versions = ", ".join(f"{name} {row['versions'].get(name)}" for name in ("jax", "warp-lang"))
+    commit, copy = (row["commit"] or "unknown")[:10], f"{bandwidth(rows) / 1e12:.2f} TB/s"
+    return f"{row['device']} · {versions} · commit {commit} · {row['time'][:10]} · copy {copy}"
+
+
+def _exactness(rows: list[dict[str, Any]]) -> str:
+    table = [
+        {"method": r["method"], "dtype": r["dtype"], "dim": r["dim"], "hard cases": r["cases"], "wrong": r["wrong"]}
+        for r in _of(rows, "exactness")
+    ]
+    return "## Hard cases against the oracle\n\n" + _markdown(table)
+
+
+def _calls(rows: list[dict[str, Any]]) -> str:
+    copy, table = bandwidth(rows), []
+    ours = {(r["layout"], r["points"]): r["median_s"] for r in _of(rows, "call") if r["method"] == OURS}
+    for r in [*_of(rows, "call"), *_of(rows, "scan")]:
+        seconds, reference = r.get("median_s"), ours.get((r["layout"], r["points"]))
+        exact = r.get("exact_directed_pairs")
+        table.append({
+            "scene": r["layout"], "points": f"{r['points']:,}".replace(",", " "),
+            "method": r["method"] + (", per step of a scan" if r["kind"] == "scan" else ""),
+            "ms": "·" if seconds is None else f"{1e3 * seconds:.4g}",
+            "/ ours": "·" if seconds is None or reference is None else f"{seconds / reference:.3g}",
+            "/ floor": "·" if seconds is None else f"{seconds / floor_seconds(r, copy):.3g}",
+            "pairs - exact": "·" if exact is None or r.get("directed_pairs") is None else r["directed_pairs"] - exact,
+            "reason": r.get("reason", "")[:80],
+        })  # fmt: skip
+    return "## Calls that are not waited for one by one\n\n" + _markdown(table)
+
+
+def _study(rows: list[dict[str, Any]]) -> str:
+    table = []
+    for r in _of(rows, "study"):
+        first = next(s for s in _of(rows, "study") if s["layout"] == r["layout"])
+        table.append({
+            "layout": r["layout"], "points": r["points"], "kernels": r["method"], "ms": f"{1e3 * r['median_s']:.4g}",
+            "/ first": f"{r['median_s'] / first['median_s']:.3g}", "query ms": f"{1e3 * r['query_s']:.4g}",
+            "pairs - exact": r["directed_pairs"] - r["exact_directed_pairs"],
+        })  # fmt: skip
+    return "## What the choices cost, kernels alone\n\n" + (_markdown(table) if table else "No CUDA device: not measured.")
+
+
+def _memory(rows: list[dict[str, Any]]) -> str:
+    names = ("layout", "points", "capacity", "planned_bytes", "compiled_bytes", "peak_bytes", "warp_pool_bytes")
+    return "## Memory, planned and measured\n\n" + _markdown([{name: r[name] for name in names} for r in _of(rows, "memory")])
+
+
+def _markdown(table: list[dict[str, Any]]) -> str:
+    if not table:
+        return "No rows."
+    cells = [list(table[0]), ["---"] * len(table[0]), *(map(str, line.values()) for line in table)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+
+
+def _draw(rows: list[dict[str, Any]], path: Path) -> None:
+    copy = bandwidth(rows)
+    calls = [row for row in _of(rows, "call") if row.get("median_s")]
+    figure = Figure(figsize=(7, 5), layout="constrained")
+    axes = figure.subplots()
+    for method in dict.fromkeys(row["method"] for row in calls):
+        of_method = sorted((row["points"], row["median_s"]) for row in calls if row["method"] == method)
+        axes.plot(*zip(*((n, 1e9 * s / n) for n, s in of_method), strict=True), marker="o", label=method)
+    lists = sorted({(row["points"], floor_seconds(row, copy)) for row in calls if row["method"] == OURS})
+    axes.plot(*zip(*((n, 1e9 * s / n) for n, s in lists), strict=True), "k--", label="floor: bytes of the list / bandwidth")
+    axes.set(xscale="log", yscale="log", xlabel="particles", ylabel="ns per particle")
+    axes.grid(alpha=0.3, which="both")
+    axes.legend()
+    figure.savefig(path, dpi=150)
