@@ -56,8 +56,9 @@ def search(
             rounded up to a multiple of 8.
         slack: Factor >= 1 on the counted capacity, room for later motion.
         backend: "warp" (cells, compiled kernels, on CPU and NVIDIA GPUs), "hashgrid" (Warp's own `wp.HashGrid`, there too), "jax"
-            (cells, any device), "brute" (all n·m candidates), or "auto": "warp" where it can run, else "jax" with a warning.
-            The platform is that of the positions, where they are traced that of `jax.default_device`.
+            (cells, any device), "brute" (all n·m candidates), or "auto": what was measured to be fastest on the platform, "warp" on
+            the CPU (where Warp is missing "jax", with a warning), elsewhere "jax". The platform is that of the positions, where
+            they are traced that of `jax.default_device`.
 
     Returns:
         A `NeighborList`; `idx` has shape [m, capacity], unused slots hold n. Rows are in no promised order, but the same input
