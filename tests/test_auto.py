@@ -97,7 +97,12 @@ def unknown_platform(monkeypatch):
         function.cache_clear()
 
 
-def test_a_platform_without_warp_falls_back_and_warns_once(unknown_platform):
+def test_a_platform_without_measurements_takes_jax(unknown_platform):
+    assert jax.jit(lambda x: jfrnn.search(x, 0.3, capacity=40))(X).backend == "jax"
+
+
+def test_a_platform_without_warp_falls_back_and_warns_once(unknown_platform, monkeypatch):
+    monkeypatch.setitem(_auto._WARP_FROM, unknown_platform, 0)
     with pytest.warns(RuntimeWarning, match=r"the platform 'abacus': Warp has no engine for .*Pass backend='jax'") as caught:
         for capacity in (40, 50):
             assert jax.jit(lambda x, k=capacity: jfrnn.search(x, 0.3, capacity=k))(X).backend == "jax"

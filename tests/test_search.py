@@ -14,6 +14,7 @@ def random_points(n, dim, dtype, seed=0):
     return np.random.default_rng(seed).random((n, dim)).astype(dtype)
 
 
+BRUTE = pytest.param("brute", marks=pytest.mark.slow)  # its filters and rows are those of "jax", and it compiles as slowly
 OPTIONS = [
     {},
     {"half": True},
@@ -24,7 +25,7 @@ OPTIONS = [
 ]
 
 
-@pytest.mark.parametrize("backend", ["jax", "brute", "warp", "hashgrid"])
+@pytest.mark.parametrize("backend", ["jax", BRUTE, "warp", "hashgrid"])
 @pytest.mark.parametrize(("dtype", "dim"), [(np.float32, 3), (np.float64, 2)])
 @pytest.mark.parametrize("options", OPTIONS, ids=lambda o: "+".join(o) or "plain")
 def test_options(options, backend, dtype, dim):
@@ -121,7 +122,7 @@ def test_overflow_sets_the_bit_and_keeps_true_counts(capacity, backend):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("backend", ["jax", "brute", "warp", "hashgrid"])
+@pytest.mark.parametrize("backend", ["jax", BRUTE, "warp", "hashgrid"])
 @pytest.mark.parametrize(("dtype", "dim"), [(np.float32, 3), (np.float64, 2)])
 def test_non_finite_positions_set_a_bit_and_spare_the_others(value, backend, dtype, dim):
     points = random_points(100, dim, dtype)
