@@ -13,6 +13,7 @@ from jfrnn._cells import build_grid, cell_edge, cell_order, grid_coordinates, st
 from jfrnn._exact import Cutoff
 from jfrnn._runs import Filter, Points, Runs, count_neighbors, list_neighbors
 from jfrnn._status import Status
+from jfrnn._warp import Rows
 
 
 class Options(NamedTuple):
@@ -23,27 +24,15 @@ class Options(NamedTuple):
     radius: float | None = None  # of the cutoff, for the one engine that builds its grid from the host: hashgrid
 
 
-class Rows(NamedTuple):
-    """Neighbors of m queries: [m, capacity] int32 source indices, unused slots n (None: only counted), and [m] int32 true counts.
-
-    `required` [] int32 is the longest row, `status` [] int32 the bits of `Status`.
-    """
-
-    idx: Array | None
-    counts: Array
-    required: Array
-    status: Array
-
-
 def neighbors(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options, capacity: int | None) -> Rows:
     """List the neighbors of every query, or only count them (capacity=None). Integers: no gradient flows through."""
     sources = lax.stop_gradient(sources)
     queries = None if queries is None else lax.stop_gradient(queries)
     n, m = sources.shape[0], (sources if queries is None else queries).shape[0]
     if options.backend == "warp" and 0 not in (n, m):
-        return Rows(*_warp.neighbors(sources, queries, cutoff, options.filter, capacity))
+        return _warp.neighbors(sources, queries, cutoff, options.filter, capacity)
     if options.radius is not None and 0 not in (n, m):
-        return Rows(*_warp.hashgrid_neighbors(sources, queries, cutoff, options.radius, options.filter, capacity))
+        return _warp.hashgrid_neighbors(sources, queries, cutoff, options.radius, options.filter, capacity)
     if 0 in (n, m):
         idx, count = None if capacity is None else jnp.full((m, capacity), n, jnp.int32), jnp.zeros(m, jnp.int32)
     elif capacity is None:

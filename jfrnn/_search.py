@@ -10,7 +10,7 @@ from jax import Array
 from jax.core import Tracer
 
 from jfrnn._auto import choose_engine
-from jfrnn._backends import Options, Rows, neighbors
+from jfrnn._backends import Options, neighbors
 from jfrnn._exact import Cutoff
 from jfrnn._inputs import (
     checked_backend,
@@ -22,6 +22,7 @@ from jfrnn._inputs import (
 )
 from jfrnn._neighbors import NeighborList
 from jfrnn._runs import Filter
+from jfrnn._warp import Rows
 
 _CAPACITY_STEP = 8  # eager capacities are rounded up to a multiple, so that similar scenes share one compiled program
 

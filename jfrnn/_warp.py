@@ -12,7 +12,7 @@ import os
 import sys
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,9 +20,6 @@ from jax import Array, lax
 
 from jfrnn._exact import Cutoff, make_cutoff
 from jfrnn._runs import Filter
-
-if TYPE_CHECKING:
-    import warp
 
 INSTALL = 'pip install "jfrnn[warp]"'
 _PLACES_PER_THREAD = 2048  # below, a second thread costs more than it saves
@@ -42,13 +39,28 @@ class Variant(NamedTuple):
     keep: Filter
 
 
-class Result(NamedTuple):
-    """What an engine returns: rows (None where only counted), counts, the longest row and the bits of `Status`."""
+class Rows(NamedTuple):
+    """Neighbors of m queries: [m, capacity] int32 source indices, unused slots n (None: only counted), and [m] int32 true counts.
+
+    `required` [] int32 is the longest row, `status` [] int32 the bits of `Status`.
+    """
 
     idx: Array | None
     counts: Array
     required: Array
     status: Array
+
+
+class _Arrays(NamedTuple):
+    """What a call gets from XLA, as `warp.array`s; without rows `idx` is None."""
+
+    positions: Any
+    queries: Any
+    cutoff: Any
+    idx: Any
+    count: Any
+    info: Any
+    scratch: Any
 
 
 @functools.cache
@@ -86,40 +98,38 @@ def missing(platform: str) -> str | None:
     return f"Warp has no engine for the JAX platform {platform!r}"
 
 
-def neighbors(sources: Array, queries: Array | None, cutoff: Cutoff, keep: Filter, capacity: int | None) -> Result:
+def neighbors(sources: Array, queries: Array | None, cutoff: Cutoff, keep: Filter, capacity: int | None) -> Rows:
     """Search among cells with the Warp kernels; capacity=None only counts."""
 
-    def on(platform: str) -> Callable[..., Result]:
-        def call(sources: Array, queries: Array | None, cutoff: Cutoff) -> Result:
-            make, words = _CELLS[platform]
-            return _call(make, sources, queries, cutoff, keep, capacity, words)
+    def on(module: str, make: Callable[[Variant], Any]) -> Callable[..., Rows]:
+        return lambda sources, queries, cutoff: _call(module, make, sources, queries, cutoff, keep, capacity)
 
-        return call
-
-    return lax.platform_dependent(sources, queries, cutoff, cpu=on("cpu"), cuda=on("cuda"))
+    cpu, cuda = on("cells_cpu", _cpu_callable), on("cells_cuda", _cuda_callable)
+    return lax.platform_dependent(sources, queries, cutoff, cpu=cpu, cuda=cuda)
 
 
 def _call(
+    module: str,
     make: Callable[[Variant], Any],
     sources: Array,
     queries: Array | None,
     cutoff: Cutoff,
     keep: Filter,
     capacity: int | None,
-    scratch_words: Callable[..., int],
-) -> Result:
+) -> Rows:
+    """Let XLA call what `make` returns, with the scratch that the module of kernels asks for."""
     own, lists = queries is None, capacity is not None
     rows = sources if queries is None else queries
     (n, dim), m = sources.shape, rows.shape[0]
     double = sources.dtype == jnp.float64
     variant = Variant(dim, double, cutoff.scaled, lists, own, cutoff.closed, keep)
-    words = scratch_words(n, m, dim, 2 if double else 1, own)
+    words = kernels_of(module).scratch_words(n, m, dim, 2 if double else 1, own)
     dims: dict[str, Any] = {"count": m, "info": 2, "scratch": max(words, 1)}
     if lists:
         dims["idx"] = (m, capacity)
     radius = jnp.reshape(jnp.asarray(cutoff.radius), 1)
     *idx, count, info, _ = make(variant)(sources, rows, radius, output_dims=dims)
-    return Result(idx[0] if lists else None, count, info[0], info[1])
+    return Rows(idx[0] if lists else None, count, info[0], info[1])
 
 
 def scratch_bytes(engine: str, platform: str, n: int, m: int, dim: int, double: bool, own: bool) -> int:
@@ -131,7 +141,7 @@ def scratch_bytes(engine: str, platform: str, n: int, m: int, dim: int, double: 
         return 0
     width = 2 if double else 1
     if engine == "warp":
-        return 4 * _CELLS[_PLATFORMS[platform]].scratch_words(n, m, dim, width, own)
+        return 4 * kernels_of(f"cells_{_PLATFORMS[platform]}").scratch_words(n, m, dim, width, own)
     hashgrid = kernels_of("hashgrid")
     # warp/native/hashgrid.cpp: two ints per cell; of each point its cell and its id, room for 1.5 n, twice for the sort
     grid = 8 * math.prod(hashgrid.grid_shape(n, dim)) + 16 * (3 * n // 2)
@@ -139,11 +149,6 @@ def scratch_bytes(engine: str, platform: str, n: int, m: int, dim: int, double: 
 
 
 # --- cells ------------------------------------------------------------------------------------------------------------
-
-
-class _Engine(NamedTuple):
-    make: Callable[[Variant], Any]
-    scratch_words: Callable[..., int]
 
 
 @functools.cache
@@ -158,17 +163,6 @@ def _cuda_callable(variant: Variant) -> Any:  # noqa: ANN401
         _cuda_kernels(variant).load(wp.get_cuda_device())
     # Warp records the launches of a call once and replays them: one launch from the host, whatever XLA makes of the call
     return _register("cells_cuda", variant, _run_cells_on_cuda, wp.JaxCallableGraphMode.WARP)
-
-
-def _cpu_scratch_words(*sizes: Any) -> int:  # noqa: ANN401
-    return kernels_of("cells_cpu").scratch_words(*sizes)
-
-
-def _cuda_scratch_words(*sizes: Any) -> int:  # noqa: ANN401
-    return kernels_of("cells_cuda").scratch_words(*sizes)
-
-
-_CELLS = {"cpu": _Engine(_cpu_callable, _cpu_scratch_words), "cuda": _Engine(_cuda_callable, _cuda_scratch_words)}
 
 
 def _register(
@@ -190,10 +184,10 @@ def _register(
     types |= {"count": ints, "info": ints, "scratch": ints}
 
     def list_rows(positions: Any, queries: Any, cutoff: Any, idx: Any, count: Any, info: Any, scratch: Any) -> None:  # noqa: ANN401
-        run(variant, positions, queries, cutoff, idx, count, info, scratch)
+        run(variant, _Arrays(positions, queries, cutoff, idx, count, info, scratch))
 
     def count_rows(positions: Any, queries: Any, cutoff: Any, count: Any, info: Any, scratch: Any) -> None:  # noqa: ANN401
-        run(variant, positions, queries, cutoff, None, count, info, scratch)
+        run(variant, _Arrays(positions, queries, cutoff, None, count, info, scratch))
 
     func = list_rows if variant.lists else count_rows
     func.__annotations__ = {name: types[name] for name in types if variant.lists or name != "idx"}
@@ -211,54 +205,38 @@ def _cuda_kernels(variant: Variant) -> Any:  # noqa: ANN401
     return make(variant.dim, variant.double, variant.scaled, variant.lists, variant.keep.later_only)
 
 
-def _run_cells_on_cuda(
-    variant: Variant,
-    positions: "warp.array",
-    queries: "warp.array",
-    cutoff: "warp.array",
-    idx: "warp.array | None",
-    count: "warp.array",
-    info: "warp.array",
-    scratch: "warp.array",
-) -> None:
+def _run_cells_on_cuda(variant: Variant, arrays: _Arrays) -> None:
     wp = load_warp()
-    n, m = positions.shape[0], queries.shape[0]
-    idx, capacity = _rows_or_nothing(idx, count)
-    sizes = [n, m, int(variant.own), kernels_of("cells_cuda").table_cells(n), capacity]
-    arguments = [positions, queries, cutoff, idx, count, info, scratch, *sizes, int(variant.closed), int(variant.keep.drop_self)]
-    for launch in _cuda_kernels(variant).launches(n, m, variant.own):
+    arrays, sizes, capacity = _launchable(variant, arrays)
+    arguments = [*arrays, *sizes, capacity, int(variant.closed), int(variant.keep.drop_self)]
+    for launch in _cuda_kernels(variant).launches(*sizes[:2], variant.own):
         inputs = [*arguments, int(launch.of_queries)]
-        wp.launch(launch.kernel, dim=launch.threads, inputs=inputs, device=count.device, block_dim=launch.block)
+        wp.launch(launch.kernel, dim=launch.threads, inputs=inputs, device=arrays.count.device, block_dim=launch.block)
 
 
-def _run_cells_on_cpu(
-    variant: Variant,
-    positions: "warp.array",
-    queries: "warp.array",
-    cutoff: "warp.array",
-    idx: "warp.array | None",
-    count: "warp.array",
-    info: "warp.array",
-    scratch: "warp.array",
-) -> None:
+def _run_cells_on_cpu(variant: Variant, arrays: _Arrays) -> None:
     wp = load_warp()
-    module = kernels_of("cells_cpu")
-    kernels = module.cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists)
-    n, m = positions.shape[0], queries.shape[0]
-    idx, capacity = _rows_or_nothing(idx, count)
-    sizes = [n, m, int(variant.own), module.table_cells(n)]
+    kernels = kernels_of("cells_cpu").cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists)
+    arrays, sizes, capacity = _launchable(variant, arrays)
+    positions, queries, cutoff, idx, _, info, scratch = arrays
     wp.launch(kernels.build, dim=1, inputs=[positions, queries, cutoff, info, scratch, *sizes], device="cpu")
-    _ask_for_huge_pages(int(idx.ptr or 0), 4 * m * capacity)
+    _ask_for_huge_pages(idx.ptr, 4 * len(queries) * capacity)
     flags = [int(variant.closed), int(variant.keep.drop_self), int(variant.keep.later_only)]
-    arguments = [positions, queries, cutoff, idx, count, info, scratch, *sizes, capacity, *flags]
-    _on_every_core(lambda: wp.launch(kernels.query, dim=1, inputs=arguments, device="cpu"), -(-m // _PLACES_PER_THREAD))
+    arguments = [*arrays, *sizes, capacity, *flags]
+    _on_every_core(lambda: wp.launch(kernels.query, dim=1, inputs=arguments, device="cpu"), -(-len(queries) // _PLACES_PER_THREAD))
 
 
-def _rows_or_nothing(idx: "warp.array | None", count: "warp.array") -> tuple["warp.array", int]:
-    """Return the rows and their capacity; without rows something of their kind that nobody writes to."""
-    if idx is not None:
-        return idx, idx.shape[1]
-    return load_warp().array(ptr=count.ptr, shape=(count.shape[0], 1), dtype=count.dtype, device=count.device), 0
+def _launchable(variant: Variant, arrays: _Arrays) -> tuple[_Arrays, list[int], int]:
+    """Return the arrays, the sizes n, m, own and cells of the table, and the capacity, as the cell kernels take them.
+
+    Without rows, something of their kind that nobody writes to stands in their place, and the capacity is 0.
+    """
+    n, m, count = arrays.positions.shape[0], arrays.queries.shape[0], arrays.count
+    sizes = [n, m, int(variant.own), kernels_of("_native").table_cells(n)]
+    if arrays.idx is not None:
+        return arrays, sizes, arrays.idx.shape[1]
+    unused = load_warp().array(ptr=count.ptr, shape=(m, 1), dtype=count.dtype, device=count.device)
+    return arrays._replace(idx=unused), sizes, 0
 
 
 def _on_every_core(launch: Callable[[], None], most: int) -> None:
@@ -298,7 +276,7 @@ def _libc() -> ctypes.CDLL:
 
 def hashgrid_neighbors(
     sources: Array, queries: Array | None, cutoff: Cutoff, radius: float, keep: Filter, capacity: int | None
-) -> Result:
+) -> Rows:
     """Search with `wp.HashGrid`; capacity=None only counts. `radius` is the cutoff's, static: the grid is built from the host."""
     version = load_warp().__version__
     if tuple(map(int, version.split(".")[:2])) < (1, 19):
@@ -309,7 +287,7 @@ def hashgrid_neighbors(
     def make(variant: Variant) -> Any:  # noqa: ANN401
         return _hashgrid_callable(variant, radius)
 
-    return _call(make, sources, queries, cutoff, keep, capacity, kernels_of("hashgrid").scratch_words)
+    return _call("hashgrid", make, sources, queries, cutoff, keep, capacity)
 
 
 @functools.cache
@@ -318,18 +296,9 @@ def _hashgrid_callable(variant: Variant, radius: float) -> Any:  # noqa: ANN401
     return _register("hashgrid", variant, functools.partial(_run_hashgrid, bounds), radius=radius)
 
 
-def _run_hashgrid(
-    bounds: Cutoff,
-    variant: Variant,
-    positions: "warp.array",
-    queries: "warp.array",
-    cutoff: "warp.array",
-    idx: "warp.array | None",
-    count: "warp.array",
-    info: "warp.array",
-    scratch: "warp.array",
-) -> None:
+def _run_hashgrid(bounds: Cutoff, variant: Variant, arrays: _Arrays) -> None:
     wp = load_warp()
+    positions, queries, cutoff, idx, count, info, scratch = arrays
     n, device = positions.shape[0], count.device
     hashgrid = kernels_of("hashgrid")
     kernels = hashgrid.hashgrid_kernels(variant.dim, variant.double, variant.scaled, variant.lists)

@@ -72,6 +72,38 @@ struct Bits {  // of floats
         return power_of_two(e > largest ? -largest : -e);
     }
 };
+auto finite_point = [](const real* p) {
+    bool finite = true;
+    for (int k = 0; k < DIM; ++k)
+        finite = finite && Bits::finite(p[k]);
+    return finite;
+};
+// the bounding box [low, high] grows to hold the box [l, h]
+auto widen = [](real* low, real* high, const real* l, const real* h) {
+    for (int k = 0; k < DIM; ++k) {
+        low[k] = l[k] < low[k] ? l[k] : low[k];
+        high[k] = h[k] > high[k] ? h[k] : high[k];
+    }
+};
+"""
+
+# XLA's threads flush denormals to zero on the CPU: undo that while native code runs.
+ENTER = r"""
+#if defined(__SSE__) && !defined(__CUDA_ARCH__)
+const unsigned int float_control = __builtin_ia32_stmxcsr();
+__builtin_ia32_ldmxcsr(float_control & ~0x8040u);
+#elif defined(__aarch64__) && !defined(__CUDA_ARCH__)
+unsigned long long float_control;
+asm volatile("mrs %0, fpcr" : "=r"(float_control));
+asm volatile("msr fpcr, %0" : : "r"(float_control & ~(1ull << 24)));
+#endif
+"""
+LEAVE = r"""
+#if defined(__SSE__) && !defined(__CUDA_ARCH__)
+__builtin_ia32_ldmxcsr(float_control);
+#elif defined(__aarch64__) && !defined(__CUDA_ARCH__)
+asm volatile("msr fpcr, %0" : : "r"(float_control));
+#endif
 """
 
 # Where a pair is decided. Step 1 belongs to the kernels: working precision and a band of 8 eps around r^2 (less would do, see

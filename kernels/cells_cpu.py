@@ -9,7 +9,7 @@ import functools
 from typing import NamedTuple
 
 import warp as wp
-from jfrnn.kernels._native import CELLS, EXACT, snippet, table_cells
+from jfrnn.kernels._native import CELLS, ENTER, EXACT, LEAVE, snippet, table_cells
 
 _HEADER_WORDS = 64
 
@@ -45,47 +45,19 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -
     return sum((words + 15) // 16 * 16 for words in parts)
 
 
-# XLA's threads flush denormals to zero: undo that while native code runs.
-_ENTER = r"""
-#if defined(__SSE__)
-const unsigned int float_control = __builtin_ia32_stmxcsr();
-__builtin_ia32_ldmxcsr(float_control & ~0x8040u);
-#elif defined(__aarch64__)
-unsigned long long float_control;
-asm volatile("mrs %0, fpcr" : "=r"(float_control));
-asm volatile("msr fpcr, %0" : : "r"(float_control & ~(1ull << 24)));
-#endif
-"""
-_LEAVE = r"""
-#if defined(__SSE__)
-__builtin_ia32_ldmxcsr(float_control);
-#elif defined(__aarch64__)
-asm volatile("msr fpcr, %0" : : "r"(float_control));
-#endif
-"""
-
 _BUILD = r"""
 real low[3], high[3];
 for (int k = 0; k < DIM; ++k) {
     low[k] = __builtin_inff();
     high[k] = -__builtin_inff();
 }
-auto finite_point = [&](const real* p) {
-    bool finite = true;
-    for (int k = 0; k < DIM; ++k)
-        finite = finite && Bits::finite(p[k]);
-    return finite;
-};
 int finite = 0;
 for (int i = 0; i < n; ++i) {
     const real* p = positions.data + (long long)DIM * i;
     if (!finite_point(p))
         continue;
     ++finite;
-    for (int k = 0; k < DIM; ++k) {
-        low[k] = p[k] < low[k] ? p[k] : low[k];
-        high[k] = p[k] > high[k] ? p[k] : high[k];
-    }
+    widen(low, high, p, p);
 }
 if (finite == 0)
     for (int k = 0; k < DIM; ++k)
@@ -455,10 +427,7 @@ for (;;) {
             cells_of(q, other);
             if (!same_cell(cell, other))
                 break;
-            for (int k = 0; k < DIM; ++k) {
-                low[k] = q[k] < low[k] ? q[k] : low[k];
-                high[k] = q[k] > high[k] ? q[k] : high[k];
-            }
+            widen(low, high, q, q);
         }
         serve(place, end, low, high);
         place = end;
@@ -503,8 +472,8 @@ def cell_kernels(dim: int, double: bool, scaled: bool, lists: bool, exact: bool 
     for native in (build_native, query_native):
         native.__name__ = native.__qualname__ = f"{native.__name__}_{variant}"
     native_text = functools.partial(snippet, "double" if double else "float", dim, CELLS, _LAYOUT, **options)
-    build_function = wp.func_native(_ENTER + native_text(_BUILD) + _LEAVE)(build_native)
-    query_function = wp.func_native(_ENTER + native_text(EXACT, _QUERY) + _LEAVE)(query_native)
+    build_function = wp.func_native(ENTER + native_text(_BUILD) + LEAVE)(build_native)
+    query_function = wp.func_native(ENTER + native_text(EXACT, _QUERY) + LEAVE)(query_native)
 
     def build(positions: points, queries: points, cutoff: reals, info: ints, scratch: ints, n: int, m: int, own: int, table: int):
         build_function(positions, queries, cutoff, info, scratch, n, m, own, table)

@@ -5,7 +5,8 @@ count    every block reduces those bounds to the grid; every particle counts its
 scan     counts to first places, in one pass (Merrill & Garland 2016, decoupled look-back)
 scatter  indices into their cells, in the order in which they came
 gather   positions into cell order, ranked by index within a cell: the same order in every run
-query    a warp of 32 lanes serves a few neighboring queries: 32 candidates at a time, hits get their slots by a vote
+query    a warp serves up to 32 neighboring queries, one per lane: candidates within reach of their box meet all of them, 32 in a
+         block; a neighbor is a bit, until the rows are written
 """
 
 import functools
@@ -55,13 +56,6 @@ constexpr unsigned int ALL = 0xffffffffu;
 auto id_of = [](real bits) -> int { return DOUBLE ? (int)__double_as_longlong(bits) : __float_as_int(bits); };
 auto bits_as_real = [](int id) -> real { return DOUBLE ? (real)__longlong_as_double(id) : (real)__int_as_float(id); };
 const real INF = DOUBLE ? (real)__longlong_as_double(0x7ff0000000000000ll) : (real)__int_as_float(0x7f800000);
-const real NOWHERE = DOUBLE ? (real)__longlong_as_double(0x7ff8000000000000ll) : (real)__int_as_float(0x7fc00000);
-auto finite_point = [&](const real* p) {
-    bool finite = true;
-    for (int k = 0; k < DIM; ++k)
-        finite = finite && Bits::finite(p[k]);
-    return finite;
-};
 """
 
 
@@ -77,6 +71,38 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, t
     return sum((words + 15) // 16 * 16 for words in parts)
 
 
+# Bounds and numbers of finite points of all threads of a block, into those of its first thread.
+_REDUCE = r"""
+auto reduce_over_block = [&](real* low, real* high, int& finite) {
+    __shared__ real lows[3][BLOCK / 32], highs[3][BLOCK / 32];
+    __shared__ int finites[BLOCK / 32];
+    for (int step = 16; step > 0; step /= 2) {
+        finite += __shfl_down_sync(ALL, finite, step);
+        for (int k = 0; k < DIM; ++k) {
+            const real l = __shfl_down_sync(ALL, low[k], step), h = __shfl_down_sync(ALL, high[k], step);
+            low[k] = l < low[k] ? l : low[k];
+            high[k] = h > high[k] ? h : high[k];
+        }
+    }
+    if (lane == 0) {
+        finites[warp_in_block] = finite;
+        for (int k = 0; k < DIM; ++k) {
+            lows[k][warp_in_block] = low[k];
+            highs[k][warp_in_block] = high[k];
+        }
+    }
+    __syncthreads();
+    if (threadIdx.x == 0)
+        for (int w = 1; w < BLOCK / 32; ++w) {
+            finite += finites[w];
+            for (int k = 0; k < DIM; ++k) {
+                low[k] = lows[k][w] < low[k] ? lows[k][w] : low[k];
+                high[k] = highs[k][w] > high[k] ? highs[k][w] : high[k];
+            }
+        }
+};
+"""
+
 _BOUNDS = r"""
 real low[3], high[3];
 for (int k = 0; k < DIM; ++k) {
@@ -91,38 +117,11 @@ for (long long i = thread; i < n; i += threads) {
     if (!finite_point(p))
         continue;
     ++finite;
-    for (int k = 0; k < DIM; ++k) {
-        low[k] = p[k] < low[k] ? p[k] : low[k];
-        high[k] = p[k] > high[k] ? p[k] : high[k];
-    }
+    widen(low, high, p, p);
 }
-__shared__ real lows[3][8], highs[3][8];
-__shared__ int finites[8];
-for (int step = 16; step > 0; step /= 2) {
-    finite += __shfl_down_sync(ALL, finite, step);
-    for (int k = 0; k < DIM; ++k) {
-        const real l = __shfl_down_sync(ALL, low[k], step), h = __shfl_down_sync(ALL, high[k], step);
-        low[k] = l < low[k] ? l : low[k];
-        high[k] = h > high[k] ? h : high[k];
-    }
-}
-if (lane == 0) {
-    finites[warp_in_block] = finite;
-    for (int k = 0; k < DIM; ++k) {
-        lows[k][warp_in_block] = low[k];
-        highs[k][warp_in_block] = high[k];
-    }
-}
-__syncthreads();
+reduce_over_block(low, high, finite);
 if (threadIdx.x == 0) {
     real* part = parts + 8 * block;
-    for (int w = 1; w < 8; ++w) {
-        finite += finites[w];
-        for (int k = 0; k < DIM; ++k) {
-            low[k] = lows[k][w] < low[k] ? lows[k][w] : low[k];
-            high[k] = highs[k][w] > high[k] ? highs[k][w] : high[k];
-        }
-    }
     for (int k = 0; k < DIM; ++k) {
         part[k] = low[k];
         part[3 + k] = high[k];
@@ -144,8 +143,6 @@ if (thread == 0) {
 """
 
 _COUNT = r"""
-__shared__ real lows[3][8], highs[3][8];
-__shared__ int finites[8];
 __shared__ Grid grid;
 {
     real low[3], high[3];
@@ -155,30 +152,8 @@ __shared__ Grid grid;
         low[k] = part[k];
         high[k] = part[3 + k];
     }
-    for (int step = 16; step > 0; step /= 2) {
-        finite += __shfl_down_sync(ALL, finite, step);
-        for (int k = 0; k < DIM; ++k) {
-            const real l = __shfl_down_sync(ALL, low[k], step), h = __shfl_down_sync(ALL, high[k], step);
-            low[k] = l < low[k] ? l : low[k];
-            high[k] = h > high[k] ? h : high[k];
-        }
-    }
-    if (lane == 0) {
-        finites[warp_in_block] = finite;
-        for (int k = 0; k < DIM; ++k) {
-            lows[k][warp_in_block] = low[k];
-            highs[k][warp_in_block] = high[k];
-        }
-    }
-    __syncthreads();
+    reduce_over_block(low, high, finite);
     if (threadIdx.x == 0) {
-        for (int w = 1; w < 8; ++w) {
-            finite += finites[w];
-            for (int k = 0; k < DIM; ++k) {
-                low[k] = lows[k][w] < low[k] ? lows[k][w] : low[k];
-                high[k] = highs[k][w] > high[k] ? highs[k][w] : high[k];
-            }
-        }
         if (finite == 0)
             for (int k = 0; k < DIM; ++k)
                 low[k] = high[k] = 0;
@@ -219,7 +194,7 @@ if (threadIdx.x == 0)
 __syncthreads();
 const int tile = tile_shared, cells = shared.grid.cells + 1;  // one more entry: the end of the last cell
 if ((long long)tile * TILE < cells) {
-    constexpr int EACH = TILE / 256;
+    constexpr int EACH = TILE / BLOCK;
     const long long first = (long long)tile * TILE + threadIdx.x * EACH;
     int value[EACH], total = 0;
     for (int e = 0; e < EACH; ++e) {
@@ -283,12 +258,14 @@ if (thread == 0 && (own || of_queries))
 """
 
 _GATHER = r"""
+const Grid grid = shared.grid;
 for (long long place = thread; place < n; place += threads) {
-    const int i = order[place], cell = key[i];
+    const int i = order[place];
     Place mine;
     for (int k = 0; k < DIM; ++k)
         mine.p[k] = positions.data[(long long)DIM * i + k];
     mine.id = bits_as_real(i);
+    const int cell = finite_point(mine.p) ? cell_key(grid, mine.p) : -1;  // cheaper than to fetch key[i] from anywhere
     long long to = place;
     if (cell >= 0) {
         const int first = start[cell], end = start[cell + 1];
@@ -302,12 +279,16 @@ for (long long place = thread; place < n; place += threads) {
 """
 
 _QUERY = r"""
-constexpr int KEPT = 720, SLOTS = 184, EACH = DOUBLE ? 2 : 1;  // bytes of a neighbor
-struct Warp {  // what a warp shares
-    Place candidates[64];  // a ring of candidates within reach of the group's box
-    int ids[LIST ? KEPT : 1];  // of all of them since the rows were last written
-    // of each query, as numbers of candidates, in float32 modulo 256; an odd stride in words
-    unsigned char neighbors[LIST ? 32 : 1][EACH * (SLOTS + 4 / EACH)];
+constexpr int BLOCKS = 24;  // of candidates, whose neighbors are written together
+constexpr int CHUNK = 32;  // neighbors of a query that are written at once
+struct alignas(16) Box { real bound[8]; };  // lowest and highest in turn, per axis
+struct alignas(16) Warp {  // what a warp shares
+    real candidates[DIM][64];  // coordinates of a ring of candidates within reach of the group's box
+    int candidate_ids[LATER ? 64 : 1];
+    int ids[LIST ? 32 * (BLOCKS + 1) : 1];  // of all of them since the rows were last written, per block from the last to the first
+    unsigned int hits[LIST ? BLOCKS : 1][32];  // per block of candidates and query: one bit per candidate, the first one leads
+    int lists[LIST ? 32 : 1][CHUNK + 1];  // of each query: what is written next; an odd stride, for the banks
+    Box box;  // of the group
     int shifts[32];  // per row of cells: what leads from a candidate's number to its place
 };
 __shared__ Warp warps[QUERY_BLOCK / 32];
@@ -317,8 +298,9 @@ const int finite_queries = shared.finite_queries;
 const long long begin = (thread >> 5) * 32;
 int place = begin < m ? (int)begin : m;
 const int stop = m - place < 32 ? m : place + 32;
-const unsigned int lanes_below = (1u << lane) - 1, lanes_until = (2u << lane) - 1;
+const unsigned int lanes_below = (1u << lane) - 1;
 const real square_radius = step_radius * step_radius, band = 8 * step_eps * square_radius;
+const real sure_square = square_radius - band;
 const bool drops_self = own && drop_self;
 auto load = [&](const Place* from) -> Place {
     if constexpr (DOUBLE) {
@@ -340,9 +322,10 @@ auto load_query = [&](int at) -> Place {
     q.id = bits_as_real(i);
     return q;
 };
-// |b - a|^2 - r^2 in working precision, fused or not: off by less than 5 eps r^2 wherever it is near zero (see jfrnn/_exact.py)
+// |b - a|^2 - r^2 + band in working precision, fused or not: off by less than 5 eps r^2 where it is near [0, 2 band], see
+// jfrnn/_exact.py. Negative: surely closer than the cutoff. Its upper word has the sign and, if not negative, the order of all.
 auto excess = [&](const real* a, const real* b) -> real {
-    real sum = -square_radius;
+    real sum = -sure_square;
 #pragma unroll
     for (int k = 0; k < DIM; ++k) {
         real d = b[k] - a[k];
@@ -352,7 +335,15 @@ auto excess = [&](const real* a, const real* b) -> real {
     }
     return sum;
 };
+auto upper_word = [](real x) -> unsigned int { return DOUBLE ? __double2hiint(x) : __float_as_uint((float)x); };
 auto magnitude = [](real x) -> real { return DOUBLE ? (real)fabs(x) : (real)fabsf(x); };
+auto larger = [](real a, real b) -> real {
+    if constexpr (DOUBLE)
+        return a > b ? a : b;
+    else
+        return fmaxf(a, b);
+};
+auto shared_address = [](const void* p) { return (unsigned int)__cvta_generic_to_shared(p); };
 auto square_root = [](float x) {
     float y;
     asm("sqrt.approx.f32 %0, %1;" : "=f"(y) : "f"(x));
@@ -382,12 +373,10 @@ while (place < stop) {
         continue;
     }
     const int my_id = id_of(mine.id);
-    real q[3];
     // lane 2a holds the group's lowest coordinate along axis a and the lowest cell in reach, lane 2a + 1 the highest
     real bound = 0, low[3] = {0, 0, 0}, high[3] = {0, 0, 0};
 #pragma unroll
     for (int a = 0; a < DIM; ++a) {
-        q[a] = lane < group ? mine.p[a] : NOWHERE;
         low[a] = lane < group ? mine.p[a] : INF;
         high[a] = lane < group ? mine.p[a] : -INF;
         if constexpr (DOUBLE) {
@@ -404,6 +393,8 @@ while (place < stop) {
         }
         bound = lane == 2 * a ? low[a] : lane == 2 * a + 1 ? high[a] : bound;
     }
+    if (lane < 2 * DIM)
+        warp.box.bound[lane] = bound;
     whole reached;
     {
         const real x = cell_of(lane / 2, lane % 2 ? bound + radius : bound - radius);
@@ -424,69 +415,94 @@ while (place < stop) {
     const int length = (int)(last[0] - first[0]) + 1, wide = (int)(last[1] - first[1]) + 1;
     const int across = ORDER != 0 ? length : 1;  // on a curve, cells along x are no run
     const int rows = length > 0 && wide > 0 && last[2] >= first[2] ? across * wide * (int)(last[2] - first[2] + 1) : 0;
-    // `kept` candidates so far, of which `tested` have met the queries; `found` neighbors stand in the rows already
-    int found = 0, kept = 0, tested = 0;
+    // since the rows were last written: `kept` candidates, of which `tested` have met the queries
+    // of this query: `found` neighbors, of which `written` stand in its row and up to CHUNK wait in its list
+    int found = 0, written = 0;
+    unsigned int waiting = 0, kept = 0, tested = 0;
+    auto keep = [&](const Place& candidate, unsigned int number) {
+#pragma unroll
+        for (int a = 0; a < DIM; ++a)
+            warp.candidates[a][number % 64] = candidate.p[a];
+        if constexpr (LATER)
+            warp.candidate_ids[number % 64] = id_of(candidate.id);
+        if constexpr (LIST)
+            warp.ids[number ^ 31] = id_of(candidate.id);
+    };
     bool meets_itself = drops_self;  // the first candidates are the queries themselves: number = lane
     if (own) {
-        if (lane < group) {
-            warp.candidates[lane] = mine;
-            if constexpr (LIST)
-                warp.ids[lane] = my_id;
-        }
+        if (lane < group)
+            keep(mine, lane);
         kept = group;
     }
-    // shared memory as the hardware numbers it: a store and a step of its address under one predicate
-    const unsigned int list_begin = (unsigned int)__cvta_generic_to_shared(warp.neighbors[LIST ? lane : 0]);
-    unsigned int list_end = list_begin, marks = 0xffffffff;  // one byte each: neighbors among the first 256, 512, 768 candidates
-    auto listed = [&] { return (int)(list_end - list_begin) / (LIST ? EACH : 1); };
-    auto add = [&](real over, real limit, int number) {
-        if constexpr (!LIST)
-            list_end += over < limit;
-        else if constexpr (DOUBLE)
-            asm volatile("{.reg .pred p; setp.lt.f64 p, %2, %3; @p st.shared.u16 [%0], %1; @p add.u32 %0, %0, 2;}"
-                         : "+r"(list_end) : "h"((short)number), "d"((double)over), "d"((double)limit) : "memory");
-        else
-            asm volatile("{.reg .pred p; setp.lt.f32 p, %2, %3; @p st.shared.u8 [%0], %1; @p add.u32 %0, %0, 1;}"
-                         : "+r"(list_end) : "r"(number), "f"((float)over), "f"((float)limit) : "memory");
-    };
+    const bool in_quads = (capacity & 3) == 0;  // only then rows begin where 16 bytes may be stored at once
+    int* const list = warp.lists[LIST ? lane : 0];
     auto write_rows = [&](bool finished) {
         __syncwarp();
-        const int added = listed();
-        if constexpr (LIST) {
-#pragma unroll 4
-            for (int k = 0; k < group; ++k) {
-                const int id = __shfl_sync(ALL, my_id, k), before = __shfl_sync(ALL, found, k), size = __shfl_sync(ALL, added, k);
-                const unsigned int steps = __shfl_sync(ALL, marks, k);
-                int* out = idx.data + (long long)id * capacity + before;
-                const int room = capacity - before, writes = finished || room < size ? room : size;
-                const unsigned int list = (unsigned int)__cvta_generic_to_shared(warp.neighbors[k]);
-                auto neighbor = [&](int s, unsigned int number) {
-                    number += 256 * ((s >= (steps & 255)) + (s >= (steps >> 8 & 255)) + (s >= (steps >> 16 & 255)));
-                    return s < size ? warp.ids[s < size ? number : 0] : n;
-                };
-                if (!DOUBLE && ((capacity | before | writes) & 3) == 0) {  // four slots per lane
-                    for (int s = 4 * lane; s < writes; s += 128) {
-                        unsigned int four = 0;
-                        if (s < size)  // beyond the row's neighbors there may be no shared memory
-                            asm volatile("ld.shared.u32 %0, [%1];" : "=r"(four) : "r"(list + s) : "memory");
-                        *(int4*)(out + s) = make_int4(neighbor(s, four & 255), neighbor(s + 1, four >> 8 & 255),
-                                                      neighbor(s + 2, four >> 16 & 255), neighbor(s + 3, four >> 24));
-                    }
-                } else
-                    for (int s = lane; s < writes; s += 32) {
-                        unsigned short number = 0;
-                        if (DOUBLE && s < size)
-                            asm volatile("ld.shared.u16 %0, [%1];" : "=h"(number) : "r"(list + 2 * s) : "memory");
-                        else if (s < size)
-                            asm volatile("ld.shared.u8 %0, [%1];" : "=h"(number) : "r"(list + s) : "memory");
-                        out[s] = DOUBLE ? (s < size ? warp.ids[number] : n) : neighbor(s, number);
-                    }
+        unsigned int hits = 0, word = shared_address(&warp.hits[0][lane]), id_word = shared_address(warp.ids) - 128;
+        const unsigned int last_word = word + 4 * tested, list_begin = shared_address(list), list_end = list_begin + 4 * CHUNK;
+        for (bool more = true; more;) {
+            // every lane numbers its next neighbors, two at a time
+            unsigned int list_at = list_begin + 4 * waiting;
+            while (list_at < list_end && (hits || word != last_word))
+                asm volatile("{.reg .pred empty, one, two; .reg .u32 bit, at, id, other_bit, other_at, other_id;"
+                             "setp.eq.u32 empty, %0, 0;"  // the next word
+                             "@empty ld.shared.u32 %0, [%1];"
+                             "@empty add.u32 %1, %1, 128;"
+                             "@empty add.u32 %2, %2, 128;"
+                             "setp.ne.u32 one, %0, 0;"
+                             "bfind.u32 bit, %0;"
+                             "mad.lo.u32 at, bit, 4, %2;"
+                             "@one ld.shared.u32 id, [at];"
+                             "shl.b32 bit, 1, bit;"
+                             "xor.b32 %0, %0, bit;"
+                             "setp.ne.u32 two, %0, 0;"
+                             "bfind.u32 other_bit, %0;"
+                             "mad.lo.u32 other_at, other_bit, 4, %2;"
+                             "@two ld.shared.u32 other_id, [other_at];"
+                             "shl.b32 other_bit, 1, other_bit;"
+                             "xor.b32 %0, %0, other_bit;"
+                             "@one st.shared.u32 [%3], id;"
+                             "@two st.shared.u32 [%3 + 4], other_id;"
+                             "@one add.u32 %3, %3, 4;"
+                             "@two add.u32 %3, %3, 4;}"
+                             : "+r"(hits), "+r"(word), "+r"(id_word), "+r"(list_at) : : "memory");
+            waiting = (list_at - list_begin) / 4;
+            const bool writes = lane < group && (finished || waiting >= CHUNK);
+            if (finished)
+#pragma unroll 1
+                for (; waiting < CHUNK; ++waiting)
+                    list[waiting] = n;
+            // eight lanes write what waits for one row
+            const int before = writes ? written : capacity;
+            const unsigned long long slot = (unsigned long long)my_id * capacity + before;
+            __syncwarp();
+#pragma unroll
+            for (int k = 0; k < 32; k += 4) {
+                const int row = k + lane / 8, first = lane % 8 * 4;
+                const int room = capacity - __shfl_sync(ALL, before, row) - first;
+                const unsigned long long row_slot = __shfl_sync(ALL, slot, row);
+                if (room <= 0)
+                    continue;
+                int* const out = idx.data + row_slot + first;
+                const int* const from = warp.lists[row] + first;
+                const int4 four = make_int4(from[0], from[1], from[2], from[3]);
+                if (in_quads) {
+                    *(int4*)out = four;
+                    continue;
+                }
+                out[0] = four.x;
+                if (room > 1) out[1] = four.y;
+                if (room > 2) out[2] = four.z;
+                if (room > 3) out[3] = four.w;
             }
+            __syncwarp();
+            if (writes) {
+                written += CHUNK;
+                waiting -= CHUNK;
+                list[0] = list[CHUNK];  // if there was one more
+            }
+            more = __any_sync(ALL, finished ? lane < group && written < capacity : hits || word != last_word);
         }
-        found += added;
-        list_end = list_begin;
-        marks = 0xffffffff;
-        __syncwarp();
     };
     for (int base = 0; base < rows; base += 32) {
         // each lane finds one row of cells
@@ -561,120 +577,117 @@ while (place < stop) {
             warp.shifts[__popc(occupied & lanes_below)] = from - (end - size);
         __syncwarp();
 
-        int rows_done = 0;
+        int rows_done = 0, at = -1;
+        const int wrap = grid.dense ? 0x7fffffff : grid.finite;  // where the ring of cells closes
         const bool last_rows = base + 32 >= rows;
-        int next_at = -1;
-        Place next{{0, 0, 0}, 0};
+        Place candidate{{0, 0, 0}, 0};
         auto fetch = [&](int c0) {
-            const int ends_at = size > 0 ? end - c0 : 0;  // rows that end within these 32 candidates, one bit each
-            const unsigned int ends = __reduce_or_sync(ALL, ends_at > 0 && ends_at < 32 ? 1u << ends_at : 0);
-            const int r = rows_done + __popc(ends & lanes_until);
-            rows_done += __popc(ends) + __any_sync(ALL, ends_at == 32);
-            next_at = -1;
+            // rows that end before one of these 32 candidates, a bit each: rows that are empty end with the one before
+            unsigned int ended;
+            asm("shl.b32 %0, 1, %1;" : "=r"(ended) : "r"(end - c0 - 1));  // 0 unless 0 < end - c0 <= 32
+            ended = __reduce_or_sync(ALL, ended);
+            at = -1;
             if (c0 + lane < total) {
-                next_at = c0 + lane + warp.shifts[r];
-                if (!grid.dense && next_at >= grid.finite)
-                    next_at -= grid.finite;  // the ring of cells closes
-                next = load(sorted + next_at);
+                at = c0 + lane + warp.shifts[rows_done + __popc(ended & lanes_below)];
+                at -= at >= wrap ? wrap : 0;
+                candidate = load(sorted + at);
             }
+            rows_done += __popc(ended);
         };
         if (total > 0)
             fetch(0);
-        bool draining = false;  // the rows are full: test what is kept, write them, go on
         int c0 = 0;
 #pragma unroll 1
-        while (c0 < total || draining || (last_rows && tested < kept)) {
-            const int at = next_at;
-            const Place candidate = next;
-            bool near = !draining && c0 < total && at >= 0;
-            if (!draining) {
-                c0 += 32;
-                if (c0 < total)
-                    fetch(c0);
-            }
+        while (c0 < total || (last_rows && tested < kept)) {
+            const Box box = *(const Box*)&warp.box;  // from there, since registers are few
             real square = 0;
 #pragma unroll
             for (int a = 0; a < DIM; ++a) {
-                const real x = candidate.p[a], under = low[a] - x, over = x - high[a];
-                real gap = under > over ? under : over;
-                gap = gap > 0 ? gap : 0;
+                const real x = candidate.p[a];
+                real gap = larger(larger(box.bound[2 * a] - x, x - box.bound[2 * a + 1]), 0);
                 if constexpr (SCALED)
                     gap *= step_scale;
                 square += gap * gap;
             }
-            near = near && square <= square_radius + band && !(own && at >= place && at < place + group);
+            const bool near = at >= 0 && square <= square_radius + band && (unsigned int)(at - place) >= (own ? group : 0);
             const unsigned int all_near = __ballot_sync(ALL, near);
-            if (near) {
-                const int number = kept + __popc(all_near & lanes_below);
-                warp.candidates[number % 64] = candidate;
-                if constexpr (LIST)
-                    warp.ids[number] = id_of(candidate.id);
-            }
+            if (near)
+                keep(candidate, kept + __popc(all_near & lanes_below));
             kept += __popc(all_near);
-            const bool rest = draining || (last_rows && c0 >= total);
-            if (kept - tested < 32 && !(rest && tested < kept)) {
-                if (draining) {
-                    write_rows(false);
-                    kept = tested = 0;
-                    draining = false;
-                }
+            c0 += 32;
+            at = -1;
+            if (c0 < total)
+                fetch(c0);
+            if (kept - tested < 32 && !(last_rows && c0 >= total && tested < kept))
                 continue;
-            }
-            if (kept - tested + lane < 32)
-                warp.candidates[(kept + lane) % 64] = Place{{NOWHERE, NOWHERE, NOWHERE}, 0};
             __syncwarp();
-            const Place* block = warp.candidates + tested % 64;
-            real tightest = INF;
-            auto allowed = [&](const Place& other) { return !LATER || id_of(other.id) >= my_id + drop_self; };
-            auto test = [&](int j) -> real {
-                const Place other = block[j];
-                const real over = excess(q, other.p);
-                if constexpr (EXACTLY)
-                    tightest = DOUBLE ? (real)fmin(tightest, magnitude(over)) : (real)fminf(tightest, magnitude(over));
-                return allowed(other) ? over : INF;
-            };
-            if (meets_itself) {
-#pragma unroll 8
-                for (int j = 0; j < 32; ++j) {
-                    const real over = test(j);
-                    add(j == lane && lane < group ? INF : over, -band, j);
-                }
-                meets_itself = false;
-            } else {
+            const unsigned int first_candidate = tested % 64;
+            const unsigned int here = kept - tested < 32 ? kept - tested : 32;
+            unsigned int hits = 0, closest = 0x7fffffff;
+            auto allowed = [&](int j) { return !LATER || warp.candidate_ids[first_candidate + j] >= my_id + drop_self; };
+            constexpr int ALONG = 16 / sizeof(real);  // candidates whose coordinate one load brings
 #pragma unroll
-                for (int j = 0; j < 32; j += AHEAD) {  // loads first: the hardware does not move them across stores either
-                    real over[AHEAD];
+            for (int j = 0; j < 32; j += ALONG) {
+                struct alignas(16) Loaded { real x[ALONG]; } loaded[DIM];
 #pragma unroll
-                    for (int e = 0; e < AHEAD; ++e)
-                        over[e] = test(j + e);
+                for (int a = 0; a < DIM; ++a)
+                    loaded[a] = *(const Loaded*)(warp.candidates[a] + first_candidate + j);
 #pragma unroll
-                    for (int e = 0; e < AHEAD; ++e)
-                        add(over[e], -band, tested + j + e);
+                for (int e = 0; e < ALONG; ++e) {
+                    real p[DIM];
+#pragma unroll
+                    for (int a = 0; a < DIM; ++a)
+                        p[a] = loaded[a].x[e];
+                    const unsigned int over = upper_word(allowed(j + e) ? excess(mine.p, p) : INF);
+                    hits = __funnelshift_l(over, hits, 1);
+                    if constexpr (EXACTLY)
+                        closest = min(closest, over);
                 }
             }
-            if (EXACTLY && __any_sync(ALL, tightest <= band)) {
+            unsigned int met = lane < group ? 0xffffffffu << (32 - here) : 0;  // candidates that are none are not met
+            if (meets_itself)
+                met &= ~(0x80000000u >> lane);
+            meets_itself = false;
+            hits &= met;
+            if (EXACTLY && __any_sync(ALL, closest <= upper_word(2 * band))) {
+                auto candidate = [&](int j, real* p) {
+#pragma unroll
+                    for (int a = 0; a < DIM; ++a)
+                        p[a] = warp.candidates[a][first_candidate + j];
+                };
                 unsigned int open = 0;
 #pragma unroll 4
                 for (int j = 0; j < 32; ++j) {
-                    const Place other = block[j];
-                    open |= magnitude(excess(q, other.p)) <= band && allowed(other) ? 1u << j : 0;
+                    real p[DIM];
+                    candidate(j, p);
+                    const real over = excess(mine.p, p);
+                    open |= allowed(j) && over >= 0 && over <= 2 * band ? 0x80000000u >> j : 0;
                 }
-                for (; open; open &= open - 1) {
-                    const int j = __ffs(open) - 1;
-                    add(exact_pair(q, block[j].p) ? -1 : 1, 0, tested + j);
+                for (open &= met; open;) {
+                    const int j = __clz(open);
+                    const unsigned int bit = 0x80000000u >> j;
+                    open ^= bit;
+                    real p[DIM];
+                    candidate(j, p);
+                    hits |= exact_pair(mine.p, p) ? bit : 0;
                 }
             }
+            found += __popc(hits);
+            if constexpr (LIST)
+                warp.hits[tested / 32][lane] = hits;
             tested += 32;
-            if (LIST && tested % 256 == 0)
-                marks ^= (255 ^ listed()) << (tested / 256 - 1) * 8;
             __syncwarp();
-            // one more block and what is kept besides must still fit
-            if (LIST && (kept > KEPT - 64 || __any_sync(ALL, listed() > SLOTS - 64)))
-                draining = c0 < total || !last_rows || tested < kept;
+            if (LIST && tested == 32 * BLOCKS) {
+                write_rows(false);
+                warp.ids[lane] = warp.ids[32 * BLOCKS + lane];  // of the few that are not tested yet
+                kept = kept > tested ? kept - tested : 0;
+                tested = 0;
+            }
         }
         __syncwarp();
     }
-    write_rows(true);
+    if constexpr (LIST)
+        write_rows(true);
     if (lane < group)
         count.data[my_id] = found;
     const int longest_row = __reduce_max_sync(ALL, lane < group ? found : 0);
@@ -738,29 +751,27 @@ def cell_kernels(
     later: bool = False,
     exact: bool = True,
     reach: int = 1,
-    reach_x: int = 4,
+    reach_x: int = 6,
     trim: bool = True,
     blocks: int | None = None,
-    ahead: int = 8,
     order: int = 0,
 ) -> Kernels:
     """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts, half lists or whole.
 
     The rest is there to be measured. exact=False lets the working precision decide alone (`|d|^2 < r^2 (1 - 8 eps)`); `reach` is
     the number of cell edges in a cutoff along y and z, `reach_x` along x; `trim` cuts rows of cells to the chord of the sphere;
-    `blocks` per multiprocessor bound the registers; `ahead` is the number of candidates that are loaded before they are tested;
-    `order` of the cells: 0 row-major, 1 Morton, 2 Hilbert.
+    `blocks` per multiprocessor bound the registers; `order` of the cells: 0 row-major, 1 Morton, 2 Hilbert.
     """
-    blocks = blocks or (10 if lists else 12)  # registers against occupancy, measured on an H200
+    blocks = blocks or (8 if lists else 12)  # registers against occupancy, measured on an H200
     kind = f"{dim}d_{'f64' if double else 'f32'}_r{reach}x{reach_x}{('', '_morton', '_hilbert')[order]}"
     variant = f"{kind}{'_scaled' * scaled}{'_list' * lists}{'_later' * later}{'' if exact else '_inexact'}{'_whole' * (not trim)}"
-    variant += f"_b{blocks}_a{ahead}"
-    grid = {"REACH": reach, "REACH_X": reach_x, "ORDER": order, "PARTS": _PARTS, "TILE": _TILE}
-    query = {"SCALED": scaled, "LIST": lists, "LATER": later, "EXACTLY": exact, "TRIM": trim, "AHEAD": ahead}
+    variant += f"_b{blocks}"
+    grid = {"REACH": reach, "REACH_X": reach_x, "ORDER": order, "PARTS": _PARTS, "TILE": _TILE, "BLOCK": BLOCK}
+    query = {"SCALED": scaled, "LIST": lists, "LATER": later, "EXACTLY": exact, "TRIM": trim}
     query |= {"QUERY_BLOCK": QUERY_BLOCK, **grid}
     return Kernels(
-        _kernel(f"bounds_{kind}", kind, dim, double, BLOCK, 1, grid, _BOUNDS),
-        _kernel(f"count_{kind}", kind, dim, double, BLOCK, 1, grid, _COUNT),
+        _kernel(f"bounds_{kind}", kind, dim, double, BLOCK, 1, grid, _REDUCE, _BOUNDS),
+        _kernel(f"count_{kind}", kind, dim, double, BLOCK, 1, grid, _REDUCE, _COUNT),
         _kernel(f"scan_{kind}", kind, dim, double, BLOCK, 1, grid, _SCAN),
         _kernel(f"scatter_{kind}", kind, dim, double, BLOCK, 1, grid, _SCATTER),
         _kernel(f"gather_{kind}", kind, dim, double, BLOCK, 1, grid, _GATHER),

@@ -18,8 +18,7 @@ import functools
 from typing import Any, NamedTuple
 
 import warp as wp
-from jfrnn.kernels._native import EXACT, snippet
-from jfrnn.kernels.cells_cpu import _ENTER, _LEAVE
+from jfrnn.kernels._native import ENTER, EXACT, LEAVE, snippet
 
 _CELLS_PER_PARTICLE = 2  # at least, and less than twice that; 8 B each
 _SMALLEST_BITS = 4  # per axis: 16 cells
@@ -100,12 +99,10 @@ class _Variant(NamedTuple):
 @functools.cache
 def _exact_function(dim: int, double: bool, scaled: bool) -> wp.Function:
     scalar, vector = _types(double)
-    # XLA's threads flush denormals on the CPU: not while the exact test runs
-    begin, end = (f"\n#if !defined(__CUDA_ARCH__)\n{text}#endif\n" for text in (_ENTER, _LEAVE))
     text = snippet("double" if double else "float", dim, EXACT, _DECIDE, SCALED=scaled)
     variant = _Variant(f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}")
 
-    @variant.func_native(f"bool pair;{begin}{text}{end}return pair;")
+    @variant.func_native(f"bool pair;{ENTER}{text}{LEAVE}return pair;")
     def is_pair(query: vector, source: vector, cutoff: wp.array(dtype=scalar), closed: int) -> bool: ...
 
     return is_pair
