@@ -102,7 +102,7 @@ def _markdown(table: list[dict[str, Any]]) -> str:
 def _draw(rows: list[dict[str, Any]], path: Path) -> None:
     copy = bandwidth(rows)
     calls = [row for row in _of(rows, "call") if row.get("median_s")]
-    figure = Figure(figsize=(7, 5), layout="constrained")
+    figure = Figure(figsize=(7, 6), layout="constrained")
     axes = figure.subplots()
     for method in dict.fromkeys(row["method"] for row in calls):
         of_method = sorted((row["points"], row["median_s"]) for row in calls if row["method"] == method)
@@ -111,5 +111,5 @@ def _draw(rows: list[dict[str, Any]], path: Path) -> None:
     axes.plot(*zip(*((n, 1e9 * s / n) for n, s in lists), strict=True), "k--", label="floor: bytes of the list / bandwidth")
     axes.set(xscale="log", yscale="log", xlabel="particles", ylabel="ns per particle")
     axes.grid(alpha=0.3, which="both")
-    axes.legend()
+    figure.legend(loc="outside lower center", ncols=2)
     figure.savefig(path, dpi=150)
