@@ -95,6 +95,19 @@ def domain(
 
 
 @app.command()
+def skin(
+    spacing: Spacing = 1e-4,
+    steps: Annotated[int, typer.Option(min=1, help="Steps of a compiled scan.")] = 100,
+    repeats: Annotated[int, typer.Option(min=2, help="Timed scans.")] = 5,
+) -> None:
+    """Time a step that keeps its neighbor list beside one that makes it anew."""
+    with _usage_errors():
+        from experiments import _skin
+
+        typer.echo(_skin.skin_table(spacing, steps, repeats).to_string(index=False, float_format="%.3g"))
+
+
+@app.command()
 def crossover(
     out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform.")] = Path("out") / "crossovers",
     repeats: Annotated[int, typer.Option(min=20, help="Timed runs of each backend.")] = 30,

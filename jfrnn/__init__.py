@@ -9,9 +9,25 @@ Array([1, 1, 0], dtype=int32)
 [[0, 1], [1, 0]]
 """
 
+from jfrnn._chunks import run_chunk
 from jfrnn._memory import MemoryPlan, memory_plan
 from jfrnn._neighbors import NeighborList
+from jfrnn._order import hilbert_decode, hilbert_encode, morton_decode, morton_encode, sort_order
 from jfrnn._search import count, search
 from jfrnn._status import NeighborOverflowError, Status
 
-__all__ = ["MemoryPlan", "NeighborList", "NeighborOverflowError", "Status", "count", "memory_plan", "search"]
+__all__ = [
+    "MemoryPlan",
+    "NeighborList",
+    "NeighborOverflowError",
+    "Status",
+    "count",
+    "hilbert_decode",
+    "hilbert_encode",
+    "memory_plan",
+    "morton_decode",
+    "morton_encode",
+    "run_chunk",
+    "search",
+    "sort_order",
+]

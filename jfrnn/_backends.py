@@ -3,8 +3,10 @@
 What a pair is, and how rows are filled, the array engines share (`_exact`, `_runs`); the Warp engines live in `_warp`.
 """
 
+import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -24,10 +26,26 @@ class Options(NamedTuple):
     radius: float | None = None  # of the cutoff, for the one engine that builds its grid from the host: hashgrid
 
 
-def neighbors(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options, capacity: int | None) -> Rows:
+def neighbors(
+    sources: Array, queries: Array | None, active: Array | None, cutoff: Cutoff, options: Options, capacity: int | None
+) -> Rows:
     """List the neighbors of every query, or only count them (capacity=None). Integers: no gradient flows through."""
     sources = lax.stop_gradient(sources)
     queries = None if queries is None else lax.stop_gradient(queries)
+    rows = _rows_of_engine(without_inactive(sources, active), queries, cutoff, options, capacity)
+    if active is None:
+        return rows
+    finite = (jnp.isfinite(sources).all(axis=1) | ~active).all() & (True if queries is None else jnp.isfinite(queries).all())
+    others = rows.status & ~Status.NONFINITE.value
+    return rows._replace(status=others | jnp.where(finite, 0, Status.NONFINITE.value).astype(jnp.int32))
+
+
+def without_inactive(positions: Array, active: Array | None) -> Array:
+    """Return positions with NaN where a particle is inactive: no engine gives such a one neighbors, or to others."""
+    return positions if active is None else jnp.where(active[:, None], positions, jnp.nan)
+
+
+def _rows_of_engine(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options, capacity: int | None) -> Rows:
     n, m = sources.shape[0], (sources if queries is None else queries).shape[0]
     if options.backend == "warp" and 0 not in (n, m):
         return _warp.neighbors(sources, queries, cutoff, options.filter, capacity)
@@ -44,6 +62,18 @@ def neighbors(sources: Array, queries: Array | None, cutoff: Cutoff, options: Op
     overflow = False if capacity is None else required > capacity
     status = jnp.where(overflow, Status.ROW_OVERFLOW.value, 0) | jnp.where(finite, 0, Status.NONFINITE.value)
     return Rows(idx, count, required, status.astype(jnp.int32))
+
+
+@functools.partial(jax.jit, static_argnames=("options", "capacity"))
+def list_rows(sources: Array, queries: Array | None, active: Array | None, cutoff: Cutoff, options: Options, capacity: int) -> Rows:
+    """List the neighbors of every query: the compiled program of `search`."""
+    return neighbors(sources, queries, active, cutoff, options, capacity)
+
+
+@functools.partial(jax.jit, static_argnames="options")
+def count_rows(sources: Array, queries: Array | None, active: Array | None, cutoff: Cutoff, options: Options) -> Array:
+    """Count the neighbors of every query, [m] int32: the compiled program of `count`."""
+    return neighbors(sources, queries, active, cutoff, options, None).counts
 
 
 def _candidates(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options) -> tuple[Points, Points, Runs]:

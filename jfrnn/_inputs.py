@@ -68,6 +68,29 @@ def checked_cutoff(cutoff: Any, dtype: np.dtype, closed: bool) -> Cutoff:  # noq
     return make_cutoff(value, dtype, checked_flag("closed", closed))
 
 
+def checked_skin(skin: Any, cutoff: float, dtype: np.dtype) -> float:  # noqa: ANN401
+    """Return a static skin, rounded once to the dtype of the positions; 0 means that there is none."""
+    if isinstance(skin, Tracer | bool) or not isinstance(skin, int | float | np.number):
+        raise TypeError(f"skin must be a number known while tracing, got {_describe(skin)}.")
+    value = float(dtype.type(skin))
+    low, high = 2 * smallest_cutoff(dtype), largest_cutoff(dtype) - cutoff
+    if not (value == 0 or low <= value <= high):
+        raise ValueError(
+            f"skin={float(skin)} must be 0 (no skin) or between {low:.1e} and {high:.1e}, so that {dtype} can tell whether a "
+            "particle moved half of it: choose e.g. a tenth to a third of the cutoff."
+        )
+    return value
+
+
+def checked_active(active: Any, positions: Array) -> Array:  # noqa: ANN401
+    """Return the mask of the particles that take part, [n] bool."""
+    if not hasattr(active, "dtype") or np.dtype(active.dtype) != np.bool_:
+        raise TypeError(f"active must be an array of bool, one per particle, got {_describe_array(active)}.")
+    if tuple(active.shape) != positions.shape[:1]:
+        raise ValueError(f"active must have shape [{positions.shape[0]}], one bool per particle, got shape {list(active.shape)}.")
+    return jnp.asarray(active)
+
+
 def checked_flag(name: str, value: Any) -> bool:  # noqa: ANN401
     """Return a static bool."""
     if isinstance(value, bool | np.bool_):
@@ -128,3 +151,7 @@ def checked_backend(backend: Any) -> str:  # noqa: ANN401
 
 def _describe(value: Any) -> str:  # noqa: ANN401
     return f"a traced value {value}" if isinstance(value, Tracer) else f"{type(value).__name__} {value!r}"
+
+
+def _describe_array(value: Any) -> str:  # noqa: ANN401
+    return f"{np.dtype(value.dtype)} of shape {list(np.shape(value))}" if hasattr(value, "dtype") else _describe(value)

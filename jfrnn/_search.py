@@ -1,30 +1,27 @@
 """The two public verbs: `search` and `count`."""
 
-import functools
-import math
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jax import Array
 from jax.core import Tracer
 
 from jfrnn._auto import choose_engine
-from jfrnn._backends import Options, neighbors
-from jfrnn._exact import Cutoff
+from jfrnn._backends import Options, count_rows, list_rows, without_inactive
+from jfrnn._exact import Cutoff, make_cutoff
 from jfrnn._inputs import (
+    checked_active,
     checked_backend,
     checked_capacity,
     checked_cutoff,
     checked_flag,
     checked_positions,
+    checked_skin,
     checked_slack,
 )
-from jfrnn._neighbors import NeighborList
+from jfrnn._neighbors import NeighborList, counted_capacity
 from jfrnn._runs import Filter
-from jfrnn._warp import Rows
-
-_CAPACITY_STEP = 8  # eager capacities are rounded up to a multiple, so that similar scenes share one compiled program
+from jfrnn._verlet import first_verlet, list_radius
 
 
 def search(
@@ -35,6 +32,8 @@ def search(
     half: bool = False,
     include_self: bool = False,
     closed: bool = False,
+    skin: float = 0.0,
+    active: Array | None = None,
     capacity: int | None = None,
     slack: float = 1.0,
     backend: str = "auto",
@@ -53,13 +52,18 @@ def search(
         half: Keep each unordered pair once, in the row of its smaller index.
         include_self: Make each particle its own neighbor.
         closed: Count pairs at exactly the cutoff (<= instead of <).
+        skin: Extra shell [length], a static number >= 0: the list holds all pairs within cutoff + skin, so that
+            `NeighborList.update` need not make it anew before something has moved skin/2. `vectors` and `distances` mask to the
+            cutoff.
+        active: Which particles take part, shape [n], bool; default: all. An inactive one has no neighbors and is nobody's, and its
+            position may be anything. Room for particles to come: the shapes, and so the compiled program, stay the same.
         capacity: Slots per row, a static int. Required where positions are traced. Default: `slack` times the longest row,
             rounded up to a multiple of 8.
         slack: Factor >= 1 on the counted capacity, room for later motion.
         backend: "warp" (cells, compiled kernels, on CPU and NVIDIA GPUs), "hashgrid" (Warp's own `wp.HashGrid`, there too), "jax"
             (cells, any device), "brute" (all n·m candidates), or "auto": what was measured to be fastest on the platform, "warp" on
-            the CPU (where Warp is missing "jax", with a warning), elsewhere "jax". The platform is that of the positions, where
-            they are traced that of `jax.default_device`.
+            the CPU and on NVIDIA GPUs (where Warp is missing "jax", with a warning), elsewhere "jax". The platform is that of the
+            positions, where they are traced that of `jax.default_device`.
 
     Returns:
         A `NeighborList`; `idx` has shape [m, capacity], unused slots hold n. Rows are in no promised order, but the same input
@@ -76,23 +80,27 @@ def search(
     Differentiable: the list is topology, without gradient; see `NeighborList.vectors`. Jit: yes, with capacity. vmap: yes, with
     capacity. Source: cell lists (Hockney & Eastwood 1981, ch. 8); strict cutoff (Peifle 2019, §2.2).
     """
-    problem = _checked_problem(positions, cutoff, queries, half, include_self, closed, backend)
+    problem = _checked_problem(positions, cutoff, queries, half, include_self, closed, backend, skin, active)
     slack = checked_slack(slack)
     if capacity is None:
         capacity = _counted_capacity(problem, slack)
-    rows = _search(*problem, checked_capacity(capacity))
+    rows = list_rows(*problem.inputs, checked_capacity(capacity))
+    sources = problem.inputs.sources
     return NeighborList(
         rows.idx,
         rows.counts,
         rows.status,
         rows.required,
-        cutoff=float(problem.cutoff.radius),
-        half=problem.options.filter.later_only,
-        include_self=queries is None and not problem.options.filter.drop_self,
-        closed=problem.cutoff.closed,
+        first_verlet(without_inactive(sources, problem.inputs.active), problem.inputs.queries) if problem.skin else None,
+        cutoff=problem.radius,
+        skin=problem.skin,
+        half=problem.inputs.options.filter.later_only,
+        include_self=queries is None and not problem.inputs.options.filter.drop_self,
+        closed=problem.inputs.cutoff.closed,
         own_queries=queries is not None,
-        source_count=problem.sources.shape[0],
-        backend=problem.options.backend,
+        masked=active is not None,
+        source_count=sources.shape[0],
+        backend=problem.inputs.options.backend,
     )
 
 
@@ -104,6 +112,7 @@ def count(
     half: bool = False,
     include_self: bool = False,
     closed: bool = False,
+    active: Array | None = None,
     backend: str = "auto",
 ) -> Array:
     """Count the neighbors that `search` would list, without listing them.
@@ -115,6 +124,7 @@ def count(
         half: As in `search`.
         include_self: As in `search`.
         closed: As in `search`.
+        active: As in `search`.
         backend: As in `search`.
 
     Returns:
@@ -125,15 +135,24 @@ def count(
 
     Memory: as in `search`, without the list. Differentiable: no (integers). Jit: yes. vmap: yes.
     """
-    problem = _checked_problem(positions, cutoff, queries, half, include_self, closed, backend)
-    return _count(*problem)
+    problem = _checked_problem(positions, cutoff, queries, half, include_self, closed, backend, 0.0, active)
+    return count_rows(*problem.inputs)
+
+
+class _Inputs(NamedTuple):
+    """What the compiled programs take, but for a capacity; the cutoff is that of the list, with the skin."""
+
+    sources: Array
+    queries: Array | None
+    active: Array | None
+    cutoff: Cutoff
+    options: Options
 
 
 class _Problem(NamedTuple):
-    sources: Array
-    queries: Array | None
-    cutoff: Cutoff
-    options: Options
+    inputs: _Inputs
+    radius: float  # of a pair, without the skin
+    skin: float
 
 
 def _checked_problem(
@@ -144,6 +163,8 @@ def _checked_problem(
     include_self: bool,
     closed: bool,
     backend: str,
+    skin: Any,  # noqa: ANN401
+    active: Any,  # noqa: ANN401
 ) -> _Problem:
     sources = checked_positions("positions", positions)
     if queries is not None:
@@ -151,36 +172,26 @@ def _checked_problem(
         for name, value in (("half", half), ("include_self", include_self)):
             if checked_flag(name, value):
                 raise ValueError(f"{name}=True pairs particles with themselves or each other: it cannot be used with queries.")
+    active = None if active is None else checked_active(active, sources)
     pair_filter = Filter(
         drop_self=queries is None and not checked_flag("include_self", include_self),
         later_only=checked_flag("half", half),
     )
-    pair_cutoff = checked_cutoff(cutoff, np.dtype(sources.dtype), closed)
+    dtype = np.dtype(sources.dtype)
+    pair_cutoff = checked_cutoff(cutoff, dtype, closed)
+    radius = float(pair_cutoff.radius)
+    skin = checked_skin(skin, radius, dtype)
+    list_cutoff = make_cutoff(list_radius(radius, skin, dtype), dtype, pair_cutoff.closed) if skin else pair_cutoff
     engine = choose_engine(checked_backend(backend), sources, queries)
-    radius = float(pair_cutoff.radius) if engine == "hashgrid" else None
-    return _Problem(sources, queries, pair_cutoff, Options(pair_filter, engine, radius))
+    options = Options(pair_filter, engine, float(list_cutoff.radius) if engine == "hashgrid" else None)
+    return _Problem(_Inputs(sources, queries, active, list_cutoff, options), radius, skin)
 
 
 def _counted_capacity(problem: _Problem, slack: float) -> int:
-    arrays = [x for x in (problem.sources, problem.queries) if x is not None]
-    if any(isinstance(x, Tracer) for x in arrays):
+    if any(isinstance(x, Tracer) for x in problem.inputs[:3]):
         raise ValueError(
             "capacity must be given where positions are traced (jax.jit, vmap, grad, scan), because it is a shape: pass "
-            "capacity=int(jfrnn.count(positions, cutoff).max()) of concrete positions, with room to move, or the capacity of an "
-            "earlier search, and check nbrs.overflow."
+            "capacity=int(jfrnn.count(positions, cutoff + skin).max()) of concrete positions, with room to move, or the capacity "
+            "of an earlier search, and check nbrs.overflow."
         )
-    with jax.ensure_compile_time_eval():
-        longest = int(np.max(_count(*problem), initial=0))
-    wanted = math.ceil(max(longest, 1) * slack)
-    rounded = -(-wanted // _CAPACITY_STEP) * _CAPACITY_STEP
-    return min(rounded, max(wanted, problem.sources.shape[0]))
-
-
-@functools.partial(jax.jit, static_argnames="options")
-def _count(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options) -> Array:
-    return neighbors(sources, queries, cutoff, options, None).counts
-
-
-@functools.partial(jax.jit, static_argnames=("options", "capacity"))
-def _search(sources: Array, queries: Array | None, cutoff: Cutoff, options: Options, capacity: int) -> Rows:
-    return neighbors(sources, queries, cutoff, options, capacity)
+    return counted_capacity(*problem.inputs, slack)

@@ -1,0 +1,286 @@
+"""Skin, update, growth and inactive particles: after any motion the masked list holds exactly the oracle's pairs."""
+
+import doctest
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jfrnn
+from jfrnn import _chunks
+from jfrnn._verlet import list_radius
+
+CUTOFF, SKIN = 0.3, 0.1
+BACKENDS = ["jax", "warp", "hashgrid", "brute"]
+
+
+def masked_pairs(nbrs, x, **options):
+    """Return the pairs of a list within the true cutoff at these positions."""
+    assert not nbrs.overflow
+    _, mask = nbrs.distances(x, **options)
+    i, k = np.nonzero(mask)
+    pairs = list(zip(i.tolist(), np.asarray(nbrs.idx)[i, k].tolist(), strict=True))
+    assert len(pairs) == len(set(pairs))
+    return set(pairs)
+
+
+def points(n, dim, dtype, seed=0):
+    return jnp.asarray(np.random.default_rng(seed).random((n, dim)), dtype)
+
+
+@given(st.floats(2**-10, 2**10, width=32), st.floats(2**-10, 2**10, width=32))
+def test_radius_of_the_list_is_the_exact_sum_rounded_up(cutoff, skin):
+    for dtype in (np.dtype(np.float32), np.dtype(np.float64)):
+        radius = dtype.type(list_radius(cutoff, skin, dtype))
+        exact = Fraction(cutoff) + Fraction(skin)
+        assert Fraction(float(np.nextafter(radius, dtype.type(0)))) < exact <= Fraction(float(radius))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_list_with_a_skin_holds_the_wider_pairs_and_masks_to_the_cutoff(backend, dtype, dim):
+    x = points(80, dim, dtype)
+    nbrs = jfrnn.search(x, CUTOFF, skin=SKIN, capacity=80, backend=backend)
+    wide = list_radius(float(dtype(CUTOFF)), float(dtype(SKIN)), np.dtype(dtype))
+    found = set(reference.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), 80))
+    assert found == reference.reference_pairs(np.asarray(x), wide)
+    assert masked_pairs(nbrs, x) == reference.reference_pairs(np.asarray(x), CUTOFF)
+
+
+@pytest.mark.parametrize(("ulps", "rebuilds"), [(-40, 0), (0, 1), (1, 1)])
+@pytest.mark.parametrize("backend", ["jax", "warp"])
+def test_half_the_skin_is_as_far_as_a_point_may_go(ulps, rebuilds, backend, dtype, dim):
+    """Two points come closer by almost the whole skin: their pair must be in the old list, or the list be made anew."""
+    half = np.float64(dtype(SKIN)) / 2
+    step = dtype(half + ulps * np.spacing(dtype(half)))
+    start = np.zeros((2, dim), dtype)
+    start[1, 0] = dtype(CUTOFF) + dtype(SKIN) - 2 * np.spacing(dtype(CUTOFF))
+    nbrs = jfrnn.search(jnp.asarray(start), CUTOFF, skin=SKIN, capacity=4, backend=backend)
+    moved = start.copy()
+    moved[0, 0] += step
+    moved[1, 0] -= step
+    after = nbrs.update(jnp.asarray(moved))
+    assert int(after.rebuild_count) == rebuilds
+    assert masked_pairs(after, jnp.asarray(moved)) == reference.reference_pairs(moved, CUTOFF)
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 0.499, 0.5, 0.51, 2.0]), st.integers(-3, 3))
+def test_adversarial_motion_misses_no_pair(seed, part, ulps):
+    """Every point moves by about the same length straight at another one."""
+    random = np.random.default_rng(seed)
+    for backend in ("jax", "warp"):
+        x = random.random((64, 3)).astype(np.float32)
+        nbrs = jfrnn.search(x, CUTOFF, skin=SKIN, capacity=64, backend=backend)
+        for _ in range(3):
+            towards = x[random.permutation(64)] - x
+            length = np.linalg.norm(towards, axis=1, keepdims=True)
+            step = np.float32(part * SKIN)
+            step = step + np.float32(ulps) * np.spacing(step)
+            x = (x + step * towards / np.where(length > 0, length, 1)).astype(np.float32)
+            nbrs = nbrs.update(jnp.asarray(x))
+            assert masked_pairs(nbrs, jnp.asarray(x)) == reference.reference_pairs(x, CUTOFF)
+
+
+def test_teleports_and_points_that_vanish(dtype, dim):
+    x = np.asarray(points(50, dim, dtype)).copy()
+    nbrs = jfrnn.search(x, CUTOFF, skin=SKIN, capacity=64)
+    for name, value, status in (
+        ("far away", 1e6, jfrnn.Status.OK),
+        ("back", 0.5, jfrnn.Status.OK),
+        ("not a number", np.nan, jfrnn.Status.NONFINITE),
+        ("and again", np.nan, jfrnn.Status.NONFINITE),
+        ("here again", 0.5, jfrnn.Status.NONFINITE),  # sticky
+    ):
+        x[7] = value
+        before = int(nbrs.rebuild_count)
+        nbrs = nbrs.update(jnp.asarray(x))
+        assert int(nbrs.rebuild_count) == before + (name != "and again"), name
+        assert jfrnn.Status(int(nbrs.status)) == status, name
+        assert masked_pairs(nbrs, jnp.asarray(x)) == reference.reference_pairs(x, CUTOFF), name
+
+
+def test_queries_move_too(dtype, dim):
+    x, q = points(60, dim, dtype), points(9, dim, dtype, 1)
+    nbrs = jfrnn.search(x, CUTOFF, queries=q, skin=SKIN, capacity=64)
+    near, far = q + dtype(SKIN / 4), q.at[3].add(dtype(SKIN))
+    assert int(nbrs.update(x, queries=near).rebuild_count) == 0
+    after = nbrs.update(x, queries=far)
+    assert int(after.rebuild_count) == 1
+    expected = reference.reference_pairs(np.asarray(x), CUTOFF, queries=np.asarray(far))
+    assert masked_pairs(after, x, queries=far) == expected
+
+
+@pytest.mark.parametrize("options", [{}, {"half": True}, {"include_self": True}, {"closed": True}], ids=str)
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_without_a_skin_update_is_a_search(options, backend):
+    x, moved = points(60, 2, np.float32), points(60, 2, np.float32, 1)
+    nbrs = jfrnn.search(x, CUTOFF, capacity=64, backend=backend, **options)
+    assert nbrs.verlet is None
+    with pytest.raises(ValueError, match="made without a skin"):
+        _ = nbrs.rebuild_count
+    after = nbrs.update(moved)
+    assert jax.tree.structure(after) == jax.tree.structure(nbrs)
+    expected = jfrnn.search(moved, CUTOFF, capacity=64, backend=backend, **options)
+    for one, other in zip(jax.tree.leaves(after), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("backend", ["jax", "warp"])
+def test_in_a_scan_it_rebuilds_as_often_as_needed_and_traces_once(backend):
+    x = points(80, 3, np.float32)
+    nbrs = jfrnn.search(x, CUTOFF, skin=SKIN, capacity=80, backend=backend)
+    traces = []
+
+    @jax.jit
+    def run(x, nbrs, velocity):
+        traces.append(None)
+
+        def step(carry, _):
+            x, nbrs = carry
+            x = x + velocity
+            nbrs = nbrs.update(x)
+            distance, mask = nbrs.distances(x)
+            return (x, nbrs), (mask.sum(), distance.sum())
+
+        return jax.lax.scan(step, (x, nbrs), None, length=20)
+
+    exact = len(reference.reference_pairs(np.asarray(x), CUTOFF))
+    for velocity, rebuilds in ((0.0, 0), (0.011 / 3**0.5, 4), (0.06, 20)):  # 0.011 per step: every fifth passes 0.05
+        (end, after), (pairs, _) = run(x, nbrs, jnp.float32(velocity))
+        assert int(after.rebuild_count) == rebuilds
+        assert abs(int(pairs[0]) - exact) <= 4  # all move alike: only what rounding does to pairs at the cutoff
+        assert masked_pairs(after, end) == reference.reference_pairs(np.asarray(end), CUTOFF)
+    assert len(traces) == 1
+
+
+def test_overflow_is_sticky_and_grow_knows_what_it_takes():
+    x = points(60, 2, np.float32)
+    crowd = x * np.float32(0.2)
+    nbrs = jfrnn.search(x, CUTOFF, skin=SKIN)
+    assert not nbrs.overflow
+    crowded = nbrs.update(crowd)
+    back = crowded.update(x)
+    assert crowded.overflow
+    assert back.overflow
+    assert int(back.required) == int(crowded.required) == 59
+    with pytest.raises(jfrnn.NeighborOverflowError, match="one row has 59 neighbors"):
+        back.check()
+    grown = back.grow(x)
+    assert grown.capacity >= 59
+    assert not grown.overflow
+    assert grown.grow(x).capacity == grown.capacity
+    assert masked_pairs(grown.update(crowd), crowd) == reference.reference_pairs(np.asarray(crowd), CUTOFF)
+    with pytest.raises(TypeError, match=r"grow\(\) changes the shape of the list and cannot run inside jax.jit"):
+        jax.jit(lambda nbrs, x: nbrs.grow(x))(back, x)
+
+
+def test_a_chunk_is_replayed_until_its_list_was_large_enough():
+    x = points(100, 2, np.float32)
+    runs = []
+
+    @jax.jit
+    def squeeze(x, nbrs):
+        jax.debug.callback(lambda: runs.append(None))
+
+        def step(_, carry):
+            x, nbrs = carry
+            x = np.float32(0.85) * x
+            return x, nbrs.update(x)
+
+        return jax.lax.fori_loop(0, 10, step, (x, nbrs))
+
+    end, nbrs = jfrnn.run_chunk(squeeze, x, jfrnn.search(x, CUTOFF, skin=SKIN), lambda x: x)
+    jax.effects_barrier()
+    assert len(runs) == 2
+    assert masked_pairs(nbrs, end) == reference.reference_pairs(np.asarray(end), CUTOFF)
+    once, _ = squeeze(x, nbrs)
+    np.testing.assert_array_equal(once, end)
+    with pytest.raises(TypeError, match="jit the chunk, not the loop"):
+        jax.jit(lambda x: jfrnn.run_chunk(squeeze, x, nbrs, lambda x: x)[0])(x)
+    assert doctest.testmod(_chunks).failed == 0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_inactive_particles_have_no_neighbors_and_come_and_go(backend, dim):
+    x = np.asarray(points(60, dim, np.float32)).copy()
+    active = np.arange(60) < 40
+    x[50:] = np.nan
+    nbrs = jfrnn.search(x, CUTOFF, skin=SKIN, active=active, capacity=64, backend=backend)
+    np.testing.assert_array_equal(nbrs.count, jfrnn.search(x[:40], CUTOFF, skin=SKIN).count.tolist() + [0] * 20)
+    assert masked_pairs(nbrs, jnp.asarray(x)) == reference.reference_pairs(x[:40], CUTOFF)
+    np.testing.assert_array_equal(
+        jfrnn.count(x, CUTOFF, active=active, backend=backend)[:40], jfrnn.count(x[:40], CUTOFF, backend=backend)
+    )
+    nbrs.check()
+    assert int(nbrs.update(x, active=active).rebuild_count) == 0
+    more = np.arange(60) < 45
+    nbrs = nbrs.update(x, active=more)
+    assert int(nbrs.rebuild_count) == 1
+    assert masked_pairs(nbrs, jnp.asarray(x)) == reference.reference_pairs(x[:45], CUTOFF)
+    nbrs.check()
+    with pytest.raises(ValueError, match="non-finite"):
+        nbrs.update(x, active=np.arange(60) < 51).check()
+
+
+def test_vmap_is_a_loop():
+    x, moved = (jnp.stack([points(40, 2, np.float32, s) for s in seeds]) for seeds in ((0, 1, 2), (0, 1, 3)))
+    lists = [jfrnn.search(one, CUTOFF, skin=SKIN, capacity=40, backend="jax") for one in x]
+    batch = jax.vmap(lambda one: jfrnn.search(one, CUTOFF, skin=SKIN, capacity=40, backend="jax"))(x)
+    after = jax.vmap(lambda nbrs, one: nbrs.update(one))(batch, moved)
+    for k, (nbrs, one) in enumerate(zip(lists, moved, strict=True)):
+        expected = nbrs.update(one)
+        for got, wanted in zip(jax.tree.leaves(after), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_array_equal(got[k], wanted)
+    assert after.rebuild_count.tolist() == [0, 0, 1]
+
+
+def test_gradients_flow_around_updates():
+    x = points(30, 2, np.float64)
+
+    def energy(x, wait):
+        nbrs = jfrnn.search(x, CUTOFF, skin=SKIN, capacity=40, backend="jax")
+
+        def step(carry, _):
+            x, nbrs = carry
+            x = x * (1 - wait)
+            nbrs = nbrs.update(x)
+            distance, mask = nbrs.distances(x)
+            return (x, nbrs), jnp.where(mask, (CUTOFF - distance) ** 2, 0).sum()
+
+        return jax.lax.scan(step, (x, nbrs), None, length=3)[1].sum()
+
+    gradient = jax.jit(jax.grad(energy))(x, 0.02)
+    direction = np.random.default_rng(0).standard_normal(x.shape)
+    h = 1e-6
+    slope = (energy(x + h * direction, 0.02) - energy(x - h * direction, 0.02)) / (2 * h)
+    np.testing.assert_allclose((gradient * direction).sum(), slope, rtol=1e-6)
+
+
+def test_refusals(dim):
+    x = points(10, dim, np.float32)
+    with pytest.raises(ValueError, match=r"skin=-0.1 must be 0 \(no skin\) or between"):
+        jfrnn.search(x, CUTOFF, skin=-0.1)
+    with pytest.raises(ValueError, match="skin=nan must be 0"):
+        jfrnn.search(x, CUTOFF, skin=float("nan"))
+    with pytest.raises(TypeError, match="skin must be a number known while tracing, got str 'wide'"):
+        jfrnn.search(x, CUTOFF, skin="wide")
+    with pytest.raises(TypeError, match="skin must be a number known while tracing, got a traced value"):
+        jax.jit(lambda s: jfrnn.search(x, CUTOFF, skin=s, capacity=4))(0.1)
+    with pytest.raises(TypeError, match=r"active must be an array of bool, one per particle, got int64 of shape \[10\]"):
+        jfrnn.search(x, CUTOFF, active=np.ones(10, np.int64))
+    with pytest.raises(TypeError, match="active must be an array of bool, one per particle, got list"):
+        jfrnn.search(x, CUTOFF, active=[True] * 10)
+    with pytest.raises(ValueError, match=r"active must have shape \[10\], one bool per particle, got shape \[9\]"):
+        jfrnn.search(x, CUTOFF, active=np.ones(9, bool))
+    nbrs = jfrnn.search(x, CUTOFF, skin=SKIN)
+    with pytest.raises(ValueError, match="this list was made without active: leave active out"):
+        nbrs.update(x, active=np.ones(10, bool))
+    with pytest.raises(ValueError, match="positions hold 9 particles, but the list was made for 10"):
+        nbrs.update(x[:9])
+    with pytest.raises(ValueError, match="this list was made with active: pass active="):
+        jfrnn.search(x, CUTOFF, active=np.ones(10, bool)).update(x)
