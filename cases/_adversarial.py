@@ -194,3 +194,127 @@ def balanced_residues(dtype: np.dtype, dim: int) -> Cloud:
         beyond[-1] = np.nextafter(end[-1], dtype.type(np.inf))
         points += [start, end, beyond]
     return np.array(points, dtype), 1.0
+
+
+def shifted(shift: Sequence[int], rows: Points) -> list[Fraction]:
+    """Return the sum of so many lattice vectors, the rows, without rounding."""
+    steps = [[int(s) * exact(value) for value in row] for s, row in zip(shift, rows, strict=True)]
+    return [sum(column, Fraction(0)) for column in zip(*steps, strict=True)]
+
+
+def _shift_across(rng: np.random.Generator, end: Points, rows: Points, periodic: Sequence[bool], turns: int) -> NDArray[np.int64]:
+    """Return the cell that a point lies in, along periodic axes, moved by up to `turns` lattice vectors more."""
+    cell = np.floor(np.linalg.solve(rows.T.astype(np.float64), end)).astype(np.int64)
+    return (cell + rng.integers(-turns, turns + 1, len(end))) * np.array(periodic)
+
+
+def ulp_images(
+    dtype: np.dtype,
+    dim: int,
+    *,
+    cutoff: float,
+    rows: Points,
+    periodic: Sequence[bool],
+    turns: int,
+    seed: int,
+    repeats: int,
+) -> Points:
+    """Pair random points of the cell with images at less than 1, 2 and 3 ulp of the cutoff from them, on both sides.
+
+    Args:
+        dtype: float32 or float64.
+        dim: 2 or 3.
+        cutoff: Cutoff; the ulp is that of its value in the dtype.
+        rows: Lattice vectors of that dtype, shape [dim, dim].
+        periodic: One per lattice vector.
+        turns: Partners lie in the cell, or up to so many lattice vectors from it.
+        seed: Of the random numbers.
+        repeats: Pairs for each of the six shells.
+
+    Returns:
+        Positions [12 * repeats, dim], points 2k and 2k + 1 being a pair through at least one face.
+    """
+    rng = np.random.default_rng(seed)
+    radius = exact(dtype.type(cutoff))
+    ulp = exact(np.spacing(dtype.type(cutoff)))
+    points: list[Points] = []
+    for k in [-3, -2, -1, 0, 1, 2] * repeats:
+        points += _image_in_shell(rng, dtype, rows, periodic, turns, radius + k * ulp, radius + (k + 1) * ulp)
+    return np.array(points, dtype)
+
+
+def _image_in_shell(
+    rng: np.random.Generator,
+    dtype: np.dtype,
+    rows: Points,
+    periodic: Sequence[bool],
+    turns: int,
+    inner: Fraction,
+    outer: Fraction,
+) -> list[Points]:
+    """Draw points until one has an image of another at a distance strictly between `inner` and `outer`.
+
+    As in `_pair_in_shell`: one coordinate of the other point is solved for, that which is nearest to zero.
+    """
+    middle = (inner + outer) / 2
+    while True:
+        start = (rng.uniform(0, 1, len(rows)) @ rows).astype(dtype)
+        direction = rng.normal(size=len(start))
+        end = start + float(middle) * direction / np.linalg.norm(direction)
+        shift = _shift_across(rng, end, rows, periodic, turns)
+        if not shift.any():
+            continue
+        offset = shifted(shift.tolist(), rows)
+        end = (end - np.array(offset, np.float64)).astype(dtype)
+        axis = int(np.argmin(np.abs(end)))
+        apart = [exact(b) - exact(a) + o for a, b, o in zip(start, end, offset, strict=True)]
+        rest = middle**2 - sum(v**2 for k, v in enumerate(apart) if k != axis)
+        if rest > 0:
+            step = Fraction(math.copysign(math.sqrt(rest), direction[axis]))
+            for value in neighbors_of(nearest(exact(start[axis]) + step - offset[axis], dtype)):
+                end[axis] = value
+                apart[axis] = exact(value) - exact(start[axis]) + offset[axis]
+                if inner**2 < sum(v**2 for v in apart) < outer**2:
+                    return [start, end]
+
+
+def dyadic_image_ties(dtype: np.dtype, dim: int, rows: Points, turns: int) -> Cloud:
+    """Pair points with images at exactly the cutoff along (1, 2, 2) or (3, 4), and one float to either side.
+
+    Args:
+        dtype: float32 or float64.
+        dim: 2 or 3.
+        rows: Lattice vectors, shape [dim, dim], multiples of 1/8 below 16.
+        turns: Partners lie in the cell, or up to so many lattice vectors from it.
+
+    Returns:
+        Positions [160, dim] in groups of four, a point and its three partners through at least one face, and the cutoff.
+    """
+    rng = np.random.default_rng(29)
+    triple, length = ((1, 2, 2), 3) if dim == 3 else ((3, 4), 5)
+    points: list[Points] = []
+    while len(points) < 160:
+        start = np.rint(rng.uniform(0, 1, dim) @ rows * 256) / 256
+        end = start + 0.25 * rng.permutation(triple) * rng.choice([-1, 1], dim)
+        shift = _shift_across(rng, end, rows, [True] * dim, turns)
+        if shift.any():
+            end = (end - shift @ rows).astype(dtype)
+            axis = np.argmax(np.abs(end))  # not at zero, whose neighbors are denormals
+            points.append(start)
+            for value in neighbors_of(end[axis]):
+                points.append(end.copy())
+                points[-1][axis] = value
+    return np.array(points, dtype), 0.25 * length
+
+
+def turned(points: Points, length: float, turns: int) -> Points:
+    """Move each coordinate by up to `turns` lengths, up or down, where the sum is exact."""
+    rng = np.random.default_rng(37)
+    moves = rng.integers(-turns, turns + 1, points.shape) * length
+    moved = points.copy()
+    for at in np.ndindex(points.shape):
+        here, move = float(points[at]), float(moves[at])
+        there = points.dtype.type(points.dtype.type(here) + points.dtype.type(move))
+        if exact(there) == exact(here) + exact(move):
+            moved[at] = there
+    return moved

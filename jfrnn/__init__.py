@@ -9,6 +9,7 @@ Array([1, 1, 0], dtype=int32)
 [[0, 1], [1, 0]]
 """
 
+from jfrnn._box import Box
 from jfrnn._chunks import run_chunk
 from jfrnn._memory import MemoryPlan, memory_plan
 from jfrnn._neighbors import NeighborList
@@ -17,6 +18,7 @@ from jfrnn._search import count, search
 from jfrnn._status import NeighborOverflowError, Status
 
 __all__ = [
+    "Box",
     "MemoryPlan",
     "NeighborList",
     "NeighborOverflowError",

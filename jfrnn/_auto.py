@@ -22,16 +22,23 @@ WARP_ENGINES = ("warp", "hashgrid")
 _WARP_FROM = {"cpu": 0, "gpu": 0}
 
 
-def choose_engine(backend: str, sources: Array, queries: Array | None) -> str:
+def choose_engine(backend: str, sources: Array, queries: Array | None, periodic: bool = False) -> str:
     """Return the engine that a backend stands for; raise where one that was named cannot run on the platform.
 
     Raises:
         ImportError: "warp" or "hashgrid", and Warp is not installed.
         RuntimeError: "warp" or "hashgrid", and Warp cannot run on the platform.
+        ValueError: "hashgrid", and space is periodic.
     """
+    if backend == "hashgrid" and periodic:
+        raise ValueError("backend='hashgrid' knows no periodic box: pass backend='warp', 'jax' or 'brute'.")
     if backend not in ("auto", *WARP_ENGINES):
         return backend
     platform = _platform_of(sources, sources if queries is None else queries)
+    if periodic and platform != "cpu":
+        if backend == "warp":
+            raise ValueError("backend='warp' knows periodic boxes on the CPU alone so far: pass backend='jax'.")
+        return "jax"
     if backend == "auto":
         return fastest_engine(platform, sources.shape[0])
     _warp.load_warp()

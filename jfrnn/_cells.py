@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._box import Images
+
 _CELLS_PER_PARTICLE = 4  # a dense table holds at most this many cells per particle: 16 B per particle
 _SMALLEST_TABLE = 4096
 _FAR = np.int32(2**31 - 1)
@@ -23,7 +25,7 @@ class Grid(NamedTuple):
     Attributes:
         order: [n] int32, the particle at each place of the cell order; non-finite ones last.
         coords: [d, n] int32 in that order, the cell of each particle (x, y[, z]).
-        extent: [d] int32, cells per axis, with a margin of one empty cell on either side.
+        extent: [d] int32, cells per axis; with a margin of one empty cell on either side where space is open.
         dense: [] bool, whether the box is small enough for `table`.
         table: [cells + 1] int32, the first place of each cell in row-major order (zeros where not dense).
     """
@@ -66,25 +68,54 @@ def _remainder(magnitude: Array, quotient: Array, edge: Array) -> Array:
     return (magnitude - high * edge) - (quotient - high) * edge
 
 
-def grid_coordinates(positions: Array, edge: Array, finite: Array) -> tuple[Array, Array]:
-    """Number the cells of [d, n] coordinates from 1 on along each axis: [d, n] int32, and the [d] extents with their margins.
+class CellAxes(NamedTuple):
+    """How each axis is cut into cells: one entry per axis, `turns` [] whole float where it is periodic (cells in its length)."""
 
-    A small bounding box keeps its empty cells. In a large one, runs of empty planes shrink to a single one, axis by axis: cells
-    that touch still touch, cells that do not still do not, and no axis is longer than 2n + 1, however far apart the particles are.
+    edges: list[Array]
+    turns: list[Array | None]
+
+
+def open_axes(edge: Array, dim: int) -> CellAxes:
+    """Cut every axis of an open space into cells of one edge."""
+    return CellAxes([edge] * dim, [None] * dim)
+
+
+def grid_coordinates(positions: Array, axes: CellAxes, finite: Array) -> tuple[Array, Array]:
+    """Number the cells of [d, n] coordinates along each axis: [d, n] int32, and the [d] extents.
+
+    Open axes count from 1 on, with margins: a small bounding box keeps its empty cells; in a large one, runs of empty planes
+    shrink to a single one, axis by axis: cells that touch still touch, cells that do not still do not, and no axis is longer than
+    2n + 1, however far apart the particles are. Periodic axes, whose coordinates are fractions from 0 to 1, count from 0 on.
     """
     some = jnp.any(finite)
-    cells = cell_coordinate(positions, edge)
+    is_open = [turn is None for turn in axes.turns]
+    numbered = [
+        cell_coordinate(x, edge) if turn is None else jnp.clip(jnp.floor(x * turn), 0, turn - 1)
+        for x, edge, turn in zip(positions, axes.edges, axes.turns, strict=True)
+    ]
+    cells = jnp.stack(numbered)
     lowest = jnp.where(some, jnp.min(cells, axis=1, initial=jnp.inf, where=finite), 0)[:, None]
     highest = jnp.where(some, jnp.max(cells, axis=1, initial=-jnp.inf, where=finite), 0)[:, None]
     cells = jnp.where(finite, cells, lowest)
-    small = jnp.prod(highest - lowest + 3) <= _table_size(finite.size)
+    extents = [
+        high - low + 3 if turn is None else turn for low, high, turn in zip(lowest[:, 0], highest[:, 0], axes.turns, strict=True)
+    ]
+    small = jnp.prod(jnp.stack(extents)) <= _table_size(finite.size)
     coords = lax.cond(
         small,
-        lambda cells: (cells - lowest).astype(jnp.int32) + 1,
-        lambda cells: lax.map(_squeeze_gaps, cells) + 1,
+        lambda cells: jnp.stack(
+            [
+                (c - low).astype(jnp.int32) + 1 if free else c.astype(jnp.int32)
+                for c, low, free in zip(cells, lowest, is_open, strict=True)
+            ]
+        ),
+        lambda cells: jnp.stack(
+            [_squeeze_gaps(c) + 1 if free else c.astype(jnp.int32) for c, free in zip(cells, is_open, strict=True)]
+        ),
         cells,
     )
-    return coords, jnp.max(coords, axis=1) + 2
+    margins = [jnp.max(c) + 2 if turn is None else turn.astype(jnp.int32) for c, turn in zip(coords, axes.turns, strict=True)]
+    return coords, jnp.stack(margins)
 
 
 def _squeeze_gaps(cells: Array) -> Array:
@@ -156,28 +187,61 @@ def _row_major(coords: Sequence[Array] | Array, extent: Array) -> Array:
     return index
 
 
-def stencil_runs(grid: Grid, coords: Array) -> tuple[Array, Array]:
-    """Find the sources in the 3^d cells around each query cell [d, m]: [m, 3^(d-1)] int32 first places and ends of the runs.
+def stencil_runs(grid: Grid, coords: Array, images: Images | None = None) -> tuple[Array, Array, Array | None]:
+    """Find the sources in the cells around each query cell [d, m]: [m, runs] int32 first places, ends, and codes of their images.
 
+    An open space has a run per row of 3 cells, 3^(d-1) of them. Along a periodic axis cells are numbered on beyond either end,
+    where they are those of an image; a row is cut where it enters another image.
     Dense: two loads from the table per run. Otherwise: two binary searches per run among the sorted cells of the sources.
     """
+    (first, last, *rest), code = _stencil_rows(coords, grid.extent, images)
 
-    def from_table(coords: Array) -> tuple[Array, Array]:
-        first = _row_major(_stencil_rows(coords), grid.extent) - 1
-        return grid.table.at[first].get(mode="clip"), grid.table.at[first + 3].get(mode="clip")
+    def from_table(cells: list[Array]) -> tuple[Array, Array]:
+        first, last, *rest = cells
+        row = _row_major([jnp.zeros_like(first), *rest], grid.extent)
+        return grid.table.at[row + first].get(mode="clip"), grid.table.at[row + last + 1].get(mode="clip")
 
-    def by_binary_search(coords: Array) -> tuple[Array, Array]:
-        x, *rest = _stencil_rows(coords)
-        bounds = _lower_bound(grid.coords, [jnp.stack([x - 1, x + 2]), *(jnp.stack([c, c]) for c in rest)])
+    def by_binary_search(cells: list[Array]) -> tuple[Array, Array]:
+        first, last, *rest = cells
+        bounds = _lower_bound(grid.coords, [jnp.stack([first, last + 1]), *(jnp.stack([c, c]) for c in rest)])
         return bounds[0], bounds[1]
 
-    return lax.cond(grid.dense, from_table, by_binary_search, coords)
+    start, stop = lax.cond(grid.dense, from_table, by_binary_search, [first, last, *rest])
+    return (start, stop, None) if code is None else (start, jnp.where(first <= last, stop, start), code)
 
 
-def _stencil_rows(coords: Array) -> list[Array]:
-    """Return the middle cell of each row of the stencil: d arrays [m, 3^(d-1)]."""
-    offsets = np.array(list(product((0,), *[(-1, 0, 1)] * (len(coords) - 1))), np.int32)
-    return [c[:, None] + offsets[:, axis] for axis, c in enumerate(coords)]
+def _stencil_rows(coords: Array, extent: Array, images: Images | None) -> tuple[list[Array], Array | None]:
+    """Return first and last cell along x and the cells along the other axes of each run, [m, runs] each, and their images."""
+    reach = (0,) * len(coords) if images is None else images.reach
+    steps = [range(-max(k, 1), max(k, 1) + 1) for k in reach]
+    parts = _parts_of_rows(coords[0], extent[0], reach[0], images)
+    rows = [(part, row) for part in parts for row in product(*steps[1:])]
+    first, last, shift = (jnp.stack([part[what] for part, _ in rows], axis=1) for what in range(3))
+    shifts, cells = [shift], [first, last]
+    for axis in range(1, len(coords)):
+        cell = coords[axis][:, None] + np.array([row[axis - 1] for _, row in rows], np.int32)
+        turn = jnp.zeros_like(cell) if reach[axis] == 0 else cell // extent[axis]
+        cells.append(cell - turn * extent[axis])
+        shifts.append(turn)
+    if images is None:
+        return cells, None
+    code = jnp.zeros_like(first)
+    for shift, k in zip(shifts, reach, strict=True):
+        code = code * (2 * k + 1) + (shift + k)
+    return cells, code
+
+
+def _parts_of_rows(x: Array, extent: Array, reach: int, images: Images | None) -> list[tuple[Array, Array, Array]]:
+    """Cut the row of cells around x [m] where images meet: for each part its first and last cell and its image, [m] each."""
+    if images is None or reach == 0:
+        return [(x - 1, x + 1, jnp.zeros_like(x))]
+    if images.nearest:  # at least two cells: only one other image is met
+        other = jnp.where(x == 0, -1, 1)
+        shifts = [jnp.zeros_like(x), other]
+    else:
+        shifts = [jnp.full_like(x, s) for s in range(-reach, reach + 1)]
+    most = extent - 1
+    return [(jnp.maximum(x - reach - s * extent, 0), jnp.minimum(x + reach - s * extent, most), s) for s in shifts]
 
 
 def _lower_bound(cells: Array, target: list[Array]) -> Array:

@@ -1,13 +1,14 @@
 """Run a chunk of steps until its neighbor list was large enough: grow and replay."""
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 from jax import Array
 from jax.core import Tracer
 
+from jfrnn._box import Box
 from jfrnn._neighbors import NeighborList
 
 State = TypeVar("State")
@@ -21,6 +22,7 @@ def run_chunk(
     *,
     queries: Callable[[State], Array] | None = None,
     active: Callable[[State], Array] | None = None,
+    box: Callable[[State], Box] | None = None,
     slack: float = 1.25,
 ) -> tuple[State, NeighborList]:
     """Run a jitted chunk of steps; where its list overflowed, grow the list and run the same chunk again from the same state.
@@ -36,6 +38,7 @@ def run_chunk(
         positions: state -> positions [length], shape [n, d]: where a larger list is made.
         queries: state -> queries, exactly if the list was made with queries.
         active: state -> mask, exactly if the list was made with `active`.
+        box: state -> periodic box, where it changes.
         slack: Factor >= 1 on the slots that were needed, as in `NeighborList.grow`.
 
     Returns:
@@ -65,5 +68,6 @@ def run_chunk(
         after, seen = chunk(state, nbrs)
         if not bool(np.any(seen.overflow)):
             return after, seen
-        given = {name: of(state) for name, of in (("queries", queries), ("active", active)) if of is not None}
+        given: dict[str, Any] = {"queries": queries, "active": active, "box": box}
+        given = {name: of(state) for name, of in given.items() if of is not None}
         nbrs = seen.grow(positions(state), slack=slack, **given)

@@ -16,13 +16,32 @@ Three steps, each exact where it answers and each asked only what the one before
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-PointsAt = Callable[[Array | None], tuple[list[Array], list[Array]]]
+
+class Pair(NamedTuple):
+    """Points a and b of pairs, axis by axis, and the lattice shift that b takes (None: no lattice): x_b + shift·matrix - x_a."""
+
+    a: list[Array]
+    b: list[Array]
+    shift: list[Array] | None = None  # whole floats
+    matrix: Array | None = None  # [d, d], lattice vectors in rows, 0 where space is open
+    orthogonal: bool = True
+
+    def lattice_terms(self, axis: int) -> list[tuple[Array, Array]]:
+        """Return the shifts and the components of lattice vectors whose products belong to one axis."""
+        if self.shift is None or self.matrix is None:
+            return []
+        rows = [axis] if self.orthogonal else range(len(self.shift))
+        return [(self.shift[k], self.matrix[k, axis]) for k in rows]
+
+
+PointsAt = Callable[[Array | None], Pair]
 
 _LIMB_BITS = 11
 _LIMB_MASK = (1 << _LIMB_BITS) - 1
@@ -77,6 +96,15 @@ def make_cutoff(value: float, dtype: np.dtype, closed: bool) -> Cutoff:
     )
 
 
+def widened(cutoff: Cutoff, slack: Array) -> Cutoff:
+    """Return a cutoff whose step 1 leaves open what differences off by `slack` per component (at most 3) may not decide."""
+    eps = jnp.finfo(slack.dtype).eps
+    scale = cutoff.unit_scale if cutoff.scaled else slack.dtype.type(1)
+    radius, off = cutoff.radius * scale, 2 * (slack * scale)
+    inside = jnp.where(radius > off, (radius - off) ** 2 * (1 - 16 * eps), 0)
+    return dataclasses.replace(cutoff, inside=inside, outside=(radius + off) ** 2 * (1 + 16 * eps))
+
+
 def squared_distance(difference: list[Array], cutoff: Cutoff) -> Array:
     """Sum the squares of the scaled differences, one array per axis, in working precision (step 1)."""
     if cutoff.scaled:
@@ -87,18 +115,36 @@ def squared_distance(difference: list[Array], cutoff: Cutoff) -> Array:
     return total
 
 
-def is_pair_of(rows: Array, sources: Array, neighbor: Array, cutoff: Cutoff) -> Array:
+def is_pair_of(rows: Array, sources: Array, neighbor: Array, cutoff: Cutoff, shifted: "Shifted | None" = None) -> Array:
     """Decide exactly, for rows [m, d], sources [n, d] and source indices [m, k], which pairs there are: [m, k] bool."""
     axes = range(sources.shape[1])
-    square = squared_distance([sources[neighbor, axis] - rows[:, axis, None] for axis in axes], cutoff)
+    if shifted is None:
+        square = squared_distance([sources[neighbor, axis] - rows[:, axis, None] for axis in axes], cutoff)
+    else:
+        cutoff = widened(cutoff, shifted.slack)
+        square = squared_distance(list(jnp.moveaxis(shifted.vectors, -1, 0)), cutoff)
 
-    def points(at: Array | None) -> tuple[list[Array], list[Array]]:
+    def points(at: Array | None) -> Pair:
         row = lax.broadcasted_iota(jnp.int32, neighbor.shape, 0)
         row, source = (row, neighbor) if at is None else (flat_take(row, at), flat_take(neighbor, at))
-        return [rows[row, axis] for axis in axes], [sources[source, axis] for axis in axes]
+        pair = Pair([rows[row, axis] for axis in axes], [sources[source, axis] for axis in axes])
+        if shifted is None:
+            return pair
+        shift = [shifted.shifts[..., k] if at is None else flat_take(shifted.shifts[..., k], at) for k in axes]
+        return pair._replace(shift=shift, matrix=shifted.matrix, orthogonal=shifted.orthogonal)
 
     surely = square < cutoff.inside
     return surely | refine((square <= cutoff.outside) & ~surely, points, cutoff)
+
+
+class Shifted(NamedTuple):
+    """What a lattice adds to pairs [m, k]: their computed vectors and shifts [m, k, d], and a bound on the vectors' error."""
+
+    vectors: Array
+    shifts: Array
+    slack: Array
+    matrix: Array
+    orthogonal: bool
 
 
 def flat_take(x: Array, at: Array) -> Array:
@@ -109,21 +155,21 @@ def flat_take(x: Array, at: Array) -> Array:
 def refine(doubtful: Array, points: PointsAt, cutoff: Cutoff) -> Array:
     """Decide the pairs that step 1 left open (steps 2 and 3); False elsewhere. Costs nothing where none is open.
 
-    `points(None)` gives both points of every pair, axis by axis, in the shape of `doubtful`; `points(at)` those of the pairs at
-    the flat indices `at`, so that nobody has to store what is rarely asked for.
+    `points(None)` gives both points of every pair in the shape of `doubtful`; `points(at)` those of the pairs at the flat indices
+    `at`, so that nobody has to store what is rarely asked for.
     """
     decide = functools.partial(_refine_some, points=points, cutoff=cutoff)
     return lax.cond(jnp.any(doubtful), decide, jnp.zeros_like, doubtful)
 
 
 def _refine_some(doubtful: Array, points: PointsAt, cutoff: Cutoff) -> Array:
-    signs = jnp.where(doubtful, _sum_sign(*points(None), cutoff), 1).reshape(-1)
+    signs = jnp.where(doubtful, _sum_sign(points(None), cutoff), 1).reshape(-1)
     chunk = min(_INTEGER_CHUNK, signs.size)
 
     def decide_chunk(signs: Array) -> Array:
         (at,) = jnp.nonzero(signs == _UNKNOWN, size=chunk, fill_value=signs.size)
         at = at.astype(jnp.int32)
-        return signs.at[at].set(_integer_sign(*points(at), cutoff), mode="drop")
+        return signs.at[at].set(_integer_sign(points(at), cutoff), mode="drop")
 
     signs = lax.while_loop(lambda signs: jnp.any(signs == _UNKNOWN), decide_chunk, signs)
     return (signs <= 0 if cutoff.closed else signs < 0).reshape(doubtful.shape)
@@ -132,12 +178,21 @@ def _refine_some(doubtful: Array, points: PointsAt, cutoff: Cutoff) -> Array:
 # --- step 2: error-free transformations -------------------------------------------------------------------------------
 
 
-def _sum_sign(a: list[Array], b: list[Array], cutoff: Cutoff) -> Array:
+def _sum_sign(pair: Pair, cutoff: Cutoff) -> Array:
     """Return the sign of |b - a|² - r² where it is proven, ties of representable differences included, else _UNKNOWN; int32."""
     radius, scale = lax.optimization_barrier((cutoff.radius, cutoff.unit_scale))  # no constants: they could be regrouped
-    terms, slack = [], jnp.zeros_like(a[0])
-    for ak, bk in zip(a, b, strict=True):
+    terms, slack = [], jnp.zeros_like(pair.a[0])
+    plain = [_is_plain(x, cutoff) for x in (*pair.a, *pair.b)]
+    for axis, (ak, bk) in enumerate(zip(pair.a, pair.b, strict=True)):
         high, low = _two_difference(bk, ak)
+        rest = jnp.zeros_like(ak)
+        for shift, component in pair.lattice_terms(axis):
+            half = _half_mantissa(component)  # times a shift of at most half a mantissa: exact
+            *others, low, high = _distill(_distill([low, shift * (component - half), shift * half, high]))
+            rest = sum((jnp.abs(x * scale) for x in others), rest)
+            plain.append(_is_plain(component, cutoff))
+        if pair.shift is not None:
+            slack = slack + (4 * jnp.abs(high * scale) * rest + 2 * rest * rest)
         high, low = high * scale, low * scale
         terms += _exact_square(high)
         tail = 2 * high * low
@@ -150,7 +205,7 @@ def _sum_sign(a: list[Array], b: list[Array], cutoff: Cutoff) -> Array:
     bound = 2 * (rest + slack)  # twice: covers the rounding of the sums of absolute values above
     leading = terms[-1]
     known = (jnp.abs(leading) > bound) | ((leading == 0) & (bound == 0))
-    known = functools.reduce(jnp.logical_and, (_is_plain(x, cutoff) for x in (*a, *b)), known)
+    known = functools.reduce(jnp.logical_and, plain, known)
     return jnp.where(known, jnp.sign(leading).astype(jnp.int32), _UNKNOWN)
 
 
@@ -205,16 +260,23 @@ def _is_plain(x: Array, cutoff: Cutoff) -> Array:
 # --- step 3: integers as wide as the float format ---------------------------------------------------------------------
 
 
-def _integer_sign(a: list[Array], b: list[Array], cutoff: Cutoff) -> Array:
+def _integer_sign(pair: Pair, cutoff: Cutoff) -> Array:
     """Return the sign of |b - a|² - r² for [k] pairs of finite points, in integer arithmetic throughout.
 
     A coordinate fills at most 6 limbs of 11 bits, a difference at most 12, each below 2^12 in magnitude; a limb of the sum of
-    squares collects at most 3·12 products below 2^24 and stays below 2^31.
+    squares collects at most 3·12 products below 2^24 and stays below 2^31. With a lattice, limbs of a difference are below 2^30
+    (shifts are below 2^17); carried into [-2^10, 2^10), all of them may be filled, 193 at most: 3·193·2^20 + 6·2^22 < 2^31.
     """
-    dim = len(a)
-    limbs = _limbs(jnp.stack([*a, *b, jnp.full_like(a[0], cutoff.radius)]))  # [2d + 1, k, count]
+    dim, shifts = len(pair.a), pair.shift is not None
+    limbs = _limbs(jnp.stack([*pair.a, *pair.b, jnp.full_like(pair.a[0], cutoff.radius)]))  # [2d + 1, k, count]
     differences, radius = limbs[dim : 2 * dim] - limbs[:dim], limbs[-1]
-    count = limbs.shape[-1]
+    if shifts:
+        for axis in range(dim):
+            for shift, component in pair.lattice_terms(axis):
+                differences = differences.at[axis].add(shift.astype(jnp.int32)[:, None] * _limbs(component))
+        more = ((0, 0), (0, 0), (0, 3))
+        differences, radius = _carried(jnp.pad(differences, more)), jnp.pad(radius, more[1:])
+    count = differences.shape[-1]
 
     def add_shifted(i: Array, total: Array) -> Array:
         squares = -_limb(radius, i) * radius
@@ -224,6 +286,18 @@ def _integer_sign(a: list[Array], b: list[Array], cutoff: Cutoff) -> Array:
 
     total = jnp.zeros((radius.shape[0], 2 * count), jnp.int32)
     return _sign_of_limbs(lax.fori_loop(0, count, add_shifted, total))
+
+
+def _carried(limbs: Array) -> Array:
+    """Bring limbs [..., count] into [-2^10, 2^10), the number that they write staying the same."""
+
+    def carry_on(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        limbs, carry = state
+        value = _limb(limbs, i) + carry
+        carry = (value + (1 << (_LIMB_BITS - 1))) >> _LIMB_BITS
+        return lax.dynamic_update_slice_in_dim(limbs, value - (carry << _LIMB_BITS), i, axis=-1), carry
+
+    return lax.fori_loop(0, limbs.shape[-1], carry_on, (limbs, jnp.zeros_like(limbs[..., :1])))[0]
 
 
 def _limb(x: Array, i: Array) -> Array:

@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
+from jfrnn._box import Box
 from jfrnn._exact import Cutoff, largest_cutoff, make_cutoff, smallest_cutoff
 
 BACKENDS = ("auto", "jax", "warp", "hashgrid", "brute")
@@ -89,6 +90,18 @@ def checked_active(active: Any, positions: Array) -> Array:  # noqa: ANN401
     if tuple(active.shape) != positions.shape[:1]:
         raise ValueError(f"active must have shape [{positions.shape[0]}], one bool per particle, got shape {list(active.shape)}.")
     return jnp.asarray(active)
+
+
+def checked_box(box: Any, positions: Array, like: Box | None = None) -> Box | None:  # noqa: ANN401
+    """Return a box that repeats space along some axis of the positions, of the same kind as `like` where that is given; or None."""
+    if not isinstance(box, Box):
+        raise TypeError(f"box must be a jfrnn.Box, got {_describe(box)}: write e.g. jfrnn.Box([1.0, 1.0, 1.0]).")
+    if box.dim != positions.shape[1]:
+        raise ValueError(f"box has {box.dim} axes, but positions have {positions.shape[1]} columns.")
+    if like is not None and (box.periodic, box.orthogonal) != (like.periodic, like.orthogonal):
+        was, came = (f"periodic={b.periodic}, {'lengths' if b.orthogonal else 'matrix'}" for b in (like, box))
+        raise ValueError(f"box must be of the kind with which the list was made ({was}), got {came}.")
+    return box if any(box.periodic) else None
 
 
 def checked_flag(name: str, value: Any) -> bool:  # noqa: ANN401

@@ -9,7 +9,7 @@ from jax.sharding import SingleDeviceSharding
 
 from jfrnn import _warp
 from jfrnn._auto import WARP_ENGINES, default_platform, fastest_engine
-from jfrnn._backends import Options, list_rows
+from jfrnn._backends import Inputs, Options, list_rows
 from jfrnn._exact import Cutoff
 from jfrnn._inputs import checked_backend, checked_capacity, checked_cutoff, checked_kind, checked_size
 from jfrnn._runs import Filter
@@ -113,7 +113,8 @@ def _device_of(platform: str) -> Any:  # noqa: ANN401
 def _compiled_scratch(points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff, engine: str, capacity: int) -> int:
     """Compile the search for sources and queries of these shapes, and return what XLA says of its temporary arrays [B]."""
     options = Options(Filter(drop_self=points[1] is None, later_only=False), engine)
-    analysis = list_rows.lower(*points, None, cutoff, options, capacity).compile().memory_analysis()
+    inputs: Any = Inputs(points[0], points[1], None, None, cutoff)  # pyright: ignore[reportArgumentType] (shapes of arrays)
+    analysis = list_rows.lower(inputs, options, capacity).compile().memory_analysis()
     if analysis is None:
         raise RuntimeError("the compiler of this platform does not say what memory a program takes: plan another backend.")
     return int(analysis.temp_size_in_bytes)

@@ -1,7 +1,9 @@
 """The result of a search: a padded neighbor list, its checks, its geometry and its exports."""
 
 import dataclasses
+import functools
 import math
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,14 +11,29 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._backends import Options, count_rows, list_rows, without_inactive
+from jfrnn._backends import Found, Inputs, Options, count_rows, list_rows, without_inactive
+from jfrnn._box import LARGEST_TURN, Box, Images, fixed_box, make_lattice, nearest_shifts, shifted_pairs, unpacked_turns
 from jfrnn._exact import Cutoff, is_pair_of, make_cutoff
-from jfrnn._inputs import checked_active, checked_positions, checked_slack
+from jfrnn._inputs import checked_active, checked_box, checked_positions, checked_slack
 from jfrnn._runs import Filter
 from jfrnn._status import NeighborOverflowError, Status
 from jfrnn._verlet import Verlet, first_verlet, list_radius, moved_too_far
 
-_CAPACITY_STEP = 8  # eager capacities are rounded up to a multiple, so that similar scenes share one compiled program
+_CAPACITY_STEP = 8
+
+
+class ImageCodes(NamedTuple):
+    """Of which image of its source each slot tells, where the nearest is not the only one.
+
+    Attributes:
+        codes: shape [m, capacity], uint8 up to 256 images, else int16: which of the shifts within reach, of wrapped particles.
+        turns: shape [n], int32: how many lattice vectors each source was from the box when the list was made, packed.
+        query_turns: shape [m], int32, or None where the sources are the queries.
+    """
+
+    codes: Array
+    turns: Array
+    query_turns: Array | None
 
 
 @jax.tree_util.register_dataclass
@@ -31,6 +48,8 @@ class NeighborList:
         status: Bits of `Status`, shape [], int32.
         required: The capacity that holds every row, shape [], int32; like the status, over all updates.
         verlet: With a skin, where the list was made and how often anew (`Verlet`); None without.
+        box: The periodic box, its floats rounded to the dtype of the positions; None where space is open.
+        images: Of which image of its source each slot tells (`ImageCodes`), 1 B per slot; None where the nearest is the only one.
         cutoff: Interaction radius [length], rounded to the dtype of the positions. Static.
         skin: Extra shell [length]. Static.
         half: Each unordered pair stands once, in the row of its smaller index. Static.
@@ -38,6 +57,7 @@ class NeighborList:
         closed: Pairs at exactly the cutoff count. Static.
         own_queries: The rows belong to `queries`, not to the positions themselves. Static.
         masked: Particles may be inactive. Static.
+        box_kind: Along which axes the box is periodic and how far pairs reach in it; None where space is open. Static.
         source_count: n, the fill value of unused slots. Static.
         backend: The engine that made the list. Static.
     """
@@ -47,6 +67,8 @@ class NeighborList:
     status: Array
     required: Array
     verlet: Verlet | None
+    box: Box | None
+    images: ImageCodes | None
     cutoff: float = dataclasses.field(metadata={"static": True})
     skin: float = dataclasses.field(metadata={"static": True})
     half: bool = dataclasses.field(metadata={"static": True})
@@ -54,6 +76,7 @@ class NeighborList:
     closed: bool = dataclasses.field(metadata={"static": True})
     own_queries: bool = dataclasses.field(metadata={"static": True})
     masked: bool = dataclasses.field(metadata={"static": True})
+    box_kind: Images | None = dataclasses.field(metadata={"static": True})
     source_count: int = dataclasses.field(metadata={"static": True})
     backend: str = dataclasses.field(metadata={"static": True})
 
@@ -67,7 +90,9 @@ class NeighborList:
         """Say whether a row lost neighbors, shape [], bool."""
         return (self.status & Status.ROW_OVERFLOW.value) != 0
 
-    def update(self, positions: Array, *, queries: Array | None = None, active: Array | None = None) -> "NeighborList":
+    def update(
+        self, positions: Array, *, queries: Array | None = None, active: Array | None = None, box: Box | None = None
+    ) -> "NeighborList":
         """Make the list anew if something has moved skin/2 since it was made, or may have by rounding; without a skin, always.
 
         The list that comes back holds every pair within the cutoff at these positions, in the same shapes: a step of a simulation
@@ -79,6 +104,8 @@ class NeighborList:
             queries: Queries [length], shape [m, d], exactly if the list was made with queries.
             active: Which particles take part now, shape [n], bool, exactly if the list was made with `active`; one that comes or
                 goes makes the list anew.
+            box: The box now, of the same kind; default: the one that the list has. The list keeps it. One that changed enough to
+                bring a new pair within the cutoff makes the list anew.
 
         Returns:
             A `NeighborList` of the same shapes and options.
@@ -90,10 +117,17 @@ class NeighborList:
         being made anew where any of the batch is.
         """
         sources, rows = self._geometry_inputs(positions, queries)
-        return _update(self, sources, rows if self.own_queries else None, self._checked_active(active, sources))
+        rows = rows if self.own_queries else None
+        return _update(self, sources, rows, self._checked_active(active, sources), self._box_now(box, sources))
 
     def grow(
-        self, positions: Array, *, queries: Array | None = None, active: Array | None = None, slack: float = 1.25
+        self,
+        positions: Array,
+        *,
+        queries: Array | None = None,
+        active: Array | None = None,
+        box: Box | None = None,
+        slack: float = 1.25,
     ) -> "NeighborList":
         """Make a list with room for what overflowed, at these positions. Not inside jit: the capacity is a shape.
 
@@ -101,6 +135,7 @@ class NeighborList:
             positions: Sources [length], shape [n, d].
             queries: As in `update`.
             active: As in `update`.
+            box: As in `update`.
             slack: Factor >= 1 on the longest row that was ever met, here or by updates of this list.
 
         Returns:
@@ -112,13 +147,12 @@ class NeighborList:
         """
         sources, rows = self._geometry_inputs(positions, queries)
         queries, active, slack = rows if self.own_queries else None, self._checked_active(active, sources), checked_slack(slack)
-        if any(isinstance(x, Tracer) for x in (sources, queries, active, self.required)):
+        box = self._box_now(box, sources)
+        if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
-        met = math.ceil(slack * int(np.max(self.required)))
-        most = max(self.capacity, -(-met // _CAPACITY_STEP) * _CAPACITY_STEP)
-        list_cutoff, options = _cutoff_and_options(self, np.dtype(sources.dtype))
-        capacity = max(most, counted_capacity(sources, queries, active, list_cutoff, options, slack))
-        return _remade(self, sources, queries, active, capacity)
+        met = rounded_capacity(math.ceil(slack * int(np.max(self.required))))
+        inputs, options = _inputs_of(self, sources, queries, active, box)
+        return _remade(self, inputs, options, max(self.capacity, met, counted_capacity(inputs, options, slack)))
 
     @property
     def rebuild_count(self) -> Array:
@@ -132,7 +166,7 @@ class NeighborList:
 
         Raises:
             NeighborOverflowError: a row holds more neighbors than `capacity`; `.required` is the capacity needed.
-            ValueError: positions or queries hold NaN or infinity.
+            ValueError: positions or queries hold NaN or infinity, or do not fit the box.
             TypeError: called on a list that is being traced.
         """
         if isinstance(self.status, Tracer):
@@ -140,15 +174,16 @@ class NeighborList:
         status = Status(int(np.bitwise_or.reduce(np.asarray(self.status), axis=None)))
         if Status.ROW_OVERFLOW in status:
             raise NeighborOverflowError(int(np.max(self.required)), self.capacity)
-        if Status.NONFINITE in status:
-            raise ValueError(Status.NONFINITE.message)
+        if status:
+            raise ValueError(status.message)
 
-    def vectors(self, positions: Array, *, queries: Array | None = None) -> tuple[Array, Array]:
-        """Compute the displacement to every neighbor, r_ij = x_j - x_i.
+    def vectors(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> tuple[Array, Array]:
+        """Compute the displacement to every neighbor, r_ij = x_j - x_i, in a periodic box plus the lattice shift of the image.
 
         Args:
             positions: Sources [length], shape [n, d], where they are now.
             queries: Queries [length], shape [m, d], exactly if the list was made with queries.
+            box: The box now; default: the one that the list has, a constant to derivatives.
 
         Returns:
             Displacements [length], shape [m, capacity, d], 0 in masked slots; and the mask, shape [m, capacity], bool: the slot is
@@ -157,20 +192,39 @@ class NeighborList:
         Raises:
             ValueError, TypeError: positions or queries do not fit the list.
 
-        Differentiable: to any order in positions and queries; the mask is a constant. Jit: yes. vmap: yes.
+        Differentiable: to any order in positions, queries and box; the mask is a constant. Jit: yes. vmap: yes.
         """
-        sources, rows = self._geometry_inputs(positions, queries)
-        if 0 in (sources.shape[0], *self.idx.shape):
-            return jnp.zeros((*self.idx.shape, sources.shape[1]), sources.dtype), jnp.zeros(self.idx.shape, bool)
-        cutoff = make_cutoff(self.cutoff, np.dtype(sources.dtype), self.closed)
-        return _vectors(self.idx, self.count, sources, rows, cutoff)
+        vectors, mask, _ = self._geometry(positions, queries, box)
+        return vectors, mask
 
-    def distances(self, positions: Array, *, queries: Array | None = None) -> tuple[Array, Array]:
+    def shifts(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> Array:
+        """Compute the lattice shift S of every neighbor: its displacement is x_j - x_i + S·(lattice vectors).
+
+        Args:
+            positions: Sources [length], shape [n, d], where they are now.
+            queries: As in `vectors`.
+            box: As in `vectors`.
+
+        Returns:
+            Whole numbers, shape [m, capacity, d], int32; 0 in masked slots and along axes that are not periodic.
+
+        Raises:
+            ValueError, TypeError: an argument does not fit the list.
+
+        Differentiable: no (integers). Jit: yes. vmap: yes.
+        """
+        vectors, mask, shifts = self._geometry(positions, queries, box)
+        if shifts is None:
+            return jnp.zeros(vectors.shape, jnp.int32)
+        return jnp.where(mask[..., None], shifts, 0).astype(jnp.int32)
+
+    def distances(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> tuple[Array, Array]:
         """Compute the distance to every neighbor.
 
         Args:
             positions: Sources [length], shape [n, d], where they are now.
-            queries: Queries [length], shape [m, d], exactly if the list was made with queries.
+            queries: As in `vectors`.
+            box: As in `vectors`.
 
         Returns:
             Distances [length], shape [m, capacity], 0 in masked slots; and the mask as `vectors` gives it.
@@ -180,7 +234,7 @@ class NeighborList:
 
         Differentiable: to any order; the gradient of a distance of 0 is 0. Jit: yes. vmap: yes.
         """
-        vectors, mask = self.vectors(positions, queries=queries)
+        vectors, mask = self.vectors(positions, queries=queries, box=box)
         return _norms(vectors), mask
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
@@ -220,6 +274,24 @@ class NeighborList:
             raise ValueError(f"this list was made {state}.")
         return None if active is None else checked_active(active, sources)
 
+    def _box_now(self, box: Box | None, sources: Array) -> Box | None:
+        if box is None:
+            return self.box
+        if self.box is None:
+            raise ValueError("this list was made without a periodic box: leave box out.")
+        checked = checked_box(box, sources, like=self.box)
+        return None if checked is None else fixed_box(checked, np.dtype(sources.dtype))
+
+    def _geometry(self, positions: Array, queries: Array | None, box: Box | None) -> tuple[Array, Array, Array | None]:
+        sources, rows = self._geometry_inputs(positions, queries)
+        box = self._box_now(box, sources)
+        if 0 in (sources.shape[0], *self.idx.shape):
+            return jnp.zeros((*self.idx.shape, sources.shape[1]), sources.dtype), jnp.zeros(self.idx.shape, bool), None
+        cutoff = make_cutoff(self.cutoff, np.dtype(sources.dtype), self.closed)
+        if box is None or self.box_kind is None:
+            return *_vectors(self.idx, self.count, sources, rows, cutoff), None
+        return _periodic_vectors(self.idx, self.count, self.images, sources, rows, box, self.box_kind, cutoff)
+
     def _geometry_inputs(self, positions: Array, queries: Array | None) -> tuple[Array, Array]:
         sources = checked_positions("positions", positions)
         if sources.shape[0] != self.source_count:
@@ -233,46 +305,69 @@ class NeighborList:
         return sources, rows
 
 
-def counted_capacity(
-    sources: Array, queries: Array | None, active: Array | None, cutoff: Cutoff, options: Options, slack: float
-) -> int:
+def rounded_capacity(slots: int) -> int:
+    """Round a capacity up, so that similar scenes share one compiled program."""
+    return -(-slots // _CAPACITY_STEP) * _CAPACITY_STEP
+
+
+def counted_capacity(inputs: Inputs, options: Options, slack: float) -> int:
     """Count the neighbors of concrete positions and return a capacity that holds `slack` times the longest row."""
     with jax.ensure_compile_time_eval():
-        longest = int(np.max(count_rows(sources, queries, active, cutoff, options), initial=0))
+        longest = int(np.max(count_rows(inputs, options), initial=0))
     wanted = math.ceil(max(longest, 1) * slack)
-    rounded = -(-wanted // _CAPACITY_STEP) * _CAPACITY_STEP
-    return min(rounded, max(wanted, sources.shape[0]))
+    return min(rounded_capacity(wanted), max(wanted, inputs.sources.shape[0]))
 
 
-def _cutoff_and_options(nbrs: NeighborList, dtype: np.dtype) -> tuple[Cutoff, Options]:
-    """Return the cutoff of the list, with the skin, and the static options with which it was made."""
-    radius = list_radius(nbrs.cutoff, nbrs.skin, dtype)
+def made_options(
+    radius: float, keep: Filter, box_kind: Images | None, backend: str, dtype: np.dtype, closed: bool
+) -> tuple[Cutoff, Options]:
+    """Return the operand and the static options of a search with this radius, which holds the skin."""
+    return make_cutoff(radius, dtype, closed), Options(keep, backend, box_kind, radius if backend == "hashgrid" else None)
+
+
+def _inputs_of(
+    nbrs: NeighborList, sources: Array, queries: Array | None, active: Array | None, box: Box | None
+) -> tuple[Inputs, Options]:
+    """Return what a search takes that makes this list at these positions."""
+    dtype = np.dtype(sources.dtype)
     keep = Filter(drop_self=not (nbrs.own_queries or nbrs.include_self), later_only=nbrs.half)
-    return make_cutoff(radius, dtype, nbrs.closed), Options(keep, nbrs.backend, radius if nbrs.backend == "hashgrid" else None)
+    radius = list_radius(nbrs.cutoff, nbrs.skin, dtype)
+    cutoff, options = made_options(radius, keep, nbrs.box_kind, nbrs.backend, dtype, nbrs.closed)
+    return Inputs(sources, queries, active, box, cutoff), options
 
 
 @jax.jit
-def _update(nbrs: NeighborList, sources: Array, queries: Array | None, active: Array | None) -> NeighborList:
+def _update(nbrs: NeighborList, sources: Array, queries: Array | None, active: Array | None, box: Box | None) -> NeighborList:
+    sources, queries, box = lax.stop_gradient((sources, queries, box))
+    inputs, options = _inputs_of(nbrs, sources, queries, active, box)
+
     def remake(nbrs: NeighborList) -> NeighborList:
-        made, verlet = _remade(nbrs, sources, queries, active, nbrs.capacity), nbrs.verlet
+        made, verlet = _remade(nbrs, inputs, options, nbrs.capacity), nbrs.verlet
         if made.verlet is not None and verlet is not None:
             made = dataclasses.replace(made, verlet=dataclasses.replace(made.verlet, rebuild_count=verlet.rebuild_count + 1))
         return dataclasses.replace(made, status=made.status | nbrs.status, required=jnp.maximum(made.required, nbrs.required))
 
     if nbrs.verlet is None:
         return remake(nbrs)
-    now = lax.stop_gradient(without_inactive(sources, active))
-    moved = moved_too_far(nbrs.verlet, now, None if queries is None else lax.stop_gradient(queries), nbrs.skin)
+    now = without_inactive(sources, active)
+    moved = moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, nbrs.skin)
+    nbrs = dataclasses.replace(nbrs, box=box)
     # a loop of at most one round: XLA keeps what a loop carries in place, but copies what a branch returns
     return lax.while_loop(lambda state: state[0], lambda state: (jnp.zeros_like(state[0]), remake(state[1])), (moved, nbrs))[1]
 
 
-def _remade(nbrs: NeighborList, sources: Array, queries: Array | None, active: Array | None, capacity: int) -> NeighborList:
+def _remade(nbrs: NeighborList, inputs: Inputs, options: Options, capacity: int) -> NeighborList:
     """Make a list with the options of this one, and nothing of its past."""
-    cutoff, options = _cutoff_and_options(nbrs, np.dtype(sources.dtype))
-    rows = list_rows(sources, queries, active, cutoff, options, capacity)
-    verlet = first_verlet(without_inactive(sources, active), queries) if nbrs.skin else None
-    return dataclasses.replace(nbrs, idx=rows.idx, count=rows.counts, status=rows.status, required=rows.required, verlet=verlet)
+    return dataclasses.replace(nbrs, **found_fields(inputs, list_rows(inputs, options, capacity), nbrs.skin))
+
+
+def found_fields(inputs: Inputs, found: Found, skin: float) -> dict[str, Any]:
+    """Return the fields of a list that come from data."""
+    rows, sources = found.rows, without_inactive(inputs.sources, inputs.active)
+    codes = None if found.images is None or found.turns is None else ImageCodes(found.images, *found.turns)
+    verlet = first_verlet(sources, inputs.queries, inputs.box) if skin else None
+    fields = {"idx": rows.idx, "count": rows.counts, "status": rows.status, "required": rows.required}
+    return fields | {"verlet": verlet, "box": lax.stop_gradient(inputs.box), "images": codes}
 
 
 @jax.jit
@@ -281,6 +376,30 @@ def _vectors(idx: Array, count: Array, sources: Array, rows: Array, cutoff: Cuto
     neighbor = jnp.where(used, idx, 0)
     mask = used & is_pair_of(lax.stop_gradient(rows), lax.stop_gradient(sources), neighbor, cutoff)
     return jnp.where(mask[..., None], sources[neighbor] - rows[:, None, :], 0), mask
+
+
+@functools.partial(jax.jit, static_argnames="kind")
+def _periodic_vectors(
+    idx: Array, count: Array, images: ImageCodes | None, sources: Array, rows: Array, box: Box, kind: Images, cutoff: Cutoff
+) -> tuple[Array, Array, Array]:
+    lattice = make_lattice(box, kind, np.dtype(sources.dtype))
+    used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
+    neighbor = jnp.where(used, idx, 0)
+    difference = sources[neighbor] - rows[:, None, :]
+    if images is None:
+        shifts = nearest_shifts(difference, lattice)
+    else:
+        turns = unpacked_turns(images.turns, lattice.dim)
+        query_turns = turns if images.query_turns is None else unpacked_turns(images.query_turns, lattice.dim)
+        codes = jnp.where(used, images.codes.astype(jnp.int32), kind.home)
+        shifts = (jnp.asarray(kind.shifts)[codes] + query_turns[:, None] - turns[neighbor]).astype(sources.dtype)
+    used = used & (jnp.abs(shifts) <= 2 * LARGEST_TURN).all(axis=-1)  # farther apart, nothing is decided exactly
+    shifts = jnp.where(used[..., None], shifts, 0)
+    fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
+    pairs = shifted_pairs(difference, shifts, (fixed_sources, fixed_rows), lattice)
+    fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
+    mask = used & is_pair_of(fixed_rows, fixed_sources, neighbor, cutoff, fixed_pairs)
+    return jnp.where(mask[..., None], pairs.vectors, 0), mask, shifts
 
 
 @jax.jit

@@ -13,15 +13,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._exact import Cutoff, flat_take, refine, squared_distance
+from jfrnn._box import Images
+from jfrnn._exact import Cutoff, Pair, flat_take, refine, squared_distance
 
 LANES = 16  # candidates per word: hits in its lower half, doubtful ones in its upper half
 _BLOCK_WORDS = 1 << 16
 _BLOCK_SLOTS = 1 << 22  # 16 MB of rows
 _SLOT_GROUP = 128  # slots of a row that are filled at a time
+_FEW_RUNS = 32
 _DOUBTFUL = 32  # doubtful candidates per row that one round of the exact test takes
 
-Runs = Callable[[Array], tuple[Array, Array]]  # places of queries [b] -> first places and ends of their runs [b, r]
+# places of queries [b] -> first places and ends of their runs [b, r], and the codes of their images (None: no lattice)
+Runs = Callable[[Array], tuple[Array, Array, Array | None]]
 
 
 class Points(NamedTuple):
@@ -31,6 +34,24 @@ class Points(NamedTuple):
     ids: Array
 
 
+class Torus(NamedTuple):
+    """What a lattice adds: images of the sources are met, of which the wrapped coordinates tell all but what is doubtful.
+
+    Attributes:
+        images: Static.
+        translations: [images, d], near enough, of each image.
+        matrix: [d, d].
+        raw: [n, d] sources and [m, d] queries as they were given.
+        turns: [n, d] and [m, d] whole floats: how many lattice vectors were taken off.
+    """
+
+    images: Images
+    translations: Array
+    matrix: Array
+    raw: tuple[Array, Array]
+    turns: tuple[Array, Array]
+
+
 class Filter(NamedTuple):
     """Which candidates may be neighbors apart from their distance; static."""
 
@@ -38,16 +59,26 @@ class Filter(NamedTuple):
     later_only: bool
 
 
-def count_neighbors(sources: Points, queries: Points, runs: Runs, cutoff: Cutoff, keep: Filter) -> Array:
+class Candidates(NamedTuple):
+    """Sources and queries in the order in which they are walked, and where the candidates of a query lie among the sources."""
+
+    sources: Points
+    queries: Points
+    runs: Runs
+    torus: Torus | None
+
+
+def count_neighbors(candidates: Candidates, cutoff: Cutoff, keep: Filter) -> Array:
     """Count the neighbors of every query: [m] int32, in the order of the queries' ids."""
-    engine = _Engine(_padded(sources), queries, runs, cutoff, keep, capacity=1)
+    engine = _Engine(candidates._replace(sources=_padded(candidates.sources)), cutoff, keep, capacity=1)
+    queries = candidates.queries
 
     def count_block(b: Array, out: Array) -> Array:
         place, ids = engine.block(b)
 
         def add_chunk(state: tuple[Array, Array]) -> tuple[Array, Array]:
             chunk, count = state
-            return chunk + 1, count + _bit_counts(engine.hit_words(place, table, chunk)[0]).sum(1, dtype=jnp.int32)
+            return chunk + 1, count + _bit_counts(engine.hit_words(place, table, chunk).hits).sum(1, dtype=jnp.int32)
 
         table = engine.word_table(place)
         start = (jnp.int32(0), jnp.zeros(place.shape, jnp.int32))
@@ -57,11 +88,14 @@ def count_neighbors(sources: Points, queries: Points, runs: Runs, cutoff: Cutoff
     return lax.fori_loop(0, engine.block_count, count_block, jnp.zeros(queries.ids.shape, jnp.int32))
 
 
-def list_neighbors(
-    sources: Points, queries: Points, runs: Runs, cutoff: Cutoff, keep: Filter, capacity: int
-) -> tuple[Array, Array]:
-    """List the neighbors of every query: [m, capacity] int32 source indices, unused slots n, and [m] int32 true counts."""
-    engine = _Engine(_padded(sources), queries, runs, cutoff, keep, capacity)
+def list_neighbors(candidates: Candidates, cutoff: Cutoff, keep: Filter, capacity: int) -> tuple[Array, Array]:
+    """List the neighbors of every query: [m, capacity] int32 source indices, unused slots n, and [m] int32 true counts.
+
+    Where images must be told apart, an index is that of the source plus n times the code of its image, unused slots n·images.
+    """
+    sources, queries, _, torus = candidates
+    engine = _Engine(candidates._replace(sources=_padded(sources)), cutoff, keep, capacity)
+    n, images = sources.ids.size, 1 if torus is None or torus.images.nearest else torus.images.total
     group = min(_SLOT_GROUP, capacity)
     slots = lax.iota(jnp.int32, group)
 
@@ -71,7 +105,7 @@ def list_neighbors(
 
         def add_chunk(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             chunk, rows, count = state
-            hits, first = engine.hit_words(place, table, chunk)
+            hits, first, image = engine.hit_words(place, table, chunk)
             total = _bit_counts(hits).sum(1, dtype=jnp.int32)
 
             def add_group(state: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -80,6 +114,8 @@ def list_neighbors(
                 ordinal = start + slots - count[:, None]
                 word, bit = _nth_bits(hits, ordinal)
                 neighbor = engine.sources.ids.at[_take(first, word) + bit].get(mode="promise_in_bounds")
+                if image is not None and images > 1:
+                    neighbor = neighbor + n * _take(image, word)
                 old = lax.dynamic_slice_in_dim(rows, start, group, axis=1)
                 new = jnp.where((ordinal >= 0) & (ordinal < total[:, None]), neighbor, old)
                 return g + 1, lax.dynamic_update_slice_in_dim(rows, new, start, axis=1)
@@ -88,7 +124,7 @@ def list_neighbors(
             _, rows = lax.while_loop(lambda state: state[0] * group < until, add_group, (jnp.min(count) // group, rows))
             return chunk + 1, rows, count + total
 
-        rows = jnp.full((place.size, capacity), sources.ids.size, jnp.int32)
+        rows = jnp.full((place.size, capacity), n * images, jnp.int32)
         start = (jnp.int32(0), rows, jnp.zeros(place.shape, jnp.int32))
         _, rows, count = lax.while_loop(lambda state: state[0] * engine.words < table.longest, add_chunk, start)
         return out[0].at[ids].set(rows), out[1].at[ids].set(count)
@@ -103,17 +139,32 @@ class _WordTable(NamedTuple):
 
     start: Array  # [b, r] first place of each run
     stop: Array  # [b, r] its end
+    image: Array | None  # [b, r] the code of its image
     before: Array  # [b, r] words of the query's earlier runs
     longest: Array  # [] words of the query that has most
 
 
+class _HitWords(NamedTuple):
+    """Neighbors among a chunk of candidates: one bit per candidate, [b, words] each."""
+
+    hits: Array
+    first: Array  # place of each word's first candidate
+    image: Array | None  # code of its image
+
+
 class _Engine(NamedTuple):
-    sources: Points
-    queries: Points
-    runs: Runs
+    candidates: Candidates
     cutoff: Cutoff
     keep: Filter
     capacity: int
+
+    @property
+    def sources(self) -> Points:
+        return self.candidates.sources
+
+    @property
+    def queries(self) -> Points:
+        return self.candidates.queries
 
     @property
     def words(self) -> int:
@@ -135,41 +186,47 @@ class _Engine(NamedTuple):
         return place, lax.dynamic_slice_in_dim(self.queries.ids, first, self.block_size)
 
     def word_table(self, place: Array) -> _WordTable:
-        start, stop = self.runs(place)
+        start, stop, image = self.candidates.runs(place)
         count = (stop - start + (LANES - 1)) // LANES
         total = jnp.cumsum(count, axis=1, dtype=jnp.int32)
-        return _WordTable(start, stop, total - count, jnp.max(total[:, -1]))
+        return _WordTable(start, stop, image, total - count, jnp.max(total[:, -1]))
 
-    def hit_words(self, place: Array, table: _WordTable, chunk: Array) -> tuple[Array, Array]:
-        """Test one chunk of words per query: [b, words] uint32 neighbor bits, and the place of each word's first candidate."""
-        first, stop = self._locate_words(table, chunk)
-        query = [x.at[place].get(mode="promise_in_bounds") for x in self.queries.axes]
-        first, packed = lax.optimization_barrier((first, self._test(first, stop, query, place)))
+    def hit_words(self, place: Array, table: _WordTable, chunk: Array) -> _HitWords:
+        """Test one chunk of words per query."""
+        first, stop, image = self._locate_words(table, chunk)
+        query = [x.at[place].get(mode="promise_in_bounds")[:, None] for x in self.queries.axes]
+        if image is not None and self.candidates.torus is not None:  # the query goes to where it meets the image at home
+            query = [q - t[image] for q, t in zip(query, self.candidates.torus.translations.T, strict=True)]
+        first, image, packed = lax.optimization_barrier((first, image, self._test(first, stop, image, query, place)))
         hits, doubtful = packed & np.uint32(0xFFFF), packed >> np.uint32(LANES)
-        return lax.optimization_barrier(hits | self._decide_doubtful(doubtful, first, query)), first
+        hits = lax.optimization_barrier(hits | self._decide_doubtful(doubtful, first, image, place))
+        return _HitWords(hits, first, image)
 
-    def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array]:
-        word = chunk * self.words + lax.iota(jnp.int32, self.words)
-        first = jnp.zeros((table.start.shape[0], self.words), jnp.int32)
-        stop = jnp.zeros_like(first)
-        for r in range(table.start.shape[1]):
-            before = table.before[:, r, None]
-            reached = word >= before
-            first = jnp.where(reached, table.start[:, r, None] + LANES * (word - before), first)
-            stop = jnp.where(reached, table.stop[:, r, None], stop)
-        return jnp.minimum(first, self.sources.ids.size - LANES), stop
+    def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
+        word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (table.start.shape[0], self.words))
+        runs = table.start.shape[1]
+        if runs > _FEW_RUNS:  # many images
+            run = jnp.sum(word[..., None] >= table.before[:, None], axis=2, dtype=jnp.int32) - 1
+            first = _take(table.start, run) + LANES * (word - _take(table.before, run))
+            stop, image = _take(table.stop, run), None if table.image is None else _take(table.image, run)
+        else:  # a chain of selections: half the time of looking up
+            first, stop = jnp.zeros_like(word), jnp.zeros_like(word)
+            image = None if table.image is None else jnp.zeros_like(word)
+            for r in range(runs):
+                before = table.before[:, r, None]
+                reached = word >= before
+                first = jnp.where(reached, table.start[:, r, None] + LANES * (word - before), first)
+                stop = jnp.where(reached, table.stop[:, r, None], stop)
+                if image is not None and table.image is not None:
+                    image = jnp.where(reached, table.image[:, r, None], image)
+        return jnp.minimum(first, self.sources.ids.size - LANES), stop, image
 
-    def _test(self, first: Array, stop: Array, query: list[Array], place: Array) -> Array:
+    def _test(self, first: Array, stop: Array, image: Array | None, query: list[Array], place: Array) -> Array:
         """Compare 16 candidates per word with the cutoff in working precision: hits low, doubtful ones high."""
         lane = lax.iota(jnp.int32, LANES)
         candidate = first[..., None] + lane
-        allowed = candidate < stop[..., None]
-        if self.keep.later_only:
-            own = self.queries.ids.at[place].get(mode="promise_in_bounds") + int(self.keep.drop_self)
-            allowed &= _windows(self.sources.ids, first) >= own[:, None, None]
-        elif self.keep.drop_self:
-            allowed &= candidate != place[:, None, None]
-        difference = [_windows(x, first) - q[:, None, None] for x, q in zip(self.sources.axes, query, strict=True)]
+        allowed = (candidate < stop[..., None]) & self._wanted(first, candidate, image, place)
+        difference = [_windows(x, first) - q[..., None] for x, q in zip(self.sources.axes, query, strict=True)]
         square = squared_distance(difference, self.cutoff)
         surely = square < self.cutoff.inside
         doubtful = (square <= self.cutoff.outside) & ~surely
@@ -177,7 +234,23 @@ class _Engine(NamedTuple):
         value = jnp.where(surely, bit, np.uint32(0)) | jnp.where(doubtful, bit << np.uint32(LANES), np.uint32(0))
         return lax.reduce(jnp.where(allowed, value, np.uint32(0)), np.uint32(0), lax.bitwise_or, (2,))
 
-    def _decide_doubtful(self, doubtful: Array, first: Array, query: list[Array]) -> Array:
+    def _wanted(self, first: Array, candidate: Array, image: Array | None, place: Array) -> Array:
+        """Say which candidates [b, words, 16] may be neighbors apart from their distance."""
+        if self.keep.later_only:
+            own = self.queries.ids.at[place].get(mode="promise_in_bounds")[:, None]
+            later = own + int(self.keep.drop_self)
+            if image is not None and self.candidates.torus is not None:  # of its own images, those in the forward half of space
+                home = self.candidates.torus.images.home
+                later = jnp.where(image > home, own, jnp.where(image < home, own + 1, later))
+            return _windows(self.sources.ids, first) >= later[..., None]
+        if not self.keep.drop_self:
+            return jnp.ones((), bool)
+        others = candidate != place[:, None, None]
+        if image is None or self.candidates.torus is None:
+            return others
+        return others | (image != self.candidates.torus.images.home)[..., None]
+
+    def _decide_doubtful(self, doubtful: Array, first: Array, image: Array | None, place: Array) -> Array:
         """Decide the doubtful candidates of each row exactly, 32 a round: [b, words] uint32 bits of those that are pairs."""
         slots = lax.iota(jnp.int32, _DOUBTFUL)
         until = jnp.cumsum(_bit_counts(doubtful), axis=1, dtype=jnp.int32)
@@ -189,11 +262,11 @@ class _Engine(NamedTuple):
             word, bit = _nth_bits(doubtful, jnp.broadcast_to(slots + done, (first.shape[0], _DOUBTFUL)))
             candidate = _take(first, word) + bit
 
-            def points(at: Array | None, candidate: Array = candidate) -> tuple[list[Array], list[Array]]:
+            def points(at: Array | None, word: Array = word, candidate: Array = candidate) -> Pair:
                 rows = jnp.broadcast_to(lax.iota(jnp.int32, first.shape[0])[:, None], candidate.shape)
                 if at is not None:
-                    rows, candidate = flat_take(rows, at), flat_take(candidate, at)
-                return [q[rows] for q in query], [x.at[candidate].get(mode="clip") for x in self.sources.axes]
+                    rows, word, candidate = flat_take(rows, at), flat_take(word, at), flat_take(candidate, at)
+                return self._pair(place[rows], candidate, None if image is None else image[rows, word])
 
             pair = refine(slots + done < total[:, None], points, self.cutoff)
             verdict = jnp.sum(jnp.where(pair, np.uint32(1) << slots.astype(jnp.uint32), np.uint32(0)), 1, dtype=jnp.uint32)
@@ -201,6 +274,22 @@ class _Engine(NamedTuple):
 
         start = (jnp.int32(0), jnp.zeros_like(doubtful))
         return lax.while_loop(lambda state: state[0] < most, decide_round, start)[1]
+
+    def _pair(self, place: Array, candidate: Array, image: Array | None) -> Pair:
+        """Return the points, as they were given, of queries and candidates at these places."""
+        torus = self.candidates.torus
+        if torus is None:
+            return Pair(
+                [x.at[place].get(mode="clip") for x in self.queries.axes],
+                [x.at[candidate].get(mode="clip") for x in self.sources.axes],
+            )
+        i, j = self.queries.ids.at[place].get(mode="clip"), self.sources.ids.at[candidate].get(mode="clip")
+        axes = range(len(self.sources.axes))
+        (sources, queries), (turns, query_turns) = torus.raw, torus.turns
+        shifts = jnp.asarray(torus.images.shifts).astype(turns.dtype)
+        shift = [shifts[image, k] + query_turns[i, k] - turns[j, k] for k in axes]
+        raw = [queries[i, k] for k in axes], [sources[j, k] for k in axes]
+        return Pair(*raw, shift, torus.matrix, torus.images.orthogonal)
 
 
 def _padded(sources: Points) -> Points:

@@ -2,16 +2,18 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jax import Array
 from jax.core import Tracer
 
 from jfrnn._auto import choose_engine
-from jfrnn._backends import Options, count_rows, list_rows, without_inactive
-from jfrnn._exact import Cutoff, make_cutoff
+from jfrnn._backends import Inputs, Options, count_rows, list_rows
+from jfrnn._box import Box, fixed_box, images_of
 from jfrnn._inputs import (
     checked_active,
     checked_backend,
+    checked_box,
     checked_capacity,
     checked_cutoff,
     checked_flag,
@@ -19,9 +21,9 @@ from jfrnn._inputs import (
     checked_skin,
     checked_slack,
 )
-from jfrnn._neighbors import NeighborList, counted_capacity
+from jfrnn._neighbors import NeighborList, counted_capacity, found_fields, made_options
 from jfrnn._runs import Filter
-from jfrnn._verlet import first_verlet, list_radius
+from jfrnn._verlet import list_radius
 
 
 def search(
@@ -29,6 +31,7 @@ def search(
     cutoff: float,
     *,
     queries: Array | None = None,
+    box: Box | None = None,
     half: bool = False,
     include_self: bool = False,
     closed: bool = False,
@@ -49,7 +52,11 @@ def search(
         cutoff: Interaction radius [length], a static number > 0.
         queries: Points [length] whose neighbors among `positions` are wanted, shape [m, d], same dtype; default: the positions
             themselves, each particle being excluded from its own row by index.
-        half: Keep each unordered pair once, in the row of its smaller index.
+        box: Periodic box (`Box`): then (i, j) stands in the list once for each image of j within the cutoff, its displacement
+            being x_j - x_i + S·(lattice vectors), S whole numbers; `NeighborList.shifts` tells them. Particles may be up to 511
+            lattice vectors away from the box; along axes that are not periodic it has no meaning.
+        half: Keep each unordered pair once, in the row of its smaller index; of the images of a particle that are its own
+            neighbors, those whose shift S has a positive number first.
         include_self: Make each particle its own neighbor.
         closed: Count pairs at exactly the cutoff (<= instead of <).
         skin: Extra shell [length], a static number >= 0: the list holds all pairs within cutoff + skin, so that
@@ -80,27 +87,24 @@ def search(
     Differentiable: the list is topology, without gradient; see `NeighborList.vectors`. Jit: yes, with capacity. vmap: yes, with
     capacity. Source: cell lists (Hockney & Eastwood 1981, ch. 8); strict cutoff (Peifle 2019, §2.2).
     """
-    problem = _checked_problem(positions, cutoff, queries, half, include_self, closed, backend, skin, active)
+    problem = _checked_problem(positions, cutoff, queries, box, half, include_self, closed, backend, skin, active)
     slack = checked_slack(slack)
+    inputs, options = problem.inputs, problem.options
     if capacity is None:
-        capacity = _counted_capacity(problem, slack)
-    rows = list_rows(*problem.inputs, checked_capacity(capacity))
-    sources = problem.inputs.sources
+        capacity = _counted_capacity(inputs, options, slack)
+    found = list_rows(inputs, options, checked_capacity(capacity))
     return NeighborList(
-        rows.idx,
-        rows.counts,
-        rows.status,
-        rows.required,
-        first_verlet(without_inactive(sources, problem.inputs.active), problem.inputs.queries) if problem.skin else None,
+        **found_fields(inputs, found, problem.skin),
         cutoff=problem.radius,
         skin=problem.skin,
-        half=problem.inputs.options.filter.later_only,
-        include_self=queries is None and not problem.inputs.options.filter.drop_self,
-        closed=problem.inputs.cutoff.closed,
+        half=options.filter.later_only,
+        include_self=queries is None and not options.filter.drop_self,
+        closed=inputs.cutoff.closed,
         own_queries=queries is not None,
         masked=active is not None,
-        source_count=sources.shape[0],
-        backend=problem.inputs.options.backend,
+        box_kind=options.images,
+        source_count=inputs.sources.shape[0],
+        backend=options.backend,
     )
 
 
@@ -109,6 +113,7 @@ def count(
     cutoff: float,
     *,
     queries: Array | None = None,
+    box: Box | None = None,
     half: bool = False,
     include_self: bool = False,
     closed: bool = False,
@@ -121,6 +126,7 @@ def count(
         positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64.
         cutoff: Interaction radius [length], a static number > 0.
         queries: As in `search`.
+        box: As in `search`.
         half: As in `search`.
         include_self: As in `search`.
         closed: As in `search`.
@@ -135,22 +141,13 @@ def count(
 
     Memory: as in `search`, without the list. Differentiable: no (integers). Jit: yes. vmap: yes.
     """
-    problem = _checked_problem(positions, cutoff, queries, half, include_self, closed, backend, 0.0, active)
-    return count_rows(*problem.inputs)
-
-
-class _Inputs(NamedTuple):
-    """What the compiled programs take, but for a capacity; the cutoff is that of the list, with the skin."""
-
-    sources: Array
-    queries: Array | None
-    active: Array | None
-    cutoff: Cutoff
-    options: Options
+    problem = _checked_problem(positions, cutoff, queries, box, half, include_self, closed, backend, 0.0, active)
+    return count_rows(problem.inputs, problem.options)
 
 
 class _Problem(NamedTuple):
-    inputs: _Inputs
+    inputs: Inputs
+    options: Options
     radius: float  # of a pair, without the skin
     skin: float
 
@@ -159,6 +156,7 @@ def _checked_problem(
     positions: Any,  # noqa: ANN401
     cutoff: Any,  # noqa: ANN401
     queries: Any,  # noqa: ANN401
+    box: Any,  # noqa: ANN401
     half: bool,
     include_self: bool,
     closed: bool,
@@ -173,7 +171,7 @@ def _checked_problem(
             if checked_flag(name, value):
                 raise ValueError(f"{name}=True pairs particles with themselves or each other: it cannot be used with queries.")
     active = None if active is None else checked_active(active, sources)
-    pair_filter = Filter(
+    keep = Filter(
         drop_self=queries is None and not checked_flag("include_self", include_self),
         later_only=checked_flag("half", half),
     )
@@ -181,17 +179,20 @@ def _checked_problem(
     pair_cutoff = checked_cutoff(cutoff, dtype, closed)
     radius = float(pair_cutoff.radius)
     skin = checked_skin(skin, radius, dtype)
-    list_cutoff = make_cutoff(list_radius(radius, skin, dtype), dtype, pair_cutoff.closed) if skin else pair_cutoff
-    engine = choose_engine(checked_backend(backend), sources, queries)
-    options = Options(pair_filter, engine, float(list_cutoff.radius) if engine == "hashgrid" else None)
-    return _Problem(_Inputs(sources, queries, active, list_cutoff, options), radius, skin)
+    list_reach = list_radius(radius, skin, dtype)
+    box = None if box is None else checked_box(box, sources)
+    kind = None if box is None else images_of(box, list_reach, dtype, sources.shape[0])
+    engine = choose_engine(checked_backend(backend), sources, queries, periodic=box is not None)
+    list_cutoff, options = made_options(list_reach, keep, kind, engine, dtype, pair_cutoff.closed)
+    box = None if box is None else fixed_box(box, dtype)
+    return _Problem(Inputs(sources, queries, active, box, list_cutoff), options, radius, skin)
 
 
-def _counted_capacity(problem: _Problem, slack: float) -> int:
-    if any(isinstance(x, Tracer) for x in problem.inputs[:3]):
+def _counted_capacity(inputs: Inputs, options: Options, slack: float) -> int:
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves(inputs)):
         raise ValueError(
             "capacity must be given where positions are traced (jax.jit, vmap, grad, scan), because it is a shape: pass "
             "capacity=int(jfrnn.count(positions, cutoff + skin).max()) of concrete positions, with room to move, or the capacity "
             "of an earlier search, and check nbrs.overflow."
         )
-    return counted_capacity(*problem.inputs, slack)
+    return counted_capacity(inputs, options, slack)

@@ -9,6 +9,8 @@ class Status(enum.IntFlag):
     OK = 0
     ROW_OVERFLOW = 1
     NONFINITE = 2
+    BOX_TOO_SMALL = 4
+    OUT_OF_RANGE = 8
 
     @property
     def message(self) -> str:
@@ -21,6 +23,15 @@ _MESSAGES = {
     Status.NONFINITE: (
         "`positions` (or `queries`) hold non-finite coordinates (NaN or infinite): those particles have no neighbors "
         "in this list. Find them with jnp.isfinite(positions).all(axis=1)."
+    ),
+    Status.BOX_TOO_SMALL: (
+        "`box` is degenerate, or too small for the images that were looked at, so that pairs may be missing: a traced box must be "
+        "at least 2.05 (cutoff + skin) wide along every periodic axis, unless jfrnn.Box(..., images=k) says over how many cells "
+        "to either side a pair may reach."
+    ),
+    Status.OUT_OF_RANGE: (
+        "`positions` (or `queries`) lie more than 511 lattice vectors away from a periodic box: those particles have no "
+        "neighbors in this list. Wrap them into the box."
     ),
 }
 

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._exact import Cutoff, make_cutoff, squared_distance
+from jfrnn._box import Box, Images, box_change
+from jfrnn._exact import Cutoff, make_cutoff, squared_distance, widened
 
 
 @jax.tree_util.register_dataclass
@@ -24,11 +25,13 @@ class Verlet:
     Attributes:
         positions: Sources when the list was last made [length], shape [n, d]; inactive ones are NaN.
         queries: Queries then [length], shape [m, d], or None.
+        box: The periodic box then, or None.
         rebuild_count: How often `update` made the list anew, shape [], int32.
     """
 
     positions: Array
     queries: Array | None
+    box: Box | None
     rebuild_count: Array
 
 
@@ -41,12 +44,18 @@ def list_radius(cutoff: float, skin: float, dtype: np.dtype) -> float:
     return float(radius)
 
 
-def moved_too_far(verlet: Verlet, positions: Array, queries: Array | None, skin: float) -> Array:
+def moved_too_far(
+    verlet: Verlet, positions: Array, queries: Array | None, box: Box | None, box_kind: Images | None, skin: float
+) -> Array:
     """Say whether any point is, or may be by rounding, skin/2 or more from where the list was made, [] bool.
 
     One pass over the positions. A point that is not finite has no neighbors: it counts as moved when it becomes so or ceases to be.
+    A box that changed has moved the images of a pair against each other: that much less of the skin is left for the points.
     """
     half = make_cutoff(skin / 2, np.dtype(positions.dtype), closed=False)
+    if box is not None and verlet.box is not None and box_kind is not None:
+        points = positions if queries is None else jnp.concatenate([positions, queries])
+        half = widened(half, box_change(verlet.box, box, points, box_kind, np.dtype(positions.dtype)) / 4)
     moved = _any_beyond(verlet.positions, positions, half)
     return moved if queries is None or verlet.queries is None else moved | _any_beyond(verlet.queries, queries, half)
 
@@ -57,7 +66,7 @@ def _any_beyond(before: Array, now: Array, half_skin: Cutoff) -> Array:
     return jnp.any(there & ~near)
 
 
-def first_verlet(positions: Array, queries: Array | None) -> Verlet:
+def first_verlet(positions: Array, queries: Array | None, box: Box | None) -> Verlet:
     """Return what a list remembers that was just made."""
-    stop = lax.stop_gradient
-    return Verlet(stop(positions), None if queries is None else stop(queries), jnp.int32(0))
+    positions, queries, box = lax.stop_gradient((positions, queries, box))
+    return Verlet(positions, queries, box, jnp.int32(0))

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._box import Lattice, Wrapped, packed_turns
 from jfrnn._exact import Cutoff, make_cutoff
 from jfrnn._runs import Filter
 
@@ -37,6 +38,7 @@ class Variant(NamedTuple):
     own: bool
     closed: bool
     keep: Filter
+    periodic: int = 0  # 1: nearest images, 2: images are told apart
 
 
 class Rows(NamedTuple):
@@ -98,14 +100,41 @@ def missing(platform: str) -> str | None:
     return f"Warp has no engine for the JAX platform {platform!r}"
 
 
-def neighbors(sources: Array, queries: Array | None, cutoff: Cutoff, keep: Filter, capacity: int | None) -> Rows:
+def neighbors(
+    sources: Array,
+    queries: Array | None,
+    cutoff: Cutoff,
+    keep: Filter,
+    capacity: int | None,
+    torus: tuple[Lattice, Wrapped] | None = None,
+) -> Rows:
     """Search among cells with the Warp kernels; capacity=None only counts."""
 
     def on(module: str, make: Callable[[Variant], Any]) -> Callable[..., Rows]:
-        return lambda sources, queries, cutoff: _call(module, make, sources, queries, cutoff, keep, capacity)
+        def call(sources: Array, queries: Array | None, cutoff: Cutoff, torus: tuple[Lattice, Wrapped] | None) -> Rows:
+            return _call(module, make, sources, queries, cutoff, torus, keep, capacity)
+
+        return call
 
     cpu, cuda = on("cells_cpu", _cpu_callable), on("cells_cuda", _cuda_callable)
-    return lax.platform_dependent(sources, queries, cutoff, cpu=cpu, cuda=cuda)
+    return lax.platform_dependent(sources, queries, cutoff, torus, cpu=cpu, cuda=cuda)
+
+
+def _with_turns(points: Array, turns: Array, near: Array) -> Array:
+    """Return rows [n, d + 1] of positions, NaN where they are out of range, and their packed turns as the kernels read them."""
+    packed = packed_turns(turns)
+    last = lax.bitcast_convert_type(packed, jnp.float32) if points.dtype == jnp.float32 else packed.astype(points.dtype)
+    return jnp.concatenate([jnp.where(near[:, None], points, jnp.nan), last[:, None]], axis=1)
+
+
+def _lattice_numbers(lattice: Lattice, wrapped: Wrapped) -> Array:
+    """Return what the kernels know of a lattice, see `jfrnn.kernels._native.LATTICE_NUMBERS`."""
+    more = 3 - lattice.dim
+    square, line = ((0, more), (0, more)), (0, more)
+    images = jnp.asarray(lattice.images.reach).astype(lattice.matrix.dtype)
+    parts = [jnp.pad(lattice.matrix, square), jnp.pad(lattice.transform, square), jnp.pad(lattice.origin, line)]
+    parts += [jnp.pad(wrapped.reach, line, constant_values=1), jnp.pad(images, line), wrapped.slack]
+    return jnp.concatenate([part.reshape(-1) for part in parts])
 
 
 def _call(
@@ -114,6 +143,7 @@ def _call(
     sources: Array,
     queries: Array | None,
     cutoff: Cutoff,
+    torus: tuple[Lattice, Wrapped] | None,
     keep: Filter,
     capacity: int | None,
 ) -> Rows:
@@ -122,13 +152,19 @@ def _call(
     rows = sources if queries is None else queries
     (n, dim), m = sources.shape, rows.shape[0]
     double = sources.dtype == jnp.float64
-    variant = Variant(dim, double, cutoff.scaled, lists, own, cutoff.closed, keep)
+    periodic = 0 if torus is None else 1 if torus[0].images.nearest else 2
+    variant = Variant(dim, double, cutoff.scaled, lists, own, cutoff.closed, keep, periodic)
     words = kernels_of(module).scratch_words(n, m, dim, 2 if double else 1, own)
     dims: dict[str, Any] = {"count": m, "info": 2, "scratch": max(words, 1)}
     if lists:
         dims["idx"] = (m, capacity)
-    radius = jnp.reshape(jnp.asarray(cutoff.radius), 1)
-    *idx, count, info, _ = make(variant)(sources, rows, radius, output_dims=dims)
+    numbers = jnp.reshape(jnp.asarray(cutoff.radius), 1)
+    if torus is not None:
+        lattice, wrapped = torus
+        sources = _with_turns(sources, wrapped.turns, wrapped.near)
+        rows = sources if queries is None else _with_turns(queries, wrapped.query_turns, wrapped.query_near)
+        numbers = jnp.concatenate([numbers, _lattice_numbers(lattice, wrapped)])
+    *idx, count, info, _ = make(variant)(sources, rows, numbers, output_dims=dims)
     return Rows(idx[0] if lists else None, count, info[0], info[1])
 
 
@@ -192,6 +228,7 @@ def _register(
     func = list_rows if variant.lists else count_rows
     func.__annotations__ = {name: types[name] for name in types if variant.lists or name != "idx"}
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
+    flags |= {"nearest": variant.periodic == 1, "images": variant.periodic == 2}
     flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
     func.__name__ = "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
     if radius is not None:
@@ -216,7 +253,7 @@ def _run_cells_on_cuda(variant: Variant, arrays: _Arrays) -> None:
 
 def _run_cells_on_cpu(variant: Variant, arrays: _Arrays) -> None:
     wp = load_warp()
-    kernels = kernels_of("cells_cpu").cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists)
+    kernels = kernels_of("cells_cpu").cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, variant.periodic)
     arrays, sizes, capacity = _launchable(variant, arrays)
     positions, queries, cutoff, idx, _, info, scratch = arrays
     wp.launch(kernels.build, dim=1, inputs=[positions, queries, cutoff, info, scratch, *sizes], device="cpu")
@@ -287,7 +324,7 @@ def hashgrid_neighbors(
     def make(variant: Variant) -> Any:  # noqa: ANN401
         return _hashgrid_callable(variant, radius)
 
-    return _call("hashgrid", make, sources, queries, cutoff, keep, capacity)
+    return _call("hashgrid", make, sources, queries, cutoff, None, keep, capacity)
 
 
 @functools.cache

@@ -14,14 +14,21 @@ CELLS_PER_PARTICLE = 4  # size of the cell table; 16 B per particle
 SMALLEST_TABLE = 4096
 
 
+# What follows the radius in the array `cutoff` where space is periodic, in this order: lattice vectors and transform, row by row
+# (3 x 3 each), origin, half the width of the stencil in units of the transform, images within reach, per axis (3 each); slack.
+LATTICE_NUMBERS = 28
+
+
 def snippet(scalar: str, dim: int, *pieces: str, **constants: int) -> str:
     """Return a block of native code for a scalar type ("float" or "double"), a dimension and named integer constants.
 
-    The function around it must have the argument `cutoff`, an array of one scalar, and what the pieces need.
+    The function around it must have the argument `cutoff`, an array of one scalar, and what the pieces need. PERIODIC is 0 in an
+    open space, 1 where the nearest image is the only one that can be a neighbor, 2 where images are told apart: `cutoff` then goes
+    on with the numbers of the lattice, and a row of positions ends with its packed turns (see `jfrnn._box`).
     """
     lines = [f"using real = {scalar};", f"using whole = {'long long' if scalar == 'double' else 'int'};"]
     lines += [f"constexpr int DIM = {dim};", f"constexpr bool DOUBLE = {int(scalar == 'double')};"]
-    lines += [f"constexpr int {name} = {int(value)};" for name, value in {"ORDER": 0, **constants}.items()]
+    lines += [f"constexpr int {name} = {int(value)};" for name, value in {"ORDER": 0, "PERIODIC": 0, **constants}.items()]
     return "\n".join(["", "{", _NO_CONTRACTION, *lines, _PORTABLE, *pieces, "}", ""])
 
 
@@ -40,11 +47,14 @@ _PORTABLE = r"""
 const real radius = cutoff.data[0];
 #if defined(__CUDA_ARCH__)
 #define JFRNN_FUNCTION static __device__ __forceinline__
+#define JFRNN_MEMBER __device__ __forceinline__
 #define JFRNN_CALL static __device__ __noinline__
 #else
 #define JFRNN_FUNCTION static
+#define JFRNN_MEMBER
 #define JFRNN_CALL static __attribute__((noinline))
 #endif
+constexpr int ROW = DIM + (PERIODIC ? 1 : 0);  // numbers per particle
 struct Bits {  // of floats
     enum { MANTISSA = DOUBLE ? 52 : 23, EXPONENTS = DOUBLE ? 0x7ff : 0xff, BIAS = DOUBLE ? 1023 : 127 };
     JFRNN_FUNCTION unsigned long long of(real x) {
@@ -77,6 +87,67 @@ auto finite_point = [](const real* p) {
     for (int k = 0; k < DIM; ++k)
         finite = finite && Bits::finite(p[k]);
     return finite;
+};
+struct Lattice {
+    const real* numbers;
+    JFRNN_MEMBER real vector(int l, int k) const { return numbers[1 + 3 * l + k]; }
+    JFRNN_MEMBER real transform(int k, int axis) const { return numbers[10 + 3 * k + axis]; }
+    JFRNN_MEMBER real origin(int k) const { return numbers[19 + k]; }
+    JFRNN_MEMBER real reach(int axis) const { return numbers[22 + axis]; }
+    JFRNN_MEMBER int images(int axis) const { return (int)numbers[25 + axis]; }
+    JFRNN_MEMBER real slack() const { return numbers[28]; }
+    JFRNN_MEMBER bool periodic(int axis) const { return images(axis) > 0; }
+    // uncontracted, so that a coordinate is the same wherever it is computed
+#if defined(__CUDA_ARCH__)
+    JFRNN_FUNCTION real add(real a, real b) {
+        if constexpr (DOUBLE) return __dadd_rn(a, b);
+        else return __fadd_rn(a, b);
+    }
+    JFRNN_FUNCTION real mul(real a, real b) {
+        if constexpr (DOUBLE) return __dmul_rn(a, b);
+        else return __fmul_rn(a, b);
+    }
+#else
+    JFRNN_FUNCTION real add(real a, real b) { return a + b; }
+    JFRNN_FUNCTION real mul(real a, real b) { return a * b; }
+#endif
+    // turns of a row: how many lattice vectors lie between the cell and the particle
+    JFRNN_FUNCTION int turn(real last, int axis) {
+        int packed;
+        if constexpr (DOUBLE) packed = (int)last;
+        else memcpy(&packed, &last, 4);
+        return ((packed >> (10 * axis)) & 1023) - 512;
+    }
+    // component k of S·A
+    JFRNN_MEMBER real translation(int sx, int sy, int sz, int k) const {
+        real sum = mul(real(sx), vector(0, k));
+        sum = add(sum, mul(real(sy), vector(1, k)));
+        return DIM == 3 ? add(sum, mul(real(sz), vector(2, k))) : sum;
+    }
+    // a row of positions brought into the cell
+    JFRNN_MEMBER void wrap(const real* row, real* p) const {
+        const int t[3] = {turn(row[DIM], 0), turn(row[DIM], 1), DIM == 3 ? turn(row[DIM], 2) : 0};
+        for (int k = 0; k < DIM; ++k)
+            p[k] = t[0] | t[1] | t[2] ? add(row[k], -translation(t[0], t[1], t[2], k)) : row[k];
+    }
+    // coordinate of a wrapped point along an axis of cells: a fraction where that is periodic, else a length
+    JFRNN_MEMBER real along(int axis, const real* p) const {
+        real sum = mul(add(p[0], -origin(0)), transform(0, axis));
+        for (int k = 1; k < DIM; ++k)
+            sum = add(sum, mul(add(p[k], -origin(k)), transform(k, axis)));
+        if (!periodic(axis))
+            return sum;
+        return sum < 0 ? real(0) : sum > 1 ? real(1) : sum;
+    }
+};
+const Lattice lattice{cutoff.data};
+// the point of a row of positions, wrapped where space is periodic
+auto point_of = [&](const real* row, real* p) {
+    if constexpr (PERIODIC)
+        lattice.wrap(row, p);
+    else
+        for (int k = 0; k < DIM; ++k)
+            p[k] = row[k];
 };
 // the bounding box [low, high] grows to hold the box [l, h]
 auto widen = [](real* low, real* high, const real* l, const real* h) {
@@ -141,8 +212,8 @@ struct Exact {
         return s;
     }
 
-    // sign of |b - a|^2 - r^2 by error-free transformations (Ogita, Rump & Oishi 2005, doi:10.1137/030601818); 2: not proven
-    JFRNN_FUNCTION int sum_sign(const real* a, const real* b, real radius) {
+    // sign of |b + S·A - a|^2 - r^2 by error-free transformations (Ogita, Rump & Oishi 2005, doi:10.1137/030601818); 2: not proven
+    JFRNN_FUNCTION int sum_sign(const real* a, const real* b, real radius, const int* shift, Lattice lattice) {
         constexpr int TERMS = 3 * DIM + 2;
         double term[TERMS];
         double slack = 0;
@@ -161,6 +232,24 @@ struct Exact {
                 plain = plain && (ak == 0 || !(size_of(ak) < smallest)) && (bk == 0 || !(size_of(bk) < smallest));
             double low;
             double high = two_sum(bk, -ak, low);
+            if constexpr (PERIODIC) {
+                double rest = 0;
+                for (int l = 0; l < DIM; ++l) {
+                    const double v = double(lattice.vector(l, k)), s = double(shift[l]);
+                    if constexpr (DOUBLE)
+                        plain = plain && (v == 0 || !(size_of(v) < smallest));
+                    const double p = mul(s, v);
+                    double carried, one, other;
+                    high = two_sum(high, p, carried);
+                    low = two_sum(low, carried, one);
+                    low = two_sum(low, product_error(s, v, p), other);
+                    high = two_sum(high, low, carried);
+                    low = carried;
+                    rest = add(rest, add(size_of(one), size_of(other)));
+                }
+                rest = mul(rest, scale);
+                slack = add(slack, mul(2, mul(rest, add(mul(2, size_of(mul(high, scale))), rest))));
+            }
             high = mul(high, scale);
             low = mul(low, scale);
             plain = plain && size_of(high) < 1e6;  // beyond, two_sum may have overflowed
@@ -239,6 +328,81 @@ struct Exact {
         return carry < 0 ? -1 : (seen | carry) != 0;
     }
 
+    // the same with a lattice: the difference may fill all limbs
+    JFRNN_CALL int integer_sign_of_image(const real* a, const real* b, real radius, const int* shift, Lattice lattice) {
+        constexpr int LIMBS = DOUBLE ? 4 : 2, ALL = DOUBLE ? 92 : 15;
+        long long total[2 * ALL], part[ALL];
+        for (int t = 0; t < 2 * ALL; ++t)
+            total[t] = 0;
+        auto put = [&](real x, long long times) {
+            const int first = first_limb(x);
+            for (int s = 0; s < LIMBS; ++s)
+                part[first + s] += times * limb(x, first + s);
+        };
+        for (int k = 0; k < DIM; ++k) {
+            for (int i = 0; i < ALL; ++i)
+                part[i] = 0;
+            put(b[k], 1);
+            put(a[k], -1);
+            for (int l = 0; l < DIM; ++l)
+                put(lattice.vector(l, k), shift[l]);
+            int lowest = ALL, highest = 0;
+            for (int i = 0; i < ALL; ++i) {  // carry into [-2^23, 2^23)
+                if (i + 1 < ALL) {
+                    const long long carry = (part[i] + (1 << 23)) >> 24;
+                    part[i] -= carry << 24;
+                    part[i + 1] += carry;
+                }
+                if (part[i]) {
+                    lowest = i < lowest ? i : lowest;
+                    highest = i;
+                }
+            }
+            for (int i = lowest; i <= highest; ++i)
+                for (int j = lowest; j <= highest; ++j)
+                    total[i + j] += part[i] * part[j];
+        }
+        const int first = first_limb(radius);
+        for (int i = first; i < first + LIMBS; ++i)
+            for (int j = first; j < first + LIMBS; ++j)
+                total[i + j] -= limb(radius, i) * limb(radius, j);
+        long long carry = 0, seen = 0;
+        for (int t = 0; t < 2 * ALL; ++t) {
+            const long long sum = total[t] + carry;
+            seen |= sum & 0xffffff;
+            carry = sum >> 24;
+        }
+        return carry < 0 ? -1 : (seen | carry) != 0;
+    }
+
+    // does b + S·A lie within the cutoff of a? S are the whole numbers that the turns of both and the image add up to
+    JFRNN_CALL bool image_pair(const real* a, const real* b, real radius, bool closed, const int* shift, Lattice lattice) {
+        if constexpr (!DOUBLE) {
+            double square = 0, doubt = 0;
+            const double r2 = double(radius) * double(radius);
+            for (int k = 0; k < DIM; ++k) {
+                double d = double(b[k]) - double(a[k]), size = size_of(double(a[k])) + size_of(double(b[k]));
+                for (int l = 0; l < DIM; ++l) {
+                    const double p = double(shift[l]) * double(lattice.vector(l, k));
+                    d += p;
+                    size += size_of(p);
+                }
+                const double e = size * 0x1p-50;
+                square += d * d;
+                doubt += e * (2 * size_of(d) + e);
+            }
+            doubt = 2 * doubt + 0x1p-49 * (r2 + square);
+            if (square + doubt < r2)
+                return true;
+            if (square - doubt > r2)
+                return false;
+        }
+        int sign = sum_sign(a, b, radius, shift, lattice);
+        if (sign == 2)
+            sign = integer_sign_of_image(a, b, radius, shift, lattice);
+        return sign < 0 || (sign == 0 && closed);
+    }
+
     // the bounds of float32 pairs in float64: at most 5 of 16 units of 2^-53 are lost in a sum of squares
     JFRNN_FUNCTION double doubly_inside(real radius) { return double(radius) * double(radius) * (1 - 0x1p-49); }
     JFRNN_FUNCTION double doubly_outside(real radius) { return double(radius) * double(radius) * (1 + 0x1p-49); }
@@ -257,11 +421,21 @@ struct Exact {
             if (square > doubly_outside(radius))
                 return false;
         }
-        int sign = sum_sign(a, b, radius);
+        int sign = sum_sign(a, b, radius, nullptr, Lattice{});
         if (sign == 2)
             sign = integer_sign(ax, ay, az, bx, by, bz, radius);
         return sign < 0 || (sign == 0 && closed);
     }
+};
+// the image of a source that a query meets: rows of positions as they were given, and the code of the image of wrapped points
+auto exact_image = [&](const real* query, const real* source, int image) {
+    int shift[3] = {0, 0, 0};
+    for (int axis = DIM - 1; axis >= 0; --axis) {
+        const int k = lattice.images(axis), codes = 2 * k + 1;
+        shift[axis] = image % codes - k + Lattice::turn(query[DIM], axis) - Lattice::turn(source[DIM], axis);
+        image /= codes;
+    }
+    return Exact::image_pair(query, source, radius, closed, shift, lattice);
 };
 auto exact_pair = [&](const real* a, const real* b) {
     return Exact::pair(a[0], a[1], DIM == 3 ? a[DIM - 1] : 0, b[0], b[1], DIM == 3 ? b[DIM - 1] : 0, radius, closed);
@@ -270,13 +444,31 @@ auto exact_pair = [&](const real* a, const real* b) {
 
 # Which cell a coordinate is in: REACH cells fit into a cutoff along y and z, REACH_X along x. Needs `radius`.
 CELLS = r"""
-const real inverse_edge[3] = {real(REACH_X) / radius, real(REACH) / radius, real(REACH) / radius};
+auto cells_per_length = [&](int axis) -> real {  // along a periodic axis: a whole number per period
+    const real cells = real(axis == 0 ? REACH_X : REACH);
+    if constexpr (!PERIODIC)
+        return cells / radius;
+    const real count = cells / lattice.reach(axis);
+    constexpr real MOST = real(1 << 22);
+    return !lattice.periodic(axis) ? count : count < 1 ? real(1) : count < MOST ? real((int)count) : MOST;
+};
+const real inverse_edge[3] = {cells_per_length(0), cells_per_length(1), DIM == 3 ? cells_per_length(2) : real(1)};
+// how far a neighbor may be along an axis, and where a point is along it
+auto reach_along = [&](int axis) -> real { return PERIODIC ? lattice.reach(axis) : radius; };
+auto coordinate = [&](int axis, const real* p) -> real {
+    if constexpr (PERIODIC)
+        return lattice.along(axis, p);
+    else
+        return p[axis];
+};
+auto is_periodic = [&](int axis) -> bool { return PERIODIC && lattice.periodic(axis); };
 auto cell_of = [&](int axis, real x) -> real {  // a whole float, monotone in x
 #if defined(__CUDA_ARCH__)
+    const real scale = axis == 0 ? inverse_edge[0] : !PERIODIC || axis == 1 ? inverse_edge[1] : inverse_edge[2];
     if constexpr (DOUBLE)
-        return floor(__dmul_rn(x, axis == 0 ? inverse_edge[0] : inverse_edge[1]));
+        return floor(__dmul_rn(x, scale));
     else
-        return floorf(__fmul_rn(x, axis == 0 ? inverse_edge[0] : inverse_edge[1]));
+        return floorf(__fmul_rn(x, scale));
 #else
     return DOUBLE ? real(__builtin_floor(x * inverse_edge[axis])) : real(__builtin_floorf(x * inverse_edge[axis]));
 #endif
@@ -311,10 +503,19 @@ auto row_hash = [](long long y, long long z, int cells) -> int {
 // cell along one axis as an integer: dense boxes count from the lowest cell, and everything outside is clamped to one cell beyond
 auto axis_cell = [&](const Grid& grid, int k, real x) -> whole {
     const real cell = cell_of(k, x);
+    if (is_periodic(k)) {  // from 0 on, whatever the box
+        const real most = inverse_edge[k] - 1;
+        return cell < 0 ? 0 : cell < most ? (whole)cell : (whole)most;
+    }
     if (!grid.dense)
         return cell_number(cell);
     const real from_low = cell - grid.low[k];
     return from_low < 0 ? -1 : from_low < real(grid.extent[k]) ? (whole)from_low : (whole)grid.extent[k];
+};
+// cells of a periodic axis are numbered on beyond its ends: in which period a cell lies
+auto period_of = [&](int axis, whole cell) -> int {
+    const whole cells = (whole)inverse_edge[axis];
+    return (int)(cell >= 0 ? cell / cells : -1 - (-1 - cell) / cells);
 };
 auto row_start = [&](const Grid& grid, whole y, whole z) -> int {
     return grid.dense ? (int)((z * grid.extent[1] + y) * grid.extent[0]) : row_hash(y, z, grid.cells);
@@ -357,7 +558,7 @@ auto curve = [](const Grid& grid, unsigned int x, unsigned int y, unsigned int z
 auto cell_key = [&](const Grid& grid, const real* p) -> int {  // a finite point; one outside a dense box is sorted into its border
     whole cell[3] = {0, 0, 0};
     for (int k = 0; k < DIM; ++k) {
-        const whole c = axis_cell(grid, k, p[k]), end = grid.extent[k] - 1;
+        const whole c = axis_cell(grid, k, coordinate(k, p)), end = grid.extent[k] - 1;
         cell[k] = !grid.dense ? c : c < 0 ? 0 : c > end ? end : c;
     }
     if (ORDER != 0)
@@ -365,12 +566,12 @@ auto cell_key = [&](const Grid& grid, const real* p) -> int {  // a finite point
     const int row = row_start(grid, cell[1], cell[2]);
     return grid.dense ? row + (int)cell[0] : ring(row + ring(cell[0], grid.cells), grid.cells);
 };
-// number of cells of a box of doubles [low, high] of cells, and whether the table holds them
+// number of cells of the box [low, high] of coordinates, and whether the table holds them
 auto lay_out = [&](Grid& grid, const real* low, const real* high, int table) {
     double cells = 1;
     for (int k = 0; k < DIM; ++k) {
-        grid.low[k] = cell_of(k, low[k]);
-        const double extent = double(cell_of(k, high[k])) - double(grid.low[k]) + 1;
+        grid.low[k] = is_periodic(k) ? real(0) : cell_of(k, low[k]);
+        const double extent = is_periodic(k) ? double(inverse_edge[k]) : double(cell_of(k, high[k])) - double(grid.low[k]) + 1;
         cells = extent <= table ? cells * extent : 2.0 * table;
         grid.extent[k] = extent <= table ? (int)extent : 1;
     }

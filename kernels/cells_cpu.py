@@ -53,11 +53,14 @@ for (int k = 0; k < DIM; ++k) {
 }
 int finite = 0;
 for (int i = 0; i < n; ++i) {
-    const real* p = positions.data + (long long)DIM * i;
+    real p[3], at[3];
+    point_of(positions.data + (long long)ROW * i, p);
     if (!finite_point(p))
         continue;
     ++finite;
-    widen(low, high, p, p);
+    for (int k = 0; k < DIM; ++k)
+        at[k] = coordinate(k, p);
+    widen(low, high, at, at);
 }
 if (finite == 0)
     for (int k = 0; k < DIM; ++k)
@@ -75,7 +78,8 @@ auto sort = [&](const real* points, int count, int* first, int* order, bool with
         first[c] = 0;
     int outside = 0;
     for (int i = 0; i < count; ++i) {
-        const real* p = points + (long long)DIM * i;
+        real p[3];
+        point_of(points + (long long)ROW * i, p);
         int cell = -1;
         if (finite_point(p))
             cell = cell_key(grid, p);
@@ -91,9 +95,12 @@ auto sort = [&](const real* points, int count, int* first, int* order, bool with
     for (int i = 0; i < count; ++i) {
         const int place = key[i] >= 0 ? first[key[i] + 1]++ : behind++;
         order[place] = i;
-        if (with_axes)
+        if (with_axes) {
+            real p[3];
+            point_of(points + (long long)ROW * i, p);
             for (int k = 0; k < DIM; ++k)
-                axis[k][place] = points[(long long)DIM * i + k];
+                axis[k][place] = p[k];
+        }
     }
     return count - outside;
 };
@@ -123,6 +130,9 @@ alignas(64) int row[CANDIDATES + LANES];
 alignas(64) real doubtful[3][CANDIDATES + LANES];
 alignas(64) unsigned short unsure[CANDIDATES / LANES + 4];  // one bit per candidate that step 1 leaves open
 alignas(64) int doubtful_ids[CANDIDATES + LANES];
+alignas(64) int candidate_images[PERIODIC ? CANDIDATES + LANES : 1];  // their codes
+alignas(64) int doubtful_images[PERIODIC ? CANDIDATES + LANES : 1];
+alignas(64) int candidate_order[PERIODIC == 2 ? CANDIDATES + LANES : 1];  // by source, then by image: behind, at home, ahead
 const Grid grid = shared.grid;
 const int places = m, finite_places = shared.finite_queries;
 int longest = 0;
@@ -147,8 +157,9 @@ auto mask_of = [](vec a, real bound, auto comparison) -> unsigned int {  // one 
 #endif
 };
 auto later_mask = [&](int b, int own_id) -> unsigned int {  // candidates whose id is above the query's, or its own id
-    const ints ids = *(const ints*)(candidate_ids + b);
-    const flags f = __builtin_convertvector(ids >= own_id + drop_self, flags);
+    const ints ids = *(const ints*)((PERIODIC == 2 ? candidate_order : candidate_ids) + b);
+    const int first = PERIODIC == 2 ? 3 * own_id + 1 + drop_self : own_id + drop_self;
+    const flags f = __builtin_convertvector(ids >= first, flags);
     unsigned short bits = 0;
     __builtin_memcpy(&bits, &f, LANES == 16 ? 2 : 1);
     return bits;
@@ -188,7 +199,9 @@ auto pack = [&](const auto* from, auto* to, unsigned int mask) {
         *to++ = from[__builtin_ctz(mask)];
 #endif
 };
-const real inside = step_radius * step_radius * (1 - 8 * step_eps), outside = step_radius * step_radius * (1 + 8 * step_eps);
+const real off = PERIODIC ? 2 * lattice.slack() * step_scale : real(0);  // by which distances of images may be wrong
+const real inner = step_radius > off ? step_radius - off : real(0), outer = step_radius + off;
+const real band = 8 * (1 + PERIODIC) * step_eps, inside = inner * inner * (1 - band), outside = outer * outer * (1 + band);
 const double doubly_inside = Exact::doubly_inside(radius), doubly_outside = Exact::doubly_outside(radius);
 typedef float floats __attribute__((vector_size(32)));
 typedef double doubles __attribute__((vector_size(64)));
@@ -227,15 +240,18 @@ auto scan = [&](const real* q, int own_id, int count, auto only_later) -> int {
             const int e = __builtin_ctzll(four) / 16, b = (v + e) * LANES;
             const unsigned int mask = (four >> (16 * e)) & 0xffff;
             four &= ~(0xffffull << (16 * e));
-            for (int k = 0; k < DIM; ++k)
-                pack(candidate[k] + b, doubtful[k] + doubts, mask);
+            if constexpr (PERIODIC)
+                pack(candidate_images + b, doubtful_images + doubts, mask);
+            else
+                for (int k = 0; k < DIM; ++k)
+                    pack(candidate[k] + b, doubtful[k] + doubts, mask);
             pack(candidate_ids + b, doubtful_ids + doubts, mask);
             doubts += __builtin_popcount(mask);
         }
     }
     for (int b = 0; b < doubts; b += 8) {
         unsigned int left = doubts - b < 8 ? (1u << (doubts - b)) - 1 : 255;
-        if constexpr (!DOUBLE) {  // in twice the precision, eight at a time
+        if constexpr (!DOUBLE && !PERIODIC) {  // in twice the precision, eight at a time
             doubles square;
             for (int k = 0; k < DIM; ++k) {
                 const doubles d = __builtin_convertvector(*(const floats*)(doubtful[k] + b), doubles) - (double)q[k];
@@ -248,6 +264,13 @@ auto scan = [&](const real* q, int own_id, int count, auto only_later) -> int {
         }
         for (; left; left &= left - 1) {
             const int c = b + __builtin_ctz(left);
+            if constexpr (PERIODIC) {
+                const int id = doubtful_ids[c];
+                const real* source = positions.data + (long long)ROW * (PERIODIC == 2 ? id % n : id);
+                if (exact_image(queries.data + (long long)ROW * own_id, source, doubtful_images[c]))
+                    row[hits++] = id;
+                continue;
+            }
             real p[3];
             for (int k = 0; k < DIM; ++k)
                 p[k] = doubtful[k][c];
@@ -260,48 +283,60 @@ auto scan = [&](const real* q, int own_id, int count, auto only_later) -> int {
 struct All { enum { value = 0 }; };
 struct Later { enum { value = 1 }; };
 
+int codes = 1;  // of images
+for (int k = 0; PERIODIC == 2 && k < DIM; ++k)
+    codes *= 2 * lattice.images(k) + 1;
+const int fill_value = n * codes;
 // writes slots [from, until) of a row, from `row` while it lasts, then the fill value
 auto write_row = [&](int id, int from, int hits, bool last) {
     int* out = idx.data + (long long)id * capacity;
     const int stop = from + hits < capacity ? from + hits : capacity;
     if (from == 0 && last && (capacity & 7) == 0 && ((unsigned long long)idx.data & 31) == 0) {
-        const eight_ints fill = eight_ints{} + n;
+        const eight_ints filled_up = eight_ints{} + fill_value;
         int s = 0;
         for (; s + 8 <= stop; s += 8)
             __builtin_nontemporal_store(*(const eight_ints*)(row + s), (eight_ints*)(out + s));
         if (s < stop) {
             eight_ints mixed = *(const eight_ints*)(row + s);
             for (int e = 0; e < 8; ++e)
-                mixed[e] = s + e < stop ? mixed[e] : n;
+                mixed[e] = s + e < stop ? mixed[e] : fill_value;
             __builtin_nontemporal_store(mixed, (eight_ints*)(out + s));
             s += 8;
         }
         for (; s < capacity; s += 8)
-            __builtin_nontemporal_store(fill, (eight_ints*)(out + s));
+            __builtin_nontemporal_store(filled_up, (eight_ints*)(out + s));
         return;
     }
     for (int s = from; s < stop; ++s)
         out[s] = row[s - from];
     if (last)
         for (int s = stop; s < capacity; ++s)
-            out[s] = n;
+            out[s] = fill_value;
 };
 
 auto position_of = [&](int place, real* q) {
-    for (int k = 0; k < DIM; ++k)
-        q[k] = own ? axis[k][place] : queries.data[(long long)DIM * query_ids[place] + k];
+    if (own)
+        for (int k = 0; k < DIM; ++k)
+            q[k] = axis[k][place];
+    else
+        point_of(queries.data + (long long)ROW * query_ids[place], q);
 };
 auto cells_of = [&](const real* q, whole* c) {
     for (int k = 0; k < DIM; ++k)
-        c[k] = axis_cell(grid, k, q[k]);
+        c[k] = axis_cell(grid, k, coordinate(k, q));
 };
 
-// all queries of one cell: places [begin, end), whose bounding box is [low, high]
+// all queries of one cell: places [begin, end), whose coordinates are between low and high
 auto serve = [&](int begin, int end, const real* low, const real* high) {
     whole first[3] = {0, 0, 0}, last[3] = {0, 0, 0};
     for (int k = 0; k < DIM; ++k) {
-        first[k] = axis_cell(grid, k, low[k] - radius);
-        last[k] = axis_cell(grid, k, high[k] + radius);
+        if (is_periodic(k)) {
+            first[k] = (whole)cell_of(k, low[k] - reach_along(k));
+            last[k] = (whole)cell_of(k, high[k] + reach_along(k));
+            continue;
+        }
+        first[k] = axis_cell(grid, k, low[k] - reach_along(k));
+        last[k] = axis_cell(grid, k, high[k] + reach_along(k));
         if (grid.dense) {
             first[k] = first[k] < 0 ? 0 : first[k];
             last[k] = last[k] >= grid.extent[k] ? grid.extent[k] - 1 : last[k];
@@ -332,6 +367,8 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
         fresh = false;
         filled = own_from = own_to = 0;
     };
+    int image = 0, side = 0;  // its code, and whether it lies behind (-1), at home, or ahead
+    real moved[3] = {0, 0, 0};
     auto copy = [&](int from, int to) {  // sources at places [from, to)
         while (from < to) {
             if (filled == CANDIDATES)
@@ -339,11 +376,15 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
             const int room = CANDIDATES - filled, size = to - from < room ? to - from : room;
             for (int k = 0; k < DIM; ++k)
                 for (int s = 0; s < size; ++s)
-                    candidate[k][filled + s] = axis[k][from + s];
+                    candidate[k][filled + s] = PERIODIC ? axis[k][from + s] + moved[k] : axis[k][from + s];
             for (int s = 0; s < size; ++s)
-                candidate_ids[filled + s] = ids[from + s];
+                candidate_ids[filled + s] = PERIODIC == 2 ? ids[from + s] + n * image : ids[from + s];
+            for (int s = 0; PERIODIC && s < size; ++s)
+                candidate_images[filled + s] = image;
+            for (int s = 0; PERIODIC == 2 && s < size; ++s)
+                candidate_order[filled + s] = 3 * ids[from + s] + 1 + side;
             const int low_place = from > begin ? from : begin, high_place = from + size < end ? from + size : end;
-            if (own && low_place < high_place) {
+            if (own && side == 0 && low_place < high_place) {
                 own_from = low_place;
                 own_to = high_place;
                 own_at = filled + low_place - from;
@@ -352,35 +393,67 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
             from += size;
         }
     };
-    const int length = (int)(last[0] - first[0] + 1);
-    int seen[ROWS], rows = 0;
-    for (whole z = first[2]; z <= last[2] && length > 0; ++z)
-        for (whole y = first[1]; y <= last[1]; ++y) {
-            if (grid.dense) {
-                const int row = row_start(grid, y, z);
-                copy(start[row + first[0]], start[row + last[0] + 1]);
-                continue;
+    auto walk = [&](const whole* first, const whole* last) {  // all rows of cells of one image
+        const int length = (int)(last[0] - first[0] + 1);
+        int seen[ROWS], rows = 0;
+        for (whole z = first[2]; z <= last[2] && length > 0; ++z)
+            for (whole y = first[1]; y <= last[1]; ++y) {
+                if (grid.dense) {
+                    const int row = row_start(grid, y, z);
+                    copy(start[row + first[0]], start[row + last[0] + 1]);
+                    continue;
+                }
+                const int begins = ring(row_start(grid, y, z) + ring(first[0], grid.cells), grid.cells);
+                int front = 0, back = 0;  // entries shared with rows that were copied before
+                for (int r = 0; r < rows; ++r) {
+                    const int behind = ring(begins - seen[r], grid.cells), ahead = grid.cells - behind;
+                    if (behind < length)
+                        front = length - behind > front ? length - behind : front;
+                    else if (ahead < length)
+                        back = length - ahead > back ? length - ahead : back;
+                }
+                seen[rows++] = begins;
+                const int size = length - front - back, from = ring(begins + front, grid.cells);
+                if (size <= 0)
+                    continue;
+                if (from + size <= grid.cells)
+                    copy(start[from], start[from + size]);
+                else {
+                    copy(start[from], start[grid.cells]);
+                    copy(start[0], start[from + size - grid.cells]);
+                }
             }
-            const int begins = ring(row_start(grid, y, z) + ring(first[0], grid.cells), grid.cells);
-            int front = 0, back = 0;  // entries shared with rows that were copied before
-            for (int r = 0; r < rows; ++r) {
-                const int behind = ring(begins - seen[r], grid.cells), ahead = grid.cells - behind;
-                if (behind < length)
-                    front = length - behind > front ? length - behind : front;
-                else if (ahead < length)
-                    back = length - ahead > back ? length - ahead : back;
+    };
+    if constexpr (PERIODIC) {
+        int from[3] = {0, 0, 0}, to[3] = {0, 0, 0};
+        for (int k = 0; k < DIM; ++k)
+            if (is_periodic(k)) {
+                from[k] = period_of(k, first[k]);
+                to[k] = period_of(k, last[k]);
             }
-            seen[rows++] = begins;
-            const int size = length - front - back, from = ring(begins + front, grid.cells);
-            if (size <= 0)
-                continue;
-            if (from + size <= grid.cells)
-                copy(start[from], start[from + size]);
-            else {
-                copy(start[from], start[grid.cells]);
-                copy(start[0], start[from + size - grid.cells]);
-            }
-        }
+        for (int x = from[0]; x <= to[0]; ++x)
+            for (int y = from[1]; y <= to[1]; ++y)
+                for (int z = from[2]; z <= to[2]; ++z) {
+                    const int shift[3] = {x, y, z};
+                    whole begins[3] = {0, 0, 0}, ends[3] = {0, 0, 0};
+                    image = 0;
+                    for (int k = 0; k < DIM; ++k) {
+                        const whole cells = (whole)inverse_edge[k], skipped = is_periodic(k) ? shift[k] * cells : 0;
+                        begins[k] = first[k] - skipped;
+                        ends[k] = last[k] - skipped;
+                        if (is_periodic(k)) {
+                            begins[k] = begins[k] < 0 ? 0 : begins[k];
+                            ends[k] = ends[k] < cells ? ends[k] : cells - 1;
+                        }
+                        moved[k] = lattice.translation(x, y, z, k);
+                        image = image * (2 * lattice.images(k) + 1) + shift[k] + lattice.images(k);
+                    }
+                    const int lead = x ? x : y ? y : z;
+                    side = (lead > 0) - (lead < 0);
+                    walk(begins, ends);
+                }
+    } else
+        walk(first, last);
     flush(true);
 };
 
@@ -420,14 +493,17 @@ for (;;) {
         position_of(place, q);
         cells_of(q, cell);
         for (int k = 0; k < DIM; ++k)
-            low[k] = high[k] = q[k];
+            low[k] = high[k] = coordinate(k, q);
         int end = place + 1;
         for (; end < finite_places; ++end) {
             position_of(end, q);
             cells_of(q, other);
             if (!same_cell(cell, other))
                 break;
-            widen(low, high, q, q);
+            real at[3];
+            for (int k = 0; k < DIM; ++k)
+                at[k] = coordinate(k, q);
+            widen(low, high, at, at);
         }
         serve(place, end, low, high);
         place = end;
@@ -449,14 +525,17 @@ class Kernels(NamedTuple):
 
 
 @functools.cache
-def cell_kernels(dim: int, double: bool, scaled: bool, lists: bool, exact: bool = True) -> Kernels:
+def cell_kernels(dim: int, double: bool, scaled: bool, lists: bool, periodic: int = 0, exact: bool = True) -> Kernels:
     """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts alone.
+
+    `periodic` is that of `jfrnn.kernels._native.snippet`.
 
     With exact=False the working precision alone decides (`|d|^2 < r^2 (1 - 8 eps)`): only to measure what exactness costs.
     """
     scalar = wp.float64 if double else wp.float32
-    variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}{'' if exact else '_inexact'}"
-    options = {"SCALED": scaled, "LIST": lists, "REACH": 1, "REACH_X": 1, "EXACTLY": exact}
+    variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}"
+    variant += f"{('', '_nearest', '_images')[periodic]}{'' if exact else '_inexact'}"
+    options = {"SCALED": scaled, "LIST": lists, "REACH": 1, "REACH_X": 1, "EXACTLY": exact, "PERIODIC": periodic}
     points = wp.array2d(dtype=scalar)
     reals, ints, rows = wp.array(dtype=scalar), wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
 

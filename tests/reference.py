@@ -1,13 +1,13 @@
 """The oracle: which pairs lie within the cutoff, decided by integers and fractions alone.
 
-Every finite float is a whole number times a power of two. So positions and cutoff, multiplied by one common power of
-two, are integers, which Python adds, multiplies and compares without ever rounding. No float and no NumPy integer takes
-part in a decision.
+Every finite float is a whole number times a power of two. So positions, cutoff and lattice vectors, multiplied by one
+common power of two, are integers, which Python adds, multiplies and compares without ever rounding. No float and no
+NumPy integer takes part in a decision.
 """
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 from itertools import product
 from typing import Any
@@ -15,6 +15,9 @@ from typing import Any
 import numpy as np
 
 Pair = tuple[int, int]
+Image = tuple[int, int, tuple[int, ...]]
+"""Query i, source j, and the shift S: whole numbers of lattice vectors that the source is moved by."""
+Vector = Sequence[int]
 
 
 def is_pair(a: Any, b: Any, cutoff: float, *, closed: bool = False) -> bool:
@@ -55,16 +58,69 @@ def reference_pairs(
     and Python's // is exactly that. On every axis a pair has |X_j - X_i| <= R, so X_i/R - 1 <= X_j/R <= X_i/R + 1.
     Floor is monotone and floor(t + 1) = floor(t) + 1, so the cells of a pair differ by at most one on every axis.
     """
-    sources = _points(positions)
-    if queries is not None and (half or include_self):
-        raise ValueError("half and include_self are about positions among themselves: leave them out with queries")
-    asking = sources if queries is None else _points(queries)
-    if asking.shape[1] != sources.shape[1]:
-        raise ValueError(f"queries have {asking.shape[1]} coordinates, positions {sources.shape[1]}: give the same")
+    sources, asking = _clouds(positions, queries, half or include_self)
     found = _within(_rounded(cutoff, sources.dtype), asking, sources, closed)
     if queries is None:
         found = ((i, j) for i, j in found if i < j or (i == j and include_self) or (i > j and not half))
     return set(found)
+
+
+def reference_images(
+    positions: Any,
+    cutoff: float,
+    *,
+    matrix: Any,
+    periodic: Sequence[bool],
+    queries: Any = None,
+    half: bool = False,
+    include_self: bool = False,
+    closed: bool = False,
+) -> set[Image]:
+    """Return every (query i, source j, shift S) with |x_j - x_i + sum_k S_k A_k| < cutoff (closed: <=), exactly.
+
+    The lattice vectors A_k are the rows of `matrix` [d, d], or the axes times `matrix` [d]; cutoff and matrix are
+    rounded once to the dtype of positions. S holds d integers, 0 on every axis k that is not `periodic`, whose row is
+    not looked at. S counts from the positions as given: nothing is wrapped.
+
+    Without `queries` each position asks for all of them: (i, i, 0) is left out unless `include_self`, every other image
+    of a particle is a neighbor of it like any other. `half` keeps j > i with every S, and of (i, i, S) the S whose first
+    non-zero component is positive. With `queries` nothing is left out, and `half` and `include_self` are refused. A
+    point that is not finite is in no pair.
+
+    Cost: all queries times all sources; 300 points in a box six cutoffs wide take a sixth of a second.
+
+    Why nothing is missed: let b_1 ... b_p be the periodic rows and w_k a vector orthogonal to b_1 ... b_(k-1), with
+    b_k w_k > 0, which Gram-Schmidt makes of b_k in integers if the rows are independent. Along w_k, a pair's vector
+    v = x_j - x_i + sum_l S_l b_l has the component v w_k, to which no S_l with l < k contributes, and by Cauchy and
+    Schwarz |v w_k| <= R |w_k|. So once S_p ... S_(k+1) are chosen, all S_k worth a look lie in one interval of integers:
+    with u = x_j - x_i + sum_(l > k) S_l b_l, |u w_k + S_k b_k w_k| <= floor(sqrt(R² w_k w_k)), an integer on either side.
+    """
+    sources, asking = _clouds(positions, queries, half or include_self)
+    dim = sources.shape[1]
+    if len(periodic) != dim or not all(isinstance(axis, bool | np.bool_) for axis in periodic):
+        raise ValueError(f"periodic must be one bool for each of {dim} axes: got {periodic}")
+    axes = [k for k in range(dim) if periodic[k]]
+    rows = _rows(matrix, sources.dtype, dim)[axes]
+    edge, (vectors, ends, starts) = _integers(_rounded(cutoff, sources.dtype), rows, sources, asking)
+    if len(vectors) < len(axes):
+        raise ValueError(f"periodic rows of the matrix must be finite: got {rows.tolist()}")
+    levels = _levels(list(vectors.values()), edge)
+    limit = edge**2 if closed else edge**2 - 1  # of integers: d2 < r2 is d2 <= r2 - 1
+    zero = (0,) * dim
+    found = set()
+    for (i, (x, y, z)), (j, (u, v, w)) in product(starts.items(), ends.items()):
+        for steps in _shifts((u - x, v - y, w - z), levels, limit):
+            shift = zero
+            if any(steps):
+                moved = dict(zip(axes, steps, strict=True))
+                shift = tuple(moved.get(k, 0) for k in range(dim))
+            if queries is None:
+                if i == j and shift == zero and not include_self:
+                    continue
+                if half and (j < i or (j == i and shift < zero)):
+                    continue
+            found.add((i, j, shift))
+    return found
 
 
 def compare(found: Any, expected: Iterable[Pair]) -> tuple[set[Pair], set[Pair]]:
@@ -111,6 +167,17 @@ def _refuse_repeats(pairs: list[Pair]) -> None:
     raise AssertionError(f"found more than once: {repeated[:5]} ({len(repeated)} such pairs)")
 
 
+def _clouds(positions: Any, queries: Any, about_self: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sources and the points that ask for them."""
+    sources = _points(positions)
+    if queries is not None and about_self:
+        raise ValueError("half and include_self are about positions among themselves: leave them out with queries")
+    asking = sources if queries is None else _points(queries)
+    if asking.shape[1] != sources.shape[1]:
+        raise ValueError(f"queries have {asking.shape[1]} coordinates, positions {sources.shape[1]}: give the same")
+    return sources, asking
+
+
 def _points(values: Any) -> np.ndarray:
     points = np.asarray(values)
     if points.dtype not in (np.float32, np.float64):
@@ -128,20 +195,37 @@ def _rounded(cutoff: float, dtype: np.dtype) -> float:
     return radius
 
 
+def _rows(matrix: Any, dtype: np.dtype, dim: int) -> np.ndarray:
+    rows = np.asarray(matrix)
+    if rows.shape not in ((dim,), (dim, dim)):
+        raise ValueError(f"matrix must have shape [{dim}] or [{dim}, {dim}]: got {rows.shape}")
+    rows = rows.astype(dtype)
+    if rows.ndim == 2:
+        return rows
+    square = np.zeros((dim, dim), dtype)
+    np.fill_diagonal(square, rows)
+    return square
+
+
 def _ratios(points: np.ndarray) -> dict[int, list[tuple[int, int]]]:
     """Return numerator and denominator of every coordinate of the finite points; missing axes become zeros."""
     rows = enumerate(points.tolist())
     return {i: [x.as_integer_ratio() for x in row] + [(0, 1)] * (3 - len(row)) for i, row in rows if all(map(math.isfinite, row))}
 
 
+def _integers(cutoff: float, *clouds: np.ndarray) -> tuple[int, list[dict[int, list[int]]]]:
+    """Return the cutoff and the finite points of every cloud, multiplied by one power of two that makes all integers."""
+    top, bottom = cutoff.as_integer_ratio()
+    ratios = [_ratios(cloud) for cloud in clouds]
+    # all denominators are powers of two, so the largest is a multiple of each
+    scale = max([bottom, *(q for cloud in ratios for point in cloud.values() for _, q in point)])
+    scaled = [{i: [p * (scale // q) for p, q in point] for i, point in cloud.items()} for cloud in ratios]
+    return top * (scale // bottom), scaled
+
+
 def _within(cutoff: float, queries: np.ndarray, sources: np.ndarray, closed: bool) -> Iterator[Pair]:
     """Yield every (query, source) within the cutoff: by integer cells of that edge, then by squared distance."""
-    top, bottom = cutoff.as_integer_ratio()
-    clouds = _ratios(queries), _ratios(sources)
-    # all denominators are powers of two, so the largest is a multiple of each
-    scale = max([bottom, *(q for cloud in clouds for point in cloud.values() for _, q in point)])
-    asking, sites = ({i: [p * (scale // q) for p, q in point] for i, point in cloud.items()} for cloud in clouds)
-    edge = top * (scale // bottom)
+    edge, (asking, sites) = _integers(cutoff, queries, sources)
     cells: defaultdict[tuple[int, int, int], list[tuple[int, int, int, int]]] = defaultdict(list)
     for j, (x, y, z) in sites.items():
         cells[x // edge, y // edge, z // edge].append((j, x, y, z))
@@ -153,3 +237,40 @@ def _within(cutoff: float, queries: np.ndarray, sources: np.ndarray, closed: boo
             for j, u, v, w in cells.get((a + da, b + db, c + dc), ()):
                 if (u - x) ** 2 + (v - y) ** 2 + (w - z) ** 2 <= limit:
                     yield i, j
+
+
+def _dot(a: Vector, b: Vector) -> int:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+Level = tuple[Vector, Vector, int, int]
+"""A lattice vector b, a normal w to those before it, b w, and the largest |v w| of a v within the cutoff."""
+
+
+def _levels(rows: list[Vector], edge: int) -> list[Level]:
+    levels: list[Level] = []
+    for row in rows:
+        normal = row
+        for _, other, _, _ in levels:
+            across, along = _dot(other, other), _dot(normal, other)
+            normal = [across * n - along * o for n, o in zip(normal, other, strict=True)]
+        if not any(normal):
+            raise ValueError("periodic rows of the matrix must be linearly independent")
+        common = math.gcd(*normal)
+        normal = [n // common for n in normal]
+        levels.append((row, normal, _dot(row, normal), math.isqrt(edge**2 * _dot(normal, normal))))
+    return levels
+
+
+def _shifts(v: Vector, levels: list[Level], limit: int) -> Iterator[tuple[int, ...]]:
+    """Yield the shifts, one integer per lattice vector, that bring v to a squared length of at most `limit`."""
+    if not levels:
+        if _dot(v, v) <= limit:
+            yield ()
+        return
+    row, normal, height, reach = levels[-1]
+    here = _dot(v, normal)
+    for s in range(-((reach + here) // height), (reach - here) // height + 1):
+        moved = [x + s * step for x, step in zip(v, row, strict=True)] if s else v
+        for others in _shifts(moved, levels[:-1], limit):
+            yield (*others, s)

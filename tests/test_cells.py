@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jfrnn import _cells
+from jfrnn._box import Images
 from jfrnn._exact import smallest_cutoff
 
 
@@ -72,7 +73,7 @@ def test_flushed_denormals_stay_within_the_edge_s_margin(dtype):
 def test_extent_is_bounded_by_the_particles(dtype, spread):
     rng = np.random.default_rng(3)
     x = jnp.asarray(rng.uniform(-spread, spread, (3, 50)), dtype)
-    coords, extent = _cells.grid_coordinates(x, edge_of(0.5, dtype), jnp.ones(50, bool))
+    coords, extent = _cells.grid_coordinates(x, _cells.open_axes(edge_of(0.5, dtype), 3), jnp.ones(50, bool))
     assert (coords >= 1).all()
     assert (coords < extent[:, None] - 1).all()
     assert (extent <= max(_cells._SMALLEST_TABLE, 2 * 50 + 2)).all()
@@ -96,10 +97,40 @@ def test_table_and_binary_search_find_the_same_runs(dense):
         order = _cells.cell_order(coords, finite, grid.extent, grid.dense)
         np.testing.assert_array_equal(order, grid.order)
     queries = jnp.asarray(rng.integers(1, 6, (3, 40)), jnp.int32)
-    start, stop = _cells.stencil_runs(grid, queries)
+    start, stop, image = _cells.stencil_runs(grid, queries)
+    assert image is None
     assert start.shape == stop.shape == (40, 9)
     for q in range(40):
         found = [set(range(a, b)) for a, b in zip(start[q].tolist(), stop[q].tolist(), strict=True)]
         assert found == runs_of_brute_force(grid, np.asarray(queries[:, q]))
     assert sorted(grid.order.tolist()) == list(range(80))
     assert not finite[grid.order[int(finite.sum()) :]].any()
+
+
+@pytest.mark.parametrize("dense", [True, False])
+@pytest.mark.parametrize(
+    "images", [Images((True,) * 3, True, (1, 1, 1), True), Images((True, False, True), True, (2, 0, 1), False)]
+)
+def test_runs_of_a_torus_meet_every_image_once(dense, images):
+    """Cells within reach, images told apart, against all shifts of all sources."""
+    rng = np.random.default_rng(5)
+    cells = np.array([4, 7, 2]) if images.nearest else np.array([1, 7, 2])
+    low = np.where(images.periodic, 0, 1)  # open axes have a margin
+    high = np.where(images.periodic, cells, cells - 1)
+    coords = jnp.asarray(rng.integers(low, high, (60, 3)).T, jnp.int32)
+    grid = _cells.build_grid(coords, jnp.ones(60, bool), jnp.asarray(cells, jnp.int32), 60)
+    grid = grid._replace(dense=jnp.asarray(dense))
+    queries = rng.integers(low, high, (20, 3))
+    start, stop, image = _cells.stencil_runs(grid, jnp.asarray(queries.T, jnp.int32), images)
+    width = [max(k, 1) for k in images.reach]
+    for q, query in enumerate(queries):
+        found = [
+            (p, c) for a, b, c in zip(start[q].tolist(), stop[q].tolist(), image[q].tolist(), strict=True) for p in range(a, b)
+        ]
+        expected = [
+            (p, code)
+            for code, shift in enumerate(images.shifts)
+            for p in range(60)
+            if (np.abs(np.asarray(grid.coords)[:, p] + shift * cells - query) <= width).all()
+        ]
+        assert sorted(found) == sorted(expected)

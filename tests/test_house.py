@@ -17,7 +17,7 @@ ALLOWED = {  # first-party and third-party modules that each folder may import
     "cases": {"numpy"},
     "jfrnn": {"jax", "numpy", "jfrnn"},
 }
-PUBLIC = {"MemoryPlan", "NeighborList", "NeighborOverflowError", "Status"}
+PUBLIC = {"Box", "MemoryPlan", "NeighborList", "NeighborOverflowError", "Status"}
 PUBLIC |= {"count", "memory_plan", "run_chunk", "search", "sort_order"}
 PUBLIC |= {"hilbert_decode", "hilbert_encode", "morton_decode", "morton_encode"}
 

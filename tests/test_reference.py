@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jfrnn.cases.hard import HARD_CASES
-from reference import compare, is_pair, pairs_of, reference_pairs
+from reference import compare, is_pair, pairs_of, reference_images, reference_pairs
 
 DTYPES = (np.float32, np.float64)
 DIMS = (2, 3)
@@ -173,6 +173,294 @@ def test_is_symmetric_and_half_is_half(name):
     pairs = reference_pairs(hard.positions, hard.cutoff)
     assert pairs == {(j, i) for i, j in pairs}
     assert reference_pairs(hard.positions, hard.cutoff, half=True) == {(i, j) for i, j in pairs if j > i}
+
+
+# Periodic images, by hand
+
+
+def opposite(images):
+    return {(j, i, tuple(-s for s in shift)) for i, j, shift in images}
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_hand_computed_images(dtype):
+    x = np.array([[0.5, 1.0], [3.5, 1.0], [2.0, 4.0]], dtype)
+    across = {(0, 1, (-1, 0)), (1, 0, (1, 0))}
+    options = {"matrix": np.array([4, 5], dtype), "periodic": (True, True)}
+    assert reference_images(x, 1.5, **options) == across
+    assert reference_images(x, 1.0, **options) == set()
+    assert reference_images(x, 1.0, closed=True, **options) == across
+    assert reference_images(x, 1.5, half=True, **options) == {(0, 1, (-1, 0))}
+    assert reference_images(x, 2.6, **options) - across == {  # |(1.5, 2)| = 2.5
+        (0, 2, (0, -1)),
+        (1, 2, (0, -1)),
+        (2, 0, (0, 1)),
+        (2, 1, (0, 1)),
+    }
+    assert reference_images(x[:2], 3.25, **options) - across == {(0, 1, (0, 0)), (1, 0, (0, 0))}
+    everyone = {(i, i, (0, 0)) for i in range(3)}
+    assert reference_images(x, 1.5, include_self=True, **options) == across | everyone
+    assert reference_images(x, 1.5, include_self=True, half=True, **options) == {(0, 1, (-1, 0))} | everyone
+
+
+def test_open_axes_have_no_images():
+    x = np.array([[0.5, 0.5], [3.5, 0.5], [0.5, 3.5]])
+    options = {"matrix": np.full(2, 4.0)}
+    assert reference_images(x, 1.5, periodic=(True, False), half=True, **options) == {(0, 1, (-1, 0))}
+    assert reference_images(x, 1.5, periodic=(False, True), half=True, **options) == {(0, 2, (0, -1))}
+    assert reference_images(x, 1.5, periodic=(False, False), **options) == set()
+    assert reference_images(x[:1], 4.0, periodic=(True, False), closed=True, **options) == {(0, 0, (1, 0)), (0, 0, (-1, 0))}
+    away = x + np.array([0.0, 1000.0])
+    assert reference_images(away, 1.5, periodic=(True, False), half=True, **options) == {(0, 1, (-1, 0))}
+    for row in ([0.0, 0.0], [8.0, 0.0], [np.nan, np.inf]):
+        matrix = np.array([[4.0, 0.0], row])
+        assert reference_images(x, 1.5, periodic=(True, False), matrix=matrix, half=True) == {(0, 1, (-1, 0))}
+
+
+def test_images_of_one_particle():
+    x = np.array([[0.3, 0.4, 0.5]])
+    options = {"matrix": np.ones(3), "periodic": (True,) * 3}
+    assert len(reference_images(x, 3.0, **options)) == 92
+    closed = reference_images(x, 3.0, closed=True, **options)
+    assert len(closed) == 122
+    half = reference_images(x, 3.0, closed=True, half=True, **options)
+    assert len(half) == 61 and half | opposite(half) == closed
+    assert (0, 0, (1, -2, -2)) in half and (0, 0, (0, 0, 3)) in half and (0, 0, (0, 0, -3)) not in half
+    assert reference_images(x, 3.0, include_self=True, **options) - reference_images(x, 3.0, **options) == {(0, 0, (0, 0, 0))}
+    fcc = np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 0.0]])  # shells of 12 at sqrt(2) and 6 at 2
+    for matrix in (fcc, fcc[::-1], -fcc):
+        assert len(reference_images(x, 2.0, matrix=matrix, periodic=(True,) * 3)) == 12
+        assert len(reference_images(x, 2.0, matrix=matrix, periodic=(True,) * 3, closed=True)) == 18
+
+
+def test_shifts_count_lattice_vectors_of_a_skewed_cell():
+    matrix = np.array([[4.0, 0.0], [3.0, 2.0]])
+    x = np.array([[0.0, 0.0], [3.0, 3.0], [-8.0, 0.0]])
+    assert reference_images(x, 1.25, matrix=matrix, periodic=(True, True), half=True) == {
+        (0, 1, (0, -1)),  # (3, 3) - (3, 2) = (0, 1)
+        (0, 2, (2, 0)),  # (-8, 0) + 2 (4, 0) = 0
+        (1, 2, (2, 1)),  # (-11, -3) + 2 (4, 0) + (3, 2) = (0, -1)
+    }
+
+
+def test_queries_have_images_and_no_self():
+    sources, queries = np.array([[0.25, 0.25]]), np.array([[0.25, 0.25], [-9.75, 10.25], [0.75, 0.25]])
+    options = {"matrix": np.ones(2), "periodic": (True, True), "queries": queries}
+    at = {(0, 0, (0, 0)), (1, 0, (-10, 10))}
+    assert reference_images(sources, 0.5, **options) == at
+    assert reference_images(sources, 0.5, closed=True, **options) == at | {(2, 0, (0, 0)), (2, 0, (1, 0))}
+    for option in ("half", "include_self"):
+        with pytest.raises(ValueError, match="leave them out with queries"):
+            reference_images(sources, 0.5, **options, **{option: True})
+
+
+def test_images_leave_out_what_is_not_finite():
+    x = np.array([[0.25, 0.0], [np.nan, 0.0], [0.75, np.inf], [0.75, 0.0]])
+    options = {"matrix": np.ones(2), "periodic": (True, False)}
+    both = {(0, 3, (0, 0)), (0, 3, (-1, 0))}
+    assert reference_images(x, 0.625, **options) == both | opposite(both)
+    assert reference_images(x, 0.625, queries=x[1:3], **options) == set()
+
+
+@pytest.mark.parametrize("residue", [2.0**-60, 2.0**-100, 2.0**-1022, 2.0**-1074])
+def test_residues_decide_across_a_face(residue):
+    options = {"matrix": np.array([8.0, 8.0]), "periodic": (True, True), "half": True}
+    for end, strict, closed in (([0, 0], 0, 1), ([-residue, 0], 1, 1), ([residue, 0], 0, 0), ([0, residue], 0, 0)):
+        x = np.array([[7.0, 0.0], end])
+        for away, shift in (([0, 0], (1, 0)), ([-800, 0], (-99, 0)), ([0, 16], (1, 2))):
+            moved = np.array([x[0] + away, x[1]])
+            assert reference_images(moved, 1.0, **options) == ({(0, 1, shift)} if strict else set())
+            assert reference_images(moved, 1.0, closed=True, **options) == ({(0, 1, shift)} if closed else set())
+
+
+def test_matrix_and_cutoff_are_rounded_once():
+    x = np.zeros((1, 2), np.float32)
+    images = {(0, 0, (1, 0)), (0, 0, (-1, 0))}
+    for cutoff, length in ((0.1, 0.1), (np.float32(0.1), 0.1), (0.1, np.float32(0.1))):
+        options = {"matrix": [length, 1.0], "periodic": (True, True)}
+        assert reference_images(x, cutoff, **options) == set()
+        assert reference_images(x, cutoff, closed=True, **options) == images
+    assert reference_images(x.astype(float), np.float32(0.1), matrix=[0.1, 1.0], periodic=(True, True)) == images
+
+
+def test_refuses_a_lattice_that_is_none():
+    x = np.zeros((2, 3))
+    for rows in ([[1, 2, 3], [2, 4, 6], [0, 0, 1]], [[0, 0, 0], [0, 1, 0], [0, 0, 1]], [[1, 0, 0], [0, 1, 0], [1, 1, 0]]):
+        with pytest.raises(ValueError, match="linearly independent"):
+            reference_images(x, 1.0, matrix=np.array(rows, float), periodic=(True,) * 3)
+    with pytest.raises(ValueError, match="linearly independent"):
+        reference_images(x[:1, :2], 1e-20, matrix=np.array([[1.0, 3.0], [3.0, 9.0]]), periodic=(True, True))
+    nearly = np.array([[0.1, 0.3], [0.3, 0.9]])  # three times 0.3 is not 0.9 in floats
+    assert reference_images(x[:1, :2], 1e-20, matrix=nearly, periodic=(True, True)) == set()
+    with pytest.raises(ValueError, match="linearly independent"):
+        reference_images(x, 1.0, matrix=np.array([1.0, 0.0, 1.0]), periodic=(True,) * 3)
+    with pytest.raises(ValueError, match="must be finite"):
+        reference_images(x, 1.0, matrix=np.array([1.0, np.inf, 1.0]), periodic=(True,) * 3)
+    for matrix in (1.0, np.ones(2), np.ones((2, 3))):
+        with pytest.raises(ValueError, match=r"shape \[3\] or \[3, 3\]"):
+            reference_images(x, 1.0, matrix=matrix, periodic=(True,) * 3)
+    for periodic in ((True, True), (1, 1, 1), (0, 1, 2)):
+        with pytest.raises(ValueError, match="one bool for each of 3 axes"):
+            reference_images(x, 1.0, matrix=np.ones(3), periodic=periodic)
+
+
+# Periodic images, against explicit copies and symmetries
+
+
+def copied_images(queries, sources, cutoff, matrix, periodic, reach, closed):
+    """The definition, over every copy up to `reach` lattice vectors away."""
+    limit = Fraction(float(cutoff)) ** 2
+    rows = [[Fraction(value) for value in row] for row in matrix.tolist()]
+    images = set()
+    for shift in product(*(range(-reach, reach + 1) if axis else (0,) for axis in periodic)):
+        offset = [sum(s * row[k] for s, row in zip(shift, rows)) for k in range(len(rows))]
+        for (i, a), (j, b) in product(enumerate(queries.tolist()), enumerate(sources.tolist())):
+            d2 = sum((Fraction(y) - Fraction(x) + o) ** 2 for x, y, o in zip(a, b, offset))
+            if d2 < limit or (closed and d2 == limit):
+                images.add((i, j, shift))
+    return images
+
+
+def without_own(images):
+    return {(i, j, shift) for i, j, shift in images if i != j or any(shift)}
+
+
+entry = st.one_of(st.integers(-2, 2).map(float), st.sampled_from([0.25, -0.75, 1.5, 0.1, -1 / 3, 1 + 2.0**-52, 3.0]))
+place = st.one_of(st.integers(-2, 2).map(float), st.floats(-2, 2, allow_subnormal=False), st.sampled_from([0.1, -0.3, 2.0**-60]))
+
+
+@st.composite
+def lattices(draw, entry=entry):
+    dim = draw(st.integers(1, 3))
+    matrix = np.array(draw(st.lists(st.lists(entry, min_size=dim, max_size=dim), min_size=dim, max_size=dim)))
+    periodic = tuple(draw(st.lists(st.booleans(), min_size=dim, max_size=dim)))
+    x = np.array(draw(st.lists(st.lists(place, min_size=dim, max_size=dim), min_size=1, max_size=3)))
+    return x, matrix, periodic
+
+
+def gram_determinant(matrix, periodic):
+    rows = [[Fraction(value) for value in row] for row, axis in zip(matrix.tolist(), periodic) if axis]
+    gram = [[sum(a * b for a, b in zip(p, q)) for q in rows] for p in rows]
+
+    def minor(square):
+        if not square:
+            return Fraction(1)
+        return sum((-1) ** k * square[0][k] * minor([row[:k] + row[k + 1 :] for row in square[1:]]) for k in range(len(square)))
+
+    return minor(gram)
+
+
+@settings(max_examples=150, deadline=None)
+@given(lattices(), st.sampled_from([0.5, 1.0, 1.25, math.sqrt(2), 1.5]), st.booleans())
+def test_images_equal_the_definition(given, cutoff, closed):
+    x, matrix, periodic = given
+    options = {"matrix": matrix, "periodic": periodic, "closed": closed}
+    determinant = gram_determinant(matrix, periodic)
+    if determinant == 0:
+        with pytest.raises(ValueError, match="linearly independent"):
+            reference_images(x, cutoff, **options)
+        return
+    if determinant < Fraction(1, 100):  # hundreds of thousands of images
+        return
+    found = reference_images(x, cutoff, include_self=True, **options)
+    reach = {0: 0, 1: 40, 2: 12, 3: 5}[sum(periodic)]
+    near = {image for image in found if max(map(abs, image[2])) <= reach}
+    assert near == copied_images(x, x, cutoff, matrix, periodic, reach, closed)
+    rows = [[Fraction(value) for value in row] for row in matrix.tolist()]
+    for i, j, shift in found - near:
+        offset = [sum(s * row[k] for s, row in zip(shift, rows)) for k in range(len(rows))]
+        d2 = sum((Fraction(b) - Fraction(a) + o) ** 2 for a, b, o in zip(x[i].tolist(), x[j].tolist(), offset))
+        assert d2 < Fraction(cutoff) ** 2 or (closed and d2 == Fraction(cutoff) ** 2)
+        assert all(s == 0 for s, axis in zip(shift, periodic) if not axis)
+    assert reference_images(x, cutoff, **options) == without_own(found)
+    assert reference_images(x, cutoff, queries=x[::-1][:2], **options) == {
+        (len(x) - 1 - i, j, shift) for i, j, shift in found if i >= len(x) - 2
+    }
+    half = reference_images(x, cutoff, half=True, **options)
+    assert half | opposite(half) == without_own(found) and not half & opposite(half)
+    assert all(i < j or (i == j and next(filter(None, shift)) > 0) for i, j, shift in half)
+
+
+def test_images_of_a_lattice_are_found_in_every_basis():
+    """Random unimodular bases of the integer lattice, skewed and of either hand."""
+    rng = np.random.default_rng(7)
+    x = rng.integers(-8, 9, (4, 3)) / 4
+    expected = None
+    for _ in range(60):
+        basis = unimodular(rng, 3, steps=int(rng.integers(0, 12)))
+        found = reference_images(x, 1.5, matrix=basis.astype(float), periodic=(True,) * 3, closed=True)
+        places = {(i, j, tuple((np.array(shift) @ basis).tolist())) for i, j, shift in found}
+        assert len(places) == len(found)
+        expected = expected or copied_images(x, x, 1.5, np.eye(3), (True,) * 3, 6, True) - {(i, i, (0, 0, 0)) for i in range(4)}
+        assert places == expected
+
+
+def unimodular(rng, dim, steps):
+    """An integer matrix of determinant 1 or -1."""
+    basis = np.eye(dim, dtype=int)
+    for _ in range(steps):
+        into, of = rng.choice(dim, 2, replace=False)
+        basis[into] += rng.choice([-2, -1, 1, 3]) * basis[of]
+        if rng.random() < 0.2:
+            basis[[into, of]] = basis[[of, into]]
+    return basis
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dim", DIMS)
+def test_images_change_with_the_basis(dtype, dim):
+    """A unimodular change of basis leaves the lattice: S' U = S."""
+    rng = np.random.default_rng(dim)
+    matrix = rng.integers(-60, 61, (dim, dim)) / 16 + 4 * np.eye(dim)
+    x = rng.integers(-400, 400, (12, dim)).astype(dtype) / dtype(16)
+    for steps in (1, 3, 6):
+        change = unimodular(rng, dim, steps)
+        first = reference_images(x, 3.5, matrix=matrix.astype(dtype), periodic=(True,) * dim)
+        other = reference_images(x, 3.5, matrix=(change @ matrix).astype(dtype), periodic=(True,) * dim)
+        assert len(first) > 50
+        assert {(i, j, tuple((np.array(shift) @ change).tolist())) for i, j, shift in other} == first
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("periodic", [(True, True, True), (True, False, True), (False, True, False)])
+def test_images_of_moved_particles(dtype, periodic):
+    """Particle i moved by n_i A shifts S of (i, j) by n_i - n_j; exact, because all numbers are dyadic."""
+    rng = np.random.default_rng(17)
+    matrix = np.array([[2.0, 0.0, 0.0], [1.0, 3.0, 0.0], [-0.5, 0.75, -2.0]], dtype)
+    x = (rng.integers(0, 48, (30, 3)) / 16).astype(dtype)
+    turns = rng.integers(-100, 101, (30, 3)) * np.array(periodic)
+    moved = x + turns.astype(dtype) @ matrix
+    options = {"matrix": matrix, "periodic": periodic, "closed": True}
+    before, after = reference_images(x, 1.25, **options), reference_images(moved, 1.25, **options)
+    assert after == {(i, j, tuple((np.array(shift) + turns[i] - turns[j]).tolist())) for i, j, shift in before}
+    assert before == opposite(before)
+    assert len(before) > 60
+
+
+def test_images_without_periodic_axes_are_pairs():
+    for name in ("mixed_exponents", "integers_9", "ulp_away", "queries_coincident", "n_0", "clump_and_largest"):
+        hard = HARD_CASES[name].build(np.float64, 2)
+        found = reference_images(hard.positions, hard.cutoff, queries=hard.queries, matrix=np.ones(2), periodic=(False, False))
+        assert found == {(i, j, (0, 0)) for i, j in reference_pairs(hard.positions, hard.cutoff, queries=hard.queries)}
+
+
+@pytest.mark.parametrize("angle", [1e-2, 1e-4, -1e-6])
+def test_images_of_a_nearly_degenerate_cell(angle):
+    """(1, 0) and (1, angle) are the lattice of (1, 0) and (0, angle)."""
+    x = np.array([[0.0, 0.0], [0.25, 100 * angle], [-70.0, 0.0]])
+    matrix = np.array([[1.0, 0.0], [1.0, angle]])
+    steps = {(i, i, (-k, k)) for i in range(3) for k in (-4, -3, -2, -1, 1, 2, 3, 4)}
+    steps |= {(0, 2, (70 - k, k)) for k in range(-4, 5)} | {(2, 0, (-70 - k, k)) for k in range(-4, 5)}
+    assert reference_images(x, 4.5 * abs(angle), matrix=matrix, periodic=(True, True)) == steps
+    swapped = {(i, j, shift[::-1]) for i, j, shift in steps}
+    assert reference_images(x, 4.5 * abs(angle), matrix=matrix[::-1], periodic=(True, True)) == swapped
+
+
+def test_images_far_from_the_cell():
+    x = np.array([[1e30, 0.0], [0.0, 2.0**80], [0.25, 0.25]])
+    options = {"matrix": np.ones(2), "periodic": (True, True), "half": True}
+    assert reference_images(x, 0.25, **options) == {(0, 1, (int(1e30), -(2**80)))}
+    assert len(reference_images(x, 0.375, **options)) == 3
 
 
 # Comparing

@@ -1,0 +1,453 @@
+"""Periodic boxes: the public `Box`, and the `Lattice` that engines work with.
+
+A pair of images (i, j, S) is a pair iff |x_j - x_i + S·A| < cutoff, where the rows A_k of A are the lattice vectors and S is a
+vector of integers, 0 along axes that are not periodic. Nothing is decided on wrapped coordinates: wrapping only brings particles
+into one cell of the lattice, so that few images need be looked at. What rounding can do there is bounded by `Wrapped.slack`
+(coordinates) and `Wrapped.reach` (cells), and whatever lies within those bounds of the cutoff is decided on the given floats.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Sequence
+from itertools import product
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.core import Tracer
+
+from jfrnn._exact import Shifted
+
+_NEAREST = 0.49  # cutoff over width up to which the nearest image is the only one, with room for rounding
+_MOST_IMAGES = 2**15 - 1  # codes of a signed 16-bit integer
+
+
+@jax.tree_util.register_pytree_with_keys_class
+@dataclasses.dataclass(frozen=True, init=False)
+class Box:
+    """Say along which lattice vectors space repeats itself. A pytree; lengths, vectors and origin may be traced.
+
+    Attributes:
+        vectors: Lengths of the edges [length], shape [d], or lattice vectors, one per row, shape [d, d].
+        origin: A corner of the cell [length], shape [d].
+        periodic: For each axis, whether space repeats itself along it. Static.
+        images: For each axis, over how many cells to either side a pair may reach; None: see `Box`. Static.
+    """
+
+    vectors: Any
+    origin: Any
+    periodic: tuple[bool, ...]
+    images: tuple[int, ...] | None
+
+    def __init__(
+        self,
+        lengths_or_matrix: Any,  # noqa: ANN401
+        periodic: bool | Sequence[bool] = True,
+        origin: Any = 0.0,  # noqa: ANN401
+        *,
+        images: int | Sequence[int] | None = None,
+    ) -> None:
+        """Make a box from the lengths of its edges or from its lattice vectors.
+
+        Args:
+            lengths_or_matrix: Lengths [length], shape [2] or [3], all > 0, of edges along the axes; or lattice vectors [length],
+                one per row, shape [2, 2] or [3, 3], of any handedness and skew. Along an axis that is not periodic nothing but
+                finite numbers is asked of them. Rounded once to the dtype of the positions.
+            periodic: One bool for all axes, or one per axis (per row of the matrix).
+            origin: A corner of the cell [length], a number or shape [d]. It changes no pair; a search is fastest where particles
+                lie between origin and origin + vectors.
+            images: Over how many cells to either side a pair may reach, a static int or one per axis. Default: as many as the
+                cutoff needs where the box is known while tracing; where it is traced, nothing but the nearest image of a particle
+                is looked at, which needs a box at least 2.05 (cutoff + skin) wide along every periodic axis. A box that
+                is too small for that sets a status bit.
+
+        Raises:
+            TypeError, ValueError: an argument is of the wrong kind, shape or range.
+        """
+        vectors = _real("lengths_or_matrix", lengths_or_matrix)
+        if vectors.shape not in ((2,), (3,), (2, 2), (3, 3)):
+            raise ValueError(
+                f"lengths_or_matrix must have shape [d] (lengths) or [d, d] (lattice vectors) with d = 2 or 3, got shape "
+                f"{list(vectors.shape)}."
+            )
+        dim = vectors.shape[0]
+        corner = _real("origin", origin)
+        if corner.shape not in ((), (dim,)):
+            raise ValueError(f"origin must be a number or have shape [{dim}], got shape {list(corner.shape)}.")
+        flags = _per_axis("periodic", periodic, dim, (bool, np.bool_), "bool")
+        reach = None if images is None else _per_axis("images", images, dim, (int, np.integer), "int >= 0", least=0)
+        _check_values(vectors, corner, flags)
+        self._set(vectors, corner if corner.shape else corner + np.zeros(dim, corner.dtype), flags, reach)
+
+    def _set(self, vectors: Any, origin: Any, periodic: tuple[bool, ...], images: tuple[int, ...] | None) -> None:  # noqa: ANN401
+        for name, value in (("vectors", vectors), ("origin", origin), ("periodic", periodic), ("images", images)):
+            object.__setattr__(self, name, value)
+
+    def tree_flatten_with_keys(self) -> tuple[Any, Any]:
+        """Return the arrays with their names, and what is static."""
+        keys = (jax.tree_util.GetAttrKey("vectors"), jax.tree_util.GetAttrKey("origin"))
+        return tuple(zip(keys, (self.vectors, self.origin), strict=True)), (self.periodic, self.images)
+
+    @classmethod
+    def tree_unflatten(cls, static: Any, arrays: Any) -> "Box":  # noqa: ANN401
+        """Make a box of arrays that nobody checks again."""
+        box = object.__new__(cls)
+        box._set(*arrays, *static)
+        return box
+
+    @property
+    def dim(self) -> int:
+        """Number of axes, 2 or 3."""
+        return len(self.periodic)
+
+    @property
+    def orthogonal(self) -> bool:
+        """Whether the box was given by lengths."""
+        return np.ndim(self.vectors) == 1
+
+
+def _real(name: str, value: Any) -> Any:  # noqa: ANN401
+    """Return floats, a traced array as it is and everything else as a NumPy array."""
+    if isinstance(value, Tracer):
+        if not jnp.issubdtype(value.dtype, jnp.floating):
+            raise TypeError(f"{name} must be real numbers, got a traced {value.dtype}.")
+        return value
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"{name} must be real numbers, got {type(value).__name__} {value!r}.")
+    return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
+
+
+def _per_axis(name: str, value: Any, dim: int, kinds: tuple[type, ...], what: str, least: int | None = None) -> tuple[Any, ...]:  # noqa: ANN401
+    values = tuple(value) if isinstance(value, Sequence | np.ndarray) else (value,) * dim
+    right = all(isinstance(v, kinds) and (least is None or (not isinstance(v, bool) and v >= least)) for v in values)
+    if not right:
+        raise TypeError(f"{name} must be one {what} or one per axis, known while tracing, got {value!r}.")
+    if len(values) != dim:
+        raise ValueError(f"{name} must be one {what} or one per axis ({dim}), got {len(values)}.")
+    return tuple(v.item() if isinstance(v, np.generic) else v for v in values)
+
+
+def _check_values(vectors: Any, origin: Any, periodic: tuple[bool, ...]) -> None:  # noqa: ANN401
+    for name, value in (("lengths_or_matrix", vectors), ("origin", origin)):
+        if not isinstance(value, Tracer) and not np.isfinite(value).all():
+            raise ValueError(f"{name} must be finite, got {value.tolist()}.")
+    if isinstance(vectors, Tracer):
+        return
+    if vectors.ndim == 1 and not (vectors[list(periodic)] > 0).all():
+        raise ValueError(f"lengths of periodic axes must be positive, got {vectors.tolist()}; give a matrix for other handedness.")
+    if vectors.ndim == 2 and any(periodic):
+        rows = vectors[list(periodic)].astype(np.float64)
+        size = np.abs(rows).max(axis=1, keepdims=True)
+        if not size.all() or np.linalg.matrix_rank(rows / size) < len(rows):
+            raise ValueError(f"periodic lattice vectors must be linearly independent, got the rows {vectors.tolist()}.")
+
+
+def fixed_box(box: Box, dtype: np.dtype) -> Box:
+    """Round a box to a dtype; what is left of it are its arrays and its periodic axes."""
+    return Box.tree_unflatten((box.periodic, None), tuple(jnp.asarray(x).astype(dtype) for x in (box.vectors, box.origin)))
+
+
+# --- what is static about the images -------------------------------------------------------------------------------------
+
+
+class Images(NamedTuple):
+    """How the images of a search are told apart; static.
+
+    Attributes:
+        periodic: One bool per axis.
+        orthogonal: Lattice vectors lie along the axes.
+        reach: Over how many cells to either side a pair may reach, per axis; 0 along axes that are not periodic.
+        nearest: No pair has more than one image within the cutoff, the nearest one: no image need be stored.
+    """
+
+    periodic: tuple[bool, ...]
+    orthogonal: bool
+    reach: tuple[int, ...]
+    nearest: bool
+
+    @property
+    def shifts(self) -> np.ndarray:
+        """All lattice shifts within reach, shape [images, d], int32; the row number is the code of the image."""
+        return np.array(list(product(*(range(-k, k + 1) for k in self.reach))), np.int32)
+
+    @property
+    def total(self) -> int:
+        """Number of shifts within reach."""
+        return math.prod(2 * k + 1 for k in self.reach)
+
+    @property
+    def home(self) -> int:
+        """The code of the shift 0."""
+        return (self.total - 1) // 2
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Of the codes in a list: 1 B up to 256 of them."""
+        return np.dtype(np.uint8 if self.total <= 256 else np.int16)
+
+
+def images_of(box: Box, radius: float, dtype: np.dtype, sources: int) -> Images:
+    """Choose which images a search with this radius looks at.
+
+    Raises:
+        ValueError: the cutoff spans more images than can be told apart.
+    """
+    if box.images is None and not isinstance(box.vectors, Tracer):
+        share = radius / _widths(np.asarray(box.vectors, dtype).astype(np.float64), box.periodic)
+        nearest = bool((share <= _NEAREST).all())
+        # room for the rounding of coordinates: far fewer than a hundredth of a cell
+        reach = tuple(math.ceil(s + 0.01) if p else 0 for s, p in zip(share.tolist(), box.periodic, strict=True))
+    else:
+        wanted = (0,) * box.dim if box.images is None else box.images
+        nearest = not any(k for k, p in zip(wanted, box.periodic, strict=True) if p)
+        reach = tuple(max(k, 1) if p else 0 for k, p in zip(wanted, box.periodic, strict=True))
+    images = Images(box.periodic, box.orthogonal, reach, nearest)
+    if not images.nearest and sources * images.total >= 2**31:
+        raise ValueError(
+            f"box is too small for its particles: {sources} of them with {images.total} images each are more than int32 can number."
+        )
+    if images.total > _MOST_IMAGES:
+        raise ValueError(
+            f"box is too small for this cutoff: pairs reach over {reach} cells along the axes, more than {_MOST_IMAGES} images. "
+            "Replicate the particles into a larger box, or reduce a skewed lattice to short vectors."
+        )
+    return images
+
+
+def _widths(vectors: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
+    """Return the distances of opposite faces [d], infinite along axes that are not periodic."""
+    rows = np.diag(vectors) if vectors.ndim == 1 else vectors
+    widths = np.full(len(rows), np.inf)
+    span = rows[list(periodic)]
+    widths[list(periodic)] = 1 / np.linalg.norm(np.linalg.pinv(span), axis=0)
+    return widths
+
+
+# --- what a compiled program computes ------------------------------------------------------------------------------------
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Lattice:
+    """A box in the dtype of the positions, ready to wrap them.
+
+    Attributes:
+        matrix: [d, d] lattice vectors, one per row; rows of axes that are not periodic are 0.
+        transform: [d, d]; (x - origin) @ transform are fractions of the lattice vectors along periodic axes, lengths along others.
+        origin: [d].
+        images: Static.
+    """
+
+    matrix: Array
+    transform: Array
+    origin: Array
+    images: Images = dataclasses.field(metadata={"static": True})
+
+    @property
+    def dim(self) -> int:
+        """Number of axes."""
+        return len(self.images.periodic)
+
+
+def make_lattice(box: Box, images: Images, dtype: np.dtype) -> Lattice:
+    """Round a box to a dtype, once, and find its transform."""
+    vectors, origin = jnp.asarray(box.vectors).astype(dtype), jnp.asarray(box.origin).astype(dtype)
+    rows = jnp.diag(vectors) if box.orthogonal else vectors
+    flags = np.array(box.periodic)
+    matrix = jnp.where(flags[:, None], rows, 0)
+    if box.orthogonal:
+        lengths = jnp.where(flags, vectors, 1)
+        return Lattice(matrix, jnp.diag(1 / lengths), origin, images)
+    return Lattice(matrix, _inverse(_completed(matrix, box.periodic)), origin, images)
+
+
+def _completed(matrix: Array, periodic: tuple[bool, ...]) -> Array:
+    """Replace the rows of axes that are not periodic by unit vectors normal to all that are, and to each other."""
+    dim, free = len(periodic), [k for k, p in enumerate(periodic) if not p]
+    rows = [matrix[k] / jnp.max(jnp.abs(matrix[k])) if p else matrix[k] for k, p in enumerate(periodic)]
+    spans = [rows[k] for k, p in enumerate(periodic) if p]
+    if len(free) == dim:
+        normals = list(jnp.eye(dim, dtype=matrix.dtype))
+    elif dim == 2:
+        normals = [jnp.stack([-spans[0][1], spans[0][0]])] if free else []
+    elif len(free) == 1:
+        normals = [jnp.cross(spans[0], spans[1])]
+    elif len(free) == 2:
+        least = jnp.eye(3, dtype=matrix.dtype)[jnp.argmin(jnp.abs(spans[0]))]
+        first = jnp.cross(spans[0], least)
+        normals = [first, jnp.cross(spans[0], first)]
+    else:
+        normals = []
+    result = list(matrix)
+    for k, normal in zip(free, normals, strict=True):
+        result[k] = normal / jnp.sqrt(jnp.sum(normal**2))
+    return jnp.stack(result)
+
+
+def _inverse(matrix: Array) -> Array:
+    """Invert a [d, d] matrix by cofactors of its scaled rows, then once by Newton's step."""
+    size = jnp.max(jnp.abs(matrix), axis=1, keepdims=True)
+    rows = matrix / size
+    if len(matrix) == 2:
+        adjugate = jnp.stack([jnp.stack([rows[1, 1], -rows[0, 1]]), jnp.stack([-rows[1, 0], rows[0, 0]])])
+    else:
+        adjugate = jnp.stack([jnp.cross(rows[k - 2], rows[k - 1]) for k in range(3)], axis=1)
+    inverse = adjugate / jnp.sum(rows[0] * adjugate[:, 0])
+    inverse = inverse @ (2 * jnp.eye(len(rows), dtype=rows.dtype) - _product(rows, inverse))
+    return inverse / size.T
+
+
+def _product(a: Array, b: Array) -> Array:
+    return jnp.sum(a[:, :, None] * b[None, :, :], axis=1)  # not a matmul, which may be made in fewer bits
+
+
+def is_valid(lattice: Lattice) -> Array:
+    """Say whether a lattice is one: finite, its vectors independent, lengths positive; [] bool."""
+    right = jnp.isfinite(lattice.matrix).all() & jnp.isfinite(lattice.transform).all() & jnp.isfinite(lattice.origin).all()
+    if lattice.images.orthogonal:
+        right = right & (jnp.diagonal(lattice.matrix) >= 0).all()
+    return right
+
+
+class Wrapped(NamedTuple):
+    """Particles in one cell of the lattice, and what rounding may have done on the way.
+
+    Attributes:
+        sources: [n, d] wrapped, near enough: within `slack` of x - turns @ matrix.
+        queries: [m, d] likewise; the sources again where they are the queries, and so on below.
+        turns: [n, d] whole floats: how many lattice vectors were taken off each source.
+        query_turns: [m, d].
+        slack: [] bound on the error of a component of a difference of wrapped coordinates, with a shift within reach.
+        reach: [d] half the width of the stencil, in units of the transform: no pair is farther apart along an axis.
+        near: [n] bool: finite and not more than `LARGEST_TURN` cells away.
+        query_near: [m] bool.
+        enough: [] bool: the images that are looked at are all that there can be.
+    """
+
+    sources: Array
+    queries: Array
+    turns: Array
+    query_turns: Array
+    slack: Array
+    reach: Array
+    near: Array
+    query_near: Array
+    enough: Array
+
+
+LARGEST_TURN = 511  # cells between a particle and the box: three such numbers share an int32, and S·A is exact in half mantissas
+_TURN_BITS = 10
+
+
+def packed_turns(turns: Array) -> Array:
+    """Write turns [n, d], whole floats within `LARGEST_TURN`, as one int32 per particle, [n]."""
+    parts = (turns.astype(jnp.int32) + (LARGEST_TURN + 1)) << np.arange(turns.shape[1], dtype=np.int32) * _TURN_BITS
+    return jnp.sum(parts, axis=1, dtype=jnp.int32)
+
+
+def unpacked_turns(packed: Array, dim: int) -> Array:
+    """Read what `packed_turns` wrote: [..., d] int32."""
+    parts = packed[..., None] >> np.arange(dim, dtype=np.int32) * _TURN_BITS
+    return (parts & ((1 << _TURN_BITS) - 1)) - (LARGEST_TURN + 1)
+
+
+def turns_of(points: Array, lattice: Lattice) -> Array:
+    """Return how many lattice vectors lie between the cell and each point: [n, d] whole floats, 0 along open axes."""
+    u = fractions_of(points, lattice)
+    turns = jnp.where(np.array(lattice.images.periodic), jnp.floor(u), 0)
+    return lax.optimization_barrier(turns)  # computed once, so that whoever asks gets the same
+
+
+def fractions_of(points: Array, lattice: Lattice) -> Array:
+    """Return points [n, d] in units of the transform."""
+    from_origin = points - lattice.origin
+    if lattice.images.orthogonal:
+        return from_origin * jnp.diagonal(lattice.transform)
+    return _product(from_origin, lattice.transform) if len(points) else from_origin
+
+
+def translation(shifts: Array, lattice: Lattice) -> Array:
+    """Return shifts @ matrix, [..., d], for whole floats; differentiable in the lattice."""
+    if lattice.images.orthogonal:
+        return shifts * jnp.diagonal(lattice.matrix)
+    return sum(
+        (shifts[..., k, None] * lattice.matrix[k] for k, p in enumerate(lattice.images.periodic) if p), jnp.zeros_like(shifts)
+    )
+
+
+def wrap(sources: Array, queries: Array | None, lattice: Lattice, radius: np.floating | Array) -> Wrapped:
+    """Bring particles into one cell of the lattice, and bound what rounding does.
+
+    With u the computed units of the transform, u' the exact ones of the same transform, and R = matrix @ transform - 1 its
+    residual (periodic columns), |u_j + S - u_i - (x_j - x_i + S·A) @ transform| is at most the rounding of u_i and u_j and
+    sum |S|·|R|; and |d @ transform| <= |d|·|column of the transform|. `reach` adds these up, each rounded up generously.
+    """
+    dtype, images = np.dtype(sources.dtype), lattice.images
+    eps = jnp.finfo(dtype).eps
+    periodic = np.array(images.periodic)
+    points = sources if queries is None else jnp.concatenate([sources, queries])
+    turns = turns_of(points, lattice)
+    finite = jnp.isfinite(points).all(axis=1)
+    near = finite & (jnp.abs(turns) <= LARGEST_TURN).all(axis=1)
+    points = jnp.where(near[:, None], points, jnp.nan)
+    turns = jnp.where(near[:, None], turns, 0)
+    wrapped = points - translation(turns, lattice)
+    wrapped = jnp.where((turns == 0).all(axis=1, keepdims=True), points, wrapped)
+
+    size = jnp.max(jnp.abs(points), axis=0, initial=0, where=near[:, None]) + jnp.abs(lattice.origin)
+    spans = jnp.max(jnp.abs(turns), initial=0) + (max(images.reach) + 1)
+    matrix, transform = jnp.abs(lattice.matrix), jnp.abs(lattice.transform)
+    slack = _slack(size, spans, lattice)
+    residual = jnp.abs(_product(lattice.matrix, lattice.transform) - jnp.diag(jnp.asarray(periodic, dtype)))
+    residual = residual + 8 * eps * _product(matrix, transform)
+    rounding = 8 * eps * _product(size[None], transform)[0] + 2 * spans * residual.sum(axis=0)
+    if images.orthogonal:
+        rounding = jnp.where(periodic, rounding, 0)  # open axes are walked in raw coordinates
+    length = jnp.sqrt(jnp.sum((transform * radius) ** 2, axis=0)) * (1 + 16 * eps)
+    reach = length + 2 * rounding + jnp.where(periodic, 8 * eps, 0)
+    limit = jnp.where(periodic, 0.5 if images.nearest else jnp.asarray(images.reach, dtype), jnp.inf)
+    enough = (reach < limit).all() if images.nearest else (reach <= limit).all()
+    n = sources.shape[0]
+    mine = slice(0, n) if queries is None else slice(n, None)
+    rest = (slack, reach, near[:n], near[mine], enough)
+    return Wrapped(wrapped[:n], wrapped[mine], turns[:n], turns[mine], *rest)
+
+
+def _slack(size: Array, spans: Array, lattice: Lattice) -> Array:
+    """Bound the error of a component of x_j - x_i + S·A, for |x| below `size` [d] and |S| below `spans`."""
+    moved = jnp.abs(lattice.matrix).sum(axis=0)  # 0 for components that no lattice vector has: nothing is added to them
+    return 8 * jnp.finfo(moved.dtype).eps * jnp.max(size + spans * moved, initial=0, where=moved > 0)
+
+
+def shifted_pairs(difference: Array, shifts: Array, points: Sequence[Array], lattice: Lattice) -> Shifted:
+    """Return x_j - x_i + S·A for differences [m, k, d] of these points, differentiable, and what their exact test needs."""
+    finite = [lax.stop_gradient(jnp.where(jnp.isfinite(x), jnp.abs(x), 0)) for x in points]
+    size = functools.reduce(jnp.maximum, (jnp.max(x, axis=0, initial=0) for x in finite))
+    spans = jnp.max(jnp.abs(shifts), initial=0) + 1
+    fixed = lax.stop_gradient(lattice)
+    vectors = difference + translation(shifts, lattice)
+    return Shifted(vectors, shifts, _slack(size, spans, fixed), fixed.matrix, lattice.images.orthogonal)
+
+
+def box_change(before: Box, now: Box, points: Array, kind: Images, dtype: np.dtype) -> Array:
+    """Bound how far the change of a box can move one image of `points` against another, for pairs within reach."""
+    old, new = (make_lattice(box, kind, dtype) for box in (before, now))
+    turns = turns_of(points, new)
+    there = jnp.isfinite(turns)
+    span = jnp.max(turns, axis=0, initial=-LARGEST_TURN, where=there) - jnp.min(turns, axis=0, initial=LARGEST_TURN, where=there)
+    moved = jnp.sqrt(jnp.sum((new.matrix - old.matrix) ** 2, axis=1)) * (1 + 16 * jnp.finfo(dtype).eps)
+    return jnp.sum((jnp.maximum(span, 0) + np.array(kind.reach, dtype)) * moved)
+
+
+def nearest_shifts(difference: Array, lattice: Lattice) -> Array:
+    """Return the lattice shifts [..., d], whole floats, that bring differences x_j - x_i [..., d] nearest to 0."""
+    difference = lax.stop_gradient(difference)
+    if lattice.images.orthogonal:
+        units = difference * jnp.diagonal(lattice.transform)
+    else:
+        units = functools.reduce(jnp.add, (difference[..., m, None] * lattice.transform[m] for m in range(lattice.dim)))
+    return lax.stop_gradient(jnp.where(np.array(lattice.images.periodic), -jnp.round(units), 0))
