@@ -16,7 +16,7 @@ import warp as wp
 from jfrnn.kernels._native import CELLS, EXACT, snippet, table_cells
 
 BLOCK = 256
-QUERY_BLOCK = 64
+QUERY_BLOCK = 32  # one warp: others need not wait for it to end
 _PARTS = 256  # blocks of `bounds`; one thread of a block reads one part
 _TILE = 2048  # cells that a block of `scan` takes
 _HEADER_WORDS = 64
@@ -279,23 +279,39 @@ for (long long place = thread; place < n; place += threads) {
 """
 
 _QUERY = r"""
-constexpr int BLOCKS = 24;  // of candidates, whose neighbors are written together
+constexpr int BLOCKS = 22;  // of candidates, whose neighbors are written together
 constexpr int CHUNK = 32;  // neighbors of a query that are written at once
-struct alignas(16) Box { real bound[8]; };  // lowest and highest in turn, per axis
+constexpr int TAKEN = 4;  // neighbors that a lane numbers at a time
+constexpr int FETCHED = 2;  // candidates that a lane fetches at a time
+constexpr int RING = 128;  // candidates: fewer than a block, what is fetched twice, rounded up
+constexpr unsigned int ONES = 0x3c003c00;  // two halves
+struct alignas(16) Box { real center[4], half[4]; };  // a group's; the last ones: what is near, squared, and twice the coarse band
+struct Run { int end, shift; };  // candidates of a row of cells: where they end, what leads from a candidate's number to its place
 struct alignas(16) Warp {  // what a warp shares
-    real candidates[DIM][64];  // coordinates of a ring of candidates within reach of the group's box
-    int candidate_ids[LATER ? 64 : 1];
-    int ids[LIST ? 32 * (BLOCKS + 1) : 1];  // of all of them since the rows were last written, per block from the last to the first
-    unsigned int hits[LIST ? BLOCKS : 1][32];  // per block of candidates and query: one bit per candidate, the first one leads
-    int lists[LIST ? 32 : 1][CHUNK + 1];  // of each query: what is written next; an odd stride, for the banks
+    union {
+        // of a ring of candidates near the group's box: coordinates (float64) or columns of a matrix, pairs of halves (float32)
+        real candidates[DOUBLE ? DIM : 4][RING + 8];
+        // per query, while rows are written: addresses of the ids that are next, two in a word; the stride is odd, for the banks
+        unsigned int lists[32][CHUNK / 2 + 3];
+    };
+    int candidate_ids[LATER || !LIST ? RING : 1];
+    int ids[LIST ? 32 * (BLOCKS + FETCHED) : 1];  // of all of them since the rows were last written
+    unsigned int hits[LIST ? BLOCKS + 1 : 1][32];  // per block of candidates and query: one bit per candidate
+    unsigned int written[LIST ? 32 : 1];  // per query: neighbors that stand in its row, a multiple of four, plus those left over
+    int left[LIST ? 3 : 1][32];  // of those, the ids
     Box box;  // of the group
-    int shifts[32];  // per row of cells: what leads from a candidate's number to its place
+    Run runs[33];
 };
-__shared__ Warp warps[QUERY_BLOCK / 32];
-Warp& warp = warps[warp_in_block];
-const Grid grid = shared.grid;
-const int finite_queries = shared.finite_queries;
-const long long begin = (thread >> 5) * 32;
+__shared__ Warp warp;
+__shared__ Grid grid;
+__shared__ int finite_queries, longest_before;
+if (lane == 0) {
+    grid = shared.grid;
+    finite_queries = shared.finite_queries;
+    longest_before = *(volatile int*)&info.data[0];
+}
+__syncwarp();
+const long long begin = (long long)block * 32;
 int place = begin < m ? (int)begin : m;
 const int stop = m - place < 32 ? m : place + 32;
 const unsigned int lanes_below = (1u << lane) - 1;
@@ -343,11 +359,23 @@ auto larger = [](real a, real b) -> real {
     else
         return fmaxf(a, b);
 };
-auto shared_address = [](const void* p) { return (unsigned int)__cvta_generic_to_shared(p); };
 auto square_root = [](float x) {
     float y;
     asm("sqrt.approx.f32 %0, %1;" : "=f"(y) : "f"(x));
     return y;
+};
+auto shared_address = [](const void* p) { return (unsigned int)__cvta_generic_to_shared(p); };
+auto load_word = [](unsigned int at) {
+    int word;
+    asm volatile("ld.shared.u32 %0, [%1];" : "=r"(word) : "r"(at) : "memory");
+    return word;
+};
+// factor * x as a sum of two halves: exact but for 2^-22 of it and what is too small for a half
+auto halves = [](float x, float factor) -> unsigned int {
+    const float high = __uint_as_float(__float_as_uint(x) & 0xffffe000u), low = x - high;
+    unsigned int word;
+    asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(word) : "f"(factor * low), "f"(factor * high));
+    return word;
 };
 
 while (place < stop) {
@@ -374,7 +402,7 @@ while (place < stop) {
     }
     const int my_id = id_of(mine.id);
     // lane 2a holds the group's lowest coordinate along axis a and the lowest cell in reach, lane 2a + 1 the highest
-    real bound = 0, low[3] = {0, 0, 0}, high[3] = {0, 0, 0};
+    real bound = 0, low[3], high[3], center[3], square = 0;
 #pragma unroll
     for (int a = 0; a < DIM; ++a) {
         low[a] = lane < group ? mine.p[a] : INF;
@@ -392,9 +420,45 @@ while (place < stop) {
             high[a] = __int_as_float(flip(__reduce_max_sync(ALL, flip(__float_as_int(high[a])))));
         }
         bound = lane == 2 * a ? low[a] : lane == 2 * a + 1 ? high[a] : bound;
+        center[a] = real(0.5) * low[a] + real(0.5) * high[a];
+        const real below = center[a] - low[a], above = high[a] - center[a], half = (below > above ? below : above) * step_scale;
+        square += half * half;
     }
-    if (lane < 2 * DIM)
-        warp.box.bound[lane] = bound;
+    // float32: everything near is closer to the center than 240 of the unit, a power of two, so that its square is a half, too
+    real unit = 1, scale = step_scale;
+    const float diagonal = 1.0001f * square_root((float)square);
+    if constexpr (!DOUBLE) {
+        constexpr float SMALLEST = 0x1p-126f;
+        unit = __uint_as_float(__float_as_uint(__fdividef(240, diagonal + step_radius)) & 0x7f800000u);
+#pragma unroll
+        for (int a = 0; a < DIM; ++a)
+            unit = fabsf(center[a]) * step_scale * unit < 1e37f ? unit : 0;
+        if (unit < SMALLEST) {  // coordinates that overflow otherwise: all pairs that are near are decided one by one
+            unit = SMALLEST;
+            scale = SCALED ? 1 : scale;
+        }
+    }
+    const real group_radius = (SCALED ? radius * scale : radius) * unit;
+    const real near_square = group_radius * group_radius * (1 + 8 * step_eps) + (DOUBLE ? real(0) : real(1e-30));
+    const float reach = fminf(diagonal * (float)unit + (float)group_radius, 240), coarse_band = reach * reach * 2e-5f;  // see meet
+    auto from_center = [&](real x, real center) -> real {
+        const real y = SCALED ? x * scale : x;
+        if constexpr (DOUBLE)
+            return y - center;
+        else
+            return fmaf((float)y, (float)unit, -(float)center);
+    };
+    Box box;
+    box.center[3] = near_square;
+    box.half[3] = 2 * coarse_band;
+#pragma unroll
+    for (int a = 0; a < DIM; ++a) {
+        box.center[a] = (SCALED ? center[a] * scale : center[a]) * unit;
+        const real below = -from_center(low[a], box.center[a]), above = from_center(high[a], box.center[a]);
+        box.half[a] = (below > above ? below : above) * (1 + 16 * step_eps);
+    }
+    if (lane == 0)
+        warp.box = box;
     whole reached;
     {
         const real x = cell_of(lane / 2, lane % 2 ? bound + radius : bound - radius);
@@ -405,138 +469,30 @@ while (place < stop) {
             reached = lane % 2 ? (reached < extent ? reached : extent - 1) : (reached < 0 ? 0 : reached);
         } else
             reached = cell_number(x);
+        if (lane >= 2 * DIM)
+            reached = 0;
     }
-    whole first[3] = {0, 0, 0}, last[3] = {0, 0, 0};
+    auto cells_along = [&](int a) { return (int)(__shfl_sync(ALL, reached, 2 * a + 1) - __shfl_sync(ALL, reached, 2 * a)) + 1; };
+    int rows = ORDER != 0 ? cells_along(0) : 1;  // on a curve, cells along x are no run
+    if (cells_along(0) <= 0 || cells_along(1) <= 0 || cells_along(2) <= 0)
+        rows = 0;
+    rows *= cells_along(1) * cells_along(2);
+    // the candidates of up to 32 rows of cells, as runs; returns how many
+    auto find_runs = [&](int base) -> int {
+        whole first[3];
 #pragma unroll
-    for (int a = 0; a < DIM; ++a) {
-        first[a] = __shfl_sync(ALL, reached, 2 * a);
-        last[a] = __shfl_sync(ALL, reached, 2 * a + 1);
-    }
-    const int length = (int)(last[0] - first[0]) + 1, wide = (int)(last[1] - first[1]) + 1;
-    const int across = ORDER != 0 ? length : 1;  // on a curve, cells along x are no run
-    const int rows = length > 0 && wide > 0 && last[2] >= first[2] ? across * wide * (int)(last[2] - first[2] + 1) : 0;
-    // since the rows were last written: `kept` candidates, of which `tested` have met the queries
-    // of this query: `found` neighbors, of which `written` stand in its row and up to CHUNK wait in its list
-    int found = 0, written = 0;
-    unsigned int waiting = 0, kept = 0, tested = 0;
-    auto keep = [&](const Place& candidate, unsigned int number) {
-#pragma unroll
-        for (int a = 0; a < DIM; ++a)
-            warp.candidates[a][number % 64] = candidate.p[a];
-        if constexpr (LATER)
-            warp.candidate_ids[number % 64] = id_of(candidate.id);
-        if constexpr (LIST)
-            warp.ids[number ^ 31] = id_of(candidate.id);
-    };
-    bool meets_itself = drops_self;  // the first candidates are the queries themselves: number = lane
-    if (own) {
-        if (lane < group)
-            keep(mine, lane);
-        kept = group;
-    }
-    const bool in_quads = (capacity & 3) == 0;  // only then rows begin where 16 bytes may be stored at once
-    int* const list = warp.lists[LIST ? lane : 0];
-    auto write_rows = [&](bool finished) {
-        __syncwarp();
-        unsigned int hits = 0, word = shared_address(&warp.hits[0][lane]), id_word = shared_address(warp.ids) - 128;
-        const unsigned int last_word = word + 4 * tested, list_begin = shared_address(list), list_end = list_begin + 4 * CHUNK;
-        for (bool more = true; more;) {
-            // every lane numbers its next neighbors, two at a time
-            unsigned int list_at = list_begin + 4 * waiting;
-            while (list_at < list_end && (hits || word != last_word))
-                asm volatile("{.reg .pred empty, one, two; .reg .u32 bit, at, id, other_bit, other_at, other_id;"
-                             "setp.eq.u32 empty, %0, 0;"  // the next word
-                             "@empty ld.shared.u32 %0, [%1];"
-                             "@empty add.u32 %1, %1, 128;"
-                             "@empty add.u32 %2, %2, 128;"
-                             "setp.ne.u32 one, %0, 0;"
-                             "bfind.u32 bit, %0;"
-                             "mad.lo.u32 at, bit, 4, %2;"
-                             "@one ld.shared.u32 id, [at];"
-                             "shl.b32 bit, 1, bit;"
-                             "xor.b32 %0, %0, bit;"
-                             "setp.ne.u32 two, %0, 0;"
-                             "bfind.u32 other_bit, %0;"
-                             "mad.lo.u32 other_at, other_bit, 4, %2;"
-                             "@two ld.shared.u32 other_id, [other_at];"
-                             "shl.b32 other_bit, 1, other_bit;"
-                             "xor.b32 %0, %0, other_bit;"
-                             "@one st.shared.u32 [%3], id;"
-                             "@two st.shared.u32 [%3 + 4], other_id;"
-                             "@one add.u32 %3, %3, 4;"
-                             "@two add.u32 %3, %3, 4;}"
-                             : "+r"(hits), "+r"(word), "+r"(id_word), "+r"(list_at) : : "memory");
-            waiting = (list_at - list_begin) / 4;
-            const bool writes = lane < group && (finished || waiting >= CHUNK);
-            if (finished)
-#pragma unroll 1
-                for (; waiting < CHUNK; ++waiting)
-                    list[waiting] = n;
-            // eight lanes write what waits for one row
-            const int before = writes ? written : capacity;
-            const unsigned long long slot = (unsigned long long)my_id * capacity + before;
-            __syncwarp();
-#pragma unroll
-            for (int k = 0; k < 32; k += 4) {
-                const int row = k + lane / 8, first = lane % 8 * 4;
-                const int room = capacity - __shfl_sync(ALL, before, row) - first;
-                const unsigned long long row_slot = __shfl_sync(ALL, slot, row);
-                if (room <= 0)
-                    continue;
-                int* const out = idx.data + row_slot + first;
-                const int* const from = warp.lists[row] + first;
-                const int4 four = make_int4(from[0], from[1], from[2], from[3]);
-                if (in_quads) {
-                    *(int4*)out = four;
-                    continue;
-                }
-                out[0] = four.x;
-                if (room > 1) out[1] = four.y;
-                if (room > 2) out[2] = four.z;
-                if (room > 3) out[3] = four.w;
-            }
-            __syncwarp();
-            if (writes) {
-                written += CHUNK;
-                waiting -= CHUNK;
-                list[0] = list[CHUNK];  // if there was one more
-            }
-            more = __any_sync(ALL, finished ? lane < group && written < capacity : hits || word != last_word);
-        }
-    };
-    for (int base = 0; base < rows; base += 32) {
-        // each lane finds one row of cells
+        for (int a = 0; a < 3; ++a)
+            first[a] = __shfl_sync(ALL, reached, 2 * a);
+        const int length = cells_along(0), wide = cells_along(1), across = ORDER != 0 ? length : 1;
         int from = 0, size = 0;
         const int row = base + lane, line = row / across, level = line / wide;
         const whole y = first[1] + (line - level * wide), z = first[2] + level;
         if (grid.dense) {
             if (row < rows) {
-                whole x0 = first[0], x1 = last[0];
-                if (TRIM && ORDER == 0) {  // only the chord of the sphere, widened by more than rounding can take from it
-                    float free = 1.0f;
-#pragma unroll
-                    for (int a = 1; a < DIM; ++a) {
-                        const real edge = radius * (real(1) / REACH);
-                        const real below = (grid.low[a] + real(a == 1 ? y : z)) * edge, above = below + edge;
-                        const real gap = below - high[a] > low[a] - above ? below - high[a] : low[a] - above;
-                        const real safe = (gap - 16 * step_eps * (magnitude(below) + edge)) * (real(1) / radius);
-                        const float part = safe > 0 ? (float)safe : 0.0f;
-                        free -= part * part;
-                    }
-                    const real reach = radius * real(square_root(fmaxf(free, 0.0f) + 1e-5f) * 1.000001f);
-                    const whole a = axis_cell(grid, 0, low[0] - reach), b = axis_cell(grid, 0, high[0] + reach);
-                    x0 = a > x0 ? a : x0;
-                    x1 = free < -1e-5f ? x0 - 1 : b < x1 ? b : x1;
-                }
-                if (ORDER != 0) {
-                    const int s = curve(grid, (unsigned int)(x0 + row % across), (unsigned int)y, (unsigned int)z);
-                    from = start[s];
-                    size = start[s + 1] - from;
-                } else if (x1 >= x0) {
-                    const int s = row_start(grid, y, z);
-                    from = start[s + x0];
-                    size = start[s + x1 + 1] - from;
-                }
+                const int s = ORDER != 0 ? curve(grid, (unsigned int)(first[0] + row % across), (unsigned int)y, (unsigned int)z)
+                                         : row_start(grid, y, z) + (int)first[0];
+                from = start[s];
+                size = start[s + (ORDER != 0 ? 1 : length)] - from;
             }
         } else {
             const int begins = ring(row_start(grid, y, z) + ring(first[0], grid.cells), grid.cells);
@@ -570,133 +526,431 @@ while (place < stop) {
             const int other = __shfl_up_sync(ALL, end, step);
             end += lane >= step ? other : 0;
         }
-        const int total = __shfl_sync(ALL, end, 31);
         const unsigned int occupied = __ballot_sync(ALL, size > 0);
         __syncwarp();
         if (size > 0)
-            warp.shifts[__popc(occupied & lanes_below)] = from - (end - size);
+            warp.runs[__popc(occupied & lanes_below)] = Run{end, from - (end - size)};
+        if (lane == 0)
+            warp.runs[__popc(occupied)] = Run{0x7fffffff, 0};
         __syncwarp();
-
-        int rows_done = 0, at = -1;
-        const int wrap = grid.dense ? 0x7fffffff : grid.finite;  // where the ring of cells closes
-        const bool last_rows = base + 32 >= rows;
-        Place candidate{{0, 0, 0}, 0};
-        auto fetch = [&](int c0) {
-            // rows that end before one of these 32 candidates, a bit each: rows that are empty end with the one before
-            unsigned int ended;
-            asm("shl.b32 %0, 1, %1;" : "=r"(ended) : "r"(end - c0 - 1));  // 0 unless 0 < end - c0 <= 32
-            ended = __reduce_or_sync(ALL, ended);
-            at = -1;
-            if (c0 + lane < total) {
-                at = c0 + lane + warp.shifts[rows_done + __popc(ended & lanes_below)];
-                at -= at >= wrap ? wrap : 0;
-                candidate = load(sorted + at);
+        return __shfl_sync(ALL, end, 31);
+    };
+    // since the rows were last written: `kept` candidates, of which `tested` have met the queries
+    int found = 0;  // neighbors of this query
+    unsigned int kept = 0, tested = 0;
+    if constexpr (LIST)
+        warp.written[lane] = 0;
+    auto keep = [&](const Place& candidate, const real* from_center, unsigned int number) {
+        if constexpr (DOUBLE)
+#pragma unroll
+            for (int a = 0; a < DIM; ++a)
+                warp.candidates[a][number % RING] = candidate.p[a];
+        else {
+            float square = 0;
+#pragma unroll
+            for (int a = 0; a < 3; ++a) {
+                const float x = a < DIM ? (float)from_center[a] : 0;
+                square += x * x;
+                warp.candidates[a][number % RING] = __uint_as_float(halves(x, 1));
             }
-            rows_done += __popc(ended);
-        };
-        if (total > 0)
-            fetch(0);
-        int c0 = 0;
-#pragma unroll 1
-        while (c0 < total || (last_rows && tested < kept)) {
-            const Box box = *(const Box*)&warp.box;  // from there, since registers are few
-            real square = 0;
+            warp.candidates[3][number % RING] = __uint_as_float(halves(square, 1));
+        }
+        if constexpr (LATER || !LIST)
+            warp.candidate_ids[number % RING] = id_of(candidate.id);
+        if constexpr (LIST)
+            warp.ids[number] = id_of(candidate.id);
+    };
+    // queries as rows of matrices, see meet: those of a quad of lanes, whose lanes hold one column each
+    unsigned int rows_high[4] = {0, 0, 0, 0}, rows_low[4] = {0, 0, 0, 0};
+    real mine_from_center[3] = {0, 0, 0};
 #pragma unroll
-            for (int a = 0; a < DIM; ++a) {
-                const real x = candidate.p[a];
-                real gap = larger(larger(box.bound[2 * a] - x, x - box.bound[2 * a + 1]), 0);
-                if constexpr (SCALED)
-                    gap *= step_scale;
-                square += gap * gap;
-            }
-            const bool near = at >= 0 && square <= square_radius + band && (unsigned int)(at - place) >= (own ? group : 0);
-            const unsigned int all_near = __ballot_sync(ALL, near);
-            if (near)
-                keep(candidate, kept + __popc(all_near & lanes_below));
-            kept += __popc(all_near);
-            c0 += 32;
-            at = -1;
-            if (c0 < total)
-                fetch(c0);
-            if (kept - tested < 32 && !(last_rows && c0 >= total && tested < kept))
-                continue;
-            __syncwarp();
-            const unsigned int first_candidate = tested % 64;
-            const unsigned int here = kept - tested < 32 ? kept - tested : 32;
-            unsigned int hits = 0, closest = 0x7fffffff;
-            auto allowed = [&](int j) { return !LATER || warp.candidate_ids[first_candidate + j] >= my_id + drop_self; };
-            constexpr int ALONG = 16 / sizeof(real);  // candidates whose coordinate one load brings
+    for (int a = 0; a < DIM; ++a)
+        mine_from_center[a] = lane < group ? from_center(mine.p[a], box.center[a]) : 0;
+    if constexpr (!DOUBLE) {
+        unsigned int words[2][4];
+        float own_square = 0;
 #pragma unroll
-            for (int j = 0; j < 32; j += ALONG) {
-                struct alignas(16) Loaded { real x[ALONG]; } loaded[DIM];
+        for (int a = 0; a < 3; ++a) {
+            const float x = (float)mine_from_center[a];
+            own_square += x * x;
+            const unsigned int word = halves(x, -2);
+            words[0][a] = __byte_perm(word, 0, 0x1010);
+            words[1][a] = __byte_perm(word, 0, 0x3232);
+        }
+        words[0][3] = ONES;
+        words[1][3] = halves(own_square - ((float)group_radius * (float)group_radius - coarse_band), 1);
+        unsigned int* const columns = (unsigned int*)warp.candidates;
 #pragma unroll
-                for (int a = 0; a < DIM; ++a)
-                    loaded[a] = *(const Loaded*)(warp.candidates[a] + first_candidate + j);
+        for (int k = 0; k < 8; ++k)
+            columns[33 * k + lane] = words[k / 4][k % 4];
+        __syncwarp();
 #pragma unroll
-                for (int e = 0; e < ALONG; ++e) {
-                    real p[DIM];
-#pragma unroll
-                    for (int a = 0; a < DIM; ++a)
-                        p[a] = loaded[a].x[e];
-                    const unsigned int over = upper_word(allowed(j + e) ? excess(mine.p, p) : INF);
-                    hits = __funnelshift_l(over, hits, 1);
-                    if constexpr (EXACTLY)
-                        closest = min(closest, over);
-                }
-            }
-            unsigned int met = lane < group ? 0xffffffffu << (32 - here) : 0;  // candidates that are none are not met
-            if (meets_itself)
-                met &= ~(0x80000000u >> lane);
-            meets_itself = false;
-            hits &= met;
-            if (EXACTLY && __any_sync(ALL, closest <= upper_word(2 * band))) {
-                auto candidate = [&](int j, real* p) {
-#pragma unroll
-                    for (int a = 0; a < DIM; ++a)
-                        p[a] = warp.candidates[a][first_candidate + j];
-                };
-                unsigned int open = 0;
-#pragma unroll 4
-                for (int j = 0; j < 32; ++j) {
-                    real p[DIM];
-                    candidate(j, p);
-                    const real over = excess(mine.p, p);
-                    open |= allowed(j) && over >= 0 && over <= 2 * band ? 0x80000000u >> j : 0;
-                }
-                for (open &= met; open;) {
-                    const int j = __clz(open);
-                    const unsigned int bit = 0x80000000u >> j;
-                    open ^= bit;
-                    real p[DIM];
-                    candidate(j, p);
-                    hits |= exact_pair(mine.p, p) ? bit : 0;
-                }
-            }
-            found += __popc(hits);
-            if constexpr (LIST)
-                warp.hits[tested / 32][lane] = hits;
-            tested += 32;
-            __syncwarp();
-            if (LIST && tested == 32 * BLOCKS) {
-                write_rows(false);
-                warp.ids[lane] = warp.ids[32 * BLOCKS + lane];  // of the few that are not tested yet
-                kept = kept > tested ? kept - tested : 0;
-                tested = 0;
-            }
+        for (int i = 0; i < 4; ++i) {
+            rows_high[i] = columns[33 * (lane % 4) + (lane & 28) + i];
+            rows_low[i] = columns[33 * (lane % 4 + 4) + (lane & 28) + i];
         }
         __syncwarp();
     }
-    if constexpr (LIST)
-        write_rows(true);
+    // float32: what most pairs are decided by. With a and b from the center, |b - a|^2 - r^2 + coarse_band is
+    // -2 a.b + |b|^2 * 1 + 1 * (|a|^2 - r^2 + coarse_band): products of rows and columns, in which a number is two halves, high
+    // and low. The tensor cores multiply them exactly and add in single precision at least, in whatever order, flushing or not
+    // flushing halves that are denormal (PTX ISA, mma). Of reach^2, 16 sums of terms that add up to 6.5 lose less than 1.3e-5,
+    // flushing (reach > 120, or it does not matter) less than 4e-6, splitting and scaling less than 2e-6: less than the band of
+    // 2e-5. Negative: surely closer than the cutoff; beyond 2 coarse_band: surely not; between: decided one by one.
+    // One bit per candidate of a block: the sum's bits, less `from`, are negative.
+    auto meet = [&](unsigned int first_candidate, unsigned int from, unsigned int& closest) -> unsigned int {
+        const uint4 loaded = *(const uint4*)(warp.candidates[DOUBLE ? 0 : lane % 4] + first_candidate + lane / 4 * 4);
+        const unsigned int column[4] = {loaded.x, loaded.y, loaded.z, loaded.w};
+        unsigned int nibbles[4][2] = {{0, 0}, {0, 0}, {0, 0}, {0, 0}};
+#pragma unroll
+        for (int j = 3; j >= 0; --j) {
+            const unsigned int again = lane % 4 == 3 ? ONES : column[j];  // meets the low halves
+#pragma unroll
+            for (int half = 0; half < 2; ++half) {
+                float sum[4];
+                asm volatile("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9},"
+                             "{%10, %10, %10, %10};"
+                             : "=f"(sum[0]), "=f"(sum[1]), "=f"(sum[2]), "=f"(sum[3])
+                             : "r"(rows_high[2 * half]), "r"(rows_high[2 * half + 1]), "r"(rows_low[2 * half]),
+                               "r"(rows_low[2 * half + 1]), "r"(column[j]), "r"(again), "f"(0.0f));
+#pragma unroll
+                for (int k = 0; k < 4; ++k) {
+                    unsigned int& nibble = nibbles[2 * half + k / 2][k % 2];
+                    nibble = __funnelshift_l(__float_as_uint(sum[k]) - from, nibble, 1);
+                    closest = min(closest, __float_as_uint(sum[k]));
+                }
+            }
+        }
+        unsigned int bits = 0;
+#pragma unroll
+        for (int k = 0; k < 8; ++k)
+            bits += nibbles[k / 2][k % 2] << 4 * k;
+        // four bits of each of eight candidates become 32 of one query
+        bits = __byte_perm(bits, __shfl_xor_sync(ALL, bits, 2), lane & 2 ? 0x3276 : 0x5410);
+        return __byte_perm(bits, __shfl_xor_sync(ALL, bits, 1), lane & 1 ? 0x3715 : 0x6240);
+    };
+    bool meets_itself = drops_self;  // the first candidates are the queries themselves: number = lane
+    if (own) {
+        if (lane < group)
+            keep(mine, mine_from_center, lane);
+        kept = group;
+    }
+    unsigned int met_in = 0;  // blocks that have a neighbor of this query, a bit each
+    auto write_rows = [&](bool finished) {
+        // behind the last block one of all n, which fill the rows up, or one that nobody has met
+        const unsigned int behind = 1u << tested / 32;
+        warp.hits[tested / 32][lane] = finished ? ALL : 0;
+        if (finished)
+            warp.ids[tested + lane] = n;
+        met_in |= behind;
+        int written = (int)(warp.written[lane] & ~3u);
+        unsigned int waiting = warp.written[lane] & 3;
+        unsigned int* const list = warp.lists[lane];
+        list[0] = shared_address(&warp.left[0][lane]) | shared_address(&warp.left[1][lane]) << 16;
+#pragma unroll
+        for (int k = 1; k < CHUNK / 2 + 2; ++k)  // what is read, whether it is written or not
+            list[k] = shared_address(&warp.left[2][lane]) * 0x10001u;
+        __syncwarp();
+        const unsigned int words = shared_address(&warp.hits[0][lane]), to_ids = shared_address(warp.ids) - words;
+        const unsigned int list_begin = shared_address(list), list_end = list_begin + 2 * CHUNK;
+        const unsigned int last_ids = finished ? 1 : words + to_ids + 4 * tested;
+        unsigned int hits = 0, ids = 0, next = 0, next_ids = 0;
+        auto advance = [&]() {  // to the next block, if nothing is left of this one; its bits are loaded ahead
+            asm volatile("{.reg .pred empty; .reg .u32 below, bit;"
+                         "setp.eq.u32 empty, %0, 0;"
+                         "@empty mov.b32 %0, %1;"
+                         "@empty mov.b32 %2, %3;"
+                         "@empty sub.u32 below, %4, 1;"
+                         "@empty lop3.b32 bit, below, %4, 0, 0x30;"
+                         "@empty popc.b32 bit, bit;"
+                         "@empty lop3.b32 %4, %4, below, %5, 0xea;"
+                         "@empty mad.lo.u32 bit, bit, 128, %6;"
+                         "@empty ld.shared.u32 %1, [bit];"
+                         "@empty add.u32 %3, bit, %7;}"
+                         : "+r"(hits), "+r"(next), "+r"(ids), "+r"(next_ids), "+r"(met_in)
+                         : "r"(behind), "r"(words), "r"(to_ids) : "memory");
+        };
+        advance();
+        for (bool more = true; more;) {
+            // every lane numbers its next neighbors
+            unsigned int list_at = list_begin + 2 * waiting;
+            while (list_at < list_end && ids != last_ids) {
+                advance();
+                const unsigned int taken = __popc(hits) < TAKEN ? __popc(hits) : TAKEN;
+#pragma unroll
+                for (int k = 0; k < TAKEN; ++k) {
+                    const unsigned int below = hits - 1, address = ids + 4 * __popc(below & ~hits);
+                    hits &= below;
+                    asm volatile("st.shared.u16 [%0], %1;" : : "r"(list_at + 2 * k), "h"((unsigned short)address) : "memory");
+                }
+                list_at += 2 * taken;
+            }
+            waiting = (list_at - list_begin) / 2;
+            // eight lanes write what waits for one row, and maybe more that will be written again
+            const unsigned int ready = waiting >= CHUNK ? CHUNK : ids == last_ids ? waiting & ~3u : 0;
+            const int before = lane < group && ready > 0 ? written : capacity;
+            __syncwarp();
+            auto load_id = [](unsigned int at) {  // may be moved: nothing is written to where addresses lead
+                int id;
+                asm("ld.shared.u32 %0, [%1];" : "=r"(id) : "r"(at));
+                return id;
+            };
+            auto row_of = [&](int k) { return k + lane / 8; };
+            char* const column = (char*)(idx.data + lane % 8 * 4);
+            const unsigned int row_bytes = 4u * (unsigned int)capacity;
+            auto four_of = [&](int k) {
+                const unsigned short* const from = (const unsigned short*)warp.lists[row_of(k)] + lane % 8 * 4;
+                return make_int4(load_id(from[0]), load_id(from[1]), load_id(from[2]), load_id(from[3]));
+            };
+            auto out_of = [&](int k, int& room) {
+                const unsigned int row_before = __shfl_sync(ALL, before, row_of(k)), row_id = __shfl_sync(ALL, my_id, row_of(k));
+                room = capacity - lane % 8 * 4 - (int)row_before;
+                return (int*)(column + (unsigned long long)row_id * row_bytes + (unsigned long long)row_before * 4);
+            };
+            if ((capacity & 3) == 0) {  // only then rows begin where 16 bytes may be stored at once
+#pragma unroll
+                for (int k = 0; k < 32; k += 4) {
+                    int room;
+                    int* const out = out_of(k, room);
+                    const int4 four = four_of(k);
+                    if (room > 0)
+                        asm volatile("st.global.v4.s32 [%0], {%1, %2, %3, %4};"
+                                     : : "l"(out), "r"(four.x), "r"(four.y), "r"(four.z), "r"(four.w) : "memory");
+                }
+            } else {
+#pragma unroll 1
+                for (int k = 0; k < 32; k += 4) {
+                    int room;
+                    int* const out = out_of(k, room);
+                    const int4 four = four_of(k);
+                    if (room > 0) out[0] = four.x;
+                    if (room > 1) out[1] = four.y;
+                    if (room > 2) out[2] = four.z;
+                    if (room > 3) out[3] = four.w;
+                }
+            }
+            __syncwarp();
+            written += ready;
+            waiting -= ready;
+            const unsigned int one = list[ready / 2], two = list[ready / 2 + 1];  // of up to three more
+            list[0] = one;
+            list[1] = two;
+            more = __any_sync(ALL, finished ? lane < group && written < capacity : ids != last_ids);
+        }
+        if (!finished) {
+            warp.written[lane] = (unsigned int)written | waiting;
+            const int ids[3] = {load_word(list[0] & 0xffff), load_word(list[0] >> 16), load_word(list[1] & 0xffff)};
+#pragma unroll
+            for (int k = 0; k < 3; ++k)
+                warp.left[k][lane] = ids[k];
+        }
+        met_in = 0;
+    };
+
+    int base = 0, total = 0, fetched = 0;  // rows of cells, candidates of their runs, those that were fetched
+    int run_end = 0, run_shift = 0;  // of what this lane fetches
+    const Run* run = warp.runs;
+    Place candidates[FETCHED];
+    auto fetch = [&]() {
+#pragma unroll
+        for (int k = 0; k < FETCHED; ++k) {
+            const int number = fetched + 32 * k + lane;
+            while (number >= run_end) {
+                run_end = run->end;
+                run_shift = run->shift;
+                ++run;
+            }
+            int at = number + run_shift;
+            if (!grid.dense && at >= grid.finite)  // the ring of cells closes
+                at -= grid.finite;
+            candidates[k].p[0] = INF;
+            if (number < total && (unsigned int)(at - place) >= (own ? group : 0))
+                candidates[k] = load(sorted + at);
+        }
+    };
+    for (bool finished = false; !finished;) {
+        if (fetched >= total && base < rows) {
+            total = find_runs(base);
+            base += 32;
+            fetched = 0;
+            run_end = 0;
+            run = warp.runs;
+            fetch();
+        }
+        if (fetched < total) {
+            const Box box = *(const Box*)&warp.box;  // from there, since registers are few
+            real p[FETCHED][3];
+            bool near[FETCHED];
+#pragma unroll
+            for (int k = 0; k < FETCHED; ++k) {
+                real square = 0;
+#pragma unroll
+                for (int a = 0; a < DIM; ++a) {
+                    p[k][a] = from_center(candidates[k].p[a], box.center[a]);
+                    const real gap = larger(magnitude(p[k][a]) - box.half[a], 0);
+                    square += gap * gap;
+                }
+                near[k] = square <= box.center[3];
+            }
+#pragma unroll
+            for (int k = 0; k < FETCHED; ++k) {
+                const unsigned int all_near = __ballot_sync(ALL, near[k]);
+                if (near[k])
+                    keep(candidates[k], p[k], kept + __popc(all_near & lanes_below));
+                kept += __popc(all_near);
+            }
+            fetched += 32 * FETCHED;
+            if (fetched < total)
+                fetch();
+        }
+        const bool last_ones = fetched >= total && base >= rows;
+        __syncwarp();
+        while ((!LIST || tested < 32 * BLOCKS) && kept >= tested + (last_ones ? 1 : 32)) {
+            const unsigned int first_candidate = tested % RING;
+            const unsigned int here = kept - tested < 32 ? kept - tested : 32;
+            unsigned int met = lane < group ? ALL >> (32 - here) : 0;  // candidates that are none are not met
+            if (meets_itself)
+                met &= ~(1u << lane);
+            meets_itself = false;
+            if constexpr (LATER) {
+                unsigned int earlier = 0;
+#pragma unroll
+                for (int j = 31; j >= 0; --j) {
+                    const int later_by = warp.candidate_ids[first_candidate + j] - my_id - drop_self;
+                    earlier = __funnelshift_l((unsigned int)later_by, earlier, 1);
+                }
+                met &= ~earlier;
+            }
+            unsigned int hits = 0, open = 0, closest = 0x7fffffff;
+            if constexpr (!DOUBLE) {
+                hits = meet(first_candidate, 0, closest);
+                const unsigned int until = __float_as_uint((float)warp.box.half[3]);
+                if (__any_sync(ALL, closest <= until))
+                    open = meet(first_candidate, until + 1, closest) & ~hits;
+            } else {
+                constexpr int ALONG = 16 / sizeof(real);  // candidates whose coordinate one load brings
+#pragma unroll
+                for (int j = 32 - ALONG; j >= 0; j -= ALONG) {
+                    struct alignas(16) Loaded { real x[ALONG]; } loaded[DIM];
+#pragma unroll
+                    for (int a = 0; a < DIM; ++a)
+                        loaded[a] = *(const Loaded*)(warp.candidates[a] + first_candidate + j);
+#pragma unroll
+                    for (int e = ALONG - 1; e >= 0; --e) {
+                        real p[DIM];
+#pragma unroll
+                        for (int a = 0; a < DIM; ++a)
+                            p[a] = loaded[a].x[e];
+                        const unsigned int over = upper_word(excess(mine.p, p));
+                        hits = __funnelshift_l(over, hits, 1);
+                        if constexpr (EXACTLY)
+                            closest = min(closest, over);
+                    }
+                }
+                if (EXACTLY && __any_sync(ALL, closest <= upper_word(2 * band)))
+#pragma unroll 4
+                    for (int j = 0; j < 32; ++j) {
+                        real p[DIM];
+#pragma unroll
+                        for (int a = 0; a < DIM; ++a)
+                            p[a] = warp.candidates[a][first_candidate + j];
+                        const real over = excess(mine.p, p);
+                        open |= over >= 0 && over <= 2 * band ? 1u << j : 0;
+                    }
+            }
+            hits &= met;
+            open &= met;
+            if (__any_sync(ALL, open)) {
+                // registers that hold something across a call cannot be the callee's: few are left, so memory holds it
+                volatile unsigned int saved[4 * FETCHED + 8];
+                if constexpr (!DOUBLE) {
+#pragma unroll
+                    for (int k = 0; k < FETCHED; ++k) {
+#pragma unroll
+                        for (int a = 0; a < DIM; ++a)
+                            saved[4 * k + a] = __float_as_uint((float)candidates[k].p[a]);
+                        saved[4 * k + 3] = __float_as_uint((float)candidates[k].id);
+                    }
+#pragma unroll
+                    for (int k = 0; k < 4; ++k) {
+                        saved[4 * FETCHED + k] = rows_high[k];
+                        saved[4 * FETCHED + 4 + k] = rows_low[k];
+                    }
+                }
+                const Place query = DOUBLE ? mine : open ? load_query(place + lane) : Place{{0, 0, 0}, 0};
+                for (; open; open &= open - 1) {
+                    const int j = __ffs(open) - 1;
+                    const int id = LIST ? warp.ids[tested + j] : warp.candidate_ids[first_candidate + j];
+                    real p[DIM];
+#pragma unroll
+                    for (int a = 0; a < DIM; ++a)
+                        p[a] = positions.data[(long long)DIM * id + a];
+                    const real over = excess(query.p, p);
+                    hits |= over < 0 || (EXACTLY && over <= 2 * band && exact_pair(query.p, p)) ? 1u << j : 0;
+                }
+                if constexpr (!DOUBLE) {
+#pragma unroll
+                    for (int k = 0; k < FETCHED; ++k) {
+#pragma unroll
+                        for (int a = 0; a < DIM; ++a)
+                            candidates[k].p[a] = __uint_as_float(saved[4 * k + a]);
+                        candidates[k].id = __uint_as_float(saved[4 * k + 3]);
+                    }
+#pragma unroll
+                    for (int k = 0; k < 4; ++k) {
+                        rows_high[k] = saved[4 * FETCHED + k];
+                        rows_low[k] = saved[4 * FETCHED + 4 + k];
+                    }
+                }
+            }
+            found += __popc(hits);
+            if constexpr (LIST) {
+                warp.hits[tested / 32][lane] = hits;
+                met_in |= hits ? 1u << tested / 32 : 0;
+            }
+            tested += 32;
+        }
+        __syncwarp();
+        finished = last_ones && tested >= kept;
+        if constexpr (LIST)
+            if (finished || tested == 32 * BLOCKS) {
+                write_rows(finished);
+                if (finished)
+                    break;
+                kept = kept > tested ? kept - tested : 0;
+                tested = 0;
+                // the candidates that are not tested yet, again, since lists stood there
+                Place left[FETCHED];
+#pragma unroll
+                for (int k = 0; k < FETCHED; ++k) {
+                    const int id = warp.ids[32 * (BLOCKS + k) + lane];
+                    left[k].id = bits_as_real(id);
+#pragma unroll
+                    for (int a = 0; a < DIM; ++a)
+                        left[k].p[a] = 32 * k + lane < kept ? positions.data[(long long)DIM * id + a] : 0;
+                }
+                __syncwarp();
+#pragma unroll
+                for (int k = 0; k < FETCHED; ++k)
+                    if (32 * k + lane < kept) {
+                        real p[3];
+#pragma unroll
+                        for (int a = 0; a < DIM; ++a)
+                            p[a] = from_center(left[k].p[a], warp.box.center[a]);
+                        keep(left[k], p, 32 * k + lane);
+                    }
+            }
+    }
     if (lane < group)
         count.data[my_id] = found;
     const int longest_row = __reduce_max_sync(ALL, lane < group ? found : 0);
-    if (lane == 0 && longest_row > *(volatile int*)&info.data[0]) {
+    if (lane == 0 && longest_row > longest_before) {
         atomicMax(&info.data[0], longest_row);
         if (LIST && longest_row > capacity)
             atomicOr(&info.data[1], 1);
     }
     place += group;
+    __syncwarp();
 }
 """
 
@@ -752,22 +1006,21 @@ def cell_kernels(
     exact: bool = True,
     reach: int = 1,
     reach_x: int = 6,
-    trim: bool = True,
     blocks: int | None = None,
     order: int = 0,
 ) -> Kernels:
     """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts, half lists or whole.
 
     The rest is there to be measured. exact=False lets the working precision decide alone (`|d|^2 < r^2 (1 - 8 eps)`); `reach` is
-    the number of cell edges in a cutoff along y and z, `reach_x` along x; `trim` cuts rows of cells to the chord of the sphere;
-    `blocks` per multiprocessor bound the registers; `order` of the cells: 0 row-major, 1 Morton, 2 Hilbert.
+    the number of cell edges in a cutoff along y and z, `reach_x` along x; `blocks` per multiprocessor bound the registers; `order`
+    of the cells: 0 row-major, 1 Morton, 2 Hilbert.
     """
-    blocks = blocks or (8 if lists else 12)  # registers against occupancy, measured on an H200
+    blocks = blocks or (24 if not lists else 16 if double else 20)  # registers against occupancy, measured on an H200
     kind = f"{dim}d_{'f64' if double else 'f32'}_r{reach}x{reach_x}{('', '_morton', '_hilbert')[order]}"
-    variant = f"{kind}{'_scaled' * scaled}{'_list' * lists}{'_later' * later}{'' if exact else '_inexact'}{'_whole' * (not trim)}"
+    variant = f"{kind}{'_scaled' * scaled}{'_list' * lists}{'_later' * later}{'' if exact else '_inexact'}"
     variant += f"_b{blocks}"
     grid = {"REACH": reach, "REACH_X": reach_x, "ORDER": order, "PARTS": _PARTS, "TILE": _TILE, "BLOCK": BLOCK}
-    query = {"SCALED": scaled, "LIST": lists, "LATER": later, "EXACTLY": exact, "TRIM": trim}
+    query = {"SCALED": scaled, "LIST": lists, "LATER": later, "EXACTLY": exact}
     query |= {"QUERY_BLOCK": QUERY_BLOCK, **grid}
     return Kernels(
         _kernel(f"bounds_{kind}", kind, dim, double, BLOCK, 1, grid, _REDUCE, _BOUNDS),
