@@ -6,7 +6,7 @@ scan     counts to first places, in one pass (Merrill & Garland 2016, decoupled 
 scatter  indices into their cells, in the order in which they came
 gather   positions into cell order, ranked by index within a cell: the same order in every run
 query    a warp serves up to 32 neighboring queries, one per lane: candidates within reach of their box meet all of them, 32 in a
-         block; a neighbor is a bit, until the rows are written
+         block, float32 on tensor cores first; a neighbor is a bit, until the rows are written
 """
 
 import functools
