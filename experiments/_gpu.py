@@ -33,6 +33,7 @@ class Exactness(BaseModel):
     dtypes: list[Literal["float32", "float64"]]
     dims: list[Literal[2, 3]]
     capacity: PositiveInt
+    periodic: bool = False  # the cases of periodic boxes instead
 
 
 class Config(BaseModel):
@@ -84,7 +85,7 @@ def run(config: Config, folder: Path) -> int:
 def _rows(config: Config) -> Iterator[dict[str, Any]]:
     yield from _memory_rows()
     for part in config.exactness:
-        yield from _exactness_rows(part)
+        yield from _periodic_exactness_rows(part) if part.periodic else _exactness_rows(part)
     yield _bandwidth_row(config)
     for name, n in [("corners", 0), *(("jitter", n) for n in config.sizes)]:
         points = _corners(config) if name == "corners" else _jitter_lattice(config, n)
@@ -146,6 +147,56 @@ def _exactness_rows(config: Exactness) -> Iterator[dict[str, Any]]:
             "kind": "exactness", "method": f"jfrnn {config.backend}", "dtype": dtype, "dim": dim,
             "cases": cases, "wrong": len(wrong), "wrong_cases": wrong,
         }  # fmt: skip
+
+
+def _periodic_exactness_rows(config: Exactness) -> Iterator[dict[str, Any]]:
+    import jax
+    from jfrnn.cases.periodic import PERIODIC_CASES  # pyright: ignore[reportMissingImports]
+
+    import jfrnn
+
+    oracle = importlib.import_module("tests.reference")
+    for dtype, dim in itertools.product(config.dtypes, config.dims):
+        wrong, cases = [], 0
+        for name, half in itertools.product(PERIODIC_CASES, (False, True)):
+            given = PERIODIC_CASES[name].build(dtype, dim)
+            if not any(given.periodic) or (half and given.queries is not None):
+                continue
+            queries = None if given.queries is None else jax.numpy.asarray(_padded(given.queries, 304))
+            x, box = jax.numpy.asarray(_padded(given.positions, 304)), jfrnn.Box(given.matrix, given.periodic)
+            options = {"queries": queries, "half": half, "capacity": config.capacity, "backend": config.backend}
+            nbrs = jfrnn.search(x, given.cutoff, box=box, **options)
+            about = {"matrix": given.matrix, "periodic": given.periodic, "queries": given.queries, "half": half}
+            cases += 1
+            if _images(nbrs, x, queries) != sorted(oracle.reference_images(given.positions, given.cutoff, **about)):
+                wrong.append(f"{name}{'-half' * half}")
+        yield {
+            "kind": "exactness", "method": f"jfrnn {config.backend}, boxes", "dtype": dtype, "dim": dim,
+            "cases": cases, "wrong": len(wrong), "wrong_cases": wrong,
+        }  # fmt: skip
+
+
+def _images(nbrs: Any, x: Any, queries: Any) -> list[tuple[int, int, tuple[int, ...]]]:  # noqa: ANN401
+    """Return (i, j, S) of every slot, sorted, on the host: a program for each kind of box would take longer to compile than to run."""
+    from jfrnn._box import unpacked_turns
+
+    idx, count = np.asarray(nbrs.idx), np.asarray(nbrs.count)
+    i, k = np.nonzero(np.arange(nbrs.capacity) < count[:, None])
+    j, kind = idx[i, k], nbrs.box_kind
+    if (j >= nbrs.source_count).any() or (j < 0).any():
+        return []
+    if nbrs.images is None:
+        sources = np.asarray(x, np.float64)
+        points = sources if queries is None else np.asarray(queries, np.float64)
+        periodic, vectors = list(kind.periodic), np.asarray(nbrs.box.vectors, np.float64)
+        vectors = (np.diag(vectors) if vectors.ndim == 1 else vectors)[periodic]
+        shifts = np.zeros((len(i), sources.shape[1]), int)
+        shifts[:, periodic] = -np.rint((sources[j] - points[i]) @ np.linalg.pinv(vectors))
+    else:
+        turns, query_turns = (None if t is None else np.asarray(unpacked_turns(t, nbrs.box.dim)) for t in nbrs.images[1:])
+        own_turns = turns if query_turns is None else query_turns
+        shifts = kind.shifts[np.asarray(nbrs.images.codes)[i, k]] + own_turns[i] - turns[j]
+    return sorted(zip(i.tolist(), j.tolist(), map(tuple, shifts.tolist()), strict=True))
 
 
 def _is_exact(oracle: Any, nbrs: Any, expected: Any) -> bool:  # noqa: ANN401
@@ -281,7 +332,53 @@ def _scene_rows(config: Config, layout: str, points: np.ndarray) -> Iterator[dic
         steps = jax.jit(lambda x: lax.scan(step, x, None, length=config.steps)[0])
         seconds = [s / config.steps for s in _timed(config, lambda: steps(x), calls=3)["seconds"]]
         yield {"kind": "scan", "method": "jfrnn warp", **base, "steps": config.steps, **_measure.summarize(seconds)}
+    if layout == "jitter":
+        yield from _loop_rows(config, base, x, cutoff)
     yield from _peer_rows(config, base, x, cutoff)
+
+
+def _loop_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> Iterator[dict[str, Any]]:  # noqa: ANN401
+    """What a time loop adds: a periodic box, whose faces close the lattice, and updates of a list with a skin."""
+    import jax
+    from jax import lax
+
+    import jfrnn
+
+    box = jfrnn.Box([float(round(base["points"] ** (1 / 3)))] * 3, origin=-0.5)
+    counts = np.asarray(jfrnn.count(x, cutoff, box=box, backend="warp"))
+    capacity = _capacity(counts.max())
+
+    def periodic(x: Any) -> Any:  # noqa: ANN401
+        nbrs = jfrnn.search(x, cutoff, box=box, capacity=capacity, backend="warp")
+        return nbrs.idx, nbrs.count
+
+    search = jax.jit(periodic)
+    row = {"kind": "call", "method": "jfrnn warp, periodic box", **base, "capacity": capacity}
+    row |= {"directed_pairs": int(counts.sum(dtype=np.int64)), "exact_directed_pairs": None}
+    if base["points"] <= 250_000:
+        exact = np.asarray(jfrnn.count(x, cutoff, box=box, backend="jax"))
+        row |= {"wrong": int((counts != exact).sum()), "exact_directed_pairs": int(exact.sum(dtype=np.int64))}
+    yield row | _timed(config, lambda: search(x))
+    if base["points"] > 1_000_000:
+        return
+    skin = 0.1 * cutoff
+    wider = _capacity(jfrnn.count(x, cutoff + skin, backend="warp").max())
+    nbrs = jfrnn.search(x, cutoff, skin=skin, capacity=wider, backend="warp")
+    for name, velocity in (("keeps", 0.0), ("rebuilds", skin)):
+
+        def step(carry: Any, _: None, velocity: float = velocity) -> tuple[Any, None]:  # noqa: ANN401
+            x, nbrs = carry
+            x = x + x.dtype.type(velocity)
+            return (x, nbrs.update(x)), None
+
+        def many(x: Any, nbrs: Any, step: Any = step) -> Any:  # noqa: ANN401
+            return lax.scan(step, (x, nbrs), None, length=config.steps)[0][1].rebuild_count
+
+        steps = jax.jit(many)
+        rebuilds = int(steps(x, nbrs))
+        seconds = [s / config.steps for s in _timed(config, lambda steps=steps: steps(x, nbrs), calls=3)["seconds"]]
+        row = {"kind": "scan", "method": f"jfrnn warp, skin, {name}", **base, "capacity": wider, "steps": config.steps}
+        yield row | {"rebuilds": rebuilds, **_measure.summarize(seconds)}
 
 
 def _different_rows(one: Any, other: Any) -> int:  # noqa: ANN401

@@ -35,10 +35,6 @@ def choose_engine(backend: str, sources: Array, queries: Array | None, periodic:
     if backend not in ("auto", *WARP_ENGINES):
         return backend
     platform = _platform_of(sources, sources if queries is None else queries)
-    if periodic and platform != "cpu":
-        if backend == "warp":
-            raise ValueError("backend='warp' knows periodic boxes on the CPU alone so far: pass backend='jax'.")
-        return "jax"
     if backend == "auto":
         return fastest_engine(platform, sources.shape[0])
     _warp.load_warp()

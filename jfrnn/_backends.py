@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn import _warp
-from jfrnn._box import Box, Images, Lattice, Wrapped, fractions_of, is_valid, make_lattice, packed_turns, translation, wrap
+from jfrnn._box import Box, Images, Lattice, Wrapped, fractions_of, is_valid, make_lattice, translation, unpacked_turns, wrap
 from jfrnn._cells import CellAxes, build_grid, cell_edge, cell_order, grid_coordinates, open_axes, stencil_runs
 from jfrnn._exact import Cutoff, widened
 from jfrnn._runs import Candidates, Filter, Points, Torus, count_neighbors, list_neighbors
@@ -77,7 +77,7 @@ def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
     lattice = make_lattice(box, images, np.dtype(sources.dtype))
     wrapped = wrap(sources, queries, lattice, cutoff.radius)
     rows = _rows_of_engine(sources, queries, cutoff, options, capacity, (lattice, wrapped))
-    in_range = _all_in_range(wrapped.near, sources) & _all_in_range(wrapped.query_near, sources if queries is None else queries)
+    in_range = _all_in_range(wrapped.turns, sources) & _all_in_range(wrapped.query_turns, sources if queries is None else queries)
     checks = {Status.BOX_TOO_SMALL: wrapped.enough & is_valid(lattice), Status.OUT_OF_RANGE: in_range}
     rows = _with_status(rows, given, queries, active, checks)
     if rows.idx is None or images.nearest:
@@ -85,12 +85,12 @@ def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
     n = max(sources.shape[0], 1)
     codes = (rows.idx // n).astype(images.dtype)
     idx = jnp.where(rows.idx == n * images.total, sources.shape[0], rows.idx % n)
-    query_turns = None if queries is None else packed_turns(wrapped.query_turns)
-    return Found(rows._replace(idx=idx), codes, (packed_turns(wrapped.turns), query_turns))
+    query_turns = None if queries is None else wrapped.query_turns
+    return Found(rows._replace(idx=idx), codes, (wrapped.turns, query_turns))
 
 
-def _all_in_range(near: Array, points: Array) -> Array:
-    return (near | ~jnp.isfinite(points).all(axis=1)).all()
+def _all_in_range(turns: Array, points: Array) -> Array:
+    return ((turns >= 0) | ~jnp.isfinite(points).all(axis=1)).all()
 
 
 def _with_status(rows: Rows, sources: Array, queries: Array | None, active: Array | None, checks: dict[Status, Array]) -> Rows:
@@ -147,9 +147,9 @@ def _candidates(
         return _cell_stencil(sources, queries, points.T, axes, None)
     lattice, wrapped = given
     raw = (sources, sources if queries is None else queries)
-    turns = (wrapped.turns, wrapped.query_turns)
+    turns = tuple(unpacked_turns(x, lattice.dim).astype(sources.dtype) for x in (wrapped.turns, wrapped.query_turns))
     shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)
-    torus = Torus(lattice.images, translation(shifts, lattice), lattice.matrix, raw, turns)
+    torus = Torus(lattice.images, translation(shifts, lattice), lattice.matrix, raw, (turns[0], turns[1]))
     wrapped_queries = None if queries is None else wrapped.queries
     if brute:
         return _all_sources(wrapped.sources, wrapped_queries, torus)
@@ -197,16 +197,16 @@ def _cells_of_lattice(
     sources: Array, queries: Array | None, cutoff: Cutoff, lattice: Lattice, wrapped: Wrapped
 ) -> tuple[Array, CellAxes]:
     """Cut a lattice cell along its vectors; what is open, and not skewed, is cut as it is without a box."""
-    points, turns, near = sources, wrapped.turns, wrapped.near
+    points, packed = sources, wrapped.turns
     if queries is not None:
         points = jnp.concatenate([sources, queries])
-        turns, near = jnp.concatenate([turns, wrapped.query_turns]), jnp.concatenate([near, wrapped.query_near])
-    units = fractions_of(points, lattice)
+        packed = jnp.concatenate([packed, wrapped.query_turns])
+    units, turns = fractions_of(points, lattice), unpacked_turns(packed, lattice.dim).astype(points.dtype)
     along, edges, cells = [], [], []
     for k, periodic in enumerate(lattice.images.periodic):
         straight = lattice.images.orthogonal and not periodic
         x = points[:, k] if straight else jnp.clip(units[:, k] - turns[:, k], 0, 1) if periodic else units[:, k]
-        along.append(jnp.where(near, x, jnp.nan))
+        along.append(jnp.where(packed >= 0, x, jnp.nan))
         edges.append(cell_edge(cutoff.radius if straight else wrapped.reach[k]))
         cells.append(jnp.clip(jnp.floor(1 / wrapped.reach[k]), 1, 2.0**23) if periodic else None)
     return jnp.stack(along), CellAxes(edges, cells)

@@ -317,14 +317,12 @@ class Wrapped(NamedTuple):
     """Particles in one cell of the lattice, and what rounding may have done on the way.
 
     Attributes:
-        sources: [n, d] wrapped, near enough: within `slack` of x - turns @ matrix.
-        queries: [m, d] likewise; the sources again where they are the queries, and so on below.
-        turns: [n, d] whole floats: how many lattice vectors were taken off each source.
-        query_turns: [m, d].
+        sources: [n, d] wrapped, near enough: x - turns @ matrix but for rounding; NaN where they are out of range.
+        queries: [m, d] likewise; the sources again where they are the queries.
+        turns: [n] int32, see `packed_turns`.
+        query_turns: [m] int32.
         slack: [] bound on the error of a component of a difference of wrapped coordinates, with a shift within reach.
         reach: [d] half the width of the stencil, in units of the transform: no pair is farther apart along an axis.
-        near: [n] bool: finite and not more than `LARGEST_TURN` cells away.
-        query_near: [m] bool.
         enough: [] bool: the images that are looked at are all that there can be.
     """
 
@@ -334,8 +332,6 @@ class Wrapped(NamedTuple):
     query_turns: Array
     slack: Array
     reach: Array
-    near: Array
-    query_near: Array
     enough: Array
 
 
@@ -343,23 +339,22 @@ LARGEST_TURN = 511  # cells between a particle and the box: three such numbers s
 _TURN_BITS = 10
 
 
-def packed_turns(turns: Array) -> Array:
-    """Write turns [n, d], whole floats within `LARGEST_TURN`, as one int32 per particle, [n]."""
-    parts = (turns.astype(jnp.int32) + (LARGEST_TURN + 1)) << np.arange(turns.shape[1], dtype=np.int32) * _TURN_BITS
-    return jnp.sum(parts, axis=1, dtype=jnp.int32)
+def packed_turns(points: Array, lattice: Lattice) -> Array:
+    """Count the lattice vectors between the cell and each point, 0 along open axes: [n] int32, 10 bits for each axis.
+
+    -1 where a point is not finite or farther away than `LARGEST_TURN`.
+    """
+    turns = jnp.where(np.array(lattice.images.periodic), jnp.floor(fractions_of(points, lattice)), 0)
+    near = (jnp.isfinite(points) & (jnp.abs(turns) <= LARGEST_TURN)).all(axis=1)
+    parts = [(turns[:, k].astype(jnp.int32) + (LARGEST_TURN + 1)) << (k * _TURN_BITS) for k in range(lattice.dim)]
+    packed = jnp.where(near, functools.reduce(jnp.bitwise_or, parts), -1)
+    return lax.optimization_barrier(packed)  # computed once, so that whoever asks gets the same
 
 
 def unpacked_turns(packed: Array, dim: int) -> Array:
-    """Read what `packed_turns` wrote: [..., d] int32."""
+    """Read what `packed_turns` wrote: [..., d] int32, 0 where it is -1."""
     parts = packed[..., None] >> np.arange(dim, dtype=np.int32) * _TURN_BITS
-    return (parts & ((1 << _TURN_BITS) - 1)) - (LARGEST_TURN + 1)
-
-
-def turns_of(points: Array, lattice: Lattice) -> Array:
-    """Return how many lattice vectors lie between the cell and each point: [n, d] whole floats, 0 along open axes."""
-    u = fractions_of(points, lattice)
-    turns = jnp.where(np.array(lattice.images.periodic), jnp.floor(u), 0)
-    return lax.optimization_barrier(turns)  # computed once, so that whoever asks gets the same
+    return jnp.where(packed[..., None] < 0, 0, (parts & ((1 << _TURN_BITS) - 1)) - (LARGEST_TURN + 1))
 
 
 def fractions_of(points: Array, lattice: Lattice) -> Array:
@@ -386,41 +381,52 @@ def wrap(sources: Array, queries: Array | None, lattice: Lattice, radius: np.flo
     residual (periodic columns), |u_j + S - u_i - (x_j - x_i + S·A) @ transform| is at most the rounding of u_i and u_j and
     sum |S|·|R|; and |d @ transform| <= |d|·|column of the transform|. `reach` adds these up, each rounded up generously.
     """
-    dtype, images = np.dtype(sources.dtype), lattice.images
-    eps = jnp.finfo(dtype).eps
-    periodic = np.array(images.periodic)
-    points = sources if queries is None else jnp.concatenate([sources, queries])
-    turns = turns_of(points, lattice)
-    finite = jnp.isfinite(points).all(axis=1)
-    near = finite & (jnp.abs(turns) <= LARGEST_TURN).all(axis=1)
-    points = jnp.where(near[:, None], points, jnp.nan)
-    turns = jnp.where(near[:, None], turns, 0)
-    wrapped = points - translation(turns, lattice)
-    wrapped = jnp.where((turns == 0).all(axis=1, keepdims=True), points, wrapped)
+    dtype, images, dim = np.dtype(sources.dtype), lattice.images, lattice.dim
+    eps, periodic = jnp.finfo(dtype).eps, np.array(images.periodic)
+    packed = [packed_turns(points, lattice) for points in ((sources,) if queries is None else (sources, queries))]
+    wrapped = []
+    for points, turns in zip((sources, queries), packed, strict=False):
+        off = unpacked_turns(turns, dim).astype(dtype)
+        moved = jnp.where((off == 0).all(axis=1, keepdims=True), points, points - translation(off, lattice))
+        wrapped.append(jnp.where(turns[:, None] >= 0, moved, jnp.nan))
+    most = functools.reduce(jnp.maximum, (jnp.max(jnp.abs(unpacked_turns(turns, dim)), initial=0) for turns in packed))
+    most = most.astype(dtype)
 
-    size = jnp.max(jnp.abs(points), axis=0, initial=0, where=near[:, None]) + jnp.abs(lattice.origin)
-    spans = jnp.max(jnp.abs(turns), initial=0) + (max(images.reach) + 1)
     matrix, transform = jnp.abs(lattice.matrix), jnp.abs(lattice.transform)
-    slack = _slack(size, spans, lattice)
+    spans = matrix.sum(axis=0)
+    size = jnp.abs(lattice.origin) + (most + 1) * spans  # of what lies so many lattice vectors away
+    if not (images.orthogonal or periodic.all()):
+        finite = [jnp.max(jnp.abs(x), axis=0, initial=0, where=jnp.isfinite(x)) for x in wrapped]
+        size = size + functools.reduce(jnp.maximum, finite)
     residual = jnp.abs(_product(lattice.matrix, lattice.transform) - jnp.diag(jnp.asarray(periodic, dtype)))
     residual = residual + 8 * eps * _product(matrix, transform)
-    rounding = 8 * eps * _product(size[None], transform)[0] + 2 * spans * residual.sum(axis=0)
+    shifts = most + max(images.reach) + 1
+    rounding = 8 * eps * _product(size[None], transform)[0] + 2 * shifts * residual.sum(axis=0)
     if images.orthogonal:
         rounding = jnp.where(periodic, rounding, 0)  # open axes are walked in raw coordinates
     length = jnp.sqrt(jnp.sum((transform * radius) ** 2, axis=0)) * (1 + 16 * eps)
     reach = length + 2 * rounding + jnp.where(periodic, 8 * eps, 0)
     limit = jnp.where(periodic, 0.5 if images.nearest else jnp.asarray(images.reach, dtype), jnp.inf)
     enough = (reach < limit).all() if images.nearest else (reach <= limit).all()
-    n = sources.shape[0]
-    mine = slice(0, n) if queries is None else slice(n, None)
-    rest = (slack, reach, near[:n], near[mine], enough)
-    return Wrapped(wrapped[:n], wrapped[mine], turns[:n], turns[mine], *rest)
+    slack = _wrapping_error(most, lattice)
+    return Wrapped(wrapped[0], wrapped[-1], packed[0], packed[-1], slack, reach, enough)
 
 
-def _slack(size: Array, spans: Array, lattice: Lattice) -> Array:
-    """Bound the error of a component of x_j - x_i + S·A, for |x| below `size` [d] and |S| below `spans`."""
-    moved = jnp.abs(lattice.matrix).sum(axis=0)  # 0 for components that no lattice vector has: nothing is added to them
-    return 8 * jnp.finfo(moved.dtype).eps * jnp.max(size + spans * moved, initial=0, where=moved > 0)
+def _wrapping_error(most: Array, lattice: Lattice) -> Array:
+    """Bound the error of a component of x_j - x_i that wrapping both, by at most so many turns, and moving one to an image made.
+
+    In units of u = eps/2: t·A of whole numbers takes u|t·A|, nothing for 0, 1, 2, and d times that where d such products add up;
+    the sum with a coordinate of the cell takes u of it. What is not wrapped loses nothing.
+    """
+    dim, images = lattice.dim, lattice.images
+    u = 0.525 * jnp.finfo(lattice.matrix.dtype).eps  # a twentieth more than half: for second orders, and for this sum
+    spans = jnp.abs(lattice.matrix).sum(axis=0)  # 0 for components that no lattice vector has
+    cell = jnp.where(spans > 0, jnp.abs(lattice.origin) + spans, 0)
+    products = 1 if images.orthogonal else 2 * dim
+    wrapping = jnp.where(most > 0, products * most * spans + cell, 0)
+    reach = max(images.reach)
+    moving = (0 if images.orthogonal and reach <= 2 else products * reach) * spans + cell + reach * spans
+    return u * jnp.max(2 * wrapping + moving, initial=0)
 
 
 def shifted_pairs(difference: Array, shifts: Array, points: Sequence[Array], lattice: Lattice) -> Shifted:
@@ -430,15 +436,16 @@ def shifted_pairs(difference: Array, shifts: Array, points: Sequence[Array], lat
     spans = jnp.max(jnp.abs(shifts), initial=0) + 1
     fixed = lax.stop_gradient(lattice)
     vectors = difference + translation(shifts, lattice)
-    return Shifted(vectors, shifts, _slack(size, spans, fixed), fixed.matrix, lattice.images.orthogonal)
+    moved = jnp.abs(fixed.matrix).sum(axis=0)  # 0 for components that no lattice vector has: nothing is added to them
+    slack = 8 * jnp.finfo(moved.dtype).eps * jnp.max(size + spans * moved, initial=0, where=moved > 0)
+    return Shifted(vectors, shifts, slack, fixed.matrix, lattice.images.orthogonal)
 
 
 def box_change(before: Box, now: Box, points: Array, kind: Images, dtype: np.dtype) -> Array:
     """Bound how far the change of a box can move one image of `points` against another, for pairs within reach."""
     old, new = (make_lattice(box, kind, dtype) for box in (before, now))
-    turns = turns_of(points, new)
-    there = jnp.isfinite(turns)
-    span = jnp.max(turns, axis=0, initial=-LARGEST_TURN, where=there) - jnp.min(turns, axis=0, initial=LARGEST_TURN, where=there)
+    turns = unpacked_turns(packed_turns(points, new), new.dim)
+    span = (jnp.max(turns, axis=0, initial=-LARGEST_TURN) - jnp.min(turns, axis=0, initial=LARGEST_TURN)).astype(dtype)
     moved = jnp.sqrt(jnp.sum((new.matrix - old.matrix) ** 2, axis=1)) * (1 + 16 * jnp.finfo(dtype).eps)
     return jnp.sum((jnp.maximum(span, 0) + np.array(kind.reach, dtype)) * moved)
 

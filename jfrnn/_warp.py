@@ -18,12 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._box import Lattice, Wrapped, packed_turns
+from jfrnn._box import Lattice, Wrapped
 from jfrnn._exact import Cutoff, make_cutoff
 from jfrnn._runs import Filter
 
 INSTALL = 'pip install "jfrnn[warp]"'
 _PLACES_PER_THREAD = 2048  # below, a second thread costs more than it saves
+_MOST_IN_BOX = 1 << 27  # an id shares its bits with the code of an image
 _HUGE = 1 << 22  # bytes from which a buffer is worth a request for huge pages
 _PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
 
@@ -120,11 +121,10 @@ def neighbors(
     return lax.platform_dependent(sources, queries, cutoff, torus, cpu=cpu, cuda=cuda)
 
 
-def _with_turns(points: Array, turns: Array, near: Array) -> Array:
+def _with_turns(points: Array, packed: Array) -> Array:
     """Return rows [n, d + 1] of positions, NaN where they are out of range, and their packed turns as the kernels read them."""
-    packed = packed_turns(turns)
     last = lax.bitcast_convert_type(packed, jnp.float32) if points.dtype == jnp.float32 else packed.astype(points.dtype)
-    return jnp.concatenate([jnp.where(near[:, None], points, jnp.nan), last[:, None]], axis=1)
+    return jnp.concatenate([jnp.where(packed[:, None] >= 0, points, jnp.nan), last[:, None]], axis=1)
 
 
 def _lattice_numbers(lattice: Lattice, wrapped: Wrapped) -> Array:
@@ -154,6 +154,10 @@ def _call(
     double = sources.dtype == jnp.float64
     periodic = 0 if torus is None else 1 if torus[0].images.nearest else 2
     variant = Variant(dim, double, cutoff.scaled, lists, own, cutoff.closed, keep, periodic)
+    if periodic == 1 and n >= _MOST_IN_BOX:
+        raise ValueError(
+            f"backend='warp' numbers at most {_MOST_IN_BOX - 1} positions in a periodic box, got {n}: pass backend='jax'."
+        )
     words = kernels_of(module).scratch_words(n, m, dim, 2 if double else 1, own)
     dims: dict[str, Any] = {"count": m, "info": 2, "scratch": max(words, 1)}
     if lists:
@@ -161,8 +165,8 @@ def _call(
     numbers = jnp.reshape(jnp.asarray(cutoff.radius), 1)
     if torus is not None:
         lattice, wrapped = torus
-        sources = _with_turns(sources, wrapped.turns, wrapped.near)
-        rows = sources if queries is None else _with_turns(queries, wrapped.query_turns, wrapped.query_near)
+        sources = _with_turns(sources, wrapped.turns)
+        rows = sources if queries is None else _with_turns(queries, wrapped.query_turns)
         numbers = jnp.concatenate([numbers, _lattice_numbers(lattice, wrapped)])
     *idx, count, info, _ = make(variant)(sources, rows, numbers, output_dims=dims)
     return Rows(idx[0] if lists else None, count, info[0], info[1])
@@ -239,7 +243,8 @@ def _register(
 
 def _cuda_kernels(variant: Variant) -> Any:  # noqa: ANN401
     make = kernels_of("cells_cuda").cell_kernels
-    return make(variant.dim, variant.double, variant.scaled, variant.lists, variant.keep.later_only)
+    keep = variant.keep
+    return make(variant.dim, variant.double, variant.scaled, variant.lists, keep.later_only, periodic=variant.periodic)
 
 
 def _run_cells_on_cuda(variant: Variant, arrays: _Arrays) -> None:

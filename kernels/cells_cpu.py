@@ -428,8 +428,9 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
         int from[3] = {0, 0, 0}, to[3] = {0, 0, 0};
         for (int k = 0; k < DIM; ++k)
             if (is_periodic(k)) {
-                from[k] = period_of(k, first[k]);
-                to[k] = period_of(k, last[k]);
+                const int most = lattice.images(k);  // rounded up, a query may reach an image that nobody can
+                from[k] = period_of(k, first[k]) < -most ? -most : period_of(k, first[k]);
+                to[k] = period_of(k, last[k]) > most ? most : period_of(k, last[k]);
             }
         for (int x = from[0]; x <= to[0]; ++x)
             for (int y = from[1]; y <= to[1]; ++y)

@@ -111,13 +111,14 @@ for (int k = 0; k < DIM; ++k) {
 }
 int finite = 0;
 for (long long i = thread; i < n; i += threads) {
-    real p[3];
-    for (int k = 0; k < DIM; ++k)
-        p[k] = positions.data[DIM * i + k];
+    real p[3], at[3];
+    point_of(positions.data + ROW * i, p);
     if (!finite_point(p))
         continue;
     ++finite;
-    widen(low, high, p, p);
+    for (int k = 0; k < DIM; ++k)
+        at[k] = coordinate(k, p);
+    widen(low, high, at, at);
 }
 reduce_over_block(low, high, finite);
 if (threadIdx.x == 0) {
@@ -173,8 +174,7 @@ const real* points = of_queries ? queries.data : positions.data;
 int* counts = of_queries ? query_start : start;
 for (long long i = thread; i < size; i += threads) {
     real p[3];
-    for (int k = 0; k < DIM; ++k)
-        p[k] = points[DIM * i + k];
+    point_of(points + ROW * i, p);
     const bool finite = finite_point(p);
     const int cell = finite ? cell_key(grid, p) : -1;
     key[i] = cell;
@@ -262,8 +262,7 @@ const Grid grid = shared.grid;
 for (long long place = thread; place < n; place += threads) {
     const int i = order[place];
     Place mine;
-    for (int k = 0; k < DIM; ++k)
-        mine.p[k] = positions.data[(long long)DIM * i + k];
+    point_of(positions.data + (long long)ROW * i, mine.p);
     mine.id = bits_as_real(i);
     const int cell = finite_point(mine.p) ? cell_key(grid, mine.p) : -1;  // cheaper than to fetch key[i] from anywhere
     long long to = place;
@@ -285,6 +284,49 @@ constexpr int TAKEN = 4;  // neighbors that a lane numbers at a time
 constexpr int FETCHED = 2;  // candidates that a lane fetches at a time
 constexpr int RING = 128;  // candidates: fewer than a block, what is fetched twice, rounded up
 constexpr unsigned int ONES = 0x3c003c00;  // two halves
+// Where space is periodic, a candidate's id tells its image, too: in the upper bits, or, where images are told apart in the list,
+// as in the list. Moving a candidate is one text, so that it is in the same place whenever it is loaded.
+constexpr int ID_BITS = 27;
+int codes = 1, home = 0;
+if constexpr (PERIODIC) {
+    for (int k = 0; k < DIM; ++k)
+        codes *= 2 * lattice.images(k) + 1;
+    home = (codes - 1) / 2;
+}
+const int fill_value = PERIODIC == 2 ? n * codes : n;
+auto id_of_image = [&](int source, int code) -> int {
+    return PERIODIC == 0 ? source : PERIODIC == 1 ? (int)((unsigned int)source | (unsigned int)code << ID_BITS) : source + n * code;
+};
+auto source_of = [&](int id) -> int { return PERIODIC == 0 ? id : PERIODIC == 1 ? id & ((1 << ID_BITS) - 1) : id % n; };
+auto image_of = [&](int id) -> int { return PERIODIC == 1 ? (int)((unsigned int)id >> ID_BITS) : id / n; };
+auto translate = [&](int code, real* moved) {
+    int shift[3] = {0, 0, 0};
+    for (int k = DIM - 1; k >= 0; --k) {
+        const int each = 2 * lattice.images(k) + 1;
+        shift[k] = code % each - lattice.images(k);
+        code /= each;
+    }
+    for (int k = 0; k < DIM; ++k)
+        moved[k] = lattice.translation(shift[0], shift[1], shift[2], k);
+};
+// the image of a source that an id names
+auto load_image = [&](int id, real* p) {
+    point_of(positions.data + (long long)ROW * source_of(id), p);
+    if constexpr (PERIODIC) {
+        real moved[3];
+        translate(image_of(id), moved);
+        for (int k = 0; k < DIM; ++k)
+            p[k] = Lattice::add(p[k], moved[k]);
+    }
+};
+// what ids in ascending order say of a pair: by source, then, of one source, its images behind, at home, ahead
+auto order_of = [&](int id) -> int {
+    if constexpr (PERIODIC != 2)
+        return source_of(id);
+    const int code = image_of(id);
+    return 3 * source_of(id) + (code > home) - (code < home);
+};
+auto first_after = [&](int my_id) -> int { return PERIODIC == 2 ? 3 * my_id + drop_self : my_id + drop_self; };
 struct alignas(16) Box { real center[4], half[4]; };  // a group's; the last ones: what is near, squared, and twice the coarse band
 struct Run { int end, shift; };  // candidates of a row of cells: where they end, what leads from a candidate's number to its place
 struct alignas(16) Warp {  // what a warp shares
@@ -301,6 +343,8 @@ struct alignas(16) Warp {  // what a warp shares
     int left[LIST ? 3 : 1][32];  // of those, the ids
     Box box;  // of the group
     Run runs[33];
+    int run_images[PERIODIC ? 33 : 1];  // their codes, and what leads from home to them
+    real run_moved[PERIODIC ? 33 : 1][3];
 };
 __shared__ Warp warp;
 __shared__ Grid grid;
@@ -315,8 +359,12 @@ const long long begin = (long long)block * 32;
 int place = begin < m ? (int)begin : m;
 const int stop = m - place < 32 ? m : place + 32;
 const unsigned int lanes_below = (1u << lane) - 1;
-const real square_radius = step_radius * step_radius, band = 8 * step_eps * square_radius;
-const real sure_square = square_radius - band;
+// differences of images may be off by more than rounding takes from a difference
+const real off = PERIODIC ? 2 * lattice.slack() * step_scale : real(0), outer_radius = step_radius + off;
+const real inner_radius = step_radius > off ? step_radius - off : real(0), square_radius = step_radius * step_radius;
+const real sure_square = inner_radius * inner_radius - 8 * (1 + PERIODIC) * step_eps * square_radius;
+const real beyond = outer_radius * outer_radius * (1 + 16 * step_eps) - sure_square;
+const real band = PERIODIC ? real(0.5) * beyond : 8 * step_eps * square_radius;
 const bool drops_self = own && drop_self;
 auto load = [&](const Place* from) -> Place {
     if constexpr (DOUBLE) {
@@ -332,9 +380,7 @@ auto load_query = [&](int at) -> Place {
         return load(sorted + at);
     Place q;
     const int i = query_order[at];
-#pragma unroll
-    for (int k = 0; k < DIM; ++k)
-        q.p[k] = queries.data[(long long)DIM * i + k];
+    point_of(queries.data + (long long)ROW * i, q.p);
     q.id = bits_as_real(i);
     return q;
 };
@@ -386,7 +432,7 @@ while (place < stop) {
         mine = load_query(place + lane);
 #pragma unroll
     for (int a = 0; a < DIM; ++a) {
-        const whole here = axis_cell(grid, a, mine.p[a]), there = __shfl_sync(ALL, here, 0);
+        const whole here = axis_cell(grid, a, coordinate(a, mine.p)), there = __shfl_sync(ALL, here, 0);
         beside = beside && (ORDER != 0 || (a == 0 ? grid.dense || (here >= there && here - there < 2 * REACH_X) : here == there));
     }
     const int group = __ffs(~__ballot_sync(ALL, beside)) == 0 ? 32 : __ffs(~__ballot_sync(ALL, beside)) - 1;
@@ -394,32 +440,38 @@ while (place < stop) {
         const int id = id_of(load_query(place).id);
         if (LIST)
             for (int s = lane; s < capacity; s += 32)
-                idx.data[(long long)id * capacity + s] = n;
+                idx.data[(long long)id * capacity + s] = fill_value;
         if (lane == 0)
             count.data[id] = 0;
         ++place;
         continue;
     }
     const int my_id = id_of(mine.id);
+    auto reduce_over_group = [&](real x, real& low, real& high) {
+        low = lane < group ? x : INF;
+        high = lane < group ? x : -INF;
+        if constexpr (DOUBLE) {
+#pragma unroll
+            for (int step = 1; step < 32; step *= 2) {
+                const real l = __shfl_xor_sync(ALL, low, step), h = __shfl_xor_sync(ALL, high, step);
+                low = l < low ? l : low;
+                high = h > high ? h : high;
+            }
+        } else {  // as integers of the same order, which one instruction reduces
+            auto flip = [](int b) { return b ^ (b >> 31 & 0x7fffffff); };
+            low = __int_as_float(flip(__reduce_min_sync(ALL, flip(__float_as_int(low)))));
+            high = __int_as_float(flip(__reduce_max_sync(ALL, flip(__float_as_int(high)))));
+        }
+    };
     // lane 2a holds the group's lowest coordinate along axis a and the lowest cell in reach, lane 2a + 1 the highest
     real bound = 0, low[3], high[3], center[3], square = 0;
 #pragma unroll
     for (int a = 0; a < DIM; ++a) {
-        low[a] = lane < group ? mine.p[a] : INF;
-        high[a] = lane < group ? mine.p[a] : -INF;
-        if constexpr (DOUBLE) {
-#pragma unroll
-            for (int step = 1; step < 32; step *= 2) {
-                const real l = __shfl_xor_sync(ALL, low[a], step), h = __shfl_xor_sync(ALL, high[a], step);
-                low[a] = l < low[a] ? l : low[a];
-                high[a] = h > high[a] ? h : high[a];
-            }
-        } else {  // as integers of the same order, which one instruction reduces
-            auto flip = [](int b) { return b ^ (b >> 31 & 0x7fffffff); };
-            low[a] = __int_as_float(flip(__reduce_min_sync(ALL, flip(__float_as_int(low[a])))));
-            high[a] = __int_as_float(flip(__reduce_max_sync(ALL, flip(__float_as_int(high[a])))));
-        }
-        bound = lane == 2 * a ? low[a] : lane == 2 * a + 1 ? high[a] : bound;
+        reduce_over_group(mine.p[a], low[a], high[a]);
+        real lowest = low[a], highest = high[a];
+        if constexpr (PERIODIC)
+            reduce_over_group(coordinate(a, mine.p), lowest, highest);
+        bound = lane == 2 * a ? lowest : lane == 2 * a + 1 ? highest : bound;
         center[a] = real(0.5) * low[a] + real(0.5) * high[a];
         const real below = center[a] - low[a], above = high[a] - center[a], half = (below > above ? below : above) * step_scale;
         square += half * half;
@@ -429,7 +481,7 @@ while (place < stop) {
     const float diagonal = 1.0001f * square_root((float)square);
     if constexpr (!DOUBLE) {
         constexpr float SMALLEST = 0x1p-126f;
-        unit = __uint_as_float(__float_as_uint(__fdividef(240, diagonal + step_radius)) & 0x7f800000u);
+        unit = __uint_as_float(__float_as_uint(__fdividef(240, diagonal + outer_radius)) & 0x7f800000u);
 #pragma unroll
         for (int a = 0; a < DIM; ++a)
             unit = fabsf(center[a]) * step_scale * unit < 1e37f ? unit : 0;
@@ -439,8 +491,12 @@ while (place < stop) {
         }
     }
     const real group_radius = (SCALED ? radius * scale : radius) * unit;
-    const real near_square = group_radius * group_radius * (1 + 8 * step_eps) + (DOUBLE ? real(0) : real(1e-30));
-    const float reach = fminf(diagonal * (float)unit + (float)group_radius, 240), coarse_band = reach * reach * 2e-5f;  // see meet
+    const real group_outer = PERIODIC ? (radius + 2 * lattice.slack()) * (SCALED ? scale : real(1)) * unit : group_radius;
+    const real near_square = group_outer * group_outer * (1 + 8 * step_eps) + (DOUBLE ? real(0) : real(1e-30));
+    const float reach = fminf(diagonal * (float)unit + (float)group_outer, 240);
+    float coarse_band = reach * reach * 2e-5f;  // see meet
+    if constexpr (PERIODIC)
+        coarse_band += 1.001f * (float)((group_outer - group_radius) * (group_outer + group_radius));
     auto from_center = [&](real x, real center) -> real {
         const real y = SCALED ? x * scale : x;
         if constexpr (DOUBLE)
@@ -461,8 +517,11 @@ while (place < stop) {
         warp.box = box;
     whole reached;
     {
-        const real x = cell_of(lane / 2, lane % 2 ? bound + radius : bound - radius);
-        if (grid.dense) {
+        const int along = lane / 2 < DIM ? lane / 2 : 0;
+        const real x = cell_of(along, lane % 2 ? bound + reach_along(along) : bound - reach_along(along));
+        if (is_periodic(along))  // numbered on beyond the ends
+            reached = (whole)x;
+        else if (grid.dense) {
             const int extent = lane < 2 ? grid.extent[0] : lane < 4 || DIM == 2 ? grid.extent[1] : grid.extent[2];
             const real from_low = x - (lane < 2 ? grid.low[0] : lane < 4 || DIM == 2 ? grid.low[1] : grid.low[2]);
             reached = from_low < 0 ? -1 : from_low < real(extent) ? (whole)from_low : (whole)extent;
@@ -474,6 +533,8 @@ while (place < stop) {
     }
     auto cells_along = [&](int a) { return (int)(__shfl_sync(ALL, reached, 2 * a + 1) - __shfl_sync(ALL, reached, 2 * a)) + 1; };
     int rows = ORDER != 0 ? cells_along(0) : 1;  // on a curve, cells along x are no run
+    if (is_periodic(0))  // a row is cut where it enters another image
+        rows = period_of(0, __shfl_sync(ALL, reached, 1)) - period_of(0, __shfl_sync(ALL, reached, 0)) + 1;
     if (cells_along(0) <= 0 || cells_along(1) <= 0 || cells_along(2) <= 0)
         rows = 0;
     rows *= cells_along(1) * cells_along(2);
@@ -483,16 +544,56 @@ while (place < stop) {
 #pragma unroll
         for (int a = 0; a < 3; ++a)
             first[a] = __shfl_sync(ALL, reached, 2 * a);
-        const int length = cells_along(0), wide = cells_along(1), across = ORDER != 0 ? length : 1;
-        int from = 0, size = 0;
+        const int wide = cells_along(1), deep = cells_along(2), across = ORDER != 0 ? cells_along(0) : rows / (wide * deep);
+        int length = cells_along(0), from = 0, size = 0, image = 0;
         const int row = base + lane, line = row / across, level = line / wide;
-        const whole y = first[1] + (line - level * wide), z = first[2] + level;
+        whole y = first[1] + (line - level * wide), z = first[2] + level;
+        struct Part { whole first, y, z; int length, image; };
+        const int cells = length;
+        const whole leftmost = first[0];
+        auto part_of = [&](int row) -> Part {  // a row of cells, in its own image
+            const int line = row / across, level = line / wide;
+            whole cell[3] = {leftmost, first[1] + (line - level * wide), first[2] + level}, last = leftmost + cells - 1;
+            int shift[3] = {0, 0, 0}, image = 0;
+            if (is_periodic(0)) {
+                const whole around = (whole)inverse_edge[0];
+                shift[0] = period_of(0, leftmost) + row % across;
+                cell[0] = leftmost - shift[0] * around;
+                cell[0] = cell[0] < 0 ? 0 : cell[0];
+                last -= shift[0] * around;
+                last = last < around ? last : around - 1;
+            }
+#pragma unroll
+            for (int a = 1; a < DIM; ++a)
+                if (is_periodic(a)) {
+                    shift[a] = period_of(a, cell[a]);
+                    cell[a] -= shift[a] * (whole)inverse_edge[a];
+                }
+            bool within = true;  // rounded up, a group may reach an image that nobody can
+#pragma unroll
+            for (int a = 0; a < DIM; ++a) {
+                const int most = lattice.images(a);
+                within = within && shift[a] >= -most && shift[a] <= most;
+                image = image * (2 * most + 1) + shift[a] + most;
+            }
+            if (!within)
+                return Part{cell[0], cell[1], cell[2], 0, home};
+            return Part{cell[0], cell[1], cell[2], (int)(last - cell[0]) + 1, image};
+        };
+        if constexpr (PERIODIC) {
+            const Part part = part_of(row < rows ? row : 0);
+            first[0] = part.first;
+            y = part.y;
+            z = part.z;
+            length = part.length;
+            image = part.image;
+        }
         if (grid.dense) {
             if (row < rows) {
                 const int s = ORDER != 0 ? curve(grid, (unsigned int)(first[0] + row % across), (unsigned int)y, (unsigned int)z)
                                          : row_start(grid, y, z) + (int)first[0];
                 from = start[s];
-                size = start[s + (ORDER != 0 ? 1 : length)] - from;
+                size = length > 0 ? start[s + (ORDER != 0 ? 1 : length)] - from : 0;
             }
         } else {
             const int begins = ring(row_start(grid, y, z) + ring(first[0], grid.cells), grid.cells);
@@ -505,12 +606,19 @@ while (place < stop) {
                     back = length - ahead > back ? length - ahead : back;
             };
             for (int r = 0; r < base; ++r)
-                overlap(ring(row_start(grid, first[1] + r % wide, first[2] + r / wide) + ring(first[0], grid.cells), grid.cells));
+                if constexpr (PERIODIC) {
+                    const Part part = part_of(r);
+                    if (part.image == image)  // as long as this one
+                        overlap(ring(row_start(grid, part.y, part.z) + ring(part.first, grid.cells), grid.cells));
+                } else {
+                    const int earlier = row_start(grid, first[1] + r % wide, first[2] + r / wide);
+                    overlap(ring(earlier + ring(first[0], grid.cells), grid.cells));
+                }
             const int here = rows - base < 32 ? rows - base : 32;
 #pragma unroll 1
             for (int r = 0; r < here; ++r) {
-                const int other = __shfl_sync(ALL, begins, r);
-                if (r < lane)
+                const int other = __shfl_sync(ALL, begins, r), other_image = PERIODIC ? __shfl_sync(ALL, image, r) : 0;
+                if (r < lane && other_image == image)
                     overlap(other);
             }
             const int entries = length - front - back;
@@ -528,8 +636,14 @@ while (place < stop) {
         }
         const unsigned int occupied = __ballot_sync(ALL, size > 0);
         __syncwarp();
-        if (size > 0)
-            warp.runs[__popc(occupied & lanes_below)] = Run{end, from - (end - size)};
+        if (size > 0) {
+            const int number = __popc(occupied & lanes_below);
+            warp.runs[number] = Run{end, from - (end - size)};
+            if constexpr (PERIODIC) {
+                warp.run_images[number] = image;
+                translate(image, warp.run_moved[number]);
+            }
+        }
         if (lane == 0)
             warp.runs[__popc(occupied)] = Run{0x7fffffff, 0};
         __syncwarp();
@@ -631,8 +745,11 @@ while (place < stop) {
     };
     bool meets_itself = drops_self;  // the first candidates are the queries themselves: number = lane
     if (own) {
+        Place at_home = mine;
+        if constexpr (PERIODIC)
+            at_home.id = bits_as_real(id_of_image(my_id, home));
         if (lane < group)
-            keep(mine, mine_from_center, lane);
+            keep(at_home, mine_from_center, lane);
         kept = group;
     }
     unsigned int met_in = 0;  // blocks that have a neighbor of this query, a bit each
@@ -641,7 +758,7 @@ while (place < stop) {
         const unsigned int behind = 1u << tested / 32;
         warp.hits[tested / 32][lane] = finished ? ALL : 0;
         if (finished)
-            warp.ids[tested + lane] = n;
+            warp.ids[tested + lane] = fill_value;
         met_in |= behind;
         int written = (int)(warp.written[lane] & ~3u);
         unsigned int waiting = warp.written[lane] & 3;
@@ -700,7 +817,11 @@ while (place < stop) {
             const unsigned int row_bytes = 4u * (unsigned int)capacity;
             auto four_of = [&](int k) {
                 const unsigned short* const from = (const unsigned short*)warp.lists[row_of(k)] + lane % 8 * 4;
-                return make_int4(load_id(from[0]), load_id(from[1]), load_id(from[2]), load_id(from[3]));
+                const int4 four = make_int4(load_id(from[0]), load_id(from[1]), load_id(from[2]), load_id(from[3]));
+                if constexpr (PERIODIC == 1)
+                    return make_int4(source_of(four.x), source_of(four.y), source_of(four.z), source_of(four.w));
+                else
+                    return four;
             };
             auto out_of = [&](int k, int& room) {
                 const unsigned int row_before = __shfl_sync(ALL, before, row_of(k)), row_id = __shfl_sync(ALL, my_id, row_of(k));
@@ -764,7 +885,16 @@ while (place < stop) {
             if (!grid.dense && at >= grid.finite)  // the ring of cells closes
                 at -= grid.finite;
             candidates[k].p[0] = INF;
-            if (number < total && (unsigned int)(at - place) >= (own ? group : 0))
+            if constexpr (PERIODIC) {
+                const int of_run = (int)(run - warp.runs) - 1;
+                if (number < total && (warp.run_images[of_run] != home || (unsigned int)(at - place) >= (own ? group : 0))) {
+                    candidates[k] = load(sorted + at);
+#pragma unroll
+                    for (int a = 0; a < DIM; ++a)
+                        candidates[k].p[a] = Lattice::add(candidates[k].p[a], warp.run_moved[of_run][a]);
+                    candidates[k].id = bits_as_real(id_of_image(id_of(candidates[k].id), warp.run_images[of_run]));
+                }
+            } else if (number < total && (unsigned int)(at - place) >= (own ? group : 0))
                 candidates[k] = load(sorted + at);
         }
     };
@@ -816,7 +946,7 @@ while (place < stop) {
                 unsigned int earlier = 0;
 #pragma unroll
                 for (int j = 31; j >= 0; --j) {
-                    const int later_by = warp.candidate_ids[first_candidate + j] - my_id - drop_self;
+                    const int later_by = order_of(warp.candidate_ids[first_candidate + j]) - first_after(my_id);
                     earlier = __funnelshift_l((unsigned int)later_by, earlier, 1);
                 }
                 met &= ~earlier;
@@ -877,10 +1007,15 @@ while (place < stop) {
                         saved[4 * FETCHED + 4 + k] = rows_low[k];
                     }
                 }
-                const Place query = DOUBLE ? mine : open ? load_query(place + lane) : Place{{0, 0, 0}, 0};
+                const Place query = DOUBLE || PERIODIC ? mine : open ? load_query(place + lane) : Place{{0, 0, 0}, 0};
                 for (; open; open &= open - 1) {
                     const int j = __ffs(open) - 1;
                     const int id = LIST ? warp.ids[tested + j] : warp.candidate_ids[first_candidate + j];
+                    if constexpr (PERIODIC) {
+                        const real* source = positions.data + (long long)ROW * source_of(id);
+                        hits |= exact_image(queries.data + (long long)ROW * my_id, source, image_of(id)) ? 1u << j : 0;
+                        continue;
+                    }
                     real p[DIM];
 #pragma unroll
                     for (int a = 0; a < DIM; ++a)
@@ -925,9 +1060,8 @@ while (place < stop) {
                 for (int k = 0; k < FETCHED; ++k) {
                     const int id = warp.ids[32 * (BLOCKS + k) + lane];
                     left[k].id = bits_as_real(id);
-#pragma unroll
-                    for (int a = 0; a < DIM; ++a)
-                        left[k].p[a] = 32 * k + lane < kept ? positions.data[(long long)DIM * id + a] : 0;
+                    if (32 * k + lane < kept)
+                        load_image(id, left[k].p);
                 }
                 __syncwarp();
 #pragma unroll
@@ -1008,18 +1142,21 @@ def cell_kernels(
     reach_x: int = 6,
     blocks: int | None = None,
     order: int = 0,
+    periodic: int = 0,
 ) -> Kernels:
     """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts, half lists or whole.
 
     The rest is there to be measured. exact=False lets the working precision decide alone (`|d|^2 < r^2 (1 - 8 eps)`); `reach` is
     the number of cell edges in a cutoff along y and z, `reach_x` along x; `blocks` per multiprocessor bound the registers; `order`
-    of the cells: 0 row-major, 1 Morton, 2 Hilbert.
+    of the cells: 0 row-major, 1 Morton, 2 Hilbert. `periodic` is that of `jfrnn.kernels._native.snippet`.
     """
     blocks = blocks or (24 if not lists else 16 if double else 20)  # registers against occupancy, measured on an H200
     kind = f"{dim}d_{'f64' if double else 'f32'}_r{reach}x{reach_x}{('', '_morton', '_hilbert')[order]}"
+    kind += ("", "_nearest", "_images")[periodic]
     variant = f"{kind}{'_scaled' * scaled}{'_list' * lists}{'_later' * later}{'' if exact else '_inexact'}"
     variant += f"_b{blocks}"
     grid = {"REACH": reach, "REACH_X": reach_x, "ORDER": order, "PARTS": _PARTS, "TILE": _TILE, "BLOCK": BLOCK}
+    grid |= {"PERIODIC": periodic}
     query = {"SCALED": scaled, "LIST": lists, "LATER": later, "EXACTLY": exact}
     query |= {"QUERY_BLOCK": QUERY_BLOCK, **grid}
     return Kernels(
