@@ -177,7 +177,7 @@ def _periodic_exactness_rows(config: Exactness) -> Iterator[dict[str, Any]]:
 
 
 def _images(nbrs: Any, x: Any, queries: Any) -> list[tuple[int, int, tuple[int, ...]]]:  # noqa: ANN401
-    """Return (i, j, S) of every slot, sorted, on the host: a program for each kind of box would take longer to compile than to run."""
+    """Return (i, j, S) of every slot, sorted, on the host: a program for each kind of box would take long to compile."""
     from jfrnn._box import unpacked_turns
 
     idx, count = np.asarray(nbrs.idx), np.asarray(nbrs.count)

@@ -90,6 +90,7 @@ auto finite_point = [](const real* p) {
 };
 struct Lattice {
     const real* numbers;
+    bool skewed;  // else its vectors lie along the axes, and what others would add is 0
     JFRNN_MEMBER real vector(int l, int k) const { return numbers[1 + 3 * l + k]; }
     JFRNN_MEMBER real transform(int k, int axis) const { return numbers[10 + 3 * k + axis]; }
     JFRNN_MEMBER real origin(int k) const { return numbers[19 + k]; }
@@ -120,6 +121,8 @@ struct Lattice {
     }
     // component k of S·A
     JFRNN_MEMBER real translation(int sx, int sy, int sz, int k) const {
+        if (!skewed)
+            return mul(real(k == 0 ? sx : k == 1 ? sy : sz), vector(k, k));
         real sum = mul(real(sx), vector(0, k));
         sum = add(sum, mul(real(sy), vector(1, k)));
         return DIM == 3 ? add(sum, mul(real(sz), vector(2, k))) : sum;
@@ -132,15 +135,22 @@ struct Lattice {
     }
     // coordinate of a wrapped point along an axis of cells: a fraction where that is periodic, else a length
     JFRNN_MEMBER real along(int axis, const real* p) const {
-        real sum = mul(add(p[0], -origin(0)), transform(0, axis));
-        for (int k = 1; k < DIM; ++k)
-            sum = add(sum, mul(add(p[k], -origin(k)), transform(k, axis)));
+        real sum = mul(add(p[axis], -origin(axis)), transform(axis, axis));
+        if (skewed) {
+            sum = mul(add(p[0], -origin(0)), transform(0, axis));
+            for (int k = 1; k < DIM; ++k)
+                sum = add(sum, mul(add(p[k], -origin(k)), transform(k, axis)));
+        }
         if (!periodic(axis))
             return sum;
         return sum < 0 ? real(0) : sum > 1 ? real(1) : sum;
     }
 };
-const Lattice lattice{cutoff.data};
+bool skewed = false;
+for (int l = 0; PERIODIC && l < DIM; ++l)
+    for (int k = 0; k < DIM; ++k)
+        skewed = skewed || (k != l && Lattice{cutoff.data, true}.transform(l, k) != 0);
+const Lattice lattice{cutoff.data, skewed};
 // the point of a row of positions, wrapped where space is periodic
 auto point_of = [&](const real* row, real* p) {
     if constexpr (PERIODIC)
@@ -461,14 +471,19 @@ auto coordinate = [&](int axis, const real* p) -> real {
     else
         return p[axis];
 };
-auto is_periodic = [&](int axis) -> bool { return PERIODIC && lattice.periodic(axis); };
+int periodic_axes = 0;  // a bit each
+for (int axis = 0; PERIODIC && axis < DIM; ++axis)
+    periodic_axes |= lattice.periodic(axis) << axis;
+auto is_periodic = [&](int axis) -> bool { return PERIODIC && (periodic_axes >> axis & 1); };
+auto cell_scale = [&](int axis) -> real {
+    return axis == 0 ? inverse_edge[0] : !PERIODIC || axis == 1 ? inverse_edge[1] : inverse_edge[2];
+};
 auto cell_of = [&](int axis, real x) -> real {  // a whole float, monotone in x
 #if defined(__CUDA_ARCH__)
-    const real scale = axis == 0 ? inverse_edge[0] : !PERIODIC || axis == 1 ? inverse_edge[1] : inverse_edge[2];
     if constexpr (DOUBLE)
-        return floor(__dmul_rn(x, scale));
+        return floor(__dmul_rn(x, cell_scale(axis)));
     else
-        return floorf(__fmul_rn(x, scale));
+        return floorf(__fmul_rn(x, cell_scale(axis)));
 #else
     return DOUBLE ? real(__builtin_floor(x * inverse_edge[axis])) : real(__builtin_floorf(x * inverse_edge[axis]));
 #endif
@@ -504,7 +519,7 @@ auto row_hash = [](long long y, long long z, int cells) -> int {
 auto axis_cell = [&](const Grid& grid, int k, real x) -> whole {
     const real cell = cell_of(k, x);
     if (is_periodic(k)) {  // from 0 on, whatever the box
-        const real most = inverse_edge[k] - 1;
+        const real most = cell_scale(k) - 1;
         return cell < 0 ? 0 : cell < most ? (whole)cell : (whole)most;
     }
     if (!grid.dense)
@@ -514,7 +529,7 @@ auto axis_cell = [&](const Grid& grid, int k, real x) -> whole {
 };
 // cells of a periodic axis are numbered on beyond its ends: in which period a cell lies
 auto period_of = [&](int axis, whole cell) -> int {
-    const whole cells = (whole)inverse_edge[axis];
+    const whole cells = (whole)cell_scale(axis);
     return (int)(cell >= 0 ? cell / cells : -1 - (-1 - cell) / cells);
 };
 auto row_start = [&](const Grid& grid, whole y, whole z) -> int {

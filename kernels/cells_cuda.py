@@ -295,10 +295,11 @@ if constexpr (PERIODIC) {
 }
 const int fill_value = PERIODIC == 2 ? n * codes : n;
 auto id_of_image = [&](int source, int code) -> int {
-    return PERIODIC == 0 ? source : PERIODIC == 1 ? (int)((unsigned int)source | (unsigned int)code << ID_BITS) : source + n * code;
+    const unsigned int upper = (unsigned int)(code ^ home) << ID_BITS;  // none at home
+    return PERIODIC == 0 ? source : PERIODIC == 1 ? (int)((unsigned int)source | upper) : source + n * code;
 };
 auto source_of = [&](int id) -> int { return PERIODIC == 0 ? id : PERIODIC == 1 ? id & ((1 << ID_BITS) - 1) : id % n; };
-auto image_of = [&](int id) -> int { return PERIODIC == 1 ? (int)((unsigned int)id >> ID_BITS) : id / n; };
+auto image_of = [&](int id) -> int { return PERIODIC == 1 ? (int)((unsigned int)id >> ID_BITS) ^ home : id / n; };
 auto translate = [&](int code, real* moved) {
     int shift[3] = {0, 0, 0};
     for (int k = DIM - 1; k >= 0; --k) {
@@ -430,9 +431,11 @@ while (place < stop) {
     bool beside = place + lane < stop && place + lane < finite_queries;
     if (beside)
         mine = load_query(place + lane);
+    real my_place[3];
 #pragma unroll
     for (int a = 0; a < DIM; ++a) {
-        const whole here = axis_cell(grid, a, coordinate(a, mine.p)), there = __shfl_sync(ALL, here, 0);
+        my_place[a] = coordinate(a, mine.p);
+        const whole here = axis_cell(grid, a, my_place[a]), there = __shfl_sync(ALL, here, 0);
         beside = beside && (ORDER != 0 || (a == 0 ? grid.dense || (here >= there && here - there < 2 * REACH_X) : here == there));
     }
     const int group = __ffs(~__ballot_sync(ALL, beside)) == 0 ? 32 : __ffs(~__ballot_sync(ALL, beside)) - 1;
@@ -470,7 +473,7 @@ while (place < stop) {
         reduce_over_group(mine.p[a], low[a], high[a]);
         real lowest = low[a], highest = high[a];
         if constexpr (PERIODIC)
-            reduce_over_group(coordinate(a, mine.p), lowest, highest);
+            reduce_over_group(my_place[a], lowest, highest);
         bound = lane == 2 * a ? lowest : lane == 2 * a + 1 ? highest : bound;
         center[a] = real(0.5) * low[a] + real(0.5) * high[a];
         const real below = center[a] - low[a], above = high[a] - center[a], half = (below > above ? below : above) * step_scale;
@@ -531,9 +534,14 @@ while (place < stop) {
         if (lane >= 2 * DIM)
             reached = 0;
     }
+    bool inside = true;  // no row of cells leaves the box: there are no images, and nothing is moved
+    if constexpr (PERIODIC) {
+        const int along = lane / 2;
+        inside = !__any_sync(ALL, lane < 2 * DIM && is_periodic(along) && (reached < 0 || reached >= (whole)cell_scale(along)));
+    }
     auto cells_along = [&](int a) { return (int)(__shfl_sync(ALL, reached, 2 * a + 1) - __shfl_sync(ALL, reached, 2 * a)) + 1; };
     int rows = ORDER != 0 ? cells_along(0) : 1;  // on a curve, cells along x are no run
-    if (is_periodic(0))  // a row is cut where it enters another image
+    if (!inside && is_periodic(0))  // a row is cut where it enters another image
         rows = period_of(0, __shfl_sync(ALL, reached, 1)) - period_of(0, __shfl_sync(ALL, reached, 0)) + 1;
     if (cells_along(0) <= 0 || cells_along(1) <= 0 || cells_along(2) <= 0)
         rows = 0;
@@ -545,7 +553,7 @@ while (place < stop) {
         for (int a = 0; a < 3; ++a)
             first[a] = __shfl_sync(ALL, reached, 2 * a);
         const int wide = cells_along(1), deep = cells_along(2), across = ORDER != 0 ? cells_along(0) : rows / (wide * deep);
-        int length = cells_along(0), from = 0, size = 0, image = 0;
+        int length = cells_along(0), from = 0, size = 0, image = home;
         const int row = base + lane, line = row / across, level = line / wide;
         whole y = first[1] + (line - level * wide), z = first[2] + level;
         struct Part { whole first, y, z; int length, image; };
@@ -580,7 +588,7 @@ while (place < stop) {
                 return Part{cell[0], cell[1], cell[2], 0, home};
             return Part{cell[0], cell[1], cell[2], (int)(last - cell[0]) + 1, image};
         };
-        if constexpr (PERIODIC) {
+        if (PERIODIC && !inside) {
             const Part part = part_of(row < rows ? row : 0);
             first[0] = part.first;
             y = part.y;
@@ -606,7 +614,7 @@ while (place < stop) {
                     back = length - ahead > back ? length - ahead : back;
             };
             for (int r = 0; r < base; ++r)
-                if constexpr (PERIODIC) {
+                if (PERIODIC && !inside) {
                     const Part part = part_of(r);
                     if (part.image == image)  // as long as this one
                         overlap(ring(row_start(grid, part.y, part.z) + ring(part.first, grid.cells), grid.cells));
@@ -639,7 +647,7 @@ while (place < stop) {
         if (size > 0) {
             const int number = __popc(occupied & lanes_below);
             warp.runs[number] = Run{end, from - (end - size)};
-            if constexpr (PERIODIC) {
+            if (PERIODIC && !inside) {
                 warp.run_images[number] = image;
                 translate(image, warp.run_moved[number]);
             }
@@ -746,7 +754,7 @@ while (place < stop) {
     bool meets_itself = drops_self;  // the first candidates are the queries themselves: number = lane
     if (own) {
         Place at_home = mine;
-        if constexpr (PERIODIC)
+        if constexpr (PERIODIC == 2)
             at_home.id = bits_as_real(id_of_image(my_id, home));
         if (lane < group)
             keep(at_home, mine_from_center, lane);
@@ -885,7 +893,7 @@ while (place < stop) {
             if (!grid.dense && at >= grid.finite)  // the ring of cells closes
                 at -= grid.finite;
             candidates[k].p[0] = INF;
-            if constexpr (PERIODIC) {
+            if (PERIODIC && !inside) {
                 const int of_run = (int)(run - warp.runs) - 1;
                 if (number < total && (warp.run_images[of_run] != home || (unsigned int)(at - place) >= (own ? group : 0))) {
                     candidates[k] = load(sorted + at);
@@ -894,8 +902,11 @@ while (place < stop) {
                         candidates[k].p[a] = Lattice::add(candidates[k].p[a], warp.run_moved[of_run][a]);
                     candidates[k].id = bits_as_real(id_of_image(id_of(candidates[k].id), warp.run_images[of_run]));
                 }
-            } else if (number < total && (unsigned int)(at - place) >= (own ? group : 0))
+            } else if (number < total && (unsigned int)(at - place) >= (own ? group : 0)) {
                 candidates[k] = load(sorted + at);
+                if constexpr (PERIODIC == 2)
+                    candidates[k].id = bits_as_real(id_of_image(id_of(candidates[k].id), home));
+            }
         }
     };
     for (bool finished = false; !finished;) {

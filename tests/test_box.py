@@ -3,6 +3,7 @@
 import functools
 
 import checked
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -119,3 +120,190 @@ def test_brute_force(name):
 @pytest.mark.parametrize(("dtype", "dim"), [*BOTH, *OTHERS])
 def test_every_case(name, dtype, dim, closed, backend):
     assert_case(name, dtype, dim, backend, closed=closed, geometry=True)
+
+
+# --- what boxes add to lists -----------------------------------------------------------------------------------------------
+
+LENGTHS, SKEWED = np.array([1.0, 1.2, 0.9]), np.array([[1.0, 0.0, 0.0], [0.3, 1.1, 0.0], [-0.2, 0.25, 0.95]])
+SMALL = np.array([0.5, 1.2, 0.45])  # several images within a cutoff of 0.3
+
+
+def points(n, dtype=np.float64, seed=0, scale=3.0):
+    return jnp.asarray(scale * (np.random.default_rng(seed).random((n, 3)) - 0.5), dtype)
+
+
+def oracle(x, cutoff, vectors, periodic=(True,) * 3, **options):
+    return reference.reference_images(np.asarray(x), cutoff, matrix=np.asarray(vectors, x.dtype), periodic=periodic, **options)
+
+
+@pytest.mark.parametrize("options", [{"half": True}, {"include_self": True}, {"half": True, "include_self": True}], ids=str)
+@pytest.mark.parametrize("vectors", [LENGTHS, SMALL], ids=["nearest", "images"])
+def test_options(options, vectors, dtype):
+    x = points(40, dtype)
+    nbrs = jfrnn.search(x, 0.3, box=jfrnn.Box(vectors), backend="warp", **options)
+    assert image_pairs(nbrs, x) == oracle(x, 0.3, vectors, **options)
+    np.testing.assert_array_equal(jfrnn.count(x, 0.3, box=jfrnn.Box(vectors), backend="warp", **options), nbrs.count)
+
+
+def test_an_open_box_is_none():
+    x = points(50)
+    nbrs = jfrnn.search(x, 0.5, box=jfrnn.Box(LENGTHS, periodic=False))
+    assert nbrs.box is None
+    checked.assert_exact(nbrs, np.asarray(x), 0.5)
+
+
+def test_memory_of_images():
+    """Nothing where the nearest image is the only one; else a byte per slot, and four per particle."""
+    x = points(64, np.float32)
+    plain, nearest, images = (jfrnn.search(x, 0.3, box=box, capacity=200) for box in (None, jfrnn.Box(LENGTHS), jfrnn.Box(SMALL)))
+    assert nearest.images is None
+    assert images.images.codes.dtype == np.uint8
+    size = [sum(leaf.nbytes for leaf in jax.tree.leaves(nbrs)) for nbrs in (plain, nearest, images)]
+    assert size[1] - size[0] == sum(leaf.nbytes for leaf in jax.tree.leaves(nearest.box))
+    assert size[2] - size[1] == images.idx.size + 4 * 64
+
+
+@pytest.mark.parametrize("backend", ["jax", "warp"])
+def test_a_traced_box_may_change(backend):
+    x = points(60, np.float32, scale=2.0)
+
+    @jax.jit
+    def neighbors(x, lengths):
+        traces.append(lengths)
+        return jfrnn.search(x, 0.3, box=jfrnn.Box(lengths), capacity=64, backend=backend)
+
+    traces = []
+    for stretch in (1.0, 0.9, 1.5):
+        lengths = (stretch * LENGTHS).astype(np.float32)
+        assert image_pairs(neighbors(x, jnp.asarray(lengths)), x) == oracle(x, 0.3, lengths)
+    assert len(traces) == 1
+    for lengths in ([1.0, 0.6, 1.0], [1.0, -1.0, 1.0], [1.0, 0.0, 1.0], [1.0, np.nan, 1.0]):
+        nbrs = neighbors(x, jnp.asarray(lengths, jnp.float32))
+        assert jfrnn.Status.BOX_TOO_SMALL in jfrnn.Status(int(nbrs.status))
+        with pytest.raises(ValueError, match="too small"):
+            nbrs.check()
+
+
+def test_a_traced_box_with_images():
+    x = points(30, scale=2.0)
+    found = jax.jit(lambda x, v: jfrnn.search(x, 0.3, box=jfrnn.Box(v, images=(1, 1, 2)), capacity=128, backend="warp"))
+    assert image_pairs(found(x, jnp.asarray(SMALL)), x) == oracle(x, 0.3, SMALL)
+    assert int(found(x, jnp.asarray(0.25 * LENGTHS)).status) == jfrnn.Status.BOX_TOO_SMALL
+
+
+def test_out_of_range_positions_set_a_bit_and_spare_the_others():
+    x = points(30, np.float32).at[7, 1].set(1e4)
+    for backend in ("jax", "warp"):
+        nbrs = jfrnn.search(x, 0.3, box=jfrnn.Box(LENGTHS), backend=backend)
+        assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.OUT_OF_RANGE
+        expected = {pair for pair in oracle(x, 0.3, LENGTHS) if 7 not in pair[:2]}
+        assert image_pairs(nbrs, x) == expected
+        with pytest.raises(ValueError, match="more than 511 lattice vectors"):
+            nbrs.check()
+
+
+@pytest.mark.parametrize("vectors", [LENGTHS, SKEWED, SMALL], ids=["lengths", "skewed", "images"])
+def test_gradients_in_positions_and_box(vectors):
+    """First and second derivatives of a sum over pairs, in float64, against finite differences."""
+    x = points(14, scale=1.0)
+    nbrs = jfrnn.search(x, 0.3, box=jfrnn.Box(vectors), backend="warp")
+
+    def energy(x, vectors):
+        r, mask = nbrs.distances(x, box=jfrnn.Box(vectors))
+        return jnp.sum(jnp.where(mask, (0.3 - r) ** 3, 0))
+
+    rng, vectors = np.random.default_rng(1), jnp.asarray(vectors)
+    dx, dv, h = jnp.asarray(rng.normal(size=x.shape)), jnp.asarray(rng.normal(size=vectors.shape)), 1e-6
+    gradient = jax.jit(jax.grad(energy, argnums=(0, 1)))
+    ahead, behind = ((x + s * h * dx, vectors + s * h * dv) for s in (1, -1))
+    gx, gv = gradient(x, vectors)
+    slope = (energy(*ahead) - energy(*behind)) / (2 * h)
+    np.testing.assert_allclose(jnp.vdot(gx, dx) + jnp.vdot(gv, dv), slope, rtol=1e-6)
+    assert float(jnp.abs(gv).max()) > 0
+    _, second = jax.jvp(gradient, (x, vectors), (dx, dv))
+    for found, plus, minus in zip(second, gradient(*ahead), gradient(*behind), strict=True):
+        np.testing.assert_allclose(found, (plus - minus) / (2 * h), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("vectors", [LENGTHS, SKEWED, SMALL], ids=["lengths", "skewed", "images"])
+@pytest.mark.parametrize("backend", ["jax", "warp"])
+def test_skin_in_a_moving_box(vectors, backend):
+    """Particles drift out of the box and the box breathes: every step holds exactly the pairs of that step."""
+    rng, x, box = np.random.default_rng(2), points(40, scale=1.0), jnp.asarray(vectors)
+    nbrs = jfrnn.search(x, 0.3, box=jfrnn.Box(vectors), skin=0.06, capacity=160, backend=backend)
+    update = jax.jit(lambda nbrs, x, box: nbrs.update(x, box=jfrnn.Box(box)))
+    for step in range(12):
+        x = x + jnp.asarray(rng.normal(scale=0.006, size=x.shape) + [0.012, 0.0, -0.02])
+        box = box * (1 + 0.004 * np.sin(step))
+        nbrs = update(nbrs, x, box)
+        assert masked_images(nbrs, x) == oracle(x, 0.3, box)
+    assert 0 < int(nbrs.rebuild_count) < 12
+
+
+def test_a_box_that_changes_enough_makes_the_list_anew():
+    """Particles rest, the box shrinks: by less than the skin in all directions the list stays, by more it is made anew."""
+    x = points(40, scale=1.0)
+    nbrs = jfrnn.search(x, 0.3, box=jfrnn.Box(LENGTHS, origin=-0.6), skin=0.06, capacity=64)
+    for shrink, rebuilds in ((0.005, 0), (0.02, 1)):
+        box = LENGTHS - shrink
+        after = nbrs.update(x, box=jfrnn.Box(box, origin=-0.6))
+        assert int(after.rebuild_count) == rebuilds
+        assert masked_images(after, x) == oracle(x, 0.3, box)
+
+
+def test_grow_and_replay_in_a_box():
+    x = points(60, scale=1.0)
+    nbrs = jfrnn.search(x, 0.2, box=jfrnn.Box(LENGTHS), capacity=2)
+    assert nbrs.overflow
+    grown = nbrs.grow(x)
+    grown.check()
+    assert image_pairs(grown, x) == oracle(x, 0.2, LENGTHS)
+
+
+def test_vmap_over_positions_and_boxes():
+    batch = jnp.stack([points(30, seed=s) for s in range(3)])
+    boxes = jnp.asarray(LENGTHS * np.array([[1.0], [1.1], [1.3]]))
+    nbrs = jax.vmap(lambda x, v: jfrnn.search(x, 0.3, box=jfrnn.Box(v), capacity=64, backend="warp"))(batch, boxes)
+    for k in range(3):
+        one = jax.tree.map(lambda leaf, k=k: leaf[k], nbrs)
+        assert image_pairs(one, batch[k]) == oracle(batch[k], 0.3, boxes[k])
+
+
+X = np.zeros((4, 3), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("error", "match", "make"),
+    [
+        (ValueError, r"lengths_or_matrix must have shape \[d\].*got shape \[4\]", lambda: jfrnn.Box([1.0] * 4)),
+        (TypeError, r"lengths_or_matrix must be real numbers, got str", lambda: jfrnn.Box("1")),
+        (ValueError, r"lengths of periodic axes must be positive, got \[1.0, 0.0\]", lambda: jfrnn.Box([1.0, 0.0])),
+        (ValueError, r"lengths_or_matrix must be finite, got \[1.0, nan\]", lambda: jfrnn.Box([1.0, np.nan])),
+        (ValueError, r"linearly independent, got the rows", lambda: jfrnn.Box([[1.0, 2.0], [2.0, 4.0]])),
+        (ValueError, r"periodic must be one bool or one per axis \(2\), got 3", lambda: jfrnn.Box([1.0, 1.0], (True,) * 3)),
+        (TypeError, r"periodic must be one bool or one per axis.*got 1", lambda: jfrnn.Box([1.0, 1.0], 1)),
+        (
+            ValueError,
+            r"origin must be a number or have shape \[2\], got shape \[3\]",
+            lambda: jfrnn.Box([1.0, 1.0], origin=[0.0] * 3),
+        ),
+        (TypeError, r"images must be one int >= 0 or one per axis", lambda: jfrnn.Box([1.0, 1.0], images=-1)),
+        (TypeError, r"box must be a jfrnn.Box, got list.*write e.g. jfrnn.Box", lambda: jfrnn.search(X, 1.0, box=[1.0, 1.0, 1.0])),
+        (ValueError, r"box has 2 axes, but positions have 3 columns", lambda: jfrnn.search(X, 1.0, box=jfrnn.Box([1.0, 1.0]))),
+        (
+            ValueError,
+            r"'hashgrid' knows no periodic box",
+            lambda: jfrnn.search(X, 0.1, box=jfrnn.Box([1.0] * 3), backend="hashgrid"),
+        ),
+        (ValueError, r"box is too small for this cutoff.*Replicate", lambda: jfrnn.search(X, 99.0, box=jfrnn.Box([1.0] * 3))),
+        (ValueError, r"without a periodic box: leave box out", lambda: jfrnn.search(X, 1.0).update(X, box=jfrnn.Box([9.0] * 3))),
+        (
+            ValueError,
+            r"box must be of the kind with which the list was made",
+            lambda: jfrnn.search(X, 1.0, box=jfrnn.Box([9.0] * 3)).update(X, box=jfrnn.Box(np.diag([9.0] * 3))),
+        ),
+    ],
+)
+def test_bad_boxes_say_what_is_wrong(error, match, make):
+    with pytest.raises(error, match=match):
+        make()
