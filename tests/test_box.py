@@ -233,7 +233,7 @@ def test_skin_in_a_moving_box(vectors, backend):
     nbrs = jfrnn.search(x, 0.3, box=jfrnn.Box(vectors), skin=0.06, capacity=160, backend=backend)
     update = jax.jit(lambda nbrs, x, box: nbrs.update(x, box=jfrnn.Box(box)))
     for step in range(12):
-        x = x + jnp.asarray(rng.normal(scale=0.006, size=x.shape) + [0.012, 0.0, -0.02])
+        x = x + jnp.asarray(np.array([0.012, 0.0, -0.02]) + rng.normal(scale=0.006, size=x.shape))
         box = box * (1 + 0.004 * np.sin(step))
         nbrs = update(nbrs, x, box)
         assert masked_images(nbrs, x) == oracle(x, 0.3, box)
