@@ -193,9 +193,10 @@ def _images(nbrs: Any, x: Any, queries: Any) -> list[tuple[int, int, tuple[int, 
         shifts = np.zeros((len(i), sources.shape[1]), int)
         shifts[:, periodic] = -np.rint((sources[j] - points[i]) @ np.linalg.pinv(vectors))
     else:
-        turns, query_turns = (None if t is None else np.asarray(unpacked_turns(t, nbrs.box.dim)) for t in nbrs.images[1:])
-        own_turns = turns if query_turns is None else query_turns
-        shifts = kind.shifts[np.asarray(nbrs.images.codes)[i, k]] + own_turns[i] - turns[j]
+        codes, source_turns, query_turns = nbrs.images
+        turns = np.asarray(unpacked_turns(source_turns, nbrs.box.dim))
+        own_turns = turns if query_turns is None else np.asarray(unpacked_turns(query_turns, nbrs.box.dim))
+        shifts = kind.shifts[np.asarray(codes)[i, k]] + own_turns[i] - turns[j]
     return sorted(zip(i.tolist(), j.tolist(), map(tuple, shifts.tolist()), strict=True))
 
 

@@ -383,9 +383,9 @@ def wrap(sources: Array, queries: Array | None, lattice: Lattice, radius: np.flo
     """
     dtype, images, dim = np.dtype(sources.dtype), lattice.images, lattice.dim
     eps, periodic = jnp.finfo(dtype).eps, np.array(images.periodic)
-    packed = [packed_turns(points, lattice) for points in ((sources,) if queries is None else (sources, queries))]
-    wrapped = []
-    for points, turns in zip((sources, queries), packed, strict=False):
+    clouds = [sources] if queries is None else [sources, queries]
+    packed, wrapped = [packed_turns(points, lattice) for points in clouds], []
+    for points, turns in zip(clouds, packed, strict=True):
         off = unpacked_turns(turns, dim).astype(dtype)
         moved = jnp.where((off == 0).all(axis=1, keepdims=True), points, points - translation(off, lattice))
         wrapped.append(jnp.where(turns[:, None] >= 0, moved, jnp.nan))
