@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import jax
 import jax.numpy as jnp
@@ -237,29 +237,101 @@ class NeighborList:
         vectors, mask = self.vectors(positions, queries=queries, box=box)
         return _norms(vectors), mask
 
-    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Export the pairs (i, j), row by row, to the host.
+    @overload
+    def pairs(self, total: None = None) -> tuple[np.ndarray, np.ndarray]: ...
+
+    @overload
+    def pairs(self, total: int) -> tuple[Array, Array]: ...
+
+    def pairs(self, total: int | None = None) -> tuple[Array | np.ndarray, Array | np.ndarray]:
+        """Export the pairs (i, j), row by row: to the host, or inside jit into arrays of a static length.
+
+        Args:
+            total: Length of the arrays, a static int; None: as many as there are, which only a list outside jit knows. Where there
+                are more pairs than `total`, the last ones are missing: compare it with `count.sum()`.
 
         Returns:
-            Query indices i and source indices j, shape [pairs], int32 each.
+            Query indices i and source indices j, shape [pairs] or [total], int32 each; what is left over holds m and n.
 
         Raises:
-            NeighborOverflowError, ValueError, TypeError: as `check`.
-        """
-        count, idx = self._checked_rows()
-        return np.repeat(np.arange(count.size, dtype=np.int32), count), idx
+            NeighborOverflowError, ValueError, TypeError: as `check`, without `total`; ValueError, TypeError: a wrong total.
 
-    def csr(self) -> tuple[np.ndarray, np.ndarray]:
-        """Export compressed rows to the host: the neighbors of row i are indices[offsets[i]:offsets[i + 1]].
+        Differentiable: no (integers). Jit: yes, with total. vmap: yes, with total.
+        """
+        if total is None:
+            count, idx = self._checked_rows()
+            return np.repeat(np.arange(count.size, dtype=np.int32), count), idx
+        rows, indices, _ = self._flat(total)
+        return rows, indices
+
+    @overload
+    def csr(self, total: None = None) -> tuple[np.ndarray, np.ndarray]: ...
+
+    @overload
+    def csr(self, total: int) -> tuple[Array, Array]: ...
+
+    def csr(self, total: int | None = None) -> tuple[Array | np.ndarray, Array | np.ndarray]:
+        """Export compressed rows: the neighbors of row i are indices[offsets[i]:offsets[i + 1]].
+
+        Args:
+            total: As in `pairs`; offsets[-1] then is the number of pairs in the rows, which may exceed `total`.
 
         Returns:
-            Offsets, shape [m + 1], int64, and indices, shape [pairs], int32.
+            Offsets, shape [m + 1], int64 on the host, int32 with `total`; and indices, shape [pairs] or [total], int32, n in what
+            is left over.
 
         Raises:
-            NeighborOverflowError, ValueError, TypeError: as `check`.
+            NeighborOverflowError, ValueError, TypeError: as in `pairs`.
+
+        Differentiable: no (integers). Jit: yes, with total. vmap: yes, with total.
         """
-        count, idx = self._checked_rows()
-        return np.concatenate([[0], np.cumsum(count, dtype=np.int64)]), idx
+        if total is None:
+            count, idx = self._checked_rows()
+            return np.concatenate([[0], np.cumsum(count, dtype=np.int64)]), idx
+        _, indices, offsets = self._flat(total)
+        return offsets, indices
+
+    def to_jraph(self, total: int) -> tuple[Array, Array]:
+        """Return senders and receivers of a graph: an edge from each neighbor j to its particle i.
+
+        Args:
+            total: Number of edges, a static int: as in `pairs`.
+
+        Returns:
+            Senders j and receivers i, shape [total], int32 each; edges that are left over lead from n to m, the node that
+            `jraph.pad_with_graphs` adds first. Stacked, they are an edge index as other graph libraries have it.
+
+        Raises:
+            ValueError, TypeError: as in `pairs`.
+
+        Differentiable: no (integers). Jit: yes. vmap: yes.
+        """
+        rows, indices, _ = self._flat(total)
+        return indices, rows
+
+    def to_jax_md(self) -> "DenseNeighbors":
+        """Return this list as the neighbor-list energies of jax-md take it: `idx` as its format `Dense` has it.
+
+        Such an energy computes displacements itself, so that it wants the full list of the particles among themselves, and at most
+        one image of each pair; the box goes into its displacement function. It sees what is within cutoff + skin.
+
+        Raises:
+            ValueError: the list is a half one, has queries, or tells images apart.
+        """
+        wrong = {"half=True": self.half, "queries": self.own_queries, "several images of a pair": self.images is not None}
+        for what in (name for name, is_so in wrong.items() if is_so):
+            raise ValueError(f"jax-md's Dense format cannot say what a list with {what} does: search without.")
+        return DenseNeighbors(self.idx)
+
+    def _flat(self, total: int) -> tuple[Array, Array, Array]:
+        """Return rows and sources of the pairs, padded to a static length, and the offsets of the rows."""
+        if isinstance(total, bool) or not isinstance(total, int | np.integer):
+            raise TypeError(f"total must be a static int, the length of the arrays, got {type(total).__name__} {total!r}.")
+        if total < 0:
+            raise ValueError(f"total must be at least 0, got {total}.")
+        if self.idx.ndim != 2:
+            raise ValueError(f"exports take one list at a time, got idx of shape {list(self.idx.shape)}: index the batch first.")
+        return _flat_pairs(self.idx, self.count, self.source_count, int(total))
 
     def _checked_rows(self) -> tuple[np.ndarray, np.ndarray]:
         self.check()
@@ -303,6 +375,20 @@ class NeighborList:
         if rows.shape[0] != self.idx.shape[0]:
             raise ValueError(f"queries hold {rows.shape[0]} points, but the list has {self.idx.shape[0]} rows.")
         return sources, rows
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class DenseNeighbors:
+    """What jax-md's energies read of a neighbor list.
+
+    Attributes:
+        idx: Neighbors, shape [n, capacity], int32; unused slots hold n.
+        format: None: neither of jax-md's two sparse formats, hence the dense one. Static.
+    """
+
+    idx: Array
+    format: None = dataclasses.field(default=None, metadata={"static": True})
 
 
 def rounded_capacity(slots: int) -> int:
@@ -400,6 +486,20 @@ def _periodic_vectors(
     fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
     mask = used & is_pair_of(fixed_rows, fixed_sources, neighbor, cutoff, fixed_pairs)
     return jnp.where(mask[..., None], pairs.vectors, 0), mask, shifts
+
+
+@functools.partial(jax.jit, static_argnames=("sources", "total"))
+def _flat_pairs(idx: Array, count: Array, sources: int, total: int) -> tuple[Array, Array, Array]:
+    m, capacity = idx.shape
+    used = jnp.minimum(count, capacity)
+    offsets = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(used, dtype=jnp.int32)])
+    if 0 in (m, capacity, total):
+        return jnp.full(total, m, jnp.int32), jnp.full(total, sources, jnp.int32), offsets
+    place = lax.iota(jnp.int32, total)
+    row = jnp.repeat(lax.iota(jnp.int32, m), used, total_repeat_length=total)
+    there = place < offsets[-1]
+    found = idx[row, jnp.minimum(place - offsets[row], capacity - 1)]
+    return jnp.where(there, row, m), jnp.where(there, found, sources), offsets
 
 
 @jax.jit

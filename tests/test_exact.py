@@ -32,7 +32,7 @@ def cutoffs(dtype):
 
 @hypothesis.settings(max_examples=150, deadline=None)
 @hypothesis.given(st.data())
-@pytest.mark.parametrize("backend", ["brute", "jax", "warp", "hashgrid"])
+@pytest.mark.parametrize("backend", [pytest.param("brute", marks=pytest.mark.slow), "jax", "warp", "hashgrid"])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_any_floats(backend, dtype, data):
     points = data.draw(hnp.arrays(dtype, (POINTS, 3), elements=floats(dtype)))

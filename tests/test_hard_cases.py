@@ -38,6 +38,8 @@ def expected_pairs(name, dtype, dim, closed):
 @pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
 @pytest.mark.parametrize("name", NAMES)
 def test_hard_case(name, dtype, dim, closed, backend):
+    if backend == "brute" and (closed or (dtype, dim) not in ((np.float32, 3), (np.float64, 2))):
+        pytest.skip("the rest of the twin of jax is decided by test_every_case_as_it_is")
     given = HARD_CASES[name].build(dtype, dim)
     rows = max(len(given.positions), 0 if given.queries is None else len(given.queries))
     length = 704 if rows <= 704 else 2048

@@ -51,7 +51,7 @@ def test_warp_takes_at_most_64_bytes_per_particle(dim, dtype):
         assert plan.total_bytes <= 4 * n * capacity + 64 * n + 64_000
 
 
-@pytest.mark.parametrize("backend", ["jax", "brute"])
+@pytest.mark.parametrize("backend", ["jax", pytest.param("brute", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("n", "capacity", "dim", "dtype", "queries"),
     [(1000, 40, 3, np.float32, None), (300_000, 256, 2, np.float64, None), (1000, 40, 2, np.float32, 30_000)],
