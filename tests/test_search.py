@@ -25,8 +25,15 @@ OPTIONS = [
 ]
 
 
-@pytest.mark.parametrize("backend", ["jax", BRUTE, "warp", "hashgrid"])
-@pytest.mark.parametrize(("dtype", "dim"), [(np.float32, 3), (np.float64, 2)])
+@pytest.mark.parametrize(
+    ("backend", "dtype", "dim"),
+    [
+        *(pytest.param("brute", *kind, marks=pytest.mark.slow) for kind in [(np.float32, 3), (np.float64, 2)]),
+        *((backend, *kind) for backend in ("warp", "hashgrid") for kind in [(np.float32, 3), (np.float64, 2)]),
+        ("jax", np.float32, 3),
+        pytest.param("jax", np.float64, 2, marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.parametrize("options", OPTIONS, ids=lambda o: "+".join(o) or "plain")
 def test_options(options, backend, dtype, dim):
     points = np.concatenate([random_points(150, dim, dtype), random_points(20, dim, dtype)])  # 20 coincident pairs
