@@ -128,7 +128,7 @@ def _with_turns(points: Array, packed: Array) -> Array:
 
 
 def _lattice_numbers(lattice: Lattice, wrapped: Wrapped) -> Array:
-    """Return what the kernels know of a lattice, see `jfrnn.kernels._native.LATTICE_NUMBERS`."""
+    """Return what the kernels know of a lattice, in the order that `jfrnn.kernels._native` states."""
     more = 3 - lattice.dim
     square, line = ((0, more), (0, more)), (0, more)
     images = jnp.asarray(lattice.images.reach).astype(lattice.matrix.dtype)

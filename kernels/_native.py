@@ -14,9 +14,8 @@ CELLS_PER_PARTICLE = 4  # size of the cell table; 16 B per particle
 SMALLEST_TABLE = 4096
 
 
-# What follows the radius in the array `cutoff` where space is periodic, in this order: lattice vectors and transform, row by row
-# (3 x 3 each), origin, half the width of the stencil in units of the transform, images within reach, per axis (3 each); slack.
-LATTICE_NUMBERS = 28
+# Where space is periodic, the radius in the array `cutoff` is followed by the numbers of the lattice: its vectors and the transform,
+# row by row (3 x 3 each); origin, half the width of the stencil in units of the transform, images within reach (3 each); slack.
 
 
 def snippet(scalar: str, dim: int, *pieces: str, **constants: int) -> str:
