@@ -14,7 +14,7 @@ CELLS_PER_PARTICLE = 4  # size of the cell table; 16 B per particle
 SMALLEST_TABLE = 4096
 
 
-# Where space is periodic, the radius in the array `cutoff` is followed by the numbers of the lattice: its vectors and the transform,
+# Where space is periodic, the radius in the array `cutoff` is followed by the lattice: its vectors and the transform,
 # row by row (3 x 3 each); origin, half the width of the stencil in units of the transform, images within reach (3 each); slack.
 
 
