@@ -28,7 +28,7 @@ def test_auto_takes_warp_and_says_so():
 
 @pytest.mark.parametrize("backend", ["jax", "brute", "warp", "hashgrid"])
 def test_a_named_engine_is_the_one_that_runs(backend):
-    assert jfrnn.search(X, 0.3, backend=backend).backend == backend
+    assert jfrnn.search(X, 0.3, capacity=8, backend=backend).backend == backend
 
 
 def run_without_warp(code):

@@ -77,10 +77,10 @@ TIED = [name for name in PERIODIC_CASES if any(word in name for word in ("ties",
 # one case for each way in which a program differs: axes, skew, images, queries
 DIFFERENT = [
     ("crystal_0.1_outside", np.float32, 3),
-    ("ties_across_skewed_far", np.float32, 2),
-    ("cutoff_1.5_boxes", np.float32, 2),
+    pytest.param("ties_across_skewed_far", np.float32, 2, marks=pytest.mark.slow),
+    pytest.param("cutoff_1.5_boxes", np.float32, 2, marks=pytest.mark.slow),
     ("queries_many_images", np.float64, 2),
-    ("residues_across_100", np.float64, 2),
+    pytest.param("residues_across_100", np.float64, 2, marks=pytest.mark.slow),
 ]
 
 
@@ -104,7 +104,7 @@ def test_case_of_every_kind(name, dtype, dim):
     assert_case(name, dtype, dim, "jax", geometry=True)
 
 
-@pytest.mark.parametrize("name", ["ties_across", "cutoff_1_boxes"])
+@pytest.mark.parametrize("name", [pytest.param("ties_across", marks=pytest.mark.slow), "cutoff_1_boxes"])
 def test_brute_force(name):
     assert_case(name, np.float32, 2, "brute")
 
@@ -186,18 +186,20 @@ def test_a_traced_box_with_images():
     assert jfrnn.Status.BOX_TOO_SMALL in jfrnn.Status(int(found(x, jnp.asarray(0.25 * LENGTHS)).status))
 
 
-def test_out_of_range_positions_set_a_bit_and_spare_the_others():
+@pytest.mark.parametrize("backend", [pytest.param("jax", marks=pytest.mark.slow), "warp"])
+def test_out_of_range_positions_set_a_bit_and_spare_the_others(backend):
     x = points(30, np.float32).at[7, 1].set(1e4)
-    for backend in ("jax", "warp"):
-        nbrs = jfrnn.search(x, 0.3, box=jfrnn.Box(LENGTHS), backend=backend)
-        assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.OUT_OF_RANGE
-        expected = {pair for pair in oracle(x, 0.3, LENGTHS) if 7 not in pair[:2]}
-        assert image_pairs(nbrs, x) == expected
-        with pytest.raises(ValueError, match="more than 511 lattice vectors"):
-            nbrs.check()
+    nbrs = jfrnn.search(x, 0.3, box=jfrnn.Box(LENGTHS), backend=backend)
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.OUT_OF_RANGE
+    expected = {pair for pair in oracle(x, 0.3, LENGTHS) if 7 not in pair[:2]}
+    assert image_pairs(nbrs, x) == expected
+    with pytest.raises(ValueError, match="more than 511 lattice vectors"):
+        nbrs.check()
 
 
-@pytest.mark.parametrize("vectors", [LENGTHS, SKEWED, SMALL], ids=["lengths", "skewed", "images"])
+@pytest.mark.parametrize(
+    "vectors", [pytest.param(LENGTHS, marks=pytest.mark.slow), SKEWED, SMALL], ids=["lengths", "skewed", "images"]
+)
 def test_gradients_in_positions_and_box(vectors):
     """First and second derivatives of a sum over pairs, in float64, against finite differences."""
     x = points(14, scale=1.0)

@@ -54,7 +54,11 @@ def test_warp_takes_at_most_64_bytes_per_particle(dim, dtype):
 @pytest.mark.parametrize("backend", ["jax", pytest.param("brute", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("n", "capacity", "dim", "dtype", "queries"),
-    [(1000, 40, 3, np.float32, None), (300_000, 256, 2, np.float64, None), (1000, 40, 2, np.float32, 30_000)],
+    [
+        pytest.param(1000, 40, 3, np.float32, None, marks=pytest.mark.slow),
+        (300_000, 256, 2, np.float64, None),
+        (1000, 40, 2, np.float32, 30_000),
+    ],
 )
 def test_compiled_engines_take_what_was_planned(n, capacity, dim, dtype, queries, backend):
     plan = jfrnn.memory_plan(n, 0.1, capacity, dim=dim, dtype=dtype, queries=queries, backend=backend)
