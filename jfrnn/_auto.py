@@ -22,14 +22,18 @@ WARP_ENGINES = ("warp", "hashgrid")
 _WARP_FROM = {"cpu": 0, "gpu": 0}
 
 
-def choose_engine(backend: str, sources: Array, queries: Array | None, periodic: bool = False) -> str:
+def choose_engine(backend: str, sources: Array, queries: Array | None, periodic: bool = False, radii: bool = False) -> str:
     """Return the engine that a backend stands for; raise where one that was named cannot run on the platform.
 
     Raises:
         ImportError: "warp" or "hashgrid", and Warp is not installed.
         RuntimeError: "warp" or "hashgrid", and Warp cannot run on the platform.
-        ValueError: "hashgrid", and space is periodic.
+        ValueError: "hashgrid", and space is periodic; "warp" or "hashgrid", and cutoffs differ from particle to particle.
     """
+    if radii and backend in WARP_ENGINES:
+        raise ValueError(f"backend={backend!r} takes one cutoff for all particles: pass backend='jax' or 'brute', or one number.")
+    if radii and backend == "auto":
+        return "jax"
     if backend == "hashgrid" and periodic:
         raise ValueError("backend='hashgrid' knows no periodic box: pass backend='warp', 'jax' or 'brute'.")
     if backend not in ("auto", *WARP_ENGINES):

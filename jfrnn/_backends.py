@@ -14,7 +14,8 @@ from jax import Array, lax
 from jfrnn import _warp
 from jfrnn._box import Box, Images, Lattice, Wrapped, fractions_of, is_valid, make_lattice, translation, unpacked_turns, wrap
 from jfrnn._cells import CellAxes, build_grid, cell_edge, cell_order, grid_coordinates, open_axes, stencil_runs
-from jfrnn._exact import Cutoff, widened
+from jfrnn._exact import Cutoff, Cutoffs, Radii, is_radius, make_cutoffs
+from jfrnn._levels import Axes, order_by_levels
 from jfrnn._runs import Candidates, Filter, Points, Torus, count_neighbors, list_neighbors
 from jfrnn._status import Status
 from jfrnn._warp import Rows
@@ -25,6 +26,8 @@ class Options(NamedTuple):
 
     filter: Filter
     backend: str
+    closed: bool
+    skin: float = 0.0  # that cutoffs of particles grow by; one cutoff for all holds it already
     images: Images | None = None  # of a box
     radius: float | None = None  # of the cutoff, for the one engine that builds its grid from the host: hashgrid
 
@@ -36,7 +39,7 @@ class Inputs(NamedTuple):
     queries: Array | None
     active: Array | None
     box: Box | None
-    cutoff: Cutoff  # of the list: with the skin
+    cutoff: Cutoff | Radii  # of the list: one for all, with the skin; of each particle, without
 
 
 class Found(NamedTuple):
@@ -69,17 +72,21 @@ def without_inactive(positions: Array, active: Array | None) -> Array:
 
 def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
     """List the neighbors of every query, or only count them (capacity=None). Integers: no gradient flows through."""
-    given, queries, active, box, cutoff = lax.stop_gradient(inputs)
-    sources, images = without_inactive(given, active), options.images
+    given, given_queries, active, box, cutoff = lax.stop_gradient(inputs)
+    sources, queries, images = without_inactive(given, active), given_queries, options.images
+    checks: dict[Status, Array] = {}
+    if isinstance(cutoff, Radii):
+        sources, queries, checks = _with_valid_radii(sources, queries, active, cutoff)
+        cutoff = make_cutoffs(cutoff, options.closed, options.skin)
     if box is None or images is None:
         rows = _rows_of_engine(sources, queries, cutoff, options, capacity)
-        return Found(_with_status(rows, given, queries, active, {}), None, None)
+        return Found(_with_status(rows, given, given_queries, active, checks), None, None)
     lattice = make_lattice(box, images, np.dtype(sources.dtype))
-    wrapped = wrap(sources, queries, lattice, cutoff.radius)
+    wrapped = wrap(sources, queries, lattice, _largest(cutoff))
     rows = _rows_of_engine(sources, queries, cutoff, options, capacity, (lattice, wrapped))
     in_range = _all_in_range(wrapped.turns, sources) & _all_in_range(wrapped.query_turns, sources if queries is None else queries)
-    checks = {Status.BOX_TOO_SMALL: wrapped.enough & is_valid(lattice), Status.OUT_OF_RANGE: in_range}
-    rows = _with_status(rows, given, queries, active, checks)
+    checks |= {Status.BOX_TOO_SMALL: wrapped.enough & is_valid(lattice), Status.OUT_OF_RANGE: in_range}
+    rows = _with_status(rows, given, given_queries, active, checks)
     if rows.idx is None or images.nearest:
         return Found(rows, None, None)
     n = max(sources.shape[0], 1)
@@ -87,6 +94,32 @@ def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
     idx = jnp.where(rows.idx == n * images.total, sources.shape[0], rows.idx % n)
     query_turns = None if queries is None else wrapped.query_turns
     return Found(rows._replace(idx=idx), codes, (wrapped.turns, query_turns))
+
+
+def _with_valid_radii(
+    sources: Array, queries: Array | None, active: Array | None, radii: Radii
+) -> tuple[Array, Array | None, dict[Status, Array]]:
+    """Return positions and queries with NaN where the cutoff is none, and whether all those of particles that take part are."""
+    of_sources, of_queries = (None if x is None else is_radius(x) for x in (radii.sources, radii.queries))
+    right = [jnp.ones((), bool)]
+    if queries is None:
+        valid = next(x for x in (of_sources, of_queries) if x is not None)
+        return _where_rows(valid, sources), None, {Status.INVALID_CUTOFF: (valid if active is None else valid | ~active).all()}
+    if of_sources is not None:
+        right.append((of_sources if active is None else of_sources | ~active).all())
+        sources = _where_rows(of_sources, sources)
+    if of_queries is not None:
+        right.append(of_queries.all())
+        queries = _where_rows(of_queries, queries)
+    return sources, queries, {Status.INVALID_CUTOFF: functools.reduce(jnp.logical_and, right)}
+
+
+def _where_rows(valid: Array, points: Array) -> Array:
+    return jnp.where(valid[:, None], points, jnp.nan)
+
+
+def _largest(cutoff: Cutoff | Cutoffs) -> np.floating | Array:
+    return cutoff.largest if isinstance(cutoff, Cutoffs) else cutoff.radius
 
 
 def _all_in_range(turns: Array, points: Array) -> Array:
@@ -108,26 +141,25 @@ def _with_status(rows: Rows, sources: Array, queries: Array | None, active: Arra
 def _rows_of_engine(
     sources: Array,
     queries: Array | None,
-    cutoff: Cutoff,
+    cutoff: Cutoff | Cutoffs,
     options: Options,
     capacity: int | None,
     torus: tuple[Lattice, Wrapped] | None = None,
 ) -> Rows:
     n, m = sources.shape[0], (sources if queries is None else queries).shape[0]
-    if options.backend == "warp" and 0 not in (n, m):
+    if options.backend == "warp" and isinstance(cutoff, Cutoff) and 0 not in (n, m):
         return _warp.neighbors(sources, queries, cutoff, options.filter, capacity, torus)
-    if options.radius is not None and 0 not in (n, m):
+    if options.radius is not None and isinstance(cutoff, Cutoff) and 0 not in (n, m):
         return _warp.hashgrid_neighbors(sources, queries, cutoff, options.radius, options.filter, capacity)
     if 0 in (n, m):
         fill = n if options.images is None or options.images.nearest else max(n, 1) * options.images.total
         idx, count = None if capacity is None else jnp.full((m, capacity), fill, jnp.int32), jnp.zeros(m, jnp.int32)
     else:
         candidates = _candidates(sources, queries, cutoff, options, torus)
-        bounds = cutoff if torus is None else widened(cutoff, torus[1].slack)
         if capacity is None:
-            idx, count = None, count_neighbors(candidates, bounds, options.filter)
+            idx, count = None, count_neighbors(candidates, cutoff, options.filter)
         else:
-            idx, count = list_neighbors(candidates, bounds, options.filter, capacity)
+            idx, count = list_neighbors(candidates, cutoff, options.filter, capacity)
     required = jnp.max(count, initial=0)
     finite = jnp.isfinite(sources).all() & (True if queries is None else jnp.isfinite(queries).all())
     overflow = False if capacity is None else required > capacity
@@ -136,37 +168,46 @@ def _rows_of_engine(
 
 
 def _candidates(
-    sources: Array, queries: Array | None, cutoff: Cutoff, options: Options, given: tuple[Lattice, Wrapped] | None
+    sources: Array, queries: Array | None, cutoff: Cutoff | Cutoffs, options: Options, given: tuple[Lattice, Wrapped] | None
 ) -> Candidates:
-    brute = options.backend == "brute"
+    """Say where the candidates of a query lie, in particle order (brute force), by cells, or by cells of many sizes."""
+    torus = None if given is None else _torus(sources, queries, *given)
+    clouds = (sources, queries) if given is None else (given[1].sources, None if queries is None else given[1].queries)
+    if options.backend == "brute":
+        return _all_sources(*clouds, cutoff, torus)
     if given is None:
-        if brute:
-            return _all_sources(sources, queries, None)
         points = sources if queries is None else jnp.concatenate([sources, queries])
-        axes = open_axes(cell_edge(cutoff.radius), sources.shape[1])
-        return _cell_stencil(sources, queries, points.T, axes, None)
-    lattice, wrapped = given
+        one = jnp.ones(points.shape[1], points.dtype)
+        along, axes = points.T, Axes(open_axes(cell_edge(_largest(cutoff)), points.shape[1]), one, 0 * one)
+    else:
+        along, axes = _cells_of_lattice(sources, queries, _largest(cutoff), *given)
+    if isinstance(cutoff, Cutoff):
+        return _cell_stencil(*clouds, along, axes.cells, torus)
+    images = None if torus is None else torus.images
+    order = order_by_levels(along, axes, cutoff, sources.shape[0], queries is None, images)
+    points = _in_order(clouds[0], order.sources, cutoff.sources)
+    rows = _in_order(clouds[0] if clouds[1] is None else clouds[1], order.queries, cutoff.queries)
+    return Candidates(points, rows, order.runs, torus, order.passes)
+
+
+def _torus(sources: Array, queries: Array | None, lattice: Lattice, wrapped: Wrapped) -> Torus:
     raw = (sources, sources if queries is None else queries)
     turns = tuple(unpacked_turns(x, lattice.dim).astype(sources.dtype) for x in (wrapped.turns, wrapped.query_turns))
     shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)
-    torus = Torus(lattice.images, translation(shifts, lattice), lattice.matrix, raw, (turns[0], turns[1]))
-    wrapped_queries = None if queries is None else wrapped.queries
-    if brute:
-        return _all_sources(wrapped.sources, wrapped_queries, torus)
-    along, axes = _cells_of_lattice(sources, queries, cutoff, lattice, wrapped)
-    return _cell_stencil(wrapped.sources, wrapped_queries, along, axes, torus)
+    return Torus(lattice.images, translation(shifts, lattice), lattice.matrix, raw, (turns[0], turns[1]), wrapped.slack)
 
 
-def _all_sources(sources: Array, queries: Array | None, torus: Torus | None) -> Candidates:
+def _all_sources(sources: Array, queries: Array | None, cutoff: Cutoff | Cutoffs, torus: Torus | None) -> Candidates:
     """Brute force: a run of all sources, O(n·m), for each image."""
     images = 1 if torus is None else torus.images.total
 
-    def runs(place: Array) -> tuple[Array, Array, Array | None]:
+    def runs(place: Array, _: Array) -> tuple[Array, Array, Array | None]:
         start = jnp.zeros((place.size, images), jnp.int32)
         return start, jnp.full_like(start, sources.shape[0]), None if torus is None else start + lax.iota(jnp.int32, images)
 
-    points = _in_order(sources, None)
-    return Candidates(points, points if queries is None else _in_order(queries, None), runs, torus)
+    of_sources, of_queries = (cutoff.sources, cutoff.queries) if isinstance(cutoff, Cutoffs) else (None, None)
+    points = _in_order(sources, None, of_sources)
+    return Candidates(points, _in_order(sources if queries is None else queries, None, of_queries), runs, torus)
 
 
 def _cell_stencil(sources: Array, queries: Array | None, along: Array, axes: CellAxes, torus: Torus | None) -> Candidates:
@@ -186,7 +227,7 @@ def _cell_stencil(sources: Array, queries: Array | None, along: Array, axes: Cel
     query_coords = coords[:, order]
     images = None if torus is None else torus.images
 
-    def runs(place: Array) -> tuple[Array, Array, Array | None]:
+    def runs(place: Array, _: Array) -> tuple[Array, Array, Array | None]:
         return stencil_runs(grid, query_coords.at[:, place].get(mode="promise_in_bounds"), images)
 
     points = _in_order(sources, grid.order)
@@ -194,25 +235,28 @@ def _cell_stencil(sources: Array, queries: Array | None, along: Array, axes: Cel
 
 
 def _cells_of_lattice(
-    sources: Array, queries: Array | None, cutoff: Cutoff, lattice: Lattice, wrapped: Wrapped
-) -> tuple[Array, CellAxes]:
+    sources: Array, queries: Array | None, radius: np.floating | Array, lattice: Lattice, wrapped: Wrapped
+) -> tuple[Array, Axes]:
     """Cut a lattice cell along its vectors; what is open, and not skewed, is cut as it is without a box."""
     points, packed = sources, wrapped.turns
     if queries is not None:
         points = jnp.concatenate([sources, queries])
         packed = jnp.concatenate([packed, wrapped.query_turns])
     units, turns = fractions_of(points, lattice), unpacked_turns(packed, lattice.dim).astype(points.dtype)
-    along, edges, cells = [], [], []
+    along, edges, cells, scales, margins = [], [], [], [], []
     for k, periodic in enumerate(lattice.images.periodic):
         straight = lattice.images.orthogonal and not periodic
         x = points[:, k] if straight else jnp.clip(units[:, k] - turns[:, k], 0, 1) if periodic else units[:, k]
         along.append(jnp.where(packed >= 0, x, jnp.nan))
-        edges.append(cell_edge(cutoff.radius if straight else wrapped.reach[k]))
+        edges.append(cell_edge(radius if straight else wrapped.reach[k]))
         cells.append(jnp.clip(jnp.floor(1 / wrapped.reach[k]), 1, 2.0**23) if periodic else None)
-    return jnp.stack(along), CellAxes(edges, cells)
+        scales.append(jnp.ones_like(wrapped.reach[k]) if straight else (wrapped.reach[k] - wrapped.margin[k]) / radius)
+        margins.append(0 * wrapped.margin[k] if straight else wrapped.margin[k])
+    scale = jnp.stack(scales) * (1 + 8 * jnp.finfo(points.dtype).eps)
+    return jnp.stack(along), Axes(CellAxes(edges, cells), scale, jnp.stack(margins))
 
 
-def _in_order(positions: Array, order: Array | None) -> Points:
+def _in_order(positions: Array, order: Array | None, radii: Array | None = None) -> Points:
     if order is None:
-        return Points(list(positions.T), lax.iota(jnp.int32, positions.shape[0]))
-    return Points([x[order] for x in positions.T], order)
+        return Points(list(positions.T), lax.iota(jnp.int32, positions.shape[0]), radii)
+    return Points([x[order] for x in positions.T], order, None if radii is None else radii[order])

@@ -190,13 +190,13 @@ class Images(NamedTuple):
         return np.dtype(np.uint8 if self.total <= 256 else np.int16)
 
 
-def images_of(box: Box, radius: float, dtype: np.dtype, sources: int) -> Images:
-    """Choose which images a search with this radius looks at.
+def images_of(box: Box, radius: float | None, dtype: np.dtype, sources: int) -> Images:
+    """Choose which images a search with this radius, the largest one, looks at; None: it is known only from data.
 
     Raises:
         ValueError: the cutoff spans more images than can be told apart.
     """
-    if box.images is None and not isinstance(box.vectors, Tracer):
+    if box.images is None and radius is not None and not isinstance(box.vectors, Tracer):
         share = radius / _widths(np.asarray(box.vectors, dtype).astype(np.float64), box.periodic)
         nearest = bool((share <= _NEAREST).all())
         # room for the rounding of coordinates: far fewer than a hundredth of a cell
@@ -323,6 +323,7 @@ class Wrapped(NamedTuple):
         query_turns: [m] int32.
         slack: [] bound on the error of a component of a difference of wrapped coordinates, with a shift within reach.
         reach: [d] half the width of the stencil, in units of the transform: no pair is farther apart along an axis.
+        margin: [d] of the reach, what does not depend on the radius.
         enough: [] bool: the images that are looked at are all that there can be.
     """
 
@@ -332,6 +333,7 @@ class Wrapped(NamedTuple):
     query_turns: Array
     slack: Array
     reach: Array
+    margin: Array
     enough: Array
 
 
@@ -405,11 +407,12 @@ def wrap(sources: Array, queries: Array | None, lattice: Lattice, radius: np.flo
     if images.orthogonal:
         rounding = jnp.where(periodic, rounding, 0)  # open axes are walked in raw coordinates
     length = jnp.sqrt(jnp.sum((transform * radius) ** 2, axis=0)) * (1 + 16 * eps)
-    reach = length + 2 * rounding + jnp.where(periodic, 8 * eps, 0)
+    margin = 2 * rounding + jnp.where(periodic, 8 * eps, 0)
+    reach = length + margin
     limit = jnp.where(periodic, 0.5 if images.nearest else jnp.asarray(images.reach, dtype), jnp.inf)
     enough = (reach < limit).all() if images.nearest else (reach <= limit).all()
     slack = _wrapping_error(most, lattice)
-    return Wrapped(wrapped[0], wrapped[-1], packed[0], packed[-1], slack, reach, enough)
+    return Wrapped(wrapped[0], wrapped[-1], packed[0], packed[-1], slack, reach, margin, enough)
 
 
 def _wrapping_error(most: Array, lattice: Lattice) -> Array:

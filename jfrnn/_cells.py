@@ -62,6 +62,12 @@ def cell_coordinate(x: Array, edge: Array) -> Array:
     return jnp.where(x < 0, -1 - quotient, quotient)
 
 
+def cell_remainder(x: Array, edge: Array) -> Array:
+    """Return how far |x| lies beyond the beginning of its cell, exactly: in [0, edge) while cells are told apart."""
+    cell = cell_coordinate(x, edge)
+    return _remainder(jnp.abs(x), jnp.where(x < 0, -1 - cell, cell), edge)
+
+
 def _remainder(magnitude: Array, quotient: Array, edge: Array) -> Array:
     half = 2.0 ** (12 if edge.dtype == np.float32 else 26)
     high = jnp.floor(quotient / half) * half
@@ -194,7 +200,13 @@ def stencil_runs(grid: Grid, coords: Array, images: Images | None = None) -> tup
     where they are those of an image; a row is cut where it enters another image.
     Dense: two loads from the table per run. Otherwise: two binary searches per run among the sorted cells of the sources.
     """
-    (first, last, *rest), code = _stencil_rows(coords, grid.extent, images)
+    cells, code = _stencil_rows(coords, grid.extent, images)
+    start, stop = places_between(grid, cells)
+    return (start, stop, None) if code is None else (start, jnp.where(cells[0] <= cells[1], stop, start), code)
+
+
+def places_between(grid: Grid, cells: list[Array]) -> tuple[Array, Array]:
+    """Return the first place and the end of rows of cells [m, r]: given are their first and last cell along x, then y[, z]."""
 
     def from_table(cells: list[Array]) -> tuple[Array, Array]:
         first, last, *rest = cells
@@ -206,8 +218,7 @@ def stencil_runs(grid: Grid, coords: Array, images: Images | None = None) -> tup
         bounds = _lower_bound(grid.coords, [jnp.stack([first, last + 1]), *(jnp.stack([c, c]) for c in rest)])
         return bounds[0], bounds[1]
 
-    start, stop = lax.cond(grid.dense, from_table, by_binary_search, [first, last, *rest])
-    return (start, stop, None) if code is None else (start, jnp.where(first <= last, stop, start), code)
+    return lax.cond(grid.dense, from_table, by_binary_search, cells)
 
 
 def _stencil_rows(coords: Array, extent: Array, images: Images | None) -> tuple[list[Array], Array | None]:

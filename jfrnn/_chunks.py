@@ -23,6 +23,7 @@ def run_chunk(
     queries: Callable[[State], Array] | None = None,
     active: Callable[[State], Array] | None = None,
     box: Callable[[State], Box] | None = None,
+    cutoff: Callable[[State], Array] | None = None,
     slack: float = 1.25,
 ) -> tuple[State, NeighborList]:
     """Run a jitted chunk of steps; where its list overflowed, grow the list and run the same chunk again from the same state.
@@ -39,6 +40,7 @@ def run_chunk(
         queries: state -> queries, exactly if the list was made with queries.
         active: state -> mask, exactly if the list was made with `active`.
         box: state -> periodic box, where it changes.
+        cutoff: state -> cutoffs of the particles, where they change.
         slack: Factor >= 1 on the slots that were needed, as in `NeighborList.grow`.
 
     Returns:
@@ -68,6 +70,6 @@ def run_chunk(
         after, seen = chunk(state, nbrs)
         if not bool(np.any(seen.overflow)):
             return after, seen
-        given: dict[str, Any] = {"queries": queries, "active": active, "box": box}
+        given: dict[str, Any] = {"queries": queries, "active": active, "box": box, "cutoff": cutoff}
         given = {name: of(state) for name, of in given.items() if of is not None}
         nbrs = seen.grow(positions(state), slack=slack, **given)

@@ -25,10 +25,14 @@ from jax import Array, lax
 
 
 class Pair(NamedTuple):
-    """Points a and b of pairs, axis by axis, and the lattice shift that b takes (None: no lattice): x_b + shift·matrix - x_a."""
+    """Points a and b of pairs, axis by axis, and the lattice shift that b takes (None: no lattice): x_b + shift·matrix - x_a.
+
+    `radii`, where cutoffs differ: one array, the cutoff of each pair; or two, of which the cutoff is the mean.
+    """
 
     a: list[Array]
     b: list[Array]
+    radii: list[Array] | None = None
     shift: list[Array] | None = None  # whole floats
     matrix: Array | None = None  # [d, d], lattice vectors in rows, 0 where space is open
     orthogonal: bool = True
@@ -75,6 +79,101 @@ class Cutoff:
     scaled: bool = dataclasses.field(metadata={"static": True})
 
 
+RULES = ("gather", "scatter", "either", "both", "mean")  # whose cutoff is a pair's: i's, j's, the larger, the smaller, the mean
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Radii:
+    """Cutoffs that differ from particle to particle, as they were given; data, so that they may be traced.
+
+    Attributes:
+        sources: [n] of the sources, or None where the rule does not ask for them.
+        queries: [m] of the queries, likewise.
+        rule: Which of both is a pair's (`RULES`). Static.
+    """
+
+    sources: Array | None
+    queries: Array | None
+    rule: str = dataclasses.field(metadata={"static": True})
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Cutoffs:
+    """What the pair test derives from radii, which are positive and finite wherever a particle takes part, else 0.
+
+    Attributes:
+        sources: [n], or None where the rule does not ask for them.
+        queries: [m], likewise.
+        largest: [] the largest of them all.
+        unit_scale: [] power of two, itself a normal float, that brings the largest into [1, 4).
+        rule: Static.
+        closed: Pairs at exactly the cutoff count. Static.
+    """
+
+    sources: Array | None
+    queries: Array | None
+    largest: Array
+    unit_scale: Array
+    rule: str = dataclasses.field(metadata={"static": True})
+    closed: bool = dataclasses.field(metadata={"static": True})
+    scaled = True
+
+    def of_pairs(self, queries: Array | None, sources: Array | None) -> list[Array]:
+        """Return the cutoff of each pair, or two of which it is the mean, from those of its query and its source."""
+        if sources is None or queries is None:
+            return [x for x in (queries, sources) if x is not None]
+        if self.rule == "mean":
+            return [queries, sources]
+        return [jnp.maximum(queries, sources) if self.rule == "either" else jnp.minimum(queries, sources)]
+
+
+def is_radius(radii: Array) -> Array:
+    """Say which cutoffs the pair test can decide."""
+    dtype = np.dtype(radii.dtype)
+    return (radii >= smallest_cutoff(dtype)) & (radii <= largest_cutoff(dtype))
+
+
+def make_cutoffs(radii: Radii, closed: bool, skin: float = 0.0) -> Cutoffs:
+    """Derive what the pair test needs; with a skin, of radii that are that much larger, rounded up."""
+    parts = [None if x is None else jnp.where(is_radius(x), _sum_rounded_up(x, skin), 0) for x in (radii.sources, radii.queries)]
+    largest = functools.reduce(jnp.maximum, (jnp.max(x, initial=0) for x in parts if x is not None))
+    largest = jnp.where(largest > 0, largest, 1)
+    return Cutoffs(parts[0], parts[1], largest, _unit_scale(largest), radii.rule, closed)
+
+
+def _sum_rounded_up(x: Array, skin: float) -> Array:
+    if skin == 0:
+        return x
+    total, error = _two_sum(x, jnp.asarray(skin, x.dtype))
+    return jnp.where(error > 0, jnp.nextafter(total, jnp.asarray(jnp.inf, x.dtype)), total)
+
+
+def bounds_of_pairs(cutoffs: Cutoffs, radii: list[Array], slack: Array | None = None) -> tuple[Array, Array]:
+    """Return what step 1 compares scaled squared distances with: below the first a pair without doubt, above the second none.
+
+    A mean is rounded (eps/2), hence 16 eps instead of 8. So small against the largest that squares could underflow, a cutoff
+    leaves to the next steps whatever is not surely farther.
+    """
+    finfo = jnp.finfo(cutoffs.largest.dtype)
+    scaled = [radius * cutoffs.unit_scale for radius in radii]
+    radius = scaled[0] if len(scaled) == 1 else (scaled[0] + scaled[1]) / 2
+    off = 0 if slack is None else 2 * slack * cutoffs.unit_scale
+    least = 2.0 ** (finfo.minexp // 2 + finfo.nmant)
+    sure = radius > jnp.maximum(off, least)
+    inside = jnp.where(sure, (radius - off) ** 2 * (1 - 32 * finfo.eps), -1)
+    outside = (jnp.maximum(radius, least) + off) ** 2 * (1 + 32 * finfo.eps)
+    return inside, outside
+
+
+def _unit_scale(x: Array) -> Array:
+    """Return the power of two that brings positive floats into [1, 4) and is itself a normal float."""
+    unsigned, nmant, bias = (jnp.uint32, 23, 127) if x.dtype == jnp.float32 else (jnp.uint64, 52, 1023)
+    exponent = lax.bitcast_convert_type(x, unsigned) >> unsigned(nmant)  # biased: 2·bias - e is that of 2^-(e - bias)
+    return lax.bitcast_convert_type(jnp.maximum(unsigned(2 * bias) - exponent, unsigned(1)) << unsigned(nmant), x.dtype)
+
+
 def make_cutoff(value: float, dtype: np.dtype, closed: bool) -> Cutoff:
     """Round a cutoff within `smallest_cutoff` and `largest_cutoff` to a dtype and derive the bounds of the pair test."""
     finfo = np.finfo(dtype)
@@ -105,7 +204,7 @@ def widened(cutoff: Cutoff, slack: Array) -> Cutoff:
     return dataclasses.replace(cutoff, inside=inside, outside=(radius + off) ** 2 * (1 + 16 * eps))
 
 
-def squared_distance(difference: list[Array], cutoff: Cutoff) -> Array:
+def squared_distance(difference: list[Array], cutoff: "Cutoff | Cutoffs") -> Array:
     """Sum the squares of the scaled differences, one array per axis, in working precision (step 1)."""
     if cutoff.scaled:
         difference = [component * cutoff.unit_scale for component in difference]
@@ -115,26 +214,47 @@ def squared_distance(difference: list[Array], cutoff: Cutoff) -> Array:
     return total
 
 
-def is_pair_of(rows: Array, sources: Array, neighbor: Array, cutoff: Cutoff, shifted: "Shifted | None" = None) -> Array:
+def is_pair_of(rows: Array, sources: Array, neighbor: Array, cutoff: "Cutoff | Cutoffs", shifted: "Shifted | None" = None) -> Array:
     """Decide exactly, for rows [m, d], sources [n, d] and source indices [m, k], which pairs there are: [m, k] bool."""
     axes = range(sources.shape[1])
     if shifted is None:
-        square = squared_distance([sources[neighbor, axis] - rows[:, axis, None] for axis in axes], cutoff)
+        difference = [sources[neighbor, axis] - rows[:, axis, None] for axis in axes]
     else:
-        cutoff = widened(cutoff, shifted.slack)
-        square = squared_distance(list(jnp.moveaxis(shifted.vectors, -1, 0)), cutoff)
+        difference = list(jnp.moveaxis(shifted.vectors, -1, 0))
+
+    def radii_of(row: Array, source: Array) -> list[Array] | None:
+        if isinstance(cutoff, Cutoff):
+            return None
+        own, other = cutoff.queries, cutoff.sources
+        return cutoff.of_pairs(None if own is None else own[row], None if other is None else other[source])
+
+    inside, outside = step_one_bounds(
+        cutoff, radii_of(lax.broadcasted_iota(jnp.int32, neighbor.shape, 0), neighbor), None if shifted is None else shifted.slack
+    )
+    square = squared_distance(difference, cutoff)
 
     def points(at: Array | None) -> Pair:
         row = lax.broadcasted_iota(jnp.int32, neighbor.shape, 0)
         row, source = (row, neighbor) if at is None else (flat_take(row, at), flat_take(neighbor, at))
-        pair = Pair([rows[row, axis] for axis in axes], [sources[source, axis] for axis in axes])
+        pair = Pair([rows[row, axis] for axis in axes], [sources[source, axis] for axis in axes], radii_of(row, source))
         if shifted is None:
             return pair
         shift = [shifted.shifts[..., k] if at is None else flat_take(shifted.shifts[..., k], at) for k in axes]
         return pair._replace(shift=shift, matrix=shifted.matrix, orthogonal=shifted.orthogonal)
 
-    surely = square < cutoff.inside
-    return surely | refine((square <= cutoff.outside) & ~surely, points, cutoff)
+    surely = square < inside
+    return surely | refine((square <= outside) & ~surely, points, cutoff)
+
+
+def step_one_bounds(
+    cutoff: "Cutoff | Cutoffs", radii: list[Array] | None, slack: Array | None = None
+) -> tuple[np.floating | Array, np.floating | Array]:
+    """Return the bounds of step 1: of one cutoff, or of pairs with these radii; differences may be off by `slack` per component."""
+    if isinstance(cutoff, Cutoffs):
+        return bounds_of_pairs(cutoff, radii or [], slack)
+    if slack is not None:
+        cutoff = widened(cutoff, slack)
+    return cutoff.inside, cutoff.outside
 
 
 class Shifted(NamedTuple):
@@ -152,7 +272,7 @@ def flat_take(x: Array, at: Array) -> Array:
     return x.reshape(-1).at[at].get(mode="clip")
 
 
-def refine(doubtful: Array, points: PointsAt, cutoff: Cutoff) -> Array:
+def refine(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
     """Decide the pairs that step 1 left open (steps 2 and 3); False elsewhere. Costs nothing where none is open.
 
     `points(None)` gives both points of every pair in the shape of `doubtful`; `points(at)` those of the pairs at the flat indices
@@ -162,43 +282,86 @@ def refine(doubtful: Array, points: PointsAt, cutoff: Cutoff) -> Array:
     return lax.cond(jnp.any(doubtful), decide, jnp.zeros_like, doubtful)
 
 
-def _refine_some(doubtful: Array, points: PointsAt, cutoff: Cutoff) -> Array:
-    signs = jnp.where(doubtful, _sum_sign(points(None), cutoff), 1).reshape(-1)
+def _refine_some(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
+    pairs = points(None)
+    signs = jnp.where(doubtful, _sum_sign(pairs, _threshold(pairs, cutoff)), 1).reshape(-1)
     chunk = min(_INTEGER_CHUNK, signs.size)
 
     def decide_chunk(signs: Array) -> Array:
         (at,) = jnp.nonzero(signs == _UNKNOWN, size=chunk, fill_value=signs.size)
         at = at.astype(jnp.int32)
-        return signs.at[at].set(_integer_sign(points(at), cutoff), mode="drop")
+        pairs = points(at)
+        return signs.at[at].set(_integer_sign(pairs, _threshold(pairs, cutoff)), mode="drop")
 
     signs = lax.while_loop(lambda signs: jnp.any(signs == _UNKNOWN), decide_chunk, signs)
     return (signs <= 0 if cutoff.closed else signs < 0).reshape(doubtful.shape)
 
 
+class _Threshold(NamedTuple):
+    """What steps 2 and 3 know of the cutoff of pairs: scalars, or one value per pair.
+
+    Attributes:
+        radii: r; or two, of which r is the mean: then twice the distance is compared with their sum.
+        scale: power of two that brings the larger one into [1, 4).
+        plain_bits: magnitude bits of the smallest number for which step 2 cannot underflow.
+    """
+
+    radii: list[Array]
+    scale: Array
+    plain_bits: Array
+
+    @property
+    def times(self) -> int:
+        """How often the distance is compared with the sum of the radii."""
+        return len(self.radii)
+
+
+def _threshold(pair: Pair, cutoff: Cutoff | Cutoffs) -> _Threshold:
+    if isinstance(cutoff, Cutoff):
+        radius, scale, plain = lax.optimization_barrier((cutoff.radius, cutoff.unit_scale, cutoff.plain_bits))  # no constants:
+        return _Threshold([radius], scale, plain)  # they could be regrouped
+    radii = pair.radii or []
+    larger = functools.reduce(jnp.maximum, radii)
+    narrow = larger.dtype == jnp.float32
+    unsigned, nmant = (jnp.uint32, 23) if narrow else (jnp.uint64, 52)
+    exponent = lax.bitcast_convert_type(larger, unsigned) >> unsigned(nmant)
+    below = unsigned(35 if narrow else 450)
+    lowest = jnp.maximum(jnp.maximum(exponent, below) - below, unsigned(nmant + 2))
+    return _Threshold(radii, _unit_scale(larger), lowest << unsigned(nmant))
+
+
 # --- step 2: error-free transformations -------------------------------------------------------------------------------
 
 
-def _sum_sign(pair: Pair, cutoff: Cutoff) -> Array:
+def _sum_sign(pair: Pair, threshold: _Threshold) -> Array:
     """Return the sign of |b - a|² - r² where it is proven, ties of representable differences included, else _UNKNOWN; int32."""
-    radius, scale = lax.optimization_barrier((cutoff.radius, cutoff.unit_scale))  # no constants: they could be regrouped
+    radii, scale, least = threshold
     terms, slack = [], jnp.zeros_like(pair.a[0])
-    plain = [_is_plain(x, cutoff) for x in (*pair.a, *pair.b)]
+    plain = [_is_plain(x, least) for x in (*pair.a, *pair.b, *(radii if len(radii) == 2 else ()))]
+    distance_scale = scale * threshold.times
     for axis, (ak, bk) in enumerate(zip(pair.a, pair.b, strict=True)):
         high, low = _two_difference(bk, ak)
         rest = jnp.zeros_like(ak)
         for shift, component in pair.lattice_terms(axis):
             half = _half_mantissa(component)  # times a shift of at most half a mantissa: exact
             *others, low, high = _distill(_distill([low, shift * (component - half), shift * half, high]))
-            rest = sum((jnp.abs(x * scale) for x in others), rest)
-            plain.append(_is_plain(component, cutoff))
+            rest = sum((jnp.abs(x * distance_scale) for x in others), rest)
+            plain.append(_is_plain(component, least))
         if pair.shift is not None:
-            slack = slack + (4 * jnp.abs(high * scale) * rest + 2 * rest * rest)
-        high, low = high * scale, low * scale
+            slack = slack + (4 * jnp.abs(high * distance_scale) * rest + 2 * rest * rest)
+        high, low = high * distance_scale, low * distance_scale
         terms += _exact_square(high)
         tail = 2 * high * low
         terms.append(tail)
         slack = slack + (jnp.abs(tail) * jnp.finfo(slack.dtype).eps + 2 * low * low)
-    terms += [-term for term in _exact_square(jnp.broadcast_to(radius * scale, slack.shape))]
+    radius, low = radii[0] * scale, None
+    if len(radii) == 2:
+        radius, low = _two_sum(radius, radii[1] * scale)
+    terms += [-term for term in _exact_square(jnp.broadcast_to(radius, slack.shape))]
+    if low is not None:
+        tail = -2 * radius * low
+        terms.append(tail)
+        slack = slack + (jnp.abs(tail) * jnp.finfo(slack.dtype).eps + 2 * low * low)
     for _ in range(3):
         terms = _distill(terms)
     rest = sum(jnp.abs(term) for term in terms[:-1])
@@ -250,32 +413,34 @@ def _distill(terms: list[Array]) -> list[Array]:
     return [*result, total]
 
 
-def _is_plain(x: Array, cutoff: Cutoff) -> Array:
+def _is_plain(x: Array, least: Array) -> Array:
     """Say where x is 0 or large enough that no product of step 2 underflows."""
     unsigned = jnp.uint32 if x.dtype == jnp.float32 else jnp.uint64
     magnitude = lax.bitcast_convert_type(x, unsigned) << unsigned(1) >> unsigned(1)
-    return (magnitude == 0) | (magnitude >= cutoff.plain_bits)
+    return (magnitude == 0) | (magnitude >= least)
 
 
 # --- step 3: integers as wide as the float format ---------------------------------------------------------------------
 
 
-def _integer_sign(pair: Pair, cutoff: Cutoff) -> Array:
+def _integer_sign(pair: Pair, threshold: _Threshold) -> Array:
     """Return the sign of |b - a|² - r² for [k] pairs of finite points, in integer arithmetic throughout.
 
     A coordinate fills at most 6 limbs of 11 bits, a difference at most 12, each below 2^12 in magnitude; a limb of the sum of
     squares collects at most 3·12 products below 2^24 and stays below 2^31. With a lattice, limbs of a difference are below 2^30
-    (shifts are below 2^17); carried into [-2^10, 2^10), all of them may be filled, 193 at most: 3·193·2^20 + 6·2^22 < 2^31.
+    (shifts are below 2^16, doubled or not); carried into [-2^10, 2^10), all of them may be filled, 193 at most: 4·193·2^20 < 2^31.
+    So are two radii, added up, and twice the differences that are compared with them.
     """
-    dim, shifts = len(pair.a), pair.shift is not None
-    limbs = _limbs(jnp.stack([*pair.a, *pair.b, jnp.full_like(pair.a[0], cutoff.radius)]))  # [2d + 1, k, count]
-    differences, radius = limbs[dim : 2 * dim] - limbs[:dim], limbs[-1]
-    if shifts:
+    dim, times = len(pair.a), threshold.times
+    radii = [jnp.broadcast_to(radius, pair.a[0].shape) for radius in threshold.radii]
+    limbs = _limbs(jnp.stack([*pair.a, *pair.b, *radii]))  # [2d + times, k, count]
+    differences, radius = times * (limbs[dim : 2 * dim] - limbs[:dim]), limbs[2 * dim :].sum(axis=0, dtype=jnp.int32)
+    if pair.shift is not None or times > 1:
         for axis in range(dim):
             for shift, component in pair.lattice_terms(axis):
-                differences = differences.at[axis].add(shift.astype(jnp.int32)[:, None] * _limbs(component))
+                differences = differences.at[axis].add(times * shift.astype(jnp.int32)[:, None] * _limbs(component))
         more = ((0, 0), (0, 0), (0, 3))
-        differences, radius = _carried(jnp.pad(differences, more)), jnp.pad(radius, more[1:])
+        differences, radius = _carried(jnp.pad(differences, more)), _carried(jnp.pad(radius, more[1:]))
     count = differences.shape[-1]
 
     def add_shifted(i: Array, total: Array) -> Array:

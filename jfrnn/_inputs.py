@@ -11,7 +11,7 @@ from jax import Array
 from jax.core import Tracer
 
 from jfrnn._box import Box
-from jfrnn._exact import Cutoff, largest_cutoff, make_cutoff, smallest_cutoff
+from jfrnn._exact import RULES, Cutoff, Radii, largest_cutoff, make_cutoff, make_cutoffs, smallest_cutoff
 
 BACKENDS = ("auto", "jax", "warp", "hashgrid", "brute")
 _MOST_POINTS = 2**31 - 32
@@ -46,12 +46,12 @@ def checked_positions(name: str, positions: Any, like: Array | None = None) -> A
         return jnp.asarray(positions)
 
 
-def checked_cutoff(cutoff: Any, dtype: np.dtype, closed: bool) -> Cutoff:  # noqa: ANN401
+def checked_cutoff(cutoff: Any, dtype: np.dtype) -> Cutoff:  # noqa: ANN401
     """Return the cutoff, rounded once to the dtype of the positions."""
     if isinstance(cutoff, Tracer):
         raise TypeError(
-            "cutoff must be a static number, got a traced value: pass a Python float, or mark the argument with "
-            "jax.jit(..., static_argnames='cutoff')."
+            "cutoff must be a static number, got a traced value: pass a Python float, mark the argument with "
+            "jax.jit(..., static_argnames='cutoff'), or pass an array with one per particle, which may be traced."
         )
     if np.ndim(cutoff) != 0:
         raise ValueError(f"cutoff must be one number, got an array of shape {list(np.shape(cutoff))}.")
@@ -66,7 +66,50 @@ def checked_cutoff(cutoff: Any, dtype: np.dtype, closed: bool) -> Cutoff:  # noq
             f"cutoff={value} is outside [{low:.1e}, {high:.1e}], the range in which {dtype} decides pairs exactly: "
             "choose another unit of length, or float64."
         )
-    return make_cutoff(value, dtype, checked_flag("closed", closed))
+    return make_cutoff(value, dtype, closed=False)
+
+
+def checked_radii(cutoff: Any, rule: Any, sources: Array, queries: Array | None) -> Radii | None:  # noqa: ANN401
+    """Return cutoffs that differ from particle to particle, in the dtype of the positions; None where it is one number."""
+    if rule not in RULES:
+        raise ValueError(f"radius_rule must be one of {', '.join(map(repr, RULES))}, got {rule!r}.")
+    if not isinstance(cutoff, tuple | list) and np.ndim(cutoff) == 0:
+        return None
+    n, m = sources.shape[0], None if queries is None else queries.shape[0]
+    if m is None:
+        radii = _checked_radii_of("cutoff", cutoff, n, "particle", sources)
+        return Radii(None if rule == "gather" else radii, None if rule == "scatter" else radii, rule)
+    if rule == "gather":
+        return Radii(None, _checked_radii_of("cutoff", cutoff, m, "query (radius_rule='gather')", sources), rule)
+    if rule == "scatter":
+        return Radii(_checked_radii_of("cutoff", cutoff, n, "position (radius_rule='scatter')", sources), None, rule)
+    if not isinstance(cutoff, tuple) or len(cutoff) != 2:
+        raise ValueError(
+            f"cutoff must be a pair of arrays, of the positions [{n}] and of the queries [{m}], where radius_rule={rule!r} asks "
+            f"for both, got {_describe_array(cutoff)}."
+        )
+    of_sources = _checked_radii_of("cutoff[0]", cutoff[0], n, "position", sources)
+    return Radii(of_sources, _checked_radii_of("cutoff[1]", cutoff[1], m, "query", sources), rule)
+
+
+def _checked_radii_of(name: str, radii: Any, size: int, what: str, like: Array) -> Array:  # noqa: ANN401
+    if not hasattr(radii, "dtype") or not np.issubdtype(radii.dtype, np.floating):
+        raise TypeError(f"{name} must be a number, or an array of floats with one per {what}, got {_describe_array(radii)}.")
+    if tuple(radii.shape) != (size,):
+        raise ValueError(f"{name} must be a number, or have shape [{size}], one per {what}, got shape {list(radii.shape)}.")
+    if isinstance(radii, Tracer):
+        return radii.astype(like.dtype)
+    with jax.ensure_compile_time_eval():  # stay concrete inside jit
+        return jnp.asarray(np.asarray(radii).astype(like.dtype) if isinstance(radii, np.ndarray) else radii.astype(like.dtype))
+
+
+def largest_known(radii: Radii, skin: float) -> float | None:
+    """Return the largest cutoff with the skin, of those that are valid; None where they are traced."""
+    given = [x for x in (radii.sources, radii.queries) if x is not None]
+    if any(isinstance(x, Tracer) for x in given):
+        return None
+    with jax.ensure_compile_time_eval():
+        return float(make_cutoffs(radii, closed=False, skin=skin).largest)
 
 
 def checked_skin(skin: Any, cutoff: float, dtype: np.dtype) -> float:  # noqa: ANN401

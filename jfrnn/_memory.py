@@ -86,7 +86,7 @@ def memory_plan(
     """
     n, queries = checked_size("n", n), None if queries is None else checked_size("queries", queries)
     dim, dtype = checked_kind(dim, dtype)
-    capacity, radius, engine = checked_capacity(capacity), checked_cutoff(cutoff, dtype, closed=False), checked_backend(backend)
+    capacity, radius, engine = checked_capacity(capacity), checked_cutoff(cutoff, dtype), checked_backend(backend)
     rows = n if queries is None else queries
     where = default_platform() if platform is None else platform
     if engine == "auto":
@@ -112,7 +112,7 @@ def _device_of(platform: str) -> Any:  # noqa: ANN401
 
 def _compiled_scratch(points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff, engine: str, capacity: int) -> int:
     """Compile the search for sources and queries of these shapes, and return what XLA says of its temporary arrays [B]."""
-    options = Options(Filter(drop_self=points[1] is None, later_only=False), engine)
+    options = Options(Filter(drop_self=points[1] is None, later_only=False), engine, closed=False)
     inputs: Any = Inputs(points[0], points[1], None, None, cutoff)  # pyright: ignore[reportArgumentType] (shapes of arrays)
     analysis = list_rows.lower(inputs, options, capacity).compile().memory_analysis()
     if analysis is None:

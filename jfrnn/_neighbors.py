@@ -13,8 +13,8 @@ from jax.core import Tracer
 
 from jfrnn._backends import Found, Inputs, Options, count_rows, list_rows, without_inactive
 from jfrnn._box import LARGEST_TURN, Box, Images, fixed_box, make_lattice, nearest_shifts, shifted_pairs, unpacked_turns
-from jfrnn._exact import Cutoff, is_pair_of, make_cutoff
-from jfrnn._inputs import checked_active, checked_box, checked_positions, checked_slack
+from jfrnn._exact import Cutoff, Cutoffs, Radii, is_pair_of, make_cutoff, make_cutoffs
+from jfrnn._inputs import checked_active, checked_box, checked_positions, checked_radii, checked_slack
 from jfrnn._runs import Filter
 from jfrnn._status import NeighborOverflowError, Status
 from jfrnn._verlet import Verlet, first_verlet, list_radius, moved_too_far
@@ -50,7 +50,8 @@ class NeighborList:
         verlet: With a skin, where the list was made and how often anew (`Verlet`); None without.
         box: The periodic box, its floats rounded to the dtype of the positions; None where space is open.
         images: Of which image of its source each slot tells (`ImageCodes`), 1 B per slot; None where the nearest is the only one.
-        cutoff: Interaction radius [length], rounded to the dtype of the positions. Static.
+        radii: Cutoffs of the particles (`Radii`: sources [n], queries [m], the rule), or None where one serves all.
+        cutoff: Interaction radius [length], rounded to the dtype of the positions; None where particles have their own. Static.
         skin: Extra shell [length]. Static.
         half: Each unordered pair stands once, in the row of its smaller index. Static.
         include_self: Each particle is its own neighbor. Static.
@@ -69,7 +70,8 @@ class NeighborList:
     verlet: Verlet | None
     box: Box | None
     images: ImageCodes | None
-    cutoff: float = dataclasses.field(metadata={"static": True})
+    radii: Radii | None
+    cutoff: float | None = dataclasses.field(metadata={"static": True})
     skin: float = dataclasses.field(metadata={"static": True})
     half: bool = dataclasses.field(metadata={"static": True})
     include_self: bool = dataclasses.field(metadata={"static": True})
@@ -91,7 +93,13 @@ class NeighborList:
         return (self.status & Status.ROW_OVERFLOW.value) != 0
 
     def update(
-        self, positions: Array, *, queries: Array | None = None, active: Array | None = None, box: Box | None = None
+        self,
+        positions: Array,
+        *,
+        cutoff: Array | tuple[Array, Array] | None = None,
+        queries: Array | None = None,
+        active: Array | None = None,
+        box: Box | None = None,
     ) -> "NeighborList":
         """Make the list anew if something has moved skin/2 since it was made, or may have by rounding; without a skin, always.
 
@@ -101,6 +109,8 @@ class NeighborList:
 
         Args:
             positions: Sources [length], shape [n, d], where they are now.
+            cutoff: Cutoffs of the particles now, as `search` takes them, if the list was made with such; default: those that it
+                has. The list keeps them. What the largest of them grew is taken off the skin.
             queries: Queries [length], shape [m, d], exactly if the list was made with queries.
             active: Which particles take part now, shape [n], bool, exactly if the list was made with `active`; one that comes or
                 goes makes the list anew.
@@ -118,12 +128,14 @@ class NeighborList:
         """
         sources, rows = self._geometry_inputs(positions, queries)
         rows = rows if self.own_queries else None
-        return _update(self, sources, rows, self._checked_active(active, sources), self._box_now(box, sources))
+        radii = self._radii_now(cutoff, sources, rows)
+        return _update(self, sources, rows, self._checked_active(active, sources), self._box_now(box, sources), radii)
 
     def grow(
         self,
         positions: Array,
         *,
+        cutoff: Array | tuple[Array, Array] | None = None,
         queries: Array | None = None,
         active: Array | None = None,
         box: Box | None = None,
@@ -133,6 +145,7 @@ class NeighborList:
 
         Args:
             positions: Sources [length], shape [n, d].
+            cutoff: As in `update`.
             queries: As in `update`.
             active: As in `update`.
             box: As in `update`.
@@ -147,11 +160,11 @@ class NeighborList:
         """
         sources, rows = self._geometry_inputs(positions, queries)
         queries, active, slack = rows if self.own_queries else None, self._checked_active(active, sources), checked_slack(slack)
-        box = self._box_now(box, sources)
-        if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, self.required))):
+        box, radii = self._box_now(box, sources), self._radii_now(cutoff, sources, queries)
+        if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, radii, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
         met = rounded_capacity(math.ceil(slack * int(np.max(self.required))))
-        inputs, options = _inputs_of(self, sources, queries, active, box)
+        inputs, options = _inputs_of(self, sources, queries, active, box, radii)
         return _remade(self, inputs, options, max(self.capacity, met, counted_capacity(inputs, options, slack)))
 
     @property
@@ -346,6 +359,16 @@ class NeighborList:
             raise ValueError(f"this list was made {state}.")
         return None if active is None else checked_active(active, sources)
 
+    def _radii_now(self, cutoff: Any, sources: Array, queries: Array | None) -> Radii | None:  # noqa: ANN401
+        if cutoff is None:
+            return self.radii
+        if self.radii is None:
+            raise ValueError("this list was made with one cutoff for all particles: leave cutoff out.")
+        radii = checked_radii(cutoff, self.radii.rule, sources, queries)
+        if radii is None:
+            raise ValueError("this list was made with a cutoff for each particle: pass such an array, or leave cutoff out.")
+        return radii
+
     def _box_now(self, box: Box | None, sources: Array) -> Box | None:
         if box is None:
             return self.box
@@ -359,10 +382,10 @@ class NeighborList:
         box = self._box_now(box, sources)
         if 0 in (sources.shape[0], *self.idx.shape):
             return jnp.zeros((*self.idx.shape, sources.shape[1]), sources.dtype), jnp.zeros(self.idx.shape, bool), None
-        cutoff = make_cutoff(self.cutoff, np.dtype(sources.dtype), self.closed)
+        cutoff = self.radii if self.cutoff is None else make_cutoff(self.cutoff, np.dtype(sources.dtype), self.closed)
         if box is None or self.box_kind is None:
-            return *_vectors(self.idx, self.count, sources, rows, cutoff), None
-        return _periodic_vectors(self.idx, self.count, self.images, sources, rows, box, self.box_kind, cutoff)
+            return *_vectors(self.idx, self.count, sources, rows, cutoff, self.closed), None
+        return _periodic_vectors(self.idx, self.count, self.images, sources, rows, box, self.box_kind, cutoff, self.closed)
 
     def _geometry_inputs(self, positions: Array, queries: Array | None) -> tuple[Array, Array]:
         sources = checked_positions("positions", positions)
@@ -405,27 +428,40 @@ def counted_capacity(inputs: Inputs, options: Options, slack: float) -> int:
 
 
 def made_options(
-    radius: float, keep: Filter, box_kind: Images | None, backend: str, dtype: np.dtype, closed: bool
-) -> tuple[Cutoff, Options]:
-    """Return the operand and the static options of a search with this radius, which holds the skin."""
-    return make_cutoff(radius, dtype, closed), Options(keep, backend, box_kind, radius if backend == "hashgrid" else None)
+    cutoff: "float | Radii | None",
+    keep: Filter,
+    box_kind: Images | None,
+    backend: str,
+    dtype: np.dtype,
+    closed: bool,
+    skin: float,
+) -> tuple[Cutoff | Radii, Options]:
+    """Return the operand and the static options of a search with this radius, which holds the skin, or radii, which do not."""
+    if isinstance(cutoff, Radii):
+        return cutoff, Options(keep, backend, closed, skin, images=box_kind)
+    if cutoff is None:
+        raise TypeError("made_options() needs a radius or radii.")
+    radius = cutoff if backend == "hashgrid" else None
+    return make_cutoff(cutoff, dtype, closed), Options(keep, backend, closed, images=box_kind, radius=radius)
 
 
 def _inputs_of(
-    nbrs: NeighborList, sources: Array, queries: Array | None, active: Array | None, box: Box | None
+    nbrs: NeighborList, sources: Array, queries: Array | None, active: Array | None, box: Box | None, radii: Radii | None
 ) -> tuple[Inputs, Options]:
     """Return what a search takes that makes this list at these positions."""
     dtype = np.dtype(sources.dtype)
     keep = Filter(drop_self=not (nbrs.own_queries or nbrs.include_self), later_only=nbrs.half)
-    radius = list_radius(nbrs.cutoff, nbrs.skin, dtype)
-    cutoff, options = made_options(radius, keep, nbrs.box_kind, nbrs.backend, dtype, nbrs.closed)
+    reach = radii if nbrs.cutoff is None else list_radius(nbrs.cutoff, nbrs.skin, dtype)
+    cutoff, options = made_options(reach, keep, nbrs.box_kind, nbrs.backend, dtype, nbrs.closed, nbrs.skin)
     return Inputs(sources, queries, active, box, cutoff), options
 
 
 @jax.jit
-def _update(nbrs: NeighborList, sources: Array, queries: Array | None, active: Array | None, box: Box | None) -> NeighborList:
-    sources, queries, box = lax.stop_gradient((sources, queries, box))
-    inputs, options = _inputs_of(nbrs, sources, queries, active, box)
+def _update(
+    nbrs: NeighborList, sources: Array, queries: Array | None, active: Array | None, box: Box | None, radii: Radii | None
+) -> NeighborList:
+    sources, queries, box, radii = lax.stop_gradient((sources, queries, box, radii))
+    inputs, options = _inputs_of(nbrs, sources, queries, active, box, radii)
 
     def remake(nbrs: NeighborList) -> NeighborList:
         made, verlet = _remade(nbrs, inputs, options, nbrs.capacity), nbrs.verlet
@@ -436,8 +472,8 @@ def _update(nbrs: NeighborList, sources: Array, queries: Array | None, active: A
     if nbrs.verlet is None:
         return remake(nbrs)
     now = without_inactive(sources, active)
-    moved = moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, nbrs.skin)
-    nbrs = dataclasses.replace(nbrs, box=box)
+    moved = moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin)
+    nbrs = dataclasses.replace(nbrs, box=box, radii=radii)
     # a loop of at most one round: XLA keeps what a loop carries in place, but copies what a branch returns
     return lax.while_loop(lambda state: state[0], lambda state: (jnp.zeros_like(state[0]), remake(state[1])), (moved, nbrs))[1]
 
@@ -451,23 +487,44 @@ def found_fields(inputs: Inputs, found: Found, skin: float) -> dict[str, Any]:
     """Return the fields of a list that come from data."""
     rows, sources = found.rows, without_inactive(inputs.sources, inputs.active)
     codes = None if found.images is None or found.turns is None else ImageCodes(found.images, *found.turns)
-    verlet = first_verlet(sources, inputs.queries, inputs.box) if skin else None
+    radii = lax.stop_gradient(inputs.cutoff) if isinstance(inputs.cutoff, Radii) else None
+    verlet = first_verlet(sources, inputs.queries, inputs.box, radii) if skin else None
     fields = {"idx": rows.idx, "count": rows.counts, "status": rows.status, "required": rows.required}
-    return fields | {"verlet": verlet, "box": lax.stop_gradient(inputs.box), "images": codes}
+    return fields | {"verlet": verlet, "box": lax.stop_gradient(inputs.box), "images": codes, "radii": radii}
 
 
-@jax.jit
-def _vectors(idx: Array, count: Array, sources: Array, rows: Array, cutoff: Cutoff) -> tuple[Array, Array]:
+def _pair_cutoff(cutoff: Cutoff | Radii | None, closed: bool) -> Cutoff | Cutoffs:
+    if isinstance(cutoff, Cutoff):
+        return cutoff
+    if cutoff is None:
+        raise TypeError("a list has a cutoff or radii.")
+    return make_cutoffs(lax.stop_gradient(cutoff), closed)
+
+
+@functools.partial(jax.jit, static_argnames="closed")
+def _vectors(
+    idx: Array, count: Array, sources: Array, rows: Array, given: Cutoff | Radii | None, closed: bool
+) -> tuple[Array, Array]:
+    cutoff = _pair_cutoff(given, closed)
     used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
     neighbor = jnp.where(used, idx, 0)
     mask = used & is_pair_of(lax.stop_gradient(rows), lax.stop_gradient(sources), neighbor, cutoff)
     return jnp.where(mask[..., None], sources[neighbor] - rows[:, None, :], 0), mask
 
 
-@functools.partial(jax.jit, static_argnames="kind")
+@functools.partial(jax.jit, static_argnames=("kind", "closed"))
 def _periodic_vectors(
-    idx: Array, count: Array, images: ImageCodes | None, sources: Array, rows: Array, box: Box, kind: Images, cutoff: Cutoff
+    idx: Array,
+    count: Array,
+    images: ImageCodes | None,
+    sources: Array,
+    rows: Array,
+    box: Box,
+    kind: Images,
+    given: Cutoff | Radii | None,
+    closed: bool,
 ) -> tuple[Array, Array, Array]:
+    cutoff = _pair_cutoff(given, closed)
     lattice = make_lattice(box, kind, np.dtype(sources.dtype))
     used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
     neighbor = jnp.where(used, idx, 0)

@@ -273,8 +273,8 @@ def _interleave(axes: list[Array]) -> Words:
     high = low = jnp.zeros_like(axes[0])
     for axis, c in enumerate(axes):
         first, shift = _high_part(axis, len(axes))
-        low = low | _spread(c, len(axes)) << axis
-        high = high | _spread(c >> first, len(axes)) << shift
+        low = low | spread(c, len(axes)) << axis
+        high = high | spread(c >> first, len(axes)) << shift
     return high, low
 
 
@@ -290,7 +290,7 @@ def _high_part(axis: int, dim: int) -> tuple[int, int]:
     return first, dim * first + axis - 32
 
 
-def _spread(c: Array, dim: int) -> Array:
+def spread(c: Array, dim: int) -> Array:
     """Move bit b to place d * b, for as many bits as one word has places (2D: 16, 3D: 11)."""
     c = c & np.uint32(2 ** -(-32 // dim) - 1)
     for group in (8, 4, 2, 1):

@@ -7,14 +7,14 @@ scratch of a block stays below 64 MB whatever n, and nothing per candidate is ev
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
 from jfrnn._box import Images
-from jfrnn._exact import Cutoff, Pair, flat_take, refine, squared_distance
+from jfrnn._exact import Cutoff, Cutoffs, Pair, flat_take, refine, squared_distance, step_one_bounds
 
 LANES = 16  # candidates per word: hits in its lower half, doubtful ones in its upper half
 _BLOCK_WORDS = 1 << 16
@@ -23,15 +23,26 @@ _SLOT_GROUP = 128  # slots of a row that are filled at a time
 _FEW_RUNS = 32
 _DOUBTFUL = 32  # doubtful candidates per row that one round of the exact test takes
 
-# places of queries [b] -> first places and ends of their runs [b, r], and the codes of their images (None: no lattice)
-Runs = Callable[[Array], tuple[Array, Array, Array | None]]
+# places of queries [b], and which pass over the sources -> first places and ends of their runs [b, r], and the codes of their
+# images (None: no lattice)
+Runs = Callable[[Array, Array], tuple[Array, Array, Array | None]]
+
+
+State = TypeVar("State")
 
 
 class Points(NamedTuple):
-    """Particles in the order in which the engine walks them: d coordinate arrays [n], and the id of each [n] int32."""
+    """Particles in the order in which the engine walks them.
+
+    Attributes:
+        axes: d coordinate arrays [n].
+        ids: [n] int32.
+        radii: [n] their cutoffs, or None where one serves all, or the rule does not ask for them.
+    """
 
     axes: list[Array]
     ids: Array
+    radii: Array | None = None
 
 
 class Torus(NamedTuple):
@@ -43,6 +54,7 @@ class Torus(NamedTuple):
         matrix: [d, d].
         raw: [n, d] sources and [m, d] queries as they were given.
         turns: [n, d] and [m, d] whole floats: how many lattice vectors were taken off.
+        slack: [] by how much a component of a difference of wrapped coordinates may be wrong.
     """
 
     images: Images
@@ -50,6 +62,7 @@ class Torus(NamedTuple):
     matrix: Array
     raw: tuple[Array, Array]
     turns: tuple[Array, Array]
+    slack: Array
 
 
 class Filter(NamedTuple):
@@ -60,15 +73,19 @@ class Filter(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """Sources and queries in the order in which they are walked, and where the candidates of a query lie among the sources."""
+    """Sources and queries in the order in which they are walked, and where the candidates of a query lie among the sources.
+
+    `passes` [] int32 is how often `runs` is asked for more; None: once.
+    """
 
     sources: Points
     queries: Points
     runs: Runs
     torus: Torus | None
+    passes: Array | None = None
 
 
-def count_neighbors(candidates: Candidates, cutoff: Cutoff, keep: Filter) -> Array:
+def count_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter) -> Array:
     """Count the neighbors of every query: [m] int32, in the order of the queries' ids."""
     engine = _Engine(candidates._replace(sources=_padded(candidates.sources)), cutoff, keep, capacity=1)
     queries = candidates.queries
@@ -76,24 +93,26 @@ def count_neighbors(candidates: Candidates, cutoff: Cutoff, keep: Filter) -> Arr
     def count_block(b: Array, out: Array) -> Array:
         place, ids = engine.block(b)
 
-        def add_chunk(state: tuple[Array, Array]) -> tuple[Array, Array]:
-            chunk, count = state
-            return chunk + 1, count + _bit_counts(engine.hit_words(place, table, chunk).hits).sum(1, dtype=jnp.int32)
+        def add_pass(which: Array, count: Array) -> Array:
+            table = engine.word_table(place, which)
 
-        table = engine.word_table(place)
-        start = (jnp.int32(0), jnp.zeros(place.shape, jnp.int32))
-        _, count = lax.while_loop(lambda state: state[0] * engine.words < table.longest, add_chunk, start)
-        return out.at[ids].set(count)
+            def add_chunk(state: tuple[Array, Array]) -> tuple[Array, Array]:
+                chunk, count = state
+                return chunk + 1, count + _bit_counts(engine.hit_words(place, table, chunk).hits).sum(1, dtype=jnp.int32)
+
+            return lax.while_loop(lambda state: state[0] * engine.words < table.longest, add_chunk, (jnp.int32(0), count))[1]
+
+        return out.at[ids].set(engine.all_passes(add_pass, jnp.zeros(place.shape, jnp.int32)))
 
     return lax.fori_loop(0, engine.block_count, count_block, jnp.zeros(queries.ids.shape, jnp.int32))
 
 
-def list_neighbors(candidates: Candidates, cutoff: Cutoff, keep: Filter, capacity: int) -> tuple[Array, Array]:
+def list_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, capacity: int) -> tuple[Array, Array]:
     """List the neighbors of every query: [m, capacity] int32 source indices, unused slots n, and [m] int32 true counts.
 
     Where images must be told apart, an index is that of the source plus n times the code of its image, unused slots n·images.
     """
-    sources, queries, _, torus = candidates
+    sources, queries, torus = candidates.sources, candidates.queries, candidates.torus
     engine = _Engine(candidates._replace(sources=_padded(sources)), cutoff, keep, capacity)
     n, images = sources.ids.size, 1 if torus is None or torus.images.nearest else torus.images.total
     group = min(_SLOT_GROUP, capacity)
@@ -101,32 +120,36 @@ def list_neighbors(candidates: Candidates, cutoff: Cutoff, keep: Filter, capacit
 
     def list_block(b: Array, out: tuple[Array, Array]) -> tuple[Array, Array]:
         place, ids = engine.block(b)
-        table = engine.word_table(place)
 
-        def add_chunk(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            chunk, rows, count = state
-            hits, first, image = engine.hit_words(place, table, chunk)
-            total = _bit_counts(hits).sum(1, dtype=jnp.int32)
+        def add_pass(which: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
+            table = engine.word_table(place, which)
 
-            def add_group(state: tuple[Array, Array]) -> tuple[Array, Array]:
-                g, rows = state
-                start = jnp.minimum(g * group, capacity - group)
-                ordinal = start + slots - count[:, None]
-                word, bit = _nth_bits(hits, ordinal)
-                neighbor = engine.sources.ids.at[_take(first, word) + bit].get(mode="promise_in_bounds")
-                if image is not None and images > 1:
-                    neighbor = neighbor + n * _take(image, word)
-                old = lax.dynamic_slice_in_dim(rows, start, group, axis=1)
-                new = jnp.where((ordinal >= 0) & (ordinal < total[:, None]), neighbor, old)
-                return g + 1, lax.dynamic_update_slice_in_dim(rows, new, start, axis=1)
+            def add_chunk(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+                chunk, rows, count = state
+                hits, first, image = engine.hit_words(place, table, chunk)
+                total = _bit_counts(hits).sum(1, dtype=jnp.int32)
 
-            until = jnp.minimum(jnp.max(count + total), capacity)
-            _, rows = lax.while_loop(lambda state: state[0] * group < until, add_group, (jnp.min(count) // group, rows))
-            return chunk + 1, rows, count + total
+                def add_group(state: tuple[Array, Array]) -> tuple[Array, Array]:
+                    g, rows = state
+                    start = jnp.minimum(g * group, capacity - group)
+                    ordinal = start + slots - count[:, None]
+                    word, bit = _nth_bits(hits, ordinal)
+                    neighbor = engine.sources.ids.at[_take(first, word) + bit].get(mode="promise_in_bounds")
+                    if image is not None and images > 1:
+                        neighbor = neighbor + n * _take(image, word)
+                    old = lax.dynamic_slice_in_dim(rows, start, group, axis=1)
+                    new = jnp.where((ordinal >= 0) & (ordinal < total[:, None]), neighbor, old)
+                    return g + 1, lax.dynamic_update_slice_in_dim(rows, new, start, axis=1)
+
+                until = jnp.minimum(jnp.max(count + total), capacity)
+                _, rows = lax.while_loop(lambda state: state[0] * group < until, add_group, (jnp.min(count) // group, rows))
+                return chunk + 1, rows, count + total
+
+            start = (jnp.int32(0), *found)
+            return lax.while_loop(lambda state: state[0] * engine.words < table.longest, add_chunk, start)[1:]
 
         rows = jnp.full((place.size, capacity), n * images, jnp.int32)
-        start = (jnp.int32(0), rows, jnp.zeros(place.shape, jnp.int32))
-        _, rows, count = lax.while_loop(lambda state: state[0] * engine.words < table.longest, add_chunk, start)
+        rows, count = engine.all_passes(add_pass, (rows, jnp.zeros(place.shape, jnp.int32)))
         return out[0].at[ids].set(rows), out[1].at[ids].set(count)
 
     m = queries.ids.size
@@ -154,7 +177,7 @@ class _HitWords(NamedTuple):
 
 class _Engine(NamedTuple):
     candidates: Candidates
-    cutoff: Cutoff
+    cutoff: Cutoff | Cutoffs
     keep: Filter
     capacity: int
 
@@ -185,8 +208,13 @@ class _Engine(NamedTuple):
         place = first + lax.iota(jnp.int32, self.block_size)
         return place, lax.dynamic_slice_in_dim(self.queries.ids, first, self.block_size)
 
-    def word_table(self, place: Array) -> _WordTable:
-        start, stop, image = self.candidates.runs(place)
+    def all_passes(self, add_pass: Callable[[Array, State], State], state: State) -> State:
+        """Go through the sources as often as the candidates ask for."""
+        passes = self.candidates.passes
+        return add_pass(jnp.int32(0), state) if passes is None else lax.fori_loop(0, passes, add_pass, state)
+
+    def word_table(self, place: Array, which: Array) -> _WordTable:
+        start, stop, image = self.candidates.runs(place, which)
         count = (stop - start + (LANES - 1)) // LANES
         total = jnp.cumsum(count, axis=1, dtype=jnp.int32)
         return _WordTable(start, stop, image, total - count, jnp.max(total[:, -1]))
@@ -228,11 +256,20 @@ class _Engine(NamedTuple):
         allowed = (candidate < stop[..., None]) & self._wanted(first, candidate, image, place)
         difference = [_windows(x, first) - q[..., None] for x, q in zip(self.sources.axes, query, strict=True)]
         square = squared_distance(difference, self.cutoff)
-        surely = square < self.cutoff.inside
-        doubtful = (square <= self.cutoff.outside) & ~surely
+        own, others = self.queries.radii, self.sources.radii
+        own = None if own is None else own.at[place].get(mode="promise_in_bounds")[:, None, None]
+        inside, outside = self._bounds(own, None if others is None else _windows(others, first))
+        surely = square < inside
+        doubtful = (square <= outside) & ~surely
         bit = np.uint32(1) << lane.astype(jnp.uint32)
         value = jnp.where(surely, bit, np.uint32(0)) | jnp.where(doubtful, bit << np.uint32(LANES), np.uint32(0))
         return lax.reduce(jnp.where(allowed, value, np.uint32(0)), np.uint32(0), lax.bitwise_or, (2,))
+
+    def _bounds(self, own: Array | None, others: Array | None) -> tuple[np.floating | Array, np.floating | Array]:
+        torus = self.candidates.torus
+        slack = None if torus is None else torus.slack
+        radii = self.cutoff.of_pairs(own, others) if isinstance(self.cutoff, Cutoffs) else None
+        return step_one_bounds(self.cutoff, radii, slack)
 
     def _wanted(self, first: Array, candidate: Array, image: Array | None, place: Array) -> Array:
         """Say which candidates [b, words, 16] may be neighbors apart from their distance."""
@@ -277,11 +314,16 @@ class _Engine(NamedTuple):
 
     def _pair(self, place: Array, candidate: Array, image: Array | None) -> Pair:
         """Return the points, as they were given, of queries and candidates at these places."""
-        torus = self.candidates.torus
+        torus, radii = self.candidates.torus, None
+        if isinstance(self.cutoff, Cutoffs):
+            own, others = self.queries.radii, self.sources.radii
+            own = None if own is None else own.at[place].get(mode="clip")
+            radii = self.cutoff.of_pairs(own, None if others is None else others.at[candidate].get(mode="clip"))
         if torus is None:
             return Pair(
                 [x.at[place].get(mode="clip") for x in self.queries.axes],
                 [x.at[candidate].get(mode="clip") for x in self.sources.axes],
+                radii,
             )
         i, j = self.queries.ids.at[place].get(mode="clip"), self.sources.ids.at[candidate].get(mode="clip")
         axes = range(len(self.sources.axes))
@@ -289,12 +331,13 @@ class _Engine(NamedTuple):
         shifts = jnp.asarray(torus.images.shifts).astype(turns.dtype)
         shift = [shifts[image, k] + query_turns[i, k] - turns[j, k] for k in axes]
         raw = [queries[i, k] for k in axes], [sources[j, k] for k in axes]
-        return Pair(*raw, shift, torus.matrix, torus.images.orthogonal)
+        return Pair(*raw, radii, shift, torus.matrix, torus.images.orthogonal)
 
 
 def _padded(sources: Points) -> Points:
     """Lengthen the sources so that a window of 16 never reaches past the end; masks keep the padding out."""
-    return Points([jnp.pad(x, (0, LANES)) for x in sources.axes], jnp.pad(sources.ids, (0, LANES)))
+    radii = None if sources.radii is None else jnp.pad(sources.radii, (0, LANES))
+    return Points([jnp.pad(x, (0, LANES)) for x in sources.axes], jnp.pad(sources.ids, (0, LANES)), radii)
 
 
 def _windows(x: Array, first: Array) -> Array:

@@ -18,8 +18,10 @@ from jfrnn._inputs import (
     checked_cutoff,
     checked_flag,
     checked_positions,
+    checked_radii,
     checked_skin,
     checked_slack,
+    largest_known,
 )
 from jfrnn._neighbors import NeighborList, counted_capacity, found_fields, made_options
 from jfrnn._runs import Filter
@@ -28,10 +30,11 @@ from jfrnn._verlet import list_radius
 
 def search(
     positions: Array,
-    cutoff: float,
+    cutoff: float | Array | tuple[Array, Array],
     *,
     queries: Array | None = None,
     box: Box | None = None,
+    radius_rule: str = "gather",
     half: bool = False,
     include_self: bool = False,
     closed: bool = False,
@@ -49,14 +52,19 @@ def search(
 
     Args:
         positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64. n = 0 is allowed.
-        cutoff: Interaction radius [length], a static number > 0.
+        cutoff: Interaction radius [length]: a static number > 0 for all; or one per particle, an array of shape [n] of floats,
+            which may be traced, and which `radius_rule` applies to. Of separate queries "gather" asks for [m], "scatter" for [n],
+            the other rules for a tuple of both, that of the positions first.
         queries: Points [length] whose neighbors among `positions` are wanted, shape [m, d], same dtype; default: the positions
             themselves, each particle being excluded from its own row by index.
         box: Periodic box (`Box`): then (i, j) stands in the list once for each image of j within the cutoff, its displacement
             being x_j - x_i + S·(lattice vectors), S whole numbers; `NeighborList.shifts` tells them. Particles may be up to 511
             lattice vectors away from the box; along axes that are not periodic it has no meaning.
+        radius_rule: Whose cutoff is that of a pair, where particles have their own: "gather" that of i, the row; "scatter" that of
+            j; "either" the larger, "both" the smaller, "mean" the exact mean of the two. Large ones cost nothing to those that are
+            small: spread over a factor of 128, each particle looks at cells of its own size.
         half: Keep each unordered pair once, in the row of its smaller index; of the images of a particle that are its own
-            neighbors, those whose shift S has a positive number first.
+            neighbors, those whose shift S has a positive number first. Not with the rules "gather" and "scatter".
         include_self: Make each particle its own neighbor.
         closed: Count pairs at exactly the cutoff (<= instead of <).
         skin: Extra shell [length], a static number >= 0: the list holds all pairs within cutoff + skin, so that
@@ -87,7 +95,7 @@ def search(
     Differentiable: the list is topology, without gradient; see `NeighborList.vectors`. Jit: yes, with capacity. vmap: yes, with
     capacity. Source: cell lists (Hockney & Eastwood 1981, ch. 8); strict cutoff (Peifle 2019, §2.2).
     """
-    problem = _checked_problem(positions, cutoff, queries, box, half, include_self, closed, backend, skin, active)
+    problem = _checked_problem(positions, cutoff, queries, box, radius_rule, half, include_self, closed, backend, skin, active)
     slack = checked_slack(slack)
     inputs, options = problem.inputs, problem.options
     if capacity is None:
@@ -99,7 +107,7 @@ def search(
         skin=problem.skin,
         half=options.filter.later_only,
         include_self=queries is None and not options.filter.drop_self,
-        closed=inputs.cutoff.closed,
+        closed=options.closed,
         own_queries=queries is not None,
         masked=active is not None,
         box_kind=options.images,
@@ -110,10 +118,11 @@ def search(
 
 def count(
     positions: Array,
-    cutoff: float,
+    cutoff: float | Array | tuple[Array, Array],
     *,
     queries: Array | None = None,
     box: Box | None = None,
+    radius_rule: str = "gather",
     half: bool = False,
     include_self: bool = False,
     closed: bool = False,
@@ -124,9 +133,10 @@ def count(
 
     Args:
         positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64.
-        cutoff: Interaction radius [length], a static number > 0.
+        cutoff: As in `search`.
         queries: As in `search`.
         box: As in `search`.
+        radius_rule: As in `search`.
         half: As in `search`.
         include_self: As in `search`.
         closed: As in `search`.
@@ -141,14 +151,14 @@ def count(
 
     Memory: as in `search`, without the list. Differentiable: no (integers). Jit: yes. vmap: yes.
     """
-    problem = _checked_problem(positions, cutoff, queries, box, half, include_self, closed, backend, 0.0, active)
+    problem = _checked_problem(positions, cutoff, queries, box, radius_rule, half, include_self, closed, backend, 0.0, active)
     return count_rows(problem.inputs, problem.options)
 
 
 class _Problem(NamedTuple):
     inputs: Inputs
     options: Options
-    radius: float  # of a pair, without the skin
+    radius: float | None  # of a pair, without the skin; None where particles have their own
     skin: float
 
 
@@ -157,6 +167,7 @@ def _checked_problem(
     cutoff: Any,  # noqa: ANN401
     queries: Any,  # noqa: ANN401
     box: Any,  # noqa: ANN401
+    radius_rule: Any,  # noqa: ANN401
     half: bool,
     include_self: bool,
     closed: bool,
@@ -176,14 +187,20 @@ def _checked_problem(
         later_only=checked_flag("half", half),
     )
     dtype = np.dtype(sources.dtype)
-    pair_cutoff = checked_cutoff(cutoff, dtype, closed)
-    radius = float(pair_cutoff.radius)
-    skin = checked_skin(skin, radius, dtype)
-    list_reach = list_radius(radius, skin, dtype)
+    radii, closed = checked_radii(cutoff, radius_rule, sources, queries), checked_flag("closed", closed)
+    if radii is None:
+        radius = float(checked_cutoff(cutoff, dtype).radius)
+        skin = checked_skin(skin, radius, dtype)
+        reach = list_radius(radius, skin, dtype)
+    else:
+        if keep.later_only and radii.rule in ("gather", "scatter"):
+            raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
+        radius, skin = None, checked_skin(skin, largest_known(radii, 0.0) or 0.0, dtype)
+        reach = largest_known(radii, skin)
     box = None if box is None else checked_box(box, sources)
-    kind = None if box is None else images_of(box, list_reach, dtype, sources.shape[0])
-    engine = choose_engine(checked_backend(backend), sources, queries, periodic=box is not None)
-    list_cutoff, options = made_options(list_reach, keep, kind, engine, dtype, pair_cutoff.closed)
+    kind = None if box is None else images_of(box, reach, dtype, sources.shape[0])
+    engine = choose_engine(checked_backend(backend), sources, queries, periodic=box is not None, radii=radii is not None)
+    list_cutoff, options = made_options(radii or reach, keep, kind, engine, dtype, closed, skin)
     box = None if box is None else fixed_box(box, dtype)
     return _Problem(Inputs(sources, queries, active, box, list_cutoff), options, radius, skin)
 

@@ -11,6 +11,7 @@ class Status(enum.IntFlag):
     NONFINITE = 2
     BOX_TOO_SMALL = 4
     OUT_OF_RANGE = 8
+    INVALID_CUTOFF = 16
 
     @property
     def message(self) -> str:
@@ -32,6 +33,10 @@ _MESSAGES = {
     Status.OUT_OF_RANGE: (
         "`positions` (or `queries`) lie more than 511 lattice vectors away from a periodic box: those particles have no "
         "neighbors in this list. Wrap them into the box."
+    ),
+    Status.INVALID_CUTOFF: (
+        "`cutoff` holds values that are not positive and finite, or too small or large for their dtype: those particles have no "
+        "neighbors in this list. Find them with ~(jnp.isfinite(cutoff) & (cutoff > 0))."
     ),
 }
 

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._box import Box, Images, box_change
-from jfrnn._exact import Cutoff, make_cutoff, squared_distance, widened
+from jfrnn._exact import Cutoff, Radii, is_radius, make_cutoff, squared_distance, widened
 
 
 @jax.tree_util.register_dataclass
@@ -26,12 +26,14 @@ class Verlet:
         positions: Sources when the list was last made [length], shape [n, d]; inactive ones are NaN.
         queries: Queries then [length], shape [m, d], or None.
         box: The periodic box then, or None.
+        radii: Cutoffs of the particles then, or None where one serves all.
         rebuild_count: How often `update` made the list anew, shape [], int32.
     """
 
     positions: Array
     queries: Array | None
     box: Box | None
+    radii: Radii | None
     rebuild_count: Array
 
 
@@ -45,19 +47,40 @@ def list_radius(cutoff: float, skin: float, dtype: np.dtype) -> float:
 
 
 def moved_too_far(
-    verlet: Verlet, positions: Array, queries: Array | None, box: Box | None, box_kind: Images | None, skin: float
+    verlet: Verlet,
+    positions: Array,
+    queries: Array | None,
+    box: Box | None,
+    box_kind: Images | None,
+    radii: Radii | None,
+    skin: float,
 ) -> Array:
     """Say whether any point is, or may be by rounding, skin/2 or more from where the list was made, [] bool.
 
     One pass over the positions. A point that is not finite has no neighbors: it counts as moved when it becomes so or ceases to be.
-    A box that changed has moved the images of a pair against each other: that much less of the skin is left for the points.
+    A box that changed has moved the images of a pair against each other, and cutoffs that grew reach farther: that much less of
+    the skin is left for the points. No rule makes a pair's cutoff grow by more than the two of which it is made.
     """
     half = make_cutoff(skin / 2, np.dtype(positions.dtype), closed=False)
+    used, grown, moved = jnp.zeros((), positions.dtype), jnp.zeros((), positions.dtype), jnp.zeros((), bool)
     if box is not None and verlet.box is not None and box_kind is not None:
         points = positions if queries is None else jnp.concatenate([positions, queries])
-        half = widened(half, box_change(verlet.box, box, points, box_kind, np.dtype(positions.dtype)) / 4)
-    moved = _any_beyond(verlet.positions, positions, half)
+        used = box_change(verlet.box, box, points, box_kind, np.dtype(positions.dtype))
+    if radii is not None and verlet.radii is not None:
+        for before, now in ((verlet.radii.sources, radii.sources), (verlet.radii.queries, radii.queries)):
+            if before is not None and now is not None:
+                moved = moved | (is_radius(before) != is_radius(now)).any()
+                grown = jnp.maximum(grown, _growth(before, now))
+    if box is not None or radii is not None:
+        half = widened(half, (used + grown) / 4)
+    moved = moved | _any_beyond(verlet.positions, positions, half)
     return moved if queries is None or verlet.queries is None else moved | _any_beyond(verlet.queries, queries, half)
+
+
+def _growth(before: Array, now: Array) -> Array:
+    """Return by how much a cutoff grew at most, rounded up."""
+    grown = jnp.where(is_radius(before) & is_radius(now), now - before, 0)
+    return jnp.max(grown, initial=0) * (1 + 4 * jnp.finfo(grown.dtype).eps)
 
 
 def _any_beyond(before: Array, now: Array, half_skin: Cutoff) -> Array:
@@ -66,7 +89,6 @@ def _any_beyond(before: Array, now: Array, half_skin: Cutoff) -> Array:
     return jnp.any(there & ~near)
 
 
-def first_verlet(positions: Array, queries: Array | None, box: Box | None) -> Verlet:
+def first_verlet(positions: Array, queries: Array | None, box: Box | None, radii: Radii | None) -> Verlet:
     """Return what a list remembers that was just made."""
-    positions, queries, box = lax.stop_gradient((positions, queries, box))
-    return Verlet(positions, queries, box, jnp.int32(0))
+    return Verlet(*lax.stop_gradient((positions, queries, box, radii)), jnp.int32(0))

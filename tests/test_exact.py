@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import jfrnn
-from jfrnn._exact import _UNKNOWN, Pair, _integer_sign, _sum_sign, largest_cutoff, make_cutoff, smallest_cutoff
+from jfrnn._exact import _UNKNOWN, Pair, _integer_sign, _sum_sign, _threshold, largest_cutoff, make_cutoff, smallest_cutoff
 
 POINTS = 12
 
@@ -76,8 +76,8 @@ def test_every_step_agrees_with_fractions(dtype, offset):
          for p, q in zip(a, b, strict=True)]
     )  # fmt: skip
     assert {-1, 1} <= set(exact)
-    np.testing.assert_array_equal(_integer_sign(pair, cutoff), exact)
-    sign = _sum_sign(pair, cutoff)
+    np.testing.assert_array_equal(_integer_sign(pair, _threshold(pair, cutoff)), exact)
+    sign = _sum_sign(pair, _threshold(pair, cutoff))
     assert np.mean(sign != _UNKNOWN) > 0.99
     np.testing.assert_array_equal(np.where(sign == _UNKNOWN, exact, sign), exact)
 
@@ -85,7 +85,8 @@ def test_every_step_agrees_with_fractions(dtype, offset):
 def test_exact_ties_are_known_without_integers(dtype):
     a = jnp.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]], dtype)
     b = a + jnp.array([1.0, 2.0, 2.0], dtype)
-    sign = _sum_sign(Pair(list(a.T), list(b.T)), make_cutoff(3.0, np.dtype(dtype), closed=False))
+    pair = Pair(list(a.T), list(b.T))
+    sign = _sum_sign(pair, _threshold(pair, make_cutoff(3.0, np.dtype(dtype), closed=False)))
     np.testing.assert_array_equal(sign, [0, 0])
 
 

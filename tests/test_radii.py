@@ -1,0 +1,202 @@
+"""Cutoffs that differ from particle to particle: every rule against the oracle, then what lists make of them."""
+
+import functools
+from itertools import product
+
+import checked
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from jfrnn.cases.radii import RADII_CASES
+from test_box import image_pairs, masked_images
+
+import jfrnn
+from jfrnn._exact import RULES
+
+SLOW = pytest.mark.slow
+LENGTH, CAPACITY = 128, 256
+
+
+def radii_of(given, rule, length=None):
+    """Return cutoffs as a search takes them, padded with 1, as the NaN rows of positions are."""
+
+    def padded(x):
+        return x if x is None or length is None else np.concatenate([x, np.ones(length - len(x), x.dtype)])
+
+    own, others = padded(given.query_cutoffs), padded(given.cutoffs)
+    if own is None:
+        return others
+    return {"gather": own, "scatter": others}.get(rule, (others, own))
+
+
+@functools.lru_cache(maxsize=64)
+def expected_pairs(name, dtype, dim, rule, closed=False):
+    given = RADII_CASES[name].build(dtype, dim)
+    options = {"queries": given.queries, "query_radii": given.query_cutoffs, "lengths": given.lengths}
+    return reference.reference_radii(given.positions, given.cutoffs, rule, closed=closed, **options)
+
+
+def search_case(name, dtype, dim, rule, backend, **options):
+    """Search a case padded to one length, so that cases share compiled programs; return the list, positions and queries."""
+    given = RADII_CASES[name].build(dtype, dim)
+    x = jnp.asarray(checked.padded(given.positions, LENGTH))
+    queries = {} if given.queries is None else {"queries": jnp.asarray(checked.padded(given.queries, LENGTH))}
+    box = {} if given.lengths is None else {"box": jfrnn.Box(given.lengths)}
+    radii = radii_of(given, rule, LENGTH)
+    return jfrnn.search(x, radii, radius_rule=rule, backend=backend, **queries, **box, **options), x, queries
+
+
+def assert_case(name, dtype, dim, rule, backend, closed=False):
+    nbrs, x, queries = search_case(name, dtype, dim, rule, backend, closed=closed, capacity=CAPACITY)
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE  # the padding
+    expected = expected_pairs(name, dtype, dim, rule, closed)
+    if nbrs.box is None:
+        found = {(*pair, (0,) * dim) for pair in reference.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), LENGTH)}
+    else:
+        found = image_pairs(nbrs, x, **queries)
+    missing, extra = expected - found, found - expected
+    assert (len(missing), len(extra)) == (0, 0), f"missing {sorted(missing)[:5]}, extra {sorted(extra)[:5]} of {len(expected)}"
+    if nbrs.box is not None or not closed:
+        assert masked_images(nbrs, x, **queries) == expected
+
+
+def each_case():
+    """Yield every case, rule and kind; by default, each rule in one kind, and open cases, which share a program, by one engine."""
+    kinds = {"gather": (np.float64, 2), "scatter": (np.float32, 2), "either": (np.float32, 3), "both": (np.float32, 3)}
+    kinds["mean"] = (np.float64, 3)
+    alone = {"queries": "either", "periodic": "gather", "periodic_ties": "mean", "periodic_images": "either"}
+    for name, rule, dtype, dim, backend in product(RADII_CASES, RULES, (np.float32, np.float64), (2, 3), ("jax", "brute")):
+        often = backend == "jax" and (dtype, dim) == kinds[rule] and rule == alone.get(name, rule) and name != "periodic_ties"
+        kind = f"{name}-{rule}-f{8 * dtype().itemsize}-{dim}d-{backend}"
+        yield pytest.param(name, rule, dtype, dim, backend, id=kind, marks=[SLOW] * (not often))
+
+
+@pytest.mark.parametrize(("name", "rule", "dtype", "dim", "backend"), list(each_case()))
+def test_case(name, rule, dtype, dim, backend):
+    assert_case(name, dtype, dim, rule, backend)
+
+
+@pytest.mark.parametrize("rule", [pytest.param(rule, marks=[SLOW] * (rule != "mean")) for rule in RULES])
+def test_ties_when_closed(rule):
+    for name in ("ties", "ties_far", "coincident", "mean_residues"):
+        assert_case(name, np.float32, 3, rule, "jax", closed=True)
+
+
+def test_each_rule_differs_and_equal_radii_agree_with_one_cutoff():
+    found = [expected_pairs("spread_100", np.float32, 3, rule) for rule in RULES]
+    assert len(set(map(frozenset, found))) == len(RULES)
+    assert found[3] < found[0] < found[2]  # both, gather, either
+    x = RADII_CASES["spread_100"].build(np.float32, 3).positions
+    one = jfrnn.count(x, 0.2)
+    np.testing.assert_array_equal(jfrnn.count(x, np.full(len(x), 0.2), radius_rule="mean"), one)
+    np.testing.assert_array_equal(jfrnn.count(x, 0.2, radius_rule="both"), one)
+
+
+def test_half_lists_take_symmetric_rules_alone():
+    given = RADII_CASES["spread_100"].build(np.float32, 3)
+    nbrs = jfrnn.search(given.positions, given.cutoffs, radius_rule="either", half=True, capacity=CAPACITY)
+    expected = {(i, j) for i, j, _ in expected_pairs("spread_100", np.float32, 3, "either") if i < j}
+    assert set(zip(*(part.tolist() for part in nbrs.pairs()), strict=True)) == expected
+    with pytest.raises(ValueError, match=r"half=True keeps pairs without direction.*'gather'"):
+        jfrnn.search(given.positions, given.cutoffs, half=True)
+
+
+def test_traced_radii_share_one_program_and_bad_ones_set_a_bit():
+    x = RADII_CASES["spread_100"].build(np.float32, 2).positions
+    traces = []
+
+    @jax.jit
+    def search(x, h):
+        traces.append(None)
+        return jfrnn.search(x, h, capacity=CAPACITY)
+
+    for scale in (0.05, 0.2):
+        h = (scale * (1 + np.arange(len(x)) / len(x))).astype(np.float32)
+        nbrs = search(x, h)
+        nbrs.check()
+        expected = {(i, j) for i, j, _ in reference.reference_radii(x, h, "gather")}
+        assert set(zip(*(part.tolist() for part in nbrs.pairs()), strict=True)) == expected
+    assert len(traces) == 1
+    for bad in (np.nan, np.inf, 0.0, -1.0, 1e-38):
+        h[7] = bad
+        nbrs = search(x, h)
+        assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.INVALID_CUTOFF
+        assert nbrs.count[7] == 0
+        assert {(i, j) for i, j in reference.pairs_of(nbrs.idx, nbrs.count, len(x))} == {pair for pair in expected if 7 not in pair}
+        with pytest.raises(ValueError, match="`cutoff` holds values that are not positive and finite"):
+            nbrs.check()
+    assert len(traces) == 1
+
+
+def test_motion_and_growth_share_the_skin():
+    """A list is kept while twice the motion and the growth of radii stay below the skin together, and misses no pair."""
+    random, skin = np.random.default_rng(0), 0.1
+    x = random.random((LENGTH, 2)).astype(np.float32)
+    h = np.exp(random.uniform(np.log(0.02), np.log(0.3), LENGTH)).astype(np.float32)
+    nbrs = jfrnn.search(x, h, radius_rule="mean", skin=skin, capacity=CAPACITY)
+    update = jax.jit(lambda nbrs, x, h: nbrs.update(x, cutoff=h))
+    for move, grow in [(0.03, 0.03), (0.03, 0.05), (0.049, 0.0), (0.051, 0.0), (0.0, 0.09), (0.0, 0.11), (0.04, -0.01)]:
+        made, before = nbrs.verlet, int(nbrs.rebuild_count)
+        angle = random.uniform(0, 2 * np.pi, LENGTH)
+        now = made.positions + jnp.asarray(move * np.stack([np.cos(angle), np.sin(angle)], axis=1), np.float32)
+        radii = made.radii.sources + np.float32(grow)
+        nbrs = update(nbrs, now, radii)
+        assert int(nbrs.rebuild_count) - before == (2 * move + grow > skin)
+        nbrs.check()
+        assert masked_images(nbrs, now) == reference.reference_radii(now, radii, "mean")
+
+
+@SLOW
+def test_grow():
+    given = RADII_CASES["graded"].build(np.float32, 2)
+    small = jfrnn.search(given.positions, given.cutoffs, capacity=2)
+    assert bool(small.overflow)
+    grown = small.grow(given.positions)
+    grown.check()
+    expected = {(i, j) for i, j, _ in expected_pairs("graded", np.float32, 2, "gather")}
+    assert set(zip(*(part.tolist() for part in grown.pairs()), strict=True)) == expected
+
+
+def test_vmap_is_a_loop():
+    given = RADII_CASES["graded"].build(np.float32, 2)
+    scales = jnp.array([0.5, 1.0], jnp.float32)
+    counts = jax.vmap(lambda s: jfrnn.count(given.positions, s * given.cutoffs))(scales)
+    for scale, row in zip(scales, counts, strict=True):
+        expected = reference.reference_radii(given.positions, np.asarray(scale * given.cutoffs), "gather")
+        np.testing.assert_array_equal(row, np.bincount([i for i, *_ in expected], minlength=len(given.positions)))
+
+
+X, H = np.zeros((4, 3), np.float32), np.ones(4, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("error", "match", "make"),
+    [
+        (ValueError, r"radius_rule must be one of 'gather'.*got 'sum'", lambda: jfrnn.search(X, H, radius_rule="sum")),
+        (
+            ValueError,
+            r"cutoff must be a number, or have shape \[4\], one per particle, got shape \[3\]",
+            lambda: jfrnn.search(X, H[:3]),
+        ),
+        (TypeError, "cutoff must be a number, or an array of floats with one per particle", lambda: jfrnn.search(X, H.astype(int))),
+        (TypeError, "cutoff must be a number, or an array of floats", lambda: jfrnn.search(X, [1.0] * 4)),
+        (
+            ValueError,
+            r"cutoff must be a number, or have shape \[2\], one per query",
+            lambda: jfrnn.search(X, H, queries=X[:2]),
+        ),
+        (
+            ValueError,
+            r"cutoff must be a pair of arrays, of the positions \[4\] and of the queries \[2\].*'mean'",
+            lambda: jfrnn.search(X, H, queries=X[:2], radius_rule="mean"),
+        ),
+        (ValueError, "backend='warp' takes one cutoff for all particles", lambda: jfrnn.search(X, H, backend="warp")),
+        (ValueError, "made with one cutoff for all particles", lambda: jfrnn.search(X, 1.0).update(X, cutoff=H)),
+        (ValueError, "pass such an array", lambda: jfrnn.search(X, H, capacity=4, backend="brute").update(X, cutoff=1.0)),
+    ],
+)
+def test_errors(error, match, make):
+    with pytest.raises(error, match=match):
+        make()
