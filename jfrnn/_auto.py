@@ -28,12 +28,17 @@ def choose_engine(backend: str, sources: Array, queries: Array | None, periodic:
     Raises:
         ImportError: "warp" or "hashgrid", and Warp is not installed.
         RuntimeError: "warp" or "hashgrid", and Warp cannot run on the platform.
-        ValueError: "hashgrid", and space is periodic; "warp" or "hashgrid", and cutoffs differ from particle to particle.
+        ValueError: "hashgrid", and space is periodic; "hashgrid", and cutoffs differ from particle to particle; or "warp", and they
+            do so in a periodic box or on a GPU.
     """
-    if radii and backend in WARP_ENGINES:
-        raise ValueError(f"backend={backend!r} takes one cutoff for all particles: pass backend='jax' or 'brute', or one number.")
-    if radii and backend == "auto":
-        return "jax"
+    if radii and backend != "brute":
+        platform = _platform_of(sources, sources if queries is None else queries)
+        can_warp = platform == "cpu" and not periodic
+        if backend == "hashgrid" or (backend == "warp" and not can_warp):
+            where = "" if backend == "hashgrid" else " in a periodic box" if periodic else f" on the platform {platform!r}"
+            raise ValueError(f"backend={backend!r} takes one cutoff for all particles{where}: pass backend='jax' or 'brute'.")
+        if backend == "auto" and not can_warp:
+            return "jax"
     if backend == "hashgrid" and periodic:
         raise ValueError("backend='hashgrid' knows no periodic box: pass backend='warp', 'jax' or 'brute'.")
     if backend not in ("auto", *WARP_ENGINES):

@@ -15,7 +15,7 @@ from jfrnn import _warp
 from jfrnn._box import Box, Images, Lattice, Wrapped, fractions_of, is_valid, make_lattice, translation, unpacked_turns, wrap
 from jfrnn._cells import CellAxes, build_grid, cell_edge, cell_order, grid_coordinates, open_axes, stencil_runs
 from jfrnn._exact import Cutoff, Cutoffs, Radii, is_radius, make_cutoffs
-from jfrnn._levels import Axes, order_by_levels
+from jfrnn._levels import Axes, level_runs, sort_by_levels
 from jfrnn._runs import Candidates, Filter, Points, Torus, count_neighbors, list_neighbors
 from jfrnn._status import Status
 from jfrnn._warp import Rows
@@ -147,6 +147,10 @@ def _rows_of_engine(
     torus: tuple[Lattice, Wrapped] | None = None,
 ) -> Rows:
     n, m = sources.shape[0], (sources if queries is None else queries).shape[0]
+    if options.backend == "warp" and isinstance(cutoff, Cutoffs) and 0 not in (n, m):
+        points, axes = _open_cells(sources, queries, cutoff)
+        levels = sort_by_levels(points, axes, cutoff, n, queries is None)
+        return _warp.level_neighbors(sources, queries, cutoff, levels, options.filter, capacity)
     if options.backend == "warp" and isinstance(cutoff, Cutoff) and 0 not in (n, m):
         return _warp.neighbors(sources, queries, cutoff, options.filter, capacity, torus)
     if options.radius is not None and isinstance(cutoff, Cutoff) and 0 not in (n, m):
@@ -176,18 +180,22 @@ def _candidates(
     if options.backend == "brute":
         return _all_sources(*clouds, cutoff, torus)
     if given is None:
-        points = sources if queries is None else jnp.concatenate([sources, queries])
-        one = jnp.ones(points.shape[1], points.dtype)
-        along, axes = points.T, Axes(open_axes(cell_edge(_largest(cutoff)), points.shape[1]), one, 0 * one)
+        along, axes = _open_cells(sources, queries, cutoff)
     else:
         along, axes = _cells_of_lattice(sources, queries, _largest(cutoff), *given)
     if isinstance(cutoff, Cutoff):
         return _cell_stencil(*clouds, along, axes.cells, torus)
     images = None if torus is None else torus.images
-    order = order_by_levels(along, axes, cutoff, sources.shape[0], queries is None, images)
-    points = _in_order(clouds[0], order.sources, cutoff.sources)
-    rows = _in_order(clouds[0] if clouds[1] is None else clouds[1], order.queries, cutoff.queries)
-    return Candidates(points, rows, order.runs, torus, order.passes)
+    levels = sort_by_levels(along, axes, cutoff, sources.shape[0], queries is None)
+    points = _in_order(clouds[0], levels.order, cutoff.sources)
+    rows = _in_order(clouds[0] if clouds[1] is None else clouds[1], levels.query_order, cutoff.queries)
+    return Candidates(points, rows, level_runs(levels, cutoff, images), torus, levels.passes)
+
+
+def _open_cells(sources: Array, queries: Array | None, cutoff: Cutoff | Cutoffs) -> tuple[Array, Axes]:
+    points = sources if queries is None else jnp.concatenate([sources, queries])
+    one = jnp.ones(points.shape[1], points.dtype)
+    return points.T, Axes(open_axes(cell_edge(_largest(cutoff)), points.shape[1]), one, 0 * one)
 
 
 def _torus(sources: Array, queries: Array | None, lattice: Lattice, wrapped: Wrapped) -> Torus:

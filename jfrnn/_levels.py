@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._box import Images
-from jfrnn._cells import CellAxes, build_grid, cell_coordinate, cell_order, cell_remainder, grid_coordinates, places_between
+from jfrnn._cells import CellAxes, Grid, build_grid, cell_coordinate, cell_order, cell_remainder, grid_coordinates, places_between
 from jfrnn._exact import Cutoffs
 from jfrnn._order import spread
 
@@ -33,23 +33,36 @@ class Axes(NamedTuple):
     margin: Array
 
 
-class Order(NamedTuple):
-    """Sources and queries in the order in which they are walked.
+class Levels(NamedTuple):
+    """Sources and queries in the order in which they are walked, and what is needed to find the sources of a group in a cell.
 
     Attributes:
-        sources: [n] int32.
-        queries: [m] int32, the same where the sources are the queries.
-        runs: As `jfrnn._runs.Runs`.
-        passes: [] int32, groups that are in use; None: the rule does not ask for the cutoffs of sources, and all are one group.
+        order: [n] int32, the source at each place.
+        query_order: [m] int32, likewise; the same where the sources are the queries.
+        grid: The top cells of the sources.
+        keys: [n] uint32 in order: group, then the place within the top cell along the Morton curve.
+        query_top: [d, m] int32, the top cell of each query.
+        query_place: [d, m] int32, the finest cell within it, counted from 0 along each axis.
+        largest: [GROUPS] the largest cutoff of each group, 0 where there is none; None: the rule asks for no cutoffs of sources,
+            and all are one group.
+        passes: [] int32, groups that are in use; None likewise.
+        widths: [d] of top cells.
+        axes: What a cutoff reaches, in the units of the widths.
     """
 
-    sources: Array
-    queries: Array
-    runs: Callable[[Array, Array], tuple[Array, Array, Array | None]]
+    order: Array
+    query_order: Array
+    grid: Grid
+    keys: Array
+    query_top: Array
+    query_place: Array
+    largest: Array | None
     passes: Array | None
+    widths: Array
+    axes: Axes
 
 
-def order_by_levels(along: Array, axes: Axes, cutoffs: Cutoffs, n: int, own: bool, images: Images | None) -> Order:
+def sort_by_levels(along: Array, axes: Axes, cutoffs: Cutoffs, n: int, own: bool) -> Levels:
     """Sort n sources, and the queries unless the sources are `own` queries, whose coordinates along the axes are [d, n + m]."""
     dim, total = along.shape
     finite = jnp.isfinite(along).all(axis=0)
@@ -66,29 +79,37 @@ def order_by_levels(along: Array, axes: Axes, cutoffs: Cutoffs, n: int, own: boo
     keys = key[order]
     query_order = order if own else cell_order(top[:, n:], finite[n:], extent, grid.dense)
     at = query_order if own else n + query_order
-    query_top, query_place = top[:, at], place[:, at]
-    query_radii = None if cutoffs.queries is None else cutoffs.queries[query_order]
     largest, passes = None, None
     if cutoffs.sources is not None:
         radii = jnp.where(finite[:n], cutoffs.sources, 0)
         largest = jnp.zeros(GROUPS, radii.dtype).at[group].max(radii)
         passes = jnp.max(jnp.where(finite[:n], group.astype(jnp.int32) + 1, 0), initial=0)
 
+    return Levels(order, query_order, grid, keys, top[:, at], place[:, at], largest, passes, widths, axes)
+
+
+def level_runs(
+    levels: Levels, cutoffs: Cutoffs, images: Images | None
+) -> Callable[[Array, Array], tuple[Array, Array, Array | None]]:
+    """Return what finds the runs of candidates of queries at some places in one group, as `jfrnn._runs.Runs`."""
+    dim, keys, largest = len(levels.widths), levels.keys, levels.largest
+    query_radii = None if cutoffs.queries is None else cutoffs.queries[levels.query_order]
+
     def runs(places: Array, which: Array) -> tuple[Array, Array, Array | None]:
         of_query = None if query_radii is None else query_radii.at[places].get(mode="promise_in_bounds")
         of_group = None if largest is None else jnp.broadcast_to(largest[which], places.shape)
         radii = cutoffs.of_pairs(of_query, of_group)
-        reach = functools.reduce(jnp.add, radii) / len(radii) * (1 + 4 * jnp.finfo(along.dtype).eps)
-        level = _finest_level(reach, widths, axes)
+        reach = functools.reduce(jnp.add, radii) / len(radii) * (1 + 4 * jnp.finfo(radii[0].dtype).eps)
+        level = _finest_level(reach, levels.widths, levels.axes)
         first = which.astype(jnp.uint32) << np.uint32(HALVINGS * dim)
-        around = _cells_around(query_top[:, places], query_place[:, places], level, extent, images)
-        start, stop = places_between(grid, [around.top[0], *around.top])
+        around = _cells_around(levels.query_top[:, places], levels.query_place[:, places], level, levels.grid.extent, images)
+        start, stop = places_between(levels.grid, [around.top[0], *around.top])
         size = (np.uint32(1) << (dim * (HALVINGS - level)).astype(jnp.uint32))[:, None]
         lowest = first | around.key
         bounds = _lower_bound(keys, jnp.stack([lowest, lowest + size]), start, stop)
         return bounds[0], jnp.where(around.there, bounds[1], bounds[0]), around.image
 
-    return Order(order, query_order, runs, passes)
+    return runs
 
 
 def _place_in_cell(x: Array, edge: Array, turns: Array | None) -> Array:

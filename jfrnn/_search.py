@@ -78,7 +78,8 @@ def search(
         backend: "warp" (cells, compiled kernels, on CPU and NVIDIA GPUs), "hashgrid" (Warp's own `wp.HashGrid`, there too), "jax"
             (cells, any device), "brute" (all n·m candidates), or "auto": what was measured to be fastest on the platform, "warp" on
             the CPU and on NVIDIA GPUs (where Warp is missing "jax", with a warning), elsewhere "jax". The platform is that of the
-            positions, where they are traced that of `jax.default_device`.
+            positions, where they are traced that of `jax.default_device`. "hashgrid" knows neither boxes nor a cutoff per
+            particle; "warp" knows the latter in open space on the CPU; "auto" then takes "jax".
 
     Returns:
         A `NeighborList`; `idx` has shape [m, capacity], unused slots hold n. Rows are in no promised order, but the same input

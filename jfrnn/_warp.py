@@ -19,7 +19,8 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._box import Lattice, Wrapped
-from jfrnn._exact import Cutoff, make_cutoff
+from jfrnn._exact import Cutoff, Cutoffs, make_cutoff
+from jfrnn._levels import GROUPS, HALVINGS, Levels
 from jfrnn._runs import Filter
 
 INSTALL = 'pip install "jfrnn[warp]"'
@@ -311,6 +312,102 @@ def _ask_for_huge_pages(address: int, size: int) -> None:
 @functools.cache
 def _libc() -> ctypes.CDLL:
     return ctypes.CDLL(None)
+
+
+# --- cells of many sizes: a cutoff per particle -----------------------------------------------------------------------
+
+
+class _LevelVariant(NamedTuple):
+    """All that is static about a call with a cutoff per particle, apart from shapes."""
+
+    dim: int
+    double: bool
+    lists: bool
+    own: bool
+    closed: bool
+    keep: Filter
+    rule: str
+
+
+def level_neighbors(
+    sources: Array, queries: Array | None, cutoffs: Cutoffs, levels: Levels, keep: Filter, capacity: int | None
+) -> Rows:
+    """Search with a cutoff per particle on the CPU, among sources that XLA has sorted; capacity=None only counts."""
+    rows, lists = sources if queries is None else queries, capacity is not None
+    dim, m, padding = sources.shape[1], rows.shape[0], kernels_of("levels").PADDING
+    variant = _LevelVariant(dim, sources.dtype == jnp.float64, lists, queries is None, cutoffs.closed, keep, cutoffs.rule)
+
+    def ordered(x: Array | None, order: Array, more: int) -> Array:
+        return jnp.zeros(1, sources.dtype) if x is None else jnp.pad(x[order], (0, more)).reshape(-1)
+
+    line = (0, 3 - dim)
+    largest = jnp.zeros(GROUPS, sources.dtype) if levels.largest is None else levels.largest
+    numbers = [jnp.pad(x, line) for x in (levels.widths, levels.axes.scale, levels.axes.margin)]
+    passes = jnp.int32(1) if levels.passes is None else levels.passes
+    header = [jnp.pad(levels.grid.extent, line), levels.grid.dense.astype(jnp.int32)[None], passes[None]]
+    dims: dict[str, Any] = {"count": m, "info": 2} | ({"idx": (m, capacity)} if lists else {})
+    *idx, count, info = _level_callable(variant)(
+        jnp.pad(sources[levels.order].T, ((0, 0), (0, padding))).reshape(-1),
+        ordered(cutoffs.sources, levels.order, padding),
+        levels.order,
+        lax.bitcast_convert_type(levels.keys, jnp.int32),
+        levels.grid.coords.reshape(-1),
+        levels.grid.table,
+        jnp.concatenate(header),
+        jnp.concatenate([cutoffs.largest[None], largest, *numbers]),
+        rows[levels.query_order].T.reshape(-1),
+        ordered(cutoffs.queries, levels.query_order, 0),
+        levels.query_order,
+        levels.query_top.reshape(-1),
+        levels.query_place.reshape(-1),
+        output_dims=dims,
+    )
+    overflow = info[0] > capacity if lists else jnp.zeros((), bool)
+    return Rows(idx[0] if lists else None, count, info[0], overflow.astype(jnp.int32))  # Status.ROW_OVERFLOW
+
+
+@functools.cache
+def _level_callable(variant: _LevelVariant) -> Any:  # noqa: ANN401
+    wp = load_warp()
+    reals, ints = wp.array(dtype=wp.float64 if variant.double else wp.float32), wp.array(dtype=wp.int32)
+    types = {"axes": reals, "radii": reals, "ids": ints, "keys": ints, "top": ints, "table": ints, "header": ints}
+    types |= {"cutoff": reals, "query_axes": reals, "query_radii": reals, "query_ids": ints, "query_top": ints, "places": ints}
+    types |= {"idx": wp.array2d(dtype=wp.int32)} if variant.lists else {}
+    types |= {"count": ints, "info": ints}
+
+    def list_rows(
+        axes: Any, radii: Any, ids: Any, keys: Any, top: Any, table: Any, header: Any, cutoff: Any, query_axes: Any,  # noqa: ANN401
+        query_radii: Any, query_ids: Any, query_top: Any, places: Any, idx: Any, count: Any, info: Any,  # noqa: ANN401
+    ) -> None:  # fmt: skip
+        inputs = [axes, radii, ids, keys, top, table, header, cutoff, query_axes, query_radii, query_ids, query_top, places]
+        _run_levels_on_cpu(variant, inputs, idx, count, info)
+
+    def count_rows(
+        axes: Any, radii: Any, ids: Any, keys: Any, top: Any, table: Any, header: Any, cutoff: Any, query_axes: Any,  # noqa: ANN401
+        query_radii: Any, query_ids: Any, query_top: Any, places: Any, count: Any, info: Any,  # noqa: ANN401
+    ) -> None:  # fmt: skip
+        inputs = [axes, radii, ids, keys, top, table, header, cutoff, query_axes, query_radii, query_ids, query_top, places]
+        _run_levels_on_cpu(variant, inputs, None, count, info)
+
+    func = list_rows if variant.lists else count_rows
+    func.__annotations__ = types
+    flags = {"f64": variant.double, "f32": not variant.double, "list": variant.lists, "own": variant.own}
+    flags |= {"closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only, variant.rule: True}
+    func.__name__ = "_".join(["jfrnn", "levels", f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
+    func.__qualname__ = func.__name__
+    graphs = wp.JaxCallableGraphMode.NONE
+    return wp.jax_callable(func, num_outputs=3 if variant.lists else 2, graph_mode=graphs, vmap_method="sequential")
+
+
+def _run_levels_on_cpu(variant: _LevelVariant, inputs: list[Any], idx: Any, count: Any, info: Any) -> None:  # noqa: ANN401
+    wp = load_warp()
+    kernel = kernels_of("levels").query_kernel(variant.dim, variant.double, variant.lists, variant.rule, GROUPS, HALVINGS)
+    info.zero_()
+    n, m, capacity = len(inputs[2]), len(count), 0 if idx is None else idx.shape[1]
+    rows = wp.array(ptr=count.ptr, shape=(m, 1), dtype=count.dtype, device=count.device) if idx is None else idx
+    flags = [int(variant.own), int(variant.closed), int(variant.keep.drop_self), int(variant.keep.later_only)]
+    arguments = [*inputs, rows, count, info, n, m, capacity, *flags]
+    _on_every_core(lambda: wp.launch(kernel, dim=1, inputs=arguments, device="cpu"), -(-m // _PLACES_PER_THREAD))
 
 
 # --- hash grid --------------------------------------------------------------------------------------------------------

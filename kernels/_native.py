@@ -23,11 +23,12 @@ def snippet(scalar: str, dim: int, *pieces: str, **constants: int) -> str:
 
     The function around it must have the argument `cutoff`, an array of one scalar, and what the pieces need. PERIODIC is 0 in an
     open space, 1 where the nearest image is the only one that can be a neighbor, 2 where images are told apart: `cutoff` then goes
-    on with the numbers of the lattice, and a row of positions ends with its packed turns (see `jfrnn._box`).
+    on with the numbers of the lattice, and a row of positions ends with its packed turns (see `jfrnn._box`). SUM is 1 where the
+    cutoff of a pair is the sum of two numbers.
     """
     lines = [f"using real = {scalar};", f"using whole = {'long long' if scalar == 'double' else 'int'};"]
     lines += [f"constexpr int DIM = {dim};", f"constexpr bool DOUBLE = {int(scalar == 'double')};"]
-    lines += [f"constexpr int {name} = {int(value)};" for name, value in {"ORDER": 0, "PERIODIC": 0, **constants}.items()]
+    lines += [f"constexpr int {name} = {int(value)};" for name, value in {"ORDER": 0, "PERIODIC": 0, "SUM": 0, **constants}.items()]
     return "\n".join(["", "{", _NO_CONTRACTION, *lines, _PORTABLE, *pieces, "}", ""])
 
 
@@ -221,19 +222,29 @@ struct Exact {
         return s;
     }
 
-    // sign of |b + S·A - a|^2 - r^2 by error-free transformations (Ogita, Rump & Oishi 2005, doi:10.1137/030601818); 2: not proven
-    JFRNN_FUNCTION int sum_sign(const real* a, const real* b, real radius, const int* shift, Lattice lattice) {
-        constexpr int TERMS = 3 * DIM + 2;
+    // sign of |b + S·A - a|^2 - r^2 by error-free transformations (Ogita, Rump & Oishi 2005, doi:10.1137/030601818); 2: not proven.
+    // Where cutoffs are sums, r is that of `radius` and `more`, here and below.
+    JFRNN_FUNCTION int sum_sign(const real* a, const real* b, real radius, real more, const int* shift, Lattice lattice) {
+        constexpr int TERMS = 3 * DIM + 2 + SUM;
         double term[TERMS];
         double slack = 0;
         bool plain = true;
-        const double scale = Bits::unit_scale(radius);
-        const double r = mul(double(radius), scale);
+        const real larger = SUM && more > radius ? more : radius;
+        const double scale = Bits::unit_scale(larger);
+        const int exponent = Bits::exponent(larger) - Bits::BIAS;
+        const double smallest = Bits::power_of_two(exponent - 450 < -970 ? -970 : exponent - 450);
+        double r = mul(double(radius), scale);
+        if constexpr (SUM) {
+            double rest;
+            r = two_sum(r, mul(double(more), scale), rest);
+            const double tail = mul(mul(-2, r), rest);
+            term[TERMS - 1] = tail;
+            slack = add(mul(size_of(tail), 2.220446049250313e-16), mul(mul(2, rest), rest));
+            plain = !(double(radius) < smallest) && !(double(more) < smallest);
+        }
         const double r2 = mul(r, r);
         term[0] = -r2;
         term[1] = -product_error(r, r, r2);
-        const int exponent = Bits::exponent(radius) - Bits::BIAS;
-        const double smallest = Bits::power_of_two(exponent - 450 < -970 ? -970 : exponent - 450);
 #pragma unroll
         for (int k = 0; k < DIM; ++k) {
             const double ak = double(a[k]), bk = double(b[k]);
@@ -304,10 +315,15 @@ struct Exact {
         return (bits >> (DOUBLE ? 63 : 31)) & 1 ? -value : value;
     }
     // sign of |b - a|^2 - r^2 in integers: only the few limbs that are not zero are multiplied
-    JFRNN_CALL int integer_sign(real ax, real ay, real az, real bx, real by, real bz, real radius) {
+    JFRNN_CALL int integer_sign(real ax, real ay, real az, real bx, real by, real bz, real radius, real more) {
         constexpr int LIMBS = DOUBLE ? 4 : 2;  // that one mantissa can touch
         const int lr = first_limb(radius);
-        int lowest = lr, highest = lr;
+        int lowest = lr, highest = lr, lm = 0;
+        if constexpr (SUM) {
+            lm = first_limb(more);
+            lowest = lm < lowest ? lm : lowest;
+            highest = lm > highest ? lm : highest;
+        }
 #pragma unroll
         for (int k = 0; k < DIM; ++k) {
             const int la = first_limb(k == 0 ? ax : k == 1 ? ay : az), lb = first_limb(k == 0 ? bx : k == 1 ? by : bz);
@@ -329,8 +345,15 @@ struct Exact {
                     sum += (limb(b, i) - limb(a, i)) * (limb(b, t - i) - limb(a, t - i));
                 }
             }
-            for (int s = 0; s < LIMBS; ++s)
-                sum -= limb(radius, lr + s) * limb(radius, t - lr - s);
+            if constexpr (SUM)
+                for (int s = 0; s < 2 * LIMBS; ++s) {
+                    const int i = s < LIMBS ? lr + s : lm + s - LIMBS;
+                    if (s < LIMBS || i < lr || i >= lr + LIMBS)
+                        sum -= (limb(radius, i) + limb(more, i)) * (limb(radius, t - i) + limb(more, t - i));
+                }
+            else
+                for (int s = 0; s < LIMBS; ++s)
+                    sum -= limb(radius, lr + s) * limb(radius, t - lr - s);
             seen |= sum & 0xffffff;
             carry = sum >> 24;
         }
@@ -406,17 +429,17 @@ struct Exact {
             if (square - doubt > r2)
                 return false;
         }
-        int sign = sum_sign(a, b, radius, shift, lattice);
+        int sign = sum_sign(a, b, radius, 0, shift, lattice);
         if (sign == 2)
             sign = integer_sign_of_image(a, b, radius, shift, lattice);
         return sign < 0 || (sign == 0 && closed);
     }
 
     // the bounds of float32 pairs in float64: at most 5 of 16 units of 2^-53 are lost in a sum of squares
-    JFRNN_FUNCTION double doubly_inside(real radius) { return double(radius) * double(radius) * (1 - 0x1p-49); }
-    JFRNN_FUNCTION double doubly_outside(real radius) { return double(radius) * double(radius) * (1 + 0x1p-49); }
+    JFRNN_FUNCTION double doubly_inside(double radius) { return radius * radius * (1 - 0x1p-49); }
+    JFRNN_FUNCTION double doubly_outside(double radius) { return radius * radius * (1 + 0x1p-49); }
 
-    JFRNN_CALL bool pair(real ax, real ay, real az, real bx, real by, real bz, real radius, bool closed) {
+    JFRNN_CALL bool pair(real ax, real ay, real az, real bx, real by, real bz, real radius, real more, bool closed) {
         const real a[3] = {ax, ay, az}, b[3] = {bx, by, bz};
         if constexpr (!DOUBLE) {
             double square = 0;
@@ -425,14 +448,15 @@ struct Exact {
                 const double d = double(b[k]) - double(a[k]);
                 square += d * d;
             }
-            if (square < doubly_inside(radius))
+            const double r = SUM ? double(radius) + double(more) : double(radius);
+            if (square < doubly_inside(r))
                 return true;
-            if (square > doubly_outside(radius))
+            if (square > doubly_outside(r))
                 return false;
         }
-        int sign = sum_sign(a, b, radius, nullptr, Lattice{});
+        int sign = sum_sign(a, b, radius, more, nullptr, Lattice{});
         if (sign == 2)
-            sign = integer_sign(ax, ay, az, bx, by, bz, radius);
+            sign = integer_sign(ax, ay, az, bx, by, bz, radius, more);
         return sign < 0 || (sign == 0 && closed);
     }
 };
@@ -447,7 +471,7 @@ auto exact_image = [&](const real* query, const real* source, int image) {
     return Exact::image_pair(query, source, radius, closed, shift, lattice);
 };
 auto exact_pair = [&](const real* a, const real* b) {
-    return Exact::pair(a[0], a[1], DIM == 3 ? a[DIM - 1] : 0, b[0], b[1], DIM == 3 ? b[DIM - 1] : 0, radius, closed);
+    return Exact::pair(a[0], a[1], DIM == 3 ? a[DIM - 1] : 0, b[0], b[1], DIM == 3 ? b[DIM - 1] : 0, radius, 0, closed);
 };
 """
 

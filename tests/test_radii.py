@@ -63,14 +63,16 @@ def assert_case(name, dtype, dim, rule, backend, closed=False):
 
 
 def each_case():
-    """Yield every case, rule and kind; by default, each rule in one kind, and open cases, which share a program, by one engine."""
+    """Yield every case, rule, kind and engine; by default, of the array engines, which compile slowly, one kind of two rules."""
     kinds = {"gather": (np.float64, 2), "scatter": (np.float32, 2), "either": (np.float32, 3), "both": (np.float32, 3)}
     kinds["mean"] = (np.float64, 3)
-    alone = {"queries": "either", "periodic": "gather", "periodic_ties": "mean", "periodic_images": "either"}
-    for name, rule, dtype, dim, backend in product(RADII_CASES, RULES, (np.float32, np.float64), (2, 3), ("jax", "brute")):
-        often = backend == "jax" and (dtype, dim) == kinds[rule] and rule == alone.get(name, rule) and name != "periodic_ties"
+    compiled = {"queries": ("either",), "periodic": ("gather",), "periodic_ties": (), "periodic_images": ("either",)}
+    for name, rule, dtype, dim, backend in product(RADII_CASES, RULES, (np.float32, np.float64), (2, 3), ("jax", "warp", "brute")):
+        if backend == "warp" and RADII_CASES[name].build(dtype, dim).lengths is not None:
+            continue
+        often = (dtype, dim) == kinds[rule] and (backend == "warp" or rule in compiled.get(name, ("either", "mean")))
         kind = f"{name}-{rule}-f{8 * dtype().itemsize}-{dim}d-{backend}"
-        yield pytest.param(name, rule, dtype, dim, backend, id=kind, marks=[SLOW] * (not often))
+        yield pytest.param(name, rule, dtype, dim, backend, id=kind, marks=[SLOW] * (backend == "brute" or not often))
 
 
 @pytest.mark.parametrize(("name", "rule", "dtype", "dim", "backend"), list(each_case()))
@@ -78,10 +80,11 @@ def test_case(name, rule, dtype, dim, backend):
     assert_case(name, dtype, dim, rule, backend)
 
 
-@pytest.mark.parametrize("rule", [pytest.param(rule, marks=[SLOW] * (rule != "mean")) for rule in RULES])
-def test_ties_when_closed(rule):
+@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
+@pytest.mark.parametrize("rule", RULES)
+def test_ties_when_closed(rule, backend):
     for name in ("ties", "ties_far", "coincident", "mean_residues"):
-        assert_case(name, np.float32, 3, rule, "jax", closed=True)
+        assert_case(name, np.float32, 3, rule, backend, closed=True)
 
 
 def test_each_rule_differs_and_equal_radii_agree_with_one_cutoff():
@@ -192,7 +195,12 @@ X, H = np.zeros((4, 3), np.float32), np.ones(4, np.float32)
             r"cutoff must be a pair of arrays, of the positions \[4\] and of the queries \[2\].*'mean'",
             lambda: jfrnn.search(X, H, queries=X[:2], radius_rule="mean"),
         ),
-        (ValueError, "backend='warp' takes one cutoff for all particles", lambda: jfrnn.search(X, H, backend="warp")),
+        (
+            ValueError,
+            "backend='warp' takes one cutoff for all particles in a periodic box",
+            lambda: jfrnn.search(X, H, box=jfrnn.Box([3.0] * 3), backend="warp"),
+        ),
+        (ValueError, "backend='hashgrid' takes one cutoff for all particles: pass", lambda: jfrnn.search(X, H, backend="hashgrid")),
         (ValueError, "made with one cutoff for all particles", lambda: jfrnn.search(X, 1.0).update(X, cutoff=H)),
         (ValueError, "pass such an array", lambda: jfrnn.search(X, H, capacity=4, backend="brute").update(X, cutoff=1.0)),
     ],

@@ -49,10 +49,8 @@ def test_options(options, backend, dtype, dim):
         np.testing.assert_array_equal(jfrnn.count(points, cutoff, backend=backend, **options), nbrs.count)
 
 
-@pytest.mark.parametrize("backend", ["jax", BRUTE, "warp", "hashgrid"])
-@pytest.mark.parametrize(
-    ("m", "dtype", "dim"), [pytest.param(1, np.float32, 2, marks=SLOW), (7, np.float64, 3), (300, np.float32, 3)]
-)
+@pytest.mark.parametrize("backend", [pytest.param("jax", marks=SLOW), BRUTE, "warp", "hashgrid"])
+@pytest.mark.parametrize(("m", "dtype", "dim"), [(1, np.float32, 2), (7, np.float64, 3), (300, np.float32, 3)])
 def test_queries(m, backend, dtype, dim):
     points, queries = random_points(150, dim, dtype), 2 * random_points(m, dim, dtype, seed=1) - dtype(0.5)
     nbrs = jfrnn.search(points, 0.2, queries=queries, backend=backend)
@@ -63,7 +61,7 @@ def test_queries(m, backend, dtype, dim):
 @pytest.mark.parametrize("backend", ["jax", "warp"])
 def test_rows_longer_than_one_group_of_slots(backend):
     points = random_points(1500, 3, np.float32)
-    nbrs = jfrnn.search(points, 0.6, capacity=1000, backend=backend)
+    nbrs = jfrnn.search(points, 0.6, capacity=1500, backend=backend)
     assert int(nbrs.required) > 300
     checked.assert_exact(nbrs, points, 0.6)
 
@@ -248,8 +246,8 @@ def test_scan_and_cond(backend):
 # --- memory -----------------------------------------------------------------------------------------------------------
 
 
-SIZES = [(20_000, 20_000, np.float64, 2), (4_000_000, 64, np.float32, 3)]
-OTHER_SIZES = [(20_000, 64, np.float32, 2), *((n, capacity, np.float64, 3) for n, capacity, *_ in SIZES)]
+SIZES = [(4_000_000, 64, np.float32, 3)]
+OTHER_SIZES = [(20_000, 64, np.float32, 2), (20_000, 20_000, np.float64, 2), (4_000_000, 64, np.float64, 3)]
 
 
 @pytest.mark.parametrize(("n", "capacity", "dtype", "dim"), [*SIZES, *(pytest.param(*size, marks=SLOW) for size in OTHER_SIZES)])
@@ -294,7 +292,7 @@ X = np.zeros((4, 3), np.float32)
         (ValueError, r"cutoff must be positive and finite, got inf", {"cutoff": float("inf")}),
         (ValueError, r"cutoff=1e-40 is outside", {"cutoff": 1e-40}),
         (ValueError, r"cutoff=3e\+38 is outside", {"cutoff": 3e38}),
-        (ValueError, r"cutoff must be one number, got an array of shape \[4\]", {"cutoff": np.ones(4)}),
+        (ValueError, r"cutoff must be a number, or have shape \[4\], one per particle", {"cutoff": np.ones(3)}),
         (TypeError, r"cutoff must be a number, got str", {"cutoff": "1"}),
         (TypeError, r"cutoff must be a number, got bool", {"cutoff": True}),
         (ValueError, r"queries must match positions \(float32, 3 columns\), got float64", {"queries": X.astype(np.float64)}),

@@ -1,0 +1,320 @@
+"""Search with a cutoff per particle, on the CPU and on CUDA: queries one by one, in chunks on every core, or one per thread.
+
+What `jfrnn._levels` sorts, `query` walks: top cells as wide as the largest cutoff, within them groups of cutoffs, within those a
+Morton curve. A query finds the candidates of a group in the cells around it that are as wide as what the group reaches.
+"""
+
+import functools
+
+import warp as wp
+from jfrnn.kernels._native import ENTER, EXACT, LEAVE, snippet
+
+BLOCK = 128
+PADDING = 16  # sources behind the last one, which nobody meets: the CPU tests so many at a time
+RULES = ("gather", "scatter", "either", "both", "mean")
+
+# `header` holds the cells of the table along each axis (3), whether there is a table, and how many groups are in use. `cutoff`
+# holds the largest cutoff, then that of each group, and along each axis: the width of a top cell, how many of those units a cutoff
+# of 1 reaches, and what is added to that (3 each).
+_QUERY = r"""
+#if defined(__CUDA_ARCH__)
+constexpr int LANES = 1;
+#else
+constexpr int LANES = 16;
+#endif
+constexpr int GATHER = 0, SCATTER = 1, EITHER = 2, BOTH = 3;
+const int* extent = header.data;
+const bool dense = header.data[3] != 0;
+const int groups = header.data[4];
+const real* largest = cutoff.data + 1;
+const real* width = largest + GROUPS;
+const real* scale = width + 3;
+const real* margin = scale + 3;
+const long long stride = n + PADDING;
+const real unit = real(Bits::unit_scale(radius));
+constexpr real EPS = DOUBLE ? real(2.220446049250313e-16) : real(1.1920929e-07f);
+constexpr real LEAST = DOUBLE ? real(0x1p-459) : real(0x1p-40f);  // below, squares might underflow
+
+// cutoff of a pair; a mean is rounded
+auto of_pair = [](real own, real other) -> real {
+    if constexpr (RULE == GATHER) return own;
+    if constexpr (RULE == SCATTER) return other;
+    if constexpr (RULE == EITHER) return own > other ? own : other;
+    if constexpr (RULE == BOTH) return own < other ? own : other;
+    return own / 2 + other / 2;
+};
+auto exactly = [&](const real* q, const real* p, real own, real other) -> bool {
+    const real first = SUM ? own / 2 : of_pair(own, other), more = SUM ? other / 2 : real(0);
+    return Exact::pair(q[0], q[1], DIM == 3 ? q[DIM - 1] : 0, p[0], p[1], DIM == 3 ? p[DIM - 1] : 0, first, more, closed);
+};
+auto row_major = [&](const int* cell) -> int {
+    return DIM == 3 ? (cell[2] * extent[1] + cell[1]) * extent[0] + cell[0] : cell[1] * extent[0] + cell[0];
+};
+// first source whose top cell is not below this one, the last axis compared first
+auto first_not_below = [&](const int* cell) -> int {
+    int low = 0, high = n;
+    while (low < high) {
+        const int middle = low + (high - low) / 2;
+        bool below = false;
+        for (int k = 0; k < DIM; ++k) {
+            const int here = top.data[(long long)k * n + middle];
+            below = here < cell[k] || (here == cell[k] && below);
+        }
+        if (below)
+            low = middle + 1;
+        else
+            high = middle;
+    }
+    return low;
+};
+auto first_key_from = [&](unsigned int key, int low, int high) -> int {
+    while (low < high) {
+        const int middle = low + (high - low) / 2;
+        if ((unsigned int)keys.data[middle] < key)
+            low = middle + 1;
+        else
+            high = middle;
+    }
+    return low;
+};
+auto spread = [](unsigned int c) -> unsigned int {  // bit b goes to place DIM * b
+    unsigned int result = 0;
+    for (int b = 0; b < HALVINGS; ++b)
+        result |= (c >> b & 1) << (DIM * b);
+    return result;
+};
+
+// Runs of candidates of one group, around a cell: sorted, those that touch joined. Queries that follow each other often share them,
+// so a thread of the CPU keeps them for each group.
+struct Runs {
+    int level;
+    long long cell[3];  // of the query, at that level
+    int count, begin[27], end[27];
+};
+#if defined(__CUDA_ARCH__)
+Runs kept[1];
+#else
+Runs kept[GROUPS];
+#endif
+for (Runs& runs : kept)
+    runs.level = -1;
+auto find_runs = [&](Runs& runs, int g, int at, int level) {
+    const int shift = HALVINGS - level, mask = (1 << level) - 1;
+    bool same = LANES > 1 && runs.level == level;
+    for (int k = 0; k < DIM; ++k) {
+        const long long first = query_top.data[(long long)k * m + at];
+        const long long cell = (first << level) + (places.data[(long long)k * m + at] >> shift);
+        same = same && runs.cell[k] == cell;
+        runs.cell[k] = cell;
+    }
+    if (same)
+        return;
+    runs.level = level;
+    runs.count = 0;
+    for (int step = 0; step < (DIM == 3 ? 27 : 9); ++step) {
+        const int steps[3] = {step % 3 - 1, step / 3 % 3 - 1, step / 9 - 1};
+        int around[3] = {0, 0, 0};
+        unsigned int key = 0;
+        for (int k = 0; k < DIM; ++k) {
+            const int fine = (places.data[(long long)k * m + at] >> shift) + steps[k];
+            around[k] = query_top.data[(long long)k * m + at] + (fine >> level);
+            key |= spread((unsigned int)(fine & mask)) << k;
+        }
+        int from, to;
+        if (dense) {
+            from = table.data[row_major(around)];
+            to = table.data[row_major(around) + 1];
+        } else {
+            from = first_not_below(around);
+            ++around[0];
+            to = from < n ? first_not_below(around) : from;
+        }
+        if (from == to)
+            continue;
+        key = ((unsigned int)g << (DIM * HALVINGS)) | (key << (DIM * shift));
+        from = first_key_from(key, from, to);
+        to = first_key_from(key + (1u << (DIM * shift)), from, to);
+        if (from == to)
+            continue;
+        int place = runs.count++;
+        for (; place > 0 && runs.begin[place - 1] > from; --place) {
+            runs.begin[place] = runs.begin[place - 1];
+            runs.end[place] = runs.end[place - 1];
+        }
+        runs.begin[place] = from;
+        runs.end[place] = to;
+    }
+    int joined = 0;
+    for (int r = 1; r < runs.count; ++r)
+        if (runs.begin[r] == runs.end[joined])
+            runs.end[joined] = runs.end[r];
+        else {
+            ++joined;
+            runs.begin[joined] = runs.begin[r];
+            runs.end[joined] = runs.end[r];
+        }
+    runs.count = runs.count ? joined + 1 : 0;
+};
+
+// Which of LANES sources from `first` on are not surely too far from a query, a bit each, and which of those are surely pairs.
+#if defined(__CUDA_ARCH__)
+auto lowest_bit = [](unsigned int) -> int { return 0; };
+#else
+typedef real lanes __attribute__((vector_size(LANES * sizeof(real))));
+typedef bool flags __attribute__((ext_vector_type(LANES)));
+auto lowest_bit = [](unsigned int bits) -> int { return __builtin_ctz(bits); };
+#endif
+auto test = [&](const real* q, real own, int first, unsigned int& sure) -> unsigned int {
+#if defined(__CUDA_ARCH__)
+    using lanes = real;
+    auto load = [&](const real* from) -> lanes { return *from; };
+    auto bits = [](bool is_so) -> unsigned int { return is_so; };
+    auto choose = [](bool is_so, real yes, real no) -> real { return is_so ? yes : no; };
+#else
+    auto load = [&](const real* from) -> lanes {
+        lanes x;
+        __builtin_memcpy(&x, from, sizeof(x));
+        return x;
+    };
+    auto bits = [](auto is_so) -> unsigned int {
+        const flags f = __builtin_convertvector(is_so, flags);
+        unsigned short b;
+        __builtin_memcpy(&b, &f, 2);
+        return b;
+    };
+    auto choose = [](auto is_so, lanes yes, lanes no) -> lanes { return is_so ? yes : no; };
+#endif
+    lanes square = lanes{};
+    for (int k = 0; k < DIM; ++k) {
+        const lanes d = (load(axes.data + k * stride + first) - q[k]) * unit;
+        square += d * d;
+    }
+    lanes r = lanes{} + own;
+    if constexpr (RULE != GATHER) {
+        const lanes other = load(radii.data + first);
+        if constexpr (RULE == SCATTER) r = other;
+        else if constexpr (RULE == EITHER) r = choose(other > r, other, r);
+        else if constexpr (RULE == BOTH) r = choose(other < r, other, r);
+        else r = r / 2 + other / 2;
+    }
+    r *= unit;
+    r *= r;
+    const lanes least = lanes{} + LEAST * LEAST;
+    sure = bits(square < r * (1 - 32 * EPS)) & bits(r > least);
+    return bits(square <= choose(r > least, r, least) * (1 + 32 * EPS));
+};
+
+int longest = 0;
+auto serve = [&](int at) {
+    const int id = query_ids.data[at];
+    int* row = idx.data + (long long)id * capacity;
+    real q[3] = {0, 0, 0};
+    for (int k = 0; k < DIM; ++k)
+        q[k] = query_axes.data[(long long)k * m + at];
+    const real own = RULE == SCATTER ? real(0) : query_radii.data[at];
+    int found = 0;
+    auto meet = [&](int from, int to) {
+        for (int first = from; first < to; first += LANES) {
+            unsigned int sure, near = test(q, own, first, sure);
+            if (to - first < LANES)
+                near &= (1u << (to - first)) - 1;
+            for (; near; near &= near - 1) {
+                const int e = LANES > 1 ? lowest_bit(near) : 0, c = first + e, other = ids.data[c];
+                if ((own_queries && drop_self && c == at) || (later_only && other < id))
+                    continue;
+                bool pair = sure >> e & 1;
+                if (!pair) {
+                    real p[3];
+                    for (int k = 0; k < DIM; ++k)
+                        p[k] = axes.data[k * stride + c];
+                    pair = exactly(q, p, own, RULE == GATHER ? real(0) : radii.data[c]);
+                }
+                if (!pair)
+                    continue;
+                if (LIST && found < capacity)
+                    row[found] = other;
+                ++found;
+            }
+        }
+    };
+    for (int g = 0; finite_point(q) && g < groups; ++g) {
+        if (RULE != GATHER && largest[g] == 0)
+            continue;
+        const real reach = of_pair(own, largest[g]) * (1 + 8 * EPS);
+        int level = 0;  // the finest one whose cells are wider than the reach
+        for (bool fits = true; fits && level < HALVINGS; level += fits)
+            for (int k = 0; k < DIM; ++k)
+                fits = fits && width[k] / real(2 << level) > reach * scale[k] + margin[k];
+        Runs& runs = kept[LANES > 1 ? g : 0];
+        find_runs(runs, g, at, level);
+        for (int r = 0; r < runs.count; ++r)
+            meet(runs.begin[r], runs.end[r]);
+    }
+    if constexpr (LIST)
+        for (int s = found; s < capacity; ++s)
+            row[s] = n;
+    count.data[id] = found;
+    longest = found > longest ? found : longest;
+};
+
+#if defined(__CUDA_ARCH__)
+const long long at = ((long long)(blockIdx.z * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x) * blockDim.x + threadIdx.x;
+if (at < m) {
+    serve((int)at);
+    if (longest > 0)
+        atomicMax(&info.data[0], longest);
+}
+#else
+constexpr int CHUNK = 256;
+for (;;) {
+    const long long begin = (long long)__atomic_fetch_add(&info.data[1], 1, __ATOMIC_RELAXED) * CHUNK;
+    if (begin >= m)
+        break;
+    for (long long at = begin; at < begin + CHUNK && at < m; ++at)
+        serve((int)at);
+}
+int known = __atomic_load_n(&info.data[0], __ATOMIC_RELAXED);
+while (known < longest && !__atomic_compare_exchange_n(&info.data[0], &known, longest, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+}
+#endif
+"""
+
+
+@functools.cache
+def query_kernel(dim: int, double: bool, lists: bool, rule: str, groups: int, halvings: int) -> wp.Kernel:
+    """Return the kernel for a dimension, a dtype and a rule, for lists or counts alone.
+
+    On the CPU it is launched with dim = 1, once per thread; on CUDA with one thread per query, in blocks of BLOCK. `info`, zeros
+    at first, gets the longest row.
+    """
+    scalar = wp.float64 if double else wp.float32
+    variant = f"{dim}d_{'f64' if double else 'f32'}_{rule}{'_list' * lists}"
+    constants = {"LIST": lists, "RULE": RULES.index(rule), "SUM": rule == "mean", "GROUPS": groups, "HALVINGS": halvings}
+    constants |= {"SCALED": True, "PADDING": PADDING}
+    reals, ints, rows = wp.array(dtype=scalar), wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
+
+    def native(
+        axes: reals, radii: reals, ids: ints, keys: ints, top: ints, table: ints, header: ints, cutoff: reals,
+        query_axes: reals, query_radii: reals, query_ids: ints, query_top: ints, places: ints,
+        idx: rows, count: ints, info: ints, n: int, m: int, capacity: int,
+        own_queries: int, closed: int, drop_self: int, later_only: int,
+    ): ...  # fmt: skip
+
+    native.__name__ = native.__qualname__ = f"query_{variant}_native"
+    text = snippet("double" if double else "float", dim, EXACT, _QUERY, **constants)
+    function = wp.func_native(ENTER + text + LEAVE)(native)
+
+    def query(
+        axes: reals, radii: reals, ids: ints, keys: ints, top: ints, table: ints, header: ints, cutoff: reals,
+        query_axes: reals, query_radii: reals, query_ids: ints, query_top: ints, places: ints,
+        idx: rows, count: ints, info: ints, n: int, m: int, capacity: int,
+        own_queries: int, closed: int, drop_self: int, later_only: int,
+    ):  # fmt: skip
+        function(
+            axes, radii, ids, keys, top, table, header, cutoff, query_axes, query_radii, query_ids, query_top, places,
+            idx, count, info, n, m, capacity, own_queries, closed, drop_self, later_only,
+        )  # fmt: skip
+
+    module = wp.get_module(f"jfrnn.kernels.levels.{variant}")
+    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
+    return wp.kernel(query, name=f"query_{variant}", module=module, grid_stride=False)
