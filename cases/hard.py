@@ -191,6 +191,14 @@ def _near_max(dtype: np.dtype, dim: int) -> Parts:
     return _cube(200, dim, 71, -0.99, 0.99) * largest, 0.35 * largest
 
 
+def _clumps_near_max(dtype: np.dtype, dim: int) -> Parts:
+    """Return clumps at the ends of the float range, and the cutoff a millionth of it: half a stencil lies beyond."""
+    largest = float(np.finfo(dtype).max)
+    corners = np.array([[-1.0, -1.0, -1.0], [1.0, -1.0, 1.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])[:, :dim]
+    points = np.repeat(corners, 25, axis=0) * (1 - 1e-6 * np.random.default_rng(79).random((100, dim)))
+    return (points * largest).astype(dtype), 4e-7 * largest
+
+
 def _tiny_scale(dtype: np.dtype, dim: int) -> Parts:
     scale = 1e-25 if dtype == np.float32 else 1e-200
     return _cube(300, dim, 73, -0.3, 0.3) * scale, 0.1 * scale
@@ -340,6 +348,7 @@ _TABLE = (
     _case("filament", "a diagonal with gaps: no axis can be compressed", _filament),
     _case("sheet", "one layer of cells", _sheet),
     _case("near_max", "differences and squares overflow", _near_max),
+    _case("clumps_near_max", "what a cutoff reaches from the largest floats is infinite", _clumps_near_max),
     _case("tiny_scale", "squares underflow to zero", _tiny_scale),
     *[_case(f"n_{n}", "edges of tiles and empty shapes", _counted(n)) for n in (0, 1, 2, 33, 65)],
     _case("no_pairs", "no two points in reach", lambda dtype, dim: (_sites(dim)[:100] * 2.0, 1.0)),

@@ -511,6 +511,11 @@ auto cell_of = [&](int axis, real x) -> real {  // a whole float, monotone in x
     return DOUBLE ? real(__builtin_floor(x * inverse_edge[axis])) : real(__builtin_floorf(x * inverse_edge[axis]));
 #endif
 };
+// the end of a stencil may be infinite, though no particle is: the largest float instead
+auto in_range = [](real x) -> real {
+    constexpr real MOST = DOUBLE ? real(1.7976931348623157e308) : real(3.4028234663852886e38f);
+    return x < -MOST ? -MOST : x > MOST ? MOST : x;
+};
 // number of a cell, monotone, consecutive for cells that touch: the integer itself, or the bits of floats too large for that
 auto cell_number = [&](real cell) -> whole {
     constexpr real WHOLE = DOUBLE ? real(9007199254740992.0) : real(16777216.0f);
@@ -546,7 +551,7 @@ auto axis_cell = [&](const Grid& grid, int k, real x) -> whole {
         return cell < 0 ? 0 : cell < most ? (whole)cell : (whole)most;
     }
     if (!grid.dense)
-        return cell_number(cell);
+        return cell_number(cell_of(k, in_range(x)));
     const real from_low = cell - grid.low[k];
     return from_low < 0 ? -1 : from_low < real(grid.extent[k]) ? (whole)from_low : (whole)grid.extent[k];
 };

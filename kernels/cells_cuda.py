@@ -521,7 +521,7 @@ while (place < stop) {
     whole reached;
     {
         const int along = lane / 2 < DIM ? lane / 2 : 0;
-        const real x = cell_of(along, lane % 2 ? bound + reach_along(along) : bound - reach_along(along));
+        const real x = cell_of(along, in_range(lane % 2 ? bound + reach_along(along) : bound - reach_along(along)));
         if (is_periodic(along))  // numbered on beyond the ends
             reached = (whole)x;
         else if (grid.dense) {

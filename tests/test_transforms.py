@@ -1,0 +1,124 @@
+"""`jax.vmap` over every public function is a Python loop, or refused; `cond` and `shard_map` on one device."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import PartitionSpec
+
+import jfrnn
+
+CUTOFF, CAPACITY, BATCH, N = 0.3, 40, 3, 40
+OPTIONS = {"capacity": CAPACITY, "backend": "warp"}
+BOX, SMALL = jfrnn.Box([1.0, 1.25]), jfrnn.Box([0.5, 0.625])
+
+
+def positions(seed=0):
+    return jnp.asarray(np.random.default_rng(seed).random((BATCH, N, 2)), jnp.float32)
+
+
+X = positions()
+LISTS = {
+    "open": lambda x: jfrnn.search(x, CUTOFF, **OPTIONS),
+    "skin": lambda x: jfrnn.search(x, CUTOFF, skin=0.05, **OPTIONS),
+    "box": lambda x: jfrnn.search(x, CUTOFF, box=BOX, **OPTIONS),
+    "images": lambda x: jfrnn.search(x, CUTOFF, box=SMALL, capacity=160, backend="warp"),
+    "half": lambda x: jfrnn.search(x, CUTOFF, half=True, **OPTIONS),
+    "queries": lambda x: jfrnn.search(x, CUTOFF, queries=x[:7] + 0.01, **OPTIONS),
+    "active": lambda x: jfrnn.search(x, CUTOFF, active=x[:, 0] < 0.7, **OPTIONS),
+    "radii": lambda x: jfrnn.search(x, 0.1 + 0.2 * x[:, 0], radius_rule="mean", **OPTIONS),
+    "hashgrid": lambda x: jfrnn.search(x, CUTOFF, capacity=CAPACITY, backend="hashgrid"),
+}
+
+
+def cells(x):
+    return (64 * x).astype(jnp.uint32)
+
+
+FUNCTIONS = {
+    **{f"search, {name}": search for name, search in LISTS.items()},
+    "count": lambda x: jfrnn.count(x, CUTOFF, backend="warp"),
+    "count, radii": lambda x: jfrnn.count(x, 0.1 + 0.2 * x[:, 0], backend="warp"),
+    "count, hashgrid": lambda x: jfrnn.count(x, CUTOFF, backend="hashgrid"),
+    "count, box per system": lambda x: jfrnn.count(x, CUTOFF, box=jfrnn.Box(1.0 + x[0]), backend="warp"),
+    "update": lambda x: LISTS["open"](x).update(x + 0.1),
+    "update, skin": lambda x: LISTS["skin"](x).update(x + jnp.where(x[0, 0] > 0.5, 0.1, 0.0).astype(x.dtype)),
+    "update, box": lambda x: LISTS["box"](x).update(x + 0.1),
+    "vectors": lambda x: LISTS["open"](x).vectors(x),
+    "vectors, images": lambda x: LISTS["images"](x).vectors(x),
+    "distances": lambda x: LISTS["skin"](x).distances(x),
+    "distances, radii": lambda x: LISTS["radii"](x).distances(x),
+    "shifts": lambda x: LISTS["images"](x).shifts(x),
+    "overflow": lambda x: jfrnn.search(x, CUTOFF, capacity=2, backend="warp").overflow,
+    "pairs": lambda x: LISTS["half"](x).pairs(200),
+    "csr": lambda x: LISTS["open"](x).csr(300),
+    "to_jraph": lambda x: LISTS["open"](x).to_jraph(300),
+    "to_jax_md": lambda x: LISTS["open"](x).to_jax_md(),
+    "sort_order": lambda x: jfrnn.sort_order(x, 0.1),
+    "morton_encode": lambda x: jfrnn.morton_encode(cells(x)),
+    "morton_decode": lambda x: jfrnn.morton_decode(jfrnn.morton_encode(cells(x)), 2),
+    "hilbert_encode": lambda x: jfrnn.hilbert_encode(cells(x), 7),
+    "hilbert_decode": lambda x: jfrnn.hilbert_decode(jfrnn.hilbert_encode(cells(x), 7), 2, 7),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_vmap_is_a_loop(name):
+    function = FUNCTIONS[name]
+    batch = jax.vmap(function)(X)
+    for k, x in enumerate(X):
+        one, expected = jax.tree.map(lambda leaf, k=k: leaf[k], batch), function(x)
+        assert jax.tree.structure(one) == jax.tree.structure(expected)
+        for got, wanted in zip(jax.tree.leaves(one), jax.tree.leaves(expected), strict=True):
+            assert (got.shape, got.dtype) == (wanted.shape, wanted.dtype)
+            if np.issubdtype(got.dtype, np.floating):  # another program may round square roots and sums otherwise
+                np.testing.assert_allclose(got, wanted, rtol=1e-6)
+            else:
+                np.testing.assert_array_equal(got, wanted)
+
+
+REFUSED = {
+    "grow": lambda x: LISTS["open"](x).grow(x),
+    "check": lambda x: LISTS["open"](x).check(),
+    "pairs without a total": lambda x: LISTS["open"](x).pairs(),
+    "run_chunk": lambda x: jfrnn.run_chunk(lambda x, n: (x, n), x, LISTS["open"](x), lambda x: x),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_needs_the_host_refuses_vmap(name):
+    with pytest.raises(TypeError, match=r"cannot run inside jax\.jit"):
+        jax.vmap(REFUSED[name])(X)
+
+
+def test_search_without_capacity_refuses_vmap():
+    with pytest.raises(ValueError, match="capacity must be given where positions are traced"):
+        jax.vmap(lambda x: jfrnn.search(x, CUTOFF))(X)
+
+
+def test_every_public_name_is_mapped_or_refused():
+    """What this file knows of: a function that is new must be added to a table above."""
+    said = " ".join([*FUNCTIONS, *REFUSED])
+    methods = {name for name, value in vars(jfrnn.NeighborList).items() if callable(value) and not name.startswith("_")}
+    functions = {name for name in jfrnn.__all__ if not isinstance(getattr(jfrnn, name), type)}
+    apart = {"memory_plan"}  # of shapes alone
+    assert [name for name in sorted((methods | functions) - apart) if name not in said] == []
+    assert dataclasses.is_dataclass(jfrnn.NeighborList)
+
+
+@pytest.mark.parametrize("backend", ["warp", "hashgrid", pytest.param("jax", marks=pytest.mark.slow)])
+def test_cond_and_shard_map_on_one_device(backend):
+    def listed(x):
+        nbrs = jfrnn.search(x, CUTOFF, capacity=CAPACITY, backend=backend)
+        return nbrs.idx, nbrs.count
+
+    expected = listed(X[0])
+    chosen = jax.jit(lambda x: jax.lax.cond(x[0, 0] > -1, listed, lambda x: listed(2 * x), x))(X[0])
+    mesh = jax.make_mesh((1,), ("system",), axis_types=(jax.sharding.AxisType.Auto,))
+    spec = PartitionSpec("system")
+    mapped = jax.jit(jax.shard_map(listed, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))(X[0])
+    for got in (chosen, mapped):
+        for one, other in zip(got, expected, strict=True):
+            np.testing.assert_array_equal(one, other)
