@@ -120,6 +120,25 @@ def crossover(
 
 
 @app.command()
+def options(
+    out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform and backend.")] = Path("out") / "options",
+    points: Annotated[int, typer.Option(min=100, help="Random points.")] = 100_000,
+    rounds: Annotated[int, typer.Option(min=2, help="Timed runs of each option.")] = 15,
+    backend: Annotated[str, typer.Option(help="As in jfrnn.search.")] = "warp",
+) -> None:
+    """Time each option of a search beside a plain one."""
+    with _usage_errors():
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        from experiments import _options
+
+        path = _options.measure(out, points, rounds, backend)
+        typer.echo(_options.table(path))
+        typer.echo(path)
+
+
+@app.command()
 def show(
     layout: Layout,
     fill: Fill = None,
