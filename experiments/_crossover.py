@@ -1,10 +1,10 @@
 """From which size on an engine is the fastest: compiled searches of random points, the engines side by side."""
 
 import csv
+import functools
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import jax
@@ -56,7 +56,8 @@ def _rows(n: int, neighbors: int, repeats: int) -> Iterator[dict[str, Any]]:
     capacity = jfrnn.search(x, cutoff).capacity
     backends = [backend for backend in BACKENDS if n <= MOST_POINTS.get(backend, n)]
     searches = {backend: _compile(x, cutoff, capacity, backend) for backend in backends}
-    seconds, others = _time_in_turns(searches, x, repeats)
+    calls = {backend: functools.partial(search, x) for backend, search in searches.items()}
+    seconds, others = _measure.time_in_turns(calls, repeats)
     versions, commit, device = _machine.versions(), _machine.commit(), next(iter(x.devices()))
     for backend, search in searches.items():
         nbrs = search(x)
@@ -76,16 +77,3 @@ def _compile(x: jax.Array, cutoff: float, capacity: int, backend: str) -> Search
     for _ in range(2):
         jax.block_until_ready(search(x))
     return search
-
-
-def _time_in_turns(searches: dict[str, Search], x: jax.Array, repeats: int) -> tuple[dict[str, list[float]], float | None]:
-    """Time the searches in turns, so that all suffer alike from what else the machine does [s], and how many cores that was."""
-    seconds: dict[str, list[float]] = {backend: [] for backend in searches}
-    bystanders = _measure.Bystanders()
-    for _ in range(repeats):
-        for backend, search in searches.items():
-            begin = perf_counter()
-            jax.block_until_ready(search(x))
-            seconds[backend].append(perf_counter() - begin)
-    others = bystanders.cores()
-    return seconds, None if others is None else round(others, 2)

@@ -83,6 +83,29 @@ def repeat(search: Callable[[], Any], repeats: int, min_seconds: float, max_repe
         del result
 
 
+def time_in_turns(calls: dict[str, Callable[[], Any]], rounds: int) -> tuple[dict[str, list[float]], float | None]:
+    """Time calls in turns, waiting for each, so that all suffer alike from what else the machine does.
+
+    Args:
+        calls: By name; compiled, and warm.
+        rounds: Timed runs of each.
+
+    Returns:
+        The times of each [s], and how many cores others kept busy meanwhile.
+    """
+    import jax
+
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    bystanders = Bystanders()
+    for _ in range(rounds):
+        for name, call in calls.items():
+            begin = perf_counter()
+            jax.block_until_ready(call())
+            seconds[name].append(perf_counter() - begin)
+    others = bystanders.cores()
+    return seconds, None if others is None else round(others, 2)
+
+
 def summarize(seconds: list[float]) -> dict[str, Any]:
     """Return count, median and the 10th and 90th percentile of the repeats, named as in a row."""
     p10, median, p90 = (float(value) for value in np.percentile(seconds, (10, 50, 90)))

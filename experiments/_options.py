@@ -1,6 +1,7 @@
 """What each option of a search costs: the same scene with one option at a time, side by side in one run."""
 
 import csv
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -41,15 +42,14 @@ def measure(folder: Path, n: int, rounds: int, backend: str, neighbors: int = 30
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{jax.default_backend()}_{backend}.csv"
-    bystanders = _measure.Bystanders()
     options = list(_options(n, neighbors))
     calls = [_compiled(option, backend) for option in options]
     for search, count in calls:
         jax.block_until_ready((search(), count()))
-    seconds = np.array([[_seconds(search), _seconds(count)] for _ in range(rounds) for search, count in calls])
-    medians = np.median(seconds.reshape(rounds, len(options), 2), axis=0)
+    numbered = {str(place): call for place, call in enumerate(itertools.chain.from_iterable(calls))}
+    seconds, others = _measure.time_in_turns(numbered, rounds)
+    medians = np.median(list(seconds.values()), axis=1).reshape(len(options), 2)
     versions, commit, device = _machine.versions(), _machine.commit(), jax.devices()[0]
-    others = bystanders.cores()
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, COLUMNS)
         writer.writeheader()
@@ -62,7 +62,7 @@ def measure(folder: Path, n: int, rounds: int, backend: str, neighbors: int = 30
                 | {"entries": int(np.asarray(nbrs.count).sum(dtype=np.int64)), "capacity": nbrs.capacity, "rounds": rounds}
                 | {"list_s": f"{median[0]:.3e}", "count_s": f"{median[1]:.3e}"}
                 | {"list_ratio": round(ratios[0], 2), "count_ratio": round(ratios[1], 2)}
-                | {"others_cores": None if others is None else round(others, 2), "device": device.device_kind}
+                | {"others_cores": others, "device": device.device_kind}
                 | {"jax": versions["jax"], "warp": versions["warp-lang"], **commit}
             )
     return path
@@ -115,7 +115,3 @@ def _compiled(option: _Option, backend: str) -> tuple[Callable[[], Any], Callabl
         static_argnums=() if hasattr(option.cutoff, "shape") else 1,
     )
     return lambda: search(option.x, option.cutoff), lambda: count(option.x, option.cutoff)
-
-
-def _seconds(call: Callable[[], Any]) -> float:
-    return _measure.repeat(lambda: jax.block_until_ready(call()), 1, 0.0, 1)[1][0]

@@ -1,5 +1,6 @@
-"""Search with a cutoff per particle, on the CPU and on CUDA: queries one by one, in chunks on every core, or one per thread.
+"""Search with a cutoff per particle, on the CPU: queries one by one, in chunks on every core.
 
+The text is written for CUDA, too, one query per thread, but nothing launches it there: it has not run on a GPU.
 What `jfrnn._levels` sorts, `query` walks: top cells as wide as the largest cutoff, within them groups of cutoffs, within those a
 Morton curve. A query finds the candidates of a group in the cells around it that are as wide as what the group reaches.
 """
@@ -9,7 +10,6 @@ import functools
 import warp as wp
 from jfrnn.kernels._native import ENTER, EXACT, LEAVE, snippet
 
-BLOCK = 128
 PADDING = 16  # sources behind the last one, which nobody meets: the CPU tests so many at a time
 RULES = ("gather", "scatter", "either", "both", "mean")
 
@@ -284,8 +284,7 @@ while (known < longest && !__atomic_compare_exchange_n(&info.data[0], &known, lo
 def query_kernel(dim: int, double: bool, lists: bool, rule: str, groups: int, halvings: int) -> wp.Kernel:
     """Return the kernel for a dimension, a dtype and a rule, for lists or counts alone.
 
-    On the CPU it is launched with dim = 1, once per thread; on CUDA with one thread per query, in blocks of BLOCK. `info`, zeros
-    at first, gets the longest row.
+    It is launched with dim = 1, once per thread. `info`, zeros at first, gets the longest row.
     """
     scalar = wp.float64 if double else wp.float32
     variant = f"{dim}d_{'f64' if double else 'f32'}_{rule}{'_list' * lists}"
