@@ -139,6 +139,24 @@ def options(
 
 
 @app.command()
+def peers(
+    names: Annotated[list[str] | None, typer.Argument(help="Of libraries; all that are known without.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "peers",
+    limit: Annotated[float, typer.Option(min=1, help="Time for one answer [s].")] = 60.0,
+) -> None:
+    """Ask other libraries for the hard cases, and print a table of their answers (pip install -e '.[peers]')."""
+    with _usage_errors():
+        from experiments import _peers
+
+        unknown = [name for name in names or [] if name not in _peers.PEERS]
+        if unknown:
+            raise UsageError(f"no peer {unknown[0]!r}: {', '.join(_peers.PEERS)}")
+        path = _peers.measure(out, names or list(_peers.PEERS), limit)
+        typer.echo(_peers.table(path))
+        typer.echo(path)
+
+
+@app.command()
 def show(
     layout: Layout,
     fill: Fill = None,

@@ -33,7 +33,7 @@ class Exactness(BaseModel):
     dtypes: list[Literal["float32", "float64"]]
     dims: list[Literal[2, 3]]
     capacity: PositiveInt
-    periodic: bool = False  # the cases of periodic boxes instead
+    cases: Literal["hard", "periodic", "radii", "batches"] = "hard"  # which table of jfrnn.cases
 
 
 class Config(BaseModel):
@@ -44,9 +44,9 @@ class Config(BaseModel):
     reach_in_spacings: PositiveFloat
     jitter_in_spacings: PositiveFloat
     sizes: list[PositiveInt]
-    corners_fill: PositiveFloat
+    corners_fill: PositiveFloat | None = None  # none: no scene of corners
     counts_only: list[PositiveInt]
-    studied_size: PositiveInt
+    studied_size: PositiveInt | None = None  # none: choices are not studied
     calls: PositiveInt
     steps: PositiveInt
     repeats: PositiveInt
@@ -85,12 +85,14 @@ def run(config: Config, folder: Path) -> int:
 def _rows(config: Config) -> Iterator[dict[str, Any]]:
     yield from _memory_rows()
     for part in config.exactness:
-        yield from _periodic_exactness_rows(part) if part.periodic else _exactness_rows(part)
+        yield from _exactness_rows(part)
     yield _bandwidth_row(config)
-    for name, n in [("corners", 0), *(("jitter", n) for n in config.sizes)]:
-        points = _corners(config) if name == "corners" else _jitter_lattice(config, n)
-        yield from _scene_rows(config, name, points)
-    yield from _study_rows(config)
+    if config.corners_fill is not None:
+        yield from _scene_rows(config, "corners", _corners(config, config.corners_fill))
+    for n in config.sizes:
+        yield from _scene_rows(config, "jitter", _jitter_lattice(config, n))
+    if config.studied_size is not None:
+        yield from _study_rows(config, config.studied_size)
     for n in config.counts_only:
         yield _count_row(config, n)
 
@@ -108,11 +110,11 @@ def _jitter_lattice(config: Config, n: int) -> np.ndarray:
     return sites
 
 
-def _corners(config: Config) -> np.ndarray:
+def _corners(config: Config, fill: float) -> np.ndarray:
     from jfrnn.cases import scene  # pyright: ignore[reportMissingImports]
 
     random = np.random.default_rng(config.seed)
-    given = scene("corners", fill=config.corners_fill)
+    given = scene("corners", fill=fill)
     moved = given.positions / given.spacing + random.uniform(
         -config.jitter_in_spacings, config.jitter_in_spacings, given.positions.shape
     )
@@ -123,57 +125,108 @@ def _corners(config: Config) -> np.ndarray:
 
 
 def _exactness_rows(config: Exactness) -> Iterator[dict[str, Any]]:
+    decide = {"hard": _hard_decisions, "periodic": _periodic_decisions, "radii": _radii_decisions, "batches": _batch_decisions}
+    about = {"hard": "", "periodic": ", boxes", "radii": ", a cutoff per particle", "batches": ", batches"}
+    for dtype, dim in itertools.product(config.dtypes, config.dims):
+        right = dict(decide[config.cases](config, dtype, dim))
+        wrong = [name for name, is_right in right.items() if not is_right]
+        yield {
+            "kind": "exactness", "method": f"jfrnn {config.backend}{about[config.cases]}", "dtype": dtype, "dim": dim,
+            "cases": len(right), "wrong": len(wrong), "wrong_cases": wrong,
+        }  # fmt: skip
+
+
+def _hard_decisions(config: Exactness, dtype: str, dim: int) -> Iterator[tuple[str, bool]]:
     import jax
     from jfrnn.cases.hard import HARD_CASES  # pyright: ignore[reportMissingImports]
 
     import jfrnn
 
-    oracle = importlib.import_module("tests.reference")
-    for dtype, dim in itertools.product(config.dtypes, config.dims):
-        wrong, cases = [], 0
-        for name, closed in itertools.product(HARD_CASES, (False, True)):
-            if name == "denormal_lattice":  # a denormal cutoff is refused
-                continue
-            given = HARD_CASES[name].build(dtype, dim)
-            most = max(len(given.positions), 0 if given.queries is None else len(given.queries))
-            rows = 704 if most <= 704 else 2048  # shapes shared by many cases: few programs
-            queries = None if given.queries is None else _padded(given.queries, rows)
-            options = {"queries": queries, "capacity": config.capacity, "closed": closed, "backend": config.backend}
-            nbrs = jfrnn.search(jax.numpy.asarray(_padded(given.positions, rows)), given.cutoff, **options)
-            cases += 1
-            if not _is_exact(oracle, nbrs, _expected(oracle, name, dtype, dim, closed)):
-                wrong.append(f"{name}{'-closed' * closed}")
-        yield {
-            "kind": "exactness", "method": f"jfrnn {config.backend}", "dtype": dtype, "dim": dim,
-            "cases": cases, "wrong": len(wrong), "wrong_cases": wrong,
-        }  # fmt: skip
+    oracle = _oracle()
+    for name, closed in itertools.product(HARD_CASES, (False, True)):
+        if name == "denormal_lattice":  # a denormal cutoff is refused
+            continue
+        given = HARD_CASES[name].build(dtype, dim)
+        most = max(len(given.positions), 0 if given.queries is None else len(given.queries))
+        rows = 704 if most <= 704 else 2048  # shapes shared by many cases: few programs
+        queries = None if given.queries is None else _padded(given.queries, rows)
+        options = {"queries": queries, "capacity": config.capacity, "closed": closed, "backend": config.backend}
+        nbrs = jfrnn.search(jax.numpy.asarray(_padded(given.positions, rows)), given.cutoff, **options)
+        yield f"{name}{'-closed' * closed}", _is_exact(oracle, nbrs, _expected(oracle, name, dtype, dim, closed))
 
 
-def _periodic_exactness_rows(config: Exactness) -> Iterator[dict[str, Any]]:
+def _periodic_decisions(config: Exactness, dtype: str, dim: int) -> Iterator[tuple[str, bool]]:
     import jax
     from jfrnn.cases.periodic import PERIODIC_CASES  # pyright: ignore[reportMissingImports]
 
     import jfrnn
 
-    oracle = importlib.import_module("tests.reference")
-    for dtype, dim in itertools.product(config.dtypes, config.dims):
-        wrong, cases = [], 0
-        for name, half in itertools.product(PERIODIC_CASES, (False, True)):
-            given = PERIODIC_CASES[name].build(dtype, dim)
-            if not any(given.periodic) or (half and given.queries is not None):
-                continue
-            queries = None if given.queries is None else jax.numpy.asarray(_padded(given.queries, 304))
-            x, box = jax.numpy.asarray(_padded(given.positions, 304)), jfrnn.Box(given.matrix, given.periodic)
-            options = {"queries": queries, "half": half, "capacity": config.capacity, "backend": config.backend}
-            nbrs = jfrnn.search(x, given.cutoff, box=box, **options)
-            about = {"matrix": given.matrix, "periodic": given.periodic, "queries": given.queries, "half": half}
-            cases += 1
-            if _images(nbrs, x, queries) != sorted(oracle.reference_images(given.positions, given.cutoff, **about)):
-                wrong.append(f"{name}{'-half' * half}")
-        yield {
-            "kind": "exactness", "method": f"jfrnn {config.backend}, boxes", "dtype": dtype, "dim": dim,
-            "cases": cases, "wrong": len(wrong), "wrong_cases": wrong,
-        }  # fmt: skip
+    for name, half in itertools.product(PERIODIC_CASES, (False, True)):
+        given = PERIODIC_CASES[name].build(dtype, dim)
+        if not any(given.periodic) or (half and given.queries is not None):
+            continue
+        queries = None if given.queries is None else jax.numpy.asarray(_padded(given.queries, 304))
+        x, box = jax.numpy.asarray(_padded(given.positions, 304)), jfrnn.Box(given.matrix, given.periodic)
+        options = {"queries": queries, "half": half, "capacity": config.capacity, "backend": config.backend}
+        nbrs = jfrnn.search(x, given.cutoff, box=box, **options)
+        about = {"matrix": given.matrix, "periodic": given.periodic, "queries": given.queries, "half": half}
+        expected = _oracle().reference_images(given.positions, given.cutoff, **about)
+        yield f"{name}{'-half' * half}", _images(nbrs, x, queries) == sorted(expected)
+
+
+def _radii_decisions(config: Exactness, dtype: str, dim: int) -> Iterator[tuple[str, bool]]:
+    import jax.numpy as jnp
+    from jfrnn.cases.radii import RADII_CASES  # pyright: ignore[reportMissingImports]
+
+    import jfrnn
+    from jfrnn._exact import RULES
+
+    def padded(radii: np.ndarray) -> np.ndarray:
+        return np.concatenate([radii, np.ones(128 - len(radii), radii.dtype)])
+
+    for name, rule in itertools.product(RADII_CASES, RULES):
+        given = RADII_CASES[name].build(dtype, dim)
+        x, box = jnp.asarray(_padded(given.positions, 128)), None if given.lengths is None else jfrnn.Box(given.lengths)
+        cutoff: Any = padded(given.cutoffs)
+        queries = None
+        if given.queries is not None:
+            own, queries = padded(given.query_cutoffs), jnp.asarray(_padded(given.queries, 128))
+            cutoff = {"gather": own, "scatter": cutoff}.get(rule, (cutoff, own))
+        options = {"queries": queries, "box": box, "radius_rule": rule, "capacity": config.capacity, "backend": config.backend}
+        nbrs = jfrnn.search(x, cutoff, **options)
+        about = {"queries": given.queries, "query_radii": given.query_cutoffs, "lengths": given.lengths}
+        expected = _oracle().reference_radii(given.positions, given.cutoffs, rule, **about)
+        yield f"{name}-{rule}", _images(nbrs, x, queries) == sorted(expected)
+
+
+def _batch_decisions(config: Exactness, dtype: str, dim: int) -> Iterator[tuple[str, bool]]:
+    import jax.numpy as jnp
+    from jfrnn.cases.batches import BATCH_CASES  # pyright: ignore[reportMissingImports]
+
+    import jfrnn
+
+    def padded(systems: np.ndarray) -> np.ndarray:
+        return np.concatenate([systems, np.zeros(128 - len(systems), np.int32)])
+
+    for name, closed in itertools.product(BATCH_CASES, (False, True)):
+        given = BATCH_CASES[name].build(dtype, dim)
+        x, box = jnp.asarray(_padded(given.positions, 128)), None if given.lengths is None else jfrnn.Box(given.lengths)
+        of_queries, queries = given.batch, None
+        batch: Any = padded(given.batch)
+        if given.queries is not None:
+            of_queries, queries = given.query_batch, jnp.asarray(_padded(given.queries, 128))
+            batch = (batch, padded(given.query_batch))
+        options = {"queries": queries, "box": box, "closed": closed, "capacity": config.capacity, "backend": config.backend}
+        nbrs = jfrnn.search(x, given.cutoff, batch=batch, **options)
+        matrix = np.ones(dim) if given.lengths is None else given.lengths
+        about = {"matrix": matrix, "periodic": (given.lengths is not None,) * dim, "queries": given.queries, "closed": closed}
+        pairs = _oracle().reference_images(given.positions, given.cutoff, **about)
+        expected = sorted(pair for pair in pairs if of_queries[pair[0]] == given.batch[pair[1]])
+        yield f"{name}{'-closed' * closed}", _images(nbrs, x, queries) == expected
+
+
+def _oracle() -> Any:  # noqa: ANN401
+    return importlib.import_module("tests.reference")
 
 
 def _images(nbrs: Any, x: Any, queries: Any) -> list[tuple[int, int, tuple[int, ...]]]:  # noqa: ANN401
@@ -185,7 +238,9 @@ def _images(nbrs: Any, x: Any, queries: Any) -> list[tuple[int, int, tuple[int, 
     j, kind = idx[i, k], nbrs.box_kind
     if (j >= nbrs.source_count).any() or (j < 0).any():
         return []
-    if nbrs.images is None:
+    if kind is None:
+        shifts = np.zeros((len(i), x.shape[1]), int)
+    elif nbrs.images is None:
         sources = np.asarray(x, np.float64)
         points = sources if queries is None else np.asarray(queries, np.float64)
         periodic, vectors = list(kind.periodic), np.asarray(nbrs.box.vectors, np.float64)
@@ -479,13 +534,13 @@ def _count_row(config: Config, n: int) -> dict[str, Any]:
 # --- what the choices cost: kernels alone, on the device's clock ---------------------------------------------------------
 
 
-def _study_rows(config: Config) -> Iterator[dict[str, Any]]:
+def _study_rows(config: Config, n: int) -> Iterator[dict[str, Any]]:
     wp = load_warp()
     from jfrnn.cases import scene  # pyright: ignore[reportMissingImports]
 
     if not wp.is_cuda_available():
         return
-    jitter = _jitter_lattice(config, config.studied_size)
+    jitter = _jitter_lattice(config, n)
     given = scene("full")
     lattice = np.random.default_rng(config.seed).permutation(given.positions).astype(np.float32)
     for layout, points, cutoff in (("jitter", jitter, config.reach_in_spacings), ("full", lattice, given.cutoff)):

@@ -83,12 +83,13 @@ def repeat(search: Callable[[], Any], repeats: int, min_seconds: float, max_repe
         del result
 
 
-def time_in_turns(calls: dict[str, Callable[[], Any]], rounds: int) -> tuple[dict[str, list[float]], float | None]:
-    """Time calls in turns, waiting for each, so that all suffer alike from what else the machine does.
+def time_in_turns(calls: dict[str, Callable[[], Any]], rounds: int, burst: int = 1) -> tuple[dict[str, list[float]], float | None]:
+    """Time calls in turns, so that all suffer alike from what else the machine does.
 
     Args:
         calls: By name; compiled, and warm.
         rounds: Timed runs of each.
+        burst: Calls per run, of which the last is waited for: what a device takes, where the host need not wait for each.
 
     Returns:
         The times of each [s], and how many cores others kept busy meanwhile.
@@ -99,9 +100,12 @@ def time_in_turns(calls: dict[str, Callable[[], Any]], rounds: int) -> tuple[dic
     bystanders = Bystanders()
     for _ in range(rounds):
         for name, call in calls.items():
-            begin = perf_counter()
             jax.block_until_ready(call())
-            seconds[name].append(perf_counter() - begin)
+            begin, result = perf_counter(), None
+            for _ in range(burst):
+                result = call()
+            jax.block_until_ready(result)
+            seconds[name].append((perf_counter() - begin) / burst)
     others = bystanders.cores()
     return seconds, None if others is None else round(others, 2)
 

@@ -47,19 +47,19 @@ def measure(folder: Path, n: int, rounds: int, backend: str, neighbors: int = 30
     for search, count in calls:
         jax.block_until_ready((search(), count()))
     numbered = {str(place): call for place, call in enumerate(itertools.chain.from_iterable(calls))}
-    seconds, others = _measure.time_in_turns(numbered, rounds)
+    burst = 20 if jax.default_backend() == "gpu" else 1
+    seconds, others = _measure.time_in_turns(numbered, rounds, burst)
     medians = np.median(list(seconds.values()), axis=1).reshape(len(options), 2)
     versions, commit, device = _machine.versions(), _machine.commit(), jax.devices()[0]
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, COLUMNS)
         writer.writeheader()
         for option, (search, _), median in zip(options, calls, medians, strict=True):
-            nbrs = search()
-            nbrs.check()
+            idx, count = search()
             ratios = median / medians[0]
             writer.writerow(
-                {"platform": device.platform, "backend": nbrs.backend, "n": n, "option": option.name}
-                | {"entries": int(np.asarray(nbrs.count).sum(dtype=np.int64)), "capacity": nbrs.capacity, "rounds": rounds}
+                {"platform": device.platform, "backend": backend, "n": n, "option": option.name}
+                | {"entries": int(np.asarray(count).sum(dtype=np.int64)), "capacity": idx.shape[1], "rounds": rounds}
                 | {"list_s": f"{median[0]:.3e}", "count_s": f"{median[1]:.3e}"}
                 | {"list_ratio": round(ratios[0], 2), "count_ratio": round(ratios[1], 2)}
                 | {"others_cores": others, "device": device.device_kind}
@@ -91,6 +91,9 @@ def _options(n: int, neighbors: int) -> Iterator[_Option]:
     skewed = np.eye(3) + np.diag([0.3, 0.3], 1)
     yield _Option("box, skewed", x, r, {"box": jfrnn.Box(skewed)})
     yield _Option("box, images told apart", x, r, {"box": jfrnn.Box([1.0, 1.0, 1.0], images=1)})
+    systems = 100
+    batch = jnp.asarray(random.integers(0, systems, n), jnp.int32)
+    yield _Option("batch of 100 systems, superposed", x, r * systems ** (1 / 3), {"batch": batch})
     yield _Option("a cutoff per particle, equal", x, jnp.full(n, r, jnp.float32), {})
     away = random.normal(size=(n, 3))
     away /= np.linalg.norm(away, axis=1, keepdims=True)
@@ -106,12 +109,20 @@ def _compiled(option: _Option, backend: str) -> tuple[Callable[[], Any], Callabl
     counted = {name: value for name, value in option.more.items() if name != "skin"}
     reach = option.cutoff + option.more.get("skin", 0.0)
     longest = int(jfrnn.count(option.x, reach, backend=backend, **counted).max())
-    search = jax.jit(
-        lambda x, cutoff: jfrnn.search(x, cutoff, capacity=-(-longest // 8) * 8, backend=backend, **option.more),
-        static_argnums=() if hasattr(option.cutoff, "shape") else 1,
-    )
-    count = jax.jit(
-        lambda x, cutoff: jfrnn.count(x, cutoff, backend=backend, **counted),
-        static_argnums=() if hasattr(option.cutoff, "shape") else 1,
-    )
-    return lambda: search(option.x, option.cutoff), lambda: count(option.x, option.cutoff)
+    data: dict[str, Any] = {name: value for name, value in option.more.items() if hasattr(value, "shape")}  # operands, no constants
+    more = {name: value for name, value in option.more.items() if name not in data}
+    cutoff = option.cutoff
+    if hasattr(cutoff, "shape"):
+        data["cutoff"] = cutoff
+    else:
+        more["cutoff"] = cutoff
+    counted = {name: value for name, value in more.items() if name != "skin"}
+    capacity = -(-longest // 8) * 8
+
+    def listed(x: jax.Array, data: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
+        nbrs = jfrnn.search(x, capacity=capacity, backend=backend, **more, **data)
+        return nbrs.idx, nbrs.count
+
+    search = jax.jit(listed)
+    count = jax.jit(lambda x, data: jfrnn.count(x, backend=backend, **counted, **data))
+    return lambda: search(option.x, data), lambda: count(option.x, data)

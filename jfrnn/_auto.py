@@ -22,23 +22,20 @@ WARP_ENGINES = ("warp", "hashgrid")
 _WARP_FROM = {"cpu": 0, "gpu": 0}
 
 
-def choose_engine(backend: str, sources: Array, queries: Array | None, periodic: bool = False, radii: bool = False) -> str:
+def choose_engine(
+    backend: str, sources: Array, queries: Array | None, *, periodic: bool = False, radii: bool = False, batch: bool = False
+) -> str:
     """Return the engine that a backend stands for; raise where one that was named cannot run on the platform.
 
     Raises:
         ImportError: "warp" or "hashgrid", and Warp is not installed.
         RuntimeError: "warp" or "hashgrid", and Warp cannot run on the platform.
-        ValueError: "hashgrid", and space is periodic; "hashgrid", and cutoffs differ from particle to particle; or "warp", and they
-            do so in a periodic box or on a GPU.
+        ValueError: "hashgrid", and space is periodic, there is a batch, or cutoffs differ from particle to particle.
     """
-    if radii and backend != "brute":
-        platform = _platform_of(sources, sources if queries is None else queries)
-        can_warp = platform == "cpu" and not periodic
-        if backend == "hashgrid" or (backend == "warp" and not can_warp):
-            where = "" if backend == "hashgrid" else " in a periodic box" if periodic else f" on the platform {platform!r}"
-            raise ValueError(f"backend={backend!r} takes one cutoff for all particles{where}: pass backend='jax' or 'brute'.")
-        if backend == "auto" and not can_warp:
-            return "jax"
+    if backend == "hashgrid" and radii:
+        raise ValueError("backend='hashgrid' takes one cutoff for all particles: pass backend='warp', 'jax' or 'brute'.")
+    if backend == "hashgrid" and batch:
+        raise ValueError("backend='hashgrid' knows one system at a time: pass backend='warp', 'jax' or 'brute'.")
     if backend == "hashgrid" and periodic:
         raise ValueError("backend='hashgrid' knows no periodic box: pass backend='warp', 'jax' or 'brute'.")
     if backend not in ("auto", *WARP_ENGINES):

@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn import _warp
+from jfrnn._batch import Batch, ranked
 from jfrnn._box import Box, Images, Lattice, Wrapped, fractions_of, is_valid, make_lattice, translation, unpacked_turns, wrap
 from jfrnn._cells import CellAxes, build_grid, cell_edge, cell_order, grid_coordinates, open_axes, stencil_runs
 from jfrnn._exact import Cutoff, Cutoffs, Radii, is_radius, make_cutoffs
@@ -40,6 +41,7 @@ class Inputs(NamedTuple):
     active: Array | None
     box: Box | None
     cutoff: Cutoff | Radii  # of the list: one for all, with the skin; of each particle, without
+    batch: Batch | None = None
 
 
 class Found(NamedTuple):
@@ -72,18 +74,19 @@ def without_inactive(positions: Array, active: Array | None) -> Array:
 
 def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
     """List the neighbors of every query, or only count them (capacity=None). Integers: no gradient flows through."""
-    given, given_queries, active, box, cutoff = lax.stop_gradient(inputs)
+    given, given_queries, active, box, cutoff, batch = lax.stop_gradient(inputs)
     sources, queries, images = without_inactive(given, active), given_queries, options.images
+    batch = None if batch is None else ranked(batch)
     checks: dict[Status, Array] = {}
     if isinstance(cutoff, Radii):
         sources, queries, checks = _with_valid_radii(sources, queries, active, cutoff)
         cutoff = make_cutoffs(cutoff, options.closed, options.skin)
     if box is None or images is None:
-        rows = _rows_of_engine(sources, queries, cutoff, options, capacity)
+        rows = _rows_of_engine(sources, queries, cutoff, options, capacity, batch)
         return Found(_with_status(rows, given, given_queries, active, checks), None, None)
     lattice = make_lattice(box, images, np.dtype(sources.dtype))
     wrapped = wrap(sources, queries, lattice, _largest(cutoff))
-    rows = _rows_of_engine(sources, queries, cutoff, options, capacity, (lattice, wrapped))
+    rows = _rows_of_engine(sources, queries, cutoff, options, capacity, batch, (lattice, wrapped))
     in_range = _all_in_range(wrapped.turns, sources) & _all_in_range(wrapped.query_turns, sources if queries is None else queries)
     checks |= {Status.BOX_TOO_SMALL: wrapped.enough & is_valid(lattice), Status.OUT_OF_RANGE: in_range}
     rows = _with_status(rows, given, given_queries, active, checks)
@@ -144,22 +147,23 @@ def _rows_of_engine(
     cutoff: Cutoff | Cutoffs,
     options: Options,
     capacity: int | None,
+    batch: Batch | None,
     torus: tuple[Lattice, Wrapped] | None = None,
 ) -> Rows:
     n, m = sources.shape[0], (sources if queries is None else queries).shape[0]
     if options.backend == "warp" and isinstance(cutoff, Cutoffs) and 0 not in (n, m):
-        points, axes = _open_cells(sources, queries, cutoff)
-        levels = sort_by_levels(points, axes, cutoff, n, queries is None)
-        return _warp.level_neighbors(sources, queries, cutoff, levels, options.filter, capacity)
+        along, axes = _cells_along(sources, queries, cutoff, torus)
+        levels = sort_by_levels(along, axes, cutoff, n, queries is None, None if batch is None else batch.of_all)
+        return _warp.level_neighbors(sources, queries, cutoff, levels, options.filter, capacity, batch, torus)
     if options.backend == "warp" and isinstance(cutoff, Cutoff) and 0 not in (n, m):
-        return _warp.neighbors(sources, queries, cutoff, options.filter, capacity, torus)
+        return _warp.neighbors(sources, queries, cutoff, options.filter, capacity, batch, torus)
     if options.radius is not None and isinstance(cutoff, Cutoff) and 0 not in (n, m):
         return _warp.hashgrid_neighbors(sources, queries, cutoff, options.radius, options.filter, capacity)
     if 0 in (n, m):
         fill = n if options.images is None or options.images.nearest else max(n, 1) * options.images.total
         idx, count = None if capacity is None else jnp.full((m, capacity), fill, jnp.int32), jnp.zeros(m, jnp.int32)
     else:
-        candidates = _candidates(sources, queries, cutoff, options, torus)
+        candidates = _candidates(sources, queries, cutoff, options, batch, torus)
         if capacity is None:
             idx, count = None, count_neighbors(candidates, cutoff, options.filter)
         else:
@@ -172,27 +176,34 @@ def _rows_of_engine(
 
 
 def _candidates(
-    sources: Array, queries: Array | None, cutoff: Cutoff | Cutoffs, options: Options, given: tuple[Lattice, Wrapped] | None
+    sources: Array,
+    queries: Array | None,
+    cutoff: Cutoff | Cutoffs,
+    options: Options,
+    batch: Batch | None,
+    given: tuple[Lattice, Wrapped] | None,
 ) -> Candidates:
     """Say where the candidates of a query lie, in particle order (brute force), by cells, or by cells of many sizes."""
     torus = None if given is None else _torus(sources, queries, *given)
     clouds = (sources, queries) if given is None else (given[1].sources, None if queries is None else given[1].queries)
     if options.backend == "brute":
-        return _all_sources(*clouds, cutoff, torus)
-    if given is None:
-        along, axes = _open_cells(sources, queries, cutoff)
-    else:
-        along, axes = _cells_of_lattice(sources, queries, _largest(cutoff), *given)
+        return _all_sources(*clouds, cutoff, batch, torus)
+    along, axes = _cells_along(sources, queries, cutoff, given)
     if isinstance(cutoff, Cutoff):
-        return _cell_stencil(*clouds, along, axes.cells, torus)
+        return _cell_stencil(*clouds, along, axes.cells, batch, torus)
     images = None if torus is None else torus.images
-    levels = sort_by_levels(along, axes, cutoff, sources.shape[0], queries is None)
+    levels = sort_by_levels(along, axes, cutoff, sources.shape[0], queries is None, None if batch is None else batch.of_all)
     points = _in_order(clouds[0], levels.order, cutoff.sources)
     rows = _in_order(clouds[0] if clouds[1] is None else clouds[1], levels.query_order, cutoff.queries)
     return Candidates(points, rows, level_runs(levels, cutoff, images), torus, levels.passes)
 
 
-def _open_cells(sources: Array, queries: Array | None, cutoff: Cutoff | Cutoffs) -> tuple[Array, Axes]:
+def _cells_along(
+    sources: Array, queries: Array | None, cutoff: Cutoff | Cutoffs, torus: tuple[Lattice, Wrapped] | None
+) -> tuple[Array, Axes]:
+    """Return the coordinates [d, n + m] that are cut into cells, those of the queries last, and how."""
+    if torus is not None:
+        return _cells_of_lattice(sources, queries, _largest(cutoff), *torus)
     points = sources if queries is None else jnp.concatenate([sources, queries])
     one = jnp.ones(points.shape[1], points.dtype)
     return points.T, Axes(open_axes(cell_edge(_largest(cutoff)), points.shape[1]), one, 0 * one)
@@ -205,26 +216,40 @@ def _torus(sources: Array, queries: Array | None, lattice: Lattice, wrapped: Wra
     return Torus(lattice.images, translation(shifts, lattice), lattice.matrix, raw, (turns[0], turns[1]), wrapped.slack)
 
 
-def _all_sources(sources: Array, queries: Array | None, cutoff: Cutoff | Cutoffs, torus: Torus | None) -> Candidates:
-    """Brute force: a run of all sources, O(n·m), for each image."""
+def _all_sources(
+    sources: Array, queries: Array | None, cutoff: Cutoff | Cutoffs, batch: Batch | None, torus: Torus | None
+) -> Candidates:
+    """Brute force: a run of all sources, or of those of the query's system, O(n·m), for each image."""
     images = 1 if torus is None else torus.images.total
+    order = query_order = None
+    first = end = jnp.zeros((), jnp.int32)
+    if batch is not None:
+        order = jnp.argsort(batch.sources)
+        query_order = order if batch.queries is None else lax.iota(jnp.int32, batch.queries.size)
+        systems, wanted = batch.sources[order], batch.of_queries[query_order]
+        first, end = (jnp.searchsorted(systems, wanted, side=side).astype(jnp.int32) for side in ("left", "right"))
 
     def runs(place: Array, _: Array) -> tuple[Array, Array, Array | None]:
-        start = jnp.zeros((place.size, images), jnp.int32)
-        return start, jnp.full_like(start, sources.shape[0]), None if torus is None else start + lax.iota(jnp.int32, images)
+        start, stop = jnp.zeros((place.size, images), jnp.int32), jnp.int32(sources.shape[0])
+        if batch is not None:
+            start, stop = start + first[place][:, None], end[place][:, None]
+        codes = None if torus is None else jnp.zeros_like(start) + lax.iota(jnp.int32, images)
+        return start, jnp.broadcast_to(stop, start.shape), codes
 
     of_sources, of_queries = (cutoff.sources, cutoff.queries) if isinstance(cutoff, Cutoffs) else (None, None)
-    points = _in_order(sources, None, of_sources)
-    return Candidates(points, _in_order(sources if queries is None else queries, None, of_queries), runs, torus)
+    points = _in_order(sources, order, of_sources)
+    return Candidates(points, _in_order(sources if queries is None else queries, query_order, of_queries), runs, torus)
 
 
-def _cell_stencil(sources: Array, queries: Array | None, along: Array, axes: CellAxes, torus: Torus | None) -> Candidates:
+def _cell_stencil(
+    sources: Array, queries: Array | None, along: Array, axes: CellAxes, batch: Batch | None, torus: Torus | None
+) -> Candidates:
     """Cells: sources and queries sorted by cell; the runs of a query are the rows of cells around its own.
 
     `along` [d, n + m] are the coordinates of the sources, then of the queries, that `axes` cuts into cells.
     """
     finite = jnp.isfinite(along).all(axis=0)
-    coords, extent = grid_coordinates(along, axes, finite)
+    coords, extent = grid_coordinates(along, axes, finite, None if batch is None else batch.of_all)
     n, total = sources.shape[0], along.shape[1]
     grid = build_grid(coords[:, :n], finite[:n], extent, total)
     if queries is None:
@@ -236,7 +261,7 @@ def _cell_stencil(sources: Array, queries: Array | None, along: Array, axes: Cel
     images = None if torus is None else torus.images
 
     def runs(place: Array, _: Array) -> tuple[Array, Array, Array | None]:
-        return stencil_runs(grid, query_coords.at[:, place].get(mode="promise_in_bounds"), images)
+        return stencil_runs(grid, query_coords.at[:, place].get(mode="promise_in_bounds"), len(along), images)
 
     points = _in_order(sources, grid.order)
     return Candidates(points, points if queries is None else _in_order(queries, order), runs, torus)

@@ -24,8 +24,9 @@ class Grid(NamedTuple):
 
     Attributes:
         order: [n] int32, the particle at each place of the cell order; non-finite ones last.
-        coords: [d, n] int32 in that order, the cell of each particle (x, y[, z]).
-        extent: [d] int32, cells per axis; with a margin of one empty cell on either side where space is open.
+        coords: [d, n] int32 in that order, the cell of each particle (x, y[, z]); [d + 1, n] where systems are told apart, the last
+            being the system.
+        extent: [d] or [d + 1] int32, cells per axis; with a margin of one empty cell on either side where space is open.
         dense: [] bool, whether the box is small enough for `table`.
         table: [cells + 1] int32, the first place of each cell in row-major order (zeros where not dense).
     """
@@ -86,12 +87,13 @@ def open_axes(edge: Array, dim: int) -> CellAxes:
     return CellAxes([edge] * dim, [None] * dim)
 
 
-def grid_coordinates(positions: Array, axes: CellAxes, finite: Array) -> tuple[Array, Array]:
-    """Number the cells of [d, n] coordinates along each axis: [d, n] int32, and the [d] extents.
+def grid_coordinates(positions: Array, axes: CellAxes, finite: Array, batch: Array | None = None) -> tuple[Array, Array]:
+    """Number the cells of [d, n] coordinates along each axis: [d, n] int32, and the [d] extents; systems are a further axis.
 
     Open axes count from 1 on, with margins: a small bounding box keeps its empty cells; in a large one, runs of empty planes
     shrink to a single one, axis by axis: cells that touch still touch, cells that do not still do not, and no axis is longer than
     2n + 1, however far apart the particles are. Periodic axes, whose coordinates are fractions from 0 to 1, count from 0 on.
+    Of `batch`, [n] uint32 from 0 on, equal numbers stay equal and different ones different; n are the most that there can be.
     """
     some = jnp.any(finite)
     is_open = [turn is None for turn in axes.turns]
@@ -106,7 +108,8 @@ def grid_coordinates(positions: Array, axes: CellAxes, finite: Array) -> tuple[A
     extents = [
         high - low + 3 if turn is None else turn for low, high, turn in zip(lowest[:, 0], highest[:, 0], axes.turns, strict=True)
     ]
-    small = jnp.prod(jnp.stack(extents)) <= _table_size(finite.size)
+    systems = 1 if batch is None else jnp.max(batch, initial=0).astype(cells.dtype) + 1
+    small = jnp.prod(jnp.stack(extents)) * systems <= _table_size(finite.size)
     coords = lax.cond(
         small,
         lambda cells: jnp.stack(
@@ -121,12 +124,15 @@ def grid_coordinates(positions: Array, axes: CellAxes, finite: Array) -> tuple[A
         cells,
     )
     margins = [jnp.max(c) + 2 if turn is None else turn.astype(jnp.int32) for c, turn in zip(coords, axes.turns, strict=True)]
-    return coords, jnp.stack(margins)
+    if batch is None:
+        return coords, jnp.stack(margins)
+    system = lax.cond(small, lambda batch: batch.astype(jnp.int32), _squeeze_gaps, batch)
+    return jnp.concatenate([coords, system[None]]), jnp.stack([*margins, jnp.max(system) + 1])
 
 
 def _squeeze_gaps(cells: Array) -> Array:
-    """Renumber whole floats [n] from 0 on, in order, with steps of at most 2."""
-    _, order = _sort_by(_ordered_bits(cells), _iota(cells.size))
+    """Renumber whole floats, or uint32, [n] from 0 on, in order, with steps of at most 2."""
+    _, order = _sort_by(cells if cells.dtype == jnp.uint32 else _ordered_bits(cells), _iota(cells.size))
     ascending = cells[order]
     before, after = ascending[:-1], ascending[1:]
     step = jnp.where(after == before, 0, jnp.where(after - before == 1, 1, 2)).astype(jnp.int32)
@@ -193,14 +199,16 @@ def _row_major(coords: Sequence[Array] | Array, extent: Array) -> Array:
     return index
 
 
-def stencil_runs(grid: Grid, coords: Array, images: Images | None = None) -> tuple[Array, Array, Array | None]:
+def stencil_runs(grid: Grid, coords: Array, dim: int, images: Images | None = None) -> tuple[Array, Array, Array | None]:
     """Find the sources in the cells around each query cell [d, m]: [m, runs] int32 first places, ends, and codes of their images.
+
+    Where systems are told apart, the cells are [d + 1, m], and the system is that of the query.
 
     An open space has a run per row of 3 cells, 3^(d-1) of them. Along a periodic axis cells are numbered on beyond either end,
     where they are those of an image; a row is cut where it enters another image.
     Dense: two loads from the table per run. Otherwise: two binary searches per run among the sorted cells of the sources.
     """
-    cells, code = _stencil_rows(coords, grid.extent, images)
+    cells, code = _stencil_rows(coords, grid.extent, dim, images)
     start, stop = places_between(grid, cells)
     return (start, stop, None) if code is None else (start, jnp.where(cells[0] <= cells[1], stop, start), code)
 
@@ -221,10 +229,12 @@ def places_between(grid: Grid, cells: list[Array]) -> tuple[Array, Array]:
     return lax.cond(grid.dense, from_table, by_binary_search, cells)
 
 
-def _stencil_rows(coords: Array, extent: Array, images: Images | None) -> tuple[list[Array], Array | None]:
+def _stencil_rows(coords: Array, extent: Array, dim: int, images: Images | None) -> tuple[list[Array], Array | None]:
     """Return first and last cell along x and the cells along the other axes of each run, [m, runs] each, and their images."""
-    reach = (0,) * len(coords) if images is None else images.reach
+    reach = (0,) * dim if images is None else images.reach
     steps = [range(-max(k, 1), max(k, 1) + 1) for k in reach]
+    if len(coords) > dim:
+        reach, steps = (*reach, 0), [*steps, range(1)]
     parts = _parts_of_rows(coords[0], extent[0], reach[0], images)
     rows = [(part, row) for part in parts for row in product(*steps[1:])]
     first, last, shift = (jnp.stack([part[what] for part, _ in rows], axis=1) for what in range(3))

@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
+from jfrnn._batch import Batch
 from jfrnn._box import Box
 from jfrnn._exact import RULES, Cutoff, Radii, largest_cutoff, make_cutoff, make_cutoffs, smallest_cutoff
 
@@ -133,6 +134,35 @@ def checked_active(active: Any, positions: Array) -> Array:  # noqa: ANN401
     if tuple(active.shape) != positions.shape[:1]:
         raise ValueError(f"active must have shape [{positions.shape[0]}], one bool per particle, got shape {list(active.shape)}.")
     return jnp.asarray(active)
+
+
+def checked_batch(batch: Any, sources: Array, queries: Array | None) -> Batch:  # noqa: ANN401
+    """Return the systems of the particles, and of the queries if there are any, as int32."""
+    if queries is None:
+        return Batch(_checked_systems("batch", batch, sources.shape[0], "particle"), None)
+    if not isinstance(batch, tuple) or len(batch) != 2:
+        raise ValueError(
+            f"batch must be a pair of arrays, of the positions [{sources.shape[0]}] and of the queries [{queries.shape[0]}], got "
+            f"{_describe_array(batch)}."
+        )
+    of_sources = _checked_systems("batch[0]", batch[0], sources.shape[0], "position")
+    return Batch(of_sources, _checked_systems("batch[1]", batch[1], queries.shape[0], "query"))
+
+
+def _checked_systems(name: str, systems: Any, size: int, what: str) -> Array:  # noqa: ANN401
+    if not hasattr(systems, "dtype") or not np.issubdtype(systems.dtype, np.integer):
+        raise TypeError(f"{name} must be an array of integers, the system of each {what}, got {_describe_array(systems)}.")
+    if tuple(systems.shape) != (size,):
+        raise ValueError(f"{name} must have shape [{size}], the system of each {what}, got shape {list(systems.shape)}.")
+    if np.can_cast(systems.dtype, np.int32):
+        return jnp.asarray(systems).astype(jnp.int32)
+    if isinstance(systems, Tracer):
+        raise TypeError(f"{name} is {systems.dtype}, of which not all numbers fit into int32: convert it with .astype(jnp.int32).")
+    values = np.asarray(systems)
+    if values.size and not -(2**31) <= int(values.min()) <= int(values.max()) < 2**31:
+        raise ValueError(f"{name} holds numbers from {values.min()} to {values.max()}, but systems are numbered in int32.")
+    with jax.ensure_compile_time_eval():
+        return jnp.asarray(values.astype(np.int32))
 
 
 def checked_box(box: Any, positions: Array, like: Box | None = None) -> Box | None:  # noqa: ANN401

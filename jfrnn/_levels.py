@@ -41,7 +41,7 @@ class Levels(NamedTuple):
         query_order: [m] int32, likewise; the same where the sources are the queries.
         grid: The top cells of the sources.
         keys: [n] uint32 in order: group, then the place within the top cell along the Morton curve.
-        query_top: [d, m] int32, the top cell of each query.
+        query_top: [d, m] int32, the top cell of each query; [d + 1, m] where systems are told apart.
         query_place: [d, m] int32, the finest cell within it, counted from 0 along each axis.
         largest: [GROUPS] the largest cutoff of each group, 0 where there is none; None: the rule asks for no cutoffs of sources,
             and all are one group.
@@ -62,11 +62,14 @@ class Levels(NamedTuple):
     axes: Axes
 
 
-def sort_by_levels(along: Array, axes: Axes, cutoffs: Cutoffs, n: int, own: bool) -> Levels:
-    """Sort n sources, and the queries unless the sources are `own` queries, whose coordinates along the axes are [d, n + m]."""
+def sort_by_levels(along: Array, axes: Axes, cutoffs: Cutoffs, n: int, own: bool, batch: Array | None = None) -> Levels:
+    """Sort n sources, and the queries unless the sources are `own` queries, whose coordinates along the axes are [d, n + m].
+
+    `batch` [n + m] uint32 are the systems to which they belong.
+    """
     dim, total = along.shape
     finite = jnp.isfinite(along).all(axis=0)
-    top, extent = grid_coordinates(along, axes.cells, finite)
+    top, extent = grid_coordinates(along, axes.cells, finite, batch)
     place = jnp.stack([_place_in_cell(*axis) for axis in zip(along, axes.cells.edges, axes.cells.turns, strict=True)])
     place = jnp.where(finite, place, 0)
     widths = jnp.stack([edge if turn is None else 1 / turn for edge, turn in zip(axes.cells.edges, axes.cells.turns, strict=True)])
@@ -156,7 +159,7 @@ class _Around(NamedTuple):
 
 def _cells_around(top: Array, place: Array, level: Array, extent: Array, images: Images | None) -> _Around:
     """Return the cells around queries [d, b] at their level [b]; many steps of top cells where images lie so close."""
-    reach = (0,) * len(top) if images is None else images.reach
+    reach = (0,) * len(place) if images is None else images.reach
     steps = [np.arange(-max(k, 1), max(k, 1) + 1, dtype=np.int32) for k in reach]
     which = np.array(list(product(*(range(len(axis)) for axis in steps)))).T  # [d, r]
     cells, within, code, there = [], [], jnp.zeros((level.size, which.shape[1]), jnp.int32), jnp.ones((), bool)
@@ -169,7 +172,8 @@ def _cells_around(top: Array, place: Array, level: Array, extent: Array, images:
         within.append((fine & ((1 << level[:, None]) - 1)).astype(jnp.uint32)[:, which[k]])
         code = code * (2 * reach[k] + 1) + (turn + reach[k])[:, which[k]]
         there = there & ~far[:, which[k]] & (jnp.abs(turn) <= max(reach[k], 1))[:, which[k]]
-    key = _morton(within) << (len(top) * (HALVINGS - level)).astype(jnp.uint32)[:, None]
+    cells += [jnp.broadcast_to(system[:, None], code.shape) for system in top[len(place) :]]
+    key = _morton(within) << (len(place) * (HALVINGS - level)).astype(jnp.uint32)[:, None]
     return _Around(cells, key, None if images is None else code, there)
 
 

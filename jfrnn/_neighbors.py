@@ -12,6 +12,7 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn._backends import Found, Inputs, Options, count_rows, list_rows, without_inactive
+from jfrnn._batch import Batch
 from jfrnn._box import LARGEST_TURN, Box, Images, fixed_box, make_lattice, nearest_shifts, shifted_pairs, unpacked_turns
 from jfrnn._exact import Cutoff, Cutoffs, Radii, is_pair_of, make_cutoff, make_cutoffs
 from jfrnn._inputs import checked_active, checked_box, checked_positions, checked_radii, checked_slack
@@ -51,6 +52,7 @@ class NeighborList:
         box: The periodic box, its floats rounded to the dtype of the positions; None where space is open.
         images: Of which image of its source each slot tells (`ImageCodes`), 1 B per slot; None where the nearest is the only one.
         radii: Cutoffs of the particles (`Radii`: sources [n], queries [m], the rule), or None where one serves all.
+        batch: To which system each particle belongs (`Batch`: sources [n], queries [m] or None), or None; updates keep it.
         cutoff: Interaction radius [length], rounded to the dtype of the positions; None where particles have their own. Static.
         skin: Extra shell [length]. Static.
         half: Each unordered pair stands once, in the row of its smaller index. Static.
@@ -71,6 +73,7 @@ class NeighborList:
     box: Box | None
     images: ImageCodes | None
     radii: Radii | None
+    batch: Batch | None
     cutoff: float | None = dataclasses.field(metadata={"static": True})
     skin: float = dataclasses.field(metadata={"static": True})
     half: bool = dataclasses.field(metadata={"static": True})
@@ -453,7 +456,7 @@ def _inputs_of(
     keep = Filter(drop_self=not (nbrs.own_queries or nbrs.include_self), later_only=nbrs.half)
     reach = radii if nbrs.cutoff is None else list_radius(nbrs.cutoff, nbrs.skin, dtype)
     cutoff, options = made_options(reach, keep, nbrs.box_kind, nbrs.backend, dtype, nbrs.closed, nbrs.skin)
-    return Inputs(sources, queries, active, box, cutoff), options
+    return Inputs(sources, queries, active, box, cutoff, nbrs.batch), options
 
 
 @jax.jit
@@ -490,7 +493,7 @@ def found_fields(inputs: Inputs, found: Found, skin: float) -> dict[str, Any]:
     radii = lax.stop_gradient(inputs.cutoff) if isinstance(inputs.cutoff, Radii) else None
     verlet = first_verlet(sources, inputs.queries, inputs.box, radii) if skin else None
     fields = {"idx": rows.idx, "count": rows.counts, "status": rows.status, "required": rows.required}
-    return fields | {"verlet": verlet, "box": lax.stop_gradient(inputs.box), "images": codes, "radii": radii}
+    return fields | {"verlet": verlet, "box": lax.stop_gradient(inputs.box), "images": codes, "radii": radii, "batch": inputs.batch}
 
 
 def _pair_cutoff(cutoff: Cutoff | Radii | None, closed: bool) -> Cutoff | Cutoffs:

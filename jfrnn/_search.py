@@ -13,6 +13,7 @@ from jfrnn._box import Box, fixed_box, images_of
 from jfrnn._inputs import (
     checked_active,
     checked_backend,
+    checked_batch,
     checked_box,
     checked_capacity,
     checked_cutoff,
@@ -34,6 +35,7 @@ def search(
     *,
     queries: Array | None = None,
     box: Box | None = None,
+    batch: Array | tuple[Array, Array] | None = None,
     radius_rule: str = "gather",
     half: bool = False,
     include_self: bool = False,
@@ -60,6 +62,9 @@ def search(
         box: Periodic box (`Box`): then (i, j) stands in the list once for each image of j within the cutoff, its displacement
             being x_j - x_i + S·(lattice vectors), S whole numbers; `NeighborList.shifts` tells them. Particles may be up to 511
             lattice vectors away from the box; along axes that are not periodic it has no meaning.
+        batch: The system to which each particle belongs, shape [n], integers that fit into int32, in any order; with queries a
+            tuple of [n] and [m]. Only particles of one system are neighbors. Many systems cost what their particles cost, also
+            where they lie on top of each other; all have the same box (for boxes of their own, `jax.vmap` over `search`).
         radius_rule: Whose cutoff is that of a pair, where particles have their own: "gather" that of i, the row; "scatter" that of
             j; "either" the larger, "both" the smaller, "mean" the exact mean of the two. Large ones cost nothing to those that are
             small: spread over a factor of 128, each particle looks at cells of its own size.
@@ -78,8 +83,8 @@ def search(
         backend: "warp" (cells, compiled kernels, on CPU and NVIDIA GPUs), "hashgrid" (Warp's own `wp.HashGrid`, there too), "jax"
             (cells, any device), "brute" (all n·m candidates), or "auto": what was measured to be fastest on the platform, "warp" on
             the CPU and on NVIDIA GPUs (where Warp is missing "jax", with a warning), elsewhere "jax". The platform is that of the
-            positions, where they are traced that of `jax.default_device`. "hashgrid" knows neither boxes nor a cutoff per
-            particle; "warp" knows the latter in open space on the CPU; "auto" then takes "jax".
+            positions, where they are traced that of `jax.default_device`. "hashgrid" knows neither boxes nor batches nor
+            a cutoff per particle.
 
     Returns:
         A `NeighborList`; `idx` has shape [m, capacity], unused slots hold n. Rows are in no promised order, but the same input
@@ -96,7 +101,9 @@ def search(
     Differentiable: the list is topology, without gradient; see `NeighborList.vectors`. Jit: yes, with capacity. vmap: yes, with
     capacity. Source: cell lists (Hockney & Eastwood 1981, ch. 8); strict cutoff (Peifle 2019, §2.2).
     """
-    problem = _checked_problem(positions, cutoff, queries, box, radius_rule, half, include_self, closed, backend, skin, active)
+    problem = _checked_problem(
+        positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, skin, active
+    )
     slack = checked_slack(slack)
     inputs, options = problem.inputs, problem.options
     if capacity is None:
@@ -123,6 +130,7 @@ def count(
     *,
     queries: Array | None = None,
     box: Box | None = None,
+    batch: Array | tuple[Array, Array] | None = None,
     radius_rule: str = "gather",
     half: bool = False,
     include_self: bool = False,
@@ -137,6 +145,7 @@ def count(
         cutoff: As in `search`.
         queries: As in `search`.
         box: As in `search`.
+        batch: As in `search`.
         radius_rule: As in `search`.
         half: As in `search`.
         include_self: As in `search`.
@@ -152,7 +161,9 @@ def count(
 
     Memory: as in `search`, without the list. Differentiable: no (integers). Jit: yes. vmap: yes.
     """
-    problem = _checked_problem(positions, cutoff, queries, box, radius_rule, half, include_self, closed, backend, 0.0, active)
+    problem = _checked_problem(
+        positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, 0.0, active
+    )
     return count_rows(problem.inputs, problem.options)
 
 
@@ -168,6 +179,7 @@ def _checked_problem(
     cutoff: Any,  # noqa: ANN401
     queries: Any,  # noqa: ANN401
     box: Any,  # noqa: ANN401
+    batch: Any,  # noqa: ANN401
     radius_rule: Any,  # noqa: ANN401
     half: bool,
     include_self: bool,
@@ -200,10 +212,13 @@ def _checked_problem(
         reach = largest_known(radii, skin)
     box = None if box is None else checked_box(box, sources)
     kind = None if box is None else images_of(box, reach, dtype, sources.shape[0])
-    engine = choose_engine(checked_backend(backend), sources, queries, periodic=box is not None, radii=radii is not None)
+    engine = choose_engine(
+        checked_backend(backend), sources, queries, periodic=box is not None, radii=radii is not None, batch=batch is not None
+    )
+    systems = None if batch is None else checked_batch(batch, sources, queries)
     list_cutoff, options = made_options(radii or reach, keep, kind, engine, dtype, closed, skin)
     box = None if box is None else fixed_box(box, dtype)
-    return _Problem(Inputs(sources, queries, active, box, list_cutoff), options, radius, skin)
+    return _Problem(Inputs(sources, queries, active, box, list_cutoff, systems), options, radius, skin)
 
 
 def _counted_capacity(inputs: Inputs, options: Options, slack: float) -> int:

@@ -7,17 +7,21 @@ depends on (JAX's persistent compilation cache sees no more than that name).
 import ctypes
 import functools
 import importlib
+import inspect
 import math
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn import _cuda
+from jfrnn._batch import Batch
 from jfrnn._box import Lattice, Wrapped
 from jfrnn._exact import Cutoff, Cutoffs, make_cutoff
 from jfrnn._levels import GROUPS, HALVINGS, Levels
@@ -41,6 +45,7 @@ class Variant(NamedTuple):
     closed: bool
     keep: Filter
     periodic: int = 0  # 1: nearest images, 2: images are told apart
+    batched: bool = False
 
 
 class Rows(NamedTuple):
@@ -108,24 +113,43 @@ def neighbors(
     cutoff: Cutoff,
     keep: Filter,
     capacity: int | None,
+    batch: Batch | None = None,
     torus: tuple[Lattice, Wrapped] | None = None,
 ) -> Rows:
     """Search among cells with the Warp kernels; capacity=None only counts."""
 
     def on(module: str, make: Callable[[Variant], Any]) -> Callable[..., Rows]:
-        def call(sources: Array, queries: Array | None, cutoff: Cutoff, torus: tuple[Lattice, Wrapped] | None) -> Rows:
-            return _call(module, make, sources, queries, cutoff, torus, keep, capacity)
+        def call(
+            sources: Array,
+            queries: Array | None,
+            cutoff: Cutoff,
+            batch: Batch | None,
+            torus: tuple[Lattice, Wrapped] | None,
+        ) -> Rows:
+            return _call(module, make, sources, queries, cutoff, batch, torus, keep, capacity)
 
         return call
 
     cpu, cuda = on("cells_cpu", _cpu_callable), on("cells_cuda", _cuda_callable)
-    return lax.platform_dependent(sources, queries, cutoff, torus, cpu=cpu, cuda=cuda)
+    return lax.platform_dependent(sources, queries, cutoff, batch, torus, cpu=cpu, cuda=cuda)
 
 
-def _with_turns(points: Array, packed: Array) -> Array:
-    """Return rows [n, d + 1] of positions, NaN where they are out of range, and their packed turns as the kernels read them."""
-    last = lax.bitcast_convert_type(packed, jnp.float32) if points.dtype == jnp.float32 else packed.astype(points.dtype)
-    return jnp.concatenate([jnp.where(packed[:, None] >= 0, points, jnp.nan), last[:, None]], axis=1)
+def _periodic_kind(torus: tuple[Lattice, Wrapped] | None) -> int:
+    """Return the PERIODIC of `jfrnn.kernels._native.snippet`."""
+    return 0 if torus is None else 1 if torus[0].images.nearest else 2
+
+
+def _rows(points: Array, turns: Array | None, systems: Array | None) -> Array:
+    """Return rows of positions as the kernels read them: NaN where they are out of range, then packed turns, then the system."""
+    if turns is not None:
+        points = jnp.where(turns[:, None] >= 0, points, jnp.nan)
+    columns = [_as_float(x, points.dtype)[:, None] for x in (turns, systems) if x is not None]
+    return jnp.concatenate([points, *columns], axis=1) if columns else points
+
+
+def _as_float(x: Array, dtype: np.dtype) -> Array:
+    """Let integers of 32 bits travel among floats: as their bits, or, in float64, as their values."""
+    return lax.bitcast_convert_type(x, jnp.float32) if dtype == jnp.float32 else x.astype(dtype)
 
 
 def _lattice_numbers(lattice: Lattice, wrapped: Wrapped) -> Array:
@@ -144,6 +168,7 @@ def _call(
     sources: Array,
     queries: Array | None,
     cutoff: Cutoff,
+    batch: Batch | None,
     torus: tuple[Lattice, Wrapped] | None,
     keep: Filter,
     capacity: int | None,
@@ -153,8 +178,8 @@ def _call(
     rows = sources if queries is None else queries
     (n, dim), m = sources.shape, rows.shape[0]
     double = sources.dtype == jnp.float64
-    periodic = 0 if torus is None else 1 if torus[0].images.nearest else 2
-    variant = Variant(dim, double, cutoff.scaled, lists, own, cutoff.closed, keep, periodic)
+    periodic = _periodic_kind(torus)
+    variant = Variant(dim, double, cutoff.scaled, lists, own, cutoff.closed, keep, periodic, batch is not None)
     if periodic == 1 and n >= _MOST_IN_BOX:
         raise ValueError(
             f"backend='warp' numbers at most {_MOST_IN_BOX - 1} positions in a periodic box, got {n}: pass backend='jax'."
@@ -163,13 +188,16 @@ def _call(
     dims: dict[str, Any] = {"count": m, "info": 2, "scratch": max(words, 1)}
     if lists:
         dims["idx"] = (m, capacity)
-    numbers = jnp.reshape(jnp.asarray(cutoff.radius), 1)
+    numbers = [jnp.reshape(jnp.asarray(cutoff.radius), 1)]
+    turns = query_turns = None
     if torus is not None:
-        lattice, wrapped = torus
-        sources = _with_turns(sources, wrapped.turns)
-        rows = sources if queries is None else _with_turns(queries, wrapped.query_turns)
-        numbers = jnp.concatenate([numbers, _lattice_numbers(lattice, wrapped)])
-    *idx, count, info, _ = make(variant)(sources, rows, numbers, output_dims=dims)
+        turns, query_turns = torus[1].turns, torus[1].query_turns
+        numbers.append(_lattice_numbers(*torus))
+    if batch is not None:
+        numbers.append(_as_float(jnp.max(batch.of_all)[None], sources.dtype))
+    sources = _rows(sources, turns, None if batch is None else batch.sources)
+    rows = sources if queries is None else _rows(queries, query_turns, None if batch is None else batch.queries)
+    *idx, count, info, _ = make(variant)(sources, rows, jnp.concatenate(numbers), output_dims=dims)
     return Rows(idx[0] if lists else None, count, info[0], info[1])
 
 
@@ -202,64 +230,93 @@ def _cuda_callable(variant: Variant) -> Any:  # noqa: ANN401
     wp = load_warp()
     if wp.is_cuda_available():
         _cuda_kernels(variant).load(wp.get_cuda_device())
-    # Warp records the launches of a call once and replays them: one launch from the host, whatever XLA makes of the call
-    return _register("cells_cuda", variant, _run_cells_on_cuda, wp.JaxCallableGraphMode.WARP)
+    return _cuda_target(_name("cells_cuda", variant), _types(variant), 3 + variant.lists, functools.partial(_commands, variant))
+
+
+def _cuda_target(
+    name: str, types: dict[str, Any], outputs: int, commands: Callable[..., list[_cuda.Command]]
+) -> Callable[..., Sequence[Array]]:
+    """Make a function that XLA calls on CUDA, as `_callable` makes one for the CPU: its outputs are int32."""
+    _cuda.register(name, load_warp(), [kind.dtype for kind in types.values()], commands)
+    results = list(types)[-outputs:]
+
+    def call(*inputs: Array, output_dims: dict[str, Any]) -> Sequence[Array]:
+        shapes = [jax.ShapeDtypeStruct(tuple(np.atleast_1d(output_dims[key]).tolist()), jnp.int32) for key in results]
+        return jax.ffi.ffi_call(name, shapes, vmap_method="sequential")(*inputs)
+
+    return call
 
 
 def _register(
     name: str,
     variant: Variant,
     run: Callable[..., None],
-    graphs: Any = None,  # noqa: ANN401
     radius: float | None = None,
 ) -> Any:  # noqa: ANN401
     """Make a function that XLA calls: positions, queries and cutoff in; [rows,] counts, info and scratch out.
 
-    `graphs` is Warp's way with CUDA graphs, by default none. One that knows its radius bears it in its name.
+    One that knows its radius bears it in its name.
     """
+    full_name, types = _name(name, variant), _types(variant)
+    if radius is not None:
+        full_name += f"_{radius.hex().replace('-', 'minus')}"  # Warp drops what an identifier cannot hold
+    return _callable(full_name, lambda *arrays: run(variant, _named(types, arrays)), types, 3 + variant.lists)
+
+
+def _types(variant: Variant) -> dict[str, Any]:
+    """Return Warp's types of what a call gets."""
     wp = load_warp()
-    graphs = wp.JaxCallableGraphMode.NONE if graphs is None else graphs
     scalar = wp.float64 if variant.double else wp.float32
     points, ints = wp.array2d(dtype=scalar), wp.array(dtype=wp.int32)
-    types = {"positions": points, "queries": points, "cutoff": wp.array(dtype=scalar), "idx": wp.array2d(dtype=wp.int32)}
-    types |= {"count": ints, "info": ints, "scratch": ints}
+    types = {"positions": points, "queries": points, "cutoff": wp.array(dtype=scalar)}
+    types |= {"idx": wp.array2d(dtype=wp.int32)} if variant.lists else {}
+    return types | {"count": ints, "info": ints, "scratch": ints}
 
-    def list_rows(positions: Any, queries: Any, cutoff: Any, idx: Any, count: Any, info: Any, scratch: Any) -> None:  # noqa: ANN401
-        run(variant, _Arrays(positions, queries, cutoff, idx, count, info, scratch))
 
-    def count_rows(positions: Any, queries: Any, cutoff: Any, count: Any, info: Any, scratch: Any) -> None:  # noqa: ANN401
-        run(variant, _Arrays(positions, queries, cutoff, None, count, info, scratch))
+def _named(types: dict[str, Any], arrays: Sequence[Any]) -> _Arrays:
+    return _Arrays(**{"idx": None, **dict(zip(types, arrays, strict=True))})
 
-    func = list_rows if variant.lists else count_rows
-    func.__annotations__ = {name: types[name] for name in types if variant.lists or name != "idx"}
+
+def _name(name: str, variant: Variant) -> str:
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
-    flags |= {"nearest": variant.periodic == 1, "images": variant.periodic == 2}
+    flags |= {"nearest": variant.periodic == 1, "images": variant.periodic == 2, "batched": variant.batched}
     flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
-    func.__name__ = "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
-    if radius is not None:
-        func.__name__ += f"_{radius.hex().replace('-', 'minus')}"  # Warp drops what an identifier cannot hold
-    func.__qualname__ = func.__name__
-    return wp.jax_callable(func, num_outputs=4 if variant.lists else 3, graph_mode=graphs, vmap_method="sequential")
+    return "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
+
+
+def _callable(name: str, run: Callable[..., None], types: dict[str, Any], outputs: int) -> Any:  # noqa: ANN401
+    """Make a function that XLA calls with arrays of these types, the last of which are its outputs."""
+
+    def func(*arrays: Any) -> None:  # noqa: ANN401
+        run(*arrays)
+
+    kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+    parameters = [inspect.Parameter(key, kind, annotation=types[key]) for key in types]
+    func.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
+    func.__annotations__ = types
+    func.__name__ = func.__qualname__ = name
+    wp = load_warp()
+    return wp.jax_callable(func, num_outputs=outputs, graph_mode=wp.JaxCallableGraphMode.NONE, vmap_method="sequential")
 
 
 def _cuda_kernels(variant: Variant) -> Any:  # noqa: ANN401
     make = kernels_of("cells_cuda").cell_kernels
     keep = variant.keep
-    return make(variant.dim, variant.double, variant.scaled, variant.lists, keep.later_only, periodic=variant.periodic)
+    kind = {"periodic": variant.periodic, "batched": variant.batched}
+    return make(variant.dim, variant.double, variant.scaled, variant.lists, keep.later_only, **kind)
 
 
-def _run_cells_on_cuda(variant: Variant, arrays: _Arrays) -> None:
-    wp = load_warp()
-    arrays, sizes, capacity = _launchable(variant, arrays)
+def _commands(variant: Variant, *buffers: Any) -> list[_cuda.Command]:  # noqa: ANN401
+    arrays, sizes, capacity = _launchable(variant, _named(_types(variant), buffers))
     arguments = [*arrays, *sizes, capacity, int(variant.closed), int(variant.keep.drop_self)]
-    for launch in _cuda_kernels(variant).launches(*sizes[:2], variant.own):
-        inputs = [*arguments, int(launch.of_queries)]
-        wp.launch(launch.kernel, dim=launch.threads, inputs=inputs, device=arrays.count.device, block_dim=launch.block)
+    launches = _cuda_kernels(variant).launches(*sizes[:2], variant.own)
+    return [_cuda.Command(x.kernel, [*arguments, int(x.of_queries)], x.threads, x.block) for x in launches]
 
 
 def _run_cells_on_cpu(variant: Variant, arrays: _Arrays) -> None:
     wp = load_warp()
-    kernels = kernels_of("cells_cpu").cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, variant.periodic)
+    kind = {"periodic": variant.periodic, "batched": variant.batched}
+    kernels = kernels_of("cells_cpu").cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, **kind)
     arrays, sizes, capacity = _launchable(variant, arrays)
     positions, queries, cutoff, idx, _, info, scratch = arrays
     wp.launch(kernels.build, dim=1, inputs=[positions, queries, cutoff, info, scratch, *sizes], device="cpu")
@@ -327,34 +384,76 @@ class _LevelVariant(NamedTuple):
     closed: bool
     keep: Filter
     rule: str
+    periodic: int
+    batched: bool
+    cuda: bool
 
 
 def level_neighbors(
-    sources: Array, queries: Array | None, cutoffs: Cutoffs, levels: Levels, keep: Filter, capacity: int | None
+    sources: Array,
+    queries: Array | None,
+    cutoffs: Cutoffs,
+    levels: Levels,
+    keep: Filter,
+    capacity: int | None,
+    batch: Batch | None = None,
+    torus: tuple[Lattice, Wrapped] | None = None,
 ) -> Rows:
-    """Search with a cutoff per particle on the CPU, among sources that XLA has sorted; capacity=None only counts."""
-    rows, lists = sources if queries is None else queries, capacity is not None
-    dim, m, padding = sources.shape[1], rows.shape[0], kernels_of("levels").PADDING
-    variant = _LevelVariant(dim, sources.dtype == jnp.float64, lists, queries is None, cutoffs.closed, keep, cutoffs.rule)
+    """Search with a cutoff per particle, among sources that XLA has sorted; capacity=None only counts."""
+
+    def on(cuda: bool) -> Callable[..., Rows]:
+        def call(*inputs: Any) -> Rows:  # noqa: ANN401
+            return _call_levels(cuda, *inputs, keep=keep, capacity=capacity)
+
+        return call
+
+    return lax.platform_dependent(sources, queries, cutoffs, levels, batch, torus, cpu=on(False), cuda=on(True))
+
+
+def _call_levels(
+    cuda: bool,
+    sources: Array,
+    queries: Array | None,
+    cutoffs: Cutoffs,
+    levels: Levels,
+    batch: Batch | None,
+    torus: tuple[Lattice, Wrapped] | None,
+    *,
+    keep: Filter,
+    capacity: int | None,
+) -> Rows:
+    given, lists = sources if queries is None else queries, capacity is not None
+    dim, m, padding = sources.shape[1], given.shape[0], kernels_of("levels").PADDING
+    double, periodic = sources.dtype == jnp.float64, _periodic_kind(torus)
+    kind = (queries is None, cutoffs.closed, keep, cutoffs.rule, periodic, batch is not None, cuda)
+    variant = _LevelVariant(dim, double, lists, *kind)
 
     def ordered(x: Array | None, order: Array, more: int) -> Array:
         return jnp.zeros(1, sources.dtype) if x is None else jnp.pad(x[order], (0, more)).reshape(-1)
 
+    raw = [jnp.zeros((1, 1), sources.dtype)] * 2
+    points, rows = sources, given
+    if torus is not None:
+        points, rows = torus[1].sources, torus[1].queries
+        raw = [_rows(sources, torus[1].turns, None), _rows(given, torus[1].query_turns, None)]
     line = (0, 3 - dim)
     largest = jnp.zeros(GROUPS, sources.dtype) if levels.largest is None else levels.largest
-    numbers = [jnp.pad(x, line) for x in (levels.widths, levels.axes.scale, levels.axes.margin)]
+    numbers = [] if torus is None else [_lattice_numbers(*torus)]
+    numbers += [largest, *(jnp.pad(x, line) for x in (levels.widths, levels.axes.scale, levels.axes.margin))]
     passes = jnp.int32(1) if levels.passes is None else levels.passes
-    header = [jnp.pad(levels.grid.extent, line), levels.grid.dense.astype(jnp.int32)[None], passes[None]]
+    extent = levels.grid.extent
+    header = [jnp.pad(extent, (0, 4 - extent.size)), levels.grid.dense.astype(jnp.int32)[None], passes[None]]
     dims: dict[str, Any] = {"count": m, "info": 2} | ({"idx": (m, capacity)} if lists else {})
     *idx, count, info = _level_callable(variant)(
-        jnp.pad(sources[levels.order].T, ((0, 0), (0, padding))).reshape(-1),
+        *raw,
+        jnp.pad(points[levels.order].T, ((0, 0), (0, padding))).reshape(-1),
         ordered(cutoffs.sources, levels.order, padding),
         levels.order,
         lax.bitcast_convert_type(levels.keys, jnp.int32),
         levels.grid.coords.reshape(-1),
         levels.grid.table,
         jnp.concatenate(header),
-        jnp.concatenate([cutoffs.largest[None], largest, *numbers]),
+        jnp.concatenate([cutoffs.largest[None], *numbers]),
         rows[levels.query_order].T.reshape(-1),
         ordered(cutoffs.queries, levels.query_order, 0),
         levels.query_order,
@@ -369,45 +468,52 @@ def level_neighbors(
 @functools.cache
 def _level_callable(variant: _LevelVariant) -> Any:  # noqa: ANN401
     wp = load_warp()
-    reals, ints = wp.array(dtype=wp.float64 if variant.double else wp.float32), wp.array(dtype=wp.int32)
-    types = {"axes": reals, "radii": reals, "ids": ints, "keys": ints, "top": ints, "table": ints, "header": ints}
+    scalar = wp.float64 if variant.double else wp.float32
+    points, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
+    types = {"positions": points, "queries": points}
+    types |= {"axes": reals, "radii": reals, "ids": ints, "keys": ints, "top": ints, "table": ints, "header": ints}
     types |= {"cutoff": reals, "query_axes": reals, "query_radii": reals, "query_ids": ints, "query_top": ints, "places": ints}
     types |= {"idx": wp.array2d(dtype=wp.int32)} if variant.lists else {}
     types |= {"count": ints, "info": ints}
-
-    def list_rows(
-        axes: Any, radii: Any, ids: Any, keys: Any, top: Any, table: Any, header: Any, cutoff: Any, query_axes: Any,  # noqa: ANN401
-        query_radii: Any, query_ids: Any, query_top: Any, places: Any, idx: Any, count: Any, info: Any,  # noqa: ANN401
-    ) -> None:  # fmt: skip
-        inputs = [axes, radii, ids, keys, top, table, header, cutoff, query_axes, query_radii, query_ids, query_top, places]
-        _run_levels_on_cpu(variant, inputs, idx, count, info)
-
-    def count_rows(
-        axes: Any, radii: Any, ids: Any, keys: Any, top: Any, table: Any, header: Any, cutoff: Any, query_axes: Any,  # noqa: ANN401
-        query_radii: Any, query_ids: Any, query_top: Any, places: Any, count: Any, info: Any,  # noqa: ANN401
-    ) -> None:  # fmt: skip
-        inputs = [axes, radii, ids, keys, top, table, header, cutoff, query_axes, query_radii, query_ids, query_top, places]
-        _run_levels_on_cpu(variant, inputs, None, count, info)
-
-    func = list_rows if variant.lists else count_rows
-    func.__annotations__ = types
     flags = {"f64": variant.double, "f32": not variant.double, "list": variant.lists, "own": variant.own}
     flags |= {"closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only, variant.rule: True}
-    func.__name__ = "_".join(["jfrnn", "levels", f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
-    func.__qualname__ = func.__name__
-    graphs = wp.JaxCallableGraphMode.NONE
-    return wp.jax_callable(func, num_outputs=3 if variant.lists else 2, graph_mode=graphs, vmap_method="sequential")
+    flags |= {"nearest": variant.periodic == 1, "images": variant.periodic == 2, "batched": variant.batched}
+    name = f"jfrnn_levels_{'cuda' if variant.cuda else 'cpu'}_{variant.dim}d"
+    name = "_".join([name, *(flag for flag, on in flags.items() if on)])
+    if not variant.cuda:
+        return _callable(name, functools.partial(_run_levels_on_cpu, variant), types, 2 + variant.lists)
+    if wp.is_cuda_available():
+        for kernel, block in ((_level_kernel(variant), kernels_of("levels").BLOCK), (kernels_of("levels").clear, 2)):
+            wp.load_module(kernel.module, device=wp.get_cuda_device(), block_dim=block)
+    return _cuda_target(name, types, 2 + variant.lists, functools.partial(_level_commands, variant))
 
 
-def _run_levels_on_cpu(variant: _LevelVariant, inputs: list[Any], idx: Any, count: Any, info: Any) -> None:  # noqa: ANN401
-    wp = load_warp()
-    kernel = kernels_of("levels").query_kernel(variant.dim, variant.double, variant.lists, variant.rule, GROUPS, HALVINGS)
-    info.zero_()
-    n, m, capacity = len(inputs[2]), len(count), 0 if idx is None else idx.shape[1]
-    rows = wp.array(ptr=count.ptr, shape=(m, 1), dtype=count.dtype, device=count.device) if idx is None else idx
+def _level_kernel(variant: _LevelVariant) -> Any:  # noqa: ANN401
+    kind = (variant.dim, variant.double, variant.lists, variant.rule, GROUPS, HALVINGS, variant.periodic, variant.batched)
+    return kernels_of("levels").query_kernel(*kind)
+
+
+def _level_arguments(variant: _LevelVariant, arrays: Sequence[Any]) -> list[Any]:
+    """Return what the kernel takes; without rows, something of their kind that nobody writes to stands in their place."""
+    *inputs, count, info = arrays
+    n, m, capacity = len(inputs[4]), len(count), inputs[-1].shape[1] if variant.lists else 0
+    if not variant.lists:
+        inputs.append(load_warp().array(ptr=count.ptr, shape=(m, 1), dtype=count.dtype, device=count.device))
     flags = [int(variant.own), int(variant.closed), int(variant.keep.drop_self), int(variant.keep.later_only)]
-    arguments = [*inputs, rows, count, info, n, m, capacity, *flags]
-    _on_every_core(lambda: wp.launch(kernel, dim=1, inputs=arguments, device="cpu"), -(-m // _PLACES_PER_THREAD))
+    return [*inputs, count, info, n, m, capacity, *flags]
+
+
+def _run_levels_on_cpu(variant: _LevelVariant, *arrays: Any) -> None:  # noqa: ANN401
+    wp, kernel, arguments = load_warp(), _level_kernel(variant), _level_arguments(variant, arrays)
+    arrays[-1].zero_()
+    places = len(arrays[-2])
+    _on_every_core(lambda: wp.launch(kernel, dim=1, inputs=arguments, device="cpu"), -(-places // _PLACES_PER_THREAD))
+
+
+def _level_commands(variant: _LevelVariant, *arrays: Any) -> list[_cuda.Command]:  # noqa: ANN401
+    levels, (*_, count, info) = kernels_of("levels"), arrays
+    query = _cuda.Command(_level_kernel(variant), _level_arguments(variant, arrays), len(count), levels.BLOCK)
+    return [_cuda.Command(levels.clear, [info], 2, 2), query]
 
 
 # --- hash grid --------------------------------------------------------------------------------------------------------
@@ -426,13 +532,13 @@ def hashgrid_neighbors(
     def make(variant: Variant) -> Any:  # noqa: ANN401
         return _hashgrid_callable(variant, radius)
 
-    return _call("hashgrid", make, sources, queries, cutoff, None, keep, capacity)
+    return _call("hashgrid", make, sources, queries, cutoff, None, None, keep, capacity)
 
 
 @functools.cache
 def _hashgrid_callable(variant: Variant, radius: float) -> Any:  # noqa: ANN401
     bounds = make_cutoff(radius, np.dtype(np.float64 if variant.double else np.float32), variant.closed)
-    return _register("hashgrid", variant, functools.partial(_run_hashgrid, bounds), radius=radius)
+    return _register("hashgrid", variant, functools.partial(_run_hashgrid, bounds), radius)
 
 
 def _run_hashgrid(bounds: Cutoff, variant: Variant, arrays: _Arrays) -> None:

@@ -16,6 +16,7 @@ SMALLEST_TABLE = 4096
 
 # Where space is periodic, the radius in the array `cutoff` is followed by the lattice: its vectors and the transform,
 # row by row (3 x 3 each); origin, half the width of the stencil in units of the transform, images within reach (3 each); slack.
+# Of a batch, the highest number of a system comes last.
 
 
 def snippet(scalar: str, dim: int, *pieces: str, **constants: int) -> str:
@@ -23,13 +24,17 @@ def snippet(scalar: str, dim: int, *pieces: str, **constants: int) -> str:
 
     The function around it must have the argument `cutoff`, an array of one scalar, and what the pieces need. PERIODIC is 0 in an
     open space, 1 where the nearest image is the only one that can be a neighbor, 2 where images are told apart: `cutoff` then goes
-    on with the numbers of the lattice, and a row of positions ends with its packed turns (see `jfrnn._box`). SUM is 1 where the
-    cutoff of a pair is the sum of two numbers.
+    on with the numbers of the lattice, and a row of positions goes on with its packed turns (see `jfrnn._box`). BATCHED is 1 where
+    it ends with the number of its system (see `jfrnn._batch`). Such integers are the bits of a float, or the value of a double. SUM
+    is 1 where the cutoff of a pair is the sum of two numbers.
     """
     lines = [f"using real = {scalar};", f"using whole = {'long long' if scalar == 'double' else 'int'};"]
     lines += [f"constexpr int DIM = {dim};", f"constexpr bool DOUBLE = {int(scalar == 'double')};"]
-    lines += [f"constexpr int {name} = {int(value)};" for name, value in {"ORDER": 0, "PERIODIC": 0, "SUM": 0, **constants}.items()]
+    lines += [f"constexpr int {name} = {int(value)};" for name, value in {**_DEFAULTS, **constants}.items()]
     return "\n".join(["", "{", _NO_CONTRACTION, *lines, _PORTABLE, *pieces, "}", ""])
+
+
+_DEFAULTS = {"ORDER": 0, "PERIODIC": 0, "BATCHED": 0, "SUM": 0}
 
 
 def table_cells(sources: int) -> int:
@@ -54,7 +59,7 @@ const real radius = cutoff.data[0];
 #define JFRNN_MEMBER
 #define JFRNN_CALL static __attribute__((noinline))
 #endif
-constexpr int ROW = DIM + (PERIODIC ? 1 : 0);  // numbers per particle
+constexpr int ROW = DIM + (PERIODIC ? 1 : 0) + BATCHED;  // numbers per particle
 struct Bits {  // of floats
     enum { MANTISSA = DOUBLE ? 52 : 23, EXPONENTS = DOUBLE ? 0x7ff : 0xff, BIAS = DOUBLE ? 1023 : 127 };
     JFRNN_FUNCTION unsigned long long of(real x) {
@@ -88,6 +93,13 @@ auto finite_point = [](const real* p) {
         finite = finite && Bits::finite(p[k]);
     return finite;
 };
+auto unsigned_of = [](real x) -> unsigned int {
+    unsigned int bits;
+    if constexpr (DOUBLE) bits = (unsigned int)x;
+    else memcpy(&bits, &x, 4);
+    return bits;
+};
+auto system_of = [&](const real* row) -> unsigned int { return BATCHED ? unsigned_of(row[ROW - 1]) : 0u; };
 struct Lattice {
     const real* numbers;
     bool skewed;  // else its vectors lie along the axes, and what others would add is 0
@@ -361,7 +373,8 @@ struct Exact {
     }
 
     // the same with a lattice: the difference may fill all limbs
-    JFRNN_CALL int integer_sign_of_image(const real* a, const real* b, real radius, const int* shift, Lattice lattice) {
+    JFRNN_CALL int integer_sign_of_image(
+        const real* a, const real* b, real radius, real more, const int* shift, Lattice lattice) {
         constexpr int LIMBS = DOUBLE ? 4 : 2, ALL = DOUBLE ? 92 : 15;
         long long total[2 * ALL], part[ALL];
         for (int t = 0; t < 2 * ALL; ++t)
@@ -394,10 +407,20 @@ struct Exact {
                 for (int j = lowest; j <= highest; ++j)
                     total[i + j] += part[i] * part[j];
         }
-        const int first = first_limb(radius);
-        for (int i = first; i < first + LIMBS; ++i)
-            for (int j = first; j < first + LIMBS; ++j)
-                total[i + j] -= limb(radius, i) * limb(radius, j);
+        if constexpr (SUM) {
+            for (int i = 0; i < ALL; ++i)
+                part[i] = 0;
+            put(radius, 1);
+            put(more, 1);
+            for (int i = 0; i < ALL; ++i)
+                for (int j = 0; j < ALL && part[i]; ++j)
+                    total[i + j] -= part[i] * part[j];
+        } else {
+            const int first = first_limb(radius);
+            for (int i = first; i < first + LIMBS; ++i)
+                for (int j = first; j < first + LIMBS; ++j)
+                    total[i + j] -= limb(radius, i) * limb(radius, j);
+        }
         long long carry = 0, seen = 0;
         for (int t = 0; t < 2 * ALL; ++t) {
             const long long sum = total[t] + carry;
@@ -408,10 +431,11 @@ struct Exact {
     }
 
     // does b + S·A lie within the cutoff of a? S are the whole numbers that the turns of both and the image add up to
-    JFRNN_CALL bool image_pair(const real* a, const real* b, real radius, bool closed, const int* shift, Lattice lattice) {
+    JFRNN_CALL bool image_pair(
+        const real* a, const real* b, real radius, real more, bool closed, const int* shift, Lattice lattice) {
         if constexpr (!DOUBLE) {
             double square = 0, doubt = 0;
-            const double r2 = double(radius) * double(radius);
+            const double r = SUM ? double(radius) + double(more) : double(radius), r2 = r * r;
             for (int k = 0; k < DIM; ++k) {
                 double d = double(b[k]) - double(a[k]), size = size_of(double(a[k])) + size_of(double(b[k]));
                 for (int l = 0; l < DIM; ++l) {
@@ -429,9 +453,9 @@ struct Exact {
             if (square - doubt > r2)
                 return false;
         }
-        int sign = sum_sign(a, b, radius, 0, shift, lattice);
+        int sign = sum_sign(a, b, radius, more, shift, lattice);
         if (sign == 2)
-            sign = integer_sign_of_image(a, b, radius, shift, lattice);
+            sign = integer_sign_of_image(a, b, radius, more, shift, lattice);
         return sign < 0 || (sign == 0 && closed);
     }
 
@@ -460,15 +484,19 @@ struct Exact {
         return sign < 0 || (sign == 0 && closed);
     }
 };
-// the image of a source that a query meets: rows of positions as they were given, and the code of the image of wrapped points
-auto exact_image = [&](const real* query, const real* source, int image) {
+// the image of a source that a query meets: rows of positions as they were given, the code of the image of wrapped points, and the
+// cutoff, where it is a sum of two numbers
+auto exact_image_within = [&](const real* query, const real* source, int image, real radius, real more) {
     int shift[3] = {0, 0, 0};
     for (int axis = DIM - 1; axis >= 0; --axis) {
         const int k = lattice.images(axis), codes = 2 * k + 1;
         shift[axis] = image % codes - k + Lattice::turn(query[DIM], axis) - Lattice::turn(source[DIM], axis);
         image /= codes;
     }
-    return Exact::image_pair(query, source, radius, closed, shift, lattice);
+    return Exact::image_pair(query, source, radius, more, closed, shift, lattice);
+};
+auto exact_image = [&](const real* query, const real* source, int image) {
+    return exact_image_within(query, source, image, radius, 0);
 };
 auto exact_pair = [&](const real* a, const real* b) {
     return Exact::pair(a[0], a[1], DIM == 3 ? a[DIM - 1] : 0, b[0], b[1], DIM == 3 ? b[DIM - 1] : 0, radius, 0, closed);
@@ -525,8 +553,9 @@ auto cell_number = [&](real cell) -> whole {
     return cell < 0 ? -number : number;
 };
 
-// The grid: `dense` boxes number their cells row-major, x fastest. In a larger box a row of cells (all but x) starts at a hashed
-// place of a ring of `cells` entries; x runs on from there. Rows that collide share entries: their particles are mere candidates.
+// The grid: `dense` boxes number their cells row-major, x fastest, systems slowest: systems share no cell. In a larger box a row of
+// cells (all but x) starts at a hashed place of a ring of `cells` entries; x runs on from there. Rows that collide share entries:
+// their particles are mere candidates, and may be of another system.
 struct Grid {
     real low[3];  // lowest cell that holds a source
     int extent[3];  // cells per axis (dense)
@@ -534,8 +563,10 @@ struct Grid {
     int dense;
     int finite;  // sources with finite coordinates
 };
-auto row_hash = [](long long y, long long z, int cells) -> int {
+auto row_hash = [](long long y, long long z, unsigned int system, int cells) -> int {
     unsigned long long h = (unsigned long long)y * 0x9e3779b97f4a7c15ull ^ (unsigned long long)z * 0xc2b2ae3d27d4eb4full;
+    if constexpr (BATCHED)
+        h ^= (system + 1) * 0x9fb21c651e98df25ull;
     h ^= h >> 32;
     h *= 0xd6e8feb86659fd93ull;
     h ^= h >> 32;
@@ -560,8 +591,10 @@ auto period_of = [&](int axis, whole cell) -> int {
     const whole cells = (whole)cell_scale(axis);
     return (int)(cell >= 0 ? cell / cells : -1 - (-1 - cell) / cells);
 };
-auto row_start = [&](const Grid& grid, whole y, whole z) -> int {
-    return grid.dense ? (int)((z * grid.extent[1] + y) * grid.extent[0]) : row_hash(y, z, grid.cells);
+auto row_start = [&](const Grid& grid, whole y, whole z, unsigned int system) -> int {
+    if constexpr (BATCHED)
+        z += grid.dense ? (whole)system * (DIM == 3 ? grid.extent[2] : 1) : 0;
+    return grid.dense ? (int)((z * grid.extent[1] + y) * grid.extent[0]) : row_hash(y, z, system, grid.cells);
 };
 auto ring = [](whole x, int cells) -> int {
     const whole r = x % cells;
@@ -598,7 +631,8 @@ auto curve = [](const Grid& grid, unsigned int x, unsigned int y, unsigned int z
         key |= (x >> b & 1) << 3 * b | (y >> b & 1) << (3 * b + 1) | (z >> b & 1) << (3 * b + 2);
     return (int)key;
 };
-auto cell_key = [&](const Grid& grid, const real* p) -> int {  // a finite point; one outside a dense box is sorted into its border
+// of a finite point; one outside a dense box is sorted into its border
+auto cell_key = [&](const Grid& grid, const real* p, unsigned int system) -> int {
     whole cell[3] = {0, 0, 0};
     for (int k = 0; k < DIM; ++k) {
         const whole c = axis_cell(grid, k, coordinate(k, p)), end = grid.extent[k] - 1;
@@ -606,12 +640,12 @@ auto cell_key = [&](const Grid& grid, const real* p) -> int {  // a finite point
     }
     if (ORDER != 0)
         return curve(grid, (unsigned int)cell[0], (unsigned int)cell[1], (unsigned int)cell[2]);
-    const int row = row_start(grid, cell[1], cell[2]);
+    const int row = row_start(grid, cell[1], cell[2], system);
     return grid.dense ? row + (int)cell[0] : ring(row + ring(cell[0], grid.cells), grid.cells);
 };
 // number of cells of the box [low, high] of coordinates, and whether the table holds them
 auto lay_out = [&](Grid& grid, const real* low, const real* high, int table) {
-    double cells = 1;
+    double cells = BATCHED ? double(unsigned_of(cutoff.data[PERIODIC ? 29 : 1])) + 1 : 1;
     for (int k = 0; k < DIM; ++k) {
         grid.low[k] = is_periodic(k) ? real(0) : cell_of(k, low[k]);
         const double extent = is_periodic(k) ? double(inverse_edge[k]) : double(cell_of(k, high[k])) - double(grid.low[k]) + 1;

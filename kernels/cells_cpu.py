@@ -82,7 +82,7 @@ auto sort = [&](const real* points, int count, int* first, int* order, bool with
         point_of(points + (long long)ROW * i, p);
         int cell = -1;
         if (finite_point(p))
-            cell = cell_key(grid, p);
+            cell = cell_key(grid, p, system_of(points + (long long)ROW * i));
         else
             ++outside;
         key[i] = cell;
@@ -321,9 +321,11 @@ auto position_of = [&](int place, real* q) {
     else
         point_of(queries.data + (long long)ROW * query_ids[place], q);
 };
-auto cells_of = [&](const real* q, whole* c) {
+auto system_at = [&](int place) { return BATCHED ? system_of(queries.data + (long long)ROW * query_ids[place]) : 0u; };
+auto cells_of = [&](int place, const real* q, whole* c) {
     for (int k = 0; k < DIM; ++k)
         c[k] = axis_cell(grid, k, coordinate(k, q));
+    c[DIM] = (whole)system_at(place);
 };
 
 // all queries of one cell: places [begin, end), whose coordinates are between low and high
@@ -342,6 +344,7 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
             last[k] = last[k] >= grid.extent[k] ? grid.extent[k] - 1 : last[k];
         }
     }
+    const unsigned int system = system_at(begin);
     int filled = 0, own_from = 0, own_to = 0, own_at = 0;
     bool fresh = true;
     auto flush = [&](bool finished) {
@@ -379,6 +382,9 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
                     candidate[k][filled + s] = PERIODIC ? axis[k][from + s] + moved[k] : axis[k][from + s];
             for (int s = 0; s < size; ++s)
                 candidate_ids[filled + s] = PERIODIC == 2 ? ids[from + s] + n * image : ids[from + s];
+            for (int s = 0; BATCHED && !grid.dense && s < size; ++s)
+                if (system_of(positions.data + (long long)ROW * ids[from + s]) != system)
+                    candidate[0][filled + s] = __builtin_nanf("");
             for (int s = 0; PERIODIC && s < size; ++s)
                 candidate_images[filled + s] = image;
             for (int s = 0; PERIODIC == 2 && s < size; ++s)
@@ -399,11 +405,11 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
         for (whole z = first[2]; z <= last[2] && length > 0; ++z)
             for (whole y = first[1]; y <= last[1]; ++y) {
                 if (grid.dense) {
-                    const int row = row_start(grid, y, z);
+                    const int row = row_start(grid, y, z, system);
                     copy(start[row + first[0]], start[row + last[0] + 1]);
                     continue;
                 }
-                const int begins = ring(row_start(grid, y, z) + ring(first[0], grid.cells), grid.cells);
+                const int begins = ring(row_start(grid, y, z, system) + ring(first[0], grid.cells), grid.cells);
                 int front = 0, back = 0;  // entries shared with rows that were copied before
                 for (int r = 0; r < rows; ++r) {
                     const int behind = ring(begins - seen[r], grid.cells), ahead = grid.cells - behind;
@@ -464,20 +470,20 @@ for (;;) {
         break;
     int place = chunk * CHUNK;
     const int chunk_end = places - place < CHUNK ? places : place + CHUNK;
-    whole cell[3], other[3];
+    whole cell[4], other[4];
     real q[3];
     auto same_cell = [&](const whole* a, const whole* b) {
         bool same = true;
-        for (int k = 0; k < DIM; ++k)
+        for (int k = 0; k < DIM + BATCHED; ++k)
             same = same && a[k] == b[k];
         return same;
     };
     if (place > 0 && place < finite_places) {  // a cell belongs to the chunk that holds its first place
         position_of(place - 1, q);
-        cells_of(q, cell);
+        cells_of(place - 1, q, cell);
         for (; place < finite_places; ++place) {
             position_of(place, q);
-            cells_of(q, other);
+            cells_of(place, q, other);
             if (!same_cell(cell, other))
                 break;
         }
@@ -492,13 +498,13 @@ for (;;) {
         }
         real low[3], high[3];
         position_of(place, q);
-        cells_of(q, cell);
+        cells_of(place, q, cell);
         for (int k = 0; k < DIM; ++k)
             low[k] = high[k] = coordinate(k, q);
         int end = place + 1;
         for (; end < finite_places; ++end) {
             position_of(end, q);
-            cells_of(q, other);
+            cells_of(end, q, other);
             if (!same_cell(cell, other))
                 break;
             real at[3];
@@ -526,17 +532,20 @@ class Kernels(NamedTuple):
 
 
 @functools.cache
-def cell_kernels(dim: int, double: bool, scaled: bool, lists: bool, periodic: int = 0, exact: bool = True) -> Kernels:
+def cell_kernels(
+    dim: int, double: bool, scaled: bool, lists: bool, periodic: int = 0, batched: bool = False, exact: bool = True
+) -> Kernels:
     """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts alone.
 
-    `periodic` is that of `jfrnn.kernels._native.snippet`.
+    `periodic` and `batched` are those of `jfrnn.kernels._native.snippet`.
 
     With exact=False the working precision alone decides (`|d|^2 < r^2 (1 - 8 eps)`): only to measure what exactness costs.
     """
     scalar = wp.float64 if double else wp.float32
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}"
-    variant += f"{('', '_nearest', '_images')[periodic]}{'' if exact else '_inexact'}"
+    variant += f"{('', '_nearest', '_images')[periodic]}{'_batched' * batched}{'' if exact else '_inexact'}"
     options = {"SCALED": scaled, "LIST": lists, "REACH": 1, "REACH_X": 1, "EXACTLY": exact, "PERIODIC": periodic}
+    options |= {"BATCHED": batched}
     points = wp.array2d(dtype=scalar)
     reals, ints, rows = wp.array(dtype=scalar), wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
 

@@ -176,7 +176,7 @@ for (long long i = thread; i < size; i += threads) {
     real p[3];
     point_of(points + ROW * i, p);
     const bool finite = finite_point(p);
-    const int cell = finite ? cell_key(grid, p) : -1;
+    const int cell = finite ? cell_key(grid, p, system_of(points + ROW * i)) : -1;
     key[i] = cell;
     slot[i] = atomicAdd(finite ? counts + cell : &shared.behind[of_queries], 1);
     if (!finite && of_queries)
@@ -264,7 +264,8 @@ for (long long place = thread; place < n; place += threads) {
     Place mine;
     point_of(positions.data + (long long)ROW * i, mine.p);
     mine.id = bits_as_real(i);
-    const int cell = finite_point(mine.p) ? cell_key(grid, mine.p) : -1;  // cheaper than to fetch key[i] from anywhere
+    const unsigned int system = system_of(positions.data + (long long)ROW * i);
+    const int cell = finite_point(mine.p) ? cell_key(grid, mine.p, system) : -1;  // cheaper than to fetch key[i] from anywhere
     long long to = place;
     if (cell >= 0) {
         const int first = start[cell], end = start[cell + 1];
@@ -438,6 +439,13 @@ while (place < stop) {
         const whole here = axis_cell(grid, a, my_place[a]), there = __shfl_sync(ALL, here, 0);
         beside = beside && (ORDER != 0 || (a == 0 ? grid.dense || (here >= there && here - there < 2 * REACH_X) : here == there));
     }
+    unsigned int system = 0;
+    if constexpr (BATCHED) {
+        system = beside ? system_of(queries.data + (long long)ROW * id_of(mine.id)) : 0;
+        const unsigned int of_first = __shfl_sync(ALL, system, 0);
+        beside = beside && system == of_first;
+        system = of_first;
+    }
     const int group = __ffs(~__ballot_sync(ALL, beside)) == 0 ? 32 : __ffs(~__ballot_sync(ALL, beside)) - 1;
     if (group == 0) {  // non-finite: an empty row
         const int id = id_of(load_query(place).id);
@@ -599,12 +607,12 @@ while (place < stop) {
         if (grid.dense) {
             if (row < rows) {
                 const int s = ORDER != 0 ? curve(grid, (unsigned int)(first[0] + row % across), (unsigned int)y, (unsigned int)z)
-                                         : row_start(grid, y, z) + (int)first[0];
+                                         : row_start(grid, y, z, system) + (int)first[0];
                 from = start[s];
                 size = length > 0 ? start[s + (ORDER != 0 ? 1 : length)] - from : 0;
             }
         } else {
-            const int begins = ring(row_start(grid, y, z) + ring(first[0], grid.cells), grid.cells);
+            const int begins = ring(row_start(grid, y, z, system) + ring(first[0], grid.cells), grid.cells);
             int front = 0, back = 0;  // entries that an earlier row has too
             auto overlap = [&](int other) {
                 const int behind = begins - other < 0 ? begins - other + grid.cells : begins - other, ahead = grid.cells - behind;
@@ -617,9 +625,9 @@ while (place < stop) {
                 if (PERIODIC && !inside) {
                     const Part part = part_of(r);
                     if (part.image == image)  // as long as this one
-                        overlap(ring(row_start(grid, part.y, part.z) + ring(part.first, grid.cells), grid.cells));
+                        overlap(ring(row_start(grid, part.y, part.z, system) + ring(part.first, grid.cells), grid.cells));
                 } else {
-                    const int earlier = row_start(grid, first[1] + r % wide, first[2] + r / wide);
+                    const int earlier = row_start(grid, first[1] + r % wide, first[2] + r / wide, system);
                     overlap(ring(earlier + ring(first[0], grid.cells), grid.cells));
                 }
             const int here = rows - base < 32 ? rows - base : 32;
@@ -932,6 +940,8 @@ while (place < stop) {
                     square += gap * gap;
                 }
                 near[k] = square <= box.center[3];
+                if (BATCHED && !grid.dense && near[k])
+                    near[k] = system_of(positions.data + (long long)ROW * source_of(id_of(candidates[k].id))) == system;
             }
 #pragma unroll
             for (int k = 0; k < FETCHED; ++k) {
@@ -1030,7 +1040,7 @@ while (place < stop) {
                     real p[DIM];
 #pragma unroll
                     for (int a = 0; a < DIM; ++a)
-                        p[a] = positions.data[(long long)DIM * id + a];
+                        p[a] = positions.data[(long long)ROW * id + a];
                     const real over = excess(query.p, p);
                     hits |= over < 0 || (EXACTLY && over <= 2 * band && exact_pair(query.p, p)) ? 1u << j : 0;
                 }
@@ -1154,20 +1164,22 @@ def cell_kernels(
     blocks: int | None = None,
     order: int = 0,
     periodic: int = 0,
+    batched: bool = False,
 ) -> Kernels:
     """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts, half lists or whole.
 
     The rest is there to be measured. exact=False lets the working precision decide alone (`|d|^2 < r^2 (1 - 8 eps)`); `reach` is
     the number of cell edges in a cutoff along y and z, `reach_x` along x; `blocks` per multiprocessor bound the registers; `order`
-    of the cells: 0 row-major, 1 Morton, 2 Hilbert. `periodic` is that of `jfrnn.kernels._native.snippet`.
+    of the cells: 0 row-major, 1 Morton, 2 Hilbert. `periodic` and `batched` are those of
+    `jfrnn.kernels._native.snippet`.
     """
     blocks = blocks or (24 if not lists else 16 if double else 20)  # registers against occupancy, measured on an H200
     kind = f"{dim}d_{'f64' if double else 'f32'}_r{reach}x{reach_x}{('', '_morton', '_hilbert')[order]}"
-    kind += ("", "_nearest", "_images")[periodic]
+    kind += ("", "_nearest", "_images")[periodic] + "_batched" * batched
     variant = f"{kind}{'_scaled' * scaled}{'_list' * lists}{'_later' * later}{'' if exact else '_inexact'}"
     variant += f"_b{blocks}"
     grid = {"REACH": reach, "REACH_X": reach_x, "ORDER": order, "PARTS": _PARTS, "TILE": _TILE, "BLOCK": BLOCK}
-    grid |= {"PERIODIC": periodic}
+    grid |= {"PERIODIC": periodic, "BATCHED": batched}
     query = {"SCALED": scaled, "LIST": lists, "LATER": later, "EXACTLY": exact}
     query |= {"QUERY_BLOCK": QUERY_BLOCK, **grid}
     return Kernels(

@@ -1,6 +1,5 @@
-"""Search with a cutoff per particle, on the CPU: queries one by one, in chunks on every core.
+"""Search with a cutoff per particle: queries one by one, on the CPU in chunks on every core, on CUDA one per thread.
 
-The text is written for CUDA, too, one query per thread, but nothing launches it there: it has not run on a GPU.
 What `jfrnn._levels` sorts, `query` walks: top cells as wide as the largest cutoff, within them groups of cutoffs, within those a
 Morton curve. A query finds the candidates of a group in the cells around it that are as wide as what the group reaches.
 """
@@ -11,11 +10,13 @@ import warp as wp
 from jfrnn.kernels._native import ENTER, EXACT, LEAVE, snippet
 
 PADDING = 16  # sources behind the last one, which nobody meets: the CPU tests so many at a time
+BLOCK = 128  # threads of CUDA
 RULES = ("gather", "scatter", "either", "both", "mean")
 
-# `header` holds the cells of the table along each axis (3), whether there is a table, and how many groups are in use. `cutoff`
-# holds the largest cutoff, then that of each group, and along each axis: the width of a top cell, how many of those units a cutoff
-# of 1 reaches, and what is added to that (3 each).
+# `header` holds the cells of the table along each axis (4), whether there is a table, and how many groups are in use. `cutoff`
+# holds the largest cutoff and the lattice, then the largest of each group, and along each axis: the width of a top cell, how many
+# of those units a cutoff of 1 reaches, and what is added to that (3 each). Where space is periodic, `axes` and `query_axes` are
+# wrapped, and `positions` and `queries` hold what was given, with turns. Of a batch, the last axis of `top` is the system.
 _QUERY = r"""
 #if defined(__CUDA_ARCH__)
 constexpr int LANES = 1;
@@ -24,9 +25,9 @@ constexpr int LANES = 16;
 #endif
 constexpr int GATHER = 0, SCATTER = 1, EITHER = 2, BOTH = 3;
 const int* extent = header.data;
-const bool dense = header.data[3] != 0;
-const int groups = header.data[4];
-const real* largest = cutoff.data + 1;
+const bool dense = header.data[4] != 0;
+const int groups = header.data[5];
+const real* largest = cutoff.data + (PERIODIC ? 29 : 1);
 const real* width = largest + GROUPS;
 const real* scale = width + 3;
 const real* margin = scale + 3;
@@ -43,12 +44,26 @@ auto of_pair = [](real own, real other) -> real {
     if constexpr (RULE == BOTH) return own < other ? own : other;
     return own / 2 + other / 2;
 };
-auto exactly = [&](const real* q, const real* p, real own, real other) -> bool {
+constexpr int TOP = DIM + BATCHED;  // axes of top cells
+const real slack = PERIODIC ? 2 * lattice.slack() * unit : real(0);  // by which distances of images may be wrong
+int codes = 1, home = 0;  // of images
+for (int k = 0; PERIODIC && k < DIM; ++k)
+    codes *= 2 * lattice.images(k) + 1;
+home = (codes - 1) / 2;
+const int fill_value = PERIODIC == 2 ? n * codes : n;
+auto exactly = [&](int query, int source, const real* q, const real* p, int image, real own, real other) -> bool {
     const real first = SUM ? own / 2 : of_pair(own, other), more = SUM ? other / 2 : real(0);
+    if constexpr (PERIODIC) {
+        const real *a = queries.data + (long long)ROW * query, *b = positions.data + (long long)ROW * source;
+        return exact_image_within(a, b, image, first, more);
+    }
     return Exact::pair(q[0], q[1], DIM == 3 ? q[DIM - 1] : 0, p[0], p[1], DIM == 3 ? p[DIM - 1] : 0, first, more, closed);
 };
 auto row_major = [&](const int* cell) -> int {
-    return DIM == 3 ? (cell[2] * extent[1] + cell[1]) * extent[0] + cell[0] : cell[1] * extent[0] + cell[0];
+    int index = cell[TOP - 1];
+    for (int k = TOP - 2; k >= 0; --k)
+        index = index * extent[k] + cell[k];
+    return index;
 };
 // first source whose top cell is not below this one, the last axis compared first
 auto first_not_below = [&](const int* cell) -> int {
@@ -56,7 +71,7 @@ auto first_not_below = [&](const int* cell) -> int {
     while (low < high) {
         const int middle = low + (high - low) / 2;
         bool below = false;
-        for (int k = 0; k < DIM; ++k) {
+        for (int k = 0; k < TOP; ++k) {
             const int here = top.data[(long long)k * n + middle];
             below = here < cell[k] || (here == cell[k] && below);
         }
@@ -84,11 +99,61 @@ auto spread = [](unsigned int c) -> unsigned int {  // bit b goes to place DIM *
     return result;
 };
 
+// how far the cells around a query reach: where images lie close, over many of the largest cells
+auto reach_of = [&](int k, int level) -> int {
+    return PERIODIC && level == 0 && lattice.images(k) > 1 ? lattice.images(k) : 1;
+};
+// for each cell around a query that holds sources of a group: its run of them, and the code of their image
+auto each_run = [&](int g, int at, int level, auto use) {
+    const int shift = HALVINGS - level, mask = (1 << level) - 1;
+    const int reach[3] = {reach_of(0, level), reach_of(1, level), DIM == 3 ? reach_of(2, level) : 0};
+    for (int z = -reach[2]; z <= reach[2]; ++z)
+        for (int y = -reach[1]; y <= reach[1]; ++y)
+            for (int x = -reach[0]; x <= reach[0]; ++x) {
+                const int steps[3] = {x, y, z};
+                int around[4] = {0, 0, 0, 0}, image = 0;
+                unsigned int key = 0;
+                bool there = true;
+                for (int k = 0; k < DIM; ++k) {
+                    const int fine = (places.data[(long long)k * m + at] >> shift) + steps[k];
+                    around[k] = query_top.data[(long long)k * m + at] + (fine >> level);
+                    key |= spread((unsigned int)(fine & mask)) << k;
+                    if constexpr (PERIODIC) {
+                        const int most = lattice.images(k), e = extent[k];
+                        const int turn = most == 0 ? 0 : around[k] >= 0 ? around[k] / e : -1 - (-1 - around[k]) / e;
+                        around[k] -= turn * e;
+                        image = image * (2 * most + 1) + turn + most;
+                        there = there && turn >= -most && turn <= most;
+                    }
+                }
+                if (!there)
+                    continue;
+                if constexpr (BATCHED)
+                    around[DIM] = query_top.data[(long long)DIM * m + at];
+                int from, to;
+                if (dense) {
+                    from = table.data[row_major(around)];
+                    to = table.data[row_major(around) + 1];
+                } else {
+                    from = first_not_below(around);
+                    ++around[0];
+                    to = from < n ? first_not_below(around) : from;
+                }
+                if (from == to)
+                    continue;
+                key = ((unsigned int)g << (DIM * HALVINGS)) | (key << (DIM * shift));
+                from = first_key_from(key, from, to);
+                to = first_key_from(key + (1u << (DIM * shift)), from, to);
+                if (from < to)
+                    use(from, to, image);
+            }
+};
+
 // Runs of candidates of one group, around a cell: sorted, those that touch joined. Queries that follow each other often share them,
-// so a thread of the CPU keeps them for each group.
+// so a thread of the CPU keeps them for each group, where there are no images.
 struct Runs {
     int level;
-    long long cell[3];  // of the query, at that level
+    long long cell[4];  // of the query, at that level, and its system
     int count, begin[27], end[27];
 };
 #if defined(__CUDA_ARCH__)
@@ -99,11 +164,11 @@ Runs kept[GROUPS];
 for (Runs& runs : kept)
     runs.level = -1;
 auto find_runs = [&](Runs& runs, int g, int at, int level) {
-    const int shift = HALVINGS - level, mask = (1 << level) - 1;
+    const int shift = HALVINGS - level;
     bool same = LANES > 1 && runs.level == level;
-    for (int k = 0; k < DIM; ++k) {
+    for (int k = 0; k < TOP; ++k) {
         const long long first = query_top.data[(long long)k * m + at];
-        const long long cell = (first << level) + (places.data[(long long)k * m + at] >> shift);
+        const long long cell = k == DIM ? first : (first << level) + (places.data[(long long)k * m + at] >> shift);
         same = same && runs.cell[k] == cell;
         runs.cell[k] = cell;
     }
@@ -111,31 +176,7 @@ auto find_runs = [&](Runs& runs, int g, int at, int level) {
         return;
     runs.level = level;
     runs.count = 0;
-    for (int step = 0; step < (DIM == 3 ? 27 : 9); ++step) {
-        const int steps[3] = {step % 3 - 1, step / 3 % 3 - 1, step / 9 - 1};
-        int around[3] = {0, 0, 0};
-        unsigned int key = 0;
-        for (int k = 0; k < DIM; ++k) {
-            const int fine = (places.data[(long long)k * m + at] >> shift) + steps[k];
-            around[k] = query_top.data[(long long)k * m + at] + (fine >> level);
-            key |= spread((unsigned int)(fine & mask)) << k;
-        }
-        int from, to;
-        if (dense) {
-            from = table.data[row_major(around)];
-            to = table.data[row_major(around) + 1];
-        } else {
-            from = first_not_below(around);
-            ++around[0];
-            to = from < n ? first_not_below(around) : from;
-        }
-        if (from == to)
-            continue;
-        key = ((unsigned int)g << (DIM * HALVINGS)) | (key << (DIM * shift));
-        from = first_key_from(key, from, to);
-        to = first_key_from(key + (1u << (DIM * shift)), from, to);
-        if (from == to)
-            continue;
+    each_run(g, at, level, [&](int from, int to, int) {
         int place = runs.count++;
         for (; place > 0 && runs.begin[place - 1] > from; --place) {
             runs.begin[place] = runs.begin[place - 1];
@@ -143,7 +184,7 @@ auto find_runs = [&](Runs& runs, int g, int at, int level) {
         }
         runs.begin[place] = from;
         runs.end[place] = to;
-    }
+    });
     int joined = 0;
     for (int r = 1; r < runs.count; ++r)
         if (runs.begin[r] == runs.end[joined])
@@ -198,10 +239,9 @@ auto test = [&](const real* q, real own, int first, unsigned int& sure) -> unsig
         else r = r / 2 + other / 2;
     }
     r *= unit;
-    r *= r;
-    const lanes least = lanes{} + LEAST * LEAST;
-    sure = bits(square < r * (1 - 32 * EPS)) & bits(r > least);
-    return bits(square <= choose(r > least, r, least) * (1 + 32 * EPS));
+    const lanes least = lanes{} + LEAST, inner = r - slack, outer = choose(r > least, r, least) + slack;
+    sure = bits(square < inner * inner * (1 - 32 * EPS)) & bits(r > least) & bits(inner > lanes{});
+    return bits(square <= outer * outer * (1 + 32 * EPS));
 };
 
 int longest = 0;
@@ -213,26 +253,28 @@ auto serve = [&](int at) {
         q[k] = query_axes.data[(long long)k * m + at];
     const real own = RULE == SCATTER ? real(0) : query_radii.data[at];
     int found = 0;
-    auto meet = [&](int from, int to) {
+    auto meet = [&](int from, int to, int image, const real* from_where) {
         for (int first = from; first < to; first += LANES) {
-            unsigned int sure, near = test(q, own, first, sure);
+            unsigned int sure, near = test(from_where, own, first, sure);
             if (to - first < LANES)
                 near &= (1u << (to - first)) - 1;
             for (; near; near &= near - 1) {
                 const int e = LANES > 1 ? lowest_bit(near) : 0, c = first + e, other = ids.data[c];
-                if ((own_queries && drop_self && c == at) || (later_only && other < id))
+                const bool itself = own_queries && c == at && image == home;
+                const bool earlier = other < id || (PERIODIC == 2 && other == id && image < home);
+                if ((drop_self && itself) || (later_only && earlier))
                     continue;
                 bool pair = sure >> e & 1;
                 if (!pair) {
                     real p[3];
                     for (int k = 0; k < DIM; ++k)
                         p[k] = axes.data[k * stride + c];
-                    pair = exactly(q, p, own, RULE == GATHER ? real(0) : radii.data[c]);
+                    pair = exactly(id, other, q, p, image, own, RULE == GATHER ? real(0) : radii.data[c]);
                 }
                 if (!pair)
                     continue;
                 if (LIST && found < capacity)
-                    row[found] = other;
+                    row[found] = PERIODIC == 2 ? other + n * image : other;
                 ++found;
             }
         }
@@ -245,14 +287,29 @@ auto serve = [&](int at) {
         for (bool fits = true; fits && level < HALVINGS; level += fits)
             for (int k = 0; k < DIM; ++k)
                 fits = fits && width[k] / real(2 << level) > reach * scale[k] + margin[k];
+        if constexpr (PERIODIC) {
+            each_run(g, at, level, [&](int from, int to, int image) {
+                int shift[3] = {0, 0, 0}, rest = image;
+                for (int k = DIM - 1; k >= 0; --k) {
+                    const int each = 2 * lattice.images(k) + 1;
+                    shift[k] = rest % each - lattice.images(k);
+                    rest /= each;
+                }
+                real moved[3] = {0, 0, 0};  // the query goes to where it meets the image at home
+                for (int k = 0; k < DIM; ++k)
+                    moved[k] = image == home ? q[k] : Lattice::add(q[k], -lattice.translation(shift[0], shift[1], shift[2], k));
+                meet(from, to, image, moved);
+            });
+            continue;
+        }
         Runs& runs = kept[LANES > 1 ? g : 0];
         find_runs(runs, g, at, level);
         for (int r = 0; r < runs.count; ++r)
-            meet(runs.begin[r], runs.end[r]);
+            meet(runs.begin[r], runs.end[r], home, q);
     }
     if constexpr (LIST)
         for (int s = found; s < capacity; ++s)
-            row[s] = n;
+            row[s] = fill_value;
     count.data[id] = found;
     longest = found > longest ? found : longest;
 };
@@ -280,21 +337,32 @@ while (known < longest && !__atomic_compare_exchange_n(&info.data[0], &known, lo
 """
 
 
+@wp.kernel(enable_backward=False)
+def clear(info_out: wp.array(dtype=wp.int32)):
+    """Write zeros (launch: dim = its length)."""
+    info_out[wp.tid()] = 0
+
+
 @functools.cache
-def query_kernel(dim: int, double: bool, lists: bool, rule: str, groups: int, halvings: int) -> wp.Kernel:
+def query_kernel(
+    dim: int, double: bool, lists: bool, rule: str, groups: int, halvings: int, periodic: int = 0, batched: bool = False
+) -> wp.Kernel:
     """Return the kernel for a dimension, a dtype and a rule, for lists or counts alone.
 
-    It is launched with dim = 1, once per thread. `info`, zeros at first, gets the longest row.
+    It is launched on the CPU with dim = 1, once per thread, on CUDA once, with a thread per query. `info`, zeros at first, gets the
+    longest row. `periodic` and `batched` are those of `jfrnn.kernels._native.snippet`.
     """
     scalar = wp.float64 if double else wp.float32
     variant = f"{dim}d_{'f64' if double else 'f32'}_{rule}{'_list' * lists}"
+    variant += f"{('', '_nearest', '_images')[periodic]}{'_batched' * batched}"
     constants = {"LIST": lists, "RULE": RULES.index(rule), "SUM": rule == "mean", "GROUPS": groups, "HALVINGS": halvings}
-    constants |= {"SCALED": True, "PADDING": PADDING}
+    constants |= {"SCALED": True, "PADDING": PADDING, "PERIODIC": periodic, "BATCHED": batched}
+    points = wp.array2d(dtype=scalar)
     reals, ints, rows = wp.array(dtype=scalar), wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
 
     def native(
-        axes: reals, radii: reals, ids: ints, keys: ints, top: ints, table: ints, header: ints, cutoff: reals,
-        query_axes: reals, query_radii: reals, query_ids: ints, query_top: ints, places: ints,
+        positions: points, queries: points, axes: reals, radii: reals, ids: ints, keys: ints, top: ints, table: ints, header: ints,
+        cutoff: reals, query_axes: reals, query_radii: reals, query_ids: ints, query_top: ints, places: ints,
         idx: rows, count: ints, info: ints, n: int, m: int, capacity: int,
         own_queries: int, closed: int, drop_self: int, later_only: int,
     ): ...  # fmt: skip
@@ -304,14 +372,15 @@ def query_kernel(dim: int, double: bool, lists: bool, rule: str, groups: int, ha
     function = wp.func_native(ENTER + text + LEAVE)(native)
 
     def query(
-        axes: reals, radii: reals, ids: ints, keys: ints, top: ints, table: ints, header: ints, cutoff: reals,
-        query_axes: reals, query_radii: reals, query_ids: ints, query_top: ints, places: ints,
+        positions: points, queries: points, axes: reals, radii: reals, ids: ints, keys: ints, top: ints, table: ints, header: ints,
+        cutoff: reals, query_axes: reals, query_radii: reals, query_ids: ints, query_top: ints, places: ints,
         idx: rows, count: ints, info: ints, n: int, m: int, capacity: int,
         own_queries: int, closed: int, drop_self: int, later_only: int,
     ):  # fmt: skip
         function(
-            axes, radii, ids, keys, top, table, header, cutoff, query_axes, query_radii, query_ids, query_top, places,
-            idx, count, info, n, m, capacity, own_queries, closed, drop_self, later_only,
+            positions, queries, axes, radii, ids, keys, top, table, header, cutoff,
+            query_axes, query_radii, query_ids, query_top, places, idx, count, info, n, m, capacity,
+            own_queries, closed, drop_self, later_only,
         )  # fmt: skip
 
     module = wp.get_module(f"jfrnn.kernels.levels.{variant}")

@@ -97,7 +97,7 @@ def test_table_and_binary_search_find_the_same_runs(dense):
         order = _cells.cell_order(coords, finite, grid.extent, grid.dense)
         np.testing.assert_array_equal(order, grid.order)
     queries = jnp.asarray(rng.integers(1, 6, (3, 40)), jnp.int32)
-    start, stop, image = _cells.stencil_runs(grid, queries)
+    start, stop, image = _cells.stencil_runs(grid, queries, 3)
     assert image is None
     assert start.shape == stop.shape == (40, 9)
     for q in range(40):
@@ -121,7 +121,7 @@ def test_runs_of_a_torus_meet_every_image_once(dense, images):
     grid = _cells.build_grid(coords, jnp.ones(60, bool), jnp.asarray(cells, jnp.int32), 60)
     grid = grid._replace(dense=jnp.asarray(dense))
     queries = rng.integers(low, high, (20, 3))
-    start, stop, image = _cells.stencil_runs(grid, jnp.asarray(queries.T, jnp.int32), images)
+    start, stop, image = _cells.stencil_runs(grid, jnp.asarray(queries.T, jnp.int32), 3, images)
     width = [max(k, 1) for k in images.reach]
     for q, query in enumerate(queries):
         found = [

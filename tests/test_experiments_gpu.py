@@ -1,5 +1,6 @@
 """The GPU run, on whatever device is there: its config, its checks and its rows."""
 
+import importlib
 import json
 from pathlib import Path
 
@@ -54,6 +55,17 @@ def test_an_inexact_answer_is_counted_as_wrong(config, monkeypatch):
     search = jfrnn.search
     monkeypatch.setattr(jfrnn, "search", lambda x, cutoff, **options: search(x, 0.9 * cutoff, **options))
     assert [row["wrong"] for row in _gpu._exactness_rows(part)] == [2]
+
+
+@pytest.mark.parametrize(("table", "name"), [("radii", "queries"), ("batches", "periodic_images")])
+def test_options_are_decided_case_by_case(table, name, monkeypatch):
+    """The second config names these tables; here one case of each."""
+    parts = {part.cases: part for part in _gpu.load(CONFIG.with_name("h200_options.toml")).exactness}
+    module = importlib.import_module(f"jfrnn.cases.{table}")
+    cases = {"radii": "RADII_CASES", "batches": "BATCH_CASES"}[table]
+    monkeypatch.setattr(module, cases, {name: getattr(module, cases)[name]})
+    (row,) = _gpu._exactness_rows(parts[table].model_copy(update={"dims": [2], "dtypes": ["float32"]}))
+    assert (row["cases"], row["wrong"]) == ({"radii": 5, "batches": 2}[table], 0)
 
 
 def test_memory_is_planned_within_a_tenth(monkeypatch):

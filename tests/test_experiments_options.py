@@ -7,13 +7,13 @@ from typer.testing import CliRunner
 from experiments._cli import app
 
 
-@pytest.mark.slow  # eighteen programs
+@pytest.mark.slow  # nineteen programs
 def test_every_option_gets_a_row(tmp_path):
     result = CliRunner().invoke(app, ["options", "--points", "500", "--rounds", "2", "--backend", "warp", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
     table = pd.read_csv(tmp_path / "cpu_warp.csv")
     assert table["option"].is_unique
-    assert len(table) == 18
+    assert len(table) == 19
     assert (table[["list_s", "count_s", "list_ratio", "count_ratio"]] > 0).all(axis=None)
     entries = dict(zip(table["option"], table["entries"], strict=True))
     assert 2 * entries["half"] == entries["open, whole list"] == entries["a cutoff per particle, equal"]

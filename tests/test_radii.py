@@ -68,8 +68,6 @@ def each_case():
     kinds["mean"] = (np.float64, 3)
     compiled = {"queries": ("either",), "periodic": ("gather",), "periodic_ties": (), "periodic_images": ("either",)}
     for name, rule, dtype, dim, backend in product(RADII_CASES, RULES, (np.float32, np.float64), (2, 3), ("jax", "warp", "brute")):
-        if backend == "warp" and RADII_CASES[name].build(dtype, dim).lengths is not None:
-            continue
         often = (dtype, dim) == kinds[rule] and (backend == "warp" or rule in compiled.get(name, ("either", "mean")))
         kind = f"{name}-{rule}-f{8 * dtype().itemsize}-{dim}d-{backend}"
         yield pytest.param(name, rule, dtype, dim, backend, id=kind, marks=[SLOW] * (backend == "brute" or not often))
@@ -194,11 +192,6 @@ X, H = np.zeros((4, 3), np.float32), np.ones(4, np.float32)
             ValueError,
             r"cutoff must be a pair of arrays, of the positions \[4\] and of the queries \[2\].*'mean'",
             lambda: jfrnn.search(X, H, queries=X[:2], radius_rule="mean"),
-        ),
-        (
-            ValueError,
-            "backend='warp' takes one cutoff for all particles in a periodic box",
-            lambda: jfrnn.search(X, H, box=jfrnn.Box([3.0] * 3), backend="warp"),
         ),
         (ValueError, "backend='hashgrid' takes one cutoff for all particles: pass", lambda: jfrnn.search(X, H, backend="hashgrid")),
         (ValueError, "made with one cutoff for all particles", lambda: jfrnn.search(X, 1.0).update(X, cutoff=H)),

@@ -27,6 +27,8 @@ LISTS = {
     "queries": lambda x: jfrnn.search(x, CUTOFF, queries=x[:7] + 0.01, **OPTIONS),
     "active": lambda x: jfrnn.search(x, CUTOFF, active=x[:, 0] < 0.7, **OPTIONS),
     "radii": lambda x: jfrnn.search(x, 0.1 + 0.2 * x[:, 0], radius_rule="mean", **OPTIONS),
+    "radii in a box": lambda x: jfrnn.search(x, 0.1 + 0.2 * x[:, 0], box=BOX, **OPTIONS),
+    "batch": lambda x: jfrnn.search(x, CUTOFF, batch=(4 * x[:, 0]).astype(jnp.int32), **OPTIONS),
     "hashgrid": lambda x: jfrnn.search(x, CUTOFF, capacity=CAPACITY, backend="hashgrid"),
 }
 
@@ -39,6 +41,7 @@ FUNCTIONS = {
     **{f"search, {name}": search for name, search in LISTS.items()},
     "count": lambda x: jfrnn.count(x, CUTOFF, backend="warp"),
     "count, radii": lambda x: jfrnn.count(x, 0.1 + 0.2 * x[:, 0], backend="warp"),
+    "count, batch": lambda x: jfrnn.count(x, CUTOFF, batch=(4 * x[:, 0]).astype(jnp.int32), backend="warp"),
     "count, hashgrid": lambda x: jfrnn.count(x, CUTOFF, backend="hashgrid"),
     "count, box per system": lambda x: jfrnn.count(x, CUTOFF, box=jfrnn.Box(1.0 + x[0]), backend="warp"),
     "update": lambda x: LISTS["open"](x).update(x + 0.1),

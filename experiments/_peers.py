@@ -1,0 +1,287 @@
+"""What other libraries answer on the hard cases: each in a process of its own, against exact arithmetic, within a time limit."""
+
+import csv
+import importlib.util
+import multiprocessing
+from collections import Counter
+from collections.abc import Callable, Iterator
+from importlib.metadata import PackageNotFoundError, version
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jfrnn.cases.catalog import CATALOG, Problem, problem  # pyright: ignore[reportMissingImports]
+from tqdm import tqdm
+
+from experiments import _machine
+
+Pairs = tuple[np.ndarray, np.ndarray]
+COLUMNS = ("row", "case", "peer", "version", "answer", "missing", "extra", "pairs", "commit", "dirty")
+_DTYPE, _DIM = np.float32, 3
+_REFERENCE = Path(__file__).parent.parent / "tests" / "reference.py"
+
+
+class Cannot(Exception):
+    """A peer has no way to be asked this; the message says what it lacks."""
+
+
+class _Peer(NamedTuple):
+    """A library: the distribution that pip knows, and how it is asked for all ordered pairs, once for each image."""
+
+    package: str
+    ask: Callable[[Problem], Pairs]
+
+
+# --- how each is asked ----------------------------------------------------------------------------------------------------
+
+
+def _jfrnn(given: Problem) -> Pairs:
+    import jfrnn
+
+    box = None if given.matrix is None else jfrnn.Box(given.matrix, given.periodic)
+    nbrs = jfrnn.search(given.positions, given.cutoff, queries=given.queries, box=box, batch=given.batch)
+    if jfrnn.Status(int(nbrs.status)) not in (jfrnn.Status.OK, jfrnn.Status.NONFINITE):
+        nbrs.check()
+    i, k = np.nonzero(np.arange(nbrs.capacity) < np.asarray(nbrs.count)[:, None])
+    return i, np.asarray(nbrs.idx)[i, k]
+
+
+def _scipy(given: Problem) -> Pairs:
+    from scipy.spatial import KDTree
+
+    points, size = given.positions.astype(np.float64), None
+    if given.matrix is not None:
+        if (given.matrix != np.diag(np.diag(given.matrix))).any():
+            raise Cannot("skewed boxes")
+        size = np.where(given.periodic, np.diag(given.matrix), 0).astype(np.float64)
+        points = np.where(size > 0, np.mod(points, np.where(size > 0, size, 1)), points)  # it asks for points in the box
+    found = KDTree(points, boxsize=size).query_pairs(_cutoff(given), output_type="ndarray")
+    return np.concatenate([found[:, 0], found[:, 1]]), np.concatenate([found[:, 1], found[:, 0]])
+
+
+def _vesin(given: Problem) -> Pairs:
+    from vesin import NeighborList  # pyright: ignore[reportMissingImports]
+
+    cell = np.zeros((3, 3)) if given.matrix is None else given.matrix.astype(np.float64)
+    search = NeighborList(cutoff=_cutoff(given), full_list=True)
+    found = search.compute(points=given.positions.astype(np.float64), box=cell, periodic=np.array(given.periodic), quantities="ij")
+    return np.asarray(found[0]), np.asarray(found[1])
+
+
+def _matscipy(given: Problem) -> Pairs:
+    from matscipy.neighbours import neighbour_list  # pyright: ignore[reportMissingImports]
+
+    points = given.positions.astype(np.float64)
+    if given.matrix is None:
+        i, j = neighbour_list("ij", positions=points, cutoff=_cutoff(given))
+    else:
+        cell, periodic = given.matrix.astype(np.float64), np.array(given.periodic)
+        for k in np.flatnonzero(~periodic):  # it asks for a cell along open axes, too
+            cell[k] = np.eye(3)[k] * (np.ptp(points[:, k]) + 3 * given.cutoff)
+        i, j = neighbour_list("ij", positions=points, cell=cell, pbc=periodic, cutoff=_cutoff(given))
+    return i, j
+
+
+def _jax_md(given: Problem) -> Pairs:
+    import jax.numpy as jnp
+    from jax_md import partition, space  # pyright: ignore[reportMissingImports]
+
+    points = jnp.asarray(given.positions)
+    if given.matrix is None:
+        displacement, _ = space.free()
+        low = np.nan_to_num(given.positions).min(axis=0)
+        extent = np.nan_to_num(given.positions).max(axis=0) - low
+        points, size = points - low, extent + given.cutoff  # its cells begin at 0
+        make = partition.neighbor_list(displacement, size, given.cutoff, format=partition.NeighborListFormat.Sparse)
+    elif not all(given.periodic):
+        raise Cannot("boxes with open axes")
+    else:
+        displacement, _ = space.periodic_general(given.matrix.T, fractional_coordinates=True)
+        points = points @ np.linalg.inv(given.matrix)
+        kind = {"fractional_coordinates": True, "format": partition.NeighborListFormat.Sparse}
+        make = partition.neighbor_list(displacement, given.matrix.T, given.cutoff, **kind)
+    nbrs = make.allocate(points)
+    i, j = np.asarray(nbrs.idx)
+    there = i < len(points)
+    i, j = i[there], j[there]
+    distance = np.linalg.norm(np.asarray(space.map_bond(displacement)(points[i], points[j])).reshape(len(i), -1), axis=1)
+    inside = distance < np.float32(given.cutoff)  # its list holds candidates: an energy looks at the distance
+    return i[inside], j[inside]
+
+
+def _nvalchemi(given: Problem) -> Pairs:
+    import jax.numpy as jnp
+    from nvalchemiops.jax.neighbors.cell_list import cell_list, estimate_cell_list_sizes  # pyright: ignore
+
+    points = jnp.asarray(given.positions)
+    cell, periodic = given.matrix, jnp.asarray(given.periodic)[None]
+    if cell is None:
+        finite = given.positions[np.isfinite(given.positions).all(axis=1)]
+        low = finite.min(axis=0) - np.float32(given.cutoff)
+        cell = np.diag(np.ptp(finite, axis=0) + np.float32(2 * given.cutoff))
+        points = points - low
+    cell = jnp.asarray(cell, jnp.float32)[None]
+    cells, _, radius = estimate_cell_list_sizes(points, cell, given.cutoff, periodic)
+    most = 8 * len(points) if given.matrix is not None else len(points)
+    idx, count, *_ = cell_list(
+        points, given.cutoff, cell, periodic, max_neighbors=most, max_total_cells=int(cells), neighbor_search_radius=radius
+    )
+    i, k = np.nonzero(np.arange(idx.shape[1]) < np.asarray(count)[:, None])
+    return i, np.asarray(idx)[i, k]
+
+
+PEERS = {
+    "jfrnn": _Peer("jfrnn", _jfrnn),
+    "scipy": _Peer("scipy", _scipy),
+    "vesin": _Peer("vesin", _vesin),
+    "matscipy": _Peer("matscipy", _matscipy),
+    "jax-md": _Peer("jax-md", _jax_md),
+    "nvalchemi": _Peer("nvalchemi-toolkit-ops", _nvalchemi),
+}
+
+
+def _cutoff(given: Problem) -> float:
+    """Return the cutoff as float64, rounded as the positions are."""
+    return float(_DTYPE(given.cutoff))
+
+
+# --- right or wrong -------------------------------------------------------------------------------------------------------
+
+
+def expected_pairs(case: str, closed: bool = False) -> Counter:
+    """Return how often each ordered pair is one, once for each image, as the oracle of the tests decides it."""
+    spec = importlib.util.spec_from_file_location("reference", _REFERENCE)
+    if spec is None or spec.loader is None:
+        raise FileNotFoundError(f"the oracle of the tests is not where it should be: {_REFERENCE}")
+    reference = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(reference)
+    given = problem(case, _DTYPE, _DIM)
+    if given.matrix is None:
+        found = reference.reference_pairs(given.positions, given.cutoff, queries=given.queries, closed=closed)
+    else:
+        options = {"matrix": given.matrix, "periodic": given.periodic, "queries": given.queries, "closed": closed}
+        found = ((i, j) for i, j, _ in reference.reference_images(given.positions, given.cutoff, **options))
+    batch = given.batch
+    return Counter((i, j) for i, j in found if batch is None or batch[i] == batch[j])
+
+
+def _judge(found: Counter, case: str) -> dict[str, Any]:
+    expected = expected_pairs(case)
+    missing, extra = (expected - found).total(), (found - expected).total()
+    right = (missing, extra) == (0, 0)
+    answer = "right" if right else "right, closed" if found == expected_pairs(case, closed=True) else "wrong"
+    return {"answer": answer, "missing": missing, "extra": extra, "pairs": expected.total()}
+
+
+# --- one process per peer -------------------------------------------------------------------------------------------------
+
+
+def measure(folder: Path, names: list[str], limit_s: float) -> Path:
+    """Ask each peer for each case of the catalog; write answers.csv row by row, and return its path.
+
+    Args:
+        folder: Takes the table; one that is there is replaced.
+        names: Of peers.
+        limit_s: Time for one answer [s], compilation included; beyond, the process is ended and the next case asked.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path, commit = folder / "answers.csv", _machine.commit()
+    cases = [(row.title, case) for row in CATALOG for case in row.cases]
+    with path.open("w", encoding="utf-8", newline="") as stream, tqdm(total=len(names) * len(cases)) as bar:
+        writer: csv.DictWriter[str] = csv.DictWriter(stream, COLUMNS)
+        writer.writeheader()
+        for name in names:
+            for (title, case), fields in zip(cases, _answers(name, [case for _, case in cases], limit_s), strict=True):
+                writer.writerow(
+                    {"row": title, "case": case, "peer": name, "version": _version(PEERS[name].package)} | fields | commit
+                )
+                stream.flush()
+                bar.set_postfix_str(f"{name}: {case}")
+                bar.update()
+    return path
+
+
+def table(path: Path) -> str:
+    """Return the answers as a table in Markdown, a line for each row of the catalog and a column for each peer."""
+    with path.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    peers = list(dict.fromkeys(row["peer"] for row in rows))
+    titles = {peer: next(row["version"] for row in rows if row["peer"] == peer) for peer in peers}
+    head = ["case", *(f"{peer} {titles[peer]}" for peer in peers)]
+    lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
+    for row in CATALOG:
+        answers = [_said([r for r in rows if r["row"] == row.title and r["peer"] == peer]) for peer in peers]
+        if row.cases:
+            lines.append(f"| {row.title} | {' | '.join(answers)} |")
+    return "\n".join(lines)
+
+
+def _said(rows: list[dict[str, str]]) -> str:
+    """Say in a word or two what a peer answered on all cases of a row."""
+    if all(row["answer"] == "right" for row in rows):
+        return "right"
+    parts = []
+    for row in rows:
+        counts = [f"{row[kind]} {kind}" for kind in ("missing", "extra") if row[kind] not in ("", "0")]
+        parts.append(", ".join(counts) if row["answer"] == "wrong" else row["answer"])
+    return "; ".join(dict.fromkeys(parts))
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _answers(name: str, cases: list[str], limit_s: float) -> Iterator[dict[str, Any]]:
+    """Yield what a peer answers on each case; a process that crashes or takes too long is replaced."""
+    context = multiprocessing.get_context("spawn")
+
+    def start() -> tuple[Connection, Any]:
+        here, there = context.Pipe()
+        worker = context.Process(target=_serve, args=(name, there), daemon=True)
+        worker.start()
+        there.close()
+        here.recv()  # it has been imported
+        return here, worker
+
+    pipe, worker = start()
+    for case in cases:
+        pipe.send(case)
+        try:
+            answer = pipe.recv() if pipe.poll(limit_s) else {"answer": f"none in {limit_s:g} s"}
+            alive = not answer["answer"].startswith("none in")
+        except EOFError:
+            worker.join()
+            answer, alive = {"answer": f"crash ({worker.exitcode})"}, False
+        if not alive:
+            worker.kill()
+            worker.join()
+            pipe, worker = start()
+        yield answer
+    worker.kill()
+
+
+def _serve(name: str, pipe: Connection) -> None:
+    import warnings
+
+    warnings.simplefilter("ignore")
+    pipe.send("ready")
+    while True:
+        case = pipe.recv()
+        try:
+            given = problem(case, _DTYPE, _DIM)
+            if given.batch is not None and name != "jfrnn":
+                answer = {"answer": "not asked"}
+            else:
+                i, j = PEERS[name].ask(given)
+                answer = _judge(Counter(zip(i.tolist(), j.tolist(), strict=True)), case)
+        except Cannot as error:
+            answer = {"answer": f"no {error}"}
+        except ImportError:
+            answer = {"answer": "not installed"}
+        except Exception as error:  # what a peer raises is its answer
+            answer = {"answer": f"{type(error).__name__}"}
+        pipe.send(answer)

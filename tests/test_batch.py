@@ -1,0 +1,152 @@
+"""Batches: every case of `jfrnn.cases.batches` against the oracle, system by system, then what lists make of them."""
+
+import functools
+from itertools import product
+
+import checked
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from jfrnn.cases.batches import BATCH_CASES
+from test_box import image_pairs, masked_images
+
+import jfrnn
+
+SLOW = pytest.mark.slow
+LENGTH, CAPACITY = 128, 256
+
+
+@functools.lru_cache(maxsize=64)
+def expected_images(name, dtype, dim, closed=False):
+    """Return (i, j, S) of the pairs within a system; S is 0 in open space."""
+    given = BATCH_CASES[name].build(dtype, dim)
+    if given.lengths is None:
+        pairs = reference.reference_pairs(given.positions, given.cutoff, queries=given.queries, closed=closed)
+        found = {(i, j, (0,) * dim) for i, j in pairs}
+    else:
+        matrix = np.diag(given.lengths)
+        found = reference.reference_images(given.positions, given.cutoff, matrix=matrix, periodic=(True,) * dim, closed=closed)
+    of_queries = given.batch if given.query_batch is None else given.query_batch
+    return {pair for pair in found if of_queries[pair[0]] == given.batch[pair[1]]}
+
+
+def numbered(systems):
+    """Return systems padded as the NaN rows of positions are, with a number that none of them has."""
+    return np.concatenate([systems, np.full(LENGTH - len(systems), 12345, np.int32)])
+
+
+def search_case(name, dtype, dim, backend, radii=False, **options):
+    """Search a case padded to one length, so that cases share compiled programs; return the list, positions and queries."""
+    given = BATCH_CASES[name].build(dtype, dim)
+    x, batch, queries = jnp.asarray(checked.padded(given.positions, LENGTH)), numbered(given.batch), {}
+    if given.queries is not None:
+        queries, batch = {"queries": jnp.asarray(checked.padded(given.queries, LENGTH))}, (batch, numbered(given.query_batch))
+    box = {} if given.lengths is None else {"box": jfrnn.Box(given.lengths)}
+    cutoff = jnp.full(LENGTH, given.cutoff, dtype) if radii else given.cutoff
+    nbrs = jfrnn.search(x, cutoff, batch=batch, backend=backend, capacity=CAPACITY, **queries, **box, **options)
+    return nbrs, x, queries
+
+
+def assert_case(name, dtype, dim, backend, closed=False, **options):
+    nbrs, x, queries = search_case(name, dtype, dim, backend, closed=closed, **options)
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE  # the padding
+    if nbrs.box is None:
+        found = {(*pair, (0,) * dim) for pair in reference.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), LENGTH)}
+    else:
+        found = image_pairs(nbrs, x, **queries)
+        assert masked_images(nbrs, x, **queries) == found
+    expected = expected_images(name, dtype, dim, closed)
+    missing, extra = expected - found, found - expected
+    assert (len(missing), len(extra)) == (0, 0), f"missing {sorted(missing)[:5]}, extra {sorted(extra)[:5]} of {len(expected)}"
+
+
+def each_case():
+    """Yield every case, kind and engine; by default, of the array engines, which compile slowly, one kind."""
+    for name, dtype, dim, backend in product(BATCH_CASES, (np.float32, np.float64), (2, 3), ("jax", "warp", "brute")):
+        rarely = backend == "brute" or (backend == "jax" and (dtype, dim) != (np.float32, 3))
+        kind = f"{name}-f{8 * dtype().itemsize}-{dim}d-{backend}"
+        yield pytest.param(name, dtype, dim, backend, id=kind, marks=[SLOW] * rarely)
+
+
+@pytest.mark.parametrize(("name", "dtype", "dim", "backend"), list(each_case()))
+def test_case(name, dtype, dim, backend):
+    assert_case(name, dtype, dim, backend)
+
+
+@pytest.mark.parametrize("name", BATCH_CASES)
+@pytest.mark.parametrize(("dtype", "dim"), [(np.float32, 3), (np.float64, 2)])
+@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
+def test_case_with_a_cutoff_per_particle(name, dtype, dim, backend):
+    rule = "gather" if name == "queries" else "mean"  # of all of them, the same cutoff
+    assert_case(name, dtype, dim, backend, radii=True, radius_rule=rule)
+
+
+@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
+def test_closed_and_half(backend):
+    assert_case("ties", np.float32, 3, backend, closed=True)
+    nbrs, *_ = search_case("ties", np.float32, 3, backend, half=True)
+    expected = {(i, j) for i, j, _ in expected_images("ties", np.float32, 3) if i < j}
+    assert set(reference.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), LENGTH)) == expected
+
+
+def test_a_batch_is_a_loop_over_its_systems():
+    given = BATCH_CASES["extreme_numbers"].build(np.float32, 3)
+    together = jfrnn.count(given.positions, given.cutoff, batch=given.batch)
+    for system in np.unique(given.batch):
+        members = given.batch == system
+        np.testing.assert_array_equal(together[members], jfrnn.count(given.positions[members], given.cutoff))
+
+
+def test_updates_keep_the_systems():
+    given, shift = BATCH_CASES["superposed"].build(np.float32, 3), np.float32(0.25)
+    nbrs = jfrnn.search(given.positions, given.cutoff, batch=given.batch, skin=0.1, slack=2.0)
+    moved = given.positions * (1 - shift * given.positions)
+    again = jax.jit(lambda nbrs, x: nbrs.update(x))(nbrs, moved)
+    again.check()
+    assert again.rebuild_count == 1
+    i, k = np.nonzero(again.distances(moved)[1])
+    pairs = reference.reference_pairs(moved, given.cutoff)
+    expected = {(i, j) for i, j in pairs if given.batch[i] == given.batch[j]}
+    assert set(zip(i.tolist(), np.asarray(again.idx)[i, k].tolist(), strict=True)) == expected
+
+
+def test_traced_systems_share_one_program():
+    given, traces = BATCH_CASES["superposed"].build(np.float32, 2), []
+
+    @jax.jit
+    def count(x, batch):
+        traces.append(None)
+        return jfrnn.count(x, 0.375, batch=batch)
+
+    count(given.positions, given.batch)
+    together = count(given.positions, 0 * given.batch)
+    np.testing.assert_array_equal(together, jfrnn.count(given.positions, 0.375))
+    assert len(traces) == 1
+
+
+X, SYSTEMS = np.zeros((4, 3), np.float32), np.zeros(4, np.int32)
+PAIR = {"queries": X[:2]}
+
+
+@pytest.mark.parametrize(
+    ("error", "match", "options"),
+    [
+        (TypeError, "batch must be an array of integers, the system of each particle, got float32", {"batch": X[:, 0]}),
+        (TypeError, "batch must be an array of integers.*got list", {"batch": [0, 0, 1, 1]}),
+        (ValueError, r"batch must have shape \[4\], the system of each particle, got shape \[3\]", {"batch": SYSTEMS[:3]}),
+        (ValueError, r"batch holds numbers from 0 to 4294967296", {"batch": np.array([0, 1, 2, 2**32])}),
+        (
+            ValueError,
+            r"batch must be a pair of arrays, of the positions \[4\] and of the queries \[2\]",
+            {"batch": SYSTEMS, **PAIR},
+        ),
+        (ValueError, r"batch\[1\] must have shape \[2\], the system of each query", {"batch": (SYSTEMS, SYSTEMS), **PAIR}),
+        (ValueError, "backend='hashgrid' knows one system at a time: pass", {"batch": SYSTEMS, "backend": "hashgrid"}),
+    ],
+)
+def test_errors(error, match, options):
+    for function in (jfrnn.search, jfrnn.count):
+        with pytest.raises(error, match=match):
+            function(X, 1.0, **options)
