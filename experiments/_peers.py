@@ -3,6 +3,8 @@
 import csv
 import importlib.util
 import multiprocessing
+import resource
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from importlib.metadata import PackageNotFoundError, version
@@ -17,8 +19,9 @@ from tqdm import tqdm
 from experiments import _machine
 
 Pairs = tuple[np.ndarray, np.ndarray]
-COLUMNS = ("row", "case", "peer", "version", "answer", "missing", "extra", "pairs", "commit", "dirty")
+COLUMNS = ("row", "case", "peer", "version", "answer", "missing", "extra", "pairs", "reason", "commit", "dirty")
 _DTYPE, _DIM = np.float32, 3
+_MOST_MEMORY = 16 << 30  # of a process [B]
 _REFERENCE = Path(__file__).parent.parent / "tests" / "reference.py"
 
 
@@ -105,7 +108,9 @@ def _jax_md(given: Problem) -> Pairs:
     i, j = np.asarray(nbrs.idx)
     there = i < len(points)
     i, j = i[there], j[there]
-    distance = np.linalg.norm(np.asarray(space.map_bond(displacement)(points[i], points[j])).reshape(len(i), -1), axis=1)
+    if len(i) == 0:
+        return i, j
+    distance = np.linalg.norm(np.asarray(space.map_bond(displacement)(points[i], points[j])), axis=1)
     inside = distance < np.float32(given.cutoff)  # its list holds candidates: an energy looks at the distance
     return i[inside], j[inside]
 
@@ -225,7 +230,7 @@ def _said(rows: list[dict[str, str]]) -> str:
     for row in rows:
         counts = [f"{row[kind]} {kind}" for kind in ("missing", "extra") if row[kind] not in ("", "0")]
         parts.append(", ".join(counts) if row["answer"] == "wrong" else row["answer"])
-    return "; ".join(dict.fromkeys(parts))
+    return "; ".join(part for part in dict.fromkeys(parts) if part != "right")
 
 
 def _version(package: str) -> str:
@@ -265,9 +270,8 @@ def _answers(name: str, cases: list[str], limit_s: float) -> Iterator[dict[str, 
 
 
 def _serve(name: str, pipe: Connection) -> None:
-    import warnings
-
     warnings.simplefilter("ignore")
+    resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY, _MOST_MEMORY))
     pipe.send("ready")
     while True:
         case = pipe.recv()
@@ -283,5 +287,5 @@ def _serve(name: str, pipe: Connection) -> None:
         except ImportError:
             answer = {"answer": "not installed"}
         except Exception as error:  # what a peer raises is its answer
-            answer = {"answer": f"{type(error).__name__}"}
+            answer = {"answer": type(error).__name__, "reason": " ".join(str(error).split())[:200]}
         pipe.send(answer)

@@ -2,6 +2,7 @@
 
 import ast
 import doctest
+import importlib
 import re
 import subprocess
 import sys
@@ -76,6 +77,12 @@ def test_examples_in_docstrings():
     result = doctest.testmod(jfrnn)
     assert result.attempted > 0
     assert result.failed == 0
+
+
+@pytest.mark.parametrize("table", ["batches", "catalog", "hard", "radii"])
+def test_examples_in_cases(table):
+    result = doctest.testmod(importlib.import_module(f"jfrnn.cases.{table}"))
+    assert (result.attempted > 0, result.failed) == (True, 0)
 
 
 def test_example_in_the_readme():
