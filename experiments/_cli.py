@@ -139,6 +139,19 @@ def options(
 
 
 @app.command()
+def use(
+    points: Annotated[int, typer.Option(min=100, help="Random points.")] = 250_000,
+    rounds: Annotated[int, typer.Option(min=2, help="Timed runs of each.")] = 9,
+) -> None:
+    """Time what uses a list: particles in random order or sorted, rows padded or compressed."""
+    with _usage_errors():
+        from experiments import _use
+
+        for table in (_use.order_table(points, rounds), _use.rows_table(points // 5, rounds)):
+            typer.echo(table.to_string(index=False, float_format="%.3g") + "\n")
+
+
+@app.command()
 def peers(
     names: Annotated[list[str] | None, typer.Argument(help="Of libraries; all that are known without.")] = None,
     out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "peers",

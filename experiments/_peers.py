@@ -93,8 +93,7 @@ def _jax_md(given: Problem) -> Pairs:
     points = jnp.asarray(given.positions)
     if given.matrix is None:
         displacement, _ = space.free()
-        low = np.nan_to_num(given.positions).min(axis=0)
-        extent = np.nan_to_num(given.positions).max(axis=0) - low
+        low, extent = _bounds(given.positions)
         points, size = points - low, extent + given.cutoff  # its cells begin at 0
         make = partition.neighbor_list(displacement, size, given.cutoff, format=partition.NeighborListFormat.Sparse)
     elif not all(given.periodic):
@@ -122,10 +121,8 @@ def _nvalchemi(given: Problem) -> Pairs:
     points = jnp.asarray(given.positions)
     cell, periodic = given.matrix, jnp.asarray(given.periodic)[None]
     if cell is None:
-        finite = given.positions[np.isfinite(given.positions).all(axis=1)]
-        low = finite.min(axis=0) - np.float32(given.cutoff)
-        cell = np.diag(np.ptp(finite, axis=0) + np.float32(2 * given.cutoff))
-        points = points - low
+        low, extent = _bounds(given.positions)
+        points, cell = points - low, np.diag(extent + np.float32(given.cutoff))  # its cells begin at 0
     cell = jnp.asarray(cell, jnp.float32)[None]
     cells, _, radius = estimate_cell_list_sizes(points, cell, given.cutoff, periodic)
     most = 8 * len(points) if given.matrix is not None else len(points)
@@ -144,6 +141,14 @@ PEERS = {
     "jax-md": _Peer("jax-md", _jax_md),
     "nvalchemi": _Peer("nvalchemi-toolkit-ops", _nvalchemi),
 }
+
+
+def _bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest coordinates and the extents of the finite points, [dim] each; 0 where there is none."""
+    finite = points[np.isfinite(points).all(axis=1)]
+    if len(finite) == 0:
+        return np.zeros(points.shape[1], points.dtype), np.zeros(points.shape[1], points.dtype)
+    return finite.min(axis=0), np.ptp(finite, axis=0)
 
 
 def _cutoff(given: Problem) -> float:
@@ -229,7 +234,8 @@ def _said(rows: list[dict[str, str]]) -> str:
     parts = []
     for row in rows:
         counts = [f"{row[kind]} {kind}" for kind in ("missing", "extra") if row[kind] not in ("", "0")]
-        parts.append(", ".join(counts) if row["answer"] == "wrong" else row["answer"])
+        said = {"wrong": ", ".join(counts), "error": f"error: {row['reason'].rstrip('.')[:60]}"}
+        parts.append(said.get(row["answer"], row["answer"]))
     return "; ".join(part for part in dict.fromkeys(parts) if part != "right")
 
 
@@ -287,5 +293,6 @@ def _serve(name: str, pipe: Connection) -> None:
         except ImportError:
             answer = {"answer": "not installed"}
         except Exception as error:  # what a peer raises is its answer
-            answer = {"answer": type(error).__name__, "reason": " ".join(str(error).split())[:200]}
+            reason = " ".join(str(error).split())[:200]
+            answer = {"answer": "out of memory" if "out of memory" in reason.lower() else "error", "reason": reason}
         pipe.send(answer)
