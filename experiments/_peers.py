@@ -125,7 +125,7 @@ def _nvalchemi(given: Problem) -> Pairs:
         points, cell = points - low, np.diag(extent + np.float32(given.cutoff))  # its cells begin at 0
     cell = jnp.asarray(cell, jnp.float32)[None]
     cells, _, radius = estimate_cell_list_sizes(points, cell, given.cutoff, periodic)
-    most = 8 * len(points) if given.matrix is not None else len(points)
+    most = 64 * len(points) if given.matrix is not None else len(points)
     idx, count, *_ = cell_list(
         points, given.cutoff, cell, periodic, max_neighbors=most, max_total_cells=int(cells), neighbor_search_radius=radius
     )

@@ -40,7 +40,7 @@ def order_table(points: int, rounds: int, neighbors: int = 30) -> pd.DataFrame:
             calls[f"sort {order}"] = lambda sort=sort: sort(x)
         nbrs = search(there)
         calls[f"search {order}"] = lambda there=there: search(there).idx
-        calls[f"sum {order}"] = lambda there=there, nbrs=nbrs: _padded_sum(there, nbrs)
+        calls[f"sum {order}"] = lambda there=there, nbrs=nbrs: _padded_sum(there, nbrs, r)
     milliseconds = _medians(calls, rounds)
     rows, first = [], milliseconds["search random"] + milliseconds["sum random"]
     for order in ORDERS:
@@ -72,7 +72,7 @@ def rows_table(points: int, rounds: int, clumps: tuple[int, ...] = (0, 100, 300,
         make = jax.jit(lambda nbrs, total=total: nbrs.pairs(total))
         i, j = make(nbrs)
         calls = {
-            "padded": lambda x=x, nbrs=nbrs: _padded_sum(x, nbrs),
+            "padded": lambda x=x, nbrs=nbrs: _padded_sum(x, nbrs, r),
             "compressed": lambda x=x, i=i, j=j: _compressed_sum(x, i, j, r),
             "make": lambda make=make, nbrs=nbrs: make(nbrs),
         }
@@ -84,9 +84,9 @@ def rows_table(points: int, rounds: int, clumps: tuple[int, ...] = (0, 100, 300,
 
 
 @jax.jit
-def _padded_sum(x: jax.Array, nbrs: jfrnn.NeighborList) -> jax.Array:
+def _padded_sum(x: jax.Array, nbrs: jfrnn.NeighborList, r: float) -> jax.Array:
     distances, mask = nbrs.distances(x)
-    return jnp.where(mask, nbrs.cutoff - distances, 0).sum(axis=1)
+    return jnp.where(mask, r - distances, 0).sum(axis=1)
 
 
 @jax.jit
