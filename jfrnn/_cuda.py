@@ -124,6 +124,13 @@ _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_CallFrame))
 _kept: list[Any] = []  # handlers live as long as programs that call them: as long as the process
 
 
+class _Stream(NamedTuple):
+    """What a launch reads of a stream. Warp forgets a stream once any `wp.Stream` of it is gone, whoever else has one."""
+
+    cuda_stream: int
+    device: Any
+
+
 class _Recorded(NamedTuple):
     """Launches, and the arguments of theirs that hold an address, each with the buffer whose address that is."""
 
@@ -141,7 +148,7 @@ def register(name: str, wp: Any, dtypes: Sequence[Any], commands: Callable[..., 
         commands: arrays -> commands, in order; once per device and shapes, with a `warp.array` for each buffer.
     """
     recorded: dict[tuple[int, ...], _Recorded] = {}
-    streams: dict[int, Any] = {}
+    streams: dict[int, _Stream] = {}
     recent: OrderedDict[tuple[int, ...], None] = OrderedDict()
     graphs: OrderedDict[tuple[int, ...], Any] = OrderedDict()
     lock = threading.Lock()
@@ -157,7 +164,7 @@ def register(name: str, wp: Any, dtypes: Sequence[Any], commands: Callable[..., 
             if stream is None:
                 frame.api.contents.get_device(ask)
                 device = wp.get_cuda_device((ask.answer or 0) & 0x7FFFFFFF)
-                stream = streams[address] = wp.Stream(device, cuda_stream=address)
+                stream = streams[address] = _Stream(address, device)
             here = [buffer.data for buffer in buffers]
             key = (address, *here, *(buffer.dims[k] for buffer in buffers for k in range(buffer.rank)))
             graph = graphs.get(key)
@@ -178,7 +185,8 @@ def register(name: str, wp: Any, dtypes: Sequence[Any], commands: Callable[..., 
                 for command in launches:
                     command.launch(stream)
                 return
-            with wp.ScopedStream(stream, sync_enter=False), wp.ScopedCapture() as capture:
+            known = wp.Stream(stream.device, cuda_stream=address)
+            with wp.ScopedStream(known, sync_enter=False), wp.ScopedCapture() as capture:
                 for command in launches:
                     command.launch(stream)
             graphs[key] = capture.graph
