@@ -96,8 +96,10 @@ def search(
         RuntimeError: "warp" or "hashgrid" on a platform on which Warp cannot run.
         Overflow of a given capacity and non-finite coordinates are known only from data: `status`, `overflow` and `check` tell.
 
-    Memory: 4 B per slot for the list; besides it, whatever the box, "warp" takes at most 64 B and "hashgrid" 84 B per particle,
-    "jax" and "brute" at most 64 MB for the block in work and 100 B per particle (float64: 125 B). See `memory_plan`.
+    Memory: 4 B per slot for the list; besides it, however large space is, "warp" takes at most 64 B and "hashgrid" 84 B per
+    particle, "jax" and "brute" at most 64 MB for the block in work and 100 B per particle (float64: 125 B). See `memory_plan`. With
+    a box or a batch "warp" takes a copy of the positions besides, at most 20 B per particle (float64: 40 B); with a cutoff per
+    particle 140 B in all (float64: 180 B).
     Differentiable: the list is topology, without gradient; see `NeighborList.vectors`. Jit: yes, with capacity. vmap: yes, with
     capacity. Source: cell lists (Hockney & Eastwood 1981, ch. 8); strict cutoff (Peifle 2019, §2.2).
     """

@@ -76,7 +76,7 @@ def test_case(name, dtype, dim, backend):
 
 
 @pytest.mark.parametrize("name", BATCH_CASES)
-@pytest.mark.parametrize(("dtype", "dim"), [(np.float32, 3), (np.float64, 2)])
+@pytest.mark.parametrize(("dtype", "dim"), [(np.float32, 3), pytest.param(np.float64, 2, marks=SLOW)])
 @pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
 def test_case_with_a_cutoff_per_particle(name, dtype, dim, backend):
     rule = "gather" if name == "queries" else "mean"  # of all of them, the same cutoff

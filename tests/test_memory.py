@@ -184,3 +184,20 @@ def test_input_errors(error, match, arguments):
 def test_float64_without_x64_is_refused():
     with jax.enable_x64(False), pytest.raises(TypeError, match="dtype is float64, but JAX's 64-bit mode is off"):
         jfrnn.memory_plan(10, 0.1, 8, dtype=np.float64)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
+def test_options_of_warp_take_what_is_stated(dtype):
+    """A box or a batch copies the positions, and cutoffs per particle are prepared by XLA: bytes per particle, the list apart."""
+    n = 20_000
+    x, radii = jax.ShapeDtypeStruct((n, 3), dtype), jax.ShapeDtypeStruct((n,), dtype)
+    systems, box = jax.ShapeDtypeStruct((n,), np.int32), jfrnn.Box([1.0] * 3, images=1)
+    common = {"capacity": 8, "backend": "warp"}
+    programs = [
+        (64 + 20, lambda x, radii, systems: jfrnn.search(x, 0.01, box=box, batch=systems, **common)),
+        (140, lambda x, radii, systems: jfrnn.search(x, radii, radius_rule="mean", box=box, **common)),
+    ]
+    bounds = [bound if dtype == np.float32 else wide for (bound, _), wide in zip(programs, (64 + 40, 180), strict=True)]
+    for bound, (_, program) in zip(bounds, programs, strict=True):
+        analysis = jax.jit(program).lower(x, radii, systems).compile().memory_analysis()
+        assert analysis.temp_size_in_bytes <= bound * n + 64_000

@@ -1,0 +1,168 @@
+"""The calls of XLA on CUDA, without a device: frames as XLA lays them out, and a Warp that notes what it is asked for."""
+
+import contextlib
+import ctypes
+from types import SimpleNamespace
+
+import jax
+import pytest
+
+from jfrnn import _cuda
+
+DEVICE = SimpleNamespace(name="cuda:0")
+
+
+class Array:
+    """What is used of a `warp.array`."""
+
+    def __init__(self, ptr, shape, dtype, device):
+        self.ptr, self.shape = ptr, shape
+        self.packed = SimpleNamespace(data=ptr)
+
+    def __ctype__(self):
+        return self.packed
+
+
+class Launch:
+    def __init__(self, log, kernel, inputs):
+        self.log, self.kernel, self.inputs = log, kernel, list(inputs)
+
+    def set_param_at_index_from_ctype(self, index, value):
+        self.inputs[index] = value
+
+    def launch(self, stream):
+        seen = tuple(getattr(x, "data", x) for x in self.inputs)
+        self.log.append(("launch", self.kernel, seen, stream.cuda_stream))
+
+
+class Warp:
+    array = Array
+
+    def __init__(self):
+        self.log, self.recorded = [], 0
+
+    def get_cuda_device(self, number):
+        assert number == 0
+        return DEVICE
+
+    def Stream(self, device, cuda_stream):
+        return SimpleNamespace(device=device, cuda_stream=cuda_stream)
+
+    def launch(self, kernel, dim, inputs, device, block_dim, record_cmd):
+        assert record_cmd
+        self.recorded += 1
+        return Launch(self.log, kernel, inputs)
+
+    def ScopedStream(self, stream, sync_enter):
+        return contextlib.nullcontext()
+
+    @contextlib.contextmanager
+    def ScopedCapture(self):
+        capture, begin = SimpleNamespace(graph=None), len(self.log)
+        yield capture
+        capture.graph = tuple(self.log[begin:])
+        del self.log[begin:]
+
+    def capture_launch(self, graph, stream):
+        self.log.append(("graph", graph, stream.cuda_stream))
+
+
+class Frame:
+    """A call frame with an input [4, 2] and an output [4] at some addresses."""
+
+    def __init__(self, addresses, extension=None):
+        self.failure = None
+        self.dims = [(ctypes.c_int64 * 2)(4, 2), (ctypes.c_int64 * 1)(4)]
+        self.buffers = [
+            _cuda._Buffer(ctypes.sizeof(_cuda._Buffer), None, 11, address, len(dims), dims)
+            for address, dims in zip(addresses, self.dims, strict=True)
+        ]
+        self.pointers = [(ctypes.POINTER(_cuda._Buffer) * 1)(ctypes.pointer(buffer)) for buffer in self.buffers]
+        self.functions = [_cuda._Get(self.stream), _cuda._Get(self.device), _cuda._Fail(self.fail)]
+        self.api = _cuda._Api(get_stream=self.functions[0], get_device=self.functions[1], fail=self.functions[2])
+        self.frame = _cuda._CallFrame(api=ctypes.pointer(self.api), context=7)
+        if extension is not None:
+            self.frame.extension = ctypes.pointer(extension)
+        for name, pointer in zip(("inputs", "outputs"), self.pointers, strict=True):
+            part = getattr(self.frame, name)
+            part.size, part.buffers = 1, pointer
+
+    def stream(self, ask):
+        assert ask.contents.context == 7
+        ask.contents.answer = 99
+        return 0
+
+    def device(self, ask):
+        ask.contents.answer = 0
+        return 0
+
+    def fail(self, failure):
+        self.failure = failure.contents.message.decode()
+        return 1
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """Register a call of two kernels; return what XLA would call, and the Warp that notes it."""
+    warp, handlers = Warp(), []
+    monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda name, capsule, platform: handlers.append((name, platform)))
+
+    def commands(x, count):
+        if x.ptr == 666:
+            raise RuntimeError("no such kernel")
+        return [_cuda.Command("sort", [x, 4], 4, 128), _cuda.Command("query", [x, count], 4, 32)]
+
+    _cuda.register("called", warp, ["float", "int"], commands)
+    assert handlers == [("called", "CUDA")]
+    return _cuda._kept.pop(), warp
+
+
+def call(handler, *addresses, **options):
+    frame = Frame(addresses, **options)
+    return handler(ctypes.pointer(frame.frame)), frame
+
+
+def launches(x, count):
+    return [("launch", "sort", (x, 4), 99), ("launch", "query", (x, count), 99)]
+
+
+def test_launches_are_recorded_once_and_told_new_addresses(registered):
+    handler, warp = registered
+    for k in range(40):
+        assert call(handler, 1000 + k, 2000 + k)[0] is None
+        assert warp.log[-2:] == launches(1000 + k, 2000 + k)
+    assert warp.recorded == 2
+    assert len(warp.log) == 80
+
+
+def test_addresses_that_come_back_soon_become_a_graph(registered):
+    handler, warp = registered
+    call(handler, 1000, 2000)
+    call(handler, 1001, 2001)
+    del warp.log[:]
+    for _ in range(3):
+        call(handler, 1000, 2000)
+    assert warp.log == [("graph", tuple(launches(1000, 2000)), 99)] * 3
+    del warp.log[:]
+    for k in range(_cuda._SOON + 1):  # none comes back within so many others
+        call(handler, 3000 + k, 4000)
+    call(handler, 3000, 4000)
+    assert not any(entry[0] == "graph" for entry in warp.log)
+    call(handler, 1000, 2000)  # a graph that was made is kept
+    assert warp.log[-1][0] == "graph"
+
+
+def test_what_goes_wrong_is_told_to_xla(registered):
+    handler, _ = registered
+    answer, frame = call(handler, 666, 2000)
+    assert answer == 1
+    assert frame.failure == "called: RuntimeError: no such kernel"
+
+
+def test_the_version_of_the_interface_is_told(registered):
+    handler, warp = registered
+    metadata = _cuda._Metadata()
+    extension = _cuda._Extension(type=1, metadata=ctypes.pointer(metadata))
+    assert call(handler, 1000, 2000, extension=extension)[0] is None
+    assert (metadata.version.major, metadata.version.minor) == (0, 1)
+    assert warp.log == []
