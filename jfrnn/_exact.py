@@ -153,8 +153,8 @@ def _sum_rounded_up(x: Array, skin: float) -> Array:
 def bounds_of_pairs(cutoffs: Cutoffs, radii: list[Array], slack: Array | None = None) -> tuple[Array, Array]:
     """Return what step 1 compares scaled squared distances with: below the first a pair without doubt, above the second none.
 
-    A mean is rounded, and so are its halves: 32 eps instead of 8 cover that generously. So small against the largest that squares could underflow, a cutoff
-    leaves to the next steps whatever is not surely farther.
+    A mean is rounded, and so are its halves: 32 eps instead of 8 cover that generously. A cutoff so small against the largest
+    that squares could underflow leaves to the next steps whatever is not surely farther.
     """
     finfo = jnp.finfo(cutoffs.largest.dtype)
     scaled = [radius * cutoffs.unit_scale for radius in radii]
