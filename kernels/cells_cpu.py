@@ -52,7 +52,8 @@ for (int k = 0; k < DIM; ++k) {
     high[k] = -__builtin_inff();
 }
 int finite = 0;
-for (int i = 0; i < n; ++i) {
+const bool bounded = periodic_axes == (1 << DIM) - 1;  // the cells are those of the box, wherever the particles are
+for (int i = 0; i < n && !bounded; ++i) {
     real p[3], at[3];
     point_of(positions.data + (long long)ROW * i, p);
     if (!finite_point(p))
@@ -66,12 +67,9 @@ if (finite == 0)
     for (int k = 0; k < DIM; ++k)
         low[k] = high[k] = 0;
 Grid grid;
-grid.finite = finite;
 lay_out(grid, low, high, table);
-shared.grid = grid;
 shared.next_chunk = 0;
 info.data[0] = 0;
-info.data[1] = finite < n ? 2 : 0;
 
 auto sort = [&](const real* points, int count, int* first, int* order, bool with_axes) {
     for (int c = 0; c < grid.cells + 2; ++c)
@@ -104,11 +102,10 @@ auto sort = [&](const real* points, int count, int* first, int* order, bool with
     }
     return count - outside;
 };
-shared.finite_queries = sort(positions.data, n, start, ids, true);
-if (!own) {
-    shared.finite_queries = sort(queries.data, m, query_start, query_ids, false);
-    info.data[1] |= shared.finite_queries < m ? 2 : 0;
-}
+grid.finite = sort(positions.data, n, start, ids, true);
+shared.grid = grid;
+shared.finite_queries = own ? grid.finite : sort(queries.data, m, query_start, query_ids, false);
+info.data[1] = grid.finite < n || shared.finite_queries < m ? 2 : 0;
 """
 
 _QUERY = r"""
@@ -322,10 +319,15 @@ auto position_of = [&](int place, real* q) {
         point_of(queries.data + (long long)ROW * query_ids[place], q);
 };
 auto system_at = [&](int place) { return BATCHED ? system_of(queries.data + (long long)ROW * query_ids[place]) : 0u; };
-auto cells_of = [&](int place, const real* q, whole* c) {
-    for (int k = 0; k < DIM; ++k)
-        c[k] = axis_cell(grid, k, coordinate(k, q));
-    c[DIM] = (whole)system_at(place);
+// where the query at a place is along the axes, and its cell
+auto locate = [&](int place, real* at, whole* cell) {
+    real q[3];
+    position_of(place, q);
+    for (int k = 0; k < DIM; ++k) {
+        at[k] = coordinate(k, q);
+        cell[k] = axis_cell(grid, k, at[k]);
+    }
+    cell[DIM] = (whole)system_at(place);
 };
 
 // all queries of one cell: places [begin, end), whose coordinates are between low and high
@@ -471,7 +473,7 @@ for (;;) {
     int place = chunk * CHUNK;
     const int chunk_end = places - place < CHUNK ? places : place + CHUNK;
     whole cell[4], other[4];
-    real q[3];
+    real at[3];
     auto same_cell = [&](const whole* a, const whole* b) {
         bool same = true;
         for (int k = 0; k < DIM + BATCHED; ++k)
@@ -479,15 +481,15 @@ for (;;) {
         return same;
     };
     if (place > 0 && place < finite_places) {  // a cell belongs to the chunk that holds its first place
-        position_of(place - 1, q);
-        cells_of(place - 1, q, cell);
+        locate(place - 1, at, cell);
         for (; place < finite_places; ++place) {
-            position_of(place, q);
-            cells_of(place, q, other);
+            locate(place, at, other);
             if (!same_cell(cell, other))
                 break;
         }
     }
+    if (place < finite_places)
+        locate(place, at, other);
     while (place < chunk_end) {
         if (place >= finite_places) {
             const int id = query_ids[place++];
@@ -496,20 +498,16 @@ for (;;) {
                 write_row(id, 0, 0, true);
             continue;
         }
-        real low[3], high[3];
-        position_of(place, q);
-        cells_of(place, q, cell);
+        real low[3], high[3];  // `other` and `at` are those of the first place
         for (int k = 0; k < DIM; ++k)
-            low[k] = high[k] = coordinate(k, q);
+            low[k] = high[k] = at[k];
+        for (int k = 0; k < DIM + BATCHED; ++k)
+            cell[k] = other[k];
         int end = place + 1;
         for (; end < finite_places; ++end) {
-            position_of(end, q);
-            cells_of(end, q, other);
+            locate(end, at, other);
             if (!same_cell(cell, other))
                 break;
-            real at[3];
-            for (int k = 0; k < DIM; ++k)
-                at[k] = coordinate(k, q);
             widen(low, high, at, at);
         }
         serve(place, end, low, high);

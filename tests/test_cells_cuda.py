@@ -7,7 +7,9 @@ import itertools
 
 import pytest
 import warp as wp
-from jfrnn.kernels import cells_cpu, cells_cuda
+from jfrnn.kernels import cells_cpu, cells_cuda, levels
+
+from jfrnn._levels import GROUPS, HALVINGS
 
 VARIANTS = [(dim, double, False, lists, False) for dim, double, lists in itertools.product((2, 3), (False, True), (False, True))]
 VARIANTS += [
@@ -29,6 +31,14 @@ def test_variants_compile(dim, double, scaled, lists, later, tmp_path):
 @pytest.mark.parametrize("order", [1, 2])
 def test_space_filling_curves_compile(order, tmp_path):
     assert compiles(cells_cuda.cell_kernels(3, False, False, True, reach_x=1, order=order), tmp_path)
+
+
+def test_boxes_batches_and_cutoffs_per_particle_compile(tmp_path):
+    assert compiles(cells_cuda.cell_kernels(3, False, False, True, periodic=2, batched=True), tmp_path)
+    for rule, periodic in (("mean", 2), ("gather", 0)):
+        kernel = levels.query_kernel(3, False, True, rule, GROUPS, HALVINGS, periodic, batched=True)
+        wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
+    assert len(list(tmp_path.glob("*.ptx"))) == 4
 
 
 @pytest.mark.parametrize("module", [cells_cpu, cells_cuda], ids=["cpu", "cuda"])
