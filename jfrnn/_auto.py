@@ -19,7 +19,7 @@ WARP_ENGINES = ("warp", "hashgrid")
 # points, 1.2x slower at 64; jax is 1.2x slower at 16, 3x at 256, 15x at 100 000. Warp compiles sooner too: in 0.05 s instead of
 # 1 to 3 s. On an H200 (16, 32 and 64 points measured) jax takes 1.8 to 2.1 times as long as Warp, brute force 1.2 to 1.4 times;
 # and Warp lists 250 000 points (experiments/results/h200) in less time than jax 64. On the CPU, Warp is per particle 14 to 20 times
-# as fast with a box or a batch, 4 to 26 times with a cutoff per particle (cpu_warp.csv, cpu_jax.csv in experiments/results/options).
+# as fast with a box or a batch, 4 to 26 times with a cutoff per particle (experiments/results/options: cpu_warp.csv, cpu_jax.csv).
 _WARP_FROM = {"cpu": 0, "gpu": 0}
 
 
