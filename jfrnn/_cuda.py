@@ -199,10 +199,10 @@ def register(name: str, wp: Any, dtypes: Sequence[Any], commands: Callable[..., 
         try:
             if call.extension:
                 asked = call.extension.contents
-                if asked.type == _METADATA:
+                if asked.type == _METADATA:  # a question, no call; with any other extension it is one
                     version = asked.metadata.contents.version
                     version.major, version.minor = _API_VERSION
-                return None
+                    return None
             launch(call)
         except Exception as error:  # XLA raises it again
             message = f"{name}: {type(error).__name__}: {error}".encode()

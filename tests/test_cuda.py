@@ -166,3 +166,9 @@ def test_the_version_of_the_interface_is_told(registered):
     assert call(handler, 1000, 2000, extension=extension)[0] is None
     assert (metadata.version.major, metadata.version.minor) == (0, 1)
     assert warp.log == []
+
+
+def test_a_call_with_an_unknown_extension_is_a_call(registered):
+    handler, warp = registered
+    assert call(handler, 1000, 2000, extension=_cuda._Extension(type=7))[0] is None
+    assert warp.log == launches(1000, 2000)
