@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from experiments import _machine, _measure
 from experiments._errors import UsageError
+from jfrnn._neighbors import rounded_capacity
 from jfrnn._warp import kernels_of, load_warp
 
 Strict = ConfigDict(extra="forbid", frozen=True)
@@ -291,7 +292,7 @@ def _memory_rows() -> Iterator[dict[str, Any]]:
     jax.block_until_ready(jfrnn.search(jax.numpy.asarray(blob[:1000], jax.numpy.float32), 1.0, backend="warp").idx)  # libraries
     for name, points in scenes.items():
         x = jax.numpy.asarray(points, jax.numpy.float32)
-        capacity = _capacity(jfrnn.count(x, 1.0, backend="warp").max())
+        capacity = rounded_capacity(int(jfrnn.count(x, 1.0, backend="warp").max()))
         search = jax.jit(functools.partial(_listed, cutoff=1.0, capacity=capacity, backend="warp"))
         compiled: Any = search.lower(x).compile().memory_analysis()
         before = _device_bytes("bytes_in_use")
@@ -317,11 +318,6 @@ def _warp_pool_bytes() -> int:
 
 
 # --- timings ----------------------------------------------------------------------------------------------------------
-
-
-def _capacity(longest: Any) -> int:  # noqa: ANN401
-    """Round the longest row up to a multiple of 8, as an eager search does."""
-    return -(-int(longest) // 8) * 8
 
 
 def _listed(x: Any, *, cutoff: float, capacity: int, backend: str) -> Any:  # noqa: ANN401
@@ -360,7 +356,7 @@ def _scene_rows(config: Config, layout: str, points: np.ndarray) -> Iterator[dic
 
     x, cutoff, n = jnp.asarray(points), config.reach_in_spacings, len(points)
     exact = np.asarray(jfrnn.count(x, cutoff, backend="jax"))
-    capacity = _capacity(exact.max())
+    capacity = rounded_capacity(int(exact.max()))
     base = {"layout": layout, "points": n, "capacity": capacity, "dtype": "float32", "exact_directed_pairs": int(exact.sum())}
     listed = functools.partial(_listed, cutoff=cutoff, capacity=capacity)
 
@@ -402,7 +398,7 @@ def _loop_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> I
 
     box = jfrnn.Box([float(round(base["points"] ** (1 / 3)))] * 3, origin=-0.5)
     counts = np.asarray(jfrnn.count(x, cutoff, box=box, backend="warp"))
-    capacity = _capacity(counts.max())
+    capacity = rounded_capacity(int(counts.max()))
 
     def periodic(x: Any) -> Any:  # noqa: ANN401
         nbrs = jfrnn.search(x, cutoff, box=box, capacity=capacity, backend="warp")
@@ -418,7 +414,7 @@ def _loop_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> I
     if base["points"] > 1_000_000:
         return
     skin = 0.1 * cutoff
-    wider = _capacity(jfrnn.count(x, cutoff + skin, backend="warp").max())
+    wider = rounded_capacity(int(jfrnn.count(x, cutoff + skin, backend="warp").max()))
     nbrs = jfrnn.search(x, cutoff, skin=skin, capacity=wider, backend="warp")
     for name, velocity in (("keeps", 0.0), ("rebuilds", skin)):
 
@@ -545,7 +541,7 @@ def _study_rows(config: Config, n: int) -> Iterator[dict[str, Any]]:
     lattice = np.random.default_rng(config.seed).permutation(given.positions).astype(np.float32)
     for layout, points, cutoff in (("jitter", jitter, config.reach_in_spacings), ("full", lattice, given.cutoff)):
         longest, directed = _kernel_time(config, points, cutoff, 0, lists=False)[2:]
-        capacity = _capacity(longest)
+        capacity = rounded_capacity(int(longest))
         for what, options in _STUDIED.items():
             seconds, stages, longest, pairs = _kernel_time(config, points, cutoff, capacity, **options)
             yield {

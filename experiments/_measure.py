@@ -86,6 +86,8 @@ def repeat(search: Callable[[], Any], repeats: int, min_seconds: float, max_repe
 def time_in_turns(calls: dict[str, Callable[[], Any]], rounds: int, burst: int = 1) -> tuple[dict[str, list[float]], float | None]:
     """Time calls in turns, so that all suffer alike from what else the machine does.
 
+    Each run follows one call that is not timed: it is its own data that the caches hold, not what another call left there.
+
     Args:
         calls: By name; compiled, and warm.
         rounds: Timed runs of each.

@@ -14,6 +14,7 @@ import pandas as pd
 
 import jfrnn
 from experiments import _machine, _measure
+from jfrnn._neighbors import rounded_capacity
 
 COLUMNS = (
     *("platform", "backend", "n", "option", "entries", "capacity", "rounds", "list_s", "count_s", "list_ratio", "count_ratio"),
@@ -106,23 +107,18 @@ def _options(n: int, neighbors: int) -> Iterator[_Option]:
 
 
 def _compiled(option: _Option, backend: str) -> tuple[Callable[[], Any], Callable[[], Any]]:
-    counted = {name: value for name, value in option.more.items() if name != "skin"}
-    reach = option.cutoff + option.more.get("skin", 0.0)
-    longest = int(jfrnn.count(option.x, reach, backend=backend, **counted).max())
-    data: dict[str, Any] = {name: value for name, value in option.more.items() if hasattr(value, "shape")}  # operands, no constants
-    more = {name: value for name, value in option.more.items() if name not in data}
-    cutoff = option.cutoff
-    if hasattr(cutoff, "shape"):
-        data["cutoff"] = cutoff
-    else:
-        more["cutoff"] = cutoff
-    counted = {name: value for name, value in more.items() if name != "skin"}
-    capacity = -(-longest // 8) * 8
+    given = {name: value for name, value in option.more.items() if name != "skin"}
+    skin = option.more.get("skin", 0.0)
+    longest = int(jfrnn.count(option.x, option.cutoff + skin, backend=backend, **given).max())
+    capacity = rounded_capacity(longest)
+    given["cutoff"] = option.cutoff
+    data: dict[str, Any] = {name: value for name, value in given.items() if hasattr(value, "shape")}  # operands, no constants
+    more = {name: value for name, value in given.items() if name not in data}
 
     def listed(x: jax.Array, data: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
-        nbrs = jfrnn.search(x, capacity=capacity, backend=backend, **more, **data)
+        nbrs = jfrnn.search(x, skin=skin, capacity=capacity, backend=backend, **more, **data)
         return nbrs.idx, nbrs.count
 
     search = jax.jit(listed)
-    count = jax.jit(lambda x, data: jfrnn.count(x, backend=backend, **counted, **data))
+    count = jax.jit(lambda x, data: jfrnn.count(x, backend=backend, **more, **data))
     return lambda: search(option.x, data), lambda: count(option.x, data)

@@ -1,7 +1,7 @@
 """What other libraries answer on the hard cases: each in a process of its own, against exact arithmetic, within a time limit."""
 
 import csv
-import importlib.util
+import importlib
 import multiprocessing
 import resource
 import warnings
@@ -22,7 +22,6 @@ Pairs = tuple[np.ndarray, np.ndarray]
 COLUMNS = ("row", "case", "peer", "version", "answer", "missing", "extra", "pairs", "reason", "commit", "dirty")
 _DTYPE, _DIM = np.float32, 3
 _MOST_MEMORY = 16 << 30  # of a process [B]
-_REFERENCE = Path(__file__).parent.parent / "tests" / "reference.py"
 
 
 class Cannot(Exception):
@@ -161,11 +160,7 @@ def _cutoff(given: Problem) -> float:
 
 def expected_pairs(case: str, closed: bool = False) -> Counter:
     """Return how often each ordered pair is one, once for each image, as the oracle of the tests decides it."""
-    spec = importlib.util.spec_from_file_location("reference", _REFERENCE)
-    if spec is None or spec.loader is None:
-        raise FileNotFoundError(f"the oracle of the tests is not where it should be: {_REFERENCE}")
-    reference = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(reference)
+    reference = importlib.import_module("tests.reference")
     given = problem(case, _DTYPE, _DIM)
     if given.matrix is None:
         found = reference.reference_pairs(given.positions, given.cutoff, queries=given.queries, closed=closed)
@@ -261,13 +256,13 @@ def _answers(name: str, cases: list[str], limit_s: float) -> Iterator[dict[str, 
     pipe, worker = start()
     for case in cases:
         pipe.send(case)
+        answered = pipe.poll(limit_s)
         try:
-            answer = pipe.recv() if pipe.poll(limit_s) else {"answer": f"none in {limit_s:g} s"}
-            alive = not answer["answer"].startswith("none in")
+            answer = pipe.recv() if answered else {"answer": f"none in {limit_s:g} s"}
         except EOFError:
             worker.join()
-            answer, alive = {"answer": f"crash ({worker.exitcode})"}, False
-        if not alive:
+            answer, answered = {"answer": f"crash ({worker.exitcode})"}, False
+        if not answered:
             worker.kill()
             worker.join()
             pipe, worker = start()

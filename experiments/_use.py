@@ -11,6 +11,7 @@ import pandas as pd
 
 import jfrnn
 from experiments import _measure
+from jfrnn._neighbors import rounded_capacity
 
 ORDERS = ("random", "row", "morton", "hilbert")
 
@@ -29,7 +30,7 @@ def order_table(points: int, rounds: int, neighbors: int = 30) -> pd.DataFrame:
     """
     random = np.random.default_rng(0)
     x, r = jnp.asarray(random.random((points, 3)), jnp.float32), (3 * neighbors / (4 * math.pi * points)) ** (1 / 3)
-    capacity = -(-int(jfrnn.count(x, r).max()) // 8) * 8
+    capacity = rounded_capacity(int(jfrnn.count(x, r).max()))
     search = jax.jit(lambda x: jfrnn.search(x, r, capacity=capacity))
     calls: dict[str, Callable[[], Any]] = {}
     for order in ORDERS:
