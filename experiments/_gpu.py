@@ -603,7 +603,7 @@ def _kernel_time(
         return float(np.median(times))
 
     until = [measure(k + 1) for k in range(len(launches))]
-    names = ("bounds", "count", "scan", "scatter", "gather", "query")
+    names = ("bounds", "lay_out", "count", "scan", "scatter", "gather", "query")
     stages = {f"{name}_s": float(s) for name, s in zip(names, np.diff([0.0, *until]), strict=True)}
     return until[-1], stages, int(info.numpy()[0]), int(count.numpy().sum(dtype=np.int64))
 

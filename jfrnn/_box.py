@@ -301,6 +301,10 @@ def _inverse(matrix: Array) -> Array:
     return inverse / size.T
 
 
+def _diagonal(matrix: Array) -> Array:
+    return jnp.stack([matrix[k, k] for k in range(len(matrix))])  # not a gather, which would be a kernel of its own
+
+
 def _product(a: Array, b: Array) -> Array:
     return jnp.sum(a[:, :, None] * b[None, :, :], axis=1)  # not a matmul, which may be made in fewer bits
 
@@ -309,7 +313,7 @@ def is_valid(lattice: Lattice) -> Array:
     """Say whether a lattice is one: finite, its vectors independent, lengths positive; [] bool."""
     right = jnp.isfinite(lattice.matrix).all() & jnp.isfinite(lattice.transform).all() & jnp.isfinite(lattice.origin).all()
     if lattice.images.orthogonal:
-        right = right & (jnp.diagonal(lattice.matrix) >= 0).all()
+        right = right & (_diagonal(lattice.matrix) >= 0).all()
     return right
 
 
@@ -346,11 +350,18 @@ def packed_turns(points: Array, lattice: Lattice) -> Array:
 
     -1 where a point is not finite or farther away than `LARGEST_TURN`.
     """
-    turns = jnp.where(np.array(lattice.images.periodic), jnp.floor(fractions_of(points, lattice)), 0)
-    near = (jnp.isfinite(points) & (jnp.abs(turns) <= LARGEST_TURN)).all(axis=1)
-    parts = [(turns[:, k].astype(jnp.int32) + (LARGEST_TURN + 1)) << (k * _TURN_BITS) for k in range(lattice.dim)]
-    packed = jnp.where(near, functools.reduce(jnp.bitwise_or, parts), -1)
+    fractions, periodic = fractions_of(points, lattice), lattice.images.periodic
+    turns = [jnp.floor(fractions[:, k]) if p else jnp.zeros_like(fractions[:, k]) for k, p in enumerate(periodic)]
+    near = [jnp.isfinite(points[:, k]) & (jnp.abs(x) <= LARGEST_TURN) for k, x in enumerate(turns)]
+    parts = [(x.astype(jnp.int32) + (LARGEST_TURN + 1)) << (k * _TURN_BITS) for k, x in enumerate(turns)]
+    packed = jnp.where(functools.reduce(jnp.logical_and, near), functools.reduce(jnp.bitwise_or, parts), -1)
     return lax.optimization_barrier(packed)  # computed once, so that whoever asks gets the same
+
+
+def _most_turns(packed: Array, dim: int) -> Array:
+    """Return the largest of the numbers that `packed_turns` wrote, [] int32."""
+    turns = unpacked_turns(packed, dim)
+    return jnp.max(functools.reduce(jnp.maximum, (jnp.abs(turns[:, k]) for k in range(dim))), initial=0)
 
 
 def unpacked_turns(packed: Array, dim: int) -> Array:
@@ -363,14 +374,14 @@ def fractions_of(points: Array, lattice: Lattice) -> Array:
     """Return points [n, d] in units of the transform."""
     from_origin = points - lattice.origin
     if lattice.images.orthogonal:
-        return from_origin * jnp.diagonal(lattice.transform)
+        return from_origin * _diagonal(lattice.transform)
     return _product(from_origin, lattice.transform) if len(points) else from_origin
 
 
 def translation(shifts: Array, lattice: Lattice) -> Array:
     """Return shifts @ matrix, [..., d], for whole floats; differentiable in the lattice."""
     if lattice.images.orthogonal:
-        return shifts * jnp.diagonal(lattice.matrix)
+        return shifts * _diagonal(lattice.matrix)
     return sum(
         (shifts[..., k, None] * lattice.matrix[k] for k, p in enumerate(lattice.images.periodic) if p), jnp.zeros_like(shifts)
     )
@@ -391,8 +402,7 @@ def wrap(sources: Array, queries: Array | None, lattice: Lattice, radius: np.flo
         off = unpacked_turns(turns, dim).astype(dtype)
         moved = jnp.where((off == 0).all(axis=1, keepdims=True), points, points - translation(off, lattice))
         wrapped.append(jnp.where(turns[:, None] >= 0, moved, jnp.nan))
-    most = functools.reduce(jnp.maximum, (jnp.max(jnp.abs(unpacked_turns(turns, dim)), initial=0) for turns in packed))
-    most = most.astype(dtype)
+    most = functools.reduce(jnp.maximum, (_most_turns(turns, dim) for turns in packed)).astype(dtype)
 
     matrix, transform = jnp.abs(lattice.matrix), jnp.abs(lattice.transform)
     spans = matrix.sum(axis=0)
@@ -457,7 +467,7 @@ def nearest_shifts(difference: Array, lattice: Lattice) -> Array:
     """Return the lattice shifts [..., d], whole floats, that bring differences x_j - x_i [..., d] nearest to 0."""
     difference = lax.stop_gradient(difference)
     if lattice.images.orthogonal:
-        units = difference * jnp.diagonal(lattice.transform)
+        units = difference * _diagonal(lattice.transform)
     else:
         units = functools.reduce(jnp.add, (difference[..., m, None] * lattice.transform[m] for m in range(lattice.dim)))
     return lax.stop_gradient(jnp.where(np.array(lattice.images.periodic), -jnp.round(units), 0))

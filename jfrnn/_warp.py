@@ -140,9 +140,7 @@ def _periodic_kind(torus: tuple[Lattice, Wrapped] | None) -> int:
 
 
 def _rows(points: Array, turns: Array | None, systems: Array | None) -> Array:
-    """Return rows of positions as the kernels read them: NaN where they are out of range, then packed turns, then the system."""
-    if turns is not None:
-        points = jnp.where(turns[:, None] >= 0, points, jnp.nan)
+    """Return rows of positions as the kernels read them: coordinates, packed turns, the number of the system."""
     columns = [_as_float(x, points.dtype)[:, None] for x in (turns, systems) if x is not None]
     return jnp.concatenate([points, *columns], axis=1) if columns else points
 

@@ -75,6 +75,13 @@ struct Bits {  // of floats
     }
     JFRNN_FUNCTION int exponent(real x) { return (int)(of(x) >> MANTISSA) & EXPONENTS; }
     JFRNN_FUNCTION bool finite(real x) { return exponent(x) != EXPONENTS; }
+    JFRNN_FUNCTION bool negative(real x) { return of(x) >> (DOUBLE ? 63 : 31) & 1; }
+    JFRNN_FUNCTION real not_finite() {
+        const unsigned long long b = (unsigned long long)EXPONENTS << MANTISSA;
+        real x;
+        memcpy(&x, &b, sizeof(real));
+        return x;
+    }
     JFRNN_FUNCTION double power_of_two(int e) {
         const unsigned long long b = (unsigned long long)(e + 1023) << 52;
         double x;
@@ -139,11 +146,13 @@ struct Lattice {
         sum = add(sum, mul(real(sy), vector(1, k)));
         return DIM == 3 ? add(sum, mul(real(sz), vector(2, k))) : sum;
     }
-    // a row of positions brought into the cell
+    // a row of positions brought into the cell; one that is too far away for that is not finite
     JFRNN_MEMBER void wrap(const real* row, real* p) const {
         const int t[3] = {turn(row[DIM], 0), turn(row[DIM], 1), DIM == 3 ? turn(row[DIM], 2) : 0};
         for (int k = 0; k < DIM; ++k)
             p[k] = t[0] | t[1] | t[2] ? add(row[k], -translation(t[0], t[1], t[2], k)) : row[k];
+        if (Bits::negative(row[DIM]))
+            p[0] = Bits::not_finite();
     }
     // coordinate of a wrapped point along an axis of cells: a fraction where that is periodic, else a length
     JFRNN_MEMBER real along(int axis, const real* p) const {
@@ -162,7 +171,14 @@ bool skewed = false;
 for (int l = 0; PERIODIC && l < DIM; ++l)
     for (int k = 0; k < DIM; ++k)
         skewed = skewed || (k != l && Lattice{cutoff.data, true}.transform(l, k) != 0);
+#if defined(__CUDA_ARCH__)
 const Lattice lattice{cutoff.data, skewed};
+#else
+real numbers[PERIODIC ? 29 : 1];  // not the caller's: nothing that is written may change them
+for (int k = 0; PERIODIC && k < 29; ++k)
+    numbers[k] = cutoff.data[k];
+const Lattice lattice{numbers, skewed};
+#endif
 // the point of a row of positions, wrapped where space is periodic
 auto point_of = [&](const real* row, real* p) {
     if constexpr (PERIODIC)

@@ -134,6 +134,8 @@ const Grid grid = shared.grid;
 const int places = m, finite_places = shared.finite_queries;
 int longest = 0;
 
+int image = 0;  // that candidates are copied from, its code
+bool several = false;  // images among them: each says which one it is of
 struct Below { enum { value = 17 }; };
 struct BelowOrAt { enum { value = 18 }; };
 auto mask_of = [](vec a, real bound, auto comparison) -> unsigned int {  // one bit per lane
@@ -237,9 +239,10 @@ auto scan = [&](const real* q, int own_id, int count, auto only_later) -> int {
             const int e = __builtin_ctzll(four) / 16, b = (v + e) * LANES;
             const unsigned int mask = (four >> (16 * e)) & 0xffff;
             four &= ~(0xffffull << (16 * e));
-            if constexpr (PERIODIC)
-                pack(candidate_images + b, doubtful_images + doubts, mask);
-            else
+            if constexpr (PERIODIC) {
+                if (several)
+                    pack(candidate_images + b, doubtful_images + doubts, mask);
+            } else
                 for (int k = 0; k < DIM; ++k)
                     pack(candidate[k] + b, doubtful[k] + doubts, mask);
             pack(candidate_ids + b, doubtful_ids + doubts, mask);
@@ -264,7 +267,7 @@ auto scan = [&](const real* q, int own_id, int count, auto only_later) -> int {
             if constexpr (PERIODIC) {
                 const int id = doubtful_ids[c];
                 const real* source = positions.data + (long long)ROW * (PERIODIC == 2 ? id % n : id);
-                if (exact_image(queries.data + (long long)ROW * own_id, source, doubtful_images[c]))
+                if (exact_image(queries.data + (long long)ROW * own_id, source, several ? doubtful_images[c] : image))
                     row[hits++] = id;
                 continue;
             }
@@ -372,7 +375,7 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
         fresh = false;
         filled = own_from = own_to = 0;
     };
-    int image = 0, side = 0;  // its code, and whether it lies behind (-1), at home, or ahead
+    int side = 0;  // whether the image lies behind (-1), at home, or ahead
     real moved[3] = {0, 0, 0};
     auto copy = [&](int from, int to) {  // sources at places [from, to)
         while (from < to) {
@@ -387,8 +390,9 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
             for (int s = 0; BATCHED && !grid.dense && s < size; ++s)
                 if (system_of(positions.data + (long long)ROW * ids[from + s]) != system)
                     candidate[0][filled + s] = __builtin_nanf("");
-            for (int s = 0; PERIODIC && s < size; ++s)
-                candidate_images[filled + s] = image;
+            if (const int code = image; PERIODIC && several)
+                for (int s = 0; s < size; ++s)
+                    candidate_images[filled + s] = code;
             for (int s = 0; PERIODIC == 2 && s < size; ++s)
                 candidate_order[filled + s] = 3 * ids[from + s] + 1 + side;
             const int low_place = from > begin ? from : begin, high_place = from + size < end ? from + size : end;
@@ -433,8 +437,11 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
             }
     };
     if constexpr (PERIODIC) {
-        int from[3] = {0, 0, 0}, to[3] = {0, 0, 0};
+        several = false;
         for (int k = 0; k < DIM; ++k)
+            several = several || (is_periodic(k) && (first[k] < 0 || last[k] >= (whole)inverse_edge[k]));
+        int from[3] = {0, 0, 0}, to[3] = {0, 0, 0};
+        for (int k = 0; several && k < DIM; ++k)
             if (is_periodic(k)) {
                 const int most = lattice.images(k);  // rounded up, a query may reach an image that nobody can
                 from[k] = period_of(k, first[k]) < -most ? -most : period_of(k, first[k]);

@@ -1,7 +1,8 @@
-"""Cell search on CUDA: six launches, no host synchronization, nothing allocated beside the scratch that the caller gives.
+"""Cell search on CUDA: seven launches, no host synchronization, nothing allocated beside the scratch that the caller gives.
 
-bounds   lowest and highest coordinate per block; clears what the others count in
-count    every block reduces those bounds to the grid; every particle counts itself in its cell
+bounds   lowest and highest coordinate per block
+lay_out  every block reduces those bounds to the grid, and clears its part of what the others count in
+count    every particle counts itself in its cell
 scan     counts to first places, in one pass (Merrill & Garland 2016, decoupled look-back)
 scatter  indices into their cells, in the order in which they came
 gather   positions into cell order, ranked by index within a cell: the same order in every run
@@ -20,7 +21,8 @@ QUERY_BLOCK = 32  # one warp: others need not wait for it to end
 _PARTS = 256  # blocks of `bounds`; one thread of a block reads one part
 _TILE = 2048  # cells that a block of `scan` takes
 _HEADER_WORDS = 64
-_SWEEP_BLOCKS = 2048  # blocks of the kernels that walk over all particles
+_SWEEP_BLOCKS = 1056  # blocks of the kernels that walk over all particles
+_RESIDENT = 132  # blocks of those that walk over the cells: all at work at once
 
 _LAYOUT = r"""
 struct Shared {
@@ -129,45 +131,50 @@ if (threadIdx.x == 0) {
     }
     part[6] = bits_as_real(finite);
 }
-for (long long c = thread; c < table + 2; c += threads) {
-    start[c] = 0;
-    query_start[c] = 0;
-}
-for (long long t = thread; t < tile_count; t += threads) {
-    tile_state[t] = 0;
-    query_tile_state[t] = 0;
-}
 if (thread == 0) {
     shared.behind[0] = shared.behind[1] = shared.tiles[0] = shared.tiles[1] = 0;
     info.data[0] = info.data[1] = 0;
 }
 """
 
-_COUNT = r"""
+_LAY_OUT = r"""
 __shared__ Grid grid;
-{
-    real low[3], high[3];
-    const real* part = parts + 8 * threadIdx.x;
-    int finite = id_of(part[6]);
-    for (int k = 0; k < DIM; ++k) {
-        low[k] = part[k];
-        high[k] = part[3 + k];
-    }
-    reduce_over_block(low, high, finite);
-    if (threadIdx.x == 0) {
-        if (finite == 0)
-            for (int k = 0; k < DIM; ++k)
-                low[k] = high[k] = 0;
-        lay_out(grid, low, high, table);
-        grid.finite = finite;
-        if (block == 0) {
-            shared.grid = grid;
-            if (finite < n)
-                atomicOr(&info.data[1], 2);
-        }
-    }
-    __syncthreads();
+real low[3], high[3];
+const real* part = parts + 8 * threadIdx.x;
+int finite = id_of(part[6]);
+for (int k = 0; k < DIM; ++k) {
+    low[k] = part[k];
+    high[k] = part[3 + k];
 }
+reduce_over_block(low, high, finite);
+if (threadIdx.x == 0) {
+    if (finite == 0)
+        for (int k = 0; k < DIM; ++k)
+            low[k] = high[k] = 0;
+    lay_out(grid, low, high, table);
+    grid.finite = finite;
+    if (block == 0) {
+        shared.grid = grid;
+        if (finite < n)
+            atomicOr(&info.data[1], 2);
+    }
+}
+__syncthreads();
+const int cells = grid.cells, tiles = (cells + 1) / TILE + 1;  // of the table, what is in use
+for (long long c = thread; c < cells + 2; c += threads) {
+    start[c] = 0;
+    if (!own)
+        query_start[c] = 0;
+}
+for (long long t = thread; t < tiles; t += threads) {
+    tile_state[t] = 0;
+    if (!own)
+        query_tile_state[t] = 0;
+}
+"""
+
+_COUNT = r"""
+const Grid grid = shared.grid;
 // the sources are counted first, then, in a second launch, the queries
 const int size = of_queries ? m : n;
 const real* points = of_queries ? queries.data : positions.data;
@@ -189,11 +196,14 @@ __shared__ int sums[8];
 __shared__ int tile_shared, before_shared;
 unsigned long long volatile* state = of_queries ? query_tile_state : tile_state;
 int* counts = of_queries ? query_start : start;
-if (threadIdx.x == 0)
-    tile_shared = atomicAdd(&shared.tiles[of_queries], 1);
-__syncthreads();
-const int tile = tile_shared, cells = shared.grid.cells + 1;  // one more entry: the end of the last cell
-if ((long long)tile * TILE < cells) {
+const int cells = shared.grid.cells + 1;  // one more entry: the end of the last cell
+for (;;) {
+    if (threadIdx.x == 0)
+        tile_shared = atomicAdd(&shared.tiles[of_queries], 1);
+    __syncthreads();
+    const int tile = tile_shared;
+    if ((long long)tile * TILE >= cells)
+        break;
     constexpr int EACH = TILE / BLOCK;
     const long long first = (long long)tile * TILE + threadIdx.x * EACH;
     int value[EACH], total = 0;
@@ -243,6 +253,7 @@ if ((long long)tile * TILE < cells) {
     for (int e = 0; e < EACH; ++e)
         if (first + e < cells)
             counts[first + e] = before + value[e];
+    __syncthreads();
 }
 """
 
@@ -1123,6 +1134,7 @@ class Kernels(NamedTuple):
     """The kernels of a variant, all with the same arguments."""
 
     bounds: wp.Kernel
+    lay_out: wp.Kernel
     count: wp.Kernel
     scan: wp.Kernel
     scatter: wp.Kernel
@@ -1131,8 +1143,10 @@ class Kernels(NamedTuple):
 
     def launches(self, n: int, m: int, own: bool, table: int | None = None) -> list[Launch]:
         """Return what is launched, in order, for n sources and m queries."""
-        tiles = ((table_cells(n) if table is None else table) + 1) // _TILE + 1
-        launches = [Launch(self.bounds, _PARTS * BLOCK, BLOCK, False)]
+        table = table_cells(n) if table is None else table
+        tiles = min((table + 1) // _TILE + 1, _RESIDENT)
+        clearing = min(-(-table // (8 * BLOCK)), _RESIDENT) * BLOCK
+        launches = [Launch(self.bounds, _PARTS * BLOCK, BLOCK, False), Launch(self.lay_out, clearing, BLOCK, False)]
         for of_queries in (False,) if own else (False, True):
             size = m if of_queries else n
             sweep = min(-(-size // BLOCK), _SWEEP_BLOCKS) * BLOCK
@@ -1173,7 +1187,7 @@ def cell_kernels(
     of the cells: 0 row-major, 1 Morton, 2 Hilbert. `periodic` and `batched` are those of
     `jfrnn.kernels._native.snippet`.
     """
-    blocks = blocks or (24 if not lists else 16 if double else 20)  # registers against occupancy, measured on an H200
+    blocks = blocks or (24 if not lists else 16 if double or periodic else 20)  # registers against occupancy, measured on an H200
     kind = f"{dim}d_{'f64' if double else 'f32'}_r{reach}x{reach_x}{('', '_morton', '_hilbert')[order]}"
     kind += ("", "_nearest", "_images")[periodic] + "_batched" * batched
     variant = f"{kind}{'_scaled' * scaled}{'_list' * lists}{'_later' * later}{'' if exact else '_inexact'}"
@@ -1184,7 +1198,8 @@ def cell_kernels(
     query |= {"QUERY_BLOCK": QUERY_BLOCK, **grid}
     return Kernels(
         _kernel(f"bounds_{kind}", kind, dim, double, BLOCK, 1, grid, _REDUCE, _BOUNDS),
-        _kernel(f"count_{kind}", kind, dim, double, BLOCK, 1, grid, _REDUCE, _COUNT),
+        _kernel(f"lay_out_{kind}", kind, dim, double, BLOCK, 1, grid, _REDUCE, _LAY_OUT),
+        _kernel(f"count_{kind}", kind, dim, double, BLOCK, 1, grid, _COUNT),
         _kernel(f"scan_{kind}", kind, dim, double, BLOCK, 1, grid, _SCAN),
         _kernel(f"scatter_{kind}", kind, dim, double, BLOCK, 1, grid, _SCATTER),
         _kernel(f"gather_{kind}", kind, dim, double, BLOCK, 1, grid, _GATHER),

@@ -53,6 +53,6 @@ def test_scratch_is_at_most_64_bytes_per_particle(module, n, dim):
 def test_queries_of_their_own_are_sorted_too():
     kernels = cells_cuda.cell_kernels(3, False, False, True)
     own, others = (kernels.launches(1000, 500, own) for own in (True, False))
-    assert [launch.of_queries for launch in own] == [False] * 6
+    assert [launch.of_queries for launch in own] == [False] * 7
     assert [launch.of_queries for launch in others].count(True) == 3
     assert all(launch.threads % launch.block == 0 for launch in own + others)
