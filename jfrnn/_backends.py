@@ -13,7 +13,20 @@ from jax import Array, lax
 
 from jfrnn import _warp
 from jfrnn._batch import Batch, ranked
-from jfrnn._box import Box, Images, Lattice, Wrapped, fractions_of, is_valid, make_lattice, translation, unpacked_turns, wrap
+from jfrnn._box import (
+    NOT_FINITE,
+    TOO_FAR,
+    Box,
+    Images,
+    Lattice,
+    Wrapped,
+    fractions_of,
+    is_valid,
+    make_lattice,
+    translation,
+    unpacked_turns,
+    wrap,
+)
 from jfrnn._cells import CellAxes, build_grid, cell_edge, cell_order, grid_coordinates, open_axes, stencil_runs
 from jfrnn._exact import Cutoff, Cutoffs, Radii, is_radius, make_cutoffs
 from jfrnn._levels import Axes, level_runs, sort_by_levels
@@ -87,8 +100,10 @@ def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
     lattice = make_lattice(box, images, np.dtype(sources.dtype))
     wrapped = wrap(sources, queries, lattice, _largest(cutoff))
     rows = _rows_of_engine(sources, queries, cutoff, options, capacity, batch, (lattice, wrapped))
-    in_range = _all_in_range(wrapped.turns, sources) & _all_in_range(wrapped.query_turns, sources if queries is None else queries)
-    checks |= {Status.BOX_TOO_SMALL: wrapped.enough & is_valid(lattice), Status.OUT_OF_RANGE: in_range}
+    if active is None and not checks:  # else positions are NaN for other reasons, too
+        checks[Status.NONFINITE] = (wrapped.met & NOT_FINITE) == 0
+    checks[Status.BOX_TOO_SMALL] = wrapped.enough & is_valid(lattice)
+    checks[Status.OUT_OF_RANGE] = (wrapped.met & TOO_FAR) == 0
     rows = _with_status(rows, given, given_queries, active, checks)
     if rows.idx is None or images.nearest:
         return Found(rows, None, None)
@@ -125,16 +140,13 @@ def _largest(cutoff: Cutoff | Cutoffs) -> np.floating | Array:
     return cutoff.largest if isinstance(cutoff, Cutoffs) else cutoff.radius
 
 
-def _all_in_range(turns: Array, points: Array) -> Array:
-    return ((turns >= 0) | ~jnp.isfinite(points).all(axis=1)).all()
-
-
 def _with_status(rows: Rows, sources: Array, queries: Array | None, active: Array | None, checks: dict[Status, Array]) -> Rows:
     """Set the bits of what the engine cannot know: it saw NaN where particles are inactive or out of range."""
     if active is None and not checks:
         return rows
-    finite = (jnp.isfinite(sources).all(axis=1) | (False if active is None else ~active)).all()
-    checks = checks | {Status.NONFINITE: finite & (True if queries is None else jnp.isfinite(queries).all())}
+    if Status.NONFINITE not in checks:
+        finite = (jnp.isfinite(sources).all(axis=1) | (False if active is None else ~active)).all()
+        checks = checks | {Status.NONFINITE: finite & (True if queries is None else jnp.isfinite(queries).all())}
     status = rows.status & ~Status.NONFINITE.value
     for bit, right in checks.items():
         status = status | jnp.where(right, 0, bit.value).astype(jnp.int32)

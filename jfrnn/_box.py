@@ -329,6 +329,7 @@ class Wrapped(NamedTuple):
         reach: [d] half the width of the stencil, in units of the transform: no pair is farther apart along an axis.
         margin: [d] of the reach, what does not depend on the radius.
         enough: [] bool: the images that are looked at are all that there can be.
+        met: [] int32, the bits `NOT_FINITE` and `TOO_FAR` where there is such a particle; the lower bits are of turns.
     """
 
     sources: Array
@@ -339,33 +340,38 @@ class Wrapped(NamedTuple):
     reach: Array
     margin: Array
     enough: Array
+    met: Array
 
 
 LARGEST_TURN = 511  # cells between a particle and the box: three such numbers share an int32, and S·A is exact in half mantissas
 _TURN_BITS = 10
+NOT_FINITE, TOO_FAR = 1 << _TURN_BITS, 2 << _TURN_BITS
 
 
 def packed_turns(points: Array, lattice: Lattice) -> Array:
     """Count the lattice vectors between the cell and each point, 0 along open axes: [n] int32, 10 bits for each axis.
 
-    -1 where a point is not finite or farther away than `LARGEST_TURN`.
+    -1 where a point is not finite, -2 where it is farther away than `LARGEST_TURN`.
     """
     fractions, periodic = fractions_of(points, lattice), lattice.images.periodic
     turns = [jnp.floor(fractions[:, k]) if p else jnp.zeros_like(fractions[:, k]) for k, p in enumerate(periodic)]
-    near = [jnp.isfinite(points[:, k]) & (jnp.abs(x) <= LARGEST_TURN) for k, x in enumerate(turns)]
+    finite = functools.reduce(jnp.logical_and, (jnp.isfinite(points[:, k]) for k in range(lattice.dim)))
+    near = functools.reduce(jnp.logical_and, (jnp.abs(x) <= LARGEST_TURN for x in turns), finite)
     parts = [(x.astype(jnp.int32) + (LARGEST_TURN + 1)) << (k * _TURN_BITS) for k, x in enumerate(turns)]
-    packed = jnp.where(functools.reduce(jnp.logical_and, near), functools.reduce(jnp.bitwise_or, parts), -1)
+    packed = jnp.where(near, functools.reduce(jnp.bitwise_or, parts), jnp.where(finite, -2, -1))
     return lax.optimization_barrier(packed)  # computed once, so that whoever asks gets the same
 
 
-def _most_turns(packed: Array, dim: int) -> Array:
-    """Return the largest of the numbers that `packed_turns` wrote, [] int32."""
+def _met(packed: Array, dim: int) -> Array:
+    """Return the bits of all numbers of turns and of what is none, [] int32: in one pass."""
     turns = unpacked_turns(packed, dim)
-    return jnp.max(functools.reduce(jnp.maximum, (jnp.abs(turns[:, k]) for k in range(dim))), initial=0)
+    bits = functools.reduce(jnp.bitwise_or, (jnp.abs(turns[:, k]) for k in range(dim)))
+    bits = jnp.where(packed >= 0, bits, jnp.where(packed == -1, NOT_FINITE, TOO_FAR))
+    return lax.reduce(bits, np.int32(0), lax.bitwise_or, (0,))
 
 
 def unpacked_turns(packed: Array, dim: int) -> Array:
-    """Read what `packed_turns` wrote: [..., d] int32, 0 where it is -1."""
+    """Read what `packed_turns` wrote: [..., d] int32, 0 where it is negative."""
     parts = packed[..., None] >> np.arange(dim, dtype=np.int32) * _TURN_BITS
     return jnp.where(packed[..., None] < 0, 0, (parts & ((1 << _TURN_BITS) - 1)) - (LARGEST_TURN + 1))
 
@@ -402,7 +408,8 @@ def wrap(sources: Array, queries: Array | None, lattice: Lattice, radius: np.flo
         off = unpacked_turns(turns, dim).astype(dtype)
         moved = jnp.where((off == 0).all(axis=1, keepdims=True), points, points - translation(off, lattice))
         wrapped.append(jnp.where(turns[:, None] >= 0, moved, jnp.nan))
-    most = functools.reduce(jnp.maximum, (_most_turns(turns, dim) for turns in packed)).astype(dtype)
+    met = functools.reduce(jnp.bitwise_or, (_met(turns, dim) for turns in packed))
+    most = (met & LARGEST_TURN).astype(dtype)  # at least as many as the largest number of turns, less than twice as many
 
     matrix, transform = jnp.abs(lattice.matrix), jnp.abs(lattice.transform)
     spans = matrix.sum(axis=0)
@@ -422,7 +429,7 @@ def wrap(sources: Array, queries: Array | None, lattice: Lattice, radius: np.flo
     limit = jnp.where(periodic, 0.5 if images.nearest else jnp.asarray(images.reach, dtype), jnp.inf)
     enough = (reach < limit).all() if images.nearest else (reach <= limit).all()
     slack = _wrapping_error(most, lattice)
-    return Wrapped(wrapped[0], wrapped[-1], packed[0], packed[-1], slack, reach, margin, enough)
+    return Wrapped(wrapped[0], wrapped[-1], packed[0], packed[-1], slack, reach, margin, enough, met)
 
 
 def _wrapping_error(most: Array, lattice: Lattice) -> Array:

@@ -132,12 +132,13 @@ struct Lattice {
     JFRNN_FUNCTION real mul(real a, real b) { return a * b; }
 #endif
     // turns of a row: how many lattice vectors lie between the cell and the particle
-    JFRNN_FUNCTION int turn(real last, int axis) {
+    JFRNN_FUNCTION int packed_turns(real last) {
         int packed;
         if constexpr (DOUBLE) packed = (int)last;
         else memcpy(&packed, &last, 4);
-        return ((packed >> (10 * axis)) & 1023) - 512;
+        return packed;
     }
+    JFRNN_FUNCTION int turn(real last, int axis) { return ((packed_turns(last) >> (10 * axis)) & 1023) - 512; }
     // component k of S·A
     JFRNN_MEMBER real translation(int sx, int sy, int sz, int k) const {
         if (!skewed)
@@ -148,6 +149,13 @@ struct Lattice {
     }
     // a row of positions brought into the cell; one that is too far away for that is not finite
     JFRNN_MEMBER void wrap(const real* row, real* p) const {
+#if !defined(__CUDA_ARCH__)
+        if (packed_turns(row[DIM]) == (DIM == 3 ? 512 * 0x100401 : 512 * 0x401)) {  // none, as nearly everywhere
+            for (int k = 0; k < DIM; ++k)
+                p[k] = row[k];
+            return;
+        }
+#endif
         const int t[3] = {turn(row[DIM], 0), turn(row[DIM], 1), DIM == 3 ? turn(row[DIM], 2) : 0};
         for (int k = 0; k < DIM; ++k)
             p[k] = t[0] | t[1] | t[2] ? add(row[k], -translation(t[0], t[1], t[2], k)) : row[k];
