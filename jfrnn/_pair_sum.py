@@ -96,8 +96,9 @@ def pair_sum(
     box and whatever fn closes over; who is a neighbor is a constant. A derivative is a sum over the same pairs, gathered
     by each particle (over a list that is not its own mirror image, scattered). What is no pair has no part in it, whatever fn
     makes of it. "max" and "min" have the derivative of the pair that is the extreme one; of several, of that with the smallest j.
-    Jit: yes; outside of it every call compiles anew. vmap: yes, one after the other. Source: sums over neighbors as in SPH (Gingold
-    & Monaghan 1977, doi:10.1093/mnras/181.3.375); derivatives by transposition (Radul et al. 2023, doi:10.1145/3571236).
+    Jit: yes; outside of it, define fn once: one that is defined anew for each call is compiled anew. vmap: yes, one after the
+    other. Source: sums over neighbors as in SPH (Gingold & Monaghan 1977, doi:10.1093/mnras/181.3.375); derivatives by
+    transposition (Radul et al. 2023, doi:10.1145/3571236).
     """
     if not callable(fn):
         raise TypeError(f"fn must be a function of (r, i, j), got {type(fn).__name__}.")
@@ -227,7 +228,7 @@ def _reduced(
         tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in operands.shared),
         *(tuple(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in group) for group in operands[1:]),
     )
-    term, needed, closed_over = traced(summand, one_pair, jax.ShapeDtypeStruct(pairs.sources.shape[1:], pairs.sources.dtype))
+    term, needed, closed_over = traced(summand, one_pair, jax.ShapeDtypeStruct(pairs.sources.shape[1:], pairs.sources.dtype), fn)
     if reduce != "sum" and not all(jnp.issubdtype(x.dtype, jnp.floating) for x in term.summands):
         raise TypeError(f"fn must return floats for reduce={reduce!r}, whose rows may be infinite: convert them with .astype.")
     operands = chosen(operands, needed)

@@ -9,7 +9,8 @@ which belong to i, as further operands.
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+import weakref
+from collections.abc import Callable, Iterator, Sequence
 from itertools import compress
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import eval_jaxpr
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun, jaxprs_in_params
 from jax.interpreters import partial_eval
 
 
@@ -74,10 +75,12 @@ def _split(operands: Sequence, like: Groups) -> Groups:
     return Groups(tuple(operands[:shared]), tuple(operands[shared : shared + own]), tuple(operands[shared + own :]))
 
 
-def traced(summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct) -> tuple[Term, Groups, tuple[Array, ...]]:
+def traced(summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct, owner: Any) -> tuple[Term, Groups, tuple[Array, ...]]:  # noqa: ANN401
     """Trace a summand that may close over anything; return its term, which operands it needs, and what it closes over.
 
     `operands` are the shapes and dtypes of what one pair gets. What it closes over becomes the first of the shared operands.
+    While the `owner`, the function that the summand calls, lives and is traced to the same again, the same term comes back, and
+    with it the programs that were compiled for it.
     """
     closed = jax.make_jaxpr(_flat(summand, operands))(*_one_pair(operands, shift))
     consts = tuple(jnp.asarray(x) for x in closed.consts)
@@ -87,9 +90,38 @@ def traced(summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct) -> t
         shared, own, others = operands
         return eval_jaxpr(closed.jaxpr, shared[: len(consts)], real, shift, *shared[len(consts) :], *own, *others)
 
-    derived = make_term(hoisted, joined(of_consts, operands), shift)
+    derived = _kept(owner, make_term(hoisted, joined(of_consts, operands), shift))
     of_closed, needed = derived.needed.shared[: len(consts)], derived.needed.shared[len(consts) :]
     return derived.term, derived.needed._replace(shared=needed), tuple(compress(consts, of_closed))
+
+
+_KNOWN: "weakref.WeakKeyDictionary[Any, dict[Any, Derived]]" = weakref.WeakKeyDictionary()
+
+
+def _kept(owner: Any, derived: "Derived") -> "Derived":  # noqa: ANN401
+    """Return an equal term that the owner had before, or this one, which it has from now on."""
+    closed = derived.term.jaxpr
+    if closed.consts:
+        return derived
+    key = (
+        str(closed.jaxpr),
+        tuple(_literals(closed.jaxpr)),
+        jax.tree.structure(derived.needed),
+        tuple(jax.tree.leaves(derived.needed)),
+    )
+    try:
+        return _KNOWN.setdefault(owner, {}).setdefault(key, derived)
+    except TypeError:  # such an owner can have nothing
+        return derived
+
+
+def _literals(jaxpr: Jaxpr) -> Iterator[bytes]:
+    """Yield the numbers that are written into a jaxpr, of which its text may show few digits."""
+    for equation in jaxpr.eqns:
+        yield from (np.asarray(v.val).tobytes() for v in equation.invars if isinstance(v, Literal))
+        for inner in jaxprs_in_params(equation.params):
+            yield from _literals(inner)
+    yield from (np.asarray(v.val).tobytes() for v in jaxpr.outvars if isinstance(v, Literal))
 
 
 class Derived(NamedTuple):
