@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import eval_jaxpr
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun, jaxprs_in_params
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jax.interpreters import partial_eval
 
 
@@ -119,8 +119,9 @@ def _literals(jaxpr: Jaxpr) -> Iterator[bytes]:
     """Yield the numbers that are written into a jaxpr, of which its text may show few digits."""
     for equation in jaxpr.eqns:
         yield from (np.asarray(v.val).tobytes() for v in equation.invars if isinstance(v, Literal))
-        for inner in jaxprs_in_params(equation.params):
-            yield from _literals(inner)
+        for inner in (x for value in equation.params.values() for x in (value if isinstance(value, tuple) else (value,))):
+            if isinstance(inner, Jaxpr | ClosedJaxpr):
+                yield from _literals(inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner)
     yield from (np.asarray(v.val).tobytes() for v in jaxpr.outvars if isinstance(v, Literal))
 
 
@@ -135,7 +136,7 @@ def make_term(summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct, t
     """Trace a summand of these operands that closes over nothing, and drop the operands that it does not need."""
     closed = jax.make_jaxpr(_flat(summand, operands))(*_one_pair(operands, shift))
     always = [True, True] + [False] * sum(map(len, operands))
-    jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, True, always)
+    jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), always)
     needed = _split(used[2:], operands)
     term = Term(ClosedJaxpr(jaxpr, closed.consts), chosen(operands, needed), shift, tuple(totals or [False] * len(jaxpr.outvars)))
     return Derived(term, needed)
