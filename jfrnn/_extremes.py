@@ -70,23 +70,35 @@ def _find(relation: Relation, term: Term, operands: Groups, largest: bool) -> li
 
 
 def _best_of(values: Array, slots: Slots, n: int) -> _Best:
-    """Return the largest of the values [b, g, ...] in each row."""
-    values, real = values.reshape(*slots.real.shape, -1), slots.real[..., None]
-    best = jnp.max(jnp.where(real, values, -jnp.inf), axis=1)
-    equal = real & _same(values, best[:, None])
-    source = jnp.min(jnp.where(equal, slots.source[..., None], n), axis=1)
+    """Return the largest of the values [b, g, ...] in each row.
+
+    One reduction of values and numbers together: XLA may evaluate values anew for each that asks, and round them otherwise.
+    """
+    values = values.reshape(*slots.real.shape, -1)
+    source = jnp.broadcast_to(jnp.where(slots.real, slots.source, n)[..., None], values.shape)
+    slot = lax.broadcasted_iota(jnp.int32, values.shape, 1)
+
+    def larger(a: tuple[Array, Array, Array], b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        take = _is_better(b[:2], a[:2], n) | (~_is_better(a[:2], b[:2], n) & (b[2] < a[2]))
+        return jnp.where(take, b[0], a[0]), jnp.where(take, b[1], a[1]), jnp.where(take, b[2], a[2])
+
+    start = jnp.asarray(-jnp.inf, values.dtype), jnp.int32(n), jnp.int32(values.shape[1])
+    best, source, slot = lax.reduce((values, source, slot), start, larger, (1,))
     if slots.shift is None:
         return best, source, None
-    slot = jnp.argmax(equal & (slots.source[..., None] == source[:, None]), axis=1)
-    return best, source, jnp.take_along_axis(slots.shift, slot[..., None], axis=1)
+    slot = jnp.minimum(slot, values.shape[1] - 1)[..., None]
+    return best, source, jnp.take_along_axis(slots.shift, slot, axis=1)
 
 
 def _better(old: _Best, new: _Best, n: int) -> _Best:
-    larger = (new[0] > old[0]) | (jnp.isnan(new[0]) & ~jnp.isnan(old[0]))
-    is_new = (new[1] < n) & ((old[1] == n) | larger | (_same(new[0], old[0]) & (new[1] < old[1])))
+    is_new = _is_better(new[:2], old[:2], n)
     shift = None if old[2] is None or new[2] is None else jnp.where(is_new[..., None], new[2], old[2])
     return jnp.where(is_new, new[0], old[0]), jnp.where(is_new, new[1], old[1]), shift
 
 
-def _same(a: Array, b: Array) -> Array:
-    return (a == b) | (jnp.isnan(a) & jnp.isnan(b))
+def _is_better(new: tuple[Array, Array], old: tuple[Array, Array], n: int) -> Array:
+    """Say which values and sources come before others; a source n is none."""
+    (value, source), (than, other) = new, old
+    larger = (value > than) | (jnp.isnan(value) & ~jnp.isnan(than))
+    same = (value == than) | (jnp.isnan(value) & jnp.isnan(than))
+    return (source < n) & ((other == n) | larger | (same & (source < other)))

@@ -78,8 +78,8 @@ def pair_sum(
         TypeError, ValueError: an argument is of the wrong kind, shape or range, or fn returns what cannot be summed.
 
     Order of summation: the neighbors of a particle as the engine meets them (cell by cell, or by index in "brute", or as listed) in
-    groups of up to 32; first within a group, then one group after the other; compensated, a group is added up by halves. The
-    same input gives the same bits. With k neighbors the error is at most 4 eps·sqrt(k) of the sum of |terms| for k up to 60 000;
+    groups of up to 32; first within a group, then one group after the other. The same
+    input gives the same bits. With k neighbors the error is at most 4 eps·sqrt(k) of the sum of |terms| for k up to 60 000;
     compensated a few eps of the sum itself, and some eps²·k of the sum of |terms|.
     Memory: what `search` takes without its list, the results, and at most 16 MB (float32) for each array that fn needs for the
     pairs that are in work; nothing grows with the number of pairs, in derivatives neither.

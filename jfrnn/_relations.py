@@ -1,7 +1,6 @@
 """Which pairs a pair sum runs over, found by a search or standing in a list, and the engines that run over them."""
 
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -229,13 +228,12 @@ class _Adder:
         if not self.compensated:
             added = jnp.sum(terms, axis=1, dtype=terms.dtype)
             return (state[0] + (added[0] if squeeze else added),)
-        size = 1 << max(math.ceil(math.log2(terms.shape[1])), 0)
-        filled = jnp.pad(terms, [(0, 0), (0, size - terms.shape[1]), *[(0, 0)] * (terms.ndim - 2)])
-        value, error = lax.optimization_barrier(filled), jnp.zeros_like(filled)  # evaluated once, not again for each half
-        while size > 1:
-            size //= 2
-            value, rounding = two_sum(value[:, :size], value[:, size:])
-            error = error[:, :size] + error[:, size:] + rounding
-        value, error = (x[0, 0] if squeeze else x[:, 0] for x in (value, error))
-        total, rounding = two_sum(state[0], value)
-        return total, state[1] + (error + rounding)
+        zero = jnp.zeros((), terms.dtype)  # one reduction of both: XLA may evaluate terms anew for each that asks
+        sums = lax.reduce((terms, jnp.zeros_like(terms)), (zero, zero), _compensated_sum, (1,))
+        value, error = (x[0] if squeeze else x for x in sums)
+        return _compensated_sum(state, (value, error))
+
+
+def _compensated_sum(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[Array, Array]:
+    total, rounding = two_sum(a[0], b[0])
+    return total, a[1] + b[1] + rounding
