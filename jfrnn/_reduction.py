@@ -61,13 +61,13 @@ def listed(
         raise ValueError(f"{name} was said when the list was made: leave it out where neighbors is given.")
     if full and nbrs.half:
         raise ValueError("neighbors must be a full list for reduce='max', 'min' and compensated=True: search without half=True.")
-    sources, rows = nbrs.geometry_inputs(positions, queries)
+    sources, rows = nbrs._geometry_inputs(positions, queries)
     dtype = np.dtype(sources.dtype)
     if cutoff is not None and (nbrs.cutoff is None or float(checked_cutoff(cutoff, dtype).radius) != nbrs.cutoff):
         has = "a cutoff per particle" if nbrs.cutoff is None else f"cutoff={nbrs.cutoff}"
         raise ValueError(f"cutoff must be None or that of the list, which has {has}, got {cutoff!r}.")
     fixed, fixed_rows, fixed_box = lax.stop_gradient((sources, rows, box))
-    _, mask, shifts = nbrs.geometry(fixed, fixed_rows if nbrs.own_queries else None, fixed_box)
+    _, mask, shifts = nbrs._geometry(fixed, fixed_rows if nbrs.own_queries else None, fixed_box)
     directionless = not nbrs.own_queries and (nbrs.radii is None or nbrs.radii.rule not in ("gather", "scatter"))
     relation = Listed(nbrs.idx, mask, shifts, nbrs.source_count, symmetric=directionless and not nbrs.half)
     relations: tuple[Relation, ...] = (relation,)
@@ -75,7 +75,7 @@ def listed(
         apart = nbrs.idx != lax.iota(jnp.int32, nbrs.idx.shape[0])[:, None]
         apart = apart if shifts is None else apart | (shifts != 0).any(axis=-1)
         relations = relation, Listed(nbrs.idx, mask & apart, shifts, nbrs.source_count, symmetric=False, flipped=True)
-    lattice = _lattice(nbrs.box_now(box, sources), nbrs.box_kind, sources)
+    lattice = _lattice(nbrs._box_now(box, sources), nbrs.box_kind, sources)
     largest = nbrs.cutoff if nbrs.radii is None else make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest
     return Pairs(relations, sources, rows, lattice, largest, directionless, None)
 
