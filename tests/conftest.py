@@ -21,6 +21,15 @@ def _release_programs():
         jax.clear_caches()
 
 
+@pytest.fixture
+def compiled_soon(request):
+    """Leave out what LLVM takes long for and what no float depends on, but in slow tests and those of memory."""
+    fully = request.node.get_closest_marker("slow") or "memory" in request.node.name
+    jax.config.update("jax_disable_most_optimizations", not fully)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 @pytest.fixture(params=[np.float32, np.float64], ids=["f32", "f64"])
 def dtype(request):
     return request.param

@@ -20,14 +20,7 @@ from jfrnn import _relations, _runs, _summation
 SLOW = pytest.mark.slow
 LENGTH = 704  # so that cases share compiled programs
 
-
-@pytest.fixture(autouse=True)
-def _compile_soon(request):
-    """Leave out what LLVM takes long for and what no float depends on, but in slow tests and those of memory."""
-    fully = request.node.get_closest_marker("slow") or "memory" in request.node.name
-    jax.config.update("jax_disable_most_optimizations", not fully)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+pytestmark = pytest.mark.usefixtures("compiled_soon")
 
 
 def arrays_of(pairs, dim):

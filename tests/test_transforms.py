@@ -8,6 +8,8 @@ from jax.sharding import PartitionSpec
 
 import jfrnn
 
+pytestmark = pytest.mark.usefixtures("compiled_soon")
+
 CUTOFF, CAPACITY, BATCH, N = 0.3, 40, 3, 40
 OPTIONS = {"capacity": CAPACITY, "backend": "warp"}
 BOX, SMALL = jfrnn.Box([1.0, 1.25]), jfrnn.Box([0.5, 0.625])

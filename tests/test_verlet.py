@@ -217,6 +217,7 @@ def test_a_chunk_is_replayed_until_its_list_was_large_enough():
     assert doctest.testmod(_chunks).failed == 0
 
 
+@pytest.mark.usefixtures("compiled_soon")
 @pytest.mark.parametrize(
     ("backend", "dim"), [("warp", 2), ("warp", 3), ("hashgrid", 3), ("jax", 3), pytest.param("brute", 2, marks=pytest.mark.slow)]
 )
@@ -241,6 +242,7 @@ def test_inactive_particles_have_no_neighbors_and_come_and_go(backend, dim):
         nbrs.update(x, active=np.arange(60) < 51).check()
 
 
+@pytest.mark.usefixtures("compiled_soon")
 def test_vmap_is_a_loop():
     x, moved = (jnp.stack([points(40, 2, np.float32, s) for s in seeds]) for seeds in ((0, 1, 2), (0, 1, 3)))
     lists = [jfrnn.search(one, CUTOFF, skin=SKIN, capacity=40, backend="jax") for one in x]
@@ -253,6 +255,7 @@ def test_vmap_is_a_loop():
     assert after.rebuild_count.tolist() == [0, 0, 1]
 
 
+@pytest.mark.usefixtures("compiled_soon")
 def test_gradients_flow_around_updates():
     x = points(30, 2, np.float64)
 
