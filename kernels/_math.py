@@ -9,12 +9,11 @@ the range of integers saturate, and NaN becomes 0. Denormals are kept, if the bl
 `jfrnn.kernels._native`); XLA on the CPU flushes them. Nothing uses CUDA's fast approximations.
 
 Warp's compiler for the CPU links the functions of the C library from a list of its own, which has neither expm1 nor log1p: there
-these two are series in both kinds. `VECTOR` takes more series, in double precision also for float32, where they are an order of
-magnitude faster than one call per lane, and calls the C library lane by lane elsewhere.
+these two are series in both kinds. `VECTOR` takes more series, several times faster than one call per lane (see
+`jfrnn.kernels._series`), and calls the C library lane by lane elsewhere.
 """
 
-import math
-import re
+from jfrnn.kernels._series import SERIES, VECTOR_SERIES, fill, for_each
 
 # What stands for what in the texts below, once for each width.
 _FLOATS = (
@@ -31,24 +30,6 @@ _TYPES = (
     {"TYPE": "i32", "WHOLE": "i32"},
     {"TYPE": "i64", "WHOLE": "i64"},
 )
-
-
-def _fill(text: str, **names: str) -> str:
-    """Return the text with names replaced: whole words, or what ends in a name that starts with an underscore."""
-    pattern = "|".join(rf"{name}\b" if name[0] == "_" else rf"\b{name}\b" for name in names)
-    return re.sub(pattern, lambda match: names[match[0]], text)
-
-
-def _for_each(types: tuple[dict[str, str], ...], *texts: str) -> str:
-    return "".join(_fill(text, **names) for names in types for text in texts)
-
-
-def _polynomial(x: str, coefficients: list[float]) -> str:
-    """Return an expression for a polynomial of f64 in Horner's form; its coefficients start at the lowest power."""
-    text = f"of({coefficients[-1].hex()})"
-    for c in reversed(coefficients[:-1]):
-        text = f"mad({text}, {x}, of({c.hex()}))"
-    return text
 
 
 # --- types and arithmetic ---------------------------------------------------------------------------------------------
@@ -236,156 +217,44 @@ _WHOLE_CALL = {
     "SCALAR": "JFRNN_MATH WHOLE NAME(WHOLE x, WHOLE y) { return CALL(x, y); }\n",
     "VECTOR": _CALL_OF_TWO["VECTOR"].replace("REAL", "WHOLE").replace("::CALL_S", "CALL"),
 }
-_WIDENED = "JFRNN_MATH f32 NAME(f32 x) { return to_f32(NAME(to_f64(x))); }\n"
 
 
 def _named(text: str, names: dict[str, str]) -> str:
     """Return the text once for each function, with what it calls."""
-    return "".join(_fill(text.replace("CALL", call), NAME=name) for name, call in names.items())
+    return "".join(fill(text.replace("CALL", call), NAME=name) for name, call in names.items())
 
 
 _LINKED = {name: name for name in ("asin", "acos", "atan", "cbrt", "erf", "erfc")}  # lane by lane in both widths
-_IN_SERIES = {name: name for name in ("exp", "exp2", "log", "sin", "cos", "tan", "tanh")}
+_IN_SERIES = {name: name for name in ("exp", "exp2", "log", "tanh", "sin", "cos", "tan")}
 _FLOAT_SERIES = {name: name for name in ("sinh", "cosh")}  # in float32 alone
 _NOT_LINKED = {name: name for name in ("expm1", "log1p")}
 _TWO = {"atan2": "atan2", "rem": "fmod"}
 _FAR = {f"called_{name}": name for name in ("sin", "cos", "tan")}
 _LOGISTIC = "JFRNN_MATH REAL logistic(REAL x) { return of((NUMBER)1) / (of((NUMBER)1) + exp(-x)); }\n"
 
-_FACTORS = [1 / math.factorial(k) for k in range(20)]
-_LOG = [2 / (2 * k + 3) for k in range(11)]
-_LN2 = ["0x1.62e42fee00000p-1", "0x1.a39ef35793c76p-33"]  # in parts: 33 bits times an integer of 20 bits are exact
-_HALF_PI = ["0x1.921fb54400000p+0", "0x1.0b4611a600000p-34", "0x1.3198a2e037073p-69"]
-_SINE = [(-1) ** k * _FACTORS[2 * k + 1] for k in range(1, 9)]
-_COSINE = [(-1) ** k * _FACTORS[2 * k] for k in range(2, 10)]
-
-# Taylor series on small intervals. What is added to `shift` is rounded to an integer, which its low bits then hold.
-_SERIES = f"""
-#if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
-JFRNN_MATH f64 mad(f64 x, f64 y, f64 z) {{ return __builtin_elementwise_fma(x, y, z); }}
-#else
-JFRNN_MATH f64 mad(f64 x, f64 y, f64 z) {{ return x * y + z; }}
-#endif
-JFRNN_MATH f64 shift() {{ return of(0x1.8p+52); }}
-JFRNN_MATH f64 power_of_two(f64 shifted) {{ return with_bits((i64)(((u64)bits(shifted) + 1023) << 52)); }}
-JFRNN_MATH f64 between(f64 low, f64 x, f64 high) {{  // NaN stays
-    const f64 y = select(lt(x, low), low, x);
-    return select(gt(y, high), high, y);
-}}
-JFRNN_MATH f64 less_powers(f64 x, f64 n) {{ return mad(n, of(-{_LN2[1]}), mad(n, of(-{_LN2[0]}), x)); }}  // x - n ln 2
-JFRNN_MATH f64 small_expm1(f64 r) {{ return mad({_polynomial("r", _FACTORS[2:14])} * r, r, r); }}  // |r| < 0.35
-JFRNN_MATH f64 expm1(f64 x) {{
-    const f64 y = between(of(-40.0), x, of(710.0)), t = mad(y, of({math.log2(math.e).hex()}), shift()), n = t - shift();
-    const f64 p = small_expm1(less_powers(y, n)), a = power_of_two(t - of(1.0)), half = mad(a, p, a - of(0.5));
-    return select(eq(x, of(0.0)), x, half + half);
-}}
-JFRNN_MATH f64 log1p(f64 x) {{
-    const f64 u = of(1.0) + x, rest = (x - (u - of(1.0))) / u, found = log(u);
-    return select(eq(u, of(1.0)), x, select(is_finite(found), found + rest, found));
-}}
-"""
-_VECTOR_SERIES = f"""
-JFRNN_MATH f64 log(f64 x) {{
-    const flag tiny = lt(x, of(0x1p-1022));
-    const f64 y = select(tiny, x * of(0x1p+54), x), from = select(tiny, of(0x1.8p+52 + 54), shift());
-    const i64 root = bits(of({math.sqrt(0.5).hex()})), b = bits(y) - root;  // y = 2^n (1 + f), between sqrt(1/2) and sqrt(2)
-    const f64 n = with_bits(bits(shift()) + (b >> 52)) - from;
-    const f64 f = with_bits((b & (i64{{}} + 0xfffffffffffffll)) + root) - of(1.0), s = f / (of(2.0) + f), z = s * s;
-    const f64 small = mad(s, f - z * {_polynomial("z", _LOG)}, n * of(-{_LN2[1]}));
-    const f64 found = mad(n, of({_LN2[0]}), f - small);
-    const f64 edge = select(eq(x, of(0.0)), of(-__builtin_inf()), select(lt(x, of(0.0)), of(__builtin_nan("")), x));
-    return select(both(gt(x, of(0.0)), is_finite(x)), found, edge);
-}}
-JFRNN_MATH f64 scaled_exp(f64 y, f64 r, f64 t) {{  // 2^(t - shift) e^r, in two steps where it may be denormal
-    const f64 h = mad(t - shift(), of(0.5), shift()), a = power_of_two(h), b = power_of_two(t - (h - shift()));
-    return mad(a, small_expm1(r), a) * b;
-}}
-JFRNN_MATH f64 exp(f64 x) {{
-    const f64 y = between(of(-746.0), x, of(710.0)), t = mad(y, of({math.log2(math.e).hex()}), shift());
-    return scaled_exp(y, less_powers(y, t - shift()), t);
-}}
-JFRNN_MATH f64 exp2(f64 x) {{
-    const f64 y = between(of(-1080.0), x, of(1025.0)), t = y + shift();
-    return scaled_exp(y, (y - (t - shift())) * of({math.log(2).hex()}), t);
-}}
-JFRNN_MATH f64 tanh(f64 x) {{
-    const f64 e = expm1(of(-2.0) * abs(x));
-    return select(eq(x, of(0.0)), x, with_sign(-e / (of(2.0) + e), x));
-}}
-JFRNN_MATH bool far(f64 x) {{  // any of them is too far for `turns`, or no number
-    return __builtin_reduce_and(JFRNN_CONVERT(le(abs(x), of(1e6)), i32)) == 0;
-}}
-JFRNN_MATH f64 less_turns(f64 x, f64 n) {{  // x - n pi / 2
-    return mad(n, of(-{_HALF_PI[2]}), mad(n, of(-{_HALF_PI[1]}), mad(n, of(-{_HALF_PI[0]}), x)));
-}}
-JFRNN_MATH f64 small_sin(f64 r) {{ const f64 z = r * r; return mad({_polynomial("z", _SINE)} * z, r, r); }}
-JFRNN_MATH f64 small_cos(f64 r) {{
-    const f64 z = r * r;
-    return of(1.0) + mad(z, of(-0.5), {_polynomial("z", _COSINE)} * z * z);
-}}
-JFRNN_MATH f64 sin_cos(f64 x, i64 quarter) {{  // sin(x + quarter pi / 2)
-    const f64 t = mad(x, of({(2 / math.pi).hex()}), shift()), r = less_turns(x, t - shift());
-    const i64 q = bits(t) + quarter;
-    const f64 y = select(ne(q & 1, i64{{}}), small_cos(r), small_sin(r));
-    return with_bits(bits(y) ^ (i64)((u64)(q & 2) << 62));
-}}
-JFRNN_MATH f64 sin(f64 x) {{
-    if (far(x))
-        return called_sin(x);
-    return select(eq(x, of(0.0)), x, sin_cos(x, i64{{}}));
-}}
-JFRNN_MATH f64 cos(f64 x) {{
-    if (far(x))
-        return called_cos(x);
-    return sin_cos(x, i64{{}} + 1);
-}}
-JFRNN_MATH f64 tan(f64 x) {{
-    if (far(x))
-        return called_tan(x);
-    return select(eq(x, of(0.0)), x, sin_cos(x, i64{{}}) / sin_cos(x, i64{{}} + 1));
-}}
-JFRNN_MATH f32 sinh(f32 x) {{
-    const f64 e = expm1(to_f64(abs(x)));
-    return with_sign(to_f32(select(is_finite(e), of(0.5) * (e + e / (e + of(1.0))), e)), x);
-}}
-JFRNN_MATH f32 cosh(f32 x) {{
-    const f64 e = exp(to_f64(abs(x)));
-    return to_f32(of(0.5) * (e + of(1.0) / e));
-}}
-JFRNN_MATH f32 pow(f32 base, f32 power) {{  // in double precision the error of y log x is out of sight
-    const f64 one = of(1.0), x = to_f64(base), y = to_f64(power), size = abs(x);
-    const flag whole = eq(round_even(y), y), odd = both(whole, ne(round_even(y * of(0.5)) * of(2.0), y));
-    const flag still = both(eq(size, one), eq(y, y));  // else 0 * inf
-    const f64 z = exp(select(still, of(0.0), y * log(size)));
-    const f64 defined = select(both(lt(x, of(0.0)), both(inverse(whole), is_finite(x))), of(__builtin_nan("")), z);
-    const f64 signed_power = select(both(odd, lt(with_sign(one, x), of(0.0))), -defined, defined);
-    return to_f32(select(either(eq(x, one), eq(y, of(0.0))), one, signed_power));
-}}
-"""
-
 
 def _shared(kind: str) -> str:
     """Return what is written alike for both kinds."""
     division = _named(_WHOLE_CALL[kind], {"div": "quotient", "rem": "remainder"})
-    comparisons = _for_each(_TYPES, _COMPARISONS) + _FLAGS
-    return comparisons + _for_each(_FLOATS, _FLOAT, _LOGISTIC) + _for_each(_WHOLES, _WHOLE_OF, _WHOLE, division) + _CONVERSIONS
+    comparisons = for_each(_TYPES, _COMPARISONS) + _FLAGS
+    return comparisons + for_each(_FLOATS, _FLOAT, _LOGISTIC) + for_each(_WHOLES, _WHOLE_OF, _WHOLE, division) + _CONVERSIONS
 
 
 def _scalar() -> str:
-    start = [_SCALAR_START, _for_each(_FLOATS, _SCALAR_FLOAT), _for_each(_TYPES, _SCALAR_SELECT), _shared("SCALAR")]
+    start = [_SCALAR_START, for_each(_FLOATS, _SCALAR_FLOAT), for_each(_TYPES, _SCALAR_SELECT), _shared("SCALAR")]
     of_one, of_two = _CALL["SCALAR"], _CALL_OF_TWO["SCALAR"]
     calls = _named(of_one, _LINKED | _IN_SERIES | _FLOAT_SERIES) + _named(of_two, _TWO | {"pow": "pow"})
-    missing = ["#if defined(__CUDA_ARCH__)\n", _for_each(_FLOATS, _named(of_one, _NOT_LINKED)), "#else\n"]
-    missing += [_SERIES, _named(_WIDENED, _NOT_LINKED), "#endif\n"]
-    return "".join([*start, _for_each(_FLOATS, calls), *missing, _END])
+    missing = ["#if defined(__CUDA_ARCH__)\n", for_each(_FLOATS, _named(of_one, _NOT_LINKED)), "#else\n"]
+    missing += [SERIES, "#endif\n"]
+    return "".join([*start, for_each(_FLOATS, calls), *missing, _END])
 
 
 def _vector() -> str:
-    start = [_VECTOR_START, _for_each(_FLOATS, _VECTOR_FLOAT), _for_each(_TYPES, _VECTOR_SELECT), _shared("VECTOR")]
+    start = [_VECTOR_START, for_each(_FLOATS, _VECTOR_FLOAT), for_each(_TYPES, _VECTOR_SELECT), _shared("VECTOR")]
     of_one, of_two = _CALL["VECTOR"], _CALL_OF_TWO["VECTOR"]
-    calls = [_for_each(_FLOATS, _named(of_one, _LINKED) + _named(of_two, _TWO))]
-    calls += [_for_each(_FLOATS[1:], _named(of_one, _FLOAT_SERIES | _FAR) + _named(of_two, {"pow": "pow"}))]
-    return "".join([*start, *calls, _SERIES, _VECTOR_SERIES, _named(_WIDENED, _NOT_LINKED | _IN_SERIES), _END])
+    calls = [for_each(_FLOATS, _named(of_one, _LINKED) + _named(of_two, _TWO))]
+    calls += [for_each(_FLOATS[1:], _named(of_one, _FLOAT_SERIES | _FAR) + _named(of_two, {"pow": "pow"}))]
+    return "".join([*start, *calls, SERIES, VECTOR_SERIES, _END])
 
 
 SCALAR = _scalar()
