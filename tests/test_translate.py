@@ -80,6 +80,7 @@ def assert_close(found, expected, ulp, scale, rows, inputs):
         off = (np.abs(found.astype(np.longdouble) - np.asarray(expected, np.longdouble)) / unit).astype(np.float64)
         tiny = (np.abs(rounded) < np.finfo(real).tiny) & (np.abs(found) <= np.finfo(real).tiny) & (real == np.float64)
     same = (found == rounded) | (np.isnan(found) & np.isnan(rounded)) | tiny
+    same &= (found != 0) | (np.signbit(found) == np.signbit(rounded)) | (scale > 0)
     ok = same | (np.isfinite(found) & np.isfinite(rounded) & (off <= ulp))
     wrong = np.argwhere(~ok & rows.reshape(-1, *[1] * (ok.ndim - 1)))
     at = [(x[k[0]].tolist() for x in inputs) for k in wrong[:3]]
@@ -100,7 +101,7 @@ def test_cases(name, kind, real):
 
 
 def test_every_primitive_that_is_translated_is_tested():
-    """Nothing stands in the table that no case reaches, but for names of other versions of JAX."""
+    """Nothing stands in the table that no case reaches, but for names of older or newer versions of JAX."""
 
     def names(jaxpr):
         for eqn in jaxpr.eqns:
@@ -109,8 +110,9 @@ def test_every_primitive_that_is_translated_is_tested():
                 yield from names(nested) if hasattr(nested, "eqns") else ()
 
     used = {name for case in CASES.values() for name in names(jax.make_jaxpr(case.function)(*case.examples("float32")).jaxpr)}
-    of_others = {"pjit", "closed_call", "core_call", "custom_vjp_call_jaxpr", "checkpoint", "remat", "copy_p", "expand_dims"}
-    assert set(TABLE) - used <= of_others
+    older = {"pjit", "closed_call", "core_call", "custom_vjp_call_jaxpr", "checkpoint", "remat", "copy_p", "expand_dims"}
+    newer = {"jit", "remat2", "stack", "unstack", "tile"}
+    assert set(TABLE) - used <= older | newer
 
 
 # --- constants --------------------------------------------------------------------------------------------------------
@@ -228,7 +230,7 @@ def test_cases_compile_for_cuda(real, tmp_path):
         (lambda x: jax.debug.print("{}", x[0]), "'debug_"),
         (lambda x: x.astype(jnp.float16), "dtype float16.*backend"),
         (lambda x: x.astype(int) ** x.astype(int), "no translation"),
-        (lambda x: jnp.tile(x, 86).sum(), r"shape \(258,\).*256.*backend"),
+        (lambda x: jnp.concatenate([x] * 86).sum(), r"shape \(258,\).*256.*backend"),
         (
             lambda x: functools.reduce(lambda m, k: jnp.sin(m + k), range(100), jnp.outer(x, jnp.arange(80.0))),
             "more than 20000.*backend",

@@ -80,7 +80,7 @@ ELEMENTWISE = {  # ulp in float32 and in float64
     "round_even": one(jnp.round),
     "sqrt": one(jnp.sqrt, 0.5),
     "rsqrt": one(lax.rsqrt, 2),
-    "cbrt": one(jnp.cbrt, 4),
+    "cbrt": one(jnp.cbrt, 4, exact=np.cbrt),
     "exp": one(jnp.exp, 2),
     "exp2": one(jnp.exp2, 2, exact=np.exp2),
     "expm1": one(jnp.expm1, 3),
