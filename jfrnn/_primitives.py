@@ -14,6 +14,8 @@ from jax import numpy as jnp
 
 from jfrnn._scalars import TYPES, NoTranslationError, Scalars
 
+MOST_REPEATED = 8  # the largest constant exponent of `pow` that is multiplied out, within a few ulp
+
 Values = np.ndarray  # numbers of scalars, in the shape of the array they make up
 
 
@@ -84,23 +86,31 @@ def _convert(eqn: Equation, inputs: list[Values]) -> list[Values]:
 
 
 def _power(eqn: Equation, inputs: list[Values]) -> list[Values]:
-    dtype = eqn.outputs[0].dtype
+    (x, y), dtype = inputs, eqn.outputs[0].dtype
     if not dtype.startswith("float"):
         raise NoTranslationError(f"the primitive 'pow' has no translation into a kernel for {dtype}: convert it to a float.")
-    return [eqn.each("pow", inputs[0], eqn.cast(inputs[1], dtype))]
+    exponents = {eqn.scalars.value(k) for k in y.reshape(-1).tolist()}
+    exponent = exponents.pop() if len(exponents) == 1 else None
+    if exponent is not None and abs(exponent) <= MOST_REPEATED and exponent == int(exponent):
+        return [_repeated(eqn, np.broadcast_to(x, eqn.outputs[0].shape), int(exponent))]
+    return [eqn.each("pow", x, eqn.cast(y, dtype))]
 
 
 def _integer_power(eqn: Equation, inputs: list[Values]) -> list[Values]:
-    exponent, square = abs(eqn.params["y"]), inputs[0]
-    result = eqn.full(1)
-    while exponent:
-        if exponent & 1:
+    return [_repeated(eqn, inputs[0], eqn.params["y"])]
+
+
+def _repeated(eqn: Equation, x: Values, exponent: int) -> Values:
+    """Return a power by repeated multiplication."""
+    result, square, left = eqn.full(1), x, abs(exponent)
+    while left:
+        if left & 1:
             result = eqn.each("mul", result, square)
-        exponent >>= 1
-        if exponent:
+        left >>= 1
+        if left:
             square = eqn.each("mul", square, square)
-    result = np.broadcast_to(result, inputs[0].shape)
-    return [eqn.each("div", eqn.full(1), result) if eqn.params["y"] < 0 else result]
+    result = np.broadcast_to(result, x.shape)
+    return eqn.each("div", eqn.full(1), result) if exponent < 0 else result
 
 
 def _round(eqn: Equation, inputs: list[Values]) -> list[Values]:

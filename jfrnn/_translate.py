@@ -29,14 +29,15 @@ MOST_ELEMENTS = 256  # of an array
 class Translated(NamedTuple):
     """A function of small arrays as native text.
 
-    `text` is a piece of a function body. It needs the scalars named in `reads`, each of the type that `Math` has for its dtype, and
-    defines `output_name(k, e)` for every element e of every output k. `key` is a hash of all of it, the same in every process.
+    `text` is a piece of a function body. For each (k, e) in `reads` it needs `input_name(k, e)`, element e of input k, of the type
+    that `Math` has for its dtype; it defines `output_name(k, e)` for every element of every output. `key` is a hash of all of it,
+    the same in every process.
     """
 
     text: str
     inputs: tuple[Spec, ...]
     outputs: tuple[Spec, ...]
-    reads: tuple[str, ...]
+    reads: tuple[tuple[int, int], ...]
     key: str
 
 
@@ -65,17 +66,17 @@ def translate(closed: ClosedJaxpr) -> Translated:
     """
     scalars = Scalars()
     inputs = tuple(_spec(v.aval, "an input") for v in closed.jaxpr.invars)
-    names: dict[int, str] = {}
+    places: dict[int, tuple[int, int]] = {}
     arguments = []
     for k, (shape, dtype) in enumerate(inputs):
-        numbers = {scalars.named(input_name(k, e), dtype): input_name(k, e) for e in range(math.prod(shape))}
-        names |= numbers
+        numbers = {scalars.named(input_name(k, e), dtype): (k, e) for e in range(math.prod(shape))}
+        places |= numbers
         arguments.append(np.array(list(numbers), int).reshape(shape))
     results = _run(scalars, closed, arguments)
     outputs = tuple(_spec(v.aval, "an output") for v in closed.jaxpr.outvars)
     defined = {output_name(k, e): x for k, result in enumerate(results) for e, x in enumerate(result.reshape(-1).tolist())}
     text = scalars.text(defined)
-    reads = tuple(names[number] for number in sorted(scalars.needed(defined.values()) & names.keys()))
+    reads = tuple(places[number] for number in sorted(scalars.needed(defined.values()) & places.keys()))
     return Translated(text, inputs, outputs, reads, hash_of(text, inputs, outputs))
 
 

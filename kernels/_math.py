@@ -102,7 +102,7 @@ JFRNN_MATH REAL sqrt(REAL x) { return __builtin_elementwise_sqrt(x); }
 JFRNN_MATH REAL floor(REAL x) { return __builtin_elementwise_floor(x); }
 JFRNN_MATH REAL ceil(REAL x) { return __builtin_elementwise_ceil(x); }
 JFRNN_MATH REAL round(REAL x) { return __builtin_elementwise_round(x); }
-JFRNN_MATH REAL round_even(REAL x) { return __builtin_elementwise_roundeven(x); }
+JFRNN_MATH REAL round_even(REAL x) { return __builtin_elementwise_rint(x); }
 """
 _SCALAR_SELECT = """
 JFRNN_MATH TYPE select(flag c, TYPE a, TYPE b) { return c ? a : b; }

@@ -93,7 +93,7 @@ def assert_close(found, expected, ulp, scale, rows, inputs):
 @pytest.mark.parametrize("real", ["float32", "float64"])
 def test_cases(name, kind, real):
     case, inputs = CASES[name], inputs_of(name, real)
-    found = run(kernel(real, kind), list(CASES).index(name), case.translated(real), inputs)
+    found = run(kernel(real, kind), list(CASES).index(name), case, inputs)
     expected = jax.tree.leaves(references(real)[name])
     assert len(found) == len(expected)
     for f, e in zip(found, expected):
@@ -130,7 +130,7 @@ def test_constants_are_the_same_bits(kind, dtype):
     quiet = bits(np.array([np.nan], dtype)) | np.array([0x1234], bits(np.zeros(1, dtype)).dtype)
     values = np.concatenate([np.array(FLOATS, dtype), quiet.view(dtype), -quiet.view(dtype), [np.finfo(dtype).smallest_subnormal]])
     case = Case(lambda x: jnp.where(jnp.isnan(x), x, values), ((),), None)
-    (found,) = run(kernel_of([case], real, kind, "constants"), 0, case.translated(real), [np.zeros(16, dtype)])
+    (found,) = run(kernel_of([case], real, kind, "constants"), 0, case, [np.zeros(16, dtype)])
     assert (bits(np.ascontiguousarray(found)) == bits(values)).all()
 
 
@@ -172,15 +172,15 @@ def test_text():
         "const auto out0_1 = v5;",
         "const auto out1_0 = v6;",
     ]
-    assert found.reads == ("in0_0", "in0_1", "in2_0", "in2_1")
+    assert found.reads == ((0, 0), (0, 1), (2, 0), (2, 1))
     assert found.inputs == (((2,), "float64"),) * 3
     assert found.outputs == (((2,), "float64"), ((), "float64"))
 
 
 def test_what_zeros_and_nan_could_tell_is_written():
     x = np.float32(2)
-    assert "0x0.0p+0f" in translated(lambda x: x + 0.0, x).text
-    assert "* in0_0" in translated(lambda x: x * 0.0, x).text.replace("in0_0 * Math::of(0x0.0p+0f)", "* in0_0")
+    assert "in0_0 + Math::of(0x0.0p+0f)" in translated(lambda x: x + 0.0, x).text
+    assert "in0_0 * Math::of(0x0.0p+0f)" in translated(lambda x: x * 0.0, x).text
     assert "in0_0 - in0_0" in translated(lambda x: x - x, x).text
     assert "in0_0 / in0_0" in translated(lambda x: x / x, x).text
 

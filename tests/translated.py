@@ -1,5 +1,6 @@
 """Translate functions, put all of them into one Warp kernel, and run it on the CPU."""
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -34,23 +35,24 @@ class Case(NamedTuple):
         dtypes = self.dtypes or ("real",) * len(self.shapes)
         return [jax.ShapeDtypeStruct(s, real if d == "real" else d) for s, d in zip(self.shapes, dtypes)]
 
-    def translated(self, real):
-        return _translate.translate(jax.make_jaxpr(self.function)(*self.examples(real)))
+
+@functools.cache
+def translated(case, real):
+    """Return a case as text, for a dtype."""
+    return _translate.translate(jax.make_jaxpr(case.function)(*case.examples(real)))
 
 
-def statements(translated, real, kind):
+def statements(text, real):
     """Return text that loads inputs from the rows of `given`, from column i on, computes, and stores into the rows of `found`."""
-    of_real, lines, rows = TYPES[real], [], {}
-    for k, spec in enumerate(translated.inputs):
-        for e in range(int(np.prod(spec.shape))):
-            rows[_translate.input_name(k, e)] = (len(rows), TYPES[spec.dtype])
-    for name in translated.reads:
-        row, of = rows[name]
-        loaded = f"load(given.data + {row} * n + i)"
+    of_real, lines = TYPES[real], []
+    before = np.cumsum([0, *(np.prod(spec.shape, dtype=int) for spec in text.inputs)])
+    for k, e in text.reads:
+        name, of = _translate.input_name(k, e), TYPES[text.inputs[k].dtype]
+        loaded = f"load(given.data + {before[k] + e} * n + i)"
         lines.append(f"const Math::{of} {name} = {loaded if of == of_real else f'Math::to_{of}({loaded})'};")
-    lines.append(translated.text)
+    lines.append(text.text)
     row = 0
-    for k, spec in enumerate(translated.outputs):
+    for k, spec in enumerate(text.outputs):
         for e in range(int(np.prod(spec.shape))):
             y = _translate.output_name(k, e)
             y = y if TYPES[spec.dtype] == of_real else f"Math::to_{of_real}({y})"
@@ -87,7 +89,7 @@ def kernel_of(cases, real, kind, name):
     def native(given: reals, found: reals, n: int, which: int): ...
 
     native.__name__ = native.__qualname__ = f"{name}_{kind}_{real}"
-    texts = [statements(case.translated(real), real, kind) for case in cases]
+    texts = [statements(translated(case, real), real) for case in cases]
     function = wp.func_native(native_text(texts, real, kind))(native)
 
     def run(given: reals, found: reals, n: int, which: int):
@@ -98,12 +100,12 @@ def kernel_of(cases, real, kind, name):
     return wp.kernel(run, module=module)
 
 
-def run(kernel, which, translated, inputs):
+def run(kernel, which, case, inputs):
     """Return the outputs [n, *shape] of one case, in the dtype under test, for inputs [n, *shape] in it."""
-    n = len(inputs[0])
+    n, outputs = len(inputs[0]), translated(case, inputs[0].dtype.name).outputs
     given = np.concatenate([x.reshape(n, -1).T for x in inputs])
-    sizes = [int(np.prod(spec.shape)) for spec in translated.outputs]
+    sizes = [int(np.prod(spec.shape)) for spec in outputs]
     found = wp.zeros((sum(sizes), n), dtype=wp.float32 if given.dtype == np.float32 else wp.float64, device="cpu")
     wp.launch(kernel, dim=1, inputs=[wp.array(given, device="cpu"), found, n, which], device="cpu")
     rows = np.split(found.numpy(), np.cumsum(sizes)[:-1])
-    return [x.T.reshape(n, *spec.shape) for x, spec in zip(rows, translated.outputs)]
+    return [x.T.reshape(n, *spec.shape) for x, spec in zip(rows, outputs)]

@@ -103,7 +103,7 @@ ELEMENTWISE = {  # ulp in float32 and in float64
     "pow": two(lambda x, y: x**y, 2),
     "square": one(jnp.square, 0.5),
     "integer_pow": one(lambda x: (x**1, x**2, x**3, x**7, x**-1, x**-2, x**-3), 4, -1e3, 1e3),
-    "power_of_constant": one(lambda x: (2.0**x, 10.0**x, x**0.5, x**1.5), 4, -300, 300),
+    "power_of_constant": one(lambda x: (2.0**x, 10.0**x, x**0.5, x**1.5, x**2.0, x**-3.0, x**7.0, x**0.0, x**9.0), 4, -300, 300),
     "select_n": two(lambda x, y: jnp.where(x > y, x, -y)),
     "isnan": one(lambda x: jnp.isnan(x) | jnp.isinf(x) ^ ~(x > 1) & (x < 3)),
     "to_int": one(lambda x: (x.astype(jnp.int32), x.astype(bool), (x > 0).astype(x.dtype), (x > 0).astype(jnp.int32))),
