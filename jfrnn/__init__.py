@@ -14,6 +14,7 @@ from jfrnn._chunks import run_chunk
 from jfrnn._memory import MemoryPlan, memory_plan
 from jfrnn._neighbors import NeighborList
 from jfrnn._order import hilbert_decode, hilbert_encode, morton_decode, morton_encode, sort_order
+from jfrnn._pair_sum import pair_sum
 from jfrnn._search import count, search
 from jfrnn._status import NeighborOverflowError, Status
 
@@ -29,6 +30,7 @@ __all__ = [
     "memory_plan",
     "morton_decode",
     "morton_encode",
+    "pair_sum",
     "run_chunk",
     "search",
     "sort_order",

@@ -17,7 +17,7 @@ from jfrnn._box import Box, Images, Lattice, Wrapped, fractions_of, is_valid, ma
 from jfrnn._cells import CellAxes, build_grid, cell_edge, cell_order, grid_coordinates, open_axes, stencil_runs
 from jfrnn._exact import Cutoff, Cutoffs, Radii, is_radius, make_cutoffs
 from jfrnn._levels import Axes, level_runs, sort_by_levels
-from jfrnn._runs import Candidates, Filter, Points, Torus, count_neighbors, list_neighbors
+from jfrnn._runs import Candidates, Filter, Points, State, Torus, Visit, count_neighbors, fold_neighbors, list_neighbors
 from jfrnn._status import Status
 from jfrnn._warp import Rows
 
@@ -72,31 +72,63 @@ def without_inactive(positions: Array, active: Array | None) -> Array:
     return positions if active is None else jnp.where(active[:, None], positions, jnp.nan)
 
 
-def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
-    """List the neighbors of every query, or only count them (capacity=None). Integers: no gradient flows through."""
-    given, given_queries, active, box, cutoff, batch = lax.stop_gradient(inputs)
-    sources, queries, images = without_inactive(given, active), given_queries, options.images
+class _Prepared(NamedTuple):
+    """The operands of a search as engines take them: NaN where a particle takes no part."""
+
+    sources: Array
+    queries: Array | None
+    cutoff: Cutoff | Cutoffs
+    batch: Batch | None
+    torus: tuple[Lattice, Wrapped] | None
+    checks: dict[Status, Array]
+
+
+def _prepared(inputs: Inputs, options: Options) -> _Prepared:
+    """Prepare a search. No gradient flows through."""
+    given, queries, active, box, cutoff, batch = lax.stop_gradient(inputs)
+    sources, images = without_inactive(given, active), options.images
     batch = None if batch is None else ranked(batch)
     checks: dict[Status, Array] = {}
     if isinstance(cutoff, Radii):
         sources, queries, checks = _with_valid_radii(sources, queries, active, cutoff)
         cutoff = make_cutoffs(cutoff, options.closed, options.skin)
     if box is None or images is None:
-        rows = _rows_of_engine(sources, queries, cutoff, options, capacity, batch)
-        return Found(_with_status(rows, given, given_queries, active, checks), None, None)
+        return _Prepared(sources, queries, cutoff, batch, None, checks)
     lattice = make_lattice(box, images, np.dtype(sources.dtype))
     wrapped = wrap(sources, queries, lattice, _largest(cutoff))
-    rows = _rows_of_engine(sources, queries, cutoff, options, capacity, batch, (lattice, wrapped))
     in_range = _all_in_range(wrapped.turns, sources) & _all_in_range(wrapped.query_turns, sources if queries is None else queries)
     checks |= {Status.BOX_TOO_SMALL: wrapped.enough & is_valid(lattice), Status.OUT_OF_RANGE: in_range}
+    return _Prepared(sources, queries, cutoff, batch, (lattice, wrapped), checks)
+
+
+def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
+    """List the neighbors of every query, or only count them (capacity=None). Integers: no gradient flows through."""
+    given, given_queries, active = lax.stop_gradient(inputs[:3])
+    sources, queries, cutoff, batch, torus, checks = _prepared(inputs, options)
+    rows = _rows_of_engine(sources, queries, cutoff, options, capacity, batch, torus)
     rows = _with_status(rows, given, given_queries, active, checks)
-    if rows.idx is None or images.nearest:
+    images = options.images
+    if rows.idx is None or torus is None or images is None or images.nearest:
         return Found(rows, None, None)
     n = max(sources.shape[0], 1)
     codes = (rows.idx // n).astype(images.dtype)
     idx = jnp.where(rows.idx == n * images.total, sources.shape[0], rows.idx % n)
-    query_turns = None if queries is None else wrapped.query_turns
-    return Found(rows._replace(idx=idx), codes, (wrapped.turns, query_turns))
+    _, wrapped = torus
+    return Found(rows._replace(idx=idx), codes, (wrapped.turns, None if queries is None else wrapped.query_turns))
+
+
+def fold_pairs(inputs: Inputs, options: Options, elements: int, visit: Visit[State], out: State) -> State:
+    """Walk over all pairs of a search, of which none is stored: see `fold_neighbors`. For the array engines."""
+    sources, queries, cutoff, batch, torus, _ = _prepared(inputs, options)
+    if 0 in (sources.shape[0], (sources if queries is None else queries).shape[0]):
+        return out
+    candidates = _candidates(sources, queries, cutoff, options, batch, torus)
+    return fold_neighbors(candidates, cutoff, options.filter, elements, visit, out)
+
+
+def is_decidable(inputs: Inputs, options: Options) -> Array:
+    """Say whether a search can answer for all particles that take part: cutoffs, box and positions are in range; [] bool."""
+    return functools.reduce(jnp.logical_and, _prepared(inputs, options).checks.values(), jnp.ones((), bool))
 
 
 def _with_valid_radii(

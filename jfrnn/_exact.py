@@ -146,7 +146,7 @@ def make_cutoffs(radii: Radii, closed: bool, skin: float = 0.0) -> Cutoffs:
 def _sum_rounded_up(x: Array, skin: float) -> Array:
     if skin == 0:
         return x
-    total, error = _two_sum(x, jnp.asarray(skin, x.dtype))
+    total, error = two_sum(x, jnp.asarray(skin, x.dtype))
     return jnp.where(error > 0, jnp.nextafter(total, jnp.asarray(jnp.inf, x.dtype)), total)
 
 
@@ -356,7 +356,7 @@ def _sum_sign(pair: Pair, threshold: _Threshold) -> Array:
         slack = slack + (jnp.abs(tail) * jnp.finfo(slack.dtype).eps + 2 * low * low)
     radius, low = radii[0] * scale, None
     if len(radii) == 2:
-        radius, low = _two_sum(radius, radii[1] * scale)
+        radius, low = two_sum(radius, radii[1] * scale)
     terms += [-term for term in _exact_square(jnp.broadcast_to(radius, slack.shape))]
     if low is not None:
         tail = -2 * radius * low
@@ -380,7 +380,7 @@ def _two_difference(a: Array, b: Array) -> tuple[Array, Array]:
     return difference, (a - a_virtual) + (b_virtual - b)
 
 
-def _two_sum(a: Array, b: Array) -> tuple[Array, Array]:
+def two_sum(a: Array, b: Array) -> tuple[Array, Array]:
     """Return fl(a + b) and its rounding error (Knuth 1969)."""
     total = a + b
     b_virtual = total - a
@@ -408,7 +408,7 @@ def _distill(terms: list[Array]) -> list[Array]:
     result = []
     total = terms[0]
     for term in terms[1:]:
-        total, error = _two_sum(total, term)
+        total, error = two_sum(total, term)
         result.append(error)
     return [*result, total]
 

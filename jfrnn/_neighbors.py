@@ -129,10 +129,10 @@ class NeighborList:
         Cost: one pass over the positions, or a search. Differentiable: no gradient flows through. Jit: yes. vmap: yes, each list
         being made anew where any of the batch is.
         """
-        sources, rows = self._geometry_inputs(positions, queries)
+        sources, rows = self.geometry_inputs(positions, queries)
         rows = rows if self.own_queries else None
         radii = self._radii_now(cutoff, sources, rows)
-        return _update(self, sources, rows, self._checked_active(active, sources), self._box_now(box, sources), radii)
+        return _update(self, sources, rows, self._checked_active(active, sources), self.box_now(box, sources), radii)
 
     def grow(
         self,
@@ -161,9 +161,9 @@ class NeighborList:
             TypeError: positions or the list are traced.
             ValueError, TypeError: an argument does not fit the list.
         """
-        sources, rows = self._geometry_inputs(positions, queries)
+        sources, rows = self.geometry_inputs(positions, queries)
         queries, active, slack = rows if self.own_queries else None, self._checked_active(active, sources), checked_slack(slack)
-        box, radii = self._box_now(box, sources), self._radii_now(cutoff, sources, queries)
+        box, radii = self.box_now(box, sources), self._radii_now(cutoff, sources, queries)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, radii, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
         met = rounded_capacity(math.ceil(slack * int(np.max(self.required))))
@@ -210,7 +210,7 @@ class NeighborList:
 
         Differentiable: to any order in positions, queries and box; the mask is a constant. Jit: yes. vmap: yes.
         """
-        vectors, mask, _ = self._geometry(positions, queries, box)
+        vectors, mask, _ = self.geometry(positions, queries, box)
         return vectors, mask
 
     def shifts(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> Array:
@@ -229,7 +229,7 @@ class NeighborList:
 
         Differentiable: no (integers). Jit: yes. vmap: yes.
         """
-        vectors, mask, shifts = self._geometry(positions, queries, box)
+        vectors, mask, shifts = self.geometry(positions, queries, box)
         if shifts is None:
             return jnp.zeros(vectors.shape, jnp.int32)
         return jnp.where(mask[..., None], shifts, 0).astype(jnp.int32)
@@ -372,7 +372,7 @@ class NeighborList:
             raise ValueError("this list was made with a cutoff for each particle: pass such an array, or leave cutoff out.")
         return radii
 
-    def _box_now(self, box: Box | None, sources: Array) -> Box | None:
+    def box_now(self, box: Box | None, sources: Array) -> Box | None:
         if box is None:
             return self.box
         if self.box is None:
@@ -380,9 +380,9 @@ class NeighborList:
         checked = checked_box(box, sources, like=self.box)
         return None if checked is None else fixed_box(checked, np.dtype(sources.dtype))
 
-    def _geometry(self, positions: Array, queries: Array | None, box: Box | None) -> tuple[Array, Array, Array | None]:
-        sources, rows = self._geometry_inputs(positions, queries)
-        box = self._box_now(box, sources)
+    def geometry(self, positions: Array, queries: Array | None, box: Box | None) -> tuple[Array, Array, Array | None]:
+        sources, rows = self.geometry_inputs(positions, queries)
+        box = self.box_now(box, sources)
         if 0 in (sources.shape[0], *self.idx.shape):
             return jnp.zeros((*self.idx.shape, sources.shape[1]), sources.dtype), jnp.zeros(self.idx.shape, bool), None
         cutoff = self.radii if self.cutoff is None else make_cutoff(self.cutoff, np.dtype(sources.dtype), self.closed)
@@ -390,7 +390,7 @@ class NeighborList:
             return *_vectors(self.idx, self.count, sources, rows, cutoff, self.closed), None
         return _periodic_vectors(self.idx, self.count, self.images, sources, rows, box, self.box_kind, cutoff, self.closed)
 
-    def _geometry_inputs(self, positions: Array, queries: Array | None) -> tuple[Array, Array]:
+    def geometry_inputs(self, positions: Array, queries: Array | None) -> tuple[Array, Array]:
         sources = checked_positions("positions", positions)
         if sources.shape[0] != self.source_count:
             raise ValueError(f"positions hold {sources.shape[0]} particles, but the list was made for {self.source_count}.")

@@ -7,7 +7,7 @@ scratch of a block stays below 64 MB whatever n, and nothing per candidate is ev
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +21,7 @@ _BLOCK_WORDS = 1 << 16
 _BLOCK_SLOTS = 1 << 22  # 16 MB of rows
 _SLOT_GROUP = 128  # slots of a row that are filled at a time
 _FEW_RUNS = 32
+FOLD_GROUP = 32  # neighbors of a query that are folded at a time
 _DOUBTFUL = 32  # doubtful candidates per row that one round of the exact test takes
 
 # places of queries [b], and which pass over the sources -> first places and ends of their runs [b, r], and the codes of their
@@ -155,6 +156,86 @@ def list_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filte
     m = queries.ids.size
     start = (jnp.zeros((m, capacity), jnp.int32), jnp.zeros(m, jnp.int32))
     return lax.fori_loop(0, engine.block_count, list_block, start)
+
+
+class Slots(NamedTuple):
+    """Some neighbors of each query of a block.
+
+    Attributes:
+        source: [b, g] int32 indices of sources, valid everywhere.
+        shift: [b, g, d] whole floats, the lattice shift of each; None where space is open.
+        real: [b, g] bool: there is such a pair.
+    """
+
+    source: Array
+    shift: Array | None
+    real: Array
+
+
+class Block(NamedTuple):
+    """Queries that are in work at a time.
+
+    Attributes:
+        query: [b] int32 their indices.
+        fresh: [b] bool: not in an earlier block; the others have no pairs here.
+        fold: (add, state) -> state; calls add(slots, state) -> state until all neighbors of all queries were seen.
+    """
+
+    query: Array
+    fresh: Array
+    fold: Callable[[Callable[[Slots, Any], Any], Any], Any]
+
+
+Visit = Callable[[Block, State], State]
+
+
+def fold_neighbors(
+    candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, elements: int, visit: Visit[State], out: State
+) -> State:
+    """Walk over the neighbors of all queries without listing them: out = visit(block, out) for one block after the other.
+
+    `elements` is how many numbers a visitor holds per pair: blocks are cut so that 16 MB of float32 hold them.
+    """
+    engine = _Engine(candidates._replace(sources=_padded(candidates.sources)), cutoff, keep, FOLD_GROUP * elements)
+    slots, torus = lax.iota(jnp.int32, FOLD_GROUP), candidates.torus
+
+    def fold_block(b: Array, out: State) -> State:
+        place, ids = engine.block(b)
+        fresh = place >= b * engine.block_size
+
+        def fold(add: Callable[[Slots, Any], Any], state: Any) -> Any:  # noqa: ANN401
+            def add_pass(which: Array, state: Any) -> Any:  # noqa: ANN401
+                table = engine.word_table(place, which)
+
+                def add_chunk(state: tuple[Array, Any]) -> tuple[Array, Any]:
+                    chunk, state = state
+                    hits, first, image = engine.hit_words(place, table, chunk)
+                    total = jnp.where(fresh, _bit_counts(hits).sum(1, dtype=jnp.int32), 0)
+
+                    def add_group(state: tuple[Array, Any]) -> tuple[Array, Any]:
+                        done, state = state
+                        ordinal = jnp.broadcast_to(done + slots, (place.size, slots.size))
+                        word, bit = _nth_bits(hits, ordinal)
+                        source = engine.sources.ids.at[_take(first, word) + bit].get(mode="promise_in_bounds")
+                        shift = None if image is None or torus is None else _shifts_of(torus, ids, source, _take(image, word))
+                        return done + FOLD_GROUP, add(Slots(source, shift, ordinal < total[:, None]), state)
+
+                    most = jnp.max(total)
+                    return chunk + 1, lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), state))[1]
+
+                return lax.while_loop(lambda state: state[0] * engine.words < table.longest, add_chunk, (jnp.int32(0), state))[1]
+
+            return engine.all_passes(add_pass, state)
+
+        return visit(Block(ids, fresh, fold), out)
+
+    return lax.fori_loop(0, engine.block_count, fold_block, out)
+
+
+def _shifts_of(torus: Torus, query: Array, source: Array, image: Array) -> Array:
+    """Return the lattice shifts [b, g, d], whole floats, of pairs of queries [b] and sources [b, g] of these images."""
+    turns, query_turns = torus.turns
+    return jnp.asarray(torus.images.shifts).astype(turns.dtype)[image] + query_turns[query][:, None] - turns[source]
 
 
 class _WordTable(NamedTuple):

@@ -103,7 +103,7 @@ def search(
     Differentiable: the list is topology, without gradient; see `NeighborList.vectors`. Jit: yes, with capacity. vmap: yes, with
     capacity. Source: cell lists (Hockney & Eastwood 1981, ch. 8); strict cutoff (Peifle 2019, §2.2).
     """
-    problem = _checked_problem(
+    problem = checked_problem(
         positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, skin, active
     )
     slack = checked_slack(slack)
@@ -163,20 +163,20 @@ def count(
 
     Memory: as in `search`, without the list. Differentiable: no (integers). Jit: yes. vmap: yes.
     """
-    problem = _checked_problem(
-        positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, 0.0, active
-    )
+    problem = checked_problem(positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, 0.0, active)
     return count_rows(problem.inputs, problem.options)
 
 
-class _Problem(NamedTuple):
+class Problem(NamedTuple):
+    """What was asked for, checked."""
+
     inputs: Inputs
     options: Options
     radius: float | None  # of a pair, without the skin; None where particles have their own
     skin: float
 
 
-def _checked_problem(
+def checked_problem(
     positions: Any,  # noqa: ANN401
     cutoff: Any,  # noqa: ANN401
     queries: Any,  # noqa: ANN401
@@ -189,7 +189,8 @@ def _checked_problem(
     backend: str,
     skin: Any,  # noqa: ANN401
     active: Any,  # noqa: ANN401
-) -> _Problem:
+) -> Problem:
+    """Check the arguments that all public verbs share."""
     sources = checked_positions("positions", positions)
     if queries is not None:
         queries = checked_positions("queries", queries, like=sources)
@@ -220,7 +221,7 @@ def _checked_problem(
     systems = None if batch is None else checked_batch(batch, sources, queries)
     list_cutoff, options = made_options(radii or reach, keep, kind, engine, dtype, closed, skin)
     box = None if box is None else fixed_box(box, dtype)
-    return _Problem(Inputs(sources, queries, active, box, list_cutoff, systems), options, radius, skin)
+    return Problem(Inputs(sources, queries, active, box, list_cutoff, systems), options, radius, skin)
 
 
 def _counted_capacity(inputs: Inputs, options: Options, slack: float) -> int:

@@ -19,7 +19,7 @@ ALLOWED = {  # first-party and third-party modules that each folder may import
     "jfrnn": {"jax", "numpy", "jfrnn"},
 }
 PUBLIC = {"Box", "MemoryPlan", "NeighborList", "NeighborOverflowError", "Status"}
-PUBLIC |= {"count", "memory_plan", "run_chunk", "search", "sort_order"}
+PUBLIC |= {"count", "memory_plan", "pair_sum", "run_chunk", "search", "sort_order"}
 PUBLIC |= {"hilbert_decode", "hilbert_encode", "morton_decode", "morton_encode"}
 
 
@@ -85,9 +85,10 @@ def test_examples_in_cases(table):
     assert (result.attempted > 0, result.failed) == (True, 0)
 
 
-def test_example_in_the_readme():
+@pytest.mark.parametrize("begin", ["import jax, jax.numpy as jnp, jfrnn\n\nx = ", "import jax, jax.numpy as jnp, jfrnn\n\nx, m = "])
+def test_example_in_the_readme(begin):
     """Runs in a process of its own, with the 64-bit mode off as a user finds it."""
-    example = (ROOT / "README.md").read_text().split("```python\n")[1].split("```")[0]
+    (example,) = (part.split("```")[0] for part in (ROOT / "README.md").read_text().split("```python\n") if part.startswith(begin))
     run = subprocess.run([sys.executable, "-c", example], capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
 

@@ -57,6 +57,7 @@ FUNCTIONS = {
     "csr": lambda x: LISTS["open"](x).csr(300),
     "to_jraph": lambda x: LISTS["open"](x).to_jraph(300),
     "to_jax_md": lambda x: LISTS["open"](x).to_jax_md(),
+    "pair_sum": lambda x: jfrnn.pair_sum(lambda r, i, j: {"r": r * j, "s": r @ r}, x, None, x[:, 0], neighbors=LISTS["open"](x)),
     "sort_order": lambda x: jfrnn.sort_order(x, 0.1),
     "morton_encode": lambda x: jfrnn.morton_encode(cells(x)),
     "morton_decode": lambda x: jfrnn.morton_decode(jfrnn.morton_encode(cells(x)), 2),

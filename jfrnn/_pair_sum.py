@@ -1,0 +1,145 @@
+"""The public verb `pair_sum`: sums over neighbors without a list of them."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jfrnn._box import Box
+from jfrnn._inputs import checked_backend, checked_flag
+from jfrnn._neighbors import NeighborList
+from jfrnn._search import checked_problem
+
+REDUCTIONS = ("sum", "max", "min")
+SYMMETRIES = (None, "symmetric", "antisymmetric")
+
+
+def pair_sum(
+    fn: Callable[[Array, Any, Any], Any],
+    positions: Array,
+    cutoff: float | Array | tuple[Array, Array] | None,
+    values: Any = None,  # noqa: ANN401
+    *,
+    query_values: Any = None,  # noqa: ANN401
+    reduce: str = "sum",
+    symmetry: str | None = None,
+    queries: Array | None = None,
+    box: Box | None = None,
+    batch: Array | tuple[Array, Array] | None = None,
+    radius_rule: str = "gather",
+    include_self: bool = False,
+    closed: bool = False,
+    active: Array | None = None,
+    compensated: bool = False,
+    backend: str = "auto",
+    neighbors: NeighborList | None = None,
+) -> Any:  # noqa: ANN401
+    """Sum a function of pairs over the neighbors of each particle, without a list of them; differentiable to every order.
+
+    result[i] = sum over the neighbors j of i of fn(r_ij, i, j), r_ij = x_j - x_i (in a periodic box + S·(lattice vectors), a term
+    for each image). The neighbors are exactly those of `search` with the same options.
+
+    Args:
+        fn: A JAX function of one pair: of the displacement r [length], shape [d], of the values of i and those of j; it returns a
+            pytree of arrays of floats or integers. It may close over arrays, traced ones too, and be differentiated in them. Where
+            particles may coincide or are their own neighbors, it must itself be safe at r = 0 (the derivative of sqrt is not).
+        positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64. n = 0 is allowed.
+        cutoff: As in `search`; with `neighbors` that of the list, or None.
+        values: A pytree of arrays of shape [n, ...]; fn gets leaves [...], of j and, without queries, of i. Default: None.
+        query_values: Likewise of the queries, leaves [m, ...], what fn gets of i. Only with queries.
+        reduce: "sum"; or "max" or "min", of each element of what fn returns, floats. Rows without neighbors then are -inf or inf.
+        symmetry: None: fn is asked about (i, j) and about (j, i). "symmetric" or "antisymmetric": fn is asked in one direction,
+            from the smaller index to the larger (of its own images: where the first number of S that is not zero is positive);
+            the other direction gets the same, or its negative, bit for bit. So forces balance to the rounding of the sums. Every
+            row gets its whole sum in any case. Not with queries, nor with the rules "gather" and "scatter".
+        queries: As in `search`: rows belong to them.
+        box: As in `search`; with `neighbors` as in `NeighborList.vectors`.
+        batch: As in `search`.
+        radius_rule: As in `search`.
+        include_self: As in `search`; r is 0 then.
+        closed: As in `search`.
+        active: As in `search`.
+        compensated: Carry the rounding errors of the sums along (two-sum, Knuth 1969) and add them in the end: the result is as if
+            summed in twice the precision. Derivatives are summed so, too. "max" and "min" are not concerned.
+        backend: "jax" (cells, any device), "brute" (all n·m candidates), or "auto": "jax".
+        neighbors: A list whose pairs are taken instead of a search: those that are closer than its cutoff at these positions, as
+            `NeighborList.vectors` says. A half list gives whole sums, too. Options with which it was made are left out. Rows that
+            overflowed lack pairs here as everywhere: see `NeighborList.check`.
+
+    Returns:
+        A pytree as fn returns it, leaves [m, ...]. Rows without neighbors, and those of particles that are inactive or have NaN or
+        infinite coordinates, are 0 ("max": -inf, "min": inf). Where the data show that a search cannot answer (a box that is too
+        small, a particle too far outside of it, a cutoff that is not positive and finite), all floats are NaN and all integers the
+        smallest of their kind; `search` says what it was.
+
+    Raises:
+        TypeError, ValueError: an argument is of the wrong kind, shape or range, or fn returns what cannot be summed.
+
+    Order of summation: the neighbors of a particle as the engine meets them (cell by cell, or by index in "brute", or as listed) in
+    groups of up to 32; first within a group, then one group after the other; compensated, a group is added up by halves. The
+    same input gives the same bits. With k neighbors the error is at most 4 eps·sqrt(k) of the sum of |terms| for k up to 60 000;
+    compensated a few eps of the sum itself, and some eps²·k of the sum of |terms|.
+    Memory: what `search` takes without its list, the results, and at most 16 MB (float32) for each array that fn needs for the
+    pairs that are in work; nothing grows with the number of pairs, in derivatives neither.
+    Differentiable: to every order, forward and backward, in positions, queries, values, query_values, the lattice vectors of the
+    box and whatever fn closes over; who is a neighbor is a constant. A derivative is a sum over the same pairs, gathered
+    by each particle (over a list that is not its own mirror image, scattered). What is no pair has no part in it, whatever fn
+    makes of it. "max" and "min" have the derivative of the pair that is the extreme one; of several, of that with the smallest j.
+    Jit: yes; outside of it, define fn once: one that is defined anew for each call is compiled anew. vmap: yes, one after the
+    other. Source: sums over neighbors as in SPH (Gingold & Monaghan 1977, doi:10.1093/mnras/181.3.375); derivatives by
+    transposition (Radul et al. 2023, doi:10.1145/3571236).
+    """
+    from jfrnn import _reduction  # brings jax.extend, which takes a while: when it is needed, not when jfrnn is imported
+
+    if not callable(fn):
+        raise TypeError(f"fn must be a function of (r, i, j), got {type(fn).__name__}.")
+    if reduce not in REDUCTIONS:
+        raise ValueError(f"reduce must be one of {', '.join(map(repr, REDUCTIONS))}, got {reduce!r}.")
+    if symmetry not in SYMMETRIES:
+        raise ValueError(f"symmetry must be None, 'symmetric' or 'antisymmetric', got {symmetry!r}.")
+    compensated = checked_flag("compensated", compensated)
+    if neighbors is None:
+        if cutoff is None:
+            raise ValueError("cutoff must be given: only a list (neighbors=) has its own.")
+        engine = _checked_engine(backend)
+        problem = checked_problem(
+            positions, cutoff, queries, box, batch, radius_rule, False, include_self, closed, engine, 0.0, active
+        )
+        pairs = _reduction.searched(problem.inputs, problem.options)
+    else:
+        given = {"batch": batch is not None, "radius_rule": radius_rule != "gather", "include_self": include_self}
+        given |= {"closed": closed, "active": active is not None, "backend": backend != "auto"}
+        pairs = _reduction.listed(neighbors, positions, cutoff, queries, box, given, reduce != "sum" or compensated)
+    if symmetry is not None and not pairs.directionless:
+        raise ValueError(
+            f"symmetry={symmetry!r} is about pairs without direction: not with queries, nor with a cutoff of one side."
+        )
+    if queries is None and query_values is not None:
+        raise ValueError("query_values belong to queries: without them fn gets values of i and of j.")
+    theirs = _checked_values("values", values, pairs.sources.shape[0], "particle")
+    mine = theirs if queries is None else _checked_values("query_values", query_values, pairs.rows.shape[0], "query")
+    return _reduction.reduced(fn, pairs, mine, theirs, reduce, symmetry, compensated)
+
+
+def _checked_engine(backend: Any) -> str:  # noqa: ANN401
+    if checked_backend(backend) in ("warp", "hashgrid"):
+        raise ValueError(f"backend={backend!r} cannot sum over pairs yet: pass 'jax', 'brute' or 'auto'.")
+    return "jax" if backend == "auto" else backend
+
+
+def _checked_values(name: str, values: Any, size: int, what: str) -> Any:  # noqa: ANN401
+    def checked(path: Any, leaf: Any) -> Array:  # noqa: ANN401
+        if not hasattr(leaf, "shape") or not hasattr(leaf, "dtype"):
+            raise TypeError(
+                f"{name}{jax.tree_util.keystr(path)} must be an array with a row per {what}, got {type(leaf).__name__}."
+            )
+        if tuple(leaf.shape[:1]) != (size,):
+            raise ValueError(
+                f"{name}{jax.tree_util.keystr(path)} must have shape [{size}, ...], one row per {what}, got {list(leaf.shape)}: "
+                "what all pairs share fn may close over."
+            )
+        return jnp.asarray(leaf)
+
+    return jax.tree_util.tree_map_with_path(checked, values)

@@ -1,0 +1,176 @@
+"""What `pair_sum` reduces: pairs that are searched or listed, and the summand that a function of one pair becomes."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jfrnn._backends import Inputs, Options, is_decidable, without_inactive
+from jfrnn._box import Box, Images, Lattice, make_lattice, translation
+from jfrnn._exact import Radii, make_cutoffs
+from jfrnn._extremes import bind_extremes
+from jfrnn._inputs import checked_cutoff
+from jfrnn._neighbors import NeighborList
+from jfrnn._relations import Listed, Relation, Searched
+from jfrnn._summation import bind_sum
+from jfrnn._terms import Groups, Summand, chosen, traced
+
+
+class Pairs(NamedTuple):
+    """Which pairs, and what their displacements are made of."""
+
+    relations: tuple[Relation, ...]
+    sources: Array
+    rows: Array
+    lattice: Lattice | None
+    largest: Any  # cutoff
+    directionless: bool
+    decidable: Array | None
+
+
+def searched(inputs: Inputs, options: Options) -> Pairs:
+    """Return the pairs that a search finds."""
+    sources, queries, active, box, cutoff, _ = inputs
+    fixed = lax.stop_gradient(inputs._replace(sources=without_inactive(sources, active), active=None))
+    relation, several = Searched(fixed, options), isinstance(cutoff, Radii)
+    decidable = is_decidable(inputs, options) if several or box is not None else None
+    largest = make_cutoffs(cutoff, options.closed).largest if isinstance(cutoff, Radii) else cutoff.radius
+    lattice = _lattice(box, options.images, sources)
+    rows = sources if queries is None else queries
+    return Pairs((relation,), sources, rows, lattice, largest, relation.symmetric, decidable)
+
+
+def listed(
+    nbrs: NeighborList,
+    positions: Array,
+    cutoff: Any,  # noqa: ANN401
+    queries: Array | None,
+    box: Box | None,
+    given: dict[str, bool],
+    full: bool,
+) -> Pairs:
+    """Return the pairs of a list, after checking that what was `given` besides fits it; `full`: a half list does not do."""
+    if not isinstance(nbrs, NeighborList):
+        raise TypeError(f"neighbors must be a jfrnn.NeighborList, got {type(nbrs).__name__}.")
+    for name in (name for name, is_given in given.items() if is_given):
+        raise ValueError(f"{name} was said when the list was made: leave it out where neighbors is given.")
+    if full and nbrs.half:
+        raise ValueError("neighbors must be a full list for reduce='max', 'min' and compensated=True: search without half=True.")
+    sources, rows = nbrs.geometry_inputs(positions, queries)
+    dtype = np.dtype(sources.dtype)
+    if cutoff is not None and (nbrs.cutoff is None or float(checked_cutoff(cutoff, dtype).radius) != nbrs.cutoff):
+        has = "a cutoff per particle" if nbrs.cutoff is None else f"cutoff={nbrs.cutoff}"
+        raise ValueError(f"cutoff must be None or that of the list, which has {has}, got {cutoff!r}.")
+    fixed, fixed_rows, fixed_box = lax.stop_gradient((sources, rows, box))
+    _, mask, shifts = nbrs.geometry(fixed, fixed_rows if nbrs.own_queries else None, fixed_box)
+    directionless = not nbrs.own_queries and (nbrs.radii is None or nbrs.radii.rule not in ("gather", "scatter"))
+    relation = Listed(nbrs.idx, mask, shifts, nbrs.source_count, symmetric=directionless and not nbrs.half)
+    relations: tuple[Relation, ...] = (relation,)
+    if nbrs.half:  # its mirror image, in which no pair of a particle with itself stands again
+        apart = nbrs.idx != lax.iota(jnp.int32, nbrs.idx.shape[0])[:, None]
+        apart = apart if shifts is None else apart | (shifts != 0).any(axis=-1)
+        relations = relation, Listed(nbrs.idx, mask & apart, shifts, nbrs.source_count, symmetric=False, flipped=True)
+    lattice = _lattice(nbrs.box_now(box, sources), nbrs.box_kind, sources)
+    largest = nbrs.cutoff if nbrs.radii is None else make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest
+    return Pairs(relations, sources, rows, lattice, largest, directionless, None)
+
+
+def _lattice(box: Box | None, images: Images | None, like: Array) -> Lattice | None:
+    return None if box is None or images is None else make_lattice(box, images, np.dtype(like.dtype))
+
+
+def reduced(
+    fn: Callable[[Array, Any, Any], Any],
+    pairs: Pairs,
+    mine: Any,  # noqa: ANN401
+    theirs: Any,  # noqa: ANN401
+    reduce: str,
+    symmetry: str | None,
+    compensated: bool,
+) -> Any:  # noqa: ANN401
+    """Trace fn, sum it, and give the sums the structure of what it returns."""
+    operands, summand, structure = _summand(fn, pairs, mine, theirs, symmetry)
+    one_pair = Groups(
+        tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in operands.shared),
+        *(tuple(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in group) for group in operands[1:]),
+    )
+    term, needed, closed_over = traced(summand, one_pair, jax.ShapeDtypeStruct(pairs.sources.shape[1:], pairs.sources.dtype), fn)
+    if reduce != "sum" and not all(jnp.issubdtype(x.dtype, jnp.floating) for x in term.summands):
+        raise TypeError(f"fn must return floats for reduce={reduce!r}, whose rows may be infinite: convert them with .astype.")
+    operands = chosen(operands, needed)
+    operands = operands._replace(shared=(*closed_over, *operands.shared))
+    if reduce == "sum":
+        parts = (bind_sum(relation, term, operands, compensated) for relation in pairs.relations)
+        leaves = functools.reduce(lambda a, b: [x + y for x, y in zip(a, b, strict=True)], parts)
+    else:
+        leaves = bind_extremes(pairs.relations[0], term, operands, reduce == "max")
+    if pairs.decidable is not None:
+        leaves = [_marked(x, pairs.decidable) for x in leaves]
+    return jax.tree.unflatten(structure[0], leaves)
+
+
+def _summand(
+    fn: Callable[[Array, Any, Any], Any],
+    pairs: Pairs,
+    mine: Any,  # noqa: ANN401
+    theirs: Any,  # noqa: ANN401
+    symmetry: str | None,
+) -> tuple[Groups, Summand, list]:
+    """Return the operands, fn as a function of one pair of them, and a list that takes the structure of what fn returns."""
+    sources, rows, lattice = pairs.sources, pairs.rows, pairs.lattice
+    dtype = sources.dtype
+    harmless = jnp.zeros(sources.shape[1], dtype).at[0].set(jnp.asarray(pairs.largest, dtype) / 2)
+    turning = [] if lattice is None else [lattice.matrix]
+    numbers = [lax.iota(jnp.int32, len(x)) for x in (rows, sources)]
+    (own, own_tree), (others, other_tree) = jax.tree.flatten(mine), jax.tree.flatten(theirs)
+    operands = Groups((harmless, *turning), (rows, numbers[0], *own), (sources, numbers[1], *others))
+    structure: list = []
+
+    def summand(real: Array, shift: Array, operands: Groups) -> list[Array]:
+        (harmless, *matrix), (x_i, number_i, *own), (x_j, number_j, *others) = operands
+        r = x_j - x_i
+        if lattice is not None:
+            r = r + translation(shift, dataclasses.replace(lattice, matrix=matrix[0]))
+        r = jnp.where(real, r, harmless)  # what fn gets where there is no pair must not stop it, or raise in debug modes
+        i, j = jax.tree.unflatten(own_tree, own), jax.tree.unflatten(other_tree, others)
+        if symmetry is None:
+            return leaves_of(fn(r, i, j))
+        ahead = (number_i < number_j) | ((number_i == number_j) & ~_is_backward(shift))
+        i, j = (jax.tree.map(functools.partial(jnp.where, ahead), *sides) for sides in ((i, j), (j, i)))
+        leaves = leaves_of(fn(jnp.where(ahead, r, -r), i, j))
+        return leaves if symmetry == "symmetric" else [jnp.where(ahead, x, -x) for x in leaves]
+
+    def leaves_of(result: Any) -> list[Array]:  # noqa: ANN401
+        leaves, tree = jax.tree.flatten(result)
+        structure[:] = [tree]
+        return [_summable(x, dtype) for x in leaves]
+
+    return operands, summand, structure
+
+
+def _is_backward(shift: Array) -> Array:
+    """Say whether the first number of a shift [d] that is not zero is negative."""
+    result = jnp.zeros((), bool)
+    for k in reversed(range(shift.shape[0])):
+        result = (shift[k] < 0) | ((shift[k] == 0) & result)
+    return result
+
+
+def _summable(x: Any, dtype: np.dtype) -> Array:  # noqa: ANN401
+    array = jnp.asarray(x)
+    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
+        raise TypeError(f"fn must return floats or integers, got {array.dtype}: convert it, e.g. with .astype(jnp.int32).")
+    is_loose = jnp.issubdtype(array.dtype, jnp.floating) and jax.typeof(array).weak_type
+    return array.astype(dtype if is_loose else array.dtype)
+
+
+def _marked(x: Array, decidable: Array) -> Array:
+    """Return what is no result where the data show that there is none; its derivatives likewise."""
+    if jnp.issubdtype(x.dtype, jnp.floating):
+        return x * jnp.where(decidable, 1, jnp.nan).astype(x.dtype)
+    return jnp.where(decidable, x, jnp.iinfo(x.dtype).min)

@@ -1,0 +1,268 @@
+"""The summand of a pair sum, as a jaxpr of one pair, and what derivatives make of it: again summands.
+
+A term g gets, of a pair (i, j): whether it is real, the lattice shift of j, operands that all pairs share, those of i ("own") and
+those of j ("others"). Positions are operands like all others: the displacement is computed inside. So its tangent is a term, with
+tangents as further operands; and the transpose of a linear term is one for each side of the pair, with cotangents of the sums,
+which belong to i, as further operands.
+"""
+
+import dataclasses
+import functools
+import math
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from itertools import compress
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import eval_jaxpr
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+from jax.interpreters import partial_eval
+
+
+class Groups(NamedTuple):
+    """Something for each operand of a term: arrays, their shapes, flags."""
+
+    shared: tuple
+    own: tuple
+    others: tuple
+
+
+Summand = Callable[[Array, Array, Groups], Sequence[Array]]  # real [] bool, shift [d], operands -> summands
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Term:
+    """A traced summand; static, told from others by its identity.
+
+    Attributes:
+        jaxpr: (real, shift, *shared, *own, *others) -> summands.
+        operands: What one pair gets of them (shapes and dtypes), but real and shift.
+        shift: Shape and dtype of the shift, [d] whole floats.
+        totals: For each summand, whether it is summed over all pairs, instead of over the neighbors j of each i.
+    """
+
+    jaxpr: ClosedJaxpr
+    operands: Groups
+    shift: jax.ShapeDtypeStruct
+    totals: tuple[bool, ...]
+
+    @property
+    def summands(self) -> tuple[jax.ShapeDtypeStruct, ...]:
+        """Shapes and dtypes of what one pair gives."""
+        return tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in self.jaxpr.out_avals)
+
+    @property
+    def elements(self) -> int:
+        """How many numbers the largest array holds that one pair needs."""
+        of_equations = (v.aval for equation in self.jaxpr.jaxpr.eqns for v in equation.outvars)
+        return max(math.prod(getattr(aval, "shape", ())) for aval in (*of_equations, *self.jaxpr.in_avals))
+
+    def __call__(self, real: Array, shift: Array, operands: Groups) -> Sequence[Array]:
+        """Evaluate one pair."""
+        return jaxpr_as_fun(self.jaxpr)(real, shift, *operands.shared, *operands.own, *operands.others)
+
+    def split(self, operands: Sequence) -> Groups:
+        """Sort what belongs to the operands, one after the other, into their groups."""
+        return _split(operands, self.operands)
+
+
+def _split(operands: Sequence, like: Groups) -> Groups:
+    shared, own, _ = (len(group) for group in like)
+    return Groups(tuple(operands[:shared]), tuple(operands[shared : shared + own]), tuple(operands[shared + own :]))
+
+
+def traced(summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct, owner: Any) -> tuple[Term, Groups, tuple[Array, ...]]:  # noqa: ANN401
+    """Trace a summand that may close over anything; return its term, which operands it needs, and what it closes over.
+
+    `operands` are the shapes and dtypes of what one pair gets. What it closes over becomes the first of the shared operands.
+    While the `owner`, the function that the summand calls, lives and is traced to the same again, the same term comes back, and
+    with it the programs that were compiled for it.
+    """
+    closed = jax.make_jaxpr(_flat(summand, operands))(*_one_pair(operands, shift))
+    consts = tuple(jnp.asarray(x) for x in closed.consts)
+    of_consts = Groups(tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in consts), (), ())
+
+    def hoisted(real: Array, shift: Array, operands: Groups) -> Sequence[Array]:
+        shared, own, others = operands
+        return eval_jaxpr(closed.jaxpr, shared[: len(consts)], real, shift, *shared[len(consts) :], *own, *others)
+
+    derived = _kept(owner, make_term(hoisted, joined(of_consts, operands), shift))
+    of_closed, needed = derived.needed.shared[: len(consts)], derived.needed.shared[len(consts) :]
+    return derived.term, derived.needed._replace(shared=needed), tuple(compress(consts, of_closed))
+
+
+_KNOWN: "weakref.WeakKeyDictionary[Any, dict[Any, Derived]]" = weakref.WeakKeyDictionary()
+
+
+def _kept(owner: Any, derived: "Derived") -> "Derived":  # noqa: ANN401
+    """Return an equal term that the owner had before, or this one, which it has from now on."""
+    closed = derived.term.jaxpr
+    if closed.consts:
+        return derived
+    key = (
+        str(closed.jaxpr),
+        tuple(_literals(closed.jaxpr)),
+        jax.tree.structure(derived.needed),
+        tuple(jax.tree.leaves(derived.needed)),
+    )
+    try:
+        return _KNOWN.setdefault(owner, {}).setdefault(key, derived)
+    except TypeError:  # such an owner can have nothing
+        return derived
+
+
+def _literals(jaxpr: Jaxpr) -> Iterator[bytes]:
+    """Yield the numbers that are written into a jaxpr, of which its text may show few digits."""
+    for equation in jaxpr.eqns:
+        yield from (np.asarray(v.val).tobytes() for v in equation.invars if isinstance(v, Literal))
+        for inner in (x for value in equation.params.values() for x in (value if isinstance(value, tuple) else (value,))):
+            if isinstance(inner, Jaxpr | ClosedJaxpr):
+                yield from _literals(inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner)
+    yield from (np.asarray(v.val).tobytes() for v in jaxpr.outvars if isinstance(v, Literal))
+
+
+class Derived(NamedTuple):
+    """A term, and which of the operands that were foreseen it needs."""
+
+    term: Term
+    needed: Groups
+
+
+def make_term(summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct, totals: Sequence[bool] | None = None) -> Derived:
+    """Trace a summand of these operands that closes over nothing, and drop the operands that it does not need."""
+    closed = jax.make_jaxpr(_flat(summand, operands))(*_one_pair(operands, shift))
+    always = [True, True] + [False] * sum(map(len, operands))
+    jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), always)
+    needed = _split(used[2:], operands)
+    term = Term(ClosedJaxpr(jaxpr, closed.consts), chosen(operands, needed), shift, tuple(totals or [False] * len(jaxpr.outvars)))
+    return Derived(term, needed)
+
+
+def _one_pair(operands: Groups, shift: jax.ShapeDtypeStruct) -> list[jax.ShapeDtypeStruct]:
+    return [jax.ShapeDtypeStruct((), np.bool_), shift, *operands.shared, *operands.own, *operands.others]
+
+
+def _flat(summand: Summand, operands: Groups) -> Callable[..., list[Array]]:
+    return lambda real, shift, *flat: [jnp.asarray(x) for x in summand(real, shift, _split(flat, operands))]
+
+
+def chosen(operands: Groups, flags: Groups) -> Groups:
+    """Return the operands whose flag is set."""
+    return Groups(*(tuple(compress(group, which)) for group, which in zip(operands, flags, strict=True)))
+
+
+def joined(*groups: Groups) -> Groups:
+    """Put operands one behind the other, group by group."""
+    return Groups(*(sum(parts, ()) for parts in zip(*groups, strict=True)))
+
+
+def is_moving(x: Any) -> bool:  # noqa: ANN401
+    """Say whether something with a dtype has derivatives."""
+    return jnp.issubdtype(x.dtype, jnp.inexact)
+
+
+@functools.lru_cache(maxsize=256)
+def tangent(term: Term, moving: Groups) -> Derived:
+    """Make the term of the tangents of the float summands: of all operands, then the tangents of the moving ones, by group."""
+    tangents = chosen(term.operands, moving)
+
+    def summand(real: Array, shift: Array, operands: Groups) -> list[Array]:
+        primals, moves = _halves(operands, term.operands)
+
+        def of_moving(moved: Groups) -> list[Array]:
+            summands = term(real, shift, _merged(primals, moved, moving))
+            return [x for x in summands if is_moving(x)]
+
+        return jax.jvp(of_moving, (chosen(primals, moving),), (moves,))[1]
+
+    totals = [total for total, x in zip(term.totals, term.summands, strict=True) if is_moving(x)]
+    return make_term(summand, joined(term.operands, tangents), term.shift, totals)
+
+
+class Transposed(NamedTuple):
+    """The terms of the cotangents of a term's linear operands; None where there are none.
+
+    Attributes:
+        along: Summed as the term was: totals of the shared linear operands, then sums of those of i. Operands: those that are not
+            linear, then the cotangents: of totals shared, of sums with i.
+        across: Summed over the i of each j, or None: sums of the linear operands of j, the roles of i and j exchanged.
+    """
+
+    along: Derived | None
+    across: Derived | None
+
+
+@functools.lru_cache(maxsize=256)
+def transposed(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetric: bool) -> Transposed:
+    """Transpose a term in its linear operands; `cotangents` says of which sums there are any.
+
+    `symmetric`: j is a neighbor of i where i is one of j, and both have operands of both kinds. Then one term does it: the sums of
+    the linear operands of j are the last ones of `along`, whose operands of either side are all those of i, then those of j.
+    """
+    still = chosen(term.operands, Groups(*(tuple(not flag for flag in group) for group in linear)))
+    of_totals, of_sums = (
+        tuple(x for x, total, there in zip(term.summands, term.totals, cotangents, strict=True) if there and total == kind)
+        for kind in (True, False)
+    )
+    given = joined(still, Groups(of_totals, of_sums, ()))
+
+    def pull(real: Array, shift: Array, operands: Groups) -> Groups:
+        known, cts = _halves(operands, still)
+        by_kind = {True: list(cts.shared), False: list(cts.own)}
+        ordered = [by_kind[total].pop(0) for total, there in zip(term.totals, cotangents, strict=True) if there]
+
+        def of_linear(unknown: Groups) -> list[Array]:
+            return list(compress(term(real, shift, _merged(known, unknown, linear)), cotangents))
+
+        (result,) = jax.linear_transpose(of_linear, chosen(term.operands, linear))(ordered)
+        return result
+
+    def along(real: Array, shift: Array, operands: Groups) -> list[Array]:
+        result = pull(real, shift, operands)
+        return [*result.shared, *result.own]
+
+    def across(real: Array, shift: Array, operands: Groups) -> list[Array]:
+        return list(pull(real, -shift, operands._replace(own=operands.others, others=operands.own)).others)
+
+    def both(real: Array, shift: Array, operands: Groups) -> list[Array]:
+        shared, mine, theirs = operands
+        count, known = len(given.own), len(given.own) + len(given.others)
+        forward, backward = (
+            Groups(shared, i[:count], j[count:known]) for i, j in ((mine, theirs), (theirs, mine))
+        )  # fmt: skip
+        return along(real, shift, forward) + list(pull(real, -shift, backward).others)
+
+    totals, sums, theirs = ([flag for flag in group if flag] for group in linear)
+    if symmetric and theirs and (totals or sums):
+        sides = given.own + given.others
+        flags = [True] * len(totals) + [False] * (len(sums) + len(theirs))
+        return Transposed(make_term(both, Groups(given.shared, sides, sides), term.shift, flags), None)
+    exchanged = Groups(given.shared, given.others, given.own)
+    flags = [True] * len(totals) + [False] * len(sums)
+    return Transposed(
+        make_term(along, given, term.shift, flags) if flags else None,
+        make_term(across, exchanged, term.shift) if theirs else None,
+    )
+
+
+def _halves(operands: Groups, first: Groups) -> tuple[Groups, Groups]:
+    """Cut each group where `first` ends."""
+    cuts = [len(group) for group in first]
+    return (
+        Groups(*(group[:cut] for group, cut in zip(operands, cuts, strict=True))),
+        Groups(*(group[cut:] for group, cut in zip(operands, cuts, strict=True))),
+    )
+
+
+def _merged(unflagged: Groups, flagged: Groups, flags: Groups) -> Groups:
+    """Return all operands in order; of `unflagged`, those that are flagged may be missing or there."""
+    groups = []
+    for rest, some, which in zip(unflagged, flagged, flags, strict=True):
+        whole = len(rest) == len(which)
+        rest_left, some_left = iter([x for k, x in enumerate(rest) if not (whole and which[k])]), iter(some)
+        groups.append(tuple(next(some_left) if flag else next(rest_left) for flag in which))
+    return Groups(*groups)

@@ -1,0 +1,661 @@
+"""`pair_sum`: the pairs of the oracle, summed; its derivatives against those of the oracle's sum; and what must not matter."""
+
+import functools
+import math
+
+import checked
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from jfrnn.cases.batches import BATCH_CASES
+from jfrnn.cases.hard import HARD_CASES
+from jfrnn.cases.periodic import PERIODIC_CASES
+from jfrnn.cases.radii import RADII_CASES
+
+import jfrnn
+from jfrnn import _relations, _runs, _summation
+
+SLOW = pytest.mark.slow
+LENGTH = 704  # so that cases share compiled programs
+
+
+@pytest.fixture(autouse=True)
+def _compile_soon(request):
+    """Leave out what LLVM takes long for and what no float depends on, but in slow tests and those of memory."""
+    fully = request.node.get_closest_marker("slow") or "memory" in request.node.name
+    jax.config.update("jax_disable_most_optimizations", not fully)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+def arrays_of(pairs, dim):
+    """Return i, j and shifts of (i, j) or (i, j, S), sorted."""
+    rows = [(p[0], p[1], *(p[2] if len(p) > 2 else (0,) * dim)) for p in sorted(pairs)]
+    table = np.array(rows, np.int64).reshape(-1, 2 + dim)
+    return table[:, 0], table[:, 1], table[:, 2:]
+
+
+def oracle_sum(fn, pairs, x, q, own, others, matrix=None):
+    """Sum fn over these pairs, all at once and rounded by float64 alone; differentiable by JAX in everything."""
+    i, j, shifts = arrays_of(pairs, x.shape[1])
+    r = x[j] - q[i] + (0 if matrix is None else jnp.asarray(shifts, x.dtype) @ matrix)
+    terms = jax.vmap(fn)(r, *(jax.tree.map(lambda v, at=at: v[at], tree) for tree, at in ((own, i), (others, j))))
+    return jax.tree.map(lambda t: jax.ops.segment_sum(t, i, q.shape[0]), terms)
+
+
+# --- the pairs are those of the oracle ---------------------------------------------------------------------------------------
+
+
+def marks(r, i, j):
+    """Tell pairs apart: whole numbers, which no order of summation rounds, and the displacement."""
+    return {"count": 1, "ids": j, "squares": j * j, "rows": i, "r": r}
+
+
+def assert_marks(sums, pairs, x, q=None, matrix=None):
+    x, q = np.asarray(x, np.float64), np.asarray(x if q is None else q, np.float64)
+    i, j, shifts = arrays_of(pairs, x.shape[1])
+    m, r = len(q), x[j] - q[i] + (0 if matrix is None else shifts @ np.asarray(matrix, np.float64))
+    counts = np.bincount(i, minlength=m)
+    np.testing.assert_array_equal(sums["count"], counts)
+    np.testing.assert_array_equal(sums["ids"], np.bincount(i, j, m))
+    np.testing.assert_array_equal(sums["squares"], np.bincount(i, j * j, m))
+    np.testing.assert_array_equal(sums["rows"], counts * np.arange(m))
+    eps = np.finfo(sums["r"].dtype).eps
+    size = 0 if matrix is None else np.abs(x[np.isfinite(x)]).max(initial=0)
+    for k in range(x.shape[1]):
+        with np.errstate(over="ignore"):
+            expected, total = np.bincount(i, r[:, k], m), np.bincount(i, np.abs(r[:, k]) + 8 * size, m)
+        small = np.abs(total) < np.finfo(sums["r"].dtype).max / 4
+        assert (np.abs(np.asarray(sums["r"])[:, k] - expected)[small] <= (4 * eps * np.sqrt(counts) * total)[small]).all()
+
+
+def marked_sums(x, cutoff, queries=None, length=LENGTH, **options):
+    ids = jnp.arange(length, dtype=jnp.int32)
+    x = jnp.asarray(checked.padded(np.asarray(x), length))
+    if queries is not None:
+        options |= {"queries": jnp.asarray(checked.padded(np.asarray(queries), length)), "query_values": ids}
+    return jfrnn.pair_sum(marks, x, cutoff, ids, **options)
+
+
+@jax.jit
+def listed_marks(x, nbrs):
+    return jfrnn.pair_sum(marks, x, None, jnp.arange(len(x), dtype=jnp.int32), neighbors=nbrs)
+
+
+def cut(sums, rows):
+    """Return the first rows, after checking that the padding has nothing."""
+    assert all(not np.asarray(leaf[rows:]).any() for leaf in jax.tree.leaves(sums))
+    return jax.tree.map(lambda leaf: leaf[:rows], sums)
+
+
+KINDS = [
+    pytest.param("jax", np.float32, 3, id="jax-f32-3d"),
+    pytest.param("brute", np.float64, 2, id="brute-f64-2d", marks=SLOW),
+    pytest.param("jax", np.float64, 2, id="jax-f64-2d", marks=SLOW),
+    pytest.param("jax", np.float64, 3, id="jax-f64-3d", marks=SLOW),
+    pytest.param("brute", np.float32, 3, id="brute-f32-3d", marks=SLOW),
+]
+HARD = ["lattice_1_at_1e4", "dyadic_ties", "ulp_negative", "mixed_exponents", "far_1e8", "all_coincident", "clumps_near_max", "n_1"]
+
+
+@pytest.mark.parametrize(("backend", "dtype", "dim"), KINDS)
+def test_hard_cases(backend, dtype, dim):
+    for name in HARD:
+        given = HARD_CASES[name].build(dtype, dim)
+        sums = cut(marked_sums(given.positions, given.cutoff, backend=backend), len(given.positions))
+        assert_marks(sums, reference.reference_pairs(given.positions, given.cutoff), given.positions)
+
+
+@pytest.mark.parametrize("backend", ["brute", pytest.param("jax", marks=SLOW)])
+def test_options(backend):
+    """Queries and active; then closed with include_self; each where it decides something."""
+    given = HARD_CASES["queries_coincident"].build(np.float32, 3)
+    active = np.arange(LENGTH) % 3 > 0
+    sums = cut(marked_sums(given.positions, given.cutoff, given.queries, active=active, backend=backend), len(given.queries))
+    pairs = reference.reference_pairs(given.positions, given.cutoff, queries=given.queries)
+    assert_marks(sums, {(i, j) for i, j in pairs if active[j]}, given.positions, given.queries)
+    given = HARD_CASES["integers_9"].build(np.float32, 2)
+    sums = marked_sums(given.positions, given.cutoff, closed=True, include_self=True, backend=backend)
+    pairs = reference.reference_pairs(given.positions, given.cutoff, closed=True, include_self=True)
+    assert_marks(cut(sums, len(given.positions)), pairs, given.positions)
+
+
+BOXES = {
+    "jax": ["outside_100", "faces", "ulp_across_100"],
+    "brute": ["cutoff_1.5_skewed"],
+    "list": ["skewed_3_small", "outside_100"],
+}
+
+
+@pytest.mark.parametrize(("backend", "dtype", "dim"), [("jax", np.float32, 3), ("brute", np.float64, 2), ("list", np.float32, 3)])
+def test_periodic_cases(backend, dtype, dim):
+    for name in BOXES[backend]:
+        given = PERIODIC_CASES[name].build(dtype, dim)
+        n, box = len(given.positions), jfrnn.Box(given.matrix, given.periodic)
+        if backend == "list":
+            nbrs = jfrnn.search(given.positions, given.cutoff, box=box, backend="warp")
+            sums = listed_marks(jnp.asarray(given.positions), nbrs)
+        else:
+            sums = cut(marked_sums(given.positions, given.cutoff, length=256, box=box, backend=backend), n)
+        pairs = reference.reference_images(given.positions, given.cutoff, matrix=given.matrix, periodic=given.periodic)
+        matrix = given.matrix if np.ndim(given.matrix) == 2 else np.diag(given.matrix)
+        assert_marks(sums, pairs, given.positions, matrix=matrix.astype(dtype))
+
+
+@pytest.mark.parametrize(
+    ("backend", "rule"),
+    [("jax", "mean"), *(pytest.param("jax", rule, marks=SLOW) for rule in ("gather", "scatter", "either", "both"))],
+)
+def test_radii(backend, rule):
+    for name in ("ties", "spread_100"):
+        given = RADII_CASES[name].build(np.float64, 2)
+        radii = np.concatenate([given.cutoffs, np.ones(LENGTH - len(given.cutoffs))])
+        sums = cut(marked_sums(given.positions, radii, radius_rule=rule, backend=backend), len(given.positions))
+        assert_marks(sums, reference.reference_radii(given.positions, given.cutoffs, rule), given.positions)
+
+
+def test_batches():
+    given = next(iter(BATCH_CASES.values())).build(np.float32, 2)
+    pairs = reference.reference_pairs(given.positions, given.cutoff)
+    pairs = {(i, j) for i, j in pairs if given.batch[i] == given.batch[j]}
+    ids = jnp.arange(len(given.positions), dtype=jnp.int32)
+    sums = jfrnn.pair_sum(marks, given.positions, given.cutoff, ids, batch=given.batch, backend="brute")
+    assert_marks(sums, pairs, given.positions)
+
+
+@pytest.mark.parametrize(("n", "m"), [(0, None), (0, 3), (3, 0)])
+def test_empty(n, m):
+    x, ids = jnp.zeros((n, 2), jnp.float32), jnp.arange(n, dtype=jnp.int32)
+    options = {} if m is None else {"queries": jnp.zeros((m, 2), jnp.float32), "query_values": jnp.arange(m, dtype=jnp.int32)}
+    sums = jfrnn.pair_sum(marks, x, 1.0, ids, **options)
+    assert sums["r"].shape == (n if m is None else m, 2)
+    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(sums))
+    low = jfrnn.pair_sum(lambda r, i, j: r[0], x, 1.0, ids, reduce="max", **options)
+    assert (np.asarray(low) == -np.inf).all()
+    gradient = jax.grad(lambda x: jfrnn.pair_sum(lambda r, i, j: r @ r, x, 1.0, ids, **options).sum())(x)
+    assert gradient.shape == x.shape
+
+
+# --- derivatives -------------------------------------------------------------------------------------------------------------
+
+N = 60
+CUTOFF = 0.5
+ENGINES = [("list", True), ("brute", False)]  # second derivatives are made of the same parts, and compile slowly
+ENGINES += [pytest.param(*engine, marks=SLOW) for engine in (("jax", False), ("brute", True), ("jax", True))]
+
+
+def scene(seed, dim=2):
+    """Return points with pairs at exactly the cutoff, coincident and lonely ones, or (seed > 0) random ones; and their masses."""
+    random = np.random.default_rng(seed)
+    if seed == 0:
+        lattice = np.stack(np.meshgrid(*[np.arange(4) * 0.25] * 2), axis=-1).reshape(-1, 2)
+        x = np.concatenate([lattice, lattice[:8], 1 + random.random((N - 25, 2)), [[9.0, 9.0]]])
+        x = np.concatenate([x, np.zeros((N, dim - 2))], axis=1)
+    else:
+        x = random.random((N, dim)) * 1.5
+    return jnp.asarray(x), jnp.asarray(0.5 + random.random(N))
+
+
+def smooth(scale, r, i, j):
+    """A function of pairs without any symmetry, differentiable everywhere, not zero at the cutoff."""
+    s = r @ r
+    return {"a": scale * j["m"] * jnp.exp(-s), "b": i["m"] * j["m"] ** 2 * (scale + s) * r}
+
+
+def everything(sums, second=True):
+    """Return a function of arguments and tangents: value, gradient and Hessian-vector product of sums, in all arguments."""
+
+    def loss(*args):
+        weight = jnp.arange(1.0, 1 + 2 * N) / N
+        return sum(jnp.sum(jnp.sin(leaf).T * weight[: len(leaf)]) for leaf in jax.tree.leaves(sums(*args)))
+
+    def derivatives(args, along):
+        def slope(*args):
+            return jax.jvp(loss, args, along)[1]
+
+        value, gradient = jax.value_and_grad(loss, range(len(args)))(*args)
+        return value, gradient, jax.grad(slope, range(len(args)))(*args) if second else None
+
+    return jax.jit(derivatives)
+
+
+def tangents_of(args, seed=5):
+    random = np.random.default_rng(seed)
+    return tuple(jnp.asarray(random.standard_normal(np.shape(x)), x.dtype) for x in args)
+
+
+def assert_same(found, expected, tolerance=1e-12):
+    for got, wanted in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert got.dtype == wanted.dtype
+        np.testing.assert_allclose(got, wanted, rtol=0, atol=tolerance * max(1e-9, float(np.abs(wanted).max())))
+        assert float(np.abs(wanted).max()) > 0
+
+
+@pytest.mark.parametrize(("backend", "second"), ENGINES)
+def test_derivatives(backend, second):
+    """Of coincident points, at ties, in empty rows; then of random points, where finite differences exist as well."""
+    nbrs = [jfrnn.search(scene(seed)[0], CUTOFF, capacity=48, backend="warp") for seed in (0, 1)]
+    options = {} if backend == "list" else {"backend": backend}
+
+    def sums(nbrs):
+        given = options or {"neighbors": nbrs}
+        return lambda x, m, s: jfrnn.pair_sum(functools.partial(smooth, s), x, CUTOFF, {"m": m}, **given)
+
+    found = jax.jit(lambda args, along, nbrs: everything(sums(nbrs), second)(args, along))
+    for seed in (0, 1):
+        args = (*scene(seed), jnp.asarray(1.3))
+        along, pairs = tangents_of(args), reference.reference_pairs(args[0], CUTOFF)
+        expected = everything(
+            lambda x, m, s, pairs=pairs: oracle_sum(functools.partial(smooth, s), pairs, x, x, {"m": m}, {"m": m}), second
+        )
+        value, gradient, product = found(args, along, nbrs[seed])
+        assert_same((value, gradient, product), expected(args, along))
+    step = 1e-6
+    ahead, behind = (found(jax.tree.map(lambda x, t, s=s: x + s * t, args, along), along, nbrs[1]) for s in (step, -step))
+    slope = sum(float(jnp.vdot(g, t)) for g, t in zip(gradient, along, strict=True))
+    assert float(ahead[0] - behind[0]) / (2 * step) == pytest.approx(slope, rel=1e-6)
+    for up, down, wanted in zip(ahead[1], behind[1], product or (), strict=second):
+        np.testing.assert_allclose((up - down) / (2 * step), wanted, atol=1e-5 * float(np.abs(wanted).max()))
+
+
+def test_third_derivatives():
+    """By reverse over reverse over reverse, over a list, which compiles soon."""
+    x, m = scene(1)
+    nbrs = jfrnn.search(x, CUTOFF, backend="warp")
+    weight, along = jnp.arange(1.0, 1 + N)[:, None], tangents_of((x,))[0]
+
+    def third(sums):
+        def first(x):
+            return jax.grad(lambda x: (sums(x)["b"] * weight).sum())(x)
+
+        def second(x):
+            return jax.grad(lambda x: jnp.vdot(first(x), along))(x)
+
+        return jax.jit(jax.grad(lambda x: jnp.vdot(second(x), along)))(x)
+
+    fn, values = functools.partial(smooth, 1.3), {"m": m}
+    pairs = reference.reference_pairs(x, CUTOFF)
+    found = third(lambda x: jfrnn.pair_sum(fn, x, None, values, neighbors=nbrs))
+    assert_same(found, third(lambda x: oracle_sum(fn, pairs, x, x, values, values)))
+
+
+@pytest.mark.parametrize("rule", ["scatter", pytest.param("gather", marks=SLOW), pytest.param("mean", marks=SLOW)])
+@pytest.mark.parametrize(("backend", "second"), ENGINES)
+def test_derivatives_with_queries_and_radii(backend, second, rule):
+    """The reversed pairs are those of the other rule; values of queries and of positions are apart."""
+    (x, m), q = scene(1), scene(2)[0][:23]
+    h, of_queries = 0.2 + 0.4 * m, jnp.linspace(0.3, 0.6, 23)
+    cutoff = {"scatter": h, "gather": of_queries}.get(rule, (h, of_queries))
+    options = {"queries": q, "radius_rule": rule}
+    fn = functools.partial(smooth, 0.7)
+    nbrs = jfrnn.search(x, cutoff, backend="warp", **options) if backend == "list" else None
+    searched = {"radius_rule": rule, "backend": backend}
+
+    def sums(x, q, m, w):
+        given = {"neighbors": nbrs} if backend == "list" else searched
+        wanted = None if backend == "list" else cutoff
+        return jfrnn.pair_sum(fn, x, wanted, {"m": m}, query_values={"m": w}, queries=q, **given)
+
+    pairs = reference.reference_radii(x, h, rule, queries=q, query_radii=of_queries)
+    args = (x, q, m, of_queries)
+    along = tangents_of(args)
+    expected = everything(lambda x, q, m, w: oracle_sum(fn, pairs, x, q, {"m": w}, {"m": m}), second)
+    assert_same(everything(sums, second)(args, along), expected(args, along))
+
+
+MATRIX = np.array([[0.45, 0.1, 0.0], [-0.1, 1.1, 0.1], [0.0, 0.0, 9.0]])
+PERIODIC = (True, True, False)
+
+
+@pytest.mark.parametrize(
+    ("backend", "second"),
+    [ENGINES[0], ("half", False), *(pytest.param(*e, marks=SLOW) for e in (("half", True), ("brute", False), ("jax", True)))],
+)
+def test_derivatives_in_a_box(backend, second):
+    """Several images of a pair, own ones too; derivatives in the lattice vectors."""
+    (x, m), fn = scene(1, dim=3), functools.partial(smooth, 0.7)
+    pairs = reference.reference_images(x, CUTOFF, matrix=MATRIX, periodic=PERIODIC)
+    assert any(i == j for i, j, _ in pairs)
+
+    def sums(x, m, matrix):
+        box = jfrnn.Box(matrix, PERIODIC, images=2)
+        if backend in ("list", "half"):
+            return jfrnn.pair_sum(fn, x, CUTOFF, {"m": m}, neighbors=nbrs, box=box)
+        return jfrnn.pair_sum(fn, x, CUTOFF, {"m": m}, box=box, backend=backend)
+
+    nbrs = jfrnn.search(x, CUTOFF, box=jfrnn.Box(MATRIX, PERIODIC, images=2), half=backend == "half", backend="warp")
+    args = (x, m, jnp.asarray(MATRIX))
+    along = (*tangents_of(args[:2]), jnp.asarray(MATRIX**2))
+    expected = everything(lambda x, m, a: oracle_sum(fn, pairs, x, x, {"m": m}, {"m": m}, a), second)
+    assert_same(everything(sums, second)(args, along), expected(args, along))
+
+
+@pytest.mark.parametrize("backend", ["jax", "list", pytest.param("brute", marks=SLOW)])
+def test_many_blocks(backend, monkeypatch):
+    """Blocks of which the last reaches back, in sums over rows and over all pairs."""
+    monkeypatch.setattr(_runs, "_BLOCK_WORDS", 16 * 25)
+    monkeypatch.setattr(_relations, "_LIST_SLOTS", 25 * 32 * 4)
+    (x, m), weights = scene(1), jnp.arange(2.0)
+    given = {"neighbors": jfrnn.search(x, CUTOFF, capacity=39, backend="warp")} if backend == "list" else {"backend": backend}
+
+    def fn(weights, r, i, j):
+        return j * jnp.tanh(weights @ r)
+
+    def gradient(sums):
+        return jax.jit(jax.grad(lambda x, w: (sums(x, functools.partial(fn, w)) ** 2).sum(), (0, 1)))(x, weights)
+
+    pairs = reference.reference_pairs(x, CUTOFF)
+    found = gradient(lambda x, fn: jfrnn.pair_sum(fn, x, CUTOFF, m, **given))
+    assert_same(found, gradient(lambda x, fn: oracle_sum(fn, pairs, x, x, m, m)))
+
+
+@pytest.mark.parametrize(("backend", "second"), [ENGINES[0], *(pytest.param(b, False, marks=SLOW) for b in ("brute", "jax"))])
+def test_what_is_no_pair_poisons_nothing(backend, second):
+    """fn is NaN or infinite where there is no pair, and so are values and positions of inactive particles."""
+    x, m = scene(1)
+    active = np.arange(N) % 4 > 0
+    x = jnp.where(active[:, None] | (np.arange(N) % 8 == 0)[:, None], x, jnp.nan)
+    m = jnp.where(active, m, jnp.nan)
+    given = {"active": active, "backend": backend}
+    if backend == "list":
+        given = {"neighbors": jfrnn.search(x, CUTOFF, active=active, capacity=50, backend="warp")}
+
+    def fn(r, i, j):
+        distance = jnp.sqrt(r @ r)
+        return i * j * jnp.log(distance) / (r[0] - CUTOFF / 2)  # infinite at the displacement that stands in for none
+
+    pairs = {(i, j) for i, j in reference.reference_pairs(x, CUTOFF) if active[i] and active[j]}
+    args, along = (x, m), tangents_of((x, m))
+    found = everything(lambda x, m: jfrnn.pair_sum(fn, x, CUTOFF, m, **given), second)(args, along)
+    assert_same(found, everything(lambda x, m: oracle_sum(fn, pairs, x, x, m, m), second)(args, along), 1e-9)
+    assert not np.asarray(found[1][0])[~active].any()
+
+
+# --- symmetry, half lists, extremes, rounding --------------------------------------------------------------------------------
+
+
+def one_sided(r, i, j):
+    return r * i + jnp.sin(j)
+
+
+def imposed(sign, pairs):
+    """Return the sums of `one_sided`, asked from the smaller index to the larger alone."""
+
+    def sums(x, m, matrix):
+        ahead = {(i, j, s) for i, j, s in pairs if i < j or (i == j and s >= (0,) * x.shape[1])}
+        back = {(i, j, s) for i, j, s in ahead if (i, any(s)) != (j, False)}  # not of a particle with itself
+        first = oracle_sum(one_sided, ahead, x, x, m, m, matrix)
+        i, j, shifts = arrays_of(back, x.shape[1])
+        terms = jax.vmap(one_sided)(x[j] - x[i] + jnp.asarray(shifts, x.dtype) @ matrix, m[i], m[j])
+        return first + sign * jax.ops.segment_sum(terms, j, len(x))
+
+    return sums
+
+
+@pytest.mark.parametrize(
+    ("backend", "symmetry"),
+    [
+        ("half", "antisymmetric"),
+        *(pytest.param(b, "symmetric", marks=SLOW) for b in ("list", "half", "jax")),
+        pytest.param("brute", "antisymmetric", marks=SLOW),
+    ],
+)
+def test_symmetry(backend, symmetry):
+    x, m = scene(1, dim=3)
+    box, options = jfrnn.Box(MATRIX, PERIODIC), {"include_self": True}
+    pairs = reference.reference_images(x, CUTOFF, matrix=MATRIX, periodic=PERIODIC, include_self=True)
+    options |= {"box": box, "backend": backend}
+    if backend in ("list", "half"):
+        options = {"neighbors": jfrnn.search(x, CUTOFF, box=box, half=backend == "half", include_self=True, backend="warp")}
+    args, along = (x, m), tangents_of((x, m))
+    expected = imposed({"symmetric": 1, "antisymmetric": -1}[symmetry], pairs)
+    found = everything(lambda x, m: jfrnn.pair_sum(one_sided, x, CUTOFF, m, symmetry=symmetry, **options), False)(args, along)
+    assert_same(found, everything(lambda x, m: expected(x, m, jnp.asarray(MATRIX)), False)(args, along))
+
+
+@pytest.mark.parametrize("include_self", [False, True])
+def test_half_lists_give_whole_sums(include_self):
+    x, _ = scene(0)
+    nbrs = jfrnn.search(x, CUTOFF, half=True, include_self=include_self, backend="warp")
+    sums = listed_marks(x, nbrs)
+    assert_marks(sums, reference.reference_pairs(x, CUTOFF, include_self=include_self), x)
+
+
+def test_a_list_with_a_skin_is_cut_at_the_cutoff():
+    x, _ = scene(0)
+    nbrs = jfrnn.search(x + 0.01, CUTOFF, skin=0.2, backend="warp")
+    sums = listed_marks(x, nbrs)
+    assert_marks(sums, reference.reference_pairs(x, CUTOFF), x)
+    assert int(nbrs.count.sum()) > int(sums["count"].sum())
+
+
+@pytest.mark.parametrize(
+    ("backend", "reduce"),
+    [
+        ("list", "max"),
+        *(pytest.param(*kind, marks=SLOW) for kind in (("list", "min"), ("brute", "min"), ("jax", "max"))),
+    ],
+)
+def test_extremes(backend, reduce):
+    """Of own images too; rows without neighbors; the derivative is that of the extreme pair."""
+    x, m = scene(1, dim=3)
+    x = x.at[:, 2].multiply(3.0).at[7].set(jnp.array([0.1, 0.1, 30.0]))
+    box = jfrnn.Box(np.array([2.0, 0.4, 9.0]), (False, True, False))
+    matrix = np.diag([2.0, 0.4, 9.0])
+    options = (
+        {"neighbors": jfrnn.search(x, 0.39, box=box, backend="warp")} if backend == "list" else {"backend": backend, "box": box}
+    )
+    pairs = reference.reference_images(x, 0.39, matrix=matrix, periodic=(False, True, False))
+    i, j, shifts = arrays_of(pairs, 3)
+    assert len(set(i.tolist())) < N
+
+    def fn(r, i, j):
+        return {"signal": i * j - r @ jnp.array([1.0, 2.0, 3.0]), "r": jnp.sin(3 * r)}
+
+    def expected(x, m):
+        terms = jax.vmap(fn)(x[j] - x[i] + shifts @ matrix, m[i], m[j])
+        reduced = {"max": jax.ops.segment_max, "min": jax.ops.segment_min}[reduce]
+        return jax.tree.map(lambda t: reduced(t, i, N), terms)
+
+    def finite(sums):
+        def loss(x, m):
+            leaves = jax.tree.leaves(sums(x, m))
+            return sum(jnp.sum(jnp.where(jnp.isfinite(leaf), leaf, 0.0) ** 2) for leaf in leaves), leaves
+
+        return jax.jit(jax.grad(loss, (0, 1), has_aux=True))(x, m)
+
+    found, leaves = finite(lambda x, m: jfrnn.pair_sum(fn, x, 0.39, m, reduce=reduce, **options))
+    wanted, wanted_leaves = finite(expected)
+    assert_same(found, wanted)
+    for got, leaf in zip(leaves, wanted_leaves, strict=True):
+        np.testing.assert_array_equal(np.isinf(got), np.isinf(leaf))
+        np.testing.assert_allclose(got, leaf, rtol=1e-13)
+
+
+def test_of_equal_extremes_the_smallest_index_counts():
+    x = jnp.zeros((50, 2)).at[49].set(9.0)
+    nbrs = jfrnn.search(x, 1.0, backend="warp")
+    largest = jax.jit(jax.value_and_grad(lambda m: jnp.sum(extremes(m)[:49]), has_aux=False))
+    extremes = functools.partial(lambda m: jfrnn.pair_sum(lambda r, i, j: j, x, None, m, reduce="max", neighbors=nbrs))
+    total, gradient = largest(jnp.asarray([1.0, 3.0, 2.0] * 16 + [2.0, 4.0]))
+    assert float(total) == 3 * 49
+    np.testing.assert_array_equal(np.nonzero(gradient)[0], [1, 4])  # 4 is what 1 itself has
+    np.testing.assert_array_equal(gradient[jnp.array([1, 4])], [48, 1])
+    rows = jax.jit(extremes)(jnp.arange(50.0).at[48].set(jnp.nan))
+    assert np.isnan(rows[:48]).all()  # NaN is not hidden
+    np.testing.assert_array_equal(rows[48:], [47, -np.inf])
+
+
+@pytest.mark.parametrize("backend", ["list", pytest.param("jax", marks=SLOW), pytest.param("brute", marks=SLOW)])
+def test_rounding(backend):
+    """Sums of many terms against exact ones: the bound of the docstring, and with compensation a far smaller one."""
+    n, eps = 500, np.finfo(np.float32).eps
+    random = np.random.default_rng(0)
+    values = (random.standard_normal(n) * 10 ** random.uniform(-3, 5, n)).astype(np.float32)
+    values[n // 2 :] = -values[: n // 2] * np.float32(1 + 1e-5)
+    x = jnp.zeros((n, 2), jnp.float32)
+    options = {"backend": backend}
+    if backend == "list":
+        options = {"neighbors": jfrnn.search(x, 1.0, include_self=True, backend="warp")}
+    else:
+        options["include_self"] = True
+    plain, compensated = (
+        np.asarray(jfrnn.pair_sum(lambda r, i, j: j, x, 1.0, values, compensated=c, **options), np.float64) for c in (False, True)
+    )
+    exact, total = math.fsum(values.tolist()), math.fsum(np.abs(values).tolist())
+    assert np.abs(plain - exact).max() <= 4 * eps * math.sqrt(n) * total
+    bound = 2 * eps * abs(exact) + 4 * eps**2 * n * total
+    assert np.abs(compensated - exact).max() <= bound
+    assert np.abs(plain - exact).max() > 10 * bound  # else this would prove nothing
+
+
+# --- transformations, memory, errors -----------------------------------------------------------------------------------------
+
+
+def test_programs_are_used_again():
+    """New positions and cutoffs trace and compile nothing; a function that changed is noticed."""
+    traces, factor = [], 2.0
+
+    def fn(r, i, j):
+        traces.append(None)
+        return factor * j
+
+    x, m = scene(1)
+    nbrs = [jfrnn.search(x + shift, CUTOFF, capacity=40, backend="warp") for shift in (0.0, 1.0)]
+    jitted = jax.jit(lambda x, m, nbrs: jfrnn.pair_sum(fn, x, None, m, neighbors=nbrs))
+    for shift, given in enumerate(nbrs):
+        jitted(x + shift, m, given)
+    assert len(traces) == 1
+    first = jfrnn.pair_sum(fn, x, None, m, neighbors=nbrs[0])
+    size = _summation._compiled._cache_size()
+    np.testing.assert_array_equal(jfrnn.pair_sum(fn, x, None, m, neighbors=nbrs[0]), first)
+    assert _summation._compiled._cache_size() == size
+    factor = 2.0 + 1e-12
+    assert (np.asarray(jfrnn.pair_sum(fn, x, None, m, neighbors=nbrs[0])) != np.asarray(first)).any()
+    assert _summation._compiled._cache_size() == size + 1
+
+
+@pytest.mark.parametrize("backend", ["list", pytest.param("brute", marks=SLOW), pytest.param("jax", marks=SLOW)])
+def test_vmap_and_scan(backend):
+    """Both over a gradient; some operands have no batch."""
+    x, m = scene(1)
+    xs, scales = jnp.stack([x, 0.9 * x, x**2]), jnp.array([1.0, 2.0, 3.0])
+
+    def gradient(x, scale):
+        def loss(x, scale):
+            given = {"backend": backend}
+            if backend == "list":
+                given = {"neighbors": jfrnn.search(jax.lax.stop_gradient(x), CUTOFF, capacity=64, backend="warp")}
+            return (jfrnn.pair_sum(lambda r, i, j: scale * j * jnp.exp(-r @ r), x, CUTOFF, m, **given) ** 2).sum()
+
+        return jax.grad(loss, (0, 1))(x, scale)
+
+    one_by_one = jax.jit(gradient)
+    expected = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(one_by_one(x, s) for x, s in zip(xs, scales, strict=True)))
+    assert_same(jax.jit(jax.vmap(gradient))(xs, scales), expected)
+    scanned = jax.jit(lambda xs, scales: jax.lax.scan(lambda c, given: (c, gradient(*given)), 0, (xs, scales))[1])
+    assert_same(scanned(xs, scales), expected)
+
+
+def test_derivatives_of_vmap():
+    x, m = scene(1)
+    nbrs, pairs = jfrnn.search(x, CUTOFF, backend="warp"), reference.reference_pairs(x, CUTOFF)
+
+    def gradient(sums):
+        def loss(x, scales):
+            each = jax.vmap(lambda x, scale: sums(functools.partial(smooth, scale), x)["b"], (None, 0))
+            return jnp.sum(jnp.sin(each(x, scales)))
+
+        return jax.jit(jax.grad(loss, (0, 1)))(x, jnp.array([1.0, 2.0]))
+
+    values = {"m": m}
+    found = gradient(lambda fn, x: jfrnn.pair_sum(fn, x, None, values, neighbors=nbrs))
+    assert_same(found, gradient(lambda fn, x: oracle_sum(fn, pairs, x, x, values, values)))
+
+
+def test_memory_does_not_grow_with_pairs():
+    """A million particles: gradient included, less than their neighbors alone would take, were they listed."""
+    n = 1_000_000
+
+    def loss(x, m):
+        return (jfrnn.pair_sum(lambda r, i, j: j * jnp.exp(-r @ r), x, 0.1, m, backend="jax") ** 2).sum()
+
+    shapes = jax.ShapeDtypeStruct((n, 2), np.float32), jax.ShapeDtypeStruct((n,), np.float32)
+    memory = jax.jit(jax.grad(loss, (0, 1))).lower(*shapes).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < 64e6 + 200 * n
+
+
+def test_where_a_search_cannot_answer_nothing_looks_like_an_answer():
+    x, m = scene(1, dim=3)
+
+    @jax.jit
+    def sums(x, h, lengths):
+        box = jfrnn.Box(lengths, (True, False, False))
+        return jfrnn.pair_sum(lambda r, i, j: {"float": j, "int": 1}, x, h, m, box=box, backend="brute")
+
+    h, lengths = jnp.full(N, 0.3), jnp.array([2.0, 1.0, 1.0])
+    good = sums(x, h, lengths)
+    assert np.isfinite(good["float"]).all()
+    assert (good["int"] >= 0).all()
+    for wrong in ((x, h.at[3].set(-1.0), lengths), (x, h, 0.1 * lengths), (x.at[0, 0].set(1e5), h, lengths)):
+        bad = sums(*wrong)
+        assert np.isnan(bad["float"]).all()
+        assert (bad["int"] < 0).all()
+
+
+X, Q, M = np.zeros((4, 2), np.float32), np.ones((3, 2), np.float32), np.ones(4, np.float32)
+pair_sum = functools.partial(jfrnn.pair_sum, lambda r, i, j: r, X, 1.0)
+
+
+def listed(**options):
+    return jfrnn.search(X, 1.0, capacity=4, backend="warp", **options)
+
+
+@pytest.mark.parametrize(
+    ("error", "match", "call"),
+    [
+        (TypeError, r"fn must be a function of \(r, i, j\), got int", lambda: jfrnn.pair_sum(3, X, 1.0)),
+        (TypeError, "fn must return floats or integers, got bool", lambda: jfrnn.pair_sum(lambda r, i, j: r[0] > 0, X, 1.0)),
+        (TypeError, "fn must return floats for reduce='max'", lambda: jfrnn.pair_sum(lambda r, i, j: 1, X, 1.0, reduce="max")),
+        (ValueError, "reduce must be one of 'sum', 'max', 'min', got 'mean'", lambda: pair_sum(reduce="mean")),
+        (ValueError, "symmetry must be None, 'symmetric' or", lambda: pair_sum(symmetry="odd")),
+        (ValueError, "symmetry='symmetric' is about pairs without direction", lambda: pair_sum(symmetry="symmetric", queries=Q)),
+        (
+            ValueError,
+            "symmetry='symmetric' is about pairs without direction",
+            lambda: jfrnn.pair_sum(lambda r, i, j: r, X, M, symmetry="symmetric"),
+        ),
+        (TypeError, "compensated must be True or False", lambda: pair_sum(compensated=1)),
+        (ValueError, "backend='warp' cannot sum over pairs yet: pass 'jax'", lambda: pair_sum(backend="warp")),
+        (ValueError, "backend='hashgrid' cannot sum over pairs yet", lambda: pair_sum(backend="hashgrid")),
+        (ValueError, "backend must be one of", lambda: pair_sum(backend="numpy")),
+        (ValueError, r"values\['m'\] must have shape \[4, ...\], one row per particle, got \[3\]", lambda: pair_sum({"m": M[:3]})),
+        (TypeError, r"values\['m'\] must be an array with a row per particle, got float", lambda: pair_sum({"m": 1.0})),
+        (ValueError, r"query_values must have shape \[3, ...\], one row per query", lambda: pair_sum(queries=Q, query_values=M)),
+        (ValueError, "query_values belong to queries", lambda: pair_sum(query_values=M)),
+        (ValueError, "cutoff must be given", lambda: jfrnn.pair_sum(lambda r, i, j: r, X, None)),
+        (ValueError, "cutoff must be positive", lambda: jfrnn.pair_sum(lambda r, i, j: r, X, -1.0)),
+        (TypeError, "neighbors must be a jfrnn.NeighborList, got int", lambda: pair_sum(neighbors=3)),
+        (ValueError, "closed was said when the list was made", lambda: pair_sum(neighbors=listed(), closed=True)),
+        (ValueError, "backend was said when the list was made", lambda: pair_sum(neighbors=listed(), backend="jax")),
+        (
+            ValueError,
+            "cutoff must be None or that of the list, which has cutoff=1.0, got 2.0",
+            lambda: jfrnn.pair_sum(lambda r, i, j: r, X, 2.0, neighbors=listed()),
+        ),
+        (
+            ValueError,
+            "positions hold 4 particles, but the list was made for 3",
+            lambda: pair_sum(neighbors=jfrnn.search(X[:3], 1.0, capacity=4, backend="warp")),
+        ),
+        (ValueError, "made without queries", lambda: pair_sum(neighbors=listed(), queries=Q)),
+        (ValueError, "made without a periodic box", lambda: pair_sum(neighbors=listed(), box=jfrnn.Box([3.0, 3.0]))),
+        (ValueError, "neighbors must be a full list for reduce='max'", lambda: pair_sum(neighbors=listed(half=True), reduce="max")),
+        (ValueError, "neighbors must be a full list", lambda: pair_sum(neighbors=listed(half=True), compensated=True)),
+    ],
+)
+def test_errors(error, match, call):
+    with pytest.raises(error, match=match):
+        call()
