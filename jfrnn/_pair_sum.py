@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jfrnn._auto import platform_of
+from jfrnn._backends import Options
 from jfrnn._box import Box
 from jfrnn._inputs import checked_backend, checked_flag
 from jfrnn._neighbors import NeighborList
-from jfrnn._search import checked_problem
+from jfrnn._search import Problem, checked_problem
 
 REDUCTIONS = ("sum", "max", "min")
 SYMMETRIES = (None, "symmetric", "antisymmetric")
@@ -103,11 +105,12 @@ def pair_sum(
     if neighbors is None:
         if cutoff is None:
             raise ValueError("cutoff must be given: only a list (neighbors=) has its own.")
-        engine = _checked_engine(backend)
+        if checked_backend(backend) == "hashgrid":
+            raise ValueError("backend='hashgrid' cannot sum over pairs: pass 'warp', 'jax', 'brute' or 'auto'.")
         problem = checked_problem(
-            positions, cutoff, queries, box, batch, radius_rule, False, include_self, closed, engine, 0.0, active
+            positions, cutoff, queries, box, batch, radius_rule, False, include_self, closed, backend, 0.0, active
         )
-        pairs = _reduction.searched(problem.inputs, problem.options)
+        pairs = _reduction.searched(problem.inputs, _with_engine(problem, backend, reduce))
     else:
         given = {"batch": batch is not None, "radius_rule": radius_rule != "gather", "include_self": include_self}
         given |= {"closed": closed, "active": active is not None, "backend": backend != "auto"}
@@ -123,10 +126,17 @@ def pair_sum(
     return _reduction.reduced(fn, pairs, mine, theirs, reduce, symmetry, compensated)
 
 
-def _checked_engine(backend: Any) -> str:  # noqa: ANN401
-    if checked_backend(backend) in ("warp", "hashgrid"):
-        raise ValueError(f"backend={backend!r} cannot sum over pairs yet: pass 'jax', 'brute' or 'auto'.")
-    return "jax" if backend == "auto" else backend
+def _with_engine(problem: Problem, backend: str, reduce: str) -> Options:
+    """Return options with an engine that can answer: "auto" stays where it depends on the term, else becomes "jax"."""
+    from jfrnn import _fused
+
+    (sources, queries, *_), options = problem.inputs, problem.options
+    if options.backend != "warp":
+        return options
+    reason = _fused.refusal(problem.inputs, options, platform_of(sources, sources if queries is None else queries), reduce)
+    if reason is not None and backend == "warp":
+        raise ValueError(f"backend='warp' cannot sum over pairs {reason}: pass backend='jax'.")
+    return options._replace(backend=backend if reason is None else "jax")
 
 
 def _checked_values(name: str, values: Any, size: int, what: str) -> Any:  # noqa: ANN401
