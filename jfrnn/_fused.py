@@ -124,8 +124,7 @@ def planned(term: Term, dtype: np.dtype) -> Plan:
         for k, (spec, total) in enumerate(zip(translated.outputs, term.totals, strict=True))
         for e in range(math.prod(spec.shape))
     )
-    operations = translated.text.count("const auto v")
-    text = kernels.TermText(translated.text, values[0], values[1], values[2], sums, operations)
+    text = kernels.TermText(translated.text, values[0], values[1], values[2], sums)
     return Plan(text, columns[0], columns[1], columns[2], hash_of(tuple(text), dtype.name)[:20])
 
 

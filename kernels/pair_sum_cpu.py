@@ -7,6 +7,7 @@ a vector, others for pairs alone, which are gathered first.
 """
 
 import functools
+import re
 from typing import NamedTuple
 
 import warp as wp
@@ -17,7 +18,9 @@ from jfrnn.kernels.cells_cpu import LAYOUT
 
 CACHE_BYTES = 24 << 10  # for candidates, of a first-level cache of 32 KiB
 MOST_CANDIDATES = 1024
-FEW_OPERATIONS = 40  # up to which the term is evaluated for candidates that are no pairs, too
+LITTLE_WORK = 100  # operations up to which the term is evaluated for candidates that are no pairs, too
+_SERIES = 20  # operations that a function like exp takes
+_SERIES_NAMES = ("exp", "log", "pow", "sin", "cos", "tan", "cbrt", "erf", "logistic", "rem")  # and what holds them in its name
 
 _NAMES = {"float32": "f32", "float64": "f64", "int32": "i32", "int64": "i64", "bool": "flag"}
 
@@ -44,7 +47,6 @@ class TermText(NamedTuple):
     own: tuple[Value, ...]
     others: tuple[Value, ...]
     sums: tuple[Sum, ...]
-    operations: int
 
 
 class Kernels(NamedTuple):
@@ -212,6 +214,12 @@ def sort_kernel(dim: int, double: bool) -> wp.Kernel:
     return wp.kernel(sort_values, module=module)
 
 
+def _work(text: str) -> int:
+    """Return roughly how many operations a text takes."""
+    called = re.findall(r"Math::(\w+)\(", text)
+    return text.count("const auto v") + _SERIES * sum(any(name in call for name in _SERIES_NAMES) for call in called)
+
+
 def _candidates(term: TermText, dim: int, double: bool) -> int:
     """Return how many candidates are held at a time, in the first-level cache."""
     width = 8 if double else 4
@@ -230,7 +238,7 @@ def query_kernel(
     """
     scalar = wp.float64 if double else wp.float32
     rows, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
-    gathered = term.operations > FEW_OPERATIONS if gathered is None else gathered
+    gathered = _work(term.text) > LITTLE_WORK if gathered is None else gathered
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
     variant += f"{('', '_nearest', '_images')[periodic]}{'_batched' * batched}_{key}"
     totals = sum(part.total for part in term.sums)
