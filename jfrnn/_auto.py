@@ -41,7 +41,7 @@ def choose_engine(
         raise ValueError("backend='hashgrid' knows no periodic box: pass backend='warp', 'jax' or 'brute'.")
     if backend not in ("auto", *WARP_ENGINES):
         return backend
-    platform = _platform_of(sources, sources if queries is None else queries)
+    platform = platform_of(sources, sources if queries is None else queries)
     if backend == "auto":
         return fastest_engine(platform, sources.shape[0])
     _warp.load_warp()
@@ -64,7 +64,7 @@ def default_platform() -> str:
     return device if isinstance(device, str) else device.platform
 
 
-def _platform_of(*arrays: Array) -> str:
+def platform_of(*arrays: Array) -> str:
     """Return the platform of concrete arrays; traced ones do not know where they will be."""
     if any(isinstance(x, Tracer) for x in arrays):
         return default_platform()
@@ -85,12 +85,12 @@ def _can_warp(platform: str) -> bool:
         f"backend='auto' takes the slower engine 'jax' on the platform {platform!r}: {reason}. "
         "Pass backend='jax' to choose it without this warning.",
         RuntimeWarning,
-        stacklevel=_level_of_caller(),
+        stacklevel=level_of_caller(),
     )
     return False
 
 
-def _level_of_caller() -> int:
+def level_of_caller() -> int:
     """Return the stacklevel that makes a warning name the caller of the library."""
     frame, level = inspect.currentframe(), 0
     while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] == "jfrnn":

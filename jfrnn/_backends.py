@@ -96,7 +96,7 @@ class _Prepared(NamedTuple):
     checks: dict[Status, Array]
 
 
-def _prepared(inputs: Inputs, options: Options) -> _Prepared:
+def prepared(inputs: Inputs, options: Options) -> _Prepared:
     """Prepare a search. No gradient flows through."""
     given, queries, active, box, cutoff, batch = lax.stop_gradient(inputs)
     sources, images = without_inactive(given, active), options.images
@@ -117,7 +117,7 @@ def _prepared(inputs: Inputs, options: Options) -> _Prepared:
 def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
     """List the neighbors of every query, or only count them (capacity=None). Integers: no gradient flows through."""
     given, given_queries, active = lax.stop_gradient(inputs[:3])
-    sources, queries, cutoff, batch, torus, checks = _prepared(inputs, options)
+    sources, queries, cutoff, batch, torus, checks = prepared(inputs, options)
     rows = _rows_of_engine(sources, queries, cutoff, options, capacity, batch, torus)
     if torus is not None and active is None and isinstance(cutoff, Cutoff):  # else positions are NaN for other reasons, too
         checks = checks | {Status.NONFINITE: (torus[1].met & NOT_FINITE) == 0}
@@ -134,7 +134,7 @@ def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
 
 def fold_pairs(inputs: Inputs, options: Options, elements: int, visit: Visit[State], out: State) -> State:
     """Walk over all pairs of a search, of which none is stored: see `fold_neighbors`. For the array engines."""
-    sources, queries, cutoff, batch, torus, _ = _prepared(inputs, options)
+    sources, queries, cutoff, batch, torus, _ = prepared(inputs, options)
     if 0 in (sources.shape[0], (sources if queries is None else queries).shape[0]):
         return out
     candidates = _candidates(sources, queries, cutoff, options, batch, torus)
@@ -143,7 +143,7 @@ def fold_pairs(inputs: Inputs, options: Options, elements: int, visit: Visit[Sta
 
 def is_decidable(inputs: Inputs, options: Options) -> Array:
     """Say whether a search can answer for all particles that take part: cutoffs, box and positions are in range; [] bool."""
-    return functools.reduce(jnp.logical_and, _prepared(inputs, options).checks.values(), jnp.ones((), bool))
+    return functools.reduce(jnp.logical_and, prepared(inputs, options).checks.values(), jnp.ones((), bool))
 
 
 def _with_valid_radii(

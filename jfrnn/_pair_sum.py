@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jfrnn._auto import platform_of
+from jfrnn._backends import Options
 from jfrnn._box import Box
 from jfrnn._inputs import checked_backend, checked_flag
 from jfrnn._neighbors import NeighborList
-from jfrnn._search import checked_problem
+from jfrnn._search import Problem, checked_problem
 
 REDUCTIONS = ("sum", "max", "min")
 SYMMETRIES = (None, "symmetric", "antisymmetric")
@@ -63,7 +65,11 @@ def pair_sum(
         active: As in `search`.
         compensated: Carry the rounding errors of the sums along (two-sum, Knuth 1969) and add them in the end: the result is as if
             summed in twice the precision. Derivatives are summed so, too. "max" and "min" are not concerned.
-        backend: "jax" (cells, any device), "brute" (all n·m candidates), or "auto": "jax".
+        backend: "jax" (cells, any device), "brute" (all n·m candidates), "warp" (cells, on the CPU: fn is translated into the kernel
+            that finds the pairs), or "auto": "warp" where it can do what is asked, else "jax". "warp" sums floats of the dtype of
+            positions, without a periodic box or a cutoff per particle; values, and what fn closes over, are of that dtype or
+            smaller floats, bool, int32 or (float64) int64. Where fn or its derivative holds a primitive that has no translation,
+            "auto" warns.
         neighbors: A list whose pairs are taken instead of a search: those that are closer than its cutoff at these positions, as
             `NeighborList.vectors` says. A half list gives whole sums, too. Options with which it was made are left out. Rows that
             overflowed lack pairs here as everywhere: see `NeighborList.check`.
@@ -75,14 +81,19 @@ def pair_sum(
         smallest of their kind; `search` says what it was.
 
     Raises:
-        TypeError, ValueError: an argument is of the wrong kind, shape or range, or fn returns what cannot be summed.
+        TypeError, ValueError: an argument is of the wrong kind, shape or range, or fn returns what cannot be summed; "warp" was named
+            and cannot do what is asked.
+        NotImplementedError: "warp" was named, and fn or its derivative has no translation: the message says which primitive.
 
     Order of summation: the neighbors of a particle as the engine meets them (cell by cell, or by index in "brute", or as listed) in
-    groups of up to 32; first within a group, then one group after the other. The same
-    input gives the same bits. With k neighbors the error is at most 4 eps·sqrt(k) of the sum of |terms| for k up to 60 000;
-    compensated a few eps of the sum itself, and some eps²·k of the sum of |terms|.
+    groups of up to 32; first within a group, then one group after the other. The same input gives the same bits. With k neighbors
+    the error is at most 4 eps·sqrt(k) of the sum of |terms| for k up to 60 000; compensated a few eps of the sum itself, and some
+    eps²·k of the sum of |terms|. "warp" adds up 4 to 16 sums side by side, each of every so many-th candidate in the order of
+    cells, then these, by halves; the bound is the same, and the bits do not depend on the number of threads, but on the
+    processor's vector width.
     Memory: what `search` takes without its list, the results, and at most 16 MB (float32) for each array that fn needs for the
-    pairs that are in work; nothing grows with the number of pairs, in derivatives neither.
+    pairs that are in work; nothing grows with the number of pairs, in derivatives neither. "warp" has no pairs in work, but two
+    copies of the numbers that fn reads of each j, and one of those of each i.
     Differentiable: to every order, forward and backward, in positions, queries, values, query_values, the lattice vectors of the
     box and whatever fn closes over; who is a neighbor is a constant. A derivative is a sum over the same pairs, gathered
     by each particle (over a list that is not its own mirror image, scattered). What is no pair has no part in it, whatever fn
@@ -103,11 +114,12 @@ def pair_sum(
     if neighbors is None:
         if cutoff is None:
             raise ValueError("cutoff must be given: only a list (neighbors=) has its own.")
-        engine = _checked_engine(backend)
+        if checked_backend(backend) == "hashgrid":
+            raise ValueError("backend='hashgrid' cannot sum over pairs: pass 'warp', 'jax', 'brute' or 'auto'.")
         problem = checked_problem(
-            positions, cutoff, queries, box, batch, radius_rule, False, include_self, closed, engine, 0.0, active
+            positions, cutoff, queries, box, batch, radius_rule, False, include_self, closed, backend, 0.0, active
         )
-        pairs = _reduction.searched(problem.inputs, problem.options)
+        pairs = _reduction.searched(problem.inputs, _with_engine(problem, backend, reduce))
     else:
         given = {"batch": batch is not None, "radius_rule": radius_rule != "gather", "include_self": include_self}
         given |= {"closed": closed, "active": active is not None, "backend": backend != "auto"}
@@ -123,10 +135,17 @@ def pair_sum(
     return _reduction.reduced(fn, pairs, mine, theirs, reduce, symmetry, compensated)
 
 
-def _checked_engine(backend: Any) -> str:  # noqa: ANN401
-    if checked_backend(backend) in ("warp", "hashgrid"):
-        raise ValueError(f"backend={backend!r} cannot sum over pairs yet: pass 'jax', 'brute' or 'auto'.")
-    return "jax" if backend == "auto" else backend
+def _with_engine(problem: Problem, backend: str, reduce: str) -> Options:
+    """Return options with an engine that can answer: "auto" stays where it depends on the term, else becomes "jax"."""
+    from jfrnn import _fused
+
+    (sources, queries, *_), options = problem.inputs, problem.options
+    if options.backend != "warp":
+        return options
+    reason = _fused.refusal(problem.inputs, options, platform_of(sources, sources if queries is None else queries), reduce)
+    if reason is not None and backend == "warp":
+        raise ValueError(f"backend='warp' cannot sum over pairs {reason}: pass backend='jax'.")
+    return options._replace(backend=backend if reason is None else "jax")
 
 
 def _checked_values(name: str, values: Any, size: int, what: str) -> Any:  # noqa: ANN401

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from jfrnn import _fused
 from jfrnn._backends import Inputs, Options, fold_pairs
 from jfrnn._batch import Batch
 from jfrnn._exact import Radii, two_sum
@@ -150,6 +151,8 @@ def sum_pairs(relation: Relation, term: Term, operands: Groups, compensated: boo
     """
     adder = _Adder(compensated)
     rows = relation.sizes[0]
+    if isinstance(relation, Searched) and 0 not in relation.sizes and _fused.is_fused(relation.inputs, relation.options, term):
+        return _fused.sums(relation.inputs, relation.options, term, operands, compensated)
     start = [adder.zeros(() if total else (rows,), x) for x, total in zip(term.summands, term.totals, strict=True)]
 
     def visit(block: Block, out: list) -> list:

@@ -15,7 +15,8 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from jfrnn._relations import Relation, sum_pairs
+from jfrnn import _fused
+from jfrnn._relations import Relation, Searched, sum_pairs
 from jfrnn._terms import Derived, Groups, Term, chosen, is_moving, joined, tangent, transposed
 
 _pair_sum_p = Primitive("pair_sum")
@@ -30,6 +31,9 @@ def bind_sum(relation: Relation, term: Term, operands: Groups, compensated: bool
 
 def _bind(leaves: list[Array], operands: Groups, term: Term, structure: Any, compensated: bool) -> list[Array]:  # noqa: ANN401
     flat = [jnp.asarray(x) for group in operands for x in group]  # tangents of scalars may be of Python
+    relation = jax.tree.unflatten(structure, leaves)
+    if isinstance(relation, Searched):
+        _fused.check(relation.inputs, relation.options, term)
     return _pair_sum_p.bind(*leaves, *flat, term=term, structure=structure, compensated=compensated)
 
 

@@ -173,8 +173,7 @@ def _call(
 ) -> Rows:
     """Let XLA call what `make` returns, with the scratch that the module of kernels asks for."""
     own, lists = queries is None, capacity is not None
-    rows = sources if queries is None else queries
-    (n, dim), m = sources.shape, rows.shape[0]
+    (n, dim), m = sources.shape, (sources if queries is None else queries).shape[0]
     double = sources.dtype == jnp.float64
     periodic = _periodic_kind(torus)
     variant = Variant(dim, double, cutoff.scaled, lists, own, cutoff.closed, keep, periodic, batch is not None)
@@ -186,6 +185,14 @@ def _call(
     dims: dict[str, Any] = {"count": m, "info": 2, "scratch": max(words, 1)}
     if lists:
         dims["idx"] = (m, capacity)
+    *idx, count, info, _ = make(variant)(*_packed(sources, queries, cutoff, batch, torus), output_dims=dims)
+    return Rows(idx[0] if lists else None, count, info[0], info[1])
+
+
+def _packed(
+    sources: Array, queries: Array | None, cutoff: Cutoff, batch: Batch | None, torus: tuple[Lattice, Wrapped] | None
+) -> tuple[Array, Array, Array]:
+    """Return rows of positions, those of the queries, and the numbers that all share, as the kernels of cells read them."""
     numbers = [jnp.reshape(jnp.asarray(cutoff.radius), 1)]
     turns = query_turns = None
     if torus is not None:
@@ -195,8 +202,7 @@ def _call(
         numbers.append(_as_float(jnp.max(batch.of_all)[None], sources.dtype))
     sources = _rows(sources, turns, None if batch is None else batch.sources)
     rows = sources if queries is None else _rows(queries, query_turns, None if batch is None else batch.queries)
-    *idx, count, info, _ = make(variant)(sources, rows, jnp.concatenate(numbers), output_dims=dims)
-    return Rows(idx[0] if lists else None, count, info[0], info[1])
+    return sources, rows, jnp.concatenate(numbers)
 
 
 def scratch_bytes(engine: str, platform: str, n: int, m: int, dim: int, double: bool, own: bool) -> int:
@@ -367,6 +373,93 @@ def _ask_for_huge_pages(address: int, size: int) -> None:
 @functools.cache
 def _libc() -> ctypes.CDLL:
     return ctypes.CDLL(None)
+
+
+# --- sums over pairs --------------------------------------------------------------------------------------------------
+
+
+class _SumVariant(NamedTuple):
+    """All that is static about a pair sum, apart from shapes; `key` names the text."""
+
+    dim: int
+    double: bool
+    scaled: bool
+    own: bool
+    closed: bool
+    drop_self: bool
+    batched: bool
+    compensated: bool
+    key: str
+
+
+def pair_sums(
+    sources: Array,
+    queries: Array | None,
+    cutoff: Cutoff,
+    keep: Filter,
+    batch: Batch | None,
+    term: Any,  # noqa: ANN401
+    key: str,
+    values: tuple[Array, Array, Array],
+    compensated: bool,
+) -> tuple[Array, Array]:
+    """Sum a term (`jfrnn.kernels.pair_sum_cpu.TermText`, named by its key) with the columns that it reads: CPU, open space.
+
+    Returns:
+        The sums of each query [m, width], and parts of the sums over all pairs with what rounding took of them [slots, 2, width].
+    """
+    (n, dim), m, double = sources.shape, (sources if queries is None else queries).shape[0], sources.dtype == jnp.float64
+    own = queries is None
+    variant = _SumVariant(dim, double, cutoff.scaled, own, cutoff.closed, keep.drop_self, batch is not None, compensated, key)
+    totals = sum(part.total for part in term.sums)
+    width, slots = len(term.sums) - totals, kernels_of("pair_sum_cpu").slots(m)
+    dims = {"sums": (m, max(width, 1)), "totals": max(2 * slots * totals, 1), "errors": m * width if compensated else 1}
+    dims |= {"columns": max(n * len(term.others), 1), "info": 2}
+    dims["scratch"] = kernels_of("cells_cpu").scratch_words(n, m, dim, 2 if double else 1, own)
+    call = _sum_callable(variant, term)
+    sums, parts, *_ = call(*_packed(sources, queries, cutoff, batch, None), *values, output_dims=dims)
+    return sums, parts[: 2 * slots * totals].reshape(slots, 2, totals)
+
+
+@functools.cache
+def _sum_callable(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN401
+    wp = load_warp()
+    scalar = wp.float64 if variant.double else wp.float32
+    rows, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
+    types = {"positions": rows, "queries": rows, "cutoff": reals, "shared_values": reals, "own_values": rows, "others": rows}
+    types |= {"sums": rows, "totals": reals, "errors": reals, "columns": reals, "info": ints, "scratch": ints}
+    flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "own": variant.own}
+    flags |= {"closed": variant.closed, "dropself": variant.drop_self, "batched": variant.batched}
+    flags |= {"compensated": variant.compensated, variant.key: True}
+    name = "_".join([f"jfrnn_pair_sum_cpu_{variant.dim}d", *(flag for flag, on in flags.items() if on)])
+    return _callable(name, functools.partial(_run_sums_on_cpu, variant, term), types, 6)
+
+
+@functools.cache
+def _sum_kernels(variant: _SumVariant, term: Any) -> tuple[Any, Any, Any]:  # noqa: ANN401
+    """Return the kernels that sort particles, sort values, and sum; loaded, since several threads launch them at once."""
+    wp, sums = load_warp(), kernels_of("pair_sum_cpu")
+    dim, double, scaled = variant[:3]
+    build = kernels_of("cells_cpu").cell_kernels(dim, double, scaled, False, batched=variant.batched).build
+    query = sums.query_kernel(term, variant.key, dim, double, scaled, variant.compensated, batched=variant.batched)
+    kernels = build, sums.sort_kernel(dim, double), query
+    for kernel in kernels:
+        wp.load_module(kernel.module, device="cpu")
+    return kernels
+
+
+def _run_sums_on_cpu(variant: _SumVariant, term: Any, *arrays: Any) -> None:  # noqa: ANN401
+    wp, (build, sort_values, query) = load_warp(), _sum_kernels(variant, term)
+    positions, queries, cutoff, shared, own, others, sums, totals, errors, columns, info, scratch = arrays
+    n, m = positions.shape[0], queries.shape[0]
+    sizes = [n, m, int(variant.own), kernels_of("_native").table_cells(n)]
+    wp.launch(build, dim=1, inputs=[positions, queries, cutoff, info, scratch, *sizes], device="cpu")
+    if term.others:
+        sorting = [others, cutoff, columns, scratch, *sizes]
+        _on_every_core(lambda: wp.launch(sort_values, dim=1, inputs=sorting, device="cpu"), -(-n // _PLACES_PER_THREAD))
+    arguments = [positions, queries, cutoff, shared, own, columns, sums, totals, errors, scratch, *sizes]
+    arguments += [int(variant.closed), int(variant.drop_self)]
+    _on_every_core(lambda: wp.launch(query, dim=1, inputs=arguments, device="cpu"), -(-m // _PLACES_PER_THREAD))
 
 
 # --- cells of many sizes: a cutoff per particle -----------------------------------------------------------------------

@@ -1,0 +1,191 @@
+"""The fused engine of pair sums: the term becomes part of the kernel that finds the pairs, so that no list is made.
+
+What a term reads travels packed, a column for each number, in the dtype of positions: of the pair sum as a whole, of each query, of
+each source. Where this engine cannot do what is asked, it says so while tracing; none of its answers is another than "jax" gives,
+but for rounding.
+"""
+
+import functools
+import math
+import warnings
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.extend.core import jaxpr_as_fun
+
+from jfrnn import _warp
+from jfrnn._auto import level_of_caller
+from jfrnn._backends import Inputs, Options, prepared
+from jfrnn._exact import Radii, two_sum
+from jfrnn._scalars import NoTranslationError, hash_of
+from jfrnn._terms import Groups, Term
+from jfrnn._translate import input_name, output_name, translate
+
+_Columns = tuple[tuple[int, int], ...]  # of each column: which operand of a group, which element of it
+
+
+class Plan(NamedTuple):
+    """A term in native text, where its columns come from, and a key that is the same in every process."""
+
+    text: Any  # jfrnn.kernels.pair_sum_cpu.TermText
+    shared: _Columns
+    own: _Columns
+    others: _Columns
+    key: str
+
+
+def refusal(inputs: Inputs, options: Options, platform: str, reduce: str) -> str | None:
+    """Say what of a search, or of the reduction, this engine cannot do; None: nothing."""
+    if platform != "cpu":
+        return f"on the platform {platform!r}, only on the CPU"
+    if reduce != "sum":
+        return f"for reduce={reduce!r}"
+    if isinstance(inputs.cutoff, Radii):
+        return "with a cutoff per particle"
+    if options.images is not None:
+        return "in a periodic box"
+    return None
+
+
+def is_fused(inputs: Inputs, options: Options, term: Term) -> bool:
+    """Say whether a sum is one for this engine: it was named, or it is "auto" and can do it."""
+    if options.backend not in ("warp", "auto"):
+        return False
+    return options.backend == "warp" or _why_not(term, np.dtype(inputs.sources.dtype)) is None
+
+
+def check(inputs: Inputs, options: Options, term: Term) -> None:
+    """Raise where this engine was named and cannot sum a term; warn where "auto" takes a slower one for lack of a translation.
+
+    Raises:
+        NoTranslationError: a primitive of the term, or of its derivative, has no translation.
+        TypeError: a dtype cannot travel.
+    """
+    if options.backend not in ("warp", "auto"):
+        return
+    reason = _why_not(term, np.dtype(inputs.sources.dtype))
+    if reason is None:
+        return
+    if options.backend == "warp":
+        raise reason
+    if isinstance(reason, NoTranslationError):
+        warnings.warn(
+            f"backend='auto' takes the slower engine 'jax' for a pair sum: {reason}", RuntimeWarning, stacklevel=level_of_caller()
+        )
+
+
+@functools.lru_cache(maxsize=256)
+def _why_not(term: Term, dtype: np.dtype) -> Exception | None:
+    for what, specs in (("fn returns", term.summands), ("fn gets or closes over", sum(term.operands, ()))):
+        known = {dtype} if what == "fn returns" else _travelling(dtype)
+        for spec in specs:
+            if spec.dtype not in known:
+                names = ", ".join(sorted(x.name for x in known))
+                return TypeError(
+                    f"backend='warp' sums {dtype} positions with values of {names}, {what} {spec.dtype}: "
+                    "convert it, or pass backend='jax'."
+                )
+    try:
+        planned(term, dtype)
+    except NoTranslationError as error:
+        return error
+    return None
+
+
+def _travelling(dtype: np.dtype) -> set[np.dtype]:
+    """Return the dtypes that lose nothing among floats of a dtype."""
+    names = ("float32", "bool", "int32") if dtype == np.float32 else ("float32", "float64", "bool", "int32", "int64")
+    return {np.dtype(name) for name in names}
+
+
+@functools.lru_cache(maxsize=256)
+def planned(term: Term, dtype: np.dtype) -> Plan:
+    """Translate a term for positions of a dtype."""
+    kernels = _warp.kernels_of("pair_sum_cpu")
+    no_shift = np.zeros(term.shift.shape, term.shift.dtype)
+    flat = [x for group in term.operands for x in group]
+
+    def of_pair(*operands: Array) -> Sequence[Array]:
+        return jaxpr_as_fun(term.jaxpr)(np.bool_(True), no_shift, *operands)
+
+    translated = translate(jax.make_jaxpr(of_pair)(*flat))
+    columns, values, before = [], [], 0
+    for group in term.operands:
+        reads = [(k, e) for k, e in translated.reads if before <= k < before + len(group)]
+        columns.append(tuple((k - before, e) for k, e in reads))
+        values.append(tuple(kernels.Value(input_name(k, e), translated.inputs[k].dtype) for k, e in reads))
+        before += len(group)
+    sums = tuple(
+        kernels.Sum(output_name(k, e), total)
+        for k, (spec, total) in enumerate(zip(translated.outputs, term.totals, strict=True))
+        for e in range(math.prod(spec.shape))
+    )
+    text = kernels.TermText(translated.text, values[0], values[1], values[2], sums)
+    return Plan(text, columns[0], columns[1], columns[2], hash_of(tuple(text), dtype.name)[:20])
+
+
+def sums(inputs: Inputs, options: Options, term: Term, operands: Groups, compensated: bool) -> list[Array]:
+    """Sum a term over all pairs of a search: see `jfrnn._relations.sum_pairs`."""
+    dtype = np.dtype(inputs.sources.dtype)
+    plan, rows = planned(term, dtype), (inputs.sources if inputs.queries is None else inputs.queries).shape[0]
+    shared, own, others = (
+        _packed(group, columns, size, dtype)
+        for group, columns, size in zip(
+            operands, (plan.shared, plan.own, plan.others), (None, rows, inputs.sources.shape[0]), strict=True
+        )
+    )
+
+    def call(search: Any, shared: Array, own: Array, others: Array) -> list[Array]:  # noqa: ANN401
+        sources, queries, cutoff, batch = search[:4]
+        values = shared, own, others
+        found = _warp.pair_sums(sources, queries, cutoff, options.filter, batch, plan.text, plan.key, values, compensated)
+        return _unpacked(term, *found)
+
+    return lax.platform_dependent(prepared(inputs, options), shared, own, others, cpu=call)
+
+
+def _packed(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) -> Array:
+    """Return the columns of a group of operands: [size, width], or where all pairs share them, [width]; never empty."""
+    leading = () if size is None else (size,)
+    if not columns:
+        return jnp.zeros((*leading, 1), dtype)
+    flat = [_as_float(jnp.reshape(x, (*leading, -1)), dtype) for x in group]
+    return jnp.concatenate([flat[k][..., e : e + 1] for k, e in columns], axis=-1)
+
+
+def _as_float(x: Array, dtype: np.dtype) -> Array:
+    """Let values travel among floats: integers of the same width as their bits, what is smaller as a value."""
+    if x.dtype == dtype:
+        return x
+    same_width = jnp.issubdtype(x.dtype, jnp.integer) and x.dtype.itemsize == dtype.itemsize
+    return lax.bitcast_convert_type(x, dtype) if same_width else x.astype(dtype)
+
+
+def _unpacked(term: Term, sums: Array, totals: Array) -> list[Array]:
+    """Return the sums of each summand from the columns of all; totals come in parts [slots, 2, width], sums and their errors."""
+    found, row, total = [], 0, 0
+    for like, is_total in zip(term.summands, term.totals, strict=True):
+        size = math.prod(like.shape)
+        if is_total:
+            found.append(_added(totals[:, :, total : total + size]).reshape(like.shape))
+            total += size
+        else:
+            found.append(sums[:, row : row + size].reshape(-1, *like.shape))
+            row += size
+    return found
+
+
+def _added(parts: Array) -> Array:
+    """Add parts [slots, 2, width] in twice the precision, by halves."""
+    size = 1 << max(math.ceil(math.log2(parts.shape[0])), 0)
+    parts = jnp.pad(parts, ((0, size - parts.shape[0]), (0, 0), (0, 0)))
+    value, error = lax.optimization_barrier((parts[:, 0], parts[:, 1]))
+    while size > 1:
+        size //= 2
+        value, rounding = two_sum(value[:size], value[size:])
+        error = error[:size] + error[size:] + rounding
+    return jnp.where(jnp.isfinite(value[0]), value[0] + error[0], value[0])

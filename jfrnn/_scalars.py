@@ -1,0 +1,167 @@
+"""Straight-line scalar code as a graph: what is written once is computed once, and what no output needs is not written.
+
+A node is named by its number. Operands come before what is made of them, so the order of the numbers is an order of execution.
+"""
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+TYPES = {"float32": "f32", "float64": "f64", "int32": "i32", "int64": "i64", "bool": "flag"}  # dtypes, and their names in `Math`
+MOST_SCALARS = 20_000  # nodes, which bounds what a compiler is given
+
+_INFIX = {"add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}"}  # of floats
+_SUFFIX = {"float32": "f", "float64": "", "int32": "", "int64": "ll"}
+_BITS = {"float32": (np.uint32, "u"), "float64": (np.uint64, "ull")}
+_FOLDED = {  # what is known of integers and truths is computed here, as indices are
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative, "abs": np.abs, "sign": np.sign,
+    "max": np.maximum, "min": np.minimum, "both": np.bitwise_and, "either": np.bitwise_or, "differ": np.bitwise_xor,
+    "inverse": np.invert, "eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater,
+    "ge": np.greater_equal, "select": np.where, "div": lambda x, y: np.where(y == 0, -1, (x - np.fmod(x, y)) // y),
+    "rem": lambda x, y: np.where(y == 0, x, np.fmod(x, y)), "clamp": lambda low, x, high: np.minimum(np.maximum(low, x), high),
+}  # fmt: skip
+
+
+class NoTranslationError(NotImplementedError):
+    """The function holds something that has no translation into a kernel."""
+
+
+class Node(NamedTuple):
+    """How a scalar is written, with {0}, {1}, ... where its operands stand; its dtype; its value where that is known."""
+
+    form: str
+    operands: tuple[int, ...]
+    dtype: str
+    value: Any = None
+
+
+def literal(scalar: Any) -> str:  # noqa: ANN401
+    """Return a scalar of NumPy in C++, bit by bit the same."""
+    dtype = scalar.dtype.name
+    if dtype == "bool":
+        return f"Math::of({str(bool(scalar)).lower()})"
+    if dtype in _BITS and not np.isfinite(scalar):
+        width, suffix = _BITS[dtype]
+        return f"Math::of_bits({int(scalar.view(width)):#x}{suffix})"
+    if dtype in _BITS:
+        return f"Math::of({float(scalar).hex()}{_SUFFIX[dtype]})"
+    value, least = int(scalar), np.iinfo(dtype).min
+    return f"Math::of({value if value != least else value + 1}{_SUFFIX[dtype]}{' - 1' if value == least else ''})"
+
+
+def hash_of(*parts: object) -> str:
+    """Return a key that is the same in every process."""
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+class Scalars:
+    """Nodes, each written once."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Node] = []
+        self._numbers: dict[Any, int] = {}
+
+    def named(self, name: str, dtype: str) -> int:
+        """Return a scalar that is defined elsewhere."""
+        return self._number((name, dtype), Node(name, (), dtype))
+
+    def constant(self, value: Any, dtype: str) -> int:  # noqa: ANN401
+        """Return a constant; constants are the same if their bits are."""
+        scalar = np.asarray(value, dtype)[()]
+        return self._number((dtype, scalar.tobytes()), Node(literal(scalar), (), dtype, scalar))
+
+    def apply(self, operation: str, operands: Sequence[int], dtype: str) -> int:
+        """Return the result of an operation, a function of `Math`: simplified, or folded where all is known, or written."""
+        known = self._simplified(operation, operands, dtype)
+        if known is None:
+            known = self._folded(operation, operands, dtype)
+        if known is not None:
+            return known
+        if operation in ("add", "mul"):
+            operands = sorted(operands)
+        arguments = ", ".join(f"{{{k}}}" for k in range(len(operands)))
+        infix = dtype.startswith("float") and operation in _INFIX
+        form = _INFIX[operation] if infix else f"Math::{operation}({arguments})"
+        return self._number((form, *operands), Node(form, tuple(operands), dtype))
+
+    def value(self, number: int) -> Any:  # noqa: ANN401
+        """Return the value of a constant, else None."""
+        return self.nodes[number].value
+
+    def needed(self, outputs: Iterable[int]) -> set[int]:
+        """Return all that the outputs are made of, themselves included."""
+        found: set[int] = set()
+        left = list(outputs)
+        while left:
+            number = left.pop()
+            if number not in found:
+                found.add(number)
+                left.extend(self.nodes[number].operands)
+        return found
+
+    def text(self, outputs: dict[str, int]) -> str:
+        """Return the statements that define the outputs by name, without what they do not need."""
+        names, lines = {}, []
+        for number in sorted(self.needed(outputs.values())):
+            node = self.nodes[number]
+            names[number] = node.form.format(*(names[k] for k in node.operands))
+            if node.operands:  # inputs and constants stand where they are used
+                name = f"v{len(lines)}"
+                lines.append(f"const auto {name} = {names[number]};\n")
+                names[number] = name
+        lines += [f"const auto {name} = {names[number]};\n" for name, number in outputs.items()]
+        return "".join(lines)
+
+    def _number(self, key: tuple[Any, ...], node: Node) -> int:
+        if key not in self._numbers:
+            if len(self.nodes) == MOST_SCALARS:
+                raise NoTranslationError(
+                    f"the function takes more than {MOST_SCALARS} operations on scalars, the most that a kernel is made of: "
+                    'write it with smaller arrays, or pass backend="jax".'
+                )
+            self._numbers[key] = len(self.nodes)
+            self.nodes.append(node)
+        return self._numbers[key]
+
+    def _is(self, number: int, value: float) -> bool:
+        known = self.value(number)
+        return known is not None and known == value and bool(np.signbit(known) == np.signbit(value))
+
+    def _simplified(self, operation: str, operands: Sequence[int], dtype: str) -> int | None:
+        """Return what the result is without any work, where no NaN, infinity or sign of a zero can tell."""
+        first, last = operands[0], operands[-1]
+        if operation == f"to_{TYPES[dtype]}" and self.nodes[first].dtype == dtype:
+            return first
+        if operation == "select":
+            known = self.value(first)
+            return last if operands[1] == last else None if known is None else operands[1] if known else last
+        if dtype == "bool":
+            return None
+        zero = -0.0 if dtype.startswith("float") else 0  # -0.0 + 0.0 is 0.0
+        if operation == "mul" and (self._is(first, 1) or self._is(last, 1)):
+            return last if self._is(first, 1) else first
+        if operation == "add" and (self._is(first, zero) or self._is(last, zero)):
+            return last if self._is(first, zero) else first
+        if (operation == "div" and self._is(last, 1)) or (operation == "sub" and self._is(last, 0)):
+            return first
+        if operation == "neg" and self.nodes[first].form == "-{0}":
+            return self.nodes[first].operands[0]
+        return None
+
+    def _folded(self, operation: str, operands: Sequence[int], dtype: str) -> int | None:
+        values = [self.value(k) for k in operands]
+        if any(value is None for value in values):
+            return None
+        real = any(value.dtype.kind == "f" for value in values)
+        if operation == f"to_{TYPES[dtype]}" and not (real and dtype.startswith("int")):
+            return self.constant(_quietly(np.asarray(values[0]).astype, dtype), dtype)
+        if real or operation not in _FOLDED:
+            return None
+        return self.constant(_quietly(_FOLDED[operation], *values), dtype)
+
+
+def _quietly(function: Any, *arguments: Any) -> Any:  # noqa: ANN401
+    with np.errstate(all="ignore"):
+        return function(*arguments)

@@ -1,0 +1,424 @@
+"""How all queries meet their candidates on the CPU, 8 or 16 at a time: the text that listing and summing share.
+
+The threads hand themselves chunks of places from an atomic counter. The sources around a cell are copied once into the first-level
+cache, as a structure of arrays, and serve all queries of that cell. What becomes of the pairs is said by the texts that `walk` is
+given.
+"""
+
+from string import Template
+
+CHUNK = 2048  # places that a thread takes at a time
+
+_TYPES = r"""
+#if defined(__AVX512F__) && defined(__AVX512VL__)
+constexpr int LANES = DOUBLE ? 8 : 16;
+#else
+constexpr int LANES = DOUBLE ? 4 : 8;
+#endif
+constexpr int ROWS = 64;
+typedef real vec __attribute__((vector_size(LANES * sizeof(real))));
+typedef int ints __attribute__((vector_size(LANES * 4)));
+typedef int eight_ints __attribute__((vector_size(32)));
+typedef bool flags __attribute__((ext_vector_type(LANES)));
+alignas(64) real candidate[3][CANDIDATES + LANES];
+alignas(64) int candidate_ids[CANDIDATES + LANES];
+alignas(64) int row[CANDIDATES + LANES];
+alignas(64) real doubtful[3][CANDIDATES + LANES];
+alignas(64) unsigned short unsure[CANDIDATES / LANES + 4];  // one bit per candidate that step 1 leaves open
+alignas(64) int doubtful_ids[CANDIDATES + LANES];
+alignas(64) unsigned short found[MASKS ? CANDIDATES / LANES + 1 : 1];  // one bit per candidate that is a pair
+alignas(64) int candidate_images[PERIODIC ? CANDIDATES + LANES : 1];  // their codes
+alignas(64) int doubtful_images[PERIODIC ? CANDIDATES + LANES : 1];
+alignas(64) int candidate_sources[SUMS != 0 && PERIODIC != 0 ? CANDIDATES + LANES : 1];
+alignas(64) int candidate_order[PERIODIC == 2 ? CANDIDATES + LANES : 1];  // by source, then by image: behind, at home, ahead
+const Grid grid = shared.grid;
+const int places = m, finite_places = shared.finite_queries;
+
+"""
+
+_SCAN = r"""int image = 0;  // that candidates are copied from, its code
+bool several = false;  // images among them: each says which one it is of
+struct Below { enum { value = 17 }; };
+struct BelowOrAt { enum { value = 18 }; };
+auto mask_of = [](vec a, real bound, auto comparison) -> unsigned int {  // one bit per lane
+#if defined(__AVX512F__) && defined(__AVX512VL__)
+    typedef float floats __attribute__((vector_size(64)));
+    typedef double doubles __attribute__((vector_size(64)));
+    const vec bounds = vec{} + bound;
+    if constexpr (DOUBLE)
+        return (unsigned char)__builtin_ia32_cmppd512_mask((doubles)a, (doubles)bounds, comparison.value, -1, 4);
+    else
+        return (unsigned short)__builtin_ia32_cmpps512_mask((floats)a, (floats)bounds, comparison.value, -1, 4);
+#else
+    const auto lanes = comparison.value == 18 ? a <= bound : a < bound;
+    const flags f = __builtin_convertvector(lanes, flags);
+    unsigned char bits;
+    __builtin_memcpy(&bits, &f, 1);
+    return LANES == 4 ? bits & 15 : bits;
+#endif
+};
+auto later_mask = [&](int b, int own_id) -> unsigned int {  // candidates whose id is above the query's, or its own id
+    const ints ids = *(const ints*)((PERIODIC == 2 ? candidate_order : candidate_ids) + b);
+    const int first = PERIODIC == 2 ? 3 * own_id + 1 + drop_self : own_id + drop_self;
+    const flags f = __builtin_convertvector(ids >= first, flags);
+    unsigned short bits = 0;
+    __builtin_memcpy(&bits, &f, LANES == 16 ? 2 : 1);
+    return bits;
+};
+auto square_of = [&](const real* q, int b) -> vec {
+    vec square;
+    for (int k = 0; k < DIM; ++k) {
+        vec d = *(const vec*)(candidate[k] + b) - q[k];
+        if constexpr (SCALED)
+            d *= step_scale;
+#if defined(__FMA__)
+        square = k == 0 ? d * d : __builtin_elementwise_fma(d, d, square);
+#else
+        square = k == 0 ? d * d : square + d * d;
+#endif
+    }
+    return square;
+};
+// stores the lanes of a mask one after the other; up to LANES elements at `to` are overwritten
+auto pack = [&](const auto* from, auto* to, unsigned int mask) {
+#if defined(__AVX512F__) && defined(__AVX512VL__)
+    typedef int ints8 __attribute__((vector_size(32)));
+    typedef int ints16 __attribute__((vector_size(64)));
+    typedef double doubles8 __attribute__((vector_size(64)));
+    if constexpr (sizeof(*from) == 8) {
+        const doubles8 packed = __builtin_ia32_compressdf512_mask(*(const doubles8*)from, doubles8{}, mask);
+        __builtin_memcpy(to, &packed, 64);
+    } else if constexpr (LANES == 8) {
+        const ints8 packed = __builtin_ia32_compresssi256_mask(*(const ints8*)from, ints8{}, mask);
+        __builtin_memcpy(to, &packed, 32);
+    } else {
+        const ints16 packed = __builtin_ia32_compresssi512_mask(*(const ints16*)from, ints16{}, mask);
+        __builtin_memcpy(to, &packed, 64);
+    }
+#else
+    for (; mask; mask &= mask - 1)
+        *to++ = from[__builtin_ctz(mask)];
+#endif
+};
+const real off = PERIODIC ? 2 * lattice.slack() * step_scale : real(0);  // by which distances of images may be wrong
+const real inner = step_radius > off ? step_radius - off : real(0), outer = step_radius + off;
+const real band = 8 * (1 + PERIODIC) * step_eps, inside = inner * inner * (1 - band), outside = outer * outer * (1 + band);
+const double doubly_inside = Exact::doubly_inside(radius), doubly_outside = Exact::doubly_outside(radius);
+typedef float floats __attribute__((vector_size(32)));
+typedef double doubles __attribute__((vector_size(64)));
+typedef bool flags8 __attribute__((ext_vector_type(8)));
+auto bits_of_lanes = [](auto lanes) -> unsigned int {
+    const flags8 f = __builtin_convertvector(lanes, flags8);
+    unsigned char bits;
+    __builtin_memcpy(&bits, &f, 1);
+    return bits;
+};
+// candidates of one query among `count` copied ones: how many are pairs; LIST: their ids in `row`, MASKS: their bits in `found`
+auto scan = [&](const real* q, int own_id, int count, auto only_later) -> int {
+    int hits = 0;
+    auto later = [&](int b) -> unsigned int {
+        return only_later.value ? later_mask(b, own_id) : ~0u;
+    };
+    for (int b = 0, v = 0; b < count; b += LANES, ++v) {
+        const vec square = square_of(q, b);
+        const unsigned int allowed = later(b);
+        const unsigned int hit = mask_of(square, inside, Below{}) & allowed;
+        if constexpr (EXACTLY)
+            unsure[v] = hit ^ (mask_of(square, outside, BelowOrAt{}) & allowed);
+        if constexpr (LIST)
+            pack(candidate_ids + b, row + hits, hit);
+        if constexpr (MASKS)
+            found[v] = hit;
+        hits += __builtin_popcount(hit);
+    }
+    if constexpr (!EXACTLY)
+        return hits;
+    const int vectors = (count + LANES - 1) / LANES;
+    for (int e = vectors; e < vectors + 3; ++e)
+        unsure[e] = 0;
+    const int sure = hits;
+    int doubts = 0;
+    for (int v = 0; v < vectors; v += 4) {
+        unsigned long long four;
+        for (__builtin_memcpy(&four, unsure + v, 8); four;) {
+            const int e = __builtin_ctzll(four) / 16, b = (v + e) * LANES;
+            const unsigned int mask = (four >> (16 * e)) & 0xffff;
+            four &= ~(0xffffull << (16 * e));
+            if constexpr (PERIODIC) {
+                if (several)
+                    pack(candidate_images + b, doubtful_images + doubts, mask);
+            } else
+                for (int k = 0; k < DIM; ++k)
+                    pack(candidate[k] + b, doubtful[k] + doubts, mask);
+            pack(candidate_ids + b, doubtful_ids + doubts, mask);
+            doubts += __builtin_popcount(mask);
+        }
+    }
+    for (int b = 0; b < doubts; b += 8) {
+        unsigned int left = doubts - b < 8 ? (1u << (doubts - b)) - 1 : 255;
+        if constexpr (!DOUBLE && !PERIODIC) {  // in twice the precision, eight at a time
+            doubles square;
+            for (int k = 0; k < DIM; ++k) {
+                const doubles d = __builtin_convertvector(*(const floats*)(doubtful[k] + b), doubles) - (double)q[k];
+                square = k == 0 ? d * d : square + d * d;
+            }
+            unsigned int pairs = left & bits_of_lanes(square < doubly_inside);
+            left &= ~pairs & bits_of_lanes(square <= doubly_outside);
+            for (; pairs; pairs &= pairs - 1)
+                row[hits++] = doubtful_ids[b + __builtin_ctz(pairs)];
+        }
+        for (; left; left &= left - 1) {
+            const int c = b + __builtin_ctz(left);
+            if constexpr (PERIODIC) {
+                const int id = doubtful_ids[c];
+                const int number = SUMS ? candidate_sources[id] : PERIODIC == 2 ? id % n : id;
+                const real* source = positions.data + (long long)ROW * number;
+                if (exact_image(queries.data + (long long)ROW * own_id, source, several ? doubtful_images[c] : image))
+                    row[hits++] = id;
+                continue;
+            }
+            real p[3];
+            for (int k = 0; k < DIM; ++k)
+                p[k] = doubtful[k][c];
+            if (exact_pair(q, p))
+                row[hits++] = doubtful_ids[c];
+        }
+    }
+    for (int h = sure; MASKS && h < hits; ++h)
+        found[row[h] / LANES] |= 1u << row[h] % LANES;
+    return hits;
+};
+struct All { enum { value = 0 }; };
+struct Later { enum { value = 1 }; };
+
+"""
+
+_WALK = Template(r"""auto position_of = [&](int place, real* q) {
+    if (own)
+        for (int k = 0; k < DIM; ++k)
+            q[k] = axis[k][place];
+    else
+        point_of(queries.data + (long long)ROW * query_ids[place], q);
+};
+auto system_at = [&](int place) { return BATCHED ? system_of(queries.data + (long long)ROW * query_ids[place]) : 0u; };
+// where the query at a place is along the axes, and its cell
+auto locate = [&](int place, real* at, whole* cell) {
+    real q[3];
+    position_of(place, q);
+    for (int k = 0; k < DIM; ++k) {
+        at[k] = coordinate(k, q);
+        cell[k] = axis_cell(grid, k, at[k]);
+    }
+    cell[DIM] = (whole)system_at(place);
+};
+
+// all queries of one cell: places [begin, end), whose coordinates are between low and high
+auto serve = [&](int begin, int end, const real* low, const real* high) {
+    whole first[3] = {0, 0, 0}, last[3] = {0, 0, 0};
+    for (int k = 0; k < DIM; ++k) {
+        if (is_periodic(k)) {
+            first[k] = (whole)cell_of(k, low[k] - reach_along(k));
+            last[k] = (whole)cell_of(k, high[k] + reach_along(k));
+            continue;
+        }
+        first[k] = axis_cell(grid, k, low[k] - reach_along(k));
+        last[k] = axis_cell(grid, k, high[k] + reach_along(k));
+        if (grid.dense) {
+            first[k] = first[k] < 0 ? 0 : first[k];
+            last[k] = last[k] >= grid.extent[k] ? grid.extent[k] - 1 : last[k];
+        }
+    }
+    const unsigned int system = system_at(begin);
+    int filled = 0, own_from = 0, own_to = 0, own_at = 0;
+    bool fresh = true;
+    auto flush = [&](bool finished) {
+        for (int e = 0; e < LANES; ++e)
+            for (int k = 0; k < DIM; ++k)
+                candidate[k][filled + e] = __builtin_nanf("");
+        for (int place = begin; place < end; ++place) {
+            real q[3];
+            position_of(place, q);
+            const int id = query_ids[place];
+            const int self = drop_self && place >= own_from && place < own_to ? own_at + place - own_from : -1;
+            if (self >= 0)
+                candidate[0][self] = __builtin_nanf("");
+            $before
+            const int hits = $scan;
+            if (self >= 0)
+                candidate[0][self] = q[0];
+            $found
+        }
+        fresh = false;
+        filled = own_from = own_to = 0;
+    };
+    int side = 0;  // whether the image lies behind (-1), at home, or ahead
+    real moved[3] = {0, 0, 0};
+    auto copy = [&](int from, int to) {  // sources at places [from, to)
+        while (from < to) {
+            if (filled == CANDIDATES)
+                flush(false);
+            const int room = CANDIDATES - filled, size = to - from < room ? to - from : room;
+            for (int k = 0; k < DIM; ++k)
+                for (int s = 0; s < size; ++s)
+                    candidate[k][filled + s] = PERIODIC ? axis[k][from + s] + moved[k] : axis[k][from + s];
+            for (int s = 0; s < size; ++s)
+                candidate_ids[filled + s] = SUMS ? filled + s : PERIODIC == 2 ? ids[from + s] + n * image : ids[from + s];
+            for (int s = 0; BATCHED && !grid.dense && s < size; ++s)
+                if (system_of(positions.data + (long long)ROW * ids[from + s]) != system)
+                    candidate[0][filled + s] = __builtin_nanf("");
+            if (const int code = image; PERIODIC && several)
+                for (int s = 0; s < size; ++s)
+                    candidate_images[filled + s] = code;
+            for (int s = 0; SUMS != 0 && PERIODIC != 0 && s < size; ++s)
+                candidate_sources[filled + s] = ids[from + s];
+            $copied
+            for (int s = 0; PERIODIC == 2 && s < size; ++s)
+                candidate_order[filled + s] = 3 * ids[from + s] + 1 + side;
+            const int low_place = from > begin ? from : begin, high_place = from + size < end ? from + size : end;
+            if (own && side == 0 && low_place < high_place) {
+                own_from = low_place;
+                own_to = high_place;
+                own_at = filled + low_place - from;
+            }
+            filled += size;
+            from += size;
+        }
+    };
+    auto walk = [&](const whole* first, const whole* last) {  // all rows of cells of one image
+        const int length = (int)(last[0] - first[0] + 1);
+        int seen[ROWS], rows = 0;
+        for (whole z = first[2]; z <= last[2] && length > 0; ++z)
+            for (whole y = first[1]; y <= last[1]; ++y) {
+                if (grid.dense) {
+                    const int row = row_start(grid, y, z, system);
+                    copy(start[row + first[0]], start[row + last[0] + 1]);
+                    continue;
+                }
+                const int begins = ring(row_start(grid, y, z, system) + ring(first[0], grid.cells), grid.cells);
+                int front = 0, back = 0;  // entries shared with rows that were copied before
+                for (int r = 0; r < rows; ++r) {
+                    const int behind = ring(begins - seen[r], grid.cells), ahead = grid.cells - behind;
+                    if (behind < length)
+                        front = length - behind > front ? length - behind : front;
+                    else if (ahead < length)
+                        back = length - ahead > back ? length - ahead : back;
+                }
+                seen[rows++] = begins;
+                const int size = length - front - back, from = ring(begins + front, grid.cells);
+                if (size <= 0)
+                    continue;
+                if (from + size <= grid.cells)
+                    copy(start[from], start[from + size]);
+                else {
+                    copy(start[from], start[grid.cells]);
+                    copy(start[0], start[from + size - grid.cells]);
+                }
+            }
+    };
+    if constexpr (PERIODIC) {
+        several = false;
+        for (int k = 0; k < DIM; ++k)
+            several = several || (is_periodic(k) && (first[k] < 0 || last[k] >= (whole)inverse_edge[k]));
+        int from[3] = {0, 0, 0}, to[3] = {0, 0, 0};
+        for (int k = 0; several && k < DIM; ++k)
+            if (is_periodic(k)) {
+                const int most = lattice.images(k);  // rounded up, a query may reach an image that nobody can
+                from[k] = period_of(k, first[k]) < -most ? -most : period_of(k, first[k]);
+                to[k] = period_of(k, last[k]) > most ? most : period_of(k, last[k]);
+            }
+        for (int x = from[0]; x <= to[0]; ++x)
+            for (int y = from[1]; y <= to[1]; ++y)
+                for (int z = from[2]; z <= to[2]; ++z) {
+                    const int shift[3] = {x, y, z};
+                    whole begins[3] = {0, 0, 0}, ends[3] = {0, 0, 0};
+                    image = 0;
+                    for (int k = 0; k < DIM; ++k) {
+                        const whole cells = (whole)inverse_edge[k], skipped = is_periodic(k) ? shift[k] * cells : 0;
+                        begins[k] = first[k] - skipped;
+                        ends[k] = last[k] - skipped;
+                        if (is_periodic(k)) {
+                            begins[k] = begins[k] < 0 ? 0 : begins[k];
+                            ends[k] = ends[k] < cells ? ends[k] : cells - 1;
+                        }
+                        moved[k] = lattice.translation(x, y, z, k);
+                        image = image * (2 * lattice.images(k) + 1) + shift[k] + lattice.images(k);
+                    }
+                    const int lead = x ? x : y ? y : z;
+                    side = (lead > 0) - (lead < 0);
+                    walk(begins, ends);
+                }
+    } else
+        walk(first, last);
+    flush(true);
+};
+
+for (;;) {
+    const int chunk = __atomic_fetch_add(&shared.next_chunk, 1, __ATOMIC_RELAXED);
+    if ((long long)chunk * CHUNK >= places)
+        break;
+    int place = chunk * CHUNK;
+    const int chunk_end = places - place < CHUNK ? places : place + CHUNK;
+    whole cell[4], other[4];
+    real at[3];
+    auto same_cell = [&](const whole* a, const whole* b) {
+        bool same = true;
+        for (int k = 0; k < DIM + BATCHED; ++k)
+            same = same && a[k] == b[k];
+        return same;
+    };
+    if (place > 0 && place < finite_places) {  // a cell belongs to the chunk that holds its first place
+        locate(place - 1, at, cell);
+        for (; place < finite_places; ++place) {
+            locate(place, at, other);
+            if (!same_cell(cell, other))
+                break;
+        }
+    }
+    if (place < finite_places)
+        locate(place, at, other);
+    while (place < chunk_end) {
+        if (place >= finite_places) {
+            const int id = query_ids[place++];
+            $none
+            continue;
+        }
+        real low[3], high[3];  // `other` and `at` are those of the first place
+        for (int k = 0; k < DIM; ++k)
+            low[k] = high[k] = at[k];
+        for (int k = 0; k < DIM + BATCHED; ++k)
+            cell[k] = other[k];
+        int end = place + 1;
+        for (; end < finite_places; ++end) {
+            locate(end, at, other);
+            if (!same_cell(cell, other))
+                break;
+            widen(low, high, at, at);
+        }
+        serve(place, end, low, high);
+        place = end;
+    }
+    $chunk_done
+}
+""")
+
+
+def walk(
+    *, begin: str, before: str = "", scan: str, found: str, none: str, copied: str = "", chunk_done: str = "", end: str = ""
+) -> str:
+    """Return the text of a kernel that walks over all queries; around it stand the pieces CELLS, the layout and EXACT.
+
+    Constants it needs: CANDIDATES, how many are held at a time; EXACTLY; and of LIST and MASKS which one says what `scan` leaves
+    behind of the pairs: ids in `row`, bits in `found`, or their number alone. With SUMS ids are the numbers of candidates.
+
+    Args:
+        begin: Comes first, after the types and `scan`.
+        before: Of a query, of which `id`, `place`, coordinates `q` and candidates, `filled` in number, are known.
+        scan: A call of `scan`; the pairs among the candidates are then known, `hits` in number.
+        found: What is done with them; `fresh` and `finished` say whether they are the first and the last ones of the query.
+        none: What is done with a query, `id`, that has no candidates.
+        copied: Copies more of the sources at places [from, from + size) to the candidates from `filled` on.
+        chunk_done: After the last query of the chunk `chunk`.
+        end: After the last chunk of this thread.
+    """
+    text = _WALK.substitute(before=before, scan=scan, found=found, none=none, copied=copied, chunk_done=chunk_done)
+    return "".join([_TYPES, _SCAN, begin, text, end])

@@ -1,0 +1,308 @@
+"""`pair_sum` with its term inside the kernel: the pairs of `search`, and the sums of the other engines."""
+
+import functools
+import math
+import warnings
+
+import checked
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from jfrnn.cases.hard import HARD_CASES
+from test_pair_sum import CUTOFF, HARD, LENGTH, SLOW, N, arrays_of, assert_same, everything, oracle_sum, scene, smooth, tangents_of
+
+import jfrnn
+from jfrnn import _translate
+
+fused = functools.partial(jfrnn.pair_sum, backend="warp")
+
+
+# --- which pairs -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [name for name in HARD_CASES if name != "denormal_lattice"])  # whose cutoff is refused
+def test_counts_are_those_of_a_search(name):
+    given = HARD_CASES[name].build(np.float32, 3)
+    length = LENGTH if max(len(given.positions), 0 if given.queries is None else len(given.queries)) <= LENGTH else 2048
+    x = jnp.asarray(checked.padded(given.positions, length))
+    queries = None if given.queries is None else jnp.asarray(checked.padded(given.queries, length))
+    counts = fused(one, x, given.cutoff, queries=queries)
+    np.testing.assert_array_equal(counts, jfrnn.count(x, given.cutoff, queries=queries, backend="warp"))
+    assert counts.dtype == np.float32
+
+
+def one(r, i, j):
+    return 1.0
+
+
+def marks(r, i, j):
+    """Tell pairs apart by whole numbers, which no order of summation rounds, and by the displacement."""
+    return {"count": 1.0, "ids": j, "rests": (j * j) % 61, "rows": i, "r": r}
+
+
+def assert_marks(found, pairs, x, q=None):
+    q = x if q is None else q
+    i, j, _ = arrays_of(pairs, x.shape[1])
+    (m, d), eps = q.shape, np.finfo(x.dtype).eps
+    counts, r = np.bincount(i, minlength=m), x.astype(np.float64)[j] - q.astype(np.float64)[i]
+    assert not any(np.asarray(leaf[m:]).any() for leaf in jax.tree.leaves(found))  # the padding has nothing
+    found = jax.tree.map(lambda leaf: np.asarray(leaf)[:m], found)
+    np.testing.assert_array_equal(found["count"], counts)
+    np.testing.assert_array_equal(found["ids"], np.bincount(i, j, m))
+    np.testing.assert_array_equal(found["rests"], np.bincount(i, j * j % 61, m))
+    np.testing.assert_array_equal(found["rows"], counts * np.arange(m))
+    for k in range(d):
+        with np.errstate(over="ignore"):
+            error, total = np.abs(found["r"][:, k] - np.bincount(i, r[:, k], m)), np.bincount(i, np.abs(r[:, k]), m)
+        bounded = total < np.finfo(x.dtype).max / 4
+        assert (error <= 4 * eps * np.sqrt(counts) * total)[bounded].all()
+
+
+def marked(x, cutoff, queries=None, **options):
+    ids = jnp.arange(LENGTH, dtype=x.dtype)
+    if queries is not None:
+        options |= {"queries": checked.padded(queries, LENGTH), "query_values": ids}
+    return fused(marks, jnp.asarray(checked.padded(x, LENGTH)), cutoff, ids, **options)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "dim"),
+    [(np.float32, 3), (np.float64, 2), *(pytest.param(*kind, marks=SLOW) for kind in ((np.float32, 2), (np.float64, 3)))],
+)
+def test_hard_cases(dtype, dim):
+    for name in HARD:
+        given = HARD_CASES[name].build(dtype, dim)
+        pairs = reference.reference_pairs(given.positions, given.cutoff)
+        assert_marks(marked(given.positions, given.cutoff), pairs, given.positions)
+
+
+def test_options():
+    """Queries, with particles that are not active; then closed with include_self; each where it decides something."""
+    given = HARD_CASES["queries_coincident"].build(np.float32, 3)
+    active = np.arange(LENGTH) % 3 > 0
+    pairs = reference.reference_pairs(given.positions, given.cutoff, queries=given.queries)
+    found = marked(given.positions, given.cutoff, given.queries, active=active)
+    assert_marks(found, {(i, j) for i, j in pairs if active[j]}, given.positions, given.queries)
+    given = HARD_CASES["integers_9"].build(np.float32, 3)
+    pairs = reference.reference_pairs(given.positions, given.cutoff, closed=True, include_self=True)
+    assert len(pairs) > len(reference.reference_pairs(given.positions, given.cutoff))
+    assert_marks(marked(given.positions, given.cutoff, closed=True, include_self=True), pairs, given.positions)
+
+
+@pytest.mark.parametrize(("n", "m"), [(0, None), (0, 3), (3, 0), (1, None)])
+def test_empty(n, m):
+    x, ids = jnp.zeros((n, 3), jnp.float32), jnp.arange(n, dtype=jnp.float32)
+    options = {} if m is None else {"queries": jnp.zeros((m, 3), jnp.float32), "query_values": jnp.arange(m, dtype=jnp.float32)}
+    sums = fused(marks, x, 1.0, ids, **options)
+    assert sums["r"].shape == (n if m is None else m, 3)
+    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(sums))
+
+
+def test_more_candidates_than_fit():
+    """Sums go on where a cell has more candidates than are held at a time; compensated ones with their errors."""
+    random = np.random.default_rng(0)
+    n, eps = 3000, np.finfo(np.float32).eps
+    values = (random.standard_normal(n) * 10 ** random.uniform(-3, 5, n)).astype(np.float32)
+    values[n // 2 :] = -values[: n // 2] * np.float32(1 + 1e-5)
+    x = jnp.zeros((n, 2), jnp.float32)
+    plain, compensated = (
+        np.asarray(fused(lambda r, i, j: j, x, 1.0, values, include_self=True, compensated=c), np.float64) for c in (False, True)
+    )
+    exact, total = math.fsum(values.tolist()), math.fsum(np.abs(values).tolist())
+    bound = 2 * eps * abs(exact) + 4 * eps**2 * n * total
+    assert np.abs(plain - exact).max() <= 4 * eps * math.sqrt(n) * total
+    assert np.abs(compensated - exact).max() <= bound
+    assert np.abs(plain - exact).max() > 10 * bound  # else this would prove nothing
+
+
+# --- what is summed ----------------------------------------------------------------------------------------------------------
+
+
+def of_all_kinds(scale, r, i, j):
+    """Vectors and matrices, truths and integers, several summands."""
+    turned = j["matrix"] @ (i["vector"] - j["vector"])
+    heavy = jnp.where(j["heavy"], j["kind"] - 2 * i["kind"], 3).astype(r.dtype)
+    return {"turned": turned, "outer": jnp.outer(r, j["vector"]), "rest": [scale * heavy, jnp.maximum(r, 0)]}
+
+
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=SLOW)])
+def test_values_of_all_kinds(dtype):
+    random = np.random.default_rng(1)
+    x = jnp.asarray(random.random((400, 3)), dtype)
+    values = {"matrix": random.standard_normal((400, 3, 3)), "vector": random.standard_normal((400, 3))}
+    values = jax.tree.map(lambda v: jnp.asarray(v, dtype), values)
+    values |= {"kind": jnp.asarray(random.integers(-5, 5, 400), np.int32), "heavy": jnp.asarray(random.random(400) < 0.5)}
+    fn = functools.partial(of_all_kinds, jnp.asarray(1.5, dtype))
+    found = fused(fn, x, 0.3, values)
+    assert_same(found, jfrnn.pair_sum(fn, x, 0.3, values, backend="brute"), 100 * np.finfo(dtype).eps)
+    again = jax.jit(lambda x: fused(fn, x, 0.3, values))(x)
+    jax.tree.map(np.testing.assert_array_equal, found, again)
+
+
+def test_rounding_of_a_density():
+    """Against float64, of the same pairs."""
+    x = jnp.asarray(np.random.default_rng(2).random((1500, 3)), np.float32)
+    h = np.float32(0.2)
+
+    def density(r, i, j):
+        return jnp.maximum(float(h) ** 2 - r @ r, 0) ** 3
+
+    pairs = reference.reference_pairs(x, h)
+    exact = oracle_sum(density, pairs, x.astype(np.float64), x.astype(np.float64), None, None)
+    counts = np.bincount([i for i, _ in pairs], minlength=len(x))
+    allowed = 4 * float(np.finfo(np.float32).eps) * (np.sqrt(counts) * np.asarray(exact) + 4 * counts * float(h) ** 6)
+    assert (np.abs(np.asarray(fused(density, x, h), np.float64) - exact) <= allowed).all()
+
+
+# --- derivatives -------------------------------------------------------------------------------------------------------------
+
+
+def test_derivatives():
+    """Of coincident points, at ties, in empty rows; then of random points: gradient and Hessian-vector product."""
+    along_of = functools.cache(tangents_of_scene)
+    found = everything(lambda x, m, s: fused(functools.partial(smooth, s), x, CUTOFF, {"m": m}))
+    for seed in (0, 1):
+        args, pairs = (*scene(seed), jnp.asarray(1.3)), reference.reference_pairs(scene(seed)[0], CUTOFF)
+        expected = everything(
+            lambda x, m, s, pairs=pairs: oracle_sum(functools.partial(smooth, s), pairs, x, x, {"m": m}, {"m": m})
+        )
+        assert_same(found(args, along_of(seed)), expected(args, along_of(seed)))
+
+
+def tangents_of_scene(seed):
+    return tangents_of((*scene(seed), jnp.asarray(1.3)))
+
+
+def test_derivatives_with_queries():
+    (x, m), q, w = scene(1), scene(2)[0][:23], jnp.linspace(0.3, 0.6, 23)
+    fn, args = functools.partial(cheap, 0.7), (x, q, m, w)
+    pairs = reference.reference_pairs(x, CUTOFF, queries=q)
+    along = tangents_of(args)
+    found = everything(lambda x, q, m, w: fused(fn, x, CUTOFF, m, queries=q, query_values=w), False)
+    expected = everything(lambda x, q, m, w: oracle_sum(fn, pairs, x, q, w, m), False)
+    assert_same(found(args, along), expected(args, along))
+
+
+def cheap(scale, r, i, j):
+    s = r @ r
+    return {"a": scale * j * s * i, "b": (scale + s) * r * j}
+
+
+def test_in_a_batch():
+    """Systems that lie in the same place."""
+    x, m = scene(1)
+    batch = np.arange(N) % 3
+    pairs = {(i, j) for i, j in reference.reference_pairs(x, CUTOFF) if batch[i] == batch[j]}
+    fn = functools.partial(cheap, 1.0)
+    assert_same(fused(fn, x, CUTOFF, m, batch=batch), oracle_sum(fn, pairs, x, x, m, m))
+
+
+def test_what_is_no_pair_poisons_nothing():
+    """fn is NaN or infinite where there is no pair, and so are values and positions of inactive particles."""
+    x, m = scene(1)
+    active = np.arange(N) % 4 > 0
+    x = jnp.where(active[:, None] | (np.arange(N) % 8 == 0)[:, None], x, jnp.nan)
+    m = jnp.where(active, m, jnp.nan)
+
+    def fn(r, i, j):
+        return i * j / jnp.sqrt(r @ r) * jnp.sqrt(CUTOFF - jnp.sqrt(r @ r))
+
+    pairs = {(i, j) for i, j in reference.reference_pairs(x, CUTOFF) if active[i] and active[j]}
+    args, along = (x, m), tangents_of((x, m))
+    found = everything(lambda x, m: fused(fn, x, CUTOFF, m, active=active), False)(args, along)
+    assert_same(found, everything(lambda x, m: oracle_sum(fn, pairs, x, x, m, m), False)(args, along), 1e-9)
+    assert not np.asarray(found[1][0])[~active].any()
+
+
+def test_same_bits_in_a_scan_and_again():
+    """Of sums over all pairs, too, which several chunks make up."""
+    x = jnp.asarray(np.random.default_rng(3).random((9000, 2)), np.float32)
+
+    def gradient(scale):
+        return jax.grad(lambda s: (fused(lambda r, i, j: s * (r @ r), x, 0.03) ** 2).sum())(scale)
+
+    scales = jnp.asarray([1.0, 2.0], np.float32)
+    first = jax.jit(lambda scales: jax.lax.map(gradient, scales))(scales)
+    scanned = jax.lax.scan(lambda c, s: (c, gradient(s)), 0, scales)[1]
+    np.testing.assert_array_equal(first, scanned)
+    assert float(first[1]) == 2 * float(first[0])
+    i, j = (np.asarray(k) for k in jfrnn.search(x, 0.03, backend="warp").pairs())
+    squares = np.bincount(i, ((np.asarray(x, np.float64)[j] - np.asarray(x, np.float64)[i]) ** 2).sum(axis=1))
+    assert float(first[0]) == pytest.approx(float(2 * (squares**2).sum()), rel=1e-5)
+
+
+# --- memory, choice of the engine, errors ------------------------------------------------------------------------------------
+
+
+def test_memory_follows_the_particles():
+    """A million particles: gradient included, some words for each, though they had hundreds of neighbors."""
+    n = 1_000_000
+
+    def loss(x, m):
+        return (fused(lambda r, i, j: j * (1 - r @ r), x, 0.1, m) ** 2).sum()
+
+    shapes = jax.ShapeDtypeStruct((n, 3), np.float32), jax.ShapeDtypeStruct((n,), np.float32)
+    memory = jax.jit(jax.grad(loss, (0, 1))).lower(*shapes).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < 1e6 + 250 * n
+
+
+def sorted_norm(r, i, j):
+    return jnp.sort(r)[0]
+
+
+X = np.zeros((4, 2), np.float32)
+
+
+def test_auto_takes_the_kernel_where_it_can():
+    x = scene(1)[0]
+
+    def engine(fn, values=None, **options):
+        return "pair_sum_cpu" in jax.jit(lambda x: jfrnn.pair_sum(fn, x, CUTOFF, values, **options)).lower(x).as_text()
+
+    assert engine(one)
+    with pytest.warns(RuntimeWarning, match="takes the slower engine 'jax' for a pair sum: the primitive 'sort'"):
+        assert not engine(sorted_norm)
+
+
+def derivative_without_translation(x):
+    """A function that translates; its derivative does not."""
+    return jax.grad(lambda x: fused(with_strange_slope, x, 1.0).sum())(x)
+
+
+@jax.custom_jvp
+def strange(r):
+    return r[0]
+
+
+strange.defjvp(lambda primals, tangents: (strange(*primals), jnp.sort(primals[0])[0] * tangents[0][0]))
+
+
+def with_strange_slope(r, i, j):
+    return strange(r)
+
+
+@pytest.mark.parametrize(
+    ("error", "match", "call"),
+    [
+        (_translate.NoTranslationError, "the primitive 'sort' has no translation", lambda: fused(sorted_norm, X, 1.0)),
+        (_translate.NoTranslationError, "the primitive 'sort'", lambda: derivative_without_translation(jnp.asarray(X))),
+        (TypeError, "fn returns int32: convert it, or pass backend='jax'", lambda: fused(lambda r, i, j: jnp.int32(1), X, 1.0)),
+        (
+            TypeError,
+            "values of bool, float32, int32, fn gets or closes over float64",
+            lambda: fused(second, X, 1.0, np.ones(4)),
+        ),
+        (ValueError, "cannot sum over pairs in a periodic box: pass", lambda: fused(one, X, 1.0, box=jfrnn.Box([9.0, 9.0]))),
+        (ValueError, "cannot sum over pairs with a cutoff per particle", lambda: fused(one, X, np.ones(4, np.float32))),
+        (ValueError, "cannot sum over pairs for reduce='max'", lambda: fused(lambda r, i, j: r, X, 1.0, reduce="max")),
+    ],
+)
+def test_errors(error, match, call):
+    with warnings.catch_warnings(), pytest.raises(error, match=match):
+        call()
+
+
+def second(r, i, j):
+    return j.astype(np.float32)

@@ -1,0 +1,262 @@
+"""Translated functions against JAX, as scalars and as vectors of lanes.
+
+The reference of both dtypes is JAX in float64 on the same numbers: it has neither the errors of XLA's own float32 functions nor
+their flushed denormals. In float64 XLA flushes denormals too, so that there they are left out; and where its functions are off by
+many ulp (sinh by hundreds), NumPy's `longdouble` decides.
+"""
+
+import functools
+import os
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+import warp as wp
+from jax import lax
+from jax import numpy as jnp
+from translated import Case, kernel_of, run
+from translated_cases import CASES, ELEMENTWISE, INTEGERS, PAIRS, N
+
+from jfrnn import _translate
+from jfrnn._primitives import TABLE
+from jfrnn._scalars import NoTranslationError, literal
+
+
+@functools.cache
+def inputs_of(name, real):
+    case = CASES[name]
+    return case.draw(np.random.default_rng(sum(map(ord, name))), real)
+
+
+@jax.jit
+def answers(inputs):
+    """Take all cases, compiled at once and for both dtypes."""
+    return {name: jax.vmap(CASES[name].function)(*x) for name, x in inputs.items()}
+
+
+@functools.cache
+def references(real):
+    """Return what JAX answers, in float64."""
+    wide = {}
+    for name, case in CASES.items():
+        dtypes = [np.float64 if x.dtype == real else x.dtype for x in case.examples(real)]
+        wide[name] = [as_dtype(x, dtype) for x, dtype in zip(inputs_of(name, real), dtypes)]
+    found = jax.device_get(answers(wide))
+    if real == "float64":
+        better = [name for name, case in CASES.items() if case.exact is not None]
+        with np.errstate(all="ignore"):
+            found |= {name: CASES[name].exact(inputs_of(name, real)[0].astype(np.longdouble)) for name in better}
+    return found
+
+
+def as_dtype(x, dtype):
+    with np.errstate(invalid="ignore"):
+        return np.asarray(x, np.float64).astype(dtype)
+
+
+@functools.cache
+def kernel(real, kind):
+    return kernel_of(list(CASES.values()), real, kind, "cases")
+
+
+def rows_to_compare(inputs, real):
+    """In float64 XLA takes denormals for 0; it is not asked about them."""
+    if real == "float32":
+        return np.ones(N, bool)
+    return np.all(
+        [np.all(np.abs(x.reshape(N, -1)) >= np.finfo(real).tiny, 1) | np.all(x.reshape(N, -1) == 0, 1) for x in inputs], 0
+    )
+
+
+def assert_close(found, expected, ulp, scale, rows, inputs):
+    """Fail unless every element is within `ulp` units in the last place of max(|y|, scale), or is the same NaN or infinity."""
+    real = found.dtype
+    with np.errstate(all="ignore"):
+        rounded = np.asarray(expected).astype(real)
+        least = max(scale, np.finfo(real).smallest_subnormal)
+        unit = np.spacing(np.maximum(np.abs(rounded), real.type(least))).astype(np.float64)
+        off = (np.abs(found.astype(np.longdouble) - np.asarray(expected, np.longdouble)) / unit).astype(np.float64)
+        tiny = (np.abs(rounded) < np.finfo(real).tiny) & (np.abs(found) <= np.finfo(real).tiny) & (real == np.float64)
+    same = (found == rounded) | (np.isnan(found) & np.isnan(rounded)) | tiny
+    same &= (found != 0) | (np.signbit(found) == np.signbit(rounded)) | (scale > 0)
+    ok = same | (np.isfinite(found) & np.isfinite(rounded) & (off <= ulp))
+    wrong = np.argwhere(~ok & rows.reshape(-1, *[1] * (ok.ndim - 1)))
+    at = [(x[k[0]].tolist() for x in inputs) for k in wrong[:3]]
+    shown = [(list(a), found[tuple(k)], rounded[tuple(k)], off[tuple(k)]) for a, k in zip(at, wrong)]
+    assert not len(wrong), f"{len(wrong)} of {ok.size}: inputs, found, expected, ulp {shown}"
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("kind", ["scalar", "vector"])
+@pytest.mark.parametrize("real", ["float32", "float64"])
+def test_cases(name, kind, real):
+    case, inputs = CASES[name], inputs_of(name, real)
+    found = run(kernel(real, kind), list(CASES).index(name), case, inputs)
+    expected = jax.tree.leaves(references(real)[name])
+    assert len(found) == len(expected)
+    for f, e in zip(found, expected):
+        assert_close(f, e, case.ulp, case.scale, rows_to_compare(inputs, real), inputs)
+
+
+def test_every_primitive_that_is_translated_is_tested():
+    """Nothing stands in the table that no case reaches, but for names of older or newer versions of JAX."""
+
+    def names(jaxpr):
+        for eqn in jaxpr.eqns:
+            yield eqn.primitive.name
+            for nested in jax.tree.leaves(list(eqn.params.values()), is_leaf=lambda x: hasattr(x, "eqns")):
+                yield from names(nested) if hasattr(nested, "eqns") else ()
+
+    used = {name for case in CASES.values() for name in names(jax.make_jaxpr(case.function)(*case.examples("float32")).jaxpr)}
+    older = {"pjit", "closed_call", "core_call", "custom_vjp_call_jaxpr", "checkpoint", "remat", "copy_p", "expand_dims"}
+    newer = {"jit", "remat2", "stack", "unstack", "tile"}
+    assert set(TABLE) - used <= older | newer
+
+
+# --- constants --------------------------------------------------------------------------------------------------------
+
+FLOATS = [0.0, -0.0, 1 / 3, -1e30, np.inf, -np.inf, 1e-40, -1e-45, 3.4028234e38]
+
+
+def bits(x):
+    return x.view({4: np.uint32, 8: np.uint64}[x.itemsize])
+
+
+@pytest.mark.parametrize("kind", ["scalar", "vector"])
+def test_constants_are_the_same_bits(kind, dtype):
+    real = np.dtype(dtype).name
+    quiet = bits(np.array([np.nan], dtype)) | np.array([0x1234], bits(np.zeros(1, dtype)).dtype)
+    values = np.concatenate([np.array(FLOATS, dtype), quiet.view(dtype), -quiet.view(dtype), [np.finfo(dtype).smallest_subnormal]])
+    case = Case(lambda x: jnp.where(jnp.isnan(x), x, values), ((),), None)
+    (found,) = run(kernel_of([case], real, kind, "constants"), 0, case, [np.zeros(16, dtype)])
+    assert (bits(np.ascontiguousarray(found)) == bits(values)).all()
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (np.float32(1.5), "Math::of(0x1.8000000000000p+0f)"),
+        (np.float64(0.1), "Math::of(0x1.999999999999ap-4)"),
+        (np.float32(-np.inf), "Math::of_bits(0xff800000u)"),
+        (np.float64(np.nan), "Math::of_bits(0x7ff8000000000000ull)"),
+        (np.int32(-(2**31)), "Math::of(-2147483647 - 1)"),
+        (np.int64(2**62), "Math::of(4611686018427387904ll)"),
+        (np.True_, "Math::of(true)"),
+    ],
+)
+def test_literals(value, text):
+    assert literal(value) == text
+
+
+# --- the text ---------------------------------------------------------------------------------------------------------
+
+
+def translated(function, *arguments):
+    return _translate.translate(jax.make_jaxpr(function)(*arguments))
+
+
+def test_text():
+    """What is written twice is computed once, what nobody reads is not computed, and what does nothing is not written."""
+    found = translated(lambda r, unused, m: (jnp.sqrt(r[0] * r[1]) * m + r[1] * r[0] * 1, jnp.exp(r)[1]), *np.ones((3, 2)))
+    assert found.text.splitlines() == [
+        "const auto v0 = in0_0 * in0_1;",
+        "const auto v1 = Math::sqrt(v0);",
+        "const auto v2 = in2_0 * v1;",
+        "const auto v3 = in2_1 * v1;",
+        "const auto v4 = v0 + v2;",
+        "const auto v5 = v0 + v3;",
+        "const auto v6 = Math::exp(in0_1);",
+        "const auto out0_0 = v4;",
+        "const auto out0_1 = v5;",
+        "const auto out1_0 = v6;",
+    ]
+    assert found.reads == ((0, 0), (0, 1), (2, 0), (2, 1))
+    assert found.inputs == (((2,), "float64"),) * 3
+    assert found.outputs == (((2,), "float64"), ((), "float64"))
+
+
+def test_what_zeros_and_nan_could_tell_is_written():
+    x = np.float32(2)
+    assert "in0_0 + Math::of(0x0.0p+0f)" in translated(lambda x: x + 0.0, x).text
+    assert "in0_0 * Math::of(0x0.0p+0f)" in translated(lambda x: x * 0.0, x).text
+    assert "in0_0 - in0_0" in translated(lambda x: x - x, x).text
+    assert "in0_0 / in0_0" in translated(lambda x: x / x, x).text
+
+
+KEY = """
+import jax
+from jfrnn._translate import translate
+print(translate(jax.make_jaxpr(lambda x: x * jax.numpy.sin(x) + 2)(1.0)).key)
+"""
+
+
+def test_key_is_the_same_in_every_process():
+    runs = [
+        subprocess.run(
+            [sys.executable, "-c", KEY], capture_output=True, text=True, check=True, env={**os.environ, "PYTHONHASHSEED": s}
+        )
+        for s in "12"
+    ]
+    keys = {run.stdout for run in runs}
+    assert len(keys) == 1
+    assert keys == {translated(lambda x: 2 + x * jnp.sin(x), np.float32(1)).key + "\n"}
+    assert translated(lambda x: 3 + x * jnp.sin(x), np.float32(1)).key not in keys.pop()
+
+
+# --- CUDA -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("real", ["float32", "float64"])
+def test_cases_compile_for_cuda(real, tmp_path):
+    if not any(arch >= 90 for arch in wp.get_cuda_supported_archs()):
+        pytest.skip("this Warp was built without NVRTC, or with one that does not know sm_90")
+    module = kernel_of([*ELEMENTWISE.values(), *INTEGERS.values(), *PAIRS.values()], real, "scalar", "cuda").module
+    wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=False)
+    assert [file.stat().st_size > 0 for file in tmp_path.glob("*.cubin")] == [True]
+
+
+# --- what has no translation ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (jnp.sort, "'sort' has no translation.*backend"),
+        (lambda x: lax.fori_loop(0, x[0].astype(int), lambda _, x: 2 * x, x), "'while' has no translation"),
+        (lambda x: lax.scan(lambda c, y: (c + y, c), x[0], x), "'scan' has no translation"),
+        (lambda x: x[x[0].astype(int)], "where its indices depend on data.*backend"),
+        (lambda x: jax.debug.print("{}", x[0]), "'debug_"),
+        (lambda x: x.astype(jnp.float16), "dtype float16.*backend"),
+        (lambda x: x.astype(int) ** x.astype(int), "no translation"),
+        (lambda x: jnp.concatenate([x] * 86).sum(), r"shape \(258,\).*256.*backend"),
+        (
+            lambda x: functools.reduce(lambda m, k: jnp.sin(m + k), range(100), jnp.outer(x, jnp.arange(80.0))),
+            "more than 20000.*backend",
+        ),
+    ],
+)
+def test_what_has_no_translation(function, message):
+    with pytest.raises(NoTranslationError, match=message):
+        translated(function, np.ones(3))
+
+
+def test_traced_constants_are_refused():
+    def outer(x):
+        closed = jax.make_jaxpr(lambda y: x * y)(1.0)
+        return _translate.translate(closed)
+
+    with pytest.raises(NoTranslationError, match="being traced: hand it over as an argument"):
+        jax.jit(outer)(1.0)
+
+
+def test_inside_a_trace():
+    """Where a function is traced, indices are still known."""
+
+    def outer(x):
+        closed = jax.make_jaxpr(lambda y: y[jnp.array([1, 0])])(np.ones(2))
+        assert "const auto out0_0 = in0_1" in _translate.translate(closed).text
+        return x
+
+    jax.jit(outer)(1.0)

@@ -1,0 +1,111 @@
+"""Translate functions, put all of them into one Warp kernel, and run it on the CPU."""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import warp as wp
+from jfrnn.kernels import _math
+from jfrnn.kernels._native import ENTER, LEAVE
+
+from jfrnn import _translate
+from jfrnn._scalars import TYPES
+
+LANES = {"float32": 16, "float64": 8}
+NUMBER = {"float32": "float", "float64": "double"}
+
+
+class Case(NamedTuple):
+    """A function, the shapes and dtypes of its inputs ("real" is the dtype under test), how far it may be off, what it is given.
+
+    The error of an element y may be `ulp` units in the last place of max(|y|, scale). `draw` makes one array [n, *shape] per input.
+    `exact` is NumPy's function, where JAX's is not good enough a reference.
+    """
+
+    function: Any
+    shapes: tuple[tuple[int, ...], ...]
+    draw: Any
+    ulp: float = 0
+    scale: float = 0
+    dtypes: tuple[str, ...] = ()
+    exact: Any = None
+
+    def examples(self, real):
+        dtypes = self.dtypes or ("real",) * len(self.shapes)
+        return [jax.ShapeDtypeStruct(s, real if d == "real" else d) for s, d in zip(self.shapes, dtypes)]
+
+
+@functools.cache
+def translated(case, real):
+    """Return a case as text, for a dtype."""
+    return _translate.translate(jax.make_jaxpr(case.function)(*case.examples(real)))
+
+
+def statements(text, real):
+    """Return text that loads inputs from the rows of `given`, from column i on, computes, and stores into the rows of `found`."""
+    of_real, lines = TYPES[real], []
+    before = np.cumsum([0, *(np.prod(spec.shape, dtype=int) for spec in text.inputs)])
+    for k, e in text.reads:
+        name, of = _translate.input_name(k, e), TYPES[text.inputs[k].dtype]
+        loaded = f"load(given.data + {before[k] + e} * n + i)"
+        lines.append(f"const Math::{of} {name} = {loaded if of == of_real else f'Math::to_{of}({loaded})'};")
+    lines.append(text.text)
+    row = 0
+    for k, spec in enumerate(text.outputs):
+        for e in range(int(np.prod(spec.shape))):
+            y = _translate.output_name(k, e)
+            y = y if TYPES[spec.dtype] == of_real else f"Math::to_{of_real}({y})"
+            lines.append(f"store(found.data + {row} * n + i, {y});")
+            row += 1
+    return "\n".join(lines)
+
+
+def native_text(texts, real, kind):
+    """Return a function body that runs the text of the number `which` on n columns."""
+    lanes, number, of_real = LANES[real] if kind == "vector" else 1, NUMBER[real], TYPES[real]
+    start = [f"constexpr int LANES = {lanes};", _math.VECTOR if kind == "vector" else _math.SCALAR]
+    if kind == "vector":
+        start.append(
+            f"auto load = [](const {number}* from) {{ Math::{of_real} x; __builtin_memcpy(&x, from, sizeof x); return x; }};"
+        )
+        start.append(f"auto store = []({number}* to, Math::{of_real} x) {{ memcpy(to, &x, sizeof x); }};")
+    else:
+        start.append(f"auto load = [](const {number}* from) {{ return *from; }};")
+        start.append(f"auto store = []({number}* to, {number} x) {{ *to = x; }};")
+    cases = [
+        f"case {k}:\nfor (int i = 0; i < n; i += LANES) {{\n{text}\n}}\nbreak;"
+        for k, text in enumerate(texts)
+    ]  # fmt: skip
+    no_contraction = "#if !defined(__CUDA_ARCH__)\n#pragma clang fp contract(off)\n#endif"
+    return "\n".join(["", ENTER, "{", no_contraction, *start, "switch (which) {", *cases, "}", "}", LEAVE, ""])
+
+
+def kernel_of(cases, real, kind, name):
+    """Return a kernel that runs one of the cases: given [rows, n], found [rows, n], n, which."""
+    scalar = {"float32": wp.float32, "float64": wp.float64}[real]
+    reals = wp.array2d(dtype=scalar)
+
+    def native(given: reals, found: reals, n: int, which: int): ...
+
+    native.__name__ = native.__qualname__ = f"{name}_{kind}_{real}"
+    texts = [statements(translated(case, real), real) for case in cases]
+    function = wp.func_native(native_text(texts, real, kind))(native)
+
+    def run(given: reals, found: reals, n: int, which: int):
+        function(given, found, n, which)
+
+    module = wp.get_module(f"tests.translated.{name}.{kind}.{real}")
+    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
+    return wp.kernel(run, module=module)
+
+
+def run(kernel, which, case, inputs):
+    """Return the outputs [n, *shape] of one case, in the dtype under test, for inputs [n, *shape] in it."""
+    n, outputs = len(inputs[0]), translated(case, inputs[0].dtype.name).outputs
+    given = np.concatenate([x.reshape(n, -1).T for x in inputs])
+    sizes = [int(np.prod(spec.shape)) for spec in outputs]
+    found = wp.zeros((sum(sizes), n), dtype=wp.float32 if given.dtype == np.float32 else wp.float64, device="cpu")
+    wp.launch(kernel, dim=1, inputs=[wp.array(given, device="cpu"), found, n, which], device="cpu")
+    rows = np.split(found.numpy(), np.cumsum(sizes)[:-1])
+    return [x.T.reshape(n, *spec.shape) for x, spec in zip(rows, outputs)]
