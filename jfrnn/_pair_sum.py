@@ -65,8 +65,8 @@ def pair_sum(
         active: As in `search`.
         compensated: Carry the rounding errors of the sums along (two-sum, Knuth 1969) and add them in the end: the result is as if
             summed in twice the precision. Derivatives are summed so, too. "max" and "min" are not concerned.
-        backend: "jax" (cells, any device), "brute" (all n·m candidates), "warp" (cells, on the CPU: fn is translated into the kernel
-            that finds the pairs), or "auto": "warp" where it can do what is asked, else "jax". "warp" sums floats of the dtype of
+        backend: "jax" (cells, any device), "brute" (all n·m candidates), "warp" (cells, on the CPU: fn is translated into the
+            kernel that finds the pairs), or "auto": "warp" where it can do what is asked, else "jax". "warp" sums floats of the dtype of
             positions, without a periodic box or a cutoff per particle; values, and what fn closes over, are of that dtype or
             smaller floats, bool, int32 or (float64) int64. Where fn or its derivative holds a primitive that has no translation,
             "auto" warns.
@@ -81,8 +81,8 @@ def pair_sum(
         smallest of their kind; `search` says what it was.
 
     Raises:
-        TypeError, ValueError: an argument is of the wrong kind, shape or range, or fn returns what cannot be summed; "warp" was named
-            and cannot do what is asked.
+        TypeError, ValueError: an argument is of the wrong kind, shape or range, or fn returns what cannot be summed; "warp" was
+            named and cannot do what is asked.
         NotImplementedError: "warp" was named, and fn or its derivative has no translation: the message says which primitive.
 
     Order of summation: the neighbors of a particle as the engine meets them (cell by cell, or by index in "brute", or as listed) in
