@@ -89,6 +89,7 @@ def pair_sum(
     same input gives the same bits. With k neighbors the error is at most 4 eps·sqrt(k) of the sum of |terms| for k up to 60 000;
     compensated a few eps of the sum itself, and some eps²·k of the sum of |terms|. "warp" adds up 4 to 16 sums side by side, and
     these by halves; the bound is the same, and the bits depend on the processor's vector width, not on the number of threads.
+    Denormal numbers count as zero in what fn computes on the CPU, as everywhere in XLA; pairs are decided with them.
     Memory: what `search` takes without its list, the results, and at most 16 MB (float32) for each array that fn needs for the
     pairs that are in work; nothing grows with the number of pairs, in derivatives neither. "warp" has no pairs in work, but two
     copies of the numbers that fn reads of each j, and one of those of each i.
