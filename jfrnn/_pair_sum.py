@@ -66,10 +66,9 @@ def pair_sum(
         compensated: Carry the rounding errors of the sums along (two-sum, Knuth 1969) and add them in the end: the result is as if
             summed in twice the precision. Derivatives are summed so, too. "max" and "min" are not concerned.
         backend: "jax" (cells, any device), "brute" (all n·m candidates), "warp" (cells, on the CPU: fn is translated into the
-            kernel that finds the pairs), or "auto": "warp" where it can do what is asked, else "jax". "warp" sums floats of the dtype of
-            positions, without a periodic box or a cutoff per particle; values, and what fn closes over, are of that dtype or
-            smaller floats, bool, int32 or (float64) int64. Where fn or its derivative holds a primitive that has no translation,
-            "auto" warns.
+            kernel that finds the pairs), or "auto": "warp" where it can do what is asked, else "jax". "warp" sums floats of the
+            dtype of positions, without a periodic box or a cutoff per particle; values, and what fn closes over, are of that dtype
+            or smaller floats, bool, int32 or (float64) int64. Where fn or its derivative has no translation, "auto" warns.
         neighbors: A list whose pairs are taken instead of a search: those that are closer than its cutoff at these positions, as
             `NeighborList.vectors` says. A half list gives whole sums, too. Options with which it was made are left out. Rows that
             overflowed lack pairs here as everywhere: see `NeighborList.check`.
@@ -86,11 +85,11 @@ def pair_sum(
         NotImplementedError: "warp" was named, and fn or its derivative has no translation: the message says which primitive.
 
     Order of summation: the neighbors of a particle as the engine meets them (cell by cell, or by index in "brute", or as listed) in
-    groups of up to 32; first within a group, then one group after the other. The same input gives the same bits. With k neighbors
-    the error is at most 4 eps·sqrt(k) of the sum of |terms| for k up to 60 000; compensated a few eps of the sum itself, and some
-    eps²·k of the sum of |terms|. "warp" adds up 4 to 16 sums side by side, each of every so many-th candidate in the order of
-    cells, then these, by halves; the bound is the same, and the bits do not depend on the number of threads, but on the
-    processor's vector width.
+    groups of up to 32; first within a group, then one group after the other. The
+    same input gives the same bits. With k neighbors the error is at most 4 eps·sqrt(k) of the sum of |terms| for k up to 60 000;
+    compensated a few eps of the sum itself, and some eps²·k of the sum of |terms|. "warp" adds up 4 to 16 sums side by side, and
+    these by halves; the bound is the same, and the bits depend on the processor's vector width, not on the number of threads.
+    Denormal numbers count as zero in what fn computes on the CPU, as everywhere in XLA; pairs are decided with them.
     Memory: what `search` takes without its list, the results, and at most 16 MB (float32) for each array that fn needs for the
     pairs that are in work; nothing grows with the number of pairs, in derivatives neither. "warp" has no pairs in work, but two
     copies of the numbers that fn reads of each j, and one of those of each i.

@@ -222,6 +222,21 @@ __builtin_ia32_ldmxcsr(float_control);
 asm volatile("msr fpcr, %0" : : "r"(float_control));
 #endif
 """
+# Between them: what users compute is flushed, as XLA does, and for its speed; what decides about pairs is not.
+FLUSH = r"""
+#if defined(__SSE__) && !defined(__CUDA_ARCH__)
+__builtin_ia32_ldmxcsr(float_control | 0x8040u);
+#elif defined(__aarch64__) && !defined(__CUDA_ARCH__)
+asm volatile("msr fpcr, %0" : : "r"(float_control | (1ull << 24)));
+#endif
+"""
+KEEP = r"""
+#if defined(__SSE__) && !defined(__CUDA_ARCH__)
+__builtin_ia32_ldmxcsr(float_control & ~0x8040u);
+#elif defined(__aarch64__) && !defined(__CUDA_ARCH__)
+asm volatile("msr fpcr, %0" : : "r"(float_control & ~(1ull << 24)));
+#endif
+"""
 
 # Where a pair is decided. Step 1 belongs to the kernels: working precision and a band of 8 eps around r^2 (less would do, see
 # jfrnn/_exact.py). `Exact::pair` answers for what falls into the band: in twice the precision (float32), then by error-free sums,

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import warp as wp
 from jfrnn.kernels._math import VECTOR
-from jfrnn.kernels._native import CELLS, ENTER, EXACT, LEAVE, snippet
+from jfrnn.kernels._native import CELLS, ENTER, EXACT, FLUSH, KEEP, LEAVE, snippet
 from jfrnn.kernels._walk_cpu import CHUNK, walk
 from jfrnn.kernels.cells_cpu import LAYOUT
 
@@ -82,6 +82,11 @@ auto lanes_of = [](unsigned int bits) -> Math::flag {
     __builtin_memcpy(&lanes, &bits, sizeof lanes);
     return lanes;
 };
+auto bits_of = [](const real& x) {
+    whole bits;
+    memcpy(&bits, &x, sizeof bits);
+    return bits;
+};
 auto two_sum = [](auto& sum, auto& error, auto x) {  // Knuth 1969
     const auto s = sum + x, b = s - sum;
     error = error + ((sum - (s - b)) + (x - b));
@@ -132,24 +137,30 @@ _CHUNK_DONE = r"""
 """
 
 
-def _loaded(value: Value, lanes: str, double: bool) -> str:
-    """Return a statement that defines a value from lanes of the dtype of positions, among which integers travel as their bits.
+def _loaded(value: Value, lanes: str, bits: str, double: bool) -> str:
+    """Return a statement that defines a value from `lanes` of the dtype of positions, or from their `bits`.
 
-    In float64, integers of 32 bits travel as their values, and so do truths in both.
+    Integers of the same width travel as their bits; in float64, integers of 32 bits as their values, and so do truths in both.
     """
     kind = _NAMES[value.dtype]
     same, whole = ("f64", "i64") if double else ("f32", "i32")
-    made = lanes if kind == same else f"Math::bits({lanes})" if kind == whole else f"Math::to_{kind}({lanes})"
+    made = lanes if kind == same else bits if kind == whole else f"Math::to_{kind}({lanes})"
     return f"const Math::{kind} {value.name} = {made};\n"
+
+
+def _spread(value: Value, at: str, double: bool) -> str:
+    """Return a statement that defines a value, the same in all lanes, from a number."""
+    return _loaded(value, f"Math::of({at})", f"Math::of(bits_of({at}))", double)
 
 
 def _evaluation(term: TermText, double: bool, gathered: bool) -> str:
     """Return the text that adds the pairs of one query to its sums."""
 
-    def each(values: tuple[Value, ...], lanes: str) -> str:
-        return "".join(_loaded(value, lanes.format(c), double) for c, value in enumerate(values))
+    def each(lanes: str) -> str:
+        names = [lanes.format(c) for c in range(len(term.others))]
+        return "".join(_loaded(value, x, f"Math::bits({x})", double) for value, x in zip(term.others, names, strict=True))
 
-    lines = [each(term.own, f"Math::of(own_values.data[(long long)id * {len(term.own)} + {{}}])")]
+    lines = [_spread(v, f"own_values.data[(long long)id * {len(term.own)} + {c}]", double) for c, v in enumerate(term.own)]
     lines += [f"number sum{k} = {{}}, error{k} = {{}};\n" for k in range(len(term.sums))]
     if gathered:
         lines.append("for (int e = 0; e < LANES; ++e)\n    row[hits + e] = hits > 0 ? row[0] : 0;\n")
@@ -157,18 +168,18 @@ def _evaluation(term: TermText, double: bool, gathered: bool) -> str:
         lines.append("const Math::flag real_lanes = lanes_of(hits - b < LANES ? (1u << (hits - b)) - 1 : ~0u);\n")
         for c in range(len(term.others)):
             lines.append(f"number lanes{c};\nfor (int l = 0; l < LANES; ++l)\n    lanes{c}[l] = column[{c}][row[b + l]];\n")
-        lines.append(each(term.others, "lanes{}"))
+        lines.append(each("lanes{}"))
     else:
         lines.append("for (int b = 0, v = 0; b < filled; b += LANES, ++v) {\n")
         lines.append("if (found[v] == 0)\n    continue;\n")
         lines.append("const Math::flag real_lanes = lanes_of(found[v]);\n")
-        lines.append(each(term.others, "*(const number*)(column[{}] + b)"))
+        lines.append(each("*(const number*)(column[{}] + b)"))
     lines.append(term.text)
     for k, part in enumerate(term.sums):
         summand = f"Math::select(real_lanes, {part.name}, number{{}})"
         lines.append(f"if constexpr (COMPENSATED)\n    two_sum(sum{k}, error{k}, {summand});\nelse\n    sum{k} += {summand};\n")
     lines.append("}\n")
-    return "".join(lines + _stored(term))
+    return "".join([FLUSH, *lines, *_stored(term), KEEP])
 
 
 def _stored(term: TermText) -> list[str]:
@@ -245,7 +256,7 @@ def query_kernel(
     constants = {"SCALED": scaled, "LIST": gathered, "MASKS": not gathered, "SUMS": 1, "REACH": 1, "REACH_X": 1, "EXACTLY": 1}
     constants |= {"PERIODIC": periodic, "BATCHED": batched, "CHUNK": CHUNK, "CANDIDATES": _candidates(term, dim, double)}
     constants |= {"OTHERS": len(term.others), "TOTALS": totals, "ROW_SUMS": len(term.sums) - totals, "COMPENSATED": compensated}
-    shared = "".join(_loaded(v, f"Math::of(shared_values.data[{c}])", double) for c, v in enumerate(term.shared))
+    shared = "".join(_spread(v, f"shared_values.data[{c}]", double) for c, v in enumerate(term.shared))
     text = walk(
         begin="".join([VECTOR, _ADD.replace("NUMBER_LANES", "f64" if double else "f32"), shared]),
         scan="scan(q, id, filled, All{})",
