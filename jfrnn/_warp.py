@@ -4,6 +4,8 @@ Each combination of static options is a callable of its own, named after them, s
 depends on (JAX's persistent compilation cache sees no more than that name).
 """
 
+import atexit
+import contextlib
 import ctypes
 import functools
 import importlib
@@ -300,7 +302,20 @@ def _callable(name: str, run: Callable[..., None], types: dict[str, Any], output
     func.__annotations__ = types
     func.__name__ = func.__qualname__ = name
     wp = load_warp()
+    _finish_before_exit()
     return wp.jax_callable(func, num_outputs=outputs, graph_mode=wp.JaxCallableGraphMode.NONE, vmap_method="sequential")
+
+
+@functools.cache
+def _finish_before_exit() -> None:
+    """Let the interpreter wait for results that are under way: what computes them needs it, and would wait for ever."""
+
+    def finish() -> None:
+        for array in jax.live_arrays():
+            with contextlib.suppress(Exception):  # it has nobody left to be told to
+                array.block_until_ready()
+
+    atexit.register(finish)
 
 
 def _cuda_kernels(variant: Variant) -> Any:  # noqa: ANN401
@@ -345,7 +360,9 @@ def _launchable(variant: Variant, arrays: _Arrays) -> tuple[_Arrays, list[int], 
 
 def _on_every_core(launch: Callable[[], None], most: int) -> None:
     """Launch once per core, at most `most` times; a launch releases the interpreter's lock while it runs."""
-    others: list[Future[None]] = [_pool().submit(launch) for _ in range(min(_cores(), most) - 1)]
+    others: list[Future[None]] = []
+    with contextlib.suppress(RuntimeError):  # while the interpreter exits, nothing can be submitted: this core does it all
+        others += [_pool().submit(launch) for _ in range(min(_cores(), most) - 1)]
     launch()
     wait(others)
     for other in others:
