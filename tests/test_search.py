@@ -1,5 +1,7 @@
 """`search` and `count`: options, capacity, jit, batches, and every input error."""
 
+import subprocess
+import sys
 from itertools import product
 
 import checked
@@ -349,3 +351,15 @@ def test_float32_works_without_x64(dim, backend):
     with jax.enable_x64(False):
         nbrs = jfrnn.search(points, 0.25, capacity=200, backend=backend)
         checked.assert_exact(nbrs, points, 0.25)
+
+
+@pytest.mark.parametrize("backend", ["warp", "hashgrid"])
+def test_a_program_may_end_before_its_results(backend):
+    """What computes them calls back into the interpreter, which would wait for it for ever."""
+    program = (
+        "import jax, jfrnn\n"
+        "x = jax.random.uniform(jax.random.key(0), (300_000, 3))\n"
+        f"search = jax.jit(lambda x: jfrnn.search(x, 0.03, capacity=64, backend='{backend}').idx)\n"
+        "found = search(x)\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=300, capture_output=True)
