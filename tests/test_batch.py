@@ -14,6 +14,8 @@ from test_box import image_pairs, masked_images
 
 import jfrnn
 
+pytestmark = pytest.mark.usefixtures("compiled_soon")
+
 SLOW = pytest.mark.slow
 LENGTH, CAPACITY = 128, 256
 
