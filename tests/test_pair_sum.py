@@ -279,7 +279,7 @@ def test_third_derivatives():
 
 
 @pytest.mark.parametrize("rule", ["scatter", pytest.param("gather", marks=SLOW), pytest.param("mean", marks=SLOW)])
-@pytest.mark.parametrize(("backend", "second"), ENGINES)
+@pytest.mark.parametrize(("backend", "second"), [pytest.param(*ENGINES[0], marks=SLOW), ENGINES[1]])
 def test_derivatives_with_queries_and_radii(backend, second, rule):
     """The reversed pairs are those of the other rule; values of queries and of positions are apart."""
     (x, m), q = scene(1), scene(2)[0][:23]
@@ -308,7 +308,7 @@ PERIODIC = (True, True, False)
 
 @pytest.mark.parametrize(
     ("backend", "second"),
-    [ENGINES[0], ("half", False), *(pytest.param(*e, marks=SLOW) for e in (("half", True), ("brute", False), ("jax", True)))],
+    [("half", False), *(pytest.param(*e, marks=SLOW) for e in (("list", True), ("half", True), ("brute", False), ("jax", True)))],
 )
 def test_derivatives_in_a_box(backend, second):
     """Several images of a pair, own ones too; derivatives in the lattice vectors."""
