@@ -141,6 +141,7 @@ def fold_pairs(inputs: Inputs, options: Options, elements: int, visit: Visit[Sta
     return fold_neighbors(candidates, cutoff, options.filter, elements, visit, out)
 
 
+@functools.partial(jax.jit, static_argnames="options")
 def is_decidable(inputs: Inputs, options: Options) -> Array:
     """Say whether a search can answer for all particles that take part: cutoffs, box and positions are in range; [] bool."""
     return functools.reduce(jnp.logical_and, prepared(inputs, options).checks.values(), jnp.ones((), bool))

@@ -380,6 +380,17 @@ def _two_difference(a: Array, b: Array) -> tuple[Array, Array]:
     return difference, (a - a_virtual) + (b_virtual - b)
 
 
+def compensated_sum(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[Array, Array]:
+    """Add sums with what rounding took of them (value, error): nearly as in twice the precision."""
+    total, rounding = two_sum(a[0], b[0])
+    return total, a[1] + b[1] + rounding
+
+
+def rounded_sum(value: Array, error: Array) -> Array:
+    """Return what a compensated sum comes to; errors mean nothing where it is not finite."""
+    return jnp.where(jnp.isfinite(value), value + error, value)
+
+
 def two_sum(a: Array, b: Array) -> tuple[Array, Array]:
     """Return fl(a + b) and its rounding error (Knuth 1969)."""
     total = a + b

@@ -20,7 +20,7 @@ from jax.extend.core import jaxpr_as_fun
 from jfrnn import _warp
 from jfrnn._auto import level_of_caller
 from jfrnn._backends import Inputs, Options, prepared
-from jfrnn._exact import Radii, two_sum
+from jfrnn._exact import Radii, compensated_sum, rounded_sum
 from jfrnn._scalars import NoTranslationError, hash_of
 from jfrnn._terms import Groups, Term
 from jfrnn._translate import input_name, output_name, translate
@@ -153,16 +153,8 @@ def _packed(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) 
     leading = () if size is None else (size,)
     if not columns:
         return jnp.zeros((*leading, 1), dtype)
-    flat = [_as_float(jnp.reshape(x, (*leading, -1)), dtype) for x in group]
+    flat = [_warp.as_float(jnp.reshape(x, (*leading, -1)), dtype) for x in group]
     return jnp.concatenate([flat[k][..., e : e + 1] for k, e in columns], axis=-1)
-
-
-def _as_float(x: Array, dtype: np.dtype) -> Array:
-    """Let values travel among floats: integers of the same width as their bits, what is smaller as a value."""
-    if x.dtype == dtype:
-        return x
-    same_width = jnp.issubdtype(x.dtype, jnp.integer) and x.dtype.itemsize == dtype.itemsize
-    return lax.bitcast_convert_type(x, dtype) if same_width else x.astype(dtype)
 
 
 def _unpacked(term: Term, sums: Array, totals: Array) -> list[Array]:
@@ -180,12 +172,6 @@ def _unpacked(term: Term, sums: Array, totals: Array) -> list[Array]:
 
 
 def _added(parts: Array) -> Array:
-    """Add parts [slots, 2, width] in twice the precision, by halves."""
-    size = 1 << max(math.ceil(math.log2(parts.shape[0])), 0)
-    parts = jnp.pad(parts, ((0, size - parts.shape[0]), (0, 0), (0, 0)))
-    value, error = lax.optimization_barrier((parts[:, 0], parts[:, 1]))
-    while size > 1:
-        size //= 2
-        value, rounding = two_sum(value[:size], value[size:])
-        error = error[:size] + error[size:] + rounding
-    return jnp.where(jnp.isfinite(value[0]), value[0] + error[0], value[0])
+    """Add parts [slots, 2, width] in twice the precision."""
+    zero = jnp.zeros((), parts.dtype)
+    return rounded_sum(*lax.reduce((parts[:, 0], parts[:, 1]), (zero, zero), compensated_sum, (0,)))

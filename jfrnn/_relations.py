@@ -11,7 +11,7 @@ from jax import Array, lax
 from jfrnn import _fused
 from jfrnn._backends import Inputs, Options, fold_pairs
 from jfrnn._batch import Batch
-from jfrnn._exact import Radii, two_sum
+from jfrnn._exact import Radii, compensated_sum, rounded_sum
 from jfrnn._runs import FOLD_GROUP, Block, Slots, Visit
 from jfrnn._terms import Groups, Term
 
@@ -219,8 +219,7 @@ class _Adder:
     def result(self, state: tuple[Array, ...]) -> Array:
         if not self.compensated:
             return state[0]
-        total, error = state
-        return jnp.where(jnp.isfinite(total), total + error, total)
+        return rounded_sum(*state)
 
     def scatter(self, state: tuple[Array, ...], place: Array, terms: Array) -> tuple[Array, ...]:
         """Add terms [b, g, ...] to rows, in place; their errors are not known."""
@@ -232,11 +231,6 @@ class _Adder:
             added = jnp.sum(terms, axis=1, dtype=terms.dtype)
             return (state[0] + (added[0] if squeeze else added),)
         zero = jnp.zeros((), terms.dtype)  # one reduction of both: XLA may evaluate terms anew for each that asks
-        sums = lax.reduce((terms, jnp.zeros_like(terms)), (zero, zero), _compensated_sum, (1,))
+        sums = lax.reduce((terms, jnp.zeros_like(terms)), (zero, zero), compensated_sum, (1,))
         value, error = (x[0] if squeeze else x for x in sums)
-        return _compensated_sum(state, (value, error))
-
-
-def _compensated_sum(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[Array, Array]:
-    total, rounding = two_sum(a[0], b[0])
-    return total, a[1] + b[1] + rounding
+        return compensated_sum(state, (value, error))

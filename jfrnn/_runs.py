@@ -217,7 +217,9 @@ def fold_neighbors(
                         ordinal = jnp.broadcast_to(done + slots, (place.size, slots.size))
                         word, bit = _nth_bits(hits, ordinal)
                         source = engine.sources.ids.at[_take(first, word) + bit].get(mode="promise_in_bounds")
-                        shift = None if image is None or torus is None else _shifts_of(torus, ids, source, _take(image, word))
+                        shift = None
+                        if torus is not None and image is not None:
+                            shift = _shifts_of(torus, ids[:, None], source, _take(image, word))
                         return done + FOLD_GROUP, add(Slots(source, shift, ordinal < total[:, None]), state)
 
                     most = jnp.max(total)
@@ -233,9 +235,9 @@ def fold_neighbors(
 
 
 def _shifts_of(torus: Torus, query: Array, source: Array, image: Array) -> Array:
-    """Return the lattice shifts [b, g, d], whole floats, of pairs of queries [b] and sources [b, g] of these images."""
+    """Return the lattice shifts [..., d], whole floats, of pairs of queries and images of sources."""
     turns, query_turns = torus.turns
-    return jnp.asarray(torus.images.shifts).astype(turns.dtype)[image] + query_turns[query][:, None] - turns[source]
+    return jnp.asarray(torus.images.shifts).astype(turns.dtype)[image] + query_turns[query] - turns[source]
 
 
 class _WordTable(NamedTuple):
@@ -400,7 +402,7 @@ class _Engine(NamedTuple):
             own, others = self.queries.radii, self.sources.radii
             own = None if own is None else own.at[place].get(mode="clip")
             radii = self.cutoff.of_pairs(own, None if others is None else others.at[candidate].get(mode="clip"))
-        if torus is None:
+        if torus is None or image is None:
             return Pair(
                 [x.at[place].get(mode="clip") for x in self.queries.axes],
                 [x.at[candidate].get(mode="clip") for x in self.sources.axes],
@@ -408,9 +410,8 @@ class _Engine(NamedTuple):
             )
         i, j = self.queries.ids.at[place].get(mode="clip"), self.sources.ids.at[candidate].get(mode="clip")
         axes = range(len(self.sources.axes))
-        (sources, queries), (turns, query_turns) = torus.raw, torus.turns
-        shifts = jnp.asarray(torus.images.shifts).astype(turns.dtype)
-        shift = [shifts[image, k] + query_turns[i, k] - turns[j, k] for k in axes]
+        (sources, queries), shifts = torus.raw, _shifts_of(torus, i, j, image)
+        shift = [shifts[..., k] for k in axes]
         raw = [queries[i, k] for k in axes], [sources[j, k] for k in axes]
         return Pair(*raw, radii, shift, torus.matrix, torus.images.orthogonal)
 

@@ -143,13 +143,16 @@ def _periodic_kind(torus: tuple[Lattice, Wrapped] | None) -> int:
 
 def _rows(points: Array, turns: Array | None, systems: Array | None) -> Array:
     """Return rows of positions as the kernels read them: coordinates, packed turns, the number of the system."""
-    columns = [_as_float(x, points.dtype)[:, None] for x in (turns, systems) if x is not None]
+    columns = [as_float(x, points.dtype)[:, None] for x in (turns, systems) if x is not None]
     return jnp.concatenate([points, *columns], axis=1) if columns else points
 
 
-def _as_float(x: Array, dtype: np.dtype) -> Array:
-    """Let integers of 32 bits travel among floats: as their bits, or, in float64, as their values."""
-    return lax.bitcast_convert_type(x, jnp.float32) if dtype == jnp.float32 else x.astype(dtype)
+def as_float(x: Array, dtype: np.dtype) -> Array:
+    """Let values travel among floats: integers of the same width as their bits, what is smaller as a value."""
+    if x.dtype == dtype:
+        return x
+    same_width = jnp.issubdtype(x.dtype, jnp.integer) and x.dtype.itemsize == dtype.itemsize
+    return lax.bitcast_convert_type(x, dtype) if same_width else x.astype(dtype)
 
 
 def _lattice_numbers(lattice: Lattice, wrapped: Wrapped) -> Array:
@@ -201,7 +204,7 @@ def _packed(
         turns, query_turns = torus[1].turns, torus[1].query_turns
         numbers.append(_lattice_numbers(*torus))
     if batch is not None:
-        numbers.append(_as_float(jnp.max(batch.of_all)[None], sources.dtype))
+        numbers.append(as_float(jnp.max(batch.of_all)[None], sources.dtype))
     sources = _rows(sources, turns, None if batch is None else batch.sources)
     rows = sources if queries is None else _rows(queries, query_turns, None if batch is None else batch.queries)
     return sources, rows, jnp.concatenate(numbers)
@@ -361,8 +364,9 @@ def _launchable(variant: Variant, arrays: _Arrays) -> tuple[_Arrays, list[int], 
 def _on_every_core(launch: Callable[[], None], most: int) -> None:
     """Launch once per core, at most `most` times; a launch releases the interpreter's lock while it runs."""
     others: list[Future[None]] = []
-    with contextlib.suppress(RuntimeError):  # while the interpreter exits, nothing can be submitted: this core does it all
-        others += [_pool().submit(launch) for _ in range(min(_cores(), most) - 1)]
+    with contextlib.suppress(RuntimeError):  # while the interpreter exits, nothing can be submitted: this core does the rest
+        for _ in range(min(_cores(), most) - 1):
+            others.append(_pool().submit(launch))  # those that were submitted are waited for in any case
     launch()
     wait(others)
     for other in others:

@@ -60,6 +60,7 @@ const real radius = cutoff.data[0];
 #define JFRNN_CALL static __attribute__((noinline))
 #endif
 constexpr int ROW = DIM + (PERIODIC ? 1 : 0) + BATCHED;  // numbers per particle
+constexpr int LATTICE_END = PERIODIC ? 29 : 1;  // numbers in `cutoff`, but for the last one of a batch
 struct Bits {  // of floats
     enum { MANTISSA = DOUBLE ? 52 : 23, EXPONENTS = DOUBLE ? 0x7ff : 0xff, BIAS = DOUBLE ? 1023 : 127 };
     JFRNN_FUNCTION unsigned long long of(real x) {
@@ -150,7 +151,8 @@ struct Lattice {
     // a row of positions brought into the cell; one that is too far away for that is not finite
     JFRNN_MEMBER void wrap(const real* row, real* p) const {
 #if !defined(__CUDA_ARCH__)
-        if (packed_turns(row[DIM]) == (DIM == 3 ? 512 * 0x100401 : 512 * 0x401)) {  // none, as nearly everywhere
+        constexpr int NONE = 512 | 512 << 10 | (DIM == 3 ? 512 << 20 : 0);
+        if (packed_turns(row[DIM]) == NONE) {  // as nearly everywhere
             for (int k = 0; k < DIM; ++k)
                 p[k] = row[k];
             return;
@@ -182,8 +184,8 @@ for (int l = 0; PERIODIC && l < DIM; ++l)
 #if defined(__CUDA_ARCH__)
 const Lattice lattice{cutoff.data, skewed};
 #else
-real numbers[PERIODIC ? 29 : 1];  // not the caller's: nothing that is written may change them
-for (int k = 0; PERIODIC && k < 29; ++k)
+real numbers[LATTICE_END];  // not the caller's: nothing that is written may change them
+for (int k = 0; PERIODIC && k < LATTICE_END; ++k)
     numbers[k] = cutoff.data[k];
 const Lattice lattice{numbers, skewed};
 #endif
@@ -204,25 +206,15 @@ auto widen = [](real* low, real* high, const real* l, const real* h) {
 };
 """
 
-# XLA's threads flush denormals to zero on the CPU: undo that while native code runs.
-ENTER = r"""
+# XLA's threads flush denormals to zero on the CPU: undo that while native code runs. In between, what users compute is flushed, as
+# XLA does, and for its speed; what decides about pairs is kept.
+KEEP = r"""
 #if defined(__SSE__) && !defined(__CUDA_ARCH__)
-const unsigned int float_control = __builtin_ia32_stmxcsr();
 __builtin_ia32_ldmxcsr(float_control & ~0x8040u);
 #elif defined(__aarch64__) && !defined(__CUDA_ARCH__)
-unsigned long long float_control;
-asm volatile("mrs %0, fpcr" : "=r"(float_control));
 asm volatile("msr fpcr, %0" : : "r"(float_control & ~(1ull << 24)));
 #endif
 """
-LEAVE = r"""
-#if defined(__SSE__) && !defined(__CUDA_ARCH__)
-__builtin_ia32_ldmxcsr(float_control);
-#elif defined(__aarch64__) && !defined(__CUDA_ARCH__)
-asm volatile("msr fpcr, %0" : : "r"(float_control));
-#endif
-"""
-# Between them: what users compute is flushed, as XLA does, and for its speed; what decides about pairs is not.
 FLUSH = r"""
 #if defined(__SSE__) && !defined(__CUDA_ARCH__)
 __builtin_ia32_ldmxcsr(float_control | 0x8040u);
@@ -230,11 +222,22 @@ __builtin_ia32_ldmxcsr(float_control | 0x8040u);
 asm volatile("msr fpcr, %0" : : "r"(float_control | (1ull << 24)));
 #endif
 """
-KEEP = r"""
+ENTER = (
+    r"""
 #if defined(__SSE__) && !defined(__CUDA_ARCH__)
-__builtin_ia32_ldmxcsr(float_control & ~0x8040u);
+const unsigned int float_control = __builtin_ia32_stmxcsr();
 #elif defined(__aarch64__) && !defined(__CUDA_ARCH__)
-asm volatile("msr fpcr, %0" : : "r"(float_control & ~(1ull << 24)));
+unsigned long long float_control;
+asm volatile("mrs %0, fpcr" : "=r"(float_control));
+#endif
+"""
+    + KEEP
+)
+LEAVE = r"""
+#if defined(__SSE__) && !defined(__CUDA_ARCH__)
+__builtin_ia32_ldmxcsr(float_control);
+#elif defined(__aarch64__) && !defined(__CUDA_ARCH__)
+asm volatile("msr fpcr, %0" : : "r"(float_control));
 #endif
 """
 
@@ -684,7 +687,7 @@ auto cell_key = [&](const Grid& grid, const real* p, unsigned int system) -> int
 };
 // number of cells of the box [low, high] of coordinates, and whether the table holds them
 auto lay_out = [&](Grid& grid, const real* low, const real* high, int table) {
-    double cells = BATCHED ? double(unsigned_of(cutoff.data[PERIODIC ? 29 : 1])) + 1 : 1;
+    double cells = BATCHED ? double(unsigned_of(cutoff.data[LATTICE_END])) + 1 : 1;
     for (int k = 0; k < DIM; ++k) {
         grid.low[k] = is_periodic(k) ? real(0) : cell_of(k, low[k]);
         const double extent = is_periodic(k) ? double(inverse_edge[k]) : double(cell_of(k, high[k])) - double(grid.low[k]) + 1;

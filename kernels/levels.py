@@ -27,7 +27,7 @@ constexpr int GATHER = 0, SCATTER = 1, EITHER = 2, BOTH = 3;
 const int* extent = header.data;
 const bool dense = header.data[4] != 0;
 const int groups = header.data[5];
-const real* largest = cutoff.data + (PERIODIC ? 29 : 1);
+const real* largest = cutoff.data + LATTICE_END;
 const real* width = largest + GROUPS;
 const real* scale = width + 3;
 const real* margin = scale + 3;

@@ -360,6 +360,7 @@ def test_a_program_may_end_before_its_results(backend):
         "import jax, jfrnn\n"
         "x = jax.random.uniform(jax.random.key(0), (300_000, 3))\n"
         f"search = jax.jit(lambda x: jfrnn.search(x, 0.03, capacity=64, backend='{backend}').idx)\n"
-        "found = search(x)\n"
+        "search(x).block_until_ready()\n"
+        "found = search(x + 1e-3)\n"  # the program is compiled: this returns at once, and the interpreter exits
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=300, capture_output=True)
