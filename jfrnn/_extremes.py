@@ -11,7 +11,7 @@ from jax import Array, lax
 from jfrnn._relations import Listed, Relation, evaluate
 from jfrnn._runs import Block, Slots
 from jfrnn._summation import bind_sum
-from jfrnn._terms import Derived, Groups, Term, chosen, joined, make_term
+from jfrnn._terms import Derived, Groups, Term, chosen, fresh_labels, joined, make_term
 
 _Best = tuple[Array, Array, Array | None]  # of each row and element [b, k]: the largest, its source (n: none), its shift [b, k, d]
 
@@ -46,7 +46,8 @@ def _element(term: Term, k: int) -> Derived:
         return [jnp.ravel(term(real, shift, operands._replace(own=tuple(own)))[k])[number]]
 
     number = jax.ShapeDtypeStruct((), np.int32)
-    return make_term(summand, joined(term.operands, Groups((), (number,), ())), term.shift)
+    mine, theirs = fresh_labels(len(term.operands.own) + 1, term.labels), term.labels[1]  # a row of i for each element
+    return make_term(summand, joined(term.operands, Groups((), (number,), ())), term.shift, (mine, theirs))
 
 
 def _find(relation: Relation, term: Term, operands: Groups, largest: bool) -> list[_Best]:

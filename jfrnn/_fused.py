@@ -22,14 +22,17 @@ from jfrnn._auto import level_of_caller
 from jfrnn._backends import Inputs, Options, prepared
 from jfrnn._exact import Radii, compensated_sum, rounded_sum
 from jfrnn._scalars import NoTranslationError, hash_of
-from jfrnn._terms import Groups, Term
+from jfrnn._terms import POSITIONS, Groups, Term
 from jfrnn._translate import input_name, output_name, translate
 
 _Columns = tuple[tuple[int, int], ...]  # of each column: which operand of a group, which element of it
 
 
 class Plan(NamedTuple):
-    """A term in native text, where its columns come from, and a key that is the same in every process."""
+    """A term in native text, where its columns come from, and a key that is the same in every process.
+
+    Positions need no columns: the kernel has them.
+    """
 
     text: Any  # jfrnn.kernels.pair_sum_cpu.TermText
     shared: _Columns
@@ -114,10 +117,16 @@ def planned(term: Term, dtype: np.dtype) -> Plan:
 
     translated = translate(jax.make_jaxpr(of_pair)(*flat))
     columns, values, before = [], [], 0
-    for group in term.operands:
-        reads = [(k, e) for k, e in translated.reads if before <= k < before + len(group)]
-        columns.append(tuple((k - before, e) for k, e in reads))
-        values.append(tuple(kernels.Value(input_name(k, e), translated.inputs[k].dtype) for k, e in reads))
+    for group, labels in zip(term.operands, ((), *term.labels), strict=True):
+        reads = [(k - before, e) for k, e in translated.reads if before <= k < before + len(group)]
+        there = [bool(labels) and labels[k] in POSITIONS for k, _ in reads]
+        columns.append(tuple(read for read, known in zip(reads, there, strict=True) if not known))
+        values.append(
+            tuple(
+                kernels.Value(input_name(before + k, e), translated.inputs[before + k].dtype, e if known else None)
+                for (k, e), known in zip(reads, there, strict=True)
+            )
+        )
         before += len(group)
     sums = tuple(
         kernels.Sum(output_name(k, e), total)
@@ -150,9 +159,9 @@ def sums(inputs: Inputs, options: Options, term: Term, operands: Groups, compens
 
 def _packed(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) -> Array:
     """Return the columns of a group of operands: [size, width], or where all pairs share them, [width]; never empty."""
-    leading = () if size is None else (size,)
     if not columns:
-        return jnp.zeros((*leading, 1), dtype)
+        return jnp.zeros(1 if size is None else (1, 1), dtype)
+    leading = () if size is None else (size,)
     flat = [_warp.as_float(jnp.reshape(x, (*leading, -1)), dtype) for x in group]
     return jnp.concatenate([flat[k][..., e : e + 1] for k, e in columns], axis=-1)
 

@@ -18,7 +18,7 @@ from jfrnn._inputs import checked_cutoff
 from jfrnn._neighbors import NeighborList
 from jfrnn._relations import Listed, Relation, Searched
 from jfrnn._summation import bind_sum
-from jfrnn._terms import Groups, Summand, chosen, traced
+from jfrnn._terms import OF_QUERIES, OF_SOURCES, Groups, Labels, Summand, chosen, fresh_labels, traced
 
 
 class Pairs(NamedTuple):
@@ -99,7 +99,10 @@ def reduced(
         tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in operands.shared),
         *(tuple(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in group) for group in operands[1:]),
     )
-    term, needed, closed_over = traced(summand, one_pair, jax.ShapeDtypeStruct(pairs.sources.shape[1:], pairs.sources.dtype), fn)
+    shift = jax.ShapeDtypeStruct(pairs.sources.shape[1:], pairs.sources.dtype)
+    term, needed, closed_over = traced(
+        summand, one_pair, shift, _labels(operands, pairs.rows is pairs.sources and mine is theirs), fn
+    )
     if reduce != "sum" and not all(jnp.issubdtype(x.dtype, jnp.floating) for x in term.summands):
         raise TypeError(f"fn must return floats for reduce={reduce!r}, whose rows may be infinite: convert them with .astype.")
     operands = chosen(operands, needed)
@@ -151,6 +154,14 @@ def _summand(
         return [_summable(x, dtype) for x in leaves]
 
     return operands, summand, structure
+
+
+def _labels(operands: Groups, same: bool) -> Labels:
+    """Label the operands of i and of j, of which positions are the first; `same`: they are the same arrays."""
+    theirs = OF_SOURCES, *fresh_labels(len(operands.others) - 1, ((), ()))
+    if same:
+        return theirs, theirs
+    return (OF_QUERIES, *fresh_labels(len(operands.own) - 1, ((), theirs))), theirs
 
 
 def _is_backward(shift: Array) -> Array:

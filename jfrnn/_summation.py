@@ -81,8 +81,9 @@ def _transpose(cotangents: list, *args: Any, term: Term, structure: Any, compens
     rules = transposed(term, linear, there, relation.symmetric)
     results: list[Array] = []
     if rules.along is not None:
-        if rules.across is None and any(linear.others):  # one term for both sides
-            given = Groups(given.shared, given.own + given.others, given.own + given.others)
+        if rules.sides:
+            side = tuple((given.own + given.others)[k] for k in rules.sides)
+            given = Groups(given.shared, side, side)
         results += _bind_derived(leaves, given, rules.along, structure, compensated)
     if rules.across is not None:
         exchanged, other_structure = jax.tree.flatten(relation.reversed())

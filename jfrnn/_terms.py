@@ -31,6 +31,8 @@ class Groups(NamedTuple):
     others: tuple
 
 
+Labels = tuple[tuple[int, ...], tuple[int, ...]]
+POSITIONS = OF_SOURCES, OF_QUERIES = 0, 1  # labels of positions; where sources are the queries, both are those of sources
 Summand = Callable[[Array, Array, Groups], Sequence[Array]]  # real [] bool, shift [d], operands -> summands
 
 
@@ -42,12 +44,14 @@ class Term:
         jaxpr: (real, shift, *shared, *own, *others) -> summands.
         operands: What one pair gets of them (shapes and dtypes), but real and shift.
         shift: Shape and dtype of the shift, [d] whole floats.
+        labels: Of the operands of i and of j: equal ones are one array, though on both sides. Those in `POSITIONS` are positions.
         totals: For each summand, whether it is summed over all pairs, instead of over the neighbors j of each i.
     """
 
     jaxpr: ClosedJaxpr
     operands: Groups
     shift: jax.ShapeDtypeStruct
+    labels: "Labels"
     totals: tuple[bool, ...]
 
     @property
@@ -75,7 +79,13 @@ def _split(operands: Sequence, like: Groups) -> Groups:
     return Groups(tuple(operands[:shared]), tuple(operands[shared : shared + own]), tuple(operands[shared + own :]))
 
 
-def traced(summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct, owner: Any) -> tuple[Term, Groups, tuple[Array, ...]]:  # noqa: ANN401
+def traced(
+    summand: Summand,
+    operands: Groups,
+    shift: jax.ShapeDtypeStruct,
+    labels: Labels,
+    owner: Any,  # noqa: ANN401
+) -> tuple[Term, Groups, tuple[Array, ...]]:
     """Trace a summand that may close over anything; return its term, which operands it needs, and what it closes over.
 
     `operands` are the shapes and dtypes of what one pair gets. What it closes over becomes the first of the shared operands.
@@ -90,7 +100,7 @@ def traced(summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct, owne
         shared, own, others = operands
         return eval_jaxpr(closed.jaxpr, shared[: len(consts)], real, shift, *shared[len(consts) :], *own, *others)
 
-    derived = _kept(owner, make_term(hoisted, joined(of_consts, operands), shift))
+    derived = _kept(owner, make_term(hoisted, joined(of_consts, operands), shift, labels))
     of_closed, needed = derived.needed.shared[: len(consts)], derived.needed.shared[len(consts) :]
     return derived.term, derived.needed._replace(shared=needed), tuple(compress(consts, of_closed))
 
@@ -108,6 +118,7 @@ def _kept(owner: Any, derived: "Derived") -> "Derived":  # noqa: ANN401
         tuple(_literals(closed.jaxpr)),
         jax.tree.structure(derived.needed),
         tuple(jax.tree.leaves(derived.needed)),
+        derived.term.labels,
     )
     try:
         return _KNOWN.setdefault(owner, {}).setdefault(key, derived)
@@ -132,14 +143,24 @@ class Derived(NamedTuple):
     needed: Groups
 
 
-def make_term(summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct, totals: Sequence[bool] | None = None) -> Derived:
+def make_term(
+    summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct, labels: Labels, totals: Sequence[bool] | None = None
+) -> Derived:
     """Trace a summand of these operands that closes over nothing, and drop the operands that it does not need."""
     closed = jax.make_jaxpr(_flat(summand, operands))(*_one_pair(operands, shift))
     always = [True, True] + [False] * sum(map(len, operands))
     jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), always)
     needed = _split(used[2:], operands)
-    term = Term(ClosedJaxpr(jaxpr, closed.consts), chosen(operands, needed), shift, tuple(totals or [False] * len(jaxpr.outvars)))
-    return Derived(term, needed)
+    mine, theirs = labels
+    labels = tuple(compress(mine, needed.own)), tuple(compress(theirs, needed.others))
+    totals = tuple(totals or [False] * len(jaxpr.outvars))
+    return Derived(Term(ClosedJaxpr(jaxpr, closed.consts), chosen(operands, needed), shift, labels, totals), needed)
+
+
+def fresh_labels(count: int, labels: Labels) -> tuple[int, ...]:
+    """Return labels that no operand has."""
+    first = max((*labels[0], *labels[1], *POSITIONS)) + 1
+    return tuple(range(first, first + count))
 
 
 def _one_pair(operands: Groups, shift: jax.ShapeDtypeStruct) -> list[jax.ShapeDtypeStruct]:
@@ -180,7 +201,13 @@ def tangent(term: Term, moving: Groups) -> Derived:
         return jax.jvp(of_moving, (chosen(primals, moving),), (moves,))[1]
 
     totals = [total for total, x in zip(term.totals, term.summands, strict=True) if is_moving(x)]
-    return make_term(summand, joined(term.operands, tangents), term.shift, totals)
+    moved = sorted({label for labels, which in zip(term.labels, moving[1:], strict=True) for label in compress(labels, which)})
+    of_tangent = dict(zip(moved, fresh_labels(len(moved), term.labels), strict=True))
+    mine, theirs = (
+        labels + tuple(of_tangent[label] for label in compress(labels, which))
+        for labels, which in zip(term.labels, moving[1:], strict=True)
+    )
+    return make_term(summand, joined(term.operands, tangents), term.shift, (mine, theirs), totals)
 
 
 class Transposed(NamedTuple):
@@ -190,10 +217,12 @@ class Transposed(NamedTuple):
         along: Summed as the term was: totals of the shared linear operands, then sums of those of i. Operands: those that are not
             linear, then the cotangents: of totals shared, of sums with i.
         across: Summed over the i of each j, or None: sums of the linear operands of j, the roles of i and j exchanged.
+        sides: Where one term does it: which of the operands of i and then of j either side of it has.
     """
 
     along: Derived | None
     across: Derived | None
+    sides: tuple[int, ...] = ()
 
 
 @functools.lru_cache(maxsize=256)
@@ -201,7 +230,7 @@ def transposed(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetr
     """Transpose a term in its linear operands; `cotangents` says of which sums there are any.
 
     `symmetric`: j is a neighbor of i where i is one of j, and both have operands of both kinds. Then one term does it: the sums of
-    the linear operands of j are the last ones of `along`, whose operands of either side are all those of i, then those of j.
+    the linear operands of j are the last ones of `along`, whose operands of either side are all those of i and of j.
     """
     still = chosen(term.operands, Groups(*(tuple(not flag for flag in group) for group in linear)))
     of_totals, of_sums = (
@@ -209,6 +238,14 @@ def transposed(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetr
         for kind in (True, False)
     )
     given = joined(still, Groups(of_totals, of_sums, ()))
+    mine, theirs = (
+        tuple(label for label, flag in zip(labels, which, strict=True) if not flag)
+        for labels, which in zip(term.labels, linear[1:], strict=True)
+    )
+    mine += fresh_labels(len(of_sums), term.labels)
+    each = mine + theirs
+    sides = tuple(k for k, label in enumerate(each) if label not in each[:k])  # what is one array is there once
+    place = [sides.index(each.index(label)) for label in each]
 
     def pull(real: Array, shift: Array, operands: Groups) -> Groups:
         known, cts = _halves(operands, still)
@@ -229,23 +266,22 @@ def transposed(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetr
         return list(pull(real, -shift, operands._replace(own=operands.others, others=operands.own)).others)
 
     def both(real: Array, shift: Array, operands: Groups) -> list[Array]:
-        shared, mine, theirs = operands
-        count, known = len(given.own), len(given.own) + len(given.others)
-        forward, backward = (
-            Groups(shared, i[:count], j[count:known]) for i, j in ((mine, theirs), (theirs, mine))
-        )  # fmt: skip
+        of_i, of_j = (tuple(side[k] for k in place) for side in (operands.own, operands.others))
+        count = len(given.own)
+        forward, backward = (Groups(operands.shared, a[:count], b[count:]) for a, b in ((of_i, of_j), (of_j, of_i)))
         return along(real, shift, forward) + list(pull(real, -shift, backward).others)
 
-    totals, sums, theirs = ([flag for flag in group if flag] for group in linear)
-    if symmetric and theirs and (totals or sums):
-        sides = given.own + given.others
-        flags = [True] * len(totals) + [False] * (len(sums) + len(theirs))
-        return Transposed(make_term(both, Groups(given.shared, sides, sides), term.shift, flags), None)
+    totals, sums, across_sums = ([flag for flag in group if flag] for group in linear)
+    if symmetric and across_sums and (totals or sums):
+        operands = given.own + given.others
+        side, labels = tuple(operands[k] for k in sides), tuple(each[k] for k in sides)
+        flags = [True] * len(totals) + [False] * (len(sums) + len(across_sums))
+        return Transposed(make_term(both, Groups(given.shared, side, side), term.shift, (labels, labels), flags), None, sides)
     exchanged = Groups(given.shared, given.others, given.own)
     flags = [True] * len(totals) + [False] * len(sums)
     return Transposed(
-        make_term(along, given, term.shift, flags) if flags else None,
-        make_term(across, exchanged, term.shift) if theirs else None,
+        make_term(along, given, term.shift, (mine, theirs), flags) if flags else None,
+        make_term(across, exchanged, term.shift, (theirs, mine)) if across_sums else None,
     )
 
 

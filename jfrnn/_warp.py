@@ -435,7 +435,7 @@ def pair_sums(
     totals = sum(part.total for part in term.sums)
     width, slots = len(term.sums) - totals, kernels_of("pair_sum_cpu").slots(m)
     dims = {"sums": (m, max(width, 1)), "totals": max(2 * slots * totals, 1), "errors": m * width if compensated else 1}
-    dims |= {"columns": max(n * len(term.others), 1), "info": 2}
+    dims |= {"columns": max(n * term.columns, 1), "info": 2}
     dims["scratch"] = kernels_of("cells_cpu").scratch_words(n, m, dim, 2 if double else 1, own)
     call = _sum_callable(variant, term)
     sums, parts, *_ = call(*_packed(sources, queries, cutoff, batch, None), *values, output_dims=dims)
@@ -475,7 +475,7 @@ def _run_sums_on_cpu(variant: _SumVariant, term: Any, *arrays: Any) -> None:  # 
     n, m = positions.shape[0], queries.shape[0]
     sizes = [n, m, int(variant.own), kernels_of("_native").table_cells(n)]
     wp.launch(build, dim=1, inputs=[positions, queries, cutoff, info, scratch, *sizes], device="cpu")
-    if term.others:
+    if term.columns:
         sorting = [others, cutoff, columns, scratch, *sizes]
         _on_every_core(lambda: wp.launch(sort_values, dim=1, inputs=sorting, device="cpu"), -(-n // _PLACES_PER_THREAD))
     arguments = [positions, queries, cutoff, shared, own, columns, sums, totals, errors, scratch, *sizes]

@@ -7,6 +7,8 @@ given.
 
 from string import Template
 
+from jfrnn.kernels._native import FLUSH, KEEP
+
 CHUNK = 2048  # places that a thread takes at a time
 
 _TYPES = r"""
@@ -23,13 +25,9 @@ typedef bool flags __attribute__((ext_vector_type(LANES)));
 alignas(64) real candidate[3][CANDIDATES + LANES];
 alignas(64) int candidate_ids[CANDIDATES + LANES];
 alignas(64) int row[CANDIDATES + LANES];
-alignas(64) real doubtful[3][CANDIDATES + LANES];
 alignas(64) unsigned short unsure[CANDIDATES / LANES + 4];  // one bit per candidate that step 1 leaves open
-alignas(64) int doubtful_ids[CANDIDATES + LANES];
-alignas(64) unsigned short found[MASKS ? CANDIDATES / LANES + 1 : 1];  // one bit per candidate that is a pair
+alignas(64) int doubtful[CANDIDATES + LANES];  // their numbers
 alignas(64) int candidate_images[PERIODIC ? CANDIDATES + LANES : 1];  // their codes
-alignas(64) int doubtful_images[PERIODIC ? CANDIDATES + LANES : 1];
-alignas(64) int candidate_sources[SUMS != 0 && PERIODIC != 0 ? CANDIDATES + LANES : 1];
 alignas(64) int candidate_order[PERIODIC == 2 ? CANDIDATES + LANES : 1];  // by source, then by image: behind, at home, ahead
 const Grid grid = shared.grid;
 const int places = m, finite_places = shared.finite_queries;
@@ -65,14 +63,24 @@ auto later_mask = [&](int b, int own_id) -> unsigned int {  // candidates whose 
     __builtin_memcpy(&bits, &f, LANES == 16 ? 2 : 1);
     return bits;
 };
-auto square_of = [&](const real* q, int b) -> vec {
+struct Points { vec p[3]; };
+auto candidates_at = [&](int b) {
+    Points points;
+    for (int k = 0; k < DIM; ++k)
+        points.p[k] = *(const vec*)(candidate[k] + b);
+    return points;
+};
+auto square_of = [&](const real* q, const vec* p) -> vec {  // of the distance of points in lanes
     vec square;
     for (int k = 0; k < DIM; ++k) {
-        vec d = *(const vec*)(candidate[k] + b) - q[k];
+        vec d = p[k] - q[k];
         if constexpr (SCALED)
             d *= step_scale;
 #if defined(__FMA__)
-        square = k == 0 ? d * d : __builtin_elementwise_fma(d, d, square);
+        if constexpr (SUMS)  // as a term computes it, too
+            square = k == 0 ? d * d : square + d * d;
+        else
+            square = k == 0 ? d * d : __builtin_elementwise_fma(d, d, square);
 #else
         square = k == 0 ? d * d : square + d * d;
 #endif
@@ -80,26 +88,33 @@ auto square_of = [&](const real* q, int b) -> vec {
     return square;
 };
 // stores the lanes of a mask one after the other; up to LANES elements at `to` are overwritten
-auto pack = [&](const auto* from, auto* to, unsigned int mask) {
+auto pack = [](auto from, auto* to, unsigned int mask) {
 #if defined(__AVX512F__) && defined(__AVX512VL__)
     typedef int ints8 __attribute__((vector_size(32)));
     typedef int ints16 __attribute__((vector_size(64)));
     typedef double doubles8 __attribute__((vector_size(64)));
-    if constexpr (sizeof(*from) == 8) {
-        const doubles8 packed = __builtin_ia32_compressdf512_mask(*(const doubles8*)from, doubles8{}, mask);
-        __builtin_memcpy(to, &packed, 64);
-    } else if constexpr (LANES == 8) {
-        const ints8 packed = __builtin_ia32_compresssi256_mask(*(const ints8*)from, ints8{}, mask);
-        __builtin_memcpy(to, &packed, 32);
-    } else {
-        const ints16 packed = __builtin_ia32_compresssi512_mask(*(const ints16*)from, ints16{}, mask);
-        __builtin_memcpy(to, &packed, 64);
-    }
+    if constexpr (sizeof(*to) == 8)
+        from = (decltype(from))__builtin_ia32_compressdf512_mask((doubles8)from, doubles8{}, mask);
+    else if constexpr (LANES == 8)
+        from = (decltype(from))__builtin_ia32_compresssi256_mask((ints8)from, ints8{}, mask);
+    else
+        from = (decltype(from))__builtin_ia32_compresssi512_mask((ints16)from, ints16{}, mask);
+    __builtin_memcpy(to, &from, sizeof from);
 #else
     for (; mask; mask &= mask - 1)
         *to++ = from[__builtin_ctz(mask)];
 #endif
 };
+// what `from` holds at the places `numbers`; instructions that gather take longer
+auto gathered = [](const real* from, const int* numbers) -> vec {
+    vec lanes;
+    for (int l = 0; l < LANES; ++l)
+        lanes[l] = from[numbers[l]];
+    return lanes;
+};
+ints first_numbers;
+for (int l = 0; l < LANES; ++l)
+    first_numbers[l] = l;
 const real off = PERIODIC ? 2 * lattice.slack() * step_scale : real(0);  // by which distances of images may be wrong
 const real inner = step_radius > off ? step_radius - off : real(0), outer = step_radius + off;
 const real band = 8 * (1 + PERIODIC) * step_eps, inside = inner * inner * (1 - band), outside = outer * outer * (1 + band);
@@ -113,79 +128,100 @@ auto bits_of_lanes = [](auto lanes) -> unsigned int {
     __builtin_memcpy(&bits, &f, 1);
     return bits;
 };
-// candidates of one query among `count` copied ones: how many are pairs; LIST: their ids in `row`, MASKS: their bits in `found`
+// which of the points in lanes are pairs for sure, in twice the precision, eight at a time; others stay `open`, or are none
+auto doubly_decided = [&](const real* q, const vec* p, unsigned int& open) -> unsigned int {
+    unsigned int pairs = 0;
+    if constexpr (!DOUBLE && !PERIODIC) {
+        struct Halves { floats eight[LANES / 8]; } x[3];
+        for (int k = 0; k < DIM; ++k)
+            __builtin_memcpy(&x[k], &p[k], sizeof(vec));
+        unsigned int doubtful = 0;
+        for (int h = 0; h < LANES / 8; ++h) {
+            doubles square;
+            for (int k = 0; k < DIM; ++k) {
+                const doubles d = __builtin_convertvector(x[k].eight[h], doubles) - (double)q[k];
+                square = k == 0 ? d * d : square + d * d;
+            }
+            pairs |= bits_of_lanes(square < doubly_inside) << 8 * h;
+            doubtful |= bits_of_lanes(square <= doubly_outside) << 8 * h;
+        }
+        pairs &= open;
+        open &= ~pairs & doubtful;
+    }
+    return pairs;
+};
+// a candidate, where it is, and its number
+auto exactly_decided = [&](const real* q, int own_id, const real* p, int number) -> bool {
+    if constexpr (PERIODIC) {
+        const int source = PERIODIC == 2 && !SUMS ? candidate_ids[number] % n : candidate_ids[number];
+        const real* there = positions.data + (long long)ROW * source;
+        return exact_image(queries.data + (long long)ROW * own_id, there, several ? candidate_images[number] : image);
+    }
+    return exact_pair(q, p);
+};
+// the numbers of what is unsure among `count` candidates, into `doubtful`; returns how many
+auto collect_doubtful = [&](int count) -> int {
+    const int vectors = (count + LANES - 1) / LANES;
+    for (int e = vectors; e < vectors + 3; ++e)
+        unsure[e] = 0;
+    int doubts = 0;
+    for (int v = 0; v < vectors; v += 4) {
+        unsigned long long four;
+        for (__builtin_memcpy(&four, unsure + v, 8); four;) {
+            const int e = __builtin_ctzll(four) / 16;
+            const unsigned int mask = (four >> (16 * e)) & 0xffff;
+            four &= ~(0xffffull << (16 * e));
+            pack(first_numbers + (v + e) * LANES, doubtful + doubts, mask);
+            doubts += __builtin_popcount(mask);
+        }
+    }
+    for (int e = 0; e < LANES; ++e)
+        doubtful[doubts + e] = 0;
+    return doubts;
+};
+auto lanes_before = [](int count) -> unsigned int { return count < LANES ? (1u << count) - 1 : (1u << LANES) - 1; };
+auto doubtful_at = [&](int b) {
+    Points points;
+    for (int k = 0; k < DIM; ++k)
+        points.p[k] = gathered(candidate[k], doubtful + b);
+    return points;
+};
+// which of the points in lanes, of which some are `open`, are pairs; `numbers` are theirs among the candidates
+auto decided = [&](const real* q, int own_id, const Points& points, const int* numbers, unsigned int open) -> unsigned int {
+    unsigned int pairs = doubly_decided(q, points.p, open);
+    for (; open; open &= open - 1) {
+        const int lane = __builtin_ctz(open);
+        real p[3];
+        for (int k = 0; k < DIM; ++k)
+            p[k] = points.p[k][lane];
+        pairs |= exactly_decided(q, own_id, p, numbers[lane]) ? 1u << lane : 0;
+    }
+    return pairs;
+};
+// candidates of one query among `count` copied ones: returns how many are pairs; LIST: their ids in `row`
 auto scan = [&](const real* q, int own_id, int count, auto only_later) -> int {
     int hits = 0;
     auto later = [&](int b) -> unsigned int {
         return only_later.value ? later_mask(b, own_id) : ~0u;
     };
     for (int b = 0, v = 0; b < count; b += LANES, ++v) {
-        const vec square = square_of(q, b);
+        const vec square = square_of(q, candidates_at(b).p);
         const unsigned int allowed = later(b);
         const unsigned int hit = mask_of(square, inside, Below{}) & allowed;
         if constexpr (EXACTLY)
             unsure[v] = hit ^ (mask_of(square, outside, BelowOrAt{}) & allowed);
         if constexpr (LIST)
-            pack(candidate_ids + b, row + hits, hit);
-        if constexpr (MASKS)
-            found[v] = hit;
+            pack(*(const ints*)(candidate_ids + b), row + hits, hit);
         hits += __builtin_popcount(hit);
     }
     if constexpr (!EXACTLY)
         return hits;
-    const int vectors = (count + LANES - 1) / LANES;
-    for (int e = vectors; e < vectors + 3; ++e)
-        unsure[e] = 0;
-    const int sure = hits;
-    int doubts = 0;
-    for (int v = 0; v < vectors; v += 4) {
-        unsigned long long four;
-        for (__builtin_memcpy(&four, unsure + v, 8); four;) {
-            const int e = __builtin_ctzll(four) / 16, b = (v + e) * LANES;
-            const unsigned int mask = (four >> (16 * e)) & 0xffff;
-            four &= ~(0xffffull << (16 * e));
-            if constexpr (PERIODIC) {
-                if (several)
-                    pack(candidate_images + b, doubtful_images + doubts, mask);
-            } else
-                for (int k = 0; k < DIM; ++k)
-                    pack(candidate[k] + b, doubtful[k] + doubts, mask);
-            pack(candidate_ids + b, doubtful_ids + doubts, mask);
-            doubts += __builtin_popcount(mask);
-        }
+    const int doubts = collect_doubtful(count);
+    for (int b = 0; b < doubts; b += LANES) {
+        unsigned int pairs = decided(q, own_id, doubtful_at(b), doubtful + b, lanes_before(doubts - b));
+        for (; pairs; pairs &= pairs - 1)
+            row[hits++] = candidate_ids[doubtful[b + __builtin_ctz(pairs)]];
     }
-    for (int b = 0; b < doubts; b += 8) {
-        unsigned int left = doubts - b < 8 ? (1u << (doubts - b)) - 1 : 255;
-        if constexpr (!DOUBLE && !PERIODIC) {  // in twice the precision, eight at a time
-            doubles square;
-            for (int k = 0; k < DIM; ++k) {
-                const doubles d = __builtin_convertvector(*(const floats*)(doubtful[k] + b), doubles) - (double)q[k];
-                square = k == 0 ? d * d : square + d * d;
-            }
-            unsigned int pairs = left & bits_of_lanes(square < doubly_inside);
-            left &= ~pairs & bits_of_lanes(square <= doubly_outside);
-            for (; pairs; pairs &= pairs - 1)
-                row[hits++] = doubtful_ids[b + __builtin_ctz(pairs)];
-        }
-        for (; left; left &= left - 1) {
-            const int c = b + __builtin_ctz(left);
-            if constexpr (PERIODIC) {
-                const int id = doubtful_ids[c];
-                const int number = SUMS ? candidate_sources[id] : PERIODIC == 2 ? id % n : id;
-                const real* source = positions.data + (long long)ROW * number;
-                if (exact_image(queries.data + (long long)ROW * own_id, source, several ? doubtful_images[c] : image))
-                    row[hits++] = id;
-                continue;
-            }
-            real p[3];
-            for (int k = 0; k < DIM; ++k)
-                p[k] = doubtful[k][c];
-            if (exact_pair(q, p))
-                row[hits++] = doubtful_ids[c];
-        }
-    }
-    for (int h = sure; MASKS && h < hits; ++h)
-        found[row[h] / LANES] |= 1u << row[h] % LANES;
     return hits;
 };
 struct All { enum { value = 0 }; };
@@ -235,6 +271,7 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
         for (int e = 0; e < LANES; ++e)
             for (int k = 0; k < DIM; ++k)
                 candidate[k][filled + e] = __builtin_nanf("");
+        $flush
         for (int place = begin; place < end; ++place) {
             real q[3];
             position_of(place, q);
@@ -242,12 +279,12 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
             const int self = drop_self && place >= own_from && place < own_to ? own_at + place - own_from : -1;
             if (self >= 0)
                 candidate[0][self] = __builtin_nanf("");
-            $before
-            const int hits = $scan;
+            $meet
             if (self >= 0)
                 candidate[0][self] = q[0];
-            $found
+            $met
         }
+        $keep
         fresh = false;
         filled = own_from = own_to = 0;
     };
@@ -261,16 +298,14 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
             for (int k = 0; k < DIM; ++k)
                 for (int s = 0; s < size; ++s)
                     candidate[k][filled + s] = PERIODIC ? axis[k][from + s] + moved[k] : axis[k][from + s];
-            for (int s = 0; s < size; ++s)
-                candidate_ids[filled + s] = SUMS ? filled + s : PERIODIC == 2 ? ids[from + s] + n * image : ids[from + s];
+            for (int s = 0; (!SUMS || PERIODIC) && s < size; ++s)
+                candidate_ids[filled + s] = PERIODIC == 2 && !SUMS ? ids[from + s] + n * image : ids[from + s];
             for (int s = 0; BATCHED && !grid.dense && s < size; ++s)
                 if (system_of(positions.data + (long long)ROW * ids[from + s]) != system)
                     candidate[0][filled + s] = __builtin_nanf("");
             if (const int code = image; PERIODIC && several)
                 for (int s = 0; s < size; ++s)
                     candidate_images[filled + s] = code;
-            for (int s = 0; SUMS != 0 && PERIODIC != 0 && s < size; ++s)
-                candidate_sources[filled + s] = ids[from + s];
             $copied
             for (int s = 0; PERIODIC == 2 && s < size; ++s)
                 candidate_order[filled + s] = 3 * ids[from + s] + 1 + side;
@@ -403,22 +438,24 @@ for (;;) {
 
 
 def walk(
-    *, begin: str, before: str = "", scan: str, found: str, none: str, copied: str = "", chunk_done: str = "", end: str = ""
+    *, begin: str, meet: str, met: str, none: str, copied: str = "", chunk_done: str = "", end: str = "", flushed: bool = False
 ) -> str:
     """Return the text of a kernel that walks over all queries; around it stand the pieces CELLS, the layout and EXACT.
 
-    Constants it needs: CANDIDATES, how many are held at a time; EXACTLY; and of LIST and MASKS which one says what `scan` leaves
-    behind of the pairs: ids in `row`, bits in `found`, or their number alone. With SUMS ids are the numbers of candidates.
+    Constants it needs: CANDIDATES, how many are held at a time; EXACTLY; LIST, whether `scan` leaves ids of pairs in `row`; SUMS,
+    whether squares of distances are computed as a term does it.
 
     Args:
         begin: Comes first, after the types and `scan`.
-        before: Of a query, of which `id`, `place`, coordinates `q` and candidates, `filled` in number, are known.
-        scan: A call of `scan`; the pairs among the candidates are then known, `hits` in number.
-        found: What is done with them; `fresh` and `finished` say whether they are the first and the last ones of the query.
+        meet: A query, of which `id`, `place`, coordinates `q` are known, meets its candidates, `filled` in number.
+        met: What is done then, when the query itself is a candidate again; `fresh` and `finished` say whether these candidates were
+            the first and the last ones.
         none: What is done with a query, `id`, that has no candidates.
         copied: Copies more of the sources at places [from, from + size) to the candidates from `filled` on.
         chunk_done: After the last query of the chunk `chunk`.
         end: After the last chunk of this thread.
+        flushed: Denormals are flushed to zero, as XLA does, while queries meet candidates.
     """
-    text = _WALK.substitute(before=before, scan=scan, found=found, none=none, copied=copied, chunk_done=chunk_done)
+    modes = {"flush": FLUSH, "keep": KEEP} if flushed else {"flush": "", "keep": ""}
+    text = _WALK.substitute(modes, meet=meet, met=met, none=none, copied=copied, chunk_done=chunk_done)
     return "".join([_TYPES, _SCAN, begin, text, end])

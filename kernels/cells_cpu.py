@@ -145,6 +145,7 @@ auto write_row = [&](int id, int from, int hits, bool last) {
 
 """
 _ADD_TO_ROW = r"""
+            const int before = fresh ? 0 : count.data[id];
             if constexpr (LIST)
                 write_row(id, before, hits, finished);
             count.data[id] = before + hits;
@@ -165,9 +166,8 @@ if (LIST && longest > capacity)
 
 _QUERY = walk(
     begin=_BEGIN_ROWS,
-    before="const int before = fresh ? 0 : count.data[id];",
-    scan="later_only ? scan(q, id, filled, Later{}) : scan(q, id, filled, All{})",
-    found=_ADD_TO_ROW,
+    meet="const int hits = later_only ? scan(q, id, filled, Later{}) : scan(q, id, filled, All{});",
+    met=_ADD_TO_ROW,
     none=_NO_ROW,
     end=_END_ROWS,
 )
@@ -194,7 +194,7 @@ def cell_kernels(
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}"
     variant += f"{('', '_nearest', '_images')[periodic]}{'_batched' * batched}{'' if exact else '_inexact'}"
     options = {"SCALED": scaled, "LIST": lists, "REACH": 1, "REACH_X": 1, "EXACTLY": exact, "PERIODIC": periodic}
-    options |= {"BATCHED": batched, "SUMS": 0, "MASKS": 0, "CHUNK": CHUNK}
+    options |= {"BATCHED": batched, "SUMS": 0, "CHUNK": CHUNK}
     options |= {"CANDIDATES": 1024 if double else 1536}  # what fits into a first-level cache beside a row
     points = wp.array2d(dtype=scalar)
     reals, ints, rows = wp.array(dtype=scalar), wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)

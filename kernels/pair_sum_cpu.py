@@ -3,11 +3,13 @@
 `jfrnn.kernels.cells_cpu` sorts the sources by cell (`build`). `sort_values` puts what a term reads of them into the same order, a
 column each; then `query` walks over all queries as a search does, with these columns beside the coordinates of the candidates.
 Sums stay in vector registers while the pairs of one query are added. Terms of few operations are evaluated for all candidates of
-a vector, others for pairs alone, which are gathered first.
+a vector, others for those that are near, which are packed first.
 """
 
 import functools
+import itertools
 import re
+from string import Template
 from typing import NamedTuple
 
 import warp as wp
@@ -16,9 +18,11 @@ from jfrnn.kernels._native import CELLS, ENTER, EXACT, FLUSH, KEEP, LEAVE, snipp
 from jfrnn.kernels._walk_cpu import CHUNK, walk
 from jfrnn.kernels.cells_cpu import LAYOUT
 
-CACHE_BYTES = 24 << 10  # for candidates, of a first-level cache of 32 KiB
+CACHE_BYTES = 40 << 10  # for candidates: most of a first-level cache, and a little of the second
 MOST_CANDIDATES = 1024
-LITTLE_WORK = 100  # operations up to which the term is evaluated for candidates that are no pairs, too
+LITTLE_WORK = 50  # operations up to which the term is evaluated for candidates that are no pairs, too
+VERY_LITTLE_WORK = 20  # up to which it is, though none of a vector is a pair
+MANY_DOUBTS = 4  # candidates of a query that step 1 leaves open, above which what is near is packed in any case
 _SERIES = 20  # operations that a function like exp takes
 _SERIES_NAMES = ("exp", "log", "pow", "sin", "cos", "tan", "cbrt", "erf", "logistic", "rem")  # and what holds them in its name
 
@@ -26,10 +30,11 @@ _NAMES = {"float32": "f32", "float64": "f64", "int32": "i32", "int64": "i64", "b
 
 
 class Value(NamedTuple):
-    """What a term reads: its name in the text, and its dtype."""
+    """What a term reads: its name in the text, its dtype, and of positions the axis; what is none of them has a column."""
 
     name: str
     dtype: str
+    axis: int | None = None
 
 
 class Sum(NamedTuple):
@@ -47,6 +52,11 @@ class TermText(NamedTuple):
     own: tuple[Value, ...]
     others: tuple[Value, ...]
     sums: tuple[Sum, ...]
+
+    @property
+    def columns(self) -> int:
+        """How many numbers of j have a column."""
+        return sum(value.axis is None for value in self.others)
 
 
 class Kernels(NamedTuple):
@@ -112,6 +122,9 @@ auto add_lanes = [&](number sum, number error, real& total, real& carried) {  //
 alignas(64) real column[OTHERS + 1][CANDIDATES + LANES];
 memset(column, 0, sizeof column);
 memset(candidate, 0, sizeof candidate);
+alignas(64) real near_points[3][CANDIDATES + LANES];  // packed
+alignas(64) real near_column[OTHERS + 1][CANDIDATES + LANES];
+int doubted = 0;  // how many candidates of the query before were in doubt
 real total[TOTALS + 1], total_carried[TOTALS + 1];
 for (int t = 0; t <= TOTALS; ++t)
     total[t] = total_carried[t] = 0;
@@ -134,6 +147,7 @@ _CHUNK_DONE = r"""
         totals.data[(2ll * chunk + 1) * TOTALS + t] = total_carried[t];
         total[t] = total_carried[t] = 0;
     }
+    doubted = 0;  // nor does it depend on what the thread did before in which order a sum is added up
 """
 
 
@@ -153,33 +167,92 @@ def _spread(value: Value, at: str, double: bool) -> str:
     return _loaded(value, f"Math::of({at})", f"Math::of(bits_of({at}))", double)
 
 
-def _evaluation(term: TermText, double: bool, gathered: bool) -> str:
-    """Return the text that adds the pairs of one query to its sums."""
+def _placed(values: tuple[Value, ...], column: str, axis: str) -> list[str]:
+    """Return where values are: those that have a column, and positions along an axis."""
+    numbers = itertools.count()
+    return [column.format(next(numbers)) if value.axis is None else axis.format(value.axis) for value in values]
 
-    def each(lanes: str) -> str:
-        names = [lanes.format(c) for c in range(len(term.others))]
-        return "".join(_loaded(value, x, f"Math::bits({x})", double) for value, x in zip(term.others, names, strict=True))
 
-    lines = [_spread(v, f"own_values.data[(long long)id * {len(term.own)} + {c}]", double) for c, v in enumerate(term.own)]
-    lines += [f"number sum{k} = {{}}, error{k} = {{}};\n" for k in range(len(term.sums))]
-    if gathered:
-        lines.append("for (int e = 0; e < LANES; ++e)\n    row[hits + e] = hits > 0 ? row[0] : 0;\n")
-        lines.append("for (int b = 0; b < hits; b += LANES) {\n")
-        lines.append("const Math::flag real_lanes = lanes_of(hits - b < LANES ? (1u << (hits - b)) - 1 : ~0u);\n")
-        for c in range(len(term.others)):
-            lines.append(f"number lanes{c};\nfor (int l = 0; l < LANES; ++l)\n    lanes{c}[l] = column[{c}][row[b + l]];\n")
-        lines.append(each("lanes{}"))
-    else:
-        lines.append("for (int b = 0, v = 0; b < filled; b += LANES, ++v) {\n")
-        lines.append("if (found[v] == 0)\n    continue;\n")
-        lines.append("const Math::flag real_lanes = lanes_of(found[v]);\n")
-        lines.append(each("*(const number*)(column[{}] + b)"))
-    lines.append(term.text)
-    for k, part in enumerate(term.sums):
-        summand = f"Math::select(real_lanes, {part.name}, number{{}})"
-        lines.append(f"if constexpr (COMPENSATED)\n    two_sum(sum{k}, error{k}, {summand});\nelse\n    sum{k} += {summand};\n")
-    lines.append("}\n")
-    return "".join([FLUSH, *lines, *_stored(term), KEEP])
+# How a query meets its candidates. In place: the term is evaluated for vectors of candidates as they are, under a mask; those in
+# doubt, few, follow. Packed: what is near comes together first, so that the term is evaluated for hardly more than the pairs.
+_IN_PLACE = Template(r"""
+    for (int b = 0, v = 0; b < filled; b += LANES, ++v) {
+        const Points points = candidates_at(b);
+        const vec square = square_of(q, points.p);
+        const unsigned int hit = mask_of(square, inside, Below{});
+        unsure[v] = hit ^ mask_of(square, outside, BelowOrAt{});
+        $skip
+        const Math::flag real_lanes = lanes_of(hit);
+        $in_place
+    }
+    const int doubts = collect_doubtful(filled);
+    for (int b = 0; b < doubts; b += LANES) {
+        const Points points = doubtful_at(b);
+        $keep
+        const unsigned int hit = decided(q, id, points, doubtful + b, lanes_before(doubts - b));
+        $flush
+        const Math::flag real_lanes = lanes_of(hit);
+        $of_doubtful
+    }
+    doubted = doubts;
+""")
+_PACKED = Template(r"""
+    int held = 0, doubts = 0;
+    for (int b = 0; b < filled; b += LANES) {
+        const Points points = candidates_at(b);
+        const unsigned int near = mask_of(square_of(q, points.p), outside, BelowOrAt{});
+        for (int k = 0; k < DIM; ++k)
+            pack(points.p[k], near_points[k] + held, near);
+        for (int c = 0; c < OTHERS; ++c)
+            pack(*(const number*)(column[c] + b), near_column[c] + held, near);
+        if constexpr (PERIODIC)
+            pack(first_numbers + b, doubtful + held, near);
+        held += __builtin_popcount(near);
+    }
+    for (int b = 0; b < held; b += LANES) {
+        Points points;
+        for (int k = 0; k < DIM; ++k)
+            points.p[k] = *(const vec*)(near_points[k] + b);
+        const unsigned int there = lanes_before(held - b);
+        unsigned int hit = mask_of(square_of(q, points.p), inside, Below{}) & there;
+        if (const unsigned int open = there & ~hit) {
+            $keep
+            hit |= decided(q, id, points, doubtful + b, open);
+            $flush
+            doubts += __builtin_popcount(open);
+        }
+        const Math::flag real_lanes = lanes_of(hit);
+        $of_packed
+    }
+    doubted = doubts;
+""")
+
+
+def _meet(term: TermText, double: bool, packed: bool, flushed: bool) -> str:
+    """Return the text that adds the pairs of a query with its candidates to `sum0`, `sum1`, ..."""
+    modes = {"flush": FLUSH, "keep": KEEP} if flushed else {"flush": "", "keep": ""}
+
+    def evaluation(column: str) -> str:
+        lanes = _placed(term.others, column, "points.p[{}]")
+        lines = [_loaded(value, x, f"Math::bits({x})", double) for value, x in zip(term.others, lanes, strict=True)]
+        lines.append(term.text)
+        for k, part in enumerate(term.sums):
+            summand = f"Math::select(real_lanes, {part.name}, number{{}})"
+            lines.append(f"if constexpr (COMPENSATED)\n    two_sum(sum{k}, error{k}, {summand});\nelse\n    sum{k} += {summand};\n")
+        return "".join(lines)
+
+    width = sum(value.axis is None for value in term.own)
+    mine = _placed(term.own, f"own_values.data[(long long)id * {width} + {{}}]", "q[{}]")
+    begin = [_spread(value, at, double) for value, at in zip(term.own, mine, strict=True)]
+    begin += [f"number sum{k} = {{}}, error{k} = {{}};\n" for k in range(len(term.sums))]
+    by_packing = _PACKED.substitute(modes, of_packed=evaluation("*(const number*)(near_column[{}] + b)"))
+    if packed:
+        return "".join([*begin, "{", by_packing, "}\n"])
+    skip = "if (hit == 0)\n    continue;" if _work(term.text) > VERY_LITTLE_WORK else ""
+    in_place = evaluation("*(const number*)(column[{}] + b)")
+    of_doubtful = evaluation("gathered(column[{}], doubtful + b)")
+    as_they_are = _IN_PLACE.substitute(modes, skip=skip, in_place=in_place, of_doubtful=of_doubtful)
+    return "".join([*begin, f"if (doubted > {MANY_DOUBTS}) {{", by_packing, "} else {", as_they_are, "}\n"])
 
 
 def _stored(term: TermText) -> list[str]:
@@ -234,36 +307,37 @@ def _work(text: str) -> int:
 def _candidates(term: TermText, dim: int, double: bool) -> int:
     """Return how many candidates are held at a time, in the first-level cache."""
     width = 8 if double else 4
-    fitting = CACHE_BYTES // (width * (dim + len(term.others)) + 8)
+    fitting = CACHE_BYTES // (width * (dim + term.columns) + 8)
     return max(64, min(fitting, MOST_CANDIDATES) // 64 * 64)
 
 
 @functools.cache
 def query_kernel(
     term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: bool = False,
-    gathered: bool | None = None,
+    packed: bool | None = None,
 ) -> wp.Kernel:  # fmt: skip
     """Return the kernel that sums a term; `key` tells it from all others in the names of programs.
 
-    `gathered`: the term is evaluated for pairs alone, not for other candidates; None: as is faster.
+    `packed`: the term is evaluated for what is near alone, not for other candidates; None: as is faster.
     """
     scalar = wp.float64 if double else wp.float32
     rows, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
-    gathered = _work(term.text) > LITTLE_WORK if gathered is None else gathered
+    packed = _work(term.text) > LITTLE_WORK if packed is None else packed
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
     variant += f"{('', '_nearest', '_images')[periodic]}{'_batched' * batched}_{key}"
     totals = sum(part.total for part in term.sums)
-    constants = {"SCALED": scaled, "LIST": gathered, "MASKS": not gathered, "SUMS": 1, "REACH": 1, "REACH_X": 1, "EXACTLY": 1}
+    constants = {"SCALED": scaled, "LIST": 0, "SUMS": 1, "REACH": 1, "REACH_X": 1, "EXACTLY": 1}
     constants |= {"PERIODIC": periodic, "BATCHED": batched, "CHUNK": CHUNK, "CANDIDATES": _candidates(term, dim, double)}
-    constants |= {"OTHERS": len(term.others), "TOTALS": totals, "ROW_SUMS": len(term.sums) - totals, "COMPENSATED": compensated}
+    constants |= {"OTHERS": term.columns, "TOTALS": totals, "ROW_SUMS": len(term.sums) - totals, "COMPENSATED": compensated}
     shared = "".join(_spread(v, f"shared_values.data[{c}]", double) for c, v in enumerate(term.shared))
     text = walk(
         begin="".join([VECTOR, _ADD.replace("NUMBER_LANES", "f64" if double else "f32"), shared]),
-        scan="scan(q, id, filled, All{})",
-        found=_evaluation(term, double, gathered),
+        meet=_meet(term, double, packed, flushed=not scaled),
+        met="".join(_stored(term)),
         none=_NO_SUM,
         copied=_COPY,
         chunk_done=_CHUNK_DONE,
+        flushed=not scaled,  # where cutoffs are so small that they are scaled, so may be what decides
     )
 
     def query_native(
