@@ -15,14 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jax.extend.core import jaxpr_as_fun
 
 from jfrnn import _warp
 from jfrnn._auto import level_of_caller
 from jfrnn._backends import Inputs, Options, prepared
 from jfrnn._exact import Radii, compensated_sum, rounded_sum
 from jfrnn._scalars import NoTranslationError, hash_of
-from jfrnn._terms import POSITIONS, Groups, Term
+from jfrnn._terms import POSITIONS, Groups, Term, joined
 from jfrnn._translate import input_name, output_name, translate
 
 _Columns = tuple[tuple[int, int], ...]  # of each column: which operand of a group, which element of it
@@ -49,8 +48,6 @@ def refusal(inputs: Inputs, options: Options, platform: str, reduce: str) -> str
         return f"for reduce={reduce!r}"
     if isinstance(inputs.cutoff, Radii):
         return "with a cutoff per particle"
-    if options.images is not None:
-        return "in a periodic box"
     return None
 
 
@@ -58,7 +55,7 @@ def is_fused(inputs: Inputs, options: Options, term: Term) -> bool:
     """Say whether a sum is one for this engine: it was named, or it is "auto" and can do it."""
     if options.backend not in ("warp", "auto"):
         return False
-    return options.backend == "warp" or _why_not(term, np.dtype(inputs.sources.dtype)) is None
+    return options.backend == "warp" or _why_not(term, *_kind(inputs)) is None
 
 
 def check(inputs: Inputs, options: Options, term: Term) -> None:
@@ -70,7 +67,7 @@ def check(inputs: Inputs, options: Options, term: Term) -> None:
     """
     if options.backend not in ("warp", "auto"):
         return
-    reason = _why_not(term, np.dtype(inputs.sources.dtype))
+    reason = _why_not(term, *_kind(inputs))
     if reason is None:
         return
     if options.backend == "warp":
@@ -81,8 +78,13 @@ def check(inputs: Inputs, options: Options, term: Term) -> None:
         )
 
 
+def _kind(inputs: Inputs) -> tuple[np.dtype, tuple[bool, ...]]:
+    """Return on what a translation depends besides its term: the dtype of positions, and which axes are periodic."""
+    return np.dtype(inputs.sources.dtype), (False,) * inputs.sources.shape[1] if inputs.box is None else inputs.box.periodic
+
+
 @functools.lru_cache(maxsize=256)
-def _why_not(term: Term, dtype: np.dtype) -> Exception | None:
+def _why_not(term: Term, dtype: np.dtype, periodic: tuple[bool, ...]) -> Exception | None:
     for what, specs in (("fn returns", term.summands), ("fn gets or closes over", sum(term.operands, ()))):
         known = {dtype} if what == "fn returns" else _travelling(dtype)
         for spec in specs:
@@ -93,7 +95,7 @@ def _why_not(term: Term, dtype: np.dtype) -> Exception | None:
                     "convert it, or pass backend='jax'."
                 )
     try:
-        planned(term, dtype)
+        planned(term, dtype, periodic)
     except NoTranslationError as error:
         return error
     return None
@@ -106,20 +108,20 @@ def _travelling(dtype: np.dtype) -> set[np.dtype]:
 
 
 @functools.lru_cache(maxsize=256)
-def planned(term: Term, dtype: np.dtype) -> Plan:
-    """Translate a term for positions of a dtype."""
+def planned(term: Term, dtype: np.dtype, periodic: tuple[bool, ...]) -> Plan:
+    """Translate a term for positions of a dtype and shifts along periodic axes."""
     kernels = _warp.kernels_of("pair_sum_cpu")
-    no_shift = np.zeros(term.shift.shape, term.shift.dtype)
-    flat = [x for group in term.operands for x in group]
 
-    def of_pair(*operands: Array) -> Sequence[Array]:
-        return jaxpr_as_fun(term.jaxpr)(np.bool_(True), no_shift, *operands)
+    def of_pair(shift: Array, operands: Groups) -> Sequence[Array]:
+        return term(jnp.asarray(True), jnp.where(np.array(periodic), shift, 0), operands)
 
-    translated = translate(jax.make_jaxpr(of_pair)(*flat))
-    columns, values, before = [], [], 0
+    translated = translate(jax.make_jaxpr(of_pair)(term.shift, term.operands))
+    steps = tuple(kernels.Step(input_name(k, e), e) for k, e in translated.reads if k == 0)
+    at_hand = () if any(periodic) else POSITIONS  # in a box the kernel has those of images
+    columns, values, before = [], [], 1
     for group, labels in zip(term.operands, ((), *term.labels), strict=True):
         reads = [(k - before, e) for k, e in translated.reads if before <= k < before + len(group)]
-        there = [bool(labels) and labels[k] in POSITIONS for k, _ in reads]
+        there = [bool(labels) and labels[k] in at_hand for k, _ in reads]
         columns.append(tuple(read for read, known in zip(reads, there, strict=True) if not known))
         values.append(
             tuple(
@@ -133,14 +135,19 @@ def planned(term: Term, dtype: np.dtype) -> Plan:
         for k, (spec, total) in enumerate(zip(translated.outputs, term.totals, strict=True))
         for e in range(math.prod(spec.shape))
     )
-    text = kernels.TermText(translated.text, values[0], values[1], values[2], sums)
-    return Plan(text, columns[0], columns[1], columns[2], hash_of(tuple(text), dtype.name)[:20])
+    text = kernels.TermText(translated.text, steps, values[0], values[1], values[2], sums)
+    turns = [((len(group), 0),) if steps else () for group in term.operands]  # behind all operands
+    return Plan(text, columns[0], columns[1] + turns[1], columns[2] + turns[2], hash_of(tuple(text), dtype.name)[:20])
 
 
 def sums(inputs: Inputs, options: Options, term: Term, operands: Groups, compensated: bool) -> list[Array]:
     """Sum a term over all pairs of a search: see `jfrnn._relations.sum_pairs`."""
-    dtype = np.dtype(inputs.sources.dtype)
-    plan, rows = planned(term, dtype), (inputs.sources if inputs.queries is None else inputs.queries).shape[0]
+    dtype, periodic = _kind(inputs)
+    plan, rows = planned(term, dtype, periodic), (inputs.sources if inputs.queries is None else inputs.queries).shape[0]
+    search = prepared(inputs, options)
+    if search.torus is not None:
+        _, wrapped = search.torus
+        operands = joined(operands, Groups((), (wrapped.query_turns,), (wrapped.turns,)))
     shared, own, others = (
         _packed(group, columns, size, dtype)
         for group, columns, size in zip(
@@ -149,12 +156,12 @@ def sums(inputs: Inputs, options: Options, term: Term, operands: Groups, compens
     )
 
     def call(search: Any, shared: Array, own: Array, others: Array) -> list[Array]:  # noqa: ANN401
-        sources, queries, cutoff, batch = search[:4]
+        sources, queries, cutoff, batch, torus = search[:5]
         values = shared, own, others
-        found = _warp.pair_sums(sources, queries, cutoff, options.filter, batch, plan.text, plan.key, values, compensated)
+        found = _warp.pair_sums(sources, queries, cutoff, options.filter, batch, torus, plan.text, plan.key, values, compensated)
         return _unpacked(term, *found)
 
-    return lax.platform_dependent(prepared(inputs, options), shared, own, others, cpu=call)
+    return lax.platform_dependent(search, shared, own, others, cpu=call)
 
 
 def _packed(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) -> Array:

@@ -67,8 +67,8 @@ def pair_sum(
             summed in twice the precision. Derivatives are summed so, too. "max" and "min" are not concerned.
         backend: "jax" (cells, any device), "brute" (all n·m candidates), "warp" (cells, on the CPU: fn is translated into the
             kernel that finds the pairs), or "auto": "warp" where it can do what is asked, else "jax". "warp" sums floats of the
-            dtype of positions, without a periodic box or a cutoff per particle; values, and what fn closes over, are of that dtype
-            or smaller floats, bool, int32 or (float64) int64. Where fn or its derivative has no translation, "auto" warns.
+            dtype of positions, with one cutoff for all; values, and what fn closes over, are of that dtype or smaller floats,
+            bool, int32 or (float64) int64. Where fn or its derivative has no translation, "auto" warns.
         neighbors: A list whose pairs are taken instead of a search: those that are closer than its cutoff at these positions, as
             `NeighborList.vectors` says. A half list gives whole sums, too. Options with which it was made are left out. Rows that
             overflowed lack pairs here as everywhere: see `NeighborList.check`.
@@ -92,7 +92,7 @@ def pair_sum(
     Denormal numbers count as zero in what fn computes on the CPU, as everywhere in XLA; pairs are decided with them.
     Memory: what `search` takes without its list, the results, and at most 16 MB (float32) for each array that fn needs for the
     pairs that are in work; nothing grows with the number of pairs, in derivatives neither. "warp" has no pairs in work, but two
-    copies of the numbers that fn reads of each j, and one of those of each i.
+    copies of the numbers that fn reads of each j, and one of those of each i; in a box one number more of each.
     Differentiable: to every order, forward and backward, in positions, queries, values, query_values, the lattice vectors of the
     box and whatever fn closes over; who is a neighbor is a constant. A derivative is a sum over the same pairs, gathered
     by each particle (over a list that is not its own mirror image, scattered). What is no pair has no part in it, whatever fn

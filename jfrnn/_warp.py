@@ -408,6 +408,7 @@ class _SumVariant(NamedTuple):
     own: bool
     closed: bool
     drop_self: bool
+    periodic: int
     batched: bool
     compensated: bool
     key: str
@@ -419,26 +420,28 @@ def pair_sums(
     cutoff: Cutoff,
     keep: Filter,
     batch: Batch | None,
+    torus: tuple[Lattice, Wrapped] | None,
     term: Any,  # noqa: ANN401
     key: str,
     values: tuple[Array, Array, Array],
     compensated: bool,
 ) -> tuple[Array, Array]:
-    """Sum a term (`jfrnn.kernels.pair_sum_cpu.TermText`, named by its key) with the columns that it reads: CPU, open space.
+    """Sum a term (`jfrnn.kernels.pair_sum_cpu.TermText`, named by its key) with the columns that it reads: CPU.
 
     Returns:
         The sums of each query [m, width], and parts of the sums over all pairs with what rounding took of them [slots, 2, width].
     """
     (n, dim), m, double = sources.shape, (sources if queries is None else queries).shape[0], sources.dtype == jnp.float64
     own = queries is None
-    variant = _SumVariant(dim, double, cutoff.scaled, own, cutoff.closed, keep.drop_self, batch is not None, compensated, key)
+    kind = _periodic_kind(torus), batch is not None
+    variant = _SumVariant(dim, double, cutoff.scaled, own, cutoff.closed, keep.drop_self, *kind, compensated, key)
     totals = sum(part.total for part in term.sums)
     width, slots = len(term.sums) - totals, kernels_of("pair_sum_cpu").slots(m)
     dims = {"sums": (m, max(width, 1)), "totals": max(2 * slots * totals, 1), "errors": m * width if compensated else 1}
-    dims |= {"columns": max(n * term.columns, 1), "info": 2}
+    dims |= {"columns": max(n * term.source_columns, 1), "info": 2}
     dims["scratch"] = kernels_of("cells_cpu").scratch_words(n, m, dim, 2 if double else 1, own)
     call = _sum_callable(variant, term)
-    sums, parts, *_ = call(*_packed(sources, queries, cutoff, batch, None), *values, output_dims=dims)
+    sums, parts, *_ = call(*_packed(sources, queries, cutoff, batch, torus), *values, output_dims=dims)
     return sums, parts[: 2 * slots * totals].reshape(slots, 2, totals)
 
 
@@ -451,6 +454,7 @@ def _sum_callable(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN401
     types |= {"sums": rows, "totals": reals, "errors": reals, "columns": reals, "info": ints, "scratch": ints}
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "own": variant.own}
     flags |= {"closed": variant.closed, "dropself": variant.drop_self, "batched": variant.batched}
+    flags |= {"nearest": variant.periodic == 1, "images": variant.periodic == 2}
     flags |= {"compensated": variant.compensated, variant.key: True}
     name = "_".join([f"jfrnn_pair_sum_cpu_{variant.dim}d", *(flag for flag, on in flags.items() if on)])
     return _callable(name, functools.partial(_run_sums_on_cpu, variant, term), types, 6)
@@ -461,8 +465,9 @@ def _sum_kernels(variant: _SumVariant, term: Any) -> tuple[Any, Any, Any]:  # no
     """Return the kernels that sort particles, sort values, and sum; loaded, since several threads launch them at once."""
     wp, sums = load_warp(), kernels_of("pair_sum_cpu")
     dim, double, scaled = variant[:3]
-    build = kernels_of("cells_cpu").cell_kernels(dim, double, scaled, False, batched=variant.batched).build
-    query = sums.query_kernel(term, variant.key, dim, double, scaled, variant.compensated, batched=variant.batched)
+    kind = {"periodic": variant.periodic, "batched": variant.batched}
+    build = kernels_of("cells_cpu").cell_kernels(dim, double, scaled, False, **kind).build
+    query = sums.query_kernel(term, variant.key, dim, double, scaled, variant.compensated, **kind)
     kernels = build, sums.sort_kernel(dim, double), query
     for kernel in kernels:
         wp.load_module(kernel.module, device="cpu")
@@ -475,7 +480,7 @@ def _run_sums_on_cpu(variant: _SumVariant, term: Any, *arrays: Any) -> None:  # 
     n, m = positions.shape[0], queries.shape[0]
     sizes = [n, m, int(variant.own), kernels_of("_native").table_cells(n)]
     wp.launch(build, dim=1, inputs=[positions, queries, cutoff, info, scratch, *sizes], device="cpu")
-    if term.columns:
+    if term.source_columns:
         sorting = [others, cutoff, columns, scratch, *sizes]
         _on_every_core(lambda: wp.launch(sort_values, dim=1, inputs=sorting, device="cpu"), -(-n // _PLACES_PER_THREAD))
     arguments = [positions, queries, cutoff, shared, own, columns, sums, totals, errors, scratch, *sizes]

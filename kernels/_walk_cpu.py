@@ -289,6 +289,7 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
         filled = own_from = own_to = 0;
     };
     int side = 0;  // whether the image lies behind (-1), at home, or ahead
+    int shift[3] = {0, 0, 0};  // of the image, in lattice vectors
     real moved[3] = {0, 0, 0};
     auto copy = [&](int from, int to) {  // sources at places [from, to)
         while (from < to) {
@@ -364,7 +365,9 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
         for (int x = from[0]; x <= to[0]; ++x)
             for (int y = from[1]; y <= to[1]; ++y)
                 for (int z = from[2]; z <= to[2]; ++z) {
-                    const int shift[3] = {x, y, z};
+                    shift[0] = x;
+                    shift[1] = y;
+                    shift[2] = z;
                     whole begins[3] = {0, 0, 0}, ends[3] = {0, 0, 0};
                     image = 0;
                     for (int k = 0; k < DIM; ++k) {
@@ -451,7 +454,7 @@ def walk(
         met: What is done then, when the query itself is a candidate again; `fresh` and `finished` say whether these candidates were
             the first and the last ones.
         none: What is done with a query, `id`, that has no candidates.
-        copied: Copies more of the sources at places [from, from + size) to the candidates from `filled` on.
+        copied: Copies more of the sources at places [from, from + size), of the image `shift`, to the candidates from `filled` on.
         chunk_done: After the last query of the chunk `chunk`.
         end: After the last chunk of this thread.
         flushed: Denormals are flushed to zero, as XLA does, while queries meet candidates.

@@ -1,7 +1,8 @@
 """Sums over pairs on the CPU, without a list: the term is evaluated where its pairs are found, 8 or 16 at a time.
 
 `jfrnn.kernels.cells_cpu` sorts the sources by cell (`build`). `sort_values` puts what a term reads of them into the same order, a
-column each; then `query` walks over all queries as a search does, with these columns beside the coordinates of the candidates.
+column each; then `query` walks over all queries as a search does, with these columns beside the coordinates of the candidates. In a
+periodic box turns stand behind what is read of i and j, packed as in `jfrnn._box`: with the image of a candidate they make S.
 Sums stay in vector registers while the pairs of one query are added. Terms of few operations are evaluated for all candidates of
 a vector, others for those that are near, which are packed first.
 """
@@ -44,10 +45,21 @@ class Sum(NamedTuple):
     total: bool
 
 
+class Step(NamedTuple):
+    """What a term reads of the lattice shift S of a pair: its name in the text, of the dtype of positions, and the axis."""
+
+    name: str
+    axis: int
+
+
 class TermText(NamedTuple):
-    """A term as native text: `text` defines the `sums` from what it reads, of what all pairs share, of i and of j; columns each."""
+    """A term as native text: `text` defines the `sums` from what it reads, of S, of what all pairs share, of i and of j.
+
+    A column of numbers stands for each value of the last three, and with `steps` one of turns behind those of i and of j.
+    """
 
     text: str
+    steps: tuple[Step, ...]
     shared: tuple[Value, ...]
     own: tuple[Value, ...]
     others: tuple[Value, ...]
@@ -55,8 +67,13 @@ class TermText(NamedTuple):
 
     @property
     def columns(self) -> int:
-        """How many numbers of j have a column."""
+        """How many numbers of j have a column, but for turns."""
         return sum(value.axis is None for value in self.others)
+
+    @property
+    def source_columns(self) -> int:
+        """How many columns are read of the sources."""
+        return self.columns + bool(self.steps)
 
 
 class Kernels(NamedTuple):
@@ -119,11 +136,11 @@ auto add_lanes = [&](number sum, number error, real& total, real& carried) {  //
     } else
         total += s[0];
 };
-alignas(64) real column[OTHERS + 1][CANDIDATES + LANES];
+alignas(64) real column[OTHERS + STEPS + 1][CANDIDATES + LANES];
 memset(column, 0, sizeof column);
 memset(candidate, 0, sizeof candidate);
 alignas(64) real near_points[3][CANDIDATES + LANES];  // packed
-alignas(64) real near_column[OTHERS + 1][CANDIDATES + LANES];
+alignas(64) real near_column[OTHERS + STEPS + 1][CANDIDATES + LANES];
 int doubted = 0;  // how many candidates of the query before were in doubt
 real total[TOTALS + 1], total_carried[TOTALS + 1];
 for (int t = 0; t <= TOTALS; ++t)
@@ -135,6 +152,12 @@ _COPY = r"""
                 for (int s = 0; s < size; ++s)
                     column[c][filled + s] = columns.data[(long long)c * n + from + s];
 """
+
+_COPY_STEP = Template(r"""
+            for (int s = 0; s < size; ++s)
+                column[OTHERS + $c][filled + s] =
+                    real(shift[$axis] - Lattice::turn(columns.data[(long long)OTHERS * n + from + s], $axis));
+""")
 
 _NO_SUM = r"""
             for (int r = 0; r < ROW_SUMS; ++r)
@@ -203,7 +226,7 @@ _PACKED = Template(r"""
         const unsigned int near = mask_of(square_of(q, points.p), outside, BelowOrAt{});
         for (int k = 0; k < DIM; ++k)
             pack(points.p[k], near_points[k] + held, near);
-        for (int c = 0; c < OTHERS; ++c)
+        for (int c = 0; c < OTHERS + STEPS; ++c)
             pack(*(const number*)(column[c] + b), near_column[c] + held, near);
         if constexpr (PERIODIC)
             pack(first_numbers + b, doubtful + held, near);
@@ -235,15 +258,19 @@ def _meet(term: TermText, double: bool, packed: bool, flushed: bool) -> str:
     def evaluation(column: str) -> str:
         lanes = _placed(term.others, column, "points.p[{}]")
         lines = [_loaded(value, x, f"Math::bits({x})", double) for value, x in zip(term.others, lanes, strict=True)]
+        steps = ((step.name, column.format(term.columns + c)) for c, step in enumerate(term.steps))
+        lines += [f"const number {name} = {x} + turned{c};\n" for c, (name, x) in enumerate(steps)]
         lines.append(term.text)
         for k, part in enumerate(term.sums):
             summand = f"Math::select(real_lanes, {part.name}, number{{}})"
             lines.append(f"if constexpr (COMPENSATED)\n    two_sum(sum{k}, error{k}, {summand});\nelse\n    sum{k} += {summand};\n")
         return "".join(lines)
 
-    width = sum(value.axis is None for value in term.own)
-    mine = _placed(term.own, f"own_values.data[(long long)id * {width} + {{}}]", "q[{}]")
-    begin = [_spread(value, at, double) for value, at in zip(term.own, mine, strict=True)]
+    numbers = sum(value.axis is None for value in term.own)
+    column = f"own_values.data[(long long)id * {numbers + bool(term.steps)} + {{}}]"
+    begin = [_spread(value, at, double) for value, at in zip(term.own, _placed(term.own, column, "q[{}]"), strict=True)]
+    turns = [f"real(Lattice::turn({column.format(numbers)}, {step.axis}))" for step in term.steps]
+    begin += [f"const number turned{c} = Math::of({x});\n" for c, x in enumerate(turns)]
     begin += [f"number sum{k} = {{}}, error{k} = {{}};\n" for k in range(len(term.sums))]
     by_packing = _PACKED.substitute(modes, of_packed=evaluation("*(const number*)(near_column[{}] + b)"))
     if packed:
@@ -307,7 +334,7 @@ def _work(text: str) -> int:
 def _candidates(term: TermText, dim: int, double: bool) -> int:
     """Return how many candidates are held at a time, in the first-level cache."""
     width = 8 if double else 4
-    fitting = CACHE_BYTES // (width * (dim + term.columns) + 8)
+    fitting = CACHE_BYTES // (width * (dim + term.columns + len(term.steps)) + 8)
     return max(64, min(fitting, MOST_CANDIDATES) // 64 * 64)
 
 
@@ -328,14 +355,15 @@ def query_kernel(
     totals = sum(part.total for part in term.sums)
     constants = {"SCALED": scaled, "LIST": 0, "SUMS": 1, "REACH": 1, "REACH_X": 1, "EXACTLY": 1}
     constants |= {"PERIODIC": periodic, "BATCHED": batched, "CHUNK": CHUNK, "CANDIDATES": _candidates(term, dim, double)}
-    constants |= {"OTHERS": term.columns, "TOTALS": totals, "ROW_SUMS": len(term.sums) - totals, "COMPENSATED": compensated}
+    constants |= {"OTHERS": term.columns, "STEPS": len(term.steps), "COMPENSATED": compensated}
+    constants |= {"TOTALS": totals, "ROW_SUMS": len(term.sums) - totals}
     shared = "".join(_spread(v, f"shared_values.data[{c}]", double) for c, v in enumerate(term.shared))
     text = walk(
         begin="".join([VECTOR, _ADD.replace("NUMBER_LANES", "f64" if double else "f32"), shared]),
         meet=_meet(term, double, packed, flushed=not scaled),
         met="".join(_stored(term)),
         none=_NO_SUM,
-        copied=_COPY,
+        copied="".join([_COPY, *(_COPY_STEP.substitute(c=c, axis=step.axis) for c, step in enumerate(term.steps))]),
         chunk_done=_CHUNK_DONE,
         flushed=not scaled,  # where cutoffs are so small that they are scaled, so may be what decides
     )

@@ -395,7 +395,7 @@ def imposed(sign, pairs):
     ("backend", "symmetry"),
     [
         ("half", "antisymmetric"),
-        *(pytest.param(b, "symmetric", marks=SLOW) for b in ("list", "half", "jax")),
+        *(pytest.param(b, "symmetric", marks=SLOW) for b in ("list", "half", "jax", "warp")),
         pytest.param("brute", "antisymmetric", marks=SLOW),
     ],
 )

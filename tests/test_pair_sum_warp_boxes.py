@@ -1,0 +1,172 @@
+"""Fused pair sums in periodic boxes: the pairs and images of the oracle, and derivatives in the lattice vectors."""
+
+import functools
+
+import checked
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from jfrnn.cases.batches import BATCH_CASES
+from jfrnn.cases.periodic import PERIODIC_CASES
+from test_pair_sum import CUTOFF, SLOW, N, arrays_of, assert_same, everything, oracle_sum, scene, smooth, tangents_of
+
+import jfrnn
+
+pytestmark = pytest.mark.usefixtures("compiled_soon")
+
+fused = functools.partial(jfrnn.pair_sum, backend="warp")
+NAMES = ["outside_100", "faces", "ulp_across_100", "thin_slab", "skewed_3_small", "skewed_slab", "queries_many_images"]
+
+
+def marks(r, i, j):
+    """Tell pairs apart by whole numbers, which no order of summation rounds, and by the displacement."""
+    return {"count": 1.0, "ids": j, "rests": (j * j) % 61, "rows": i, "r": r, "square": r @ r}
+
+
+def assert_marks(found, pairs, x, q, matrix):
+    """Compare sums with those over the oracle's pairs; of displacements but for the rounding of their terms and of the sum."""
+    (m, d), eps = q.shape, np.finfo(x.dtype).eps
+    i, j, shifts = arrays_of(pairs, d)
+    matrix = (matrix if matrix.ndim == 2 else np.diag(matrix)).astype(np.float64)
+    x, q, counts = x.astype(np.float64), q.astype(np.float64), np.bincount(i, minlength=m)
+    assert not any(np.asarray(leaf[m:]).any() for leaf in jax.tree.leaves(found))  # the padding has nothing
+    found = jax.tree.map(lambda leaf: np.asarray(leaf)[:m], found)
+    np.testing.assert_array_equal(found["count"], counts)
+    np.testing.assert_array_equal(found["ids"], np.bincount(i, j, m))
+    np.testing.assert_array_equal(found["rests"], np.bincount(i, j * j % 61, m))
+    np.testing.assert_array_equal(found["rows"], counts * np.arange(m))
+    r = x[j] - q[i] + shifts @ matrix
+    wrong = 2 * eps * (np.abs(x[j]) + np.abs(q[i]) + np.abs(shifts) @ np.abs(matrix))  # rounding of each component
+    terms = {"square": ((r**2).sum(axis=1), (2 * np.abs(r) * wrong + wrong**2).sum(axis=1))}
+    terms |= {k: (r[:, k], wrong[:, k]) for k in range(d)}
+    for key, (term, each) in terms.items():
+        sums = found["square"] if key == "square" else found["r"][:, key]
+        allowed = np.bincount(i, each, m) + 4 * eps * np.sqrt(counts) * np.bincount(i, np.abs(term), m)
+        assert (np.abs(sums - np.bincount(i, term, m)) <= allowed).all()
+
+
+def marked(given, box, **options):
+    """Return the marks of a case, lengthened so that cases share programs."""
+    ids = jnp.arange(300, dtype=given.positions.dtype)
+    if given.queries is not None:
+        options |= {"queries": checked.padded(given.queries, 300), "query_values": ids}
+    return fused(marks, checked.padded(given.positions, 300), given.cutoff, ids, box=box, **options)
+
+
+def assert_case(name, dtype, dim, **options):
+    given = PERIODIC_CASES[name].build(dtype, dim)
+    found = marked(given, jfrnn.Box(given.matrix, given.periodic), **options)
+    kind = {"matrix": given.matrix, "periodic": given.periodic, "queries": given.queries}
+    pairs = reference.reference_images(given.positions, given.cutoff, **kind, **options)
+    assert_marks(found, pairs, given.positions, given.positions if given.queries is None else given.queries, given.matrix)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_cases(name):
+    assert_case(name, np.float32, 3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("dtype", "dim"), [(np.float32, 2), (np.float64, 2), (np.float32, 3), (np.float64, 3)])
+@pytest.mark.parametrize("name", PERIODIC_CASES)
+def test_every_case(name, dtype, dim):
+    assert_case(name, dtype, dim)
+
+
+@pytest.mark.slow
+def test_options():
+    """Closed, with themselves, where it decides something."""
+    given = PERIODIC_CASES["crystal_integer"].build(np.float32, 3)
+    kind = {"matrix": given.matrix, "periodic": given.periodic}
+    few, all_of_them = (
+        reference.reference_images(given.positions, given.cutoff, closed=flag, include_self=flag, **kind) for flag in (False, True)
+    )
+    assert len(all_of_them) > len(few) + len(given.positions)
+    assert_case("crystal_integer", np.float32, 3, closed=True, include_self=True)
+
+
+@pytest.mark.parametrize("name", ["periodic", pytest.param("periodic_images", marks=SLOW)])
+def test_batches(name):
+    """In a box that is traced: its image is the nearest one, or how many are looked at is said."""
+    given = BATCH_CASES[name].build(np.float64, 2)
+    n, images = len(given.positions), None if name == "periodic" else 1
+    batch = np.concatenate([given.batch, np.zeros(300 - n, np.int32)])
+
+    @jax.jit
+    def sums(x, lengths):
+        ids = jnp.arange(300, dtype=x.dtype)
+        return fused(marks, x, given.cutoff, ids, box=jfrnn.Box(lengths, images=images), batch=batch)
+
+    found = sums(checked.padded(given.positions, 300), given.lengths)
+    pairs = reference.reference_images(given.positions, given.cutoff, matrix=given.lengths, periodic=(True, True))
+    assert_marks(
+        found,
+        {(i, j, s) for i, j, s in pairs if given.batch[i] == given.batch[j]},
+        given.positions,
+        given.positions,
+        given.lengths,
+    )
+
+
+# --- derivatives -------------------------------------------------------------------------------------------------------------
+
+MATRIX = np.array([[0.9, 0.2, 0.0], [-0.2, 1.1, 0.1], [0.0, 0.0, 9.0]])
+PERIODIC = (True, True, False)
+
+
+@pytest.mark.parametrize("second", [False, pytest.param(True, marks=SLOW)])
+def test_derivatives(second):
+    """Several images of a pair, turns of particles; of the lattice vectors, by the oracle's sum and by finite differences."""
+    (x, m), fn = scene(1, dim=3), functools.partial(smooth, 0.7)
+    x = x + (np.arange(N) % 5 - 2)[:, None] * MATRIX[0] - (np.arange(N) % 3)[:, None] * MATRIX[1]
+    pairs = reference.reference_images(x, CUTOFF, matrix=MATRIX, periodic=PERIODIC)
+
+    def sums(x, m, matrix):
+        return fused(fn, x, CUTOFF, {"m": m}, box=jfrnn.Box(matrix, PERIODIC, images=1))
+
+    args = (x, m, jnp.asarray(MATRIX))
+    along = (*tangents_of(args[:2]), jnp.asarray(MATRIX**2))
+    found = everything(sums, second)
+    value, gradient, product = found(args, along)
+    expected = everything(lambda x, m, a: oracle_sum(fn, pairs, x, x, {"m": m}, {"m": m}, a), second)
+    assert_same((value, gradient, product), expected(args, along))
+    step = 1e-7
+    ahead, behind = (found(jax.tree.map(lambda x, t, s=s: x + s * t, args, along), along) for s in (step, -step))
+    slope = sum(float(jnp.vdot(g, t)) for g, t in zip(gradient, along, strict=True))
+    assert float(ahead[0] - behind[0]) / (2 * step) == pytest.approx(slope, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_derivatives_with_queries():
+    """Against the engine "jax"; the reversed pairs have their own turns."""
+    (x, m), q = scene(1), scene(2)[0][:23] - 3.0
+    w = jnp.linspace(0.3, 0.6, 23)
+
+    def sums(backend):
+        def of(x, q, m, w, lengths):
+            given = {"queries": q, "query_values": {"m": w}, "box": jfrnn.Box(lengths, (True, False)), "backend": backend}
+            return jfrnn.pair_sum(functools.partial(smooth, 0.7), x, CUTOFF, {"m": m}, **given)
+
+        return of
+
+    args = (x, q, m, w, jnp.array([1.3, 1.0]))
+    along = tangents_of(args)
+    assert_same(everything(sums("warp"))(args, along), everything(sums("jax"))(args, along))
+
+
+# --- where there is no answer; which engine ----------------------------------------------------------------------------------
+
+
+def test_where_a_search_cannot_answer_nothing_looks_like_an_answer():
+    x, m = scene(1, dim=3)
+
+    @jax.jit
+    def sums(x, lengths):
+        return fused(lambda r, i, j: j, x, 0.3, m, box=jfrnn.Box(lengths, (True, False, False)))
+
+    lengths = jnp.array([2.0, 1.0, 1.0])
+    assert np.isfinite(sums(x, lengths)).all()
+    for wrong in ((x, 0.1 * lengths), (x.at[0, 0].set(1e5), lengths)):
+        assert np.isnan(sums(*wrong)).all()
