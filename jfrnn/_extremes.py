@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._relations import Listed, Relation, evaluate
+from jfrnn import _fused
+from jfrnn._relations import Listed, Relation, Searched, evaluate, is_fused
 from jfrnn._runs import Block, Slots
 from jfrnn._summation import bind_sum
 from jfrnn._terms import Derived, Groups, Term, chosen, fresh_labels, joined, make_term
@@ -22,6 +23,8 @@ def bind_extremes(relation: Relation, term: Term, operands: Groups, largest: boo
     NaN counts as the most extreme. Of equal ones that of the smallest j counts, and with it its derivative.
     """
     m, n = relation.sizes
+    if isinstance(relation, Searched):
+        _fused.check(relation.inputs, relation.options, term)
     found = _find(lax.stop_gradient(relation), term, lax.stop_gradient(operands), largest)
     results = []
     for k, (like, (_, source, shift)) in enumerate(zip(term.summands, found, strict=True)):
@@ -50,7 +53,10 @@ def _element(term: Term, k: int) -> Derived:
     return make_term(summand, joined(term.operands, Groups((), (number,), ())), term.shift, (mine, theirs))
 
 
+@functools.partial(jax.jit, static_argnames=("term", "largest"))
 def _find(relation: Relation, term: Term, operands: Groups, largest: bool) -> list[_Best]:
+    if is_fused(relation, term):
+        return _fused.extremes(relation.inputs, relation.options, term, operands, largest)
     m, n = relation.sizes
 
     def start(rows: int, like: jax.ShapeDtypeStruct) -> _Best:

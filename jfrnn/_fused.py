@@ -19,6 +19,7 @@ from jax import Array, lax
 from jfrnn import _warp
 from jfrnn._auto import level_of_caller
 from jfrnn._backends import Inputs, Options, prepared
+from jfrnn._box import unpacked_turns
 from jfrnn._exact import Radii, compensated_sum, rounded_sum
 from jfrnn._scalars import NoTranslationError, hash_of
 from jfrnn._terms import POSITIONS, Groups, Term, joined
@@ -40,12 +41,10 @@ class Plan(NamedTuple):
     key: str
 
 
-def refusal(inputs: Inputs, options: Options, platform: str, reduce: str) -> str | None:
-    """Say what of a search, or of the reduction, this engine cannot do; None: nothing."""
+def refusal(inputs: Inputs, platform: str) -> str | None:
+    """Say what of a search this engine cannot do; None: nothing."""
     if platform != "cpu":
         return f"on the platform {platform!r}, only on the CPU"
-    if reduce != "sum":
-        return f"for reduce={reduce!r}"
     if isinstance(inputs.cutoff, Radii):
         return "with a cutoff per particle"
     return None
@@ -108,12 +107,13 @@ def _travelling(dtype: np.dtype) -> set[np.dtype]:
 
 
 @functools.lru_cache(maxsize=256)
-def planned(term: Term, dtype: np.dtype, periodic: tuple[bool, ...]) -> Plan:
-    """Translate a term for positions of a dtype and shifts along periodic axes."""
+def planned(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: bool = False) -> Plan:
+    """Translate a term, or its negative, for positions of a dtype and shifts along periodic axes."""
     kernels = _warp.kernels_of("pair_sum_cpu")
 
     def of_pair(shift: Array, operands: Groups) -> Sequence[Array]:
-        return term(jnp.asarray(True), jnp.where(np.array(periodic), shift, 0), operands)
+        summands = term(jnp.asarray(True), jnp.where(np.array(periodic), shift, 0), operands)
+        return [-x for x in summands] if negated else summands
 
     translated = translate(jax.make_jaxpr(of_pair)(term.shift, term.operands))
     steps = tuple(kernels.Step(input_name(k, e), e) for k, e in translated.reads if k == 0)
@@ -142,26 +142,56 @@ def planned(term: Term, dtype: np.dtype, periodic: tuple[bool, ...]) -> Plan:
 
 def sums(inputs: Inputs, options: Options, term: Term, operands: Groups, compensated: bool) -> list[Array]:
     """Sum a term over all pairs of a search: see `jfrnn._relations.sum_pairs`."""
-    dtype, periodic = _kind(inputs)
-    plan, rows = planned(term, dtype, periodic), (inputs.sources if inputs.queries is None else inputs.queries).shape[0]
+    plan = planned(term, *_kind(inputs))
+    found, totals, _ = _launched(prepared(inputs, options), options, plan, operands, compensated)
+    return _unpacked(term, found, totals)
+
+
+def extremes(
+    inputs: Inputs, options: Options, term: Term, operands: Groups, largest: bool
+) -> list[tuple[Array, Array, Array | None]]:
+    """Find the largest summands (or the negatives of the smallest) over all pairs of a search.
+
+    Returns:
+        For each summand, with its elements in one row: the largest [rows, elements]; of which source that is, int32, n where there
+        is none; and in a box its lattice shift [rows, elements, d]. Of equal ones the smallest source, then any image.
+    """
     search = prepared(inputs, options)
+    values, _, which = _launched(search, options, planned(term, *_kind(inputs), not largest), operands, False, extremes=True)
+    source, shifts = which[..., 0], None
     if search.torus is not None:
-        _, wrapped = search.torus
-        operands = joined(operands, Groups((), (wrapped.query_turns,), (wrapped.turns,)))
-    shared, own, others = (
-        _packed(group, columns, size, dtype)
-        for group, columns, size in zip(
-            operands, (plan.shared, plan.own, plan.others), (None, rows, inputs.sources.shape[0]), strict=True
-        )
-    )
+        lattice, wrapped = search.torus
+        mine, theirs = (unpacked_turns(x, lattice.dim) for x in (wrapped.query_turns, wrapped.turns))
+        shifts = jnp.asarray(lattice.images.shifts)[which[..., 1]] + mine[:, None] - theirs.at[source].get(mode="clip")
+        shifts = shifts.astype(values.dtype)
+    ends = np.cumsum([math.prod(like.shape) for like in term.summands])[:-1]
+    of_each = (values, source) if shifts is None else (values, source, shifts)
+    parts = [jnp.split(x, ends, axis=1) for x in of_each] + [[None] * len(term.summands)]
+    return list(zip(*parts[:3], strict=True))
 
-    def call(search: Any, shared: Array, own: Array, others: Array) -> list[Array]:  # noqa: ANN401
-        sources, queries, cutoff, batch, torus = search[:5]
-        values = shared, own, others
-        found = _warp.pair_sums(sources, queries, cutoff, options.filter, batch, torus, plan.text, plan.key, values, compensated)
-        return _unpacked(term, *found)
 
-    return lax.platform_dependent(search, shared, own, others, cpu=call)
+def _launched(
+    search: Any,  # noqa: ANN401
+    options: Options,
+    plan: Plan,
+    operands: Groups,
+    compensated: bool,
+    extremes: bool = False,
+) -> tuple[Array, Array, Array]:
+    """Hand a prepared search and what a plan reads to the kernel."""
+    sources, queries, *_, torus, _ = search
+    if torus is not None:
+        operands = joined(operands, Groups((), (torus[1].query_turns,), (torus[1].turns,)))
+    sizes = None, (sources if queries is None else queries).shape[0], sources.shape[0]
+    columns = plan.shared, plan.own, plan.others
+    values = tuple(_packed(*group, sources.dtype) for group in zip(operands, columns, sizes, strict=True))
+
+    def call(search: Any, values: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:  # noqa: ANN401
+        sources, queries, cutoff, batch, torus, _ = search
+        given = options.filter, batch, torus, plan.text, plan.key, values
+        return _warp.pair_sums(sources, queries, cutoff, *given, compensated, extremes)
+
+    return lax.platform_dependent(search, values, cpu=call)
 
 
 def _packed(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) -> Array:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeGuard
 
 import jax
 import jax.numpy as jnp
@@ -136,6 +136,11 @@ class Listed:
 Relation = Searched | Listed
 
 
+def is_fused(relation: Relation, term: Term) -> TypeGuard[Searched]:
+    """Say whether the fused engine runs over a relation with this term."""
+    return isinstance(relation, Searched) and 0 not in relation.sizes and _fused.is_fused(relation.inputs, relation.options, term)
+
+
 def sum_pairs(relation: Relation, term: Term, operands: Groups, compensated: bool) -> list[Array]:
     """Sum a term over all pairs of a relation: what an engine has to do.
 
@@ -151,7 +156,7 @@ def sum_pairs(relation: Relation, term: Term, operands: Groups, compensated: boo
     """
     adder = _Adder(compensated)
     rows = relation.sizes[0]
-    if isinstance(relation, Searched) and 0 not in relation.sizes and _fused.is_fused(relation.inputs, relation.options, term):
+    if is_fused(relation, term):
         return _fused.sums(relation.inputs, relation.options, term, operands, compensated)
     start = [adder.zeros(() if total else (rows,), x) for x, total in zip(term.summands, term.totals, strict=True)]
 

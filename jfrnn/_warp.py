@@ -155,6 +155,11 @@ def as_float(x: Array, dtype: np.dtype) -> Array:
     return lax.bitcast_convert_type(x, dtype) if same_width else x.astype(dtype)
 
 
+def as_integer(x: Array) -> Array:
+    """Return int32 that traveled among floats."""
+    return lax.bitcast_convert_type(x, jnp.int32) if x.dtype == jnp.float32 else x.astype(jnp.int32)
+
+
 def _lattice_numbers(lattice: Lattice, wrapped: Wrapped) -> Array:
     """Return what the kernels know of a lattice, in the order that `jfrnn.kernels._native` states."""
     more = 3 - lattice.dim
@@ -411,6 +416,7 @@ class _SumVariant(NamedTuple):
     periodic: int
     batched: bool
     compensated: bool
+    extremes: bool
     key: str
 
 
@@ -425,24 +431,31 @@ def pair_sums(
     key: str,
     values: tuple[Array, Array, Array],
     compensated: bool,
-) -> tuple[Array, Array]:
+    extremes: bool = False,
+) -> tuple[Array, Array, Array]:
     """Sum a term (`jfrnn.kernels.pair_sum_cpu.TermText`, named by its key) with the columns that it reads: CPU.
 
     Returns:
-        The sums of each query [m, width], and parts of the sums over all pairs with what rounding took of them [slots, 2, width].
+        The sums of each query [m, width]; parts of the sums over all pairs with what rounding took of them [slots, 2, width]; and
+        for `extremes`, where sums are the largest summands, their sources and the codes of their images, int32 [m, width, 2].
     """
     (n, dim), m, double = sources.shape, (sources if queries is None else queries).shape[0], sources.dtype == jnp.float64
     own = queries is None
     kind = _periodic_kind(torus), batch is not None
-    variant = _SumVariant(dim, double, cutoff.scaled, own, cutoff.closed, keep.drop_self, *kind, compensated, key)
+    variant = _SumVariant(dim, double, cutoff.scaled, own, cutoff.closed, keep.drop_self, *kind, compensated, extremes, key)
     totals = sum(part.total for part in term.sums)
     width, slots = len(term.sums) - totals, kernels_of("pair_sum_cpu").slots(m)
-    dims = {"sums": (m, max(width, 1)), "totals": max(2 * slots * totals, 1), "errors": m * width if compensated else 1}
+    dims = {
+        "sums": (m, max(width, 1)),
+        "totals": max(2 * slots * totals, 1),
+        "errors": max(m * width * (2 * extremes + compensated), 1),
+    }
     dims |= {"columns": max(n * term.source_columns, 1), "info": 2}
     dims["scratch"] = kernels_of("cells_cpu").scratch_words(n, m, dim, 2 if double else 1, own)
     call = _sum_callable(variant, term)
-    sums, parts, *_ = call(*_packed(sources, queries, cutoff, batch, torus), *values, output_dims=dims)
-    return sums, parts[: 2 * slots * totals].reshape(slots, 2, totals)
+    sums, parts, rest, *_ = call(*_packed(sources, queries, cutoff, batch, torus), *values, output_dims=dims)
+    which = as_integer(rest).reshape(m, width, 2) if extremes else jnp.zeros((m, width, 0), jnp.int32)
+    return sums, parts[: 2 * slots * totals].reshape(slots, 2, totals), which
 
 
 @functools.cache
@@ -455,7 +468,7 @@ def _sum_callable(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN401
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "own": variant.own}
     flags |= {"closed": variant.closed, "dropself": variant.drop_self, "batched": variant.batched}
     flags |= {"nearest": variant.periodic == 1, "images": variant.periodic == 2}
-    flags |= {"compensated": variant.compensated, variant.key: True}
+    flags |= {"compensated": variant.compensated, "extremes": variant.extremes, variant.key: True}
     name = "_".join([f"jfrnn_pair_sum_cpu_{variant.dim}d", *(flag for flag, on in flags.items() if on)])
     return _callable(name, functools.partial(_run_sums_on_cpu, variant, term), types, 6)
 
@@ -467,7 +480,7 @@ def _sum_kernels(variant: _SumVariant, term: Any) -> tuple[Any, Any, Any]:  # no
     dim, double, scaled = variant[:3]
     kind = {"periodic": variant.periodic, "batched": variant.batched}
     build = kernels_of("cells_cpu").cell_kernels(dim, double, scaled, False, **kind).build
-    query = sums.query_kernel(term, variant.key, dim, double, scaled, variant.compensated, **kind)
+    query = sums.query_kernel(term, variant.key, dim, double, scaled, variant.compensated, **kind, extremes=variant.extremes)
     kernels = build, sums.sort_kernel(dim, double), query
     for kernel in kernels:
         wp.load_module(kernel.module, device="cpu")

@@ -299,7 +299,7 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
             for (int k = 0; k < DIM; ++k)
                 for (int s = 0; s < size; ++s)
                     candidate[k][filled + s] = PERIODIC ? axis[k][from + s] + moved[k] : axis[k][from + s];
-            for (int s = 0; (!SUMS || PERIODIC) && s < size; ++s)
+            for (int s = 0; (SUMS != 1 || PERIODIC) && s < size; ++s)
                 candidate_ids[filled + s] = PERIODIC == 2 && !SUMS ? ids[from + s] + n * image : ids[from + s];
             for (int s = 0; BATCHED && !grid.dense && s < size; ++s)
                 if (system_of(positions.data + (long long)ROW * ids[from + s]) != system)
@@ -446,7 +446,7 @@ def walk(
     """Return the text of a kernel that walks over all queries; around it stand the pieces CELLS, the layout and EXACT.
 
     Constants it needs: CANDIDATES, how many are held at a time; EXACTLY; LIST, whether `scan` leaves ids of pairs in `row`; SUMS,
-    whether squares of distances are computed as a term does it.
+    whether squares of distances are computed as a term does it; with 2 `candidate_ids` are known in open space, too.
 
     Args:
         begin: Comes first, after the types and `scan`.

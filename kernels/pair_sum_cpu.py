@@ -4,12 +4,14 @@
 column each; then `query` walks over all queries as a search does, with these columns beside the coordinates of the candidates. In a
 periodic box turns stand behind what is read of i and j, packed as in `jfrnn._box`: with the image of a candidate they make S.
 Sums stay in vector registers while the pairs of one query are added. Terms of few operations are evaluated for all candidates of
-a vector, others for those that are near, which are packed first.
+a vector, others for those that are near, which are packed first. In place of sums `query` can find the largest summands, and whose
+they are.
 """
 
 import functools
 import itertools
 import re
+from collections.abc import Callable
 from string import Template
 from typing import NamedTuple
 
@@ -139,12 +141,50 @@ auto add_lanes = [&](number sum, number error, real& total, real& carried) {  //
 alignas(64) real column[OTHERS + STEPS + 1][CANDIDATES + LANES];
 memset(column, 0, sizeof column);
 memset(candidate, 0, sizeof candidate);
+memset(doubtful, 0, sizeof doubtful);
 alignas(64) real near_points[3][CANDIDATES + LANES];  // packed
 alignas(64) real near_column[OTHERS + STEPS + 1][CANDIDATES + LANES];
 int doubted = 0;  // how many candidates of the query before were in doubt
 real total[TOTALS + 1], total_carried[TOTALS + 1];
 for (int t = 0; t <= TOTALS; ++t)
     total[t] = total_carried[t] = 0;
+"""
+
+# What finds the largest lane. NaN is larger than all; of equal ones comes first the smallest source, then the smallest image.
+_TAKE = r"""
+auto take_larger = [](number x, Math::i32 source, Math::i32 code, Math::flag among, number& best, Math::i32& of, Math::i32& at) {
+    const Math::flag is_nan = Math::ne(x, x), was_nan = Math::ne(best, best);
+    const Math::flag larger = Math::either(Math::gt(x, best), Math::both(is_nan, Math::inverse(was_nan)));
+    const Math::flag same = Math::either(Math::eq(x, best), Math::both(is_nan, was_nan));
+    const Math::flag first = Math::either(Math::lt(source, of), Math::both(Math::eq(source, of), Math::lt(code, at)));
+    const Math::flag taken = Math::both(among, Math::either(larger, Math::both(same, first)));
+    best = Math::select(taken, x, best);
+    of = Math::select(taken, source, of);
+    at = Math::select(taken, code, at);
+};
+auto integer_at = [&](long long at) -> int { return Lattice::packed_turns(errors.data[at]); };
+auto put_integer = [&](long long at, int x) {
+    if constexpr (DOUBLE)
+        errors.data[at] = x;
+    else
+        memcpy(errors.data + at, &x, 4);
+};
+auto keep_largest = [&](number best, Math::i32 of, Math::i32 code, long long at, bool fresh) {
+    real x = fresh ? -Bits::not_finite() : sums.data[at];
+    int source = fresh ? n : integer_at(2 * at), image_of_it = fresh ? 0 : integer_at(2 * at + 1);
+    for (int l = 0; l < LANES; ++l) {
+        const bool same = x == best[l] || (x != x && best[l] != best[l]);
+        const bool first = of[l] < source || (of[l] == source && code[l] < image_of_it);
+        if (!(best[l] > x || (best[l] != best[l] && x == x) || (same && first)))
+            continue;
+        x = best[l];
+        source = of[l];
+        image_of_it = code[l];
+    }
+    sums.data[at] = x;
+    put_integer(2 * at, source);
+    put_integer(2 * at + 1, image_of_it);
+};
 """
 
 _COPY = r"""
@@ -162,6 +202,11 @@ _COPY_STEP = Template(r"""
 _NO_SUM = r"""
             for (int r = 0; r < ROW_SUMS; ++r)
                 sums.data[(long long)id * ROW_SUMS + r] = 0;
+"""
+
+_NO_EXTREME = r"""
+            for (int r = 0; r < ROW_SUMS; ++r)
+                put_integer(2 * ((long long)id * ROW_SUMS + r), n);
 """
 
 _CHUNK_DONE = r"""
@@ -228,7 +273,7 @@ _PACKED = Template(r"""
             pack(points.p[k], near_points[k] + held, near);
         for (int c = 0; c < OTHERS + STEPS; ++c)
             pack(*(const number*)(column[c] + b), near_column[c] + held, near);
-        if constexpr (PERIODIC)
+        if constexpr (PERIODIC || SUMS == 2)
             pack(first_numbers + b, doubtful + held, near);
         held += __builtin_popcount(near);
     }
@@ -251,19 +296,27 @@ _PACKED = Template(r"""
 """)
 
 
-def _meet(term: TermText, double: bool, packed: bool, flushed: bool) -> str:
-    """Return the text that adds the pairs of a query with its candidates to `sum0`, `sum1`, ..."""
+class _Reduction(NamedTuple):
+    """What becomes of summands: text before all pairs of a query, for a vector of them (`real_lanes`) whose numbers are in a place.
+
+    `after`: when all of these candidates have been met.
+    """
+
+    before: str
+    each: Callable[[str], str]
+    after: str
+
+
+def _meet(term: TermText, reduction: _Reduction, double: bool, packed: bool, flushed: bool) -> str:
+    """Return the text that reduces the pairs of a query with its candidates."""
     modes = {"flush": FLUSH, "keep": KEEP} if flushed else {"flush": "", "keep": ""}
 
-    def evaluation(column: str) -> str:
+    def evaluation(column: str, number: str) -> str:
         lanes = _placed(term.others, column, "points.p[{}]")
         lines = [_loaded(value, x, f"Math::bits({x})", double) for value, x in zip(term.others, lanes, strict=True)]
         steps = ((step.name, column.format(term.columns + c)) for c, step in enumerate(term.steps))
         lines += [f"const number {name} = {x} + turned{c};\n" for c, (name, x) in enumerate(steps)]
-        lines.append(term.text)
-        for k, part in enumerate(term.sums):
-            summand = f"Math::select(real_lanes, {part.name}, number{{}})"
-            lines.append(f"if constexpr (COMPENSATED)\n    two_sum(sum{k}, error{k}, {summand});\nelse\n    sum{k} += {summand};\n")
+        lines += [term.text, reduction.each(number)]
         return "".join(lines)
 
     numbers = sum(value.axis is None for value in term.own)
@@ -271,15 +324,41 @@ def _meet(term: TermText, double: bool, packed: bool, flushed: bool) -> str:
     begin = [_spread(value, at, double) for value, at in zip(term.own, _placed(term.own, column, "q[{}]"), strict=True)]
     turns = [f"real(Lattice::turn({column.format(numbers)}, {step.axis}))" for step in term.steps]
     begin += [f"const number turned{c} = Math::of({x});\n" for c, x in enumerate(turns)]
-    begin += [f"number sum{k} = {{}}, error{k} = {{}};\n" for k in range(len(term.sums))]
-    by_packing = _PACKED.substitute(modes, of_packed=evaluation("*(const number*)(near_column[{}] + b)"))
+    begin.append(reduction.before)
+    by_packing = _PACKED.substitute(modes, of_packed=evaluation("*(const number*)(near_column[{}] + b)", "doubtful[b + l]"))
     if packed:
         return "".join([*begin, "{", by_packing, "}\n"])
     skip = "if (hit == 0)\n    continue;" if _work(term.text) > VERY_LITTLE_WORK else ""
-    in_place = evaluation("*(const number*)(column[{}] + b)")
-    of_doubtful = evaluation("gathered(column[{}], doubtful + b)")
+    in_place = evaluation("*(const number*)(column[{}] + b)", "b + l")
+    of_doubtful = evaluation("gathered(column[{}], doubtful + b)", "doubtful[b + l]")
     as_they_are = _IN_PLACE.substitute(modes, skip=skip, in_place=in_place, of_doubtful=of_doubtful)
     return "".join([*begin, f"if (doubted > {MANY_DOUBTS}) {{", by_packing, "} else {", as_they_are, "}\n"])
+
+
+def _largest(term: TermText) -> _Reduction:
+    """Return text that keeps the largest summands of a query, their sources and their images."""
+    before, taken, after, width = [], [], [], len(term.sums)
+    for k, part in enumerate(term.sums):
+        before.append(f"number best{k} = Math::of(-Bits::not_finite());\nMath::i32 of{k} = Math::i32{{}} + n, code{k} = {{}};\n")
+        taken.append(f"take_larger({part.name}, source, code, real_lanes, best{k}, of{k}, code{k});\n")
+        after.append(f"keep_largest(best{k}, of{k}, code{k}, (long long)id * {width} + {k}, fresh);\n")
+
+    def each(number: str) -> str:
+        whose = f"Math::i32 source, code;\nfor (int l = 0; l < LANES; ++l) {{\n    source[l] = candidate_ids[{number}];\n"
+        whose += f"    code[l] = PERIODIC && several ? candidate_images[{number}] : image;\n}}\n"
+        return "".join([whose, *taken])
+
+    return _Reduction("".join(before), each, "".join(after))
+
+
+def _added(term: TermText) -> _Reduction:
+    """Return text that adds summands to what the query has already, and to the totals of the chunk."""
+    before = "".join(f"number sum{k} = {{}}, error{k} = {{}};\n" for k in range(len(term.sums)))
+    lines = []
+    for k, part in enumerate(term.sums):
+        summand = f"Math::select(real_lanes, {part.name}, number{{}})"
+        lines.append(f"if constexpr (COMPENSATED)\n    two_sum(sum{k}, error{k}, {summand});\nelse\n    sum{k} += {summand};\n")
+    return _Reduction(before, lambda _: "".join(lines), "".join(_stored(term)))
 
 
 def _stored(term: TermText) -> list[str]:
@@ -341,28 +420,31 @@ def _candidates(term: TermText, dim: int, double: bool) -> int:
 @functools.cache
 def query_kernel(
     term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: bool = False,
-    packed: bool | None = None,
+    extremes: bool = False, packed: bool | None = None,
 ) -> wp.Kernel:  # fmt: skip
     """Return the kernel that sums a term; `key` tells it from all others in the names of programs.
 
+    `extremes`: it finds the largest summands instead; `errors` [m, width, 2] then gets their sources (n: there is none), and the
+    codes of their images, as integers travel among floats.
     `packed`: the term is evaluated for what is near alone, not for other candidates; None: as is faster.
     """
     scalar = wp.float64 if double else wp.float32
     rows, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
     packed = _work(term.text) > LITTLE_WORK if packed is None else packed
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
-    variant += f"{('', '_nearest', '_images')[periodic]}{'_batched' * batched}_{key}"
+    variant += f"{('', '_nearest', '_images')[periodic]}{'_batched' * batched}{'_extremes' * extremes}_{key}"
     totals = sum(part.total for part in term.sums)
-    constants = {"SCALED": scaled, "LIST": 0, "SUMS": 1, "REACH": 1, "REACH_X": 1, "EXACTLY": 1}
+    constants = {"SCALED": scaled, "LIST": 0, "SUMS": 1 + extremes, "REACH": 1, "REACH_X": 1, "EXACTLY": 1}
     constants |= {"PERIODIC": periodic, "BATCHED": batched, "CHUNK": CHUNK, "CANDIDATES": _candidates(term, dim, double)}
     constants |= {"OTHERS": term.columns, "STEPS": len(term.steps), "COMPENSATED": compensated}
     constants |= {"TOTALS": totals, "ROW_SUMS": len(term.sums) - totals}
+    reduction = _largest(term) if extremes else _added(term)
     shared = "".join(_spread(v, f"shared_values.data[{c}]", double) for c, v in enumerate(term.shared))
     text = walk(
-        begin="".join([VECTOR, _ADD.replace("NUMBER_LANES", "f64" if double else "f32"), shared]),
-        meet=_meet(term, double, packed, flushed=not scaled),
-        met="".join(_stored(term)),
-        none=_NO_SUM,
+        begin="".join([VECTOR, _ADD.replace("NUMBER_LANES", "f64" if double else "f32"), _TAKE * extremes, shared]),
+        meet=_meet(term, reduction, double, packed, flushed=not scaled),
+        met=reduction.after,
+        none=_NO_SUM + _NO_EXTREME * extremes,
         copied="".join([_COPY, *(_COPY_STEP.substitute(c=c, axis=step.axis) for c, step in enumerate(term.steps))]),
         chunk_done=_CHUNK_DONE,
         flushed=not scaled,  # where cutoffs are so small that they are scaled, so may be what decides

@@ -432,6 +432,7 @@ def test_a_list_with_a_skin_is_cut_at_the_cutoff():
     ("backend", "reduce"),
     [
         ("list", "max"),
+        ("warp", "min"),
         *(pytest.param(*kind, marks=SLOW) for kind in (("list", "min"), ("brute", "min"), ("jax", "max"))),
     ],
 )

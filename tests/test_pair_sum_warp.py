@@ -119,6 +119,41 @@ def test_more_candidates_than_fit():
     assert np.abs(plain - exact).max() > 10 * bound  # else this would prove nothing
 
 
+def light(r, i, j):
+    return j
+
+
+def heavy(r, i, j):
+    """Grow with j up to 50, in more operations than are done for candidates that are no pairs."""
+    return jnp.sin(j * jnp.linspace(0.01, 0.03, 8, dtype=j.dtype)).sum()
+
+
+@pytest.mark.parametrize("fn", [light, heavy])
+def test_extremes_among_more_candidates_than_fit(fn):
+    """Of equal ones that of the smallest index; NaN is not hidden; rows without neighbors."""
+    n = 3000
+    values = np.random.default_rng(0).integers(0, 50, n).astype(np.float32)
+    x = jnp.zeros((n, 2), jnp.float32).at[n - 1].set(9.0)
+    first, last = int(values[:-1].argmax()), int(values[:-1].argmin())
+    values[7] = np.nan if fn is light else values[7]
+
+    def extremes(m, reduce):
+        return fused(fn, x, 1.0, m, reduce=reduce)
+
+    rows = np.asarray(extremes(values, "max"))
+    assert rows[-1] == -np.inf
+    if fn is light:
+        assert np.isnan(np.delete(rows[:-1], 7)).all()
+        assert rows[7] == 49
+        return
+    for reduce, chosen in (("max", first), ("min", last)):
+        gradient = jax.grad(lambda m, reduce=reduce: extremes(m, reduce)[:-1].sum())(jnp.asarray(values))
+        others = np.nonzero(gradient)[0]
+        assert len(others) == 2  # the second one is what the first one has
+        assert others[0] == chosen
+        np.testing.assert_allclose(gradient[chosen], (n - 2) * jax.grad(heavy, 2)(None, None, values[chosen]), rtol=1e-4)
+
+
 # --- what is summed ----------------------------------------------------------------------------------------------------------
 
 
@@ -265,6 +300,7 @@ def test_auto_takes_the_kernel_where_it_can():
 
     assert engine(one)
     assert engine(one, box=jfrnn.Box([2.0, 2.0]))
+    assert engine(lambda r, i, j: r, reduce="max")
     with pytest.warns(RuntimeWarning, match="takes the slower engine 'jax' for a pair sum: the primitive 'sort'"):
         assert not engine(sorted_norm)
 
@@ -298,7 +334,6 @@ def with_strange_slope(r, i, j):
             lambda: fused(second, X, 1.0, np.ones(4)),
         ),
         (ValueError, "cannot sum over pairs with a cutoff per particle", lambda: fused(one, X, np.ones(4, np.float32))),
-        (ValueError, "cannot sum over pairs for reduce='max'", lambda: fused(lambda r, i, j: r, X, 1.0, reduce="max")),
     ],
 )
 def test_errors(error, match, call):

@@ -156,7 +156,7 @@ def test_derivatives_with_queries():
     assert_same(everything(sums("warp"))(args, along), everything(sums("jax"))(args, along))
 
 
-# --- where there is no answer; which engine ----------------------------------------------------------------------------------
+# --- where there is no answer ----------------------------------------------------------------------------------
 
 
 def test_where_a_search_cannot_answer_nothing_looks_like_an_answer():
