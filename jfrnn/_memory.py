@@ -1,10 +1,15 @@
-"""What a search will take of the memory, known from shapes alone: `memory_plan`."""
+"""What a search or a pair sum will take of the memory, known from shapes alone: `memory_plan`."""
 
+import contextlib
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.sharding import SingleDeviceSharding
 
 from jfrnn import _warp
@@ -12,70 +17,82 @@ from jfrnn._auto import WARP_ENGINES, default_platform, fastest_engine
 from jfrnn._backends import Inputs, Options, list_rows
 from jfrnn._exact import Cutoff
 from jfrnn._inputs import checked_backend, checked_capacity, checked_cutoff, checked_kind, checked_size
+from jfrnn._pair_sum import pair_sum
 from jfrnn._runs import Filter
 
 
 @dataclasses.dataclass(frozen=True)
 class MemoryPlan:
-    """Say how many bytes one search takes, beside the positions that it is given.
+    """Say how many bytes one search, or one pair sum, takes beside the positions and values that it is given.
 
     Attributes:
-        list_bytes: The result [B]: 4 per slot, 4 per row for its count, 8 for `status` and `required`.
-        scratch_bytes: What the search needs besides while it runs [B].
+        list_bytes: The result of a search [B]: 4 per slot, 4 per row for its count, 8 for `status` and `required`.
+        scratch_bytes: What is needed besides while it runs [B].
         backend: The engine, never "auto".
+        sums_bytes: The results of a pair sum, with a gradient that one too [B].
     """
 
     list_bytes: int
     scratch_bytes: int
     backend: str
+    sums_bytes: int = 0
 
     @property
     def total_bytes(self) -> int:
-        """List and scratch together [B]."""
-        return self.list_bytes + self.scratch_bytes
+        """Results and scratch together [B]."""
+        return self.list_bytes + self.sums_bytes + self.scratch_bytes
 
     def __str__(self) -> str:
-        """Return a line each for list, scratch and total, in MB of 10^6 B."""
-        lines = [f"one search with backend={self.backend!r}, beside the positions:"]
-        parts = {"list": self.list_bytes, "scratch": self.scratch_bytes, "total": self.total_bytes}
+        """Return a line each for the results, scratch and total, in MB of 10^6 B."""
+        done, given, result = ("search", "positions", "list") if self.list_bytes else ("pair sum", "positions and values", "sums")
+        lines = [f"one {done} with backend={self.backend!r}, beside the {given}:"]
+        parts = {result: self.list_bytes + self.sums_bytes, "scratch": self.scratch_bytes, "total": self.total_bytes}
         return "\n".join([*lines, *(f"  {name:<8}{size / 1e6:10.2f} MB" for name, size in parts.items())])
 
 
 def memory_plan(
     n: int,
     cutoff: float,
-    capacity: int,
+    capacity: int | None = None,
     *,
     dim: int = 3,
     dtype: Any = np.float32,  # noqa: ANN401
     queries: int | None = None,
+    fn: Callable[[Any, Any, Any], Any] | None = None,
+    values: Any = None,  # noqa: ANN401
+    gradient: bool = False,
     backend: str = "auto",
     platform: str | None = None,
 ) -> MemoryPlan:
-    """Say what one `search` with these shapes will take of the memory, before anything is allocated.
+    """Say what one `search`, or with fn one `pair_sum`, of these shapes will take of the memory, before anything is allocated.
 
     Nothing depends on where the particles are. "warp" and "hashgrid": the sizes of the arrays that they ask for, known for a
     platform that is elsewhere too. "jax" and "brute": what XLA reports of the program that it compiles for these shapes, which
-    takes seconds; not in it are the 32 B per point that a sort of "jax" takes for a moment on CPU.
+    takes seconds; not in it are the 32 B per point that a sort of "jax" takes for a moment on CPU. Pair sums are compiled, too,
+    with "warp" in a tenth of a second. That one takes the scratch of its search, two copies of the numbers that fn reads of each j,
+    one of those of each i (coordinates apart), and the sums; in a gradient, two sums for each coordinate.
 
     Args:
         n: Number of particles, from 0 to 2^31 - 32.
         cutoff: Interaction radius [length], checked as in `search`; it does not change the bytes.
-        capacity: Slots per row.
+        capacity: Slots per row; None for a pair sum.
         dim: 2 or 3.
         dtype: Of the positions, float32 or float64.
         queries: Number of separate queries; None: the particles themselves are the queries.
-        backend: As in `search`.
+        fn: As in `pair_sum`, which is planned then.
+        values: Of it, a pytree of arrays or of their shapes (`jax.ShapeDtypeStruct`), [n, ...].
+        gradient: The plan is that of the sums and of a gradient in the positions, of a function of all sums of floats.
+        backend: As in `search` or `pair_sum`.
         platform: JAX platform, such as "cpu" or "gpu"; default: the one on which JAX makes arrays now.
 
     Returns:
         A `MemoryPlan`; `print` it for a table in MB. "hashgrid" keeps the grid itself, most of its scratch, for the next search.
 
     Raises:
-        TypeError, ValueError: an argument is of the wrong kind or range.
+        TypeError, ValueError: an argument is of the wrong kind or range, or `pair_sum` would raise it.
         ImportError: "warp" or "hashgrid", and Warp is not installed.
-        RuntimeError: "auto", "jax" or "brute", and JAX does not have the platform here; "warp" or "hashgrid", and it is none of
-            "cpu", "gpu" and "cuda".
+        RuntimeError: "auto", "jax", "brute" or a pair sum, and JAX does not have the platform here; "warp" or "hashgrid", and it
+            is none of "cpu", "gpu" and "cuda".
 
     >>> import jfrnn
     >>> print(jfrnn.memory_plan(1_000_000, 0.1, 64, backend="warp", platform="gpu"))
@@ -86,9 +103,17 @@ def memory_plan(
     """
     n, queries = checked_size("n", n), None if queries is None else checked_size("queries", queries)
     dim, dtype = checked_kind(dim, dtype)
-    capacity, radius, engine = checked_capacity(capacity), checked_cutoff(cutoff, dtype), checked_backend(backend)
+    radius, engine = checked_cutoff(cutoff, dtype), checked_backend(backend)
     rows = n if queries is None else queries
     where = default_platform() if platform is None else platform
+    if fn is not None:
+        if capacity is not None:
+            raise ValueError(f"capacity is that of a list, which a pair sum does not make: leave it out, or fn, got {capacity}.")
+        points = [None if size is None else jax.ShapeDtypeStruct((size, dim), dtype) for size in (n, queries)]
+        return _plan_of_sum(fn, points, cutoff, values, gradient, engine, _device_of(where))
+    if values is not None or gradient:
+        raise ValueError("values and gradient belong to a pair sum: say its fn, too.")
+    capacity = checked_capacity(capacity)
     if engine == "auto":
         engine = fastest_engine(_device_of(where).platform, n)
     if engine in WARP_ENGINES:
@@ -114,7 +139,44 @@ def _compiled_scratch(points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff,
     """Compile the search for sources and queries of these shapes, and return what XLA says of its temporary arrays [B]."""
     options = Options(Filter(drop_self=points[1] is None, later_only=False), engine, closed=False)
     inputs: Any = Inputs(points[0], points[1], None, None, cutoff)  # pyright: ignore[reportArgumentType] (shapes of arrays)
-    analysis = list_rows.lower(inputs, options, capacity).compile().memory_analysis()
+    return int(_analysis(list_rows.lower(inputs, options, capacity)).temp_size_in_bytes)
+
+
+def _analysis(lowered: Any) -> Any:  # noqa: ANN401
+    analysis = lowered.compile().memory_analysis()
     if analysis is None:
         raise RuntimeError("the compiler of this platform does not say what memory a program takes: plan another backend.")
-    return int(analysis.temp_size_in_bytes)
+    return analysis
+
+
+def _plan_of_sum(
+    fn: Callable[[Any, Any, Any], Any],
+    points: list[jax.ShapeDtypeStruct | None],
+    cutoff: float,
+    values: Any,  # noqa: ANN401
+    gradient: bool,
+    engine: str,
+    device: Any,  # noqa: ANN401
+) -> MemoryPlan:
+    """Compile a pair sum for sources and queries of these shapes, with the engine that "auto" stands for."""
+
+    def program(x: Array, queries: Array | None, values: Any, *, backend: str) -> Any:  # noqa: ANN401
+        def loss(x: Array) -> Any:  # noqa: ANN401
+            sums = pair_sum(fn, x, cutoff, values, queries=queries, backend=backend)
+            floats = (leaf for leaf in jax.tree.leaves(sums) if jnp.issubdtype(leaf.dtype, jnp.floating))
+            return sum(jnp.vdot(leaf, leaf) for leaf in floats), sums
+
+        return jax.grad(loss, has_aux=True)(x) if gradient else loss(x)[1]
+
+    def plan(backend: str) -> MemoryPlan:
+        analysis = _analysis(jax.jit(functools.partial(program, backend=backend)).lower(*points, shapes))
+        return MemoryPlan(0, int(analysis.temp_size_in_bytes), backend, int(analysis.output_size_in_bytes))
+
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), values)
+    with jax.default_device(device):
+        if engine != "auto":
+            return plan(engine)
+        if fastest_engine(device.platform, 1) == "warp":
+            with contextlib.suppress(TypeError, ValueError, NotImplementedError):  # "jax" takes it, or says what is wrong
+                return plan("warp")
+        return plan("jax")

@@ -1,8 +1,9 @@
-"""`memory_plan`: what it predicts against what the compiled programs, Warp and the operating system say."""
+"""`memory_plan`: what it predicts against what the compiled programs, Warp and the operating system say; of pair sums, too."""
 
 import dataclasses
 import doctest
 import itertools
+import os
 import subprocess
 import sys
 import time
@@ -119,6 +120,101 @@ def test_two_blobs_cost_the_same_however_far_apart(backend):
     assert abs(taken[1] - taken[0]) < 20 * n  # the cell table: 16 B per particle
 
 
+# --- pair sums ---------------------------------------------------------------------------------------------------------------
+
+
+def density(r, i, j):
+    return j["m"] * jax.numpy.maximum(1 - r @ r / 0.01, 0) ** 3
+
+
+def several(r, i, j):
+    """Read two numbers of j besides coordinates, one more of i, and sum three."""
+    return j["m"] * r[:2] + i["v"], j["m"] * j["u"]
+
+
+def numbers_of(n, dtype, *names):
+    return {name: jax.ShapeDtypeStruct((n,), dtype) for name in names}
+
+
+@pytest.mark.parametrize(
+    ("fn", "names", "gradient", "bytes_"),
+    [
+        (density, "m", False, 36 + 4 + 4),  # the array of a single number is not packed
+        (density, "m", True, 36 + 3 * 8 + 2 * 8 + 4 + 12),
+        (several, "muv", False, 36 + 2 * 8 + 4 + 2 * 12),  # what is summed, and the arrays that fn returns
+    ],
+)
+def test_sums_take_what_is_stated(fn, names, gradient, bytes_):
+    """At most, in bytes per particle (float32): scratch of the search, packed and sorted numbers, sums and results."""
+    n = 30_000
+    plan = jfrnn.memory_plan(n, 0.1, fn=fn, values=numbers_of(n, np.float32, *names), gradient=gradient)
+    assert (plan.backend, plan.list_bytes) == ("warp", 0)
+    assert 0.8 * bytes_ * n < plan.total_bytes < bytes_ * n + 4000
+
+
+def test_the_gradient_of_a_density_takes_less_than_100_bytes_per_particle():
+    n = 1_000_000
+    assert jfrnn.memory_plan(n, 0.1, fn=density, values=numbers_of(n, np.float32, "m"), gradient=True).total_bytes < 100 * n
+
+
+SUMS = """
+import sys
+import jax, jfrnn
+import numpy as np
+from experiments._measure import PeakMemory
+from test_memory import density
+
+n, gradient = int(sys.argv[1]), sys.argv[2] == "True"
+random = np.random.default_rng(0)
+
+
+def run(x, m):
+    return jfrnn.pair_sum(density, x, 0.03, {"m": m}, backend="warp")
+
+
+def with_gradient(x, m):
+    return jax.grad(lambda x: ((rho := run(x, m)) @ rho, rho), has_aux=True)(x)
+
+
+x, m = jax.numpy.asarray(random.random((n, 3)), "float32"), jax.numpy.ones(n, "float32")
+program = jax.jit(with_gradient if gradient else run)
+jax.block_until_ready(program(x[:10], m[:10]))
+compiled = program.lower(x, m).compile()
+memory = PeakMemory()
+jax.block_until_ready(compiled(x, m))
+print(memory.source, memory.peak() - memory.start)
+"""
+
+
+@pytest.mark.parametrize("gradient", [False, True])
+def test_sums_take_what_was_planned(gradient):
+    """In a process of its own, as a search above."""
+    n, tests = 300_000, str(ROOT / "tests")
+    command = [sys.executable, "-c", SUMS, str(n), str(gradient)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), tests])}
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    source, size = done.stdout.split()[-2:]
+    if source != "VmHWM":
+        pytest.skip("this system cannot reset the peak of a process")
+    plan = jfrnn.memory_plan(n, 0.03, fn=density, values=numbers_of(n, np.float32, "m"), gradient=gradient)
+    assert plan.total_bytes - 20 * n < int(size) < 1.1 * plan.total_bytes + 1e6  # some of the cell table stays untouched
+
+
+@pytest.mark.usefixtures("compiled_soon")
+def test_a_sum_without_translation_is_planned_with_the_array_engine():
+    def sorts(r, i, j):
+        return jax.numpy.sort(r)
+
+    plan = jfrnn.memory_plan(100, 0.1, fn=sorts, dim=2)
+    assert (plan.backend, plan.sums_bytes) == ("jax", 800)
+    with pytest.raises(NotImplementedError, match="no translation"):
+        jfrnn.memory_plan(100, 0.1, fn=sorts, dim=2, backend="warp")
+
+
+# --- for all -----------------------------------------------------------------------------------------------------------------
+
+
 def test_a_plan_allocates_nothing():
     memory, begin = _measure.PeakMemory(), time.perf_counter()
     assert jfrnn.memory_plan(2_000_000_000, 0.1, 64, backend="warp").total_bytes > 560e9
@@ -152,6 +248,13 @@ def test_the_plan_reads_well():
     ]
     with pytest.raises(dataclasses.FrozenInstanceError):
         plan.backend = "warp"
+    plan = jfrnn.MemoryPlan(list_bytes=0, scratch_bytes=1_000_000, backend="warp", sums_bytes=12_345_678)
+    assert str(plan).splitlines() == [
+        "one pair sum with backend='warp', beside the positions and values:",
+        "  sums         12.35 MB",
+        "  scratch       1.00 MB",
+        "  total        13.35 MB",
+    ]
 
 
 def test_example_in_the_docstring():
@@ -167,6 +270,9 @@ def test_example_in_the_docstring():
         (TypeError, r"queries must be an int, the number of points, got bool True", {"queries": True}),
         (ValueError, r"cutoff must be positive and finite, got 0", {"cutoff": 0.0}),
         (ValueError, r"capacity must be at least 1, got 0", {"capacity": 0}),
+        (TypeError, r"capacity must be a static int", {"capacity": None}),
+        (ValueError, r"capacity is that of a list.*got 8", {"fn": density}),
+        (ValueError, r"values and gradient belong to a pair sum", {"gradient": True}),
         (ValueError, r"dim must be 2 or 3, got int 4", {"dim": 4}),
         (TypeError, r"dtype must be float32 or float64, got int64", {"dtype": np.int64}),
         (ValueError, r"backend must be one of 'auto', 'jax', 'warp', 'hashgrid', 'brute', got 'cuda'", {"backend": "cuda"}),

@@ -157,6 +157,24 @@ def test_extremes_among_more_candidates_than_fit(fn):
 # --- what is summed ----------------------------------------------------------------------------------------------------------
 
 
+def test_arrays_that_are_given_twice():
+    """Positions among the values are those of the search, unless particles are inactive; two names may mean one array."""
+    random = np.random.default_rng(2)
+    x, m = random.random((200, 3)).astype(np.float32), random.random(200).astype(np.float32)
+    given, active = {"x": jnp.asarray(x), "m": jnp.asarray(m)}, m > 0.1
+
+    def fn(r, i, j):
+        return (j["x"] - i["x"] + r) * i["m"] * j["k"] * j["m"]
+
+    r = x[None].astype(np.float64) - x[:, None]
+    near = (np.linalg.norm(r, axis=-1) < 0.3) & ~np.eye(200, dtype=bool)
+    for flags in (None, active):
+        found = fused(fn, given["x"], 0.3, given | {"k": given["m"]}, active=flags)
+        pairs = near if flags is None else near & flags & flags[:, None]
+        expected = np.einsum("ijk,ij,i,j->ik", 2 * r, pairs, m, m**2)
+        np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+
+
 def of_all_kinds(scale, r, i, j):
     """Vectors and matrices, truths and integers, several summands."""
     turned = j["matrix"] @ (i["vector"] - j["vector"])
