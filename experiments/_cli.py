@@ -152,6 +152,25 @@ def use(
 
 
 @app.command()
+def sums(
+    config: Annotated[Path, typer.Argument(help="Config of sums, TOML.")] = Path("experiments/configs/sums.toml"),
+    out: Annotated[Path | None, typer.Option(help="Folder of the rows; out/NAME without it.")] = None,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Measure missing, failed and timed-out rows again.")] = False,
+) -> None:
+    """Measure one sum over neighbors in many ways, or go on with it; then print a table, and draw pictures beside the rows."""
+    with _usage_errors():
+        from experiments import _config, _sums, _sums_report
+
+        folder = out or Path("out") / config.stem
+        try:
+            rows = _sums.run(_config.load(config, _sums.Config), folder, retry_failed)
+        except KeyboardInterrupt:
+            typer.echo("stopped; the same command goes on from here", err=True)
+            raise typer.Exit(130) from None
+        typer.echo(_sums_report.report(rows, folder))
+
+
+@app.command()
 def peers(
     names: Annotated[list[str] | None, typer.Argument(help="Of libraries; all that are known without.")] = None,
     out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "peers",

@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, ValidationInfo, field_validator
 from pydantic_core import ErrorDetails
@@ -18,11 +18,13 @@ Positive = Annotated[FiniteFloat, Field(gt=0)]
 Fill = Annotated[FiniteFloat, Field(gt=0, le=1)]
 
 
-class _Table(BaseModel):
+class Table(BaseModel):
+    """A table of a config: keys that it does not know are refused."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Scenes(_Table):
+class Scenes(Table):
     """Every layout at every fill; without fills, each layout at its own."""
 
     layouts: tuple[str, ...] = Field(min_length=1)
@@ -37,7 +39,7 @@ class Scenes(_Table):
         return layouts
 
 
-class Config(_Table):
+class Config(Table):
     """A sweep: scenes × methods, and how each row is measured.
 
     Attributes:
@@ -84,7 +86,7 @@ class Config(_Table):
     @property
     def hash(self) -> str:
         """Digest of all that the config says, 12 hex digits."""
-        return _digest(self.model_dump())
+        return digest(self.model_dump())
 
     def specs(self) -> Iterator["Spec"]:
         """Yield the rows of the sweep, the methods of one scene side by side, each row once."""
@@ -130,35 +132,39 @@ class Spec:
     @property
     def key(self) -> str:
         """Digest of all fields, 12 hex digits: a row with the same key need not run again."""
-        return _digest(asdict(self))
+        return digest(asdict(self))
 
 
-def _digest(value: object) -> str:
+def digest(value: object) -> str:
+    """Return 12 hex digits that stand for a value of JSON."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def load(path: Path) -> Config:
-    """Read and check a sweep config.
+ConfigT = TypeVar("ConfigT", bound=Table)
+
+
+def load(path: Path, kind: type[ConfigT] = Config) -> ConfigT:
+    """Read and check a config, by default that of a sweep.
 
     Raises:
         UsageError: The file cannot be read, is no TOML, or says something that is not allowed.
     """
     try:
-        return Config.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        return kind.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
     except OSError as error:
-        raise UsageError(f"{path}: cannot be read ({error.strerror}); expected a TOML file with a sweep") from error
+        raise UsageError(f"{path}: cannot be read ({error.strerror}); expected a TOML file") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: no valid TOML: {error}") from error
     except ValidationError as error:
-        raise UsageError("\n".join(f"{path}: {_explain(item)}" for item in error.errors())) from error
+        raise UsageError("\n".join(f"{path}: {_explain(item, kind)}" for item in error.errors())) from error
 
 
-def _explain(item: ErrorDetails) -> str:
+def _explain(item: ErrorDetails, kind: type[Table]) -> str:
     """Say in one line which key is wrong, what came, and what is allowed."""
     location = item["loc"]
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location).lstrip(".")
     if item["type"] == "extra_forbidden":
-        table = Scenes if location[0] == "scenes" and len(location) > 1 else Config
+        table = Scenes if location[0] == "scenes" and len(location) > 1 else kind
         return f"{key}: unknown key (value {item['input']!r}); allowed: {', '.join(table.model_fields)}"
     if item["type"] == "missing":
         return f"{key}: missing; it must be given"

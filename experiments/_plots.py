@@ -103,7 +103,7 @@ def _figure(width: float, height: float, title: str) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _label_logarithmic(axis: Axis) -> None:
+def label_logarithmic(axis: Axis) -> None:
     """Write plain numbers at the powers of ten, and at 2 and 5 times these where the axis is short."""
     low, high = axis.get_view_interval()
     axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,)))
@@ -155,7 +155,7 @@ def _by_layout(rows: list[Row], value: Value, thesis_value: ThesisValue, label: 
     labels = [f"{names[key]}\n{_table.count(points[key])} points" for key in places]
     axes.set_yticks(list(places.values()), labels, fontsize=9)
     axes.set(xscale="log", ylim=(len(places) - 0.5, -0.5), xlabel=label)
-    _label_logarithmic(axes.xaxis)
+    label_logarithmic(axes.xaxis)
     axes.yaxis.grid(False)
     _legend(axes, methods, theirs)
     return figure
@@ -177,7 +177,7 @@ def _by_fill(rows: list[Row], value: Value, thesis_value: ThesisValue, label: st
     axes.xaxis.set_major_locator(FixedLocator(ticks))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(PLAIN)
-    _label_logarithmic(axes.yaxis)
+    label_logarithmic(axes.yaxis)
     fills = [100 * row.fill for row in rows if row.fill]
     axes.set_xlim(min(fills) / 1.25, max(fills) * 1.25)
     _legend(axes, methods, theirs, lines=True)
@@ -216,6 +216,6 @@ def _speed_against_error(rows: list[Row]) -> Figure:
     axes.set_ylabel(SECONDS.split(";")[0])
     axes.axvline(0, color="0.6", linewidth=0.8, zorder=0.5)
     axes.xaxis.set_major_formatter(PLAIN)
-    _label_logarithmic(axes.yaxis)
+    label_logarithmic(axes.yaxis)
     _legend(axes, methods, [])
     return figure

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar, cast
 
 from experiments._errors import UsageError
 
@@ -129,12 +129,18 @@ def name_scene(layout: str, fill: float | None) -> str:
     return layout if fill is None else f"{layout} {100 * fill:.4g} %"
 
 
-class RowFile:
-    """The rows of a sweep, DIR/rows.jsonl. Whatever was written before a kill stays; half a last line is cut off."""
+RowT = TypeVar("RowT")
 
-    def __init__(self, folder: Path) -> None:
+
+class RowFile(Generic[RowT]):
+    """Rows of one kind, dataclasses with a key, in DIR/rows.jsonl.
+
+    Whatever was written before a kill stays; half a last line is cut off.
+    """
+
+    def __init__(self, folder: Path, kind: type[RowT] = Row) -> None:
         """Name the file; nothing is read or written yet."""
-        self.path = folder / "rows.jsonl"
+        self.path, self._kind = folder / "rows.jsonl", kind
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -168,9 +174,9 @@ class RowFile:
         else:
             self._write(b"\n")
 
-    def append(self, row: Row) -> None:
+    def append(self, row: RowT) -> None:
         """Write a row and wait until it is on the disk."""
-        self._write(json.dumps(asdict(row), allow_nan=False).encode() + b"\n")
+        self._write(json.dumps(asdict(cast(Any, row)), allow_nan=False).encode() + b"\n")
 
     def _write(self, data: bytes) -> None:
         with self.path.open("ab") as stream:
@@ -178,7 +184,7 @@ class RowFile:
             stream.flush()
             os.fsync(stream.fileno())
 
-    def read(self) -> list[Row]:
+    def read(self) -> list[RowT]:
         """Return the latest row of each key, in the order of their first appearance; half a last line is passed over.
 
         Raises:
@@ -186,13 +192,13 @@ class RowFile:
         """
         if not self.path.exists():
             return []
-        known = {item.name for item in fields(Row)}
-        rows: dict[str, Row] = {}
+        known = {item.name for item in fields(cast(Any, self._kind))}
+        rows: dict[str, RowT] = {}
         lines = self.path.read_text(encoding="utf-8").split("\n")
         for number, line in enumerate(lines, start=1):
             try:
                 values = json.loads(line)
-                rows[values["key"]] = Row(**{name: value for name, value in values.items() if name in known})
+                rows[values["key"]] = self._kind(**{name: value for name, value in values.items() if name in known})
             except (ValueError, TypeError, KeyError, AttributeError) as error:
                 if number < len(lines):  # what follows the last line feed is empty, or what a kill left
                     raise UsageError(f"{self.path}: line {number} is no row ({error}): repair or remove that line") from error

@@ -46,28 +46,29 @@ def _run(config: Config, name: str, file: RowFile, retry_failed: bool) -> list[R
     done = {row.key for row in file.read() if not (retry_failed and row.status in RETRIED)}
     pending = [spec for spec in specs if spec.key not in done]
     about = {"machine": _machine.machine(), **_machine.commit(), "config": name, "config_hash": config.hash}
-    with _progress(len(specs)) as progress:
-        bar = progress.add_task("", total=len(specs), completed=len(specs) - len(pending))
+    with progress(len(specs)) as shown:
+        bar = shown.add_task("", total=len(specs), completed=len(specs) - len(pending))
         if len(pending) < len(specs):
-            progress.console.print(f"{len(specs) - len(pending)} of {len(specs)} rows are there already")
+            shown.console.print(f"{len(specs) - len(pending)} of {len(specs)} rows are there already")
         for spec, opens_scene in _mark_scenes(pending):
             if opens_scene:
-                progress.update(bar, description=f"{spec.scene_name} · exact pairs")
-                _prepare_oracle(spec, folder, progress.console)
-            progress.update(bar, description=f"{spec.scene_name} · {spec.method}")
+                shown.update(bar, description=f"{spec.scene_name} · exact pairs")
+                _prepare_oracle(spec, folder, shown.console)
+            shown.update(bar, description=f"{spec.scene_name} · {spec.method}")
             row = replace(measure(spec, folder), **about)
             file.append(row)
-            progress.console.print(describe(row), highlight=False, markup=False, soft_wrap=True)
-            progress.advance(bar)
+            shown.console.print(describe(row), highlight=False, markup=False, soft_wrap=True)
+            shown.advance(bar)
     keys = {spec.key for spec in specs}
     return [row for row in file.read() if row.key in keys]
 
 
 @contextmanager
-def _progress(total: int) -> Iterator[Progress]:
+def progress(total: int) -> Iterator[Progress]:
+    """Show a bar on stderr."""
     columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True), disable=total == 0) as progress:
-        yield progress
+    with Progress(*columns, console=Console(stderr=True), disable=total == 0) as shown:
+        yield shown
 
 
 def _mark_scenes(specs: list[Spec]) -> Iterator[tuple[Spec, bool]]:
@@ -80,32 +81,40 @@ def _mark_scenes(specs: list[Spec]) -> Iterator[tuple[Spec, bool]]:
 
 def _prepare_oracle(spec: Spec, folder: Path, console: Console) -> None:
     """Find the exact pairs of a scene before its rows run, so that no row's time limit pays for them."""
-    answer = _ask("oracle", spec, folder)
+    answer = ask(_task("oracle", spec, folder), spec.timeout)
     if "reason" in answer:
         console.print(f"{spec.scene_name}: no exact pairs: {answer['reason']}", highlight=False, markup=False)
 
 
 def measure(spec: Spec, folder: Path) -> Row:
     """Measure one row in a fresh process; never raises for what happens there."""
-    answer = _ask("measure", spec, folder)
+    answer = ask(_task("measure", spec, folder), spec.timeout)
     asked = {"layout": spec.layout, "method": spec.method, "fill_asked": spec.fill, "spacing": spec.spacing}
     asked |= {"cutoff_ratio": spec.cutoff_ratio, "dtype": spec.dtype, "dim": spec.dim, "seed": spec.seed}
     return Row(key=spec.key, **asked, **answer, time=datetime.now(UTC).isoformat(timespec="seconds"))
 
 
-def _ask(do: str, spec: Spec, folder: Path) -> dict[str, Any]:
-    """Run a worker and return its answer, or a status with the reason why there is none."""
-    task = json.dumps({"do": do, "spec": asdict(spec), "oracle": str(folder.resolve() / "oracle")})
+def _task(do: str, spec: Spec, folder: Path) -> dict[str, Any]:
+    return {"do": do, "spec": asdict(spec), "oracle": str(folder.resolve() / "oracle")}
+
+
+def ask(task: dict[str, Any], timeout: float, *, cold: bool = True) -> dict[str, Any]:
+    """Let a worker do a task and return its answer, or a status with the reason why there is none.
+
+    Args:
+        task: See `experiments._worker`.
+        timeout: The worker is ended after this time [s].
+        cold: Kernels are compiled anew: a compile time from a warm cache would mean nothing.
+    """
     with tempfile.TemporaryDirectory() as cache:
-        # Kernels are compiled anew in each row: a compile time from a warm cache would mean nothing.
-        environment = os.environ | {"WARP_CACHE_PATH": cache, "JAX_ENABLE_COMPILATION_CACHE": "false"}
+        environment = os.environ | ({"WARP_CACHE_PATH": cache, "JAX_ENABLE_COMPILATION_CACHE": "false"} if cold else {})
         command = [sys.executable, "-m", "experiments._worker"]
         try:
             done = subprocess.run(
-                command, input=task, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=spec.timeout
+                command, input=json.dumps(task), capture_output=True, text=True, cwd=ROOT, env=environment, timeout=timeout
             )
         except subprocess.TimeoutExpired:
-            return {"status": "timeout", "reason": f"not done after {spec.timeout:g} s"}
+            return {"status": "timeout", "reason": f"not done after {timeout:g} s"}
     if done.returncode == 0:
         return json.loads(done.stdout)
     return {"status": "failed", "reason": _explain_exit(done.returncode, done.stderr)}

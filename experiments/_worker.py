@@ -25,10 +25,19 @@ def main() -> None:
     answer_stream = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     task = json.load(sys.stdin)
-    spec, folder = Spec(**task["spec"]), Path(task["oracle"])
-    answer = prepare_oracle(spec, folder) if task["do"] == "oracle" else measure(spec, folder)
+    answer = _answer(task)
     with answer_stream:
         json.dump(answer, answer_stream, allow_nan=False)
+
+
+def _answer(task: dict[str, Any]) -> dict[str, Any]:
+    """Do a task: {"do": "oracle" or "measure", "spec", "oracle": folder}, or {"do": "sum", "spec"}."""
+    if task["do"] == "sum":
+        from experiments import _ways
+
+        return _ways.measure(_ways.Spec(**task["spec"]))
+    spec, folder = Spec(**task["spec"]), Path(task["oracle"])
+    return prepare_oracle(spec, folder) if task["do"] == "oracle" else measure(spec, folder)
 
 
 def prepare_oracle(spec: Spec, folder: Path) -> dict[str, Any]:

@@ -1,0 +1,324 @@
+"""One sum in many ways, a poly6 density and its gradient: without a list, over lists of several libraries, over all pairs.
+
+`measure` does one of them in this process: a worker's.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from experiments import _layouts, _machine
+from experiments._config import digest
+
+MOST_ROWS = 20_000  # whose error is looked at; of more particles, evenly chosen ones
+
+
+@dataclass(frozen=True)
+class Spec:
+    """What one row measures, and how: fields as in a config of sums.
+
+    Attributes:
+        gradient: Density and gradient of the sum of all densities in the positions; else the density alone.
+        compensated: Rounding errors of the sums are carried along.
+        most_points: Larger scenes are skipped; None: none is.
+    """
+
+    layout: str
+    spacing: float
+    cutoff_ratio: float
+    dtype: str
+    seed: int
+    way: str
+    gradient: bool
+    compensated: bool
+    most_points: int | None
+    repeats: int
+    min_seconds: float
+    max_repeats: int
+    timeout: float
+
+    @property
+    def key(self) -> str:
+        """Digest of all fields, 12 hex digits: a row with the same key need not run again."""
+        return digest(asdict(self))
+
+
+class Given(NamedTuple):
+    """Particle positions [m], shape [n, 3]; what each contributes, shape [n]; the cutoff [m]."""
+
+    x: Any
+    m: Any
+    cutoff: float
+
+
+class Steps(NamedTuple):
+    """`build(x)` makes a list anew, where there is one; `sums(x, m, list or None)` uses it."""
+
+    build: Callable[[Any], Any] | None
+    sums: Callable[[Any, Any, Any], Any]
+
+
+class Way(NamedTuple):
+    """How a sum is made ready, and what it is able to do."""
+
+    prepare: Callable[[Given, bool, bool], Steps]
+    package: str = "jfrnn"
+    compensates: bool = False
+    sums: bool = True  # else it only searches
+
+
+def poly6(cutoff: float) -> Callable[[Any, Any, Any], Any]:
+    """Return the kernel of a density (Müller et al. 2003, doi:10.2312/SCA03/154-159), as `jfrnn.pair_sum` takes it."""
+    import jax.numpy as jnp
+
+    scale = 315 / (64 * math.pi * cutoff**3)
+
+    def kernel(r: Any, i: Any, j: Any) -> Any:  # noqa: ANN401
+        return j * scale * jnp.maximum(1 - r @ r / cutoff**2, 0.0) ** 3
+
+    return kernel
+
+
+def over_list(kernel: Callable[[Any, Any, Any], Any], x: Any, m: Any, idx: Any) -> Any:  # noqa: ANN401
+    """Sum a kernel over the rows of a padded list [n, capacity] in plain JAX; slots from n on are unused."""
+    import jax
+    import jax.numpy as jnp
+
+    used = idx < len(x)
+    j = jnp.where(used, idx, 0)
+    each = jax.vmap(jax.vmap(kernel, (0, None, 0)), (0, 0, 0))
+    return jnp.where(used, each(x[j] - x[:, None], m, m[j]), 0).sum(axis=1)
+
+
+def reference(given: Given, rows: np.ndarray, gradient: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return of some particles sums in float64, sums of absolute values, and numbers of neighbors; independent of the library.
+
+    Ties at the cutoff need no decision: the kernel and its gradient are 0 there.
+    """
+    from scipy.spatial import KDTree
+
+    x, m, h = np.asarray(given.x, np.float64), np.asarray(given.m, np.float64), given.cutoff
+    found = KDTree(x).query_ball_point(x[rows], h)
+    place, j = np.repeat(np.arange(len(rows)), [len(row) for row in found]), np.concatenate([*found]).astype(np.int64)
+    place, j = place[j != rows[place]], j[j != rows[place]]
+    r = x[j] - x[rows[place]]
+    inside, scale = np.maximum(1 - (r**2).sum(axis=1) / h**2, 0), 315 / (64 * math.pi * h**3)
+    terms = (m[j] * scale * inside**3)[:, None]
+    if gradient:
+        terms = np.hstack([terms, ((m[j] + m[rows[place]]) * scale * 6 / h**2 * inside**2)[:, None] * r])
+    sums, sizes = (
+        np.stack([np.bincount(place, column, len(rows)) for column in columns.T], axis=1) for columns in (terms, np.abs(terms))
+    )
+    return sums, sizes, np.bincount(place, minlength=len(rows))
+
+
+def error_of(given: Given, found: Any, gradient: bool) -> float:  # noqa: ANN401
+    """Return the largest error of sums against float64, over the sum of |terms|, in eps·sqrt(number of neighbors).
+
+    What the terms are rounded by is in it: of few neighbors, all of them near the cutoff, a multiple of what summing takes.
+    """
+    n = len(given.x)
+    rows = np.unique(np.linspace(0, n - 1, min(n, MOST_ROWS)).astype(np.int64))
+    exact, size, count = reference(given, rows, gradient)
+    columns = [np.asarray(found[0])[:, None], np.asarray(found[1])] if gradient else [np.asarray(found)[:, None]]
+    error = np.abs(np.hstack(columns)[rows].astype(np.float64) - exact)
+    allowed = np.finfo(columns[0].dtype).eps * np.sqrt(count)[:, None] * size
+    if (error[allowed == 0] != 0).any() or not np.isfinite(error).all():
+        raise ValueError("a particle without neighbors has a sum, or a sum is not finite")
+    return float((error[allowed > 0] / allowed[allowed > 0]).max(initial=0.0))
+
+
+def measure(spec: Spec) -> dict[str, Any]:
+    """Return the fields of the row that this process can know; a failure is a field too."""
+    way = WAYS[spec.way]
+    row: dict[str, Any] = {"versions": _machine.versions([way.package])}
+    try:
+        scene = _layouts.make(
+            spec.layout, spacing=spec.spacing, cutoff_ratio=spec.cutoff_ratio, dtype=spec.dtype, seed=spec.seed, fill=1.0
+        )
+        row["points"] = n = len(scene.positions)
+        if spec.most_points is not None and n > spec.most_points:
+            return row | {"status": "skipped", "reason": f"{n} points; {spec.way} is run up to {spec.most_points}"}
+        _measure_way(way, spec, scene.positions, float(scene.positions.dtype.type(scene.cutoff)), row)
+        row["status"] = "ok"
+    except ImportError as error:
+        row |= {"status": "missing", "reason": f"{spec.way} cannot be imported: {error}"}
+    except Exception as error:  # whatever a way raises is the result of its row
+        row |= {"status": "failed", "reason": f"{type(error).__name__}: {error}"[:600]}
+    return row
+
+
+def _measure_way(way: Way, spec: Spec, positions: np.ndarray, cutoff: float, row: dict[str, Any]) -> None:
+    """Run once to compile, then for the time, once for the memory; fill the row as far as it comes."""
+    import jax
+
+    from experiments import _measure
+
+    jax.config.update("jax_enable_x64", spec.dtype == "float64")
+    masses = np.random.default_rng(spec.seed).uniform(0.5, 1.5, len(positions)).astype(positions.dtype)
+    given = Given(jax.numpy.asarray(positions), jax.numpy.asarray(masses), cutoff)
+    used_before = _device_bytes("bytes_in_use")
+    steps, building = way.prepare(given, spec.gradient, spec.compensated), []
+
+    def once() -> Any:  # noqa: ANN401
+        begin = perf_counter()
+        made = None if steps.build is None else jax.block_until_ready(steps.build(given.x))
+        building.append(perf_counter() - begin)
+        return jax.block_until_ready(steps.sums(given.x, given.m, made))
+
+    begin = perf_counter()
+    once()
+    row["first_s"] = perf_counter() - begin
+    building.clear()
+    bystanders = _measure.Bystanders()
+    found, seconds = _measure.repeat(once, spec.repeats, spec.min_seconds, spec.max_repeats)
+    row |= {name: value for name, value in _measure.summarize(seconds).items() if name != "seconds"}
+    row |= {"others_cores": bystanders.cores(), "cutoff": cutoff, "device": jax.devices()[0].device_kind}
+    if steps.build is not None:
+        row["build_s"] = float(np.median(building))
+    row["sum_s"] = float(np.median(np.subtract(seconds, building)))
+    if way.sums:
+        row["error"] = error_of(given, found, spec.gradient)
+    del found
+    _measure.forget_freed_memory()
+    memory = _measure.PeakMemory()
+    once()
+    row |= {"peak_bytes": memory.peak() - memory.start, "memory_source": memory.source}
+    if (peak := _device_bytes("peak_bytes_in_use")) is not None:  # which is never forgotten; compiling does not raise it
+        row |= {"peak_bytes": peak - (used_before or 0), "memory_source": "memory_stats"}
+
+
+def _device_bytes(what: str) -> int | None:
+    import jax
+
+    return (jax.devices()[0].memory_stats() or {}).get(what)
+
+
+# --- the ways ---------------------------------------------------------------------------------------------------------
+
+
+def _compiled(density: Callable[[Any, Any, Any], Any], gradient: bool) -> Callable[[Any, Any, Any], Any]:
+    """Return a jitted density(x, m, made), or it and the gradient of the sum of all densities in x."""
+    import jax
+
+    if not gradient:
+        return jax.jit(density)
+
+    def total(x: Any, m: Any, made: Any) -> Any:  # noqa: ANN401
+        sums = density(x, m, made)
+        return sums.sum(), sums
+
+    def both(x: Any, m: Any, made: Any) -> Any:  # noqa: ANN401
+        slope, sums = jax.grad(total, has_aux=True)(x, m, made)
+        return sums, slope
+
+    return jax.jit(both)
+
+
+def _without_list(backend: str) -> Callable[[Given, bool, bool], Steps]:
+    def prepare(given: Given, gradient: bool, compensated: bool) -> Steps:
+        import jfrnn
+
+        kernel, cutoff = poly6(given.cutoff), given.cutoff
+
+        def density(x: Any, m: Any, made: Any) -> Any:  # noqa: ANN401
+            return jfrnn.pair_sum(kernel, x, cutoff, m, compensated=compensated, backend=backend)
+
+        return Steps(None, _compiled(density, gradient))
+
+    return prepare
+
+
+def _our_list(given: Given) -> Callable[[Any], Any]:
+    import jax
+
+    import jfrnn
+
+    capacity, cutoff = _capacity(given), given.cutoff
+    return jax.jit(lambda x: jfrnn.search(x, cutoff, capacity=capacity))
+
+
+def _capacity(given: Given) -> int:
+    import jfrnn
+    from jfrnn._neighbors import rounded_capacity
+
+    return rounded_capacity(int(jfrnn.count(given.x, given.cutoff).max()))
+
+
+def _listed(given: Given, gradient: bool, compensated: bool) -> Steps:
+    del compensated
+    kernel = poly6(given.cutoff)
+    return Steps(_our_list(given), _compiled(lambda x, m, nbrs: over_list(kernel, x, m, nbrs.idx), gradient))
+
+
+def _pair_sum_listed(given: Given, gradient: bool, compensated: bool) -> Steps:
+    import jfrnn
+
+    kernel = poly6(given.cutoff)
+
+    def density(x: Any, m: Any, nbrs: Any) -> Any:  # noqa: ANN401
+        return jfrnn.pair_sum(kernel, x, None, m, neighbors=nbrs, compensated=compensated)
+
+    return Steps(_our_list(given), _compiled(density, gradient))
+
+
+def _jax_md(given: Given, gradient: bool, compensated: bool) -> Steps:
+    del compensated
+    import jax
+    import jax.numpy as jnp
+    from jax_md import partition, space  # pyright: ignore[reportMissingImports]
+
+    displacement, _ = space.free()
+    low = jnp.min(given.x, axis=0)
+    size = np.asarray(jnp.max(given.x, axis=0) - low) + given.cutoff  # its cells begin at 0
+    make = partition.neighbor_list(displacement, size, given.cutoff, format=partition.NeighborListFormat.Dense)
+    nbrs = make.allocate(given.x - low)
+    moved = replace(nbrs, reference_position=nbrs.reference_position + 2 * given.cutoff)  # else it keeps what it has
+    update = jax.jit(lambda x, nbrs: nbrs.update(x - low))
+    if update(given.x, moved).did_buffer_overflow:
+        raise RuntimeError("the list overflowed")
+    kernel = poly6(given.cutoff)
+    return Steps(lambda x: update(x, moved).idx, _compiled(lambda x, m, idx: over_list(kernel, x, m, idx), gradient))
+
+
+def _nvalchemi(given: Given, gradient: bool, compensated: bool) -> Steps:
+    del compensated
+    import jax
+    import jax.numpy as jnp
+    from nvalchemiops.jax.neighbors.cell_list import cell_list, estimate_cell_list_sizes  # pyright: ignore
+
+    low, cutoff, capacity = jnp.min(given.x, axis=0), given.cutoff, _capacity(given)
+    cell, periodic = jnp.diag(jnp.max(given.x, axis=0) - low + 2 * cutoff)[None], jnp.zeros((1, 3), bool)
+    cells, _, radius = estimate_cell_list_sizes(given.x - low + cutoff, cell, cutoff, periodic)
+    most = {"max_neighbors": capacity, "max_total_cells": int(cells), "neighbor_search_radius": radius}
+
+    def build(x: Any) -> Any:  # noqa: ANN401
+        idx, count, *_ = cell_list(x - low + cutoff, cutoff, cell, periodic, **most)
+        return jnp.where(jnp.arange(capacity) < count[:, None], idx, len(x))
+
+    kernel = poly6(given.cutoff)
+    return Steps(jax.jit(build), _compiled(lambda x, m, idx: over_list(kernel, x, m, idx), gradient))
+
+
+def _scipy(given: Given, gradient: bool, compensated: bool) -> Steps:
+    del gradient, compensated
+    from scipy.spatial import KDTree
+
+    points = np.asarray(given.x, np.float64)
+    return Steps(None, lambda x, m, made: KDTree(points).query_pairs(given.cutoff, output_type="ndarray"))
+
+
+WAYS = {
+    "pair_sum warp": Way(_without_list("warp"), compensates=True),
+    "pair_sum jax": Way(_without_list("jax"), compensates=True),
+    "brute force": Way(_without_list("brute"), compensates=True),
+    "list, sum": Way(_listed),
+    "list, pair_sum": Way(_pair_sum_listed, compensates=True),
+    "jax-md list, sum": Way(_jax_md, "jax-md"),
+    "nvalchemi list, sum": Way(_nvalchemi, "nvalchemi-toolkit-ops"),
+    "scipy pairs alone": Way(_scipy, "scipy", sums=False),
+}
