@@ -92,8 +92,8 @@ def pair_sum(
     Denormal numbers count as zero in what fn computes on the CPU, as everywhere in XLA; pairs are decided with them.
     Memory: what `search` takes without its list, the results, and at most 16 MB (float32) for each array that fn needs for the
     pairs that are in work; nothing grows with the number of pairs, in derivatives neither. "warp" has no pairs in work, but two
-    copies of the numbers that fn reads of each j, and one of those of each i, none of coordinates in open space; in a box one number
-    more of each. `memory_plan` knows beforehand.
+    copies of the numbers that fn reads of each j, and one of those of each i, but for coordinates in open space; in a box one
+    number more of each. `memory_plan` knows beforehand.
     Differentiable: to every order, forward and backward, in positions, queries, values, query_values, the lattice vectors of the
     box and whatever fn closes over; who is a neighbor is a constant. A derivative is a sum over the same pairs, gathered
     by each particle (over a list that is not its own mirror image, scattered). What is no pair has no part in it, whatever fn
