@@ -44,13 +44,16 @@ class PeakMemory:
 
 
 def forget_freed_memory() -> None:
-    """Let the system have back at once, from now on, what arrays of 64 KiB and more leave: nothing hides in a later peak.
+    """Let the system have back at once, from now on, what is freed: nothing hides in a later peak.
 
-    Where the C library is another than glibc, nothing changes. Calls are slower afterwards: time them before.
+    What was freed before goes with the next call that takes and frees memory, in each of its threads. Where the C library is
+    another than glibc, nothing changes. Calls are slower afterwards: time them before.
     """
-    mallopt, mmap_threshold = getattr(ctypes.CDLL(None), "mallopt", None), -3  # M_MMAP_THRESHOLD of malloc.h
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
+        trim_threshold, mmap_threshold = -1, -3  # of malloc.h
         mallopt(mmap_threshold, 1 << 16)
+        mallopt(trim_threshold, 0)
 
 
 class Bystanders:

@@ -6,7 +6,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from time import perf_counter
+from time import perf_counter, sleep
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -185,6 +185,8 @@ def _measure_way(way: Way, spec: Spec, positions: np.ndarray, cutoff: float, row
         row["error"] = error_of(given, found, spec.gradient)
     del found
     _measure.forget_freed_memory()
+    once()
+    sleep(0.2)  # threads of XLA give back what a call took after its result is there
     memory = _measure.PeakMemory()
     once()
     row |= {"peak_bytes": memory.peak() - memory.start, "memory_source": memory.source}
