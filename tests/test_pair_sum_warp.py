@@ -240,6 +240,20 @@ def test_derivatives_with_queries():
     assert_same(found(args, along), expected(args, along))
 
 
+def test_queries_at_the_particles_have_values_of_their_own():
+    """Positions of i and of j are one array then, their values and derivatives are not."""
+    (x, m), w = scene(1), jnp.linspace(0.3, 0.6, N)
+    pairs, fn = reference.reference_pairs(x, CUTOFF, queries=x), functools.partial(cheap, 0.7)
+    args = jnp.asarray(x), jnp.asarray(m), w
+
+    def slopes(sums):
+        return jax.jit(jax.grad(lambda x, m, w: sum(jnp.sin(leaf).sum() for leaf in jax.tree.leaves(sums(x, m, w))), (0, 1, 2)))
+
+    found = slopes(lambda x, m, w: fused(fn, x, CUTOFF, m, queries=x, query_values=w))(*args)
+    expected = slopes(lambda x, m, w: oracle_sum(fn, pairs, x, x, w, m))(*args)
+    assert_same(found, expected)
+
+
 def cheap(scale, r, i, j):
     s = r @ r
     return {"a": scale * j * s * i, "b": (scale + s) * r * j}
