@@ -24,12 +24,13 @@ _INTERNAL_ERROR = 13
 
 
 class Command(NamedTuple):
-    """A kernel, its arguments (arrays and numbers), and its threads, in all and per block."""
+    """A kernel, its arguments (arrays and numbers), its threads, in all and per block, whether it may run beside the one before."""
 
     kernel: Any
     arguments: Sequence[Any]
     threads: int
     block: int
+    beside: bool = False
 
 
 class _Version(ctypes.Structure):
@@ -135,7 +136,19 @@ class _Recorded(NamedTuple):
     """Launches, and the arguments of theirs that hold an address, each with the buffer whose address that is."""
 
     launches: list[Any]
+    beside: list[bool]
     addresses: list[tuple[Any, int]]
+
+    def launch(self, stream: Any, side: Any = None) -> None:  # noqa: ANN401
+        """Launch all in order; those that may run beside others do, if there is a stream for them."""
+        for k, launch in enumerate(self.launches):
+            if side is None or not self.beside[k]:
+                if side is not None and any(self.beside[k + 1 : k + 2]):
+                    side.wait_stream(stream)
+                launch.launch(stream)
+            else:
+                launch.launch(side)
+                stream.wait_stream(side)
 
 
 def register(name: str, wp: Any, dtypes: Sequence[Any], commands: Callable[..., list[Command]]) -> None:  # noqa: ANN401
@@ -149,6 +162,7 @@ def register(name: str, wp: Any, dtypes: Sequence[Any], commands: Callable[..., 
     """
     recorded: dict[tuple[int, ...], _Recorded] = {}
     streams: dict[int, _Stream] = {}
+    sides: dict[str, Any] = {}  # per device: a stream that only graphs are recorded from
     recent: OrderedDict[tuple[int, ...], None] = OrderedDict()
     graphs: OrderedDict[tuple[int, ...], Any] = OrderedDict()
     lock = threading.Lock()
@@ -175,20 +189,20 @@ def register(name: str, wp: Any, dtypes: Sequence[Any], commands: Callable[..., 
             shapes = (address, *key[1 + len(here) :])
             if shapes not in recorded:
                 recorded[shapes] = _record(wp, stream.device, buffers, dtypes, commands)
-            launches, addresses = recorded[shapes]
-            for argument, place in addresses:
+            launches = recorded[shapes]
+            for argument, place in launches.addresses:
                 argument.data = here[place]
             if key not in recent:
                 recent[key] = None
                 if len(recent) > _SOON:
                     recent.popitem(last=False)
-                for command in launches:
-                    command.launch(stream)
+                launches.launch(stream)
                 return
+            if stream.device.alias not in sides:
+                sides[stream.device.alias] = wp.Stream(stream.device)
             known = wp.Stream(stream.device, cuda_stream=address)
             with wp.ScopedStream(known, sync_enter=False), wp.ScopedCapture() as capture:
-                for command in launches:
-                    command.launch(stream)
+                launches.launch(known, sides[stream.device.alias])
             graphs[key] = capture.graph
             if len(graphs) > _GRAPHS:
                 graphs.popitem(last=False)
@@ -228,7 +242,8 @@ def _record(
     places = {id(array): place for place, array in enumerate(arrays)}
     launches: list[Any] = []
     addresses: dict[int, tuple[Any, int]] = {}
-    for kernel, arguments, threads, block in commands(*arrays):
+    listed = commands(*arrays)
+    for kernel, arguments, threads, block, _ in listed:
         launch = wp.launch(kernel, dim=threads, inputs=list(arguments), device=device, block_dim=block, record_cmd=True)
         for index, argument in enumerate(arguments):
             if isinstance(argument, wp.array):
@@ -239,4 +254,4 @@ def _record(
                 launch.set_param_at_index_from_ctype(index, packed)
                 addresses[id(packed)] = (packed, place)
         launches.append(launch)
-    return _Recorded(launches, list(addresses.values()))
+    return _Recorded(launches, [command.beside for command in listed], list(addresses.values()))

@@ -26,11 +26,13 @@ def snippet(scalar: str, dim: int, *pieces: str, **constants: int) -> str:
     open space, 1 where the nearest image is the only one that can be a neighbor, 2 where images are told apart: `cutoff` then goes
     on with the numbers of the lattice, and a row of positions goes on with its packed turns (see `jfrnn._box`). BATCHED is 1 where
     it ends with the number of its system (see `jfrnn._batch`). Such integers are the bits of a float, or the value of a double. SUM
-    is 1 where the cutoff of a pair is the sum of two numbers.
+    is 1 where the cutoff of a pair is the sum of two numbers. SHIFTED is 0 where all pairs that are decided are those of points as
+    they are, though space is periodic.
     """
     lines = [f"using real = {scalar};", f"using whole = {'long long' if scalar == 'double' else 'int'};"]
     lines += [f"constexpr int DIM = {dim};", f"constexpr bool DOUBLE = {int(scalar == 'double')};"]
-    lines += [f"constexpr int {name} = {int(value)};" for name, value in {**_DEFAULTS, **constants}.items()]
+    constants = {**_DEFAULTS, "SHIFTED": constants.get("PERIODIC", 0), **constants}
+    lines += [f"constexpr int {name} = {int(value)};" for name, value in constants.items()]
     return "\n".join(["", "{", _NO_CONTRACTION, *lines, _PORTABLE, *pieces, "}", ""])
 
 
@@ -109,6 +111,7 @@ auto unsigned_of = [](real x) -> unsigned int {
 };
 auto system_of = [&](const real* row) -> unsigned int { return BATCHED ? unsigned_of(row[ROW - 1]) : 0u; };
 struct Lattice {
+    enum { NONE = 512 | 512 << 10 | (DIM == 3 ? 512 << 20 : 0) };  // packed turns of what lies in the cell
     const real* numbers;
     bool skewed;  // else its vectors lie along the axes, and what others would add is 0
     JFRNN_MEMBER real vector(int l, int k) const { return numbers[1 + 3 * l + k]; }
@@ -149,15 +152,15 @@ struct Lattice {
         return DIM == 3 ? add(sum, mul(real(sz), vector(2, k))) : sum;
     }
     // a row of positions brought into the cell; one that is too far away for that is not finite
-    JFRNN_MEMBER void wrap(const real* row, real* p) const {
-#if !defined(__CUDA_ARCH__)
-        constexpr int NONE = 512 | 512 << 10 | (DIM == 3 ? 512 << 20 : 0);
+    JFRNN_MEMBER void wrap(const real* numbers, real* p) const {
+        struct alignas(ROW % 4 ? sizeof(real) : 16) Row { real numbers[ROW]; };  // loaded at once, if it can be
+        const Row loaded = *(const Row*)numbers;
+        const real* row = loaded.numbers;
         if (packed_turns(row[DIM]) == NONE) {  // as nearly everywhere
             for (int k = 0; k < DIM; ++k)
                 p[k] = row[k];
             return;
         }
-#endif
         const int t[3] = {turn(row[DIM], 0), turn(row[DIM], 1), DIM == 3 ? turn(row[DIM], 2) : 0};
         for (int k = 0; k < DIM; ++k)
             p[k] = t[0] | t[1] | t[2] ? add(row[k], -translation(t[0], t[1], t[2], k)) : row[k];
@@ -180,7 +183,7 @@ struct Lattice {
 bool skewed = false;
 for (int l = 0; PERIODIC && l < DIM; ++l)
     for (int k = 0; k < DIM; ++k)
-        skewed = skewed || (k != l && Lattice{cutoff.data, true}.transform(l, k) != 0);
+        skewed |= k != l && Lattice{cutoff.data, true}.transform(l, k) != 0;  // loads that need not wait for each other
 #if defined(__CUDA_ARCH__)
 const Lattice lattice{cutoff.data, skewed};
 #else
@@ -306,7 +309,7 @@ struct Exact {
                 plain = plain && (ak == 0 || !(size_of(ak) < smallest)) && (bk == 0 || !(size_of(bk) < smallest));
             double low;
             double high = two_sum(bk, -ak, low);
-            if constexpr (PERIODIC) {
+            if constexpr (SHIFTED) {
                 double rest = 0;
                 for (int l = 0; l < DIM; ++l) {
                     const double v = double(lattice.vector(l, k)), s = double(shift[l]);
@@ -552,8 +555,9 @@ auto cells_per_length = [&](int axis) -> real {  // along a periodic axis: a who
     if constexpr (!PERIODIC)
         return cells / radius;
     const real count = cells / lattice.reach(axis);
+    const bool periodic = lattice.periodic(axis);
     constexpr real MOST = real(1 << 22);
-    return !lattice.periodic(axis) ? count : count < 1 ? real(1) : count < MOST ? real((int)count) : MOST;
+    return !periodic ? count : count < 1 ? real(1) : count < MOST ? real((int)count) : MOST;
 };
 const real inverse_edge[3] = {cells_per_length(0), cells_per_length(1), DIM == 3 ? cells_per_length(2) : real(1)};
 // how far a neighbor may be along an axis, and where a point is along it

@@ -1,4 +1,4 @@
-"""Cell search on CUDA: seven launches, no host synchronization, nothing allocated beside the scratch that the caller gives.
+"""Cell search on CUDA: seven or eight launches, no host synchronization, nothing allocated beside the scratch it is given.
 
 bounds   lowest and highest coordinate per block
 lay_out  every block reduces those bounds to the grid, and clears its part of what the others count in
@@ -8,6 +8,7 @@ scatter  indices into their cells, in the order in which they came
 gather   positions into cell order, ranked by index within a cell: the same order in every run
 query    a warp serves up to 32 neighboring queries, one per lane: candidates within reach of their box meet all of them, 32 in a
          block, float32 on tensor cores first; a neighbor is a bit, until the rows are written
+crossing the same in a periodic box, for queries whose reach leaves it: images take registers, which the others have no use for
 """
 
 import functools
@@ -22,6 +23,7 @@ _PARTS = 256  # blocks of `bounds`; one thread of a block reads one part
 _TILE = 2048  # cells that a block of `scan` takes
 _HEADER_WORDS = 64
 _SWEEP_BLOCKS = 1056  # blocks of the kernels that walk over all particles
+_CROSSING_BLOCKS = 8448  # blocks of the kernel for queries whose reach leaves a box: what is to do is known to the device only
 _RESIDENT = 132  # blocks of those that walk over the cells: all at work at once
 
 _LAYOUT = r"""
@@ -30,6 +32,8 @@ struct Shared {
     int finite_queries;
     int behind[2];  // non-finite particles so far: sources, queries
     int tiles[2];  // tiles of the scan that have begun
+    int crossing;  // blocks of queries that cross the box: the reach of one of them leaves it
+    float depth;  // how far a source from outside the box may be from its faces, in reaches: as far as they may be, queries cross
 };
 constexpr int WIDTH = DOUBLE ? 2 : 1;
 struct alignas(4 * sizeof(real)) Place { real p[3]; real id; };  // id: the bits of an int
@@ -49,6 +53,9 @@ int* order = take(n);
 int* query_start = own ? start : take(table + 2);
 unsigned long long* query_tile_state = own ? tile_state : (unsigned long long*)take(2 * tile_count);
 int* query_order = own ? order : take(m);
+const int query_blocks = (m + 31) / 32;
+int* crossing = take(query_blocks);  // their numbers
+int* crosses = take(query_blocks);  // whether a block does
 const int lane = threadIdx.x & 31, warp_in_block = threadIdx.x >> 5;
 // Warp spreads more than 65535 blocks over y and z
 const int block = (blockIdx.z * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x;
@@ -57,6 +64,15 @@ const long long threads = (long long)gridDim.z * gridDim.y * gridDim.x * blockDi
 constexpr unsigned int ALL = 0xffffffffu;
 auto id_of = [](real bits) -> int { return DOUBLE ? (int)__double_as_longlong(bits) : __float_as_int(bits); };
 auto bits_as_real = [](int id) -> real { return DOUBLE ? (real)__longlong_as_double(id) : (real)__int_as_float(id); };
+// of a point that comes from outside the box: how far from the nearest face it is, in reaches, rounded up
+auto depth_of = [&](const real* at) -> float {
+    float depth = INFINITY;
+    for (int k = 0; k < DIM; ++k)
+        if (is_periodic(k))
+            depth = fminf(depth, 1.0001f * (float)((at[k] < real(0.5) ? at[k] : 1 - at[k]) / reach_along(k)));
+    return depth;
+};
+auto is_turned = [](const real* row) { return PERIODIC && Lattice::packed_turns(row[DIM]) != Lattice::NONE; };
 const real INF = DOUBLE ? (real)__longlong_as_double(0x7ff0000000000000ll) : (real)__int_as_float(0x7f800000);
 """
 
@@ -70,16 +86,20 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, t
     parts = [_HEADER_WORDS, 8 * _PARTS * width, 4 * width * sources, table + 2, tiles, longest, longest, sources]
     if not own:
         parts += [table + 2, tiles, queries]
+    parts += 2 * [-(-queries // QUERY_BLOCK)]
     return sum((words + 15) // 16 * 16 for words in parts)
 
 
 # Bounds and numbers of finite points of all threads of a block, into those of its first thread.
 _REDUCE = r"""
-auto reduce_over_block = [&](real* low, real* high, int& finite) {
+auto reduce_over_block = [&](real* low, real* high, int& finite, float& depth) {
     __shared__ real lows[3][BLOCK / 32], highs[3][BLOCK / 32];
     __shared__ int finites[BLOCK / 32];
+    __shared__ float depths[BLOCK / 32];
     for (int step = 16; step > 0; step /= 2) {
         finite += __shfl_down_sync(ALL, finite, step);
+        if constexpr (PERIODIC)
+            depth = fmaxf(depth, __shfl_down_sync(ALL, depth, step));
         for (int k = 0; k < DIM; ++k) {
             const real l = __shfl_down_sync(ALL, low[k], step), h = __shfl_down_sync(ALL, high[k], step);
             low[k] = l < low[k] ? l : low[k];
@@ -88,6 +108,7 @@ auto reduce_over_block = [&](real* low, real* high, int& finite) {
     }
     if (lane == 0) {
         finites[warp_in_block] = finite;
+        depths[warp_in_block] = depth;
         for (int k = 0; k < DIM; ++k) {
             lows[k][warp_in_block] = low[k];
             highs[k][warp_in_block] = high[k];
@@ -97,6 +118,7 @@ auto reduce_over_block = [&](real* low, real* high, int& finite) {
     if (threadIdx.x == 0)
         for (int w = 1; w < BLOCK / 32; ++w) {
             finite += finites[w];
+            depth = fmaxf(depth, depths[w]);
             for (int k = 0; k < DIM; ++k) {
                 low[k] = lows[k][w] < low[k] ? lows[k][w] : low[k];
                 high[k] = highs[k][w] > high[k] ? highs[k][w] : high[k];
@@ -112,6 +134,7 @@ for (int k = 0; k < DIM; ++k) {
     high[k] = -INF;
 }
 int finite = 0;
+float depth = 0;
 for (long long i = thread; i < n; i += threads) {
     real p[3], at[3];
     point_of(positions.data + ROW * i, p);
@@ -121,8 +144,10 @@ for (long long i = thread; i < n; i += threads) {
     for (int k = 0; k < DIM; ++k)
         at[k] = coordinate(k, p);
     widen(low, high, at, at);
+    if (is_turned(positions.data + ROW * i))
+        depth = fmaxf(depth, depth_of(at));
 }
-reduce_over_block(low, high, finite);
+reduce_over_block(low, high, finite, depth);
 if (threadIdx.x == 0) {
     real* part = parts + 8 * block;
     for (int k = 0; k < DIM; ++k) {
@@ -130,9 +155,10 @@ if (threadIdx.x == 0) {
         part[3 + k] = high[k];
     }
     part[6] = bits_as_real(finite);
+    part[7] = depth;
 }
 if (thread == 0) {
-    shared.behind[0] = shared.behind[1] = shared.tiles[0] = shared.tiles[1] = 0;
+    shared.behind[0] = shared.behind[1] = shared.tiles[0] = shared.tiles[1] = shared.crossing = 0;
     info.data[0] = info.data[1] = 0;
 }
 """
@@ -142,11 +168,12 @@ __shared__ Grid grid;
 real low[3], high[3];
 const real* part = parts + 8 * threadIdx.x;
 int finite = id_of(part[6]);
+float depth = (float)part[7];
 for (int k = 0; k < DIM; ++k) {
     low[k] = part[k];
     high[k] = part[3 + k];
 }
-reduce_over_block(low, high, finite);
+reduce_over_block(low, high, finite, depth);
 if (threadIdx.x == 0) {
     if (finite == 0)
         for (int k = 0; k < DIM; ++k)
@@ -155,6 +182,7 @@ if (threadIdx.x == 0) {
     grid.finite = finite;
     if (block == 0) {
         shared.grid = grid;
+        shared.depth = depth;
         if (finite < n)
             atomicOr(&info.data[1], 2);
     }
@@ -171,6 +199,8 @@ for (long long t = thread; t < tiles; t += threads) {
     if (!own)
         query_tile_state[t] = 0;
 }
+for (long long b = thread; PERIODIC && b < query_blocks; b += threads)
+    crosses[b] = 0;
 """
 
 _COUNT = r"""
@@ -270,7 +300,29 @@ if (thread == 0 && (own || of_queries))
 
 _GATHER = r"""
 const Grid grid = shared.grid;
-for (long long place = thread; place < n; place += threads) {
+real crossing_low[3], crossing_high[3];  // beyond, a query reaches out of the box, or may meet what comes from outside
+for (int a = 0; a < DIM; ++a) {
+    const real reach = reach_along(a) * (real(1.00001) + real(shared.depth));  // rounding does no harm
+    crossing_low[a] = is_periodic(a) ? reach : -INF;
+    crossing_high[a] = is_periodic(a) ? real(0.999999) - reach : INF;
+}
+auto mark = [&](const real* row, const real* p, long long place) {  // a query's block, if it crosses the box
+    bool crosses_box = is_turned(row);
+#pragma unroll
+    for (int a = 0; a < DIM; ++a) {
+        const real x = coordinate(a, p);
+        crosses_box = crosses_box || !(x > crossing_low[a] && x < crossing_high[a]);
+    }
+    if (crosses_box && crosses[place / 32] == 0 && atomicExch(crosses + place / 32, 1) == 0)
+        crossing[atomicAdd(&shared.crossing, 1)] = (int)(place / 32);
+};
+for (long long place = thread; of_queries && place < shared.finite_queries; place += threads) {
+    real p[3];
+    const real* row = queries.data + (long long)ROW * query_order[place];
+    point_of(row, p);
+    mark(row, p, place);
+}
+for (long long place = thread; !of_queries && place < n; place += threads) {
     const int i = order[place];
     Place mine;
     point_of(positions.data + (long long)ROW * i, mine.p);
@@ -286,6 +338,8 @@ for (long long place = thread; place < n; place += threads) {
         to = first + rank;
     }
     sorted[to] = mine;
+    if (PERIODIC && own && cell >= 0)
+        mark(positions.data + (long long)ROW * i, mine.p, to);
 }
 """
 
@@ -299,8 +353,11 @@ constexpr unsigned int ONES = 0x3c003c00;  // two halves
 // Where space is periodic, a candidate's id tells its image, too: in the upper bits, or, where images are told apart in the list,
 // as in the list. Moving a candidate is one text, so that it is in the same place whenever it is loaded.
 constexpr int ID_BITS = 27;
+// Inside, no row of cells leaves the box, and nothing that is near comes from outside of it: all are at home, nothing is moved.
+constexpr bool inside = !CROSSING;
+constexpr int IDS = PERIODIC == 1 && inside ? 0 : PERIODIC;
 int codes = 1, home = 0;
-if constexpr (PERIODIC) {
+if constexpr (IDS) {
     for (int k = 0; k < DIM; ++k)
         codes *= 2 * lattice.images(k) + 1;
     home = (codes - 1) / 2;
@@ -308,10 +365,10 @@ if constexpr (PERIODIC) {
 const int fill_value = PERIODIC == 2 ? n * codes : n;
 auto id_of_image = [&](int source, int code) -> int {
     const unsigned int upper = (unsigned int)(code ^ home) << ID_BITS;  // none at home
-    return PERIODIC == 0 ? source : PERIODIC == 1 ? (int)((unsigned int)source | upper) : source + n * code;
+    return IDS == 0 ? source : IDS == 1 ? (int)((unsigned int)source | upper) : source + n * code;
 };
-auto source_of = [&](int id) -> int { return PERIODIC == 0 ? id : PERIODIC == 1 ? id & ((1 << ID_BITS) - 1) : id % n; };
-auto image_of = [&](int id) -> int { return PERIODIC == 1 ? (int)((unsigned int)id >> ID_BITS) ^ home : id / n; };
+auto source_of = [&](int id) -> int { return IDS == 0 ? id : IDS == 1 ? id & ((1 << ID_BITS) - 1) : id % n; };
+auto image_of = [&](int id) -> int { return IDS == 1 ? (int)((unsigned int)id >> ID_BITS) ^ home : id / n; };
 auto translate = [&](int code, real* moved) {
     int shift[3] = {0, 0, 0};
     for (int k = DIM - 1; k >= 0; --k) {
@@ -325,7 +382,7 @@ auto translate = [&](int code, real* moved) {
 // the image of a source that an id names
 auto load_image = [&](int id, real* p) {
     point_of(positions.data + (long long)ROW * source_of(id), p);
-    if constexpr (PERIODIC) {
+    if constexpr (!inside) {
         real moved[3];
         translate(image_of(id), moved);
         for (int k = 0; k < DIM; ++k)
@@ -356,8 +413,8 @@ struct alignas(16) Warp {  // what a warp shares
     int left[LIST ? 3 : 1][32];  // of those, the ids
     Box box;  // of the group
     Run runs[33];
-    int run_images[PERIODIC ? 33 : 1];  // their codes, and what leads from home to them
-    real run_moved[PERIODIC ? 33 : 1][3];
+    int run_images[CROSSING ? 33 : 1];  // their codes, and what leads from home to them
+    real run_moved[CROSSING ? 33 : 1][3];
 };
 __shared__ Warp warp;
 __shared__ Grid grid;
@@ -368,16 +425,13 @@ if (lane == 0) {
     longest_before = *(volatile int*)&info.data[0];
 }
 __syncwarp();
-const long long begin = (long long)block * 32;
-int place = begin < m ? (int)begin : m;
-const int stop = m - place < 32 ? m : place + 32;
 const unsigned int lanes_below = (1u << lane) - 1;
 // differences of images may be off by more than rounding takes from a difference
-const real off = PERIODIC ? 2 * lattice.slack() * step_scale : real(0), outer_radius = step_radius + off;
+const real off = CROSSING ? 2 * lattice.slack() * step_scale : real(0), outer_radius = step_radius + off;
 const real inner_radius = step_radius > off ? step_radius - off : real(0), square_radius = step_radius * step_radius;
-const real sure_square = inner_radius * inner_radius - 8 * (1 + PERIODIC) * step_eps * square_radius;
+const real sure_square = inner_radius * inner_radius - 8 * (1 + SHIFTED) * step_eps * square_radius;
 const real beyond = outer_radius * outer_radius * (1 + 16 * step_eps) - sure_square;
-const real band = PERIODIC ? real(0.5) * beyond : 8 * step_eps * square_radius;
+const real band = CROSSING ? real(0.5) * beyond : 8 * step_eps * square_radius;
 const bool drops_self = own && drop_self;
 auto load = [&](const Place* from) -> Place {
     if constexpr (DOUBLE) {
@@ -436,7 +490,12 @@ auto halves = [](float x, float factor) -> unsigned int {
     asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(word) : "f"(factor * low), "f"(factor * high));
     return word;
 };
-
+if (PERIODIC && !CROSSING && (block >= query_blocks || crosses[block]))
+    return;
+for (int turn = block; !CROSSING || turn < shared.crossing; turn += (int)(threads / 32)) {
+const long long begin = (long long)(CROSSING ? crossing[turn] : turn) * 32;
+int place = begin < m ? (int)begin : m;
+const int stop = m - place < 32 ? m : place + 32;
 while (place < stop) {
     // one query per lane; those that share a row of cells with the first form a group
     Place mine{{0, 0, 0}, 0};
@@ -491,8 +550,15 @@ while (place < stop) {
     for (int a = 0; a < DIM; ++a) {
         reduce_over_group(mine.p[a], low[a], high[a]);
         real lowest = low[a], highest = high[a];
-        if constexpr (PERIODIC)
-            reduce_over_group(my_place[a], lowest, highest);
+        if constexpr (PERIODIC) {
+            if (skewed)
+                reduce_over_group(my_place[a], lowest, highest);
+            else {  // in one order or the other
+                const real begin = coordinate(a, low), end = coordinate(a, high);
+                lowest = begin < end ? begin : end;
+                highest = begin < end ? end : begin;
+            }
+        }
         bound = lane == 2 * a ? lowest : lane == 2 * a + 1 ? highest : bound;
         center[a] = real(0.5) * low[a] + real(0.5) * high[a];
         const real below = center[a] - low[a], above = high[a] - center[a], half = (below > above ? below : above) * step_scale;
@@ -513,11 +579,11 @@ while (place < stop) {
         }
     }
     const real group_radius = (SCALED ? radius * scale : radius) * unit;
-    const real group_outer = PERIODIC ? (radius + 2 * lattice.slack()) * (SCALED ? scale : real(1)) * unit : group_radius;
+    const real group_outer = CROSSING ? (radius + 2 * lattice.slack()) * (SCALED ? scale : real(1)) * unit : group_radius;
     const real near_square = group_outer * group_outer * (1 + 8 * step_eps) + (DOUBLE ? real(0) : real(1e-30));
     const float reach = fminf(diagonal * (float)unit + (float)group_outer, 240);
     float coarse_band = reach * reach * 2e-5f;  // see meet
-    if constexpr (PERIODIC)
+    if constexpr (CROSSING)
         coarse_band += 1.001f * (float)((group_outer - group_radius) * (group_outer + group_radius));
     auto from_center = [&](real x, real center) -> real {
         const real y = SCALED ? x * scale : x;
@@ -552,11 +618,6 @@ while (place < stop) {
             reached = cell_number(x);
         if (lane >= 2 * DIM)
             reached = 0;
-    }
-    bool inside = true;  // no row of cells leaves the box: there are no images, and nothing is moved
-    if constexpr (PERIODIC) {
-        const int along = lane / 2;
-        inside = !__any_sync(ALL, lane < 2 * DIM && is_periodic(along) && (reached < 0 || reached >= (whole)cell_scale(along)));
     }
     auto cells_along = [&](int a) { return (int)(__shfl_sync(ALL, reached, 2 * a + 1) - __shfl_sync(ALL, reached, 2 * a)) + 1; };
     int rows = ORDER != 0 ? cells_along(0) : 1;  // on a curve, cells along x are no run
@@ -607,7 +668,7 @@ while (place < stop) {
                 return Part{cell[0], cell[1], cell[2], 0, home};
             return Part{cell[0], cell[1], cell[2], (int)(last - cell[0]) + 1, image};
         };
-        if (PERIODIC && !inside) {
+        if constexpr (!inside) {
             const Part part = part_of(row < rows ? row : 0);
             first[0] = part.first;
             y = part.y;
@@ -633,7 +694,7 @@ while (place < stop) {
                     back = length - ahead > back ? length - ahead : back;
             };
             for (int r = 0; r < base; ++r)
-                if (PERIODIC && !inside) {
+                if constexpr (!inside) {
                     const Part part = part_of(r);
                     if (part.image == image)  // as long as this one
                         overlap(ring(row_start(grid, part.y, part.z, system) + ring(part.first, grid.cells), grid.cells));
@@ -644,7 +705,7 @@ while (place < stop) {
             const int here = rows - base < 32 ? rows - base : 32;
 #pragma unroll 1
             for (int r = 0; r < here; ++r) {
-                const int other = __shfl_sync(ALL, begins, r), other_image = PERIODIC ? __shfl_sync(ALL, image, r) : 0;
+                const int other = __shfl_sync(ALL, begins, r), other_image = CROSSING ? __shfl_sync(ALL, image, r) : 0;
                 if (r < lane && other_image == image)
                     overlap(other);
             }
@@ -666,7 +727,7 @@ while (place < stop) {
         if (size > 0) {
             const int number = __popc(occupied & lanes_below);
             warp.runs[number] = Run{end, from - (end - size)};
-            if (PERIODIC && !inside) {
+            if constexpr (!inside) {
                 warp.run_images[number] = image;
                 translate(image, warp.run_moved[number]);
             }
@@ -845,7 +906,7 @@ while (place < stop) {
             auto four_of = [&](int k) {
                 const unsigned short* const from = (const unsigned short*)warp.lists[row_of(k)] + lane % 8 * 4;
                 const int4 four = make_int4(load_id(from[0]), load_id(from[1]), load_id(from[2]), load_id(from[3]));
-                if constexpr (PERIODIC == 1)
+                if constexpr (IDS == 1)
                     return make_int4(source_of(four.x), source_of(four.y), source_of(four.z), source_of(four.w));
                 else
                     return four;
@@ -899,6 +960,7 @@ while (place < stop) {
     int run_end = 0, run_shift = 0;  // of what this lane fetches
     const Run* run = warp.runs;
     Place candidates[FETCHED];
+    int runs_of[FETCHED];  // crossing: nothing may wait here for what is loaded, so that it is moved later
     auto fetch = [&]() {
 #pragma unroll
         for (int k = 0; k < FETCHED; ++k) {
@@ -912,20 +974,15 @@ while (place < stop) {
             if (!grid.dense && at >= grid.finite)  // the ring of cells closes
                 at -= grid.finite;
             candidates[k].p[0] = INF;
-            if (PERIODIC && !inside) {
-                const int of_run = (int)(run - warp.runs) - 1;
-                if (number < total && (warp.run_images[of_run] != home || (unsigned int)(at - place) >= (own ? group : 0))) {
-                    candidates[k] = load(sorted + at);
-#pragma unroll
-                    for (int a = 0; a < DIM; ++a)
-                        candidates[k].p[a] = Lattice::add(candidates[k].p[a], warp.run_moved[of_run][a]);
-                    candidates[k].id = bits_as_real(id_of_image(id_of(candidates[k].id), warp.run_images[of_run]));
-                }
-            } else if (number < total && (unsigned int)(at - place) >= (own ? group : 0)) {
-                candidates[k] = load(sorted + at);
-                if constexpr (PERIODIC == 2)
-                    candidates[k].id = bits_as_real(id_of_image(id_of(candidates[k].id), home));
+            bool taken = number < total;  // those of the group stand in front
+            if constexpr (inside)
+                taken = taken && (unsigned int)(at - place) >= (own ? group : 0);
+            else {
+                runs_of[k] = taken ? (int)(run - warp.runs) - 1 : 0;  // what is not taken is infinite: moved by what is finite, too
+                taken = taken && (warp.run_images[runs_of[k]] != home || (unsigned int)(at - place) >= (own ? group : 0));
             }
+            if (taken)
+                candidates[k] = load(sorted + at);
         }
     };
     for (bool finished = false; !finished;) {
@@ -943,6 +1000,14 @@ while (place < stop) {
             bool near[FETCHED];
 #pragma unroll
             for (int k = 0; k < FETCHED; ++k) {
+                if constexpr (IDS) {
+                    const int image = inside ? home : warp.run_images[runs_of[k]];
+                    candidates[k].id = bits_as_real(id_of_image(id_of(candidates[k].id), image));
+                }
+                if constexpr (!inside)
+#pragma unroll
+                    for (int a = 0; a < DIM; ++a)
+                        candidates[k].p[a] = Lattice::add(candidates[k].p[a], warp.run_moved[runs_of[k]][a]);
                 real square = 0;
 #pragma unroll
                 for (int a = 0; a < DIM; ++a) {
@@ -1039,21 +1104,23 @@ while (place < stop) {
                         saved[4 * FETCHED + 4 + k] = rows_low[k];
                     }
                 }
-                const Place query = DOUBLE || PERIODIC ? mine : open ? load_query(place + lane) : Place{{0, 0, 0}, 0};
+                const Place query = DOUBLE || CROSSING ? mine : open ? load_query(place + lane) : Place{{0, 0, 0}, 0};
                 for (; open; open &= open - 1) {
                     const int j = __ffs(open) - 1;
                     const int id = LIST ? warp.ids[tested + j] : warp.candidate_ids[first_candidate + j];
-                    if constexpr (PERIODIC) {
-                        const real* source = positions.data + (long long)ROW * source_of(id);
-                        hits |= exact_image(queries.data + (long long)ROW * my_id, source, image_of(id)) ? 1u << j : 0;
-                        continue;
-                    }
-                    real p[DIM];
-#pragma unroll
-                    for (int a = 0; a < DIM; ++a)
-                        p[a] = positions.data[(long long)ROW * id + a];
+                    real p[3];
+                    load_image(id, p);
                     const real over = excess(query.p, p);
-                    hits |= over < 0 || (EXACTLY && over <= 2 * band && exact_pair(query.p, p)) ? 1u << j : 0;
+                    bool hit = over < 0;
+                    if (EXACTLY && over >= 0 && over <= 2 * band) {
+                        if constexpr (inside)
+                            hit = exact_pair(query.p, p);
+                        else {
+                            const real* source = positions.data + (long long)ROW * source_of(id);
+                            hit = exact_image(queries.data + (long long)ROW * my_id, source, image_of(id));
+                        }
+                    }
+                    hits |= hit ? 1u << j : 0;
                 }
                 if constexpr (!DOUBLE) {
 #pragma unroll
@@ -1118,16 +1185,23 @@ while (place < stop) {
     place += group;
     __syncwarp();
 }
+if (!CROSSING)
+    break;
+}
 """
 
 
 class Launch(NamedTuple):
-    """A kernel, its threads in all and per block, and its last argument: whether it works on the queries."""
+    """A kernel, its threads in all and per block, and its last argument: whether it works on the queries.
+
+    One that may run `beside` the launch before it needs nothing that this one computes.
+    """
 
     kernel: wp.Kernel
     threads: int
     block: int
     of_queries: bool
+    beside: bool = False
 
 
 class Kernels(NamedTuple):
@@ -1140,6 +1214,7 @@ class Kernels(NamedTuple):
     scatter: wp.Kernel
     gather: wp.Kernel
     query: wp.Kernel
+    crossing: wp.Kernel | None
 
     def launches(self, n: int, m: int, own: bool, table: int | None = None) -> list[Launch]:
         """Return what is launched, in order, for n sources and m queries."""
@@ -1155,14 +1230,19 @@ class Kernels(NamedTuple):
                 Launch(self.scan, tiles * BLOCK, BLOCK, of_queries),
                 Launch(self.scatter, sweep, BLOCK, of_queries),
             ]
-            if not of_queries:
-                launches.append(Launch(self.gather, sweep, BLOCK, False))
-        return [*launches, Launch(self.query, -(-m // QUERY_BLOCK) * QUERY_BLOCK, QUERY_BLOCK, False)]
+            if not of_queries or self.crossing is not None:
+                launches.append(Launch(self.gather, sweep, BLOCK, of_queries))
+        threads = -(-m // QUERY_BLOCK) * QUERY_BLOCK
+        if self.crossing is not None:  # first: what takes longest
+            launches.append(Launch(self.crossing, min(threads, _CROSSING_BLOCKS * QUERY_BLOCK), QUERY_BLOCK, False))
+        return [*launches, Launch(self.query, threads, QUERY_BLOCK, False, beside=self.crossing is not None)]
 
     def load(self, device: wp.DeviceLike) -> None:
         """Compile and load what a launch needs: nothing is left to do while a CUDA graph is recorded."""
         wp.load_module(self.bounds.module, device=device, block_dim=BLOCK)
-        wp.load_module(self.query.module, device=device, block_dim=QUERY_BLOCK)
+        for kernel in (self.query, self.crossing):
+            if kernel is not None:
+                wp.load_module(kernel.module, device=device, block_dim=QUERY_BLOCK)
 
 
 @functools.cache
@@ -1187,23 +1267,28 @@ def cell_kernels(
     of the cells: 0 row-major, 1 Morton, 2 Hilbert. `periodic` and `batched` are those of
     `jfrnn.kernels._native.snippet`.
     """
-    blocks = blocks or (24 if not lists else 16 if double or periodic else 20)  # registers against occupancy, measured on an H200
+    blocks = blocks or (24 if not lists else 16 if double else 20)  # registers against occupancy, measured on an H200
     kind = f"{dim}d_{'f64' if double else 'f32'}_r{reach}x{reach_x}{('', '_morton', '_hilbert')[order]}"
     kind += ("", "_nearest", "_images")[periodic] + "_batched" * batched
     variant = f"{kind}{'_scaled' * scaled}{'_list' * lists}{'_later' * later}{'' if exact else '_inexact'}"
-    variant += f"_b{blocks}"
     grid = {"REACH": reach, "REACH_X": reach_x, "ORDER": order, "PARTS": _PARTS, "TILE": _TILE, "BLOCK": BLOCK}
     grid |= {"PERIODIC": periodic, "BATCHED": batched}
     query = {"SCALED": scaled, "LIST": lists, "LATER": later, "EXACTLY": exact}
     query |= {"QUERY_BLOCK": QUERY_BLOCK, **grid}
+
+    def query_kernel(name: str, crossing: bool = False) -> wp.Kernel:
+        module, kind = f"{name}_{variant}_b{blocks}", {"CROSSING": crossing, "SHIFTED": periodic if crossing else 0}
+        return _kernel(module, module, dim, double, QUERY_BLOCK, blocks, query | kind, EXACT, _QUERY)
+
     return Kernels(
         _kernel(f"bounds_{kind}", kind, dim, double, BLOCK, 1, grid, _REDUCE, _BOUNDS),
         _kernel(f"lay_out_{kind}", kind, dim, double, BLOCK, 1, grid, _REDUCE, _LAY_OUT),
         _kernel(f"count_{kind}", kind, dim, double, BLOCK, 1, grid, _COUNT),
         _kernel(f"scan_{kind}", kind, dim, double, BLOCK, 1, grid, _SCAN),
         _kernel(f"scatter_{kind}", kind, dim, double, BLOCK, 1, grid, _SCATTER),
-        _kernel(f"gather_{kind}", kind, dim, double, BLOCK, 1, grid, _GATHER),
-        _kernel(f"query_{variant}", variant, dim, double, QUERY_BLOCK, blocks, query, EXACT, _QUERY),
+        _kernel(f"gather_{kind}", kind, dim, double, BLOCK, 6 if periodic else 8, grid, _GATHER),
+        query_kernel("query"),
+        query_kernel("crossing", crossing=True) if periodic else None,
     )
 
 

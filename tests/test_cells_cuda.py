@@ -18,7 +18,7 @@ VARIANTS += [
 
 
 def compiles(kernels, folder):
-    for module in {kernels.bounds.module, kernels.query.module}:
+    for module in {kernel.module for kernel in (kernels.bounds, kernels.query, kernels.crossing) if kernel is not None}:
         wp.compile_aot_module(module, arch=90, module_dir=folder, use_ptx=True)
     return list(folder.glob("*.ptx"))
 
@@ -38,7 +38,7 @@ def test_boxes_batches_and_cutoffs_per_particle_compile(tmp_path):
     for rule, periodic in (("mean", 2), ("gather", 0)):
         kernel = levels.query_kernel(3, False, True, rule, GROUPS, HALVINGS, periodic, batched=True)
         wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
-    assert len(list(tmp_path.glob("*.ptx"))) == 4
+    assert len(list(tmp_path.glob("*.ptx"))) == 5
 
 
 @pytest.mark.parametrize("module", [cells_cpu, cells_cuda], ids=["cpu", "cuda"])
@@ -48,6 +48,16 @@ def test_scratch_is_at_most_64_bytes_per_particle(module, n, dim):
         fixed = 64 * 1024  # headers and bounds of blocks
         assert 4 * module.scratch_words(n, n, dim, width, True) <= 64 * n + fixed
         assert 4 * module.scratch_words(n, n, dim, width, False) <= 64 * (n + n) + fixed
+
+
+def test_queries_that_reach_out_of_a_box_have_a_kernel_of_their_own():
+    kernels = cells_cuda.cell_kernels(3, False, False, True, periodic=1)
+    for own, marks in ((True, 0), (False, 1)):
+        launches = kernels.launches(1000, 500, own)
+        assert [launch.kernel for launch in launches[-2:]] == [kernels.crossing, kernels.query]
+        assert [launch.beside for launch in launches] == [False] * (len(launches) - 1) + [True]
+        assert [(launch.kernel, launch.of_queries) for launch in launches].count((kernels.gather, True)) == marks
+        assert all(launch.threads % launch.block == 0 for launch in launches)
 
 
 def test_queries_of_their_own_are_sorted_too():

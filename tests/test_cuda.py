@@ -9,7 +9,7 @@ import pytest
 
 from jfrnn import _cuda
 
-DEVICE = SimpleNamespace(name="cuda:0")
+DEVICE = SimpleNamespace(alias="cuda:0")
 
 
 class Array:
@@ -45,8 +45,10 @@ class Warp:
         assert number == 0
         return DEVICE
 
-    def Stream(self, device, cuda_stream):
-        return SimpleNamespace(device=device, cuda_stream=cuda_stream)
+    def Stream(self, device, cuda_stream=7):  # 7: one of its own
+        stream = SimpleNamespace(device=device, cuda_stream=cuda_stream)
+        stream.wait_stream = lambda other: self.log.append(("wait", cuda_stream, other.cuda_stream))
+        return stream
 
     def launch(self, kernel, dim, inputs, device, block_dim, record_cmd):
         assert record_cmd
@@ -110,7 +112,8 @@ def registered(monkeypatch):
     def commands(x, count):
         if x.ptr == 666:
             raise RuntimeError("no such kernel")
-        return [_cuda.Command("sort", [x, 4], 4, 128), _cuda.Command("query", [x, count], 4, 32)]
+        besides = [_cuda.Command("beside", [x], 4, 32, beside=True)] if x.ptr >= 5000 else []
+        return [_cuda.Command("sort", [x, 4], 4, 128), _cuda.Command("query", [x, count], 4, 32), *besides]
 
     _cuda.register("called", warp, ["float", "int"], commands)
     assert handlers == [("called", "CUDA")]
@@ -150,6 +153,17 @@ def test_addresses_that_come_back_soon_become_a_graph(registered):
     assert not any(entry[0] == "graph" for entry in warp.log)
     call(handler, 1000, 2000)  # a graph that was made is kept
     assert warp.log[-1][0] == "graph"
+
+
+def test_what_may_run_beside_the_one_before_does_in_a_graph(registered):
+    handler, warp = registered
+    call(handler, 5000, 2000)
+    beside = ("launch", "beside", (5000,), 99)
+    assert warp.log == [*launches(5000, 2000), beside]
+    del warp.log[:]
+    call(handler, 5000, 2000)
+    sort, query = launches(5000, 2000)
+    assert warp.log == [("graph", (sort, ("wait", 7, 99), query, (*beside[:3], 7), ("wait", 99, 7)), 99)]
 
 
 def test_what_goes_wrong_is_told_to_xla(registered):
