@@ -81,6 +81,8 @@ class Scalars:
             return known
         if operation in ("add", "mul"):
             operands = sorted(operands)
+        if operation == "mul" and operands[0] == operands[1]:
+            operands = [self._known_up_to_sign(operands[0])] * 2
         arguments = ", ".join(f"{{{k}}}" for k in range(len(operands)))
         infix = dtype.startswith("float") and operation in _INFIX
         form = _INFIX[operation] if infix else f"Math::{operation}({arguments})"
@@ -125,6 +127,11 @@ class Scalars:
             self.nodes.append(node)
         return self._numbers[key]
 
+    def _known_up_to_sign(self, number: int) -> int:
+        """Return b - a for a - b, if it is there: its square is the same, bit by bit."""
+        form, operands, *_ = self.nodes[number]
+        return self._numbers.get((form, *reversed(operands)), number) if form == _INFIX["sub"] else number
+
     def _is(self, number: int, value: float) -> bool:
         known = self.value(number)
         return known is not None and known == value and bool(np.signbit(known) == np.signbit(value))
@@ -148,7 +155,19 @@ class Scalars:
             return first
         if operation == "neg" and self.nodes[first].form == "-{0}":
             return self.nodes[first].operands[0]
-        return None
+        reciprocal = self._reciprocal(last) if operation == "div" else None
+        return None if reciprocal is None else self.apply("mul", (first, reciprocal), dtype)
+
+    def _reciprocal(self, number: int) -> int | None:
+        """Return 1 / a for powers of two and choices of them, as in the derivative of max: to multiply by it is to divide."""
+        form, operands, dtype, value = self.nodes[number]
+        if value is not None and dtype.startswith("float"):
+            mantissa, exponent = np.frexp(value)
+            return self.constant(1 / value, dtype) if abs(mantissa) == 0.5 and abs(exponent) < 100 else None
+        if not form.startswith("Math::select"):
+            return None
+        parts = [self._reciprocal(k) for k in operands[1:]]
+        return None if None in parts else self.apply("select", [operands[0], *(k for k in parts if k is not None)], dtype)
 
     def _folded(self, operation: str, operands: Sequence[int], dtype: str) -> int | None:
         values = [self.value(k) for k in operands]
