@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 
 from jfrnn import _warp
 from jfrnn._auto import level_of_caller
 from jfrnn._backends import Inputs, Options, prepared
 from jfrnn._box import unpacked_turns
-from jfrnn._exact import Radii, compensated_sum, rounded_sum
+from jfrnn._exact import Radii
 from jfrnn._scalars import NoTranslationError, hash_of
 from jfrnn._terms import POSITIONS, Groups, Term, joined
 from jfrnn._translate import input_name, output_name, translate
@@ -41,12 +41,19 @@ class Plan(NamedTuple):
     key: str
 
 
-def refusal(inputs: Inputs, platform: str) -> str | None:
-    """Say what of a search this engine cannot do; None: nothing."""
-    if platform != "cpu":
-        return f"on the platform {platform!r}, only on the CPU"
+FASTEST_ON = ("cpu",)  # platforms where "auto" takes this engine: it was measured there
+
+
+def refusal(inputs: Inputs, platform: str, reduce: str) -> str | None:
+    """Say what of a search, or of the reduction, this engine cannot do; None: nothing."""
+    if platform not in ("cpu", "gpu", "cuda"):
+        return f"on the platform {platform!r}, only on the CPU and on CUDA"
     if isinstance(inputs.cutoff, Radii):
         return "with a cutoff per particle"
+    if platform != "cpu" and inputs.box is not None and any(inputs.box.periodic):
+        return f"in a periodic box on the platform {platform!r}"
+    if platform != "cpu" and reduce != "sum":
+        return f"with reduce={reduce!r} on the platform {platform!r}"
     return None
 
 
@@ -179,19 +186,14 @@ def _launched(
     extremes: bool = False,
 ) -> tuple[Array, Array, Array]:
     """Hand a prepared search and what a plan reads to the kernel."""
-    sources, queries, *_, torus, _ = search
+    sources, queries, cutoff, batch, torus, _ = search
     if torus is not None:
         operands = joined(operands, Groups((), (torus[1].query_turns,), (torus[1].turns,)))
     sizes = None, (sources if queries is None else queries).shape[0], sources.shape[0]
     columns = plan.shared, plan.own, plan.others
-    values = tuple(_packed(*group, sources.dtype) for group in zip(operands, columns, sizes, strict=True))
-
-    def call(search: Any, values: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:  # noqa: ANN401
-        sources, queries, cutoff, batch, torus, _ = search
-        given = options.filter, batch, torus, plan.text, plan.key, values
-        return _warp.pair_sums(sources, queries, cutoff, *given, compensated, extremes)
-
-    return lax.platform_dependent(search, values, cpu=call)
+    shared, own, others = (_packed(*group, sources.dtype) for group in zip(operands, columns, sizes, strict=True))
+    given = options.filter, batch, torus, plan.text, plan.key, (shared, own, others)
+    return _warp.pair_sums(sources, queries, cutoff, *given, compensated, extremes)
 
 
 def _packed(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) -> Array:
@@ -204,20 +206,14 @@ def _packed(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) 
 
 
 def _unpacked(term: Term, sums: Array, totals: Array) -> list[Array]:
-    """Return the sums of each summand from the columns of all; totals come in parts [slots, 2, width], sums and their errors."""
+    """Return the sums of each summand from the columns of all."""
     found, row, total = [], 0, 0
     for like, is_total in zip(term.summands, term.totals, strict=True):
         size = math.prod(like.shape)
         if is_total:
-            found.append(_added(totals[:, :, total : total + size]).reshape(like.shape))
+            found.append(totals[total : total + size].reshape(like.shape))
             total += size
         else:
             found.append(sums[:, row : row + size].reshape(-1, *like.shape))
             row += size
     return found
-
-
-def _added(parts: Array) -> Array:
-    """Add parts [slots, 2, width] in twice the precision."""
-    zero = jnp.zeros((), parts.dtype)
-    return rounded_sum(*lax.reduce((parts[:, 0], parts[:, 1]), (zero, zero), compensated_sum, (0,)))

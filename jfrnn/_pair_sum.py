@@ -65,10 +65,10 @@ def pair_sum(
         active: As in `search`.
         compensated: Carry the rounding errors of the sums along (two-sum, Knuth 1969) and add them in the end: the result is as if
             summed in twice the precision. Derivatives are summed so, too. "max" and "min" are not concerned.
-        backend: "jax" (cells, any device), "brute" (all n·m candidates), "warp" (cells, on the CPU: fn is translated into the
-            kernel that finds the pairs), or "auto": "warp" where it can do what is asked, else "jax". "warp" sums floats of the
-            dtype of positions, with one cutoff for all; values, and what fn closes over, are of that dtype or smaller floats,
-            bool, int32 or (float64) int64. Where fn or its derivative has no translation, "auto" warns.
+        backend: "jax" (cells, any device), "brute" (all n·m candidates), "warp" (cells, on the CPU and on CUDA: fn is translated
+            into the kernel that finds the pairs), or "auto": on the CPU "warp" where it can do what is asked, else "jax". "warp"
+            sums floats of the dtype of positions, with one cutoff for all; values, and what fn closes over, are of that dtype or
+            smaller floats, bool, int32 or (float64) int64. Where fn or its derivative has no translation, "auto" warns.
         neighbors: A list whose pairs are taken instead of a search: those that are closer than its cutoff at these positions, as
             `NeighborList.vectors` says. A half list gives whole sums, too. Options with which it was made are left out. Rows that
             overflowed lack pairs here as everywhere: see `NeighborList.check`.
@@ -87,8 +87,9 @@ def pair_sum(
     Order of summation: the neighbors of a particle as the engine meets them (cell by cell, or by index in "brute", or as listed) in
     groups of up to 32; first within a group, then one group after the other. The
     same input gives the same bits. With k neighbors the error is at most 4 eps·sqrt(k) of the sum of |terms| for k up to 60 000;
-    compensated a few eps of the sum itself, and some eps²·k of the sum of |terms|. "warp" adds up 4 to 16 sums side by side, and
-    these by halves; the bound is the same, and the bits depend on the processor's vector width, not on the number of threads.
+    compensated a few eps of the sum itself, and some eps²·k of the sum of |terms|. "warp" on the CPU adds up 4 to 16 sums side by
+    side, and these by halves; the bound is the same, and the bits depend on the processor's vector width, not on the number of
+    threads. On CUDA it adds those among up to 704 candidates one after the other, then their sums; again with that bound.
     Denormal numbers count as zero in what fn computes on the CPU, as everywhere in XLA; pairs are decided with them.
     Memory: what `search` takes without its list, the results, and at most 16 MB (float32) for each array that fn needs for the
     pairs that are in work; nothing grows with the number of pairs, in derivatives neither. "warp" has no pairs in work, but two
@@ -119,7 +120,7 @@ def pair_sum(
         problem = checked_problem(
             positions, cutoff, queries, box, batch, radius_rule, False, include_self, closed, backend, 0.0, active
         )
-        pairs = _reduction.searched(problem.inputs, _with_engine(problem, backend))
+        pairs = _reduction.searched(problem.inputs, _with_engine(problem, backend, reduce))
     else:
         given = {"batch": batch is not None, "radius_rule": radius_rule != "gather", "include_self": include_self}
         given |= {"closed": closed, "active": active is not None, "backend": backend != "auto"}
@@ -135,17 +136,19 @@ def pair_sum(
     return _reduction.reduced(fn, pairs, mine, theirs, reduce, symmetry, compensated)
 
 
-def _with_engine(problem: Problem, backend: str) -> Options:
+def _with_engine(problem: Problem, backend: str, reduce: str) -> Options:
     """Return options with an engine that can answer: "auto" stays where it depends on the term, else becomes "jax"."""
     from jfrnn import _fused
 
     (sources, queries, *_), options = problem.inputs, problem.options
     if options.backend != "warp":
         return options
-    reason = _fused.refusal(problem.inputs, platform_of(sources, sources if queries is None else queries))
+    platform = platform_of(sources, sources if queries is None else queries)
+    reason = _fused.refusal(problem.inputs, platform, reduce)
     if reason is not None and backend == "warp":
         raise ValueError(f"backend='warp' cannot sum over pairs {reason}: pass backend='jax'.")
-    return options._replace(backend=backend if reason is None else "jax")
+    is_taken = reason is None and (backend == "warp" or platform in _fused.FASTEST_ON)
+    return options._replace(backend=backend if is_taken else "jax")
 
 
 def _checked_values(name: str, values: Any, size: int, what: str) -> Any:  # noqa: ANN401

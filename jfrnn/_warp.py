@@ -25,7 +25,7 @@ from jax import Array, lax
 from jfrnn import _cuda
 from jfrnn._batch import Batch
 from jfrnn._box import Lattice, Wrapped
-from jfrnn._exact import Cutoff, Cutoffs, make_cutoff
+from jfrnn._exact import Cutoff, Cutoffs, compensated_sum, make_cutoff, rounded_sum
 from jfrnn._levels import GROUPS, HALVINGS, Levels
 from jfrnn._runs import Filter
 
@@ -253,12 +253,13 @@ def _cuda_callable(variant: Variant) -> Any:  # noqa: ANN401
 def _cuda_target(
     name: str, types: dict[str, Any], outputs: int, commands: Callable[..., list[_cuda.Command]]
 ) -> Callable[..., Sequence[Array]]:
-    """Make a function that XLA calls on CUDA, as `_callable` makes one for the CPU: its outputs are int32."""
-    _cuda.register(name, load_warp(), [kind.dtype for kind in types.values()], commands)
-    results = list(types)[-outputs:]
+    """Make a function that XLA calls on CUDA, as `_callable` makes one for the CPU."""
+    wp = load_warp()
+    _cuda.register(name, wp, [kind.dtype for kind in types.values()], commands)
+    results = {key: wp.dtype_to_numpy(types[key].dtype) for key in list(types)[-outputs:]}
 
     def call(*inputs: Array, output_dims: dict[str, Any]) -> Sequence[Array]:
-        shapes = [jax.ShapeDtypeStruct(tuple(np.atleast_1d(output_dims[key]).tolist()), jnp.int32) for key in results]
+        shapes = [jax.ShapeDtypeStruct(tuple(np.atleast_1d(output_dims[key]).tolist()), results[key]) for key in results]
         return jax.ffi.ffi_call(name, shapes, vmap_method="sequential")(*inputs)
 
     return call
@@ -421,6 +422,7 @@ class _SumVariant(NamedTuple):
     compensated: bool
     extremes: bool
     key: str
+    cuda: bool
 
 
 def pair_sums(
@@ -436,29 +438,63 @@ def pair_sums(
     compensated: bool,
     extremes: bool = False,
 ) -> tuple[Array, Array, Array]:
-    """Sum a term (`jfrnn.kernels.pair_sum_cpu.TermText`, named by its key) with the columns that it reads: CPU.
+    """Sum a term (`jfrnn.kernels.pair_sum_cpu.TermText`, named by its key) with the columns that it reads.
 
     Returns:
-        The sums of each query [m, width]; parts of the sums over all pairs with what rounding took of them [slots, 2, width]; and
-        for `extremes`, where sums are the largest summands, their sources and the codes of their images, int32 [m, width, 2].
+        The sums of each query [m, width]; the sums over all pairs [totals]; and for `extremes`, where sums are the largest
+        summands, their sources and the codes of their images, int32 [m, width, 2].
     """
-    (n, dim), m, double = sources.shape, (sources if queries is None else queries).shape[0], sources.dtype == jnp.float64
-    own = queries is None
-    kind = _periodic_kind(torus), batch is not None
-    variant = _SumVariant(dim, double, cutoff.scaled, own, cutoff.closed, keep.drop_self, *kind, compensated, extremes, key)
+
+    def on(cuda: bool) -> Callable[..., tuple[Array, Array, Array]]:
+        def call(
+            sources: Array,
+            queries: Array | None,
+            cutoff: Cutoff,
+            batch: Batch | None,
+            torus: tuple[Lattice, Wrapped] | None,
+            values: tuple[Array, Array, Array],
+        ) -> tuple[Array, Array, Array]:
+            flags = (queries is None, cutoff.closed, keep.drop_self, _periodic_kind(torus), batch is not None)
+            double, kind = sources.dtype == jnp.float64, (compensated, extremes, key, cuda)
+            variant = _SumVariant(sources.shape[1], double, cutoff.scaled, *flags, *kind)
+            return _call_sums(variant, term, _packed(sources, queries, cutoff, batch, torus), values)
+
+        return call
+
+    return lax.platform_dependent(sources, queries, cutoff, batch, torus, values, cpu=on(False), cuda=on(True))
+
+
+def _call_sums(
+    variant: _SumVariant,
+    term: Any,  # noqa: ANN401
+    particles: tuple[Array, Array, Array],
+    values: tuple[Array, Array, Array],
+) -> tuple[Array, Array, Array]:
+    """Let XLA call the kernels, and add up the parts of the sums over all pairs, with what rounding took of them."""
+    n, m, engine = len(particles[0]), len(particles[1]), kernels_of(_module_of(variant))
     totals = sum(part.total for part in term.sums)
-    width, slots = len(term.sums) - totals, kernels_of("pair_sum_cpu").slots(m)
+    width, slots = len(term.sums) - totals, engine.slots(m)
     dims = {
         "sums": (m, max(width, 1)),
         "totals": max(2 * slots * totals, 1),
-        "errors": max(m * width * (2 * extremes + compensated), 1),
+        "errors": max(m * width * (2 * variant.extremes + variant.compensated), 1),
     }
-    dims |= {"columns": max(n * term.source_columns, 1), "info": 2}
-    dims["scratch"] = kernels_of("cells_cpu").scratch_words(n, m, dim, 2 if double else 1, own)
-    call = _sum_callable(variant, term)
-    sums, parts, rest, *_ = call(*_packed(sources, queries, cutoff, batch, torus), *values, output_dims=dims)
-    which = as_integer(rest).reshape(m, width, 2) if extremes else jnp.zeros((m, width, 0), jnp.int32)
-    return sums, parts[: 2 * slots * totals].reshape(slots, 2, totals), which
+    dims |= {"columns": max(n * engine.row_length(term.source_columns, variant.double), 1), "info": 2}
+    cells = kernels_of(f"cells_{'cuda' if variant.cuda else 'cpu'}")
+    dims["scratch"] = cells.scratch_words(n, m, variant.dim, 2 if variant.double else 1, variant.own)
+    sums, parts, rest, *_ = _sum_callable(variant, term)(*particles, *values, output_dims=dims)
+    which = as_integer(rest).reshape(m, width, 2) if variant.extremes else jnp.zeros((m, width, 0), jnp.int32)
+    return sums, _added(parts[: 2 * slots * totals].reshape(slots, 2, totals)), which
+
+
+def _added(parts: Array) -> Array:
+    """Add parts [slots, 2, width], sums and their errors, in twice the precision."""
+    zero = jnp.zeros((), parts.dtype)
+    return rounded_sum(*lax.reduce((parts[:, 0], parts[:, 1]), (zero, zero), compensated_sum, (0,)))
+
+
+def _module_of(variant: _SumVariant) -> str:
+    return f"pair_sum_{'cuda' if variant.cuda else 'cpu'}"
 
 
 @functools.cache
@@ -472,12 +508,16 @@ def _sum_callable(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN401
     flags |= {"closed": variant.closed, "dropself": variant.drop_self, "batched": variant.batched}
     flags |= {"nearest": variant.periodic == 1, "images": variant.periodic == 2}
     flags |= {"compensated": variant.compensated, "extremes": variant.extremes, variant.key: True}
-    name = "_".join([f"jfrnn_pair_sum_cpu_{variant.dim}d", *(flag for flag, on in flags.items() if on)])
-    return _callable(name, functools.partial(_run_sums_on_cpu, variant, term), types, 6)
+    name = "_".join([f"jfrnn_{_module_of(variant)}_{variant.dim}d", *(flag for flag, on in flags.items() if on)])
+    if not variant.cuda:
+        return _callable(name, functools.partial(_run_sums_on_cpu, variant, term), types, 6)
+    if wp.is_cuda_available():
+        _sum_kernels_on_cuda(variant, term).load(wp.get_cuda_device())
+    return _cuda_target(name, types, 6, functools.partial(_sum_commands, variant, term))
 
 
 @functools.cache
-def _sum_kernels(variant: _SumVariant, term: Any) -> tuple[Any, Any, Any]:  # noqa: ANN401
+def _sum_kernels_on_cpu(variant: _SumVariant, term: Any) -> tuple[Any, Any, Any]:  # noqa: ANN401
     """Return the kernels that sort particles, sort values, and sum; loaded, since several threads launch them at once."""
     wp, sums = load_warp(), kernels_of("pair_sum_cpu")
     dim, double, scaled = variant[:3]
@@ -491,7 +531,7 @@ def _sum_kernels(variant: _SumVariant, term: Any) -> tuple[Any, Any, Any]:  # no
 
 
 def _run_sums_on_cpu(variant: _SumVariant, term: Any, *arrays: Any) -> None:  # noqa: ANN401
-    wp, (build, sort_values, query) = load_warp(), _sum_kernels(variant, term)
+    wp, (build, sort_values, query) = load_warp(), _sum_kernels_on_cpu(variant, term)
     positions, queries, cutoff, shared, own, others, sums, totals, errors, columns, info, scratch = arrays
     n, m = positions.shape[0], queries.shape[0]
     sizes = [n, m, int(variant.own), kernels_of("_native").table_cells(n)]
@@ -502,6 +542,28 @@ def _run_sums_on_cpu(variant: _SumVariant, term: Any, *arrays: Any) -> None:  # 
     arguments = [positions, queries, cutoff, shared, own, columns, sums, totals, errors, scratch, *sizes]
     arguments += [int(variant.closed), int(variant.drop_self)]
     _on_every_core(lambda: wp.launch(query, dim=1, inputs=arguments, device="cpu"), -(-m // _PLACES_PER_THREAD))
+
+
+def _sum_kernels_on_cuda(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN401
+    dim, double, scaled = variant[:3]
+    make = kernels_of("pair_sum_cuda").sum_kernels
+    return make(term, variant.key, dim, double, scaled, variant.compensated, batched=variant.batched)
+
+
+def _sum_commands(variant: _SumVariant, term: Any, *arrays: Any) -> list[_cuda.Command]:  # noqa: ANN401
+    positions, queries, cutoff, *_, info, scratch = arrays
+    n, m = positions.shape[0], queries.shape[0]
+    sizes = [n, m, int(variant.own), kernels_of("_native").table_cells(n)]
+    flags = [int(variant.closed), int(variant.drop_self)]
+    kernels = _sum_kernels_on_cuda(variant, term)
+    # what sorts particles takes the arguments of a search that only counts
+    unused = load_warp().array(ptr=info.ptr, shape=(1, 1), dtype=info.dtype, device=info.device)
+    of_stage = [positions, queries, cutoff, unused, info, info, scratch, *sizes, 0, *flags]
+    of_sum = [*arrays, *sizes, *flags]
+    return [
+        _cuda.Command(x.kernel, of_sum if x.kernel in kernels.summing else [*of_stage, int(x.of_queries)], x.threads, x.block)
+        for x in kernels.launches(n, m, variant.own)
+    ]
 
 
 # --- cells of many sizes: a cutoff per particle -----------------------------------------------------------------------

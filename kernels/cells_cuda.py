@@ -12,6 +12,7 @@ crossing the same in a periodic box, for queries whose reach leaves it: images t
 """
 
 import functools
+from string import Template
 from typing import NamedTuple
 
 import warp as wp
@@ -21,12 +22,13 @@ BLOCK = 256
 QUERY_BLOCK = 32  # one warp: others need not wait for it to end
 _PARTS = 256  # blocks of `bounds`; one thread of a block reads one part
 _TILE = 2048  # cells that a block of `scan` takes
+GRID = {"REACH": 1, "REACH_X": 6, "PARTS": _PARTS, "TILE": _TILE, "BLOCK": BLOCK}  # what all kernels of a search must agree on
 _HEADER_WORDS = 64
 _SWEEP_BLOCKS = 1056  # blocks of the kernels that walk over all particles
 _CROSSING_BLOCKS = 8448  # blocks of the kernel for queries whose reach leaves a box: what is to do is known to the device only
 _RESIDENT = 132  # blocks of those that walk over the cells: all at work at once
 
-_LAYOUT = r"""
+LAYOUT = r"""
 struct Shared {
     Grid grid;
     int finite_queries;
@@ -343,10 +345,10 @@ for (long long place = thread; !of_queries && place < n; place += threads) {
 }
 """
 
-_QUERY = r"""
-constexpr int BLOCKS = 22;  // of candidates, whose neighbors are written together
+_WALK = Template(r"""
+constexpr bool HELD = LIST || SUMS;  // pairs are held until many can be written, or evaluated, together
+constexpr int BLOCKS = 22;  // of candidates, whose pairs are held
 constexpr int CHUNK = 32;  // neighbors of a query that are written at once
-constexpr int TAKEN = 4;  // neighbors that a lane numbers at a time
 constexpr int FETCHED = 2;  // candidates that a lane fetches at a time
 constexpr int RING = 128;  // candidates: fewer than a block, what is fetched twice, rounded up
 constexpr unsigned int ONES = 0x3c003c00;  // two halves
@@ -379,8 +381,23 @@ auto translate = [&](int code, real* moved) {
     for (int k = 0; k < DIM; ++k)
         moved[k] = lattice.translation(shift[0], shift[1], shift[2], k);
 };
-// the image of a source that an id names
+auto load = [&](const Place* from) -> Place {
+    if constexpr (DOUBLE) {
+        const double2 a = __ldg((const double2*)from), b = __ldg((const double2*)from + 1);
+        return Place{{(real)a.x, (real)a.y, (real)b.x}, (real)b.y};
+    } else {
+        const float4 a = __ldg((const float4*)from);
+        return Place{{(real)a.x, (real)a.y, (real)a.z}, (real)a.w};
+    }
+};
+// What is summed is named by its place, which is where all that is known of it stands; else an id names the image of a source.
 auto load_image = [&](int id, real* p) {
+    if constexpr (SUMS) {
+        const Place here = load(sorted + id);
+        for (int k = 0; k < DIM; ++k)
+            p[k] = here.p[k];
+        return;
+    }
     point_of(positions.data + (long long)ROW * source_of(id), p);
     if constexpr (!inside) {
         real moved[3];
@@ -404,11 +421,11 @@ struct alignas(16) Warp {  // what a warp shares
         // of a ring of candidates near the group's box: coordinates (float64) or columns of a matrix, pairs of halves (float32)
         real candidates[DOUBLE ? DIM : 4][RING + 8];
         // per query, while rows are written: addresses of the ids that are next, two in a word; the stride is odd, for the banks
-        unsigned int lists[32][CHUNK / 2 + 3];
+        unsigned int lists[SUMS ? 1 : 32][CHUNK / 2 + 3];
     };
-    int candidate_ids[LATER || !LIST ? RING : 1];
-    int ids[LIST ? 32 * (BLOCKS + FETCHED) : 1];  // of all of them since the rows were last written
-    unsigned int hits[LIST ? BLOCKS + 1 : 1][32];  // per block of candidates and query: one bit per candidate
+    int candidate_ids[LATER || !HELD ? RING : 1];
+    int ids[HELD ? 32 * (BLOCKS + FETCHED) : 1];  // of all of them since pairs were last settled
+    unsigned int hits[HELD ? BLOCKS + 1 : 1][32];  // per block of candidates and query: one bit per candidate
     unsigned int written[LIST ? 32 : 1];  // per query: neighbors that stand in its row, a multiple of four, plus those left over
     int left[LIST ? 3 : 1][32];  // of those, the ids
     Box box;  // of the group
@@ -422,7 +439,7 @@ __shared__ int finite_queries, longest_before;
 if (lane == 0) {
     grid = shared.grid;
     finite_queries = shared.finite_queries;
-    longest_before = *(volatile int*)&info.data[0];
+    longest_before = SUMS ? 0 : *(volatile int*)&info.data[0];
 }
 __syncwarp();
 const unsigned int lanes_below = (1u << lane) - 1;
@@ -433,14 +450,8 @@ const real sure_square = inner_radius * inner_radius - 8 * (1 + SHIFTED) * step_
 const real beyond = outer_radius * outer_radius * (1 + 16 * step_eps) - sure_square;
 const real band = CROSSING ? real(0.5) * beyond : 8 * step_eps * square_radius;
 const bool drops_self = own && drop_self;
-auto load = [&](const Place* from) -> Place {
-    if constexpr (DOUBLE) {
-        const double2 a = __ldg((const double2*)from), b = __ldg((const double2*)from + 1);
-        return Place{{(real)a.x, (real)a.y, (real)b.x}, (real)b.y};
-    } else {
-        const float4 a = __ldg((const float4*)from);
-        return Place{{(real)a.x, (real)a.y, (real)a.z}, (real)a.w};
-    }
+auto source_at = [&](const Place& candidate) -> int {
+    return SUMS ? id_of(load(sorted + id_of(candidate.id)).id) : source_of(id_of(candidate.id));
 };
 auto load_query = [&](int at) -> Place {
     if (own)
@@ -496,6 +507,7 @@ for (int turn = block; !CROSSING || turn < shared.crossing; turn += (int)(thread
 const long long begin = (long long)(CROSSING ? crossing[turn] : turn) * 32;
 int place = begin < m ? (int)begin : m;
 const int stop = m - place < 32 ? m : place + 32;
+$opened
 while (place < stop) {
     // one query per lane; those that share a row of cells with the first form a group
     Place mine{{0, 0, 0}, 0};
@@ -519,11 +531,7 @@ while (place < stop) {
     const int group = __ffs(~__ballot_sync(ALL, beside)) == 0 ? 32 : __ffs(~__ballot_sync(ALL, beside)) - 1;
     if (group == 0) {  // non-finite: an empty row
         const int id = id_of(load_query(place).id);
-        if (LIST)
-            for (int s = lane; s < capacity; s += 32)
-                idx.data[(long long)id * capacity + s] = fill_value;
-        if (lane == 0)
-            count.data[id] = 0;
+        $none
         ++place;
         continue;
     }
@@ -737,7 +745,7 @@ while (place < stop) {
         __syncwarp();
         return __shfl_sync(ALL, end, 31);
     };
-    // since the rows were last written: `kept` candidates, of which `tested` have met the queries
+    // since pairs were last settled: `kept` candidates, of which `tested` have met the queries
     int found = 0;  // neighbors of this query
     unsigned int kept = 0, tested = 0;
     if constexpr (LIST)
@@ -757,9 +765,9 @@ while (place < stop) {
             }
             warp.candidates[3][number % RING] = __uint_as_float(halves(square, 1));
         }
-        if constexpr (LATER || !LIST)
+        if constexpr (LATER || !HELD)
             warp.candidate_ids[number % RING] = id_of(candidate.id);
-        if constexpr (LIST)
+        if constexpr (HELD)
             warp.ids[number] = id_of(candidate.id);
     };
     // queries as rows of matrices, see meet: those of a quad of lanes, whose lanes hold one column each
@@ -836,125 +844,14 @@ while (place < stop) {
         Place at_home = mine;
         if constexpr (PERIODIC == 2)
             at_home.id = bits_as_real(id_of_image(my_id, home));
+        if constexpr (SUMS)
+            at_home.id = bits_as_real(place + lane);
         if (lane < group)
             keep(at_home, mine_from_center, lane);
         kept = group;
     }
     unsigned int met_in = 0;  // blocks that have a neighbor of this query, a bit each
-    auto write_rows = [&](bool finished) {
-        // behind the last block one of all n, which fill the rows up, or one that nobody has met
-        const unsigned int behind = 1u << tested / 32;
-        warp.hits[tested / 32][lane] = finished ? ALL : 0;
-        if (finished)
-            warp.ids[tested + lane] = fill_value;
-        met_in |= behind;
-        int written = (int)(warp.written[lane] & ~3u);
-        unsigned int waiting = warp.written[lane] & 3;
-        unsigned int* const list = warp.lists[lane];
-        list[0] = shared_address(&warp.left[0][lane]) | shared_address(&warp.left[1][lane]) << 16;
-#pragma unroll
-        for (int k = 1; k < CHUNK / 2 + 2; ++k)  // what is read, whether it is written or not
-            list[k] = shared_address(&warp.left[2][lane]) * 0x10001u;
-        __syncwarp();
-        const unsigned int words = shared_address(&warp.hits[0][lane]), to_ids = shared_address(warp.ids) - words;
-        const unsigned int list_begin = shared_address(list), list_end = list_begin + 2 * CHUNK;
-        const unsigned int last_ids = finished ? 1 : words + to_ids + 4 * tested;
-        unsigned int hits = 0, ids = 0, next = 0, next_ids = 0;
-        auto advance = [&]() {  // to the next block, if nothing is left of this one; its bits are loaded ahead
-            asm volatile("{.reg .pred empty; .reg .u32 below, bit;"
-                         "setp.eq.u32 empty, %0, 0;"
-                         "@empty mov.b32 %0, %1;"
-                         "@empty mov.b32 %2, %3;"
-                         "@empty sub.u32 below, %4, 1;"
-                         "@empty lop3.b32 bit, below, %4, 0, 0x30;"
-                         "@empty popc.b32 bit, bit;"
-                         "@empty lop3.b32 %4, %4, below, %5, 0xea;"
-                         "@empty mad.lo.u32 bit, bit, 128, %6;"
-                         "@empty ld.shared.u32 %1, [bit];"
-                         "@empty add.u32 %3, bit, %7;}"
-                         : "+r"(hits), "+r"(next), "+r"(ids), "+r"(next_ids), "+r"(met_in)
-                         : "r"(behind), "r"(words), "r"(to_ids) : "memory");
-        };
-        advance();
-        for (bool more = true; more;) {
-            // every lane numbers its next neighbors
-            unsigned int list_at = list_begin + 2 * waiting;
-            while (list_at < list_end && ids != last_ids) {
-                advance();
-                const unsigned int taken = __popc(hits) < TAKEN ? __popc(hits) : TAKEN;
-#pragma unroll
-                for (int k = 0; k < TAKEN; ++k) {
-                    const unsigned int below = hits - 1, address = ids + 4 * __popc(below & ~hits);
-                    hits &= below;
-                    asm volatile("st.shared.u16 [%0], %1;" : : "r"(list_at + 2 * k), "h"((unsigned short)address) : "memory");
-                }
-                list_at += 2 * taken;
-            }
-            waiting = (list_at - list_begin) / 2;
-            // eight lanes write what waits for one row, and maybe more that will be written again
-            const unsigned int ready = waiting >= CHUNK ? CHUNK : ids == last_ids ? waiting & ~3u : 0;
-            const int before = lane < group && ready > 0 ? written : capacity;
-            __syncwarp();
-            auto load_id = [](unsigned int at) {  // may be moved: nothing is written to where addresses lead
-                int id;
-                asm("ld.shared.u32 %0, [%1];" : "=r"(id) : "r"(at));
-                return id;
-            };
-            auto row_of = [&](int k) { return k + lane / 8; };
-            char* const column = (char*)(idx.data + lane % 8 * 4);
-            const unsigned int row_bytes = 4u * (unsigned int)capacity;
-            auto four_of = [&](int k) {
-                const unsigned short* const from = (const unsigned short*)warp.lists[row_of(k)] + lane % 8 * 4;
-                const int4 four = make_int4(load_id(from[0]), load_id(from[1]), load_id(from[2]), load_id(from[3]));
-                if constexpr (IDS == 1)
-                    return make_int4(source_of(four.x), source_of(four.y), source_of(four.z), source_of(four.w));
-                else
-                    return four;
-            };
-            auto out_of = [&](int k, int& room) {
-                const unsigned int row_before = __shfl_sync(ALL, before, row_of(k)), row_id = __shfl_sync(ALL, my_id, row_of(k));
-                room = capacity - lane % 8 * 4 - (int)row_before;
-                return (int*)(column + (unsigned long long)row_id * row_bytes + (unsigned long long)row_before * 4);
-            };
-            if ((capacity & 3) == 0) {  // only then rows begin where 16 bytes may be stored at once
-#pragma unroll
-                for (int k = 0; k < 32; k += 4) {
-                    int room;
-                    int* const out = out_of(k, room);
-                    const int4 four = four_of(k);
-                    if (room > 0)
-                        asm volatile("st.global.v4.s32 [%0], {%1, %2, %3, %4};"
-                                     : : "l"(out), "r"(four.x), "r"(four.y), "r"(four.z), "r"(four.w) : "memory");
-                }
-            } else {
-#pragma unroll 1
-                for (int k = 0; k < 32; k += 4) {
-                    int room;
-                    int* const out = out_of(k, room);
-                    const int4 four = four_of(k);
-                    if (room > 0) out[0] = four.x;
-                    if (room > 1) out[1] = four.y;
-                    if (room > 2) out[2] = four.z;
-                    if (room > 3) out[3] = four.w;
-                }
-            }
-            __syncwarp();
-            written += ready;
-            waiting -= ready;
-            const unsigned int one = list[ready / 2], two = list[ready / 2 + 1];  // of up to three more
-            list[0] = one;
-            list[1] = two;
-            more = __any_sync(ALL, finished ? lane < group && written < capacity : ids != last_ids);
-        }
-        if (!finished) {
-            warp.written[lane] = (unsigned int)written | waiting;
-            const int ids[3] = {load_word(list[0] & 0xffff), load_word(list[0] >> 16), load_word(list[1] & 0xffff)};
-#pragma unroll
-            for (int k = 0; k < 3; ++k)
-                warp.left[k][lane] = ids[k];
-        }
-        met_in = 0;
-    };
+    $begun
 
     int base = 0, total = 0, fetched = 0;  // rows of cells, candidates of their runs, those that were fetched
     int run_end = 0, run_shift = 0;  // of what this lane fetches
@@ -983,6 +880,8 @@ while (place < stop) {
             }
             if (taken)
                 candidates[k] = load(sorted + at);
+            if constexpr (SUMS)
+                candidates[k].id = bits_as_real(at);
         }
     };
     for (bool finished = false; !finished;) {
@@ -1017,7 +916,7 @@ while (place < stop) {
                 }
                 near[k] = square <= box.center[3];
                 if (BATCHED && !grid.dense && near[k])
-                    near[k] = system_of(positions.data + (long long)ROW * source_of(id_of(candidates[k].id))) == system;
+                    near[k] = system_of(positions.data + (long long)ROW * source_at(candidates[k])) == system;
             }
 #pragma unroll
             for (int k = 0; k < FETCHED; ++k) {
@@ -1032,7 +931,7 @@ while (place < stop) {
         }
         const bool last_ones = fetched >= total && base >= rows;
         __syncwarp();
-        while ((!LIST || tested < 32 * BLOCKS) && kept >= tested + (last_ones ? 1 : 32)) {
+        while ((!HELD || tested < 32 * BLOCKS) && kept >= tested + (last_ones ? 1 : 32)) {
             const unsigned int first_candidate = tested % RING;
             const unsigned int here = kept - tested < 32 ? kept - tested : 32;
             unsigned int met = lane < group ? ALL >> (32 - here) : 0;  // candidates that are none are not met
@@ -1107,7 +1006,7 @@ while (place < stop) {
                 const Place query = DOUBLE || CROSSING ? mine : open ? load_query(place + lane) : Place{{0, 0, 0}, 0};
                 for (; open; open &= open - 1) {
                     const int j = __ffs(open) - 1;
-                    const int id = LIST ? warp.ids[tested + j] : warp.candidate_ids[first_candidate + j];
+                    const int id = HELD ? warp.ids[tested + j] : warp.candidate_ids[first_candidate + j];
                     real p[3];
                     load_image(id, p);
                     const real over = excess(query.p, p);
@@ -1138,7 +1037,7 @@ while (place < stop) {
                 }
             }
             found += __popc(hits);
-            if constexpr (LIST) {
+            if constexpr (HELD) {
                 warp.hits[tested / 32][lane] = hits;
                 met_in |= hits ? 1u << tested / 32 : 0;
             }
@@ -1146,9 +1045,9 @@ while (place < stop) {
         }
         __syncwarp();
         finished = last_ones && tested >= kept;
-        if constexpr (LIST)
+        if constexpr (HELD)
             if (finished || tested == 32 * BLOCKS) {
-                write_rows(finished);
+                $settled
                 if (finished)
                     break;
                 kept = kept > tested ? kept - tested : 0;
@@ -1174,21 +1073,183 @@ while (place < stop) {
                     }
             }
     }
-    if (lane < group)
-        count.data[my_id] = found;
-    const int longest_row = __reduce_max_sync(ALL, lane < group ? found : 0);
-    if (lane == 0 && longest_row > longest_before) {
-        atomicMax(&info.data[0], longest_row);
-        if (LIST && longest_row > capacity)
-            atomicOr(&info.data[1], 1);
-    }
+    $done
     place += group;
     __syncwarp();
 }
+$closed
 if (!CROSSING)
     break;
 }
+""")
+
+# How a lane walks over the bits of its query, block by block that has any: `hits` are those of a block that are left, `ids` the
+# address of the block's ids. Behind the last block stands one, `behind` as a bit, that is never left.
+HELD_PAIRS = r"""
+const unsigned int words = shared_address(&warp.hits[0][lane]), to_ids = shared_address(warp.ids) - words;
+unsigned int hits = 0, ids = 0, next = 0, next_ids = 0;
+auto advance = [&]() {  // to the next block, if nothing is left of this one; its bits are loaded ahead
+    asm volatile("{.reg .pred empty; .reg .u32 below, bit;"
+                 "setp.eq.u32 empty, %0, 0;"
+                 "@empty mov.b32 %0, %1;"
+                 "@empty mov.b32 %2, %3;"
+                 "@empty sub.u32 below, %4, 1;"
+                 "@empty lop3.b32 bit, below, %4, 0, 0x30;"
+                 "@empty popc.b32 bit, bit;"
+                 "@empty lop3.b32 %4, %4, below, %5, 0xea;"
+                 "@empty mad.lo.u32 bit, bit, 128, %6;"
+                 "@empty ld.shared.u32 %1, [bit];"
+                 "@empty add.u32 %3, bit, %7;}"
+                 : "+r"(hits), "+r"(next), "+r"(ids), "+r"(next_ids), "+r"(met_in)
+                 : "r"(behind), "r"(words), "r"(to_ids) : "memory");
+};
+auto load_id = [](unsigned int at) {  // may be moved: nothing is written to where addresses lead
+    int id;
+    asm("ld.shared.u32 %0, [%1];" : "=r"(id) : "r"(at));
+    return id;
+};
 """
+
+_WRITE_ROWS = (
+    r"""
+auto write_rows = [&](bool finished) {
+    constexpr int TAKEN = 4;  // neighbors that a lane numbers at a time
+    // behind the last block one of all n, which fill the rows up, or one that nobody has met
+    const unsigned int behind = 1u << tested / 32;
+    warp.hits[tested / 32][lane] = finished ? ALL : 0;
+    if (finished)
+        warp.ids[tested + lane] = fill_value;
+    met_in |= behind;
+    int written = (int)(warp.written[lane] & ~3u);
+    unsigned int waiting = warp.written[lane] & 3;
+    unsigned int* const list = warp.lists[lane];
+    list[0] = shared_address(&warp.left[0][lane]) | shared_address(&warp.left[1][lane]) << 16;
+#pragma unroll
+    for (int k = 1; k < CHUNK / 2 + 2; ++k)  // what is read, whether it is written or not
+        list[k] = shared_address(&warp.left[2][lane]) * 0x10001u;
+    __syncwarp();
+"""
+    + HELD_PAIRS
+    + r"""
+    const unsigned int list_begin = shared_address(list), list_end = list_begin + 2 * CHUNK;
+    const unsigned int last_ids = finished ? 1 : words + to_ids + 4 * tested;
+    advance();
+    for (bool more = true; more;) {
+        // every lane numbers its next neighbors
+        unsigned int list_at = list_begin + 2 * waiting;
+        while (list_at < list_end && ids != last_ids) {
+            advance();
+            const unsigned int taken = __popc(hits) < TAKEN ? __popc(hits) : TAKEN;
+#pragma unroll
+            for (int k = 0; k < TAKEN; ++k) {
+                const unsigned int below = hits - 1, address = ids + 4 * __popc(below & ~hits);
+                hits &= below;
+                asm volatile("st.shared.u16 [%0], %1;" : : "r"(list_at + 2 * k), "h"((unsigned short)address) : "memory");
+            }
+            list_at += 2 * taken;
+        }
+        waiting = (list_at - list_begin) / 2;
+        // eight lanes write what waits for one row, and maybe more that will be written again
+        const unsigned int ready = waiting >= CHUNK ? CHUNK : ids == last_ids ? waiting & ~3u : 0;
+        const int before = lane < group && ready > 0 ? written : capacity;
+        __syncwarp();
+        auto row_of = [&](int k) { return k + lane / 8; };
+        char* const column = (char*)(idx.data + lane % 8 * 4);
+        const unsigned int row_bytes = 4u * (unsigned int)capacity;
+        auto four_of = [&](int k) {
+            const unsigned short* const from = (const unsigned short*)warp.lists[row_of(k)] + lane % 8 * 4;
+            const int4 four = make_int4(load_id(from[0]), load_id(from[1]), load_id(from[2]), load_id(from[3]));
+            if constexpr (IDS == 1)
+                return make_int4(source_of(four.x), source_of(four.y), source_of(four.z), source_of(four.w));
+            else
+                return four;
+        };
+        auto out_of = [&](int k, int& room) {
+            const unsigned int row_before = __shfl_sync(ALL, before, row_of(k)), row_id = __shfl_sync(ALL, my_id, row_of(k));
+            room = capacity - lane % 8 * 4 - (int)row_before;
+            return (int*)(column + (unsigned long long)row_id * row_bytes + (unsigned long long)row_before * 4);
+        };
+        if ((capacity & 3) == 0) {  // only then rows begin where 16 bytes may be stored at once
+#pragma unroll
+            for (int k = 0; k < 32; k += 4) {
+                int room;
+                int* const out = out_of(k, room);
+                const int4 four = four_of(k);
+                if (room > 0)
+                    asm volatile("st.global.v4.s32 [%0], {%1, %2, %3, %4};"
+                                 : : "l"(out), "r"(four.x), "r"(four.y), "r"(four.z), "r"(four.w) : "memory");
+            }
+        } else {
+#pragma unroll 1
+            for (int k = 0; k < 32; k += 4) {
+                int room;
+                int* const out = out_of(k, room);
+                const int4 four = four_of(k);
+                if (room > 0) out[0] = four.x;
+                if (room > 1) out[1] = four.y;
+                if (room > 2) out[2] = four.z;
+                if (room > 3) out[3] = four.w;
+            }
+        }
+        __syncwarp();
+        written += ready;
+        waiting -= ready;
+        const unsigned int one = list[ready / 2], two = list[ready / 2 + 1];  // of up to three more
+        list[0] = one;
+        list[1] = two;
+        more = __any_sync(ALL, finished ? lane < group && written < capacity : ids != last_ids);
+    }
+    if (!finished) {
+        warp.written[lane] = (unsigned int)written | waiting;
+        const int ids[3] = {load_word(list[0] & 0xffff), load_word(list[0] >> 16), load_word(list[1] & 0xffff)};
+#pragma unroll
+        for (int k = 0; k < 3; ++k)
+            warp.left[k][lane] = ids[k];
+    }
+    met_in = 0;
+};
+"""
+)
+
+_NO_ROW = r"""
+if (LIST)
+    for (int s = lane; s < capacity; s += 32)
+        idx.data[(long long)id * capacity + s] = fill_value;
+if (lane == 0)
+    count.data[id] = 0;
+"""
+
+_ROW_DONE = r"""
+if (lane < group)
+    count.data[my_id] = found;
+const int longest_row = __reduce_max_sync(ALL, lane < group ? found : 0);
+if (lane == 0 && longest_row > longest_before) {
+    atomicMax(&info.data[0], longest_row);
+    if (LIST && longest_row > capacity)
+        atomicOr(&info.data[1], 1);
+}
+"""
+
+
+def walk(*, opened: str = "", none: str, begun: str, settled: str, done: str = "", closed: str = "") -> str:
+    """Return the text of a kernel in which a block of one warp serves the 32 queries of its number, `turn`, in groups.
+
+    Around it stand the pieces CELLS, LAYOUT and EXACT. Constants it needs: LIST, or SUMS, or neither, and the pairs are counted:
+    `found`; LATER, EXACTLY, CROSSING. With SUMS candidates are named by their places in `sorted`.
+
+    Args:
+        opened: Comes before the queries from `place` to `stop`; they may be none.
+        none: What is done with a query, `id`, that is not finite.
+        begun: Of a group, of which `my_id`, its first `place` and its size, `group`, are known: defines what `settled` calls.
+        settled: What is done with the pairs that are held: those of blocks of candidates below `tested`, whose ids stand in
+            `warp.ids`, and bits in `warp.hits`; `met_in` says in which. `finished`: they are the last ones of the group.
+        done: After the last ones.
+        closed: After the last group.
+    """
+    return _WALK.substitute(opened=opened, none=none, begun=begun, settled=settled, done=done, closed=closed)
+
+
+_ROWS = walk(none=_NO_ROW, begun=_WRITE_ROWS, settled="write_rows(finished);", done=_ROW_DONE)
 
 
 class Launch(NamedTuple):
@@ -1253,8 +1314,8 @@ def cell_kernels(
     lists: bool,
     later: bool = False,
     exact: bool = True,
-    reach: int = 1,
-    reach_x: int = 6,
+    reach: int = GRID["REACH"],
+    reach_x: int = GRID["REACH_X"],
     blocks: int | None = None,
     order: int = 0,
     periodic: int = 0,
@@ -1271,14 +1332,13 @@ def cell_kernels(
     kind = f"{dim}d_{'f64' if double else 'f32'}_r{reach}x{reach_x}{('', '_morton', '_hilbert')[order]}"
     kind += ("", "_nearest", "_images")[periodic] + "_batched" * batched
     variant = f"{kind}{'_scaled' * scaled}{'_list' * lists}{'_later' * later}{'' if exact else '_inexact'}"
-    grid = {"REACH": reach, "REACH_X": reach_x, "ORDER": order, "PARTS": _PARTS, "TILE": _TILE, "BLOCK": BLOCK}
-    grid |= {"PERIODIC": periodic, "BATCHED": batched}
-    query = {"SCALED": scaled, "LIST": lists, "LATER": later, "EXACTLY": exact}
-    query |= {"QUERY_BLOCK": QUERY_BLOCK, **grid}
+    grid = {**GRID, "REACH": reach, "REACH_X": reach_x, "ORDER": order, "PERIODIC": periodic, "BATCHED": batched}
+    query = {"SCALED": scaled, "LIST": lists, "SUMS": 0, "LATER": later, "EXACTLY": exact}
+    query |= grid
 
     def query_kernel(name: str, crossing: bool = False) -> wp.Kernel:
         module, kind = f"{name}_{variant}_b{blocks}", {"CROSSING": crossing, "SHIFTED": periodic if crossing else 0}
-        return _kernel(module, module, dim, double, QUERY_BLOCK, blocks, query | kind, EXACT, _QUERY)
+        return _kernel(module, module, dim, double, QUERY_BLOCK, blocks, query | kind, EXACT, _ROWS)
 
     return Kernels(
         _kernel(f"bounds_{kind}", kind, dim, double, BLOCK, 1, grid, _REDUCE, _BOUNDS),
@@ -1310,7 +1370,7 @@ def _kernel(
     ): ...  # fmt: skip
 
     native.__name__ = native.__qualname__ = f"{name}_native"
-    function = wp.func_native(snippet("double" if double else "float", dim, CELLS, _LAYOUT, *pieces, **constants))(native)
+    function = wp.func_native(snippet("double" if double else "float", dim, CELLS, LAYOUT, *pieces, **constants))(native)
 
     def kernel(
         positions: points, queries: points, cutoff: reals, idx: rows, count: ints, info: ints, scratch: ints,

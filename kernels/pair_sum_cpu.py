@@ -90,6 +90,12 @@ def slots(queries: int) -> int:
     return -(-queries // CHUNK)
 
 
+def row_length(columns: int, double: bool) -> int:
+    """Return how many numbers of each source the sorted values have: one for each column."""
+    del double
+    return columns
+
+
 _SORT_VALUES = r"""
 for (;;) {
     const int chunk = __atomic_fetch_add(&shared.next_sorted, 1, __ATOMIC_RELAXED);
@@ -219,7 +225,7 @@ _CHUNK_DONE = r"""
 """
 
 
-def _loaded(value: Value, lanes: str, bits: str, double: bool) -> str:
+def loaded(value: Value, lanes: str, bits: str, double: bool) -> str:
     """Return a statement that defines a value from `lanes` of the dtype of positions, or from their `bits`.
 
     Integers of the same width travel as their bits; in float64, integers of 32 bits as their values, and so do truths in both.
@@ -232,10 +238,10 @@ def _loaded(value: Value, lanes: str, bits: str, double: bool) -> str:
 
 def _spread(value: Value, at: str, double: bool) -> str:
     """Return a statement that defines a value, the same in all lanes, from a number."""
-    return _loaded(value, f"Math::of({at})", f"Math::of(bits_of({at}))", double)
+    return loaded(value, f"Math::of({at})", f"Math::of(bits_of({at}))", double)
 
 
-def _placed(values: tuple[Value, ...], column: str, axis: str) -> list[str]:
+def placed(values: tuple[Value, ...], column: str, axis: str) -> list[str]:
     """Return where values are: those that have a column, and positions along an axis."""
     numbers = itertools.count()
     return [column.format(next(numbers)) if value.axis is None else axis.format(value.axis) for value in values]
@@ -312,8 +318,8 @@ def _meet(term: TermText, reduction: _Reduction, double: bool, packed: bool, flu
     modes = {"flush": FLUSH, "keep": KEEP} if flushed else {"flush": "", "keep": ""}
 
     def evaluation(column: str, number: str) -> str:
-        lanes = _placed(term.others, column, "points.p[{}]")
-        lines = [_loaded(value, x, f"Math::bits({x})", double) for value, x in zip(term.others, lanes, strict=True)]
+        lanes = placed(term.others, column, "points.p[{}]")
+        lines = [loaded(value, x, f"Math::bits({x})", double) for value, x in zip(term.others, lanes, strict=True)]
         steps = ((step.name, column.format(term.columns + c)) for c, step in enumerate(term.steps))
         lines += [f"const number {name} = {x} + turned{c};\n" for c, (name, x) in enumerate(steps)]
         lines += [term.text, reduction.each(number)]
@@ -321,14 +327,14 @@ def _meet(term: TermText, reduction: _Reduction, double: bool, packed: bool, flu
 
     numbers = sum(value.axis is None for value in term.own)
     column = f"own_values.data[(long long)id * {numbers + bool(term.steps)} + {{}}]"
-    begin = [_spread(value, at, double) for value, at in zip(term.own, _placed(term.own, column, "q[{}]"), strict=True)]
+    begin = [_spread(value, at, double) for value, at in zip(term.own, placed(term.own, column, "q[{}]"), strict=True)]
     turns = [f"real(Lattice::turn({column.format(numbers)}, {step.axis}))" for step in term.steps]
     begin += [f"const number turned{c} = Math::of({x});\n" for c, x in enumerate(turns)]
     begin.append(reduction.before)
     by_packing = _PACKED.substitute(modes, of_packed=evaluation("*(const number*)(near_column[{}] + b)", "doubtful[b + l]"))
     if packed:
         return "".join([*begin, "{", by_packing, "}\n"])
-    skip = "if (hit == 0)\n    continue;" if _work(term.text) > VERY_LITTLE_WORK else ""
+    skip = "if (hit == 0)\n    continue;" if work(term.text) > VERY_LITTLE_WORK else ""
     in_place = evaluation("*(const number*)(column[{}] + b)", "b + l")
     of_doubtful = evaluation("gathered(column[{}], doubtful + b)", "doubtful[b + l]")
     as_they_are = _IN_PLACE.substitute(modes, skip=skip, in_place=in_place, of_doubtful=of_doubtful)
@@ -404,7 +410,7 @@ def sort_kernel(dim: int, double: bool) -> wp.Kernel:
     return wp.kernel(sort_values, module=module)
 
 
-def _work(text: str) -> int:
+def work(text: str) -> int:
     """Return roughly how many operations a text takes."""
     called = re.findall(r"Math::(\w+)\(", text)
     return text.count("const auto v") + _SERIES * sum(any(name in call for name in _SERIES_NAMES) for call in called)
@@ -430,7 +436,7 @@ def query_kernel(
     """
     scalar = wp.float64 if double else wp.float32
     rows, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
-    packed = _work(term.text) > LITTLE_WORK if packed is None else packed
+    packed = work(term.text) > LITTLE_WORK if packed is None else packed
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
     variant += f"{('', '_nearest', '_images')[periodic]}{'_batched' * batched}{'_extremes' * extremes}_{key}"
     totals = sum(part.total for part in term.sums)

@@ -1,0 +1,152 @@
+"""Pair sums on CUDA as far as a machine without a GPU can tell: every kind of term compiles for one.
+
+What they answer is decided on a GPU.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import warp as wp
+from jfrnn.kernels import cells_cuda, pair_sum_cuda
+
+import jfrnn
+from jfrnn import _fused, _warp
+from jfrnn._pair_sum import _with_engine
+from jfrnn._search import checked_problem
+
+CUTOFF = 0.1
+
+
+def poly6(r, i, j):
+    return j * jnp.maximum(CUTOFF**2 - r @ r, 0) ** 3
+
+
+def everything(r, i, j):
+    """A term that calls functions, and reads integers and truths."""
+    far = jnp.exp(-jnp.sqrt(r @ r + 1)) * jnp.tanh(j["charge"])
+    return {"far": far * r, "kinds": jnp.where(j["heavy"], i["kind"] - j["kind"], 3).astype(r.dtype)}
+
+
+def square_sum(values, x, scale, fn=poly6, **options):
+    sums = jfrnn.pair_sum(
+        lambda r, i, j: jax.tree.map(lambda y: scale * y, fn(r, i, j)), x, CUTOFF, values, backend="warp", **options
+    )
+    return sum((leaf**2).sum() for leaf in jax.tree.leaves(sums))
+
+
+def plan_of(function, *args):
+    """Return the plan of the last pair sum of the program that a function becomes."""
+    found = []
+
+    def planned(*args):
+        found.append(original(*args))
+        return found[-1]
+
+    original = _fused.planned
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_fused, "planned", planned)
+        jax.jit(lambda *args: function(*args)).lower(*args)
+    return found[-1]
+
+
+def arguments(dtype, dim):
+    values = {"charge": np.ones(4, dtype), "heavy": np.ones(4, bool), "kind": np.ones(4, np.int32)}
+    return np.ones(4, dtype), jnp.zeros((4, dim), dtype), jnp.asarray(1, dtype), values
+
+
+def compiles_for(plan, dim, double, folder, **variant):
+    options = {"scaled": False, "compensated": False} | variant
+    kernels = pair_sum_cuda.sum_kernels(plan.text, plan.key, dim, double, **options)
+    wp.compile_aot_module(kernels.query.module, arch=90, module_dir=folder, use_ptx=True)
+    return len(list(folder.glob("*.ptx"))) == 1
+
+
+@pytest.mark.parametrize(
+    ("dim", "dtype", "variant"),
+    [
+        (3, np.float32, {}),
+        (2, np.float32, {"compensated": True}),
+        (3, np.float32, {"batched": True, "scaled": True}),
+        (2, np.float64, {}),
+        (3, np.float64, {"batched": True, "compensated": True}),
+    ],
+)
+def test_densities_compile(dim, dtype, variant, tmp_path):
+    masses, x, scale, _ = arguments(dtype, dim)
+    assert compiles_for(plan_of(square_sum, masses, x, scale), dim, dtype == np.float64, tmp_path, **variant)
+
+
+@pytest.mark.parametrize("argnums", [0, 1, 2], ids=["values", "positions", "closed over"])
+def test_derivatives_compile(argnums, tmp_path):
+    masses, x, scale, _ = arguments(np.float32, 3)
+    plan = plan_of(jax.grad(square_sum, argnums), masses, x, scale)
+    assert [part.total for part in plan.text.sums] == [argnums == 2] * len(plan.text.sums)
+    assert compiles_for(plan, 3, False, tmp_path)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_functions_and_values_of_all_kinds_compile(dtype, tmp_path):
+    _, x, scale, values = arguments(dtype, 3)
+    plan = plan_of(functools.partial(square_sum, fn=everything), values, x, scale)
+    assert {value.dtype for value in plan.text.others} == {np.dtype(dtype).name, "bool", "int32"}
+    assert compiles_for(plan, 3, dtype == np.float64, tmp_path)
+
+
+def test_terms_that_read_nothing_compile(tmp_path):
+    plan = plan_of(lambda x: jfrnn.pair_sum(lambda r, i, j: 1.0, x, CUTOFF, backend="warp"), jnp.zeros((4, 3), np.float32))
+    assert not (plan.text.own or plan.text.source_columns)
+    kernels = pair_sum_cuda.sum_kernels(plan.text, plan.key, 3, False, False, False)
+    assert kernels.sort_values is None
+    assert compiles_for(plan, 3, False, tmp_path)
+
+
+def test_stages_are_those_of_a_search():
+    """Nothing but the query is compiled for a term; in between, what it reads is sorted."""
+    plan = plan_of(square_sum, *arguments(np.float32, 3)[:3])
+    kernels = pair_sum_cuda.sum_kernels(plan.text, plan.key, 3, False, False, False)
+    search = cells_cuda.cell_kernels(3, False, False, False)
+    for own in (True, False):
+        *stages, sort_values, query = kernels.launches(1000, 500, own)
+        assert stages == search.launches(1000, 500, own)[:-1]
+        assert (sort_values.kernel, query.kernel) == (kernels.sort_values, kernels.query)
+        assert query.threads == 32 * pair_sum_cuda.slots(500)
+        assert all(launch.threads % launch.block == 0 for launch in (*stages, sort_values, query))
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_rows_of_values_begin_where_16_bytes_may_be_loaded(double):
+    width = 8 if double else 4
+    lengths = [pair_sum_cuda.row_length(columns, double) for columns in range(40)]
+    assert all(0 <= length - columns < 16 // width for columns, length in enumerate(lengths))
+    assert all(length * width % 16 == 0 or length * width in (4, 8) for length in lengths[1:])
+
+
+def test_auto_stays_with_jax_where_nothing_was_measured(monkeypatch):
+    x = np.zeros((4, 3), np.float32)
+    problem = checked_problem(x, 1.0, None, None, None, "gather", False, False, False, "auto", 0.0, None)
+    assert _with_engine(problem, "auto", "sum").backend == "auto"
+    monkeypatch.setattr("jfrnn._pair_sum.platform_of", lambda *_: "gpu")
+    assert _with_engine(problem, "auto", "sum").backend == "jax"
+    assert _with_engine(problem, "warp", "sum").backend == "warp"
+    monkeypatch.setattr("jfrnn._pair_sum.platform_of", lambda *_: "rocm")
+    with pytest.raises(ValueError, match="on the platform 'rocm', only on the CPU and on CUDA"):
+        _with_engine(problem, "warp", "sum")
+
+
+def test_programs_for_cuda_call_it_and_launches_have_the_arguments_of_their_kernels():
+    x = np.zeros((40, 3), np.float32)
+    program = jax.jit(lambda x: square_sum(x[:, 0], x, 1.0)).trace(x).lower(lowering_platforms=("cuda",)).as_text()
+    assert "@jfrnn_pair_sum_cuda_3d_f32_own_dropself_" in program
+    plan = plan_of(square_sum, *arguments(np.float32, 3)[:3])
+    variant = _warp._SumVariant(3, False, False, True, False, True, 0, False, False, False, plan.key, True)
+    rows, line = wp.zeros((40, 3), dtype=float, device="cpu"), wp.zeros(40, dtype=float, device="cpu")
+    ints = wp.zeros(40, dtype=int, device="cpu")
+    commands = _warp._sum_commands(variant, plan.text, rows, rows, line, line, rows, rows, rows, line, line, line, ints, ints)
+    assert len(commands) == 8
+    for command in commands:
+        types = [argument.type for argument in command.kernel.adj.args]
+        given = [(x.dtype, x.ndim) if isinstance(x, wp.array) else int for x in command.arguments]
+        assert given == [(kind.dtype, kind.ndim) if isinstance(kind, wp.array) else int for kind in types]
