@@ -44,16 +44,14 @@ class Plan(NamedTuple):
 FASTEST_ON = ("cpu",)  # platforms where "auto" takes this engine: it was measured there
 
 
-def refusal(inputs: Inputs, platform: str, reduce: str) -> str | None:
-    """Say what of a search, or of the reduction, this engine cannot do; None: nothing."""
+def refusal(inputs: Inputs, platform: str) -> str | None:
+    """Say what of a search this engine cannot do; None: nothing."""
     if platform not in ("cpu", "gpu", "cuda"):
         return f"on the platform {platform!r}, only on the CPU and on CUDA"
     if isinstance(inputs.cutoff, Radii):
         return "with a cutoff per particle"
-    if platform != "cpu" and inputs.box is not None and any(inputs.box.periodic):
-        return f"in a periodic box on the platform {platform!r}"
-    if platform != "cpu" and reduce != "sum":
-        return f"with reduce={reduce!r} on the platform {platform!r}"
+    if platform != "cpu" and inputs.box is not None and inputs.sources.shape[0] >= _warp.MOST_IN_BOX:
+        return f"of more than {_warp.MOST_IN_BOX - 1} positions in a periodic box on the platform {platform!r}"
     return None
 
 

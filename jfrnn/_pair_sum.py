@@ -120,7 +120,7 @@ def pair_sum(
         problem = checked_problem(
             positions, cutoff, queries, box, batch, radius_rule, False, include_self, closed, backend, 0.0, active
         )
-        pairs = _reduction.searched(problem.inputs, _with_engine(problem, backend, reduce))
+        pairs = _reduction.searched(problem.inputs, _with_engine(problem, backend))
     else:
         given = {"batch": batch is not None, "radius_rule": radius_rule != "gather", "include_self": include_self}
         given |= {"closed": closed, "active": active is not None, "backend": backend != "auto"}
@@ -136,7 +136,7 @@ def pair_sum(
     return _reduction.reduced(fn, pairs, mine, theirs, reduce, symmetry, compensated)
 
 
-def _with_engine(problem: Problem, backend: str, reduce: str) -> Options:
+def _with_engine(problem: Problem, backend: str) -> Options:
     """Return options with an engine that can answer: "auto" stays where it depends on the term, else becomes "jax"."""
     from jfrnn import _fused
 
@@ -144,7 +144,7 @@ def _with_engine(problem: Problem, backend: str, reduce: str) -> Options:
     if options.backend != "warp":
         return options
     platform = platform_of(sources, sources if queries is None else queries)
-    reason = _fused.refusal(problem.inputs, platform, reduce)
+    reason = _fused.refusal(problem.inputs, platform)
     if reason is not None and backend == "warp":
         raise ValueError(f"backend='warp' cannot sum over pairs {reason}: pass backend='jax'.")
     is_taken = reason is None and (backend == "warp" or platform in _fused.FASTEST_ON)

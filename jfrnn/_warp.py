@@ -31,7 +31,7 @@ from jfrnn._runs import Filter
 
 INSTALL = 'pip install "jfrnn[warp]"'
 _PLACES_PER_THREAD = 2048  # below, a second thread costs more than it saves
-_MOST_IN_BOX = 1 << 27  # an id shares its bits with the code of an image
+MOST_IN_BOX = 1 << 27  # an id shares its bits with the code of an image
 _HUGE = 1 << 22  # bytes from which a buffer is worth a request for huge pages
 _PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
 
@@ -190,9 +190,9 @@ def _call(
     double = sources.dtype == jnp.float64
     periodic = _periodic_kind(torus)
     variant = Variant(dim, double, cutoff.scaled, lists, own, cutoff.closed, keep, periodic, batch is not None)
-    if periodic == 1 and n >= _MOST_IN_BOX:
+    if periodic == 1 and n >= MOST_IN_BOX:
         raise ValueError(
-            f"backend='warp' numbers at most {_MOST_IN_BOX - 1} positions in a periodic box, got {n}: pass backend='jax'."
+            f"backend='warp' numbers at most {MOST_IN_BOX - 1} positions in a periodic box, got {n}: pass backend='jax'."
         )
     words = kernels_of(module).scratch_words(n, m, dim, 2 if double else 1, own)
     dims: dict[str, Any] = {"count": m, "info": 2, "scratch": max(words, 1)}
@@ -547,7 +547,8 @@ def _run_sums_on_cpu(variant: _SumVariant, term: Any, *arrays: Any) -> None:  # 
 def _sum_kernels_on_cuda(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN401
     dim, double, scaled = variant[:3]
     make = kernels_of("pair_sum_cuda").sum_kernels
-    return make(term, variant.key, dim, double, scaled, variant.compensated, batched=variant.batched)
+    kind = {"periodic": variant.periodic, "batched": variant.batched, "extremes": variant.extremes}
+    return make(term, variant.key, dim, double, scaled, variant.compensated, **kind)
 
 
 def _sum_commands(variant: _SumVariant, term: Any, *arrays: Any) -> list[_cuda.Command]:  # noqa: ANN401
@@ -560,10 +561,12 @@ def _sum_commands(variant: _SumVariant, term: Any, *arrays: Any) -> list[_cuda.C
     unused = load_warp().array(ptr=info.ptr, shape=(1, 1), dtype=info.dtype, device=info.device)
     of_stage = [positions, queries, cutoff, unused, info, info, scratch, *sizes, 0, *flags]
     of_sum = [*arrays, *sizes, *flags]
-    return [
-        _cuda.Command(x.kernel, of_sum if x.kernel in kernels.summing else [*of_stage, int(x.of_queries)], x.threads, x.block)
-        for x in kernels.launches(n, m, variant.own)
-    ]
+
+    def command(launch: Any) -> _cuda.Command:  # noqa: ANN401
+        arguments = of_sum if launch.kernel in kernels.summing else [*of_stage, int(launch.of_queries)]
+        return _cuda.Command(launch.kernel, arguments, launch.threads, launch.block, launch.beside)
+
+    return [command(launch) for launch in kernels.launches(n, m, variant.own)]
 
 
 # --- cells of many sizes: a cutoff per particle -----------------------------------------------------------------------

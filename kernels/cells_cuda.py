@@ -357,7 +357,7 @@ constexpr unsigned int ONES = 0x3c003c00;  // two halves
 constexpr int ID_BITS = 27;
 // Inside, no row of cells leaves the box, and nothing that is near comes from outside of it: all are at home, nothing is moved.
 constexpr bool inside = !CROSSING;
-constexpr int IDS = PERIODIC == 1 && inside ? 0 : PERIODIC;
+constexpr int IDS = (PERIODIC == 1 || SUMS) && inside ? 0 : PERIODIC;
 int codes = 1, home = 0;
 if constexpr (IDS) {
     for (int k = 0; k < DIM; ++k)
@@ -371,13 +371,16 @@ auto id_of_image = [&](int source, int code) -> int {
 };
 auto source_of = [&](int id) -> int { return IDS == 0 ? id : IDS == 1 ? id & ((1 << ID_BITS) - 1) : id % n; };
 auto image_of = [&](int id) -> int { return IDS == 1 ? (int)((unsigned int)id >> ID_BITS) ^ home : id / n; };
-auto translate = [&](int code, real* moved) {
-    int shift[3] = {0, 0, 0};
+auto shift_of = [&](int code, int* shift) {
     for (int k = DIM - 1; k >= 0; --k) {
         const int each = 2 * lattice.images(k) + 1;
         shift[k] = code % each - lattice.images(k);
         code /= each;
     }
+};
+auto translate = [&](int code, real* moved) {
+    int shift[3] = {0, 0, 0};
+    shift_of(code, shift);
     for (int k = 0; k < DIM; ++k)
         moved[k] = lattice.translation(shift[0], shift[1], shift[2], k);
 };
@@ -390,15 +393,15 @@ auto load = [&](const Place* from) -> Place {
         return Place{{(real)a.x, (real)a.y, (real)a.z}, (real)a.w};
     }
 };
-// What is summed is named by its place, which is where all that is known of it stands; else an id names the image of a source.
+// An id names the image of a source; of what is summed the image of a place, which is where all that is known of it stands.
+auto source_named = [&](int id) -> int { return SUMS ? id_of(load(sorted + source_of(id)).id) : source_of(id); };
 auto load_image = [&](int id, real* p) {
     if constexpr (SUMS) {
-        const Place here = load(sorted + id);
+        const Place here = load(sorted + source_of(id));
         for (int k = 0; k < DIM; ++k)
             p[k] = here.p[k];
-        return;
-    }
-    point_of(positions.data + (long long)ROW * source_of(id), p);
+    } else
+        point_of(positions.data + (long long)ROW * source_of(id), p);
     if constexpr (!inside) {
         real moved[3];
         translate(image_of(id), moved);
@@ -450,9 +453,6 @@ const real sure_square = inner_radius * inner_radius - 8 * (1 + SHIFTED) * step_
 const real beyond = outer_radius * outer_radius * (1 + 16 * step_eps) - sure_square;
 const real band = CROSSING ? real(0.5) * beyond : 8 * step_eps * square_radius;
 const bool drops_self = own && drop_self;
-auto source_at = [&](const Place& candidate) -> int {
-    return SUMS ? id_of(load(sorted + id_of(candidate.id)).id) : source_of(id_of(candidate.id));
-};
 auto load_query = [&](int at) -> Place {
     if (own)
         return load(sorted + at);
@@ -842,10 +842,8 @@ while (place < stop) {
     bool meets_itself = drops_self;  // the first candidates are the queries themselves: number = lane
     if (own) {
         Place at_home = mine;
-        if constexpr (PERIODIC == 2)
-            at_home.id = bits_as_real(id_of_image(my_id, home));
-        if constexpr (SUMS)
-            at_home.id = bits_as_real(place + lane);
+        if constexpr (PERIODIC == 2 || SUMS)
+            at_home.id = bits_as_real(id_of_image(SUMS ? place + lane : my_id, home));
         if (lane < group)
             keep(at_home, mine_from_center, lane);
         kept = group;
@@ -916,7 +914,7 @@ while (place < stop) {
                 }
                 near[k] = square <= box.center[3];
                 if (BATCHED && !grid.dense && near[k])
-                    near[k] = system_of(positions.data + (long long)ROW * source_at(candidates[k])) == system;
+                    near[k] = system_of(positions.data + (long long)ROW * source_named(id_of(candidates[k].id))) == system;
             }
 #pragma unroll
             for (int k = 0; k < FETCHED; ++k) {
@@ -1015,7 +1013,7 @@ while (place < stop) {
                         if constexpr (inside)
                             hit = exact_pair(query.p, p);
                         else {
-                            const real* source = positions.data + (long long)ROW * source_of(id);
+                            const real* source = positions.data + (long long)ROW * source_named(id);
                             hit = exact_image(queries.data + (long long)ROW * my_id, source, image_of(id));
                         }
                     }
@@ -1232,10 +1230,10 @@ if (lane == 0 && longest_row > longest_before) {
 
 
 def walk(*, opened: str = "", none: str, begun: str, settled: str, done: str = "", closed: str = "") -> str:
-    """Return the text of a kernel in which a block of one warp serves the 32 queries of its number, `turn`, in groups.
+    """Return the text of a kernel in which a block of one warp serves 32 queries, from `begin` on, in groups.
 
     Around it stand the pieces CELLS, LAYOUT and EXACT. Constants it needs: LIST, or SUMS, or neither, and the pairs are counted:
-    `found`; LATER, EXACTLY, CROSSING. With SUMS candidates are named by their places in `sorted`.
+    `found`; LATER, EXACTLY, CROSSING. With SUMS candidates are images of places in `sorted`, not of sources.
 
     Args:
         opened: Comes before the queries from `place` to `stop`; they may be none.

@@ -156,8 +156,8 @@ for (int t = 0; t <= TOTALS; ++t)
     total[t] = total_carried[t] = 0;
 """
 
-# What finds the largest lane. NaN is larger than all; of equal ones comes first the smallest source, then the smallest image.
-_TAKE = r"""
+# What finds the largest. NaN is larger than all; of equal ones comes first the smallest source, then the smallest image.
+TAKE_LARGER = r"""
 auto take_larger = [](number x, Math::i32 source, Math::i32 code, Math::flag among, number& best, Math::i32& of, Math::i32& at) {
     const Math::flag is_nan = Math::ne(x, x), was_nan = Math::ne(best, best);
     const Math::flag larger = Math::either(Math::gt(x, best), Math::both(is_nan, Math::inverse(was_nan)));
@@ -175,6 +175,8 @@ auto put_integer = [&](long long at, int x) {
     else
         memcpy(errors.data + at, &x, 4);
 };
+"""
+_KEEP_LARGEST = r"""
 auto keep_largest = [&](number best, Math::i32 of, Math::i32 code, long long at, bool fresh) {
     real x = fresh ? -Bits::not_finite() : sums.data[at];
     int source = fresh ? n : integer_at(2 * at), image_of_it = fresh ? 0 : integer_at(2 * at + 1);
@@ -446,8 +448,9 @@ def query_kernel(
     constants |= {"TOTALS": totals, "ROW_SUMS": len(term.sums) - totals}
     reduction = _largest(term) if extremes else _added(term)
     shared = "".join(_spread(v, f"shared_values.data[{c}]", double) for c, v in enumerate(term.shared))
+    largest = (TAKE_LARGER + _KEEP_LARGEST) * extremes
     text = walk(
-        begin="".join([VECTOR, _ADD.replace("NUMBER_LANES", "f64" if double else "f32"), _TAKE * extremes, shared]),
+        begin="".join([VECTOR, _ADD.replace("NUMBER_LANES", "f64" if double else "f32"), largest, shared]),
         meet=_meet(term, reduction, double, packed, flushed=not scaled),
         met=reduction.after,
         none=_NO_SUM + _NO_EXTREME * extremes,

@@ -3,7 +3,9 @@
 The stages of `jfrnn.kernels.cells_cuda` sort the sources by cell. `sort_values` puts what a term reads of them, but for
 coordinates, into the same order, a row each. Then the walk of that module finds pairs as a search does, and holds their bits for
 22 blocks of candidates. A lane goes through the bits of its query and reads coordinates and row of each neighbor through the
-first-level cache, which the 31 other lanes share.
+first-level cache, which the 31 other lanes share. In a periodic box turns stand behind what is read of i and j, packed as in
+`jfrnn._box`: with the image of a neighbor they make its lattice shift S. In place of sums it can find the largest summands, and
+whose they are.
 
 Of a million particles with 108 neighbors (float32), 32 queries meet 570 candidates near their box. Evaluating the term for all of
 them would take 570 steps of the warp; for the pairs of one block of 32 at a time 345, as lanes wait for the one with most; for
@@ -22,7 +24,7 @@ from jfrnn.kernels._math import SCALAR
 from jfrnn.kernels._native import CELLS, EXACT, snippet
 from jfrnn.kernels.cells_cuda import GRID, HELD_PAIRS, LAYOUT, QUERY_BLOCK, Launch, cell_kernels, walk
 from jfrnn.kernels.cells_cuda import Kernels as CellKernels
-from jfrnn.kernels.pair_sum_cpu import LITTLE_WORK, TermText, Value, loaded, placed, work
+from jfrnn.kernels.pair_sum_cpu import LITTLE_WORK, TAKE_LARGER, TermText, Value, loaded, placed, work
 
 _SWEEP_BLOCKS = 4224  # blocks of the kernel that walks over all values
 
@@ -47,13 +49,18 @@ for (long long t = thread; t < (long long)ROW_LENGTH * n; t += threads) {
 """
 
 _OPENED = r"""
-for (int t = lane; turn < query_blocks && t < 2 * TOTALS; t += 32)
-    totals.data[2ll * TOTALS * turn + t] = 0;
+const long long slot_of_totals = begin / 32;
+for (int t = lane; slot_of_totals < query_blocks && t < 2 * TOTALS; t += 32)
+    totals.data[2 * TOTALS * slot_of_totals + t] = 0;
 """
 
 _NO_SUM = r"""
 for (int r = lane; r < ROW_SUMS; r += 32)
     sums.data[(long long)id * ROW_SUMS + r] = 0;
+"""
+_NO_EXTREME = r"""
+for (int r = lane; r < 2 * ROW_SUMS; r += 32)
+    put_integer(2ll * ROW_SUMS * id + r, r % 2 ? 0 : n);
 """
 
 # Sums, and what rounding took of them, which is added in the end, or goes on as they do.
@@ -86,11 +93,28 @@ auto add_total = [&](int t, real sum, real error) {  // of all lanes, always in 
         error += other_error;
     }
     if (lane == 0) {
-        real* const part = totals.data + 2ll * TOTALS * turn + t;
+        real* const part = totals.data + 2 * TOTALS * slot_of_totals + t;
         two_sum(part[0], part[TOTALS], sum);
         part[TOTALS] += error;
     }
 };
+"""
+_KEEP_LARGEST = r"""
+int code_at_home = 1;
+for (int k = 0; PERIODIC && k < DIM; ++k)
+    code_at_home *= 2 * lattice.images(k) + 1;
+code_at_home /= 2;
+auto keep_largest = [&](long long at, real best, int of, int code, bool fresh) {
+    real x = fresh ? -INF : sums.data[at];
+    int source = fresh ? n : integer_at(2 * at), image = fresh ? 0 : integer_at(2 * at + 1);
+    take_larger(best, of, code, true, x, source, image);
+    sums.data[at] = x;
+    put_integer(2 * at, source);
+    put_integer(2 * at + 1, image);
+};
+"""
+
+_LOAD_ROW = r"""
 struct Row { real at[ROW_LENGTH]; };
 auto load_row = [&](int place) -> Row {
     constexpr int TOGETHER = ROW_LENGTH * sizeof(real) < 16 ? ROW_LENGTH : 16 / sizeof(real);
@@ -119,7 +143,7 @@ auto add_pairs = [&](bool finished) {
     __syncwarp();
     const long long own_at = (long long)my_id * OWN, at = (long long)my_id * ROW_SUMS;
     $values
-    $sums
+    $started
     $held_pairs
     advance();
     for (advance(); __any_sync(ALL, hits != 0); advance()) {
@@ -127,7 +151,7 @@ auto add_pairs = [&](bool finished) {
         for (int k = 0; k < TAKEN; ++k) {
             const bool is_pair = hits != 0;
             const unsigned int below = hits - 1;
-            const int source = load_id(ids + 4 * __popc(below & ~hits));
+            const int id = load_id(ids + 4 * __popc(below & ~hits)), other = source_of(id);
             hits &= below;
             $row
             $term
@@ -141,83 +165,152 @@ auto add_pairs = [&](bool finished) {
 
 
 class Kernels(NamedTuple):
-    """The stages of a search that sort particles, the kernel that sorts values (None: there are none), and the one that sums."""
+    """The stages of a search that sort particles, the kernel that sorts values (None: there are none), and those that sum.
+
+    `crossing` is for queries whose reach leaves a periodic box, as in a search.
+    """
 
     stages: CellKernels
     sort_values: wp.Kernel | None
     query: wp.Kernel
+    crossing: wp.Kernel | None
 
     @property
-    def summing(self) -> tuple[wp.Kernel | None, wp.Kernel]:
+    def summing(self) -> tuple[wp.Kernel | None, ...]:
         """Those that take the arguments of a sum; the stages take those of a search."""
-        return self.sort_values, self.query
+        return self.sort_values, self.query, self.crossing
 
     def launches(self, n: int, m: int, own: bool) -> list[Launch]:
         """Return what is launched, in order, for n sources and m queries."""
-        *stages, query = self.stages.launches(n, m, own)
+        of_search, walks = self.stages.launches(n, m, own), [x for x in (self.crossing, self.query) if x is not None]
+        cut = len(of_search) - len(walks)
         blocks = min(-(-n // QUERY_BLOCK), _SWEEP_BLOCKS)
         sorting = [] if self.sort_values is None else [Launch(self.sort_values, blocks * QUERY_BLOCK, QUERY_BLOCK, False)]
-        return [*stages, *sorting, query._replace(kernel=self.query)]
+        summing = [launch._replace(kernel=kernel) for launch, kernel in zip(of_search[cut:], walks, strict=True)]
+        return [*of_search[:cut], *sorting, *summing]
 
     def load(self, device: wp.DeviceLike) -> None:
         """Compile and load what a launch needs: nothing is left to do while a CUDA graph is recorded."""
-        self.stages._replace(query=self.query).load(device)
+        self.stages._replace(query=self.query, crossing=self.crossing).load(device)
 
 
-def _evaluation(term: TermText, double: bool) -> str:
-    """Return the text that defines `add_pairs`: it adds the pairs that are held to the sums of their queries."""
+class _Reduction(NamedTuple):
+    """What becomes of summands: text before the pairs that are held, for each of them (`is_pair`), and after the last one.
+
+    `kept` is for queries, `totalled` for all lanes.
+    """
+
+    started: str
+    each: str
+    kept: str
+    totalled: str = ""
+
+
+def _added(term: TermText) -> _Reduction:
+    """Return text that adds summands to what the query has already, and to the totals of the block."""
+    started, each, rows, totals = [], [], [], []
+    for k, part in enumerate(term.sums):
+        started.append(f"real sum{k} = 0, error{k} = 0;\n")
+        each.append(f"add(sum{k}, error{k}, is_pair, {part.name});\n")
+        if part.total:
+            totals.append(f"add_total({len(totals)}, sum{k}, error{k});\n")
+        else:
+            rows.append(f"store(at + {len(rows)}, sum{k}, error{k}, fresh, finished);\n")
+    return _Reduction(*("".join(lines) for lines in (started, each, rows, totals)))
+
+
+def _largest(term: TermText) -> _Reduction:
+    """Return text that keeps the largest summands of a query, their sources and their images."""
+    started, kept = [], []
+    each = ["const int source = id_of(there.id), code = CROSSING ? image_of(id) : code_at_home;\n"]
+    for k, part in enumerate(term.sums):
+        started.append(f"real best{k} = -INF;\nint of{k} = n, code{k} = 0;\n")
+        each.append(f"take_larger({part.name}, source, code, is_pair, best{k}, of{k}, code{k});\n")
+        kept.append(f"keep_largest(at + {k}, best{k}, of{k}, code{k}, fresh);\n")
+    return _Reduction(*("".join(lines) for lines in (started, each, kept)))
+
+
+def _evaluation(term: TermText, double: bool, extremes: bool) -> str:
+    """Return the text that defines `add_pairs`: it reduces the pairs that are held to what their queries get."""
 
     def defined(values: tuple[Value, ...], column: str, point: str) -> str:
         numbers = placed(values, column, f"{point}.p[{{}}]")
         return "".join(loaded(value, x, f"Math::bits({x})", double) for value, x in zip(values, numbers, strict=True))
 
-    def point(values: tuple[Value, ...], name: str, place: str) -> str:
-        return f"const Place {name} = {place};\n" if any(value.axis is not None for value in values) else ""
+    def point(needed: bool, name: str, place: str) -> str:
+        return f"const Place {name} = {place};\n" if needed else ""
 
-    added, rows, totals = [], [], []
-    for k, part in enumerate(term.sums):
-        added.append(f"add(sum{k}, error{k}, is_pair, {part.name});\n")
-        if part.total:
-            totals.append(f"add_total({len(totals)}, sum{k}, error{k});\n")
-        else:
-            rows.append(f"store(at + {len(rows)}, sum{k}, error{k}, fresh, finished);\n")
-    here = point(term.own, "here", "lane < group ? load_query(place + lane) : Place{{0, 0, 0}, 0}")
-    shared = defined(term.shared, "shared_values.data[{}]", "")
-    row = ["const Row row = load_row(source);\n"] if term.source_columns else []
+    def has_positions(values: tuple[Value, ...]) -> bool:
+        return any(value.axis is not None for value in values)
+
+    reduction = _largest(term) if extremes else _added(term)
+    here = "lane < group ? load_query(place + lane) : Place{{0, 0, 0}, 0}"
+    values = [defined(term.shared, "shared_values.data[{}]", ""), point(has_positions(term.own), "here", here)]
+    values.append(defined(term.own, "own_values.data[own_at + {}]", "here"))
+    row = [point(extremes or has_positions(term.others), "there", "load(sorted + other)")]
+    row += ["const Row row = load_row(other);\n"] if term.source_columns else []
+    if term.steps:  # inside of a box there are none
+        turns = f"own_values.data[own_at + {_own_columns(term) - 1}]"
+        values += [f"const int turn{c} = Lattice::turn({turns}, {step.axis});\n" for c, step in enumerate(term.steps)]
+        row.append("int shift[3] = {0, 0, 0};\nif constexpr (CROSSING)\n    shift_of(image_of(id), shift);\n")
+        for c, (name, axis) in enumerate(term.steps):
+            step = f"shift[{axis}] - Lattice::turn(row.at[{term.columns}], {axis}) + turn{c}"
+            row.append(f"const real {name} = CROSSING ? real({step}) : real(0);\n")
     return _ADD_PAIRS.substitute(
-        values="".join([shared, here, defined(term.own, "own_values.data[own_at + {}]", "here")]),
-        sums="".join(f"real sum{k} = 0, error{k} = 0;\n" for k in range(len(term.sums))),
+        values="".join(values),
+        started=reduction.started,
         held_pairs=HELD_PAIRS,
-        row="".join([point(term.others, "there", "load(sorted + source)"), *row]),
-        term="".join([defined(term.others, "row.at[{}]", "there"), term.text, *added]),
-        stored="".join(["if (lane < group) {\n", *rows, "}\n", *totals]),
+        row="".join(row),
+        term="".join([defined(term.others, "row.at[{}]", "there"), term.text, reduction.each]),
+        stored="".join(["if (lane < group) {\n", reduction.kept, "}\n", reduction.totalled]),
     )
+
+
+def _own_columns(term: TermText) -> int:
+    """Return how many numbers of i have a column, turns among them."""
+    return sum(value.axis is None for value in term.own) + bool(term.steps)
 
 
 @functools.cache
 def sum_kernels(
-    term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, batched: bool = False,
-    blocks: int | None = None, taken: int | None = None,
+    term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: bool = False,
+    extremes: bool = False, blocks: int | None = None, taken: int | None = None,
 ) -> Kernels:  # fmt: skip
     """Return the kernels that sum a term; `key` tells it from all others in the names of programs.
 
+    `extremes`: they find the largest summands instead; `errors` [m, width, 2] then gets their sources (n: there is none), and the
+    codes of their images, as integers travel among floats.
     The rest is there to be measured: `blocks` per multiprocessor bound the registers, `taken` is how many pairs a lane adds before
     it looks for the next block; None: as seems best.
     """
     cheap = work(term.text) <= LITTLE_WORK
     taken = taken or (2 if cheap else 1)
     blocks = blocks or (16 if double or not cheap else 20)
-    totals = sum(part.total for part in term.sums)
-    kind = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}{'_batched' * batched}"
+    totals, columns = sum(part.total for part in term.sums), term.source_columns
+    kind = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
+    kind += f"{('', '_nearest', '_images')[periodic]}{'_batched' * batched}{'_extremes' * extremes}"
     module = f"{kind}_b{blocks}_t{taken}_{key}"
-    constants = {**GRID, "BATCHED": batched, "SCALED": scaled, "LIST": 0, "SUMS": 1, "LATER": 0, "EXACTLY": 1, "CROSSING": 0}
-    columns, own = term.source_columns, sum(value.axis is None for value in term.own)
-    constants |= {"OTHERS": columns, "ROW_LENGTH": max(row_length(columns, double), 1), "OWN": own}
-    constants |= {"TOTALS": totals, "ROW_SUMS": len(term.sums) - totals, "COMPENSATED": compensated, "TAKEN": taken}
-    text = SCALAR + walk(opened=_OPENED, none=_NO_SUM, begun=_ADD + _evaluation(term, double), settled="add_pairs(finished);")
-    query = _kernel("pair_sum", module, dim, double, blocks, constants, EXACT, text)
-    sorting = _kernel("sort_values", module, dim, double, 32, constants, _SORT_VALUES) if columns else None
-    return Kernels(cell_kernels(dim, double, scaled, False, batched=batched), sorting, query)
+    constants = {**GRID, "PERIODIC": periodic, "BATCHED": batched, "SCALED": scaled}
+    constants |= {"LIST": 0, "SUMS": 1, "LATER": 0, "EXACTLY": 1, "COMPENSATED": compensated, "TAKEN": taken}
+    constants |= {"OTHERS": columns, "ROW_LENGTH": max(row_length(columns, double), 1), "OWN": _own_columns(term)}
+    constants |= {"TOTALS": totals, "ROW_SUMS": len(term.sums) - totals}
+    text = SCALAR + walk(
+        opened=_OPENED + (f"typedef Math::{'f64' if double else 'f32'} number;\n" + TAKE_LARGER + _KEEP_LARGEST) * extremes,
+        none=_NO_SUM + _NO_EXTREME * extremes,
+        begun="".join([_ADD, _LOAD_ROW, _evaluation(term, double, extremes)]),
+        settled="add_pairs(finished);",
+    )
+
+    def query_kernel(name: str, crossing: bool = False) -> wp.Kernel:
+        where = {"CROSSING": crossing, "SHIFTED": periodic if crossing else 0}
+        return _kernel(name, module, dim, double, blocks, constants | where, EXACT, text)
+
+    return Kernels(
+        cell_kernels(dim, double, scaled, False, periodic=periodic, batched=batched),
+        _kernel("sort_values", module, dim, double, 32, constants, _SORT_VALUES) if columns else None,
+        query_kernel("pair_sum"),
+        query_kernel("crossing_pair_sum", crossing=True) if periodic else None,
+    )
 
 
 def _kernel(name: str, module: str, dim: int, double: bool, blocks: int, constants: dict[str, int], *pieces: str) -> wp.Kernel:

@@ -60,6 +60,7 @@ def arguments(dtype, dim):
 def compiles_for(plan, dim, double, folder, **variant):
     options = {"scaled": False, "compensated": False} | variant
     kernels = pair_sum_cuda.sum_kernels(plan.text, plan.key, dim, double, **options)
+    assert kernels.crossing is None or kernels.crossing.module is kernels.query.module
     wp.compile_aot_module(kernels.query.module, arch=90, module_dir=folder, use_ptx=True)
     return len(list(folder.glob("*.ptx"))) == 1
 
@@ -95,6 +96,23 @@ def test_functions_and_values_of_all_kinds_compile(dtype, tmp_path):
     assert compiles_for(plan, 3, dtype == np.float64, tmp_path)
 
 
+@pytest.mark.parametrize(("dim", "dtype", "length"), [(3, np.float32, 2.0), (2, np.float64, 0.1)])
+def test_terms_in_boxes_compile(dim, dtype, length, tmp_path):
+    """Of the nearest images, and of several; the lattice shift has no column, its turns have one."""
+    masses, x, scale, _ = arguments(dtype, dim)
+    periodic = (True, False, True)[:dim]
+    plan = plan_of(jax.grad(functools.partial(square_sum, box=jfrnn.Box([length] * dim, periodic)), 1), masses, x, scale)
+    assert {step.axis for step in plan.text.steps} == {k for k in range(dim) if periodic[k]}
+    assert compiles_for(plan, dim, dtype == np.float64, tmp_path, periodic=1 if length > CUTOFF else 2)
+
+
+@pytest.mark.parametrize(("dtype", "variant"), [(np.float32, {}), (np.float64, {"periodic": 2, "batched": True})])
+def test_extremes_compile(dtype, variant, tmp_path):
+    masses, x, _, _ = arguments(dtype, 3)
+    plan = plan_of(lambda x: jfrnn.pair_sum(poly6, x, CUTOFF, masses, reduce="min", backend="warp"), x)
+    assert compiles_for(plan, 3, dtype == np.float64, tmp_path, extremes=True, **variant)
+
+
 def test_terms_that_read_nothing_compile(tmp_path):
     plan = plan_of(lambda x: jfrnn.pair_sum(lambda r, i, j: 1.0, x, CUTOFF, backend="warp"), jnp.zeros((4, 3), np.float32))
     assert not (plan.text.own or plan.text.source_columns)
@@ -116,6 +134,19 @@ def test_stages_are_those_of_a_search():
         assert all(launch.threads % launch.block == 0 for launch in (*stages, sort_values, query))
 
 
+def test_queries_that_leave_a_box_have_a_kernel_beside_the_others():
+    masses, x, scale, _ = arguments(np.float32, 3)
+    plan = plan_of(functools.partial(square_sum, box=jfrnn.Box([2.0, 2.0, 2.0])), masses, x, scale)
+    kernels = pair_sum_cuda.sum_kernels(plan.text, plan.key, 3, False, False, False, periodic=1)
+    search = cells_cuda.cell_kernels(3, False, False, False, periodic=1)
+    for own in (True, False):
+        *stages, sort_values, crossing, query = kernels.launches(1000, 500, own)
+        assert stages == search.launches(1000, 500, own)[:-2]
+        assert [x.kernel for x in (sort_values, crossing, query)] == [kernels.sort_values, kernels.crossing, kernels.query]
+        assert [x.beside for x in (sort_values, crossing, query)] == [False, False, True]
+    assert kernels.summing == (kernels.sort_values, kernels.query, kernels.crossing)
+
+
 @pytest.mark.parametrize("double", [False, True])
 def test_rows_of_values_begin_where_16_bytes_may_be_loaded(double):
     width = 8 if double else 4
@@ -127,25 +158,37 @@ def test_rows_of_values_begin_where_16_bytes_may_be_loaded(double):
 def test_auto_stays_with_jax_where_nothing_was_measured(monkeypatch):
     x = np.zeros((4, 3), np.float32)
     problem = checked_problem(x, 1.0, None, None, None, "gather", False, False, False, "auto", 0.0, None)
-    assert _with_engine(problem, "auto", "sum").backend == "auto"
+    assert _with_engine(problem, "auto").backend == "auto"
     monkeypatch.setattr("jfrnn._pair_sum.platform_of", lambda *_: "gpu")
-    assert _with_engine(problem, "auto", "sum").backend == "jax"
-    assert _with_engine(problem, "warp", "sum").backend == "warp"
+    assert _with_engine(problem, "auto").backend == "jax"
+    assert _with_engine(problem, "warp").backend == "warp"
     monkeypatch.setattr("jfrnn._pair_sum.platform_of", lambda *_: "rocm")
     with pytest.raises(ValueError, match="on the platform 'rocm', only on the CPU and on CUDA"):
-        _with_engine(problem, "warp", "sum")
+        _with_engine(problem, "warp")
 
 
-def test_programs_for_cuda_call_it_and_launches_have_the_arguments_of_their_kernels():
-    x = np.zeros((40, 3), np.float32)
-    program = jax.jit(lambda x: square_sum(x[:, 0], x, 1.0)).trace(x).lower(lowering_platforms=("cuda",)).as_text()
-    assert "@jfrnn_pair_sum_cuda_3d_f32_own_dropself_" in program
-    plan = plan_of(square_sum, *arguments(np.float32, 3)[:3])
-    variant = _warp._SumVariant(3, False, False, True, False, True, 0, False, False, False, plan.key, True)
+def test_a_box_holds_as_many_particles_as_their_numbers_leave_room_for(monkeypatch):
+    """An image's code takes bits of the number; on the CPU it does not."""
+    monkeypatch.setattr(_warp, "MOST_IN_BOX", 4)
+    x, box = np.zeros((4, 3), np.float32), jfrnn.Box([4.0] * 3)
+    inputs = checked_problem(x, 1.0, None, box, None, "gather", False, False, False, "warp", 0.0, None).inputs
+    assert _fused.refusal(inputs, "cpu") is None
+    assert _fused.refusal(inputs._replace(box=None), "gpu") is None
+    assert _fused.refusal(inputs, "gpu") == "of more than 3 positions in a periodic box on the platform 'gpu'"
+
+
+@pytest.mark.parametrize("periodic", [0, 1])
+def test_programs_for_cuda_call_it_and_launches_have_the_arguments_of_their_kernels(periodic):
+    x, box = np.zeros((40, 3), np.float32), jfrnn.Box([2.0] * 3) if periodic else None
+    program = jax.jit(lambda x: square_sum(x[:, 0], x, 1.0, box=box)).trace(x).lower(lowering_platforms=("cuda",)).as_text()
+    assert f"@jfrnn_pair_sum_cuda_3d_f32_own_dropself_{'nearest_' * periodic}" in program
+    plan = plan_of(functools.partial(square_sum, box=box), *arguments(np.float32, 3)[:3])
+    variant = _warp._SumVariant(3, False, False, True, False, True, periodic, False, False, False, plan.key, True)
     rows, line = wp.zeros((40, 3), dtype=float, device="cpu"), wp.zeros(40, dtype=float, device="cpu")
     ints = wp.zeros(40, dtype=int, device="cpu")
     commands = _warp._sum_commands(variant, plan.text, rows, rows, line, line, rows, rows, rows, line, line, line, ints, ints)
-    assert len(commands) == 8
+    assert len(commands) == 8 + periodic
+    assert [command.beside for command in commands] == [False] * (7 + periodic) + [bool(periodic)]
     for command in commands:
         types = [argument.type for argument in command.kernel.adj.args]
         given = [(x.dtype, x.ndim) if isinstance(x, wp.array) else int for x in command.arguments]
