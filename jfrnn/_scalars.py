@@ -159,11 +159,11 @@ class Scalars:
         return None if reciprocal is None else self.apply("mul", (first, reciprocal), dtype)
 
     def _reciprocal(self, number: int) -> int | None:
-        """Return 1 / a for powers of two and choices of them, as in the derivative of max: to multiply by it is to divide."""
+        """Return 1 / a for a number and choices of such, as in the derivative of max: XLA multiplies by it, too."""
         form, operands, dtype, value = self.nodes[number]
         if value is not None and dtype.startswith("float"):
-            mantissa, exponent = np.frexp(value)
-            return self.constant(1 / value, dtype) if abs(mantissa) == 0.5 and abs(exponent) < 100 else None
+            moderate = 1e-30 < abs(value) < 1e30  # it is a normal number
+            return self.constant(value.dtype.type(1) / value, dtype) if moderate else None
         if not form.startswith("Math::select"):
             return None
         parts = [self._reciprocal(k) for k in operands[1:]]
