@@ -90,8 +90,9 @@ def _transpose(cotangents: list, *args: Any, term: Term, structure: Any, compens
         results += _bind_derived(
             exchanged, Groups(given.shared, given.others, given.own), rules.across, other_structure, compensated
         )
-    found = iter(results)
-    return [None] * cut + [next(found) if flag else None for group in linear for flag in group]
+    found, joint = iter(results), iter(rules.joint)
+    flags = [flag for group in linear[:2] for flag in group] + [flag and not next(joint, False) for flag in linear.others]
+    return [None] * cut + [next(found) if flag else None for flag in flags]
 
 
 def _bind_derived(leaves: list, operands: Groups, derived: Derived, structure: Any, compensated: bool) -> list[Array]:  # noqa: ANN401

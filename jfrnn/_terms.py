@@ -218,11 +218,13 @@ class Transposed(NamedTuple):
             linear, then the cotangents: of totals shared, of sums with i.
         across: Summed over the i of each j, or None: sums of the linear operands of j, the roles of i and j exchanged.
         sides: Where one term does it: which of the operands of i and then of j either side of it has.
+        joint: For each linear operand of j, whether it is one of i, too: that one's sums hold those of both.
     """
 
     along: Derived | None
     across: Derived | None
     sides: tuple[int, ...] = ()
+    joint: tuple[bool, ...] = ()
 
 
 @functools.lru_cache(maxsize=256)
@@ -230,7 +232,8 @@ def transposed(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetr
     """Transpose a term in its linear operands; `cotangents` says of which sums there are any.
 
     `symmetric`: j is a neighbor of i where i is one of j, and both have operands of both kinds. Then one term does it: the sums of
-    the linear operands of j are the last ones of `along`, whose operands of either side are all those of i and of j.
+    the linear operands of j are the last ones of `along`, whose operands of either side are all those of i and of j. Where an
+    operand of j is one array with one of i, they are added to those of i.
     """
     still = chosen(term.operands, Groups(*(tuple(not flag for flag in group) for group in linear)))
     of_totals, of_sums = (
@@ -246,6 +249,8 @@ def transposed(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetr
     each = mine + theirs
     sides = tuple(k for k, label in enumerate(each) if label not in each[:k])  # what is one array is there once
     place = [sides.index(each.index(label)) for label in each]
+    moving_i, moving_j = (tuple(compress(labels, which)) for labels, which in zip(term.labels, linear[1:], strict=True))
+    joint = tuple(label in moving_i for label in moving_j)
 
     def pull(real: Array, shift: Array, operands: Groups) -> Groups:
         known, cts = _halves(operands, still)
@@ -269,14 +274,20 @@ def transposed(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetr
         of_i, of_j = (tuple(side[k] for k in place) for side in (operands.own, operands.others))
         count = len(given.own)
         forward, backward = (Groups(operands.shared, a[:count], b[count:]) for a, b in ((of_i, of_j), (of_j, of_i)))
-        return along(real, shift, forward) + list(pull(real, -shift, backward).others)
+        result, others = pull(real, shift, forward), list(pull(real, -shift, backward).others)
+        own = list(result.own)
+        for label, x in zip(moving_j, others, strict=True):
+            if label in moving_i:
+                own[moving_i.index(label)] += x
+        return [*result.shared, *own, *(x for x, there in zip(others, joint, strict=True) if not there)]
 
     totals, sums, across_sums = ([flag for flag in group if flag] for group in linear)
     if symmetric and across_sums and (totals or sums):
         operands = given.own + given.others
         side, labels = tuple(operands[k] for k in sides), tuple(each[k] for k in sides)
-        flags = [True] * len(totals) + [False] * (len(sums) + len(across_sums))
-        return Transposed(make_term(both, Groups(given.shared, side, side), term.shift, (labels, labels), flags), None, sides)
+        flags = [True] * len(totals) + [False] * (len(sums) + joint.count(False))
+        of_both = make_term(both, Groups(given.shared, side, side), term.shift, (labels, labels), flags)
+        return Transposed(of_both, None, sides, joint)
     exchanged = Groups(given.shared, given.others, given.own)
     flags = [True] * len(totals) + [False] * len(sums)
     return Transposed(
