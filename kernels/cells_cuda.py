@@ -56,8 +56,8 @@ int* query_start = own ? start : take(table + 2);
 unsigned long long* query_tile_state = own ? tile_state : (unsigned long long*)take(2 * tile_count);
 int* query_order = own ? order : take(m);
 const int query_blocks = (m + 31) / 32;
-int* crossing = take(query_blocks);  // their numbers
-int* crosses = take(query_blocks);  // whether a block does
+int* crossing = key;  // their numbers: nobody asks for keys and slots once particles are scattered
+int* crosses = slot;  // whether a block does
 const int lane = threadIdx.x & 31, warp_in_block = threadIdx.x >> 5;
 // Warp spreads more than 65535 blocks over y and z
 const int block = (blockIdx.z * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x;
@@ -88,7 +88,6 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, t
     parts = [_HEADER_WORDS, 8 * _PARTS * width, 4 * width * sources, table + 2, tiles, longest, longest, sources]
     if not own:
         parts += [table + 2, tiles, queries]
-    parts += 2 * [-(-queries // QUERY_BLOCK)]
     return sum((words + 15) // 16 * 16 for words in parts)
 
 
@@ -201,8 +200,6 @@ for (long long t = thread; t < tiles; t += threads) {
     if (!own)
         query_tile_state[t] = 0;
 }
-for (long long b = thread; PERIODIC && b < query_blocks; b += threads)
-    crosses[b] = 0;
 """
 
 _COUNT = r"""
@@ -294,8 +291,11 @@ const int size = of_queries ? m : n;
 const int* first = of_queries ? query_start : start;
 int* out = of_queries ? query_order : order;
 const int finite = size - shared.behind[of_queries];
-for (long long i = thread; i < size; i += threads)
+for (long long i = thread; i < size; i += threads) {
     out[(key[i] >= 0 ? first[key[i]] : finite) + slot[i]] = (int)i;
+    if constexpr (PERIODIC)
+        slot[i] = 0;  // of `crosses`, from now on
+}
 if (thread == 0 && (own || of_queries))
     shared.finite_queries = finite;
 """
