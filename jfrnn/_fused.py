@@ -41,9 +41,6 @@ class Plan(NamedTuple):
     key: str
 
 
-FASTEST_ON = ("cpu",)  # platforms where "auto" takes this engine: it was measured there
-
-
 def refusal(inputs: Inputs, platform: str) -> str | None:
     """Say what of a search this engine cannot do; None: nothing."""
     if platform not in ("cpu", "gpu", "cuda"):

@@ -172,13 +172,11 @@ def _plan_of_sum(
         analysis = _analysis(jax.jit(functools.partial(program, backend=backend)).lower(*points, shapes))
         return MemoryPlan(0, int(analysis.temp_size_in_bytes), backend, int(analysis.output_size_in_bytes))
 
-    from jfrnn import _fused  # see `pair_sum`
-
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), values)
     with jax.default_device(device):
         if engine != "auto":
             return plan(engine)
-        if device.platform in _fused.FASTEST_ON and fastest_engine(device.platform, 1) == "warp":
+        if fastest_engine(device.platform, 1) == "warp":
             with contextlib.suppress(TypeError, ValueError, NotImplementedError):  # "jax" takes it, or says what is wrong
                 return plan("warp")
         return plan("jax")

@@ -147,8 +147,7 @@ def _with_engine(problem: Problem, backend: str) -> Options:
     reason = _fused.refusal(problem.inputs, platform)
     if reason is not None and backend == "warp":
         raise ValueError(f"backend='warp' cannot sum over pairs {reason}: pass backend='jax'.")
-    is_taken = reason is None and (backend == "warp" or platform in _fused.FASTEST_ON)
-    return options._replace(backend=backend if is_taken else "jax")
+    return options._replace(backend=backend if reason is None else "jax")
 
 
 def _checked_values(name: str, values: Any, size: int, what: str) -> Any:  # noqa: ANN401

@@ -479,7 +479,7 @@ def _call_sums(
         "totals": max(2 * slots * totals, 1),
         "errors": max(m * width * (2 * variant.extremes + variant.compensated), 1),
     }
-    dims |= {"columns": max(n * engine.row_length(term.source_columns, variant.double), 1), "info": 2}
+    dims |= {"columns": max(n * engine.row_length(term, variant.dim, variant.double), 1), "info": 2}
     cells = kernels_of(f"cells_{'cuda' if variant.cuda else 'cpu'}")
     dims["scratch"] = cells.scratch_words(n, m, variant.dim, 2 if variant.double else 1, variant.own)
     sums, parts, rest, *_ = _sum_callable(variant, term)(*particles, *values, output_dims=dims)

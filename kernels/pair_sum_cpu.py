@@ -90,10 +90,10 @@ def slots(queries: int) -> int:
     return -(-queries // CHUNK)
 
 
-def row_length(columns: int, double: bool) -> int:
+def row_length(term: TermText, dim: int, double: bool) -> int:
     """Return how many numbers of each source the sorted values have: one for each column."""
-    del double
-    return columns
+    del dim, double
+    return term.source_columns
 
 
 _SORT_VALUES = r"""

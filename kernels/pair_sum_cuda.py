@@ -1,18 +1,17 @@
 """Sums over pairs on CUDA, without a list: the term is evaluated where its pairs are found, by the lane of their query.
 
-The stages of `jfrnn.kernels.cells_cuda` sort the sources by cell. `sort_values` puts what a term reads of them, but for
-coordinates, into the same order, a row each. Then the walk of that module finds pairs as a search does, and holds their bits for
-22 blocks of candidates. A lane goes through the bits of its query and reads coordinates and row of each neighbor through the
-first-level cache, which the 31 other lanes share. In a periodic box turns stand behind what is read of i and j, packed as in
-`jfrnn._box`: with the image of a neighbor they make its lattice shift S. In place of sums it can find the largest summands, and
-whose they are.
+The stages of `jfrnn.kernels.cells_cuda` sort the sources by cell. `sort_values` puts what a term reads of them into the same
+order, a row each. Then the walk of that module finds pairs as a search does, and holds their bits for 22 blocks of candidates. A
+lane goes through the bits of its query and reads the row of each neighbor through the first-level cache, which the 31 other lanes
+share: of a few pairs at a time, while it evaluates the term for those before. In a periodic box turns stand behind what is read of
+i and j, packed as in `jfrnn._box`: with the image of a neighbor they make its lattice shift S. In place of sums it can find the
+largest summands, and whose they are.
 
 Of a million particles with 108 neighbors (float32), 32 queries meet 570 candidates near their box. Evaluating the term for all of
 them would take 570 steps of the warp; for the pairs of one block of 32 at a time 345, as lanes wait for the one with most; for
-those of 22 blocks 116, or 62 of two pairs each. Such a step of a density (10 operations) is 55 instructions of sm_90, one of its
-gradient 122: 3400 and 7600 in all, beside some 6300 that finding the pairs takes. Prediction for an H200, from a search that
-writes lists (9300 instructions, 0.4 ms) and its stages (0.09 ms): a density 0.5 ms, its gradient 0.7 ms. Bytes do not bound it:
-40 per particle are 0.01 ms.
+those of 22 blocks 116. On an H200 a warp executes 10 000 instructions for a density, 6300 of them to find the pairs; schedulers
+issue in 64 % of their cycles, the first-level cache is at 78 % of what it can (ncu). 0.84 ms became 0.63 when rows were loaded
+ahead and numbers were multiplied by reciprocals. Bytes of memory do not bound it: 40 per particle are 0.01 ms.
 """
 
 import functools
@@ -34,8 +33,12 @@ def slots(queries: int) -> int:
     return -(-queries // QUERY_BLOCK)
 
 
-def row_length(columns: int, double: bool) -> int:
-    """Return how many numbers of each source the sorted values have, a row: 16 bytes are loaded at once, if there are so many."""
+def row_length(term: TermText, dim: int, double: bool) -> int:
+    """Return how many numbers of each source the sorted values have, a row: 16 bytes are loaded at once, if there are so many.
+
+    Coordinates come first, where a term reads them and something else.
+    """
+    columns = term.source_columns + _placed_columns(term, dim)
     at_once = 2 if double else 4
     return next((length for length in (0, 1, 2) if columns <= length <= at_once), -(-columns // at_once) * at_once)
 
@@ -43,8 +46,10 @@ def row_length(columns: int, double: bool) -> int:
 _SORT_VALUES = r"""
 for (long long t = thread; t < (long long)ROW_LENGTH * n; t += threads) {
     const long long place = t / ROW_LENGTH;
-    const int c = (int)(t % ROW_LENGTH);
-    values.data[t] = c < OTHERS ? others.data[(long long)OTHERS * id_of(sorted[place].id) + c] : real(0);
+    const int c = (int)(t % ROW_LENGTH), column = c - PLACED;
+    const Place from = sorted[place];
+    const real along = c == 0 ? from.p[0] : c == 1 ? from.p[1] : from.p[2];
+    values.data[t] = column < 0 ? along : column < OTHERS ? others.data[(long long)OTHERS * id_of(from.id) + column] : real(0);
 }
 """
 
@@ -114,20 +119,49 @@ auto keep_largest = [&](long long at, real best, int of, int code, bool fresh) {
 };
 """
 
+# What is loaded here comes in the order of the text, all of several pairs before any of it is used: else the compiler saves
+# registers, and every pair waits for its own.
 _LOAD_ROW = r"""
 struct Row { real at[ROW_LENGTH]; };
+auto load_words = [](const void* from, auto* to) {
+    unsigned int w[4];
+    const size_t at = __cvta_generic_to_global(from);
+    if constexpr (sizeof(*to) == 16)
+        asm volatile("ld.global.nc.v4.b32 {%0, %1, %2, %3}, [%4];" : "=r"(w[0]), "=r"(w[1]), "=r"(w[2]), "=r"(w[3]) : "l"(at));
+    else if constexpr (sizeof(*to) == 8)
+        asm volatile("ld.global.nc.v2.b32 {%0, %1}, [%2];" : "=r"(w[0]), "=r"(w[1]) : "l"(at));
+    else
+        asm volatile("ld.global.nc.b32 %0, [%1];" : "=r"(w[0]) : "l"(at));
+    memcpy(to, w, sizeof(*to));
+};
+auto load_id_now = [](unsigned int at) -> int {
+    int id;
+    asm volatile("ld.shared.u32 %0, [%1];" : "=r"(id) : "r"(at));
+    return id;
+};
 auto load_row = [&](int place) -> Row {
     constexpr int TOGETHER = ROW_LENGTH * sizeof(real) < 16 ? ROW_LENGTH : 16 / sizeof(real);
-    struct alignas(TOGETHER * sizeof(real)) Part { real at[TOGETHER]; };
+    struct Part { real at[TOGETHER]; };
     Row row;
 #pragma unroll
     for (int p = 0; p < ROW_LENGTH / TOGETHER; ++p) {
-        const Part part = *((const Part*)(values.data + (long long)ROW_LENGTH * place) + p);
+        Part part;
+        load_words((const Part*)(values.data + (long long)ROW_LENGTH * place) + p, &part);
 #pragma unroll
         for (int c = 0; c < TOGETHER; ++c)
             row.at[TOGETHER * p + c] = part.at[c];
     }
     return row;
+};
+auto load_place = [&](int place) -> Place {
+    struct Part { real at[16 / sizeof(real)]; };
+    Part parts[4 * sizeof(real) / 16];
+#pragma unroll
+    for (int p = 0; p < (int)(4 * sizeof(real) / 16); ++p)
+        load_words((const Part*)(sorted + place) + p, parts + p);
+    Place there;
+    memcpy(&there, parts, sizeof there);
+    return there;
 };
 """
 
@@ -145,17 +179,37 @@ auto add_pairs = [&](bool finished) {
     $values
     $started
     $held_pairs
-    advance();
-    for (advance(); __any_sync(ALL, hits != 0); advance()) {
+    // several pairs at once, and what is read of the next ones meanwhile: it takes longer than what is done with it
+    struct Taken {
+        bool pairs[TAKEN];
+        $fields
+    };
+    auto take = [&](Taken& taken) {
+        unsigned int at[TAKEN];
 #pragma unroll
         for (int k = 0; k < TAKEN; ++k) {
-            const bool is_pair = hits != 0;
             const unsigned int below = hits - 1;
-            const int id = load_id(ids + 4 * __popc(below & ~hits)), other = source_of(id);
+            taken.pairs[k] = hits != 0;
+            at[k] = ids + 4 * __popc(below & ~hits);
             hits &= below;
+        }
+        $loaded
+        advance();
+    };
+    advance();
+    advance();
+    Taken now;
+    take(now);
+    while (__any_sync(ALL, now.pairs[0])) {
+        Taken next;
+        take(next);
+#pragma unroll
+        for (int k = 0; k < TAKEN; ++k) {
+            const bool is_pair = now.pairs[k];
             $row
             $term
         }
+        now = next;
     }
     $stored
     met_in = 0;
@@ -233,37 +287,54 @@ def _largest(term: TermText) -> _Reduction:
 def _evaluation(term: TermText, double: bool, extremes: bool) -> str:
     """Return the text that defines `add_pairs`: it reduces the pairs that are held to what their queries get."""
 
-    def defined(values: tuple[Value, ...], column: str, point: str) -> str:
-        numbers = placed(values, column, f"{point}.p[{{}}]")
+    def defined(values: tuple[Value, ...], column: str, axis: str) -> str:
+        numbers = placed(values, column, axis)
         return "".join(loaded(value, x, f"Math::bits({x})", double) for value, x in zip(values, numbers, strict=True))
-
-    def point(needed: bool, name: str, place: str) -> str:
-        return f"const Place {name} = {place};\n" if needed else ""
 
     def has_positions(values: tuple[Value, ...]) -> bool:
         return any(value.axis is not None for value in values)
 
     reduction = _largest(term) if extremes else _added(term)
-    here = "lane < group ? load_query(place + lane) : Place{{0, 0, 0}, 0}"
-    values = [defined(term.shared, "shared_values.data[{}]", ""), point(has_positions(term.own), "here", here)]
-    values.append(defined(term.own, "own_values.data[own_at + {}]", "here"))
-    row = [point(extremes or has_positions(term.others), "there", "load(sorted + other)")]
-    row += ["const Row row = load_row(other);\n"] if term.source_columns else []
+    values = [defined(term.shared, "shared_values.data[{}]", "")]
+    if has_positions(term.own):
+        values.append("const Place here = lane < group ? load_query(place + lane) : Place{{0, 0, 0}, 0};\n")
+    values.append(defined(term.own, "own_values.data[own_at + {}]", "here.p[{}]"))
+    from_place = has_positions(term.others) and not term.source_columns
+    numbers = defined(term.others, "row.at[PLACED + {}]", "there.p[{}]" if from_place else "row.at[{}]")
+    fields, arrays, row = [], [], []
+
+    def ahead(kind: str, name: str, loaded: str) -> None:
+        fields.append(f"{kind} {name}[TAKEN];\n")
+        arrays.append(f"#pragma unroll\nfor (int k = 0; k < TAKEN; ++k)\n    taken.{name}[k] = {loaded};\n")
+        row.append(f"const {kind} {name} = now.{name}[k];\n")
+
+    ahead("int", "id", "load_id_now(at[k])")
+    if extremes or from_place:
+        ahead("Place", "there", "load_place(source_of(taken.id[k]))")
+    if term.source_columns:
+        ahead("Row", "row", "load_row(source_of(taken.id[k]))")
     if term.steps:  # inside of a box there are none
         turns = f"own_values.data[own_at + {_own_columns(term) - 1}]"
         values += [f"const int turn{c} = Lattice::turn({turns}, {step.axis});\n" for c, step in enumerate(term.steps)]
         row.append("int shift[3] = {0, 0, 0};\nif constexpr (CROSSING)\n    shift_of(image_of(id), shift);\n")
         for c, (name, axis) in enumerate(term.steps):
-            step = f"shift[{axis}] - Lattice::turn(row.at[{term.columns}], {axis}) + turn{c}"
+            step = f"shift[{axis}] - Lattice::turn(row.at[PLACED + {term.columns}], {axis}) + turn{c}"
             row.append(f"const real {name} = CROSSING ? real({step}) : real(0);\n")
     return _ADD_PAIRS.substitute(
         values="".join(values),
         started=reduction.started,
         held_pairs=HELD_PAIRS,
+        fields="".join(fields),
+        loaded="".join(arrays),
         row="".join(row),
-        term="".join([defined(term.others, "row.at[{}]", "there"), term.text, reduction.each]),
+        term="".join([numbers, term.text, reduction.each]),
         stored="".join(["if (lane < group) {\n", reduction.kept, "}\n", reduction.totalled]),
     )
+
+
+def _placed_columns(term: TermText, dim: int) -> int:
+    """Return how many coordinates of j stand before its columns."""
+    return dim if term.source_columns and any(value.axis is not None for value in term.others) else 0
 
 
 def _own_columns(term: TermText) -> int:
@@ -281,10 +352,10 @@ def sum_kernels(
     `extremes`: they find the largest summands instead; `errors` [m, width, 2] then gets their sources (n: there is none), and the
     codes of their images, as integers travel among floats.
     The rest is there to be measured: `blocks` per multiprocessor bound the registers, `taken` is how many pairs a lane adds before
-    it looks for the next block; None: as seems best.
+    it looks for the next block; None: as was fastest on an H200.
     """
     cheap = work(term.text) <= LITTLE_WORK
-    taken = taken or (2 if cheap else 1)
+    taken = taken or (4 if cheap else 2)
     blocks = blocks or (16 if double or not cheap else 20)
     totals, columns = sum(part.total for part in term.sums), term.source_columns
     kind = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
@@ -292,7 +363,8 @@ def sum_kernels(
     module = f"{kind}_b{blocks}_t{taken}_{key}"
     constants = {**GRID, "PERIODIC": periodic, "BATCHED": batched, "SCALED": scaled}
     constants |= {"LIST": 0, "SUMS": 1, "LATER": 0, "EXACTLY": 1, "COMPENSATED": compensated, "TAKEN": taken}
-    constants |= {"OTHERS": columns, "ROW_LENGTH": max(row_length(columns, double), 1), "OWN": _own_columns(term)}
+    constants |= {"OTHERS": columns, "ROW_LENGTH": max(row_length(term, dim, double), 1), "OWN": _own_columns(term)}
+    constants |= {"PLACED": _placed_columns(term, dim)}
     constants |= {"TOTALS": totals, "ROW_SUMS": len(term.sums) - totals}
     text = SCALAR + walk(
         opened=_OPENED + (f"typedef Math::{'f64' if double else 'f32'} number;\n" + TAKE_LARGER + _KEEP_LARGEST) * extremes,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import warp as wp
-from jfrnn.kernels import cells_cuda, pair_sum_cuda
+from jfrnn.kernels import cells_cuda, pair_sum_cpu, pair_sum_cuda
 
 import jfrnn
 from jfrnn import _fused, _warp
@@ -150,19 +150,24 @@ def test_queries_that_leave_a_box_have_a_kernel_beside_the_others():
 @pytest.mark.parametrize("double", [False, True])
 def test_rows_of_values_begin_where_16_bytes_may_be_loaded(double):
     width = 8 if double else 4
-    lengths = [pair_sum_cuda.row_length(columns, double) for columns in range(40)]
-    assert all(0 <= length - columns < 16 // width for columns, length in enumerate(lengths))
-    assert all(length * width % 16 == 0 or length * width in (4, 8) for length in lengths[1:])
+    of_positions = tuple(pair_sum_cpu.Value(f"x{axis}", "float32", axis) for axis in range(3))
+    for positions in ((), of_positions):
+        for columns in range(40):
+            values = tuple(pair_sum_cpu.Value(f"v{k}", "float32") for k in range(columns))
+            term = pair_sum_cpu.TermText("", (), (), (), positions + values, ())
+            length, numbers = pair_sum_cuda.row_length(term, 3, double), columns + len(positions) if columns else 0
+            assert 0 <= length - numbers < 16 // width
+            assert length * width % 16 == 0 or length * width in (4, 8)
 
 
-def test_auto_stays_with_jax_where_nothing_was_measured(monkeypatch):
+def test_auto_takes_the_kernel_on_cuda_and_jax_elsewhere(monkeypatch):
     x = np.zeros((4, 3), np.float32)
     problem = checked_problem(x, 1.0, None, None, None, "gather", False, False, False, "auto", 0.0, None)
-    assert _with_engine(problem, "auto").backend == "auto"
     monkeypatch.setattr("jfrnn._pair_sum.platform_of", lambda *_: "gpu")
-    assert _with_engine(problem, "auto").backend == "jax"
+    assert _with_engine(problem, "auto").backend == "auto"
     assert _with_engine(problem, "warp").backend == "warp"
     monkeypatch.setattr("jfrnn._pair_sum.platform_of", lambda *_: "rocm")
+    assert _with_engine(problem, "auto").backend == "jax"
     with pytest.raises(ValueError, match="on the platform 'rocm', only on the CPU and on CUDA"):
         _with_engine(problem, "warp")
 
