@@ -479,9 +479,15 @@ def _call_sums(
         "totals": max(2 * slots * totals, 1),
         "errors": max(m * width * (2 * variant.extremes + variant.compensated), 1),
     }
-    dims |= {"columns": max(n * engine.row_length(term, variant.dim, variant.double), 1), "info": 2}
+    dims |= {"columns": max(n * engine.row_length(term, variant.dim, variant.double), 1)}
     cells = kernels_of(f"cells_{'cuda' if variant.cuda else 'cpu'}")
-    dims["scratch"] = cells.scratch_words(n, m, variant.dim, 2 if variant.double else 1, variant.own)
+    of_search = {"info": 2, "scratch": cells.scratch_words(n, m, variant.dim, 2 if variant.double else 1, variant.own)}
+    if (
+        variant.cuda
+    ):  # a call of its own sorts particles, which XLA leaves out where it was made before: for a sum and its derivative
+        values = (*values, *_sorting_callable(_sorting(variant))(*particles, output_dims=of_search))
+    else:
+        dims |= of_search
     sums, parts, rest, *_ = _sum_callable(variant, term)(*particles, *values, output_dims=dims)
     which = as_integer(rest).reshape(m, width, 2) if variant.extremes else jnp.zeros((m, width, 0), jnp.int32)
     return sums, _added(parts[: 2 * slots * totals].reshape(slots, 2, totals)), which
@@ -503,17 +509,54 @@ def _sum_callable(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN401
     scalar = wp.float64 if variant.double else wp.float32
     rows, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
     types = {"positions": rows, "queries": rows, "cutoff": reals, "shared_values": reals, "own_values": rows, "others": rows}
-    types |= {"sums": rows, "totals": reals, "errors": reals, "columns": reals, "info": ints, "scratch": ints}
+    of_search, results = {"info": ints, "scratch": ints}, {"sums": rows, "totals": reals, "errors": reals, "columns": reals}
+    name = _name_of_sum(_module_of(variant), variant)
+    if not variant.cuda:
+        return _callable(name, functools.partial(_run_sums_on_cpu, variant, term), types | results | of_search, 6)
+    if wp.is_cuda_available():
+        _sum_kernels_on_cuda(variant, term).load(wp.get_cuda_device())
+    return _cuda_target(name, types | of_search | results, 4, functools.partial(_sum_commands, variant, term))
+
+
+def _name_of_sum(name: str, variant: _SumVariant) -> str:
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "own": variant.own}
     flags |= {"closed": variant.closed, "dropself": variant.drop_self, "batched": variant.batched}
     flags |= {"nearest": variant.periodic == 1, "images": variant.periodic == 2}
-    flags |= {"compensated": variant.compensated, "extremes": variant.extremes, variant.key: True}
-    name = "_".join([f"jfrnn_{_module_of(variant)}_{variant.dim}d", *(flag for flag, on in flags.items() if on)])
-    if not variant.cuda:
-        return _callable(name, functools.partial(_run_sums_on_cpu, variant, term), types, 6)
+    flags |= {"compensated": variant.compensated, "extremes": variant.extremes, variant.key: bool(variant.key)}
+    return "_".join([f"jfrnn_{name}_{variant.dim}d", *(flag for flag, on in flags.items() if on)])
+
+
+def _sorting(variant: _SumVariant) -> _SumVariant:
+    """Return on what of a variant it depends how particles are sorted."""
+    return variant._replace(closed=False, drop_self=False, compensated=False, extremes=False, key="")
+
+
+@functools.cache
+def _sorting_callable(variant: _SumVariant) -> Any:  # noqa: ANN401
+    """Make a function that XLA calls to sort particles on CUDA: positions, queries and cutoff in; info and scratch out."""
+    wp = load_warp()
     if wp.is_cuda_available():
-        _sum_kernels_on_cuda(variant, term).load(wp.get_cuda_device())
-    return _cuda_target(name, types, 6, functools.partial(_sum_commands, variant, term))
+        _stages_on_cuda(variant).load_stages(wp.get_cuda_device())
+    scalar = wp.float64 if variant.double else wp.float32
+    rows, ints = wp.array2d(dtype=scalar), wp.array(dtype=wp.int32)
+    types = {"positions": rows, "queries": rows, "cutoff": wp.array(dtype=scalar), "info": ints, "scratch": ints}
+    return _cuda_target(_name_of_sum("sorting_cuda", variant), types, 2, functools.partial(_sorting_commands, variant))
+
+
+def _stages_on_cuda(variant: _SumVariant) -> Any:  # noqa: ANN401
+    kind = {"periodic": variant.periodic, "batched": variant.batched}
+    return kernels_of("cells_cuda").cell_kernels(variant.dim, variant.double, variant.scaled, False, **kind)
+
+
+def _sorting_commands(variant: _SumVariant, *arrays: Any) -> list[_cuda.Command]:  # noqa: ANN401
+    positions, queries, cutoff, info, scratch = arrays
+    n, m = positions.shape[0], queries.shape[0]
+    # what sorts particles takes the arguments of a search that only counts
+    unused = load_warp().array(ptr=info.ptr, shape=(1, 1), dtype=info.dtype, device=info.device)
+    sizes = [n, m, int(variant.own), kernels_of("_native").table_cells(n)]
+    arguments = [positions, queries, cutoff, unused, info, info, scratch, *sizes, 0, 0, 0]
+    stages = _stages_on_cuda(variant).stages(n, m, variant.own)
+    return [_cuda.Command(x.kernel, [*arguments, int(x.of_queries)], x.threads, x.block) for x in stages]
 
 
 @functools.cache
@@ -552,21 +595,12 @@ def _sum_kernels_on_cuda(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN40
 
 
 def _sum_commands(variant: _SumVariant, term: Any, *arrays: Any) -> list[_cuda.Command]:  # noqa: ANN401
-    positions, queries, cutoff, *_, info, scratch = arrays
-    n, m = positions.shape[0], queries.shape[0]
+    *given, info, scratch, sums, totals, errors, columns = arrays
+    n, m = given[0].shape[0], given[1].shape[0]
     sizes = [n, m, int(variant.own), kernels_of("_native").table_cells(n)]
-    flags = [int(variant.closed), int(variant.drop_self)]
-    kernels = _sum_kernels_on_cuda(variant, term)
-    # what sorts particles takes the arguments of a search that only counts
-    unused = load_warp().array(ptr=info.ptr, shape=(1, 1), dtype=info.dtype, device=info.device)
-    of_stage = [positions, queries, cutoff, unused, info, info, scratch, *sizes, 0, *flags]
-    of_sum = [*arrays, *sizes, *flags]
-
-    def command(launch: Any) -> _cuda.Command:  # noqa: ANN401
-        arguments = of_sum if launch.kernel in kernels.summing else [*of_stage, int(launch.of_queries)]
-        return _cuda.Command(launch.kernel, arguments, launch.threads, launch.block, launch.beside)
-
-    return [command(launch) for launch in kernels.launches(n, m, variant.own)]
+    arguments = [*given, sums, totals, errors, columns, info, scratch, *sizes, int(variant.closed), int(variant.drop_self)]
+    launches = _sum_kernels_on_cuda(variant, term).launches(n, m)
+    return [_cuda.Command(x.kernel, arguments, x.threads, x.block, x.beside) for x in launches]
 
 
 # --- cells of many sizes: a cutoff per particle -----------------------------------------------------------------------

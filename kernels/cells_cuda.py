@@ -1277,6 +1277,10 @@ class Kernels(NamedTuple):
 
     def launches(self, n: int, m: int, own: bool, table: int | None = None) -> list[Launch]:
         """Return what is launched, in order, for n sources and m queries."""
+        return self.stages(n, m, own, table) + walks(self.query, self.crossing, m)
+
+    def stages(self, n: int, m: int, own: bool, table: int | None = None) -> list[Launch]:
+        """Return those that sort sources and queries by cell."""
         table = table_cells(n) if table is None else table
         tiles = min((table + 1) // _TILE + 1, _RESIDENT)
         clearing = min(-(-table // (8 * BLOCK)), _RESIDENT) * BLOCK
@@ -1291,17 +1295,32 @@ class Kernels(NamedTuple):
             ]
             if not of_queries or self.crossing is not None:
                 launches.append(Launch(self.gather, sweep, BLOCK, of_queries))
-        threads = -(-m // QUERY_BLOCK) * QUERY_BLOCK
-        if self.crossing is not None:  # first: what takes longest
-            launches.append(Launch(self.crossing, min(threads, _CROSSING_BLOCKS * QUERY_BLOCK), QUERY_BLOCK, False))
-        return [*launches, Launch(self.query, threads, QUERY_BLOCK, False, beside=self.crossing is not None)]
+        return launches
+
+    def load_stages(self, device: wp.DeviceLike) -> None:
+        """Compile and load what sorts: nothing is left to do while a CUDA graph is recorded."""
+        wp.load_module(self.bounds.module, device=device, block_dim=BLOCK)
 
     def load(self, device: wp.DeviceLike) -> None:
-        """Compile and load what a launch needs: nothing is left to do while a CUDA graph is recorded."""
-        wp.load_module(self.bounds.module, device=device, block_dim=BLOCK)
-        for kernel in (self.query, self.crossing):
-            if kernel is not None:
-                wp.load_module(kernel.module, device=device, block_dim=QUERY_BLOCK)
+        """Compile and load all."""
+        self.load_stages(device)
+        load_walks(self.query, self.crossing, device)
+
+
+def walks(query: wp.Kernel, crossing: wp.Kernel | None, m: int) -> list[Launch]:
+    """Return the launches that walk over m queries: those whose reach leaves a periodic box have a kernel of their own."""
+    threads = -(-m // QUERY_BLOCK) * QUERY_BLOCK
+    if crossing is None:
+        return [Launch(query, threads, QUERY_BLOCK, False)]
+    first = Launch(crossing, min(threads, _CROSSING_BLOCKS * QUERY_BLOCK), QUERY_BLOCK, False)  # what takes longest
+    return [first, Launch(query, threads, QUERY_BLOCK, False, beside=True)]
+
+
+def load_walks(query: wp.Kernel, crossing: wp.Kernel | None, device: wp.DeviceLike) -> None:
+    """Compile and load what walks over queries."""
+    for kernel in (query, crossing):
+        if kernel is not None:
+            wp.load_module(kernel.module, device=device, block_dim=QUERY_BLOCK)
 
 
 @functools.cache

@@ -21,8 +21,7 @@ from typing import NamedTuple
 import warp as wp
 from jfrnn.kernels._math import SCALAR
 from jfrnn.kernels._native import CELLS, EXACT, snippet
-from jfrnn.kernels.cells_cuda import GRID, HELD_PAIRS, LAYOUT, QUERY_BLOCK, Launch, cell_kernels, walk
-from jfrnn.kernels.cells_cuda import Kernels as CellKernels
+from jfrnn.kernels.cells_cuda import GRID, HELD_PAIRS, LAYOUT, QUERY_BLOCK, Launch, load_walks, walk, walks
 from jfrnn.kernels.pair_sum_cpu import LITTLE_WORK, TAKE_LARGER, TermText, Value, loaded, placed, work
 
 _SWEEP_BLOCKS = 4224  # blocks of the kernel that walks over all values
@@ -219,33 +218,21 @@ auto add_pairs = [&](bool finished) {
 
 
 class Kernels(NamedTuple):
-    """The stages of a search that sort particles, the kernel that sorts values (None: there are none), and those that sum.
+    """The kernel that sorts values (None: there are none), and those that sum; `crossing` as in a search."""
 
-    `crossing` is for queries whose reach leaves a periodic box, as in a search.
-    """
-
-    stages: CellKernels
     sort_values: wp.Kernel | None
     query: wp.Kernel
     crossing: wp.Kernel | None
 
-    @property
-    def summing(self) -> tuple[wp.Kernel | None, ...]:
-        """Those that take the arguments of a sum; the stages take those of a search."""
-        return self.sort_values, self.query, self.crossing
-
-    def launches(self, n: int, m: int, own: bool) -> list[Launch]:
-        """Return what is launched, in order, for n sources and m queries."""
-        of_search, walks = self.stages.launches(n, m, own), [x for x in (self.crossing, self.query) if x is not None]
-        cut = len(of_search) - len(walks)
+    def launches(self, n: int, m: int) -> list[Launch]:
+        """Return what is launched, in order, for n sources and m queries, which are sorted already."""
         blocks = min(-(-n // QUERY_BLOCK), _SWEEP_BLOCKS)
         sorting = [] if self.sort_values is None else [Launch(self.sort_values, blocks * QUERY_BLOCK, QUERY_BLOCK, False)]
-        summing = [launch._replace(kernel=kernel) for launch, kernel in zip(of_search[cut:], walks, strict=True)]
-        return [*of_search[:cut], *sorting, *summing]
+        return sorting + walks(self.query, self.crossing, m)
 
     def load(self, device: wp.DeviceLike) -> None:
         """Compile and load what a launch needs: nothing is left to do while a CUDA graph is recorded."""
-        self.stages._replace(query=self.query, crossing=self.crossing).load(device)
+        load_walks(self.query, self.crossing, device)
 
 
 class _Reduction(NamedTuple):
@@ -378,7 +365,6 @@ def sum_kernels(
         return _kernel(name, module, dim, double, blocks, constants | where, EXACT, text)
 
     return Kernels(
-        cell_kernels(dim, double, scaled, False, periodic=periodic, batched=batched),
         _kernel("sort_values", module, dim, double, 32, constants, _SORT_VALUES) if columns else None,
         query_kernel("pair_sum"),
         query_kernel("crossing_pair_sum", crossing=True) if periodic else None,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import warp as wp
-from jfrnn.kernels import cells_cuda, pair_sum_cpu, pair_sum_cuda
+from jfrnn.kernels import pair_sum_cpu, pair_sum_cuda
 
 import jfrnn
 from jfrnn import _fused, _warp
@@ -121,30 +121,22 @@ def test_terms_that_read_nothing_compile(tmp_path):
     assert compiles_for(plan, 3, False, tmp_path)
 
 
-def test_stages_are_those_of_a_search():
-    """Nothing but the query is compiled for a term; in between, what it reads is sorted."""
+def test_what_a_term_reads_is_sorted_before_it_is_summed():
     plan = plan_of(square_sum, *arguments(np.float32, 3)[:3])
     kernels = pair_sum_cuda.sum_kernels(plan.text, plan.key, 3, False, False, False)
-    search = cells_cuda.cell_kernels(3, False, False, False)
-    for own in (True, False):
-        *stages, sort_values, query = kernels.launches(1000, 500, own)
-        assert stages == search.launches(1000, 500, own)[:-1]
-        assert (sort_values.kernel, query.kernel) == (kernels.sort_values, kernels.query)
-        assert query.threads == 32 * pair_sum_cuda.slots(500)
-        assert all(launch.threads % launch.block == 0 for launch in (*stages, sort_values, query))
+    sort_values, query = kernels.launches(1000, 500)
+    assert (sort_values.kernel, query.kernel) == (kernels.sort_values, kernels.query)
+    assert query.threads == 32 * pair_sum_cuda.slots(500)
+    assert all(launch.threads % launch.block == 0 for launch in (sort_values, query))
 
 
 def test_queries_that_leave_a_box_have_a_kernel_beside_the_others():
     masses, x, scale, _ = arguments(np.float32, 3)
     plan = plan_of(functools.partial(square_sum, box=jfrnn.Box([2.0, 2.0, 2.0])), masses, x, scale)
     kernels = pair_sum_cuda.sum_kernels(plan.text, plan.key, 3, False, False, False, periodic=1)
-    search = cells_cuda.cell_kernels(3, False, False, False, periodic=1)
-    for own in (True, False):
-        *stages, sort_values, crossing, query = kernels.launches(1000, 500, own)
-        assert stages == search.launches(1000, 500, own)[:-2]
-        assert [x.kernel for x in (sort_values, crossing, query)] == [kernels.sort_values, kernels.crossing, kernels.query]
-        assert [x.beside for x in (sort_values, crossing, query)] == [False, False, True]
-    assert kernels.summing == (kernels.sort_values, kernels.query, kernels.crossing)
+    launches = kernels.launches(1000, 500)
+    assert [launch.kernel for launch in launches] == [kernels.sort_values, kernels.crossing, kernels.query]
+    assert [launch.beside for launch in launches] == [False, False, True]
 
 
 @pytest.mark.parametrize("double", [False, True])
@@ -188,13 +180,15 @@ def test_programs_for_cuda_call_it_and_launches_have_the_arguments_of_their_kern
     program = jax.jit(lambda x: square_sum(x[:, 0], x, 1.0, box=box)).trace(x).lower(lowering_platforms=("cuda",)).as_text()
     assert f"@jfrnn_pair_sum_cuda_3d_f32_own_dropself_{'nearest_' * periodic}" in program
     plan = plan_of(functools.partial(square_sum, box=box), *arguments(np.float32, 3)[:3])
+    assert f"@jfrnn_sorting_cuda_3d_f32_own{'_nearest' * periodic}" in program
     variant = _warp._SumVariant(3, False, False, True, False, True, periodic, False, False, False, plan.key, True)
     rows, line = wp.zeros((40, 3), dtype=float, device="cpu"), wp.zeros(40, dtype=float, device="cpu")
     ints = wp.zeros(40, dtype=int, device="cpu")
-    commands = _warp._sum_commands(variant, plan.text, rows, rows, line, line, rows, rows, rows, line, line, line, ints, ints)
-    assert len(commands) == 8 + periodic
-    assert [command.beside for command in commands] == [False] * (7 + periodic) + [bool(periodic)]
-    for command in commands:
+    sorting = _warp._sorting_commands(_warp._sorting(variant), rows, rows, line, ints, ints)
+    summing = _warp._sum_commands(variant, plan.text, rows, rows, line, line, rows, rows, ints, ints, rows, line, line, line)
+    assert (len(sorting), len(summing)) == (6, 2 + periodic)
+    assert [command.beside for command in summing] == [False] * (1 + periodic) + [bool(periodic)]
+    for command in (*sorting, *summing):
         types = [argument.type for argument in command.kernel.adj.args]
         given = [(x.dtype, x.ndim) if isinstance(x, wp.array) else int for x in command.arguments]
         assert given == [(kind.dtype, kind.ndim) if isinstance(kind, wp.array) else int for kind in types]
