@@ -12,13 +12,13 @@ import time
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, PositiveFloat, PositiveInt, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, PositiveFloat, PositiveInt, ValidationError
 from tqdm import tqdm
 
-from experiments import _machine, _measure
+from experiments import _machine, _measure, _ways
 from experiments._errors import UsageError
 from jfrnn._neighbors import rounded_capacity
 from jfrnn._warp import kernels_of, load_warp
@@ -50,6 +50,7 @@ class Config(BaseModel):
     studied_size: PositiveInt | None = None  # none: choices are not studied
     calls: PositiveInt
     steps: PositiveInt
+    sums: list[Annotated[str, AfterValidator(_ways.known)]] = []  # of a density and its gradient
     repeats: PositiveInt
     seconds_per_timing: PositiveFloat
     exactness: list[Exactness]
@@ -96,6 +97,8 @@ def _rows(config: Config) -> Iterator[dict[str, Any]]:
         yield from _study_rows(config, config.studied_size)
     for n in config.counts_only:
         yield _count_row(config, n)
+        if config.sums:
+            yield from _large_sum_rows(config, n)
 
 
 # --- scenes -----------------------------------------------------------------------------------------------------------
@@ -386,6 +389,7 @@ def _scene_rows(config: Config, layout: str, points: np.ndarray) -> Iterator[dic
         yield {"kind": "scan", "method": "jfrnn warp", **base, "steps": config.steps, **_measure.summarize(seconds)}
     if layout == "jitter":
         yield from _loop_rows(config, base, x, cutoff)
+        yield from _sum_rows(config, base, x, cutoff)
     yield from _peer_rows(config, base, x, cutoff)
 
 
@@ -431,6 +435,41 @@ def _loop_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> I
         seconds = [s / config.steps for s in _timed(config, lambda steps=steps: steps(x, nbrs), calls=3)["seconds"]]
         row = {"kind": "scan", "method": f"jfrnn warp, skin, {name}", **base, "capacity": wider, "steps": config.steps}
         yield row | {"rebuilds": rebuilds, **_measure.summarize(seconds)}
+
+
+def _sum_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> Iterator[dict[str, Any]]:  # noqa: ANN401
+    """A density, and with it its gradient: without a list, and over lists that are made for it."""
+    import jax
+
+    masses = np.random.default_rng(config.seed).uniform(0.5, 1.5, base["points"]).astype(np.float32)
+    given = _ways.Given(x, jax.numpy.asarray(masses), cutoff)
+    for way, gradient in itertools.product(config.sums, (False, True)):
+        row: dict[str, Any] = {"kind": "sum", "method": way, "gradient": gradient, **base}
+        try:
+            steps = _ways.WAYS[way].prepare(given, gradient, False)
+
+            def call(steps: _ways.Steps = steps) -> Any:  # noqa: ANN401
+                return steps.sums(given.x, given.m, None if steps.build is None else steps.build(given.x))
+
+            if base["points"] <= 1_000_000:
+                row["error"] = _ways.error_of(given, jax.device_get(call()), gradient)
+            yield row | _timed(config, call)
+        except Exception as error:  # a way that is missing or out of memory says so in its row
+            yield row | {"status": "failed", "reason": f"{type(error).__name__}: {error}"[:300]}
+
+
+def _large_sum_rows(config: Config, n: int) -> Iterator[dict[str, Any]]:
+    """The same of so many random particles that a list of them would not fit; what the program takes beside its arguments."""
+    import jax
+
+    x, cutoff = _random_points(config, n)
+    given = _ways.Given(x, jax.numpy.ones(n, jax.numpy.float32), cutoff)
+    for gradient in (False, True):
+        sums = _ways.WAYS["pair_sum warp"].prepare(given, gradient, False).sums
+        memory: Any = jax.jit(sums).lower(x, given.m, None).compile().memory_analysis()
+        row = {"kind": "sum", "method": "pair_sum warp", "gradient": gradient, "layout": "random", "points": n, "dtype": "float32"}
+        row |= {"compiled_bytes": memory.temp_size_in_bytes + memory.output_size_in_bytes}
+        yield row | _timed(config, lambda sums=sums: sums(x, given.m, None), calls=2)
 
 
 def _different_rows(one: Any, other: Any) -> int:  # noqa: ANN401
@@ -506,24 +545,25 @@ def _nvalchemi(x: Any, cutoff: float, capacity: int) -> tuple[Callable[[], Any],
     return (lambda: search(shifted)), int(search(shifted)[1].sum())
 
 
+def _random_points(config: Config, n: int) -> tuple[Any, float]:
+    """Return points made on the device, float32 [n, 3], and a cutoff: about 113 neighbors."""
+    import jax
+
+    side = (n / 27.0) ** (1 / 3)  # 27 particles per cube of one cutoff
+    return jax.random.uniform(jax.random.key(config.seed), (n, 3), jax.numpy.float32, 0, side), 1.0
+
+
 def _count_row(config: Config, n: int) -> dict[str, Any]:
-    """Count neighbors of so many particles that a list of them would not fit: random points, made on the device."""
+    """Count neighbors of so many particles that a list of them would not fit."""
     import jax
 
     import jfrnn
 
-    side = (n / 27.0) ** (1 / 3)  # 27 particles per cube of one cutoff: about 113 neighbors
-    x = jax.random.uniform(jax.random.key(config.seed), (n, 3), jax.numpy.float32, 0, side)
-    counts = jax.jit(lambda x: jfrnn.count(x, 1.0, backend="warp"))
+    x, cutoff = _random_points(config, n)
+    counts = jax.jit(lambda x: jfrnn.count(x, cutoff, backend="warp"))
     total = int(np.asarray(counts(x)).sum(dtype=np.int64))
-    row = {
-        "kind": "call",
-        "method": "jfrnn warp, counts",
-        "layout": "random",
-        "points": n,
-        "dtype": "float32",
-        "directed_pairs": total,
-    }
+    row = {"kind": "call", "method": "jfrnn warp, counts", "layout": "random", "points": n, "dtype": "float32"}
+    row |= {"directed_pairs": total}
     return row | _timed(config, lambda: counts(x), calls=2) | {"peak_bytes": _device_bytes("peak_bytes_in_use")}
 
 

@@ -21,7 +21,7 @@ def report(folder: Path) -> str:
     if not path.exists():
         raise UsageError(f"{path} does not exist: run python -m experiments gpu CONFIG --out {folder} first")
     rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    text = "\n\n".join([_head(rows), _exactness(rows), _calls(rows), _study(rows), _memory(rows)]) + "\n"
+    text = "\n\n".join([_head(rows), _exactness(rows), _calls(rows), _sums(rows), _study(rows), _memory(rows)]) + "\n"
     (folder / "report.md").write_text(text, encoding="utf-8")
     _draw(rows, folder / "roofline.png")
     return text
@@ -73,6 +73,23 @@ def _calls(rows: list[dict[str, Any]]) -> str:
             "reason": r.get("reason", "")[:80],
         })  # fmt: skip
     return "## Calls that are not waited for one by one\n\n" + _markdown(table)
+
+
+def _sums(rows: list[dict[str, Any]]) -> str:
+    table, sums = [], _of(rows, "sum")
+    without_list = {(r["points"], r["gradient"]): r.get("median_s") for r in sums if r["method"] == "pair_sum warp"}
+    for r in sums:
+        seconds, ours = r.get("median_s"), without_list.get((r["points"], r["gradient"]))
+        table.append({
+            "scene": r["layout"], "points": f"{r['points']:,}".replace(",", " "), "way": r["method"],
+            "what": "density, gradient" if r["gradient"] else "density",
+            "ms": "·" if seconds is None else f"{1e3 * seconds:.4g}",
+            "/ pair_sum warp": "·" if seconds is None or ours is None else f"{seconds / ours:.3g}",
+            "error / eps √k": f"{r['error']:.2g}" if "error" in r else "·",
+            "B per particle": f"{r['compiled_bytes'] / r['points']:.1f}" if "compiled_bytes" in r else "·",
+            "reason": r.get("reason", "")[:80],
+        })  # fmt: skip
+    return "## Sums over neighbors\n\n" + _markdown(table)
 
 
 def _study(rows: list[dict[str, Any]]) -> str:

@@ -50,10 +50,7 @@ class Config(Table):
     @field_validator("ways")
     @classmethod
     def _ways_exist(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        for name in names:
-            if name not in _ways.WAYS:
-                raise ValueError(f"unknown way {name!r}; allowed: {', '.join(_ways.WAYS)}")
-        return names
+        return tuple(map(_ways.known, names))
 
     @field_validator("layouts")
     @classmethod

@@ -324,3 +324,14 @@ WAYS = {
     "nvalchemi list, sum": Way(_nvalchemi, "nvalchemi-toolkit-ops"),
     "scipy pairs alone": Way(_scipy, "scipy", sums=False),
 }
+
+
+def known(name: str) -> str:
+    """Return the name of a way.
+
+    Raises:
+        ValueError: There is none of that name.
+    """
+    if name not in WAYS:
+        raise ValueError(f"unknown way {name!r}; allowed: {', '.join(WAYS)}")
+    return name

@@ -1,6 +1,7 @@
 """The GPU run, on whatever device is there: its config, its checks and its rows."""
 
 import importlib
+import itertools
 import json
 from pathlib import Path
 
@@ -15,7 +16,7 @@ CONFIG = Path(__file__).parent.parent / "experiments" / "configs" / "h200.toml"
 
 @pytest.fixture
 def config():
-    small = {"sizes": [1000], "counts_only": [1000], "studied_size": 1000, "calls": 2, "steps": 2, "repeats": 2}
+    small = {"sizes": [1000], "counts_only": [1000], "studied_size": 1000, "calls": 2, "steps": 2, "repeats": 2, "sums": []}
     return _gpu.load(CONFIG).model_copy(update=small)
 
 
@@ -36,6 +37,19 @@ def test_rows_of_a_scene_are_checked_and_timed(config):
     assert all(row["same_bits_twice"] for row in ours[:2])
     assert all(row["directed_pairs"] == row["exact_directed_pairs"] for row in ours[:3])
     json.dumps(rows)
+
+
+def test_sums_are_timed_and_their_errors_known(config):
+    config = config.model_copy(update={"sums": ["pair_sum warp", "nvalchemi list, sum"]})
+    x = np.asarray(_gpu._jitter_lattice(config, 300))
+    rows = list(_gpu._sum_rows(config, {"layout": "jitter", "points": len(x)}, x, 3.0))
+    assert [(row["method"], row["gradient"]) for row in rows] == list(itertools.product(config.sums, (False, True)))
+    assert all(row["median_s"] > 0 and row["error"] < 16 for row in rows[:2])
+    for row in rows[2:]:  # a peer may be missing
+        assert row["error"] < 16 if "median_s" in row else row["reason"].startswith("ModuleNotFoundError")
+    large = list(_gpu._large_sum_rows(config, 2000))
+    assert [row["gradient"] for row in large] == [False, True]
+    assert all(36 < row["compiled_bytes"] / row["points"] < 100 for row in large)
 
 
 def test_different_rows_are_counted_as_sets():
@@ -76,18 +90,23 @@ def test_memory_is_planned_within_a_tenth(monkeypatch):
 def test_report_of_a_run(tmp_path, config):
     about = {"device": "some GPU", "versions": {"jax": "1", "warp-lang": "2"}, "commit": "abc", "time": "2026-01-01T00:00:00Z"}
     call = {"kind": "call", "layout": "jitter", "points": 1000, "capacity": 100, "exact_directed_pairs": 5}
+    both = {**call, "kind": "sum", "gradient": True}
     rows = [
         {"kind": "ceiling", "method": "read and write", "bytes_per_s": 1e12},
         {"kind": "exactness", "method": "jfrnn warp", "dtype": "float32", "dim": 3, "cases": 2, "wrong": 0},
         {**call, "method": "jfrnn warp", "directed_pairs": 5, "median_s": 1e-3},
         {**call, "method": "a peer", "directed_pairs": 7, "median_s": 4e-3},
         {**call, "method": "another", "reason": "not installed"},
+        {**both, "method": "pair_sum warp", "median_s": 2e-3, "error": 0.5, "compiled_bytes": 68_000},
+        {**both, "method": "list, sum", "median_s": 6e-3, "error": 0.25},
     ]
     (tmp_path / "rows.jsonl").write_text("\n".join(json.dumps(row | about) for row in rows))
     text = _gpu_report.report(tmp_path)
     assert "| jitter | 1 000 | a peer | 4 | 4 |" in text  # ms, and four times ours
     assert "| 2 |  |" in text  # its two pairs too many
     assert "not installed" in text
+    assert "| pair_sum warp | density, gradient | 2 | 1 | 0.5 | 68.0 |" in text
+    assert "| list, sum | density, gradient | 6 | 3 | 0.25 | · |" in text
     assert _gpu_report.floor_seconds(rows[2], 1e12) == pytest.approx(1000 * 416 / 1e12)
     assert (tmp_path / "roofline.png").stat().st_size > 1000
 
