@@ -171,6 +171,40 @@ def sums(
 
 
 @app.command()
+def sph(
+    scene: Annotated[str, typer.Argument(help="Fluid scene, such as dam, taylor-green, dam-break-2d, jet.")],
+    settings: Annotated[list[str] | None, typer.Option("--set", help="key=value: of the scene, or of its physics.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the run; out/sph/SCENE without it.")] = None,
+    initial: Annotated[Path | None, typer.Option(help="Initial particles instead of the scene's: .npz or .csv.")] = None,
+    frames: Annotated[int, typer.Option(min=1, help="Snapshots after the first.")] = 50,
+    dtype: Annotated[str, typer.Option(help="float32 or float64.")] = "float64",
+    neighbors: Annotated[str, typer.Option(help="pair_sum, or list: a list with a skin.")] = "pair_sum",
+    skin: Annotated[float, typer.Option(min=0.01, help="Of the list, in particle spacings.")] = 0.3,
+    pictures: Annotated[bool, typer.Option(help="Draw frames and a GIF.")] = True,
+) -> None:
+    """Run a fluid scene, or go on with it from its last snapshot: snapshots, energies, pictures."""
+    with _usage_errors():
+        import jax
+
+        jax.config.update("jax_enable_x64", dtype == "float64")
+        from experiments.sph import run as sph_run
+        from experiments.sph import settings as sph_settings
+
+        for name, value, allowed in (("dtype", dtype, ("float32", "float64")), ("neighbors", neighbors, ("pair_sum", "list"))):
+            if value not in allowed:
+                raise UsageError(f"--{name} {value}: allowed: {', '.join(allowed)}")
+        fluid = sph_settings.make_scene(scene, settings or [])
+        fluid = fluid if initial is None else sph_settings.with_particles(fluid, initial)
+        folder = out or Path("out") / "sph" / scene
+        try:
+            sph_run.run(fluid, folder, sph_run.How(frames, dtype, neighbors, skin, pictures))
+        except KeyboardInterrupt:
+            typer.echo("stopped; the same command goes on from the last snapshot", err=True)
+            raise typer.Exit(130) from None
+        typer.echo(folder)
+
+
+@app.command()
 def peers(
     names: Annotated[list[str] | None, typer.Argument(help="Of libraries; all that are known without.")] = None,
     out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "peers",

@@ -1,0 +1,143 @@
+"""A fluid scene: particles, and what acts on them, as plain data. What is None is not there, and will not be computed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Kernel = Literal["cubic", "quintic", "wendland2", "wendland4", "wendland6", "poly6"]
+
+
+@dataclass(frozen=True)
+class Physics:
+    """State what acts in a scene: words choose an equation, numbers are its constants, and None leaves it out.
+
+    Args:
+        density: Rest density ρ0 [kg/m³; in 2D kg/m²].
+        sound_speed: Artificial speed of sound c [m/s], about ten times the largest velocity.
+        smoothing: Smoothing length h [m]. The cutoff is the kernel's support times h.
+        kernel: Smoothing kernel; "poly6" takes the spiky kernel for gradients, as the 2D source does.
+        evolve: What follows the compression: "summation" (density, summed anew), "continuity" (density, carried along), or
+            "pressure" (EDAC: the pressure is carried along).
+        state: Pressure of a density: "linear", c²(ρ-ρ0), or "tait", ρ0c²/γ·((ρ/ρ0)^γ - 1).
+        exponent: γ of "tait".
+        pressure: Form of the pressure force: "symmetric", "mean", "volume", "difference"; "source" is that of the 2D source.
+        viscosity: Kinematic viscosity ν [m²/s] of laminar viscosity; with "source" the dynamic one, μ.
+        viscosity_form: "morris", "volume", or "source", that of the 2D source.
+        artificial: Monaghan's α of artificial viscosity.
+        density_diffusion: δ of δ-SPH, about 0.1.
+        pressure_diffusion: ν of EDAC [m²/s]: what smooths a carried pressure.
+        transport: Background pressure [Pa] of the transport velocity, which keeps particles evenly spread.
+        shifting: Strength of particle shifting.
+        tension: Strength of cohesion [m³/s²/kg · kg], see `experiments.sph.surface`.
+        corrected: Gradients of the kernel are renormalized, so that linear fields have exact gradients.
+        gravity: Acceleration [m/s²], one number per axis.
+        restitution: Share of the normal velocity that a particle keeps at the walls of the `Tank` around the scene.
+        slip: Walls of dummy particles do not hold the fluid along them.
+        integrator: "leapfrog" (kick, drift), "symplectic" (kick, drift, kick), or "midpoint" (Runge-Kutta of second order).
+    """
+
+    density: float
+    sound_speed: float
+    smoothing: float
+    kernel: Kernel = "wendland2"
+    evolve: Literal["summation", "continuity", "pressure"] = "continuity"
+    state: Literal["linear", "tait"] = "tait"
+    exponent: float = 7.0
+    pressure: Literal["symmetric", "mean", "volume", "difference", "source"] = "symmetric"
+    viscosity: float | None = None
+    viscosity_form: Literal["morris", "volume", "source"] = "morris"
+    artificial: float | None = None
+    density_diffusion: float | None = None
+    pressure_diffusion: float | None = None
+    transport: float | None = None
+    shifting: float | None = None
+    tension: float | None = None
+    corrected: bool = False
+    gravity: tuple[float, ...] | None = None
+    restitution: float | None = None
+    slip: bool = False
+    integrator: Literal["leapfrog", "symplectic", "midpoint"] = "symplectic"
+
+
+WORDS = ("smoothing", "kernel", "evolve", "state", "exponent", "pressure", "viscosity_form", "corrected", "slip", "integrator")
+"""Fields of `Physics` that choose what is computed; the others are numbers that may be traced."""
+
+
+@dataclass(frozen=True, eq=False)
+class FluidScene:
+    """Hold particles and what acts on them.
+
+    Args:
+        name: Name of the scene.
+        positions: Particle positions [m], float64, shape [n, d].
+        velocities: Velocities [m/s], float64, shape [n, d]; those of wall particles stay.
+        masses: Masses [kg], float64, shape [n].
+        spacing: Particle distance [m].
+        duration: Time that is simulated [s].
+        step: Time step [s]; None: it follows from the Courant condition, anew in every step.
+        physics: What acts.
+        wall: Which particles are dummies of a wall, bool, shape [n]; None: there are none.
+        periodic: Lower corner and lengths of a box that repeats itself [m], and along which axes; None: space is open.
+        tank: Lower and upper corner of a box that particles bounce off [m], for `physics.restitution`; None: there is none.
+        bounds: Lower and upper corner [m] of what a picture shows.
+        sealed: Lower and upper corner [m] of what no particle of the fluid may leave, infinite where there is no wall; None: there
+            are none.
+        enters: When each particle enters [s], shape [n]; until then it waits and takes no part. None: all are there.
+        guided: How long a particle that entered keeps its velocity [s], whatever acts on it.
+        densities: Densities at first [kg/m³], shape [n], where they are carried; None: the rest density.
+        pressures: Pressures at first [Pa], shape [n], where they are carried; None: 0.
+    """
+
+    name: str
+    positions: NDArray[np.float64]
+    velocities: NDArray[np.float64]
+    masses: NDArray[np.float64]
+    spacing: float
+    duration: float
+    step: float | None
+    physics: Physics
+    wall: NDArray[np.bool_] | None = None
+    periodic: "Periodic | None" = None
+    tank: "Tank | None" = None
+    bounds: "Tank | None" = None
+    sealed: "Tank | None" = None
+    enters: NDArray[np.float64] | None = None
+    guided: float = 0.0
+    densities: NDArray[np.float64] | None = None
+    pressures: NDArray[np.float64] | None = None
+
+    @property
+    def n(self) -> int:
+        """Number of particles."""
+        return self.positions.shape[0]
+
+    @property
+    def dim(self) -> int:
+        """Number of axes."""
+        return self.positions.shape[1]
+
+
+@dataclass(frozen=True)
+class Tank:
+    """A box by its lower and upper corner [m]."""
+
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Periodic:
+    """A box that repeats itself: lower corner and lengths [m], and along which axes it does."""
+
+    lower: tuple[float, ...]
+    lengths: tuple[float, ...]
+    axes: tuple[bool, ...]
+
+
+def lattice(lower: Sequence[float], counts: Sequence[int], spacing: float) -> NDArray[np.float64]:
+    """Return the centers of cells of this size from a lower corner on, shape [n, d], x slowest."""
+    axes = [np.float64(low) + (np.arange(count) + 0.5) * spacing for low, count in zip(lower, counts, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))

@@ -1,0 +1,178 @@
+"""Fluids with a free surface: a tank at rest, an elliptical drop, dam breaks, an oil jet onto a plate."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ._fluid import FluidScene, Physics, Tank, lattice
+
+LAYERS = 3  # of wall dummies: as far as a Wendland kernel with h = 1.3 dx reaches
+
+
+def free(density: float, sound_speed: float, spacing: float) -> Physics:
+    """Return physics for flows with a free surface: density carried by continuity and smoothed (δ-SPH), Tait's equation of state.
+
+    Args:
+        density: Rest density ρ0.
+        sound_speed: c [m/s].
+        spacing: Particle distance [m]; the smoothing length is 1.3 times as much.
+    """
+    return Physics(
+        density=density,
+        sound_speed=sound_speed,
+        smoothing=1.3 * spacing,
+        kernel="wendland2",
+        density_diffusion=0.1,
+        pressure="mean",
+        slip=True,
+    )
+
+
+def hydrostatic(*, height: float = 0.9, ny: int = 45, duration: float = 8.0, viscosity: float = 0.005) -> FluidScene:
+    """Return water in an open tank 2 m wide, at rest density everywhere, which settles under g = 1 m/s².
+
+    Args:
+        height: Of the water H [m].
+        ny: Particles from the ground to the surface.
+        duration: Time that is simulated [s].
+        viscosity: ν [m²/s]: what brings it to rest.
+
+    Source: Adami, Hu & Adams (2012), doi:10.1016/j.jcp.2012.05.005, sec. 4.1.
+    """
+    spacing = height / ny
+    sound_speed = 10 * math.sqrt(height)
+    water = lattice((0.0, 0.0), (round(2 / spacing), ny), spacing)
+    physics = replace(free(1000.0, sound_speed, spacing), gravity=(0.0, -1.0), viscosity=viscosity)
+    return _in_tank("hydrostatic", water, spacing, (round(2 / spacing) * spacing, height + 0.1), physics, duration)
+
+
+def drop(*, radius: float = 1.0, nx: int = 40, duration: float = 0.0076, sound_speed: float = 1400.0) -> FluidScene:
+    """Return a disc in free space that its own motion, (-100 x, 100 y) m/s, makes an ellipse.
+
+    Args:
+        radius: Of the disc [m].
+        nx: Particles along a radius.
+        duration: Time that is simulated [s].
+        sound_speed: c [m/s].
+
+    Source: Monaghan (1994), doi:10.1006/jcph.1994.1034, sec. 5.1.
+    """
+    spacing = radius / nx
+    grid = lattice((-radius, -radius), (2 * nx, 2 * nx), spacing)
+    disc = grid[(grid**2).sum(axis=1) <= radius**2]
+    return FluidScene(
+        name="drop",
+        positions=disc,
+        velocities=disc * (-100.0, 100.0),
+        masses=np.full(len(disc), spacing**2),
+        spacing=spacing,
+        duration=duration,
+        step=0.25 * 1.3 * spacing / (sound_speed + 100 * radius),
+        physics=free(1.0, sound_speed, spacing),
+        bounds=Tank((-2 * radius, -2 * radius), (2 * radius, 2 * radius)),
+    )
+
+
+def dam_break(
+    *, width: float = 1.0, nx: int = 40, dim: int = 2, tank: float = 4.0, depth: float = 0.5, duration: float = 0.8
+) -> FluidScene:
+    """Return a column of water, twice as high as wide, that collapses in a longer tank.
+
+    Args:
+        width: Of the column a [m].
+        nx: Particles along it.
+        dim: 2 or 3.
+        tank: Length of the tank in column widths.
+        depth: Of the tank in 3D, in column widths.
+        duration: Time that is simulated [s].
+
+    Source: Martin & Moyce (1952), doi:10.1098/rsta.1952.0006.
+    """
+    spacing = width / nx
+    counts = (nx, 2 * nx) if dim == 2 else (nx, max(1, round(depth * nx)), 2 * nx)  # the last axis points up
+    sides = (tank * width, 2.5 * width) if dim == 2 else (tank * width, counts[1] * spacing, 2.5 * width)
+    sound_speed = 10 * math.sqrt(2 * 9.81 * 2 * width)
+    physics = replace(free(1000.0, sound_speed, spacing), gravity=(*(0.0,) * (dim - 1), -9.81), artificial=0.05)
+    return _in_tank(f"dam-break-{dim}d", lattice((0.0,) * dim, counts, spacing), spacing, sides, physics, duration)
+
+
+def dam_break_3d(*, width: float = 1.0, nx: int = 20, tank: float = 4.0, depth: float = 0.5, duration: float = 0.8) -> FluidScene:
+    """Return `dam_break` in three dimensions; nx = 46 makes 97 000 particles of water."""
+    return dam_break(width=width, nx=nx, dim=3, tank=tank, depth=depth, duration=duration)
+
+
+def jet(
+    *,
+    diameter: float = 2e-3,
+    layers: int = 8,
+    speed: float = 5.0,
+    height: float = 8e-3,
+    plate: float = 16e-3,
+    duration: float = 5e-3,
+    viscosity: float = 2e-5,
+    tension: float = 0.0,
+) -> FluidScene:
+    """Return a jet of oil (860 kg/m³) that leaves a nozzle downwards and hits a flat plate: a few percent of its box.
+
+    Args:
+        diameter: Of the jet [m].
+        layers: Particles along it.
+        speed: At the nozzle [m/s].
+        height: Of the nozzle over the plate [m].
+        plate: Side of the plate [m].
+        duration: Time that is simulated, and for which oil comes [s].
+        viscosity: ν [m²/s].
+        tension: Cohesion [m/s²/kg]; 0: there is none.
+    """
+    spacing = diameter / layers
+    disc = lattice((-diameter / 2,) * 2, (layers, layers), spacing)
+    disc = disc[(disc**2).sum(axis=1) <= diameter**2 / 4]
+    enters = np.arange(int(duration * speed / spacing), dtype=np.float64) * spacing / speed
+    oil = np.tile(np.column_stack([disc, np.full(len(disc), height)]), (len(enters), 1))
+    sites = round(plate / spacing)
+    ground = lattice((-sites * spacing / 2, -sites * spacing / 2, -LAYERS * spacing), (sites, sites, LAYERS), spacing)
+    positions, wall = np.concatenate([oil, ground]), np.arange(len(oil) + len(ground)) >= len(oil)
+    physics = replace(free(860.0, 10 * speed, spacing), viscosity=viscosity, gravity=(0.0, 0.0, -9.81), artificial=0.05, slip=False)
+    return FluidScene(
+        name="jet",
+        positions=positions,
+        velocities=np.where(wall[:, None], 0.0, np.array([0.0, 0.0, -speed])),
+        masses=np.full(len(positions), 860.0 * spacing**3),
+        spacing=spacing,
+        duration=duration,
+        step=0.25 * 1.3 * spacing / (12 * speed),
+        physics=replace(physics, tension=tension or None),
+        wall=wall,
+        bounds=Tank((-plate / 2, -plate / 2, 0.0), (plate / 2, plate / 2, height)),
+        enters=np.concatenate([np.repeat(enters, len(disc)), np.zeros(len(ground))]).astype(np.float64),
+        guided=2.6 * spacing / speed,
+    )
+
+
+def _in_tank(
+    name: str, water: NDArray[np.float64], spacing: float, sides: tuple[float, ...], physics: Physics, duration: float
+) -> FluidScene:
+    """Return water in a tank of dummy particles, open above; the last axis points up."""
+    counts = [round(side / spacing) for side in sides]
+    around = lattice((-LAYERS * spacing,) * len(counts), [*(n + 2 * LAYERS for n in counts[:-1]), counts[-1] + LAYERS], spacing)
+    inner = ((around > 0) & (around < np.array([*(n * spacing for n in counts[:-1]), np.inf]))).all(axis=1)
+    walls = around[~inner]
+    positions = np.concatenate([water, walls])
+    return FluidScene(
+        name=name,
+        positions=positions,
+        velocities=np.zeros_like(positions),
+        masses=np.full(len(positions), physics.density * spacing ** len(counts)),
+        spacing=spacing,
+        duration=duration,
+        step=0.25 * physics.smoothing / (1.1 * physics.sound_speed),
+        physics=physics,
+        wall=np.arange(len(positions)) >= len(water),
+        bounds=Tank((0.0,) * len(counts), tuple(n * spacing for n in counts)),
+        sealed=Tank((0.0,) * len(counts), (*(n * spacing for n in counts[:-1]), np.inf)),
+    )
+
+
+SCENES = {"hydrostatic": hydrostatic, "drop": drop, "dam-break-2d": dam_break, "dam-break-3d": dam_break_3d, "jet": jet}

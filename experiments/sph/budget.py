@@ -1,0 +1,28 @@
+"""Energies and momentum of a state."""
+
+import jax.numpy as jnp
+from jax import Array
+
+from experiments.sph.model import Model, State
+
+
+def kinetic_energy(model: Model, s: State) -> Array:
+    """Return ½ Σ m v² of the fluid [J; in 2D J/m], shape []."""
+    return jnp.sum(_masses(model) * jnp.sum(s.v * s.v, axis=1)) / 2
+
+
+def potential_energy(model: Model, s: State) -> Array:
+    """Return -Σ m g·(x - x0) of the fluid [J], shape []; x0 is the lower corner of the tank, or the origin. 0 without gravity."""
+    if model.physics.gravity is None:
+        return jnp.zeros((), s.x.dtype)
+    ground = jnp.zeros((), s.x.dtype) if model.tank is None else model.tank[0]
+    return -jnp.sum(_masses(model) * ((s.x - ground) @ model.physics.gravity))
+
+
+def momentum(model: Model, s: State) -> Array:
+    """Return Σ m v of the fluid [kg m/s], shape [d]."""
+    return jnp.sum(_masses(model)[:, None] * s.v, axis=0)
+
+
+def _masses(model: Model) -> Array:
+    return model.m if model.wall is None else jnp.where(model.wall, 0, model.m)

@@ -1,0 +1,179 @@
+"""What acts on the particles of a model: the parts that its scene has, put together. One sum over neighbors per stage."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+import jfrnn
+from experiments.sph import correction, density, states, surface, transport, viscosity, walls
+from experiments.sph.kernels import KERNELS
+from experiments.sph.model import Model, State
+from experiments.sph.pairs import Pair, Term, Values, total
+from experiments.sph.pressure import PRESSURES
+
+Neighbors = jfrnn.NeighborList | None
+
+
+class Fields(NamedTuple):
+    """What forces are made of: densities, pressures [n], velocities that viscosity sees [n, d], corrections [n, d, d] or None."""
+
+    rho: Array
+    p: Array
+    u: Array
+    inverse: Array | None
+
+
+def active(model: Model, time: Array) -> Array | None:
+    """Return which particles have entered, shape [n], bool; None where all are there from the beginning."""
+    return None if model.enters is None else time >= model.enters
+
+
+def resting(model: Model, time: Array) -> Array | None:
+    """Return which particles stay where they are, shape [n], bool: those of walls, and those that have not entered yet."""
+    return model.wall if model.enters is None else _either(model.wall, time < model.enters)
+
+
+def guided(model: Model, time: Array) -> Array | None:
+    """Return which particles keep their velocity, shape [n], bool: those of walls, and those that have just entered."""
+    if model.enters is None or model.guided is None:
+        return model.wall
+    return _either(model.wall, time < model.enters + model.guided)
+
+
+def _either(mask: Array | None, other: Array) -> Array:
+    return other if mask is None else mask | other
+
+
+def _sum(term: Term, model: Model, s: State, values: Values, nbrs: Neighbors) -> Any:  # noqa: ANN401
+    options = {"box": model.box, "active": active(model, s.time), "backend": model.backend}
+    values = values | {"m": model.m} | ({} if model.wall is None else {"wall": model.wall})
+    return total(term, s.x, values, model.kernel, model.physics.smoothing, nbrs, **options)
+
+
+def _gradient(model: Model, pair: Pair, i: Values) -> Array:
+    """Return ∇W at i, shape [d], corrected where the scene asks for it."""
+    if model.physics.kernel == "poly6":  # not steep enough near 0: particles would cluster
+        pair = Pair(pair.r, KERNELS["spiky"], pair.h)
+    plain = -pair.pull * pair.r
+    return i["inverse"] @ plain if "inverse" in i else plain
+
+
+def fluid(j: Values, part: Any) -> Any:  # noqa: ANN401
+    """Return what neighbor j adds if it belongs to the fluid, else 0; where there are no walls, what it adds."""
+    return jnp.where(j["wall"], 0, part) if "wall" in j else part
+
+
+def densities(model: Model, s: State, nbrs: Neighbors) -> Array:
+    """Return densities [kg/m³], shape [n]: those that are carried, those of rest, or summed over neighbors and itself."""
+    physics = model.physics
+    if s.rho is not None:
+        return s.rho
+    if s.p is not None:
+        return jnp.broadcast_to(physics.density, s.x.shape[:1])
+    own = model.kernel.value(jnp.zeros((), s.x.dtype), physics.smoothing, s.x.shape[1])
+    return _sum(lambda pair, i, j: density.summation(pair, j), model, s, {}, nbrs) + model.m * own
+
+
+def pressures(model: Model, s: State, rho: Array) -> Array:
+    """Return pressures [Pa], shape [n]: those that are carried, or what the equation of state makes of densities."""
+    physics = model.physics
+    if s.p is not None:
+        return s.p
+    if physics.state == "linear":
+        return states.linear(rho, physics.density, physics.sound_speed)
+    return states.tait(rho, physics.density, physics.sound_speed, physics.exponent)
+
+
+def corrections(model: Model, s: State, rho: Array, nbrs: Neighbors) -> Array | None:
+    """Return what kernel gradients are multiplied with, shape [n, d, d], or None."""
+    if not model.physics.corrected:
+        return None
+    return correction.inverse(_sum(lambda pair, i, j: correction.moment(pair, j), model, s, {"rho": rho}, nbrs))
+
+
+def carried_rate(model: Model, s: State, rho: Array, inverse: Array | None, nbrs: Neighbors) -> Array:
+    """Return the rate of the carried density [kg/m³/s] or pressure [Pa/s], shape [n]; walls have none."""
+    physics, name = model.physics, "p" if s.rho is None else "rho"
+    values = {"v": s.v, "rho": rho} | {
+        key: value for key, value in (("p", s.p), ("w", s.w), ("inverse", inverse)) if value is not None
+    }
+    hydrostatic = None
+    if physics.gravity is not None:
+        hydrostatic = physics.density * physics.gravity / physics.sound_speed**2
+
+    def term(pair: Pair, i: Values, j: Values) -> Array:
+        gradient = _gradient(model, pair, i)
+        within = 0  # diffusion is among the fluid: a wall's own value means nothing
+        if name == "rho":
+            rate = density.continuity(pair, i, j, gradient)
+            if physics.density_diffusion is not None:
+                strength = physics.density_diffusion * physics.smoothing * physics.sound_speed
+                within = density.diffusion(pair, i, j, strength, hydrostatic)
+        else:
+            rate = transport.pressure_rate(pair, i, j, gradient, physics.density * physics.sound_speed**2)
+            if physics.pressure_diffusion is not None:
+                within = transport.pressure_diffusion(pair, i, j, physics.pressure_diffusion)
+        if s.w is not None:
+            within = within + transport.advected_change(pair, i, j, gradient, name)
+        return rate + fluid(j, within)
+
+    return walls.fluid_only(model.wall, _sum(term, model, s, values, nbrs))
+
+
+def fields(model: Model, s: State, rho: Array, inverse: Array | None, nbrs: Neighbors) -> Fields:
+    """Return what forces are made of; at walls, what they show to the fluid."""
+    p = pressures(model, s, rho)
+    if model.wall is None:
+        return Fields(rho, p, s.v, inverse)
+    physics = model.physics
+    sums = _sum(walls.seen_by_wall, model, s, {"rho": rho, "p": p, "v": s.v}, nbrs)
+    wall_p, wall_u = walls.extrapolated(sums, s.v, physics.gravity)
+    if physics.evolve == "pressure":
+        wall_rho = rho
+    elif physics.state == "linear":
+        wall_rho = states.linear_density(wall_p, physics.density, physics.sound_speed)
+    else:
+        wall_rho = states.tait_density(wall_p, physics.density, physics.sound_speed, physics.exponent)
+    u = s.v if physics.slip else walls.fluid_only(model.wall, s.v, wall_u)
+    return Fields(walls.fluid_only(model.wall, rho, wall_rho), walls.fluid_only(model.wall, p, wall_p), u, inverse)
+
+
+def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tuple[Array, Array | None]:
+    """Return accelerations [m/s²], shape [n, d], and velocities by which particles move besides v [m/s], or None."""
+    physics = model.physics
+    values = {"rho": seen.rho, "p": seen.p, "v": s.v, "u": seen.u}
+    values |= {key: value for key, value in (("w", s.w), ("inverse", seen.inverse)) if value is not None}
+    unit = model.kernel.value(jnp.asarray(model.spacing, s.x.dtype), physics.smoothing, s.x.shape[1])
+
+    def term(pair: Pair, i: Values, j: Values) -> dict[str, Array]:
+        gradient = _gradient(model, pair, i)
+        a = PRESSURES[physics.pressure](pair, i, j, gradient)
+        if physics.viscosity is not None:
+            drag = viscosity.VISCOSITIES[physics.viscosity_form](pair, i, j, physics.viscosity)
+            a = a + (fluid(j, drag) if physics.slip else drag)
+        if physics.artificial is not None:
+            a = a + viscosity.artificial(pair, i, j, gradient, physics.artificial * physics.sound_speed)
+        if physics.tension is not None:
+            a = a + surface.cohesion(pair, i, j, physics.tension, model.cutoff)
+        if physics.transport is not None:
+            a = a + transport.advected(pair, i, j, gradient)
+        if physics.shifting is not None:
+            a = a + fluid(j, transport.advected_change(pair, i, j, gradient, "v"))
+        sums = {"a": a}
+        if physics.transport is not None:
+            sums["w"] = transport.transport(pair, i, j, physics.transport)
+        if physics.shifting is not None:
+            sums["w"] = transport.spread(pair, i, j, unit)
+        return sums
+
+    sums = _sum(term, model, s, values, nbrs)
+    a = sums["a"] if physics.gravity is None else sums["a"] + physics.gravity
+    return walls.fluid_only(guided(model, s.time), a), sums.get("w")
+
+
+def density_and_pressure(model: Model, s: State, nbrs: Neighbors = None) -> tuple[Array, Array]:
+    """Return densities [kg/m³] and pressures [Pa] of a state, shape [n] each; at walls those that they show to the fluid."""
+    rho = densities(model, s, nbrs)
+    seen = fields(model, s, rho, None, nbrs)
+    return seen.rho, seen.p

@@ -1,0 +1,70 @@
+"""Pictures of a run: a frame per snapshot, and all of them as a GIF."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
+
+if TYPE_CHECKING:
+    from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
+
+WALL = "0.75"
+
+
+def draw(scene: "FluidScene", x: np.ndarray, v: np.ndarray, time: float, top_speed: float, path: Path) -> None:
+    """Draw particles from the side, colored by speed: the first axis to the right, the last one upwards.
+
+    Args:
+        scene: The scene; its bounds are the frame.
+        x: Positions [m], shape [n, d].
+        v: Velocities [m/s], shape [n, d].
+        time: [s].
+        top_speed: Where the color scale ends [m/s].
+        path: The picture.
+    """
+    lower, upper = picture_bounds(scene)
+    wide, high = (upper - lower)[[0, -1]]
+    figure = Figure(figsize=(7.0, min(max(7.0 * high / wide, 2.5) + 0.8, 9.0)), layout="constrained")
+    axes = figure.add_subplot()
+    x = wrapped(scene, x)
+    there = np.ones(scene.n, bool) if scene.enters is None else scene.enters <= time
+    wall = np.zeros(scene.n, bool) if scene.wall is None else scene.wall
+    depth = np.argsort(x[:, 1]) if scene.dim == 3 else np.arange(scene.n)
+    seen = depth[(there & ~wall)[depth]]
+    pixels = 72 * 6.0 * scene.spacing / max(wide, 1e-300)
+    shape = {"s": max(0.8 * pixels, 0.6) ** 2, "linewidths": 0}
+    axes.scatter(*x[wall][:, [0, -1]].T, color=WALL, **shape)
+    speed = np.linalg.norm(v[seen], axis=1)
+    marks = axes.scatter(*x[seen][:, [0, -1]].T, c=speed, cmap="viridis", vmin=0, vmax=top_speed or 1.0, **shape)
+    figure.colorbar(marks, ax=axes, label="speed [m/s]", shrink=0.8)
+    margin = 2 * scene.spacing
+    axes.set(xlim=(lower[0] - margin, upper[0] + margin), ylim=(lower[-1] - margin, upper[-1] + margin), aspect="equal")
+    axes.set(xlabel="x [m]", ylabel=f"{'xyz'[scene.dim - 1]} [m]", title=f"{scene.name}, t = {time:.4g} s")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)
+
+
+def picture_bounds(scene: "FluidScene") -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and upper corner of what is shown."""
+    if scene.bounds is None:
+        return scene.positions.min(axis=0), scene.positions.max(axis=0)
+    return np.array(scene.bounds.lower), np.array(scene.bounds.upper)
+
+
+def wrapped(scene: "FluidScene", x: np.ndarray) -> np.ndarray:
+    """Return positions inside the periodic box, where there is one."""
+    if scene.periodic is None:
+        return x
+    lower, lengths = np.array(scene.periodic.lower), np.array(scene.periodic.lengths)
+    return np.where(scene.periodic.axes, lower + (x - lower) % lengths, x)
+
+
+def animate(folder: Path, path: Path, seconds: float = 0.08) -> Path | None:
+    """Put the frames of a folder, in the order of their names, into one GIF; None where there are none."""
+    pictures = [Image.open(frame).convert("P", palette=Image.Palette.ADAPTIVE) for frame in sorted(folder.glob("*.png"))]
+    if not pictures:
+        return None
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=int(1000 * seconds), loop=0)
+    return path

@@ -1,0 +1,69 @@
+"""Whether a run diverges, in which step, and which particle says so."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from experiments._errors import UsageError
+from experiments.sph import solver
+from experiments.sph.forces import Neighbors
+from experiments.sph.model import Model, State
+
+if TYPE_CHECKING:
+    from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
+
+
+class DivergedError(UsageError):
+    """A run went wrong; the message says in which step, and which particle."""
+
+
+def complaint(scene: "FluidScene", s: State) -> str | None:
+    """Say which particle is not finite or went through a wall by more than half a spacing; None: all is well."""
+    for name in ("x", "v", "rho", "p"):
+        value = getattr(s, name)
+        if value is not None and not np.isfinite(value := np.asarray(value)).all():
+            particle = int(np.argwhere(~np.isfinite(value))[0][0])
+            return f"particle {particle} has {_WORDS[name]} {value[particle]}"
+    if scene.sealed is None:
+        return None
+    x, far = np.asarray(s.x), scene.spacing / 2
+    outside = ((x < np.array(scene.sealed.lower) - far) | (x > np.array(scene.sealed.upper) + far)).any(axis=1)
+    if scene.wall is not None:
+        outside &= ~scene.wall
+    if not outside.any():
+        return None
+    particle = int(outside.argmax())
+    return f"particle {particle} went through a wall, to {x[particle]} at {np.asarray(s.v)[particle]} m/s"
+
+
+def check(scene: "FluidScene", model: Model, before: State, nbrs: Neighbors, after: State, steps: int, first: int) -> None:
+    """Raise where a chunk of steps ended badly; its steps are run again to find the one in which it began.
+
+    Args:
+        scene: The scene.
+        model: What acts.
+        before: The state before the chunk, which was well.
+        nbrs: The list then.
+        after: The state after it.
+        steps: How many steps the chunk has.
+        first: The number of steps before it.
+
+    Raises:
+        DivergedError: Names step, time and particle.
+    """
+    if (found := complaint(scene, after)) is None:
+        return
+    well, ill, at = 0, steps, after
+    while ill - well > 1:
+        middle = (well + ill) // 2
+        s, _ = solver.advance(model, before, nbrs, middle)
+        if (worse := complaint(scene, s)) is None:
+            well = middle
+        else:
+            ill, found, at = middle, worse, s
+    raise DivergedError(
+        f"{scene.name}: diverged in step {first + ill}, t = {float(at.time):.6g} s: {found}. A smaller step may help."
+    )
+
+
+_WORDS = {"x": "position", "v": "velocity", "rho": "density", "p": "pressure"}

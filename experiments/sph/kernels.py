@@ -1,0 +1,115 @@
+"""Smoothing kernels W(r, h) of SPH, each normalized to 1 in two and in three dimensions.
+
+With q = r/h a kernel is norm/h^d · shape(q), zero from q = support on. Kernels and their derivatives are written with truncated
+polynomials, so that they need no branches and are differentiable wherever the kernel is.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+
+class Kernel(NamedTuple):
+    """A smoothing kernel.
+
+    Attributes:
+        support: The q = r/h from which on it is zero.
+        norm: Its factor in two and in three dimensions.
+        shape: q -> shape(q).
+        derivative: q -> shape'(q).
+        source: Author, year, DOI.
+    """
+
+    support: float
+    norm: tuple[float, float]
+    shape: Callable[[Array], Array]
+    derivative: Callable[[Array], Array]
+    source: str
+
+    def value(self, r: Array, h: float, dim: int) -> Array:
+        """Return W(r, h) [1/length^dim] at distances r [length], any shape."""
+        return self.norm[dim - 2] / h**dim * self.shape(r / h)
+
+    def slope(self, r: Array, h: float, dim: int) -> Array:
+        """Return dW/dr [1/length^(dim+1)] at distances r [length], any shape."""
+        return self.norm[dim - 2] / h ** (dim + 1) * self.derivative(r / h)
+
+
+def below(edge: float, q: Array) -> Array:
+    """Return edge - q where that is positive, else 0."""
+    return jnp.maximum(edge - q, 0.0)
+
+
+def _cubic(q: Array) -> Array:
+    return 0.25 * below(2, q) ** 3 - below(1, q) ** 3
+
+
+def _cubic_derivative(q: Array) -> Array:
+    return -0.75 * below(2, q) ** 2 + 3 * below(1, q) ** 2
+
+
+def _quintic(q: Array) -> Array:
+    return below(3, q) ** 5 - 6 * below(2, q) ** 5 + 15 * below(1, q) ** 5
+
+
+def _quintic_derivative(q: Array) -> Array:
+    return -5 * below(3, q) ** 4 + 30 * below(2, q) ** 4 - 75 * below(1, q) ** 4
+
+
+def _wendland2(q: Array) -> Array:
+    return (below(2, q) / 2) ** 4 * (2 * q + 1)
+
+
+def _wendland2_derivative(q: Array) -> Array:
+    return -5 * q * (below(2, q) / 2) ** 3
+
+
+def _wendland4(q: Array) -> Array:
+    return (below(2, q) / 2) ** 6 * (35 / 12 * q**2 + 3 * q + 1)
+
+
+def _wendland4_derivative(q: Array) -> Array:
+    return -(7 / 3) * q * (2 + 5 * q) * (below(2, q) / 2) ** 5
+
+
+def _wendland6(q: Array) -> Array:
+    return (below(2, q) / 2) ** 8 * (4 * q**3 + 25 / 4 * q**2 + 4 * q + 1)
+
+
+def _wendland6_derivative(q: Array) -> Array:
+    return -(11 / 4) * q * (2 + 7 * q + 8 * q**2) * (below(2, q) / 2) ** 7
+
+
+def _poly6(q: Array) -> Array:
+    return jnp.maximum(1 - q**2, 0.0) ** 3
+
+
+def _poly6_derivative(q: Array) -> Array:
+    return -6 * q * jnp.maximum(1 - q**2, 0.0) ** 2
+
+
+def _spiky(q: Array) -> Array:
+    return below(1, q) ** 3
+
+
+def _spiky_derivative(q: Array) -> Array:
+    return -3 * below(1, q) ** 2
+
+
+_MONAGHAN = "Monaghan (1992), doi:10.1146/annurev.aa.30.090192.002551"
+_SCHOENBERG = "Schoenberg (1946) B-spline; Morris, Fox & Zhu (1997), doi:10.1006/jcph.1997.5776"
+_WENDLAND = "Wendland (1995), doi:10.1007/BF02123482; Dehnen & Aly (2012), doi:10.1111/j.1365-2966.2012.21439.x"
+_MUELLER = "Müller, Charypar & Gross (2003), doi:10.2312/SCA03/154-159"
+
+KERNELS = {
+    "cubic": Kernel(2.0, (10 / (7 * math.pi), 1 / math.pi), _cubic, _cubic_derivative, _MONAGHAN),
+    "quintic": Kernel(3.0, (7 / (478 * math.pi), 1 / (120 * math.pi)), _quintic, _quintic_derivative, _SCHOENBERG),
+    "wendland2": Kernel(2.0, (7 / (4 * math.pi), 21 / (16 * math.pi)), _wendland2, _wendland2_derivative, _WENDLAND),
+    "wendland4": Kernel(2.0, (9 / (4 * math.pi), 495 / (256 * math.pi)), _wendland4, _wendland4_derivative, _WENDLAND),
+    "wendland6": Kernel(2.0, (78 / (28 * math.pi), 1365 / (512 * math.pi)), _wendland6, _wendland6_derivative, _WENDLAND),
+    "poly6": Kernel(1.0, (4 / math.pi, 315 / (64 * math.pi)), _poly6, _poly6_derivative, _MUELLER),
+    "spiky": Kernel(1.0, (10 / math.pi, 15 / math.pi), _spiky, _spiky_derivative, _MUELLER),
+}

@@ -1,0 +1,129 @@
+"""What a scene is made of once it is in JAX: a model, which stays, and a state, which moves. Both are pytrees."""
+
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
+
+import jfrnn
+from experiments.sph.kernels import KERNELS, Kernel
+
+if TYPE_CHECKING:
+    from jfrnn.cases.fluids import FluidScene, Physics  # pyright: ignore[reportMissingImports]
+
+jax.tree_util.register_dataclass(
+    fluids.Physics,
+    data_fields=[item.name for item in fields(fluids.Physics) if item.name not in fluids.WORDS],
+    meta_fields=list(fluids.WORDS),
+)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Model:
+    """What acts on which particles. Whatever is None is no part of the compiled program.
+
+    Attributes:
+        physics: `cases.fluids.Physics`; its words are static, its numbers may be traced.
+        m: Masses [kg], shape [n].
+        wall: Which particles are dummies of a wall, shape [n], bool.
+        box: Periodic box.
+        tank: Lower and upper corner [m] of a tank, shape [d] each.
+        enters: When each particle enters [s], shape [n].
+        step: Time step [s]; None: the Courant condition gives it.
+        guided: How long a particle that entered keeps its velocity [s], shape [].
+        spacing: Particle distance [m]. Static.
+        backend: Of `jfrnn.pair_sum`. Static.
+    """
+
+    physics: "Physics"
+    m: Array
+    wall: Array | None
+    box: jfrnn.Box | None
+    tank: tuple[Array, Array] | None
+    enters: Array | None
+    step: Array | None
+    guided: Array | None
+    spacing: float = field(metadata={"static": True})
+    backend: str = field(default="auto", metadata={"static": True})
+
+    @property
+    def kernel(self) -> Kernel:
+        """The smoothing kernel."""
+        return KERNELS[self.physics.kernel]
+
+    @property
+    def cutoff(self) -> float:
+        """Interaction radius [m]."""
+        return self.kernel.support * self.physics.smoothing
+
+
+class State(NamedTuple):
+    """What moves. Fields that the scene has no use for are None.
+
+    Attributes:
+        x: Positions [m], shape [n, d].
+        v: Velocities [m/s], shape [n, d]; of "leapfrog" half a step behind.
+        time: [s], shape [].
+        a: Accelerations of the last evaluation [m/s²], shape [n, d].
+        last: Step before this one [s], shape []; 0 at first.
+        rho: Carried densities [kg/m³], shape [n].
+        p: Carried pressures [Pa], shape [n].
+        w: Velocities with which particles move besides v [m/s], shape [n, d].
+    """
+
+    x: Array
+    v: Array
+    time: Array
+    a: Array
+    last: Array
+    rho: Array | None = None
+    p: Array | None = None
+    w: Array | None = None
+
+
+def make_model(scene: "FluidScene", dtype: type = np.float64, backend: str = "auto") -> Model:
+    """Put what acts in a scene into JAX, numbers of one dtype."""
+
+    def array(value: Any) -> Array:  # noqa: ANN401
+        return jnp.asarray(value, dtype)
+
+    physics = jax.tree.map(array, replace(scene.physics, gravity=_row(scene.physics.gravity)))
+    box = scene.periodic and jfrnn.Box(array(scene.periodic.lengths), scene.periodic.axes, array(scene.periodic.lower))
+    return Model(
+        physics=physics,
+        m=array(scene.masses),
+        wall=None if scene.wall is None else jnp.asarray(scene.wall),
+        box=box,
+        tank=scene.tank and (array(scene.tank.lower), array(scene.tank.upper)),
+        enters=None if scene.enters is None else array(scene.enters),
+        step=None if scene.step is None else array(scene.step),
+        guided=None if scene.enters is None else array(scene.guided),
+        spacing=scene.spacing,
+        backend=backend,
+    )
+
+
+def make_state(scene: "FluidScene", dtype: type = np.float64) -> State:
+    """Put the particles of a scene into JAX, where they are at first; `solver.begin` does the rest."""
+    physics = scene.physics
+    x, v = jnp.asarray(scene.positions, dtype), jnp.asarray(scene.velocities, dtype)
+    zero = jnp.zeros((), dtype)
+    state = State(x, v, zero, jnp.zeros_like(x), zero)
+    if physics.transport is not None or physics.shifting is not None:
+        state = state._replace(w=jnp.zeros_like(x))
+    if physics.evolve == "continuity":
+        return state._replace(rho=_first(scene.densities, physics.density, x))
+    return state._replace(p=_first(scene.pressures, 0.0, x)) if physics.evolve == "pressure" else state
+
+
+def _first(given: np.ndarray | None, default: float, x: Array) -> Array:
+    return jnp.full(x.shape[0], default, x.dtype) if given is None else jnp.asarray(given, x.dtype)
+
+
+def _row(gravity: tuple[float, ...] | None) -> np.ndarray | None:
+    return None if gravity is None else np.asarray(gravity)

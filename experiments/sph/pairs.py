@@ -1,0 +1,81 @@
+"""A pair of particles, and sums over the neighbors of each: the one place where the solver meets jfrnn."""
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+import jfrnn
+from experiments.sph.kernels import Kernel
+
+Values = dict[str, Array]
+Term = Callable[["Pair", Values, Values], Any]
+
+
+class Pair:
+    """What terms ask about a pair (i, j): each quantity is computed when it is asked for, and once.
+
+    Attributes:
+        r: Displacement x_j - x_i [length], shape [d].
+        h: Smoothing length.
+    """
+
+    def __init__(self, r: Array, kernel: Kernel, h: float) -> None:
+        """Hold the displacement of a pair, and the kernel."""
+        self.r, self.kernel, self.h = r, kernel, h
+
+    @cached_property
+    def square(self) -> Array:
+        """Squared distance [length²]."""
+        return jnp.sum(self.r * self.r)
+
+    @cached_property
+    def distance(self) -> Array:
+        """Distance [length], and its derivative 0 instead of NaN where two particles coincide."""
+        apart = self.square > 0
+        return jnp.where(apart, jnp.sqrt(jnp.where(apart, self.square, 1)), 0)
+
+    @cached_property
+    def weight(self) -> Array:
+        """W(r, h)."""
+        return self.kernel.value(self.distance, self.h, self.r.shape[0])
+
+    @cached_property
+    def pull(self) -> Array:
+        """F = (dW/dr)/r, not positive, 0 where two particles coincide: the gradient of W(x_i - x_j) at i is -F·r."""
+        apart = self.square > 0
+        return jnp.where(apart, self.kernel.slope(self.distance, self.h, self.r.shape[0]) / jnp.where(apart, self.distance, 1), 0)
+
+
+def total(
+    term: Term,
+    x: Array,
+    values: Values,
+    kernel: Kernel,
+    h: float,
+    nbrs: "jfrnn.NeighborList | None" = None,
+    **options: Any,  # noqa: ANN401
+) -> Any:  # noqa: ANN401
+    """Sum a term over the neighbors of each particle.
+
+    Args:
+        term: (pair, values of i, values of j) -> a pytree of arrays.
+        x: Positions [length], shape [n, d].
+        values: Arrays of shape [n, ...], that the term reads.
+        kernel: Gives the pair its weights and, by its support, the cutoff.
+        h: Smoothing length, static.
+        nbrs: A list, whose pairs are taken; None: they are found anew by `jfrnn.pair_sum`, and no list is made.
+        **options: Of `jfrnn.pair_sum`, where no list is given: box, active.
+
+    Returns:
+        What the term returns, leaves [n, ...].
+    """
+
+    def fn(r: Array, i: Values, j: Values) -> Any:  # noqa: ANN401
+        return term(Pair(r, kernel, h), i, j)
+
+    if nbrs is not None:
+        return jfrnn.pair_sum(fn, x, None, values, neighbors=nbrs)
+    return jfrnn.pair_sum(fn, x, kernel.support * h, values, **options)

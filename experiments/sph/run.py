@@ -1,0 +1,112 @@
+"""Run a scene: in chunks of steps, a snapshot, a line of energies and a picture after each, from the last snapshot on."""
+
+import hashlib
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+
+import jfrnn
+from experiments import _sweep
+from experiments.sph import forces, frames, health, settings, snapshots, solver
+from experiments.sph.forces import Neighbors
+from experiments.sph.model import Model, State, make_model, make_state
+
+if TYPE_CHECKING:
+    from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
+
+
+@dataclass(frozen=True)
+class How:
+    """How a scene is run.
+
+    Attributes:
+        frames: Snapshots after the first.
+        dtype: "float32" or "float64".
+        neighbors: "pair_sum": every sum finds neighbors anew; "list": a list with a skin is updated.
+        skin: Of the list, in particle spacings.
+        pictures: Whether frames and a GIF are drawn.
+    """
+
+    frames: int = 50
+    dtype: str = "float64"
+    neighbors: str = "pair_sum"
+    skin: float = 0.3
+    pictures: bool = True
+
+
+def run(scene: "FluidScene", folder: Path, how: How) -> State:
+    """Run a scene from its beginning, or from the last snapshot of the folder, to its end.
+
+    Args:
+        scene: The scene.
+        folder: Gets run.json, energies.csv, snapshots/STEP.npz and .vtp, frames/STEP.png, NAME.gif.
+        how: Options.
+
+    Returns:
+        The last state.
+
+    Raises:
+        UsageError: The folder holds another run.
+        DivergedError: A particle is not finite, or went through a wall.
+    """
+    given = hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in (scene.positions, scene.velocities, scene.masses)))
+    about = settings.described(scene) | {"dtype": how.dtype, "frames": how.frames, "given": given.hexdigest()[:12]}
+    snapshots.check_same(about, folder)
+    model = make_model(scene, np.dtype(how.dtype).type)
+    saved = snapshots.latest(folder / "snapshots")
+    s, step = saved or (make_state(scene, np.dtype(how.dtype).type), 0)
+    nbrs = solver.list_neighbors(model, s, how.skin * scene.spacing) if how.neighbors == "list" else None
+    if saved is None:
+        s = jax.jit(solver.begin)(model, s, nbrs)
+        _keep(scene, model, s, nbrs, folder, step, how)
+    with _sweep.progress(how.frames) as shown:
+        bar = shown.add_task(scene.name, total=how.frames, completed=round(how.frames * float(s.time) / scene.duration))
+        while (steps := _steps_to_next(scene, model, s, how.frames)) > 0:
+            start, before, nbrs_before = perf_counter(), s, nbrs
+            s, nbrs = _chunk(model, s, nbrs, steps)
+            jax.block_until_ready(s.x)
+            seconds = perf_counter() - start
+            health.check(scene, model, before, nbrs_before, s, steps, step)
+            step += steps
+            line = _keep(scene, model, s, nbrs, folder, step, how)
+            text = f"t {line['time']:.4g} s · {steps / seconds:.0f} steps/s · energy {line['total']:.4g} J"
+            shown.update(bar, advance=1, description=text + ("" if nbrs is None else f" · {int(nbrs.rebuild_count)} rebuilds"))
+    if how.pictures:
+        frames.animate(folder / "frames", folder / f"{scene.name}.gif")
+    return s
+
+
+def _chunk(model: Model, s: State, nbrs: Neighbors, steps: int) -> tuple[State, Neighbors]:
+    """Run steps; where a row of the list overflowed, with a larger list again."""
+    if nbrs is None:
+        return solver.advance(model, s, None, steps)
+    active = None if model.enters is None else lambda s: forces.active(model, s.time)
+    return jfrnn.run_chunk(lambda s, nbrs: solver.advance(model, s, nbrs, steps), s, nbrs, lambda s: s.x, active=active)  # type: ignore[arg-type]
+
+
+def _steps_to_next(scene: "FluidScene", model: Model, s: State, count: int) -> int:
+    """Return how many steps it is to the next snapshot; 0 at the end."""
+    time, step = float(s.time), float(solver.courant(model, s)) if scene.step is None else scene.step
+    if time > scene.duration - step / 2:
+        return 0
+    interval = scene.duration / count
+    goal = interval * (math.floor(time / interval + 1e-6) + 1)
+    return max(1, round((goal - time) / step))
+
+
+def _keep(scene: "FluidScene", model: Model, s: State, nbrs: Neighbors, folder: Path, step: int, how: How) -> dict[str, float]:
+    """Write what belongs to a moment; return its energies."""
+    line = snapshots.energies(model, s, scene)
+    snapshots.add_line(line, folder / "energies.csv", step)
+    rho, p = jax.jit(forces.density_and_pressure)(model, s, nbrs)
+    if how.pictures:
+        x, v = np.asarray(s.x), np.asarray(s.v)
+        top = max(np.linalg.norm(scene.velocities, axis=1).max(initial=0), line["top_speed"])
+        frames.draw(scene, x, v, line["time"], float(top), folder / "frames" / f"{step:09d}.png")
+    snapshots.save(s, scene, np.asarray(rho), np.asarray(p), folder / "snapshots", step)
+    return line

@@ -1,0 +1,123 @@
+"""What a run may be told: `--set key=value` for a scene, and files of initial particles."""
+
+import inspect
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_type_hints
+
+import numpy as np
+from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
+from pydantic import TypeAdapter, ValidationError
+
+from experiments._errors import UsageError
+
+if TYPE_CHECKING:
+    from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
+
+PHYSICS = get_type_hints(fluids.Physics)
+
+
+def make_scene(name: str, settings: list[str]) -> "FluidScene":
+    """Return a scene with settings "key=value": of the scene's function, or of `Physics`.
+
+    Raises:
+        UsageError: There is no such scene or key, or the value is not allowed.
+    """
+    if name not in fluids.FLUIDS:
+        raise UsageError(f"unknown fluid scene {name!r}; allowed: {', '.join(fluids.FLUIDS)}")
+    make = fluids.FLUIDS[name]
+    of_scene = {key: item.annotation for key, item in inspect.signature(make).parameters.items() if key != "name"}
+    chosen: dict[str, dict[str, Any]] = {"scene": {}, "physics": {}}
+    for setting in settings:
+        key, sign, text = setting.partition("=")
+        if not sign:
+            raise UsageError(f"--set {setting}: expected key=value")
+        if key not in of_scene and key not in PHYSICS:
+            raise UsageError(f"--set {key}: unknown; of {name}: {', '.join(of_scene)}; physics: {', '.join(PHYSICS)}")
+        kind = "scene" if key in of_scene else "physics"
+        chosen[kind][key] = _value(key, text, of_scene.get(key, PHYSICS.get(key)))
+    try:
+        scene = make(**chosen["scene"])
+    except (ValueError, ZeroDivisionError) as error:
+        raise UsageError(f"scene {name!r}: {error}") from error
+    return replace(scene, physics=replace(scene.physics, **chosen["physics"]))
+
+
+def _value(key: str, text: str, kind: Any) -> Any:  # noqa: ANN401
+    try:
+        value = json.loads(text)
+    except ValueError:
+        value = None if text.lower() == "none" else text
+    try:
+        return TypeAdapter(kind).validate_python(value)
+    except ValidationError as error:
+        raise UsageError(f"--set {key}: got {text!r}; {error.errors()[0]['msg'].lower()}") from error
+
+
+def with_particles(scene: "FluidScene", path: Path) -> "FluidScene":
+    """Return the scene with the fluid of a file; its walls stay.
+
+    Args:
+        scene: A scene.
+        path: .npz with positions [n, d] and, if wanted, velocities [n, d] and masses [n]; or .csv with a line of names: x, y, z,
+            then vx, vy, vz and m, if wanted. Velocities are 0 without, masses those of the scene's first particle.
+
+    Raises:
+        UsageError: The file cannot be used.
+    """
+    given = _read(path, scene.dim)
+    positions = np.asarray(given["positions"], np.float64)
+    if positions.ndim != 2 or positions.shape[1] != scene.dim:
+        raise UsageError(f"{path}: positions must have shape [n, {scene.dim}], got {list(positions.shape)}")
+    velocities = np.asarray(given.get("velocities", np.zeros_like(positions)), np.float64)
+    masses = np.asarray(given.get("masses", np.full(len(positions), scene.masses[0])), np.float64)
+    if velocities.shape != positions.shape or masses.shape != positions.shape[:1]:
+        raise UsageError(f"{path}: velocities {list(velocities.shape)} and masses {list(masses.shape)} must fit the positions")
+    for name, array in (("positions", positions), ("velocities", velocities), ("masses", masses)):
+        if not np.isfinite(array).all():
+            raise UsageError(f"{path}: {name} must be finite; particle {int(np.argwhere(~np.isfinite(array))[0][0])} is not")
+    return _replaced(scene, positions, velocities, masses)
+
+
+def _replaced(scene: "FluidScene", positions: np.ndarray, velocities: np.ndarray, masses: np.ndarray) -> "FluidScene":
+    """Return the scene with these particles, all of them there from the beginning, before its walls."""
+    walls = np.zeros(scene.n, bool) if scene.wall is None else scene.wall
+    return replace(
+        scene,
+        positions=np.concatenate([positions, scene.positions[walls]]),
+        velocities=np.concatenate([velocities, scene.velocities[walls]]),
+        masses=np.concatenate([masses, scene.masses[walls]]),
+        wall=None if scene.wall is None else np.arange(len(positions) + walls.sum()) >= len(positions),
+        **{"enters": None, "densities": None, "pressures": None},
+    )
+
+
+def _read(path: Path, dim: int) -> dict[str, np.ndarray]:
+    try:
+        if path.suffix == ".npz":
+            with np.load(path) as file:
+                given = {key: file[key] for key in file}
+        elif path.suffix == ".csv":
+            table = np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True, dtype=np.float64))
+            given = _columns(table, "xyz"[:dim])
+        else:
+            raise UsageError(f"{path}: unknown ending {path.suffix!r}; allowed: .csv, .npz")
+    except ValueError as error:
+        raise UsageError(f"{path}: cannot be read: {error}") from error
+    if "positions" not in given:
+        raise UsageError(f"{path}: no positions; expected arrays positions, velocities, masses, or columns x, y, vx, vy, m")
+    return given
+
+
+def _columns(table: np.ndarray, axes: str) -> dict[str, np.ndarray]:
+    names = table.dtype.names or ()
+    wanted = {"positions": list(axes), "velocities": [f"v{axis}" for axis in axes]}
+    given = {key: np.stack([table[c] for c in columns], axis=1) for key, columns in wanted.items() if set(columns) <= set(names)}
+    return given | ({"masses": table["m"]} if "m" in names else {})
+
+
+def described(scene: "FluidScene") -> dict[str, Any]:
+    """Return what a scene says, but its particles: what a run must have in common with one that it goes on with."""
+    physics = {item.name: getattr(scene.physics, item.name) for item in fields(scene.physics)}
+    return {"name": scene.name, "particles": scene.n, "duration": scene.duration, "step": scene.step, "physics": physics}

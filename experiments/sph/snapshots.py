@@ -1,0 +1,89 @@
+"""What a run keeps of itself: snapshots as .npz, to go on from, and as .vtp, for ParaView; and a line of energies each."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from experiments._errors import UsageError
+from experiments.sph import budget
+from experiments.sph.model import Model, State
+
+if TYPE_CHECKING:
+    from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
+
+
+def save(state: State, scene: "FluidScene", rho: np.ndarray, p: np.ndarray, folder: Path, step: int) -> None:
+    """Write a state as STEP.npz, complete or not at all, and its particles that have entered as STEP.vtp."""
+    folder.mkdir(parents=True, exist_ok=True)
+    arrays = {name: np.asarray(value) for name, value in state._asdict().items() if value is not None}
+    whole, part = folder / f"{step:09d}.npz", folder / "part.npz"
+    _write_vtk(arrays, scene, {"density": rho, "pressure": p}, whole.with_suffix(".vtp"))
+    np.savez(part, **arrays)  # pyright: ignore[reportArgumentType]
+    part.replace(whole)
+
+
+def latest(folder: Path) -> tuple[State, int] | None:
+    """Return the last state that was saved, and its step; None where there is none."""
+    paths = sorted(path for path in folder.glob("*.npz") if path.stem.isdigit())
+    if not paths:
+        return None
+    with np.load(paths[-1]) as file:
+        return State(**{name: jnp.asarray(file[name]) for name in file}), int(paths[-1].stem)
+
+
+def check_same(about: dict[str, Any], folder: Path) -> None:
+    """Remember what the run is, or refuse a folder that holds another one.
+
+    Raises:
+        UsageError: The folder holds a run of something else.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path, text = folder / "run.json", json.dumps(about, indent=1, sort_keys=True)
+    if not path.exists():
+        path.write_text(text)
+    elif (there := json.loads(path.read_text())) != json.loads(text):
+        asked = json.loads(text)
+        different = [key for key in asked if asked[key] != there.get(key)]
+        raise UsageError(f"{folder}: holds a run with another {', '.join(different)}; take another folder, or remove it")
+
+
+def energies(model: Model, state: State, scene: "FluidScene") -> dict[str, float]:
+    """Return a line of the energies: time [s], kinetic and potential energy [J], momentum [kg m/s], largest speed [m/s]."""
+    moved = budget.momentum(model, state)
+    fluid = np.ones(scene.n, bool) if scene.wall is None else ~scene.wall
+    line = {
+        "time": float(state.time),
+        "kinetic": float(budget.kinetic_energy(model, state)),
+        "potential": float(budget.potential_energy(model, state)),
+        **{f"momentum_{axis}": float(moved[k]) for k, axis in enumerate("xyz"[: scene.dim])},
+        "top_speed": float(np.linalg.norm(np.asarray(state.v)[fluid], axis=1).max(initial=0)),
+    }
+    return line | {"total": line["kinetic"] + line["potential"]}
+
+
+def add_line(line: dict[str, float], path: Path, step: int) -> None:
+    """Add a line to a CSV file; lines of this step and later, of a run that was stopped, are removed before."""
+    text = ["step," + ",".join(line)]
+    if path.exists():
+        text += [old for old in path.read_text().splitlines()[1:] if int(old.split(",")[0]) < step]
+    part = path.with_suffix(".part")
+    part.write_text("\n".join([*text, ",".join([str(step), *(f"{value:.12g}" for value in line.values())])]) + "\n")
+    part.replace(path)
+
+
+def _write_vtk(arrays: dict[str, np.ndarray], scene: "FluidScene", values: dict[str, np.ndarray], path: Path) -> None:
+    import pyvista
+
+    there = np.ones(scene.n, bool) if scene.enters is None else scene.enters <= arrays["time"]
+    flat = ((0, 0), (0, 3 - scene.dim))
+    cloud = pyvista.PolyData(np.pad(arrays["x"][there], flat))
+    cloud.point_data["velocity"] = np.pad(arrays["v"][there], flat)
+    for name, value in values.items():
+        cloud.point_data[name] = value[there]
+    if scene.wall is not None:
+        cloud.point_data["wall"] = scene.wall[there].astype(np.uint8)
+    cloud.field_data["time"] = [float(arrays["time"])]
+    cloud.save(path)

@@ -1,0 +1,170 @@
+"""Steps of a scene: the integrators, the Courant condition, and runs of many steps that may be differentiated."""
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+import jfrnn
+from experiments.sph import forces, walls
+from experiments.sph.forces import Neighbors
+from experiments.sph.model import Model, State
+
+
+def begin(model: Model, s: State, nbrs: Neighbors = None) -> State:
+    """Return the state with what its integrator carries from step to step, at the positions and velocities that it has."""
+    return _evaluate(model, s, nbrs) if model.physics.integrator == "symplectic" else s
+
+
+def courant(model: Model, s: State) -> Array:
+    """Return the time step [s], shape [], that sound, viscosity and acceleration allow.
+
+    The least of 0.25 h/(c + |v|), 0.25 √(h/|a|) and, with viscosity, 0.125 h²/ν.
+    Source: Monaghan (1992), doi:10.1146/annurev.aa.30.090192.002551; Morris, Fox & Zhu (1997), doi:10.1006/jcph.1997.5776.
+    """
+    physics, h = model.physics, model.physics.smoothing
+    speed = jnp.sqrt(jnp.max(jnp.sum(s.v * s.v, axis=1), initial=0))
+    limits = [0.25 * h / (physics.sound_speed + speed)]
+    if physics.viscosity is not None:
+        kinematic = physics.viscosity / physics.density if physics.viscosity_form == "source" else physics.viscosity
+        limits.append(0.125 * h**2 / kinematic)
+    strongest = jnp.sqrt(jnp.max(jnp.sum(s.a * s.a, axis=1), initial=0))
+    limits.append(0.25 * jnp.sqrt(h / jnp.maximum(strongest, jnp.finfo(s.x.dtype).tiny)))
+    return jnp.min(jnp.stack(limits))
+
+
+def step(model: Model, s: State, nbrs: Neighbors = None) -> tuple[State, Neighbors]:
+    """Advance by one time step: the scene's own, or what `courant` allows.
+
+    Args:
+        model: What acts.
+        s: The state, as `begin` or this function returns it.
+        nbrs: A neighbor list, which is updated; None: neighbors are found by each sum anew.
+
+    Returns:
+        The state after the step, and the list.
+    """
+    dt = courant(model, s) if model.step is None else model.step
+    s, nbrs = _INTEGRATORS[model.physics.integrator](model, s, dt, nbrs)
+    return s._replace(time=s.time + dt, last=dt), nbrs
+
+
+@jax.jit
+def advance(model: Model, s: State, nbrs: Neighbors, steps: Array | int) -> tuple[State, Neighbors]:
+    """Run a number of steps, data: one compiled loop serves all numbers."""
+    return jax.lax.fori_loop(0, steps, lambda _, carry: step(model, *carry), (s, nbrs))
+
+
+def rollout(model: Model, s: State, steps: int, nbrs: Neighbors = None, segments: int = 1) -> State:
+    """Run steps such that they can be differentiated in reverse, in the model's numbers and in the state.
+
+    Args:
+        model: What acts.
+        s: The state, as `begin` returns it.
+        steps: How many, static; a multiple of `segments`.
+        nbrs: As in `step`.
+        segments: Reverse mode keeps the states between segments and runs each segment again: memory for segments + steps/segments
+            states. √steps is best.
+
+    Returns:
+        The last state.
+    """
+    if steps % segments:
+        raise ValueError(f"steps must be a multiple of segments, got {steps} and {segments}.")
+
+    def one(carry: tuple[State, Neighbors], _: None) -> tuple[tuple[State, Neighbors], None]:
+        return step(model, *carry), None
+
+    def segment(carry: tuple[State, Neighbors], _: None) -> tuple[tuple[State, Neighbors], None]:
+        return jax.lax.scan(jax.checkpoint(one), carry, None, length=steps // segments)[0], None
+
+    return jax.lax.scan(jax.checkpoint(segment), (s, nbrs), None, length=segments)[0][0]
+
+
+def list_neighbors(model: Model, s: State, skin: float, slack: float = 1.3) -> jfrnn.NeighborList:
+    """Return a neighbor list of a state with room to move: skin [m], and slots for `slack` times the longest row."""
+    entered = forces.active(model, s.time)
+    return jfrnn.search(s.x, model.cutoff, box=model.box, active=entered, skin=skin, slack=slack)
+
+
+def _update(model: Model, s: State, nbrs: Neighbors) -> Neighbors:
+    return None if nbrs is None else nbrs.update(s.x, active=forces.active(model, s.time))
+
+
+def _evaluate(model: Model, s: State, nbrs: Neighbors, dt: Array | None = None) -> State:
+    """Bring a carried density or pressure over dt, and return the state with the accelerations of it."""
+    rho = forces.densities(model, s, nbrs)
+    inverse = forces.corrections(model, s, rho, nbrs)
+    if dt is not None:
+        s = _carry(model, s, rho, inverse, nbrs, dt)
+        rho = s.rho if s.rho is not None else rho
+    a, w = forces.accelerations(model, s, forces.fields(model, s, rho, inverse, nbrs), nbrs)
+    return s._replace(a=a, w=_besides(model, w, s.last if dt is None else dt))
+
+
+def _carry(model: Model, s: State, rho: Array, inverse: Array | None, nbrs: Neighbors, dt: Array) -> State:
+    """Return the state with its carried density or pressure after dt; where nothing is carried, the state."""
+    if s.rho is not None:
+        return s._replace(rho=s.rho + dt * forces.carried_rate(model, s, rho, inverse, nbrs))
+    if s.p is not None:
+        return s._replace(p=s.p + dt * forces.carried_rate(model, s, rho, inverse, nbrs))
+    return s
+
+
+def _besides(model: Model, sums: Array | None, dt: Array) -> Array | None:
+    """Return the velocity by which particles move besides the fluid's: by background pressure, or by shifting."""
+    if sums is None:
+        return None
+    moved = -model.physics.shifting * sums if model.physics.shifting is not None else dt / 2 * sums
+    return walls.fluid_only(model.wall, moved)
+
+
+def _moving(model: Model, s: State) -> Array:
+    """Return the velocities with which positions change; dummies of walls stay, their velocity is along the wall."""
+    return walls.fluid_only(forces.resting(model, s.time), s.v if s.w is None else s.v + s.w)
+
+
+def _bounced(model: Model, s: State) -> State:
+    if model.tank is None:
+        return s
+    x, v = walls.bounce(s.x, s.v, *model.tank, model.physics.restitution)
+    return s._replace(x=x, v=v)
+
+
+def _leapfrog(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[State, Neighbors]:
+    """Kick, then drift: velocities stand half a step before positions, so the first kick is half as long."""
+    nbrs = _update(model, s, nbrs)
+    s = _evaluate(model, s, nbrs)
+    s = s._replace(v=s.v + (s.last + dt) / 2 * s.a)
+    return _bounced(model, s._replace(x=s.x + dt * _moving(model, s))), nbrs
+
+
+def _symplectic(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[State, Neighbors]:
+    """Kick half, drift, carry density or pressure on at the new positions, kick half (velocity Verlet)."""
+    s = s._replace(v=s.v + dt / 2 * s.a)
+    s = _bounced(model, s._replace(x=s.x + dt * _moving(model, s)))
+    nbrs = _update(model, s, nbrs)
+    s = _evaluate(model, s, nbrs, dt)
+    return s._replace(v=s.v + dt / 2 * s.a), nbrs
+
+
+def _midpoint(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[State, Neighbors]:
+    """Half a step to the rates of its middle, then the whole step with those: Runge-Kutta of second order, two evaluations."""
+    at, base = s, s
+    for share in (0.5, 1.0):
+        nbrs = _update(model, at, nbrs)
+        rho = forces.densities(model, at, nbrs)
+        inverse = forces.corrections(model, at, rho, nbrs)
+        a, w = forces.accelerations(model, at, forces.fields(model, at, rho, inverse, nbrs), nbrs)
+        at = at._replace(a=a, w=_besides(model, w, dt))
+        part = share * dt
+        moved = base.x + part * _moving(model, at)
+        carried = {}
+        if at.rho is not None and base.rho is not None:
+            carried["rho"] = base.rho + part * forces.carried_rate(model, at, rho, inverse, nbrs)
+        elif at.p is not None and base.p is not None:
+            carried["p"] = base.p + part * forces.carried_rate(model, at, rho, inverse, nbrs)
+        at = at._replace(x=moved, v=base.v + part * a, **carried)
+    return _bounced(model, at), nbrs
+
+
+_INTEGRATORS = {"leapfrog": _leapfrog, "symplectic": _symplectic, "midpoint": _midpoint}

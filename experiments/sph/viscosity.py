@@ -1,0 +1,54 @@
+"""Viscosity: each function returns what neighbor j adds to the acceleration of i [m/s²], shape [d].
+
+Velocities are read from `u`: those of particles, and of wall dummies what holds the fluid or lets it slip.
+"""
+
+import jax.numpy as jnp
+from jax import Array
+
+from experiments.sph.pairs import Pair, Values
+
+
+def morris(pair: Pair, i: Values, j: Values, viscosity: Array) -> Array:
+    """Return 2ν m_j/ρ_j F (u_i - u_j), ν kinematic [m²/s]. Source: Morris, Fox & Zhu (1997), doi:10.1006/jcph.1997.5776, eq. 22."""
+    return 2 * viscosity * j["m"] / j["rho"] * pair.pull * (i["u"] - j["u"])
+
+
+def volume(pair: Pair, i: Values, j: Values, viscosity: Array) -> Array:
+    """Return (V_i² + V_j²) ρ ν F (u_i - u_j)/m_i, ρ the harmonic mean of both, ν kinematic [m²/s].
+
+    Source: Adami, Hu & Adams (2013), doi:10.1016/j.jcp.2013.01.043.
+    """
+    volumes = (i["m"] / i["rho"]) ** 2 + (j["m"] / j["rho"]) ** 2
+    density = 2 * i["rho"] * j["rho"] / (i["rho"] + j["rho"])
+    return volumes * density * viscosity * pair.pull * (i["u"] - j["u"]) / i["m"]
+
+
+def source(pair: Pair, i: Values, j: Values, viscosity: Array) -> Array:
+    """Return what the 2D source computes: -μ (m_j/ρ_j) (u_i - u_j) 40/(πh⁴)(1 - q)/ρ_i, μ dynamic [Pa s].
+
+    Source: Müller, Charypar & Gross (2003), doi:10.2312/SCA03/154-159, eq. 14 in 2D; ReCoDE-SPH-solver-2D-NS (2024).
+    """
+    laplacian = 40 / (jnp.pi * pair.h**4) * jnp.maximum(1 - pair.distance / pair.h, 0.0)
+    return -viscosity * j["m"] / j["rho"] * laplacian * (i["u"] - j["u"]) / i["rho"]
+
+
+def artificial(pair: Pair, i: Values, j: Values, gradient: Array, strength: Array) -> Array:
+    """Return Monaghan's artificial viscosity between particles that come closer, zero else.
+
+    -m_j Π ∇W, Π = -αch φ/ρ̄, φ = v·r/(r² + h²/100) where that is negative.
+
+    Args:
+        pair: The pair.
+        i: Values of i.
+        j: Values of j.
+        gradient: ∇W at i, shape [d].
+        strength: αc [m/s].
+
+    Source: Monaghan (1992), doi:10.1146/annurev.aa.30.090192.002551.
+    """
+    approach = jnp.minimum((j["v"] - i["v"]) @ pair.r, 0.0) / (pair.square + 0.01 * pair.h**2)
+    return 2 * strength * pair.h * j["m"] * approach / (i["rho"] + j["rho"]) * gradient
+
+
+VISCOSITIES = {"morris": morris, "volume": volume, "source": source}

@@ -1,0 +1,143 @@
+"""Parts of the SPH solver, each alone: kernels, equations of state, terms of pairs, corrections, walls."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.sph import correction, density, pressure, states, surface, transport, viscosity, walls
+from experiments.sph.kernels import KERNELS
+from experiments.sph.pairs import Pair, total
+
+SMOOTHING = 0.13
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_kernels_are_normalized_and_end_at_their_support(name, dim):
+    kernel, h = KERNELS[name], SMOOTHING
+    r = (np.arange(200_000) + 0.5) / 200_000 * kernel.support * h
+    shells = {2: 2 * np.pi * r, 3: 4 * np.pi * r**2}[dim] * kernel.support * h / len(r)
+    assert np.sum(shells * np.asarray(kernel.value(jnp.asarray(r), h, dim))) == pytest.approx(1, rel=1e-9)
+    beyond = jnp.array([1.0, 1.5]) * kernel.support * h
+    assert not np.asarray(kernel.value(beyond, h, dim)).any()
+    assert not np.asarray(kernel.slope(beyond, h, dim)).any()
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_slopes_are_the_derivatives_of_kernels(name, dim):
+    kernel, r = KERNELS[name], jnp.linspace(0.01, 0.999, 50) * KERNELS[name].support * SMOOTHING
+    derivative = jax.vmap(jax.grad(lambda r: kernel.value(r, SMOOTHING, dim)))(r)
+    np.testing.assert_allclose(kernel.slope(r, SMOOTHING, dim), derivative, rtol=1e-9, atol=1e-9 * float(jnp.abs(derivative).max()))
+
+
+def test_equations_of_state_and_their_inverses():
+    rho = jnp.linspace(980.0, 1050.0, 7)
+    np.testing.assert_allclose(states.linear_density(states.linear(rho, 1000.0, 30.0), 1000.0, 30.0), rho, rtol=1e-14)
+    np.testing.assert_allclose(states.tait_density(states.tait(rho, 1000.0, 30.0, 7.0), 1000.0, 30.0, 7.0), rho, rtol=1e-14)
+    slope = jax.grad(lambda rho: states.tait(rho, 1000.0, 30.0, 7.0))(1000.0)
+    assert slope == pytest.approx(30.0**2)
+
+
+def make_pair(r, name="quintic"):
+    return Pair(jnp.asarray(r), KERNELS[name], 0.1)
+
+
+VALUES = (
+    {"m": 1.1, "rho": 900.0, "p": 20.0, "v": [0.1, 0.3], "u": [0.1, 0.3], "w": [0.02, 0.0]},
+    {"m": 1.4, "rho": 1100.0, "p": -5.0, "v": [-0.4, 0.2], "u": [-0.4, 0.2], "w": [0.0, -0.01]},
+)
+
+
+def forces(name, r, i, j):
+    """Return the force on i, mass times acceleration."""
+    pair = make_pair(r)
+    gradient = -pair.pull * pair.r
+    terms = {
+        **{
+            f"pressure {key}": lambda key=key: pressure.PRESSURES[key](pair, i, j, gradient)
+            for key in ("symmetric", "mean", "volume")
+        },
+        "viscosity morris": lambda: viscosity.morris(pair, i, j, 0.01),
+        "viscosity volume": lambda: viscosity.volume(pair, i, j, 0.01),
+        "artificial": lambda: viscosity.artificial(pair, i, j, gradient, 3.0),
+        "cohesion": lambda: surface.cohesion(pair, i, j, 2.0, 0.3),
+        "transport": lambda: transport.transport(pair, i, j, 50.0),
+        "advected": lambda: transport.advected(pair, i, j, gradient),
+    }
+    return terms, i["m"]
+
+
+NAMES = tuple(forces("", [0.1, 0.05], *({k: jnp.asarray(v) for k, v in side.items()} for side in VALUES))[0])
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "viscosity morris"])
+def test_forces_of_a_pair_are_opposite(name):
+    i, j = ({key: jnp.asarray(value) for key, value in side.items()} for side in VALUES)
+    (there, mass_i), (back, mass_j) = forces(name, [0.1, 0.05], i, j), forces(name, [-0.1, -0.05], j, i)
+    there, back = mass_i * there[name](), mass_j * back[name]()
+    assert np.abs(there).max() > 0
+    np.testing.assert_allclose(there, -back, rtol=1e-12)
+
+
+def test_coincident_particles_have_no_force_and_finite_derivatives():
+    def push(r):
+        pair = make_pair(r)
+        return jnp.sum(pair.pull * pair.r) + pair.weight + pair.distance
+
+    assert np.isfinite(jax.grad(push)(jnp.zeros(2))).all()
+    assert not np.asarray(make_pair([0.0, 0.0]).pull * jnp.zeros(2)).any()
+
+
+def lattice(n, dim, seed=0, jitter=0.1):
+    sites = np.stack(np.meshgrid(*[(np.arange(n) + 0.5) / n] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+    return jnp.asarray(sites + jitter / n * np.random.default_rng(seed).uniform(-1, 1, sites.shape))
+
+
+def test_density_of_a_lattice(dim):
+    n, kernel = {2: 20, 3: 10}[dim], KERNELS["quintic"]
+    x = lattice(n, dim, jitter=0.0)
+    inner = (jnp.abs(x - 0.5) < 0.5 - 3 / n).all(axis=1)
+    m = jnp.full(len(x), 1.0 / n**dim)
+    rho = total(lambda pair, i, j: density.summation(pair, j), x, {"m": m}, kernel, 1 / n, backend="brute")
+    rho = rho + m * kernel.value(jnp.zeros(()), 1 / n, dim)
+    np.testing.assert_allclose(rho[inner], 1.0, rtol=2e-3)
+
+
+def test_corrected_gradients_are_exact_for_linear_fields(dim):
+    n, kernel = {2: 12, 3: 7}[dim], KERNELS["wendland2"]
+    x = lattice(n, dim, jitter=0.3)
+    slope = jnp.arange(1.0, dim + 1)
+    values = {"m": jnp.full(len(x), 1.0 / n**dim), "rho": jnp.ones(len(x)), "f": x @ slope}
+
+    def moment_and_change(pair, i, j):
+        return correction.moment(pair, j), -j["m"] / j["rho"] * (j["f"] - i["f"]) * pair.pull * pair.r
+
+    moments, changes = total(moment_and_change, x, values, kernel, 1.5 / n, backend="brute")
+    gradients = jnp.einsum("nab,nb->na", correction.inverse(moments), changes)
+    np.testing.assert_allclose(gradients, jnp.broadcast_to(slope, x.shape), rtol=1e-10)
+
+
+def test_few_neighbors_leave_gradients_as_they_are():
+    moments = jnp.stack([jnp.eye(2), jnp.zeros((2, 2)), 1e-9 * jnp.ones((2, 2))])
+    np.testing.assert_array_equal(correction.inverse(moments), jnp.broadcast_to(jnp.eye(2), (3, 2, 2)))
+
+
+def test_particles_bounce_off_the_tank():
+    x, v = jnp.array([[-0.1, 0.5], [0.5, 1.2], [0.5, 0.5]]), jnp.array([[-1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+    x, v = walls.bounce(x, v, jnp.zeros(2), jnp.ones(2), jnp.asarray(0.5))
+    np.testing.assert_array_equal(x, [[0.0, 0.5], [0.5, 1.0], [0.5, 0.5]])
+    np.testing.assert_array_equal(v, [[0.5, 2.0], [3.0, -2.0], [5.0, 6.0]])
+
+
+def test_walls_show_hydrostatic_pressure_and_hold_the_fluid():
+    x = lattice(10, 2, jitter=0.0)
+    gravity, wall = jnp.array([0.0, -9.81]), x[:, 1] < 0.3
+    p = jnp.where(wall, 0, 1000.0 * 9.81 * (1 - x[:, 1]))
+    v = jnp.where(wall[:, None], jnp.array([0.2, 0.0]), jnp.array([1.0, 0.0]))
+    values = {"wall": wall, "rho": jnp.full(100, 1000.0), "p": p, "v": v}
+    sums = total(walls.seen_by_wall, x, values, KERNELS["quintic"], 0.1, backend="brute")
+    shown, held = walls.extrapolated(sums, v, gravity)
+    met = np.asarray(wall & (sums["weight"] > 0))
+    assert met.sum() == 20
+    np.testing.assert_allclose(shown[met], 1000.0 * 9.81 * (1 - x[met, 1]), rtol=1e-12)
+    np.testing.assert_allclose(held[met], np.broadcast_to([-0.6, 0.0], (20, 2)), atol=1e-12)

@@ -1,0 +1,119 @@
+"""`python -m experiments sph`: what a run writes, how it goes on after a kill, and what it says when it goes wrong."""
+
+import json
+
+import numpy as np
+import pytest
+import pyvista
+from jfrnn.cases import fluids
+from typer.testing import CliRunner
+
+from experiments._cli import app
+from experiments.sph import health
+from experiments.sph.model import make_model, make_state
+from experiments.sph.settings import make_scene
+
+FEW = ("--frames", 3, "--set", "duration=0.003")
+
+
+def invoke(*arguments):
+    result = CliRunner().invoke(app, ["sph", *(str(argument) for argument in arguments)])
+    if result.exit_code not in (0, 2):
+        raise result.exception
+    return result.exit_code, result.stdout, result.stderr
+
+
+def load(folder, step):
+    with np.load(folder / "snapshots" / f"{step:09d}.npz") as saved:
+        return {name: saved[name] for name in saved}
+
+
+def test_a_run_writes_snapshots_energies_frames_and_a_gif(tmp_path):
+    code, out, _ = invoke("four", *FEW, "--out", tmp_path)
+    assert (code, out.split()[-1]) == (0, str(tmp_path))
+    names = [f"{step:09d}" for step in (0, 10, 20, 30)]
+    for folder, ending in (("snapshots", "npz"), ("snapshots", "vtp"), ("frames", "png")):
+        assert sorted(path.stem for path in (tmp_path / folder).glob(f"*.{ending}")) == names
+    assert (tmp_path / "four.gif").read_bytes()[:4] == b"GIF8"
+    table = np.genfromtxt(tmp_path / "energies.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(table["time"], [0, 0.001, 0.002, 0.003], atol=1e-12)
+    np.testing.assert_allclose(table["total"], table["kinetic"] + table["potential"], rtol=1e-9)
+    cloud = pyvista.read(tmp_path / "snapshots" / "000000030.vtp")
+    np.testing.assert_array_equal(cloud.points[:, :2], load(tmp_path, 30)["x"])
+    np.testing.assert_array_equal(cloud.point_data["velocity"][:, :2], load(tmp_path, 30)["v"])
+
+
+@pytest.mark.parametrize("neighbors", ["pair_sum", "list"])
+def test_a_killed_run_goes_on_to_the_same_end(tmp_path, neighbors):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    options = ("dam", "--set", "spacing=0.008", *FEW, "--no-pictures", "--neighbors", neighbors)
+    invoke(*options, "--out", whole)
+    invoke(*options, "--out", killed)
+    for step in (20, 30):
+        (killed / "snapshots" / f"{step:09d}.npz").unlink()
+    invoke(*options, "--out", killed)
+    tables = [np.genfromtxt(folder / "energies.csv", delimiter=",", names=True)["kinetic"] for folder in (whole, killed)]
+    tolerance = 0 if neighbors == "pair_sum" else 1e-9  # a list that is made anew may order its rows, and their sums, otherwise
+    np.testing.assert_allclose(*tables, rtol=tolerance)
+    np.testing.assert_allclose(load(whole, 30)["x"], load(killed, 30)["x"], rtol=tolerance)
+
+
+def test_given_particles_replace_those_of_the_scene(tmp_path):
+    table = tmp_path / "given.csv"
+    table.write_text("x,y,vx,vy\n0.3,0.5,1.0,0.0\n0.7,0.5,-1.0,0.0\n")
+    invoke("dam", *FEW, "--initial", table, "--out", tmp_path / "csv")
+    np.savez(tmp_path / "given.npz", positions=[[0.3, 0.5], [0.7, 0.5]], velocities=[[1.0, 0.0], [-1.0, 0.0]])
+    invoke("dam", *FEW, "--initial", tmp_path / "given.npz", "--out", tmp_path / "npz")
+    first, second = (load(tmp_path / kind, 30) for kind in ("csv", "npz"))
+    np.testing.assert_array_equal(first["x"], second["x"])
+    np.testing.assert_allclose(first["x"], [[0.303, 0.5], [0.697, 0.5]], atol=1e-4)
+
+
+def test_a_folder_of_another_run_is_refused(tmp_path):
+    invoke("one", *FEW, "--out", tmp_path, "--no-pictures")
+    code, _, error = invoke("one", *FEW, "--out", tmp_path, "--set", "restitution=0.4")
+    assert code == 2
+    assert "holds a run with another physics" in error
+    assert json.loads((tmp_path / "run.json").read_text())["physics"]["restitution"] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("sea",), "error: unknown fluid scene 'sea'; allowed: one, two, "),
+        (("dam", "--set", "spaced=1"), "error: --set spaced: unknown; of dam: spacing, duration, step; physics: density, "),
+        (("dam", "--set", "spacing"), "error: --set spacing: expected key=value"),
+        (("dam", "--set", "spacing=wide"), "error: --set spacing: got 'wide'; input should be a valid number"),
+        (("dam", "--set", "integrator=euler"), "error: --set integrator: got 'euler'; input should be 'leapfrog', "),
+        (("dam", "--dtype", "float16"), "error: --dtype float16: allowed: float32, float64"),
+        (("dam", "--initial", "particles.txt"), "error: particles.txt: unknown ending '.txt'; allowed: .csv, .npz"),
+    ],
+)
+def test_mistakes_end_with_2_and_a_message(tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    code, _, error = invoke(*arguments)
+    assert code == 2
+    assert error.startswith(message)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_that_diverges_names_step_and_particle(tmp_path):
+    code, _, error = invoke("dam", *FEW, "--set", "spacing=0.008", "--set", "sound_speed=1e160", "--no-pictures", "--out", tmp_path)
+    assert code == 2
+    assert "dam: diverged in step 1, t = 0.0001 s: particle 0 has position [nan nan]" in error
+
+
+def test_the_step_in_which_a_particle_crossed_a_wall():
+    scene = make_scene("one", ["restitution=0.5"])
+    model = make_model(scene, backend="brute")
+    fast = make_state(scene)._replace(v=np.array([[0.0, -300.0]]))
+    through = model.__class__(**{**vars(model), "tank": None})  # the same without a tank
+    with pytest.raises(health.DivergedError, match=r"in step 117, t = 0.0017 s: particle 0 went through a wall, to \[ 0.5 "):
+        health.check(scene, through, fast, None, health.solver.advance(through, fast, None, 50)[0], 50, 100)
+
+
+def test_values_of_settings_have_their_kind():
+    scene = make_scene("dam", ["gravity=[0, -1.62]", "artificial=0.1", "viscosity=none"])
+    assert scene.physics.gravity == (0.0, -1.62)
+    assert (scene.physics.artificial, scene.physics.viscosity) == (0.1, None)
+    assert fluids.fluid("dam").physics.viscosity == 1.0
