@@ -1,0 +1,97 @@
+"""What a scene does not have is no part of its program: operations and bytes of pairs of scenes that differ in one part."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from jfrnn.cases import fluids
+
+from experiments.sph import solver
+from experiments.sph.model import make_model, make_state
+
+N = 64
+SITES = np.stack(np.meshgrid(np.arange(8.0), np.arange(8.0)), axis=-1).reshape(-1, 2) / 8
+BARE = fluids.FluidScene(
+    name="bare",
+    positions=SITES,
+    velocities=np.zeros((N, 2)),
+    masses=np.full(N, 1 / N),
+    spacing=1 / 8,
+    duration=1.0,
+    step=1e-3,
+    physics=fluids.Physics(density=1.0, sound_speed=10.0, smoothing=1 / 8, state="linear"),
+)
+PARTS = {
+    "viscosity": {"viscosity": 0.1},
+    "artificial viscosity": {"artificial": 0.1},
+    "density diffusion": {"density_diffusion": 0.1},
+    "cohesion": {"tension": 1.0},
+    "gravity": {"gravity": (0.0, -1.0)},
+    "transport velocity": {"transport": 1.0},
+    "shifting": {"shifting": 0.1},
+    "correction": {"corrected": True},
+    "Tait's equation": {"state": "tait"},
+}
+WHOLE = {
+    "walls": replace(BARE, wall=np.arange(N) < 8),
+    "tank": replace(BARE, tank=fluids.Tank((0.0, 0.0), (1.0, 1.0)), physics=replace(BARE.physics, restitution=0.5)),
+    "periodicity": replace(BARE, periodic=fluids.Periodic((0.0, 0.0), (1.0, 1.0), (True, True))),
+    "inflow": replace(BARE, enters=np.linspace(0, 1, N)),
+    "a Courant step": replace(BARE, step=None),
+    **{name: replace(BARE, physics=replace(BARE.physics, **change)) for name, change in PARTS.items()},
+}
+
+
+def lowered(scene, skin=None):
+    model, s = make_model(scene, backend="brute"), make_state(scene)
+    nbrs = None if skin is None else solver.list_neighbors(model, s, skin)
+    return jax.jit(solver.step).lower(model, s, nbrs), (model, s, nbrs)
+
+
+def operations(program):
+    return sum(" = " in line for line in program.as_text().splitlines())
+
+
+@pytest.fixture(scope="module")
+def bare():
+    return lowered(BARE)
+
+
+@pytest.mark.parametrize("part", WHOLE)
+def test_a_part_that_is_left_out_takes_no_operation(bare, part):
+    program, given = lowered(WHOLE[part])
+    assert operations(program) > operations(bare[0])
+    more = len(jax.tree.leaves(given)) - len(jax.tree.leaves(bare[1]))
+    numbers = {"walls": 1, "tank": 3, "periodicity": 2, "inflow": 2, "a Courant step": -1, "correction": 0, "Tait's equation": 0}
+    carried = {"transport velocity": 1, "shifting": 1}
+    assert more == numbers.get(part, 1 + carried.get(part, 0))  # no array that nobody reads
+
+
+def test_the_bare_program_holds_no_trace_of_other_parts(bare):
+    text = bare[0].as_text()
+    for operation in ("power", "select_and_", "floor", "round_nearest", "sort"):  # Tait; images; cells, lists
+        assert f"stablehlo.{operation}" not in text, operation
+
+
+@pytest.mark.parametrize("part", ["walls", "viscosity", "correction"])
+def test_compiled_programs_are_larger_with_a_part(bare, part):
+    without, having = (program.compile() for program in (bare[0], lowered(WHOLE[part])[0]))
+    assert having.cost_analysis()["flops"] > without.cost_analysis()["flops"]
+    assert needed(having) >= needed(without)
+
+
+def needed(compiled):
+    """Return the bytes of arguments, results and scratch."""
+    memory = compiled.memory_analysis()
+    return memory.argument_size_in_bytes + memory.output_size_in_bytes + memory.temp_size_in_bytes
+
+
+def test_no_skin_keeps_no_reference_positions():
+    (_, (_, _, none)), (_, (_, _, listed)) = lowered(BARE), lowered(BARE, skin=0.01)
+    assert jax.tree.leaves(none) == []
+    assert [leaf.shape for leaf in jax.tree.leaves(listed.verlet.positions)] == [(N, 2)]
+
+
+def test_two_dimensions_compute_two_components(bare):
+    assert "x3xf64" not in bare[0].as_text()
