@@ -87,11 +87,16 @@ class State(NamedTuple):
 
 
 def make_model(scene: "FluidScene", dtype: type = np.float64, backend: str = "auto") -> Model:
-    """Put what acts in a scene into JAX, numbers of one dtype."""
+    """Put what acts in a scene into JAX, numbers of one dtype.
+
+    Raises:
+        ValueError: A periodic box is too small for the kernel.
+    """
 
     def array(value: Any) -> Array:  # noqa: ANN401
         return jnp.asarray(value, dtype)
 
+    _check_box(scene)
     physics = jax.tree.map(array, replace(scene.physics, gravity=_row(scene.physics.gravity)))
     box = scene.periodic and jfrnn.Box(array(scene.periodic.lengths), scene.periodic.axes, array(scene.periodic.lower))
     return Model(
@@ -106,6 +111,18 @@ def make_model(scene: "FluidScene", dtype: type = np.float64, backend: str = "au
         spacing=scene.spacing,
         backend=backend,
     )
+
+
+def _check_box(scene: "FluidScene") -> None:
+    """Refuse a periodic box in which a particle might meet two images of another: the solver traces its box."""
+    if scene.periodic is None:
+        return
+    least = 2.05 * KERNELS[scene.physics.kernel].support * scene.physics.smoothing
+    for axis, length, periodic in zip("xyz", scene.periodic.lengths, scene.periodic.axes, strict=False):
+        if periodic and length < least:
+            raise ValueError(
+                f"periodic box must be 2.05 cutoffs wide along {axis}: {least:.6g} m, got {length:.6g} m: take more particles."
+            )
 
 
 def make_state(scene: "FluidScene", dtype: type = np.float64) -> State:

@@ -12,6 +12,7 @@ import numpy as np
 
 import jfrnn
 from experiments import _sweep
+from experiments._errors import UsageError
 from experiments.sph import forces, frames, health, settings, snapshots, solver
 from experiments.sph.forces import Neighbors
 from experiments.sph.model import Model, State, make_model, make_state
@@ -57,7 +58,10 @@ def run(scene: "FluidScene", folder: Path, how: How) -> State:
     given = hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in (scene.positions, scene.velocities, scene.masses)))
     about = settings.described(scene) | {"dtype": how.dtype, "frames": how.frames, "given": given.hexdigest()[:12]}
     snapshots.check_same(about, folder)
-    model = make_model(scene, np.dtype(how.dtype).type)
+    try:
+        model = make_model(scene, np.dtype(how.dtype).type)
+    except ValueError as error:
+        raise UsageError(f"scene {scene.name!r}: {error}") from error
     saved = snapshots.latest(folder / "snapshots")
     s, step = saved or (make_state(scene, np.dtype(how.dtype).type), 0)
     nbrs = solver.list_neighbors(model, s, how.skin * scene.spacing) if how.neighbors == "list" else None

@@ -1,0 +1,148 @@
+"""Flows with known answers, coarse and short: the full runs are a command's."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from jfrnn.cases import fluids
+from jfrnn.cases._fluid_flows import taylor_green_velocity
+
+import jfrnn
+from experiments.sph import budget, forces, health, solver
+from experiments.sph.model import make_model, make_state
+
+
+def begun(scene, backend="auto"):
+    model = make_model(scene, backend=backend)
+    return model, jax.jit(solver.begin)(model, make_state(scene))
+
+
+def run(scene, time=None, backend="auto"):
+    model, s = begun(scene, backend)
+    s, _ = solver.advance(model, s, None, round((scene.duration if time is None else time) / scene.step))
+    complaint = health.complaint(scene, s)
+    assert complaint is None
+    return model, s
+
+
+def fluid_of(scene, s):
+    fluid = ~scene.wall
+    return np.asarray(s.x)[fluid], np.asarray(s.v)[fluid]
+
+
+def test_poiseuille_flow_at_18_particles():
+    scene = fluids.fluid("poiseuille", ny=18, duration=2e-3)
+    x, v = fluid_of(scene, run(scene)[1])
+    y, exact = x[:, 1], 5 * x[:, 1] * (1 - x[:, 1])
+    for k in range(1, 20, 2):
+        exact = exact - 40 / (np.pi * k) ** 3 * np.sin(np.pi * k * y) * np.exp(-((np.pi * k) ** 2) * 100 * 2e-3)
+    assert np.linalg.norm(v[:, 0] - exact) < 0.015 * np.linalg.norm(exact)
+    assert np.abs(v[:, 1]).max() < 1e-6
+
+
+def test_a_box_that_is_too_small_for_the_kernel_is_refused():
+    with pytest.raises(ValueError, match=r"periodic box must be 2.05 cutoffs wide along x: .* got 0.333"):
+        make_model(fluids.fluid("poiseuille", ny=6))
+
+
+def test_couette_flow_at_18_particles():
+    scene = fluids.fluid("couette", ny=18, duration=1e-2)
+    x, v = fluid_of(scene, run(scene)[1])
+    assert np.linalg.norm(v[:, 0] - 1.25 * x[:, 1]) < 0.002 * np.linalg.norm(v[:, 0])
+
+
+def test_taylor_green_vortices_at_24_particles():
+    scene = fluids.fluid("taylor-green", nx=24, duration=0.3)
+    _, s = run(scene)
+    x, v = np.asarray(s.x), np.asarray(s.v)
+    exact = taylor_green_velocity(x, float(s.time), 100.0)
+    assert np.abs(np.linalg.norm(v, axis=1) - np.linalg.norm(exact, axis=1)).mean() < 0.01 * np.linalg.norm(exact, axis=1).mean()
+    assert (v**2).sum() == pytest.approx((exact**2).sum(), rel=0.02)
+
+
+@pytest.mark.slow
+def test_taylor_green_in_3d_loses_energy_and_keeps_its_particles():
+    scene = fluids.fluid("taylor-green", nx=8, dim=3, duration=0.1)
+    model, before = begun(scene)
+    _, s = run(scene)
+    assert 0.7 < budget.kinetic_energy(model, s) / budget.kinetic_energy(model, before) < 1.0
+
+
+def test_an_elliptical_drop_stretches():
+    scene = fluids.fluid("drop", nx=10, duration=0.0038)
+    model, s = run(scene)
+    x, before = np.asarray(s.x), scene.positions
+    assert np.sqrt((x[:, 1] ** 2).mean() / (before[:, 1] ** 2).mean()) == pytest.approx(1.4392191, rel=0.015)
+    top = np.abs(scene.velocities).sum() * scene.masses[0]
+    assert np.abs(budget.momentum(model, s)).max() < 1e-12 * top  # symmetric forces balance to rounding
+
+
+@pytest.mark.slow
+def test_a_tank_at_rest_has_hydrostatic_pressure():
+    scene = fluids.fluid("hydrostatic", ny=10, duration=0.3)
+    model, s = run(scene)
+    p = np.asarray(jax.jit(forces.density_and_pressure)(model, s)[1])[~scene.wall]
+    exact = 1000.0 * (0.9 - fluid_of(scene, s)[0][:, 1])
+    assert np.linalg.norm(p - exact) < 0.03 * np.linalg.norm(exact)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "settings"), [("dam-break-2d", {"nx": 6}), ("dam-break-3d", {"nx": 4}), ("cavity", {"nx": 8})])
+def test_scenes_with_walls_keep_their_fluid(name, settings):
+    scene = fluids.fluid(name, **settings)
+    x, _ = fluid_of(scene, run(scene, time=300 * scene.step)[1])
+    assert np.abs(x - scene.positions[~scene.wall]).max() > 0.01 * scene.spacing
+
+
+def test_a_jet_enters_layer_by_layer():
+    scene = fluids.fluid("jet", layers=4, duration=2e-3)
+    model, s = begun(scene)
+    assert forces.active(model, s.time).sum() == 12 + scene.wall.sum()
+    _, s = run(scene, time=1.75e-3)
+    waiting = np.asarray(~forces.active(model, s.time))
+    assert 0 < waiting.sum() < (~scene.wall).sum()
+    np.testing.assert_array_equal(np.asarray(s.x)[waiting], scene.positions[waiting])
+    front = np.asarray(s.x)[:12, 2]
+    assert (front < 0.5e-3).all()  # 8 mm at 5 m/s in 1.6 ms: the first layer has reached the plate, and gone apart
+    assert (np.asarray(s.x)[~scene.wall, 2] > 0).all()
+    assert np.linalg.norm(np.asarray(s.x)[:12, :2], axis=1).max() > 1.2 * np.linalg.norm(scene.positions[:12, :2], axis=1).max()
+
+
+@pytest.mark.parametrize("integrator", ["symplectic", pytest.param("midpoint", marks=pytest.mark.slow)])
+def test_lists_and_pair_sums_agree(integrator):
+    scene = fluids.fluid("taylor-green", nx=12, jitter=0.2)
+    scene = replace(scene, physics=replace(scene.physics, integrator=integrator))
+    model, s = begun(scene)
+    nbrs = solver.list_neighbors(model, s, skin=0.2 * scene.spacing)
+    assert isinstance(nbrs, jfrnn.NeighborList)
+    direct, _ = solver.advance(model, s, None, 40)
+    listed, nbrs = solver.advance(model, s, nbrs, 40)
+    assert not nbrs.overflow
+    assert nbrs.rebuild_count > 0
+    for name in ("x", "v", "p"):
+        np.testing.assert_allclose(getattr(direct, name), getattr(listed, name), rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_symplectic_and_midpoint_converge_to_each_other():
+    scene = fluids.fluid("taylor-green", nx=10)
+    found = {}
+    for integrator in ("symplectic", "midpoint"):
+        for step in (4e-4, 2e-4):
+            changed = replace(scene, step=step, physics=replace(scene.physics, integrator=integrator))
+            found[integrator, step] = np.asarray(run(changed, time=0.02)[1].v)
+    coarse, fine = (np.abs(found["symplectic", step] - found["midpoint", step]).max() for step in (4e-4, 2e-4))
+    assert fine < 0.6 * coarse
+    assert fine < 1e-3
+
+
+def test_the_courant_step_follows_the_scene():
+    scene = replace(fluids.fluid("dam-break-2d", nx=6), step=None)
+    model, s = begun(scene)
+    h, c = scene.physics.smoothing, scene.physics.sound_speed
+    assert solver.courant(model, s) == pytest.approx(min(0.25 * h / c, 0.25 * np.sqrt(h / 9.81)), rel=0.3)
+    later, _ = solver.advance(model, s, None, 20)
+    assert later.last < 0.25 * h / c
+    with pytest.raises(ValueError, match="multiple of segments"):
+        solver.rollout(model, s, 10, segments=3)
