@@ -99,7 +99,7 @@ def _steps_to_next(scene: "FluidScene", model: Model, s: State, count: int) -> i
     if time > scene.duration - step / 2:
         return 0
     interval = scene.duration / count
-    goal = interval * (math.floor(time / interval + 1e-6) + 1)
+    goal = interval * (math.floor((time + step / 2) / interval) + 1)
     return max(1, round((goal - time) / step))
 
 
