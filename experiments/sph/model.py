@@ -90,13 +90,14 @@ def make_model(scene: "FluidScene", dtype: type = np.float64, backend: str = "au
     """Put what acts in a scene into JAX, numbers of one dtype.
 
     Raises:
-        ValueError: A periodic box is too small for the kernel.
+        ValueError: A periodic box is too small for the kernel, or parts of the physics do not go together.
     """
 
     def array(value: Any) -> Array:  # noqa: ANN401
         return jnp.asarray(value, dtype)
 
     _check_box(scene)
+    _check_parts(scene)
     physics = jax.tree.map(array, replace(scene.physics, gravity=_row(scene.physics.gravity)))
     box = scene.periodic and jfrnn.Box(array(scene.periodic.lengths), scene.periodic.axes, array(scene.periodic.lower))
     return Model(
@@ -123,6 +124,21 @@ def _check_box(scene: "FluidScene") -> None:
             raise ValueError(
                 f"periodic box must be 2.05 cutoffs wide along {axis}: {least:.6g} m, got {length:.6g} m: take more particles."
             )
+
+
+def _check_parts(scene: "FluidScene") -> None:
+    """Refuse what compiles and means nothing."""
+    physics = scene.physics
+    if physics.integrator == "leapfrog" and physics.evolve != "summation":
+        raise ValueError(
+            f"integrator 'leapfrog' carries no density or pressure, got evolve {physics.evolve!r}: "
+            "take evolve 'summation', or integrator 'symplectic' or 'midpoint'."
+        )
+    if physics.pressure == "difference" and scene.periodic is None and scene.wall is None:
+        raise ValueError(
+            "pressure 'difference' does not vanish at a free surface, got a scene without walls or period: "
+            "take 'mean', 'symmetric' or 'volume'."
+        )
 
 
 def make_state(scene: "FluidScene", dtype: type = np.float64) -> State:

@@ -22,14 +22,19 @@ def courant(model: Model, s: State) -> Array:
     Source: Monaghan (1992), doi:10.1146/annurev.aa.30.090192.002551; Morris, Fox & Zhu (1997), doi:10.1006/jcph.1997.5776.
     """
     physics, h = model.physics, model.physics.smoothing
-    speed = jnp.sqrt(jnp.max(jnp.sum(s.v * s.v, axis=1), initial=0))
+    speed = _greatest(s.v)
     limits = [0.25 * h / (physics.sound_speed + speed)]
     if physics.viscosity is not None:
         kinematic = physics.viscosity / physics.density if physics.viscosity_form == "source" else physics.viscosity
         limits.append(0.125 * h**2 / kinematic)
-    strongest = jnp.sqrt(jnp.max(jnp.sum(s.a * s.a, axis=1), initial=0))
-    limits.append(0.25 * jnp.sqrt(h / jnp.maximum(strongest, jnp.finfo(s.x.dtype).tiny)))
+    limits.append(0.25 * jnp.sqrt(h / jnp.maximum(_greatest(s.a), jnp.finfo(s.x.dtype).smallest_normal ** (1 / 3))))
     return jnp.min(jnp.stack(limits))
+
+
+def _greatest(vectors: Array) -> Array:
+    """Return the length of the longest vector, shape []; its derivative is 0 instead of NaN where all are 0."""
+    square = jnp.max(jnp.sum(vectors * vectors, axis=1), initial=0)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 
 def step(model: Model, s: State, nbrs: Neighbors = None) -> tuple[State, Neighbors]:
@@ -54,8 +59,11 @@ def advance(model: Model, s: State, nbrs: Neighbors, steps: Array | int) -> tupl
     return jax.lax.fori_loop(0, steps, lambda _, carry: step(model, *carry), (s, nbrs))
 
 
-def rollout(model: Model, s: State, steps: int, nbrs: Neighbors = None, segments: int = 1) -> State:
+def rollout(model: Model, s: State, steps: int, nbrs: Neighbors = None, segments: int = 1) -> tuple[State, Neighbors]:
     """Run steps such that they can be differentiated in reverse, in the model's numbers and in the state.
+
+    Derivatives are those of the program: a list changes none of them, and where a flow has a kink (a bounce off a tank; artificial
+    viscosity between particles that rest) they are those of one side.
 
     Args:
         model: What acts.
@@ -66,9 +74,12 @@ def rollout(model: Model, s: State, steps: int, nbrs: Neighbors = None, segments
             states. √steps is best.
 
     Returns:
-        The last state.
+        The last state, and the list: where its `overflow` is set, pairs were missing: `grow` it, and run again.
+
+    Raises:
+        ValueError: `steps` is no multiple of `segments`.
     """
-    if steps % segments:
+    if segments < 1 or steps % segments:
         raise ValueError(f"steps must be a multiple of segments, got {steps} and {segments}.")
 
     def one(carry: tuple[State, Neighbors], _: None) -> tuple[tuple[State, Neighbors], None]:
@@ -77,7 +88,7 @@ def rollout(model: Model, s: State, steps: int, nbrs: Neighbors = None, segments
     def segment(carry: tuple[State, Neighbors], _: None) -> tuple[tuple[State, Neighbors], None]:
         return jax.lax.scan(jax.checkpoint(one), carry, None, length=steps // segments)[0], None
 
-    return jax.lax.scan(jax.checkpoint(segment), (s, nbrs), None, length=segments)[0][0]
+    return jax.lax.scan(jax.checkpoint(segment), (s, nbrs), None, length=segments)[0]
 
 
 def list_neighbors(model: Model, s: State, skin: float, slack: float = 1.3) -> jfrnn.NeighborList:
