@@ -34,6 +34,8 @@ class Physics:
         tension: Strength of cohesion [m³/s²/kg · kg], see `experiments.sph.surface`.
         corrected: Gradients of the kernel are renormalized, so that linear fields have exact gradients.
         gravity: Acceleration [m/s²], one number per axis.
+        damping: Rate [1/s] at which velocities decay besides, so that sound does while a scene settles.
+        damped_until: When damping ends [s]; None: never.
         restitution: Share of the normal velocity that a particle keeps at the walls of the `Tank` around the scene.
         slip: Walls of dummy particles do not hold the fluid along them.
         integrator: "leapfrog" (kick, drift), "symplectic" (kick, drift, kick), or "midpoint" (Runge-Kutta of second order).
@@ -57,6 +59,8 @@ class Physics:
     tension: float | None = None
     corrected: bool = False
     gravity: tuple[float, ...] | None = None
+    damping: float | None = None
+    damped_until: float | None = None
     restitution: float | None = None
     slip: bool = False
     integrator: Literal["leapfrog", "symplectic", "midpoint"] = "symplectic"

@@ -31,16 +31,26 @@ def free(density: float, sound_speed: float, spacing: float) -> Physics:
     )
 
 
-def hydrostatic(*, height: float = 0.9, ny: int = 45, duration: float = 8.0, viscosity: float = 0.005) -> FluidScene:
-    """Return water in an open tank 2 m wide under g = 1 m/s², at first with the densities that balance it.
+def hydrostatic(
+    *,
+    height: float = 0.9,
+    ny: int = 45,
+    duration: float = 4.0,
+    viscosity: float = 0.005,
+    damping: float = 10.0,
+    settling: float = 2.0,
+) -> FluidScene:
+    """Return water in an open tank 2 m wide under g = 1 m/s², at first with the densities and masses that balance it.
 
-    From rest density, sound would run up and down for minutes: nothing damps it but ν.
+    What is not balanced, by sums in place of integrals, is sound, which would run up and down for minutes: it is damped at first.
 
     Args:
         height: Of the water H [m].
         ny: Particles from the ground to the surface.
         duration: Time that is simulated [s].
         viscosity: ν [m²/s]: what brings it to rest.
+        damping: Rate [1/s] at which velocities decay while it settles.
+        settling: How long they do [s].
 
     Source: Adami, Hu & Adams (2012), doi:10.1016/j.jcp.2012.05.005, sec. 4.1.
     """
@@ -48,11 +58,12 @@ def hydrostatic(*, height: float = 0.9, ny: int = 45, duration: float = 8.0, vis
     sound_speed = 10 * math.sqrt(height)
     water = lattice((0.0, 0.0), (round(2 / spacing), ny), spacing)
     physics = replace(free(1000.0, sound_speed, spacing), gravity=(0.0, -1.0), viscosity=viscosity)
+    physics = replace(physics, damping=damping or None, damped_until=settling if damping else None)
     scene = _in_tank("hydrostatic", water, spacing, (round(2 / spacing) * spacing, height + 0.1), physics, duration)
     depth = np.maximum(height - scene.positions[:, 1], 0.0)
     squeezed = 1000.0 * (1 + 7 * depth / sound_speed**2) ** (1 / 7)  # Tait's density at the pressure ρ0 g depth
     squeezed[len(water) :] = 1000.0
-    return replace(scene, densities=squeezed)
+    return replace(scene, densities=squeezed, masses=squeezed * spacing**2)
 
 
 def drop(*, radius: float = 1.0, nx: int = 40, duration: float = 0.0076, sound_speed: float = 1400.0) -> FluidScene:

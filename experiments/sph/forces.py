@@ -169,7 +169,15 @@ def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tupl
 
     sums = _sum(term, model, s, values, nbrs)
     a = sums["a"] if physics.gravity is None else sums["a"] + physics.gravity
+    if physics.damping is not None:
+        a = a - _damping(model, s.time) * s.v
     return walls.fluid_only(guided(model, s.time), a), sums.get("w")
+
+
+def _damping(model: Model, time: Array) -> Array:
+    """Return the rate [1/s], shape [], at which velocities decay now."""
+    rate, until = model.physics.damping, model.physics.damped_until
+    return rate if until is None else jnp.where(time < until, rate, 0)
 
 
 def density_and_pressure(model: Model, s: State, nbrs: Neighbors = None) -> tuple[Array, Array]:
