@@ -205,6 +205,26 @@ def sph(
 
 
 @app.command()
+def sph_validate(
+    cases: Annotated[list[str] | None, typer.Argument(help="Such as taylor-green, cavity; all, long ones last, without.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the rows.")] = Path("out") / "sph-validate",
+) -> None:
+    """Run fluid scenes with known answers, or go on with them; then print a table, and draw pictures beside the rows."""
+    with _usage_errors():
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        from experiments.sph import validate
+
+        try:
+            rows = validate.run(cases or [], out)
+        except KeyboardInterrupt:
+            typer.echo("stopped; the same command goes on from here", err=True)
+            raise typer.Exit(130) from None
+        typer.echo(validate.report(rows, out))
+
+
+@app.command()
 def peers(
     names: Annotated[list[str] | None, typer.Argument(help="Of libraries; all that are known without.")] = None,
     out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "peers",

@@ -1,0 +1,68 @@
+"""Known answers: what a flow must be at its times, from closed forms and tables."""
+
+from pathlib import Path
+
+import numpy as np
+
+REFERENCE = Path(__file__).parent.parent / "reference"
+DRAG = np.pi**2 * 100.0  # of the channel's slowest mode [1/s]: ν π²/H² with ν = 100 m²/s, H = 1 m
+
+
+def poiseuille(y: np.ndarray, time: float, top_speed: float = 1.25) -> np.ndarray:
+    """Return the velocity [m/s] between plates at rest, y in [0, 1] m, after the force was switched on (ν = 100 m²/s).
+
+    Source: Morris, Fox & Zhu (1997), doi:10.1006/jcph.1997.5776, eq. 31.
+    """
+    k = np.arange(1, 200, 2)
+    modes = np.sin(np.pi * k * y[:, None]) * np.exp(-DRAG * k**2 * time) / k**3
+    return 4 * top_speed * (y * (1 - y) - 8 / np.pi**3 * modes.sum(axis=1))
+
+
+def couette(y: np.ndarray, time: float, lid: float = 1.25) -> np.ndarray:
+    """Return the velocity [m/s] between a plate at rest and one that moves, y in [0, 1] m (ν = 100 m²/s).
+
+    Source: Morris, Fox & Zhu (1997), doi:10.1006/jcph.1997.5776, eq. 33.
+    """
+    k = np.arange(1, 200)
+    modes = (-1.0) ** k / k * np.sin(np.pi * k * y[:, None]) * np.exp(-DRAG * k**2 * time)
+    return lid * (y + 2 / np.pi * modes.sum(axis=1))
+
+
+def drop_axis(times: np.ndarray, rate: float = 100.0) -> np.ndarray:
+    """Return the half major axis of a disc of radius 1 m whose motion (-rate x, rate y) makes it an ellipse, at times [s].
+
+    With half axes 1/b and b, and v = A y, incompressible and without pressure at its surface: b' = A b and
+    A' = A² (1 - b⁴)/(1 + b⁴). Source: Monaghan (1994), doi:10.1006/jcph.1994.1034, sec. 5.1.
+    """
+    from scipy.integrate import solve_ivp
+
+    def rates(_: float, now: np.ndarray) -> list[float]:
+        b, a = now
+        return [a * b, a**2 * (1 - b**4) / (1 + b**4)]
+
+    return solve_ivp(rates, (0, max(times)), [1.0, rate], t_eval=times, rtol=1e-11, atol=1e-11).y[0]
+
+
+def table(name: str) -> np.ndarray:
+    """Return the numbers of a table in `experiments/reference`."""
+    return np.loadtxt(REFERENCE / f"{name}.csv", delimiter=",", comments=("#", "t,", "T,"))
+
+
+def interpolated(x: np.ndarray, values: np.ndarray, points: np.ndarray, reach: float) -> np.ndarray:
+    """Return values at points, from planes fitted to the particles within reach, weighed by a Wendland kernel.
+
+    Args:
+        x: Positions [m], shape [n, 2].
+        values: At them, shape [n].
+        points: Where they are asked for [m], shape [k, 2].
+        reach: [m].
+    """
+    found = []
+    for point in points:
+        apart = (x - point) / reach
+        q = np.sqrt((apart**2).sum(axis=1))
+        near = q < 1
+        root = np.sqrt((1 - q[near]) ** 4 * (4 * q[near] + 1))
+        plane = np.column_stack([np.ones(near.sum()), apart[near]])
+        found.append(np.linalg.lstsq(plane * root[:, None], values[near] * root, rcond=None)[0][0])
+    return np.array(found)

@@ -1,0 +1,172 @@
+"""Run scenes with known answers: a row per case, on disk before the next one starts; a table and pictures are made of the rows."""
+
+import math
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import jax
+import pandas as pd
+from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
+from matplotlib.figure import Figure as Picture
+
+from experiments import _machine, _sweep
+from experiments._errors import UsageError
+from experiments._rows import RowFile
+from experiments.sph import health, solver
+from experiments.sph.model import make_model, make_state
+from experiments.sph.validation import CASES, Case, Curves, Seen, look
+
+
+@dataclass(frozen=True)
+class Row:
+    """A case.
+
+    Attributes:
+        key: Its name.
+        figures: What was measured: quantity, measured, low, high (what it has to be), met; none where the run diverged.
+        reason: Why there are none.
+        particles: Walls included.
+        steps: Of the run.
+        seconds: Of the run, compilation included.
+        curves: What the picture shows, [x, y] by name.
+        axes: Its axes.
+        versions: Of packages.
+        machine: Processor, cores, memory.
+        commit: Of the project.
+        dirty: Whether its files differed from that.
+        time: When the row was written.
+    """
+
+    key: str
+    figures: list[dict[str, Any]]
+    reason: str | None
+    particles: int
+    steps: int
+    seconds: float
+    curves: Curves = field(default_factory=dict)
+    axes: tuple[str, str] = ("", "")
+    versions: dict[str, str | None] = field(default_factory=dict)
+    machine: dict[str, Any] = field(default_factory=dict)
+    commit: str | None = None
+    dirty: bool | None = None
+    time: str | None = None
+
+
+def run(names: list[str], folder: Path) -> list[Row]:
+    """Run the cases that the folder does not hold yet, and return the rows of all that were asked for.
+
+    Args:
+        names: Of `CASES`; all, where there are none.
+        folder: Gets rows.jsonl.
+
+    Raises:
+        UsageError: There is no such case.
+    """
+    unknown = [name for name in names if name not in CASES]
+    if unknown:
+        raise UsageError(f"no case {unknown[0]!r}; allowed: {', '.join(CASES)}")
+    names, file = names or list(CASES), RowFile(folder, Row)
+    with file.locked():
+        file.repair()
+        done = {row.key for row in file.read()}
+        about = {"machine": _machine.machine(), "versions": _machine.versions(), **_machine.commit()}
+        with _sweep.progress(len(names)) as shown:
+            bar = shown.add_task("", total=len(names), completed=sum(name in done for name in names))
+            for name in names:
+                if name not in done:
+                    row = measure(name, CASES[name], about, lambda text: shown.update(bar, description=text))
+                    file.append(row)
+                    shown.console.print(_in_words(row), highlight=False, markup=False, soft_wrap=True)
+                    shown.advance(bar)
+        rows = {row.key: row for row in file.read()}
+    return [rows[name] for name in names]
+
+
+def measure(name: str, case: Case, about: dict[str, Any], say: Any = print) -> Row:  # noqa: ANN401
+    """Run a case and judge it; a run that diverges makes a row that says so."""
+    scene = fluids.fluid(case.scene, **case.settings)
+    assert scene.step is not None, "cases are looked at after whole steps"
+    model, start, step, seen = make_model(scene, backend=case.backend), perf_counter(), 0, []
+    s = jax.jit(solver.begin)(model, make_state(scene))
+    reason = None
+    for time in case.times:
+        steps = round(time / scene.step) - step
+        s, _ = solver.advance(model, s, None, steps)
+        step += steps
+        if (reason := health.complaint(scene, s)) is not None:
+            reason = f"diverged until t = {float(s.time):.6g} s: {reason}"
+            break
+        seen.append(look(scene, model, s))
+        say(f"{name} · t {float(s.time):.4g} s · {step / (perf_counter() - start):.0f} steps/s")
+    figures, curves = _judged(case, scene, seen) if reason is None else ([], {})
+    seconds, now = round(perf_counter() - start, 1), datetime.now(UTC).isoformat(timespec="seconds")
+    return Row(name, figures, reason, scene.n, step, seconds, curves, case.axes, **about, time=now)
+
+
+def _judged(case: Case, scene: Any, seen: list[Seen]) -> tuple[list[dict[str, Any]], Curves]:  # noqa: ANN401
+    figures, curves = case.judge(scene, seen)
+    measured = ((figure, figure.measured if math.isfinite(figure.measured) else None) for figure in figures)  # JSON has no NaN
+    return [figure._asdict() | {"measured": number, "met": figure.met} for figure, number in measured], curves
+
+
+def report(rows: list[Row], folder: Path) -> str:
+    """Write table.csv and a picture per case into the folder, and return the table as text."""
+    frame = table(rows)
+    frame.to_csv(folder / "table.csv", index=False)
+    for row in rows:
+        if row.curves:
+            draw(row).savefig(folder / f"{row.key}.png", dpi=100)
+    return frame.to_string(index=False)
+
+
+def table(rows: list[Row]) -> pd.DataFrame:
+    """Return a line per figure, and one for each case that has none."""
+    lines = []
+    for row in rows:
+        run_line = {"particles": row.particles, "steps": row.steps, "seconds": row.seconds}
+        if not row.figures:
+            lines.append({"case": row.key, "quantity": row.reason, "measured": "", "target": "", "met": "no"} | run_line)
+        for figure in row.figures:
+            words = {"quantity": figure["quantity"], "measured": _number(figure), "target": _target(figure)}
+            lines.append({"case": row.key, **words, "met": "yes" if figure["met"] else "no"} | run_line)
+    return pd.DataFrame(lines)
+
+
+def draw(row: Row) -> Picture:
+    """Draw what was measured as dots or dashes, what is known as lines."""
+    figure = Picture(figsize=(5.2, 3.6), layout="constrained")
+    axes = figure.add_subplot()
+    colors: dict[str, str] = {}
+    for name, (x, y) in row.curves.items():
+        what, _, kind = name.rpartition(", ")
+        known = kind == "known"
+        color = colors.setdefault(what, f"C{len(colors)}")
+        if row.key.startswith("dam-break"):
+            axes.plot(x, y, "o" if known else "-", color=color, label=name, markersize=4)
+        else:
+            axes.plot(x, y, "-" if known else "o", color=color, label=name if len(row.curves) <= 4 else None, markersize=3, lw=1)
+    if row.figures:
+        axes.set_title("\n".join(f"{x['quantity']}: {_number(x)} ({_target(x)})" for x in row.figures), fontsize=7)
+    axes.set(xlabel=row.axes[0], ylabel=row.axes[1])
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(fontsize=7)
+    return figure
+
+
+def _number(figure: dict[str, Any]) -> str:
+    return "not finite" if figure["measured"] is None else f"{figure['measured']:.3g}"
+
+
+def _target(figure: dict[str, Any]) -> str:
+    return f"≤ {figure['high']:g}" if figure["low"] is None else f"{figure['low']:g} to {figure['high']:g}"
+
+
+def _in_words(row: Row) -> str:
+    if not row.figures:
+        return f"{row.key}: {row.reason}"
+    return f"{row.key}: " + "; ".join(
+        f"{x['quantity']} {_number(x)} ({_target(x)}: {'met' if x['met'] else 'missed'})" for x in row.figures
+    )

@@ -1,0 +1,212 @@
+"""Scenes with known answers: how each is run, what is measured, and what it has to be."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import numpy as np
+from jfrnn.cases._fluid_flows import taylor_green_velocity  # pyright: ignore[reportMissingImports]
+
+from experiments.sph import answers, budget, forces
+from experiments.sph.model import Model, State
+
+if TYPE_CHECKING:
+    from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
+
+Curves = dict[str, list[list[float]]]
+
+
+class Seen(NamedTuple):
+    """The fluid at a moment: time [s], positions, velocities, pressures, kinetic and potential energy [J]; no walls."""
+
+    time: float
+    x: np.ndarray
+    v: np.ndarray
+    p: np.ndarray
+    kinetic: float
+    potential: float
+
+
+class Figure(NamedTuple):
+    """What was measured, and the range in which it has to be."""
+
+    quantity: str
+    measured: float
+    low: float | None
+    high: float
+
+    @property
+    def met(self) -> bool:
+        """Whether it is in its range; what is not finite is not."""
+        return bool((self.low is None or self.measured >= self.low) and self.measured <= self.high)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene, when it is looked at, and what is said about what was seen.
+
+    Attributes:
+        scene: Name of a fluid scene.
+        times: When it is looked at [s].
+        judge: (scene, what was seen) -> figures, and curves by name, each [x, y], for the picture.
+        settings: Of the scene.
+        backend: Of `jfrnn.pair_sum`.
+        axes: What the picture has along its axes.
+    """
+
+    scene: str
+    times: tuple[float, ...]
+    judge: Callable[["FluidScene", list[Seen]], tuple[list[Figure], Curves]]
+    settings: dict[str, Any] = field(default_factory=dict)
+    backend: str = "auto"
+    axes: tuple[str, str] = ("time [s]", "energy [J]")
+
+
+@jax.jit
+def _measures(model: Model, s: State) -> tuple[jax.Array, ...]:
+    return forces.density_and_pressure(model, s)[1], budget.kinetic_energy(model, s), budget.potential_energy(model, s)
+
+
+def look(scene: "FluidScene", model: Model, s: State) -> Seen:
+    """Return what is to be seen of a state."""
+    fluid = np.ones(scene.n, bool) if scene.wall is None else ~scene.wall
+    p, kinetic, potential = _measures(model, s)
+    return Seen(
+        float(s.time), np.asarray(s.x)[fluid], np.asarray(s.v)[fluid], np.asarray(p)[fluid], float(kinetic), float(potential)
+    )
+
+
+def relative(found: np.ndarray, exact: np.ndarray) -> float:
+    """Return the L2 norm of the difference over that of what is exact."""
+    return float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
+
+
+def curve(x: np.ndarray, y: np.ndarray) -> list[list[float]]:
+    """Return a curve as lists of five digits."""
+    return [[float(f"{value:.5g}") for value in values] for values in (x, y)]
+
+
+def means(x: np.ndarray, y: np.ndarray, edges: np.ndarray) -> list[list[float]]:
+    """Return the mean of y within each pair of edges of x that holds any, over the mean of x there."""
+    counts, x_sums, y_sums = (np.histogram(x, edges, weights=weights)[0] for weights in (None, x, y))
+    some = counts > 0
+    return curve(x_sums[some] / counts[some], y_sums[some] / counts[some])
+
+
+def few(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
+    """Energies of one to four particles; what is below 1 mJ is compared to 1e-12 J."""
+    expected = answers.table(f"sph2d_{scene.name}_simultaneous")
+    found = np.array([[at.kinetic, at.potential] for at in seen])
+    error = np.abs(found - expected[:, 1:3]) / (np.abs(expected[:, 1:3]) + 1e-3)
+    curves = {}
+    for k, name in enumerate(("kinetic", "potential")):
+        curves[f"{name}, measured"] = curve(expected[::10, 0], found[::10, k])
+        curves[f"{name}, known"] = curve(expected[:, 0], expected[:, 1 + k])
+    return [Figure("energies, largest relative error", float(error.max()), None, 1e-9)], curves
+
+
+def taylor_green(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
+    """Kinetic energy against the exact decay, and the mean error of speeds."""
+    times = np.array([at.time for at in seen])
+    kinetic, exact = np.array([at.kinetic for at in seen]), 0.25 * np.exp(-16 * np.pi**2 * times / 100)
+    last = seen[-1]
+    speed, known = (np.linalg.norm(v, axis=1) for v in (last.v, taylor_green_velocity(last.x, last.time, 100.0)))
+    l1 = float(np.abs(speed - known).mean() / known.mean())
+    figures = [
+        Figure("kinetic energy over exact, t = 2", float(kinetic[-1] / exact[-1]), 0.95, 1.05),
+        Figure("l1 of speed, t = 2", l1, None, 0.02),
+    ]
+    return figures, {"measured": curve(times, kinetic), "known": curve(times, exact)}
+
+
+def channel(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
+    """Profiles between plates."""
+    exact = {"poiseuille": answers.poiseuille, "couette": answers.couette}[scene.name]
+    errors = [relative(at.v[:, 0], exact(at.x[:, 1], at.time)) for at in seen]
+    curves, edges = {}, np.linspace(0, 1, 31)
+    for at in seen:
+        y = np.linspace(0, 1, 61)
+        curves[f"t = {at.time:.2g} s, measured"] = means(at.x[:, 1], at.v[:, 0], edges)
+        curves[f"t = {at.time:.2g} s, known"] = curve(y, exact(y, at.time))
+    figures = [
+        Figure(f"velocity, relative L2, t = {seen[-1].time:.2g}", errors[-1], None, 0.007),
+        Figure("velocity, relative L2, largest of all times", max(errors), None, 0.007),
+    ]
+    return figures, curves
+
+
+def cavity(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
+    """Velocities along the middle lines of the cavity, Re = 100."""
+    figures, curves, last = [], {}, seen[-1]
+    for k, (name, line, target) in enumerate((("u", "ghia1982_u_x0.5", 0.008), ("v", "ghia1982_v_y0.5", 0.010))):
+        known = answers.table(line)[:, :2]
+        at = np.full((len(known), 2), 0.5)
+        at[:, 1 - k] = known[:, 0]
+        found = answers.interpolated(last.x, last.v[:, k], at, 2.5 * scene.spacing)
+        figures.append(
+            Figure(f"{name}, RMS, t = {last.time:.3g}", float(np.sqrt(((found - known[:, 1]) ** 2).mean())), None, target)
+        )
+        dense = np.full((81, 2), 0.5)
+        dense[:, 1 - k] = np.linspace(0, 1, 81)
+        curves[f"{name}, measured"] = curve(dense[:, 1 - k], answers.interpolated(last.x, last.v[:, k], dense, 2.5 * scene.spacing))
+        curves[f"{name}, known"] = curve(*known.T)
+    return figures, curves
+
+
+def drop(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
+    """The half major axis of the ellipse: by second moments and by its outermost particle, against the disc."""
+    times, start = np.array([at.time for at in seen]), (scene.positions[:, 1] ** 2).mean()
+    exact = answers.drop_axis(times)
+    moments = np.sqrt([(at.x[:, 1] ** 2).mean() / start for at in seen])
+    outermost = np.array([np.abs(at.x[:, 1]).max() / np.abs(scene.positions[:, 1]).max() for at in seen])
+    figures = [
+        Figure("major axis by second moment, relative error", float(abs(moments[-1] / exact[-1] - 1)), None, 0.005),
+        Figure("major axis by outermost particle, relative error", float(abs(outermost[-1] / exact[-1] - 1)), None, 0.005),
+    ]
+    return figures, {"measured": curve(times, moments), "known": curve(times, exact)}
+
+
+def hydrostatic(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
+    """Pressure over height, damping being over, and the largest speed left."""
+    height, last = 0.9, seen[-1]
+    worst = max(relative(at.p, 1000 * (height - at.x[:, 1])) for at in seen)
+    y = np.linspace(0, height, 2)
+    figures = [Figure("pressure, relative L2, largest after damping", worst, None, 0.01)]
+    return figures, {"measured": means(last.x[:, 1], last.p, np.linspace(0, 0.95, 39)), "known": curve(y, 1000 * (height - y))}
+
+
+def dam_break(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
+    """The front in column widths over t√(2g/a), as far as the tank lets it run; times count from the start, nothing is shifted."""
+    times = np.array([at.time for at in seen]) * np.sqrt(2 * 9.81)
+    front = np.array([at.x[:, 0].max() + scene.spacing / 2 for at in seen])
+    figures, curves = [], {"measured": curve(times, front)}
+    for size in ("1.125", "2.25"):
+        known = answers.table(f"martin_moyce_a{size}_n2_2")
+        met = known[(known[:, 1] < 3.9) & (known[:, 0] < times[-1])]
+        error = np.abs(np.interp(met[:, 0], times, front) / met[:, 1] - 1)
+        figures.append(Figure(f"front, a = {size} in, largest relative deviation", float(error.max()), None, 0.10))
+        curves[f"a = {size} in, known"] = curve(*met.T)
+    return figures, curves
+
+
+def _times(end: float, count: int) -> tuple[float, ...]:
+    return tuple(float(end * (k + 1) / count) for k in range(count))
+
+
+_CHANNEL = (2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)
+_PROFILE = ("y [m]", "velocity [m/s]")
+_FEW_TIMES = (1e-4, *(0.01 * k for k in range(1, 201)))
+_FRONT = ("t √(2g/a)", "front [column widths]")
+CASES = {
+    **{name: Case(name, _FEW_TIMES, few, backend="brute") for name in ("one", "two", "three", "four")},
+    "taylor-green": Case("taylor-green", _times(2.0, 20), taylor_green),
+    "drop": Case("drop", _times(0.0076, 20), drop, axes=("time [s]", "half major axis [m]")),
+    "hydrostatic": Case("hydrostatic", (2.5, 3.0, 3.5, 4.0), hydrostatic, axes=("y [m]", "pressure [Pa]")),
+    "dam-break-20": Case("dam-break-2d", _times(0.8, 80), dam_break, {"nx": 20}, axes=_FRONT),
+    "dam-break-40": Case("dam-break-2d", _times(0.8, 80), dam_break, {"nx": 40}, axes=_FRONT),
+    "couette": Case("couette", _CHANNEL, channel, axes=_PROFILE),
+    "poiseuille": Case("poiseuille", _CHANNEL, channel, axes=_PROFILE),
+    "cavity": Case("cavity", _times(25.0, 25), cavity, axes=("y, x [m]", "velocity [m/s]")),
+}
+"""By name, long ones last."""

@@ -1,0 +1,98 @@
+"""`python -m experiments sph-validate`: known answers, rows, and how it goes on."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from jfrnn.cases import fluids
+from typer.testing import CliRunner
+
+from experiments._cli import app
+from experiments.sph import answers, validate
+from experiments.sph.validation import CASES, Case, Figure, Seen
+
+SHORT = Case(
+    "one", (0.001, 0.002), lambda scene, seen: ([Figure("fallen", 0.5 - seen[-1].x[0, 1], None, 1e-9)], {}), backend="brute"
+)
+
+
+def test_closed_forms_give_the_tabled_numbers():
+    y = np.array([0.25, 0.5, 0.75])
+    np.testing.assert_allclose(answers.poiseuille(y[:2], 2e-3), [0.8107837, 1.0707961], atol=1e-7)
+    np.testing.assert_allclose(answers.couette(y, 1e-3), [0.1104299, 0.3284453, 0.7200744], atol=1e-7)
+    np.testing.assert_allclose(answers.drop_axis(np.array([0.0008, 0.0038, 0.0076])), [1.0831035, 1.4392191, 1.9445172], rtol=1e-7)
+
+
+def test_interpolation_is_exact_for_planes_up_to_the_walls():
+    x = np.random.default_rng(0).uniform(size=(400, 2))
+    points = np.array([[0.0, 0.5], [0.5, 0.5], [1.0, 1.0]])
+    np.testing.assert_allclose(answers.interpolated(x, x @ [2.0, 3.0] - 1, points, 0.2), points @ [2.0, 3.0] - 1, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["taylor-green", "poiseuille", "couette", "drop", "hydrostatic"])
+def test_what_is_exact_meets_its_targets_and_what_is_not_misses_them(name):
+    case = CASES[name]
+    scene = fluids.fluid(case.scene)
+    x = scene.positions if scene.wall is None else scene.positions[~scene.wall]
+    for factor, met in ((1.0, True), (1.1, False)):
+        figures, _ = case.judge(scene, [exact(name, x, time, factor) for time in case.times])
+        assert [figure.met for figure in figures] == [met] * len(figures)
+
+
+def exact(name, x, time, factor):
+    seen = Seen(time, x, np.zeros_like(x), np.zeros(len(x)), factor * 0.25 * np.exp(-16 * np.pi**2 * time / 100), 0.0)
+    if name == "taylor-green":
+        return seen._replace(v=factor * fluids_velocity(x, time))
+    if name == "drop":
+        axis = factor * answers.drop_axis(np.array([time]))[0]
+        return seen._replace(x=x * (1 / axis, axis))
+    if name == "hydrostatic":
+        return seen._replace(p=factor * 1000 * (0.9 - x[:, 1]))
+    along = {"poiseuille": answers.poiseuille, "couette": answers.couette}[name](x[:, 1], time)
+    return seen._replace(v=np.stack([factor * along, 0 * along], axis=1))
+
+
+def fluids_velocity(x, time):
+    from jfrnn.cases._fluid_flows import taylor_green_velocity
+
+    return taylor_green_velocity(x, time, 100.0)
+
+
+def invoke(*arguments):
+    result = CliRunner().invoke(app, ["sph-validate", *map(str, arguments)])
+    if result.exit_code not in (0, 2):
+        raise result.exception
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_rows_are_kept_and_missed_targets_say_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(validate, "CASES", {"short": SHORT, "other": replace(SHORT, times=(0.003,))})
+    code, out, _ = invoke("short", "--out", tmp_path)
+    first = (tmp_path / "rows.jsonl").read_text()
+    row = json.loads(first)
+    assert code == 0
+    assert (row["key"], row["steps"], row["figures"][0]["met"]) == ("short", 20, False)
+    assert "1.96e-05" in out and "≤ 1e-09  no" in out
+    invoke("--out", tmp_path)
+    after = (tmp_path / "rows.jsonl").read_text()
+    assert after.startswith(first)  # not run again
+    assert [json.loads(line)["key"] for line in after.splitlines()] == ["short", "other"]
+    assert len((tmp_path / "table.csv").read_text().splitlines()) == 3
+
+
+def test_a_run_that_diverges_is_a_row(tmp_path, monkeypatch):
+    wild = replace(SHORT, judge=lambda scene, seen: ([Figure("nothing", np.nan, None, 1.0)], {}))
+    assert validate.measure("wild", wild, {}, str).figures == [
+        {"quantity": "nothing", "measured": None, "low": None, "high": 1.0, "met": False}
+    ]
+    monkeypatch.setattr(validate.health, "complaint", lambda scene, s: "particle 0 is gone")
+    row = validate.measure("wild", wild, {}, str)
+    assert (row.figures, row.reason) == ([], "diverged until t = 0.001 s: particle 0 is gone")
+    assert list(validate.table([row])["met"]) == ["no"]
+
+
+def test_unknown_cases_are_refused(tmp_path):
+    code, _, error = invoke("sea", "--out", tmp_path)
+    assert code == 2
+    assert error.startswith("error: no case 'sea'; allowed: one, two, three, four, taylor-green")
