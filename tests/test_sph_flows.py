@@ -31,6 +31,7 @@ def fluid_of(scene, s):
     return np.asarray(s.x)[fluid], np.asarray(s.v)[fluid]
 
 
+@pytest.mark.slow
 def test_poiseuille_flow_at_18_particles():
     scene = fluids.fluid("poiseuille", ny=18, duration=2e-3)
     x, v = fluid_of(scene, run(scene)[1])
@@ -46,12 +47,14 @@ def test_a_box_that_is_too_small_for_the_kernel_is_refused():
         make_model(fluids.fluid("poiseuille", ny=6))
 
 
+@pytest.mark.slow
 def test_couette_flow_at_18_particles():
     scene = fluids.fluid("couette", ny=18, duration=1e-2)
     x, v = fluid_of(scene, run(scene)[1])
     assert np.linalg.norm(v[:, 0] - 1.25 * x[:, 1]) < 0.002 * np.linalg.norm(v[:, 0])
 
 
+@pytest.mark.slow
 def test_taylor_green_vortices_at_24_particles():
     scene = fluids.fluid("taylor-green", nx=24, duration=0.3)
     _, s = run(scene)
@@ -88,6 +91,7 @@ def test_a_tank_at_rest_has_hydrostatic_pressure():
     assert np.abs(s.v).max() < 0.002 * np.sqrt(0.9)
 
 
+@pytest.mark.slow
 def test_damping_ends():
     scene = fluids.fluid("one", duration=0.2)
     scene = replace(scene, physics=replace(scene.physics, gravity=None, damping=20.0, damped_until=0.1), velocities=np.ones((1, 2)))
@@ -103,6 +107,7 @@ def test_scenes_with_walls_keep_their_fluid(name, settings):
     assert np.abs(x - scene.positions[~scene.wall]).max() > 0.01 * scene.spacing
 
 
+@pytest.mark.slow
 def test_a_jet_enters_layer_by_layer():
     scene = fluids.fluid("jet", layers=4, duration=2e-3)
     model, s = begun(scene)
@@ -117,7 +122,8 @@ def test_a_jet_enters_layer_by_layer():
     assert np.linalg.norm(np.asarray(s.x)[:12, :2], axis=1).max() > 1.2 * np.linalg.norm(scene.positions[:12, :2], axis=1).max()
 
 
-@pytest.mark.parametrize("integrator", ["symplectic", pytest.param("midpoint", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["symplectic", "midpoint"])
 def test_lists_and_pair_sums_agree(integrator):
     scene = fluids.fluid("taylor-green", nx=12, jitter=0.2)
     scene = replace(scene, physics=replace(scene.physics, integrator=integrator))
@@ -145,6 +151,7 @@ def test_symplectic_and_midpoint_converge_to_each_other():
     assert fine < 1e-3
 
 
+@pytest.mark.slow
 def test_the_courant_step_follows_the_scene():
     scene = replace(fluids.fluid("dam-break-2d", nx=6), step=None)
     model, s = begun(scene)

@@ -103,6 +103,7 @@ def test_density_of_a_lattice(dim):
     np.testing.assert_allclose(rho[inner], 1.0, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_corrected_gradients_are_exact_for_linear_fields(dim):
     n, kernel = {2: 12, 3: 7}[dim], KERNELS["wendland2"]
     x = lattice(n, dim, jitter=0.3)

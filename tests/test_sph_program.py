@@ -75,6 +75,7 @@ def test_the_bare_program_holds_no_trace_of_other_parts(bare):
         assert f"stablehlo.{operation}" not in text, operation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ["walls", "viscosity", "correction"])
 def test_compiled_programs_are_larger_with_a_part(bare, part):
     without, having = (program.compile() for program in (bare[0], lowered(WHOLE[part])[0]))

@@ -43,7 +43,7 @@ def test_a_run_writes_snapshots_energies_frames_and_a_gif(tmp_path):
     np.testing.assert_array_equal(cloud.point_data["velocity"][:, :2], load(tmp_path, 30)["v"])
 
 
-@pytest.mark.parametrize("neighbors", ["pair_sum", "list"])
+@pytest.mark.parametrize("neighbors", ["pair_sum", pytest.param("list", marks=pytest.mark.slow)])
 def test_a_killed_run_goes_on_to_the_same_end(tmp_path, neighbors):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     options = ("dam", "--set", "spacing=0.008", *FEW, "--no-pictures", "--neighbors", neighbors)
@@ -103,6 +103,7 @@ def test_a_run_that_diverges_names_step_and_particle(tmp_path):
     assert "dam: diverged in step 1, t = 0.0001 s: particle 0 has position [nan nan]" in error
 
 
+@pytest.mark.slow
 def test_the_step_in_which_a_particle_crossed_a_wall():
     scene = make_scene("one", ["restitution=0.5"])
     model = make_model(scene, backend="brute")

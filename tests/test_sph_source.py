@@ -19,7 +19,10 @@ def make(name, backend="brute"):
     return model, solver.begin(model, make_state(scene))
 
 
-@pytest.mark.parametrize("name", ["one", "two", "three", "four"])
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("one", "two", "three")]
+
+
+@pytest.mark.parametrize("name", [*SLOW, "four"])
 def test_energies_over_20_000_steps(name):
     model, s = make(name)
     energies = jax.jit(lambda s: (s.time, budget.kinetic_energy(model, s), budget.potential_energy(model, s)))
@@ -34,6 +37,7 @@ def test_energies_over_20_000_steps(name):
     np.testing.assert_allclose(found[:, 1:].sum(axis=1), expected[:, 3], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_closed_forms_of_a_falling_particle():
     model, s = make("one")
     y, v = [], []

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jax import Array
 
+from experiments.sph import states
 from experiments.sph.model import Model, State
 
 
@@ -17,6 +18,24 @@ def potential_energy(model: Model, s: State) -> Array:
         return jnp.zeros((), s.x.dtype)
     ground = jnp.zeros((), s.x.dtype) if model.tank is None else model.tank[0]
     return -jnp.sum(_masses(model) * ((s.x - ground) @ model.physics.gravity))
+
+
+def internal_energy(model: Model, s: State) -> Array:
+    """Return the energy [J], shape [], that compression of the fluid took, of a state that carries its densities.
+
+    With the pressure force "mean", without dissipation, it and the kinetic and potential energy together are conserved.
+
+    Raises:
+        ValueError: The state carries no densities.
+    """
+    physics = model.physics
+    if s.rho is None:
+        raise ValueError(f"energy of compression needs carried densities, got evolve {physics.evolve!r}: take 'continuity'.")
+    if physics.state == "linear":
+        each = states.linear_energy(s.rho, physics.density, physics.sound_speed)
+    else:
+        each = states.tait_energy(s.rho, physics.density, physics.sound_speed, physics.exponent)
+    return jnp.sum(_masses(model) * each)
 
 
 def momentum(model: Model, s: State) -> Array:
