@@ -27,6 +27,7 @@ _HEADER_WORDS = 64
 _SWEEP_BLOCKS = 1056  # blocks of the kernels that walk over all particles
 _CROSSING_BLOCKS = 8448  # blocks of the kernel for queries whose reach leaves a box: what is to do is known to the device only
 _RESIDENT = 132  # blocks of those that walk over the cells: all at work at once
+_GATHERING = (8, 6)  # blocks of `gather` that are at work at once per multiprocessor, in open space and in a box
 
 LAYOUT = r"""
 struct Shared {
@@ -315,7 +316,9 @@ auto mark = [&](const real* row, const real* p, long long place) {  // a query's
         const real x = coordinate(a, p);
         crosses_box = crosses_box || !(x > crossing_low[a] && x < crossing_high[a]);
     }
-    if (crosses_box && crosses[place / 32] == 0 && atomicExch(crosses + place / 32, 1) == 0)
+    // one lane for all of its warp that belong to the same block
+    const unsigned int alike = __match_any_sync(__activemask(), crosses_box ? (int)(place / 32) : -1);
+    if (crosses_box && (alike & ((1u << lane) - 1)) == 0 && crosses[place / 32] == 0 && atomicExch(crosses + place / 32, 1) == 0)
         crossing[atomicAdd(&shared.crossing, 1)] = (int)(place / 32);
 };
 for (long long place = thread; of_queries && place < shared.finite_queries; place += threads) {
@@ -1294,7 +1297,8 @@ class Kernels(NamedTuple):
                 Launch(self.scatter, sweep, BLOCK, of_queries),
             ]
             if not of_queries or self.crossing is not None:
-                launches.append(Launch(self.gather, sweep, BLOCK, of_queries))
+                most = _RESIDENT * _GATHERING[self.crossing is not None]
+                launches.append(Launch(self.gather, min(-(-size // BLOCK), most) * BLOCK, BLOCK, of_queries))
         return launches
 
     def load_stages(self, device: wp.DeviceLike) -> None:
@@ -1363,7 +1367,7 @@ def cell_kernels(
         _kernel(f"count_{kind}", kind, dim, double, BLOCK, 1, grid, _COUNT),
         _kernel(f"scan_{kind}", kind, dim, double, BLOCK, 1, grid, _SCAN),
         _kernel(f"scatter_{kind}", kind, dim, double, BLOCK, 1, grid, _SCATTER),
-        _kernel(f"gather_{kind}", kind, dim, double, BLOCK, 6 if periodic else 8, grid, _GATHER),
+        _kernel(f"gather_{kind}", kind, dim, double, BLOCK, _GATHERING[periodic > 0], grid, _GATHER),
         query_kernel("query"),
         query_kernel("crossing", crossing=True) if periodic else None,
     )

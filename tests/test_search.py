@@ -18,6 +18,8 @@ def random_points(n, dim, dtype, seed=0):
     return np.random.default_rng(seed).random((n, dim)).astype(dtype)
 
 
+pytestmark = pytest.mark.usefixtures("compiled_soon")
+
 SLOW = pytest.mark.slow
 BRUTE = pytest.param("brute", marks=SLOW)  # its filters and rows are those of "jax", and it compiles as slowly
 OPTIONS = [
@@ -253,7 +255,7 @@ OTHER_SIZES = [(20_000, 64, np.float32, 2), (20_000, 20_000, np.float64, 2), (4_
 
 
 @pytest.mark.parametrize(("n", "capacity", "dtype", "dim"), [*SIZES, *(pytest.param(*size, marks=SLOW) for size in OTHER_SIZES)])
-def test_scratch_stays_within_the_stated_bound(n, capacity, dtype, dim):
+def test_memory_of_scratch_stays_within_the_stated_bound(n, capacity, dtype, dim):
     x = jax.ShapeDtypeStruct((n, dim), dtype)
     for function in (
         lambda x: jfrnn.search(x, 0.1, capacity=capacity, backend="jax"),
