@@ -25,8 +25,9 @@ typedef bool flags __attribute__((ext_vector_type(LANES)));
 alignas(64) real candidate[3][CANDIDATES + LANES];
 alignas(64) int candidate_ids[CANDIDATES + LANES];
 alignas(64) int row[CANDIDATES + LANES];
-alignas(64) unsigned short unsure[CANDIDATES / LANES + 4];  // one bit per candidate that step 1 leaves open
+alignas(64) unsigned short unsure[CANDIDATES / LANES + LANES];  // one bit per candidate that step 1 leaves open
 alignas(64) int doubtful[CANDIDATES + LANES];  // their numbers
+alignas(64) int vectors_in_doubt[CANDIDATES / LANES + LANES];  // numbers of the vectors that have any
 alignas(64) int candidate_images[PERIODIC ? CANDIDATES + LANES : 1];  // their codes
 alignas(64) int candidate_order[PERIODIC == 2 ? CANDIDATES + LANES : 1];  // by source, then by image: behind, at home, ahead
 const Grid grid = shared.grid;
@@ -162,18 +163,23 @@ auto exactly_decided = [&](const real* q, int own_id, const real* p, int number)
 // the numbers of what is unsure among `count` candidates, into `doubtful`; returns how many
 auto collect_doubtful = [&](int count) -> int {
     const int vectors = (count + LANES - 1) / LANES;
-    for (int e = vectors; e < vectors + 3; ++e)
+    for (int e = vectors; e < vectors + LANES; ++e)
         unsure[e] = 0;
-    int doubts = 0;
-    for (int v = 0; v < vectors; v += 4) {
-        unsigned long long four;
-        for (__builtin_memcpy(&four, unsure + v, 8); four;) {
-            const int e = __builtin_ctzll(four) / 16;
-            const unsigned int mask = (four >> (16 * e)) & 0xffff;
-            four &= ~(0xffffull << (16 * e));
-            pack(first_numbers + (v + e) * LANES, doubtful + doubts, mask);
-            doubts += __builtin_popcount(mask);
-        }
+    int chosen = 0, doubts = 0;
+    for (int v = 0; v < vectors; v += LANES) {  // loops of known length: what would be a branch per vector is hard to predict
+        typedef unsigned short shorts __attribute__((vector_size(2 * LANES)));
+        const shorts masks = *(const shorts*)(unsure + v);
+        const flags some = __builtin_convertvector(masks != 0, flags);
+        unsigned short bits = 0;
+        __builtin_memcpy(&bits, &some, LANES == 16 ? 2 : 1);
+        bits &= (1u << LANES) - 1;
+        pack(first_numbers + v, vectors_in_doubt + chosen, bits);
+        chosen += __builtin_popcount(bits);
+    }
+    for (int k = 0; k < chosen; ++k) {
+        const int v = vectors_in_doubt[k];
+        pack(first_numbers + v * LANES, doubtful + doubts, unsure[v]);
+        doubts += __builtin_popcount(unsure[v]);
     }
     for (int e = 0; e < LANES; ++e)
         doubtful[doubts + e] = 0;
@@ -236,6 +242,19 @@ _WALK = Template(r"""auto position_of = [&](int place, real* q) {
     else
         point_of(queries.data + (long long)ROW * query_ids[place], q);
 };
+// numbers, all moved by one, a vector of them at a time and then one by one
+auto copy_numbers = [](const auto* from, auto* to, int size, auto moved) {
+    typedef decltype(moved) lanes __attribute__((vector_size(LANES * sizeof moved)));
+    int s = 0;
+    for (; s + LANES <= size; s += LANES) {
+        lanes loaded;
+        __builtin_memcpy(&loaded, from + s, sizeof loaded);
+        loaded += moved;
+        __builtin_memcpy(to + s, &loaded, sizeof loaded);
+    }
+    for (; s < size; ++s)
+        to[s] = from[s] + moved;
+};
 auto system_at = [&](int place) { return BATCHED ? system_of(queries.data + (long long)ROW * query_ids[place]) : 0u; };
 // where the query at a place is along the axes, and its cell
 auto locate = [&](int place, real* at, whole* cell) {
@@ -296,11 +315,12 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
             if (filled == CANDIDATES)
                 flush(false);
             const int room = CANDIDATES - filled, size = to - from < room ? to - from : room;
+            // whole vectors while sources last: what is too much is overwritten by what comes next
+            const int spread = n - from < size + LANES ? size : (size + LANES - 1) / LANES * LANES;
             for (int k = 0; k < DIM; ++k)
-                for (int s = 0; s < size; ++s)
-                    candidate[k][filled + s] = PERIODIC ? axis[k][from + s] + moved[k] : axis[k][from + s];
-            for (int s = 0; (SUMS != 1 || PERIODIC) && s < size; ++s)
-                candidate_ids[filled + s] = PERIODIC == 2 && !SUMS ? ids[from + s] + n * image : ids[from + s];
+                copy_numbers(axis[k] + from, candidate[k] + filled, spread, PERIODIC ? moved[k] : real(0));
+            if constexpr (SUMS != 1 || PERIODIC)
+                copy_numbers(ids + from, candidate_ids + filled, spread, PERIODIC == 2 && !SUMS ? n * image : 0);
             for (int s = 0; BATCHED && !grid.dense && s < size; ++s)
                 if (system_of(positions.data + (long long)ROW * ids[from + s]) != system)
                     candidate[0][filled + s] = __builtin_nanf("");

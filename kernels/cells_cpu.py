@@ -12,6 +12,7 @@ from jfrnn.kernels._native import CELLS, ENTER, EXACT, LEAVE, snippet, table_cel
 from jfrnn.kernels._walk_cpu import CHUNK, walk
 
 _HEADER_WORDS = 64
+GRID = {"REACH": 1, "REACH_X": 2}  # finer cells along x alone: fewer candidates, but no more rows of cells that are copied
 
 # Where things lie in the scratch: one text, so that `build` and `query` agree; `scratch_words` below is its sum.
 LAYOUT = r"""
@@ -193,7 +194,7 @@ def cell_kernels(
     scalar = wp.float64 if double else wp.float32
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}"
     variant += f"{('', '_nearest', '_images')[periodic]}{'_batched' * batched}{'' if exact else '_inexact'}"
-    options = {"SCALED": scaled, "LIST": lists, "REACH": 1, "REACH_X": 1, "EXACTLY": exact, "PERIODIC": periodic}
+    options = {"SCALED": scaled, "LIST": lists, **GRID, "EXACTLY": exact, "PERIODIC": periodic}
     options |= {"BATCHED": batched, "SUMS": 0, "CHUNK": CHUNK}
     options |= {"CANDIDATES": 1024 if double else 1536}  # what fits into a first-level cache beside a row
     points = wp.array2d(dtype=scalar)

@@ -19,13 +19,12 @@ import warp as wp
 from jfrnn.kernels._math import VECTOR
 from jfrnn.kernels._native import CELLS, ENTER, EXACT, FLUSH, KEEP, LEAVE, snippet
 from jfrnn.kernels._walk_cpu import CHUNK, walk
-from jfrnn.kernels.cells_cpu import LAYOUT
+from jfrnn.kernels.cells_cpu import GRID, LAYOUT
 
 CACHE_BYTES = 40 << 10  # for candidates: most of a first-level cache, and a little of the second
 MOST_CANDIDATES = 1024
 LITTLE_WORK = 50  # operations up to which the term is evaluated for candidates that are no pairs, too
 VERY_LITTLE_WORK = 20  # up to which it is, though none of a vector is a pair
-MANY_DOUBTS = 4  # candidates of a query that step 1 leaves open, above which what is near is packed in any case
 _SERIES = 20  # operations that a function like exp takes
 _SERIES_NAMES = ("exp", "log", "pow", "sin", "cos", "tan", "cbrt", "erf", "logistic", "rem")  # and what holds them in its name
 
@@ -150,7 +149,6 @@ memset(candidate, 0, sizeof candidate);
 memset(doubtful, 0, sizeof doubtful);
 alignas(64) real near_points[3][CANDIDATES + LANES];  // packed
 alignas(64) real near_column[OTHERS + STEPS + 1][CANDIDATES + LANES];
-int doubted = 0;  // how many candidates of the query before were in doubt
 real total[TOTALS + 1], total_carried[TOTALS + 1];
 for (int t = 0; t <= TOTALS; ++t)
     total[t] = total_carried[t] = 0;
@@ -197,8 +195,7 @@ auto keep_largest = [&](number best, Math::i32 of, Math::i32 code, long long at,
 
 _COPY = r"""
             for (int c = 0; c < OTHERS; ++c)
-                for (int s = 0; s < size; ++s)
-                    column[c][filled + s] = columns.data[(long long)c * n + from + s];
+                copy_numbers(columns.data + (long long)c * n + from, column[c] + filled, spread, real(0));
 """
 
 _COPY_STEP = Template(r"""
@@ -223,7 +220,6 @@ _CHUNK_DONE = r"""
         totals.data[(2ll * chunk + 1) * TOTALS + t] = total_carried[t];
         total[t] = total_carried[t] = 0;
     }
-    doubted = 0;  // nor does it depend on what the thread did before in which order a sum is added up
 """
 
 
@@ -250,7 +246,7 @@ def placed(values: tuple[Value, ...], column: str, axis: str) -> list[str]:
 
 
 # How a query meets its candidates. In place: the term is evaluated for vectors of candidates as they are, under a mask; those in
-# doubt, few, follow. Packed: what is near comes together first, so that the term is evaluated for hardly more than the pairs.
+# doubt follow. Packed: what is near comes together first, so that the term is evaluated for hardly more than the pairs.
 _IN_PLACE = Template(r"""
     for (int b = 0, v = 0; b < filled; b += LANES, ++v) {
         const Points points = candidates_at(b);
@@ -270,10 +266,9 @@ _IN_PLACE = Template(r"""
         const Math::flag real_lanes = lanes_of(hit);
         $of_doubtful
     }
-    doubted = doubts;
 """)
 _PACKED = Template(r"""
-    int held = 0, doubts = 0;
+    int held = 0;
     for (int b = 0; b < filled; b += LANES) {
         const Points points = candidates_at(b);
         const unsigned int near = mask_of(square_of(q, points.p), outside, BelowOrAt{});
@@ -295,12 +290,10 @@ _PACKED = Template(r"""
             $keep
             hit |= decided(q, id, points, doubtful + b, open);
             $flush
-            doubts += __builtin_popcount(open);
         }
         const Math::flag real_lanes = lanes_of(hit);
         $of_packed
     }
-    doubted = doubts;
 """)
 
 
@@ -333,14 +326,13 @@ def _meet(term: TermText, reduction: _Reduction, double: bool, packed: bool, flu
     turns = [f"real(Lattice::turn({column.format(numbers)}, {step.axis}))" for step in term.steps]
     begin += [f"const number turned{c} = Math::of({x});\n" for c, x in enumerate(turns)]
     begin.append(reduction.before)
-    by_packing = _PACKED.substitute(modes, of_packed=evaluation("*(const number*)(near_column[{}] + b)", "doubtful[b + l]"))
     if packed:
-        return "".join([*begin, "{", by_packing, "}\n"])
+        of_packed = evaluation("*(const number*)(near_column[{}] + b)", "doubtful[b + l]")
+        return "".join([*begin, _PACKED.substitute(modes, of_packed=of_packed)])
     skip = "if (hit == 0)\n    continue;" if work(term.text) > VERY_LITTLE_WORK else ""
     in_place = evaluation("*(const number*)(column[{}] + b)", "b + l")
     of_doubtful = evaluation("gathered(column[{}], doubtful + b)", "doubtful[b + l]")
-    as_they_are = _IN_PLACE.substitute(modes, skip=skip, in_place=in_place, of_doubtful=of_doubtful)
-    return "".join([*begin, f"if (doubted > {MANY_DOUBTS}) {{", by_packing, "} else {", as_they_are, "}\n"])
+    return "".join([*begin, _IN_PLACE.substitute(modes, skip=skip, in_place=in_place, of_doubtful=of_doubtful)])
 
 
 def _largest(term: TermText) -> _Reduction:
@@ -400,7 +392,7 @@ def sort_kernel(dim: int, double: bool) -> wp.Kernel:
     def sort_native(others: table_of, cutoff: reals, columns: reals, scratch: ints, n: int, m: int, own: int, table: int): ...
 
     sort_native.__name__ = sort_native.__qualname__ = f"sort_values_{variant}"
-    constants = {"SCALED": 0, "REACH": 1, "REACH_X": 1, "CHUNK": CHUNK}
+    constants = {"SCALED": 0, **GRID, "CHUNK": CHUNK}
     text = snippet("double" if double else "float", dim, CELLS, LAYOUT, _SORT_VALUES, **constants)
     function = wp.func_native(ENTER + text + LEAVE)(sort_native)
 
@@ -442,7 +434,7 @@ def query_kernel(
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
     variant += f"{('', '_nearest', '_images')[periodic]}{'_batched' * batched}{'_extremes' * extremes}_{key}"
     totals = sum(part.total for part in term.sums)
-    constants = {"SCALED": scaled, "LIST": 0, "SUMS": 1 + extremes, "REACH": 1, "REACH_X": 1, "EXACTLY": 1}
+    constants = {"SCALED": scaled, "LIST": 0, "SUMS": 1 + extremes, **GRID, "EXACTLY": 1}
     constants |= {"PERIODIC": periodic, "BATCHED": batched, "CHUNK": CHUNK, "CANDIDATES": _candidates(term, dim, double)}
     constants |= {"OTHERS": term.columns, "STEPS": len(term.steps), "COMPENSATED": compensated}
     constants |= {"TOTALS": totals, "ROW_SUMS": len(term.sums) - totals}
