@@ -225,6 +225,29 @@ def sph_validate(
 
 
 @app.command()
+def sph_speed(
+    config: Annotated[Path, typer.Argument(help="Config of steps, TOML.")] = Path("experiments/configs/sph_speed.toml"),
+    out: Annotated[Path | None, typer.Option(help="Folder of the rows; out/NAME without it.")] = None,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Measure missing and failed rows again.")] = False,
+) -> None:
+    """Time steps of a fluid scene by ways to find its pairs, or go on with it; then print a table, and draw pictures."""
+    with _usage_errors():
+        import jax
+
+        from experiments import _config
+        from experiments.sph import speed, speed_report
+
+        given, folder = _config.load(config, speed.Config), out or Path("out") / config.stem
+        jax.config.update("jax_enable_x64", given.dtype == "float64")
+        try:
+            rows = speed.run(given, folder, retry_failed)
+        except KeyboardInterrupt:
+            typer.echo("stopped; the same command goes on from here", err=True)
+            raise typer.Exit(130) from None
+        typer.echo(speed_report.report(rows, folder))
+
+
+@app.command()
 def peers(
     names: Annotated[list[str] | None, typer.Argument(help="Of libraries; all that are known without.")] = None,
     out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "peers",

@@ -94,7 +94,7 @@ def _jax_md(given: Problem) -> Pairs:
         displacement, _ = space.free()
         low, extent = _bounds(given.positions)
         points, size = points - low, extent + given.cutoff  # its cells begin at 0
-        make = partition.neighbor_list(displacement, size, given.cutoff, format=partition.NeighborListFormat.Sparse)
+        make: Any = partition.neighbor_list(displacement, size, given.cutoff, format=partition.NeighborListFormat.Sparse)
     elif not all(given.periodic):
         raise Cannot("boxes with open axes")
     else:

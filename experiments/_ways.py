@@ -277,7 +277,7 @@ def _jax_md(given: Given, gradient: bool, compensated: bool) -> Steps:
     displacement, _ = space.free()
     low = jnp.min(given.x, axis=0)
     size = np.asarray(jnp.max(given.x, axis=0) - low) + given.cutoff  # its cells begin at 0
-    make = partition.neighbor_list(displacement, size, given.cutoff, format=partition.NeighborListFormat.Dense)
+    make: Any = partition.neighbor_list(displacement, jnp.asarray(size), given.cutoff, format=partition.NeighborListFormat.Dense)
     nbrs = make.allocate(given.x - low)
     moved = replace(nbrs, reference_position=nbrs.reference_position + 2 * given.cutoff)  # else it keeps what it has
     update = jax.jit(lambda x, nbrs: nbrs.update(x - low))

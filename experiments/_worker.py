@@ -31,11 +31,15 @@ def main() -> None:
 
 
 def _answer(task: dict[str, Any]) -> dict[str, Any]:
-    """Do a task: {"do": "oracle" or "measure", "spec", "oracle": folder}, or {"do": "sum", "spec"}."""
+    """Do a task: {"do": "oracle" or "measure", "spec", "oracle": folder}, or {"do": "sum" or "sph", "spec"}."""
     if task["do"] == "sum":
         from experiments import _ways
 
         return _ways.measure(_ways.Spec(**task["spec"]))
+    if task["do"] == "sph":
+        from experiments.sph import tradeoff
+
+        return tradeoff.measure(tradeoff.Spec(**task["spec"]))
     spec, folder = Spec(**task["spec"]), Path(task["oracle"])
     return prepare_oracle(spec, folder) if task["do"] == "oracle" else measure(spec, folder)
 

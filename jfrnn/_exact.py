@@ -222,21 +222,23 @@ def is_pair_of(rows: Array, sources: Array, neighbor: Array, cutoff: "Cutoff | C
     else:
         difference = list(jnp.moveaxis(shifted.vectors, -1, 0))
 
-    def radii_of(row: Array, source: Array) -> list[Array] | None:
+    def of_rows(column: Array, at: Array | None) -> Array:  # no index array of all slots: XLA would make constants of it
+        if at is None:
+            return jnp.broadcast_to(column[:, None], neighbor.shape)
+        return column.at[at // neighbor.shape[1]].get(mode="clip")
+
+    def radii_of(at: Array | None, source: Array) -> list[Array] | None:
         if isinstance(cutoff, Cutoff):
             return None
         own, other = cutoff.queries, cutoff.sources
-        return cutoff.of_pairs(None if own is None else own[row], None if other is None else other[source])
+        return cutoff.of_pairs(None if own is None else of_rows(own, at), None if other is None else other[source])
 
-    inside, outside = step_one_bounds(
-        cutoff, radii_of(lax.broadcasted_iota(jnp.int32, neighbor.shape, 0), neighbor), None if shifted is None else shifted.slack
-    )
+    inside, outside = step_one_bounds(cutoff, radii_of(None, neighbor), None if shifted is None else shifted.slack)
     square = squared_distance(difference, cutoff)
 
     def points(at: Array | None) -> Pair:
-        row = lax.broadcasted_iota(jnp.int32, neighbor.shape, 0)
-        row, source = (row, neighbor) if at is None else (flat_take(row, at), flat_take(neighbor, at))
-        pair = Pair([rows[row, axis] for axis in axes], [sources[source, axis] for axis in axes], radii_of(row, source))
+        source = neighbor if at is None else flat_take(neighbor, at)
+        pair = Pair([of_rows(rows[:, axis], at) for axis in axes], [sources[source, axis] for axis in axes], radii_of(at, source))
         if shifted is None:
             return pair
         shift = [shifted.shifts[..., k] if at is None else flat_take(shifted.shifts[..., k], at) for k in axes]

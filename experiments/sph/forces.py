@@ -2,17 +2,19 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
 import jfrnn
 from experiments.sph import correction, density, states, surface, transport, viscosity, walls
+from experiments.sph.edges import Edges
 from experiments.sph.kernels import KERNELS
 from experiments.sph.model import Model, State
 from experiments.sph.pairs import Pair, Term, Values, total
 from experiments.sph.pressure import PRESSURES
 
-Neighbors = jfrnn.NeighborList | None
+Neighbors = jfrnn.NeighborList | Edges | None
 
 
 class Fields(NamedTuple):
@@ -45,10 +47,31 @@ def _either(mask: Array | None, other: Array) -> Array:
     return other if mask is None else mask | other
 
 
-def _sum(term: Term, model: Model, s: State, values: Values, nbrs: Neighbors) -> Any:  # noqa: ANN401
-    options = {"box": model.box, "active": active(model, s.time), "backend": model.backend}
+def _sum(term: Term, model: Model, s: State, values: Values, nbrs: Neighbors, of: str = "all") -> Any:  # noqa: ANN401
+    """Sum a term for all particles, for those of the "fluid", or for the "wall" over the fluid; other rows may be 0.
+
+    Where a scene's walls stand behind its fluid, rows that nobody reads are not summed: walls are most of a shallow tank. A
+    particle of the fluid then meets itself at r = 0, where terms of the fluid are 0.
+    """
+    options = {"box": model.box, "backend": model.backend}
     values = values | {"m": model.m} | ({} if model.wall is None else {"wall": model.wall})
-    return total(term, s.x, values, model.kernel, model.physics.smoothing, nbrs, **options)
+    entered, k = active(model, s.time), model.fluid_count
+    if k is None or nbrs is not None or of == "all":
+        return total(term, s.x, values, model.kernel, model.physics.smoothing, nbrs, active=entered, **options)
+    rows, sources = (slice(0, k), slice(None)) if of == "fluid" else (slice(k, None), slice(0, k))
+    mine, theirs = ({key: value[part] for key, value in values.items()} for part in (rows, sources))
+    if of == "wall":
+        del theirs["wall"]
+    options |= {"active": None if entered is None else entered[sources], "queries": s.x[rows], "query_values": mine}
+    sums = total(term, s.x[sources], theirs, model.kernel, model.physics.smoothing, **options)
+
+    def whole(part: Array) -> Array:
+        if entered is not None:
+            part = jnp.where(entered[rows].reshape(-1, *[1] * (part.ndim - 1)), part, 0)
+        nobody = jnp.zeros((model.m.shape[0] - part.shape[0], *part.shape[1:]), part.dtype)
+        return jnp.concatenate([part, nobody] if of == "fluid" else [nobody, part])
+
+    return jax.tree.map(whole, sums)
 
 
 def _gradient(model: Model, pair: Pair, i: Values) -> Array:
@@ -89,7 +112,7 @@ def corrections(model: Model, s: State, rho: Array, nbrs: Neighbors) -> Array | 
     """Return what kernel gradients are multiplied with, shape [n, d, d], or None."""
     if not model.physics.corrected:
         return None
-    return correction.inverse(_sum(lambda pair, i, j: correction.moment(pair, j), model, s, {"rho": rho}, nbrs))
+    return correction.inverse(_sum(lambda pair, i, j: correction.moment(pair, j), model, s, {"rho": rho}, nbrs, "fluid"))
 
 
 def carried_rate(model: Model, s: State, rho: Array, inverse: Array | None, nbrs: Neighbors) -> Array:
@@ -118,7 +141,7 @@ def carried_rate(model: Model, s: State, rho: Array, inverse: Array | None, nbrs
             within = within + transport.advected_change(pair, i, j, gradient, name)
         return rate + fluid(j, within)
 
-    return walls.fluid_only(model.wall, _sum(term, model, s, values, nbrs))
+    return walls.fluid_only(model.wall, _sum(term, model, s, values, nbrs, "fluid"))
 
 
 def fields(model: Model, s: State, rho: Array, inverse: Array | None, nbrs: Neighbors) -> Fields:
@@ -127,7 +150,7 @@ def fields(model: Model, s: State, rho: Array, inverse: Array | None, nbrs: Neig
     if model.wall is None:
         return Fields(rho, p, s.v, inverse)
     physics = model.physics
-    sums = _sum(walls.seen_by_wall, model, s, {"rho": rho, "p": p, "v": s.v}, nbrs)
+    sums = _sum(walls.seen_by_wall, model, s, {"rho": rho, "p": p, "v": s.v}, nbrs, "wall")
     wall_p, wall_u = walls.extrapolated(sums, s.v, physics.gravity)
     if physics.evolve == "pressure":
         wall_rho = rho
@@ -155,7 +178,7 @@ def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tupl
         if physics.artificial is not None:
             a = a + viscosity.artificial(pair, i, j, gradient, physics.artificial * physics.sound_speed)
         if physics.tension is not None:
-            a = a + surface.cohesion(pair, i, j, physics.tension, model.cutoff)
+            a = a + surface.cohesion(pair, i, j, physics.tension, model.kernel.support * physics.smoothing)
         if physics.transport is not None:
             a = a + transport.advected(pair, i, j, gradient)
         if physics.shifting is not None:
@@ -167,7 +190,7 @@ def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tupl
             sums["w"] = transport.spread(pair, i, j, unit)
         return sums
 
-    sums = _sum(term, model, s, values, nbrs)
+    sums = _sum(term, model, s, values, nbrs, "fluid")
     a = sums["a"] if physics.gravity is None else sums["a"] + physics.gravity
     if physics.damping is not None:
         a = a - _damping(model, s.time) * s.v

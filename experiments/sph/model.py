@@ -11,6 +11,7 @@ from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
 
 import jfrnn
 from experiments.sph.kernels import KERNELS, Kernel
+from experiments.sph.pairs import reach
 
 if TYPE_CHECKING:
     from jfrnn.cases.fluids import FluidScene, Physics  # pyright: ignore[reportMissingImports]
@@ -37,6 +38,7 @@ class Model:
         step: Time step [s]; None: the Courant condition gives it.
         guided: How long a particle that entered keeps its velocity [s], shape [].
         spacing: Particle distance [m]. Static.
+        fluid_count: How many particles stand before those of walls; None where there are no walls, or among the fluid. Static.
         backend: Of `jfrnn.pair_sum`. Static.
     """
 
@@ -49,6 +51,7 @@ class Model:
     step: Array | None
     guided: Array | None
     spacing: float = field(metadata={"static": True})
+    fluid_count: int | None = field(metadata={"static": True})
     backend: str = field(default="auto", metadata={"static": True})
 
     @property
@@ -58,8 +61,8 @@ class Model:
 
     @property
     def cutoff(self) -> float:
-        """Interaction radius [m]."""
-        return self.kernel.support * self.physics.smoothing
+        """Interaction radius of pairs [m]: that of the kernel and a little more, see `pairs.reach`."""
+        return reach(self.kernel, self.physics.smoothing)
 
 
 class State(NamedTuple):
@@ -110,6 +113,7 @@ def make_model(scene: "FluidScene", dtype: type = np.float64, backend: str = "au
         step=None if scene.step is None else array(scene.step),
         guided=None if scene.enters is None else array(scene.guided),
         spacing=scene.spacing,
+        fluid_count=None if scene.wall is None else _first_wall(scene.wall),
         backend=backend,
     )
 
@@ -156,6 +160,12 @@ def make_state(scene: "FluidScene", dtype: type = np.float64) -> State:
 
 def _first(given: np.ndarray | None, default: float, x: Array) -> Array:
     return jnp.full(x.shape[0], default, x.dtype) if given is None else jnp.asarray(given, x.dtype)
+
+
+def _first_wall(wall: np.ndarray) -> int | None:
+    """Return where the walls begin, None where fluid comes after them."""
+    count = int(np.count_nonzero(~wall))
+    return None if wall[:count].any() else count
 
 
 def _row(gravity: tuple[float, ...] | None) -> np.ndarray | None:

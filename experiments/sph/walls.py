@@ -29,7 +29,7 @@ def bounce(x: Array, v: Array, lower: Array, upper: Array, restitution: Array) -
 
 def seen_by_wall(pair: Pair, i: Values, j: Values) -> dict[str, Array]:
     """Return what a wall particle i takes from a fluid particle j, weighed by W: weight, pressure, velocity, ρ_j (x_i - x_j)."""
-    weight = jnp.where(j["wall"], 0, pair.weight)
+    weight = jnp.where(j["wall"], 0, pair.weight) if "wall" in j else pair.weight
     return {"weight": weight, "p": weight * j["p"], "v": weight * j["v"], "moment": -weight * j["rho"] * pair.r}
 
 

@@ -1,0 +1,317 @@
+"""Steps per second of a scene by ways to find and sum pairs, all in one process and in turns; and where a step's time goes."""
+
+import functools
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
+from pydantic import Field, FiniteFloat, field_validator
+
+from experiments import _machine, _measure, _sweep
+from experiments._config import Positive, Table, digest
+from experiments._rows import RETRIED, RowFile
+from experiments.sph import edges, solver
+from experiments.sph import stages as parts_of_a_step
+from experiments.sph import tradeoff as known_flow
+from experiments.sph.model import Model, State, make_model, make_state
+
+if TYPE_CHECKING:
+    from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
+
+Prepare = Callable[[Model, State, float], Any]
+WAYS: dict[str, Prepare] = {
+    "pair_sum": lambda model, s, skin: None,
+    "list": solver.list_neighbors,
+    "jax-sph": lambda model, s, skin: edges.of_jax_md(model, s, 0.0),
+    "jax-sph, skin": edges.of_jax_md,
+    "edges of jfrnn": edges.of_own_list,
+}
+"""What finds the pairs of each way: sums that search, our list with a skin, jax-md's list as jax-sph takes it (made anew in every
+step) and with a skin, and our list; the last three as edges, summed by segments."""
+MOST_ROUNDINGS = 64  # by which two ways may differ after a step, see `difference`
+
+
+class Config(Table):
+    """What is measured.
+
+    Attributes:
+        scene: Name of a fluid scene; walls count as particles.
+        nx: Resolutions, as the scene takes them.
+        ways: Of `WAYS`; all are compared with the first.
+        most_particles: Of ways that larger scenes are skipped for.
+        stages: Ways whose stages are timed besides.
+        dtype: Of all numbers.
+        steps: Per timed run, from the same state each time.
+        rounds: Timed runs of each way.
+        skin: In particle spacings.
+        rate: The fluid begins with velocities rate·(x, 0, -z) [1/s]: a column in mid-collapse, whose lists are made anew.
+        tradeoff: Runs of a flow with a known answer: error against seconds.
+    """
+
+    scene: str = "dam-break-3d"
+    nx: tuple[Annotated[int, Field(ge=2)], ...] = ()
+    ways: tuple[str, ...] = ("pair_sum", "list")
+    most_particles: dict[str, int] = Field(default_factory=dict)
+    stages: tuple[Literal["pair_sum", "list"], ...] = ()
+    dtype: Literal["float32", "float64"] = "float32"
+    steps: Annotated[int, Field(ge=1)] = 10
+    rounds: Annotated[int, Field(ge=1)] = 5
+    skin: Positive = 0.3
+    rate: FiniteFloat = 1.5
+    tradeoff: known_flow.Config | None = None
+
+    @field_validator("scene")
+    @classmethod
+    def _scene_exists(cls, name: str) -> str:
+        if name not in fluids.FLUIDS:
+            raise ValueError(f"unknown fluid scene {name!r}; allowed: {', '.join(fluids.FLUIDS)}")
+        return name
+
+    @field_validator("ways")
+    @classmethod
+    def _ways_exist(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        for name in names:
+            if name not in WAYS:
+                raise ValueError(f"unknown way {name!r}; allowed: {', '.join(WAYS)}")
+        return names
+
+    def specs(self) -> Iterator["Spec"]:
+        """Yield the rows of steps and of stages, those of one scene side by side."""
+        shared = self.model_dump(include={"scene", "dtype", "steps", "rounds", "skin", "rate"})
+        for nx in self.nx:
+            for kind, way in itertools.chain((("step", way) for way in self.ways), (("stages", way) for way in self.stages)):
+                yield Spec(kind=kind, way=way, nx=nx, most_particles=self.most_particles.get(way), **shared)
+
+
+@dataclass(frozen=True)
+class Spec:
+    """What one row measures, and how: fields as in `Config`."""
+
+    kind: str
+    way: str
+    scene: str
+    nx: int
+    dtype: str
+    steps: int
+    rounds: int
+    skin: float
+    rate: float
+    most_particles: int | None
+
+    @property
+    def key(self) -> str:
+        """Digest of all fields, 12 hex digits: a row with the same key need not run again."""
+        return digest(asdict(self))
+
+
+@dataclass
+class Row:
+    """Steps of a scene by one way ("step"), its stages ("stages"), or a run with a known answer ("tradeoff").
+
+    Attributes:
+        key: Digest of what is measured and how; rows with the same key replace each other.
+        kind, way, scene, nx, dtype, steps, skin: As in `Spec`; steps of the whole run in a "tradeoff", of one timed run else.
+        status, reason: As in `experiments._rows.Row`.
+        particles: Walls included.
+        fluid: Those of the fluid.
+        first_s: First run, compilation included [s].
+        median_s: Of one step, with the list's share of being made anew [s].
+        p10_s, p90_s: Percentiles of it.
+        steps_per_s, particle_steps_per_s: By the median; of all particles.
+        rebuilds: How often the list was made anew in a run; None where there is none.
+        bytes: What the compiled run takes: arguments, results and scratch.
+        difference: Largest difference from the first way after one step, see `speed.difference`.
+        parts: Seconds of a step by stage.
+        error: Of a "tradeoff": by name.
+        seconds: Of a "tradeoff": the run without compilation.
+        others_cores, device, versions, machine, commit, dirty, time: As in `experiments._rows.Row`.
+    """
+
+    key: str
+    kind: str
+    way: str
+    scene: str
+    nx: int
+    dtype: str
+    steps: int
+    skin: float
+    status: str = "failed"
+    reason: str | None = None
+    particles: int | None = None
+    fluid: int | None = None
+    first_s: float | None = None
+    median_s: float | None = None
+    p10_s: float | None = None
+    p90_s: float | None = None
+    steps_per_s: float | None = None
+    particle_steps_per_s: float | None = None
+    rebuilds: int | None = None
+    bytes: int | None = None
+    difference: float | None = None
+    parts: dict[str, float] = field(default_factory=dict)
+    error: dict[str, float] = field(default_factory=dict)
+    seconds: float | None = None
+    others_cores: float | None = None
+    device: str | None = None
+    versions: dict[str, str | None] = field(default_factory=dict)
+    machine: dict[str, Any] = field(default_factory=dict)
+    commit: str | None = None
+    dirty: bool | None = None
+    time: str | None = None
+
+
+def run(config: Config, folder: Path, retry_failed: bool = False) -> list[Row]:
+    """Measure what the folder does not hold yet, and return all rows of the config.
+
+    Ways of one scene are timed in turns: where a row of them is missing, all are measured again.
+
+    Args:
+        config: What is measured.
+        folder: Holds rows.jsonl.
+        retry_failed: Whether rows that are missing or failed are measured again.
+    """
+    file, specs = RowFile(folder, Row), list(config.specs())
+    runs = [] if config.tradeoff is None else list(config.tradeoff.specs())
+    with file.locked(), _sweep.progress(len(specs) + len(runs)) as shown:
+        file.repair()
+        done = {row.key for row in file.read() if not (retry_failed and row.status in RETRIED)}
+        bar = shown.add_task("", total=len(specs) + len(runs))
+        about = {"machine": _machine.machine(), "versions": _machine.versions(["jax-md"]), **_machine.commit()}
+        for (nx, kind), same in itertools.groupby(specs, lambda spec: (spec.nx, spec.kind)):
+            group = list(same)
+            shown.update(bar, description=f"{config.scene} · nx {nx} · {kind}")
+            if not all(spec.key in done for spec in group):
+                for row in _measured(group):
+                    file.append(_stamped(row, about))
+                    shown.console.print(describe(row), highlight=False, markup=False, soft_wrap=True)
+            shown.advance(bar, len(group))
+        for spec in runs:
+            shown.update(bar, description=f"{spec.scene} · nx {spec.nx} · {spec.way}")
+            if spec.key not in done:
+                row = _row(spec, "tradeoff", _sweep.ask({"do": "sph", "spec": asdict(spec)}, 3600.0, cold=False))
+                file.append(_stamped(row, about))
+                shown.console.print(describe(row), highlight=False, markup=False, soft_wrap=True)
+            shown.advance(bar)
+        rows = {row.key: row for row in file.read()}
+    return [rows[spec.key] for spec in (*specs, *runs)]
+
+
+def _stamped(row: Row, about: dict[str, Any]) -> Row:
+    return replace(row, **about, time=datetime.now(UTC).isoformat(timespec="seconds"))
+
+
+def _measured(group: list[Spec]) -> list[Row]:
+    """Measure the rows of one scene."""
+    first = group[0]
+    scene, model, s = _begun(first.scene, first.nx, first.rate, first.dtype)
+    about = {"particles": scene.n, "fluid": scene.n if scene.wall is None else int((~scene.wall).sum())}
+    about |= {"device": jax.devices()[0].device_kind}
+    if first.kind == "step":
+        return [replace(row, **about) for row in _step_rows(group, model, s)]
+    rows = []
+    for spec in group:
+        row = _row(spec, "stages", about)
+        parts, others = parts_of_a_step.times(model, s, spec.way, spec.skin * model.spacing, spec.steps, spec.rounds)
+        rows.append(replace(row, status="ok", parts=parts, others_cores=others))
+    return rows
+
+
+@functools.lru_cache(maxsize=1)
+def _begun(name: str, nx: int, rate: float, dtype: str) -> tuple["FluidScene", Model, State]:
+    """Return a moving scene and its first state; the last one is kept, since rows of it follow."""
+    scene, number = moving(fluids.fluid(name, nx=nx), rate), np.dtype(dtype).type
+    model = make_model(scene, number)
+    return scene, model, jax.block_until_ready(jax.jit(solver.begin)(model, make_state(scene, number)))
+
+
+def _row(spec: "Spec | known_flow.Spec", kind: str, seen: dict[str, Any]) -> Row:
+    shared = {name: value for name, value in asdict(spec).items() if name in Row.__dataclass_fields__}
+    values: dict[str, Any] = shared | {"kind": kind, "key": spec.key} | seen
+    return Row(**values)
+
+
+def moving(scene: "FluidScene", rate: float) -> "FluidScene":
+    """Return the scene with a fluid that moves by rate·(x, 0, -z), in 2D rate·(x, -z): without divergence, along its walls."""
+    flow = np.zeros_like(scene.positions)
+    flow[:, 0], flow[:, -1] = rate * scene.positions[:, 0], -rate * scene.positions[:, -1]
+    return replace(scene, velocities=flow if scene.wall is None else np.where(scene.wall[:, None], scene.velocities, flow))
+
+
+def _step_rows(group: list[Spec], model: Model, s: State) -> list[Row]:
+    """Make every way ready, compare what a step of each gives, then time those that agree, in turns."""
+    rows, ready, reference = {}, {}, None
+    for spec in group:
+        row, most = _row(spec, "step", {}), spec.most_particles
+        if most is not None and model.m.shape[0] > most:
+            rows[spec.way] = replace(row, status="skipped", reason=f"{spec.way} is run up to {most} particles")
+            continue
+        try:
+            run, fields = _prepared(spec, model, s)
+            after = run(1)
+            reference = after if reference is None else reference
+            fields["difference"] = difference(model, reference, after)
+            if not fields["difference"] <= MOST_ROUNDINGS:
+                raise ValueError(f"differs from {group[0].way} by {fields['difference']:.3g} roundings")
+            ready[spec.way], rows[spec.way] = run, replace(row, **fields)
+        except ImportError as error:
+            rows[spec.way] = replace(row, status="missing", reason=f"{spec.way} cannot be imported: {error}")
+        except Exception as error:  # whatever a way raises, out of memory too, is the result of its row
+            rows[spec.way] = replace(row, reason=f"{type(error).__name__}: {error}"[:600])
+    steps = group[0].steps
+    calls = {way: lambda run=run: run(steps).x for way, run in ready.items()}
+    seconds, others = _measure.time_in_turns(calls, group[0].rounds)
+    for way, times in seconds.items():
+        p10, median, p90 = (float(value) / steps for value in np.percentile(times, (10, 50, 90)))
+        speed = {"steps_per_s": 1 / median, "particle_steps_per_s": model.m.shape[0] / median}
+        rows[way] = replace(rows[way], status="ok", median_s=median, p10_s=p10, p90_s=p90, others_cores=others, **speed)
+    return list(rows.values())
+
+
+def _prepared(spec: Spec, model: Model, s: State) -> tuple[Callable[[int], State], dict[str, Any]]:
+    """Return a compiled run of so many steps, whose list does not overflow, and what was seen of it."""
+    nbrs = WAYS[spec.way](model, s, spec.skin * model.spacing)
+    begin = perf_counter()
+    compiled = solver.advance.lower(model, s, nbrs, spec.steps).compile()
+    _, after = jax.block_until_ready(compiled(model, s, nbrs, spec.steps))
+    seen: dict[str, Any] = {"first_s": perf_counter() - begin}
+    memory: Any = compiled.memory_analysis()
+    if memory is not None:
+        seen["bytes"] = memory.argument_size_in_bytes + memory.output_size_in_bytes + memory.temp_size_in_bytes
+    if after is not None:
+        if bool(after.overflow):
+            raise ValueError("the list overflowed: a row holds more than it did at first")
+        seen["rebuilds"] = int(after.rebuild_count)
+    return lambda steps: compiled(model, s, nbrs, steps)[0], seen
+
+
+def difference(model: Model, one: State, other: State) -> float:
+    """Return by how many roundings two states differ at most: of density eps ρ0, of acceleration what that makes, eps c²/dx."""
+    physics, eps = model.physics, float(jnp.finfo(one.x.dtype).eps)
+    speed = float(physics.sound_speed)
+    units = {"rho": float(physics.density), "a": speed**2 / model.spacing, "v": speed}
+    found = [0.0]
+    for name, unit in units.items():
+        mine, theirs = getattr(one, name), getattr(other, name)
+        if mine is not None:
+            found.append(float(jnp.max(jnp.abs(mine - theirs))) / (eps * unit))
+    return max(found, key=lambda value: (value != value, value))  # NaN is the largest
+
+
+def describe(row: Row) -> str:
+    """Return a row as a line for the reader."""
+    what = f"{row.kind:<9} {row.way:<16} {row.particles or 0:>9} particles"
+    if row.status != "ok":
+        return f"{what} {row.status}: {row.reason}"
+    if row.kind == "stages":
+        return f"{what} " + ", ".join(f"{name} {1e3 * value:.3g} ms" for name, value in row.parts.items())
+    if row.kind == "tradeoff":
+        return f"{what} {row.dtype} {row.seconds:.3g} s, " + ", ".join(f"{name} {value:.3g}" for name, value in row.error.items())
+    return f"{what} {row.steps_per_s:8.3g} steps/s, {(row.bytes or 0) / 1e6:.0f} MB, {row.difference:.2g} roundings apart"
