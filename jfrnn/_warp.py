@@ -46,7 +46,7 @@ class Variant(NamedTuple):
     own: bool
     closed: bool
     keep: Filter
-    periodic: int = 0  # 1: nearest images, 2: images are told apart
+    periodic: int = 0  # 1: nearest images, 2: images are told apart; two more where the lattice is skewed
     batched: bool = False
 
 
@@ -138,7 +138,14 @@ def neighbors(
 
 def _periodic_kind(torus: tuple[Lattice, Wrapped] | None) -> int:
     """Return the PERIODIC of `jfrnn.kernels._native.snippet`."""
-    return 0 if torus is None else 1 if torus[0].images.nearest else 2
+    if torus is None:
+        return 0
+    images = torus[0].images
+    return (1 if images.nearest else 2) + (0 if images.orthogonal else 2)
+
+
+def _space_flags(periodic: int) -> dict[str, bool]:
+    return {"nearest": periodic in (1, 3), "images": periodic in (2, 4), "skewed": periodic > 2}
 
 
 def _rows(points: Array, turns: Array | None, systems: Array | None) -> Array:
@@ -190,7 +197,7 @@ def _call(
     double = sources.dtype == jnp.float64
     periodic = _periodic_kind(torus)
     variant = Variant(dim, double, cutoff.scaled, lists, own, cutoff.closed, keep, periodic, batch is not None)
-    if periodic == 1 and n >= MOST_IN_BOX:
+    if periodic in (1, 3) and n >= MOST_IN_BOX:
         raise ValueError(
             f"backend='warp' numbers at most {MOST_IN_BOX - 1} positions in a periodic box, got {n}: pass backend='jax'."
         )
@@ -297,7 +304,7 @@ def _named(types: dict[str, Any], arrays: Sequence[Any]) -> _Arrays:
 
 def _name(name: str, variant: Variant) -> str:
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
-    flags |= {"nearest": variant.periodic == 1, "images": variant.periodic == 2, "batched": variant.batched}
+    flags |= {**_space_flags(variant.periodic), "batched": variant.batched}
     flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
     return "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
 
@@ -350,11 +357,27 @@ def _run_cells_on_cpu(variant: Variant, arrays: _Arrays) -> None:
     kernels = kernels_of("cells_cpu").cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, **kind)
     arrays, sizes, capacity = _launchable(variant, arrays)
     positions, queries, cutoff, idx, _, info, scratch = arrays
-    wp.launch(kernels.build, dim=1, inputs=[positions, queries, cutoff, info, scratch, *sizes], device="cpu")
+    _sort_on_cpu(kernels, positions, queries, cutoff, info, scratch, sizes)
     _ask_for_huge_pages(idx.ptr, 4 * len(queries) * capacity)
     flags = [int(variant.closed), int(variant.keep.drop_self), int(variant.keep.later_only)]
     arguments = [*arrays, *sizes, capacity, *flags]
     _on_every_core(lambda: wp.launch(kernels.query, dim=1, inputs=arguments, device="cpu"), -(-len(queries) // _PLACES_PER_THREAD))
+
+
+def _sort_on_cpu(
+    kernels: Any,  # noqa: ANN401
+    positions: Any,  # noqa: ANN401
+    queries: Any,  # noqa: ANN401
+    cutoff: Any,  # noqa: ANN401
+    info: Any,  # noqa: ANN401
+    scratch: Any,  # noqa: ANN401
+    sizes: list[int],
+) -> None:
+    wp, n = load_warp(), sizes[0]
+    wp.launch(kernels.build, dim=1, inputs=[positions, queries, cutoff, info, scratch, *sizes], device="cpu")
+    if n >= kernels_of("cells_cpu").MANY:
+        arguments = [positions, cutoff, scratch, *sizes]
+        _on_every_core(lambda: wp.launch(kernels.gather, dim=1, inputs=arguments, device="cpu"), -(-n // _PLACES_PER_THREAD))
 
 
 def _launchable(variant: Variant, arrays: _Arrays) -> tuple[_Arrays, list[int], int]:
@@ -521,7 +544,7 @@ def _sum_callable(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN401
 def _name_of_sum(name: str, variant: _SumVariant) -> str:
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "own": variant.own}
     flags |= {"closed": variant.closed, "dropself": variant.drop_self, "batched": variant.batched}
-    flags |= {"nearest": variant.periodic == 1, "images": variant.periodic == 2}
+    flags |= _space_flags(variant.periodic)
     flags |= {"compensated": variant.compensated, "extremes": variant.extremes, variant.key: bool(variant.key)}
     return "_".join([f"jfrnn_{name}_{variant.dim}d", *(flag for flag, on in flags.items() if on)])
 
@@ -565,20 +588,20 @@ def _sum_kernels_on_cpu(variant: _SumVariant, term: Any) -> tuple[Any, Any, Any]
     wp, sums = load_warp(), kernels_of("pair_sum_cpu")
     dim, double, scaled = variant[:3]
     kind = {"periodic": variant.periodic, "batched": variant.batched}
-    build = kernels_of("cells_cpu").cell_kernels(dim, double, scaled, False, **kind).build
+    cells = kernels_of("cells_cpu").cell_kernels(dim, double, scaled, False, **kind)
     query = sums.query_kernel(term, variant.key, dim, double, scaled, variant.compensated, **kind, extremes=variant.extremes)
-    kernels = build, sums.sort_kernel(dim, double), query
-    for kernel in kernels:
+    sort_values = sums.sort_kernel(dim, double)
+    for kernel in (cells.build, sort_values, query):
         wp.load_module(kernel.module, device="cpu")
-    return kernels
+    return cells, sort_values, query
 
 
 def _run_sums_on_cpu(variant: _SumVariant, term: Any, *arrays: Any) -> None:  # noqa: ANN401
-    wp, (build, sort_values, query) = load_warp(), _sum_kernels_on_cpu(variant, term)
+    wp, (cells, sort_values, query) = load_warp(), _sum_kernels_on_cpu(variant, term)
     positions, queries, cutoff, shared, own, others, sums, totals, errors, columns, info, scratch = arrays
     n, m = positions.shape[0], queries.shape[0]
     sizes = [n, m, int(variant.own), kernels_of("_native").table_cells(n)]
-    wp.launch(build, dim=1, inputs=[positions, queries, cutoff, info, scratch, *sizes], device="cpu")
+    _sort_on_cpu(cells, positions, queries, cutoff, info, scratch, sizes)
     if term.source_columns:
         sorting = [others, cutoff, columns, scratch, *sizes]
         _on_every_core(lambda: wp.launch(sort_values, dim=1, inputs=sorting, device="cpu"), -(-n // _PLACES_PER_THREAD))
@@ -709,7 +732,7 @@ def _level_callable(variant: _LevelVariant) -> Any:  # noqa: ANN401
     types |= {"count": ints, "info": ints}
     flags = {"f64": variant.double, "f32": not variant.double, "list": variant.lists, "own": variant.own}
     flags |= {"closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only, variant.rule: True}
-    flags |= {"nearest": variant.periodic == 1, "images": variant.periodic == 2, "batched": variant.batched}
+    flags |= {**_space_flags(variant.periodic), "batched": variant.batched}
     name = f"jfrnn_levels_{'cuda' if variant.cuda else 'cpu'}_{variant.dim}d"
     name = "_".join([name, *(flag for flag, on in flags.items() if on)])
     if not variant.cuda:

@@ -24,18 +24,23 @@ def snippet(scalar: str, dim: int, *pieces: str, **constants: int) -> str:
 
     The function around it must have the argument `cutoff`, an array of one scalar, and what the pieces need. PERIODIC is 0 in an
     open space, 1 where the nearest image is the only one that can be a neighbor, 2 where images are told apart: `cutoff` then goes
-    on with the numbers of the lattice, and a row of positions goes on with its packed turns (see `jfrnn._box`). BATCHED is 1 where
-    it ends with the number of its system (see `jfrnn._batch`). Such integers are the bits of a float, or the value of a double. SUM
-    is 1 where the cutoff of a pair is the sum of two numbers. SHIFTED is 0 where all pairs that are decided are those of points as
-    they are, though space is periodic.
+    on with the numbers of the lattice, and a row of positions goes on with its packed turns (see `jfrnn._box`). Where vectors of it
+    do not lie along the axes, it is given as two more, and the text finds SKEWED. BATCHED is 1 where a row ends with the number of
+    its system (see `jfrnn._batch`). Such integers are the bits of a float, or the value of a double. SUM is 1 where the cutoff of a
+    pair is the sum of two numbers. SHIFTED is 0 where all pairs that are decided are those of points as they are, though space is
+    periodic.
     """
     lines = [f"using real = {scalar};", f"using whole = {'long long' if scalar == 'double' else 'int'};"]
     lines += [f"constexpr int DIM = {dim};", f"constexpr bool DOUBLE = {int(scalar == 'double')};"]
     constants = {**_DEFAULTS, "SHIFTED": constants.get("PERIODIC", 0), **constants}
+    constants["SKEWED"] = constants["PERIODIC"] > SKEWED
+    constants |= {name: constants[name] - SKEWED for name in ("PERIODIC", "SHIFTED") if constants[name] > SKEWED}
     lines += [f"constexpr int {name} = {int(value)};" for name, value in constants.items()]
     return "\n".join(["", "{", _NO_CONTRACTION, *lines, _PORTABLE, *pieces, "}", ""])
 
 
+SKEWED = 2
+SPACES = ("", "_nearest", "_images", "_nearest_skewed", "_images_skewed")  # in names of variants
 _DEFAULTS = {"ORDER": 0, "PERIODIC": 0, "BATCHED": 0, "SUM": 0}
 
 
@@ -113,7 +118,6 @@ auto system_of = [&](const real* row) -> unsigned int { return BATCHED ? unsigne
 struct Lattice {
     enum { NONE = 512 | 512 << 10 | (DIM == 3 ? 512 << 20 : 0) };  // packed turns of what lies in the cell
     const real* numbers;
-    bool skewed;  // else its vectors lie along the axes, and what others would add is 0
     JFRNN_MEMBER real vector(int l, int k) const { return numbers[1 + 3 * l + k]; }
     JFRNN_MEMBER real transform(int k, int axis) const { return numbers[10 + 3 * k + axis]; }
     JFRNN_MEMBER real origin(int k) const { return numbers[19 + k]; }
@@ -145,7 +149,7 @@ struct Lattice {
     JFRNN_FUNCTION int turn(real last, int axis) { return ((packed_turns(last) >> (10 * axis)) & 1023) - 512; }
     // component k of S·A
     JFRNN_MEMBER real translation(int sx, int sy, int sz, int k) const {
-        if (!skewed)
+        if constexpr (!SKEWED)  // its vectors lie along the axes, and what others would add is 0
             return mul(real(k == 0 ? sx : k == 1 ? sy : sz), vector(k, k));
         real sum = mul(real(sx), vector(0, k));
         sum = add(sum, mul(real(sy), vector(1, k)));
@@ -170,7 +174,7 @@ struct Lattice {
     // coordinate of a wrapped point along an axis of cells: a fraction where that is periodic, else a length
     JFRNN_MEMBER real along(int axis, const real* p) const {
         real sum = mul(add(p[axis], -origin(axis)), transform(axis, axis));
-        if (skewed) {
+        if constexpr (SKEWED) {
             sum = mul(add(p[0], -origin(0)), transform(0, axis));
             for (int k = 1; k < DIM; ++k)
                 sum = add(sum, mul(add(p[k], -origin(k)), transform(k, axis)));
@@ -180,17 +184,13 @@ struct Lattice {
         return sum < 0 ? real(0) : sum > 1 ? real(1) : sum;
     }
 };
-bool skewed = false;
-for (int l = 0; PERIODIC && l < DIM; ++l)
-    for (int k = 0; k < DIM; ++k)
-        skewed |= k != l && Lattice{cutoff.data, true}.transform(l, k) != 0;  // loads that need not wait for each other
 #if defined(__CUDA_ARCH__)
-const Lattice lattice{cutoff.data, skewed};
+const Lattice lattice{cutoff.data};
 #else
 real numbers[LATTICE_END];  // not the caller's: nothing that is written may change them
 for (int k = 0; PERIODIC && k < LATTICE_END; ++k)
     numbers[k] = cutoff.data[k];
-const Lattice lattice{numbers, skewed};
+const Lattice lattice{numbers};
 #endif
 // the point of a row of positions, wrapped where space is periodic
 auto point_of = [&](const real* row, real* p) {

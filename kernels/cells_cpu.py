@@ -1,17 +1,19 @@
 """Cell search on the CPU: a serial counting sort, then queries on every core, 8 or 16 candidates at a time.
 
-`build` sorts the sources (and the queries, if they are others) by cell. `query` is launched once per thread: the threads hand
-themselves chunks of places from an atomic counter (see `jfrnn.kernels._walk_cpu`).
+`build` sorts the sources (and the queries, if they are others) by cell. `gather` puts the coordinates of many sources into that
+order: to read them from anywhere takes longer than all that `build` does. It and `query` are launched once per thread: the threads
+hand themselves chunks of places from an atomic counter (see `jfrnn.kernels._walk_cpu`).
 """
 
 import functools
 from typing import NamedTuple
 
 import warp as wp
-from jfrnn.kernels._native import CELLS, ENTER, EXACT, LEAVE, snippet, table_cells
+from jfrnn.kernels._native import CELLS, ENTER, EXACT, LEAVE, SPACES, snippet, table_cells
 from jfrnn.kernels._walk_cpu import CHUNK, walk
 
 _HEADER_WORDS = 64
+MANY = 1 << 15  # sources from which several threads gather their coordinates
 GRID = {"REACH": 1, "REACH_X": 2}  # finer cells along x alone: fewer candidates, but no more rows of cells that are copied
 
 # Where things lie in the scratch: one text, so that `build` and `query` agree; `scratch_words` below is its sum.
@@ -20,7 +22,7 @@ struct Shared {
     Grid grid;
     int finite_queries;
     int next_chunk;
-    int next_sorted;  // chunk of sources whose values are put in order
+    int next_gathered, next_sorted;  // chunks of sources whose coordinates and values are put in order
 };
 constexpr int WIDTH = DOUBLE ? 2 : 1;
 auto up = [](long long words) { return (words + 15) & ~15ll; };
@@ -71,7 +73,7 @@ if (finite == 0)
 Grid grid;
 lay_out(grid, low, high, table);
 shared.next_chunk = 0;
-shared.next_sorted = 0;
+shared.next_gathered = shared.next_sorted = 0;
 info.data[0] = 0;
 
 auto sort = [&](const real* points, int count, int* first, int* order, bool with_axes) {
@@ -96,7 +98,7 @@ auto sort = [&](const real* points, int count, int* first, int* order, bool with
     for (int i = 0; i < count; ++i) {
         const int place = key[i] >= 0 ? first[key[i] + 1]++ : behind++;
         order[place] = i;
-        if (with_axes) {
+        if (with_axes && n < MANY) {
             real p[3];
             point_of(points + (long long)ROW * i, p);
             for (int k = 0; k < DIM; ++k)
@@ -109,6 +111,23 @@ grid.finite = sort(positions.data, n, start, ids, true);
 shared.grid = grid;
 shared.finite_queries = own ? grid.finite : sort(queries.data, m, query_start, query_ids, false);
 info.data[1] = grid.finite < n || shared.finite_queries < m ? 2 : 0;
+"""
+
+_GATHER = r"""
+for (;;) {
+    const int chunk = __atomic_fetch_add(&shared.next_gathered, 1, __ATOMIC_RELAXED);
+    if ((long long)chunk * CHUNK >= n)
+        break;
+    const int begin = chunk * CHUNK, end = n - begin < CHUNK ? n : begin + CHUNK;
+    for (int place = begin; place < end; ++place) {
+        constexpr int AHEAD = 16;  // places, whose rows are on their way
+        __builtin_prefetch(positions.data + (long long)ROW * ids[place + AHEAD < n ? place + AHEAD : place]);
+        real p[3];
+        point_of(positions.data + (long long)ROW * ids[place], p);
+        for (int k = 0; k < DIM; ++k)
+            axis[k][place] = p[k];
+    }
+}
 """
 
 _BEGIN_ROWS = r"""
@@ -175,9 +194,10 @@ _QUERY = walk(
 
 
 class Kernels(NamedTuple):
-    """The two kernels of a variant, both launched with dim = 1 (`query` once per thread)."""
+    """The kernels of a variant, all launched with dim = 1: `gather`, for `MANY` sources, and `query` once per thread."""
 
     build: wp.Kernel
+    gather: wp.Kernel
     query: wp.Kernel
 
 
@@ -193,9 +213,9 @@ def cell_kernels(
     """
     scalar = wp.float64 if double else wp.float32
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}"
-    variant += f"{('', '_nearest', '_images')[periodic]}{'_batched' * batched}{'' if exact else '_inexact'}"
+    variant += f"{SPACES[periodic]}{'_batched' * batched}{'' if exact else '_inexact'}"
     options = {"SCALED": scaled, "LIST": lists, **GRID, "EXACTLY": exact, "PERIODIC": periodic}
-    options |= {"BATCHED": batched, "SUMS": 0, "CHUNK": CHUNK}
+    options |= {"BATCHED": batched, "SUMS": 0, "CHUNK": CHUNK, "MANY": MANY}
     options |= {"CANDIDATES": 1024 if double else 1536}  # what fits into a first-level cache beside a row
     points = wp.array2d(dtype=scalar)
     reals, ints, rows = wp.array(dtype=scalar), wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
@@ -204,19 +224,25 @@ def cell_kernels(
         positions: points, queries: points, cutoff: reals, info: ints, scratch: ints, n: int, m: int, own: int, table: int
     ): ...
 
+    def gather_native(positions: points, cutoff: reals, scratch: ints, n: int, m: int, own: int, table: int): ...
+
     def query_native(
         positions: points, queries: points, cutoff: reals, idx: rows, count: ints, info: ints, scratch: ints,
         n: int, m: int, own: int, table: int, capacity: int, closed: int, drop_self: int, later_only: int,
     ): ...  # fmt: skip
 
-    for native in (build_native, query_native):
+    for native in (build_native, gather_native, query_native):
         native.__name__ = native.__qualname__ = f"{native.__name__}_{variant}"
     native_text = functools.partial(snippet, "double" if double else "float", dim, CELLS, LAYOUT, **options)
     build_function = wp.func_native(ENTER + native_text(_BUILD) + LEAVE)(build_native)
+    gather_function = wp.func_native(ENTER + native_text(_GATHER) + LEAVE)(gather_native)
     query_function = wp.func_native(ENTER + native_text(EXACT, _QUERY) + LEAVE)(query_native)
 
     def build(positions: points, queries: points, cutoff: reals, info: ints, scratch: ints, n: int, m: int, own: int, table: int):
         build_function(positions, queries, cutoff, info, scratch, n, m, own, table)
+
+    def gather(positions: points, cutoff: reals, scratch: ints, n: int, m: int, own: int, table: int):
+        gather_function(positions, cutoff, scratch, n, m, own, table)
 
     def query(
         positions: points, queries: points, cutoff: reals, idx: rows, count: ints, info: ints, scratch: ints,
@@ -228,4 +254,4 @@ def cell_kernels(
 
     module = wp.get_module(f"jfrnn.kernels.cells_cpu.{variant}")
     wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
-    return Kernels(wp.kernel(build, module=module), wp.kernel(query, module=module))
+    return Kernels(*(wp.kernel(kernel, module=module) for kernel in (build, gather, query)))

@@ -16,7 +16,7 @@ from string import Template
 from typing import NamedTuple
 
 import warp as wp
-from jfrnn.kernels._native import CELLS, EXACT, snippet, table_cells
+from jfrnn.kernels._native import CELLS, EXACT, SPACES, snippet, table_cells
 
 BLOCK = 256
 QUERY_BLOCK = 32  # one warp: others need not wait for it to end
@@ -562,7 +562,7 @@ while (place < stop) {
         reduce_over_group(mine.p[a], low[a], high[a]);
         real lowest = low[a], highest = high[a];
         if constexpr (PERIODIC) {
-            if (skewed)
+            if constexpr (SKEWED)
                 reduce_over_group(my_place[a], lowest, highest);
             else {  // in one order or the other
                 const real begin = coordinate(a, low), end = coordinate(a, high);
@@ -1351,7 +1351,7 @@ def cell_kernels(
     """
     blocks = blocks or (24 if not lists else 16 if double else 20)  # registers against occupancy, measured on an H200
     kind = f"{dim}d_{'f64' if double else 'f32'}_r{reach}x{reach_x}{('', '_morton', '_hilbert')[order]}"
-    kind += ("", "_nearest", "_images")[periodic] + "_batched" * batched
+    kind += SPACES[periodic] + "_batched" * batched
     variant = f"{kind}{'_scaled' * scaled}{'_list' * lists}{'_later' * later}{'' if exact else '_inexact'}"
     grid = {**GRID, "REACH": reach, "REACH_X": reach_x, "ORDER": order, "PERIODIC": periodic, "BATCHED": batched}
     query = {"SCALED": scaled, "LIST": lists, "SUMS": 0, "LATER": later, "EXACTLY": exact}

@@ -7,7 +7,7 @@ Morton curve. A query finds the candidates of a group in the cells around it tha
 import functools
 
 import warp as wp
-from jfrnn.kernels._native import ENTER, EXACT, LEAVE, snippet
+from jfrnn.kernels._native import ENTER, EXACT, LEAVE, SPACES, snippet
 
 PADDING = 16  # sources behind the last one, which nobody meets: the CPU tests so many at a time
 BLOCK = 128  # threads of CUDA
@@ -354,7 +354,7 @@ def query_kernel(
     """
     scalar = wp.float64 if double else wp.float32
     variant = f"{dim}d_{'f64' if double else 'f32'}_{rule}{'_list' * lists}"
-    variant += f"{('', '_nearest', '_images')[periodic]}{'_batched' * batched}"
+    variant += f"{SPACES[periodic]}{'_batched' * batched}"
     constants = {"LIST": lists, "RULE": RULES.index(rule), "SUM": rule == "mean", "GROUPS": groups, "HALVINGS": halvings}
     constants |= {"SCALED": True, "PADDING": PADDING, "PERIODIC": periodic, "BATCHED": batched}
     points = wp.array2d(dtype=scalar)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import warp as wp
 from jfrnn.kernels._math import VECTOR
-from jfrnn.kernels._native import CELLS, ENTER, EXACT, FLUSH, KEEP, LEAVE, snippet
+from jfrnn.kernels._native import CELLS, ENTER, EXACT, FLUSH, KEEP, LEAVE, SPACES, snippet
 from jfrnn.kernels._walk_cpu import CHUNK, walk
 from jfrnn.kernels.cells_cpu import GRID, LAYOUT
 
@@ -432,7 +432,7 @@ def query_kernel(
     rows, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
     packed = work(term.text) > LITTLE_WORK if packed is None else packed
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
-    variant += f"{('', '_nearest', '_images')[periodic]}{'_batched' * batched}{'_extremes' * extremes}_{key}"
+    variant += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}_{key}"
     totals = sum(part.total for part in term.sums)
     constants = {"SCALED": scaled, "LIST": 0, "SUMS": 1 + extremes, **GRID, "EXACTLY": 1}
     constants |= {"PERIODIC": periodic, "BATCHED": batched, "CHUNK": CHUNK, "CANDIDATES": _candidates(term, dim, double)}

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import warp as wp
 from jfrnn.kernels._math import SCALAR
-from jfrnn.kernels._native import CELLS, EXACT, snippet
+from jfrnn.kernels._native import CELLS, EXACT, SPACES, snippet
 from jfrnn.kernels.cells_cuda import GRID, HELD_PAIRS, LAYOUT, QUERY_BLOCK, Launch, load_walks, walk, walks
 from jfrnn.kernels.pair_sum_cpu import LITTLE_WORK, TAKE_LARGER, TermText, Value, loaded, placed, work
 
@@ -346,7 +346,7 @@ def sum_kernels(
     blocks = blocks or (16 if double or not cheap else 20)
     totals, columns = sum(part.total for part in term.sums), term.source_columns
     kind = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
-    kind += f"{('', '_nearest', '_images')[periodic]}{'_batched' * batched}{'_extremes' * extremes}"
+    kind += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}"
     module = f"{kind}_b{blocks}_t{taken}_{key}"
     constants = {**GRID, "PERIODIC": periodic, "BATCHED": batched, "SCALED": scaled}
     constants |= {"LIST": 0, "SUMS": 1, "LATER": 0, "EXACTLY": 1, "COMPENSATED": compensated, "TAKEN": taken}
