@@ -267,12 +267,24 @@ def _step_rows(group: list[Spec], model: Model, s: State) -> list[Row]:
             rows[spec.way] = replace(row, reason=f"{type(error).__name__}: {error}"[:600])
     steps = group[0].steps
     calls = {way: lambda run=run: run(steps).x for way, run in ready.items()}
-    seconds, others = _measure.time_in_turns(calls, group[0].rounds)
+    seconds, others = _timed(calls, group[0].rounds)
     for way, times in seconds.items():
         p10, median, p90 = (float(value) / steps for value in np.percentile(times, (10, 50, 90)))
         speed = {"steps_per_s": 1 / median, "particle_steps_per_s": model.m.shape[0] / median}
         rows[way] = replace(rows[way], status="ok", median_s=median, p10_s=p10, p90_s=p90, others_cores=others, **speed)
     return list(rows.values())
+
+
+def _timed(calls: dict[str, Callable[[], Any]], rounds: int) -> tuple[dict[str, list[float]], float | None]:
+    """Time calls in turns, and tell how many cores others kept busy; a run is long enough not to mind whose data caches hold."""
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    bystanders = _measure.Bystanders()
+    for _, (name, call) in itertools.product(range(rounds), calls.items()):
+        begin = perf_counter()
+        jax.block_until_ready(call())
+        seconds[name].append(perf_counter() - begin)
+    others = bystanders.cores()
+    return seconds, None if others is None else round(others, 2)
 
 
 def _prepared(spec: Spec, model: Model, s: State) -> tuple[Callable[[int], State], dict[str, Any]]:
