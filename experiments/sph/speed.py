@@ -47,7 +47,8 @@ class Config(Table):
         nx: Resolutions, as the scene takes them.
         ways: Of `WAYS`; all are compared with the first.
         most_particles: Of ways that larger scenes are skipped for.
-        stages: Ways whose stages are timed besides.
+        stages: Ways whose stages are timed besides ...
+        staged: ... at these resolutions; none: at all.
         dtype: Of all numbers.
         steps: Per timed run, from the same state each time.
         rounds: Timed runs of each way.
@@ -61,6 +62,7 @@ class Config(Table):
     ways: tuple[str, ...] = ("pair_sum", "list")
     most_particles: dict[str, int] = Field(default_factory=dict)
     stages: tuple[Literal["pair_sum", "list"], ...] = ()
+    staged: tuple[int, ...] = ()
     dtype: Literal["float32", "float64"] = "float32"
     steps: Annotated[int, Field(ge=1)] = 10
     rounds: Annotated[int, Field(ge=1)] = 5
@@ -87,7 +89,8 @@ class Config(Table):
         """Yield the rows of steps and of stages, those of one scene side by side."""
         shared = self.model_dump(include={"scene", "dtype", "steps", "rounds", "skin", "rate"})
         for nx in self.nx:
-            for kind, way in itertools.chain((("step", way) for way in self.ways), (("stages", way) for way in self.stages)):
+            parts = self.stages if nx in (self.staged or self.nx) else ()
+            for kind, way in itertools.chain((("step", way) for way in self.ways), (("stages", way) for way in parts)):
                 yield Spec(kind=kind, way=way, nx=nx, most_particles=self.most_particles.get(way), **shared)
 
 
