@@ -19,9 +19,9 @@ from experiments import _machine, _measure, _sweep
 from experiments._config import Positive, Table, digest
 from experiments._rows import RETRIED, RowFile
 from experiments.sph import edges, solver
-from experiments.sph import stages as parts_of_a_step
 from experiments.sph import tradeoff as known_flow
 from experiments.sph.model import Model, State, make_model, make_state
+from experiments.sph.stages import part_times
 
 if TYPE_CHECKING:
     from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
@@ -222,7 +222,7 @@ def _measured(group: list[Spec]) -> list[Row]:
     rows = []
     for spec in group:
         row = _row(spec, "stages", about)
-        parts, others = parts_of_a_step.times(model, s, spec.way, spec.skin * model.spacing, spec.steps, spec.rounds)
+        parts, others = part_times(model, s, spec.way, spec.skin * model.spacing, spec.steps, spec.rounds)
         rows.append(replace(row, status="ok", parts=parts, others_cores=others))
     return rows
 
