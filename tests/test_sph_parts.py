@@ -43,8 +43,26 @@ def make_pair(r, name="quintic"):
 
 
 VALUES = (
-    {"m": 1.1, "rho": 900.0, "p": 20.0, "v": [0.1, 0.3], "u": [0.1, 0.3], "w": [0.02, 0.0]},
-    {"m": 1.4, "rho": 1100.0, "p": -5.0, "v": [-0.4, 0.2], "u": [-0.4, 0.2], "w": [0.0, -0.01]},
+    {
+        "m": 1.1,
+        "rho": 900.0,
+        "specific": 1 / 900,
+        "volume": 1.1 / 900,
+        "p": 20.0,
+        "v": [0.1, 0.3],
+        "u": [0.1, 0.3],
+        "w": [0.02, 0.0],
+    },
+    {
+        "m": 1.4,
+        "rho": 1100.0,
+        "specific": 1 / 1100,
+        "volume": 1.4 / 1100,
+        "p": -5.0,
+        "v": [-0.4, 0.2],
+        "u": [-0.4, 0.2],
+        "w": [0.0, -0.01],
+    },
 )
 
 
@@ -54,12 +72,12 @@ def forces(name, r, i, j):
     gradient = -pair.pull * pair.r
     terms = {
         **{
-            f"pressure {key}": lambda key=key: pressure.PRESSURES[key](pair, i, j, gradient)
+            f"pressure {key}": lambda key=key: pressure.PRESSURES[key](pair, i, j) * gradient
             for key in ("symmetric", "mean", "volume")
         },
         "viscosity morris": lambda: viscosity.morris(pair, i, j, 0.01),
         "viscosity volume": lambda: viscosity.volume(pair, i, j, 0.01),
-        "artificial": lambda: viscosity.artificial(pair, i, j, gradient, 3.0),
+        "artificial": lambda: viscosity.artificial(pair, i, j, 3.0) * gradient,
         "cohesion": lambda: surface.cohesion(pair, i, j, 2.0, 0.3),
         "transport": lambda: transport.transport(pair, i, j, 50.0),
         "advected": lambda: transport.advected(pair, i, j, gradient),
@@ -77,6 +95,13 @@ def test_forces_of_a_pair_are_opposite(name):
     there, back = mass_i * there[name](), mass_j * back[name]()
     assert np.abs(there).max() > 0
     np.testing.assert_allclose(there, -back, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_the_pull_of_a_kernel_is_its_slope_over_the_distance(name):
+    r = np.linspace(0.01, 0.35, 60)
+    for dim in (2, 3):
+        np.testing.assert_allclose(KERNELS[name].pull(r, 0.1, dim), KERNELS[name].slope(r, 0.1, dim) / r, rtol=1e-12)
 
 
 def test_coincident_particles_have_no_force_and_finite_derivatives():
@@ -108,10 +133,11 @@ def test_corrected_gradients_are_exact_for_linear_fields(dim):
     n, kernel = {2: 12, 3: 7}[dim], KERNELS["wendland2"]
     x = lattice(n, dim, jitter=0.3)
     slope = jnp.arange(1.0, dim + 1)
-    values = {"m": jnp.full(len(x), 1.0 / n**dim), "rho": jnp.ones(len(x)), "f": x @ slope}
+    values = {"m": jnp.full(len(x), 1.0 / n**dim), "f": x @ slope}
+    values["volume"] = values["m"]
 
     def moment_and_change(pair, i, j):
-        return correction.moment(pair, j), -j["m"] / j["rho"] * (j["f"] - i["f"]) * pair.pull * pair.r
+        return correction.moment(pair, j), -j["volume"] * (j["f"] - i["f"]) * pair.pull * pair.r
 
     moments, changes = total(moment_and_change, x, values, kernel, 1.5 / n, backend="brute")
     gradients = jnp.einsum("nab,nb->na", correction.inverse(moments), changes)

@@ -15,7 +15,7 @@ def summation(pair: Pair, j: Values) -> Array:
 
 def continuity(pair: Pair, i: Values, j: Values, gradient: Array) -> Array:
     """Return ρ_i V_j (v_i - v_j)·∇W, whose sum is dρ_i/dt. Source: Monaghan (1994), doi:10.1006/jcph.1994.1034."""
-    return i["rho"] * j["m"] / j["rho"] * ((i["v"] - j["v"]) @ gradient)
+    return i["rho"] * j["volume"] * ((i["v"] - j["v"]) @ gradient)
 
 
 def diffusion(pair: Pair, i: Values, j: Values, strength: Array, hydrostatic: Array | None) -> Array:
@@ -37,4 +37,4 @@ def diffusion(pair: Pair, i: Values, j: Values, strength: Array, hydrostatic: Ar
     difference = j["rho"] - i["rho"]
     if hydrostatic is not None:
         difference = difference - hydrostatic @ pair.r
-    return -2 * strength * j["m"] / j["rho"] * difference * pair.pull
+    return -2 * strength * j["volume"] * difference * pair.pull

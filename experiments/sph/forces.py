@@ -54,6 +54,8 @@ def _sum(term: Term, model: Model, s: State, values: Values, nbrs: Neighbors, of
     particle of the fluid then meets itself at r = 0, where terms of the fluid are 0.
     """
     options = {"box": model.box, "backend": model.backend}
+    if "rho" in values:  # per particle: a division per pair takes as long as the rest of a term
+        values = values | {"specific": 1 / values["rho"], "volume": model.m / values["rho"]}
     values = values | {"m": model.m} | ({} if model.wall is None else {"wall": model.wall})
     entered, k = active(model, s.time), model.fluid_count
     if k is None or nbrs is not None or of == "all":
@@ -171,12 +173,13 @@ def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tupl
 
     def term(pair: Pair, i: Values, j: Values) -> dict[str, Array]:
         gradient = _gradient(model, pair, i)
-        a = PRESSURES[physics.pressure](pair, i, j, gradient)
+        along = PRESSURES[physics.pressure](pair, i, j)
+        if physics.artificial is not None:
+            along = along + viscosity.artificial(pair, i, j, physics.artificial * physics.sound_speed)
+        a = along * gradient
         if physics.viscosity is not None:
             drag = viscosity.VISCOSITIES[physics.viscosity_form](pair, i, j, physics.viscosity)
             a = a + (fluid(j, drag) if physics.slip else drag)
-        if physics.artificial is not None:
-            a = a + viscosity.artificial(pair, i, j, gradient, physics.artificial * physics.sound_speed)
         if physics.tension is not None:
             a = a + surface.cohesion(pair, i, j, physics.tension, model.kernel.support * physics.smoothing)
         if physics.transport is not None:

@@ -21,6 +21,7 @@ class Kernel(NamedTuple):
         shape: q -> shape(q).
         derivative: q -> shape'(q).
         source: Author, year, DOI.
+        over_q: q -> shape'(q)/q, where that is a polynomial.
     """
 
     support: float
@@ -28,6 +29,7 @@ class Kernel(NamedTuple):
     shape: Callable[[Array], Array]
     derivative: Callable[[Array], Array]
     source: str
+    over_q: Callable[[Array], Array] | None = None
 
     def value(self, r: Array, h: float, dim: int) -> Array:
         """Return W(r, h) [1/length^dim] at distances r [length], any shape."""
@@ -36,6 +38,13 @@ class Kernel(NamedTuple):
     def slope(self, r: Array, h: float, dim: int) -> Array:
         """Return dW/dr [1/length^(dim+1)] at distances r [length], any shape."""
         return self.norm[dim - 2] / h ** (dim + 1) * self.derivative(r / h)
+
+    def pull(self, r: Array, h: float, dim: int) -> Array:
+        """Return dW/dr / r [1/length^(dim+2)] at distances r [length], any shape; where that has no limit at r = 0, 0 there."""
+        if self.over_q is not None:
+            return self.norm[dim - 2] / h ** (dim + 2) * self.over_q(r / h)
+        apart = r > 0
+        return jnp.where(apart, self.slope(r, h, dim) / jnp.where(apart, r, 1), 0)
 
 
 def below(edge: float, q: Array) -> Array:
@@ -63,24 +72,36 @@ def _wendland2(q: Array) -> Array:
     return (below(2, q) / 2) ** 4 * (2 * q + 1)
 
 
+def _wendland2_over_q(q: Array) -> Array:
+    return -5 * (below(2, q) / 2) ** 3
+
+
 def _wendland2_derivative(q: Array) -> Array:
-    return -5 * q * (below(2, q) / 2) ** 3
+    return q * _wendland2_over_q(q)
 
 
 def _wendland4(q: Array) -> Array:
     return (below(2, q) / 2) ** 6 * (35 / 12 * q**2 + 3 * q + 1)
 
 
+def _wendland4_over_q(q: Array) -> Array:
+    return -(7 / 3) * (2 + 5 * q) * (below(2, q) / 2) ** 5
+
+
 def _wendland4_derivative(q: Array) -> Array:
-    return -(7 / 3) * q * (2 + 5 * q) * (below(2, q) / 2) ** 5
+    return q * _wendland4_over_q(q)
 
 
 def _wendland6(q: Array) -> Array:
     return (below(2, q) / 2) ** 8 * (4 * q**3 + 25 / 4 * q**2 + 4 * q + 1)
 
 
+def _wendland6_over_q(q: Array) -> Array:
+    return -(11 / 4) * (2 + 7 * q + 8 * q**2) * (below(2, q) / 2) ** 7
+
+
 def _wendland6_derivative(q: Array) -> Array:
-    return -(11 / 4) * q * (2 + 7 * q + 8 * q**2) * (below(2, q) / 2) ** 7
+    return q * _wendland6_over_q(q)
 
 
 def _poly6(q: Array) -> Array:
@@ -107,9 +128,15 @@ _MUELLER = "Müller, Charypar & Gross (2003), doi:10.2312/SCA03/154-159"
 KERNELS = {
     "cubic": Kernel(2.0, (10 / (7 * math.pi), 1 / math.pi), _cubic, _cubic_derivative, _MONAGHAN),
     "quintic": Kernel(3.0, (7 / (478 * math.pi), 1 / (120 * math.pi)), _quintic, _quintic_derivative, _SCHOENBERG),
-    "wendland2": Kernel(2.0, (7 / (4 * math.pi), 21 / (16 * math.pi)), _wendland2, _wendland2_derivative, _WENDLAND),
-    "wendland4": Kernel(2.0, (9 / (4 * math.pi), 495 / (256 * math.pi)), _wendland4, _wendland4_derivative, _WENDLAND),
-    "wendland6": Kernel(2.0, (78 / (28 * math.pi), 1365 / (512 * math.pi)), _wendland6, _wendland6_derivative, _WENDLAND),
+    "wendland2": Kernel(
+        2.0, (7 / (4 * math.pi), 21 / (16 * math.pi)), _wendland2, _wendland2_derivative, _WENDLAND, _wendland2_over_q
+    ),
+    "wendland4": Kernel(
+        2.0, (9 / (4 * math.pi), 495 / (256 * math.pi)), _wendland4, _wendland4_derivative, _WENDLAND, _wendland4_over_q
+    ),
+    "wendland6": Kernel(
+        2.0, (78 / (28 * math.pi), 1365 / (512 * math.pi)), _wendland6, _wendland6_derivative, _WENDLAND, _wendland6_over_q
+    ),
     "poly6": Kernel(1.0, (4 / math.pi, 315 / (64 * math.pi)), _poly6, _poly6_derivative, _MUELLER),
     "spiky": Kernel(1.0, (10 / math.pi, 15 / math.pi), _spiky, _spiky_derivative, _MUELLER),
 }

@@ -122,7 +122,7 @@ def _check_box(scene: "FluidScene") -> None:
     """Refuse a periodic box in which a particle might meet two images of another: the solver traces its box."""
     if scene.periodic is None:
         return
-    least = 2.05 * KERNELS[scene.physics.kernel].support * scene.physics.smoothing
+    least = 2.05 * reach(KERNELS[scene.physics.kernel], scene.physics.smoothing)
     for axis, length, periodic in zip("xyz", scene.periodic.lengths, scene.periodic.axes, strict=False):
         if periodic and length < least:
             raise ValueError(

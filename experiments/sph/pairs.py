@@ -12,6 +12,7 @@ from experiments.sph.edges import Edges
 from experiments.sph.kernels import Kernel
 
 Values = dict[str, Array]
+"""What is known of each particle: m [kg], rho [kg/m³], volume m/rho, specific 1/rho, p [Pa], v, u, w [m/s], wall, inverse."""
 Term = Callable[["Pair", Values, Values], Any]
 _BEYOND = 1 + 2**-12  # a lattice has many pairs at exactly the support, which take long to decide (10 times the sum) and add 0
 
@@ -46,9 +47,8 @@ class Pair:
 
     @cached_property
     def pull(self) -> Array:
-        """F = (dW/dr)/r, not positive, 0 where two particles coincide: the gradient of W(x_i - x_j) at i is -F·r."""
-        apart = self.square > 0
-        return jnp.where(apart, self.kernel.slope(self.distance, self.h, self.r.shape[0]) / jnp.where(apart, self.distance, 1), 0)
+        """F = (dW/dr)/r, not positive, finite where two particles coincide: the gradient of W(x_i - x_j) at i is -F·r."""
+        return self.kernel.pull(self.distance, self.h, self.r.shape[0])
 
 
 def reach(kernel: Kernel, h: float) -> float:

@@ -19,9 +19,9 @@ from experiments import _machine, _measure, _sweep
 from experiments._config import Positive, Table, digest
 from experiments._rows import RETRIED, RowFile
 from experiments.sph import edges, solver
-from experiments.sph import stages as parts_of_a_step
 from experiments.sph import tradeoff as known_flow
 from experiments.sph.model import Model, State, make_model, make_state
+from experiments.sph.stages import part_times
 
 if TYPE_CHECKING:
     from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
@@ -47,7 +47,8 @@ class Config(Table):
         nx: Resolutions, as the scene takes them.
         ways: Of `WAYS`; all are compared with the first.
         most_particles: Of ways that larger scenes are skipped for.
-        stages: Ways whose stages are timed besides.
+        stages: Ways whose stages are timed besides ...
+        staged: ... at these resolutions; none: at all.
         dtype: Of all numbers.
         steps: Per timed run, from the same state each time.
         rounds: Timed runs of each way.
@@ -61,6 +62,7 @@ class Config(Table):
     ways: tuple[str, ...] = ("pair_sum", "list")
     most_particles: dict[str, int] = Field(default_factory=dict)
     stages: tuple[Literal["pair_sum", "list"], ...] = ()
+    staged: tuple[int, ...] = ()
     dtype: Literal["float32", "float64"] = "float32"
     steps: Annotated[int, Field(ge=1)] = 10
     rounds: Annotated[int, Field(ge=1)] = 5
@@ -87,7 +89,8 @@ class Config(Table):
         """Yield the rows of steps and of stages, those of one scene side by side."""
         shared = self.model_dump(include={"scene", "dtype", "steps", "rounds", "skin", "rate"})
         for nx in self.nx:
-            for kind, way in itertools.chain((("step", way) for way in self.ways), (("stages", way) for way in self.stages)):
+            parts = self.stages if nx in (self.staged or self.nx) else ()
+            for kind, way in itertools.chain((("step", way) for way in self.ways), (("stages", way) for way in parts)):
                 yield Spec(kind=kind, way=way, nx=nx, most_particles=self.most_particles.get(way), **shared)
 
 
@@ -219,7 +222,7 @@ def _measured(group: list[Spec]) -> list[Row]:
     rows = []
     for spec in group:
         row = _row(spec, "stages", about)
-        parts, others = parts_of_a_step.times(model, s, spec.way, spec.skin * model.spacing, spec.steps, spec.rounds)
+        parts, others = part_times(model, s, spec.way, spec.skin * model.spacing, spec.steps, spec.rounds)
         rows.append(replace(row, status="ok", parts=parts, others_cores=others))
     return rows
 
@@ -267,12 +270,24 @@ def _step_rows(group: list[Spec], model: Model, s: State) -> list[Row]:
             rows[spec.way] = replace(row, reason=f"{type(error).__name__}: {error}"[:600])
     steps = group[0].steps
     calls = {way: lambda run=run: run(steps).x for way, run in ready.items()}
-    seconds, others = _measure.time_in_turns(calls, group[0].rounds)
+    seconds, others = _timed(calls, group[0].rounds)
     for way, times in seconds.items():
         p10, median, p90 = (float(value) / steps for value in np.percentile(times, (10, 50, 90)))
         speed = {"steps_per_s": 1 / median, "particle_steps_per_s": model.m.shape[0] / median}
         rows[way] = replace(rows[way], status="ok", median_s=median, p10_s=p10, p90_s=p90, others_cores=others, **speed)
     return list(rows.values())
+
+
+def _timed(calls: dict[str, Callable[[], Any]], rounds: int) -> tuple[dict[str, list[float]], float | None]:
+    """Time calls in turns, and tell how many cores others kept busy; a run is long enough not to mind whose data caches hold."""
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    bystanders = _measure.Bystanders()
+    for _, (name, call) in itertools.product(range(rounds), calls.items()):
+        begin = perf_counter()
+        jax.block_until_ready(call())
+        seconds[name].append(perf_counter() - begin)
+    others = bystanders.cores()
+    return seconds, None if others is None else round(others, 2)
 
 
 def _prepared(spec: Spec, model: Model, s: State) -> tuple[Callable[[int], State], dict[str, Any]]:

@@ -10,7 +10,7 @@ def transport(pair: Pair, i: Values, j: Values, background: Array) -> Array:
 
     Source: Adami, Hu & Adams (2013), doi:10.1016/j.jcp.2013.01.043, eq. 13.
     """
-    volumes = (i["m"] / i["rho"]) ** 2 + (j["m"] / j["rho"]) ** 2
+    volumes = i["volume"] ** 2 + j["volume"] ** 2
     return volumes * background / i["m"] * pair.pull * pair.r
 
 
@@ -19,7 +19,7 @@ def advected(pair: Pair, i: Values, j: Values, gradient: Array) -> Array:
 
     (V_i² + V_j²)/(2 m_i) (A_i + A_j)·∇W, A = ρ v⊗w. Source: Adami, Hu & Adams (2013), doi:10.1016/j.jcp.2013.01.043, eq. 8.
     """
-    volumes = (i["m"] / i["rho"]) ** 2 + (j["m"] / j["rho"]) ** 2
+    volumes = i["volume"] ** 2 + j["volume"] ** 2
     flow = i["rho"] * i["v"] * (i["w"] @ gradient) + j["rho"] * j["v"] * (j["w"] @ gradient)
     return volumes / (2 * i["m"]) * flow
 
@@ -35,7 +35,7 @@ def spread(pair: Pair, i: Values, j: Values, unit: Array) -> Array:
 
     Source: Sun et al. (2017), doi:10.1016/j.cma.2016.10.028, eq. 9, after Monaghan (2000), doi:10.1006/jcph.2000.6439.
     """
-    return -(1 + 0.2 * (pair.weight / unit) ** 4) * j["m"] / j["rho"] * pair.pull * pair.r
+    return -(1 + 0.2 * (pair.weight / unit) ** 4) * j["volume"] * pair.pull * pair.r
 
 
 def pressure_rate(pair: Pair, i: Values, j: Values, gradient: Array, stiffness: Array) -> Array:
@@ -43,7 +43,7 @@ def pressure_rate(pair: Pair, i: Values, j: Values, gradient: Array, stiffness: 
 
     Source: Ramachandran & Puri (2019), doi:10.1016/j.compfluid.2018.11.023.
     """
-    return stiffness * j["m"] / j["rho"] * ((i["v"] - j["v"]) @ gradient)
+    return stiffness * j["volume"] * ((i["v"] - j["v"]) @ gradient)
 
 
 def pressure_diffusion(pair: Pair, i: Values, j: Values, viscosity: Array) -> Array:
@@ -51,9 +51,9 @@ def pressure_diffusion(pair: Pair, i: Values, j: Values, viscosity: Array) -> Ar
 
     Source: Ramachandran & Puri (2019), doi:10.1016/j.compfluid.2018.11.023.
     """
-    return 2 * viscosity * j["m"] / j["rho"] * pair.pull * (i["p"] - j["p"])
+    return 2 * viscosity * j["volume"] * pair.pull * (i["p"] - j["p"])
 
 
 def advected_change(pair: Pair, i: Values, j: Values, gradient: Array, name: str) -> Array:
     """Return V_j (w_i·∇W)(f_j - f_i): the derivative of a quantity along w, with which particles move besides the fluid."""
-    return j["m"] / j["rho"] * (i["w"] @ gradient) * (j[name] - i[name])
+    return j["volume"] * (i["w"] @ gradient) * (j[name] - i[name])

@@ -1,4 +1,4 @@
-"""Viscosity: each function returns what neighbor j adds to the acceleration of i [m/s²], shape [d].
+"""Viscosity: each function but `artificial` returns what neighbor j adds to the acceleration of i [m/s²], shape [d].
 
 Velocities are read from `u`: those of particles, and of wall dummies what holds the fluid or lets it slip.
 """
@@ -11,7 +11,7 @@ from experiments.sph.pairs import Pair, Values
 
 def morris(pair: Pair, i: Values, j: Values, viscosity: Array) -> Array:
     """Return 2ν m_j/ρ_j F (u_i - u_j), ν kinematic [m²/s]. Source: Morris, Fox & Zhu (1997), doi:10.1006/jcph.1997.5776, eq. 22."""
-    return 2 * viscosity * j["m"] / j["rho"] * pair.pull * (i["u"] - j["u"])
+    return 2 * viscosity * j["volume"] * pair.pull * (i["u"] - j["u"])
 
 
 def volume(pair: Pair, i: Values, j: Values, viscosity: Array) -> Array:
@@ -19,7 +19,7 @@ def volume(pair: Pair, i: Values, j: Values, viscosity: Array) -> Array:
 
     Source: Adami, Hu & Adams (2013), doi:10.1016/j.jcp.2013.01.043.
     """
-    volumes = (i["m"] / i["rho"]) ** 2 + (j["m"] / j["rho"]) ** 2
+    volumes = i["volume"] ** 2 + j["volume"] ** 2
     density = 2 * i["rho"] * j["rho"] / (i["rho"] + j["rho"])
     return volumes * density * viscosity * pair.pull * (i["u"] - j["u"]) / i["m"]
 
@@ -30,25 +30,24 @@ def source(pair: Pair, i: Values, j: Values, viscosity: Array) -> Array:
     Source: Müller, Charypar & Gross (2003), doi:10.2312/SCA03/154-159, eq. 14 in 2D; ReCoDE-SPH-solver-2D-NS (2024).
     """
     laplacian = 40 / (jnp.pi * pair.h**4) * jnp.maximum(1 - pair.distance / pair.h, 0.0)
-    return -viscosity * j["m"] / j["rho"] * laplacian * (i["u"] - j["u"]) / i["rho"]
+    return -viscosity * j["volume"] * laplacian * (i["u"] - j["u"]) * i["specific"]
 
 
-def artificial(pair: Pair, i: Values, j: Values, gradient: Array, strength: Array) -> Array:
-    """Return Monaghan's artificial viscosity between particles that come closer, zero else.
+def artificial(pair: Pair, i: Values, j: Values, strength: Array) -> Array:
+    """Return the factor of ∇W in Monaghan's artificial viscosity, shape []: of particles that come closer, zero else.
 
-    -m_j Π ∇W, Π = -αch φ/ρ̄, φ = v·r/(r² + h²/100) where that is negative.
+    -m_j Π, Π = -αch φ/ρ̄, φ = v·r/(r² + h²/100) where that is negative.
 
     Args:
         pair: The pair.
         i: Values of i.
         j: Values of j.
-        gradient: ∇W at i, shape [d].
         strength: αc [m/s].
 
     Source: Monaghan (1992), doi:10.1146/annurev.aa.30.090192.002551.
     """
-    approach = jnp.minimum((j["v"] - i["v"]) @ pair.r, 0.0) / (pair.square + 0.01 * pair.h**2)
-    return 2 * strength * pair.h * j["m"] * approach / (i["rho"] + j["rho"]) * gradient
+    approach = jnp.minimum((j["v"] - i["v"]) @ pair.r, 0.0)
+    return 2 * strength * pair.h * j["m"] * approach / ((pair.square + 0.01 * pair.h**2) * (i["rho"] + j["rho"]))
 
 
 VISCOSITIES = {"morris": morris, "volume": volume, "source": source}
