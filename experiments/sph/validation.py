@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -167,6 +168,25 @@ def drop(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
     return figures, {"measured": curve(times, moments), "known": curve(times, exact)}
 
 
+def square_drop(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
+    """Pressure in the middle over Laplace's σ/R, and how round the rim is: its distance from the center over R, the volume's."""
+    tension = scene.physics.surface_tension
+    assert tension is not None, "a drop that nothing makes round"
+    radius = np.sqrt(scene.n / np.pi) * scene.spacing
+    inside = [float(at.p[np.linalg.norm(at.x, axis=1) < radius / 2].mean() * radius / tension) for at in seen]
+    last = seen[-1]
+    angles, distances = np.arctan2(*last.x.T), np.linalg.norm(last.x, axis=1)
+    sectors = np.linspace(-np.pi, np.pi, 17)
+    rim = np.array([distances[(angles >= a) & (angles <= b)].max() for a, b in pairwise(sectors)])
+    rim = (rim + scene.spacing / 2) / radius
+    figures = [
+        Figure("pressure inside over Laplace's, mean of late times", float(np.mean(inside[len(inside) // 2 :])), 0.9, 1.1),
+        Figure("rim over R, largest deviation of 16", float(np.abs(rim - 1).max()), None, 0.05),
+    ]
+    times = np.array([at.time for at in seen])
+    return figures, {"measured": curve(times, np.array(inside)), "known": curve(times, np.ones_like(times))}
+
+
 def hydrostatic(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
     """Pressure over height, damping being over, and the largest speed left."""
     height, last = 0.9, seen[-1]
@@ -210,6 +230,7 @@ CASES = {
     **{name: Case(name, _FEW_TIMES, few, backend="brute") for name in ("one", "two", "three", "four")},
     "taylor-green": Case("taylor-green", _times(2.0, 20), taylor_green),
     "drop": Case("drop", _times(0.0076, 20), drop, axes=("time [s]", "half major axis [m]")),
+    "square-drop": Case("square-drop", _times(3.0, 12), square_drop, axes=("time [s]", "pressure inside [Laplace's]")),
     "hydrostatic": Case("hydrostatic", (2.5, 3.0, 3.5, 4.0), hydrostatic, axes=("y [m]", "pressure [Pa]")),
     "dam-break-20": Case("dam-break-2d", _times(0.8, 80), dam_break, {"nx": 20}, axes=_FRONT),
     "dam-break-40": Case("dam-break-2d", _times(0.8, 80), dam_break, {"nx": 40}, axes=_FRONT),
