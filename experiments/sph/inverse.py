@@ -69,7 +69,7 @@ def solve(problem: Problem, evaluations: int = 30) -> Found:
         tried.append((guess.copy(), float(value)))
         return float(value), np.asarray(slope, np.float64)
 
-    minimize(evaluated, problem.start, jac=True, method="L-BFGS-B", options={"maxfun": evaluations, "ftol": 1e-12, "gtol": 1e-9})
+    minimize(evaluated, problem.start, jac=True, method="L-BFGS-B", options={"maxfun": evaluations, "ftol": 1e-10, "gtol": 1e-9})
     parameters, losses = np.array([guess for guess, _ in tried]), np.array([value for _, value in tried])
     return Found(parameters, losses, parameters[losses.argmin()], float(losses.min()))
 
@@ -173,7 +173,7 @@ def droplet(*, goal: float = 0.4, intervals: int = 8, backend: str = "auto") -> 
         intervals: Of the force.
         backend: Of `jfrnn.pair_sum`.
     """
-    scene = _droplet_scene()
+    scene = droplet_scene()
     model, s = make_model(scene, backend=backend), make_state(scene)
     fluid = ~scene.wall
     each = _square(scene.duration / scene.step / intervals)
@@ -196,7 +196,8 @@ def steered(model: Model, s: State, forces: Array, each: int) -> State:
     return jax.lax.scan(interval, solver.begin(model, s), forces)[0]
 
 
-def _droplet_scene(spacing: float = 0.04 / 3, radius: float = 0.04, length: float = 0.8) -> "FluidScene":
+def droplet_scene(spacing: float = 0.04 / 3, radius: float = 0.04, length: float = 0.8) -> "FluidScene":
+    """Return a droplet above the ground, which it will reach in 0.06 s."""
     grid = lattice((-radius, -radius), (round(2 * radius / spacing),) * 2, spacing)
     disc = grid[(grid**2).sum(axis=1) <= radius**2] + (0.0, 0.06)  # 2 cm above the ground
     ground = lattice((-0.15, -LAYERS * spacing), (round(length / spacing), LAYERS), spacing)

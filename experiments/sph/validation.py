@@ -229,7 +229,10 @@ _FRONT = ("t √(2g/a)", "front [column widths]")
 CASES = {
     **{name: Case(name, _FEW_TIMES, few, backend="brute") for name in ("one", "two", "three", "four")},
     "taylor-green": Case("taylor-green", _times(2.0, 20), taylor_green),
-    "drop": Case("drop", _times(0.0076, 20), drop, axes=("time [s]", "half major axis [m]")),
+    **{
+        f"drop{name}": Case("drop", _times(0.0076, 20), drop, {"nx": nx}, axes=("time [s]", "half major axis [m]"))
+        for name, nx in (("-20", 20), ("", 40), ("-60", 60))
+    },
     "square-drop": Case("square-drop", _times(3.0, 12), square_drop, axes=("time [s]", "pressure inside [Laplace's]")),
     "hydrostatic": Case("hydrostatic", (2.5, 3.0, 3.5, 4.0), hydrostatic, axes=("y [m]", "pressure [Pa]")),
     "dam-break-20": Case("dam-break-2d", _times(0.8, 80), dam_break, {"nx": 20}, axes=_FRONT),
