@@ -32,6 +32,7 @@ class Physics:
         transport: Background pressure [Pa] of the transport velocity, which keeps particles evenly spread.
         shifting: Strength of particle shifting.
         tension: Strength of cohesion [m³/s²/kg · kg], see `experiments.sph.surface`.
+        surface_tension: σ [N/m] of a free surface, as a continuum force.
         corrected: Gradients of the kernel are renormalized, so that linear fields have exact gradients.
         gravity: Acceleration [m/s²], one number per axis.
         damping: Rate [1/s] at which velocities decay besides, so that sound does while a scene settles.
@@ -57,6 +58,7 @@ class Physics:
     transport: float | None = None
     shifting: float | None = None
     tension: float | None = None
+    surface_tension: float | None = None
     corrected: bool = False
     gravity: tuple[float, ...] | None = None
     damping: float | None = None

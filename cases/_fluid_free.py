@@ -1,4 +1,4 @@
-"""Fluids with a free surface: a tank at rest, an elliptical drop, dam breaks, an oil jet onto a plate."""
+"""Fluids with a free surface: a tank at rest, an elliptical and a square drop, dam breaks, an oil jet onto a plate."""
 
 import math
 from dataclasses import replace
@@ -93,6 +93,37 @@ def drop(*, radius: float = 1.0, nx: int = 40, duration: float = 0.0076, sound_s
     )
 
 
+def square_drop(
+    *, side: float = 1.0, nx: int = 20, surface_tension: float = 1.0, viscosity: float = 0.1, duration: float = 3.0
+) -> FluidScene:
+    """Return a square in free space, of density 1, that surface tension makes round: under σ/R inside, R = side/√π, in the end.
+
+    Args:
+        side: Of the square [m].
+        nx: Particles along it.
+        surface_tension: σ [N/m; in 2D N].
+        viscosity: ν [m²/s]: what brings it to rest.
+        duration: Time that is simulated [s].
+
+    Source: Brackbill, Kothe & Zemach (1992), doi:10.1016/0021-9991(92)90240-Y, after their relaxing rod.
+    """
+    spacing = side / nx
+    sound_speed = 15 * math.sqrt(surface_tension / side)
+    square = lattice((-side / 2,) * 2, (nx, nx), spacing)
+    physics = replace(free(1.0, sound_speed, spacing), surface_tension=surface_tension, viscosity=viscosity)
+    return FluidScene(
+        name="square-drop",
+        positions=square,
+        velocities=np.zeros_like(square),
+        masses=np.full(len(square), spacing**2),
+        spacing=spacing,
+        duration=duration,
+        step=0.25 * physics.smoothing / (1.1 * sound_speed),
+        physics=physics,
+        bounds=Tank((-0.75 * side,) * 2, (0.75 * side,) * 2),
+    )
+
+
 def dam_break(
     *, width: float = 1.0, nx: int = 40, dim: int = 2, tank: float = 4.0, depth: float = 0.5, duration: float = 0.8
 ) -> FluidScene:
@@ -131,6 +162,7 @@ def jet(
     duration: float = 5e-3,
     viscosity: float = 2e-5,
     tension: float = 0.0,
+    surface_tension: float = 0.0,
 ) -> FluidScene:
     """Return a jet of oil (860 kg/m³) that leaves a nozzle downwards and hits a flat plate: a few percent of its box.
 
@@ -143,6 +175,7 @@ def jet(
         duration: Time that is simulated, and for which oil comes [s].
         viscosity: ν [m²/s].
         tension: Cohesion [m/s²/kg]; 0: there is none.
+        surface_tension: σ [N/m] as a continuum force, of oil about 0.03; 0: there is none.
     """
     spacing = diameter / layers
     disc = lattice((-diameter / 2,) * 2, (layers, layers), spacing)
@@ -161,7 +194,7 @@ def jet(
         spacing=spacing,
         duration=duration,
         step=0.25 * 1.5 * spacing / (12 * speed),
-        physics=replace(physics, tension=tension or None),
+        physics=replace(physics, tension=tension or None, surface_tension=surface_tension or None),
         wall=wall,
         bounds=Tank((-plate / 2, -plate / 2, 0.0), (plate / 2, plate / 2, height)),
         enters=np.concatenate([np.repeat(enters, len(disc)), np.zeros(len(ground))]).astype(np.float64),
@@ -193,4 +226,11 @@ def _in_tank(
     )
 
 
-SCENES = {"hydrostatic": hydrostatic, "drop": drop, "dam-break-2d": dam_break, "dam-break-3d": dam_break_3d, "jet": jet}
+SCENES = {
+    "hydrostatic": hydrostatic,
+    "drop": drop,
+    "square-drop": square_drop,
+    "dam-break-2d": dam_break,
+    "dam-break-3d": dam_break_3d,
+    "jet": jet,
+}

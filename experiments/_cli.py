@@ -248,6 +248,22 @@ def sph_speed(
 
 
 @app.command()
+def sph_gradients(
+    names: Annotated[list[str] | None, typer.Argument(help="viscosity, jet, droplet, memory; all without.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of tables and pictures.")] = Path("out") / "sph-gradients",
+    evaluations: Annotated[int, typer.Option(min=1, help="Runs to solve a problem with, at most.")] = 25,
+) -> None:
+    """Solve inverse problems by gradients through whole runs of a fluid, and measure the memory that such gradients take."""
+    with _usage_errors():
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        from experiments.sph import gradients
+
+        typer.echo(gradients.run(names or [], out, evaluations))
+
+
+@app.command()
 def peers(
     names: Annotated[list[str] | None, typer.Argument(help="Of libraries; all that are known without.")] = None,
     out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "peers",

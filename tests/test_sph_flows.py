@@ -82,6 +82,18 @@ def test_an_elliptical_drop_stretches():
 
 
 @pytest.mark.slow
+def test_a_square_drop_becomes_round():
+    scene = fluids.fluid("square-drop", nx=16, duration=2.0)
+    model, s = run(scene)
+    x, radius = np.asarray(s.x), 1 / np.sqrt(np.pi)
+    p = np.asarray(jax.jit(forces.density_and_pressure)(model, s)[1])
+    assert p[np.linalg.norm(x, axis=1) < radius / 2].mean() == pytest.approx(1.0 / radius, rel=0.15)
+    corner, side = (np.abs(x @ along).max() for along in (np.array([1.0, 1.0]) / np.sqrt(2), np.array([1.0, 0.0])))
+    assert corner == pytest.approx(side, rel=0.03)  # 1.41 at first
+    assert np.abs(x.mean(axis=0)).max() < 1e-3
+
+
+@pytest.mark.slow
 def test_a_tank_at_rest_has_hydrostatic_pressure():
     scene = fluids.fluid("hydrostatic", ny=20, duration=2.5)
     model, s = run(scene)

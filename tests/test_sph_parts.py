@@ -128,6 +128,25 @@ def test_density_of_a_lattice(dim):
     np.testing.assert_allclose(rho[inner], 1.0, rtol=2e-3)
 
 
+@pytest.mark.parametrize(("dim", "n", "h", "share"), [(2, 16, 2.0, 0.05), (3, 8, 1.5, 0.12)])
+def test_continuum_tension_presses_as_laplace_says(dim, n, h, share):
+    """Σ m a·x = -∫ d p dV, p = (d-1) σ/R, of a ball whose particles are not in order."""
+    spacing, kernel = 1 / n, KERNELS["wendland2"]
+    x = lattice(2 * n, dim) * 2 - 1
+    x = x[jnp.sum(x**2, axis=1) < 1]
+    m, rho = jnp.full(len(x), spacing**dim), jnp.ones(len(x))
+    values = {"m": m, "rho": rho}
+    normals = total(lambda pair, i, j: surface.inward(pair, j), x, values, kernel, h * spacing)
+    directions, known = surface.directions(normals, h * spacing)
+    sums = total(surface.bend, x, values | {"normal": directions, "known": known}, kernel, h * spacing)
+    a = surface.continuum(sums, normals, known, rho, jnp.asarray(0.3))
+    volume = spacing**dim * len(x)
+    radius = (volume / {2: np.pi, 3: 4 / 3 * np.pi}[dim]) ** (1 / dim)
+    assert jnp.sum(m[:, None] * a * x) == pytest.approx(-dim * (dim - 1) * 0.3 / radius * volume, rel=share)
+    assert not np.asarray(a)[np.linalg.norm(x, axis=1) < 1 - 3 * h * spacing].any()
+    assert np.isfinite(jax.grad(lambda n: jnp.sum(surface.directions(n, 0.1)[0]))(jnp.zeros((3, dim)))).all()
+
+
 @pytest.mark.slow
 def test_corrected_gradients_are_exact_for_linear_fields(dim):
     n, kernel = {2: 12, 3: 7}[dim], KERNELS["wendland2"]

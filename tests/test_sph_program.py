@@ -27,6 +27,7 @@ PARTS = {
     "artificial viscosity": {"artificial": 0.1},
     "density diffusion": {"density_diffusion": 0.1},
     "cohesion": {"tension": 1.0},
+    "surface tension": {"surface_tension": 1.0},
     "damping": {"damping": 1.0},
     "gravity": {"gravity": (0.0, -1.0)},
     "transport velocity": {"transport": 1.0},

@@ -9,7 +9,7 @@ from jfrnn.cases import fluids
 from typer.testing import CliRunner
 
 from experiments._cli import app
-from experiments.sph import answers, validate
+from experiments.sph import answers, potential, validate
 from experiments.sph.validation import CASES, Case, Figure, Seen
 
 SHORT = Case(
@@ -38,6 +38,33 @@ def test_what_is_exact_meets_its_targets_and_what_is_not_misses_them(name):
     for factor, met in ((1.0, True), (1.1, False)):
         figures, _ = case.judge(scene, [exact(name, x, time, factor) for time in case.times])
         assert [figure.met for figure in figures] == [met] * len(figures)
+
+
+def test_a_dam_break_is_compared_with_a_perfect_fluid():
+    case = CASES["dam-break-20"]
+    scene = fluids.fluid(case.scene, **case.settings)
+    times = np.array([0.1, 0.2])
+    fronts = potential.fronts(times * np.sqrt(2 * 9.81))
+    for factor, met in ((1.0, True), (0.85, False)):
+        empty = Seen(0.0, np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1), 0.0, 0.0)
+        places = factor * fronts - scene.spacing / 2
+        seen = [empty._replace(time=t, x=np.array([[x, 0.0]])) for t, x in zip(times, places, strict=True)]
+        (perfect, *experiments), curves = case.judge(scene, seen)
+        assert perfect.met == met
+        assert perfect.measured == pytest.approx(1 - factor, abs=1e-9)
+        assert [figure.met for figure in experiments] == [factor == 0.85] * 2  # a perfect fluid is ahead of both
+        assert set(curves) == {"measured", "a perfect fluid, computed", "a = 1.125 in, known", "a = 2.25 in, known"}
+
+
+def test_a_round_drop_under_the_right_pressure_meets_its_targets():
+    scene = fluids.fluid("square-drop", nx=40)
+    radius = np.sqrt(scene.n / np.pi) * scene.spacing
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 60) * radius] * 2), axis=-1).reshape(-1, 2)
+    x = grid[np.linalg.norm(grid, axis=1) <= radius - scene.spacing / 2]
+    for stretch, factor, met in ((1.0, 1.0, [True, True]), (1.0, 1.2, [False, True]), (1.1, 1.0, [True, False])):
+        at = Seen(1.0, stretch * x, 0 * x, np.full(len(x), factor / radius), 0.0, 0.0)
+        figures, _ = CASES["square-drop"].judge(scene, [at, at])
+        assert [figure.met for figure in figures] == met
 
 
 def exact(name, x, time, factor):

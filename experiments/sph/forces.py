@@ -195,9 +195,19 @@ def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tupl
 
     sums = _sum(term, model, s, values, nbrs, "fluid")
     a = sums["a"] if physics.gravity is None else sums["a"] + physics.gravity
+    if physics.surface_tension is not None:
+        a = a + _tension(model, s, seen.rho, nbrs)
     if physics.damping is not None:
         a = a - _damping(model, s.time) * s.v
     return walls.fluid_only(guided(model, s.time), a), sums.get("w")
+
+
+def _tension(model: Model, s: State, rho: Array, nbrs: Neighbors) -> Array:
+    """Return accelerations by surface tension as a continuum force [m/s²], shape [n, d]; at walls there is no surface."""
+    n = _sum(lambda pair, i, j: surface.inward(pair, j), model, s, {"rho": rho}, nbrs)
+    normal, known = surface.directions(n, model.physics.smoothing)
+    sums = _sum(surface.bend, model, s, {"rho": rho, "normal": normal, "known": known}, nbrs)
+    return surface.continuum(sums, n, known, rho, model.physics.surface_tension)
 
 
 def _damping(model: Model, time: Array) -> Array:

@@ -145,7 +145,7 @@ def draw(row: Row) -> Picture:
         known = kind == "known"
         color = colors.setdefault(what, f"C{len(colors)}")
         if row.key.startswith("dam-break"):
-            axes.plot(x, y, "o" if known else "-", color=color, label=name, markersize=4)
+            axes.plot(x, y, {"known": "o", "computed": "--"}.get(kind, "-"), color=color, label=name, markersize=4)
         else:
             axes.plot(x, y, "-" if known else "o", color=color, label=name if len(row.curves) <= 4 else None, markersize=3, lw=1)
     if row.figures:
