@@ -1,0 +1,31 @@
+"""freud: cells with linked lists in C++, on all cores, with all ordered pairs, float32; open space as a box that is wide enough."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from freud import box as boxes  # pyright: ignore
+from freud import locality  # pyright: ignore
+
+from experiments.methods import Found
+
+PACKAGES = ("freud-analysis",)
+
+
+def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], Any]:
+    """Return a search that sorts the particles and lists the pairs."""
+    points = np.pad(positions, ((0, 0), (0, 3 - positions.shape[1])))
+    # around the origin, as its boxes are: to move the points instead would round them
+    box = boxes.Box(*(2 * float(most) + 3 * cutoff for most in np.abs(points).max(axis=0)))
+
+    def search() -> Any:  # noqa: ANN401
+        query: Any = locality.LinkCell(box, points, cell_width=cutoff)  # pyright: ignore
+        return query.query(points, {"r_max": cutoff, "exclude_ii": True}).toNeighborList()
+
+    return search
+
+
+def read(result: Any) -> Found:  # noqa: ANN401
+    """Return the ordered pairs."""
+    pairs = np.asarray(result[:], np.int64)
+    return Found(pairs.nbytes, (pairs[:, 0], pairs[:, 1]), directed=True)

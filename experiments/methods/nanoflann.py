@@ -1,0 +1,30 @@
+"""nanoflann through pynanoflann: a kd-tree in C++ with a row of neighbors per particle, in the dtype of the positions."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pynanoflann  # pyright: ignore[reportMissingImports]
+
+from experiments.methods import Found
+
+PACKAGES = ("pynanoflann",)
+
+
+def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], list[Any]]:
+    """Return a search that builds the tree and lists the rows, on one thread."""
+
+    def search() -> list[Any]:
+        tree = pynanoflann.KDTree(metric="L2", radius=cutoff)
+        tree.fit(positions)
+        return tree.radius_neighbors(positions, radius=cutoff, return_distance=False)
+
+    return search
+
+
+def read(result: list[Any]) -> Found:
+    """Return the ordered pairs, less each particle with itself."""
+    i = np.repeat(np.arange(len(result)), [len(row) for row in result])
+    j = np.concatenate(result).astype(np.int64)
+    others = i != j
+    return Found(int(sum(row.nbytes for row in result)), (i[others], j[others]), directed=True)

@@ -1,0 +1,32 @@
+"""`jfrnn.pair_sum` with the backend `warp`: density by the kernel poly6 and the number of neighbors, in one sum, without a list."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import warp as wp  # noqa: F401 - without it this method is missing, which is no failure
+
+import jfrnn
+from experiments.methods import Found
+
+
+def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], tuple[jax.Array, jax.Array]]:
+    """Compile the sum, and return it; all masses are 1, and distances are in cutoffs."""
+    jax.config.update("jax_enable_x64", positions.dtype == np.float64)
+    mass, one = jnp.ones(len(positions), positions.dtype), positions.dtype.type(1)
+
+    def poly6(r: jax.Array, i: dict[str, jax.Array], j: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        rest = jnp.maximum(1 - (r @ r) / (cutoff * cutoff), 0)
+        return j["m"] * rest * rest * rest, one
+
+    sums = jax.jit(lambda x: jfrnn.pair_sum(poly6, x, cutoff, {"m": mass}, backend="warp"))
+    jax.block_until_ready(sums(positions))
+    return lambda: jax.block_until_ready(sums(jnp.asarray(positions)))
+
+
+def read(result: tuple[jax.Array, jax.Array]) -> Found:
+    """Return the counts, shape [n]."""
+    density, count = result
+    size = density.nbytes + count.nbytes
+    return Found(size, counts=np.asarray(count).astype(np.int64), device=next(iter(count.devices())).device_kind)
