@@ -36,6 +36,7 @@ WAYS: dict[str, Prepare] = {
 }
 """What finds the pairs of each way: sums that search, our list with a skin, jax-md's list as jax-sph takes it (made anew in every
 step) and with a skin, and our list; the last three as edges, summed by segments."""
+_SECONDS = 2.0  # that a way runs in its turn at least, in up to five runs
 MOST_ROUNDINGS = 64  # by which two ways may differ after a step, see `difference`
 
 
@@ -283,9 +284,8 @@ def _timed(calls: dict[str, Callable[[], Any]], rounds: int) -> tuple[dict[str, 
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     bystanders = _measure.Bystanders()
     for _, (name, call) in itertools.product(range(rounds), calls.items()):
-        begin = perf_counter()
-        jax.block_until_ready(call())
-        seconds[name].append(perf_counter() - begin)
+        _, runs = _measure.repeat(lambda call=call: jax.block_until_ready(call()), 1, _SECONDS, 5)
+        seconds[name] += runs
     others = bystanders.cores()
     return seconds, None if others is None else round(others, 2)
 

@@ -1,6 +1,5 @@
 """Where a step's time goes: its stages as programs of their own, and what the whole takes besides."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +14,7 @@ from experiments.sph.model import Model, State
 
 STAGES = ("search", "density", "walls", "forces", "integration")
 _SUMS = ("density", "walls", "forces")
+_SECONDS = 5.0  # that runs of all stages take at least, up to 50 of each
 _BURST = 5  # calls that are not waited for one by one, on a device
 
 
@@ -26,8 +26,8 @@ def part_times(model: Model, s: State, way: str, skin: float, steps: int, rounds
         s: A state.
         way: "pair_sum" or "list".
         skin: Of the list [m].
-        steps: Of the whole, over which the list's being made anew is shared out.
-        rounds: Timed runs of each stage; medians count.
+        steps: Of a run, over which the list's being made anew is shared out.
+        rounds: Fewest timed runs of each stage, in turns; medians count.
 
     Returns:
         Seconds by stage, see `STAGES`, and how many cores others kept busy. "search": to find pairs, or to update the list; of
@@ -39,22 +39,24 @@ def part_times(model: Model, s: State, way: str, skin: float, steps: int, rounds
     calls = _finding(model, s) if nbrs is None else _updates(s, nbrs, skin)
     finding = tuple(calls)
     calls |= _sums(model, s, nbrs)
+    _, after = jax.block_until_ready(solver.advance(model, s, nbrs, steps))
+    calls["whole"] = lambda: solver.advance(model, s, nbrs, 1)[0].x
     for call in calls.values():
         jax.block_until_ready(call())
+    _, once = _measure.repeat(lambda: jax.block_until_ready([call() for call in calls.values()]), 1, 0.0, 1)
+    rounds = max(rounds, min(round(_SECONDS / once[0]), 50))
     seconds, others = _measure.time_in_turns(calls, rounds, burst=1 if jax.default_backend() == "cpu" else _BURST)
     median = {name: float(np.median(values)) for name, values in seconds.items()}
-    whole = functools.partial(solver.advance, model, s, nbrs, steps)
-    (_, after), runs = _measure.repeat(lambda: jax.block_until_ready(whole()), rounds + 1, 0.0, rounds + 1)
-    step = float(np.median(runs[1:])) / steps  # the first one was compiled
     parts = {name: median[name] for name in _SUMS}
-    if after is None:
+    if nbrs is None or after is None:
         found = {"density": median[finding[0]], "walls": median[finding[-1]], "forces": median[finding[0]]}
-        parts = {name: max(parts[name] - found[name], 0.0) for name in _SUMS}
+        parts |= {name: max(parts[name] - found[name], 0.0) for name in _SUMS}
         parts["search"] = sum(found.values())
+        parts["integration"] = median["whole"] - sum(parts.values())
     else:
+        parts["integration"] = median["whole"] - median["keep"] - sum(parts.values())
         share = int(after.rebuild_count) / steps
         parts["search"] = median["keep"] + share * max(median["anew"] - median["keep"], 0.0)
-    parts["integration"] = step - sum(parts.values())
     return {name: parts[name] for name in STAGES}, others
 
 
