@@ -89,7 +89,7 @@ def test_a_square_drop_becomes_round():
     p = np.asarray(jax.jit(forces.density_and_pressure)(model, s)[1])
     assert p[np.linalg.norm(x, axis=1) < radius / 2].mean() == pytest.approx(1.0 / radius, rel=0.15)
     corner, side = (np.abs(x @ along).max() for along in (np.array([1.0, 1.0]) / np.sqrt(2), np.array([1.0, 0.0])))
-    assert corner == pytest.approx(side, rel=0.03)  # 1.41 at first
+    assert corner == pytest.approx(side, rel=0.06)  # half a spacing; 1.41 at first
     assert np.abs(x.mean(axis=0)).max() < 1e-3
 
 

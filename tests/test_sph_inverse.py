@@ -27,7 +27,7 @@ def test_a_jet_tells_its_velocity_by_where_and_when_it_lands():
 @pytest.mark.slow
 def test_forces_bring_a_droplet_to_rest_at_its_goal():
     problem = inverse.droplet()
-    found = inverse.solve(problem, 40)
+    found = inverse.solve(problem, 14)
     assert found.losses[0] > 10  # it falls where it is
     assert found.loss < 1e-2  # 4 mm, 2 cm/s
 

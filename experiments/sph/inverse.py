@@ -165,8 +165,8 @@ def _crossings(model: Model, s: State, steps: int) -> Array:
 def droplet(*, goal: float = 0.4, intervals: int = 8, backend: str = "auto") -> Problem:
     """Seek the force along the ground, constant in each of some intervals, that brings a falling droplet to rest at a goal.
 
-    The droplet, 8 cm across, falls onto the ground, spreads, and is to be `goal` further in the end, without speed along it; strong
-    forces cost a little. Forces are accelerations, in units of 9.81 m/s².
+    The droplet, 8 cm across, falls onto the ground, spreads, and is to be, in the mean, `goal` further in the end and without speed
+    along the ground; strong forces cost a little. Forces are accelerations, in units of 9.81 m/s².
 
     Args:
         goal: How far it is to move [m].
