@@ -8,10 +8,11 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
+from jfrnn._auto import choose_engine, platform_of
 from jfrnn._inputs import checked_capacity, checked_cutoff, checked_positions, checked_slack
 from jfrnn._triangles_list import TriangleList, counted_slots, found_triangles
 
-_BACKENDS = ("auto", "jax")
+_BACKENDS = ("auto", "jax", "warp")
 
 
 def search_triangles(
@@ -43,7 +44,8 @@ def search_triangles(
         capacity: Slots per row, a static int. Required where positions, vertices or faces are traced. Default: `slack` times the
             longest row, rounded up to a multiple of 8.
         slack: Factor >= 1 on the counted capacity, room for later motion.
-        backend: "jax" (any device), or "auto": what is fastest.
+        backend: "warp" (compiled kernels, on the CPU), "jax" (any device), or "auto": "warp" on the CPU (where Warp is missing
+            "jax", with a warning), elsewhere "jax".
 
     Returns:
         A `TriangleList`; `idx` has shape [n, capacity], unused slots hold f. Rows are in no promised order, but the same input
@@ -51,6 +53,7 @@ def search_triangles(
 
     Raises:
         TypeError, ValueError: an argument is of the wrong kind, shape or range, or `capacity` is missing under jit.
+        ImportError, RuntimeError: "warp", and it is not installed or cannot run on the platform.
         Overflow of a given capacity, coordinates that are not finite and faces without vertices are known only from data: `status`,
         `overflow` and `check` tell.
 
@@ -69,7 +72,7 @@ def search_triangles(
     corners = checked_positions("vertices", vertices, like=points)
     named = _checked_faces(faces, points.shape[1], corners.shape[0])
     radius = float(checked_cutoff(cutoff, np.dtype(points.dtype)).radius)
-    engine, slack = _checked_engine(backend), checked_slack(slack)
+    engine, slack = _chosen_engine(backend, points), checked_slack(slack)
     if capacity is None:
         if any(isinstance(x, Tracer) for x in (points, corners, named)):
             raise ValueError(
@@ -95,7 +98,10 @@ def _checked_faces(faces: Any, dim: int, vertices: int) -> Array:  # noqa: ANN40
         return jnp.asarray(np.clip(np.asarray(faces).astype(np.int64), -1, vertices).astype(np.int32))
 
 
-def _checked_engine(backend: Any) -> str:  # noqa: ANN401
+def _chosen_engine(backend: Any, points: Array) -> str:  # noqa: ANN401
     if backend not in _BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(map(repr, _BACKENDS))}, got {backend!r}.")
-    return "jax"
+    platform = platform_of(points)
+    if backend == "warp" and platform != "cpu":
+        raise RuntimeError(f"backend='warp' finds triangles on the platform 'cpu' alone, got {platform!r}: pass backend='jax'.")
+    return "jax" if backend == "auto" and platform != "cpu" else choose_engine(backend, points, None)

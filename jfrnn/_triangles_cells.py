@@ -2,7 +2,7 @@
 
 A triangle stands in every cell from which it may be closer than the cutoff. So a particle looks into the one cell that it is in,
 meets no triangle twice, and none has to be told apart from earlier ones. Triangles differ in size by orders of magnitude: each
-takes the smallest cells, from about a cutoff on by powers of two, of which at most `_MOST_CELLS` hold it; in the largest, one cell
+takes the smallest cells, from about a cutoff on by powers of two, of which at most `MOST_CELLS` hold it; in the largest, one cell
 is all of space. The number of entries is therefore bounded by the number of triangles alone, however large they are: nothing can
 overflow. A particle looks once into each size that is in use.
 
@@ -22,8 +22,8 @@ from jax import Array, lax
 from jfrnn._exact import Cutoff
 from jfrnn._triangles_exact import Vector, cross, dot, minus
 
-_MOST_CELLS = {2: 8, 3: 16}  # per triangle, by dimension
-_LANES = {2: 32, 3: 128}  # cells of a box that are looked at one by one; a larger box takes larger cells
+MOST_CELLS = {2: 8, 3: 16}  # per triangle, by dimension
+LANES = {2: 32, 3: 128}  # cells of a box that are looked at one by one; a larger box takes larger cells
 _BLOCK = 1024  # triangles that are in work at a time
 _FARTHEST = 2.0**22  # cells from the origin, so that their centers are floats
 _BUCKETS_PER_TRIANGLE = 8
@@ -51,7 +51,7 @@ class TriangleCells(NamedTuple):
 
 def entry_count(faces: int, dim: int) -> int:
     """Return the number of entries for a number of triangles."""
-    return faces * _MOST_CELLS[dim]
+    return faces * MOST_CELLS[dim]
 
 
 def bucket_count(faces: int) -> int:
@@ -127,12 +127,12 @@ def _held_cells(corners: Array, cutoff: Cutoff) -> tuple[Array, Array, list[Arra
     high = jnp.clip(jnp.max(corners, axis=1) + radius, -finfo.max, finfo.max)
 
     start = _finest_level(low, high, cutoff)
-    state = (start, jnp.zeros((start.size, _LANES[dim]), bool), jnp.ones(start.size, bool))
+    state = (start, jnp.zeros((start.size, LANES[dim]), bool), jnp.ones(start.size, bool))
 
     def try_level(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         level, _, undecided = state
         held, complete = _cells_at(level, corners, low, high, radius)
-        too_many = undecided & (~complete | (jnp.sum(held, axis=1, dtype=jnp.int32) > _MOST_CELLS[dim])) & (level > 0)
+        too_many = undecided & (~complete | (jnp.sum(held, axis=1, dtype=jnp.int32) > MOST_CELLS[dim])) & (level > 0)
         return level - too_many.astype(jnp.int32), held, too_many
 
     level, held, _ = lax.while_loop(lambda state: jnp.any(state[2]), try_level, state)
@@ -142,7 +142,7 @@ def _held_cells(corners: Array, cutoff: Cutoff) -> tuple[Array, Array, list[Arra
 def _finest_level(low: Array, high: Array, cutoff: Cutoff) -> Array:
     """Return the level of the smallest cells that triangles may take: about a cutoff, and not too many or too far away; [b]."""
     bias = 127 if low.dtype == jnp.float32 else 1023
-    lanes = _LANES[low.shape[1]]
+    lanes = LANES[low.shape[1]]
     farthest = _exponent(jnp.max(jnp.maximum(jnp.abs(low), jnp.abs(high)), axis=1))
     extent = _exponent(jnp.max(high - low, axis=1))
     level = jnp.minimum(2 * bias + int(np.log2(_FARTHEST)) - 1 - farthest, 2 * bias + int(np.log2(lanes)) - extent)
@@ -167,7 +167,7 @@ def _box_cells(level: Array, low: Array, high: Array) -> tuple[list[Array], Arra
     dim = low.shape[1]
     scale = scale_of(level, np.dtype(low.dtype))
     first, last = (cells_of(x, scale[:, None]) for x in (low, high))
-    lanes, span = _LANES[dim], last - first + 1
+    lanes, span = LANES[dim], last - first + 1
     lane, cells = lax.iota(jnp.int32, lanes)[None], []
     for k in range(dim - 1):
         width = jnp.minimum(span[:, k, None], lanes)

@@ -99,13 +99,14 @@ def make_normals(vertices: Array, faces: Array, corners: Array, good: Array) -> 
     named = jnp.where(good[:, None], faces, count)
     if dim == 2:
         along = corners[:, 1] - corners[:, 0]
-        normal = _unit(jnp.stack([along[:, 1], -along[:, 0]], axis=1)) * good[:, None]
+        normal = _unit(jnp.stack([along[:, 1], -along[:, 0]], axis=1)) * good[:, None].astype(corners.dtype)
         sums = jnp.zeros_like(vertices).at[named].add(normal[:, None], mode="drop")
         ends = jnp.zeros((count, 2), jnp.int32).at[named, jnp.arange(2)].add(1, mode="drop")
         whole = jnp.all((ends == 1) | (ends.sum(axis=1) == 0)[:, None])
         return Normals(normal, jnp.zeros((faces.shape[0], 0, 2), vertices.dtype), sums, whole)
     after, before = jnp.roll(corners, -1, axis=1), jnp.roll(corners, 1, axis=1)
-    normal = _unit(jnp.cross(_unit(corners[:, 1] - corners[:, 0]), _unit(corners[:, 2] - corners[:, 0]))) * good[:, None]
+    across = jnp.cross(_unit(corners[:, 1] - corners[:, 0]), _unit(corners[:, 2] - corners[:, 0]))
+    normal = _unit(across) * good[:, None].astype(corners.dtype)
     one, two = _unit(after - corners), _unit(before - corners)
     angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(one, two), axis=-1), jnp.sum(one * two, axis=-1))
     sums = jnp.zeros_like(vertices).at[named].add(angle[..., None] * normal[:, None], mode="drop")

