@@ -69,6 +69,12 @@ def _foot_on_face(x: list[Vector]) -> tuple[Vector, Array]:
     whole = jnp.where(inside, sum_of(parts), 1)
     weights = [jnp.where(inside, part / whole, 0) for part in parts]
     foot = [sum_of([w * corner[k] for w, corner in zip(weights, x, strict=True)]) for k in range(3)]
+    one, two, area = (dot(v, v) for v in (minus(x[1], x[0]), minus(x[2], x[0]), normal))
+    well_shaped = inside & (
+        area > 2.0**-6 * one * two
+    )  # its normal is known: no rounding along the face, then, at contact above all
+    height = jnp.where(well_shaped, dot(x[0], normal) / jnp.where(well_shaped, area, 1), 0)
+    foot = [jnp.where(well_shaped, height * n, f) for n, f in zip(normal, foot, strict=True)]
     return foot, jnp.where(inside, dot(foot, foot), jnp.inf)
 
 
