@@ -221,13 +221,14 @@ def found_triangles(
 ) -> dict[str, Any]:
     """Return the fields of a list that come from data; with capacity=None only counts. `cells`: those of an earlier list."""
     radius = make_cutoff(cutoff, np.dtype(points.dtype), closed=False)
-    return _find(*lax.stop_gradient((points, vertices, faces)), cells, radius, backend, capacity)
+    return find_triangles(*lax.stop_gradient((points, vertices, faces)), cells, radius, backend, capacity)
 
 
 @functools.partial(jax.jit, static_argnames=("backend", "capacity"))
-def _find(
+def find_triangles(
     points: Array, vertices: Array, faces: Array, cells: TriangleCells | None, cutoff: Cutoff, backend: str, capacity: int | None
 ) -> dict[str, Any]:
+    """List or count triangles: the compiled program of a search."""
     corners, finite, there = without_faults(vertices, faces)
     sound = {
         Status.NONFINITE: jnp.all(jnp.isfinite(points)),

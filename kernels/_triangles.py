@@ -160,6 +160,9 @@ struct Shape {
                 if constexpr (DOUBLE)
                     x[c][k] *= scale;
             }
+        for (int c = 0; c < DIM; ++c)  // as most that are near, where triangles are small
+            if (product(x[c], x[c]) * (1 + 16 * EPS) < r * r)
+                return true;
         for (int c = 0; c < (DIM == 3 ? 3 : 1); ++c) {
             const int next = (c + 1) % DIM;
             double along[DIM], point[DIM];

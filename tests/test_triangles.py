@@ -233,3 +233,23 @@ def test_engines_make_the_same_cells():
     one, two = (jfrnn.search_triangles(*padded(given), given.cutoff, capacity=40, backend=backend) for backend in BACKENDS)
     assert np.array_equal(one.cells.level_of, two.cells.level_of)
     assert np.array_equal(one.idx, two.idx)
+
+
+@pytest.mark.parametrize("faces", [0, 500])
+def test_memory_is_planned(dtype, dim, faces):
+    """What the list takes is known beforehand, and follows particles and faces alone."""
+    plan = jfrnn.memory_plan(1000, 0.1, 16, dim=dim, dtype=dtype, faces=faces)
+    vertices = np.random.default_rng(0).normal(size=(400, dim)).astype(dtype)
+    named = np.random.default_rng(1).integers(0, 400, (faces, dim))
+    tri = jfrnn.search_triangles(np.zeros((1000, dim), dtype), vertices, named, 0.1, capacity=16)
+    made = jax.tree.leaves((tri.idx, tri.count, tri.status, tri.required, tri.cells))
+    assert 0 <= plan.list_bytes - sum(leaf.nbytes for leaf in made) <= 16 * len(made)  # a table of results
+    assert plan.scratch_bytes < 1000 * (64 + faces)
+    assert plan.backend == tri.backend == "warp"
+
+
+def test_plans_that_make_no_sense_are_refused():
+    with pytest.raises(ValueError, match="faces belong to a search for triangles"):
+        jfrnn.memory_plan(10, 0.1, 8, faces=10, queries=10)
+    with pytest.raises(ValueError, match="finds no triangles"):
+        jfrnn.memory_plan(10, 0.1, 8, faces=10, backend="brute")
