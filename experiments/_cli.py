@@ -299,6 +299,21 @@ def show(
 
 
 @app.command()
+def triangles(
+    out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform and backend.")] = Path("out") / "triangles",
+    points: Annotated[int, typer.Option(min=100, help="Random points in the box of a gear.")] = 250_000,
+    faces: Annotated[int, typer.Option(min=100, help="Of the gear, about.")] = 12_000,
+    rounds: Annotated[int, typer.Option(min=2, help="Timed runs of each way.")] = 15,
+    backend: Annotated[str, typer.Option(help="warp or jax.")] = "warp",
+) -> None:
+    """Time the triangles of a gear that are near particles, beside trimesh and libigl where they are installed."""
+    with _usage_errors():
+        from experiments import _triangles
+
+        typer.echo(_triangles.table(_triangles.measure(out, points, faces, rounds, backend)))
+
+
+@app.command()
 def export(
     layout: Layout,
     out: Annotated[Path, typer.Option(help="File: .csv, .vtp or .vtk.")],

@@ -17,6 +17,8 @@ from jfrnn._order import hilbert_decode, hilbert_encode, morton_decode, morton_e
 from jfrnn._pair_sum import pair_sum
 from jfrnn._search import count, search
 from jfrnn._status import NeighborOverflowError, Status
+from jfrnn._triangles import search_triangles
+from jfrnn._triangles_list import TriangleList
 
 __all__ = [
     "Box",
@@ -24,6 +26,7 @@ __all__ = [
     "NeighborList",
     "NeighborOverflowError",
     "Status",
+    "TriangleList",
     "count",
     "hilbert_decode",
     "hilbert_encode",
@@ -33,5 +36,6 @@ __all__ = [
     "pair_sum",
     "run_chunk",
     "search",
+    "search_triangles",
     "sort_order",
 ]

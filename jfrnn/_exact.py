@@ -47,8 +47,8 @@ class Pair(NamedTuple):
 
 PointsAt = Callable[[Array | None], Pair]
 
-_LIMB_BITS = 11
-_LIMB_MASK = (1 << _LIMB_BITS) - 1
+LIMB_BITS = 11
+_LIMB_MASK = (1 << LIMB_BITS) - 1
 _UNKNOWN = 2  # a sign that step 2 could not prove
 _INTEGER_CHUNK = 64  # pairs that one round of the integer test decides
 
@@ -457,13 +457,13 @@ def _integer_sign(pair: Pair, threshold: _Threshold) -> Array:
     count = differences.shape[-1]
 
     def add_shifted(i: Array, total: Array) -> Array:
-        squares = -_limb(radius, i) * radius
-        squares = squares + jnp.sum(_limb(differences, i) * differences, axis=0, dtype=jnp.int32)
+        squares = -limb_of(radius, i) * radius
+        squares = squares + jnp.sum(limb_of(differences, i) * differences, axis=0, dtype=jnp.int32)
         window = lax.dynamic_slice_in_dim(total, i, count, axis=1)
         return lax.dynamic_update_slice_in_dim(total, window + squares, i, axis=1)
 
     total = jnp.zeros((radius.shape[0], 2 * count), jnp.int32)
-    return _sign_of_limbs(lax.fori_loop(0, count, add_shifted, total))
+    return sign_of_limbs(lax.fori_loop(0, count, add_shifted, total))
 
 
 def _carried(limbs: Array) -> Array:
@@ -471,24 +471,24 @@ def _carried(limbs: Array) -> Array:
 
     def carry_on(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         limbs, carry = state
-        value = _limb(limbs, i) + carry
-        carry = (value + (1 << (_LIMB_BITS - 1))) >> _LIMB_BITS
-        return lax.dynamic_update_slice_in_dim(limbs, value - (carry << _LIMB_BITS), i, axis=-1), carry
+        value = limb_of(limbs, i) + carry
+        carry = (value + (1 << (LIMB_BITS - 1))) >> LIMB_BITS
+        return lax.dynamic_update_slice_in_dim(limbs, value - (carry << LIMB_BITS), i, axis=-1), carry
 
     return lax.fori_loop(0, limbs.shape[-1], carry_on, (limbs, jnp.zeros_like(limbs[..., :1])))[0]
 
 
-def _limb(x: Array, i: Array) -> Array:
+def limb_of(x: Array, i: Array) -> Array:
     return lax.dynamic_slice_in_dim(x, i, 1, axis=-1)
 
 
-def _sign_of_limbs(total: Array) -> Array:
+def sign_of_limbs(total: Array) -> Array:
     """Carry upwards with floor division: the last carry holds the sign, the remainders tell zero from positive."""
 
     def carry_on(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         carry, seen = state
-        value = _limb(total, i)[:, 0] + carry
-        return value >> _LIMB_BITS, seen | (value & _LIMB_MASK)
+        value = limb_of(total, i)[:, 0] + carry
+        return value >> LIMB_BITS, seen | (value & _LIMB_MASK)
 
     zero = jnp.zeros(total.shape[0], jnp.int32)
     carry, seen = lax.fori_loop(0, total.shape[1], carry_on, (zero, zero))
@@ -498,16 +498,16 @@ def _sign_of_limbs(total: Array) -> Array:
 def _limbs(x: Array) -> Array:
     """Write finite floats [...] as signed int32 limbs [..., count], in units of the smallest denormal, lowest limb first."""
     finfo = jnp.finfo(x.dtype)
-    sign, exponent, high, low = _fields(x)
+    sign, exponent, high, low = fields_of(x)
     place = jnp.maximum(exponent, 1) - 1
     width = finfo.nmant + 1
-    count = -(-(finfo.maxexp - finfo.minexp + width) // _LIMB_BITS)
-    shift = jnp.arange(count, dtype=jnp.int32) * _LIMB_BITS - place[..., None]
-    limbs = _shift_right(high[..., None], low[..., None], shift) & np.uint32(_LIMB_MASK)
+    count = -(-(finfo.maxexp - finfo.minexp + width) // LIMB_BITS)
+    shift = jnp.arange(count, dtype=jnp.int32) * LIMB_BITS - place[..., None]
+    limbs = shift_right(high[..., None], low[..., None], shift) & np.uint32(_LIMB_MASK)
     return jnp.where(sign[..., None], -1, 1) * limbs.astype(jnp.int32)
 
 
-def _fields(x: Array) -> tuple[Array, Array, Array, Array]:
+def fields_of(x: Array) -> tuple[Array, Array, Array, Array]:
     """Split floats into sign, biased exponent and the mantissa with its leading bit, as high and low uint32 words."""
     bits = lax.bitcast_convert_type(x, jnp.uint32)
     top, below = (bits, None) if x.dtype == jnp.float32 else (bits[..., 1], bits[..., 0])
@@ -521,7 +521,7 @@ def _fields(x: Array) -> tuple[Array, Array, Array, Array]:
     return sign, exponent, mantissa, below
 
 
-def _shift_right(high: Array, low: Array, shift: Array) -> Array:
+def shift_right(high: Array, low: Array, shift: Array) -> Array:
     """Return the low word of (high·2^32 + low) >> shift; a negative shift goes left."""
 
     def shifted(word: Array, by: Array) -> Array:  # XLA leaves shifts by 32 or more to the hardware: clamp, then mask

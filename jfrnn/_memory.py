@@ -19,6 +19,7 @@ from jfrnn._exact import Cutoff
 from jfrnn._inputs import checked_backend, checked_capacity, checked_cutoff, checked_kind, checked_size
 from jfrnn._pair_sum import pair_sum
 from jfrnn._runs import Filter
+from jfrnn._triangles_list import find_triangles
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,10 +62,11 @@ def memory_plan(
     fn: Callable[[Any, Any, Any], Any] | None = None,
     values: Any = None,  # noqa: ANN401
     gradient: bool = False,
+    faces: int | None = None,
     backend: str = "auto",
     platform: str | None = None,
 ) -> MemoryPlan:
-    """Say what one `search`, or with fn one `pair_sum`, of these shapes will take of the memory, before anything is allocated.
+    """Say what one `search`, `pair_sum` (fn) or `search_triangles` (faces) of these shapes will take of the memory, beforehand.
 
     Nothing depends on where the particles are. "warp" and "hashgrid": the sizes of the arrays that they ask for, known for a
     platform that is elsewhere too. "jax" and "brute": what XLA reports of the program that it compiles for these shapes, which
@@ -82,6 +84,7 @@ def memory_plan(
         fn: As in `pair_sum`, which is planned then.
         values: Of it, a pytree of arrays or of their shapes (`jax.ShapeDtypeStruct`), [n, ...].
         gradient: The plan is that of the sums and of a gradient in the positions, of a function of all sums of floats.
+        faces: Triangles of a wall, in 2D segments: the plan is that of `search_triangles`, compiled, cells being part of the list.
         backend: As in `search` or `pair_sum`.
         platform: JAX platform, such as "cpu" or "gpu"; default: the one on which JAX makes arrays now.
 
@@ -106,6 +109,11 @@ def memory_plan(
     radius, engine = checked_cutoff(cutoff, dtype), checked_backend(backend)
     rows = n if queries is None else queries
     where = default_platform() if platform is None else platform
+    if faces is not None:
+        if fn is not None or queries is not None:
+            raise ValueError("faces belong to a search for triangles, which knows neither fn nor queries: leave them out.")
+        sizes = (n, checked_size("faces", faces), dim, checked_capacity(capacity))
+        return _plan_of_triangles(sizes, dtype, radius, engine, _device_of(where))
     if fn is not None:
         if capacity is not None:
             raise ValueError(f"capacity is that of a list, which a pair sum does not make: leave it out, or fn, got {capacity}.")
@@ -140,6 +148,20 @@ def _compiled_scratch(points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff,
     options = Options(Filter(drop_self=points[1] is None, later_only=False), engine, closed=False)
     inputs: Any = Inputs(points[0], points[1], None, None, cutoff)  # pyright: ignore[reportArgumentType] (shapes of arrays)
     return int(_analysis(list_rows.lower(inputs, options, capacity)).temp_size_in_bytes)
+
+
+def _plan_of_triangles(sizes: tuple[int, int, int, int], dtype: np.dtype, cutoff: Cutoff, engine: str, device: Any) -> MemoryPlan:  # noqa: ANN401
+    """Compile a search of n particles for faces, in dim dimensions, with this capacity."""
+    n, faces, dim, capacity = sizes
+    at = SingleDeviceSharding(device)
+    if engine not in ("auto", "jax", "warp"):
+        raise ValueError(f"backend={engine!r} finds no triangles: pass 'auto', 'jax' or 'warp'.")
+    if engine == "auto":
+        engine = fastest_engine(device.platform, n) if device.platform == "cpu" else "jax"
+    points, corners = (jax.ShapeDtypeStruct((size, dim), dtype, sharding=at) for size in (n, faces // 2 + 2))
+    named: Any = jax.ShapeDtypeStruct((faces, dim), np.int32, sharding=at)
+    analysis = _analysis(find_triangles.lower(points, corners, named, None, cutoff, engine, capacity))
+    return MemoryPlan(int(analysis.output_size_in_bytes), int(analysis.temp_size_in_bytes), engine)
 
 
 def _analysis(lowered: Any) -> Any:  # noqa: ANN401

@@ -251,7 +251,7 @@ class NeighborList:
         Differentiable: to any order; the gradient of a distance of 0 is 0. Jit: yes. vmap: yes.
         """
         vectors, mask = self.vectors(positions, queries=queries, box=box)
-        return _norms(vectors), mask
+        return norms(vectors), mask
 
     @overload
     def pairs(self, total: None = None) -> tuple[np.ndarray, np.ndarray]: ...
@@ -563,7 +563,7 @@ def _flat_pairs(idx: Array, count: Array, sources: int, total: int) -> tuple[Arr
 
 
 @jax.jit
-def _norms(vectors: Array) -> Array:
+def norms(vectors: Array) -> Array:
     largest = lax.stop_gradient(jnp.max(jnp.abs(vectors), axis=-1, initial=0))
     apart = largest > 0
     unit = jnp.where(apart, largest, 1)  # squares of very small or large lengths would leave the float range

@@ -12,6 +12,8 @@ class Status(enum.IntFlag):
     BOX_TOO_SMALL = 4
     OUT_OF_RANGE = 8
     INVALID_CUTOFF = 16
+    NONFINITE_VERTEX = 32
+    FACE_OUT_OF_RANGE = 64
 
     @property
     def message(self) -> str:
@@ -37,6 +39,14 @@ _MESSAGES = {
     Status.INVALID_CUTOFF: (
         "`cutoff` holds values that are not positive and finite, or too small or large for their dtype: those particles have no "
         "neighbors in this list. Find them with ~(jnp.isfinite(cutoff) & (cutoff > 0))."
+    ),
+    Status.NONFINITE_VERTEX: (
+        "`vertices` that faces name hold non-finite coordinates (NaN or infinite): those faces are nobody's neighbors. "
+        "Find them with ~jnp.isfinite(vertices[faces]).all(axis=(1, 2))."
+    ),
+    Status.FACE_OUT_OF_RANGE: (
+        "`faces` name vertices that do not exist: those faces are nobody's neighbors in this list. Find them with "
+        "((faces < 0) | (faces >= len(vertices))).any(axis=1)."
     ),
 }
 

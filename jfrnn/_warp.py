@@ -260,7 +260,7 @@ def _cuda_callable(variant: Variant) -> Any:  # noqa: ANN401
 def _cuda_target(
     name: str, types: dict[str, Any], outputs: int, commands: Callable[..., list[_cuda.Command]]
 ) -> Callable[..., Sequence[Array]]:
-    """Make a function that XLA calls on CUDA, as `_callable` makes one for the CPU."""
+    """Make a function that XLA calls on CUDA, as `callable_of` makes one for the CPU."""
     wp = load_warp()
     _cuda.register(name, wp, [kind.dtype for kind in types.values()], commands)
     results = {key: wp.dtype_to_numpy(types[key].dtype) for key in list(types)[-outputs:]}
@@ -285,7 +285,7 @@ def _register(
     full_name, types = _name(name, variant), _types(variant)
     if radius is not None:
         full_name += f"_{radius.hex().replace('-', 'minus')}"  # Warp drops what an identifier cannot hold
-    return _callable(full_name, lambda *arrays: run(variant, _named(types, arrays)), types, 3 + variant.lists)
+    return callable_of(full_name, lambda *arrays: run(variant, _named(types, arrays)), types, 3 + variant.lists)
 
 
 def _types(variant: Variant) -> dict[str, Any]:
@@ -309,7 +309,7 @@ def _name(name: str, variant: Variant) -> str:
     return "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
 
 
-def _callable(name: str, run: Callable[..., None], types: dict[str, Any], outputs: int) -> Any:  # noqa: ANN401
+def callable_of(name: str, run: Callable[..., None], types: dict[str, Any], outputs: int) -> Any:  # noqa: ANN401
     """Make a function that XLA calls with arrays of these types, the last of which are its outputs."""
 
     def func(*arrays: Any) -> None:  # noqa: ANN401
@@ -361,7 +361,7 @@ def _run_cells_on_cpu(variant: Variant, arrays: _Arrays) -> None:
     _ask_for_huge_pages(idx.ptr, 4 * len(queries) * capacity)
     flags = [int(variant.closed), int(variant.keep.drop_self), int(variant.keep.later_only)]
     arguments = [*arrays, *sizes, capacity, *flags]
-    _on_every_core(lambda: wp.launch(kernels.query, dim=1, inputs=arguments, device="cpu"), -(-len(queries) // _PLACES_PER_THREAD))
+    on_every_core(lambda: wp.launch(kernels.query, dim=1, inputs=arguments, device="cpu"), -(-len(queries) // _PLACES_PER_THREAD))
 
 
 def _sort_on_cpu(
@@ -393,7 +393,7 @@ def _launchable(variant: Variant, arrays: _Arrays) -> tuple[_Arrays, list[int], 
     return arrays._replace(idx=unused), sizes, 0
 
 
-def _on_every_core(launch: Callable[[], None], most: int) -> None:
+def on_every_core(launch: Callable[[], None], most: int) -> None:
     """Launch once per core, at most `most` times; a launch releases the interpreter's lock while it runs."""
     others: list[Future[None]] = []
     with contextlib.suppress(RuntimeError):  # while the interpreter exits, nothing can be submitted: this core does the rest
@@ -535,7 +535,7 @@ def _sum_callable(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN401
     of_search, results = {"info": ints, "scratch": ints}, {"sums": rows, "totals": reals, "errors": reals, "columns": reals}
     name = _name_of_sum(_module_of(variant), variant)
     if not variant.cuda:
-        return _callable(name, functools.partial(_run_sums_on_cpu, variant, term), types | results | of_search, 6)
+        return callable_of(name, functools.partial(_run_sums_on_cpu, variant, term), types | results | of_search, 6)
     if wp.is_cuda_available():
         _sum_kernels_on_cuda(variant, term).load(wp.get_cuda_device())
     return _cuda_target(name, types | of_search | results, 4, functools.partial(_sum_commands, variant, term))
@@ -604,10 +604,10 @@ def _run_sums_on_cpu(variant: _SumVariant, term: Any, *arrays: Any) -> None:  # 
     _sort_on_cpu(cells, positions, queries, cutoff, info, scratch, sizes)
     if term.source_columns:
         sorting = [others, cutoff, columns, scratch, *sizes]
-        _on_every_core(lambda: wp.launch(sort_values, dim=1, inputs=sorting, device="cpu"), -(-n // _PLACES_PER_THREAD))
+        on_every_core(lambda: wp.launch(sort_values, dim=1, inputs=sorting, device="cpu"), -(-n // _PLACES_PER_THREAD))
     arguments = [positions, queries, cutoff, shared, own, columns, sums, totals, errors, scratch, *sizes]
     arguments += [int(variant.closed), int(variant.drop_self)]
-    _on_every_core(lambda: wp.launch(query, dim=1, inputs=arguments, device="cpu"), -(-m // _PLACES_PER_THREAD))
+    on_every_core(lambda: wp.launch(query, dim=1, inputs=arguments, device="cpu"), -(-m // _PLACES_PER_THREAD))
 
 
 def _sum_kernels_on_cuda(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN401
@@ -736,7 +736,7 @@ def _level_callable(variant: _LevelVariant) -> Any:  # noqa: ANN401
     name = f"jfrnn_levels_{'cuda' if variant.cuda else 'cpu'}_{variant.dim}d"
     name = "_".join([name, *(flag for flag, on in flags.items() if on)])
     if not variant.cuda:
-        return _callable(name, functools.partial(_run_levels_on_cpu, variant), types, 2 + variant.lists)
+        return callable_of(name, functools.partial(_run_levels_on_cpu, variant), types, 2 + variant.lists)
     if wp.is_cuda_available():
         for kernel, block in ((_level_kernel(variant), kernels_of("levels").BLOCK), (kernels_of("levels").clear, 2)):
             wp.load_module(kernel.module, device=wp.get_cuda_device(), block_dim=block)
@@ -762,7 +762,7 @@ def _run_levels_on_cpu(variant: _LevelVariant, *arrays: Any) -> None:  # noqa: A
     wp, kernel, arguments = load_warp(), _level_kernel(variant), _level_arguments(variant, arrays)
     arrays[-1].zero_()
     places = len(arrays[-2])
-    _on_every_core(lambda: wp.launch(kernel, dim=1, inputs=arguments, device="cpu"), -(-places // _PLACES_PER_THREAD))
+    on_every_core(lambda: wp.launch(kernel, dim=1, inputs=arguments, device="cpu"), -(-places // _PLACES_PER_THREAD))
 
 
 def _level_commands(variant: _LevelVariant, *arrays: Any) -> list[_cuda.Command]:  # noqa: ANN401

@@ -162,6 +162,62 @@ def reference_radii(
     return found
 
 
+def triangle_pairs(positions: Any, vertices: Any, faces: Any, cutoff: float) -> set[Pair]:
+    """Return every (particle i, face t) whose closed triangle (in 2D: segment) is closer than the cutoff, exactly.
+
+    A particle that is not finite, and a face with a vertex that is not finite or not there, is in no pair. `cutoff` is rounded once
+    to the dtype of positions. Cost: particles times faces whose boxes are within the cutoff, some 20 us each.
+    """
+    points, corners = _points(positions), _points(vertices)
+    if points.dtype != corners.dtype or points.shape[1] != corners.shape[1]:
+        raise ValueError(f"positions {points.dtype} {points.shape}, vertices {corners.dtype} {corners.shape}: give the same kind")
+    edge, (asking, sites) = _integers(_rounded(cutoff, points.dtype), points, corners)
+    found = set()
+    for t, face in enumerate(np.asarray(faces).tolist()):
+        if any(k not in sites for k in face):
+            continue
+        shape = [sites[k] for k in face]
+        low, high = ([pick(axis) for axis in zip(*shape, strict=True)] for pick in (min, max))
+        for i, point in asking.items():
+            nearby = all(a - edge < x < b + edge for x, a, b in zip(point, low, high, strict=True))
+            if nearby and squared_distance(point, shape) < edge**2:
+                found.add((i, t))
+    return found
+
+
+def squared_distance(point: Sequence[int | Fraction], corners: Sequence[Sequence[int | Fraction]]) -> Fraction:
+    """Return the squared distance of a point to the closed triangle, or segment, between corners, all in 3D: a rational number.
+
+    The foot of the perpendicular on the plane is written in the coordinates of two sides (Cramer's rule); where it lies outside, or
+    the corners are on one line, the nearest point is on a side.
+    """
+    if len(corners) == 2:
+        return _squared_distance_to_segment(point, *corners)
+    a, b, c = corners
+    along, across, away = _minus(b, a), _minus(c, a), _minus(point, a)
+    aa, ac, cc = _dot(along, along), _dot(along, across), _dot(across, across)
+    pa, pc = _dot(away, along), _dot(away, across)
+    area = aa * cc - ac * ac
+    if area != 0:
+        s, t = Fraction(cc * pa - ac * pc, area), Fraction(aa * pc - ac * pa, area)
+        if s >= 0 and t >= 0 and s + t <= 1:
+            rest = [w - s * u - t * v for w, u, v in zip(away, along, across, strict=True)]
+            return Fraction(_dot(rest, rest))
+    return min(_squared_distance_to_segment(point, *side) for side in ((a, b), (b, c), (c, a)))
+
+
+def _squared_distance_to_segment(point: Sequence[Any], a: Sequence[Any], b: Sequence[Any]) -> Fraction:
+    along, away = _minus(b, a), _minus(point, a)
+    length = _dot(along, along)
+    t = min(max(Fraction(_dot(away, along), length), Fraction(0)), Fraction(1)) if length != 0 else Fraction(0)
+    rest = [w - t * u for w, u in zip(away, along, strict=True)]
+    return Fraction(_dot(rest, rest))
+
+
+def _minus(a: Sequence[Any], b: Sequence[Any]) -> list[Any]:
+    return [x - y for x, y in zip(a, b, strict=True)]
+
+
 def compare(found: Any, expected: Iterable[Pair]) -> tuple[set[Pair], set[Pair]]:
     """Return the pairs that `found` misses of `expected`, and the pairs that it has beyond them.
 
@@ -278,7 +334,7 @@ def _within(cutoff: float, queries: np.ndarray, sources: np.ndarray, closed: boo
                     yield i, j
 
 
-def _dot(a: Vector, b: Vector) -> int:
+def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

@@ -1,0 +1,130 @@
+"""Particles around a gear: what `search_triangles` takes, beside libraries that find the nearest triangle of each point."""
+
+import csv
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+from jfrnn.cases import meshes  # pyright: ignore[reportMissingImports]
+
+import jfrnn
+from experiments import _machine, _measure
+
+COLUMNS = (
+    *("method", "n", "faces", "cutoff", "pairs", "longest_row", "rounds", "median_s", "p10_s", "p90_s", "us_per_particle"),
+    *("missing", "extra", "others_cores", "jax", "warp", "peer", "commit", "dirty"),
+)
+_FEW = 2_000  # points that a peer is asked for whose time would be minutes
+_LISTS = ("update", "rebuild", "count")  # ways of jfrnn
+
+
+class _Scene(NamedTuple):
+    points: np.ndarray  # float32
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+def measure(folder: Path, n: int, faces: int, rounds: int, backend: str, cutoffs: tuple[float, ...] = (0.1, 0.3, 0.8)) -> Path:
+    """Write a table of seconds by method and cutoff, and return its path.
+
+    jfrnn lists all triangles within the cutoff: "update" with the cells of a wall that stays, "rebuild" with one that is sorted
+    anew.
+    Peers find the one nearest triangle of each point, however far. `missing` and `extra` are particles of which jfrnn says
+    otherwise than a peer, in float64, whether a triangle is within the cutoff.
+
+    Args:
+        folder: Takes a file named after the backend, such as cpu_warp.csv; one that is there is replaced.
+        n: Random points in the bounding box of the gear.
+        faces: Of the gear, about; its module is 1, its teeth are 20.
+        rounds: Of timed runs.
+        backend: As in `jfrnn.search_triangles`.
+        cutoffs: [modules].
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{jax.default_backend()}_{backend}.csv"
+    scene = _gear(n, faces)
+    peers = {name: peer(scene) for name, peer in _PEERS.items() if importlib.util.find_spec(_MODULES[name])}
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.DictWriter(stream, COLUMNS, restval="")
+        writer.writeheader()
+        for cutoff in cutoffs:
+            calls, tri = _calls(scene, cutoff, backend)
+            seconds, others = _measure.time_in_turns(calls, rounds)
+            near = np.asarray(tri.count) > 0
+            common = {"faces": len(scene.faces), "cutoff": cutoff, "others_cores": others, **_versions()}
+            row = {"n": n, "pairs": int(tri.count.sum()), "longest_row": int(tri.required)}
+            for way in _LISTS:
+                writer.writerow(common | row | {"method": f"jfrnn {way}"} | _timed(seconds[way], n))
+            for name, (asked, distance, taken) in peers.items():
+                within = distance < cutoff
+                wrong = {"missing": int(np.sum(within & ~near[asked])), "extra": int(np.sum(near[asked] & ~within))}
+                writer.writerow(
+                    common | {"n": len(asked), "method": name, "peer": _peer_version(name)} | wrong | _timed(taken, len(asked))
+                )
+    return path
+
+
+def table(path: Path) -> str:
+    """Return the table of a run as text."""
+    columns = ["method", "n", "cutoff", "pairs", "longest_row", "median_s", "us_per_particle", "missing", "extra"]
+    return pd.read_csv(path)[columns].to_string(index=False, na_rep="")
+
+
+def _gear(n: int, faces: int) -> _Scene:
+    vertices, named = meshes.gear(20, faces)
+    vertices = vertices.astype(np.float32)
+    low, high = vertices.min(axis=0) - 0.5, vertices.max(axis=0) + 0.5
+    return _Scene(np.random.default_rng(0).uniform(low, high, (n, 3)).astype(np.float32), vertices, named)
+
+
+def _calls(scene: _Scene, cutoff: float, backend: str) -> tuple[dict[str, Callable[[], Any]], jfrnn.TriangleList]:
+    x, vertices = jnp.asarray(scene.points), jnp.asarray(scene.vertices)
+    tri = jfrnn.search_triangles(x, vertices, jnp.asarray(scene.faces), cutoff, backend=backend)
+    update = jax.jit(lambda x, tri: tri.update(x))
+    rebuild = jax.jit(lambda x, vertices, tri: tri.update(x, vertices=vertices))
+    single = jax.jit(lambda x, tri: tri.update(x).count)
+    calls = {"update": lambda: update(x, tri), "rebuild": lambda: rebuild(x, vertices, tri), "count": lambda: single(x, tri)}
+    jax.block_until_ready([call() for call in calls.values()])
+    return calls, tri
+
+
+def _libigl(scene: _Scene) -> tuple[np.ndarray, np.ndarray, list[float]]:
+    import igl
+
+    points, vertices = scene.points.astype(np.float64), scene.vertices.astype(np.float64)
+    (square, *_), seconds = _measure.repeat(lambda: igl.point_mesh_squared_distance(points, vertices, scene.faces), 3, 0.0, 3)
+    return np.arange(len(points)), np.sqrt(square), seconds
+
+
+def _trimesh(scene: _Scene) -> tuple[np.ndarray, np.ndarray, list[float]]:
+    import trimesh
+
+    mesh = trimesh.Trimesh(scene.vertices.astype(np.float64), scene.faces, process=False)
+    asked = np.arange(min(_FEW, len(scene.points)))
+    points = scene.points[asked].astype(np.float64)
+    (_, distance, _), seconds = _measure.repeat(lambda: trimesh.proximity.closest_point(mesh, points), 3, 0.0, 3)
+    return asked, distance, seconds
+
+
+_PEERS: dict[str, Callable[[_Scene], tuple[np.ndarray, np.ndarray, list[float]]]] = {"libigl": _libigl, "trimesh": _trimesh}
+_MODULES = {"libigl": "igl", "trimesh": "trimesh"}
+
+
+def _peer_version(name: str) -> str:
+    return str(_machine.versions([name])[name])
+
+
+def _timed(seconds: list[float], n: int) -> dict[str, Any]:
+    said = _measure.summarize(seconds)
+    times = {name: f"{said[name]:.3e}" for name in ("median_s", "p10_s", "p90_s")}
+    return {"rounds": said["repeats"], **times, "us_per_particle": f"{1e6 * said['median_s'] / n:.3g}"}
+
+
+def _versions() -> dict[str, Any]:
+    found = _machine.versions()
+    return {"jax": found["jax"], "warp": found["warp-lang"], **_machine.commit()}

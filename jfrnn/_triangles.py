@@ -1,0 +1,107 @@
+"""The public verb `search_triangles`: which triangles of a wall are closer to each particle than a cutoff."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+
+from jfrnn._auto import choose_engine, platform_of
+from jfrnn._inputs import checked_capacity, checked_cutoff, checked_positions, checked_slack
+from jfrnn._triangles_list import TriangleList, counted_slots, found_triangles
+
+_BACKENDS = ("auto", "jax", "warp")
+
+
+def search_triangles(
+    positions: Array,
+    vertices: Array,
+    faces: Array,
+    cutoff: float,
+    *,
+    capacity: int | None = None,
+    slack: float = 1.0,
+    backend: str = "auto",
+) -> TriangleList:
+    """Find all triangles of a wall that are closer to a particle than a cutoff, exactly, each once; in 2D all segments.
+
+    (i, t) stands in the list iff the distance of particle i to the closed triangle t (its face, sides and vertices) is below the
+    cutoff in exact arithmetic on the given floats, the cutoff being rounded once to their dtype. Triangles may be slivers, segments
+    or points, and of any size beside the cutoff. Cost: O(particles + faces + candidates), the candidates of a particle being the
+    triangles in its cell, whose edge is about the cutoff, or about a quarter of a larger triangle.
+
+    A wall that stays is sorted into cells once: `TriangleList.update` keeps the cells that the list has. One that moves as a whole
+    stays too, if the particles are taken into its frame. One that is deformed is sorted anew: `update(positions, vertices=...)`.
+
+    Args:
+        positions: Particle positions [length], shape [n, 3] or [n, 2], float32 or float64. n = 0 is allowed.
+        vertices: Corners [length], shape [v, 3] or [v, 2], same dtype.
+        faces: Indices of vertices, integers, shape [f, 3] for triangles, [f, 2] for segments in 2D. f = 0 is allowed. Which way
+            round they run matters to `TriangleList.signed_distance` alone.
+        cutoff: Distance [length], a static number > 0.
+        capacity: Slots per row, a static int. Required where positions, vertices or faces are traced. Default: `slack` times the
+            longest row, rounded up to a multiple of 8.
+        slack: Factor >= 1 on the counted capacity, room for later motion.
+        backend: "warp" (compiled kernels, on the CPU), "jax" (any device), or "auto": "warp" on the CPU (where Warp is missing
+            "jax", with a warning), elsewhere "jax".
+
+    Returns:
+        A `TriangleList`; `idx` has shape [n, capacity], unused slots hold f. Rows are in no promised order, but the same input
+        gives the same bits.
+
+    Raises:
+        TypeError, ValueError: an argument is of the wrong kind, shape or range, or `capacity` is missing under jit.
+        ImportError, RuntimeError: "warp", and it is not installed or cannot run on the platform.
+        Overflow of a given capacity, coordinates that are not finite and faces without vertices are known only from data: `status`,
+        `overflow` and `check` tell.
+
+    Memory: 4 B per slot and particle for the list; 100 to 132 B per triangle for the cells, which the list keeps, whatever the
+    sizes of the triangles and of space. Differentiable: the list is topology, without gradient; see `TriangleList.closest`.
+    Jit: yes, with capacity. vmap: yes, with capacity. Source: strict cutoff (Peifle 2019, §2.2).
+
+    >>> import jax.numpy as jnp, jfrnn
+    >>> x = jnp.array([[0.2, 0.2, 0.05], [0.2, 0.2, -0.2], [1.05, 0.0, 0.0]])
+    >>> corners = jnp.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    >>> tri = jfrnn.search_triangles(x, corners, jnp.array([[0, 1, 2]]), 0.1)
+    >>> tri.count
+    Array([1, 0, 1], dtype=int32)
+    """
+    points = checked_positions("positions", positions)
+    corners = checked_positions("vertices", vertices, like=points)
+    named = _checked_faces(faces, points.shape[1], corners.shape[0])
+    radius = float(checked_cutoff(cutoff, np.dtype(points.dtype)).radius)
+    engine, slack = _chosen_engine(backend, points), checked_slack(slack)
+    if capacity is None:
+        if any(isinstance(x, Tracer) for x in (points, corners, named)):
+            raise ValueError(
+                "capacity must be given where positions, vertices or faces are traced (jax.jit, vmap, grad, scan), because it is a "
+                "shape: pass the capacity of an earlier search, with room to move, and check tri.overflow."
+            )
+        capacity = counted_slots(points, corners, named, radius, engine, slack)
+    found = found_triangles(points, corners, named, None, radius, engine, checked_capacity(capacity))
+    return TriangleList(**found, vertices=jax.lax.stop_gradient(corners), faces=named, cutoff=radius, backend=engine)
+
+
+def _checked_faces(faces: Any, dim: int, vertices: int) -> Array:  # noqa: ANN401
+    """Return faces as int32 [f, dim]; what names no vertex stays out of range."""
+    kind = "triangles" if dim == 3 else "segments"
+    if not hasattr(faces, "dtype") or not np.issubdtype(faces.dtype, np.integer):
+        given = f"{np.dtype(faces.dtype)}" if hasattr(faces, "dtype") else type(faces).__name__
+        raise TypeError(f"faces must be an array of integers of shape [f, {dim}], the vertices of {kind}, got {given}.")
+    if len(faces.shape) != 2 or faces.shape[1] != dim:
+        raise ValueError(f"faces must have shape [f, {dim}], the vertices of {kind} in {dim}D, got shape {list(faces.shape)}.")
+    if isinstance(faces, Tracer):
+        return jnp.clip(faces, -1, vertices).astype(jnp.int32) if np.iinfo(faces.dtype).max > vertices else faces.astype(jnp.int32)
+    with jax.ensure_compile_time_eval():
+        return jnp.asarray(np.clip(np.asarray(faces).astype(np.int64), -1, vertices).astype(np.int32))
+
+
+def _chosen_engine(backend: Any, points: Array) -> str:  # noqa: ANN401
+    if backend not in _BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(map(repr, _BACKENDS))}, got {backend!r}.")
+    platform = platform_of(points)
+    if backend == "warp" and platform != "cpu":
+        raise RuntimeError(f"backend='warp' finds triangles on the platform 'cpu' alone, got {platform!r}: pass backend='jax'.")
+    return "jax" if backend == "auto" and platform != "cpu" else choose_engine(backend, points, None)

@@ -1,0 +1,282 @@
+"""The result of a search for triangles, and the compiled programs that make it."""
+
+import dataclasses
+import functools
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.core import Tracer
+
+from jfrnn import _triangles_warp
+from jfrnn._exact import Cutoff, make_cutoff
+from jfrnn._inputs import checked_positions, checked_slack
+from jfrnn._neighbors import norms, rounded_capacity
+from jfrnn._status import NeighborOverflowError, Status
+from jfrnn._triangles_cells import TriangleCells, sort_triangles, without_faults
+from jfrnn._triangles_closest import make_normals, nearest_of, normal_at
+from jfrnn._triangles_rows import are_near, list_triangles
+
+_ENGINES = {
+    "jax": (sort_triangles, list_triangles),
+    "warp": (_triangles_warp.sort_triangles, _triangles_warp.list_triangles),
+}
+
+
+class SignedDistance(NamedTuple):
+    """On which side of a closed wall particles are.
+
+    Attributes:
+        distance: To the nearest triangle of the row [length], shape [n]: negative inside, 0 where there is none within the cutoff.
+        mask: There is one, shape [n], bool.
+        watertight: Each side belongs to two triangles that run through it in opposite directions (in 2D, each vertex to two
+            segments), shape [], bool. Where False, signs mean nothing away from the faces.
+    """
+
+    distance: Array
+    mask: Array
+    watertight: Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class TriangleList:
+    """Hold the triangles (in 2D: segments) near n particles, one row of `capacity` slots per particle. A pytree.
+
+    Attributes:
+        idx: Indices of triangles, shape [n, capacity], int32; the first min(count, capacity) slots are used, the others hold f.
+        count: True number of triangles per row, shape [n], int32; it may exceed the capacity.
+        status: Bits of `Status`, shape [], int32.
+        required: The capacity that holds every row, shape [], int32; like the status, over all updates.
+        vertices: Corners of the wall [length], shape [v, d].
+        faces: Vertices of each triangle, shape [f, d], int32.
+        cells: The wall, sorted into cells (`TriangleCells`); None where there is none.
+        cutoff: Distance [length], rounded to the dtype of the positions. Static.
+        backend: The engine that made the list. Static.
+    """
+
+    idx: Array
+    count: Array
+    status: Array
+    required: Array
+    vertices: Array
+    faces: Array
+    cells: TriangleCells | None
+    cutoff: float = dataclasses.field(metadata={"static": True})
+    backend: str = dataclasses.field(metadata={"static": True})
+
+    @property
+    def capacity(self) -> int:
+        """Slots per row."""
+        return self.idx.shape[-1]
+
+    @property
+    def overflow(self) -> Array:
+        """Say whether a row lost triangles, shape [], bool."""
+        return (self.status & Status.ROW_OVERFLOW.value) != 0
+
+    def update(self, positions: Array, *, vertices: Array | None = None) -> "TriangleList":
+        """Make the list anew at these positions, in the same shapes: a step of a simulation inside `jax.jit` or `lax.scan`.
+
+        Status bits and `required` are kept over all updates; look at `overflow` after a chunk of steps, `grow` and run it again.
+
+        Args:
+            positions: Particles [length], shape [n, d], where they are now. Where the wall moves as a whole: in its frame.
+            vertices: Corners [length], shape [v, d], where the wall is deformed: it is then sorted into cells anew. Default: those
+                that the list has, whose cells it keeps.
+
+        Returns:
+            A `TriangleList` of the same shapes and options.
+
+        Raises:
+            ValueError, TypeError: an argument does not fit the list.
+
+        Differentiable: no gradient flows through. Jit: yes. vmap: yes.
+        """
+        points, corners = self._checked(positions, vertices)
+        cells = self.cells if vertices is None else None
+        found = found_triangles(points, corners, self.faces, cells, self.cutoff, self.backend, self.capacity)
+        found |= {"status": found["status"] | self.status, "required": jnp.maximum(found["required"], self.required)}
+        return dataclasses.replace(self, **found, vertices=lax.stop_gradient(corners))
+
+    def grow(self, positions: Array, *, vertices: Array | None = None, slack: float = 1.25) -> "TriangleList":
+        """Make a list with room for what overflowed, at these positions. Not inside jit: the capacity is a shape.
+
+        Args:
+            positions: As in `update`.
+            vertices: As in `update`.
+            slack: Factor >= 1 on the longest row that was ever met, here or by updates of this list.
+
+        Returns:
+            A `TriangleList` with the same options, a capacity not smaller than before, and no bits from the past.
+
+        Raises:
+            TypeError: positions, vertices or the list are traced.
+            ValueError, TypeError: an argument does not fit the list.
+        """
+        points, corners = self._checked(positions, vertices)
+        if any(isinstance(x, Tracer) for x in jax.tree.leaves((points, corners, self.required))):
+            raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
+        met = rounded_capacity(math.ceil(checked_slack(slack) * int(np.max(self.required))))
+        counted = counted_slots(points, corners, self.faces, self.cutoff, self.backend, slack)
+        capacity, cells = max(self.capacity, met, counted), self.cells if vertices is None else None
+        found = found_triangles(points, corners, self.faces, cells, self.cutoff, self.backend, capacity)
+        return dataclasses.replace(self, **found, vertices=corners)
+
+    def check(self) -> None:
+        """Raise what the status bits report; wait for the device. Not inside jit: there, read `status` and `overflow`.
+
+        Raises:
+            NeighborOverflowError: a row holds more triangles than `capacity`; `.required` is the capacity needed.
+            ValueError: positions or vertices hold NaN or infinity, or faces name vertices that do not exist.
+            TypeError: called on a list that is being traced.
+        """
+        if isinstance(self.status, Tracer):
+            raise TypeError("check() reads values and cannot run inside jax.jit: call it on the list that jit returns.")
+        status = Status(int(np.bitwise_or.reduce(np.asarray(self.status), axis=None)))
+        if Status.ROW_OVERFLOW in status:
+            raise NeighborOverflowError(int(np.max(self.required)), self.capacity)
+        if status:
+            raise ValueError(status.message)
+
+    def closest(self, positions: Array, *, vertices: Array | None = None) -> tuple[Array, Array, Array]:
+        """Compute the nearest point of every triangle of a row.
+
+        Rounding may find another point of a thin triangle than the nearest, but none beside the triangle: distances are too large,
+        if anything, by some ulp of the distance to its farthest corner. The mask is exact.
+
+        Args:
+            positions: Particles [length], shape [n, d], where they are now.
+            vertices: Corners [length], shape [v, d]; default: those that the list has, constants to derivatives.
+
+        Returns:
+            Points [length], shape [n, capacity, d], the particle's own in masked slots; distances [length], shape [n, capacity], 0
+            there; and the mask, shape [n, capacity], bool: the slot is used and its triangle is closer than the cutoff, at these
+            positions and exactly.
+
+        Raises:
+            ValueError, TypeError: an argument does not fit the list.
+
+        Differentiable: to any order in positions and vertices, where the nearest point does not jump; the gradient of a distance
+        of 0 is 0. Jit: yes. vmap: yes. Source: Ericson (2005), sect. 5.1.
+        """
+        points, corners = self._checked(positions, vertices)
+        if 0 in (*self.idx.shape, self.faces.shape[0]):
+            none = jnp.zeros(self.idx.shape, points.dtype)
+            return jnp.broadcast_to(points[:, None], (*self.idx.shape, points.shape[1])), none, none > 0
+        vectors, _, mask = _nearest_in_rows(self, points, corners)
+        return points[:, None] + vectors, norms(vectors), mask
+
+    def signed_distance(self, positions: Array, *, vertices: Array | None = None) -> SignedDistance:
+        """Compute the distance to the nearest triangle of each row, negative inside what the triangles enclose.
+
+        The sign is that of the angle-weighted pseudonormal of the nearest face, side or vertex, which decides for any closed mesh
+        whose faces run counterclockwise as seen from outside (in 2D, segments counterclockwise around what they enclose).
+
+        Args:
+            positions: As in `closest`.
+            vertices: As in `closest`.
+
+        Returns:
+            A `SignedDistance`: distance [n], mask [n], and whether the mesh is watertight.
+
+        Raises:
+            ValueError, TypeError: an argument does not fit the list.
+
+        Cost: beside the rows, a sort of all sides. Differentiable: to any order in positions and vertices, where the nearest point
+        does not jump; at contact the derivative is that of the plane of the normal. Jit: yes. vmap: yes.
+        Source: Baerentzen & Aanaes (2005), doi:10.1109/TVCG.2005.49.
+        """
+        points, corners = self._checked(positions, vertices)
+        if 0 in (*self.idx.shape, self.faces.shape[0]):
+            none = jnp.zeros(points.shape[0], points.dtype)
+            return SignedDistance(none, none > 0, jnp.asarray(self.faces.shape[0] == 0))
+        return _signed_distance(self, points, corners)
+
+    def _checked(self, positions: Array, vertices: Array | None) -> tuple[Array, Array]:
+        points = checked_positions("positions", positions, like=self.vertices)
+        if points.shape[0] != self.idx.shape[0]:
+            raise ValueError(f"positions hold {points.shape[0]} particles, but the list was made for {self.idx.shape[0]}.")
+        if vertices is None:
+            return points, self.vertices
+        corners = checked_positions("vertices", vertices, like=self.vertices)
+        if corners.shape != self.vertices.shape:
+            raise ValueError(f"vertices have shape {list(corners.shape)}, but the list was made for {list(self.vertices.shape)}.")
+        return points, corners
+
+
+def counted_slots(points: Array, vertices: Array, faces: Array, cutoff: float, backend: str, slack: float) -> int:
+    """Count the triangles near concrete positions and return a capacity that holds `slack` times the longest row."""
+    with jax.ensure_compile_time_eval():
+        found = found_triangles(points, vertices, faces, None, cutoff, backend, None)
+        longest = int(found["required"])
+    return rounded_capacity(math.ceil(max(longest, 1) * slack))
+
+
+def found_triangles(
+    points: Array, vertices: Array, faces: Array, cells: TriangleCells | None, cutoff: float, backend: str, capacity: int | None
+) -> dict[str, Any]:
+    """Return the fields of a list that come from data; with capacity=None only counts. `cells`: those of an earlier list."""
+    radius = make_cutoff(cutoff, np.dtype(points.dtype), closed=False)
+    return find_triangles(*lax.stop_gradient((points, vertices, faces)), cells, radius, backend, capacity)
+
+
+@functools.partial(jax.jit, static_argnames=("backend", "capacity"))
+def find_triangles(
+    points: Array, vertices: Array, faces: Array, cells: TriangleCells | None, cutoff: Cutoff, backend: str, capacity: int | None
+) -> dict[str, Any]:
+    """List or count triangles: the compiled program of a search."""
+    corners, finite, there = without_faults(vertices, faces)
+    sound = {
+        Status.NONFINITE: jnp.all(jnp.isfinite(points)),
+        Status.NONFINITE_VERTEX: jnp.all(finite),
+        Status.FACE_OUT_OF_RANGE: jnp.all(there),
+    }
+    n, f, slots = points.shape[0], faces.shape[0], capacity or 0
+    sort, listed = _ENGINES[backend]
+    if cells is None and f > 0:
+        cells = sort(corners, finite & there, cutoff)
+    if cells is None or n == 0:
+        idx, count = jnp.full((n, slots), f, jnp.int32), jnp.zeros(n, jnp.int32)
+    else:
+        idx, count = listed(points, corners, cells, cutoff, capacity)
+    required = jnp.max(count, initial=0)
+    if capacity is not None:
+        sound[Status.ROW_OVERFLOW] = required <= slots
+    bits = [jnp.where(good, 0, bit.value).astype(jnp.int32) for bit, good in sound.items()]
+    status = functools.reduce(jnp.bitwise_or, bits)
+    return {"idx": idx, "count": count, "status": status, "required": required, "cells": cells}
+
+
+@jax.jit
+def _nearest_in_rows(tri: TriangleList, points: Array, vertices: Array) -> tuple[Array, Array, Array]:
+    """Return vectors to nearest points [n, capacity, d], on which feature they lie, and which slots hold a pair."""
+    used = lax.broadcasted_iota(jnp.int32, tri.idx.shape, 1) < tri.count[:, None]
+    corners, finite, there = without_faults(vertices, tri.faces)
+    triangle = jnp.where(used, tri.idx, 0)
+    cutoff = make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False)
+    near = are_near(*lax.stop_gradient((points, corners)), triangle, cutoff, used & (finite & there)[triangle])
+    mask = near & jnp.all(jnp.isfinite(points), axis=1)[:, None]
+    shapes = jnp.where(mask[..., None, None], corners[triangle], 0)
+    vectors, feature = nearest_of(jnp.where(mask[..., None], points[:, None], 0), shapes)
+    return jnp.where(mask[..., None], vectors, 0), feature, mask
+
+
+@jax.jit
+def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> SignedDistance:
+    vectors, feature, mask = _nearest_in_rows(tri, points, vertices)
+    lengths = norms(vectors)
+    slot = jnp.argmin(jnp.where(mask, lax.stop_gradient(lengths), jnp.inf), axis=1)[:, None]
+    pick = functools.partial(jnp.take_along_axis, indices=slot, axis=1)
+    some, distance = pick(mask)[:, 0], pick(lengths)[:, 0]
+    away = -jnp.take_along_axis(vectors, slot[..., None], axis=1)[:, 0]
+    corners, finite, there = without_faults(lax.stop_gradient(vertices), tri.faces)
+    normals = make_normals(lax.stop_gradient(vertices), tri.faces, corners, finite & there)
+    triangle = jnp.where(some, pick(tri.idx)[:, 0], 0)
+    normal = normal_at(normals, tri.faces, triangle, pick(feature)[:, 0])
+    height = jnp.sum(normal * away, axis=1)
+    signed = jnp.where(distance > 0, jnp.where(height < 0, -distance, distance), height)
+    return SignedDistance(jnp.where(some, signed, 0), some, normals.watertight & jnp.all(finite & there))

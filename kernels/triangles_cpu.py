@@ -1,0 +1,274 @@
+"""Triangles on the CPU: `build` sorts them into cells, one by one; `query` lists those near each particle, on every core.
+
+`query` is launched once per thread: the threads hand themselves chunks of particles from an atomic counter.
+"""
+
+import functools
+from typing import NamedTuple
+
+import warp as wp
+from jfrnn.kernels._native import ENTER, LEAVE, snippet
+from jfrnn.kernels._triangles import DECIDE, LEVELS
+
+CHUNK = 1024  # particles that a thread takes at a time
+
+# corners [f][DIM][DIM], good [f], start [buckets + 1], triangles [f MOST_CELLS], levels [limit], level_count [1], level_of [f],
+# scratch [f MOST_CELLS]: the buckets of each triangle, -1 behind the last
+_BUILD = r"""
+const double reach_of = double(radius) * (1 + 8 * (DOUBLE ? 0x1p-52 : 0x1p-23));
+const double MOST = DOUBLE ? 0x1.fffffffffffffp1023 : 0x1.fffffep127;
+const int finest = Bits::exponent(real(Bits::unit_scale(radius)));
+auto within = [](double x, double most) -> double { return x < -most ? -most : x > most ? most : x; };
+
+// does a direction keep the box [0, 1]^DIM around `cell`, widened by `reach`, apart from the triangle? all in units of a cell
+auto apart = [&](const double* direction, const double (*x)[DIM], const int* cell, double reach) -> bool {
+    double whole = 0, square = 0, most = 0, high = 0, low = 0;
+    for (int k = 0; k < DIM; ++k) {
+        whole += Shape::size_of(direction[k]);
+        square += direction[k] * direction[k];
+    }
+    for (int c = 0; c < DIM; ++c) {
+        double height = 0, doubt = 0;
+        for (int k = 0; k < DIM; ++k) {
+            const double part = direction[k] * (x[c][k] - (cell[k] + 0.5));
+            height += part;
+            doubt += Shape::size_of(part);
+        }
+        low = c == 0 || height < low ? height : low;
+        high = c == 0 || height > high ? height : high;
+        most = doubt > most ? doubt : most;
+    }
+    const double room = (0.5 * whole + reach * __builtin_sqrt(square)) * (1 + 0x1p-48) + 0x1p-48 * most;
+    return whole > 0x1p-60 && room < 0x1p1000 && (low > room || high < -room);
+};
+// the buckets of a triangle at a level: their number, or -1 for too many cells
+auto hold = [&](const real* corners, const double* low, const double* high, int level, int* buckets_of) -> int {
+    const double scale = scale_of(level);
+    int first[3] = {0, 0, 0}, last[3] = {0, 0, 0}, cell[3], held = 0, found = 0;
+    double size = 1;
+    for (int k = 0; k < DIM; ++k) {
+        first[k] = cell_at(low[k], scale);
+        last[k] = cell_at(high[k], scale);
+        size *= double(last[k]) - double(first[k]) + 1;
+    }
+    if (size > LANES)
+        return -1;
+    double x[DIM][DIM], direction[10][DIM];
+    for (int c = 0; c < DIM; ++c)
+        for (int k = 0; k < DIM; ++k)
+            x[c][k] = double(corners[DIM * c + k]) * scale;
+    int directions = 1;
+    if constexpr (DIM == 2) {
+        direction[0][0] = -(x[1][1] - x[0][1]);
+        direction[0][1] = x[1][0] - x[0][0];
+    } else {
+        double side[3][3];
+        for (int c = 0; c < 3; ++c)
+            for (int k = 0; k < 3; ++k)
+                side[c][k] = x[(c + 1) % 3][k] - x[c][k];
+        for (int k = 0; k < 3; ++k)
+            direction[0][k] = side[0][(k + 1) % 3] * side[1][(k + 2) % 3] - side[0][(k + 2) % 3] * side[1][(k + 1) % 3];
+        for (int c = 0; c < 3; ++c)
+            for (int k = 0; k < 3; ++k, ++directions) {
+                direction[directions][k] = 0;
+                direction[directions][(k + 1) % 3] = -side[c][(k + 2) % 3];
+                direction[directions][(k + 2) % 3] = side[c][(k + 1) % 3];
+            }
+    }
+    for (cell[2] = first[2]; cell[2] <= last[2]; ++cell[2])
+        for (cell[1] = first[1]; cell[1] <= last[1]; ++cell[1])
+            for (cell[0] = first[0]; cell[0] <= last[0]; ++cell[0]) {
+                bool free = false;
+                for (int d = 0; d < directions && !free; ++d)
+                    free = apart(direction[d], x, cell, reach_of * scale);
+                if (free)
+                    continue;
+                if (++held > MOST_CELLS && level > 0)
+                    return -1;
+                const int bucket = bucket_of(level, cell, buckets);
+                bool fresh = true;  // two cells may be hashed alike
+                for (int i = 0; i < found; ++i)
+                    fresh = fresh && buckets_of[i] != bucket;
+                if (fresh)
+                    buckets_of[found++] = bucket;
+            }
+    return found;
+};
+
+for (int b = 0; b < buckets + 2; ++b)
+    if (b <= buckets)
+        start.data[b] = 0;
+const int limit = DOUBLE ? 2048 : 256;
+for (int l = 0; l < limit; ++l)
+    levels.data[l] = 0;
+for (int t = 0; t < f; ++t) {
+    int* buckets_of = scratch.data + (long long)MOST_CELLS * t;
+    level_of.data[t] = 0;
+    buckets_of[0] = -1;
+    if (!good.data[t])
+        continue;
+    const real* shape = corners.data + (long long)DIM * DIM * t;
+    double low[DIM], high[DIM], farthest = 0, extent = 0;
+    for (int k = 0; k < DIM; ++k) {
+        low[k] = high[k] = double(shape[k]);
+        for (int c = 1; c < DIM; ++c) {
+            const double x = double(shape[DIM * c + k]);
+            low[k] = x < low[k] ? x : low[k];
+            high[k] = x > high[k] ? x : high[k];
+        }
+        low[k] = within(low[k] - reach_of, MOST);
+        high[k] = within(high[k] + reach_of, MOST);
+        const double far = -low[k] > high[k] ? -low[k] : high[k], wide = within(high[k] - low[k], MOST);
+        farthest = far > farthest ? far : farthest;
+        extent = wide > extent ? wide : extent;
+    }
+    // cells are numbered up to 2^22, and a box has no more than LANES along an axis
+    int level = finest, bound = 2 * Bits::BIAS + 21 - Bits::exponent(real(farthest));
+    level = bound < level ? bound : level;
+    bound = 2 * Bits::BIAS + LANES_LOG2 - Bits::exponent(real(extent));
+    level = bound < level ? bound : level;
+    level = level < 0 ? 0 : level;
+    int found = hold(shape, low, high, level, buckets_of);
+    while (found < 0)
+        found = hold(shape, low, high, --level, buckets_of);
+    if (found < MOST_CELLS)
+        buckets_of[found] = -1;
+    level_of.data[t] = level;
+    levels.data[level] = 1;
+    for (int i = 0; i < found; ++i)
+        ++start.data[buckets_of[i] + 1];
+}
+for (int b = 0; b < buckets; ++b)
+    start.data[b + 1] += start.data[b];
+const int filled = start.data[buckets];
+for (long long e = filled; e < (long long)f * MOST_CELLS; ++e)
+    triangles.data[e] = f;
+for (int t = f - 1; t >= 0; --t)  // from the back: entries of a bucket end up in the order of triangles
+    for (int i = 0; i < MOST_CELLS && scratch.data[(long long)MOST_CELLS * t + i] >= 0; ++i)
+        triangles.data[--start.data[scratch.data[(long long)MOST_CELLS * t + i] + 1]] = t;
+for (int b = 0; b < buckets; ++b)  // each start was moved to that of the bucket before
+    start.data[b] = start.data[b + 1];
+start.data[buckets] = filled;
+int used = 0;
+for (int l = limit - 1; l >= 0; --l)
+    used += levels.data[l];
+level_count.data[0] = used;
+for (int l = 0, place = used; l < limit; ++l)  // the smallest cells, which have the highest level, come first
+    if (levels.data[l])
+        scratch.data[--place] = l;
+for (int l = 0; l < limit; ++l)
+    levels.data[l] = l < used ? scratch.data[l] : 0;
+"""
+
+_QUERY = r"""
+struct Shared { int next_chunk; };
+Shared& shared = *(Shared*)info.data;
+const double scale = Bits::unit_scale(radius);
+const int sizes_of_cells = level_count.data[0];
+int longest = 0;
+for (;;) {
+    const long long begin = (long long)__atomic_fetch_add(&info.data[2], 1, __ATOMIC_RELAXED) * CHUNK;
+    if (begin >= n)
+        break;
+    const long long end = begin + CHUNK < n ? begin + CHUNK : n;
+    for (long long i = begin; i < end; ++i) {
+        const real* p = positions.data + DIM * i;
+        int* row = idx.data + (long long)capacity * i;
+        int found = 0;
+        for (int l = 0; l < sizes_of_cells && finite_point(p); ++l) {
+            const int level = levels.data[l];
+            const double per_length = scale_of(level);
+            int cell[3];
+            for (int k = 0; k < DIM; ++k)
+                cell[k] = cell_at(double(p[k]), per_length);
+            const int bucket = bucket_of(level, cell, buckets);
+            for (int e = start.data[bucket]; e < start.data[bucket + 1]; ++e) {
+                const int t = triangles.data[e];
+                const real* box = boxes.data + (long long)2 * DIM * t;
+                bool inside = level_of.data[t] == level;
+                for (int k = 0; k < DIM; ++k)
+                    inside = inside & (p[k] >= box[k]) & (p[k] <= box[DIM + k]);
+                if (!inside || !Shape::near(p, corners.data + (long long)DIM * DIM * t, radius, scale))
+                    continue;
+                if (LIST && found < capacity)
+                    row[found] = t;
+                ++found;
+            }
+        }
+        if constexpr (LIST)
+            for (int s = found; s < capacity; ++s)
+                row[s] = f;
+        count.data[i] = found;
+        longest = found > longest ? found : longest;
+    }
+}
+int known = __atomic_load_n(&info.data[0], __ATOMIC_RELAXED);
+while (known < longest && !__atomic_compare_exchange_n(&info.data[0], &known, longest, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+}
+"""
+
+
+class Kernels(NamedTuple):
+    """The two kernels of a variant, both launched with dim = 1 (`query` once per thread)."""
+
+    build: wp.Kernel
+    query: wp.Kernel
+
+
+@functools.cache
+def triangle_kernels(dim: int, double: bool, lists: bool, most_cells: int, lanes: int) -> Kernels:
+    """Return the kernels for a dimension and dtype, for lists or counts alone; `most_cells` and `lanes` are those of the cells."""
+    scalar = wp.float64 if double else wp.float32
+    variant = f"{dim}d_{'f64' if double else 'f32'}{'_list' * lists}"
+    options = {"LIST": lists, "MOST_CELLS": most_cells, "LANES": lanes, "LANES_LOG2": lanes.bit_length() - 1, "CHUNK": CHUNK}
+    reals, ints = wp.array(dtype=scalar), wp.array(dtype=wp.int32)
+    points, rows, shapes = wp.array2d(dtype=scalar), wp.array2d(dtype=wp.int32), wp.array3d(dtype=scalar)
+
+    def build_native(
+        corners: shapes, good: ints, cutoff: reals, start: ints, triangles: ints, levels: ints, level_count: ints, level_of: ints,
+        scratch: ints, f: int, buckets: int,
+    ): ...  # fmt: skip
+
+    def query_native(
+        positions: points, corners: shapes, boxes: points, cutoff: reals, start: ints, triangles: ints, levels: ints,
+        level_count: ints, level_of: ints, idx: rows, count: ints, info: ints, n: int, f: int, buckets: int, capacity: int,
+    ): ...  # fmt: skip
+
+    for native in (build_native, query_native):
+        native.__name__ = native.__qualname__ = f"triangles_{native.__name__}_{variant}"
+    text = functools.partial(snippet, "double" if double else "float", dim, DECIDE, LEVELS, **options)
+    build_function = wp.func_native(ENTER + text(_BUILD) + LEAVE)(build_native)
+    query_function = wp.func_native(ENTER + text(_QUERY) + LEAVE)(query_native)
+
+    def build(
+        corners: shapes, good: ints, cutoff: reals, start: ints, triangles: ints, levels: ints, level_count: ints, level_of: ints,
+        scratch: ints, f: int, buckets: int,
+    ):  # fmt: skip
+        build_function(corners, good, cutoff, start, triangles, levels, level_count, level_of, scratch, f, buckets)
+
+    def query(
+        positions: points, corners: shapes, boxes: points, cutoff: reals, start: ints, triangles: ints, levels: ints,
+        level_count: ints, level_of: ints, idx: rows, count: ints, info: ints, n: int, f: int, buckets: int, capacity: int,
+    ):  # fmt: skip
+        query_function(
+            positions,
+            corners,
+            boxes,
+            cutoff,
+            start,
+            triangles,
+            levels,
+            level_count,
+            level_of,
+            idx,
+            count,
+            info,
+            n,
+            f,
+            buckets,
+            capacity,
+        )
+
+    module = wp.get_module(f"jfrnn.kernels.triangles_cpu.{variant}")
+    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
+    return Kernels(wp.kernel(build, module=module), wp.kernel(query, module=module))

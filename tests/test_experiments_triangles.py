@@ -1,0 +1,41 @@
+"""The comparison with libraries that find nearest triangles runs, and agrees; meshes are read from files."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from jfrnn.cases import meshes
+
+from experiments import _mesh_files, _triangles
+from experiments._errors import UsageError
+
+
+def test_a_small_comparison(tmp_path):
+    path = _triangles.measure(tmp_path, 500, 500, 2, "warp", cutoffs=(0.5,))
+    rows = pd.read_csv(path)
+    assert list(rows["method"])[:3] == ["jfrnn update", "jfrnn rebuild", "jfrnn count"]
+    assert "trimesh" in set(rows["method"])
+    peers = rows[rows["method"].isin(["trimesh", "libigl"])]
+    assert not peers[["missing", "extra"]].to_numpy().any()
+    assert "us_per_particle" in _triangles.table(path)
+
+
+@pytest.mark.parametrize("kind", ["stl", "obj", "ply"])
+def test_meshes_are_read(tmp_path, kind):
+    import trimesh
+
+    vertices, faces = meshes.sphere(2.0, 3)
+    path = tmp_path / f"sphere.{kind}"
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
+    points, named = _mesh_files.read(path)
+    assert (points.shape, named.shape, named.dtype) == (vertices.shape, faces.shape, np.int32)
+    assert np.allclose(
+        np.sort(points[named].reshape(len(faces), -1), axis=0), np.sort(vertices[faces].reshape(len(faces), -1), axis=0), atol=1e-6
+    )
+
+
+def test_what_is_no_mesh_is_refused(tmp_path):
+    with pytest.raises(UsageError, match="is no file"):
+        _mesh_files.read(tmp_path / "none.stl")
+    (tmp_path / "text.txt").write_text("no mesh")
+    with pytest.raises(UsageError, match=r"is no mesh|holds no triangles"):
+        _mesh_files.read(tmp_path / "text.txt")

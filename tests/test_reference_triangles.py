@@ -1,0 +1,92 @@
+"""The oracle of triangles: by hand, against figures of 60 digits, and against a search over points of the triangle."""
+
+from decimal import Decimal, localcontext
+from fractions import Fraction
+from itertools import permutations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference import squared_distance, triangle_pairs
+
+UNIT = [[0, 0, 0], [4, 0, 0], [0, 4, 0]]
+WHOLE = st.lists(st.integers(-6, 6), min_size=3, max_size=3)
+
+
+@pytest.mark.parametrize(
+    ("point", "square"),
+    [
+        ([1, 1, 3], 9),  # above the face
+        ([1, 1, 0], 0),  # on it
+        ([0, 0, 0], 0),  # on a vertex
+        ([2, 0, 0], 0),  # on an edge
+        ([-3, -4, 0], 25),  # beyond a vertex
+        ([2, -2, 1], 5),  # beyond an edge
+        ([4, 4, 0], 8),  # beyond the long edge
+        ([6, -1, 2], 9),  # beyond the vertex at its end
+    ],
+)
+def test_distances_by_hand(point, square):
+    for corners in permutations(UNIT):
+        assert squared_distance(point, corners) == square
+
+
+def test_degenerate_triangles_by_hand():
+    segment = [[0, 0, 0], [1, 1, 0], [4, 4, 0]]
+    for corners in permutations(segment):
+        assert squared_distance([2, 0, 0], corners) == 2
+        assert squared_distance([5, 5, 1], corners) == 3
+    assert squared_distance([1, 2, 2], [[0, 0, 0]] * 3) == 9
+    assert squared_distance([1, 2, 2], [[0, 0, 0]] * 2) == 9
+
+
+def test_needle_of_the_reference_figures():
+    """Exact distance, 60 digits: .00141414285346."""
+    point = [Fraction(1, 2), Fraction(1, 1000), Fraction(1, 1000)]
+    needle = [[0, 0, 0], [1, 0, 0], [Fraction(1, 2), Fraction(1, 10**7), 0]]
+    square = squared_distance(point, needle)
+    with localcontext() as context:
+        context.prec = 60
+        distance = (Decimal(square.numerator) / Decimal(square.denominator)).sqrt()
+    assert str(distance).startswith("0.00141414285346")
+
+
+@given(WHOLE, st.lists(WHOLE, min_size=3, max_size=3))
+@settings(max_examples=200, deadline=None)
+def test_no_point_of_the_triangle_is_nearer(point, corners):
+    """A lattice of points of the triangle comes as near as its spacing allows, and never nearer."""
+    square = squared_distance(point, corners)
+    steps = 12
+    nearest = min(
+        sum((p - Fraction(i * a + j * b + (steps - i - j) * c, steps)) ** 2 for p, a, b, c in zip(point, *corners, strict=True))
+        for i in range(steps + 1)
+        for j in range(steps + 1 - i)
+    )
+    assert square <= nearest
+    size = max(sum((x - y) ** 2 for x, y in zip(a, b, strict=True)) for a in corners for b in corners)
+    assert float(nearest) ** 0.5 - float(square) ** 0.5 <= size**0.5 / steps + 1e-12
+
+
+@given(WHOLE, st.lists(WHOLE, min_size=3, max_size=3), st.permutations([0, 1, 2]), st.sampled_from([-1, 1]), WHOLE)
+@settings(max_examples=100, deadline=None)
+def test_distance_knows_no_order_axis_or_origin(point, corners, order, sign, shift):
+    def moved(p):
+        return [sign * p[k] + s for k, s in zip(order, shift, strict=True)]
+
+    assert squared_distance(point, corners) == squared_distance(moved(point), [moved(corners[k]) for k in order])
+
+
+def test_pairs_are_strict_and_rounded_once(dtype, dim):
+    radius = float(dtype(0.1))
+    positions = np.zeros((4, dim), dtype)
+    positions[:, -1] = [np.nextafter(dtype(0.1), dtype(0)), radius, np.nextafter(dtype(0.1), dtype(1)), np.nan]
+    vertices = np.zeros((4, dim), dtype)
+    vertices[1:3, 0] = [-1, 1]
+    vertices[3] = np.nan
+    if dim == 2:
+        faces = [[1, 2], [0, 0], [1, 3], [1, 4], [-1, 1]]
+    else:
+        vertices[0, 1] = 1
+        faces = [[0, 1, 2], [1, 2, 1], [1, 2, 3], [1, 2, 4], [-1, 1, 2]]
+    assert triangle_pairs(positions, vertices, faces, 0.1) == {(0, 0), (0, 1)}

@@ -1,0 +1,255 @@
+"""`search_triangles` against the oracle on every hard case, what it refuses, and what a list does in a time loop."""
+
+import functools
+from itertools import pairwise, product
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from jfrnn.cases.triangles import TRIANGLE_CASES
+
+import jfrnn
+from jfrnn import _triangles_cells, _triangles_warp
+
+BACKENDS = ("jax", "warp")
+CAPACITY = 40
+KINDS = list(product((np.float32, np.float64), (2, 3)))
+OFTEN = {(np.float32, 3), (np.float64, 2)}  # the array engine compiles slowly
+pytestmark = pytest.mark.usefixtures("compiled_soon")
+
+
+def padded(given):
+    """Make all cases of one shape: NaN is near nothing, and so are faces without vertices."""
+    dim, dtype = given.positions.shape[1], given.positions.dtype
+    positions, vertices = np.full((48, dim), np.nan, dtype), np.full((96, dim), np.nan, dtype)
+    faces = np.full((32, dim), -1, np.int32)
+    positions[: len(given.positions)], vertices[: len(given.vertices)] = given.positions, given.vertices
+    faces[: len(given.faces)] = np.where(given.faces < len(given.vertices), given.faces, -1)
+    return positions, vertices, faces
+
+
+def assert_exact(tri, expected):
+    """Fail unless the list holds exactly these pairs."""
+    assert not tri.overflow
+    found = reference.pairs_of(np.asarray(tri.idx), np.asarray(tri.count), len(tri.faces))
+    missing, extra = reference.compare(found, expected)
+    assert (len(missing), len(extra)) == (0, 0), f"missing {sorted(missing)[:5]}, extra {sorted(extra)[:5]} of {len(expected)}"
+
+
+@functools.lru_cache(maxsize=2)
+def expected_pairs(name, dtype, dim):
+    given = TRIANGLE_CASES[name].build(dtype, dim)
+    return reference.triangle_pairs(given.positions, given.vertices, given.faces, given.cutoff)
+
+
+def each_case():
+    for (dtype, dim), name, backend in product(KINDS, TRIANGLE_CASES, BACKENDS):
+        rarely = backend == "jax" and (dtype, dim) not in OFTEN
+        kind = f"f{8 * dtype().itemsize}-{dim}d-{name}-{backend}"
+        yield pytest.param(name, dtype, dim, backend, id=kind, marks=[pytest.mark.slow] * rarely)
+
+
+@pytest.mark.parametrize(("name", "dtype", "dim", "backend"), list(each_case()))
+def test_hard_case(name, dtype, dim, backend):
+    given = TRIANGLE_CASES[name].build(dtype, dim)
+    tri = jfrnn.search_triangles(*padded(given), given.cutoff, capacity=CAPACITY, backend=backend)
+    assert_exact(tri, expected_pairs(name, dtype, dim))
+    assert int(tri.required) == int(np.max(tri.count))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TRIANGLE_CASES)
+def test_every_case_as_it_is(name, dtype, dim):
+    """Eager, unpadded, capacity counted, other optimizations of the compiler: hundreds of programs."""
+    given = TRIANGLE_CASES[name].build(dtype, dim)
+    tri = jfrnn.search_triangles(given.positions, given.vertices, given.faces, given.cutoff)
+    assert_exact(tri, expected_pairs(name, dtype, dim))
+
+
+def wall(dtype=np.float32, origin=0.0):
+    """A square of two triangles in the plane z = 0."""
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype) + np.array([0, 0, origin], dtype)
+    return vertices, np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def test_nothing_is_near_nothing(dtype, dim):
+    empty, faces = np.zeros((0, dim), dtype), np.zeros((0, dim), np.int64)
+    points, corners = np.zeros((2, dim), dtype), np.eye(dim, dtype=dtype)
+    search = functools.partial(jfrnn.search_triangles, cutoff=1.0)
+    for x, v, f in (
+        (empty, empty, faces),
+        (points, empty, faces),
+        (points, corners, faces),
+        (empty, corners, np.arange(dim)[None]),
+    ):
+        tri = search(x, v, f)
+        tri.check()
+        assert tri.idx.shape == (len(x), 8)
+        assert np.all(np.asarray(tri.idx) == len(f))
+        assert not np.any(tri.count)
+        if 0 in (len(x), len(f)):
+            nearest, distance, mask = tri.closest(x)
+            assert (nearest.shape, distance.shape) == ((len(x), 8, dim), (len(x), 8))
+            assert not np.any(mask)
+            assert tri.signed_distance(x).distance.shape == (len(x),)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "match"),
+    [
+        ({"positions": [[0.0] * 3]}, TypeError, r"positions must be a JAX or NumPy array"),
+        ({"vertices": np.zeros((4, 2), np.float32)}, ValueError, r"vertices must match positions \(float32, 3 columns\)"),
+        ({"vertices": np.zeros((4, 3))}, ValueError, r"vertices must match positions"),
+        ({"faces": np.zeros((2, 3))}, TypeError, r"faces must be an array of integers of shape \[f, 3\], .* got float64"),
+        ({"faces": [[0, 1, 2]]}, TypeError, r"faces must be an array of integers .* got list"),
+        ({"faces": np.zeros((2, 4), int)}, ValueError, r"faces must have shape \[f, 3\], the vertices of triangles in 3D"),
+        ({"cutoff": 0.0}, ValueError, r"cutoff must be positive and finite"),
+        ({"cutoff": 1e-40}, ValueError, r"cutoff=.* is outside"),
+        ({"capacity": 0}, ValueError, r"capacity must be at least 1"),
+        ({"slack": 0.5}, ValueError, r"slack must be finite and at least 1"),
+        ({"backend": "hashgrid"}, ValueError, r"backend must be one of 'auto', 'jax', 'warp'"),
+    ],
+)
+def test_what_is_refused(change, error, match):
+    vertices, faces = wall()
+    given = {"positions": np.zeros((1, 3), np.float32), "vertices": vertices, "faces": faces, "cutoff": 1.0} | change
+    with pytest.raises(error, match=match):
+        jfrnn.search_triangles(**given)
+
+
+def test_capacity_is_asked_for_under_jit():
+    vertices, faces = wall()
+    with pytest.raises(ValueError, match="capacity must be given where positions, vertices or faces are traced"):
+        jax.jit(lambda x: jfrnn.search_triangles(x, vertices, faces, 1.0).idx)(np.zeros((1, 3), np.float32))
+
+
+def test_status_tells_of_the_data():
+    vertices, faces = wall()
+    points = np.full((4, 3), 0.25, np.float32)
+    broken = vertices.copy()
+    broken[3] = np.nan
+    search = functools.partial(jfrnn.search_triangles, cutoff=0.5, capacity=1)
+    cases = [
+        (points, vertices, faces, jfrnn.Status.ROW_OVERFLOW, r"capacity=1 is too small: one row has 2 neighbors"),
+        (points * np.nan, vertices, faces, jfrnn.Status.NONFINITE, r"`positions` .* hold non-finite"),
+        (points, broken, faces, jfrnn.Status.NONFINITE_VERTEX, r"`vertices` that faces name hold non-finite"),
+        (
+            points,
+            vertices,
+            np.array([[0, 1, 2], [0, 2, 4]]),
+            jfrnn.Status.FACE_OUT_OF_RANGE,
+            r"`faces` name vertices that do not exist",
+        ),
+        (points, vertices, np.array([[0, 1, 2], [0, 2, -(2**40)]]), jfrnn.Status.FACE_OUT_OF_RANGE, r"`faces` name vertices"),
+    ]
+    for x, v, f, bit, match in cases:
+        tri = search(x, v, f)
+        assert jfrnn.Status(int(tri.status)) == bit
+        with pytest.raises((ValueError, jfrnn.NeighborOverflowError), match=match):
+            tri.check()
+
+
+def test_a_loop_with_a_wall_that_moves():
+    """Updates keep what was sticky, reuse the cells of a wall that stays, and sort one that does not; grow makes room."""
+    vertices, faces = wall()
+    x = np.random.default_rng(0).uniform([-0.5, -0.5, 0.6], [1.5, 1.5, 1.4], (4, 3)).astype(np.float32)
+    tri = jfrnn.search_triangles(x, vertices, faces, 0.5, capacity=1)
+    assert int(tri.required) <= 1 or tri.overflow
+
+    @jax.jit
+    def fall(x, tri):
+        def step(_, carry):
+            x, tri = carry
+            x = x - jnp.array([0.0, 0.0, 0.25], jnp.float32)
+            return x, tri.update(x)
+
+        return jax.lax.fori_loop(0, 4, step, (x, tri))
+
+    after, seen = fall(x, tri)
+    assert seen.overflow
+    assert int(seen.required) == 2
+    grown = seen.grow(after)
+    grown.check()
+    assert grown.capacity == 8
+    assert_exact(grown, reference.triangle_pairs(np.asarray(after), vertices, faces, 0.5))
+    lifted = wall(origin=0.75)[0]
+    moved = jax.jit(lambda x, v, tri: tri.update(x, vertices=v))(after, lifted, grown)
+    assert_exact(moved, reference.triangle_pairs(np.asarray(after), lifted, faces, 0.5))
+    assert np.array_equal(moved.vertices, lifted)
+    with pytest.raises(TypeError, match=r"grow\(\) changes the shape"):
+        jax.jit(lambda x, tri: tri.grow(x).idx)(after, grown)
+    with pytest.raises(ValueError, match="positions hold 3 particles, but the list was made for 4"):
+        grown.update(after[:3])
+    with pytest.raises(ValueError, match="vertices have shape"):
+        grown.update(after, vertices=lifted[:3])
+
+
+@pytest.mark.parametrize("backend", [pytest.param("jax", marks=pytest.mark.slow), "warp"])
+def test_vmap_is_a_loop(backend):
+    vertices, faces = wall()
+    x = np.random.default_rng(1).uniform(-0.2, 1.2, (2, 4, 3)).astype(np.float32)
+    one = functools.partial(jfrnn.search_triangles, vertices=vertices, faces=faces, cutoff=0.5, capacity=2, backend=backend)
+    together = jax.vmap(one)(x)
+    for b in range(2):
+        alone = one(x[b])
+        assert np.array_equal(together.idx[b], alone.idx)
+        assert np.array_equal(together.count[b], alone.count)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_buckets_are_shared_without_harm(monkeypatch, backend):
+    """All cells hashed into two buckets: candidates are many, pairs the same."""
+    for module in (_triangles_cells, _triangles_warp):
+        monkeypatch.setattr(module, "bucket_count", lambda faces: 2)
+    given = TRIANGLE_CASES["sizes"].build(np.float64, 2)
+    positions, vertices, faces = padded(given)
+    tri = jax.jit(lambda *wall: jfrnn.search_triangles(*wall, given.cutoff, capacity=41, backend=backend))(
+        positions, vertices, faces
+    )
+    assert tri.cells.start.shape == (3,)
+    assert_exact(tri, expected_pairs("sizes", np.float64, 2))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_cells_hold_what_they_say(backend):
+    """Each bucket holds a triangle once at most, in the order of triangles; levels in use come first, the smallest cells before."""
+    given = TRIANGLE_CASES["sizes"].build(np.float64, 2)
+    tri = jfrnn.search_triangles(*padded(given), given.cutoff, capacity=40, backend=backend)
+    start, held, levels = (np.asarray(x) for x in (tri.cells.start, tri.cells.triangles, tri.cells.levels))
+    count = int(tri.cells.level_count)
+    assert start[0] == 0
+    for low, high in pairwise(start):
+        inside = held[low:high][held[low:high] < 32]
+        assert np.all(np.diff(inside) > 0)
+    assert np.all(np.diff(levels[:count]) < 0)
+    assert not np.any(levels[count:])
+    assert set(levels[:count]) == set(np.asarray(tri.cells.level_of)[:24])
+
+
+def test_engines_make_the_same_cells():
+    given = TRIANGLE_CASES["random"].build(np.float32, 3)
+    one, two = (jfrnn.search_triangles(*padded(given), given.cutoff, capacity=40, backend=backend) for backend in BACKENDS)
+    assert np.array_equal(one.cells.level_of, two.cells.level_of)
+    assert np.array_equal(one.idx, two.idx)
+
+
+@pytest.mark.parametrize("faces", [0, 500])
+def test_memory_is_planned(dtype, dim, faces):
+    """What the list takes is known beforehand, and follows particles and faces alone."""
+    plan = jfrnn.memory_plan(1000, 0.1, 16, dim=dim, dtype=dtype, faces=faces)
+    vertices = np.random.default_rng(0).normal(size=(400, dim)).astype(dtype)
+    named = np.random.default_rng(1).integers(0, 400, (faces, dim))
+    tri = jfrnn.search_triangles(np.zeros((1000, dim), dtype), vertices, named, 0.1, capacity=16)
+    made = jax.tree.leaves((tri.idx, tri.count, tri.status, tri.required, tri.cells))
+    assert 0 <= plan.list_bytes - sum(leaf.nbytes for leaf in made) <= 16 * len(made)  # a table of results
+    assert plan.scratch_bytes < 1000 * (64 + faces)
+    assert plan.backend == tri.backend == "warp"
+
+
+def test_plans_that_make_no_sense_are_refused():
+    with pytest.raises(ValueError, match="faces belong to a search for triangles"):
+        jfrnn.memory_plan(10, 0.1, 8, faces=10, queries=10)
+    with pytest.raises(ValueError, match="finds no triangles"):
+        jfrnn.memory_plan(10, 0.1, 8, faces=10, backend="brute")
