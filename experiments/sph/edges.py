@@ -117,8 +117,8 @@ class JaxMdEdges:
         if active is not None:
             raise ValueError("jax-md's list knows no inactive particles: take a scene without inflow.")
         nbrs = self.nbrs.update(positions - self.low)
-        made = True if self.always else jnp.any(nbrs.reference_position != self.nbrs.reference_position)
-        return replace(self, nbrs=nbrs, rebuilds=self.rebuilds + made)
+        made = self.always | jnp.any(nbrs.reference_position != self.nbrs.reference_position)
+        return replace(self, nbrs=nbrs, rebuilds=self.rebuilds + made.astype(jnp.int32))
 
     def sum(self, fn: Callable[[Array, Any, Any], Any], positions: Array, values: Any) -> Any:  # noqa: ANN401
         """Sum over the edges of each i."""

@@ -5,6 +5,7 @@ from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from experiments._plots import COLORS, OTHER_COLORS, label_logarithmic
 from experiments.sph.speed import Row
@@ -72,19 +73,21 @@ def _status(row: Row) -> str:
 
 
 def draw_stages(rows: list[Row]) -> Figure:
-    """Draw where a step's time goes, nanoseconds per particle, a bar for each way and scene."""
-    figure = Figure(figsize=(6.4, 0.9 + 0.55 * len(rows)), layout="constrained")
-    axes = figure.add_subplot()
-    names = [f"{row.way}\n{row.particles:,}".replace(",", "\u2009") for row in rows]
-    left = [0.0] * len(rows)
-    for color, stage in zip(_PALETTE, STAGES, strict=False):
-        width = [1e9 * max(row.parts[stage], 0.0) / (row.particles or 1) for row in rows]
-        axes.barh(names, width, left=left, color=color, label=stage, height=0.7)
-        left = [a + b for a, b in zip(left, width, strict=True)]
-    axes.invert_yaxis()
-    axes.set(xlabel="time of a step [ns per particle]", title=f"{rows[0].scene}, {rows[0].dtype}, {rows[0].device}")
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside lower center", ncols=len(STAGES), frameon=False, fontsize=8)
+    """Draw where a step's time goes, nanoseconds per particle, a bar for each way and scene; each has its own scale."""
+    figure = Figure(figsize=(6.4, 1.2 + 0.85 * len(rows)), layout="constrained")
+    panels = figure.subplots(len(rows), squeeze=False)[:, 0]
+    for axes, row in zip(panels, rows, strict=True):
+        left, name = 0.0, f"{row.way}\n{row.particles:,}".replace(",", "\u2009")
+        for color, stage in zip(_PALETTE, STAGES, strict=False):
+            width = 1e9 * max(row.parts[stage], 0.0) / (row.particles or 1)
+            axes.barh([name], [width], left=left, color=color, label=stage)
+            left += width
+        axes.set_xlim(0, left)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[-1].set_xlabel("time of a step [ns per particle]")
+    panels[0].set_title(f"{rows[0].scene}, {rows[0].dtype}, {rows[0].device}", fontsize=10)
+    handles, names = panels[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=len(STAGES), frameon=False, fontsize=8)
     return figure
 
 
@@ -107,6 +110,7 @@ def draw_tradeoff(rows: list[Row]) -> Figure:
     axes.set_title(f"Taylor-Green vortices, Re = 100, {rows[0].device}", fontsize=10)
     for axis in (axes.xaxis, axes.yaxis):
         label_logarithmic(axis)
+        axis.set_minor_formatter(NullFormatter())
     axes.grid(True, which="major", color="0.9", linewidth=0.8)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize=8, frameon=False)
