@@ -377,7 +377,7 @@ def _sort_on_cpu(
     wp.launch(kernels.build, dim=1, inputs=[positions, queries, cutoff, info, scratch, *sizes], device="cpu")
     if n >= kernels_of("cells_cpu").MANY:
         arguments = [positions, cutoff, scratch, *sizes]
-        _on_every_core(lambda: wp.launch(kernels.gather, dim=1, inputs=arguments, device="cpu"), -(-n // _PLACES_PER_THREAD))
+        on_every_core(lambda: wp.launch(kernels.gather, dim=1, inputs=arguments, device="cpu"), -(-n // _PLACES_PER_THREAD))
 
 
 def _launchable(variant: Variant, arrays: _Arrays) -> tuple[_Arrays, list[int], int]:

@@ -341,7 +341,8 @@ def sum_kernels(
     The rest is there to be measured: `blocks` per multiprocessor bound the registers, `taken` is how many pairs a lane adds before
     it looks for the next block; None: as was fastest on an H200.
     """
-    cheap = work(term.text) <= LITTLE_WORK
+    # rows of several loads, each of which waits in registers: 1.3 times slower for sums of SPH, if so many are loaded ahead
+    cheap = work(term.text) <= LITTLE_WORK and row_length(term, dim, double) <= 4
     taken = taken or (4 if cheap else 2)
     blocks = blocks or (16 if double or not cheap else 20)
     totals, columns = sum(part.total for part in term.sums), term.source_columns
