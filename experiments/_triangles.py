@@ -94,7 +94,7 @@ def _calls(scene: _Scene, cutoff: float, backend: str) -> tuple[dict[str, Callab
 
 
 def _libigl(scene: _Scene) -> tuple[np.ndarray, np.ndarray, list[float]]:
-    import igl
+    import igl  # pyright: ignore[reportMissingImports]
 
     points, vertices = scene.points.astype(np.float64), scene.vertices.astype(np.float64)
     (square, *_), seconds = _measure.repeat(lambda: igl.point_mesh_squared_distance(points, vertices, scene.faces), 3, 0.0, 3)

@@ -41,12 +41,12 @@ def expected_pairs(name, dtype, dim, closed):
 def each_case():
     """Yield every dtype, dimension, comparison, case and backend, in an order in which the oracle answers each case once.
 
-    The array engines decide alike and compile slowly: of them, some kinds run by hand alone.
+    The array engines decide alike and compile slowly: of them, and of "hashgrid", some kinds run by hand alone.
     """
     for dtype, dim, closed, name, backend in product((np.float32, np.float64), (2, 3), (False, True), NAMES, BACKENDS):
         often = (dtype, dim) in ((np.float32, 3), (np.float64, 2))
         first = (dtype, dim) == (np.float32, 3)
-        rarely = (backend == "brute" and (closed or not first)) or (backend == "jax" and (closed or not often))
+        rarely = {"brute": closed or not first, "jax": closed or not often, "hashgrid": not often}.get(backend, False)
         kind = f"f{8 * dtype().itemsize}-{dim}d-{'closed' if closed else 'open'}"
         yield pytest.param(name, dtype, dim, closed, backend, id=f"{kind}-{name}-{backend}", marks=[pytest.mark.slow] * rarely)
 

@@ -10,6 +10,7 @@ from experiments._cli import app
 from experiments.sph import gradients, inverse
 
 
+@pytest.mark.slow
 def test_a_viscosity_is_found_from_an_early_profile():
     problem = inverse.viscosity(time=2e-4)
     found = inverse.solve(problem, 12)

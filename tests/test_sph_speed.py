@@ -45,6 +45,7 @@ def read(folder):
     return [json.loads(line) for line in (folder / "rows.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.slow
 def test_ways_agree_before_their_time_counts(folder):
     rows = {row["way"]: row for row in read(folder) if row["kind"] == "step"}
     assert {way: row["status"] for way, row in rows.items()} == {

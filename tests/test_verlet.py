@@ -61,7 +61,7 @@ def test_a_list_with_a_skin_holds_the_wider_pairs_and_masks_to_the_cutoff(backen
 
 
 @pytest.mark.parametrize(("ulps", "rebuilds"), [(-40, 0), (0, 1), (1, 1)])
-@pytest.mark.parametrize(("backend", "dtype", "dim"), [each for each in EACH[:-1] if each[0] != "hashgrid"])
+@pytest.mark.parametrize(("backend", "dtype", "dim"), [*EACH[:4], pytest.param(*EACH[-2], marks=pytest.mark.slow)])
 def test_half_the_skin_is_as_far_as_a_point_may_go(ulps, rebuilds, backend, dtype, dim):
     """Two points come closer by almost the whole skin: their pair must be in the old list, or the list be made anew."""
     half = np.float64(dtype(SKIN)) / 2
