@@ -97,7 +97,7 @@ def domain(
 @app.command()
 def skin(
     spacing: Spacing = 1e-4,
-    steps: Annotated[int, typer.Option(min=1, help="Steps of a compiled scan.")] = 20,
+    steps: Annotated[int, typer.Option(min=1, help="Steps of a compiled scan.")] = 100,
     repeats: Annotated[int, typer.Option(min=2, help="Timed scans.")] = 3,
 ) -> None:
     """Time a step that keeps its neighbor list beside one that makes it anew."""
