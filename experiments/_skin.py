@@ -20,8 +20,8 @@ def skin_table(spacing: float, steps: int, repeats: int, skin: float = 0.1) -> p
         skin: In cutoffs.
 
     Returns:
-        One row per backend: points, skin [cutoffs], steps, milliseconds per step that keeps and that rebuilds (medians), their ratio, and
-        how often each scan rebuilt.
+        One row per backend: points, skin [cutoffs], steps, milliseconds per step that keeps and that rebuilds (medians), their
+        ratio, and how often each scan rebuilt.
     """
     scene = _layouts.make("full", spacing=spacing)
     x = jnp.asarray(scene.positions, jnp.float32)

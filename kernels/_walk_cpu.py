@@ -242,19 +242,21 @@ _WALK = Template(r"""auto position_of = [&](int place, real* q) {
     else
         point_of(queries.data + (long long)ROW * query_ids[place], q);
 };
-// numbers, all moved by one, a vector of them at a time and then one by one
-auto copy_numbers = [](const auto* from, auto* to, int size, auto moved) {
-    typedef decltype(moved) lanes __attribute__((vector_size(LANES * sizeof moved)));
+// numbers, changed or as they are, a vector of them at a time and then one by one
+auto copy_numbers = [](const auto* from, auto* to, int size, auto changed) {
+    typedef __typeof__(*to + 0) element;
+    typedef element lanes __attribute__((vector_size(LANES * sizeof(element))));
     int s = 0;
     for (; s + LANES <= size; s += LANES) {
         lanes loaded;
         __builtin_memcpy(&loaded, from + s, sizeof loaded);
-        loaded += moved;
+        loaded = changed(loaded);
         __builtin_memcpy(to + s, &loaded, sizeof loaded);
     }
     for (; s < size; ++s)
-        to[s] = from[s] + moved;
+        to[s] = changed(from[s]);
 };
+auto as_they_are = [](auto x) { return x; };  // integers travel as the bits of floats: not even 0 may be added to them
 auto system_at = [&](int place) { return BATCHED ? system_of(queries.data + (long long)ROW * query_ids[place]) : 0u; };
 // where the query at a place is along the axes, and its cell
 auto locate = [&](int place, real* at, whole* cell) {
@@ -316,11 +318,15 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
                 flush(false);
             const int room = CANDIDATES - filled, size = to - from < room ? to - from : room;
             // whole vectors while sources last: what is too much is overwritten by what comes next
+            const int told = PERIODIC == 2 && !SUMS ? n * image : 0;  // of the image
             const int spread = n - from < size + LANES ? size : (size + LANES - 1) / LANES * LANES;
             for (int k = 0; k < DIM; ++k)
-                copy_numbers(axis[k] + from, candidate[k] + filled, spread, PERIODIC ? moved[k] : real(0));
+                if constexpr (PERIODIC)
+                    copy_numbers(axis[k] + from, candidate[k] + filled, spread, [&](auto x) { return x + moved[k]; });
+                else
+                    copy_numbers(axis[k] + from, candidate[k] + filled, spread, as_they_are);
             if constexpr (SUMS != 1 || PERIODIC)
-                copy_numbers(ids + from, candidate_ids + filled, spread, PERIODIC == 2 && !SUMS ? n * image : 0);
+                copy_numbers(ids + from, candidate_ids + filled, spread, [&](auto x) { return x + told; });
             for (int s = 0; BATCHED && !grid.dense && s < size; ++s)
                 if (system_of(positions.data + (long long)ROW * ids[from + s]) != system)
                     candidate[0][filled + s] = __builtin_nanf("");

@@ -195,7 +195,7 @@ auto keep_largest = [&](number best, Math::i32 of, Math::i32 code, long long at,
 
 _COPY = r"""
             for (int c = 0; c < OTHERS; ++c)
-                copy_numbers(columns.data + (long long)c * n + from, column[c] + filled, spread, real(0));
+                copy_numbers(columns.data + (long long)c * n + from, column[c] + filled, spread, as_they_are);
 """
 
 _COPY_STEP = Template(r"""

@@ -39,6 +39,22 @@ def one(r, i, j):
     return 1.0
 
 
+@pytest.mark.parametrize("box", [None, jfrnn.Box([1.0] * 3)], ids=["open", "box"])
+def test_integers_travel_whose_bits_are_no_usual_floats(box):
+    """-0, numbers that are none and denormals, as floats: nothing may be computed with them on the way."""
+    bits = np.array([0x80000000, 0x7F800001, 0xFF812345, 0x00000001, 0x7FC00000, 0x80000001], np.uint32).view(np.int32)
+    x = jax.random.uniform(jax.random.key(0), (400, 3), jnp.float32)
+    kinds = jnp.asarray(np.resize(bits, 400))
+
+    def same(r, i, j):
+        return [(j == k).astype(r.dtype) for k in bits]
+
+    found = fused(same, x, 0.3, kinds, box=box)
+    expected = jfrnn.pair_sum(same, x, 0.3, kinds, box=box, backend="brute")
+    assert all(total.sum() > 1000 for total in expected)
+    np.testing.assert_array_equal(np.stack(found), np.stack(expected))
+
+
 def marks(r, i, j):
     """Tell pairs apart by whole numbers, which no order of summation rounds, and by the displacement."""
     return {"count": 1.0, "ids": j, "rests": (j * j) % 61, "rows": i, "r": r}
