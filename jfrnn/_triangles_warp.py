@@ -69,7 +69,7 @@ def _build_callable(variant: _Variant) -> Any:  # noqa: ANN401
     def run(*arrays: Any) -> None:  # noqa: ANN401
         named = dict(zip(types, arrays, strict=True))
         sizes = [named["corners"].shape[0], named["start"].shape[0] - 1]
-        wp.launch(_kernels(variant).build, dim=1, inputs=[*arrays, *sizes], device="cpu")
+        _warp.on_one_core(_kernels(variant).build, [*arrays, *sizes])
 
     return _warp.callable_of(_name("build", variant), run, types, 6)
 
@@ -88,7 +88,6 @@ def _query_callable(variant: _Variant) -> Any:  # noqa: ANN401
         n, capacity = named["positions"].shape[0], named["idx"].shape[1]
         sizes = [n, named["corners"].shape[0], named["start"].shape[0] - 1, capacity]
         named["info"].numpy()[:] = 0
-        launch = functools.partial(wp.launch, _kernels(variant).query, dim=1, inputs=[*arrays, *sizes], device="cpu")
-        _warp.on_every_core(launch, -(-n // _PARTICLES_PER_THREAD))
+        _warp.on_every_core(_kernels(variant).query, [*arrays, *sizes], -(-n // _PARTICLES_PER_THREAD))
 
     return _warp.callable_of(_name("query", variant), run, types, 3)

@@ -322,6 +322,7 @@ def callable_of(name: str, run: Callable[..., None], types: dict[str, Any], outp
     func.__name__ = func.__qualname__ = name
     wp = load_warp()
     _finish_before_exit()
+    _load_on_cpu(wp.get_module(__name__))  # which XLA's threads would do otherwise
     return wp.jax_callable(func, num_outputs=outputs, graph_mode=wp.JaxCallableGraphMode.NONE, vmap_method="sequential")
 
 
@@ -352,7 +353,6 @@ def _commands(variant: Variant, *buffers: Any) -> list[_cuda.Command]:  # noqa: 
 
 
 def _run_cells_on_cpu(variant: Variant, arrays: _Arrays) -> None:
-    wp = load_warp()
     kind = {"periodic": variant.periodic, "batched": variant.batched}
     kernels = kernels_of("cells_cpu").cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, **kind)
     arrays, sizes, capacity = _launchable(variant, arrays)
@@ -361,7 +361,7 @@ def _run_cells_on_cpu(variant: Variant, arrays: _Arrays) -> None:
     _ask_for_huge_pages(idx.ptr, 4 * len(queries) * capacity)
     flags = [int(variant.closed), int(variant.keep.drop_self), int(variant.keep.later_only)]
     arguments = [*arrays, *sizes, capacity, *flags]
-    on_every_core(lambda: wp.launch(kernels.query, dim=1, inputs=arguments, device="cpu"), -(-len(queries) // _PLACES_PER_THREAD))
+    on_every_core(kernels.query, arguments, -(-len(queries) // _PLACES_PER_THREAD))
 
 
 def _sort_on_cpu(
@@ -373,11 +373,11 @@ def _sort_on_cpu(
     scratch: Any,  # noqa: ANN401
     sizes: list[int],
 ) -> None:
-    wp, n = load_warp(), sizes[0]
-    wp.launch(kernels.build, dim=1, inputs=[positions, queries, cutoff, info, scratch, *sizes], device="cpu")
+    n = sizes[0]
+    on_one_core(kernels.build, [positions, queries, cutoff, info, scratch, *sizes])
     if n >= kernels_of("cells_cpu").MANY:
         arguments = [positions, cutoff, scratch, *sizes]
-        on_every_core(lambda: wp.launch(kernels.gather, dim=1, inputs=arguments, device="cpu"), -(-n // _PLACES_PER_THREAD))
+        on_every_core(kernels.gather, arguments, -(-n // _PLACES_PER_THREAD))
 
 
 def _launchable(variant: Variant, arrays: _Arrays) -> tuple[_Arrays, list[int], int]:
@@ -393,8 +393,16 @@ def _launchable(variant: Variant, arrays: _Arrays) -> tuple[_Arrays, list[int], 
     return arrays._replace(idx=unused), sizes, 0
 
 
-def on_every_core(launch: Callable[[], None], most: int) -> None:
-    """Launch once per core, at most `most` times; a launch releases the interpreter's lock while it runs."""
+def on_one_core(kernel: Any, inputs: list[Any]) -> None:  # noqa: ANN401
+    """Launch a kernel once on the CPU."""
+    _load_on_cpu(kernel.module)
+    load_warp().launch(kernel, dim=1, inputs=inputs, device="cpu")
+
+
+def on_every_core(kernel: Any, inputs: list[Any], most: int) -> None:  # noqa: ANN401
+    """Launch a kernel once per core, at most `most` times; a launch releases the interpreter's lock while it runs."""
+    launch = functools.partial(on_one_core, kernel, inputs)
+    _load_on_cpu(kernel.module)
     others: list[Future[None]] = []
     with contextlib.suppress(RuntimeError):  # while the interpreter exits, nothing can be submitted: this core does the rest
         for _ in range(min(_cores(), most) - 1):
@@ -403,6 +411,23 @@ def on_every_core(launch: Callable[[], None], most: int) -> None:
     wait(others)
     for other in others:
         other.result()
+
+
+@functools.cache
+def _load_on_cpu(module: Any) -> None:  # noqa: ANN401
+    """Compile a module before several threads launch from it, and always in the same one: each has its own precompiled headers."""
+    load = functools.partial(load_warp().load_module, module, device="cpu")
+    try:
+        compiled = _compiler().submit(load)
+    except RuntimeError:  # while the interpreter exits
+        load()
+    else:
+        compiled.result()
+
+
+@functools.cache
+def _compiler() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max_workers=1, thread_name_prefix="jfrnn-compiler")
 
 
 @functools.cache
@@ -502,7 +527,7 @@ def _call_sums(
         "totals": max(2 * slots * totals, 1),
         "errors": max(m * width * (2 * variant.extremes + variant.compensated), 1),
     }
-    dims |= {"columns": max(n * engine.row_length(term, variant.dim, variant.double), 1)}
+    dims |= {"columns": max(engine.sorted_numbers(term, n, variant.dim, variant.double), 1)}
     cells = kernels_of(f"cells_{'cuda' if variant.cuda else 'cpu'}")
     of_search = {"info": 2, "scratch": cells.scratch_words(n, m, variant.dim, 2 if variant.double else 1, variant.own)}
     if (
@@ -584,30 +609,27 @@ def _sorting_commands(variant: _SumVariant, *arrays: Any) -> list[_cuda.Command]
 
 @functools.cache
 def _sum_kernels_on_cpu(variant: _SumVariant, term: Any) -> tuple[Any, Any, Any]:  # noqa: ANN401
-    """Return the kernels that sort particles, sort values, and sum; loaded, since several threads launch them at once."""
-    wp, sums = load_warp(), kernels_of("pair_sum_cpu")
+    """Return the kernels that sort particles, sort values, and sum."""
+    sums = kernels_of("pair_sum_cpu")
     dim, double, scaled = variant[:3]
     kind = {"periodic": variant.periodic, "batched": variant.batched}
     cells = kernels_of("cells_cpu").cell_kernels(dim, double, scaled, False, **kind)
     query = sums.query_kernel(term, variant.key, dim, double, scaled, variant.compensated, **kind, extremes=variant.extremes)
-    sort_values = sums.sort_kernel(dim, double)
-    for kernel in (cells.build, sort_values, query):
-        wp.load_module(kernel.module, device="cpu")
-    return cells, sort_values, query
+    return cells, sums.sort_kernel(dim, double), query
 
 
 def _run_sums_on_cpu(variant: _SumVariant, term: Any, *arrays: Any) -> None:  # noqa: ANN401
-    wp, (cells, sort_values, query) = load_warp(), _sum_kernels_on_cpu(variant, term)
+    cells, sort_values, query = _sum_kernels_on_cpu(variant, term)
     positions, queries, cutoff, shared, own, others, sums, totals, errors, columns, info, scratch = arrays
     n, m = positions.shape[0], queries.shape[0]
     sizes = [n, m, int(variant.own), kernels_of("_native").table_cells(n)]
     _sort_on_cpu(cells, positions, queries, cutoff, info, scratch, sizes)
     if term.source_columns:
         sorting = [others, cutoff, columns, scratch, *sizes]
-        on_every_core(lambda: wp.launch(sort_values, dim=1, inputs=sorting, device="cpu"), -(-n // _PLACES_PER_THREAD))
+        on_every_core(sort_values, sorting, -(-n // _PLACES_PER_THREAD))
     arguments = [positions, queries, cutoff, shared, own, columns, sums, totals, errors, scratch, *sizes]
     arguments += [int(variant.closed), int(variant.drop_self)]
-    on_every_core(lambda: wp.launch(query, dim=1, inputs=arguments, device="cpu"), -(-m // _PLACES_PER_THREAD))
+    on_every_core(query, arguments, -(-m // _PLACES_PER_THREAD))
 
 
 def _sum_kernels_on_cuda(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN401
@@ -759,10 +781,10 @@ def _level_arguments(variant: _LevelVariant, arrays: Sequence[Any]) -> list[Any]
 
 
 def _run_levels_on_cpu(variant: _LevelVariant, *arrays: Any) -> None:  # noqa: ANN401
-    wp, kernel, arguments = load_warp(), _level_kernel(variant), _level_arguments(variant, arrays)
+    kernel, arguments = _level_kernel(variant), _level_arguments(variant, arrays)
     arrays[-1].zero_()
     places = len(arrays[-2])
-    on_every_core(lambda: wp.launch(kernel, dim=1, inputs=arguments, device="cpu"), -(-places // _PLACES_PER_THREAD))
+    on_every_core(kernel, arguments, -(-places // _PLACES_PER_THREAD))
 
 
 def _level_commands(variant: _LevelVariant, *arrays: Any) -> list[_cuda.Command]:  # noqa: ANN401
@@ -804,6 +826,8 @@ def _run_hashgrid(bounds: Cutoff, variant: Variant, arrays: _Arrays) -> None:
     kernels = hashgrid.hashgrid_kernels(variant.dim, variant.double, variant.scaled, variant.lists)
     shape = hashgrid.grid_shape(n, variant.dim)
     packed = wp.array(ptr=scratch.ptr, shape=n, dtype=wp.vec3d if variant.double else wp.vec3f, device=device)
+    if not device.is_cuda:
+        _load_on_cpu(kernels.pack.module)
     info.zero_()
     wp.launch(kernels.pack, dim=n, inputs=[positions, cutoff, wp.vec3i(*shape)], outputs=[packed, info], device=device)
     grid = _hash_grid(str(device), shape, variant.double)

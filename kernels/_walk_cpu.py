@@ -242,21 +242,13 @@ _WALK = Template(r"""auto position_of = [&](int place, real* q) {
     else
         point_of(queries.data + (long long)ROW * query_ids[place], q);
 };
-// numbers, changed or as they are, a vector of them at a time and then one by one
-auto copy_numbers = [](const auto* from, auto* to, int size, auto changed) {
-    typedef __typeof__(*to + 0) element;
-    typedef element lanes __attribute__((vector_size(LANES * sizeof(element))));
-    int s = 0;
-    for (; s + LANES <= size; s += LANES) {
-        lanes loaded;
-        __builtin_memcpy(&loaded, from + s, sizeof loaded);
-        loaded = changed(loaded);
-        __builtin_memcpy(to + s, &loaded, sizeof loaded);
-    }
-    for (; s < size; ++s)
-        to[s] = changed(from[s]);
+// a vector of numbers; of sources, what stands behind the last of them may be read, too
+auto lanes_from = [](const auto* from) {
+    typedef __typeof__(*from + 0) element;
+    element __attribute__((vector_size(LANES * sizeof(element)))) lanes;
+    __builtin_memcpy(&lanes, from, sizeof lanes);
+    return lanes;
 };
-auto as_they_are = [](auto x) { return x; };  // integers travel as the bits of floats: not even 0 may be added to them
 auto system_at = [&](int place) { return BATCHED ? system_of(queries.data + (long long)ROW * query_ids[place]) : 0u; };
 // where the query at a place is along the axes, and its cell
 auto locate = [&](int place, real* at, whole* cell) {
@@ -285,10 +277,18 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
             last[k] = last[k] >= grid.extent[k] ? grid.extent[k] - 1 : last[k];
         }
     }
+    real lowest[3], highest[3];  // of the coordinates of the queries
+    position_of(begin, lowest);
+    position_of(begin, highest);
+    for (int place = begin + 1; place < end; ++place) {
+        real q[3];
+        position_of(place, q);
+        widen(lowest, highest, q, q);
+    }
     const unsigned int system = system_at(begin);
     int filled = 0, own_from = 0, own_to = 0, own_at = 0;
     bool fresh = true;
-    auto flush = [&](bool finished) {
+    auto flush = [&](bool finished) __attribute__((noinline)) {
         for (int e = 0; e < LANES; ++e)
             for (int k = 0; k < DIM; ++k)
                 candidate[k][filled + e] = __builtin_nanf("");
@@ -312,38 +312,49 @@ auto serve = [&](int begin, int end, const real* low, const real* high) {
     int side = 0;  // whether the image lies behind (-1), at home, or ahead
     int shift[3] = {0, 0, 0};  // of the image, in lattice vectors
     real moved[3] = {0, 0, 0};
-    auto copy = [&](int from, int to) {  // sources at places [from, to)
-        while (from < to) {
-            if (filled == CANDIDATES)
+    // Copies those of the sources at places [from, to) that may be near one of the queries: others are too far from the box around
+    // these. Rounding is monotone, so that no query is nearer to a source, by `square_of`, than the nearest point of the box is.
+    auto copy = [&](int from, int to) {
+        for (; from < to; from += LANES) {
+            if (filled > CANDIDATES - LANES)
                 flush(false);
-            const int room = CANDIDATES - filled, size = to - from < room ? to - from : room;
-            // whole vectors while sources last: what is too much is overwritten by what comes next
-            const int told = PERIODIC == 2 && !SUMS ? n * image : 0;  // of the image
-            const int spread = n - from < size + LANES ? size : (size + LANES - 1) / LANES * LANES;
-            for (int k = 0; k < DIM; ++k)
+            Points points;
+            vec beside[3];
+            const real origin[3] = {0, 0, 0};
+            for (int k = 0; k < DIM; ++k) {
+                points.p[k] = lanes_from(axis[k] + from);
                 if constexpr (PERIODIC)
-                    copy_numbers(axis[k] + from, candidate[k] + filled, spread, [&](auto x) { return x + moved[k]; });
-                else
-                    copy_numbers(axis[k] + from, candidate[k] + filled, spread, as_they_are);
-            if constexpr (SUMS != 1 || PERIODIC)
-                copy_numbers(ids + from, candidate_ids + filled, spread, [&](auto x) { return x + told; });
-            for (int s = 0; BATCHED && !grid.dense && s < size; ++s)
-                if (system_of(positions.data + (long long)ROW * ids[from + s]) != system)
-                    candidate[0][filled + s] = __builtin_nanf("");
-            if (const int code = image; PERIODIC && several)
-                for (int s = 0; s < size; ++s)
-                    candidate_images[filled + s] = code;
-            $copied
-            for (int s = 0; PERIODIC == 2 && s < size; ++s)
-                candidate_order[filled + s] = 3 * ids[from + s] + 1 + side;
-            const int low_place = from > begin ? from : begin, high_place = from + size < end ? from + size : end;
-            if (own && side == 0 && low_place < high_place) {
-                own_from = low_place;
-                own_to = high_place;
-                own_at = filled + low_place - from;
+                    points.p[k] += moved[k];
+                const vec least = points.p[k] > lowest[k] ? points.p[k] : vec{} + lowest[k];
+                beside[k] = points.p[k] - (least < highest[k] ? least : vec{} + highest[k]);
             }
-            filled += size;
-            from += size;
+            unsigned int near = to - from < LANES ? (1u << (to - from)) - 1 : (1u << LANES) - 1;
+            near &= mask_of(square_of(origin, beside), outside, BelowOrAt{});
+            const ints numbers = lanes_from(ids + from);
+            for (int l = 0; BATCHED && !grid.dense && l < LANES && from + l < to; ++l)
+                if (system_of(positions.data + (long long)ROW * numbers[l]) != system)
+                    near &= ~(1u << l);
+            for (int k = 0; k < DIM; ++k)
+                pack(points.p[k], candidate[k] + filled, near);
+            if constexpr (SUMS != 1 || PERIODIC)
+                pack(numbers + (PERIODIC == 2 && !SUMS ? n * image : 0), candidate_ids + filled, near);
+            if constexpr (PERIODIC) {
+                const ints codes = ints{} + image;
+                __builtin_memcpy(candidate_images + filled, &codes, sizeof codes);
+            }
+            if constexpr (PERIODIC == 2)
+                pack(3 * numbers + (1 + side), candidate_order + filled, near);
+            $copied
+            const int low_place = from > begin ? from : begin, stop = from + LANES < to ? from + LANES : to;
+            const int high_place = stop < end ? stop : end;
+            if (own && side == 0 && low_place < high_place) {  // all of these are near
+                if (own_from == own_to) {
+                    own_from = low_place;
+                    own_at = filled + __builtin_popcount(near & ((1u << (low_place - from)) - 1));
+                }
+                own_to = high_place;
+            }
+            filled += __builtin_popcount(near);
         }
     };
     auto walk = [&](const whole* first, const whole* last) {  // all rows of cells of one image
@@ -480,7 +491,8 @@ def walk(
         met: What is done then, when the query itself is a candidate again; `fresh` and `finished` say whether these candidates were
             the first and the last ones.
         none: What is done with a query, `id`, that has no candidates.
-        copied: Copies more of the sources at places [from, from + size), of the image `shift`, to the candidates from `filled` on.
+        copied: Packs more of those of a vector of sources from the place `from` on that are `near`, of the image `shift`, to the
+            candidates from `filled` on.
         chunk_done: After the last query of the chunk `chunk`.
         end: After the last chunk of this thread.
         flushed: Denormals are flushed to zero, as XLA does, while queries meet candidates.

@@ -23,6 +23,7 @@ from jfrnn.kernels.cells_cpu import GRID, LAYOUT
 
 CACHE_BYTES = 40 << 10  # for candidates: most of a first-level cache, and a little of the second
 MOST_CANDIDATES = 1024
+MOST_LANES = 16
 LITTLE_WORK = 50  # operations up to which the term is evaluated for candidates that are no pairs, too
 VERY_LITTLE_WORK = 20  # up to which it is, though none of a vector is a pair
 _SERIES = 20  # operations that a function like exp takes
@@ -89,10 +90,10 @@ def slots(queries: int) -> int:
     return -(-queries // CHUNK)
 
 
-def row_length(term: TermText, dim: int, double: bool) -> int:
-    """Return how many numbers of each source the sorted values have: one for each column."""
+def sorted_numbers(term: TermText, sources: int, dim: int, double: bool) -> int:
+    """Return how many numbers the sorted values of all sources take: one of each for each column, and behind them a vector."""
     del dim, double
-    return term.source_columns
+    return sources * term.source_columns + (MOST_LANES if term.source_columns else 0)
 
 
 _SORT_VALUES = r"""
@@ -195,13 +196,17 @@ auto keep_largest = [&](number best, Math::i32 of, Math::i32 code, long long at,
 
 _COPY = r"""
             for (int c = 0; c < OTHERS; ++c)
-                copy_numbers(columns.data + (long long)c * n + from, column[c] + filled, spread, as_they_are);
+                pack(lanes_from(columns.data + (long long)c * n + from), column[c] + filled, near);
 """
 
 _COPY_STEP = Template(r"""
-            for (int s = 0; s < size; ++s)
-                column[OTHERS + $c][filled + s] =
-                    real(shift[$axis] - Lattice::turn(columns.data[(long long)OTHERS * n + from + s], $axis));
+            {
+                const vec turns = lanes_from(columns.data + (long long)OTHERS * n + from);
+                vec steps;
+                for (int l = 0; l < LANES; ++l)
+                    steps[l] = real(shift[$axis] - Lattice::turn(turns[l], $axis));
+                pack(steps, column[OTHERS + $c] + filled, near);
+            }
 """)
 
 _NO_SUM = r"""

@@ -32,6 +32,11 @@ def slots(queries: int) -> int:
     return -(-queries // QUERY_BLOCK)
 
 
+def sorted_numbers(term: TermText, sources: int, dim: int, double: bool) -> int:
+    """Return how many numbers the sorted values of all sources take."""
+    return sources * row_length(term, dim, double)
+
+
 def row_length(term: TermText, dim: int, double: bool) -> int:
     """Return how many numbers of each source the sorted values have, a row: 16 bytes are loaded at once, if there are so many.
 

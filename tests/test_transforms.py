@@ -12,6 +12,7 @@ pytestmark = pytest.mark.usefixtures("compiled_soon")
 
 CUTOFF, CAPACITY, BATCH, N = 0.3, 40, 3, 40
 OPTIONS = {"capacity": CAPACITY, "backend": "warp"}
+SEGMENTS = jnp.asarray([[0.2, 0.1], [0.8, 0.4], [0.5, 0.9]], jnp.float32), jnp.asarray([[0, 1], [1, 2], [2, 0]])
 BOX, SMALL = jfrnn.Box([1.0, 1.25]), jfrnn.Box([0.5, 0.625])
 
 
@@ -60,6 +61,9 @@ FUNCTIONS = {
     "to_jraph": lambda x: LISTS["open"](x).to_jraph(300),
     "to_jax_md": lambda x: LISTS["open"](x).to_jax_md(),
     "pair_sum": lambda x: jfrnn.pair_sum(lambda r, i, j: {"r": r * j, "s": r @ r}, x, None, x[:, 0], neighbors=LISTS["open"](x)),
+    "search_triangles": lambda x: jfrnn.search_triangles(x, *SEGMENTS, 0.2, capacity=4, backend="warp"),
+    "search_triangles, jax": lambda x: jfrnn.search_triangles(x, *SEGMENTS, 0.2, capacity=4, backend="jax"),
+    "closest": lambda x: jfrnn.search_triangles(x, *SEGMENTS, 0.2, capacity=4, backend="warp").closest(x),
     "sort_order": lambda x: jfrnn.sort_order(x, 0.1),
     "morton_encode": lambda x: jfrnn.morton_encode(cells(x)),
     "morton_decode": lambda x: jfrnn.morton_decode(jfrnn.morton_encode(cells(x)), 2),
