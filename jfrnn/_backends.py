@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn import _warp
+from jfrnn import _levels_warp, _warp
 from jfrnn._batch import Batch, ranked
 from jfrnn._box import (
     NOT_FINITE,
@@ -29,7 +29,7 @@ from jfrnn._box import (
 )
 from jfrnn._cells import CellAxes, build_grid, cell_edge, cell_order, grid_coordinates, open_axes, stencil_runs
 from jfrnn._exact import Cutoff, Cutoffs, Radii, is_radius, make_cutoffs
-from jfrnn._levels import Axes, level_runs, sort_by_levels
+from jfrnn._levels import Axes, Levels, level_runs, sort_by_levels
 from jfrnn._runs import Candidates, Filter, Points, State, Torus, Visit, count_neighbors, fold_neighbors, list_neighbors
 from jfrnn._status import Status
 from jfrnn._warp import Rows
@@ -197,9 +197,8 @@ def _rows_of_engine(
 ) -> Rows:
     n, m = sources.shape[0], (sources if queries is None else queries).shape[0]
     if options.backend == "warp" and isinstance(cutoff, Cutoffs) and 0 not in (n, m):
-        along, axes = _cells_along(sources, queries, cutoff, torus)
-        levels = sort_by_levels(along, axes, cutoff, n, queries is None, None if batch is None else batch.of_all)
-        return _warp.level_neighbors(sources, queries, cutoff, levels, options.filter, capacity, batch, torus)
+        levels = levels_of(sources, queries, cutoff, batch, torus)
+        return _levels_warp.level_neighbors(sources, queries, cutoff, levels, options.filter, capacity, batch, torus)
     if options.backend == "warp" and isinstance(cutoff, Cutoff) and 0 not in (n, m):
         return _warp.neighbors(sources, queries, cutoff, options.filter, capacity, batch, torus)
     if options.radius is not None and isinstance(cutoff, Cutoff) and 0 not in (n, m):
@@ -233,14 +232,21 @@ def _candidates(
     clouds = (sources, queries) if given is None else (given[1].sources, None if queries is None else given[1].queries)
     if options.backend == "brute":
         return _all_sources(*clouds, cutoff, batch, torus)
-    along, axes = _cells_along(sources, queries, cutoff, given)
     if isinstance(cutoff, Cutoff):
+        along, axes = _cells_along(sources, queries, cutoff, given)
         return _cell_stencil(*clouds, along, axes.cells, batch, torus)
-    images = None if torus is None else torus.images
-    levels = sort_by_levels(along, axes, cutoff, sources.shape[0], queries is None, None if batch is None else batch.of_all)
+    images, levels = None if torus is None else torus.images, levels_of(sources, queries, cutoff, batch, given)
     points = _in_order(clouds[0], levels.order, cutoff.sources)
     rows = _in_order(clouds[0] if clouds[1] is None else clouds[1], levels.query_order, cutoff.queries)
     return Candidates(points, rows, level_runs(levels, cutoff, images), torus, levels.passes)
+
+
+def levels_of(
+    sources: Array, queries: Array | None, cutoff: Cutoffs, batch: Batch | None, torus: tuple[Lattice, Wrapped] | None
+) -> Levels:
+    """Sort a prepared search with a cutoff per particle into cells of many sizes."""
+    along, axes = _cells_along(sources, queries, cutoff, torus)
+    return sort_by_levels(along, axes, cutoff, sources.shape[0], queries is None, None if batch is None else batch.of_all)
 
 
 def _cells_along(

@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jfrnn import _warp
+from jfrnn import _levels_warp, _warp
 from jfrnn._auto import level_of_caller
-from jfrnn._backends import Inputs, Options, prepared
+from jfrnn._backends import Inputs, Options, levels_of, prepared
 from jfrnn._box import unpacked_turns
-from jfrnn._exact import Radii
+from jfrnn._exact import Cutoffs, Radii
 from jfrnn._scalars import NoTranslationError, hash_of
 from jfrnn._terms import POSITIONS, Groups, Term, joined
 from jfrnn._translate import input_name, output_name, translate
@@ -45,8 +45,8 @@ def refusal(inputs: Inputs, platform: str) -> str | None:
     """Say what of a search this engine cannot do; None: nothing."""
     if platform not in ("cpu", "gpu", "cuda"):
         return f"on the platform {platform!r}, only on the CPU and on CUDA"
-    if isinstance(inputs.cutoff, Radii):
-        return "with a cutoff per particle"
+    if platform != "cpu" and isinstance(inputs.cutoff, Radii):
+        return f"with a cutoff per particle on the platform {platform!r}, only on the CPU"
     if platform != "cpu" and inputs.box is not None and inputs.sources.shape[0] >= _warp.MOST_IN_BOX:
         return f"of more than {_warp.MOST_IN_BOX - 1} positions in a periodic box on the platform {platform!r}"
     return None
@@ -187,8 +187,10 @@ def _launched(
     sizes = None, (sources if queries is None else queries).shape[0], sources.shape[0]
     columns = plan.shared, plan.own, plan.others
     shared, own, others = (_packed(*group, sources.dtype) for group in zip(operands, columns, sizes, strict=True))
-    given = options.filter, batch, torus, plan.text, plan.key, (shared, own, others)
-    return _warp.pair_sums(sources, queries, cutoff, *given, compensated, extremes)
+    given = options.filter, batch, torus, plan.text, plan.key, (shared, own, others), compensated, extremes
+    if isinstance(cutoff, Cutoffs):
+        return _levels_warp.level_sums(sources, queries, cutoff, levels_of(sources, queries, cutoff, batch, torus), *given)
+    return _warp.pair_sums(sources, queries, cutoff, *given)
 
 
 def _packed(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) -> Array:

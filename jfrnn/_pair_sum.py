@@ -67,8 +67,9 @@ def pair_sum(
             summed in twice the precision. Derivatives are summed so, too. "max" and "min" are not concerned.
         backend: "jax" (cells, any device), "brute" (all n·m candidates), "warp" (cells, on the CPU and on CUDA: fn is translated
             into the kernel that finds the pairs), or "auto": on the CPU "warp" where it can do what is asked, else "jax". "warp"
-            sums floats of the dtype of positions, with one cutoff for all; values, and what fn closes over, are of that dtype or
-            smaller floats, bool, int32 or (float64) int64. Where fn or its derivative has no translation, "auto" warns.
+            sums floats of the dtype of positions; values, and what fn closes over, are of that dtype or smaller floats, bool,
+            int32 or (float64) int64; with a cutoff per particle on the CPU alone. Where fn or its derivative has no translation,
+            "auto" warns.
         neighbors: A list whose pairs are taken instead of a search: those that are closer than its cutoff at these positions, as
             `NeighborList.vectors` says. A half list gives whole sums, too. Options with which it was made are left out. Rows that
             overflowed lack pairs here as everywhere: see `NeighborList.check`.

@@ -25,12 +25,11 @@ from jax import Array, lax
 from jfrnn import _cuda
 from jfrnn._batch import Batch
 from jfrnn._box import Lattice, Wrapped
-from jfrnn._exact import Cutoff, Cutoffs, compensated_sum, make_cutoff, rounded_sum
-from jfrnn._levels import GROUPS, HALVINGS, Levels
+from jfrnn._exact import Cutoff, compensated_sum, make_cutoff, rounded_sum
 from jfrnn._runs import Filter
 
 INSTALL = 'pip install "jfrnn[warp]"'
-_PLACES_PER_THREAD = 2048  # below, a second thread costs more than it saves
+PLACES_PER_THREAD = 2048  # below, a second thread costs more than it saves
 MOST_IN_BOX = 1 << 27  # an id shares its bits with the code of an image
 _HUGE = 1 << 22  # bytes from which a buffer is worth a request for huge pages
 _PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
@@ -136,7 +135,7 @@ def neighbors(
     return lax.platform_dependent(sources, queries, cutoff, batch, torus, cpu=cpu, cuda=cuda)
 
 
-def _periodic_kind(torus: tuple[Lattice, Wrapped] | None) -> int:
+def periodic_kind(torus: tuple[Lattice, Wrapped] | None) -> int:
     """Return the PERIODIC of `jfrnn.kernels._native.snippet`."""
     if torus is None:
         return 0
@@ -144,11 +143,11 @@ def _periodic_kind(torus: tuple[Lattice, Wrapped] | None) -> int:
     return (1 if images.nearest else 2) + (0 if images.orthogonal else 2)
 
 
-def _space_flags(periodic: int) -> dict[str, bool]:
+def space_flags(periodic: int) -> dict[str, bool]:
     return {"nearest": periodic in (1, 3), "images": periodic in (2, 4), "skewed": periodic > 2}
 
 
-def _rows(points: Array, turns: Array | None, systems: Array | None) -> Array:
+def particle_rows(points: Array, turns: Array | None, systems: Array | None) -> Array:
     """Return rows of positions as the kernels read them: coordinates, packed turns, the number of the system."""
     columns, dim = [as_float(x, points.dtype) for x in (turns, systems) if x is not None], points.shape[1]
     rows = jnp.pad(points, ((0, 0), (0, len(columns))))
@@ -170,7 +169,7 @@ def as_integer(x: Array) -> Array:
     return lax.bitcast_convert_type(x, jnp.int32) if x.dtype == jnp.float32 else x.astype(jnp.int32)
 
 
-def _lattice_numbers(lattice: Lattice, wrapped: Wrapped) -> Array:
+def lattice_numbers(lattice: Lattice, wrapped: Wrapped) -> Array:
     """Return what the kernels know of a lattice, in the order that `jfrnn.kernels._native` states."""
     more = 3 - lattice.dim
     square, line = ((0, more), (0, more)), (0, more)
@@ -195,7 +194,7 @@ def _call(
     own, lists = queries is None, capacity is not None
     (n, dim), m = sources.shape, (sources if queries is None else queries).shape[0]
     double = sources.dtype == jnp.float64
-    periodic = _periodic_kind(torus)
+    periodic = periodic_kind(torus)
     variant = Variant(dim, double, cutoff.scaled, lists, own, cutoff.closed, keep, periodic, batch is not None)
     if periodic in (1, 3) and n >= MOST_IN_BOX:
         raise ValueError(
@@ -217,11 +216,11 @@ def _packed(
     turns = query_turns = None
     if torus is not None:
         turns, query_turns = torus[1].turns, torus[1].query_turns
-        numbers.append(_lattice_numbers(*torus))
+        numbers.append(lattice_numbers(*torus))
     if batch is not None:
         numbers.append(as_float(jnp.max(batch.of_all)[None], sources.dtype))
-    sources = _rows(sources, turns, None if batch is None else batch.sources)
-    rows = sources if queries is None else _rows(queries, query_turns, None if batch is None else batch.queries)
+    sources = particle_rows(sources, turns, None if batch is None else batch.sources)
+    rows = sources if queries is None else particle_rows(queries, query_turns, None if batch is None else batch.queries)
     return sources, rows, jnp.concatenate(numbers)
 
 
@@ -254,10 +253,10 @@ def _cuda_callable(variant: Variant) -> Any:  # noqa: ANN401
     wp = load_warp()
     if wp.is_cuda_available():
         _cuda_kernels(variant).load(wp.get_cuda_device())
-    return _cuda_target(_name("cells_cuda", variant), _types(variant), 3 + variant.lists, functools.partial(_commands, variant))
+    return cuda_target(_name("cells_cuda", variant), _types(variant), 3 + variant.lists, functools.partial(_commands, variant))
 
 
-def _cuda_target(
+def cuda_target(
     name: str, types: dict[str, Any], outputs: int, commands: Callable[..., list[_cuda.Command]]
 ) -> Callable[..., Sequence[Array]]:
     """Make a function that XLA calls on CUDA, as `callable_of` makes one for the CPU."""
@@ -304,7 +303,7 @@ def _named(types: dict[str, Any], arrays: Sequence[Any]) -> _Arrays:
 
 def _name(name: str, variant: Variant) -> str:
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
-    flags |= {**_space_flags(variant.periodic), "batched": variant.batched}
+    flags |= {**space_flags(variant.periodic), "batched": variant.batched}
     flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
     return "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
 
@@ -361,7 +360,7 @@ def _run_cells_on_cpu(variant: Variant, arrays: _Arrays) -> None:
     _ask_for_huge_pages(idx.ptr, 4 * len(queries) * capacity)
     flags = [int(variant.closed), int(variant.keep.drop_self), int(variant.keep.later_only)]
     arguments = [*arrays, *sizes, capacity, *flags]
-    on_every_core(kernels.query, arguments, -(-len(queries) // _PLACES_PER_THREAD))
+    on_every_core(kernels.query, arguments, -(-len(queries) // PLACES_PER_THREAD))
 
 
 def _sort_on_cpu(
@@ -377,7 +376,7 @@ def _sort_on_cpu(
     on_one_core(kernels.build, [positions, queries, cutoff, info, scratch, *sizes])
     if n >= kernels_of("cells_cpu").MANY:
         arguments = [positions, cutoff, scratch, *sizes]
-        on_every_core(kernels.gather, arguments, -(-n // _PLACES_PER_THREAD))
+        on_every_core(kernels.gather, arguments, -(-n // PLACES_PER_THREAD))
 
 
 def _launchable(variant: Variant, arrays: _Arrays) -> tuple[_Arrays, list[int], int]:
@@ -456,6 +455,38 @@ def _libc() -> ctypes.CDLL:
 # --- sums over pairs --------------------------------------------------------------------------------------------------
 
 
+class SumsOf(NamedTuple):
+    """The results of a kernel that sums a term: for each of `rows` queries, and over all pairs in `slots` parts."""
+
+    term: Any
+    rows: int
+    slots: int
+    compensated: bool
+    extremes: bool
+
+    def dims(self) -> dict[str, Any]:
+        """Return the shapes of the arrays that the kernel writes."""
+        return {
+            "sums": (self.rows, max(self._width, 1)),
+            "totals": max(2 * self.slots * self._totals, 1),
+            "errors": max(self.rows * self._width * (2 * self.extremes + self.compensated), 1),
+        }
+
+    def unpacked(self, sums: Array, parts: Array, rest: Array) -> tuple[Array, Array, Array]:
+        """Return what `pair_sums` returns: parts of sums over all pairs are added, with what rounding took of them."""
+        width, totals = self._width, self._totals
+        which = as_integer(rest).reshape(self.rows, width, 2) if self.extremes else jnp.zeros((self.rows, width, 0), jnp.int32)
+        return sums, _added(parts[: 2 * self.slots * totals].reshape(self.slots, 2, totals)), which
+
+    @property
+    def _totals(self) -> int:
+        return sum(part.total for part in self.term.sums)
+
+    @property
+    def _width(self) -> int:
+        return len(self.term.sums) - self._totals
+
+
 class _SumVariant(NamedTuple):
     """All that is static about a pair sum, apart from shapes; `key` names the text."""
 
@@ -502,7 +533,7 @@ def pair_sums(
             torus: tuple[Lattice, Wrapped] | None,
             values: tuple[Array, Array, Array],
         ) -> tuple[Array, Array, Array]:
-            flags = (queries is None, cutoff.closed, keep.drop_self, _periodic_kind(torus), batch is not None)
+            flags = (queries is None, cutoff.closed, keep.drop_self, periodic_kind(torus), batch is not None)
             double, kind = sources.dtype == jnp.float64, (compensated, extremes, key, cuda)
             variant = _SumVariant(sources.shape[1], double, cutoff.scaled, *flags, *kind)
             return _call_sums(variant, term, _packed(sources, queries, cutoff, batch, torus), values)
@@ -518,15 +549,10 @@ def _call_sums(
     particles: tuple[Array, Array, Array],
     values: tuple[Array, Array, Array],
 ) -> tuple[Array, Array, Array]:
-    """Let XLA call the kernels, and add up the parts of the sums over all pairs, with what rounding took of them."""
+    """Let XLA call the kernels."""
     n, m, engine = len(particles[0]), len(particles[1]), kernels_of(_module_of(variant))
-    totals = sum(part.total for part in term.sums)
-    width, slots = len(term.sums) - totals, engine.slots(m)
-    dims = {
-        "sums": (m, max(width, 1)),
-        "totals": max(2 * slots * totals, 1),
-        "errors": max(m * width * (2 * variant.extremes + variant.compensated), 1),
-    }
+    results = SumsOf(term, m, engine.slots(m), variant.compensated, variant.extremes)
+    dims = results.dims()
     dims |= {"columns": max(engine.sorted_numbers(term, n, variant.dim, variant.double), 1)}
     cells = kernels_of(f"cells_{'cuda' if variant.cuda else 'cpu'}")
     of_search = {"info": 2, "scratch": cells.scratch_words(n, m, variant.dim, 2 if variant.double else 1, variant.own)}
@@ -537,8 +563,7 @@ def _call_sums(
     else:
         dims |= of_search
     sums, parts, rest, *_ = _sum_callable(variant, term)(*particles, *values, output_dims=dims)
-    which = as_integer(rest).reshape(m, width, 2) if variant.extremes else jnp.zeros((m, width, 0), jnp.int32)
-    return sums, _added(parts[: 2 * slots * totals].reshape(slots, 2, totals)), which
+    return results.unpacked(sums, parts, rest)
 
 
 def _added(parts: Array) -> Array:
@@ -563,13 +588,13 @@ def _sum_callable(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN401
         return callable_of(name, functools.partial(_run_sums_on_cpu, variant, term), types | results | of_search, 6)
     if wp.is_cuda_available():
         _sum_kernels_on_cuda(variant, term).load(wp.get_cuda_device())
-    return _cuda_target(name, types | of_search | results, 4, functools.partial(_sum_commands, variant, term))
+    return cuda_target(name, types | of_search | results, 4, functools.partial(_sum_commands, variant, term))
 
 
 def _name_of_sum(name: str, variant: _SumVariant) -> str:
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "own": variant.own}
     flags |= {"closed": variant.closed, "dropself": variant.drop_self, "batched": variant.batched}
-    flags |= _space_flags(variant.periodic)
+    flags |= space_flags(variant.periodic)
     flags |= {"compensated": variant.compensated, "extremes": variant.extremes, variant.key: bool(variant.key)}
     return "_".join([f"jfrnn_{name}_{variant.dim}d", *(flag for flag, on in flags.items() if on)])
 
@@ -588,7 +613,7 @@ def _sorting_callable(variant: _SumVariant) -> Any:  # noqa: ANN401
     scalar = wp.float64 if variant.double else wp.float32
     rows, ints = wp.array2d(dtype=scalar), wp.array(dtype=wp.int32)
     types = {"positions": rows, "queries": rows, "cutoff": wp.array(dtype=scalar), "info": ints, "scratch": ints}
-    return _cuda_target(_name_of_sum("sorting_cuda", variant), types, 2, functools.partial(_sorting_commands, variant))
+    return cuda_target(_name_of_sum("sorting_cuda", variant), types, 2, functools.partial(_sorting_commands, variant))
 
 
 def _stages_on_cuda(variant: _SumVariant) -> Any:  # noqa: ANN401
@@ -626,10 +651,10 @@ def _run_sums_on_cpu(variant: _SumVariant, term: Any, *arrays: Any) -> None:  # 
     _sort_on_cpu(cells, positions, queries, cutoff, info, scratch, sizes)
     if term.source_columns:
         sorting = [others, cutoff, columns, scratch, *sizes]
-        on_every_core(sort_values, sorting, -(-n // _PLACES_PER_THREAD))
+        on_every_core(sort_values, sorting, -(-n // PLACES_PER_THREAD))
     arguments = [positions, queries, cutoff, shared, own, columns, sums, totals, errors, scratch, *sizes]
     arguments += [int(variant.closed), int(variant.drop_self)]
-    on_every_core(query, arguments, -(-m // _PLACES_PER_THREAD))
+    on_every_core(query, arguments, -(-m // PLACES_PER_THREAD))
 
 
 def _sum_kernels_on_cuda(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN401
@@ -646,151 +671,6 @@ def _sum_commands(variant: _SumVariant, term: Any, *arrays: Any) -> list[_cuda.C
     arguments = [*given, sums, totals, errors, columns, info, scratch, *sizes, int(variant.closed), int(variant.drop_self)]
     launches = _sum_kernels_on_cuda(variant, term).launches(n, m)
     return [_cuda.Command(x.kernel, arguments, x.threads, x.block, x.beside) for x in launches]
-
-
-# --- cells of many sizes: a cutoff per particle -----------------------------------------------------------------------
-
-
-class _LevelVariant(NamedTuple):
-    """All that is static about a call with a cutoff per particle, apart from shapes."""
-
-    dim: int
-    double: bool
-    lists: bool
-    own: bool
-    closed: bool
-    keep: Filter
-    rule: str
-    periodic: int
-    batched: bool
-    cuda: bool
-
-
-def level_neighbors(
-    sources: Array,
-    queries: Array | None,
-    cutoffs: Cutoffs,
-    levels: Levels,
-    keep: Filter,
-    capacity: int | None,
-    batch: Batch | None = None,
-    torus: tuple[Lattice, Wrapped] | None = None,
-) -> Rows:
-    """Search with a cutoff per particle, among sources that XLA has sorted; capacity=None only counts."""
-
-    def on(cuda: bool) -> Callable[..., Rows]:
-        def call(*inputs: Any) -> Rows:  # noqa: ANN401
-            return _call_levels(cuda, *inputs, keep=keep, capacity=capacity)
-
-        return call
-
-    return lax.platform_dependent(sources, queries, cutoffs, levels, batch, torus, cpu=on(False), cuda=on(True))
-
-
-def _call_levels(
-    cuda: bool,
-    sources: Array,
-    queries: Array | None,
-    cutoffs: Cutoffs,
-    levels: Levels,
-    batch: Batch | None,
-    torus: tuple[Lattice, Wrapped] | None,
-    *,
-    keep: Filter,
-    capacity: int | None,
-) -> Rows:
-    given, lists = sources if queries is None else queries, capacity is not None
-    dim, m, padding = sources.shape[1], given.shape[0], kernels_of("levels").PADDING
-    double, periodic = sources.dtype == jnp.float64, _periodic_kind(torus)
-    kind = (queries is None, cutoffs.closed, keep, cutoffs.rule, periodic, batch is not None, cuda)
-    variant = _LevelVariant(dim, double, lists, *kind)
-
-    def ordered(x: Array | None, order: Array, more: int) -> Array:
-        return jnp.zeros(1, sources.dtype) if x is None else jnp.pad(x[order], (0, more)).reshape(-1)
-
-    raw = [jnp.zeros((1, 1), sources.dtype)] * 2
-    points, rows = sources, given
-    if torus is not None:
-        points, rows = torus[1].sources, torus[1].queries
-        raw = [_rows(sources, torus[1].turns, None), _rows(given, torus[1].query_turns, None)]
-    line = (0, 3 - dim)
-    largest = jnp.zeros(GROUPS, sources.dtype) if levels.largest is None else levels.largest
-    numbers = [] if torus is None else [_lattice_numbers(*torus)]
-    numbers += [largest, *(jnp.pad(x, line) for x in (levels.widths, levels.axes.scale, levels.axes.margin))]
-    passes = jnp.int32(1) if levels.passes is None else levels.passes
-    extent = levels.grid.extent
-    header = [jnp.pad(extent, (0, 4 - extent.size)), levels.grid.dense.astype(jnp.int32)[None], passes[None]]
-    dims: dict[str, Any] = {"count": m, "info": 2} | ({"idx": (m, capacity)} if lists else {})
-    *idx, count, info = _level_callable(variant)(
-        *raw,
-        jnp.pad(points[levels.order].T, ((0, 0), (0, padding))).reshape(-1),
-        ordered(cutoffs.sources, levels.order, padding),
-        levels.order,
-        lax.bitcast_convert_type(levels.keys, jnp.int32),
-        levels.grid.coords.reshape(-1),
-        levels.grid.table,
-        jnp.concatenate(header),
-        jnp.concatenate([cutoffs.largest[None], *numbers]),
-        rows[levels.query_order].T.reshape(-1),
-        ordered(cutoffs.queries, levels.query_order, 0),
-        levels.query_order,
-        levels.query_top.reshape(-1),
-        levels.query_place.reshape(-1),
-        output_dims=dims,
-    )
-    overflow = info[0] > capacity if lists else jnp.zeros((), bool)
-    return Rows(idx[0] if lists else None, count, info[0], overflow.astype(jnp.int32))  # Status.ROW_OVERFLOW
-
-
-@functools.cache
-def _level_callable(variant: _LevelVariant) -> Any:  # noqa: ANN401
-    wp = load_warp()
-    scalar = wp.float64 if variant.double else wp.float32
-    points, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
-    types = {"positions": points, "queries": points}
-    types |= {"axes": reals, "radii": reals, "ids": ints, "keys": ints, "top": ints, "table": ints, "header": ints}
-    types |= {"cutoff": reals, "query_axes": reals, "query_radii": reals, "query_ids": ints, "query_top": ints, "places": ints}
-    types |= {"idx": wp.array2d(dtype=wp.int32)} if variant.lists else {}
-    types |= {"count": ints, "info": ints}
-    flags = {"f64": variant.double, "f32": not variant.double, "list": variant.lists, "own": variant.own}
-    flags |= {"closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only, variant.rule: True}
-    flags |= {**_space_flags(variant.periodic), "batched": variant.batched}
-    name = f"jfrnn_levels_{'cuda' if variant.cuda else 'cpu'}_{variant.dim}d"
-    name = "_".join([name, *(flag for flag, on in flags.items() if on)])
-    if not variant.cuda:
-        return callable_of(name, functools.partial(_run_levels_on_cpu, variant), types, 2 + variant.lists)
-    if wp.is_cuda_available():
-        for kernel, block in ((_level_kernel(variant), kernels_of("levels").BLOCK), (kernels_of("levels").clear, 2)):
-            wp.load_module(kernel.module, device=wp.get_cuda_device(), block_dim=block)
-    return _cuda_target(name, types, 2 + variant.lists, functools.partial(_level_commands, variant))
-
-
-def _level_kernel(variant: _LevelVariant) -> Any:  # noqa: ANN401
-    kind = (variant.dim, variant.double, variant.lists, variant.rule, GROUPS, HALVINGS, variant.periodic, variant.batched)
-    return kernels_of("levels").query_kernel(*kind)
-
-
-def _level_arguments(variant: _LevelVariant, arrays: Sequence[Any]) -> list[Any]:
-    """Return what the kernel takes; without rows, something of their kind that nobody writes to stands in their place."""
-    *inputs, count, info = arrays
-    n, m, capacity = len(inputs[4]), len(count), inputs[-1].shape[1] if variant.lists else 0
-    if not variant.lists:
-        inputs.append(load_warp().array(ptr=count.ptr, shape=(m, 1), dtype=count.dtype, device=count.device))
-    flags = [int(variant.own), int(variant.closed), int(variant.keep.drop_self), int(variant.keep.later_only)]
-    return [*inputs, count, info, n, m, capacity, *flags]
-
-
-def _run_levels_on_cpu(variant: _LevelVariant, *arrays: Any) -> None:  # noqa: ANN401
-    kernel, arguments = _level_kernel(variant), _level_arguments(variant, arrays)
-    arrays[-1].zero_()
-    places = len(arrays[-2])
-    on_every_core(kernel, arguments, -(-places // _PLACES_PER_THREAD))
-
-
-def _level_commands(variant: _LevelVariant, *arrays: Any) -> list[_cuda.Command]:  # noqa: ANN401
-    levels, (*_, count, info) = kernels_of("levels"), arrays
-    query = _cuda.Command(_level_kernel(variant), _level_arguments(variant, arrays), len(count), levels.BLOCK)
-    return [_cuda.Command(levels.clear, [info], 2, 2), query]
 
 
 # --- hash grid --------------------------------------------------------------------------------------------------------

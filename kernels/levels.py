@@ -5,11 +5,13 @@ Morton curve. A query finds the candidates of a group in the cells around it tha
 """
 
 import functools
+from string import Template
 
 import warp as wp
 from jfrnn.kernels._native import ENTER, EXACT, LEAVE, SPACES, snippet
 
 PADDING = 16  # sources behind the last one, which nobody meets: the CPU tests so many at a time
+CHUNK = 256  # queries that a thread of the CPU takes at a time
 BLOCK = 128  # threads of CUDA
 RULES = ("gather", "scatter", "either", "both", "mean")
 
@@ -17,7 +19,7 @@ RULES = ("gather", "scatter", "either", "both", "mean")
 # holds the largest cutoff and the lattice, then the largest of each group, and along each axis: the width of a top cell, how many
 # of those units a cutoff of 1 reaches, and what is added to that (3 each). Where space is periodic, `axes` and `query_axes` are
 # wrapped, and `positions` and `queries` hold what was given, with turns. Of a batch, the last axis of `top` is the system.
-_QUERY = r"""
+_QUERY = Template(r"""
 #if defined(__CUDA_ARCH__)
 constexpr int LANES = 1;
 #else
@@ -245,14 +247,15 @@ auto test = [&](const real* q, real own, int first, unsigned int& sure) -> unsig
 };
 
 int longest = 0;
+$begin
 auto serve = [&](int at) {
     const int id = query_ids.data[at];
-    int* row = idx.data + (long long)id * capacity;
     real q[3] = {0, 0, 0};
     for (int k = 0; k < DIM; ++k)
         q[k] = query_axes.data[(long long)k * m + at];
     const real own = RULE == SCATTER ? real(0) : query_radii.data[at];
-    int found = 0;
+    int shift[3] = {0, 0, 0};  // of the image that is met, in lattice vectors
+    $begin_query
     auto meet = [&](int from, int to, int image, const real* from_where) {
         for (int first = from; first < to; first += LANES) {
             unsigned int sure, near = test(from_where, own, first, sure);
@@ -273,9 +276,7 @@ auto serve = [&](int at) {
                 }
                 if (!pair)
                     continue;
-                if (LIST && found < capacity)
-                    row[found] = PERIODIC == 2 ? other + n * image : other;
-                ++found;
+                $pair
             }
         }
     };
@@ -289,7 +290,7 @@ auto serve = [&](int at) {
                 fits = fits && width[k] / real(2 << level) > reach * scale[k] + margin[k];
         if constexpr (PERIODIC) {
             each_run(g, at, level, [&](int from, int to, int image) {
-                int shift[3] = {0, 0, 0}, rest = image;
+                int rest = image;
                 for (int k = DIM - 1; k >= 0; --k) {
                     const int each = 2 * lattice.images(k) + 1;
                     shift[k] = rest % each - lattice.images(k);
@@ -307,11 +308,7 @@ auto serve = [&](int at) {
         for (int r = 0; r < runs.count; ++r)
             meet(runs.begin[r], runs.end[r], home, q);
     }
-    if constexpr (LIST)
-        for (int s = found; s < capacity; ++s)
-            row[s] = fill_value;
-    count.data[id] = found;
-    longest = found > longest ? found : longest;
+    $end_query
 };
 
 #if defined(__CUDA_ARCH__)
@@ -322,19 +319,71 @@ if (at < m) {
         atomicMax(&info.data[0], longest);
 }
 #else
-constexpr int CHUNK = 256;
 for (;;) {
-    const long long begin = (long long)__atomic_fetch_add(&info.data[1], 1, __ATOMIC_RELAXED) * CHUNK;
+    const long long chunk = __atomic_fetch_add(&info.data[1], 1, __ATOMIC_RELAXED), begin = chunk * CHUNK;
     if (begin >= m)
         break;
     for (long long at = begin; at < begin + CHUNK && at < m; ++at)
         serve((int)at);
+    $end_chunk
 }
 int known = __atomic_load_n(&info.data[0], __ATOMIC_RELAXED);
 while (known < longest && !__atomic_compare_exchange_n(&info.data[0], &known, longest, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
 }
 #endif
+""")
+
+_BEGIN_ROW = r"""
+    int* row = idx.data + (long long)id * capacity;
+    int found = 0;
 """
+_ADD_TO_ROW = r"""
+                if (LIST && found < capacity)
+                    row[found] = PERIODIC == 2 ? other + n * image : other;
+                ++found;
+"""
+_END_ROW = r"""
+    if constexpr (LIST)
+        for (int s = found; s < capacity; ++s)
+            row[s] = fill_value;
+    count.data[id] = found;
+    longest = found > longest ? found : longest;
+"""
+
+
+def native_text(
+    dim: int,
+    double: bool,
+    rule: str,
+    groups: int,
+    halvings: int,
+    *,
+    begin: str = "",
+    begin_query: str,
+    pair: str,
+    end_query: str,
+    end_chunk: str = "",
+    **constants: int,
+) -> str:
+    """Return the text of a kernel in which queries meet their candidates; texts say what becomes of the pairs.
+
+    Args:
+        dim: 2 or 3.
+        double: Whether positions are float64.
+        rule: One of `RULES`.
+        groups: Of cutoffs.
+        halvings: Of a top cell.
+        begin: Comes before all queries.
+        begin_query: Of the query `id`, at `q`.
+        pair: With the source at place `c`, whose number is `other`, in the `image` that `shift` leads to.
+        end_query: After the last pair of the query `id`.
+        end_chunk: After the last query of the chunk `chunk`; on the CPU alone.
+        constants: Further ones, such as PERIODIC and BATCHED of `jfrnn.kernels._native.snippet`.
+    """
+    constants |= {"RULE": RULES.index(rule), "SUM": rule == "mean", "GROUPS": groups, "HALVINGS": halvings}
+    constants |= {"SCALED": True, "PADDING": PADDING, "CHUNK": CHUNK}
+    query = _QUERY.substitute(begin=begin, begin_query=begin_query, pair=pair, end_query=end_query, end_chunk=end_chunk)
+    return ENTER + snippet("double" if double else "float", dim, EXACT, query, **constants) + LEAVE
 
 
 @wp.kernel(enable_backward=False)
@@ -355,8 +404,10 @@ def query_kernel(
     scalar = wp.float64 if double else wp.float32
     variant = f"{dim}d_{'f64' if double else 'f32'}_{rule}{'_list' * lists}"
     variant += f"{SPACES[periodic]}{'_batched' * batched}"
-    constants = {"LIST": lists, "RULE": RULES.index(rule), "SUM": rule == "mean", "GROUPS": groups, "HALVINGS": halvings}
-    constants |= {"SCALED": True, "PADDING": PADDING, "PERIODIC": periodic, "BATCHED": batched}
+    text = native_text(
+        dim, double, rule, groups, halvings,
+        begin_query=_BEGIN_ROW, pair=_ADD_TO_ROW, end_query=_END_ROW, LIST=lists, PERIODIC=periodic, BATCHED=batched,
+    )  # fmt: skip
     points = wp.array2d(dtype=scalar)
     reals, ints, rows = wp.array(dtype=scalar), wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
 
@@ -368,8 +419,7 @@ def query_kernel(
     ): ...  # fmt: skip
 
     native.__name__ = native.__qualname__ = f"query_{variant}_native"
-    text = snippet("double" if double else "float", dim, EXACT, _QUERY, **constants)
-    function = wp.func_native(ENTER + text + LEAVE)(native)
+    function = wp.func_native(text)(native)
 
     def query(
         positions: points, queries: points, axes: reals, radii: reals, ids: ints, keys: ints, top: ints, table: ints, header: ints,

@@ -110,7 +110,7 @@ for (;;) {
 """
 
 # What adds up lanes; `errors` is what rounding took, in sums that are carried in twice the precision.
-_ADD = r"""
+ADD = r"""
 typedef Math::NUMBER_LANES number;
 auto lanes_of = [](unsigned int bits) -> Math::flag {
     Math::flag lanes;
@@ -144,15 +144,17 @@ auto add_lanes = [&](number sum, number error, real& total, real& carried) {  //
     } else
         total += s[0];
 };
+real total[TOTALS + 1], total_carried[TOTALS + 1];
+for (int t = 0; t <= TOTALS; ++t)
+    total[t] = total_carried[t] = 0;
+"""
+_CANDIDATES = r"""
 alignas(64) real column[OTHERS + STEPS + 1][CANDIDATES + LANES];
 memset(column, 0, sizeof column);
 memset(candidate, 0, sizeof candidate);
 memset(doubtful, 0, sizeof doubtful);
 alignas(64) real near_points[3][CANDIDATES + LANES];  // packed
 alignas(64) real near_column[OTHERS + STEPS + 1][CANDIDATES + LANES];
-real total[TOTALS + 1], total_carried[TOTALS + 1];
-for (int t = 0; t <= TOTALS; ++t)
-    total[t] = total_carried[t] = 0;
 """
 
 # What finds the largest. NaN is larger than all; of equal ones comes first the smallest source, then the smallest image.
@@ -175,7 +177,7 @@ auto put_integer = [&](long long at, int x) {
         memcpy(errors.data + at, &x, 4);
 };
 """
-_KEEP_LARGEST = r"""
+KEEP_LARGEST = r"""
 auto keep_largest = [&](number best, Math::i32 of, Math::i32 code, long long at, bool fresh) {
     real x = fresh ? -Bits::not_finite() : sums.data[at];
     int source = fresh ? n : integer_at(2 * at), image_of_it = fresh ? 0 : integer_at(2 * at + 1);
@@ -219,7 +221,7 @@ _NO_EXTREME = r"""
                 put_integer(2 * ((long long)id * ROW_SUMS + r), n);
 """
 
-_CHUNK_DONE = r"""
+CHUNK_DONE = r"""
     for (int t = 0; t < TOTALS; ++t) {
         totals.data[(2ll * chunk) * TOTALS + t] = total[t];
         totals.data[(2ll * chunk + 1) * TOTALS + t] = total_carried[t];
@@ -302,7 +304,7 @@ _PACKED = Template(r"""
 """)
 
 
-class _Reduction(NamedTuple):
+class Reduction(NamedTuple):
     """What becomes of summands: text before all pairs of a query, for a vector of them (`real_lanes`) whose numbers are in a place.
 
     `after`: when all of these candidates have been met.
@@ -313,34 +315,58 @@ class _Reduction(NamedTuple):
     after: str
 
 
-def _meet(term: TermText, reduction: _Reduction, double: bool, packed: bool, flushed: bool) -> str:
-    """Return the text that reduces the pairs of a query with its candidates."""
-    modes = {"flush": FLUSH, "keep": KEEP} if flushed else {"flush": "", "keep": ""}
+def constants_of(term: TermText, compensated: bool, extremes: bool) -> dict[str, int]:
+    """Return the named integers that the text of a term needs, but for CANDIDATES, how many pairs are held."""
+    totals = sum(part.total for part in term.sums)
+    found = {"OTHERS": term.columns, "STEPS": len(term.steps), "TOTALS": totals, "ROW_SUMS": len(term.sums) - totals}
+    return found | {"COMPENSATED": compensated, "SUMS": 1 + extremes}
 
-    def evaluation(column: str, number: str) -> str:
-        lanes = placed(term.others, column, "points.p[{}]")
-        lines = [loaded(value, x, f"Math::bits({x})", double) for value, x in zip(term.others, lanes, strict=True)]
-        steps = ((step.name, column.format(term.columns + c)) for c, step in enumerate(term.steps))
-        lines += [f"const number {name} = {x} + turned{c};\n" for c, (name, x) in enumerate(steps)]
-        lines += [term.text, reduction.each(number)]
-        return "".join(lines)
 
+def beginning(term: TermText, double: bool, extremes: bool) -> str:
+    """Return the text that comes before all queries."""
+    shared = "".join(_spread(v, f"shared_values.data[{c}]", double) for c, v in enumerate(term.shared))
+    add = ADD.replace("NUMBER_LANES", "f64" if double else "f32")
+    return "".join([VECTOR, add, (TAKE_LARGER + KEEP_LARGEST) * extremes, shared])
+
+
+def reduction_of(term: TermText, extremes: bool) -> Reduction:
+    """Return how summands are added up, or (`extremes`) how the largest are found."""
+    return _largest(term) if extremes else _added(term)
+
+
+def begin_query(term: TermText, double: bool) -> str:
+    """Return the text that reads what is known of a query, `id` at `q`."""
     numbers = sum(value.axis is None for value in term.own)
     column = f"own_values.data[(long long)id * {numbers + bool(term.steps)} + {{}}]"
-    begin = [_spread(value, at, double) for value, at in zip(term.own, placed(term.own, column, "q[{}]"), strict=True)]
+    lines = [_spread(value, at, double) for value, at in zip(term.own, placed(term.own, column, "q[{}]"), strict=True)]
     turns = [f"real(Lattice::turn({column.format(numbers)}, {step.axis}))" for step in term.steps]
-    begin += [f"const number turned{c} = Math::of({x});\n" for c, x in enumerate(turns)]
-    begin.append(reduction.before)
+    return "".join([*lines, *(f"const number turned{c} = Math::of({x});\n" for c, x in enumerate(turns))])
+
+
+def evaluation(term: TermText, reduction: Reduction, double: bool, column: str, number: str) -> str:
+    """Return the text that reduces a vector of pairs: of `points`, of what stands in `column`, each candidate by its `number`."""
+    lanes = placed(term.others, column, "points.p[{}]")
+    lines = [loaded(value, x, f"Math::bits({x})", double) for value, x in zip(term.others, lanes, strict=True)]
+    steps = ((step.name, column.format(term.columns + c)) for c, step in enumerate(term.steps))
+    lines += [f"const number {name} = {x} + turned{c};\n" for c, (name, x) in enumerate(steps)]
+    return "".join([*lines, term.text, reduction.each(number)])
+
+
+def _meet(term: TermText, reduction: Reduction, double: bool, packed: bool, flushed: bool) -> str:
+    """Return the text that reduces the pairs of a query with its candidates."""
+    modes = {"flush": FLUSH, "keep": KEEP} if flushed else {"flush": "", "keep": ""}
+    of_pairs = functools.partial(evaluation, term, reduction, double)
+    begin = begin_query(term, double) + reduction.before
     if packed:
-        of_packed = evaluation("*(const number*)(near_column[{}] + b)", "doubtful[b + l]")
-        return "".join([*begin, _PACKED.substitute(modes, of_packed=of_packed)])
+        of_packed = of_pairs("*(const number*)(near_column[{}] + b)", "doubtful[b + l]")
+        return begin + _PACKED.substitute(modes, of_packed=of_packed)
     skip = "if (hit == 0)\n    continue;" if work(term.text) > VERY_LITTLE_WORK else ""
-    in_place = evaluation("*(const number*)(column[{}] + b)", "b + l")
-    of_doubtful = evaluation("gathered(column[{}], doubtful + b)", "doubtful[b + l]")
-    return "".join([*begin, _IN_PLACE.substitute(modes, skip=skip, in_place=in_place, of_doubtful=of_doubtful)])
+    in_place = of_pairs("*(const number*)(column[{}] + b)", "b + l")
+    of_doubtful = of_pairs("gathered(column[{}], doubtful + b)", "doubtful[b + l]")
+    return begin + _IN_PLACE.substitute(modes, skip=skip, in_place=in_place, of_doubtful=of_doubtful)
 
 
-def _largest(term: TermText) -> _Reduction:
+def _largest(term: TermText) -> Reduction:
     """Return text that keeps the largest summands of a query, their sources and their images."""
     before, taken, after, width = [], [], [], len(term.sums)
     for k, part in enumerate(term.sums):
@@ -353,17 +379,17 @@ def _largest(term: TermText) -> _Reduction:
         whose += f"    code[l] = PERIODIC && several ? candidate_images[{number}] : image;\n}}\n"
         return "".join([whose, *taken])
 
-    return _Reduction("".join(before), each, "".join(after))
+    return Reduction("".join(before), each, "".join(after))
 
 
-def _added(term: TermText) -> _Reduction:
+def _added(term: TermText) -> Reduction:
     """Return text that adds summands to what the query has already, and to the totals of the chunk."""
     before = "".join(f"number sum{k} = {{}}, error{k} = {{}};\n" for k in range(len(term.sums)))
     lines = []
     for k, part in enumerate(term.sums):
         summand = f"Math::select(real_lanes, {part.name}, number{{}})"
         lines.append(f"if constexpr (COMPENSATED)\n    two_sum(sum{k}, error{k}, {summand});\nelse\n    sum{k} += {summand};\n")
-    return _Reduction(before, lambda _: "".join(lines), "".join(_stored(term)))
+    return Reduction(before, lambda _: "".join(lines), "".join(_stored(term)))
 
 
 def _stored(term: TermText) -> list[str]:
@@ -438,21 +464,16 @@ def query_kernel(
     packed = work(term.text) > LITTLE_WORK if packed is None else packed
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
     variant += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}_{key}"
-    totals = sum(part.total for part in term.sums)
-    constants = {"SCALED": scaled, "LIST": 0, "SUMS": 1 + extremes, **GRID, "EXACTLY": 1}
+    constants = {"SCALED": scaled, "LIST": 0, **GRID, "EXACTLY": 1, **constants_of(term, compensated, extremes)}
     constants |= {"PERIODIC": periodic, "BATCHED": batched, "CHUNK": CHUNK, "CANDIDATES": _candidates(term, dim, double)}
-    constants |= {"OTHERS": term.columns, "STEPS": len(term.steps), "COMPENSATED": compensated}
-    constants |= {"TOTALS": totals, "ROW_SUMS": len(term.sums) - totals}
-    reduction = _largest(term) if extremes else _added(term)
-    shared = "".join(_spread(v, f"shared_values.data[{c}]", double) for c, v in enumerate(term.shared))
-    largest = (TAKE_LARGER + _KEEP_LARGEST) * extremes
+    reduction = reduction_of(term, extremes)
     text = walk(
-        begin="".join([VECTOR, _ADD.replace("NUMBER_LANES", "f64" if double else "f32"), largest, shared]),
+        begin=beginning(term, double, extremes) + _CANDIDATES,
         meet=_meet(term, reduction, double, packed, flushed=not scaled),
         met=reduction.after,
         none=_NO_SUM + _NO_EXTREME * extremes,
         copied="".join([_COPY, *(_COPY_STEP.substitute(c=c, axis=step.axis) for c, step in enumerate(term.steps))]),
-        chunk_done=_CHUNK_DONE,
+        chunk_done=CHUNK_DONE,
         flushed=not scaled,  # where cutoffs are so small that they are scaled, so may be what decides
     )
 

@@ -36,9 +36,11 @@ def cutoffs(dtype):
     ("backend", "dtype"),
     [
         *((backend, dtype) for backend in ("warp", "hashgrid") for dtype in (np.float32, np.float64)),
-        ("jax", np.float64),
-        pytest.param("jax", np.float32, marks=pytest.mark.slow),
-        *(pytest.param("brute", dtype, marks=pytest.mark.slow) for dtype in (np.float32, np.float64)),
+        *(
+            pytest.param(backend, dtype, marks=pytest.mark.slow)
+            for backend in ("jax", "brute")
+            for dtype in (np.float32, np.float64)
+        ),
     ],
 )
 def test_any_floats(backend, dtype, data):

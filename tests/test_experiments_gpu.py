@@ -71,7 +71,9 @@ def test_an_inexact_answer_is_counted_as_wrong(config, monkeypatch):
     assert [row["wrong"] for row in _gpu._exactness_rows(part)] == [2]
 
 
-@pytest.mark.parametrize(("table", "name"), [("radii", "queries"), ("batches", "periodic_images")])
+@pytest.mark.parametrize(
+    ("table", "name"), [("radii", "queries"), pytest.param("batches", "periodic_images", marks=pytest.mark.slow)]
+)
 def test_options_are_decided_case_by_case(table, name, monkeypatch):
     """The second config names these tables; here one case of each."""
     parts = {part.cases: part for part in _gpu.load(CONFIG.with_name("h200_options.toml")).exactness}

@@ -343,11 +343,12 @@ X = np.zeros((4, 2), np.float32)
 def test_auto_takes_the_kernel_where_it_can():
     x = scene(1)[0]
 
-    def engine(fn, values=None, **options):
-        return "pair_sum_cpu" in jax.jit(lambda x: jfrnn.pair_sum(fn, x, CUTOFF, values, **options)).lower(x).as_text()
+    def engine(fn, cutoff=CUTOFF, **options):
+        return "jfrnn_pair_sum" in jax.jit(lambda x: jfrnn.pair_sum(fn, x, cutoff, **options)).lower(x).as_text()
 
     assert engine(one)
     assert engine(one, box=jfrnn.Box([2.0, 2.0]))
+    assert engine(one, cutoff=np.full(N, CUTOFF))
     assert engine(lambda r, i, j: r, reduce="max")
     with pytest.warns(RuntimeWarning, match="takes the slower engine 'jax' for a pair sum: the primitive 'sort'"):
         assert not engine(sorted_norm)
@@ -381,7 +382,6 @@ def with_strange_slope(r, i, j):
             "values of bool, float32, int32, fn gets or closes over float64",
             lambda: fused(second, X, 1.0, np.ones(4)),
         ),
-        (ValueError, "cannot sum over pairs with a cutoff per particle", lambda: fused(one, X, np.ones(4, np.float32))),
     ],
 )
 def test_errors(error, match, call):

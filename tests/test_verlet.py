@@ -78,7 +78,7 @@ def test_half_the_skin_is_as_far_as_a_point_may_go(ulps, rebuilds, backend, dtyp
 
 
 @pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=pytest.mark.slow)])
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 0.499, 0.5, 0.51, 2.0]), st.integers(-3, 3))
 def test_adversarial_motion_misses_no_pair(backend, seed, part, ulps):
     """Every point moves by about the same length straight at another one."""
@@ -146,7 +146,7 @@ def test_without_a_skin_update_is_a_search(options, backend):
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("backend", ["jax", "warp"])
+@pytest.mark.parametrize("backend", [pytest.param("jax", marks=pytest.mark.slow), "warp"])
 def test_in_a_scan_it_rebuilds_as_often_as_needed_and_traces_once(backend):
     x = points(80, 3, np.float32)
     nbrs = jfrnn.search(x, CUTOFF, skin=SKIN, capacity=80, backend=backend)
@@ -223,7 +223,8 @@ def test_a_chunk_is_replayed_until_its_list_was_large_enough():
 
 @pytest.mark.usefixtures("compiled_soon")
 @pytest.mark.parametrize(
-    ("backend", "dim"), [("warp", 2), ("warp", 3), ("hashgrid", 3), ("jax", 3), pytest.param("brute", 2, marks=pytest.mark.slow)]
+    ("backend", "dim"),
+    [("warp", 2), ("warp", 3), ("hashgrid", 3), *(pytest.param(*x, marks=pytest.mark.slow) for x in (("jax", 3), ("brute", 2)))],
 )
 def test_inactive_particles_have_no_neighbors_and_come_and_go(backend, dim):
     x = np.asarray(points(60, dim, np.float32)).copy()

@@ -1,0 +1,97 @@
+"""Fused pair sums with a cutoff per particle: the pairs of the oracle, by every rule, and derivatives over the reversed ones."""
+
+import functools
+import math
+
+import checked
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from jfrnn.cases.radii import RADII_CASES
+from test_pair_sum import SLOW, N, assert_same, everything, oracle_sum, scene, smooth, tangents_of
+from test_pair_sum_warp_boxes import assert_marks, marks
+from test_radii import LENGTH, radii_of
+
+import jfrnn
+from jfrnn._exact import RULES
+
+pytestmark = pytest.mark.usefixtures("compiled_soon")
+
+fused = functools.partial(jfrnn.pair_sum, backend="warp")
+
+
+def assert_case(name, dtype, dim, rule, **options):
+    """Compare the marks of a case, lengthened so that cases share programs, with those of the oracle's pairs."""
+    given = RADII_CASES[name].build(dtype, dim)
+    ids, more = jnp.arange(LENGTH, dtype=dtype), dict(options)
+    if given.queries is not None:
+        more |= {"queries": checked.padded(given.queries, LENGTH), "query_values": ids}
+    more |= {} if given.lengths is None else {"box": jfrnn.Box(given.lengths)}
+    x = checked.padded(given.positions, LENGTH)
+    found = fused(marks, x, radii_of(given, rule, LENGTH), ids, radius_rule=rule, **more)
+    kind = {"queries": given.queries, "query_radii": given.query_cutoffs, "lengths": given.lengths}
+    pairs = reference.reference_radii(given.positions, given.cutoffs, rule, **kind, **options)
+    assert pairs or name in ("one_particle", "no_queries")
+    lengths = np.zeros(dim) if given.lengths is None else given.lengths
+    assert_marks(found, pairs, given.positions, given.positions if given.queries is None else given.queries, lengths)
+
+
+@pytest.mark.parametrize("rule", ["mean", *(pytest.param(rule, marks=SLOW) for rule in RULES if rule != "mean")])
+@pytest.mark.parametrize("name", ["ties", "spread_100", "coincident"])
+def test_open_cases(name, rule):
+    assert_case(name, np.float32, 3, rule)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("dtype", "dim"), [(np.float32, 2), (np.float64, 2), (np.float32, 3), (np.float64, 3)])
+@pytest.mark.parametrize("name", RADII_CASES)
+def test_every_case(name, dtype, dim):
+    for rule in RULES:
+        assert_case(name, dtype, dim, rule)
+    assert_case(name, dtype, dim, "either", closed=True)
+
+
+def test_more_pairs_than_are_put_down_at_a_time():
+    """Sums go on, compensated ones with their errors, extremes with whose they are."""
+    n, eps = 1000, np.finfo(np.float32).eps
+    random = np.random.default_rng(0)
+    values = (random.standard_normal(n) * 10 ** random.uniform(-3, 5, n)).astype(np.float32)
+    values[n // 2 :] = -values[: n // 2] * np.float32(1 + 1e-5)
+    x, radii = jnp.zeros((n, 2), jnp.float32), jnp.linspace(0.1, 2.0, n, dtype=jnp.float32)
+    plain, compensated = (
+        np.asarray(fused(light, x, radii, values, include_self=True, compensated=c), np.float64) for c in (False, True)
+    )
+    exact, total = math.fsum(values.tolist()), math.fsum(np.abs(values).tolist())
+    bound = 2 * eps * abs(exact) + 4 * eps**2 * n * total
+    assert np.abs(plain - exact).max() <= 4 * eps * math.sqrt(n) * total
+    assert np.abs(compensated - exact).max() <= bound
+    assert np.abs(plain - exact).max() > 10 * bound  # else this would prove nothing
+    gradient = jax.grad(lambda m: fused(light, x, radii, m, reduce="min").sum())(jnp.asarray(values))
+    first, second = np.argsort(values)[:2]
+    expected = np.zeros(n)
+    expected[[first, second]] = n - 1, 1  # what `first` has is `second`
+    np.testing.assert_array_equal(gradient, expected)
+
+
+def light(r, i, j):
+    return j
+
+
+@pytest.mark.parametrize(("rule", "second"), [("scatter", False), *(pytest.param(rule, True, marks=SLOW) for rule in RULES)])
+def test_derivatives(rule, second):
+    """In a box with several images of a pair, and turns of particles; the reversed pairs are those of another rule."""
+    (x, m), fn, lengths = scene(1), functools.partial(smooth, 0.7), np.array([0.6, 1.5])
+    x = x + (np.arange(N) % 5 - 2.0)[:, None] * np.array([0.6, 0.0])
+    radii = 0.2 + 0.4 * m
+    pairs = reference.reference_radii(x, radii, rule, lengths=lengths)
+    assert any(i == j for i, j, _ in pairs)
+
+    def sums(x, m, lengths):
+        return fused(fn, x, radii, {"m": m}, radius_rule=rule, box=jfrnn.Box(lengths, images=(2, 1)))
+
+    args = (x, m, jnp.asarray(lengths))
+    along = tangents_of(args)
+    expected = everything(lambda x, m, a: oracle_sum(fn, pairs, x, x, {"m": m}, {"m": m}, jnp.diag(a)), second)
+    assert_same(everything(sums, second)(args, along), expected(args, along))
