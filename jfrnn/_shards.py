@@ -80,9 +80,9 @@ class Particles:
     Rows of all shards stand one after the other, N = shards · capacity of them, sharded over the mesh; unused rows have id -1.
 
     Attributes:
-        positions: Positions [length], shape [N, d]; of unused rows anything.
+        positions: Positions [length], shape [N, d]; `scatter` and `migrate` leave 0 in unused rows, of which nobody reads.
         ids: Row of the plain array that each particle came from, shape [N], int32; -1 where there is none.
-        values: A pytree of arrays of shape [N, ...] that travel along.
+        values: A pytree of arrays of shape [N, ...] that travel along; likewise.
         bounds: For each axis of the mesh, where it is cut [length], shape [*mesh.shape[:k], mesh.shape[k] - 1]: each part of an
             axis is cut on its own along the next.
         box: The periodic box, or None.

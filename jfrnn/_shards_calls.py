@@ -48,12 +48,14 @@ def checked_asked(particles: Any, cutoff: Any, skin: Any, include_self: Any, clo
 
 
 def over_shards(fn: Callable[..., Any], particles: Particles, out: Any, *arguments: Any) -> Any:  # noqa: ANN401
-    """Run a function of the parts of a shard on every shard; rows of arguments other than particles and halos are spread."""
+    """Run a function of the parts of a shard on every shard; arguments of no kind that is known here have spread rows."""
 
     def spec(argument: Any) -> Any:  # noqa: ANN401
         if isinstance(argument, Particles):
             return spec_of(argument)
-        return halo_spec(particles) if isinstance(argument, Halo) else jax.tree.map(lambda _: of_shards(particles.mesh), argument)
+        if isinstance(argument, Halo):
+            return halo_spec(particles)
+        return jax.tree.map(lambda _: of_shards(particles.mesh), argument)
 
     specs = tuple(spec(argument) for argument in arguments)
     return jax.shard_map(fn, mesh=particles.mesh, in_specs=specs, out_specs=out, check_vma=False)(*arguments)

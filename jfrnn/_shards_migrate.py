@@ -61,13 +61,19 @@ def _migrated(particles: Particles) -> Particles:
     fullest = jnp.max(lax.psum(_counts(jnp.where(there, wanted, shards), shards), mesh.axis_names))
     fits = fullest <= room
     goes = jnp.where(there, jnp.where(fits, wanted, here), shards)
-    positions, ids, values = _moved((x, particles.ids, particles.values), goes, particles)
+    rows = _moved((x, particles.ids, particles.values), goes, particles)
+    positions, ids, values = jax.tree.map(lambda leaf: _where_used(rows[1], leaf), rows)
     status = particles.status | shared_bits(jnp.where(fits, 0, Status.SHARD_OVERFLOW.value).astype(jnp.int32), mesh)
     bounds = tuple(jnp.where(fits, new, old) for new, old in zip(bounds, particles.bounds, strict=True))
     moved = dataclasses.replace(particles, positions=positions, ids=ids, values=values, bounds=bounds)
     halo = halo_in_shard(moved)
     required = particles.required.joined(halo.required._replace(particles=fullest))
     return dataclasses.replace(moved, status=status | halo.status, required=required)
+
+
+def _where_used(ids: Array, leaf: Array) -> Array:
+    """Return rows with 0 where there is no particle, -1 of ids themselves."""
+    return leaf if leaf is ids else jnp.where((ids >= 0).reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.zeros((), leaf.dtype))
 
 
 def _counts(goes: Array, shards: int) -> Array:

@@ -6,6 +6,7 @@ its halo, which alone travel; it asks `jfrnn.search` or `jfrnn.pair_sum` about t
 
 from jfrnn._shards import Particles, Required, Sizes
 from jfrnn._shards_calls import halo
+from jfrnn._shards_connect import connect
 from jfrnn._shards_halo import Halo
 from jfrnn._shards_list import Neighbors
 from jfrnn._shards_migrate import migrate
@@ -19,6 +20,7 @@ __all__ = [
     "Required",
     "Sizes",
     "collect",
+    "connect",
     "count",
     "halo",
     "migrate",
