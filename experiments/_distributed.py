@@ -24,7 +24,8 @@ from jfrnn import distributed
 from jfrnn._shards_scatter import fetched
 
 _WORK = ("list", "pair_sum", "sph")
-_SENDS = re.compile(r"= (\w+)\[([\d,]*)\][^=]* collective-permute(?:-start)?\(")
+_SENDS = re.compile(r"= (.*?) collective-permute(?:-start)?\(")
+_ARRAY = re.compile(r"(\w+)\[([\d,]*)\]")
 _BYTES = {"pred": 1, "s32": 4, "u32": 4, "f32": 4, "f64": 8, "s64": 8}
 
 
@@ -260,8 +261,12 @@ def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: Row
 
 def sent_bytes(program: str) -> int:
     """Return what a device sends to others in one pass over a compiled program: results of its collective permutes [bytes]."""
-    found = ((kind, sizes.split(",") if sizes else []) for kind, sizes in _SENDS.findall(program))
-    return sum(_BYTES[kind] * math.prod(int(size) for size in sizes) for kind, sizes in found)
+    total = 0
+    for result in _SENDS.findall(program):
+        arrays = _ARRAY.findall(result[: result.index(")")] if result.startswith("((") else result)
+        for kind, sizes in arrays if result.startswith("((") else arrays[:1]:  # of one that starts: what it takes comes first
+            total += _BYTES[kind] * math.prod(int(size) for size in sizes.split(",") if size)
+    return total
 
 
 def report(rows: list[Row], folder: Path) -> str:

@@ -11,6 +11,7 @@ import sys
 import time
 import traceback
 import warnings
+from pathlib import Path
 
 os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=8"
 
@@ -26,6 +27,7 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_disable_most_optimizations", True)
 
 CHECKS = {}
+README = Path(__file__).parent.parent / "README.md"
 
 
 def check(fn):
@@ -226,6 +228,38 @@ def sums_and_their_gradients(listed=False):
     ends = [on_many(particles.positions + s * towards, particles.values["m"], h, halo=halo) for s in (step, -step)]
     by_x = jax.grad(functools.partial(on_many, halo=halo))(particles.positions, particles.values["m"], h)
     np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), (by_x * towards).sum(), rtol=1e-6)
+
+
+@check
+def sums_of_what_lies_on_the_mesh():
+    """What fn closes over is spread already: JAX puts a reshard before it."""
+    x = np.random.default_rng(11).uniform(0, 1, (40, 2))
+    particles = distributed.scatter(x, 0.3, mesh=mesh_of(2))
+    everywhere = jax.sharding.NamedSharding(particles.mesh, jax.sharding.PartitionSpec())
+    h = jax.jit(lambda h: 2 * h, out_shardings=everywhere)(jnp.asarray(0.15))
+
+    def near(h, r, i, j):
+        return jnp.where(r @ r < h**2, (h - jnp.sqrt(r @ r + 0.01)) ** 2, 0)
+
+    def on_many(particles, h):
+        return distributed.pair_sum(functools.partial(near, h), particles, 0.3, backend="warp").sum()
+
+    def on_one(h):
+        return jfrnn.pair_sum(functools.partial(near, h), jnp.asarray(x), 0.3, backend="warp").sum()
+
+    ours = jax.jit(jax.value_and_grad(on_many, 1))(particles, h)
+    np.testing.assert_allclose(ours, jax.value_and_grad(on_one)(jnp.asarray(0.3)), rtol=1e-12)
+
+
+@check
+def example_of_the_readme():
+    (example,) = (part.split("```")[0] for part in README.read_text().split("```python\n") if "distributed.collect" in part)
+    names = {}
+    exec(example, names)
+    i, j = names["nbrs"].pairs()
+    np.testing.assert_array_equal(np.bincount(i, minlength=20_000), jfrnn.count(names["x"], 0.3, backend="warp"))
+    np.testing.assert_array_equal(names["x_again"], names["x"])
+    assert len(i) == len(j)
 
 
 @check

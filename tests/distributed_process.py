@@ -1,4 +1,4 @@
-"""One of the processes of a run: `python tests/distributed_process.py ADDRESS PROCESSES PROCESS lives|dies0|dies1`, for test_distributed.py."""
+"""One process of a run, for test_distributed.py: `distributed_process.py ADDRESS PROCESSES PROCESS lives|dies0|dies1`."""
 
 import os
 import sys

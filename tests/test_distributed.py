@@ -89,6 +89,6 @@ def test_a_process_that_dies_ends_the_other(process):
     """With the message of JAX's coordination service, or that of the collective whose connection broke."""
     runs = two_processes(f"dies{process}")  # does not hang: there is a limit to it
     assert runs[process][2] == 1
-    stdout, stderr, code = runs[1 - process]
+    _, stderr, code = runs[1 - process]
     assert code != 0
     assert "another task died" in stderr or "Connection" in stderr, stderr
