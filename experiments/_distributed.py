@@ -24,7 +24,7 @@ from jfrnn import distributed
 from jfrnn._shards_scatter import fetched
 
 _WORK = ("list", "pair_sum", "sph")
-_SENDS = re.compile(r"= (.*?) collective-permute(?:-start)?\(")
+_SENDS = re.compile(r"= (.*?) collective-permute(?:-start)?\(.*source_target_pairs=\{(.*?)\}\}")
 _ARRAY = re.compile(r"(\w+)\[([\d,]*)\]")
 _BYTES = {"pred": 1, "s32": 4, "u32": 4, "f32": 4, "f64": 8, "s64": 8}
 
@@ -252,7 +252,7 @@ def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: Row
     arguments = (given,) if compiled is None else (given, spec.steps)
     program: Any = compiled or work
     text = program.lower(*arguments).compile().as_text()
-    row.sent_bytes = row.devices * sent_bytes(text)
+    row.sent_bytes = sent_bytes(text)
     _, (row.first_s,) = _measure.repeat(lambda: jax.block_until_ready(work(given)), 1, 0.0, 1)
     _, seconds = _measure.repeat(lambda: jax.block_until_ready(work(given)), spec.repeats, spec.min_seconds, 10 * spec.repeats)
     timed = _measure.summarize([s / per for s in seconds])
@@ -260,24 +260,23 @@ def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: Row
 
 
 def sent_bytes(program: str) -> int:
-    """Return what a device sends to others in one pass over a compiled program: results of its collective permutes [bytes]."""
+    """Return what all devices send to others in one pass over a compiled program: by its collective permutes [bytes]."""
     total = 0
-    for result in _SENDS.findall(program):
-        arrays = _ARRAY.findall(result[: result.index(")")] if result.startswith("((") else result)
-        for kind, sizes in arrays if result.startswith("((") else arrays[:1]:  # of one that starts: what it takes comes first
-            total += _BYTES[kind] * math.prod(int(size) for size in sizes.split(",") if size)
+    for result, moves in _SENDS.findall(program):
+        several = result.startswith("((")  # arrays that travel together; of one that starts, what it takes comes first
+        arrays = _ARRAY.findall(result[: result.index(")")] if several else result)
+        sizes = [_BYTES[kind] * math.prod(int(size) for size in shape.split(",") if size) for kind, shape in arrays]
+        total += sum(sizes if several else sizes[:1]) * moves.count("{")
     return total
 
 
 def report(rows: list[Row], folder: Path) -> str:
-    """Return the table of a run, and write it beside the rows: efficiency is 1 where k devices are k times as fast as one."""
+    """Return the table of a run, and write it beside the rows: efficiency is a device's particles per second over one alone."""
     table = pd.DataFrame([asdict(row) for row in rows])
-    alone = {(row.scaling, row.work): row.median_s for row in rows if row.devices == 1 and row.median_s}
-    times = [(alone.get((row.scaling, row.work)), row) for row in rows]
-    table["efficiency"] = [
-        None if one is None or row.median_s is None else one / row.median_s / (row.devices if row.scaling == "strong" else 1)
-        for one, row in times
-    ]
+    rates = [None if not row.median_s or not row.particles else row.particles / row.median_s / row.devices for row in rows]
+    alone = {(row.scaling, row.work): rate for row, rate in zip(rows, rates, strict=True) if row.devices == 1}
+    ones = [alone.get((row.scaling, row.work)) for row in rows]
+    table["efficiency"] = [None if not rate or not one else rate / one for rate, one in zip(rates, ones, strict=True)]
     table["ms"] = 1e3 * table["median_s"].astype(float)
     columns = [
         "scaling",
