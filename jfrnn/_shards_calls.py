@@ -9,12 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.sharding import PartitionSpec
 
 from jfrnn import _search
 from jfrnn._inputs import checked_cutoff, checked_flag, checked_skin
 from jfrnn._neighbors import rounded_capacity
 from jfrnn._shards import OVERFLOWS, Particles, of_shards
-from jfrnn._shards_halo import Halo, exchanged, halo_in_shard, halo_spec
+from jfrnn._shards_halo import Halo, exchanged, halo_in_shard, halo_spec, rows_seen
 from jfrnn._shards_migrate import spec_of
 from jfrnn._verlet import list_radius
 
@@ -59,6 +60,41 @@ def over_shards(fn: Callable[..., Any], particles: Particles, out: Any, *argumen
 
     specs = tuple(spec(argument) for argument in arguments)
     return jax.shard_map(fn, mesh=particles.mesh, in_specs=specs, out_specs=out, check_vma=False)(*arguments)
+
+
+def checked_halo(halo: Any, particles: Particles) -> None:  # noqa: ANN401
+    """Refuse a halo of particles that are laid out otherwise: after `grow`, what was made before is of no use.
+
+    Raises:
+        TypeError, ValueError: It is no halo, or one of other shapes.
+    """
+    if not isinstance(halo, Halo):
+        raise TypeError(f"halo must be what jfrnn.distributed.halo returns, got {type(halo).__name__}.")
+    wanted = particles.mesh.devices.size * rows_seen(particles)
+    if halo.ids.shape != (wanted,):
+        raise ValueError(
+            f"halo has {halo.ids.shape[0]} rows, but particles with {particles.sizes} see {wanted}: after grow() make halos and "
+            "lists anew."
+        )
+
+
+def on_each(fn: Callable[..., Any], particles: Particles, *same: Any) -> Any:  # noqa: ANN401
+    """Run a function on every device, on its own particles alone: what needs no neighbors, such as walls that all devices know.
+
+    Args:
+        fn: (particles, *same) -> a pytree of arrays with a row for each row of the particles that it gets: `positions`, `ids`,
+            `active` and `values` are those of one device.
+        particles: Spread particles.
+        *same: Pytrees of arrays that every device gets whole, such as vertices and faces.
+
+    Returns:
+        What fn returns, leaves [N, ...], rows as in `particles.positions`.
+
+    Differentiable: as fn. Jit: yes, and only there fast. vmap: no.
+    """
+    specs = spec_of(particles), *(jax.tree.map(lambda _: PartitionSpec(), each) for each in same)
+    rows = of_shards(particles.mesh)
+    return jax.shard_map(fn, mesh=particles.mesh, in_specs=specs, out_specs=rows, check_vma=False)(particles, *same)
 
 
 @jax.jit

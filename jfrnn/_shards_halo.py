@@ -91,6 +91,13 @@ def halo_spec(particles: Particles) -> Halo:
     return Halo((rows,) * len(particles.along), rows, same, Required(same, same, same, same), same)
 
 
+def rows_seen(particles: Particles) -> int:
+    """Return how many rows a shard sees: its own and those that it may receive."""
+    sizes = particles.sizes
+    messages = (len(stage.offsets(sizes.hops[stage.number])) * sizes.halo[stage.number] for stage in stages(particles))
+    return sizes.particles + sum(messages)
+
+
 def halo_in_shard(particles: Particles) -> Halo:
     """Make a halo, inside `shard_map`."""
     x, numbers = lax.stop_gradient(particles.positions), particles.ids + 1  # where nothing is received are zeros

@@ -15,7 +15,7 @@ from jax.sharding import PartitionSpec
 from jfrnn import _search
 from jfrnn._neighbors import NeighborList, rounded_capacity
 from jfrnn._shards import OVERFLOWS, Particles, Required, check, of_shards, shared_bits
-from jfrnn._shards_calls import Asked, counted_capacity, over_shards, seen
+from jfrnn._shards_calls import Asked, checked_halo, counted_capacity, over_shards, seen
 from jfrnn._shards_halo import Halo, halo_in_shard, halo_spec
 from jfrnn._shards_migrate import migrate
 from jfrnn._shards_scatter import fetched
@@ -77,6 +77,7 @@ class Neighbors:
         Cost: one pass over the positions and one number from each device; or `migrate` and `search`. Differentiable: no gradient
         flows through. Jit: yes. vmap: no.
         """
+        checked_halo(self.halo, particles)
         return _updated(particles, self)
 
     def grow(self, particles: Particles, slack: float = 1.25) -> "Neighbors":

@@ -13,7 +13,7 @@ from jfrnn import _pair_sum
 from jfrnn._inputs import checked_capacity, checked_flag, checked_slack
 from jfrnn._neighbors import NeighborList
 from jfrnn._shards import Particles, of_shards
-from jfrnn._shards_calls import Asked, checked_asked, counted_capacity, counts, is_good, marked, over_shards, seen
+from jfrnn._shards_calls import Asked, checked_asked, checked_halo, counted_capacity, counts, is_good, marked, over_shards, seen
 from jfrnn._shards_halo import Halo, exchanged, halo_in_shard
 from jfrnn._shards_list import Neighbors, listed
 
@@ -88,6 +88,8 @@ def count(
 
     Differentiable: no. Jit: yes. vmap: no.
     """
+    if halo is not None:
+        checked_halo(halo, particles)
     return counts(particles, halo, checked_asked(particles, cutoff, 0.0, include_self, closed, backend))
 
 
@@ -145,6 +147,8 @@ def pair_sum(
         if tuple(jnp.shape(leaf)[:1]) != particles.ids.shape:
             name, shape = f"values{jax.tree_util.keystr(path)}", list(jnp.shape(leaf))
             raise ValueError(f"{name} must have shape [{particles.ids.shape[0]}, ...], a row per row of particles, got {shape}.")
+    if halo is not None:
+        checked_halo(halo, particles)
     local = None if neighbors is None else neighbors.local
     return _sums(particles, halo, local, values, fn, asked, reduce, checked_flag("compensated", compensated))
 

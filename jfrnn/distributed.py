@@ -5,7 +5,7 @@ its halo, which alone travel; it asks `jfrnn.search` or `jfrnn.pair_sum` about t
 """
 
 from jfrnn._shards import Particles, Required, Sizes
-from jfrnn._shards_calls import halo
+from jfrnn._shards_calls import halo, on_each
 from jfrnn._shards_connect import connect
 from jfrnn._shards_halo import Halo
 from jfrnn._shards_list import Neighbors
@@ -24,6 +24,7 @@ __all__ = [
     "count",
     "halo",
     "migrate",
+    "on_each",
     "pair_sum",
     "scatter",
     "search",

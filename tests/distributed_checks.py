@@ -312,6 +312,23 @@ def particles_that_are_nowhere_stay():
 
 
 @check
+def walls_that_all_devices_know():
+    rng = np.random.default_rng(12)
+    x, vertices = rng.uniform(-1, 1, (60, 3)), jnp.asarray(rng.uniform(-1, 1, (5, 3)))
+    faces = jnp.asarray([[0, 1, 2], [1, 2, 3], [2, 3, 4]])
+    particles = distributed.scatter(x, 0.3, mesh=mesh_of(2))
+
+    def counted(part, vertices, faces):
+        there = jnp.where(part.active[:, None], part.positions, 1e3)
+        return jfrnn.search_triangles(there, vertices, faces, 0.5, capacity=3, backend="warp").count
+
+    counts = jax.jit(lambda p, *wall: distributed.on_each(counted, p, *wall))(particles, vertices, faces)
+    expected = jfrnn.search_triangles(jnp.asarray(x), vertices, faces, 0.5, backend="warp").count
+    np.testing.assert_array_equal(by_id(counts, particles), expected)
+    assert int(expected.sum()) > 10
+
+
+@check
 def engine_of_arrays():
     x = uneven(np.random.default_rng(10), 60, 2, np.float32)
     found(x, 0.5, (2,), capacity=40, backend="jax")
@@ -319,20 +336,22 @@ def engine_of_arrays():
 
 @check
 def wrong_arguments_are_named():
-    x, mesh = np.zeros((8, 2)), mesh_of(2)
+    x, mesh = np.zeros((20, 2)), mesh_of(2)
     raises(ValueError, "skewed", distributed.scatter, x, 0.1, mesh=mesh, box=jfrnn.Box([[1.0, 0.0], [0.5, 1.0]]))
     raises(TypeError, "mesh", distributed.scatter, x, 0.1, mesh=4)
     raises(ValueError, "mesh", distributed.scatter, x, 0.1, mesh=mesh_of(2, 2, 2))
     raises(ValueError, "along", distributed.scatter, x, 0.1, mesh=mesh, along=(2,))
     raises(ValueError, r"values['m']", distributed.scatter, x, 0.1, {"m": np.zeros(7)}, mesh=mesh)
     raises(TypeError, "inside jax.jit", jax.jit(lambda x: distributed.scatter(x, 0.1, mesh=mesh).ids), x)
-    particles = distributed.scatter(x + np.arange(8)[:, None], 0.1, mesh=mesh)
+    particles = distributed.scatter(x + np.arange(20)[:, None], 0.1, mesh=mesh)
     raises(ValueError, "reach", distributed.search, particles, 0.2)
     raises(ValueError, "hashgrid", distributed.search, particles, 0.1, backend="hashgrid")
     raises(TypeError, "particles", distributed.count, x, 0.1)
     raises(ValueError, "capacity", jax.jit(lambda p: distributed.search(p, 0.1).count), particles)
     raises(ValueError, "values", distributed.pair_sum, weight, particles, 0.1, {"m": np.zeros(3)})
     raises(ValueError, "cutoff", distributed.pair_sum, weight, particles, None)
+    raises(TypeError, "halo", distributed.pair_sum, weight, particles, 0.1, halo=3)
+    raises(ValueError, "anew", distributed.count, roomy(particles), 0.1, halo=distributed.halo(particles))
 
 
 def main(names):
