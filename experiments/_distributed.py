@@ -1,5 +1,6 @@
 """Scaling over devices: lists, sums and steps of a fluid on 1 to k of them, and what travels between them."""
 
+import itertools
 import math
 import re
 from collections.abc import Callable, Iterator
@@ -38,7 +39,7 @@ class Config(Table):
         work: Of "list" (a list is made), "pair_sum" (a density), "sph" (a step of the 3D dam break).
         side: Particles along an edge of the cube, in all ("strong") or per device ("weak").
         nx: Likewise of the dam break: particles along the width of its column.
-        axes: Along how many axes space is cut, at most; devices are split among them evenly.
+        axes: Along how many axes space is cut, at most, one after the other; devices are split among them evenly.
         cutoff_ratio: Cutoff of lists and sums, in spacings of a jittered lattice.
         dtype: Of all numbers.
         repeats: Fewest timed runs.
@@ -54,7 +55,7 @@ class Config(Table):
     work: tuple[Literal["list", "pair_sum", "sph"], ...] = _WORK
     side: Annotated[int, Field(ge=2)] = 317
     nx: Annotated[int, Field(ge=2)] = 250
-    axes: Literal[1, 2, 3] = 1
+    axes: tuple[Literal[1, 2, 3], ...] = (1,)
     cutoff_ratio: Positive = 3.0
     dtype: Literal["float32", "float64"] = "float32"
     repeats: Annotated[int, Field(ge=1)] = 20
@@ -66,10 +67,9 @@ class Config(Table):
 
     def specs(self) -> Iterator["Spec"]:
         """Yield the rows, those of one kind of work side by side."""
-        shared = self.model_dump(exclude={"devices", "scaling", "work", "virtual_devices"})
-        for scaling in self.scaling:
-            for work in self.work:
-                yield from (Spec(scaling=scaling, work=work, devices=devices, **shared) for devices in self.devices)
+        shared = self.model_dump(exclude={"devices", "scaling", "work", "axes", "virtual_devices"})
+        for scaling, work, axes in itertools.product(self.scaling, self.work, self.axes):
+            yield from (Spec(scaling=scaling, work=work, axes=axes, devices=devices, **shared) for devices in self.devices)
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Row:
     """One kind of work on a number of devices.
 
     Attributes:
-        key, scaling, work, devices, dtype: As in `Spec`.
+        key, scaling, work, axes, devices, dtype: As in `Spec`.
         status, reason: As in `experiments._rows.Row`.
         particles: Of all devices.
         fullest: Of the fullest device.
@@ -119,6 +119,7 @@ class Row:
     key: str
     scaling: str
     work: str
+    axes: int
     devices: int
     dtype: str
     status: str = "failed"
@@ -169,7 +170,7 @@ def run(config: Config, folder: Path, retry_failed: bool = False) -> list[Row]:
 
 
 def _row(spec: Spec) -> Row:
-    row = Row(spec.key, spec.scaling, spec.work, spec.devices, spec.dtype)
+    row = Row(spec.key, spec.scaling, spec.work, spec.axes, spec.devices, spec.dtype)
     row.device, row.versions, row.machine = jax.devices()[0].device_kind, _machine.versions(), _machine.machine()
     row.commit, row.dirty = _machine.commit().values()
     if spec.devices > jax.device_count():
@@ -274,8 +275,8 @@ def report(rows: list[Row], folder: Path) -> str:
     """Return the table of a run, and write it beside the rows: efficiency is a device's particles per second over one alone."""
     table = pd.DataFrame([asdict(row) for row in rows])
     rates = [None if not row.median_s or not row.particles else row.particles / row.median_s / row.devices for row in rows]
-    alone = {(row.scaling, row.work): rate for row, rate in zip(rows, rates, strict=True) if row.devices == 1}
-    ones = [alone.get((row.scaling, row.work)) for row in rows]
+    alone = {(row.scaling, row.work, row.axes): rate for row, rate in zip(rows, rates, strict=True) if row.devices == 1}
+    ones = [alone.get((row.scaling, row.work, row.axes)) for row in rows]
     table["efficiency"] = [None if not rate or not one else rate / one for rate, one in zip(rates, ones, strict=True)]
     table["ms"] = 1e3 * table["median_s"].astype(float)
     columns = [

@@ -84,12 +84,21 @@ def uneven(rng, n, dim, dtype):
     return np.concatenate([blob, lattice]).astype(dtype)
 
 
-@check
-def pairs_on_1_2_4_8_devices():
+def pairs_on(*numbers):
     x = uneven(np.random.default_rng(1), 160, 3, np.float32)
-    for shards in (1, 2, 4, 8):
+    for shards in numbers:
         particles, _ = found(x, 0.5, (shards,), capacity=96)
         assert per_shard(particles).sum() == len(x)
+
+
+@check
+def pairs_on_1_and_8_devices():
+    pairs_on(1, 8)
+
+
+@check
+def pairs_on_2_and_4_devices():
+    pairs_on(2, 4)
 
 
 @check

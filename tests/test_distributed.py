@@ -13,7 +13,7 @@ import pytest
 HERE = Path(__file__).parent
 CHECKS, SPH, PROCESS = HERE / "distributed_checks.py", HERE / "distributed_sph.py", HERE / "distributed_process.py"
 QUICK = {  # the others compile longer
-    "pairs_on_1_2_4_8_devices",
+    "pairs_on_1_and_8_devices",
     "particles_move_across_several_shards",
     "room_that_is_missing_is_told_and_made",
     "sums_and_their_gradients",

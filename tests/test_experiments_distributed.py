@@ -62,7 +62,7 @@ def test_all_kinds_of_work(tmp_path):
 def test_configs_can_be_read():
     for name in ("distributed_smoke", "distributed_h200"):
         config = load(ROOT / "experiments" / "configs" / f"{name}.toml", _distributed.Config)
-        assert len({spec.key for spec in config.specs()}) == 2 * 3 * len(config.devices)
+        assert len({spec.key for spec in config.specs()}) == 2 * 3 * len(config.axes) * len(config.devices)
 
 
 def test_bytes_that_a_program_sends():
