@@ -279,18 +279,7 @@ def report(rows: list[Row], folder: Path) -> str:
     ones = [alone.get((row.scaling, row.work, row.axes)) for row in rows]
     table["efficiency"] = [None if not rate or not one else rate / one for rate, one in zip(rates, ones, strict=True)]
     table["ms"] = 1e3 * table["median_s"].astype(float)
-    columns = [
-        "scaling",
-        "work",
-        "devices",
-        "particles",
-        "fullest",
-        "halo",
-        "halo_bytes",
-        "sent_bytes",
-        "ms",
-        "efficiency",
-        "status",
-    ]
+    names = "scaling work axes devices particles fullest halo halo_bytes sent_bytes ms efficiency status"
+    columns = names.split()
     table[columns].to_csv(folder / "table.csv", index=False)
     return table[columns].to_string(index=False, float_format="%.3g")

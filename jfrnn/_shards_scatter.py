@@ -58,27 +58,28 @@ def scatter(
     x = np.asarray(positions)
     if len(x) > _MOST:
         raise ValueError(f"positions hold {len(x)} particles, but ids are int32: at most {_MOST}.")
-    values, slack = (
-        jax.tree_util.tree_map_with_path(lambda path, leaf: _checked_value(path, leaf, len(x)), values),
-        checked_slack(slack),
-    )
-    reach = _checked_reach(cutoff, skin, x.dtype)
+    values = jax.tree_util.tree_map_with_path(lambda path, leaf: _checked_value(path, leaf, len(x)), values)
+    slack, reach = checked_slack(slack), _checked_reach(cutoff, skin, x.dtype)
     mesh, cut = _checked_mesh(mesh, x.shape[1]), _checked_along(along, x, mesh)
     fixed = None if box is None else _checked_box(box, x, reach, mesh)
-    shards = mesh.devices.size
+    return _settled(_in_blocks(x, values, fixed, mesh, cut, reach), slack)
+
+
+def _in_blocks(x: np.ndarray, values: Any, box: Box | None, mesh: Mesh, along: tuple[int, ...], reach: float) -> Particles:  # noqa: ANN401
+    """Put equally many rows on each device as they come: `migrate` knows where they belong."""
+    shape, shards = mesh.devices.shape, mesh.devices.size
     share = -(-len(x) // shards)
     guess = room(max(share // 4, min(share, _SMALL)))
-    sizes = Sizes(room(share), (guess,) * len(cut), tuple(min(1, size - 1) for size in mesh.devices.shape))
+    sizes = Sizes(room(share), (guess,) * len(along), tuple(min(1, size - 1) for size in shape))
     place = np.arange(sizes.particles)
     source = np.where(place < share, share * np.arange(shards)[:, None] + place, len(x)).reshape(-1)
     source = np.where(source < len(x), source, -1).astype(np.int32)
-    bounds = tuple(np.zeros((*mesh.devices.shape[:k], size - 1), x.dtype) for k, size in enumerate(mesh.devices.shape))
-    same = (bounds, np.zeros((), np.int32), no_requirements(len(cut)))
+    bounds = tuple(np.zeros((*shape[:k], size - 1), x.dtype) for k, size in enumerate(shape))
+    same = (bounds, np.zeros((), np.int32), no_requirements(len(along)))
     bounds, status, required = jax.tree.map(lambda leaf: replicated(mesh, leaf), same)
     rows = jax.tree.map(lambda leaf: placed(mesh, leaf, source), (x, values))
     ids = placed(mesh, source, np.arange(len(source)))
-    moved = Particles(rows[0], ids, rows[1], bounds, fixed, status, required, mesh, cut, len(x), reach, sizes)
-    return _settled(moved, slack)
+    return Particles(rows[0], ids, rows[1], bounds, box, status, required, mesh, along, len(x), reach, sizes)
 
 
 def _settled(particles: Particles, slack: float) -> Particles:
