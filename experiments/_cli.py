@@ -170,6 +170,26 @@ def sums(
         typer.echo(_sums_report.report(rows, folder))
 
 
+@app.command(name="distributed")
+def over_devices(
+    config: Annotated[Path, typer.Argument(help="Config of scaling over devices, TOML.")],
+    out: Annotated[Path | None, typer.Option(help="Folder of the rows; out/NAME without it.")] = None,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Measure failed rows again.")] = False,
+) -> None:
+    """Time lists, sums and steps of a fluid on 1 to k devices, or go on with it; then print a table."""
+    with _usage_errors():
+        from experiments import _config, _distributed
+
+        given, folder = _config.load(config, _distributed.Config), out or Path("out") / config.stem
+        _distributed.prepare(given)
+        try:
+            rows = _distributed.run(given, folder, retry_failed)
+        except KeyboardInterrupt:
+            typer.echo("stopped; the same command goes on from here", err=True)
+            raise typer.Exit(130) from None
+        typer.echo(_distributed.report(rows, folder))
+
+
 @app.command()
 def sph(
     scene: Annotated[str, typer.Argument(help="Fluid scene, such as dam, taylor-green, dam-break-2d, jet.")],

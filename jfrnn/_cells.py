@@ -132,7 +132,7 @@ def grid_coordinates(positions: Array, axes: CellAxes, finite: Array, batch: Arr
 
 def _squeeze_gaps(cells: Array) -> Array:
     """Renumber whole floats, or uint32, [n] from 0 on, in order, with steps of at most 2."""
-    _, order = _sort_by(cells if cells.dtype == jnp.uint32 else _ordered_bits(cells), _iota(cells.size))
+    _, order = _sort_by(cells if cells.dtype == jnp.uint32 else ordered_bits(cells), _iota(cells.size))
     ascending = cells[order]
     before, after = ascending[:-1], ascending[1:]
     step = jnp.where(after == before, 0, jnp.where(after - before == 1, 1, 2)).astype(jnp.int32)
@@ -140,7 +140,7 @@ def _squeeze_gaps(cells: Array) -> Array:
     return jnp.zeros(cells.size, jnp.int32).at[order].set(place, unique_indices=True)
 
 
-def _ordered_bits(x: Array) -> Array:
+def ordered_bits(x: Array) -> Array:
     """Map floats to unsigned integers of the same order."""
     unsigned = jnp.uint32 if x.dtype == jnp.float32 else jnp.uint64
     top = unsigned(1 << (32 if x.dtype == jnp.float32 else 64) - 1)

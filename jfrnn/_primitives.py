@@ -314,6 +314,7 @@ TABLE: dict[str, Rule] = {name: _each(name) for name in _SAME_NAME} | {
     "convert_element_type": _convert,
     "copy": _same,
     "copy_p": _same,
+    "reshard": _same,  # of what a function closes over from outside of shard_map: every device has all of it
     "name": _same,
     "optimization_barrier": _same,
     "stop_gradient": _same,

@@ -14,6 +14,9 @@ class Status(enum.IntFlag):
     INVALID_CUTOFF = 16
     NONFINITE_VERTEX = 32
     FACE_OUT_OF_RANGE = 64
+    SHARD_OVERFLOW = 128
+    HALO_OVERFLOW = 256
+    HALO_TOO_FAR = 512
 
     @property
     def message(self) -> str:
@@ -48,6 +51,9 @@ _MESSAGES = {
         "`faces` name vertices that do not exist: those faces are nobody's neighbors in this list. Find them with "
         "((faces < 0) | (faces >= len(vertices))).any(axis=1)."
     ),
+    Status.SHARD_OVERFLOW: "A shard would have got more particles than it has room for: none of them changed their shard.",
+    Status.HALO_OVERFLOW: "A message to a neighboring shard holds fewer particles than it should: pairs may be missing.",
+    Status.HALO_TOO_FAR: "Pairs reach to shards farther away than messages go: pairs may be missing.",
 }
 
 

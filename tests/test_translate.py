@@ -101,7 +101,7 @@ def test_cases(name, kind, real):
 
 
 def test_every_primitive_that_is_translated_is_tested():
-    """Nothing stands in the table that no case reaches, but for names of older or newer versions of JAX."""
+    """Nothing stands in the table that no case reaches, but for names of older or newer versions of JAX, and within shard_map."""
 
     def names(jaxpr):
         for eqn in jaxpr.eqns:
@@ -112,7 +112,7 @@ def test_every_primitive_that_is_translated_is_tested():
     used = {name for case in CASES.values() for name in names(jax.make_jaxpr(case.function)(*case.examples("float32")).jaxpr)}
     older = {"pjit", "closed_call", "core_call", "custom_vjp_call_jaxpr", "checkpoint", "remat", "copy_p", "expand_dims"}
     newer = {"jit", "remat2", "stack", "unstack", "tile"}
-    assert set(TABLE) - used <= older | newer
+    assert set(TABLE) - used <= older | newer | {"reshard"}  # reached by tests/distributed_checks.py
 
 
 # --- constants --------------------------------------------------------------------------------------------------------

@@ -1,0 +1,285 @@
+"""Scaling over devices: lists, sums and steps of a fluid on 1 to k of them, and what travels between them."""
+
+import itertools
+import math
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+from jax import Array
+from jax.sharding import Mesh
+from pydantic import Field
+
+import jfrnn
+from experiments import _machine, _measure, _sweep
+from experiments._config import Positive, Table, digest
+from experiments._rows import RETRIED, RowFile
+from jfrnn import distributed
+from jfrnn._shards_scatter import fetched
+
+_WORK = ("list", "pair_sum", "sph")
+_SENDS = re.compile(r"= (.*?) collective-permute(?:-start)?\(.*source_target_pairs=\{(.*?)\}\}")
+_ARRAY = re.compile(r"(\w+)\[([\d,]*)\]")
+_BYTES = {"pred": 1, "s32": 4, "u32": 4, "f32": 4, "f64": 8, "s64": 8}
+
+
+class Config(Table):
+    """What is measured.
+
+    Attributes:
+        devices: Numbers of devices; those that are not there are skipped.
+        scaling: "strong": the same particles on all of them; "weak": the same number on each.
+        work: Of "list" (a list is made), "pair_sum" (a density), "sph" (a step of the 3D dam break).
+        side: Particles along an edge of the cube, in all ("strong") or per device ("weak").
+        nx: Likewise of the dam break: particles along the width of its column.
+        axes: Along how many axes space is cut, at most, one after the other; devices are split among them evenly.
+        cutoff_ratio: Cutoff of lists and sums, in spacings of a jittered lattice.
+        dtype: Of all numbers.
+        repeats: Fewest timed runs.
+        min_seconds: Runs go on until they took this long together [s].
+        steps: Of the fluid, per timed run.
+        check_most: Pairs are counted on one device, too, up to so many particles.
+        virtual_devices: Of the CPU; 0: the devices that there are.
+        backend: As in `jfrnn.search`.
+    """
+
+    devices: tuple[Annotated[int, Field(ge=1)], ...] = (1, 2, 4, 8)
+    scaling: tuple[Literal["strong", "weak"], ...] = ("strong", "weak")
+    work: tuple[Literal["list", "pair_sum", "sph"], ...] = _WORK
+    side: Annotated[int, Field(ge=2)] = 317
+    nx: Annotated[int, Field(ge=2)] = 250
+    axes: tuple[Literal[1, 2, 3], ...] = (1,)
+    cutoff_ratio: Positive = 3.0
+    dtype: Literal["float32", "float64"] = "float32"
+    repeats: Annotated[int, Field(ge=1)] = 20
+    min_seconds: Annotated[float, Field(ge=0)] = 0.5
+    steps: Annotated[int, Field(ge=1)] = 10
+    check_most: Annotated[int, Field(ge=0)] = 40_000_000
+    virtual_devices: Annotated[int, Field(ge=0)] = 0
+    backend: Literal["auto", "warp", "jax"] = "auto"
+
+    def specs(self) -> Iterator["Spec"]:
+        """Yield the rows, those of one kind of work side by side."""
+        shared = self.model_dump(exclude={"devices", "scaling", "work", "axes", "virtual_devices"})
+        for scaling, work, axes in itertools.product(self.scaling, self.work, self.axes):
+            yield from (Spec(scaling=scaling, work=work, axes=axes, devices=devices, **shared) for devices in self.devices)
+
+
+@dataclass(frozen=True)
+class Spec:
+    """What one row measures, and how: fields as in `Config`."""
+
+    scaling: str
+    work: str
+    devices: int
+    side: int
+    nx: int
+    axes: int
+    cutoff_ratio: float
+    dtype: str
+    repeats: int
+    min_seconds: float
+    steps: int
+    check_most: int
+    backend: str
+
+    @property
+    def key(self) -> str:
+        """Digest of all fields, 12 hex digits: a row with the same key need not run again."""
+        return digest(asdict(self))
+
+
+@dataclass
+class Row:
+    """One kind of work on a number of devices.
+
+    Attributes:
+        key, scaling, work, axes, devices, dtype: As in `Spec`.
+        status, reason: As in `experiments._rows.Row`.
+        particles: Of all devices.
+        fullest: Of the fullest device.
+        halo: Particles that are sent to others, of all devices and messages, each time positions are exchanged.
+        halo_bytes: Their coordinates [bytes].
+        sent_bytes: What all devices send to others per run or step, padding, values and ids included, as compiled [bytes].
+        pairs: Neighbors of all particles together; None for "sph".
+        pairs_of_one: As one device counts them, up to `check_most` particles.
+        first_s: First run, compilation included [s].
+        median_s, p10_s, p90_s: Of a list, a sum, or a step.
+        repeats: Timed runs.
+        device, versions, machine, commit, dirty, time: As in `experiments._rows.Row`.
+    """
+
+    key: str
+    scaling: str
+    work: str
+    axes: int
+    devices: int
+    dtype: str
+    status: str = "failed"
+    reason: str | None = None
+    particles: int | None = None
+    fullest: int | None = None
+    halo: int | None = None
+    halo_bytes: int | None = None
+    sent_bytes: int | None = None
+    pairs: int | None = None
+    pairs_of_one: int | None = None
+    first_s: float | None = None
+    median_s: float | None = None
+    p10_s: float | None = None
+    p90_s: float | None = None
+    repeats: int | None = None
+    device: str | None = None
+    versions: dict[str, str | None] = field(default_factory=dict)
+    machine: dict[str, Any] = field(default_factory=dict)
+    commit: str | None = None
+    dirty: bool | None = None
+    time: str | None = None
+
+
+def prepare(config: Config) -> None:
+    """Ask for the devices of a config, before anything else asks for one."""
+    jax.config.update("jax_enable_x64", config.dtype == "float64")
+    if config.virtual_devices:
+        jax.config.update("jax_num_cpu_devices", config.virtual_devices)
+        jax.config.update("jax_platforms", "cpu")
+
+
+def run(config: Config, folder: Path, retry_failed: bool = False) -> list[Row]:
+    """Measure all rows that are not there yet; they are added to rows.jsonl one by one."""
+    rows, specs = RowFile(folder, Row), list(config.specs())
+    with rows.locked():
+        rows.repair()
+        done = {row.key for row in rows.read() if not (retry_failed and row.status in RETRIED)}
+        left = [spec for spec in specs if spec.key not in done]
+        with _sweep.progress(len(left)) as shown:
+            bar = shown.add_task("", total=len(left))
+            for spec in left:
+                shown.update(bar, description=f"{spec.scaling} {spec.work} on {spec.devices}")
+                rows.append(_row(spec))
+                shown.advance(bar)
+    wanted = {spec.key for spec in specs}
+    return [row for row in rows.read() if row.key in wanted]
+
+
+def _row(spec: Spec) -> Row:
+    row = Row(spec.key, spec.scaling, spec.work, spec.axes, spec.devices, spec.dtype)
+    row.device, row.versions, row.machine = jax.devices()[0].device_kind, _machine.versions(), _machine.machine()
+    row.commit, row.dirty = _machine.commit().values()
+    if spec.devices > jax.device_count():
+        row.status, row.reason = "skipped", f"there are {jax.device_count()} devices"
+    else:
+        try:
+            (_sph if spec.work == "sph" else _search)(spec, row)
+        except Exception as error:
+            row.status, row.reason = "failed", f"{type(error).__name__}: {error}"[:500]
+    row.time = datetime.now(UTC).isoformat(timespec="seconds")
+    return row
+
+
+def mesh_of(devices: int, axes: int) -> Mesh:
+    """Return a mesh of the first devices, split among up to so many axes as evenly as their number allows."""
+    shape, left = [], devices
+    for k in range(axes, 0, -1):
+        divisors = [d for d in range(1, left + 1) if left % d == 0]
+        part = divisors[int(np.argmin([abs(d**k - left) for d in divisors]))]
+        shape, left = [*shape, part], left // part
+    shape = sorted((s for s in shape if s > 1), reverse=True) or [1]
+    return Mesh(np.array(jax.devices()[:devices]).reshape(shape), tuple("xyz"[: len(shape)]))
+
+
+def lattice(spec: Spec) -> np.ndarray:
+    """Return a jittered lattice with spacing 1, [n, 3]: a cube, or one for each device in a row."""
+    sides = (spec.side * (spec.devices if spec.scaling == "weak" else 1), spec.side, spec.side)
+    x = np.stack(np.meshgrid(*(np.arange(s, dtype=spec.dtype) for s in sides), indexing="ij"), axis=-1).reshape(-1, 3)
+    return x + np.random.default_rng(0).uniform(-0.3, 0.3, x.shape).astype(spec.dtype)
+
+
+def _weight(r: Array, i: Any, j: Any) -> Array:  # noqa: ANN401
+    return j["m"] * jnp.maximum(1 - (r @ r) / 9, 0) ** 3
+
+
+def _search(spec: Spec, row: Row) -> None:
+    x, cutoff, backend = lattice(spec), spec.cutoff_ratio, spec.backend
+    particles = distributed.scatter(x, cutoff, {"m": np.ones(len(x), x.dtype)}, mesh=mesh_of(spec.devices, spec.axes))
+    _describe(particles, row)
+    counts = distributed.count(particles, cutoff, backend=backend)
+    row.pairs = int(fetched(counts).sum(dtype=np.int64))
+    if spec.work == "list":
+        capacity = -(-int(jnp.max(counts)) // 8) * 8
+        work = jax.jit(lambda p: distributed.search(p, cutoff, capacity=capacity, backend=backend))
+    else:
+        work = jax.jit(lambda p: distributed.pair_sum(_weight, p, cutoff, p.values, backend=backend))
+    _time(work, particles, 1, spec, row)
+    if len(x) <= spec.check_most:
+        row.pairs_of_one = int(np.asarray(jfrnn.count(jnp.asarray(x), cutoff, backend=backend)).sum(dtype=np.int64))
+    row.status = "ok" if row.pairs_of_one in (None, row.pairs) else "failed"
+    row.reason = None if row.status == "ok" else "pairs differ from those of one device"
+
+
+def _sph(spec: Spec, row: Row) -> None:
+    from experiments.sph import spread
+    from experiments.sph.model import make_model, make_state
+    from experiments.sph.settings import make_scene
+
+    depth = 0.5 * (spec.devices if spec.scaling == "weak" else 1)
+    scene = make_scene("dam-break-3d", [f"nx={spec.nx}", f"depth={depth}"])
+    kind = np.dtype(spec.dtype).type
+    flow = spread.spread(make_model(scene, kind, spec.backend), make_state(scene, kind), mesh_of(spec.devices, spec.axes))
+    flow = spread.begin(flow)
+    flow = spread.run(flow, spec.steps)  # room that is missing is made before anything is timed
+    _describe(flow.particles, row)
+    _time(lambda flow: spread.advanced(flow, spec.steps), flow, spec.steps, spec, row, spread.advanced)
+    row.status = "ok"
+
+
+def _describe(particles: distributed.Particles, row: Row) -> None:
+    """Say how many particles there are, on the fullest device, and in halos."""
+    halo = distributed.halo(particles)
+    row.particles, row.halo = particles.total, int(halo.sent)
+    row.fullest = int(fetched(particles.active).reshape(row.devices, -1).sum(axis=1).max())
+    row.halo_bytes = row.halo * particles.dim * particles.positions.dtype.itemsize
+
+
+def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: Row, compiled: Any = None) -> None:  # noqa: ANN401
+    """Time calls of compiled work, and add up what it sends."""
+    arguments = (given,) if compiled is None else (given, spec.steps)
+    program: Any = compiled or work
+    text = program.lower(*arguments).compile().as_text()
+    row.sent_bytes = sent_bytes(text)
+    _, (row.first_s,) = _measure.repeat(lambda: jax.block_until_ready(work(given)), 1, 0.0, 1)
+    _, seconds = _measure.repeat(lambda: jax.block_until_ready(work(given)), spec.repeats, spec.min_seconds, 10 * spec.repeats)
+    timed = _measure.summarize([s / per for s in seconds])
+    row.median_s, row.p10_s, row.p90_s, row.repeats = (timed[name] for name in ("median_s", "p10_s", "p90_s", "repeats"))
+
+
+def sent_bytes(program: str) -> int:
+    """Return what all devices send to others in one pass over a compiled program: by its collective permutes [bytes]."""
+    total = 0
+    for result, moves in _SENDS.findall(program):
+        several = result.startswith("((")  # arrays that travel together; of one that starts, what it takes comes first
+        arrays = _ARRAY.findall(result[: result.index(")")] if several else result)
+        sizes = [_BYTES[kind] * math.prod(int(size) for size in shape.split(",") if size) for kind, shape in arrays]
+        total += sum(sizes if several else sizes[:1]) * moves.count("{")
+    return total
+
+
+def report(rows: list[Row], folder: Path) -> str:
+    """Return the table of a run, and write it beside the rows: efficiency is a device's particles per second over one alone."""
+    table = pd.DataFrame([asdict(row) for row in rows])
+    rates = [None if not row.median_s or not row.particles else row.particles / row.median_s / row.devices for row in rows]
+    alone = {(row.scaling, row.work, row.axes): rate for row, rate in zip(rows, rates, strict=True) if row.devices == 1}
+    ones = [alone.get((row.scaling, row.work, row.axes)) for row in rows]
+    table["efficiency"] = [None if not rate or not one else rate / one for rate, one in zip(rates, ones, strict=True)]
+    table["ms"] = 1e3 * table["median_s"].astype(float)
+    names = "scaling work axes devices particles fullest halo halo_bytes sent_bytes ms efficiency status"
+    columns = names.split()
+    table[columns].to_csv(folder / "table.csv", index=False)
+    return table[columns].to_string(index=False, float_format="%.3g")

@@ -1,0 +1,188 @@
+"""Migration: bounds that give each shard as many particles, and particles that go to the shard in whose region they are."""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.sharding import PartitionSpec
+
+from jfrnn._cells import ordered_bits
+from jfrnn._shards import Particles, of_shards, shared_bits
+from jfrnn._shards_halo import halo_in_shard
+from jfrnn._status import Status
+
+_DIGIT = 4  # bits of a bound that are found in one round
+_BUCKETS = 4  # a round of migration moves up to this part of a shard
+
+
+def spec_of(particles: Particles) -> Particles:
+    """Return how the arrays of particles are spread, in their structure."""
+    rows, same = of_shards(particles.mesh), PartitionSpec()
+    return dataclasses.replace(
+        jax.tree.map(lambda _: same, particles),
+        positions=rows,
+        ids=rows,
+        values=jax.tree.map(lambda _: rows, particles.values),
+    )
+
+
+@jax.jit
+def migrate(particles: Particles) -> Particles:
+    """Move the bounds of shards so that each has as many particles, and particles to the shard in whose region they are.
+
+    Rows change places; values travel along. Nothing depends on it but speed: `search` and `pair_sum` find the same pairs however
+    particles are spread. Where a shard would get more particles than it has room for, all stay where they are, and a bit says so.
+
+    Args:
+        particles: Particles, wherever they have moved to, also across several shards.
+
+    Returns:
+        The same particles, n in all; with status bits, and what was required, of this arrangement's halo too.
+
+    Cost: a sort of each shard for each axis of the mesh, and as much communication as particles change shards; rounds of at most a
+    quarter of a shard each. Differentiable: no gradient flows through. Jit: yes. vmap: no. Source: bounds by counting (Warren &
+    Salmon 1993, doi:10.1145/169627.169640), found digit by digit.
+    """
+    particles = lax.stop_gradient(particles)
+    spec = spec_of(particles)
+    return jax.shard_map(_migrated, mesh=particles.mesh, in_specs=(spec,), out_specs=spec, check_vma=False)(particles)
+
+
+def _migrated(particles: Particles) -> Particles:
+    mesh, x, room = particles.mesh, particles.positions, particles.sizes.particles
+    shards, here = mesh.devices.size, lax.axis_index(mesh.axis_names)
+    there = particles.ids >= 0
+    bounds, wanted = _balanced(particles, there & jnp.isfinite(x).all(axis=1))
+    wanted = jnp.where(jnp.isfinite(x).all(axis=1), wanted, here)
+    fullest = jnp.max(lax.psum(_counts(jnp.where(there, wanted, shards), shards), mesh.axis_names))
+    fits = fullest <= room
+    goes = jnp.where(there, jnp.where(fits, wanted, here), shards)
+    rows = _moved((x, particles.ids, particles.values), goes, particles)
+    positions, ids, values = jax.tree.map(lambda leaf: _where_used(rows[1], leaf), rows)
+    status = particles.status | shared_bits(jnp.where(fits, 0, Status.SHARD_OVERFLOW.value).astype(jnp.int32), mesh)
+    bounds = tuple(jnp.where(fits, new, old) for new, old in zip(bounds, particles.bounds, strict=True))
+    moved = dataclasses.replace(particles, positions=positions, ids=ids, values=values, bounds=bounds)
+    halo = halo_in_shard(moved)
+    required = particles.required.joined(halo.required._replace(particles=fullest))
+    return dataclasses.replace(moved, status=status | halo.status, required=required)
+
+
+def _where_used(ids: Array, leaf: Array) -> Array:
+    """Return rows with 0 where there is no particle, -1 of ids themselves."""
+    return leaf if leaf is ids else jnp.where((ids >= 0).reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.zeros((), leaf.dtype))
+
+
+def _counts(goes: Array, shards: int) -> Array:
+    return jnp.zeros(shards, jnp.int32).at[goes].add(1, mode="drop")
+
+
+def _moved(rows: Any, goes: Array, particles: Particles) -> Any:  # noqa: ANN401
+    """Send rows to the shards where they go, and close ranks; `shards` stands for rows that are unused."""
+    mesh, room = particles.mesh, particles.sizes.particles
+    shards, here = mesh.devices.size, lax.axis_index(mesh.axis_names)
+    counts = _counts(goes, shards)
+    first = jnp.cumsum(counts, dtype=jnp.int32) - counts
+    order = jnp.argsort(goes, stable=True).astype(jnp.int32)
+    bucket = max(math.ceil(room / (_BUCKETS * shards)), 1)
+    leaving = counts.at[here].set(0)
+    rounds = -(-lax.pmax(jnp.max(leaving), mesh.axis_names) // bucket)
+
+    def taken(places: Array, used: Array) -> Any:  # noqa: ANN401
+        """Return rows at places of the order; of those that are not used, -1 as their id."""
+        positions, ids, values = jax.tree.map(lambda leaf: leaf[order.at[places].get(mode="clip")], rows)
+        return positions, jnp.where(used, ids, -1), values
+
+    own = lax.iota(jnp.int32, room)
+    kept = taken(first[here] + own, own < counts[here])
+
+    def send(carry: tuple[Array, Array, Any]) -> tuple[Array, Array, Any]:
+        number, filled, kept = carry
+        places = number * bucket + jnp.broadcast_to(lax.iota(jnp.int32, bucket), (shards, bucket))
+        buckets = taken((first[:, None] + places).reshape(-1), (places < leaving[:, None]).reshape(-1))
+        came = jax.tree.map(lambda leaf: lax.all_to_all(leaf, mesh.axis_names, 0, 0, tiled=True), buckets)
+        real = came[1] >= 0
+        slot = jnp.where(real, filled + jnp.cumsum(real, dtype=jnp.int32) - 1, room)
+        kept = jax.tree.map(lambda leaf, new: leaf.at[slot].set(new, mode="drop"), kept, came)
+        return number + 1, filled + jnp.sum(real, dtype=jnp.int32), kept
+
+    return lax.while_loop(lambda carry: carry[0] < rounds, send, (jnp.int32(0), counts[here], kept))[2]
+
+
+def _balanced(particles: Particles, counted: Array) -> tuple[tuple[Array, ...], Array]:
+    """Return bounds between which equally many particles lie, and the shard in whose region each particle is, [rows] int32.
+
+    The first axis of the mesh cuts space into slabs, the next each slab on its own (recursive coordinate bisection with as many
+    parts as there are devices, Berger & Bokhari 1987, doi:10.1109/TC.1987.1676942). Particles at a bound belong above it.
+    """
+    x, mesh = lax.stop_gradient(particles.positions), particles.mesh
+    part, bounds, groups = jnp.zeros(len(x), jnp.int32), [], 1
+    for axis, shards in zip(particles.along, mesh.devices.shape, strict=True):
+        coordinate = _in_box(x[:, axis], axis, particles)
+        bits = ordered_bits(coordinate)
+        found = _bounds(bits, jnp.where(counted, part, groups), groups, shards, particles)
+        above = bits[:, None] >= found[part]
+        part = part * shards + jnp.sum(above, axis=1, dtype=jnp.int32)
+        inner = _floats(found, coordinate.dtype).reshape(*mesh.devices.shape[: len(bounds)], shards - 1)
+        bounds, groups = [*bounds, inner], groups * shards
+    return tuple(bounds), part
+
+
+def _in_box(x: Array, axis: int, particles: Particles) -> Array:
+    """Bring a coordinate between the ends of a periodic box, near enough."""
+    box = particles.box
+    if box is None or not box.periodic[axis]:
+        return x
+    t = x - box.origin[axis]
+    return box.origin[axis] + (t - box.vectors[axis] * jnp.floor(t / box.vectors[axis]))
+
+
+def _bounds(bits: Array, group: Array, groups: int, shards: int, particles: Particles) -> Array:
+    """Find, for each group, the largest keys below which at most 1/shards, 2/shards ... of its particles lie, [groups, shards - 1].
+
+    Args:
+        bits: Keys, shape [rows], unsigned, in the order of coordinates.
+        group: Shape [rows], int32; `groups` where a row does not count.
+        groups: How many.
+        shards: Parts.
+        particles: Name the devices.
+    """
+    group, bits = lax.sort((group, bits), num_keys=2)
+    ends = jnp.searchsorted(group, lax.iota(jnp.int32, groups + 1)).astype(jnp.int32)
+    start, end = ends[:-1, None], ends[1:, None]
+    total = lax.psum(end - start, particles.mesh.axis_names)
+    share = np.arange(1, shards, dtype=np.int32)
+    wanted = total // shards * share + total % shards * share // shards
+    digits = np.arange(1, 2**_DIGIT).astype(bits.dtype)
+
+    def find(k: Array, low: Array) -> Array:
+        shift = (bits.dtype.itemsize * 8 - _DIGIT * (k + 1)).astype(bits.dtype)
+        tried = low[..., None] + (digits << shift)
+        below = lax.psum(_places(bits, start, end, tried.reshape(groups, -1)) - start, particles.mesh.axis_names)
+        enough = jnp.sum(below.reshape(tried.shape) <= wanted[..., None], axis=-1)
+        return low + (enough.astype(bits.dtype) << shift)
+
+    return lax.fori_loop(0, bits.dtype.itemsize * 8 // _DIGIT, find, jnp.zeros((groups, shards - 1), bits.dtype))
+
+
+def _places(ascending: Array, start: Array, end: Array, wanted: Array) -> Array:
+    """Return the first place, from start to end [groups, 1], whose key is not below the wanted ones [groups, k]."""
+
+    def halve(_: Array, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bounds
+        middle = low + (high - low) // 2
+        right = (ascending.at[middle].get(mode="clip") < wanted) & (low < high)
+        return jnp.where(right, middle + 1, low), jnp.where(right, high, middle)
+
+    begin = jnp.broadcast_to(start, wanted.shape), jnp.broadcast_to(end, wanted.shape)
+    return lax.fori_loop(0, len(ascending).bit_length(), halve, begin)[0]
+
+
+def _floats(keys: Array, dtype: np.dtype) -> Array:
+    """Return the coordinates of keys, the inverse of `ordered_bits`; infinite beyond all floats."""
+    top = keys.dtype.type(1 << (keys.dtype.itemsize * 8 - 1))
+    x = lax.bitcast_convert_type(jnp.where(keys >= top, keys ^ top, ~keys), dtype)
+    return jnp.where(jnp.isnan(x), jnp.inf, x)

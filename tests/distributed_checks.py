@@ -1,0 +1,378 @@
+"""Checks of `jfrnn.distributed` on 8 virtual CPU devices, in a process of their own: `python tests/distributed_checks.py NAME...`.
+
+Prints a line of JSON for each: its name, and what was wrong, or null. The oracle is the search on one device, which other tests
+compare with rational arithmetic.
+"""
+
+import functools
+import json
+import os
+import sys
+import time
+import traceback
+import warnings
+from pathlib import Path
+
+os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=8"
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jfrnn
+from jfrnn import distributed
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_disable_most_optimizations", True)
+
+CHECKS = {}
+README = Path(__file__).parent.parent / "README.md"
+
+
+def check(fn):
+    CHECKS[fn.__name__] = fn
+    return fn
+
+
+def mesh_of(*shape):
+    return jax.make_mesh(shape, ("a", "b", "c")[: len(shape)], devices=jax.devices()[: int(np.prod(shape))])
+
+
+def pairs_of_one(x, radius, backend="warp", **options):
+    i, j = jfrnn.search(jnp.asarray(x), radius, backend=backend, **options).pairs()
+    order = np.lexsort((j, i))
+    return i[order], j[order]
+
+
+def same_pairs(nbrs, x, **asked):
+    for ours, theirs in zip(nbrs.pairs(), pairs_of_one(x, **asked), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def whole(particles, x):
+    """No particle was lost or doubled, and none changed."""
+    ids = np.asarray(particles.ids)
+    assert sorted(ids[ids >= 0]) == list(range(len(x)))
+    np.testing.assert_array_equal(distributed.collect(particles)[0], x)
+
+
+def by_id(rows, particles):
+    ids = np.asarray(particles.ids)
+    out = np.zeros((particles.total, *rows.shape[1:]), rows.dtype)
+    out[ids[ids >= 0]] = np.asarray(rows)[ids >= 0]
+    return out
+
+
+def per_shard(particles):
+    return np.asarray(particles.active).reshape(particles.mesh.devices.size, -1).sum(axis=1)
+
+
+def found(x, radius, shape, *, box=None, along=None, backend="warp", capacity=None, skin=0.0, **options):
+    """Spread, search, and compare with one device."""
+    particles = distributed.scatter(x, radius, mesh=mesh_of(*shape), box=box, along=along, skin=skin)
+    whole(particles, x)
+    nbrs = distributed.search(particles, radius, backend=backend, capacity=capacity, skin=skin, **options)
+    same_pairs(nbrs, x, radius=radius, box=box, backend=backend, skin=skin, **options)
+    return particles, nbrs
+
+
+def uneven(rng, n, dim, dtype):
+    """Two blobs far apart, a lattice with ties at the cutoff 0.5, coincident points."""
+    blob = rng.normal(0, 0.4, (n // 2, dim))
+    lattice = 6 + 0.25 * rng.integers(0, 6, (n - n // 2, dim))
+    return np.concatenate([blob, lattice]).astype(dtype)
+
+
+def pairs_on(*numbers):
+    x = uneven(np.random.default_rng(1), 160, 3, np.float32)
+    for shards in numbers:
+        particles, _ = found(x, 0.5, (shards,), capacity=96)
+        assert per_shard(particles).sum() == len(x)
+
+
+@check
+def pairs_on_1_and_8_devices():
+    pairs_on(1, 8)
+
+
+@check
+def pairs_on_2_and_4_devices():
+    pairs_on(2, 4)
+
+
+@check
+def pairs_on_a_mesh_of_three_axes_in_a_box():
+    rng = np.random.default_rng(2)
+    x = rng.uniform(-2.5, 4.5, (200, 3))  # outside of the box, by up to two of its lengths
+    box = jfrnn.Box([1.5, 1.25, 2.0], periodic=(True, True, False), origin=(0.25, -0.5, 0.0))
+    particles, _ = found(x, 0.4, (2, 2, 2), box=box, along=(0, 1, 2), capacity=48)
+    assert per_shard(particles).max() == len(x) // 8
+
+
+@check
+def cutoffs_wider_than_a_box_have_many_images():
+    x = np.random.default_rng(3).uniform(0, 1, (24, 2)).astype(np.float32)
+    found(x, 0.8, (4,), box=jfrnn.Box([1.0, 1.0]), along=(1,), capacity=96, closed=True, include_self=True)
+
+
+@check
+def particles_at_bounds_and_ties():
+    rng = np.random.default_rng(4)
+    x = 0.25 * rng.integers(-4, 5, (200, 2)).astype(np.float32)  # distances that equal the cutoff, bounds on lattice planes
+    found(x, 0.75, (4, 2), capacity=96, closed=True)
+    assert len(np.unique(x, axis=0)) < len(x)
+    for name, (shape, size) in {"one place": ((8,), 40), "nothing": ((2,), 0)}.items():
+        same = np.full((size, 2), 3.5, np.float32)
+        _, nbrs = found(same, 0.1, shape, capacity=40)
+        assert int(nbrs.count.sum()) == size * (size - 1), name
+
+
+@check
+def particles_move_across_several_shards():
+    rng = np.random.default_rng(5)
+    x = rng.uniform(0, 8, (160, 2))
+    particles = distributed.scatter(x, 0.5, {"name": np.arange(160), "flag": x[:, 0] > 4}, mesh=mesh_of(8), along=(0,))
+    for now in (8 - x, x % 1.0, np.where(x > 4, x + 1e6, x), np.full_like(x, 2.0)):
+        moved = particles.replace(positions=jnp.asarray(now)[np.maximum(np.asarray(particles.ids), 0)])
+        same_pairs(distributed.search(roomy(moved), 0.5, capacity=160, backend="warp"), now, radius=0.5)  # on the old shards
+        settled = distributed.migrate(roomy(moved))
+        whole(settled, now)
+        _, values = distributed.collect(settled)
+        np.testing.assert_array_equal(values["name"], np.arange(160))
+        np.testing.assert_array_equal(values["flag"], x[:, 0] > 4)
+        if len(np.unique(now[:, 0])) == len(now):
+            assert per_shard(settled).max() == 20
+            assert settled.bounds[0].shape == (7,)
+
+
+def roomy(particles):
+    """Return particles with room for a halo of all others, and for all on one shard."""
+    sizes = distributed.Sizes(particles.total, (particles.total,) * len(particles.along), (7,) * len(particles.along))
+    from jfrnn._shards import resized
+
+    return resized(particles, sizes)
+
+
+@check
+def room_that_is_missing_is_told_and_made():
+    x = np.random.default_rng(6).uniform(0, 8, (160, 2))
+    particles = distributed.scatter(x, 0.5, mesh=mesh_of(4), along=(0,), slack=1.0)
+    near = particles.replace(positions=particles.positions * 0.01)  # all within reach of each other, on four shards
+    nbrs = distributed.search(near, 0.5, capacity=160, backend="warp")
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.HALO_OVERFLOW | jfrnn.Status.HALO_TOO_FAR
+    assert bool(nbrs.overflow)
+    assert nbrs.required.hops.tolist() == [3]
+    assert nbrs.required.halo.tolist() == [40]
+    raises(RuntimeError, "hops", nbrs.check)
+    sums = distributed.pair_sum(weight, near, 0.5, backend="warp")
+    assert bool(jnp.isnan(sums).all())
+    assert int(distributed.count(near, 0.5, backend="warp").max()) == np.iinfo(np.int32).min
+    grown = near.grow(nbrs)
+    same_pairs(distributed.search(grown, 0.5, capacity=160, backend="warp"), x * 0.01, radius=0.5)
+    rows = distributed.search(grown, 0.5, capacity=8, backend="warp")
+    assert jfrnn.Status(int(rows.status)) == jfrnn.Status.ROW_OVERFLOW
+    assert int(rows.required.row) == 159
+    raises(RuntimeError, "row 159", rows.check)
+    same_pairs(rows.grow(grown), x * 0.01, radius=0.5)
+    together = grown.replace(positions=grown.positions * 0)
+    settled = distributed.migrate(together)
+    assert jfrnn.Status(int(settled.status)) == jfrnn.Status.SHARD_OVERFLOW
+    assert int(settled.required.particles) == 160
+    whole(settled, x * 0)
+    settled = distributed.migrate(together.grow(settled))
+    assert int(settled.status) == 0
+    assert sorted(per_shard(settled)) == [0, 0, 0, 160]
+
+
+def raises(kind, words, fn, *args, **kwargs):
+    try:
+        fn(*args, **kwargs)
+    except kind as error:
+        assert words in str(error), error
+    else:
+        raise AssertionError(f"no {kind.__name__}")
+
+
+def weight(r, i, j):
+    return jnp.maximum(1 - r @ r / 0.25, 0.0) ** 3
+
+
+def density(h, r, i, j):
+    return {"rho": j["m"] * jnp.maximum(1 - r @ r / h**2, 0.0) ** 3, "pull": (i["m"] - j["m"]) * r}
+
+
+@check
+def sums_and_their_gradients(listed=False):
+    rng = np.random.default_rng(7)
+    x, m, box = rng.uniform(0, 1, (60, 2)), rng.uniform(1, 2, 60), jfrnn.Box([1.0, 1.0], periodic=(True, False))
+    particles = distributed.scatter(x, 0.3, {"m": m}, mesh=mesh_of(2, 2), skin=0.05, box=box)
+    probe = rng.normal(0, 1, (60, 2))
+    nbrs = distributed.search(particles, 0.3, skin=0.05, backend="warp") if listed else None
+    halo = distributed.halo(particles)
+
+    def scalar(sums, probe):
+        return (sums["rho"] ** 2).sum() + (sums["pull"] * probe).sum()
+
+    def on_one(x, m, h):
+        return scalar(jfrnn.pair_sum(functools.partial(density, h), x, 0.3, {"m": m}, box=box, backend="warp"), jnp.asarray(probe))
+
+    mine = jnp.asarray(probe)[np.maximum(np.asarray(particles.ids), 0)]
+
+    def on_many(x, m, h, **given):
+        at = particles.replace(positions=x)
+        cutoff, given = (None, given) if "neighbors" in given else (0.3, given | {"backend": "warp"})
+        return scalar(distributed.pair_sum(functools.partial(density, h), at, cutoff, {"m": m}, **given), mine)
+
+    h = jnp.asarray(0.3)
+    value, expected = jax.jit(jax.value_and_grad(on_one, (0, 1, 2)))(jnp.asarray(x), jnp.asarray(m), h)
+    for given in ({"halo": halo}, {"neighbors": nbrs})[: 2 if listed else 1]:
+        many = jax.jit(jax.value_and_grad(functools.partial(on_many, **given), (0, 1, 2)))
+        ours, (by_x, by_m, by_h) = many(particles.positions, particles.values["m"], h)
+        np.testing.assert_allclose(ours, value, rtol=1e-12)
+        np.testing.assert_allclose(by_id(by_x, particles), expected[0], rtol=1e-10, atol=1e-9)
+        np.testing.assert_allclose(by_id(by_m, particles), expected[1], rtol=1e-10, atol=1e-9)
+        np.testing.assert_allclose(by_h, expected[2], rtol=1e-10)
+    step, towards = 1e-6, jnp.asarray(rng.normal(0, 1, particles.positions.shape))
+    ends = [on_many(particles.positions + s * towards, particles.values["m"], h, halo=halo) for s in (step, -step)]
+    by_x = jax.grad(functools.partial(on_many, halo=halo))(particles.positions, particles.values["m"], h)
+    np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), (by_x * towards).sum(), rtol=1e-6)
+
+
+@check
+def sums_of_what_lies_on_the_mesh():
+    """What fn closes over is spread already: JAX puts a reshard before it."""
+    x = np.random.default_rng(11).uniform(0, 1, (40, 2))
+    particles = distributed.scatter(x, 0.3, mesh=mesh_of(2))
+    everywhere = jax.sharding.NamedSharding(particles.mesh, jax.sharding.PartitionSpec())
+    h = jax.jit(lambda h: 2 * h, out_shardings=everywhere)(jnp.asarray(0.15))
+
+    def near(h, r, i, j):
+        return jnp.where(r @ r < h**2, (h - jnp.sqrt(r @ r + 0.01)) ** 2, 0)
+
+    def on_many(particles, h):
+        return distributed.pair_sum(functools.partial(near, h), particles, 0.3, backend="warp").sum()
+
+    def on_one(h):
+        return jfrnn.pair_sum(functools.partial(near, h), jnp.asarray(x), 0.3, backend="warp").sum()
+
+    ours = jax.jit(jax.value_and_grad(on_many, 1))(particles, h)
+    np.testing.assert_allclose(ours, jax.value_and_grad(on_one)(jnp.asarray(0.3)), rtol=1e-12)
+
+
+@check
+def example_of_the_readme():
+    (example,) = (part.split("```")[0] for part in README.read_text().split("```python\n") if "distributed.collect" in part)
+    names = {}
+    exec(example, names)
+    i, j = names["nbrs"].pairs()
+    np.testing.assert_array_equal(np.bincount(i, minlength=20_000), jfrnn.count(names["x"], 0.3, backend="warp"))
+    np.testing.assert_array_equal(names["x_again"], names["x"])
+    assert len(i) == len(j)
+
+
+@check
+def sums_over_lists_and_their_gradients():
+    sums_and_their_gradients(listed=True)
+
+
+@check
+def updates_keep_the_list_until_something_moved():
+    rng = np.random.default_rng(8)
+    x, v = rng.uniform(0, 4, (160, 2)), rng.normal(0, 1, (160, 2))
+    particles = distributed.scatter(x, 0.5, {"v": v}, mesh=mesh_of(4), skin=0.1, slack=2.0)
+    nbrs = distributed.search(particles, 0.5, skin=0.1, slack=2.0, backend="warp")
+
+    @jax.jit
+    def step(particles, nbrs):
+        particles = particles.replace(positions=particles.positions + 0.005 * particles.values["v"])
+        return nbrs.update(particles)
+
+    made = []
+    for k in range(1, 9):
+        particles, nbrs = step(particles, nbrs)
+        nbrs.check()
+        particles.check()
+        made.append(int(nbrs.rebuild_count[0]))
+        now, values = distributed.collect(particles)
+        np.testing.assert_allclose(now, x + 0.005 * k * v, rtol=1e-12, atol=1e-12)
+        np.testing.assert_array_equal(values["v"], v)
+        sums = distributed.pair_sum(weight, particles, None, neighbors=nbrs)
+        expected = jfrnn.pair_sum(weight, jnp.asarray(now), 0.5, backend="warp")
+        np.testing.assert_allclose(by_id(sums, particles), expected, rtol=1e-12, atol=1e-12)
+    assert 0 < made[-1] < 8, made
+    settled = distributed.migrate(particles.replace(positions=4 - particles.positions))
+    assert bool(jnp.isnan(distributed.pair_sum(weight, settled, None, neighbors=nbrs)).all())  # rows of others
+    _, again = nbrs.update(settled)
+    assert int(again.rebuild_count[0]) == made[-1] + 1
+
+
+@check
+def particles_that_are_nowhere_stay():
+    x = np.random.default_rng(9).uniform(0, 1, (80, 3)).astype(np.float32)
+    x[3], x[50, 1] = np.nan, np.inf
+    particles = distributed.scatter(x, 0.3, mesh=mesh_of(4))
+    whole(particles, x)
+    nbrs = distributed.search(particles, 0.3, capacity=40, backend="warp")
+    raises(ValueError, "non-finite", nbrs.check)
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
+    expected = jfrnn.count(jnp.asarray(x), 0.3, backend="warp")
+    np.testing.assert_array_equal(by_id(nbrs.count, particles), expected)
+
+
+@check
+def walls_that_all_devices_know():
+    rng = np.random.default_rng(12)
+    x, vertices = rng.uniform(-1, 1, (60, 3)), jnp.asarray(rng.uniform(-1, 1, (5, 3)))
+    faces = jnp.asarray([[0, 1, 2], [1, 2, 3], [2, 3, 4]])
+    particles = distributed.scatter(x, 0.3, mesh=mesh_of(2))
+
+    def counted(part, vertices, faces):
+        there = jnp.where(part.active[:, None], part.positions, 1e3)
+        return jfrnn.search_triangles(there, vertices, faces, 0.5, capacity=3, backend="warp").count
+
+    counts = jax.jit(lambda p, *wall: distributed.on_each(counted, p, *wall))(particles, vertices, faces)
+    expected = jfrnn.search_triangles(jnp.asarray(x), vertices, faces, 0.5, backend="warp").count
+    np.testing.assert_array_equal(by_id(counts, particles), expected)
+    assert int(expected.sum()) > 10
+
+
+@check
+def engine_of_arrays():
+    x = uneven(np.random.default_rng(10), 60, 2, np.float32)
+    found(x, 0.5, (2,), capacity=40, backend="jax")
+
+
+@check
+def wrong_arguments_are_named():
+    x, mesh = np.zeros((20, 2)), mesh_of(2)
+    raises(ValueError, "skewed", distributed.scatter, x, 0.1, mesh=mesh, box=jfrnn.Box([[1.0, 0.0], [0.5, 1.0]]))
+    raises(TypeError, "mesh", distributed.scatter, x, 0.1, mesh=4)
+    raises(ValueError, "mesh", distributed.scatter, x, 0.1, mesh=mesh_of(2, 2, 2))
+    raises(ValueError, "along", distributed.scatter, x, 0.1, mesh=mesh, along=(2,))
+    raises(ValueError, r"values['m']", distributed.scatter, x, 0.1, {"m": np.zeros(7)}, mesh=mesh)
+    raises(TypeError, "inside jax.jit", jax.jit(lambda x: distributed.scatter(x, 0.1, mesh=mesh).ids), x)
+    particles = distributed.scatter(x + np.arange(20)[:, None], 0.1, mesh=mesh)
+    raises(ValueError, "reach", distributed.search, particles, 0.2)
+    raises(ValueError, "hashgrid", distributed.search, particles, 0.1, backend="hashgrid")
+    raises(TypeError, "particles", distributed.count, x, 0.1)
+    raises(ValueError, "capacity", jax.jit(lambda p: distributed.search(p, 0.1).count), particles)
+    raises(ValueError, "values", distributed.pair_sum, weight, particles, 0.1, {"m": np.zeros(3)})
+    raises(ValueError, "cutoff", distributed.pair_sum, weight, particles, None)
+    raises(TypeError, "halo", distributed.pair_sum, weight, particles, 0.1, halo=3)
+    raises(ValueError, "anew", distributed.count, roomy(particles), 0.1, halo=distributed.halo(particles))
+
+
+def main(names):
+    warnings.simplefilter("error")
+    for name in names or CHECKS:
+        wrong, before = None, time.process_time()
+        try:
+            CHECKS[name]()
+        except Exception:
+            wrong = traceback.format_exc()
+        print(json.dumps({"name": name, "wrong": wrong, "cpu_s": time.process_time() - before}), flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
