@@ -1,11 +1,13 @@
 # Two commands: `make sweep` runs the thesis sweep on CPU, `make test` runs every test. Both set up .venv first.
+# Methods of others come with `make peers`. Those in C++ without a Python package, ANN and nanoflann's dynamic index, are compiled when
+# they first run, from Debian's headers: apt-get install g++ libann-dev libnanoflann-dev. Rows say what is missing; nothing else fails.
 PYTHON ?= python3
 VENV   := .venv
 PY     := $(VENV)/bin/python
 OUT    ?= out/thesis
 STAMP  := $(VENV)/.installed
 
-.PHONY: sweep test test-slow lint clean
+.PHONY: sweep peers test test-slow lint clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml
@@ -18,6 +20,9 @@ $(STAMP): pyproject.toml
 sweep: $(STAMP)
 	$(PY) -m experiments run experiments/configs/thesis.toml --out $(OUT)
 	$(PY) -m experiments report $(OUT)
+
+peers: $(STAMP)
+	$(PY) -m pip install --quiet --editable '.[peers]'
 
 test: lint
 	$(PY) -m pytest

@@ -40,6 +40,7 @@ class Row:
         median_s: Median of the repeats, from raw positions to the result [s].
         p10_s: 10th percentile of the repeats [s].
         p90_s: 90th percentile of the repeats [s].
+        parts: Median seconds of the parts of a search, by name, where a method tells them apart.
         repeats: Number of timed runs after the first.
         seconds: All their times [s].
         others_cores: Cores that other processes of the machine kept busy meanwhile, on average; None below 0.2 s.
@@ -85,6 +86,7 @@ class Row:
     median_s: float | None = None
     p10_s: float | None = None
     p90_s: float | None = None
+    parts: dict[str, float] = field(default_factory=dict)
     repeats: int | None = None
     seconds: list[float] = field(default_factory=list)
     others_cores: float | None = None

@@ -96,7 +96,7 @@ def _measure_search(adapter: methods.Adapter, spec: Spec, scene: "Scene", folder
     peak = searching.peak()
 
     found = adapter.read(result)
-    row |= _measure.summarize(seconds) | {"list_bytes": found.list_bytes, "device": found.device}
+    row |= _measure.summarize(seconds) | {"list_bytes": found.list_bytes, "device": found.device, "parts": found.parts}
     row |= {"peak_bytes": max(prepared_peak, peak) - memory.start, "memory_source": searching.source}
     if searching.source == "VmHWM":
         taken = max(peak - searching.start, found.list_bytes)  # a small list may fit into pages that were there before
