@@ -5,6 +5,8 @@ PYTHON ?= python3
 VENV   := .venv
 PY     := $(VENV)/bin/python
 OUT    ?= out/thesis
+# Of each row of the sweep; five tell how far two runs differ, and go on from what one has measured.
+PROCESSES ?= 1
 STAMP  := $(VENV)/.installed
 
 .PHONY: sweep peers test test-slow lint clean
@@ -18,7 +20,7 @@ $(STAMP): pyproject.toml
 	touch $@
 
 sweep: $(STAMP)
-	$(PY) -m experiments run experiments/configs/thesis.toml --out $(OUT)
+	$(PY) -m experiments run experiments/configs/thesis.toml --out $(OUT) --processes $(PROCESSES)
 	$(PY) -m experiments report $(OUT)
 
 peers: $(STAMP)

@@ -7,7 +7,8 @@ import pytest
 from experiments import _compare, _native, _oracle, methods
 
 OURS = {"brute", "cll", "hashgrid", "jax", "pair-sum", "warp", "warp-counts"}  # run by the tests of the sweep and of the engines
-OTHERS = [name for name in methods.names() if name not in OURS]
+MOVING = ["nanoflann-dynamic", "nanoflann-rebuild", "warp-rebuild", "warp-update"]
+OTHERS = [name for name in methods.names() if name not in OURS and name not in MOVING]
 
 
 @pytest.fixture
@@ -37,6 +38,24 @@ def test_pairs_without_ties_are_the_exact_ones(name, foreign):
     exact = _oracle.find_pairs(positions, cutoff)
     row = _compare.compare(find(name, positions, cutoff), exact, len(positions))
     assert (row["missing"], row["extra"], row["pairs"]) == (0, 0, len(exact)), row
+
+
+@pytest.mark.parametrize("name", MOVING)
+def test_methods_that_follow_motion_find_the_pairs_where_particles_are(name, foreign):
+    try:
+        adapter = methods.load(name)
+    except ImportError as error:
+        pytest.skip(f"{name}: {error}")
+    positions = np.random.default_rng(3).random((300, 3)).astype(np.float32)
+    cutoff = _oracle.round_cutoff(0.2, np.float32)
+    search = adapter.follow(positions, cutoff, 0.002)
+    for _ in range(2):
+        found = adapter.read(search())
+        gone = np.linalg.norm(found.positions.astype(float) - positions, axis=1)
+        assert 0.001 < gone.min() < gone.max() < cutoff / 3
+        row = _compare.compare(found, _oracle.find_pairs(found.positions, cutoff), 300)
+        assert (row["missing"], row["extra"], row["pairs"] > 0) == (0, 0, True)
+    assert found.rebuilt in {"warp-update": (0.15, 0.2), "warp-rebuild": (1.0,)}.get(name, (None,))
 
 
 def test_the_list_of_the_thesis_and_the_sane_one_are_the_same():
