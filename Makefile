@@ -9,7 +9,7 @@ OUT    ?= out/thesis
 PROCESSES ?= 1
 STAMP  := $(VENV)/.installed
 
-.PHONY: sweep peers test test-slow lint clean
+.PHONY: sweep peers notebooks test test-slow lint clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml
@@ -25,6 +25,11 @@ sweep: $(STAMP)
 
 peers: $(STAMP)
 	$(PY) -m pip install --quiet --editable '.[peers]'
+
+# The notebooks that read rows of sweeps, with their outputs.
+notebooks: $(STAMP)
+	cd notebooks && for each in thesis_reproduced open_questions gpu_layouts speed_against_error; do \
+	  ../$(VENV)/bin/jupyter execute --inplace $$each.ipynb || exit 1; done
 
 test: lint
 	$(PY) -m pytest

@@ -33,7 +33,7 @@ PLAIN = FuncFormatter(lambda number, _: _table.count(int(number)) if number >= 1
 Value = Callable[[Row], float | None]
 ThesisValue = Callable[[_thesis.Figures], float]
 
-SECONDS = "time of a search [s], median; bars: where it lies"
+SECONDS = "time of a search [s], median; bars: its interval"
 MEGABYTES = "peak memory of a search over its start [MB]"
 
 
@@ -68,8 +68,9 @@ def draw_all(rows: Sequence[Row], folder: Path, origin: str) -> list[Path]:
         "memory_by_fill": _by_fill(good, memory, thesis_memory, MEGABYTES),
         "speed_against_error": _against_error(good, seconds, SECONDS.split(";")[0], "Speed"),
         "memory_against_error": _against_error(good, memory, MEGABYTES, "Memory"),
-        "speed_against_sum_error": _against_sum_error(good),
     }
+    if any(row.density_error is not None for row in good):
+        pictures["speed_against_sum_error"] = _against_sum_error(good)
     if any(row.device_bytes for row in good):
 
         def device(row: Row) -> float | None:

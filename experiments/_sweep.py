@@ -78,7 +78,7 @@ def _run(config: Config, name: str, file: RowFile, retry_failed: bool, shard: tu
 def progress(total: int) -> Iterator[Progress]:
     """Show a bar on stderr."""
     columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True), disable=total == 0) as shown:
+    with Progress(*columns, console=Console(stderr=True, force_jupyter=False), disable=total == 0) as shown:
         yield shown
 
 

@@ -28,7 +28,17 @@ def make_row(scene, method, seconds, megabytes, **options):
         **{"spacing": 1e-4, "cutoff_ratio": 3.0, "dtype": "float32", "dim": 3, "seed": 0, "status": "ok", "points": points},
         **{"compile_s": 0.5, "first_s": seconds, "median_s": seconds, "p10_s": 0.9 * seconds, "p90_s": 1.2 * seconds, "repeats": 5},
         **{"search_bytes": int(1e6 * megabytes), "peak_bytes": int(3e6 * megabytes), "list_bytes": 1000, "scratch_bytes": 2000},
-        **{"pairs": 90, "exact_pairs": 90, "missing": 0, "extra": 0, "compared": "pairs", "machine": MACHINE, "versions": VERSIONS},
+        **{
+            "pairs": 90,
+            "exact_pairs": 90,
+            "missing": 0,
+            "extra": 0,
+            "compared": "pairs",
+            "density_error": 0.0,
+            "jump_error": 0.01,
+            "machine": MACHINE,
+            "versions": VERSIONS,
+        },
         **{"commit": "0123456789abcdef", "dirty": False, "config": "thesis", "time": "2031-02-03T04:05:06+00:00"},
     )
     return replace(row, **options)

@@ -50,7 +50,7 @@ class Sweep:
             env=os.environ | environment,
             capture_output=True,
             text=True,
-            timeout=200,
+            timeout=280,
             check=True,
         )
 
@@ -107,7 +107,8 @@ def test_pairs_of_a_row_are_compared_with_the_exact_ones(swept):
     assert rows["cll"]["missing"] > 0  # float32 decides ties as it rounds
     for method in ("jax", "warp", "hashgrid", "brute"):
         assert (rows[method]["density_error"], rows[method]["gradient_error"], rows[method]["jump_error"]) == (0, 0, 0)
-        assert rows[method]["planned_list_bytes"] == rows[method]["list_bytes"] + 8  # status, required
+        planned = rows[method]["planned_list_bytes"]
+        assert planned == (None if method == "brute" else rows[method]["list_bytes"] + 8)  # status, required
     assert rows["cll"]["density_error"] < 1e-12 < rows["cll"]["jump_error"]  # a tie is nothing to a kernel that ends at 0
 
 
@@ -206,7 +207,7 @@ FOUR = '[[scenes]]\nlayouts = ["corners"]\nfills = [0.02, 0.05]\n[[scenes]]\nlay
 
 
 def test_two_shards_merged_are_the_whole(tmp_path):
-    config = 'methods = ["scipy-kdtree", "ann-kd"]\nspacing = 1e-3\nprocesses = 2\nrepeats = 2\nmin_seconds = 0.0\n' + FOUR
+    config = 'methods = ["scipy-kdtree"]\nspacing = 1e-3\nprocesses = 2\nrepeats = 2\nmin_seconds = 0.0\n' + FOUR
     whole, parts = Sweep(tmp_path / "a", config), Sweep(tmp_path / "b", config)
     whole.run()
     for part in ("1/2", "2/2"):
@@ -215,7 +216,7 @@ def test_two_shards_merged_are_the_whole(tmp_path):
     scenes = [{(row.layout, row.fill_asked) for row in _rows.RowFile(shard).read()} for shard in shards]
     assert [len(part) for part in scenes] == [2, 1]  # a scene is measured on one machine
     done = subprocess.run([*parts.command[:3], "merge", str(parts.out)], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("12 rows came")
+    assert done.stdout.startswith("6 rows came")
 
     def told(rows):
         names = ("key", "layout", "fill_asked", "method", "process", "status", "pairs", "missing", "extra")
@@ -224,8 +225,8 @@ def test_two_shards_merged_are_the_whole(tmp_path):
     assert told(parts.rows()) == told(whole.rows())
     again = subprocess.run([*parts.command[:3], "merge", str(parts.out)], cwd=ROOT, capture_output=True, text=True, check=True)
     assert again.stdout.startswith("0 rows came")
-    assert len(parts.rows()) == 12
-    assert "12 of 12 rows are there already" in parts.run().stderr  # the whole sweep goes on from them
+    assert len(parts.rows()) == 6
+    assert "6 of 6 rows are there already" in parts.run().stderr  # the whole sweep goes on from them
 
 
 def test_of_one_key_a_row_with_figures_counts_when_rows_are_merged(tmp_path):
