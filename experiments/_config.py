@@ -82,7 +82,7 @@ class Config(Table):
         seed: Seed of random layouts.
         repeats: Fewest timed runs in a process.
         min_seconds: Runs go on until they took this long together [s].
-        max_repeats: Most timed runs in a process.
+        max_repeats: Most timed runs in a process; 1: the first run is the only one.
         most_seconds: No run begins when they took this long together, be they as few as they may [s].
         timeout: A row's process is ended after this time [s].
     """

@@ -54,7 +54,7 @@ def _cell(line: dict[str, Any], name: str, digits: str) -> dict[str, Any]:
     value = line[name]
     if value is None:
         status = f"{line['status']}: {line['reason'] or ''}" if name == "median_s" and line["status"] != "ok" else ""
-        return {"text": status[:40], "hint": status, "by": "", "kind": "none"}
+        return {"text": status.split(":")[0], "hint": status, "by": "", "kind": "none"}
     if not digits:
         return {"text": value, "hint": "", "by": value, "kind": "text"}
     text = format(value, digits).replace(",", " ") if math.isfinite(value) else str(value)

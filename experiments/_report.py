@@ -29,10 +29,11 @@ NOTES = """\
   that ratio holds 1 (of one process: the intervals of both overlap).
 - **missing**, **extra**: unordered pairs against the exact answer on the given floats, distance < cutoff. Of a method without pair
   list (`~`), only the surplus and the deficit of each particle can be seen.
-- **thesis**: Table 6.1 of J. Peifle, *Implementation of a Nearest-Neighbor Search for Particle Simulation in Sparse Computational
-  Domains*, KIT, February 2019: the method closest to ours, its total time, the largest resident set of its process, and both
+- **thesis**: Table 6.1 of J. Peifle, Implementation of a Nearest-Neighbor Search for Particle Simulation in Sparse Computational
+  Domains, KIT, February 2019: the method closest to ours, its total time, the largest resident set of its process, and both
   divided by its own CLL. Its machine was another, so only ratios compare.
-- `jax` and `brute` use all cores and list both directions of each pair; the others use one thread, and list each pair once.
+- `warp`, `pair-sum`, `jax`, `brute`, `freud`, `pykdtree` and what runs inside JAX may use all cores, the others one thread. Lists
+  hold each pair once or in both directions, as the method gives them.
 - `*`: other processes kept more than a quarter of a core busy meanwhile (`others_cores` in table.csv). Methods on all cores then
   look slower than they are.
 - table.csv holds all times, compilation included; rows.jsonl all that was measured.

@@ -92,6 +92,7 @@ def _line(row: Summary, scene: str, cll: Summary | None) -> dict[str, Any]:
     thesis, thesis_cll = _thesis.figures(row), _thesis.figures(row, "CLL")
     line = {name: getattr(row, name) for name in COLUMNS if hasattr(row, name)}
     line |= {"scene": scene, "seconds_to_cll": paired.middle if paired else ratio(row.median_s, cll and cll.median_s), **row.parts}
+    line["processes"] = row.processes or None
     line["within_noise"] = None if cll is None or cll is row else _statistics.within_noise(row, cll)
     sizes = ("search", "list", "scratch", "peak", "device", "planned_list", "planned_scratch")
     line |= {f"{name}_mb": megabytes(getattr(row, f"{name}_bytes")) for name in sizes}

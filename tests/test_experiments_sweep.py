@@ -14,7 +14,7 @@ import psutil
 import pytest
 from typer.testing import CliRunner
 
-from experiments import _measure, _rows, _sweep
+from experiments import _config, _measure, _rows, _sweep, _worker
 from experiments._cli import app
 from experiments._errors import UsageError
 
@@ -245,6 +245,14 @@ def test_of_one_key_a_row_with_figures_counts_when_rows_are_merged(tmp_path):
 def test_a_shard_that_is_none(text, tmp_path):
     result = CliRunner().invoke(app, ["run", str(tmp_path / "c.toml"), "--shard", text])
     assert (result.exit_code, result.stderr) == (2, f"error: --shard {text}: expected K/N with 1 <= K <= N, such as 2/8\n")
+
+
+def test_where_one_run_takes_minutes_it_is_the_only_one(tmp_path):
+    table = {"layouts": ("corners",), "fills": (0.02,)}
+    given = {"methods": ["scipy-kdtree"], "scenes": [table], "spacing": 1e-3, "repeats": 1, "max_repeats": 1, "min_seconds": 0.0}
+    (spec,) = _config.Config.model_validate(given).specs()
+    row = _worker.measure(spec, tmp_path)
+    assert (row["status"], row["repeats"], row["first_s"]) == ("ok", 1, row["median_s"])
 
 
 ROW = _rows.Row(key="a", layout="full", method="m", fill_asked=None, spacing=1.0, cutoff_ratio=3.0, dtype="f", dim=3, seed=0)
