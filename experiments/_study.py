@@ -1,6 +1,7 @@
 """What notebooks ask of the rows of sweeps: a table of rounds, and effects of one thing at a time with their uncertainty."""
 
 import io
+import tempfile
 from collections.abc import Sequence
 from contextlib import redirect_stderr
 from pathlib import Path
@@ -32,7 +33,7 @@ def rows(sweep: str, small: bool, results: str | None = None) -> list[Row]:
     if not small and (folder / "rows.jsonl").exists():
         return RowFile(folder).read()
     config = shrink(_config.load(ROOT / "configs" / f"{sweep}.toml"))
-    out = ROOT.parent / "out" / "small" / sweep
+    out = Path(tempfile.mkdtemp()) if small else ROOT.parent / "out" / "small" / sweep
     with redirect_stderr(io.StringIO()):  # its progress is no result
         made = _sweep.run(config, f"{sweep}, small", out)
     if not small:

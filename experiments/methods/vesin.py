@@ -1,7 +1,7 @@
 """vesin: a cell list in C++ with a list of unordered pairs, float64.
 
-It is given lengths times a power of two, which changes no bit of them but the exponent, so that the cutoff is near 1: in metres it took
-ten times as long on 7 200 particles, and did not end on 250 000.
+It is given lengths times a power of two, which changes their exponent alone, so that the cutoff is near 1: in metres it took ten
+times as long on 7 200 particles, and did not end on 250 000.
 """
 
 import math
