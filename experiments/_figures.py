@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from experiments import _plots, _thesis
 
@@ -112,6 +113,10 @@ def effect_bars(axes: Axes, made: Frame, factor: str, title: str) -> None:
     axes.axvline(1, color="0.5", linewidth=0.8)
     axes.set_yticks(range(len(methods)), methods)
     axes.set(title=title, xlabel="ratio of times")
+    if made.ratio.max() > 3 * made.ratio.min() or made.high.max() > 5:
+        axes.set_xscale("log")
+        _plots.label_logarithmic(axes.xaxis)
+        axes.xaxis.set_minor_locator(NullLocator())
     axes.legend(fontsize=8, frameon=False)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import _config, _thesis, _worker, methods
+from experiments import _config, _layouts, _thesis, _worker, methods
 from experiments._errors import UsageError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -136,6 +136,17 @@ def test_whatever_is_given_several_times_is_multiplied(tmp_path):
     first, second = (_worker.make_scene(spec) for spec in specs[:2])
     assert not np.array_equal(first.positions, second.positions)
     assert np.array_equal(np.sort(first.positions, axis=0), np.sort(second.positions, axis=0))
+
+
+def test_orders_keep_the_particles():
+    scenes = [_layouts.ordered(_layouts.make("jitter", spacing=5e-4), order, 3) for order in ("layout", "sorted", "shuffled")]
+    known = [np.unique(scene.positions, axis=0) for scene in scenes]
+    assert all(np.array_equal(known[0], other) for other in known[1:])
+    for scene, is_sorted in zip(scenes, (False, True, False), strict=True):
+        cells = np.floor(scene.positions / scene.cutoff).astype(int)
+        assert (np.diff(cells @ [10_000, 100, 1]) >= 0).all() == is_sorted
+    again = _layouts.ordered(scenes[0], "shuffled", 3)
+    assert np.array_equal(again.positions, scenes[2].positions)
 
 
 def test_smoke_config_has_every_method():

@@ -314,6 +314,10 @@ def test_peak_memory_sees_what_came_and_went():
         assert after.peak() - after.start < 20e6
 
 
+def test_there_is_no_device_memory_on_a_cpu():
+    assert _measure.DeviceMemory().peak() is None
+
+
 def test_bystanders_are_other_processes_alone():
     def watch():
         """Keep this process busy; return what others and itself took [cores]."""
