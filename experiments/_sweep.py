@@ -52,7 +52,7 @@ def shard_specs(specs: Iterable[Spec], shard: tuple[int, int]) -> list[Spec]:
 def _run(config: Config, name: str, file: RowFile, retry_failed: bool, shard: tuple[int, int]) -> list[Row]:
     """Do the work of `run` with the file of rows at hand."""
     folder = file.path.parent
-    specs, prepared = shard_specs(config.specs(), shard), set()
+    specs, prepared, absent = shard_specs(config.specs(), shard), set(), {}
     done = {row.key for row in file.read() if not (retry_failed and row.status in RETRIED)}
     pending = [spec for spec in specs if spec.key not in done]
     about = {"machine": _machine.machine(), **_machine.commit(), "config": name, "config_hash": config.hash}
@@ -66,7 +66,9 @@ def _run(config: Config, name: str, file: RowFile, retry_failed: bool, shard: tu
                 shown.update(bar, description=f"{spec.scene_name} · exact pairs")
                 _prepare_oracle(spec, folder, shown.console)
             shown.update(bar, description=f"{spec.scene_name} · {spec.method}")
-            row = replace(measure(spec, folder), **about)
+            row = replace(measure(spec, folder, absent.get(spec.method)), **about)
+            if row.status == "missing":
+                absent[spec.method] = {"status": row.status, "reason": row.reason}  # it will not appear while this runs
             file.append(row)
             shown.console.print(describe(row), highlight=False, markup=False, soft_wrap=True)
             shown.advance(bar)
@@ -89,13 +91,18 @@ def _prepare_oracle(spec: Spec, folder: Path, console: Console) -> None:
         console.print(f"{spec.scene_name}: no exact pairs: {answer['reason']}", highlight=False, markup=False)
 
 
-def measure(spec: Spec, folder: Path) -> Row:
+def measure(spec: Spec, folder: Path, known: dict[str, Any] | None = None) -> Row:
     """Measure one row in a fresh process; never raises for what happens there.
 
     The first process of a row compiles its kernels, which is timed; the others take them from the folder.
+
+    Args:
+        spec: The row.
+        folder: Holds the exact pairs, and kernels.
+        known: What the process would answer, where that is known without it.
     """
     kernels = None if spec.process == 0 else folder.resolve() / "kernels"
-    answer = ask(_task("measure", spec, folder), spec.timeout, kernels=kernels)
+    answer = known or ask(_task("measure", spec, folder), spec.timeout, kernels=kernels)
     asked = {"layout": spec.layout, "method": spec.method, "fill_asked": spec.fill, "process": spec.process}
     asked |= {name: getattr(spec, name) for name in SCENE_FIELDS}
     return Row(key=spec.key, **asked, **answer, time=datetime.now(UTC).isoformat(timespec="seconds"))
