@@ -46,15 +46,18 @@ def shrink(config: Config) -> Config:
     """Return a sweep of seconds that has the same axes: a coarse lattice, two values of each, light methods, two rounds."""
     tables = [{name: _few(name, values) for name, values in table.model_dump().items()} for table in config.scenes[:2]]
     scenes = tuple(Scenes.model_validate(table) for table in tables)
-    light = tuple(name for name in config.methods if name in LIGHT)[:3]
+    count = len([scene for table in scenes for scene in table.scenes()])
+    light = tuple(name for name in LIGHT if name in config.methods)[: 3 if count <= 4 else 2]
     few: dict[str, Any] = {"processes": 2, "repeats": 3, "min_seconds": 0.0, "timeout": 60.0}
     return config.model_copy(update={"scenes": scenes, "methods": light, "spacing": 2.5e-4, **few})
 
 
 def _few(axis: str, values: Sequence[Any]) -> tuple[Any, ...]:
-    """Return two layouts, two coarse spacings, of all else the first and the last value."""
+    """Return two layouts, two coarse spacings, one seed, of all else the first and the last value."""
     if axis == "spacings" and values:
         return (5e-4, 2.5e-4)
+    if axis == "seeds":
+        return tuple(values[:1])
     return tuple(values[:2]) if axis == "layouts" or len(values) < 2 else (values[0], values[-1])
 
 

@@ -22,7 +22,7 @@ def allocate(positions: np.ndarray, cutoff: float) -> int:
 def prepare(positions: np.ndarray, cutoff: float, capacity: int) -> Callable[[], tuple[jax.Array, jax.Array]]:
     """Compile the search, and return it; open space as a box that nothing wraps around."""
     jax.config.update("jax_enable_x64", positions.dtype == np.float64)
-    low = positions.min(axis=0) - positions.dtype.type(cutoff)
+    low = positions.min(axis=0)  # its cells begin at 0
     cell = jnp.diag(jnp.asarray(positions.max(axis=0) - low + positions.dtype.type(cutoff)))[None]
     periodic = jnp.zeros((1, positions.shape[1]), bool)
     cells, _, radius = estimate_cell_list_sizes(jnp.asarray(positions - low), cell, cutoff, periodic)
