@@ -1,11 +1,15 @@
 # Two commands: `make sweep` runs the thesis sweep on CPU, `make test` runs every test. Both set up .venv first.
+# Methods of others come with `make peers`. Those in C++ without a Python package, ANN and nanoflann's dynamic index, are compiled when
+# they first run, from Debian's headers: apt-get install g++ libann-dev libnanoflann-dev. Rows say what is missing; nothing else fails.
 PYTHON ?= python3
 VENV   := .venv
 PY     := $(VENV)/bin/python
 OUT    ?= out/thesis
+# Of each row of the sweep; five tell how far two runs differ, and go on from what one has measured.
+PROCESSES ?= 1
 STAMP  := $(VENV)/.installed
 
-.PHONY: sweep test test-slow lint clean
+.PHONY: sweep peers notebooks test test-slow lint clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml
@@ -16,8 +20,16 @@ $(STAMP): pyproject.toml
 	touch $@
 
 sweep: $(STAMP)
-	$(PY) -m experiments run experiments/configs/thesis.toml --out $(OUT)
+	$(PY) -m experiments run experiments/configs/thesis.toml --out $(OUT) --processes $(PROCESSES)
 	$(PY) -m experiments report $(OUT)
+
+peers: $(STAMP)
+	$(PY) -m pip install --quiet --editable '.[peers]'
+
+# The notebooks that read rows of sweeps, with their outputs.
+notebooks: $(STAMP)
+	cd notebooks && for each in thesis_reproduced open_questions gpu_layouts speed_against_error; do \
+	  ../$(VENV)/bin/jupyter execute --inplace $$each.ipynb || exit 1; done
 
 test: lint
 	$(PY) -m pytest

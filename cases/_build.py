@@ -13,6 +13,7 @@ from ._domain import Domain
 from ._scatter import clump, filament, jitter, random, sheet, two_blobs
 from ._scene import Scene
 from ._thesis import clusters, corners, diagonal, full
+from ._turned import cut, grown, tumbled, turned
 
 Layout = Callable[..., NDArray[np.float64]]
 
@@ -30,7 +31,10 @@ _BY_NAME: dict[str, Layout] = {
 }
 
 LAYOUTS = tuple(_BY_NAME)
-"""Names that `scene` knows. It builds clustersN for any other N too."""
+"""Names that `scene` knows. It builds clustersN for any other N too, and those of `FAMILIES`."""
+
+FAMILIES: dict[str, Layout] = {"clusters": clusters, "turned": turned, "tumbled": tumbled, "cut": cut, "grown": grown}
+"""Layouts of N tiles per axis, by what stands before the N: clusters5, turned4."""
 
 
 def scene(
@@ -46,6 +50,8 @@ def scene(
     separation: float | None = None,
     amplitude: float | None = None,
     density: float | None = None,
+    angle: float | None = None,
+    growth: float | None = None,
 ) -> Scene:
     """Build a scene by the name of its layout.
 
@@ -57,20 +63,22 @@ def scene(
     (37044, 0.148176)
 
     Args:
-        name: One of `LAYOUTS`, or "clustersN" with any whole number N of tiles per axis.
+        name: One of `LAYOUTS`, or "clustersN", "turnedN", "tumbledN", "cutN" or "grownN" with any whole number N of tiles per axis.
         fill: Points / sites of the full domain, in (0, 1]. The fill that was reached is in the result.
         spacing: Distance of neighboring lattice sites [m]; the domain stays 0.005 m × 0.01 m × 0.005 m.
         cutoff_ratio: Cutoff in units of the spacing.
         dim: 3, or 2 for the x-y plane alone.
         dtype: float32 or float64.
-        seed: Seed of the layouts that draw (random, jitter, clump); the others need none.
+        seed: Seed of the layouts that draw (random, jitter, clump, tumbledN); the others need none.
         n: Number of points instead of `fill`: random, two-blobs, clump.
         separation: Gap of two-blobs in cutoffs.
         amplitude: Displacement of jitter in units of the spacing.
         density: Points per lattice site in a clump.
+        angle: Of turnedN and cutN [degrees].
+        growth: Of the domain of grownN: how many times larger it is. The fill counts that.
 
     Returns:
-        The scene. Its lengths are those of the domain, or of the box around two-blobs, which outgrow it.
+        The scene. Its lengths are those of the domain, or of the box around two-blobs and grownN, which outgrow it.
 
     Raises:
         TypeError: An argument has the wrong type.
@@ -81,6 +89,7 @@ def scene(
     rounded = float_dtype("dtype", dtype)
     whole("seed", seed, 0)
     options = {"fill": fill, "n": n, "separation": separation, "amplitude": amplitude, "density": density}
+    options |= {"angle": angle, "growth": growth}
     exact = layout(domain, **_accepted(name, layout, {k: v for k, v in options.items() if v is not None}, seed))
     around = tuple((exact.max(axis=0) + domain.spacing).tolist())
     return Scene(
@@ -88,19 +97,20 @@ def scene(
         positions=exact.astype(rounded),
         cutoff=domain.cutoff,
         spacing=domain.spacing,
-        lengths=around if layout is two_blobs else domain.lengths,
-        fill=len(exact) / domain.size,
+        lengths=around if layout is two_blobs or growth is not None else domain.lengths,
+        fill=len(exact) / domain.size / (growth or 1.0),
         exact=exact,
     )
 
 
 def _layout(name: str) -> Layout:
     """Find the layout of a name, or raise with the names that exist."""
-    tiles = re.fullmatch(r"clusters([1-9][0-9]{0,8})", str(name))
-    if tiles:
-        return partial(clusters, tiles=int(tiles[1]))
+    numbered = re.fullmatch(rf"({'|'.join(FAMILIES)})([1-9][0-9]{{0,8}})", str(name))
+    if numbered:
+        return partial(FAMILIES[numbered[1]], tiles=int(numbered[2]))
     if name not in _BY_NAME:
-        raise ValueError(f"name must be a known layout, got {name!r}: take one of {', '.join(LAYOUTS)}, or clustersN.")
+        numbered_names = ", ".join(f"{family}N" for family in FAMILIES)
+        raise ValueError(f"name must be a known layout, got {name!r}: take one of {', '.join(LAYOUTS)}, or {numbered_names}.")
     return _BY_NAME[name]
 
 

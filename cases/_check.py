@@ -10,6 +10,14 @@ from numpy.typing import DTypeLike
 INDEX_LIMIT = 2**31 - 1  # points are counted by int32 indices
 
 
+def real(name: str, value: object) -> float:
+    """Return `value` as a float, or raise when it is not a finite number."""
+    number = _real(name, value)
+    if not math.isfinite(number):
+        raise ValueError(f"{name} must be finite, got {value!r}: pass a number.")
+    return number
+
+
 def positive(name: str, value: object) -> float:
     """Return `value` as a float, or raise when it is not a finite number above zero."""
     number = _real(name, value)

@@ -33,19 +33,46 @@ def run(
     config: Annotated[Path, typer.Argument(help="Sweep config, TOML.")],
     out: Annotated[Path | None, typer.Option(help="Folder of the rows; out/NAME without it.")] = None,
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Measure missing, failed and timed-out rows again.")] = False,
+    processes: Annotated[int | None, typer.Option(min=1, help="Of each row, instead of the config's.")] = None,
+    shard: Annotated[str, typer.Option(help="K/N: every N-th scene from the K-th on, in OUT/shard-K-of-N.")] = "1/1",
 ) -> None:
     """Run a sweep, or go on with it: rows that are there already are not measured again."""
     with _usage_errors():
         from experiments import _config, _sweep
 
+        part, parts = _read_shard(shard)
         folder = out or Path("out") / config.stem
+        folder = folder if parts == 1 else folder / f"shard-{part}-of-{parts}"
+        given = _config.load(config)
+        given = given if processes is None else given.model_copy(update={"processes": processes})
         try:
-            rows = _sweep.run(_config.load(config), config.stem, folder, retry_failed)
+            rows = _sweep.run(given, config.stem, folder, retry_failed, (part, parts))
         except KeyboardInterrupt:
             typer.echo("stopped; the same command goes on from here", err=True)
             raise typer.Exit(130) from None
         good = sum(row.status == "ok" for row in rows)
         typer.echo(f"{good} of {len(rows)} rows ok, {len(rows) - good} with a reason; rows in {folder / 'rows.jsonl'}")
+
+
+def _read_shard(text: str) -> tuple[int, int]:
+    """Return (k, n) of "k/n"."""
+    part, _, parts = text.partition("/")
+    if not (part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
+        raise UsageError(f"--shard {text}: expected K/N with 1 <= K <= N, such as 2/8")
+    return int(part), int(parts)
+
+
+@app.command()
+def merge(
+    out: Annotated[Path, typer.Argument(help="Folder that takes the rows.")],
+    parts: Annotated[list[Path] | None, typer.Argument(help="Folders with rows; all OUT/shard-* without.")] = None,
+) -> None:
+    """Put the rows of shards, or of other machines, into one folder; a row that is there already is not added."""
+    with _usage_errors():
+        from experiments import _sweep
+
+        came = _sweep.merge(out, parts or sorted(out.glob("shard-*")))
+        typer.echo(f"{came} rows came; all are in {out / 'rows.jsonl'}")
 
 
 @app.command()

@@ -1,17 +1,19 @@
 """Sweep configs: what a TOML file may say, and messages that name the file, the key, what came and what is allowed."""
 
 import hashlib
+import itertools
 import json
+import random
 import tomllib
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, ValidationInfo, field_validator
 from pydantic_core import ErrorDetails
 
-from experiments import _layouts, methods
+from experiments import _layouts, _rows, methods
 from experiments._errors import UsageError
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
@@ -25,10 +27,29 @@ class Table(BaseModel):
 
 
 class Scenes(Table):
-    """Every layout at every fill; without fills, each layout at its own."""
+    """Every layout at every fill and whatever else is given several times; without fills, each layout at its own.
+
+    Attributes:
+        layouts: Names of layouts.
+        fills: Shares of the full domain.
+        spacings: Instead of the config's.
+        cutoff_ratios: Instead of the config's.
+        seeds: Instead of the config's.
+        angles: Of turnedN and cutN [degrees].
+        growths: Of grownN: how many times larger the domain becomes.
+        orders: Of the particles: as the layout has them, shuffled, or sorted by cells of a cutoff.
+        motions: How far every particle goes between two searches, for methods that follow motion [spacings].
+    """
 
     layouts: tuple[str, ...] = Field(min_length=1)
     fills: tuple[Fill, ...] = ()
+    spacings: tuple[Positive, ...] = ()
+    cutoff_ratios: tuple[Positive, ...] = ()
+    seeds: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    angles: tuple[FiniteFloat, ...] = ()
+    growths: tuple[Annotated[FiniteFloat, Field(ge=1)], ...] = ()
+    orders: tuple[Literal["layout", "shuffled", "sorted"], ...] = ()
+    motions: tuple[Annotated[FiniteFloat, Field(ge=0)], ...] = ()
 
     @field_validator("layouts")
     @classmethod
@@ -38,21 +59,31 @@ class Scenes(Table):
                 raise ValueError(f"unknown layout {layout!r}; allowed: {', '.join(_layouts.names())}")
         return layouts
 
+    def scenes(self) -> Iterator[dict[str, Any]]:
+        """Yield what each scene says, as fields of a `Spec`; what is not given is left out."""
+        axes = {"layout": self.layouts, "fill": self.fills or (None,)}
+        more = ("spacings", "cutoff_ratios", "seeds", "angles", "growths", "orders", "motions")
+        axes |= {name.removesuffix("s"): getattr(self, name) for name in more if getattr(self, name)}
+        for values in itertools.product(*axes.values()):
+            yield dict(zip(axes, values, strict=True))
+
 
 class Config(Table):
     """A sweep: scenes × methods, and how each row is measured.
 
     Attributes:
         methods: Names of adapters, one file each in experiments/methods.
-        scenes: Tables of layouts × fills.
+        scenes: Tables of layouts × fills × what else is given several times.
+        processes: Every row is measured in so many processes, each of them in a round of its own over all scenes.
         spacing: Distance of lattice neighbors [m].
         cutoff_ratio: Cutoff in spacings.
         dtype: Precision of the positions.
         dim: 2 or 3.
         seed: Seed of random layouts.
-        repeats: Fewest timed runs of a row.
+        repeats: Fewest timed runs in a process.
         min_seconds: Runs go on until they took this long together [s].
-        max_repeats: Most timed runs of a row.
+        max_repeats: Most timed runs in a process; 1: the first run is the only one.
+        most_seconds: No run begins when they took this long together, be they as few as they may [s].
         timeout: A row's process is ended after this time [s].
     """
 
@@ -63,9 +94,11 @@ class Config(Table):
     dtype: Literal["float32", "float64"] = "float32"
     dim: Literal[2, 3] = 3
     seed: Annotated[int, Field(ge=0)] = 0
+    processes: Annotated[int, Field(ge=1)] = 1
     repeats: Annotated[int, Field(ge=1)] = 5
     min_seconds: Annotated[FiniteFloat, Field(ge=0)] = 0.5
     max_repeats: Annotated[int, Field(ge=1)] = 50
+    most_seconds: Positive = 60.0
     timeout: Positive = 300.0
 
     @field_validator("methods")
@@ -89,17 +122,18 @@ class Config(Table):
         return digest(self.model_dump())
 
     def specs(self) -> Iterator["Spec"]:
-        """Yield the rows of the sweep, the methods of one scene side by side, each row once."""
-        shared = self.model_dump(exclude={"methods", "scenes"})
-        seen = set()
-        for table in self.scenes:
-            pairs = ((layout, fill) for layout in table.layouts for fill in table.fills or (None,))
-            for layout, fill in pairs:
-                for method in self.methods:
-                    spec = Spec(layout=layout, fill=fill, method=method, **shared)
-                    if spec.key not in seen:
-                        seen.add(spec.key)
-                        yield spec
+        """Yield the rows of the sweep, each once, in rounds: drift of the machine meets all scenes and methods alike.
+
+        The first round goes as the config does, the others each in a random order, the methods of a scene side by side.
+        """
+        shared = self.model_dump(exclude={"methods", "scenes", "processes"})
+        scenes = list(dict.fromkeys(tuple(scene.items()) for table in self.scenes for scene in table.scenes()))
+        for process in range(self.processes):
+            order = random.Random(process)
+            for scene in scenes if process == 0 else order.sample(scenes, len(scenes)):
+                methods = self.methods if process == 0 else order.sample(self.methods, len(self.methods))
+                for method in dict.fromkeys(methods):
+                    yield Spec(**shared | dict(scene) | {"method": method, "process": process})
 
 
 @dataclass(frozen=True)
@@ -117,17 +151,23 @@ class Spec:
     repeats: int
     min_seconds: float
     max_repeats: int
+    most_seconds: float
     timeout: float
+    process: int = 0
+    angle: float | None = None
+    growth: float | None = None
+    order: str = "layout"
+    motion: float = 0.0
 
     @property
     def scene_name(self) -> str:
         """Layout and fill in words, such as `corners 11 %`."""
-        return self.layout if self.fill is None else f"{self.layout} {100 * self.fill:g} %"
+        return _rows.name_scene(self.layout, self.fill)
 
     @property
     def scene_key(self) -> tuple:
         """What decides the positions and the cutoff."""
-        return (self.layout, self.fill, self.spacing, self.cutoff_ratio, self.dtype, self.dim, self.seed)
+        return (self.layout, self.fill, *(getattr(self, name) for name in _rows.SCENE_FIELDS))
 
     @property
     def key(self) -> str:

@@ -2,6 +2,7 @@
 
 import ctypes
 import gc
+import math
 import resource
 import sys
 from collections.abc import Callable
@@ -56,6 +57,30 @@ def forget_freed_memory() -> None:
         mallopt(trim_threshold, 0)
 
 
+class DeviceMemory:
+    """Peak memory of the accelerator since the moment of creation, of what JAX and Warp take; not their programs."""
+
+    def __init__(self) -> None:
+        """Note what is held now."""
+        self._start = self._read("bytes_in_use", "get_mempool_used_mem_current")
+
+    def peak(self) -> int | None:
+        """Return the peak over the start [bytes], None where JAX runs on a CPU or has not been imported.
+
+        A peak is never forgotten: ask in a process that did nothing else.
+        """
+        peak = self._read("peak_bytes_in_use", "get_mempool_used_mem_high")
+        return None if peak is None else peak - (self._start or 0)
+
+    @staticmethod
+    def _read(of_jax: str, of_warp: str) -> int | None:
+        jax, warp = (sys.modules.get(name) for name in ("jax", "warp"))
+        if jax is None or jax.default_backend() != "gpu":
+            return None
+        own = getattr(warp, of_warp)("cuda:0") if warp is not None and warp.is_cuda_available() else 0
+        return int((jax.devices()[0].memory_stats() or {}).get(of_jax, 0)) + int(own)
+
+
 class Bystanders:
     """What other processes of the machine do since the moment of creation: a search on all cores is slower beside them."""
 
@@ -77,7 +102,9 @@ class Bystanders:
         return perf_counter(), sum(getattr(times, kind, 0.0) for kind in kinds), process_time()
 
 
-def repeat(search: Callable[[], Any], repeats: int, min_seconds: float, max_repeats: int) -> tuple[Any, list[float]]:
+def repeat(
+    search: Callable[[], Any], repeats: int, min_seconds: float, max_repeats: int, most_seconds: float = math.inf
+) -> tuple[Any, list[float]]:
     """Run a search again and again; return its last result and the time of each run [s].
 
     Args:
@@ -85,13 +112,15 @@ def repeat(search: Callable[[], Any], repeats: int, min_seconds: float, max_repe
         repeats: Fewest runs.
         min_seconds: Runs go on until they took this long together [s] ...
         max_repeats: ... or until there are so many.
+        most_seconds: No run begins when they took this long together, be they as few as they may.
     """
     seconds: list[float] = []
     while True:
         begin = perf_counter()
         result = search()
         seconds.append(perf_counter() - begin)
-        if len(seconds) >= repeats and (sum(seconds) >= min_seconds or len(seconds) >= max_repeats):
+        enough = len(seconds) >= repeats and (sum(seconds) >= min_seconds or len(seconds) >= max_repeats)
+        if enough or sum(seconds) >= most_seconds:
             return result, seconds
         del result
 

@@ -84,6 +84,21 @@ def count_neighbors(keys: np.ndarray, size: int) -> np.ndarray:
     return np.bincount(i, minlength=size) + np.bincount(j, minlength=size)
 
 
+def count_sample(positions: np.ndarray, cutoff: float, rows: np.ndarray) -> np.ndarray:
+    """Return the exact number of neighbors of some particles, shape [rows]: where all pairs would not fit into memory."""
+    cutoff, points = round_cutoff(cutoff, positions.dtype), positions.astype(np.float64)
+    near = KDTree(points).query_ball_point(points[rows], cutoff * (1 + CANDIDATE_MARGIN))
+    place = np.repeat(np.arange(len(rows)), [len(row) for row in near])
+    i, j = rows[place], np.concatenate([*near]).astype(np.int64)
+    low, high = np.minimum(i, j), np.maximum(i, j)
+    local, inverse = np.unique(np.concatenate((low, high)), return_inverse=True)  # keys of few points stay small
+    inside = np.zeros(len(i), bool)
+    apart = low != high
+    pairs = np.stack(np.split(inverse, 2), axis=1)[apart]
+    inside[apart] = np.isin(pairs @ [len(local), 1], _decide(points[local], pairs, cutoff))
+    return np.bincount(place, inside, len(rows)).astype(np.int64)
+
+
 def load_pairs(positions: np.ndarray, cutoff: float, folder: Path) -> np.ndarray:
     """Return `find_pairs`, computed at most once per folder: the file is named by a digest of positions, cutoff and dtype."""
     cutoff = round_cutoff(cutoff, positions.dtype)

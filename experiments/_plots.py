@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from statistics import geometric_mean
 
@@ -20,7 +20,11 @@ COLORS = {
     **{"warp": "#CC79A7", "hashgrid": "#E69F00", "jax": "#0072B2", "cll": "#D55E00"},
     **{"scipy-kdtree": "#009E73", "scipy-kdtree-nolist": "#56B4E9", "brute": "#999999"},
 }
-OTHER_COLORS = ("#000000", "#F0E442", "#7F3C8D", "#6B4423")
+OTHER_COLORS = (
+    *("#000000", "#F0E442", "#7F3C8D", "#6B4423", "#1F77B4", "#8C564B", "#17BECF", "#BCBD22", "#2CA02C", "#AF4B91"),
+    *("#98DF8A", "#FF9896", "#9467BD", "#C49C94", "#393B79", "#637939"),
+)
+OTHER_MARKERS = ("P", "p", "h", "<", ">", "d", "8")
 MARKERS = {
     **{"warp": "*", "hashgrid": "X", "jax": "o", "cll": "s"},
     **{"scipy-kdtree": "^", "scipy-kdtree-nolist": "v", "brute": "D"},
@@ -29,11 +33,11 @@ PLAIN = FuncFormatter(lambda number, _: _table.count(int(number)) if number >= 1
 Value = Callable[[Row], float | None]
 ThesisValue = Callable[[_thesis.Figures], float]
 
-SECONDS = "time of a search [s], median; bars: 10 % to 90 %"
+SECONDS = "time of a search [s], median; bars: its interval"
 MEGABYTES = "peak memory of a search over its start [MB]"
 
 
-def draw_all(rows: list[Row], folder: Path, origin: str) -> list[Path]:
+def draw_all(rows: Sequence[Row], folder: Path, origin: str) -> list[Path]:
     """Draw every picture into the folder and return their paths; none where no row has figures.
 
     Args:
@@ -62,8 +66,17 @@ def draw_all(rows: list[Row], folder: Path, origin: str) -> list[Path]:
         "memory_by_layout": _by_layout(good, memory, thesis_memory, MEGABYTES),
         "runtime_by_fill": _by_fill(good, seconds, thesis_seconds, SECONDS.split(";")[0]),
         "memory_by_fill": _by_fill(good, memory, thesis_memory, MEGABYTES),
-        "speed_against_error": _speed_against_error(good),
+        "speed_against_error": _against_error(good, seconds, SECONDS.split(";")[0], "Speed"),
+        "memory_against_error": _against_error(good, memory, MEGABYTES, "Memory"),
     }
+    if any(row.density_error is not None for row in good):
+        pictures["speed_against_sum_error"] = _against_sum_error(good)
+    if any(row.device_bytes for row in good):
+
+        def device(row: Row) -> float | None:
+            return _table.megabytes(row.device_bytes)
+
+        pictures["device_memory_by_layout"] = _by_layout(good, device, None, "peak memory on the device [MB]")
     paths = []
     for name, figure in pictures.items():
         figure.text(0.01, 0.008, origin, fontsize=7, color="0.45", wrap=True)
@@ -80,11 +93,11 @@ def _methods(rows: Iterable[Row]) -> list[str]:
 
 def _color(method: str, methods: list[str]) -> str:
     others = [name for name in methods if name not in COLORS]
-    return COLORS.get(method) or OTHER_COLORS[others.index(method) % len(OTHER_COLORS)]
+    return COLORS.get(method) or OTHER_COLORS[others.index(method) % len(OTHER_COLORS) if method in others else 0]
 
 
 def _marker(method: str) -> str:
-    return MARKERS.get(method, "P")
+    return MARKERS.get(method) or OTHER_MARKERS[sum(method.encode()) % len(OTHER_MARKERS)]
 
 
 def _title(label: str) -> str:
@@ -115,7 +128,7 @@ def _legend(axes: Axes, methods: list[str], thesis: Iterable[tuple[str, str]], *
     solid, dashed = ("-", "--") if lines else ("none", "none")
     handles = [Line2D([], [], color=_color(name, methods), marker=_marker(name), linestyle=solid, label=name) for name in methods]
     for ours, theirs in thesis:
-        handle = Line2D([], [], color=COLORS[ours], marker=_marker(ours), linestyle=dashed, label=f"thesis: {theirs}")
+        handle = Line2D([], [], color=_color(ours, methods), marker=_marker(ours), linestyle=dashed, label=f"thesis: {theirs}")
         handle.set_markerfacecolor("none")
         handles.append(handle)
     axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9)
@@ -125,19 +138,21 @@ def _theirs(rows: list[Row], value: ThesisValue) -> dict[tuple[str, str], list[t
     """Return the thesis's values on the scenes of these rows, by our method and its counterpart."""
     scenes = {row.scene_key: row for row in rows}
     found = defaultdict(list)
-    for ours, theirs in _thesis.COUNTERPARTS.items():
+    for ours, theirs in _thesis.counterparts(row.method for row in rows).items():
         for row in scenes.values():
             if (figures := _thesis.figures(row, theirs)) is not None:
                 found[ours, theirs].append((row, value(figures)))
     return dict(found)
 
 
-def _by_layout(rows: list[Row], value: Value, thesis_value: ThesisValue, label: str) -> Figure:
+def _by_layout(rows: list[Row], value: Value, thesis_value: ThesisValue | None, label: str) -> Figure:
     """Draw a mark per row: scenes downwards, values to the right on a log axis."""
-    names, methods, theirs = _table.name_scenes(rows), _methods(rows), _theirs(rows, thesis_value)
+    names, methods = _table.name_scenes(rows), _methods(rows)
+    theirs = {} if thesis_value is None else _theirs(rows, thesis_value)
     places = {key: number for number, key in enumerate(dict.fromkeys(row.scene_key for row in rows))}
     points = {row.scene_key: row.points or 0 for row in rows}
-    figure, axes = _figure(10.5, 1.8 + 0.52 * len(places), f"{_title(label)}, by layout")
+    height = max(1.8 + max(0.52, 0.06 * len(methods)) * len(places), 2 + 0.2 * len(methods))
+    figure, axes = _figure(10.5, height, f"{_title(label)}, by layout")
     for number in range(0, len(places), 2):
         axes.axhspan(number - 0.5, number + 0.5, color="0.97", zorder=0)
     offsets = {name: 0.62 * ((number + 0.5) / len(methods) - 0.5) for number, name in enumerate(methods)}
@@ -145,13 +160,15 @@ def _by_layout(rows: list[Row], value: Value, thesis_value: ThesisValue, label: 
         if not (middle := value(row)):
             continue
         y, color = places[row.scene_key] + offsets[row.method], _color(row.method, methods)
-        if value(row) == row.median_s and row.p10_s and row.p90_s:
-            axes.plot([row.p10_s, row.p90_s], [y, y], color=color, linewidth=1.5)
+        low, high = getattr(row, "low_s", None) or row.p10_s, getattr(row, "high_s", None) or row.p90_s
+        if value(row) == row.median_s and low and high:
+            axes.plot([low, high], [y, y], color=color, linewidth=1.5)
         axes.plot(middle, y, color=color, marker=_marker(row.method), markersize=6, linestyle="none")
     for (ours, _), values in theirs.items():
         y = [places[row.scene_key] + offsets.get(ours, 0.0) + 0.31 / len(methods) for row, _ in values]  # beside ours, not upon it
         x = [number for _, number in values]
-        axes.plot(x, y, color=COLORS[ours], marker=_marker(ours), markersize=6, markerfacecolor="none", linestyle="none")
+        style = {"color": _color(ours, methods), "marker": _marker(ours), "markerfacecolor": "none", "linestyle": "none"}
+        axes.plot(x, y, markersize=6, **style)  # pyright: ignore[reportArgumentType]
     labels = [f"{names[key]}\n{_table.count(points[key])} points" for key in places]
     axes.set_yticks(list(places.values()), labels, fontsize=9)
     axes.set(xscale="log", ylim=(len(places) - 0.5, -0.5), xlabel=label)
@@ -170,7 +187,7 @@ def _by_fill(rows: list[Row], value: Value, thesis_value: ThesisValue, label: st
         mine = [(row, number) for row in rows if row.method == method and (number := value(row))]
         _draw_over_fill(axes, mine, shifts[method], color=_color(method, methods), marker=_marker(method), linestyle="-")
     for (ours, _), values in theirs.items():
-        style = {"color": COLORS[ours], "marker": _marker(ours), "markerfacecolor": "white", "linestyle": "--"}
+        style = {"color": _color(ours, methods), "marker": _marker(ours), "markerfacecolor": "white", "linestyle": "--"}
         _draw_over_fill(axes, values, shifts.get(ours, 1.0), **style)
     ticks = [number * 10.0**power for power in range(-6, 3) for number in (1, 2, 5) if number * 10**power <= 100]
     axes.set(xscale="log", yscale="log", xlabel="fill: points / points of the full domain [%]", ylabel=label)
@@ -198,24 +215,51 @@ def _draw_over_fill(axes: Axes, values: list[tuple[Row, float]], shift: float, *
     axes.plot(x, y, markersize=6, linewidth=1.2, **style)  # pyright: ignore[reportArgumentType]
 
 
-def _speed_against_error(rows: list[Row]) -> Figure:
-    """Draw time over missing and extra pairs: exact methods stand on the left edge, fast ones low."""
+def _against_error(rows: list[Row], value: Value, label: str, title: str) -> Figure:
+    """Draw a value over missing and extra pairs: exact methods stand on the left edge, good ones low."""
     methods = _methods(rows)
-    figure, axes = _figure(10.5, 6.0, "Speed against error: a mark per scene, larger for more points")
-    for row in rows:
-        if row.errors is None or not row.median_s or not row.points:
-            continue
-        size = 15 + 9 * math.log2(max(row.points / 1000, 1))
-        color = _color(row.method, methods)
-        axes.scatter(
-            row.errors, row.median_s, s=size, color=color, marker=_marker(row.method), alpha=0.8, edgecolor="white", linewidths=0.5
-        )
+    figure, axes = _figure(
+        10.5, max(6.0, 2 + 0.2 * len(methods)), f"{title} against error: a mark per scene, larger for more points"
+    )
+    _scatter(axes, rows, lambda row: row.errors, value)
     axes.set_xscale("symlog", linthresh=1)
     most = max((row.errors or 0 for row in rows), default=0)
     axes.set(yscale="log", xlim=(-0.5, max(2.0 * most, 10)), xlabel="missing + extra pairs, against the exact answer")
-    axes.set_ylabel(SECONDS.split(";")[0])
+    axes.set_ylabel(label)
     axes.axvline(0, color="0.6", linewidth=0.8, zorder=0.5)
     axes.xaxis.set_major_formatter(PLAIN)
     label_logarithmic(axes.yaxis)
     _legend(axes, methods, [])
     return figure
+
+
+def _against_sum_error(rows: list[Row]) -> Figure:
+    """Draw time over the largest error of a sum over neighbors: what wrong pairs do, and rounding to sums without a list."""
+    methods = _methods(rows)
+    figure, axes = _figure(10.5, max(6.0, 2 + 0.2 * len(methods)), "Speed against the error of a sum over neighbors")
+
+    def error(row: Row) -> float | None:
+        known = [value for value in (row.density_error, row.jump_error) if value is not None]
+        return max(known) if known else None
+
+    _scatter(axes, rows, error, lambda row: row.median_s)
+    axes.set_xscale("symlog", linthresh=1e-8)
+    axes.set(yscale="log", xlim=(-5e-9, 1), ylabel=SECONDS.split(";")[0])
+    axes.set_xlabel(
+        "largest error of a particle, over the mean: of unit vectors, which jump at the cutoff; of pair-sum, its density"
+    )
+    axes.axvline(0, color="0.6", linewidth=0.8, zorder=0.5)
+    label_logarithmic(axes.yaxis)
+    _legend(axes, methods, [])
+    return figure
+
+
+def _scatter(axes: Axes, rows: list[Row], x: Value, y: Value) -> None:
+    """Draw a mark per row, larger for more points; rows that lack a value are left out."""
+    methods = _methods(rows)
+    for row in rows:
+        place, height = x(row), y(row)
+        if place is None or not height or not row.points:
+            continue
+        style = {"color": _color(row.method, methods), "marker": _marker(row.method), "alpha": 0.8, "linewidths": 0.5}
+        axes.scatter(place, height, s=15 + 9 * math.log2(max(row.points / 1000, 1)), edgecolor="white", **style)

@@ -14,21 +14,26 @@ from experiments import _table
 from experiments._errors import UsageError
 from experiments._rows import Row, RowFile
 
-TITLES = ("scene", "points", "method", "s", "/ cll", "MB", "/ cll", "missing", "extra", "thesis", "s", "/ CLL", "MB", "/ CLL")
+TITLES = ("scene", "points", "method", "s", "±", "/ cll", "MB", "/ cll", "missing", "extra", "thesis", "s", "/ CLL", "MB", "/ CLL")
 TEXT_COLUMNS = ("scene", "method", "thesis")
 ABSENT = "·"
 NOTEWORTHY_CORES = 0.25  # what other processes take beyond it is said: it slows down the methods that use all cores
 
 NOTES = """\
-- **s**: median time of a search, from raw positions to the finished result, without compilation.
+- **s**: median time of a search, from raw positions to the finished result, without compilation; of several processes the median of
+  their medians.
+- **±**: half the interval that holds the median with a probability of 95 % (93.75 % of five processes, which is all that five can
+  tell), in per cent of it. Of several processes it is that of their medians; of one, in brackets, that of its repeats alone.
 - **MB**: peak resident memory of the process during the searches, over what was resident after compilation; 10^6 bytes.
-- **/ cll**: divided by the row `cll` of the same scene.
+- **/ cll**: divided by the row `cll` of the same scene, process by process of the same round. `≈`: within noise: the interval of
+  that ratio holds 1 (of one process: the intervals of both overlap).
 - **missing**, **extra**: unordered pairs against the exact answer on the given floats, distance < cutoff. Of a method without pair
   list (`~`), only the surplus and the deficit of each particle can be seen.
-- **thesis**: Table 6.1 of J. Peifle, *Implementation of a Nearest-Neighbor Search for Particle Simulation in Sparse Computational
-  Domains*, KIT, February 2019: the method closest to ours, its total time, the largest resident set of its process, and both
+- **thesis**: Table 6.1 of J. Peifle, Implementation of a Nearest-Neighbor Search for Particle Simulation in Sparse Computational
+  Domains, KIT, February 2019: the method closest to ours, its total time, the largest resident set of its process, and both
   divided by its own CLL. Its machine was another, so only ratios compare.
-- `jax` and `brute` use all cores and list both directions of each pair; the others use one thread, and list each pair once.
+- `warp`, `pair-sum`, `jax`, `brute`, `freud`, `pykdtree` and what runs inside JAX may use all cores, the others one thread. Lists
+  hold each pair once or in both directions, as the method gives them.
 - `*`: other processes kept more than a quarter of a core busy meanwhile (`others_cores` in table.csv). Methods on all cores then
   look slower than they are.
 - table.csv holds all times, compilation included; rows.jsonl all that was measured.
@@ -36,7 +41,7 @@ NOTES = """\
 
 
 def report(folder: Path) -> None:
-    """Print the table of a sweep and the paths of its pictures; write report.md, table.csv and the pictures into the folder.
+    """Print the table of a sweep and the paths of its files: report.md, report.html, table.csv and the pictures, beside the rows.
 
     Raises:
         UsageError: The folder holds no rows.
@@ -44,19 +49,24 @@ def report(folder: Path) -> None:
     rows = RowFile(folder).read()
     if not rows:
         raise UsageError(f"{folder}: no rows; fill it with `python -m experiments run CONFIG.toml --out {folder}`")
-    from experiments import _plots
+    from experiments import _page, _plots, _statistics
 
     lines = _table.lines(rows)
-    pictures = _plots.draw_all(rows, folder, describe_origin(rows))
+    pictures = _plots.draw_all(_statistics.summarize(rows), folder, describe_origin(rows))
     write_csv(lines, folder / "table.csv")
     (folder / "report.md").write_text(markdown(rows, lines, pictures), encoding="utf-8")
+    _page.write(folder / "report.html", _title(rows), describe_origin(rows), lines, NOTES, pictures)
     console = Console(highlight=False)
     if not console.is_terminal:
         console.width = 200
     console.print(rich_table(lines))
     console.print(describe_origin(rows), soft_wrap=True)
-    for path in (folder / "report.md", folder / "table.csv", *pictures):
+    for path in (folder / "report.md", folder / "report.html", folder / "table.csv", *pictures):
         console.print(str(path), soft_wrap=True)
+
+
+def _title(rows: list[Row]) -> str:
+    return ", ".join(_distinct(row.config or "" for row in rows)) or "rows"
 
 
 def describe_origin(rows: Iterable[Row]) -> str:
@@ -89,7 +99,8 @@ def cells(line: dict[str, Any]) -> list[str]:
         *(line["scene"], _count(line["points"]), line["method"]),
         *(
             _busy(line) + _seconds(line["median_s"]),
-            _ratio(line["seconds_to_cll"]),
+            _spread(line),
+            ("≈" if line["within_noise"] else "") + _ratio(line["seconds_to_cll"]),
             _megabytes(line["search_mb"]),
             _ratio(line["mb_to_cll"]),
         ),
@@ -113,6 +124,14 @@ def _busy(line: dict[str, Any]) -> str:
 
 def _seconds(value: float | None, digits: int = 4) -> str:
     return ABSENT if value is None else f"{value:.{digits}f}"
+
+
+def _spread(line: dict[str, Any]) -> str:
+    """Return half the interval of the median in per cent, in brackets where it is that of one process."""
+    if line["low_s"] is None or not line["median_s"]:
+        return ABSENT
+    text = f"{50 * (line['high_s'] - line['low_s']) / line['median_s']:.1f} %"
+    return text if line["processes"] > 1 else f"({text})"
 
 
 def _megabytes(value: float | None) -> str:
@@ -146,7 +165,7 @@ def rich_table(lines: list[dict[str, Any]]) -> Table:
 
 def _error_marks(line: dict[str, Any]) -> list[bool]:
     """Return for each entry of `TITLES` but the first whether it tells of wrong pairs."""
-    marks = {6: bool(line["missing"]), 7: bool(line["extra"])}
+    marks = {7: bool(line["missing"]), 8: bool(line["extra"])}
     return [marks.get(number, False) for number in range(len(TITLES) - 1)]
 
 
@@ -167,5 +186,4 @@ def markdown(rows: list[Row], lines: list[dict[str, Any]], pictures: list[Path])
     unfinished = [f"- {line['scene']}, {line['method']}: {line['status']}: {line['reason']}" for line in failed]
     reasons = ["## Rows without figures", "", *unfinished, ""] if unfinished else []
     images = [f"![{path.stem.replace('_', ' ')}]({path.name})" for path in pictures]
-    title = ", ".join(_distinct(row.config or "" for row in rows)) or "rows"
-    return "\n".join([f"# Sweep {title}", "", describe_origin(rows), "", *table, "", NOTES, *reasons, *images, ""])
+    return "\n".join([f"# Sweep {_title(rows)}", "", describe_origin(rows), "", *table, "", NOTES, *reasons, *images, ""])

@@ -13,14 +13,16 @@ from experiments._errors import UsageError
 
 STATUSES = ("ok", "missing", "failed", "timeout", "skipped")
 RETRIED = ("missing", "failed", "timeout")
+SCENE_FIELDS = ("spacing", "cutoff_ratio", "dtype", "dim", "seed", "angle", "growth", "order", "motion")
+"""What decides, beside layout and fill, where particles are and what a pair is."""
 
 
 @dataclass
 class Row:
-    """One method on one scene, measured in a process of its own. What was not reached is None.
+    """One method on one scene, measured in one process of its own. What was not reached is None.
 
     Attributes:
-        key: Digest of scene, method and way of measuring; rows with the same key replace each other.
+        key: Digest of scene, method, process and way of measuring; rows with the same key replace each other.
         layout: Name of the layout.
         method: Name of the adapter.
         fill_asked: Fill that the config asked for, as a share of the full domain.
@@ -29,6 +31,11 @@ class Row:
         dtype: Precision of the positions.
         dim: Dimensions.
         seed: Seed of random layouts.
+        process: Which of the processes that measured the same, from 0.
+        angle: Of turnedN and cutN [degrees].
+        growth: Of grownN: how many times larger the domain became.
+        order: Of the particles: layout, shuffled, or sorted.
+        motion: How far particles went between two searches [spacings].
         status: One of `STATUSES`.
         reason: Why the status is not ok.
         fill: Fill that the scene has.
@@ -40,6 +47,8 @@ class Row:
         median_s: Median of the repeats, from raw positions to the result [s].
         p10_s: 10th percentile of the repeats [s].
         p90_s: 90th percentile of the repeats [s].
+        parts: Median seconds of the parts of a search, by name, where a method tells them apart.
+        rebuilt: Share of the searches that made a list anew, of methods that keep one while particles move.
         repeats: Number of timed runs after the first.
         seconds: All their times [s].
         others_cores: Cores that other processes of the machine kept busy meanwhile, on average; None below 0.2 s.
@@ -48,6 +57,9 @@ class Row:
             unknown where the peak cannot be reset.
         list_bytes: Size of the result.
         scratch_bytes: search_bytes - list_bytes.
+        device_bytes: Peak of the accelerator's memory over what it held before, as JAX and Warp count it; None on a CPU.
+        planned_list_bytes: The list as `jfrnn.memory_plan` says beforehand; the library's own methods, process 0.
+        planned_scratch_bytes: What is needed besides, as it says.
         memory_source: VmHWM, reset at both starts; or ru_maxrss, which cannot be: earlier peaks hide later ones.
         pairs: Unordered pairs that the method found.
         directed_pairs: Entries (i, j) of a full list.
@@ -55,6 +67,10 @@ class Row:
         missing: Unordered pairs that the oracle has and the method has not.
         extra: Unordered pairs that the method has and the oracle has not, repeated ones included.
         compared: `pairs`, or `counts` where a method gives only neighbors per particle.
+        density_error: Largest error of a poly6 density over the neighbors that were found, over the mean density.
+        gradient_error: The same of the length of its gradient, over the mean density per cutoff.
+        jump_error: The same of a sum of unit vectors, the gradient of 1 - r / cutoff, over the mean number of neighbors: it does
+            not vanish at the cutoff, where methods differ.
         device: Where it ran.
         versions: Python and the packages.
         machine: Processor, cores, memory [bytes], operating system.
@@ -74,6 +90,11 @@ class Row:
     dtype: str
     dim: int
     seed: int
+    process: int = 0
+    angle: float | None = None
+    growth: float | None = None
+    order: str = "layout"
+    motion: float = 0.0
     status: str = "failed"
     reason: str | None = None
     fill: float | None = None
@@ -85,6 +106,8 @@ class Row:
     median_s: float | None = None
     p10_s: float | None = None
     p90_s: float | None = None
+    parts: dict[str, float] = field(default_factory=dict)
+    rebuilt: float | None = None
     repeats: int | None = None
     seconds: list[float] = field(default_factory=list)
     others_cores: float | None = None
@@ -92,6 +115,9 @@ class Row:
     search_bytes: int | None = None
     list_bytes: int | None = None
     scratch_bytes: int | None = None
+    device_bytes: int | None = None
+    planned_list_bytes: int | None = None
+    planned_scratch_bytes: int | None = None
     memory_source: str | None = None
     pairs: int | None = None
     directed_pairs: int | None = None
@@ -99,6 +125,9 @@ class Row:
     missing: int | None = None
     extra: int | None = None
     compared: str | None = None
+    density_error: float | None = None
+    gradient_error: float | None = None
+    jump_error: float | None = None
     device: str | None = None
     versions: dict[str, str | None] = field(default_factory=dict)
     machine: dict[str, Any] = field(default_factory=dict)
@@ -116,7 +145,7 @@ class Row:
     @property
     def scene_key(self) -> tuple[Any, ...]:
         """What decides the positions and the cutoff."""
-        return (self.layout, self.fill_asked, self.spacing, self.cutoff_ratio, self.dtype, self.dim, self.seed)
+        return (self.layout, self.fill_asked, *(getattr(self, name) for name in SCENE_FIELDS))
 
     @property
     def errors(self) -> int | None:

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
@@ -18,13 +18,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from experiments import _machine
 from experiments._config import Config, Spec
-from experiments._rows import RETRIED, Row, RowFile
+from experiments._errors import UsageError
+from experiments._rows import RETRIED, SCENE_FIELDS, Row, RowFile
 
 ROOT = Path(__file__).resolve().parent.parent
 REASON_LENGTH = 600
 
 
-def run(config: Config, name: str, folder: Path, retry_failed: bool = False) -> list[Row]:
+def run(config: Config, name: str, folder: Path, retry_failed: bool = False, shard: tuple[int, int] = (1, 1)) -> list[Row]:
     """Measure every row of the config that the folder does not hold yet, and return all rows of the config.
 
     Args:
@@ -32,17 +33,26 @@ def run(config: Config, name: str, folder: Path, retry_failed: bool = False) -> 
         name: Name of the config, kept in the rows.
         folder: Holds rows.jsonl and the exact pairs.
         retry_failed: Whether rows that are missing, failed or ran out of time are measured again.
+        shard: (k, n): only every n-th scene from the k-th on, with all its methods and processes, which are to be compared.
     """
     file = RowFile(folder)
     with file.locked():
         file.repair()
-        return _run(config, name, file, retry_failed)
+        return _run(config, name, file, retry_failed, shard)
 
 
-def _run(config: Config, name: str, file: RowFile, retry_failed: bool) -> list[Row]:
+def shard_specs(specs: Iterable[Spec], shard: tuple[int, int]) -> list[Spec]:
+    """Return the rows of every n-th scene from the k-th on; shards of all k are the whole, and none has a row of another."""
+    part, parts = shard
+    specs = list(specs)
+    scenes = {key: number for number, key in enumerate(dict.fromkeys(spec.scene_key for spec in specs))}
+    return [spec for spec in specs if scenes[spec.scene_key] % parts == part - 1]
+
+
+def _run(config: Config, name: str, file: RowFile, retry_failed: bool, shard: tuple[int, int]) -> list[Row]:
     """Do the work of `run` with the file of rows at hand."""
     folder = file.path.parent
-    specs = list(config.specs())
+    specs, prepared, absent = shard_specs(config.specs(), shard), set(), {}
     done = {row.key for row in file.read() if not (retry_failed and row.status in RETRIED)}
     pending = [spec for spec in specs if spec.key not in done]
     about = {"machine": _machine.machine(), **_machine.commit(), "config": name, "config_hash": config.hash}
@@ -50,12 +60,15 @@ def _run(config: Config, name: str, file: RowFile, retry_failed: bool) -> list[R
         bar = shown.add_task("", total=len(specs), completed=len(specs) - len(pending))
         if len(pending) < len(specs):
             shown.console.print(f"{len(specs) - len(pending)} of {len(specs)} rows are there already")
-        for spec, opens_scene in _mark_scenes(pending):
-            if opens_scene:
+        for spec in pending:
+            if spec.scene_key not in prepared:
+                prepared.add(spec.scene_key)
                 shown.update(bar, description=f"{spec.scene_name} · exact pairs")
                 _prepare_oracle(spec, folder, shown.console)
             shown.update(bar, description=f"{spec.scene_name} · {spec.method}")
-            row = replace(measure(spec, folder), **about)
+            row = replace(measure(spec, folder, absent.get(spec.method)), **about)
+            if row.status == "missing":
+                absent[spec.method] = {"status": row.status, "reason": row.reason}  # it will not appear while this runs
             file.append(row)
             shown.console.print(describe(row), highlight=False, markup=False, soft_wrap=True)
             shown.advance(bar)
@@ -67,16 +80,8 @@ def _run(config: Config, name: str, file: RowFile, retry_failed: bool) -> list[R
 def progress(total: int) -> Iterator[Progress]:
     """Show a bar on stderr."""
     columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True), disable=total == 0) as shown:
+    with Progress(*columns, console=Console(stderr=True, force_jupyter=False), disable=total == 0) as shown:
         yield shown
-
-
-def _mark_scenes(specs: list[Spec]) -> Iterator[tuple[Spec, bool]]:
-    """Yield each row with whether its scene differs from that of the row before."""
-    previous = None
-    for spec in specs:
-        yield spec, spec.scene_key != previous
-        previous = spec.scene_key
 
 
 def _prepare_oracle(spec: Spec, folder: Path, console: Console) -> None:
@@ -86,11 +91,20 @@ def _prepare_oracle(spec: Spec, folder: Path, console: Console) -> None:
         console.print(f"{spec.scene_name}: no exact pairs: {answer['reason']}", highlight=False, markup=False)
 
 
-def measure(spec: Spec, folder: Path) -> Row:
-    """Measure one row in a fresh process; never raises for what happens there."""
-    answer = ask(_task("measure", spec, folder), spec.timeout)
-    asked = {"layout": spec.layout, "method": spec.method, "fill_asked": spec.fill, "spacing": spec.spacing}
-    asked |= {"cutoff_ratio": spec.cutoff_ratio, "dtype": spec.dtype, "dim": spec.dim, "seed": spec.seed}
+def measure(spec: Spec, folder: Path, known: dict[str, Any] | None = None) -> Row:
+    """Measure one row in a fresh process; never raises for what happens there.
+
+    The first process of a row compiles its kernels, which is timed; the others take them from the folder.
+
+    Args:
+        spec: The row.
+        folder: Holds the exact pairs, and kernels.
+        known: What the process would answer, where that is known without it.
+    """
+    kernels = None if spec.process == 0 else folder.resolve() / "kernels"
+    answer = known or ask(_task("measure", spec, folder), spec.timeout, kernels=kernels)
+    asked = {"layout": spec.layout, "method": spec.method, "fill_asked": spec.fill, "process": spec.process}
+    asked |= {name: getattr(spec, name) for name in SCENE_FIELDS}
     return Row(key=spec.key, **asked, **answer, time=datetime.now(UTC).isoformat(timespec="seconds"))
 
 
@@ -98,16 +112,18 @@ def _task(do: str, spec: Spec, folder: Path) -> dict[str, Any]:
     return {"do": do, "spec": asdict(spec), "oracle": str(folder.resolve() / "oracle")}
 
 
-def ask(task: dict[str, Any], timeout: float, *, cold: bool = True) -> dict[str, Any]:
+def ask(task: dict[str, Any], timeout: float, *, cold: bool = True, kernels: Path | None = None) -> dict[str, Any]:
     """Let a worker do a task and return its answer, or a status with the reason why there is none.
 
     Args:
         task: See `experiments._worker`.
         timeout: The worker is ended after this time [s].
         cold: Kernels are compiled anew: a compile time from a warm cache would mean nothing.
+        kernels: Take kernels from this folder, and leave them there, instead.
     """
     with tempfile.TemporaryDirectory() as cache:
-        environment = os.environ | ({"WARP_CACHE_PATH": cache, "JAX_ENABLE_COMPILATION_CACHE": "false"} if cold else {})
+        where = {"WARP_CACHE_PATH": str(kernels or cache), "JAX_ENABLE_COMPILATION_CACHE": "false"}
+        environment = os.environ | (where if cold else {})
         command = [sys.executable, "-m", "experiments._worker"]
         try:
             done = subprocess.run(
@@ -124,6 +140,29 @@ def _explain_exit(code: int, stderr: str) -> str:
     """Say how a process ended that gave no answer."""
     how = f"ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
     return f"the process {how}: {stderr.strip()[-REASON_LENGTH:]}"
+
+
+def merge(folder: Path, parts: Iterable[Path]) -> int:
+    """Add to a folder the rows of others that it does not hold, and return how many came; of one key, a row that is ok counts.
+
+    Raises:
+        UsageError: A part has no rows, or a line of it is no row.
+    """
+    file, came = RowFile(folder), 0
+    with file.locked():
+        file.repair()
+        rows = {row.key: row for row in file.read()}
+        for part in parts:
+            theirs = RowFile(part).read()
+            if not theirs:
+                raise UsageError(f"{part}: no rows to merge; name a folder that a sweep has filled")
+            for row in theirs:
+                here = rows.get(row.key)
+                if here is None or (here.status in RETRIED and row.status not in RETRIED):
+                    rows[row.key] = row
+                    file.append(row)
+                    came += 1
+    return came
 
 
 def describe(row: Row) -> str:

@@ -1,39 +1,61 @@
 """The table of a sweep: a line per row, beside what the thesis says, with ratios to cell-linked lists on either side."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeVar
 
-from experiments import _thesis
+from experiments import _statistics, _thesis
 from experiments._rows import Row
+from experiments._statistics import Summary
+
+RowT = TypeVar("RowT", bound=Row)
 
 YARDSTICK = "cll"
+PARTS = ("t_tree", "t_ksearch", "t_frsearch", "t_processing")
 COLUMNS = (
-    *("scene", "layout", "fill_asked", "fill", "points", "spacing", "cutoff_ratio", "dim", "dtype", "method", "status", "reason"),
-    *("allocate_s", "compile_s", "first_s", "median_s", "p10_s", "p90_s", "repeats", "others_cores", "seconds_to_cll"),
-    *("search_mb", "list_mb", "scratch_mb", "peak_mb", "mb_to_cll", "pairs", "missing", "extra", "compared"),
+    *(
+        "scene",
+        "layout",
+        "fill_asked",
+        "fill",
+        "points",
+        "spacing",
+        "cutoff_ratio",
+        "dim",
+        "dtype",
+        "seed",
+        "angle",
+        "growth",
+        "order",
+    ),
+    *("motion", "method", "status", "reason", "processes", "repeats", "allocate_s", "compile_s", "first_s", "median_s", "low_s"),
+    *("high_s", "confidence", "p10_s", "p90_s", *PARTS, "rebuilt", "others_cores", "seconds_to_cll", "within_noise"),
+    *("search_mb", "list_mb", "scratch_mb", "peak_mb", "device_mb", "planned_list_mb", "planned_scratch_mb", "mb_to_cll"),
+    *("pairs", "missing", "extra", "compared", "density_error", "gradient_error", "jump_error"),
     *("thesis_method", "thesis_points", "thesis_s", "thesis_s_to_cll", "thesis_mb", "thesis_mb_to_cll"),
 )
 
 
 def lines(rows: list[Row]) -> list[dict[str, Any]]:
-    """Return a line per row, with the keys `COLUMNS`, None where there is nothing to say.
+    """Return a line per method and scene, with the keys `COLUMNS`, None where there is nothing to say.
 
     Scenes stand in order of their points; within one, the methods stand as the rows do. `seconds_to_cll` and `mb_to_cll` divide by
-    the row `cll` of the same scene; `thesis_..._to_cll` divide the thesis's figures by its own. MB are 10^6 bytes; `search_mb` is
-    what the search takes over what was resident after compilation, `peak_mb` counts compilation too.
+    the row `cll` of the same scene, seconds round by round; `thesis_..._to_cll` divide the thesis's figures by its own. MB are 10^6
+    bytes; `search_mb` is what the search takes over what was resident after compilation, `peak_mb` counts compilation too.
     """
-    names = name_scenes(rows)
-    yardsticks = {row.scene_key: row for row in rows if row.method == YARDSTICK and row.status == "ok"}
-    return [_line(row, names[row.scene_key], yardsticks.get(row.scene_key)) for row in in_order(rows)]
+    summaries = _statistics.summarize(rows)
+    names = name_scenes(summaries)
+    yardsticks = {row.scene_key: row for row in summaries if row.method == YARDSTICK and row.status == "ok"}
+    return [_line(row, names[row.scene_key], yardsticks.get(row.scene_key)) for row in in_order(summaries)]
 
 
-def in_order(rows: list[Row]) -> list[Row]:
+def in_order(rows: Sequence[RowT]) -> list[RowT]:
     """Return the rows, small scenes first and each scene's rows together."""
     points = {row.scene_key: row.points for row in rows if row.points is not None}
     first = {key: number for number, key in enumerate(dict.fromkeys(row.scene_key for row in rows))}
     return sorted(rows, key=lambda row: (points.get(row.scene_key, 0), first[row.scene_key]))
 
 
-def name_scenes(rows: list[Row]) -> dict[tuple[Any, ...], str]:
+def name_scenes(rows: Sequence[Row]) -> dict[tuple[Any, ...], str]:
     """Return a name of each scene: layout and fill, and whatever else differs within these rows."""
     differing = {
         "spacing": lambda row: f"dx {row.spacing:g} m",
@@ -41,9 +63,13 @@ def name_scenes(rows: list[Row]) -> dict[tuple[Any, ...], str]:
         "dim": lambda row: f"{row.dim}D",
         "dtype": lambda row: row.dtype,
         "seed": lambda row: f"seed {row.seed}",
+        "angle": lambda row: "" if row.angle is None else f"{row.angle:g}°",
+        "growth": lambda row: "" if row.growth is None else f"grown {row.growth:g} x",
+        "order": lambda row: row.order,
+        "motion": lambda row: f"motion {row.motion:g} dx",
     }
     shown = [text for name, text in differing.items() if len({getattr(row, name) for row in rows}) > 1]
-    return {row.scene_key: ", ".join([row.scene_name, *(text(row) for text in shown)]) for row in rows}
+    return {row.scene_key: ", ".join(filter(None, [row.scene_name, *(text(row) for text in shown)])) for row in rows}
 
 
 def megabytes(count: int | None) -> float | None:
@@ -61,11 +87,15 @@ def ratio(value: float | None, yardstick: float | None) -> float | None:
     return value / yardstick if value is not None and yardstick else None
 
 
-def _line(row: Row, scene: str, cll: Row | None) -> dict[str, Any]:
+def _line(row: Summary, scene: str, cll: Summary | None) -> dict[str, Any]:
+    paired = None if cll is None or cll is row else _statistics.ratio_interval(row, cll)
     thesis, thesis_cll = _thesis.figures(row), _thesis.figures(row, "CLL")
     line = {name: getattr(row, name) for name in COLUMNS if hasattr(row, name)}
-    line |= {"scene": scene, "seconds_to_cll": ratio(row.median_s, cll and cll.median_s)}
-    line |= {f"{name}_mb": megabytes(getattr(row, f"{name}_bytes")) for name in ("search", "list", "scratch", "peak")}
+    line |= {"scene": scene, "seconds_to_cll": paired.middle if paired else ratio(row.median_s, cll and cll.median_s), **row.parts}
+    line["processes"] = row.processes or None
+    line["within_noise"] = None if cll is None or cll is row else _statistics.within_noise(row, cll)
+    sizes = ("search", "list", "scratch", "peak", "device", "planned_list", "planned_scratch")
+    line |= {f"{name}_mb": megabytes(getattr(row, f"{name}_bytes")) for name in sizes}
     line["mb_to_cll"] = ratio(row.search_bytes, cll and cll.search_bytes)
     if thesis is not None and thesis_cll is not None:
         line |= {"thesis_method": thesis.method, "thesis_points": thesis.points}

@@ -2,25 +2,34 @@
 
 import csv
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
 from experiments._rows import Row
 
 FILE = Path(__file__).parent / "reference" / "table_6_1.csv"
-COUNTERPARTS = {"cll": "CLL", "scipy-kdtree": "ANN", "scipy-kdtree-nolist": "ANN-NL"}
+COUNTERPARTS = {
+    **{"cll": "CLL", "ann-kd-naive": "ANN", "ann-kd": "ANN", "ann-bd": "ANN", "ann-kd-nolist": "ANN-NL"},
+    **{"scipy-kdtree": "ANN", "scipy-kdtree-nolist": "ANN-NL"},
+}
+"""Methods of ours and what the thesis has that is like them, the most alike first."""
 SPACING, CUTOFF_RATIO, DIM = 1e-4, 3.0, 3
 
 
 @dataclass(frozen=True)
 class Figures:
-    """What the thesis says about one method on one scene: t_total [s] and the largest resident set of the process [MB]."""
+    """What the thesis says about one method on one scene: t_total [s] and the largest resident set of the process [MB].
+
+    `parts` holds t_ksearch, t_frsearch and t_processing [s].
+    """
 
     method: str
     points: int
     seconds: float
     megabytes: float
+    parts: dict[str, float] = field(default_factory=dict, compare=False)
 
 
 @cache
@@ -30,10 +39,23 @@ def table() -> dict[tuple[str, int, str], Figures]:
         rows = list(csv.DictReader(stream))
     return {
         (row["layout"], int(row["fill_percent"]), row["method"]): Figures(
-            row["method"], int(row["points"]), float(row["t_total_s"]), float(row["memory_mb"])
+            *(row["method"], int(row["points"]), float(row["t_total_s"]), float(row["memory_mb"])),
+            {name: float(row[f"{name}_s"]) for name in ("t_ksearch", "t_frsearch", "t_processing")},
         )
         for row in rows
     }
+
+
+def counterparts(present: Iterable[str]) -> dict[str, str]:
+    """Return for each method of the thesis the one of these methods that is most like it; where none is, one of SciPy's."""
+    present, chosen = set(present), {}
+    for ours, theirs in COUNTERPARTS.items():
+        if theirs not in chosen.values() and ours in present:
+            chosen[ours] = theirs
+    for ours, theirs in reversed(COUNTERPARTS.items()):
+        if theirs not in chosen.values():
+            chosen[ours] = theirs
+    return chosen
 
 
 def figures(row: Row, method: str | None = None) -> Figures | None:

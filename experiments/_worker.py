@@ -3,6 +3,7 @@
 import ctypes
 import json
 import os
+import resource
 import signal
 import sys
 from collections.abc import Callable
@@ -18,10 +19,14 @@ from experiments._config import Spec
 if TYPE_CHECKING:
     from jfrnn.cases import Scene  # pyright: ignore[reportMissingImports]
 
+MOST_LISTED = 2_000_000  # of more particles the exact pairs do not fit into memory: a sample of them is looked at
+MOST_MEMORY = 0.8  # of the machine; a method that wants more gets an error instead of taking the machine down
+
 
 def main() -> None:
     """Do the task of stdin. Whatever else is printed, by kernels too, goes to stderr."""
     _end_with_parent()
+    _limit_memory()
     answer_stream = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     task = json.load(sys.stdin)
@@ -45,10 +50,12 @@ def _answer(task: dict[str, Any]) -> dict[str, Any]:
 
 
 def prepare_oracle(spec: Spec, folder: Path) -> dict[str, Any]:
-    """Leave the exact pairs of the scene in the folder."""
+    """Leave the exact pairs of the scene in the folder; of a large one, nothing: a sample is decided with each row."""
     from experiments import _oracle
 
     scene = make_scene(spec)
+    if len(scene.positions) > MOST_LISTED:
+        return {"pairs": None}
     return {"pairs": len(_oracle.load_pairs(scene.positions, scene.cutoff, folder))}
 
 
@@ -74,38 +81,69 @@ def measure(spec: Spec, folder: Path) -> dict[str, Any]:
 
 def make_scene(spec: Spec) -> "Scene":
     """Return the scene of a row."""
-    options = {"spacing": spec.spacing, "cutoff_ratio": spec.cutoff_ratio, "dtype": spec.dtype, "dim": spec.dim, "seed": spec.seed}
-    return _layouts.make(spec.layout, **options, **({} if spec.fill is None else {"fill": spec.fill}))
+    options = {name: getattr(spec, name) for name in ("spacing", "cutoff_ratio", "dtype", "dim", "seed", "fill", "angle", "growth")}
+    scene = _layouts.make(spec.layout, **options)
+    return _layouts.ordered(scene, spec.order, spec.seed)
 
 
 def _measure_search(adapter: methods.Adapter, spec: Spec, scene: "Scene", folder: Path, row: dict[str, Any]) -> None:
     """Time the search, then compare what it found; fill the row as far as it comes."""
-    from experiments import _compare, _measure, _oracle
+    from experiments import _measure, _oracle
 
     positions, cutoff = scene.positions, _oracle.round_cutoff(scene.cutoff, scene.positions.dtype)
     row["cutoff"] = cutoff
+    device = _measure.DeviceMemory()
     memory = _measure.PeakMemory()
-    search = _prepare(adapter, positions, cutoff, row)
+    search, capacity = _prepare(adapter, spec, positions, cutoff, row)
     prepared_peak = memory.peak()
 
     searching = _measure.PeakMemory()
-    _, [row["first_s"]] = _measure.repeat(search, 1, 0.0, 1)
+    steps = getattr(adapter, "STEPS", 1)
+    first = None
+    if spec.max_repeats > 1:
+        _, [first] = _measure.repeat(search, 1, 0.0, 1)
     bystanders = _measure.Bystanders()
-    result, seconds = _measure.repeat(search, spec.repeats, spec.min_seconds, spec.max_repeats)
-    row["others_cores"] = bystanders.cores()
-    peak = searching.peak()
+    result, seconds = _measure.repeat(search, spec.repeats, spec.min_seconds, spec.max_repeats, spec.most_seconds)
+    first = seconds[0] if first is None else first  # where one run takes minutes, it is the only one
+    row |= {"first_s": first / steps, "others_cores": bystanders.cores()}
+    peak, row["device_bytes"] = searching.peak(), device.peak()
 
     found = adapter.read(result)
-    row |= _measure.summarize(seconds) | {"list_bytes": found.list_bytes, "device": found.device}
+    row |= _measure.summarize([second / steps for second in seconds])
+    row |= {"list_bytes": found.list_bytes, "device": found.device, "parts": found.parts, "rebuilt": found.rebuilt}
     row |= {"peak_bytes": max(prepared_peak, peak) - memory.start, "memory_source": searching.source}
     if searching.source == "VmHWM":
         taken = max(peak - searching.start, found.list_bytes)  # a small list may fit into pages that were there before
         row |= {"search_bytes": taken, "scratch_bytes": taken - found.list_bytes}
-    row |= _compare.compare(found, _oracle.load_pairs(positions, cutoff, folder), len(positions))
+    del result
+    if spec.process == 0 and (plan := getattr(adapter, "plan", None)):
+        planned = plan(positions, cutoff, *capacity)
+        row |= {"planned_list_bytes": planned.list_bytes + planned.sums_bytes, "planned_scratch_bytes": planned.scratch_bytes}
+    _judge(found, spec, positions if found.positions is None else found.positions, cutoff, folder, row)
 
 
-def _prepare(adapter: methods.Adapter, positions: np.ndarray, cutoff: float, row: dict[str, Any]) -> Callable[[], Any]:
-    """Do what the adapter does once, and note how long that takes."""
+def _judge(found: methods.Found, spec: Spec, positions: np.ndarray, cutoff: float, folder: Path, row: dict[str, Any]) -> None:
+    """Compare what was found with the exact pairs, and in the first process sums over it with exact ones."""
+    from experiments import _accuracy, _compare, _oracle
+
+    if len(positions) > MOST_LISTED:
+        row |= _compare.compare_sample(found, positions, cutoff)
+        return
+    exact = _oracle.load_pairs(positions, cutoff, folder) if found.positions is None else _oracle.find_pairs(positions, cutoff)
+    row |= _compare.compare(found, exact, len(positions))
+    if spec.process == 0:
+        row |= _accuracy.errors(found, row, exact, positions, cutoff)
+
+
+def _prepare(
+    adapter: methods.Adapter, spec: Spec, positions: np.ndarray, cutoff: float, row: dict[str, Any]
+) -> tuple[Callable[[], Any], tuple[Any, ...]]:
+    """Do what the adapter does once, and note how long that takes; return the search, and the capacity it was prepared for."""
+    if follow := getattr(adapter, "follow", None):
+        begin = perf_counter()
+        search = follow(positions, cutoff, spec.motion * spec.spacing)
+        row["compile_s"] = perf_counter() - begin
+        return search, ()
     capacity = ()
     if allocate := getattr(adapter, "allocate", None):
         begin = perf_counter()
@@ -114,7 +152,16 @@ def _prepare(adapter: methods.Adapter, positions: np.ndarray, cutoff: float, row
     begin = perf_counter()
     search = adapter.prepare(positions, cutoff, *capacity)
     row["compile_s"] = perf_counter() - begin
-    return search
+    return search, capacity
+
+
+def _limit_memory() -> None:
+    """Keep this process below a share of the machine's memory; not where a GPU's driver reserves addresses without end."""
+    import psutil
+
+    if not Path("/dev/nvidiactl").exists():
+        most = int(MOST_MEMORY * psutil.virtual_memory().total)
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
 
 def _end_with_parent() -> None:

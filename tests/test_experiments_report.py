@@ -10,6 +10,7 @@ from experiments._cli import app
 from experiments._rows import Row, RowFile
 
 PICTURES = ("runtime_by_layout", "memory_by_layout", "runtime_by_fill", "memory_by_fill", "speed_against_error")
+PICTURES += ("memory_against_error", "speed_against_sum_error")
 MACHINE = {"cpu": "Some CPU", "cores": 2, "memory_bytes": 8 * 2**30, "system": "Linux 6"}
 VERSIONS = {"jax": "0.10.2", "scipy": "1.17.1", "warp-lang": None}
 SCENES = (
@@ -27,7 +28,17 @@ def make_row(scene, method, seconds, megabytes, **options):
         **{"spacing": 1e-4, "cutoff_ratio": 3.0, "dtype": "float32", "dim": 3, "seed": 0, "status": "ok", "points": points},
         **{"compile_s": 0.5, "first_s": seconds, "median_s": seconds, "p10_s": 0.9 * seconds, "p90_s": 1.2 * seconds, "repeats": 5},
         **{"search_bytes": int(1e6 * megabytes), "peak_bytes": int(3e6 * megabytes), "list_bytes": 1000, "scratch_bytes": 2000},
-        **{"pairs": 90, "exact_pairs": 90, "missing": 0, "extra": 0, "compared": "pairs", "machine": MACHINE, "versions": VERSIONS},
+        **{
+            "pairs": 90,
+            "exact_pairs": 90,
+            "missing": 0,
+            "extra": 0,
+            "compared": "pairs",
+            "density_error": 0.0,
+            "jump_error": 0.01,
+            "machine": MACHINE,
+            "versions": VERSIONS,
+        },
         **{"commit": "0123456789abcdef", "dirty": False, "config": "thesis", "time": "2031-02-03T04:05:06+00:00"},
     )
     return replace(row, **options)
@@ -114,10 +125,11 @@ def test_scenes_stand_by_size_and_are_told_apart():
 def test_printed_table_and_paths(reported):
     folder, printed = reported
     lines = printed.splitlines()
-    assert lines[-5:] == [str(folder / f"{name}.png") for name in PICTURES]
+    assert lines[-9:-7] == [str(folder / "report.html"), str(folder / "table.csv")]
+    assert lines[-7:] == [str(folder / f"{name}.png") for name in PICTURES]
     full = [line.split() for line in lines if " 250 000 " in line]
     assert len(full) == 4
-    assert ["cll", "1.0000", "1", "40.0", "1", "8", "7", "CLL", "2.14", "1", "116.8", "1"] in [line[-12:] for line in full]
+    assert ["cll", "1.0000", "·", "1", "40.0", "1", "8", "7", "CLL", "2.14", "1", "116.8", "1"] in [line[-13:] for line in full]
     assert "brute skipped" in " ".join(next(line for line in full if "brute" in line))
     assert "Some CPU, 2 cores, 8 GiB · jax 0.10.2, scipy 1.17.1 · commit 0123456789 · 2031-02-03" in lines
 
@@ -128,11 +140,12 @@ def test_markdown_holds_the_table_the_source_the_reasons_and_the_pictures(report
     assert len(table) == 2 + 16
     assert len({line.count("|") for line in table}) == 1
     assert (
-        "| corners 11 % | 28 158 | scipy-kdtree | 1.5000 | 3 | 40.0 | 2 | 0 | 600 | ANN | 1340.39 | 16755 | 51.0 | 2.65 |" in table
+        "| corners 11 % | 28 158 | scipy-kdtree | 1.5000 | · | 3 | 40.0 | 2 | 0 | 600 | ANN | 1340.39 | 16755 | 51.0 | 2.65 |"
+        in table
     )
     assert "J. Peifle" in text
     assert "- full 100 %, brute: skipped: too many" in text
-    assert [f"![{name.replace('_', ' ')}]({name}.png)" in text for name in PICTURES] == [True] * 5
+    assert [f"![{name.replace('_', ' ')}]({name}.png)" in text for name in PICTURES] == [True] * 7
     assert "Some CPU" in text
 
 

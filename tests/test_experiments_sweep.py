@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+from typer.testing import CliRunner
 
-from experiments import _measure, _rows
+from experiments import _config, _measure, _rows, _sweep, _worker
+from experiments._cli import app
 from experiments._errors import UsageError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -27,6 +29,7 @@ class Sweep:
     """A folder with a config, and the command that runs it."""
 
     def __init__(self, folder, config, name="small"):
+        folder.mkdir(exist_ok=True)
         self.config = folder / f"{name}.toml"
         self.config.write_text(config)
         self.out = folder / "out"
@@ -47,7 +50,7 @@ class Sweep:
             env=os.environ | environment,
             capture_output=True,
             text=True,
-            timeout=200,
+            timeout=280,
             check=True,
         )
 
@@ -68,7 +71,8 @@ def test_each_method_gives_a_whole_row(swept):
     rows = swept.rows()
     assert [row["method"] for row in rows] == METHODS
     assert "7 of 7 rows ok, 0 with a reason" in swept.done.stdout
-    optional = {"reason", "allocate_s", "directed_pairs", "others_cores"}
+    optional = {"reason", "allocate_s", "directed_pairs", "others_cores", "angle", "growth", "parts", "rebuilt", "device_bytes"}
+    optional |= {"planned_list_bytes", "planned_scratch_bytes", "density_error", "gradient_error", "jump_error"}
     for row in rows:
         assert set(row) == {field.name for field in fields(_rows.Row)}
         assert row["status"] == "ok"
@@ -101,6 +105,11 @@ def test_pairs_of_a_row_are_compared_with_the_exact_ones(swept):
         assert (rows[method]["missing"], rows[method]["extra"], rows[method]["directed_pairs"]) == (0, 0, 2 * exact)
     assert rows["scipy-kdtree"]["extra"] == rows["scipy-kdtree-nolist"]["extra"] > 0  # pairs at exactly the cutoff
     assert rows["cll"]["missing"] > 0  # float32 decides ties as it rounds
+    for method in ("jax", "warp", "hashgrid", "brute"):
+        assert (rows[method]["density_error"], rows[method]["gradient_error"], rows[method]["jump_error"]) == (0, 0, 0)
+        planned = rows[method]["planned_list_bytes"]
+        assert planned == (None if method == "brute" else rows[method]["list_bytes"] + 8)  # status, required
+    assert rows["cll"]["density_error"] < 1e-12 < rows["cll"]["jump_error"]  # a tie is nothing to a kernel that ends at 0
 
 
 def test_a_row_says_where_it_comes_from_but_names_no_host(swept):
@@ -194,6 +203,58 @@ def wait_for_children(pid, deadline):
     return children
 
 
+FOUR = '[[scenes]]\nlayouts = ["corners"]\nfills = [0.02, 0.05]\n[[scenes]]\nlayouts = ["sheet"]\nfills = [0.02]\n'
+
+
+def test_two_shards_merged_are_the_whole(tmp_path):
+    config = 'methods = ["scipy-kdtree"]\nspacing = 1e-3\nprocesses = 2\nrepeats = 2\nmin_seconds = 0.0\n' + FOUR
+    whole, parts = Sweep(tmp_path / "a", config), Sweep(tmp_path / "b", config)
+    whole.run()
+    for part in ("1/2", "2/2"):
+        parts.run("--shard", part)
+    shards = [parts.out / f"shard-{k}-of-2" for k in (1, 2)]
+    scenes = [{(row.layout, row.fill_asked) for row in _rows.RowFile(shard).read()} for shard in shards]
+    assert [len(part) for part in scenes] == [2, 1]  # a scene is measured on one machine
+    done = subprocess.run([*parts.command[:3], "merge", str(parts.out)], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("6 rows came")
+
+    def told(rows):
+        names = ("key", "layout", "fill_asked", "method", "process", "status", "pairs", "missing", "extra")
+        return sorted([tuple(str(row[name]) for name in names) for row in rows])
+
+    assert told(parts.rows()) == told(whole.rows())
+    again = subprocess.run([*parts.command[:3], "merge", str(parts.out)], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert again.stdout.startswith("0 rows came")
+    assert len(parts.rows()) == 6
+    assert "6 of 6 rows are there already" in parts.run().stderr  # the whole sweep goes on from them
+
+
+def test_of_one_key_a_row_with_figures_counts_when_rows_are_merged(tmp_path):
+    bad, good = replace(ROW, status="failed"), replace(ROW, status="ok")
+    for folder, row in (("bad", bad), ("good", good)):
+        (tmp_path / folder).mkdir()
+        _rows.RowFile(tmp_path / folder).append(row)
+    assert _sweep.merge(tmp_path / "bad", [tmp_path / "good"]) == 1
+    assert _sweep.merge(tmp_path / "good", [tmp_path / "bad"]) == 0
+    assert [row.status for row in _rows.RowFile(tmp_path / "bad").read()] == ["ok"]
+    with pytest.raises(UsageError, match="none: no rows to merge"):
+        _sweep.merge(tmp_path / "good", [tmp_path / "none"])
+
+
+@pytest.mark.parametrize("text", ["3/2", "0/2", "2", "a/b"])
+def test_a_shard_that_is_none(text, tmp_path):
+    result = CliRunner().invoke(app, ["run", str(tmp_path / "c.toml"), "--shard", text])
+    assert (result.exit_code, result.stderr) == (2, f"error: --shard {text}: expected K/N with 1 <= K <= N, such as 2/8\n")
+
+
+def test_where_one_run_takes_minutes_it_is_the_only_one(tmp_path):
+    table = {"layouts": ("corners",), "fills": (0.02,)}
+    given = {"methods": ["scipy-kdtree"], "scenes": [table], "spacing": 1e-3, "repeats": 1, "max_repeats": 1, "min_seconds": 0.0}
+    (spec,) = _config.Config.model_validate(given).specs()
+    row = _worker.measure(spec, tmp_path)
+    assert (row["status"], row["repeats"], row["first_s"]) == ("ok", 1, row["median_s"])
+
+
 ROW = _rows.Row(key="a", layout="full", method="m", fill_asked=None, spacing=1.0, cutoff_ratio=3.0, dtype="f", dim=3, seed=0)
 
 
@@ -251,6 +312,10 @@ def test_peak_memory_sees_what_came_and_went():
     if memory.source == "VmHWM":
         after = _measure.PeakMemory()
         assert after.peak() - after.start < 20e6
+
+
+def test_there_is_no_device_memory_on_a_cpu():
+    assert _measure.DeviceMemory().peak() is None
 
 
 def test_bystanders_are_other_processes_alone():

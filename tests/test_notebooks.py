@@ -21,6 +21,13 @@ print("pictures:", sum("image/png" in output.get("data", {}) for output in outpu
 
 
 SAYS = {  # pictures, and what each prints
+    "gpu_layouts": (1, ("NVIDIA H200", "plan and peak differ by", "warp, ns per particle by layout")),
+    "open_questions": (
+        2,
+        ("times as long as cll", "turned2 tumbled / straight", "spacings per step: nanoflann-dynamic", "growth: time"),
+    ),
+    "speed_against_error": (3, ("exact on every scene", "methods with a list give")),
+    "thesis_reproduced": (7, ("have a counterpart here", "verdict of the thesis, CLL before")),
     "pair_sums": (2, ("sums per rebuild on", "one pair sum with backend='warp'")),
     "sph_gradients": (6, ("at the best ε", "m²/s was the first guess", "first guess [1. 0.]", "forces:")),
     "sph_jet": (2, ("particles of oil", "operations in a step", "kinetic energy", "neighbors on average")),
@@ -32,7 +39,9 @@ def test_every_notebook_is_run():
     assert {path.stem for path in NOTEBOOKS.glob("*.ipynb")} == set(SAYS)
 
 
-@pytest.mark.parametrize("name", [name if name == "pair_sums" else pytest.param(name, marks=pytest.mark.slow) for name in SAYS])
+@pytest.mark.parametrize(
+    "name", [name if name in ("gpu_layouts", "pair_sums") else pytest.param(name, marks=pytest.mark.slow) for name in SAYS]
+)
 def test_notebook(name):
     pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")

@@ -6,6 +6,9 @@ An adapter is a module with
   every call goes from the raw positions to the finished result, waits for it, and builds whatever structure it needs anew;
 - `read(result)`: return what the search found, a `Found`; not timed;
 - optionally `allocate(positions, cutoff)`: return the capacity that the scene needs; `prepare` then takes it as third argument;
+- optionally `follow(positions, cutoff, motion)` instead of `prepare`, for methods that keep something between searches: a callable
+  that moves every particle by `motion` `STEPS` times and searches after each, as `_moving` says; times are per search;
+- optionally `plan(positions, cutoff, capacity)`: what `jfrnn.memory_plan` says of the search;
 - optionally `MAX_POINTS`: larger scenes are skipped, with a row that says so;
 - optionally `PACKAGES`: names of distributions whose versions the row shall hold besides the usual ones.
 
@@ -14,7 +17,7 @@ that cannot be imported makes a row with status `missing`, one that raises makes
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol, cast
@@ -32,6 +35,10 @@ class Found:
         directed: Whether `pairs` holds both (i, j) and (j, i).
         counts: Neighbors of each particle without itself, shape [n]; for methods that give no pairs.
         device: Where it ran.
+        parts: Median seconds of the parts of a search, by name; empty where they cannot be told apart.
+        density: Sums of a poly6 kernel that the method made itself, `_accuracy` says which; shape [n].
+        rebuilt: Share of the searches that made a list anew, of methods that keep one.
+        positions: Where the particles were at last, if the method moved them; shape [n, d].
     """
 
     list_bytes: int
@@ -39,6 +46,10 @@ class Found:
     directed: bool = False
     counts: np.ndarray | None = None
     device: str = "cpu"
+    parts: dict[str, float] = field(default_factory=dict)
+    density: np.ndarray | None = None
+    rebuilt: float | None = None
+    positions: np.ndarray | None = None
 
 
 class Adapter(Protocol):

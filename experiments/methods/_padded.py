@@ -26,6 +26,12 @@ def prepare_backend(
     return lambda: jax.block_until_ready(compiled(jax.numpy.asarray(positions)))
 
 
+def plan_backend(positions: np.ndarray, cutoff: float, capacity: int, backend: str) -> jfrnn.MemoryPlan:
+    """Return what the search is said to take of the memory."""
+    n, dim = positions.shape
+    return jfrnn.memory_plan(n, cutoff, capacity, dim=dim, dtype=positions.dtype, backend=backend)
+
+
 def read(result: jfrnn.NeighborList) -> Found:
     """Return the directed pairs of the padded list."""
     result.check()

@@ -1,4 +1,7 @@
-"""freud: cells with linked lists in C++, on all cores, with all ordered pairs, float32; open space as a box that is wide enough."""
+"""freud: its tree of bounding boxes in C++, on all cores, with all ordered pairs, float32; open space as a box that is wide enough.
+
+Its `LinkCell` took eight times as long on 450 particles.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +22,7 @@ def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], Any]:
     box = boxes.Box(*(2 * float(most) + 3 * cutoff for most in np.abs(points).max(axis=0)))
 
     def search() -> Any:  # noqa: ANN401
-        query: Any = locality.LinkCell(box, points, cell_width=cutoff)  # pyright: ignore
+        query: Any = locality.AABBQuery(box, points)  # pyright: ignore
         return query.query(points, {"r_max": cutoff, "exclude_ii": True}).toNeighborList()
 
     return search

@@ -25,8 +25,19 @@ def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], tuple[jax.Arra
     return lambda: jax.block_until_ready(sums(jnp.asarray(positions)))
 
 
+def plan(positions: np.ndarray, cutoff: float) -> jfrnn.MemoryPlan:
+    """Return what the sum is said to take of the memory."""
+    n, dim = positions.shape
+    one = positions.dtype.type(1)
+    values = {"m": jax.ShapeDtypeStruct((n,), positions.dtype)}
+    return jfrnn.memory_plan(
+        *(n, cutoff), dim=dim, dtype=positions.dtype, fn=lambda r, i, j: (j["m"] * (r @ r), one), values=values, backend="warp"
+    )
+
+
 def read(result: tuple[jax.Array, jax.Array]) -> Found:
-    """Return the counts, shape [n]."""
+    """Return the counts and the density, shape [n]."""
     density, count = result
     size = density.nbytes + count.nbytes
-    return Found(size, counts=np.asarray(count).astype(np.int64), device=next(iter(count.devices())).device_kind)
+    counts, device = np.asarray(count).astype(np.int64), next(iter(count.devices())).device_kind
+    return Found(size, counts=counts, device=device, density=np.asarray(density, np.float64))

@@ -1,0 +1,42 @@
+"""nvalchemi-toolkit-ops: cells and a padded list with Warp kernels inside `jax.jit`."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from nvalchemiops.jax.neighbors.cell_list import cell_list, estimate_cell_list_sizes  # pyright: ignore
+
+from experiments.methods import Found
+
+PACKAGES = ("nvalchemi-toolkit-ops",)
+
+
+def allocate(positions: np.ndarray, cutoff: float) -> int:
+    """Return the most neighbors of a particle; without it, the list is cut off in silence."""
+    from scipy.spatial import KDTree
+
+    return int(KDTree(positions).query_ball_point(positions, cutoff, return_length=True).max())
+
+
+def prepare(positions: np.ndarray, cutoff: float, capacity: int) -> Callable[[], tuple[jax.Array, jax.Array]]:
+    """Compile the search, and return it; open space as a box that nothing wraps around."""
+    jax.config.update("jax_enable_x64", positions.dtype == np.float64)
+    low = positions.min(axis=0)  # its cells begin at 0
+    cell = jnp.diag(jnp.asarray(positions.max(axis=0) - low + positions.dtype.type(cutoff)))[None]
+    periodic = jnp.zeros((1, positions.shape[1]), bool)
+    cells, _, radius = estimate_cell_list_sizes(jnp.asarray(positions - low), cell, cutoff, periodic)
+    most = {"max_neighbors": capacity, "max_total_cells": int(cells), "neighbor_search_radius": radius}
+    search = jax.jit(lambda x: cell_list(x - low, cutoff, cell, periodic, **most)[:2])
+    jax.block_until_ready(search(jnp.asarray(positions)))
+    return lambda: jax.block_until_ready(search(jnp.asarray(positions)))
+
+
+def read(result: tuple[jax.Array, jax.Array]) -> Found:
+    """Return the ordered pairs of the padded list."""
+    idx, count = (np.asarray(part) for part in result)
+    if count.max(initial=0) > idx.shape[1]:
+        raise RuntimeError(f"a row has {count.max()} neighbors and {idx.shape[1]} slots")
+    i, k = np.nonzero(np.arange(idx.shape[1]) < count[:, None])
+    size = idx.nbytes + count.nbytes
+    return Found(size, (i, idx[i, k].astype(np.int64)), directed=True, device=next(iter(result[0].devices())).device_kind)

@@ -1,0 +1,12 @@
+"""`jfrnn.search` with the backend `warp` in every step of a scan: what `warp-update` is to be compared with."""
+
+from functools import partial
+
+import warp as wp  # noqa: F401 - without it this method is missing, which is no failure
+
+from experiments.methods._moving import STEPS, follow_list
+from experiments.methods._moving import read_list as read
+
+__all__ = ["STEPS", "follow", "read"]
+
+follow = partial(follow_list, skin=0.0)

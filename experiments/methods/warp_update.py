@@ -1,0 +1,12 @@
+"""`NeighborList.update`, backend `warp`: a list with a skin of a tenth of the cutoff, made anew when something moved half of it."""
+
+from functools import partial
+
+import warp as wp  # noqa: F401 - without it this method is missing, which is no failure
+
+from experiments.methods._moving import SKIN, STEPS, follow_list
+from experiments.methods._moving import read_list as read
+
+__all__ = ["STEPS", "follow", "read"]
+
+follow = partial(follow_list, skin=SKIN)

@@ -1,0 +1,76 @@
+"""Errors of sums over what a method found, and exact counts of a sample."""
+
+import numpy as np
+import pytest
+
+from experiments import _accuracy, _compare, _oracle
+from experiments.methods import Found
+
+POSITIONS = np.random.default_rng(5).random((200, 3)).astype(np.float32)
+CUTOFF = _oracle.round_cutoff(0.3, np.float32)
+EXACT = _oracle.find_pairs(POSITIONS, CUTOFF)
+
+
+def direct(i, j):
+    """Sum over ordered pairs one by one."""
+    total = np.zeros((200, 7))
+    for a, b in zip(i, j, strict=True):
+        r = (POSITIONS[b].astype(float) - POSITIONS[a]) / CUTOFF
+        q = np.sqrt(r @ r)
+        total[a] += [(1 - q * q) ** 3, *(6 * (1 - q * q) ** 2 * r), *(r / q)]
+    return total
+
+
+def errors(i, j, directed):
+    found = Found(0, (i, j), directed=directed)
+    return _accuracy.errors(found, _compare.compare(found, EXACT, 200), EXACT, POSITIONS, CUTOFF)
+
+
+@pytest.mark.parametrize("directed", [False, True])
+def test_errors_are_those_of_the_sums(directed):
+    i, j = np.divmod(EXACT, 200)
+    both = np.concatenate((i, j)), np.concatenate((j, i))
+    found = both if directed else (i, j)
+    assert errors(*found, directed) == {"density_error": 0, "gradient_error": 0, "jump_error": 0}
+    kept = np.arange(len(found[0])) % 50 != 7
+    wrong = found[0][kept], found[1][kept]
+    mine = direct(*wrong) if directed else direct(np.concatenate(wrong), np.concatenate(wrong[::-1]))
+    off = mine - direct(*both)
+    density = direct(*both)[:, 0].mean()
+    expected = {
+        "density_error": np.abs(off[:, 0]).max() / density,
+        "gradient_error": np.linalg.norm(off[:, 1:4], axis=1).max() / density,
+        "jump_error": np.linalg.norm(off[:, 4:], axis=1).max() / (2 * len(EXACT) / 200),
+    }
+    assert errors(*wrong, directed) == pytest.approx(expected)
+
+
+def test_pairs_that_are_too_many_count_and_so_do_repeats():
+    i, j = np.divmod(EXACT, 200)
+    far = next((a, b) for a in range(200) for b in range(a + 1, 200) if a * 200 + b not in set(EXACT))
+    more = np.append(i, [far[0], i[0]]), np.append(j, [far[1], j[0]])
+    found = Found(0, more)
+    a, b, weight = _accuracy.difference(found, EXACT, 200)
+    assert sorted(zip(a, b, weight, strict=True)) == sorted([(*far, 1.0), (i[0], j[0], 1.0)])
+    assert errors(*more, False)["density_error"] > 0
+
+
+def test_a_method_that_sums_itself_is_judged_by_its_sums():
+    i, j = np.divmod(EXACT, 200)
+    density = direct(np.concatenate((i, j)), np.concatenate((j, i)))[:, 0]
+    density[3] += 0.5
+    found = Found(0, counts=_oracle.count_neighbors(EXACT, 200), density=density)
+    row = _compare.compare(found, EXACT, 200)
+    error = _accuracy.errors(found, row, EXACT, POSITIONS, CUTOFF)
+    assert error == {"density_error": pytest.approx(0.5 / density.mean(), rel=0.01)}
+    assert _accuracy.errors(Found(0, counts=found.counts), row, EXACT, POSITIONS, CUTOFF) == {}
+
+
+def test_a_sample_is_counted_exactly_on_a_lattice_full_of_ties():
+    sites = np.stack(np.meshgrid(*3 * [np.arange(9)], indexing="ij"), axis=-1).reshape(-1, 3)
+    positions, rows = (sites * 1e-4).astype(np.float32), np.arange(0, 729, 7)
+    whole = _oracle.count_neighbors(_oracle.find_pairs(positions, 3e-4), 729)
+    assert np.array_equal(_oracle.count_sample(positions, 3e-4, rows), whole[rows])
+    row = _compare.compare_sample(Found(0, counts=whole), positions, 3e-4)
+    assert (row["missing"], row["extra"], row["compared"], row["pairs"]) == (0, 0, "sample", whole.sum() // 2)
+    assert _compare.compare_sample(Found(0, counts=whole + 1), positions, 3e-4)["extra"] == 365

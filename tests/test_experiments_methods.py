@@ -1,0 +1,76 @@
+"""Adapters of methods beyond the library's own: what each finds, where it is installed."""
+
+import jax
+import numpy as np
+import pytest
+
+from experiments import _compare, _native, _oracle, methods
+
+OURS = {"brute", "cll", "hashgrid", "jax", "pair-sum", "warp", "warp-counts"}  # run by the tests of the sweep and of the engines
+MOVING = ["nanoflann-dynamic", "nanoflann-rebuild", "warp-rebuild", "warp-update"]
+OTHERS = [name for name in methods.names() if name not in OURS and name not in MOVING]
+
+
+@pytest.fixture
+def foreign():
+    """Let other libraries mix dtypes, as they do, and adapters set how wide floats are, for a test alone."""
+    wide = jax.config.jax_enable_x64
+    with jax.numpy_dtype_promotion("standard"):
+        yield
+    jax.config.update("jax_enable_x64", wide)
+
+
+def find(name, positions, cutoff):
+    """Run a method once; skip where it is not installed."""
+    try:
+        adapter = methods.load(name)
+    except ImportError as error:
+        pytest.skip(f"{name}: {error}")
+    capacity = (adapter.allocate(positions, cutoff),) if hasattr(adapter, "allocate") else ()
+    return adapter.read(adapter.prepare(positions, cutoff, *capacity)())
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", OTHERS)
+def test_pairs_without_ties_are_the_exact_ones(name, foreign):
+    positions = np.random.default_rng(3).random((700, 3)).astype(np.float32)
+    cutoff = _oracle.round_cutoff(0.15, np.float32)
+    exact = _oracle.find_pairs(positions, cutoff)
+    row = _compare.compare(find(name, positions, cutoff), exact, len(positions))
+    assert (row["missing"], row["extra"], row["pairs"]) == (0, 0, len(exact)), row
+
+
+@pytest.mark.parametrize("name", MOVING)
+def test_methods_that_follow_motion_find_the_pairs_where_particles_are(name, foreign):
+    try:
+        adapter = methods.load(name)
+    except ImportError as error:
+        pytest.skip(f"{name}: {error}")
+    positions = np.random.default_rng(3).random((300, 3)).astype(np.float32)
+    cutoff = _oracle.round_cutoff(0.2, np.float32)
+    search = adapter.follow(positions, cutoff, 0.002)
+    for _ in range(2):
+        found = adapter.read(search())
+        gone = np.linalg.norm(found.positions.astype(float) - positions, axis=1)
+        assert 0.001 < gone.min() < gone.max() < cutoff / 3
+        row = _compare.compare(found, _oracle.find_pairs(found.positions, cutoff), 300)
+        assert (row["missing"], row["extra"], row["pairs"] > 0) == (0, 0, True)
+    shares = {"warp-update": (0.05, 0.2), "warp-rebuild": (1.0, 1.0)}
+    assert found.rebuilt is None if name not in shares else shares[name][0] <= found.rebuilt <= shares[name][1]
+
+
+def test_the_list_of_the_thesis_and_the_sane_one_are_the_same():
+    positions = np.random.default_rng(4).random((300, 3))
+    naive, sane = (find(name, positions, 0.2) for name in ("ann-kd-naive", "ann-kd"))
+    listed = [sorted(map(tuple, np.stack(found.pairs, axis=1).tolist())) for found in (naive, sane)]
+    assert listed[0] == listed[1] != []
+    assert set(naive.parts) == {"t_tree", "t_ksearch", "t_frsearch", "t_processing"}
+    assert naive.parts["t_processing"] > sane.parts["t_processing"] > 0
+
+
+def test_an_adapter_says_what_it_lacks(monkeypatch):
+    with pytest.raises(ImportError, match=r"no/such/header\.h is not installed: apt-get install libnothing-dev"):
+        _native.load("ann", "no/such/header.h", "libnothing-dev")
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.raises(ImportError, match="no C\\+\\+ compiler: install g\\+\\+, or name one in the environment variable CXX"):
+        _native.load("ann", "ANN/ANN.h", "libann-dev")

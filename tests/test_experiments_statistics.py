@@ -1,0 +1,97 @@
+"""Intervals of medians, processes put together, and what the report says of noise; the page that holds it all."""
+
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pandas as pd
+import pytest
+from test_experiments_report import SCENES, make_row
+from typer.testing import CliRunner
+
+from experiments import _report, _statistics, _table
+from experiments._cli import app
+from experiments._rows import RowFile
+
+
+@pytest.mark.parametrize(("n", "low", "confidence"), [(1, 0, 0.0), (2, 0, 0.5), (5, 0, 0.9375), (6, 0, 0.96875), (9, 1, 0.9609375)])
+def test_the_interval_lies_between_order_statistics(n, low, confidence):
+    interval = _statistics.median_interval(np.arange(n)[::-1])
+    assert interval == (np.median(np.arange(n)), low, n - 1 - low, confidence)
+
+
+def test_the_interval_holds_the_median_as_often_as_it_says():
+    random = np.random.default_rng(1)
+    held = [low <= np.log(2) <= high for _, low, high, _ in map(_statistics.median_interval, random.exponential(size=(4000, 20)))]
+    promised = _statistics.median_interval(range(20)).confidence
+    assert 0.95 <= promised < 0.98
+    assert np.mean(held) == pytest.approx(promised, abs=0.012)
+
+
+def rounds(method, medians):
+    rows = [make_row(SCENES[1], method, second, 10.0, key=f"{method} {k}", process=k) for k, second in enumerate(medians)]
+    return [replace(row, seconds=[row.median_s, 1.1 * row.median_s, 0.9 * row.median_s]) for row in rows]
+
+
+def test_processes_become_one_row():
+    rows = rounds("jax", [3.0, 1.0, 2.0, 5.0, 4.0])
+    rows[2] = replace(rows[2], extra=4, search_bytes=90_000_000)
+    (summary,) = _statistics.summarize(rows)
+    assert (summary.median_s, summary.low_s, summary.high_s, summary.processes, summary.repeats) == (3.0, 1.0, 5.0, 5, 15)
+    assert (summary.extra, summary.missing, summary.search_bytes) == (4, 0, 10_000_000)
+    failed = replace(rows[0], key="f", process=9, status="failed", reason="no", median_s=None)
+    assert _statistics.summarize([*rows, failed])[0].processes == 5
+    assert _statistics.summarize([failed])[0].reason == "no"
+
+
+def test_a_ratio_is_taken_round_by_round_so_that_drift_cancels():
+    drift = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
+    rows = rounds("cll", drift) + rounds("jax", 1.1 * drift) + rounds("warp", drift * [0.9, 1.1, 1.0, 1.2, 0.8])
+    lines = {line["method"]: line for line in _table.lines(rows)}
+    assert lines["jax"]["seconds_to_cll"] == pytest.approx(1.1)
+    assert (lines["jax"]["within_noise"], lines["warp"]["within_noise"], lines["cll"]["within_noise"]) == (False, True, None)
+    assert _report.cells(lines["warp"])[5] == "≈1"
+    assert _report.cells(lines["jax"])[5] == "1.1"
+
+
+def test_of_one_process_repeats_are_told_and_said_to_be_that():
+    (line,) = _table.lines(rounds("jax", [2.0]))
+    assert (line["processes"], line["low_s"], line["high_s"]) == (1, 1.8, pytest.approx(2.2))
+    assert _report.cells(line)[4] == "(10.0 %)"
+
+
+class Page(HTMLParser):
+    def __init__(self, text):
+        super().__init__()
+        self.cells, self.sources, self.links = [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        if tag == "td":
+            self.cells.append(values["data-by"])
+        self.sources += [values["src"]] if "src" in values else []
+        self.links += [values["href"]] if "href" in values else []
+
+
+def test_the_page_needs_nothing_besides_and_pandas_reads_the_table(tmp_path):
+    for row in [
+        *rounds("cll", [1.0, 1.2]),
+        *rounds("jax<b>", [2.0, 2.2]),
+        make_row(SCENES[0], "brute", 0, 0, status="skipped", reason="x"),
+    ]:
+        RowFile(tmp_path).append(row)
+    assert CliRunner().invoke(app, ["report", str(tmp_path)], catch_exceptions=False).exit_code == 0
+    text = (tmp_path / "report.html").read_text()
+    page = Page(text)
+    assert len(page.sources) == 7
+    assert all(source.startswith("data:image/png;base64,") for source in page.sources)
+    assert page.links == []
+    assert "jax&lt;b&gt;" in text
+    assert "jax<b>" not in text
+    assert {"cll", "1.1", "28158"} <= set(page.cells)
+    assert "<b>missing</b>, <b>extra</b>" in text
+    table = pd.read_csv(tmp_path / "table.csv")
+    assert list(table.columns) == list(_table.COLUMNS)
+    assert table.set_index("method").loc["cll", "median_s"] == pytest.approx(1.1)
+    assert table.seconds_to_cll.dtype == float
