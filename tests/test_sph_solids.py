@@ -95,15 +95,15 @@ def test_frames_turn_back(dim):
     np.testing.assert_allclose(solids.into_frame(jnp.asarray(moved), there, 0.7 * 3.0), x, atol=1e-14)
 
 
-SHARP = meshes.gear(6, 400, 1.0, 2.0, 3.0)
+SHARP = meshes.gear(6, 200, 1.0, 2.0, 3.0)
 
 
-@pytest.mark.parametrize("turning", [None, fluids.Turning((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 2.0)], ids=["stands", "turns"])
+@pytest.mark.parametrize("turning", [fluids.Turning((0.0,) * 3, (0.0, 0.0, 1.0), 2.0), pytest.param(None, marks=pytest.mark.slow)])
 def test_nothing_passes_however_it_is_thrown(turning):
     """Particles thrown about at random around a gear with few, sharp teeth, many of them farther than its walls are thick."""
     random = np.random.default_rng(1)
     low, high = SHARP[0].min(axis=0) - 0.3, SHARP[0].max(axis=0) + 0.3
-    scene = beside(fluids.Solid(*SHARP, turning), random.uniform(low, high, (1500, 3)), 0.2)
+    scene = beside(fluids.Solid(*SHARP, turning), random.uniform(low, high, (400, 3)), 0.2)
     outside = ~is_inside(scene.positions, scene, 0.0)
     apart = np.array([np.min(np.linalg.norm(SHARP[0][SHARP[1]].mean(axis=1) - x, axis=1)) for x in scene.positions])
     scene = replace(beside(scene.solid, scene.positions[outside & (apart > 0.1)], 0.2), step=0.05)
@@ -112,15 +112,15 @@ def test_nothing_passes_however_it_is_thrown(turning):
     model, s = make_model(scene), make_state(scene)
     out = jax.jit(lambda s, x, v: solids.keep_out(model, s, x, v, jnp.asarray(0.02), None))
     touched = 0
-    for k in range(40):
+    for k in range(10):
         throw = random.normal(size=s.x.shape) * random.choice([0.02, 0.1, 0.5], (len(s.x), 1))
         s = out(s, s.x + throw, s.v)
         touched += int(np.sum(solids.clearance(scene, s) < 1.01 * solids.GAP * scene.spacing))
         assert not s.solid.tri.overflow
         assert solids.clearance(scene, s).min() > 0.49 * solids.GAP * scene.spacing
-        if k % 10 == 9:
+        if k % 5 == 4:
             assert not is_inside(s.x, scene, 0.02 * (k + 1)).any()
-    assert touched > 1000
+    assert touched > 50
 
 
 def safe_state(scene):
