@@ -95,6 +95,7 @@ class FluidScene:
         guided: How long a particle that entered keeps its velocity [s], whatever acts on it.
         densities: Densities at first [kg/m³], shape [n], where they are carried; None: the rest density.
         pressures: Pressures at first [Pa], shape [n], where they are carried; None: 0.
+        solid: A wall of triangles, outside of which the fluid is; None: there is none.
     """
 
     name: str
@@ -114,6 +115,7 @@ class FluidScene:
     guided: float = 0.0
     densities: NDArray[np.float64] | None = None
     pressures: NDArray[np.float64] | None = None
+    solid: "Solid | None" = None
 
     @property
     def n(self) -> int:
@@ -141,6 +143,31 @@ class Periodic:
     lower: tuple[float, ...]
     lengths: tuple[float, ...]
     axes: tuple[bool, ...]
+
+
+@dataclass(frozen=True)
+class Turning:
+    """How a solid turns: around a center [m], along an axis (in 2D none), at a rate [rad/s] counterclockwise as seen against it."""
+
+    center: tuple[float, ...]
+    axis: tuple[float, ...] | None
+    rate: float
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A closed wall of triangles, in 2D of segments.
+
+    Args:
+        vertices: Corners at time 0 [m], shape [v, d].
+        faces: Vertices of each triangle, counterclockwise as seen from the fluid, integers, shape [f, d]; in 2D segments,
+            counterclockwise around what holds no fluid.
+        turning: How it turns; None: it stays.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    turning: Turning | None = None
 
 
 def lattice(lower: Sequence[float], counts: Sequence[int], spacing: float) -> NDArray[np.float64]:

@@ -4,14 +4,15 @@
 [[0.505, 0.5], [0.515, 0.5], [0.51, 0.45], [0.5, 0.45]]
 """
 
-from ._fluid import WORDS, FluidScene, Periodic, Physics, Tank
+from ._fluid import WORDS, FluidScene, Periodic, Physics, Solid, Tank, Turning
 from ._fluid_flows import SCENES as _FLOWS
 from ._fluid_free import SCENES as _FREE
+from ._fluid_gear import SCENES as _GEAR
 from ._fluid_source import SCENES as _SOURCE
 
-__all__ = ["FLUIDS", "WORDS", "FluidScene", "Periodic", "Physics", "Tank", "fluid"]
+__all__ = ["FLUIDS", "WORDS", "FluidScene", "Periodic", "Physics", "Solid", "Tank", "Turning", "fluid"]
 
-FLUIDS = {**_SOURCE, **_FLOWS, **_FREE}
+FLUIDS = {**_SOURCE, **_FLOWS, **_FREE, **_GEAR}
 """Functions that make scenes, by name."""
 
 

@@ -20,7 +20,7 @@ COLUMNS = (
     *("missing", "extra", "others_cores", "jax", "warp", "peer", "commit", "dirty"),
 )
 _FEW = 2_000  # points that a peer is asked for whose time would be minutes
-_LISTS = ("update", "rebuild", "count")  # ways of jfrnn
+_CURVES = ("row", "morton", "hilbert")
 
 
 class _Scene(NamedTuple):
@@ -33,8 +33,10 @@ def measure(folder: Path, n: int, faces: int, rounds: int, backend: str, cutoffs
     """Write a table of seconds by method and cutoff, and return its path.
 
     jfrnn lists all triangles within the cutoff: "update" with the cells of a wall that stays, "rebuild" with one that is sorted
-    anew.
-    Peers find the one nearest triangle of each point, however far. `missing` and `extra` are particles of which jfrnn says
+    anew, "morton order" and the like the first for points along a curve.
+    Peers find the one nearest triangle of each point, however far, but for "wp.Mesh": "nearest" looks no farther than the cutoff,
+    "boxes" only counts triangles whose boxes are as near, which is where a search through its tree of boxes begins; both run on one
+    core. `missing` and `extra` are particles of which jfrnn says
     otherwise than a peer, in float64, whether a triangle is within the cutoff.
 
     Args:
@@ -58,14 +60,15 @@ def measure(folder: Path, n: int, faces: int, rounds: int, backend: str, cutoffs
             near = np.asarray(tri.count) > 0
             common = {"faces": len(scene.faces), "cutoff": cutoff, "others_cores": others, **_versions()}
             row = {"n": n, "pairs": int(tri.count.sum()), "longest_row": int(tri.required)}
-            for way in _LISTS:
+            for way in calls:
                 writer.writerow(common | row | {"method": f"jfrnn {way}"} | _timed(seconds[way], n))
-            for name, (asked, distance, taken) in peers.items():
+            for name, (asked, distance, taken) in (peers | _trees(scene, cutoff)).items():
                 within = distance < cutoff
                 wrong = {"missing": int(np.sum(within & ~near[asked])), "extra": int(np.sum(near[asked] & ~within))}
-                writer.writerow(
-                    common | {"n": len(asked), "method": name, "peer": _peer_version(name)} | wrong | _timed(taken, len(asked))
-                )
+                if len(asked) == 0:
+                    asked, wrong = scene.points, {}
+                row = {"n": len(asked), "method": name, "peer": _peer_version(name)} | wrong
+                writer.writerow(common | row | _timed(taken, len(asked)))
     return path
 
 
@@ -88,7 +91,11 @@ def _calls(scene: _Scene, cutoff: float, backend: str) -> tuple[dict[str, Callab
     update = jax.jit(lambda x, tri: tri.update(x))
     rebuild = jax.jit(lambda x, vertices, tri: tri.update(x, vertices=vertices))
     single = jax.jit(lambda x, tri: tri.update(x).count)
-    calls = {"update": lambda: update(x, tri), "rebuild": lambda: rebuild(x, vertices, tri), "count": lambda: single(x, tri)}
+    calls: dict[str, Callable[[], Any]] = {"update": lambda: update(x, tri), "rebuild": lambda: rebuild(x, vertices, tri)}
+    calls["count"] = lambda: single(x, tri)
+    for curve in _CURVES:
+        ordered = x[jfrnn.sort_order(x, cutoff, curve=curve)]
+        calls[f"update, {curve} order"] = lambda ordered=ordered: update(ordered, tri)
     jax.block_until_ready([call() for call in calls.values()])
     return calls, tri
 
@@ -111,12 +118,29 @@ def _trimesh(scene: _Scene) -> tuple[np.ndarray, np.ndarray, list[float]]:
     return asked, distance, seconds
 
 
-_PEERS: dict[str, Callable[[_Scene], tuple[np.ndarray, np.ndarray, list[float]]]] = {"libigl": _libigl, "trimesh": _trimesh}
+def _trees(scene: _Scene, cutoff: float) -> dict[str, tuple[np.ndarray, np.ndarray, list[float]]]:
+    """Ask the tree of boxes that Warp has of a mesh, by name of the way; empty where Warp is missing."""
+    if importlib.util.find_spec("warp") is None:
+        return {}
+    from experiments import _bvh
+
+    everyone = np.arange(len(scene.points))
+    nearest, boxes = _bvh.calls(scene.points, scene.vertices, scene.faces, cutoff)
+    found, times = _measure.repeat(nearest, 3, 0.0, 3)
+    _, taken = _measure.repeat(boxes, 3, 0.0, 3)
+    return {"wp.Mesh nearest": (everyone, found, times), "wp.Mesh boxes": (everyone[:0], found[:0], taken)}
+
+
+_PEERS: dict[str, Callable[[_Scene], tuple[np.ndarray, np.ndarray, list[float]]]] = {
+    "libigl": _libigl,
+    "trimesh": _trimesh,
+}
 _MODULES = {"libigl": "igl", "trimesh": "trimesh"}
 
 
 def _peer_version(name: str) -> str:
-    return str(_machine.versions([name])[name])
+    package = "warp-lang" if name.startswith("wp.") else name
+    return str(_machine.versions([package])[package])
 
 
 def _timed(seconds: list[float], n: int) -> dict[str, Any]:

@@ -59,7 +59,8 @@ def search_triangles(
 
     Memory: 4 B per slot and particle for the list; 100 to 132 B per triangle for the cells, which the list keeps, whatever the
     sizes of the triangles and of space. Differentiable: the list is topology, without gradient; see `TriangleList.closest`.
-    Jit: yes, with capacity. vmap: yes, with capacity. Source: strict cutoff (Peifle 2019, §2.2).
+    Jit: yes, with capacity. vmap: yes, with capacity. `jax.shard_map`: yes, with particles spread and the wall on every device
+    (`check_vma=False`). Source: strict cutoff (Peifle 2019, §2.2).
 
     >>> import jax.numpy as jnp, jfrnn
     >>> x = jnp.array([[0.2, 0.2, 0.05], [0.2, 0.2, -0.2], [1.05, 0.0, 0.0]])

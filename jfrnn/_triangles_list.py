@@ -32,12 +32,15 @@ class SignedDistance(NamedTuple):
     Attributes:
         distance: To the nearest triangle of the row [length], shape [n]: negative inside, 0 where there is none within the cutoff.
         mask: There is one, shape [n], bool.
+        normal: Where the distance grows fastest, of unit length, shape [n, d]: away from the wall outside, toward it inside; at
+            contact the pseudonormal; 0 where there is no triangle.
         watertight: Each side belongs to two triangles that run through it in opposite directions (in 2D, each vertex to two
             segments), shape [], bool. Where False, signs mean nothing away from the faces.
     """
 
     distance: Array
     mask: Array
+    normal: Array
     watertight: Array
 
 
@@ -181,7 +184,7 @@ class TriangleList:
             vertices: As in `closest`.
 
         Returns:
-            A `SignedDistance`: distance [n], mask [n], and whether the mesh is watertight.
+            A `SignedDistance`: distance [n], mask [n], normal [n, d], and whether the mesh is watertight.
 
         Raises:
             ValueError, TypeError: an argument does not fit the list.
@@ -193,7 +196,7 @@ class TriangleList:
         points, corners = self._checked(positions, vertices)
         if 0 in (*self.idx.shape, self.faces.shape[0]):
             none = jnp.zeros(points.shape[0], points.dtype)
-            return SignedDistance(none, none > 0, jnp.asarray(self.faces.shape[0] == 0))
+            return SignedDistance(none, none > 0, jnp.zeros_like(points), jnp.asarray(self.faces.shape[0] == 0))
         return _signed_distance(self, points, corners)
 
     def _checked(self, positions: Array, vertices: Array | None) -> tuple[Array, Array]:
@@ -279,4 +282,6 @@ def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> Signe
     normal = normal_at(normals, tri.faces, triangle, pick(feature)[:, 0])
     height = jnp.sum(normal * away, axis=1)
     signed = jnp.where(distance > 0, jnp.where(height < 0, -distance, distance), height)
-    return SignedDistance(jnp.where(some, signed, 0), some, normals.watertight & jnp.all(finite & there))
+    apart = (some & (distance > 0))[:, None]
+    grows = jnp.where(apart, away / jnp.where(apart, signed[:, None], 1), jnp.where(some[:, None], normal, 0))
+    return SignedDistance(jnp.where(some, signed, 0), some, grows, normals.watertight & jnp.all(finite & there))

@@ -11,6 +11,7 @@ from jfrnn import _warp
 from jfrnn._exact import Cutoff
 from jfrnn._triangles_cells import LANES, MOST_CELLS, TriangleCells, bucket_count, entry_count, level_limit
 
+_LONGEST_VECTOR = 16
 _PARTICLES_PER_THREAD = 1024  # below, a second thread costs more than it saves
 
 
@@ -43,6 +44,8 @@ def list_triangles(
     radius = jnp.asarray(cutoff.radius)
     wide = radius * (1 + 8 * finfo.eps)  # no particle that is nearer than r lies beyond: subtraction rounds monotonously
     boxes = jnp.concatenate([jnp.min(corners, axis=1) - wide, jnp.max(corners, axis=1) + wide], axis=1)
+    entries = jnp.pad(cells.triangles, (0, _LONGEST_VECTOR), constant_values=corners.shape[0])  # vectors reach over the end
+    boxes = boxes.T.at[:, entries].get(mode="fill", fill_value=jnp.nan)  # side by side, as a bucket holds them
     query = _query_callable(_Variant(dim, positions.dtype == jnp.float64, capacity is not None))
     inputs = (positions, corners, boxes, jnp.reshape(radius, 1), cells.start, cells.triangles, cells.levels)
     inputs += (jnp.reshape(cells.level_count, 1), cells.level_of)
@@ -86,8 +89,9 @@ def _query_callable(variant: _Variant) -> Any:  # noqa: ANN401
     def run(*arrays: Any) -> None:  # noqa: ANN401
         named = dict(zip(types, arrays, strict=True))
         n, capacity = named["positions"].shape[0], named["idx"].shape[1]
-        sizes = [n, named["corners"].shape[0], named["start"].shape[0] - 1, capacity]
+        sizes = [n, named["corners"].shape[0], named["start"].shape[0] - 1, capacity, named["boxes"].shape[1]]
         named["info"].numpy()[:] = 0
+        _warp.ask_for_huge_pages(named["idx"].ptr, 4 * n * capacity)
         _warp.on_every_core(_kernels(variant).query, [*arrays, *sizes], -(-n // _PARTICLES_PER_THREAD))
 
     return _warp.callable_of(_name("query", variant), run, types, 3)

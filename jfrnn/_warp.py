@@ -357,7 +357,7 @@ def _run_cells_on_cpu(variant: Variant, arrays: _Arrays) -> None:
     arrays, sizes, capacity = _launchable(variant, arrays)
     positions, queries, cutoff, idx, _, info, scratch = arrays
     _sort_on_cpu(kernels, positions, queries, cutoff, info, scratch, sizes)
-    _ask_for_huge_pages(idx.ptr, 4 * len(queries) * capacity)
+    ask_for_huge_pages(idx.ptr, 4 * len(queries) * capacity)
     flags = [int(variant.closed), int(variant.keep.drop_self), int(variant.keep.later_only)]
     arguments = [*arrays, *sizes, capacity, *flags]
     on_every_core(kernels.query, arguments, -(-len(queries) // PLACES_PER_THREAD))
@@ -438,7 +438,7 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _ask_for_huge_pages(address: int, size: int) -> None:
+def ask_for_huge_pages(address: int, size: int) -> None:
     """Let Linux back a large output with huge pages: its first touch then costs a few faults instead of one per 4 KiB."""
     if size < _HUGE or not sys.platform.startswith("linux"):
         return

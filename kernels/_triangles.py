@@ -228,7 +228,9 @@ struct Shape {
             direction[k] /= largest;
         for (int c = 0; c < DIM; ++c) {
             const double height = product(direction, x[c]) - 8 * EPS * sizes(direction, x[c]);
-            least = c == 0 || !(height >= least) ? height : least;
+            if (!(height > 0))  // or no number
+                return surely_near(p, corners, radius);
+            least = c == 0 || height < least ? height : least;
         }
         if (least > 0 && least * least > r * r * product(direction, direction) * (1 + 16 * EPS))
             return false;

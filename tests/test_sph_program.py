@@ -35,12 +35,16 @@ PARTS = {
     "correction": {"corrected": True},
     "Tait's equation": {"state": "tait"},
 }
+CORNERS = np.array([[-9.0, -9.0], [9.0, -9.0], [9.0, 9.0], [-9.0, 9.0]])
+FRAME = fluids.Solid(CORNERS, np.array([[1, 0], [2, 1], [3, 2], [0, 3]], np.int32))
 WHOLE = {
     "walls": replace(BARE, wall=np.arange(N) < 8),
     "tank": replace(BARE, tank=fluids.Tank((0.0, 0.0), (1.0, 1.0)), physics=replace(BARE.physics, restitution=0.5)),
     "periodicity": replace(BARE, periodic=fluids.Periodic((0.0, 0.0), (1.0, 1.0), (True, True))),
     "inflow": replace(BARE, enters=np.linspace(0, 1, N)),
     "a Courant step": replace(BARE, step=None),
+    "a solid": replace(BARE, solid=FRAME),
+    "a solid that turns": replace(BARE, solid=replace(FRAME, turning=fluids.Turning((0.5, 0.5), None, 1.0))),
     **{name: replace(BARE, physics=replace(BARE.physics, **change)) for name, change in PARTS.items()},
 }
 
@@ -66,6 +70,7 @@ def test_a_part_that_is_left_out_takes_no_operation(bare, part):
     assert operations(program) > operations(bare[0])
     more = len(jax.tree.leaves(given)) - len(jax.tree.leaves(bare[1]))
     numbers = {"walls": 1, "tank": 3, "periodicity": 2, "inflow": 2, "a Courant step": -1, "correction": 0, "Tait's equation": 0}
+    numbers |= {"a solid": 14, "a solid that turns": 14 + 1 + 2}  # the list of triangles, what is seen; the angle, center, rate
     carried = {"transport velocity": 1, "shifting": 1}
     assert more == numbers.get(part, 1 + carried.get(part, 0))  # no array that nobody reads
 

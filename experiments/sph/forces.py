@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 import jfrnn
-from experiments.sph import correction, density, states, surface, transport, viscosity, walls
+from experiments.sph import correction, density, solids, states, surface, transport, viscosity, walls
 from experiments.sph.edges import Edges
 from experiments.sph.kernels import KERNELS
 from experiments.sph.model import Model, State
@@ -143,7 +143,8 @@ def carried_rate(model: Model, s: State, rho: Array, inverse: Array | None, nbrs
             within = within + transport.advected_change(pair, i, j, gradient, name)
         return rate + fluid(j, within)
 
-    return walls.fluid_only(model.wall, _sum(term, model, s, values, nbrs, "fluid"))
+    rate = _sum(term, model, s, values, nbrs, "fluid")
+    return walls.fluid_only(model.wall, rate if s.solid is None else rate + solids.compression(model, s, s.solid, rho))
 
 
 def fields(model: Model, s: State, rho: Array, inverse: Array | None, nbrs: Neighbors) -> Fields:
@@ -195,6 +196,8 @@ def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tupl
 
     sums = _sum(term, model, s, values, nbrs, "fluid")
     a = sums["a"] if physics.gravity is None else sums["a"] + physics.gravity
+    if s.solid is not None:
+        a = a + solids.push(model, s, s.solid, seen.rho, seen.p)
     if physics.surface_tension is not None:
         a = a + _tension(model, s, seen.rho, nbrs)
     if physics.damping is not None:

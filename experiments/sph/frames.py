@@ -4,8 +4,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from PIL import Image
+
+from experiments.sph import view
 
 if TYPE_CHECKING:
     from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
@@ -14,7 +19,7 @@ WALL = "0.75"
 
 
 def draw(scene: "FluidScene", x: np.ndarray, v: np.ndarray, time: float, top_speed: float, path: Path) -> None:
-    """Draw particles from the side, colored by speed: the first axis to the right, the last one upwards.
+    """Draw particles from the side, colored by speed: the first axis to the right, the last one upwards; a solid in 3D aslant.
 
     Args:
         scene: The scene; its bounds are the frame.
@@ -24,6 +29,9 @@ def draw(scene: "FluidScene", x: np.ndarray, v: np.ndarray, time: float, top_spe
         top_speed: Where the color scale ends [m/s].
         path: The picture.
     """
+    if scene.solid is not None and scene.dim == 3:
+        _draw_in_space(scene, x, v, time, top_speed, path)
+        return
     lower, upper = picture_bounds(scene)
     wide, high = (upper - lower)[[0, -1]]
     figure = Figure(figsize=(7.0, min(max(7.0 * high / wide, 2.5) + 0.8, 9.0)), layout="constrained")
@@ -36,12 +44,29 @@ def draw(scene: "FluidScene", x: np.ndarray, v: np.ndarray, time: float, top_spe
     pixels = 72 * 6.0 * scene.spacing / max(wide, 1e-300)
     shape = {"s": max(0.8 * pixels, 0.6) ** 2, "linewidths": 0}
     axes.scatter(*x[wall][:, [0, -1]].T, color=WALL, **shape)
+    if scene.solid is not None:
+        axes.add_collection(LineCollection(list(view.turned(scene.solid.vertices, scene.solid.turning, time)[scene.solid.faces])))
     speed = np.linalg.norm(v[seen], axis=1)
     marks = axes.scatter(*x[seen][:, [0, -1]].T, c=speed, cmap="viridis", vmin=0, vmax=top_speed or 1.0, **shape)
     figure.colorbar(marks, ax=axes, label="speed [m/s]", shrink=0.8)
     margin = 2 * scene.spacing
     axes.set(xlim=(lower[0] - margin, upper[0] + margin), ylim=(lower[-1] - margin, upper[-1] + margin), aspect="equal")
     axes.set(xlabel="x [m]", ylabel=f"{'xyz'[scene.dim - 1]} [m]", title=f"{scene.name}, t = {time:.4g} s")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)
+
+
+def _draw_in_space(scene: "FluidScene", x: np.ndarray, v: np.ndarray, time: float, top_speed: float, path: Path) -> None:
+    """Draw particles that have come, and the solid, aslant from above."""
+    there = np.ones(scene.n, bool) if scene.enters is None else scene.enters <= time
+    scale = ScalarMappable(Normalize(0, top_speed or 1.0), "viridis")
+    picture = view.render(scene, x[there], scale.to_rgba(np.linalg.norm(v[there], axis=1))[:, :3], time)
+    figure = Figure(figsize=(7.0, 6.0), layout="constrained")
+    axes = figure.add_subplot()
+    axes.imshow(picture)
+    axes.set_axis_off()
+    axes.set_title(f"{scene.name}, t = {time:.4g} s")
+    figure.colorbar(scale, ax=axes, label="speed [m/s]", shrink=0.8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from experiments._errors import UsageError
-from experiments.sph import solver
+from experiments.sph import solids, solver
 from experiments.sph.forces import Neighbors
 from experiments.sph.model import Model, State
 
@@ -24,6 +24,9 @@ def complaint(scene: "FluidScene", s: State) -> str | None:
         if value is not None and not np.isfinite(value := np.asarray(value)).all():
             particle = int(np.argwhere(~np.isfinite(value))[0][0])
             return f"particle {particle} has {_WORDS[name]} {value[particle]}"
+    distances = solids.clearance(scene, s)
+    if distances is not None and distances.min(initial=np.inf) <= 0:
+        return f"particle {distances.argmin()} went through the wall of triangles, {-distances.min()} m deep"
     if scene.sealed is None:
         return None
     x, far = np.asarray(s.x), scene.spacing / 2

@@ -10,17 +10,19 @@ from jax import Array
 from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
 
 import jfrnn
+from experiments.sph import solids
 from experiments.sph.kernels import KERNELS, Kernel
 from experiments.sph.pairs import reach
 
 if TYPE_CHECKING:
-    from jfrnn.cases.fluids import FluidScene, Physics  # pyright: ignore[reportMissingImports]
+    from jfrnn.cases.fluids import FluidScene, Physics, Turning  # pyright: ignore[reportMissingImports]
 
 jax.tree_util.register_dataclass(
     fluids.Physics,
     data_fields=[item.name for item in fields(fluids.Physics) if item.name not in fluids.WORDS],
     meta_fields=list(fluids.WORDS),
 )
+jax.tree_util.register_dataclass(fluids.Turning, data_fields=["center", "axis", "rate"], meta_fields=[])
 
 
 @jax.tree_util.register_dataclass
@@ -40,6 +42,7 @@ class Model:
         spacing: Particle distance [m]. Static.
         fluid_count: How many particles stand before those of walls; None where there are no walls, or among the fluid. Static.
         backend: Of `jfrnn.pair_sum`. Static.
+        turning: How the wall of triangles turns; None: it stays, or there is none.
     """
 
     physics: "Physics"
@@ -53,6 +56,7 @@ class Model:
     spacing: float = field(metadata={"static": True})
     fluid_count: int | None = field(metadata={"static": True})
     backend: str = field(default="auto", metadata={"static": True})
+    turning: "Turning | None" = None
 
     @property
     def kernel(self) -> Kernel:
@@ -77,6 +81,7 @@ class State(NamedTuple):
         rho: Carried densities [kg/m³], shape [n].
         p: Carried pressures [Pa], shape [n].
         w: Velocities with which particles move besides v [m/s], shape [n, d].
+        solid: The wall of triangles as particles see it.
     """
 
     x: Array
@@ -87,6 +92,7 @@ class State(NamedTuple):
     rho: Array | None = None
     p: Array | None = None
     w: Array | None = None
+    solid: solids.Beside | None = None
 
 
 def make_model(scene: "FluidScene", dtype: type = np.float64, backend: str = "auto") -> Model:
@@ -115,6 +121,7 @@ def make_model(scene: "FluidScene", dtype: type = np.float64, backend: str = "au
         spacing=scene.spacing,
         fluid_count=None if scene.wall is None else _first_wall(scene.wall),
         backend=backend,
+        turning=solids.turning_of(scene, dtype),
     )
 
 
@@ -138,6 +145,8 @@ def _check_parts(scene: "FluidScene") -> None:
             f"integrator 'leapfrog' carries no density or pressure, got evolve {physics.evolve!r}: "
             "take evolve 'summation', or integrator 'symplectic' or 'midpoint'."
         )
+    if scene.solid is not None:
+        _check_solid(physics)
     if physics.pressure == "difference" and scene.periodic is None and scene.wall is None:
         raise ValueError(
             "pressure 'difference' does not vanish at a free surface, got a scene without walls or period: "
@@ -145,12 +154,32 @@ def _check_parts(scene: "FluidScene") -> None:
         )
 
 
+def _check_solid(physics: "Physics") -> None:
+    """Refuse what walls of triangles have no integrals for."""
+    for name, allowed in (
+        ("evolve", ("continuity",)),
+        ("integrator", ("symplectic",)),
+        ("pressure", ("mean", "symmetric", "volume")),
+    ):
+        if getattr(physics, name) not in allowed:
+            raise ValueError(f"{name} must be {' or '.join(map(repr, allowed))} beside a solid, got {getattr(physics, name)!r}.")
+    for name in ("transport", "shifting", "surface_tension"):
+        if getattr(physics, name) is not None:
+            raise ValueError(f"{name} must be None beside a solid, whose surface it does not know, got {getattr(physics, name)}.")
+    if physics.corrected:
+        raise ValueError("corrected must be False beside a solid: what it corrects is what the wall lacks in particles.")
+
+
 def make_state(scene: "FluidScene", dtype: type = np.float64) -> State:
-    """Put the particles of a scene into JAX, where they are at first; `solver.begin` does the rest."""
+    """Put the particles of a scene into JAX, where they are at first; `solver.begin` does the rest.
+
+    Raises:
+        ValueError: The solid is not closed, or holds a particle.
+    """
     physics = scene.physics
     x, v = jnp.asarray(scene.positions, dtype), jnp.asarray(scene.velocities, dtype)
     zero = jnp.zeros((), dtype)
-    state = State(x, v, zero, jnp.zeros_like(x), zero)
+    state = State(x, v, zero, jnp.zeros_like(x), zero, solid=solids.begin(scene, x))
     if physics.transport is not None or physics.shifting is not None:
         state = state._replace(w=jnp.zeros_like(x))
     if physics.evolve == "continuity":

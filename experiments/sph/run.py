@@ -13,7 +13,7 @@ import numpy as np
 import jfrnn
 from experiments import _sweep
 from experiments._errors import UsageError
-from experiments.sph import forces, frames, health, settings, snapshots, solver
+from experiments.sph import forces, frames, health, settings, snapshots, solids, solver
 from experiments.sph.forces import Neighbors
 from experiments.sph.model import Model, State, make_model, make_state
 
@@ -55,14 +55,15 @@ def run(scene: "FluidScene", folder: Path, how: How) -> State:
         UsageError: The folder holds another run.
         DivergedError: A particle is not finite, or went through a wall.
     """
-    given = hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in (scene.positions, scene.velocities, scene.masses)))
+    arrays = (scene.positions, scene.velocities, scene.masses, *((scene.solid.vertices, scene.solid.faces) if scene.solid else ()))
+    given = hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays))
     about = settings.described(scene) | {"dtype": how.dtype, "frames": how.frames, "given": given.hexdigest()[:12]}
     snapshots.check_same(about, folder)
     try:
         model = make_model(scene, np.dtype(how.dtype).type)
     except ValueError as error:
         raise UsageError(f"scene {scene.name!r}: {error}") from error
-    saved = snapshots.latest(folder / "snapshots")
+    saved = snapshots.latest(folder / "snapshots", scene)
     s, step = saved or (make_state(scene, np.dtype(how.dtype).type), 0)
     nbrs = solver.list_neighbors(model, s, how.skin * scene.spacing) if how.neighbors == "list" else None
     if saved is None:
@@ -86,7 +87,16 @@ def run(scene: "FluidScene", folder: Path, how: How) -> State:
 
 
 def _chunk(model: Model, s: State, nbrs: Neighbors, steps: int) -> tuple[State, Neighbors]:
-    """Run steps; where a row of the list overflowed, with a larger list again."""
+    """Run steps; where a row of a list overflowed, with a larger list again."""
+    while True:
+        after, seen = _chunk_of_particles(model, s, nbrs, steps)
+        if s.solid is None or after.solid is None or not after.solid.tri.overflow:
+            return after, seen
+        larger = after.solid.tri.grow(solids.into_frame(s.x, model.turning, s.solid.angle))
+        s = s._replace(solid=s.solid._replace(tri=larger))
+
+
+def _chunk_of_particles(model: Model, s: State, nbrs: Neighbors, steps: int) -> tuple[State, Neighbors]:
     if nbrs is None:
         return solver.advance(model, s, None, steps)
     active = None if model.enters is None else lambda s: forces.active(model, s.time)

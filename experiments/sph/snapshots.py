@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments._errors import UsageError
-from experiments.sph import budget
+from experiments.sph import budget, solids
 from experiments.sph.model import Model, State
 
 if TYPE_CHECKING:
@@ -18,20 +18,24 @@ if TYPE_CHECKING:
 def save(state: State, scene: "FluidScene", rho: np.ndarray, p: np.ndarray, folder: Path, step: int) -> None:
     """Write a state as STEP.npz, complete or not at all, and its particles that have entered as STEP.vtp."""
     folder.mkdir(parents=True, exist_ok=True)
-    arrays = {name: np.asarray(value) for name, value in state._asdict().items() if value is not None}
+    arrays = {name: np.asarray(value) for name, value in state._asdict().items() if value is not None and name != "solid"}
+    if state.solid is not None and state.solid.angle is not None:
+        arrays["angle"] = np.asarray(state.solid.angle)
     whole, part = folder / f"{step:09d}.npz", folder / "part.npz"
     _write_vtk(arrays, scene, {"density": rho, "pressure": p}, whole.with_suffix(".vtp"))
     np.savez(part, **arrays)  # pyright: ignore[reportArgumentType]
     part.replace(whole)
 
 
-def latest(folder: Path) -> tuple[State, int] | None:
-    """Return the last state that was saved, and its step; None where there is none."""
+def latest(folder: Path, scene: "FluidScene") -> tuple[State, int] | None:
+    """Return the last state that was saved of a scene, and its step; None where there is none."""
     paths = sorted(path for path in folder.glob("*.npz") if path.stem.isdigit())
     if not paths:
         return None
     with np.load(paths[-1]) as file:
-        return State(**{name: jnp.asarray(file[name]) for name in file}), int(paths[-1].stem)
+        arrays = {name: jnp.asarray(file[name]) for name in file}
+    angle, s = arrays.pop("angle", None), State(**arrays)  # pyright: ignore[reportArgumentType]
+    return s._replace(solid=solids.begin(scene, s.x, angle)), int(paths[-1].stem)
 
 
 def check_same(about: dict[str, Any], folder: Path) -> None:
@@ -51,7 +55,10 @@ def check_same(about: dict[str, Any], folder: Path) -> None:
 
 
 def energies(model: Model, state: State, scene: "FluidScene") -> dict[str, float]:
-    """Return a line of the energies: time [s], kinetic and potential energy [J], momentum [kg m/s], largest speed [m/s]."""
+    """Return a line of the energies: time [s], kinetic and potential energy [J], momentum [kg m/s], largest speed [m/s].
+
+    Where there is a solid, also the least signed distance to it [m], infinite where nothing is within its reach.
+    """
     moved = budget.momentum(model, state)
     fluid = np.ones(scene.n, bool) if scene.wall is None else ~scene.wall
     line = {
@@ -61,7 +68,9 @@ def energies(model: Model, state: State, scene: "FluidScene") -> dict[str, float
         **{f"momentum_{axis}": float(moved[k]) for k, axis in enumerate("xyz"[: scene.dim])},
         "top_speed": float(np.linalg.norm(np.asarray(state.v)[fluid], axis=1).max(initial=0)),
     }
-    return line | {"total": line["kinetic"] + line["potential"]}
+    line |= {"total": line["kinetic"] + line["potential"]}
+    distances = solids.clearance(scene, state)
+    return line if distances is None else line | {"clearance": float(distances.min(initial=np.inf))}
 
 
 def add_line(line: dict[str, float], path: Path, step: int) -> None:

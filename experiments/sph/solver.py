@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax import Array
 
 import jfrnn
-from experiments.sph import forces, walls
+from experiments.sph import forces, solids, walls
 from experiments.sph.forces import Neighbors
 from experiments.sph.model import Model, State
 
@@ -22,7 +22,7 @@ def courant(model: Model, s: State) -> Array:
     Source: Monaghan (1992), doi:10.1146/annurev.aa.30.090192.002551; Morris, Fox & Zhu (1997), doi:10.1006/jcph.1997.5776.
     """
     physics, h = model.physics, model.physics.smoothing
-    speed = _greatest(s.v)
+    speed = _greatest(s.v) if s.solid is None else _greatest(s.v) + solids.rim_speed(model, s.solid)
     limits = [0.25 * h / (physics.sound_speed + speed)]
     if physics.viscosity is not None:
         kinematic = physics.viscosity / physics.density if physics.viscosity_form == "source" else physics.viscosity
@@ -156,7 +156,9 @@ def _symplectic(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[Sta
     energy drifts with dt; with `_midpoint`, with dt³ on the elliptical drop.
     """
     s = s._replace(v=s.v + dt / 2 * s.a)
-    s = _bounced(model, s._replace(x=s.x + dt * _moving(model, s)))
+    moved = s.x + dt * _moving(model, s)
+    s = s._replace(x=moved) if s.solid is None else solids.keep_out(model, s, moved, s.v, dt, forces.resting(model, s.time))
+    s = _bounced(model, s)
     nbrs = _update(model, s, nbrs)
     s = _evaluate(model, s, nbrs, dt)
     return s._replace(v=s.v + dt / 2 * s.a), nbrs

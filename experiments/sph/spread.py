@@ -94,12 +94,17 @@ def spread(model: Model, s: State, mesh: Mesh, settle: int = 10, slack: float = 
     """Spread a model and its state, as `solver.begin` returns it or not.
 
     Args:
-        model: What acts; walls of triangles are not part of models.
+        model: What acts.
         s: The state, rows as in the model.
         mesh: As in `jfrnn.distributed.scatter`.
         settle: As in `Flow`: fewer steps send less in halos, more steps sort less often. No pair depends on it.
         slack: Room for more particles, as in `scatter`.
+
+    Raises:
+        ValueError: The scene has a wall of triangles.
     """
+    if s.solid is not None:
+        raise ValueError("s must be a state without a wall of triangles, which sums over devices do not see: run it on one device.")
     rows = {name: getattr(s, name) for name in OF_STATE} | {name: getattr(model, name) for name in _OF_MODEL}
     if model.enters is None:
         rows["enters"] = np.full(len(s.x), -_NEVER, s.x.dtype)
@@ -189,5 +194,5 @@ def load(folder: Path) -> tuple[State, int] | None:
             continue
         order = np.argsort(ids)
         arrays = {name: value[order] for name, value in rows.items()} | {name: parts[0][name] for name in ("time", "last")}
-        return State(**{name: jnp.asarray(value) for name, value in arrays.items()}), int(step)
+        return State(**{name: jnp.asarray(value) for name, value in arrays.items()}), int(step)  # pyright: ignore[reportArgumentType]
     return None

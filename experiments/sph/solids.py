@@ -1,0 +1,279 @@
+"""A wall of triangles that stands or turns: what it does to the fluid, and that nothing passes it.
+
+What acts is that of a half-space of fluid at rest in the wall, behind the plane of the nearest point, integrated in closed form
+instead of summed over dummies: right at a plane, and at edges and corners as far as they are like one. It takes one signed distance
+per particle and no particles of its own, whatever the size of triangles.
+
+Nothing passes, whatever the forces do: `keep_out` begins at a place outside, in the frame of the wall, by more than half a gap, and
+ends at one. The step is shorter than half the cutoff, or is not taken. So where no triangle is within the cutoff of its end, none
+is between its ends; and where one is, the signed distance of the end tells its side, by a theorem for closed meshes. A particle
+that ends nearer than a gap is put one gap away; one that after that is not outside by half a gap stays where it was, and moves with
+the wall. Rounding is many orders smaller than the gap.
+"""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
+
+import jfrnn
+from experiments.sph.kernels import KERNELS, Kernel
+from experiments.sph.pairs import reach
+
+if TYPE_CHECKING:
+    from jfrnn.cases.fluids import FluidScene, Turning  # pyright: ignore[reportMissingImports]
+
+    from experiments.sph.model import Model, State
+
+GAP = 0.2  # particle spacings: on a lattice, particles at a wall are half a spacing away
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+_PLACES, _SHARES = (_NODES + 1) / 2, _WEIGHTS / 2
+
+
+class Beside(NamedTuple):
+    """The wall as particles see it, where they are.
+
+    Attributes:
+        tri: Triangles that are near, in the frame of the wall.
+        angle: By which it has turned [rad], shape []; None: it stands.
+        mask: It is within reach, shape [n], bool.
+        distance: To it [m], shape [n].
+        normal: Away from it, of unit length, in its frame, shape [n, d].
+    """
+
+    tri: jfrnn.TriangleList
+    angle: Array | None
+    mask: Array
+    distance: Array
+    normal: Array
+
+
+def begin(scene: "FluidScene", x: Array, angle: Array | None = None) -> Beside | None:
+    """Look at the solid of a scene from where its particles are; None where it has no solid.
+
+    Args:
+        scene: The scene.
+        x: Positions [m], shape [n, d].
+        angle: By which the wall has turned [rad].
+
+    Raises:
+        ValueError: The mesh is not closed, or a particle of the fluid is in it.
+    """
+    solid = scene.solid
+    if solid is None:
+        return None
+    vertices, faces, cutoff = jnp.asarray(solid.vertices, x.dtype), jnp.asarray(solid.faces), _reach(scene)
+    on_wall = vertices[faces].mean(axis=1)
+    longest = int(jfrnn.search_triangles(on_wall, vertices, faces, cutoff).required)
+    capacity = -(-longest * 3 // 16) * 8  # half as many again; a run that needs more is told by `overflow`
+    turning = turning_of(scene, x.dtype)
+    angle = jnp.zeros((), x.dtype) if turning is not None and angle is None else angle
+    at = into_frame(x, turning, angle)
+    tri = jfrnn.search_triangles(at, vertices, faces, cutoff, capacity=capacity)
+    signed = tri.signed_distance(at)
+    if not signed.watertight:
+        raise ValueError(
+            "solid must be a closed mesh whose faces run counterclockwise as seen from the fluid: one side has no two."
+        )
+    inside = np.asarray(signed.mask & (signed.distance < GAP / 2 * scene.spacing))
+    if scene.wall is not None:
+        inside &= ~scene.wall
+    if inside.any():
+        raise ValueError(
+            f"positions of the fluid must be outside the solid by {GAP / 2} spacings: particle {inside.argmax()} is not."
+        )
+    return Beside(tri, angle, signed.mask, signed.distance, signed.normal)
+
+
+def _reach(scene: "FluidScene") -> float:
+    return reach(KERNELS[scene.physics.kernel], scene.physics.smoothing)
+
+
+def turning_of(scene: "FluidScene", dtype: np.dtype | type) -> "Turning | None":
+    """Return how the solid of a scene turns, numbers of a dtype; None where it stands, or is none."""
+    turning = scene.solid and scene.solid.turning
+    if turning is None:
+        return None
+    axis = None if turning.axis is None else jnp.asarray(turning.axis, dtype) / np.linalg.norm(turning.axis)
+    return fluids.Turning(jnp.asarray(turning.center, dtype), axis, jnp.asarray(turning.rate, dtype))
+
+
+def into_frame(x: Array, turning: "Turning | None", angle: Array | None) -> Array:
+    """Return positions [n, d] as the wall sees them that has turned by an angle [rad]: it stands, they have turned back."""
+    return x if turning is None or angle is None else turning.center + _turned(x - turning.center, turning, -angle)
+
+
+def _out_of_frame(x: Array, turning: "Turning | None", angle: Array | None) -> Array:
+    return x if turning is None or angle is None else turning.center + _turned(x - turning.center, turning, angle)
+
+
+def _turned(r: Array, turning: "Turning | None", angle: Array | None) -> Array:
+    """Turn vectors [n, d]. Source: Rodrigues (1840)."""
+    if turning is None or angle is None:
+        return r
+    sine, cosine = jnp.sin(angle), jnp.cos(angle)
+    if turning.axis is None:
+        return r * cosine + _across(r, turning) * sine
+    along = (r @ turning.axis)[:, None] * turning.axis
+    return along + (r - along) * cosine + _across(r, turning) * sine
+
+
+def _across(r: Array, turning: "Turning") -> Array:
+    """Return axis × r, shape [n, d]."""
+    return jnp.stack([-r[:, 1], r[:, 0]], axis=1) if turning.axis is None else jnp.cross(turning.axis, r)
+
+
+def keep_out(model: "Model", s: "State", x: Array, v: Array, dt: Array, rests: Array | None) -> "State":
+    """Return the state after a step, at positions near x that are outside of the wall; see the head of this file.
+
+    A particle that meets the wall loses the velocity toward it, one that stays with it takes its velocity.
+
+    Args:
+        model: What acts.
+        s: The state before the step.
+        x: Where it would end [m], shape [n, d].
+        v: Velocities [m/s], shape [n, d].
+        dt: The step [s].
+        rests: Which particles do not move, shape [n], bool; None: all do.
+    """
+    if s.solid is None:
+        return s._replace(x=x, v=v)
+    old, gap, turning = s.solid, GAP * model.spacing, model.turning
+    angle = None if turning is None or old.angle is None else old.angle + dt * turning.rate
+    before, ends = into_frame(s.x, turning, old.angle), into_frame(x, turning, angle)
+    tri = old.tri.update(ends)
+
+    def look(points: Array, _: None) -> tuple[Array, tuple[Array, Array, Array]]:
+        there = tri.signed_distance(points)
+        lacks = jnp.where(there.mask & (there.distance < gap), gap - there.distance, 0)
+        return points + lacks[:, None] * there.normal, (there.mask, there.distance, there.normal)
+
+    _, looks = jax.lax.scan(look, ends, None, length=2)  # where steps end, and where they end once they are put right
+    (mask, distance, normal), after = (tuple(both[k] for both in looks) for k in range(2))
+    meets = mask & (distance < gap)
+    placed = ends + jnp.where(meets, gap - distance, 0)[:, None] * normal
+    far = jnp.sum((placed - before) ** 2, axis=1) > (model.cutoff / 2) ** 2
+    stays = far | (after[0] & (after[1] < gap / 2))
+    if rests is not None:
+        meets, stays = meets & ~rests, stays & ~rests
+    kept = _out_of_frame(jnp.where(stays[:, None], before, placed), turning, angle)
+    x = jnp.where((meets | stays)[:, None], kept, x)
+    wall, normal = jnp.zeros_like(v), _turned(normal, turning, angle)
+    if turning is not None:
+        wall = turning.rate * _across(x - turning.center, turning)
+    toward = jnp.minimum(jnp.sum((v - wall) * normal, axis=1), 0)
+    v = jnp.where(meets[:, None], v - toward[:, None] * normal, v)
+    v = jnp.where(stays[:, None], wall, v)
+    seen = [
+        jnp.where(stays if was.ndim == 1 else stays[:, None], was, now)
+        for was, now in zip((old.mask, old.distance, old.normal), after, strict=True)
+    ]
+    return s._replace(x=x, v=v, solid=Beside(tri, angle, *seen))
+
+
+def missing(kernel: Kernel, distance: Array, h: float, dim: int) -> tuple[Array, Array]:
+    """Integrate a kernel behind a plane.
+
+    A(d) = ∫ W over the plane [1/m]: the gradient at the particle of what lies behind is -A n. Γ(d) = ∫_d A, the weight of what
+    lies behind. By Gauss's rule with 8 nodes, exact for Wendland kernels in 3D.
+
+    Args:
+        kernel: W.
+        distance: d [m], shape [n], from 0 on.
+        h: Smoothing length [m].
+        dim: 2 or 3.
+
+    Returns:
+        A and Γ, shape [n] each.
+
+    Source: Kulasegaram, Bonet, Lewis & Profit (2004), doi:10.1007/s00466-003-0524-0, for walls by integrals.
+    """
+    support = kernel.support * h
+    near = jnp.minimum(distance, 0.999 * support)[:, None]  # beyond, both are below 1e-9, and roots have no slope
+    r = near + (support - near) * _PLACES.astype(near.dtype)
+    share = (support - near) * _SHARES.astype(near.dtype)
+    if dim == 3:
+        rings = 2 * jnp.pi * share * r * kernel.value(r, h, dim)
+        return jnp.sum(rings, axis=1), jnp.sum(rings * (r - near), axis=1)
+    return _line(kernel, near[:, 0], h), jnp.sum(share * _line(kernel, r, h), axis=1)
+
+
+def _line(kernel: Kernel, distance: Array, h: float) -> Array:
+    """Integrate a kernel in 2D along a line at distances below its support, any shape."""
+    half = jnp.sqrt((kernel.support * h) ** 2 - distance**2)[..., None]
+    r = jnp.sqrt(distance[..., None] ** 2 + (half * _PLACES.astype(half.dtype)) ** 2)
+    return 2 * jnp.sum(half * _SHARES.astype(half.dtype) * kernel.value(r, h, 2), axis=-1)
+
+
+class _Acting(NamedTuple):
+    """What acts on a particle: A [1/m] and Γ, shape [n], 0 beyond reach; the normal, and the wall's velocity and acceleration."""
+
+    area: Array
+    weight: Array
+    distance: Array
+    normal: Array
+    slip: Array
+    acceleration: Array | None
+
+
+def _acting(model: "Model", s: "State", beside: Beside) -> _Acting:
+    mask = beside.mask if model.enters is None else beside.mask & (s.time >= model.enters)
+    distance = jnp.where(mask, jnp.maximum(beside.distance, 0), 0)
+    sums = missing(model.kernel, distance, model.physics.smoothing, s.x.shape[1])
+    area, weight = (jnp.where(mask, part, 0) for part in sums)
+    normal, turning = _turned(beside.normal, model.turning, beside.angle), model.turning
+    if turning is None:
+        return _Acting(area, weight, distance, normal, s.v, None)
+    velocity = turning.rate * _across(s.x - distance[:, None] * normal - turning.center, turning)
+    return _Acting(area, weight, distance, normal, s.v - velocity, turning.rate * _across(velocity, turning))
+
+
+def compression(model: "Model", s: "State", beside: Beside, rho: Array) -> Array:
+    """Return what the wall adds to dρ/dt [kg/m³/s], shape [n]: -ρ A (v - v_wall)·n."""
+    wall = _acting(model, s, beside)
+    return -rho * wall.area * jnp.sum(wall.slip * wall.normal, axis=1)
+
+
+def push(model: "Model", s: "State", beside: Beside, rho: Array, p: Array) -> Array:
+    """Return what the wall adds to accelerations [m/s²], shape [n, d].
+
+    Pressure: 2p/ρ A n - (g - a_wall)·n (d A + Γ) n, the wall's pressure being that of the particle, carried on by what acts on the
+    fluid. Viscosity, where the fluid is held: -2ν A/d (v - v_wall), that of a velocity which changes its sign at the wall.
+    Source: Adami, Hu & Adams (2012), doi:10.1016/j.jcp.2012.05.005, eq. 23, for the pressure in the wall; Morris, Fox & Zhu (1997),
+    doi:10.1006/jcph.1997.5776, eqs. 22 and 28; both integrated over a half-space.
+    """
+    physics, wall = model.physics, _acting(model, s, beside)
+    along = 2 * p / rho * wall.area
+    body = None if physics.gravity is None else jnp.broadcast_to(physics.gravity, s.x.shape)
+    if wall.acceleration is not None:
+        body = -wall.acceleration if body is None else body - wall.acceleration
+    if body is not None:
+        along = along - jnp.sum(body * wall.normal, axis=1) * (wall.distance * wall.area + wall.weight)
+    a = along[:, None] * wall.normal
+    if physics.viscosity is not None and not physics.slip:
+        a = a - (2 * physics.viscosity * wall.area / jnp.maximum(wall.distance, model.spacing / 2))[:, None] * wall.slip
+    return a
+
+
+def rim_speed(model: "Model", beside: Beside) -> Array:
+    """Return the largest speed of the wall [m/s], shape []."""
+    corners = beside.tri.vertices
+    if model.turning is None:
+        return jnp.zeros((), corners.dtype)
+    return jnp.abs(model.turning.rate) * jnp.max(jnp.linalg.norm(corners - model.turning.center, axis=1))
+
+
+def clearance(scene: "FluidScene", s: "State") -> np.ndarray | None:
+    """Return the signed distances [m] of the fluid to the solid of its scene, shape [n], infinite where it is beyond reach.
+
+    Triangles are searched and distances computed anew, at the positions of the state.
+    """
+    if s.solid is None:
+        return None
+    at = into_frame(s.x, turning_of(scene, s.x.dtype), s.solid.angle)
+    signed = s.solid.tri.update(at).signed_distance(at)
+    free = np.asarray(signed.mask) if scene.wall is None else np.asarray(signed.mask) & ~scene.wall
+    return np.where(free, np.asarray(signed.distance), np.inf)

@@ -1,0 +1,253 @@
+"""Walls of triangles: nothing passes them, they push as a half-space of fluid does, and runs beside them can be differentiated."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jfrnn.cases import fluids, meshes
+from matplotlib.path import Path as Outline
+from typer.testing import CliRunner
+
+from experiments._cli import app
+from experiments.sph import budget, health, solids, solver, view
+from experiments.sph.kernels import KERNELS
+from experiments.sph.model import make_model, make_state
+
+pytestmark = pytest.mark.usefixtures("compiled_soon")
+TURNS = fluids.Turning((0.1, -0.2, 0.3), (1.0, 2.0, -0.5), 3.0)
+
+
+def winding_number(points, corners):
+    """Return how often triangles [f, 3, 3] go around points [n, 3]. Source: van Oosterom & Strackee (1983)."""
+    r = corners[None] - points[:, None, None]
+    length = np.linalg.norm(r, axis=-1)
+    volume = np.einsum("nfk,nfk->nf", r[:, :, 0], np.cross(r[:, :, 1], r[:, :, 2]))
+    dots = [np.einsum("nfk,nfk->nf", r[:, :, i], r[:, :, j]) * length[:, :, k] for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1))]
+    return np.arctan2(volume, length.prod(axis=-1) + sum(dots)).sum(axis=1) / (2 * np.pi)
+
+
+def is_inside(x, scene, time):
+    """Say which particles are in the solid of a scene, without the code under test."""
+    corners = view.turned(scene.solid.vertices, scene.solid.turning, time)[scene.solid.faces]
+    if scene.dim == 3:
+        return np.abs(winding_number(np.asarray(x, np.float64), corners)) > 0.5
+    return Outline(corners[:, 0]).contains_points(x)
+
+
+def beside(solid, positions, spacing=0.1, velocities=None, **physics):
+    """Return a scene of particles around a solid."""
+    physics = {"density": 1.0, "sound_speed": 10.0, "smoothing": 1.5 * spacing, "pressure": "mean"} | physics
+    return fluids.FluidScene(
+        name="beside",
+        positions=positions,
+        velocities=np.zeros_like(positions) if velocities is None else velocities,
+        masses=np.full(len(positions), spacing ** positions.shape[1]),
+        spacing=spacing,
+        duration=1.0,
+        step=0.25 * physics["smoothing"] / (1.2 * physics["sound_speed"]),
+        physics=fluids.Physics(**physics),
+        solid=solid,
+    )
+
+
+@pytest.mark.parametrize("name", ["wendland2", "wendland6", "cubic", "quintic"])
+def test_kernels_behind_a_plane(name, dim):
+    kernel, h = KERNELS[name], 0.13
+    reach = kernel.support * h
+    d = jnp.linspace(0, 1, 9) * reach
+    area, weight = solids.missing(kernel, d, h, dim)
+    t = (np.arange(200_000) + 0.5) / 200_000 * reach
+    rings = {2: 2 * np.ones_like(t), 3: 2 * np.pi * t}[dim] * reach / len(t)
+    expected = [np.sum(rings * np.asarray(kernel.value(jnp.sqrt(k**2 + t**2), h, dim))) for k in d]
+    np.testing.assert_allclose(area, expected, atol=2e-3 * float(area[0]))
+    assert float(weight[0]) == pytest.approx(0.5, abs=2e-3)  # half of space
+    fine = jnp.linspace(0, 1, 4001) * reach
+    slopes = np.trapezoid(np.asarray(solids.missing(kernel, fine, h, dim)[0]), fine)
+    assert slopes == pytest.approx(float(weight[0]), abs=2e-3)
+
+
+def test_a_lattice_beside_a_wall_feels_no_gradient():
+    """Gradients of the kernel over a lattice that ends at a plane, and the plane's integral, cancel."""
+    spacing, h, kernel = 0.1, 0.15, KERNELS["wendland2"]
+    sites = (
+        np.stack(np.meshgrid(np.arange(-6, 7), np.arange(-6, 7), np.arange(8) + 0.5, indexing="ij"), -1).reshape(-1, 3) * spacing
+    )
+    for layer in range(3):
+        here = np.array([0, 0, (layer + 0.5) * spacing])
+        r = sites - here
+        pull = np.asarray(kernel.pull(jnp.asarray(np.linalg.norm(r, axis=1)), h, 3))
+        fluid = -(spacing**3 * pull[:, None] * r).sum(axis=0)[2]
+        wall = -float(solids.missing(kernel, jnp.asarray(here[2:]), h, 3)[0][0])
+        scale = float(solids.missing(kernel, jnp.zeros(1), h, 3)[0][0])
+        assert abs(fluid + wall) < 0.04 * scale, layer  # what sums differ from integrals
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_frames_turn_back(dim):
+    turning = TURNS if dim == 3 else fluids.Turning((0.1, -0.2), None, 3.0)
+    x = np.random.default_rng(0).normal(size=(20, dim))
+    scene = beside(fluids.Solid(x, np.zeros((0, dim), np.int32), turning), x)
+    there = solids.turning_of(scene, np.float64)
+    moved = view.turned(x, turning, 0.7)
+    assert np.ptp(np.linalg.norm(moved - x, axis=1)) > 0.1
+    np.testing.assert_allclose(solids.into_frame(jnp.asarray(moved), there, 0.7 * 3.0), x, atol=1e-14)
+
+
+SHARP = meshes.gear(6, 200, 1.0, 2.0, 3.0)
+
+
+@pytest.mark.parametrize("turning", [fluids.Turning((0.0,) * 3, (0.0, 0.0, 1.0), 2.0), pytest.param(None, marks=pytest.mark.slow)])
+def test_nothing_passes_however_it_is_thrown(turning):
+    """Particles thrown about at random around a gear with few, sharp teeth, many of them farther than its walls are thick."""
+    random = np.random.default_rng(1)
+    low, high = SHARP[0].min(axis=0) - 0.3, SHARP[0].max(axis=0) + 0.3
+    scene = beside(fluids.Solid(*SHARP, turning), random.uniform(low, high, (400, 3)), 0.2)
+    outside = ~is_inside(scene.positions, scene, 0.0)
+    apart = np.array([np.min(np.linalg.norm(SHARP[0][SHARP[1]].mean(axis=1) - x, axis=1)) for x in scene.positions])
+    scene = replace(beside(scene.solid, scene.positions[outside & (apart > 0.1)], 0.2), step=0.05)
+    signed = solids.clearance(scene, safe_state(scene))
+    scene = beside(scene.solid, scene.positions[signed > 0.05], 0.2)
+    model, s = make_model(scene), make_state(scene)
+    out = jax.jit(lambda s, x, v: solids.keep_out(model, s, x, v, jnp.asarray(0.02), None))
+    touched = 0
+    for k in range(10):
+        throw = random.normal(size=s.x.shape) * random.choice([0.02, 0.1, 0.5], (len(s.x), 1))
+        s = out(s, s.x + throw, s.v)
+        touched += int(np.sum(solids.clearance(scene, s) < 1.01 * solids.GAP * scene.spacing))
+        assert not s.solid.tri.overflow
+        assert solids.clearance(scene, s).min() > 0.49 * solids.GAP * scene.spacing
+        if k % 5 == 4:
+            assert not is_inside(s.x, scene, 0.02 * (k + 1)).any()
+    assert touched > 50
+
+
+def safe_state(scene):
+    """Return a state of positions that may be anywhere."""
+    far = replace(scene, positions=scene.positions + 100)
+    s = make_state(far)
+    x = jnp.asarray(scene.positions)
+    return s._replace(x=x, solid=s.solid._replace(tri=s.solid.tri.update(x)))
+
+
+def drop_on_gear(nx=10, **physics):
+    """A square of fluid that falls onto a turning gear in 2D."""
+    spacing = 2.0 / nx
+    grid = np.stack(np.meshgrid(np.arange(nx) + 0.5, np.arange(nx) + 0.5), axis=-1).reshape(-1, 2) * spacing + [-1.0, 5.3]
+    solid = fluids.Solid(*meshes.gear_outline(8), fluids.Turning((0.0, 0.0), None, -0.8))
+    return beside(solid, grid, spacing, np.tile([0.3, -3.0], (len(grid), 1)), sound_speed=50.0, density_diffusion=0.1, **physics)
+
+
+def test_a_drop_on_a_turning_gear():
+    scene = drop_on_gear(viscosity=0.05, gravity=(0.0, -1.0), artificial=0.1)
+    model, s = make_model(scene), make_state(scene)
+    s = solver.begin(model, s)
+    for _ in range(5):
+        s, _ = solver.advance(model, s, None, 60)
+        assert health.complaint(scene, s) is None
+        assert not is_inside(s.x, scene, float(s.time)).any()
+    assert float(s.solid.angle) == pytest.approx(-0.8 * float(s.time))
+    assert solids.clearance(scene, s).min() < scene.spacing  # it is there
+    assert np.linalg.norm(s.v, axis=1).max() < 6.0
+    assert not s.solid.tri.overflow
+
+
+@pytest.mark.slow
+def test_energy_and_momentum_beside_a_wall_that_stands():
+    """A square of fluid thrown at a flat wall: what is lost is lost to the wall, and nothing is gained along it."""
+    scene = drop_on_gear(8)
+    block = np.array([[-9.0, -1], [9, -1], [9, 0], [-9, 0]]), np.array([[0, 1], [1, 2], [2, 3], [3, 0]], np.int32)
+    scene = replace(scene, positions=scene.positions - [0, 5.2], solid=fluids.Solid(*block))
+    model, s = make_model(scene), make_state(scene)
+    s = solver.begin(model, s)
+    total = lambda s: float(budget.kinetic_energy(model, s) + budget.internal_energy(model, s))  # noqa: E731
+    first, along = total(s), float(budget.momentum(model, s)[0])
+    energies = []
+    for _ in range(6):
+        s, _ = solver.advance(model, s, None, 40)
+        energies.append(total(s))
+    assert max(energies) < 1.02 * first
+    assert min(energies) > 0.1 * first
+    assert float(budget.momentum(model, s)[0]) == pytest.approx(along, rel=1e-9)  # the wall is smooth
+    assert float(budget.momentum(model, s)[1]) > -0.5 * 3.0 * scene.masses.sum()  # it has stopped, or turned back
+    assert np.asarray(s.x)[:, 1].min() > 0
+
+
+@pytest.mark.slow
+def test_a_column_at_rest_on_a_wall():
+    """Water that stands in an open tank of segments, whose inside is the fluid's side: its weight is borne."""
+    spacing = 0.1
+    tank = np.array([[0, 0], [1, 0], [1, 2], [1.5, 2], [1.5, -1], [-0.5, -1], [-0.5, 2], [0, 2.0]])
+    sides = np.stack([np.arange(8), (np.arange(8) + 1) % 8], axis=1)[:, ::-1].astype(np.int32)
+    water = np.stack(np.meshgrid(np.arange(10) + 0.5, np.arange(10) + 0.5), axis=-1).reshape(-1, 2) * spacing
+    scene = beside(fluids.Solid(tank, sides), water, spacing, gravity=(0.0, -1.0), sound_speed=15.0, density_diffusion=0.1)
+    scene = replace(scene, densities=1 + (1 - water[:, 1]) / 15.0**2, physics=replace(scene.physics, damping=10.0, state="linear"))
+    model, s = make_model(scene), make_state(scene)
+    s, _ = solver.advance(model, solver.begin(model, s), None, 600)
+    assert np.asarray(s.x).mean(axis=0) == pytest.approx([0.5, 0.5], abs=0.03)
+    assert np.abs(np.asarray(s.v)).max() < 0.05
+    depth, p = 1 - np.asarray(s.x)[:, 1], 15.0**2 * (np.asarray(s.rho) - 1)
+    assert np.abs(p - depth).max() < 0.15
+
+
+@pytest.mark.slow
+def test_gradients_through_contact():
+    """Of how far a square of fluid goes that meets a turning wall, in its velocity and in the rate at which the wall turns."""
+    scene = replace(drop_on_gear(4, viscosity=0.05), positions=drop_on_gear(4).positions - [0, 0.1])
+    model, s = make_model(scene), make_state(scene)
+    weights = jnp.asarray(np.random.default_rng(5).normal(size=s.x.shape))
+
+    @jax.jit
+    def end(push, rate):
+        here = replace(model, turning=replace(model.turning, rate=rate))
+        s2, _ = solver.rollout(here, solver.begin(here, s._replace(v=s.v * (1 + push))), 24, None, 4)
+        return jnp.sum(weights * s2.x) + 0.01 * jnp.sum(weights * s2.v), s2.solid.mask.sum()
+
+    at = (jnp.zeros(()), model.turning.rate)
+    slopes = jax.jit(jax.grad(lambda *at: end(*at)[0], (0, 1)))(*at)
+    assert int(end(*at)[1]) > 0
+    for k in range(2):
+        up, down = (tuple(x + sign * 1e-6 * (j == k) for j, x in enumerate(at)) for sign in (1, -1))
+        assert float(slopes[k]) == pytest.approx(float(end(*up)[0] - end(*down)[0]) / 2e-6, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"evolve": "summation"}, "evolve must be 'continuity' beside a solid, got 'summation'"),
+        ({"shifting": 0.1}, "shifting must be None beside a solid"),
+        ({"pressure": "difference"}, "pressure must be 'mean' or 'symmetric' or 'volume' beside a solid"),
+        ({"corrected": True}, "corrected must be False beside a solid"),
+    ],
+)
+def test_what_does_not_go_with_a_solid_is_refused(change, match):
+    scene = drop_on_gear(2)
+    with pytest.raises(ValueError, match=match):
+        make_model(replace(scene, physics=replace(scene.physics, **change)))
+
+
+def test_fluid_in_the_solid_and_open_meshes_are_refused():
+    scene = drop_on_gear(2)
+    with pytest.raises(ValueError, match=r"positions of the fluid must be outside the solid by 0.1 spacings: particle 0 is not"):
+        make_state(replace(scene, positions=scene.positions - [0, 1.8]))
+    with pytest.raises(ValueError, match="solid must be a closed mesh"):
+        make_state(replace(scene, solid=replace(scene.solid, faces=scene.solid.faces[1:])))
+
+
+@pytest.mark.slow
+def test_a_run_of_the_jet_onto_the_gear(tmp_path):
+    options = ["jet-gear", "--set", "layers=3", "--set", "faces=400", "--set", "duration=0.0006", "--set", "height=0.001"]
+    options += ["--frames", "2", "--dtype", "float32", "--out", str(tmp_path)]
+    result = CliRunner().invoke(app, ["sph", *options])
+    assert result.exit_code == 0, result.output
+    table = np.genfromtxt(tmp_path / "energies.csv", delimiter=",", names=True)
+    assert len(list((tmp_path / "frames").glob("*.png"))) == 3
+    assert table["clearance"].min() > 0
+    last = sorted((tmp_path / "snapshots").glob("*.npz"))[-1]
+    with np.load(last) as saved:
+        before = saved["x"]
+    last.unlink()
+    assert CliRunner().invoke(app, ["sph", *options]).exit_code == 0
+    with np.load(last) as saved:
+        np.testing.assert_allclose(saved["x"], before, atol=1e-6)

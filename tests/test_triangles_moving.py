@@ -1,0 +1,105 @@
+"""Walls that are deformed or turn, inside compiled programs, and particles that are spread over devices."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from jfrnn.cases import meshes
+
+import jfrnn
+
+BACKENDS = [pytest.param("jax", marks=pytest.mark.slow), "warp"]
+pytestmark = pytest.mark.usefixtures("compiled_soon")
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_wall_that_is_deformed(backend):
+    """In a scan, searched for in each step from traced corners, and by updates of a list: all that exact arithmetic finds."""
+    vertices, faces = meshes.cube(2.0, 1)
+    vertices = vertices.astype(np.float32)
+    random = np.random.default_rng(0)
+    x, bump = (random.uniform(-1.5, 1.5, size).astype(np.float32) for size in ((24, 3), vertices.shape))
+    first = jfrnn.search_triangles(x, vertices, faces, 0.5, capacity=12, backend=backend)
+
+    @jax.jit
+    def steps(x, vertices, tri):
+        def step(carry, _):
+            corners, tri = carry
+            corners = corners + 0.2 * bump
+            tri = tri.update(x, vertices=corners)
+            fresh = jfrnn.search_triangles(x, corners, tri.faces, 0.5, capacity=12, backend=backend)
+            return (corners, tri), (corners, tri.idx, tri.count, fresh.idx, fresh.count)
+
+        return jax.lax.scan(step, (vertices, tri), None, length=3)[1]
+
+    for corners, idx, count, fresh_idx, fresh_count in zip(*(np.asarray(a) for a in steps(x, vertices, first))):
+        expected = reference.triangle_pairs(x, corners, faces, 0.5)
+        assert expected
+        missing, extra = reference.compare(reference.pairs_of(idx, count, len(faces)), expected)
+        assert (len(missing), len(extra)) == (0, 0)
+        assert np.array_equal(idx, fresh_idx)
+        assert np.array_equal(count, fresh_count)
+
+
+def test_particles_in_the_frame_of_a_wall_that_turns():
+    """A quarter turn is exact; another angle moves distances by rounding alone."""
+    vertices, faces = meshes.gear(6, 200, 1.0, 2.0, 3.0)
+    x = np.random.default_rng(1).uniform(-4, 4, (150, 3))
+
+    @jax.jit
+    def both(x, turn, corners):
+        moved = jfrnn.search_triangles(x, corners @ turn.T, jnp.asarray(faces), 0.6, capacity=96)
+        still = jfrnn.search_triangles(x @ turn, corners, jnp.asarray(faces), 0.6, capacity=96)
+        return moved, still, moved.signed_distance(x), still.signed_distance(x @ turn)
+
+    for angle in (np.pi / 2, 0.7):
+        c, s = (0.0, 1.0) if angle == np.pi / 2 else (np.cos(angle), np.sin(angle))
+        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+        moved, still, there, here = both(x, turn, vertices)
+        assert not moved.overflow
+        assert int(moved.count.sum()) > 100
+        if c == 0:
+            assert np.array_equal(np.sort(moved.idx, axis=1), np.sort(still.idx, axis=1))
+        assert np.array_equal(moved.count, still.count)
+        np.testing.assert_allclose(there.distance, here.distance, atol=1e-14)
+        clear = np.asarray(there.mask) & (np.abs(there.distance) > 1e-3)
+        np.testing.assert_allclose(np.asarray(there.normal)[clear], np.asarray(here.normal @ turn.T)[clear], atol=1e-10)
+
+
+SPREAD = """
+import jax, jfrnn, numpy as np, sys
+from jax.sharding import Mesh, PartitionSpec as P
+from jfrnn.cases import meshes
+
+vertices, faces = meshes.gear(8, 300)
+vertices = vertices.astype(np.float32)
+x = np.random.default_rng(0).uniform(vertices.min(0) - 0.5, vertices.max(0) + 0.5, (256, 3)).astype(np.float32)
+
+def near(x, vertices, faces):
+    tri = jfrnn.search_triangles(x, vertices, faces, 0.6, capacity=64, backend=sys.argv[1])
+    return tri.idx, tri.count, jax.lax.pmax(tri.required, "particles")
+
+found = []
+for devices in (1, 4):
+    mesh = Mesh(np.array(jax.devices()[:devices]), ("particles",))
+    spread = P("particles")
+    call = jax.shard_map(near, mesh=mesh, in_specs=(spread, P(), P()), out_specs=(spread, spread, P()), check_vma=False)
+    found.append([np.asarray(a) for a in jax.jit(call)(x, vertices, faces)])
+assert all(np.array_equal(one, four) for one, four in zip(*found)), "not the same"
+assert np.array_equal(jfrnn.search_triangles(x, vertices, faces, 0.6, capacity=64).idx, found[0][0])
+print(found[0][1].sum())
+"""
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_one_and_four_devices_find_the_same(backend):
+    """Particles spread, the wall on every device: bit for bit."""
+    given = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
+    run = subprocess.run([sys.executable, "-c", SPREAD, backend], env=given, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert int(run.stdout.split()[-1]) > 500
