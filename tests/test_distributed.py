@@ -15,7 +15,6 @@ CHECKS, SPH, PROCESS = HERE / "distributed_checks.py", HERE / "distributed_sph.p
 QUICK = {  # the others compile longer
     "pairs_on_1_and_8_devices",
     "particles_move_across_several_shards",
-    "room_that_is_missing_is_told_and_made",
     "sums_and_their_gradients",
     "wrong_arguments_are_named",
 }

@@ -41,6 +41,7 @@ def test_rows_of_a_tiny_run(tmp_path):
     for row in rows[:2]:
         assert row["particles"] == 216
         assert row["pairs"] == row["pairs_of_one"] > 216 * 20
+        assert row["differing"] == 0
         assert row["median_s"] > 0
     assert (rows[0]["sent_bytes"], rows[0]["halo"]) == (0, 0)
     halo = rows[1]["halo"]
@@ -60,9 +61,10 @@ def test_all_kinds_of_work(tmp_path):
 
 
 def test_configs_can_be_read():
-    for name in ("distributed_smoke", "distributed_h200"):
+    for name in ("distributed_smoke", "distributed_cpu", "distributed_h200", "distributed_h200_x2"):
         config = load(ROOT / "experiments" / "configs" / f"{name}.toml", _distributed.Config)
-        assert len({spec.key for spec in config.specs()}) == 2 * 3 * len(config.axes) * len(config.devices)
+        rows = len(config.scaling) * len(config.work) * len(config.axes) * len(config.devices)
+        assert len({spec.key for spec in config.specs()}) == rows
 
 
 def test_bytes_that_a_program_sends():
