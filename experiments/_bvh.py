@@ -1,5 +1,8 @@
 """A mesh as Warp holds it, in a tree of boxes, on the CPU: its nearest point within a cutoff, and how many boxes are as near."""
 
+# pyright: reportInvalidTypeForm=false, reportAttributeAccessIssue=false, reportArgumentType=false
+# (what Warp's language is made of)
+
 from collections.abc import Callable
 
 import numpy as np
