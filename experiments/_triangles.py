@@ -128,8 +128,8 @@ def _libigl(scene: _Scene) -> _Asked:
     import igl  # pyright: ignore[reportMissingImports]
 
     points, vertices = scene.points.astype(np.float64), scene.vertices.astype(np.float64)
-    (square, *_), *times = _repeated(lambda: igl.point_mesh_squared_distance(points, vertices, scene.faces))
-    return _Asked(np.arange(len(points)), np.sqrt(square), *times)
+    (square, *_), seconds, processor = _repeated(lambda: igl.point_mesh_squared_distance(points, vertices, scene.faces))
+    return _Asked(np.arange(len(points)), np.sqrt(square), seconds, processor)
 
 
 def _trimesh(scene: _Scene) -> _Asked:
@@ -138,8 +138,8 @@ def _trimesh(scene: _Scene) -> _Asked:
     mesh = trimesh.Trimesh(scene.vertices.astype(np.float64), scene.faces, process=False)
     asked = np.arange(min(_FEW, len(scene.points)))
     points = scene.points[asked].astype(np.float64)
-    (_, distance, _), *times = _repeated(lambda: trimesh.proximity.closest_point(mesh, points))
-    return _Asked(asked, distance, *times)
+    (_, distance, _), seconds, processor = _repeated(lambda: trimesh.proximity.closest_point(mesh, points))
+    return _Asked(asked, distance, seconds, processor)
 
 
 def _trees(scene: _Scene, cutoff: float) -> dict[str, _Asked]:
@@ -150,9 +150,12 @@ def _trees(scene: _Scene, cutoff: float) -> dict[str, _Asked]:
 
     everyone = np.arange(len(scene.points))
     nearest, boxes = _bvh.calls(scene.points, scene.vertices, scene.faces, cutoff)
-    found, *times = _repeated(nearest)
-    _, *taken = _repeated(boxes)
-    return {"wp.Mesh nearest": _Asked(everyone, found, *times), "wp.Mesh boxes": _Asked(everyone[:0], found[:0], *taken)}
+    found, seconds, processor = _repeated(nearest)
+    _, taken, busy = _repeated(boxes)
+    return {
+        "wp.Mesh nearest": _Asked(everyone, found, seconds, processor),
+        "wp.Mesh boxes": _Asked(everyone[:0], found[:0], taken, busy),
+    }
 
 
 def _repeated(call: Callable[[], Any]) -> tuple[Any, list[float], float]:
