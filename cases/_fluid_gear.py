@@ -29,7 +29,7 @@ def jet_gear(
 
     Args:
         diameter: Of the jet [m].
-        layers: Particles along it; 8 make 5 000 particles, 52 make 1.4 million.
+        layers: Particles along it; 8 make 5 500 particles, 52 make 1.5 million.
         speed: At the nozzle [m/s].
         rate: At which the gear turns [rad/s]; 0: it stands.
         teeth: Of the gear.

@@ -1,7 +1,7 @@
 """A mesh as Warp holds it, in a tree of boxes, on the CPU: its nearest point within a cutoff, and how many boxes are as near."""
 
-# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportAttributeAccessIssue=false
-# (types of Warp's kernels are values)
+# pyright: reportInvalidTypeForm=false, reportAttributeAccessIssue=false, reportArgumentType=false
+# (what Warp's language is made of)
 
 from collections.abc import Callable
 

@@ -4,6 +4,7 @@ import csv
 import importlib.util
 from collections.abc import Callable
 from pathlib import Path
+from time import process_time
 from typing import Any, NamedTuple
 
 import jax
@@ -16,11 +17,33 @@ import jfrnn
 from experiments import _machine, _measure
 
 COLUMNS = (
-    *("method", "n", "faces", "cutoff", "pairs", "longest_row", "rounds", "median_s", "p10_s", "p90_s", "us_per_particle"),
+    *(
+        "method",
+        "n",
+        "faces",
+        "cutoff",
+        "pairs",
+        "longest_row",
+        "rounds",
+        "median_s",
+        "p10_s",
+        "p90_s",
+        "us_per_particle",
+        "processor_s",
+    ),
     *("missing", "extra", "others_cores", "jax", "warp", "peer", "commit", "dirty"),
 )
 _FEW = 2_000  # points that a peer is asked for whose time would be minutes
 _CURVES = ("row", "morton", "hilbert")
+
+
+class _Asked(NamedTuple):
+    """What a peer says of the points `which`: their distances; and seconds of its runs, and of processors per run."""
+
+    which: np.ndarray
+    distance: np.ndarray
+    seconds: list[float]
+    processor: float
 
 
 class _Scene(NamedTuple):
@@ -60,21 +83,22 @@ def measure(folder: Path, n: int, faces: int, rounds: int, backend: str, cutoffs
             near = np.asarray(tri.count) > 0
             common = {"faces": len(scene.faces), "cutoff": cutoff, "others_cores": others, **_versions()}
             row = {"n": n, "pairs": int(tri.count.sum()), "longest_row": int(tri.required)}
-            for way in calls:
-                writer.writerow(common | row | {"method": f"jfrnn {way}"} | _timed(seconds[way], n))
-            for name, (asked, distance, taken) in (peers | _trees(scene, cutoff)).items():
+            for way, call in calls.items():
+                _, _, processor = _repeated(lambda call=call: jax.block_until_ready(call()))
+                writer.writerow(common | row | {"method": f"jfrnn {way}"} | _timed(seconds[way], n, processor))
+            for name, (asked, distance, taken, processor) in (peers | _trees(scene, cutoff)).items():
                 within = distance < cutoff
                 wrong = {"missing": int(np.sum(within & ~near[asked])), "extra": int(np.sum(near[asked] & ~within))}
                 if len(asked) == 0:
                     asked, wrong = scene.points, {}
                 row = {"n": len(asked), "method": name, "peer": _peer_version(name)} | wrong
-                writer.writerow(common | row | _timed(taken, len(asked)))
+                writer.writerow(common | row | _timed(taken, len(asked), processor))
     return path
 
 
 def table(path: Path) -> str:
     """Return the table of a run as text."""
-    columns = ["method", "n", "cutoff", "pairs", "longest_row", "median_s", "us_per_particle", "missing", "extra"]
+    columns = ["method", "n", "cutoff", "pairs", "longest_row", "median_s", "processor_s", "us_per_particle", "missing", "extra"]
     return pd.read_csv(path)[columns].to_string(index=False, na_rep="")
 
 
@@ -100,25 +124,25 @@ def _calls(scene: _Scene, cutoff: float, backend: str) -> tuple[dict[str, Callab
     return calls, tri
 
 
-def _libigl(scene: _Scene) -> tuple[np.ndarray, np.ndarray, list[float]]:
+def _libigl(scene: _Scene) -> _Asked:
     import igl  # pyright: ignore[reportMissingImports]
 
     points, vertices = scene.points.astype(np.float64), scene.vertices.astype(np.float64)
-    (square, *_), seconds = _measure.repeat(lambda: igl.point_mesh_squared_distance(points, vertices, scene.faces), 3, 0.0, 3)
-    return np.arange(len(points)), np.sqrt(square), seconds
+    (square, *_), seconds, processor = _repeated(lambda: igl.point_mesh_squared_distance(points, vertices, scene.faces))
+    return _Asked(np.arange(len(points)), np.sqrt(square), seconds, processor)
 
 
-def _trimesh(scene: _Scene) -> tuple[np.ndarray, np.ndarray, list[float]]:
+def _trimesh(scene: _Scene) -> _Asked:
     import trimesh
 
     mesh = trimesh.Trimesh(scene.vertices.astype(np.float64), scene.faces, process=False)
     asked = np.arange(min(_FEW, len(scene.points)))
     points = scene.points[asked].astype(np.float64)
-    (_, distance, _), seconds = _measure.repeat(lambda: trimesh.proximity.closest_point(mesh, points), 3, 0.0, 3)
-    return asked, distance, seconds
+    (_, distance, _), seconds, processor = _repeated(lambda: trimesh.proximity.closest_point(mesh, points))
+    return _Asked(asked, distance, seconds, processor)
 
 
-def _trees(scene: _Scene, cutoff: float) -> dict[str, tuple[np.ndarray, np.ndarray, list[float]]]:
+def _trees(scene: _Scene, cutoff: float) -> dict[str, _Asked]:
     """Ask the tree of boxes that Warp has of a mesh, by name of the way; empty where Warp is missing."""
     if importlib.util.find_spec("warp") is None:
         return {}
@@ -126,12 +150,23 @@ def _trees(scene: _Scene, cutoff: float) -> dict[str, tuple[np.ndarray, np.ndarr
 
     everyone = np.arange(len(scene.points))
     nearest, boxes = _bvh.calls(scene.points, scene.vertices, scene.faces, cutoff)
-    found, times = _measure.repeat(nearest, 3, 0.0, 3)
-    _, taken = _measure.repeat(boxes, 3, 0.0, 3)
-    return {"wp.Mesh nearest": (everyone, found, times), "wp.Mesh boxes": (everyone[:0], found[:0], taken)}
+    found, seconds, processor = _repeated(nearest)
+    _, taken, busy = _repeated(boxes)
+    return {
+        "wp.Mesh nearest": _Asked(everyone, found, seconds, processor),
+        "wp.Mesh boxes": _Asked(everyone[:0], found[:0], taken, busy),
+    }
 
 
-_PEERS: dict[str, Callable[[_Scene], tuple[np.ndarray, np.ndarray, list[float]]]] = {
+def _repeated(call: Callable[[], Any]) -> tuple[Any, list[float], float]:
+    """Return a result, the seconds of three runs, and those of all processors per run, which other work disturbs less."""
+    call()
+    begin = process_time()
+    result, seconds = _measure.repeat(call, 3, 0.0, 3)
+    return result, seconds, (process_time() - begin) / len(seconds)
+
+
+_PEERS: dict[str, Callable[[_Scene], _Asked]] = {
     "libigl": _libigl,
     "trimesh": _trimesh,
 }
@@ -143,10 +178,15 @@ def _peer_version(name: str) -> str:
     return str(_machine.versions([package])[package])
 
 
-def _timed(seconds: list[float], n: int) -> dict[str, Any]:
+def _timed(seconds: list[float], n: int, processor: float) -> dict[str, Any]:
     said = _measure.summarize(seconds)
     times = {name: f"{said[name]:.3e}" for name in ("median_s", "p10_s", "p90_s")}
-    return {"rounds": said["repeats"], **times, "us_per_particle": f"{1e6 * said['median_s'] / n:.3g}"}
+    return {
+        "rounds": said["repeats"],
+        **times,
+        "us_per_particle": f"{1e6 * said['median_s'] / n:.3g}",
+        "processor_s": f"{processor:.3e}",
+    }
 
 
 def _versions() -> dict[str, Any]:

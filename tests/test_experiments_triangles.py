@@ -14,7 +14,9 @@ def test_a_small_comparison(tmp_path):
     rows = pd.read_csv(path)
     assert list(rows["method"])[:3] == ["jfrnn update", "jfrnn rebuild", "jfrnn count"]
     assert "trimesh" in set(rows["method"])
-    peers = rows[rows["method"].isin(["trimesh", "libigl"])]
+    assert "jfrnn update, hilbert order" in set(rows["method"])
+    assert (rows["processor_s"] > 0).all()
+    peers = rows[rows["method"].isin(["trimesh", "libigl", "wp.Mesh nearest"])]
     assert not peers[["missing", "extra"]].to_numpy().any()
     assert "us_per_particle" in _triangles.table(path)
 

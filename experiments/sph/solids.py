@@ -241,7 +241,8 @@ def push(model: "Model", s: "State", beside: Beside, rho: Array, p: Array) -> Ar
     """Return what the wall adds to accelerations [m/s²], shape [n, d].
 
     Pressure: 2p/ρ A n - (g - a_wall)·n (d A + Γ) n, the wall's pressure being that of the particle, carried on by what acts on the
-    fluid. Viscosity, where the fluid is held: -2ν A/d (v - v_wall), that of a velocity which changes its sign at the wall.
+    fluid; none where that would pull: single particles, less dense than at rest, would run along the wall and around its edges.
+    Viscosity, where the fluid is held: -2ν A/d (v - v_wall), that of a velocity which changes its sign at the wall.
     Source: Adami, Hu & Adams (2012), doi:10.1016/j.jcp.2012.05.005, eq. 23, for the pressure in the wall; Morris, Fox & Zhu (1997),
     doi:10.1006/jcph.1997.5776, eqs. 22 and 28; both integrated over a half-space.
     """
@@ -252,7 +253,7 @@ def push(model: "Model", s: "State", beside: Beside, rho: Array, p: Array) -> Ar
         body = -wall.acceleration if body is None else body - wall.acceleration
     if body is not None:
         along = along - jnp.sum(body * wall.normal, axis=1) * (wall.distance * wall.area + wall.weight)
-    a = along[:, None] * wall.normal
+    a = jnp.maximum(along, 0)[:, None] * wall.normal
     if physics.viscosity is not None and not physics.slip:
         a = a - (2 * physics.viscosity * wall.area / jnp.maximum(wall.distance, model.spacing / 2))[:, None] * wall.slip
     return a
