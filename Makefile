@@ -9,7 +9,7 @@ OUT    ?= out/thesis
 PROCESSES ?= 1
 STAMP  := $(VENV)/.installed
 
-.PHONY: sweep peers notebooks test test-slow lint clean
+.PHONY: sweep sweeps peers notebooks test test-slow lint clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml
@@ -22,6 +22,15 @@ $(STAMP): pyproject.toml
 sweep: $(STAMP)
 	$(PY) -m experiments run experiments/configs/thesis.toml --out $(OUT) --processes $(PROCESSES)
 	$(PY) -m experiments report $(OUT)
+
+# Hours: five processes of each row of Table 6.1, then every other question, into the folders that the notebooks read.
+SWEEPS := orientation motion cluster_size domain cutoff order size size_large fill
+sweeps: $(STAMP)
+	$(PY) -m experiments run experiments/configs/thesis.toml --out experiments/results/thesis_cpu
+	$(PY) -m experiments report experiments/results/thesis_cpu
+	for each in $(SWEEPS); do \
+	  $(PY) -m experiments run experiments/configs/sweep_$$each.toml --out experiments/results/sweep_$$each && \
+	  $(PY) -m experiments report experiments/results/sweep_$$each || exit 1; done
 
 peers: $(STAMP)
 	$(PY) -m pip install --quiet --editable '.[peers]'
