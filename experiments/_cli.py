@@ -28,6 +28,16 @@ def _usage_errors() -> Iterator[None]:
         raise typer.Exit(2) from error
 
 
+@contextmanager
+def _stoppable(start: str = "here") -> Iterator[None]:
+    """Where the user stops what keeps its rows, say where the same command goes on, and exit with code 130."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo(f"stopped; the same command goes on from {start}", err=True)
+        raise typer.Exit(130) from None
+
+
 @app.command()
 def run(
     config: Annotated[Path, typer.Argument(help="Sweep config, TOML.")],
@@ -45,11 +55,8 @@ def run(
         folder = folder if parts == 1 else folder / f"shard-{part}-of-{parts}"
         given = _config.load(config)
         given = given if processes is None else given.model_copy(update={"processes": processes})
-        try:
+        with _stoppable():
             rows = _sweep.run(given, config.stem, folder, retry_failed, (part, parts))
-        except KeyboardInterrupt:
-            typer.echo("stopped; the same command goes on from here", err=True)
-            raise typer.Exit(130) from None
         good = sum(row.status == "ok" for row in rows)
         typer.echo(f"{good} of {len(rows)} rows ok, {len(rows) - good} with a reason; rows in {folder / 'rows.jsonl'}")
 
@@ -189,11 +196,8 @@ def sums(
         from experiments import _config, _sums, _sums_report
 
         folder = out or Path("out") / config.stem
-        try:
+        with _stoppable():
             rows = _sums.run(_config.load(config, _sums.Config), folder, retry_failed)
-        except KeyboardInterrupt:
-            typer.echo("stopped; the same command goes on from here", err=True)
-            raise typer.Exit(130) from None
         typer.echo(_sums_report.report(rows, folder))
 
 
@@ -209,11 +213,8 @@ def over_devices(
 
         given, folder = _config.load(config, _distributed.Config), out or Path("out") / config.stem
         _distributed.prepare(given)
-        try:
+        with _stoppable():
             rows = _distributed.run(given, folder, retry_failed)
-        except KeyboardInterrupt:
-            typer.echo("stopped; the same command goes on from here", err=True)
-            raise typer.Exit(130) from None
         typer.echo(_distributed.report(rows, folder))
 
 
@@ -243,11 +244,8 @@ def sph(
         fluid = sph_settings.make_scene(scene, settings or [])
         fluid = fluid if initial is None else sph_settings.with_particles(fluid, initial)
         folder = out or Path("out") / "sph" / scene
-        try:
+        with _stoppable("the last snapshot"):
             sph_run.run(fluid, folder, sph_run.How(frames, dtype, neighbors, skin, pictures))
-        except KeyboardInterrupt:
-            typer.echo("stopped; the same command goes on from the last snapshot", err=True)
-            raise typer.Exit(130) from None
         typer.echo(folder)
 
 
@@ -263,11 +261,8 @@ def sph_validate(
         jax.config.update("jax_enable_x64", True)
         from experiments.sph import validate
 
-        try:
+        with _stoppable():
             rows = validate.run(cases or [], out)
-        except KeyboardInterrupt:
-            typer.echo("stopped; the same command goes on from here", err=True)
-            raise typer.Exit(130) from None
         typer.echo(validate.report(rows, out))
 
 
@@ -286,11 +281,8 @@ def sph_speed(
 
         given, folder = _config.load(config, speed.Config), out or Path("out") / config.stem
         jax.config.update("jax_enable_x64", given.dtype == "float64")
-        try:
+        with _stoppable():
             rows = speed.run(given, folder, retry_failed)
-        except KeyboardInterrupt:
-            typer.echo("stopped; the same command goes on from here", err=True)
-            raise typer.Exit(130) from None
         typer.echo(speed_report.report(rows, folder))
 
 

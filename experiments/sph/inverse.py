@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -129,15 +129,13 @@ def _jet_scene(spacing: float = 0.02, rows: int = 6, height: float = 0.3, speed:
     across = lattice((0.0, height - 1.5 * spacing), (1, 3), spacing)
     positions = np.tile(across, (rows, 1))
     physics = replace(free(1000.0, 10 * speed, spacing), artificial=0.1, gravity=(0.0, -9.81))
-    return fluids.FluidScene(
-        name="thrown jet",
-        positions=positions,
-        velocities=np.zeros_like(positions),
-        masses=np.full(len(positions), 1000.0 * spacing**2),
-        spacing=spacing,
+    return _at_rest(
+        "thrown jet",
+        positions,
+        spacing,
+        physics=physics,
         duration=0.5,
         step=0.25 * physics.smoothing / (12 * speed),
-        physics=physics,
         enters=np.repeat(np.arange(rows) * spacing / speed, len(across)),
         guided=spacing / speed,
     )
@@ -203,16 +201,22 @@ def droplet_scene(spacing: float = 0.04 / 3, radius: float = 0.04, length: float
     ground = lattice((-0.15, -LAYERS * spacing), (round(length / spacing), LAYERS), spacing)
     positions = np.concatenate([disc, ground])
     physics = replace(free(1000.0, 8.0, spacing), artificial=0.2, gravity=(0.0, -9.81))
-    return fluids.FluidScene(
-        name="steered droplet",
-        positions=positions,
-        velocities=np.zeros_like(positions),
-        masses=np.full(len(positions), 1000.0 * spacing**2),
-        spacing=spacing,
+    return _at_rest(
+        "steered droplet",
+        positions,
+        spacing,
+        physics=physics,
         duration=0.3,
         step=0.25 * physics.smoothing / (1.2 * physics.sound_speed),
-        physics=physics,
         wall=np.arange(len(positions)) >= len(disc),
+    )
+
+
+def _at_rest(name: str, positions: np.ndarray, spacing: float, **more: Any) -> "FluidScene":  # noqa: ANN401
+    """Return a scene of particles that do not move, a square of the spacing [m] of water each; `more`: further fields."""
+    masses = np.full(len(positions), 1000.0 * spacing**2)
+    return fluids.FluidScene(
+        name=name, positions=positions, velocities=np.zeros_like(positions), masses=masses, spacing=spacing, **more
     )
 
 
