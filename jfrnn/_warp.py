@@ -321,7 +321,8 @@ def callable_of(name: str, run: Callable[..., None], types: dict[str, Any], outp
     func.__name__ = func.__qualname__ = name
     wp = load_warp()
     _finish_before_exit()
-    _load_on_cpu(wp.get_module(__name__))  # which XLA's threads would do otherwise
+    if jax.default_backend() == "cpu":
+        _load_on_cpu(wp.get_module(__name__))  # which XLA's threads would do otherwise
     return wp.jax_callable(func, num_outputs=outputs, graph_mode=wp.JaxCallableGraphMode.NONE, vmap_method="sequential")
 
 

@@ -497,6 +497,25 @@ auto load_word = [](unsigned int at) {
     asm volatile("ld.shared.u32 %0, [%1];" : "=r"(word) : "r"(at) : "memory");
     return word;
 };
+// what lanes without anything to do skip by a predicate: it costs less than a branch around it
+auto store_if = [](bool is_stored, unsigned int to, unsigned int word) {
+    asm volatile("{.reg .pred is; setp.ne.u32 is, %0, 0; @is st.shared.u32 [%1], %2;}"
+                 : : "r"((unsigned int)is_stored), "r"(to), "r"(word) : "memory");
+};
+auto load_if = [&](bool is_loaded, const Place* from, auto& to) {
+    if constexpr (sizeof(to.id) == 8) {
+        if (is_loaded)
+            to = load(from);
+    } else if constexpr (SUMS)  // not the id, which nobody asks for: its register would be given away, and who takes it would wait
+        asm volatile("{.reg .pred is; setp.ne.u32 is, %3, 0; @is ld.global.nc.f32 %0, [%4];"
+                     "@is ld.global.nc.f32 %1, [%4 + 4]; @is ld.global.nc.f32 %2, [%4 + 8];}"
+                     : "+f"(to.p[0]), "+f"(to.p[1]), "+f"(to.p[2])
+                     : "r"((unsigned int)is_loaded), "l"(__cvta_generic_to_global(from)));
+    else
+        asm volatile("{.reg .pred is; setp.ne.u32 is, %4, 0; @is ld.global.nc.v4.f32 {%0, %1, %2, %3}, [%5];}"
+                     : "+f"(to.p[0]), "+f"(to.p[1]), "+f"(to.p[2]), "+f"(to.id)
+                     : "r"((unsigned int)is_loaded), "l"(__cvta_generic_to_global(from)));
+};
 // factor * x as a sum of two halves: exact but for 2^-22 of it and what is too small for a half
 auto halves = [](float x, float factor) -> unsigned int {
     const float high = __uint_as_float(__float_as_uint(x) & 0xffffe000u), low = x - high;
@@ -753,25 +772,27 @@ while (place < stop) {
     unsigned int kept = 0, tested = 0;
     if constexpr (LIST)
         warp.written[lane] = 0;
-    auto keep = [&](const Place& candidate, const real* from_center, unsigned int number) {
-        if constexpr (DOUBLE)
+    auto keep = [&](bool is_near, const Place& candidate, const real* from_center, unsigned int number) {
+        if constexpr (DOUBLE) {
+            if (is_near)
 #pragma unroll
-            for (int a = 0; a < DIM; ++a)
-                warp.candidates[a][number % RING] = candidate.p[a];
-        else {
+                for (int a = 0; a < DIM; ++a)
+                    warp.candidates[a][number % RING] = candidate.p[a];
+        } else {
+            const unsigned int column = shared_address(warp.candidates[0]) + 4 * (number % RING);
             float square = 0;
 #pragma unroll
             for (int a = 0; a < 3; ++a) {
                 const float x = a < DIM ? (float)from_center[a] : 0;
                 square += x * x;
-                warp.candidates[a][number % RING] = __uint_as_float(halves(x, 1));
+                store_if(is_near, column + (unsigned int)sizeof(warp.candidates[0]) * a, halves(x, 1));
             }
-            warp.candidates[3][number % RING] = __uint_as_float(halves(square, 1));
+            store_if(is_near, column + (unsigned int)sizeof(warp.candidates[0]) * 3, halves(square, 1));
         }
         if constexpr (LATER || !HELD)
-            warp.candidate_ids[number % RING] = id_of(candidate.id);
+            store_if(is_near, shared_address(warp.candidate_ids) + 4 * (number % RING), (unsigned int)id_of(candidate.id));
         if constexpr (HELD)
-            warp.ids[number] = id_of(candidate.id);
+            store_if(is_near, shared_address(warp.ids) + 4 * number, (unsigned int)id_of(candidate.id));
     };
     // queries as rows of matrices, see meet: those of a quad of lanes, whose lanes hold one column each
     unsigned int rows_high[4] = {0, 0, 0, 0}, rows_low[4] = {0, 0, 0, 0};
@@ -847,8 +868,7 @@ while (place < stop) {
         Place at_home = mine;
         if constexpr (PERIODIC == 2 || SUMS)
             at_home.id = bits_as_real(id_of_image(SUMS ? place + lane : my_id, home));
-        if (lane < group)
-            keep(at_home, mine_from_center, lane);
+        keep(lane < group, at_home, mine_from_center, lane);
         kept = group;
     }
     unsigned int met_in = 0;  // blocks that have a neighbor of this query, a bit each
@@ -879,10 +899,44 @@ while (place < stop) {
                 runs_of[k] = taken ? (int)(run - warp.runs) - 1 : 0;  // what is not taken is infinite: moved by what is finite, too
                 taken = taken && (warp.run_images[runs_of[k]] != home || (unsigned int)(at - place) >= (own ? group : 0));
             }
-            if (taken)
-                candidates[k] = load(sorted + at);
+            load_if(taken, sorted + at, candidates[k]);
             if constexpr (SUMS)
                 candidates[k].id = bits_as_real(at);
+        }
+    };
+    // What is met goes on with, while something else needs the registers: a callee, who cannot use those that hold something across
+    // the call, or what is done with many pairs at once. Few are left, so memory holds it.
+    volatile unsigned int aside[4 * FETCHED + 8];
+    auto put_aside = [&]() {
+        if constexpr (!DOUBLE) {
+#pragma unroll
+            for (int k = 0; k < FETCHED; ++k) {
+#pragma unroll
+                for (int a = 0; a < DIM; ++a)
+                    aside[4 * k + a] = __float_as_uint((float)candidates[k].p[a]);
+                aside[4 * k + 3] = __float_as_uint((float)candidates[k].id);
+            }
+#pragma unroll
+            for (int k = 0; k < 4; ++k) {
+                aside[4 * FETCHED + k] = rows_high[k];
+                aside[4 * FETCHED + 4 + k] = rows_low[k];
+            }
+        }
+    };
+    auto take_back = [&]() {
+        if constexpr (!DOUBLE) {
+#pragma unroll
+            for (int k = 0; k < FETCHED; ++k) {
+#pragma unroll
+                for (int a = 0; a < DIM; ++a)
+                    candidates[k].p[a] = __uint_as_float(aside[4 * k + a]);
+                candidates[k].id = __uint_as_float(aside[4 * k + 3]);
+            }
+#pragma unroll
+            for (int k = 0; k < 4; ++k) {
+                rows_high[k] = aside[4 * FETCHED + k];
+                rows_low[k] = aside[4 * FETCHED + 4 + k];
+            }
         }
     };
     for (bool finished = false; !finished;) {
@@ -922,8 +976,7 @@ while (place < stop) {
 #pragma unroll
             for (int k = 0; k < FETCHED; ++k) {
                 const unsigned int all_near = __ballot_sync(ALL, near[k]);
-                if (near[k])
-                    keep(candidates[k], p[k], kept + __popc(all_near & lanes_below));
+                keep(near[k], candidates[k], p[k], kept + __popc(all_near & lanes_below));
                 kept += __popc(all_near);
             }
             fetched += 32 * FETCHED;
@@ -988,22 +1041,7 @@ while (place < stop) {
             hits &= met;
             open &= met;
             if (__any_sync(ALL, open)) {
-                // registers that hold something across a call cannot be the callee's: few are left, so memory holds it
-                volatile unsigned int saved[4 * FETCHED + 8];
-                if constexpr (!DOUBLE) {
-#pragma unroll
-                    for (int k = 0; k < FETCHED; ++k) {
-#pragma unroll
-                        for (int a = 0; a < DIM; ++a)
-                            saved[4 * k + a] = __float_as_uint((float)candidates[k].p[a]);
-                        saved[4 * k + 3] = __float_as_uint((float)candidates[k].id);
-                    }
-#pragma unroll
-                    for (int k = 0; k < 4; ++k) {
-                        saved[4 * FETCHED + k] = rows_high[k];
-                        saved[4 * FETCHED + 4 + k] = rows_low[k];
-                    }
-                }
+                put_aside();
                 const Place query = DOUBLE || CROSSING ? mine : open ? load_query(place + lane) : Place{{0, 0, 0}, 0};
                 for (; open; open &= open - 1) {
                     const int j = __ffs(open) - 1;
@@ -1022,20 +1060,7 @@ while (place < stop) {
                     }
                     hits |= hit ? 1u << j : 0;
                 }
-                if constexpr (!DOUBLE) {
-#pragma unroll
-                    for (int k = 0; k < FETCHED; ++k) {
-#pragma unroll
-                        for (int a = 0; a < DIM; ++a)
-                            candidates[k].p[a] = __uint_as_float(saved[4 * k + a]);
-                        candidates[k].id = __uint_as_float(saved[4 * k + 3]);
-                    }
-#pragma unroll
-                    for (int k = 0; k < 4; ++k) {
-                        rows_high[k] = saved[4 * FETCHED + k];
-                        rows_low[k] = saved[4 * FETCHED + 4 + k];
-                    }
-                }
+                take_back();
             }
             found += __popc(hits);
             if constexpr (HELD) {
@@ -1048,9 +1073,12 @@ while (place < stop) {
         finished = last_ones && tested >= kept;
         if constexpr (HELD)
             if (finished || tested == 32 * BLOCKS) {
+                if (!finished)
+                    put_aside();
                 $settled
                 if (finished)
                     break;
+                take_back();
                 kept = kept > tested ? kept - tested : 0;
                 tested = 0;
                 // the candidates that are not tested yet, again, since lists stood there
@@ -1064,14 +1092,13 @@ while (place < stop) {
                 }
                 __syncwarp();
 #pragma unroll
-                for (int k = 0; k < FETCHED; ++k)
-                    if (32 * k + lane < kept) {
-                        real p[3];
+                for (int k = 0; k < FETCHED; ++k) {
+                    real p[3];
 #pragma unroll
-                        for (int a = 0; a < DIM; ++a)
-                            p[a] = from_center(left[k].p[a], warp.box.center[a]);
-                        keep(left[k], p, 32 * k + lane);
-                    }
+                    for (int a = 0; a < DIM; ++a)
+                        p[a] = from_center(left[k].p[a], warp.box.center[a]);
+                    keep(32 * k + lane < kept, left[k], p, 32 * k + lane);
+                }
             }
     }
     $done

@@ -183,7 +183,9 @@ auto add_pairs = [&](bool finished) {
     $values
     $started
     $held_pairs
-    // several pairs at once, and what is read of the next ones meanwhile: it takes longer than what is done with it
+    // Several pairs at once, and what is read of the next ones meanwhile: it takes longer than what is done with it. Two of them take
+    // turns, since to copy one would be to wait for it; and it is asked in between whether more is left, since the compiler puts
+    // what is loaded off until it is used, but not beyond that question.
     struct Taken {
         bool pairs[TAKEN];
         $fields
@@ -200,20 +202,25 @@ auto add_pairs = [&](bool finished) {
         $loaded
         advance();
     };
-    advance();
-    advance();
-    Taken now;
-    take(now);
-    while (__any_sync(ALL, now.pairs[0])) {
-        Taken next;
-        take(next);
+    auto evaluate = [&](const Taken& now) {
 #pragma unroll
         for (int k = 0; k < TAKEN; ++k) {
             const bool is_pair = now.pairs[k];
             $row
             $term
         }
-        now = next;
+    };
+    advance();
+    advance();
+    Taken some, others;
+    take(some);
+    while (__any_sync(ALL, some.pairs[0])) {
+        take(others);
+        evaluate(some);
+        if (!__any_sync(ALL, others.pairs[0]))
+            break;
+        take(some);
+        evaluate(others);
     }
     $stored
     met_in = 0;
