@@ -144,7 +144,7 @@ def dam_break(
         depth: Of the tank in 3D, in column widths.
         duration: Time that is simulated [s].
         artificial: α of artificial viscosity. At 0.05 the water is nearly a perfect fluid, whose front is ahead of the experiment;
-            at 0.3, which was chosen among runs for that, it is with it.
+            at nx / 100, which was chosen among runs for that, it is with it.
 
     Source: Martin & Moyce (1952), doi:10.1098/rsta.1952.0006.
     """
