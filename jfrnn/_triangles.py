@@ -59,7 +59,8 @@ def search_triangles(
         `overflow` and `check` tell.
 
     Memory: 4 B per slot and particle for the list; 100 to 132 B per triangle for the cells, which the list keeps, whatever the
-    sizes of the triangles and of space. Differentiable: the list is topology, without gradient; see `TriangleList.closest`.
+    sizes of the triangles and of space; while "warp" lists on CUDA 12 B per particle, 0.6 kB per triangle (float64: 1.1) and at
+    most 58 MB. Differentiable: the list is topology, without gradient; see `TriangleList.closest`.
     Jit: yes, with capacity. vmap: yes, with capacity. `jax.shard_map`: yes, with particles spread and the wall on every device
     (`check_vma=False`). Source: strict cutoff (Peifle 2019, §2.2).
 
