@@ -50,6 +50,19 @@ class TriangleCase:
     build: Callable[[DTypeLike, int], TriangleInput]
 
 
+def padded(given: TriangleInput) -> TriangleInput:
+    """Return an input of the shape that all cases fit into, [48, dim], [96, dim], [32, dim], with the same pairs.
+
+    Particles that are not finite are near nothing, and so are faces without vertices.
+    """
+    dim, dtype = given.positions.shape[1], given.positions.dtype
+    positions, vertices = np.full((48, dim), np.nan, dtype), np.full((96, dim), np.nan, dtype)
+    faces = np.full((32, dim), -1, np.int32)
+    positions[: len(given.positions)], vertices[: len(given.vertices)] = given.positions, given.vertices
+    faces[: len(given.faces)] = np.where(given.faces < len(given.vertices), given.faces, -1)
+    return TriangleInput(positions, vertices, faces, given.cutoff)
+
+
 def _case(name: str, mechanism: str, recipe: Recipe) -> TriangleCase:
     def build(dtype: DTypeLike, dim: int) -> TriangleInput:
         kind = np.dtype(dtype)

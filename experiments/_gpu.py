@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, PositiveFloat, PositiveInt, ValidationError
 from tqdm import tqdm
 
-from experiments import _machine, _measure, _ways
+from experiments import _gpu_triangles, _machine, _measure, _ways
 from experiments._errors import UsageError
 from jfrnn._neighbors import rounded_capacity
 from jfrnn._warp import kernels_of, load_warp
@@ -34,7 +34,17 @@ class Exactness(BaseModel):
     dtypes: list[Literal["float32", "float64"]]
     dims: list[Literal[2, 3]]
     capacity: PositiveInt
-    cases: Literal["hard", "periodic", "radii", "batches"] = "hard"  # which table of jfrnn.cases
+    cases: Literal["hard", "periodic", "radii", "batches", "triangles"] = "hard"  # which table of jfrnn.cases
+
+
+class Triangles(BaseModel):
+    """Which lists of triangles around a gear are timed: every combination."""
+
+    model_config = Strict
+    points: list[PositiveInt]
+    faces: PositiveInt  # about
+    cutoffs: list[PositiveFloat]  # in modules
+    dtypes: list[Literal["float32", "float64"]]
 
 
 class Config(BaseModel):
@@ -54,6 +64,7 @@ class Config(BaseModel):
     repeats: PositiveInt
     seconds_per_timing: PositiveFloat
     exactness: list[Exactness]
+    triangles: list[Triangles] = []
 
 
 def load(path: Path) -> Config:
@@ -99,6 +110,10 @@ def _rows(config: Config) -> Iterator[dict[str, Any]]:
         yield _count_row(config, n)
         if config.sums:
             yield from _large_sum_rows(config, n)
+    for part in config.triangles:
+        for n, cutoff, dtype in itertools.product(part.points, part.cutoffs, part.dtypes):
+            timed = functools.partial(_timed, config)
+            yield from _gpu_triangles.rows(n, part.faces, cutoff, dtype, config.steps, timed)
 
 
 # --- scenes -----------------------------------------------------------------------------------------------------------
@@ -130,7 +145,14 @@ def _corners(config: Config, fill: float) -> np.ndarray:
 
 def _exactness_rows(config: Exactness) -> Iterator[dict[str, Any]]:
     decide = {"hard": _hard_decisions, "periodic": _periodic_decisions, "radii": _radii_decisions, "batches": _batch_decisions}
-    about = {"hard": "", "periodic": ", boxes", "radii": ", a cutoff per particle", "batches": ", batches"}
+    decide |= {"triangles": _triangle_decisions}
+    about = {
+        "hard": "",
+        "periodic": ", boxes",
+        "radii": ", a cutoff per particle",
+        "batches": ", batches",
+        "triangles": ", triangles",
+    }
     for dtype, dim in itertools.product(config.dtypes, config.dims):
         right = dict(decide[config.cases](config, dtype, dim))
         wrong = [name for name, is_right in right.items() if not is_right]
@@ -227,6 +249,10 @@ def _batch_decisions(config: Exactness, dtype: str, dim: int) -> Iterator[tuple[
         pairs = _oracle().reference_images(given.positions, given.cutoff, **about)
         expected = sorted(pair for pair in pairs if of_queries[pair[0]] == given.batch[pair[1]])
         yield f"{name}{'-closed' * closed}", _images(nbrs, x, queries) == expected
+
+
+def _triangle_decisions(config: Exactness, dtype: str, dim: int) -> Iterator[tuple[str, bool]]:
+    return _gpu_triangles.decisions(_oracle(), dtype, dim, config.capacity, config.backend)
 
 
 def _oracle() -> Any:  # noqa: ANN401

@@ -13,15 +13,19 @@ from matplotlib.figure import Figure
 from experiments._errors import UsageError
 
 OURS = "jfrnn warp"
+_TRIANGLE_KERNELS = ("prepare_s", "place_s", "fill_s", "allocate_s", "scatter_s", "query_s", "settle_s")
 
 
 def report(folder: Path) -> str:
-    """Write report.md and roofline.png beside the rows, and return the text."""
+    """Write report.md and, of searches, roofline.png beside the rows, and return the text."""
     path = folder / "rows.jsonl"
     if not path.exists():
         raise UsageError(f"{path} does not exist: run python -m experiments gpu CONFIG --out {folder} first")
     rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    text = "\n\n".join([_head(rows), _exactness(rows), _calls(rows), _sums(rows), _study(rows), _memory(rows)]) + "\n"
+    text = (
+        "\n\n".join([_head(rows), _exactness(rows), _calls(rows), _sums(rows), _study(rows), _memory(rows), _triangles(rows)])
+        + "\n"
+    )
     (folder / "report.md").write_text(text, encoding="utf-8")
     _draw(rows, folder / "roofline.png")
     return text
@@ -109,6 +113,18 @@ def _memory(rows: list[dict[str, Any]]) -> str:
     return "## Memory, planned and measured\n\n" + _markdown([{name: r[name] for name in names} for r in _of(rows, "memory")])
 
 
+def _triangles(rows: list[dict[str, Any]]) -> str:
+    table = []
+    for r in _of(rows, "triangles"):
+        stages = ", ".join(f"{name.removesuffix('_s')} {1e3 * r[name]:.3g}" for name in _TRIANGLE_KERNELS if name in r)
+        table.append({
+            "points": f"{r['points']:,}".replace(",", " "), "dtype": r["dtype"], "cutoff": r["cutoff"], "slots": r["capacity"],
+            "pairs": r["pairs"], "method": r["method"], "ms": f"{1e3 * r['median_s']:.4g}", "wrong rows": r["wrong"],
+            "kernels, ms": stages, "settled": r.get("settled", ""),
+        })  # fmt: skip
+    return "## Triangles around a gear\n\n" + _markdown(table)
+
+
 def _markdown(table: list[dict[str, Any]]) -> str:
     if not table:
         return "No rows."
@@ -125,6 +141,8 @@ def _draw(rows: list[dict[str, Any]], path: Path) -> None:
         of_method = sorted((row["points"], row["median_s"]) for row in calls if row["method"] == method)
         axes.plot(*zip(*((n, 1e9 * s / n) for n, s in of_method), strict=True), marker="o", label=method)
     lists = sorted({(row["points"], floor_seconds(row, copy)) for row in calls if row["method"] == OURS})
+    if not lists:
+        return
     axes.plot(*zip(*((n, 1e9 * s / n) for n, s in lists), strict=True), "k--", label="floor: bytes of the list / bandwidth")
     axes.set(xscale="log", yscale="log", xlabel="particles", ylabel="ns per particle")
     axes.grid(alpha=0.3, which="both")

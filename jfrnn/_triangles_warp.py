@@ -1,13 +1,17 @@
-"""Triangles with Warp's kernels inside JAX, on the CPU: what they are given, and how they are launched."""
+"""Triangles with Warp's kernels inside JAX, on the CPU and on CUDA: what they are given, and how they are launched.
+
+On CUDA the kernels list; cells are those of `jfrnn._triangles_cells`.
+"""
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn import _warp
+from jfrnn import _cuda, _triangles_cells, _warp
 from jfrnn._exact import Cutoff
 from jfrnn._triangles_cells import LANES, MOST_CELLS, TriangleCells, bucket_count, entry_count, level_limit
 
@@ -28,30 +32,54 @@ def sort_triangles(corners: Array, good: Array, cutoff: Cutoff) -> TriangleCells
     faces, dim = corners.shape[:2]
     sizes = {"start": bucket_count(faces) + 1, "triangles": entry_count(faces, dim), "levels": level_limit(np.dtype(corners.dtype))}
     sizes |= {"level_count": 1, "level_of": faces, "scratch": max(entry_count(faces, dim), 2048)}
-    radius = jnp.reshape(jnp.asarray(cutoff.radius), 1)
-    build = _build_callable(_Variant(dim, corners.dtype == jnp.float64, lists=True))
-    call = functools.partial(build, output_dims=sizes)
-    start, triangles, levels, level_count, level_of, _ = lax.platform_dependent(corners, good.astype(jnp.int32), radius, cpu=call)
-    return TriangleCells(start, triangles, levels, level_count[0], level_of)
+
+    def build(corners: Array, good: Array, cutoff: Cutoff) -> TriangleCells:
+        radius = jnp.reshape(jnp.asarray(cutoff.radius), 1)
+        call = _build_callable(_Variant(dim, corners.dtype == jnp.float64, lists=True))
+        start, triangles, levels, level_count, level_of, _ = call(corners, good.astype(jnp.int32), radius, output_dims=sizes)
+        return TriangleCells(start, triangles, levels, level_count[0], level_of)
+
+    return lax.platform_dependent(corners, good, cutoff, cpu=build, cuda=_triangles_cells.sort_triangles)
 
 
 def list_triangles(
     positions: Array, corners: Array, cells: TriangleCells, cutoff: Cutoff, capacity: int | None
 ) -> tuple[Array, Array]:
     """List the triangles near every particle, as `jfrnn._triangles_rows.list_triangles` does."""
-    (n, dim), slots = positions.shape, capacity or 0
-    finfo = jnp.finfo(corners.dtype)
+    variant = _Variant(positions.shape[1], positions.dtype == jnp.float64, capacity is not None)
+    on_cpu, on_cuda = (functools.partial(call, variant, capacity or 0) for call in (_query_on_cpu, _query_on_cuda))
+    return lax.platform_dependent(*query_inputs(positions, corners, cells, cutoff), cpu=on_cpu, cuda=on_cuda)
+
+
+def query_inputs(positions: Array, corners: Array, cells: TriangleCells, cutoff: Cutoff) -> tuple[Array, ...]:
+    """Return what a query is given: beside these arrays the boxes of triangles, [f, 2 d], that hold all particles near them."""
     radius = jnp.asarray(cutoff.radius)
-    wide = radius * (1 + 8 * finfo.eps)  # no particle that is nearer than r lies beyond: subtraction rounds monotonously
+    wide = radius * (1 + 8 * jnp.finfo(corners.dtype).eps)  # no particle nearer than r lies beyond: subtraction rounds monotonously
     boxes = jnp.concatenate([jnp.min(corners, axis=1) - wide, jnp.max(corners, axis=1) + wide], axis=1)
-    entries = jnp.pad(cells.triangles, (0, _LONGEST_VECTOR), constant_values=corners.shape[0])  # vectors reach over the end
+    return positions, corners, boxes, jnp.reshape(radius, 1), *cells._replace(level_count=jnp.reshape(cells.level_count, 1))
+
+
+def _query_on_cpu(variant: _Variant, slots: int, *inputs: Array) -> tuple[Array, Array]:
+    positions, corners, boxes, radius, start, triangles, *of_cells = inputs
+    entries = jnp.pad(triangles, (0, _LONGEST_VECTOR), constant_values=corners.shape[0])  # vectors reach over the end
     boxes = boxes.T.at[:, entries].get(mode="fill", fill_value=jnp.nan)  # side by side, as a bucket holds them
-    query = _query_callable(_Variant(dim, positions.dtype == jnp.float64, capacity is not None))
-    inputs = (positions, corners, boxes, jnp.reshape(radius, 1), cells.start, cells.triangles, cells.levels)
-    inputs += (jnp.reshape(cells.level_count, 1), cells.level_of)
-    call = functools.partial(query, output_dims={"idx": (n, max(slots, 1)), "count": n, "info": 4})
-    idx, count, _ = lax.platform_dependent(*inputs, cpu=call)
+    sizes = {"idx": (len(positions), max(slots, 1)), "count": len(positions), "info": 4}
+    query = _query_callable(variant)
+    idx, count, _ = query(positions, corners, boxes, radius, start, triangles, *of_cells, output_dims=sizes)
     return idx[:, :slots], count
+
+
+def _query_on_cuda(variant: _Variant, slots: int, *inputs: Array) -> tuple[Array, Array]:
+    n, dim = inputs[0].shape
+    words = _warp.kernels_of("triangles_cuda").scratch_words(n, *_sizes_of_cells(inputs), dim, variant.double)
+    sizes = {"idx": (n, slots) if variant.lists else (1, 1), "count": n, "scratch": words}
+    idx, count, _ = _cuda_callable(variant)(*inputs, output_dims=sizes)
+    return idx if variant.lists else jnp.zeros((n, 0), jnp.int32), count
+
+
+def _sizes_of_cells(inputs: Sequence[Any]) -> tuple[int, int]:
+    """Return the number of buckets and of entries."""
+    return inputs[4].shape[0] - 1, inputs[5].shape[0]
 
 
 def _name(name: str, variant: _Variant) -> str:
@@ -77,14 +105,20 @@ def _build_callable(variant: _Variant) -> Any:  # noqa: ANN401
     return _warp.callable_of(_name("build", variant), run, types, 6)
 
 
-@functools.cache
-def _query_callable(variant: _Variant) -> Any:  # noqa: ANN401
+def _query_types(variant: _Variant) -> dict[str, Any]:
+    """Return Warp's types of what a query is given, and of what it returns, but for its last output."""
     wp = _warp.load_warp()
     scalar, ints = wp.float64 if variant.double else wp.float32, wp.array(dtype=wp.int32)
     points = wp.array2d(dtype=scalar)
     types = {"positions": points, "corners": wp.array3d(dtype=scalar), "boxes": points, "cutoff": wp.array(dtype=scalar)}
     types |= {"start": ints, "triangles": ints, "levels": ints, "level_count": ints, "level_of": ints}
-    types |= {"idx": wp.array2d(dtype=wp.int32), "count": ints, "info": ints}
+    return types | {"idx": wp.array2d(dtype=wp.int32), "count": ints}
+
+
+@functools.cache
+def _query_callable(variant: _Variant) -> Any:  # noqa: ANN401
+    wp = _warp.load_warp()
+    types = _query_types(variant) | {"info": wp.array(dtype=wp.int32)}
 
     def run(*arrays: Any) -> None:  # noqa: ANN401
         named = dict(zip(types, arrays, strict=True))
@@ -95,3 +129,24 @@ def _query_callable(variant: _Variant) -> Any:  # noqa: ANN401
         _warp.on_every_core(_kernels(variant).query, [*arrays, *sizes], -(-n // _PARTICLES_PER_THREAD))
 
     return _warp.callable_of(_name("query", variant), run, types, 3)
+
+
+@functools.cache
+def _cuda_callable(variant: _Variant) -> Any:  # noqa: ANN401
+    wp = _warp.load_warp()
+    if wp.is_cuda_available():
+        _cuda_kernels(variant).load(wp.get_cuda_device())
+    types = _query_types(variant) | {"scratch": wp.array(dtype=wp.int32)}
+    return _warp.cuda_target(_name("cuda", variant), types, 3, functools.partial(_commands, variant))
+
+
+def _cuda_kernels(variant: _Variant) -> Any:  # noqa: ANN401
+    return _warp.kernels_of("triangles_cuda").triangle_kernels(*variant)
+
+
+def _commands(variant: _Variant, *arrays: Any) -> list[_cuda.Command]:  # noqa: ANN401
+    (n, _), faces, capacity = arrays[0].shape, arrays[1].shape[0], arrays[9].shape[1]
+    sizes, workers = _sizes_of_cells(arrays), _warp.kernels_of("triangles_cuda").workers_for(n, variant.double)
+    launches = _cuda_kernels(variant).launches(n, *sizes, capacity, variant.double)
+    arguments = [*arrays, n, faces, *sizes, capacity, workers]
+    return [_cuda.Command(x.kernel, [*arguments, x.threads], x.threads, x.block, x.beside) for x in launches]

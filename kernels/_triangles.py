@@ -2,139 +2,191 @@
 
 C++17 for a function body, for Clang on the CPU and for NVRTC on CUDA alike, joined by `jfrnn.kernels._native.snippet`; in 2D
 "triangles" are segments. What is decided, and why it is right, stands in `jfrnn/_triangles_exact.py` and
-`jfrnn/_triangles_integers.py`; which cells hold a triangle, in `jfrnn/_triangles_cells.py`. Here, step 1 works in float64, whatever
-the positions are, and integers have limbs of 24 bits, only as many as a number needs.
+`jfrnn/_triangles_integers.py`; which cells hold a triangle, in `jfrnn/_triangles_cells.py`. Here, step 1 works in the precision of
+the positions, then in float64, and integers have limbs of 24 bits, only as many as a number needs.
 """
 
-# `Shape::near(p, corners, radius)`: is the distance below the radius? p [DIM], corners [DIM][DIM].
+# What the integers of a pair are: how many in 2D and in 3D, and products of how many coordinates.
+_NUMBERS = {
+    "x": (4, 9, 1),
+    "along": (2, 3, 1),
+    "square": (2, 3, 2),
+    "limit": (1, 1, 2),
+    "side": (0, 9, 2),
+    "normal": (0, 3, 2),
+    "place": (1, 1, 3),
+    "length": (1, 1, 4),
+    "rest": (1, 1, 6),
+    "other": (1, 1, 6),
+    "spare": (2, 2, 6),
+}
+_LIMBS = {False: 14, True: 90}  # of a coordinate of either width
+_ROOM = "Room left{room};" + "".join(
+    f"const Wholes {name} = left.take(DIM == 3 ? {three} : {two}, {degree});" for name, (two, three, degree) in _NUMBERS.items()
+)
+
+
+def constants(dim: int, double: bool, stride: int) -> dict[str, int]:
+    """Return the constants that `DECIDE` needs; ROOM is the memory of a pair, in ints, of which threads have every `stride`-th."""
+    limbs = _LIMBS[double]
+    room = sum((two, three)[dim == 3] * (2 + limbs * degree) for two, three, degree in _NUMBERS.values())
+    return {"LIMBS": limbs, "ROOM": room, "STRIDE": stride}
+
+
+# `Shape::sure(p, corners, radius, scale)`: is the distance below the radius? 1: it is, 0: it is not, -1: float64 cannot tell.
+# `Shape::near(p, corners, radius, scale, room)` can. p [DIM], corners [DIM][DIM]; room: ROOM ints, each STRIDE behind the last, so
+# that threads beside each other use memory side by side.
 DECIDE = r"""
-struct Whole {  // an integer times a power of two: sum of limb[i] 2^(24 (low + i)), limbs in [-2^23, 2^23), the outermost not 0
-    enum { MOST = 6 * (DOUBLE ? 90 : 14) };
+struct Whole {  // an integer times a power of two: sum of limb(i) 2^(24 (low + i)), limbs in [-2^23, 2^23), the outermost not 0
+    int* at;
+    JFRNN_MEMBER int low() const { return at[0]; }
+    JFRNN_MEMBER int count() const { return at[STRIDE]; }
+    JFRNN_MEMBER int limb(int i) const { return at[STRIDE * (2 + i)]; }
+    JFRNN_MEMBER int end() const { return low() + count(); }
+    JFRNN_MEMBER int sign() const { return count() == 0 ? 0 : limb(count() - 1) < 0 ? -1 : 1; }
+};
+struct Writer {  // takes sums of limbs, the lowest first; carries, and leaves out zeros at either end
+    int* at;
     int low, count;
-    int limb[MOST];
-    JFRNN_MEMBER int sign() const { return count == 0 ? 0 : limb[count - 1] < 0 ? -1 : 1; }
-    JFRNN_MEMBER void put(int first, const long long* sums, int number) {  // carry, and leave out zeros at either end
-        long long carry = 0;
-        low = first;
-        count = 0;
-        for (int i = 0; i < number || carry; ++i) {
-            const long long sum = carry + (i < number ? sums[i] : 0);
-            carry = (sum + (1 << 23)) >> 24;
-            const int rest = (int)(sum - carry * (1 << 24));
-            if (count == 0 && rest == 0) {
-                ++low;
-                continue;
-            }
-            limb[count++] = rest;
-        }
-        while (count > 0 && limb[count - 1] == 0)
-            --count;
+    long long carry;
+    JFRNN_MEMBER void put(long long sum) {
+        sum += carry;
+        carry = (sum + (1 << 23)) >> 24;
+        const int rest = (int)(sum - carry * (1 << 24));
+        if (count == 0 && rest == 0)
+            ++low;
+        else
+            at[STRIDE * (2 + count++)] = rest;
     }
-    JFRNN_MEMBER void read(real x) {
-        const unsigned long long bits = Bits::of(x), lead = Bits::exponent(x) > 0;
-        const unsigned long long mantissa = (bits & ((1ull << Bits::MANTISSA) - 1)) | (lead << Bits::MANTISSA);
-        const int e = Bits::exponent(x), place = (e > 1 ? e : 1) - 1, shift = place % 24;
-        long long sums[4];
-        for (int i = 0; i < 4; ++i) {
-            const int down = 24 * i - shift;
-            const long long word = (long long)((down >= 64 ? 0 : down >= 0 ? mantissa >> down : mantissa << -down) & 0xffffff);
-            sums[i] = Bits::negative(x) ? -word : word;
-        }
-        put(place / 24, sums, 4);
+    JFRNN_MEMBER void close() {
+        while (carry)
+            put(0);
+        while (count > 0 && at[STRIDE * (1 + count)] == 0)
+            --count;
+        at[0] = low;
+        at[STRIDE] = count;
+    }
+};
+struct Wholes {  // side by side
+    int *at, degree;
+    JFRNN_MEMBER Whole operator[](int i) const { return Whole{at + STRIDE * i * (2 + LIMBS * degree)}; }
+    JFRNN_MEMBER Wholes operator+(int i) const { return Wholes{(*this)[i].at, degree}; }
+};
+struct Room {  // memory for products of so many numbers
+    int* at;
+    JFRNN_MEMBER Wholes take(int number, int degree) {
+        const Wholes taken{at, degree};
+        at += STRIDE * number * (2 + LIMBS * degree);
+        return taken;
     }
 };
 struct Shape {
-    JFRNN_CALL void add(Whole& out, const Whole& a, const Whole& b, int times) {  // a + times b; out may be either
-        long long sums[Whole::MOST];
-        const int first = a.count == 0 ? b.low : b.count == 0 || a.low < b.low ? a.low : b.low;
-        const int enda = a.low + a.count, endb = b.low + b.count;
-        const int end = a.count == 0 ? endb : b.count == 0 || enda > endb ? enda : endb;
-        for (int i = first; i < end; ++i) {
-            const long long one = i >= a.low && i < enda ? a.limb[i - a.low] : 0;
-            const long long two = i >= b.low && i < endb ? b.limb[i - b.low] : 0;
-            sums[i - first] = one + times * two;
+    JFRNN_CALL void read(Whole out, real x) {
+        const unsigned long long bits = Bits::of(x), lead = Bits::exponent(x) > 0;
+        const unsigned long long mantissa = (bits & ((1ull << Bits::MANTISSA) - 1)) | (lead << Bits::MANTISSA);
+        const int e = Bits::exponent(x), place = (e > 1 ? e : 1) - 1, shift = place % 24;
+        Writer writer{out.at, place / 24, 0, 0};
+        for (int i = 0; i < 4; ++i) {
+            const int down = 24 * i - shift;
+            const long long word = (long long)((down >= 64 ? 0 : down >= 0 ? mantissa >> down : mantissa << -down) & 0xffffff);
+            writer.put(Bits::negative(x) ? -word : word);
         }
-        out.put(first, sums, end > first ? end - first : 0);
+        writer.close();
     }
-    JFRNN_CALL void multiply(Whole& out, const Whole& a, const Whole& b) {
-        long long sums[Whole::MOST];
-        const int count = a.count && b.count ? a.count + b.count : 0;
-        for (int i = 0; i < count; ++i)
-            sums[i] = 0;
-        for (int i = 0; i < a.count && count; ++i)
-            for (int j = 0; j < b.count; ++j)
-                sums[i + j] += (long long)a.limb[i] * b.limb[j];
-        out.put(a.low + b.low, sums, count);
+    // a + times b into `spare`, which is then copied: out may be a or b
+    JFRNN_CALL void add(Whole out, Whole a, Whole b, int times, Whole spare) {
+        const int counta = a.count(), countb = b.count(), lowa = a.low(), lowb = b.low();
+        const int enda = lowa + counta, endb = lowb + countb;
+        const int first = counta == 0 ? lowb : countb == 0 || lowa < lowb ? lowa : lowb;
+        const int end = counta == 0 ? endb : countb == 0 || enda > endb ? enda : endb;
+        Writer writer{spare.at, first, 0, 0};
+        for (int i = first; i < end; ++i) {
+            const long long one = i >= lowa && i < enda ? a.limb(i - lowa) : 0;
+            const long long two = i >= lowb && i < endb ? b.limb(i - lowb) : 0;
+            writer.put(one + times * two);
+        }
+        writer.close();
+        for (int i = 0; i < 2 + writer.count; ++i)
+            out.at[STRIDE * i] = spare.at[STRIDE * i];
     }
-    JFRNN_CALL void dot(Whole& out, const Whole* a, const Whole* b) {
-        Whole part;
+    JFRNN_CALL void multiply(Whole out, Whole a, Whole b) {  // out is neither
+        const int counta = a.count(), countb = b.count(), number = counta && countb ? counta + countb : 0;
+        Writer writer{out.at, a.low() + b.low(), 0, 0};
+        for (int k = 0; k < number; ++k) {
+            long long sum = 0;
+            for (int i = k < countb ? 0 : k - countb + 1; i < counta && i <= k; ++i)
+                sum += (long long)a.limb(i) * b.limb(k - i);
+            writer.put(sum);
+        }
+        writer.close();
+    }
+    JFRNN_FUNCTION void dot(Whole out, Wholes a, Wholes b, Wholes spare) {
         multiply(out, a[0], b[0]);
         for (int k = 1; k < DIM; ++k) {
-            multiply(part, a[k], b[k]);
-            add(out, out, part, 1);
+            multiply(spare[1], a[k], b[k]);
+            add(out, out, spare[1], 1, spare[0]);
         }
     }
-    JFRNN_CALL void cross(Whole* out, const Whole* a, const Whole* b) {
-        Whole part;
+    JFRNN_FUNCTION void cross(Wholes out, Wholes a, Wholes b, Wholes spare) {
         for (int k = 0; k < 3; ++k) {
             const int i = (k + 1) % 3, j = (k + 2) % 3;
             multiply(out[k], a[i], b[j]);
-            multiply(part, a[j], b[i]);
-            add(out[k], out[k], part, -1);
+            multiply(spare[1], a[j], b[i]);
+            add(out[k], out[k], spare[1], -1, spare[0]);
         }
     }
 
     // the last word: signs of polynomials in integers
-    JFRNN_CALL bool surely_near(const real* p, const real* corners, real radius) {
-        Whole x[DIM][DIM], along[DIM], square[DIM], limit, place, length, rest, other;
-        other.read(radius);
-        multiply(limit, other, other);
+    JFRNN_CALL bool surely_near(const real* p, const real* corners, real radius, int* room) {
+        ROOM_OF_NUMBERS
+        const Whole none = spare[0];
+        read(other[0], radius);
+        multiply(limit[0], other[0], other[0]);
         for (int c = 0; c < DIM; ++c) {
             for (int k = 0; k < DIM; ++k) {
-                x[c][k].read(corners[DIM * c + k]);
-                other.read(p[k]);
-                add(x[c][k], x[c][k], other, -1);
+                read(x[DIM * c + k], corners[DIM * c + k]);
+                read(other[0], p[k]);
+                add(x[DIM * c + k], x[DIM * c + k], other[0], -1, none);
             }
-            dot(square[c], x[c], x[c]);
-            add(square[c], square[c], limit, -1);
+            dot(square[c], x + DIM * c, x + DIM * c, spare);
+            add(square[c], square[c], limit[0], -1, none);
             if (square[c].sign() < 0)
                 return true;
         }
         for (int c = 0; c < (DIM == 3 ? 3 : 1); ++c) {
             for (int k = 0; k < DIM; ++k)
-                add(along[k], x[(c + 1) % DIM][k], x[c][k], -1);
-            dot(place, x[c], along);  // -t
-            if (place.sign() >= 0)
+                add(along[k], x[DIM * ((c + 1) % DIM) + k], x[DIM * c + k], -1, none);
+            dot(place[0], x + DIM * c, along, spare);  // -t
+            if (place[0].sign() >= 0)
                 continue;
-            dot(length, along, along);
-            add(rest, length, place, 1);
-            if (rest.sign() <= 0)
+            dot(length[0], along, along, spare);
+            add(rest[0], length[0], place[0], 1, none);
+            if (rest[0].sign() <= 0)
                 continue;
-            multiply(rest, square[c], length);
-            multiply(other, place, place);
-            add(rest, rest, other, -1);
-            if (rest.sign() < 0)
+            multiply(rest[0], square[c], length[0]);
+            multiply(other[0], place[0], place[0]);
+            add(rest[0], rest[0], other[0], -1, none);
+            if (rest[0].sign() < 0)
                 return true;
         }
         if constexpr (DIM == 3) {
-            Whole side[3][3], normal[3];
             for (int c = 0; c < 3; ++c)
-                cross(side[c], x[(c + 1) % 3], x[(c + 2) % 3]);
+                cross(side + 3 * c, x + 3 * ((c + 1) % 3), x + 3 * ((c + 2) % 3), spare);
             for (int k = 0; k < 3; ++k) {
-                add(normal[k], side[0][k], side[1][k], 1);
-                add(normal[k], normal[k], side[2][k], 1);
+                add(normal[k], side[k], side[3 + k], 1, none);
+                add(normal[k], normal[k], side[6 + k], 1, none);
             }
             for (int c = 0; c < 3; ++c) {
-                dot(rest, side[c], normal);
-                if (rest.sign() <= 0)
+                dot(rest[0], side + 3 * c, normal, spare);
+                if (rest[0].sign() <= 0)
                     return false;
             }
-            dot(place, x[0], normal);
-            multiply(other, place, place);
-            dot(length, normal, normal);
-            multiply(rest, limit, length);
-            add(rest, other, rest, -1);
-            return rest.sign() < 0;
+            dot(place[0], x, normal, spare);
+            multiply(other[0], place[0], place[0]);
+            dot(length[0], normal, normal, spare);
+            multiply(rest[0], limit[0], length[0]);
+            add(rest[0], other[0], rest[0], -1, none);
+            return rest[0].sign() < 0;
         }
         return false;
     }
@@ -150,7 +202,7 @@ struct Shape {
     }
 
     // bounds from either side, by a point of the shape and by a direction; `scale` is a power of two that brings r to about 1
-    JFRNN_FUNCTION bool near(const real* p, const real* corners, real radius, double scale) {
+    JFRNN_CALL int sure(const real* p, const real* corners, real radius, double scale) {
         constexpr double EPS = 0x1p-52;
         const double r = DOUBLE ? double(radius) * scale : double(radius);
         double x[DIM][DIM], foot[DIM], direction[DIM], weight[DIM], best = -1;
@@ -162,7 +214,7 @@ struct Shape {
             }
         for (int c = 0; c < DIM; ++c)  // as most that are near, where triangles are small
             if (product(x[c], x[c]) * (1 + 16 * EPS) < r * r)
-                return true;
+                return 1;
         for (int c = 0; c < (DIM == 3 ? 3 : 1); ++c) {
             const int next = (c + 1) % DIM;
             double along[DIM], point[DIM];
@@ -220,7 +272,7 @@ struct Shape {
         }
         const double reach = r * whole * (1 - 16 * EPS) - 8 * EPS * size;
         if (reach > 0 && square * (1 + 16 * EPS) < reach * reach)
-            return true;
+            return 1;
         double largest = 0, least = 0;
         for (int k = 0; k < DIM; ++k)
             largest += size_of(direction[k]);
@@ -229,21 +281,23 @@ struct Shape {
         for (int c = 0; c < DIM; ++c) {
             const double height = product(direction, x[c]) - 8 * EPS * sizes(direction, x[c]);
             if (!(height > 0))  // or no number
-                return surely_near(p, corners, radius);
+                return -1;
             least = c == 0 || height < least ? height : least;
         }
-        if (least > 0 && least * least > r * r * product(direction, direction) * (1 + 16 * EPS))
-            return false;
-        return surely_near(p, corners, radius);
+        return least > 0 && least * least > r * r * product(direction, direction) * (1 + 16 * EPS) ? 0 : -1;
+    }
+    JFRNN_FUNCTION bool near(const real* p, const real* corners, real radius, double scale, int* room) {
+        const int known = sure(p, corners, radius, scale);
+        return known < 0 ? surely_near(p, corners, radius, room) : known == 1;
     }
 };
-"""
+""".replace("ROOM_OF_NUMBERS", _ROOM)
 
 # Which cell a coordinate is in, and which bucket a cell; a level is the biased exponent of the inverse edge of its cells.
 LEVELS = r"""
 auto scale_of = [](int level) -> double { return level == 0 ? 0.0 : Bits::power_of_two(level - Bits::BIAS); };
 auto cell_at = [](double x, double scale) -> int {
-    const double cell = __builtin_floor(x * scale);
+    const double cell = floor(x * scale);
     return cell < -0x1p30 ? -(1 << 30) : cell > 0x1p30 ? 1 << 30 : (int)cell;
 };
 auto bucket_of = [](int level, const int* cell, int buckets) -> int {
@@ -254,5 +308,120 @@ auto bucket_of = [](int level, const int* cell, int buckets) -> int {
     }
     word *= 0xc2b2ae35u;
     return (int)((word ^ (word >> 16)) & (unsigned int)(buckets - 1));
+};
+auto bucket_at = [&](const real* p, int level, int buckets) -> int {
+    const double scale = scale_of(level);
+    int cell[DIM];
+    for (int k = 0; k < DIM; ++k)
+        cell[k] = cell_at(double(p[k]), scale);
+    return bucket_of(level, cell, buckets);
+};
+"""
+
+# `bounded(x, near, far)`: step 1 in the precision of the positions, with the bounds of `_triangles_exact.sure_pairs`; what is
+# neither is open. x [DIM][DIM]: corners as the particle sees them, times `unit`. `vec` is `real`, or many side by side.
+BOUNDS = r"""
+const double scale = Bits::unit_scale(radius);
+const real unit = real(scale);
+using mask = decltype(vec{} < vec{});
+struct Lanes {
+    JFRNN_FUNCTION vec size_of(vec a) {
+#if defined(__CUDA_ARCH__)
+        return fabs(a);
+#else
+        return __builtin_elementwise_abs(a);
+#endif
+    }
+    JFRNN_FUNCTION vec product(const vec* a, const vec* b) {
+        const vec sum = a[0] * b[0] + a[1] * b[1];
+        return DIM == 3 ? sum + a[DIM - 1] * b[DIM - 1] : sum;
+    }
+    JFRNN_FUNCTION vec sum_of_sizes(const vec* a) {
+        const vec sum = size_of(a[0]) + size_of(a[1]);
+        return DIM == 3 ? sum + size_of(a[DIM - 1]) : sum;
+    }
+    JFRNN_FUNCTION vec sizes(const vec* a, const vec* b) {
+        const vec sum = size_of(a[0] * b[0]) + size_of(a[1] * b[1]);
+        return DIM == 3 ? sum + size_of(a[DIM - 1] * b[DIM - 1]) : sum;
+    }
+    JFRNN_FUNCTION void cross(vec* out, const vec* a, const vec* b) {
+        for (int k = 0; k < 3; ++k)
+            out[k] = a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3];
+    }
+};
+using V = Lanes;
+auto bounded = [&](const vec (&x)[DIM][DIM], mask& near, mask& far) {
+    constexpr real EPS = DOUBLE ? real(0x1p-52) : real(0x1p-23);
+    const real r = radius * unit;
+    vec weight[DIM], foot[DIM], direction[DIM], best;
+    const vec none = vec{}, one = none + 1;
+    for (int c = 0; c < (DIM == 3 ? 3 : 1); ++c) {
+        const int next = (c + 1) % DIM;
+        vec along[DIM], point[DIM];
+        for (int k = 0; k < DIM; ++k)
+            along[k] = x[next][k] - x[c][k];
+        const vec length = V::product(along, along);
+        vec t = length > 0 ? -V::product(x[c], along) / (length > 0 ? length : one) : none;
+        t = t > 0 ? (t < 1 ? t : one) : none;
+        for (int k = 0; k < DIM; ++k)
+            point[k] = x[c][k] + t * along[k];
+        const vec square = V::product(point, point);
+        if (c == 0) {
+            best = square;
+            for (int k = 0; k < DIM; ++k) {
+                direction[k] = point[k];
+                weight[k] = none;
+            }
+            weight[0] = one - t;
+            weight[next] = t;
+            continue;
+        }
+        const mask nearer = square < best;
+        best = nearer ? square : best;
+        for (int k = 0; k < DIM; ++k) {
+            direction[k] = nearer ? point[k] : direction[k];
+            weight[k] = nearer ? (k == c ? one - t : k == next ? t : none) : weight[k];
+        }
+    }
+    if constexpr (DIM == 3) {
+        vec side[2][3], normal[3], area[3], part[3];
+        for (int k = 0; k < 3; ++k) {
+            side[0][k] = x[1][k] - x[0][k];
+            side[1][k] = x[2][k] - x[0][k];
+        }
+        V::cross(normal, side[0], side[1]);
+        for (int c = 0; c < 3; ++c) {
+            V::cross(area, x[(c + 1) % 3], x[(c + 2) % 3]);
+            part[c] = V::product(area, normal);
+        }
+        const mask inside = (part[0] > 0) & (part[1] > 0) & (part[2] > 0);
+        const vec sum = inside ? part[0] + part[1] + part[2] : one;
+        const vec toward = V::product(x[0], normal) < 0 ? none - 1 : one;
+        for (int k = 0; k < 3; ++k) {
+            weight[k] = inside ? part[k] / sum : weight[k];
+            direction[k] = inside ? toward * normal[k] : direction[k];
+        }
+    }
+    vec sum = weight[0], size = weight[0] * V::sum_of_sizes(x[0]);
+    for (int c = 1; c < DIM; ++c) {
+        sum = sum + weight[c];
+        size = size + weight[c] * V::sum_of_sizes(x[c]);
+    }
+    for (int k = 0; k < DIM; ++k) {
+        foot[k] = weight[0] * x[0][k];
+        for (int c = 1; c < DIM; ++c)
+            foot[k] = foot[k] + weight[c] * x[c][k];
+    }
+    const vec reach = r * sum * (1 - 8 * EPS) - 4 * EPS * size;
+    near = (reach > 0) & (V::product(foot, foot) * (1 + 16 * EPS) < reach * reach);
+    const vec largest = V::sum_of_sizes(direction);
+    for (int k = 0; k < DIM; ++k)
+        direction[k] = direction[k] / largest;
+    const vec limit = r * r * V::product(direction, direction) * (1 + 16 * EPS);
+    far = limit == limit;
+    for (int c = 0; c < DIM; ++c) {
+        const vec height = V::product(direction, x[c]) - 4 * EPS * V::sizes(direction, x[c]);
+        far = far & (height > 0) & (height * height > limit);
+    }
 };
 """

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import warp as wp
 from jfrnn.kernels._native import ENTER, LEAVE, snippet
-from jfrnn.kernels._triangles import DECIDE, LEVELS
+from jfrnn.kernels._triangles import BOUNDS, DECIDE, LEVELS, constants
 
 CHUNK = 1024  # particles that a thread takes at a time
 
@@ -160,9 +160,8 @@ for (int l = 0; l < limit; ++l)
     levels.data[l] = l < used ? scratch.data[l] : 0;
 """
 
-# `surely_near(p, which, open)`: which of WIDTH triangles are near, one bit each, and which floats leave open; bounds are those of
-# `_triangles_exact.sure_pairs`, in the precision of the positions
-_MANY = r"""
+# WIDTH triangles side by side: the `vec` of `BOUNDS`
+_LANES = r"""
 #if defined(__AVX512F__) && defined(__AVX512VL__)
 constexpr int WIDTH = DOUBLE ? 8 : 16;
 #else
@@ -170,113 +169,27 @@ constexpr int WIDTH = DOUBLE ? 4 : 8;
 #endif
 typedef real vec __attribute__((vector_size(WIDTH * sizeof(real))));
 typedef bool flags __attribute__((ext_vector_type(WIDTH)));
-const double scale = Bits::unit_scale(radius);
-struct Vectors {
-    JFRNN_FUNCTION vec size_of(vec a) { return __builtin_elementwise_abs(a); }
-    JFRNN_FUNCTION vec product(const vec* a, const vec* b) {
-        const vec sum = a[0] * b[0] + a[1] * b[1];
-        return DIM == 3 ? sum + a[DIM - 1] * b[DIM - 1] : sum;
-    }
-    JFRNN_FUNCTION vec sum_of_sizes(const vec* a) {
-        const vec sum = size_of(a[0]) + size_of(a[1]);
-        return DIM == 3 ? sum + size_of(a[DIM - 1]) : sum;
-    }
-    JFRNN_FUNCTION vec sizes(const vec* a, const vec* b) {
-        const vec sum = size_of(a[0] * b[0]) + size_of(a[1] * b[1]);
-        return DIM == 3 ? sum + size_of(a[DIM - 1] * b[DIM - 1]) : sum;
-    }
-    JFRNN_FUNCTION void cross(vec* out, const vec* a, const vec* b) {
-        for (int k = 0; k < 3; ++k)
-            out[k] = a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3];
-    }
-    JFRNN_FUNCTION unsigned int bits_of(flags f) {
-        unsigned short bits = 0;
-        __builtin_memcpy(&bits, &f, WIDTH == 16 ? 2 : 1);
-        return bits & ((1u << WIDTH) - 1);
-    }
+"""
+
+# `surely_near(p, which, open)`: which of WIDTH triangles are near, one bit each, and which floats leave open
+_MANY = r"""
+auto bits_of = [](flags f) -> unsigned int {
+    unsigned short bits = 0;
+    __builtin_memcpy(&bits, &f, WIDTH == 16 ? 2 : 1);
+    return bits & ((1u << WIDTH) - 1);
 };
-using V = Vectors;
 auto surely_near = [&](const real* p, const int* which, unsigned int& open) -> unsigned int {
-    constexpr real EPS = DOUBLE ? real(0x1p-52) : real(0x1p-23);
-    const real unit = real(scale), r = radius * unit;
-    vec x[DIM][DIM], weight[DIM], foot[DIM], direction[DIM], best;
+    vec x[DIM][DIM];
     for (int c = 0; c < DIM; ++c)
         for (int k = 0; k < DIM; ++k) {
             for (int l = 0; l < WIDTH; ++l)
                 x[c][k][l] = corners.data[(long long)DIM * DIM * which[l] + DIM * c + k];
             x[c][k] = (x[c][k] - p[k]) * unit;
         }
-    const vec none = vec{}, one = none + 1;
-    for (int c = 0; c < (DIM == 3 ? 3 : 1); ++c) {
-        const int next = (c + 1) % DIM;
-        vec along[DIM], point[DIM];
-        for (int k = 0; k < DIM; ++k)
-            along[k] = x[next][k] - x[c][k];
-        const vec length = V::product(along, along);
-        vec t = length > 0 ? -V::product(x[c], along) / (length > 0 ? length : one) : none;
-        t = t > 0 ? (t < 1 ? t : one) : none;
-        for (int k = 0; k < DIM; ++k)
-            point[k] = x[c][k] + t * along[k];
-        const vec square = V::product(point, point);
-        if (c == 0) {
-            best = square;
-            for (int k = 0; k < DIM; ++k) {
-                direction[k] = point[k];
-                weight[k] = none;
-            }
-            weight[0] = one - t;
-            weight[next] = t;
-            continue;
-        }
-        const auto nearer = square < best;
-        best = nearer ? square : best;
-        for (int k = 0; k < DIM; ++k) {
-            direction[k] = nearer ? point[k] : direction[k];
-            weight[k] = nearer ? (k == c ? one - t : k == next ? t : none) : weight[k];
-        }
-    }
-    if constexpr (DIM == 3) {
-        vec side[2][3], normal[3], area[3], part[3];
-        for (int k = 0; k < 3; ++k) {
-            side[0][k] = x[1][k] - x[0][k];
-            side[1][k] = x[2][k] - x[0][k];
-        }
-        V::cross(normal, side[0], side[1]);
-        for (int c = 0; c < 3; ++c) {
-            V::cross(area, x[(c + 1) % 3], x[(c + 2) % 3]);
-            part[c] = V::product(area, normal);
-        }
-        const auto inside = (part[0] > 0) & (part[1] > 0) & (part[2] > 0);
-        const vec sum = inside ? part[0] + part[1] + part[2] : one;
-        const vec toward = V::product(x[0], normal) < 0 ? none - 1 : one;
-        for (int k = 0; k < 3; ++k) {
-            weight[k] = inside ? part[k] / sum : weight[k];
-            direction[k] = inside ? toward * normal[k] : direction[k];
-        }
-    }
-    vec sum = weight[0], size = weight[0] * V::sum_of_sizes(x[0]);
-    for (int c = 1; c < DIM; ++c) {
-        sum = sum + weight[c];
-        size = size + weight[c] * V::sum_of_sizes(x[c]);
-    }
-    for (int k = 0; k < DIM; ++k) {
-        foot[k] = weight[0] * x[0][k];
-        for (int c = 1; c < DIM; ++c)
-            foot[k] = foot[k] + weight[c] * x[c][k];
-    }
-    const vec reach = r * sum * (1 - 8 * EPS) - 4 * EPS * size;
-    const auto near = (reach > 0) & (V::product(foot, foot) * (1 + 16 * EPS) < reach * reach);
-    const vec largest = V::sum_of_sizes(direction);
-    for (int k = 0; k < DIM; ++k)
-        direction[k] = direction[k] / largest;
-    const vec limit = r * r * V::product(direction, direction) * (1 + 16 * EPS);
-    auto far = limit == limit;
-    for (int c = 0; c < DIM; ++c) {
-        const vec height = V::product(direction, x[c]) - 4 * EPS * V::sizes(direction, x[c]);
-        far = far & (height > 0) & (height * height > limit);
-    }
-    const unsigned int yes = V::bits_of(__builtin_convertvector(near, flags));
-    open = ~yes & ~V::bits_of(__builtin_convertvector(far, flags));
+    mask near, far;
+    bounded(x, near, far);
+    const unsigned int yes = bits_of(__builtin_convertvector(near, flags));
+    open = ~yes & ~bits_of(__builtin_convertvector(far, flags));
     return yes;
 };
 """
@@ -286,7 +199,7 @@ _QUERY = r"""
 struct Shared { int next_chunk; };
 Shared& shared = *(Shared*)info.data;
 constexpr int MOST = 512;  // triangles whose boxes hold a particle that wait to be decided
-int waiting[MOST + WIDTH];
+int waiting[MOST + WIDTH], room[ROOM];
 const int sizes_of_cells = level_count.data[0];
 int longest = 0;
 for (;;) {
@@ -306,7 +219,7 @@ for (;;) {
                 const unsigned int asked = number - first < WIDTH ? (1u << (number - first)) - 1 : (1u << WIDTH) - 1;
                 for (open &= asked; open; open &= open - 1) {
                     const int l = __builtin_ctz(open);
-                    if (Shape::near(p, corners.data + (long long)DIM * DIM * waiting[first + l], radius, scale))
+                    if (Shape::near(p, corners.data + (long long)DIM * DIM * waiting[first + l], radius, scale, room))
                         near |= 1u << l;
                 }
                 for (near &= asked; near; near &= near - 1, ++found)
@@ -317,11 +230,7 @@ for (;;) {
         };
         for (int l = 0; l < sizes_of_cells && finite_point(p); ++l) {
             const int level = levels.data[l];
-            const double per_length = scale_of(level);
-            int cell[3];
-            for (int k = 0; k < DIM; ++k)
-                cell[k] = cell_at(double(p[k]), per_length);
-            const int bucket = bucket_of(level, cell, buckets);
+            const int bucket = bucket_at(p, level, buckets);
             const int last = start.data[bucket + 1];
             for (int e = start.data[bucket]; e < last; e += WIDTH) {
                 unsigned int inside = last - e < WIDTH ? (1u << (last - e)) - 1 : (1u << WIDTH) - 1;
@@ -329,7 +238,7 @@ for (;;) {
                     vec low, high;
                     __builtin_memcpy(&low, boxes.data + (long long)stride * k + e, sizeof low);
                     __builtin_memcpy(&high, boxes.data + (long long)stride * (DIM + k) + e, sizeof high);
-                    inside &= V::bits_of(__builtin_convertvector((low <= p[k]) & (high >= p[k]), flags));
+                    inside &= bits_of(__builtin_convertvector((low <= p[k]) & (high >= p[k]), flags));
                 }
                 for (; inside; inside &= inside - 1) {
                     const int t = triangles.data[e + __builtin_ctz(inside)];
@@ -368,6 +277,7 @@ def triangle_kernels(dim: int, double: bool, lists: bool, most_cells: int, lanes
     scalar = wp.float64 if double else wp.float32
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_list' * lists}"
     options = {"LIST": lists, "MOST_CELLS": most_cells, "LANES": lanes, "LANES_LOG2": lanes.bit_length() - 1, "CHUNK": CHUNK}
+    options |= constants(dim, double, stride=1)
     reals, ints = wp.array(dtype=scalar), wp.array(dtype=wp.int32)
     points, rows, shapes = wp.array2d(dtype=scalar), wp.array2d(dtype=wp.int32), wp.array3d(dtype=scalar)
 
@@ -386,7 +296,7 @@ def triangle_kernels(dim: int, double: bool, lists: bool, most_cells: int, lanes
         native.__name__ = native.__qualname__ = f"triangles_{native.__name__}_{variant}"
     text = functools.partial(snippet, "double" if double else "float", dim, DECIDE, LEVELS, **options)
     build_function = wp.func_native(ENTER + text(_BUILD) + LEAVE)(build_native)
-    query_function = wp.func_native(ENTER + text(_MANY, _QUERY) + LEAVE)(query_native)
+    query_function = wp.func_native(ENTER + text(_LANES, BOUNDS, _MANY, _QUERY) + LEAVE)(query_native)
 
     def build(
         corners: shapes, good: ints, cutoff: reals, start: ints, triangles: ints, levels: ints, level_count: ints, level_of: ints,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import _gpu, _gpu_report
+from experiments import _gpu, _gpu_report, _gpu_triangles, _triangles
 from experiments._errors import UsageError
 
 CONFIG = Path(__file__).parent.parent / "experiments" / "configs" / "h200.toml"
@@ -82,6 +82,59 @@ def test_options_are_decided_case_by_case(table, name, monkeypatch):
     monkeypatch.setattr(module, cases, {name: getattr(module, cases)[name]})
     (row,) = _gpu._exactness_rows(parts[table].model_copy(update={"dims": [2], "dtypes": ["float32"]}))
     assert (row["cases"], row["wrong"]) == ({"radii": 5, "batches": 2}[table], 0)
+
+
+@pytest.mark.usefixtures("compiled_soon")
+def test_triangles_are_decided_timed_and_reported(tmp_path, monkeypatch):
+    """The third config, with one case and a small gear: from its command to its report."""
+    from jfrnn.cases import triangles
+
+    cases = {name: triangles.TRIANGLE_CASES[name] for name in ("ties", "faces_out_of_range")}
+    monkeypatch.setattr(triangles, "TRIANGLE_CASES", cases)
+    monkeypatch.setattr(_gpu, "_memory_rows", lambda: iter(()))
+    monkeypatch.setattr(_gpu, "_bandwidth_row", lambda _: {"kind": "ceiling", "bytes_per_s": 1e12})
+    given = _gpu.load(CONFIG.with_name("h200_triangles.toml"))
+    gear = given.triangles[0].model_copy(update={"points": [500], "faces": 500, "cutoffs": [0.5], "dtypes": ["float32"]})
+    exact = given.exactness[0].model_copy(update={"dims": [2], "dtypes": ["float64"]})
+    small = {"exactness": [exact], "triangles": [gear], "calls": 2, "steps": 2, "repeats": 2, "seconds_per_timing": 0.1}
+    assert _gpu.run(given.model_copy(update=small), tmp_path) == 0
+    rows = [json.loads(line) for line in (tmp_path / "rows.jsonl").read_text().splitlines()]
+    assert [row["kind"] for row in rows] == ["exactness", "ceiling", *["triangles"] * 7]
+    assert rows[0]["cases"] == len(cases)
+    assert all((row["wrong"], row["same_bits_twice"]) == (0, True) and row["median_s"] > 0 for row in rows[2:])
+    assert {row["pairs"] for row in rows[2:]} == {rows[-1]["pairs"]}
+    assert rows[0]["wrong"] == 0
+    assert "| jfrnn warp, scan of updates |" in _gpu_report.report(tmp_path)
+
+
+def test_kernels_of_triangles_are_launched_one_by_one():
+    """As on a GPU, where each is timed."""
+    import warp as wp
+
+    import jfrnn
+
+    scene = _triangles._gear(300, 500)
+    tri = jfrnn.search_triangles(scene.points, scene.vertices, scene.faces, 0.5, backend="warp")
+    commands, idx, count, _ = _gpu_triangles.launchable(tri, scene.points, "cpu")
+    for kernel, arguments, threads, _, _ in commands:
+        wp.launch(kernel, dim=threads, inputs=list(arguments), device="cpu")
+    names = [f"{command.kernel.key.split('_')[0]}_s" for command in commands]
+    assert names == list(_gpu_report._TRIANGLE_KERNELS)
+    assert (idx.numpy() == tri.idx).all()
+    assert (count.numpy() == tri.count).all()
+
+
+def test_a_wrong_list_of_triangles_is_counted(monkeypatch):
+    from jfrnn.cases import triangles
+
+    import jfrnn
+
+    monkeypatch.setattr(triangles, "TRIANGLE_CASES", {"ties": triangles.TRIANGLE_CASES["ties"]})
+    (part,) = _gpu.load(CONFIG.with_name("h200_triangles.toml")).exactness
+    part = part.model_copy(update={"dims": [3], "dtypes": ["float32"]})
+    search = jfrnn.search_triangles
+    monkeypatch.setattr(jfrnn, "search_triangles", lambda x, v, f, cutoff, **options: search(x, v, f, 1.5 * cutoff, **options))
+    assert [row["wrong"] for row in _gpu._exactness_rows(part)] == [1]
 
 
 def test_memory_is_planned_within_a_tenth(monkeypatch):

@@ -1,0 +1,170 @@
+"""Triangles in a run on a GPU: the hard cases against the oracle, then seconds of lists around a gear, by engine and kernel.
+
+A time stands in a row that also says how many lists were wrong: those that differ, as sets, from the array engine's.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from experiments import _measure, _triangles
+from jfrnn._warp import load_warp
+
+
+def decisions(oracle: Any, dtype: str, dim: int, capacity: int, backend: str) -> Iterator[tuple[str, bool]]:  # noqa: ANN401
+    """Say of every hard case whether its list is the oracle's."""
+    import jax.numpy as jnp
+    from jfrnn.cases.triangles import TRIANGLE_CASES, padded  # pyright: ignore[reportMissingImports]
+
+    import jfrnn
+
+    for name, case in TRIANGLE_CASES.items():
+        plain = case.build(np.dtype(dtype), dim)
+        given = padded(plain)
+        x, vertices, faces = (jnp.asarray(array) for array in (given.positions, given.vertices, given.faces))
+        tri = jfrnn.search_triangles(x, vertices, faces, given.cutoff, capacity=capacity, backend=backend)
+        expected = oracle.triangle_pairs(plain.positions, plain.vertices, plain.faces, plain.cutoff)
+        yield name, is_exact(oracle, tri, expected)
+
+
+def is_exact(oracle: Any, tri: Any, expected: Any) -> bool:  # noqa: ANN401
+    """Say whether a list holds exactly these pairs, and says no less of itself."""
+    idx, count = np.asarray(tri.idx), np.asarray(tri.count)
+    try:
+        found = oracle.pairs_of(idx, count, len(tri.faces))
+    except AssertionError:  # indices out of range, or repeated
+        return False
+    filled = np.all(idx[np.arange(tri.capacity) >= count[:, None]] == len(tri.faces))
+    return bool(filled) and not tri.overflow and int(tri.required) == int(count.max()) and not any(oracle.compare(found, expected))
+
+
+def rows(
+    n: int, faces: int, cutoff: float, dtype: str, steps: int, timed: Callable[..., dict[str, Any]]
+) -> Iterator[dict[str, Any]]:
+    """Time lists of n random particles around a gear, by "warp" and by "jax".
+
+    "update" keeps the cells of a wall that stays, also for particles along a Morton curve, "rebuild" sorts it anew, "count" makes
+    no list; each is a call that is not waited for, or a step of a scan. Of "warp" on CUDA, each kernel is timed, too.
+
+    Args:
+        n: Particles.
+        faces: Of the gear, about.
+        cutoff: [modules].
+        dtype: Of all floats.
+        steps: Of the scan.
+        timed: Times a call: `experiments._gpu._timed`, of a config.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    import jfrnn
+
+    scene = _triangles._gear(n, faces)
+    x, vertices, named = (
+        jnp.asarray(scene.points.astype(dtype)),
+        jnp.asarray(scene.vertices.astype(dtype)),
+        jnp.asarray(scene.faces),
+    )
+    exact = jfrnn.search_triangles(x, vertices, named, cutoff, backend="jax")
+    base = {"kind": "triangles", "layout": "gear", "points": n, "faces": len(scene.faces), "cutoff": cutoff, "dtype": dtype}
+    base |= {"capacity": exact.capacity, "pairs": int(np.asarray(exact.count).sum(dtype=np.int64))}
+    for backend in ("warp", "jax"):
+        tri = jfrnn.search_triangles(x, vertices, named, cutoff, capacity=exact.capacity, backend=backend)
+        again = tri.update(x)
+        wrong = different_rows(tri, exact) + int(np.sum(np.asarray(tri.count) != np.asarray(exact.count)))
+        about = base | {"wrong": wrong, "same_bits_twice": bool((tri.idx == again.idx).all() & (tri.count == again.count).all())}
+        for name, call in _calls(tri, x, vertices, steps).items():
+            said = timed(call)
+            if name.startswith("scan"):
+                said = _measure.summarize([s / steps for s in said["seconds"]]) | {"steps": steps}
+            yield about | {"method": f"jfrnn {backend}, {name}"} | said
+        if backend == "warp" and jax.default_backend() == "gpu":
+            yield about | {"method": "jfrnn warp, kernels alone"} | stages(tri, x)
+
+
+def _calls(tri: Any, x: Any, vertices: Any, steps: int) -> dict[str, Callable[[], Any]]:  # noqa: ANN401
+    import jax
+    from jax import lax
+
+    import jfrnn
+
+    if tri.backend == "jax":  # takes long, to compile too: what `rows` has compiled says enough
+        return {"update": lambda: tri.update(x).idx, "rebuild": lambda: tri.update(x, vertices=vertices).idx}
+
+    def step(carry: Any, _: None) -> tuple[Any, None]:  # noqa: ANN401
+        x, tri = carry
+        tri = tri.update(x)
+        return (x + 0 * (tri.idx[0, 0] + tri.count[0]).astype(x.dtype), tri), None
+
+    update = jax.jit(lambda x, tri: tri.update(x))
+    rebuild = jax.jit(lambda x, vertices, tri: tri.update(x, vertices=vertices))
+    count = jax.jit(lambda x, tri: tri.update(x).count)
+    scan = jax.jit(lambda x, tri: lax.scan(step, (x, tri), None, length=steps)[0][1].status)
+    ordered = x[jfrnn.sort_order(x, tri.cutoff, curve="morton")]
+    return {
+        "update": lambda: update(x, tri).idx,
+        "update, morton order": lambda: update(ordered, tri).idx,
+        "rebuild": lambda: rebuild(x, vertices, tri).idx,
+        "count": lambda: count(x, tri),
+        "scan of updates": lambda: scan(x, tri),
+    }
+
+
+def different_rows(one: Any, other: Any) -> int:  # noqa: ANN401
+    """Count the rows of two lists that differ as sets."""
+    import jax.numpy as jnp
+
+    different, block = 0, 1 << 17
+    for start in range(0, len(one.idx), block):
+        part = slice(start, start + block)
+        different += int((jnp.sort(one.idx[part], axis=1) != jnp.sort(other.idx[part], axis=1)).any(axis=1).sum())
+    return different
+
+
+def launchable(tri: Any, x: Any, device: str) -> tuple[list[Any], Any, Any, Any]:  # noqa: ANN401
+    """Return the commands of a query with the cells of a list, and its arrays on a device: idx, count, scratch."""
+    wp = load_warp()
+    from jfrnn import _triangles_warp
+    from jfrnn._exact import make_cutoff
+    from jfrnn._triangles_cells import without_faults
+    from jfrnn._warp import kernels_of
+
+    n, dim = x.shape
+    variant = _triangles_warp._Variant(dim, x.dtype == np.float64, lists=True)
+    corners, _, _ = without_faults(tri.vertices, tri.faces)
+    inputs = _triangles_warp.query_inputs(x, corners, tri.cells, make_cutoff(tri.cutoff, np.dtype(x.dtype), closed=False))
+    sizes = _triangles_warp._sizes_of_cells(inputs)
+    words = kernels_of("triangles_cuda").scratch_words(n, *sizes, dim, variant.double)
+    arrays = [wp.array(np.asarray(given), device=device) for given in inputs]
+    arrays[1] = wp.array(np.asarray(corners), dtype=arrays[0].dtype, ndim=3, device=device)
+    arrays += [wp.empty(shape, dtype=wp.int32, device=device) for shape in ((n, tri.capacity), n, words)]
+    if device != "cpu":
+        _triangles_warp._cuda_kernels(variant).load(device)
+    return _triangles_warp._commands(variant, *arrays), *arrays[-3:]
+
+
+def stages(tri: Any, x: Any, repeats: int = 5) -> dict[str, Any]:  # noqa: ANN401
+    """Return the seconds of the kernels of a query on CUDA, each alone on the device's clock, and what waited for integers."""
+    wp = load_warp()
+    commands, _, _, scratch = launchable(tri, x, "cuda:0")
+
+    def measure(until: int) -> float:
+        with wp.ScopedCapture("cuda") as capture:
+            for kernel, arguments, threads, block, _ in commands[:until]:
+                wp.launch(kernel, dim=threads, inputs=list(arguments), device="cuda", block_dim=block)
+        times = []
+        for _ in range(repeats):
+            begin, end = wp.Event("cuda", enable_timing=True), wp.Event("cuda", enable_timing=True)
+            wp.record_event(begin)
+            for _ in range(10):
+                wp.capture_launch(capture.graph)
+            wp.record_event(end)
+            times.append(wp.get_event_elapsed_time(begin, end) / 10 * 1e-3)
+        return float(np.median(times))
+
+    until = [measure(k + 1) for k in range(len(commands))]
+    names = [f"{command.kernel.key.split('_')[0]}_s" for command in commands]
+    near, queued = scratch.numpy()[:2]
+    told = {"median_s": until[-1], **dict(zip(names, np.diff([0.0, *until]).tolist(), strict=True))}
+    return told | {"with_candidates": int(near), "settled": int(queued)}

@@ -1,0 +1,341 @@
+"""Triangles near each particle on CUDA: seven launches, no host synchronization, nothing allocated beside the scratch.
+
+prepare  boxes of triangles into the order of entries, so that a candidate is one sector; clears what the others count in
+place    every particle looks into its buckets: with no entry in any it is done, else it counts itself in that of its smallest cell
+fill     unused slots into all rows, beside `place`
+allocate counts to first places; in which order the buckets come is left to chance, and no result depends on it
+scatter  particles with candidates, those of neighboring cells side by side: the threads of a warp then meet the same candidates
+query    a thread per particle: boxes first; what they leave waits in shared memory, float bounds decide it, then float64
+settle   rows in which float64 left a pair open, anew, with integers: few threads, whose numbers take scratch
+
+A thread writes its own row, in the order of the CPU kernel: rows are the same bits in every run, and those of the CPU. No product
+is contracted with a sum, so that the same text on the CPU decides with the same floats.
+
+The floor of 1 000 000 particles at random around a gear of 12 160 faces (`python -m experiments triangles`), float32, counted on
+the CPU, for cutoffs of 0.1 | 0.3 | 0.8 modules: 4 | 3 | 2 sizes of cells; 0.68 | 0.66 | 0.78 million particles with candidates;
+9.9 | 19 | 121 million candidates, of which 0.67 | 3.0 | 19 million boxes hold the particle; 0.15 | 1.2 | 9.9 million pairs.
+Bytes: rows of 16 | 32 | 128 slots, 64 | 128 | 512 MB, 12 MB of positions, 4 MB of counts, 20 MB to sort by: 23 | 38 | 130 us at
+4.3 TB/s; entries (4 MB) and tables stay in L2. Operations: 20 per candidate, 350 per box, in all 0.4 | 1.4 | 9.1 billion, which 30
+per ns do in 15 | 48 | 300 us if no lane idles. Half of them will, and seven launches wait for each other.
+Prediction for an H200: 0.15 | 0.25 | 0.85 ms. NOT YET MEASURED.
+"""
+
+import functools
+from typing import NamedTuple
+
+import warp as wp
+from jfrnn.kernels._native import snippet
+from jfrnn.kernels._triangles import BOUNDS, DECIDE, LEVELS, constants
+
+BLOCK = 256
+QUERY_BLOCK = 128
+_SETTLE_BLOCK = 32
+_RUN = 64  # buckets that a thread of `allocate` takes: the cells of a block
+_SWEEP = 132 * 2048  # threads of `fill`: all at work at once
+_WORKERS = {False: 8448, True: 2112}  # threads of `settle`, by width: 38 and 58 MB of integers
+_HEADER_WORDS = 16
+_QUERY_BLOCKS = {False: 5, True: 3}  # per multiprocessor, which bounds the registers; by width
+
+LAYOUT = r"""
+struct Shared {
+    int near;  // particles with candidates
+    int queued;  // rows that wait for `settle`
+};
+struct alignas(DIM == 3 ? 16 : 2 * sizeof(real)) Entry {
+    real low[DIM];
+    whole triangle;
+    real high[DIM];
+    whole level;
+};
+int* cursor = scratch.data;
+auto take = [&](long long words) { int* here = cursor; cursor += (words + 15) / 16 * 16; return here; };
+Shared& shared = *(Shared*)take(HEADER);
+int* first = take(buckets);  // particles of each key, then the first place of theirs
+int* key = take(n);
+int* slot = take(n);
+int* order = take(n);
+int* queue = slot;  // nobody asks for slots once particles are scattered
+Entry* entry_of = (Entry*)take((long long)entries * (sizeof(Entry) / 4));
+int* room = take((long long)workers * ROOM);
+auto add_to = [](int* sum, int number) -> int {
+#if defined(__CUDA_ARCH__)
+    return atomicAdd(sum, number);
+#else
+    *sum += number;  // threads come one after the other
+    return *sum - number;
+#endif
+};
+"""
+
+_PREPARE = r"""
+if (thread == 0)
+    shared.near = shared.queued = 0;
+if (thread < buckets)
+    first[thread] = 0;
+if (thread < entries) {
+    Entry entry;
+    const int t = triangles.data[thread];
+    const bool there = t < f;
+    for (int k = 0; k < DIM; ++k) {
+        entry.low[k] = there ? boxes.data[(long long)2 * DIM * t + k] : Bits::not_finite();
+        entry.high[k] = there ? boxes.data[(long long)2 * DIM * t + DIM + k] : real(0);
+    }
+    entry.triangle = t;
+    entry.level = there ? level_of.data[t] : -1;
+    entry_of[thread] = entry;
+}
+"""
+
+_PLACE = r"""
+// where particles are sorted to: 64 cells of a block stand side by side, blocks anywhere
+auto key_at = [&](const real* p) -> int {
+    constexpr int BITS = DIM == 3 ? 2 : 3;
+    const int level = levels.data[0];
+    int cell[DIM], within = 0;
+    for (int k = 0; k < DIM; ++k) {
+        cell[k] = cell_at(double(p[k]), scale_of(level));
+        within |= (cell[k] & ((1 << BITS) - 1)) << BITS * k;
+        cell[k] >>= BITS;
+    }
+    return ((bucket_of(level, cell, buckets) & ~63) | within) & (buckets - 1);
+};
+if (thread < n) {
+    real p[DIM];
+    for (int k = 0; k < DIM; ++k)
+        p[k] = positions.data[(long long)DIM * thread + k];
+    const int number = finite_point(p) ? level_count.data[0] : 0;
+    bool some = false;
+    for (int l = 0; l < number && !some; ++l) {
+        const int bucket = bucket_at(p, levels.data[l], buckets);
+        some = start.data[bucket] < start.data[bucket + 1];
+    }
+    const int mine = some ? key_at(p) : -1;
+    key[thread] = mine;
+    if (some)
+        slot[thread] = add_to(first + mine, 1);
+    else
+        count.data[thread] = 0;
+}
+"""
+
+_FILL = r"""
+const long long words = (long long)n * capacity, fours = words / 4;
+struct alignas(16) Four { int id[4]; };  // an array from XLA begins where 16 bytes may be stored at once
+const Four none{{f, f, f, f}};
+for (long long i = thread; i < fours; i += threads)
+    ((Four*)idx.data)[i] = none;
+if (thread < words - 4 * fours)
+    idx.data[4 * fours + thread] = f;
+"""
+
+_ALLOCATE = r"""
+const long long begin = (long long)thread * RUN;
+int sum = 0;
+for (long long b = begin; b < begin + RUN && b < buckets; ++b)
+    sum += first[b];
+int place = sum ? add_to(&shared.near, sum) : 0;
+for (long long b = begin; sum && b < begin + RUN && b < buckets; ++b) {
+    const int number = first[b];
+    first[b] = place;
+    place += number;
+}
+"""
+
+_SCATTER = r"""
+if (thread < n && key[thread] >= 0)
+    order[first[key[thread]] + slot[thread]] = thread;
+"""
+
+# `list_row(i, decide)`: lists the triangles near particle i; are all pairs decided? `decide(p, corners)`: 1 near, 0 far, -1 open
+_ROW = r"""
+#if defined(__CUDA_ARCH__)
+__shared__ int waiting_of[WAITING][THREADS];
+auto waiting = [&](int k) -> int& { return waiting_of[k][threadIdx.x]; };
+#else
+int waiting_of[WAITING];
+auto waiting = [&](int k) -> int& { return waiting_of[k]; };
+#endif
+auto list_row = [&](int i, auto decide) -> bool {
+    real p[DIM];
+    for (int k = 0; k < DIM; ++k)
+        p[k] = positions.data[(long long)DIM * i + k];
+    int* row = idx.data + (long long)capacity * i;
+    const int sizes_of_cells = level_count.data[0];
+    int found = 0, l = 0, level = 0, e = 0, last = 0;
+    bool more = true, open = false;
+    while (more && !open) {
+        int number = 0;
+        while (number < WAITING) {
+            if (e < last) {
+                const Entry entry = entry_of[e++];
+                bool inside = entry.level == level;
+                for (int k = 0; k < DIM; ++k)
+                    inside = inside && entry.low[k] <= p[k] && entry.high[k] >= p[k];
+                if (inside)
+                    waiting(number++) = (int)entry.triangle;
+            } else if (l < sizes_of_cells) {
+                level = levels.data[l++];
+                const int bucket = bucket_at(p, level, buckets);
+                e = start.data[bucket];
+                last = start.data[bucket + 1];
+            } else {
+                more = false;
+                break;
+            }
+        }
+        for (int w = 0; w < number && !open; ++w) {
+            const int t = waiting(w), near = decide(p, corners.data + (long long)DIM * DIM * t);
+            open = near < 0;
+            if (near > 0) {
+                if (LIST && found < capacity)
+                    row[found] = t;
+                ++found;
+            }
+        }
+    }
+    count.data[i] = found;
+    return !open;
+};
+"""
+
+_QUERY = r"""
+auto with_floats = [&](const real* p, const real* shape) -> int {
+    vec x[DIM][DIM];
+    for (int c = 0; c < DIM; ++c)
+        for (int k = 0; k < DIM; ++k)
+            x[c][k] = (shape[DIM * c + k] - p[k]) * unit;
+    mask near, far;
+    bounded(x, near, far);
+    return near ? 1 : far ? 0 : Shape::sure(p, shape, radius, scale);
+};
+if (thread < shared.near) {
+    const int i = order[thread];
+    if (!list_row(i, with_floats))
+        queue[add_to(&shared.queued, 1)] = i;
+}
+"""
+
+_SETTLE = r"""
+int* mine = room + (long long)(thread / 32) * 32 * ROOM + thread % 32;
+auto with_integers = [&](const real* p, const real* shape) -> int { return Shape::near(p, shape, radius, scale, mine); };
+for (int q = thread; q < shared.queued; q += threads)
+    list_row(queue[q], with_integers);
+"""
+
+
+def workers_for(n: int, double: bool) -> int:
+    """Return the number of threads of `settle`, each with memory for the integers of a pair."""
+    return min(_WORKERS[double], (n + 31) // 32 * 32)
+
+
+def scratch_words(n: int, buckets: int, entries: int, dim: int, double: bool) -> int:
+    """Return the int32 words of scratch that the kernels need."""
+    entry = (2 if double else 1) * 2 * (dim + 1)
+    parts = [_HEADER_WORDS, buckets, n, n, n, entries * entry, workers_for(n, double) * constants(dim, double, 32)["ROOM"]]
+    return sum((words + 15) // 16 * 16 for words in parts)
+
+
+class Launch(NamedTuple):
+    """A kernel, its threads in all and per block, and whether it may run beside the launch before it."""
+
+    kernel: wp.Kernel
+    threads: int
+    block: int
+    beside: bool = False
+
+
+class Kernels(NamedTuple):
+    """The kernels of a variant, all with the same arguments, of which the last is the number of threads."""
+
+    prepare: wp.Kernel
+    place: wp.Kernel
+    fill: wp.Kernel | None
+    allocate: wp.Kernel
+    scatter: wp.Kernel
+    query: wp.Kernel
+    settle: wp.Kernel
+
+    def launches(self, n: int, buckets: int, entries: int, capacity: int, double: bool) -> list[Launch]:
+        """Return what is launched, in order, for n particles."""
+        slots = n * capacity
+        return [
+            _launch(self.prepare, max(buckets, entries), BLOCK),
+            _launch(self.place, n, BLOCK),
+            *([] if self.fill is None else [_launch(self.fill, min(max(slots // 4, 3), _SWEEP), BLOCK, beside=True)]),
+            _launch(self.allocate, -(-buckets // _RUN), BLOCK),
+            _launch(self.scatter, n, BLOCK),
+            _launch(self.query, n, QUERY_BLOCK),
+            _launch(self.settle, workers_for(n, double), _SETTLE_BLOCK),
+        ]
+
+    def load(self, device: wp.DeviceLike) -> None:
+        """Compile and load all: nothing is left to do while a CUDA graph is recorded."""
+        for kernel, block in ((self.prepare, BLOCK), (self.query, QUERY_BLOCK), (self.settle, _SETTLE_BLOCK)):
+            wp.load_module(kernel.module, device=device, block_dim=block)
+
+
+def _launch(kernel: wp.Kernel, threads: int, block: int, beside: bool = False) -> Launch:
+    return Launch(kernel, -(-threads // block) * block, block, beside)
+
+
+@functools.cache
+def triangle_kernels(dim: int, double: bool, lists: bool) -> Kernels:
+    """Return the kernels for a dimension and dtype, for lists or counts alone."""
+    kind = f"{dim}d_{'f64' if double else 'f32'}"
+    rows = f"{kind}{'_list' * lists}"
+
+    def sorting(name: str, text: str) -> wp.Kernel:
+        return _kernel(f"{name}_{kind}", f"sort_{kind}", dim, double, (BLOCK, 1), lists, LEVELS, LAYOUT, text)
+
+    def deciding(name: str, block: int, blocks: int, text: str) -> wp.Kernel:
+        pieces = (DECIDE, LEVELS, "using vec = real;", BOUNDS, LAYOUT, _ROW, text)
+        return _kernel(f"{name}_{rows}", f"{name}_{rows}", dim, double, (block, blocks), lists, *pieces)
+
+    return Kernels(
+        sorting("prepare", _PREPARE),
+        sorting("place", _PLACE),
+        sorting("fill", _FILL) if lists else None,
+        sorting("allocate", _ALLOCATE),
+        sorting("scatter", _SCATTER),
+        deciding("query", QUERY_BLOCK, _QUERY_BLOCKS[double], _QUERY),
+        deciding("settle", _SETTLE_BLOCK, 1, _SETTLE),
+    )
+
+
+_made: dict[str, wp.Kernel] = {}
+_WAITING = 16  # candidates of a thread whose boxes hold its particle, until they are decided
+
+
+def _kernel(name: str, module_name: str, dim: int, double: bool, bounds: tuple[int, int], lists: bool, *pieces: str) -> wp.Kernel:
+    if name in _made:
+        return _made[name]
+    scalar = wp.float64 if double else wp.float32
+    reals, ints = wp.array(dtype=scalar), wp.array(dtype=wp.int32)
+    points, rows, shapes = wp.array2d(dtype=scalar), wp.array2d(dtype=wp.int32), wp.array3d(dtype=scalar)
+    options = {"LIST": lists, "WAITING": _WAITING, "THREADS": bounds[0], "RUN": _RUN, "HEADER": _HEADER_WORDS}
+
+    def native(
+        positions: points, corners: shapes, boxes: points, cutoff: reals, start: ints, triangles: ints, levels: ints,
+        level_count: ints, level_of: ints, idx: rows, count: ints, scratch: ints,
+        n: int, f: int, buckets: int, entries: int, capacity: int, workers: int, threads: int, thread: int,
+    ): ...  # fmt: skip
+
+    native.__name__ = native.__qualname__ = f"triangles_{name}_native"
+    text = snippet("double" if double else "float", dim, *pieces, **options, **constants(dim, double, stride=32))
+    function = wp.func_native(text)(native)
+
+    def kernel(
+        positions: points, corners: shapes, boxes: points, cutoff: reals, start: ints, triangles: ints, levels: ints,
+        level_count: ints, level_of: ints, idx: rows, count: ints, scratch: ints,
+        n: int, f: int, buckets: int, entries: int, capacity: int, workers: int, threads: int,
+    ):  # fmt: skip
+        thread = wp.tid()
+        function(
+            positions, corners, boxes, cutoff, start, triangles, levels, level_count, level_of, idx, count, scratch,
+            n, f, buckets, entries, capacity, workers, threads, thread,
+        )  # fmt: skip
+
+    module = wp.get_module(f"jfrnn.kernels.triangles_cuda.{module_name}")
+    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
+    _made[name] = wp.kernel(kernel, name=name, module=module, grid_stride=False, launch_bounds=bounds)
+    return _made[name]

@@ -1,0 +1,149 @@
+"""The CUDA kernels of triangles as far as a machine without a GPU can tell: they compile for one, and on the CPU, thread by thread,
+their text lists what the oracle says, bit for bit in the order of the CPU kernel.
+
+What they answer on a GPU is decided there: python -m experiments gpu experiments/configs/h200_triangles.toml --out DIR.
+"""
+
+import re
+from itertools import product
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+import warp as wp
+from jfrnn.cases import meshes
+from jfrnn.cases.triangles import TRIANGLE_CASES, padded
+from jfrnn.kernels import triangles_cuda
+
+import jfrnn
+from jfrnn import _triangles, _triangles_warp
+from jfrnn._exact import make_cutoff
+from jfrnn._triangles_cells import without_faults
+from jfrnn._triangles_warp import _Variant, query_inputs
+
+KINDS = list(product((np.float32, np.float64), (2, 3)))
+GUARD = 64  # words behind the scratch, which nobody may touch
+pytestmark = pytest.mark.usefixtures("compiled_soon")
+
+
+@pytest.mark.parametrize(("dim", "double", "lists"), list(product((2, 3), (False, True), (False, True))))
+def test_variants_compile(dim, double, lists, tmp_path):
+    """For float bounds that hold, and are those of the CPU: nothing is contracted."""
+    kernels = triangles_cuda.triangle_kernels(dim, double, lists)
+    for module in {kernel.module for kernel in kernels if kernel is not None}:
+        wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
+    programs = [path.read_text() for path in tmp_path.glob("*.ptx")]
+    assert len(programs) == 3
+    for program in programs:
+        assert not re.search(r"\bfma\.|\b(mul|add|sub)\.f(32|64)", program)
+        assert sum(map(int, re.findall(r"\.local .*\[(\d+)\]", program))) <= 32  # bytes of a thread: no big integer is among them
+
+
+class Answer:
+    """What the kernels make of the cells of a list, on the CPU."""
+
+    def __init__(self, tri, positions, lists=True):
+        n, dim = positions.shape
+        self.variant = _Variant(dim, positions.dtype == np.float64, lists)
+        corners, _, _ = without_faults(tri.vertices, tri.faces)
+        inputs = query_inputs(positions, corners, tri.cells, make_cutoff(tri.cutoff, positions.dtype, closed=False))
+        words = triangles_cuda.scratch_words(n, len(tri.cells.start) - 1, len(tri.cells.triangles), dim, self.variant.double)
+        self.idx = np.full((n, tri.capacity) if lists else (1, 1), -7, np.int32)
+        self.count, scratch = (np.full(size, -7, np.int32) for size in (n, words + GUARD))
+        arrays = [wp.array(given, device="cpu", copy=False) for given in (*map(np.asarray, inputs), self.idx, self.count, scratch)]
+        arrays[1] = wp.array(np.asarray(corners), device="cpu", dtype=arrays[0].dtype, ndim=3)  # no matrices
+        self.commands = _triangles_warp._commands(self.variant, *arrays)
+        for kernel, arguments, threads, block, _ in self.commands:
+            assert threads % block == 0
+            wp.launch(kernel, dim=threads, inputs=list(arguments), device="cpu")
+        assert np.all(scratch[words:] == -7)
+        self.near, self.queued = scratch[:2]
+
+
+@pytest.mark.parametrize(("dtype", "dim"), KINDS)
+@pytest.mark.parametrize("name", TRIANGLE_CASES)
+def test_hard_case(name, dtype, dim):
+    plain = TRIANGLE_CASES[name].build(dtype, dim)
+    given = padded(plain)
+    tri = jfrnn.search_triangles(given.positions, given.vertices, given.faces, given.cutoff, capacity=40, backend="warp")
+    answer = Answer(tri, given.positions)
+    expected = reference.triangle_pairs(plain.positions, plain.vertices, plain.faces, plain.cutoff)
+    assert not any(reference.compare(reference.pairs_of(answer.idx, answer.count, len(given.faces)), expected))
+    assert np.array_equal(answer.idx, tri.idx)
+    if name in ("ties", "sheet"):
+        assert answer.queued > 0  # integers are asked
+
+
+def around_a_gear(n, cutoff):
+    vertices, faces = meshes.gear(12, 1500)
+    vertices = vertices.astype(np.float32)
+    x = np.random.default_rng(0).uniform(vertices.min(axis=0) - 1, vertices.max(axis=0) + 1, (n, 3)).astype(np.float32)
+    return x, jfrnn.search_triangles(x, vertices, faces, cutoff, backend="warp")
+
+
+@pytest.mark.parametrize(("n", "cutoff"), [(1, 5.0), (3001, 0.5)])
+def test_around_a_gear(n, cutoff):
+    """Cells of several sizes, and rows longer than what waits to be decided at a time; most particles are near nothing."""
+    x, tri = around_a_gear(n, cutoff)
+    assert int(tri.required) > triangles_cuda._WAITING
+    answer = Answer(tri, x)
+    assert np.array_equal(answer.idx, tri.idx)
+    assert np.array_equal(answer.count, tri.count)
+    assert np.sum(answer.count > 0) <= answer.near <= n
+    counted = Answer(tri, x, lists=False)
+    assert np.array_equal(counted.count, tri.count)
+    assert len(counted.commands) == len(answer.commands) - 1  # no row is filled
+    assert np.all(counted.idx == -7)
+
+
+def test_rows_that_are_too_short():
+    """Counts stay true, and what fits is written."""
+    x, tri = around_a_gear(500, 0.7)
+    few = tri.update(x)
+    short = jfrnn.search_triangles(x, few.vertices, few.faces, 0.7, capacity=3, backend="warp")
+    assert short.overflow
+    answer = Answer(short, x)
+    assert np.array_equal(answer.idx, short.idx)
+    assert np.array_equal(answer.count, tri.count)
+
+
+def test_programs_for_cuda_call_it():
+    given = padded(TRIANGLE_CASES["random"].build(np.float32, 3))
+    search = jax.jit(lambda x: jfrnn.search_triangles(x, given.vertices, given.faces, 1.0, capacity=40, backend="warp").idx)
+    program = search.trace(given.positions).lower(lowering_platforms=("cuda",)).as_text()
+    assert "@jfrnn_triangles_cuda_3d_f32_list(" in program
+    assert "_build_" not in program  # XLA sorts the wall
+    assert "cuda" not in search.lower(given.positions).as_text()
+
+
+@pytest.mark.parametrize("lists", [False, True])
+def test_launches_have_the_arguments_of_their_kernels(lists):
+    x, tri = around_a_gear(100, 0.5)
+    commands = Answer(tri, x, lists).commands
+    assert [command.beside for command in commands] == [False, False, *([True] if lists else []), False, False, False, False]
+    for command in commands:
+        types = [argument.type for argument in command.kernel.adj.args]
+        given = [(x.dtype, x.ndim) if isinstance(x, wp.array) else int for x in command.arguments]
+        assert given == [(kind.dtype, kind.ndim) if isinstance(kind, wp.array) else int for kind in types]
+        assert all(isinstance(x, wp.array) or 0 <= x < 2**31 for x in command.arguments)
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_scratch_follows_particles_and_triangles(double):
+    for n in (10, 1_000_000, 100_000_000):
+        words = triangles_cuda.scratch_words(n, 1 << 17, 16 * 12_000, 3, double)
+        assert 4 * words <= 12 * n + (4 << 17) + 64 * (1 + double) * 16 * 12_000 + min(60e6, 30_000 * (n + 31)) + 1024
+
+
+def test_auto_waits_until_it_is_measured(monkeypatch):
+    x = jnp.zeros((4, 3), np.float32)
+    monkeypatch.setattr(_triangles, "choose_engine", lambda backend, *_: f"chose {backend}")
+    monkeypatch.setattr(_triangles, "platform_of", lambda *_: "gpu")
+    assert _triangles._chosen_engine("auto", x) == "jax"
+    assert _triangles._chosen_engine("warp", x) == "chose warp"
+    monkeypatch.setattr(_triangles, "platform_of", lambda *_: "rocm")
+    assert _triangles._chosen_engine("auto", x) == "jax"
+    with pytest.raises(RuntimeError, match="on the CPU and on CUDA alone, got 'rocm'"):
+        _triangles._chosen_engine("warp", x)
