@@ -21,6 +21,13 @@ def _release_programs():
         jax.clear_caches()
 
 
+@pytest.fixture(autouse=True)
+def _both_widths():
+    """Turn float64 on again: commands that a test calls in this process may have turned it off."""
+    yield
+    jax.config.update("jax_enable_x64", True)
+
+
 @pytest.fixture
 def compiled_soon(request):
     """Leave out what LLVM takes long for and what no float depends on, but in slow tests and those of memory."""
