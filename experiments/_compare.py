@@ -1,4 +1,4 @@
-"""Missing and extra pairs of a method against the oracle."""
+"""Missing and extra pairs of a method against the oracle; padded rows against the tests' oracle, and against each other."""
 
 from typing import Any
 
@@ -46,6 +46,26 @@ def compare_sample(found: Found, positions: np.ndarray, cutoff: float) -> dict[s
     missing, extra = (int(-(-np.maximum(part, 0).sum() // 2)) for part in (-surplus, surplus))
     total = {"pairs": int(np.asarray(counts).sum(dtype=np.int64) // 2), "exact_pairs": int(exact.sum() // 2)}
     return total | {"missing": missing, "extra": extra, "compared": "sample"}
+
+
+def is_exact(oracle: Any, idx: Any, count: Any, fill: int, expected: Any) -> bool:  # noqa: ANN401
+    """Say whether padded rows, whose unused slots hold `fill`, hold exactly the pairs of the tests' oracle, each once."""
+    try:
+        found = oracle.pairs_of(np.asarray(idx), np.asarray(count), fill)
+    except AssertionError:  # indices out of range, or repeated
+        return False
+    return not any(oracle.compare(found, expected))
+
+
+def different_rows(one: Any, other: Any) -> int:  # noqa: ANN401
+    """Count the rows of two padded lists that differ as sets."""
+    import jax.numpy as jnp
+
+    different = 0
+    for start in range(0, len(one), 1 << 17):
+        part = slice(start, start + (1 << 17))
+        different += int((jnp.sort(one[part], axis=1) != jnp.sort(other[part], axis=1)).any(axis=1).sum())
+    return different
 
 
 def _keys(i: np.ndarray, j: np.ndarray, size: int) -> np.ndarray:

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, PositiveFloat, PositiveInt, ValidationError
 from tqdm import tqdm
 
-from experiments import _gpu_triangles, _machine, _measure, _ways
+from experiments import _compare, _gpu_triangles, _machine, _measure, _ways
 from experiments._errors import UsageError
 from jfrnn._neighbors import rounded_capacity
 from jfrnn._warp import kernels_of, load_warp
@@ -178,7 +178,10 @@ def _hard_decisions(config: Exactness, dtype: str, dim: int) -> Iterator[tuple[s
         queries = None if given.queries is None else _padded(given.queries, rows)
         options = {"queries": queries, "capacity": config.capacity, "closed": closed, "backend": config.backend}
         nbrs = jfrnn.search(jax.numpy.asarray(_padded(given.positions, rows)), given.cutoff, **options)
-        yield f"{name}{'-closed' * closed}", _is_exact(oracle, nbrs, _expected(oracle, name, dtype, dim, closed))
+        yield (
+            f"{name}{'-closed' * closed}",
+            _compare.is_exact(oracle, nbrs.idx, nbrs.count, nbrs.source_count, _expected(oracle, name, dtype, dim, closed)),
+        )
 
 
 def _periodic_decisions(config: Exactness, dtype: str, dim: int) -> Iterator[tuple[str, bool]]:
@@ -285,14 +288,6 @@ def _images(nbrs: Any, x: Any, queries: Any) -> list[tuple[int, int, tuple[int, 
     return sorted(zip(i.tolist(), j.tolist(), map(tuple, shifts.tolist()), strict=True))
 
 
-def _is_exact(oracle: Any, nbrs: Any, expected: Any) -> bool:  # noqa: ANN401
-    try:
-        found = oracle.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), nbrs.source_count)
-    except AssertionError:  # indices out of range, or repeated
-        return False
-    return not any(oracle.compare(found, expected))
-
-
 @functools.lru_cache(maxsize=1024)
 def _expected(oracle: Any, name: str, dtype: str, dim: int, closed: bool) -> Any:  # noqa: ANN401
     from jfrnn.cases.hard import HARD_CASES  # pyright: ignore[reportMissingImports]
@@ -397,7 +392,7 @@ def _scene_rows(config: Config, layout: str, points: np.ndarray) -> Iterator[dic
         row["wrong"] = int((np.asarray(count) != exact).sum())
         row["same_bits_twice"] = bool((idx == again[0]).all() and (count == again[1]).all())
         if n <= 1_000_000:
-            row["wrong"] += _different_rows(idx, jax.jit(functools.partial(listed, backend="jax"))(x)[0])
+            row["wrong"] += _compare.different_rows(idx, jax.jit(functools.partial(listed, backend="jax"))(x)[0])
         del idx, count, again
         yield row | _timed(config, lambda search=search: search(x))
     counts = jax.jit(lambda x: jfrnn.count(x, cutoff, backend="warp"))
@@ -496,17 +491,6 @@ def _large_sum_rows(config: Config, n: int) -> Iterator[dict[str, Any]]:
         row = {"kind": "sum", "method": "pair_sum warp", "gradient": gradient, "layout": "random", "points": n, "dtype": "float32"}
         row |= {"compiled_bytes": memory.temp_size_in_bytes + memory.output_size_in_bytes}
         yield row | _timed(config, lambda sums=sums: sums(x, given.m, None), calls=2)
-
-
-def _different_rows(one: Any, other: Any) -> int:  # noqa: ANN401
-    """Count the rows of two padded lists that differ as sets."""
-    import jax.numpy as jnp
-
-    different = 0
-    for start in range(0, len(one), 1 << 17):
-        part = slice(start, start + (1 << 17))
-        different += int((jnp.sort(one[part], axis=1) != jnp.sort(other[part], axis=1)).any(axis=1).sum())
-    return different
 
 
 def _peer_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> Iterator[dict[str, Any]]:  # noqa: ANN401
@@ -653,22 +637,8 @@ def _kernel_time(
     arguments = [x, x, radius, idx, count, info, scratch, n, n, 1, table, capacity if lists else 0, 0, 1]
     launches = kernels.launches(n, n, True, table)
 
-    def measure(until: int) -> float:
-        with wp.ScopedCapture("cuda") as capture:
-            for launch in launches[:until]:
-                inputs = [*arguments, int(launch.of_queries)]
-                wp.launch(launch.kernel, dim=launch.threads, inputs=inputs, device="cuda", block_dim=launch.block)
-        times = []
-        for _ in range(config.repeats):
-            begin, end = wp.Event("cuda", enable_timing=True), wp.Event("cuda", enable_timing=True)
-            wp.record_event(begin)
-            for _ in range(10):
-                wp.capture_launch(capture.graph)
-            wp.record_event(end)
-            times.append(wp.get_event_elapsed_time(begin, end) / 10 * 1e-3)
-        return float(np.median(times))
-
-    until = [measure(k + 1) for k in range(len(launches))]
+    commands = [(launch.kernel, [*arguments, int(launch.of_queries)], launch.threads, launch.block) for launch in launches]
+    until = _measure.time_kernels(commands, config.repeats)
     names = ("bounds", "lay_out", "count", "scan", "scatter", "gather", "query")
     stages = {f"{name}_s": float(s) for name, s in zip(names, np.diff([0.0, *until]), strict=True)}
     return until[-1], stages, int(info.numpy()[0]), int(count.numpy().sum(dtype=np.int64))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments import _measure, _triangles
+from experiments import _compare, _measure, _triangles
 from jfrnn._warp import load_warp
 
 
@@ -30,13 +30,10 @@ def decisions(oracle: Any, dtype: str, dim: int, capacity: int, backend: str) ->
 
 def is_exact(oracle: Any, tri: Any, expected: Any) -> bool:  # noqa: ANN401
     """Say whether a list holds exactly these pairs, and says no less of itself."""
-    idx, count = np.asarray(tri.idx), np.asarray(tri.count)
-    try:
-        found = oracle.pairs_of(idx, count, len(tri.faces))
-    except AssertionError:  # indices out of range, or repeated
-        return False
-    filled = np.all(idx[np.arange(tri.capacity) >= count[:, None]] == len(tri.faces))
-    return bool(filled) and not tri.overflow and int(tri.required) == int(count.max()) and not any(oracle.compare(found, expected))
+    idx, count, fill = np.asarray(tri.idx), np.asarray(tri.count), len(tri.faces)
+    filled = np.all(idx[np.arange(tri.capacity) >= count[:, None]] == fill)
+    told = bool(filled) and not tri.overflow and int(tri.required) == int(count.max())
+    return told and _compare.is_exact(oracle, idx, count, fill, expected)
 
 
 def rows(
@@ -72,7 +69,7 @@ def rows(
     for backend in ("warp", "jax"):
         tri = jfrnn.search_triangles(x, vertices, named, cutoff, capacity=exact.capacity, backend=backend)
         again = tri.update(x)
-        wrong = different_rows(tri, exact) + int(np.sum(np.asarray(tri.count) != np.asarray(exact.count)))
+        wrong = _compare.different_rows(tri.idx, exact.idx) + int(np.sum(np.asarray(tri.count) != np.asarray(exact.count)))
         about = base | {"wrong": wrong, "same_bits_twice": bool((tri.idx == again.idx).all() & (tri.count == again.count).all())}
         for name, call in _calls(tri, x, vertices, steps).items():
             said = timed(call)
@@ -111,17 +108,6 @@ def _calls(tri: Any, x: Any, vertices: Any, steps: int) -> dict[str, Callable[[]
     }
 
 
-def different_rows(one: Any, other: Any) -> int:  # noqa: ANN401
-    """Count the rows of two lists that differ as sets."""
-    import jax.numpy as jnp
-
-    different, block = 0, 1 << 17
-    for start in range(0, len(one.idx), block):
-        part = slice(start, start + block)
-        different += int((jnp.sort(one.idx[part], axis=1) != jnp.sort(other.idx[part], axis=1)).any(axis=1).sum())
-    return different
-
-
 def launchable(tri: Any, x: Any, device: str) -> tuple[list[Any], Any, Any, Any]:  # noqa: ANN401
     """Return the commands of a query with the cells of a list, and its arrays on a device: idx, count, scratch."""
     wp = load_warp()
@@ -146,24 +132,8 @@ def launchable(tri: Any, x: Any, device: str) -> tuple[list[Any], Any, Any, Any]
 
 def stages(tri: Any, x: Any, repeats: int = 5) -> dict[str, Any]:  # noqa: ANN401
     """Return the seconds of the kernels of a query on CUDA, each alone on the device's clock, and what waited for integers."""
-    wp = load_warp()
     commands, _, _, scratch = launchable(tri, x, "cuda:0")
-
-    def measure(until: int) -> float:
-        with wp.ScopedCapture("cuda") as capture:
-            for kernel, arguments, threads, block, _ in commands[:until]:
-                wp.launch(kernel, dim=threads, inputs=list(arguments), device="cuda", block_dim=block)
-        times = []
-        for _ in range(repeats):
-            begin, end = wp.Event("cuda", enable_timing=True), wp.Event("cuda", enable_timing=True)
-            wp.record_event(begin)
-            for _ in range(10):
-                wp.capture_launch(capture.graph)
-            wp.record_event(end)
-            times.append(wp.get_event_elapsed_time(begin, end) / 10 * 1e-3)
-        return float(np.median(times))
-
-    until = [measure(k + 1) for k in range(len(commands))]
+    until = _measure.time_kernels([command[:4] for command in commands], repeats)
     names = [f"{command.kernel.key.split('_')[0]}_s" for command in commands]
     near, queued = scratch.numpy()[:2]
     told = {"median_s": until[-1], **dict(zip(names, np.diff([0.0, *until]).tolist(), strict=True))}

@@ -5,7 +5,7 @@ import gc
 import math
 import resource
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
@@ -152,6 +152,34 @@ def time_in_turns(calls: dict[str, Callable[[], Any]], rounds: int, burst: int =
             seconds[name].append((perf_counter() - begin) / burst)
     others = bystanders.cores()
     return seconds, None if others is None else round(others, 2)
+
+
+def time_kernels(launches: Sequence[tuple[Any, Sequence[Any], int, int]], repeats: int) -> list[float]:
+    """Return the seconds on CUDA, by the device's clock, of the first launch, of the first two, and so on: medians of graphs.
+
+    Args:
+        launches: Kernel, arguments, threads in all and per block of each.
+        repeats: How often each graph is timed, ten runs at a time.
+    """
+    from jfrnn._warp import load_warp
+
+    wp = load_warp()
+
+    def measure(until: int) -> float:
+        with wp.ScopedCapture("cuda") as capture:
+            for kernel, arguments, threads, block in launches[:until]:
+                wp.launch(kernel, dim=threads, inputs=list(arguments), device="cuda", block_dim=block)
+        times = []
+        for _ in range(repeats):
+            begin, end = wp.Event("cuda", enable_timing=True), wp.Event("cuda", enable_timing=True)
+            wp.record_event(begin)
+            for _ in range(10):
+                wp.capture_launch(capture.graph)
+            wp.record_event(end)
+            times.append(wp.get_event_elapsed_time(begin, end) / 10 * 1e-3)
+        return float(np.median(times))
+
+    return [measure(k + 1) for k in range(len(launches))]
 
 
 def summarize(seconds: list[float]) -> dict[str, Any]:

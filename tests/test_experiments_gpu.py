@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import _gpu, _gpu_report, _gpu_triangles, _triangles
+from experiments import _compare, _gpu, _gpu_report, _gpu_triangles, _triangles
 from experiments._errors import UsageError
 
 CONFIG = Path(__file__).parent.parent / "experiments" / "configs" / "h200.toml"
@@ -55,7 +55,7 @@ def test_sums_are_timed_and_their_errors_known(config):
 def test_different_rows_are_counted_as_sets():
     one = np.array([[1, 2, 3], [4, 5, 9], [6, 9, 9]], np.int32)
     other = np.array([[3, 1, 2], [4, 9, 5], [7, 9, 9]], np.int32)
-    assert _gpu._different_rows(one, other) == 1
+    assert _compare.different_rows(one, other) == 1
 
 
 def test_an_inexact_answer_is_counted_as_wrong(config, monkeypatch):

@@ -8,22 +8,13 @@ import numpy as np
 import pytest
 import reference
 from jfrnn.cases import meshes
-from jfrnn.cases.triangles import TRIANGLE_CASES
+from jfrnn.cases.triangles import TRIANGLE_CASES, padded
 
 import jfrnn
 from jfrnn._triangles_closest import make_normals
 
 pytestmark = pytest.mark.usefixtures("compiled_soon")
 FINITE = [name for name in TRIANGLE_CASES if name not in ("not_finite", "faces_out_of_range", "huge_and_tiny")]
-
-
-def padded(given, dtype):
-    dim = given.positions.shape[1]
-    positions, vertices = np.full((48, dim), np.nan, dtype), np.full((96, dim), np.nan, dtype)
-    faces = np.full((32, dim), -1, np.int32)
-    positions[: len(given.positions)], vertices[: len(given.vertices)] = given.positions, given.vertices
-    faces[: len(given.faces)] = given.faces
-    return positions, vertices, faces
 
 
 KINDS = [pytest.param(np.float32, 3, id="f32-3d"), pytest.param(np.float64, 2, id="f64-2d", marks=pytest.mark.slow)]
@@ -33,9 +24,9 @@ KINDS = [pytest.param(np.float32, 3, id="f32-3d"), pytest.param(np.float64, 2, i
 @pytest.mark.parametrize("name", FINITE)
 def test_distances_are_those_of_the_oracle(name, dtype, dim):
     given = TRIANGLE_CASES[name].build(dtype, dim)
-    positions, vertices, faces = padded(given, dtype)
-    tri = jfrnn.search_triangles(positions, vertices, faces, given.cutoff, capacity=40)
-    points, distance, mask = (np.asarray(x) for x in tri.closest(positions))
+    wide = padded(given)
+    tri = jfrnn.search_triangles(wide.positions, wide.vertices, wide.faces, given.cutoff, capacity=40)
+    points, distance, mask = (np.asarray(x) for x in tri.closest(wide.positions))
     assert np.array_equal(mask, np.arange(40) < np.asarray(tri.count)[:, None])
     eps = float(np.finfo(dtype).eps)
     lift = [[Fraction(x) for x in row] + [Fraction(0)] * (3 - dim) for row in given.vertices.tolist()]
