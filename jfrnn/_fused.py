@@ -43,7 +43,7 @@ class Plan(NamedTuple):
 
 def refusal(inputs: Inputs, platform: str) -> str | None:
     """Say what of a search this engine cannot do; None: nothing."""
-    if platform not in ("cpu", "gpu", "cuda"):
+    if platform not in _warp.PLATFORMS:
         return f"on the platform {platform!r}, only on the CPU and on CUDA"
     if platform != "cpu" and isinstance(inputs.cutoff, Radii):
         return f"with a cutoff per particle on the platform {platform!r}, only on the CPU"

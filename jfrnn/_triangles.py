@@ -8,12 +8,12 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
+from jfrnn import _warp
 from jfrnn._auto import choose_engine, platform_of
 from jfrnn._inputs import checked_capacity, checked_cutoff, checked_positions, checked_slack
 from jfrnn._triangles_list import TriangleList, counted_slots, found_triangles
 
 _BACKENDS = ("auto", "jax", "warp")
-_WARP_PLATFORMS = ("cpu", "gpu", "cuda")
 
 
 def search_triangles(
@@ -105,6 +105,6 @@ def _chosen_engine(backend: Any, points: Array) -> str:  # noqa: ANN401
     if backend not in _BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(map(repr, _BACKENDS))}, got {backend!r}.")
     platform = platform_of(points)
-    if backend == "warp" and platform not in _WARP_PLATFORMS:
+    if backend == "warp" and platform not in _warp.PLATFORMS:
         raise RuntimeError(f"backend='warp' finds triangles on the CPU and on CUDA alone, got {platform!r}: pass backend='jax'.")
     return "jax" if backend == "auto" and platform != "cpu" else choose_engine(backend, points, None)  # CUDA: not measured yet

@@ -32,7 +32,7 @@ INSTALL = 'pip install "jfrnn[warp]"'
 PLACES_PER_THREAD = 2048  # below, a second thread costs more than it saves
 MOST_IN_BOX = 1 << 27  # an id shares its bits with the code of an image
 _HUGE = 1 << 22  # bytes from which a buffer is worth a request for huge pages
-_PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
+PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
 
 
 class Variant(NamedTuple):
@@ -227,13 +227,13 @@ def _packed(
 def scratch_bytes(engine: str, platform: str, n: int, m: int, dim: int, double: bool, own: bool) -> int:
     """Return what "warp" or "hashgrid" takes beside its list [B]: the scratch it is given, and what Warp allocates for itself."""
     load_warp()
-    if platform not in _PLATFORMS:
-        raise RuntimeError(f"backend={engine!r} runs on the platforms {', '.join(map(repr, _PLATFORMS))}, got {platform!r}.")
+    if platform not in PLATFORMS:
+        raise RuntimeError(f"backend={engine!r} runs on the platforms {', '.join(map(repr, PLATFORMS))}, got {platform!r}.")
     if 0 in (n, m):
         return 0
     width = 2 if double else 1
     if engine == "warp":
-        return 4 * kernels_of(f"cells_{_PLATFORMS[platform]}").scratch_words(n, m, dim, width, own)
+        return 4 * kernels_of(f"cells_{PLATFORMS[platform]}").scratch_words(n, m, dim, width, own)
     hashgrid = kernels_of("hashgrid")
     # warp/native/hashgrid.cpp: two ints per cell; of each point its cell and its id, room for 1.5 n, twice for the sort
     grid = 8 * math.prod(hashgrid.grid_shape(n, dim)) + 16 * (3 * n // 2)
