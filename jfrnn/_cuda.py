@@ -9,6 +9,7 @@ spelled out.
 """
 
 import ctypes
+import functools
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -122,6 +123,9 @@ class _CallFrame(ctypes.Structure):
 
 
 _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_CallFrame))
+_warp_lock = (
+    threading.Lock()
+)  # Warp keeps one account of devices, streams and recordings for all threads; held while none is launched
 _kept: list[Any] = []  # handlers live as long as programs that call them: as long as the process
 
 
@@ -151,6 +155,58 @@ class _Recorded(NamedTuple):
                 stream.wait_stream(side)
 
 
+class _Calls:
+    """The calls of one name on one stream of XLA, of which a thread makes one after the other; another device has another thread.
+
+    Graphs are recorded from streams of Warp: those of XLA may be told to wait for each other meanwhile, by threads of other
+    devices, and what waits for a stream that is being recorded is recorded, too.
+    """
+
+    def __init__(self, wp: Any, stream: _Stream, dtypes: Sequence[Any], commands: Callable[..., list[Command]]) -> None:  # noqa: ANN401
+        self._wp, self._stream, self._dtypes, self._commands = wp, stream, dtypes, commands
+        self._recorded: dict[tuple[int, ...], _Recorded] = {}
+        self._recent: OrderedDict[tuple[int, ...], None] = OrderedDict()
+        self._graphs: OrderedDict[tuple[int, ...], Any] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def launch(self, buffers: list[_Buffer]) -> None:
+        """Launch what the commands say, on these buffers."""
+        with self._lock:
+            here = [buffer.data for buffer in buffers]
+            shapes = tuple(buffer.dims[k] for buffer in buffers for k in range(buffer.rank))
+            key = (*here, *shapes)
+            graph = self._graphs.get(key)
+            if graph is not None:
+                self._graphs.move_to_end(key)
+                self._wp.capture_launch(graph, stream=self._stream)
+                return
+            if shapes not in self._recorded:
+                with _warp_lock:
+                    self._recorded[shapes] = _record(self._wp, self._stream.device, buffers, self._dtypes, self._commands)
+            launches = self._recorded[shapes]
+            for argument, place in launches.addresses:
+                argument.data = here[place]
+            if key not in self._recent:
+                self._recent[key] = None
+                if len(self._recent) > _SOON:
+                    self._recent.popitem(last=False)
+                launches.launch(self._stream)
+                return
+            with _warp_lock:
+                first, side = _recording_streams(self._wp, self._stream.device)
+                with self._wp.ScopedCapture(stream=first) as capture:
+                    launches.launch(first, side)
+                self._graphs[key] = capture.graph
+                if len(self._graphs) > _GRAPHS:
+                    self._graphs.popitem(last=False)
+            self._wp.capture_launch(capture.graph, stream=self._stream)
+
+
+@functools.cache
+def _recording_streams(wp: Any, device: Any) -> tuple[Any, Any]:  # noqa: ANN401
+    return wp.Stream(device), wp.Stream(device)
+
+
 def register(name: str, wp: Any, dtypes: Sequence[Any], commands: Callable[..., list[Command]]) -> None:  # noqa: ANN401
     """Let XLA call kernels by a name, on CUDA.
 
@@ -160,12 +216,7 @@ def register(name: str, wp: Any, dtypes: Sequence[Any], commands: Callable[..., 
         dtypes: Warp's scalar types of the buffers, inputs first.
         commands: arrays -> commands, in order; once per device and shapes, with a `warp.array` for each buffer.
     """
-    recorded: dict[tuple[int, ...], _Recorded] = {}
-    streams: dict[int, _Stream] = {}
-    sides: dict[str, Any] = {}  # per device: a stream that only graphs are recorded from
-    recent: OrderedDict[tuple[int, ...], None] = OrderedDict()
-    graphs: OrderedDict[tuple[int, ...], Any] = OrderedDict()
-    lock = threading.Lock()
+    streams: dict[int, _Calls] = {}
 
     def launch(frame: _CallFrame) -> None:
         buffers = [frame.inputs.buffers[k].contents for k in range(frame.inputs.size)]
@@ -173,40 +224,12 @@ def register(name: str, wp: Any, dtypes: Sequence[Any], commands: Callable[..., 
         ask = _Ask(ctypes.sizeof(_Ask), None, frame.context, None)
         frame.api.contents.get_stream(ask)
         address = ask.answer or 0
-        with lock:
-            stream = streams.get(address)
-            if stream is None:
-                frame.api.contents.get_device(ask)
+        if address not in streams:
+            frame.api.contents.get_device(ask)
+            with _warp_lock:
                 device = wp.get_cuda_device((ask.answer or 0) & 0x7FFFFFFF)
-                stream = streams[address] = _Stream(address, device)
-            here = [buffer.data for buffer in buffers]
-            key = (address, *here, *(buffer.dims[k] for buffer in buffers for k in range(buffer.rank)))
-            graph = graphs.get(key)
-            if graph is not None:
-                graphs.move_to_end(key)
-                wp.capture_launch(graph, stream=stream)
-                return
-            shapes = (address, *key[1 + len(here) :])
-            if shapes not in recorded:
-                recorded[shapes] = _record(wp, stream.device, buffers, dtypes, commands)
-            launches = recorded[shapes]
-            for argument, place in launches.addresses:
-                argument.data = here[place]
-            if key not in recent:
-                recent[key] = None
-                if len(recent) > _SOON:
-                    recent.popitem(last=False)
-                launches.launch(stream)
-                return
-            if stream.device.alias not in sides:
-                sides[stream.device.alias] = wp.Stream(stream.device)
-            known = wp.Stream(stream.device, cuda_stream=address)
-            with wp.ScopedStream(known, sync_enter=False), wp.ScopedCapture() as capture:
-                launches.launch(known, sides[stream.device.alias])
-            graphs[key] = capture.graph
-            if len(graphs) > _GRAPHS:
-                graphs.popitem(last=False)
-            wp.capture_launch(capture.graph, stream=stream)
+                streams.setdefault(address, _Calls(wp, _Stream(address, device), dtypes, commands))
+        streams[address].launch(buffers)
 
     def handle(frame: Any) -> int | None:  # noqa: ANN401
         call = frame.contents

@@ -9,7 +9,7 @@ import pytest
 
 from jfrnn import _cuda
 
-DEVICE = SimpleNamespace(alias="cuda:0")
+DEVICES = ["cuda:0", "cuda:1"]
 
 
 class Array:
@@ -39,15 +39,15 @@ class Warp:
     array = Array
 
     def __init__(self):
-        self.log, self.recorded = [], 0
+        self.log, self.recorded, self.streams = [], 0, 0
 
     def get_cuda_device(self, number):
-        assert number == 0
-        return DEVICE
+        return DEVICES[number]
 
-    def Stream(self, device, cuda_stream=7):  # 7: one of its own
-        stream = SimpleNamespace(device=device, cuda_stream=cuda_stream)
-        stream.wait_stream = lambda other: self.log.append(("wait", cuda_stream, other.cuda_stream))
+    def Stream(self, device):  # one of its own
+        self.streams += 1
+        stream = SimpleNamespace(device=device, cuda_stream=self.streams)
+        stream.wait_stream = lambda other: self.log.append(("wait", stream.cuda_stream, other.cuda_stream))
         return stream
 
     def launch(self, kernel, dim, inputs, device, block_dim, record_cmd):
@@ -55,11 +55,8 @@ class Warp:
         self.recorded += 1
         return Launch(self.log, kernel, inputs)
 
-    def ScopedStream(self, stream, sync_enter):
-        return contextlib.nullcontext()
-
     @contextlib.contextmanager
-    def ScopedCapture(self):
+    def ScopedCapture(self, stream):
         capture, begin = SimpleNamespace(graph=None), len(self.log)
         yield capture
         capture.graph = tuple(self.log[begin:])
@@ -72,8 +69,8 @@ class Warp:
 class Frame:
     """A call frame with an input [4, 2] and an output [4] at some addresses."""
 
-    def __init__(self, addresses, extension=None):
-        self.failure = None
+    def __init__(self, addresses, extension=None, device=0):
+        self.failure, self.number = None, device
         self.dims = [(ctypes.c_int64 * 2)(4, 2), (ctypes.c_int64 * 1)(4)]
         self.buffers = [
             _cuda._Buffer(ctypes.sizeof(_cuda._Buffer), None, 11, address, len(dims), dims)
@@ -91,11 +88,11 @@ class Frame:
 
     def stream(self, ask):
         assert ask.contents.context == 7
-        ask.contents.answer = 99
+        ask.contents.answer = 99 + self.number
         return 0
 
     def device(self, ask):
-        ask.contents.answer = 0
+        ask.contents.answer = self.number
         return 0
 
     def fail(self, failure):
@@ -125,8 +122,8 @@ def call(handler, *addresses, **options):
     return handler(ctypes.pointer(frame.frame)), frame
 
 
-def launches(x, count):
-    return [("launch", "sort", (x, 4), 99), ("launch", "query", (x, count), 99)]
+def launches(x, count, stream=99):
+    return [("launch", "sort", (x, 4), stream), ("launch", "query", (x, count), stream)]
 
 
 def test_launches_are_recorded_once_and_told_new_addresses(registered):
@@ -145,7 +142,7 @@ def test_addresses_that_come_back_soon_become_a_graph(registered):
     del warp.log[:]
     for _ in range(3):
         call(handler, 1000, 2000)
-    assert warp.log == [("graph", tuple(launches(1000, 2000)), 99)] * 3
+    assert warp.log == [("graph", tuple(launches(1000, 2000, stream=1)), 99)] * 3  # recorded elsewhere
     del warp.log[:]
     for k in range(_cuda._SOON + 1):  # none comes back within so many others
         call(handler, 3000 + k, 4000)
@@ -155,6 +152,15 @@ def test_addresses_that_come_back_soon_become_a_graph(registered):
     assert warp.log[-1][0] == "graph"
 
 
+def test_each_device_has_launches_and_graphs_of_its_own(registered):
+    handler, warp = registered
+    for device in (0, 1, 1, 0):
+        call(handler, 1000, 2000, device=device)
+    graphs = [("graph", tuple(launches(1000, 2000, stream)), 99 + device) for device, stream in ((1, 1), (0, 3))]
+    assert warp.log == [*launches(1000, 2000, 99), *launches(1000, 2000, 100), *graphs]
+    assert warp.recorded == 4
+
+
 def test_what_may_run_beside_the_one_before_does_in_a_graph(registered):
     handler, warp = registered
     call(handler, 5000, 2000)
@@ -162,8 +168,8 @@ def test_what_may_run_beside_the_one_before_does_in_a_graph(registered):
     assert warp.log == [*launches(5000, 2000), beside]
     del warp.log[:]
     call(handler, 5000, 2000)
-    sort, query = launches(5000, 2000)
-    assert warp.log == [("graph", (sort, ("wait", 7, 99), query, (*beside[:3], 7), ("wait", 99, 7)), 99)]
+    sort, query = launches(5000, 2000, stream=1)
+    assert warp.log == [("graph", (sort, ("wait", 2, 1), query, (*beside[:3], 2), ("wait", 1, 2)), 99)]
 
 
 def test_what_goes_wrong_is_told_to_xla(registered):
