@@ -193,7 +193,7 @@ class _Calls:
                 launches.launch(self._stream)
                 return
             with _warp_lock:
-                first, side = _recording_streams(self._wp, self._stream.device)
+                first, side = _recording_streams(self._wp, self._stream.device.alias)
                 with self._wp.ScopedCapture(stream=first) as capture:
                     launches.launch(first, side)
                 self._graphs[key] = capture.graph
@@ -203,7 +203,7 @@ class _Calls:
 
 
 @functools.cache
-def _recording_streams(wp: Any, device: Any) -> tuple[Any, Any]:  # noqa: ANN401
+def _recording_streams(wp: Any, device: str) -> tuple[Any, Any]:  # noqa: ANN401
     return wp.Stream(device), wp.Stream(device)
 
 

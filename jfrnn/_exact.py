@@ -23,6 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._flags import set_places
+
 
 class Pair(NamedTuple):
     """Points a and b of pairs, axis by axis, and the lattice shift that b takes (None: no lattice): x_b + shift·matrix - x_a.
@@ -290,8 +292,7 @@ def _refine_some(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) ->
     chunk = min(_INTEGER_CHUNK, signs.size)
 
     def decide_chunk(signs: Array) -> Array:
-        (at,) = jnp.nonzero(signs == _UNKNOWN, size=chunk, fill_value=signs.size)
-        at = at.astype(jnp.int32)
+        at = set_places(signs == _UNKNOWN, chunk)
         pairs = points(at)
         return signs.at[at].set(_integer_sign(pairs, _threshold(pairs, cutoff)), mode="drop")
 

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._flags import set_places
 from jfrnn._shards import Particles, Required, of_shards, shared_bits
 from jfrnn._status import Status
 
@@ -108,7 +109,7 @@ def halo_in_shard(particles: Particles) -> Halo:
         members, farthest = _members(x, numbers > 0, extents, particles, stage)
         room = particles.sizes.halo[stage.number]
         counts = [jnp.sum(member, dtype=jnp.int32) for member in members]
-        rows = [jnp.nonzero(member, size=room, fill_value=len(x))[0].astype(jnp.int32) for member in members]
+        rows = [set_places(member, room) for member in members]
         sends.append(jnp.stack(rows) if rows else jnp.zeros((0, room), jnp.int32))
         largest = functools.reduce(jnp.maximum, counts, jnp.int32(0))
         status = status | jnp.where(largest > room, Status.HALO_OVERFLOW.value, 0)

@@ -22,6 +22,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._exact import Cutoff
+from jfrnn._flags import set_places
 from jfrnn._triangles_integers import Shapes, bit_range, is_near, limb_counts
 
 ShapesAt = Callable[[Array], Shapes]
@@ -160,8 +161,7 @@ def _decided(state: Array, waiting: int, chunk: int, shapes_at: ShapesAt) -> Arr
     """Let integers decide [q] pairs that wait for these: 0 far, 1 near, or, where they are not wide enough, _WIDE."""
 
     def decide_chunk(state: Array) -> Array:
-        (at,) = jnp.nonzero(state == waiting, size=chunk, fill_value=state.size)
-        at = at.astype(jnp.int32)
+        at = set_places(state == waiting, chunk)
         shapes = shapes_at(jnp.minimum(at, state.size - 1))
         usual, most = limb_counts(shapes.points.dtype)
         count = usual if waiting == _USUAL else most

@@ -9,7 +9,7 @@ import pytest
 
 from jfrnn import _cuda
 
-DEVICES = ["cuda:0", "cuda:1"]
+DEVICES = [SimpleNamespace(alias=f"cuda:{k}") for k in range(2)]  # not hashable, as those of Warp
 
 
 class Array:

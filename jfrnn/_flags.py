@@ -1,0 +1,41 @@
+"""Which of many flags are set, in order."""
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+_BITS = 32
+
+
+def set_places(flags: Array, most: int) -> Array:
+    """Return the places of the first flags that are set, as `jax.numpy.nonzero` with a size.
+
+    Args:
+        flags: Shape [n], bool.
+        most: How many places, static.
+
+    Returns:
+        Shape [most], int32, ascending; n where no more are set.
+
+    Cost: flags are read once and packed into words; words are summed up, and each place is looked for among the sums, and in its
+    word (Jacobson 1989, doi:10.1109/SFCS.1989.63533). `nonzero` adds every flag to a histogram instead, of which an accelerator
+    does one at a time.
+    """
+    n = len(flags)
+    words = -(-n // _BITS)
+    if not n:
+        return jnp.zeros(most, jnp.int32)
+    bits = jnp.pad(flags, (0, words * _BITS - n)).reshape(words, _BITS).astype(jnp.uint32)
+    packed = jnp.sum(bits << lax.iota(jnp.uint32, _BITS), axis=1, dtype=jnp.uint32)
+    until = jnp.cumsum(lax.population_count(packed).astype(jnp.int32), dtype=jnp.int32)
+    number = lax.iota(jnp.int32, most)
+    found = jnp.searchsorted(until, number, side="right", method="scan_unrolled").astype(jnp.int32)
+    word = jnp.minimum(found, words - 1)
+    left, place = packed[word], word * _BITS
+    before = number - (until[word] - lax.population_count(left).astype(jnp.int32))  # flags that are set before, in this word
+    for width in (16, 8, 4, 2, 1):
+        low = lax.population_count(left & np.uint32((1 << width) - 1)).astype(jnp.int32)
+        beyond = before >= low
+        before, place = jnp.where(beyond, before - low, before), jnp.where(beyond, place + width, place)
+        left = jnp.where(beyond, left >> np.uint32(width), left)
+    return jnp.where(found < words, place, n)

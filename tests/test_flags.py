@@ -1,0 +1,27 @@
+"""Places of flags that are set, against NumPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jfrnn._flags import set_places
+
+
+@pytest.mark.parametrize("n", [0, 1, 31, 32, 33, 1000])
+@pytest.mark.parametrize("share", [0.0, 0.03, 0.5, 1.0])
+def test_places_are_those_of_numpy(n, share):
+    flags = np.random.default_rng(n).random(n) < share
+    places = jax.jit(set_places, static_argnums=1)
+    for most in (1, 40, 1100):
+        expected = np.full(most, n)
+        found = np.flatnonzero(flags)[:most]
+        expected[: len(found)] = found
+        got = places(jnp.asarray(flags), most)
+        assert got.dtype == jnp.int32
+        np.testing.assert_array_equal(got, expected)
+
+
+def test_the_last_and_the_first_flag_of_each_word_are_found():
+    for k in (0, 31, 32, 63, 64, 95):
+        assert set_places(jnp.arange(96) == k, 2).tolist() == [k, 96]
