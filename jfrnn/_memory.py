@@ -157,7 +157,7 @@ def _plan_of_triangles(sizes: tuple[int, int, int, int], dtype: np.dtype, cutoff
     if engine not in ("auto", "jax", "warp"):
         raise ValueError(f"backend={engine!r} finds no triangles: pass 'auto', 'jax' or 'warp'.")
     if engine == "auto":
-        engine = fastest_engine(device.platform, n) if device.platform == "cpu" else "jax"
+        engine = fastest_engine(device.platform, n)
     points, corners = (jax.ShapeDtypeStruct((size, dim), dtype, sharding=at) for size in (n, faces // 2 + 2))
     named: Any = jax.ShapeDtypeStruct((faces, dim), np.int32, sharding=at)
     analysis = _analysis(find_triangles.lower(points, corners, named, None, cutoff, engine, capacity))

@@ -45,8 +45,8 @@ def search_triangles(
         capacity: Slots per row, a static int. Required where positions, vertices or faces are traced. Default: `slack` times the
             longest row, rounded up to a multiple of 8.
         slack: Factor >= 1 on the counted capacity, room for later motion.
-        backend: "warp" (compiled kernels, on the CPU and on CUDA), "jax" (any device), or "auto": "warp" on the CPU (where Warp is
-            missing "jax", with a warning), elsewhere "jax".
+        backend: "warp" (compiled kernels, on the CPU and on CUDA), "jax" (any device), or "auto": "warp" on these two (where Warp
+            is missing "jax", with a warning), elsewhere "jax".
 
     Returns:
         A `TriangleList`; `idx` has shape [n, capacity], unused slots hold f. Rows are in no promised order, but the same input
@@ -107,4 +107,4 @@ def _chosen_engine(backend: Any, points: Array) -> str:  # noqa: ANN401
     platform = platform_of(points)
     if backend == "warp" and platform not in _warp.PLATFORMS:
         raise RuntimeError(f"backend='warp' finds triangles on the CPU and on CUDA alone, got {platform!r}: pass backend='jax'.")
-    return "jax" if backend == "auto" and platform != "cpu" else choose_engine(backend, points, None)  # CUDA: not measured yet
+    return choose_engine(backend, points, None)

@@ -18,7 +18,7 @@ from jfrnn._neighbors import norms, rounded_capacity
 from jfrnn._status import NeighborOverflowError, Status
 from jfrnn._triangles_cells import TriangleCells, sort_triangles, without_faults
 from jfrnn._triangles_closest import make_normals, nearest_of, normal_at
-from jfrnn._triangles_rows import are_near, list_triangles
+from jfrnn._triangles_rows import are_near, list_triangles, nearest_slots
 
 _ENGINES = {
     "jax": (sort_triangles, list_triangles),
@@ -270,16 +270,16 @@ def _nearest_in_rows(tri: TriangleList, points: Array, vertices: Array) -> tuple
 
 @jax.jit
 def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> SignedDistance:
-    vectors, feature, mask = _nearest_in_rows(tri, points, vertices)
-    lengths = norms(vectors)
-    slot = jnp.argmin(jnp.where(mask, lax.stop_gradient(lengths), jnp.inf), axis=1)[:, None]
-    pick = functools.partial(jnp.take_along_axis, indices=slot, axis=1)
-    some, distance = pick(mask)[:, 0], pick(lengths)[:, 0]
-    away = -jnp.take_along_axis(vectors, slot[..., None], axis=1)[:, 0]
-    corners, finite, there = without_faults(lax.stop_gradient(vertices), tri.faces)
-    normals = make_normals(lax.stop_gradient(vertices), tri.faces, corners, finite & there)
-    triangle = jnp.where(some, pick(tri.idx)[:, 0], 0)
-    normal = normal_at(normals, tri.faces, triangle, pick(feature)[:, 0])
+    corners, finite, there = without_faults(vertices, tri.faces)
+    fixed, used = lax.stop_gradient(corners), jnp.minimum(tri.count, tri.capacity)
+    cutoff = make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False)
+    slot, some = nearest_slots(lax.stop_gradient(points), fixed, tri.idx, used, finite & there, cutoff)
+    triangle = jnp.where(some, jnp.take_along_axis(tri.idx, slot[:, None], axis=1)[:, 0], 0)
+    shapes = jnp.where(some[:, None, None], corners[triangle], 0)
+    vectors, feature = nearest_of(jnp.where(some[:, None], points, 0), shapes)
+    away, distance = -vectors, norms(vectors)
+    normals = make_normals(lax.stop_gradient(vertices), tri.faces, fixed, finite & there)
+    normal = normal_at(normals, tri.faces, triangle, feature)
     height = jnp.sum(normal * away, axis=1)
     signed = jnp.where(distance > 0, jnp.where(height < 0, -distance, distance), height)
     apart = (some & (distance > 0))[:, None]

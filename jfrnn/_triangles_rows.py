@@ -7,7 +7,9 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._exact import Cutoff
+from jfrnn._neighbors import norms
 from jfrnn._triangles_cells import TriangleCells, bucket_of, cells_of, scale_of
+from jfrnn._triangles_closest import nearest_of
 from jfrnn._triangles_exact import is_near_of, zero_of
 from jfrnn._triangles_integers import Shapes
 
@@ -95,6 +97,49 @@ def _decided(own: Array, corners: Array, particle: Array, triangle: Array, cutof
         return Shapes(own[particle[at]].T, jnp.moveaxis(corners[triangle[at]], 0, -1), radius)
 
     return is_near_of(axes, corner_axes, cutoff, shapes_at, asked, zero_of(triangle, np.dtype(own.dtype)))
+
+
+def nearest_slots(points: Array, corners: Array, idx: Array, count: Array, good: Array, cutoff: Cutoff) -> tuple[Array, Array]:
+    """Find the nearest triangle of each row, n > 0 and f > 0, in chunks of as many pairs as there are particles in a block.
+
+    Args:
+        points: Shape [n, d].
+        corners: Shape [f, corner, d].
+        idx: Rows, shape [n, capacity], int32.
+        count: How many slots of a row are used, shape [n], int32.
+        good: Which triangles are such, shape [f], bool.
+        cutoff: Triangles that are not closer do not count, exactly.
+
+    Returns:
+        The slot of the nearest, the first of those as near, shape [n], int32, and whether there is one, shape [n], bool.
+    """
+    n, capacity = idx.shape
+    block = max(min(n, (2**31 - n) // capacity), 1)
+    finite = jnp.all(jnp.isfinite(points), axis=1)
+
+    def of_block(b: Array, slots: Array) -> Array:
+        first = jnp.minimum(b * block, n - block)
+        own, rows, used, fine = (lax.dynamic_slice_in_dim(x, first, block) for x in (points, idx, count, finite))
+        until = jnp.cumsum(jnp.where(fine, used, 0), dtype=jnp.int32)
+
+        def look(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            begin, least, slots = state
+            at = begin + lax.iota(jnp.int32, block)
+            particle = jnp.minimum(jnp.searchsorted(until, at, side="right").astype(jnp.int32), block - 1)
+            slot = jnp.where(at < until[-1], at - (until[particle] - used[particle]), 0)
+            triangle = jnp.where(at < until[-1], rows[particle, slot], 0)
+            near = _decided(own, corners, particle, triangle, cutoff, (at < until[-1]) & good[triangle])
+            lengths = norms(nearest_of(own[particle], corners[triangle]).vectors)
+            now = least.at[particle].min(jnp.where(near, lengths, jnp.inf))
+            wins = jnp.where(near & (lengths == now[particle]), particle, block)
+            return begin + block, now, jnp.where(now < least, capacity, slots).at[wins].min(slot, mode="drop")
+
+        none = jnp.full(block, jnp.inf, points.dtype), jnp.full(block, capacity, jnp.int32)
+        found = lax.while_loop(lambda state: state[0] < until[-1], look, (jnp.int32(0), *none))[2]
+        return lax.dynamic_update_slice_in_dim(slots, found, first, axis=0)
+
+    slots = lax.fori_loop(0, -(-n // block), of_block, jnp.zeros(n, jnp.int32))
+    return jnp.minimum(slots, capacity - 1), slots < capacity
 
 
 def are_near(points: Array, corners: Array, triangle: Array, cutoff: Cutoff, asked: Array) -> Array:

@@ -18,7 +18,7 @@ from jfrnn.cases.triangles import TRIANGLE_CASES, padded
 from jfrnn.kernels import triangles_cuda
 
 import jfrnn
-from jfrnn import _triangles, _triangles_warp
+from jfrnn import _auto, _triangles, _triangles_warp
 from jfrnn._exact import make_cutoff
 from jfrnn._triangles_cells import without_faults
 from jfrnn._triangles_warp import _Variant, query_inputs
@@ -137,13 +137,10 @@ def test_scratch_follows_particles_and_triangles(double):
         assert 4 * words <= 12 * n + (4 << 17) + 64 * (1 + double) * 16 * 12_000 + min(60e6, 30_000 * (n + 31)) + 1024
 
 
-def test_auto_waits_until_it_is_measured(monkeypatch):
+def test_platforms_without_kernels_take_arrays(monkeypatch):
     x = jnp.zeros((4, 3), np.float32)
-    monkeypatch.setattr(_triangles, "choose_engine", lambda backend, *_: f"chose {backend}")
-    monkeypatch.setattr(_triangles, "platform_of", lambda *_: "gpu")
-    assert _triangles._chosen_engine("auto", x) == "jax"
-    assert _triangles._chosen_engine("warp", x) == "chose warp"
-    monkeypatch.setattr(_triangles, "platform_of", lambda *_: "rocm")
+    for module in (_auto, _triangles):
+        monkeypatch.setattr(module, "platform_of", lambda *_: "rocm")
     assert _triangles._chosen_engine("auto", x) == "jax"
     with pytest.raises(RuntimeError, match="on the CPU and on CUDA alone, got 'rocm'"):
         _triangles._chosen_engine("warp", x)
