@@ -39,6 +39,8 @@ class Physics:
         damped_until: When damping ends [s]; None: never.
         restitution: Share of the normal velocity that a particle keeps at the walls of the `Tank` around the scene.
         slip: Walls of dummy particles do not hold the fluid along them.
+        tears: The fluid gives way where it is stretched: a density that is carried along does not fall below that at rest. Without
+            it, a jet that breaks up pulls its particles together in pairs and clumps.
         integrator: "leapfrog" (kick, drift), "symplectic" (kick, drift, kick), or "midpoint" (Runge-Kutta of second order).
     """
 
@@ -65,10 +67,14 @@ class Physics:
     damped_until: float | None = None
     restitution: float | None = None
     slip: bool = False
+    tears: bool = False
     integrator: Literal["leapfrog", "symplectic", "midpoint"] = "symplectic"
 
 
-WORDS = ("smoothing", "kernel", "evolve", "state", "exponent", "pressure", "viscosity_form", "corrected", "slip", "integrator")
+WORDS = (
+    "smoothing", "kernel", "evolve", "state", "exponent", "pressure",
+    "viscosity_form", "corrected", "slip", "tears", "integrator",
+)  # fmt: skip
 """Fields of `Physics` that choose what is computed; the others are numbers that may be traced."""
 
 

@@ -50,8 +50,9 @@ def jet_gear(
     oil = np.tile(np.column_stack([disc, np.full(len(disc), tip + height)]), (len(enters), 1))
     sound_speed = 10 * math.hypot(speed, rate * tip)
     physics = replace(
-        free(860.0, sound_speed, spacing), viscosity=viscosity, gravity=(0.0, 0.0, -9.81), artificial=0.05, slip=False
-    )
+        free(860.0, sound_speed, spacing),
+        viscosity=viscosity, gravity=(0.0, 0.0, -9.81), artificial=0.05, slip=False, tears=True,
+    )  # fmt: skip
     around = 1.25 * tip
     return FluidScene(
         name="jet-gear",

@@ -147,6 +147,11 @@ def carried_rate(model: Model, s: State, rho: Array, inverse: Array | None, nbrs
     return walls.fluid_only(model.wall, rate if s.solid is None else rate + solids.compression(model, s, s.solid, rho))
 
 
+def torn(model: Model, rho: Array) -> Array:
+    """Return carried densities [kg/m³]: where a fluid tears, not less than that at rest."""
+    return jnp.maximum(rho, model.physics.density) if model.physics.tears else rho
+
+
 def fields(model: Model, s: State, rho: Array, inverse: Array | None, nbrs: Neighbors) -> Fields:
     """Return what forces are made of; at walls, what they show to the fluid."""
     p = pressures(model, s, rho)
