@@ -253,7 +253,7 @@ def test_a_fluid_that_tears_keeps_its_density_where_it_is_stretched(integrator):
 def test_a_coarse_jet_that_breaks_up_stays_calm():
     """Without `tears`, clumps of stretched particles met each other at a thousand times the speed of the jet."""
     scene = fluids.fluid("jet-gear", layers=8, duration=2.8e-3)
-    model, s = make_model(scene, np.float32), make_state(scene, np.float32)
+    model, s = make_model(scene), make_state(scene)
     s = jax.jit(solver.begin)(model, s, None)
     while float(s.time) < scene.duration:
         s, _ = solver.advance(model, s, None, 200)
