@@ -119,7 +119,8 @@ for (int l = 0; l < LANES; ++l)
 const real off = PERIODIC ? 2 * lattice.slack() * step_scale : real(0);  // by which distances of images may be wrong
 const real inner = step_radius > off ? step_radius - off : real(0), outer = step_radius + off;
 // 7 roundings of eps/2, 5 in a square and 2 in a bound (jfrnn/_exact.py); images are farther off
-const real band = (PERIODIC ? 8 * (1 + PERIODIC) : 4) * step_eps, inside = inner * inner * (1 - band), outside = outer * outer * (1 + band);
+const real band = (PERIODIC ? 8 * (1 + PERIODIC) : 4) * step_eps;
+const real inside = inner * inner * (1 - band), outside = outer * outer * (1 + band);
 const double doubly_inside = Exact::doubly_inside(radius), doubly_outside = Exact::doubly_outside(radius);
 typedef float floats __attribute__((vector_size(32)));
 typedef double doubles __attribute__((vector_size(64)));
