@@ -1,9 +1,7 @@
-"""A mesh as Warp holds it, in a tree of boxes, on the CPU: its nearest point within a cutoff, and how many boxes are as near."""
+"""A mesh as Warp holds it, in a tree of boxes: its nearest point within a cutoff, and how many boxes are as near."""
 
 # pyright: reportInvalidTypeForm=false, reportAttributeAccessIssue=false, reportArgumentType=false
 # (what Warp's language is made of)
-
-from collections.abc import Callable
 
 import numpy as np
 import warp as wp
@@ -30,22 +28,36 @@ def _boxes_kernel(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), cutoff: floa
     count_out[i] = count
 
 
-def calls(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, cutoff: float) -> tuple[Callable[[], np.ndarray], ...]:
-    """Return two functions of no argument, ready to be timed: distances of the nearest points, and counts of boxes.
+class Tree:
+    """A mesh on a device, and points that ask for it.
 
-    Args:
-        points: Shape [n, 3], float32.
-        vertices: Shape [v, 3], float32.
-        faces: Shape [f, 3].
-        cutoff: Beyond, distances are infinite.
+    Attributes:
+        distance: What "nearest" wrote, infinite beyond the cutoff, shape [n].
+        count: What "boxes" wrote, shape [n].
+        launches: By these names: kernel, arguments, threads, and threads of a block.
     """
-    corners = wp.array(vertices, dtype=wp.vec3, device="cpu")
-    mesh = wp.Mesh(corners, wp.array(faces.reshape(-1).astype(np.int32), dtype=wp.int32, device="cpu"))
-    asked = wp.array(points, dtype=wp.vec3, device="cpu")
-    distance, count = wp.empty(len(points), dtype=float, device="cpu"), wp.empty(len(points), dtype=int, device="cpu")
 
-    def run(kernel: wp.Kernel, out: wp.array) -> np.ndarray:
-        wp.launch(kernel, len(points), [mesh.id, asked, cutoff], [out], device="cpu")
-        return out.numpy()
+    def __init__(self, points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, cutoff: float, device: str) -> None:
+        """Build the tree.
 
-    return lambda: run(_nearest_kernel, distance), lambda: run(_boxes_kernel, count)
+        Args:
+            points: Shape [n, 3], float32.
+            vertices: Shape [v, 3], float32.
+            faces: Shape [f, 3].
+            cutoff: Beyond, distances are infinite.
+            device: "cpu", or such as "cuda:0".
+        """
+        corners = wp.array(vertices, dtype=wp.vec3, device=device)
+        self._mesh = wp.Mesh(corners, wp.array(faces.reshape(-1).astype(np.int32), dtype=wp.int32, device=device))
+        asked, n = wp.array(points, dtype=wp.vec3, device=device), len(points)
+        self.distance, self.count = wp.empty(n, dtype=float, device=device), wp.empty(n, dtype=int, device=device)
+        self.launches = {
+            name: (kernel, [self._mesh.id, asked, cutoff, out], n, 256)
+            for name, kernel, out in (("nearest", _nearest_kernel, self.distance), ("boxes", _boxes_kernel, self.count))
+        }
+
+    def ask(self, name: str) -> np.ndarray:
+        """Launch a kernel by its name; return what it wrote."""
+        kernel, arguments, threads, _ = self.launches[name]
+        wp.launch(kernel, threads, arguments, device=self.count.device)
+        return arguments[-1].numpy()

@@ -109,6 +109,8 @@ class Row:
         halo: Particles that are sent to others, of all devices and messages, each time positions are exchanged.
         halo_bytes: Their coordinates [bytes].
         sent_bytes: What all devices send to others per run or step, padding, values and ids included, as compiled [bytes].
+        halo_s: What it takes to choose the halo; a list, and each update of the solver, begins with it [s].
+        migrate_s: What it takes to balance the load and to move particles, few after the first time; with a halo [s].
         pairs: Neighbors of all particles together; None for "sph".
         pairs_of_one: As one device counts them, up to `check_most` particles.
         differing: Particles whose number of neighbors is another on one device.
@@ -131,6 +133,8 @@ class Row:
     halo: int | None = None
     halo_bytes: int | None = None
     sent_bytes: int | None = None
+    halo_s: float | None = None
+    migrate_s: float | None = None
     pairs: int | None = None
     pairs_of_one: int | None = None
     differing: int | None = None
@@ -213,7 +217,7 @@ def _weight(r: Array, i: Any, j: Any) -> Array:  # noqa: ANN401
 def _search(spec: Spec, row: Row) -> None:
     x, cutoff, backend = lattice(spec), spec.cutoff_ratio, spec.backend
     particles = distributed.scatter(x, cutoff, {"m": np.ones(len(x), x.dtype)}, mesh=mesh_of(spec.devices, spec.axes))
-    _describe(particles, row)
+    _describe(particles, spec, row)
     counts = distributed.count(particles, cutoff, backend=backend)
     row.pairs = int(fetched(counts).sum(dtype=np.int64))
     if spec.work == "list":
@@ -244,17 +248,25 @@ def _sph(spec: Spec, row: Row) -> None:
     flow = spread.spread(make_model(scene, kind, spec.backend), make_state(scene, kind), mesh_of(spec.devices, spec.axes))
     flow = spread.begin(flow)
     flow = spread.run(flow, spec.steps)  # room that is missing is made before anything is timed
-    _describe(flow.particles, row)
+    _describe(flow.particles, spec, row)
     _time(lambda flow: spread.advanced(flow, spec.steps), flow, spec.steps, spec, row, spread.advanced)
     row.status = "ok"
 
 
-def _describe(particles: distributed.Particles, row: Row) -> None:
-    """Say how many particles there are, on the fullest device, and in halos."""
+def _describe(particles: distributed.Particles, spec: Spec, row: Row) -> None:
+    """Say how many particles there are, on the fullest device, and in halos, and what halos and migration take."""
     halo = distributed.halo(particles)
     row.particles, row.halo = particles.total, int(halo.sent)
     row.fullest = int(fetched(particles.active).reshape(row.devices, -1).sum(axis=1).max())
     row.halo_bytes = row.halo * particles.dim * particles.positions.dtype.itemsize
+    row.halo_s = _repeated(lambda: distributed.halo(particles), spec)["median_s"]
+    settled = distributed.migrate(particles)
+    row.migrate_s = _repeated(lambda: distributed.migrate(settled), spec)["median_s"]
+
+
+def _repeated(call: Callable[[], Any], spec: Spec) -> dict[str, Any]:
+    _, seconds = _measure.repeat(lambda: jax.block_until_ready(call()), spec.repeats, spec.min_seconds, 10 * spec.repeats)
+    return _measure.summarize(seconds)
 
 
 def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: Row, compiled: Any = None) -> None:  # noqa: ANN401
@@ -264,9 +276,9 @@ def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: Row
     text = program.lower(*arguments).compile().as_text()
     row.sent_bytes = sent_bytes(text)
     _, (row.first_s,) = _measure.repeat(lambda: jax.block_until_ready(work(given)), 1, 0.0, 1)
-    _, seconds = _measure.repeat(lambda: jax.block_until_ready(work(given)), spec.repeats, spec.min_seconds, 10 * spec.repeats)
-    timed = _measure.summarize([s / per for s in seconds])
-    row.median_s, row.p10_s, row.p90_s, row.repeats = (timed[name] for name in ("median_s", "p10_s", "p90_s", "repeats"))
+    timed = _repeated(lambda: work(given), spec)
+    row.median_s, row.p10_s, row.p90_s = (timed[name] / per for name in ("median_s", "p10_s", "p90_s"))
+    row.repeats = timed["repeats"]
 
 
 def sent_bytes(program: str) -> int:
@@ -287,8 +299,9 @@ def report(rows: list[Row], folder: Path) -> str:
     alone = {(row.scaling, row.work, row.axes): rate for row, rate in zip(rows, rates, strict=True) if row.devices == 1}
     ones = [alone.get((row.scaling, row.work, row.axes)) for row in rows]
     table["efficiency"] = [None if not rate or not one else rate / one for rate, one in zip(rates, ones, strict=True)]
-    table["ms"] = 1e3 * table["median_s"].astype(float)
-    names = "scaling work axes devices particles fullest halo halo_bytes sent_bytes ms efficiency status"
+    for name, seconds in (("ms", "median_s"), ("halo_ms", "halo_s"), ("migrate_ms", "migrate_s")):
+        table[name] = 1e3 * table[seconds].astype(float)
+    names = "scaling work axes devices particles fullest halo halo_bytes sent_bytes ms efficiency halo_ms migrate_ms status"
     columns = names.split()
     table[columns].to_csv(folder / "table.csv", index=False)
     return table[columns].to_string(index=False, float_format="%.3g")

@@ -116,10 +116,11 @@ def _memory(rows: list[dict[str, Any]]) -> str:
 def _triangles(rows: list[dict[str, Any]]) -> str:
     table = []
     for r in _of(rows, "triangles"):
+        wrong = r.get("wrong", r.get("differing", ""))
         stages = ", ".join(f"{name.removesuffix('_s')} {1e3 * r[name]:.3g}" for name in _TRIANGLE_KERNELS if name in r)
         table.append({
             "points": f"{r['points']:,}".replace(",", " "), "dtype": r["dtype"], "cutoff": r["cutoff"], "slots": r["capacity"],
-            "pairs": r["pairs"], "method": r["method"], "ms": f"{1e3 * r['median_s']:.4g}", "wrong rows": r["wrong"],
+            "pairs": r["pairs"], "method": r["method"], "ms": f"{1e3 * r['median_s']:.4g}", "wrong rows": wrong,
             "kernels, ms": stages, "settled": r.get("settled", ""),
         })  # fmt: skip
     return "## Triangles around a gear\n\n" + _markdown(table)

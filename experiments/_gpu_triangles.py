@@ -78,6 +78,22 @@ def rows(
             yield about | {"method": f"jfrnn {backend}, {name}"} | said
         if backend == "warp" and jax.default_backend() == "gpu":
             yield about | {"method": "jfrnn warp, kernels alone"} | stages(tri, x)
+    if dtype == "float32" and jax.default_backend() == "gpu":
+        yield from tree_rows(base, scene, exact.count, "cuda:0")
+
+
+def tree_rows(base: dict[str, Any], scene: Any, count: Any, device: str) -> Iterator[dict[str, Any]]:  # noqa: ANN401
+    """Time what Warp's tree of boxes takes of the same scene, kernels alone: for nearest points, and for boxes that are near.
+
+    `differing` says of how many particles the tree has a triangle within the cutoff and the list has none, or the other way round.
+    """
+    from experiments import _bvh
+
+    tree = _bvh.Tree(scene.points, scene.vertices, scene.faces, base["cutoff"], device)
+    differs = (tree.ask("nearest") < base["cutoff"]) != (np.asarray(count) > 0)
+    for name, launch in tree.launches.items():
+        told = {"differing": int(differs.sum())} if name == "nearest" else {"boxes": int(tree.ask(name).sum(dtype=np.int64))}
+        yield base | {"method": f"wp.Mesh, {name}, kernel alone"} | told | {"median_s": _measure.time_kernels([launch], 5)[-1]}
 
 
 def _calls(tri: Any, x: Any, vertices: Any, steps: int) -> dict[str, Callable[[], Any]]:  # noqa: ANN401

@@ -149,9 +149,9 @@ def _trees(scene: _Scene, cutoff: float) -> dict[str, _Asked]:
     from experiments import _bvh
 
     everyone = np.arange(len(scene.points))
-    nearest, boxes = _bvh.calls(scene.points, scene.vertices, scene.faces, cutoff)
-    found, seconds, processor = _repeated(nearest)
-    _, taken, busy = _repeated(boxes)
+    tree = _bvh.Tree(scene.points, scene.vertices, scene.faces, cutoff, "cpu")
+    found, seconds, processor = _repeated(lambda: tree.ask("nearest"))
+    _, taken, busy = _repeated(lambda: tree.ask("boxes"))
     return {
         "wp.Mesh nearest": _Asked(everyone, found, seconds, processor),
         "wp.Mesh boxes": _Asked(everyone[:0], found[:0], taken, busy),

@@ -169,3 +169,15 @@ def test_report_of_a_run(tmp_path, config):
 def test_report_without_rows_says_what_to_run(tmp_path):
     with pytest.raises(UsageError, match="run python -m experiments gpu"):
         _gpu_report.report(tmp_path)
+
+
+def test_the_tree_of_boxes_is_a_row_beside(monkeypatch):
+    import jfrnn
+    from experiments import _measure
+
+    monkeypatch.setattr(_measure, "time_kernels", lambda launches, repeats: [1e-3] * len(launches))  # wants CUDA
+    scene = _triangles._gear(300, 500)
+    tri = jfrnn.search_triangles(scene.points, scene.vertices, scene.faces, 0.5, backend="warp")
+    nearest, boxes = _gpu_triangles.tree_rows({"cutoff": 0.5}, scene, tri.count, "cpu")
+    assert nearest["differing"] == 0
+    assert boxes["boxes"] >= int(tri.count.sum())
