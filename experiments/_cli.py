@@ -342,6 +342,7 @@ def triangles(
     out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform and backend.")] = Path("out") / "triangles",
     points: Annotated[int, typer.Option(min=100, help="Random points in the box of a gear.")] = 250_000,
     faces: Annotated[int, typer.Option(min=100, help="Of the gear, about.")] = 12_000,
+    cutoff: Annotated[list[float], typer.Option(help="[modules]; may be said several times.")] = [0.1, 0.3, 0.8],  # noqa: B006
     rounds: Annotated[int, typer.Option(min=2, help="Timed runs of each way.")] = 15,
     backend: Annotated[str, typer.Option(help="warp or jax.")] = "warp",
 ) -> None:
@@ -349,7 +350,7 @@ def triangles(
     with _usage_errors():
         from experiments import _triangles
 
-        typer.echo(_triangles.table(_triangles.measure(out, points, faces, rounds, backend)))
+        typer.echo(_triangles.table(_triangles.measure(out, points, faces, rounds, backend, tuple(cutoff))))
 
 
 @app.command()

@@ -52,7 +52,7 @@ class _Scene(NamedTuple):
     faces: np.ndarray
 
 
-def measure(folder: Path, n: int, faces: int, rounds: int, backend: str, cutoffs: tuple[float, ...] = (0.1, 0.3, 0.8)) -> Path:
+def measure(folder: Path, n: int, faces: int, rounds: int, backend: str, cutoffs: tuple[float, ...]) -> Path:
     """Write a table of seconds by method and cutoff, and return its path.
 
     jfrnn lists all triangles within the cutoff: "update" with the cells of a wall that stays, "rebuild" with one that is sorted
