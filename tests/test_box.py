@@ -13,6 +13,8 @@ from jfrnn.cases.periodic import PERIODIC_CASES
 import jfrnn
 from jfrnn._box import unpacked_turns
 
+pytestmark = pytest.mark.usefixtures("compiled_soon")
+
 CAPACITY = 400
 LENGTH = 304
 
