@@ -2,6 +2,8 @@
 
 import contextlib
 import ctypes
+import time
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import jax
@@ -39,7 +41,7 @@ class Warp:
     array = Array
 
     def __init__(self):
-        self.log, self.recorded, self.streams = [], 0, 0
+        self.log, self.recorded, self.streams, self.recording = [], 0, 0, 0
 
     def get_cuda_device(self, number):
         return DEVICES[number]
@@ -57,8 +59,12 @@ class Warp:
 
     @contextlib.contextmanager
     def ScopedCapture(self, stream):
+        self.recording += 1
+        time.sleep(0.01)
+        assert self.recording == 1  # Warp has one account of what is recorded
         capture, begin = SimpleNamespace(graph=None), len(self.log)
         yield capture
+        self.recording -= 1
         capture.graph = tuple(self.log[begin:])
         del self.log[begin:]
 
@@ -159,6 +165,17 @@ def test_each_device_has_launches_and_graphs_of_its_own(registered):
     graphs = [("graph", tuple(launches(1000, 2000, stream)), 99 + device) for device, stream in ((1, 1), (0, 3))]
     assert warp.log == [*launches(1000, 2000, 99), *launches(1000, 2000, 100), *graphs]
     assert warp.recorded == 4
+
+
+def test_devices_call_at_the_same_time(registered):
+    handler, warp = registered
+    devices = [k % 2 for k in range(40)]
+    with ThreadPoolExecutor(2) as threads:
+        answers = list(threads.map(lambda device: call(handler, 1000 + device, 2000, device=device)[0], devices))
+    assert answers == [None] * 40
+    assert warp.recorded == 4
+    graphs = [entry for entry in warp.log if entry[0] == "graph"]
+    assert sorted(entry[2] for entry in graphs) == [99] * 19 + [100] * 19
 
 
 def test_what_may_run_beside_the_one_before_does_in_a_graph(registered):
