@@ -116,10 +116,10 @@ def _figure(width: float, height: float, title: str) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def label_logarithmic(axis: Axis) -> None:
-    """Write plain numbers at the powers of ten, and at 2 and 5 times these where the axis is short."""
+def label_logarithmic(axis: Axis, short: float = 1000) -> None:
+    """Write plain numbers at the powers of ten, and at 2 and 5 times these where an axis ends below `short` times its begin."""
     low, high = axis.get_view_interval()
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,)))
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < short * low else (1,)))
     axis.set_major_formatter(PLAIN)
 
 

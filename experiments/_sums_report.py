@@ -128,8 +128,8 @@ def _plot(axes: Axes, x: Iterable[float], y: Iterable[float], way: str, compensa
 
 def _dress(axes: Axes, xlabel: str, ylabel: str) -> None:
     axes.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
-    for axis in (axes.xaxis, axes.yaxis):
-        label_logarithmic(axis)
+    for axis, short in ((axes.xaxis, 100), (axes.yaxis, 1000)):  # numbers side by side take more room
+        label_logarithmic(axis, short)
         axis.set_minor_formatter(NullFormatter())
     axes.grid(True, which="major", color="0.9", linewidth=0.8)
     axes.spines[["top", "right"]].set_visible(False)
