@@ -206,6 +206,7 @@ def wait_for_children(pid, deadline):
 FOUR = '[[scenes]]\nlayouts = ["corners"]\nfills = [0.02, 0.05]\n[[scenes]]\nlayouts = ["sheet"]\nfills = [0.02]\n'
 
 
+@pytest.mark.slow
 def test_two_shards_merged_are_the_whole(tmp_path):
     config = 'methods = ["scipy-kdtree"]\nspacing = 1e-3\nprocesses = 2\nrepeats = 2\nmin_seconds = 0.0\n' + FOUR
     whole, parts = Sweep(tmp_path / "a", config), Sweep(tmp_path / "b", config)

@@ -139,6 +139,7 @@ def drop_on_gear(nx=10, **physics):
     return beside(solid, grid, spacing, np.tile([0.3, -3.0], (len(grid), 1)), sound_speed=50.0, density_diffusion=0.1, **physics)
 
 
+@pytest.mark.slow
 def test_a_drop_on_a_turning_gear():
     scene = drop_on_gear(viscosity=0.05, gravity=(0.0, -1.0), artificial=0.1)
     model, s = make_model(scene), make_state(scene)
