@@ -123,9 +123,8 @@ class _CallFrame(ctypes.Structure):
 
 
 _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_CallFrame))
-_warp_lock = (
-    threading.Lock()
-)  # Warp keeps one account of devices, streams and recordings for all threads; held while none is launched
+# Warp keeps one account of devices, streams and recordings for all threads; nothing is launched while this is held
+_warp_lock = threading.Lock()
 _kept: list[Any] = []  # handlers live as long as programs that call them: as long as the process
 
 

@@ -18,8 +18,8 @@ def set_places(flags: Array, most: int) -> Array:
         Shape [most], int32, ascending; n where no more are set.
 
     Cost: flags are read once and packed into words; words are summed up, and each place is looked for among the sums, and in its
-    word (Jacobson 1989, doi:10.1109/SFCS.1989.63533). `nonzero` adds every flag to a histogram instead, of which an accelerator
-    does one at a time.
+    word (Jacobson 1989, doi:10.1109/SFCS.1989.63533). `nonzero` adds every flag to a histogram instead, which takes longer on CPU
+    and GPU.
     """
     n = len(flags)
     words = -(-n // _BITS)

@@ -15,6 +15,7 @@ from jfrnn._triangles_integers import Shapes
 
 _BLOCK = 1 << 16  # particles in work at a time
 _CHUNK = 1 << 14  # candidates in work at a time
+_MOST_PAIRS = 2**31  # that int32 numbers
 
 
 class _Run(NamedTuple):
@@ -34,7 +35,7 @@ def list_triangles(
     Rows are in the order of cell sizes, then of triangles. With capacity=None only the counts are made; rows then are [n, 0].
     """
     (n, dim), faces, slots = positions.shape, corners.shape[0], capacity or 0
-    block = max(min(_BLOCK, n, (2**31 - _CHUNK) // (faces + 1)), 1)
+    block = max(min(_BLOCK, n, (_MOST_PAIRS - _CHUNK) // (faces + 1)), 1)
     buckets = cells.start.shape[0] - 1
 
     def add_block(b: Array, out: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -114,7 +115,7 @@ def nearest_slots(points: Array, corners: Array, idx: Array, count: Array, good:
         The slot of the nearest, the first of those as near, shape [n], int32, and whether there is one, shape [n], bool.
     """
     n, capacity = idx.shape
-    block = max(min(n, (2**31 - n) // capacity), 1)
+    block = max(min(n, (_MOST_PAIRS - n) // capacity), 1)
     finite = jnp.all(jnp.isfinite(points), axis=1)
 
     def of_block(b: Array, slots: Array) -> Array:

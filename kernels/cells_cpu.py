@@ -209,7 +209,7 @@ def cell_kernels(
 
     `periodic` and `batched` are those of `jfrnn.kernels._native.snippet`.
 
-    With exact=False the working precision alone decides (`|d|^2 < r^2 (1 - 8 eps)`): only to measure what exactness costs.
+    With exact=False the working precision alone decides (`|d|^2 < r^2 (1 - 4 eps)`): only to measure what exactness costs.
     """
     scalar = wp.float64 if double else wp.float32
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}"

@@ -11,6 +11,8 @@ from jfrnn.cases import meshes
 from jfrnn.cases.triangles import TRIANGLE_CASES, padded
 
 import jfrnn
+from jfrnn import _triangles_rows
+from jfrnn._exact import make_cutoff
 from jfrnn._triangles_closest import make_normals
 
 pytestmark = pytest.mark.usefixtures("compiled_soon")
@@ -71,6 +73,18 @@ def test_signed_distance_to_a_cube():
     expected = distance_to_cube(x)
     assert np.array_equal(signed.mask, np.abs(expected) < 1)
     assert np.allclose(np.where(signed.mask, expected, 0), signed.distance, atol=1e-14)
+
+
+def test_the_nearest_of_each_row_is_found_in_blocks_and_chunks(monkeypatch):
+    x = np.random.default_rng(1).uniform(-1.6, 1.6, (97, 3))
+    tri = cube_list(x, np.float64)
+    _, distance, mask = (np.asarray(a) for a in tri.closest(x))
+    assert int(tri.count.sum()) > 3 * len(x)  # several chunks
+    monkeypatch.setattr(_triangles_rows, "_MOST_PAIRS", 97 + 20 * tri.capacity)  # and blocks of 20 rows
+    given = jnp.asarray(x), tri.vertices[tri.faces], tri.idx, tri.count, jnp.ones(len(tri.faces), bool)
+    slot, some = _triangles_rows.nearest_slots(*given, make_cutoff(tri.cutoff, np.dtype(np.float64), closed=False))
+    assert np.array_equal(some, mask.any(axis=1))
+    assert np.array_equal(np.asarray(slot)[some], np.where(mask, distance, np.inf).argmin(axis=1)[some])
 
 
 def test_signed_distance_in_2d():
