@@ -341,16 +341,16 @@ def show(
 def triangles(
     out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform and backend.")] = Path("out") / "triangles",
     points: Annotated[int, typer.Option(min=100, help="Random points in the box of a gear.")] = 250_000,
-    faces: Annotated[int, typer.Option(min=100, help="Of the gear, about.")] = 12_000,
-    cutoff: Annotated[list[float], typer.Option(help="[modules]; may be said several times.")] = [0.1, 0.3, 0.8],  # noqa: B006
+    faces: Annotated[list[int], typer.Option(min=100, help="Of the gear, about; may be said several times.")] = [500, 12_000, 200_000],  # noqa: B006
+    cutoff: Annotated[list[float], typer.Option(help="[modules]; may be said several times.")] = [0.01, 0.03, 0.1, 0.3, 0.8],  # noqa: B006
     rounds: Annotated[int, typer.Option(min=2, help="Timed runs of each way.")] = 15,
-    backend: Annotated[str, typer.Option(help="warp or jax.")] = "warp",
+    backend: Annotated[str, typer.Option(help="warp (beside bvh), bvh or jax.")] = "warp",
 ) -> None:
     """Time the triangles of a gear that are near particles, beside trimesh and libigl where they are installed."""
     with _usage_errors():
         from experiments import _triangles
 
-        typer.echo(_triangles.table(_triangles.measure(out, points, faces, rounds, backend, tuple(cutoff))))
+        typer.echo(_triangles.table(_triangles.measure(out, points, tuple(faces), rounds, backend, tuple(cutoff))))
 
 
 @app.command()

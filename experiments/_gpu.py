@@ -30,7 +30,7 @@ class Exactness(BaseModel):
     """Which hard cases are decided on the device."""
 
     model_config = Strict
-    backend: Literal["jax", "warp", "hashgrid", "brute"]
+    backend: Literal["jax", "warp", "hashgrid", "brute", "bvh"]
     dtypes: list[Literal["float32", "float64"]]
     dims: list[Literal[2, 3]]
     capacity: PositiveInt

@@ -39,10 +39,11 @@ def is_exact(oracle: Any, tri: Any, expected: Any) -> bool:  # noqa: ANN401
 def rows(
     n: int, faces: int, cutoff: float, dtype: str, steps: int, timed: Callable[..., dict[str, Any]]
 ) -> Iterator[dict[str, Any]]:
-    """Time lists of n random particles around a gear, by "warp" and by "jax".
+    """Time lists of n random particles around a gear, by "warp", "bvh" and "jax".
 
-    "update" keeps the cells of a wall that stays, also for particles along a Morton curve, "rebuild" sorts it anew, "count" makes
-    no list; each is a call that is not waited for, or a step of a scan. Of "warp" on CUDA, each kernel is timed, too.
+    "update" keeps the cells or the tree of a wall that stays, also for particles along a Morton curve, "rebuild" sorts it anew,
+    "count" makes no list; each is a call that is not waited for, or a step of a scan. Of the first two on CUDA, each kernel is
+    timed, too.
 
     Args:
         n: Particles.
@@ -66,7 +67,7 @@ def rows(
     exact = jfrnn.search_triangles(x, vertices, named, cutoff, backend="jax")
     base = {"kind": "triangles", "layout": "gear", "points": n, "faces": len(scene.faces), "cutoff": cutoff, "dtype": dtype}
     base |= {"capacity": exact.capacity, "pairs": int(np.asarray(exact.count).sum(dtype=np.int64))}
-    for backend in ("warp", "jax"):
+    for backend in ("warp", "bvh", "jax"):
         tri = jfrnn.search_triangles(x, vertices, named, cutoff, capacity=exact.capacity, backend=backend)
         again = tri.update(x)
         wrong = _compare.different_rows(tri.idx, exact.idx) + int(np.sum(np.asarray(tri.count) != np.asarray(exact.count)))
@@ -76,8 +77,8 @@ def rows(
             if name.startswith("scan"):
                 said = _measure.summarize([s / steps for s in said["seconds"]]) | {"steps": steps}
             yield about | {"method": f"jfrnn {backend}, {name}"} | said
-        if backend == "warp" and jax.default_backend() == "gpu":
-            yield about | {"method": "jfrnn warp, kernels alone"} | stages(tri, x)
+        if backend != "jax" and jax.default_backend() == "gpu":
+            yield about | {"method": f"jfrnn {backend}, kernels alone"} | stages(tri, x)
     if dtype == "float32" and jax.default_backend() == "gpu":
         yield from tree_rows(base, scene, exact.count, "cuda:0")
 
@@ -133,10 +134,10 @@ def launchable(tri: Any, x: Any, device: str) -> tuple[list[Any], Any, Any, Any]
     from jfrnn._warp import kernels_of
 
     n, dim = x.shape
-    variant = _triangles_warp._Variant(dim, x.dtype == np.float64, lists=True)
+    variant = _triangles_warp._Variant(dim, x.dtype == np.float64, lists=True, tree=tri.backend == "bvh")
     corners, _, _ = without_faults(tri.vertices, tri.faces)
     inputs = _triangles_warp.query_inputs(x, corners, tri.cells, make_cutoff(tri.cutoff, np.dtype(x.dtype), closed=False))
-    sizes = _triangles_warp._sizes_of_cells(inputs)
+    sizes = _triangles_warp.sizes_on_cuda(variant, inputs)
     words = kernels_of("triangles_cuda").scratch_words(n, *sizes, dim, variant.double)
     arrays = [wp.array(np.asarray(given), device=device) for given in inputs]
     arrays[1] = wp.array(np.asarray(corners), dtype=arrays[0].dtype, ndim=3, device=device)

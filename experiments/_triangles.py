@@ -2,7 +2,7 @@
 
 import csv
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from time import process_time
 from typing import Any, NamedTuple
@@ -52,11 +52,11 @@ class _Scene(NamedTuple):
     faces: np.ndarray
 
 
-def measure(folder: Path, n: int, faces: int, rounds: int, backend: str, cutoffs: tuple[float, ...]) -> Path:
-    """Write a table of seconds by method and cutoff, and return its path.
+def measure(folder: Path, n: int, faces: tuple[int, ...], rounds: int, backend: str, cutoffs: tuple[float, ...]) -> Path:
+    """Write a table of seconds by method, number of faces and cutoff, and return its path.
 
     jfrnn lists all triangles within the cutoff: "update" with the cells of a wall that stays, "rebuild" with one that is sorted
-    anew, "morton order" and the like the first for points along a curve.
+    anew, "morton order" and the like the first for points along a curve. Beside "warp" also "bvh", the same in a tree of boxes.
     Peers find the one nearest triangle of each point, however far, but for "wp.Mesh": "nearest" looks no farther than the cutoff,
     "boxes" only counts triangles whose boxes are as near, which is where a search through its tree of boxes begins; both run on one
     core. `missing` and `extra` are particles of which jfrnn says
@@ -65,40 +65,52 @@ def measure(folder: Path, n: int, faces: int, rounds: int, backend: str, cutoffs
     Args:
         folder: Takes a file named after the backend, such as cpu_warp.csv; one that is there is replaced.
         n: Random points in the bounding box of the gear.
-        faces: Of the gear, about; its module is 1, its teeth are 20.
+        faces: Of gears, about; their module is 1, their teeth are 20.
         rounds: Of timed runs.
         backend: As in `jfrnn.search_triangles`.
         cutoffs: [modules].
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{jax.default_backend()}_{backend}.csv"
-    scene = _gear(n, faces)
-    peers = {name: peer(scene) for name, peer in _PEERS.items() if importlib.util.find_spec(_MODULES[name])}
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, COLUMNS, restval="")
         writer.writeheader()
-        for cutoff in cutoffs:
-            calls, tri = _calls(scene, cutoff, backend)
-            seconds, others = _measure.time_in_turns(calls, rounds)
-            near = np.asarray(tri.count) > 0
-            common = {"faces": len(scene.faces), "cutoff": cutoff, "others_cores": others, **_versions()}
-            row = {"n": n, "pairs": int(tri.count.sum()), "longest_row": int(tri.required)}
-            for way, call in calls.items():
-                _, _, processor = _repeated(lambda call=call: jax.block_until_ready(call()))
-                writer.writerow(common | row | {"method": f"jfrnn {way}"} | _timed(seconds[way], n, processor))
-            for name, (asked, distance, taken, processor) in (peers | _trees(scene, cutoff)).items():
-                within = distance < cutoff
-                wrong = {"missing": int(np.sum(within & ~near[asked])), "extra": int(np.sum(near[asked] & ~within))}
-                if len(asked) == 0:
-                    asked, wrong = scene.points, {}
-                row = {"n": len(asked), "method": name, "peer": _peer_version(name)} | wrong
-                writer.writerow(common | row | _timed(taken, len(asked), processor))
+        for number in faces:
+            scene = _gear(n, number)
+            peers = {name: peer(scene) for name, peer in _PEERS.items() if importlib.util.find_spec(_MODULES[name])}
+            for cutoff in cutoffs:
+                for row in _rows(scene, cutoff, rounds, backend, peers):
+                    writer.writerow(row)
+                    stream.flush()
     return path
+
+
+def _rows(scene: _Scene, cutoff: float, rounds: int, backend: str, peers: dict[str, _Asked]) -> Iterator[dict[str, Any]]:
+    engines = (backend, "bvh") if backend == "warp" else (backend,)
+    lists = {engine: _calls(scene, cutoff, engine) for engine in engines}
+    calls = {f"{engine} {way}": call for engine, (calls, _) in lists.items() for way, call in calls.items()}
+    seconds, others = _measure.time_in_turns(calls, rounds)
+    tri, n = lists[backend][1], len(scene.points)
+    if any(np.any(np.asarray(other.count) != np.asarray(tri.count)) for _, other in lists.values()):
+        raise RuntimeError(f"two engines count other triangles within {cutoff}: {', '.join(engines)}.")
+    near = np.asarray(tri.count) > 0
+    common = {"faces": len(scene.faces), "cutoff": cutoff, "others_cores": others, **_versions()}
+    row = {"n": n, "pairs": int(tri.count.sum()), "longest_row": int(tri.required)}
+    for way, call in calls.items():
+        _, _, processor = _repeated(lambda call=call: jax.block_until_ready(call()))
+        yield common | row | {"method": f"jfrnn {way}"} | _timed(seconds[way], n, processor)
+    for name, (asked, distance, taken, processor) in (peers | _trees(scene, cutoff)).items():
+        within = distance < cutoff
+        wrong = {"missing": int(np.sum(within & ~near[asked])), "extra": int(np.sum(near[asked] & ~within))}
+        if len(asked) == 0:
+            asked, wrong = scene.points, {}
+        row = {"n": len(asked), "method": name, "peer": _peer_version(name)} | wrong
+        yield common | row | _timed(taken, len(asked), processor)
 
 
 def table(path: Path) -> str:
     """Return the table of a run as text."""
-    columns = ["method", "n", "cutoff", "pairs", "longest_row", "median_s", "processor_s", "us_per_particle", "missing", "extra"]
+    columns = ["method", "n", "faces", "cutoff", "pairs", "median_s", "processor_s", "us_per_particle", "missing", "extra"]
     return pd.read_csv(path)[columns].to_string(index=False, na_rep="")
 
 

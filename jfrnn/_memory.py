@@ -19,6 +19,7 @@ from jfrnn._exact import Cutoff
 from jfrnn._inputs import checked_backend, checked_capacity, checked_cutoff, checked_kind, checked_size
 from jfrnn._pair_sum import pair_sum
 from jfrnn._runs import Filter
+from jfrnn._triangles import TRIANGLE_BACKENDS, fastest_of
 from jfrnn._triangles_list import find_triangles
 
 
@@ -106,14 +107,15 @@ def memory_plan(
     """
     n, queries = checked_size("n", n), None if queries is None else checked_size("queries", queries)
     dim, dtype = checked_kind(dim, dtype)
-    radius, engine = checked_cutoff(cutoff, dtype), checked_backend(backend)
+    radius = checked_cutoff(cutoff, dtype)
     rows = n if queries is None else queries
     where = default_platform() if platform is None else platform
     if faces is not None:
         if fn is not None or queries is not None:
             raise ValueError("faces belong to a search for triangles, which knows neither fn nor queries: leave them out.")
         sizes = (n, checked_size("faces", faces), dim, checked_capacity(capacity))
-        return _plan_of_triangles(sizes, dtype, radius, engine, _device_of(where))
+        return _plan_of_triangles(sizes, dtype, radius, backend, _device_of(where))
+    engine = checked_backend(backend)
     if fn is not None:
         if capacity is not None:
             raise ValueError(f"capacity is that of a list, which a pair sum does not make: leave it out, or fn, got {capacity}.")
@@ -154,10 +156,10 @@ def _plan_of_triangles(sizes: tuple[int, int, int, int], dtype: np.dtype, cutoff
     """Compile a search of n particles for faces, in dim dimensions, with this capacity."""
     n, faces, dim, capacity = sizes
     at = SingleDeviceSharding(device)
-    if engine not in ("auto", "jax", "warp"):
-        raise ValueError(f"backend={engine!r} finds no triangles: pass 'auto', 'jax' or 'warp'.")
+    if engine not in TRIANGLE_BACKENDS:
+        raise ValueError(f"backend={engine!r} finds no triangles: pass one of {', '.join(map(repr, TRIANGLE_BACKENDS))}.")
     if engine == "auto":
-        engine = fastest_engine(device.platform, n)
+        engine = fastest_of(device.platform, fastest_engine(device.platform, n))
     points, corners = (jax.ShapeDtypeStruct((size, dim), dtype, sharding=at) for size in (n, faces // 2 + 2))
     named: Any = jax.ShapeDtypeStruct((faces, dim), np.int32, sharding=at)
     analysis = _analysis(find_triangles.lower(points, corners, named, None, cutoff, engine, capacity))

@@ -13,7 +13,13 @@ from jfrnn._auto import choose_engine, platform_of
 from jfrnn._inputs import checked_capacity, checked_cutoff, checked_positions, checked_slack
 from jfrnn._triangles_list import TriangleList, counted_slots, found_triangles
 
-_BACKENDS = ("auto", "jax", "warp")
+TRIANGLE_BACKENDS = ("auto", "jax", "warp", "bvh")
+
+# Where Warp runs: which of its two engines "auto" takes, by platform. `python -m experiments triangles` and `gpu
+# experiments/configs/h200_triangles.toml`, rows in experiments/results/triangles: on the CPU the tree is the faster one around
+# gears of 12 160 and 200 640 faces at all cutoffs or level, and up to 1.2 times slower for 1 280; to sort a wall anew takes it a
+# third to a tenth of the time. On an H200 it takes 1.0 to 2.1 times as long as the cells, a wall anew 0.3 to 0.8 times.
+_FASTER = {"cpu": "bvh", "gpu": "warp"}
 
 
 def search_triangles(
@@ -31,10 +37,12 @@ def search_triangles(
     (i, t) stands in the list iff the distance of particle i to the closed triangle t (its face, sides and vertices) is below the
     cutoff in exact arithmetic on the given floats, the cutoff being rounded once to their dtype. Triangles may be slivers, segments
     or points, and of any size beside the cutoff. Cost: O(particles + faces + candidates), the candidates of a particle being the
-    triangles in its cell, whose edge is about the cutoff, or about a quarter of a larger triangle.
+    triangles in its cell, whose edge is about the cutoff, or about a quarter of a larger triangle; in a tree those whose boxes, and
+    their neighbors' along a curve, hold it.
 
-    A wall that stays is sorted into cells once: `TriangleList.update` keeps the cells that the list has. One that moves as a whole
-    stays too, if the particles are taken into its frame. One that is deformed is sorted anew: `update(positions, vertices=...)`.
+    A wall that stays is sorted once: `TriangleList.update` keeps the cells, or the tree, that the list has. One that moves as a
+    whole stays too, if the particles are taken into its frame. One that is deformed is sorted anew: `update(positions,
+    vertices=...)`.
 
     Args:
         positions: Particle positions [length], shape [n, 3] or [n, 2], float32 or float64. n = 0 is allowed.
@@ -45,8 +53,9 @@ def search_triangles(
         capacity: Slots per row, a static int. Required where positions, vertices or faces are traced. Default: `slack` times the
             longest row, rounded up to a multiple of 8.
         slack: Factor >= 1 on the counted capacity, room for later motion.
-        backend: "warp" (compiled kernels, on the CPU and on CUDA), "jax" (any device), or "auto": "warp" on these two (where Warp
-            is missing "jax", with a warning), elsewhere "jax".
+        backend: Where triangles are looked for: "warp" (compiled kernels, on the CPU and on CUDA) and "jax" (any device) in
+            cells, "bvh" (compiled kernels) in a tree of boxes, which is made anew sooner; or "auto": "bvh" on the CPU, "warp" on
+            CUDA (where Warp is missing "jax", with a warning), elsewhere "jax".
 
     Returns:
         A `TriangleList`; `idx` has shape [n, capacity], unused slots hold f. Rows are in no promised order, but the same input
@@ -59,8 +68,9 @@ def search_triangles(
         `overflow` and `check` tell.
 
     Memory: 4 B per slot and particle for the list; 100 to 132 B per triangle for the cells, which the list keeps, whatever the
-    sizes of the triangles and of space; while "warp" lists on CUDA 12 B per particle, 0.6 kB per triangle (float64: 1.1) and at
-    most 58 MB. Differentiable: the list is topology, without gradient; see `TriangleList.closest`.
+    sizes of the triangles and of space, or 30 B for the tree (float64: 56); while "warp" lists on CUDA 12 B per particle, 0.6 kB
+    per triangle (float64: 1.1; "bvh" a tenth) and at most 58 MB. Differentiable: the list is topology, without gradient; see
+    `TriangleList.closest`.
     Jit: yes, with capacity. vmap: yes, with capacity. `jax.shard_map`: yes, with particles spread and the wall on every device
     (`check_vma=False`). Source: strict cutoff (Peifle 2019, §2.2).
 
@@ -102,9 +112,17 @@ def _checked_faces(faces: Any, dim: int, vertices: int) -> Array:  # noqa: ANN40
 
 
 def _chosen_engine(backend: Any, points: Array) -> str:  # noqa: ANN401
-    if backend not in _BACKENDS:
-        raise ValueError(f"backend must be one of {', '.join(map(repr, _BACKENDS))}, got {backend!r}.")
+    if backend not in TRIANGLE_BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(map(repr, TRIANGLE_BACKENDS))}, got {backend!r}.")
     platform = platform_of(points)
-    if backend == "warp" and platform not in _warp.PLATFORMS:
-        raise RuntimeError(f"backend='warp' finds triangles on the CPU and on CUDA alone, got {platform!r}: pass backend='jax'.")
-    return choose_engine(backend, points, None)
+    if backend in ("warp", "bvh") and platform not in _warp.PLATFORMS:
+        raise RuntimeError(f"backend={backend!r} finds triangles on the CPU and on CUDA, got {platform!r}: pass backend='jax'.")
+    if backend == "bvh":
+        choose_engine("warp", points, None)  # needs what it needs
+        return backend
+    return fastest_of(platform, choose_engine(backend, points, None)) if backend == "auto" else choose_engine(backend, points, None)
+
+
+def fastest_of(platform: str, engine: str) -> str:
+    """Return the engine that "auto" takes for triangles where it takes this one for neighbors."""
+    return _FASTER.get(platform, engine) if engine == "warp" else engine

@@ -19,10 +19,12 @@ from jfrnn._status import NeighborOverflowError, Status
 from jfrnn._triangles_cells import TriangleCells, sort_triangles, without_faults
 from jfrnn._triangles_closest import make_normals, nearest_of, normal_at
 from jfrnn._triangles_rows import are_near, list_triangles, nearest_slots
+from jfrnn._triangles_tree import TriangleTree, grow_tree
 
 _ENGINES = {
     "jax": (sort_triangles, list_triangles),
     "warp": (_triangles_warp.sort_triangles, _triangles_warp.list_triangles),
+    "bvh": (grow_tree, _triangles_warp.list_triangles),
 }
 
 
@@ -56,7 +58,7 @@ class TriangleList:
         required: The capacity that holds every row, shape [], int32; like the status, over all updates.
         vertices: Corners of the wall [length], shape [v, d].
         faces: Vertices of each triangle, shape [f, d], int32.
-        cells: The wall, sorted into cells (`TriangleCells`); None where there is none.
+        cells: The wall, sorted into cells (`TriangleCells`) or, by "bvh", in a tree (`TriangleTree`); None where there is none.
         cutoff: Distance [length], rounded to the dtype of the positions. Static.
         backend: The engine that made the list. Static.
     """
@@ -67,7 +69,7 @@ class TriangleList:
     required: Array
     vertices: Array
     faces: Array
-    cells: TriangleCells | None
+    cells: TriangleCells | TriangleTree | None
     cutoff: float = dataclasses.field(metadata={"static": True})
     backend: str = dataclasses.field(metadata={"static": True})
 
@@ -88,8 +90,8 @@ class TriangleList:
 
         Args:
             positions: Particles [length], shape [n, d], where they are now. Where the wall moves as a whole: in its frame.
-            vertices: Corners [length], shape [v, d], where the wall is deformed: it is then sorted into cells anew. Default: those
-                that the list has, whose cells it keeps.
+            vertices: Corners [length], shape [v, d], where the wall is deformed: it is then sorted anew. Default: those that the
+                list has, whose cells or tree it keeps.
 
         Returns:
             A `TriangleList` of the same shapes and options.
@@ -220,7 +222,13 @@ def counted_slots(points: Array, vertices: Array, faces: Array, cutoff: float, b
 
 
 def found_triangles(
-    points: Array, vertices: Array, faces: Array, cells: TriangleCells | None, cutoff: float, backend: str, capacity: int | None
+    points: Array,
+    vertices: Array,
+    faces: Array,
+    cells: TriangleCells | TriangleTree | None,
+    cutoff: float,
+    backend: str,
+    capacity: int | None,
 ) -> dict[str, Any]:
     """Return the fields of a list that come from data; with capacity=None only counts. `cells`: those of an earlier list."""
     radius = make_cutoff(cutoff, np.dtype(points.dtype), closed=False)
@@ -229,7 +237,13 @@ def found_triangles(
 
 @functools.partial(jax.jit, static_argnames=("backend", "capacity"))
 def find_triangles(
-    points: Array, vertices: Array, faces: Array, cells: TriangleCells | None, cutoff: Cutoff, backend: str, capacity: int | None
+    points: Array,
+    vertices: Array,
+    faces: Array,
+    cells: TriangleCells | TriangleTree | None,
+    cutoff: Cutoff,
+    backend: str,
+    capacity: int | None,
 ) -> dict[str, Any]:
     """List or count triangles: the compiled program of a search."""
     corners, finite, there = without_faults(vertices, faces)

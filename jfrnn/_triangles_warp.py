@@ -1,6 +1,6 @@
 """Triangles with Warp's kernels inside JAX, on the CPU and on CUDA: what they are given, and how they are launched.
 
-On CUDA the kernels list; cells are those of `jfrnn._triangles_cells`.
+They look for triangles in cells, which on CUDA are those of `jfrnn._triangles_cells`, or in the tree of `jfrnn._triangles_tree`.
 """
 
 import functools
@@ -14,6 +14,7 @@ from jax import Array, lax
 from jfrnn import _cuda, _triangles_cells, _warp
 from jfrnn._exact import Cutoff
 from jfrnn._triangles_cells import LANES, MOST_CELLS, TriangleCells, bucket_count, entry_count, level_limit
+from jfrnn._triangles_tree import WIDTH, TriangleTree, level_starts, widened
 
 _LONGEST_VECTOR = 16
 _PARTICLES_PER_THREAD = 1024  # below, a second thread costs more than it saves
@@ -25,6 +26,7 @@ class _Variant(NamedTuple):
     dim: int
     double: bool
     lists: bool
+    tree: bool = False
 
 
 def sort_triangles(corners: Array, good: Array, cutoff: Cutoff) -> TriangleCells:
@@ -43,26 +45,33 @@ def sort_triangles(corners: Array, good: Array, cutoff: Cutoff) -> TriangleCells
 
 
 def list_triangles(
-    positions: Array, corners: Array, cells: TriangleCells, cutoff: Cutoff, capacity: int | None
+    positions: Array, corners: Array, cells: TriangleCells | TriangleTree, cutoff: Cutoff, capacity: int | None
 ) -> tuple[Array, Array]:
     """List the triangles near every particle, as `jfrnn._triangles_rows.list_triangles` does."""
-    variant = _Variant(positions.shape[1], positions.dtype == jnp.float64, capacity is not None)
+    tree = isinstance(cells, TriangleTree)
+    variant = _Variant(positions.shape[1], positions.dtype == jnp.float64, capacity is not None, tree)
     on_cpu, on_cuda = (functools.partial(call, variant, capacity or 0) for call in (_query_on_cpu, _query_on_cuda))
     return lax.platform_dependent(*query_inputs(positions, corners, cells, cutoff), cpu=on_cpu, cuda=on_cuda)
 
 
-def query_inputs(positions: Array, corners: Array, cells: TriangleCells, cutoff: Cutoff) -> tuple[Array, ...]:
-    """Return what a query is given: beside these arrays the boxes of triangles, [f, 2 d], that hold all particles near them."""
-    radius = jnp.asarray(cutoff.radius)
-    wide = radius * (1 + 8 * jnp.finfo(corners.dtype).eps)  # no particle nearer than r lies beyond: subtraction rounds monotonously
-    boxes = jnp.concatenate([jnp.min(corners, axis=1) - wide, jnp.max(corners, axis=1) + wide], axis=1)
-    return positions, corners, boxes, jnp.reshape(radius, 1), *cells._replace(level_count=jnp.reshape(cells.level_count, 1))
+def query_inputs(positions: Array, corners: Array, cells: TriangleCells | TriangleTree, cutoff: Cutoff) -> tuple[Array, ...]:
+    """Return what a query is given: beside these arrays the boxes of triangles, [f, 2 d], that hold all particles near them.
+
+    A tree has boxes, [2 d, entries], and in place of the buckets' first entries those of its levels; it knows no sizes of cells.
+    """
+    radius = jnp.reshape(jnp.asarray(cutoff.radius), 1)
+    if isinstance(cells, TriangleTree):
+        starts, none = jnp.asarray(level_starts(len(corners))), jnp.zeros(1, jnp.int32)
+        return positions, corners, cells.boxes, radius, starts, cells.triangles, none, none, none
+    boxes = jnp.concatenate(widened(corners, cutoff), axis=1)
+    return positions, corners, boxes, radius, *cells._replace(level_count=jnp.reshape(cells.level_count, 1))
 
 
 def _query_on_cpu(variant: _Variant, slots: int, *inputs: Array) -> tuple[Array, Array]:
     positions, corners, boxes, radius, start, triangles, *of_cells = inputs
-    entries = jnp.pad(triangles, (0, _LONGEST_VECTOR), constant_values=corners.shape[0])  # vectors reach over the end
-    boxes = boxes.T.at[:, entries].get(mode="fill", fill_value=jnp.nan)  # side by side, as a bucket holds them
+    if not variant.tree:
+        entries = jnp.pad(triangles, (0, _LONGEST_VECTOR), constant_values=corners.shape[0])  # vectors reach over the end
+        boxes = boxes.T.at[:, entries].get(mode="fill", fill_value=jnp.nan)  # side by side, as a bucket holds them
     sizes = {"idx": (len(positions), max(slots, 1)), "count": len(positions), "info": 4}
     query = _query_callable(variant)
     idx, count, _ = query(positions, corners, boxes, radius, start, triangles, *of_cells, output_dims=sizes)
@@ -71,23 +80,26 @@ def _query_on_cpu(variant: _Variant, slots: int, *inputs: Array) -> tuple[Array,
 
 def _query_on_cuda(variant: _Variant, slots: int, *inputs: Array) -> tuple[Array, Array]:
     n, dim = inputs[0].shape
-    words = _warp.kernels_of("triangles_cuda").scratch_words(n, *_sizes_of_cells(inputs), dim, variant.double)
+    words = _warp.kernels_of("triangles_cuda").scratch_words(n, *sizes_on_cuda(variant, inputs), dim, variant.double)
     sizes = {"idx": (n, slots) if variant.lists else (1, 1), "count": n, "scratch": words}
     idx, count, _ = _cuda_callable(variant)(*inputs, output_dims=sizes)
     return idx if variant.lists else jnp.zeros((n, 0), jnp.int32), count
 
 
-def _sizes_of_cells(inputs: Sequence[Any]) -> tuple[int, int]:
-    """Return the number of buckets and of entries."""
+def sizes_on_cuda(variant: _Variant, inputs: Sequence[Any]) -> tuple[int, int]:
+    """Return the number of buckets, into which particles are sorted, and of entries."""
+    if variant.tree:
+        return bucket_count(inputs[1].shape[0]), inputs[2].shape[1]
     return inputs[4].shape[0] - 1, inputs[5].shape[0]
 
 
 def _name(name: str, variant: _Variant) -> str:
-    return f"jfrnn_triangles_{name}_{variant.dim}d_{'f64' if variant.double else 'f32'}{'_list' * variant.lists}"
+    options = "_list" * variant.lists + "_tree" * variant.tree
+    return f"jfrnn_triangles_{name}_{variant.dim}d_{'f64' if variant.double else 'f32'}{options}"
 
 
 def _kernels(variant: _Variant) -> Any:  # noqa: ANN401
-    return _warp.kernels_of("triangles_cpu").triangle_kernels(*variant, MOST_CELLS[variant.dim], LANES[variant.dim])
+    return _warp.kernels_of("triangles_cpu").triangle_kernels(*variant, MOST_CELLS[variant.dim], LANES[variant.dim], WIDTH)
 
 
 @functools.cache
@@ -141,12 +153,12 @@ def _cuda_callable(variant: _Variant) -> Any:  # noqa: ANN401
 
 
 def _cuda_kernels(variant: _Variant) -> Any:  # noqa: ANN401
-    return _warp.kernels_of("triangles_cuda").triangle_kernels(*variant)
+    return _warp.kernels_of("triangles_cuda").triangle_kernels(*variant, WIDTH)
 
 
 def _commands(variant: _Variant, *arrays: Any) -> list[_cuda.Command]:  # noqa: ANN401
     (n, _), faces, capacity = arrays[0].shape, arrays[1].shape[0], arrays[9].shape[1]
-    sizes, workers = _sizes_of_cells(arrays), _warp.kernels_of("triangles_cuda").workers_for(n, variant.double)
+    sizes, workers = sizes_on_cuda(variant, arrays), _warp.kernels_of("triangles_cuda").workers_for(n, variant.double)
     launches = _cuda_kernels(variant).launches(n, *sizes, capacity, variant.double)
     arguments = [*arrays, n, faces, *sizes, capacity, workers]
     return [_cuda.Command(x.kernel, [*arguments, x.threads], x.threads, x.block, x.beside) for x in launches]

@@ -33,6 +33,14 @@ def constants(dim: int, double: bool, stride: int) -> dict[str, int]:
     return {"LIMBS": limbs, "ROOM": room, "STRIDE": stride}
 
 
+def pending(node: int) -> int:
+    """Return how many sets of siblings, `node` at a time, may wait while a tree of at most 2^31 leaves is searched depth first."""
+    levels = 1
+    while node**levels < 2**31:
+        levels += 1
+    return (levels - 1) * (node - 1) + 1
+
+
 # `Shape::sure(p, corners, radius, scale)`: is the distance below the radius? 1: it is, 0: it is not, -1: float64 cannot tell.
 # `Shape::near(p, corners, radius, scale, room)` can. p [DIM], corners [DIM][DIM]; room: ROOM ints, each STRIDE behind the last, so
 # that threads beside each other use memory side by side.

@@ -1,14 +1,17 @@
 """Triangles on the CPU: `build` sorts them into cells, one by one; `query` lists those near each particle, on every core.
 
+`query` looks for them in the cells, or in a tree of boxes (`jfrnn/_triangles_tree.py`); what it finds is decided by the same text.
+
 `query` is launched once per thread: the threads hand themselves chunks of particles from an atomic counter.
 """
 
 import functools
+from string import Template
 from typing import NamedTuple
 
 import warp as wp
 from jfrnn.kernels._native import ENTER, LEAVE, snippet
-from jfrnn.kernels._triangles import BOUNDS, DECIDE, LEVELS, constants
+from jfrnn.kernels._triangles import BOUNDS, DECIDE, LEVELS, constants, pending
 
 CHUNK = 1024  # particles that a thread takes at a time
 
@@ -194,13 +197,12 @@ auto surely_near = [&](const real* p, const int* which, unsigned int& open) -> u
 };
 """
 
-# boxes [2 DIM][stride]: corners of the boxes of entries, NaN where there is no triangle; a vector more than there are entries
-_QUERY = r"""
+# boxes [2 DIM][stride]: corners of the boxes of entries, which hold nothing where there is no triangle; a vector reaches no farther
+_QUERY = Template(r"""
 struct Shared { int next_chunk; };
 Shared& shared = *(Shared*)info.data;
 constexpr int MOST = 512;  // triangles whose boxes hold a particle that wait to be decided
 int waiting[MOST + WIDTH], room[ROOM];
-const int sizes_of_cells = level_count.data[0];
 int longest = 0;
 for (;;) {
     const long long begin = (long long)__atomic_fetch_add(&info.data[2], 1, __ATOMIC_RELAXED) * CHUNK;
@@ -228,26 +230,18 @@ for (;;) {
             }
             number = 0;
         };
-        for (int l = 0; l < sizes_of_cells && finite_point(p); ++l) {
-            const int level = levels.data[l];
-            const int bucket = bucket_at(p, level, buckets);
-            const int last = start.data[bucket + 1];
-            for (int e = start.data[bucket]; e < last; e += WIDTH) {
-                unsigned int inside = last - e < WIDTH ? (1u << (last - e)) - 1 : (1u << WIDTH) - 1;
-                for (int k = 0; k < DIM; ++k) {
-                    vec low, high;
-                    __builtin_memcpy(&low, boxes.data + (long long)stride * k + e, sizeof low);
-                    __builtin_memcpy(&high, boxes.data + (long long)stride * (DIM + k) + e, sizeof high);
-                    inside &= bits_of(__builtin_convertvector((low <= p[k]) & (high >= p[k]), flags));
-                }
-                for (; inside; inside &= inside - 1) {
-                    const int t = triangles.data[e + __builtin_ctz(inside)];
-                    waiting[number] = t;
-                    number += level_of.data[t] == level;
-                    if (number == MOST)
-                        decide();
-                }
+        auto inside = [&](int e) -> unsigned int {  // which of WIDTH boxes hold the particle, one bit each
+            mask within = vec{} == vec{};
+            for (int k = 0; k < DIM; ++k) {
+                vec low, high;
+                __builtin_memcpy(&low, boxes.data + (long long)stride * k + e, sizeof low);
+                __builtin_memcpy(&high, boxes.data + (long long)stride * (DIM + k) + e, sizeof high);
+                within &= (low <= p[k]) & (high >= p[k]);
             }
+            return bits_of(__builtin_convertvector(within, flags));
+        };
+        if (finite_point(p)) {
+            $candidates
         }
         if (number)
             decide();
@@ -261,6 +255,45 @@ for (;;) {
 int known = __atomic_load_n(&info.data[0], __ATOMIC_RELAXED);
 while (known < longest && !__atomic_compare_exchange_n(&info.data[0], &known, longest, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
 }
+""")
+
+_IN_CELLS = r"""
+for (int l = 0; l < level_count.data[0]; ++l) {
+    const int level = levels.data[l];
+    const int bucket = bucket_at(p, level, buckets);
+    const int last = start.data[bucket + 1];
+    for (int e = start.data[bucket]; e < last; e += WIDTH)
+        for (unsigned int hold = inside(e) & (last - e < WIDTH ? (1u << (last - e)) - 1 : ~0u); hold; hold &= hold - 1) {
+            const int t = triangles.data[e + __builtin_ctz(hold)];
+            waiting[number] = t;
+            number += level_of.data[t] == level;
+            if (number == MOST)
+                decide();
+        }
+}
+"""
+
+# start [levels + 1]: the first entry of each level of the tree; `buckets` is how many there are
+_IN_TREE = r"""
+struct Siblings { int first, level; };
+Siblings pending[PENDING];
+int depth = 0;
+pending[depth++] = Siblings{start.data[buckets - 1], buckets - 1};
+while (depth > 0) {
+    const Siblings here = pending[--depth];
+    for (int part = 0; part < NODE; part += WIDTH)
+        for (unsigned int hold = inside(here.first + part); hold; hold &= hold - 1) {
+            const int e = here.first + part + __builtin_ctz(hold);
+            if (here.level > 0) {
+                const int level = here.level - 1;
+                pending[depth++] = Siblings{start.data[level] + NODE * (e - start.data[level + 1]), level};
+                continue;
+            }
+            waiting[number++] = triangles.data[e];
+            if (number == MOST)
+                decide();
+        }
+}
 """
 
 
@@ -272,11 +305,15 @@ class Kernels(NamedTuple):
 
 
 @functools.cache
-def triangle_kernels(dim: int, double: bool, lists: bool, most_cells: int, lanes: int) -> Kernels:
-    """Return the kernels for a dimension and dtype, for lists or counts alone; `most_cells` and `lanes` are those of the cells."""
+def triangle_kernels(dim: int, double: bool, lists: bool, tree: bool, most_cells: int, lanes: int, node: int) -> Kernels:
+    """Return the kernels for a dimension and dtype, for lists or counts alone, in cells or in a tree.
+
+    `most_cells` and `lanes` are those of the cells, `node` is the number of children in the tree, which the kernels do not build.
+    """
     scalar = wp.float64 if double else wp.float32
-    variant = f"{dim}d_{'f64' if double else 'f32'}{'_list' * lists}"
+    variant = f"{dim}d_{'f64' if double else 'f32'}{'_list' * lists}{'_tree' * tree}"
     options = {"LIST": lists, "MOST_CELLS": most_cells, "LANES": lanes, "LANES_LOG2": lanes.bit_length() - 1, "CHUNK": CHUNK}
+    options |= {"NODE": node, "PENDING": pending(node)}
     options |= constants(dim, double, stride=1)
     reals, ints = wp.array(dtype=scalar), wp.array(dtype=wp.int32)
     points, rows, shapes = wp.array2d(dtype=scalar), wp.array2d(dtype=wp.int32), wp.array3d(dtype=scalar)
@@ -296,7 +333,8 @@ def triangle_kernels(dim: int, double: bool, lists: bool, most_cells: int, lanes
         native.__name__ = native.__qualname__ = f"triangles_{native.__name__}_{variant}"
     text = functools.partial(snippet, "double" if double else "float", dim, DECIDE, LEVELS, **options)
     build_function = wp.func_native(ENTER + text(_BUILD) + LEAVE)(build_native)
-    query_function = wp.func_native(ENTER + text(_LANES, BOUNDS, _MANY, _QUERY) + LEAVE)(query_native)
+    candidates = _QUERY.substitute(candidates=_IN_TREE if tree else _IN_CELLS)
+    query_function = wp.func_native(ENTER + text(_LANES, BOUNDS, _MANY, candidates) + LEAVE)(query_native)
 
     def build(
         corners: shapes, good: ints, cutoff: reals, start: ints, triangles: ints, levels: ints, level_count: ints, level_of: ints,

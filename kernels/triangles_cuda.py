@@ -8,6 +8,9 @@ scatter  particles with candidates, those of neighboring cells side by side: the
 query    a thread per particle: boxes first; what they leave waits in shared memory, float bounds decide it, then float64
 settle   rows in which float64 left a pair open, anew, with integers: few threads, whose numbers take scratch
 
+In a tree of boxes (`jfrnn/_triangles_tree.py`) the same: what holds a particle is asked of boxes from the root on, and particles
+are sorted by cells of a grid over the wall.
+
 A thread writes its own row, in the order of the CPU kernel: rows are the same bits in every run, and those of the CPU. No product
 is contracted with a sum, so that the same text on the CPU decides with the same floats.
 
@@ -17,7 +20,8 @@ the CPU, for cutoffs of 0.1 | 0.3 | 0.8 modules: 4 | 3 | 2 sizes of cells; 0.68 
 Bytes: rows of 16 | 32 | 128 slots, 64 | 128 | 512 MB, 12 MB of positions, 4 MB of counts, 20 MB to sort by: 23 | 38 | 130 us at
 4.3 TB/s; entries (4 MB) and tables stay in L2. Operations: 20 per candidate, 350 per box, in all 0.4 | 1.4 | 9.1 billion, which 30
 per ns do in 15 | 48 | 300 us if no lane idles. Half of them will, and seven launches wait for each other.
-Prediction for an H200: 0.15 | 0.25 | 0.85 ms. NOT YET MEASURED.
+Prediction for an H200: 0.15 | 0.25 | 0.85 ms. Measured, kernels alone: 0.33 | 0.47 | 2.0; in a tree 0.54 | 0.79 | 2.0, where a
+thread asks 16 boxes one after the other for each node (experiments/results/triangles/h200.jsonl).
 """
 
 import functools
@@ -25,7 +29,7 @@ from typing import NamedTuple
 
 import warp as wp
 from jfrnn.kernels._native import snippet
-from jfrnn.kernels._triangles import BOUNDS, DECIDE, LEVELS, constants
+from jfrnn.kernels._triangles import BOUNDS, DECIDE, LEVELS, constants, pending
 
 BLOCK = 256
 QUERY_BLOCK = 128
@@ -43,9 +47,9 @@ struct Shared {
 };
 struct alignas(DIM == 3 ? 16 : 2 * sizeof(real)) Entry {
     real low[DIM];
-    whole triangle;
+    whole triangle;  // of a node in a tree: its first child
     real high[DIM];
-    whole level;
+    whole level;  // of cells, or in a tree
 };
 int* cursor = scratch.data;
 auto take = [&](long long words) { int* here = cursor; cursor += (words + 15) / 16 * 16; return here; };
@@ -72,7 +76,20 @@ if (thread == 0)
     shared.near = shared.queued = 0;
 if (thread < buckets)
     first[thread] = 0;
-if (thread < entries) {
+if (TREE && thread < entries) {
+    Entry entry;
+    int level = 0;
+    while (thread >= start.data[level + 1])
+        ++level;
+    for (int k = 0; k < DIM; ++k) {
+        entry.low[k] = boxes.data[(long long)entries * k + thread];
+        entry.high[k] = boxes.data[(long long)entries * (DIM + k) + thread];
+    }
+    entry.triangle = level == 0 ? triangles.data[thread] : start.data[level - 1] + NODE * (thread - start.data[level]);
+    entry.level = level;
+    entry_of[thread] = entry;
+}
+if (!TREE && thread < entries) {
     Entry entry;
     const int t = triangles.data[thread];
     const bool there = t < f;
@@ -88,9 +105,8 @@ if (thread < entries) {
 
 _PLACE = r"""
 // where particles are sorted to: 64 cells of a block stand side by side, blocks anywhere
-auto key_at = [&](const real* p) -> int {
+auto key_at = [&](const real* p, int level) -> int {
     constexpr int BITS = DIM == 3 ? 2 : 3;
-    const int level = levels.data[0];
     int cell[DIM], within = 0;
     for (int k = 0; k < DIM; ++k) {
         cell[k] = cell_at(double(p[k]), scale_of(level));
@@ -103,13 +119,32 @@ if (thread < n) {
     real p[DIM];
     for (int k = 0; k < DIM; ++k)
         p[k] = positions.data[(long long)DIM * thread + k];
-    const int number = finite_point(p) ? level_count.data[0] : 0;
     bool some = false;
-    for (int l = 0; l < number && !some; ++l) {
-        const int bucket = bucket_at(p, levels.data[l], buckets);
-        some = start.data[bucket] < start.data[bucket + 1];
+    int level = 0;
+    if constexpr (TREE) {
+        real extent = 0;  // about that of the wall, per node below the root
+        for (int e = entries - NODE; e < entries && finite_point(p); ++e) {
+            const Entry entry = entry_of[e];
+            bool inside = true;
+            for (int k = 0; k < DIM; ++k) {
+                inside = inside && entry.low[k] <= p[k] && entry.high[k] >= p[k];
+                const real wide = entry.high[k] - entry.low[k];
+                extent = wide > extent && Bits::finite(wide) ? wide : extent;
+            }
+            some = some || inside;
+        }
+        // 2^5 cells along it
+        const int finest = 2 * Bits::BIAS + 5 - Bits::exponent(extent);
+        level = finest < 1 ? 1 : finest > 2 * Bits::BIAS - 1 ? 2 * Bits::BIAS - 1 : finest;
+    } else {
+        level = levels.data[0];
+        const int number = finite_point(p) ? level_count.data[0] : 0;
+        for (int l = 0; l < number && !some; ++l) {
+            const int bucket = bucket_at(p, levels.data[l], buckets);
+            some = start.data[bucket] < start.data[bucket + 1];
+        }
     }
-    const int mine = some ? key_at(p) : -1;
+    const int mine = some ? key_at(p, level) : -1;
     key[thread] = mine;
     if (some)
         slot[thread] = add_to(first + mine, 1);
@@ -160,19 +195,25 @@ auto list_row = [&](int i, auto decide) -> bool {
     for (int k = 0; k < DIM; ++k)
         p[k] = positions.data[(long long)DIM * i + k];
     int* row = idx.data + (long long)capacity * i;
-    const int sizes_of_cells = level_count.data[0];
-    int found = 0, l = 0, level = 0, e = 0, last = 0;
+    const int sizes_of_cells = TREE ? 0 : level_count.data[0];
+    int found = 0, l = 0, level = 0, e = TREE ? entries - NODE : 0, last = TREE ? entries : 0;
+    int pending[TREE ? PENDING : 1], depth = 0;  // siblings whose parent's box holds the particle
     bool more = true, open = false;
     while (more && !open) {
         int number = 0;
         while (number < WAITING) {
             if (e < last) {
                 const Entry entry = entry_of[e++];
-                bool inside = entry.level == level;
+                bool inside = TREE || entry.level == level;
                 for (int k = 0; k < DIM; ++k)
                     inside = inside && entry.low[k] <= p[k] && entry.high[k] >= p[k];
-                if (inside)
+                if (TREE && inside && entry.level > 0)
+                    pending[depth++] = (int)entry.triangle;
+                else if (inside)
                     waiting(number++) = (int)entry.triangle;
+            } else if (TREE && depth > 0) {
+                e = pending[--depth];
+                last = e + NODE;
             } else if (l < sizes_of_cells) {
                 level = levels.data[l++];
                 const int bucket = bucket_at(p, level, buckets);
@@ -279,17 +320,18 @@ def _launch(kernel: wp.Kernel, threads: int, block: int, beside: bool = False) -
 
 
 @functools.cache
-def triangle_kernels(dim: int, double: bool, lists: bool) -> Kernels:
-    """Return the kernels for a dimension and dtype, for lists or counts alone."""
-    kind = f"{dim}d_{'f64' if double else 'f32'}"
+def triangle_kernels(dim: int, double: bool, lists: bool, tree: bool, node: int) -> Kernels:
+    """Return the kernels for a dimension and dtype, for lists or counts alone, in cells or in a tree of `node` children each."""
+    kind = f"{dim}d_{'f64' if double else 'f32'}{'_tree' * tree}"
     rows = f"{kind}{'_list' * lists}"
+    where = {"TREE": tree, "NODE": node, "PENDING": pending(node)}
 
     def sorting(name: str, text: str) -> wp.Kernel:
-        return _kernel(f"{name}_{kind}", f"sort_{kind}", dim, double, (BLOCK, 1), lists, LEVELS, LAYOUT, text)
+        return _kernel(f"{name}_{kind}", f"sort_{kind}", dim, double, (BLOCK, 1), lists, where, LEVELS, LAYOUT, text)
 
     def deciding(name: str, block: int, blocks: int, text: str) -> wp.Kernel:
         pieces = (DECIDE, LEVELS, "using vec = real;", BOUNDS, LAYOUT, _ROW, text)
-        return _kernel(f"{name}_{rows}", f"{name}_{rows}", dim, double, (block, blocks), lists, *pieces)
+        return _kernel(f"{name}_{rows}", f"{name}_{rows}", dim, double, (block, blocks), lists, where, *pieces)
 
     return Kernels(
         sorting("prepare", _PREPARE),
@@ -306,13 +348,16 @@ _made: dict[str, wp.Kernel] = {}
 _WAITING = 16  # candidates of a thread whose boxes hold its particle, until they are decided
 
 
-def _kernel(name: str, module_name: str, dim: int, double: bool, bounds: tuple[int, int], lists: bool, *pieces: str) -> wp.Kernel:
+def _kernel(
+    name: str, module_name: str, dim: int, double: bool, bounds: tuple[int, int], lists: bool, where: dict[str, int], *pieces: str
+) -> wp.Kernel:
     if name in _made:
         return _made[name]
     scalar = wp.float64 if double else wp.float32
     reals, ints = wp.array(dtype=scalar), wp.array(dtype=wp.int32)
     points, rows, shapes = wp.array2d(dtype=scalar), wp.array2d(dtype=wp.int32), wp.array3d(dtype=scalar)
     options = {"LIST": lists, "WAITING": _WAITING, "THREADS": bounds[0], "RUN": _RUN, "HEADER": _HEADER_WORDS}
+    options |= where
 
     def native(
         positions: points, corners: shapes, boxes: points, cutoff: reals, start: ints, triangles: ints, levels: ints,

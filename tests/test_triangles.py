@@ -11,9 +11,11 @@ import reference
 from jfrnn.cases.triangles import TRIANGLE_CASES, padded
 
 import jfrnn
-from jfrnn import _triangles_cells, _triangles_warp
+from jfrnn import _triangles_cells, _triangles_tree, _triangles_warp
+from jfrnn._exact import make_cutoff
 
-BACKENDS = ("jax", "warp")
+BACKENDS = ("jax", "warp", "bvh")
+IN_CELLS = ("jax", "warp")
 CAPACITY = 40
 KINDS = list(product((np.float32, np.float64), (2, 3)))
 OFTEN = {(np.float32, 3)}  # the array engine compiles slowly
@@ -103,7 +105,7 @@ def test_nothing_is_near_nothing(dtype, dim):
         ({"cutoff": 1e-40}, ValueError, r"cutoff=.* is outside"),
         ({"capacity": 0}, ValueError, r"capacity must be at least 1"),
         ({"slack": 0.5}, ValueError, r"slack must be finite and at least 1"),
-        ({"backend": "hashgrid"}, ValueError, r"backend must be one of 'auto', 'jax', 'warp'"),
+        ({"backend": "hashgrid"}, ValueError, r"backend must be one of 'auto', 'jax', 'warp', 'bvh'"),
     ],
 )
 def test_what_is_refused(change, error, match):
@@ -180,7 +182,7 @@ def test_a_loop_with_a_wall_that_moves():
         grown.update(after, vertices=lifted[:3])
 
 
-@pytest.mark.parametrize("backend", [pytest.param("jax", marks=pytest.mark.slow), "warp"])
+@pytest.mark.parametrize("backend", [pytest.param("jax", marks=pytest.mark.slow), "warp", "bvh"])
 def test_vmap_is_a_loop(backend):
     vertices, faces = wall()
     x = np.random.default_rng(1).uniform(-0.2, 1.2, (2, 4, 3)).astype(np.float32)
@@ -192,7 +194,7 @@ def test_vmap_is_a_loop(backend):
         assert np.array_equal(together.count[b], alone.count)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", IN_CELLS)
 def test_buckets_are_shared_without_harm(monkeypatch, backend):
     """All cells hashed into two buckets: candidates are many, pairs the same."""
     for module in (_triangles_cells, _triangles_warp):
@@ -205,7 +207,7 @@ def test_buckets_are_shared_without_harm(monkeypatch, backend):
     assert_exact(tri, expected_pairs("sizes", np.float64, 2))
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", IN_CELLS)
 def test_cells_hold_what_they_say(backend):
     """Each bucket holds a triangle once at most, in the order of triangles; levels in use come first, the smallest cells before."""
     tri = search_padded("sizes", np.float64, 2, backend)
@@ -221,22 +223,64 @@ def test_cells_hold_what_they_say(backend):
 
 
 def test_engines_make_the_same_cells():
-    one, two = (search_padded("random", np.float32, 3, backend) for backend in BACKENDS)
+    one, two = (search_padded("random", np.float32, 3, backend) for backend in IN_CELLS)
     assert np.array_equal(one.cells.level_of, two.cells.level_of)
     assert np.array_equal(one.idx, two.idx)
 
 
-@pytest.mark.parametrize("faces", [0, 500])
-def test_memory_is_planned(dtype, dim, faces):
+@pytest.mark.parametrize(("faces", "starts"), [(1, [0, 16]), (16, [0, 16]), (17, [0, 32, 48]), (257, [0, 272, 304, 320])])
+def test_levels_of_a_tree(faces, starts):
+    assert _triangles_tree.level_starts(faces).tolist() == starts
+
+
+@pytest.mark.parametrize("spread", [0.0, 1e-30, 1.0, 1e30])
+def test_a_tree_holds_what_it_says(dtype, dim, spread):
+    """Every sound triangle is a leaf, once; a box holds those of its children, and a leaf's what is within the cutoff."""
+    corners = np.random.default_rng(2).normal(size=(300, dim, dim)).astype(dtype) * dtype(spread)
+    good = np.arange(300) % 7 != 3
+    tree = _triangles_tree.grow_tree(jnp.asarray(corners), jnp.asarray(good), make_cutoff(0.25, np.dtype(dtype), closed=False))
+    triangles, boxes = np.asarray(tree.triangles), np.asarray(tree.boxes)
+    starts = _triangles_tree.level_starts(300)
+    assert sorted(triangles) == [*range(300), *[300] * 4]
+    assert boxes.shape == (2 * dim, starts[-1])
+    low, high = boxes[:dim], boxes[dim:]
+    empty = low[0] == np.inf
+    assert np.all((low == np.inf) == (high == -np.inf))
+    assert np.array_equal(empty[:304], [t == 300 or not good[t] for t in triangles])
+    held = triangles[~empty[:304]]
+    assert np.all(low[:, :304][:, ~empty[:304]] <= corners[held].min(axis=1).T - dtype(0.25))
+    assert np.all(high[:, :304][:, ~empty[:304]] >= corners[held].max(axis=1).T + dtype(0.25))
+    for (begin, end), after in zip(pairwise(starts[:-1]), starts[1:-1], strict=True):
+        nodes = (end - begin) // 16
+        assert np.array_equal(low[:, after : after + nodes], low[:, begin:end].reshape(dim, nodes, 16).min(axis=2))
+        assert np.array_equal(high[:, after : after + nodes], high[:, begin:end].reshape(dim, nodes, 16).max(axis=2))
+
+
+def test_a_tree_finds_what_cells_find(dtype, dim):
+    """More triangles than two levels hold, of sizes from a thousandth of the cutoff to a hundredfold."""
+    random = np.random.default_rng(3)
+    sizes = 10.0 ** random.uniform(-3, 2, (700, 1, 1))
+    corners = random.uniform(-20, 20, (700, 1, dim)) + sizes * random.normal(size=(700, dim, dim))
+    x, faces = random.uniform(-20, 20, (900, dim)).astype(dtype), np.arange(700 * dim).reshape(700, dim)
+    lists = [jfrnn.search_triangles(x, corners.reshape(-1, dim).astype(dtype), faces, 1.0, backend=b) for b in ("bvh", "warp")]
+    found = [reference.pairs_of(np.asarray(tri.idx), np.asarray(tri.count), 700) for tri in lists]
+    assert sorted(found[0]) == sorted(found[1])
+    assert len(found[0]) > 700  # more than one per triangle
+    again = lists[0].update(x)
+    assert np.array_equal(again.idx, lists[0].idx)
+
+
+@pytest.mark.parametrize(("faces", "backend"), [(0, "warp"), (500, "warp"), (0, "bvh"), (500, "bvh")])
+def test_memory_is_planned(dtype, dim, faces, backend):
     """What the list takes is known beforehand, and follows particles and faces alone."""
-    plan = jfrnn.memory_plan(1000, 0.1, 16, dim=dim, dtype=dtype, faces=faces)
+    plan = jfrnn.memory_plan(1000, 0.1, 16, dim=dim, dtype=dtype, faces=faces, backend=backend)
     vertices = np.random.default_rng(0).normal(size=(400, dim)).astype(dtype)
     named = np.random.default_rng(1).integers(0, 400, (faces, dim))
-    tri = jfrnn.search_triangles(np.zeros((1000, dim), dtype), vertices, named, 0.1, capacity=16)
+    tri = jfrnn.search_triangles(np.zeros((1000, dim), dtype), vertices, named, 0.1, capacity=16, backend=backend)
     made = jax.tree.leaves((tri.idx, tri.count, tri.status, tri.required, tri.cells))
     assert 0 <= plan.list_bytes - sum(leaf.nbytes for leaf in made) <= 16 * len(made)  # a table of results
     assert plan.scratch_bytes < 1000 * (64 + faces)
-    assert plan.backend == tri.backend == "warp"
+    assert plan.backend == tri.backend == backend
 
 
 def test_plans_that_make_no_sense_are_refused():

@@ -16,29 +16,32 @@ import warp as wp
 from jfrnn.cases import meshes
 from jfrnn.cases.triangles import TRIANGLE_CASES, padded
 from jfrnn.kernels import triangles_cuda
+from jfrnn.kernels._triangles import pending
 
 import jfrnn
 from jfrnn import _auto, _triangles, _triangles_warp
 from jfrnn._exact import make_cutoff
 from jfrnn._triangles_cells import without_faults
-from jfrnn._triangles_warp import _Variant, query_inputs
+from jfrnn._triangles_tree import WIDTH
+from jfrnn._triangles_warp import _Variant, query_inputs, sizes_on_cuda
 
 KINDS = list(product((np.float32, np.float64), (2, 3)))
 GUARD = 64  # words behind the scratch, which nobody may touch
 pytestmark = pytest.mark.usefixtures("compiled_soon")
 
 
-@pytest.mark.parametrize(("dim", "double", "lists"), list(product((2, 3), (False, True), (False, True))))
-def test_variants_compile(dim, double, lists, tmp_path):
+@pytest.mark.parametrize(("dim", "double", "lists", "tree"), list(product((2, 3), *[(False, True)] * 3)))
+def test_variants_compile(dim, double, lists, tree, tmp_path):
     """For float bounds that hold, and are those of the CPU: nothing is contracted."""
-    kernels = triangles_cuda.triangle_kernels(dim, double, lists)
+    kernels = triangles_cuda.triangle_kernels(dim, double, lists, tree, WIDTH)
     for module in {kernel.module for kernel in kernels if kernel is not None}:
         wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
     programs = [path.read_text() for path in tmp_path.glob("*.ptx")]
     assert len(programs) == 3
     for program in programs:
         assert not re.search(r"\bfma\.|\b(mul|add|sub)\.f(32|64)", program)
-        assert sum(map(int, re.findall(r"\.local .*\[(\d+)\]", program))) <= 32  # bytes of a thread: no big integer is among them
+        # bytes of a thread: no big integer is among them, but what waits in a tree is
+        assert sum(map(int, re.findall(r"\.local .*\[(\d+)\]", program))) <= 32 + 4 * pending(WIDTH) * tree
 
 
 class Answer:
@@ -46,10 +49,10 @@ class Answer:
 
     def __init__(self, tri, positions, lists=True):
         n, dim = positions.shape
-        self.variant = _Variant(dim, positions.dtype == np.float64, lists)
+        self.variant = _Variant(dim, positions.dtype == np.float64, lists, tri.backend == "bvh")
         corners, _, _ = without_faults(tri.vertices, tri.faces)
         inputs = query_inputs(positions, corners, tri.cells, make_cutoff(tri.cutoff, positions.dtype, closed=False))
-        words = triangles_cuda.scratch_words(n, len(tri.cells.start) - 1, len(tri.cells.triangles), dim, self.variant.double)
+        words = triangles_cuda.scratch_words(n, *sizes_on_cuda(self.variant, inputs), dim, self.variant.double)
         self.idx = np.full((n, tri.capacity) if lists else (1, 1), -7, np.int32)
         self.count, scratch = (np.full(size, -7, np.int32) for size in (n, words + GUARD))
         arrays = [wp.array(given, device="cpu", copy=False) for given in (*map(np.asarray, inputs), self.idx, self.count, scratch)]
@@ -63,11 +66,11 @@ class Answer:
 
 
 @pytest.mark.parametrize(("dtype", "dim"), KINDS)
-@pytest.mark.parametrize("name", TRIANGLE_CASES)
-def test_hard_case(name, dtype, dim):
+@pytest.mark.parametrize(("name", "backend"), list(product(TRIANGLE_CASES, ("warp", "bvh"))))
+def test_hard_case(name, backend, dtype, dim):
     plain = TRIANGLE_CASES[name].build(dtype, dim)
     given = padded(plain)
-    tri = jfrnn.search_triangles(given.positions, given.vertices, given.faces, given.cutoff, capacity=40, backend="warp")
+    tri = jfrnn.search_triangles(given.positions, given.vertices, given.faces, given.cutoff, capacity=40, backend=backend)
     answer = Answer(tri, given.positions)
     expected = reference.triangle_pairs(plain.positions, plain.vertices, plain.faces, plain.cutoff)
     assert not any(reference.compare(reference.pairs_of(answer.idx, answer.count, len(given.faces)), expected))
@@ -76,17 +79,17 @@ def test_hard_case(name, dtype, dim):
         assert answer.queued > 0  # integers are asked
 
 
-def around_a_gear(n, cutoff):
+def around_a_gear(n, cutoff, backend="warp"):
     vertices, faces = meshes.gear(12, 1500)
     vertices = vertices.astype(np.float32)
     x = np.random.default_rng(0).uniform(vertices.min(axis=0) - 1, vertices.max(axis=0) + 1, (n, 3)).astype(np.float32)
-    return x, jfrnn.search_triangles(x, vertices, faces, cutoff, backend="warp")
+    return x, jfrnn.search_triangles(x, vertices, faces, cutoff, backend=backend)
 
 
-@pytest.mark.parametrize(("n", "cutoff"), [(1, 5.0), (3001, 0.5)])
-def test_around_a_gear(n, cutoff):
+@pytest.mark.parametrize(("n", "cutoff", "backend"), [(1, 5.0, "warp"), (1, 5.0, "bvh"), (3001, 0.5, "warp"), (3001, 0.5, "bvh")])
+def test_around_a_gear(n, cutoff, backend):
     """Cells of several sizes, and rows longer than what waits to be decided at a time; most particles are near nothing."""
-    x, tri = around_a_gear(n, cutoff)
+    x, tri = around_a_gear(n, cutoff, backend)
     assert int(tri.required) > triangles_cuda._WAITING
     answer = Answer(tri, x)
     assert np.array_equal(answer.idx, tri.idx)
