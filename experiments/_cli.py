@@ -337,13 +337,17 @@ def show(
         typer.echo(_show.draw(scene, out or Path("out") / f"{layout}.png"))
 
 
+_FACES = [500, 12_000, 200_000]
+_CUTOFFS = [0.01, 0.03, 0.1, 0.3, 0.8]
+
+
 @app.command()
 def triangles(
     out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform and backend.")] = Path("out") / "triangles",
     points: Annotated[int, typer.Option(min=100, help="Random points in the box of a gear.")] = 250_000,
-    faces: Annotated[list[int], typer.Option(min=100, help="Of the gear, about; may be said several times.")] = [500, 12_000, 200_000],  # noqa: B006
-    cutoff: Annotated[list[float], typer.Option(help="[modules]; may be said several times.")] = [0.01, 0.03, 0.1, 0.3, 0.8],  # noqa: B006
-    rounds: Annotated[int, typer.Option(min=2, help="Timed runs of each way.")] = 15,
+    faces: Annotated[list[int], typer.Option(min=100, help="Of gears, about; may be said several times.")] = _FACES,
+    cutoff: Annotated[list[float], typer.Option(help="[modules]; may be said several times.")] = _CUTOFFS,
+    rounds: Annotated[int, typer.Option(min=2, help="Timed runs of each way.")] = 9,
     backend: Annotated[str, typer.Option(help="warp (beside bvh), bvh or jax.")] = "warp",
 ) -> None:
     """Time the triangles of a gear that are near particles, beside trimesh and libigl where they are installed."""
