@@ -13,7 +13,7 @@ from jfrnn import _pair_sum
 from jfrnn._inputs import checked_capacity, checked_flag, checked_slack
 from jfrnn._neighbors import NeighborList
 from jfrnn._shards import Particles, of_shards
-from jfrnn._shards_calls import Asked, checked_asked, checked_halo, counted_capacity, counts, is_good, marked, over_shards
+from jfrnn._shards_calls import Asked, checked_asked, checked_halo, counted_capacity, counts, is_good, marked, over_shards, seen
 from jfrnn._shards_halo import Halo, exchanged, halo_in_shard
 from jfrnn._shards_list import Neighbors, listed
 
@@ -166,11 +166,12 @@ def _sums(
 ) -> Any:  # noqa: ANN401
     def summed(particles: Particles, halo: Halo | None, local: NeighborList | None, values: Any) -> Any:  # noqa: ANN401
         halo = halo_in_shard(particles) if halo is None else halo
-        x, theirs = exchanged((particles.positions, values), halo, particles)
+        x, active = seen(particles, halo)
+        theirs = jax.tree.map(lambda leaf: exchanged(leaf, halo, particles), values)
         options: dict[str, Any] = {"reduce": reduce, "compensated": compensated}
         if local is None:
             options |= {"box": particles.box, "include_self": asked.include_self, "closed": asked.closed}
-            options |= {"active": halo.ids >= 0, "backend": asked.backend}
+            options |= {"active": active, "backend": asked.backend}
             sums = _pair_sum.pair_sum(fn, x, asked.cutoff, theirs, **options)
         else:
             sums = _pair_sum.pair_sum(fn, x, None, theirs, neighbors=jax.tree.map(lambda leaf: leaf[0], local), **options)
