@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, PositiveFloat, PositiveInt, ValidationError
 from tqdm import tqdm
 
-from experiments import _compare, _gpu_triangles, _machine, _measure, _ways
+from experiments import _compare, _gpu_sums, _gpu_triangles, _machine, _measure, _ways
 from experiments._errors import UsageError
 from jfrnn._neighbors import rounded_capacity
 from jfrnn._warp import kernels_of, load_warp
@@ -34,7 +34,8 @@ class Exactness(BaseModel):
     dtypes: list[Literal["float32", "float64"]]
     dims: list[Literal[2, 3]]
     capacity: PositiveInt
-    cases: Literal["hard", "periodic", "radii", "batches", "triangles"] = "hard"  # which table of jfrnn.cases
+    # which table of jfrnn.cases, or "sums" of whole numbers against lists
+    cases: Literal["hard", "periodic", "radii", "batches", "triangles", "sums"] = "hard"
 
 
 class Triangles(BaseModel):
@@ -145,13 +146,14 @@ def _corners(config: Config, fill: float) -> np.ndarray:
 
 def _exactness_rows(config: Exactness) -> Iterator[dict[str, Any]]:
     decide = {"hard": _hard_decisions, "periodic": _periodic_decisions, "radii": _radii_decisions, "batches": _batch_decisions}
-    decide |= {"triangles": _triangle_decisions}
+    decide |= {"triangles": _triangle_decisions, "sums": _sum_decisions}
     about = {
         "hard": "",
         "periodic": ", boxes",
         "radii": ", a cutoff per particle",
         "batches": ", batches",
         "triangles": ", triangles",
+        "sums": ", sums",
     }
     for dtype, dim in itertools.product(config.dtypes, config.dims):
         right = dict(decide[config.cases](config, dtype, dim))
@@ -256,6 +258,10 @@ def _batch_decisions(config: Exactness, dtype: str, dim: int) -> Iterator[tuple[
 
 def _triangle_decisions(config: Exactness, dtype: str, dim: int) -> Iterator[tuple[str, bool]]:
     return _gpu_triangles.decisions(_oracle(), dtype, dim, config.capacity, config.backend)
+
+
+def _sum_decisions(config: Exactness, dtype: str, dim: int) -> Iterator[tuple[str, bool]]:
+    return _gpu_sums.decisions(dtype, dim, config.capacity, config.backend)
 
 
 def _oracle() -> Any:  # noqa: ANN401

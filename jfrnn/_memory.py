@@ -86,7 +86,7 @@ def memory_plan(
         values: Of it, a pytree of arrays or of their shapes (`jax.ShapeDtypeStruct`), [n, ...].
         gradient: The plan is that of the sums and of a gradient in the positions, of a function of all sums of floats.
         faces: Triangles of a wall, in 2D segments: the plan is that of `search_triangles`, compiled, cells being part of the list.
-        backend: As in `search` or `pair_sum`.
+        backend: As in `search`, `pair_sum` or `search_triangles`.
         platform: JAX platform, such as "cpu" or "gpu"; default: the one on which JAX makes arrays now.
 
     Returns:

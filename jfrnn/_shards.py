@@ -75,7 +75,7 @@ class Met(Protocol):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Particles:
-    """Hold particles spread over a mesh of devices. A pytree; made by `scatter`, kept in order by `migrate`.
+    """Hold particles spread over a mesh of devices. A pytree; made by `scatter`, kept on the right shards by `migrate`.
 
     Rows of all shards stand one after the other, N = shards · capacity of them, sharded over the mesh; unused rows have id -1.
 

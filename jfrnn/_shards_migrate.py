@@ -17,7 +17,7 @@ from jfrnn._shards_halo import halo_in_shard
 from jfrnn._status import Status
 
 _DIGIT = 2  # bits of a bound that are found in one round
-_BUCKETS = 32  # a round of migration moves up to this part of a shard
+_BUCKETS = 32  # a round of migration moves up to this part of a shard, as much of it to each other shard
 
 
 def spec_of(particles: Particles) -> Particles:
@@ -44,10 +44,10 @@ def migrate(particles: Particles) -> Particles:
     Returns:
         The same particles, n in all; with status bits, and what was required, of this arrangement's halo too.
 
-    Cost: 16 passes over each shard for each axis of the mesh (float64: 32) to find the bounds, and as much communication as
-    particles change shards; rounds of at most a 32nd of a shard each. Those that stay keep their rows. Differentiable: no gradient
-    flows through. Jit: yes. vmap: no. Source: bounds by counting (Warren & Salmon 1993, doi:10.1145/169627.169640), found digit by
-    digit.
+    Cost: to find the bounds, each shard counts 16 times for each axis of the mesh (float64: 32), three numbers for each cut; then
+    rounds, in each of which messages of a 32nd of a shard in all go to the other shards, until all have moved. Those that stay keep
+    their rows. Differentiable: no gradient flows through. Jit: yes. vmap: no. Source: bounds by counting (Warren & Salmon 1993,
+    doi:10.1145/169627.169640), found digit by digit.
     """
     particles = lax.stop_gradient(particles)
     spec = spec_of(particles)

@@ -16,9 +16,9 @@ from jfrnn._triangles_list import TriangleList, counted_slots, found_triangles
 TRIANGLE_BACKENDS = ("auto", "jax", "warp", "bvh")
 
 # Where Warp runs: which of its two engines "auto" takes, by platform. `python -m experiments triangles` and `gpu
-# experiments/configs/h200_triangles.toml`, rows in experiments/results/triangles: on the CPU the tree is the faster one around
-# gears of 12 160 and 200 640 faces at all cutoffs or level, and up to 1.2 times slower for 1 280; to sort a wall anew takes it a
-# third to a tenth of the time. On an H200 it takes 1.0 to 2.1 times as long as the cells, a wall anew 0.3 to 0.8 times.
+# experiments/configs/h200_triangles.toml`, rows in experiments/results/triangles: on the CPU the tree takes 0.2 to 1.2 times as
+# long as the cells around gears of 1 280 to 200 640 faces, at cutoffs from a hundredth of a module to 0.8, a wall anew 0.1 to 0.9
+# times. On an H200 it takes 1.0 to 2.1 times as long, a wall anew 0.3 to 0.8 times.
 _FASTER = {"cpu": "bvh", "gpu": "warp"}
 
 
@@ -63,13 +63,13 @@ def search_triangles(
 
     Raises:
         TypeError, ValueError: an argument is of the wrong kind, shape or range, or `capacity` is missing under jit.
-        ImportError, RuntimeError: "warp", and it is not installed or cannot run on the platform.
+        ImportError, RuntimeError: "warp" or "bvh", and Warp is not installed or cannot run on the platform.
         Overflow of a given capacity, coordinates that are not finite and faces without vertices are known only from data: `status`,
         `overflow` and `check` tell.
 
     Memory: 4 B per slot and particle for the list; 100 to 132 B per triangle for the cells, which the list keeps, whatever the
     sizes of the triangles and of space, or 30 B for the tree (float64: 56); while "warp" lists on CUDA 12 B per particle, 0.6 kB
-    per triangle (float64: 1.1; "bvh" a tenth) and at most 58 MB. Differentiable: the list is topology, without gradient; see
+    per triangle (float64: 1.1; "bvh" at most 0.13) and at most 58 MB. Differentiable: the list is topology, without gradient; see
     `TriangleList.closest`.
     Jit: yes, with capacity. vmap: yes, with capacity. `jax.shard_map`: yes, with particles spread and the wall on every device
     (`check_vma=False`). Source: strict cutoff (Peifle 2019, §2.2).

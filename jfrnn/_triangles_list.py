@@ -232,7 +232,7 @@ def found_triangles(
 ) -> dict[str, Any]:
     """Return the fields of a list that come from data; with capacity=None only counts. `cells`: those of an earlier list."""
     radius = make_cutoff(cutoff, np.dtype(points.dtype), closed=False)
-    return find_triangles(*lax.stop_gradient((points, vertices, faces)), cells, radius, backend, capacity)
+    return find_triangles(*lax.stop_gradient((points, vertices, faces, cells)), radius, backend, capacity)
 
 
 @functools.partial(jax.jit, static_argnames=("backend", "capacity"))

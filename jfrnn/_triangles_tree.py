@@ -1,8 +1,9 @@
 """A tree of boxes around triangles (in 2D: segments), the other structure in which a search looks for them.
 
 Triangles stand along a Hilbert curve through the middles of their boxes; each `WIDTH` of them share a node, each `WIDTH` nodes one
-above, up to the children of the root (Kamel & Faloutsos 1993, doi:10.1145/170088.170403). So a tree is made by one sort and by
-minima and maxima of rows, in arrays whose shapes the number of triangles tells, and depends on nothing but data inside `jax.jit`.
+above, up to the children of the root (Kamel & Faloutsos 1993, doi:10.1145/170088.170403). So a tree is made by sorting and by
+minima and maxima of rows, in arrays whose shapes the number of triangles tells: inside `jax.jit`, too. The curve tells a millionth
+of the extent of all middles apart, so that a few triangles far away leave the others in order.
 
 Why no pair is missed: the box of a triangle is wider by r' on each side, slightly more than the cutoff, and holds all particles
 that are nearer, since rounding is monotone and a particle is a float; the box of a node holds those of its children.
@@ -18,7 +19,7 @@ from jfrnn._exact import Cutoff
 from jfrnn._order import hilbert_order
 
 WIDTH = 16  # children of a node
-_CELLS = {2: 2.0**-16, 3: 2.0**-10}  # of the curve, by dimension, beside the extent of the wall: keys of 32 bits
+_CELL = 2.0**-20  # of the curve, beside the extent of the middles of boxes
 
 
 class TriangleTree(NamedTuple):
@@ -55,9 +56,12 @@ def grow_tree(corners: Array, good: Array, cutoff: Cutoff) -> TriangleTree:
     """Put triangles [f, corner, axis] with f > 0 into a tree; those that are not `good` [f] bool are in no box."""
     faces, dim = corners.shape[:2]
     low, high = widened(corners, cutoff)
-    scale, tiny = jnp.asarray(_CELLS[dim], corners.dtype), jnp.finfo(corners.dtype).tiny
-    extent = jnp.max(jnp.max(high, axis=0) * scale - jnp.min(low, axis=0) * scale)  # may be more than a float holds, unscaled
-    order = hilbert_order(0.5 * low + 0.5 * high, jnp.clip(extent, tiny, jnp.finfo(corners.dtype).max))
+    middle = jnp.where(good[:, None], 0.5 * low + 0.5 * high, jnp.nan)
+    finite, finfo = jnp.isfinite(middle), jnp.finfo(corners.dtype)
+    least = jnp.min(middle, axis=0, initial=finfo.max, where=finite)
+    most = jnp.max(middle, axis=0, initial=finfo.min, where=finite)
+    cell = jnp.max(most * _CELL - least * _CELL)  # the extent itself may be more than a float holds
+    order = hilbert_order(middle, jnp.clip(cell, finfo.tiny, finfo.max))
     low, high = jnp.where(good[:, None], low, jnp.inf)[order].T, jnp.where(good[:, None], high, -jnp.inf)[order].T
     levels = []
     for size in np.diff(level_starts(faces)):

@@ -11,8 +11,8 @@ settle   rows in which float64 left a pair open, anew, with integers: few thread
 In a tree of boxes (`jfrnn/_triangles_tree.py`) the same: what holds a particle is asked of boxes from the root on, and particles
 are sorted by cells of a grid over the wall.
 
-A thread writes its own row, in the order of the CPU kernel: rows are the same bits in every run, and those of the CPU. No product
-is contracted with a sum, so that the same text on the CPU decides with the same floats.
+A thread writes its own row, in the order of the CPU kernel: rows are the same bits in every run, and those of the CPU for the same
+cells or tree. No product is contracted with a sum, so that the same text on the CPU decides with the same floats.
 
 The floor of 1 000 000 particles at random around a gear of 12 160 faces (`python -m experiments triangles`), float32, counted on
 the CPU, for cutoffs of 0.1 | 0.3 | 0.8 modules: 4 | 3 | 2 sizes of cells; 0.68 | 0.66 | 0.78 million particles with candidates;

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import _compare, _gpu, _gpu_report, _gpu_triangles, _triangles
+from experiments import _compare, _gpu, _gpu_report, _gpu_sums, _gpu_triangles, _triangles
 from experiments._errors import UsageError
 
 CONFIG = Path(__file__).parent.parent / "experiments" / "configs" / "h200.toml"
@@ -84,6 +84,26 @@ def test_options_are_decided_case_by_case(table, name, monkeypatch):
     assert (row["cases"], row["wrong"]) == ({"radii": 5, "batches": 2}[table], 0)
 
 
+def test_sums_are_decided_against_lists(monkeypatch):
+    """The second config names them; here two scenes, and a sum that misses a pair is wrong."""
+    import jfrnn
+
+    scenes = _gpu_sums._scenes
+
+    def some(*given):
+        return (scene for scene in scenes(*given) if scene[0] in ("open", "queries"))
+
+    monkeypatch.setattr(_gpu_sums, "_scenes", some)
+    monkeypatch.setattr(_gpu_sums, "COLUMNS", (1,))
+    (part,) = (part for part in _gpu.load(CONFIG.with_name("h200_options.toml")).exactness if part.cases == "sums")
+    part = part.model_copy(update={"dims": [2], "dtypes": ["float32"]})
+    (row,) = _gpu._exactness_rows(part)
+    assert (row["method"], row["cases"], row["wrong"]) == ("jfrnn warp, sums", 2, 0)
+    search = jfrnn.search
+    monkeypatch.setattr(jfrnn, "search", lambda x, cutoff, **options: search(x, 0.99 * cutoff, **options))
+    assert [row["wrong"] for row in _gpu._exactness_rows(part)] == [2]
+
+
 @pytest.mark.usefixtures("compiled_soon")
 def test_triangles_are_decided_timed_and_reported(tmp_path, monkeypatch):
     """The third config, with one case and a small gear: from its command to its report."""
@@ -99,22 +119,25 @@ def test_triangles_are_decided_timed_and_reported(tmp_path, monkeypatch):
     small = {"exactness": [exact], "triangles": [gear], "calls": 2, "steps": 2, "repeats": 2, "seconds_per_timing": 0.1}
     assert _gpu.run(given.model_copy(update=small), tmp_path) == 0
     rows = [json.loads(line) for line in (tmp_path / "rows.jsonl").read_text().splitlines()]
-    assert [row["kind"] for row in rows] == ["exactness", "ceiling", *["triangles"] * 7]
+    assert [row["kind"] for row in rows] == ["exactness", "ceiling", *["triangles"] * 12]
     assert rows[0]["cases"] == len(cases)
     assert all((row["wrong"], row["same_bits_twice"]) == (0, True) and row["median_s"] > 0 for row in rows[2:])
     assert {row["pairs"] for row in rows[2:]} == {rows[-1]["pairs"]}
     assert rows[0]["wrong"] == 0
-    assert "| jfrnn warp, scan of updates |" in _gpu_report.report(tmp_path)
+    report = _gpu_report.report(tmp_path)
+    assert "| jfrnn warp, scan of updates |" in report
+    assert "| jfrnn bvh, rebuild |" in report
 
 
-def test_kernels_of_triangles_are_launched_one_by_one():
+@pytest.mark.parametrize("backend", ["warp", "bvh"])
+def test_kernels_of_triangles_are_launched_one_by_one(backend):
     """As on a GPU, where each is timed."""
     import warp as wp
 
     import jfrnn
 
     scene = _triangles._gear(300, 500)
-    tri = jfrnn.search_triangles(scene.points, scene.vertices, scene.faces, 0.5, backend="warp")
+    tri = jfrnn.search_triangles(scene.points, scene.vertices, scene.faces, 0.5, backend=backend)
     commands, idx, count, _ = _gpu_triangles.launchable(tri, scene.points, "cpu")
     for kernel, arguments, threads, _, _ in commands:
         wp.launch(kernel, dim=threads, inputs=list(arguments), device="cpu")
@@ -130,7 +153,7 @@ def test_a_wrong_list_of_triangles_is_counted(monkeypatch):
     import jfrnn
 
     monkeypatch.setattr(triangles, "TRIANGLE_CASES", {"ties": triangles.TRIANGLE_CASES["ties"]})
-    (part,) = _gpu.load(CONFIG.with_name("h200_triangles.toml")).exactness
+    part = _gpu.load(CONFIG.with_name("h200_triangles.toml")).exactness[0]
     part = part.model_copy(update={"dims": [3], "dtypes": ["float32"]})
     search = jfrnn.search_triangles
     monkeypatch.setattr(jfrnn, "search_triangles", lambda x, v, f, cutoff, **options: search(x, v, f, 1.5 * cutoff, **options))

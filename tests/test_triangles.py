@@ -288,3 +288,32 @@ def test_plans_that_make_no_sense_are_refused():
         jfrnn.memory_plan(10, 0.1, 8, faces=10, queries=10)
     with pytest.raises(ValueError, match="finds no triangles"):
         jfrnn.memory_plan(10, 0.1, 8, faces=10, backend="brute")
+
+
+def test_a_triangle_far_away_leaves_others_in_order():
+    """Boxes of nodes stay small: a curve whose cells were a thousandth of the extent would put all but one into one cell."""
+    corners = np.random.default_rng(4).random((512, 1, 3)) + 0.01 * np.random.default_rng(5).random((512, 3, 3))
+    far = np.concatenate([corners, corners[:1] + [4096.0, 0, 0]]).astype(np.float32)
+    cutoff = make_cutoff(0.01, np.dtype(np.float32), closed=False)
+
+    def node_volume(corners):
+        boxes = np.asarray(_triangles_tree.grow_tree(jnp.asarray(corners), jnp.ones(len(corners), bool), cutoff).boxes)
+        first, last = _triangles_tree.level_starts(len(corners))[1:3]
+        return np.median(np.prod(boxes[3:, first:last] - boxes[:3, first:last], axis=0)[np.isfinite(boxes[0, first:last])])
+
+    assert node_volume(far) < 2 * node_volume(corners.astype(np.float32)) < 0.2
+
+
+def test_a_list_may_be_an_argument_of_what_is_differentiated():
+    vertices, faces = wall()
+    x = np.random.default_rng(6).uniform(0.1, 0.9, (5, 3)).astype(np.float32) * np.array([1, 1, 0.2], np.float32)
+
+    def total(tri, x):
+        return tri.update(x).closest(x)[1].sum()
+
+    for backend in ("warp", "bvh"):
+        tri = jfrnn.search_triangles(x, vertices, faces, 0.5, capacity=2, backend=backend)
+        value, pull = jax.vjp(total, tri, jnp.asarray(x))
+        along = jax.grad(lambda x, tri=tri: total(tri, x))(jnp.asarray(x))
+        assert value > 0
+        assert np.array_equal(pull(jnp.ones((), jnp.float32))[1], along)

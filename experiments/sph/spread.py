@@ -97,7 +97,7 @@ def spread(model: Model, s: State, mesh: Mesh, settle: int = 10, slack: float = 
         model: What acts.
         s: The state, rows as in the model.
         mesh: As in `jfrnn.distributed.scatter`.
-        settle: As in `Flow`: fewer steps send less in halos, more steps sort less often. No pair depends on it.
+        settle: As in `Flow`: fewer steps send less in halos, more steps migrate less often. No pair depends on it.
         slack: Room for more particles, as in `scatter`.
 
     Raises:
