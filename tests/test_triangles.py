@@ -293,7 +293,7 @@ def test_plans_that_make_no_sense_are_refused():
 def test_a_triangle_far_away_leaves_others_in_order():
     """Boxes of nodes stay small: a curve whose cells were a thousandth of the extent would put all but one into one cell."""
     corners = np.random.default_rng(4).random((512, 1, 3)) + 0.01 * np.random.default_rng(5).random((512, 3, 3))
-    far = np.concatenate([corners, corners[:1] + [4096.0, 0, 0]]).astype(np.float32)
+    far = np.concatenate([corners, corners[:1] + np.array([4096.0, 0, 0])]).astype(np.float32)
     cutoff = make_cutoff(0.01, np.dtype(np.float32), closed=False)
 
     def node_volume(corners):
