@@ -311,9 +311,7 @@ def test_a_list_may_be_an_argument_of_what_is_differentiated():
     def total(tri, x):
         return tri.update(x).closest(x)[1].sum()
 
-    for backend in ("warp", "bvh"):
-        tri = jfrnn.search_triangles(x, vertices, faces, 0.5, capacity=2, backend=backend)
-        value, pull = jax.vjp(total, tri, jnp.asarray(x))
-        along = jax.grad(lambda x, tri=tri: total(tri, x))(jnp.asarray(x))
-        assert value > 0
-        assert np.array_equal(pull(jnp.ones((), jnp.float32))[1], along)
+    tri = jfrnn.search_triangles(x, vertices, faces, 0.5, capacity=2, backend="bvh")  # its boxes are floats
+    value, pull = jax.vjp(total, tri, jnp.asarray(x))
+    assert value > 0
+    assert np.array_equal(pull(jnp.ones((), jnp.float32))[1], jax.grad(lambda x: total(tri, x))(jnp.asarray(x)))
