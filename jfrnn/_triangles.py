@@ -117,10 +117,8 @@ def _chosen_engine(backend: Any, points: Array) -> str:  # noqa: ANN401
     platform = platform_of(points)
     if backend in ("warp", "bvh") and platform not in _warp.PLATFORMS:
         raise RuntimeError(f"backend={backend!r} finds triangles on the CPU and on CUDA, got {platform!r}: pass backend='jax'.")
-    if backend == "bvh":
-        choose_engine("warp", points, None)  # needs what it needs
-        return backend
-    return fastest_of(platform, choose_engine(backend, points, None)) if backend == "auto" else choose_engine(backend, points, None)
+    engine = choose_engine("warp" if backend == "bvh" else backend, points, None)  # a tree needs what "warp" needs
+    return fastest_of(platform, engine) if backend == "auto" else backend
 
 
 def fastest_of(platform: str, engine: str) -> str:

@@ -298,9 +298,9 @@ while (depth > 0) {
 
 
 class Kernels(NamedTuple):
-    """The two kernels of a variant, both launched with dim = 1 (`query` once per thread)."""
+    """The two kernels of a variant, both launched with dim = 1 (`query` once per thread); a tree is built by XLA."""
 
-    build: wp.Kernel
+    build: wp.Kernel | None
     query: wp.Kernel
 
 
@@ -308,7 +308,7 @@ class Kernels(NamedTuple):
 def triangle_kernels(dim: int, double: bool, lists: bool, tree: bool, most_cells: int, lanes: int, node: int) -> Kernels:
     """Return the kernels for a dimension and dtype, for lists or counts alone, in cells or in a tree.
 
-    `most_cells` and `lanes` are those of the cells, `node` is the number of children in the tree, which the kernels do not build.
+    `most_cells` and `lanes` are those of the cells, `node` is the number of children in the tree.
     """
     scalar = wp.float64 if double else wp.float32
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_list' * lists}{'_tree' * tree}"
@@ -369,4 +369,4 @@ def triangle_kernels(dim: int, double: bool, lists: bool, tree: bool, most_cells
 
     module = wp.get_module(f"jfrnn.kernels.triangles_cpu.{variant}")
     wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
-    return Kernels(wp.kernel(build, module=module), wp.kernel(query, module=module))
+    return Kernels(None if tree else wp.kernel(build, module=module), wp.kernel(query, module=module))
