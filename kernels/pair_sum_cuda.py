@@ -14,8 +14,8 @@ for those of 22 blocks 116. On an H200 a warp executes 9400 instructions for a d
 load (ncu). 0.84 ms became 0.63 when rows were loaded ahead and numbers were multiplied by reciprocals, 0.60 when two sets of
 rows took turns and candidates were kept by predicate. What bounds it is the first-level cache, busy in 89 % of the cycles: rows of
 32 lanes stand in as many places, and to gather them takes it about 18. With rows held in shared memory, 15, but pairs of half as
-many blocks then fit, and 12 % more instructions are executed: 0.59 to 0.64 ms, the gradient 1.51 to 1.67 instead of 1.43. Bytes of
-memory do not bound it: 40 per particle are 0.01 ms.
+many blocks then fit, and 12 % more instructions are executed: 0.59 to 0.65 ms, the gradient 1.51 to 1.67 instead of 1.43
+(experiments/results/h200/density). Bytes of memory do not bound it: 40 per particle are 0.01 ms.
 """
 
 import functools
