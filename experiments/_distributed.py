@@ -105,6 +105,7 @@ class Row:
         key, scaling, work, axes, devices, dtype: As in `Spec`.
         status, reason: As in `experiments._rows.Row`.
         particles: Of all devices.
+        fluid: Of these, those that are no wall; None but for "sph".
         fullest: Of the fullest device.
         halo: Particles that are sent to others, of all devices and messages, each time positions are exchanged.
         halo_bytes: Their coordinates [bytes].
@@ -129,6 +130,7 @@ class Row:
     status: str = "failed"
     reason: str | None = None
     particles: int | None = None
+    fluid: int | None = None
     fullest: int | None = None
     halo: int | None = None
     halo_bytes: int | None = None
@@ -245,10 +247,13 @@ def _sph(spec: Spec, row: Row) -> None:
     depth = 0.5 * (spec.devices if spec.scaling == "weak" else 1)
     scene = make_scene("dam-break-3d", [f"nx={spec.nx}", f"depth={depth}"])
     kind = np.dtype(spec.dtype).type
-    flow = spread.spread(make_model(scene, kind, spec.backend), make_state(scene, kind), mesh_of(spec.devices, spec.axes))
+    mesh = mesh_of(spec.devices, spec.axes)
+    along = (1, 0, 2)[: mesh.devices.ndim]  # the tank's depth first: all along it, a slab has as much water and wall as any other
+    flow = spread.spread(make_model(scene, kind, spec.backend), make_state(scene, kind), mesh, along=along)
     flow = spread.begin(flow)
     flow = spread.run(flow, spec.steps)  # room that is missing is made before anything is timed
     _describe(flow.particles, spec, row)
+    row.fluid = int(jnp.sum(flow.particles.active & ~flow.particles.values["wall"]))
     _time(lambda flow: spread.advanced(flow, spec.steps), flow, spec.steps, spec, row, spread.advanced)
     row.status = "ok"
 
@@ -301,7 +306,7 @@ def report(rows: list[Row], folder: Path) -> str:
     table["efficiency"] = [None if not rate or not one else rate / one for rate, one in zip(rates, ones, strict=True)]
     for name, seconds in (("ms", "median_s"), ("halo_ms", "halo_s"), ("migrate_ms", "migrate_s")):
         table[name] = 1e3 * table[seconds].astype(float)
-    names = "scaling work axes devices particles fullest halo halo_bytes sent_bytes ms efficiency halo_ms migrate_ms status"
+    names = "scaling work axes devices particles fluid fullest halo halo_bytes sent_bytes ms efficiency halo_ms migrate_ms status"
     columns = names.split()
     table[columns].to_csv(folder / "table.csv", index=False)
     return table[columns].to_string(index=False, float_format="%.3g")

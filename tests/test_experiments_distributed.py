@@ -61,7 +61,7 @@ def test_all_kinds_of_work(tmp_path):
 
 
 def test_configs_can_be_read():
-    for name in ("distributed_smoke", "distributed_cpu", "distributed_h200", "distributed_h200_x2"):
+    for name in ("distributed_smoke", "distributed_cpu", "distributed_h200", "distributed_h200_x2", "distributed_h200_x2_full"):
         config = load(ROOT / "experiments" / "configs" / f"{name}.toml", _distributed.Config)
         rows = len(config.scaling) * len(config.work) * len(config.axes) * len(config.devices)
         assert len({spec.key for spec in config.specs()}) == rows

@@ -4,7 +4,7 @@ Everything but sums over neighbors works row by row, or takes the largest of all
 hold no particle are particles that never enter.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -90,7 +90,9 @@ class Flow:
     settle: int = field(metadata={"static": True})
 
 
-def spread(model: Model, s: State, mesh: Mesh, settle: int = 10, slack: float = 1.25) -> Flow:
+def spread(
+    model: Model, s: State, mesh: Mesh, settle: int = 10, slack: float = 1.25, along: Sequence[int] | None = None
+) -> Flow:
     """Spread a model and its state, as `solver.begin` returns it or not.
 
     Args:
@@ -99,6 +101,8 @@ def spread(model: Model, s: State, mesh: Mesh, settle: int = 10, slack: float = 
         mesh: As in `jfrnn.distributed.scatter`.
         settle: As in `Flow`: fewer steps send less in halos, more steps migrate less often. No pair depends on it.
         slack: Room for more particles, as in `scatter`.
+        along: Which axis of space each axis of the mesh cuts, as in `scatter`; default: the longest ones. Devices get as many rows,
+            though those of walls cost less than those of water: best is an axis all along which both are mixed alike.
 
     Raises:
         ValueError: The scene has a wall of triangles.
@@ -109,14 +113,19 @@ def spread(model: Model, s: State, mesh: Mesh, settle: int = 10, slack: float = 
     if model.enters is None:
         rows["enters"] = np.full(len(s.x), -_NEVER, s.x.dtype)
         model = replace(model, guided=jnp.zeros((), s.x.dtype))
-    particles = distributed.scatter(s.x, model.cutoff, rows, mesh=mesh, box=model.box, slack=slack)
+    particles = distributed.scatter(s.x, model.cutoff, rows, mesh=mesh, box=model.box, along=along, slack=slack)
     rest: Any = dict.fromkeys(_OF_MODEL)
     return Flow(particles, replace(model, fluid_count=None, **rest), s.time, s.last, settle)
 
 
 def begin(flow: Flow) -> Flow:
     """Return what its integrator carries from step to step, as `solver.begin`."""
-    return _ran(flow, jax.jit(partial(_with_solver, lambda model, s, nbrs: (solver.begin(model, s, nbrs), nbrs))))
+
+    def first(model: Model, s: State, nbrs: Any) -> tuple[State, Any]:  # noqa: ANN401
+        nbrs = nbrs.update(s.x, active=forces.active(model, s.time))
+        return solver.begin(model, s, nbrs), nbrs
+
+    return _ran(flow, jax.jit(partial(_with_solver, first)))
 
 
 def run(flow: Flow, steps: int) -> Flow:
@@ -153,13 +162,13 @@ def advanced(flow: Flow, steps: Array | int) -> Flow:
 
 
 def _with_solver(advance: Callable[[Model, State, Any], tuple[State, Any]], flow: Flow) -> Flow:
+    """Advance by what updates the neighbors that it gets, at the positions whose pairs it wants, before it sums."""
     particles, values = flow.particles, flow.particles.values
     of_model = {name: values[name] for name in _OF_MODEL}
     of_model["enters"] = jnp.where(particles.active, values["enters"], _NEVER)
     model = replace(flow.model, **of_model)
     s = State(particles.positions, time=flow.time, last=flow.last, **{name: values[name] for name in OF_STATE})
-    active = forces.active(model, s.time)
-    s, nbrs = advance(model, s, Spread(particles, None, None, flow.model.backend).update(s.x, active=active))
+    s, nbrs = advance(model, s, Spread(particles, None, None, flow.model.backend))
     rows = {name: getattr(s, name) for name in OF_STATE}
     return replace(flow, particles=nbrs.particles.replace(s.x, values | rows), time=s.time, last=s.last)
 
