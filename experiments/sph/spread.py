@@ -90,9 +90,7 @@ class Flow:
     settle: int = field(metadata={"static": True})
 
 
-def spread(
-    model: Model, s: State, mesh: Mesh, settle: int = 10, slack: float = 1.25, along: Sequence[int] | None = None
-) -> Flow:
+def spread(model: Model, s: State, mesh: Mesh, settle: int = 10, slack: float = 1.25, along: Sequence[int] | None = None) -> Flow:
     """Spread a model and its state, as `solver.begin` returns it or not.
 
     Args:
