@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -46,7 +47,7 @@ class Config(Table):
         repeats: Fewest timed runs.
         min_seconds: Runs go on until they took this long together [s].
         steps: Of the fluid, per timed run.
-        check_most: Pairs are counted on one device, too, up to so many particles.
+        check_most: One device counts pairs, and runs the fluid, too, up to so many particles.
         virtual_devices: Of the CPU; 0: the devices that there are.
         backend: As in `jfrnn.search`.
     """
@@ -114,7 +115,8 @@ class Row:
         migrate_s: What it takes to balance the load and to move particles, few after the first time; with a halo [s].
         pairs: Neighbors of all particles together; None for "sph".
         pairs_of_one: As one device counts them, up to `check_most` particles.
-        differing: Particles whose number of neighbors is another on one device.
+        differing: Particles whose number of neighbors is another on one device; of a fluid those that are elsewhere after `steps`,
+            by more than a hundredth of a spacing, or were at any other place when it began.
         first_s: First run, compilation included [s].
         median_s, p10_s, p90_s: Of a list, a sum, or a step.
         repeats: Timed runs.
@@ -247,15 +249,30 @@ def _sph(spec: Spec, row: Row) -> None:
     depth = 0.5 * (spec.devices if spec.scaling == "weak" else 1)
     scene = make_scene("dam-break-3d", [f"nx={spec.nx}", f"depth={depth}"])
     kind = np.dtype(spec.dtype).type
-    mesh = mesh_of(spec.devices, spec.axes)
-    along = (1, 0, 2)[: mesh.devices.ndim]  # the tank's depth first: all along it, a slab has as much water and wall as any other
-    flow = spread.spread(make_model(scene, kind, spec.backend), make_state(scene, kind), mesh, along=along)
-    flow = spread.begin(flow)
-    flow = spread.run(flow, spec.steps)  # room that is missing is made before anything is timed
+
+    def begun(mesh: Mesh) -> spread.Flow:
+        along = (1, 0, 2)[: mesh.devices.ndim]  # the tank's depth first: a slab has as much water and wall as any other
+        return spread.begin(spread.spread(make_model(scene, kind, spec.backend), make_state(scene, kind), mesh, along=along))
+
+    first = begun(mesh_of(spec.devices, spec.axes))
+    flow = spread.run(first, spec.steps)  # room that is missing is made before anything is timed
     _describe(flow.particles, spec, row)
     row.fluid = int(jnp.sum(flow.particles.active & ~flow.particles.values["wall"]))
+    if spec.devices > 1 and flow.particles.total <= spec.check_most:
+        ways = [scene.positions, spread.run(begun(mesh_of(1, 1)), spec.steps).particles]
+        row.differing = sum(map(partial(_elsewhere, 0.01 * scene.spacing), ways, (first.particles, flow.particles)))
+        if row.differing:
+            row.status, row.reason = "failed", "particles are elsewhere than on one device"
+            return
+    del first
     _time(lambda flow: spread.advanced(flow, spec.steps), flow, spec.steps, spec, row, spread.advanced)
     row.status = "ok"
+
+
+def _elsewhere(far: float, one: np.ndarray | distributed.Particles, other: distributed.Particles) -> int:
+    """Count particles that are farther apart than `far` along any axis, or not finite."""
+    x, y = (np.asarray(p) if isinstance(p, np.ndarray) else distributed.collect(p)[0] for p in (one, other))
+    return int((~(np.abs(x - y) <= far)).any(axis=1).sum())
 
 
 def _describe(particles: distributed.Particles, spec: Spec, row: Row) -> None:
@@ -280,7 +297,7 @@ def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: Row
     program: Any = compiled or work
     text = program.lower(*arguments).compile().as_text()
     row.sent_bytes = sent_bytes(text)
-    _, (row.first_s,) = _measure.repeat(lambda: jax.block_until_ready(work(given)), 1, 0.0, 1)
+    (row.first_s,) = _measure.repeat(lambda: jax.block_until_ready(work(given)), 1, 0.0, 1)[1]  # what it made is gone, it is large
     timed = _repeated(lambda: work(given), spec)
     row.median_s, row.p10_s, row.p90_s = (timed[name] / per for name in ("median_s", "p10_s", "p90_s"))
     row.repeats = timed["repeats"]

@@ -58,6 +58,7 @@ def test_all_kinds_of_work(tmp_path):
     assert {(row["scaling"], row["work"]) for row in rows} == {
         (s, w) for s in ("strong", "weak") for w in ("list", "pair_sum", "sph")
     }
+    assert {row["differing"] for row in rows if row["devices"] > 1} == {0}
 
 
 def test_configs_can_be_read():
