@@ -20,7 +20,7 @@ from jax.sharding import Mesh
 from pydantic import Field
 
 import jfrnn
-from experiments import _machine, _measure, _sweep
+from experiments import _machine, _measure, _sweep, _trace
 from experiments._config import Positive, Table, digest
 from experiments._rows import RETRIED, RowFile
 from jfrnn import distributed
@@ -120,6 +120,7 @@ class Row:
         first_s: First run, compilation included [s].
         median_s, p10_s, p90_s: Of a list, a sum, or a step.
         repeats: Timed runs.
+        busy: Of one run of a list or sum, of all `steps` of a fluid, what each GPU did (`_trace.Busy`); None on a CPU.
         device, versions, machine, commit, dirty, time: As in `experiments._rows.Row`.
     """
 
@@ -147,6 +148,7 @@ class Row:
     p10_s: float | None = None
     p90_s: float | None = None
     repeats: int | None = None
+    busy: list[dict[str, Any]] | None = None
     device: str | None = None
     versions: dict[str, str | None] = field(default_factory=dict)
     machine: dict[str, Any] = field(default_factory=dict)
@@ -301,6 +303,7 @@ def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: Row
     timed = _repeated(lambda: work(given), spec)
     row.median_s, row.p10_s, row.p90_s = (timed[name] / per for name in ("median_s", "p10_s", "p90_s"))
     row.repeats = timed["repeats"]
+    row.busy = [device._asdict() for device in _trace.of_run(lambda: work(given))] or None
 
 
 def sent_bytes(program: str) -> int:
