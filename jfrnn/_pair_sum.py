@@ -92,6 +92,8 @@ def pair_sum(
     side, and these by halves; the bound is the same, and the bits depend on the processor's vector width, not on the number of
     threads. On CUDA it adds those among up to 704 candidates one after the other, then their sums; again with that bound.
     Denormal numbers count as zero in what fn computes on the CPU, as everywhere in XLA; pairs are decided with them.
+    Products of matrices in fn, such as r @ r, are made in all bits, also where a GPU by itself takes fewer (TF32), unless fn says
+    otherwise (`precision`).
     Memory: what `search` takes without its list, the results, and at most 16 MB (float32) for each array that fn needs for the
     pairs that are in work; nothing grows with the number of pairs, in derivatives neither. "warp" has no pairs in work, but two
     copies of the numbers that fn reads of each j, and one of those of each i, but for coordinates in open space; in a box one

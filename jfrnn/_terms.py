@@ -79,6 +79,12 @@ def _split(operands: Sequence, like: Groups) -> Groups:
     return Groups(tuple(operands[:shared]), tuple(operands[shared : shared + own]), tuple(operands[shared + own :]))
 
 
+def _jaxpr_of(summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct) -> ClosedJaxpr:
+    """Trace what one pair adds. Products of matrices are made in all bits, whatever a device takes by itself: on GPUs TF32."""
+    with jax.default_matmul_precision("highest"):
+        return jax.make_jaxpr(_flat(summand, operands))(*_one_pair(operands, shift))
+
+
 def traced(
     summand: Summand,
     operands: Groups,
@@ -92,7 +98,7 @@ def traced(
     While the `owner`, the function that the summand calls, lives and is traced to the same again, the same term comes back, and
     with it the programs that were compiled for it.
     """
-    closed = jax.make_jaxpr(_flat(summand, operands))(*_one_pair(operands, shift))
+    closed = _jaxpr_of(summand, operands, shift)
     consts = tuple(jnp.asarray(x) for x in closed.consts)
     of_consts = Groups(tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in consts), (), ())
 
@@ -147,7 +153,7 @@ def make_term(
     summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct, labels: Labels, totals: Sequence[bool] | None = None
 ) -> Derived:
     """Trace a summand of these operands that closes over nothing, and drop the operands that it does not need."""
-    closed = jax.make_jaxpr(_flat(summand, operands))(*_one_pair(operands, shift))
+    closed = _jaxpr_of(summand, operands, shift)
     always = [True, True] + [False] * sum(map(len, operands))
     jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), always)
     needed = _split(used[2:], operands)

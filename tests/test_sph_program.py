@@ -103,3 +103,11 @@ def test_no_skin_keeps_no_reference_positions():
 
 def test_two_dimensions_compute_two_components(bare):
     assert "x3xf64" not in bare[0].as_text()
+
+
+def test_products_of_matrices_take_all_bits():
+    """What a GPU makes of them by itself has 10 bits less."""
+    physics = replace(BARE.physics, gravity=(0.0, -1.0), viscosity=0.1, corrected=True)
+    text = lowered(replace(BARE, wall=np.arange(N) < 8, physics=physics))[0].as_text()
+    precisions = {line.split("precision = ")[1].split("]")[0] for line in text.splitlines() if "stablehlo.dot" in line}
+    assert precisions == {"[HIGHEST, HIGHEST"}

@@ -17,7 +17,7 @@ def potential_energy(model: Model, s: State) -> Array:
     if model.physics.gravity is None:
         return jnp.zeros((), s.x.dtype)
     ground = jnp.zeros((), s.x.dtype) if model.tank is None else model.tank[0]
-    return -jnp.sum(_masses(model) * ((s.x - ground) @ model.physics.gravity))
+    return -jnp.sum(_masses(model) * jnp.sum((s.x - ground) * model.physics.gravity, axis=1))
 
 
 def internal_energy(model: Model, s: State) -> Array:

@@ -117,7 +117,7 @@ def _turned(r: Array, turning: "Turning | None", angle: Array | None) -> Array:
     sine, cosine = jnp.sin(angle), jnp.cos(angle)
     if turning.axis is None:
         return r * cosine + _across(r, turning) * sine
-    along = (r @ turning.axis)[:, None] * turning.axis
+    along = jnp.sum(r * turning.axis, axis=1, keepdims=True) * turning.axis
     return along + (r - along) * cosine + _across(r, turning) * sine
 
 

@@ -47,7 +47,7 @@ def extrapolated(sums: dict[str, Array], wall_velocity: Array, gravity: Array | 
     """
     met = sums["weight"] > 0
     weight = jnp.where(met, sums["weight"], 1)
-    pressure = sums["p"] if gravity is None else sums["p"] + sums["moment"] @ gravity
+    pressure = sums["p"] if gravity is None else sums["p"] + jnp.sum(sums["moment"] * gravity, axis=1)
     held = 2 * wall_velocity - sums["v"] / weight[:, None]
     return jnp.where(met, pressure / weight, 0), jnp.where(met[:, None], held, wall_velocity)
 
