@@ -11,13 +11,14 @@ _LARGEST = 512  # such that no sum of a row leaves the integers of float32
 
 def decisions(dtype: str, dim: int, capacity: int, backend: str) -> Iterator[tuple[str, bool]]:
     """Say of every scene, and of every number of columns, whether sums and counts of pairs are those of the list."""
+    import jax
     import jax.numpy as jnp
 
     import jfrnn
 
     random = np.random.default_rng(1)
 
-    def is_right(x: np.ndarray, cutoff: float, columns: int, **options: Any) -> bool:  # noqa: ANN401
+    def is_right(x: np.ndarray, cutoff: float, columns: int, capacity: int = capacity, **options: Any) -> bool:  # noqa: ANN401
         n, points = len(x), jnp.asarray(x)
         weights = random.integers(1, _LARGEST, (n, columns)).astype(dtype)
         nbrs = jfrnn.search(points, cutoff, capacity=capacity, backend="warp", **options)
@@ -34,6 +35,12 @@ def decisions(dtype: str, dim: int, capacity: int, backend: str) -> Iterator[tup
     for columns in COLUMNS:
         for name, x, cutoff, options in _scenes(random, dtype, dim):
             yield f"{name}-{columns}", is_right(x, cutoff, columns, **options)
+    if jax.default_backend() != "cpu" and dim == 3:  # more threads than Warp puts into one row of a grid
+        yield "large-5", is_right(_lattice(257, dtype), 1.1, 5, capacity=8)
+
+
+def _lattice(side: int, dtype: str) -> np.ndarray:
+    return np.stack(np.meshgrid(*[np.arange(side, dtype=dtype)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _scenes(random: np.random.Generator, dtype: str, dim: int) -> Iterator[tuple[str, np.ndarray, float, dict[str, Any]]]:

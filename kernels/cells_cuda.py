@@ -28,6 +28,9 @@ _SWEEP_BLOCKS = 1056  # blocks of the kernels that walk over all particles
 _CROSSING_BLOCKS = 8448  # blocks of the kernel for queries whose reach leaves a box: what is to do is known to the device only
 _RESIDENT = 132  # blocks of those that walk over the cells: all at work at once
 _GATHERING = (8, 6)  # blocks of `gather` that are at work at once per multiprocessor, in open space and in a box
+# Beyond, Warp rounds the grid up to whole multiples, and threads that do not run count in a stride: what walks in strides would
+# leave out what they should have done.
+MOST_IN_STRIDES = 2**24
 
 LAYOUT = r"""
 struct Shared {

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import warp as wp
 from jfrnn.kernels._math import SCALAR
 from jfrnn.kernels._native import CELLS, EXACT, SPACES, snippet
-from jfrnn.kernels.cells_cuda import GRID, HELD_PAIRS, LAYOUT, QUERY_BLOCK, Launch, load_walks, walk, walks
+from jfrnn.kernels.cells_cuda import GRID, HELD_PAIRS, LAYOUT, MOST_IN_STRIDES, QUERY_BLOCK, Launch, load_walks, walk, walks
 from jfrnn.kernels.pair_sum_cpu import LITTLE_WORK, TAKE_LARGER, TermText, Value, loaded, placed, work
 
 
@@ -247,7 +247,7 @@ class Kernels(NamedTuple):
 
     def launches(self, n: int, m: int) -> list[Launch]:
         """Return what is launched, in order, for n sources and m queries, which are sorted already."""
-        threads = -(-n // QUERY_BLOCK) * QUERY_BLOCK
+        threads = min(-(-n // QUERY_BLOCK) * QUERY_BLOCK, MOST_IN_STRIDES)
         sorting = [] if self.sort_values is None else [Launch(self.sort_values, threads, QUERY_BLOCK, False)]
         return sorting + walks(self.query, self.crossing, m)
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import warp as wp
-from jfrnn.kernels import pair_sum_cpu, pair_sum_cuda
+from jfrnn.kernels import cells_cuda, pair_sum_cpu, pair_sum_cuda
 
 import jfrnn
 from jfrnn import _fused, _warp
@@ -128,6 +128,19 @@ def test_what_a_term_reads_is_sorted_before_it_is_summed():
     assert (sort_values.kernel, query.kernel) == (kernels.sort_values, kernels.query)
     assert query.threads == 32 * pair_sum_cuda.slots(500)
     assert all(launch.threads % launch.block == 0 for launch in (sort_values, query))
+
+
+@pytest.mark.parametrize("n", [1, 1_000_000, 2**24 + 1, 200_000_000])
+def test_what_walks_in_strides_is_launched_as_one_grid(n):
+    """Warp rounds larger grids up to multiples of 2^24 threads: what those would do that are not run, nobody did."""
+    plan = plan_of(square_sum, *arguments(np.float32, 3)[:3])
+    sums = pair_sum_cuda.sum_kernels(plan.text, plan.key, 3, False, False, False)
+    search = cells_cuda.cell_kernels(3, False, False, True, periodic=1)
+    launches = [
+        launch for launch in sums.launches(n, n) + search.launches(n, n, False) if launch.kernel not in (sums.query, search.query)
+    ]
+    assert sums.sort_values in [launch.kernel for launch in launches]
+    assert all(launch.threads <= 2**24 for launch in launches)
 
 
 def test_queries_that_leave_a_box_have_a_kernel_beside_the_others():
