@@ -112,6 +112,14 @@ def test_pairs_of_a_row_are_compared_with_the_exact_ones(swept):
     assert rows["cll"]["density_error"] < 1e-12 < rows["cll"]["jump_error"]  # a tie is nothing to a kernel that ends at 0
 
 
+def test_memory_holds_one_result_at_a_time(tmp_path):
+    scene = '[[scenes]]\nlayouts = ["full"]\n'
+    few = Sweep(tmp_path, f'methods = ["cll"]\nspacing = 2.5e-4\nrepeats = 3\nmin_seconds = 0.0\n{scene}')
+    few.run()
+    (row,) = few.rows()
+    assert 5_000_000 < row["list_bytes"] <= row["search_bytes"] < 1.5 * row["list_bytes"]
+
+
 def test_a_row_says_where_it_comes_from_but_names_no_host(swept):
     for row in swept.rows():
         assert set(row["machine"]) == {"cpu", "cores", "memory_bytes", "system"}

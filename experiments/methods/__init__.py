@@ -3,7 +3,8 @@
 An adapter is a module with
 
 - `prepare(positions, cutoff)`: do what is needed once (compile, say) and return the search, a callable without arguments whose
-  every call goes from the raw positions to the finished result, waits for it, and builds whatever structure it needs anew;
+  every call goes from the raw positions to the finished result, waits for it, and builds whatever structure it needs anew; on a
+  GPU positions are there already, as in a simulation (`at_hand`);
 - `read(result)`: return what the search found, a `Found`; not timed;
 - optionally `allocate(positions, cutoff)`: return the capacity that the scene needs; `prepare` then takes it as third argument;
 - optionally `follow(positions, cutoff, motion)` instead of `prepare`, for methods that keep something between searches: a callable
@@ -72,3 +73,10 @@ def names() -> list[str]:
 def load(name: str) -> Adapter:
     """Import the adapter of a method; its ImportError is the caller's."""
     return cast(Adapter, import_module(f"{__name__}.{name.replace('-', '_')}"))
+
+
+def at_hand(positions: np.ndarray) -> Any:  # noqa: ANN401
+    """Return positions where JAX works, so that no search brings them to a GPU: at a million that takes longer than to search."""
+    import jax
+
+    return positions if jax.default_backend() == "cpu" else jax.device_put(positions)

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 import jfrnn
-from experiments.methods import Found
+from experiments.methods import Found, at_hand
 
 
 def allocate_backend(positions: np.ndarray, cutoff: float, backend: str) -> int:
@@ -23,7 +23,8 @@ def prepare_backend(
     compiled = search.lower(jax.ShapeDtypeStruct(positions.shape, positions.dtype)).compile()
     if kernels:
         jax.block_until_ready(search(positions[:1]))
-    return lambda: jax.block_until_ready(compiled(jax.numpy.asarray(positions)))
+    x = at_hand(positions)
+    return lambda: jax.block_until_ready(compiled(jax.numpy.asarray(x)))
 
 
 def plan_backend(positions: np.ndarray, cutoff: float, capacity: int, backend: str) -> jfrnn.MemoryPlan:

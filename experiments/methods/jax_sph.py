@@ -10,7 +10,7 @@ import numpy as np
 from jax_sph.jax_md import space  # pyright: ignore[reportMissingImports]
 from jax_sph.partition import neighbor_list  # pyright: ignore[reportMissingImports]
 
-from experiments.methods import Found
+from experiments.methods import Found, at_hand
 
 PACKAGES = ("jax-sph",)
 MAX_POINTS = 130_000
@@ -33,7 +33,8 @@ def prepare(positions: np.ndarray, cutoff: float, lists: Any) -> Callable[[], tu
     update = jax.jit(lambda x, nbrs: nbrs.update(x - low))
     if update(jnp.asarray(positions), moved).did_buffer_overflow:
         raise RuntimeError("the list overflowed right after it was allocated")
-    return lambda: (jax.block_until_ready(update(jnp.asarray(positions), moved).idx), len(positions))
+    x = at_hand(positions)
+    return lambda: (jax.block_until_ready(update(jnp.asarray(x), moved).idx), len(positions))
 
 
 def read(result: tuple[jax.Array, int]) -> Found:

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp  # noqa: F401 - without it this method is missing, which is no failure
 
 import jfrnn
-from experiments.methods import Found
+from experiments.methods import Found, at_hand
 
 
 def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], jax.Array]:
@@ -15,7 +15,8 @@ def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], jax.Array]:
     jax.config.update("jax_enable_x64", positions.dtype == np.float64)
     count = jax.jit(lambda x: jfrnn.count(x, cutoff, backend="warp"))
     jax.block_until_ready(count(positions))
-    return lambda: jax.block_until_ready(count(jax.numpy.asarray(positions)))
+    x = at_hand(positions)
+    return lambda: jax.block_until_ready(count(jax.numpy.asarray(x)))
 
 
 def read(result: jax.Array) -> Found:
