@@ -36,11 +36,11 @@ def decisions(dtype: str, dim: int, capacity: int, backend: str) -> Iterator[tup
         for name, x, cutoff, options in _scenes(random, dtype, dim):
             yield f"{name}-{columns}", is_right(x, cutoff, columns, **options)
     if jax.default_backend() != "cpu" and dim == 3:  # more threads than Warp puts into one row of a grid
-        yield "large-5", is_right(_lattice(257, dtype), 1.1, 5, capacity=8)
+        yield "large-5", is_right(_lattice(257, 3, dtype), 1.1, 5, capacity=8)
 
 
-def _lattice(side: int, dtype: str) -> np.ndarray:
-    return np.stack(np.meshgrid(*[np.arange(side, dtype=dtype)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+def _lattice(side: int, dim: int, dtype: str) -> np.ndarray:
+    return np.stack(np.meshgrid(*[np.arange(side, dtype=dtype)] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
 
 
 def _scenes(random: np.random.Generator, dtype: str, dim: int) -> Iterator[tuple[str, np.ndarray, float, dict[str, Any]]]:
@@ -58,7 +58,7 @@ def _scenes(random: np.random.Generator, dtype: str, dim: int) -> Iterator[tuple
     yield "queries", x, cutoff, {"queries": beyond}
     if dim == 3:
         yield "skewed", x, cutoff, {"box": jfrnn.Box(np.array([[1, 0.3, 0], [0, 1, 0.2], [0.1, 0, 1]]))}
-    sites = np.stack(np.meshgrid(*[np.arange(12.0)] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+    sites = _lattice(12, dim, "float64")
     yield "ties", (0.1 * sites).astype(dtype), 0.3, {}
     yield "ties-closed", sites.astype(dtype), 3.0, {"closed": True}
     clump = np.concatenate([0.01 * random.normal(size=(150, dim)), 50 * random.random((500, dim))])
