@@ -154,8 +154,9 @@ def _extents(particles: Particles, stage: _Stage) -> _Extents:
     there = (particles.ids >= 0) & jnp.isfinite(x).all(axis=1)
     center = _center(particles, stage)
     u, error = _from_center(x, center, particles)
-    low = jnp.min(u - error, axis=0, initial=jnp.inf, where=there[:, None])
-    high = jnp.max(u + error, axis=0, initial=-jnp.inf, where=there[:, None])
+    # one column after the other: the rows of [n, d] all at once take 6 times as long on a GPU, more than the rest of a halo
+    low = jnp.stack([jnp.min((u - error)[:, k], initial=jnp.inf, where=there) for k in range(particles.dim)])
+    high = jnp.stack([jnp.max((u + error)[:, k], initial=-jnp.inf, where=there) for k in range(particles.dim)])
     later = particles.mesh.axis_names[stage.number + 1 :]
     if later:
         low, high = lax.pmin(low, later), lax.pmax(high, later)
