@@ -27,7 +27,8 @@ from jfrnn import distributed
 from jfrnn._shards_scatter import fetched
 
 _WORK = ("list", "pair_sum", "sph")
-_SENDS = re.compile(r"= (.*?) collective-permute(?:-start)?\(.*source_target_pairs=\{(.*?)\}\}")
+_SENDS = re.compile(r"= (.*?) collective-permute(?:-start)?\((.*?)\),.*?source_target_pairs=\{(.*?)\}\}")
+_NESTED = re.compile(r"\[.*?\]|\{.*?\}")  # shape and layout of an operand, which hold commas too
 _ARRAY = re.compile(r"(\w+)\[([\d,]*)\]")
 _BYTES = {"pred": 1, "s32": 4, "u32": 4, "f32": 4, "f64": 8, "s64": 8}
 
@@ -307,13 +308,16 @@ def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: Row
 
 
 def sent_bytes(program: str) -> int:
-    """Return what all devices send to others in one pass over a compiled program: by its collective permutes [bytes]."""
+    """Return what all devices send to others in one pass over a compiled program: by its collective permutes [bytes].
+
+    Arrays may travel together; of what has only begun the result names what it takes before what it gives: as many of its arrays
+    count as there are operands.
+    """
     total = 0
-    for result, moves in _SENDS.findall(program):
-        several = result.startswith("((")  # arrays that travel together; of one that starts, what it takes comes first
-        arrays = _ARRAY.findall(result[: result.index(")")] if several else result)
+    for result, operands, moves in _SENDS.findall(program):
+        arrays = _ARRAY.findall(result)[: 1 + _NESTED.sub("", operands).count(",")]
         sizes = [_BYTES[kind] * math.prod(int(size) for size in shape.split(",") if size) for kind, shape in arrays]
-        total += sum(sizes if several else sizes[:1]) * moves.count("{")
+        total += sum(sizes) * moves.count("{")
     return total
 
 

@@ -595,7 +595,8 @@ def _study_rows(config: Config, n: int) -> Iterator[dict[str, Any]]:
     jitter = _jitter_lattice(config, n)
     given = scene("full")
     lattice = np.random.default_rng(config.seed).permutation(given.positions).astype(np.float32)
-    for layout, points, cutoff in (("jitter", jitter, config.reach_in_spacings), ("full", lattice, given.cutoff)):
+    rounded = float(np.float32(given.cutoff))  # the same number in both precisions: the lattice is full of ties
+    for layout, points, cutoff in (("jitter", jitter, config.reach_in_spacings), ("full", lattice, rounded)):
         longest, directed = _kernel_time(config, points, cutoff, 0, lists=False)[2:]
         capacity = rounded_capacity(int(longest))
         for what, options in _STUDIED.items():

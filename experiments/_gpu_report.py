@@ -22,10 +22,8 @@ def report(folder: Path) -> str:
     if not path.exists():
         raise UsageError(f"{path} does not exist: run python -m experiments gpu CONFIG --out {folder} first")
     rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    text = (
-        "\n\n".join([_head(rows), _exactness(rows), _calls(rows), _sums(rows), _study(rows), _memory(rows), _triangles(rows)])
-        + "\n"
-    )
+    parts = [part(rows) for part in (_head, _exactness, _calls, _sums, _study, _memory, _triangles)]
+    text = "\n\n".join(part for part in parts if part) + "\n"
     (folder / "report.md").write_text(text, encoding="utf-8")
     _draw(rows, folder / "roofline.png")
     return text
@@ -123,7 +121,7 @@ def _triangles(rows: list[dict[str, Any]]) -> str:
             "pairs": r["pairs"], "method": r["method"], "ms": f"{1e3 * r['median_s']:.4g}", "wrong rows": wrong,
             "kernels, ms": stages, "settled": r.get("settled", ""),
         })  # fmt: skip
-    return "## Triangles around a gear\n\n" + _markdown(table)
+    return "## Triangles around a gear\n\n" + _markdown(table) if table else ""
 
 
 def _markdown(table: list[dict[str, Any]]) -> str:

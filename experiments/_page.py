@@ -18,7 +18,7 @@ SHOWN = (  # column, title, digits
         ("low_s", "from", ".3g"),
     ),
     *(("high_s", "to", ".3g"), ("processes", "processes", "d"), ("seconds_to_cll", "/ cll", ".3g"), ("search_mb", "MB", ".1f")),
-    *(("mb_to_cll", "MB / cll", ".3g"), ("list_mb", "list MB", ".1f"), ("device_mb", "device MB", ".1f")),
+    *(("mb_to_cll", "MB / cll", ".3g"), ("list_mb", "list MB", ".1f"), ("scratch_mb", "scratch MB", ".1f")),
     *(("planned_list_mb", "planned list", ".1f"), ("planned_scratch_mb", "planned scratch", ".1f"), ("missing", "missing", "d")),
     *(("extra", "extra", "d"), ("density_error", "density error", ".1e"), ("gradient_error", "gradient error", ".1e")),
     *(("jump_error", "jump error", ".1e"), ("t_ksearch", "t_ksearch", ".3g"), ("t_frsearch", "t_frsearch", ".3g")),

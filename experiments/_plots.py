@@ -71,12 +71,6 @@ def draw_all(rows: Sequence[Row], folder: Path, origin: str) -> list[Path]:
     }
     if any(row.density_error is not None for row in good):
         pictures["speed_against_sum_error"] = _against_sum_error(good)
-    if any(row.device_bytes for row in good):
-
-        def device(row: Row) -> float | None:
-            return _table.megabytes(row.device_bytes)
-
-        pictures["device_memory_by_layout"] = _by_layout(good, device, None, "peak memory on the device [MB]")
     paths = []
     for name, figure in pictures.items():
         figure.text(0.01, 0.008, origin, fontsize=7, color="0.45", wrap=True)

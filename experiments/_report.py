@@ -24,7 +24,8 @@ NOTES = """\
   their medians.
 - **±**: half the interval that holds the median with a probability of 95 % (93.75 % of five processes, which is all that five can
   tell), in per cent of it. Of several processes it is that of their medians; of one, in brackets, that of its repeats alone.
-- **MB**: peak resident memory of the process during the searches, over what was resident after compilation; 10^6 bytes.
+- **MB**: peak resident memory of the process during the searches, over what was resident after compilation; 10^6 bytes. On a GPU
+  the peak of its memory over what it held at first: positions, list and scratch, or what the compiler tried out, if that is more.
 - **/ cll**: divided by the row `cll` of the same scene, process by process of the same round. `≈`: within noise: the interval of
   that ratio holds 1 (of one process: the intervals of both overlap).
 - **missing**, **extra**: unordered pairs against the exact answer on the given floats, distance < cutoff. Of a method without pair

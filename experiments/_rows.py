@@ -54,13 +54,15 @@ class Row:
         others_cores: Cores that other processes of the machine kept busy meanwhile, on average; None below 0.2 s.
         peak_bytes: Peak resident memory over the start (imports done, positions made), allocation and compilation included.
         search_bytes: The same over what was resident after compilation: what the search itself takes, at least list_bytes;
-            unknown where the peak cannot be reset.
+            unknown where the peak cannot be reset. On an accelerator `device_bytes`.
         list_bytes: Size of the result.
         scratch_bytes: search_bytes - list_bytes.
-        device_bytes: Peak of the accelerator's memory over what it held before, as JAX and Warp count it; None on a CPU.
+        device_bytes: Peak of the accelerator's memory over what it held before, as JAX and Warp count it: positions, and what the
+            compiler tries out, included; None on a CPU.
         planned_list_bytes: The list as `jfrnn.memory_plan` says beforehand; the library's own methods, process 0.
         planned_scratch_bytes: What is needed besides, as it says.
-        memory_source: VmHWM, reset at both starts; or ru_maxrss, which cannot be: earlier peaks hide later ones.
+        memory_source: Of search_bytes: VmHWM, reset at both starts; ru_maxrss, which cannot be: earlier peaks hide later ones;
+            device.
         pairs: Unordered pairs that the method found.
         directed_pairs: Entries (i, j) of a full list.
         exact_pairs: Unordered pairs of the oracle.

@@ -112,8 +112,11 @@ def _measure_search(adapter: methods.Adapter, spec: Spec, scene: "Scene", folder
     row |= _measure.summarize([second / steps for second in seconds])
     row |= {"list_bytes": found.list_bytes, "device": found.device, "parts": found.parts, "rebuilt": found.rebuilt}
     row |= {"peak_bytes": max(prepared_peak, peak) - memory.start, "memory_source": searching.source}
-    if searching.source == "VmHWM":
-        taken = max(peak - searching.start, found.list_bytes)  # a small list may fit into pages that were there before
+    taken = peak - searching.start if searching.source == "VmHWM" else None
+    if row["device_bytes"] is not None:
+        taken, row["memory_source"] = row["device_bytes"], "device"
+    if taken is not None:
+        taken = max(taken, found.list_bytes)  # a small list may fit into pages that were there before
         row |= {"search_bytes": taken, "scratch_bytes": taken - found.list_bytes}
     del result
     if spec.process == 0 and (plan := getattr(adapter, "plan", None)):

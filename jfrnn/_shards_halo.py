@@ -125,7 +125,7 @@ def exchanged(leaf: Array, halo: Halo, particles: Particles) -> Array:
     """Return a shard's own rows of an array and those of its halo, inside `shard_map`; unused ones are 0. Linear.
 
     Arrays travel one by one, so that the compiler sends what several sums read once, and what none reads not at all. Packed into
-    one message per sum, those of a step of the solver were five times as many bytes, and it took longer on two GPUs.
+    one message per sum, a step of the solver took longer on two GPUs.
     """
     for stage in stages(particles):
         leaf = _with_received(leaf, halo.sends[stage.number], particles, stage)

@@ -72,7 +72,7 @@ def two_processes(what):
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
     runs = [started(PROCESS, address, 2, process, what) for process in range(2)]
-    return [(*run.communicate(timeout=300), run.returncode) for run in runs]
+    return [(*run.communicate(timeout=120), run.returncode) for run in runs]
 
 
 @pytest.mark.slow

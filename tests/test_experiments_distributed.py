@@ -74,7 +74,9 @@ def test_bytes_that_a_program_sends():
         f"%a = f32[2,3]{{1,0}} collective-permute(f32[2,3]{{1,0}} %b), {pairs}",
         f"%c = (s32[5]{{0}}, s32[5]{{0}}, u32[], u32[]) collective-permute-start(%d), {pairs}",
         f"%e = ((f32[7]{{0}}, f64[2,2]{{1,0}}), (f32[7]{{0}}, f64[2,2]{{1,0}})) collective-permute-start(%f, %g), {pairs}",
+        f"%h = (f32[6,3]{{1,0}}, s32[6]{{0}}) collective-permute(%a, f32[2,3]{{1,0}} %b), channel_id=1, {pairs}",
+        f"%l = (f32[4]{{0}}, s32[3]{{0}}, f32[4]{{0}}, s32[3]{{0}}) collective-permute-start(%a, %b), channel_id=2, {pairs}",
         "%h = s32[5]{0} collective-permute-done(%c)",
         "%i = f32[9]{0} add(%j, %k)",
     ]
-    assert _distributed.sent_bytes("\n".join(lines)) == 2 * (24 + 20 + 28 + 32)
+    assert _distributed.sent_bytes("\n".join(lines)) == 2 * (24 + 20 + (28 + 32) + (72 + 24) + (16 + 12))
