@@ -61,14 +61,17 @@ def draw_all(rows: Sequence[Row], folder: Path, origin: str) -> list[Path]:
     def thesis_memory(figures: _thesis.Figures) -> float:
         return figures.megabytes
 
-    pictures = {
-        "runtime_by_layout": _by_layout(good, seconds, thesis_seconds, SECONDS),
-        "memory_by_layout": _by_layout(good, memory, thesis_memory, MEGABYTES),
-        "runtime_by_fill": _by_fill(good, seconds, thesis_seconds, SECONDS.split(";")[0]),
-        "memory_by_fill": _by_fill(good, memory, thesis_memory, MEGABYTES),
-        "speed_against_error": _against_error(good, seconds, SECONDS.split(";")[0], "Speed"),
-        "memory_against_error": _against_error(good, memory, MEGABYTES, "Memory"),
-    }
+    speed = SECONDS.split(";")[0]
+    pictures = {"runtime_by_layout": _by_layout(good, seconds, thesis_seconds, SECONDS)}
+    remembered = any(memory(row) for row in good)
+    if remembered:
+        pictures["memory_by_layout"] = _by_layout(good, memory, thesis_memory, MEGABYTES)
+    pictures["runtime_by_fill"] = _by_fill(good, seconds, thesis_seconds, speed)
+    if remembered:
+        pictures["memory_by_fill"] = _by_fill(good, memory, thesis_memory, MEGABYTES)
+    pictures["speed_against_error"] = _against_error(good, seconds, speed, "Speed")
+    if remembered:
+        pictures["memory_against_error"] = _against_error(good, memory, MEGABYTES, "Memory")
     if any(row.density_error is not None for row in good):
         pictures["speed_against_sum_error"] = _against_sum_error(good)
     paths = []
@@ -139,10 +142,10 @@ def _theirs(rows: list[Row], value: ThesisValue) -> dict[tuple[str, str], list[t
     return dict(found)
 
 
-def _by_layout(rows: list[Row], value: Value, thesis_value: ThesisValue | None, label: str) -> Figure:
+def _by_layout(rows: list[Row], value: Value, thesis_value: ThesisValue, label: str) -> Figure:
     """Draw a mark per row: scenes downwards, values to the right on a log axis."""
     names, methods = _table.name_scenes(rows), _methods(rows)
-    theirs = {} if thesis_value is None else _theirs(rows, thesis_value)
+    theirs = _theirs(rows, thesis_value)
     places = {key: number for number, key in enumerate(dict.fromkeys(row.scene_key for row in rows))}
     points = {row.scene_key: row.points or 0 for row in rows}
     height = max(1.8 + max(0.52, 0.06 * len(methods)) * len(places), 2 + 0.2 * len(methods))

@@ -195,3 +195,12 @@ def test_a_folder_without_rows(tmp_path):
     result = CliRunner().invoke(app, ["report", str(tmp_path)])
     assert result.exit_code == 2
     assert result.stderr.startswith(f"error: {tmp_path}: no rows; fill it with `python -m experiments run CONFIG.toml --out")
+
+
+def test_without_memory_there_are_no_pictures_of_it(tmp_path):
+    file = RowFile(tmp_path)
+    for row in make_rows():
+        file.append(replace(row, search_bytes=None, peak_bytes=None, scratch_bytes=None))
+    _report.report(tmp_path)
+    drawn = {path.stem for path in tmp_path.glob("*.png")}
+    assert drawn == {"runtime_by_layout", "runtime_by_fill", "speed_against_error", "speed_against_sum_error"}
