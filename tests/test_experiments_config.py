@@ -60,7 +60,7 @@ def test_key_and_hash_follow_what_the_config_says(tmp_path):
         ("fills =", "fill =", r"sweep\.toml: scenes\[0\]\.fill: unknown key \(value \[0\.02, 0\.11\]\); allowed: layouts, fills"),
         ('"full"', '"fulll"', r"scenes\[1\]\.layouts: unknown layout 'fulll'; allowed: full, corners, .*clustersN"),
         ('"clusters7"', '"clustersN"', r"scenes\[0\]\.layouts: unknown layout 'clustersN'; allowed: "),
-        ('"cll"', '"ccl"', r"methods: unknown method 'ccl'; allowed: .*brute, cll, freud, hashgrid, jax, .*, warp"),
+        ('"cll"', '"ccl"', r"methods: unknown method 'ccl'; allowed: .*brute, cll, freud, hashgrid, hashgrid-plain, jax, .*, warp"),
         ("0.11]", "1.5]", r"scenes\[0\]\.fills\[1\]: got 1\.5; input should be less than or equal to 1"),
         ("0.02,", "0.0,", r"scenes\[0\]\.fills\[0\]: got 0\.0; input should be greater than 0"),
         ("repeats = 5", "repeats = 0", r"repeats: got 0; input should be greater than or equal to 1"),
