@@ -3,6 +3,7 @@
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from statistics import geometric_mean
 
@@ -61,19 +62,20 @@ def draw_all(rows: Sequence[Row], folder: Path, origin: str) -> list[Path]:
     def thesis_memory(figures: _thesis.Figures) -> float:
         return figures.megabytes
 
+    def density(row: Row) -> float | None:
+        return row.density_error
+
     speed = SECONDS.split(";")[0]
-    pictures = {"runtime_by_layout": _by_layout(good, seconds, thesis_seconds, SECONDS)}
-    remembered = any(memory(row) for row in good)
-    if remembered:
-        pictures["memory_by_layout"] = _by_layout(good, memory, thesis_memory, MEGABYTES)
-    pictures["runtime_by_fill"] = _by_fill(good, seconds, thesis_seconds, speed)
-    if remembered:
-        pictures["memory_by_fill"] = _by_fill(good, memory, thesis_memory, MEGABYTES)
-    pictures["speed_against_error"] = _against_error(good, seconds, speed, "Speed")
-    if remembered:
-        pictures["memory_against_error"] = _against_error(good, memory, MEGABYTES, "Memory")
-    if any(row.density_error is not None for row in good):
-        pictures["speed_against_sum_error"] = _against_sum_error(good)
+    wanted: tuple[tuple[str, Value, Callable[[], Figure]], ...] = (
+        ("runtime_by_layout", seconds, partial(_by_layout, good, seconds, thesis_seconds, SECONDS)),
+        ("memory_by_layout", memory, partial(_by_layout, good, memory, thesis_memory, MEGABYTES)),
+        ("runtime_by_fill", seconds, partial(_by_fill, good, seconds, thesis_seconds, speed)),
+        ("memory_by_fill", memory, partial(_by_fill, good, memory, thesis_memory, MEGABYTES)),
+        ("speed_against_error", seconds, partial(_against_error, good, seconds, speed, "Speed")),
+        ("memory_against_error", memory, partial(_against_error, good, memory, MEGABYTES, "Memory")),
+        ("speed_against_sum_error", density, partial(_against_sum_error, good)),
+    )
+    pictures = {name: draw() for name, value, draw in wanted if any(value(row) is not None for row in good)}
     paths = []
     for name, figure in pictures.items():
         figure.text(0.01, 0.008, origin, fontsize=7, color="0.45", wrap=True)

@@ -33,6 +33,14 @@ def plan_backend(positions: np.ndarray, cutoff: float, capacity: int, backend: s
     return jfrnn.memory_plan(n, cutoff, capacity, dim=dim, dtype=positions.dtype, backend=backend)
 
 
+def found_in_rows(idx: np.ndarray, count: np.ndarray, device: str) -> Found:
+    """Return the ordered pairs of another library's padded list; raise RuntimeError where a row was cut off."""
+    if count.max(initial=0) > idx.shape[1]:
+        raise RuntimeError(f"a row has {count.max()} neighbors and {idx.shape[1]} slots")
+    i, k = np.nonzero(np.arange(idx.shape[1]) < count[:, None])
+    return Found(idx.nbytes + count.nbytes, (i, idx[i, k].astype(np.int64)), directed=True, device=device)
+
+
 def read(result: jfrnn.NeighborList) -> Found:
     """Return the directed pairs of the padded list."""
     result.check()

@@ -7,6 +7,7 @@ import numpy as np
 import warp
 
 from experiments.methods import Found
+from experiments.methods._padded import found_in_rows
 from jfrnn._warp import kernels_of
 
 wp: Any = warp  # whose types are those of kernels, not of what the host gets
@@ -40,8 +41,5 @@ def prepare(positions: np.ndarray, cutoff: float, capacity: int) -> Callable[[],
 def read(result: tuple[Any, Any]) -> Found:
     """Return the ordered pairs of the padded list."""
     idx, count = (part.numpy() for part in result)
-    if count.max(initial=0) > idx.shape[1]:
-        raise RuntimeError(f"a row has {count.max()} neighbors and {idx.shape[1]} slots")
-    i, k = np.nonzero(np.arange(idx.shape[1]) < count[:, None])
-    pairs, device = (i, idx[i, k].astype(np.int64)), result[0].device
-    return Found(idx.nbytes + count.nbytes, pairs, directed=True, device=device.name if device.is_cuda else "cpu")
+    device = result[0].device
+    return found_in_rows(idx, count, device.name if device.is_cuda else "cpu")

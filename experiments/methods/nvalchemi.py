@@ -8,6 +8,7 @@ import numpy as np
 from nvalchemiops.jax.neighbors.cell_list import cell_list, estimate_cell_list_sizes  # pyright: ignore
 
 from experiments.methods import Found, at_hand
+from experiments.methods._padded import found_in_rows
 
 PACKAGES = ("nvalchemi-toolkit-ops",)
 
@@ -36,8 +37,4 @@ def prepare(positions: np.ndarray, cutoff: float, capacity: int) -> Callable[[],
 def read(result: tuple[jax.Array, jax.Array]) -> Found:
     """Return the ordered pairs of the padded list."""
     idx, count = (np.asarray(part) for part in result)
-    if count.max(initial=0) > idx.shape[1]:
-        raise RuntimeError(f"a row has {count.max()} neighbors and {idx.shape[1]} slots")
-    i, k = np.nonzero(np.arange(idx.shape[1]) < count[:, None])
-    size = idx.nbytes + count.nbytes
-    return Found(size, (i, idx[i, k].astype(np.int64)), directed=True, device=next(iter(result[0].devices())).device_kind)
+    return found_in_rows(idx, count, next(iter(result[0].devices())).device_kind)
