@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, PositiveFloat, PositiveInt, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
 from tqdm import tqdm
 
 from experiments import _compare, _gpu_sums, _gpu_triangles, _machine, _measure, _ways
@@ -65,6 +65,7 @@ class Config(BaseModel):
     repeats: PositiveInt
     seconds_per_timing: PositiveFloat
     exactness: list[Exactness]
+    warps: NonNegativeInt | None = None  # among which `warp` shares few queries; 0: 32 to a warp, as where they are many
     triangles: list[Triangles] = []
 
 
@@ -87,6 +88,9 @@ def run(config: Config, folder: Path) -> int:
     device = jax.devices()[0]
     about = {"device": device.device_kind, "versions": _machine.versions() | {"warp-lang": load_warp().__version__}}
     about |= _machine.commit()
+    if config.warps is not None:
+        kernels_of("cells_cuda").GRID["WARPS"] = config.warps  # of kernels that are still to be made
+        about["warps"] = config.warps
     wrong = 0
     with (folder / "rows.jsonl").open("a", encoding="utf-8") as file:
         for row in tqdm(_rows(config), desc="rows"):

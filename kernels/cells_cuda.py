@@ -7,7 +7,8 @@ scan     counts to first places, in one pass (Merrill & Garland 2016, decoupled 
 scatter  indices into their cells, in the order in which they came
 gather   positions into cell order, ranked by index within a cell: the same order in every run
 query    a warp serves up to 32 neighboring queries, one per lane: candidates within reach of their box meet all of them, 32 in a
-         block, float32 on tensor cores first; a neighbor is a bit, until the rows are written
+         block, float32 on tensor cores first; a neighbor is a bit, until the rows are written. Those that are far from each other
+         it serves one after the other: where queries are few, they are shared among more warps
 crossing the same in a periodic box, for queries whose reach leaves it: images take registers, which the others have no use for
 """
 
@@ -22,7 +23,10 @@ BLOCK = 256
 QUERY_BLOCK = 32  # one warp: others need not wait for it to end
 _PARTS = 256  # blocks of `bounds`; one thread of a block reads one part
 _TILE = 2048  # cells that a block of `scan` takes
-GRID = {"REACH": 1, "REACH_X": 6, "PARTS": _PARTS, "TILE": _TILE, "BLOCK": BLOCK}  # what all kernels of a search must agree on
+# Among which few queries are shared, at most: 32 per multiprocessor of an H200; half and twice as many took longer there.
+_WARPS = 4224
+# what all kernels of a search must agree on
+GRID = {"REACH": 1, "REACH_X": 6, "PARTS": _PARTS, "TILE": _TILE, "BLOCK": BLOCK, "WARPS": _WARPS}
 _HEADER_WORDS = 64
 _SWEEP_BLOCKS = 1056  # blocks of the kernels that walk over all particles
 _CROSSING_BLOCKS = 8448  # blocks of the kernel for queries whose reach leaves a box: what is to do is known to the device only
@@ -32,7 +36,17 @@ _GATHERING = (8, 6)  # blocks of `gather` that are at work at once per multiproc
 # leave out what they should have done.
 MOST_IN_STRIDES = 2**24
 
-LAYOUT = r"""
+# What `share_bits` and `query_blocks` return.
+SHARE = r"""
+int share_bits = 5;
+while (share_bits > 0 && ((m - 1) >> (share_bits - 1)) + 1 <= WARPS)
+    --share_bits;
+const int query_blocks = ((m - 1) >> share_bits) + 1;
+"""
+
+LAYOUT = (
+    SHARE
+    + r"""
 struct Shared {
     Grid grid;
     int finite_queries;
@@ -59,7 +73,6 @@ int* order = take(n);
 int* query_start = own ? start : take(table + 2);
 unsigned long long* query_tile_state = own ? tile_state : (unsigned long long*)take(2 * tile_count);
 int* query_order = own ? order : take(m);
-const int query_blocks = (m + 31) / 32;
 int* crossing = key;  // their numbers: nobody asks for keys and slots once particles are scattered
 int* crosses = slot;  // whether a block does
 const int lane = threadIdx.x & 31, warp_in_block = threadIdx.x >> 5;
@@ -81,6 +94,7 @@ auto depth_of = [&](const real* at) -> float {
 auto is_turned = [](const real* row) { return PERIODIC && Lattice::packed_turns(row[DIM]) != Lattice::NONE; };
 const real INF = DOUBLE ? (real)__longlong_as_double(0x7ff0000000000000ll) : (real)__int_as_float(0x7f800000);
 """
+)
 
 
 def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, table: int | None = None) -> int:
@@ -320,9 +334,10 @@ auto mark = [&](const real* row, const real* p, long long place) {  // a query's
         crosses_box = crosses_box || !(x > crossing_low[a] && x < crossing_high[a]);
     }
     // one lane for all of its warp that belong to the same block
-    const unsigned int alike = __match_any_sync(__activemask(), crosses_box ? (int)(place / 32) : -1);
-    if (crosses_box && (alike & ((1u << lane) - 1)) == 0 && crosses[place / 32] == 0 && atomicExch(crosses + place / 32, 1) == 0)
-        crossing[atomicAdd(&shared.crossing, 1)] = (int)(place / 32);
+    const int of_block = (int)(place >> share_bits);
+    const unsigned int alike = __match_any_sync(__activemask(), crosses_box ? of_block : -1);
+    if (crosses_box && (alike & ((1u << lane) - 1)) == 0 && crosses[of_block] == 0 && atomicExch(crosses + of_block, 1) == 0)
+        crossing[atomicAdd(&shared.crossing, 1)] = of_block;
 };
 for (long long place = thread; of_queries && place < shared.finite_queries; place += threads) {
     real p[3];
@@ -529,9 +544,9 @@ auto halves = [](float x, float factor) -> unsigned int {
 if (PERIODIC && !CROSSING && (block >= query_blocks || crosses[block]))
     return;
 for (int turn = block; !CROSSING || turn < shared.crossing; turn += (int)(threads / 32)) {
-const long long begin = (long long)(CROSSING ? crossing[turn] : turn) * 32;
+const long long begin = (long long)(CROSSING ? crossing[turn] : turn) << share_bits;
 int place = begin < m ? (int)begin : m;
-const int stop = m - place < 32 ? m : place + 32;
+const int share = 1 << share_bits, stop = m - place < share ? m : place + share;
 $opened
 while (place < stop) {
     // one query per lane; those that share a row of cells with the first form a group
@@ -1263,7 +1278,7 @@ if (lane == 0 && longest_row > longest_before) {
 
 
 def walk(*, opened: str = "", none: str, begun: str, settled: str, done: str = "", closed: str = "") -> str:
-    """Return the text of a kernel in which a block of one warp serves 32 queries, from `begin` on, in groups.
+    """Return the text of a kernel in which a block of one warp serves its share of the queries, from `begin` on, in groups.
 
     Around it stand the pieces CELLS, LAYOUT and EXACT. Constants it needs: LIST, or SUMS, or neither, and the pairs are counted:
     `found`; LATER, EXACTLY, CROSSING. With SUMS candidates are images of places in `sorted`, not of sources.
@@ -1341,9 +1356,23 @@ class Kernels(NamedTuple):
         load_walks(self.query, self.crossing, device)
 
 
+def share_bits(m: int) -> int:
+    """Return the binary logarithm of how many of m queries a warp serves: fewer than 32 while warps are few."""
+    return next((bits for bits in range(5) if _shares(m, bits) <= GRID["WARPS"]), 5)
+
+
+def query_blocks(m: int) -> int:
+    """Return how many warps m queries are shared among."""
+    return _shares(m, share_bits(m))
+
+
+def _shares(m: int, bits: int) -> int:
+    return -(-m >> bits)
+
+
 def walks(query: wp.Kernel, crossing: wp.Kernel | None, m: int) -> list[Launch]:
     """Return the launches that walk over m queries: those whose reach leaves a periodic box have a kernel of their own."""
-    threads = -(-m // QUERY_BLOCK) * QUERY_BLOCK
+    threads = query_blocks(m) * QUERY_BLOCK
     if crossing is None:
         return [Launch(query, threads, QUERY_BLOCK, False)]
     first = Launch(crossing, min(threads, _CROSSING_BLOCKS * QUERY_BLOCK), QUERY_BLOCK, False)  # what takes longest

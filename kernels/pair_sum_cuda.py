@@ -25,13 +25,24 @@ from typing import NamedTuple
 import warp as wp
 from jfrnn.kernels._math import SCALAR
 from jfrnn.kernels._native import CELLS, EXACT, SPACES, snippet
-from jfrnn.kernels.cells_cuda import GRID, HELD_PAIRS, LAYOUT, MOST_IN_STRIDES, QUERY_BLOCK, Launch, load_walks, walk, walks
+from jfrnn.kernels.cells_cuda import (
+    GRID,
+    HELD_PAIRS,
+    LAYOUT,
+    MOST_IN_STRIDES,
+    QUERY_BLOCK,
+    Launch,
+    load_walks,
+    query_blocks,
+    walk,
+    walks,
+)
 from jfrnn.kernels.pair_sum_cpu import LITTLE_WORK, TAKE_LARGER, TermText, Value, loaded, placed, work
 
 
 def slots(queries: int) -> int:
     """Return the number of partial sums that make up a sum over all pairs."""
-    return -(-queries // QUERY_BLOCK)
+    return query_blocks(queries)
 
 
 def sorted_numbers(term: TermText, sources: int, dim: int, double: bool) -> int:
@@ -67,7 +78,7 @@ for (long long t = thread; t < (long long)CHUNKS * n; t += threads) {
 """
 
 _OPENED = r"""
-const long long slot_of_totals = begin / 32;
+const long long slot_of_totals = begin >> share_bits;
 for (int t = lane; slot_of_totals < query_blocks && t < 2 * TOTALS; t += 32)
     totals.data[2 * TOTALS * slot_of_totals + t] = 0;
 """

@@ -66,3 +66,32 @@ def test_queries_of_their_own_are_sorted_too():
     assert [launch.of_queries for launch in own] == [False] * 7
     assert [launch.of_queries for launch in others].count(True) == 3
     assert all(launch.threads % launch.block == 0 for launch in own + others)
+
+
+def test_few_queries_are_shared_among_more_warps():
+    warps = cells_cuda.GRID["WARPS"]
+    for m in (1, 1000, warps, warps + 1, 31 * warps, 32 * warps + 1, 10**8):
+        blocks, share = cells_cuda.query_blocks(m), 2 ** cells_cuda.share_bits(m)
+        assert (blocks - 1) * share < m <= blocks * share
+        assert blocks <= warps if share < 32 else blocks >= warps // 2
+        assert share == 1 or -(-m // (share // 2)) > warps
+    assert cells_cuda.query_blocks(0) == 0
+
+
+def test_kernels_share_queries_as_launches_do():
+    text = "{\n" + f"constexpr int WARPS = {cells_cuda.GRID['WARPS']};" + cells_cuda.SHARE
+    text += "shared.data[0] = share_bits;\nshared.data[1] = query_blocks;\n}"
+
+    def share_native(m: int, shared: wp.array(dtype=int)): ...
+
+    function = wp.func_native(text)(share_native)
+
+    def share(queries: wp.array(dtype=int), shared: wp.array2d(dtype=int)):
+        function(queries[wp.tid()], shared[wp.tid()])
+
+    edges = [cells_cuda.GRID["WARPS"] * 2**bits + k for bits in range(7) for k in (-1, 0, 1)]
+    queries = [0, 1, 31, 32, 33, 1000, *edges, 10**6, 2**31 - 1]
+    found = wp.zeros((len(queries), 2), dtype=int, device="cpu")
+    kernel = wp.kernel(share, module="unique")
+    wp.launch(kernel, dim=len(queries), inputs=[wp.array(queries, dtype=int, device="cpu"), found], device="cpu")
+    assert found.numpy().tolist() == [[cells_cuda.share_bits(m), cells_cuda.query_blocks(m)] for m in queries]
