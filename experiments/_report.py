@@ -1,6 +1,7 @@
 """The report of a sweep: reads its rows and nothing else; prints a table, writes report.md, table.csv and pictures."""
 
 import csv
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -124,7 +125,11 @@ def _busy(line: dict[str, Any]) -> str:
 
 
 def _seconds(value: float | None, digits: int = 4) -> str:
-    return ABSENT if value is None else f"{value:.{digits}f}"
+    """Return a time with so many decimals, and more where they would leave fewer than three figures."""
+    if value is None:
+        return ABSENT
+    digits = max(digits, 2 - math.floor(math.log10(value))) if 0 < value < 0.01 else digits
+    return f"{value:.{digits}f}"
 
 
 def _spread(line: dict[str, Any]) -> str:

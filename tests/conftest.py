@@ -28,8 +28,8 @@ def _both_widths():
     jax.config.update("jax_enable_x64", True)
 
 
-@pytest.fixture
-def compiled_soon(request):
+@pytest.fixture(autouse=True)
+def _compiled_soon(request):
     """Leave out what LLVM takes long for and what no float depends on, but in slow tests and those of memory."""
     fully = request.node.get_closest_marker("slow") or "memory" in request.node.name
     jax.config.update("jax_disable_most_optimizations", not fully)

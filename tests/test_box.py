@@ -13,8 +13,6 @@ from jfrnn.cases.periodic import PERIODIC_CASES
 import jfrnn
 from jfrnn._box import unpacked_turns
 
-pytestmark = pytest.mark.usefixtures("compiled_soon")
-
 CAPACITY = 400
 LENGTH = 304
 

@@ -204,3 +204,8 @@ def test_without_memory_there_are_no_pictures_of_it(tmp_path):
     _report.report(tmp_path)
     drawn = {path.stem for path in tmp_path.glob("*.png")}
     assert drawn == {"runtime_by_layout", "runtime_by_fill", "speed_against_error", "speed_against_sum_error"}
+
+
+def test_short_times_keep_three_figures():
+    shown = [_report._seconds(value) for value in (12.3456, 0.01234, 0.0099, 0.000151, 0.0, None)]
+    assert shown == ["12.3456", "0.0123", "0.00990", "0.000151", "0.0000", "·"]

@@ -11,8 +11,6 @@ from jfrnn.cases.hard import HARD_CASES
 
 import jfrnn
 
-pytestmark = pytest.mark.usefixtures("compiled_soon")
-
 BACKENDS = ("jax", "brute", "warp", "hashgrid")
 CAPACITY = 704  # the fullest row of all hard cases fits
 

@@ -201,7 +201,6 @@ def test_sums_take_what_was_planned(gradient):
     assert plan.total_bytes - 20 * n < int(size) < 1.1 * plan.total_bytes + 1e6  # some of the cell table stays untouched
 
 
-@pytest.mark.usefixtures("compiled_soon")
 def test_a_sum_without_translation_is_planned_with_the_array_engine():
     def sorts(r, i, j):
         return jax.numpy.sort(r)

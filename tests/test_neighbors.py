@@ -9,8 +9,6 @@ from jax.test_util import check_grads
 
 import jfrnn
 
-pytestmark = pytest.mark.usefixtures("compiled_soon")
-
 
 def search(points, cutoff, **options):
     """Search with one capacity for all tests, so that they share compiled programs."""

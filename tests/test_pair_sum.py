@@ -20,8 +20,6 @@ from jfrnn import _relations, _runs, _summation
 SLOW = pytest.mark.slow
 LENGTH = 704  # so that cases share compiled programs
 
-pytestmark = pytest.mark.usefixtures("compiled_soon")
-
 
 def arrays_of(pairs, dim):
     """Return i, j and shifts of (i, j) or (i, j, S), sorted."""

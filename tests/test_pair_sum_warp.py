@@ -16,8 +16,6 @@ from test_pair_sum import CUTOFF, HARD, LENGTH, SLOW, N, arrays_of, assert_same,
 import jfrnn
 from jfrnn import _translate
 
-pytestmark = pytest.mark.usefixtures("compiled_soon")
-
 fused = functools.partial(jfrnn.pair_sum, backend="warp")
 
 

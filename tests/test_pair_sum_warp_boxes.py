@@ -14,8 +14,6 @@ from test_pair_sum import CUTOFF, SLOW, N, arrays_of, assert_same, everything, o
 
 import jfrnn
 
-pytestmark = pytest.mark.usefixtures("compiled_soon")
-
 fused = functools.partial(jfrnn.pair_sum, backend="warp")
 NAMES = ["outside_100", "faces", "ulp_across_100", "thin_slab", "skewed_3_small", "skewed_slab", "queries_many_images"]
 

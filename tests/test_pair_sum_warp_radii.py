@@ -17,8 +17,6 @@ from test_radii import LENGTH, radii_of
 import jfrnn
 from jfrnn._exact import RULES
 
-pytestmark = pytest.mark.usefixtures("compiled_soon")
-
 fused = functools.partial(jfrnn.pair_sum, backend="warp")
 
 

@@ -15,8 +15,6 @@ from test_box import image_pairs, masked_images
 import jfrnn
 from jfrnn._exact import RULES
 
-pytestmark = pytest.mark.usefixtures("compiled_soon")
-
 SLOW = pytest.mark.slow
 LENGTH, CAPACITY = 128, 256
 

@@ -18,8 +18,6 @@ def random_points(n, dim, dtype, seed=0):
     return np.random.default_rng(seed).random((n, dim)).astype(dtype)
 
 
-pytestmark = pytest.mark.usefixtures("compiled_soon")
-
 SLOW = pytest.mark.slow
 BRUTE = pytest.param("brute", marks=SLOW)  # its filters and rows are those of "jax", and it compiles as slowly
 OPTIONS = [

@@ -24,8 +24,6 @@ BLOB = fluids.FluidScene(
     physics=fluids.Physics(density=1.0, sound_speed=5.0, smoothing=0.2, state="linear", viscosity=0.1),
 )
 
-pytestmark = pytest.mark.usefixtures("compiled_soon")
-
 
 def stirred(scene):
     """Return a scene whose fluid moves at random: at rest, artificial viscosity and bounces have kinks."""

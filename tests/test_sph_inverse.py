@@ -9,8 +9,6 @@ from typer.testing import CliRunner
 from experiments._cli import app
 from experiments.sph import gradients, inverse
 
-pytestmark = pytest.mark.usefixtures("compiled_soon")
-
 
 @pytest.mark.slow
 def test_a_viscosity_is_found_from_an_early_profile():

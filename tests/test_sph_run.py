@@ -13,8 +13,6 @@ from experiments.sph import health
 from experiments.sph.model import make_model, make_state
 from experiments.sph.settings import make_scene
 
-pytestmark = pytest.mark.usefixtures("compiled_soon")
-
 FEW = ("--frames", 3, "--set", "duration=0.003")
 
 

@@ -15,7 +15,6 @@ from experiments.sph import budget, health, solids, solver, view
 from experiments.sph.kernels import KERNELS
 from experiments.sph.model import make_model, make_state
 
-pytestmark = pytest.mark.usefixtures("compiled_soon")
 TURNS = fluids.Turning((0.1, -0.2, 0.3), (1.0, 2.0, -0.5), 3.0)
 
 

@@ -19,8 +19,6 @@ from experiments._errors import UsageError
 from experiments.sph import edges, forces, speed, speed_report, tradeoff
 from experiments.sph.model import make_model, make_state
 
-pytestmark = pytest.mark.usefixtures("compiled_soon")
-
 TINY = """
 scene = "dam-break-2d"
 nx = [4]

@@ -8,8 +8,6 @@ from jax.sharding import PartitionSpec
 
 import jfrnn
 
-pytestmark = pytest.mark.usefixtures("compiled_soon")
-
 CUTOFF, CAPACITY, BATCH, N = 0.3, 40, 3, 40
 OPTIONS = {"capacity": CAPACITY, "backend": "warp"}
 SEGMENTS = jnp.asarray([[0.2, 0.1], [0.8, 0.4], [0.5, 0.9]], jnp.float32), jnp.asarray([[0, 1], [1, 2], [2, 0]])

@@ -19,7 +19,6 @@ IN_CELLS = ("jax", "warp")
 CAPACITY = 40
 KINDS = list(product((np.float32, np.float64), (2, 3)))
 OFTEN = {(np.float32, 3)}  # the array engine compiles slowly
-pytestmark = pytest.mark.usefixtures("compiled_soon")
 
 
 def search_padded(name, dtype, dim, backend):

@@ -15,7 +15,6 @@ from jfrnn import _triangles_rows
 from jfrnn._exact import make_cutoff
 from jfrnn._triangles_closest import make_normals
 
-pytestmark = pytest.mark.usefixtures("compiled_soon")
 FINITE = [name for name in TRIANGLE_CASES if name not in ("not_finite", "faces_out_of_range", "huge_and_tiny")]
 
 

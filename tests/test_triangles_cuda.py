@@ -27,7 +27,6 @@ from jfrnn._triangles_warp import _Variant, query_inputs, sizes_on_cuda
 
 KINDS = list(product((np.float32, np.float64), (2, 3)))
 GUARD = 64  # words behind the scratch, which nobody may touch
-pytestmark = pytest.mark.usefixtures("compiled_soon")
 
 
 @pytest.mark.parametrize(("dim", "double", "lists", "tree"), list(product((2, 3), *[(False, True)] * 3)))

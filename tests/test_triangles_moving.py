@@ -14,7 +14,6 @@ from jfrnn.cases import meshes
 import jfrnn
 
 BACKENDS = [pytest.param("jax", marks=pytest.mark.slow), "warp", "bvh"]
-pytestmark = pytest.mark.usefixtures("compiled_soon")
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

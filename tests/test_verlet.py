@@ -221,7 +221,6 @@ def test_a_chunk_is_replayed_until_its_list_was_large_enough():
     assert doctest.testmod(_chunks).failed == 0
 
 
-@pytest.mark.usefixtures("compiled_soon")
 @pytest.mark.parametrize(
     ("backend", "dim"),
     [("warp", 2), ("warp", 3), ("hashgrid", 3), *(pytest.param(*x, marks=pytest.mark.slow) for x in (("jax", 3), ("brute", 2)))],
@@ -247,7 +246,6 @@ def test_inactive_particles_have_no_neighbors_and_come_and_go(backend, dim):
         nbrs.update(x, active=np.arange(60) < 51).check()
 
 
-@pytest.mark.usefixtures("compiled_soon")
 def test_vmap_is_a_loop():
     x, moved = (jnp.stack([points(40, 2, np.float32, s) for s in seeds]) for seeds in ((0, 1, 2), (0, 1, 3)))
     lists = [jfrnn.search(one, CUTOFF, skin=SKIN, capacity=40, backend="jax") for one in x]
@@ -260,7 +258,6 @@ def test_vmap_is_a_loop():
     assert after.rebuild_count.tolist() == [0, 0, 1]
 
 
-@pytest.mark.usefixtures("compiled_soon")
 def test_gradients_flow_around_updates():
     x = points(30, 2, np.float64)
 
