@@ -99,14 +99,15 @@ def _measure_search(adapter: methods.Adapter, spec: Spec, scene: "Scene", folder
 
     searching = _measure.PeakMemory()
     steps = getattr(adapter, "STEPS", 1)
-    first = None
-    if spec.max_repeats > 1:
-        [first] = _measure.repeat(search, 1, 0.0, 1)[1]  # its result is gone: memory shall hold one
     bystanders = _measure.Bystanders()
-    result, seconds = _measure.repeat(search, spec.repeats, spec.min_seconds, spec.max_repeats, spec.most_seconds)
-    first = seconds[0] if first is None else first  # where one run takes minutes, it is the only one
-    row |= {"first_s": first / steps, "others_cores": bystanders.cores()}
-    peak, row["device_bytes"] = searching.peak(), device.peak()
+    result, seconds = _measure.repeat(search, 1, 0.0, 1)
+    row["first_s"] = seconds[0] / steps
+    peak, row["device_bytes"] = searching.peak(), device.peak()  # of one search: JAX may free its result during the next
+    if spec.max_repeats > 1:  # else one run takes minutes, and is the only one
+        del result
+        bystanders = _measure.Bystanders()
+        result, seconds = _measure.repeat(search, spec.repeats, spec.min_seconds, spec.max_repeats, spec.most_seconds)
+    row["others_cores"] = bystanders.cores()
 
     found = adapter.read(result)
     row |= _measure.summarize([second / steps for second in seconds])
