@@ -23,8 +23,8 @@ NOTEWORTHY_CORES = 0.25  # what other processes take beyond it is said: it slows
 NOTES = """\
 - **s**: median time of a search, from raw positions to the finished result, without compilation; of several processes the median of
   their medians.
-- **±**: half the interval that holds the median with a probability of 95 % (93.75 % of five processes, which is all that five can
-  tell), in per cent of it. Of several processes it is that of their medians; of one, in brackets, that of its repeats alone.
+- **±**: half the interval that holds the median with a probability of 95 %, in per cent of it; five processes can tell 93.75 % at
+  most, four 87.5 %, three 75 %. Of several processes it is that of their medians; of one, in brackets, that of its repeats alone.
 - **MB**: peak resident memory of the process during the searches, over what was resident after compilation; 10^6 bytes. On a GPU
   the peak of its memory over what it held at first: positions, list and scratch, or what the compiler tried out, if that is more.
 - **/ cll**: divided by the row `cll` of the same scene, process by process of the same round. `≈`: within noise: the interval of

@@ -6,7 +6,8 @@ import jax
 import numpy as np
 
 import jfrnn
-from experiments.methods import Found, at_hand
+from experiments.methods import Found
+from experiments.methods._compiled import compile_for
 
 
 def allocate_backend(positions: np.ndarray, cutoff: float, backend: str) -> int:
@@ -18,13 +19,8 @@ def allocate_backend(positions: np.ndarray, cutoff: float, backend: str) -> int:
 def prepare_backend(
     positions: np.ndarray, cutoff: float, capacity: int, backend: str, kernels: bool = False
 ) -> Callable[[], jfrnn.NeighborList]:
-    """Compile the search, and return it; `kernels` of Warp compile when they first run, here on one particle."""
-    search = jax.jit(lambda x: jfrnn.search(x, cutoff, capacity=capacity, backend=backend))
-    compiled = search.lower(jax.ShapeDtypeStruct(positions.shape, positions.dtype)).compile()
-    if kernels:
-        jax.block_until_ready(search(positions[:1]))
-    x = at_hand(positions)
-    return lambda: jax.block_until_ready(compiled(jax.numpy.asarray(x)))
+    """Compile the search, and return it."""
+    return compile_for(lambda x: jfrnn.search(x, cutoff, capacity=capacity, backend=backend), positions, kernels=kernels)
 
 
 def plan_backend(positions: np.ndarray, cutoff: float, capacity: int, backend: str) -> jfrnn.MemoryPlan:

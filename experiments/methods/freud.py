@@ -19,7 +19,8 @@ def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], Any]:
     """Return a search that sorts the particles and lists the pairs."""
     points = np.pad(positions, ((0, 0), (0, 3 - positions.shape[1])))
     # around the origin, as its boxes are: to move the points instead would round them
-    box = boxes.Box(*(2 * float(most) + 3 * cutoff for most in np.abs(points).max(axis=0)))
+    lengths: Any = [2 * float(most) + 3 * cutoff for most in np.abs(points).max(axis=0)]
+    box = boxes.Box(*lengths)
 
     def search() -> Any:  # noqa: ANN401
         query: Any = locality.AABBQuery(box, points)  # pyright: ignore

@@ -22,7 +22,7 @@ def allocate(positions: np.ndarray, cutoff: float) -> Any:  # noqa: ANN401
     low = positions.min(axis=0)
     size = np.maximum(positions.max(axis=0) - low + 2 * cutoff, 3.5 * cutoff)
     parts = next(k for k in range(MOST_PARTITIONS, 0, -1) if len(positions) % k == 0)
-    functions = neighbor_list(space.free()[0], jnp.asarray(size), cutoff, backend="jaxmd_scan", num_partitions=parts)
+    functions: Any = neighbor_list(space.free()[0], jnp.asarray(size), cutoff, backend="jaxmd_scan", num_partitions=parts)
     return functions.allocate(jnp.asarray(positions - low)), low
 
 

@@ -15,7 +15,7 @@ def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], list[Any]]:
     """Return a search that builds the tree and lists the rows, on one thread."""
 
     def search() -> list[Any]:
-        tree = pynanoflann.KDTree(metric="L2", radius=cutoff)
+        tree: Any = pynanoflann.KDTree(metric="L2", radius=cutoff)
         tree.fit(positions)
         return tree.radius_neighbors(positions, radius=cutoff, return_distance=False)
 

@@ -8,11 +8,12 @@ import numpy as np
 import warp as wp  # noqa: F401 - without it this method is missing, which is no failure
 
 import jfrnn
-from experiments.methods import Found, at_hand
+from experiments.methods import Found
+from experiments.methods._compiled import compile_for
 
 
 def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], tuple[jax.Array, jax.Array]]:
-    """Compile the sum, its kernels too, and return it; all masses are 1, and distances are in cutoffs."""
+    """Compile the sum, and return it; all masses are 1, and distances are in cutoffs."""
     jax.config.update("jax_enable_x64", positions.dtype == np.float64)
     mass, one = jnp.ones(len(positions), positions.dtype), positions.dtype.type(1)
 
@@ -20,12 +21,7 @@ def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], tuple[jax.Arra
         rest = jnp.maximum(1 - (r @ r) / (cutoff * cutoff), 0)
         return j["m"] * rest * rest * rest, one
 
-    sums = jax.jit(lambda x, mass: jfrnn.pair_sum(poly6, x, cutoff, {"m": mass}, backend="warp"))
-    shapes = [jax.ShapeDtypeStruct(shape, positions.dtype) for shape in (positions.shape, mass.shape)]
-    compiled = sums.lower(*shapes).compile()
-    x = at_hand(positions)
-    jax.block_until_ready(sums(jnp.asarray(x)[:1], mass[:1]))  # kernels, and what makes an array of that shape, compile here
-    return lambda: jax.block_until_ready(compiled(jnp.asarray(x), mass))
+    return compile_for(lambda x, mass: jfrnn.pair_sum(poly6, x, cutoff, {"m": mass}, backend="warp"), positions, mass)
 
 
 def plan(positions: np.ndarray, cutoff: float) -> jfrnn.MemoryPlan:

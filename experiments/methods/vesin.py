@@ -15,7 +15,7 @@ from experiments.methods import Found
 PACKAGES = ("vesin",)
 
 
-def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
+def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], tuple[np.ndarray, ...]]:
     """Return a search that lists the pairs."""
     scale = 2.0 ** -math.floor(math.log2(cutoff))
     search, box = NeighborList(cutoff=scale * cutoff, full_list=False), np.zeros((3, 3))  # pyright: ignore
@@ -23,7 +23,7 @@ def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], tuple[np.ndarr
     return lambda: tuple(search.compute(points=scale * points.astype(np.float64), box=box, periodic=False, quantities="ij"))
 
 
-def read(result: tuple[np.ndarray, np.ndarray]) -> Found:
+def read(result: tuple[np.ndarray, ...]) -> Found:
     """Return the pairs."""
     i, j = result
     return Found(i.nbytes + j.nbytes, (np.asarray(i, np.int64), np.asarray(j, np.int64)))

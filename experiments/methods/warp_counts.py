@@ -7,17 +7,13 @@ import numpy as np
 import warp as wp  # noqa: F401 - without it this method is missing, which is no failure
 
 import jfrnn
-from experiments.methods import Found, at_hand
+from experiments.methods import Found
+from experiments.methods._compiled import compile_for
 
 
 def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], jax.Array]:
-    """Compile the count, and return it; kernels of Warp compile when they first run, here on one particle."""
-    jax.config.update("jax_enable_x64", positions.dtype == np.float64)
-    count = jax.jit(lambda x: jfrnn.count(x, cutoff, backend="warp"))
-    compiled = count.lower(jax.ShapeDtypeStruct(positions.shape, positions.dtype)).compile()
-    x = at_hand(positions)
-    jax.block_until_ready(count(jax.numpy.asarray(x)[:1]))  # to make an array of that shape compiles something, too
-    return lambda: jax.block_until_ready(compiled(jax.numpy.asarray(x)))
+    """Compile the count, and return it."""
+    return compile_for(lambda x: jfrnn.count(x, cutoff, backend="warp"), positions)
 
 
 def read(result: jax.Array) -> Found:
