@@ -21,7 +21,10 @@ print("pictures:", sum("image/png" in output.get("data", {}) for output in outpu
 
 
 SAYS = {  # pictures, and what each prints
-    "gpu_layouts": (2, ("NVIDIA H200", "nvalchemi takes", "plan and peak differ by", "warp, ns per particle by layout")),
+    "gpu_layouts": (
+        2,
+        ("NVIDIA H200", "nvalchemi takes", "plan and peak differ by", "warp, ns per particle: corners", " 0 of them wrong"),
+    ),
     "open_questions": (
         2,
         ("times as long as cll", "turned2 tumbled / straight", "spacings per step: nanoflann-dynamic", "growth: time"),
