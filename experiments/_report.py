@@ -13,7 +13,7 @@ from rich.text import Text
 
 from experiments import _table
 from experiments._errors import UsageError
-from experiments._rows import Row, RowFile
+from experiments._rows import Row, read_latest
 
 TITLES = ("scene", "points", "method", "s", "±", "/ cll", "MB", "/ cll", "missing", "extra", "thesis", "s", "/ CLL", "MB", "/ CLL")
 TEXT_COLUMNS = ("scene", "method", "thesis")
@@ -25,8 +25,9 @@ NOTES = """\
   their medians.
 - **±**: half the interval that holds the median with a probability of 95 %, in per cent of it; five processes can tell 93.75 % at
   most, four 87.5 %, three 75 %. Of several processes it is that of their medians; of one, in brackets, that of its repeats alone.
-- **MB**: peak resident memory of the process during the searches, over what was resident after compilation; 10^6 bytes. On a GPU
-  the peak of its memory over what it held at first: positions, list and scratch, or what the compiler tried out, if that is more.
+- **MB**: peak resident memory of the process during its first search, over what was resident after compilation; 10^6 bytes. On a
+  GPU the peak of its memory over what it held at first: positions, list and scratch, or what the compiler tried out, if that is
+  more.
 - **/ cll**: divided by the row `cll` of the same scene, process by process of the same round. `≈`: within noise: the interval of
   that ratio holds 1 (of one process: the intervals of both overlap).
 - **missing**, **extra**: unordered pairs against the exact answer on the given floats, distance < cutoff. Of a method without pair
@@ -48,7 +49,7 @@ def report(folder: Path) -> None:
     Raises:
         UsageError: The folder holds no rows.
     """
-    rows = RowFile(folder).read()
+    rows = read_latest(folder)
     if not rows:
         raise UsageError(f"{folder}: no rows; fill it with `python -m experiments run CONFIG.toml --out {folder}`")
     from experiments import _page, _plots, _statistics

@@ -52,8 +52,9 @@ class Row:
         repeats: Number of timed runs after the first.
         seconds: All their times [s].
         others_cores: Cores that other processes of the machine kept busy meanwhile, on average; None below 0.2 s.
-        peak_bytes: Peak resident memory over the start (imports done, positions made), allocation and compilation included.
-        search_bytes: The same over what was resident after compilation: what the search itself takes, at least list_bytes;
+        peak_bytes: Peak resident memory over the start (imports done, positions made), allocation, compilation and the first search
+            included.
+        search_bytes: That of the first search over what was resident after compilation: what it takes itself, at least list_bytes;
             unknown where the peak cannot be reset. On an accelerator `device_bytes`.
         list_bytes: Size of the result.
         scratch_bytes: search_bytes - list_bytes.
@@ -234,3 +235,15 @@ class RowFile(Generic[RowT]):
                 if number < len(lines):  # what follows the last line feed is empty, or what a kill left
                     raise UsageError(f"{self.path}: line {number} is no row ({error}): repair or remove that line") from error
         return list(rows.values())
+
+
+def read_latest(folder: Path) -> list[Row]:
+    """Return the rows of a sweep that count: of one method on one scene in one round, the last in the file.
+
+    A config that changes how it measures, by how many repeats say, gives its rows other keys, and those from before stay.
+
+    Raises:
+        UsageError: A line is no row.
+    """
+    rows = RowFile(folder).read()
+    return list({(*row.scene_key, row.method, row.process): row for row in rows}.values())

@@ -13,7 +13,7 @@ from scipy import stats
 
 from experiments import _config, _sweep, _table
 from experiments._config import Config, Scenes
-from experiments._rows import SCENE_FIELDS, Row, RowFile
+from experiments._rows import SCENE_FIELDS, Row, read_latest
 
 ROOT = Path(__file__).resolve().parent
 Frame = Any  # a pd.DataFrame; what its columns hold, its annotations do not know
@@ -31,7 +31,7 @@ def rows(sweep: str, small: bool, results: str | None = None) -> list[Row]:
     """
     folder = ROOT / "results" / (results or sweep)
     if not small and (folder / "rows.jsonl").exists():
-        return RowFile(folder).read()
+        return read_latest(folder)
     config = shrink(_config.load(ROOT / "configs" / f"{sweep}.toml"))
     out = Path(tempfile.mkdtemp()) if small else ROOT.parent / "out" / "small" / sweep
     with redirect_stderr(io.StringIO()):  # its progress is no result

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from experiments import _report, _statistics, _table
 from experiments._cli import app
-from experiments._rows import RowFile
+from experiments._rows import RowFile, read_latest
 
 
 @pytest.mark.parametrize(("n", "low", "confidence"), [(1, 0, 0.0), (2, 0, 0.5), (5, 0, 0.9375), (6, 0, 0.96875), (9, 1, 0.9609375)])
@@ -42,6 +42,18 @@ def test_processes_become_one_row():
     failed = replace(rows[0], key="f", process=9, status="failed", reason="no", median_s=None)
     assert _statistics.summarize([*rows, failed])[0].processes == 5
     assert _statistics.summarize([failed])[0].reason == "no"
+
+
+def test_rows_measured_in_another_way_replace_those_from_before(tmp_path):
+    before = rounds("jax", [3.0, 1.0, 2.0])
+    again = replace(before[1], key="another way", median_s=4.0)
+    for row in [*before, *rounds("cll", [1.0]), again]:
+        RowFile(tmp_path).append(row)
+    found = [(row.method, row.process, row.median_s) for row in read_latest(tmp_path)]
+    assert found == [("jax", 0, 3.0), ("jax", 1, 4.0), ("jax", 2, 2.0), ("cll", 0, 1.0)]
+    _report.report(tmp_path)
+    table = pd.read_csv(tmp_path / "table.csv").set_index("method")
+    assert (table.loc["jax", "median_s"], table.loc["jax", "processes"], table.loc["jax", "repeats"]) == (3.0, 3, 9)
 
 
 def test_a_ratio_is_taken_round_by_round_so_that_drift_cancels():
