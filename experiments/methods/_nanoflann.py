@@ -51,7 +51,9 @@ def follow(positions: np.ndarray, cutoff: float, motion: float, *, dynamic: bool
                 continue
             if tree is None:
                 tree = ctypes.c_void_p(LIBRARY.dynamic_new(_native.pointer(points), n, dim))
-            pairs = _native.take_pairs(LIBRARY, LIBRARY.dynamic_search(tree, _native.pointer(points), radius))
+            else:
+                LIBRARY.dynamic_move(tree, _native.pointer(points))
+            pairs = _native.take_pairs(LIBRARY, LIBRARY.dynamic_search(tree, radius))
         if dynamic:
             LIBRARY.dynamic_release(tree)
         return pairs, x  # pyright: ignore[reportPossiblyUnboundVariable]

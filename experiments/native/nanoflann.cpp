@@ -64,16 +64,22 @@ void* static_search(const double* points, int32_t n, int32_t dim, double cutoff)
   return list_pairs(tree, cloud, n, cutoff);
 }
 
+// Puts `points`, shape [n, dim], into a dynamic index.
 void* dynamic_new(const double* points, int32_t n, int32_t dim) { return new Follower(points, n, dim); }
 
-// Forgets where the particles were, adds where they are, and returns the list of pairs. A point cannot be moved: its place is marked as
-// gone, which stays in the trees, and the particle comes back as a new one.
-void* dynamic_search(void* handle, const double* points, double cutoff) {
+// Forgets where the particles were, and adds where they are. A point cannot be moved: its place is marked as gone, which stays in the
+// trees, and the particle comes back as a new one.
+void dynamic_move(void* handle, const double* points) {
   auto& [cloud, n, tree] = *static_cast<Follower*>(handle);
   const size_t last = cloud.kdtree_get_point_count();
   for (size_t old = last - n; old < last; ++old) tree.removePoint(old);
   cloud.rows.insert(cloud.rows.end(), points, points + int64_t(n) * cloud.dim);
   tree.addPoints(last, last + n - 1);
+}
+
+// Returns the list of pairs closer than the cutoff where the particles are.
+void* dynamic_search(void* handle, double cutoff) {
+  const auto& [cloud, n, tree] = *static_cast<Follower*>(handle);
   return list_pairs(tree, cloud, n, cutoff);
 }
 
