@@ -147,9 +147,11 @@ def merge(folder: Path, parts: Iterable[Path]) -> int:
     """Add to a folder the rows of others that it does not hold, and return how many came; of one key, a row that is ok counts.
 
     Raises:
-        UsageError: A part has no rows, or a line of it is no row.
+        UsageError: There are no parts, a part has no rows, or a line of it is no row.
     """
-    file, came = RowFile(folder), 0
+    file, came, parts = RowFile(folder), 0, list(parts)
+    if not parts:
+        raise UsageError(f"{folder}: no folders shard-K-of-N in it; name the folders whose rows are to go there")
     with file.locked():
         file.repair()
         rows = {row.key: row for row in file.read()}

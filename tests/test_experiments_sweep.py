@@ -248,6 +248,29 @@ def test_of_one_key_a_row_with_figures_counts_when_rows_are_merged(tmp_path):
     assert [row.status for row in _rows.RowFile(tmp_path / "bad").read()] == ["ok"]
     with pytest.raises(UsageError, match="none: no rows to merge"):
         _sweep.merge(tmp_path / "good", [tmp_path / "none"])
+    with pytest.raises(UsageError, match="good: no folders shard-K-of-N in it; name the folders"):
+        _sweep.merge(tmp_path / "good", [])
+
+
+def test_an_array_job_measures_its_part(tmp_path):
+    """The script that SLURM starts, with what SLURM sets, in a folder that has a .venv as the repository has."""
+    script = ROOT / "experiments" / "slurm" / "sweep.sbatch"
+    (tmp_path / ".venv" / "bin").mkdir(parents=True)
+    python = tmp_path / ".venv" / "bin" / "python"
+    python.write_text(f'#!/bin/sh\nexec "{sys.executable}" "$@"\n')
+    python.chmod(0o755)
+    sweep = Sweep(tmp_path, 'methods = ["scipy-kdtree"]\nspacing = 1e-3\nrepeats = 2\nmin_seconds = 0.0\n' + FOUR)
+    environment = os.environ | {"SLURM_SUBMIT_DIR": str(tmp_path), "SLURM_ARRAY_TASK_ID": "2", "PYTHONPATH": str(ROOT)}
+
+    def submit(*given, **more):
+        command = ["bash", str(script), *map(str, given)]
+        return subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, env=environment | more)
+
+    assert submit(sweep.config, sweep.out, 3).returncode == 0
+    assert [path.name for path in sweep.out.iterdir()] == ["shard-2-of-3"]
+    assert len(_rows.RowFile(sweep.out / "shard-2-of-3").read()) == 1
+    assert "number of parts" in submit(sweep.config, sweep.out).stderr
+    assert "expected K/N with 1 <= K <= N" in submit(sweep.config, sweep.out, 3, SLURM_ARRAY_TASK_ID="0").stderr
 
 
 @pytest.mark.parametrize("text", ["3/2", "0/2", "2", "a/b"])
