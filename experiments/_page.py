@@ -8,6 +8,8 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
+from experiments import _table
+
 TEMPLATE = Path(__file__).parent / "report.html.j2"
 SHOWN = (  # column, title, digits
     *(
@@ -17,8 +19,8 @@ SHOWN = (  # column, title, digits
         ("median_s", "s", ".3g"),
         ("low_s", "from", ".3g"),
     ),
-    *(("high_s", "to", ".3g"), ("processes", "processes", "d"), ("seconds_to_cll", "/ cll", ".3g"), ("search_mb", "MB", ".1f")),
-    *(("mb_to_cll", "MB / cll", ".3g"), ("list_mb", "list MB", ".1f"), ("scratch_mb", "scratch MB", ".1f")),
+    *(("high_s", "to", ".3g"), ("processes", "processes", "d"), ("seconds_ratio", "/ {}", ".3g"), ("search_mb", "MB", ".1f")),
+    *(("mb_ratio", "MB / {}", ".3g"), ("list_mb", "list MB", ".1f"), ("scratch_mb", "scratch MB", ".1f")),
     *(("planned_list_mb", "planned list", ".1f"), ("planned_scratch_mb", "planned scratch", ".1f"), ("missing", "missing", "d")),
     *(("extra", "extra", "d"), ("density_error", "density error", ".1e"), ("gradient_error", "gradient error", ".1e")),
     *(("jump_error", "jump error", ".1e"), ("t_ksearch", "t_ksearch", ".3g"), ("t_frsearch", "t_frsearch", ".3g")),
@@ -44,7 +46,12 @@ def write(path: Path, title: str, origin: str, lines: list[dict[str, Any]], note
     images = [(picture.stem.replace("_", " "), base64.b64encode(picture.read_bytes()).decode()) for picture in pictures]
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     page = environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
-        title=title, origin=origin, titles=[text for _, text, _ in columns], rows=rows, notes=_items(notes), images=images
+        title=title,
+        origin=origin,
+        titles=[text.format(lines[0]["yardstick"]) for _, text, _ in columns],
+        rows=rows,
+        notes=_items(notes),
+        images=images,
     )
     path.write_text(page, encoding="utf-8")
 
@@ -59,9 +66,10 @@ def _cell(line: dict[str, Any], name: str, digits: str) -> dict[str, Any]:
         return {"text": value, "hint": "", "by": value, "kind": "text"}
     text = format(value, digits).replace(",", " ") if math.isfinite(value) else str(value)
     about = "~" if name in ("missing", "extra") and line["compared"] != "pairs" else ""
-    about = "≈" if name == "seconds_to_cll" and line["within_noise"] else about
+    about = _table.noise_mark(line) if name == "seconds_ratio" else about
     kind = "wrong" if name in ("missing", "extra") and value else "number"
-    return {"text": about + text, "hint": "", "by": value, "kind": kind}
+    partial = name == "processes" and bool(line["reason"])
+    return {"text": about + text + " !" * partial, "hint": line["reason"] if partial else "", "by": value, "kind": kind}
 
 
 def _items(notes: str) -> list[Markup]:

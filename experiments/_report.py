@@ -15,7 +15,8 @@ from experiments import _table
 from experiments._errors import UsageError
 from experiments._rows import Row, read_latest
 
-TITLES = ("scene", "points", "method", "s", "±", "/ cll", "MB", "/ cll", "missing", "extra", "thesis", "s", "/ CLL", "MB", "/ CLL")
+TITLES = ("scene", "points", "method", "s", "±", "/ {}", "MB", "/ {}", "missing", "extra", "density error", "gradient error")
+TITLES += ("thesis", "s", "/ CLL", "MB", "/ CLL")
 TEXT_COLUMNS = ("scene", "method", "thesis")
 ABSENT = "·"
 NOTEWORTHY_CORES = 0.25  # what other processes take beyond it is said: it slows down the methods that use all cores
@@ -25,13 +26,18 @@ NOTES = """\
   their medians.
 - **±**: half the interval that holds the median with a probability of 95 %, in per cent of it; five processes can tell 93.75 % at
   most, four 87.5 %, three 75 %. Of several processes it is that of their medians; of one, in brackets, that of its repeats alone.
+  table.csv tells how many there are of each.
 - **MB**: peak resident memory of the process during its first search, over what was resident after compilation; 10^6 bytes. On a
   GPU the peak of its memory over what it held at first: positions, list and scratch, or what the compiler tried out, if that is
   more.
-- **/ cll**: divided by the row `cll` of the same scene, process by process of the same round. `≈`: within noise: the interval of
-  that ratio holds 1 (of one process: the intervals of both overlap).
+- **/ cll**, or another method's name in a sweep that has no `cll`: divided by the row of that method on the same scene, process by
+  process of the same round. `≈`: within noise: the interval of that ratio holds 1 (of one process: the intervals of both overlap).
+  `?`: fewer than three rounds, or repeats too few to tell.
 - **missing**, **extra**: unordered pairs against the exact answer on the given floats, distance < cutoff. Of a method without pair
-  list (`~`), only the surplus and the deficit of each particle can be seen.
+  list (`~`), only the surplus and the deficit of each particle can be seen; of more than two million particles (`~`, too), those
+  of 20 000 of them.
+- **density error**, **gradient error**: of a poly6 density over the neighbors that were found and of its gradient, the largest of
+  all particles, over the mean density, and over that per cutoff; `pair-sum` makes such a density itself.
 - **thesis**: Table 6.1 of J. Peifle, Implementation of a Nearest-Neighbor Search for Particle Simulation in Sparse Computational
   Domains, KIT, February 2019: the method closest to ours, its total time, the largest resident set of its process, and both
   divided by its own CLL. Its machine was another, so only ratios compare.
@@ -96,6 +102,11 @@ def _describe_machine(machine: dict[str, Any]) -> str:
     return f"{machine.get('cpu')}, {machine.get('cores')} cores{size}"
 
 
+def titles(lines: list[dict[str, Any]]) -> list[str]:
+    """Return the titles of the columns, with the name of the method that ratios divide by."""
+    return [title.format(lines[0]["yardstick"]) for title in TITLES]
+
+
 def cells(line: dict[str, Any]) -> list[str]:
     """Return what the printed table shows of a line, a text per entry of `TITLES`."""
     return [
@@ -103,11 +114,12 @@ def cells(line: dict[str, Any]) -> list[str]:
         *(
             _busy(line) + _seconds(line["median_s"]),
             _spread(line),
-            ("≈" if line["within_noise"] else "") + _ratio(line["seconds_to_cll"]),
+            _table.noise_mark(line) + _ratio(line["seconds_ratio"]),
             _megabytes(line["search_mb"]),
-            _ratio(line["mb_to_cll"]),
+            _ratio(line["mb_ratio"]),
         ),
-        *(_errors(line, "missing"), _errors(line, "extra"), line["thesis_method"] or ABSENT),
+        *(_errors(line, "missing"), _errors(line, "extra"), _relative(line["density_error"]), _relative(line["gradient_error"])),
+        line["thesis_method"] or ABSENT,
         *(_seconds(line["thesis_s"], 2), _ratio(line["thesis_s_to_cll"])),
         *(_megabytes(line["thesis_mb"]), _ratio(line["thesis_mb_to_cll"])),
     ]
@@ -118,7 +130,11 @@ def _count(value: int | None) -> str:
 
 
 def _errors(line: dict[str, Any], name: str) -> str:
-    return ("~" if line["compared"] == "counts" else "") + _count(line[name])
+    return ("~" if line["compared"] in ("counts", "sample") else "") + _count(line[name])
+
+
+def _relative(value: float | None) -> str:
+    return ABSENT if value is None else f"{value:.1e}" if value else "0"
 
 
 def _busy(line: dict[str, Any]) -> str:
@@ -135,7 +151,7 @@ def _seconds(value: float | None, digits: int = 4) -> str:
 
 def _spread(line: dict[str, Any]) -> str:
     """Return half the interval of the median in per cent, in brackets where it is that of one process."""
-    if line["low_s"] is None or not line["median_s"]:
+    if line["low_s"] is None or not line["median_s"] or not line["confidence"]:
         return ABSENT
     text = f"{50 * (line['high_s'] - line['low_s']) / line['median_s']:.1f} %"
     return text if line["processes"] > 1 else f"({text})"
@@ -154,7 +170,7 @@ def _ratio(value: float | None) -> str:
 def rich_table(lines: list[dict[str, Any]]) -> Table:
     """Return the printed table, a section per scene; what has no figures says why."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for title in TITLES:
+    for title in titles(lines):
         table.add_column(title, justify="left" if title in TEXT_COLUMNS else "right", no_wrap=True)
     previous = None
     for line in lines:
@@ -186,11 +202,11 @@ def write_csv(lines: list[dict[str, Any]], path: Path) -> None:
 
 def markdown(rows: list[Row], lines: list[dict[str, Any]], pictures: list[Path]) -> str:
     """Return report.md."""
-    head = [" | ".join(TITLES), " | ".join(":---" if title in TEXT_COLUMNS else "---:" for title in TITLES)]
+    head = [" | ".join(titles(lines)), " | ".join(":---" if title in TEXT_COLUMNS else "---:" for title in TITLES)]
     body = [" | ".join(cells(line)) for line in lines]
     table = [f"| {text} |" for text in (*head, *body)]
-    failed = [line for line in lines if line["status"] != "ok"]
-    unfinished = [f"- {line['scene']}, {line['method']}: {line['status']}: {line['reason']}" for line in failed]
-    reasons = ["## Rows without figures", "", *unfinished, ""] if unfinished else []
+    failed = [(line, f"{line['status']}: " if line["status"] != "ok" else "") for line in lines if line["reason"]]
+    unfinished = [f"- {line['scene']}, {line['method']}: {status}{line['reason']}" for line, status in failed]
+    reasons = ["## Rows, and processes of them, without figures", "", *unfinished, ""] if unfinished else []
     images = [f"![{path.stem.replace('_', ' ')}]({path.name})" for path in pictures]
     return "\n".join([f"# Sweep {_title(rows)}", "", describe_origin(rows), "", *table, "", NOTES, *reasons, *images, ""])

@@ -37,7 +37,7 @@ class Row:
         order: Of the particles: layout, shuffled, or sorted.
         motion: How far particles went between two searches [spacings].
         status: One of `STATUSES`.
-        reason: Why the status is not ok.
+        reason: Why the status is not ok; of several processes as one row, why some of them have no figures.
         fill: Fill that the scene has.
         cutoff: Cutoff [m], rounded to the dtype.
         points: Number of particles n.
@@ -69,7 +69,8 @@ class Row:
         exact_pairs: Unordered pairs of the oracle.
         missing: Unordered pairs that the oracle has and the method has not.
         extra: Unordered pairs that the method has and the oracle has not, repeated ones included.
-        compared: `pairs`, or `counts` where a method gives only neighbors per particle.
+        compared: `pairs`, `counts` where a method gives only neighbors per particle, or `sample`: counts of 20 000 particles, where
+            there are more than two million; `exact_pairs`, `missing` and `extra` are theirs then, `pairs` still those of all.
         density_error: Largest error of a poly6 density over the neighbors that were found, over the mean density.
         gradient_error: The same of the length of its gradient, over the mean density per cutoff.
         jump_error: The same of a sum of unit vectors, the gradient of 1 - r / cutoff, over the mean number of neighbors: it does
@@ -222,19 +223,27 @@ class RowFile(Generic[RowT]):
         Raises:
             UsageError: A line is no row.
         """
+        return list({cast(Any, row).key: row for row in self.read_all()}.values())
+
+    def read_all(self) -> list[RowT]:
+        """Return the rows as they stand in the file, also those that others with their key have replaced.
+
+        Raises:
+            UsageError: A line is no row.
+        """
         if not self.path.exists():
             return []
         known = {item.name for item in fields(cast(Any, self._kind))}
-        rows: dict[str, RowT] = {}
+        rows: list[RowT] = []
         lines = self.path.read_text(encoding="utf-8").split("\n")
         for number, line in enumerate(lines, start=1):
             try:
                 values = json.loads(line)
-                rows[values["key"]] = self._kind(**{name: value for name, value in values.items() if name in known})
+                rows.append(self._kind(**{name: value for name, value in values.items() if name in known}))
             except (ValueError, TypeError, KeyError, AttributeError) as error:
                 if number < len(lines):  # what follows the last line feed is empty, or what a kill left
                     raise UsageError(f"{self.path}: line {number} is no row ({error}): repair or remove that line") from error
-        return list(rows.values())
+        return rows
 
 
 def read_latest(folder: Path) -> list[Row]:
@@ -245,5 +254,4 @@ def read_latest(folder: Path) -> list[Row]:
     Raises:
         UsageError: A line is no row.
     """
-    rows = RowFile(folder).read()
-    return list({(*row.scene_key, row.method, row.process): row for row in rows}.values())
+    return list({(*row.scene_key, row.method, row.process): row for row in RowFile(folder).read_all()}.values())

@@ -11,6 +11,9 @@ from scipy import stats
 from experiments._rows import Row
 
 CONFIDENCE = 0.95
+LEAST_CONFIDENCE = 0.7  # two rounds tell with 50 %, three with 75 %: below it, nothing is said
+FIRST_ALONE = ("density_error", "gradient_error", "jump_error", "planned_list_bytes", "planned_scratch_bytes")
+"""What the first process alone finds out."""
 
 
 class Interval(NamedTuple):
@@ -79,6 +82,9 @@ def _summary(group: list[Row]) -> Summary:
         return summary
     summary.medians = {row.process: row.median_s for row in good if row.median_s is not None}
     summary.processes = len(good)
+    if len(good) < len(group):
+        bad = next(row for row in group if row.status != "ok" or row.median_s is None)
+        summary.reason = f"{len(group) - len(good)} of {len(group)} processes, the first of them {bad.status}: {bad.reason}"
     pooled = [second for row in good for second in row.seconds]
     sampled = list(summary.medians.values()) if len(good) > 1 else pooled
     edges = median_interval(sampled)[1:] if sampled else (None, None, None)
@@ -95,8 +101,10 @@ def _summary(group: list[Row]) -> Summary:
         seconds=pooled,
         repeats=len(pooled) or known.repeats,
         others_cores=max(busy) if busy else None,
+        compile_s=known.compile_s if known.process == 0 else None,  # later ones find their kernels compiled
         parts={name: float(np.median([row.parts[name] for row in good if name in row.parts])) for name in known.parts},
         **worst,
+        **{name: next((value for row in good if (value := getattr(row, name)) is not None), None) for name in FIRST_ALONE},
         **{name: _middle(good, name) for name in ("search_bytes", "peak_bytes", "scratch_bytes", "device_bytes")},
         **dict(zip(("low_s", "high_s", "confidence"), edges, strict=True)),
     )
@@ -119,11 +127,10 @@ def ratio_interval(mine: Summary, theirs: Summary) -> Interval | None:
 
 
 def within_noise(mine: Summary, theirs: Summary) -> bool | None:
-    """Whether the interval of their ratio holds 1; of one process, whether those of the repeats overlap; None if unknown."""
+    """Whether the interval of their ratio holds 1; of one process, whether those of the repeats overlap; None: too few."""
     ratio = ratio_interval(mine, theirs)
     if ratio is not None:
-        return ratio.low <= 1 <= ratio.high
-    edges = (mine.low_s, mine.high_s, theirs.low_s, theirs.high_s)
-    if any(edge is None for edge in edges):
+        return ratio.low <= 1 <= ratio.high if ratio.confidence > LEAST_CONFIDENCE else None
+    if any((one.confidence or 0.0) < LEAST_CONFIDENCE for one in (mine, theirs)):
         return None
     return not (mine.high_s < theirs.low_s or theirs.high_s < mine.low_s)  # pyright: ignore[reportOperatorIssue]

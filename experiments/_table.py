@@ -1,4 +1,4 @@
-"""The table of a sweep: a line per row, beside what the thesis says, with ratios to cell-linked lists on either side."""
+"""The table of a sweep: a line per row, beside what the thesis says, with ratios to cell-linked lists or another method."""
 
 from collections.abc import Sequence
 from typing import Any, TypeVar
@@ -9,7 +9,8 @@ from experiments._statistics import Summary
 
 RowT = TypeVar("RowT", bound=Row)
 
-YARDSTICK = "cll"
+YARDSTICKS = ("cll", "warp", "warp-counts", "warp-rebuild")
+"""What ratios divide by: the first of these that a sweep has."""
 PARTS = ("t_tree", "t_ksearch", "t_frsearch", "t_processing")
 COLUMNS = (
     *(
@@ -28,8 +29,8 @@ COLUMNS = (
         "order",
     ),
     *("motion", "method", "status", "reason", "processes", "repeats", "allocate_s", "compile_s", "first_s", "median_s", "low_s"),
-    *("high_s", "confidence", "p10_s", "p90_s", *PARTS, "rebuilt", "others_cores", "seconds_to_cll", "within_noise"),
-    *("search_mb", "list_mb", "scratch_mb", "peak_mb", "device_mb", "planned_list_mb", "planned_scratch_mb", "mb_to_cll"),
+    *("high_s", "confidence", "p10_s", "p90_s", *PARTS, "rebuilt", "others_cores", "yardstick", "seconds_ratio", "within_noise"),
+    *("search_mb", "list_mb", "scratch_mb", "peak_mb", "device_mb", "planned_list_mb", "planned_scratch_mb", "mb_ratio"),
     *("pairs", "missing", "extra", "compared", "density_error", "gradient_error", "jump_error"),
     *("thesis_method", "thesis_points", "thesis_s", "thesis_s_to_cll", "thesis_mb", "thesis_mb_to_cll"),
 )
@@ -38,14 +39,18 @@ COLUMNS = (
 def lines(rows: list[Row]) -> list[dict[str, Any]]:
     """Return a line per method and scene, with the keys `COLUMNS`, None where there is nothing to say.
 
-    Scenes stand in order of their points; within one, the methods stand as the rows do. `seconds_to_cll` and `mb_to_cll` divide by
-    the row `cll` of the same scene, seconds round by round; `thesis_..._to_cll` divide the thesis's figures by its own. MB are 10^6
-    bytes; `search_mb` is what the search takes over what was resident after compilation, `peak_mb` counts compilation too.
+    Scenes stand in order of their points; within one, the methods stand as the rows do. `seconds_ratio` and `mb_ratio` divide by
+    the row of the method `yardstick` of the same scene, seconds round by round; `thesis_..._to_cll` divide the thesis's figures by
+    its own. MB are 10^6 bytes; `search_mb` is what the search takes over what was resident after compilation, `peak_mb` counts
+    compilation too.
     """
     summaries = _statistics.summarize(rows)
     names = name_scenes(summaries)
-    yardsticks = {row.scene_key: row for row in summaries if row.method == YARDSTICK and row.status == "ok"}
-    return [_line(row, names[row.scene_key], yardsticks.get(row.scene_key)) for row in in_order(summaries)]
+    present = {row.method for row in summaries}
+    yardstick = next((name for name in YARDSTICKS if name in present), YARDSTICKS[0])
+    others = {row.scene_key: row for row in summaries if row.method == yardstick and row.status == "ok"}
+    made = [_line(row, names[row.scene_key], others.get(row.scene_key)) for row in in_order(summaries)]
+    return [line | {"yardstick": yardstick} for line in made]
 
 
 def in_order(rows: Sequence[RowT]) -> list[RowT]:
@@ -87,16 +92,27 @@ def ratio(value: float | None, yardstick: float | None) -> float | None:
     return value / yardstick if value is not None and yardstick else None
 
 
-def _line(row: Summary, scene: str, cll: Summary | None) -> dict[str, Any]:
-    paired = None if cll is None or cll is row else _statistics.ratio_interval(row, cll)
+def noise_mark(line: dict[str, Any]) -> str:
+    """Return what stands before the ratio of times of a line: whether it is within noise."""
+    if line["method"] == line["yardstick"] or line["seconds_ratio"] is None:
+        return ""
+    return {True: "≈", False: "", None: "?"}[line["within_noise"]]
+
+
+def _line(row: Summary, scene: str, other: Summary | None) -> dict[str, Any]:
+    paired = None if other is None or other is row else _statistics.ratio_interval(row, other)
     thesis, thesis_cll = _thesis.figures(row), _thesis.figures(row, "CLL")
     line = {name: getattr(row, name) for name in COLUMNS if hasattr(row, name)}
-    line |= {"scene": scene, "seconds_to_cll": paired.middle if paired else ratio(row.median_s, cll and cll.median_s), **row.parts}
+    line |= {
+        "scene": scene,
+        "seconds_ratio": paired.middle if paired else ratio(row.median_s, other and other.median_s),
+        **row.parts,
+    }
     line["processes"] = row.processes or None
-    line["within_noise"] = None if cll is None or cll is row else _statistics.within_noise(row, cll)
+    line["within_noise"] = None if other is None or other is row else _statistics.within_noise(row, other)
     sizes = ("search", "list", "scratch", "peak", "device", "planned_list", "planned_scratch")
     line |= {f"{name}_mb": megabytes(getattr(row, f"{name}_bytes")) for name in sizes}
-    line["mb_to_cll"] = ratio(row.search_bytes, cll and cll.search_bytes)
+    line["mb_ratio"] = ratio(row.search_bytes, other and other.search_bytes)
     if thesis is not None and thesis_cll is not None:
         line |= {"thesis_method": thesis.method, "thesis_points": thesis.points}
         line |= {"thesis_s": thesis.seconds, "thesis_s_to_cll": ratio(thesis.seconds, thesis_cll.seconds)}

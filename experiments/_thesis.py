@@ -15,7 +15,7 @@ COUNTERPARTS = {
     **{"scipy-kdtree": "ANN", "scipy-kdtree-nolist": "ANN-NL"},
 }
 """Methods of ours and what the thesis has that is like them, the most alike first."""
-SPACING, CUTOFF_RATIO, DIM = 1e-4, 3.0, 3
+SPACING, CUTOFF_RATIO, DIM, ORDER = 1e-4, 3.0, 3, "layout"
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,7 @@ def figures(row: Row, method: str | None = None) -> Figures | None:
     """
     wanted = method or COUNTERPARTS.get(row.method)
     same_lattice = math.isclose(row.spacing, SPACING) and math.isclose(row.cutoff_ratio, CUTOFF_RATIO) and row.dim == DIM
+    same_lattice = same_lattice and row.order == ORDER
     fill = row.fill if row.fill_asked is None else row.fill_asked
     if wanted is None or fill is None or not same_lattice:
         return None

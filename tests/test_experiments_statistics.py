@@ -40,8 +40,22 @@ def test_processes_become_one_row():
     assert (summary.median_s, summary.low_s, summary.high_s, summary.processes, summary.repeats) == (3.0, 1.0, 5.0, 5, 15)
     assert (summary.extra, summary.missing, summary.search_bytes) == (4, 0, 10_000_000)
     failed = replace(rows[0], key="f", process=9, status="failed", reason="no", median_s=None)
-    assert _statistics.summarize([*rows, failed])[0].processes == 5
+    partial = _statistics.summarize([*rows, failed])[0]
+    assert (partial.status, partial.processes, partial.reason) == ("ok", 5, "1 of 6 processes, the first of them failed: no")
+    assert "- corners 11 %, jax: 1 of 6 processes, the first of them failed: no" in _report.markdown(
+        [*rows, failed], _table.lines([*rows, failed]), []
+    )
     assert _statistics.summarize([failed])[0].reason == "no"
+
+
+def test_what_the_first_process_alone_finds_out_may_come_later():
+    rows = rounds("jax", [3.0, 1.0, 2.0])
+    rows[0] = replace(rows[0], status="missing", reason="not there", median_s=None, density_error=None)
+    rows[2] = replace(rows[2], density_error=1e-9)
+    rows[1] = replace(rows[1], density_error=None)
+    (summary,) = _statistics.summarize(rows)
+    assert (summary.density_error, summary.compile_s) == (1e-9, None)  # later processes find their kernels compiled
+    assert _statistics.summarize(rounds("jax", [3.0, 1.0]))[0].compile_s == 0.5
 
 
 def test_rows_measured_in_another_way_replace_those_from_before(tmp_path):
@@ -54,16 +68,33 @@ def test_rows_measured_in_another_way_replace_those_from_before(tmp_path):
     _report.report(tmp_path)
     table = pd.read_csv(tmp_path / "table.csv").set_index("method")
     assert (table.loc["jax", "median_s"], table.loc["jax", "processes"], table.loc["jax", "repeats"]) == (3.0, 3, 9)
+    RowFile(tmp_path).append(replace(before[1], median_s=5.0))  # its key stands in the file already, before the other
+    assert [row.median_s for row in read_latest(tmp_path)] == [3.0, 5.0, 2.0, 1.0]
 
 
 def test_a_ratio_is_taken_round_by_round_so_that_drift_cancels():
     drift = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
     rows = rounds("cll", drift) + rounds("jax", 1.1 * drift) + rounds("warp", drift * [0.9, 1.1, 1.0, 1.2, 0.8])
     lines = {line["method"]: line for line in _table.lines(rows)}
-    assert lines["jax"]["seconds_to_cll"] == pytest.approx(1.1)
+    assert lines["jax"]["seconds_ratio"] == pytest.approx(1.1)
     assert (lines["jax"]["within_noise"], lines["warp"]["within_noise"], lines["cll"]["within_noise"]) == (False, True, None)
     assert _report.cells(lines["warp"])[5] == "≈1"
     assert _report.cells(lines["jax"])[5] == "1.1"
+
+
+def test_too_few_rounds_give_no_verdict():
+    lines = {line["method"]: line for line in _table.lines(rounds("cll", [1.0, 1.0]) + rounds("jax", [2.0, 3.0]))}
+    assert (lines["jax"]["within_noise"], _report.cells(lines["jax"])[5]) == (None, "?2.5")
+    once = [replace(rounds(name, [second])[0], seconds=[second]) for name, second in (("cll", 1.0), ("jax", 2.0))]
+    line = _table.lines(once)[1]
+    assert (line["within_noise"], _report.cells(line)[4:6]) == (None, ["·", "?2"])
+
+
+def test_without_cll_ratios_divide_by_a_method_that_is_there():
+    rows = rounds("jax", [2.0, 4.0, 6.0]) + rounds("warp", [1.0, 2.0, 3.0])
+    lines = {line["method"]: line for line in _table.lines(rows)}
+    assert [lines[name]["seconds_ratio"] for name in ("jax", "warp")] == [2.0, 1.0]
+    assert _report.titles(list(lines.values()))[5] == "/ warp"
 
 
 def test_of_one_process_repeats_are_told_and_said_to_be_that():
@@ -106,4 +137,4 @@ def test_the_page_needs_nothing_besides_and_pandas_reads_the_table(tmp_path):
     table = pd.read_csv(tmp_path / "table.csv")
     assert list(table.columns) == list(_table.COLUMNS)
     assert table.set_index("method").loc["cll", "median_s"] == pytest.approx(1.1)
-    assert table.seconds_to_cll.dtype == float
+    assert table.seconds_ratio.dtype == float
