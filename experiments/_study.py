@@ -1,5 +1,6 @@
 """What notebooks ask of the rows of sweeps: a table of rounds, and effects of one thing at a time with their uncertainty."""
 
+import gc
 import io
 import tempfile
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from experiments import _config, _sweep, _table
+from experiments import _config, _sweep, _table, _worker
 from experiments._config import Config, Scenes
 from experiments._rows import SCENE_FIELDS, Row, read_latest
 
@@ -26,19 +27,21 @@ def rows(sweep: str, small: bool, results: str | None = None) -> list[Row]:
 
     Args:
         sweep: Name of a config, such as sweep_orientation.
-        small: Whether to measure a coarse lattice with few methods instead: for tests.
+        small: Whether to measure a coarse lattice with few methods instead, all in this process: for tests.
         results: Folder below experiments/results; without it, that of the name.
     """
     folder = ROOT / "results" / (results or sweep)
     if not small and (folder / "rows.jsonl").exists():
         return read_latest(folder)
     config = shrink(_config.load(ROOT / "configs" / f"{sweep}.toml"))
-    out = Path(tempfile.mkdtemp()) if small else ROOT.parent / "out" / "small" / sweep
+    if small:
+        gc.freeze()  # a row collects garbage before it measures memory: what is imported is none, and slow to look through
+        with tempfile.TemporaryDirectory() as out:
+            return [_sweep.measure(spec, Path(out), _worker.measure(spec, Path(out))) for spec in config.specs()]
     with redirect_stderr(io.StringIO()):  # its progress is no result
-        made = _sweep.run(config, f"{sweep}, small", out)
-    if not small:
-        command = f"python -m experiments run experiments/configs/{sweep}.toml --out {folder.relative_to(ROOT.parent)}"
-        print(f"no rows of {sweep} are here: what follows is a small version, measured now. `{command}` measures the whole one.")
+        made = _sweep.run(config, f"{sweep}, small", ROOT.parent / "out" / "small" / sweep)
+    command = f"python -m experiments run experiments/configs/{sweep}.toml --out {folder.relative_to(ROOT.parent)}"
+    print(f"no rows of {sweep} are here: what follows is a small version, measured now. `{command}` measures the whole one.")
     return made
 
 

@@ -1,5 +1,6 @@
 """Shared by all tests: both float widths are on, and arrays never mix dtypes in silence."""
 
+import os
 from pathlib import Path
 
 import jax
@@ -9,6 +10,7 @@ import warp
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"  # in processes that tests start, as `_compiled_soon` in this one
 warp.config.log_level = warp.LOG_WARNING  # else it prints what it compiles, into doctests too
 
 
@@ -29,9 +31,11 @@ def _both_widths():
 
 
 @pytest.fixture(autouse=True)
-def _compiled_soon(request):
+def _compiled_soon(request, monkeypatch):
     """Leave out what LLVM takes long for and what no float depends on, but in slow tests and those of memory."""
-    fully = request.node.get_closest_marker("slow") or "memory" in request.node.name
+    fully = request.node.get_closest_marker("slow") or "memory" in request.node.nodeid
+    if fully:
+        monkeypatch.delenv("JAX_DISABLE_MOST_OPTIMIZATIONS")
     jax.config.update("jax_disable_most_optimizations", not fully)
     yield
     jax.config.update("jax_disable_most_optimizations", False)

@@ -24,7 +24,6 @@ from jfrnn import distributed
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-jax.config.update("jax_disable_most_optimizations", True)
 
 CHECKS = {}
 README = Path(__file__).parent.parent / "README.md"

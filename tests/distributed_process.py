@@ -14,7 +14,6 @@ from jfrnn import distributed
 def main(address, processes, process, dies):
     jax.config.update("jax_num_cpu_devices", 2)
     jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_disable_most_optimizations", True)
     distributed.connect(address, processes, process, patience=5)
     x = np.random.default_rng(0).uniform(0, 8, (160, 2))
     box = jfrnn.Box([8.0, 8.0])

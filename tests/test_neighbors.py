@@ -22,12 +22,13 @@ def points(dim):
 
 def test_distances_and_vectors(points):
     nbrs = search(points, 0.4)
-    r, mask = nbrs.vectors(points)
-    d, same = nbrs.distances(points)
+    r, mask = map(np.asarray, nbrs.vectors(points))
+    d, same = map(np.asarray, nbrs.distances(points))
     np.testing.assert_array_equal(mask, same)
     np.testing.assert_array_equal(mask.sum(1), nbrs.count)
+    points, idx = np.asarray(points), np.asarray(nbrs.idx)
     for i in range(40):
-        j = np.asarray(nbrs.idx[i])[np.asarray(mask[i])]
+        j = idx[i][mask[i]]
         np.testing.assert_array_equal(r[i][mask[i]], points[j] - points[i])
         np.testing.assert_allclose(d[i][mask[i]], np.linalg.norm(points[j] - points[i], axis=1), rtol=1e-15)
     assert not r[~mask].any()

@@ -42,9 +42,7 @@ def test_every_notebook_is_run():
     assert {path.stem for path in NOTEBOOKS.glob("*.ipynb")} == set(SAYS)
 
 
-@pytest.mark.parametrize(
-    "name", [name if name in ("gpu_layouts", "pair_sums") else pytest.param(name, marks=pytest.mark.slow) for name in SAYS]
-)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name.startswith("sph_") else ()) for name in SAYS])
 def test_notebook(name):
     pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")
