@@ -248,7 +248,7 @@ def test_inactive_particles_have_no_neighbors_and_come_and_go(backend, dim):
 
 def test_vmap_is_a_loop():
     x, moved = (jnp.stack([points(40, 2, np.float32, s) for s in seeds]) for seeds in ((0, 1, 2), (0, 1, 3)))
-    search = jax.jit(lambda one: jfrnn.search(one, CUTOFF, skin=SKIN, capacity=40, backend="jax"))
+    search = jax.jit(lambda one: jfrnn.search(one, CUTOFF, skin=SKIN, capacity=40, backend="brute"))
     update = jax.jit(lambda nbrs, one: nbrs.update(one))
     after = jax.jit(jax.vmap(update))(jax.jit(jax.vmap(search))(x), moved)
     for k, (before, one) in enumerate(zip(x, moved, strict=True)):
@@ -262,7 +262,7 @@ def test_gradients_flow_around_updates():
     x = points(30, 2, np.float64)
 
     def energy(x, wait):
-        nbrs = jfrnn.search(x, CUTOFF, skin=SKIN, capacity=40, backend="jax")
+        nbrs = jfrnn.search(x, CUTOFF, skin=SKIN, capacity=40, backend="brute")
 
         def step(carry, _):
             x, nbrs = carry
