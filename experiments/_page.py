@@ -65,7 +65,7 @@ def _cell(line: dict[str, Any], name: str, digits: str) -> dict[str, Any]:
     if not digits:
         return {"text": value, "hint": "", "by": value, "kind": "text"}
     text = format(value, digits).replace(",", " ") if math.isfinite(value) else str(value)
-    about = "~" if name in ("missing", "extra") and line["compared"] != "pairs" else ""
+    about = _table.pairs_mark(line) if name in ("missing", "extra") else ""
     about = _table.noise_mark(line) if name == "seconds_ratio" else about
     kind = "wrong" if name in ("missing", "extra") and value else "number"
     partial = name == "processes" and bool(line["reason"])

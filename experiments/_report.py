@@ -130,7 +130,7 @@ def _count(value: int | None) -> str:
 
 
 def _errors(line: dict[str, Any], name: str) -> str:
-    return ("~" if line["compared"] in ("counts", "sample") else "") + _count(line[name])
+    return _table.pairs_mark(line) + _count(line[name])
 
 
 def _relative(value: float | None) -> str:

@@ -36,8 +36,11 @@ def rows(sweep: str, small: bool, results: str | None = None) -> list[Row]:
     config = shrink(_config.load(ROOT / "configs" / f"{sweep}.toml"))
     if small:
         gc.freeze()  # a row collects garbage before it measures memory: what is imported is none, and slow to look through
-        with tempfile.TemporaryDirectory() as out:
-            return [_sweep.measure(spec, Path(out), _worker.measure(spec, Path(out))) for spec in config.specs()]
+        try:
+            with tempfile.TemporaryDirectory() as out:
+                return [_sweep.measure(spec, Path(out), _worker.measure(spec, Path(out))) for spec in config.specs()]
+        finally:
+            gc.unfreeze()
     with redirect_stderr(io.StringIO()):  # its progress is no result
         made = _sweep.run(config, f"{sweep}, small", ROOT.parent / "out" / "small" / sweep)
     command = f"python -m experiments run experiments/configs/{sweep}.toml --out {folder.relative_to(ROOT.parent)}"

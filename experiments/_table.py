@@ -92,6 +92,11 @@ def ratio(value: float | None, yardstick: float | None) -> float | None:
     return value / yardstick if value is not None and yardstick else None
 
 
+def pairs_mark(line: dict[str, Any]) -> str:
+    """Return what stands before the numbers of wrong pairs of a line: whether they were told from counts alone."""
+    return "~" if line["compared"] in ("counts", "sample") else ""
+
+
 def noise_mark(line: dict[str, Any]) -> str:
     """Return what stands before the ratio of times of a line: whether it is within noise."""
     if line["method"] == line["yardstick"] or line["seconds_ratio"] is None:

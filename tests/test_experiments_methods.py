@@ -6,7 +6,7 @@ import pytest
 
 from experiments import _compare, _native, _oracle, methods
 
-OURS = {"brute", "cll", "jax", "pair-sum", "warp", "warp-counts"}  # run by the tests of the sweep and of the engines
+OURS = {"brute", "cll", "hashgrid", "jax", "pair-sum", "warp", "warp-counts"}  # run by the tests of the sweep and of the engines
 MOVING = ["nanoflann-dynamic", "nanoflann-rebuild", "warp-rebuild", "warp-update"]
 OTHERS = [name for name in methods.names() if name not in OURS and name not in MOVING]
 

@@ -218,8 +218,8 @@ def test_closed_over_positions_are_counted_while_tracing(backend):
 @pytest.mark.parametrize("backend", ["jax", BRUTE, "warp", "hashgrid"])
 def test_vmap_equals_a_loop(backend):
     batch = np.stack([random_points(60, 2, np.float32, seed) * 10.0**seed for seed in range(3)]).astype(np.float32)
-    nbrs = jax.jit(jax.vmap(lambda x: jfrnn.search(x, 0.3, capacity=60, backend=backend)))(batch)
-    counts = jax.jit(jax.vmap(lambda x: jfrnn.count(x, 0.3, backend=backend)))(batch)
+    nbrs = jax.vmap(lambda x: jfrnn.search(x, 0.3, capacity=60, backend=backend))(batch)
+    counts = jax.vmap(lambda x: jfrnn.count(x, 0.3, backend=backend))(batch)
     for k, points in enumerate(batch):
         one = jax.tree.map(lambda leaf, k=k: leaf[k], nbrs)
         checked.assert_exact(one, points, 0.3)

@@ -248,11 +248,11 @@ def test_inactive_particles_have_no_neighbors_and_come_and_go(backend, dim):
 
 def test_vmap_is_a_loop():
     x, moved = (jnp.stack([points(40, 2, np.float32, s) for s in seeds]) for seeds in ((0, 1, 2), (0, 1, 3)))
-    search = jax.jit(lambda one: jfrnn.search(one, CUTOFF, skin=SKIN, capacity=40, backend="brute"))
-    update = jax.jit(lambda nbrs, one: nbrs.update(one))
-    after = jax.jit(jax.vmap(update))(jax.jit(jax.vmap(search))(x), moved)
-    for k, (before, one) in enumerate(zip(x, moved, strict=True)):
-        expected = update(search(before), one)
+    lists = [jfrnn.search(one, CUTOFF, skin=SKIN, capacity=40, backend="jax") for one in x]
+    batch = jax.vmap(lambda one: jfrnn.search(one, CUTOFF, skin=SKIN, capacity=40, backend="jax"))(x)
+    after = jax.vmap(lambda nbrs, one: nbrs.update(one))(batch, moved)
+    for k, (nbrs, one) in enumerate(zip(lists, moved, strict=True)):
+        expected = nbrs.update(one)
         for got, wanted in zip(jax.tree.leaves(after), jax.tree.leaves(expected), strict=True):
             np.testing.assert_array_equal(got[k], wanted)
     assert after.rebuild_count.tolist() == [0, 0, 1]
@@ -262,7 +262,7 @@ def test_gradients_flow_around_updates():
     x = points(30, 2, np.float64)
 
     def energy(x, wait):
-        nbrs = jfrnn.search(x, CUTOFF, skin=SKIN, capacity=40, backend="brute")
+        nbrs = jfrnn.search(x, CUTOFF, skin=SKIN, capacity=40, backend="jax")
 
         def step(carry, _):
             x, nbrs = carry
