@@ -13,7 +13,7 @@ from experiments.methods._compiled import compile_for
 def allocate_backend(positions: np.ndarray, cutoff: float, backend: str) -> int:
     """Count the neighbors once, and return the length of the longest row."""
     jax.config.update("jax_enable_x64", positions.dtype == np.float64)
-    return int(jfrnn.count(jax.numpy.asarray(positions), cutoff, backend=backend).max())
+    return int(np.asarray(jfrnn.count(jax.numpy.asarray(positions), cutoff, backend=backend)).max(initial=0))
 
 
 def prepare_backend(
