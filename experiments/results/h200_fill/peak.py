@@ -1,4 +1,9 @@
-"""The peak of a GPU's memory after each step of a small search: which of them takes it."""
+"""The peak of a GPU's memory after each step of a small search: which of them takes it.
+
+With the word `host` behind it, the largest count is looked for there.
+"""
+
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -16,14 +21,21 @@ def show(what: str) -> None:
 
 x = np.random.default_rng(0).random((1024, 3)).astype(np.float32)
 show("start")
-count = jax.block_until_ready(jfrnn.count(jnp.asarray(x), 0.1, backend="warp"))
-show("count")
-capacity = int(np.asarray(count).max())
-show("largest count, on the host")
+a = jax.block_until_ready(jnp.asarray(x))
+show("positions")
+count = jax.block_until_ready(jfrnn.count(a, 0.1, backend="warp"))
+show("count warp")
+more = jax.block_until_ready(count + 1)
+show("count+1")
+if "host" in sys.argv:
+    capacity = int(np.asarray(count).max())
+    show("max on the host")
+else:
+    longest = jax.block_until_ready(jnp.max(count))
+    show("max")
+    capacity = int(longest)
+    show("int(max)")
 search = compile_for(lambda x: jfrnn.search(x, 0.1, capacity=capacity, backend="warp"), x)
-show("search compiled")
+show("compiled")
 nbrs = search()
 show("search")
-del nbrs
-jax.block_until_ready(jnp.max(count))
-show("largest count, by jnp.max")

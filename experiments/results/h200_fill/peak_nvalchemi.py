@@ -9,7 +9,7 @@ from nvalchemiops.jax.neighbors.cell_list import cell_list, estimate_cell_list_s
 def show(what: str) -> None:
     """Print what JAX holds now, and the most that it held so far."""
     stats = jax.devices()[0].memory_stats()
-    print(f"{what:42s} in use {stats['bytes_in_use']:>12,d} peak {stats['peak_bytes_in_use']:>12,d}")
+    print(f"{what:30s} in use {stats['bytes_in_use']:>12,d} peak {stats['peak_bytes_in_use']:>12,d}")
 
 
 x = np.random.default_rng(0).random((1024, 3)).astype(np.float32)
