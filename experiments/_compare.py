@@ -1,5 +1,6 @@
 """Missing and extra pairs of a method against the oracle; padded rows against the tests' oracle, and against each other."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -33,19 +34,34 @@ def compare(found: Found, exact: np.ndarray, size: int) -> dict[str, Any]:
     return row | {"exact_pairs": len(exact)}
 
 
-def compare_sample(found: Found, positions: np.ndarray, cutoff: float) -> dict[str, Any]:
-    """Return the same of evenly chosen particles alone, as if only counts were known: where all exact pairs are too many."""
-    n = len(positions)
-    rows = np.unique(np.linspace(0, n - 1, SAMPLED).astype(np.int64))
+def sample(size: int) -> np.ndarray:
+    """Return the particles that are compared where all are too many, evenly chosen, shape [s]."""
+    return np.unique(np.linspace(0, size - 1, SAMPLED).astype(np.int64))
+
+
+def compare_sample(found: Found, exact: np.ndarray, rows: np.ndarray, size: int) -> dict[str, Any]:
+    """Return the same of some particles alone: their rows of a list, or their counts.
+
+    A pair counts as half a pair for each of its particles that is among them; halves are rounded up.
+
+    Args:
+        found: What the method found.
+        exact: Sorted keys i·n + j of the oracle, of these particles i and whatever j is.
+        rows: The particles.
+        size: Number of particles n.
+    """
     if found.pairs is None:
         assert found.counts is not None
-        counts = found.counts
+        surplus = found.counts.astype(np.int64)[rows] - np.bincount(exact // size, minlength=size)[rows]
+        missing, extra = (int(np.maximum(part, 0).sum()) for part in (-surplus, surplus))
+        total = int(found.counts.sum(dtype=np.int64)) // 2
     else:
-        counts = sum(np.bincount(part, minlength=n) for part in (found.pairs[:1] if found.directed else found.pairs))
-    surplus = np.asarray(counts, np.int64)[rows] - (exact := _oracle.count_sample(positions, cutoff, rows))
-    missing, extra = (int(-(-np.maximum(part, 0).sum() // 2)) for part in (-surplus, surplus))
-    total = {"pairs": int(np.asarray(counts).sum(dtype=np.int64) // 2), "exact_pairs": int(exact.sum() // 2)}
-    return total | {"missing": missing, "extra": extra, "compared": "sample"}
+        keys = np.sort(np.concatenate([*_keys_of(rows, found, size)]))
+        common = _common(_distinct(keys), exact)
+        missing, extra = len(exact) - common, len(keys) - common
+        total = len(found.pairs[0]) // (2 if found.directed else 1)
+    row = {"pairs": total, "exact_pairs": len(exact) // 2, "compared": "sample"}
+    return row | {"missing": -(-missing // 2), "extra": -(-extra // 2)}
 
 
 def is_exact(oracle: Any, idx: Any, count: Any, fill: int, expected: Any) -> bool:  # noqa: ANN401
@@ -71,6 +87,16 @@ def different_rows(one: Any, other: Any) -> int:  # noqa: ANN401
 def _keys(i: np.ndarray, j: np.ndarray, size: int) -> np.ndarray:
     """Return the sorted keys min(i, j)·n + max(i, j)."""
     return np.sort(np.minimum(i, j).astype(np.int64) * size + np.maximum(i, j))
+
+
+def _keys_of(rows: np.ndarray, found: Found, size: int) -> Iterator[np.ndarray]:
+    """Yield the keys i·n + j that a list has of some particles i."""
+    assert found.pairs is not None
+    wanted = np.zeros(size, bool)
+    wanted[rows] = True
+    for i, j in (found.pairs,) if found.directed else (found.pairs, found.pairs[::-1]):
+        here = np.flatnonzero(wanted[i])
+        yield i[here].astype(np.int64) * size + j[here]
 
 
 def _distinct(keys: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ outside; integers of any length decide the rest.
 
 import hashlib
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -84,30 +85,45 @@ def count_neighbors(keys: np.ndarray, size: int) -> np.ndarray:
     return np.bincount(i, minlength=size) + np.bincount(j, minlength=size)
 
 
-def count_sample(positions: np.ndarray, cutoff: float, rows: np.ndarray) -> np.ndarray:
-    """Return the exact number of neighbors of some particles, shape [rows]: where all pairs would not fit into memory."""
+def find_sample(positions: np.ndarray, cutoff: float, rows: np.ndarray) -> np.ndarray:
+    """Return all pairs of some particles i, whatever j is, as sorted keys i·n + j: where those of all would not fit into memory.
+
+    Args:
+        positions: Finite coordinates, shape [n, d], float32 or float64.
+        cutoff: Interaction radius; rounded to the dtype of the positions first.
+        rows: The particles, ascending, shape [s].
+    """
     cutoff, points = round_cutoff(cutoff, positions.dtype), positions.astype(np.float64)
-    near = KDTree(points).query_ball_point(points[rows], cutoff * (1 + CANDIDATE_MARGIN))
-    place = np.repeat(np.arange(len(rows)), [len(row) for row in near])
-    i, j = rows[place], np.concatenate([*near]).astype(np.int64)
-    low, high = np.minimum(i, j), np.maximum(i, j)
-    local, inverse = np.unique(np.concatenate((low, high)), return_inverse=True)  # keys of few points stay small
-    inside = np.zeros(len(i), bool)
-    apart = low != high
-    pairs = np.stack(np.split(inverse, 2), axis=1)[apart]
-    inside[apart] = np.isin(pairs @ [len(local), 1], _decide(points[local], pairs, cutoff))
-    return np.bincount(place, inside, len(rows)).astype(np.int64)
+    tree = KDTree(points, compact_nodes=False, balanced_tree=False)  # few are asked: what takes long is to build it
+    near = tree.query_ball_point(points[rows], cutoff * (1 + CANDIDATE_MARGIN))
+    i, j = np.repeat(rows, [len(row) for row in near]), np.concatenate([*near]).astype(np.int64)
+    i, j = i[i != j], j[i != j]
+    local, inverse = np.unique(np.concatenate((i, j)), return_inverse=True)  # keys of few points stay small
+    pairs = np.stack(np.split(inverse, 2), axis=1)
+    inside = np.isin(pairs @ [len(local), 1], _decide(points[local], pairs, cutoff))
+    return np.sort(i[inside] * len(points) + j[inside])
 
 
 def load_pairs(positions: np.ndarray, cutoff: float, folder: Path) -> np.ndarray:
-    """Return `find_pairs`, computed at most once per folder: the file is named by a digest of positions, cutoff and dtype."""
+    """Return `find_pairs`, computed at most once per folder."""
+    return _load(find_pairs, positions, cutoff, folder)
+
+
+def load_sample(positions: np.ndarray, cutoff: float, rows: np.ndarray, folder: Path) -> np.ndarray:
+    """Return `find_sample`, computed at most once per folder."""
+    return _load(find_sample, positions, cutoff, folder, rows)
+
+
+def _load(find: Callable[..., np.ndarray], positions: np.ndarray, cutoff: float, folder: Path, *rows: np.ndarray) -> np.ndarray:
+    """Return what `find` finds, from a file named by a digest of all that is given, where there is one."""
     cutoff = round_cutoff(cutoff, positions.dtype)
-    digest = hashlib.sha256(np.ascontiguousarray(positions).tobytes())
-    digest.update(f"{positions.shape} {positions.dtype} {cutoff.hex()}".encode())
+    digest = hashlib.sha256(f"{positions.shape} {positions.dtype} {cutoff.hex()}".encode())
+    for values in (positions, *rows):
+        digest.update(np.ascontiguousarray(values).data)
     file = folder / f"{digest.hexdigest()[:24]}.npy"
     if file.exists():
         return np.load(file)
-    keys = find_pairs(positions, cutoff)
+    keys = find(positions, cutoff, *rows)
     folder.mkdir(parents=True, exist_ok=True)
     partial = file.with_suffix(f".{os.getpid()}.part")
     with partial.open("wb") as stream:

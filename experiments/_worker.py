@@ -50,11 +50,12 @@ def _answer(task: dict[str, Any]) -> dict[str, Any]:
 
 
 def prepare_oracle(spec: Spec, folder: Path) -> dict[str, Any]:
-    """Leave the exact pairs of the scene in the folder; of a large one, nothing: a sample is decided with each row."""
-    from experiments import _oracle
+    """Leave the exact pairs of the scene in the folder; of a large one, those of a sample."""
+    from experiments import _compare, _oracle
 
     scene = make_scene(spec)
-    if len(scene.positions) > MOST_LISTED:
+    if (n := len(scene.positions)) > MOST_LISTED:
+        _oracle.load_sample(scene.positions, scene.cutoff, _compare.sample(n), folder)
         return {"pairs": None}
     return {"pairs": len(_oracle.load_pairs(scene.positions, scene.cutoff, folder))}
 
@@ -130,11 +131,12 @@ def _judge(found: methods.Found, spec: Spec, positions: np.ndarray, cutoff: floa
     """Compare what was found with the exact pairs, and in the first process sums over it with exact ones."""
     from experiments import _accuracy, _compare, _oracle
 
-    if len(positions) > MOST_LISTED:
-        row |= _compare.compare_sample(found, positions, cutoff)
+    if (n := len(positions)) > MOST_LISTED:
+        rows = _compare.sample(n)
+        row |= _compare.compare_sample(found, _oracle.load_sample(positions, cutoff, rows, folder), rows, n)
         return
     exact = _oracle.load_pairs(positions, cutoff, folder) if found.positions is None else _oracle.find_pairs(positions, cutoff)
-    row |= _compare.compare(found, exact, len(positions))
+    row |= _compare.compare(found, exact, n)
     if spec.process == 0:
         row |= _accuracy.errors(found, row, exact, positions, cutoff)
 

@@ -66,11 +66,47 @@ def test_a_method_that_sums_itself_is_judged_by_its_sums():
     assert _accuracy.errors(Found(0, counts=found.counts), row, EXACT, POSITIONS, CUTOFF) == {}
 
 
-def test_a_sample_is_counted_exactly_on_a_lattice_full_of_ties():
-    sites = np.stack(np.meshgrid(*3 * [np.arange(9)], indexing="ij"), axis=-1).reshape(-1, 3)
-    positions, rows = (sites * 1e-4).astype(np.float32), np.arange(0, 729, 7)
-    whole = _oracle.count_neighbors(_oracle.find_pairs(positions, 3e-4), 729)
-    assert np.array_equal(_oracle.count_sample(positions, 3e-4, rows), whole[rows])
-    row = _compare.compare_sample(Found(0, counts=whole), positions, 3e-4)
-    assert (row["missing"], row["extra"], row["compared"], row["pairs"]) == (0, 0, "sample", whole.sum() // 2)
-    assert _compare.compare_sample(Found(0, counts=whole + 1), positions, 3e-4)["extra"] == 365
+SITES = np.stack(np.meshgrid(*3 * [np.arange(9)], indexing="ij"), axis=-1).reshape(-1, 3)
+LATTICE, SAMPLE = (SITES * 1e-4).astype(np.float32), np.arange(0, 729, 7)  # full of ties at three spacings
+
+
+def sampled(found: Found) -> tuple[int, int, int]:
+    exact = _oracle.find_sample(LATTICE, 3e-4, SAMPLE)
+    row = _compare.compare_sample(found, exact, SAMPLE, 729)
+    assert row["compared"] == "sample" and row["exact_pairs"] == len(exact) // 2
+    return row["missing"], row["extra"], row["pairs"]
+
+
+def test_a_sample_is_decided_exactly_on_a_lattice_full_of_ties():
+    i, j = np.divmod(_oracle.find_pairs(LATTICE, 3e-4), 729)
+    both = np.concatenate((i * 729 + j, j * 729 + i))
+    assert np.array_equal(_oracle.find_sample(LATTICE, 3e-4, SAMPLE), np.sort(both[np.isin(both // 729, SAMPLE)]))
+
+
+def test_counts_of_a_sample_are_compared():
+    keys = _oracle.find_pairs(LATTICE, 3e-4)
+    whole = _oracle.count_neighbors(keys, 729)
+    assert sampled(Found(0, counts=whole)) == (0, 0, len(keys))
+    assert sampled(Found(0, counts=whole + 1))[1] == -(-len(SAMPLE) // 2)
+    assert sampled(Found(0, counts=whole - 1))[0] == -(-len(SAMPLE) // 2)
+
+
+@pytest.mark.parametrize("directed", [False, True])
+def test_lists_of_a_sample_are_compared_pair_by_pair(directed):
+    keys = _oracle.find_pairs(LATTICE, 3e-4)
+    i, j = np.divmod(keys, 729)
+    if directed:
+        i, j = np.concatenate((i, j)), np.concatenate((j, i))
+    order = np.random.default_rng(0).permutation(len(i))
+    i, j = i[order], j[order]
+    assert sampled(Found(0, (i, j), directed)) == (0, 0, len(keys))
+    one = np.flatnonzero((i == 7) & ~np.isin(j, SAMPLE))[:2]
+    wrong = j.copy()
+    wrong[one] = 727  # as many neighbors as before, two of them others, and those twice
+    assert sampled(Found(0, (i, wrong), directed))[:2] == (1, 1)
+    away = np.setdiff1d(np.arange(len(i)), one)
+    assert sampled(Found(0, (i[away], j[away]), directed))[:2] == (1, 0)
+    outside = np.flatnonzero(~np.isin(i, SAMPLE) & ~np.isin(j, SAMPLE))[0]
+    wrong = j.copy()
+    wrong[outside] = i[outside]
+    assert sampled(Found(0, (i, wrong), directed))[:2] == (0, 0)

@@ -85,6 +85,17 @@ def test_neighbor_counts_are_those_of_the_pairs():
     assert counts.tolist() == (closer.sum(axis=1) - 1).tolist()
 
 
+def test_pairs_of_a_sample_are_found_once_per_folder(tmp_path, monkeypatch):
+    positions, rows = np.random.default_rng(5).uniform(0, 1, (50, 3)), np.arange(0, 50, 3)
+    first = _oracle.load_sample(positions, 0.3, rows, tmp_path)
+    assert first.size
+    assert np.array_equal(first, _oracle.find_sample(positions, 0.3, rows))
+    monkeypatch.setattr(_oracle, "find_sample", lambda positions, cutoff, rows: np.array([7]))
+    assert np.array_equal(_oracle.load_sample(positions, 0.3, rows, tmp_path), first)
+    for changed in ((positions, 0.3, rows[1:]), (positions[::-1], 0.3, rows), (positions, 0.31, rows)):
+        assert _oracle.load_sample(*changed, tmp_path).tolist() == [7]
+
+
 def test_pairs_are_found_once_per_folder(tmp_path, monkeypatch):
     positions = np.random.default_rng(5).uniform(0, 1, (50, 3))
     first = _oracle.load_pairs(positions, 0.3, tmp_path / "oracle")

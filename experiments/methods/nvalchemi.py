@@ -17,7 +17,7 @@ def allocate(positions: np.ndarray, cutoff: float) -> int:
     """Return the most neighbors of a particle; without it, the list is cut off in silence."""
     from scipy.spatial import KDTree
 
-    return int(KDTree(positions).query_ball_point(positions, cutoff, return_length=True).max())
+    return int(KDTree(positions).query_ball_point(positions, cutoff, return_length=True, workers=-1).max())
 
 
 def prepare(positions: np.ndarray, cutoff: float, capacity: int) -> Callable[[], tuple[jax.Array, jax.Array]]:
