@@ -69,8 +69,8 @@ class Row:
         exact_pairs: Unordered pairs of the oracle.
         missing: Unordered pairs that the oracle has and the method has not.
         extra: Unordered pairs that the method has and the oracle has not, repeated ones included.
-        compared: `pairs`, `counts` where a method gives only neighbors per particle, or `sample`: the same of 20 000 particles, where
-            there are more than two million; `exact_pairs`, `missing` and `extra` are theirs then, `pairs` still those of all.
+        compared: `pairs`; `counts` where a method gives only neighbors per particle; or `sample`: the same of 20 000 particles,
+            where there are more than two million. `exact_pairs`, `missing` and `extra` are theirs then, `pairs` still those of all.
         density_error: Largest error of a poly6 density over the neighbors that were found, over the mean density.
         gradient_error: The same of the length of its gradient, over the mean density per cutoff.
         jump_error: The same of a sum of unit vectors, the gradient of 1 - r / cutoff, over the mean number of neighbors: it does
