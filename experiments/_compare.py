@@ -52,7 +52,7 @@ def compare_sample(found: Found, exact: np.ndarray, rows: np.ndarray, size: int)
     """
     if found.pairs is None:
         assert found.counts is not None
-        surplus = found.counts.astype(np.int64)[rows] - np.bincount(exact // size, minlength=size)[rows]
+        surplus = found.counts[rows].astype(np.int64) - np.bincount(np.searchsorted(rows, exact // size), minlength=len(rows))
         missing, extra = (int(np.maximum(part, 0).sum()) for part in (-surplus, surplus))
         total = int(found.counts.sum(dtype=np.int64)) // 2
     else:
