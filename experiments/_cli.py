@@ -44,9 +44,10 @@ def run(
     out: Annotated[Path | None, typer.Option(help="Folder of the rows; out/NAME without it.")] = None,
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Measure missing, failed and timed-out rows again.")] = False,
     processes: Annotated[int | None, typer.Option(min=1, help="Of each row, instead of the config's.")] = None,
+    most_seconds: Annotated[float | None, typer.Option(help="That repeats of a row may take, instead of the config's.")] = None,
     shard: Annotated[str, typer.Option(help="K/N: every N-th scene from the K-th on, in OUT/shard-K-of-N.")] = "1/1",
 ) -> None:
-    """Run a sweep, or go on with it: rows that are there already are not measured again."""
+    """Run a sweep, or go on with it: rows that are there are not measured again, unless less time cut their repeats short."""
     with _usage_errors():
         from experiments import _config, _sweep
 
@@ -54,7 +55,10 @@ def run(
         folder = out or Path("out") / config.stem
         folder = folder if parts == 1 else folder / f"shard-{part}-of-{parts}"
         given = _config.load(config)
-        given = given if processes is None else given.model_copy(update={"processes": processes})
+        if most_seconds is not None and not most_seconds > 0:
+            raise UsageError(f"--most-seconds {most_seconds}: expected more than 0")
+        asked = {"processes": processes, "most_seconds": most_seconds}
+        given = given.model_copy(update={name: value for name, value in asked.items() if value is not None})
         with _stoppable():
             rows = _sweep.run(given, config.stem, folder, retry_failed, (part, parts))
         good = sum(row.status == "ok" for row in rows)

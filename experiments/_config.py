@@ -18,6 +18,7 @@ from experiments._errors import UsageError
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Fill = Annotated[FiniteFloat, Field(gt=0, le=1)]
+LIMITS = ("most_seconds", "timeout")  # when a row is given up, not what it measures
 
 
 class Table(BaseModel):
@@ -83,7 +84,8 @@ class Config(Table):
         repeats: Fewest timed runs in a process.
         min_seconds: Runs go on until they took this long together [s].
         max_repeats: Most timed runs in a process; 1: the first run is the only one.
-        most_seconds: No run begins when they took this long together, be they as few as they may [s].
+        most_seconds: No run begins when they took this long together, be they as few as they may [s]. Where a later sweep allows
+            more, rows with too few repeats are measured again.
         timeout: A row's process is ended after this time [s].
     """
 
@@ -171,8 +173,15 @@ class Spec:
 
     @property
     def key(self) -> str:
-        """Digest of all fields, 12 hex digits: a row with the same key need not run again."""
-        return digest(asdict(self))
+        """Digest of all fields but the limits of time, 12 hex digits: a row with the same key need not run again, unless cut short.
+
+        A row that no limit cut short would be the same under any other.
+        """
+        return digest({name: value for name, value in asdict(self).items() if name not in LIMITS})
+
+    def cut_short(self, row: _rows.Row) -> bool:
+        """Whether a row has fewer repeats than asked, where `most_seconds` would have let another begin."""
+        return row.status == "ok" and len(row.seconds) < self.repeats and sum(row.seconds) < self.most_seconds
 
 
 def digest(value: object) -> str:

@@ -53,8 +53,8 @@ def _run(config: Config, name: str, file: RowFile, retry_failed: bool, shard: tu
     """Do the work of `run` with the file of rows at hand."""
     folder = file.path.parent
     specs, prepared, absent = shard_specs(config.specs(), shard), set(), {}
-    done = {row.key for row in file.read() if not (retry_failed and row.status in RETRIED)}
-    pending = [spec for spec in specs if spec.key not in done]
+    rows = {row.key: row for row in file.read() if not (retry_failed and row.status in RETRIED)}
+    pending = [spec for spec in specs if (row := rows.get(spec.key)) is None or spec.cut_short(row)]
     about = {"machine": _machine.machine(), **_machine.commit(), "config": name, "config_hash": config.hash}
     with progress(len(specs)) as shown:
         bar = shown.add_task("", total=len(specs), completed=len(specs) - len(pending))
@@ -144,7 +144,9 @@ def _explain_exit(code: int, stderr: str) -> str:
 
 
 def merge(folder: Path, parts: Iterable[Path]) -> int:
-    """Add to a folder the rows of others that it does not hold, and return how many came; of one key, a row that is ok counts.
+    """Add to a folder the rows of others that it does not hold, and return how many came.
+
+    Of one key, a row that is ok counts, and among those the one with more repeats.
 
     Raises:
         UsageError: There are no parts, a part has no rows, or a line of it is no row.
@@ -161,11 +163,16 @@ def merge(folder: Path, parts: Iterable[Path]) -> int:
                 raise UsageError(f"{part}: no rows to merge; name a folder that a sweep has filled")
             for row in theirs:
                 here = rows.get(row.key)
-                if here is None or (here.status in RETRIED and row.status not in RETRIED):
+                if here is None or _worth(row) > _worth(here):
                     rows[row.key] = row
                     file.append(row)
                     came += 1
     return came
+
+
+def _worth(row: Row) -> tuple[bool, int]:
+    """Return what makes a row count before another of its key: that there need not be a next one, and its repeats."""
+    return row.status not in RETRIED, len(row.seconds)
 
 
 def describe(row: Row) -> str:

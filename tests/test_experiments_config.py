@@ -1,11 +1,12 @@
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from experiments import _config, _layouts, _thesis, _worker, methods
+from experiments import _config, _layouts, _rows, _thesis, _worker, methods
 from experiments._errors import UsageError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -51,6 +52,21 @@ def test_key_and_hash_follow_what_the_config_says(tmp_path):
     keys = [[spec.key for spec in config.specs()] for config in (first, same, other)]
     assert keys[0] == keys[1]
     assert not set(keys[0]) & set(keys[2])
+
+
+def test_limits_of_time_change_no_key_but_rows_that_they_cut_short_are_wanted_again(tmp_path):
+    short, long = (load(tmp_path, f"most_seconds = {most}\ntimeout = {2 * most}\n" + GOOD) for most in (1.0, 9.0))
+    assert [spec.key for spec in short.specs()] == [spec.key for spec in long.specs()]
+    spec, later = next(short.specs()), next(long.specs())
+    row = _rows.Row(
+        **{name: getattr(spec, name) for name in ("key", "layout", "method", *_rows.SCENE_FIELDS)}, fill_asked=spec.fill
+    )
+    assert spec.repeats == 5
+    for seconds, again in (([0.6, 0.6], False), ([0.3] * 5, False), ([0.5], True)):
+        assert spec.cut_short(replace(row, status="ok", seconds=seconds)) is again
+    assert later.cut_short(replace(row, status="ok", seconds=[0.6, 0.6]))
+    assert not later.cut_short(replace(row, status="ok", seconds=[3.0] * 3))
+    assert not later.cut_short(replace(row, status="skipped"))
 
 
 @pytest.mark.parametrize(

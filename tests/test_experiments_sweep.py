@@ -150,6 +150,20 @@ def test_half_a_last_line_is_cut_off_and_measured_again(swept):
     assert json.loads(after[-1])["status"] == "ok"
 
 
+def test_rows_that_a_limit_cut_short_are_measured_again_where_it_is_wider(tmp_path):
+    sweep = Sweep(tmp_path, KDTREES + QUICK + "most_seconds = 1e-9\n" + CORNERS)
+    sweep.run()
+    assert "2 of 2 rows are there already" in sweep.run().stderr
+    assert "rows are there already" not in sweep.run("--most-seconds", "60").stderr
+    assert [row["repeats"] for row in sweep.rows()] == [1, 1, 5, 5]
+    assert [row.repeats for row in _rows.RowFile(sweep.out).read()] == [5, 5]
+    assert [row.repeats for row in _rows.read_latest(sweep.out)] == [5, 5]
+    for limit in ("60", "1e-9"):
+        assert "2 of 2 rows are there already" in sweep.run("--most-seconds", limit).stderr
+    result = CliRunner().invoke(app, ["run", str(sweep.config), "--most-seconds", "0"])
+    assert (result.exit_code, result.stderr) == (2, "error: --most-seconds 0.0: expected more than 0\n")
+
+
 def test_a_method_that_is_not_installed_gives_a_row_and_the_sweep_goes_on(tmp_path):
     (tmp_path / "shadow" / "warp").mkdir(parents=True)
     (tmp_path / "shadow" / "warp" / "__init__.py").write_text("raise ImportError('there is no warp here')")
@@ -246,6 +260,12 @@ def test_of_one_key_a_row_with_figures_counts_when_rows_are_merged(tmp_path):
     assert _sweep.merge(tmp_path / "bad", [tmp_path / "good"]) == 1
     assert _sweep.merge(tmp_path / "good", [tmp_path / "bad"]) == 0
     assert [row.status for row in _rows.RowFile(tmp_path / "bad").read()] == ["ok"]
+    (tmp_path / "more").mkdir()
+    _rows.RowFile(tmp_path / "more").append(replace(good, seconds=[0.1, 0.1]))
+    assert _sweep.merge(tmp_path / "more", [tmp_path / "good"]) == 0
+    assert _sweep.merge(tmp_path / "good", [tmp_path / "more"]) == 1
+    assert [row.seconds for row in _rows.RowFile(tmp_path / "good").read()] == [[0.1, 0.1]]
+    assert _sweep.merge(tmp_path / "good", [tmp_path / "bad"]) == 0
     with pytest.raises(UsageError, match="none: no rows to merge"):
         _sweep.merge(tmp_path / "good", [tmp_path / "none"])
     with pytest.raises(UsageError, match="good: no folders shard-K-of-N in it; name the folders"):
