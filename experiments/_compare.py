@@ -8,6 +8,7 @@ import numpy as np
 from experiments import _oracle
 from experiments.methods import Found
 
+MOST_LISTED = 2_000_000  # of more particles all pairs do not fit into memory: a sample of them is looked at
 SAMPLED = 20_000  # particles
 
 
@@ -59,7 +60,7 @@ def compare_sample(found: Found, exact: np.ndarray, rows: np.ndarray, size: int)
         keys = np.sort(np.concatenate([*_keys_of(rows, found, size)]))
         common = _common(_distinct(keys), exact)
         missing, extra = len(exact) - common, len(keys) - common
-        total = len(found.pairs[0]) // (2 if found.directed else 1)
+        total = (len(found.pairs[0]) if found.total is None else found.total) // (2 if found.directed else 1)
     row = {"pairs": total, "exact_pairs": len(exact) // 2, "compared": "sample"}
     return row | {"missing": -(-missing // 2), "extra": -(-extra // 2)}
 

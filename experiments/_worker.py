@@ -19,7 +19,6 @@ from experiments._config import Spec
 if TYPE_CHECKING:
     from jfrnn.cases import Scene  # pyright: ignore[reportMissingImports]
 
-MOST_LISTED = 2_000_000  # of more particles the exact pairs do not fit into memory: a sample of them is looked at
 MOST_MEMORY = 0.8  # of the machine; a method that wants more gets an error instead of taking the machine down
 
 
@@ -54,7 +53,7 @@ def prepare_oracle(spec: Spec, folder: Path) -> dict[str, Any]:
     from experiments import _compare, _oracle
 
     scene = make_scene(spec)
-    if (n := len(scene.positions)) > MOST_LISTED:
+    if (n := len(scene.positions)) > _compare.MOST_LISTED:
         _oracle.load_sample(scene.positions, scene.cutoff, _compare.sample(n), folder)
         return {"pairs": None}
     return {"pairs": len(_oracle.load_pairs(scene.positions, scene.cutoff, folder))}
@@ -123,7 +122,7 @@ def _measure_search(adapter: methods.Adapter, spec: Spec, scene: "Scene", folder
     del result
     if spec.process == 0 and (plan := getattr(adapter, "plan", None)):
         planned = plan(positions, cutoff, *capacity)
-        row |= {"planned_list_bytes": planned.list_bytes + planned.sums_bytes, "planned_scratch_bytes": planned.scratch_bytes}
+        row |= {"planned_list_bytes": planned.result_bytes, "planned_scratch_bytes": planned.scratch_bytes}
     _judge(found, spec, positions if found.positions is None else found.positions, cutoff, folder, row)
 
 
@@ -131,7 +130,7 @@ def _judge(found: methods.Found, spec: Spec, positions: np.ndarray, cutoff: floa
     """Compare what was found with the exact pairs, and in the first process sums over it with exact ones."""
     from experiments import _accuracy, _compare, _oracle
 
-    if (n := len(positions)) > MOST_LISTED:
+    if (n := len(positions)) > _compare.MOST_LISTED:
         rows = _compare.sample(n)
         row |= _compare.compare_sample(found, _oracle.load_sample(positions, cutoff, rows, folder), rows, n)
         return

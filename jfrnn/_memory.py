@@ -14,7 +14,7 @@ from jax.sharding import SingleDeviceSharding
 
 from jfrnn import _warp
 from jfrnn._auto import WARP_ENGINES, default_platform, fastest_engine
-from jfrnn._backends import Inputs, Options, list_rows
+from jfrnn._backends import Inputs, Options, count_rows, list_rows
 from jfrnn._exact import Cutoff
 from jfrnn._inputs import checked_backend, checked_capacity, checked_cutoff, checked_kind, checked_size
 from jfrnn._pair_sum import pair_sum
@@ -25,30 +25,39 @@ from jfrnn._triangles_list import find_triangles
 
 @dataclasses.dataclass(frozen=True)
 class MemoryPlan:
-    """Say how many bytes one search, or one pair sum, takes beside the positions and values that it is given.
+    """Say how many bytes one search, count or pair sum takes beside the positions and values that it is given.
 
     Attributes:
         list_bytes: The result of a search [B]: 4 per slot, 4 per row for its count, 8 for `status` and `required`.
         scratch_bytes: What is needed besides while it runs [B].
         backend: The engine, never "auto".
         sums_bytes: The results of a pair sum, with a gradient that one too [B].
+        counts_bytes: The result of `count`, 4 per row [B]; None: the plan is not that of a count.
     """
 
     list_bytes: int
     scratch_bytes: int
     backend: str
     sums_bytes: int = 0
+    counts_bytes: int | None = None
+
+    @property
+    def result_bytes(self) -> int:
+        """The list, the sums or the counts [B]."""
+        return self.list_bytes + self.sums_bytes + (self.counts_bytes or 0)
 
     @property
     def total_bytes(self) -> int:
         """Results and scratch together [B]."""
-        return self.list_bytes + self.sums_bytes + self.scratch_bytes
+        return self.result_bytes + self.scratch_bytes
 
     def __str__(self) -> str:
         """Return a line each for the results, scratch and total, in MB of 10^6 B."""
         done, given, result = ("search", "positions", "list") if self.list_bytes else ("pair sum", "positions and values", "sums")
+        if self.counts_bytes is not None:
+            done, given, result = "count", "positions", "counts"
         lines = [f"one {done} with backend={self.backend!r}, beside the {given}:"]
-        parts = {result: self.list_bytes + self.sums_bytes, "scratch": self.scratch_bytes, "total": self.total_bytes}
+        parts = {result: self.result_bytes, "scratch": self.scratch_bytes, "total": self.total_bytes}
         return "\n".join([*lines, *(f"  {name:<8}{size / 1e6:10.2f} MB" for name, size in parts.items())])
 
 
@@ -67,7 +76,7 @@ def memory_plan(
     backend: str = "auto",
     platform: str | None = None,
 ) -> MemoryPlan:
-    """Say what one `search`, `pair_sum` (fn) or `search_triangles` (faces) of these shapes will take of the memory, beforehand.
+    """Say what a `search`, `count`, `pair_sum` (fn) or `search_triangles` (faces) of these shapes will take of the memory.
 
     Nothing depends on where the particles are. "warp" and "hashgrid": the sizes of the arrays that they ask for, known for a
     platform that is elsewhere too. "jax" and "brute": what XLA reports of the program that it compiles for these shapes, which
@@ -78,7 +87,7 @@ def memory_plan(
     Args:
         n: Number of particles, from 0 to 2^31 - 32.
         cutoff: Interaction radius [length], checked as in `search`; it does not change the bytes.
-        capacity: Slots per row; None for a pair sum.
+        capacity: Slots per row; None: no list is made, the plan is that of `count` or of a pair sum.
         dim: 2 or 3.
         dtype: Of the positions, float32 or float64.
         queries: Number of separate queries; None: the particles themselves are the queries.
@@ -123,7 +132,7 @@ def memory_plan(
         return _plan_of_sum(fn, points, cutoff, values, gradient, engine, _device_of(where))
     if values is not None or gradient:
         raise ValueError("values and gradient belong to a pair sum: say its fn, too.")
-    capacity = checked_capacity(capacity)
+    capacity = None if capacity is None else checked_capacity(capacity)
     if engine == "auto":
         engine = fastest_engine(_device_of(where).platform, n)
     if engine in WARP_ENGINES:
@@ -132,6 +141,8 @@ def memory_plan(
         at = SingleDeviceSharding(_device_of(where))
         points = [None if size is None else jax.ShapeDtypeStruct((size, dim), dtype, sharding=at) for size in (n, queries)]
         scratch = _compiled_scratch(points, radius, engine, capacity)
+    if capacity is None:
+        return MemoryPlan(0, scratch, engine, counts_bytes=4 * rows)
     return MemoryPlan(4 * rows * (capacity + 1) + 8, scratch, engine)
 
 
@@ -145,11 +156,12 @@ def _device_of(platform: str) -> Any:  # noqa: ANN401
         ) from error
 
 
-def _compiled_scratch(points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff, engine: str, capacity: int) -> int:
-    """Compile the search for sources and queries of these shapes, and return what XLA says of its temporary arrays [B]."""
+def _compiled_scratch(points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff, engine: str, capacity: int | None) -> int:
+    """Compile the search, or the count, for these shapes, and return what XLA says of its temporary arrays [B]."""
     options = Options(Filter(drop_self=points[1] is None, later_only=False), engine, closed=False)
     inputs: Any = Inputs(points[0], points[1], None, None, cutoff)  # pyright: ignore[reportArgumentType] (shapes of arrays)
-    return int(_analysis(list_rows.lower(inputs, options, capacity)).temp_size_in_bytes)
+    lowered = count_rows.lower(inputs, options) if capacity is None else list_rows.lower(inputs, options, capacity)
+    return int(_analysis(lowered).temp_size_in_bytes)
 
 
 def _plan_of_triangles(sizes: tuple[int, int, int, int], dtype: np.dtype, cutoff: Cutoff, engine: str, device: Any) -> MemoryPlan:  # noqa: ANN401

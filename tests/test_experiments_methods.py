@@ -55,8 +55,18 @@ def test_methods_that_follow_motion_find_the_pairs_where_particles_are(name, for
         assert 0.001 < gone.min() < gone.max() < cutoff / 3
         row = _compare.compare(found, _oracle.find_pairs(found.positions, cutoff), 300)
         assert (row["missing"], row["extra"], row["pairs"] > 0) == (0, 0, True)
+    if name.startswith("warp-"):
+        plan = adapter.plan(positions, cutoff)
+        assert (plan.list_bytes, plan.backend) == (found.list_bytes + 8, "warp")  # status, required
     shares = {"warp-update": (0.05, 0.2), "warp-rebuild": (1.0, 1.0)}
     assert found.rebuilt is None if name not in shares else shares[name][0] <= found.rebuilt <= shares[name][1]
+
+
+@pytest.mark.parametrize(("name", "pointers"), [("pair-sum", 16), ("warp-counts", 0)])  # XLA counts those to two sums as results
+def test_methods_without_a_list_plan_their_results(name, pointers):
+    positions = np.random.default_rng(3).random((300, 3)).astype(np.float32)
+    plan = methods.load(name).plan(positions, 0.2)
+    assert (plan.list_bytes, plan.result_bytes) == (0, find(name, positions, 0.2).list_bytes + pointers)
 
 
 def test_the_list_of_the_thesis_and_the_sane_one_are_the_same():

@@ -47,6 +47,21 @@ def test_warp_takes_what_was_planned(n, capacity, queries, dim, dtype):
     assert_close(plan, compiled_bytes(n, capacity, dim, dtype, "warp", queries))
 
 
+@pytest.mark.parametrize(
+    ("backend", "queries", "dim", "dtype"),
+    [*itertools.product(["warp"], [None, 500], [2, 3], [np.float32, np.float64]), ("jax", 500, 3, np.float32)],
+)
+def test_counts_take_what_was_planned(backend, queries, dim, dtype):
+    n = 30_000
+    points = [None if size is None else jax.ShapeDtypeStruct((size, dim), dtype) for size in (n, queries)]
+    count = jax.jit(lambda x, q: jfrnn.count(x, 0.1, queries=q, backend=backend))
+    memory = count.lower(*points).compile().memory_analysis()
+    plan = jfrnn.memory_plan(n, 0.1, dim=dim, dtype=dtype, queries=queries, backend=backend)
+    assert plan.counts_bytes == memory.output_size_in_bytes == 4 * (queries or n)
+    assert plan.scratch_bytes == pytest.approx(memory.temp_size_in_bytes, rel=0.01)
+    assert plan.total_bytes == plan.counts_bytes + plan.scratch_bytes
+
+
 def test_warp_takes_at_most_64_bytes_per_particle(dim, dtype):
     for (n, capacity), platform in itertools.product([(10, 1), *SIZES, (10**9, 64)], ["cpu", "gpu"]):
         plan = jfrnn.memory_plan(n, 0.1, capacity, dim=dim, dtype=dtype, backend="warp", platform=platform)
@@ -247,6 +262,14 @@ def test_the_plan_reads_well():
     ]
     with pytest.raises(dataclasses.FrozenInstanceError):
         plan.backend = "warp"
+    plan = jfrnn.MemoryPlan(list_bytes=0, scratch_bytes=1_000_000, backend="warp", counts_bytes=400_000)
+    assert str(plan).splitlines() == [
+        "one count with backend='warp', beside the positions:",
+        "  counts        0.40 MB",
+        "  scratch       1.00 MB",
+        "  total         1.40 MB",
+    ]
+    assert str(jfrnn.memory_plan(0, 0.1, backend="warp")).startswith("one count")
     plan = jfrnn.MemoryPlan(list_bytes=0, scratch_bytes=1_000_000, backend="warp", sums_bytes=12_345_678)
     assert str(plan).splitlines() == [
         "one pair sum with backend='warp', beside the positions and values:",
@@ -269,7 +292,7 @@ def test_example_in_the_docstring():
         (TypeError, r"queries must be an int, the number of points, got bool True", {"queries": True}),
         (ValueError, r"cutoff must be positive and finite, got 0", {"cutoff": 0.0}),
         (ValueError, r"capacity must be at least 1, got 0", {"capacity": 0}),
-        (TypeError, r"capacity must be a static int", {"capacity": None}),
+        (TypeError, r"capacity must be a static int", {"capacity": 8.0}),
         (ValueError, r"capacity is that of a list.*got 8", {"fn": density}),
         (ValueError, r"values and gradient belong to a pair sum", {"gradient": True}),
         (ValueError, r"dim must be 2 or 3, got int 4", {"dim": 4}),

@@ -40,6 +40,7 @@ class Found:
         density: Sums of a poly6 kernel that the method made itself, `_accuracy` says which; shape [n].
         rebuilt: Share of the searches that made a list anew, of methods that keep one.
         positions: Where the particles were at last, if the method moved them; shape [n, d].
+        total: How many pairs there are, where `pairs` holds those of the compared particles alone.
     """
 
     list_bytes: int
@@ -51,6 +52,7 @@ class Found:
     density: np.ndarray | None = None
     rebuilt: float | None = None
     positions: np.ndarray | None = None
+    total: int | None = None
 
 
 class Adapter(Protocol):

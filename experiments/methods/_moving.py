@@ -9,6 +9,7 @@ import numpy as np
 
 import jfrnn
 from experiments.methods import Found
+from experiments.methods._padded import plan_backend
 
 STEPS = 20  # searches of a timed run
 SKIN = 0.1  # of the cutoff
@@ -30,6 +31,18 @@ def away(step: Any, turn: int) -> Any:  # noqa: ANN401
     return turn - abs(turn - step % (2 * turn))
 
 
+def first_list(start: jax.Array, cutoff: float, skin: float) -> jfrnn.NeighborList:
+    """Return the list that motion begins with, with room for more neighbors."""
+    return jfrnn.search(start, cutoff, skin=skin * cutoff, slack=1.5, backend="warp")
+
+
+def plan_list(positions: np.ndarray, cutoff: float, *, skin: float) -> jfrnn.MemoryPlan:
+    """Return what one search is said to take of the memory; a list with a skin holds the positions of its making besides."""
+    jax.config.update("jax_enable_x64", positions.dtype == np.float64)
+    capacity = first_list(jnp.asarray(positions), cutoff, skin).capacity
+    return plan_backend(positions, cutoff, capacity, backend="warp")
+
+
 def follow_list(positions: np.ndarray, cutoff: float, motion: float, *, skin: float) -> Callable[[], Any]:
     """Compile `STEPS` steps of motion and search in one scan, and return it: a list with a skin [cutoffs], or made anew for 0.
 
@@ -38,7 +51,7 @@ def follow_list(positions: np.ndarray, cutoff: float, motion: float, *, skin: fl
     jax.config.update("jax_enable_x64", positions.dtype == np.float64)
     start, rays = jnp.asarray(positions), jnp.asarray(motion * directions(positions), positions.dtype)
     turn = turning(cutoff, motion)
-    first = jfrnn.search(start, cutoff, skin=skin * cutoff, slack=1.5, backend="warp")
+    first = first_list(start, cutoff, skin)
 
     @jax.jit
     def run(step: jax.Array, nbrs: jfrnn.NeighborList, start: jax.Array, rays: jax.Array) -> Any:  # noqa: ANN401

@@ -2,10 +2,11 @@
 
 from functools import partial
 
-from experiments.methods._padded import allocate_backend, prepare_backend, read
+from experiments.methods._padded import allocate_backend, plan_backend, prepare_backend, read
 
-__all__ = ["MAX_POINTS", "allocate", "prepare", "read"]
+__all__ = ["MAX_POINTS", "allocate", "plan", "prepare", "read"]
 
 MAX_POINTS = 20_000
 allocate = partial(allocate_backend, backend="brute")
 prepare = partial(prepare_backend, backend="brute")
+plan = partial(plan_backend, backend="brute")

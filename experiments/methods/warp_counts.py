@@ -1,6 +1,7 @@
 """`jfrnn.count` with the backend `warp`: the number of neighbors of each particle, no list."""
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import numpy as np
@@ -9,6 +10,9 @@ import warp as wp  # noqa: F401 - without it this method is missing, which is no
 import jfrnn
 from experiments.methods import Found
 from experiments.methods._compiled import compile_for
+from experiments.methods._padded import plan_backend
+
+plan = partial(plan_backend, backend="warp")
 
 
 def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], jax.Array]:
