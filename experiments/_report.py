@@ -31,8 +31,8 @@ NOTES = """\
   GPU the peak of its memory over what it held at first: positions, list and scratch, or what the compiler tried out, if that is
   more.
 - **/ cll**, or another method's name in a sweep that has no `cll`: divided by the row of that method on the same scene, process by
-  process of the same round. `≈`: within noise: the interval of that ratio holds 1 (of one process: the intervals of both overlap).
-  `?`: fewer than three rounds, or repeats too few to tell.
+  process of the same round on the same kind of machine. `≈`: within noise: the interval of that ratio holds 1 (of one process: the
+  intervals of both overlap). `?`: fewer than three such rounds, or repeats too few to tell.
 - **missing**, **extra**: unordered pairs against the exact answer on the given floats, distance < cutoff. Of a method without pair
   list (`~`), only the surplus and the deficit of each particle can be seen; of more than two million particles (`~`, too), those
   of 20 000 of them.

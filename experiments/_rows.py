@@ -147,6 +147,11 @@ class Row:
         return name_scene(self.layout, self.fill_asked)
 
     @property
+    def machine_kind(self) -> tuple[str, ...]:
+        """Processor, cores and operating system: times of one kind of machine may be divided by each other."""
+        return tuple(str(self.machine.get(name)) for name in ("cpu", "cores", "system"))
+
+    @property
     def scene_key(self) -> tuple[Any, ...]:
         """What decides the positions and the cutoff."""
         return (self.layout, self.fill_asked, *(getattr(self, name) for name in SCENE_FIELDS))

@@ -49,6 +49,7 @@ class Summary(Row):
     Attributes:
         processes: That gave figures.
         medians: Median of each, by process [s].
+        machines: The kind of machine of each, by process.
         low_s: Where the interval of the median begins [s]; of one process, that of its repeats.
         high_s: Where it ends [s].
         confidence: Of the interval.
@@ -56,6 +57,7 @@ class Summary(Row):
 
     processes: int = 0
     medians: dict[int, float] = field(default_factory=dict)
+    machines: dict[int, tuple[str, ...]] = field(default_factory=dict)
     low_s: float | None = None
     high_s: float | None = None
     confidence: float | None = None
@@ -81,6 +83,7 @@ def _summary(group: list[Row]) -> Summary:
     if not good:
         return summary
     summary.medians = {row.process: row.median_s for row in good if row.median_s is not None}
+    summary.machines = {row.process: row.machine_kind for row in good}
     summary.processes = len(good)
     if len(good) < len(group):
         bad = next(row for row in group if row.status != "ok" or row.median_s is None)
@@ -115,12 +118,18 @@ def _middle(rows: list[Row], name: str) -> int | None:
     return int(np.median(values)) if values else None
 
 
+def _shared_rounds(mine: Summary, theirs: Summary) -> list[int]:
+    """Return the rounds in which a machine of one kind measured both."""
+    both = sorted(set(mine.medians) & set(theirs.medians))
+    return [k for k in both if mine.machines.get(k) == theirs.machines.get(k)]
+
+
 def ratio_interval(mine: Summary, theirs: Summary) -> Interval | None:
     """Return how many times as long one takes as the other, process by process of the same round: drift of the machine cancels.
 
-    None where there are no two rounds that both have: then only repeats within one process are known.
+    None where there are no two rounds in which one kind of machine measured both: then only repeats within one process are known.
     """
-    rounds = sorted(set(mine.medians) & set(theirs.medians))
+    rounds = _shared_rounds(mine, theirs)
     if len(rounds) < 2:
         return None
     return median_interval([mine.medians[k] / theirs.medians[k] for k in rounds])
@@ -131,6 +140,6 @@ def within_noise(mine: Summary, theirs: Summary) -> bool | None:
     ratio = ratio_interval(mine, theirs)
     if ratio is not None:
         return ratio.low <= 1 <= ratio.high if ratio.confidence > LEAST_CONFIDENCE else None
-    if any((one.confidence or 0.0) < LEAST_CONFIDENCE for one in (mine, theirs)):
+    if not _shared_rounds(mine, theirs) or any((one.confidence or 0.0) < LEAST_CONFIDENCE for one in (mine, theirs)):
         return None
     return not (mine.high_s < theirs.low_s or theirs.high_s < mine.low_s)  # pyright: ignore[reportOperatorIssue]

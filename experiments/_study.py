@@ -73,11 +73,12 @@ def table(found: list[Row]) -> Frame:
 
 
 def rounds(found: list[Row]) -> Frame:
-    """Return a line per process with figures: method, scene, process, median_s [s], search_mb [MB], pairs."""
+    """Return a line per process with figures: method, scene, process, machine, median_s [s], search_mb [MB], pairs."""
     names = ("method", "layout", "fill_asked", *SCENE_FIELDS, "process", "points", "median_s", "pairs", "rebuilt")
     good = [row for row in found if row.status == "ok"]
-    lines = [{name: getattr(row, name) for name in names} | {"search_mb": (row.search_bytes or np.nan) / 1e6} for row in good]
-    return pd.DataFrame(lines, columns=[*names, "search_mb"])
+    more = [{"machine": ", ".join(row.machine_kind), "search_mb": (row.search_bytes or np.nan) / 1e6} for row in good]
+    lines = [{name: getattr(row, name) for name in names} | other for row, other in zip(good, more, strict=True)]
+    return pd.DataFrame(lines, columns=[*names, "machine", "search_mb"])
 
 
 class Effect(NamedTuple):
@@ -103,7 +104,7 @@ def effect(lines: Frame, factor: str, before: object, after: object, value: str 
     """Return value(after) / value(before) of scenes and methods that differ in one factor alone, None where there are none.
 
     The unit is the round: a geometric mean over its scenes, so that processes of one round, which share what the machine did then,
-    count once. Intervals and p are those of Student's t on the logarithms.
+    count once; what machines of different kinds measured is not compared. Intervals and p: Student's t on the logarithms.
 
     Args:
         lines: From `rounds`.
@@ -119,7 +120,7 @@ def effect(lines: Frame, factor: str, before: object, after: object, value: str 
     if factor == "layout":  # what only one of the layouts has is no other scene
         fixed = [name for name in fixed if name not in ("angle", "seed")]
     index = chosen[fixed].map(str).agg(" ".join, axis=1)
-    wide = chosen.assign(scene=index).pivot_table(index=["process", "scene"], columns=factor, values=value)
+    wide = chosen.assign(scene=index).pivot_table(index=["process", "machine", "scene"], columns=factor, values=value)
     if before not in wide or after not in wide:
         return None
     logs = np.log(wide[after] / wide[before]).dropna()

@@ -90,6 +90,18 @@ def test_too_few_rounds_give_no_verdict():
     assert (line["within_noise"], _report.cells(line)[4:6]) == (None, ["·", "?2"])
 
 
+def test_rounds_of_different_machines_are_not_divided():
+    cll, jax = rounds("cll", [1.0, 1.0, 1.0, 2.0, 2.0]), rounds("jax", [3.0, 3.0, 3.0, 60.0, 60.0])
+    moved = [replace(row, machine=row.machine | {"system": "another"}) if row.process > 2 else row for row in jax]
+    line = _table.lines(cll + moved)[1]
+    assert (line["seconds_ratio"], line["within_noise"]) == (3.0, False)
+    apart = [replace(row, machine=row.machine | {"cpu": "another"}) for row in jax]
+    line = _table.lines(cll + apart)[1]
+    assert (line["within_noise"], _report.cells(line)[5]) == (None, "?3")
+    line = _table.lines([cll[0], apart[0]])[1]
+    assert line["within_noise"] is None
+
+
 def test_without_cll_ratios_divide_by_a_method_that_is_there():
     rows = rounds("jax", [2.0, 4.0, 6.0]) + rounds("warp", [1.0, 2.0, 3.0])
     lines = {line["method"]: line for line in _table.lines(rows)}

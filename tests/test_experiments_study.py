@@ -1,5 +1,6 @@
 """Effects of one factor with their uncertainty, small versions of sweeps, and the thesis's table beside ours."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,18 @@ def test_an_effect_is_found_through_the_drift():
     assert found.ratio == pytest.approx(1.1, rel=0.02)
     assert (found.p < 0.01, found.rounds, found.scenes) == (True, 5, 2)
     assert "beyond noise (5 rounds, 2 scenes)" in str(found)
+
+
+def test_rows_of_different_machines_are_not_compared():
+    rows = turned_rows(1.1, 0.01)
+    moved = [replace(row, machine=row.machine | {"system": "another"}) if row.process > 2 else row for row in rows]
+    assert _study.effect(_study.rounds(moved), "angle", 0.0, 45.0) == _study.effect(_study.rounds(rows), "angle", 0.0, 45.0)
+    apart = [replace(row, machine=row.machine | {"system": "another"}) if row.angle else row for row in rows]
+    assert _study.effect(_study.rounds(apart), "angle", 0.0, 45.0) is None
+    some = [replace(row, machine=row.machine | {"system": "another"}) if row.angle and row.process > 2 else row for row in rows]
+    found = _study.effect(_study.rounds(some), "angle", 0.0, 45.0)
+    assert found is not None
+    assert (found.rounds, found.scenes) == (3, 2)
 
 
 def test_without_an_effect_the_interval_misses_1_as_rarely_as_it_says():
