@@ -76,7 +76,7 @@ def assert_case(name, dtype, dim, backend, *, closed=False, geometry=False):
 TIED = [name for name in PERIODIC_CASES if any(word in name for word in ("ties", "crystal", "cutoffs", "residues", "_supercell"))]
 # one case for each way in which a program differs: axes, skew, images, queries
 DIFFERENT = [
-    ("crystal_0.1_outside", np.float32, 3),
+    pytest.param("crystal_0.1_outside", np.float32, 3, marks=pytest.mark.slow),
     pytest.param("ties_across_skewed_far", np.float32, 2, marks=pytest.mark.slow),
     pytest.param("cutoff_1.5_boxes", np.float32, 2, marks=pytest.mark.slow),
     ("queries_many_images", np.float64, 2),

@@ -106,6 +106,7 @@ def test_sums_are_decided_against_lists(monkeypatch):
     assert [row["wrong"] for row in _gpu._exactness_rows(part)] == [2]
 
 
+@pytest.mark.slow  # a dozen programs
 def test_triangles_are_decided_timed_and_reported(tmp_path, monkeypatch):
     """The third config, with one case and a small gear: from its command to its report."""
     from jfrnn.cases import triangles

@@ -68,6 +68,7 @@ def energy(nbrs, x):
     return jnp.sum(jnp.where(mask, (0.4 - d) ** 3, 0.0))
 
 
+@pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)], ids=["2d", "3d"])
 def test_gradients_against_finite_differences(points):
     nbrs = search(points, 0.4)
     check_grads(lambda x: energy(nbrs, x), (points,), order=2, modes=("fwd", "rev"), eps=1e-6, rtol=1e-6)

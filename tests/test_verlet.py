@@ -246,6 +246,7 @@ def test_inactive_particles_have_no_neighbors_and_come_and_go(backend, dim):
         nbrs.update(x, active=np.arange(60) < 51).check()
 
 
+@pytest.mark.slow  # on Warp, test_transforms.py says it by default
 def test_vmap_is_a_loop():
     x, moved = (jnp.stack([points(40, 2, np.float32, s) for s in seeds]) for seeds in ((0, 1, 2), (0, 1, 3)))
     lists = [jfrnn.search(one, CUTOFF, skin=SKIN, capacity=40, backend="jax") for one in x]
