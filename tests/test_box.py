@@ -224,7 +224,12 @@ def test_gradients_in_positions_and_box(vectors):
 
 @pytest.mark.parametrize(
     ("backend", "vectors"),
-    [("warp", LENGTHS), ("warp", SKEWED), ("warp", SMALL), pytest.param("jax", LENGTHS, marks=pytest.mark.slow)],
+    [
+        pytest.param("warp", LENGTHS, marks=pytest.mark.slow),
+        ("warp", SKEWED),
+        ("warp", SMALL),
+        pytest.param("jax", LENGTHS, marks=pytest.mark.slow),
+    ],
     ids=["warp-lengths", "warp-skewed", "warp-images", "jax-lengths"],
 )
 def test_skin_in_a_moving_box(backend, vectors):

@@ -121,7 +121,8 @@ BOXES = {
 
 
 @pytest.mark.parametrize(
-    ("backend", "dtype", "dim"), [("jax", np.float32, 3), ("brute", np.float64, 2), pytest.param("list", np.float32, 3, marks=SLOW)]
+    ("backend", "dtype", "dim"),
+    [("jax", np.float32, 3), *(pytest.param(*kind, marks=SLOW) for kind in (("brute", np.float64, 2), ("list", np.float32, 3)))],
 )
 def test_periodic_cases(backend, dtype, dim):
     for name in BOXES[backend]:

@@ -67,9 +67,9 @@ def each_case():
     kinds = {"gather": (np.float64, 2), "scatter": (np.float32, 2), "either": (np.float32, 3), "both": (np.float32, 3)}
     kinds["mean"] = (np.float64, 3)
     compiled = {"queries": ("either",), "periodic": ("gather",), "periodic_ties": (), "periodic_images": ()}
-    in_boxes = ("gather", "mean")  # on warp, too, XLA prepares what the kernel walks
+    in_boxes = {"periodic": ("gather",), "periodic_images": ("gather",), "periodic_ties": ("mean",)}  # XLA prepares what Warp walks
     for name, rule, dtype, dim, backend in product(RADII_CASES, RULES, (np.float32, np.float64), (2, 3), ("jax", "warp", "brute")):
-        common = in_boxes if "periodic" in name else RULES
+        common = in_boxes.get(name, RULES)
         often = (dtype, dim) == kinds[rule] and rule in (common if backend == "warp" else compiled.get(name, ("mean",)))
         kind = f"{name}-{rule}-f{8 * dtype().itemsize}-{dim}d-{backend}"
         yield pytest.param(name, rule, dtype, dim, backend, id=kind, marks=[SLOW] * (backend == "brute" or not often))

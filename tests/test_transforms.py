@@ -70,7 +70,10 @@ FUNCTIONS = {
 }
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+SLOWLY = "search_triangles, jax"  # compiled
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == SLOWLY)) for name in FUNCTIONS])
 def test_vmap_is_a_loop(name):
     function = FUNCTIONS[name]
     batch = jax.vmap(function)(X)
