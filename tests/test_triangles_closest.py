@@ -16,7 +16,7 @@ from jfrnn._exact import make_cutoff
 from jfrnn._triangles_closest import make_normals
 
 FINITE = [name for name in TRIANGLE_CASES if name not in ("not_finite", "faces_out_of_range", "huge_and_tiny")]
-SOME = 400  # pairs of a case, which fractions decide slowly
+
 
 KINDS = [pytest.param(np.float32, 3, id="f32-3d"), pytest.param(np.float64, 2, id="f64-2d", marks=pytest.mark.slow)]
 
@@ -31,9 +31,8 @@ def test_distances_are_those_of_the_oracle(name, dtype, dim):
     assert np.array_equal(mask, np.arange(40) < np.asarray(tri.count)[:, None])
     eps = float(np.finfo(dtype).eps)
     lift = [[Fraction(x) for x in row] + [Fraction(0)] * (3 - dim) for row in given.vertices.tolist()]
-    pairs = np.argwhere(mask)
-    for i, t in pairs[:: 1 + len(pairs) // SOME]:
-        face, far, here = given.faces[int(tri.idx[i, t])], distance[i, t], points[i, t]
+    for i, t, far, here in zip(*np.nonzero(mask), distance[mask], points[mask], strict=True):
+        face = given.faces[int(tri.idx[i, t])]
         point = [Fraction(x) for x in given.positions[i].tolist()] + [Fraction(0)] * (3 - dim)
         square = reference.squared_distance(point, [lift[k] for k in face])
         exact = float(square / Fraction(given.cutoff) ** 2) ** 0.5 * given.cutoff  # squares may leave the range of floats
