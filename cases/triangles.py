@@ -121,6 +121,16 @@ def _thin(height: float, at_end: bool) -> Recipe:
     return recipe
 
 
+def _touched(dtype: np.dtype, dim: int, rng: np.random.Generator) -> Parts:
+    """Make slivers of every thinness, each with a particle above its inside, at any height."""
+    corners = rng.uniform(-3, 3, (32, dim, dim))
+    tip = corners[:, 0] + rng.uniform(0.1, 0.9, (32, 1)) * (corners[:, 1] - corners[:, 0])
+    corners[:, -1] = tip + _directions(rng, 32, dim) * 10.0 ** rng.uniform(-16, 0, (32, 1))
+    corners = corners.astype(dtype)
+    above = _directions(rng, 32, dim) * 10.0 ** rng.uniform(-16, 0, (32, 1)) * rng.integers(0, 2, (32, 1))
+    return np.einsum("fk,fkd->fd", rng.dirichlet(np.ones(dim), 32), corners) + above, corners, 1.0
+
+
 def _degenerate(dtype: np.dtype, dim: int, rng: np.random.Generator) -> Parts:
     corners = rng.integers(-3, 4, (16, dim, dim)).astype(float)
     corners[:4] = corners[:4, :1]  # points
@@ -296,6 +306,7 @@ TRIANGLE_CASES: dict[str, TriangleCase] = {
             "slivers", "the third vertex is up to 1e-9 from the opposite side: its plane is unknown to floats", _thin(1e-6, False)
         ),
         _case("slivers_1e-3", "slivers whose plane floats know, badly", _thin(1e-3, False)),
+        _case("slivers_touched", "slivers from 1 to 1e-16 wide, particles as far above their insides, or on them", _touched),
         _case("needles", "two vertices nearly coincide", _thin(1e-6, True)),
         _case("degenerate", "points, segments, three vertices on a line", _degenerate),
         _case("repeated_vertices", "a face names a vertex twice", _drawn(2.0)),

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jfrnn._triangles_exact import Vector, cross, dot, minus, sum_of
+from jfrnn._triangles_exact import Vector, cross, dot, minus
 
 # where the nearest point lies: corners are 0, 1, 2, sides (from that corner to the next) _SIDE + 0, 1, 2, the face _FACE
 _SIDE, _FACE = 3, 6
@@ -26,8 +26,9 @@ class Nearest(NamedTuple):
 def nearest_of(points: Array, corners: Array) -> Nearest:
     """Compute the nearest points of closed shapes [..., corner, d] to points [..., d].
 
-    What is compared are points of the shape, a foot on each side and on the face, so that rounding, even of slivers, can find
-    another point of the shape than the nearest, but none beside it. Differentiable: to any order, also where shapes are degenerate.
+    What is compared are a foot on each side and one on the face, each right for a shape whose corners are a few roundings of the
+    largest coordinate seen from the point away, so that distances are, too, even of slivers. Differentiable: to any order, also
+    where shapes are degenerate.
     Source: Ericson (2005), Real-Time Collision Detection, sect. 5.1, for the feet.
     """
     raw = corners - points[..., None, :]
@@ -62,19 +63,28 @@ def _nearer(
 
 
 def _foot_on_face(x: list[Vector]) -> tuple[Vector, Array]:
-    """Return the foot of the origin on a triangle, and its squared distance: infinite where it lies outside."""
-    normal = cross(minus(x[1], x[0]), minus(x[2], x[0]))
-    parts = [dot(cross(x[1], x[2]), normal), dot(cross(x[2], x[0]), normal), dot(cross(x[0], x[1]), normal)]
-    inside = (parts[0] > 0) & (parts[1] > 0) & (parts[2] > 0)
-    whole = jnp.where(inside, sum_of(parts), 1)
-    weights = [jnp.where(inside, part / whole, 0) for part in parts]
-    foot = [sum_of([w * corner[k] for w, corner in zip(weights, x, strict=True)]) for k in range(3)]
-    one, two, area = (dot(v, v) for v in (minus(x[1], x[0]), minus(x[2], x[0]), normal))
-    well_shaped = inside & (
-        area > 2.0**-6 * one * two
-    )  # its normal is known: no rounding along the face, then, at contact above all
-    height = jnp.where(well_shaped, dot(x[0], normal) / jnp.where(well_shaped, area, 1), 0)
-    foot = [jnp.where(well_shaped, height * n, f) for n, f in zip(normal, foot, strict=True)]
+    """Return the foot of the origin on a triangle, and its squared distance: infinite where it lies outside.
+
+    Its plane is spanned by one side and the height on it, made orthogonal twice, so that all is exact for a triangle whose corners
+    are a few roundings from the given ones, however thin; one as thin as a rounding is left to its sides.
+    Source: Giraud et al. (2005), doi:10.1007/s00211-005-0615-4, for the second time.
+    """
+    side, slant = minus(x[1], x[0]), minus(x[2], x[0])
+    length, thinnest = dot(side, side), (4 * jnp.finfo(side[0].dtype).eps) ** 2
+    is_line = length > thinnest
+    height, along = slant, jnp.zeros_like(length)
+    for _ in range(2):
+        step = dot(height, side) / jnp.where(is_line, length, 1)
+        height, along = [h - step * s for h, s in zip(height, side, strict=True)], along + step
+    square = dot(height, height)
+    is_face = is_line & (square > thinnest)
+    of_third = -dot(x[0], height) / jnp.where(is_face, square, 1)
+    of_second = -dot(x[0], side) / jnp.where(is_line, length, 1) - along * of_third
+    inside = is_face & (of_third > 0) & (of_second > 0) & (of_second + of_third < 1)
+    normal = cross(side, height)
+    area = jnp.where(inside, dot(normal, normal), 1)
+    distance = jnp.where(inside, dot(x[0], normal) / area, 0)
+    foot = [distance * n for n in normal]
     return foot, jnp.where(inside, dot(foot, foot), jnp.inf)
 
 

@@ -37,8 +37,9 @@ def _both_widths():
 
 @pytest.fixture(autouse=True)
 def _compiled_soon(request, monkeypatch):
-    """Leave out what LLVM takes long for and what no float depends on, but in slow tests and those of memory."""
-    fully = request.node.get_closest_marker("slow") or "memory" in request.node.nodeid
+    """Leave out what LLVM takes long for, but in slow tests, those of memory, and where the last digits of floats are tested."""
+    marked = any(request.node.get_closest_marker(name) for name in ("slow", "fully_compiled"))
+    fully = marked or "memory" in request.node.nodeid
     if fully:
         monkeypatch.delenv("JAX_DISABLE_MOST_OPTIMIZATIONS")
     jax.config.update("jax_disable_most_optimizations", not fully)
