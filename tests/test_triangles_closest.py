@@ -15,6 +15,8 @@ from jfrnn import _triangles_rows
 from jfrnn._exact import make_cutoff
 from jfrnn._triangles_closest import make_normals, nearest_of
 
+# of cutoffs of their own, each a program anew, between the smallest and the largest
+_IN_BETWEEN = {"ties_small", "ties_spacing", "ulps", "ulps_far", "ulps_large", "axis_ulps", "cell_edges"}
 FINITE = [name for name in TRIANGLE_CASES if name not in ("not_finite", "faces_out_of_range", "huge_and_tiny")]
 
 
@@ -23,7 +25,7 @@ KINDS = [pytest.param(np.float32, 3, id="f32-3d"), pytest.param(np.float64, 2, i
 
 @pytest.mark.fully_compiled
 @pytest.mark.parametrize(("dtype", "dim"), KINDS)
-@pytest.mark.parametrize("name", FINITE)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x in _IN_BETWEEN)) for x in FINITE])
 def test_distances_are_those_of_the_oracle(name, dtype, dim):
     given = TRIANGLE_CASES[name].build(dtype, dim)
     wide = padded(given)
