@@ -13,7 +13,7 @@ from jfrnn._warp import load_warp
 
 
 def decisions(oracle: Any, dtype: str, dim: int, capacity: int, backend: str) -> Iterator[tuple[str, bool]]:  # noqa: ANN401
-    """Say of every hard case whether its list is the oracle's."""
+    """Say of every hard case whether its list is the oracle's, and its distances are as near as they are promised to be."""
     import jax.numpy as jnp
     from jfrnn.cases.triangles import TRIANGLE_CASES, padded  # pyright: ignore[reportMissingImports]
 
@@ -25,7 +25,7 @@ def decisions(oracle: Any, dtype: str, dim: int, capacity: int, backend: str) ->
         x, vertices, faces = (jnp.asarray(array) for array in (given.positions, given.vertices, given.faces))
         tri = jfrnn.search_triangles(x, vertices, faces, given.cutoff, capacity=capacity, backend=backend)
         expected = oracle.triangle_pairs(plain.positions, plain.vertices, plain.faces, plain.cutoff)
-        yield name, is_exact(oracle, tri, expected)
+        yield name, is_exact(oracle, tri, expected) and are_near(oracle, tri, x, plain)
 
 
 def is_exact(oracle: Any, tri: Any, expected: Any) -> bool:  # noqa: ANN401
@@ -34,6 +34,19 @@ def is_exact(oracle: Any, tri: Any, expected: Any) -> bool:  # noqa: ANN401
     filled = np.all(idx[np.arange(tri.capacity) >= count[:, None]] == fill)
     told = bool(filled) and not tri.overflow and int(tri.required) == int(count.max())
     return told and _compare.is_exact(oracle, idx, count, fill, expected)
+
+
+def are_near(oracle: Any, tri: Any, x: Any, given: Any) -> bool:  # noqa: ANN401
+    """Say whether the distances of a list of particles x to their triangles are within what `TriangleList.closest` says."""
+    _, distances, mask = (np.asarray(array) for array in tri.closest(x))
+    if not np.array_equal(mask, np.arange(tri.capacity) < np.asarray(tri.count)[:, None]):
+        return False
+    idx, bound = np.asarray(tri.idx), 4 * float(np.finfo(distances.dtype).eps)
+    for i, slot in np.argwhere(mask):
+        exact, size = oracle.distance(given.positions[i], given.vertices[given.faces[idx[i, slot]]])
+        if not abs(float(distances[i, slot]) - exact) <= bound * size:
+            return False
+    return True
 
 
 def rows(

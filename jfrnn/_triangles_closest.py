@@ -83,8 +83,8 @@ def _foot_on_face(x: list[Vector]) -> tuple[Vector, Array]:
     inside = is_face & (of_third > 0) & (of_second > 0) & (of_second + of_third < 1)
     normal = cross(side, height)
     area = jnp.where(inside, dot(normal, normal), 1)
-    distance = jnp.where(inside, dot(x[0], normal) / area, 0)
-    foot = [distance * n for n in normal]
+    along_normal = jnp.where(inside, dot(x[0], normal) / area, 0)
+    foot = [along_normal * n for n in normal]
     return foot, jnp.where(inside, dot(foot, foot), jnp.inf)
 
 

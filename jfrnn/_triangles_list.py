@@ -150,8 +150,8 @@ class TriangleList:
     def closest(self, positions: Array, *, vertices: Array | None = None) -> tuple[Array, Array, Array]:
         """Compute the nearest point of every triangle of a row.
 
-        Distances of slivers, too, are within 4 ulp of the largest coordinate of a corner as seen from the particle: what rounding
-        moves is a triangle's corners, by as much. The mask is exact.
+        Distances, of slivers too, are within 4 eps of the dtype times the largest coordinate of a corner as seen from the particle:
+        what rounding moves is a triangle's corners, by as much. The mask is exact.
 
         Args:
             positions: Particles [length], shape [n, d], where they are now.

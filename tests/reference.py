@@ -206,6 +206,16 @@ def squared_distance(point: Sequence[int | Fraction], corners: Sequence[Sequence
     return min(_squared_distance_to_segment(point, *side) for side in ((a, b), (b, c), (c, a)))
 
 
+def distance(point: Any, corners: Any) -> tuple[float, float]:
+    """Return the distance of a point [d] to the closed shape between corners [2 or 3, d], and the largest coordinate seen from it.
+
+    Both are rational numbers until they are rounded to double precision; squares do not leave its range.
+    """
+    start, *ends = ([Fraction(float(x)) for x in row] + [Fraction(0)] * (3 - len(row)) for row in (point, *corners))
+    size = max(abs(x) for end in ends for x in _minus(end, start))
+    return (math.sqrt(squared_distance(start, ends) / size**2) * float(size) if size else 0.0), float(size)
+
+
 def _squared_distance_to_segment(point: Sequence[Any], a: Sequence[Any], b: Sequence[Any]) -> Fraction:
     along, away = _minus(b, a), _minus(point, a)
     length = _dot(along, along)

@@ -3,6 +3,7 @@
 import importlib
 import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -160,6 +161,18 @@ def test_a_wrong_list_of_triangles_is_counted(monkeypatch):
     search = jfrnn.search_triangles
     monkeypatch.setattr(jfrnn, "search_triangles", lambda x, v, f, cutoff, **options: search(x, v, f, 1.5 * cutoff, **options))
     assert [row["wrong"] for row in _gpu._exactness_rows(part)] == [1]
+
+
+def test_distances_of_a_moved_wall_are_not_near():
+    from jfrnn.cases import triangles
+
+    import jfrnn
+
+    given = triangles.TRIANGLE_CASES["random"].build(np.dtype(np.float64), 2)
+    tri = jfrnn.search_triangles(given.positions, given.vertices, given.faces, given.cutoff)
+    assert _gpu_triangles.are_near(_gpu._oracle(), tri, given.positions, given)
+    moved = replace(given, vertices=given.vertices * (1 + 1e-13))
+    assert not _gpu_triangles.are_near(_gpu._oracle(), tri, given.positions, moved)
 
 
 def test_memory_is_planned_within_a_tenth(monkeypatch):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import squared_distance, triangle_pairs
+from reference import distance, squared_distance, triangle_pairs
 
 UNIT = [[0, 0, 0], [4, 0, 0], [0, 4, 0]]
 WHOLE = st.lists(st.integers(-6, 6), min_size=3, max_size=3)
@@ -30,6 +30,13 @@ WHOLE = st.lists(st.integers(-6, 6), min_size=3, max_size=3)
 def test_distances_by_hand(point, square):
     for corners in permutations(UNIT):
         assert squared_distance(point, corners) == square
+        size = max(abs(c - p) for corner in corners for c, p in zip(corner, point, strict=True))
+        assert distance(point, corners) == (pytest.approx(square**0.5, rel=1e-15), size)
+
+
+def test_distances_beyond_the_range_of_squares():
+    assert distance([0.0, 3e-200], [[0.0, 0.0], [5e-324, 0.0]]) == (pytest.approx(3e-200, rel=1e-15), 3e-200)
+    assert distance([0.0, 1e200], [[-1e200, 0.0], [1e200, 0.0]]) == (pytest.approx(1e200, rel=1e-15), 1e200)
 
 
 def test_degenerate_triangles_by_hand():
