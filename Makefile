@@ -18,7 +18,7 @@ $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(f"jfrnn needs Python >= 3.11, found {v[0]}.{v[1]}: set PYTHON=/path/to/python3") if v < (3, 11) else None'
 	$(PYTHON) -m venv $(VENV)
 	$(PY) -m pip install --quiet --upgrade pip
-	$(PY) -m pip install --quiet --editable '.[test]'
+	$(PY) -m pip install --quiet --no-compile --editable '.[test]'
 	touch $@
 
 sweep: $(STAMP)
