@@ -74,6 +74,31 @@ def _lattice(spacing: float, offset: float) -> Recipe:
     return lambda dtype, dim: (_sites(dim) * spacing + offset, 3 * spacing)
 
 
+def _one_off_the_lattice(dtype: np.dtype, dim: int) -> Parts:
+    sites = _sites(dim)
+    sites[-1] += 0.1
+    return sites, 3.0
+
+
+def _grid(steps: int) -> Recipe:
+    """Put pairs on a grid of so many steps per unit length at exactly the cutoff of 3, and one step to either side of it."""
+
+    def recipe(dtype: np.dtype, dim: int) -> Parts:
+        first = np.random.default_rng(12).integers(0, 4 * steps, (60, dim))
+        way = np.eye(dim)[np.arange(60) % dim] * 3 * steps
+        if dim == 3:
+            way[::2] = np.roll([1, 2, 2], 1) * steps
+        step = np.arange(60) % 3 - 1
+        return np.concatenate([first, first + way + step[:, None] * (way != 0)]) / steps, 3.0
+
+    return recipe
+
+
+def _queries_between_sites(dtype: np.dtype, dim: int) -> Parts:
+    sites = _sites(dim)
+    return sites, 1.5, sites[::3] + np.eye(dim)[0] / 2
+
+
 def _lattice_in_dtype(dtype: np.dtype, dim: int) -> Parts:
     spacing = dtype.type(1e-4)
     return _sites(dim).astype(dtype) * spacing, float(dtype.type(3) * spacing)
@@ -275,6 +300,9 @@ _TABLE = (
     _case("integers_14", "sqrt(14) rounds, beside (1, 2, 3)", _integers(14)),
     _case("integers_25", "exact ties at 5: (5, 0, 0), (3, 4, 0)", _integers(25)),
     _case("integers_49", "exact ties at 7: (7, 0, 0), (2, 3, 6)", _integers(49)),
+    _case("integers_one_off", "exact ties at 3 among integers, beside one particle that is none", _one_off_the_lattice),
+    _case("grid_256", "exact ties on a grid as fine as single precision can square", _grid(256)),
+    _case("grid_1024", "exact ties on a grid finer than that", _grid(1024)),
     _case("dyadic_ties", "exact ties at (1, 2, 2) * 2^-10, and one float to either side", adversarial.dyadic_ties),
     _case("cutoff_rounds_down", "float32(0.7) < 0.7: a tie only once the cutoff is rounded", _at_rounded_cutoff(0.7)),
     _case("cutoff_rounds_up", "float32(0.1) > 0.1: a tie only once the cutoff is rounded", _at_rounded_cutoff(0.1)),
@@ -359,6 +387,11 @@ _TABLE = (
     _case("queries_fewer", "37 queries, 200 sources", _queried(200, 37)),
     _case("queries_more", "330 queries, 41 sources", _queried(41, 330)),
     _case("queries_just_outside", "queries in cells beside the box of the sources", _queries_just_outside),
+    _case(
+        "queries_between_sites",
+        "exact ties at (1.5, 0, 0) and (0.5, 1, 1) of queries halfway between integers",
+        _queries_between_sites,
+    ),
     _case("queries_far_outside", "queries whose cell indices overflow", _queries_far_outside),
     _case("queries_coincident", "distance zero is a pair, index equality means nothing", _queries_coincident),
     _case("queries_none_in_reach", "no query has a source", _queried(100, 50, 3.0, 4.0)),

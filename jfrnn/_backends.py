@@ -275,7 +275,7 @@ def _all_sources(
     order = query_order = None
     first = end = jnp.zeros((), jnp.int32)
     if batch is not None:
-        order = jnp.argsort(batch.sources)
+        order = jnp.argsort(batch.sources).astype(jnp.int32)
         query_order = order if batch.queries is None else lax.iota(jnp.int32, batch.queries.size)
         systems, wanted = batch.sources[order], batch.of_queries[query_order]
         first, end = (jnp.searchsorted(systems, wanted, side=side).astype(jnp.int32) for side in ("left", "right"))

@@ -272,11 +272,23 @@ struct Exact {
     }
 #endif
     JFRNN_FUNCTION double size_of(double x) { return x < 0 ? -x : x; }
+    // has x at most 26 bits? Then its square is exact.
+    JFRNN_FUNCTION bool is_narrow(double x) {
+        unsigned long long bits;
+        memcpy(&bits, &x, 8);
+        return (bits & 0x7ffffff) == 0;
+    }
     JFRNN_FUNCTION double two_sum(double a, double b, double& error) {  // Knuth 1969
         const double s = add(a, b);
         const double bv = add(s, -a);
         error = add(add(a, -add(s, -bv)), add(b, -bv));
         return s;
+    }
+
+    // size of the smallest coordinate with which products of differences do not underflow
+    JFRNN_FUNCTION double smallest_plain(real larger) {
+        const int exponent = Bits::exponent(larger) - Bits::BIAS;
+        return Bits::power_of_two(exponent - 450 < -970 ? -970 : exponent - 450);
     }
 
     // sign of |b + S·A - a|^2 - r^2 by error-free transformations (Ogita, Rump & Oishi 2005, doi:10.1137/030601818); 2: not proven.
@@ -288,8 +300,7 @@ struct Exact {
         bool plain = true;
         const real larger = SUM && more > radius ? more : radius;
         const double scale = Bits::unit_scale(larger);
-        const int exponent = Bits::exponent(larger) - Bits::BIAS;
-        const double smallest = Bits::power_of_two(exponent - 450 < -970 ? -970 : exponent - 450);
+        const double smallest = smallest_plain(larger);
         double r = mul(double(radius), scale);
         if constexpr (SUM) {
             double rest;
@@ -302,6 +313,8 @@ struct Exact {
         const double r2 = mul(r, r);
         term[0] = -r2;
         term[1] = -product_error(r, r, r2);
+        double whole_square = 0;
+        bool rounded = term[1] != 0 || slack != 0 || (SUM && term[TERMS - 1] != 0);  // else all may be exact, as on many lattices
 #pragma unroll
         for (int k = 0; k < DIM; ++k) {
             const double ak = double(a[k]), bk = double(b[k]);
@@ -331,6 +344,9 @@ struct Exact {
             low = mul(low, scale);
             plain = plain && size_of(high) < 1e6;  // beyond, two_sum may have overflowed
             const double square = mul(high, high), tail = mul(mul(2, high), low);
+            double lost;
+            whole_square = two_sum(whole_square, square, lost);
+            rounded = rounded || low != 0 || lost != 0 || !is_narrow(high);
             term[3 * k + 2] = square;
             term[3 * k + 3] = product_error(high, high, square);
             term[3 * k + 4] = tail;
@@ -338,6 +354,8 @@ struct Exact {
         }
         if (!plain)
             return 2;
+        if (!rounded && slack == 0)
+            return whole_square < r2 ? -1 : whole_square > r2;
 #pragma unroll
         for (int pass = 0; pass < 3; ++pass) {  // VecSum: the exact sum stays, most of it in the last term
             double total = term[0];
@@ -529,6 +547,15 @@ struct Exact {
         return sign < 0 || (sign == 0 && closed);
     }
 };
+// Where coordinates lie on a lattice: the square, in units, that separates those of pairs from all others, half a unit from both.
+auto square_between = [&](real unit) -> double {
+    const double r = double(radius) / double(unit), square = r * r, error = Exact::product_error(r, r, square);
+    double whole_part = double((long long)square);
+    if (whole_part == square && error < 0)
+        whole_part -= 1;
+    const bool tie = whole_part == square && error == 0;
+    return (tie && !closed ? whole_part - 1 : whole_part) + 0.5;
+};
 // the image of a source that a query meets: rows of positions as they were given, the code of the image of wrapped points, and the
 // cutoff, where it is a sum of two numbers
 auto exact_image_within = [&](const real* query, const real* source, int image, real radius, real more) {
@@ -584,6 +611,40 @@ auto cell_of = [&](int axis, real x) -> real {  // a whole float, monotone in x
 #else
     return DOUBLE ? real(__builtin_floor(x * inverse_edge[axis])) : real(__builtin_floorf(x * inverse_edge[axis]));
 #endif
+};
+// The exponent of a float's lowest bit: it is a multiple of 2 to that. Zero is a multiple of everything.
+auto lowest_bit = [](real x) -> int {
+    const int e = Bits::exponent(x);
+    const unsigned long long lead = e ? 1ull << Bits::MANTISSA : 0;
+    const unsigned long long mantissa = (Bits::of(x) & ((1ull << Bits::MANTISSA) - 1)) | lead;
+#if defined(__CUDA_ARCH__)
+    const int zeros = (DOUBLE ? __ffsll((long long)mantissa) : __ffs((int)mantissa)) - 1;
+#else
+    const int zeros = mantissa ? __builtin_ctzll(mantissa) : -1;
+#endif
+    return zeros < 0 ? 1 << 20 : (e > 1 ? e : 1) - Bits::BIAS - Bits::MANTISSA + zeros;
+};
+// Do all coordinates lie on a lattice of which the cutoff is a moderate multiple, crystals and the usual start of an SPH run? Then
+// squared distances near the cutoff are whole numbers of squared units, computed without any rounding, and working precision
+// decides ties as well. `lowest` is the lowest bit of all coordinates, as they were given, `highest` their largest exponent, which
+// matters where they are moved by lattice vectors: all sums must be exact. Returns the unit, or 0.
+constexpr int UNITS = DOUBLE ? 24 : 10;  // bits of the cutoff in units; its square has twice as many, less than a float has
+auto lattice_unit = [&](int lowest, int highest) -> real {
+    if (SKEWED)
+        return 0;
+    for (int k = 0; PERIODIC && k < DIM; ++k)
+        if (is_periodic(k)) {
+            const real v = lattice.vector(k, k), farthest = v * real(lattice.images(k) + 1);
+            lowest = lowest_bit(v) < lowest ? lowest_bit(v) : lowest;
+            highest = Bits::exponent(farthest) > highest ? Bits::exponent(farthest) : highest;
+            highest = Bits::exponent(lattice.origin(k)) > highest ? Bits::exponent(lattice.origin(k)) : highest;
+        }
+    if (Bits::exponent(radius) - Bits::BIAS > lowest + UNITS)
+        return 0;
+    if (PERIODIC && highest - Bits::BIAS > lowest + Bits::MANTISSA - 3)
+        return 0;
+    const int finest = Bits::exponent(radius) - Bits::BIAS + 1;  // a coarser unit than the cutoff would gain nothing
+    return real(Bits::power_of_two(lowest < finest ? lowest : finest));
 };
 // the end of a stencil may be infinite, though no particle is: the largest float instead
 auto in_range = [](real x) -> real {

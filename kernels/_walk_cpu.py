@@ -120,37 +120,123 @@ const real off = PERIODIC ? 2 * lattice.slack() * step_scale : real(0);  // by w
 const real inner = step_radius > off ? step_radius - off : real(0), outer = step_radius + off;
 // 7 roundings of eps/2, 5 in a square and 2 in a bound (jfrnn/_exact.py); images are farther off
 const real band = (PERIODIC ? 8 * (1 + PERIODIC) : 4) * step_eps;
-const real inside = inner * inner * (1 - band), outside = outer * outer * (1 + band);
+const real between = !SCALED && shared.unit > 0 ? real(square_between(shared.unit)) * shared.unit * shared.unit : real(0);
+const real inside = between > 0 ? between : inner * inner * (1 - band);
+const real outside = between > 0 ? between : outer * outer * (1 + band);
 const double doubly_inside = Exact::doubly_inside(radius), doubly_outside = Exact::doubly_outside(radius);
-typedef float floats __attribute__((vector_size(32)));
-typedef double doubles __attribute__((vector_size(64)));
-typedef bool flags8 __attribute__((ext_vector_type(8)));
+constexpr int WIDE = LANES < 8 ? LANES : 8;  // numbers in twice the precision
+typedef double doubles __attribute__((vector_size(WIDE * 8)));
+typedef bool wide_flags __attribute__((ext_vector_type(WIDE)));
 auto bits_of_lanes = [](auto lanes) -> unsigned int {
-    const flags8 f = __builtin_convertvector(lanes, flags8);
+    const wide_flags f = __builtin_convertvector(lanes, wide_flags);
     unsigned char bits;
     __builtin_memcpy(&bits, &f, 1);
-    return bits;
+    return bits & ((1u << WIDE) - 1);
 };
-// which of the points in lanes are pairs for sure, in twice the precision, eight at a time; others stay `open`, or are none
-auto doubly_decided = [&](const real* q, const vec* p, unsigned int& open) -> unsigned int {
-    unsigned int pairs = 0;
-    if constexpr (!DOUBLE && !PERIODIC) {
-        struct Halves { floats eight[LANES / 8]; } x[3];
-        for (int k = 0; k < DIM; ++k)
-            __builtin_memcpy(&x[k], &p[k], sizeof(vec));
-        unsigned int doubtful = 0;
-        for (int h = 0; h < LANES / 8; ++h) {
-            doubles square;
-            for (int k = 0; k < DIM; ++k) {
-                const doubles d = __builtin_convertvector(x[k].eight[h], doubles) - (double)q[k];
-                square = k == 0 ? d * d : square + d * d;
-            }
-            pairs |= bits_of_lanes(square < doubly_inside) << 8 * h;
-            doubtful |= bits_of_lanes(square <= doubly_outside) << 8 * h;
-        }
-        pairs &= open;
-        open &= ~pairs & doubtful;
+// `Exact::sum_sign` for WIDE pairs at a time, in open space: those whose sign is not proven stay `open`
+auto signs_decided = [&](const double* q, const doubles* p, unsigned int& open) -> unsigned int {
+    const double scale = Bits::unit_scale(radius), r = (double)radius * scale, r2 = r * r;
+    const double smallest = Exact::smallest_plain(radius);
+    constexpr int TERMS = 3 * DIM + 2;
+    auto size_of = [](doubles x) -> doubles { return x < 0 ? -x : x; };
+    auto two_sum = [](doubles a, doubles b, doubles& error) -> doubles {
+        const doubles s = a + b, bv = s - a;
+        error = (a - (s - bv)) + (b - bv);
+        return s;
+    };
+    auto product_error = [](doubles a, doubles b, doubles p) -> doubles {
+#if defined(__FMA__) || defined(__aarch64__)
+        return __builtin_elementwise_fma(a, b, -p);
+#else
+        const doubles ca = 134217729.0 * a, cb = 134217729.0 * b;
+        const doubles ah = ca - (ca - a), bh = cb - (cb - b);
+        const doubles al = a - ah, bl = b - bh;
+        return al * bl - (((p - ah * bh) - al * bh) - ah * bl);
+#endif
+    };
+    const double r2_error = Exact::product_error(r, r, r2);
+    doubles high[3], low[3], square = doubles{};
+    auto plain = square == 0;
+    for (int k = 0; k < DIM; ++k) {
+        const doubles a = doubles{} + q[k], b = p[k];
+        if constexpr (DOUBLE)
+            plain &= ((a == 0) | (size_of(a) >= smallest)) & ((b == 0) | (size_of(b) >= smallest));
+        high[k] = two_sum(b, -a, low[k]) * scale;
+        low[k] *= scale;
+        plain &= size_of(high[k]) < 1e6;
     }
+    auto exact = plain & (r2_error == 0 ? plain : ~plain);  // is nothing rounded, as between the sites of many lattices?
+    for (int k = 0; k < DIM; ++k) {
+        typedef decltype(plain) integers;
+        doubles error;
+        exact &= (low[k] == 0) & (((integers)high[k] & 0x7ffffff) == 0);  // 26 bits: the square is exact
+        square = two_sum(square, high[k] * high[k], error);
+        exact &= error == 0;
+    }
+    if ((open & ~bits_of_lanes(exact)) == 0) {
+        const unsigned int pairs = open & (closed ? bits_of_lanes(square <= r2) : bits_of_lanes(square < r2));
+        open = 0;
+        return pairs;
+    }
+    doubles term[TERMS], slack = doubles{};
+    term[0] = doubles{} - r2;
+    term[1] = doubles{} - r2_error;
+    for (int k = 0; k < DIM; ++k) {
+        const doubles tail = 2 * high[k] * low[k];
+        term[3 * k + 2] = high[k] * high[k];
+        term[3 * k + 3] = product_error(high[k], high[k], term[3 * k + 2]);
+        term[3 * k + 4] = tail;
+        slack += size_of(tail) * 2.220446049250313e-16 + 2 * low[k] * low[k];
+    }
+    for (int pass = 0; pass < 3; ++pass) {
+        doubles total = term[0];
+        for (int t = 1; t < TERMS; ++t) {
+            doubles error;
+            total = two_sum(total, term[t], error);
+            term[t - 1] = error;
+        }
+        term[TERMS - 1] = total;
+    }
+    doubles rest = slack;
+    for (int t = 0; t < TERMS - 1; ++t)
+        rest += size_of(term[t]);
+    rest *= 2;
+    const doubles lead = term[TERMS - 1];
+    const unsigned int inside = bits_of_lanes(plain & (lead < -rest)), tie = bits_of_lanes(plain & (lead == 0) & (rest == 0));
+    const unsigned int pairs = (inside | (closed ? tie : 0)) & open;
+    open &= ~(inside | tie | bits_of_lanes(plain & (lead > rest)));
+    return pairs;
+};
+// which of the points in lanes are pairs, in twice the precision or more, WIDE at a time; few stay `open`, others are none
+auto wide_decided = [&](const real* q, const vec* p, unsigned int& open) -> unsigned int {
+    if constexpr (PERIODIC)
+        return 0;
+    unsigned int pairs = 0, left = 0;
+    double origin[3];
+    for (int k = 0; k < DIM; ++k)
+        origin[k] = (double)q[k];
+    for (int h = 0; h < LANES / WIDE; ++h) {
+        unsigned int here = open >> WIDE * h & ((1u << WIDE) - 1), found = 0;
+        doubles points[3];
+        for (int k = 0; k < DIM; ++k) {
+            typedef real reals __attribute__((vector_size(WIDE * sizeof(real))));
+            reals part;
+            __builtin_memcpy(&part, (const real*)&p[k] + WIDE * h, sizeof part);
+            points[k] = __builtin_convertvector(part, doubles);
+        }
+        if constexpr (!DOUBLE) {
+            doubles square = doubles{};
+            for (int k = 0; k < DIM; ++k)
+                square += (points[k] - origin[k]) * (points[k] - origin[k]);
+            found = bits_of_lanes(square < doubly_inside) & here;
+            here &= ~found & bits_of_lanes(square <= doubly_outside);
+        }
+        if (here)
+            found |= signs_decided(origin, points, here);
+        pairs |= found << WIDE * h;
+        left |= here << WIDE * h;
+    }
+    open = left;
     return pairs;
 };
 // a candidate, where it is, and its number
@@ -196,7 +282,7 @@ auto doubtful_at = [&](int b) {
 };
 // which of the points in lanes, of which some are `open`, are pairs; `numbers` are theirs among the candidates
 auto decided = [&](const real* q, int own_id, const Points& points, const int* numbers, unsigned int open) -> unsigned int {
-    unsigned int pairs = doubly_decided(q, points.p, open);
+    unsigned int pairs = wide_decided(q, points.p, open);
     for (; open; open &= open - 1) {
         const int lane = __builtin_ctz(open);
         real p[3];

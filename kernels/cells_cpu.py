@@ -23,6 +23,7 @@ struct Shared {
     int finite_queries;
     int next_chunk;
     int next_gathered, next_sorted;  // chunks of sources whose coordinates and values are put in order
+    real unit;  // of the lattice on which all coordinates lie, or 0
 };
 constexpr int WIDTH = DOUBLE ? 2 : 1;
 auto up = [](long long words) { return (words + 15) & ~15ll; };
@@ -107,6 +108,25 @@ auto sort = [&](const real* points, int count, int* first, int* order, bool with
     }
     return count - outside;
 };
+// whatever lies on no lattice shows soon
+int lowest = 1 << 20, highest = 0;
+const int too_low = Bits::exponent(radius) - Bits::BIAS - UNITS;
+auto look_for_lattice = [&](const real* points, int count) {
+    for (int i = 0; i < count && lowest >= too_low; ++i) {
+        const real* row = points + (long long)ROW * i;
+        if (!finite_point(row))
+            continue;
+        for (int k = 0; k < DIM; ++k) {
+            const int low_bit = lowest_bit(row[k]), exponent = Bits::exponent(row[k]);
+            lowest = low_bit < lowest ? low_bit : lowest;
+            highest = exponent > highest ? exponent : highest;
+        }
+    }
+};
+look_for_lattice(positions.data, n);
+if (!own)
+    look_for_lattice(queries.data, m);
+shared.unit = lattice_unit(lowest, highest);
 grid.finite = sort(positions.data, n, start, ids, true);
 shared.grid = grid;
 shared.finite_queries = own ? grid.finite : sort(queries.data, m, query_start, query_ids, false);

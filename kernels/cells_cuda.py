@@ -22,11 +22,12 @@ from jfrnn.kernels._native import CELLS, EXACT, SPACES, snippet, table_cells
 BLOCK = 256
 QUERY_BLOCK = 32  # one warp: others need not wait for it to end
 _PARTS = 256  # blocks of `bounds`; one thread of a block reads one part
+_PART = 10  # numbers of a part
 _TILE = 2048  # cells that a block of `scan` takes
 # Among which few queries are shared, at most: 32 per multiprocessor of an H200; half and twice as many took longer there.
 _WARPS = 4224
 # what all kernels of a search must agree on
-GRID = {"REACH": 1, "REACH_X": 6, "PARTS": _PARTS, "TILE": _TILE, "BLOCK": BLOCK, "WARPS": _WARPS}
+GRID = {"REACH": 1, "REACH_X": 6, "PARTS": _PARTS, "PART": _PART, "TILE": _TILE, "BLOCK": BLOCK, "WARPS": _WARPS}
 _HEADER_WORDS = 64
 _SWEEP_BLOCKS = 1056  # blocks of the kernels that walk over all particles
 _CROSSING_BLOCKS = 8448  # blocks of the kernel for queries whose reach leaves a box: what is to do is known to the device only
@@ -54,6 +55,7 @@ struct Shared {
     int tiles[2];  // tiles of the scan that have begun
     int crossing;  // blocks of queries that cross the box: the reach of one of them leaves it
     float depth;  // how far a source from outside the box may be from its faces, in reaches: as far as they may be, queries cross
+    real unit;  // of the lattice on which all coordinates lie, or 0
 };
 constexpr int WIDTH = DOUBLE ? 2 : 1;
 struct alignas(4 * sizeof(real)) Place { real p[3]; real id; };  // id: the bits of an int
@@ -62,7 +64,7 @@ auto up = [](long long words) { return (words + 15) & ~15ll; };
 int* cursor = scratch.data;
 auto take = [&](long long words) { int* here = cursor; cursor += up(words); return here; };
 Shared& shared = *(Shared*)take(64);
-real* parts = (real*)take(8 * PARTS * WIDTH);
+real* parts = (real*)take(PART * PARTS * WIDTH);
 Place* sorted = (Place*)take(4 * WIDTH * (long long)n);
 int* start = take(table + 2);
 unsigned long long* tile_state = (unsigned long long*)take(2 * tile_count);
@@ -103,18 +105,21 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, t
     table = table_cells(sources) if table is None else table
     tiles = 2 * ((table + 1) // _TILE + 1)
     longest = max(sources, queries)
-    parts = [_HEADER_WORDS, 8 * _PARTS * width, 4 * width * sources, table + 2, tiles, longest, longest, sources]
+    parts = [_HEADER_WORDS, _PART * _PARTS * width, 4 * width * sources, table + 2, tiles, longest, longest, sources]
     if not own:
         parts += [table + 2, tiles, queries]
     return sum((words + 15) // 16 * 16 for words in parts)
 
 
-# Bounds and numbers of finite points of all threads of a block, into those of its first thread.
+# Bounds and numbers of finite points of all threads of a block, and which bits they have, into those of its first thread.
 _REDUCE = r"""
-auto reduce_over_block = [&](real* low, real* high, int& finite, float& depth) {
+auto reduce_over_block = [&](real* low, real* high, int& finite, float& depth, int& lowest, int& highest) {
     __shared__ real lows[3][BLOCK / 32], highs[3][BLOCK / 32];
     __shared__ int finites[BLOCK / 32];
     __shared__ float depths[BLOCK / 32];
+    __shared__ int lowests[BLOCK / 32], highests[BLOCK / 32];
+    lowest = __reduce_min_sync(ALL, lowest);
+    highest = __reduce_max_sync(ALL, highest);
     for (int step = 16; step > 0; step /= 2) {
         finite += __shfl_down_sync(ALL, finite, step);
         if constexpr (PERIODIC)
@@ -128,6 +133,8 @@ auto reduce_over_block = [&](real* low, real* high, int& finite, float& depth) {
     if (lane == 0) {
         finites[warp_in_block] = finite;
         depths[warp_in_block] = depth;
+        lowests[warp_in_block] = lowest;
+        highests[warp_in_block] = highest;
         for (int k = 0; k < DIM; ++k) {
             lows[k][warp_in_block] = low[k];
             highs[k][warp_in_block] = high[k];
@@ -138,6 +145,8 @@ auto reduce_over_block = [&](real* low, real* high, int& finite, float& depth) {
         for (int w = 1; w < BLOCK / 32; ++w) {
             finite += finites[w];
             depth = fmaxf(depth, depths[w]);
+            lowest = lowests[w] < lowest ? lowests[w] : lowest;
+            highest = highests[w] > highest ? highests[w] : highest;
             for (int k = 0; k < DIM; ++k) {
                 low[k] = lows[k][w] < low[k] ? lows[k][w] : low[k];
                 high[k] = highs[k][w] > high[k] ? highs[k][w] : high[k];
@@ -152,29 +161,43 @@ for (int k = 0; k < DIM; ++k) {
     low[k] = INF;
     high[k] = -INF;
 }
-int finite = 0;
+int finite = 0, lowest = 1 << 20, highest = 0;
 float depth = 0;
+auto look_at_bits = [&](const real* row) {
+#pragma unroll
+    for (int k = 0; k < DIM; ++k) {
+        const int low_bit = lowest_bit(row[k]), exponent = Bits::exponent(row[k]);
+        lowest = low_bit < lowest ? low_bit : lowest;
+        highest = exponent > highest ? exponent : highest;
+    }
+};
+for (long long i = thread; !own && i < m; i += threads)
+    if (finite_point(queries.data + ROW * i))
+        look_at_bits(queries.data + ROW * i);
 for (long long i = thread; i < n; i += threads) {
     real p[3], at[3];
     point_of(positions.data + ROW * i, p);
     if (!finite_point(p))
         continue;
     ++finite;
+    look_at_bits(positions.data + ROW * i);
     for (int k = 0; k < DIM; ++k)
         at[k] = coordinate(k, p);
     widen(low, high, at, at);
     if (is_turned(positions.data + ROW * i))
         depth = fmaxf(depth, depth_of(at));
 }
-reduce_over_block(low, high, finite, depth);
+reduce_over_block(low, high, finite, depth, lowest, highest);
 if (threadIdx.x == 0) {
-    real* part = parts + 8 * block;
+    real* part = parts + PART * block;
     for (int k = 0; k < DIM; ++k) {
         part[k] = low[k];
         part[3 + k] = high[k];
     }
     part[6] = bits_as_real(finite);
     part[7] = depth;
+    part[8] = bits_as_real(lowest);
+    part[9] = bits_as_real(highest);
 }
 if (thread == 0) {
     shared.behind[0] = shared.behind[1] = shared.tiles[0] = shared.tiles[1] = shared.crossing = 0;
@@ -185,14 +208,14 @@ if (thread == 0) {
 _LAY_OUT = r"""
 __shared__ Grid grid;
 real low[3], high[3];
-const real* part = parts + 8 * threadIdx.x;
-int finite = id_of(part[6]);
+const real* part = parts + PART * threadIdx.x;
+int finite = id_of(part[6]), lowest = id_of(part[8]), highest = id_of(part[9]);
 float depth = (float)part[7];
 for (int k = 0; k < DIM; ++k) {
     low[k] = part[k];
     high[k] = part[3 + k];
 }
-reduce_over_block(low, high, finite, depth);
+reduce_over_block(low, high, finite, depth, lowest, highest);
 if (threadIdx.x == 0) {
     if (finite == 0)
         for (int k = 0; k < DIM; ++k)
@@ -202,6 +225,7 @@ if (threadIdx.x == 0) {
     if (block == 0) {
         shared.grid = grid;
         shared.depth = depth;
+        shared.unit = lattice_unit(lowest, highest);
         if (finite < n)
             atomicOr(&info.data[1], 2);
     }
@@ -460,7 +484,10 @@ struct alignas(16) Warp {  // what a warp shares
 __shared__ Warp warp;
 __shared__ Grid grid;
 __shared__ int finite_queries, longest_before;
+__shared__ real site, between;  // the unit of a lattice, and the square, in such units, between those of pairs and of others; or 0
 if (lane == 0) {
+    site = SCALED ? real(0) : shared.unit;
+    between = site > 0 ? (real)square_between(site) : real(0);
     grid = shared.grid;
     finite_queries = shared.finite_queries;
     longest_before = SUMS ? 0 : *(volatile int*)&info.data[0];
@@ -470,9 +497,11 @@ const unsigned int lanes_below = (1u << lane) - 1;
 // differences of images may be off by more than rounding takes from a difference
 const real off = CROSSING ? 2 * lattice.slack() * step_scale : real(0), outer_radius = step_radius + off;
 const real inner_radius = step_radius > off ? step_radius - off : real(0), square_radius = step_radius * step_radius;
-const real sure_square = inner_radius * inner_radius - 8 * (1 + SHIFTED) * step_eps * square_radius;
+// where coordinates lie on a lattice nothing is in doubt, and bands are negative
+const real sure_square = DOUBLE && between > 0 ? between * site * site
+                                               : inner_radius * inner_radius - 8 * (1 + SHIFTED) * step_eps * square_radius;
 const real beyond = outer_radius * outer_radius * (1 + 16 * step_eps) - sure_square;
-const real band = CROSSING ? real(0.5) * beyond : 8 * step_eps * square_radius;
+const real band = DOUBLE && between > 0 ? real(-1) : CROSSING ? real(0.5) * beyond : 8 * step_eps * square_radius;
 const bool drops_self = own && drop_self;
 auto load_query = [&](int at) -> Place {
     if (own)
@@ -630,9 +659,17 @@ while (place < stop) {
     const real group_outer = CROSSING ? (radius + 2 * lattice.slack()) * (SCALED ? scale : real(1)) * unit : group_radius;
     const real near_square = group_outer * group_outer * (1 + 8 * step_eps) + (DOUBLE ? real(0) : real(1e-30));
     const float reach = fminf(diagonal * (float)unit + (float)group_outer, 240);
-    float coarse_band = reach * reach * 2e-5f;  // see meet
-    if constexpr (CROSSING)
-        coarse_band += 1.001f * (float)((group_outer - group_radius) * (group_outer + group_radius));
+    float coarse_band = reach * reach * 2e-5f, coarse_square = 0;  // see meet
+    const float square_unit = (float)(site * unit) * (float)(site * unit);
+    const bool on_lattice = !DOUBLE && between > 0 && reach < 239 && coarse_band < 0.25f * square_unit;
+    if (on_lattice) {
+        coarse_square = (float)between * square_unit;
+        coarse_band = -1;
+    } else {
+        if constexpr (CROSSING)
+            coarse_band += 1.001f * (float)((group_outer - group_radius) * (group_outer + group_radius));
+        coarse_square = (float)group_radius * (float)group_radius - coarse_band;
+    }
     auto from_center = [&](real x, real center) -> real {
         const real y = SCALED ? x * scale : x;
         if constexpr (DOUBLE)
@@ -830,7 +867,7 @@ while (place < stop) {
             words[1][a] = __byte_perm(word, 0, 0x3232);
         }
         words[0][3] = ONES;
-        words[1][3] = halves(own_square - ((float)group_radius * (float)group_radius - coarse_band), 1);
+        words[1][3] = halves(own_square - coarse_square, 1);
         unsigned int* const columns = (unsigned int*)warp.candidates;
 #pragma unroll
         for (int k = 0; k < 8; ++k)
@@ -848,7 +885,9 @@ while (place < stop) {
     // and low. The tensor cores multiply them exactly and add in single precision at least, in whatever order, flushing or not
     // flushing halves that are denormal (PTX ISA, mma). Of reach^2, 16 sums of terms that add up to 6.5 lose less than 1.3e-5,
     // flushing (reach > 120, or it does not matter) less than 4e-6, splitting and scaling less than 2e-6: less than the band of
-    // 2e-5. Negative: surely closer than the cutoff; beyond 2 coarse_band: surely not; between: decided one by one.
+    // 2e-5. Negative: surely closer than the cutoff; beyond 2 coarse_band: surely not; between: decided one by one. On a lattice
+    // squares are whole numbers of squared units, of which that band is less than a quarter, and the limit lies in the middle
+    // between two of them: all signs are sure.
     // One bit per candidate of a block: the sum's bits, less `from`, are negative.
     auto meet = [&](unsigned int first_candidate, unsigned int from, unsigned int& closest) -> unsigned int {
         const uint4 loaded = *(const uint4*)(warp.candidates[DOUBLE ? 0 : lane % 4] + first_candidate + lane / 4 * 4);
@@ -1023,7 +1062,7 @@ while (place < stop) {
             if constexpr (!DOUBLE) {
                 hits = meet(first_candidate, 0, closest);
                 const unsigned int until = __float_as_uint((float)warp.box.half[3]);
-                if (__any_sync(ALL, closest <= until))
+                if (__any_sync(ALL, (int)closest <= (int)until))
                     open = meet(first_candidate, until + 1, closest) & ~hits;
             } else {
                 constexpr int ALONG = 16 / sizeof(real);  // candidates whose coordinate one load brings
@@ -1045,7 +1084,7 @@ while (place < stop) {
                             closest = min(closest, over);
                     }
                 }
-                if (EXACTLY && __any_sync(ALL, closest <= upper_word(2 * band)))
+                if (EXACTLY && __any_sync(ALL, (int)closest <= (int)upper_word(2 * band)))
 #pragma unroll 4
                     for (int j = 0; j < 32; ++j) {
                         real p[DIM];

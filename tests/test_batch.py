@@ -66,7 +66,8 @@ def each_case():
     """Yield every case, kind and engine; by default two kinds, of the array engines, which compile slowly, one, of fewer cases."""
     for name, dtype, dim, backend in product(BATCH_CASES, (np.float32, np.float64), (2, 3), ("jax", "warp", "brute")):
         often = [(np.float32, 3), (np.float64, 2)] if backend == "warp" else [(np.float32, 3)]  # XLA compiles for both, in boxes
-        rarely = backend == "brute" or (dtype, dim) not in often or (backend == "jax" and name == "periodic")
+        slowly = (backend == "brute" and name != "superposed") or (backend == "jax" and name == "periodic")
+        rarely = slowly or (dtype, dim) not in often
         kind = f"{name}-f{8 * dtype().itemsize}-{dim}d-{backend}"
         yield pytest.param(name, dtype, dim, backend, id=kind, marks=[SLOW] * rarely)
 
