@@ -3,25 +3,18 @@
 A CUDA graph launches all of them at once, but knows its addresses, and takes several times as long to make as a search of 28 000
 particles. XLA brings the same addresses again in a loop, and often from call to call; but a program with many small results brings
 others nearly every time. So graphs are made only of addresses that came back soon, and launches are told new ones otherwise.
-
-The structures are those of XLA's foreign function interface (xla/ffi/api/c_api.h, version 0.1), of which only what is read here is
-spelled out.
 """
 
-import ctypes
 import functools
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import jax
+from jfrnn._ffi import Buffer, CallFrame
 
 _SOON = 16  # calls with other addresses, within which the same ones must come back to be worth a graph
 _GRAPHS = 32  # that are kept per function: more than can come back so soon
-_API_VERSION = (0, 1)
-_METADATA = 1  # the extension that asks for the version
-_INTERNAL_ERROR = 13
 
 
 class Command(NamedTuple):
@@ -34,98 +27,8 @@ class Command(NamedTuple):
     beside: bool = False
 
 
-class _Version(ctypes.Structure):
-    _fields_ = (("struct_size", ctypes.c_size_t), ("extension", ctypes.c_void_p), ("major", ctypes.c_int), ("minor", ctypes.c_int))
-
-
-class _Metadata(ctypes.Structure):
-    _fields_ = (("struct_size", ctypes.c_size_t), ("version", _Version), ("traits", ctypes.c_uint32))
-
-
-class _Extension(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("type", ctypes.c_int),
-        ("next", ctypes.c_void_p),
-        ("metadata", ctypes.POINTER(_Metadata)),  # of the one type that is looked at
-    )
-
-
-class _Buffer(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("dtype", ctypes.c_int),
-        ("data", ctypes.c_void_p),
-        ("rank", ctypes.c_int64),
-        ("dims", ctypes.POINTER(ctypes.c_int64)),
-    )
-
-
-class _Buffers(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("size", ctypes.c_int64),
-        ("types", ctypes.c_void_p),
-        ("buffers", ctypes.POINTER(ctypes.POINTER(_Buffer))),
-    )
-
-
-class _Ask(ctypes.Structure):
-    """What is asked about a call: its stream, or the number of its device; the answer comes last."""
-
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("context", ctypes.c_void_p),
-        ("answer", ctypes.c_void_p),
-    )
-
-
-class _Failure(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("message", ctypes.c_char_p),
-        ("code", ctypes.c_int),
-    )
-
-
-_Fail = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Failure))
-_Get = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Ask))
-
-
-class _Api(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("version", _Version),
-        ("internal", ctypes.c_void_p),
-        ("fail", _Fail),
-        ("others", ctypes.c_void_p * 3),
-        ("get_stream", _Get),
-        ("more", ctypes.c_void_p * 12),
-        ("get_device", _Get),
-    )
-
-
-class _CallFrame(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.POINTER(_Extension)),
-        ("api", ctypes.POINTER(_Api)),
-        ("context", ctypes.c_void_p),
-        ("stage", ctypes.c_int),
-        ("inputs", _Buffers),
-        ("outputs", _Buffers),
-    )
-
-
-_Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_CallFrame))
 # Warp keeps one account of devices, streams and recordings for all threads; nothing is launched while this is held
 _warp_lock = threading.Lock()
-_kept: list[Any] = []  # handlers live as long as programs that call them: as long as the process
 
 
 class _Stream(NamedTuple):
@@ -168,7 +71,7 @@ class _Calls:
         self._graphs: OrderedDict[tuple[int, ...], Any] = OrderedDict()
         self._lock = threading.Lock()
 
-    def launch(self, buffers: list[_Buffer]) -> None:
+    def launch(self, buffers: list[Buffer]) -> None:
         """Launch what the commands say, on these buffers."""
         with self._lock:
             here = [buffer.data for buffer in buffers]
@@ -206,59 +109,36 @@ def _recording_streams(wp: Any, device: str) -> tuple[Any, Any]:  # noqa: ANN401
     return wp.Stream(device), wp.Stream(device)
 
 
-def register(name: str, wp: Any, dtypes: Sequence[Any], commands: Callable[..., list[Command]]) -> None:  # noqa: ANN401
-    """Let XLA call kernels by a name, on CUDA.
+def serve(wp: Any, dtypes: Sequence[Any], commands: Callable[..., list[Command]]) -> Callable[[CallFrame], None]:  # noqa: ANN401
+    """Return what launches kernels when XLA calls, on CUDA.
 
     Args:
-        name: Of the target of `jax.ffi.ffi_call`.
         wp: The package Warp.
         dtypes: Warp's scalar types of the buffers, inputs first.
         commands: arrays -> commands, in order; once per device and shapes, with a `warp.array` for each buffer.
     """
     streams: dict[int, _Calls] = {}
 
-    def launch(frame: _CallFrame) -> None:
-        buffers = [frame.inputs.buffers[k].contents for k in range(frame.inputs.size)]
-        buffers += [frame.outputs.buffers[k].contents for k in range(frame.outputs.size)]
-        ask = _Ask(ctypes.sizeof(_Ask), None, frame.context, None)
-        frame.api.contents.get_stream(ask)
-        address = ask.answer or 0
+    def launch(frame: CallFrame) -> None:
+        address = frame.stream()
         if address not in streams:
-            frame.api.contents.get_device(ask)
             with _warp_lock:
-                device = wp.get_cuda_device((ask.answer or 0) & 0x7FFFFFFF)
+                device = wp.get_cuda_device(frame.device())
                 streams.setdefault(address, _Calls(wp, _Stream(address, device), dtypes, commands))
-        streams[address].launch(buffers)
+        streams[address].launch(frame.buffers())
 
-    def handle(frame: Any) -> int | None:  # noqa: ANN401
-        call = frame.contents
-        try:
-            if call.extension:
-                asked = call.extension.contents
-                if asked.type == _METADATA:  # a question, no call; with any other extension it is one
-                    version = asked.metadata.contents.version
-                    version.major, version.minor = _API_VERSION
-                    return None
-            launch(call)
-        except Exception as error:  # XLA raises it again
-            message = f"{name}: {type(error).__name__}: {error}".encode()
-            return call.api.contents.fail(_Failure(ctypes.sizeof(_Failure), None, message, _INTERNAL_ERROR))
-        return None
-
-    handler = _Handler(handle)
-    _kept.append(handler)
-    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(ctypes.cast(handler, ctypes.c_void_p).value), platform="CUDA")
+    return launch
 
 
 def _record(
     wp: Any,  # noqa: ANN401
     device: Any,  # noqa: ANN401
-    buffers: list[_Buffer],
+    buffers: list[Buffer],
     dtypes: Sequence[Any],
     commands: Callable[..., list[Command]],
 ) -> _Recorded:
     arrays = [
-        wp.array(ptr=buffer.data, shape=tuple(buffer.dims[k] for k in range(buffer.rank)), dtype=dtype, device=device)
+        wp.array(ptr=buffer.data, shape=buffer.shape, dtype=dtype, device=device)
         for buffer, dtype in zip(buffers, dtypes, strict=True)
     ]
     places = {id(array): place for place, array in enumerate(arrays)}

@@ -11,17 +11,17 @@ from jfrnn import _cuda
 from jfrnn._batch import Batch
 from jfrnn._box import Lattice, Wrapped
 from jfrnn._exact import Cutoffs
+from jfrnn._launch import Kernel, kernel
 from jfrnn._levels import GROUPS, HALVINGS, Levels
 from jfrnn._runs import Filter
+from jfrnn._start import kernels_of, load_warp
 from jfrnn._warp import (
     PLACES_PER_THREAD,
     Rows,
     SumsOf,
-    callable_of,
-    cuda_target,
-    kernels_of,
     lattice_numbers,
-    load_warp,
+    on_cpu,
+    on_cuda,
     on_every_core,
     particle_rows,
     periodic_kind,
@@ -101,7 +101,7 @@ def level_sums(
 ) -> tuple[Array, Array, Array]:
     """Sum a term as `jfrnn._warp.pair_sums` does, on the CPU, among sources that XLA has sorted."""
 
-    def on_cpu(
+    def sums_on_cpu(
         sources: Array,
         queries: Array | None,
         cutoffs: Cutoffs,
@@ -118,7 +118,7 @@ def level_sums(
         operands = _operands(sources, queries, cutoffs, levels, torus)
         return results.unpacked(*call(*operands, shared, own, columns, output_dims=results.dims() | {"info": 2})[:3])
 
-    return lax.platform_dependent(sources, queries, cutoffs, levels, batch, torus, values, cpu=on_cpu)
+    return lax.platform_dependent(sources, queries, cutoffs, levels, batch, torus, values, cpu=sums_on_cpu)
 
 
 def _variant_of(
@@ -192,23 +192,23 @@ def _name(name: str, variant: _LevelVariant, **more: bool) -> str:
     return "_".join([f"jfrnn_{name}_{variant.dim}d", *(flag for flag, on in {**flags, **more}.items() if on)])
 
 
-@functools.cache
-def _level_callable(variant: _LevelVariant) -> Any:  # noqa: ANN401
+@kernel
+def _level_callable(variant: _LevelVariant) -> Kernel:
     wp, types = load_warp(), _inputs(variant.double)
     ints = wp.array(dtype=wp.int32)
     types |= {"idx": wp.array2d(dtype=wp.int32)} if variant.lists else {}
     types |= {"count": ints, "info": ints}
     name = _name(f"levels_{'cuda' if variant.cuda else 'cpu'}", variant)
     if not variant.cuda:
-        return callable_of(name, functools.partial(_run_levels_on_cpu, variant), types, 2 + variant.lists)
+        return on_cpu(name, functools.partial(_run_levels_on_cpu, variant), types, 2 + variant.lists)
     if wp.is_cuda_available():
-        for kernel, block in ((_level_kernel(variant), kernels_of("levels").BLOCK), (kernels_of("levels").clear, 2)):
-            wp.load_module(kernel.module, device=wp.get_cuda_device(), block_dim=block)
-    return cuda_target(name, types, 2 + variant.lists, functools.partial(_level_commands, variant))
+        for launched, block in ((_level_kernel(variant), kernels_of("levels").BLOCK), (kernels_of("levels").clear, 2)):
+            wp.load_module(launched.module, device=wp.get_cuda_device(), block_dim=block)
+    return on_cuda(name, types, 2 + variant.lists, functools.partial(_level_commands, variant))
 
 
-@functools.cache
-def _sum_callable(variant: _LevelVariant, results: SumsOf, key: str) -> Any:  # noqa: ANN401
+@kernel
+def _sum_callable(variant: _LevelVariant, results: SumsOf, key: str) -> Kernel:
     wp, types = load_warp(), _inputs(variant.double)
     rows, reals = types["positions"], types["axes"]
     types |= {"shared_values": reals, "own_values": rows, "columns": reals}
@@ -218,13 +218,13 @@ def _sum_callable(variant: _LevelVariant, results: SumsOf, key: str) -> Any:  # 
     def run(*arrays: Any) -> None:  # noqa: ANN401
         of_search = variant.dim, variant.double, variant.rule, GROUPS, HALVINGS, results.compensated, variant.periodic
         make = kernels_of("pair_sum_levels").query_kernel
-        kernel = make(results.term, key, *of_search, variant.batched, results.extremes)
+        query = make(results.term, key, *of_search, variant.batched, results.extremes)
         n, m = len(arrays[4]), len(arrays[12])
         flags = variant.own, variant.closed, variant.keep.drop_self, variant.keep.later_only
         arrays[-1].zero_()
-        on_every_core(kernel, [*arrays, n, m, *map(int, flags)], -(-m // PLACES_PER_THREAD))
+        on_every_core(query, [*arrays, n, m, *map(int, flags)], -(-m // PLACES_PER_THREAD))
 
-    return callable_of(_name("pair_sum_levels_cpu", variant, **kind, **{key: True}), run, types, 4)
+    return on_cpu(_name("pair_sum_levels_cpu", variant, **kind, **{key: True}), run, types, 4)
 
 
 def _level_kernel(variant: _LevelVariant) -> Any:  # noqa: ANN401
@@ -243,10 +243,9 @@ def _level_arguments(variant: _LevelVariant, arrays: Sequence[Any]) -> list[Any]
 
 
 def _run_levels_on_cpu(variant: _LevelVariant, *arrays: Any) -> None:  # noqa: ANN401
-    kernel, arguments = _level_kernel(variant), _level_arguments(variant, arrays)
     arrays[-1].zero_()
     places = len(arrays[-2])
-    on_every_core(kernel, arguments, -(-places // PLACES_PER_THREAD))
+    on_every_core(_level_kernel(variant), _level_arguments(variant, arrays), -(-places // PLACES_PER_THREAD))
 
 
 def _level_commands(variant: _LevelVariant, *arrays: Any) -> list[_cuda.Command]:  # noqa: ANN401

@@ -13,6 +13,8 @@ from jax import Array, lax
 
 from jfrnn import _cuda, _triangles_cells, _warp
 from jfrnn._exact import Cutoff
+from jfrnn._launch import Kernel, kernel
+from jfrnn._start import kernels_of, load_warp
 from jfrnn._triangles_cells import LANES, MOST_CELLS, TriangleCells, bucket_count, entry_count, level_limit
 from jfrnn._triangles_tree import WIDTH, TriangleTree, level_starts, widened
 
@@ -80,7 +82,7 @@ def _query_on_cpu(variant: _Variant, slots: int, *inputs: Array) -> tuple[Array,
 
 def _query_on_cuda(variant: _Variant, slots: int, *inputs: Array) -> tuple[Array, Array]:
     n, dim = inputs[0].shape
-    words = _warp.kernels_of("triangles_cuda").scratch_words(n, *sizes_on_cuda(variant, inputs), dim, variant.double)
+    words = kernels_of("triangles_cuda").scratch_words(n, *sizes_on_cuda(variant, inputs), dim, variant.double)
     sizes = {"idx": (n, slots) if variant.lists else (1, 1), "count": n, "scratch": words}
     idx, count, _ = _cuda_callable(variant)(*inputs, output_dims=sizes)
     return idx if variant.lists else jnp.zeros((n, 0), jnp.int32), count
@@ -99,12 +101,12 @@ def _name(name: str, variant: _Variant) -> str:
 
 
 def _kernels(variant: _Variant) -> Any:  # noqa: ANN401
-    return _warp.kernels_of("triangles_cpu").triangle_kernels(*variant, MOST_CELLS[variant.dim], LANES[variant.dim], WIDTH)
+    return kernels_of("triangles_cpu").triangle_kernels(*variant, MOST_CELLS[variant.dim], LANES[variant.dim], WIDTH)
 
 
-@functools.cache
-def _build_callable(variant: _Variant) -> Any:  # noqa: ANN401
-    wp = _warp.load_warp()
+@kernel
+def _build_callable(variant: _Variant) -> Kernel:
+    wp = load_warp()
     scalar, ints = wp.float64 if variant.double else wp.float32, wp.array(dtype=wp.int32)
     types = {"corners": wp.array3d(dtype=scalar), "good": ints, "cutoff": wp.array(dtype=scalar), "start": ints, "triangles": ints}
     types |= {"levels": ints, "level_count": ints, "level_of": ints, "scratch": ints}
@@ -114,12 +116,12 @@ def _build_callable(variant: _Variant) -> Any:  # noqa: ANN401
         sizes = [named["corners"].shape[0], named["start"].shape[0] - 1]
         _warp.on_one_core(_kernels(variant).build, [*arrays, *sizes])
 
-    return _warp.callable_of(_name("build", variant), run, types, 6)
+    return _warp.on_cpu(_name("build", variant), run, types, 6)
 
 
 def _query_types(variant: _Variant) -> dict[str, Any]:
     """Return Warp's types of what a query is given, and of what it returns, but for its last output."""
-    wp = _warp.load_warp()
+    wp = load_warp()
     scalar, ints = wp.float64 if variant.double else wp.float32, wp.array(dtype=wp.int32)
     points = wp.array2d(dtype=scalar)
     types = {"positions": points, "corners": wp.array3d(dtype=scalar), "boxes": points, "cutoff": wp.array(dtype=scalar)}
@@ -127,9 +129,9 @@ def _query_types(variant: _Variant) -> dict[str, Any]:
     return types | {"idx": wp.array2d(dtype=wp.int32), "count": ints}
 
 
-@functools.cache
-def _query_callable(variant: _Variant) -> Any:  # noqa: ANN401
-    wp = _warp.load_warp()
+@kernel
+def _query_callable(variant: _Variant) -> Kernel:
+    wp = load_warp()
     types = _query_types(variant) | {"info": wp.array(dtype=wp.int32)}
 
     def run(*arrays: Any) -> None:  # noqa: ANN401
@@ -140,25 +142,25 @@ def _query_callable(variant: _Variant) -> Any:  # noqa: ANN401
         _warp.ask_for_huge_pages(named["idx"].ptr, 4 * n * capacity)
         _warp.on_every_core(_kernels(variant).query, [*arrays, *sizes], -(-n // _PARTICLES_PER_THREAD))
 
-    return _warp.callable_of(_name("query", variant), run, types, 3)
+    return _warp.on_cpu(_name("query", variant), run, types, 3)
 
 
-@functools.cache
-def _cuda_callable(variant: _Variant) -> Any:  # noqa: ANN401
-    wp = _warp.load_warp()
+@kernel
+def _cuda_callable(variant: _Variant) -> Kernel:
+    wp = load_warp()
     if wp.is_cuda_available():
         _cuda_kernels(variant).load(wp.get_cuda_device())
     types = _query_types(variant) | {"scratch": wp.array(dtype=wp.int32)}
-    return _warp.cuda_target(_name("cuda", variant), types, 3, functools.partial(_commands, variant))
+    return _warp.on_cuda(_name("cuda", variant), types, 3, functools.partial(_commands, variant))
 
 
 def _cuda_kernels(variant: _Variant) -> Any:  # noqa: ANN401
-    return _warp.kernels_of("triangles_cuda").triangle_kernels(*variant, WIDTH)
+    return kernels_of("triangles_cuda").triangle_kernels(*variant, WIDTH)
 
 
 def _commands(variant: _Variant, *arrays: Any) -> list[_cuda.Command]:  # noqa: ANN401
     (n, _), faces, capacity = arrays[0].shape, arrays[1].shape[0], arrays[9].shape[1]
-    sizes, workers = sizes_on_cuda(variant, arrays), _warp.kernels_of("triangles_cuda").workers_for(n, variant.double)
+    sizes, workers = sizes_on_cuda(variant, arrays), kernels_of("triangles_cuda").workers_for(n, variant.double)
     launches = _cuda_kernels(variant).launches(n, *sizes, capacity, variant.double)
     arguments = [*arrays, n, faces, *sizes, capacity, workers]
     return [_cuda.Command(x.kernel, [*arguments, x.threads], x.threads, x.block, x.beside) for x in launches]

@@ -1,23 +1,20 @@
-"""Warp inside JAX: the one module that imports Warp, registers its kernels with XLA and launches them.
+"""Warp inside JAX: what its kernels are given, and how they are launched.
 
-Each combination of static options is a callable of its own, named after them, so that the compiled program says all that it
-depends on (JAX's persistent compilation cache sees no more than that name).
+Each combination of static options is a kernel of its own, named after them, so that the compiled program says all that it
+depends on (JAX's persistent compilation cache sees no more than that).
 """
 
-import atexit
 import contextlib
 import ctypes
 import functools
-import importlib
-import inspect
 import math
 import os
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -26,9 +23,11 @@ from jfrnn import _cuda
 from jfrnn._batch import Batch
 from jfrnn._box import Lattice, Wrapped
 from jfrnn._exact import Cutoff, compensated_sum, make_cutoff, rounded_sum
+from jfrnn._ffi import CallFrame
+from jfrnn._launch import Kernel, kernel
 from jfrnn._runs import Filter
+from jfrnn._start import INSTALL, kernels_of, load_warp
 
-INSTALL = 'pip install "jfrnn[warp]"'
 PLACES_PER_THREAD = 2048  # below, a second thread costs more than it saves
 MOST_IN_BOX = 1 << 27  # an id shares its bits with the code of an image
 _HUGE = 1 << 22  # bytes from which a buffer is worth a request for huge pages
@@ -71,27 +70,6 @@ class _Arrays(NamedTuple):
     count: Any
     info: Any
     scratch: Any
-
-
-@functools.cache
-def load_warp() -> Any:  # noqa: ANN401
-    """Import Warp, quietly if nobody did before, or say what to install."""
-    fresh = "warp" not in sys.modules
-    try:
-        import warp
-    except ImportError as error:
-        raise ImportError(f"the backends 'warp' and 'hashgrid' need the package warp-lang (1.18 or 1.19): {INSTALL}") from error
-    if fresh:
-        warp.config.log_level = warp.LOG_WARNING
-    if not hasattr(warp, "jax_callable"):
-        raise ImportError(f"the backends 'warp' and 'hashgrid' need warp-lang 1.18 or 1.19, found {warp.__version__}: {INSTALL}")
-    return warp
-
-
-def kernels_of(name: str) -> Any:  # noqa: ANN401
-    """Return a module of jfrnn.kernels, which imports Warp."""
-    load_warp()
-    return importlib.import_module(f"jfrnn.kernels.{name}")
 
 
 def missing(platform: str) -> str | None:
@@ -243,48 +221,48 @@ def scratch_bytes(engine: str, platform: str, n: int, m: int, dim: int, double: 
 # --- cells ------------------------------------------------------------------------------------------------------------
 
 
-@functools.cache
-def _cpu_callable(variant: Variant) -> Any:  # noqa: ANN401
-    return _register("cells_cpu", variant, _run_cells_on_cpu)
+@kernel
+def _cpu_callable(variant: Variant) -> Kernel:
+    return _kernel_on_cpu("cells_cpu", variant, _run_cells_on_cpu)
 
 
-@functools.cache
-def _cuda_callable(variant: Variant) -> Any:  # noqa: ANN401
+@kernel
+def _cuda_callable(variant: Variant) -> Kernel:
     wp = load_warp()
     if wp.is_cuda_available():
         _cuda_kernels(variant).load(wp.get_cuda_device())
-    return cuda_target(_name("cells_cuda", variant), _types(variant), 3 + variant.lists, functools.partial(_commands, variant))
+    return on_cuda(_name("cells_cuda", variant), _types(variant), 3 + variant.lists, functools.partial(_commands, variant))
 
 
-def cuda_target(
-    name: str, types: dict[str, Any], outputs: int, commands: Callable[..., list[_cuda.Command]]
-) -> Callable[..., Sequence[Array]]:
-    """Make a function that XLA calls on CUDA, as `callable_of` makes one for the CPU."""
-    wp = load_warp()
-    _cuda.register(name, wp, [kind.dtype for kind in types.values()], commands)
-    results = {key: wp.dtype_to_numpy(types[key].dtype) for key in list(types)[-outputs:]}
-
-    def call(*inputs: Array, output_dims: dict[str, Any]) -> Sequence[Array]:
-        shapes = [jax.ShapeDtypeStruct(tuple(np.atleast_1d(output_dims[key]).tolist()), results[key]) for key in results]
-        return jax.ffi.ffi_call(name, shapes, vmap_method="sequential")(*inputs)
-
-    return call
+def on_cuda(name: str, types: dict[str, Any], outputs: int, commands: Callable[..., list[_cuda.Command]]) -> Kernel:
+    """Return what runs commands on CUDA when XLA calls."""
+    return Kernel(name, types, outputs, _cuda.serve(load_warp(), [kind.dtype for kind in types.values()], commands))
 
 
-def _register(
-    name: str,
-    variant: Variant,
-    run: Callable[..., None],
-    radius: float | None = None,
-) -> Any:  # noqa: ANN401
-    """Make a function that XLA calls: positions, queries and cutoff in; [rows,] counts, info and scratch out.
+_one_on_cpu = threading.Lock()  # is served at a time: it takes all cores, and a hash grid is kept for all
+
+
+def on_cpu(name: str, run: Callable[..., None], types: dict[str, Any], outputs: int) -> Kernel:
+    """Return what calls `run` with a `warp.array` for each buffer when XLA calls."""
+    wp, dtypes = load_warp(), [kind.dtype for kind in types.values()]
+
+    def serve(frame: CallFrame) -> None:
+        device, buffers = wp.get_device("cpu"), zip(frame.buffers(), dtypes, strict=True)
+        arrays = [wp.array(ptr=x.data, shape=x.shape, dtype=dtype, device=device) for x, dtype in buffers]
+        with _one_on_cpu:
+            run(*arrays)
+
+    return Kernel(name, types, outputs, serve)
+
+
+def _kernel_on_cpu(name: str, variant: Variant, run: Callable[..., None], radius: float | None = None) -> Kernel:
+    """Return what XLA calls: positions, queries and cutoff in; [rows,] counts, info and scratch out.
 
     One that knows its radius bears it in its name.
     """
-    full_name, types = _name(name, variant), _types(variant)
-    if radius is not None:
-        full_name += f"_{radius.hex().replace('-', 'minus')}"  # Warp drops what an identifier cannot hold
-    return callable_of(full_name, lambda *arrays: run(variant, _named(types, arrays)), types, 3 + variant.lists)
+    types = _types(variant)
+    full_name = _name(name, variant) + ("" if radius is None else f"_{radius.hex()}")
+    return on_cpu(full_name, lambda *arrays: run(variant, _named(types, arrays)), types, 3 + variant.lists)
 
 
 def _types(variant: Variant) -> dict[str, Any]:
@@ -306,36 +284,6 @@ def _name(name: str, variant: Variant) -> str:
     flags |= {**space_flags(variant.periodic), "batched": variant.batched}
     flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
     return "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
-
-
-def callable_of(name: str, run: Callable[..., None], types: dict[str, Any], outputs: int) -> Any:  # noqa: ANN401
-    """Make a function that XLA calls with arrays of these types, the last of which are its outputs."""
-
-    def func(*arrays: Any) -> None:  # noqa: ANN401
-        run(*arrays)
-
-    kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
-    parameters = [inspect.Parameter(key, kind, annotation=types[key]) for key in types]
-    func.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
-    func.__annotations__ = types
-    func.__name__ = func.__qualname__ = name
-    wp = load_warp()
-    _finish_before_exit()
-    if jax.default_backend() == "cpu":
-        _load_on_cpu(wp.get_module(__name__))  # which XLA's threads would do otherwise
-    return wp.jax_callable(func, num_outputs=outputs, graph_mode=wp.JaxCallableGraphMode.NONE, vmap_method="sequential")
-
-
-@functools.cache
-def _finish_before_exit() -> None:
-    """Let the interpreter wait for results that are under way: what computes them needs it, and would wait for ever."""
-
-    def finish() -> None:
-        for array in jax.live_arrays():
-            with contextlib.suppress(Exception):  # it has nobody left to be told to
-                array.block_until_ready()
-
-    atexit.register(finish)
 
 
 def _cuda_kernels(variant: Variant) -> Any:  # noqa: ANN401
@@ -402,13 +350,18 @@ def on_one_core(kernel: Any, inputs: list[Any]) -> None:  # noqa: ANN401
 def on_every_core(kernel: Any, inputs: list[Any], most: int) -> None:  # noqa: ANN401
     """Launch a kernel once per core, at most `most` times; a launch releases the interpreter's lock while it runs."""
     launch = functools.partial(on_one_core, kernel, inputs)
+    if most <= 1:
+        launch()
+        return
     _load_on_cpu(kernel.module)
     others: list[Future[None]] = []
-    with contextlib.suppress(RuntimeError):  # while the interpreter exits, nothing can be submitted: this core does the rest
-        for _ in range(min(_cores(), most) - 1):
-            others.append(_pool().submit(launch))  # those that were submitted are waited for in any case
-    launch()
-    wait(others)
+    try:
+        with contextlib.suppress(RuntimeError):  # while the interpreter exits, nothing can be submitted: this core does the rest
+            for _ in range(min(_cores(), most) - 1):
+                others.append(_pool().submit(launch))
+        launch()
+    finally:  # they write to memory that XLA takes back when the call ends, however it ends
+        wait(others)
     for other in others:
         other.result()
 
@@ -577,8 +530,8 @@ def _module_of(variant: _SumVariant) -> str:
     return f"pair_sum_{'cuda' if variant.cuda else 'cpu'}"
 
 
-@functools.cache
-def _sum_callable(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN401
+@kernel
+def _sum_callable(variant: _SumVariant, term: Any) -> Kernel:  # noqa: ANN401
     wp = load_warp()
     scalar = wp.float64 if variant.double else wp.float32
     rows, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
@@ -586,10 +539,10 @@ def _sum_callable(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN401
     of_search, results = {"info": ints, "scratch": ints}, {"sums": rows, "totals": reals, "errors": reals, "columns": reals}
     name = _name_of_sum(_module_of(variant), variant)
     if not variant.cuda:
-        return callable_of(name, functools.partial(_run_sums_on_cpu, variant, term), types | results | of_search, 6)
+        return on_cpu(name, functools.partial(_run_sums_on_cpu, variant, term), types | results | of_search, 6)
     if wp.is_cuda_available():
         _sum_kernels_on_cuda(variant, term).load(wp.get_cuda_device())
-    return cuda_target(name, types | of_search | results, 4, functools.partial(_sum_commands, variant, term))
+    return on_cuda(name, types | of_search | results, 4, functools.partial(_sum_commands, variant, term))
 
 
 def _name_of_sum(name: str, variant: _SumVariant) -> str:
@@ -605,8 +558,8 @@ def _sorting(variant: _SumVariant) -> _SumVariant:
     return variant._replace(closed=False, drop_self=False, compensated=False, extremes=False, key="")
 
 
-@functools.cache
-def _sorting_callable(variant: _SumVariant) -> Any:  # noqa: ANN401
+@kernel
+def _sorting_callable(variant: _SumVariant) -> Kernel:
     """Make a function that XLA calls to sort particles on CUDA: positions, queries and cutoff in; info and scratch out."""
     wp = load_warp()
     if wp.is_cuda_available():
@@ -614,7 +567,7 @@ def _sorting_callable(variant: _SumVariant) -> Any:  # noqa: ANN401
     scalar = wp.float64 if variant.double else wp.float32
     rows, ints = wp.array2d(dtype=scalar), wp.array(dtype=wp.int32)
     types = {"positions": rows, "queries": rows, "cutoff": wp.array(dtype=scalar), "info": ints, "scratch": ints}
-    return cuda_target(_name_of_sum("sorting_cuda", variant), types, 2, functools.partial(_sorting_commands, variant))
+    return on_cuda(_name_of_sum("sorting_cuda", variant), types, 2, functools.partial(_sorting_commands, variant))
 
 
 def _stages_on_cuda(variant: _SumVariant) -> Any:  # noqa: ANN401
@@ -693,10 +646,10 @@ def hashgrid_neighbors(
     return _call("hashgrid", make, sources, queries, cutoff, None, None, keep, capacity)
 
 
-@functools.cache
-def _hashgrid_callable(variant: Variant, radius: float) -> Any:  # noqa: ANN401
+@kernel
+def _hashgrid_callable(variant: Variant, radius: float) -> Kernel:
     bounds = make_cutoff(radius, np.dtype(np.float64 if variant.double else np.float32), variant.closed)
-    return _register("hashgrid", variant, functools.partial(_run_hashgrid, bounds), radius)
+    return _kernel_on_cpu("hashgrid", variant, functools.partial(_run_hashgrid, bounds), radius)
 
 
 def _run_hashgrid(bounds: Cutoff, variant: Variant, arrays: _Arrays) -> None:

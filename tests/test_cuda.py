@@ -6,11 +6,11 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
-import jax
 import pytest
 
-from jfrnn import _cuda
+from jfrnn import _cuda, _ffi, _launch
 
+NAME = b"called@here"
 DEVICES = [SimpleNamespace(alias=f"cuda:{k}") for k in range(2)]  # not hashable, as those of Warp
 
 
@@ -77,15 +77,18 @@ class Frame:
 
     def __init__(self, addresses, extension=None, device=0):
         self.failure, self.number = None, device
+        texts = [_ffi.Text(ctypes.cast(ctypes.c_char_p(text), ctypes.c_void_p), len(text)) for text in (b"kernel", NAME)]
+        self.texts = [(ctypes.POINTER(_ffi.Text) * 1)(ctypes.pointer(text)) for text in texts]
         self.dims = [(ctypes.c_int64 * 2)(4, 2), (ctypes.c_int64 * 1)(4)]
         self.buffers = [
-            _cuda._Buffer(ctypes.sizeof(_cuda._Buffer), None, 11, address, len(dims), dims)
+            _ffi.Buffer(ctypes.sizeof(_ffi.Buffer), None, 11, address, len(dims), dims)
             for address, dims in zip(addresses, self.dims, strict=True)
         ]
-        self.pointers = [(ctypes.POINTER(_cuda._Buffer) * 1)(ctypes.pointer(buffer)) for buffer in self.buffers]
-        self.functions = [_cuda._Get(self.stream), _cuda._Get(self.device), _cuda._Fail(self.fail)]
-        self.api = _cuda._Api(get_stream=self.functions[0], get_device=self.functions[1], fail=self.functions[2])
-        self.frame = _cuda._CallFrame(api=ctypes.pointer(self.api), context=7)
+        self.pointers = [(ctypes.POINTER(_ffi.Buffer) * 1)(ctypes.pointer(buffer)) for buffer in self.buffers]
+        self.functions = [_ffi.Get(self.stream), _ffi.Get(self.device), _ffi.Fail(self.fail)]
+        self.api = _ffi.Api(get_stream=self.functions[0], get_device=self.functions[1], fail=self.functions[2])
+        self.frame = _ffi.CallFrame(api=ctypes.pointer(self.api), context=7, stage=_ffi.EXECUTE)
+        self.frame.attributes.size, self.frame.attributes.names, self.frame.attributes.values = 1, *self.texts
         if extension is not None:
             self.frame.extension = ctypes.pointer(extension)
         for name, pointer in zip(("inputs", "outputs"), self.pointers, strict=True):
@@ -108,24 +111,24 @@ class Frame:
 
 @pytest.fixture
 def registered(monkeypatch):
-    """Register a call of two kernels; return what XLA would call, and the Warp that notes it."""
-    warp, handlers = Warp(), []
-    monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda name, capsule, platform: handlers.append((name, platform)))
+    """Serve a call of two kernels; return what answers XLA, and the Warp that notes it."""
+    warp = Warp()
 
     def commands(x, count):
         if x.ptr == 666:
             raise RuntimeError("no such kernel")
+        if x.ptr == 667:
+            raise KeyboardInterrupt
         besides = [_cuda.Command("beside", [x], 4, 32, beside=True)] if x.ptr >= 5000 else []
         return [_cuda.Command("sort", [x, 4], 4, 128), _cuda.Command("query", [x, count], 4, 32), *besides]
 
-    _cuda.register("called", warp, ["float", "int"], commands)
-    assert handlers == [("called", "CUDA")]
-    return _cuda._kept.pop(), warp
+    monkeypatch.setitem(_launch._served, NAME, _cuda.serve(warp, ["float", "int"], commands))
+    return _launch._answer, warp
 
 
-def call(handler, *addresses, **options):
+def call(answer, *addresses, **options):
     frame = Frame(addresses, **options)
-    return handler(ctypes.pointer(frame.frame)), frame
+    return answer(ctypes.addressof(frame.frame)), frame
 
 
 def launches(x, count, stream=99):
@@ -194,12 +197,15 @@ def test_what_goes_wrong_is_told_to_xla(registered):
     answer, frame = call(handler, 666, 2000)
     assert answer == 1
     assert frame.failure == "called: RuntimeError: no such kernel"
+    answer, frame = call(handler, 667, 2000)  # whatever is raised: no answer would mean success
+    assert answer == 1
+    assert frame.failure == "called: KeyboardInterrupt: "
 
 
 def test_the_version_of_the_interface_is_told(registered):
     handler, warp = registered
-    metadata = _cuda._Metadata()
-    extension = _cuda._Extension(type=1, metadata=ctypes.pointer(metadata))
+    metadata = _ffi.Metadata()
+    extension = _ffi.Extension(type=1, metadata=ctypes.pointer(metadata))
     assert call(handler, 1000, 2000, extension=extension)[0] is None
     assert (metadata.version.major, metadata.version.minor) == (0, 1)
     assert warp.log == []
@@ -207,5 +213,5 @@ def test_the_version_of_the_interface_is_told(registered):
 
 def test_a_call_with_an_unknown_extension_is_a_call(registered):
     handler, warp = registered
-    assert call(handler, 1000, 2000, extension=_cuda._Extension(type=7))[0] is None
+    assert call(handler, 1000, 2000, extension=_ffi.Extension(type=7))[0] is None
     assert warp.log == launches(1000, 2000)

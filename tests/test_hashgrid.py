@@ -83,12 +83,12 @@ def test_two_cutoffs_in_one_program():
 
 
 def test_the_program_names_the_cutoff():
-    """JAX's persistent compilation cache knows a callable by its name alone."""
+    """JAX's persistent compilation cache knows a kernel by what the program says of it alone."""
     x = jnp.zeros((5, 3), jnp.float32)
     names = set()
     for cutoff in (0.25, 4.0, 0.3, np.nextafter(np.float32(0.3), np.float32(1))):
         text = jax.jit(lambda x, r=cutoff: jfrnn.count(x, r, backend="hashgrid")).lower(x).as_text()
-        names |= set(re.findall(r"custom_call @(jfrnn_hashgrid_3d_f32_own_dropself_\w+)_0\(", text))
+        names |= set(re.findall(r'kernel = "(jfrnn_hashgrid_3d_f32_own_dropself_0x[^"]+)@', text))
     assert len(names) == 4
 
 
