@@ -13,7 +13,7 @@ from jax.core import Tracer
 
 from jfrnn._backends import Found, Inputs, Options, count_rows, list_rows, without_inactive
 from jfrnn._batch import Batch
-from jfrnn._box import LARGEST_TURN, Box, Images, fixed_box, make_lattice, nearest_shifts, shifted_pairs, unpacked_turns
+from jfrnn._box import LARGEST_TURN, Box, Images, Lattice, fixed_box, make_lattice, nearest_shifts, shifted_pairs, unpacked_turns
 from jfrnn._exact import Cutoff, Cutoffs, Radii, is_pair_of, make_cutoff, make_cutoffs
 from jfrnn._inputs import checked_active, checked_box, checked_positions, checked_radii, checked_slack
 from jfrnn._runs import Filter
@@ -216,23 +216,29 @@ class NeighborList:
     def shifts(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> Array:
         """Compute the lattice shift S of every neighbor: its displacement is x_j - x_i + S·(lattice vectors).
 
+        Every used slot has its shift, also where its pair lies in the skin, and so beyond the cutoff: `vectors` and `distances`
+        mask such pairs, `shifts` and `pairs` do not. `nbrs.shifts(x)[nbrs.idx < nbrs.source_count]` has a row for each pair, in
+        the order of `pairs`.
+
         Args:
             positions: Sources [length], shape [n, d], where they are now.
             queries: As in `vectors`.
             box: As in `vectors`.
 
         Returns:
-            Whole numbers, shape [m, capacity, d], int32; 0 in masked slots and along axes that are not periodic.
+            Whole numbers, shape [m, capacity, d], int32; 0 in unused slots, along axes that are not periodic, and between positions
+            that now are more than 1022 lattice vectors apart.
 
         Raises:
             ValueError, TypeError: an argument does not fit the list.
 
         Differentiable: no (integers). Jit: yes. vmap: yes.
         """
-        vectors, mask, shifts = self._geometry(positions, queries, box)
-        if shifts is None:
-            return jnp.zeros(vectors.shape, jnp.int32)
-        return jnp.where(mask[..., None], shifts, 0).astype(jnp.int32)
+        sources, rows = self._geometry_inputs(positions, queries)
+        box = self._box_now(box, sources)
+        if box is None or self.box_kind is None or 0 in (sources.shape[0], *self.idx.shape):
+            return jnp.zeros((*self.idx.shape, sources.shape[1]), jnp.int32)
+        return _shifts(self.idx, self.count, self.images, sources, rows, box, self.box_kind)
 
     def distances(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> tuple[Array, Array]:
         """Compute the distance to every neighbor.
@@ -310,6 +316,9 @@ class NeighborList:
     def to_jraph(self, total: int) -> tuple[Array, Array]:
         """Return senders and receivers of a graph: an edge from each neighbor j to its particle i.
 
+        Each pair has at most one image here, and in a periodic box the edge is to the nearest image of j. A list that tells images
+        apart is refused, since edges alone cannot: of such a list, `shifts` says of which image each slot of `idx` is.
+
         Args:
             total: Number of edges, a static int: as in `pairs`.
 
@@ -318,10 +327,19 @@ class NeighborList:
             `jraph.pad_with_graphs` adds first. Stacked, they are an edge index as other graph libraries have it.
 
         Raises:
+            ValueError: the list tells images apart.
             ValueError, TypeError: as in `pairs`.
 
         Differentiable: no (integers). Jit: yes. vmap: yes.
         """
+        if self.images is not None:
+            raise ValueError(
+                "to_jraph() returns edges without lattice shifts, which a list with several images of a pair needs: take "
+                "i, k = jnp.nonzero(nbrs.idx < nbrs.source_count, size=total, fill_value=len(nbrs.idx)), senders "
+                "nbrs.idx.at[i, k].get(mode='fill', fill_value=nbrs.source_count), receivers i and shifts "
+                "nbrs.shifts(positions).at[i, k].get(mode='fill', fill_value=0); or search in a box that is at least 2.05 "
+                "(cutoff + skin) wide."
+            )
         rows, indices, _ = self._flat(total)
         return indices, rows
 
@@ -515,6 +533,36 @@ def _vectors(
     return jnp.where(mask[..., None], sources[neighbor] - rows[:, None, :], 0), mask
 
 
+class _Slots(NamedTuple):
+    """Of every slot: whether it is used, its source, x_j - x_i, and its lattice shift in whole floats; 0 where it is not used."""
+
+    used: Array
+    neighbor: Array
+    difference: Array
+    shifts: Array
+
+
+def _slots(idx: Array, count: Array, images: ImageCodes | None, sources: Array, rows: Array, lattice: Lattice) -> _Slots:
+    used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
+    neighbor = jnp.where(used, idx, 0)
+    difference = sources[neighbor] - rows[:, None, :]
+    if images is None:
+        shifts = nearest_shifts(difference, lattice)
+    else:
+        turns = unpacked_turns(images.turns, lattice.dim)
+        query_turns = turns if images.query_turns is None else unpacked_turns(images.query_turns, lattice.dim)
+        codes = jnp.where(used, images.codes.astype(jnp.int32), lattice.images.home)
+        shifts = (jnp.asarray(lattice.images.shifts)[codes] + query_turns[:, None] - turns[neighbor]).astype(sources.dtype)
+    used = used & (jnp.abs(shifts) <= 2 * LARGEST_TURN).all(axis=-1)  # farther apart, nothing is decided exactly
+    return _Slots(used, neighbor, difference, jnp.where(used[..., None], shifts, 0))
+
+
+@functools.partial(jax.jit, static_argnames="kind")
+def _shifts(idx: Array, count: Array, images: ImageCodes | None, sources: Array, rows: Array, box: Box, kind: Images) -> Array:
+    lattice = make_lattice(box, kind, np.dtype(sources.dtype))
+    return lax.stop_gradient(_slots(idx, count, images, sources, rows, lattice).shifts).astype(jnp.int32)
+
+
 @functools.partial(jax.jit, static_argnames=("kind", "closed"))
 def _periodic_vectors(
     idx: Array,
@@ -529,18 +577,7 @@ def _periodic_vectors(
 ) -> tuple[Array, Array, Array]:
     cutoff = _pair_cutoff(given, closed)
     lattice = make_lattice(box, kind, np.dtype(sources.dtype))
-    used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
-    neighbor = jnp.where(used, idx, 0)
-    difference = sources[neighbor] - rows[:, None, :]
-    if images is None:
-        shifts = nearest_shifts(difference, lattice)
-    else:
-        turns = unpacked_turns(images.turns, lattice.dim)
-        query_turns = turns if images.query_turns is None else unpacked_turns(images.query_turns, lattice.dim)
-        codes = jnp.where(used, images.codes.astype(jnp.int32), kind.home)
-        shifts = (jnp.asarray(kind.shifts)[codes] + query_turns[:, None] - turns[neighbor]).astype(sources.dtype)
-    used = used & (jnp.abs(shifts) <= 2 * LARGEST_TURN).all(axis=-1)  # farther apart, nothing is decided exactly
-    shifts = jnp.where(used[..., None], shifts, 0)
+    used, neighbor, difference, shifts = _slots(idx, count, images, sources, rows, lattice)
     fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
     pairs = shifted_pairs(difference, shifts, (fixed_sources, fixed_rows), lattice)
     fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))

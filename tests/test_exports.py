@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
 
 import jfrnn
 
@@ -27,6 +28,96 @@ def test_exports_of_static_length(total):
     np.testing.assert_array_equal(senders, sources)
     np.testing.assert_array_equal(receivers, rows)
     assert {rows.dtype, sources.dtype, found_offsets.dtype, found_indices.dtype} == {np.dtype(np.int32)}
+
+
+HALF = np.arange(50) % 2 == 0
+KINDS = {
+    "plain": {},
+    "half": {"half": True},
+    "self": {"include_self": True},
+    "queries": {"queries": X[::5] + 0.01},
+    "batch": {"batch": jnp.arange(50) % 3},
+    "active": {"active": jnp.asarray(HALF)},
+    "skin": {"skin": 0.05},
+    "box": {"box": jfrnn.Box([1.0] * 3), "skin": 0.05},
+    "images": {"box": jfrnn.Box([0.5, 0.55, 3.0])},
+    "half images": {"box": jfrnn.Box([0.5, 0.55, 3.0]), "half": True, "skin": 0.05},
+}
+
+
+SLOWLY = ("images", "radii", "batch")  # compiled
+
+
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in SLOWLY)) for kind in [*KINDS, "radii"]])
+def test_all_that_leaves_a_list_says_the_same_pairs(kind):
+    radii = kind == "radii"
+    nbrs = jfrnn.search(X, 0.1 + 0.4 * X[:, 0], radius_rule="mean") if radii else jfrnn.search(X, 0.3, **KINDS[kind])
+    queries = KINDS.get(kind, {}).get("queries", X)
+    given = {"queries": queries} if "queries" in KINDS.get(kind, {}) else {}
+    total, m = 2400, len(queries)
+    i, j = nbrs.pairs()
+    assert 10 < len(i) < total
+    fill = np.full(total - len(i), 50), np.full(total - len(i), m)
+    rows, sources = nbrs.pairs(total)
+    np.testing.assert_array_equal(rows, np.concatenate([i, fill[1]]))
+    np.testing.assert_array_equal(sources, np.concatenate([j, fill[0]]))
+    for offsets, indices in (nbrs.csr(), nbrs.csr(total)):
+        np.testing.assert_array_equal(np.repeat(np.arange(m), np.diff(offsets)), i)
+        np.testing.assert_array_equal(indices[: len(j)], j)
+        assert (indices[len(j) :] == 50).all()
+    used = np.asarray(nbrs.idx) < 50
+    np.testing.assert_array_equal(np.nonzero(used)[0], i)
+    np.testing.assert_array_equal(np.asarray(nbrs.idx)[used], j)
+    vectors, mask = (np.asarray(x) for x in nbrs.vectors(X, **given))
+    assert not (mask & ~used).any()
+    assert (vectors[~mask] == 0).all()
+    shifts = np.asarray(nbrs.shifts(X, **given))
+    assert (shifts[~used] == 0).all()
+    box = KINDS.get(kind, {}).get("box")
+    lengths = np.zeros(3) if box is None else np.asarray(box.vectors)
+    apart = np.asarray(X)[j] - np.asarray(queries)[i] + shifts[used] * lengths
+    reach = 0.1 + 0.4 * float(X.max()) if radii else 0.3 + KINDS[kind].get("skin", 0.0)
+    assert (np.linalg.norm(apart, axis=1) < reach + 1e-6).all()
+    np.testing.assert_allclose(vectors[used], np.where(mask[used][:, None], apart, 0), atol=1e-6)
+    if "skin" in KINDS.get(kind, {}):
+        assert (used & ~mask).any()  # the skin holds pairs, which `pairs` lists and whose shifts are known
+    if nbrs.images is None:
+        senders, receivers = nbrs.to_jraph(total)
+        np.testing.assert_array_equal(senders, sources)
+        np.testing.assert_array_equal(receivers, rows)
+
+
+def test_a_pair_in_the_skin_has_its_shift():
+    x = jnp.asarray([[0.05, 0.5, 0.5], [0.93, 0.5, 0.5]], jnp.float32)
+    nbrs = jfrnn.search(x, 0.1, skin=0.05, box=jfrnn.Box([1.0] * 3))
+    i, j = nbrs.pairs()
+    shifts = np.asarray(nbrs.shifts(x))[np.asarray(nbrs.idx) < 2]
+    np.testing.assert_allclose(np.linalg.norm(np.asarray(x)[j] - np.asarray(x)[i] + shifts, axis=1), [0.12, 0.12], rtol=1e-6)
+    assert not nbrs.distances(x)[1].any()
+
+
+def test_edges_of_images_are_refused_and_the_message_says_how_to_get_them():
+    x = jnp.asarray([[0.5, 0.5, 0.5], [0.9, 0.5, 0.5]], jnp.float32)
+    box = jfrnn.Box([1.0, 1.0, 1.0])
+    nbrs, total = jfrnn.search(x, 1.1, box=box), 64
+    with pytest.raises(
+        ValueError, match=r"without lattice shifts.*jnp.nonzero\(nbrs.idx < nbrs.source_count, size=total"
+    ) as refused:
+        nbrs.to_jraph(total)
+    assert "nbrs.shifts(positions).at[i, k]" in str(refused.value)
+
+    @jax.jit
+    def edges(nbrs, positions):
+        i, k = jnp.nonzero(nbrs.idx < nbrs.source_count, size=total, fill_value=len(nbrs.idx))
+        senders = nbrs.idx.at[i, k].get(mode="fill", fill_value=nbrs.source_count)
+        return senders, i, nbrs.shifts(positions).at[i, k].get(mode="fill", fill_value=0)
+
+    senders, receivers, shifts = (np.asarray(part) for part in edges(nbrs, x))
+    real = receivers < 2
+    assert (senders[~real] == 2).all()
+    found = set(zip(receivers[real].tolist(), senders[real].tolist(), map(tuple, shifts[real].tolist()), strict=True))
+    assert found == reference.reference_images(np.asarray(x), 1.1, matrix=np.eye(3), periodic=(True,) * 3)
+    assert len(found) == real.sum()
 
 
 def test_rows_that_overflowed_export_what_they_hold():
