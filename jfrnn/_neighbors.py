@@ -15,6 +15,7 @@ from jfrnn._backends import Found, Inputs, Options, count_rows, list_rows, witho
 from jfrnn._batch import Batch
 from jfrnn._box import LARGEST_TURN, Box, Images, Lattice, fixed_box, make_lattice, nearest_shifts, shifted_pairs, unpacked_turns
 from jfrnn._exact import Cutoff, Cutoffs, Radii, is_pair_of, make_cutoff, make_cutoffs
+from jfrnn._exports import DenseNeighbors, checked_total, flat_pairs, pair_total
 from jfrnn._inputs import checked_active, checked_box, checked_positions, checked_radii, checked_slack
 from jfrnn._runs import Filter
 from jfrnn._status import NeighborOverflowError, Status
@@ -182,14 +183,46 @@ class NeighborList:
 
         Raises:
             NeighborOverflowError: a row holds more neighbors than `capacity`; `.required` is the capacity needed.
-            ValueError: positions or queries hold NaN or infinity, or do not fit the box.
+            ValueError: positions or queries hold NaN or infinity, or do not fit the box; or there were more pairs than `require`
+                was told.
             TypeError: called on a list that is being traced.
         """
         if isinstance(self.status, Tracer):
             raise TypeError("check() reads values and cannot run inside jax.jit: call it on the list that jit returns.")
-        status = Status(int(np.bitwise_or.reduce(np.asarray(self.status), axis=None)))
+        self._check_known()
+
+    def require(self, total: int) -> "NeighborList":
+        """Return this list with the bit `Status.TOTAL_OVERFLOW` set where it holds more pairs than exports of this length take.
+
+        For loops inside `jax.jit`, where `pairs(total)`, `csr(total)` and `to_jraph(total)` cannot raise: the bit is kept by
+        updates, and `check` names it afterwards.
+
+        Args:
+            total: Number of pairs, a static int.
+
+        Returns:
+            The same list, but for its status.
+
+        Raises:
+            ValueError, TypeError: a wrong total.
+
+        Cost: a sum over the rows. Jit: yes. vmap: yes.
+        """
+        self._check_single()
+        missing = pair_total(self.count, self.capacity) > checked_total(total)
+        return dataclasses.replace(self, status=self.status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0))
+
+    def _check_known(self, spared: Status = Status.OK) -> None:
+        """Raise what status bits report, but for the spared ones, where they are known: not on a list that is being traced."""
+        if isinstance(self.status, Tracer):
+            return
+        bits = jax.device_get(self.status)  # stays with the array: to ask again costs nothing
+        status = Status(int(np.bitwise_or.reduce(bits, axis=None))) & ~spared
         if Status.ROW_OVERFLOW in status:
-            raise NeighborOverflowError(int(np.max(self.required)), self.capacity)
+            raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self.capacity)
+        if Status.TOTAL_OVERFLOW in status:
+            now = int(np.sum(jax.device_get(self.count), dtype=np.int64))
+            raise ValueError(f"{status.message} At present it holds {now}.")
         if status:
             raise ValueError(status.message)
 
@@ -269,19 +302,21 @@ class NeighborList:
         """Export the pairs (i, j), row by row: to the host, or inside jit into arrays of a static length.
 
         Args:
-            total: Length of the arrays, a static int; None: as many as there are, which only a list outside jit knows. Where there
-                are more pairs than `total`, the last ones are missing: compare it with `count.sum()`.
+            total: Length of the arrays, a static int up to 2³¹ - 1; None: as many as there are, which is known only outside jit.
+                Where there are more pairs than `total`, a list outside jit raises. Inside jit the last pairs are missing then, and
+                nothing is left over: `require(total)` sets a bit that `check` names.
 
         Returns:
             Query indices i and source indices j, shape [pairs] or [total], int32 each; what is left over holds m and n.
 
         Raises:
-            NeighborOverflowError, ValueError, TypeError: as `check`, without `total`; ValueError, TypeError: a wrong total.
+            NeighborOverflowError, ValueError: as `check`, outside jit; ValueError: more pairs than `total`, outside jit.
+            ValueError, TypeError: a wrong total, or none inside jit.
 
         Differentiable: no (integers). Jit: yes, with total. vmap: yes, with total.
         """
         if total is None:
-            count, idx = self._checked_rows()
+            count, idx = self._checked_rows("pairs")
             return np.repeat(np.arange(count.size, dtype=np.int32), count), idx
         rows, indices, _ = self._flat(total)
         return rows, indices
@@ -296,7 +331,8 @@ class NeighborList:
         """Export compressed rows: the neighbors of row i are indices[offsets[i]:offsets[i + 1]].
 
         Args:
-            total: As in `pairs`; offsets[-1] then is the number of pairs in the rows, which may exceed `total`.
+            total: As in `pairs`; offsets[-1] then is the number of pairs in the rows, at most 2³¹ - 1, which inside jit may exceed
+                `total`.
 
         Returns:
             Offsets, shape [m + 1], int64 on the host, int32 with `total`; and indices, shape [pairs] or [total], int32, n in what
@@ -308,7 +344,7 @@ class NeighborList:
         Differentiable: no (integers). Jit: yes, with total. vmap: yes, with total.
         """
         if total is None:
-            count, idx = self._checked_rows()
+            count, idx = self._checked_rows("csr")
             return np.concatenate([[0], np.cumsum(count, dtype=np.int64)]), idx
         _, indices, offsets = self._flat(total)
         return offsets, indices
@@ -343,36 +379,49 @@ class NeighborList:
         rows, indices, _ = self._flat(total)
         return indices, rows
 
-    def to_jax_md(self) -> "DenseNeighbors":
+    def to_jax_md(self) -> DenseNeighbors:
         """Return this list as the neighbor-list energies of jax-md take it: `idx` as its format `Dense` has it.
 
         Such an energy computes displacements itself, so that it wants the full list of the particles among themselves, and at most
-        one image of each pair; the box goes into its displacement function. It sees what is within cutoff + skin.
+        one image of each pair; the box goes into its displacement function. It sees what is within cutoff + skin. Inside jit the
+        `did_buffer_overflow` of what comes back says whether neighbors are missing.
 
         Raises:
             ValueError: the list is a half one, has queries, or tells images apart.
+            NeighborOverflowError, ValueError: as `check`, outside jit.
         """
         wrong = {"half=True": self.half, "queries": self.own_queries, "several images of a pair": self.images is not None}
         for what in (name for name, is_so in wrong.items() if is_so):
             raise ValueError(f"jax-md's Dense format cannot say what a list with {what} does: search without.")
-        return DenseNeighbors(self.idx)
+        self._check_known()
+        return DenseNeighbors(self.idx, self.status)
 
     def _flat(self, total: int) -> tuple[Array, Array, Array]:
         """Return rows and sources of the pairs, padded to a static length, and the offsets of the rows."""
-        if isinstance(total, bool) or not isinstance(total, int | np.integer):
-            raise TypeError(f"total must be a static int, the length of the arrays, got {type(total).__name__} {total!r}.")
-        if total < 0:
-            raise ValueError(f"total must be at least 0, got {total}.")
-        if self.idx.ndim != 2:
-            raise ValueError(f"exports take one list at a time, got idx of shape {list(self.idx.shape)}: index the batch first.")
-        return _flat_pairs(self.idx, self.count, self.source_count, int(total))
+        total = checked_total(total)
+        self._check_single()
+        self._check_known()
+        if not isinstance(self.count, Tracer):
+            with jax.ensure_compile_time_eval():
+                held = int(jax.device_get(pair_total(self.count, self.capacity)))
+            if held > total:
+                raise ValueError(f"total={total} is too small: the list holds {held} pairs. Pass total={held} or more.")
+        return flat_pairs(self.idx, self.count, self.source_count, total)
 
-    def _checked_rows(self) -> tuple[np.ndarray, np.ndarray]:
-        self.check()
-        if self.idx.ndim != 2:
-            raise ValueError(f"exports take one list at a time, got idx of shape {list(self.idx.shape)}: index the batch first.")
+    def _checked_rows(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        if isinstance(self.status, Tracer):
+            raise TypeError(
+                f"{name}() returns as many pairs as there are and cannot run inside jax.jit: write {name}(total), total being the "
+                "static length of its arrays."
+            )
+        self._check_known()
+        self._check_single()
         idx, count = np.asarray(self.idx), np.asarray(self.count)
         return count, idx[np.arange(self.capacity) < count[:, None]]
+
+    def _check_single(self) -> None:
+        if self.idx.ndim != 2:
+            raise ValueError(f"exports take one list at a time, got idx of shape {list(self.idx.shape)}: index the batch first.")
 
     def _checked_active(self, active: Array | None, sources: Array) -> Array | None:
         if self.masked != (active is not None):
@@ -419,20 +468,6 @@ class NeighborList:
         if rows.shape[0] != self.idx.shape[0]:
             raise ValueError(f"queries hold {rows.shape[0]} points, but the list has {self.idx.shape[0]} rows.")
         return sources, rows
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class DenseNeighbors:
-    """What jax-md's energies read of a neighbor list.
-
-    Attributes:
-        idx: Neighbors, shape [n, capacity], int32; unused slots hold n.
-        format: None: neither of jax-md's two sparse formats, hence the dense one. Static.
-    """
-
-    idx: Array
-    format: None = dataclasses.field(default=None, metadata={"static": True})
 
 
 def rounded_capacity(slots: int) -> int:
@@ -583,20 +618,6 @@ def _periodic_vectors(
     fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
     mask = used & is_pair_of(fixed_rows, fixed_sources, neighbor, cutoff, fixed_pairs)
     return jnp.where(mask[..., None], pairs.vectors, 0), mask, shifts
-
-
-@functools.partial(jax.jit, static_argnames=("sources", "total"))
-def _flat_pairs(idx: Array, count: Array, sources: int, total: int) -> tuple[Array, Array, Array]:
-    m, capacity = idx.shape
-    used = jnp.minimum(count, capacity)
-    offsets = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(used, dtype=jnp.int32)])
-    if 0 in (m, capacity, total):
-        return jnp.full(total, m, jnp.int32), jnp.full(total, sources, jnp.int32), offsets
-    place = lax.iota(jnp.int32, total)
-    row = jnp.repeat(lax.iota(jnp.int32, m), used, total_repeat_length=total)
-    there = place < offsets[-1]
-    found = idx[row, jnp.minimum(place - offsets[row], capacity - 1)]
-    return jnp.where(there, row, m), jnp.where(there, found, sources), offsets
 
 
 @jax.jit

@@ -17,6 +17,7 @@ class Status(enum.IntFlag):
     SHARD_OVERFLOW = 128
     HALO_OVERFLOW = 256
     HALO_TOO_FAR = 512
+    TOTAL_OVERFLOW = 1024
 
     @property
     def message(self) -> str:
@@ -54,6 +55,7 @@ _MESSAGES = {
     Status.SHARD_OVERFLOW: "A shard would have got more particles than it has room for: none of them changed their shard.",
     Status.HALO_OVERFLOW: "A message to a neighboring shard holds fewer particles than it should: pairs may be missing.",
     Status.HALO_TOO_FAR: "Pairs reach to shards farther away than messages go: pairs may be missing.",
+    Status.TOTAL_OVERFLOW: "The list held more pairs than the `total` that `require` was told: exports of that length lack pairs.",
 }
 
 

@@ -1,5 +1,7 @@
 """Exports of a list: pairs, compressed rows, edges, jax-md's dense format; on the host and under jit."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 import reference
 
 import jfrnn
+from jfrnn._exports import flat_pairs, pair_total, row_offsets
 
 X = jnp.asarray(np.random.default_rng(0).random((50, 3)), jnp.float32)
 
@@ -24,7 +27,7 @@ def test_exports_of_static_length(total):
     found_offsets, found_indices = jax.jit(lambda nbrs: nbrs.csr(total))(nbrs)
     np.testing.assert_array_equal(found_offsets, offsets)
     np.testing.assert_array_equal(found_indices, np.concatenate([indices[:kept], np.full(total - kept, 50)]))
-    senders, receivers = nbrs.to_jraph(total)
+    senders, receivers = jax.jit(lambda nbrs: nbrs.to_jraph(total))(nbrs)
     np.testing.assert_array_equal(senders, sources)
     np.testing.assert_array_equal(receivers, rows)
     assert {rows.dtype, sources.dtype, found_offsets.dtype, found_indices.dtype} == {np.dtype(np.int32)}
@@ -120,13 +123,96 @@ def test_edges_of_images_are_refused_and_the_message_says_how_to_get_them():
     assert len(found) == real.sum()
 
 
-def test_rows_that_overflowed_export_what_they_hold():
+def test_rows_that_overflowed_export_what_they_hold_and_carry_the_status():
     nbrs = jfrnn.search(X, 0.3, capacity=4)
-    offsets, indices = nbrs.csr(300)
+    offsets, indices = jax.jit(lambda nbrs: nbrs.csr(300))(nbrs)
     used = np.minimum(nbrs.count, 4)
     np.testing.assert_array_equal(offsets, np.concatenate([[0], np.cumsum(used)]))
     np.testing.assert_array_equal(indices[: used.sum()], np.asarray(nbrs.idx)[np.arange(4) < used[:, None]])
     assert (np.asarray(indices)[used.sum() :] == 50).all()
+    dense = jax.jit(lambda nbrs: nbrs.to_jax_md())(nbrs)
+    assert bool(dense.did_buffer_overflow)
+    assert int(dense.status) == int(nbrs.status)
+
+
+@pytest.mark.parametrize(
+    "leave", [lambda n: n.pairs(900), lambda n: n.csr(900), lambda n: n.to_jraph(900), lambda n: n.to_jax_md()]
+)
+def test_a_list_that_is_not_whole_does_not_leave(leave):
+    nbrs = jfrnn.search(X, 0.3, capacity=4)
+    with pytest.raises(jfrnn.NeighborOverflowError, match="capacity=4 is too small") as refused:
+        leave(nbrs)
+    assert refused.value.required == int(nbrs.required)
+    with pytest.raises(jfrnn.NeighborOverflowError, match="capacity=4 is too small"):
+        jax.jit(lambda x: (leave(nbrs), x))(X)  # closed over, and so known while tracing
+    leave(nbrs.grow(X))
+
+
+EXPORTS = {"pairs": lambda n, t: n.pairs(t), "csr": lambda n, t: n.csr(t), "to_jraph": lambda n, t: n.to_jraph(t)}
+
+
+@pytest.mark.parametrize("export", EXPORTS)
+def test_a_total_that_is_too_small_raises_outside_jit(export):
+    nbrs = jfrnn.search(X, 0.3)
+    held = len(nbrs.pairs()[0])
+    with pytest.raises(ValueError, match=rf"total=100 is too small: the list holds {held} pairs. Pass total={held} or more"):
+        EXPORTS[export](nbrs, 100)
+    assert len(EXPORTS[export](nbrs, held)[1]) == held
+
+
+def test_a_total_that_is_too_small_sets_a_bit_that_stays():
+    nbrs = jfrnn.search(X, 0.3)
+    held = len(nbrs.pairs()[0])
+
+    @functools.partial(jax.jit, static_argnames="total")
+    def steps(nbrs, total):
+        def step(_, nbrs):
+            return nbrs.update(X).require(total)
+
+        nbrs = jax.lax.fori_loop(0, 2, step, nbrs)
+        return nbrs.update(100 * X), nbrs.pairs(total)
+
+    enough, _ = steps(nbrs, held)
+    enough.check()
+    short, (rows, _) = steps(nbrs, held - 1)
+    assert rows[-1] < 50
+    assert jfrnn.Status(int(short.status)) == jfrnn.Status.TOTAL_OVERFLOW
+    with pytest.raises(ValueError, match=r"more pairs than the `total` that `require` was told.*At present it holds 0"):
+        short.check()
+    with pytest.raises(ValueError, match=f"At present it holds {held}"):
+        nbrs.require(1).check()
+    nbrs.require(1).grow(X).check()
+
+
+@pytest.mark.parametrize("export", EXPORTS)
+def test_totals_that_int32_cannot_number_are_refused_while_tracing(export):
+    nbrs = jfrnn.search(X, 0.3)
+    for total in (2**31, 2**31 + 8):
+        with pytest.raises(ValueError, match=rf"total must be at most 2147483647.*got {total}"):
+            jax.eval_shape(lambda nbrs, total=total: EXPORTS[export](nbrs, total), nbrs)
+    with pytest.raises(ValueError, match="total must be at most 2147483647"):
+        nbrs.require(2**31)
+
+
+def test_sums_of_counts_never_wrap():
+    """More slots than int32 can number: no array of them is made here, only what is added up."""
+    capacity, counts = 2**30, np.array([5, 2**30, 0, 2**30, 2**31 - 1, 7], np.int32)
+    exact = np.concatenate([[0], np.cumsum(np.minimum(counts, capacity), dtype=np.int64)])
+    offsets = jax.jit(row_offsets, static_argnames="capacity")(jnp.asarray(counts), capacity)
+    np.testing.assert_array_equal(offsets, np.minimum(exact, 2**31 - 1))
+    assert (offsets.dtype, int(pair_total(jnp.asarray(counts), capacity))) == (np.int32, 2**31 - 1)
+    assert int(pair_total(jnp.asarray(counts[[0, 2, 5]]), capacity)) == 12
+    many = jax.eval_shape(
+        lambda idx, count: flat_pairs(idx, count, 64_000_000, 8),
+        *(jax.ShapeDtypeStruct(shape, np.int32) for shape in ((64_000_000, 112), (64_000_000,))),
+    )
+    assert many[2].dtype == np.int32
+
+
+def test_what_needs_the_host_says_to_pass_a_total():
+    for export in ("pairs", "csr"):
+        with pytest.raises(TypeError, match=rf"{export}\(\) returns as many pairs as there are.*write {export}\(total\)"):
+            jax.jit(lambda nbrs, export=export: getattr(nbrs, export)())(jfrnn.search(X, 0.3))
 
 
 @pytest.mark.parametrize(("m", "n"), [(0, 5), (5, 0)])
