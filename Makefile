@@ -10,6 +10,8 @@ PROCESSES ?= 1
 # That the repeats of a row may take [s]; `make sweeps` lets slow methods have all of theirs.
 MOST_SECONDS ?= 20
 STAMP  := $(VENV)/.installed
+# What pip and setuptools say of themselves in every set-up: that there is a newer pip, that root installs, how an editable install works.
+PIP    := PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore PYTHONWARNINGS='ignore:Editable installation' $(PY) -m pip install --quiet
 
 .PHONY: sweep sweeps peers notebooks test test-slow lint clean
 .DEFAULT_GOAL := test
@@ -17,8 +19,8 @@ STAMP  := $(VENV)/.installed
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(f"jfrnn needs Python >= 3.11, found {v[0]}.{v[1]}: set PYTHON=/path/to/python3") if v < (3, 11) else None'
 	$(PYTHON) -m venv $(VENV)
-	$(PY) -m pip install --quiet --upgrade pip
-	$(PY) -m pip install --quiet --no-compile --editable '.[test]'
+	$(PIP) --upgrade pip
+	$(PIP) --no-compile --editable '.[test]'
 	touch $@
 
 sweep: $(STAMP)
@@ -35,7 +37,7 @@ sweeps: $(STAMP)
 	  $(PY) -m experiments report experiments/results/sweep_$$each || exit 1; done
 
 peers: $(STAMP)
-	$(PY) -m pip install --quiet --editable '.[peers]'
+	$(PIP) --editable '.[peers]'
 
 # The notebooks that read rows of sweeps, with their outputs.
 notebooks: $(STAMP)

@@ -61,8 +61,7 @@ def run(
         given = given.model_copy(update={name: value for name, value in asked.items() if value is not None})
         with _stoppable():
             rows = _sweep.run(given, config.stem, folder, retry_failed, (part, parts))
-        good = sum(row.status == "ok" for row in rows)
-        typer.echo(f"{good} of {len(rows)} rows ok, {len(rows) - good} with a reason; rows in {folder / 'rows.jsonl'}")
+        typer.echo(f"{_sweep.count_results(rows)}; rows in {folder / 'rows.jsonl'}")
 
 
 def _read_shard(text: str) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""The report of a sweep: reads its rows and nothing else; prints a table, writes report.md, table.csv and pictures."""
+"""The report of a sweep: reads its rows and nothing else; prints a short table, writes report.md, table.csv and pictures."""
 
 import csv
 import math
@@ -11,13 +11,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from experiments import _table
+from experiments import _table, methods
 from experiments._errors import UsageError
 from experiments._rows import Row, read_latest
 
 TITLES = ("scene", "points", "method", "s", "±", "/ {}", "MB", "/ {}", "missing", "extra", "density error", "gradient error")
 TITLES += ("thesis", "s", "/ CLL", "MB", "/ CLL")
 TEXT_COLUMNS = ("scene", "method", "thesis")
+PRINTED = ("s", "MB", "missing", "extra")
 ABSENT = "·"
 NOTEWORTHY_CORES = 0.25  # what other processes take beyond it is said: it slows down the methods that use all cores
 
@@ -65,11 +66,12 @@ def report(folder: Path) -> None:
     write_csv(lines, folder / "table.csv")
     (folder / "report.md").write_text(markdown(rows, lines, pictures), encoding="utf-8")
     _page.write(folder / "report.html", _title(rows), describe_origin(rows), lines, NOTES, pictures)
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     if not console.is_terminal:
-        console.width = 200
+        console.width = 80
     console.print(rich_table(lines))
-    console.print(describe_origin(rows), soft_wrap=True)
+    for text in (*remarks(lines), describe_origin(rows)):
+        console.print(text, soft_wrap=True)
     for path in (folder / "report.md", folder / "report.html", folder / "table.csv", *pictures):
         console.print(str(path), soft_wrap=True)
 
@@ -168,28 +170,39 @@ def _ratio(value: float | None) -> str:
 
 
 def rich_table(lines: list[dict[str, Any]]) -> Table:
-    """Return the printed table, a section per scene; what has no figures says why."""
+    """Return the printed table, scene by scene: what has figures, or says why it has none, but for what is not installed.
+
+    It fits a terminal of 80 columns, where long names of scenes are broken; `report.md` and `report.html` have all columns.
+    """
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for title in titles(lines):
-        table.add_column(title, justify="left" if title in TEXT_COLUMNS else "right", no_wrap=True)
+    table.add_column("")
+    for title in PRINTED:
+        table.add_column(title, justify="right", no_wrap=True)
     previous = None
     for line in lines:
-        if previous not in (None, line["scene"]):
-            table.add_section()
-        scene, *rest = cells(line)
-        if line["status"] != "ok":
-            rest[2] = line["status"]
-        style = None if line["status"] == "ok" else "dim"
-        texts = [Text(text, "yellow" if is_error else "") for text, is_error in zip(rest, _error_marks(line), strict=True)]
-        table.add_row("" if scene == previous else scene, *texts, style=style)
-        previous = scene
+        if line["status"] == "missing":
+            continue
+        if line["scene"] != previous:
+            if previous is not None:
+                table.add_section()
+            table.add_row(Text(f"{line['scene']}, {_count(line['points'])} points", "bold"))
+            previous = line["scene"]
+        wrong = [Text(_errors(line, name), "yellow" if line[name] else "") for name in ("missing", "extra")]
+        ok = line["status"] == "ok"
+        seconds = _busy(line) + _seconds(line["median_s"]) if ok else line["status"]
+        table.add_row(f"  {line['method']}", seconds, _megabytes(line["search_mb"]), *wrong, style=None if ok else "dim")
     return table
 
 
-def _error_marks(line: dict[str, Any]) -> list[bool]:
-    """Return for each entry of `TITLES` but the first whether it tells of wrong pairs."""
-    marks = {7: bool(line["missing"]), 8: bool(line["extra"])}
-    return [marks.get(number, False) for number in range(len(TITLES) - 1)]
+def remarks(lines: list[dict[str, Any]]) -> list[str]:
+    """Return what is to be said below the printed table: what is not installed, and what its marks mean, where they occur."""
+    absent = dict.fromkeys(line["method"] for line in lines if line["status"] == "missing")
+    said = [f"not installed: {', '.join(absent)} ({methods.HOW_TO_INSTALL})"] if absent else []
+    if any(_busy(line) for line in lines):
+        said.append("*: other processes kept more than a quarter of a core busy meanwhile, so that this time may be too long")
+    if any(_table.pairs_mark(line) for line in lines):
+        said.append("~: told from counts of neighbors, or from a sample of the particles")
+    return [*said, "s: median time of a search; MB: its peak memory, 10^6 bytes; missing, extra: pairs against the exact answer"]
 
 
 def write_csv(lines: list[dict[str, Any]], path: Path) -> None:

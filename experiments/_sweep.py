@@ -6,20 +6,24 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from experiments import _machine
+from experiments import _machine, methods
 from experiments._config import Config, Spec
 from experiments._errors import UsageError
+from experiments._forecast import Forecast, in_words
 from experiments._rows import RETRIED, SCENE_FIELDS, Row, RowFile
+from experiments._worker import RUNNER
 
 ROOT = Path(__file__).resolve().parent.parent
 REASON_LENGTH = 600
@@ -51,35 +55,53 @@ def shard_specs(specs: Iterable[Spec], shard: tuple[int, int]) -> list[Spec]:
 
 def _run(config: Config, name: str, file: RowFile, retry_failed: bool, shard: tuple[int, int]) -> list[Row]:
     """Do the work of `run` with the file of rows at hand."""
-    folder = file.path.parent
-    specs, prepared, absent = shard_specs(config.specs(), shard), set(), {}
+    folder, specs = file.path.parent, shard_specs(config.specs(), shard)
     rows = {row.key: row for row in file.read() if not (retry_failed and row.status in RETRIED)}
     pending = [spec for spec in specs if (row := rows.get(spec.key)) is None or spec.cut_short(row)]
     about = {"machine": _machine.machine(), **_machine.commit(), "config": name, "config_hash": config.hash}
+    forecast, scene, prepared, absent = Forecast(pending, rows.values()), None, set(), {}
     with progress(len(specs)) as shown:
         bar = shown.add_task("", total=len(specs), completed=len(specs) - len(pending))
-        if len(pending) < len(specs):
-            shown.console.print(f"{len(specs) - len(pending)} of {len(specs)} rows are there already")
-        for spec in pending:
-            if spec.scene_key not in prepared:
-                prepared.add(spec.scene_key)
-                shown.update(bar, description=f"{spec.scene_name} · exact pairs")
+        _announce(shown.console, specs, pending, forecast)
+        for done, spec in enumerate(pending):
+            left = f"left: {in_words(forecast.left(pending[done:]))}"
+            if spec.scene_key != scene:
+                scene = spec.scene_key
+                shown.console.print(f"{spec.scene_name}: {done} of {len(pending)} rows measured, {left}", highlight=False)
+            if scene not in prepared:
+                prepared.add(scene)
+                shown.update(bar, description=f"{left} · {spec.scene_name} · exact pairs")
                 _prepare_oracle(spec, folder, shown.console)
-            shown.update(bar, description=f"{spec.scene_name} · {spec.method}")
+            shown.update(bar, description=f"{left} · {spec.scene_name} · {spec.method}")
+            begin = perf_counter()
             row = replace(measure(spec, folder, absent.get(spec.method)), **about)
+            forecast.note(spec, perf_counter() - begin)
+            file.append(row)
+            if spec.method not in absent:
+                shown.console.print(describe(row), highlight=False, markup=False, soft_wrap=True)
             if row.status == "missing":
                 absent[spec.method] = {"status": row.status, "reason": row.reason}  # it will not appear while this runs
-            file.append(row)
-            shown.console.print(describe(row), highlight=False, markup=False, soft_wrap=True)
             shown.advance(bar)
     keys = {spec.key for spec in specs}
     return [row for row in file.read() if row.key in keys]
 
 
+def _announce(console: Console, specs: list[Spec], pending: list[Spec], forecast: Forecast) -> None:
+    """Say what is there, what is not installed, and how long the rest will take."""
+    if len(pending) < len(specs):
+        console.print(f"{len(specs) - len(pending)} of {len(specs)} rows are there already")
+    if forecast.absent:
+        count = sum(spec.method in forecast.absent for spec in pending)
+        names = f"{', '.join(forecast.absent)} ({methods.HOW_TO_INSTALL})"
+        console.print(f"not installed, so that {count} rows will have no figures: {names}", highlight=False, markup=False)
+    if pending:
+        console.print(f"{len(pending)} rows to measure: {in_words(forecast.left(pending))}", highlight=False, markup=False)
+
+
 @contextmanager
 def progress(total: int) -> Iterator[Progress]:
     """Show a bar on stderr."""
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    columns = (BarColumn(16), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=Console(stderr=True, force_jupyter=False), disable=total == 0) as shown:
         yield shown
 
@@ -124,7 +146,7 @@ def ask(task: dict[str, Any], timeout: float, *, cold: bool = True, kernels: Pat
     with tempfile.TemporaryDirectory() as cache:
         where = {"WARP_CACHE_PATH": str(kernels or cache), "JAX_ENABLE_COMPILATION_CACHE": "false"}
         # one pool from the start, see `_gpu.run`: else peaks on a GPU are those of whole pieces
-        environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "true"} | (where if cold else {})
+        environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "true", RUNNER: str(os.getpid())} | (where if cold else {})
         command = [sys.executable, "-m", "experiments._worker"]
         try:
             done = subprocess.run(
@@ -173,6 +195,14 @@ def merge(folder: Path, parts: Iterable[Path]) -> int:
 def _worth(row: Row) -> tuple[bool, int]:
     """Return what makes a row count before another of its key: that there need not be a next one, and its repeats."""
     return row.status not in RETRIED, len(row.seconds)
+
+
+def count_results(rows: list[Row]) -> str:
+    """Say how many rows have a result, and why the others have none."""
+    statuses = Counter(row.status for row in rows)
+    good = statuses.pop("ok", 0)
+    others = ", ".join(f"{count} {status}" for status, count in statuses.items())
+    return f"{good} of {len(rows)} rows ok" + (f", {len(rows) - good} without a result ({others})" if others else "")
 
 
 def describe(row: Row) -> str:

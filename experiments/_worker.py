@@ -19,6 +19,7 @@ from experiments._config import Spec
 if TYPE_CHECKING:
     from jfrnn.cases import Scene  # pyright: ignore[reportMissingImports]
 
+RUNNER = "JFRNN_RUNNER"  # environment variable: the process that asks, which this one is not to survive
 MOST_MEMORY = 0.8  # of the machine; a method that wants more gets an error instead of taking the machine down
 
 
@@ -174,6 +175,8 @@ def _end_with_parent() -> None:
     if sys.platform == "linux":
         set_death_signal = 1  # PR_SET_PDEATHSIG of linux/prctl.h
         ctypes.CDLL(None).prctl(set_death_signal, signal.SIGKILL)
+        if os.environ.get(RUNNER, str(os.getppid())) != str(os.getppid()):
+            sys.exit("the runner ended before this process had begun")  # no signal will tell
 
 
 if __name__ == "__main__":

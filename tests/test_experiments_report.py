@@ -128,13 +128,34 @@ def test_printed_table_and_paths(reported):
     lines = printed.splitlines()
     assert lines[-9:-7] == [str(folder / "report.html"), str(folder / "table.csv")]
     assert lines[-7:] == [str(folder / f"{name}.png") for name in PICTURES]
-    full = [line.split() for line in lines if " 250 000 " in line]
-    assert len(full) == 4
-    assert ["cll", "1.0000", "·", "1", "40.0", "1", "8", "7", "0", "·", "CLL", "2.14", "1", "116.8", "1"] in [
-        line[-15:] for line in full
-    ]
-    assert "brute skipped" in " ".join(next(line for line in full if "brute" in line))
+    assert ["s", "MB", "missing", "extra"] in [line.split() for line in lines]
+    full = lines.index(next(line for line in lines if line.strip() == "full 100 %, 250 000 points"))
+    shown = [line.split() for line in lines[full + 1 : full + 5]]
+    assert shown[:2] == [["cll", "1.0000", "40.0", "8", "7"], ["scipy-kdtree", "3.0000", "80.0", "0", "1", "200"]]
+    assert (shown[2][:2], shown[3]) == (["brute", "skipped"], ["jax", "2.0000", "160.0", "0", "0"])
     assert "Some CPU, 2 cores, 8 GiB · jax 0.10.2, scipy 1.17.1 · commit 0123456789 · 2031-02-03" in lines
+
+
+def test_printed_table_fits_80_columns_and_names_what_is_not_installed_in_one_line(tmp_path):
+    names = ("scipy-kdtree-nolist", "freud", "jax-md")
+    for number, method in enumerate(names):
+        scene = ("corners", 0.11, 28158, 0.112632)
+        row = make_row(scene, method, 1234.5678, 123456.7, missing=24_012_345, extra=6_152_345, others_cores=1.5, compared="counts")
+        lost = {"status": "missing", "reason": "not there", "median_s": None, "points": None}
+        RowFile(tmp_path).append(row if number == 0 else replace(row, **lost))
+        RowFile(tmp_path).append(replace(row, key=f"{method}, turned", layout="turned4", angle=45.0, order="shuffled"))
+    result = CliRunner().invoke(app, ["report", str(tmp_path)], catch_exceptions=False)
+    lines = result.stdout.splitlines()
+    start = lines.index(next(line for line in lines if "missing" in line))
+    end = lines.index(next(line for line in lines if line.startswith("not installed: ")))
+    table = [line.rstrip() for line in lines[start:end]]
+    assert max(map(len, table)) <= 80
+    assert len(table) > 5
+    cells = ["scipy-kdtree-nolist", "*1234.5678", "123456.7", "~24", "012", "345", "~6", "152", "345"]
+    assert sum(line.split() == cells for line in table) == 2
+    assert sum(line.split()[0] in names[1:] for line in table if line) == 2, "those that are there, of the other scene"
+    assert lines[end].startswith("not installed: freud, jax-md (make peers; ")
+    assert [line[:2] for line in lines[end + 1 : end + 4]] == ["*:", "~:", "s:"]
 
 
 def test_markdown_holds_the_table_the_source_the_reasons_and_the_pictures(reported):

@@ -14,7 +14,7 @@ import psutil
 import pytest
 from typer.testing import CliRunner
 
-from experiments import _config, _measure, _rows, _sweep, _worker
+from experiments import _config, _machine, _measure, _rows, _sweep, _worker
 from experiments._cli import app
 from experiments._errors import UsageError
 
@@ -64,9 +64,11 @@ def swept(tmp_path_factory):
 def test_each_method_gives_a_whole_row(swept):
     rows = swept.rows()
     assert [row["method"] for row in rows] == METHODS
-    assert "7 of 7 rows ok, 0 with a reason" in swept.done.stdout
+    assert "7 of 7 rows ok; rows in" in swept.done.stdout
     optional = {"reason", "allocate_s", "directed_pairs", "others_cores", "angle", "growth", "parts", "rebuilt", "device_bytes"}
     optional |= {"planned_list_bytes", "planned_scratch_bytes", "density_error", "gradient_error", "jump_error"}
+    if _machine.commit()["commit"] is None:  # no git here, or no repository
+        optional |= {"commit", "dirty"}
     for row in rows:
         assert set(row) == {field.name for field in fields(_rows.Row)}
         assert row["status"] == "ok"
@@ -162,7 +164,7 @@ def test_a_method_that_is_not_installed_gives_a_row_and_the_sweep_goes_on(tmp_pa
     (tmp_path / "shadow" / "warp" / "__init__.py").write_text("raise ImportError('there is no warp here')")
     sweep = Sweep(tmp_path, 'methods = ["cll", "scipy-kdtree"]\n' + QUICK + CORNERS)
     done = sweep.run(PYTHONPATH=str(tmp_path / "shadow"))
-    assert "1 of 2 rows ok, 1 with a reason" in done.stdout
+    assert "1 of 2 rows ok, 1 without a result (1 missing)" in done.stdout
     missing, good = sweep.rows()
     assert (missing["method"], missing["status"]) == ("cll", "missing")
     assert missing["reason"] == "cll cannot be imported: there is no warp here"
@@ -183,7 +185,7 @@ def test_failed_and_skipped_rows_say_why(tmp_path):
     assert (failed["status"], skipped["status"], skipped["points"]) == ("failed", "skipped", 31250)
     assert failed["reason"].startswith("UsageError: layout 'full': fill must be 1 for the layout 'full', got 0.5")
     assert skipped["reason"] == "31250 points; brute is run up to 20000"
-    assert "0 of 2 rows ok, 2 with a reason" in done.stdout
+    assert "0 of 2 rows ok, 2 without a result (1 failed, 1 skipped)" in done.stdout
 
 
 def test_a_row_that_takes_too_long_is_ended(tmp_path):
@@ -194,28 +196,43 @@ def test_a_row_that_takes_too_long_is_ended(tmp_path):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a killed runner takes its worker along on Linux alone")
 def test_kill_9_loses_no_row_and_doubles_none(tmp_path):
-    sweep = Sweep(tmp_path, KDTREES + QUICK + CORNERS)
+    scenes = '[[scenes]]\nlayouts = ["full"]\nfills = [0.5]\n'  # fails at once: there is a row, and the next one is endless
+    endless = "spacing = 5e-4\nrepeats = 1\nmin_seconds = 1e6\nmax_repeats = 1_000_000_000\nmost_seconds = 1e6\ntimeout = 1e6\n"
+    sweep = Sweep(tmp_path, 'methods = ["scipy-kdtree"]\n' + endless + scenes + CORNERS)
     with subprocess.Popen(sweep.command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as runner:
-        deadline = time.monotonic() + 60
-        while not (sweep.file.exists() and sweep.file.read_text().count("\n")) and time.monotonic() < deadline:
-            time.sleep(0.02)
-        workers = wait_for_children(runner.pid, deadline)
-        runner.send_signal(signal.SIGKILL)
-    _, alive = psutil.wait_procs(workers, timeout=10)
+        try:
+            while not (sweep.file.exists() and sweep.file.read_text().endswith("\n")):
+                assert runner.poll() is None
+                time.sleep(0.02)
+            workers = stop_with_a_worker(runner)
+        finally:
+            runner.send_signal(signal.SIGKILL)
+    _, alive = psutil.wait_procs(workers, timeout=60)
     assert (len(workers), alive) == (1, [])
     early = sweep.file.read_bytes()
     assert early.count(b"\n") == 1
 
-    sweep.run()
+    sweep.run("--most-seconds", "0.01")
     assert sweep.file.read_bytes().startswith(early)
-    assert len({row["key"] for row in sweep.rows()}) == len(sweep.rows()) == 2
+    assert [(row["layout"], row["status"]) for row in sweep.rows()] == [("full", "failed"), ("corners", "ok")]
 
 
-def wait_for_children(pid, deadline):
-    """Return the worker of a runner, which is between two of them for a moment."""
-    while not (children := psutil.Process(pid).children()) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    return children
+def stop_with_a_worker(runner):
+    """Stop a runner while it has a worker, so that it starts no other, and return that."""
+    while True:
+        runner.send_signal(signal.SIGSTOP)
+        if workers := psutil.Process(runner.pid).children():
+            return workers
+        runner.send_signal(signal.SIGCONT)  # it was between two of them
+        time.sleep(0.02)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a killed runner takes its worker along on Linux alone")
+def test_a_worker_ends_whose_runner_was_killed_before_it_could_ask_for_a_signal():
+    environment = os.environ | {_worker.RUNNER: "1"}  # who started it was another, as after the death of its parent
+    command = [sys.executable, "-m", "experiments._worker"]
+    done = subprocess.run(command, input="", capture_output=True, text=True, cwd=ROOT, env=environment, timeout=300)
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", "the runner ended before this process had begun\n")
 
 
 FOUR = '[[scenes]]\nlayouts = ["corners"]\nfills = [0.02, 0.05]\n[[scenes]]\nlayouts = ["sheet"]\nfills = [0.02]\n'

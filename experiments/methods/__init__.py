@@ -17,13 +17,18 @@ Positions come as NumPy array, shape [n, d], float32 or float64; the cutoff is a
 that cannot be imported makes a row with status `missing`, one that raises makes a row with status `failed`.
 """
 
+import ast
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol, cast
 
 import numpy as np
+
+HOW_TO_INSTALL = "make peers; apt-get install g++ libann-dev libnanoflann-dev"
 
 
 @dataclass(frozen=True)
@@ -70,6 +75,43 @@ class Adapter(Protocol):
 def names() -> list[str]:
     """Return the names of all methods, without importing any."""
     return sorted(file.stem.replace("_", "-") for file in Path(__file__).parent.glob("[!_]*.py"))
+
+
+def lacks(name: str) -> str | None:
+    """Say what a method needs that is not installed, None where nothing is missing: found out without importing the method."""
+    return _lacks(f"{__name__}.{name.replace('-', '_')}")
+
+
+@cache
+def _lacks(module: str) -> str | None:
+    """Look at what a module imports and loads, and at what the modules beside it that it imports do."""
+    text = (Path(__file__).parent / f"{module.rpartition('.')[2]}.py").read_text(encoding="utf-8")
+    for node in ast.parse(text).body:
+        named = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        named = [alias.name for alias in node.names] if isinstance(node, ast.Import) else named
+        reasons = [_lacks(each) if each.startswith(f"{__name__}.") else _lacks_package(each) for each in named]
+        if isinstance(node, ast.Assign) and ast.unparse(node.value).startswith("_native.load("):
+            reasons.append(_lacks_native(node.value))
+        if any(reasons):
+            return next(filter(None, reasons))
+    return None
+
+
+def _lacks_package(imported: str) -> str | None:
+    package = imported.partition(".")[0]
+    return None if find_spec(package) else f"no module named {package!r}"
+
+
+def _lacks_native(call: ast.expr) -> str | None:
+    """Say why the adapter of a call of `_native.load` cannot be compiled, None where it can, or has been."""
+    from experiments import _native
+
+    assert isinstance(call, ast.Call), "as the caller has seen"
+    try:
+        _native.load(*map(ast.literal_eval, call.args))
+    except ImportError as error:
+        return str(error)
+    return None
 
 
 def load(name: str) -> Adapter:
