@@ -176,6 +176,28 @@ def options(
 
 
 @app.command()
+def ties(
+    scenes: Annotated[Path, typer.Argument(help="Config of a sweep whose layouts are measured, TOML.")] = Path(
+        "experiments/configs/thesis.toml"
+    ),
+    out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform and backend.")] = Path("out") / "ties",
+    rounds: Annotated[int, typer.Option(min=2, help="Timed runs of each.")] = 15,
+    backend: Annotated[str, typer.Option(help="As in jfrnn.search.")] = "warp",
+    cube: Annotated[int | None, typer.Option(min=1000, help="Sites of a cube to measure instead of these layouts.")] = None,
+) -> None:
+    """Time lattices full of pairs at exactly the cutoff beside the same scenes moved at random."""
+    with _usage_errors():
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        from experiments import _ties
+
+        path = _ties.measure(out, rounds, backend, scenes, cube)
+        typer.echo(_ties.table(path))
+        typer.echo(path)
+
+
+@app.command()
 def use(
     points: Annotated[int, typer.Option(min=100, help="Random points.")] = 250_000,
     rounds: Annotated[int, typer.Option(min=2, help="Timed runs of each.")] = 9,
