@@ -1,7 +1,6 @@
 """Which engine answers: what "auto" stands for on a platform, and whether a named engine can run there. Decided while tracing."""
 
 import functools
-import inspect
 import warnings
 
 import jax
@@ -9,6 +8,7 @@ from jax import Array
 from jax.core import Tracer
 
 from jfrnn import _warp
+from jfrnn._start import level_of_caller
 
 WARP_ENGINES = ("warp", "hashgrid")
 
@@ -88,11 +88,3 @@ def _can_warp(platform: str) -> bool:
         stacklevel=level_of_caller(),
     )
     return False
-
-
-def level_of_caller() -> int:
-    """Return the stacklevel that makes a warning name the caller of the library."""
-    frame, level = inspect.currentframe(), 0
-    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] == "jfrnn":
-        frame, level = frame.f_back, level + 1
-    return level

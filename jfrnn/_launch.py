@@ -62,7 +62,7 @@ def kernel(make: Callable[..., Kernel]) -> Callable[..., Callable[..., Any]]:
 
 
 def _made(make: Callable[..., Kernel], place: str, arguments: tuple[Any, ...]) -> Callable[..., Any]:
-    _open_relay()
+    open_relay()
     _finish_before_exit()
     found = make(*arguments)
     name = f"{found.name}@{_sources()}"
@@ -183,7 +183,7 @@ def _answer_first(address: int) -> int | None:
         if not once.acquire(blocking=False):
             return
         with contextlib.suppress(BaseException):  # the call itself says what is wrong
-            _open_relay()
+            open_relay()
             _finish_before_exit()
         answers.append(_answer(address))
         done.set()
@@ -213,7 +213,7 @@ _door = ctypes.cast(_behind_door, _Answer)  # its address is exchanged for the r
 _entrance = _Answer(_door)  # calls a function that is not Python: nothing runs in between
 
 
-def _open_relay() -> None:
+def open_relay() -> None:
     """Start Warp and the thread that answers in place of the main thread, and lead all calls there."""
     with _starting:
         if not _kept:
@@ -246,6 +246,7 @@ def _relay() -> list[Any]:
 
     address = np.zeros(1, np.uint64)
     given = [wp.array(array, dtype=wp.uint64, device="cpu", copy=False) for array in (words, address)]
+    kernels_of("_load").load_module(relay.open_relay.module, "cpu")
     wp.launch(relay.open_relay, dim=1, inputs=given, device="cpu")
     threading.Thread(target=work, name="jfrnn-relay", daemon=True).start()
     return [int(address[0]), here, words, given]

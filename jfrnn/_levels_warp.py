@@ -203,7 +203,7 @@ def _level_callable(variant: _LevelVariant) -> Kernel:
         return on_cpu(name, functools.partial(_run_levels_on_cpu, variant), types, 2 + variant.lists)
     if wp.is_cuda_available():
         for launched, block in ((_level_kernel(variant), kernels_of("levels").BLOCK), (kernels_of("levels").clear, 2)):
-            wp.load_module(launched.module, device=wp.get_cuda_device(), block_dim=block)
+            kernels_of("_load").load_module(launched.module, wp.get_cuda_device(), block)
     return on_cuda(name, types, 2 + variant.lists, functools.partial(_level_commands, variant))
 
 

@@ -1,33 +1,93 @@
 """Warp, started where it is needed: the one module that imports it. Whoever waits may be interrupted, what is started may not."""
 
+import contextlib
 import functools
 import importlib
+import inspect
+import os
 import sys
+import tempfile
 import threading
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+_NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
+_LINUX = sys.platform == "linux"
 INSTALL = 'pip install "jfrnn[warp]"'
 
 
 @functools.cache
 def load_warp() -> Any:  # noqa: ANN401
-    """Import Warp, quietly if nobody did before, or say what to install."""
-    return apart(_load_warp)
+    """Import Warp and start it, without a word of its own.
+
+    Warns once where it takes a temporary folder for its kernels.
+
+    Raises:
+        ImportError: It is not installed, or another version is.
+        RuntimeError: It cannot start.
+    """
+    warp, warning = apart(_load_warp)
+    if warning is not None:
+        warnings.warn(warning, RuntimeWarning, stacklevel=level_of_caller())
+    return warp
 
 
-def _load_warp() -> Any:  # noqa: ANN401
+def _load_warp() -> tuple[Any, str | None]:
+    """Return Warp, and what is to be said of the folder in which it keeps kernels."""
     fresh = "warp" not in sys.modules
     try:
         import warp
     except ImportError as error:
         raise ImportError(f"the backends 'warp' and 'hashgrid' need the package warp-lang (1.18 or 1.19): {INSTALL}") from error
-    if fresh:
-        warp.config.log_level = warp.LOG_WARNING
     if not hasattr(warp, "jax_callable"):
         raise ImportError(f"the backends 'warp' and 'hashgrid' need warp-lang 1.18 or 1.19, found {warp.__version__}: {INSTALL}")
-    return warp
+    level, warp.config.log_level = warp.config.log_level, warp.LOG_WARNING
+    try:
+        with _without_a_word_of_drivers():
+            return warp, _init(warp)
+    finally:
+        if not fresh:
+            warp.config.log_level = level
+
+
+def _init(warp: Any) -> str | None:  # noqa: ANN401
+    given, warning = warp.config.kernel_cache_dir, None
+    try:
+        try:
+            warp.init()
+        except OSError:
+            warning = importlib.import_module("jfrnn.kernels._load").temporary_folder()
+            warp.init()
+    except RuntimeError:
+        warp.config.kernel_cache_dir = given  # what it makes of the path, it would make again of that
+        raise
+    except Exception as error:
+        raise RuntimeError(f"Warp cannot start: {type(error).__name__}: {error}") from error
+    return warning
+
+
+@contextlib.contextmanager
+def _without_a_word_of_drivers() -> Iterator[None]:
+    """Leave out Warp's complaint that there is no CUDA driver, which it writes past Python: whoever asks for a GPU is told."""
+    with contextlib.ExitStack() as stack:
+        try:
+            opened = os.fdopen(os.memfd_create("stderr"), "w+b") if _LINUX else tempfile.TemporaryFile()  # noqa: SIM115
+            written = stack.enter_context(opened)
+            kept = os.dup(2)
+        except OSError:  # no standard error, no folder for temporary files
+            yield
+            return
+        os.dup2(written.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            written.seek(0)
+            lines = [line for line in written.read().splitlines(keepends=True) if _NO_DRIVER not in line]
+            os.write(2, b"".join(lines))
 
 
 def kernels_of(name: str) -> Any:  # noqa: ANN401
@@ -55,3 +115,11 @@ def apart(work: Callable[[], Any]) -> Any:  # noqa: ANN401
 @functools.cache
 def _others() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(thread_name_prefix="jfrnn-start")
+
+
+def level_of_caller() -> int:
+    """Return the stacklevel that makes a warning name the caller of the library."""
+    frame, level = inspect.currentframe(), 0
+    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] == "jfrnn":
+        frame, level = frame.f_back, level + 1
+    return level

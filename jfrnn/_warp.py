@@ -24,9 +24,9 @@ from jfrnn._batch import Batch
 from jfrnn._box import Lattice, Wrapped
 from jfrnn._exact import Cutoff, compensated_sum, make_cutoff, rounded_sum
 from jfrnn._ffi import CallFrame
-from jfrnn._launch import Kernel, kernel
+from jfrnn._launch import Kernel, kernel, open_relay
 from jfrnn._runs import Filter
-from jfrnn._start import INSTALL, kernels_of, load_warp
+from jfrnn._start import INSTALL, apart, kernels_of, load_warp
 
 PLACES_PER_THREAD = 2048  # below, a second thread costs more than it saves
 MOST_IN_BOX = 1 << 27  # an id shares its bits with the code of an image
@@ -76,9 +76,10 @@ def missing(platform: str) -> str | None:
     """Say what keeps Warp from running on a JAX platform; None: nothing does."""
     try:
         warp = load_warp()
-    except ImportError as error:
-        return str(error)
-    warp.init()
+        if platform in PLATFORMS:
+            apart(open_relay)
+    except (ImportError, RuntimeError) as error:
+        return str(error).rstrip(".")
     if platform == "cpu":
         return None if warp.is_cpu_available() else "this Warp was built without its CPU compiler"
     if platform in ("gpu", "cuda"):
@@ -369,7 +370,7 @@ def on_every_core(kernel: Any, inputs: list[Any], most: int) -> None:  # noqa: A
 @functools.cache
 def _load_on_cpu(module: Any) -> None:  # noqa: ANN401
     """Compile a module before several threads launch from it, and always in the same one: each has its own precompiled headers."""
-    load = functools.partial(load_warp().load_module, module, device="cpu")
+    load = functools.partial(kernels_of("_load").load_module, module, "cpu")
     try:
         compiled = _compiler().submit(load)
     except RuntimeError:  # while the interpreter exits

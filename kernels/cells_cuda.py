@@ -17,6 +17,7 @@ from string import Template
 from typing import NamedTuple
 
 import warp as wp
+from jfrnn.kernels._load import load_module
 from jfrnn.kernels._native import CELLS, EXACT, SPACES, snippet, table_cells
 
 BLOCK = 256
@@ -1387,7 +1388,7 @@ class Kernels(NamedTuple):
 
     def load_stages(self, device: wp.DeviceLike) -> None:
         """Compile and load what sorts: nothing is left to do while a CUDA graph is recorded."""
-        wp.load_module(self.bounds.module, device=device, block_dim=BLOCK)
+        load_module(self.bounds.module, device, BLOCK)
 
     def load(self, device: wp.DeviceLike) -> None:
         """Compile and load all."""
@@ -1422,7 +1423,7 @@ def load_walks(query: wp.Kernel, crossing: wp.Kernel | None, device: wp.DeviceLi
     """Compile and load what walks over queries."""
     for kernel in (query, crossing):
         if kernel is not None:
-            wp.load_module(kernel.module, device=device, block_dim=QUERY_BLOCK)
+            load_module(kernel.module, device, QUERY_BLOCK)
 
 
 @functools.cache

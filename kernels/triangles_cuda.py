@@ -28,6 +28,7 @@ import functools
 from typing import NamedTuple
 
 import warp as wp
+from jfrnn.kernels._load import load_module
 from jfrnn.kernels._native import snippet
 from jfrnn.kernels._triangles import BOUNDS, DECIDE, LEVELS, constants, pending
 
@@ -312,7 +313,7 @@ class Kernels(NamedTuple):
     def load(self, device: wp.DeviceLike) -> None:
         """Compile and load all: nothing is left to do while a CUDA graph is recorded."""
         for kernel, block in ((self.prepare, BLOCK), (self.query, QUERY_BLOCK), (self.settle, _SETTLE_BLOCK)):
-            wp.load_module(kernel.module, device=device, block_dim=block)
+            load_module(kernel.module, device, block)
 
 
 def _launch(kernel: wp.Kernel, threads: int, block: int, beside: bool = False) -> Launch:

@@ -1,0 +1,113 @@
+"""How Warp starts where its folder cannot be written or holds damaged files, and what it says; each in a fresh process."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+COUNT = """
+import jax, numpy as np, warnings
+import jfrnn
+
+def count(backend):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        x = np.linspace(0, 1, 16, dtype=np.float32).reshape(8, 2)
+        chosen = jax.eval_shape(lambda x: jfrnn.search(x, 0.2, capacity=9, backend=backend), x).backend
+        print(jfrnn.count(x, 0.2, backend=backend).tolist(), chosen)
+    for warning in caught:
+        print(warning.category.__name__, warning.filename, warning.message)
+"""
+DAMAGED = Path(__file__).with_name("damaged.py")
+COUNTS = "[1, 2, 2, 2, 2, 2, 2, 1]"
+
+
+def run(*command, cache, limits=""):
+    """Run Python with a folder for Warp's kernels; return what it writes."""
+    words = ["bash", "-c", f'{limits} exec "$@"', "bash", sys.executable, *command]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, env=os.environ | {"WARP_CACHE_PATH": str(cache)})
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines(), done.stderr
+
+
+@pytest.fixture
+def nowhere(tmp_path):
+    """A path at which no folder can be made, not even by root."""
+    (tmp_path / "file").write_text("")
+    return tmp_path / "file" / "cache"
+
+
+@pytest.fixture
+def read_only(tmp_path):
+    """A folder for kernels that is there and in which nobody can make files."""
+    import warp
+
+    (tmp_path / warp.__version__).symlink_to("/proc/self/fdinfo")
+    return tmp_path
+
+
+def test_without_a_folder_kernels_are_compiled_elsewhere_with_one_warning(nowhere):
+    (answer, warned), errors = run("-c", COUNT + "count('auto')", cache=nowhere)
+    assert answer == f"{COUNTS} warp"
+    assert warned.startswith(f"RuntimeWarning <string> the folder in which Warp keeps compiled kernels, {nowhere}/")
+    assert "Set the environment variable WARP_CACHE_PATH to a folder that can be written" in warned
+    assert errors == ""  # nor does Warp say that there is no driver for CUDA
+    folder = warned.partition("compiled into ")[2].split()[0]
+    assert not Path(folder).exists()
+
+
+def test_in_a_folder_that_can_only_be_read_kernels_are_compiled_elsewhere(read_only):
+    answers, errors = run(DAMAGED, "first", "second", cache=read_only)
+    assert answers == ["first 1", "second 1"]
+    assert errors.count("RuntimeWarning: the folder in which Warp keeps compiled kernels,") == 1
+
+
+def test_without_any_folder_auto_takes_jax_with_one_warning_and_warp_says_what_to_set(nowhere):
+    code = "\ntry:\n    count('warp')\nexcept RuntimeError as error:\n    print(error)\ncount('auto')\ncount('auto')"
+    (refused, answer, warned, again), errors = run("-c", COUNT + code, cache=nowhere, limits="ulimit -f 0;")
+    assert f"{nowhere}/" in refused
+    assert "Set the environment variable WARP_CACHE_PATH to a folder that can be written" in refused
+    assert answer == again == f"{COUNTS} jax"
+    assert "RuntimeWarning <string> backend='auto' takes the slower engine 'jax' on the platform 'cpu': " in warned
+    assert refused.rstrip(".") in warned
+    assert errors == ""
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def spoil(path):
+    path.write_bytes(bytes(path.stat().st_size))
+
+
+DAMAGES = {
+    "cut_object": (".o", cut, True),
+    "cut_object_unknown": (".o", cut, False),
+    "empty_object": (".o", lambda path: path.write_bytes(b""), False),
+    "spoiled_object": (".o", spoil, True),
+    "cut_text": (".meta", cut, True),
+    "empty_text": (".meta", lambda path: path.write_bytes(b""), False),
+    "no_damage": (".o", lambda path: None, False),
+}
+
+
+def test_damaged_files_are_compiled_anew(tmp_path):
+    right = [f"{name} 1" for name in DAMAGES]
+    assert run(DAMAGED, *DAMAGES, cache=tmp_path)[0] == right
+    damaged = {}
+    for name, (kind, damage, known) in DAMAGES.items():
+        (folder,) = tmp_path.glob(f"*/wp_damaged.{name}_???????")
+        (path,) = folder.glob(f"*{kind}")
+        assert path.name in json.loads((folder / "jfrnn.json").read_text())
+        damaged[path] = path.read_bytes(), path.stat().st_mtime_ns
+        damage(path)
+        if not known:
+            (folder / "jfrnn.json").unlink()
+    assert run(DAMAGED, *DAMAGES, cache=tmp_path)[0] == right
+    for path, (before, made) in damaged.items():
+        assert len(path.read_bytes()) == len(before)
+        assert (path.stat().st_mtime_ns == made) == ("no_damage" in str(path))
