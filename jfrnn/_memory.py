@@ -111,8 +111,8 @@ def memory_plan(
     >>> print(jfrnn.memory_plan(1_000_000, 0.1, 64, backend="warp", platform="gpu"))
     one search with backend='warp', beside the positions:
       list        260.00 MB
-      scratch      44.02 MB
-      total       304.02 MB
+      scratch      44.03 MB
+      total       304.03 MB
     """
     n, queries = checked_size("n", n), None if queries is None else checked_size("queries", queries)
     dim, dtype = checked_kind(dim, dtype)
