@@ -5,10 +5,10 @@ import itertools
 import json
 import random
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, ValidationInfo, field_validator
 from pydantic_core import ErrorDetails
@@ -17,6 +17,7 @@ from experiments import _layouts, _rows, methods
 from experiments._errors import UsageError
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
+Timeout = Annotated[FiniteFloat, Field(gt=0, le=1e6)]  # [s]; the system waits no longer than some weeks
 Fill = Annotated[FiniteFloat, Field(gt=0, le=1)]
 LIMITS = ("most_seconds", "timeout")  # when a row is given up, not what it measures
 
@@ -101,7 +102,7 @@ class Config(Table):
     min_seconds: Annotated[FiniteFloat, Field(ge=0)] = 0.5
     max_repeats: Annotated[int, Field(ge=1)] = 50
     most_seconds: Positive = 60.0
-    timeout: Positive = 300.0
+    timeout: Timeout = 300.0
 
     @field_validator("methods")
     @classmethod
@@ -208,13 +209,27 @@ def load(path: Path, kind: type[ConfigT] = Config) -> ConfigT:
         raise UsageError("\n".join(f"{path}: {_explain(item, kind)}" for item in error.errors())) from error
 
 
+def _table_of(kind: type[BaseModel], location: Sequence[int | str]) -> type[BaseModel]:
+    """Return the table of a config that stands at a place."""
+    for part in location:
+        inside = _tables_in(kind.model_fields[part].annotation) if isinstance(part, str) else []
+        kind = inside[0] if inside else kind
+    return kind
+
+
+def _tables_in(annotation: Any) -> list[type[BaseModel]]:  # noqa: ANN401
+    """Return the tables that an annotation names, however deep."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [table for part in get_args(annotation) for table in _tables_in(part)]
+
+
 def _explain(item: ErrorDetails, kind: type[Table]) -> str:
     """Say in one line which key is wrong, what came, and what is allowed."""
     location = item["loc"]
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location).lstrip(".")
     if item["type"] == "extra_forbidden":
-        table = Scenes if location[0] == "scenes" and len(location) > 1 else kind
-        return f"{key}: unknown key (value {item['input']!r}); allowed: {', '.join(table.model_fields)}"
+        return f"{key}: unknown key (value {item['input']!r}); allowed: {', '.join(_table_of(kind, location[:-1]).model_fields)}"
     if item["type"] == "missing":
         return f"{key}: missing; it must be given"
     if item["type"] == "value_error":

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from jax import Array
 from jax.sharding import Mesh
-from pydantic import Field
+from pydantic import Field, FiniteFloat
 
 import jfrnn
 from experiments import _machine, _measure, _sweep, _trace
@@ -62,7 +62,7 @@ class Config(Table):
     cutoff_ratio: Positive = 3.0
     dtype: Literal["float32", "float64"] = "float32"
     repeats: Annotated[int, Field(ge=1)] = 20
-    min_seconds: Annotated[float, Field(ge=0)] = 0.5
+    min_seconds: Annotated[FiniteFloat, Field(ge=0)] = 0.5
     steps: Annotated[int, Field(ge=1)] = 10
     check_most: Annotated[int, Field(ge=0)] = 40_000_000
     virtual_devices: Annotated[int, Field(ge=0)] = 0

@@ -9,27 +9,23 @@ import itertools
 import json
 import os
 import time
-import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
+from pydantic import AfterValidator, NonNegativeInt, PositiveInt
 from tqdm import tqdm
 
-from experiments import _compare, _gpu_sums, _gpu_triangles, _machine, _measure, _ways
-from experiments._errors import UsageError
+from experiments import _compare, _config, _gpu_sums, _gpu_triangles, _machine, _measure, _ways
+from experiments._config import Positive, Table
 from jfrnn._neighbors import rounded_capacity
 from jfrnn._warp import kernels_of, load_warp
 
-Strict = ConfigDict(extra="forbid", frozen=True)
 
-
-class Exactness(BaseModel):
+class Exactness(Table):
     """Which hard cases are decided on the device."""
 
-    model_config = Strict
     backend: Literal["jax", "warp", "hashgrid", "brute", "bvh"]
     dtypes: list[Literal["float32", "float64"]]
     dims: list[Literal[2, 3]]
@@ -38,43 +34,38 @@ class Exactness(BaseModel):
     cases: Literal["hard", "periodic", "radii", "batches", "triangles", "sums"] = "hard"
 
 
-class Triangles(BaseModel):
+class Triangles(Table):
     """Which lists of triangles around a gear are timed: every combination."""
 
-    model_config = Strict
     points: list[PositiveInt]
     faces: PositiveInt  # about
-    cutoffs: list[PositiveFloat]  # in modules
+    cutoffs: list[Positive]  # in modules
     dtypes: list[Literal["float32", "float64"]]
 
 
-class Config(BaseModel):
+class Config(Table):
     """What is run, see experiments/configs/h200.toml."""
 
-    model_config = Strict
     seed: int
-    reach_in_spacings: PositiveFloat
-    jitter_in_spacings: PositiveFloat
+    reach_in_spacings: Positive
+    jitter_in_spacings: Positive
     sizes: list[PositiveInt]
-    corners_fill: PositiveFloat | None = None  # none: no scene of corners
+    corners_fill: Positive | None = None  # none: no scene of corners
     counts_only: list[PositiveInt]
     studied_size: PositiveInt | None = None  # none: choices are not studied
     calls: PositiveInt
     steps: PositiveInt
-    sums: list[Annotated[str, AfterValidator(_ways.known)]] = []  # of a density and its gradient
+    sums: tuple[Annotated[str, AfterValidator(_ways.known)], ...] = ()  # of a density and its gradient
     repeats: PositiveInt
-    seconds_per_timing: PositiveFloat
+    seconds_per_timing: Positive
     exactness: list[Exactness]
     warps: NonNegativeInt | None = None  # among which `warp` shares few queries; 0: 32 to a warp, as where they are many
-    triangles: list[Triangles] = []
+    triangles: tuple[Triangles, ...] = ()
 
 
 def load(path: Path) -> Config:
     """Read a config; raise UsageError that names what is wrong."""
-    try:
-        return Config.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except (tomllib.TOMLDecodeError, ValidationError) as error:
-        raise UsageError(f"{path}: {error}") from error
+    return _config.load(path, Config)
 
 
 def run(config: Config, folder: Path) -> int:

@@ -21,8 +21,11 @@ def report(folder: Path) -> str:
     path = folder / "rows.jsonl"
     if not path.exists():
         raise UsageError(f"{path} does not exist: run python -m experiments gpu CONFIG --out {folder} first")
-    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    parts = [part(rows) for part in (_head, _exactness, _calls, _sums, _study, _memory, _triangles)]
+    try:
+        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        parts = [part(rows) for part in (_head, _exactness, _calls, _sums, _study, _memory, _triangles)]
+    except (ValueError, KeyError, TypeError, StopIteration) as error:
+        raise UsageError(f"{path}: holds no rows of a GPU run ({type(error).__name__}: {error}); name the folder of one") from error
     text = "\n\n".join(part for part in parts if part) + "\n"
     (folder / "report.md").write_text(text, encoding="utf-8")
     _draw(rows, folder / "roofline.png")

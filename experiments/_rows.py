@@ -240,7 +240,7 @@ class RowFile(Generic[RowT]):
             return []
         known = {item.name for item in fields(cast(Any, self._kind))}
         rows: list[RowT] = []
-        lines = self.path.read_text(encoding="utf-8").split("\n")
+        lines = self.path.read_text(encoding="utf-8", errors="replace").split("\n")  # what is no text is no row, and is named
         for number, line in enumerate(lines, start=1):
             try:
                 values = json.loads(line)

@@ -13,6 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from experiments import _table
+from experiments._errors import UsageError
 
 if TYPE_CHECKING:
     from jfrnn.cases import Scene  # pyright: ignore[reportMissingImports]
@@ -20,6 +21,17 @@ if TYPE_CHECKING:
 MILLI = 1e3
 COLOR = "#0072B2"
 RING_COLOR = "#D55E00"
+
+
+def check(path: Path) -> None:
+    """Refuse a picture whose ending names no format.
+
+    Raises:
+        UsageError: Names the formats that there are.
+    """
+    endings = sorted(f".{ending}" for ending in Figure().canvas.get_supported_filetypes())
+    if path.suffix not in endings:
+        raise UsageError(f"--out {path}: unknown ending {path.suffix!r}; allowed: {', '.join(endings)}")
 
 
 def draw(scene: "Scene", path: Path) -> Path:

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import pandas as pd
+from tqdm import tqdm
 
 import jfrnn
 from experiments import _layouts, _measure
@@ -25,15 +26,19 @@ def skin_table(spacing: float, steps: int, repeats: int, skin: float = 0.1) -> p
     """
     scene = _layouts.make("full", spacing=spacing)
     x = jnp.asarray(scene.positions, jnp.float32)
-    rows = []
+    rows, kinds = [], (("keep", 0.0), ("rebuild", skin * scene.cutoff))
+    bar = tqdm(total=2 * len(BACKENDS), desc="scans", leave=False)
     for backend in BACKENDS:
         nbrs = jfrnn.search(x, scene.cutoff, skin=skin * scene.cutoff, backend=backend)
         taken = steps if backend == "warp" else -(-steps // 10)
         row = {"backend": backend, "points": len(x), "skin": skin, "steps": taken}
-        for name, velocity in (("keep", 0.0), ("rebuild", skin * scene.cutoff)):
+        for name, velocity in kinds:
+            bar.set_postfix_str(f"{backend}: {name}")
             seconds, rebuilds = _time_scan(x, nbrs, velocity, taken, repeats)
+            bar.update()
             row |= {f"{name}_ms": 1e3 * seconds, f"{name}_rebuilds": rebuilds}
         rows.append(row | {"keep / rebuild": row["keep_ms"] / row["rebuild_ms"]})
+    bar.close()
     return pd.DataFrame(rows)
 
 

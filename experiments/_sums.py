@@ -10,8 +10,11 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, FiniteFloat, field_validator
 
 from experiments import _layouts, _machine, _sweep, _ways
-from experiments._config import Positive, Table
+from experiments._config import Positive, Table, Timeout
 from experiments._rows import RETRIED, RowFile
+
+ERROR_UNIT = "eps·√neighbors"
+"""Of errors of sums: what rounding makes of a sum of so many terms, in machine epsilons."""
 
 
 class Config(Table):
@@ -45,7 +48,7 @@ class Config(Table):
     repeats: Annotated[int, Field(ge=1)] = 5
     min_seconds: Annotated[FiniteFloat, Field(ge=0)] = 1.0
     max_repeats: Annotated[int, Field(ge=1)] = 50
-    timeout: Positive = 300.0
+    timeout: Timeout = 300.0
 
     @field_validator("ways")
     @classmethod
@@ -167,5 +170,5 @@ def describe(row: Row) -> str:
     if row.status != "ok":
         return f"{what:<42} {row.status}: {row.reason}"
     bytes_each = (row.peak_bytes or 0) / (row.points or 1)
-    error = "" if row.error is None else f", error {row.error:.2g}"
+    error = "" if row.error is None else f", error {row.error:.2g} {ERROR_UNIT}"
     return f"{what:<42} {row.points:>9} points {row.median_s:9.4f} s {bytes_each:8.0f} B per particle{error}"

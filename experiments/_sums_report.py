@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from experiments._plots import COLORS, OTHER_COLORS, label_logarithmic
-from experiments._sums import Row
+from experiments._sums import ERROR_UNIT, Row
 from experiments._ways import WAYS
 
 FUSED = "pair_sum warp"
@@ -33,7 +33,8 @@ def report(rows: list[Row], folder: Path) -> str:
     frame.to_csv(folder / "table.csv", index=False)
     draw(lines).savefig(folder / "sums.png", dpi=130)
     draw_payoff(lines).savefig(folder / "payoff.png", dpi=130)
-    return frame.to_string(index=False, na_rep="", float_format="%.3g")
+    shown = frame.rename(columns={"error": f"error [{ERROR_UNIT}]"})
+    return shown.to_string(index=False, na_rep="", float_format="%.3g")
 
 
 def table(rows: list[Row]) -> list[_Line]:

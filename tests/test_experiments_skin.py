@@ -21,4 +21,5 @@ def test_command(monkeypatch):
     monkeypatch.setattr(_skin, "BACKENDS", ("warp",))
     result = CliRunner().invoke(app, ["skin", "--spacing", "1e-3", "--steps", "2", "--repeats", "2"])
     assert result.exit_code == 0, result.output
-    assert result.output.split()[:3] == ["backend", "points", "skin"]
+    assert result.stdout.split()[:3] == ["backend", "points", "skin"]
+    assert "scans: " in result.stderr  # on a fine lattice it takes minutes

@@ -13,6 +13,7 @@ import jfrnn
 from experiments import _config, _sums, _sums_report, _ways
 from experiments._cli import app
 from experiments._errors import UsageError
+from experiments.sph import speed
 
 CONFIGS = Path(__file__).parent.parent / "experiments" / "configs"
 TINY = """
@@ -106,6 +107,20 @@ def test_where_a_list_pays_off():
     listed = replace(row, key="b", way="list, sum", median_s=11.0, sum_s=1.0, build_s=10.0)
     first, second = _sums_report.table([row, listed])
     assert (first["ratio"], first["B per particle"], second["ratio"], second["pays_from"]) == (1.0, 40.0, 11 / 6, 3)
+
+
+def test_an_error_is_said_with_its_unit(tmp_path):
+    row = _sums.Row(
+        **{"key": "a", "layout": "full", "spacing": 1.0, "cutoff_ratio": 3.0, "dtype": "float32", "seed": 0, "gradient": False},
+        **{"way": "pair_sum warp", "compensated": False, "status": "ok", "points": 100, "error": 0.19, "peak_bytes": 4000},
+        **{"median_s": 6.0, "sum_s": 6.0},
+    )
+    assert _sums.describe(row).endswith(", error 0.19 eps·√neighbors")
+    assert "error [eps·√neighbors]" in _sums_report.report([row], tmp_path).splitlines()[0]
+    run = speed.Row(
+        "a", "tradeoff", "list", "taylor-green", 8, "float32", 10, 0.3, "ok", seconds=1.0, error={"l2 of velocity": 0.19}
+    )
+    assert speed.describe(run).endswith("1 s, error of l2 of velocity 19 %")
 
 
 @pytest.mark.parametrize("gradient", [False, True])

@@ -19,6 +19,17 @@ from experiments.sph.model import Model, State, make_model, make_state
 NAMES = (*PROBLEMS, "memory")
 
 
+def check(names: list[str]) -> None:
+    """Refuse names that are no problems.
+
+    Raises:
+        UsageError: There is no such name.
+    """
+    unknown = [name for name in names if name not in NAMES]
+    if unknown:
+        raise UsageError(f"no problem {unknown[0]!r}; allowed: {', '.join(NAMES)}")
+
+
 def run(names: list[str], folder: Path, evaluations: int = 25) -> str:
     """Solve inverse problems, measure memory, write tables and pictures, and return the tables as text.
 
@@ -30,9 +41,7 @@ def run(names: list[str], folder: Path, evaluations: int = 25) -> str:
     Raises:
         UsageError: There is no such name.
     """
-    unknown = [name for name in names if name not in NAMES]
-    if unknown:
-        raise UsageError(f"no problem {unknown[0]!r}; allowed: {', '.join(NAMES)}")
+    check(names)
     folder.mkdir(parents=True, exist_ok=True)
     texts = []
     for name in names or NAMES:

@@ -58,11 +58,11 @@ def run(scene: "FluidScene", folder: Path, how: How) -> State:
     arrays = (scene.positions, scene.velocities, scene.masses, *((scene.solid.vertices, scene.solid.faces) if scene.solid else ()))
     given = hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays))
     about = settings.described(scene) | {"dtype": how.dtype, "frames": how.frames, "given": given.hexdigest()[:12]}
-    snapshots.check_same(about, folder)
     try:
         model = make_model(scene, np.dtype(how.dtype).type)
     except ValueError as error:
         raise UsageError(f"scene {scene.name!r}: {error}") from error
+    snapshots.check_same(about, folder)
     saved = snapshots.latest(folder / "snapshots", scene)
     s, step = saved or (make_state(scene, np.dtype(how.dtype).type), 0)
     nbrs = solver.list_neighbors(model, s, how.skin * scene.spacing) if how.neighbors == "list" else None

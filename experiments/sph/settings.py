@@ -2,32 +2,33 @@
 
 import inspect
 import json
+import math
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
+from zipfile import BadZipFile
 
 import numpy as np
 from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
-from pydantic import TypeAdapter, ValidationError
 
 from experiments._errors import UsageError
+from experiments.sph import ranges
 
 if TYPE_CHECKING:
     from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 PHYSICS = get_type_hints(fluids.Physics)
+LEAST_SMOOTHING, MOST_SMOOTHING = 0.1, 50.0  # in particle spacings
+MOST_STEPS = 1e9
 
 
 def make_scene(name: str, settings: list[str]) -> "FluidScene":
     """Return a scene with settings "key=value": of the scene's function, or of `Physics`.
 
     Raises:
-        UsageError: There is no such scene or key, or the value is not allowed.
+        UsageError: There is no such scene or key, the value is out of its range, or values do not go together.
     """
-    if name not in fluids.FLUIDS:
-        raise UsageError(f"unknown fluid scene {name!r}; allowed: {', '.join(fluids.FLUIDS)}")
-    make = fluids.FLUIDS[name]
-    of_scene = {key: item.annotation for key, item in inspect.signature(make).parameters.items() if key != "name"}
+    of_scene = parameters(name)
     chosen: dict[str, dict[str, Any]] = {"scene": {}, "physics": {}}
     for setting in settings:
         key, sign, text = setting.partition("=")
@@ -36,23 +37,60 @@ def make_scene(name: str, settings: list[str]) -> "FluidScene":
         if key not in of_scene and key not in PHYSICS:
             raise UsageError(f"--set {key}: unknown; of {name}: {', '.join(of_scene)}; physics: {', '.join(PHYSICS)}")
         kind = "scene" if key in of_scene else "physics"
-        chosen[kind][key] = _value(key, text, of_scene.get(key, PHYSICS.get(key)))
+        chosen[kind][key] = _value(name, key, text, of_scene.get(key, PHYSICS.get(key)))
+    said = "".join(f" --set {setting}" for setting in settings)
     try:
-        scene = make(**chosen["scene"])
-    except (ValueError, ZeroDivisionError) as error:
-        raise UsageError(f"scene {name!r}: {error}") from error
-    return replace(scene, physics=replace(scene.physics, **chosen["physics"]))
+        with np.errstate(all="ignore"):  # what is not finite is refused below
+            scene = fluids.FLUIDS[name](**chosen["scene"])
+    except (ValueError, ZeroDivisionError, OverflowError, MemoryError) as error:
+        raise UsageError(f"scene {name!r}{said}: cannot be made ({error})") from error
+    scene = replace(scene, physics=replace(scene.physics, **chosen["physics"]))
+    if (wrong := _complaint(scene)) is not None:
+        raise UsageError(f"scene {name!r}{said}: {wrong}")
+    return scene
 
 
-def _value(key: str, text: str, kind: Any) -> Any:  # noqa: ANN401
+def parameters(name: str) -> dict[str, Any]:
+    """Return the settings of a scene's function with their annotations.
+
+    Raises:
+        UsageError: There is no such scene.
+    """
+    if name not in fluids.FLUIDS:
+        raise UsageError(f"unknown fluid scene {name!r}; allowed: {', '.join(fluids.FLUIDS)}")
+    return {key: item.annotation for key, item in inspect.signature(fluids.FLUIDS[name]).parameters.items() if key != "name"}
+
+
+def _complaint(scene: "FluidScene") -> str | None:
+    """Say which settings do not go together, None where they do."""
+    gravity, smoothing = scene.physics.gravity, scene.physics.smoothing / scene.spacing
+    fluid = scene.n if scene.wall is None else int((~scene.wall).sum())
+    if fluid == 0:
+        return "has no particle of fluid: make it larger, or its particles smaller"
+    for name in ("positions", "velocities", "masses"):
+        if not np.isfinite(getattr(scene, name)).all():
+            return f"its {name} are not finite"
+    if gravity is not None and len(gravity) != scene.dim:
+        return f"gravity has {len(gravity)} components, expected {scene.dim} in {scene.dim}D"
+    if not LEAST_SMOOTHING <= smoothing <= MOST_SMOOTHING:
+        spacing = f"{LEAST_SMOOTHING:g} to {MOST_SMOOTHING:g} particle spacings of {scene.spacing:.4g} m"
+        return f"smoothing is {scene.physics.smoothing:.4g} m, expected {spacing}"
+    if scene.step is not None and not scene.duration / MOST_STEPS <= scene.step < math.inf:
+        return f"takes steps of {scene.step:.3g} s for {scene.duration:.3g} s, expected up to {MOST_STEPS:.0e} steps"
+    if scene.step == 0:
+        return f"takes steps of 0 s for {scene.duration:.3g} s"
+    return None
+
+
+def _value(scene: str, key: str, text: str, kind: Any) -> Any:  # noqa: ANN401
     try:
         value = json.loads(text)
     except ValueError:
         value = None if text.lower() == "none" else text
     try:
-        return TypeAdapter(kind).validate_python(value)
-    except ValidationError as error:
-        raise UsageError(f"--set {key}: got {text!r}; {error.errors()[0]['msg'].lower()}") from error
+        return ranges.read(kind, value, ranges.of(scene, key))
+    except ValueError as error:
+        raise UsageError(f"--set {key}: got {text!r}; {error}") from error
 
 
 def with_particles(scene: "FluidScene", path: Path) -> "FluidScene":
@@ -66,17 +104,22 @@ def with_particles(scene: "FluidScene", path: Path) -> "FluidScene":
     Raises:
         UsageError: The file cannot be used.
     """
-    given = _read(path, scene.dim)
-    positions = np.asarray(given["positions"], np.float64)
+    try:
+        given = {name: np.asarray(array, np.float64) for name, array in _read(path, scene.dim).items()}
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{path}: holds what are no numbers: {error}") from error
+    positions = given["positions"]
     if positions.ndim != 2 or positions.shape[1] != scene.dim:
         raise UsageError(f"{path}: positions must have shape [n, {scene.dim}], got {list(positions.shape)}")
-    velocities = np.asarray(given.get("velocities", np.zeros_like(positions)), np.float64)
-    masses = np.asarray(given.get("masses", np.full(len(positions), scene.masses[0])), np.float64)
+    velocities = given.get("velocities", np.zeros_like(positions))
+    masses = given.get("masses", np.full(len(positions), scene.masses[0]))
     if velocities.shape != positions.shape or masses.shape != positions.shape[:1]:
         raise UsageError(f"{path}: velocities {list(velocities.shape)} and masses {list(masses.shape)} must fit the positions")
     for name, array in (("positions", positions), ("velocities", velocities), ("masses", masses)):
         if not np.isfinite(array).all():
             raise UsageError(f"{path}: {name} must be finite; particle {int(np.argwhere(~np.isfinite(array))[0][0])} is not")
+    if len(positions) == 0 or not (masses > 0).all():
+        raise UsageError(f"{path}: expected at least one particle, and masses above 0")
     return _replaced(scene, positions, velocities, masses)
 
 
@@ -96,14 +139,17 @@ def _replaced(scene: "FluidScene", positions: np.ndarray, velocities: np.ndarray
 def _read(path: Path, dim: int) -> dict[str, np.ndarray]:
     try:
         if path.suffix == ".npz":
-            with np.load(path) as file:
+            with path.open("rb") as stream, np.load(stream) as file:
                 given = {key: file[key] for key in file}
         elif path.suffix == ".csv":
             table = np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True, dtype=np.float64))
             given = _columns(table, "xyz"[:dim])
         else:
             raise UsageError(f"{path}: unknown ending {path.suffix!r}; allowed: .csv, .npz")
-    except ValueError as error:
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise UsageError(f"--initial {path}: cannot be read ({reason}); expected a file .npz or .csv") from error
+    except (ValueError, TypeError, AttributeError, EOFError, BadZipFile) as error:
         raise UsageError(f"{path}: cannot be read: {error}") from error
     if "positions" not in given:
         raise UsageError(f"{path}: no positions; expected arrays positions, velocities, masses, or columns x, y, vx, vy, m")

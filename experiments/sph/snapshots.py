@@ -3,10 +3,12 @@
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
 
 import jax.numpy as jnp
 import numpy as np
 
+from experiments._commands import take_folder
 from experiments._errors import UsageError
 from experiments.sph import budget, solids
 from experiments.sph.model import Model, State
@@ -32,9 +34,12 @@ def latest(folder: Path, scene: "FluidScene") -> tuple[State, int] | None:
     paths = sorted(path for path in folder.glob("*.npz") if path.stem.isdigit())
     if not paths:
         return None
-    with np.load(paths[-1]) as file:
-        arrays = {name: jnp.asarray(file[name]) for name in file}
-    angle, s = arrays.pop("angle", None), State(**arrays)  # pyright: ignore[reportArgumentType]
+    try:
+        with paths[-1].open("rb") as stream, np.load(stream) as file:
+            arrays = {name: jnp.asarray(file[name]) for name in file}
+        angle, s = arrays.pop("angle", None), State(**arrays)  # pyright: ignore[reportArgumentType]
+    except (ValueError, TypeError, EOFError, BadZipFile) as error:
+        raise UsageError(f"{paths[-1]}: is no snapshot ({error}); remove it, and the run goes on from the one before") from error
     return s._replace(solid=solids.begin(scene, s.x, angle)), int(paths[-1].stem)
 
 
@@ -42,14 +47,17 @@ def check_same(about: dict[str, Any], folder: Path) -> None:
     """Remember what the run is, or refuse a folder that holds another one.
 
     Raises:
-        UsageError: The folder holds a run of something else.
+        UsageError: The folder holds a run of something else, or cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    path, text = folder / "run.json", json.dumps(about, indent=1, sort_keys=True)
+    path, text = take_folder(folder) / "run.json", json.dumps(about, indent=1, sort_keys=True)
     if not path.exists():
         path.write_text(text)
-    elif (there := json.loads(path.read_text())) != json.loads(text):
-        asked = json.loads(text)
+        return
+    try:
+        there = dict(json.loads(path.read_text()))
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{path}: says no run ({error}); take another folder, or remove it") from error
+    if there != (asked := json.loads(text)):
         different = [key for key in asked if asked[key] != there.get(key)]
         raise UsageError(f"{folder}: holds a run with another {', '.join(different)}; take another folder, or remove it")
 

@@ -1,6 +1,7 @@
 """Steps per second of a scene by ways to find and sum pairs, all in one process and in turns; and where a step's time goes."""
 
 import functools
+import inspect
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
@@ -76,6 +77,8 @@ class Config(Table):
     def _scene_exists(cls, name: str) -> str:
         if name not in fluids.FLUIDS:
             raise ValueError(f"unknown fluid scene {name!r}; allowed: {', '.join(fluids.FLUIDS)}")
+        if "nx" not in inspect.signature(fluids.FLUIDS[name]).parameters:
+            raise ValueError(f"fluid scene {name!r} has no nx, by which its steps are timed")
         return name
 
     @field_validator("ways")
@@ -328,5 +331,7 @@ def describe(row: Row) -> str:
     if row.kind == "stages":
         return f"{what} " + ", ".join(f"{name} {1e3 * value:.3g} ms" for name, value in row.parts.items())
     if row.kind == "tradeoff":
-        return f"{what} {row.dtype} {row.seconds:.3g} s, " + ", ".join(f"{name} {value:.3g}" for name, value in row.error.items())
+        return f"{what} {row.dtype} {row.seconds:.3g} s, " + ", ".join(
+            f"error of {name} {100 * value:.3g} %" for name, value in row.error.items()
+        )
     return f"{what} {row.steps_per_s:8.3g} steps/s, {(row.bytes or 0) / 1e6:.0f} MB, {row.difference:.2g} roundings apart"

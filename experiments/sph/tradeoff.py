@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
 from jfrnn.cases._fluid_flows import taylor_green_velocity  # pyright: ignore[reportMissingImports]
-from pydantic import Field
+from pydantic import Field, FiniteFloat
 
 from experiments._config import Positive, Table, digest
 
@@ -31,7 +31,7 @@ class Config(Table):
 
     nx: tuple[Annotated[int, Field(ge=8)], ...]
     dtypes: tuple[Literal["float32", "float64"], ...] = ("float32", "float64")
-    skins: tuple[Annotated[float, Field(ge=0)], ...] = (0.0,)
+    skins: tuple[Annotated[FiniteFloat, Field(ge=0)], ...] = (0.0,)
     duration: Positive = 0.5
 
     def specs(self) -> Iterator["Spec"]:

@@ -55,6 +55,17 @@ class Row:
     time: str | None = None
 
 
+def check(names: list[str]) -> None:
+    """Refuse names that are no cases.
+
+    Raises:
+        UsageError: There is no such case.
+    """
+    unknown = [name for name in names if name not in CASES]
+    if unknown:
+        raise UsageError(f"no case {unknown[0]!r}; allowed: {', '.join(CASES)}")
+
+
 def run(names: list[str], folder: Path) -> list[Row]:
     """Run the cases that the folder does not hold yet, and return the rows of all that were asked for.
 
@@ -65,9 +76,7 @@ def run(names: list[str], folder: Path) -> list[Row]:
     Raises:
         UsageError: There is no such case.
     """
-    unknown = [name for name in names if name not in CASES]
-    if unknown:
-        raise UsageError(f"no case {unknown[0]!r}; allowed: {', '.join(CASES)}")
+    check(names)
     names, file = names or list(CASES), RowFile(folder, Row)
     with file.locked():
         file.repair()

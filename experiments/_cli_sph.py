@@ -1,0 +1,104 @@
+"""The commands of the fluid solver."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from experiments._commands import RetryFailed, RowsFolder, check_choice, finite, stoppable, take_folder, usage_errors
+
+SHORT = {
+    "sph": "Run a fluid scene, or go on with it.",
+    "sph-validate": "Run fluid scenes with known answers.",
+    "sph-speed": "Time steps of a fluid scene.",
+    "sph-gradients": "Solve inverse problems by gradients.",
+}
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the commands to the command line."""
+    for name, command in (("sph", sph), ("sph-validate", sph_validate), ("sph-speed", sph_speed), ("sph-gradients", sph_gradients)):
+        app.command(name=name, rich_help_panel="fluids", short_help=SHORT[name])(command)
+
+
+def sph(
+    scene: Annotated[str, typer.Argument(help="Fluid scene, such as dam, taylor-green, dam-break-2d, jet: see `list`.")],
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="key=value: of the scene, or of its physics; `list SCENE` names them.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the run; out/sph/SCENE without it.")] = None,
+    initial: Annotated[Path | None, typer.Option(help="Initial particles instead of the scene's: .npz or .csv.")] = None,
+    frames: Annotated[int, typer.Option(min=1, max=1_000_000, help="Snapshots after the first.")] = 50,
+    dtype: Annotated[str, typer.Option(help="float32 or float64.")] = "float64",
+    neighbors: Annotated[str, typer.Option(help="pair_sum, or list: a list with a skin.")] = "pair_sum",
+    skin: Annotated[float, typer.Option(min=0.01, max=100, callback=finite, help="Of the list, in particle spacings.")] = 0.3,
+    pictures: Annotated[bool, typer.Option(help="Draw frames and a GIF.")] = True,
+) -> None:
+    """Run a fluid scene, or go on with it from its last snapshot: snapshots, energies, pictures."""
+    with usage_errors():
+        check_choice("--dtype", dtype, ("float32", "float64"))
+        check_choice("--neighbors", neighbors, ("pair_sum", "list"))
+        import jax
+
+        jax.config.update("jax_enable_x64", dtype == "float64")
+        from experiments.sph import run as sph_run
+        from experiments.sph import settings as sph_settings
+
+        fluid = sph_settings.make_scene(scene, settings or [])
+        fluid = fluid if initial is None else sph_settings.with_particles(fluid, initial)
+        folder = out or Path("out") / "sph" / scene
+        with stoppable("the last snapshot"):
+            sph_run.run(fluid, folder, sph_run.How(frames, dtype, neighbors, skin, pictures))
+        typer.echo(folder)
+
+
+def sph_validate(
+    cases: Annotated[list[str] | None, typer.Argument(help="Such as taylor-green, cavity; all, long ones last, without.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the rows.")] = Path("out") / "sph-validate",
+) -> None:
+    """Run fluid scenes with known answers, or go on with them; then print a table, and draw pictures beside the rows."""
+    with usage_errors():
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        from experiments.sph import validate
+
+        validate.check(cases or [])
+        with stoppable():
+            rows = validate.run(cases or [], take_folder(out))
+        typer.echo(validate.report(rows, out))
+
+
+def sph_speed(
+    config: Annotated[Path, typer.Argument(help="Config of steps, TOML.")] = Path("experiments/configs/sph_speed.toml"),
+    out: RowsFolder = None,
+    retry_failed: RetryFailed = False,
+) -> None:
+    """Time steps of a fluid scene by ways to find its pairs, or go on with it; then print a table, and draw pictures."""
+    with usage_errors():
+        import jax
+
+        from experiments import _config
+        from experiments.sph import speed, speed_report
+
+        given, folder = _config.load(config, speed.Config), take_folder(out or Path("out") / config.stem)
+        jax.config.update("jax_enable_x64", given.dtype == "float64")
+        with stoppable():
+            rows = speed.run(given, folder, retry_failed)
+        typer.echo(speed_report.report(rows, folder))
+
+
+def sph_gradients(
+    names: Annotated[list[str] | None, typer.Argument(help="viscosity, jet, droplet, memory; all without.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of tables and pictures.")] = Path("out") / "sph-gradients",
+    evaluations: Annotated[int, typer.Option(min=1, max=100_000, help="Runs to solve a problem with, at most.")] = 25,
+) -> None:
+    """Solve inverse problems by gradients through whole runs of a fluid, and measure the memory that such gradients take."""
+    with usage_errors():
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        from experiments.sph import gradients
+
+        gradients.check(names or [])
+        typer.echo(gradients.run(names or [], take_folder(out), evaluations))

@@ -1,0 +1,167 @@
+"""What all commands share: how they are listed, options that are checked where they enter, and errors that fit into a line."""
+
+import math
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from experiments._errors import UsageError
+
+MOST_POINTS = 100_000_000
+
+
+class Commands(TyperGroup):
+    """Commands listed by group, a line each; what is wrong with a command line is said in one line, with exit code 2."""
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ANN401
+        """Return the names by group, groups in the order in which they were first met."""
+        groups = list(dict.fromkeys(str(command.rich_help_panel) for command in self.commands.values()))  # pyright: ignore
+        return sorted(self.commands, key=lambda name: groups.index(str(self.commands[name].rich_help_panel)))  # pyright: ignore
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
+        """Write the list, groups on the left: less than the 24 lines of a screen."""
+        formatter.write(f"Usage: {ctx.command_path} COMMAND [ARGS]...   (COMMAND --help says more)\n")
+        previous = None
+        for name in self.list_commands(ctx):
+            command: Any = self.commands[name]
+            group = command.rich_help_panel
+            formatter.write(f"{group if group != previous else '':<10} {name:<14} {command.get_short_help_str(54)}\n")
+            previous = group
+
+    def main(self, args: Sequence[str] | None = None, *more: Any, standalone_mode: bool = True, **others: Any) -> Any:  # noqa: ANN401
+        """Run, and say mistakes in a line."""
+        if not standalone_mode:
+            return super().main(args, *more, standalone_mode=False, **others)
+        try:
+            code = super().main(args, *more, standalone_mode=False, **others)
+        except Exception as error:
+            code = _said(error, sys.argv[1:] if args is None else args)
+        sys.exit(code if isinstance(code, int) else 0)
+
+
+def _said(error: Exception, given: Sequence[str]) -> int:
+    """Print a mistake in the command line and return the exit code; what else went wrong is raised again."""
+    if isinstance(error, typer.Abort):
+        typer.echo("aborted", err=True)
+        return 1
+    tell, context = getattr(error, "format_message", None), getattr(error, "ctx", None)
+    if tell is None:
+        raise error
+    if type(error).__name__ == "NoArgsIsHelpError":
+        typer.echo(context.get_help() if context else tell())
+        return 0
+    message, option = " ".join(tell().split()), _option_of(error, given)
+    if option is not None:
+        message = f"{option}: {message.partition(': ')[2] or message}"
+    where = f" (see {context.command_path} --help)" if context else ""
+    typer.echo(f"error: {message}{where}", err=True)
+    return 2
+
+
+def _option_of(error: Any, given: Sequence[str]) -> str | None:  # noqa: ANN401
+    """Return the option whose value is refused, with that value, as it was given."""
+    for name in getattr(getattr(error, "param", None), "opts", ()):
+        for place, token in enumerate(given):
+            if token.startswith(f"{name}="):
+                return token.replace("=", " ", 1)
+            if token == name and place + 1 < len(given):
+                return f"{name} {given[place + 1]}"
+    return None
+
+
+# --- checks ---------------------------------------------------------------------------------------------------------------
+
+
+def finite(value: Any) -> Any:  # noqa: ANN401
+    """Refuse numbers that are none, or infinite: a range lets NaN through."""
+    for number in value if isinstance(value, list | tuple) else [value]:
+        if number is not None and not math.isfinite(number):
+            raise typer.BadParameter(f"{number} is not a finite number.")
+    return value
+
+
+def positive(value: Any) -> Any:  # noqa: ANN401
+    """Refuse numbers that are not finite or not above 0."""
+    for number in finite(value) if isinstance(value, list | tuple) else [finite(value)]:
+        if number is not None and not number > 0:
+            raise typer.BadParameter(f"{number} is not in the range x>0.")
+    return value
+
+
+def check_choice(option: str, value: str, allowed: Sequence[str]) -> None:
+    """Refuse a word that an option does not know.
+
+    Raises:
+        UsageError: Names the option and what is allowed.
+    """
+    if value not in allowed:
+        raise UsageError(f"{option} {value}: allowed: {', '.join(allowed)}")
+
+
+def take_folder(folder: Path, option: str = "--out") -> Path:
+    """Make the folder that takes what a command writes, and return it.
+
+    Raises:
+        UsageError: It cannot be made or written; the message names the option.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(13, "Permission denied")
+    except OSError as error:
+        reason = "there is a file of that name" if isinstance(error, FileExistsError | NotADirectoryError) else error.strerror
+        raise UsageError(f"{option} {folder}: cannot be written ({reason}); name a folder that can be") from error
+    return folder
+
+
+def take_file(path: Path, option: str = "--out") -> Path:
+    """Make the folder of a file that a command writes, and return the file; see `take_folder`."""
+    take_folder(path.parent, option)
+    if path.is_dir() or (path.exists() and not os.access(path, os.W_OK)):
+        reason = "there is a folder of that name" if path.is_dir() else "Permission denied"
+        raise UsageError(f"{option} {path}: cannot be written ({reason}); name a file that can be")
+    return path
+
+
+@contextmanager
+def usage_errors() -> Iterator[None]:
+    """Turn a UsageError, a file that cannot be read or written, or too little memory, into a line and exit code 2."""
+    try:
+        yield
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        typer.echo(f"error: {where}{error.strerror or error}", err=True)
+        raise typer.Exit(2) from error
+    except UsageError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(2) from error
+    except MemoryError as error:
+        typer.echo(f"error: this takes more memory than there is; ask for fewer particles: {error}", err=True)
+        raise typer.Exit(2) from error
+
+
+@contextmanager
+def stoppable(start: str = "here") -> Iterator[None]:
+    """Where the user stops what keeps its rows, say where the same command goes on, and exit with code 130."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo(f"stopped; the same command goes on from {start}", err=True)
+        raise typer.Exit(130) from None
+
+
+# --- options that several commands have -------------------------------------------------------------------------------------
+
+Layout = Annotated[str, typer.Argument(help="Name of a layout, such as full, clusters2, corners.")]
+Fill = Annotated[float | None, typer.Option(callback=finite, help="Share of the full domain, above 0 and up to 1.")]
+Spacing = Annotated[float, typer.Option(min=1e-6, max=1.0, callback=finite, help="Distance of lattice neighbors [m].")]
+Dim = Annotated[int, typer.Option(min=2, max=3, help="Dimensions.")]
+Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of random layouts.")]
+RetryFailed = Annotated[bool, typer.Option("--retry-failed", help="Measure missing, failed and timed-out rows again.")]
+RowsFolder = Annotated[Path | None, typer.Option(help="Folder of the rows; out/NAME without it.")]
