@@ -207,8 +207,8 @@ auto signs_decided = [&](const double* q, const doubles* p, unsigned int& open) 
     open &= ~(inside | tie | bits_of_lanes(plain & (lead > rest)));
     return pairs;
 };
-// Which of the points in lanes are pairs, in twice the precision or more, WIDE at a time; few stay `open`, others are none. A call of
-// its own: nothing of it may be computed while denormals are flushed.
+// Which of the points in lanes are pairs, in twice the precision or more, WIDE at a time; few stay `open`, others are none.
+// This is a call of its own: nothing of it may be computed while denormals are flushed.
 auto wide_decided = [&](const real* q, const vec* p, unsigned int& open) __attribute__((noinline)) -> unsigned int {
     if constexpr (PERIODIC)
         return 0;
