@@ -13,7 +13,18 @@ from jax.core import Tracer
 
 from jfrnn._backends import Found, Inputs, Options, count_rows, list_rows, without_inactive
 from jfrnn._batch import Batch
-from jfrnn._box import LARGEST_TURN, Box, Images, Lattice, fixed_box, make_lattice, nearest_shifts, shifted_pairs, unpacked_turns
+from jfrnn._box import (
+    LARGEST_TURN,
+    Box,
+    Images,
+    Lattice,
+    fixed_box,
+    make_lattice,
+    nearest_shifts,
+    shifted_pairs,
+    turns_between,
+    unpacked_turns,
+)
 from jfrnn._exact import Cutoff, Cutoffs, Radii, is_pair_of, make_cutoff, make_cutoffs
 from jfrnn._exports import DenseNeighbors, checked_total, flat_pairs, pair_total
 from jfrnn._inputs import checked_active, checked_box, checked_positions, checked_radii, checked_slack
@@ -108,7 +119,8 @@ class NeighborList:
         """Make the list anew if something has moved skin/2 since it was made, or may have by rounding; without a skin, always.
 
         The list that comes back holds every pair within the cutoff at these positions, in the same shapes: a step of a simulation
-        inside `jax.jit`, `lax.scan` or `lax.fori_loop`. Status bits and `required` are kept over all updates; look at `overflow`
+        inside `jax.jit`, `lax.scan` or `lax.fori_loop`. Lattice vectors of a periodic box are no motion: positions may be wrapped
+        into it in every step. Status bits and `required` are kept over all updates; look at `overflow`
         after a chunk of steps, then `grow` and run the chunk again (`run_chunk` does that).
 
         Args:
@@ -271,7 +283,7 @@ class NeighborList:
         box = self._box_now(box, sources)
         if box is None or self.box_kind is None or 0 in (sources.shape[0], *self.idx.shape):
             return jnp.zeros((*self.idx.shape, sources.shape[1]), jnp.int32)
-        return _shifts(self.idx, self.count, self.images, sources, rows, box, self.box_kind)
+        return _shifts(self.idx, self.count, self._images_made(), sources, rows, box, self.box_kind)
 
     def distances(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> tuple[Array, Array]:
         """Compute the distance to every neighbor.
@@ -455,7 +467,12 @@ class NeighborList:
         cutoff = self.radii if self.cutoff is None else make_cutoff(self.cutoff, np.dtype(sources.dtype), self.closed)
         if box is None or self.box_kind is None:
             return *_vectors(self.idx, self.count, sources, rows, cutoff, self.closed), None
-        return _periodic_vectors(self.idx, self.count, self.images, sources, rows, box, self.box_kind, cutoff, self.closed)
+        images = self._images_made()
+        return _periodic_vectors(self.idx, self.count, images, sources, rows, box, self.box_kind, cutoff, self.closed)
+
+    def _images_made(self) -> "_ImagesMade":
+        made = None if self.images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
+        return self.images, made
 
     def _geometry_inputs(self, positions: Array, queries: Array | None) -> tuple[Array, Array]:
         sources = checked_positions("positions", positions)
@@ -568,6 +585,9 @@ def _vectors(
     return jnp.where(mask[..., None], sources[neighbor] - rows[:, None, :], 0), mask
 
 
+_ImagesMade = tuple[ImageCodes | None, tuple[Array, Array | None] | None]  # and where all were when a list with a skin was made
+
+
 class _Slots(NamedTuple):
     """Of every slot: whether it is used, its source, x_j - x_i, and its lattice shift in whole floats; 0 where it is not used."""
 
@@ -577,23 +597,23 @@ class _Slots(NamedTuple):
     shifts: Array
 
 
-def _slots(idx: Array, count: Array, images: ImageCodes | None, sources: Array, rows: Array, lattice: Lattice) -> _Slots:
+def _slots(idx: Array, count: Array, images: _ImagesMade, sources: Array, rows: Array, lattice: Lattice) -> _Slots:
     used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
     neighbor = jnp.where(used, idx, 0)
     difference = sources[neighbor] - rows[:, None, :]
-    if images is None:
+    codes, made = images
+    if codes is None:
         shifts = nearest_shifts(difference, lattice)
     else:
-        turns = unpacked_turns(images.turns, lattice.dim)
-        query_turns = turns if images.query_turns is None else unpacked_turns(images.query_turns, lattice.dim)
-        codes = jnp.where(used, images.codes.astype(jnp.int32), lattice.images.home)
-        shifts = (jnp.asarray(lattice.images.shifts)[codes] + query_turns[:, None] - turns[neighbor]).astype(sources.dtype)
+        turns, query_turns = _turns_now(codes, made, sources, rows, lattice)
+        image = jnp.where(used, codes.codes.astype(jnp.int32), lattice.images.home)
+        shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)[image] + query_turns[:, None] - turns[neighbor]
     used = used & (jnp.abs(shifts) <= 2 * LARGEST_TURN).all(axis=-1)  # farther apart, nothing is decided exactly
     return _Slots(used, neighbor, difference, jnp.where(used[..., None], shifts, 0))
 
 
 @functools.partial(jax.jit, static_argnames="kind")
-def _shifts(idx: Array, count: Array, images: ImageCodes | None, sources: Array, rows: Array, box: Box, kind: Images) -> Array:
+def _shifts(idx: Array, count: Array, images: _ImagesMade, sources: Array, rows: Array, box: Box, kind: Images) -> Array:
     lattice = make_lattice(box, kind, np.dtype(sources.dtype))
     return lax.stop_gradient(_slots(idx, count, images, sources, rows, lattice).shifts).astype(jnp.int32)
 
@@ -602,7 +622,7 @@ def _shifts(idx: Array, count: Array, images: ImageCodes | None, sources: Array,
 def _periodic_vectors(
     idx: Array,
     count: Array,
-    images: ImageCodes | None,
+    images: _ImagesMade,
     sources: Array,
     rows: Array,
     box: Box,
@@ -618,6 +638,22 @@ def _periodic_vectors(
     fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
     mask = used & is_pair_of(fixed_rows, fixed_sources, neighbor, cutoff, fixed_pairs)
     return jnp.where(mask[..., None], pairs.vectors, 0), mask, shifts
+
+
+def _turns_now(
+    images: ImageCodes, made: tuple[Array, Array | None] | None, sources: Array, rows: Array, lattice: Lattice
+) -> tuple[Array, Array]:
+    """Return how many lattice vectors lie between the cell and the sources [n, d], and the rows [m, d]: whole floats.
+
+    They are those that the list was made with, and those by which a point has been moved since (`made`: where all were then), as
+    wrapping it does: the image that a code tells of is the same one before and after.
+    """
+    both = [images.turns] if images.query_turns is None else [images.turns, images.query_turns]
+    turns = [unpacked_turns(x, lattice.dim).astype(sources.dtype) for x in both]
+    if made is not None:
+        since = zip(turns, made, (sources, rows), strict=False)
+        turns = [x if before is None else x + turns_between(before, now, lattice) for x, before, now in since]
+    return turns[0], turns[-1]
 
 
 @jax.jit

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._box import Box, Images, box_change
+from jfrnn._box import Box, Images, Motion, box_change, make_lattice, motion_of
 from jfrnn._exact import Cutoff, Radii, is_radius, make_cutoff, squared_distance, widened
 
 
@@ -58,14 +58,20 @@ def moved_too_far(
     """Say whether any point is, or may be by rounding, skin/2 or more from where the list was made, [] bool.
 
     One pass over the positions. A point that is not finite has no neighbors: it counts as moved when it becomes so or ceases to be.
-    A box that changed has moved the images of a pair against each other, and cutoffs that grew reach farther: that much less of
-    the skin is left for the points. No rule makes a pair's cutoff grow by more than the two of which it is made.
+    Lattice vectors by which a point was wrapped are no motion, since its images stay where they are. A box that changed has moved
+    the images of a pair against each other, and cutoffs that grew reach farther: that much less of the skin is left for the
+    points. No rule makes a pair's cutoff grow by more than the two of which it is made.
     """
     half = make_cutoff(skin / 2, np.dtype(positions.dtype), closed=False)
     used, grown, moved = jnp.zeros((), positions.dtype), jnp.zeros((), positions.dtype), jnp.zeros((), bool)
+    clouds = [(verlet.positions, positions)]
+    if queries is not None and verlet.queries is not None:
+        clouds.append((verlet.queries, queries))
+    motions: list[Motion | None] = [None] * len(clouds)
     if box is not None and verlet.box is not None and box_kind is not None:
-        points = positions if queries is None else jnp.concatenate([positions, queries])
-        used = box_change(verlet.box, box, points, box_kind, np.dtype(positions.dtype))
+        old, new = (make_lattice(x, box_kind, np.dtype(positions.dtype)) for x in (verlet.box, box))
+        motions = [motion_of(before, now, new) for before, now in clouds]
+        used = box_change(old, new, [motion.home for motion in motions if motion is not None])
     if radii is not None and verlet.radii is not None:
         for before, now in ((verlet.radii.sources, radii.sources), (verlet.radii.queries, radii.queries)):
             if before is not None and now is not None:
@@ -73,8 +79,9 @@ def moved_too_far(
                 grown = jnp.maximum(grown, _growth(before, now))
     if box is not None or radii is not None:
         half = widened(half, (used + grown) / 4)
-    moved = moved | _any_beyond(verlet.positions, positions, half)
-    return moved if queries is None or verlet.queries is None else moved | _any_beyond(verlet.queries, queries, half)
+    for cloud, motion in zip(clouds, motions, strict=True):
+        moved = moved | _any_beyond(*cloud, motion, half)
+    return moved
 
 
 def _growth(before: Array, now: Array) -> Array:
@@ -83,8 +90,10 @@ def _growth(before: Array, now: Array) -> Array:
     return jnp.max(grown, initial=0) * (1 + 4 * jnp.finfo(grown.dtype).eps)
 
 
-def _any_beyond(before: Array, now: Array, half_skin: Cutoff) -> Array:
-    near = squared_distance(list((now - before).T), half_skin) < half_skin.inside  # 8 eps inside: surely closer
+def _any_beyond(before: Array, now: Array, motion: Motion | None, half_skin: Cutoff) -> Array:
+    axes = list((now - before).T) if motion is None else motion.axes
+    near = squared_distance(axes, half_skin) < half_skin.inside  # 8 eps inside: surely closer
+    near = near if motion is None else near & motion.sure
     there = jnp.isfinite(before).all(axis=1) | jnp.isfinite(now).all(axis=1)
     return jnp.any(there & ~near)
 

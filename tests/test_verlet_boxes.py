@@ -1,0 +1,129 @@
+"""Lists with a skin in periodic boxes: wrapping is no motion, and the images of a list are the same before and after."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from test_box import masked_images
+
+import jfrnn
+
+SKEWED = np.array([[1.0, 0.0, 0.0], [0.45, 0.9, 0.0], [-0.3, 0.35, 1.1]])
+
+
+def oracle(x, cutoff, box, **options):
+    rows = np.asarray(box.vectors)
+    return reference.reference_images(np.asarray(x), cutoff, matrix=rows, periodic=box.periodic, **options)
+
+
+def rows_of(box):
+    rows = np.asarray(box.vectors, np.float64)
+    return np.diag(rows) if rows.ndim == 1 else rows
+
+
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=pytest.mark.slow)])
+def test_positions_that_are_wrapped_in_every_step_cost_no_lists(backend, dtype):
+    lengths, cutoff, skin = np.array([1.0, 1.3, 0.9]), 0.2, 0.05
+    box, rng = jfrnn.Box(lengths), np.random.default_rng(0)
+    x = jnp.asarray(rng.uniform(0, lengths, (200, 3)), dtype)
+    speed = jnp.asarray(rng.normal(0, 1, (200, 3)), dtype)
+    step = speed * dtype(0.11 * skin / np.linalg.norm(speed, axis=1).max())
+
+    @jax.jit
+    def run(x, nbrs):
+        def advance(_, carry):
+            free, x, nbrs, wrapped = carry
+            free, x = free + step, jnp.mod(x + step, lengths.astype(dtype))
+            return free, x, nbrs.update(free), wrapped.update(x)
+
+        return jax.lax.fori_loop(0, 20, advance, (x, x, nbrs, nbrs))
+
+    start = jfrnn.search(x, cutoff, skin=skin, box=box, capacity=48, backend=backend)
+    _, end, nbrs, wrapped = run(x, start)
+    wrapped.check()
+    assert (np.floor(np.asarray(x + 20 * step) / lengths) != 0).any(axis=1).sum() > 5
+    assert int(wrapped.rebuild_count) == int(nbrs.rebuild_count) == 4
+    assert masked_images(wrapped, end) == oracle(end, cutoff, box)
+
+
+KINDS = {
+    "orthogonal": (jfrnn.Box([0.7, 1.6, 1.1], origin=[-0.2, 0.1, 0.0]), 0.9),
+    "skewed": (jfrnn.Box(SKEWED), 0.8),
+    "slab": (jfrnn.Box(SKEWED, periodic=(True, False, True)), 0.8),
+    "nearest": (jfrnn.Box(3 * SKEWED), 0.6),
+}
+
+
+EACH = [
+    (np.float32, "skewed", "own"),
+    (np.float64, "slab", "queries"),
+    (np.float32, "orthogonal", "half"),
+    (np.float64, "nearest", "own"),
+]
+ALL = [(dtype, kind, asked) for dtype in (np.float32, np.float64) for kind in KINDS for asked in ("own", "half", "queries")]
+
+
+@pytest.mark.parametrize(
+    ("dtype", "kind", "asked"), [*EACH, *(pytest.param(*x, marks=pytest.mark.slow) for x in ALL if x not in EACH)]
+)
+def test_images_of_a_kept_list_are_those_of_the_moved_particles(dtype, kind, asked):
+    box, cutoff = KINDS[kind]
+    rng, skin, rows = np.random.default_rng(1), 0.1, rows_of(box)
+    whole = lambda size, most: (rng.integers(-most, most + 1, (size, 3)) * box.periodic) @ rows  # noqa: E731
+    before = jnp.asarray(rng.uniform(0, 1, (24, 3)) @ rows + whole(24, 2), dtype)
+    points = None if asked != "queries" else jnp.asarray(rng.uniform(0, 1, (9, 3)) @ rows + whole(9, 2), dtype)
+    options = {"half": asked == "half"}
+    given = {} if points is None else {"queries": points}
+    nbrs = jfrnn.search(before, cutoff, skin=skin, box=box, **options, **given)
+    assert (nbrs.images is None) == (kind == "nearest")
+
+    def moved(x):
+        return jnp.asarray(np.asarray(x, np.float64) + whole(len(x), 3) + rng.uniform(-1, 1, x.shape) * 0.4 * skin / 3, dtype)
+
+    after, given = moved(before), {name: moved(x) for name, x in given.items()}
+    kept = nbrs.update(after, **given)
+    kept.check()
+    assert int(kept.rebuild_count) == 0
+    assert masked_images(kept, after, **given) == oracle(after, cutoff, box, **options, **given)
+    if (kind, asked) == ("skewed", "own"):
+        weight = lambda r, i, j: jnp.stack([r[0] ** 2, r[1] * r[2], jnp.ones_like(r[0])])  # noqa: E731
+        listed = jfrnn.pair_sum(weight, after, None, neighbors=kept)
+        np.testing.assert_allclose(listed, jfrnn.pair_sum(weight, after, cutoff, box=box), rtol=3e-5, atol=3e-5)
+
+
+def test_a_box_that_changes_while_particles_are_wrapped():
+    dtype, skin, cutoff, rng = np.float64, 0.1, 0.8, np.random.default_rng(2)
+    x = rng.uniform(0, 1, (20, 3)) + rng.integers(-2, 3, (20, 3))
+    nbrs = jfrnn.search(jnp.asarray(x @ SKEWED, dtype), cutoff, skin=skin, box=jfrnn.Box(SKEWED.astype(dtype)), slack=2.0)
+    made = []
+    for size in (1.002, 1.004, 0.93):
+        x = np.mod(x, 1) if size < 1.004 else x + rng.integers(-2, 3, x.shape)
+        box = jfrnn.Box((size * SKEWED).astype(dtype))
+        now = jnp.asarray(x @ (size * SKEWED), dtype)
+        nbrs = nbrs.update(now, box=box)
+        made.append(int(nbrs.rebuild_count))
+        assert masked_images(nbrs, now) == oracle(now, cutoff, box)
+    assert made == [0, 1, 2]
+
+
+def test_motion_of_half_a_cell_is_never_taken_for_another_image():
+    dtype, box, cutoff, skin, rng = np.float32, jfrnn.Box(0.3 * SKEWED), 0.5, 0.5, np.random.default_rng(3)
+    x = jnp.asarray(rng.uniform(0, 0.3, (4, 3)), dtype)
+    start = jfrnn.search(x, cutoff, skin=skin, box=box, slack=1.5)
+    for step in (0.5, 0.4999999, 0.5000001, 0.6):
+        now = x.at[0].add(jnp.asarray(step * 0.3 * SKEWED[0], dtype)).at[1].add(jnp.asarray(-step * 0.3 * SKEWED[2], dtype))
+        nbrs = start.update(now)
+        assert masked_images(nbrs, now) == oracle(now, cutoff, box)
+
+
+def test_particles_that_leave_the_range_of_a_box_are_noticed():
+    dtype, box = np.float32, jfrnn.Box([1.0, 1.0, 1.0])
+    x = jnp.asarray(np.random.default_rng(4).uniform(0, 1, (10, 3)), dtype)
+    nbrs = jfrnn.search(x, 0.3, skin=0.1, box=box, slack=2.0)
+    assert int(nbrs.update(x.at[0, 0].add(500)).rebuild_count) == 0
+    with pytest.raises(ValueError, match="511 lattice vectors away"):
+        nbrs.update(x.at[0, 0].add(600)).check()
+    far = jfrnn.search(x.at[0, 0].add(-500), 0.3, skin=0.1, box=box, slack=2.0)
+    assert masked_images(far, x.at[0, 0].add(-500)) == oracle(x.at[0, 0].add(-500), 0.3, box)
