@@ -205,17 +205,42 @@ def images_of(box: Box, radius: float | None, dtype: np.dtype, sources: int) -> 
         wanted = (0,) * box.dim if box.images is None else box.images
         nearest = not any(k for k, p in zip(wanted, box.periodic, strict=True) if p)
         reach = tuple(max(k, 1) if p else 0 for k, p in zip(wanted, box.periodic, strict=True))
-    images = Images(box.periodic, box.orthogonal, reach, nearest)
+    return checked_images(Images(box.periodic, box.orthogonal, reach, nearest), sources)
+
+
+def checked_images(images: Images, sources: int) -> Images:
+    """Return images of which there are not too many.
+
+    Raises:
+        ValueError: there are more images than can be told apart.
+    """
     if not images.nearest and sources * images.total >= 2**31:
         raise ValueError(
             f"box is too small for its particles: {sources} of them with {images.total} images each are more than int32 can number."
         )
     if images.total > _MOST_IMAGES:
         raise ValueError(
-            f"box is too small for this cutoff: pairs reach over {reach} cells along the axes, more than {_MOST_IMAGES} images. "
-            "Replicate the particles into a larger box, or reduce a skewed lattice to short vectors."
+            f"box is too small for this cutoff: pairs reach over {images.reach} cells along the axes, more than {_MOST_IMAGES} "
+            "images. Replicate the particles into a larger box, or reduce a skewed lattice to short vectors."
         )
     return images
+
+
+def grown_images(kind: Images, boxes: Sequence[Box], radius: float | None, dtype: np.dtype, sources: int, short: bool) -> Images:
+    """Choose the images of a list that is made again: those that it has, and those that this radius needs in each of these boxes.
+
+    `short`: a search met a box that needs more of them. Where none of these boxes does, it was another: then twice as many.
+
+    Raises:
+        ValueError: a box is none, or too small for this radius.
+    """
+    for box in boxes:
+        _check_values(np.asarray(box.vectors), np.asarray(box.origin), box.periodic)
+    kinds = [kind, *(images_of(box, radius, dtype, sources) for box in boxes)]
+    reach, nearest = tuple(map(max, *(k.reach for k in kinds), kind.reach)), all(k.nearest for k in kinds)
+    if short and (reach, nearest) == (kind.reach, kind.nearest):
+        reach, nearest = reach if nearest else tuple(2 * k for k in reach), False
+    return checked_images(Images(kind.periodic, kind.orthogonal, reach, nearest), sources)
 
 
 def _widths(vectors: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:

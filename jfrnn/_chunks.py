@@ -28,8 +28,9 @@ def run_chunk(
 ) -> tuple[State, NeighborList]:
     """Run a jitted chunk of steps; where its list overflowed, grow the list and run the same chunk again from the same state.
 
-    A chunk whose list overflowed has missed pairs, so that nothing of it may be kept; what it knows is how many slots were needed.
-    Each replay has at least that many, so that the loop ends unless the data do not: one host synchronization per run.
+    A chunk whose list overflowed has missed pairs, so that nothing of it may be kept; what it knows is how many slots were needed,
+    and whether a box needed more images. Each replay has at least that many slots, and more images, so that the loop ends, or
+    raises where no room helps: one host synchronization per run.
 
     Args:
         chunk: (state, nbrs) -> (state, nbrs), usually under `jax.jit`; it calls `nbrs.update` in every step, and must not donate
@@ -39,16 +40,17 @@ def run_chunk(
         positions: state -> positions [length], shape [n, d]: where a larger list is made.
         queries: state -> queries, exactly if the list was made with queries.
         active: state -> mask, exactly if the list was made with `active`.
-        box: state -> periodic box, where it changes.
-        cutoff: state -> cutoffs of the particles, where they change.
+        box: state -> periodic box, where it changes; default: the one that the list has at the beginning.
+        cutoff: state -> cutoffs of the particles, where they change; default likewise.
         slack: Factor >= 1 on the slots that were needed, as in `NeighborList.grow`.
 
     Returns:
-        The state and the list after a run in which nothing overflowed.
+        The state and the list after a run in which nothing overflowed, and of which the list has nothing to report (`check`).
 
     Raises:
         TypeError: called inside jit, where a shape cannot change.
         TypeError, ValueError: as `NeighborList.update`.
+        ValueError: the list reports what no room mends, as `NeighborList.check`: positions that are not finite, a degenerate box.
 
     >>> import jax, jax.numpy as jnp, jfrnn
     >>> @jax.jit
@@ -66,10 +68,20 @@ def run_chunk(
     """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((state, nbrs))):
         raise TypeError("run_chunk() changes the shape of the list and cannot run inside jax.jit: jit the chunk, not the loop.")
+    given: dict[str, Any] = {"queries": queries, "active": active, "box": box, "cutoff": cutoff}
+    given = {name: of(state) for name, of in given.items() if of is not None}
+    given = {"box": nbrs.box, "cutoff": _given_cutoffs(nbrs)} | given
     while True:
         after, seen = chunk(state, nbrs)
         if not bool(np.any(seen.overflow)):
+            seen.check()
             return after, seen
-        given: dict[str, Any] = {"queries": queries, "active": active, "box": box, "cutoff": cutoff}
-        given = {name: of(state) for name, of in given.items() if of is not None}
         nbrs = seen.grow(positions(state), slack=slack, **given)
+
+
+def _given_cutoffs(nbrs: NeighborList) -> Array | tuple[Array, Array] | None:
+    """Return the cutoffs of the particles of a list as `NeighborList.grow` takes them."""
+    if nbrs.radii is None:
+        return None
+    known = [x for x in (nbrs.radii.sources, nbrs.radii.queries) if x is not None]
+    return (known[0], known[1]) if nbrs.own_queries and len(known) == 2 else known[0]

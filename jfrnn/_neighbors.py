@@ -19,6 +19,7 @@ from jfrnn._box import (
     Images,
     Lattice,
     fixed_box,
+    grown_images,
     make_lattice,
     nearest_shifts,
     shifted_pairs,
@@ -27,7 +28,7 @@ from jfrnn._box import (
 )
 from jfrnn._exact import Cutoff, Cutoffs, Radii, is_pair_of, make_cutoff, make_cutoffs
 from jfrnn._exports import DenseNeighbors, checked_total, flat_pairs, pair_total
-from jfrnn._inputs import checked_active, checked_box, checked_positions, checked_radii, checked_slack
+from jfrnn._inputs import checked_active, checked_box, checked_positions, checked_radii, checked_slack, largest_known
 from jfrnn._runs import Filter
 from jfrnn._status import NeighborOverflowError, Status
 from jfrnn._verlet import Verlet, first_verlet, list_radius, moved_too_far
@@ -104,8 +105,8 @@ class NeighborList:
 
     @property
     def overflow(self) -> Array:
-        """Say whether a row lost neighbors, shape [], bool."""
-        return (self.status & Status.ROW_OVERFLOW.value) != 0
+        """Say whether pairs may be missing for want of room, which `grow` makes: slots of a row, or images in a box; [] bool."""
+        return (self.status & (Status.ROW_OVERFLOW | Status.BOX_TOO_SMALL).value) != 0
 
     def update(
         self,
@@ -159,20 +160,24 @@ class NeighborList:
     ) -> "NeighborList":
         """Make a list with room for what overflowed, at these positions. Not inside jit: the capacity is a shape.
 
+        Room are the slots of a row and, in a periodic box, the images of a particle: as many as the cutoff needs in this box and
+        in that of the list, or twice as many where updates met a smaller box in between.
+
         Args:
             positions: Sources [length], shape [n, d].
             cutoff: As in `update`.
             queries: As in `update`.
             active: As in `update`.
-            box: As in `update`.
+            box: The box at these positions; default: the one that the list has, which after a chunk is the last one.
             slack: Factor >= 1 on the longest row that was ever met, here or by updates of this list.
 
         Returns:
-            A `NeighborList` with the same options, a capacity not smaller than before, and no bits from the past.
+            A `NeighborList` with the same options, room not smaller than before, no bits from the past, and nothing to `check`.
 
         Raises:
             TypeError: positions or the list are traced.
-            ValueError, TypeError: an argument does not fit the list.
+            ValueError, TypeError: an argument does not fit the list, or the list that was made says what is wrong with its data
+                (`check`): no room makes positions finite, or a degenerate box one.
         """
         sources, rows = self._geometry_inputs(positions, queries)
         queries, active, slack = rows if self.own_queries else None, self._checked_active(active, sources), checked_slack(slack)
@@ -180,8 +185,11 @@ class NeighborList:
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, radii, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
         met = rounded_capacity(math.ceil(slack * int(np.max(self.required))))
-        inputs, options = _inputs_of(self, sources, queries, active, box, radii)
-        return _remade(self, inputs, options, max(self.capacity, met, counted_capacity(inputs, options, slack)))
+        wider = dataclasses.replace(self, box_kind=self._grown_images(box, radii, np.dtype(sources.dtype)))
+        inputs, options = _inputs_of(wider, sources, queries, active, box, radii)
+        made = _remade(wider, inputs, options, max(self.capacity, met, counted_capacity(inputs, options, slack)))
+        made.check()
+        return made
 
     @property
     def rebuild_count(self) -> Array:
@@ -458,6 +466,13 @@ class NeighborList:
             raise ValueError("this list was made without a periodic box: leave box out.")
         checked = checked_box(box, sources, like=self.box)
         return None if checked is None else fixed_box(checked, np.dtype(sources.dtype))
+
+    def _grown_images(self, box: Box | None, radii: Radii | None, dtype: np.dtype) -> Images | None:
+        if self.box_kind is None or self.box is None or box is None:
+            return self.box_kind
+        reach = largest_known(radii, self.skin) if radii is not None else list_radius(self.cutoff or 0.0, self.skin, dtype)
+        short = bool(np.any(np.asarray(self.status) & Status.BOX_TOO_SMALL.value))
+        return grown_images(self.box_kind, (box, self.box), reach, dtype, self.source_count, short)
 
     def _geometry(self, positions: Array, queries: Array | None, box: Box | None) -> tuple[Array, Array, Array | None]:
         sources, rows = self._geometry_inputs(positions, queries)

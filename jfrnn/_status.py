@@ -34,7 +34,7 @@ _MESSAGES = {
     Status.BOX_TOO_SMALL: (
         "`box` is degenerate, or too small for the images that were looked at, so that pairs may be missing: a traced box must be "
         "at least 2.05 (cutoff + skin) wide along every periodic axis, unless jfrnn.Box(..., images=k) says over how many cells "
-        "to either side a pair may reach."
+        "to either side a pair may reach. Outside jit, search() and NeighborList.grow() see how many images a box needs."
     ),
     Status.OUT_OF_RANGE: (
         "`positions` (or `queries`) lie more than 511 lattice vectors away from a periodic box: those particles have no "

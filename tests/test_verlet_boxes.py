@@ -127,3 +127,89 @@ def test_particles_that_leave_the_range_of_a_box_are_noticed():
         nbrs.update(x.at[0, 0].add(600)).check()
     far = jfrnn.search(x.at[0, 0].add(-500), 0.3, skin=0.1, box=box, slack=2.0)
     assert masked_images(far, x.at[0, 0].add(-500)) == oracle(x.at[0, 0].add(-500), 0.3, box)
+
+
+# --- boxes that change ----------------------------------------------------------------------------------------------------
+
+
+def shrinking(ratio, steps=20):
+    """A chunk of steps in which a cell, and the particles in it, shrink to a ratio of their size; state: fractions and lengths."""
+
+    @jax.jit
+    def chunk(state, nbrs):
+        def step(_, carry):
+            (u, lengths), nbrs = carry
+            lengths = lengths * ratio ** (1 / steps)
+            return (u, lengths), nbrs.update(u * lengths, box=jfrnn.Box(lengths))
+
+        return jax.lax.fori_loop(0, steps, step, (state, nbrs))
+
+    return chunk
+
+
+def by_run_chunk(chunk, state, nbrs):
+    return jfrnn.run_chunk(chunk, state, nbrs, lambda s: s[0] * s[1], box=lambda s: jfrnn.Box(s[1]))
+
+
+def by_the_loop_of_the_readme(chunk, state, nbrs):
+    while True:
+        after, seen = chunk(state, nbrs)
+        if not seen.overflow:
+            break
+        nbrs = seen.grow(state[0] * state[1], box=jfrnn.Box(state[1]))
+    state, nbrs = after, seen
+    nbrs.check()
+    return state, nbrs
+
+
+def by_grow(chunk, state, nbrs):
+    state, nbrs = chunk(state, nbrs)
+    with pytest.raises(ValueError, match=r"too small for the images.*NeighborList.grow\(\)"):
+        nbrs.check()
+    return state, nbrs.grow(state[0] * state[1])
+
+
+@pytest.mark.parametrize(
+    ("lengths", "cutoff", "skin", "ratio", "run"),
+    [
+        ([25.75, 25.75, 25.75], 12.0, 0.5, 0.96, by_run_chunk),
+        ([25.75, 25.75, 25.75], 12.0, 0.5, 0.96, by_grow),
+        ([10.0, 9.0, 11.0], 2.5, 0.0, 0.1, by_the_loop_of_the_readme),
+    ],
+    ids=["run_chunk", "grow", "loop"],
+)
+def test_a_box_that_shrinks_until_the_cutoff_needs_more_images(lengths, cutoff, skin, ratio, run):
+    u, dtype = np.random.default_rng(5).uniform(0, 1, (5, 3)), np.float64
+    state = jnp.asarray(u, dtype), jnp.asarray(lengths, dtype)
+    nbrs = jfrnn.search(state[0] * state[1], cutoff, skin=skin, box=jfrnn.Box(lengths))
+    assert nbrs.box_kind.nearest
+    (u, now), nbrs = run(shrinking(ratio), state, nbrs)
+    nbrs.check()
+    assert not nbrs.box_kind.nearest
+    np.testing.assert_allclose(now, np.array(lengths) * ratio)
+    assert masked_images(nbrs, u * now) == oracle(u * now, cutoff, jfrnn.Box(now))
+
+
+def test_a_box_that_was_too_small_in_between_takes_more_images_too():
+    x = jnp.asarray(np.random.default_rng(6).uniform(0, 1, (6, 3)))
+    nbrs = jfrnn.search(x, 0.3, box=jfrnn.Box([1.0, 1.0, 1.0]), capacity=64)
+    narrow = jfrnn.Box([1.0, 0.5, 1.0])
+    seen = nbrs.update(x, box=narrow).update(x, box=jfrnn.Box([1.0, 1.0, 1.0]))
+    assert seen.overflow
+    grown = seen.grow(x)
+    after = grown.update(x, box=narrow)
+    after.check()
+    assert masked_images(after, x) == oracle(x, 0.3, narrow)
+
+
+def test_what_no_room_mends_is_raised():
+    x = jnp.asarray(np.random.default_rng(6).uniform(0, 1, (6, 3)))
+    nbrs = jfrnn.search(x, 0.3, box=jfrnn.Box([1.0, 1.0, 1.0]), capacity=64)
+    lost = jax.jit(lambda x, n: (x, n.update(x.at[0].set(jnp.nan))))
+    with pytest.raises(ValueError, match="hold non-finite coordinates"):
+        jfrnn.run_chunk(lost, x, nbrs, lambda x: x)
+    with pytest.raises(ValueError, match="hold non-finite coordinates"):
+        nbrs.grow(x.at[0].set(jnp.nan))
+    flat = jax.jit(lambda x, n: (x, n.update(x, box=jfrnn.Box(0 * x[0]))))
+    with pytest.raises(ValueError, match=r"lengths of periodic axes must be positive, got \[0.0, 0.0, 0.0\]"):
+        jfrnn.run_chunk(flat, x, nbrs, lambda x: x)

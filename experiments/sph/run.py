@@ -77,6 +77,8 @@ def run(scene: "FluidScene", folder: Path, how: How) -> State:
             jax.block_until_ready(s.x)
             seconds = perf_counter() - start
             health.check(scene, model, before, nbrs_before, s, steps, step)
+            if isinstance(nbrs, jfrnn.NeighborList):
+                nbrs.check()
             step += steps
             line = _keep(scene, model, s, nbrs, folder, step, how)
             text = f"t {line['time']:.4g} s · {steps / seconds:.0f} steps/s · energy {line['total']:.4g} J"
@@ -100,7 +102,10 @@ def _chunk_of_particles(model: Model, s: State, nbrs: Neighbors, steps: int) -> 
     if nbrs is None:
         return solver.advance(model, s, None, steps)
     active = None if model.enters is None else lambda s: forces.active(model, s.time)
-    return jfrnn.run_chunk(lambda s, nbrs: solver.advance(model, s, nbrs, steps), s, nbrs, lambda s: s.x, active=active)  # type: ignore[arg-type]
+    try:
+        return jfrnn.run_chunk(lambda s, nbrs: solver.advance(model, s, nbrs, steps), s, nbrs, lambda s: s.x, active=active)  # type: ignore[arg-type]
+    except ValueError:  # particles are nowhere: `health.check` finds out since which step
+        return solver.advance(model, s, nbrs, steps)
 
 
 def _steps_to_next(scene: "FluidScene", model: Model, s: State, count: int) -> int:
