@@ -110,7 +110,7 @@ class Box:
 
 
 def _real(name: str, value: Any) -> Any:  # noqa: ANN401
-    """Return floats, a traced array as it is and everything else as a NumPy array."""
+    """Return floats, a traced array as it is and everything else as a NumPy array of its own."""
     if isinstance(value, Tracer):
         if not jnp.issubdtype(value.dtype, jnp.floating):
             raise TypeError(f"{name} must be real numbers, got a traced {value.dtype}.")
@@ -118,7 +118,7 @@ def _real(name: str, value: Any) -> Any:  # noqa: ANN401
     array = np.asarray(value)
     if array.dtype.kind not in "fiu":
         raise TypeError(f"{name} must be real numbers, got {type(value).__name__} {value!r}.")
-    return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
+    return array.astype(array.dtype if array.dtype in (np.float32, np.float64) else np.float64)  # a copy, whoever changes the other
 
 
 def _per_axis(name: str, value: Any, dim: int, kinds: tuple[type, ...], what: str, least: int | None = None) -> tuple[Any, ...]:  # noqa: ANN401

@@ -16,7 +16,7 @@ from jfrnn import _warp
 from jfrnn._auto import WARP_ENGINES, default_platform, fastest_engine
 from jfrnn._backends import Inputs, Options, count_rows, list_rows
 from jfrnn._exact import Cutoff
-from jfrnn._inputs import checked_backend, checked_capacity, checked_cutoff, checked_kind, checked_size
+from jfrnn._inputs import checked_backend, checked_capacity, checked_cutoff, checked_kind, checked_size, checked_skin
 from jfrnn._pair_sum import pair_sum
 from jfrnn._runs import Filter
 from jfrnn._triangles import TRIANGLE_BACKENDS, fastest_of
@@ -28,7 +28,8 @@ class MemoryPlan:
     """Say how many bytes one search, count or pair sum takes beside the positions and values that it is given.
 
     Attributes:
-        list_bytes: The result of a search [B]: 4 per slot, 4 per row for its count, 8 for `status` and `required`.
+        list_bytes: The result of a search [B]: 4 per slot, 4 per row for its count, 8 for `status` and `required`; with a skin,
+            copies of positions and queries, and 4.
         scratch_bytes: What is needed besides while it runs [B].
         backend: The engine, never "auto".
         sums_bytes: The results of a pair sum, with a gradient that one too [B].
@@ -69,6 +70,7 @@ def memory_plan(
     dim: int = 3,
     dtype: Any = np.float32,  # noqa: ANN401
     queries: int | None = None,
+    skin: float = 0.0,
     fn: Callable[[Any, Any, Any], Any] | None = None,
     values: Any = None,  # noqa: ANN401
     gradient: bool = False,
@@ -84,6 +86,10 @@ def memory_plan(
     with "warp" in a tenth of a second. That one takes the scratch of its search, two copies of the numbers that fn reads of each j,
     one of those of each i (coordinates apart), and the sums; in a gradient, two sums for each coordinate.
 
+    Not in the plan is what lists of some scenes keep besides: of a batch 4 B per particle and query, of cutoffs per particle a
+    float each (with a skin two), of a box where images must be told apart 1 B per slot (2 B from 257 images on) and 4 B per
+    particle and query.
+
     Args:
         n: Number of particles, from 0 to 2^31 - 32.
         cutoff: Interaction radius [length], checked as in `search`; it does not change the bytes.
@@ -91,10 +97,12 @@ def memory_plan(
         dim: 2 or 3.
         dtype: Of the positions, float32 or float64.
         queries: Number of separate queries; None: the particles themselves are the queries.
+        skin: As in `search`; only whether there is one changes the bytes.
         fn: As in `pair_sum`, which is planned then.
         values: Of it, a pytree of arrays or of their shapes (`jax.ShapeDtypeStruct`), [n, ...].
         gradient: The plan is that of the sums and of a gradient in the positions, of a function of all sums of floats.
-        faces: Triangles of a wall, in 2D segments: the plan is that of `search_triangles`, compiled, cells being part of the list.
+        faces: Triangles of a wall, in 2D segments: the plan is that of `search_triangles`, compiled; the cells and a copy of the
+            wall, of faces / 2 + 2 vertices, are part of the list.
         backend: As in `search`, `pair_sum` or `search_triangles`.
         platform: JAX platform, such as "cpu" or "gpu"; default: the one on which JAX makes arrays now.
 
@@ -143,7 +151,8 @@ def memory_plan(
         scratch = _compiled_scratch(points, radius, engine, capacity)
     if capacity is None:
         return MemoryPlan(0, scratch, engine, counts_bytes=4 * rows)
-    return MemoryPlan(4 * rows * (capacity + 1) + 8, scratch, engine)
+    kept = (n + (queries or 0)) * dim * dtype.itemsize + 4 if checked_skin(skin, float(radius.radius), dtype) else 0
+    return MemoryPlan(4 * rows * (capacity + 1) + 8 + kept, scratch, engine)
 
 
 def _device_of(platform: str) -> Any:  # noqa: ANN401

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._backends import Found, Inputs, Options, count_rows, list_rows, without_inactive
+from jfrnn._backends import Inputs, Options, count_rows, list_rows, without_inactive
 from jfrnn._batch import Batch
 from jfrnn._box import (
     LARGEST_TURN,
@@ -568,11 +568,16 @@ def _update(
 
 def _remade(nbrs: NeighborList, inputs: Inputs, options: Options, capacity: int) -> NeighborList:
     """Make a list with the options of this one, and nothing of its past."""
-    return dataclasses.replace(nbrs, **found_fields(inputs, list_rows(inputs, options, capacity), nbrs.skin))
+    return dataclasses.replace(nbrs, **found_fields(inputs, options, capacity, nbrs.skin))
 
 
-def found_fields(inputs: Inputs, found: Found, skin: float) -> dict[str, Any]:
-    """Return the fields of a list that come from data."""
+@functools.partial(jax.jit, static_argnames=("options", "capacity", "skin"))
+def found_fields(inputs: Inputs, options: Options, capacity: int, skin: float) -> dict[str, Any]:
+    """Search, and return the fields of a list that come from data: the compiled program of `search`.
+
+    Being results of one program, they share no memory with the caller's arrays, or with each other: either may be donated.
+    """
+    found = list_rows(inputs, options, capacity)
     rows, sources = found.rows, without_inactive(inputs.sources, inputs.active)
     codes = None if found.images is None or found.turns is None else ImageCodes(found.images, *found.turns)
     radii = lax.stop_gradient(inputs.cutoff) if isinstance(inputs.cutoff, Radii) else None

@@ -8,7 +8,7 @@ from jax import Array
 from jax.core import Tracer
 
 from jfrnn._auto import choose_engine
-from jfrnn._backends import Inputs, Options, count_rows, list_rows
+from jfrnn._backends import Inputs, Options, count_rows
 from jfrnn._box import Box, fixed_box, images_of
 from jfrnn._inputs import (
     checked_active,
@@ -96,10 +96,12 @@ def search(
         RuntimeError: "warp" or "hashgrid" on a platform on which Warp cannot run.
         Overflow of a given capacity and non-finite coordinates are known only from data: `status`, `overflow` and `check` tell.
 
-    Memory: 4 B per slot for the list; besides it, however large space is, "warp" takes at most 64 B and "hashgrid" 84 B per
-    particle, "jax" and "brute" at most 64 MB for the block in work and 100 B per particle (float64: 125 B). See `memory_plan`. With
-    a box or a batch "warp" takes a copy of the positions besides, at most 20 B per particle (float64: 40 B); with a cutoff per
-    particle 140 B in all (float64: 180 B).
+    Memory: 4 B per slot for the list, which keeps copies of what updates look back at: with a skin positions and queries, with a
+    batch 4 B and with a cutoff per particle one float each (with a skin two). It shares no memory with the arrays that it is given,
+    so that they, or the list, may be donated (`jax.jit(..., donate_argnums=)`). Besides it, however large space is, "warp" takes at
+    most 64 B and "hashgrid" 84 B per particle, "jax" and "brute" at most 64 MB for the block in work and 100 B per particle
+    (float64: 125 B). See `memory_plan`. With a box or a batch "warp" takes a copy of the positions besides, at most 20 B per
+    particle (float64: 40 B); with a cutoff per particle 140 B in all (float64: 180 B).
     Differentiable: the list is topology, without gradient; see `NeighborList.vectors`. Jit: yes, with capacity. vmap: yes, with
     capacity. Source: cell lists (Hockney & Eastwood 1981, ch. 8); strict cutoff (Peifle 2019, §2.2).
     """
@@ -110,9 +112,8 @@ def search(
     inputs, options = problem.inputs, problem.options
     if capacity is None:
         capacity = _counted_capacity(inputs, options, slack)
-    found = list_rows(inputs, options, checked_capacity(capacity))
     return NeighborList(
-        **found_fields(inputs, found, problem.skin),
+        **found_fields(inputs, options, checked_capacity(capacity), problem.skin),
         cutoff=problem.radius,
         skin=problem.skin,
         half=options.filter.later_only,

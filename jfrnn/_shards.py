@@ -217,11 +217,11 @@ def resized(particles: Particles, sizes: Sizes) -> Particles:
         positions, ids, values = rows
         return padded(positions, 0), padded(ids, -1), jax.tree.map(lambda x: padded(x, 0), values)
 
-    if new > old:
-        kept = jax.jit(jax.shard_map(wider, mesh=mesh, in_specs=of_shards(mesh), out_specs=of_shards(mesh), check_vma=False))(kept)
-    return dataclasses.replace(
-        particles, positions=kept[0], ids=kept[1], values=kept[2], status=status, required=required, sizes=sizes
-    )
+    # also where nothing is wider: results of a program share no memory with what it is given
+    kept = jax.jit(jax.shard_map(wider, mesh=mesh, in_specs=of_shards(mesh), out_specs=of_shards(mesh), check_vma=False))(kept)
+    bounds, box = jax.jit(lambda same: same)((particles.bounds, particles.box))
+    changed = {"positions": kept[0], "ids": kept[1], "values": kept[2], "bounds": bounds, "box": box}
+    return dataclasses.replace(particles, **changed, status=status, required=required, sizes=sizes)
 
 
 def shared_bits(status: Array, mesh: Mesh) -> Array:

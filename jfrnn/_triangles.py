@@ -94,7 +94,7 @@ def search_triangles(
             )
         capacity = counted_slots(points, corners, named, radius, engine, slack)
     found = found_triangles(points, corners, named, None, radius, engine, checked_capacity(capacity))
-    return TriangleList(**found, vertices=jax.lax.stop_gradient(corners), faces=named, cutoff=radius, backend=engine)
+    return TriangleList(**found, cutoff=radius, backend=engine)
 
 
 def _checked_faces(faces: Any, dim: int, vertices: int) -> Array:  # noqa: ANN401

@@ -105,7 +105,7 @@ class TriangleList:
         cells = self.cells if vertices is None else None
         found = found_triangles(points, corners, self.faces, cells, self.cutoff, self.backend, self.capacity)
         found |= {"status": found["status"] | self.status, "required": jnp.maximum(found["required"], self.required)}
-        return dataclasses.replace(self, **found, vertices=lax.stop_gradient(corners))
+        return dataclasses.replace(self, **found)
 
     def grow(self, positions: Array, *, vertices: Array | None = None, slack: float = 1.25) -> "TriangleList":
         """Make a list with room for what overflowed, at these positions. Not inside jit: the capacity is a shape.
@@ -129,7 +129,7 @@ class TriangleList:
         counted = counted_slots(points, corners, self.faces, self.cutoff, self.backend, slack)
         capacity, cells = max(self.capacity, met, counted), self.cells if vertices is None else None
         found = found_triangles(points, corners, self.faces, cells, self.cutoff, self.backend, capacity)
-        return dataclasses.replace(self, **found, vertices=corners)
+        return dataclasses.replace(self, **found)
 
     def check(self) -> None:
         """Raise what the status bits report; wait for the device. Not inside jit: there, read `status` and `overflow`.
@@ -245,7 +245,10 @@ def find_triangles(
     backend: str,
     capacity: int | None,
 ) -> dict[str, Any]:
-    """List or count triangles: the compiled program of a search."""
+    """List or count triangles: the compiled program of a search.
+
+    With a list come the wall and its cells, so that, as results, they share no memory with the caller's arrays or another list.
+    """
     corners, finite, there = without_faults(vertices, faces)
     sound = {
         Status.NONFINITE: jnp.all(jnp.isfinite(points)),
@@ -265,7 +268,8 @@ def find_triangles(
         sound[Status.ROW_OVERFLOW] = required <= slots
     bits = [jnp.where(good, 0, bit.value).astype(jnp.int32) for bit, good in sound.items()]
     status = functools.reduce(jnp.bitwise_or, bits)
-    return {"idx": idx, "count": count, "status": status, "required": required, "cells": cells}
+    fields = {"idx": idx, "count": count, "status": status, "required": required}
+    return fields if capacity is None else fields | {"cells": cells, "vertices": vertices, "faces": faces}
 
 
 @jax.jit

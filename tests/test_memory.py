@@ -47,6 +47,15 @@ def test_warp_takes_what_was_planned(n, capacity, queries, dim, dtype):
     assert_close(plan, compiled_bytes(n, capacity, dim, dtype, "warp", queries))
 
 
+@pytest.mark.parametrize("queries", [None, 500])
+def test_what_a_list_with_a_skin_keeps_is_planned(queries, dtype):
+    plan = jfrnn.memory_plan(1000, 0.1, 8, dtype=dtype, queries=queries, skin=0.01, backend="warp")
+    x = np.random.default_rng(0).random((1000, 3)).astype(dtype)
+    asked = None if queries is None else x[:queries]
+    nbrs = jfrnn.search(x, 0.1, skin=0.01, capacity=8, queries=asked, backend="warp")
+    assert plan.list_bytes == sum(leaf.nbytes for leaf in jax.tree.leaves(nbrs))
+
+
 @pytest.mark.parametrize(
     ("backend", "queries", "dim", "dtype"),
     [*itertools.product(["warp"], [None, 500], [2, 3], [np.float32, np.float64]), ("jax", 500, 3, np.float32)],
