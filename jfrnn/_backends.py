@@ -6,7 +6,6 @@ What a pair is, and how rows are filled, the array engines share (`_exact`, `_ru
 import functools
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -30,6 +29,7 @@ from jfrnn._box import (
 from jfrnn._cells import CellAxes, build_grid, cell_edge, cell_order, grid_coordinates, open_axes, stencil_runs
 from jfrnn._exact import Cutoff, Cutoffs, Radii, is_radius, make_cutoffs
 from jfrnn._levels import Axes, Levels, level_runs, sort_by_levels
+from jfrnn._programs import compiled
 from jfrnn._runs import Candidates, Filter, Points, State, Torus, Visit, count_neighbors, fold_neighbors, list_neighbors
 from jfrnn._status import Status
 from jfrnn._warp import Rows
@@ -68,16 +68,17 @@ class Found(NamedTuple):
     turns: tuple[Array, Array | None] | None
 
 
-@functools.partial(jax.jit, static_argnames=("options", "capacity"))
+@functools.partial(compiled, static_argnames=("options", "capacity"))
 def list_rows(inputs: Inputs, options: Options, capacity: int) -> Found:
     """List the neighbors of every query: the compiled program of `search`."""
     return _find(inputs, options, capacity)
 
 
-@functools.partial(jax.jit, static_argnames="options")
-def count_rows(inputs: Inputs, options: Options) -> Array:
-    """Count the neighbors of every query, [m] int32: the compiled program of `count`."""
-    return _find(inputs, options, None).rows.counts
+@functools.partial(compiled, static_argnames="options")
+def count_rows(inputs: Inputs, options: Options) -> tuple[Array, Array]:
+    """Count the neighbors of every query, [m] int32, and return the largest number with them: the compiled program of `count`."""
+    rows = _find(inputs, options, None).rows
+    return rows.counts, rows.required
 
 
 def without_inactive(positions: Array, active: Array | None) -> Array:
@@ -141,7 +142,7 @@ def fold_pairs(inputs: Inputs, options: Options, elements: int, visit: Visit[Sta
     return fold_neighbors(candidates, cutoff, options.filter, elements, visit, out)
 
 
-@functools.partial(jax.jit, static_argnames="options")
+@functools.partial(compiled, static_argnames="options")
 def is_decidable(inputs: Inputs, options: Options) -> Array:
     """Say whether a search can answer for all particles that take part: cutoffs, box and positions are in range; [] bool."""
     return functools.reduce(jnp.logical_and, prepared(inputs, options).checks.values(), jnp.ones((), bool))

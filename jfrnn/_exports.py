@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._programs import compiled
 from jfrnn._status import Status
 
 MOST_PAIRS = 2**31 - 1  # that int32 offsets can number
@@ -54,7 +55,7 @@ def _add(a: Array, b: Array) -> Array:
     return jnp.where(a > MOST_PAIRS - b, MOST_PAIRS, a + b)
 
 
-@functools.partial(jax.jit, static_argnames="capacity")
+@functools.partial(compiled, static_argnames="capacity")
 def pair_total(count: Array, capacity: int) -> Array:
     """Add up the used slots of all rows, [] int32; more than int32 can hold are the largest int32."""
     used = jnp.minimum(count, capacity)
@@ -71,7 +72,7 @@ def row_offsets(count: Array, capacity: int) -> Array:
     return jnp.concatenate([jnp.zeros(1, jnp.int32), ends])
 
 
-@functools.partial(jax.jit, static_argnames=("sources", "total"))
+@functools.partial(compiled, static_argnames=("sources", "total"))
 def flat_pairs(idx: Array, count: Array, sources: int, total: int) -> tuple[Array, Array, Array]:
     """Return rows and sources of the pairs, [total] int32 each, padded with m and `sources`, and the offsets of the rows."""
     m, capacity = idx.shape

@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn import _fused
+from jfrnn._programs import compiled
 from jfrnn._relations import Listed, Relation, Searched, evaluate, is_fused
 from jfrnn._runs import Block, Slots
 from jfrnn._summation import bind_sum
@@ -53,7 +54,7 @@ def _element(term: Term, k: int) -> Derived:
     return make_term(summand, joined(term.operands, Groups((), (number,), ())), term.shift, (mine, theirs))
 
 
-@functools.partial(jax.jit, static_argnames=("term", "largest"))
+@functools.partial(compiled, static_argnames=("term", "largest"))
 def _find(relation: Relation, term: Term, operands: Groups, largest: bool) -> list[_Best]:
     if is_fused(relation, term):
         return _fused.extremes(relation.inputs, relation.options, term, operands, largest)

@@ -12,7 +12,8 @@ from jax.core import Tracer
 
 from jfrnn._batch import Batch
 from jfrnn._box import Box
-from jfrnn._exact import RULES, Cutoff, Radii, largest_cutoff, make_cutoff, make_cutoffs, smallest_cutoff
+from jfrnn._exact import RULES, Cutoff, Radii, is_radius, largest_cutoff, make_cutoff, smallest_cutoff
+from jfrnn._programs import on_device
 
 BACKENDS = ("auto", "jax", "warp", "hashgrid", "brute")
 _MOST_POINTS = 2**31 - 32
@@ -41,10 +42,7 @@ def checked_positions(name: str, positions: Any, like: Array | None = None) -> A
         raise ValueError(
             f"{name} must match positions ({like.dtype}, {like.shape[1]} columns), got {dtype} with {shape[1]} columns."
         )
-    if isinstance(positions, Tracer):
-        return jnp.asarray(positions)
-    with jax.ensure_compile_time_eval():  # stay concrete inside jit too: search can then count what it closes over
-        return jnp.asarray(positions)
+    return on_device(positions)  # concrete inside jit too: search can then count what it closes over
 
 
 def checked_cutoff(cutoff: Any, dtype: np.dtype) -> Cutoff:  # noqa: ANN401
@@ -98,19 +96,23 @@ def _checked_radii_of(name: str, radii: Any, size: int, what: str, like: Array) 
         raise TypeError(f"{name} must be a number, or an array of floats with one per {what}, got {_describe_array(radii)}.")
     if tuple(radii.shape) != (size,):
         raise ValueError(f"{name} must be a number, or have shape [{size}], one per {what}, got shape {list(radii.shape)}.")
-    if isinstance(radii, Tracer):
-        return radii.astype(like.dtype)
-    with jax.ensure_compile_time_eval():  # stay concrete inside jit
-        return jnp.asarray(np.asarray(radii).astype(like.dtype) if isinstance(radii, np.ndarray) else radii.astype(like.dtype))
+    return _as_dtype(radii, like.dtype)
 
 
-def largest_known(radii: Radii, skin: float) -> float | None:
-    """Return the largest cutoff with the skin, of those that are valid; None where they are traced."""
+def _as_dtype(x: Any, dtype: Any) -> Array:  # noqa: ANN401
+    """Convert an array; one that is known on the host, where no program is compiled for its shape."""
+    if isinstance(x, Tracer):
+        return x.astype(dtype)
+    return on_device(x if x.dtype == dtype else np.asarray(jax.device_get(x)).astype(dtype))
+
+
+def largest_known(radii: Radii) -> float | None:
+    """Return the largest cutoff of those that are valid, 1 where none is; None where they are traced."""
     given = [x for x in (radii.sources, radii.queries) if x is not None]
     if any(isinstance(x, Tracer) for x in given):
         return None
-    with jax.ensure_compile_time_eval():
-        return float(make_cutoffs(radii, closed=False, skin=skin).largest)
+    values: Any = np.concatenate(jax.device_get(given))
+    return float(np.max(values[is_radius(values)], initial=0)) or 1.0
 
 
 def checked_skin(skin: Any, cutoff: float, dtype: np.dtype) -> float:  # noqa: ANN401
@@ -133,7 +135,7 @@ def checked_active(active: Any, positions: Array) -> Array:  # noqa: ANN401
         raise TypeError(f"active must be an array of bool, one per particle, got {_describe_array(active)}.")
     if tuple(active.shape) != positions.shape[:1]:
         raise ValueError(f"active must have shape [{positions.shape[0]}], one bool per particle, got shape {list(active.shape)}.")
-    return jnp.asarray(active)
+    return on_device(active)
 
 
 def checked_batch(batch: Any, sources: Array, queries: Array | None) -> Batch:  # noqa: ANN401
@@ -155,14 +157,13 @@ def _checked_systems(name: str, systems: Any, size: int, what: str) -> Array:  #
     if tuple(systems.shape) != (size,):
         raise ValueError(f"{name} must have shape [{size}], the system of each {what}, got shape {list(systems.shape)}.")
     if np.can_cast(systems.dtype, np.int32):
-        return jnp.asarray(systems).astype(jnp.int32)
+        return _as_dtype(systems, jnp.int32)
     if isinstance(systems, Tracer):
         raise TypeError(f"{name} is {systems.dtype}, of which not all numbers fit into int32: convert it with .astype(jnp.int32).")
     values = np.asarray(systems)
     if values.size and not -(2**31) <= int(values.min()) <= int(values.max()) < 2**31:
         raise ValueError(f"{name} holds numbers from {values.min()} to {values.max()}, but systems are numbered in int32.")
-    with jax.ensure_compile_time_eval():
-        return jnp.asarray(values.astype(np.int32))
+    return on_device(values.astype(np.int32))
 
 
 def checked_box(box: Any, positions: Array, like: Box | None = None) -> Box | None:  # noqa: ANN401

@@ -29,6 +29,7 @@ from jfrnn._box import (
 from jfrnn._exact import Cutoff, Cutoffs, Radii, is_pair_of, make_cutoff, make_cutoffs
 from jfrnn._exports import DenseNeighbors, checked_total, flat_pairs, pair_total
 from jfrnn._inputs import checked_active, checked_box, checked_positions, checked_radii, checked_slack, largest_known
+from jfrnn._programs import at_once, compiled
 from jfrnn._runs import Filter
 from jfrnn._status import NeighborOverflowError, Status
 from jfrnn._verlet import Verlet, first_verlet, list_radius, moved_too_far
@@ -184,7 +185,7 @@ class NeighborList:
         box, radii = self._box_now(box, sources), self._radii_now(cutoff, sources, queries)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, radii, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
-        met = rounded_capacity(math.ceil(slack * int(np.max(self.required))))
+        met = rounded_capacity(math.ceil(slack * int(np.max(np.asarray(self.required)))))
         wider = dataclasses.replace(self, box_kind=self._grown_images(box, radii, np.dtype(sources.dtype)))
         inputs, options = _inputs_of(wider, sources, queries, active, box, radii)
         made = _remade(wider, inputs, options, max(self.capacity, met, counted_capacity(inputs, options, slack)))
@@ -422,7 +423,7 @@ class NeighborList:
         self._check_single()
         self._check_known()
         if not isinstance(self.count, Tracer):
-            with jax.ensure_compile_time_eval():
+            with at_once():
                 held = int(jax.device_get(pair_total(self.count, self.capacity)))
             if held > total:
                 raise ValueError(f"total={total} is too small: the list holds {held} pairs. Pass total={held} or more.")
@@ -470,7 +471,8 @@ class NeighborList:
     def _grown_images(self, box: Box | None, radii: Radii | None, dtype: np.dtype) -> Images | None:
         if self.box_kind is None or self.box is None or box is None:
             return self.box_kind
-        reach = largest_known(radii, self.skin) if radii is not None else list_radius(self.cutoff or 0.0, self.skin, dtype)
+        largest = self.cutoff or 0.0 if radii is None else largest_known(radii)
+        reach = None if largest is None else list_radius(largest, self.skin, dtype)
         short = bool(np.any(np.asarray(self.status) & Status.BOX_TOO_SMALL.value))
         return grown_images(self.box_kind, (box, self.box), reach, dtype, self.source_count, short)
 
@@ -509,8 +511,8 @@ def rounded_capacity(slots: int) -> int:
 
 def counted_capacity(inputs: Inputs, options: Options, slack: float) -> int:
     """Count the neighbors of concrete positions and return a capacity that holds `slack` times the longest row."""
-    with jax.ensure_compile_time_eval():
-        longest = int(np.max(count_rows(inputs, options), initial=0))
+    with at_once():
+        longest = int(count_rows(inputs, options)[1])
     wanted = math.ceil(max(longest, 1) * slack)
     return min(rounded_capacity(wanted), max(wanted, inputs.sources.shape[0]))
 
@@ -544,7 +546,7 @@ def _inputs_of(
     return Inputs(sources, queries, active, box, cutoff, nbrs.batch), options
 
 
-@jax.jit
+@compiled
 def _update(
     nbrs: NeighborList, sources: Array, queries: Array | None, active: Array | None, box: Box | None, radii: Radii | None
 ) -> NeighborList:
@@ -568,12 +570,12 @@ def _update(
 
 def _remade(nbrs: NeighborList, inputs: Inputs, options: Options, capacity: int) -> NeighborList:
     """Make a list with the options of this one, and nothing of its past."""
-    return dataclasses.replace(nbrs, **found_fields(inputs, options, capacity, nbrs.skin))
+    return dataclasses.replace(nbrs, **found_fields(inputs, options, capacity, nbrs.skin > 0))
 
 
-@functools.partial(jax.jit, static_argnames=("options", "capacity", "skin"))
-def found_fields(inputs: Inputs, options: Options, capacity: int, skin: float) -> dict[str, Any]:
-    """Search, and return the fields of a list that come from data: the compiled program of `search`.
+@functools.partial(compiled, static_argnames=("options", "capacity", "moving"))
+def found_fields(inputs: Inputs, options: Options, capacity: int, moving: bool) -> dict[str, Any]:
+    """Search, and return the fields of a list that come from data; `moving`: it has a skin. The compiled program of `search`.
 
     Being results of one program, they share no memory with the caller's arrays, or with each other: either may be donated.
     """
@@ -581,7 +583,7 @@ def found_fields(inputs: Inputs, options: Options, capacity: int, skin: float) -
     rows, sources = found.rows, without_inactive(inputs.sources, inputs.active)
     codes = None if found.images is None or found.turns is None else ImageCodes(found.images, *found.turns)
     radii = lax.stop_gradient(inputs.cutoff) if isinstance(inputs.cutoff, Radii) else None
-    verlet = first_verlet(sources, inputs.queries, inputs.box, radii) if skin else None
+    verlet = first_verlet(sources, inputs.queries, inputs.box, radii) if moving else None
     fields = {"idx": rows.idx, "count": rows.counts, "status": rows.status, "required": rows.required}
     return fields | {"verlet": verlet, "box": lax.stop_gradient(inputs.box), "images": codes, "radii": radii, "batch": inputs.batch}
 
@@ -594,7 +596,7 @@ def _pair_cutoff(cutoff: Cutoff | Radii | None, closed: bool) -> Cutoff | Cutoff
     return make_cutoffs(lax.stop_gradient(cutoff), closed)
 
 
-@functools.partial(jax.jit, static_argnames="closed")
+@functools.partial(compiled, static_argnames="closed")
 def _vectors(
     idx: Array, count: Array, sources: Array, rows: Array, given: Cutoff | Radii | None, closed: bool
 ) -> tuple[Array, Array]:
@@ -632,13 +634,13 @@ def _slots(idx: Array, count: Array, images: _ImagesMade, sources: Array, rows: 
     return _Slots(used, neighbor, difference, jnp.where(used[..., None], shifts, 0))
 
 
-@functools.partial(jax.jit, static_argnames="kind")
+@functools.partial(compiled, static_argnames="kind")
 def _shifts(idx: Array, count: Array, images: _ImagesMade, sources: Array, rows: Array, box: Box, kind: Images) -> Array:
     lattice = make_lattice(box, kind, np.dtype(sources.dtype))
     return lax.stop_gradient(_slots(idx, count, images, sources, rows, lattice).shifts).astype(jnp.int32)
 
 
-@functools.partial(jax.jit, static_argnames=("kind", "closed"))
+@functools.partial(compiled, static_argnames=("kind", "closed"))
 def _periodic_vectors(
     idx: Array,
     count: Array,
@@ -676,7 +678,7 @@ def _turns_now(
     return turns[0], turns[-1]
 
 
-@jax.jit
+@compiled
 def norms(vectors: Array) -> Array:
     largest = lax.stop_gradient(jnp.max(jnp.abs(vectors), axis=-1, initial=0))
     apart = largest > 0

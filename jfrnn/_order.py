@@ -15,6 +15,7 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn._inputs import checked_positions
+from jfrnn._programs import at_once, compiled
 
 Words = tuple[Array, Array]  # the high and the low half of a key, uint32
 
@@ -150,20 +151,20 @@ def hilbert_order(positions: Array, size: Array) -> Array:
     return _sort_order(positions, size, _hilbert_words)
 
 
-@functools.partial(jax.jit, static_argnames=("bits", "curve"))
+@functools.partial(compiled, static_argnames=("bits", "curve"))
 def _encode(coords: Array, bits: int, curve: Callable[[list[Array], int], Words]) -> Array:
     dim = coords.shape[-1]
     mask = np.uint32(2**bits - 1)
     return _pack(*curve([coords[..., axis].astype(jnp.uint32) & mask for axis in range(dim)], bits), dim * bits)
 
 
-@functools.partial(jax.jit, static_argnames=("dim", "bits", "curve"))
+@functools.partial(compiled, static_argnames=("dim", "bits", "curve"))
 def _decode(keys: Array, dim: int, bits: int, curve: Callable[[Words, int, int], list[Array]]) -> Array:
     mask = np.uint32(2**bits - 1)
     return jnp.stack([(c & mask).astype(jnp.int32) for c in curve(_unpack(keys, dim * bits), dim, bits)], axis=-1)
 
 
-@functools.partial(jax.jit, static_argnames="curve")
+@functools.partial(compiled, static_argnames="curve")
 def _sort_order(positions: Array, size: Array, curve: Callable[[list[Array], int], Words]) -> Array:
     finite = jnp.all(jnp.isfinite(positions), axis=1)
     high, low = curve(_cells_from_lowest(positions.T, size, finite), _SORT_BITS)
@@ -386,10 +387,15 @@ def _check_range(name: str, values: Any, limit: int, advice: str) -> None:  # no
     """Refuse concrete integers outside [0, limit), before a conversion could drop their high bits."""
     if isinstance(values, Tracer) or not values.size:
         return
-    with jax.ensure_compile_time_eval():  # concrete inside jit too
-        low, high = int(values.min()), int(values.max())
+    with at_once():  # concrete inside jit too
+        low, high = (int(x) for x in _range(values))
     if not 0 <= low <= high < limit:
         raise ValueError(f"{name} must be in [0, {limit}), got values from {low} to {high}: {advice}.")
+
+
+@compiled
+def _range(values: Array) -> tuple[Array, Array]:
+    return jnp.min(values), jnp.max(values)
 
 
 def _checked_cell_size(cell_size: Any, dtype: np.dtype) -> np.floating:  # noqa: ANN401

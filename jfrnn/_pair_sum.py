@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax import Array
 
 from jfrnn._auto import platform_of
@@ -12,6 +11,7 @@ from jfrnn._backends import Options
 from jfrnn._box import Box
 from jfrnn._inputs import checked_backend, checked_flag
 from jfrnn._neighbors import NeighborList
+from jfrnn._programs import on_device
 from jfrnn._search import Problem, checked_problem
 
 REDUCTIONS = ("sum", "max", "min")
@@ -164,6 +164,6 @@ def _checked_values(name: str, values: Any, size: int, what: str) -> Any:  # noq
                 f"{name}{jax.tree_util.keystr(path)} must have shape [{size}, ...], one row per {what}, got {list(leaf.shape)}: "
                 "what all pairs share fn may close over."
             )
-        return jnp.asarray(leaf)
+        return on_device(leaf)
 
     return jax.tree_util.tree_map_with_path(checked, values)

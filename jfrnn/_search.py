@@ -113,7 +113,7 @@ def search(
     if capacity is None:
         capacity = _counted_capacity(inputs, options, slack)
     return NeighborList(
-        **found_fields(inputs, options, checked_capacity(capacity), problem.skin),
+        **found_fields(inputs, options, checked_capacity(capacity), problem.skin > 0),
         cutoff=problem.radius,
         skin=problem.skin,
         half=options.filter.later_only,
@@ -165,7 +165,7 @@ def count(
     Memory: as in `search`, without the list. Differentiable: no (integers). Jit: yes. vmap: yes.
     """
     problem = checked_problem(positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, 0.0, active)
-    return count_rows(problem.inputs, problem.options)
+    return count_rows(problem.inputs, problem.options)[0]
 
 
 class Problem(NamedTuple):
@@ -212,8 +212,9 @@ def checked_problem(
     else:
         if keep.later_only and radii.rule in ("gather", "scatter"):
             raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
-        radius, skin = None, checked_skin(skin, largest_known(radii, 0.0) or 0.0, dtype)
-        reach = largest_known(radii, skin)
+        largest = largest_known(radii)
+        radius, skin = None, checked_skin(skin, largest or 0.0, dtype)
+        reach = None if largest is None else list_radius(largest, skin, dtype)
     box = None if box is None else checked_box(box, sources)
     kind = None if box is None else images_of(box, reach, dtype, sources.shape[0])
     engine = choose_engine(

@@ -16,6 +16,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jfrnn import _fused
+from jfrnn._programs import compiled
 from jfrnn._relations import Relation, Searched, sum_pairs
 from jfrnn._terms import Derived, Groups, Term, chosen, is_moving, joined, tangent, transposed
 
@@ -112,7 +113,7 @@ def _batch(args: tuple, dims: tuple, **params: Any) -> tuple[list[Array], list[i
     return sums, [0] * len(sums)
 
 
-_compiled = functools.partial(jax.jit, static_argnames=("term", "structure", "compensated"))(_sums)
+_compiled = functools.partial(compiled, static_argnames=("term", "structure", "compensated"))(_sums)
 _pair_sum_p.def_impl(lambda *args, **params: _compiled(*args, **params))
 _pair_sum_p.def_abstract_eval(_result_shapes)
 ad.primitive_jvps[_pair_sum_p] = _jvp

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -11,6 +10,7 @@ from jax.core import Tracer
 from jfrnn import _warp
 from jfrnn._auto import choose_engine, platform_of
 from jfrnn._inputs import checked_capacity, checked_cutoff, checked_positions, checked_slack
+from jfrnn._programs import on_device
 from jfrnn._triangles_list import TriangleList, counted_slots, found_triangles
 
 TRIANGLE_BACKENDS = ("auto", "jax", "warp", "bvh")
@@ -107,8 +107,7 @@ def _checked_faces(faces: Any, dim: int, vertices: int) -> Array:  # noqa: ANN40
         raise ValueError(f"faces must have shape [f, {dim}], the vertices of {kind} in {dim}D, got shape {list(faces.shape)}.")
     if isinstance(faces, Tracer):
         return jnp.clip(faces, -1, vertices).astype(jnp.int32) if np.iinfo(faces.dtype).max > vertices else faces.astype(jnp.int32)
-    with jax.ensure_compile_time_eval():
-        return jnp.asarray(np.clip(np.asarray(faces).astype(np.int64), -1, vertices).astype(np.int32))
+    return on_device(np.clip(np.asarray(faces).astype(np.int64), -1, vertices).astype(np.int32))
 
 
 def _chosen_engine(backend: Any, points: Array) -> str:  # noqa: ANN401

@@ -15,6 +15,7 @@ from jfrnn import _triangles_warp
 from jfrnn._exact import Cutoff, make_cutoff
 from jfrnn._inputs import checked_positions, checked_slack
 from jfrnn._neighbors import norms, rounded_capacity
+from jfrnn._programs import at_once, compiled
 from jfrnn._status import NeighborOverflowError, Status
 from jfrnn._triangles_cells import TriangleCells, sort_triangles, without_faults
 from jfrnn._triangles_closest import make_normals, nearest_of, normal_at
@@ -215,7 +216,7 @@ class TriangleList:
 
 def counted_slots(points: Array, vertices: Array, faces: Array, cutoff: float, backend: str, slack: float) -> int:
     """Count the triangles near concrete positions and return a capacity that holds `slack` times the longest row."""
-    with jax.ensure_compile_time_eval():
+    with at_once():
         found = found_triangles(points, vertices, faces, None, cutoff, backend, None)
         longest = int(found["required"])
     return rounded_capacity(math.ceil(max(longest, 1) * slack))
@@ -235,7 +236,7 @@ def found_triangles(
     return find_triangles(*lax.stop_gradient((points, vertices, faces, cells)), radius, backend, capacity)
 
 
-@functools.partial(jax.jit, static_argnames=("backend", "capacity"))
+@functools.partial(compiled, static_argnames=("backend", "capacity"))
 def find_triangles(
     points: Array,
     vertices: Array,
@@ -272,7 +273,7 @@ def find_triangles(
     return fields if capacity is None else fields | {"cells": cells, "vertices": vertices, "faces": faces}
 
 
-@jax.jit
+@compiled
 def _nearest_in_rows(tri: TriangleList, points: Array, vertices: Array) -> tuple[Array, Array, Array]:
     """Return vectors to nearest points [n, capacity, d], on which feature they lie, and which slots hold a pair."""
     used = lax.broadcasted_iota(jnp.int32, tri.idx.shape, 1) < tri.count[:, None]
@@ -286,7 +287,7 @@ def _nearest_in_rows(tri: TriangleList, points: Array, vertices: Array) -> tuple
     return jnp.where(mask[..., None], vectors, 0), feature, mask
 
 
-@jax.jit
+@compiled
 def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> SignedDistance:
     corners, finite, there = without_faults(vertices, tri.faces)
     fixed, used = lax.stop_gradient(corners), jnp.minimum(tri.count, tri.capacity)
