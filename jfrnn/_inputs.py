@@ -1,7 +1,7 @@
 """What a search accepts: every argument checked while tracing, with errors that name it, what came and what to do."""
 
 import math
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
 
 import jax
@@ -36,6 +36,7 @@ def checked_positions(name: str, positions: Any, like: Array | None = None) -> A
         )
     if len(shape) != 2 or shape[1] not in (2, 3):
         raise ValueError(f"{name} must have shape [n, 2] or [n, 3], one row per particle, got shape {list(shape)}.")
+    check_is_known(name, shape)
     if shape[0] > _MOST_POINTS:
         raise ValueError(f"{name} hold {shape[0]} particles, but indices are int32: at most {_MOST_POINTS}.")
     if like is not None and (dtype, shape[1]) != (like.dtype, like.shape[1]):
@@ -43,6 +44,17 @@ def checked_positions(name: str, positions: Any, like: Array | None = None) -> A
             f"{name} must match positions ({like.dtype}, {like.shape[1]} columns), got {dtype} with {shape[1]} columns."
         )
     return on_device(positions)  # concrete inside jit too: search can then count what it closes over
+
+
+def check_is_known(name: str, shape: tuple[Any, ...]) -> None:
+    """Raise where a shape holds a symbol of `jax.export` in place of a number."""
+    symbols = [str(size) for size in shape if not isinstance(size, Integral)]
+    if symbols:
+        raise ValueError(
+            f"{name} must have a shape of numbers, got ({', '.join(map(str, shape))}): kernels and scratch are made for a number "
+            f"of rows, not for the symbol {symbols[0]}. Export one program for each number, or one for the most rows that come: "
+            "`search`, `count` and `pair_sum` take active= for those that are there."
+        )
 
 
 def checked_cutoff(cutoff: Any, dtype: np.dtype) -> Cutoff:  # noqa: ANN401

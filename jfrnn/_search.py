@@ -103,7 +103,9 @@ def search(
     (float64: 125 B). See `memory_plan`. With a box or a batch "warp" takes a copy of the positions besides, at most 20 B per
     particle (float64: 40 B); with a cutoff per particle 140 B in all (float64: 180 B).
     Differentiable: the list is topology, without gradient; see `NeighborList.vectors`. Jit: yes, with capacity. vmap: yes, with
-    capacity. Source: cell lists (Hockney & Eastwood 1981, ch. 8); strict cutoff (Peifle 2019, §2.2).
+    capacity. `jax.export`: yes, with `disabled_checks=[jax.export.DisabledSafetyCheck.custom_call("jfrnn")]`; a process that runs
+    such a program imports jfrnn of the same version first. Shapes are numbers, not symbols.
+    Source: cell lists (Hockney & Eastwood 1981, ch. 8); strict cutoff (Peifle 2019, §2.2).
     """
     problem = checked_problem(
         positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, skin, active

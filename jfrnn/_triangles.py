@@ -9,7 +9,7 @@ from jax.core import Tracer
 
 from jfrnn import _warp
 from jfrnn._auto import choose_engine, platform_of
-from jfrnn._inputs import checked_capacity, checked_cutoff, checked_positions, checked_slack
+from jfrnn._inputs import check_is_known, checked_capacity, checked_cutoff, checked_positions, checked_slack
 from jfrnn._programs import on_device
 from jfrnn._triangles_list import TriangleList, counted_slots, found_triangles
 
@@ -105,6 +105,7 @@ def _checked_faces(faces: Any, dim: int, vertices: int) -> Array:  # noqa: ANN40
         raise TypeError(f"faces must be an array of integers of shape [f, {dim}], the vertices of {kind}, got {given}.")
     if len(faces.shape) != 2 or faces.shape[1] != dim:
         raise ValueError(f"faces must have shape [f, {dim}], the vertices of {kind} in {dim}D, got shape {list(faces.shape)}.")
+    check_is_known("faces", faces.shape)
     if isinstance(faces, Tracer):
         return jnp.clip(faces, -1, vertices).astype(jnp.int32) if np.iinfo(faces.dtype).max > vertices else faces.astype(jnp.int32)
     return on_device(np.clip(np.asarray(faces).astype(np.int64), -1, vertices).astype(np.int32))
