@@ -74,6 +74,7 @@ class _Calls:
     def launch(self, buffers: list[Buffer]) -> None:
         """Launch what the commands say, on these buffers."""
         with self._lock:
+            self._stream.device.make_current()  # for the thread that answers in place of another one
             here = [buffer.data for buffer in buffers]
             shapes = tuple(buffer.dims[k] for buffer in buffers for k in range(buffer.rank))
             key = (*here, *shapes)

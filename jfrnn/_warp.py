@@ -224,7 +224,12 @@ def scratch_bytes(engine: str, platform: str, n: int, m: int, dim: int, double: 
 
 @kernel
 def _cpu_callable(variant: Variant) -> Kernel:
-    return _kernel_on_cpu("cells_cpu", variant, _run_cells_on_cpu)
+    types = _types(variant)
+
+    def run(*arrays: Any) -> None:  # noqa: ANN401
+        _run_cells_on_cpu(variant, _named(types, arrays))
+
+    return on_cpu(_name("cells_cpu", variant), run, types, 3 + variant.lists)
 
 
 @kernel
@@ -240,30 +245,40 @@ def on_cuda(name: str, types: dict[str, Any], outputs: int, commands: Callable[.
     return Kernel(name, types, outputs, _cuda.serve(load_warp(), [kind.dtype for kind in types.values()], commands))
 
 
-_one_on_cpu = threading.Lock()  # is served at a time: it takes all cores, and a hash grid is kept for all
+_one_at_a_time = threading.Lock()  # is served: on the CPU it takes all cores, and a hash grid is kept for all
 
 
 def on_cpu(name: str, run: Callable[..., None], types: dict[str, Any], outputs: int) -> Kernel:
-    """Return what calls `run` with a `warp.array` for each buffer when XLA calls."""
+    """Return what calls `run` with a `warp.array` for each buffer when XLA calls on the CPU."""
     wp, dtypes = load_warp(), [kind.dtype for kind in types.values()]
 
     def serve(frame: CallFrame) -> None:
-        device, buffers = wp.get_device("cpu"), zip(frame.buffers(), dtypes, strict=True)
-        arrays = [wp.array(ptr=x.data, shape=x.shape, dtype=dtype, device=device) for x, dtype in buffers]
-        with _one_on_cpu:
+        arrays = _arrays(wp, frame, dtypes, wp.get_device("cpu"))
+        with _one_at_a_time:
             run(*arrays)
 
     return Kernel(name, types, outputs, serve)
 
 
-def _kernel_on_cpu(name: str, variant: Variant, run: Callable[..., None], radius: float | None = None) -> Kernel:
-    """Return what XLA calls: positions, queries and cutoff in; [rows,] counts, info and scratch out.
+def _on_stream(name: str, run: Callable[..., None], types: dict[str, Any], outputs: int) -> Kernel:
+    """Return what calls `run` as `on_cpu` does, on CUDA, where it launches on the stream of the call."""
+    wp, dtypes = load_warp(), [kind.dtype for kind in types.values()]
+    streams: dict[int, Any] = {}  # Warp forgets one that is gone
 
-    One that knows its radius bears it in its name.
-    """
-    types = _types(variant)
-    full_name = _name(name, variant) + ("" if radius is None else f"_{radius.hex()}")
-    return on_cpu(full_name, lambda *arrays: run(variant, _named(types, arrays)), types, 3 + variant.lists)
+    def serve(frame: CallFrame) -> None:
+        device, address = wp.get_cuda_device(frame.device()), frame.stream()
+        with _one_at_a_time:
+            if address not in streams:
+                streams[address] = wp.Stream(device, cuda_stream=address)
+            with wp.ScopedStream(streams[address], sync_enter=False):
+                run(*_arrays(wp, frame, dtypes, device))
+
+    return Kernel(name, types, outputs, serve)
+
+
+def _arrays(wp: Any, frame: CallFrame, dtypes: Sequence[Any], device: Any) -> list[Any]:  # noqa: ANN401
+    buffers = zip(frame.buffers(), dtypes, strict=True)
+    return [wp.array(ptr=x.data, shape=x.shape, dtype=dtype, device=device) for x, dtype in buffers]
 
 
 def _types(variant: Variant) -> dict[str, Any]:
@@ -641,16 +656,28 @@ def hashgrid_neighbors(
             f"the backend 'hashgrid' needs warp-lang 1.19: the HashGrid of {version} can list a pair twice. {INSTALL}"
         )
 
-    def make(variant: Variant) -> Any:  # noqa: ANN401
-        return _hashgrid_callable(variant, radius)
+    def on(cuda: bool) -> Callable[..., Rows]:
+        def make(variant: Variant) -> Any:  # noqa: ANN401
+            return _hashgrid_callable(variant, radius, cuda)
 
-    return _call("hashgrid", make, sources, queries, cutoff, None, None, keep, capacity)
+        def call(sources: Array, queries: Array | None, cutoff: Cutoff) -> Rows:
+            return _call("hashgrid", make, sources, queries, cutoff, None, None, keep, capacity)
+
+        return call
+
+    return lax.platform_dependent(sources, queries, cutoff, cpu=on(False), cuda=on(True))
 
 
 @kernel
-def _hashgrid_callable(variant: Variant, radius: float) -> Kernel:
+def _hashgrid_callable(variant: Variant, radius: float, cuda: bool) -> Kernel:
+    """Return what searches on a platform; it knows its radius, and bears it in its name."""
     bounds = make_cutoff(radius, np.dtype(np.float64 if variant.double else np.float32), variant.closed)
-    return _kernel_on_cpu("hashgrid", variant, functools.partial(_run_hashgrid, bounds), radius)
+    types, name = _types(variant), _name("hashgrid_cuda" if cuda else "hashgrid_cpu", variant)
+
+    def run(*arrays: Any) -> None:  # noqa: ANN401
+        _run_hashgrid(bounds, variant, _named(types, arrays))
+
+    return (_on_stream if cuda else on_cpu)(f"{name}_{radius.hex()}", run, types, 3 + variant.lists)
 
 
 def _run_hashgrid(bounds: Cutoff, variant: Variant, arrays: _Arrays) -> None:

@@ -11,7 +11,7 @@ import pytest
 from jfrnn import _cuda, _ffi, _launch
 
 NAME = b"called@here"
-DEVICES = [SimpleNamespace(alias=f"cuda:{k}") for k in range(2)]  # not hashable, as those of Warp
+DEVICES = [SimpleNamespace(alias=f"cuda:{k}", make_current=lambda: None) for k in range(2)]  # not hashable, as those of Warp
 
 
 class Array:
