@@ -15,7 +15,7 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn._inputs import checked_positions
-from jfrnn._programs import at_once, compiled
+from jfrnn._programs import at_once, compiled, on_device
 
 Words = tuple[Array, Array]  # the high and the low half of a key, uint32
 
@@ -143,7 +143,7 @@ def sort_order(positions: Array, cell_size: float, *, curve: str = "hilbert") ->
     size = _checked_cell_size(cell_size, np.dtype(positions.dtype))
     if not isinstance(curve, str) or curve not in _CURVES:
         raise ValueError(f"curve must be one of {', '.join(map(repr, _CURVES))}, got {curve!r}.")
-    return _sort_order(positions, jnp.asarray(size), _CURVES[curve])
+    return _sort_order(positions, on_device(size), _CURVES[curve])
 
 
 def hilbert_order(positions: Array, size: Array) -> Array:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.core import Tracer
 
 from jfrnn._backends import Inputs, Options, is_decidable, without_inactive
 from jfrnn._box import Box, Images, Lattice, make_lattice, translation
@@ -16,21 +17,23 @@ from jfrnn._exact import Radii, make_cutoffs
 from jfrnn._extremes import bind_extremes
 from jfrnn._inputs import checked_cutoff
 from jfrnn._neighbors import NeighborList
+from jfrnn._programs import compiled, on_device
 from jfrnn._relations import Listed, Relation, Searched
 from jfrnn._summation import bind_sum
-from jfrnn._terms import OF_QUERIES, OF_SOURCES, Groups, Labels, Summand, chosen, fresh_labels, traced
+from jfrnn._terms import OF_QUERIES, OF_SOURCES, Groups, Labels, Summand, Term, chosen, fresh_labels, traced
 
 
 class Pairs(NamedTuple):
     """Which pairs, and what their displacements are made of."""
 
-    relations: tuple[Relation, ...]
+    relation: Relation
+    half: bool  # each pair stands there once: its mirror image is summed, too
     sources: Array
     rows: Array
     lattice: Lattice | None
     largest: Any  # cutoff
     directionless: bool
-    decidable: Array | None
+    decidable: tuple[Inputs, Options] | None  # what says so
 
 
 def searched(inputs: Inputs, options: Options) -> Pairs:
@@ -38,11 +41,11 @@ def searched(inputs: Inputs, options: Options) -> Pairs:
     sources, queries, active, box, cutoff, _ = inputs
     fixed = lax.stop_gradient(inputs._replace(sources=without_inactive(sources, active), active=None))
     relation, several = Searched(fixed, options), isinstance(cutoff, Radii)
-    decidable = is_decidable(inputs, options) if several or box is not None else None
+    decidable = (inputs, options) if several or box is not None else None
     largest = make_cutoffs(cutoff, options.closed).largest if isinstance(cutoff, Radii) else cutoff.radius
     lattice = _lattice(box, options.images, sources)
     rows = sources if queries is None else queries
-    return Pairs((relation,), sources, rows, lattice, largest, relation.symmetric, decidable)
+    return Pairs(relation, False, sources, rows, lattice, largest, relation.symmetric, decidable)
 
 
 def listed(
@@ -70,14 +73,9 @@ def listed(
     _, mask, shifts = nbrs._geometry(fixed, fixed_rows if nbrs.own_queries else None, fixed_box)
     directionless = not nbrs.own_queries and (nbrs.radii is None or nbrs.radii.rule not in ("gather", "scatter"))
     relation = Listed(nbrs.idx, mask, shifts, nbrs.source_count, symmetric=directionless and not nbrs.half)
-    relations: tuple[Relation, ...] = (relation,)
-    if nbrs.half:  # its mirror image, in which no pair of a particle with itself stands again
-        apart = nbrs.idx != lax.iota(jnp.int32, nbrs.idx.shape[0])[:, None]
-        apart = apart if shifts is None else apart | (shifts != 0).any(axis=-1)
-        relations = relation, Listed(nbrs.idx, mask & apart, shifts, nbrs.source_count, symmetric=False, flipped=True)
     lattice = _lattice(nbrs._box_now(box, sources), nbrs.box_kind, sources)
     largest = nbrs.cutoff if nbrs.radii is None else make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest
-    return Pairs(relations, sources, rows, lattice, largest, directionless, None)
+    return Pairs(relation, nbrs.half, sources, rows, lattice, largest, directionless, None)
 
 
 def _lattice(box: Box | None, images: Images | None, like: Array) -> Lattice | None:
@@ -106,15 +104,36 @@ def reduced(
     if reduce != "sum" and not all(jnp.issubdtype(x.dtype, jnp.floating) for x in term.summands):
         raise TypeError(f"fn must return floats for reduce={reduce!r}, whose rows may be infinite: convert them with .astype.")
     operands = chosen(operands, needed)
+    known = not isinstance(pairs.sources, Tracer)
+    operands = Groups(
+        *(tuple(_numbers(x, known) if isinstance(x, jax.ShapeDtypeStruct) else x for x in group) for group in operands)
+    )
     operands = operands._replace(shared=(*closed_over, *operands.shared))
-    if reduce == "sum":
-        parts = (bind_sum(relation, term, operands, compensated) for relation in pairs.relations)
-        leaves = functools.reduce(lambda a, b: [x + y for x, y in zip(a, b, strict=True)], parts)
+    if reduce != "sum":
+        leaves = bind_extremes(pairs.relation, term, operands, reduce == "max")
+    elif pairs.half:
+        leaves = _sums_of_half(pairs.relation, term, operands, compensated)
     else:
-        leaves = bind_extremes(pairs.relations[0], term, operands, reduce == "max")
+        leaves = bind_sum(pairs.relation, term, operands, compensated)
     if pairs.decidable is not None:
-        leaves = [_marked(x, pairs.decidable) for x in leaves]
+        leaves = _marked_all(leaves, *pairs.decidable)
     return jax.tree.unflatten(structure[0], leaves)
+
+
+@functools.partial(compiled, static_argnames=("term", "compensated"))
+def _sums_of_half(listed: Listed, term: Term, operands: Groups, compensated: bool) -> list[Array]:
+    """Sum over a half list and over its mirror image, in which no pair of a particle with itself stands again."""
+    apart = listed.idx != lax.iota(jnp.int32, listed.idx.shape[0])[:, None]
+    apart = apart if listed.shifts is None else apart | (listed.shifts != 0).any(axis=-1)
+    mirrored = dataclasses.replace(listed, mask=listed.mask & apart, flipped=True)
+    parts = (bind_sum(relation, term, operands, compensated) for relation in (listed, mirrored))
+    return [x + y for x, y in zip(*parts, strict=True)]
+
+
+def _numbers(like: jax.ShapeDtypeStruct, known: bool) -> Array:
+    """Number particles: while tracing by the program, where they are known on the host, which needs no program."""
+    n = like.shape[0]
+    return on_device(np.arange(n, dtype=np.int32)) if known else lax.iota(jnp.int32, n)
 
 
 def _summand(
@@ -129,7 +148,7 @@ def _summand(
     dtype = sources.dtype
     harmless = jnp.zeros(sources.shape[1], dtype).at[0].set(jnp.asarray(pairs.largest, dtype) / 2)
     turning = [] if lattice is None else [lattice.matrix]
-    numbers = [lax.iota(jnp.int32, len(x)) for x in (rows, sources)]
+    numbers = [jax.ShapeDtypeStruct((len(x),), np.int32) for x in (rows, sources)]  # arrays where they are needed
     (own, own_tree), (others, other_tree) = jax.tree.flatten(mine), jax.tree.flatten(theirs)
     operands = Groups((harmless, *turning), (rows, numbers[0], *own), (sources, numbers[1], *others))
     structure: list = []
@@ -178,6 +197,12 @@ def _summable(x: Any, dtype: np.dtype) -> Array:  # noqa: ANN401
         raise TypeError(f"fn must return floats or integers, got {array.dtype}: convert it, e.g. with .astype(jnp.int32).")
     is_loose = jnp.issubdtype(array.dtype, jnp.floating) and jax.typeof(array).weak_type
     return array.astype(dtype if is_loose else array.dtype)
+
+
+@functools.partial(compiled, static_argnames="options")
+def _marked_all(leaves: list[Array], inputs: Inputs, options: Options) -> list[Array]:
+    decidable = is_decidable(inputs, options)
+    return [_marked(x, decidable) for x in leaves]
 
 
 def _marked(x: Array, decidable: Array) -> Array:

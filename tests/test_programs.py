@@ -1,0 +1,198 @@
+"""How many programs an eager call compiles for a new number of particles, and how many the library keeps."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jfrnn
+from jfrnn import _programs
+
+COMPILED = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, _, **__: COMPILED.append(event) if event.endswith("backend_compile_duration") else None
+)
+BOX = jfrnn.Box([4.0, 4.0, 4.0])
+SIZES = iter(range(40, 400))
+
+
+def compiled_by(call, *args, **kwargs):
+    before = len(COMPILED)
+    jax.block_until_ready(call(*args, **kwargs))
+    return len(COMPILED) - before
+
+
+def scene(n):
+    return jax.device_put((np.random.default_rng(n).random((n, 3)) * 4).astype(np.float32))
+
+
+def energy(r, i, j):
+    return (r * r).sum()
+
+
+SEARCHES = {
+    "open": lambda x: {},
+    "NumPy": lambda x: {},
+    "skin": lambda x: {"skin": 0.1},
+    "skin and active": lambda x: {"skin": 0.1, "active": np.arange(len(x)) > 3},
+    "active": lambda x: {"active": jax.device_put(np.arange(len(x)) > 3)},
+    "queries": lambda x: {"queries": jax.device_put(np.asarray(x)[::2])},
+    "batch": lambda x: {"batch": np.arange(len(x)) % 3},
+    "box": lambda x: {"box": BOX},
+}
+
+
+def warm(kind):
+    """Compile what no number of particles changes."""
+    x = scene(next(SIZES))
+    return jfrnn.search(x, 0.6, **SEARCHES[kind](x))
+
+
+@pytest.mark.parametrize("kind", SEARCHES)
+def test_a_search_of_a_new_size_compiles_a_count_and_a_list(kind):
+    warm(kind)
+    x = scene(next(SIZES))
+    options = SEARCHES[kind](x)
+    x = np.asarray(x) if kind == "NumPy" else x
+    assert compiled_by(jfrnn.search, x, 0.6, **options) == 2
+    assert compiled_by(jfrnn.search, x, 0.6, **options) == 0
+    counted = {name: value for name, value in options.items() if name != "skin"}
+    assert compiled_by(jfrnn.count, x, 0.6, **counted) == 0  # the search counted first
+
+
+def test_a_search_with_a_capacity_compiles_one_program():
+    warm("open")
+    x = scene(next(SIZES))
+    assert compiled_by(jfrnn.search, x, 0.6, capacity=16) == 1
+    assert compiled_by(jfrnn.count, x, 0.6) == 1
+    assert compiled_by(jfrnn.count, np.asarray(x), 0.6) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("skin", [0.0, 0.1])
+def test_a_search_with_a_cutoff_per_particle_compiles_a_count_and_a_list(skin):
+    x, y = scene(next(SIZES)), scene(next(SIZES))
+    jfrnn.search(x, np.full(len(x), 0.6), radius_rule="mean", skin=skin, box=BOX)
+    assert compiled_by(jfrnn.search, y, np.full(len(y), 0.6), radius_rule="mean", skin=skin, box=BOX) == 2
+
+
+def test_what_is_asked_of_a_list_of_a_new_size_compiles_one_program_each():
+    warm("skin").shifts(scene(next(SIZES) - 1))
+    x = scene(next(SIZES))
+    nbrs = jfrnn.search(x, 0.6, skin=0.1)
+    assert compiled_by(nbrs.update, x) == 1
+    assert compiled_by(nbrs.check) == compiled_by(nbrs.pairs) == compiled_by(nbrs.csr) == compiled_by(nbrs.grow, x) == 0
+    total = len(nbrs.pairs()[0])
+    assert compiled_by(nbrs.pairs, total) == 2
+    assert compiled_by(nbrs.csr, total) == compiled_by(nbrs.to_jraph, total) == 0
+    assert compiled_by(nbrs.shifts, x) == 1
+    assert compiled_by(nbrs.vectors, x) == 1
+    assert compiled_by(nbrs.distances, x) == 1  # and the program of vectors
+    assert compiled_by(jfrnn.sort_order, x, 0.6) == 1
+
+
+def test_a_box_compiles_no_more():
+    warm("box")
+    x = scene(next(SIZES))
+    nbrs = jfrnn.search(x, 0.6, box=BOX)
+    assert compiled_by(nbrs.vectors, x) == 1
+    assert compiled_by(nbrs.shifts, x) == 1
+
+
+def balanced(r, i, j):
+    return r
+
+
+@pytest.mark.parametrize(
+    ("options", "programs"),
+    [({}, 1), ({"box": BOX}, 2), ({"fn": balanced, "symmetry": "antisymmetric"}, 1)],
+    ids=["open", "box", "symmetry"],
+)
+def test_a_sum_over_pairs_of_a_new_size_compiles_at_most_two_programs(options, programs):
+    given = {"fn": energy} | options
+    fn = given.pop("fn")
+    jfrnn.pair_sum(fn, scene(next(SIZES)), 0.6, **given)
+    x = scene(next(SIZES))
+    assert compiled_by(jfrnn.pair_sum, fn, x, 0.6, **given) == programs
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_a_sum_over_a_list_of_a_new_size_compiles_one_program_and_vectors(half):
+    x, y = scene(next(SIZES)), scene(next(SIZES))
+    jfrnn.pair_sum(energy, x, None, neighbors=jfrnn.search(x, 0.6, half=half))
+    nbrs = jfrnn.search(y, 0.6, half=half)
+    nbrs.vectors(y)
+    assert compiled_by(jfrnn.pair_sum, energy, y, None, neighbors=nbrs) == 1
+
+
+def test_concrete_positions_are_counted_inside_jit_by_the_program_of_an_eager_count():
+    x = scene(next(SIZES))
+    longest = int(jfrnn.count(x, 0.6).max())
+    capacities = []
+
+    @jax.jit
+    def moved(y):
+        capacities.append(jfrnn.search(x, 0.6).capacity)
+        return y + 1
+
+    assert compiled_by(moved, jnp.zeros(3)) == 1
+    assert capacities == [-(-longest // 8) * 8]
+
+
+def test_arrays_of_numpy_are_copied():
+    x = np.asarray(scene(next(SIZES)))
+    y = x.copy()
+    nbrs = jfrnn.search(y, 0.6, skin=0.1)
+    y[:] = 0
+    np.testing.assert_array_equal(nbrs.verlet.positions, x)
+
+
+def test_programs_of_many_sizes_are_let_go(monkeypatch):
+    _programs.clear_programs()
+    monkeypatch.setattr(_programs, "MOST", 20)
+    held = []
+    for _ in range(40):
+        jfrnn.count(scene(next(SIZES)), 0.6)
+        held.append(_programs.program_count())
+    assert max(held) <= 20 + _programs._LOOK_EVERY
+    assert max(held) > 16  # they are kept until then
+    x = scene(next(SIZES))
+    assert compiled_by(jfrnn.count, x, 0.6) == 1
+    assert compiled_by(jfrnn.count, x, 0.6) == 0
+
+
+MANY_SIZES = """
+import gc, sys
+import jax, numpy as np
+import jfrnn
+
+def maps():
+    with open("/proc/self/maps") as lines:
+        return sum(1 for _ in lines)
+
+def searches(start):
+    for n in range(start, start + 30):
+        jfrnn.search(np.random.default_rng(n).random((n, 3)).astype(np.float32), 0.2)
+
+searches(100)
+jax.clear_caches()
+gc.collect()
+before = maps()
+searches(200)
+between = maps()
+jax.clear_caches()
+gc.collect()
+print(before, between, maps())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts memory maps")
+def test_memory_maps_are_given_back():
+    printed = subprocess.run([sys.executable, "-c", MANY_SIZES], capture_output=True, text=True, check=True).stdout
+    before, between, after = map(int, printed.split())
+    assert between > before + 60
+    assert after <= before + 20
