@@ -12,6 +12,7 @@ from jfrnn._auto import choose_engine, platform_of
 from jfrnn._inputs import check_is_known, checked_capacity, checked_cutoff, checked_positions, checked_slack
 from jfrnn._programs import on_device
 from jfrnn._triangles_list import TriangleList, counted_slots, found_triangles
+from jfrnn._triangles_winding import is_closed
 
 TRIANGLE_BACKENDS = ("auto", "jax", "warp", "bvh")
 
@@ -94,7 +95,8 @@ def search_triangles(
             )
         capacity = counted_slots(points, corners, named, radius, engine, slack)
     found = found_triangles(points, corners, named, None, radius, engine, checked_capacity(capacity))
-    return TriangleList(**found, cutoff=radius, backend=engine)
+    closed = None if isinstance(named, Tracer) else is_closed(named)
+    return TriangleList(**found, cutoff=radius, backend=engine, closed=closed)
 
 
 def _checked_faces(faces: Any, dim: int, vertices: int) -> Array:  # noqa: ANN401

@@ -5,10 +5,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
+from jfrnn._flags import set_places
 from jfrnn._triangles_exact import Vector, cross, dot, minus
 
 # where the nearest point lies: corners are 0, 1, 2, sides (from that corner to the next) _SIDE + 0, 1, 2, the face _FACE
 _SIDE, _FACE = 3, 6
+_BLOCK = 1 << 16  # slots in work at a time
 
 
 class Nearest(NamedTuple):
@@ -88,62 +90,80 @@ def _foot_on_face(x: list[Vector]) -> tuple[Vector, Array]:
     return foot, jnp.where(inside, dot(foot, foot), jnp.inf)
 
 
-class Normals(NamedTuple):
-    """Outward normals of faces, sides and vertices, as far as they tell inside from outside.
+class Rows(NamedTuple):
+    """Triangles near points, and where the nearest of each row is met.
 
     Attributes:
-        faces: [f, d], of unit length; 0 where the shape has no area (2D: length).
-        sides: [f, 3, d], sums of those of the faces that share a side; [f, 0, 2] in 2D.
-        vertices: [v, d], sums of those of the faces around it, times their angles; in 2D of both segments.
-        watertight: [] bool: each side belongs to two faces that run through it in opposite directions; in 2D each
-            vertex to two segments.
+        idx: Shape [n, capacity], int32.
+        used: How many slots of each row are used, shape [n], int32.
+        triangle: The nearest triangle, shape [n], int32.
+        feature: On which of its corners, sides or its face the nearest point lies, shape [n], int32.
     """
 
-    faces: Array
-    sides: Array
-    vertices: Array
-    watertight: Array
+    idx: Array
+    used: Array
+    triangle: Array
+    feature: Array
 
 
-def make_normals(vertices: Array, faces: Array, corners: Array, good: Array) -> Normals:
-    """Sum angle-weighted pseudonormals of shapes [f, corner, d], of those that are `good`.
+def pseudonormals(rows: Rows, faces: Array, corners: Array, good: Array, asked: Array) -> Array:
+    """Return unit pseudonormals at the nearest points of rows [n, d] that are `asked` for; 0 where shapes have no area.
 
+    A face has its normal, a side the sum of those of the faces that share it, a vertex the sum over the faces around it, times
+    their angles; in 2D a vertex that of both segments. All of these faces are as near, so that they are in the same row.
     Faces run counterclockwise as seen from outside; so do segments around what they enclose.
     Source: Baerentzen & Aanaes (2005), doi:10.1109/TVCG.2005.49.
+
+    Args:
+        rows: The rows.
+        faces: Vertices of shapes, shape [f, corner], int32.
+        corners: Shape [f, corner, d].
+        good: Which shapes there are, shape [f], bool.
+        asked: Shape [n], bool.
     """
-    count, dim = vertices.shape
-    named = jnp.where(good[:, None], faces, count)
+    n, capacity = rows.idx.shape
+    block = min(max(_BLOCK // capacity, 1), n)
+    queue, total = set_places(asked, n + block), jnp.sum(asked, dtype=jnp.int32)
+
+    def add_block(b: Array, normals: Array) -> Array:
+        place = lax.dynamic_slice_in_dim(queue, b * block, block)
+        own = jnp.minimum(place, n - 1)
+        slots, feature = rows.idx[own], rows.feature[own]
+        shape = jnp.where(lax.broadcasted_iota(jnp.int32, slots.shape, 1) < rows.used[own, None], slots, len(faces))
+        known = jnp.minimum(shape, len(faces) - 1)
+        there = (shape < len(faces)) & good[known]
+        weights = _weights(faces[known], faces[rows.triangle[own]], corners[known], feature)
+        alone = feature >= (_FACE if faces.shape[1] == 3 else _SIDE)
+        weights = jnp.where(alone[:, None], (slots == rows.triangle[own, None]).astype(weights.dtype), weights)
+        sums = jnp.sum(jnp.where(there, weights, 0)[..., None] * _face_normals(corners[known]), axis=1)
+        return normals.at[place].set(_unit(sums), mode="drop")
+
+    none = jnp.zeros((n, corners.shape[2]), corners.dtype)
+    return lax.fori_loop(0, -(-total // block), add_block, none)
+
+
+def _weights(named: Array, nearest: Array, corners: Array, feature: Array) -> Array:
+    """Return what faces [b, k, corner] count at corners or sides [b] of the nearest ones [b, corner]: [b, k]."""
+    dim = named.shape[2]
+    start = jnp.take_along_axis(nearest, jnp.minimum(feature % _SIDE, dim - 1)[:, None], axis=1)
+    has_start = named == start[..., None]
     if dim == 2:
-        along = corners[:, 1] - corners[:, 0]
-        normal = _unit(jnp.stack([along[:, 1], -along[:, 0]], axis=1)) * good[:, None].astype(corners.dtype)
-        sums = jnp.zeros_like(vertices).at[named].add(normal[:, None], mode="drop")
-        ends = jnp.zeros((count, 2), jnp.int32).at[named, jnp.arange(2)].add(1, mode="drop")
-        whole = jnp.all((ends == 1) | (ends.sum(axis=1) == 0)[:, None])
-        return Normals(normal, jnp.zeros((faces.shape[0], 0, 2), vertices.dtype), sums, whole)
-    after, before = jnp.roll(corners, -1, axis=1), jnp.roll(corners, 1, axis=1)
-    across = jnp.cross(_unit(corners[:, 1] - corners[:, 0]), _unit(corners[:, 2] - corners[:, 0]))
-    normal = _unit(across) * good[:, None].astype(corners.dtype)
-    one, two = _unit(after - corners), _unit(before - corners)
+        return jnp.any(has_start, axis=2).astype(corners.dtype)
+    end = jnp.take_along_axis(nearest, ((feature + 1) % _SIDE)[:, None], axis=1)
+    one = _unit(jnp.roll(corners, -1, axis=2) - corners)
+    two = _unit(jnp.roll(corners, 1, axis=2) - corners)
     angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(one, two), axis=-1), jnp.sum(one * two, axis=-1))
-    sums = jnp.zeros_like(vertices).at[named].add(angle[..., None] * normal[:, None], mode="drop")
-    sides, watertight = _sum_over_sides(named, normal, good)
-    return Normals(normal, sides, sums, watertight)
+    around = jnp.sum(jnp.where(has_start, angle, 0), axis=2)
+    beside = jnp.any(has_start, axis=2) & jnp.any(named == end[..., None], axis=2)
+    return jnp.where((feature < _SIDE)[:, None], around, beside.astype(around.dtype))
 
 
-def _sum_over_sides(named: Array, normal: Array, good: Array) -> tuple[Array, Array]:
-    """Sum what faces [f, d] have over all that share a side: [f, 3, d]; say whether each side has two, in opposite directions."""
-    faces = named.shape[0]
-    start, end = named.reshape(-1), jnp.roll(named, -1, axis=1).reshape(-1)
-    place = lax.iota(jnp.int32, 3 * faces)
-    low, high, order = lax.sort((jnp.minimum(start, end), jnp.maximum(start, end), place), num_keys=2)
-    fresh = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
-    group = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(fresh, dtype=jnp.int32)])
-    of_side = jnp.zeros(3 * faces, jnp.int32).at[order].set(group)
-    there = jnp.repeat(good, 3)
-    sums = jnp.zeros((3 * faces, 3), normal.dtype).at[of_side].add(jnp.repeat(normal, 3, axis=0))
-    runs = jnp.zeros((3 * faces, 2), jnp.int32).at[of_side, (start > end).astype(jnp.int32)].add(there.astype(jnp.int32))
-    whole = jnp.all((runs == 1) | (runs.sum(axis=1) == 0)[:, None]) & ~jnp.any(there & (start == end))
-    return sums[of_side].reshape(faces, 3, 3), whole
+def _face_normals(corners: Array) -> Array:
+    """Return unit normals of shapes [..., corner, d]; 0 where a shape has no area (2D: length)."""
+    along = corners[..., 1, :] - corners[..., 0, :]
+    if corners.shape[-1] == 2:
+        return _unit(jnp.stack([along[..., 1], -along[..., 0]], axis=-1))
+    return _unit(jnp.cross(_unit(along), _unit(corners[..., 2, :] - corners[..., 0, :])))
 
 
 def _unit(vectors: Array) -> Array:
@@ -151,13 +171,3 @@ def _unit(vectors: Array) -> Array:
     scaled = vectors / jnp.where(largest > 0, largest, 1)
     square = jnp.sum(scaled * scaled, axis=-1, keepdims=True)
     return jnp.where(largest > 0, scaled / jnp.sqrt(jnp.where(largest > 0, square, 1)), 0)
-
-
-def normal_at(normals: Normals, faces: Array, triangle: Array, feature: Array) -> Array:
-    """Return the unit normals [m, d] of the features of triangles [m] on which nearest points lie; 0 where there is none."""
-    corner = faces[triangle, jnp.clip(feature, 0, faces.shape[1] - 1)]
-    normal = jnp.where((feature < _SIDE)[:, None], normals.vertices[corner], normals.faces[triangle])
-    if faces.shape[1] == 3:
-        side = normals.sides[triangle, jnp.clip(feature - _SIDE, 0, 2)]
-        normal = jnp.where(((feature >= _SIDE) & (feature < _FACE))[:, None], side, normal)
-    return _unit(normal)

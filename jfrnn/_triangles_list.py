@@ -18,9 +18,10 @@ from jfrnn._neighbors import norms, rounded_capacity
 from jfrnn._programs import at_once, compiled
 from jfrnn._status import NeighborOverflowError, Status
 from jfrnn._triangles_cells import TriangleCells, sort_triangles, without_faults
-from jfrnn._triangles_closest import make_normals, nearest_of, normal_at
+from jfrnn._triangles_closest import Rows, nearest_of, pseudonormals
 from jfrnn._triangles_rows import are_near, list_triangles, nearest_slots
 from jfrnn._triangles_tree import TriangleTree, grow_tree
+from jfrnn._triangles_winding import cast_rays, is_closed, least_winding, ray_ways
 
 _ENGINES = {
     "jax": (sort_triangles, list_triangles),
@@ -37,8 +38,8 @@ class SignedDistance(NamedTuple):
         mask: There is one, shape [n], bool.
         normal: Where the distance grows fastest, of unit length, shape [n, d]: away from the wall outside, toward it inside; at
             contact the pseudonormal; 0 where there is no triangle.
-        watertight: Each side belongs to two triangles that run through it in opposite directions (in 2D, each vertex to two
-            segments), shape [], bool. Where False, signs mean nothing away from the faces.
+        watertight: Triangles run through each side as often one way as the other (in 2D, as many segments begin at each vertex as
+            end there), shape [], bool. Where False, they enclose nothing, and signs tell the sides of faces alone.
     """
 
     distance: Array
@@ -62,6 +63,8 @@ class TriangleList:
         cells: The wall, sorted into cells (`TriangleCells`) or, by "bvh", in a tree (`TriangleTree`); None where there is none.
         cutoff: Distance [length], rounded to the dtype of the positions. Static.
         backend: The engine that made the list. Static.
+        closed: What `signed_distance` needs to know of faces alone, shape [], bool: they bound a solid. None where faces were
+            traced; each call then finds out.
     """
 
     idx: Array
@@ -73,6 +76,7 @@ class TriangleList:
     cells: TriangleCells | TriangleTree | None
     cutoff: float = dataclasses.field(metadata={"static": True})
     backend: str = dataclasses.field(metadata={"static": True})
+    closed: Array | None = None
 
     @property
     def capacity(self) -> int:
@@ -179,8 +183,12 @@ class TriangleList:
     def signed_distance(self, positions: Array, *, vertices: Array | None = None) -> SignedDistance:
         """Compute the distance to the nearest triangle of each row, negative inside what the triangles enclose.
 
-        The sign is that of the angle-weighted pseudonormal of the nearest face, side or vertex, which decides for any closed mesh
-        whose faces run counterclockwise as seen from outside (in 2D, segments counterclockwise around what they enclose).
+        Inside is where the winding number of the triangles is 1 or more, so that closed parts which overlap, touch, nest or are
+        doubled make one solid; of a wall that encloses less than nothing, as one around a fluid that its faces look at, it is where
+        the number is 0 or more. Faces run counterclockwise as seen from outside of what is solid (in 2D, segments
+        counterclockwise around it). The distance is to the nearest triangle, even to one inside the solid, within another part.
+        Within rounding of a triangle, about 100 eps of the dtype times its largest coordinate as seen from the particle, and
+        where a wall is not watertight, the sign is that of the angle-weighted pseudonormal of the nearest face, side or vertex.
 
         Args:
             positions: As in `closest`.
@@ -192,15 +200,18 @@ class TriangleList:
         Raises:
             ValueError, TypeError: an argument does not fit the list.
 
-        Cost: beside the rows, a sort of all sides. Differentiable: to any order in positions and vertices, where the nearest point
-        does not jump; at contact the derivative is that of the plane of the normal. Jit: yes. vmap: yes.
+        Cost: beside the rows, a ray through a tree of boxes for each particle that has a triangle. The tree is that of the list
+        where "bvh" made it; otherwise, and with `vertices`, each call makes one. Differentiable: to any order in positions and
+        vertices, where the nearest point does not jump; at contact the derivative is that of the plane of the normal. Jit: yes.
+        vmap: yes.
         Source: Baerentzen & Aanaes (2005), doi:10.1109/TVCG.2005.49.
         """
         points, corners = self._checked(positions, vertices)
         if 0 in (*self.idx.shape, self.faces.shape[0]):
             none = jnp.zeros(points.shape[0], points.dtype)
             return SignedDistance(none, none > 0, jnp.zeros_like(points), jnp.asarray(self.faces.shape[0] == 0))
-        return _signed_distance(self, points, corners)
+        tri = self if vertices is None else dataclasses.replace(self, cells=None)
+        return _signed_distance(tri, points, corners)
 
     def _checked(self, positions: Array, vertices: Array | None) -> tuple[Array, Array]:
         points = checked_positions("positions", positions, like=self.vertices)
@@ -290,17 +301,23 @@ def _nearest_in_rows(tri: TriangleList, points: Array, vertices: Array) -> tuple
 @compiled
 def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> SignedDistance:
     corners, finite, there = without_faults(vertices, tri.faces)
-    fixed, used = lax.stop_gradient(corners), jnp.minimum(tri.count, tri.capacity)
-    cutoff = make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False)
-    slot, some = nearest_slots(lax.stop_gradient(points), fixed, tri.idx, used, finite & there, cutoff)
+    fixed, at, good = *lax.stop_gradient((corners, points)), finite & there
+    cutoff, used = make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False), jnp.minimum(tri.count, tri.capacity)
+    slot, some = nearest_slots(at, fixed, tri.idx, used, good, cutoff)
     triangle = jnp.where(some, jnp.take_along_axis(tri.idx, slot[:, None], axis=1)[:, 0], 0)
     shapes = jnp.where(some[:, None, None], corners[triangle], 0)
     vectors, feature = nearest_of(jnp.where(some[:, None], points, 0), shapes)
     away, distance = -vectors, norms(vectors)
-    normals = make_normals(lax.stop_gradient(vertices), tri.faces, fixed, finite & there)
-    normal = normal_at(normals, tri.faces, triangle, feature)
+    apart = some & (distance > 0)
+    watertight = (is_closed(tri.faces) if tri.closed is None else tri.closed) & jnp.all(good)
+    tree = tri.cells if isinstance(tri.cells, TriangleTree) else grow_tree(fixed, good, cutoff)
+    cast = cast_rays if tri.backend == "jax" else _triangles_warp.cast_rays
+    rays, least = ray_ways(points.shape[1], np.dtype(points.dtype)), least_winding(fixed, good)
+    inside, unknown = cast(tree, fixed, at, rays, apart & watertight, least, cutoff)
+    by_normal = some & (unknown | ~(apart & watertight))
+    normal = pseudonormals(Rows(tri.idx, used, triangle, feature), tri.faces, fixed, good, by_normal)
     height = jnp.sum(normal * away, axis=1)
-    signed = jnp.where(distance > 0, jnp.where(height < 0, -distance, distance), height)
-    apart = (some & (distance > 0))[:, None]
-    grows = jnp.where(apart, away / jnp.where(apart, signed[:, None], 1), jnp.where(some[:, None], normal, 0))
-    return SignedDistance(jnp.where(some, signed, 0), some, grows, normals.watertight & jnp.all(finite & there))
+    signed = jnp.where(jnp.where(by_normal, height < 0, inside), -distance, distance)
+    signed = jnp.where(distance > 0, signed, height)
+    grows = jnp.where(apart[:, None], away / jnp.where(apart, signed, 1)[:, None], jnp.where(some[:, None], normal, 0))
+    return SignedDistance(jnp.where(some, signed, 0), some, grows, watertight)

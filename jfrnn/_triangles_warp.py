@@ -164,3 +164,60 @@ def _commands(variant: _Variant, *arrays: Any) -> list[_cuda.Command]:  # noqa: 
     launches = _cuda_kernels(variant).launches(n, *sizes, capacity, variant.double)
     arguments = [*arrays, n, faces, *sizes, capacity, workers]
     return [_cuda.Command(x.kernel, [*arguments, x.threads], x.threads, x.block, x.beside) for x in launches]
+
+
+def cast_rays(
+    tree: TriangleTree, corners: Array, points: Array, rays: Array, asked: Array, least: Array, cutoff: Cutoff
+) -> tuple[Array, Array]:
+    """Say which points are inside and which no ray tells, as `jfrnn._triangles_winding.cast_rays` does, in float64."""
+    radius, starts = jnp.reshape(jnp.asarray(cutoff.radius), 1), jnp.asarray(level_starts(len(corners)))
+    inputs = points, corners, tree.boxes, radius, rays, starts, tree.triangles, asked.astype(jnp.int32), jnp.reshape(least, 1)
+
+    def call(of: Any, *given: Array) -> Array:  # noqa: ANN401
+        return of(points.shape[1], points.dtype == jnp.float64)(*given, output_dims={"side": len(points), "info": 1})[0]
+
+    on_cpu, on_cuda = (functools.partial(call, of) for of in (_rays_on_cpu, _rays_on_cuda))
+    side = lax.platform_dependent(*inputs, cpu=on_cpu, cuda=on_cuda)
+    return side == 1, side == 2
+
+
+def _ray_types(double: bool) -> dict[str, Any]:
+    wp = _warp.load_warp()
+    scalar, ints = wp.float64 if double else wp.float32, wp.array(dtype=wp.int32)
+    points = wp.array2d(dtype=scalar)
+    types = {"positions": points, "corners": wp.array3d(dtype=scalar), "boxes": points, "cutoff": wp.array(dtype=scalar)}
+    types |= {"rays": points, "start": ints, "triangles": ints, "asked": ints, "least": ints}
+    return types | {"side": ints, "info": ints}
+
+
+def _ray_sizes(arrays: Sequence[Any]) -> list[int]:
+    """Return the numbers of points, of levels and of entries."""
+    return [arrays[0].shape[0], arrays[5].shape[0] - 1, arrays[2].shape[1]]
+
+
+def _ray_kernel(dim: int, double: bool, cuda: bool) -> Any:  # noqa: ANN401
+    return _warp.kernels_of("winding").side_kernel(dim, bool(double), WIDTH, cuda)
+
+
+@functools.cache
+def _rays_on_cpu(dim: int, double: bool) -> Any:  # noqa: ANN401
+    def run(*arrays: Any) -> None:  # noqa: ANN401
+        arrays[-1].numpy()[:] = 0
+        sizes = _ray_sizes(arrays)
+        most = -(-sizes[0] // _warp.kernels_of("winding").CHUNK)
+        _warp.on_every_core(_ray_kernel(dim, double, cuda=False), [*arrays, *sizes], most)
+
+    return _warp.callable_of(f"jfrnn_winding_{dim}d_{'f64' if double else 'f32'}", run, _ray_types(double), 2)
+
+
+@functools.cache
+def _rays_on_cuda(dim: int, double: bool) -> Any:  # noqa: ANN401
+    wp, block = _warp.load_warp(), _warp.kernels_of("winding").BLOCK
+    if wp.is_cuda_available():
+        wp.load_module(_ray_kernel(dim, double, cuda=True).module, device=wp.get_cuda_device(), block_dim=block)
+
+    def commands(*arrays: Any) -> list[_cuda.Command]:  # noqa: ANN401
+        sizes = _ray_sizes(arrays)
+        return [_cuda.Command(_ray_kernel(dim, double, cuda=True), [*arrays, *sizes], -(-sizes[0] // block) * block, block)]
+
+    return _warp.cuda_target(f"jfrnn_winding_cuda_{dim}d_{'f64' if double else 'f32'}", _ray_types(double), 2, commands)

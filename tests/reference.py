@@ -216,6 +216,42 @@ def distance(point: Any, corners: Any) -> tuple[float, float]:
     return (math.sqrt(squared_distance(start, ends) / size**2) * float(size) if size else 0.0), float(size)
 
 
+def winding_number(point: Any, vertices: Any, faces: Any) -> int | None:
+    """Return how often triangles, in 2D segments, wind around a point, in exact arithmetic; None where it is on one of them.
+
+    A ray leaves some of them and enters others. One that meets a side or a vertex, in 2D an end, is turned a little.
+    """
+    ratios = [[float(x).as_integer_ratio() for x in row] for row in (*vertices, point)]
+    unit = max(below for row in ratios for _, below in row)
+    *corners, origin = [[above * (unit // below) for above, below in row] for row in ratios]
+    shapes = [[_minus(corners[v], origin) for v in face] for face in faces if len(set(face)) == len(face)]
+    for turn in range(1, 50):
+        ray = [211, 2 * turn + 1, -6 * turn][: len(origin)]
+        parts = [_crossing(ray, shape) for shape in shapes]
+        if None not in parts:
+            return sum(part for part in parts if part is not None)
+    return None
+
+
+def _crossing(ray: Sequence[int], shape: Sequence[Sequence[int]]) -> int | None:
+    """Return 1 where a ray from the origin leaves a shape, -1 where it enters, 0 where it passes by; None where this is unclear."""
+    dim = len(ray)
+    sides = [_determinant([ray if c == k else x for c, x in enumerate(shape)]) for k in range(dim)]
+    height = _determinant(shape)
+    if all(side > 0 for side in sides) or all(side < 0 for side in sides):
+        sign = 1 if sides[0] > 0 else -1
+        return None if height == 0 else sign * (height * sign > 0)
+    one_way, other_way = any(side > 0 for side in sides), any(side < 0 for side in sides)
+    return 0 if one_way and other_way else None
+
+
+def _determinant(rows: Sequence[Sequence[int]]) -> int:
+    if len(rows) == 2:
+        return rows[0][0] * rows[1][1] - rows[0][1] * rows[1][0]
+    a, b, c = rows
+    return sum(a[i] * (b[j] * c[k] - b[k] * c[j]) for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)))
+
+
 def _squared_distance_to_segment(point: Sequence[Any], a: Sequence[Any], b: Sequence[Any]) -> Fraction:
     along, away = _minus(b, a), _minus(point, a)
     length = _dot(along, along)

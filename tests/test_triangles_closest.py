@@ -1,17 +1,23 @@
 """Nearest points and signed distances against the oracle, finite differences, and shapes whose distance is known."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+import warp as wp
 from jfrnn.cases import meshes
 from jfrnn.cases.triangles import TRIANGLE_CASES, padded
+from jfrnn.kernels import winding
 
 import jfrnn
-from jfrnn import _triangles_rows
+from jfrnn import _triangles_rows, _triangles_warp
 from jfrnn._exact import make_cutoff
-from jfrnn._triangles_closest import make_normals, nearest_of
+from jfrnn._triangles_closest import nearest_of
+from jfrnn._triangles_tree import WIDTH, grow_tree, level_starts
+from jfrnn._triangles_winding import cast_rays, is_closed, least_winding, ray_ways
 
 # of cutoffs of their own, each a program anew, between the smallest and the largest
 _IN_BETWEEN = {"ties_small", "ties_spacing", "ulps", "ulps_far", "ulps_large", "axis_ulps", "cell_edges"}
@@ -110,20 +116,178 @@ def test_signed_distance_in_2d():
 
 
 @pytest.mark.parametrize("mesh", [meshes.circle(1.0, 8), meshes.cube(2.0, 2)], ids=["2d", "3d"])
-def test_meshes_that_are_not_closed_are_told(mesh):
+@pytest.mark.parametrize("closed", [is_closed, jax.jit(is_closed)], ids=["known", "traced"])
+def test_meshes_that_are_not_closed_are_told(mesh, closed):
+    faces = mesh[1]
+    assert closed(faces)
+    turned, twice, lost, both = faces.copy(), faces.copy(), faces.copy(), faces.copy()
+    turned[0], twice[0], lost[0], both[1] = faces[0, ::-1], faces[1], faces[0, 0], faces[0, ::-1]
+    assert not closed(turned)
+    assert not closed(twice)
+    assert not closed(lost)  # collapsed: it bounds nothing
+    assert not closed(both)
+    assert closed(np.concatenate([faces, faces]))
+    assert closed(np.concatenate([faces, faces[:3], faces[:3, ::-1]]))
+
+
+def moved(mesh, by=0.0, size=1.0, turned_over=False):
     vertices, faces = mesh
+    return vertices * size + np.asarray(by), faces[:, ::-1] if turned_over else faces
+
+
+def joined(*parts):
+    """Put meshes into one, padded with collapsed faces to the numbers of vertices and faces that other tests search among."""
+    dim = parts[0][0].shape[1]
+    starts = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
+    vertices = np.concatenate([vertices for vertices, _ in parts])
+    faces = np.concatenate([start + faces for start, (_, faces) in zip(starts, parts, strict=False)])
+    most_vertices, most_faces = (26, 48) if dim == 3 else (64, 64)
+    vertices = np.concatenate([vertices, np.repeat(vertices[:1], most_vertices - len(vertices), axis=0)])
+    return vertices, np.concatenate([faces, np.zeros((most_faces - len(faces), dim), faces.dtype)])
+
+
+def walls(dim):
+    """Closed parts that meet: their names, and those parts."""
+    part = meshes.cube(1.0, 1) if dim == 3 else meshes.circle(1.0, 4)
+    beside, within = np.array([1.0, 0, 0][:dim]), np.array([0.6, 0.2, 0.1][:dim])
+    if dim == 2:  # a square along the axes, so that parts may touch all along a side
+        part = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]), part[1]
+    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(dim, dim)))[0]
+    turn[:, 0] *= np.sign(np.linalg.det(turn))
+    askew = part[0] @ turn.T, part[1]
+    return {
+        "one": [part],
+        "apart": [part, moved(part, 3 * beside)],
+        "overlapping": [part, moved(part, within)],
+        "crossing": [part, moved(askew, 0.3 * within)],
+        "touching": [part, moved(part, beside)],
+        "touching in part": [part, moved(part, beside + 0.5 * (within - within[0]))],
+        "at a vertex": [part, moved(part, np.ones(dim))],
+        "nested": [part, moved(part, 0.05, 0.5), moved(part, 0.05, 0.3)],
+        "doubled": [part, part],
+        "hollow": [part, moved(part, 0.05, 0.5, turned_over=True)],
+        "container": [moved(part, size=1.2, turned_over=True)],
+        "full container": [moved(part, size=1.2, turned_over=True), moved(part, -0.1, 0.5), moved(part, -0.2, 0.4)],
+        "undone": [part, moved(part, turned_over=True)],
+    }
+
+
+def around(dim, dtype):
+    """Return points at random, and such that are level with faces, sides and vertices."""
+    random = np.random.default_rng(1)
+    random_points = random.uniform(-0.8, 1.6, (140, dim))
+    level = random.choice([-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0, 1.25], (60, dim))
+    level[np.arange(60), random.integers(0, dim, 60)] += random.choice([-1e-6, 1e-3, 1e-6], 60)
+    return np.concatenate([random_points, level]).astype(dtype)
+
+
+WALLS = [(dim, name) for dim in (2, 3) for name in walls(dim)]
+
+
+_known = {}
+
+
+def expected_side(x, vertices, faces, name="one"):
+    """Say which points are inside, and which are on a face, where there is no side. Asked again, the answer is there."""
+    key = x.tobytes(), vertices.tobytes(), faces.tobytes()
+    numbers = _known[key] = _known.get(key) or [reference.winding_number(point, vertices, faces) for point in x]
+    least = 0 if "container" in name else 1
+    return np.array([number is not None and number >= least for number in numbers]), np.array([x is None for x in numbers])
+
+
+@pytest.mark.parametrize(
+    "backend", ["bvh", pytest.param("warp", marks=pytest.mark.slow), pytest.param("jax", marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize("dtype", [np.float64, pytest.param(np.float32, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("dim", "name"), WALLS)
+def test_signs_are_those_of_the_union(dim, name, dtype, backend):
+    vertices, faces = joined(*walls(dim)[name])
+    vertices, x = vertices.astype(dtype), around(dim, dtype)
+    cutoff, capacity = (1.0, 48) if dim == 3 else (0.5, 72)
+    tri = jfrnn.search_triangles(x, vertices, faces, cutoff, capacity=capacity, backend=backend)
+    tri.check()
+    signed = tri.signed_distance(x)
+    mask, distance = np.asarray(signed.mask), np.asarray(signed.distance)
+    assert signed.watertight
+    assert mask.sum() > 100
+    inside, on_face = expected_side(x, vertices, faces, name)
+    assert np.all(np.abs(distance[on_face]) < np.finfo(dtype).eps)
+    mask = mask & ~on_face
+    clear = mask & (np.abs(distance) > 4 * np.finfo(dtype).eps)
+    assert clear.sum() > mask.sum() - 8
+    assert np.array_equal(distance[clear] < 0, inside[clear])
+    assert inside[mask].any() == (name != "undone")
+    away = np.asarray(signed.normal) * distance[:, None]
+    assert np.allclose(np.linalg.norm(away[mask], axis=1), np.abs(distance[mask]), rtol=1e-5)
+    nearest = np.where(np.asarray(tri.closest(x)[2]), tri.closest(x)[1], np.inf).min(axis=1)
+    assert np.allclose(np.abs(distance[mask]), nearest[mask], rtol=1e-6)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
+def test_rays_without_warp(dim, dtype):
+    """Rays of arrays tell the sides that those of kernels do, also of points as near as rounding, or leave them open."""
 
     @jax.jit
-    def watertight(faces, good):
-        return make_normals(jnp.asarray(vertices), faces, jnp.asarray(vertices)[faces], good).watertight
+    def both(vertices, faces, x):
+        corners, good, cutoff = vertices[faces], jnp.ones(len(faces), bool), make_cutoff(0.25, np.dtype(dtype), closed=False)
+        tree, rays = grow_tree(corners, good, cutoff), ray_ways(dim, np.dtype(dtype))
+        given = tree, corners, x, rays, jnp.ones(len(x), bool), least_winding(corners, good), cutoff
+        return cast_rays(*given), _triangles_warp.cast_rays(*given)
 
-    good = np.ones(len(faces), bool)
-    assert watertight(faces, good)
-    turned, twice = faces.copy(), faces.copy()
-    turned[0], twice[0] = faces[0, ::-1], faces[1]
-    assert not watertight(turned, good)
-    assert not watertight(twice, good)
-    assert not watertight(faces, np.arange(len(faces)) > 0)
+    for name, parts in walls(dim).items():
+        vertices, faces = joined(*parts)
+        vertices, x = vertices.astype(dtype), around(dim, dtype)
+        (inside, unknown), (surely, still) = both(vertices, faces, x)
+        expected, on_face = expected_side(x, vertices, faces, name)
+        for told, sure in ((inside, ~np.asarray(unknown)), (surely, ~np.asarray(still))):
+            assert (sure | on_face)[:-60].all()
+            assert np.array_equal(np.asarray(told)[sure & ~on_face], expected[sure & ~on_face])
+        assert dtype == np.float64 or not np.any(np.asarray(still) & ~on_face)
+
+
+def test_rays_through_a_tree_of_many_levels():
+    """Gears of 6 000 and of 200 faces, one through the other, cast in chunks that do not hold all, as particles move."""
+    vertices, faces = meshes.gear(12, 6000, 1.0, 2.0, 3.0)
+    more, others = meshes.gear(6, 200, 1.0, 8.0, 2.0)
+    both = np.concatenate([vertices, more + np.array([1.0, 0, 0])]).astype(np.float32)
+    faces = np.concatenate([faces, others + len(vertices)])
+    x = np.random.default_rng(0).uniform(both.min(axis=0), both.max(axis=0), (3000, 3)).astype(np.float32)
+    tri = jfrnn.search_triangles(x, both, faces, 0.2, backend="bvh")
+    corners, good = tri.vertices[tri.faces], jnp.ones(len(faces), bool)
+    cutoff, rays = make_cutoff(tri.cutoff, np.dtype(np.float32), closed=False), ray_ways(3, np.dtype(np.float32))
+    asked = np.asarray(tri.count > 0)
+    given = tri.cells, corners, jnp.asarray(x), rays, jnp.asarray(asked), least_winding(corners, good), cutoff
+    sides = [
+        np.asarray(inside) & ~np.asarray(unknown) for inside, unknown in (cast_rays(*given), _triangles_warp.cast_rays(*given))
+    ]
+    assert np.array_equal(*sides)
+    assert not sides[0][~asked].any()
+    some = np.flatnonzero(asked)[:: asked.sum() // 8]
+    expected, _ = expected_side(x[some], both, faces)
+    assert np.array_equal(sides[0][some], expected)
+    assert len(set(expected)) == 2
+
+
+@pytest.mark.parametrize("dim", [pytest.param(2, marks=pytest.mark.slow), 3])
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
+def test_kernel_for_cuda(dim, dtype, tmp_path):
+    """It compiles for a GPU, nothing contracted, and its text tells on the CPU, thread by thread, what that of the CPU does."""
+    kernel = winding.side_kernel(dim, dtype == np.float64, WIDTH, cuda=True)
+    wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
+    (program,) = [path.read_text() for path in tmp_path.glob("*.ptx")]
+    assert not re.search(r"\bfma\.|\b(mul|add|sub)\.f(32|64)", program)
+    vertices, faces = joined(*walls(dim)["crossing"])
+    vertices, x = vertices.astype(dtype), around(dim, dtype)
+    tri = jfrnn.search_triangles(x, vertices, faces, 0.5, capacity=48, backend="bvh")
+    given = x, vertices[faces], tri.cells.boxes, np.array([0.5], dtype), ray_ways(dim, np.dtype(dtype)), level_starts(len(faces))
+    side, info = np.full(len(x), -7, np.int32), np.zeros(1, np.int32)
+    ones = np.ones(len(x), np.int32), np.ones(1, np.int32)
+    arrays = [wp.array(np.asarray(a), device="cpu", copy=False) for a in (*given, tri.cells.triangles, *ones, side, info)]
+    arrays[1] = wp.array(vertices[faces], device="cpu", dtype=arrays[0].dtype, ndim=3)
+    wp.launch(kernel, dim=256, inputs=[*arrays, len(x), len(given[5]) - 1, tri.cells.boxes.shape[1]], device="cpu")
+    inside, on_face = expected_side(x, vertices, faces)
+    assert np.array_equal(side[~on_face], inside[~on_face])
 
 
 def test_gradients_are_those_of_finite_differences():

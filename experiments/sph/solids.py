@@ -76,7 +76,8 @@ def begin(scene: "FluidScene", x: Array, angle: Array | None = None) -> Beside |
     signed = tri.signed_distance(at)
     if not signed.watertight:
         raise ValueError(
-            "solid must be a closed mesh whose faces run counterclockwise as seen from the fluid: one side has no two."
+            "solid must be a closed mesh whose faces run counterclockwise as seen from the fluid: they run through one side more "
+            "often one way than the other. If corners are written once per triangle, as in STL files, join them first."
         )
     inside = np.asarray(signed.mask & (signed.distance < GAP / 2 * scene.spacing))
     if scene.wall is not None:
