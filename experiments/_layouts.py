@@ -1,36 +1,39 @@
-"""Names of layouts, and scenes by name with errors for the command line."""
+"""Names of layouts, and scenes by name with errors for the command line.
+
+`cases` is taken from the repository, not as `jfrnn.cases`: with that comes JAX, for which processes would wait that need none.
+"""
 
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from experiments._errors import UsageError
 
 if TYPE_CHECKING:
-    from jfrnn.cases import Scene  # pyright: ignore[reportMissingImports]
+    from cases import Scene
 
 
 def names() -> list[str]:
     """Return what a layout may be called; the N of `clustersN` and the like stands for any number of tiles per axis."""
-    from jfrnn import cases  # pyright: ignore[reportAttributeAccessIssue]
+    import cases
 
     return [*(name for name in cases.LAYOUTS if not name.startswith("clusters")), *(f"{family}N" for family in cases.FAMILIES)]
 
 
 def is_layout(name: str) -> bool:
     """Whether a scene of this name can be made."""
-    from jfrnn import cases  # pyright: ignore[reportAttributeAccessIssue]
+    import cases
 
     return bool(re.fullmatch(rf"({'|'.join(cases.FAMILIES)})[1-9]\d*", name)) or name in cases.LAYOUTS
 
 
-def make(name: str, **options: float | str | None) -> "Scene":
+def make(name: str, **options: Any) -> "Scene":  # noqa: ANN401 - those of `cases.scene`
     """Return a scene of `jfrnn.cases`.
 
     Raises:
         UsageError: There is no such layout, or it cannot be made with these options.
     """
-    from jfrnn import cases  # pyright: ignore[reportAttributeAccessIssue]
+    import cases
 
     if not is_layout(name):
         raise UsageError(f"unknown layout {name!r}; allowed: {', '.join(names())}")
@@ -42,7 +45,7 @@ def make(name: str, **options: float | str | None) -> "Scene":
 
 def ordered(scene: "Scene", order: str, seed: int) -> "Scene":
     """Return the scene with its particles as the layout has them, "shuffled", or "sorted" by cells of a cutoff, x slowest."""
-    from jfrnn import cases  # pyright: ignore[reportAttributeAccessIssue]
+    import cases
 
     if order == "shuffled":
         return cases.shuffle(scene, seed)

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from experiments import _machine, methods
-from experiments._config import Config, Spec
+from experiments._config import Config, Spec, digest
 from experiments._errors import UsageError
 from experiments._forecast import Forecast, in_words
 from experiments._rows import RETRIED, SCENE_FIELDS, Row, RowFile
@@ -107,10 +107,15 @@ def progress(total: int) -> Iterator[Progress]:
 
 
 def _prepare_oracle(spec: Spec, folder: Path, console: Console) -> None:
-    """Find the exact pairs of a scene before its rows run, so that no row's time limit pays for them."""
+    """Find the exact pairs of a scene before its rows run, so that no row's time limit pays for them; once per folder."""
+    there = folder / "oracle" / f"{digest(spec.scene_key)}.there"
+    if there.exists():
+        return
     answer = ask(_task("oracle", spec, folder), spec.timeout)
     if "reason" in answer:
         console.print(f"{spec.scene_name}: no exact pairs: {answer['reason']}", highlight=False, markup=False)
+    else:
+        there.touch()
 
 
 def measure(spec: Spec, folder: Path, known: dict[str, Any] | None = None) -> Row:

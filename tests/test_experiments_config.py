@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import _config, _layouts, _rows, _thesis, _worker, methods
+from experiments import _config, _layouts, _rows, _sweep, _thesis, _worker, methods
 from experiments._errors import UsageError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -174,3 +174,12 @@ def test_help_imports_nothing_heavy():
     code = f"import sys; from experiments import _cli; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout == "[]\n"
+
+
+def test_a_process_that_needs_no_jax_does_not_wait_for_it(tmp_path):
+    (spec,) = load(tmp_path, 'methods = ["scipy-kdtree"]\nspacing = 1e-3\nrepeats = 1\n[[scenes]]\nlayouts = ["corners"]\n').specs()
+    task = _sweep._task("measure", spec, tmp_path)
+    code = f"import sys; from experiments import _worker; print(_worker._answer({task})['status'])\n"
+    code += "print(sorted({'jax', 'jfrnn', 'pandas', 'matplotlib'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.splitlines() == ["ok", "[]"]

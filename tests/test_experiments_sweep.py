@@ -156,7 +156,8 @@ def test_rows_that_a_limit_cut_short_are_measured_again_where_it_is_wider(tmp_pa
     for limit in ("60", "1e-9"):
         assert "1 of 1 rows are there already" in sweep.run("--most-seconds", limit).stderr
     result = CliRunner().invoke(app, ["run", str(sweep.config), "--most-seconds", "0"])
-    assert (result.exit_code, result.stderr) == (2, "error: --most-seconds 0.0: expected more than 0\n")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("error: --most-seconds 0: 0.0 is not in the range x>0.")
 
 
 def test_a_method_that_is_not_installed_gives_a_row_and_the_sweep_goes_on(tmp_path):
