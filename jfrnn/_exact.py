@@ -104,7 +104,7 @@ class Radii:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Cutoffs:
-    """What the pair test derives from radii, which are positive and finite wherever a particle takes part, else 0.
+    """What the pair test derives from radii, which are 0 or positive and finite wherever a particle takes part, else 0.
 
     Attributes:
         sources: [n], or None where the rule does not ask for them.
@@ -133,14 +133,21 @@ class Cutoffs:
 
 
 def is_radius(radii: Array) -> Array:
-    """Say which cutoffs the pair test can decide."""
+    """Say which cutoffs the pair test can decide: 0, which reaches what coincides, is one of them."""
     dtype = np.dtype(radii.dtype)
-    return (radii >= smallest_cutoff(dtype)) & (radii <= largest_cutoff(dtype))
+    unsigned = np.uint32 if dtype == np.float32 else np.uint64  # compared as floats, denormal numbers were 0
+    low, high = (np.array(x, dtype).view(unsigned)[()] for x in (smallest_cutoff(dtype), largest_cutoff(dtype)))
+    bits = lax.bitcast_convert_type(radii, unsigned)
+    magnitude = bits << unsigned(1) >> unsigned(1)
+    negative_zero = np.array(-0.0, dtype).view(unsigned)[()]
+    return (bits <= negative_zero) & (magnitude - unsigned(1) >= low - unsigned(1)) & (magnitude <= high)  # 0 - 1 is the largest
 
 
 def make_cutoffs(radii: Radii, closed: bool, skin: float = 0.0) -> Cutoffs:
     """Derive what the pair test needs; with a skin, of radii that are that much larger, rounded up."""
-    parts = [None if x is None else jnp.where(is_radius(x), _sum_rounded_up(x, skin), 0) for x in (radii.sources, radii.queries)]
+    parts = [
+        None if x is None else jnp.where(is_radius(x), _sum_rounded_up(jnp.abs(x), skin), 0) for x in (radii.sources, radii.queries)
+    ]
     largest = functools.reduce(jnp.maximum, (jnp.max(x, initial=0) for x in parts if x is not None))
     largest = jnp.where(largest > 0, largest, 1)
     return Cutoffs(parts[0], parts[1], largest, _unit_scale(largest), radii.rule, closed)

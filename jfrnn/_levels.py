@@ -43,7 +43,7 @@ class Levels(NamedTuple):
         keys: [n] uint32 in order: group, then the place within the top cell along the Morton curve.
         query_top: [d, m] int32, the top cell of each query; [d + 1, m] where systems are told apart.
         query_place: [d, m] int32, the finest cell within it, counted from 0 along each axis.
-        largest: [GROUPS] the largest cutoff of each group, 0 where there is none; None: the rule asks for no cutoffs of sources,
+        largest: [GROUPS] the largest cutoff of each group, -1 where there is none; None: the rule asks for no cutoffs of sources,
             and all are one group.
         passes: [] int32, groups that are in use; None likewise.
         widths: [d] of top cells.
@@ -84,8 +84,8 @@ def sort_by_levels(along: Array, axes: Axes, cutoffs: Cutoffs, n: int, own: bool
     at = query_order if own else n + query_order
     largest, passes = None, None
     if cutoffs.sources is not None:
-        radii = jnp.where(finite[:n], cutoffs.sources, 0)
-        largest = jnp.zeros(GROUPS, radii.dtype).at[group].max(radii)
+        radii = jnp.where(finite[:n], cutoffs.sources, -1)
+        largest = jnp.full(GROUPS, -1, radii.dtype).at[group].max(radii)
         passes = jnp.max(jnp.where(finite[:n], group.astype(jnp.int32) + 1, 0), initial=0)
 
     return Levels(order, query_order, grid, keys, top[:, at], place[:, at], largest, passes, widths, axes)
@@ -100,7 +100,7 @@ def level_runs(
 
     def runs(places: Array, which: Array) -> tuple[Array, Array, Array | None]:
         of_query = None if query_radii is None else query_radii.at[places].get(mode="promise_in_bounds")
-        of_group = None if largest is None else jnp.broadcast_to(largest[which], places.shape)
+        of_group = None if largest is None else jnp.broadcast_to(jnp.maximum(largest[which], 0), places.shape)
         radii = cutoffs.of_pairs(of_query, of_group)
         reach = functools.reduce(jnp.add, radii) / len(radii) * (1 + 4 * jnp.finfo(radii[0].dtype).eps)
         level = _finest_level(reach, levels.widths, levels.axes)

@@ -1,6 +1,12 @@
 """What can go wrong with the data of a search: one bit each, and the error that reports it."""
 
 import enum
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+from jax.core import Tracer
 
 
 class Status(enum.IntFlag):
@@ -41,8 +47,8 @@ _MESSAGES = {
         "neighbors in this list. Wrap them into the box."
     ),
     Status.INVALID_CUTOFF: (
-        "`cutoff` holds values that are not positive and finite, or too small or large for their dtype: those particles have no "
-        "neighbors in this list. Find them with ~(jnp.isfinite(cutoff) & (cutoff > 0))."
+        "`cutoff` holds values that are negative or not finite, or, where not 0, too small or large for their dtype: those "
+        "particles have no neighbors in this list. Find them with ~(jnp.isfinite(cutoff) & (cutoff >= 0))."
     ),
     Status.NONFINITE_VERTEX: (
         "`vertices` that faces name hold non-finite coordinates (NaN or infinite): those faces are nobody's neighbors. "
@@ -57,6 +63,14 @@ _MESSAGES = {
     Status.HALO_TOO_FAR: "Pairs reach to shards farther away than messages go: pairs may be missing.",
     Status.TOTAL_OVERFLOW: "The list held more pairs than the `total` that `require` was told: exports of that length lack pairs.",
 }
+
+
+def known_status(status: Array) -> Status | None:
+    """Return the bits of a list, or of any of a batch; None while it is being traced."""
+    if isinstance(status, Tracer):
+        return None
+    bits: Any = jax.device_get(status)  # stays with the array: to ask again costs nothing
+    return Status(int(np.bitwise_or.reduce(bits, axis=None)))
 
 
 class NeighborOverflowError(RuntimeError):
@@ -74,3 +88,7 @@ class NeighborOverflowError(RuntimeError):
             f"capacity={capacity} is too small: one row has {required} neighbors. Search again with "
             f"capacity={required} or more; called outside jax.jit without `capacity`, search counts first and cannot overflow."
         )
+
+    def __reduce__(self) -> tuple[type, tuple[int, int]]:
+        """Say how to make it anew: pickle would pass the message alone, and a process pool would wait for ever."""
+        return type(self), (self.required, self.capacity)

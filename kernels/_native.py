@@ -308,7 +308,7 @@ struct Exact {
             const double tail = mul(mul(-2, r), rest);
             term[TERMS - 1] = tail;
             slack = add(mul(size_of(tail), 2.220446049250313e-16), mul(mul(2, rest), rest));
-            plain = !(double(radius) < smallest) && !(double(more) < smallest);
+            plain = (radius == 0 || !(double(radius) < smallest)) && (more == 0 || !(double(more) < smallest));
         }
         const double r2 = mul(r, r);
         term[0] = -r2;

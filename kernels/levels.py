@@ -281,7 +281,7 @@ auto serve = [&](int at) {
         }
     };
     for (int g = 0; finite_point(q) && g < groups; ++g) {
-        if (RULE != GATHER && largest[g] == 0)
+        if (RULE != GATHER && largest[g] < 0)
             continue;
         const real reach = of_pair(own, largest[g]) * (1 + 8 * EPS);
         int level = 0;  // the finest one whose cells are wider than the reach

@@ -17,6 +17,8 @@ from jfrnn._exact import RULES
 
 SLOW = pytest.mark.slow
 LENGTH, CAPACITY = 128, 256
+KINDS = {"gather": (np.float64, 2), "scatter": (np.float32, 2), "either": (np.float32, 3), "both": (np.float32, 3)}
+KINDS["mean"] = (np.float64, 3)
 
 
 def radii_of(given, rule, length=None):
@@ -64,13 +66,11 @@ def assert_case(name, dtype, dim, rule, backend, closed=False):
 
 def each_case():
     """Yield every case, rule, kind and engine; by default, of the array engines, which compile slowly, one kind of two rules."""
-    kinds = {"gather": (np.float64, 2), "scatter": (np.float32, 2), "either": (np.float32, 3), "both": (np.float32, 3)}
-    kinds["mean"] = (np.float64, 3)
     compiled = {"queries": ("either",), "periodic": ("gather",), "periodic_ties": (), "periodic_images": ()}
     in_boxes = {"periodic": ("gather",), "periodic_images": ("gather",), "periodic_ties": ("mean",)}  # XLA prepares what Warp walks
     for name, rule, dtype, dim, backend in product(RADII_CASES, RULES, (np.float32, np.float64), (2, 3), ("jax", "warp", "brute")):
         common = in_boxes.get(name, RULES)
-        often = (dtype, dim) == kinds[rule] and rule in (common if backend == "warp" else compiled.get(name, ("mean",)))
+        often = (dtype, dim) == KINDS[rule] and rule in (common if backend == "warp" else compiled.get(name, ("mean",)))
         kind = f"{name}-{rule}-f{8 * dtype().itemsize}-{dim}d-{backend}"
         yield pytest.param(name, rule, dtype, dim, backend, id=kind, marks=[SLOW] * (backend == "brute" or not often))
 
@@ -122,15 +122,68 @@ def test_traced_radii_share_one_program_and_bad_ones_set_a_bit():
         expected = {(i, j) for i, j, _ in reference.reference_radii(x, h, "gather")}
         assert set(zip(*(part.tolist() for part in nbrs.pairs()), strict=True)) == expected
     assert len(traces) == 1
-    for bad in (np.nan, np.inf, 0.0, -1.0, 1e-38):
+    for bad in (np.nan, np.inf, -1.0, 1e-38):
         h[7] = bad
         nbrs = search(x, h)
         assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.INVALID_CUTOFF
         assert nbrs.count[7] == 0
         assert {(i, j) for i, j in reference.pairs_of(nbrs.idx, nbrs.count, len(x))} == {pair for pair in expected if 7 not in pair}
-        with pytest.raises(ValueError, match="`cutoff` holds values that are not positive and finite"):
+        with pytest.raises(ValueError, match="`cutoff` holds values that are negative or not finite"):
             nbrs.check()
     assert len(traces) == 1
+
+
+RADII_OF_0 = {
+    "most": lambda h: np.where(np.arange(len(h)) % 4 > 0, 0, h),
+    "nearly all": lambda h: np.where(np.arange(len(h)) == 1, 1e-6, 0),
+    "negative zero": lambda h: np.where(np.arange(len(h)) % 2 > 0, -0.0, h),
+}
+
+
+def assert_radii_of_0(dtype, dim, rule, backend, *, closed=False, box=False, sums=True):
+    """A third of the points lie on top of each other; lists, then sums."""
+    random = np.random.default_rng(1)
+    x = random.random((LENGTH, dim)).astype(dtype)
+    x[::3] = x[0]
+    given = {"radius_rule": rule, "backend": backend, "closed": closed} | ({"box": jfrnn.Box(np.ones(dim))} if box else {})
+    counted = jax.jit(lambda x, h: jfrnn.pair_sum(lambda r, i, j: jnp.ones((), dtype), x, h, **given))
+    for zeros in RADII_OF_0.values():
+        h = zeros(np.exp(random.uniform(np.log(0.02), np.log(0.4), LENGTH))).astype(dtype)
+        nbrs = jfrnn.search(x, h, capacity=CAPACITY, **given)
+        nbrs.check()
+        expected = reference.reference_radii(x, h, rule, closed=closed, lengths=np.ones(dim) if box else None)
+        if box:
+            assert image_pairs(nbrs, x) == expected
+        else:
+            assert {(*p, (0,) * dim) for p in reference.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), LENGTH)} == expected
+        if sums:
+            np.testing.assert_array_equal(counted(x, h), np.bincount([i for i, *_ in expected], minlength=LENGTH))
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_a_radius_of_0_is_a_radius(rule):
+    dtype, dim = KINDS[rule]  # of which other tests have compiled the kernels
+    assert_radii_of_0(dtype, dim, rule, "warp", sums=False)
+
+
+@SLOW
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("box", [False, True])
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("backend", ["warp", "jax", "brute"])
+def test_a_radius_of_0_on_every_engine(backend, rule, box, closed, dtype, dim):
+    assert_radii_of_0(dtype, dim, rule, backend, closed=closed, box=box)
+
+
+@pytest.mark.parametrize("backend", ["warp", "brute", pytest.param("jax", marks=SLOW)])
+def test_a_mean_with_0_reaches_half_as_far(backend):
+    x = np.array([[0.0, 0.0], [1.0, 0.0]], np.float32)
+    nbrs = jfrnn.search(x, np.array([0.0, 3.0], np.float32), radius_rule="mean", capacity=2, backend=backend)
+    nbrs.check()
+    assert nbrs.pairs()[0].tolist() == [0, 1]
+    twice, none = np.repeat(x, 2, axis=0), np.zeros(4, np.float32)
+    assert jfrnn.count(twice, none, radius_rule="mean", backend=backend).tolist() == [0] * 4
+    assert jfrnn.count(twice, none, radius_rule="mean", closed=True, backend=backend).tolist() == [1] * 4
 
 
 def test_motion_and_growth_share_the_skin():
