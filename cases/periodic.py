@@ -354,13 +354,32 @@ _LEFT = _ROTATED[[1, 0, 2]]
 _FLAT = np.array([[11.0, 0.0, 0.0], [9.0, 0.7, 0.0], [4.0, 10.0, 0.7]])
 _NARROW = 6.0 * np.array([[1.0, 0.0, 0.0], [np.cos(0.1), np.sin(0.1), 0.0], [0.5, 0.05, 1.0]])
 _PARALLEL = 60.0 * np.array([[1.0, 0.0, 0.0], [1.0, 0.01, 0.0], [1.0, 0.01, 0.05]])
+# 900 long, and yet a cubic lattice; and one that no float rounds well, of vectors up to 60 long in a lattice of lengths about 1
+_FAR_FROM_REDUCED = 3.0 * np.array([[1.0, 0.0, 0.0], [300.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+_LONG = np.array([[1.0, 0.0, 0.0], [30.3, 1.1, 0.0], [-17.2, 21.1, 0.9]]) @ (_ROTATED / 4.4)
 _FCC = np.array([[1.0, 1.0, 0.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
 _BCC = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0]])
 _HEXAGONAL = np.array([[1.0, 0.0, 0.0], [0.5, 0.875, 0.0], [0.0, 0.0, 1.5]])
 _DYADIC = np.array([[4.0, 0.0, 0.0], [1.25, 3.5, 0.0], [-0.75, 2.0, 4.5]])
 _DYADIC_LEFT = np.array([[1.5, 4.0, 0.5], [4.5, -1.0, 0.0], [0.25, 1.0, 4.0]])
 
+
+def _alone_far(dtype: np.dtype, dim: int) -> Parts:
+    return np.zeros((1, dim)), 6.0, _FAR_FROM_REDUCED, _ALL
+
+
 _TABLE = (
+    _case(
+        "far_from_reduced",
+        "one vector is another plus 300 times a third: far more images lie within reach of the given vectors than of short ones",
+        _filled(_FAR_FROM_REDUCED, n=(20, 12), cutoff=3.5),
+    ),
+    _case("far_from_reduced_alone", "a cubic lattice in disguise, of which 6 neighbors and 12 more lie at ties", _alone_far),
+    _case(
+        "far_from_reduced_turned",
+        "long vectors that no float rounds well, particles up to 4 of them outside",
+        _filled(_LONG, n=(20, 12), cutoff=1.1, turns=(-4, 4)),
+    ),
     _case("random", "the plain case: box six cutoffs wide, particles in it", _filled(_WIDE)),
     *[
         _case(

@@ -285,7 +285,7 @@ def _images(nbrs: Any, x: Any, queries: Any) -> list[tuple[int, int, tuple[int, 
         codes, source_turns, query_turns = nbrs.images
         turns = np.asarray(unpacked_turns(source_turns, nbrs.box.dim))
         own_turns = turns if query_turns is None else np.asarray(unpacked_turns(query_turns, nbrs.box.dim))
-        shifts = kind.shifts[np.asarray(codes)[i, k]] + own_turns[i] - turns[j]
+        shifts = (kind.shifts[np.asarray(codes)[i, k]] + own_turns[i] - turns[j]) @ kind.numbers
     return sorted(zip(i.tolist(), j.tolist(), map(tuple, shifts.tolist()), strict=True))
 
 

@@ -265,7 +265,7 @@ def _torus(sources: Array, queries: Array | None, lattice: Lattice, wrapped: Wra
     raw = (sources, sources if queries is None else queries)
     turns = tuple(unpacked_turns(x, lattice.dim).astype(sources.dtype) for x in (wrapped.turns, wrapped.query_turns))
     shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)
-    return Torus(lattice.images, translation(shifts, lattice), lattice.matrix, raw, (turns[0], turns[1]), wrapped.slack)
+    return Torus(lattice.images, translation(shifts, lattice), lattice.given, raw, (turns[0], turns[1]), wrapped.slack)
 
 
 def _all_sources(

@@ -10,7 +10,6 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
-from itertools import product
 from typing import Any, NamedTuple
 
 import jax
@@ -19,10 +18,13 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._exact import Shifted
+from jfrnn._exact import Shifted, combined
+from jfrnn._reduced import Basis, reduced_basis
 
 _NEAREST = 0.49  # cutoff over width up to which the nearest image is the only one, with room for rounding
-_MOST_IMAGES = 2**15 - 1  # codes of a signed 16-bit integer
+_MANY_IMAGES = 2**15 - 1  # from which on shorter lattice vectors are looked for
+_MOST_IMAGES = 2**22  # of which tables take 100 MB
+_MOST_VECTORS = 2**23  # of the given ones in a shift: float32 says whole numbers below 2^24 exactly
 
 
 @jax.tree_util.register_pytree_with_keys_class
@@ -54,7 +56,8 @@ class Box:
 
         Args:
             lengths_or_matrix: Lengths [length], shape [2] or [3], all > 0, of edges along the axes; or lattice vectors [length],
-                one per row, shape [2, 2] or [3, 3], of any handedness and skew. Along an axis that is not periodic nothing but
+                one per row, shape [2, 2] or [3, 3], of any handedness and skew (where they are known while tracing, short ones of
+                the same lattice are found; shifts count the given ones). Along an axis that is not periodic nothing but
                 finite numbers is asked of them. Rounded once to the dtype of the positions.
             periodic: One bool for all axes, or one per axis (per row of the matrix).
             origin: A corner of the cell [length], a number or shape [d]. It changes no pair; a search is fastest where particles
@@ -162,17 +165,25 @@ class Images(NamedTuple):
         orthogonal: Lattice vectors lie along the axes.
         reach: Over how many cells to either side a pair may reach, per axis; 0 along axes that are not periodic.
         nearest: No pair has more than one image within the cutoff, the nearest one: no image need be stored.
+        basis: Of which whole numbers of the given lattice vectors those consist that shifts count; None: of themselves.
     """
 
     periodic: tuple[bool, ...]
     orthogonal: bool
     reach: tuple[int, ...]
     nearest: bool
+    basis: Basis | None = None
 
     @property
     def shifts(self) -> np.ndarray:
         """All lattice shifts within reach, shape [images, d], int32; the row number is the code of the image."""
-        return np.array(list(product(*(range(-k, k + 1) for k in self.reach))), np.int32)
+        axes = np.meshgrid(*(np.arange(-k, k + 1, dtype=np.int32) for k in self.reach), indexing="ij")
+        return np.stack(axes, axis=-1).reshape(-1, len(self.reach))
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The basis, shape [d, d], int64."""
+        return np.eye(len(self.reach), dtype=np.int64) if self.basis is None else np.array(self.basis)
 
     @property
     def total(self) -> int:
@@ -186,8 +197,8 @@ class Images(NamedTuple):
 
     @property
     def dtype(self) -> np.dtype:
-        """Of the codes in a list: 1 B up to 256 of them."""
-        return np.dtype(np.uint8 if self.total <= 256 else np.int16)
+        """Of the codes in a list: 1 B up to 256 of them, 2 B up to 32 768."""
+        return np.dtype(np.uint8 if self.total <= 256 else np.int16 if self.total <= 2**15 else np.int32)
 
 
 def images_of(box: Box, radius: float | None, dtype: np.dtype, sources: int) -> Images:
@@ -197,15 +208,34 @@ def images_of(box: Box, radius: float | None, dtype: np.dtype, sources: int) -> 
         ValueError: the cutoff spans more images than can be told apart.
     """
     if box.images is None and radius is not None and not isinstance(box.vectors, Tracer):
-        share = radius / _widths(np.asarray(box.vectors, dtype).astype(np.float64), box.periodic)
-        nearest = bool((share <= _NEAREST).all())
-        # room for the rounding of coordinates: far fewer than a hundredth of a cell
-        reach = tuple(math.ceil(s + 0.01) if p else 0 for s, p in zip(share.tolist(), box.periodic, strict=True))
-    else:
-        wanted = (0,) * box.dim if box.images is None else box.images
-        nearest = not any(k for k, p in zip(wanted, box.periodic, strict=True) if p)
-        reach = tuple(max(k, 1) if p else 0 for k, p in zip(wanted, box.periodic, strict=True))
+        vectors = np.asarray(box.vectors, dtype).astype(np.float64)
+        images = _needed_images(vectors, box, radius, None)
+        if not box.orthogonal and _too_many(images, sources, _MANY_IMAGES):
+            basis, short = reduced_basis(vectors, box.periodic)
+            reduced = _needed_images(short, box, radius, basis)
+            images = reduced if reduced.total < images.total and _are_exact(reduced) else images
+        return checked_images(images, sources)
+    wanted = (0,) * box.dim if box.images is None else box.images
+    nearest = not any(k for k, p in zip(wanted, box.periodic, strict=True) if p)
+    reach = tuple(max(k, 1) if p else 0 for k, p in zip(wanted, box.periodic, strict=True))
     return checked_images(Images(box.periodic, box.orthogonal, reach, nearest), sources)
+
+
+def _needed_images(vectors: np.ndarray, box: Box, radius: float, basis: Basis | None) -> Images:
+    """Return the images that a radius needs in a lattice of these vectors."""
+    share = radius / _widths(vectors, box.periodic)
+    # room for the rounding of coordinates: far fewer than a hundredth of a cell
+    reach = tuple(math.ceil(s + 0.01) if p else 0 for s, p in zip(share.tolist(), box.periodic, strict=True))
+    return Images(box.periodic, box.orthogonal, reach, bool((share <= _NEAREST).all()), basis)
+
+
+def _too_many(images: Images, sources: int, most: int) -> bool:
+    return images.total > most or (not images.nearest and sources * images.total >= 2**31)
+
+
+def _are_exact(images: Images) -> bool:
+    """Say whether shifts in the given vectors are whole numbers that every dtype holds."""
+    return (2 * LARGEST_TURN + max(images.reach)) * np.abs(images.numbers).sum(axis=0).max() <= _MOST_VECTORS
 
 
 def checked_images(images: Images, sources: int) -> Images:
@@ -214,14 +244,15 @@ def checked_images(images: Images, sources: int) -> Images:
     Raises:
         ValueError: there are more images than can be told apart.
     """
+    if images.total > _MOST_IMAGES:
+        raise ValueError(
+            f"box is too small for this cutoff: pairs reach over {images.reach} cells along the axes, {images.total} images, "
+            f"whose tables take {24 * images.total // 10**6} MB; {_MOST_IMAGES} have room, {24 * _MOST_IMAGES // 10**6} MB. "
+            "Replicate the particles into a larger box, or give short lattice vectors."
+        )
     if not images.nearest and sources * images.total >= 2**31:
         raise ValueError(
             f"box is too small for its particles: {sources} of them with {images.total} images each are more than int32 can number."
-        )
-    if images.total > _MOST_IMAGES:
-        raise ValueError(
-            f"box is too small for this cutoff: pairs reach over {images.reach} cells along the axes, more than {_MOST_IMAGES} "
-            "images. Replicate the particles into a larger box, or reduce a skewed lattice to short vectors."
         )
     return images
 
@@ -237,10 +268,20 @@ def grown_images(kind: Images, boxes: Sequence[Box], radius: float | None, dtype
     for box in boxes:
         _check_values(np.asarray(box.vectors), np.asarray(box.origin), box.periodic)
     kinds = [kind, *(images_of(box, radius, dtype, sources) for box in boxes)]
+    if len({k.basis for k in kinds}) > 1:  # numbers of images can be compared in one basis only: that of the last box
+        kinds = [_in_basis(box, radius, dtype, kinds[-1]) for box in boxes]
+        kind = Images(kind.periodic, kind.orthogonal, kinds[-1].reach, kinds[-1].nearest, kinds[-1].basis)
     reach, nearest = tuple(map(max, *(k.reach for k in kinds), kind.reach)), all(k.nearest for k in kinds)
     if short and (reach, nearest) == (kind.reach, kind.nearest):
         reach, nearest = reach if nearest else tuple(2 * k for k in reach), False
-    return checked_images(Images(kind.periodic, kind.orthogonal, reach, nearest), sources)
+    return checked_images(kind._replace(reach=reach, nearest=nearest), sources)
+
+
+def _in_basis(box: Box, radius: float | None, dtype: np.dtype, like: Images) -> Images:
+    if radius is None:
+        return like
+    vectors = np.asarray(box.vectors, dtype).astype(np.float64)
+    return _needed_images(like.numbers @ vectors, box, radius, like.basis)
 
 
 def _widths(vectors: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
@@ -261,13 +302,16 @@ class Lattice:
     """A box in the dtype of the positions, ready to wrap them.
 
     Attributes:
-        matrix: [d, d] lattice vectors, one per row; rows of axes that are not periodic are 0.
+        matrix: [d, d] lattice vectors, one per row; rows of axes that are not periodic are 0. Short ones, and rounded, where the
+            images have a basis.
+        given: [d, d] those that were given: what is exact is said in them.
         transform: [d, d]; (x - origin) @ transform are fractions of the lattice vectors along periodic axes, lengths along others.
         origin: [d].
         images: Static.
     """
 
     matrix: Array
+    given: Array
     transform: Array
     origin: Array
     images: Images = dataclasses.field(metadata={"static": True})
@@ -283,11 +327,13 @@ def make_lattice(box: Box, images: Images, dtype: np.dtype) -> Lattice:
     vectors, origin = jnp.asarray(box.vectors).astype(dtype), jnp.asarray(box.origin).astype(dtype)
     rows = jnp.diag(vectors) if box.orthogonal else vectors
     flags = np.array(box.periodic)
-    matrix = jnp.where(flags[:, None], rows, 0)
+    given = matrix = jnp.where(flags[:, None], rows, 0)
     if box.orthogonal:
         lengths = jnp.where(flags, vectors, 1)
-        return Lattice(matrix, jnp.diag(1 / lengths), origin, images)
-    return Lattice(matrix, _inverse(_completed(matrix, box.periodic)), origin, images)
+        return Lattice(matrix, given, jnp.diag(1 / lengths), origin, images)
+    if images.basis is not None:
+        matrix = combined(images.basis, given)
+    return Lattice(matrix, given, _inverse(_completed(matrix, box.periodic)), origin, images)
 
 
 def _completed(matrix: Array, periodic: tuple[bool, ...]) -> Array:
@@ -483,7 +529,7 @@ def shifted_pairs(difference: Array, shifts: Array, points: Sequence[Array], lat
     vectors = difference + translation(shifts, lattice)
     moved = jnp.abs(fixed.matrix).sum(axis=0)  # 0 for components that no lattice vector has: nothing is added to them
     slack = 8 * jnp.finfo(moved.dtype).eps * jnp.max(size + spans * moved, initial=0, where=moved > 0)
-    return Shifted(vectors, shifts, slack, fixed.matrix, lattice.images.orthogonal)
+    return Shifted(vectors, shifts, slack, fixed.given, lattice.images.orthogonal, lattice.images.basis)
 
 
 class Motion(NamedTuple):
@@ -524,6 +570,22 @@ def turns_between(before: Array, now: Array, lattice: Lattice) -> Array:
     return -nearest_shifts(jnp.where(jnp.isfinite(now - before).all(axis=1, keepdims=True), now - before, 0), lattice)
 
 
+def given_shifts(shifts: Array, images: Images) -> Array:
+    """Return shifts [..., d], whole numbers, in the lattice vectors as they were given: int32."""
+    counts = shifts.astype(jnp.int32)
+    if images.basis is None:
+        return counts
+    return functools.reduce(jnp.add, (counts[..., k, None] * np.array(row, np.int32) for k, row in enumerate(images.basis)))
+
+
+def forward_shifts(shifts: Array, images: Images) -> Array:
+    """Return shifts [..., d] with the sign for which their first number that is not 0, in the given vectors, is positive."""
+    given, backward = given_shifts(shifts, images), jnp.zeros(shifts.shape[:-1], bool)
+    for k in reversed(range(shifts.shape[-1])):
+        backward = (given[..., k] < 0) | ((given[..., k] == 0) & backward)
+    return jnp.where(backward[..., None], -shifts, shifts)
+
+
 def box_change(before: Lattice, now: Lattice, home: Sequence[Array]) -> Array:
     """Bound how far the change of a box can move one image of points against another, for pairs within reach.
 
@@ -534,7 +596,10 @@ def box_change(before: Lattice, now: Lattice, home: Sequence[Array]) -> Array:
         return jnp.zeros((), dtype)
     highest = functools.reduce(jnp.maximum, (jnp.max(x, axis=0) for x in places))
     lowest = functools.reduce(jnp.minimum, (jnp.min(x, axis=0) for x in places))
-    moved = jnp.sqrt(jnp.sum((now.matrix - before.matrix) ** 2, axis=1)) * (1 + 16 * jnp.finfo(dtype).eps)
+    eps = jnp.finfo(dtype).eps
+    moved = jnp.sqrt(jnp.sum((now.matrix - before.matrix) ** 2, axis=1)) * (1 + 16 * eps)
+    if now.images.basis is not None:  # short vectors are rounded
+        moved = jnp.where(moved > 0, moved + 4 * eps * jnp.sum(jnp.abs(now.matrix), axis=1), moved)
     return jnp.sum(((highest - lowest).astype(dtype) + np.array(now.images.reach, dtype)) * moved)
 
 

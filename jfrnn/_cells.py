@@ -5,7 +5,6 @@ the stencil of a particle is one contiguous run of sorted particles per row of c
 """
 
 from collections.abc import Sequence
-from itertools import product
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -236,11 +235,15 @@ def _stencil_rows(coords: Array, extent: Array, dim: int, images: Images | None)
     if len(coords) > dim:
         reach, steps = (*reach, 0), [*steps, range(1)]
     parts = _parts_of_rows(coords[0], extent[0], reach[0], images)
-    rows = [(part, row) for part in parts for row in product(*steps[1:])]
-    first, last, shift = (jnp.stack([part[what] for part, _ in rows], axis=1) for what in range(3))
+    rows = np.stack(np.meshgrid(*steps[1:], indexing="ij"), -1).reshape(-1, len(coords) - 1).astype(np.int32)
+
+    def each(parts: Sequence[Array]) -> Array:  # [m, runs]: the rows of the first part, then those of the next
+        return jnp.repeat(jnp.stack(parts, axis=1), len(rows), axis=1)
+
+    first, last, shift = (each([part[what] for part in parts]) for what in range(3))
     shifts, cells = [shift], [first, last]
     for axis in range(1, len(coords)):
-        cell = coords[axis][:, None] + np.array([row[axis - 1] for _, row in rows], np.int32)
+        cell = coords[axis][:, None] + np.tile(rows[:, axis - 1], len(parts))
         turn = jnp.zeros_like(cell) if reach[axis] == 0 else cell // extent[axis]
         cells.append(cell - turn * extent[axis])
         shifts.append(turn)

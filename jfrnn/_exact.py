@@ -25,6 +25,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._flags import set_places
+from jfrnn._reduced import Basis
 
 
 class Pair(NamedTuple):
@@ -44,8 +45,40 @@ class Pair(NamedTuple):
         """Return the shifts and the components of lattice vectors whose products belong to one axis."""
         if self.shift is None or self.matrix is None:
             return []
-        rows = [axis] if self.orthogonal else range(len(self.shift))
+        rows = [axis] if self.orthogonal else range(len(self.shift))  # more than axes where numbers are cut into two
         return [(self.shift[k], self.matrix[k, axis]) for k in rows]
+
+
+_WHOLE_BITS = 12  # of whole numbers whose products with half mantissas are exact
+
+
+def shift_in_given(shift: list[Array], basis: Basis | None, matrix: Array) -> tuple[list[Array], Array]:
+    """Return terms of a translation, shifts and lattice vectors, that say it exactly in the given vectors [d, d].
+
+    `shift`, whole floats, counts vectors of the basis; in the given ones numbers may be large: they are cut into two.
+    """
+    if basis is None:
+        return shift, matrix
+    counts = [x.astype(jnp.int32) for x in shift]
+    given = [functools.reduce(jnp.add, (x * row[k] for x, row in zip(counts, basis, strict=True))) for k in range(len(shift))]
+    high = [(x + (1 << (_WHOLE_BITS - 1))) >> _WHOLE_BITS for x in given]
+    low = [x - (h << _WHOLE_BITS) for x, h in zip(given, high, strict=True)]
+    return [x.astype(matrix.dtype) for x in (*low, *high)], jnp.concatenate([matrix, matrix * 2**_WHOLE_BITS])
+
+
+def combined(basis: Basis, matrix: Array) -> Array:
+    """Return basis @ matrix, whole numbers times lattice vectors, each component rounded about once; differentiable."""
+    whole = np.array(basis)
+    high = (whole + (1 << (_WHOLE_BITS - 1))) >> _WHOLE_BITS
+    half = _half_mantissa(lax.stop_gradient(matrix))
+    terms = []
+    for numbers, size in ((whole - (high << _WHOLE_BITS), 1), (high, 2**_WHOLE_BITS)):
+        if numbers.any():
+            times = numbers.astype(matrix.dtype)
+            terms += [times[:, k, None] * (part[k] * size) for k in range(len(whole)) for part in (matrix - half, half)]
+    for _ in range(3):
+        terms = _distill(terms)
+    return functools.reduce(jnp.add, terms)
 
 
 PointsAt = Callable[[Array | None], Pair]
@@ -252,7 +285,8 @@ def is_pair_of(rows: Array, sources: Array, neighbor: Array, cutoff: "Cutoff | C
         if shifted is None:
             return pair
         shift = [shifted.shifts[..., k] if at is None else flat_take(shifted.shifts[..., k], at) for k in axes]
-        return pair._replace(shift=shift, matrix=shifted.matrix, orthogonal=shifted.orthogonal)
+        shift, matrix = shift_in_given(shift, shifted.basis, shifted.matrix)
+        return pair._replace(shift=shift, matrix=matrix, orthogonal=shifted.orthogonal)
 
     surely = square < inside
     return surely | refine((square <= outside) & ~surely, points, cutoff)
@@ -277,6 +311,7 @@ class Shifted(NamedTuple):
     slack: Array
     matrix: Array
     orthogonal: bool
+    basis: Basis | None = None  # in which shifts count, of the vectors in `matrix`; None: those
 
 
 def flat_take(x: Array, at: Array) -> Array:
@@ -357,7 +392,7 @@ def _sum_sign(pair: Pair, threshold: _Threshold) -> Array:
             half = _half_mantissa(component)  # times a shift of at most half a mantissa: exact
             *others, low, high = _distill(_distill([low, shift * (component - half), shift * half, high]))
             rest = sum((jnp.abs(x * distance_scale) for x in others), rest)
-            plain.append(_is_plain(component, least))
+            plain += [_is_plain(component, least), jnp.abs(shift) <= 2**_WHOLE_BITS]
         if pair.shift is not None:
             slack = slack + (4 * jnp.abs(high * distance_scale) * rest + 2 * rest * rest)
         high, low = high * distance_scale, low * distance_scale

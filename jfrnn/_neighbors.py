@@ -19,6 +19,8 @@ from jfrnn._box import (
     Images,
     Lattice,
     fixed_box,
+    forward_shifts,
+    given_shifts,
     grown_images,
     make_lattice,
     nearest_shifts,
@@ -41,7 +43,8 @@ class ImageCodes(NamedTuple):
     """Of which image of its source each slot tells, where the nearest is not the only one.
 
     Attributes:
-        codes: shape [m, capacity], uint8 up to 256 images, else int16: which of the shifts within reach, of wrapped particles.
+        codes: shape [m, capacity], uint8 up to 256 images, int16 up to 32 768, else int32: which of the shifts within reach, of
+            wrapped particles. These shifts and turns count the vectors of `Images.basis`.
         turns: shape [n], int32: how many lattice vectors each source was from the box when the list was made, packed.
         query_turns: shape [m], int32, or None where the sources are the queries.
     """
@@ -292,7 +295,7 @@ class NeighborList:
         box = self._box_now(box, sources)
         if box is None or self.box_kind is None or 0 in (sources.shape[0], *self.idx.shape):
             return jnp.zeros((*self.idx.shape, sources.shape[1]), jnp.int32)
-        return _shifts(self.idx, self.count, self._images_made(), sources, rows, box, self.box_kind)
+        return _shifts(self.idx, self.count, self._images_made(), sources, rows, box, self.box_kind, self.half)
 
     def distances(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> tuple[Array, Array]:
         """Compute the distance to every neighbor.
@@ -484,8 +487,8 @@ class NeighborList:
         cutoff = self.radii if self.cutoff is None else make_cutoff(self.cutoff, np.dtype(sources.dtype), self.closed)
         if box is None or self.box_kind is None:
             return *_vectors(self.idx, self.count, sources, rows, cutoff, self.closed), None
-        images = self._images_made()
-        return _periodic_vectors(self.idx, self.count, images, sources, rows, box, self.box_kind, cutoff, self.closed)
+        given = (self.box_kind, cutoff, self.closed, self.half)
+        return _periodic_vectors(self.idx, self.count, self._images_made(), sources, rows, box, *given)
 
     def _images_made(self) -> "_ImagesMade":
         made = None if self.images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
@@ -619,7 +622,7 @@ class _Slots(NamedTuple):
     shifts: Array
 
 
-def _slots(idx: Array, count: Array, images: _ImagesMade, sources: Array, rows: Array, lattice: Lattice) -> _Slots:
+def _slots(idx: Array, count: Array, images: _ImagesMade, sources: Array, rows: Array, lattice: Lattice, half: bool) -> _Slots:
     used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
     neighbor = jnp.where(used, idx, 0)
     difference = sources[neighbor] - rows[:, None, :]
@@ -630,17 +633,24 @@ def _slots(idx: Array, count: Array, images: _ImagesMade, sources: Array, rows: 
         turns, query_turns = _turns_now(codes, made, sources, rows, lattice)
         image = jnp.where(used, codes.codes.astype(jnp.int32), lattice.images.home)
         shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)[image] + query_turns[:, None] - turns[neighbor]
-    used = used & (jnp.abs(shifts) <= 2 * LARGEST_TURN).all(axis=-1)  # farther apart, nothing is decided exactly
+    kind = lattice.images
+    if half and kind.basis is not None:  # of an image of its own, a particle keeps the one ahead in the given vectors
+        own = neighbor == lax.broadcasted_iota(jnp.int32, idx.shape, 0)
+        shifts = jnp.where(own[..., None], forward_shifts(shifts, kind), shifts)
+    most = 2 * LARGEST_TURN + max(kind.reach)  # farther apart, nothing is decided exactly
+    used = used & (jnp.abs(shifts) <= most).all(axis=-1)
     return _Slots(used, neighbor, difference, jnp.where(used[..., None], shifts, 0))
 
 
-@functools.partial(compiled, static_argnames="kind")
-def _shifts(idx: Array, count: Array, images: _ImagesMade, sources: Array, rows: Array, box: Box, kind: Images) -> Array:
+@functools.partial(compiled, static_argnames=("kind", "half"))
+def _shifts(
+    idx: Array, count: Array, images: _ImagesMade, sources: Array, rows: Array, box: Box, kind: Images, half: bool
+) -> Array:
     lattice = make_lattice(box, kind, np.dtype(sources.dtype))
-    return lax.stop_gradient(_slots(idx, count, images, sources, rows, lattice).shifts).astype(jnp.int32)
+    return given_shifts(lax.stop_gradient(_slots(idx, count, images, sources, rows, lattice, half).shifts), kind)
 
 
-@functools.partial(compiled, static_argnames=("kind", "closed"))
+@functools.partial(compiled, static_argnames=("kind", "closed", "half"))
 def _periodic_vectors(
     idx: Array,
     count: Array,
@@ -651,10 +661,11 @@ def _periodic_vectors(
     kind: Images,
     given: Cutoff | Radii | None,
     closed: bool,
+    half: bool,
 ) -> tuple[Array, Array, Array]:
     cutoff = _pair_cutoff(given, closed)
     lattice = make_lattice(box, kind, np.dtype(sources.dtype))
-    used, neighbor, difference, shifts = _slots(idx, count, images, sources, rows, lattice)
+    used, neighbor, difference, shifts = _slots(idx, count, images, sources, rows, lattice, half)
     fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
     pairs = shifted_pairs(difference, shifts, (fixed_sources, fixed_rows), lattice)
     fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))

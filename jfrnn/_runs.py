@@ -9,18 +9,20 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
 from jfrnn._box import Images
-from jfrnn._exact import Cutoff, Cutoffs, Pair, flat_take, refine, squared_distance, step_one_bounds
+from jfrnn._exact import Cutoff, Cutoffs, Pair, flat_take, refine, shift_in_given, squared_distance, step_one_bounds
 
 LANES = 16  # candidates per word: hits in its lower half, doubtful ones in its upper half
 _BLOCK_WORDS = 1 << 16
 _BLOCK_SLOTS = 1 << 22  # 16 MB of rows
 _SLOT_GROUP = 128  # slots of a row that are filled at a time
 _FEW_RUNS = 32
+_MANY_RUNS = 4096
 FOLD_GROUP = 32  # neighbors of a query that are folded at a time
 _DOUBTFUL = 32  # doubtful candidates per row that one round of the exact test takes
 
@@ -52,7 +54,7 @@ class Torus(NamedTuple):
     Attributes:
         images: Static.
         translations: [images, d], near enough, of each image.
-        matrix: [d, d].
+        matrix: [d, d], the lattice vectors as they were given.
         raw: [n, d] sources and [m, d] queries as they were given.
         turns: [n, d] and [m, d] whole floats: how many lattice vectors were taken off.
         slack: [] by how much a component of a difference of wrapped coordinates may be wrong.
@@ -279,7 +281,9 @@ class _Engine(NamedTuple):
 
     @property
     def block_size(self) -> int:
-        return min(_BLOCK_WORDS // self.words, max(_BLOCK_SLOTS // self.capacity, 1), self.queries.ids.size)
+        torus = self.candidates.torus
+        runs = 1 if torus is None or torus.images.nearest else torus.images.total  # at least so many of each query
+        return min(_BLOCK_WORDS // self.words, max(_BLOCK_SLOTS // max(self.capacity, runs), 1), self.queries.ids.size)
 
     @property
     def block_count(self) -> int:
@@ -317,7 +321,10 @@ class _Engine(NamedTuple):
         word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (table.start.shape[0], self.words))
         runs = table.start.shape[1]
         if runs > _FEW_RUNS:  # many images
-            run = jnp.sum(word[..., None] >= table.before[:, None], axis=2, dtype=jnp.int32) - 1
+            if runs > _MANY_RUNS:
+                run = jax.vmap(functools.partial(jnp.searchsorted, side="right"))(table.before, word).astype(jnp.int32) - 1
+            else:
+                run = jnp.sum(word[..., None] >= table.before[:, None], axis=2, dtype=jnp.int32) - 1
             first = _take(table.start, run) + LANES * (word - _take(table.before, run))
             stop, image = _take(table.stop, run), None if table.image is None else _take(table.image, run)
         else:  # a chain of selections: half the time of looking up
@@ -413,7 +420,7 @@ class _Engine(NamedTuple):
         (sources, queries), shifts = torus.raw, _shifts_of(torus, i, j, image)
         shift = [shifts[..., k] for k in axes]
         raw = [queries[i, k] for k in axes], [sources[j, k] for k in axes]
-        return Pair(*raw, radii, shift, torus.matrix, torus.images.orthogonal)
+        return Pair(*raw, radii, *shift_in_given(shift, torus.images.basis, torus.matrix), torus.images.orthogonal)
 
 
 def _padded(sources: Points) -> Points:

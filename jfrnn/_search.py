@@ -61,7 +61,8 @@ def search(
             themselves, each particle being excluded from its own row by index.
         box: Periodic box (`Box`): then (i, j) stands in the list once for each image of j within the cutoff, its displacement
             being x_j - x_i + S·(lattice vectors), S whole numbers; `NeighborList.shifts` tells them. Particles may be up to 511
-            lattice vectors away from the box; along axes that are not periodic it has no meaning.
+            lattice vectors away from the box (short ones, where a skewed box is searched in such); along axes that are not
+            periodic it has no meaning.
         batch: The system to which each particle belongs, shape [n], integers that fit into int32, in any order; with queries a
             tuple of [n] and [m]. Only particles of one system are neighbors. Many systems cost what their particles cost, also
             where they lie on top of each other; all have the same box (for boxes of their own, `jax.vmap` over `search`).

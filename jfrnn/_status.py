@@ -44,7 +44,7 @@ _MESSAGES = {
     ),
     Status.OUT_OF_RANGE: (
         "`positions` (or `queries`) lie more than 511 lattice vectors away from a periodic box: those particles have no "
-        "neighbors in this list. Wrap them into the box."
+        "neighbors in this list. Wrap them into the box (one whose vectors are far longer than need be into that of short ones)."
     ),
     Status.INVALID_CUTOFF: (
         "`cutoff` holds values that are negative or not finite, or, where not 0, too small or large for their dtype: those "

@@ -155,6 +155,8 @@ def lattice_numbers(lattice: Lattice, wrapped: Wrapped) -> Array:
     images = jnp.asarray(lattice.images.reach).astype(lattice.matrix.dtype)
     parts = [jnp.pad(lattice.matrix, square), jnp.pad(lattice.transform, square), jnp.pad(lattice.origin, line)]
     parts += [jnp.pad(wrapped.reach, line, constant_values=1), jnp.pad(images, line), wrapped.slack]
+    if not lattice.images.orthogonal:
+        parts += [jnp.pad(lattice.given, square), jnp.pad(lattice.images.numbers.astype(images.dtype), square)]
     return jnp.concatenate([part.reshape(-1) for part in parts])
 
 

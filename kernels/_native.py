@@ -16,6 +16,7 @@ SMALLEST_TABLE = 4096
 
 # Where space is periodic, the radius in the array `cutoff` is followed by the lattice: its vectors and the transform,
 # row by row (3 x 3 each); origin, half the width of the stencil in units of the transform, images within reach (3 each); slack.
+# Where it is skewed, its vectors as they were given follow, and which whole numbers of those the vectors are (3 x 3 each).
 # Of a batch, the highest number of a system comes last.
 
 
@@ -67,7 +68,7 @@ const real radius = cutoff.data[0];
 #define JFRNN_CALL static __attribute__((noinline))
 #endif
 constexpr int ROW = DIM + (PERIODIC ? 1 : 0) + BATCHED;  // numbers per particle
-constexpr int LATTICE_END = PERIODIC ? 29 : 1;  // numbers in `cutoff`, but for the last one of a batch
+constexpr int LATTICE_END = PERIODIC ? (SKEWED ? 47 : 29) : 1;  // numbers in `cutoff`, but for the last one of a batch
 struct Bits {  // of floats
     enum { MANTISSA = DOUBLE ? 52 : 23, EXPONENTS = DOUBLE ? 0x7ff : 0xff, BIAS = DOUBLE ? 1023 : 127 };
     JFRNN_FUNCTION unsigned long long of(real x) {
@@ -119,6 +120,9 @@ struct Lattice {
     enum { NONE = 512 | 512 << 10 | (DIM == 3 ? 512 << 20 : 0) };  // packed turns of what lies in the cell
     const real* numbers;
     JFRNN_MEMBER real vector(int l, int k) const { return numbers[1 + 3 * l + k]; }
+    // the vectors that the caller gave, in which pairs are decided, and how many of each there are in vector l
+    JFRNN_MEMBER real given(int l, int k) const { return numbers[(SKEWED ? 29 : 1) + 3 * l + k]; }
+    JFRNN_MEMBER int number(int l, int k) const { return SKEWED ? (int)numbers[38 + 3 * l + k] : l == k; }
     JFRNN_MEMBER real transform(int k, int axis) const { return numbers[10 + 3 * k + axis]; }
     JFRNN_MEMBER real origin(int k) const { return numbers[19 + k]; }
     JFRNN_MEMBER real reach(int axis) const { return numbers[22 + axis]; }
@@ -325,7 +329,7 @@ struct Exact {
             if constexpr (SHIFTED) {
                 double rest = 0;
                 for (int l = 0; l < DIM; ++l) {
-                    const double v = double(lattice.vector(l, k)), s = double(shift[l]);
+                    const double v = double(lattice.given(l, k)), s = double(shift[l]);
                     if constexpr (DOUBLE)
                         plain = plain && (v == 0 || !(size_of(v) < smallest));
                     const double p = mul(s, v);
@@ -453,7 +457,7 @@ struct Exact {
             put(b[k], 1);
             put(a[k], -1);
             for (int l = 0; l < DIM; ++l)
-                put(lattice.vector(l, k), shift[l]);
+                put(lattice.given(l, k), shift[l]);
             int lowest = ALL, highest = 0;
             for (int i = 0; i < ALL; ++i) {  // carry into [-2^23, 2^23)
                 if (i + 1 < ALL) {
@@ -493,7 +497,7 @@ struct Exact {
         return carry < 0 ? -1 : (seen | carry) != 0;
     }
 
-    // does b + S·A lie within the cutoff of a? S are the whole numbers that the turns of both and the image add up to
+    // does b + S·A lie within the cutoff of a? S are the whole numbers of given vectors that turns and image add up to
     JFRNN_CALL bool image_pair(
         const real* a, const real* b, real radius, real more, bool closed, const int* shift, Lattice lattice) {
         if constexpr (!DOUBLE) {
@@ -502,7 +506,7 @@ struct Exact {
             for (int k = 0; k < DIM; ++k) {
                 double d = double(b[k]) - double(a[k]), size = size_of(double(a[k])) + size_of(double(b[k]));
                 for (int l = 0; l < DIM; ++l) {
-                    const double p = double(shift[l]) * double(lattice.vector(l, k));
+                    const double p = double(shift[l]) * double(lattice.given(l, k));
                     d += p;
                     size += size_of(p);
                 }
@@ -564,6 +568,14 @@ auto exact_image_within = [&](const real* query, const real* source, int image, 
         const int k = lattice.images(axis), codes = 2 * k + 1;
         shift[axis] = image % codes - k + Lattice::turn(query[DIM], axis) - Lattice::turn(source[DIM], axis);
         image /= codes;
+    }
+    if constexpr (SKEWED) {
+        int sums[3] = {0, 0, 0};
+        for (int l = 0; l < DIM; ++l)
+            for (int k = 0; k < DIM; ++k)
+                sums[k] += shift[l] * lattice.number(l, k);
+        for (int k = 0; k < DIM; ++k)
+            shift[k] = sums[k];
     }
     return Exact::image_pair(query, source, radius, more, closed, shift, lattice);
 };

@@ -35,6 +35,7 @@ def image_pairs(nbrs, positions, queries=None):
     else:
         turns, query_turns = (None if t is None else np.asarray(unpacked_turns(t, nbrs.box.dim)) for t in nbrs.images[1:])
         shifts = kind.shifts[np.asarray(nbrs.images.codes)[i, k]] + (turns if query_turns is None else query_turns)[i] - turns[j]
+        shifts = shifts @ kind.numbers  # of given vectors, where the list counts short ones
     pairs = list(zip(i.tolist(), j.tolist(), map(tuple, shifts.tolist()), strict=True))
     assert len(set(pairs)) == len(pairs)
     return set(pairs)
@@ -272,6 +273,55 @@ def test_vmap_over_positions_and_boxes():
     for k in range(3):
         one = jax.tree.map(lambda leaf, k=k: leaf[k], nbrs)
         assert image_pairs(one, batch[k]) == oracle(batch[k], 0.3, boxes[k])
+
+
+LONG = np.array([[1.0, 0.0, 0.0], [30.3, 1.1, 0.0], [-17.2, 21.1, 0.9]]) @ np.linalg.qr(SKEWED + 1)[0]
+
+
+@pytest.mark.parametrize(
+    ("backend", "kind", "options"),
+    [
+        ("warp", np.float32, {}),
+        ("warp", np.float64, {"queries": 5}),
+        ("jax", np.float32, {"half": True}),
+        pytest.param("brute", np.float64, {"periodic": (True, True, False)}, marks=pytest.mark.slow),
+        pytest.param("jax", np.float64, {}, marks=pytest.mark.slow),
+    ],
+    ids=str,
+)
+def test_lattices_far_from_reduced(backend, kind, options):
+    rng, periodic = np.random.default_rng(0), options.get("periodic", (True,) * 3)
+    whole = rng.integers(-3, 4, (12, 3)) * periodic
+    x = jnp.asarray((rng.uniform(0, 1, (12, 3)) + whole) @ LONG, kind)
+    given = {"half": True} if "half" in options else {"queries": x[:5] + 0.25} if "queries" in options else {}
+    box = jfrnn.Box(LONG, periodic)
+    nbrs = jfrnn.search(x, 0.9, box=box, backend=backend, **given)
+    nbrs.check()
+    expected = oracle(x, 0.9, LONG, periodic, **given)
+    asked = {name: given[name] for name in ("queries",) if name in given}
+    assert masked_images(nbrs, x, **asked) == expected
+    assert int(nbrs.count.sum()) == len(expected) > 100
+    assert nbrs.box_kind.basis is not None
+
+
+def test_derivatives_in_a_lattice_far_from_reduced_are_those_in_the_given_vectors():
+    x = jnp.asarray(np.random.default_rng(0).uniform(0, 1, (6, 3)) @ LONG)
+    nbrs = jfrnn.search(x, 0.9, box=jfrnn.Box(LONG), backend="warp")
+    given = jax.grad(lambda v: (nbrs.vectors(x, box=jfrnn.Box(v))[0] ** 2).sum())(jnp.asarray(LONG))
+    vectors, shifts = np.asarray(nbrs.vectors(x)[0]), np.asarray(nbrs.shifts(x))
+    np.testing.assert_allclose(given, 2 * np.einsum("nkl,nkd->ld", shifts, vectors), rtol=1e-9, atol=1e-9)
+
+
+def test_known_numbers_of_neighbors_at_long_cutoffs():
+    """One particle in a skewed cell; diamond, 2 atoms in its primitive cell, at 95 bohr."""
+    alone = jfrnn.Box([[3.0, 0.0, 0.0], [900.0, 3.0, 0.0], [0.0, 0.0, 3.0]])
+    assert jfrnn.count(np.zeros((1, 3)), 6.0, box=alone).tolist() == [26]
+    edge, bohr = 3.567, 0.529177210903
+    diamond = jfrnn.Box(edge / 2 * np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 0.0]]))
+    atoms = edge / 4 * np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    nbrs = jfrnn.search(atoms, 95 * bohr, box=diamond)
+    assert nbrs.count.tolist() == [94004, 94004]
+    np.testing.assert_array_equal(nbrs.distances(atoms)[1].sum(axis=1), 94004)
 
 
 X = np.zeros((4, 3), np.float32)
