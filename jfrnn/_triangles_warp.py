@@ -174,7 +174,7 @@ def cast_rays(
     inputs = points, corners, tree.boxes, radius, rays, starts, tree.triangles, asked.astype(jnp.int32), jnp.reshape(least, 1)
 
     def call(of: Any, *given: Array) -> Array:  # noqa: ANN401
-        return of(points.shape[1], points.dtype == jnp.float64)(*given, output_dims={"side": len(points), "info": 1})[0]
+        return of(points.shape[1], bool(points.dtype == jnp.float64))(*given, output_dims={"side": len(points), "info": 1})[0]
 
     on_cpu, on_cuda = (functools.partial(call, of) for of in (_rays_on_cpu, _rays_on_cuda))
     side = lax.platform_dependent(*inputs, cpu=on_cpu, cuda=on_cuda)
@@ -182,7 +182,7 @@ def cast_rays(
 
 
 def _ray_types(double: bool) -> dict[str, Any]:
-    wp = _warp.load_warp()
+    wp = load_warp()
     scalar, ints = wp.float64 if double else wp.float32, wp.array(dtype=wp.int32)
     points = wp.array2d(dtype=scalar)
     types = {"positions": points, "corners": wp.array3d(dtype=scalar), "boxes": points, "cutoff": wp.array(dtype=scalar)}
@@ -196,28 +196,32 @@ def _ray_sizes(arrays: Sequence[Any]) -> list[int]:
 
 
 def _ray_kernel(dim: int, double: bool, cuda: bool) -> Any:  # noqa: ANN401
-    return _warp.kernels_of("winding").side_kernel(dim, bool(double), WIDTH, cuda)
+    return kernels_of("winding").side_kernel(dim, double, WIDTH, cuda)
 
 
-@functools.cache
-def _rays_on_cpu(dim: int, double: bool) -> Any:  # noqa: ANN401
+def _ray_name(dim: int, double: bool, where: str) -> str:
+    return f"jfrnn_winding_{where}_{dim}d_{'f64' if double else 'f32'}"
+
+
+@kernel
+def _rays_on_cpu(dim: int, double: bool) -> Kernel:
     def run(*arrays: Any) -> None:  # noqa: ANN401
         arrays[-1].numpy()[:] = 0
         sizes = _ray_sizes(arrays)
-        most = -(-sizes[0] // _warp.kernels_of("winding").CHUNK)
+        most = -(-sizes[0] // kernels_of("winding").CHUNK)
         _warp.on_every_core(_ray_kernel(dim, double, cuda=False), [*arrays, *sizes], most)
 
-    return _warp.callable_of(f"jfrnn_winding_{dim}d_{'f64' if double else 'f32'}", run, _ray_types(double), 2)
+    return _warp.on_cpu(_ray_name(dim, double, "cpu"), run, _ray_types(double), 2)
 
 
-@functools.cache
-def _rays_on_cuda(dim: int, double: bool) -> Any:  # noqa: ANN401
-    wp, block = _warp.load_warp(), _warp.kernels_of("winding").BLOCK
+@kernel
+def _rays_on_cuda(dim: int, double: bool) -> Kernel:
+    wp, block = load_warp(), kernels_of("winding").BLOCK
     if wp.is_cuda_available():
-        wp.load_module(_ray_kernel(dim, double, cuda=True).module, device=wp.get_cuda_device(), block_dim=block)
+        kernels_of("_load").load_module(_ray_kernel(dim, double, cuda=True).module, wp.get_cuda_device(), block)
 
     def commands(*arrays: Any) -> list[_cuda.Command]:  # noqa: ANN401
         sizes = _ray_sizes(arrays)
         return [_cuda.Command(_ray_kernel(dim, double, cuda=True), [*arrays, *sizes], -(-sizes[0] // block) * block, block)]
 
-    return _warp.cuda_target(f"jfrnn_winding_cuda_{dim}d_{'f64' if double else 'f32'}", _ray_types(double), 2, commands)
+    return _warp.on_cuda(_ray_name(dim, double, "cuda"), _ray_types(double), 2, commands)
