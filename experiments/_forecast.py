@@ -11,7 +11,7 @@ from experiments._rows import SCENE_FIELDS, Row
 
 RESULTS = Path(__file__).parent / "results"
 STARTED_S = 3.0  # what a process takes besides its search: imports, positions, comparison with the exact pairs [s]
-PRIOR_S = 30.0  # how much time the earlier rows weigh against what this run has taken [s]
+PRIOR_S = 15.0  # how much time the earlier rows weigh against what this run has taken [s]
 Known = dict[tuple[Any, ...], tuple[float, float]]
 
 
@@ -76,7 +76,7 @@ class Forecast:
 def in_words(seconds: float | None) -> str:
     """Return a time as a reader says it."""
     if seconds is None:
-        return "how long, the first rows will tell"
+        return "a time that the first rows will tell"
     if seconds < 90:
         return f"about {max(seconds, 1):.0f} s"
     return f"about {seconds / 60:.0f} min" if seconds < 5400 else f"about {seconds / 3600:.1f} h"

@@ -64,7 +64,7 @@ def _run(config: Config, name: str, file: RowFile, retry_failed: bool, shard: tu
         bar = shown.add_task("", total=len(specs), completed=len(specs) - len(pending))
         _announce(shown.console, specs, pending, forecast)
         for done, spec in enumerate(pending):
-            left = f"left: {in_words(forecast.left(pending[done:]))}"
+            begin, left = perf_counter(), f"left: {in_words(forecast.left(pending[done:]))}"
             if spec.scene_key != scene:
                 scene = spec.scene_key
                 shown.console.print(f"{spec.scene_name}: {done} of {len(pending)} rows measured, {left}", highlight=False)
@@ -73,7 +73,6 @@ def _run(config: Config, name: str, file: RowFile, retry_failed: bool, shard: tu
                 shown.update(bar, description=f"{left} · {spec.scene_name} · exact pairs")
                 _prepare_oracle(spec, folder, shown.console)
             shown.update(bar, description=f"{left} · {spec.scene_name} · {spec.method}")
-            begin = perf_counter()
             row = replace(measure(spec, folder, absent.get(spec.method)), **about)
             forecast.note(spec, perf_counter() - begin)
             file.append(row)
