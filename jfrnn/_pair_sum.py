@@ -102,7 +102,9 @@ def pair_sum(
     box and whatever fn closes over; who is a neighbor is a constant. A derivative is a sum over the same pairs, gathered
     by each particle (over a list that is not its own mirror image, scattered). What is no pair has no part in it, whatever fn
     makes of it. "max" and "min" have the derivative of the pair that is the extreme one; of several, of that with the smallest j.
-    Jit: yes; outside of it, define fn once: one that is defined anew for each call is compiled anew. vmap: yes, one after the
+    Jit: yes; outside of it, define fn once: one that is defined anew for each call is compiled anew. A Python number that fn closes
+    over is part of its text: with "warp" each new value is another kernel, which takes a second to compile. Close over an array,
+    jnp.asarray(number, x.dtype), where values change: it is data, and the kernel stays the same. vmap: yes, one after the
     other. Source: sums over neighbors as in SPH (Gingold & Monaghan 1977, doi:10.1093/mnras/181.3.375); derivatives by
     transposition (Radul et al. 2023, doi:10.1145/3571236).
     """

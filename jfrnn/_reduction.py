@@ -111,7 +111,7 @@ def reduced(
     operands = operands._replace(shared=(*closed_over, *operands.shared))
     if reduce != "sum":
         leaves = bind_extremes(pairs.relation, term, operands, reduce == "max")
-    elif isinstance(pairs.relation, Listed) and pairs.half:
+    elif pairs.half and isinstance(pairs.relation, Listed):
         leaves = _sums_of_half(pairs.relation, term, operands, compensated)
     else:
         leaves = bind_sum(pairs.relation, term, operands, compensated)

@@ -107,6 +107,21 @@ def search(
     capacity. `jax.export`: yes, with `disabled_checks=[jax.export.DisabledSafetyCheck.custom_call("jfrnn")]`; a process that runs
     such a program imports jfrnn of the same version first. Shapes are numbers, not symbols.
     Source: cell lists (Hockney & Eastwood 1981, ch. 8); strict cutoff (Peifle 2019, §2.2).
+
+    Compilation: once for each number of particles, of queries and of slots, and once more for the count where `capacity` is
+    missing; cutoffs and boxes are data. Structures of many sizes share a program if they are padded to sizes that come again, with
+    `active=` for the particles that are there, one `capacity`, and `Box(..., images=)`, which fixes the number of images:
+
+    >>> import numpy as np, jfrnn
+    >>> def searched(x, lengths, size=8):
+    ...     padded = np.zeros((size, 3), np.float32)
+    ...     padded[: len(x)] = x
+    ...     box = jfrnn.Box(lengths, images=1)
+    ...     return jfrnn.search(padded, 1.0, active=np.arange(size) < len(x), box=box, capacity=8)
+    >>> searched([[0.1, 0.1, 0.1], [1.9, 0.1, 0.1]], [2.0, 2.0, 2.0]).count[:2]
+    Array([1, 1], dtype=int32)
+    >>> searched([[0.1, 0.1, 0.1], [2.9, 0.1, 0.1], [1.5, 0.1, 0.1]], [3.0, 2.0, 2.0]).count[:3]
+    Array([1, 1, 0], dtype=int32)
     """
     problem = checked_problem(
         positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, skin, active

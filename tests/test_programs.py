@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
 
 import jfrnn
 from jfrnn import _programs
@@ -148,6 +149,23 @@ def test_arrays_of_numpy_are_copied():
     nbrs = jfrnn.search(y, 0.6, skin=0.1)
     y[:] = 0
     np.testing.assert_array_equal(nbrs.verlet.positions, x)
+
+
+def test_padded_structures_in_boxes_of_their_own_share_a_program():
+    size, programs = 48, []
+    for n, edge in ((30, 2.5), (35, 2.3), (44, 2.9)):
+        lengths = np.array([edge, 2.0, 2.5], np.float32)
+        x, padded = np.random.default_rng(n).random((n, 3)).astype(np.float32) * lengths, np.zeros((size, 3), np.float32)
+        padded[:n] = x
+        given = {"active": np.arange(size) < n, "box": jfrnn.Box(lengths, images=1), "capacity": 24}
+        programs.append(compiled_by(jfrnn.search, padded, 0.7, **given))
+        nbrs = jfrnn.search(padded, 0.7, **given)
+        nbrs.check()
+        shifts = np.asarray(nbrs.shifts(padded))[np.asarray(nbrs.idx) < size]
+        found = list(zip(*(part.tolist() for part in nbrs.pairs()), map(tuple, shifts.tolist()), strict=True))
+        assert len(set(found)) == len(found) > 50
+        assert set(found) == reference.reference_images(x, 0.7, matrix=np.diag(lengths), periodic=(True,) * 3)
+    assert programs[1:] == [0, 0]
 
 
 def test_programs_of_many_sizes_are_let_go(monkeypatch):
