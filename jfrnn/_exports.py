@@ -50,8 +50,8 @@ def checked_total(total: Any) -> int:  # noqa: ANN401
     return int(total)
 
 
-def _add(a: Array, b: Array) -> Array:
-    """Add int32 that are not negative; what int32 cannot hold is the largest of them."""
+def saturating_add(a: Array, b: Array) -> Array:
+    """Add int32 that are not negative; a sum that int32 cannot hold is the largest int32."""
     return jnp.where(a > MOST_PAIRS - b, MOST_PAIRS, a + b)
 
 
@@ -61,14 +61,14 @@ def pair_total(count: Array, capacity: int) -> Array:
     used = jnp.minimum(count, capacity)
     if count.shape[0] * capacity <= MOST_PAIRS:
         return jnp.sum(used, dtype=jnp.int32)
-    return lax.reduce(used, jnp.int32(0), _add, (0,))
+    return lax.reduce(used, jnp.int32(0), saturating_add, (0,))
 
 
 def row_offsets(count: Array, capacity: int) -> Array:
     """Say where each row begins, and behind the last where it ends, [m + 1] int32; from where int32 ends on all are the largest."""
     used = jnp.minimum(count, capacity)
     fits = count.shape[0] * capacity <= MOST_PAIRS
-    ends = jnp.cumsum(used, dtype=jnp.int32) if fits else lax.associative_scan(_add, used)
+    ends = jnp.cumsum(used, dtype=jnp.int32) if fits else lax.associative_scan(saturating_add, used)
     return jnp.concatenate([jnp.zeros(1, jnp.int32), ends])
 
 

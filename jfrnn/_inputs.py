@@ -57,6 +57,35 @@ def check_is_known(name: str, shape: tuple[Any, ...]) -> None:
         )
 
 
+def checked_again(name: str, positions: Any, dtype: np.dtype, dim: int, rows: int, what: str = "the list") -> Array:  # noqa: ANN401
+    """Return positions that are of the kind and number for which something, such as a list, was made."""
+    points = checked_positions(name, positions)
+    if (points.dtype, points.shape[1]) != (dtype, dim):
+        raise ValueError(
+            f"{name} must be {dtype} with {dim} columns, for which {what} was made, got {points.dtype} with {points.shape[1]} "
+            f"columns: convert them, e.g. with .astype(jnp.{dtype}), or make {what} anew."
+        )
+    if points.shape[0] != rows:
+        noun = {"queries": "points", "vertices": "corners"}.get(name, "particles")
+        raise ValueError(
+            f"{name} hold {points.shape[0]} {noun}, but {what} was made for {rows}: make it anew for as many as there are."
+        )
+    return points
+
+
+def check_devices(name: str, given: Any, made: Any, what: str = "the list") -> None:  # noqa: ANN401
+    """Raise where an array and what was made before are bound to different devices, as far as that is known."""
+    if isinstance(given, Tracer) or isinstance(made, Tracer):
+        return
+    if not (getattr(given, "committed", False) and getattr(made, "committed", False)) or given.devices() == made.devices():
+        return
+    here, there = (", ".join(sorted(map(str, x.devices()))) for x in (given, made))
+    raise ValueError(
+        f"{name} lie on {here}, but {what} on {there}: move one of them with jax.device_put, or make {what} anew where {name} lie. "
+        "Over several devices, see jfrnn.distributed."
+    )
+
+
 def checked_cutoff(cutoff: Any, dtype: np.dtype) -> Cutoff:  # noqa: ANN401
     """Return the cutoff, rounded once to the dtype of the positions."""
     if isinstance(cutoff, Tracer):
@@ -183,7 +212,9 @@ def checked_box(box: Any, positions: Array, like: Box | None = None) -> Box | No
     if not isinstance(box, Box):
         raise TypeError(f"box must be a jfrnn.Box, got {_describe(box)}: write e.g. jfrnn.Box([1.0, 1.0, 1.0]).")
     if box.dim != positions.shape[1]:
-        raise ValueError(f"box has {box.dim} axes, but positions have {positions.shape[1]} columns.")
+        raise ValueError(
+            f"box has {box.dim} axes, but positions have {positions.shape[1]} columns: give as many lengths or lattice vectors."
+        )
     if like is not None and (box.periodic, box.orthogonal) != (like.periodic, like.orthogonal):
         was, came = (f"periodic={b.periodic}, {'lengths' if b.orthogonal else 'matrix'}" for b in (like, box))
         raise ValueError(f"box must be of the kind with which the list was made ({was}), got {came}.")

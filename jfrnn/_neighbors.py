@@ -30,13 +30,14 @@ from jfrnn._box import (
 )
 from jfrnn._exact import Cutoff, Cutoffs, Radii, is_pair_of, make_cutoff, make_cutoffs
 from jfrnn._exports import DenseNeighbors, checked_total, flat_pairs, pair_total
-from jfrnn._inputs import checked_active, checked_box, checked_positions, checked_radii, checked_slack, largest_known
+from jfrnn._inputs import check_devices, checked_active, checked_again, checked_box, checked_radii, checked_slack, largest_known
 from jfrnn._programs import at_once, compiled
 from jfrnn._runs import Filter
-from jfrnn._status import NeighborOverflowError, Status
+from jfrnn._status import NeighborOverflowError, Status, known_status, pairs_and_status, shape_of
 from jfrnn._verlet import Verlet, first_verlet, list_radius, moved_too_far
 
 _CAPACITY_STEP = 8
+ROWS_ARE_WHOLE = Status.NONFINITE | Status.TOTAL_OVERFLOW  # bits with which every row has all its neighbors
 
 
 class ImageCodes(NamedTuple):
@@ -79,6 +80,8 @@ class NeighborList:
         masked: Particles may be inactive. Static.
         box_kind: Along which axes the box is periodic and how far pairs reach in it; None where space is open. Static.
         source_count: n, the fill value of unused slots. Static.
+        dim: Axes of the positions, 2 or 3. Static.
+        dtype: Of the positions. Static.
         backend: The engine that made the list. Static.
     """
 
@@ -100,7 +103,19 @@ class NeighborList:
     masked: bool = dataclasses.field(metadata={"static": True})
     box_kind: Images | None = dataclasses.field(metadata={"static": True})
     source_count: int = dataclasses.field(metadata={"static": True})
+    dim: int = dataclasses.field(metadata={"static": True})
+    dtype: np.dtype = dataclasses.field(metadata={"static": True})
     backend: str = dataclasses.field(metadata={"static": True})
+
+    def __repr__(self) -> str:
+        """Say in a line what it holds; waits for the device."""
+        *batch, m, capacity = shape_of(self.idx)
+        rows = f"{m} queries of {self.source_count} particles" if self.own_queries else f"{self.source_count} particles"
+        rows = f"batch of {batch}, {rows}" if batch else rows
+        reach = "per particle" if self.cutoff is None else f"{self.cutoff:.6g}"
+        skin = f", skin {self.skin:.6g}" if self.skin else ""
+        rest = pairs_and_status(self.count, self.status)
+        return f"NeighborList({rows}, capacity {capacity}, cutoff {reach}{skin}, engine {self.backend!r}, {rest})"
 
     @property
     def capacity(self) -> int:
@@ -238,10 +253,7 @@ class NeighborList:
 
     def _check_known(self, spared: Status = Status.OK) -> None:
         """Raise what status bits report, but for the spared ones, where they are known: not on a list that is being traced."""
-        if isinstance(self.status, Tracer):
-            return
-        bits = jax.device_get(self.status)  # stays with the array: to ask again costs nothing
-        status = Status(int(np.bitwise_or.reduce(bits, axis=None))) & ~spared
+        status = (known_status(self.status) or Status.OK) & ~spared
         if Status.ROW_OVERFLOW in status:
             raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self.capacity)
         if Status.TOTAL_OVERFLOW in status:
@@ -264,6 +276,8 @@ class NeighborList:
 
         Raises:
             ValueError, TypeError: positions or queries do not fit the list.
+            NeighborOverflowError, ValueError: outside jit, the status says that pairs may be missing: rows overflowed, or the data
+                did not fit; inside, look at `status`. Particles that are not finite have no pairs, which is no error here.
 
         Differentiable: to any order in positions, queries and box; the mask is a constant. Jit: yes. vmap: yes.
         """
@@ -288,10 +302,12 @@ class NeighborList:
 
         Raises:
             ValueError, TypeError: an argument does not fit the list.
+            NeighborOverflowError, ValueError: as `vectors`.
 
         Differentiable: no (integers). Jit: yes. vmap: yes.
         """
         sources, rows = self._geometry_inputs(positions, queries)
+        self._check_known(spared=ROWS_ARE_WHOLE)
         box = self._box_now(box, sources)
         if box is None or self.box_kind is None or 0 in (sources.shape[0], *self.idx.shape):
             return jnp.zeros((*self.idx.shape, sources.shape[1]), jnp.int32)
@@ -310,6 +326,7 @@ class NeighborList:
 
         Raises:
             ValueError, TypeError: positions or queries do not fit the list.
+            NeighborOverflowError, ValueError: as `vectors`.
 
         Differentiable: to any order; the gradient of a distance of 0 is 0. Jit: yes. vmap: yes.
         """
@@ -481,6 +498,7 @@ class NeighborList:
 
     def _geometry(self, positions: Array, queries: Array | None, box: Box | None) -> tuple[Array, Array, Array | None]:
         sources, rows = self._geometry_inputs(positions, queries)
+        self._check_known(spared=ROWS_ARE_WHOLE)
         box = self._box_now(box, sources)
         if 0 in (sources.shape[0], *self.idx.shape):
             return jnp.zeros((*self.idx.shape, sources.shape[1]), sources.dtype), jnp.zeros(self.idx.shape, bool), None
@@ -495,15 +513,15 @@ class NeighborList:
         return self.images, made
 
     def _geometry_inputs(self, positions: Array, queries: Array | None) -> tuple[Array, Array]:
-        sources = checked_positions("positions", positions)
-        if sources.shape[0] != self.source_count:
-            raise ValueError(f"positions hold {sources.shape[0]} particles, but the list was made for {self.source_count}.")
+        sources = checked_again("positions", positions, self.dtype, self.dim, self.source_count)
+        check_devices("positions", sources, self.idx)
         if self.own_queries != (queries is not None):
             state = "with queries: pass queries=" if self.own_queries else "without queries: leave queries out"
             raise ValueError(f"this list was made {state}.")
-        rows = sources if queries is None else checked_positions("queries", queries, like=sources)
-        if rows.shape[0] != self.idx.shape[0]:
-            raise ValueError(f"queries hold {rows.shape[0]} points, but the list has {self.idx.shape[0]} rows.")
+        if queries is None:
+            return sources, sources
+        rows = checked_again("queries", queries, self.dtype, self.dim, self.idx.shape[0])
+        check_devices("queries", rows, self.idx)
         return sources, rows
 
 

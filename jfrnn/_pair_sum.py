@@ -71,16 +71,18 @@ def pair_sum(
             int32 or (float64) int64; with a cutoff per particle on the CPU alone. Where fn or its derivative has no translation,
             "auto" warns.
         neighbors: A list whose pairs are taken instead of a search: those that are closer than its cutoff at these positions, as
-            `NeighborList.vectors` says. A half list gives whole sums, too. Options with which it was made are left out. Rows that
-            overflowed lack pairs here as everywhere: see `NeighborList.check`.
+            `NeighborList.vectors` says. A half list gives whole sums, too. Options with which it was made are left out. Of a list
+            that may lack pairs (rows overflowed, see `NeighborList.check`) there are no sums: outside jit it raises.
 
     Returns:
-        A pytree as fn returns it, leaves [m, ...]. Rows without neighbors, and those of particles that are inactive or have NaN or
-        infinite coordinates, are 0 ("max": -inf, "min": inf). Where the data show that a search cannot answer (a box that is too
-        small, a particle too far outside of it, a cutoff that is not positive and finite), all floats are NaN and all integers the
-        smallest of their kind; `search` says what it was.
+        A pytree as fn returns it, leaves [m, ...]. Rows without neighbors, and those of particles that are inactive, are 0 ("max":
+        -inf, "min": inf). Where there is no sum, floats are NaN, and so are their derivatives in the positions, and integers are
+        the smallest of their kind: in the row of a particle with NaN or infinite coordinates; and in all rows where the data show
+        that a search cannot answer (a box that is too small, a particle too far outside of it, a cutoff per particle that is
+        negative or not finite), or that the list lacks pairs. The `status` of a `search`, or of the list, says what it was.
 
     Raises:
+        NeighborOverflowError, ValueError: outside jit, `neighbors` may lack pairs.
         TypeError, ValueError: an argument is of the wrong kind, shape or range, or fn returns what cannot be summed; "warp" was
             named and cannot do what is asked.
         NotImplementedError: "warp" was named, and fn or its derivative has no translation: the message says which primitive.

@@ -16,15 +16,20 @@ from jfrnn._box import Box, Images, Lattice, make_lattice, translation
 from jfrnn._exact import Radii, make_cutoffs
 from jfrnn._extremes import bind_extremes
 from jfrnn._inputs import checked_cutoff
-from jfrnn._neighbors import NeighborList
+from jfrnn._neighbors import ROWS_ARE_WHOLE, NeighborList
 from jfrnn._programs import compiled, on_device
 from jfrnn._relations import Listed, Relation, Searched
+from jfrnn._status import Status
 from jfrnn._summation import bind_sum
 from jfrnn._terms import OF_QUERIES, OF_SOURCES, Groups, Labels, Summand, Term, chosen, fresh_labels, traced
 
 
 class Pairs(NamedTuple):
-    """Which pairs, and what their displacements are made of."""
+    """Which pairs, and what their displacements are made of.
+
+    `good` [rows] bool: the row has a sum. It has none where the data show that pairs may be missing, or where its position is not
+    finite, unless the particle is inactive.
+    """
 
     relation: Relation
     half: bool  # each pair stands there once: its mirror image is summed, too
@@ -33,7 +38,7 @@ class Pairs(NamedTuple):
     lattice: Lattice | None
     largest: Any  # cutoff
     directionless: bool
-    decidable: tuple[Inputs, Options] | None  # what says so
+    good: Array
 
 
 def searched(inputs: Inputs, options: Options) -> Pairs:
@@ -41,11 +46,11 @@ def searched(inputs: Inputs, options: Options) -> Pairs:
     sources, queries, active, box, cutoff, _ = inputs
     fixed = lax.stop_gradient(inputs._replace(sources=without_inactive(sources, active), active=None))
     relation, several = Searched(fixed, options), isinstance(cutoff, Radii)
-    decidable = (inputs, options) if several or box is not None else None
     largest = make_cutoffs(cutoff, options.closed).largest if isinstance(cutoff, Radii) else cutoff.radius
     lattice = _lattice(box, options.images, sources)
-    rows = sources if queries is None else queries
-    return Pairs(relation, False, sources, rows, lattice, largest, relation.symmetric, decidable)
+    good = _good_rows_of_search(inputs, options, several or box is not None)
+    sources, rows = _telling(sources, queries, good)
+    return Pairs(relation, False, sources, rows, lattice, largest, relation.symmetric, good)
 
 
 def listed(
@@ -69,13 +74,66 @@ def listed(
     if cutoff is not None and (nbrs.cutoff is None or float(checked_cutoff(cutoff, dtype).radius) != nbrs.cutoff):
         has = "a cutoff per particle" if nbrs.cutoff is None else f"cutoff={nbrs.cutoff}"
         raise ValueError(f"cutoff must be None or that of the list, which has {has}, got {cutoff!r}.")
+    own = nbrs.own_queries
     fixed, fixed_rows, fixed_box = lax.stop_gradient((sources, rows, box))
-    _, mask, shifts = nbrs._geometry(fixed, fixed_rows if nbrs.own_queries else None, fixed_box)
-    directionless = not nbrs.own_queries and (nbrs.radii is None or nbrs.radii.rule not in ("gather", "scatter"))
+    _, mask, shifts = nbrs._geometry(fixed, fixed_rows if own else None, fixed_box)
+    directionless = not own and (nbrs.radii is None or nbrs.radii.rule not in ("gather", "scatter"))
     relation = Listed(nbrs.idx, mask, shifts, nbrs.source_count, symmetric=directionless and not nbrs.half)
     lattice = _lattice(nbrs._box_now(box, sources), nbrs.box_kind, sources)
     largest = nbrs.cutoff if nbrs.radii is None else make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest
-    return Pairs(relation, nbrs.half, sources, rows, lattice, largest, directionless, None)
+    good = _good_rows_of_list(nbrs.status, nbrs.count if nbrs.masked and not own else None, fixed_rows)
+    sources, rows = _telling(sources, rows if own else None, good)
+    return Pairs(relation, nbrs.half, sources, rows, lattice, largest, directionless, good)
+
+
+@compiled
+def _good_rows(points: Array, active: Array | None, whole: Array | None) -> Array:
+    """Say which rows [m] have a sum: those of finite points, and of inactive ones, if pairs are known to be whole."""
+    fixed = lax.stop_gradient(points)
+    columns = (jnp.isfinite(fixed[:, k]) for k in range(fixed.shape[1]))
+    finite = functools.reduce(jnp.logical_and, columns)  # not a reduction, which XLA would not fuse
+    good = finite if active is None else finite | ~active
+    return good if whole is None else good & whole
+
+
+@functools.partial(compiled, static_argnames=("options", "doubtful"))
+def _good_rows_of_search(inputs: Inputs, options: Options, doubtful: bool) -> Array:
+    """Say which rows [m] of a search have a sum; `doubtful`: the data may show that pairs cannot be decided."""
+    whole = is_decidable(inputs, options) if doubtful else None
+    return _good_rows(inputs.sources, inputs.active, whole) if inputs.queries is None else _good_rows(inputs.queries, None, whole)
+
+
+@compiled
+def _good_rows_of_list(status: Array, count: Array | None, points: Array) -> Array:
+    """Say which rows [m] of a list have a sum. Where particles may be inactive, `count` is given: those with neighbors are not."""
+    whole = (status & ~ROWS_ARE_WHOLE.value) == 0
+    active = None if count is None else (count > 0) | ((status & Status.NONFINITE.value) != 0)
+    return _good_rows(points, active, whole)
+
+
+def _telling(sources: Array, queries: Array | None, good: Array) -> tuple[Array, Array]:
+    """Return the sources, and the rows, which derivatives reach as NaN where there is no sum."""
+    points = sources if queries is None else queries
+    if isinstance(points, Tracer):  # else there are no derivatives
+        points = _told(points, good)
+    return (points, points) if queries is None else (sources, points)
+
+
+@jax.custom_jvp
+def _told(points: Array, good: Array) -> Array:
+    del good
+    return points
+
+
+@_told.defjvp
+def _told_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Any]) -> tuple[Array, Array]:
+    points, good = primals
+    return points, tangents[0] * _one_or_nan(good, tangents[0])
+
+
+def _one_or_nan(good: Array, like: Array) -> Array:
+    """Return 1 or NaN for each row, to be multiplied with `like` [rows, ...]."""
+    return jnp.where(good, 1, jnp.nan).astype(like.dtype).reshape(-1, *[1] * (like.ndim - 1))
 
 
 def _lattice(box: Box | None, images: Images | None, like: Array) -> Lattice | None:
@@ -115,8 +173,7 @@ def reduced(
         leaves = _sums_of_half(pairs.relation, term, operands, compensated)
     else:
         leaves = bind_sum(pairs.relation, term, operands, compensated)
-    if pairs.decidable is not None:
-        leaves = _marked_all(leaves, *pairs.decidable)
+    leaves = _marked(leaves, pairs.good)
     return jax.tree.unflatten(structure[0], leaves)
 
 
@@ -199,14 +256,13 @@ def _summable(x: Any, dtype: np.dtype) -> Array:  # noqa: ANN401
     return array.astype(dtype if is_loose else array.dtype)
 
 
-@functools.partial(compiled, static_argnames="options")
-def _marked_all(leaves: list[Array], inputs: Inputs, options: Options) -> list[Array]:
-    decidable = is_decidable(inputs, options)
-    return [_marked(x, decidable) for x in leaves]
+@compiled
+def _marked(leaves: list[Array], good: Array) -> list[Array]:
+    """Return what is no result in rows that have no sum; its derivatives likewise."""
 
+    def marked(x: Array) -> Array:
+        if jnp.issubdtype(x.dtype, jnp.floating):
+            return x * _one_or_nan(good, x)
+        return jnp.where(good.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.iinfo(x.dtype).min)
 
-def _marked(x: Array, decidable: Array) -> Array:
-    """Return what is no result where the data show that there is none; its derivatives likewise."""
-    if jnp.issubdtype(x.dtype, jnp.floating):
-        return x * jnp.where(decidable, 1, jnp.nan).astype(x.dtype)
-    return jnp.where(decidable, x, jnp.iinfo(x.dtype).min)
+    return [marked(x) for x in leaves]

@@ -55,8 +55,8 @@ def search(
     Args:
         positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64. n = 0 is allowed.
         cutoff: Interaction radius [length]: a static number > 0 for all; or one per particle, an array of shape [n] of floats,
-            which may be traced, and which `radius_rule` applies to. Of separate queries "gather" asks for [m], "scatter" for [n],
-            the other rules for a tuple of both, that of the positions first.
+            which may be traced and hold 0, and which `radius_rule` applies to. Of separate queries "gather" asks for [m], "scatter"
+            for [n], the other rules for a tuple of both, that of the positions first.
         queries: Points [length] whose neighbors among `positions` are wanted, shape [m, d], same dtype; default: the positions
             themselves, each particle being excluded from its own row by index.
         box: Periodic box (`Box`): then (i, j) stands in the list once for each image of j within the cutoff, its displacement
@@ -141,6 +141,8 @@ def search(
         masked=active is not None,
         box_kind=options.images,
         source_count=inputs.sources.shape[0],
+        dim=inputs.sources.shape[1],
+        dtype=np.dtype(inputs.sources.dtype),
         backend=options.backend,
     )
 

@@ -18,7 +18,8 @@ from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jfrnn._box import Box
-from jfrnn._status import Status
+from jfrnn._inputs import checked_again
+from jfrnn._status import Status, names_of_bits, shape_of
 
 _STEP = 8  # sizes are rounded up to multiples, so that similar scenes share a compiled program
 OVERFLOWS = Status.ROW_OVERFLOW | Status.SHARD_OVERFLOW | Status.HALO_OVERFLOW | Status.HALO_TOO_FAR
@@ -108,6 +109,12 @@ class Particles:
     reach: float = dataclasses.field(metadata={"static": True})
     sizes: Sizes = dataclasses.field(metadata={"static": True})
 
+    def __repr__(self) -> str:
+        """Say in a line what they are; waits for the devices."""
+        shards, dim = self.mesh.devices.size, shape_of(self.positions)[-1]
+        room, status = self.sizes.particles, names_of_bits(self.status)
+        return f"Particles({self.total} in {dim}D on {shards} shards of {room}, reach {self.reach:.6g}, status {status})"
+
     @property
     def active(self) -> Array:
         """Which rows hold a particle, shape [N], bool."""
@@ -124,7 +131,18 @@ class Particles:
         return self.positions.shape[1]
 
     def replace(self, positions: Array | None = None, values: Any = None) -> "Particles":  # noqa: ANN401
-        """Return the same particles with other positions [N, d], or other values (leaves [N, ...]). Jit: yes."""
+        """Return the same particles with other positions [N, d], or other values (leaves [N, ...]). Jit: yes.
+
+        Raises:
+            ValueError, TypeError: Positions are of another kind or number than before, or values have other rows.
+        """
+        rows, dim = self.positions.shape
+        if positions is not None:
+            positions = checked_again("positions", positions, np.dtype(self.positions.dtype), dim, rows, "this")
+        for path, leaf in jax.tree_util.tree_leaves_with_path(values):
+            if tuple(np.shape(leaf)[:1]) != (rows,):
+                name = f"values{jax.tree_util.keystr(path)}"
+                raise ValueError(f"{name} must have shape [{rows}, ...], a row per row of particles, got {list(np.shape(leaf))}.")
         changed = {name: value for name, value in (("positions", positions), ("values", values)) if value is not None}
         return dataclasses.replace(self, **changed)
 
@@ -154,6 +172,34 @@ class Particles:
             raise TypeError("grow() changes shapes and cannot run inside jax.jit: call it on what jit returns.")
         required = functools.reduce(Required.joined, (met.required for met in seen), self.required)
         return resized(self, _enough(self.sizes, required, self.mesh, slack))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Say how to make them anew, on devices of the same numbers: a mesh itself cannot be pickled."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "mesh"}
+        mesh = self.mesh
+        return _spread_again, (fields, [d.id for d in mesh.devices.flat], mesh.devices.shape, mesh.axis_names, mesh.axis_types)
+
+
+def _spread_again(fields: dict[str, Any], ids: list[int], shape: tuple[int, ...], names: Any, kinds: Any) -> Particles:  # noqa: ANN401
+    """Make particles of the fields of others, on devices of the same numbers.
+
+    Raises:
+        RuntimeError: This process has no such devices.
+    """
+    from jfrnn._shards_migrate import spec_of
+
+    devices = {device.id: device for device in jax.devices()}
+    if missing := [k for k in ids if k not in devices]:
+        raise RuntimeError(
+            f"particles were spread over devices {ids}, of which this process lacks {missing}: collect() them before they travel, "
+            "and scatter() them anew."
+        )
+    mesh = Mesh(np.array([devices[k] for k in ids]).reshape(shape), names, axis_types=kinds)
+    particles = Particles(**fields, mesh=mesh)
+    places = jax.tree.map(
+        lambda spec: NamedSharding(mesh, spec), spec_of(particles), is_leaf=lambda x: isinstance(x, PartitionSpec)
+    )
+    return jax.device_put(particles, places)
 
 
 def room(size: int) -> int:

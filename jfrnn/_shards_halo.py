@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._exports import MOST_PAIRS, saturating_add
 from jfrnn._flags import set_places
 from jfrnn._shards import Particles, Required, of_shards, shared_bits
 from jfrnn._status import Status
@@ -42,7 +43,7 @@ class Halo:
         ids: Of a shard's own particles and those of its halo, shape [shards · rows], int32; -1 where there is none.
         status: Bits of `Status`, shape [], int32.
         required: How much room would have been enough (`Required`).
-        sent: Particles that were sent, over all shards and messages, shape [], int32 (they wrap beyond 2^31).
+        sent: Particles that were sent, over all shards and messages, shape [], int32; at most the largest int32.
     """
 
     sends: tuple[Array, ...]
@@ -114,11 +115,18 @@ def halo_in_shard(particles: Particles) -> Halo:
         largest = functools.reduce(jnp.maximum, counts, jnp.int32(0))
         status = status | jnp.where(largest > room, Status.HALO_OVERFLOW.value, 0)
         status = status | jnp.where(farthest > particles.sizes.hops[stage.number], Status.HALO_TOO_FAR.value, 0)
-        sizes, hops, sent = [*sizes, largest], [*hops, farthest], sum(counts, sent)
+        sizes, hops, sent = [*sizes, largest], [*hops, farthest], functools.reduce(saturating_add, counts, sent)
         x, numbers = (_with_received(leaf, sends[-1], particles, stage) for leaf in (x, numbers))
     names, none = particles.mesh.axis_names, jnp.int32(0)
     required = Required(none, lax.pmax(jnp.stack(sizes), names), lax.pmax(jnp.stack(hops), names), none)
-    return Halo(tuple(sends), numbers - 1, shared_bits(status, particles.mesh), required, lax.psum(sent, names))
+    return Halo(tuple(sends), numbers - 1, shared_bits(status, particles.mesh), required, _psum(sent, names))
+
+
+def _psum(x: Array, names: Any) -> Array:  # noqa: ANN401
+    """Add up int32 of all shards that are not negative; a sum that int32 cannot hold is the largest int32."""
+    high, low = lax.psum((x >> 15, x & 0x7FFF), names)  # of up to 32 768 shards, neither overflows
+    high = high + (low >> 15)
+    return jnp.where(high > 0xFFFF, MOST_PAIRS, (high << 15) | (low & 0x7FFF))
 
 
 def exchanged(leaf: Array, halo: Halo, particles: Particles) -> Array:

@@ -13,12 +13,14 @@ from jax.core import Tracer
 from jax.sharding import PartitionSpec
 
 from jfrnn import _search
+from jfrnn._inputs import check_devices
 from jfrnn._neighbors import NeighborList, rounded_capacity
 from jfrnn._shards import OVERFLOWS, Particles, Required, check, of_shards, shared_bits
 from jfrnn._shards_calls import Asked, checked_halo, counted_capacity, over_shards, seen
 from jfrnn._shards_halo import Halo, halo_in_shard, halo_spec
 from jfrnn._shards_migrate import migrate
 from jfrnn._shards_scatter import fetched
+from jfrnn._status import pairs_and_status, shape_of
 from jfrnn._verlet import moved_too_far
 
 
@@ -43,6 +45,15 @@ class Neighbors:
     status: Array
     required: Required
     asked: Asked = dataclasses.field(metadata={"static": True})
+
+    def __repr__(self) -> str:
+        """Say in a line what it holds; waits for the devices."""
+        shape, (cutoff, skin, *_) = shape_of(self.local.idx), self.asked
+        kept = f", skin {skin:.6g}" if skin else ""
+        rest = pairs_and_status(self.count, self.status)
+        return (
+            f"Neighbors({shape[0]} shards, capacity {shape[-1]}, cutoff {cutoff:.6g}{kept}, engine {self.asked.backend!r}, {rest})"
+        )
 
     @property
     def capacity(self) -> int:
@@ -77,7 +88,7 @@ class Neighbors:
         Cost: one pass over the positions and one number from each device; or `migrate` and `search`. Differentiable: no gradient
         flows through. Jit: yes. vmap: no.
         """
-        checked_halo(self.halo, particles)
+        self._check_fits(particles)
         return _updated(particles, self)
 
     def grow(self, particles: Particles, slack: float = 1.25) -> "Neighbors":
@@ -92,7 +103,9 @@ class Neighbors:
 
         Raises:
             TypeError: Called inside jit.
+            ValueError: The particles are of another kind than those for which the list was made.
         """
+        self._check_kind(particles)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((particles, self.required))):
             raise TypeError("grow() changes shapes and cannot run inside jax.jit: call it on what jit returns.")
         counted = counted_capacity(particles, self.asked, slack)
@@ -107,6 +120,26 @@ class Neighbors:
             ValueError: Positions hold NaN or infinity, or do not fit the box.
         """
         check(self, f"row {self.capacity}, halo {[sends.shape[1] for sends in self.halo.sends]}")
+
+    def _check_kind(self, particles: Any) -> None:  # noqa: ANN401
+        """Refuse particles of another dtype or dimension, in another kind of box, or on other devices than those of the list."""
+        if not isinstance(particles, Particles):
+            raise TypeError(f"particles must be what jfrnn.distributed.scatter returns, got {type(particles).__name__}.")
+        check_devices("particles", particles.ids, self.count)
+        made, came = (
+            f"{dtype}, {dim}D, {'in open space' if box is None else f'box with periodic={box.periodic}'}"
+            for dtype, dim, box in (
+                (self.local.dtype, self.local.dim, self.local.box),
+                (np.dtype(particles.positions.dtype), particles.dim, particles.box),
+            )
+        )
+        if made != came:
+            raise ValueError(f"particles must be of the kind for which the list was made ({made}), got {came}: search anew.")
+
+    def _check_fits(self, particles: Any) -> None:  # noqa: ANN401
+        """Refuse particles of another kind, or laid out otherwise, than those for which the list was made."""
+        self._check_kind(particles)
+        checked_halo(self.halo, particles)
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the ids (i, j) of all pairs, once for each direction and image, sorted, in every process all of them.

@@ -11,11 +11,12 @@ from jax.core import Tracer
 
 from jfrnn import _pair_sum
 from jfrnn._inputs import checked_capacity, checked_flag, checked_slack
-from jfrnn._neighbors import NeighborList
+from jfrnn._neighbors import ROWS_ARE_WHOLE, NeighborList
 from jfrnn._shards import Particles, of_shards
 from jfrnn._shards_calls import Asked, checked_asked, checked_halo, counted_capacity, counts, is_good, marked, over_shards, seen
 from jfrnn._shards_halo import Halo, exchanged, halo_in_shard
 from jfrnn._shards_list import Neighbors, listed
+from jfrnn._status import Status, known_status
 
 
 def search(
@@ -124,9 +125,11 @@ def pair_sum(
 
     Returns:
         A pytree as fn returns it, leaves [N, ...], 0 in unused rows. Where a halo has no room for what it should hold, or list or
-        halo are of other rows, all floats are NaN and all integers the smallest of their kind: `migrate` tells what is needed.
+        halo are of other rows, all floats are NaN and all integers the smallest of their kind: `migrate` tells what is needed. So
+        are rows of particles that are not finite, and those of shards on which rows of the list overflowed.
 
     Raises:
+        RuntimeError: Outside jit, room was missing in `neighbors`: as its `check`.
         TypeError, ValueError, NotImplementedError: As `jfrnn.pair_sum` and `search`.
 
     Order of summation: that of each device; sums differ from those on one device by rounding. Communication: positions of halos
@@ -136,8 +139,13 @@ def pair_sum(
     if not callable(fn):
         raise TypeError(f"fn must be a function of (r, i, j), got {type(fn).__name__}.")
     if neighbors is not None:
+        if not isinstance(neighbors, Neighbors):
+            raise TypeError(f"neighbors must be what jfrnn.distributed.search returns, got {type(neighbors).__name__}.")
+        neighbors._check_fits(particles)
         if cutoff is not None or include_self or closed or backend != "auto":
             raise ValueError("cutoff, include_self, closed and backend were said when the list was made: leave them out.")
+        if (known_status(neighbors.status) or Status.OK) & ~ROWS_ARE_WHOLE:
+            neighbors.check()
         asked, halo = neighbors.asked, neighbors.halo if halo is None else halo
     elif cutoff is None:
         raise ValueError("cutoff must be given: only a list (neighbors=) has its own.")

@@ -1,6 +1,7 @@
 """What can go wrong with the data of a search: one bit each, and the error that reports it."""
 
 import enum
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -71,6 +72,40 @@ def known_status(status: Array) -> Status | None:
         return None
     bits: Any = jax.device_get(status)  # stays with the array: to ask again costs nothing
     return Status(int(np.bitwise_or.reduce(bits, axis=None)))
+
+
+def shape_of(rows: Any) -> tuple[Any, ...]:  # noqa: ANN401
+    """Return the shape of an array of rows, or that of none."""
+    shape = tuple(getattr(rows, "shape", ()))
+    return shape if len(shape) > 1 else (None, None)
+
+
+def told(x: Any, how: Callable[[Any], Any]) -> str:  # noqa: ANN401
+    """Say what an array comes to, for a line about what holds it; or why that is not known."""
+    if isinstance(x, Tracer):
+        return "traced"
+    if not isinstance(x, np.ndarray | Array):
+        return type(x).__name__
+    if isinstance(x, Array) and x.is_deleted():
+        return "deleted"
+    if isinstance(x, Array) and not (x.is_fully_addressable or x.is_fully_replicated):
+        return "elsewhere"
+    return str(how(jax.device_get(x)))
+
+
+def names_of_bits(status: Any) -> str:  # noqa: ANN401
+    """Say which bits are set."""
+
+    def names(bits: np.ndarray) -> str:
+        found = Status(int(np.bitwise_or.reduce(bits, axis=None)))
+        return " | ".join(bit.name or "" for bit in Status if bit and bit in found) or "OK"
+
+    return told(status, names)
+
+
+def pairs_and_status(count: Any, status: Any) -> str:  # noqa: ANN401
+    """Say how many pairs rows have, and which bits are set."""
+    return f"{told(count, lambda x: np.sum(x, dtype=np.int64))} pairs, status {names_of_bits(status)}"
 
 
 class NeighborOverflowError(RuntimeError):

@@ -13,10 +13,10 @@ from jax.core import Tracer
 
 from jfrnn import _triangles_warp
 from jfrnn._exact import Cutoff, make_cutoff
-from jfrnn._inputs import checked_positions, checked_slack
+from jfrnn._inputs import check_devices, checked_again, checked_slack
 from jfrnn._neighbors import norms, rounded_capacity
 from jfrnn._programs import at_once, compiled
-from jfrnn._status import NeighborOverflowError, Status
+from jfrnn._status import NeighborOverflowError, Status, known_status, pairs_and_status, shape_of
 from jfrnn._triangles_cells import TriangleCells, sort_triangles, without_faults
 from jfrnn._triangles_closest import Rows, nearest_of, pseudonormals
 from jfrnn._triangles_rows import are_near, list_triangles, nearest_slots
@@ -77,6 +77,14 @@ class TriangleList:
     cutoff: float = dataclasses.field(metadata={"static": True})
     backend: str = dataclasses.field(metadata={"static": True})
     closed: Array | None = None
+
+    def __repr__(self) -> str:
+        """Say in a line what it holds; waits for the device."""
+        *batch, n, capacity = shape_of(self.idx)
+        rows = f"batch of {batch}, {n} particles" if batch else f"{n} particles"
+        faces = shape_of(self.faces)[-2]
+        rest = f"engine {self.backend!r}, {pairs_and_status(self.count, self.status)}"
+        return f"TriangleList({rows}, {faces} triangles, capacity {capacity}, cutoff {self.cutoff:.6g}, {rest})"
 
     @property
     def capacity(self) -> int:
@@ -146,11 +154,15 @@ class TriangleList:
         """
         if isinstance(self.status, Tracer):
             raise TypeError("check() reads values and cannot run inside jax.jit: call it on the list that jit returns.")
-        status = Status(int(np.bitwise_or.reduce(np.asarray(self.status), axis=None)))
-        if Status.ROW_OVERFLOW in status:
-            raise NeighborOverflowError(int(np.max(self.required)), self.capacity)
+        self._check_rows()
+        status = known_status(self.status)
         if status:
             raise ValueError(status.message)
+
+    def _check_rows(self) -> None:
+        """Raise where rows are known to lack triangles: not on a list that is being traced."""
+        if Status.ROW_OVERFLOW in (known_status(self.status) or Status.OK):
+            raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self.capacity)
 
     def closest(self, positions: Array, *, vertices: Array | None = None) -> tuple[Array, Array, Array]:
         """Compute the nearest point of every triangle of a row.
@@ -169,11 +181,13 @@ class TriangleList:
 
         Raises:
             ValueError, TypeError: an argument does not fit the list.
+            NeighborOverflowError: outside jit, a row lacks triangles; inside, look at `overflow`.
 
         Differentiable: to any order in positions and vertices, where the nearest point does not jump; the gradient of a distance
         of 0 is 0. Jit: yes. vmap: yes. Source: Ericson (2005), sect. 5.1.
         """
         points, corners = self._checked(positions, vertices)
+        self._check_rows()
         if 0 in (*self.idx.shape, self.faces.shape[0]):
             none = jnp.zeros(self.idx.shape, points.dtype)
             return jnp.broadcast_to(points[:, None], (*self.idx.shape, points.shape[1])), none, none > 0
@@ -199,6 +213,7 @@ class TriangleList:
 
         Raises:
             ValueError, TypeError: an argument does not fit the list.
+            NeighborOverflowError: as `closest`.
 
         Cost: beside the rows, a ray through a tree of boxes for each particle that has a triangle. The tree is that of the list
         where "bvh" made it; otherwise, and with `vertices`, each call makes one. Differentiable: to any order in positions and
@@ -207,6 +222,7 @@ class TriangleList:
         Source: Baerentzen & Aanaes (2005), doi:10.1109/TVCG.2005.49.
         """
         points, corners = self._checked(positions, vertices)
+        self._check_rows()
         if 0 in (*self.idx.shape, self.faces.shape[0]):
             none = jnp.zeros(points.shape[0], points.dtype)
             return SignedDistance(none, none > 0, jnp.zeros_like(points), jnp.asarray(self.faces.shape[0] == 0))
@@ -214,14 +230,13 @@ class TriangleList:
         return _signed_distance(tri, points, corners)
 
     def _checked(self, positions: Array, vertices: Array | None) -> tuple[Array, Array]:
-        points = checked_positions("positions", positions, like=self.vertices)
-        if points.shape[0] != self.idx.shape[0]:
-            raise ValueError(f"positions hold {points.shape[0]} particles, but the list was made for {self.idx.shape[0]}.")
+        dtype, (count, dim) = np.dtype(self.vertices.dtype), self.vertices.shape
+        points = checked_again("positions", positions, dtype, dim, self.idx.shape[0])
+        check_devices("positions", points, self.idx)
         if vertices is None:
             return points, self.vertices
-        corners = checked_positions("vertices", vertices, like=self.vertices)
-        if corners.shape != self.vertices.shape:
-            raise ValueError(f"vertices have shape {list(corners.shape)}, but the list was made for {list(self.vertices.shape)}.")
+        corners = checked_again("vertices", vertices, dtype, dim, count)
+        check_devices("vertices", corners, self.idx)
         return points, corners
 
 

@@ -1,5 +1,6 @@
 """Search, and compare what came back with the oracle as a set of pairs. Shapes and dtypes are checked on the way."""
 
+import jax
 import numpy as np
 import reference
 from beartype import beartype
@@ -49,3 +50,17 @@ def search_padded(hard_input, length, capacity, **options):
     """Search a hard case with sources and queries padded to `length` rows."""
     queries = None if hard_input.queries is None else padded(hard_input.queries, length)
     return jfrnn.search(padded(hard_input.positions, length), hard_input.cutoff, queries=queries, capacity=capacity, **options)
+
+
+def with_sums(found, points):
+    """Return the sums of rows of points, 0 where a point is not finite, after checking that those, and the padding, have none."""
+    lost = ~np.isfinite(np.asarray(points)).all(axis=1)
+
+    def of_points(leaf):
+        leaf = np.asarray(leaf)
+        none = np.isnan(leaf) if np.issubdtype(leaf.dtype, np.floating) else leaf == np.iinfo(leaf.dtype).min
+        assert none[: len(lost)][lost].all()
+        assert none[len(lost) :].all()
+        return np.where(lost.reshape(-1, *[1] * (leaf.ndim - 1)), 0, leaf[: len(lost)])
+
+    return jax.tree.map(of_points, found)

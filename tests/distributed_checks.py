@@ -166,6 +166,10 @@ def room_that_is_missing_is_told_and_made():
     raises(RuntimeError, "hops", nbrs.check)
     sums = distributed.pair_sum(weight, near, 0.5, backend="warp")
     assert bool(jnp.isnan(sums).all())
+    raises(RuntimeError, "hops", lambda: distributed.pair_sum(weight, near, None, neighbors=nbrs))
+    short = distributed.search(particles, 0.5, capacity=1, backend="warp")
+    over_a_list = jax.jit(lambda particles, nbrs: distributed.pair_sum(weight, particles, None, neighbors=nbrs))
+    assert bool(jnp.isnan(over_a_list(particles, short)[particles.active]).all())
     assert int(distributed.count(near, 0.5, backend="warp").max()) == np.iinfo(np.int32).min
     grown = near.grow(nbrs)
     same_pairs(distributed.search(grown, 0.5, capacity=160, backend="warp"), x * 0.01, radius=0.5)
@@ -317,6 +321,35 @@ def particles_that_are_nowhere_stay():
     assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
     expected = jfrnn.count(jnp.asarray(x), 0.3, backend="warp")
     np.testing.assert_array_equal(by_id(nbrs.count, particles), expected)
+    for given in ({"cutoff": 0.3}, {"cutoff": None, "neighbors": nbrs}):
+        sums = by_id(distributed.pair_sum(weight, particles, **given), particles)
+        np.testing.assert_array_equal(np.flatnonzero(np.isnan(sums)), [3, 50])
+
+
+@check
+def a_list_is_asked_about_what_it_was_made_of():
+    x = np.random.default_rng(10).uniform(0, 4, (64, 2))
+    here, there = (jax.device_put(x, device) for device in jax.devices()[:2])
+    nbrs = jfrnn.search(here, 0.5, capacity=32, backend="warp")
+    for ask in (nbrs.update, nbrs.grow, nbrs.vectors, nbrs.distances, nbrs.shifts):
+        raises(ValueError, "positions lie on cpu:1, but the list on cpu:0", lambda ask=ask: ask(there))
+    raises(ValueError, "move one of them", lambda: jfrnn.pair_sum(weight, there, None, neighbors=nbrs))
+    particles = distributed.scatter(x, 0.5, mesh=mesh_of(4))
+    spread = distributed.search(particles, 0.5, capacity=32, backend="warp")
+    others = {
+        "float64, 2D, in open space), got float32": distributed.scatter(x.astype(np.float32), 0.5, mesh=mesh_of(4)),
+        "got float64, 2D, box with periodic": distributed.scatter(x, 0.5, mesh=mesh_of(4), box=jfrnn.Box([4.0, 4.0])),
+        "particles lie on": distributed.scatter(x, 0.5, mesh=mesh_of(2)),
+        "must be what jfrnn.distributed.scatter returns": x,
+    }
+    for words, other in others.items():
+        error = TypeError if other is x else ValueError
+        for ask in (spread.update, spread.grow, lambda p: distributed.pair_sum(weight, p, None, neighbors=spread)):
+            raises(error, words, lambda ask=ask, other=other: ask(other))
+    raises(
+        ValueError, "positions must be float64 with 2 columns", lambda: particles.replace(particles.positions.astype(np.float32))
+    )
+    raises(ValueError, "values must have shape", lambda: particles.replace(values=jnp.zeros(3)))
 
 
 @check

@@ -148,10 +148,59 @@ def test_refusals(points):
     asked = search(points, 0.4, queries=points[:3])
     with pytest.raises(ValueError, match="made with queries: pass queries="):
         asked.distances(points)
-    with pytest.raises(ValueError, match="queries hold 4 points, but the list has 3 rows"):
+    with pytest.raises(ValueError, match="queries hold 4 points, but the list was made for 3"):
         asked.distances(points, queries=points[:4])
     with pytest.raises(TypeError, match=r"check\(\) reads values and cannot run inside jax.jit"):
         jax.jit(lambda x: jfrnn.search(x, 0.4, capacity=40).check())(points)
     batch = jax.vmap(lambda x: jfrnn.search(x, 0.4, capacity=40))(points[None])
     with pytest.raises(ValueError, match="index the batch first"):
         batch.pairs()
+
+
+ASKED = {
+    "update": lambda nbrs, x, **given: nbrs.update(x, **given),
+    "grow": lambda nbrs, x, **given: nbrs.grow(x, **given),
+    "vectors": lambda nbrs, x, **given: nbrs.vectors(x, **given),
+    "distances": lambda nbrs, x, **given: nbrs.distances(x, **given),
+    "shifts": lambda nbrs, x, **given: nbrs.shifts(x, **given),
+    "pair_sum": lambda nbrs, x, **given: jfrnn.pair_sum(lambda r, i, j: r, x, None, neighbors=nbrs, **given),
+}
+
+
+@pytest.mark.parametrize("asked", ASKED)
+@pytest.mark.parametrize("options", [{}, {"skin": 0.1, "box": jfrnn.Box([3.0, 3.0, 3.0])}], ids=["open", "skin in a box"])
+def test_a_list_is_asked_about_what_it_was_made_of(asked, options):
+    x = jnp.zeros((5, 3), jnp.float32)
+    nbrs = jfrnn.search(x, 0.4, capacity=8, backend="warp", **options)
+    others = {
+        "float32 with 3 columns, for which the list was made, got float64 with 3 columns: convert": x.astype(jnp.float64),
+        "float32 with 3 columns, for which the list was made, got float32 with 2 columns": x[:, :2],
+        "hold 4 particles, but the list was made for 5: make it anew": x[1:],
+    }
+    for match, other in others.items():
+        for call in (ASKED[asked], lambda nbrs, x: jax.eval_shape(lambda x: ASKED[asked](nbrs, x), x)):
+            with pytest.raises(ValueError, match=f"positions.*{match}"):
+                call(nbrs, other)
+    if not options:
+        of_queries = jfrnn.search(x, 0.4, queries=x[:3], capacity=8, backend="warp")
+        with pytest.raises(ValueError, match=r"queries must be float32 with 3 columns.*got float64"):
+            ASKED[asked](of_queries, x, queries=x[:3].astype(jnp.float64))
+        with pytest.raises(ValueError, match="queries hold 2 points, but the list was made for 3"):
+            ASKED[asked](of_queries, x, queries=x[:2])
+    elif asked != "grow":
+        with pytest.raises(ValueError, match="box has 2 axes, but positions have 3 columns"):
+            ASKED[asked](nbrs, x, box=jfrnn.Box([3.0, 3.0]))
+
+
+def test_a_list_is_printed_in_a_line():
+    x = jnp.asarray([[0.0, 0.0], [0.3, 0.4], [2.0, 0.0]], jnp.float32)
+    nbrs = jfrnn.search(x, 1.0, capacity=1, skin=0.25, backend="warp")
+    line = "NeighborList(3 particles, capacity 1, cutoff 1, skin 0.25, engine 'warp', {} pairs, status {})"
+    assert repr(nbrs) == str(nbrs) == line.format(2, "OK")
+    short = jfrnn.search(jnp.zeros((3, 2), jnp.float32).at[2].set(jnp.nan), 1.0, queries=jnp.zeros((2, 2), jnp.float32), capacity=1)
+    assert "2 queries of 3 particles, capacity 1" in repr(short)
+    assert repr(short).endswith("4 pairs, status ROW_OVERFLOW | NONFINITE)")
+    seen = []
+    jax.eval_shape(lambda nbrs: seen.append(repr(nbrs)), nbrs)
+    assert seen == [line.format("traced", "traced")]
+    assert "shape" not in repr(jax.tree.map(lambda _: 0, nbrs))  # whatever stands where arrays stood

@@ -75,9 +75,13 @@ def listed_marks(x, nbrs):
     return jfrnn.pair_sum(marks, x, None, jnp.arange(len(x), dtype=jnp.int32), neighbors=nbrs)
 
 
+def has_no_sum(x):
+    return jnp.isnan(x) if jnp.issubdtype(x.dtype, jnp.floating) else x == jnp.iinfo(x.dtype).min
+
+
 def cut(sums, rows):
-    """Return the first rows, after checking that the padding has nothing."""
-    assert all(not np.asarray(leaf[rows:]).any() for leaf in jax.tree.leaves(sums))
+    """Return the first rows, after checking that the padding, whose coordinates are NaN, has no sums."""
+    assert all(np.asarray(has_no_sum(leaf[rows:])).all() for leaf in jax.tree.leaves(sums))
     return jax.tree.map(lambda leaf: leaf[:rows], sums)
 
 
@@ -619,6 +623,71 @@ def test_where_a_search_cannot_answer_nothing_looks_like_an_answer():
         bad = sums(*wrong)
         assert np.isnan(bad["float"]).all()
         assert (bad["int"] < 0).all()
+
+
+@functools.partial(jax.jit, static_argnames=("backend", "reduce"))
+def sums_and_forces(x, m, nbrs, active, backend, reduce):
+    """Return sums of floats and integers over a list or a search, and the derivatives of the former."""
+    given = {"active": active, "backend": backend} if nbrs is None else {"neighbors": nbrs}
+
+    def sums(x, m):
+        found = jfrnn.pair_sum(lambda r, i, j: {"float": j * (r @ r)}, x, CUTOFF, m, reduce=reduce, **given)["float"]
+        return jnp.where(jnp.isinf(found), 0, found).sum(), found
+
+    integers = None if nbrs is None and backend == "warp" else jfrnn.pair_sum(lambda r, i, j: 1, x, CUTOFF, m, **given)
+    (force, of_values), found = jax.grad(sums, (0, 1), has_aux=True)(x, m)
+    return {"float": found, "integer": integers}, force, of_values
+
+
+@pytest.mark.parametrize("reduce", ["sum", "max"])
+@pytest.mark.parametrize("backend", ["list", "warp", pytest.param("brute", marks=SLOW), pytest.param("jax", marks=SLOW)])
+def test_a_particle_that_is_nowhere_has_no_sum(backend, reduce):
+    """Nor has it a force; the others have what they have without it, and inactive particles have 0 as everywhere."""
+    x, m = scene(2)
+    lost, asleep = np.array([3, 17]), np.array([5, 6])
+    active = np.ones(N, bool)
+    active[asleep] = False
+    x = x.at[3, 1].set(jnp.nan).at[17, 0].set(jnp.inf).at[5].set(jnp.nan)
+    nbrs = jfrnn.search(x, CUTOFF, active=active, capacity=50, backend="warp") if backend == "list" else None
+    found, force, of_values = sums_and_forces(x, m, nbrs, active, "auto" if nbrs else backend, reduce)
+    parked = x.at[lost].set(1e3 + jnp.arange(2.0)[:, None] * 1e3)
+    if nbrs is not None:
+        nbrs = jfrnn.search(parked, CUTOFF, active=active, capacity=50, backend="warp")
+        asleep = asleep[1:]  # the list knows that some particle is nowhere, but not that the one with NaN is inactive
+    expected, exact, of_others = sums_and_forces(parked, m, nbrs, active, "auto" if nbrs else backend, reduce)
+    no_sum = jax.tree.map(has_no_sum, found)
+    assert all(of_each[lost].all() and not of_each[asleep].any() for of_each in jax.tree.leaves(no_sum))
+    assert np.isnan(force[lost]).all()
+    known = np.setdiff1d(np.arange(N), [*lost, 5])
+    for got, wanted in zip(jax.tree.leaves((found, force, of_values)), jax.tree.leaves((expected, exact, of_others)), strict=True):
+        np.testing.assert_allclose(got[known], wanted[known], rtol=1e-12, atol=1e-14)
+
+
+def test_a_query_that_is_nowhere_has_no_sum():
+    x, _ = scene(2)
+    queries, active = x[:9].at[4, 0].set(jnp.nan), np.arange(N) % 3 > 0
+    nbrs = jfrnn.search(x, CUTOFF, queries=queries, active=active, capacity=50, backend="warp")
+    for given in ({"neighbors": nbrs}, {"active": active, "backend": "warp"}):
+        sums = jfrnn.pair_sum(lambda r, i, j: r @ r, x, CUTOFF, queries=queries, **given)
+        np.testing.assert_array_equal(np.flatnonzero(np.isnan(sums)), [4])
+
+
+@pytest.mark.parametrize(("half", "reduce"), [(False, "sum"), pytest.param(True, "sum", marks=SLOW), (False, "max")])
+def test_a_list_that_lacks_pairs_has_no_sums(half, reduce):
+    """Outside jit, and where it is closed over, it raises; inside, no row looks like a sum, nor does a force."""
+    x, m = scene(1)
+    nbrs = jfrnn.search(x, CUTOFF, half=half, capacity=3, backend="warp")
+
+    def sums(nbrs, x):
+        return jfrnn.pair_sum(lambda r, i, j: j * (r @ r), x, None, m, neighbors=nbrs, reduce=reduce)
+
+    assert np.isnan(jax.jit(sums)(nbrs, x)).all()
+    assert np.isnan(jax.jit(jax.grad(lambda x, nbrs: sums(nbrs, x)[0]))(x, nbrs)).all()
+    for call in (sums, lambda nbrs, x: jax.jit(lambda x: sums(nbrs, x))(x)):
+        with pytest.raises(jfrnn.NeighborOverflowError, match="capacity=3 is too small"):
+            call(nbrs, x)
+    whole = nbrs.grow(x)
+    np.testing.assert_allclose(sums(whole, x), jfrnn.pair_sum(lambda r, i, j: j * (r @ r), x, CUTOFF, m, reduce=reduce), rtol=1e-12)
 
 
 X, Q, M = np.zeros((4, 2), np.float32), np.ones((3, 2), np.float32), np.ones(4, np.float32)

@@ -177,8 +177,17 @@ def test_a_loop_with_a_wall_that_moves():
         jax.jit(lambda x, tri: tri.grow(x).idx)(after, grown)
     with pytest.raises(ValueError, match="positions hold 3 particles, but the list was made for 4"):
         grown.update(after[:3])
-    with pytest.raises(ValueError, match="vertices have shape"):
+    with pytest.raises(ValueError, match="vertices hold 3 corners, but the list was made for 4"):
         grown.update(after, vertices=lifted[:3])
+    for ask in (grown.update, grown.grow, grown.closest, grown.signed_distance):
+        with pytest.raises(
+            ValueError, match="positions must be float32 with 3 columns, for which the list was made, got float64 with 3"
+        ):
+            ask(after.astype(np.float64))
+        with pytest.raises(
+            ValueError, match="vertices must be float32 with 3 columns, for which the list was made, got float32 with 2"
+        ):
+            ask(after, vertices=lifted[:, :2])
 
 
 @pytest.mark.parametrize("backend", [pytest.param("jax", marks=pytest.mark.slow), "warp", "bvh"])

@@ -67,6 +67,16 @@ def test_needle_of_the_reference_figures():
     assert abs(float(tri.closest(x)[1][0, 0]) - 0.00141414285346) < 1e-14
 
 
+def test_a_list_that_lacks_triangles_raises_outside_jit():
+    vertices, faces = meshes.cube(2.0, 2)
+    x = jnp.asarray([[0.5, 1.0, 0.5]], jnp.float32)
+    tri = jfrnn.search_triangles(x, jnp.asarray(vertices, jnp.float32), faces, 1.0, capacity=1, backend="warp")
+    for ask in (jfrnn.TriangleList.closest, jfrnn.TriangleList.signed_distance):
+        with pytest.raises(jfrnn.NeighborOverflowError, match="capacity=1 is too small"):
+            ask(tri, x)
+        jax.eval_shape(ask, tri, x)  # inside jit nobody knows
+
+
 def cube_list(x, dtype, cutoff=1.0):
     vertices, faces = meshes.cube(2.0, 2)
     return jfrnn.search_triangles(x, vertices.astype(dtype), faces, cutoff, capacity=48)
