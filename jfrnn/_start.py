@@ -15,7 +15,7 @@ from typing import Any
 
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 _LINUX = sys.platform == "linux"
-INSTALL = 'pip install "jfrnn[warp]"'
+INSTALL = "pip install 'warp-lang==1.19.*'"
 
 
 @functools.cache

@@ -66,7 +66,7 @@ print(caught[0].message)
     assert warned == "1 RuntimeWarning <string>"
     assert message == (
         "backend='auto' takes the slower engine 'jax' on the platform 'cpu': the backends 'warp' and 'hashgrid' need the package "
-        "warp-lang (1.18 or 1.19): pip install \"jfrnn[warp]\". Pass backend='jax' to choose it without this warning."
+        "warp-lang (1.18 or 1.19): pip install 'warp-lang==1.19.*'. Pass backend='jax' to choose it without this warning."
     )
 
 
@@ -83,7 +83,7 @@ print(*(jfrnn.search(X, 0.3, capacity=9, backend=backend).backend for backend in
 """)
     *messages, engines = text.splitlines()
     assert messages == 6 * [
-        "the backends 'warp' and 'hashgrid' need the package warp-lang (1.18 or 1.19): pip install \"jfrnn[warp]\""
+        "the backends 'warp' and 'hashgrid' need the package warp-lang (1.18 or 1.19): pip install 'warp-lang==1.19.*'"
     ]
     assert engines == "jax brute"
 
