@@ -45,8 +45,10 @@ def pair_sum(
 
     Args:
         fn: A JAX function of one pair: of the displacement r [length], shape [d], of the values of i and those of j; it returns a
-            pytree of arrays of floats or integers. It may close over arrays, traced ones too, and be differentiated in them. Where
-            particles may coincide or are their own neighbors, it must itself be safe at r = 0 (the derivative of sqrt is not).
+            pytree of arrays of floats or integers. It may close over arrays, traced ones too, and be differentiated in them. Python
+            numbers that it closes over are constants of the compiled program: each new value compiles it anew, for about a second;
+            one that changes is closed over as `jnp.asarray(number)`. Where particles may coincide or are their own neighbors, fn
+            must itself be safe at r = 0 (the derivative of sqrt is not).
         positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64. n = 0 is allowed.
         cutoff: As in `search`; with `neighbors` that of the list, or None.
         values: A pytree of arrays of shape [n, ...]; fn gets leaves [...], of j and, without queries, of i. Default: None.

@@ -19,7 +19,7 @@ from jfrnn._programs import at_once, compiled
 from jfrnn._status import NeighborOverflowError, Status, known_status, pairs_and_status, shape_of
 from jfrnn._triangles_cells import TriangleCells, sort_triangles, without_faults
 from jfrnn._triangles_closest import Rows, nearest_of, pseudonormals
-from jfrnn._triangles_rows import are_near, list_triangles, nearest_slots
+from jfrnn._triangles_rows import are_near, decide_pairs, list_triangles, nearest_slots
 from jfrnn._triangles_tree import TriangleTree, grow_tree
 from jfrnn._triangles_winding import cast_rays, is_closed, least_winding, ray_ways
 
@@ -306,7 +306,8 @@ def _nearest_in_rows(tri: TriangleList, points: Array, vertices: Array) -> tuple
     corners, finite, there = without_faults(vertices, tri.faces)
     triangle = jnp.where(used, tri.idx, 0)
     cutoff = make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False)
-    near = are_near(*lax.stop_gradient((points, corners)), triangle, cutoff, used & (finite & there)[triangle])
+    decide = decide_pairs if tri.backend == "jax" else _triangles_warp.decide_pairs
+    near = are_near(*lax.stop_gradient((points, corners)), triangle, cutoff, used & (finite & there)[triangle], decide)
     mask = near & jnp.all(jnp.isfinite(points), axis=1)[:, None]
     shapes = jnp.where(mask[..., None, None], corners[triangle], 0)
     vectors, feature = nearest_of(jnp.where(mask[..., None], points[:, None], 0), shapes)
@@ -318,7 +319,8 @@ def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> Signe
     corners, finite, there = without_faults(vertices, tri.faces)
     fixed, at, good = *lax.stop_gradient((corners, points)), finite & there
     cutoff, used = make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False), jnp.minimum(tri.count, tri.capacity)
-    slot, some = nearest_slots(at, fixed, tri.idx, used, good, cutoff)
+    decide = decide_pairs if tri.backend == "jax" else _triangles_warp.decide_pairs
+    slot, some = nearest_slots(at, fixed, tri.idx, used, good, cutoff, decide)
     triangle = jnp.where(some, jnp.take_along_axis(tri.idx, slot[:, None], axis=1)[:, 0], 0)
     shapes = jnp.where(some[:, None, None], corners[triangle], 0)
     vectors, feature = nearest_of(jnp.where(some[:, None], points, 0), shapes)

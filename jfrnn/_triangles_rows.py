@@ -1,5 +1,6 @@
 """The array engine of triangles: each particle meets the triangles of its cells, in chunks of candidates of a fixed size."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -12,6 +13,8 @@ from jfrnn._triangles_cells import TriangleCells, bucket_of, cells_of, scale_of
 from jfrnn._triangles_closest import nearest_of
 from jfrnn._triangles_exact import is_near_of, zero_of
 from jfrnn._triangles_integers import Shapes
+
+Decide = Callable[[Array, Array, Array, Array, Cutoff, Array], Array]  # `decide_pairs`, or what answers like it
 
 _BLOCK = 1 << 16  # particles in work at a time
 _CHUNK = 1 << 14  # candidates in work at a time
@@ -76,7 +79,7 @@ def _add_run(
         triangle = cells.triangles.at[run.start[particle] + at - before].get(mode="clip")
         there = (at < total) & (triangle < faces)
         known = jnp.minimum(triangle, faces - 1)
-        near = _decided(own, corners, particle, known, cutoff, there & (cells.level_of[known] == run.level))
+        near = decide_pairs(own, corners, particle, known, cutoff, there & (cells.level_of[known] == run.level))
         hits = jnp.cumsum(near, dtype=jnp.int32) - near.astype(jnp.int32)
         rank = hits - hits[jnp.maximum(before - begin, 0)]  # among those of its particle in this chunk
         slot = jnp.where(near, count[particle] + rank, rows.shape[1])
@@ -86,7 +89,7 @@ def _add_run(
     return lax.while_loop(lambda state: state[0] * _CHUNK < total, add_chunk, (jnp.int32(0), *found))[1:]
 
 
-def _decided(own: Array, corners: Array, particle: Array, triangle: Array, cutoff: Cutoff, asked: Array) -> Array:
+def decide_pairs(own: Array, corners: Array, particle: Array, triangle: Array, cutoff: Cutoff, asked: Array) -> Array:
     """Decide which particles are near which triangles: [q] bool."""
     dim = own.shape[1]
     points, shapes = own[particle], corners[triangle]
@@ -100,7 +103,9 @@ def _decided(own: Array, corners: Array, particle: Array, triangle: Array, cutof
     return is_near_of(axes, corner_axes, cutoff, shapes_at, asked, zero_of(triangle, np.dtype(own.dtype)))
 
 
-def nearest_slots(points: Array, corners: Array, idx: Array, count: Array, good: Array, cutoff: Cutoff) -> tuple[Array, Array]:
+def nearest_slots(
+    points: Array, corners: Array, idx: Array, count: Array, good: Array, cutoff: Cutoff, decide: Decide = decide_pairs
+) -> tuple[Array, Array]:
     """Find the nearest triangle of each row, n > 0 and f > 0, in chunks of as many pairs as there are particles in a block.
 
     Args:
@@ -110,6 +115,7 @@ def nearest_slots(points: Array, corners: Array, idx: Array, count: Array, good:
         count: How many slots of a row are used, shape [n], int32.
         good: Which triangles are such, shape [f], bool.
         cutoff: Triangles that are not closer do not count, exactly.
+        decide: Says which pairs are closer.
 
     Returns:
         The slot of the nearest, the first of those as near, shape [n], int32, and whether there is one, shape [n], bool.
@@ -129,7 +135,7 @@ def nearest_slots(points: Array, corners: Array, idx: Array, count: Array, good:
             particle = jnp.minimum(jnp.searchsorted(until, at, side="right").astype(jnp.int32), block - 1)
             slot = jnp.where(at < until[-1], at - (until[particle] - used[particle]), 0)
             triangle = jnp.where(at < until[-1], rows[particle, slot], 0)
-            near = _decided(own, corners, particle, triangle, cutoff, (at < until[-1]) & good[triangle])
+            near = decide(own, corners, particle, triangle, cutoff, (at < until[-1]) & good[triangle])
             lengths = norms(nearest_of(own[particle], corners[triangle]).vectors)
             now = least.at[particle].min(jnp.where(near, lengths, jnp.inf))
             wins = jnp.where(near & (lengths == now[particle]), particle, block)
@@ -143,8 +149,8 @@ def nearest_slots(points: Array, corners: Array, idx: Array, count: Array, good:
     return jnp.minimum(slots, capacity - 1), slots < capacity
 
 
-def are_near(points: Array, corners: Array, triangle: Array, cutoff: Cutoff, asked: Array) -> Array:
+def are_near(points: Array, corners: Array, triangle: Array, cutoff: Cutoff, asked: Array, decide: Decide = decide_pairs) -> Array:
     """Decide for points [n, d] which triangles [n, k] of their rows are closer than the cutoff: [n, k] bool."""
     particle = lax.broadcasted_iota(jnp.int32, triangle.shape, 0)
-    near = _decided(points, corners, particle.reshape(-1), triangle.reshape(-1), cutoff, asked.reshape(-1))
+    near = decide(points, corners, particle.reshape(-1), triangle.reshape(-1), cutoff, asked.reshape(-1))
     return near.reshape(triangle.shape)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn import _cuda, _triangles_cells, _warp
+from jfrnn import _cuda, _triangles_cells, _triangles_rows, _warp
 from jfrnn._exact import Cutoff
 from jfrnn._launch import Kernel, kernel
 from jfrnn._start import kernels_of, load_warp
@@ -179,6 +179,39 @@ def cast_rays(
     on_cpu, on_cuda = (functools.partial(call, of) for of in (_rays_on_cpu, _rays_on_cuda))
     side = lax.platform_dependent(*inputs, cpu=on_cpu, cuda=on_cuda)
     return side == 1, side == 2
+
+
+def decide_pairs(own: Array, corners: Array, particle: Array, triangle: Array, cutoff: Cutoff, asked: Array) -> Array:
+    """Decide which particles are near which triangles: [q] bool, as `jfrnn._triangles_rows.decide_pairs` does.
+
+    On the CPU by a kernel, whose integers XLA would compile anew, for seconds, wherever pairs are decided.
+    """
+    radius = jnp.reshape(jnp.asarray(cutoff.radius), 1)
+
+    def on_cpu(own: Array, corners: Array, particle: Array, triangle: Array, asked: Array) -> Array:
+        call = _pairs_callable(own.shape[1], own.dtype == jnp.float64)
+        sizes = {"near": len(particle), "info": 1}
+        return call(own, corners, radius, particle, triangle, asked.astype(jnp.int32), output_dims=sizes)[0] > 0
+
+    def elsewhere(own: Array, corners: Array, particle: Array, triangle: Array, asked: Array) -> Array:
+        return _triangles_rows.decide_pairs(own, corners, particle, triangle, cutoff, asked)
+
+    return lax.platform_dependent(own, corners, particle, triangle, asked, cpu=on_cpu, default=elsewhere)
+
+
+@functools.cache
+def _pairs_callable(dim: int, double: bool) -> Any:  # noqa: ANN401
+    wp = _warp.load_warp()
+    scalar, ints = wp.float64 if double else wp.float32, wp.array(dtype=wp.int32)
+    types = {"positions": wp.array2d(dtype=scalar), "corners": wp.array3d(dtype=scalar), "cutoff": wp.array(dtype=scalar)}
+    types |= {"particle": ints, "triangle": ints, "asked": ints, "near": ints, "info": ints}
+
+    def run(*arrays: Any) -> None:  # noqa: ANN401
+        arrays[-1].numpy()[:] = 0
+        kernels, n = _warp.kernels_of("triangle_pairs_cpu"), arrays[3].shape[0]
+        _warp.on_every_core(kernels.pairs_kernel(dim, bool(double)), [*arrays, n], -(-n // kernels.CHUNK))
+
+    return _warp.callable_of(f"jfrnn_triangle_pairs_{dim}d_{'f64' if double else 'f32'}", run, types, 2)
 
 
 def _ray_types(double: bool) -> dict[str, Any]:

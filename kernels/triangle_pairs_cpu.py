@@ -1,0 +1,55 @@
+"""Pairs of a particle and a triangle, given one by one, on the CPU: which are closer than the cutoff, exactly.
+
+Threads hand themselves chunks of pairs from an atomic counter.
+"""
+
+import functools
+
+import warp as wp
+from jfrnn.kernels._native import ENTER, LEAVE, snippet
+from jfrnn.kernels._triangles import DECIDE, constants
+
+CHUNK = 4096  # pairs that a thread takes at a time
+
+_DECIDE_PAIRS = r"""
+const double scale = Bits::unit_scale(radius);
+int room[ROOM];
+for (;;) {
+    const long long begin = (long long)__atomic_fetch_add(&info.data[0], 1, __ATOMIC_RELAXED) * CHUNK;
+    if (begin >= n)
+        break;
+    for (long long q = begin; q < n && q < begin + CHUNK; ++q) {
+        const real* p = positions.data + (long long)DIM * particle.data[q];
+        const real* shape = corners.data + (long long)DIM * DIM * triangle.data[q];
+        near.data[q] = asked.data[q] && Shape::near(p, shape, radius, scale, room);
+    }
+}
+"""
+
+
+@functools.cache
+def pairs_kernel(dim: int, double: bool) -> wp.Kernel:
+    """Return the kernel for a dimension and dtype, launched once per thread with dim = 1."""
+    scalar, variant = wp.float64 if double else wp.float32, f"{dim}d_{'f64' if double else 'f32'}"
+    reals, ints = wp.array(dtype=scalar), wp.array(dtype=wp.int32)
+    points, shapes = wp.array2d(dtype=scalar), wp.array3d(dtype=scalar)
+
+    def native(
+        positions: points, corners: shapes, cutoff: reals, particle: ints, triangle: ints, asked: ints, near: ints, info: ints,
+        n: int,
+    ): ...  # fmt: skip
+
+    native.__name__ = native.__qualname__ = f"triangle_pairs_native_{variant}"
+    options = {"CHUNK": CHUNK, **constants(dim, double, stride=1)}
+    text = snippet("double" if double else "float", dim, DECIDE, _DECIDE_PAIRS, **options)
+    function = wp.func_native(ENTER + text + LEAVE)(native)
+
+    def kernel(
+        positions: points, corners: shapes, cutoff: reals, particle: ints, triangle: ints, asked: ints, near: ints, info: ints,
+        n: int,
+    ):  # fmt: skip
+        function(positions, corners, cutoff, particle, triangle, asked, near, info, n)
+
+    module = wp.get_module(f"jfrnn.kernels.triangle_pairs_cpu.{variant}")
+    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
+    return wp.kernel(kernel, module=module)
