@@ -12,6 +12,7 @@ Array([1, 1, 0], dtype=int32)
 from jfrnn._box import Box
 from jfrnn._chunks import run_chunk
 from jfrnn._memory import MemoryPlan, memory_plan
+from jfrnn._meshes import merge_vertices
 from jfrnn._neighbors import NeighborList
 from jfrnn._order import hilbert_decode, hilbert_encode, morton_decode, morton_encode, sort_order
 from jfrnn._pair_sum import pair_sum
@@ -31,6 +32,7 @@ __all__ = [
     "hilbert_decode",
     "hilbert_encode",
     "memory_plan",
+    "merge_vertices",
     "morton_decode",
     "morton_encode",
     "pair_sum",
