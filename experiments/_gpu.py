@@ -286,6 +286,9 @@ def _images(nbrs: Any, x: Any, queries: Any) -> list[tuple[int, int, tuple[int, 
         turns = np.asarray(unpacked_turns(source_turns, nbrs.box.dim))
         own_turns = turns if query_turns is None else np.asarray(unpacked_turns(query_turns, nbrs.box.dim))
         shifts = (kind.shifts[np.asarray(codes)[i, k]] + own_turns[i] - turns[j]) @ kind.numbers
+        if nbrs.half and kind.basis is not None:  # of an image of its own, a particle keeps the one ahead in the given vectors
+            leads = np.take_along_axis(shifts, np.argmax(shifts != 0, axis=1)[:, None], axis=1)
+            shifts = np.where((i == j)[:, None] & (leads < 0), -shifts, shifts)
     return sorted(zip(i.tolist(), j.tolist(), map(tuple, shifts.tolist()), strict=True))
 
 

@@ -12,7 +12,7 @@ from jax.core import Tracer
 
 from jfrnn._batch import Batch
 from jfrnn._box import Box
-from jfrnn._exact import RULES, Cutoff, Radii, is_radius, largest_cutoff, make_cutoff, smallest_cutoff
+from jfrnn._exact import RULES, Cutoff, Radii, largest_cutoff, make_cutoff, smallest_cutoff
 from jfrnn._programs import on_device
 
 BACKENDS = ("auto", "jax", "warp", "hashgrid", "brute")
@@ -153,7 +153,8 @@ def largest_known(radii: Radii) -> float | None:
     if any(isinstance(x, Tracer) for x in given):
         return None
     values: Any = np.concatenate(jax.device_get(given))
-    return float(np.max(values[is_radius(values)], initial=0)) or 1.0
+    low, high = smallest_cutoff(values.dtype), largest_cutoff(values.dtype)
+    return float(np.max(values[(values >= low) & (values <= high)], initial=0)) or 1.0
 
 
 def checked_skin(skin: Any, cutoff: float, dtype: np.dtype) -> float:  # noqa: ANN401
