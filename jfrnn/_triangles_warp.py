@@ -189,7 +189,7 @@ def decide_pairs(own: Array, corners: Array, particle: Array, triangle: Array, c
     radius = jnp.reshape(jnp.asarray(cutoff.radius), 1)
 
     def on_cpu(own: Array, corners: Array, particle: Array, triangle: Array, asked: Array) -> Array:
-        call = _pairs_callable(own.shape[1], own.dtype == jnp.float64)
+        call = _pairs_on_cpu(own.shape[1], bool(own.dtype == jnp.float64))
         sizes = {"near": len(particle), "info": 1}
         return call(own, corners, radius, particle, triangle, asked.astype(jnp.int32), output_dims=sizes)[0] > 0
 
@@ -199,19 +199,19 @@ def decide_pairs(own: Array, corners: Array, particle: Array, triangle: Array, c
     return lax.platform_dependent(own, corners, particle, triangle, asked, cpu=on_cpu, default=elsewhere)
 
 
-@functools.cache
-def _pairs_callable(dim: int, double: bool) -> Any:  # noqa: ANN401
-    wp = _warp.load_warp()
+@kernel
+def _pairs_on_cpu(dim: int, double: bool) -> Kernel:
+    wp = load_warp()
     scalar, ints = wp.float64 if double else wp.float32, wp.array(dtype=wp.int32)
     types = {"positions": wp.array2d(dtype=scalar), "corners": wp.array3d(dtype=scalar), "cutoff": wp.array(dtype=scalar)}
     types |= {"particle": ints, "triangle": ints, "asked": ints, "near": ints, "info": ints}
 
     def run(*arrays: Any) -> None:  # noqa: ANN401
         arrays[-1].numpy()[:] = 0
-        kernels, n = _warp.kernels_of("triangle_pairs_cpu"), arrays[3].shape[0]
-        _warp.on_every_core(kernels.pairs_kernel(dim, bool(double)), [*arrays, n], -(-n // kernels.CHUNK))
+        kernels, n = kernels_of("triangle_pairs_cpu"), arrays[3].shape[0]
+        _warp.on_every_core(kernels.pairs_kernel(dim, double), [*arrays, n], -(-n // kernels.CHUNK))
 
-    return _warp.callable_of(f"jfrnn_triangle_pairs_{dim}d_{'f64' if double else 'f32'}", run, types, 2)
+    return _warp.on_cpu(f"jfrnn_triangle_pairs_{dim}d_{'f64' if double else 'f32'}", run, types, 2)
 
 
 def _ray_types(double: bool) -> dict[str, Any]:
