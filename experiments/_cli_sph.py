@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from experiments._commands import RetryFailed, RowsFolder, check_choice, finite, stoppable, take_folder, usage_errors
+from experiments._errors import UsageError
 
 SHORT = {
     "sph": "Run a fluid scene, or go on with it.",
@@ -28,6 +29,10 @@ def sph(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the run; out/sph/SCENE without it.")] = None,
     initial: Annotated[Path | None, typer.Option(help="Initial particles instead of the scene's: .npz or .csv.")] = None,
+    solid: Annotated[Path | None, typer.Option(help="A closed wall instead of the scene's, in 3D: STL, OBJ or PLY.")] = None,
+    solid_unit: Annotated[
+        float | None, typer.Option(min=1e-9, max=1e3, callback=finite, help="Unit of that file [m]: 0.001 for mm; 1 without.")
+    ] = None,
     frames: Annotated[int, typer.Option(min=1, max=1_000_000, help="Snapshots after the first.")] = 50,
     dtype: Annotated[str, typer.Option(help="float32 or float64.")] = "float64",
     neighbors: Annotated[str, typer.Option(help="pair_sum, or list: a list with a skin.")] = "pair_sum",
@@ -38,6 +43,8 @@ def sph(
     with usage_errors():
         check_choice("--dtype", dtype, ("float32", "float64"))
         check_choice("--neighbors", neighbors, ("pair_sum", "list"))
+        if solid is None and solid_unit is not None:
+            raise UsageError(f"--solid-unit {solid_unit:g}: is the unit of the file of --solid; name that file too")
         import jax
 
         jax.config.update("jax_enable_x64", dtype == "float64")
@@ -46,6 +53,7 @@ def sph(
 
         fluid = sph_settings.make_scene(scene, settings or [])
         fluid = fluid if initial is None else sph_settings.with_particles(fluid, initial)
+        fluid = fluid if solid is None else sph_settings.with_solid(fluid, solid, 1.0 if solid_unit is None else solid_unit)
         folder = out or Path("out") / "sph" / scene
         with stoppable("the last snapshot"):
             sph_run.run(fluid, folder, sph_run.How(frames, dtype, neighbors, skin, pictures))

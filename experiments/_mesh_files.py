@@ -25,8 +25,9 @@ def read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
         raise UsageError(f"{path} is no file: name an STL, OBJ or PLY.")
     try:
         mesh = trimesh.load(path, force="mesh")
-    except (ValueError, NotImplementedError) as error:
-        raise UsageError(f"{path} is no mesh that trimesh reads ({error}): name an STL, OBJ or PLY.") from error
+    except Exception as error:  # readers of trimesh raise of any kind
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise UsageError(f"{path} is no mesh that trimesh reads ({reason}): name an STL, OBJ or PLY.") from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise UsageError(f"{path} holds no triangles.")
     mesh.merge_vertices()

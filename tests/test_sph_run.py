@@ -5,13 +5,15 @@ import json
 import numpy as np
 import pytest
 import pyvista
-from jfrnn.cases import fluids
+import trimesh
+from jfrnn.cases import fluids, meshes
 from typer.testing import CliRunner
 
 from experiments._cli import app
 from experiments.sph import health
 from experiments.sph.model import make_model, make_state
-from experiments.sph.settings import make_scene
+from experiments.sph.settings import make_scene, with_solid
+from jfrnn._triangles_winding import is_closed
 
 FEW = ("--frames", 3, "--set", "duration=0.003")
 
@@ -118,3 +120,54 @@ def test_values_of_settings_have_their_kind():
     assert scene.physics.gravity == (0.0, -1.62)
     assert (scene.physics.artificial, scene.physics.viscosity) == (0.1, None)
     assert fluids.fluid("dam").physics.viscosity == 1.0
+
+
+def write_cube(path, center=(0.0, 0.0, 0.0), edge=1.0, faces=12):
+    """Write a cube as STL, each of its triangles with corners of its own."""
+    vertices, named = meshes.cube(edge, 1)
+    trimesh.Trimesh(vertices + center, named[:faces], process=False).export(path)
+    return path
+
+
+def test_a_wall_from_a_file(tmp_path):
+    path = write_cube(tmp_path / "cube.stl", (1.0, 2.0, 4.0), 2.0)
+    scene = with_solid(make_scene("jet", []), path, 0.001)
+    assert scene.solid.turning is None
+    assert scene.solid.vertices.shape == (8, 3)
+    assert np.allclose([scene.solid.vertices.min(axis=0), scene.solid.vertices.max(axis=0)], [[0, 1e-3, 3e-3], [2e-3, 3e-3, 5e-3]])
+    assert is_closed(scene.solid.faces)
+    assert make_state(scene).solid.tri.faces.shape == (12, 3)  # also beside particles that are a wall
+
+
+@pytest.mark.parametrize(
+    ("scene", "center", "edge", "unit", "message"),
+    [
+        ("dam", (0, 0, 0), 1.0, 1, "triangles are a wall in 3D; dam is in 2D"),
+        ("jet", (30, 0, 4), 2.0, 1, "reaches from (29, -1, 3) to (31, 1, 5) m, the scene from (-0.008, -0.008,"),
+        ("jet", (0, 0, 0), 9.0, 1, "is 9 m long, from (-4.5, "),
+        ("jet", (0, 0, 4), 1e-3, 1e-3, "is 1e-06 m long"),
+    ],
+)
+def test_walls_that_cannot_be_meant_are_refused(tmp_path, scene, center, edge, unit, message):
+    path = write_cube(tmp_path / "cube.stl", center, edge)
+    code, _, error = invoke(scene, "--solid", path, "--solid-unit", unit, "--out", tmp_path / "run")
+    assert code == 2
+    assert (message in error, error.count("\n")) == (True, 1)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("ending", ["stl", "obj", "ply"])
+def test_files_that_hold_no_wall_are_refused(tmp_path, ending):
+    code, _, error = invoke("jet", "--solid", tmp_path / f"none.{ending}")
+    assert (code, f"--solid {tmp_path}/none.{ending} is no file: name an STL, OBJ or PLY." in error) == (2, True)
+    for text in (b"", b"solid\n facet", b"\x00\xff" * 50, b"ply\nformat ascii 1.0\n", b"f 1 2 3\nv 0 0"):
+        (tmp_path / f"broken.{ending}").write_bytes(text)
+        code, _, error = invoke("jet", "--solid", tmp_path / f"broken.{ending}")
+        assert (code, error.startswith(f"error: --solid {tmp_path}/broken.{ending} "), error.count("\n")) == (2, True, 1)
+
+
+def test_a_wall_that_is_open_is_refused_before_a_folder_is_made(tmp_path):
+    path = write_cube(tmp_path / "open.stl", (0, 0, 4), 2.0, faces=11)
+    code, _, error = invoke("jet-gear", "--solid", path, "--solid-unit", 0.001, "--out", tmp_path / "run", "--set", "layers=2")
+    assert (code, "solid must be a closed mesh" in error, error.count("\n")) == (2, True, 1)
+    assert not (tmp_path / "run").exists()

@@ -52,7 +52,7 @@ def run(scene: "FluidScene", folder: Path, how: How) -> State:
         The last state.
 
     Raises:
-        UsageError: The folder holds another run.
+        UsageError: The folder holds another run, or the scene cannot be run.
         DivergedError: A particle is not finite, or went through a wall.
     """
     arrays = (scene.positions, scene.velocities, scene.masses, *((scene.solid.vertices, scene.solid.faces) if scene.solid else ()))
@@ -60,11 +60,12 @@ def run(scene: "FluidScene", folder: Path, how: How) -> State:
     about = settings.described(scene) | {"dtype": how.dtype, "frames": how.frames, "given": given.hexdigest()[:12]}
     try:
         model = make_model(scene, np.dtype(how.dtype).type)
+        first = None if (folder / "run.json").exists() else make_state(scene, np.dtype(how.dtype).type)  # refused before
+        snapshots.check_same(about, folder)
+        saved = snapshots.latest(folder / "snapshots", scene)
+        s, step = saved or (first or make_state(scene, np.dtype(how.dtype).type), 0)
     except ValueError as error:
         raise UsageError(f"scene {scene.name!r}: {error}") from error
-    snapshots.check_same(about, folder)
-    saved = snapshots.latest(folder / "snapshots", scene)
-    s, step = saved or (make_state(scene, np.dtype(how.dtype).type), 0)
     nbrs = solver.list_neighbors(model, s, how.skin * scene.spacing) if how.neighbors == "list" else None
     if saved is None:
         s = jax.jit(solver.begin)(model, s, nbrs)

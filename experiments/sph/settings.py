@@ -11,6 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
 
+from experiments import _mesh_files
 from experiments._errors import UsageError
 from experiments.sph import ranges
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 PHYSICS = get_type_hints(fluids.Physics)
 LEAST_SMOOTHING, MOST_SMOOTHING = 0.1, 50.0  # in particle spacings
 MOST_STEPS = 1e9
+_LARGEST_SOLID = 100  # times what the scene shows: files in millimeters are 1000 times as large as they say
 
 
 def make_scene(name: str, settings: list[str]) -> "FluidScene":
@@ -121,6 +123,41 @@ def with_particles(scene: "FluidScene", path: Path) -> "FluidScene":
     if len(positions) == 0 or not (masses > 0).all():
         raise UsageError(f"{path}: expected at least one particle, and masses above 0")
     return _replaced(scene, positions, velocities, masses)
+
+
+def with_solid(scene: "FluidScene", path: Path, scale: float) -> "FluidScene":
+    """Return the scene with the triangles of a file as its solid, which stands.
+
+    Args:
+        scene: A scene in 3D.
+        path: STL, OBJ, PLY; faces counterclockwise as seen from the fluid.
+        scale: Length of a unit of the file [m].
+
+    Raises:
+        UsageError: The file cannot be used, or its triangles lie beside what the scene shows.
+    """
+    if scene.dim != len("xyz"):
+        raise UsageError(f"--solid {path}: triangles are a wall in 3D; {scene.name} is in {scene.dim}D")
+    try:
+        vertices, faces = _mesh_files.read(path)
+    except UsageError as error:
+        raise UsageError(f"--solid {error}") from error
+    vertices = vertices * scale
+    if not (finite := np.isfinite(vertices).all(axis=1)).all():
+        raise UsageError(f"--solid {path}: vertices must be finite; one is {vertices[~finite][0].tolist()}")
+    corners = [scene.positions] if scene.bounds is None else [scene.positions, scene.bounds.lower, scene.bounds.upper]
+    (low, high), (least, most) = ((x.min(axis=0), x.max(axis=0)) for x in (np.vstack(corners), vertices))
+    size, span = np.max(most - least), np.max(high - low)
+    where = f"from {_place(least)} to {_place(most)} m, the scene from {_place(low)} to {_place(high)} m"
+    if np.any(least > high) or np.any(most < low):
+        raise UsageError(f"--solid {path}: reaches {where}; move it there, or name its unit: --solid-unit 0.001 for mm")
+    if size < scene.spacing or size > _LARGEST_SOLID * span:
+        raise UsageError(f"--solid {path}: is {size:.3g} m long, {where}; name its unit: --solid-unit 0.001 for mm")
+    return replace(scene, solid=fluids.Solid(vertices, faces))
+
+
+def _place(corner: np.ndarray) -> str:
+    return "(" + ", ".join(f"{x:.3g}" for x in corner) + ")"
 
 
 def _replaced(scene: "FluidScene", positions: np.ndarray, velocities: np.ndarray, masses: np.ndarray) -> "FluidScene":

@@ -81,7 +81,7 @@ def begin(scene: "FluidScene", x: Array, angle: Array | None = None) -> Beside |
         )
     inside = np.asarray(signed.mask & (signed.distance < GAP / 2 * scene.spacing))
     if scene.wall is not None:
-        inside &= ~scene.wall
+        inside = inside & ~scene.wall
     if inside.any():
         raise ValueError(
             f"positions of the fluid must be outside the solid by {GAP / 2} spacings: particle {inside.argmax()} is not."
