@@ -184,7 +184,8 @@ def _plan_of_triangles(sizes: tuple[int, int, int, int], dtype: np.dtype, cutoff
     points, corners = (jax.ShapeDtypeStruct((size, dim), dtype, sharding=at) for size in (n, faces // 2 + 2))
     named: Any = jax.ShapeDtypeStruct((faces, dim), np.int32, sharding=at)
     analysis = _analysis(find_triangles.lower(points, corners, named, None, cutoff, engine, capacity))
-    return MemoryPlan(int(analysis.output_size_in_bytes), int(analysis.temp_size_in_bytes), engine)
+    closed = 1  # byte: whether the wall is, which a program of its own finds out
+    return MemoryPlan(int(analysis.output_size_in_bytes) + closed, int(analysis.temp_size_in_bytes), engine)
 
 
 def _analysis(lowered: Any) -> Any:  # noqa: ANN401

@@ -22,7 +22,7 @@ _SHARE = 0.5  # of the memory maps that a process may have, from which on progra
 
 _Args = ParamSpec("_Args")
 _Result = TypeVar("_Result")
-_functions: list[Any] = []
+_functions: "list[Program[..., Any]]" = []
 _seen = 0  # how many programs there were when memory maps were last counted
 
 
@@ -31,7 +31,7 @@ class Program(Generic[_Args, _Result]):
 
     def __init__(self, function: Callable[_Args, _Result], **options: Any) -> None:  # noqa: ANN401
         self._jitted: Any = jax.jit(function, **options)
-        _functions.append(self._jitted)
+        _functions.append(self)
         functools.update_wrapper(self, function)
 
     def __call__(self, *args: _Args.args, **kwargs: _Args.kwargs) -> _Result:
@@ -39,6 +39,14 @@ class Program(Generic[_Args, _Result]):
         result = self._jitted(*args, **kwargs)
         _keep_bounded()
         return result
+
+    def cache_size(self) -> int:
+        """Return how many programs are kept of this function: one per combination of shapes and static arguments."""
+        return self._jitted._cache_size()
+
+    def clear_cache(self) -> None:
+        """Let go of the programs of this function."""
+        self._jitted.clear_cache()
 
     def lower(self, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
         """Do as `lower` of what `jax.jit` returns: shapes may stand for arrays."""
@@ -55,7 +63,7 @@ def compiled(function: Callable[_Args, _Result], **options: Any) -> Program[_Arg
 
 def program_count() -> int:
     """Return how many compiled programs the library keeps."""
-    return sum(function._cache_size() for function in _functions)
+    return sum(function.cache_size() for function in _functions)
 
 
 def clear_programs() -> None:

@@ -549,12 +549,12 @@ def test_programs_are_used_again():
         jitted(x + shift, m, given)
     assert len(traces) == 1
     first = jfrnn.pair_sum(fn, x, None, m, neighbors=nbrs[0])
-    size = _summation._compiled._cache_size()
+    size = _summation._compiled.cache_size()
     np.testing.assert_array_equal(jfrnn.pair_sum(fn, x, None, m, neighbors=nbrs[0]), first)
-    assert _summation._compiled._cache_size() == size
+    assert _summation._compiled.cache_size() == size
     factor = 2.0 + 1e-12
     assert (np.asarray(jfrnn.pair_sum(fn, x, None, m, neighbors=nbrs[0])) != np.asarray(first)).any()
-    assert _summation._compiled._cache_size() == size + 1
+    assert _summation._compiled.cache_size() == size + 1
 
 
 @pytest.mark.parametrize("backend", ["list", pytest.param("brute", marks=SLOW), pytest.param("jax", marks=SLOW)])

@@ -202,10 +202,10 @@ def test_one_program_serves_every_cutoff(backend):
 
     points = random_points(77, 2, np.float32)
     jfrnn.search(points, 0.1, capacity=76, backend=backend)
-    before = found_fields._cache_size()
+    before = found_fields.cache_size()
     for cutoff in (0.2, 0.5, 3.0):
         checked.assert_exact(jfrnn.search(points, cutoff, capacity=76, backend=backend), points, cutoff)
-    assert found_fields._cache_size() == before
+    assert found_fields.cache_size() == before
 
 
 @pytest.mark.parametrize("backend", [pytest.param("jax", marks=SLOW), "warp"])
