@@ -17,7 +17,7 @@ Three steps, each exact where it answers and each asked only what the one before
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -165,12 +165,12 @@ class Cutoffs:
         return [jnp.maximum(queries, sources) if self.rule == "either" else jnp.minimum(queries, sources)]
 
 
-def is_radius(radii: Array) -> Array:
-    """Say which cutoffs the pair test can decide: 0, which reaches what coincides, is one of them."""
+def is_radius(radii: Array | np.ndarray) -> Any:  # noqa: ANN401
+    """Say which cutoffs the pair test can decide: 0, which reaches what coincides, is one of them. NumPy's arrays give NumPy's."""
     dtype = np.dtype(radii.dtype)
     unsigned = np.uint32 if dtype == np.float32 else np.uint64  # compared as floats, denormal numbers were 0
     low, high = (np.array(x, dtype).view(unsigned)[()] for x in (smallest_cutoff(dtype), largest_cutoff(dtype)))
-    bits = lax.bitcast_convert_type(radii, unsigned)
+    bits = radii.view(unsigned) if isinstance(radii, np.ndarray) else lax.bitcast_convert_type(radii, unsigned)
     magnitude = bits << unsigned(1) >> unsigned(1)
     negative_zero = np.array(-0.0, dtype).view(unsigned)[()]
     return (bits <= negative_zero) & (magnitude - unsigned(1) >= low - unsigned(1)) & (magnitude <= high)  # 0 - 1 is the largest

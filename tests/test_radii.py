@@ -13,7 +13,7 @@ from jfrnn.cases.radii import RADII_CASES
 from test_box import image_pairs, masked_images
 
 import jfrnn
-from jfrnn._exact import RULES
+from jfrnn._exact import RULES, is_radius, smallest_cutoff
 
 SLOW = pytest.mark.slow
 LENGTH, CAPACITY = 128, 256
@@ -256,3 +256,23 @@ X, H = np.zeros((4, 3), np.float32), np.ones(4, np.float32)
 def test_errors(error, match, make):
     with pytest.raises(error, match=match):
         make()
+
+
+def test_known_cutoffs_are_read_while_positions_are_traced():
+    x = np.random.default_rng(0).random((30, 3)).astype(np.float32)
+    cutoffs = jnp.linspace(0.2, 0.4, 30)
+    found = jax.jit(lambda x: jfrnn.search(x, cutoffs, capacity=32, backend="brute"))(x)
+    expected = reference.reference_radii(x, np.asarray(cutoffs), "gather")
+    assert sorted(reference.pairs_of(np.asarray(found.idx), np.asarray(found.count), 30)) == sorted(pair[:2] for pair in expected)
+
+
+def test_valid_cutoffs_are_told_alike_on_the_host():
+    for dtype in (np.float32, np.float64):
+        info = np.finfo(dtype)
+        given = [0.0, -0.0, 1.0, -1.0, np.inf, np.nan, -np.nan, info.smallest_subnormal, info.tiny, info.max, info.max / 4]
+        given += [x * f for x in (smallest_cutoff(np.dtype(dtype)),) for f in (0.5, 1.0, 2.0)]
+        radii = np.array(given, dtype)
+        valid = is_radius(radii)
+        assert isinstance(valid, np.ndarray)
+        np.testing.assert_array_equal(valid, is_radius(jnp.asarray(radii)))
+        assert valid[:4].tolist() == [True, True, True, False]
