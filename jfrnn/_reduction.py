@@ -27,8 +27,8 @@ from jfrnn._terms import OF_QUERIES, OF_SOURCES, Groups, Labels, Summand, Term, 
 class Pairs(NamedTuple):
     """Which pairs, and what their displacements are made of.
 
-    `good` [rows] bool: the row has a sum. It has none where the data show that pairs may be missing, or where its position is not
-    finite, unless the particle is inactive.
+    `mark` gives sums what is no result in rows that have none: where the data show that pairs may be missing, or where the position
+    is not finite, unless the particle is inactive.
     """
 
     relation: Relation
@@ -38,7 +38,7 @@ class Pairs(NamedTuple):
     lattice: Lattice | None
     largest: Any  # cutoff
     directionless: bool
-    good: Array
+    mark: Callable[[list[Array]], list[Array]]
 
 
 def searched(inputs: Inputs, options: Options) -> Pairs:
@@ -48,9 +48,9 @@ def searched(inputs: Inputs, options: Options) -> Pairs:
     relation, several = Searched(fixed, options), isinstance(cutoff, Radii)
     largest = make_cutoffs(cutoff, options.closed).largest if isinstance(cutoff, Radii) else cutoff.radius
     lattice = _lattice(box, options.images, sources)
-    good = _good_rows_of_search(inputs, options, several or box is not None)
-    sources, rows = _telling(sources, queries, good)
-    return Pairs(relation, False, sources, rows, lattice, largest, relation.symmetric, good)
+    static = options, several or box is not None
+    sources, rows, mark = _telling(sources, queries, _good_rows_of_search, (inputs,), static)
+    return Pairs(relation, False, sources, rows, lattice, largest, relation.symmetric, mark)
 
 
 def listed(
@@ -81,9 +81,9 @@ def listed(
     relation = Listed(nbrs.idx, mask, shifts, nbrs.source_count, symmetric=directionless and not nbrs.half)
     lattice = _lattice(nbrs._box_now(box, sources), nbrs.box_kind, sources)
     largest = nbrs.cutoff if nbrs.radii is None else make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest
-    good = _good_rows_of_list(nbrs.status, nbrs.count if nbrs.masked and not own else None, fixed_rows)
-    sources, rows = _telling(sources, rows if own else None, good)
-    return Pairs(relation, nbrs.half, sources, rows, lattice, largest, directionless, good)
+    data = nbrs.status, nbrs.count if nbrs.masked and not own else None, fixed_rows
+    sources, rows, mark = _telling(sources, rows if own else None, _good_rows_of_list, data)
+    return Pairs(relation, nbrs.half, sources, rows, lattice, largest, directionless, mark)
 
 
 @compiled
@@ -111,12 +111,19 @@ def _good_rows_of_list(status: Array, count: Array | None, points: Array) -> Arr
     return _good_rows(points, active, whole)
 
 
-def _telling(sources: Array, queries: Array | None, good: Array) -> tuple[Array, Array]:
-    """Return the sources, and the rows, which derivatives reach as NaN where there is no sum."""
+def _telling(
+    sources: Array, queries: Array | None, good_rows: Callable[..., Array], data: tuple, static: tuple = ()
+) -> tuple[Array, Array, Callable[[list[Array]], list[Array]]]:
+    """Return the sources, the rows, which derivatives reach as NaN where there is no sum, and what marks sums likewise.
+
+    `good_rows(*data, *static)` says which rows have a sum. Concrete arrays are marked by the program that finds it out.
+    """
     points = sources if queries is None else queries
-    if isinstance(points, Tracer):  # else there are no derivatives
-        points = _told(points, good)
-    return (points, points) if queries is None else (sources, points)
+    if not isinstance(points, Tracer):  # there are no derivatives
+        return sources, points, functools.partial(_marked_by, data=data, good_rows=good_rows, static=static)
+    good = good_rows(*data, *static)
+    points = _told(points, good)
+    return points if queries is None else sources, points, functools.partial(_marked, good=good)
 
 
 @jax.custom_jvp
@@ -173,7 +180,7 @@ def reduced(
         leaves = _sums_of_half(pairs.relation, term, operands, compensated)
     else:
         leaves = bind_sum(pairs.relation, term, operands, compensated)
-    leaves = _marked(leaves, pairs.good)
+    leaves = pairs.mark(leaves)
     return jax.tree.unflatten(structure[0], leaves)
 
 
@@ -266,3 +273,8 @@ def _marked(leaves: list[Array], good: Array) -> list[Array]:
         return jnp.where(good.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.iinfo(x.dtype).min)
 
     return [marked(x) for x in leaves]
+
+
+@functools.partial(compiled, static_argnames=("good_rows", "static"))
+def _marked_by(leaves: list[Array], data: tuple, good_rows: Callable[..., Array], static: tuple) -> list[Array]:
+    return _marked(leaves, good_rows(*data, *static))
