@@ -82,12 +82,15 @@ def count_rows(inputs: Inputs, options: Options) -> tuple[Array, Array]:
 
 
 def without_inactive(positions: Array, active: Array | None) -> Array:
-    """Return positions with NaN where a particle is inactive: no engine gives such a one neighbors, or to others."""
-    return positions if active is None else jnp.where(active[:, None], positions, jnp.nan)
+    """Return positions that are infinite where a particle is inactive: no engine gives such a one neighbors, or to others.
+
+    The mark is not NaN, because JAX's mode `jax_debug_nans` takes every NaN that leaves a program for an error.
+    """
+    return positions if active is None else jnp.where(active[:, None], positions, jnp.inf)
 
 
 class _Prepared(NamedTuple):
-    """The operands of a search as engines take them: NaN where a particle takes no part."""
+    """The operands of a search as engines take them: not finite where a particle takes no part."""
 
     sources: Array
     queries: Array | None
@@ -120,7 +123,7 @@ def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
     given, given_queries, active = lax.stop_gradient(inputs[:3])
     sources, queries, cutoff, batch, torus, checks = prepared(inputs, options)
     rows = _rows_of_engine(sources, queries, cutoff, options, capacity, batch, torus)
-    if torus is not None and active is None and isinstance(cutoff, Cutoff):  # else positions are NaN for other reasons, too
+    if torus is not None and active is None and isinstance(cutoff, Cutoff):  # else positions are not finite for other reasons, too
         checks = checks | {Status.NONFINITE: (torus[1].met & NOT_FINITE) == 0}
     rows = _with_status(rows, given, given_queries, active, checks)
     images = options.images
@@ -151,7 +154,7 @@ def is_decidable(inputs: Inputs, options: Options) -> Array:
 def _with_valid_radii(
     sources: Array, queries: Array | None, active: Array | None, radii: Radii
 ) -> tuple[Array, Array | None, dict[Status, Array]]:
-    """Return positions and queries with NaN where the cutoff is none, and whether all those of particles that take part are."""
+    """Return positions and queries, infinite where the cutoff is none, and whether all those of particles that take part are."""
     of_sources, of_queries = (None if x is None else is_radius(x) for x in (radii.sources, radii.queries))
     right = [jnp.ones((), bool)]
     if queries is None:
@@ -167,7 +170,7 @@ def _with_valid_radii(
 
 
 def _where_rows(valid: Array, points: Array) -> Array:
-    return jnp.where(valid[:, None], points, jnp.nan)
+    return jnp.where(valid[:, None], points, jnp.inf)
 
 
 def _largest(cutoff: Cutoff | Cutoffs) -> np.floating | Array:
@@ -175,7 +178,7 @@ def _largest(cutoff: Cutoff | Cutoffs) -> np.floating | Array:
 
 
 def _with_status(rows: Rows, sources: Array, queries: Array | None, active: Array | None, checks: dict[Status, Array]) -> Rows:
-    """Set the bits of what the engine cannot know: it saw NaN where particles are inactive or out of range."""
+    """Set the bits of what the engine cannot know: positions are not finite where particles are inactive or out of range."""
     if active is None and not checks:
         return rows
     if Status.NONFINITE not in checks:
@@ -285,7 +288,7 @@ def _all_sources(
         start, stop = jnp.zeros((place.size, images), jnp.int32), jnp.int32(sources.shape[0])
         if batch is not None:
             start, stop = start + first[place][:, None], end[place][:, None]
-        codes = None if torus is None else jnp.zeros_like(start) + lax.iota(jnp.int32, images)
+        codes = None if torus is None else jnp.zeros_like(start) + lax.iota(jnp.int32, images)[None]
         return start, jnp.broadcast_to(stop, start.shape), codes
 
     of_sources, of_queries = (cutoff.sources, cutoff.queries) if isinstance(cutoff, Cutoffs) else (None, None)

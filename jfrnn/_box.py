@@ -19,6 +19,7 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn._exact import Shifted, combined
+from jfrnn._modes import leading_axes, own_transfers
 from jfrnn._reduced import Basis, reduced_basis
 
 _NEAREST = 0.49  # cutoff over width up to which the nearest image is the only one, with room for rounding
@@ -82,7 +83,8 @@ class Box:
             raise ValueError(f"origin must be a number or have shape [{dim}], got shape {list(corner.shape)}.")
         flags = _per_axis("periodic", periodic, dim, (bool, np.bool_), "bool")
         reach = None if images is None else _per_axis("images", images, dim, (int, np.integer), "int >= 0", least=0)
-        _check_values(vectors, corner, flags)
+        with own_transfers():
+            _check_values(vectors, corner, flags)
         self._set(vectors, corner if corner.shape else corner + np.zeros(dim, corner.dtype), flags, reach)
 
     def _set(self, vectors: Any, origin: Any, periodic: tuple[bool, ...], images: tuple[int, ...] | None) -> None:  # noqa: ANN401
@@ -151,7 +153,8 @@ def _check_values(vectors: Any, origin: Any, periodic: tuple[bool, ...]) -> None
 
 def fixed_box(box: Box, dtype: np.dtype) -> Box:
     """Round a box to a dtype; what is left of it are its arrays and its periodic axes."""
-    return Box.tree_unflatten((box.periodic, None), tuple(jnp.asarray(x).astype(dtype) for x in (box.vectors, box.origin)))
+    with own_transfers():
+        return Box.tree_unflatten((box.periodic, None), tuple(jnp.asarray(x).astype(dtype) for x in (box.vectors, box.origin)))
 
 
 # --- what is static about the images -------------------------------------------------------------------------------------
@@ -208,7 +211,8 @@ def images_of(box: Box, radius: float | None, dtype: np.dtype, sources: int) -> 
         ValueError: the cutoff spans more images than can be told apart.
     """
     if box.images is None and radius is not None and not isinstance(box.vectors, Tracer):
-        vectors = np.asarray(box.vectors, dtype).astype(np.float64)
+        with own_transfers():
+            vectors = np.asarray(box.vectors, dtype).astype(np.float64)
         images = _needed_images(vectors, box, radius, None)
         if not box.orthogonal and _too_many(images, sources, _MANY_IMAGES):
             basis, short = reduced_basis(vectors, box.periodic)
@@ -434,34 +438,36 @@ def packed_turns(points: Array, lattice: Lattice) -> Array:
 
 
 def _met(packed: Array, dim: int) -> Array:
-    """Return the bits of all numbers of turns and of what is none, [] int32: in one pass."""
-    turns = unpacked_turns(packed, dim)
-    bits = functools.reduce(jnp.bitwise_or, (jnp.abs(turns[:, k]) for k in range(dim)))
-    bits = jnp.where(packed >= 0, bits, jnp.where(packed == -1, NOT_FINITE, TOO_FAR))
-    return lax.reduce(bits, np.int32(0), lax.bitwise_or, (0,))
+    """Return the largest number of turns, and the bits of what is none, [] int32.
+
+    Reductions that any number of devices can do together: XLA has no bitwise one of integers for that.
+    """
+    most = jnp.max(jnp.abs(unpacked_turns(packed, dim)), initial=0)
+    nowhere, far = jnp.any(packed == -1), jnp.any(packed == -2)
+    return most | jnp.where(nowhere, NOT_FINITE, 0).astype(jnp.int32) | jnp.where(far, TOO_FAR, 0).astype(jnp.int32)
 
 
 def unpacked_turns(packed: Array, dim: int) -> Array:
     """Read what `packed_turns` wrote: [..., d] int32, 0 where it is negative."""
-    parts = packed[..., None] >> np.arange(dim, dtype=np.int32) * _TURN_BITS
+    places = np.arange(dim, dtype=np.int32) * _TURN_BITS
+    parts = packed[..., None] >> places.reshape((1,) * packed.ndim + (dim,))
     return jnp.where(packed[..., None] < 0, 0, (parts & ((1 << _TURN_BITS) - 1)) - (LARGEST_TURN + 1))
 
 
 def fractions_of(points: Array, lattice: Lattice) -> Array:
     """Return points [n, d] in units of the transform."""
-    from_origin = points - lattice.origin
+    from_origin = points - lattice.origin[None]
     if lattice.images.orthogonal:
-        return from_origin * _diagonal(lattice.transform)
+        return from_origin * _diagonal(lattice.transform)[None]
     return _product(from_origin, lattice.transform) if len(points) else from_origin
 
 
 def translation(shifts: Array, lattice: Lattice) -> Array:
     """Return shifts @ matrix, [..., d], for whole floats; differentiable in the lattice."""
     if lattice.images.orthogonal:
-        return shifts * _diagonal(lattice.matrix)
-    return sum(
-        (shifts[..., k, None] * lattice.matrix[k] for k, p in enumerate(lattice.images.periodic) if p), jnp.zeros_like(shifts)
-    )
+        return shifts * leading_axes(_diagonal(lattice.matrix), shifts.ndim)
+    rows = [leading_axes(lattice.matrix[k], shifts.ndim) for k in range(lattice.dim)]
+    return sum((shifts[..., k, None] * rows[k] for k, p in enumerate(lattice.images.periodic) if p), jnp.zeros_like(shifts))
 
 
 def wrap(sources: Array, queries: Array | None, lattice: Lattice, radius: np.floating | Array) -> Wrapped:
@@ -557,8 +563,8 @@ def motion_of(before: Array, now: Array, lattice: Lattice) -> Motion:
     left = jnp.abs(difference - translation(turns, lattice)) + jnp.where(was_turned[:, None], rounding, 0)
     residual = jnp.abs(_product(lattice.matrix, lattice.transform) - jnp.diag(jnp.asarray(periodic, now.dtype)))
     most = jnp.max(taken, axis=1, keepdims=True, initial=0) + 1
-    unsure = 8 * eps * _units_of(size, dataclasses.replace(lattice, transform=transform)) + 2 * most * residual.sum(axis=0)
-    sure = jnp.where(periodic, jnp.abs(units - turns) + unsure < 0.5, True).all(axis=1)
+    unsure = 8 * eps * _units_of(size, dataclasses.replace(lattice, transform=transform)) + 2 * most * residual.sum(axis=0)[None]
+    sure = jnp.where(periodic[None], jnp.abs(units - turns) + unsure < 0.5, True).all(axis=1)
     packed = packed_turns(now, lattice)
     home = unpacked_turns(packed, lattice.dim) - jnp.clip(turns, -(2.0**20), 2.0**20).astype(jnp.int32)
     return Motion(list(left.T), sure & ((packed >= 0) | ~was_turned), home)
@@ -575,7 +581,8 @@ def given_shifts(shifts: Array, images: Images) -> Array:
     counts = shifts.astype(jnp.int32)
     if images.basis is None:
         return counts
-    return functools.reduce(jnp.add, (counts[..., k, None] * np.array(row, np.int32) for k, row in enumerate(images.basis)))
+    rows = [np.array(row, np.int32).reshape((1,) * (counts.ndim - 1) + (-1,)) for row in images.basis]
+    return functools.reduce(jnp.add, (counts[..., k, None] * row for k, row in enumerate(rows)))
 
 
 def forward_shifts(shifts: Array, images: Images) -> Array:
@@ -612,5 +619,6 @@ def nearest_shifts(difference: Array, lattice: Lattice) -> Array:
 def _units_of(difference: Array, lattice: Lattice) -> Array:
     """Return differences [..., d] in units of the transform."""
     if lattice.images.orthogonal:
-        return difference * _diagonal(lattice.transform)
-    return functools.reduce(jnp.add, (difference[..., m, None] * lattice.transform[m] for m in range(lattice.dim)))
+        return difference * leading_axes(_diagonal(lattice.transform), difference.ndim)
+    rows = [leading_axes(lattice.transform[m], difference.ndim) for m in range(lattice.dim)]
+    return functools.reduce(jnp.add, (difference[..., m, None] * row for m, row in enumerate(rows)))

@@ -243,7 +243,7 @@ def _stencil_rows(coords: Array, extent: Array, dim: int, images: Images | None)
     first, last, shift = (each([part[what] for part in parts]) for what in range(3))
     shifts, cells = [shift], [first, last]
     for axis in range(1, len(coords)):
-        cell = coords[axis][:, None] + np.tile(rows[:, axis - 1], len(parts))
+        cell = coords[axis][:, None] + np.tile(rows[:, axis - 1], len(parts))[None]
         turn = jnp.zeros_like(cell) if reach[axis] == 0 else cell // extent[axis]
         cells.append(cell - turn * extent[axis])
         shifts.append(turn)

@@ -9,6 +9,7 @@ from jax import Array
 from jax.core import Tracer
 
 from jfrnn._box import Box
+from jfrnn._modes import own_transfers
 from jfrnn._neighbors import NeighborList
 
 State = TypeVar("State")
@@ -73,7 +74,9 @@ def run_chunk(
     given = {"box": nbrs.box, "cutoff": _given_cutoffs(nbrs)} | given
     while True:
         after, seen = chunk(state, nbrs)
-        if not bool(np.any(seen.overflow)):
+        with own_transfers():
+            overflow = bool(np.any(np.asarray(seen.overflow)))
+        if not overflow:
             seen.check()
             return after, seen
         nbrs = seen.grow(positions(state), slack=slack, **given)

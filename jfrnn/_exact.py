@@ -25,6 +25,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._flags import set_places
+from jfrnn._modes import leading_axes
 from jfrnn._reduced import Basis
 
 
@@ -75,7 +76,7 @@ def combined(basis: Basis, matrix: Array) -> Array:
     for numbers, size in ((whole - (high << _WHOLE_BITS), 1), (high, 2**_WHOLE_BITS)):
         if numbers.any():
             times = numbers.astype(matrix.dtype)
-            terms += [times[:, k, None] * (part[k] * size) for k in range(len(whole)) for part in (matrix - half, half)]
+            terms += [times[:, k, None] * (part[k] * size)[None] for k in range(len(whole)) for part in (matrix - half, half)]
     for _ in range(3):
         terms = _distill(terms)
     return functools.reduce(jnp.add, terms)
@@ -495,7 +496,7 @@ def _integer_sign(pair: Pair, threshold: _Threshold) -> Array:
     if pair.shift is not None or times > 1:
         for axis in range(dim):
             for shift, component in pair.lattice_terms(axis):
-                differences = differences.at[axis].add(times * shift.astype(jnp.int32)[:, None] * _limbs(component))
+                differences = differences.at[axis].add(times * shift.astype(jnp.int32)[:, None] * _limbs(component)[None])
         more = ((0, 0), (0, 0), (0, 3))
         differences, radius = _carried(jnp.pad(differences, more)), _carried(jnp.pad(radius, more[1:]))
     count = differences.shape[-1]
@@ -546,7 +547,7 @@ def _limbs(x: Array) -> Array:
     place = jnp.maximum(exponent, 1) - 1
     width = finfo.nmant + 1
     count = -(-(finfo.maxexp - finfo.minexp + width) // LIMB_BITS)
-    shift = jnp.arange(count, dtype=jnp.int32) * LIMB_BITS - place[..., None]
+    shift = leading_axes(jnp.arange(count, dtype=jnp.int32) * LIMB_BITS, place.ndim + 1) - place[..., None]
     limbs = shift_right(high[..., None], low[..., None], shift) & np.uint32(_LIMB_MASK)
     return jnp.where(sign[..., None], -1, 1) * limbs.astype(jnp.int32)
 

@@ -26,7 +26,7 @@ def set_places(flags: Array, most: int) -> Array:
     if not n:
         return jnp.zeros(most, jnp.int32)
     bits = jnp.pad(flags, (0, words * _BITS - n)).reshape(words, _BITS).astype(jnp.uint32)
-    packed = jnp.sum(bits << lax.iota(jnp.uint32, _BITS), axis=1, dtype=jnp.uint32)
+    packed = jnp.sum(bits << lax.iota(jnp.uint32, _BITS)[None], axis=1, dtype=jnp.uint32)
     until = jnp.cumsum(lax.population_count(packed).astype(jnp.int32), dtype=jnp.int32)
     number = lax.iota(jnp.int32, most)
     found = jnp.searchsorted(until, number, side="right", method="scan_unrolled").astype(jnp.int32)

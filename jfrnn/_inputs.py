@@ -13,7 +13,8 @@ from jax.core import Tracer
 from jfrnn._batch import Batch
 from jfrnn._box import Box
 from jfrnn._exact import RULES, Cutoff, Radii, largest_cutoff, make_cutoff, smallest_cutoff
-from jfrnn._programs import on_device
+from jfrnn._modes import gathered
+from jfrnn._programs import made_on_host, on_device
 
 BACKENDS = ("auto", "jax", "warp", "hashgrid", "brute")
 _MOST_POINTS = 2**31 - 32
@@ -143,8 +144,8 @@ def _checked_radii_of(name: str, radii: Any, size: int, what: str, like: Array) 
 def _as_dtype(x: Any, dtype: Any) -> Array:  # noqa: ANN401
     """Convert an array; one that is known on the host, where no program is compiled for its shape."""
     if isinstance(x, Tracer):
-        return x.astype(dtype)
-    return on_device(x if x.dtype == dtype else np.asarray(jax.device_get(x)).astype(dtype))
+        return gathered(x).astype(dtype)
+    return on_device(x) if x.dtype == dtype else made_on_host(x, lambda known: known.astype(dtype))
 
 
 def largest_known(radii: Radii) -> float | None:
@@ -202,10 +203,10 @@ def _checked_systems(name: str, systems: Any, size: int, what: str) -> Array:  #
         return _as_dtype(systems, jnp.int32)
     if isinstance(systems, Tracer):
         raise TypeError(f"{name} is {systems.dtype}, of which not all numbers fit into int32: convert it with .astype(jnp.int32).")
-    values = np.asarray(systems)
+    values: Any = np.asarray(jax.device_get(systems))
     if values.size and not -(2**31) <= int(values.min()) <= int(values.max()) < 2**31:
         raise ValueError(f"{name} holds numbers from {values.min()} to {values.max()}, but systems are numbered in int32.")
-    return on_device(values.astype(np.int32))
+    return made_on_host(systems, lambda known: known.astype(np.int32))
 
 
 def checked_box(box: Any, positions: Array, like: Box | None = None) -> Box | None:  # noqa: ANN401

@@ -143,8 +143,8 @@ def _morton(axes: list[Array]) -> Array:
 
 def _finest_level(reach: Array, widths: Array, axes: Axes) -> Array:
     """Return the finest level whose cells are wider than a reach [b], along every axis: [b] int32; 0 are the top cells."""
-    along = reach[:, None] * axes.scale + axes.margin
-    fits = [(widths * 2.0**-level > along).all(axis=1).astype(jnp.int32) for level in range(1, HALVINGS + 1)]
+    along = reach[:, None] * axes.scale[None] + axes.margin[None]
+    fits = [((widths * 2.0**-level)[None] > along).all(axis=1).astype(jnp.int32) for level in range(1, HALVINGS + 1)]
     return functools.reduce(jnp.add, fits)
 
 
@@ -164,10 +164,10 @@ def _cells_around(top: Array, place: Array, level: Array, extent: Array, images:
     which = np.array(list(product(*(range(len(axis)) for axis in steps)))).T  # [d, r]
     cells, within, code, there = [], [], jnp.zeros((level.size, which.shape[1]), jnp.int32), jnp.ones((), bool)
     for k, step in enumerate(steps):
-        fine = (place[k] >> (HALVINGS - level))[:, None] + step
+        fine = (place[k] >> (HALVINGS - level))[:, None] + step[None]
         cell = top[k][:, None] + (fine >> level[:, None])
         turn = jnp.zeros_like(cell) if reach[k] == 0 else cell // extent[k]
-        far = (np.abs(step) > 1) & (level[:, None] > 0)
+        far = (np.abs(step) > 1)[None] & (level[:, None] > 0)
         cells.append((cell - turn * extent[k])[:, which[k]])
         within.append((fine & ((1 << level[:, None]) - 1)).astype(jnp.uint32)[:, which[k]])
         code = code * (2 * reach[k] + 1) + (turn + reach[k])[:, which[k]]

@@ -2,10 +2,13 @@
 
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jax import Array
 from jax.core import Tracer
+
+from jfrnn._modes import own_transfers
+from jfrnn._programs import on_device
 
 
 def merge_vertices(vertices: Array, faces: Array) -> tuple[Array, Array]:
@@ -48,11 +51,12 @@ def merge_vertices(vertices: Array, faces: Array) -> tuple[Array, Array]:
     rank[np.argsort(first)] = np.arange(len(first))
     of_vertex = np.empty(len(points), np.int32)
     of_vertex[order] = rank[group]
-    return jnp.asarray(points[np.sort(first)]), jnp.asarray(of_vertex[named])
+    with own_transfers():
+        return on_device(points[np.sort(first)]), on_device(of_vertex[named])
 
 
 def _checked(vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: ANN401
-    points, named = np.asarray(vertices), np.asarray(faces)
+    points, named = np.asarray(jax.device_get(vertices)), np.asarray(jax.device_get(faces))
     if points.dtype not in (np.float32, np.float64):
         raise TypeError(f"vertices must be float32 or float64, got {points.dtype}.")
     if points.ndim != 2 or points.shape[1] not in (2, 3):

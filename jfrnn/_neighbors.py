@@ -31,6 +31,7 @@ from jfrnn._box import (
 from jfrnn._exact import Cutoff, Cutoffs, Radii, is_pair_of, make_cutoff, make_cutoffs
 from jfrnn._exports import DenseNeighbors, checked_total, flat_pairs, pair_total
 from jfrnn._inputs import check_devices, checked_active, checked_again, checked_box, checked_radii, checked_slack, largest_known
+from jfrnn._modes import own_transfers
 from jfrnn._programs import at_once, compiled
 from jfrnn._runs import Filter
 from jfrnn._status import NeighborOverflowError, Status, known_status, pairs_and_status, shape_of
@@ -125,7 +126,8 @@ class NeighborList:
     @property
     def overflow(self) -> Array:
         """Say whether pairs may be missing for want of room, which `grow` makes: slots of a row, or images in a box; [] bool."""
-        return (self.status & (Status.ROW_OVERFLOW | Status.BOX_TOO_SMALL).value) != 0
+        with own_transfers():
+            return (self.status & (Status.ROW_OVERFLOW | Status.BOX_TOO_SMALL).value) != 0
 
     def update(
         self,
@@ -165,7 +167,9 @@ class NeighborList:
         sources, rows = self._geometry_inputs(positions, queries)
         rows = rows if self.own_queries else None
         radii = self._radii_now(cutoff, sources, rows)
-        return _update(self, sources, rows, self._checked_active(active, sources), self._box_now(box, sources), radii)
+        active, box = self._checked_active(active, sources), self._box_now(box, sources)
+        with own_transfers():
+            return _update(self, sources, rows, active, box, radii)
 
     def grow(
         self,
@@ -203,10 +207,11 @@ class NeighborList:
         box, radii = self._box_now(box, sources), self._radii_now(cutoff, sources, queries)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, radii, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
-        met = rounded_capacity(math.ceil(slack * int(np.max(np.asarray(self.required)))))
         wider = dataclasses.replace(self, box_kind=self._grown_images(box, radii, np.dtype(sources.dtype)))
         inputs, options = _inputs_of(wider, sources, queries, active, box, radii)
-        made = _remade(wider, inputs, options, max(self.capacity, met, counted_capacity(inputs, options, slack)))
+        with own_transfers():
+            met = rounded_capacity(math.ceil(slack * int(np.max(np.asarray(self.required)))))
+            made = _remade(wider, inputs, options, max(self.capacity, met, counted_capacity(inputs, options, slack)))
         made.check()
         return made
 
@@ -248,8 +253,10 @@ class NeighborList:
         Cost: a sum over the rows. Jit: yes. vmap: yes.
         """
         self._check_single()
-        missing = pair_total(self.count, self.capacity) > checked_total(total)
-        return dataclasses.replace(self, status=self.status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0))
+        with own_transfers():
+            missing = pair_total(self.count, self.capacity) > checked_total(total)
+            status = self.status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
+        return dataclasses.replace(self, status=status)
 
     def _check_known(self, spared: Status = Status.OK) -> None:
         """Raise what status bits report, but for the spared ones, where they are known: not on a list that is being traced."""
@@ -309,9 +316,10 @@ class NeighborList:
         sources, rows = self._geometry_inputs(positions, queries)
         self._check_known(spared=ROWS_ARE_WHOLE)
         box = self._box_now(box, sources)
-        if box is None or self.box_kind is None or 0 in (sources.shape[0], *self.idx.shape):
-            return jnp.zeros((*self.idx.shape, sources.shape[1]), jnp.int32)
-        return _shifts(self.idx, self.count, self._images_made(), sources, rows, box, self.box_kind, self.half)
+        with own_transfers():
+            if box is None or self.box_kind is None or 0 in (sources.shape[0], *self.idx.shape):
+                return jnp.zeros((*self.idx.shape, sources.shape[1]), jnp.int32)
+            return _shifts(self.idx, self.count, self._images_made(), sources, rows, box, self.box_kind, self.half)
 
     def distances(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> tuple[Array, Array]:
         """Compute the distance to every neighbor.
@@ -457,7 +465,8 @@ class NeighborList:
             )
         self._check_known()
         self._check_single()
-        idx, count = np.asarray(self.idx), np.asarray(self.count)
+        with own_transfers():
+            idx, count = np.asarray(self.idx), np.asarray(self.count)
         return count, idx[np.arange(self.capacity) < count[:, None]]
 
     def _check_single(self) -> None:
@@ -493,7 +502,7 @@ class NeighborList:
             return self.box_kind
         largest = self.cutoff or 0.0 if radii is None else largest_known(radii)
         reach = None if largest is None else list_radius(largest, self.skin, dtype)
-        short = bool(np.any(np.asarray(self.status) & Status.BOX_TOO_SMALL.value))
+        short = bool(np.any(np.asarray(jax.device_get(self.status)) & Status.BOX_TOO_SMALL.value))
         return grown_images(self.box_kind, (box, self.box), reach, dtype, self.source_count, short)
 
     def _geometry(self, positions: Array, queries: Array | None, box: Box | None) -> tuple[Array, Array, Array | None]:
@@ -501,12 +510,14 @@ class NeighborList:
         self._check_known(spared=ROWS_ARE_WHOLE)
         box = self._box_now(box, sources)
         if 0 in (sources.shape[0], *self.idx.shape):
-            return jnp.zeros((*self.idx.shape, sources.shape[1]), sources.dtype), jnp.zeros(self.idx.shape, bool), None
+            with own_transfers():
+                return jnp.zeros((*self.idx.shape, sources.shape[1]), sources.dtype), jnp.zeros(self.idx.shape, bool), None
         cutoff = self.radii if self.cutoff is None else make_cutoff(self.cutoff, np.dtype(sources.dtype), self.closed)
-        if box is None or self.box_kind is None:
-            return *_vectors(self.idx, self.count, sources, rows, cutoff, self.closed), None
-        given = (self.box_kind, cutoff, self.closed, self.half)
-        return _periodic_vectors(self.idx, self.count, self._images_made(), sources, rows, box, *given)
+        with own_transfers():
+            if box is None or self.box_kind is None:
+                return *_vectors(self.idx, self.count, sources, rows, cutoff, self.closed), None
+            given = (self.box_kind, cutoff, self.closed, self.half)
+            return _periodic_vectors(self.idx, self.count, self._images_made(), sources, rows, box, *given)
 
     def _images_made(self) -> "_ImagesMade":
         made = None if self.images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
@@ -532,7 +543,7 @@ def rounded_capacity(slots: int) -> int:
 
 def counted_capacity(inputs: Inputs, options: Options, slack: float) -> int:
     """Count the neighbors of concrete positions and return a capacity that holds `slack` times the longest row."""
-    with at_once():
+    with at_once(), own_transfers():
         longest = int(count_rows(inputs, options)[1])
     wanted = math.ceil(max(longest, 1) * slack)
     return min(rounded_capacity(wanted), max(wanted, inputs.sources.shape[0]))

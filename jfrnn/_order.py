@@ -15,6 +15,7 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn._inputs import checked_positions
+from jfrnn._modes import own_transfers
 from jfrnn._programs import at_once, compiled, on_device
 
 Words = tuple[Array, Array]  # the high and the low half of a key, uint32
@@ -143,7 +144,8 @@ def sort_order(positions: Array, cell_size: float, *, curve: str = "hilbert") ->
     size = _checked_cell_size(cell_size, np.dtype(positions.dtype))
     if not isinstance(curve, str) or curve not in _CURVES:
         raise ValueError(f"curve must be one of {', '.join(map(repr, _CURVES))}, got {curve!r}.")
-    return _sort_order(positions, on_device(size), _CURVES[curve])
+    with own_transfers():
+        return _sort_order(positions, on_device(size), _CURVES[curve])
 
 
 def hilbert_order(positions: Array, size: Array) -> Array:
@@ -262,7 +264,7 @@ def _turn_levels(axes: list[Array], bits: int, *, upwards: bool) -> list[Array]:
     """
 
     def turn(step: Array, axes: list[Array]) -> list[Array]:
-        level = (step if upwards else bits - step).astype(jnp.uint32)
+        level = jnp.asarray(step if upwards else bits - step).astype(jnp.uint32)  # a number without jit
         below = (jnp.uint32(1) << level) - 1
         for axis in range(len(axes))[:: -1 if upwards else 1]:
             upper = (axes[axis] >> level & 1) == 1
@@ -367,7 +369,8 @@ def _checked_keys(keys: Any, dim: Any, bits: Any, default: bool = False) -> tupl
             f"keys of dim={dim} and bits={bits} are {wanted} of shape {'[..., 2] (high, low)' if words else '[...]'} with JAX's "
             f"64-bit mode {'on' if _wide() else 'off'}, got {dtype} of shape {shape}: encode with the same bits and mode."
         )
-    highest, limit = (keys[..., 0], 2 ** (dim * bits - 32)) if words else (keys, 2 ** (dim * bits))
+    with own_transfers():
+        highest, limit = (keys[..., 0], 2 ** (dim * bits - 32)) if words else (keys, 2 ** (dim * bits))
     _check_range("keys", highest, limit, "decode with the bits that the keys were made with")
     return jnp.asarray(keys), dim, bits
 
@@ -387,7 +390,7 @@ def _check_range(name: str, values: Any, limit: int, advice: str) -> None:  # no
     """Refuse concrete integers outside [0, limit), before a conversion could drop their high bits."""
     if isinstance(values, Tracer) or not values.size:
         return
-    with at_once():  # concrete inside jit too
+    with at_once(), own_transfers():  # concrete inside jit too
         low, high = (int(x) for x in _range(values))
     if not 0 <= low <= high < limit:
         raise ValueError(f"{name} must be in [0, {limit}), got values from {low} to {high}: {advice}.")

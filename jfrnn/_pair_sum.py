@@ -10,6 +10,7 @@ from jfrnn._auto import platform_of
 from jfrnn._backends import Options
 from jfrnn._box import Box
 from jfrnn._inputs import checked_backend, checked_flag
+from jfrnn._modes import own_transfers
 from jfrnn._neighbors import NeighborList
 from jfrnn._programs import on_device
 from jfrnn._search import Problem, checked_problem
@@ -129,11 +130,13 @@ def pair_sum(
         problem = checked_problem(
             positions, cutoff, queries, box, batch, radius_rule, False, include_self, closed, backend, 0.0, active
         )
-        pairs = _reduction.searched(problem.inputs, _with_engine(problem, backend))
+        with own_transfers():
+            pairs = _reduction.searched(problem.inputs, _with_engine(problem, backend))
     else:
         given = {"batch": batch is not None, "radius_rule": radius_rule != "gather", "include_self": include_self}
         given |= {"closed": closed, "active": active is not None, "backend": backend != "auto"}
-        pairs = _reduction.listed(neighbors, positions, cutoff, queries, box, given, reduce != "sum" or compensated)
+        with own_transfers():
+            pairs = _reduction.listed(neighbors, positions, cutoff, queries, box, given, reduce != "sum" or compensated)
     if symmetry is not None and not pairs.directionless:
         raise ValueError(
             f"symmetry={symmetry!r} is about pairs without direction: not with queries, nor with a cutoff of one side."
@@ -142,7 +145,8 @@ def pair_sum(
         raise ValueError("query_values belong to queries: without them fn gets values of i and of j.")
     theirs = _checked_values("values", values, pairs.sources.shape[0], "particle")
     mine = theirs if queries is None else _checked_values("query_values", query_values, pairs.rows.shape[0], "query")
-    return _reduction.reduced(fn, pairs, mine, theirs, reduce, symmetry, compensated)
+    with own_transfers():
+        return _reduction.reduced(fn, pairs, mine, theirs, reduce, symmetry, compensated)
 
 
 def _with_engine(problem: Problem, backend: str) -> Options:

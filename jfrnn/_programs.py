@@ -4,6 +4,7 @@ JAX keeps what it compiled for a shape as long as the function lives. A structur
 shape, and one program of XLA's CPU compiler takes up to 600 memory maps, of which Linux grants a process 65 530 by default.
 """
 
+import contextlib
 import functools
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -15,6 +16,9 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
+
+from jfrnn._modes import gathered, guards_transfers, own_transfers
 
 MOST = 512  # programs of all functions together: 1 to 4 MB each
 _LOOK_EVERY = 16  # new programs after which memory maps are counted: a millisecond or twenty, against a second of compilation
@@ -82,11 +86,23 @@ def at_once() -> AbstractContextManager[None]:
 
 
 def on_device(x: Any) -> Array:  # noqa: ANN401
-    """Return `jnp.asarray(x)`, concrete where x is, and without the program that this compiles for each shape of NumPy's arrays."""
-    if isinstance(x, Array):
-        return jnp.asarray(x)
+    """Return `jnp.asarray(x)` in one piece, concrete where x is.
+
+    Of NumPy's arrays it does so without the program that this compiles for each shape, but where a guard is to see the transfer.
+    """
+    if isinstance(x, Tracer):
+        return gathered(jnp.asarray(x))
     with at_once():
-        return jax.device_put(np.array(x))  # a copy: where JAX shares memory with an array, it must not be the caller's
+        if isinstance(x, Array):
+            return gathered(jnp.asarray(x))
+        copied = np.array(x)  # where JAX shares memory with an array, it must not be the caller's
+        return jnp.asarray(copied) if guards_transfers() else jax.device_put(copied)
+
+
+def made_on_host(x: Any, how: Callable[[np.ndarray], np.ndarray]) -> Array:  # noqa: ANN401
+    """Return on the device what a function of NumPy makes of an array that is known: no program is compiled for its shape."""
+    with own_transfers() if isinstance(x, Array) else contextlib.nullcontext():
+        return on_device(how(np.asarray(jax.device_get(x))))
 
 
 def _keep_bounded() -> None:

@@ -25,7 +25,7 @@ class Searched:
     """The pairs that a search finds, anew in every sum; nothing of them is stored.
 
     Attributes:
-        inputs: NaN where a particle is inactive; no mask.
+        inputs: Infinite where a particle is inactive; no mask.
         options: Static.
     """
 
@@ -123,7 +123,7 @@ class Listed:
                     zero = jnp.zeros_like(first)
                     shift = self.shifts
                     shift = None if shift is None else lax.dynamic_slice(shift, (first, start, zero), (size, group, shift.shape[2]))
-                    real = mask & new & fresh[:, None]
+                    real = mask & new[None] & fresh[:, None]
                     return add(Slots(jnp.where(real, idx, 0), shift, real), state)
 
                 return lax.fori_loop(0, -(-capacity // group), add_group, state)

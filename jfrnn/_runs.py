@@ -135,7 +135,7 @@ def list_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filte
                 def add_group(state: tuple[Array, Array]) -> tuple[Array, Array]:
                     g, rows = state
                     start = jnp.minimum(g * group, capacity - group)
-                    ordinal = start + slots - count[:, None]
+                    ordinal = (start + slots)[None] - count[:, None]
                     word, bit = _nth_bits(hits, ordinal)
                     neighbor = engine.sources.ids.at[_take(first, word) + bit].get(mode="promise_in_bounds")
                     if image is not None and images > 1:
@@ -342,7 +342,7 @@ class _Engine(NamedTuple):
     def _test(self, first: Array, stop: Array, image: Array | None, query: list[Array], place: Array) -> Array:
         """Compare 16 candidates per word with the cutoff in working precision: hits low, doubtful ones high."""
         lane = lax.iota(jnp.int32, LANES)
-        candidate = first[..., None] + lane
+        candidate = first[..., None] + lane[None, None]
         allowed = (candidate < stop[..., None]) & self._wanted(first, candidate, image, place)
         difference = [_windows(x, first) - q[..., None] for x, q in zip(self.sources.axes, query, strict=True)]
         square = squared_distance(difference, self.cutoff)
@@ -395,7 +395,7 @@ class _Engine(NamedTuple):
                     rows, word, candidate = flat_take(rows, at), flat_take(word, at), flat_take(candidate, at)
                 return self._pair(place[rows], candidate, None if image is None else image[rows, word])
 
-            pair = refine(slots + done < total[:, None], points, self.cutoff)
+            pair = refine((slots + done)[None] < total[:, None], points, self.cutoff)
             verdict = jnp.sum(jnp.where(pair, np.uint32(1) << slots.astype(jnp.uint32), np.uint32(0)), 1, dtype=jnp.uint32)
             return done + _DOUBTFUL, hits | _deposit(verdict[:, None], doubtful, before - done)
 

@@ -24,6 +24,7 @@ from jfrnn._inputs import (
     checked_slack,
     largest_known,
 )
+from jfrnn._modes import own_transfers
 from jfrnn._neighbors import NeighborList, counted_capacity, found_fields, made_options
 from jfrnn._runs import Filter
 from jfrnn._verlet import list_radius
@@ -104,8 +105,10 @@ def search(
     (float64: 125 B). See `memory_plan`. With a box or a batch "warp" takes a copy of the positions besides, at most 20 B per
     particle (float64: 40 B); with a cutoff per particle 140 B in all (float64: 180 B).
     Differentiable: the list is topology, without gradient; see `NeighborList.vectors`. Jit: yes, with capacity. vmap: yes, with
-    capacity. `jax.export`: yes, with `disabled_checks=[jax.export.DisabledSafetyCheck.custom_call("jfrnn")]`; a process that runs
-    such a program imports jfrnn of the same version first. Shapes are numbers, not symbols.
+    capacity. Arrays that are spread over the devices of a mesh are gathered on each, and each does the whole work: to spread that
+    as well, see `jfrnn.distributed`. `jax.export`: yes, with
+    `disabled_checks=[jax.export.DisabledSafetyCheck.custom_call("jfrnn")]`; a process that runs such a program imports jfrnn of
+    the same version first. Shapes are numbers, not symbols.
     Source: cell lists (Hockney & Eastwood 1981, ch. 8); strict cutoff (Peifle 2019, §2.2).
 
     Compilation: once for each number of particles, of queries and of slots, and once more for the count where `capacity` is
@@ -130,8 +133,11 @@ def search(
     inputs, options = problem.inputs, problem.options
     if capacity is None:
         capacity = _counted_capacity(inputs, options, slack)
+    capacity = checked_capacity(capacity)
+    with own_transfers():
+        fields = found_fields(inputs, options, capacity, problem.skin > 0)
     return NeighborList(
-        **found_fields(inputs, options, checked_capacity(capacity), problem.skin > 0),
+        **fields,
         cutoff=problem.radius,
         skin=problem.skin,
         half=options.filter.later_only,
@@ -185,7 +191,8 @@ def count(
     Memory: as in `search`, without the list. Differentiable: no (integers). Jit: yes. vmap: yes.
     """
     problem = checked_problem(positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, 0.0, active)
-    return count_rows(problem.inputs, problem.options)[0]
+    with own_transfers():
+        return count_rows(problem.inputs, problem.options)[0]
 
 
 class Problem(NamedTuple):

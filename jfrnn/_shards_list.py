@@ -218,7 +218,7 @@ def _is_stale(particles: Particles, halo: Halo, local: NeighborList) -> Array:
     if local.verlet is None:
         raise TypeError("a list without a skin is always stale.")
     before = dataclasses.replace(local.verlet, positions=local.verlet.positions[:own])
-    now = jnp.where((particles.ids >= 0)[:, None], particles.positions, jnp.nan)
+    now = jnp.where((particles.ids >= 0)[:, None], particles.positions, jnp.inf)
     moved = moved_too_far(before, now, None, local.box, local.box_kind, None, local.skin)
     return lax.pmax(moved | jnp.any(halo.ids[:own] != particles.ids), particles.mesh.axis_names)
 

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import Tracer
@@ -10,7 +9,8 @@ from jax.core import Tracer
 from jfrnn import _warp
 from jfrnn._auto import choose_engine, platform_of
 from jfrnn._inputs import check_is_known, checked_capacity, checked_cutoff, checked_positions, checked_slack
-from jfrnn._programs import on_device
+from jfrnn._modes import gathered
+from jfrnn._programs import made_on_host
 from jfrnn._triangles_list import TriangleList, counted_slots, found_triangles
 from jfrnn._triangles_winding import is_closed
 
@@ -108,9 +108,14 @@ def _checked_faces(faces: Any, dim: int, vertices: int) -> Array:  # noqa: ANN40
     if len(faces.shape) != 2 or faces.shape[1] != dim:
         raise ValueError(f"faces must have shape [f, {dim}], the vertices of {kind} in {dim}D, got shape {list(faces.shape)}.")
     check_is_known("faces", faces.shape)
+    least = 0 if np.issubdtype(faces.dtype, np.unsignedinteger) else -1
     if isinstance(faces, Tracer):
-        return jnp.clip(faces, -1, vertices).astype(jnp.int32) if np.iinfo(faces.dtype).max > vertices else faces.astype(jnp.int32)
-    return on_device(np.clip(np.asarray(faces).astype(np.int64), -1, vertices).astype(np.int32))
+        return _clipped(gathered(faces), least, vertices)
+    return made_on_host(faces, lambda known: _clipped(known, least, vertices))
+
+
+def _clipped(faces: Any, least: int, most: int) -> Any:  # noqa: ANN401
+    return (faces.clip(least, most) if np.iinfo(faces.dtype).max > most else faces).astype(np.int32)
 
 
 def _chosen_engine(backend: Any, points: Array) -> str:  # noqa: ANN401

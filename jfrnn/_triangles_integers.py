@@ -67,7 +67,7 @@ def is_near(shapes: Shapes, origin: Array, count: int) -> Array:
     limbs = jnp.pad(limbs, ((0, 0), (0, 0), (0, 1)))  # room for a sign
     points, radius = limbs[:dim], limbs[-1:]
     corners = limbs[dim:-1].reshape(dim, dim, *points.shape[1:])
-    x = _balanced(corners - points)  # [corner, axis, k, limbs]
+    x = _balanced(corners - points[None])  # [corner, axis, k, limbs]
     return _near_triangle(x, radius) if dim == 3 else _near_segment(x, radius)
 
 
@@ -131,8 +131,8 @@ def _trailing_zeros(word: Array) -> Array:
 def _limbs(x: Array, origin: Array, count: int) -> Array:
     """Write floats [v, k] as signed limbs [v, k, count] in units of the bit at place `origin` [k], lowest limb first."""
     sign, exponent, high, low = fields_of(x)
-    place = jnp.maximum(exponent, 1) - 1 - origin
-    shift = jnp.arange(count, dtype=jnp.int32) * LIMB_BITS - place[..., None]
+    place = jnp.maximum(exponent, 1) - 1 - origin[None]
+    shift = (jnp.arange(count, dtype=jnp.int32) * LIMB_BITS)[None, None] - place[..., None]
     limbs = shift_right(high[..., None], low[..., None], shift) & np.uint32((1 << LIMB_BITS) - 1)
     return jnp.where(sign[..., None], -1, 1) * limbs.astype(jnp.int32)
 

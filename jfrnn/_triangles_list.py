@@ -14,6 +14,7 @@ from jax.core import Tracer
 from jfrnn import _triangles_warp
 from jfrnn._exact import Cutoff, make_cutoff
 from jfrnn._inputs import check_devices, checked_again, checked_slack
+from jfrnn._modes import own_transfers
 from jfrnn._neighbors import norms, rounded_capacity
 from jfrnn._programs import at_once, compiled
 from jfrnn._status import NeighborOverflowError, Status, known_status, pairs_and_status, shape_of
@@ -94,7 +95,8 @@ class TriangleList:
     @property
     def overflow(self) -> Array:
         """Say whether a row lost triangles, shape [], bool."""
-        return (self.status & Status.ROW_OVERFLOW.value) != 0
+        with own_transfers():
+            return (self.status & Status.ROW_OVERFLOW.value) != 0
 
     def update(self, positions: Array, *, vertices: Array | None = None) -> "TriangleList":
         """Make the list anew at these positions, in the same shapes: a step of a simulation inside `jax.jit` or `lax.scan`.
@@ -138,7 +140,8 @@ class TriangleList:
         points, corners = self._checked(positions, vertices)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((points, corners, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
-        met = rounded_capacity(math.ceil(checked_slack(slack) * int(np.max(self.required))))
+        with own_transfers():
+            met = rounded_capacity(math.ceil(checked_slack(slack) * int(np.max(np.asarray(self.required)))))
         counted = counted_slots(points, corners, self.faces, self.cutoff, self.backend, slack)
         capacity, cells = max(self.capacity, met, counted), self.cells if vertices is None else None
         found = found_triangles(points, corners, self.faces, cells, self.cutoff, self.backend, capacity)
@@ -242,7 +245,7 @@ class TriangleList:
 
 def counted_slots(points: Array, vertices: Array, faces: Array, cutoff: float, backend: str, slack: float) -> int:
     """Count the triangles near concrete positions and return a capacity that holds `slack` times the longest row."""
-    with at_once():
+    with at_once(), own_transfers():
         found = found_triangles(points, vertices, faces, None, cutoff, backend, None)
         longest = int(found["required"])
     return rounded_capacity(math.ceil(max(longest, 1) * slack))
@@ -259,7 +262,8 @@ def found_triangles(
 ) -> dict[str, Any]:
     """Return the fields of a list that come from data; with capacity=None only counts. `cells`: those of an earlier list."""
     radius = make_cutoff(cutoff, np.dtype(points.dtype), closed=False)
-    return find_triangles(*lax.stop_gradient((points, vertices, faces, cells)), radius, backend, capacity)
+    with own_transfers():
+        return find_triangles(*lax.stop_gradient((points, vertices, faces, cells)), radius, backend, capacity)
 
 
 @functools.partial(compiled, static_argnames=("backend", "capacity"))

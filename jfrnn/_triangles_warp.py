@@ -73,7 +73,7 @@ def _query_on_cpu(variant: _Variant, slots: int, *inputs: Array) -> tuple[Array,
     positions, corners, boxes, radius, start, triangles, *of_cells = inputs
     if not variant.tree:
         entries = jnp.pad(triangles, (0, _LONGEST_VECTOR), constant_values=corners.shape[0])  # vectors reach over the end
-        boxes = boxes.T.at[:, entries].get(mode="fill", fill_value=jnp.nan)  # side by side, as a bucket holds them
+        boxes = boxes.T.at[:, entries].get(mode="fill", fill_value=jnp.inf)  # side by side, as a bucket holds them
     sizes = {"idx": (len(positions), max(slots, 1)), "count": len(positions), "info": 4}
     query = _query_callable(variant)
     idx, count, _ = query(positions, corners, boxes, radius, start, triangles, *of_cells, output_dims=sizes)

@@ -15,6 +15,7 @@ Source: Ericson (2005), Real-Time Collision Detection, sect. 5.3.4, for the prod
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -22,6 +23,8 @@ from jax.core import Tracer
 
 from jfrnn._exact import Cutoff
 from jfrnn._flags import set_places
+from jfrnn._modes import own_transfers
+from jfrnn._programs import on_device
 from jfrnn._triangles_exact import Vector, cross, dot, sum_of
 from jfrnn._triangles_tree import WIDTH, TriangleTree, level_starts
 
@@ -44,9 +47,10 @@ def is_closed(faces: Array) -> Array:
         start, end = _sides(faces)
         one, two = (lax.sort(both, num_keys=len(both)) for both in (start, end))
         return jnp.all(jnp.stack([jnp.all(a == b) for a, b in zip(one, two, strict=True)]))
-    start, end = _sides(np.asarray(faces).astype(np.int64))
+    start, end = _sides(np.asarray(jax.device_get(faces)).astype(np.int64))
     one, two = (np.sort(sum_of([part << 32 * k for k, part in enumerate(both)])) for both in (start, end))
-    return jnp.asarray(np.array_equal(one, two))
+    with own_transfers():
+        return on_device(np.array_equal(one, two))
 
 
 def _sides(faces: Any) -> tuple[list[Any], list[Any]]:  # noqa: ANN401
@@ -62,7 +66,7 @@ def least_winding(corners: Array, good: Array) -> Array:
 
     Such a wall, that of a container for example, encloses a signed volume (2D: area) below 0, by more than rounding.
     """
-    raw = corners - corners[0, 0]
+    raw = corners - corners[:1, :1]
     raw = raw / jnp.maximum(jnp.max(jnp.abs(raw)), jnp.finfo(raw.dtype).tiny)
     x = [[raw[:, c, k] for k in range(raw.shape[2])] for c in range(raw.shape[1])]
     parts = jnp.where(good, _determinant(x), 0)
@@ -91,7 +95,7 @@ def cast_rays(
     """
     dim = points.shape[1]
     top = tree.boxes[:, int(level_starts(len(corners))[-2]) :]
-    exits = jnp.concatenate([jnp.max(top[dim:], axis=1) - points, points - jnp.min(top[:dim], axis=1)], axis=1)
+    exits = jnp.concatenate([jnp.max(top[dim:], axis=1)[None] - points, points - jnp.min(top[:dim], axis=1)[None]], axis=1)
     ways = jnp.argsort(exits, axis=1)  # the shortest way out meets the fewest boxes
 
     def cast(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -126,7 +130,7 @@ def _bounds(tree: TriangleTree, corners: Array, points: Array, rays: Array, aske
         place = height - chunk + lax.iota(jnp.int32, chunk)
         owner, group = stack[:, jnp.maximum(place, 0)]
         met = (place >= 0)[:, None] & _meets_boxes(boxes[:, group], points[owner], rays[owner], cutoff)
-        is_leaf, below = (group < starts[1])[:, None], group[:, None] * WIDTH + lanes
+        is_leaf, below = (group < starts[1])[:, None], group[:, None] * WIDTH + lanes[None]
         for start, end, first in zip(starts[1:-1], starts[2:], starts, strict=False):
             here = (group >= start) & (group < end)
             below = jnp.where(here[:, None], below - start * WIDTH + first, below)

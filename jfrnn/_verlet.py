@@ -23,7 +23,7 @@ class Verlet:
     """What a list with a skin remembers: where it was made, and how often it was made anew.
 
     Attributes:
-        positions: Sources when the list was last made [length], shape [n, d]; inactive ones are NaN.
+        positions: Sources when the list was last made [length], shape [n, d]; inactive ones are infinite.
         queries: Queries then [length], shape [m, d], or None.
         box: The periodic box then, or None.
         radii: Cutoffs of the particles then, or None where one serves all.
