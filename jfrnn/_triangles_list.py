@@ -120,7 +120,7 @@ class TriangleList:
         cells = self.cells if vertices is None else None
         found = found_triangles(points, corners, self.faces, cells, self.cutoff, self.backend, self.capacity)
         found |= {"status": found["status"] | self.status, "required": jnp.maximum(found["required"], self.required)}
-        return dataclasses.replace(self, **found)
+        return dataclasses.replace(self, **found, closed=self._closed_again())
 
     def grow(self, positions: Array, *, vertices: Array | None = None, slack: float = 1.25) -> "TriangleList":
         """Make a list with room for what overflowed, at these positions. Not inside jit: the capacity is a shape.
@@ -145,7 +145,11 @@ class TriangleList:
         counted = counted_slots(points, corners, self.faces, self.cutoff, self.backend, slack)
         capacity, cells = max(self.capacity, met, counted), self.cells if vertices is None else None
         found = found_triangles(points, corners, self.faces, cells, self.cutoff, self.backend, capacity)
-        return dataclasses.replace(self, **found)
+        return dataclasses.replace(self, **found, closed=self._closed_again())
+
+    def _closed_again(self) -> Array | None:
+        """Return `closed` for a list made of this one: no two lists share memory, either may be donated."""
+        return None if self.closed is None else jnp.array(self.closed, copy=True)
 
     def check(self) -> None:
         """Raise what the status bits report; wait for the device. Not inside jit: there, read `status` and `overflow`.
