@@ -86,8 +86,9 @@ def pair_sum(
 
     Raises:
         NeighborOverflowError, ValueError: outside jit, `neighbors` may lack pairs.
-        TypeError, ValueError: an argument is of the wrong kind, shape or range, or fn returns what cannot be summed; "warp" was
-            named and cannot do what is asked.
+        TypeError, ValueError: an argument is of the wrong kind, shape or range; fn does not take (r, i, j), asks what a number is
+            (as `if` does), or returns what cannot be summed; "warp" was named and cannot do what is asked. What else fn raises
+            comes up as itself, with a note that says what fn was given.
         NotImplementedError: "warp" was named, and fn or its derivative has no translation: the message says which primitive.
 
     Order of summation: the neighbors of a particle as the engine meets them (cell by cell, or by index in "brute", or as listed) in

@@ -17,6 +17,7 @@ from jfrnn._exact import Radii, make_cutoffs
 from jfrnn._extremes import bind_extremes
 from jfrnn._inputs import checked_cutoff
 from jfrnn._neighbors import ROWS_ARE_WHOLE, NeighborList
+from jfrnn._pair_function import call_with_pair
 from jfrnn._programs import compiled, on_device
 from jfrnn._relations import Listed, Relation, Searched
 from jfrnn._status import Status
@@ -225,14 +226,16 @@ def _summand(
         r = jnp.where(real, r, harmless)  # what fn gets where there is no pair must not stop it, or raise in debug modes
         i, j = jax.tree.unflatten(own_tree, own), jax.tree.unflatten(other_tree, others)
         if symmetry is None:
-            return leaves_of(fn(r, i, j))
+            return leaves_of(call_with_pair(fn, r, i, j))
         ahead = (number_i < number_j) | ((number_i == number_j) & ~_is_backward(shift))
         i, j = (jax.tree.map(functools.partial(jnp.where, ahead), *sides) for sides in ((i, j), (j, i)))
-        leaves = leaves_of(fn(jnp.where(ahead, r, -r), i, j))
+        leaves = leaves_of(call_with_pair(fn, jnp.where(ahead, r, -r), i, j))
         return leaves if symmetry == "symmetric" else [jnp.where(ahead, x, -x) for x in leaves]
 
     def leaves_of(result: Any) -> list[Array]:  # noqa: ANN401
         leaves, tree = jax.tree.flatten(result)
+        if not leaves:
+            raise TypeError(f"fn must return arrays, got {result!r}: let it end with `return`.")
         structure[:] = [tree]
         return [_summable(x, dtype) for x in leaves]
 
@@ -256,6 +259,10 @@ def _is_backward(shift: Array) -> Array:
 
 
 def _summable(x: Any, dtype: np.dtype) -> Array:  # noqa: ANN401
+    if isinstance(x, str | bytes) or callable(x):
+        raise TypeError(
+            f"fn must return floats or integers, got {type(x).__name__}: return arrays, in a pytree if there are several."
+        )
     array = jnp.asarray(x)
     if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
         raise TypeError(f"fn must return floats or integers, got {array.dtype}: convert it, e.g. with .astype(jnp.int32).")

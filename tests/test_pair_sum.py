@@ -704,6 +704,8 @@ def listed(**options):
         (TypeError, r"fn must be a function of \(r, i, j\), got int", lambda: jfrnn.pair_sum(3, X, 1.0)),
         (TypeError, "fn must return floats or integers, got bool", lambda: jfrnn.pair_sum(lambda r, i, j: r[0] > 0, X, 1.0)),
         (TypeError, "fn must return floats for reduce='max'", lambda: jfrnn.pair_sum(lambda r, i, j: 1, X, 1.0, reduce="max")),
+        (TypeError, "fn must return arrays, got None", lambda: jfrnn.pair_sum(lambda r, i, j: None, X, 1.0)),
+        (TypeError, "fn must return floats or integers, got str", lambda: jfrnn.pair_sum(lambda r, i, j: "r", X, 1.0)),
         (ValueError, "reduce must be one of 'sum', 'max', 'min', got 'mean'", lambda: pair_sum(reduce="mean")),
         (ValueError, "symmetry must be None, 'symmetric' or", lambda: pair_sum(symmetry="odd")),
         (ValueError, "symmetry='symmetric' is about pairs without direction", lambda: pair_sum(symmetry="symmetric", queries=Q)),

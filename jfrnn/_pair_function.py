@@ -1,0 +1,75 @@
+"""How the function of a pair sum is called, and what its errors say: what it was given, and what to do."""
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax import Array
+
+_NEEDS_A_VALUE = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.NonConcreteBooleanIndexError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+
+
+def call_with_pair(fn: Callable[[Array, Any, Any], Any], r: Array, i: Any, j: Any) -> Any:  # noqa: ANN401
+    """Return fn(r, i, j) of one traced pair.
+
+    Raises:
+        TypeError: fn does not take three arguments, or needs to know a number to go on, as `if` does.
+        Exception: what else fn raises, with a note that says what it was given.
+    """
+    _check_signature(fn, r, i, j)
+    try:
+        return fn(r, i, j)
+    except _NEEDS_A_VALUE as error:
+        raise TypeError(
+            f"fn ({_name_of(fn)}) asks what a number is, as `if`, `and`, `float()` and functions of NumPy do. It is traced once "
+            "for all pairs, so numbers are not known: write jnp.where(condition, a, b) instead of `if`, & instead of `and`, "
+            f"and jnp instead of np. {_given(r, i, j)}"
+        ) from error
+    except Exception as error:
+        error.add_note(f"Raised by fn ({_name_of(fn)}) of a pair sum. {_given(r, i, j)}")
+        raise
+
+
+def _check_signature(fn: Callable[..., Any], r: Array, i: Any, j: Any) -> None:  # noqa: ANN401
+    try:
+        signature = inspect.signature(fn)
+    except (TypeError, ValueError):  # some built-in functions do not say what they take
+        return
+    try:
+        signature.bind(r, i, j)
+    except TypeError as error:
+        names = ", ".join(map(str, signature.parameters))
+        raise TypeError(
+            f"fn must take three arguments, (r, i, j), also where it reads but one of them; {_name_of(fn)} takes ({names}). "
+            f"{_given(r, i, j)}"
+        ) from error
+
+
+def _name_of(fn: Any) -> str:  # noqa: ANN401
+    while isinstance(fn, functools.partial):
+        fn = fn.func
+    return getattr(fn, "__name__", type(fn).__name__)
+
+
+class _Shape(str):
+    """A text that is its own representation, so that a pytree of shapes prints as one is written."""
+
+    __repr__ = str.__str__
+
+
+def _given(r: Array, i: Any, j: Any) -> str:  # noqa: ANN401
+    """Say what fn gets of a pair."""
+
+    def described(values: Any) -> str:  # noqa: ANN401
+        if not jax.tree.leaves(values):
+            return f"{values!r}, as no values were given"
+        return repr(jax.tree.map(lambda x: _Shape(f"{x.dtype}{list(x.shape)}"), values))
+
+    return f"What it gets of a pair: r = x_j - x_i, {r.dtype}{list(r.shape)}; i = {described(i)}; j = {described(j)}."

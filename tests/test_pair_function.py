@@ -1,0 +1,69 @@
+"""What `pair_sum` says of functions that take something else, that branch, or that fail."""
+
+import functools
+import re
+
+import numpy as np
+import pytest
+
+import jfrnn
+
+X = np.zeros((4, 2), np.float32)
+
+
+def of_two(r, j):
+    return r
+
+
+def branching(r, i, j):
+    return r if r[0] > 0 else -r
+
+
+def by_numpy(r, i, j):
+    return np.linalg.norm(r)
+
+
+def by_index(r, i, j):
+    return (1.0, 2.0)[j["kind"]]
+
+
+def of_mass(r, i, j):
+    return j["m"] * r
+
+
+def failing(r, i, j):
+    raise ZeroDivisionError("a reason of its own")
+
+
+GIVEN = {"v": np.ones((4, 2), np.float32), "kind": np.ones(4, np.int32)}
+PAIR = r"r = x_j - x_i, float32\[2\]; i = {'kind': int32\[\], 'v': float32\[2\]}; j = {'kind': int32\[\], 'v': float32\[2\]}"
+
+
+@pytest.mark.parametrize(
+    ("error", "fn", "values", "matches"),
+    [
+        (TypeError, of_two, GIVEN, [r"fn must take three arguments, \(r, i, j\).*of_two takes \(r, j\)", PAIR]),
+        (TypeError, functools.partial(of_two, j=1), None, ["of_two takes", "i = None, as no values were given"]),
+        (TypeError, branching, GIVEN, [r"fn \(branching\) asks what a number is.*jnp.where", PAIR]),
+        (TypeError, by_numpy, GIVEN, [r"fn \(by_numpy\) asks what a number is.*jnp instead of np", PAIR]),
+        (TypeError, by_index, GIVEN, [r"fn \(by_index\) asks what a number is", PAIR]),
+        (KeyError, of_mass, GIVEN, ["^'m'", r"Raised by fn \(of_mass\)", PAIR]),
+        (TypeError, of_mass, None, ["not subscriptable", r"fn \(of_mass\).*j = None, as no values were given"]),
+        (ZeroDivisionError, failing, GIVEN, ["^a reason of its own", r"Raised by fn \(failing\)", PAIR]),
+    ],
+)
+@pytest.mark.parametrize("symmetry", [None, "symmetric"])
+def test_errors_of_a_function_say_what_it_is_given(error, fn, values, matches, symmetry):
+    with pytest.raises(error) as raised:
+        jfrnn.pair_sum(fn, X, 1.0, values, symmetry=symmetry)
+    assert raised.type is error
+    said = "\n".join([str(raised.value), *getattr(raised.value, "__notes__", ())])
+    for match in matches:
+        assert re.search(match, said), said
+    if error is TypeError and values is not None:
+        assert isinstance(raised.value.__cause__, TypeError)  # what Python or JAX said
+
+
+@pytest.mark.parametrize("fn", [lambda r, *values: r, lambda r, i, j, k=2.0: k * r, lambda *pair: pair[0]])
+def test_functions_that_can_take_three_arguments_do(fn):
+    assert jfrnn.pair_sum(fn, X, 1.0, backend="brute").shape == X.shape
