@@ -163,7 +163,7 @@ def numbers_of(n, dtype, *names):
 @pytest.mark.parametrize(
     ("fn", "names", "gradient", "bytes_"),
     [
-        (density, "m", False, 36 + 4 + 4),  # the array of a single number is not packed
+        (density, "m", False, 36 + 4 + 2 * 4),  # the array of a single number is not packed; rows without a sum are marked apart
         (density, "m", True, 36 + 3 * 4 + 2 * 8 + 4 + 12),
         (several, "muv", False, 36 + 2 * 8 + 4 + 2 * 12),  # what is summed, and the arrays that fn returns
     ],
