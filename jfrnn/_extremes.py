@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn import _fused
+from jfrnn._manual import call_apart
 from jfrnn._programs import compiled
 from jfrnn._relations import Listed, Relation, Searched, evaluate, is_fused
 from jfrnn._runs import Block, Slots
@@ -26,7 +27,8 @@ def bind_extremes(relation: Relation, term: Term, operands: Groups, largest: boo
     m, n = relation.sizes
     if isinstance(relation, Searched):
         _fused.check(relation.inputs, relation.options, term)
-    found = _find(lax.stop_gradient(relation), term, lax.stop_gradient(operands), largest)
+    find = functools.partial(_find, term=term, largest=largest)
+    found = call_apart(lambda *given: find(given[0], operands=given[1]), lax.stop_gradient(relation), lax.stop_gradient(operands))
     results = []
     for k, (like, (_, source, shift)) in enumerate(zip(term.summands, found, strict=True)):
         has, elements = source < n, source.shape[1]

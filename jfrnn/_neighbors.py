@@ -31,6 +31,7 @@ from jfrnn._box import (
 from jfrnn._exact import Cutoff, Cutoffs, Radii, is_pair_of, make_cutoff, make_cutoffs
 from jfrnn._exports import DenseNeighbors, checked_total, flat_pairs, pair_total
 from jfrnn._inputs import check_devices, checked_active, checked_again, checked_box, checked_radii, checked_slack, largest_known
+from jfrnn._manual import call_apart
 from jfrnn._modes import own_transfers
 from jfrnn._programs import at_once, compiled
 from jfrnn._runs import Filter
@@ -169,7 +170,7 @@ class NeighborList:
         radii = self._radii_now(cutoff, sources, rows)
         active, box = self._checked_active(active, sources), self._box_now(box, sources)
         with own_transfers():
-            return _update(self, sources, rows, active, box, radii)
+            return call_apart(_update, self, sources, rows, active, box, radii)
 
     def grow(
         self,
@@ -635,7 +636,7 @@ def _vectors(
     cutoff = _pair_cutoff(given, closed)
     used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
     neighbor = jnp.where(used, idx, 0)
-    mask = used & is_pair_of(lax.stop_gradient(rows), lax.stop_gradient(sources), neighbor, cutoff)
+    mask = used & call_apart(is_pair_of, lax.stop_gradient(rows), lax.stop_gradient(sources), neighbor, cutoff)
     return jnp.where(mask[..., None], sources[neighbor] - rows[:, None, :], 0), mask
 
 
@@ -698,7 +699,7 @@ def _periodic_vectors(
     fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
     pairs = shifted_pairs(difference, shifts, (fixed_sources, fixed_rows), lattice)
     fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
-    mask = used & is_pair_of(fixed_rows, fixed_sources, neighbor, cutoff, fixed_pairs)
+    mask = used & call_apart(is_pair_of, fixed_rows, fixed_sources, neighbor, cutoff, fixed_pairs)
     return jnp.where(mask[..., None], pairs.vectors, 0), mask, shifts
 
 

@@ -16,6 +16,7 @@ from jfrnn._box import Box, Images, Lattice, make_lattice, translation
 from jfrnn._exact import Radii, make_cutoffs
 from jfrnn._extremes import bind_extremes
 from jfrnn._inputs import checked_cutoff
+from jfrnn._manual import call_apart
 from jfrnn._neighbors import ROWS_ARE_WHOLE, NeighborList
 from jfrnn._pair_function import call_with_pair
 from jfrnn._programs import compiled, on_device
@@ -122,7 +123,7 @@ def _telling(
     points = sources if queries is None else queries
     if not isinstance(points, Tracer):  # there are no derivatives
         return sources, points, functools.partial(_marked_by, data=data, good_rows=good_rows, static=static)
-    good = good_rows(*data, *static)
+    good = call_apart(lambda *data: good_rows(*data, *static), *data)
     points = _told(points, good)
     return points if queries is None else sources, points, functools.partial(_marked, good=good)
 

@@ -24,6 +24,7 @@ from jfrnn._inputs import (
     checked_slack,
     largest_known,
 )
+from jfrnn._manual import call_apart
 from jfrnn._modes import own_transfers
 from jfrnn._neighbors import NeighborList, counted_capacity, found_fields, made_options
 from jfrnn._runs import Filter
@@ -135,7 +136,7 @@ def search(
         capacity = _counted_capacity(inputs, options, slack)
     capacity = checked_capacity(capacity)
     with own_transfers():
-        fields = found_fields(inputs, options, capacity, problem.skin > 0)
+        fields = call_apart(lambda inputs: found_fields(inputs, options, capacity, problem.skin > 0), inputs)
     return NeighborList(
         **fields,
         cutoff=problem.radius,
@@ -192,7 +193,7 @@ def count(
     """
     problem = checked_problem(positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, 0.0, active)
     with own_transfers():
-        return count_rows(problem.inputs, problem.options)[0]
+        return call_apart(lambda inputs: count_rows(inputs, problem.options)[0], problem.inputs)
 
 
 class Problem(NamedTuple):

@@ -16,6 +16,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jfrnn import _fused
+from jfrnn._manual import result_aval, unvaried, varied, varying_axes
 from jfrnn._programs import compiled
 from jfrnn._relations import Relation, Searched, sum_pairs
 from jfrnn._terms import Derived, Groups, Term, chosen, is_moving, joined, tangent, transposed
@@ -35,6 +36,8 @@ def _bind(leaves: list[Array], operands: Groups, term: Term, structure: Any, com
     relation = jax.tree.unflatten(structure, leaves)
     if isinstance(relation, Searched):
         _fused.check(relation.inputs, relation.options, term)
+    axes = varying_axes((leaves, flat))
+    leaves, flat = varied((leaves, flat), axes)
     return _pair_sum_p.bind(*leaves, *flat, term=term, structure=structure, compensated=compensated)
 
 
@@ -47,7 +50,8 @@ def _result_shapes(*args: Any, term: Term, structure: Any, compensated: bool) ->
     del compensated
     rows = jax.tree.unflatten(structure, args[: structure.num_leaves]).sizes[0]
     return [
-        ShapedArray(x.shape if total else (rows, *x.shape), x.dtype) for x, total in zip(term.summands, term.totals, strict=True)
+        result_aval(x.shape if total else (rows, *x.shape), x.dtype, args)
+        for x, total in zip(term.summands, term.totals, strict=True)
     ]
 
 
@@ -113,10 +117,15 @@ def _batch(args: tuple, dims: tuple, **params: Any) -> tuple[list[Array], list[i
     return sums, [0] * len(sums)
 
 
+def _lower(ctx: Any, *args: Any, **params: Any) -> Any:  # noqa: ANN401
+    """Trace the sums as they are on one device: see `jfrnn._manual`."""
+    return mlir.lower_fun(_sums, multiple_results=True)(ctx.replace(avals_in=unvaried(ctx.avals_in)), *args, **params)
+
+
 _compiled = functools.partial(compiled, static_argnames=("term", "structure", "compensated"))(_sums)
 _pair_sum_p.def_impl(lambda *args, **params: _compiled(*args, **params))
 _pair_sum_p.def_abstract_eval(_result_shapes)
 ad.primitive_jvps[_pair_sum_p] = _jvp
 ad.primitive_transposes[_pair_sum_p] = _transpose
 batching.primitive_batchers[_pair_sum_p] = _batch
-mlir.register_lowering(_pair_sum_p, mlir.lower_fun(_sums, multiple_results=True))
+mlir.register_lowering(_pair_sum_p, _lower)

@@ -72,8 +72,8 @@ def search_triangles(
     sizes of the triangles and of space, or 30 B for the tree (float64: 56); while "warp" lists on CUDA 12 B per particle, 0.6 kB
     per triangle (float64: 1.1; "bvh" at most 0.13) and at most 58 MB. Differentiable: the list is topology, without gradient; see
     `TriangleList.closest`.
-    Jit: yes, with capacity. vmap: yes, with capacity. `jax.shard_map`: yes, with particles spread and the wall on every device
-    (`check_vma=False`). Source: strict cutoff (Peifle 2019, §2.2).
+    Jit: yes, with capacity. vmap: yes, with capacity. `jax.shard_map`: yes, with particles spread and the wall on every device.
+    Source: strict cutoff (Peifle 2019, §2.2).
 
     >>> import jax.numpy as jnp, jfrnn
     >>> x = jnp.array([[0.2, 0.2, 0.05], [0.2, 0.2, -0.2], [1.05, 0.0, 0.0]])

@@ -14,6 +14,7 @@ from jax.core import Tracer
 from jfrnn import _triangles_warp
 from jfrnn._exact import Cutoff, make_cutoff
 from jfrnn._inputs import check_devices, checked_again, checked_slack
+from jfrnn._manual import call_apart
 from jfrnn._modes import own_transfers
 from jfrnn._neighbors import norms, rounded_capacity
 from jfrnn._programs import at_once, compiled
@@ -267,7 +268,8 @@ def found_triangles(
     """Return the fields of a list that come from data; with capacity=None only counts. `cells`: those of an earlier list."""
     radius = make_cutoff(cutoff, np.dtype(points.dtype), closed=False)
     with own_transfers():
-        return find_triangles(*lax.stop_gradient((points, vertices, faces, cells)), radius, backend, capacity)
+        given = *lax.stop_gradient((points, vertices, faces, cells)), radius
+        return call_apart(lambda *given: find_triangles(*given, backend, capacity), *given)
 
 
 @functools.partial(compiled, static_argnames=("backend", "capacity"))
@@ -315,7 +317,8 @@ def _nearest_in_rows(tri: TriangleList, points: Array, vertices: Array) -> tuple
     triangle = jnp.where(used, tri.idx, 0)
     cutoff = make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False)
     decide = decide_pairs if tri.backend == "jax" else _triangles_warp.decide_pairs
-    near = are_near(*lax.stop_gradient((points, corners)), triangle, cutoff, used & (finite & there)[triangle], decide)
+    are_pairs = functools.partial(are_near, decide=decide)
+    near = call_apart(are_pairs, *lax.stop_gradient((points, corners)), triangle, cutoff, used & (finite & there)[triangle])
     mask = near & jnp.all(jnp.isfinite(points), axis=1)[:, None]
     shapes = jnp.where(mask[..., None, None], corners[triangle], 0)
     vectors, feature = nearest_of(jnp.where(mask[..., None], points[:, None], 0), shapes)
@@ -328,21 +331,29 @@ def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> Signe
     fixed, at, good = *lax.stop_gradient((corners, points)), finite & there
     cutoff, used = make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False), jnp.minimum(tri.count, tri.capacity)
     decide = decide_pairs if tri.backend == "jax" else _triangles_warp.decide_pairs
-    slot, some = nearest_slots(at, fixed, tri.idx, used, good, cutoff, decide)
+    slot, some = call_apart(functools.partial(nearest_slots, decide=decide), at, fixed, tri.idx, used, good, cutoff)
     triangle = jnp.where(some, jnp.take_along_axis(tri.idx, slot[:, None], axis=1)[:, 0], 0)
     shapes = jnp.where(some[:, None, None], corners[triangle], 0)
     vectors, feature = nearest_of(jnp.where(some[:, None], points, 0), shapes)
     away, distance = -vectors, norms(vectors)
     apart = some & (distance > 0)
     watertight = (is_closed(tri.faces) if tri.closed is None else tri.closed) & jnp.all(good)
-    tree = tri.cells if isinstance(tri.cells, TriangleTree) else grow_tree(fixed, good, cutoff)
-    cast = cast_rays if tri.backend == "jax" else _triangles_warp.cast_rays
-    rays, least = ray_ways(points.shape[1], np.dtype(points.dtype)), least_winding(fixed, good)
-    inside, unknown = cast(tree, fixed, at, rays, apart & watertight, least, cutoff)
+    tree = tri.cells if isinstance(tri.cells, TriangleTree) else None
+    inside, unknown = call_apart(functools.partial(_sides, tri.backend), tree, fixed, at, good, apart & watertight, cutoff)
     by_normal = some & (unknown | ~(apart & watertight))
-    normal = pseudonormals(Rows(tri.idx, used, triangle, feature), tri.faces, fixed, good, by_normal)
+    normal = call_apart(pseudonormals, Rows(tri.idx, used, triangle, feature), tri.faces, fixed, good, by_normal)
     height = jnp.sum(normal * away, axis=1)
     signed = jnp.where(jnp.where(by_normal, height < 0, inside), -distance, distance)
     signed = jnp.where(distance > 0, signed, height)
     grows = jnp.where(apart[:, None], away / jnp.where(apart, signed, 1)[:, None], jnp.where(some[:, None], normal, 0))
     return SignedDistance(jnp.where(some, signed, 0), some, grows, watertight)
+
+
+def _sides(
+    backend: str, tree: TriangleTree | None, corners: Array, points: Array, good: Array, asked: Array, cutoff: Cutoff
+) -> tuple[Array, Array]:
+    """Say which of the points that are asked for are inside, and of which no ray tells: [n] bool each."""
+    tree = grow_tree(corners, good, cutoff) if tree is None else tree
+    cast = cast_rays if backend == "jax" else _triangles_warp.cast_rays
+    rays, least = ray_ways(points.shape[1], np.dtype(points.dtype)), least_winding(corners, good)
+    return cast(tree, corners, points, rays, asked, least, cutoff)

@@ -113,6 +113,72 @@ def explicit_axes_without_a_context():
     np.testing.assert_array_equal(nbrs.update(x).idx, nbrs.idx)
 
 
+MESH = jax.make_mesh((4,), ("p",), axis_types=(AxisType.Auto,))
+
+
+def systems_of_devices(case):
+    """Compare a function of 8 positions and numbers on each device, in `shard_map` as it is by itself, with one device."""
+    x, r = jnp.concatenate([X, X[::-1] / 2]), jnp.concatenate([R, R / 2])
+    spec = PartitionSpec("p")
+    found = jax.jit(jax.shard_map(case, mesh=MESH, in_specs=spec, out_specs=spec))(x, r)
+    alone = [jax.tree.leaves(case(x[k : k + 8], r[k : k + 8])) for k in range(0, 32, 8)]
+    for one, others in zip(jax.tree.leaves(found), zip(*alone), strict=True):
+        np.testing.assert_allclose(one, np.concatenate(others), rtol=1e-5, atol=1e-6)
+
+
+def moving(x, r, **options):
+    """A scan of updates."""
+
+    def step(carry, _):
+        x, nbrs = carry
+        nbrs = nbrs.update(1.1 * x, active=r > 0.2)
+        return (1.1 * x, nbrs), nbrs.count
+
+    nbrs = jfrnn.search(x, 0.5, capacity=8, skin=0.1, active=r > 0.2, **options)
+    return jax.lax.scan(step, (x, nbrs), None, length=3)[1].sum(axis=0)
+
+
+@check
+def shard_map_as_it_is_by_itself():
+    systems_of_devices(lambda x, r: (jfrnn.count(x, 0.5), *summed(x, r)))
+    systems_of_devices(moving)
+
+
+@check
+def more_in_shard_map():
+    def of_triangles(x, r):
+        tri = jfrnn.search_triangles(x, CORNERS, SIDES, 0.4, capacity=8)
+        return tri.count, tri.closest(x), tri.signed_distance(x)[:3]
+
+    systems_of_devices(of_triangles)
+    systems_of_devices(lambda x, r: jfrnn.count(x, r))
+    systems_of_devices(lambda x, r: moving(x, r, box=jfrnn.Box([2.0, 2.0])))
+    systems_of_devices(lambda x, r: jfrnn.search(x, 0.5, capacity=8, box=jfrnn.Box([2.0, 2.0])).distances(x))
+    systems_of_devices(lambda x, r: jfrnn.pair_sum(weight, x, 0.5, r, reduce="max"))
+    systems_of_devices(lambda x, r: jfrnn.search(x, 0.5, capacity=8, backend="jax").distances(x))
+    systems_of_devices(lambda x, r: jax.vmap(lambda x: jfrnn.count(x, 0.5))(x.reshape(2, 4, 2)).reshape(8))
+
+
+@check
+def what_devices_share_keeps_its_gradient():
+    """Of a number that all devices have, the derivative is that of the sum over all; where nothing varies, nothing does."""
+
+    def loss(scale, x):
+        return jnp.sum(jfrnn.pair_sum(lambda r, i, j: jnp.exp(-scale * jnp.sum(r * r)), x, 0.5))
+
+    def total(scale, x):
+        return jax.lax.psum(loss(scale, x), "p")
+
+    specs = PartitionSpec(), PartitionSpec("p")
+    found = jax.jit(jax.shard_map(jax.grad(total, (0, 1)), mesh=MESH, in_specs=specs, out_specs=specs))(jnp.float32(1.5), X)
+    alone = [jax.grad(loss, (0, 1))(jnp.float32(1.5), X[k : k + 4]) for k in range(0, 16, 4)]
+    np.testing.assert_allclose(found[0], sum(scale for scale, _ in alone), rtol=1e-5)
+    np.testing.assert_allclose(found[1], np.concatenate([x for _, x in alone]), rtol=1e-5, atol=1e-6)
+    spec = PartitionSpec()
+    counted = jax.jit(jax.shard_map(lambda x: jfrnn.count(x, 0.5), mesh=MESH, in_specs=spec, out_specs=spec))(X)
+    np.testing.assert_array_equal(counted, jfrnn.count(X, 0.5))
+
+
 def main(names):
     for name in names:
         wrong = None

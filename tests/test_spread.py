@@ -6,7 +6,7 @@ import pytest
 from test_distributed import names_in, outcomes
 
 CHECKS = Path(__file__).parent / "spread_checks.py"
-SLOW = {"more_on_automatic_axes", "more_on_explicit_axes"}
+SLOW = {"more_on_automatic_axes", "more_on_explicit_axes", "more_in_shard_map"}
 QUICK = [name for name in names_in(CHECKS) if name not in SLOW]
 
 
