@@ -21,6 +21,7 @@ from jfrnn._programs import at_once, compiled
 from jfrnn._status import NeighborOverflowError, Status, known_status, pairs_and_status, shape_of
 from jfrnn._triangles_cells import TriangleCells, sort_triangles, without_faults
 from jfrnn._triangles_closest import Rows, nearest_of, pseudonormals
+from jfrnn._triangles_contacts import are_contacts
 from jfrnn._triangles_rows import are_near, decide_pairs, list_triangles, nearest_slots
 from jfrnn._triangles_tree import TriangleTree, grow_tree
 from jfrnn._triangles_winding import cast_rays, is_closed, least_winding, ray_ways
@@ -202,6 +203,49 @@ class TriangleList:
         vectors, _, mask = _nearest_in_rows(self, points, corners)
         return points[:, None] + vectors, norms(vectors), mask
 
+    def contacts(self, positions: Array, *, vertices: Array | None = None) -> tuple[Array, Array, Array]:
+        """Compute the contacts of spheres with walls: the nearest points of `closest`, one per wall instead of one per triangle.
+
+        A triangle gives way to another one of its row that holds the corner or side on which its nearest point lies and that is
+        nearer, or as near and of a lower index; so does one of two whose nearest points are the same within rounding. A sphere has
+        one contact on a flat wall of many triangles, over a convex edge and over a corner, and one per wall in a concave edge or
+        corner. On a surface that curves around it, such as the inside of a pipe, it has one with each triangle whose face it is
+        over. The nearest triangle of a row is always a contact.
+
+        Triangles are neighbors by the numbers of their vertices: `jfrnn.merge_vertices` joins those that are written apart, as in
+        STL files. A vertex in the middle of a side, which the triangle there does not have, joins nothing: contacts may double.
+
+        Args:
+            positions: As in `closest`.
+            vertices: As in `closest`.
+
+        Returns:
+            Points [n, capacity, d], distances [n, capacity] and the mask [n, capacity], as `closest` returns them; slots that are
+            no contacts are masked.
+
+        Raises:
+            ValueError, TypeError, NeighborOverflowError: as `closest`.
+
+        Cost: n times the longest row, squared; memory is that of `closest`. Differentiable: as `closest`; the mask is constant.
+        Jit: yes. vmap: yes.
+
+        Example:
+        >>> import jax.numpy as jnp
+        >>> import jfrnn
+        >>> plate = jnp.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+        >>> x = jnp.array([[0.5, 0.4, 0.1]])
+        >>> tri = jfrnn.search_triangles(x, plate, jnp.array([[0, 1, 2], [0, 2, 3]]), 0.3, capacity=2)
+        >>> tri.count, tri.contacts(x)[2].sum()
+        (Array([2], dtype=int32), Array(1, dtype=int32))
+        """
+        points, corners = self._checked(positions, vertices)
+        if 0 in (*self.idx.shape, self.faces.shape[0]):
+            return self.closest(points, vertices=vertices)
+        self._check_rows()
+        vectors, feature, mask = _nearest_in_rows(self, points, corners)
+        vectors, mask = _contacts_in_rows(self, points, corners, vectors, feature, mask)
+        return points[:, None] + vectors, norms(vectors), mask
+
     def signed_distance(self, positions: Array, *, vertices: Array | None = None) -> SignedDistance:
         """Compute the distance to the nearest triangle of each row, negative inside what the triangles enclose.
 
@@ -323,6 +367,18 @@ def _nearest_in_rows(tri: TriangleList, points: Array, vertices: Array) -> tuple
     shapes = jnp.where(mask[..., None, None], corners[triangle], 0)
     vectors, feature = nearest_of(jnp.where(mask[..., None], points[:, None], 0), shapes)
     return jnp.where(mask[..., None], vectors, 0), feature, mask
+
+
+@compiled
+def _contacts_in_rows(
+    tri: TriangleList, points: Array, vertices: Array, vectors: Array, feature: Array, mask: Array
+) -> tuple[Array, Array]:
+    """Return the vectors to nearest points [n, capacity, d] of contacts, 0 elsewhere, and which slots these are."""
+    points, vertices, fixed = lax.stop_gradient((points, vertices, vectors))
+    triangle = jnp.where(mask, tri.idx, 0)
+    seen = jnp.where(mask[..., None, None], vertices[tri.faces[triangle]] - points[:, None, None], 0)
+    kept = are_contacts(mask, triangle, tri.faces, seen, fixed, norms(fixed), feature)
+    return jnp.where(kept[..., None], vectors, 0), kept
 
 
 @compiled

@@ -136,7 +136,7 @@ def distances_to_wall(backend):
     tri = jfrnn.search_triangles(x, given()["vertices"], given()["faces"], 0.4, backend=backend)
     losses = (lambda x: jnp.sum(tri.closest(x)[1])), (lambda x: jnp.sum(tri.signed_distance(x).distance))
     slopes = [jax.jit(jax.grad(loss)) for loss in losses]
-    return tri.closest(x), tri.signed_distance(x), [slope(x) for slope in slopes]
+    return tri.closest(x), tri.contacts(x), tri.signed_distance(x), [slope(x) for slope in slopes]
 
 
 def ordered(curve):

@@ -63,6 +63,7 @@ FUNCTIONS = {
     "search_triangles": lambda x: jfrnn.search_triangles(x, *SEGMENTS, 0.2, capacity=4, backend="warp"),
     "search_triangles, jax": lambda x: jfrnn.search_triangles(x, *SEGMENTS, 0.2, capacity=4, backend="jax"),
     "closest": lambda x: jfrnn.search_triangles(x, *SEGMENTS, 0.2, capacity=4, backend="warp").closest(x),
+    "contacts": lambda x: jfrnn.search_triangles(x, *SEGMENTS, 0.2, capacity=4, backend="warp").contacts(x),
     "sort_order": lambda x: jfrnn.sort_order(x, 0.1),
     "morton_encode": lambda x: jfrnn.morton_encode(cells(x)),
     "morton_decode": lambda x: jfrnn.morton_decode(jfrnn.morton_encode(cells(x)), 2),
