@@ -122,10 +122,10 @@ def test_values_of_settings_have_their_kind():
     assert fluids.fluid("dam").physics.viscosity == 1.0
 
 
-def write_cube(path, center=(0.0, 0.0, 0.0), edge=1.0, faces=12):
+def write_cube(path, center=(0.0, 0.0, 0.0), edge=1.0, faces=range(12)):
     """Write a cube as STL, each of its triangles with corners of its own."""
     vertices, named = meshes.cube(edge, 1)
-    trimesh.Trimesh(vertices + center, named[:faces], process=False).export(path)
+    trimesh.Trimesh(vertices + center, named[list(faces)], process=False).export(path)
     return path
 
 
@@ -167,7 +167,7 @@ def test_files_that_hold_no_wall_are_refused(tmp_path, ending):
 
 
 def test_a_wall_that_is_open_is_refused_before_a_folder_is_made(tmp_path):
-    path = write_cube(tmp_path / "open.stl", (0, 0, 4), 2.0, faces=11)
-    code, _, error = invoke("jet-gear", "--solid", path, "--solid-unit", 0.001, "--out", tmp_path / "run", "--set", "layers=2")
+    path = write_cube(tmp_path / "open.stl", (1.0, 2.0, 4.0), 2.0, faces=[*range(11), 0])
+    code, _, error = invoke("jet", "--solid", path, "--solid-unit", 0.001, "--out", tmp_path / "run")
     assert (code, "solid must be a closed mesh" in error, error.count("\n")) == (2, True, 1)
     assert not (tmp_path / "run").exists()

@@ -233,7 +233,7 @@ def test_signs_are_those_of_the_union(dim, name, dtype, backend):
     assert np.allclose(np.abs(distance[mask]), nearest[mask], rtol=1e-6)
 
 
-@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])  # in 3D the next test does, with one wall
 @pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
 def test_rays_without_warp(dim, dtype):
     """Rays of arrays tell the sides that those of kernels do, also of points as near as rounding, or leave them open."""
