@@ -312,8 +312,8 @@ def found_triangles(
     """Return the fields of a list that come from data; with capacity=None only counts. `cells`: those of an earlier list."""
     radius = make_cutoff(cutoff, np.dtype(points.dtype), closed=False)
     with own_transfers():
-        given = *lax.stop_gradient((points, vertices, faces, cells)), radius
-        return call_apart(lambda *given: find_triangles(*given, backend, capacity), *given)
+        find = functools.partial(find_triangles, backend=backend, capacity=capacity)
+        return call_apart(find, *lax.stop_gradient((points, vertices, faces, cells)), radius)
 
 
 @functools.partial(compiled, static_argnames=("backend", "capacity"))
