@@ -73,7 +73,7 @@ def listed(names="", backend="warp", cutoff=CUTOFF, rule="gather", x="x"):
     now = places | {key: options[key] for key in ("active",) if key in options}
     total = 256
     asked = [nbrs.overflow, nbrs.pairs(), nbrs.csr(), nbrs.pairs(total), nbrs.csr(total), nbrs.require(total).status]
-    asked += [] if nbrs.images is not None and not nbrs.box_kind.nearest else [nbrs.to_jraph(total)]
+    asked += [nbrs.to_jraph(total)] if nbrs.images is None else []
     asked += [nbrs.vectors(x, **places), nbrs.distances(x, **places), nbrs.shifts(x, **places)]
     asked += [nbrs.rebuild_count] if "skin" in options else []
     return nbrs, nbrs.update(x, **now), nbrs.grow(x, **now), asked
