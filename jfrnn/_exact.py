@@ -282,10 +282,15 @@ def is_pair_of(rows: Array, sources: Array, neighbor: Array, cutoff: "Cutoff | C
 
     def points(at: Array | None) -> Pair:
         source = neighbor if at is None else flat_take(neighbor, at)
-        pair = Pair([of_rows(rows[:, axis], at) for axis in axes], [sources[source, axis] for axis in axes], radii_of(at, source))
+        if at is None:
+            own, others = [of_rows(rows[:, axis], at) for axis in axes], [sources[source, axis] for axis in axes]
+        else:
+            own, others = list(rows.at[at // neighbor.shape[1]].get(mode="clip").T), list(sources[source].T)
+        pair = Pair(own, others, radii_of(at, source))
         if shifted is None:
             return pair
-        shift = [shifted.shifts[..., k] if at is None else flat_take(shifted.shifts[..., k], at) for k in axes]
+        shifts = shifted.shifts if at is None else shifted.shifts.reshape(-1, len(axes)).at[at].get(mode="clip")
+        shift = list(jnp.moveaxis(shifts, -1, 0))
         shift, matrix = shift_in_given(shift, shifted.basis, shifted.matrix)
         return pair._replace(shift=shift, matrix=matrix, orthogonal=shifted.orthogonal)
 
@@ -335,10 +340,13 @@ def _refine_some(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) ->
     signs = jnp.where(doubtful, _sum_sign(pairs, _threshold(pairs, cutoff)), 1).reshape(-1)
     chunk = min(_INTEGER_CHUNK, signs.size)
 
-    def decide_chunk(signs: Array) -> Array:
-        at = set_places(signs == _UNKNOWN, chunk)
+    def decide_at(signs: Array, at: Array) -> Array:
         pairs = points(at)
         return signs.at[at].set(_integer_sign(pairs, _threshold(pairs, cutoff)), mode="drop")
+
+    def decide_chunk(signs: Array) -> Array:
+        at = set_places(signs == _UNKNOWN, chunk)  # there is one: the branch is a wall, or XLA finds `at` anew for each use of it
+        return lax.cond(at[0] < signs.size, decide_at, lambda signs, _: signs, signs, at)
 
     signs = lax.while_loop(lambda signs: jnp.any(signs == _UNKNOWN), decide_chunk, signs)
     return (signs <= 0 if cutoff.closed else signs < 0).reshape(doubtful.shape)
@@ -490,25 +498,33 @@ def _integer_sign(pair: Pair, threshold: _Threshold) -> Array:
     So are two radii, added up, and twice the differences that are compared with them.
     """
     dim, times = len(pair.a), threshold.times
-    radii = [jnp.broadcast_to(radius, pair.a[0].shape) for radius in threshold.radii]
-    limbs = _limbs(jnp.stack([*pair.a, *pair.b, *radii]))  # [2d + times, k, count]
-    differences, radius = times * (limbs[dim : 2 * dim] - limbs[:dim]), limbs[2 * dim :].sum(axis=0, dtype=jnp.int32)
+    columns = jnp.stack([*pair.a, *pair.b, *(jnp.broadcast_to(radius, pair.a[0].shape) for radius in threshold.radii)])
+    numbers = columns.reshape(-1) if pair.matrix is None else jnp.concatenate([columns.reshape(-1), pair.matrix.reshape(-1)])
+    limbs = _limbs(numbers)  # of all at once: what is written here is compiled wherever a pair is decided
+    of_pairs, of_lattice = limbs[: columns.size].reshape(*columns.shape, -1), limbs[columns.size :]
+    squared = times * (of_pairs[dim : 2 * dim] - of_pairs[:dim])
+    if pair.shift is not None:
+        squared = squared + _translation_limbs(times * jnp.stack(pair.shift).astype(jnp.int32), of_lattice, dim, pair.orthogonal)
+    squared = jnp.concatenate([squared, of_pairs[2 * dim :].sum(axis=0, keepdims=True, dtype=jnp.int32)])  # [d + 1, k, count]
     if pair.shift is not None or times > 1:
-        for axis in range(dim):
-            for shift, component in pair.lattice_terms(axis):
-                differences = differences.at[axis].add(times * shift.astype(jnp.int32)[:, None] * _limbs(component)[None])
-        more = ((0, 0), (0, 0), (0, 3))
-        differences, radius = _carried(jnp.pad(differences, more)), _carried(jnp.pad(radius, more[1:]))
-    count = differences.shape[-1]
+        squared = _carried(jnp.pad(squared, ((0, 0), (0, 0), (0, 3))))
+    signs, count = np.array([1] * dim + [-1], np.int32)[:, None, None], squared.shape[-1]
 
     def add_shifted(i: Array, total: Array) -> Array:
-        squares = -limb_of(radius, i) * radius
-        squares = squares + jnp.sum(limb_of(differences, i) * differences, axis=0, dtype=jnp.int32)
+        squares = jnp.sum(signs * limb_of(squared, i) * squared, axis=0, dtype=jnp.int32)
         window = lax.dynamic_slice_in_dim(total, i, count, axis=1)
         return lax.dynamic_update_slice_in_dim(total, window + squares, i, axis=1)
 
-    total = jnp.zeros((radius.shape[0], 2 * count), jnp.int32)
+    total = jnp.zeros((squared.shape[1], 2 * count), jnp.int32)
     return sign_of_limbs(lax.fori_loop(0, count, add_shifted, total))
+
+
+def _translation_limbs(shift: Array, limbs: Array, dim: int, orthogonal: bool) -> Array:
+    """Return shifts [t, k] times lattice vectors, of which limbs [t·d, count] are given, added up: [d, k, count]."""
+    vectors = limbs.reshape(-1, dim, 1, limbs.shape[-1])
+    if orthogonal:
+        return shift[:dim, :, None] * jnp.stack([vectors[axis, axis] for axis in range(dim)])
+    return jnp.sum(shift[:, None, :, None] * vectors, axis=0, dtype=jnp.int32)
 
 
 def _carried(limbs: Array) -> Array:
