@@ -52,7 +52,7 @@ def warm(kind):
     return jfrnn.search(x, 0.6, **SEARCHES[kind](x))
 
 
-@pytest.mark.parametrize("kind", SEARCHES)
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.slow] * (k in ("box", "active", "batch"))) for k in SEARCHES])
 def test_a_search_of_a_new_size_compiles_a_count_and_a_list(kind):
     warm(kind)
     x = scene(next(SIZES))
@@ -95,6 +95,7 @@ def test_what_is_asked_of_a_list_of_a_new_size_compiles_one_program_each():
     assert compiled_by(jfrnn.sort_order, x, 0.6) == 1
 
 
+@pytest.mark.slow
 def test_a_box_compiles_no_more():
     warm("box")
     x = scene(next(SIZES))
@@ -109,7 +110,11 @@ def balanced(r, i, j):
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"box": BOX}, {"fn": balanced, "symmetry": "antisymmetric"}],
+    [
+        pytest.param({}, marks=pytest.mark.slow),
+        pytest.param({"box": BOX}, marks=pytest.mark.slow),
+        {"fn": balanced, "symmetry": "antisymmetric"},
+    ],
     ids=["open", "box", "symmetry"],
 )
 def test_a_sum_over_pairs_of_a_new_size_compiles_two_programs(options):
@@ -120,7 +125,7 @@ def test_a_sum_over_pairs_of_a_new_size_compiles_two_programs(options):
     assert compiled_by(jfrnn.pair_sum, fn, x, 0.6, **given) == 2  # one sums, one marks rows that have no sum
 
 
-@pytest.mark.parametrize("half", [False, True])
+@pytest.mark.parametrize("half", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_sum_over_a_list_of_a_new_size_compiles_two_programs_and_vectors(half):
     x, y = scene(next(SIZES)), scene(next(SIZES))
     jfrnn.pair_sum(energy, x, None, neighbors=jfrnn.search(x, 0.6, half=half))
@@ -168,6 +173,7 @@ def test_padded_structures_in_boxes_of_their_own_share_a_program():
     assert programs[1:] == [0, 0]
 
 
+@pytest.mark.slow
 def test_programs_of_many_sizes_are_let_go(monkeypatch):
     _programs.clear_programs()
     monkeypatch.setattr(_programs, "MOST", 20)
