@@ -80,7 +80,9 @@ def as_on_one_device(cases, kind):
             found = {"eager": case(x, r), "jit": jax.jit(case)(x, r)}
         for how, result in found.items():
             for one, other in zip(jax.tree.leaves(result), expected, strict=True):
-                np.testing.assert_array_equal(one, other, err_msg=f"{name}, {how}")
+                # Another program than the eager calls': fully compiled, it may join products and sums.
+                near = 1e-6 if how == "jit" and jnp.issubdtype(one.dtype, jnp.floating) else 0
+                np.testing.assert_allclose(one, other, rtol=near, atol=0, err_msg=f"{name}, {how}")
 
 
 @check
