@@ -24,7 +24,7 @@ from experiments import _machine, _measure, _sweep, _trace
 from experiments._config import Positive, Table, digest
 from experiments._rows import RETRIED, RowFile
 from jfrnn import distributed
-from jfrnn._shards_scatter import fetched
+from jfrnn._shards.scatter import fetched
 
 _WORK = ("list", "pair_sum", "sph")
 _SENDS = re.compile(r"= (.*?) collective-permute(?:-start)?\((.*?)\),.*?source_target_pairs=\{(.*?)\}\}")

@@ -19,8 +19,8 @@ from tqdm import tqdm
 
 from experiments import _compare, _config, _gpu_sums, _gpu_triangles, _machine, _measure, _ways
 from experiments._config import Positive, Table
-from jfrnn._neighbors import rounded_capacity
-from jfrnn._warp import kernels_of, load_warp
+from jfrnn._engine.warp import kernels_of, load_warp
+from jfrnn._search.neighbor_list import rounded_capacity
 
 
 class Exactness(Table):
@@ -205,7 +205,7 @@ def _radii_decisions(config: Exactness, dtype: str, dim: int) -> Iterator[tuple[
     from jfrnn.cases.radii import RADII_CASES  # pyright: ignore[reportMissingImports]
 
     import jfrnn
-    from jfrnn._exact import RULES
+    from jfrnn._geometry.exact import RULES
 
     def padded(radii: np.ndarray) -> np.ndarray:
         return np.concatenate([radii, np.ones(128 - len(radii), radii.dtype)])
@@ -265,7 +265,7 @@ def _oracle() -> Any:  # noqa: ANN401
 
 def _images(nbrs: Any, x: Any, queries: Any) -> list[tuple[int, int, tuple[int, ...]]]:  # noqa: ANN401
     """Return (i, j, S) of every slot, sorted, on the host: a program for each kind of box would take long to compile."""
-    from jfrnn._box import unpacked_turns
+    from jfrnn._geometry.box import unpacked_turns
 
     idx, count = np.asarray(nbrs.idx), np.asarray(nbrs.count)
     i, k = np.nonzero(np.arange(nbrs.capacity) < count[:, None])

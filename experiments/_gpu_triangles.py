@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from experiments import _compare, _measure, _triangles
-from jfrnn._warp import load_warp
+from jfrnn._engine.warp import load_warp
 
 
 def decisions(oracle: Any, dtype: str, dim: int, capacity: int, backend: str) -> Iterator[tuple[str, bool]]:  # noqa: ANN401
@@ -141,10 +141,10 @@ def _calls(tri: Any, x: Any, vertices: Any, steps: int) -> dict[str, Callable[[]
 def launchable(tri: Any, x: Any, device: str) -> tuple[list[Any], Any, Any, Any]:  # noqa: ANN401
     """Return the commands of a query with the cells of a list, and its arrays on a device: idx, count, scratch."""
     wp = load_warp()
-    from jfrnn import _triangles_warp
-    from jfrnn._exact import make_cutoff
-    from jfrnn._triangles_cells import without_faults
-    from jfrnn._warp import kernels_of
+    from jfrnn._engine.warp import kernels_of
+    from jfrnn._geometry.exact import make_cutoff
+    from jfrnn._triangles import warp as _triangles_warp
+    from jfrnn._triangles.cells import without_faults
 
     n, dim = x.shape
     variant = _triangles_warp._Variant(dim, x.dtype == np.float64, lists=True, tree=tri.backend == "bvh")

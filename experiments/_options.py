@@ -14,7 +14,7 @@ import pandas as pd
 
 import jfrnn
 from experiments import _machine, _measure
-from jfrnn._neighbors import rounded_capacity
+from jfrnn._search.neighbor_list import rounded_capacity
 
 COLUMNS = (
     *("platform", "backend", "n", "option", "entries", "capacity", "rounds", "list_s", "count_s", "list_ratio", "count_ratio"),

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 import jfrnn
 from experiments import _config, _layouts, _machine, _measure, _oracle
-from jfrnn._neighbors import rounded_capacity
+from jfrnn._search.neighbor_list import rounded_capacity
 
 JITTER = 0.3  # of a spacing, to either side
 SAMPLE = 2000  # particles whose neighbors are compared with the oracle's

@@ -11,7 +11,7 @@ import pandas as pd
 
 import jfrnn
 from experiments import _measure
-from jfrnn._neighbors import rounded_capacity
+from jfrnn._search.neighbor_list import rounded_capacity
 
 ORDERS = ("random", "row", "morton", "hilbert")
 

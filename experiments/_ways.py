@@ -246,7 +246,7 @@ def _our_list(given: Given) -> Callable[[Any], Any]:
 
 def _capacity(given: Given) -> int:
     import jfrnn
-    from jfrnn._neighbors import rounded_capacity
+    from jfrnn._search.neighbor_list import rounded_capacity
 
     return rounded_capacity(int(jfrnn.count(given.x, given.cutoff).max()))
 

@@ -9,17 +9,21 @@ Array([1, 1, 0], dtype=int32)
 [[0, 1], [1, 0]]
 """
 
-from jfrnn._box import Box
-from jfrnn._chunks import run_chunk
+from jfrnn._geometry import (
+    Box,
+    NeighborOverflowError,
+    Status,
+    hilbert_decode,
+    hilbert_encode,
+    merge_vertices,
+    morton_decode,
+    morton_encode,
+    sort_order,
+)
 from jfrnn._memory import MemoryPlan, memory_plan
-from jfrnn._meshes import merge_vertices
-from jfrnn._neighbors import NeighborList
-from jfrnn._order import hilbert_decode, hilbert_encode, morton_decode, morton_encode, sort_order
-from jfrnn._pair_sum import pair_sum
-from jfrnn._search import count, search
-from jfrnn._status import NeighborOverflowError, Status
-from jfrnn._triangles import search_triangles
-from jfrnn._triangles_list import TriangleList
+from jfrnn._search import NeighborList, count, run_chunk, search
+from jfrnn._sums import pair_sum
+from jfrnn._triangles import TriangleList, search_triangles
 
 __all__ = [
     "Box",

@@ -12,15 +12,11 @@ import numpy as np
 from jax import Array
 from jax.sharding import SingleDeviceSharding
 
-from jfrnn import _warp
-from jfrnn._auto import WARP_ENGINES, default_platform, fastest_engine
-from jfrnn._backends import Inputs, Options, count_rows, list_rows
-from jfrnn._exact import Cutoff
-from jfrnn._inputs import checked_backend, checked_capacity, checked_cutoff, checked_kind, checked_size, checked_skin
-from jfrnn._pair_sum import pair_sum
-from jfrnn._runs import Filter
-from jfrnn._triangles import TRIANGLE_BACKENDS, fastest_of
-from jfrnn._triangles_list import find_triangles
+from jfrnn._engine import WARP_ENGINES, Filter, Inputs, Options, count_rows, default_platform, fastest_engine, list_rows
+from jfrnn._engine import scratch_bytes as warp_scratch_bytes
+from jfrnn._geometry import Cutoff, checked_backend, checked_capacity, checked_cutoff, checked_kind, checked_size, checked_skin
+from jfrnn._sums import pair_sum
+from jfrnn._triangles import TRIANGLE_BACKENDS, fastest_of, find_triangles
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,7 +140,7 @@ def memory_plan(
     if engine == "auto":
         engine = fastest_engine(_device_of(where).platform, n)
     if engine in WARP_ENGINES:
-        scratch = _warp.scratch_bytes(engine, where, n, rows, dim, dtype == np.float64, queries is None)
+        scratch = warp_scratch_bytes(engine, where, n, rows, dim, dtype == np.float64, queries is None)
     else:
         at = SingleDeviceSharding(_device_of(where))
         points = [None if size is None else jax.ShapeDtypeStruct((size, dim), dtype, sharding=at) for size in (n, queries)]

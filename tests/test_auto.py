@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import jfrnn
-from jfrnn import _auto
+from jfrnn._engine import auto as _auto
 
 ROOT = Path(__file__).parent.parent
 X = np.random.default_rng(0).random((50, 3)).astype(np.float32)

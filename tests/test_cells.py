@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jfrnn import _cells
-from jfrnn._box import Images
-from jfrnn._exact import smallest_cutoff
+from jfrnn._geometry import cells as _cells
+from jfrnn._geometry.box import Images
+from jfrnn._geometry.exact import smallest_cutoff
 
 
 def edge_of(cutoff, dtype):

@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 from jfrnn.kernels import cells_cpu, cells_cuda, levels
 
-from jfrnn._levels import GROUPS, HALVINGS
+from jfrnn._geometry.levels import GROUPS, HALVINGS
 
 VARIANTS = [(dim, double, False, lists, False) for dim, double, lists in itertools.product((2, 3), (False, True), (False, True))]
 VARIANTS += [

@@ -8,7 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from jfrnn import _cuda, _ffi, _launch
+from jfrnn._engine import cuda as _cuda
+from jfrnn._engine import ffi as _ffi
+from jfrnn._engine import launch as _launch
 
 NAME = b"called@here"
 DEVICES = [SimpleNamespace(alias=f"cuda:{k}", make_current=lambda: None) for k in range(2)]  # not hashable, as those of Warp

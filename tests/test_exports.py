@@ -9,7 +9,7 @@ import pytest
 import reference
 
 import jfrnn
-from jfrnn._exports import flat_pairs, pair_total, row_offsets
+from jfrnn._search.exports import flat_pairs, pair_total, row_offsets
 
 X = jnp.asarray(np.random.default_rng(0).random((50, 3)), jnp.float32)
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jfrnn._flags import set_places
+from jfrnn._tracing.flags import set_places
 
 
 @pytest.mark.parametrize("n", [0, 1, 31, 32, 33, 1000])

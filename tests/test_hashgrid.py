@@ -10,7 +10,7 @@ import pytest
 from jfrnn.kernels.hashgrid import grid_shape
 
 import jfrnn
-from jfrnn import _warp
+from jfrnn._engine import warp as _warp
 
 
 @pytest.mark.parametrize(

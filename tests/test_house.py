@@ -13,6 +13,15 @@ import pytest
 import jfrnn
 
 ROOT = Path(__file__).parent.parent
+FLOORS = (  # from the lowest: a package or module of the library imports only from floors below its own
+    {"_tracing"},
+    {"_geometry"},
+    {"_engine"},
+    {"_search"},
+    {"_sums", "_triangles"},
+    {"_shards", "_memory"},
+    {"distributed", ""},  # "": the public names
+)
 ALLOWED = {  # first-party and third-party modules that each folder may import
     "kernels": {"warp"},
     "cases": {"numpy"},
@@ -39,11 +48,97 @@ def test_imports(folder):
     for path in files:
         roots = {module.split(".")[0] for module in imported_modules(path)} - set(sys.stdlib_module_names)
         within = {"jfrnn"} if folder in ("kernels", "cases") else set()  # jfrnn.kernels, jfrnn.cases
-        within |= {"warp"} if path == ROOT / "jfrnn" / "_start.py" else set()  # where it is needed, not when jfrnn is imported
+        within |= (
+            {"warp"} if path == ROOT / "jfrnn" / "_engine" / "start.py" else set()
+        )  # where it is needed, not when jfrnn is imported
         assert roots <= ALLOWED[folder] | within, f"{path.name} imports {roots - ALLOWED[folder]}"
         if folder in ("kernels", "cases"):
             own = f"jfrnn.{folder}"
             assert all(m.startswith(own) for m in imported_modules(path) if m.split(".")[0] == "jfrnn"), path.name
+
+
+def modules_below(folder, name):
+    """Return the path of every module of a package by its dotted name."""
+    named = {path.relative_to(ROOT / folder).with_suffix("").parts: path for path in (ROOT / folder).rglob("*.py")}
+    return {".".join((name, *(part for part in parts if part != "__init__"))): path for parts, path in named.items()}
+
+
+def taken_from(path):
+    """Yield what a file imports: a dotted module and a name of it, or None."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, None) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = [".".join(package_of(path).split(".")[: 1 - node.level or None])] if node.level else []
+            module = ".".join([*above, *([node.module] if node.module else [])])
+            yield from ((module, alias.name) for alias in node.names)
+
+
+def package_of(path):
+    """Return the dotted name of the package in which a file stands."""
+    parts = path.relative_to(ROOT).parent.parts
+    return ".".join(("jfrnn", *parts) if parts[0] in ("cases", "kernels") else parts)
+
+
+def floor_of(room):
+    return next(level for level, rooms in enumerate(FLOORS) if room in rooms)
+
+
+def room_of(module):
+    """Return the package of a module of the library, or the module itself where it stands beside the packages."""
+    return ([*module.split("."), ""])[1]
+
+
+LIBRARY = modules_below("jfrnn", "jfrnn")
+
+
+@pytest.mark.parametrize("module", sorted(LIBRARY))
+def test_floors_and_doors(module):
+    """A package takes from floors below it, and only what their doors list."""
+    room = room_of(module)
+    for source, name in taken_from(LIBRARY[module]):
+        if source.split(".")[0] != "jfrnn" or source.startswith("jfrnn.kernels"):
+            continue
+        other = room_of(source)
+        if room == other:
+            assert source not in ("jfrnn", f"jfrnn.{room}"), f"{module} goes through its own door to {name}"
+            continue
+        assert floor_of(other) < floor_of(room), f"{module} imports {source}, which is not on a floor below"
+        assert source == f"jfrnn.{other}", f"{module} reaches past the door of {other}: {source}.{name}"
+        door = importlib.import_module(source)
+        assert name in getattr(door, "__all__", [name]), f"{module} takes {name}, which is not at the door of {other}"
+
+
+def circles(graph):
+    """Return the modules that reach themselves."""
+
+    def reached(module):
+        seen, waiting = set(), [module]
+        while waiting:
+            new = graph[waiting.pop()] - seen
+            seen |= new
+            waiting += new
+        return seen
+
+    return sorted(module for module in graph if module in reached(module))
+
+
+def test_circles_are_found():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": set()}) == ["b", "c"]
+
+
+@pytest.mark.parametrize(
+    ("folder", "name"),
+    [("jfrnn", "jfrnn"), ("kernels", "jfrnn.kernels"), ("cases", "jfrnn.cases")],
+)
+def test_no_circles(folder, name):
+    """No module imports itself by way of others, wherever in its text the imports stand."""
+    modules = modules_below(folder, name)
+    graph = {}
+    for module, path in modules.items():
+        taken = {f"{source}.{part}" if f"{source}.{part}" in modules else source for source, part in taken_from(path)}
+        graph[module] = taken & modules.keys() - {module}
+    assert circles(graph) == []
 
 
 def test_nothing_imports_experiments():

@@ -17,7 +17,7 @@ import warp as wp
 import jfrnn
 import jfrnn._memory
 from experiments import _measure
-from jfrnn import _warp
+from jfrnn._engine import warp as _warp
 
 ROOT = Path(__file__).parent.parent
 SIZES = [(1000, 40), (30_000, 256), (300_000, 40)]

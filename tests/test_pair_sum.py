@@ -15,7 +15,9 @@ from jfrnn.cases.periodic import PERIODIC_CASES
 from jfrnn.cases.radii import RADII_CASES
 
 import jfrnn
-from jfrnn import _relations, _runs, _summation
+from jfrnn._engine import runs as _runs
+from jfrnn._sums import relations as _relations
+from jfrnn._sums import summation as _summation
 
 SLOW = pytest.mark.slow
 LENGTH = 704  # so that cases share compiled programs

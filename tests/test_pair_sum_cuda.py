@@ -13,9 +13,10 @@ import warp as wp
 from jfrnn.kernels import cells_cuda, pair_sum_cpu, pair_sum_cuda
 
 import jfrnn
-from jfrnn import _fused, _warp
-from jfrnn._pair_sum import _with_engine
-from jfrnn._search import checked_problem
+from jfrnn._engine import warp as _warp
+from jfrnn._search.search import checked_problem
+from jfrnn._sums import fused as _fused
+from jfrnn._sums.verb import _with_engine
 
 CUTOFF = 0.1
 
@@ -168,10 +169,10 @@ def test_rows_of_values_begin_where_16_bytes_may_be_loaded(double):
 def test_auto_takes_the_kernel_on_cuda_and_jax_elsewhere(monkeypatch):
     x = np.zeros((4, 3), np.float32)
     problem = checked_problem(x, 1.0, None, None, None, "gather", False, False, False, "auto", 0.0, None)
-    monkeypatch.setattr("jfrnn._pair_sum.platform_of", lambda *_: "gpu")
+    monkeypatch.setattr("jfrnn._sums.verb.platform_of", lambda *_: "gpu")
     assert _with_engine(problem, "auto").backend == "auto"
     assert _with_engine(problem, "warp").backend == "warp"
-    monkeypatch.setattr("jfrnn._pair_sum.platform_of", lambda *_: "rocm")
+    monkeypatch.setattr("jfrnn._sums.verb.platform_of", lambda *_: "rocm")
     assert _with_engine(problem, "auto").backend == "jax"
     with pytest.raises(ValueError, match="on the platform 'rocm', only on the CPU and on CUDA"):
         _with_engine(problem, "warp")

@@ -14,7 +14,7 @@ from jfrnn.cases.hard import HARD_CASES
 from test_pair_sum import CUTOFF, HARD, LENGTH, SLOW, N, arrays_of, assert_same, everything, oracle_sum, scene, smooth, tangents_of
 
 import jfrnn
-from jfrnn import _translate
+from jfrnn._sums import translate as _translate
 
 fused = functools.partial(jfrnn.pair_sum, backend="warp")
 

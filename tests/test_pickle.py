@@ -13,8 +13,8 @@ import pytest
 
 import jfrnn
 from jfrnn import distributed
-from jfrnn._exports import DenseNeighbors
-from jfrnn._triangles_list import SignedDistance
+from jfrnn._search.exports import DenseNeighbors
+from jfrnn._triangles.triangle_list import SignedDistance
 
 X = jnp.asarray(np.random.default_rng(0).random((20, 2)), jnp.float32)
 WALL = jnp.asarray([[0.2, 0.1], [0.8, 0.4], [0.5, 0.9]], jnp.float32), jnp.asarray([[0, 1], [1, 2], [2, 0]])

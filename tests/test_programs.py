@@ -10,7 +10,7 @@ import pytest
 import reference
 
 import jfrnn
-from jfrnn import _programs
+from jfrnn._tracing import programs as _programs
 
 COMPILED = []
 jax.monitoring.register_event_duration_secs_listener(

@@ -13,7 +13,7 @@ from experiments._cli import app
 from experiments.sph import health
 from experiments.sph.model import make_model, make_state
 from experiments.sph.settings import make_scene, with_solid
-from jfrnn._triangles_winding import is_closed
+from jfrnn._triangles.winding import is_closed
 
 FEW = ("--frames", 3, "--set", "duration=0.003")
 

@@ -19,9 +19,9 @@ from jax import numpy as jnp
 from translated import Case, kernel_of, run
 from translated_cases import CASES, ELEMENTWISE, INTEGERS, PAIRS, N
 
-from jfrnn import _translate
-from jfrnn._primitives import TABLE
-from jfrnn._scalars import NoTranslationError, literal
+from jfrnn._sums import translate as _translate
+from jfrnn._sums.primitives import TABLE
+from jfrnn._sums.scalars import NoTranslationError, literal
 
 
 @functools.cache

@@ -11,8 +11,10 @@ import reference
 from jfrnn.cases.triangles import TRIANGLE_CASES, padded
 
 import jfrnn
-from jfrnn import _triangles_cells, _triangles_tree, _triangles_warp
-from jfrnn._exact import make_cutoff
+from jfrnn._geometry.exact import make_cutoff
+from jfrnn._triangles import cells as _triangles_cells
+from jfrnn._triangles import tree as _triangles_tree
+from jfrnn._triangles import warp as _triangles_warp
 
 BACKENDS = ("jax", "warp", "bvh")
 IN_CELLS = ("jax", "warp")

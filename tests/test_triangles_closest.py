@@ -13,11 +13,12 @@ from jfrnn.cases.triangles import TRIANGLE_CASES, padded
 from jfrnn.kernels import winding
 
 import jfrnn
-from jfrnn import _triangles_rows, _triangles_warp
-from jfrnn._exact import make_cutoff
-from jfrnn._triangles_closest import nearest_of
-from jfrnn._triangles_tree import WIDTH, grow_tree, level_starts
-from jfrnn._triangles_winding import cast_rays, is_closed, least_winding, ray_ways
+from jfrnn._geometry.exact import make_cutoff
+from jfrnn._triangles import rows as _triangles_rows
+from jfrnn._triangles import warp as _triangles_warp
+from jfrnn._triangles.closest import nearest_of
+from jfrnn._triangles.tree import WIDTH, grow_tree, level_starts
+from jfrnn._triangles.winding import cast_rays, is_closed, least_winding, ray_ways
 
 # of cutoffs of their own, each a program anew, between the smallest and the largest
 _IN_BETWEEN = {"ties_small", "ties_spacing", "ulps", "ulps_far", "ulps_large", "axis_ulps", "cell_edges"}

@@ -8,8 +8,8 @@ from jax.extend.core import jaxprs_in_params
 from jfrnn.cases import meshes
 
 import jfrnn
-from jfrnn import _triangles_list
-from jfrnn._triangles_closest import nearest_of
+from jfrnn._triangles import triangle_list as _triangles_list
+from jfrnn._triangles.closest import nearest_of
 
 CAPACITY = 40
 

@@ -19,11 +19,13 @@ from jfrnn.kernels import triangles_cuda
 from jfrnn.kernels._triangles import pending
 
 import jfrnn
-from jfrnn import _auto, _triangles, _triangles_warp
-from jfrnn._exact import make_cutoff
-from jfrnn._triangles_cells import without_faults
-from jfrnn._triangles_tree import WIDTH
-from jfrnn._triangles_warp import _Variant, query_inputs, sizes_on_cuda
+from jfrnn._engine import auto as _auto
+from jfrnn._geometry.exact import make_cutoff
+from jfrnn._triangles import verb as _triangles
+from jfrnn._triangles import warp as _triangles_warp
+from jfrnn._triangles.cells import without_faults
+from jfrnn._triangles.tree import WIDTH
+from jfrnn._triangles.warp import _Variant, query_inputs, sizes_on_cuda
 
 KINDS = list(product((np.float32, np.float64), (2, 3)))
 GUARD = 64  # words behind the scratch, which nobody may touch

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jfrnn
-from jfrnn import _chunks
-from jfrnn._verlet import list_radius
+from jfrnn._search import chunks as _chunks
+from jfrnn._search.verlet import list_radius
 
 CUTOFF, SKIN = 0.3, 0.1
 

@@ -9,8 +9,8 @@ import warp as wp
 from jfrnn.kernels import _math
 from jfrnn.kernels._native import ENTER, LEAVE
 
-from jfrnn import _translate
-from jfrnn._scalars import TYPES
+from jfrnn._sums import translate as _translate
+from jfrnn._sums.scalars import TYPES
 
 LANES = {"float32": 16, "float64": 8}
 NUMBER = {"float32": "float", "float64": "double"}

@@ -8,7 +8,7 @@ import warp
 
 from experiments.methods import Found
 from experiments.methods._padded import found_in_rows
-from jfrnn._warp import kernels_of
+from jfrnn._engine.warp import kernels_of
 
 wp: Any = warp  # whose types are those of kernels, not of what the host gets
 CELLS = (128, 128, 128)  # of Warp's examples

@@ -1,0 +1,289 @@
+"""Cells: which cell a particle is in, in which order the cells stand, and where the particles of a cell lie.
+
+A cell is a cube of edge `cell_edge(cutoff)`, a float slightly above the cutoff. Cells along x are adjacent in the order, so that
+the stencil of a particle is one contiguous run of sorted particles per row of cells: 3 runs in 2D, 9 in 3D.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jfrnn._geometry.box import Images
+
+_CELLS_PER_PARTICLE = 4  # a dense table holds at most this many cells per particle: 16 B per particle
+_SMALLEST_TABLE = 4096
+_FAR = np.int32(2**31 - 1)
+
+
+class Grid(NamedTuple):
+    """Sources in cell order, and what is needed to find a cell among them.
+
+    Attributes:
+        order: [n] int32, the particle at each place of the cell order; non-finite ones last.
+        coords: [d, n] int32 in that order, the cell of each particle (x, y[, z]); [d + 1, n] where systems are told apart, the last
+            being the system.
+        extent: [d] or [d + 1] int32, cells per axis; with a margin of one empty cell on either side where space is open.
+        dense: [] bool, whether the box is small enough for `table`.
+        table: [cells + 1] int32, the first place of each cell in row-major order (zeros where not dense).
+    """
+
+    order: Array
+    coords: Array
+    extent: Array
+    dense: Array
+    table: Array
+
+
+def cell_edge(radius: np.floating | Array) -> Array:
+    """Return the smallest float with half a mantissa (12 or 26 bits) above the cutoff."""
+    radius = jnp.asarray(radius)
+    unsigned, dropped = (jnp.uint32, 12) if radius.dtype == jnp.float32 else (jnp.uint64, 27)
+    bits = lax.bitcast_convert_type(radius, unsigned)
+    return lax.bitcast_convert_type(((bits >> unsigned(dropped)) + unsigned(1)) << unsigned(dropped), radius.dtype)
+
+
+def cell_coordinate(x: Array, edge: Array) -> Array:
+    """Return the index of the cell that holds each coordinate, as a whole float: the exact floor of |x|/edge, mirrored below 0.
+
+    Why no pair leaves the stencil: cells are intervals of width `edge` (x >= 0: [k·edge, (k+1)·edge) is cell k; x < 0: the mirror
+    image is cell -1-k), and `edge` exceeds the cutoff, so that two coordinates with a whole cell between them are further apart
+    than the cutoff. The quotient's rounding is undone: with half a mantissa in `edge` and in either half of q, the products
+    q_high·edge and q_low·edge are exact, and so is |x| - q_high·edge; the sign of the remainder is therefore right. From
+    q = 2^24 (2^53) on, neighboring floats are further apart than the cutoff, so that only equal coordinates, which share a cell,
+    can belong to a pair.
+    """
+    magnitude = jnp.abs(x)
+    quotient = jnp.floor(magnitude / edge)
+    quotient = jnp.where(_remainder(magnitude, quotient, edge) < 0, quotient - 1, quotient)
+    quotient = jnp.where(_remainder(magnitude, quotient + 1, edge) >= 0, quotient + 1, quotient)
+    return jnp.where(x < 0, -1 - quotient, quotient)
+
+
+def cell_remainder(x: Array, edge: Array) -> Array:
+    """Return how far |x| lies beyond the beginning of its cell, exactly: in [0, edge) while cells are told apart."""
+    cell = cell_coordinate(x, edge)
+    return _remainder(jnp.abs(x), jnp.where(x < 0, -1 - cell, cell), edge)
+
+
+def _remainder(magnitude: Array, quotient: Array, edge: Array) -> Array:
+    half = 2.0 ** (12 if edge.dtype == np.float32 else 26)
+    high = jnp.floor(quotient / half) * half
+    return (magnitude - high * edge) - (quotient - high) * edge
+
+
+class CellAxes(NamedTuple):
+    """How each axis is cut into cells: one entry per axis, `turns` [] whole float where it is periodic (cells in its length)."""
+
+    edges: list[Array]
+    turns: list[Array | None]
+
+
+def open_axes(edge: Array, dim: int) -> CellAxes:
+    """Cut every axis of an open space into cells of one edge."""
+    return CellAxes([edge] * dim, [None] * dim)
+
+
+def grid_coordinates(positions: Array, axes: CellAxes, finite: Array, batch: Array | None = None) -> tuple[Array, Array]:
+    """Number the cells of [d, n] coordinates along each axis: [d, n] int32, and the [d] extents; systems are a further axis.
+
+    Open axes count from 1 on, with margins: a small bounding box keeps its empty cells; in a large one, runs of empty planes
+    shrink to a single one, axis by axis: cells that touch still touch, cells that do not still do not, and no axis is longer than
+    2n + 1, however far apart the particles are. Periodic axes, whose coordinates are fractions from 0 to 1, count from 0 on.
+    Of `batch`, [n] uint32 from 0 on, equal numbers stay equal and different ones different; n are the most that there can be.
+    """
+    some = jnp.any(finite)
+    is_open = [turn is None for turn in axes.turns]
+    numbered = [
+        cell_coordinate(x, edge) if turn is None else jnp.clip(jnp.floor(x * turn), 0, turn - 1)
+        for x, edge, turn in zip(positions, axes.edges, axes.turns, strict=True)
+    ]
+    cells = jnp.stack(numbered)
+    lowest = jnp.where(some, jnp.min(cells, axis=1, initial=jnp.inf, where=finite), 0)[:, None]
+    highest = jnp.where(some, jnp.max(cells, axis=1, initial=-jnp.inf, where=finite), 0)[:, None]
+    cells = jnp.where(finite, cells, lowest)
+    extents = [
+        high - low + 3 if turn is None else turn for low, high, turn in zip(lowest[:, 0], highest[:, 0], axes.turns, strict=True)
+    ]
+    systems = 1 if batch is None else jnp.max(batch, initial=0).astype(cells.dtype) + 1
+    small = jnp.prod(jnp.stack(extents)) * systems <= _table_size(finite.size)
+    coords = lax.cond(
+        small,
+        lambda cells: jnp.stack(
+            [
+                (c - low).astype(jnp.int32) + 1 if free else c.astype(jnp.int32)
+                for c, low, free in zip(cells, lowest, is_open, strict=True)
+            ]
+        ),
+        lambda cells: jnp.stack(
+            [_squeeze_gaps(c) + 1 if free else c.astype(jnp.int32) for c, free in zip(cells, is_open, strict=True)]
+        ),
+        cells,
+    )
+    margins = [jnp.max(c) + 2 if turn is None else turn.astype(jnp.int32) for c, turn in zip(coords, axes.turns, strict=True)]
+    if batch is None:
+        return coords, jnp.stack(margins)
+    system = lax.cond(small, lambda batch: batch.astype(jnp.int32), _squeeze_gaps, batch)
+    return jnp.concatenate([coords, system[None]]), jnp.stack([*margins, jnp.max(system) + 1])
+
+
+def _squeeze_gaps(cells: Array) -> Array:
+    """Renumber whole floats, or uint32, [n] from 0 on, in order, with steps of at most 2."""
+    _, order = _sort_by(cells if cells.dtype == jnp.uint32 else ordered_bits(cells), _iota(cells.size))
+    ascending = cells[order]
+    before, after = ascending[:-1], ascending[1:]
+    step = jnp.where(after == before, 0, jnp.where(after - before == 1, 1, 2)).astype(jnp.int32)
+    place = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(step, dtype=jnp.int32)])
+    return jnp.zeros(cells.size, jnp.int32).at[order].set(place, unique_indices=True)
+
+
+def ordered_bits(x: Array) -> Array:
+    """Map floats to unsigned integers of the same order."""
+    unsigned = jnp.uint32 if x.dtype == jnp.float32 else jnp.uint64
+    top = unsigned(1 << (32 if x.dtype == jnp.float32 else 64) - 1)
+    bits = lax.bitcast_convert_type(x, unsigned)
+    return jnp.where(bits >= top, ~bits, bits | top)
+
+
+def _sort_by(key: Array, payload: Array) -> tuple[Array, Array]:
+    # two operands: XLA's fast sort on every device
+    ascending, carried = lax.sort((key, payload), num_keys=1, is_stable=True)
+    return ascending, carried
+
+
+def _iota(n: int) -> Array:
+    return lax.iota(jnp.int32, n)
+
+
+def _table_size(n: int) -> int:
+    return min(max(_SMALLEST_TABLE, _CELLS_PER_PARTICLE * n), 2**30)
+
+
+def build_grid(coords: Array, finite: Array, extent: Array, capacity: int) -> Grid:
+    """Sort n >= 1 sources by cell; `capacity` particles (sources and queries) bound the size of a dense table."""
+    cells = jnp.prod(extent.astype(jnp.float32)) * np.float32(1 + 1e-6)  # rounded up: a table is never too small
+    size = _table_size(capacity)
+    dense = cells <= size
+    order = cell_order(coords, finite, extent, dense)
+    coords = jnp.where(finite, coords, _FAR)[:, order]
+
+    def count_cells(coords: Array) -> Array:
+        cell = jnp.where(coords[0] == _FAR, size, _row_major(coords, extent))
+        return jnp.cumsum(jnp.zeros(size + 1, jnp.int32).at[cell + 1].add(1, mode="drop"), dtype=jnp.int32)
+
+    table = lax.cond(dense, count_cells, lambda _: jnp.zeros(size + 1, jnp.int32), coords)
+    return Grid(order, coords, extent, dense, table)
+
+
+def cell_order(coords: Array, finite: Array, extent: Array, dense: Array) -> Array:
+    """Return the [n] int32 order of particles by cell (x fastest), ties by index, non-finite ones last."""
+
+    def by_row_major_key(coords: Array) -> Array:
+        key = jnp.where(finite, _row_major(coords, extent), _FAR)
+        return _sort_by(key.astype(jnp.uint32), _iota(finite.size))[1]
+
+    def axis_by_axis(coords: Array) -> Array:
+        keys = jnp.where(finite, coords, _FAR).astype(jnp.uint32)
+        return lax.fori_loop(0, len(keys), lambda axis, order: _sort_by(keys[axis, order], order)[1], _iota(finite.size))
+
+    return lax.cond(dense, by_row_major_key, axis_by_axis, coords)
+
+
+def _row_major(coords: Sequence[Array] | Array, extent: Array) -> Array:
+    index = coords[-1]
+    for axis in range(len(coords) - 2, -1, -1):
+        index = index * extent[axis] + coords[axis]
+    return index
+
+
+def stencil_runs(grid: Grid, coords: Array, dim: int, images: Images | None = None) -> tuple[Array, Array, Array | None]:
+    """Find the sources in the cells around each query cell [d, m]: [m, runs] int32 first places, ends, and codes of their images.
+
+    Where systems are told apart, the cells are [d + 1, m], and the system is that of the query.
+
+    An open space has a run per row of 3 cells, 3^(d-1) of them. Along a periodic axis cells are numbered on beyond either end,
+    where they are those of an image; a row is cut where it enters another image.
+    Dense: two loads from the table per run. Otherwise: two binary searches per run among the sorted cells of the sources.
+    """
+    cells, code = _stencil_rows(coords, grid.extent, dim, images)
+    start, stop = places_between(grid, cells)
+    return (start, stop, None) if code is None else (start, jnp.where(cells[0] <= cells[1], stop, start), code)
+
+
+def places_between(grid: Grid, cells: list[Array]) -> tuple[Array, Array]:
+    """Return the first place and the end of rows of cells [m, r]: given are their first and last cell along x, then y[, z]."""
+
+    def from_table(cells: list[Array]) -> tuple[Array, Array]:
+        first, last, *rest = cells
+        row = _row_major([jnp.zeros_like(first), *rest], grid.extent)
+        return grid.table.at[row + first].get(mode="clip"), grid.table.at[row + last + 1].get(mode="clip")
+
+    def by_binary_search(cells: list[Array]) -> tuple[Array, Array]:
+        first, last, *rest = cells
+        bounds = _lower_bound(grid.coords, [jnp.stack([first, last + 1]), *(jnp.stack([c, c]) for c in rest)])
+        return bounds[0], bounds[1]
+
+    return lax.cond(grid.dense, from_table, by_binary_search, cells)
+
+
+def _stencil_rows(coords: Array, extent: Array, dim: int, images: Images | None) -> tuple[list[Array], Array | None]:
+    """Return first and last cell along x and the cells along the other axes of each run, [m, runs] each, and their images."""
+    reach = (0,) * dim if images is None else images.reach
+    steps = [range(-max(k, 1), max(k, 1) + 1) for k in reach]
+    if len(coords) > dim:
+        reach, steps = (*reach, 0), [*steps, range(1)]
+    parts = _parts_of_rows(coords[0], extent[0], reach[0], images)
+    rows = np.stack(np.meshgrid(*steps[1:], indexing="ij"), -1).reshape(-1, len(coords) - 1).astype(np.int32)
+
+    def each(parts: Sequence[Array]) -> Array:  # [m, runs]: the rows of the first part, then those of the next
+        return jnp.repeat(jnp.stack(parts, axis=1), len(rows), axis=1)
+
+    first, last, shift = (each([part[what] for part in parts]) for what in range(3))
+    shifts, cells = [shift], [first, last]
+    for axis in range(1, len(coords)):
+        cell = coords[axis][:, None] + np.tile(rows[:, axis - 1], len(parts))[None]
+        turn = jnp.zeros_like(cell) if reach[axis] == 0 else cell // extent[axis]
+        cells.append(cell - turn * extent[axis])
+        shifts.append(turn)
+    if images is None:
+        return cells, None
+    code = jnp.zeros_like(first)
+    for shift, k in zip(shifts, reach, strict=True):
+        code = code * (2 * k + 1) + (shift + k)
+    return cells, code
+
+
+def _parts_of_rows(x: Array, extent: Array, reach: int, images: Images | None) -> list[tuple[Array, Array, Array]]:
+    """Cut the row of cells around x [m] where images meet: for each part its first and last cell and its image, [m] each."""
+    if images is None or reach == 0:
+        return [(x - 1, x + 1, jnp.zeros_like(x))]
+    if images.nearest:  # at least two cells: only one other image is met
+        other = jnp.where(x == 0, -1, 1)
+        shifts = [jnp.zeros_like(x), other]
+    else:
+        shifts = [jnp.full_like(x, s) for s in range(-reach, reach + 1)]
+    most = extent - 1
+    return [(jnp.maximum(x - reach - s * extent, 0), jnp.minimum(x + reach - s * extent, most), s) for s in shifts]
+
+
+def _lower_bound(cells: Array, target: list[Array]) -> Array:
+    """Return the first place among sorted cells [d, n] that is not below the target, the last axis compared first."""
+
+    def is_below(place: Array) -> Array:
+        below = jnp.zeros(place.shape, bool)
+        for c, t in zip(cells, target, strict=True):  # x first: a later axis overrules an earlier one
+            here = c.at[place].get(mode="clip")
+            below = (here < t) | ((here == t) & below)
+        return below
+
+    def halve(_: Array, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bounds
+        middle = low + (high - low) // 2
+        right = is_below(middle) & (low < high)
+        return jnp.where(right, middle + 1, low), jnp.where(right, high, middle)
+
+    low = jnp.zeros(target[0].shape, jnp.int32)
+    n = cells.shape[1]
+    return lax.fori_loop(0, n.bit_length(), halve, (low, jnp.full_like(low, n)))[0]

@@ -1,0 +1,288 @@
+"""What a search accepts: every argument checked while tracing, with errors that name it, what came and what to do."""
+
+import math
+from numbers import Integral, Real
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+
+from jfrnn._geometry.batch import Batch
+from jfrnn._geometry.box import Box
+from jfrnn._geometry.exact import RULES, Cutoff, Radii, largest_cutoff, make_cutoff, smallest_cutoff
+from jfrnn._tracing import gathered, made_on_host, on_device
+
+BACKENDS = ("auto", "jax", "warp", "hashgrid", "brute")
+_MOST_POINTS = 2**31 - 32
+
+
+def checked_positions(name: str, positions: Any, like: Array | None = None) -> Array:  # noqa: ANN401
+    """Return positions as a float32 or float64 array [n, 2] or [n, 3], of the same kind as `like` where that is given."""
+    if not hasattr(positions, "dtype") or not hasattr(positions, "shape"):
+        raise TypeError(
+            f"{name} must be a JAX or NumPy array of shape [n, 2] or [n, 3], got {type(positions).__name__}: "
+            f"convert it with jnp.asarray({name}, dtype=jnp.float32)."
+        )
+    dtype, shape = np.dtype(positions.dtype), tuple(positions.shape)
+    if dtype not in (np.float32, np.float64):
+        raise TypeError(f"{name} must be float32 or float64, got {dtype}: convert them first, e.g. with .astype(jnp.float32).")
+    if dtype == np.float64 and not jax.config.read("jax_enable_x64"):
+        raise TypeError(
+            f"{name} are float64, but JAX's 64-bit mode is off and would round them to float32 in silence: call "
+            f'jax.config.update("jax_enable_x64", True) at start-up, or pass {name}.astype(np.float32).'
+        )
+    if len(shape) != 2 or shape[1] not in (2, 3):
+        raise ValueError(f"{name} must have shape [n, 2] or [n, 3], one row per particle, got shape {list(shape)}.")
+    check_is_known(name, shape)
+    if shape[0] > _MOST_POINTS:
+        raise ValueError(f"{name} hold {shape[0]} particles, but indices are int32: at most {_MOST_POINTS}.")
+    if like is not None and (dtype, shape[1]) != (like.dtype, like.shape[1]):
+        raise ValueError(
+            f"{name} must match positions ({like.dtype}, {like.shape[1]} columns), got {dtype} with {shape[1]} columns."
+        )
+    return on_device(positions)  # concrete inside jit too: search can then count what it closes over
+
+
+def check_is_known(name: str, shape: tuple[Any, ...]) -> None:
+    """Raise where a shape holds a symbol of `jax.export` in place of a number."""
+    symbols = [str(size) for size in shape if not isinstance(size, Integral)]
+    if symbols:
+        raise ValueError(
+            f"{name} must have a shape of numbers, got ({', '.join(map(str, shape))}): kernels and scratch are made for a number "
+            f"of rows, not for the symbol {symbols[0]}. Export one program for each number, or one for the most rows that come: "
+            "`search`, `count` and `pair_sum` take active= for those that are there."
+        )
+
+
+def checked_again(name: str, positions: Any, dtype: np.dtype, dim: int, rows: int, what: str = "the list") -> Array:  # noqa: ANN401
+    """Return positions that are of the kind and number for which something, such as a list, was made."""
+    points = checked_positions(name, positions)
+    if (points.dtype, points.shape[1]) != (dtype, dim):
+        raise ValueError(
+            f"{name} must be {dtype} with {dim} columns, for which {what} was made, got {points.dtype} with {points.shape[1]} "
+            f"columns: convert them, e.g. with .astype(jnp.{dtype}), or make {what} anew."
+        )
+    if points.shape[0] != rows:
+        noun = {"queries": "points", "vertices": "corners"}.get(name, "particles")
+        raise ValueError(
+            f"{name} hold {points.shape[0]} {noun}, but {what} was made for {rows}: make it anew for as many as there are."
+        )
+    return points
+
+
+def check_devices(name: str, given: Any, made: Any, what: str = "the list") -> None:  # noqa: ANN401
+    """Raise where an array and what was made before are bound to different devices, as far as that is known."""
+    if isinstance(given, Tracer) or isinstance(made, Tracer):
+        return
+    if not (getattr(given, "committed", False) and getattr(made, "committed", False)) or given.devices() == made.devices():
+        return
+    here, there = (", ".join(sorted(map(str, x.devices()))) for x in (given, made))
+    raise ValueError(
+        f"{name} lie on {here}, but {what} on {there}: move one of them with jax.device_put, or make {what} anew where {name} lie. "
+        "Over several devices, see jfrnn.distributed."
+    )
+
+
+def checked_cutoff(cutoff: Any, dtype: np.dtype) -> Cutoff:  # noqa: ANN401
+    """Return the cutoff, rounded once to the dtype of the positions."""
+    if isinstance(cutoff, Tracer):
+        raise TypeError(
+            "cutoff must be a static number, got a traced value: pass a Python float, mark the argument with "
+            "jax.jit(..., static_argnames='cutoff'), or pass an array with one per particle, which may be traced."
+        )
+    if np.ndim(cutoff) != 0:
+        raise ValueError(f"cutoff must be one number, got an array of shape {list(np.shape(cutoff))}.")
+    if isinstance(cutoff, bool) or not (isinstance(cutoff, Real) or hasattr(cutoff, "dtype")):
+        raise TypeError(f"cutoff must be a number, got {type(cutoff).__name__}.")
+    value = float(cutoff)
+    if not (math.isfinite(value) and value > 0):
+        raise ValueError(f"cutoff must be positive and finite, got {value}.")
+    low, high = smallest_cutoff(dtype), largest_cutoff(dtype)
+    if not low <= value <= high:
+        raise ValueError(
+            f"cutoff={value} is outside [{low:.1e}, {high:.1e}], the range in which {dtype} decides pairs exactly: "
+            "choose another unit of length, or float64."
+        )
+    return make_cutoff(value, dtype, closed=False)
+
+
+def checked_radii(cutoff: Any, rule: Any, sources: Array, queries: Array | None) -> Radii | None:  # noqa: ANN401
+    """Return cutoffs that differ from particle to particle, in the dtype of the positions; None where it is one number."""
+    if rule not in RULES:
+        raise ValueError(f"radius_rule must be one of {', '.join(map(repr, RULES))}, got {rule!r}.")
+    if not isinstance(cutoff, tuple | list) and np.ndim(cutoff) == 0:
+        return None
+    n, m = sources.shape[0], None if queries is None else queries.shape[0]
+    if m is None:
+        radii = _checked_radii_of("cutoff", cutoff, n, "particle", sources)
+        return Radii(None if rule == "gather" else radii, None if rule == "scatter" else radii, rule)
+    if rule == "gather":
+        return Radii(None, _checked_radii_of("cutoff", cutoff, m, "query (radius_rule='gather')", sources), rule)
+    if rule == "scatter":
+        return Radii(_checked_radii_of("cutoff", cutoff, n, "position (radius_rule='scatter')", sources), None, rule)
+    if not isinstance(cutoff, tuple) or len(cutoff) != 2:
+        raise ValueError(
+            f"cutoff must be a pair of arrays, of the positions [{n}] and of the queries [{m}], where radius_rule={rule!r} asks "
+            f"for both, got {_describe_array(cutoff)}."
+        )
+    of_sources = _checked_radii_of("cutoff[0]", cutoff[0], n, "position", sources)
+    return Radii(of_sources, _checked_radii_of("cutoff[1]", cutoff[1], m, "query", sources), rule)
+
+
+def _checked_radii_of(name: str, radii: Any, size: int, what: str, like: Array) -> Array:  # noqa: ANN401
+    if not hasattr(radii, "dtype") or not np.issubdtype(radii.dtype, np.floating):
+        raise TypeError(f"{name} must be a number, or an array of floats with one per {what}, got {_describe_array(radii)}.")
+    if tuple(radii.shape) != (size,):
+        raise ValueError(f"{name} must be a number, or have shape [{size}], one per {what}, got shape {list(radii.shape)}.")
+    return _as_dtype(radii, like.dtype)
+
+
+def _as_dtype(x: Any, dtype: Any) -> Array:  # noqa: ANN401
+    """Convert an array; one that is known on the host, where no program is compiled for its shape."""
+    if isinstance(x, Tracer):
+        return gathered(x).astype(dtype)
+    return on_device(x) if x.dtype == dtype else made_on_host(x, lambda known: known.astype(dtype))
+
+
+def largest_known(radii: Radii) -> float | None:
+    """Return the largest cutoff of those that are valid, 1 where none is; None where they are traced."""
+    given = [x for x in (radii.sources, radii.queries) if x is not None]
+    if any(isinstance(x, Tracer) for x in given):
+        return None
+    values: Any = np.concatenate(jax.device_get(given))
+    low, high = smallest_cutoff(values.dtype), largest_cutoff(values.dtype)
+    return float(np.max(values[(values >= low) & (values <= high)], initial=0)) or 1.0
+
+
+def checked_skin(skin: Any, cutoff: float, dtype: np.dtype) -> float:  # noqa: ANN401
+    """Return a static skin, rounded once to the dtype of the positions; 0 means that there is none."""
+    if isinstance(skin, Tracer | bool) or not isinstance(skin, int | float | np.number):
+        raise TypeError(f"skin must be a number known while tracing, got {_describe(skin)}.")
+    value = float(dtype.type(skin))
+    low, high = 2 * smallest_cutoff(dtype), largest_cutoff(dtype) - cutoff
+    if not (value == 0 or low <= value <= high):
+        raise ValueError(
+            f"skin={float(skin)} must be 0 (no skin) or between {low:.1e} and {high:.1e}, so that {dtype} can tell whether a "
+            "particle moved half of it: choose e.g. a tenth to a third of the cutoff."
+        )
+    return value
+
+
+def checked_active(active: Any, positions: Array) -> Array:  # noqa: ANN401
+    """Return the mask of the particles that take part, [n] bool."""
+    if not hasattr(active, "dtype") or np.dtype(active.dtype) != np.bool_:
+        raise TypeError(f"active must be an array of bool, one per particle, got {_describe_array(active)}.")
+    if tuple(active.shape) != positions.shape[:1]:
+        raise ValueError(f"active must have shape [{positions.shape[0]}], one bool per particle, got shape {list(active.shape)}.")
+    return on_device(active)
+
+
+def checked_batch(batch: Any, sources: Array, queries: Array | None) -> Batch:  # noqa: ANN401
+    """Return the systems of the particles, and of the queries if there are any, as int32."""
+    if queries is None:
+        return Batch(_checked_systems("batch", batch, sources.shape[0], "particle"), None)
+    if not isinstance(batch, tuple) or len(batch) != 2:
+        raise ValueError(
+            f"batch must be a pair of arrays, of the positions [{sources.shape[0]}] and of the queries [{queries.shape[0]}], got "
+            f"{_describe_array(batch)}."
+        )
+    of_sources = _checked_systems("batch[0]", batch[0], sources.shape[0], "position")
+    return Batch(of_sources, _checked_systems("batch[1]", batch[1], queries.shape[0], "query"))
+
+
+def _checked_systems(name: str, systems: Any, size: int, what: str) -> Array:  # noqa: ANN401
+    if not hasattr(systems, "dtype") or not np.issubdtype(systems.dtype, np.integer):
+        raise TypeError(f"{name} must be an array of integers, the system of each {what}, got {_describe_array(systems)}.")
+    if tuple(systems.shape) != (size,):
+        raise ValueError(f"{name} must have shape [{size}], the system of each {what}, got shape {list(systems.shape)}.")
+    if np.can_cast(systems.dtype, np.int32):
+        return _as_dtype(systems, jnp.int32)
+    if isinstance(systems, Tracer):
+        raise TypeError(f"{name} is {systems.dtype}, of which not all numbers fit into int32: convert it with .astype(jnp.int32).")
+    values: Any = np.asarray(jax.device_get(systems))
+    if values.size and not -(2**31) <= int(values.min()) <= int(values.max()) < 2**31:
+        raise ValueError(f"{name} holds numbers from {values.min()} to {values.max()}, but systems are numbered in int32.")
+    return made_on_host(systems, lambda known: known.astype(np.int32))
+
+
+def checked_box(box: Any, positions: Array, like: Box | None = None) -> Box | None:  # noqa: ANN401
+    """Return a box that repeats space along some axis of the positions, of the same kind as `like` where that is given; or None."""
+    if not isinstance(box, Box):
+        raise TypeError(f"box must be a jfrnn.Box, got {_describe(box)}: write e.g. jfrnn.Box([1.0, 1.0, 1.0]).")
+    if box.dim != positions.shape[1]:
+        raise ValueError(
+            f"box has {box.dim} axes, but positions have {positions.shape[1]} columns: give as many lengths or lattice vectors."
+        )
+    if like is not None and (box.periodic, box.orthogonal) != (like.periodic, like.orthogonal):
+        was, came = (f"periodic={b.periodic}, {'lengths' if b.orthogonal else 'matrix'}" for b in (like, box))
+        raise ValueError(f"box must be of the kind with which the list was made ({was}), got {came}.")
+    return box if any(box.periodic) else None
+
+
+def checked_flag(name: str, value: Any) -> bool:  # noqa: ANN401
+    """Return a static bool."""
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    raise TypeError(f"{name} must be True or False, known while tracing, got {_describe(value)}.")
+
+
+def checked_capacity(capacity: Any) -> int:  # noqa: ANN401
+    """Return a static capacity of at least one slot per row."""
+    if isinstance(capacity, bool) or not isinstance(capacity, int | np.integer):
+        raise TypeError(
+            f"capacity must be a static int (slots per row), known while tracing, got {_describe(capacity)}: pass a Python int, "
+            "e.g. nbrs.capacity of an earlier search."
+        )
+    if capacity < 1:
+        raise ValueError(f"capacity must be at least 1, got {capacity}.")
+    return int(capacity)
+
+
+def checked_slack(slack: Any) -> float:  # noqa: ANN401
+    """Return a static factor of at least 1."""
+    if isinstance(slack, bool) or not isinstance(slack, int | float | np.number):
+        raise TypeError(f"slack must be a number of at least 1, known while tracing, got {_describe(slack)}.")
+    if not (math.isfinite(slack) and slack >= 1):
+        raise ValueError(f"slack must be finite and at least 1 (the capacity is slack times the longest row), got {slack}.")
+    return float(slack)
+
+
+def checked_size(name: str, size: Any) -> int:  # noqa: ANN401
+    """Return a number of points that are not there yet."""
+    if isinstance(size, bool) or not isinstance(size, int | np.integer):
+        raise TypeError(f"{name} must be an int, the number of points, got {_describe(size)}.")
+    if not 0 <= size <= _MOST_POINTS:
+        raise ValueError(f"{name} must be a number of points from 0 to {_MOST_POINTS}, got {size}.")
+    return int(size)
+
+
+def checked_kind(dim: Any, dtype: Any) -> tuple[int, np.dtype]:  # noqa: ANN401
+    """Return the dimensions and the dtype of positions that are not there yet."""
+    if isinstance(dim, bool) or not isinstance(dim, int | np.integer) or dim not in (2, 3):
+        raise ValueError(f"dim must be 2 or 3, got {_describe(dim)}.")
+    if np.dtype(dtype) not in (np.float32, np.float64):
+        raise TypeError(f"dtype must be float32 or float64, got {np.dtype(dtype)}.")
+    if np.dtype(dtype) == np.float64 and not jax.config.read("jax_enable_x64"):
+        raise TypeError(
+            "dtype is float64, but JAX's 64-bit mode is off, so that no search can have such positions: call "
+            'jax.config.update("jax_enable_x64", True) at start-up, or pass dtype=np.float32.'
+        )
+    return int(dim), np.dtype(dtype)
+
+
+def checked_backend(backend: Any) -> str:  # noqa: ANN401
+    """Return the name of a backend."""
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(map(repr, BACKENDS))}, got {backend!r}.")
+    return backend
+
+
+def _describe(value: Any) -> str:  # noqa: ANN401
+    return f"a traced value {value}" if isinstance(value, Tracer) else f"{type(value).__name__} {value!r}"
+
+
+def _describe_array(value: Any) -> str:  # noqa: ANN401
+    return f"{np.dtype(value.dtype)} of shape {list(np.shape(value))}" if hasattr(value, "dtype") else _describe(value)

@@ -1,0 +1,23 @@
+"""Searches and counts, the list of neighbors, its geometry and what leaves it."""
+
+from jfrnn._search.chunks import run_chunk
+from jfrnn._search.exports import MOST_PAIRS, saturating_add
+from jfrnn._search.neighbor_list import ROWS_ARE_WHOLE, NeighborList, norms, rounded_capacity
+from jfrnn._search.search import Problem, checked_problem, count, search
+from jfrnn._search.verlet import list_radius, moved_too_far
+
+__all__ = [
+    "MOST_PAIRS",
+    "ROWS_ARE_WHOLE",
+    "NeighborList",
+    "Problem",
+    "checked_problem",
+    "count",
+    "list_radius",
+    "moved_too_far",
+    "norms",
+    "rounded_capacity",
+    "run_chunk",
+    "saturating_add",
+    "search",
+]

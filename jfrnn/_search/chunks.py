@@ -1,0 +1,90 @@
+"""Run a chunk of steps until its neighbor list was large enough: grow and replay."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+
+from jfrnn._geometry import Box
+from jfrnn._search.neighbor_list import NeighborList
+from jfrnn._tracing import own_transfers
+
+State = TypeVar("State")
+
+
+def run_chunk(
+    chunk: Callable[[State, NeighborList], tuple[State, NeighborList]],
+    state: State,
+    nbrs: NeighborList,
+    positions: Callable[[State], Array],
+    *,
+    queries: Callable[[State], Array] | None = None,
+    active: Callable[[State], Array] | None = None,
+    box: Callable[[State], Box] | None = None,
+    cutoff: Callable[[State], Array] | None = None,
+    slack: float = 1.25,
+) -> tuple[State, NeighborList]:
+    """Run a jitted chunk of steps; where its list overflowed, grow the list and run the same chunk again from the same state.
+
+    A chunk whose list overflowed has missed pairs, so that nothing of it may be kept; what it knows is how many slots were needed,
+    and whether a box needed more images. Each replay has at least that many slots, and more images, so that the loop ends, or
+    raises where no room helps: one host synchronization per run.
+
+    Args:
+        chunk: (state, nbrs) -> (state, nbrs), usually under `jax.jit`; it calls `nbrs.update` in every step, and must not donate
+            its arguments, since they are what is replayed.
+        state: A pytree.
+        nbrs: The list to begin with.
+        positions: state -> positions [length], shape [n, d]: where a larger list is made.
+        queries: state -> queries, exactly if the list was made with queries.
+        active: state -> mask, exactly if the list was made with `active`.
+        box: state -> periodic box, where it changes; default: the one that the list has at the beginning.
+        cutoff: state -> cutoffs of the particles, where they change; default likewise.
+        slack: Factor >= 1 on the slots that were needed, as in `NeighborList.grow`.
+
+    Returns:
+        The state and the list after a run in which nothing overflowed, and of which the list has nothing to report (`check`).
+
+    Raises:
+        TypeError: called inside jit, where a shape cannot change.
+        TypeError, ValueError: as `NeighborList.update`.
+        ValueError: the list reports what no room mends, as `NeighborList.check`: positions that are not finite, a degenerate box.
+
+    >>> import jax, jax.numpy as jnp, jfrnn
+    >>> @jax.jit
+    ... def chunk(x, nbrs):
+    ...     def step(_, carry):
+    ...         x, nbrs = carry
+    ...         x = 0.9 * x
+    ...         return x, nbrs.update(x)
+    ...     return jax.lax.fori_loop(0, 5, step, (x, nbrs))
+    >>> x = jax.random.uniform(jax.random.key(0), (200, 3))
+    >>> nbrs = jfrnn.search(x, 0.2, skin=0.05)
+    >>> x, nbrs = run_chunk(chunk, x, nbrs, lambda x: x)
+    >>> bool(nbrs.overflow)
+    False
+    """
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((state, nbrs))):
+        raise TypeError("run_chunk() changes the shape of the list and cannot run inside jax.jit: jit the chunk, not the loop.")
+    given: dict[str, Any] = {"queries": queries, "active": active, "box": box, "cutoff": cutoff}
+    given = {name: of(state) for name, of in given.items() if of is not None}
+    given = {"box": nbrs.box, "cutoff": _given_cutoffs(nbrs)} | given
+    while True:
+        after, seen = chunk(state, nbrs)
+        with own_transfers():
+            overflow = bool(np.any(np.asarray(seen.overflow)))
+        if not overflow:
+            seen.check()
+            return after, seen
+        nbrs = seen.grow(positions(state), slack=slack, **given)
+
+
+def _given_cutoffs(nbrs: NeighborList) -> Array | tuple[Array, Array] | None:
+    """Return the cutoffs of the particles of a list as `NeighborList.grow` takes them."""
+    if nbrs.radii is None:
+        return None
+    known = [x for x in (nbrs.radii.sources, nbrs.radii.queries) if x is not None]
+    return (known[0], known[1]) if nbrs.own_queries and len(known) == 2 else known[0]

@@ -1,0 +1,87 @@
+"""What leaves a list as pairs: flat arrays of a static length, how many pairs there are, and what jax-md reads."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jfrnn._geometry import Status
+from jfrnn._tracing import compiled
+
+MOST_PAIRS = 2**31 - 1  # that int32 offsets can number
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class DenseNeighbors:
+    """What jax-md's energies and simulations read of a neighbor list.
+
+    Attributes:
+        idx: Neighbors, shape [n, capacity], int32; unused slots hold n.
+        status: Bits of `Status` of the list that it was made of, shape [], int32.
+        format: None: neither of jax-md's two sparse formats, hence the dense one. Static.
+    """
+
+    idx: Array
+    status: Array
+    format: None = dataclasses.field(default=None, metadata={"static": True})
+
+    @property
+    def did_buffer_overflow(self) -> Array:
+        """Say whether a row lost neighbors, shape [], bool: search again with more capacity."""
+        return (self.status & Status.ROW_OVERFLOW.value) != 0
+
+
+def checked_total(total: Any) -> int:  # noqa: ANN401
+    """Return a static number of pairs that int32 offsets can number."""
+    if isinstance(total, bool) or not isinstance(total, int | np.integer):
+        raise TypeError(f"total must be a static int, the length of the arrays, got {type(total).__name__} {total!r}.")
+    if total < 0:
+        raise ValueError(f"total must be at least 0, got {total}.")
+    if total > MOST_PAIRS:
+        raise ValueError(
+            f"total must be at most {MOST_PAIRS}, as many pairs as int32 offsets can number, got {total}: export in parts, each a "
+            "search with queries=, or outside jax.jit without total, where offsets are int64."
+        )
+    return int(total)
+
+
+def saturating_add(a: Array, b: Array) -> Array:
+    """Add int32 that are not negative; a sum that int32 cannot hold is the largest int32."""
+    return jnp.where(a > MOST_PAIRS - b, MOST_PAIRS, a + b)
+
+
+@functools.partial(compiled, static_argnames="capacity")
+def pair_total(count: Array, capacity: int) -> Array:
+    """Add up the used slots of all rows, [] int32; more than int32 can hold are the largest int32."""
+    used = jnp.minimum(count, capacity)
+    if count.shape[0] * capacity <= MOST_PAIRS:
+        return jnp.sum(used, dtype=jnp.int32)
+    return lax.reduce(used, jnp.int32(0), saturating_add, (0,))
+
+
+def row_offsets(count: Array, capacity: int) -> Array:
+    """Say where each row begins, and behind the last where it ends, [m + 1] int32; from where int32 ends on all are the largest."""
+    used = jnp.minimum(count, capacity)
+    fits = count.shape[0] * capacity <= MOST_PAIRS
+    ends = jnp.cumsum(used, dtype=jnp.int32) if fits else lax.associative_scan(saturating_add, used)
+    return jnp.concatenate([jnp.zeros(1, jnp.int32), ends])
+
+
+@functools.partial(compiled, static_argnames=("sources", "total"))
+def flat_pairs(idx: Array, count: Array, sources: int, total: int) -> tuple[Array, Array, Array]:
+    """Return rows and sources of the pairs, [total] int32 each, padded with m and `sources`, and the offsets of the rows."""
+    m, capacity = idx.shape
+    offsets = row_offsets(count, capacity)
+    if 0 in (m, capacity, total):
+        return jnp.full(total, m, jnp.int32), jnp.full(total, sources, jnp.int32), offsets
+    place = lax.iota(jnp.int32, total)
+    begun = jnp.zeros(total, jnp.int32).at[offsets[1:-1]].add(1, mode="drop", indices_are_sorted=True)
+    row = jnp.cumsum(begun, dtype=jnp.int32)
+    there = place < offsets[-1]
+    found = idx[row, jnp.minimum(place - offsets[row], capacity - 1)]
+    return jnp.where(there, row, m), jnp.where(there, found, sources), offsets

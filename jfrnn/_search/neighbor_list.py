@@ -1,0 +1,740 @@
+"""The result of a search: a padded neighbor list, its checks, its geometry and its exports."""
+
+import dataclasses
+import functools
+import math
+from typing import Any, NamedTuple, overload
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.core import Tracer
+
+from jfrnn._engine import Filter, Inputs, Options, count_rows, list_rows, without_inactive
+from jfrnn._geometry import (
+    LARGEST_TURN,
+    Batch,
+    Box,
+    Cutoff,
+    Cutoffs,
+    Images,
+    Lattice,
+    NeighborOverflowError,
+    Radii,
+    Status,
+    check_devices,
+    checked_active,
+    checked_again,
+    checked_box,
+    checked_radii,
+    checked_slack,
+    fixed_box,
+    forward_shifts,
+    given_shifts,
+    grown_images,
+    is_pair_of,
+    known_status,
+    largest_known,
+    make_cutoff,
+    make_cutoffs,
+    make_lattice,
+    nearest_shifts,
+    pairs_and_status,
+    shape_of,
+    shifted_pairs,
+    turns_between,
+    unpacked_turns,
+)
+from jfrnn._search.exports import DenseNeighbors, checked_total, flat_pairs, pair_total
+from jfrnn._search.verlet import Verlet, first_verlet, list_radius, moved_too_far
+from jfrnn._tracing import at_once, call_apart, compiled, own_transfers
+
+_CAPACITY_STEP = 8
+ROWS_ARE_WHOLE = Status.NONFINITE | Status.TOTAL_OVERFLOW  # bits with which every row has all its neighbors
+
+
+class ImageCodes(NamedTuple):
+    """Of which image of its source each slot tells, where the nearest is not the only one.
+
+    Attributes:
+        codes: shape [m, capacity], uint8 up to 256 images, int16 up to 32 768, else int32: which of the shifts within reach, of
+            wrapped particles. These shifts and turns count the vectors of `Images.basis`.
+        turns: shape [n], int32: how many lattice vectors each source was from the box when the list was made, packed.
+        query_turns: shape [m], int32, or None where the sources are the queries.
+    """
+
+    codes: Array
+    turns: Array
+    query_turns: Array | None
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class NeighborList:
+    """Hold the neighbors of m queries among n sources, one row of `capacity` slots per query. A pytree.
+
+    Attributes:
+        idx: Source indices, shape [m, capacity], int32; the first min(count, capacity) slots of a row are used, the others hold n.
+        count: True number of neighbors per row, shape [m], int32; it may exceed the capacity. With a skin, of those within
+            cutoff + skin when the list was last made, and so are `idx`, `pairs` and `csr`.
+        status: Bits of `Status`, shape [], int32.
+        required: The capacity that holds every row, shape [], int32; like the status, over all updates.
+        verlet: With a skin, where the list was made and how often anew (`Verlet`); None without.
+        box: The periodic box, its floats rounded to the dtype of the positions; None where space is open.
+        images: Of which image of its source each slot tells (`ImageCodes`), 1 B per slot; None where the nearest is the only one.
+        radii: Cutoffs of the particles (`Radii`: sources [n], queries [m], the rule), or None where one serves all.
+        batch: To which system each particle belongs (`Batch`: sources [n], queries [m] or None), or None; updates keep it.
+        cutoff: Interaction radius [length], rounded to the dtype of the positions; None where particles have their own. Static.
+        skin: Extra shell [length]. Static.
+        half: Each unordered pair stands once, in the row of its smaller index. Static.
+        include_self: Each particle is its own neighbor. Static.
+        closed: Pairs at exactly the cutoff count. Static.
+        own_queries: The rows belong to `queries`, not to the positions themselves. Static.
+        masked: Particles may be inactive. Static.
+        box_kind: Along which axes the box is periodic and how far pairs reach in it; None where space is open. Static.
+        source_count: n, the fill value of unused slots. Static.
+        dim: Axes of the positions, 2 or 3. Static.
+        dtype: Of the positions. Static.
+        backend: The engine that made the list. Static.
+    """
+
+    idx: Array
+    count: Array
+    status: Array
+    required: Array
+    verlet: Verlet | None
+    box: Box | None
+    images: ImageCodes | None
+    radii: Radii | None
+    batch: Batch | None
+    cutoff: float | None = dataclasses.field(metadata={"static": True})
+    skin: float = dataclasses.field(metadata={"static": True})
+    half: bool = dataclasses.field(metadata={"static": True})
+    include_self: bool = dataclasses.field(metadata={"static": True})
+    closed: bool = dataclasses.field(metadata={"static": True})
+    own_queries: bool = dataclasses.field(metadata={"static": True})
+    masked: bool = dataclasses.field(metadata={"static": True})
+    box_kind: Images | None = dataclasses.field(metadata={"static": True})
+    source_count: int = dataclasses.field(metadata={"static": True})
+    dim: int = dataclasses.field(metadata={"static": True})
+    dtype: np.dtype = dataclasses.field(metadata={"static": True})
+    backend: str = dataclasses.field(metadata={"static": True})
+
+    def __repr__(self) -> str:
+        """Say in a line what it holds; waits for the device."""
+        *batch, m, capacity = shape_of(self.idx)
+        rows = f"{m} queries of {self.source_count} particles" if self.own_queries else f"{self.source_count} particles"
+        rows = f"batch of {batch}, {rows}" if batch else rows
+        reach = "per particle" if self.cutoff is None else f"{self.cutoff:.6g}"
+        skin = f", skin {self.skin:.6g}" if self.skin else ""
+        rest = pairs_and_status(self.count, self.status)
+        return f"NeighborList({rows}, capacity {capacity}, cutoff {reach}{skin}, engine {self.backend!r}, {rest})"
+
+    @property
+    def capacity(self) -> int:
+        """Slots per row."""
+        return self.idx.shape[-1]
+
+    @property
+    def overflow(self) -> Array:
+        """Say whether pairs may be missing for want of room, which `grow` makes: slots of a row, or images in a box; [] bool."""
+        with own_transfers():
+            return (self.status & (Status.ROW_OVERFLOW | Status.BOX_TOO_SMALL).value) != 0
+
+    def update(
+        self,
+        positions: Array,
+        *,
+        cutoff: Array | tuple[Array, Array] | None = None,
+        queries: Array | None = None,
+        active: Array | None = None,
+        box: Box | None = None,
+    ) -> "NeighborList":
+        """Make the list anew if something has moved skin/2 since it was made, or may have by rounding; without a skin, always.
+
+        The list that comes back holds every pair within the cutoff at these positions, in the same shapes: a step of a simulation
+        inside `jax.jit`, `lax.scan` or `lax.fori_loop`. Lattice vectors of a periodic box are no motion: positions may be wrapped
+        into it in every step. Status bits and `required` are kept over all updates; look at `overflow`
+        after a chunk of steps, then `grow` and run the chunk again (`run_chunk` does that).
+
+        Args:
+            positions: Sources [length], shape [n, d], where they are now.
+            cutoff: Cutoffs of the particles now, as `search` takes them, if the list was made with such; default: those that it
+                has. The list keeps them. What the largest of them grew is taken off the skin.
+            queries: Queries [length], shape [m, d], exactly if the list was made with queries.
+            active: Which particles take part now, shape [n], bool, exactly if the list was made with `active`; one that comes or
+                goes makes the list anew.
+            box: The box now, of the same kind; default: the one that the list has. The list keeps it. One that changed enough to
+                bring a new pair within the cutoff makes the list anew.
+
+        Returns:
+            A `NeighborList` of the same shapes and options.
+
+        Raises:
+            ValueError, TypeError: an argument does not fit the list.
+
+        Cost: one pass over the positions, or a search. Differentiable: no gradient flows through. Jit: yes. vmap: yes, each list
+        being made anew where any of the batch is.
+        """
+        sources, rows = self._geometry_inputs(positions, queries)
+        rows = rows if self.own_queries else None
+        radii = self._radii_now(cutoff, sources, rows)
+        active, box = self._checked_active(active, sources), self._box_now(box, sources)
+        with own_transfers():
+            return call_apart(_update, self, sources, rows, active, box, radii)
+
+    def grow(
+        self,
+        positions: Array,
+        *,
+        cutoff: Array | tuple[Array, Array] | None = None,
+        queries: Array | None = None,
+        active: Array | None = None,
+        box: Box | None = None,
+        slack: float = 1.25,
+    ) -> "NeighborList":
+        """Make a list with room for what overflowed, at these positions. Not inside jit: the capacity is a shape.
+
+        Room are the slots of a row and, in a periodic box, the images of a particle: as many as the cutoff needs in this box and
+        in that of the list, or twice as many where updates met a smaller box in between.
+
+        Args:
+            positions: Sources [length], shape [n, d].
+            cutoff: As in `update`.
+            queries: As in `update`.
+            active: As in `update`.
+            box: The box at these positions; default: the one that the list has, which after a chunk is the last one.
+            slack: Factor >= 1 on the longest row that was ever met, here or by updates of this list.
+
+        Returns:
+            A `NeighborList` with the same options, room not smaller than before, no bits from the past, and nothing to `check`.
+
+        Raises:
+            TypeError: positions or the list are traced.
+            ValueError, TypeError: an argument does not fit the list, or the list that was made says what is wrong with its data
+                (`check`): no room makes positions finite, or a degenerate box one.
+        """
+        sources, rows = self._geometry_inputs(positions, queries)
+        queries, active, slack = rows if self.own_queries else None, self._checked_active(active, sources), checked_slack(slack)
+        box, radii = self._box_now(box, sources), self._radii_now(cutoff, sources, queries)
+        if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, radii, self.required))):
+            raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
+        wider = dataclasses.replace(self, box_kind=self._grown_images(box, radii, np.dtype(sources.dtype)))
+        inputs, options = _inputs_of(wider, sources, queries, active, box, radii)
+        with own_transfers():
+            met = rounded_capacity(math.ceil(slack * int(np.max(np.asarray(self.required)))))
+            made = _remade(wider, inputs, options, max(self.capacity, met, counted_capacity(inputs, options, slack)))
+        made.check()
+        return made
+
+    @property
+    def rebuild_count(self) -> Array:
+        """How often updates made the list anew, shape [], int32; known for a list with a skin."""
+        if self.verlet is None:
+            raise ValueError("this list was made without a skin: every update makes it anew, and nothing counts them.")
+        return self.verlet.rebuild_count
+
+    def check(self) -> None:
+        """Raise what the status bits report; wait for the device. Not inside jit: there, read `status` and `overflow`.
+
+        Raises:
+            NeighborOverflowError: a row holds more neighbors than `capacity`; `.required` is the capacity needed.
+            ValueError: positions or queries hold NaN or infinity, or do not fit the box; or there were more pairs than `require`
+                was told.
+            TypeError: called on a list that is being traced.
+        """
+        if isinstance(self.status, Tracer):
+            raise TypeError("check() reads values and cannot run inside jax.jit: call it on the list that jit returns.")
+        self._check_known()
+
+    def require(self, total: int) -> "NeighborList":
+        """Return this list with the bit `Status.TOTAL_OVERFLOW` set where it holds more pairs than exports of this length take.
+
+        For loops inside `jax.jit`, where `pairs(total)`, `csr(total)` and `to_jraph(total)` cannot raise: the bit is kept by
+        updates, and `check` names it afterwards.
+
+        Args:
+            total: Number of pairs, a static int.
+
+        Returns:
+            The same list, but for its status.
+
+        Raises:
+            ValueError, TypeError: a wrong total.
+
+        Cost: a sum over the rows. Jit: yes. vmap: yes.
+        """
+        self._check_single()
+        with own_transfers():
+            missing = pair_total(self.count, self.capacity) > checked_total(total)
+            status = self.status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
+        return dataclasses.replace(self, status=status)
+
+    def _check_known(self, spared: Status = Status.OK) -> None:
+        """Raise what status bits report, but for the spared ones, where they are known: not on a list that is being traced."""
+        status = (known_status(self.status) or Status.OK) & ~spared
+        if Status.ROW_OVERFLOW in status:
+            raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self.capacity)
+        if Status.TOTAL_OVERFLOW in status:
+            now = int(np.sum(jax.device_get(self.count), dtype=np.int64))
+            raise ValueError(f"{status.message} At present it holds {now}.")
+        if status:
+            raise ValueError(status.message)
+
+    def vectors(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> tuple[Array, Array]:
+        """Compute the displacement to every neighbor, r_ij = x_j - x_i, in a periodic box plus the lattice shift of the image.
+
+        Args:
+            positions: Sources [length], shape [n, d], where they are now.
+            queries: Queries [length], shape [m, d], exactly if the list was made with queries.
+            box: The box now; default: the one that the list has, a constant to derivatives.
+
+        Returns:
+            Displacements [length], shape [m, capacity, d], 0 in masked slots; and the mask, shape [m, capacity], bool: the slot is
+            used and its pair is, at these positions and exactly, closer than the cutoff.
+
+        Raises:
+            ValueError, TypeError: positions or queries do not fit the list.
+            NeighborOverflowError, ValueError: outside jit, the status says that pairs may be missing: rows overflowed, or the data
+                did not fit; inside, look at `status`. Particles that are not finite have no pairs, which is no error here.
+
+        Differentiable: to any order in positions, queries and box; the mask is a constant. Jit: yes. vmap: yes.
+        """
+        vectors, mask, _ = self._geometry(positions, queries, box)
+        return vectors, mask
+
+    def shifts(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> Array:
+        """Compute the lattice shift S of every neighbor: its displacement is x_j - x_i + S·(lattice vectors).
+
+        Every used slot has its shift, also where its pair lies in the skin, and so beyond the cutoff: `vectors` and `distances`
+        mask such pairs, `shifts` and `pairs` do not. `nbrs.shifts(x)[nbrs.idx < nbrs.source_count]` has a row for each pair, in
+        the order of `pairs`.
+
+        Args:
+            positions: Sources [length], shape [n, d], where they are now.
+            queries: As in `vectors`.
+            box: As in `vectors`.
+
+        Returns:
+            Whole numbers, shape [m, capacity, d], int32; 0 in unused slots, along axes that are not periodic, and between positions
+            that now are more than 1022 lattice vectors apart.
+
+        Raises:
+            ValueError, TypeError: an argument does not fit the list.
+            NeighborOverflowError, ValueError: as `vectors`.
+
+        Differentiable: no (integers). Jit: yes. vmap: yes.
+        """
+        sources, rows = self._geometry_inputs(positions, queries)
+        self._check_known(spared=ROWS_ARE_WHOLE)
+        box = self._box_now(box, sources)
+        with own_transfers():
+            if box is None or self.box_kind is None or 0 in (sources.shape[0], *self.idx.shape):
+                return jnp.zeros((*self.idx.shape, sources.shape[1]), jnp.int32)
+            return _shifts(self.idx, self.count, self._images_made(), sources, rows, box, self.box_kind, self.half)
+
+    def distances(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> tuple[Array, Array]:
+        """Compute the distance to every neighbor.
+
+        Args:
+            positions: Sources [length], shape [n, d], where they are now.
+            queries: As in `vectors`.
+            box: As in `vectors`.
+
+        Returns:
+            Distances [length], shape [m, capacity], 0 in masked slots; and the mask as `vectors` gives it.
+
+        Raises:
+            ValueError, TypeError: positions or queries do not fit the list.
+            NeighborOverflowError, ValueError: as `vectors`.
+
+        Differentiable: to any order; the gradient of a distance of 0 is 0. Jit: yes. vmap: yes.
+        """
+        vectors, mask = self.vectors(positions, queries=queries, box=box)
+        return norms(vectors), mask
+
+    @overload
+    def pairs(self, total: None = None) -> tuple[np.ndarray, np.ndarray]: ...
+
+    @overload
+    def pairs(self, total: int) -> tuple[Array, Array]: ...
+
+    def pairs(self, total: int | None = None) -> tuple[Array | np.ndarray, Array | np.ndarray]:
+        """Export the pairs (i, j), row by row: to the host, or inside jit into arrays of a static length.
+
+        Args:
+            total: Length of the arrays, a static int up to 2³¹ - 1; None: as many as there are, which is known only outside jit.
+                Where there are more pairs than `total`, a list outside jit raises. Inside jit the last pairs are missing then, and
+                nothing is left over: `require(total)` sets a bit that `check` names.
+
+        Returns:
+            Query indices i and source indices j, shape [pairs] or [total], int32 each; what is left over holds m and n.
+
+        Raises:
+            NeighborOverflowError, ValueError: as `check`, outside jit; ValueError: more pairs than `total`, outside jit.
+            ValueError, TypeError: a wrong total, or none inside jit.
+
+        Differentiable: no (integers). Jit: yes, with total. vmap: yes, with total.
+        """
+        if total is None:
+            count, idx = self._checked_rows("pairs")
+            return np.repeat(np.arange(count.size, dtype=np.int32), count), idx
+        rows, indices, _ = self._flat(total)
+        return rows, indices
+
+    @overload
+    def csr(self, total: None = None) -> tuple[np.ndarray, np.ndarray]: ...
+
+    @overload
+    def csr(self, total: int) -> tuple[Array, Array]: ...
+
+    def csr(self, total: int | None = None) -> tuple[Array | np.ndarray, Array | np.ndarray]:
+        """Export compressed rows: the neighbors of row i are indices[offsets[i]:offsets[i + 1]].
+
+        Args:
+            total: As in `pairs`; offsets[-1] then is the number of pairs in the rows, at most 2³¹ - 1, which inside jit may exceed
+                `total`.
+
+        Returns:
+            Offsets, shape [m + 1], int64 on the host, int32 with `total`; and indices, shape [pairs] or [total], int32, n in what
+            is left over.
+
+        Raises:
+            NeighborOverflowError, ValueError, TypeError: as in `pairs`.
+
+        Differentiable: no (integers). Jit: yes, with total. vmap: yes, with total.
+        """
+        if total is None:
+            count, idx = self._checked_rows("csr")
+            return np.concatenate([[0], np.cumsum(count, dtype=np.int64)]), idx
+        _, indices, offsets = self._flat(total)
+        return offsets, indices
+
+    def to_jraph(self, total: int) -> tuple[Array, Array]:
+        """Return senders and receivers of a graph: an edge from each neighbor j to its particle i.
+
+        Each pair has at most one image here, and in a periodic box the edge is to the nearest image of j. A list that tells images
+        apart is refused, since edges alone cannot: of such a list, `shifts` says of which image each slot of `idx` is.
+
+        Args:
+            total: Number of edges, a static int: as in `pairs`.
+
+        Returns:
+            Senders j and receivers i, shape [total], int32 each; edges that are left over lead from n to m, the node that
+            `jraph.pad_with_graphs` adds first. Stacked, they are an edge index as other graph libraries have it.
+
+        Raises:
+            ValueError: the list tells images apart.
+            ValueError, TypeError: as in `pairs`.
+
+        Differentiable: no (integers). Jit: yes. vmap: yes.
+        """
+        if self.images is not None:
+            raise ValueError(
+                "to_jraph() returns edges without lattice shifts, which a list with several images of a pair needs: take "
+                "i, k = jnp.nonzero(nbrs.idx < nbrs.source_count, size=total, fill_value=len(nbrs.idx)), senders "
+                "nbrs.idx.at[i, k].get(mode='fill', fill_value=nbrs.source_count), receivers i and shifts "
+                "nbrs.shifts(positions).at[i, k].get(mode='fill', fill_value=0); or search in a box that is at least 2.05 "
+                "(cutoff + skin) wide."
+            )
+        rows, indices, _ = self._flat(total)
+        return indices, rows
+
+    def to_jax_md(self) -> DenseNeighbors:
+        """Return this list as the neighbor-list energies of jax-md take it: `idx` as its format `Dense` has it.
+
+        Such an energy computes displacements itself, so that it wants the full list of the particles among themselves, and at most
+        one image of each pair; the box goes into its displacement function. It sees what is within cutoff + skin. Inside jit the
+        `did_buffer_overflow` of what comes back says whether neighbors are missing.
+
+        Raises:
+            ValueError: the list is a half one, has queries, or tells images apart.
+            NeighborOverflowError, ValueError: as `check`, outside jit.
+        """
+        wrong = {"half=True": self.half, "queries": self.own_queries, "several images of a pair": self.images is not None}
+        for what in (name for name, is_so in wrong.items() if is_so):
+            raise ValueError(f"jax-md's Dense format cannot say what a list with {what} does: search without.")
+        self._check_known()
+        return DenseNeighbors(self.idx, self.status)
+
+    def _flat(self, total: int) -> tuple[Array, Array, Array]:
+        """Return rows and sources of the pairs, padded to a static length, and the offsets of the rows."""
+        total = checked_total(total)
+        self._check_single()
+        self._check_known()
+        if not isinstance(self.count, Tracer):
+            with at_once():
+                held = int(jax.device_get(pair_total(self.count, self.capacity)))
+            if held > total:
+                raise ValueError(f"total={total} is too small: the list holds {held} pairs. Pass total={held} or more.")
+        return flat_pairs(self.idx, self.count, self.source_count, total)
+
+    def _checked_rows(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        if isinstance(self.status, Tracer):
+            raise TypeError(
+                f"{name}() returns as many pairs as there are and cannot run inside jax.jit: write {name}(total), total being the "
+                "static length of its arrays."
+            )
+        self._check_known()
+        self._check_single()
+        with own_transfers():
+            idx, count = np.asarray(self.idx), np.asarray(self.count)
+        return count, idx[np.arange(self.capacity) < count[:, None]]
+
+    def _check_single(self) -> None:
+        if self.idx.ndim != 2:
+            raise ValueError(f"exports take one list at a time, got idx of shape {list(self.idx.shape)}: index the batch first.")
+
+    def _checked_active(self, active: Array | None, sources: Array) -> Array | None:
+        if self.masked != (active is not None):
+            state = "with active: pass active=" if self.masked else "without active: leave active out"
+            raise ValueError(f"this list was made {state}.")
+        return None if active is None else checked_active(active, sources)
+
+    def _radii_now(self, cutoff: Any, sources: Array, queries: Array | None) -> Radii | None:  # noqa: ANN401
+        if cutoff is None:
+            return self.radii
+        if self.radii is None:
+            raise ValueError("this list was made with one cutoff for all particles: leave cutoff out.")
+        radii = checked_radii(cutoff, self.radii.rule, sources, queries)
+        if radii is None:
+            raise ValueError("this list was made with a cutoff for each particle: pass such an array, or leave cutoff out.")
+        return radii
+
+    def _box_now(self, box: Box | None, sources: Array) -> Box | None:
+        if box is None:
+            return self.box
+        if self.box is None:
+            raise ValueError("this list was made without a periodic box: leave box out.")
+        checked = checked_box(box, sources, like=self.box)
+        return None if checked is None else fixed_box(checked, np.dtype(sources.dtype))
+
+    def _grown_images(self, box: Box | None, radii: Radii | None, dtype: np.dtype) -> Images | None:
+        if self.box_kind is None or self.box is None or box is None:
+            return self.box_kind
+        largest = self.cutoff or 0.0 if radii is None else largest_known(radii)
+        reach = None if largest is None else list_radius(largest, self.skin, dtype)
+        short = bool(np.any(np.asarray(jax.device_get(self.status)) & Status.BOX_TOO_SMALL.value))
+        return grown_images(self.box_kind, (box, self.box), reach, dtype, self.source_count, short)
+
+    def _geometry(self, positions: Array, queries: Array | None, box: Box | None) -> tuple[Array, Array, Array | None]:
+        sources, rows = self._geometry_inputs(positions, queries)
+        self._check_known(spared=ROWS_ARE_WHOLE)
+        box = self._box_now(box, sources)
+        if 0 in (sources.shape[0], *self.idx.shape):
+            with own_transfers():
+                return jnp.zeros((*self.idx.shape, sources.shape[1]), sources.dtype), jnp.zeros(self.idx.shape, bool), None
+        cutoff = self.radii if self.cutoff is None else make_cutoff(self.cutoff, np.dtype(sources.dtype), self.closed)
+        with own_transfers():
+            if box is None or self.box_kind is None:
+                return *_vectors(self.idx, self.count, sources, rows, cutoff, self.closed), None
+            given = (self.box_kind, cutoff, self.closed, self.half)
+            return _periodic_vectors(self.idx, self.count, self._images_made(), sources, rows, box, *given)
+
+    def _images_made(self) -> "_ImagesMade":
+        made = None if self.images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
+        return self.images, made
+
+    def _geometry_inputs(self, positions: Array, queries: Array | None) -> tuple[Array, Array]:
+        sources = checked_again("positions", positions, self.dtype, self.dim, self.source_count)
+        check_devices("positions", sources, self.idx)
+        if self.own_queries != (queries is not None):
+            state = "with queries: pass queries=" if self.own_queries else "without queries: leave queries out"
+            raise ValueError(f"this list was made {state}.")
+        if queries is None:
+            return sources, sources
+        rows = checked_again("queries", queries, self.dtype, self.dim, self.idx.shape[0])
+        check_devices("queries", rows, self.idx)
+        return sources, rows
+
+
+def rounded_capacity(slots: int) -> int:
+    """Round a capacity up, so that similar scenes share one compiled program."""
+    return -(-slots // _CAPACITY_STEP) * _CAPACITY_STEP
+
+
+def counted_capacity(inputs: Inputs, options: Options, slack: float) -> int:
+    """Count the neighbors of concrete positions and return a capacity that holds `slack` times the longest row."""
+    with at_once(), own_transfers():
+        longest = int(count_rows(inputs, options)[1])
+    wanted = math.ceil(max(longest, 1) * slack)
+    return min(rounded_capacity(wanted), max(wanted, inputs.sources.shape[0]))
+
+
+def made_options(
+    cutoff: "float | Radii | None",
+    keep: Filter,
+    box_kind: Images | None,
+    backend: str,
+    dtype: np.dtype,
+    closed: bool,
+    skin: float,
+) -> tuple[Cutoff | Radii, Options]:
+    """Return the operand and the static options of a search with this radius, which holds the skin, or radii, which do not."""
+    if isinstance(cutoff, Radii):
+        return cutoff, Options(keep, backend, closed, skin, images=box_kind)
+    if cutoff is None:
+        raise TypeError("made_options() needs a radius or radii.")
+    radius = cutoff if backend == "hashgrid" else None
+    return make_cutoff(cutoff, dtype, closed), Options(keep, backend, closed, images=box_kind, radius=radius)
+
+
+def _inputs_of(
+    nbrs: NeighborList, sources: Array, queries: Array | None, active: Array | None, box: Box | None, radii: Radii | None
+) -> tuple[Inputs, Options]:
+    """Return what a search takes that makes this list at these positions."""
+    dtype = np.dtype(sources.dtype)
+    keep = Filter(drop_self=not (nbrs.own_queries or nbrs.include_self), later_only=nbrs.half)
+    reach = radii if nbrs.cutoff is None else list_radius(nbrs.cutoff, nbrs.skin, dtype)
+    cutoff, options = made_options(reach, keep, nbrs.box_kind, nbrs.backend, dtype, nbrs.closed, nbrs.skin)
+    return Inputs(sources, queries, active, box, cutoff, nbrs.batch), options
+
+
+@compiled
+def _update(
+    nbrs: NeighborList, sources: Array, queries: Array | None, active: Array | None, box: Box | None, radii: Radii | None
+) -> NeighborList:
+    sources, queries, box, radii = lax.stop_gradient((sources, queries, box, radii))
+    inputs, options = _inputs_of(nbrs, sources, queries, active, box, radii)
+
+    def remake(nbrs: NeighborList) -> NeighborList:
+        made, verlet = _remade(nbrs, inputs, options, nbrs.capacity), nbrs.verlet
+        if made.verlet is not None and verlet is not None:
+            made = dataclasses.replace(made, verlet=dataclasses.replace(made.verlet, rebuild_count=verlet.rebuild_count + 1))
+        return dataclasses.replace(made, status=made.status | nbrs.status, required=jnp.maximum(made.required, nbrs.required))
+
+    if nbrs.verlet is None:
+        return remake(nbrs)
+    now = without_inactive(sources, active)
+    moved = moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin)
+    nbrs = dataclasses.replace(nbrs, box=box, radii=radii)
+    # a loop of at most one round: XLA keeps what a loop carries in place, but copies what a branch returns
+    return lax.while_loop(lambda state: state[0], lambda state: (jnp.zeros_like(state[0]), remake(state[1])), (moved, nbrs))[1]
+
+
+def _remade(nbrs: NeighborList, inputs: Inputs, options: Options, capacity: int) -> NeighborList:
+    """Make a list with the options of this one, and nothing of its past."""
+    return dataclasses.replace(nbrs, **found_fields(inputs, options, capacity, nbrs.skin > 0))
+
+
+@functools.partial(compiled, static_argnames=("options", "capacity", "moving"))
+def found_fields(inputs: Inputs, options: Options, capacity: int, moving: bool) -> dict[str, Any]:
+    """Search, and return the fields of a list that come from data; `moving`: it has a skin. The compiled program of `search`.
+
+    Being results of one program, they share no memory with the caller's arrays, or with each other: either may be donated.
+    """
+    found = list_rows(inputs, options, capacity)
+    rows, sources = found.rows, without_inactive(inputs.sources, inputs.active)
+    codes = None if found.images is None or found.turns is None else ImageCodes(found.images, *found.turns)
+    radii = lax.stop_gradient(inputs.cutoff) if isinstance(inputs.cutoff, Radii) else None
+    verlet = first_verlet(sources, inputs.queries, inputs.box, radii) if moving else None
+    fields = {"idx": rows.idx, "count": rows.counts, "status": rows.status, "required": rows.required}
+    return fields | {"verlet": verlet, "box": lax.stop_gradient(inputs.box), "images": codes, "radii": radii, "batch": inputs.batch}
+
+
+def _pair_cutoff(cutoff: Cutoff | Radii | None, closed: bool) -> Cutoff | Cutoffs:
+    if isinstance(cutoff, Cutoff):
+        return cutoff
+    if cutoff is None:
+        raise TypeError("a list has a cutoff or radii.")
+    return make_cutoffs(lax.stop_gradient(cutoff), closed)
+
+
+@functools.partial(compiled, static_argnames="closed")
+def _vectors(
+    idx: Array, count: Array, sources: Array, rows: Array, given: Cutoff | Radii | None, closed: bool
+) -> tuple[Array, Array]:
+    cutoff = _pair_cutoff(given, closed)
+    used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
+    neighbor = jnp.where(used, idx, 0)
+    mask = used & call_apart(is_pair_of, lax.stop_gradient(rows), lax.stop_gradient(sources), neighbor, cutoff)
+    return jnp.where(mask[..., None], sources[neighbor] - rows[:, None, :], 0), mask
+
+
+_ImagesMade = tuple[ImageCodes | None, tuple[Array, Array | None] | None]  # and where all were when a list with a skin was made
+
+
+class _Slots(NamedTuple):
+    """Of every slot: whether it is used, its source, x_j - x_i, and its lattice shift in whole floats; 0 where it is not used."""
+
+    used: Array
+    neighbor: Array
+    difference: Array
+    shifts: Array
+
+
+def _slots(idx: Array, count: Array, images: _ImagesMade, sources: Array, rows: Array, lattice: Lattice, half: bool) -> _Slots:
+    used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
+    neighbor = jnp.where(used, idx, 0)
+    difference = sources[neighbor] - rows[:, None, :]
+    codes, made = images
+    if codes is None:
+        shifts = nearest_shifts(difference, lattice)
+    else:
+        turns, query_turns = _turns_now(codes, made, sources, rows, lattice)
+        image = jnp.where(used, codes.codes.astype(jnp.int32), lattice.images.home)
+        shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)[image] + query_turns[:, None] - turns[neighbor]
+    kind = lattice.images
+    if half and kind.basis is not None:  # of an image of its own, a particle keeps the one ahead in the given vectors
+        own = neighbor == lax.broadcasted_iota(jnp.int32, idx.shape, 0)
+        shifts = jnp.where(own[..., None], forward_shifts(shifts, kind), shifts)
+    most = 2 * LARGEST_TURN + max(kind.reach)  # farther apart, nothing is decided exactly
+    used = used & (jnp.abs(shifts) <= most).all(axis=-1)
+    return _Slots(used, neighbor, difference, jnp.where(used[..., None], shifts, 0))
+
+
+@functools.partial(compiled, static_argnames=("kind", "half"))
+def _shifts(
+    idx: Array, count: Array, images: _ImagesMade, sources: Array, rows: Array, box: Box, kind: Images, half: bool
+) -> Array:
+    lattice = make_lattice(box, kind, np.dtype(sources.dtype))
+    return given_shifts(lax.stop_gradient(_slots(idx, count, images, sources, rows, lattice, half).shifts), kind)
+
+
+@functools.partial(compiled, static_argnames=("kind", "closed", "half"))
+def _periodic_vectors(
+    idx: Array,
+    count: Array,
+    images: _ImagesMade,
+    sources: Array,
+    rows: Array,
+    box: Box,
+    kind: Images,
+    given: Cutoff | Radii | None,
+    closed: bool,
+    half: bool,
+) -> tuple[Array, Array, Array]:
+    cutoff = _pair_cutoff(given, closed)
+    lattice = make_lattice(box, kind, np.dtype(sources.dtype))
+    used, neighbor, difference, shifts = _slots(idx, count, images, sources, rows, lattice, half)
+    fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
+    pairs = shifted_pairs(difference, shifts, (fixed_sources, fixed_rows), lattice)
+    fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
+    mask = used & call_apart(is_pair_of, fixed_rows, fixed_sources, neighbor, cutoff, fixed_pairs)
+    return jnp.where(mask[..., None], pairs.vectors, 0), mask, shifts
+
+
+def _turns_now(
+    images: ImageCodes, made: tuple[Array, Array | None] | None, sources: Array, rows: Array, lattice: Lattice
+) -> tuple[Array, Array]:
+    """Return how many lattice vectors lie between the cell and the sources [n, d], and the rows [m, d]: whole floats.
+
+    They are those that the list was made with, and those by which a point has been moved since (`made`: where all were then), as
+    wrapping it does: the image that a code tells of is the same one before and after.
+    """
+    both = [images.turns] if images.query_turns is None else [images.turns, images.query_turns]
+    turns = [unpacked_turns(x, lattice.dim).astype(sources.dtype) for x in both]
+    if made is not None:
+        since = zip(turns, made, (sources, rows), strict=False)
+        turns = [x if before is None else x + turns_between(before, now, lattice) for x, before, now in since]
+    return turns[0], turns[-1]
+
+
+@compiled
+def norms(vectors: Array) -> Array:
+    largest = lax.stop_gradient(jnp.max(jnp.abs(vectors), axis=-1, initial=0))
+    apart = largest > 0
+    unit = jnp.where(apart, largest, 1)  # squares of very small or large lengths would leave the float range
+    square = jnp.sum((vectors / unit[..., None]) ** 2, axis=-1)
+    return jnp.where(apart, unit * jnp.sqrt(jnp.where(apart, square, 1)), 0)

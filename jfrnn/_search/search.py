@@ -1,0 +1,263 @@
+"""The two public verbs: `search` and `count`."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+
+from jfrnn._engine import Filter, Inputs, Options, choose_engine, count_rows
+from jfrnn._geometry import (
+    Box,
+    checked_active,
+    checked_backend,
+    checked_batch,
+    checked_box,
+    checked_capacity,
+    checked_cutoff,
+    checked_flag,
+    checked_positions,
+    checked_radii,
+    checked_skin,
+    checked_slack,
+    fixed_box,
+    images_of,
+    largest_known,
+)
+from jfrnn._search.neighbor_list import NeighborList, counted_capacity, found_fields, made_options
+from jfrnn._search.verlet import list_radius
+from jfrnn._tracing import call_apart, own_transfers
+
+
+def search(
+    positions: Array,
+    cutoff: float | Array | tuple[Array, Array],
+    *,
+    queries: Array | None = None,
+    box: Box | None = None,
+    batch: Array | tuple[Array, Array] | None = None,
+    radius_rule: str = "gather",
+    half: bool = False,
+    include_self: bool = False,
+    closed: bool = False,
+    skin: float = 0.0,
+    active: Array | None = None,
+    capacity: int | None = None,
+    slack: float = 1.0,
+    backend: str = "auto",
+) -> NeighborList:
+    """Find every pair of particles closer than a cutoff, exactly.
+
+    (i, j) is a pair iff |x_j - x_i| < cutoff in exact arithmetic on the given floats, the cutoff being rounded once to their
+    dtype. Without `capacity` the neighbors are counted first, so that no row can overflow. Cost: O(n + candidates), a particle's
+    candidates being the particles in the 3^d cells around it; empty space costs nothing, however large.
+
+    Args:
+        positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64. n = 0 is allowed.
+        cutoff: Interaction radius [length]: a static number > 0 for all; or one per particle, an array of shape [n] of floats,
+            which may be traced and hold 0, and which `radius_rule` applies to. Of separate queries "gather" asks for [m], "scatter"
+            for [n], the other rules for a tuple of both, that of the positions first.
+        queries: Points [length] whose neighbors among `positions` are wanted, shape [m, d], same dtype; default: the positions
+            themselves, each particle being excluded from its own row by index.
+        box: Periodic box (`Box`): then (i, j) stands in the list once for each image of j within the cutoff, its displacement
+            being x_j - x_i + S·(lattice vectors), S whole numbers; `NeighborList.shifts` tells them. Particles may be up to 511
+            lattice vectors away from the box (short ones, where a skewed box is searched in such); along axes that are not
+            periodic it has no meaning.
+        batch: The system to which each particle belongs, shape [n], integers that fit into int32, in any order; with queries a
+            tuple of [n] and [m]. Only particles of one system are neighbors. Many systems cost what their particles cost, also
+            where they lie on top of each other; all have the same box (for boxes of their own, `jax.vmap` over `search`).
+        radius_rule: Whose cutoff is that of a pair, where particles have their own: "gather" that of i, the row; "scatter" that of
+            j; "either" the larger, "both" the smaller, "mean" the exact mean of the two. Large ones cost nothing to those that are
+            small: spread over a factor of 128, each particle looks at cells of its own size.
+        half: Keep each unordered pair once, in the row of its smaller index; of the images of a particle that are its own
+            neighbors, those whose shift S has a positive number first. Not with the rules "gather" and "scatter".
+        include_self: Make each particle its own neighbor.
+        closed: Count pairs at exactly the cutoff (<= instead of <).
+        skin: Extra shell [length], a static number >= 0: the list holds all pairs within cutoff + skin, so that
+            `NeighborList.update` need not make it anew before something has moved skin/2. `vectors` and `distances` mask to the
+            cutoff.
+        active: Which particles take part, shape [n], bool; default: all. An inactive one has no neighbors and is nobody's, and its
+            position may be anything. Room for particles to come: the shapes, and so the compiled program, stay the same.
+        capacity: Slots per row, a static int. Required where positions are traced. Default: `slack` times the longest row,
+            rounded up to a multiple of 8.
+        slack: Factor >= 1 on the counted capacity, room for later motion.
+        backend: "warp" (cells, compiled kernels, on CPU and NVIDIA GPUs), "hashgrid" (Warp's own `wp.HashGrid`, there too), "jax"
+            (cells, any device), "brute" (all n·m candidates), or "auto": what was measured to be fastest on the platform, "warp" on
+            the CPU and on NVIDIA GPUs (where Warp is missing "jax", with a warning), elsewhere "jax". The platform is that of the
+            positions, where they are traced that of `jax.default_device`. "hashgrid" knows neither boxes nor batches nor
+            a cutoff per particle.
+
+    Returns:
+        A `NeighborList`; `idx` has shape [m, capacity], unused slots hold n. Rows are in no promised order, but the same input
+        gives the same bits.
+
+    Raises:
+        TypeError, ValueError: an argument is of the wrong kind, shape or range, or `capacity` is missing under jit.
+        ImportError: "warp" or "hashgrid" without the package that they need.
+        RuntimeError: "warp" or "hashgrid" on a platform on which Warp cannot run.
+        Overflow of a given capacity and non-finite coordinates are known only from data: `status`, `overflow` and `check` tell.
+
+    Memory: 4 B per slot for the list, which keeps copies of what updates look back at: with a skin positions and queries, with a
+    batch 4 B and with a cutoff per particle one float each (with a skin two). It shares no memory with the arrays that it is given,
+    so that they, or the list, may be donated (`jax.jit(..., donate_argnums=)`). Besides it, however large space is, "warp" takes at
+    most 64 B and "hashgrid" 84 B per particle, "jax" and "brute" at most 64 MB for the block in work and 100 B per particle
+    (float64: 125 B). See `memory_plan`. With a box or a batch "warp" takes a copy of the positions besides, at most 20 B per
+    particle (float64: 40 B); with a cutoff per particle 140 B in all (float64: 180 B).
+    Differentiable: the list is topology, without gradient; see `NeighborList.vectors`. Jit: yes, with capacity. vmap: yes, with
+    capacity. Arrays that are spread over the devices of a mesh are gathered on each, and each does the whole work: to spread that
+    as well, see `jfrnn.distributed`. `jax.export`: yes, with
+    `disabled_checks=[jax.export.DisabledSafetyCheck.custom_call("jfrnn")]`; a process that runs such a program imports jfrnn of
+    the same version first. Shapes are numbers, not symbols.
+    Source: cell lists (Hockney & Eastwood 1981, ch. 8); strict cutoff (Peifle 2019, §2.2).
+
+    Compilation: once for each number of particles, of queries and of slots, and once more for the count where `capacity` is
+    missing; cutoffs and boxes are data. Structures of many sizes share a program if they are padded to sizes that come again, with
+    `active=` for the particles that are there, one `capacity`, and `Box(..., images=)`, which fixes the number of images:
+
+    >>> import numpy as np, jfrnn
+    >>> def searched(x, lengths, size=8):
+    ...     padded = np.zeros((size, 3), np.float32)
+    ...     padded[: len(x)] = x
+    ...     box = jfrnn.Box(lengths, images=1)
+    ...     return jfrnn.search(padded, 1.0, active=np.arange(size) < len(x), box=box, capacity=8)
+    >>> searched([[0.1, 0.1, 0.1], [1.9, 0.1, 0.1]], [2.0, 2.0, 2.0]).count[:2]
+    Array([1, 1], dtype=int32)
+    >>> searched([[0.1, 0.1, 0.1], [2.9, 0.1, 0.1], [1.5, 0.1, 0.1]], [3.0, 2.0, 2.0]).count[:3]
+    Array([1, 1, 0], dtype=int32)
+    """
+    problem = checked_problem(
+        positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, skin, active
+    )
+    slack = checked_slack(slack)
+    inputs, options = problem.inputs, problem.options
+    if capacity is None:
+        capacity = _counted_capacity(inputs, options, slack)
+    capacity = checked_capacity(capacity)
+    with own_transfers():
+        fields = call_apart(lambda inputs: found_fields(inputs, options, capacity, problem.skin > 0), inputs)
+    return NeighborList(
+        **fields,
+        cutoff=problem.radius,
+        skin=problem.skin,
+        half=options.filter.later_only,
+        include_self=queries is None and not options.filter.drop_self,
+        closed=options.closed,
+        own_queries=queries is not None,
+        masked=active is not None,
+        box_kind=options.images,
+        source_count=inputs.sources.shape[0],
+        dim=inputs.sources.shape[1],
+        dtype=np.dtype(inputs.sources.dtype),
+        backend=options.backend,
+    )
+
+
+def count(
+    positions: Array,
+    cutoff: float | Array | tuple[Array, Array],
+    *,
+    queries: Array | None = None,
+    box: Box | None = None,
+    batch: Array | tuple[Array, Array] | None = None,
+    radius_rule: str = "gather",
+    half: bool = False,
+    include_self: bool = False,
+    closed: bool = False,
+    active: Array | None = None,
+    backend: str = "auto",
+) -> Array:
+    """Count the neighbors that `search` would list, without listing them.
+
+    Args:
+        positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64.
+        cutoff: As in `search`.
+        queries: As in `search`.
+        box: As in `search`.
+        batch: As in `search`.
+        radius_rule: As in `search`.
+        half: As in `search`.
+        include_self: As in `search`.
+        closed: As in `search`.
+        active: As in `search`.
+        backend: As in `search`.
+
+    Returns:
+        Neighbors per row, shape [m], int32. A particle with a non-finite coordinate has none, and is nobody's.
+
+    Raises:
+        TypeError, ValueError, ImportError, RuntimeError: as in `search`.
+
+    Memory: as in `search`, without the list. Differentiable: no (integers). Jit: yes. vmap: yes.
+    """
+    problem = checked_problem(positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, 0.0, active)
+    with own_transfers():
+        return call_apart(lambda inputs: count_rows(inputs, problem.options)[0], problem.inputs)
+
+
+class Problem(NamedTuple):
+    """What was asked for, checked."""
+
+    inputs: Inputs
+    options: Options
+    radius: float | None  # of a pair, without the skin; None where particles have their own
+    skin: float
+
+
+def checked_problem(
+    positions: Any,  # noqa: ANN401
+    cutoff: Any,  # noqa: ANN401
+    queries: Any,  # noqa: ANN401
+    box: Any,  # noqa: ANN401
+    batch: Any,  # noqa: ANN401
+    radius_rule: Any,  # noqa: ANN401
+    half: bool,
+    include_self: bool,
+    closed: bool,
+    backend: str,
+    skin: Any,  # noqa: ANN401
+    active: Any,  # noqa: ANN401
+) -> Problem:
+    """Check the arguments that all public verbs share."""
+    sources = checked_positions("positions", positions)
+    if queries is not None:
+        queries = checked_positions("queries", queries, like=sources)
+        for name, value in (("half", half), ("include_self", include_self)):
+            if checked_flag(name, value):
+                raise ValueError(f"{name}=True pairs particles with themselves or each other: it cannot be used with queries.")
+    active = None if active is None else checked_active(active, sources)
+    keep = Filter(
+        drop_self=queries is None and not checked_flag("include_self", include_self),
+        later_only=checked_flag("half", half),
+    )
+    dtype = np.dtype(sources.dtype)
+    radii, closed = checked_radii(cutoff, radius_rule, sources, queries), checked_flag("closed", closed)
+    if radii is None:
+        radius = float(checked_cutoff(cutoff, dtype).radius)
+        skin = checked_skin(skin, radius, dtype)
+        reach = list_radius(radius, skin, dtype)
+    else:
+        if keep.later_only and radii.rule in ("gather", "scatter"):
+            raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
+        largest = largest_known(radii)
+        radius, skin = None, checked_skin(skin, largest or 0.0, dtype)
+        reach = None if largest is None else list_radius(largest, skin, dtype)
+    box = None if box is None else checked_box(box, sources)
+    kind = None if box is None else images_of(box, reach, dtype, sources.shape[0])
+    engine = choose_engine(
+        checked_backend(backend), sources, queries, periodic=box is not None, radii=radii is not None, batch=batch is not None
+    )
+    systems = None if batch is None else checked_batch(batch, sources, queries)
+    list_cutoff, options = made_options(radii or reach, keep, kind, engine, dtype, closed, skin)
+    box = None if box is None else fixed_box(box, dtype)
+    return Problem(Inputs(sources, queries, active, box, list_cutoff, systems), options, radius, skin)
+
+
+def _counted_capacity(inputs: Inputs, options: Options, slack: float) -> int:
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves(inputs)):
+        raise ValueError(
+            "capacity must be given where positions are traced (jax.jit, vmap, grad, scan), because it is a shape: pass "
+            "capacity=int(jfrnn.count(positions, cutoff + skin).max()) of concrete positions, with room to move, or the capacity "
+            "of an earlier search, and check nbrs.overflow."
+        )
+    return counted_capacity(inputs, options, slack)

@@ -1,0 +1,115 @@
+"""The Verlet skin: a list of all pairs within cutoff + skin stays complete until something has moved more than half the skin.
+
+If no point moved farther than skin/2 since the list was made, a pair that is closer than the cutoff now was closer than
+cutoff + skin then (triangle inequality), so it stands in the list (Verlet 1967, doi:10.1103/PhysRev.159.98).
+"""
+
+import dataclasses
+import math
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jfrnn._geometry import (
+    Box,
+    Cutoff,
+    Images,
+    Motion,
+    Radii,
+    box_change,
+    is_radius,
+    make_cutoff,
+    make_lattice,
+    motion_of,
+    squared_distance,
+    widened,
+)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Verlet:
+    """What a list with a skin remembers: where it was made, and how often it was made anew.
+
+    Attributes:
+        positions: Sources when the list was last made [length], shape [n, d]; inactive ones are infinite.
+        queries: Queries then [length], shape [m, d], or None.
+        box: The periodic box then, or None.
+        radii: Cutoffs of the particles then, or None where one serves all.
+        rebuild_count: How often `update` made the list anew, shape [], int32.
+    """
+
+    positions: Array
+    queries: Array | None
+    box: Box | None
+    radii: Radii | None
+    rebuild_count: Array
+
+
+def list_radius(cutoff: float, skin: float, dtype: np.dtype) -> float:
+    """Return cutoff + skin, both of this dtype, rounded up to it: no pair within the exact sum is lost."""
+    exact = Fraction(cutoff) + Fraction(skin)
+    radius = dtype.type(cutoff) + dtype.type(skin)
+    while math.isfinite(radius) and Fraction(float(radius)) < exact:
+        radius = np.nextafter(radius, dtype.type(np.inf))
+    return float(radius)
+
+
+def moved_too_far(
+    verlet: Verlet,
+    positions: Array,
+    queries: Array | None,
+    box: Box | None,
+    box_kind: Images | None,
+    radii: Radii | None,
+    skin: float,
+) -> Array:
+    """Say whether any point is, or may be by rounding, skin/2 or more from where the list was made, [] bool.
+
+    One pass over the positions. A point that is not finite has no neighbors: it counts as moved when it becomes so or ceases to be.
+    Lattice vectors by which a point was wrapped are no motion, since its images stay where they are. A box that changed has moved
+    the images of a pair against each other, and cutoffs that grew reach farther: that much less of the skin is left for the
+    points. No rule makes a pair's cutoff grow by more than the two of which it is made.
+    """
+    half = make_cutoff(skin / 2, np.dtype(positions.dtype), closed=False)
+    used, grown, moved = jnp.zeros((), positions.dtype), jnp.zeros((), positions.dtype), jnp.zeros((), bool)
+    clouds = [(verlet.positions, positions)]
+    if queries is not None and verlet.queries is not None:
+        clouds.append((verlet.queries, queries))
+    motions: list[Motion | None] = [None] * len(clouds)
+    if box is not None and verlet.box is not None and box_kind is not None:
+        old, new = (make_lattice(x, box_kind, np.dtype(positions.dtype)) for x in (verlet.box, box))
+        motions = [motion_of(before, now, new) for before, now in clouds]
+        used = box_change(old, new, [motion.home for motion in motions if motion is not None])
+    if radii is not None and verlet.radii is not None:
+        for before, now in ((verlet.radii.sources, radii.sources), (verlet.radii.queries, radii.queries)):
+            if before is not None and now is not None:
+                moved = moved | (is_radius(before) != is_radius(now)).any()
+                grown = jnp.maximum(grown, _growth(before, now))
+    if box is not None or radii is not None:
+        half = widened(half, (used + grown) / 4)
+    for cloud, motion in zip(clouds, motions, strict=True):
+        moved = moved | _any_beyond(*cloud, motion, half)
+    return moved
+
+
+def _growth(before: Array, now: Array) -> Array:
+    """Return by how much a cutoff grew at most, rounded up."""
+    grown = jnp.where(is_radius(before) & is_radius(now), now - before, 0)
+    return jnp.max(grown, initial=0) * (1 + 4 * jnp.finfo(grown.dtype).eps)
+
+
+def _any_beyond(before: Array, now: Array, motion: Motion | None, half_skin: Cutoff) -> Array:
+    axes = list((now - before).T) if motion is None else motion.axes
+    near = squared_distance(axes, half_skin) < half_skin.inside  # 8 eps inside: surely closer
+    near = near if motion is None else near & motion.sure
+    there = jnp.isfinite(before).all(axis=1) | jnp.isfinite(now).all(axis=1)
+    return jnp.any(there & ~near)
+
+
+def first_verlet(positions: Array, queries: Array | None, box: Box | None, radii: Radii | None) -> Verlet:
+    """Return what a list remembers that was just made."""
+    return Verlet(*lax.stop_gradient((positions, queries, box, radii)), jnp.int32(0))

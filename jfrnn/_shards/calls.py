@@ -1,0 +1,153 @@
+"""What a shard asks the library on one device about its own particles and those of its halo."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.sharding import PartitionSpec
+
+from jfrnn._geometry import checked_cutoff, checked_flag, checked_skin
+from jfrnn._search import count, list_radius, rounded_capacity
+from jfrnn._shards.halo import Halo, exchanged, halo_in_shard, halo_spec, rows_seen
+from jfrnn._shards.particles import OVERFLOWS, Particles, of_shards, spec_of
+
+_ENGINES = ("auto", "jax", "warp", "brute")
+
+
+class Asked(NamedTuple):
+    """What is asked about pairs; static."""
+
+    cutoff: float
+    skin: float
+    include_self: bool
+    closed: bool
+    backend: str
+
+
+def checked_asked(particles: Any, cutoff: Any, skin: Any, include_self: Any, closed: Any, backend: Any) -> Asked:  # noqa: ANN401
+    if not isinstance(particles, Particles):
+        raise TypeError(f"particles must be what jfrnn.distributed.scatter returns, got {type(particles).__name__}.")
+    if backend not in _ENGINES:
+        raise ValueError(f"backend must be one of {', '.join(map(repr, _ENGINES))} on several devices, got {backend!r}.")
+    dtype = np.dtype(particles.positions.dtype)
+    radius = float(checked_cutoff(cutoff, dtype).radius)
+    skin = checked_skin(skin, radius, dtype)
+    if list_radius(radius, skin, dtype) > particles.reach:
+        raise ValueError(
+            f"cutoff + skin must be at most {particles.reach}, the reach with which the particles were spread, got "
+            f"{radius} + {skin}: pass larger ones to scatter."
+        )
+    return Asked(radius, skin, checked_flag("include_self", include_self), checked_flag("closed", closed), backend)
+
+
+def over_shards(fn: Callable[..., Any], particles: Particles, out: Any, *arguments: Any) -> Any:  # noqa: ANN401
+    """Run a function of the parts of a shard on every shard; arguments of no kind that is known here have spread rows."""
+
+    def spec(argument: Any) -> Any:  # noqa: ANN401
+        if isinstance(argument, Particles):
+            return spec_of(argument)
+        if isinstance(argument, Halo):
+            return halo_spec(particles)
+        return jax.tree.map(lambda _: of_shards(particles.mesh), argument)
+
+    specs = tuple(spec(argument) for argument in arguments)
+    return jax.shard_map(fn, mesh=particles.mesh, in_specs=specs, out_specs=out, check_vma=False)(*arguments)
+
+
+def checked_halo(halo: Any, particles: Particles) -> None:  # noqa: ANN401
+    """Refuse a halo of particles that are laid out otherwise: after `grow`, what was made before is of no use.
+
+    Raises:
+        TypeError, ValueError: It is no halo, or one of other shapes.
+    """
+    if not isinstance(halo, Halo):
+        raise TypeError(f"halo must be what jfrnn.distributed.halo returns, got {type(halo).__name__}.")
+    wanted = particles.mesh.devices.size * rows_seen(particles)
+    if halo.ids.shape != (wanted,):
+        raise ValueError(
+            f"halo has {halo.ids.shape[0]} rows, but particles with {particles.sizes} see {wanted}: after grow() make halos and "
+            "lists anew."
+        )
+
+
+def on_each(fn: Callable[..., Any], particles: Particles, *same: Any) -> Any:  # noqa: ANN401
+    """Run a function on every device, on its own particles alone: what needs no neighbors, such as walls that all devices know.
+
+    Args:
+        fn: (particles, *same) -> a pytree of arrays with a row for each row of the particles that it gets: `positions`, `ids`,
+            `active` and `values` are those of one device.
+        particles: Spread particles.
+        *same: Pytrees of arrays that every device gets whole, such as vertices and faces.
+
+    Returns:
+        What fn returns, leaves [N, ...], rows as in `particles.positions`.
+
+    Differentiable: as fn. Jit: yes, and only there fast. vmap: no.
+    """
+    specs = spec_of(particles), *(jax.tree.map(lambda _: PartitionSpec(), each) for each in same)
+    rows = of_shards(particles.mesh)
+    return jax.shard_map(fn, mesh=particles.mesh, in_specs=specs, out_specs=rows, check_vma=False)(particles, *same)
+
+
+@jax.jit
+def halo(particles: Particles) -> Halo:
+    """Choose which particles are sent where, once for several sums at the same positions.
+
+    Args:
+        particles: Where they are now, on whatever shard.
+
+    Returns:
+        A `Halo` for particles at these positions.
+
+    Cost: a pass over a shard for each shard along an axis of the mesh. Differentiable: no gradient flows through. Jit: yes.
+    vmap: no.
+    """
+    return over_shards(halo_in_shard, particles, halo_spec(particles), lax.stop_gradient(particles))
+
+
+class Seen(NamedTuple):
+    """What a shard sees: its own particles and those of its halo."""
+
+    positions: Array
+    active: Array
+
+
+def seen(particles: Particles, halo: Halo) -> Seen:
+    return Seen(exchanged(particles.positions, halo, particles), halo.ids >= 0)
+
+
+def is_good(particles: Particles, halo: Halo) -> Array:
+    """Say on every shard whether a halo has all it should have, of these rows; [] bool."""
+    other = jnp.any(halo.ids[: particles.sizes.particles] != particles.ids)
+    return ~lax.pmax(other, particles.mesh.axis_names) & ((halo.status & OVERFLOWS.value) == 0)
+
+
+def marked(x: Array, good: Array) -> Array:
+    """Return what is no result where pairs may be missing; its derivatives likewise."""
+    if jnp.issubdtype(x.dtype, jnp.floating):
+        return x * jnp.where(good, 1, jnp.nan).astype(x.dtype)
+    return jnp.where(good, x, jnp.iinfo(x.dtype).min)
+
+
+@functools.partial(jax.jit, static_argnames="asked")
+def counts(particles: Particles, halo: Halo | None, asked: Asked) -> Array:
+    def counted(particles: Particles, halo: Halo | None) -> Array:
+        halo = halo_in_shard(particles) if halo is None else halo
+        x, active = seen(particles, halo)
+        radius = list_radius(asked.cutoff, asked.skin, np.dtype(x.dtype))
+        counts = count(
+            x, radius, box=particles.box, include_self=asked.include_self, closed=asked.closed, active=active, backend=asked.backend
+        )
+        return marked(counts[: particles.sizes.particles], is_good(particles, halo))
+
+    return over_shards(counted, particles, of_shards(particles.mesh), lax.stop_gradient(particles), halo)
+
+
+def counted_capacity(particles: Particles, asked: Asked, slack: float) -> int:
+    longest = int(jnp.max(counts(particles, None, asked), initial=0))
+    return rounded_capacity(math.ceil(max(longest, 1) * slack))

@@ -1,0 +1,166 @@
+"""From plain arrays to particles spread over devices, and back."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, cast
+
+import jax
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+from jax.sharding import Mesh
+
+from jfrnn._geometry import Box, checked_box, checked_cutoff, checked_positions, checked_skin, checked_slack, images_of
+from jfrnn._search import list_radius
+from jfrnn._shards.migrate import migrate
+from jfrnn._shards.particles import Particles, Sizes, no_requirements, placed, replicated, resized, room
+
+_MOST = 2**31 - 1
+_SMALL = 1024  # particles that may travel at first without a thought: a wrong guess is compiled anew
+
+
+def scatter(
+    positions: np.ndarray | Array,
+    cutoff: float,
+    values: Any = None,  # noqa: ANN401
+    *,
+    mesh: Mesh,
+    skin: float = 0.0,
+    box: Box | None = None,
+    along: Sequence[int] | None = None,
+    slack: float = 1.25,
+) -> Particles:
+    """Spread particles over a mesh of devices, evenly, each device getting a region of space.
+
+    Args:
+        positions: Positions [length], shape [n, 2] or [n, 3], float32 or float64; in every process all of them.
+        cutoff: Largest interaction radius that will be asked for [length], a number > 0.
+        values: A pytree of arrays of shape [n, ...] that travel with the particles.
+        mesh: Devices, with as many axes as space is to be cut along, at most d: `jax.make_mesh((8,), ("x",))` cuts slabs,
+            `jax.make_mesh((4, 2), ("x", "y"))` slabs and each of them once more.
+        skin: Largest extra shell that will be asked for [length].
+        box: Periodic box, given by lengths: a lattice that is skewed is refused.
+        along: Which axis of space each axis of the mesh cuts; default: the longest ones first.
+        slack: Factor >= 1 on what shards and messages hold now, room to move.
+
+    Returns:
+        `Particles` with room for `slack` times what is there.
+
+    Raises:
+        TypeError, ValueError: An argument is of the wrong kind, shape or range, or is traced.
+
+    Memory: in each process what was given, on each device its share. Differentiable: no. Jit: no.
+    """
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves((positions, values, box))):
+        raise TypeError("scatter() chooses shapes from data and cannot run inside jax.jit: call it before, on arrays.")
+    checked_positions("positions", positions[:0] if hasattr(positions, "shape") and np.ndim(positions) else positions)
+    x = np.asarray(positions)
+    if len(x) > _MOST:
+        raise ValueError(f"positions hold {len(x)} particles, but ids are int32: at most {_MOST}.")
+    values = jax.tree_util.tree_map_with_path(lambda path, leaf: _checked_value(path, leaf, len(x)), values)
+    slack, reach = checked_slack(slack), _checked_reach(cutoff, skin, x.dtype)
+    mesh, cut = _checked_mesh(mesh, x.shape[1]), _checked_along(along, x, mesh)
+    fixed = None if box is None else _checked_box(box, x, reach, mesh)
+    return _settled(_in_blocks(x, values, fixed, mesh, cut, reach), slack)
+
+
+def _in_blocks(x: np.ndarray, values: Any, box: Box | None, mesh: Mesh, along: tuple[int, ...], reach: float) -> Particles:  # noqa: ANN401
+    """Put equally many rows on each device as they come: `migrate` knows where they belong."""
+    shape, shards = mesh.devices.shape, mesh.devices.size
+    share = -(-len(x) // shards)
+    guess = room(max(share // 4, min(share, _SMALL)))
+    sizes = Sizes(room(share), (guess,) * len(along), tuple(min(1, size - 1) for size in shape))
+    place = np.arange(sizes.particles)
+    source = np.where(place < share, share * np.arange(shards)[:, None] + place, len(x)).reshape(-1)
+    source = np.where(source < len(x), source, -1).astype(np.int32)
+    bounds = tuple(np.zeros((*shape[:k], size - 1), x.dtype) for k, size in enumerate(shape))
+    same = (bounds, np.zeros((), np.int32), no_requirements(len(along)))
+    bounds, status, required = jax.tree.map(lambda leaf: replicated(mesh, leaf), same)
+    rows = jax.tree.map(lambda leaf: placed(mesh, leaf, source), (x, values))
+    ids = placed(mesh, source, np.arange(len(source)))
+    return Particles(rows[0], ids, rows[1], bounds, box, status, required, mesh, along, len(x), reach, sizes)
+
+
+def _settled(particles: Particles, slack: float) -> Particles:
+    """Move particles to their shards, making room until it is enough: what later axes of a mesh need is known last."""
+    while True:
+        moved = migrate(particles)
+        if not bool(moved.overflow):
+            break
+        particles = particles.grow(moved, slack=1.0)
+    needed = (int(moved.required.particles), *np.asarray(moved.required.halo).tolist())
+    fullest, *halo = (room(math.ceil(slack * size)) for size in needed)
+    return resized(moved, Sizes(max(fullest, moved.sizes.particles), tuple(halo), moved.sizes.hops))
+
+
+def collect(particles: Particles) -> tuple[np.ndarray, Any]:
+    """Return positions [n, d] and values (leaves [n, ...]) as plain host arrays, in the order of ids; in every process all.
+
+    Raises:
+        TypeError: Called inside jit.
+
+    Communication: everything goes everywhere, for checks and pictures. Differentiable: no. Jit: no.
+    """
+    if isinstance(particles.ids, Tracer):
+        raise TypeError("collect() makes host arrays and cannot run inside jax.jit: call it on what jit returns.")
+    ids = fetched(particles.ids)
+    rows = np.flatnonzero(ids >= 0)
+    order = rows[np.argsort(ids[rows], kind="stable")]
+    return jax.tree.map(lambda leaf: fetched(leaf)[order], (particles.positions, particles.values))
+
+
+def fetched(array: Array) -> np.ndarray:
+    """Return all of a global array on the host, in every process."""
+    if array.is_fully_addressable or array.is_fully_replicated:
+        return np.asarray(array)
+    from jax.experimental import multihost_utils
+
+    return np.asarray(multihost_utils.process_allgather(array, tiled=True))
+
+
+def _checked_value(path: Any, leaf: Any, total: int) -> np.ndarray:  # noqa: ANN401
+    name = f"values{jax.tree_util.keystr(path)}"
+    if not hasattr(leaf, "shape") or not hasattr(leaf, "dtype"):
+        raise TypeError(f"{name} must be an array with a row per particle, got {type(leaf).__name__}.")
+    if tuple(leaf.shape[:1]) != (total,):
+        raise ValueError(f"{name} must have shape [{total}, ...], one row per particle, got {list(leaf.shape)}.")
+    return np.asarray(leaf)
+
+
+def _checked_reach(cutoff: Any, skin: Any, dtype: np.dtype) -> float:  # noqa: ANN401
+    radius = float(checked_cutoff(cutoff, dtype).radius)
+    return list_radius(radius, checked_skin(skin, radius, dtype), dtype)
+
+
+def _checked_mesh(mesh: Any, dim: int) -> Mesh:  # noqa: ANN401
+    if not isinstance(mesh, Mesh):
+        raise TypeError(f"mesh must be a jax.sharding.Mesh, got {type(mesh).__name__}: write e.g. jax.make_mesh((8,), ('x',)).")
+    if not 1 <= mesh.devices.ndim <= dim:
+        raise ValueError(f"mesh must have 1 to {dim} axes, as many as space is cut along, got {mesh.devices.ndim}.")
+    return Mesh(mesh.devices, mesh.axis_names)  # its axes for `shard_map` and for the compiler, not for types
+
+
+def _checked_along(along: Sequence[int] | None, x: np.ndarray, mesh: Mesh) -> tuple[int, ...]:
+    dim, axes = x.shape[1], mesh.devices.ndim
+    if along is None:
+        finite = x[np.isfinite(x).all(axis=1)]
+        extent = np.ptp(finite, axis=0) if len(finite) else np.zeros(dim)
+        return tuple(np.argsort(-extent, kind="stable")[:axes].tolist())
+    given = tuple(along)
+    if len(given) != axes or len(set(given)) != axes or not set(given) <= set(range(dim)):
+        raise ValueError(
+            f"along must name {axes} different axes of space, of 0 to {dim - 1}, one per axis of the mesh, got {given}."
+        )
+    return given
+
+
+def _checked_box(box: Any, x: np.ndarray, reach: float, mesh: Mesh) -> Box | None:  # noqa: ANN401
+    """Return the box in the dtype of positions, its images chosen as on one device, on every device."""
+    checked = checked_box(box, cast(Any, x))
+    if checked is None:
+        return None
+    if not checked.orthogonal:
+        raise ValueError("box must be given by lengths: particles in a skewed lattice cannot be spread yet; run it on one device.")
+    kind = images_of(checked, reach, x.dtype, len(x))
+    arrays = (replicated(mesh, np.asarray(a).astype(x.dtype)) for a in (checked.vectors, checked.origin))
+    return Box.tree_unflatten((checked.periodic, (0,) * checked.dim if kind.nearest else kind.reach), tuple(arrays))

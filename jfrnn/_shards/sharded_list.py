@@ -1,0 +1,231 @@
+"""Lists of neighbors that are spread over devices."""
+
+import dataclasses
+import functools
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.core import Tracer
+from jax.sharding import PartitionSpec
+
+from jfrnn._geometry import check_devices, pairs_and_status, shape_of
+from jfrnn._search import NeighborList, moved_too_far, rounded_capacity, search
+from jfrnn._shards.calls import Asked, checked_halo, counted_capacity, over_shards, seen
+from jfrnn._shards.halo import Halo, halo_in_shard, halo_spec
+from jfrnn._shards.migrate import migrate
+from jfrnn._shards.particles import OVERFLOWS, Particles, Required, check, of_shards, shared_bits
+from jfrnn._shards.scatter import fetched
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Neighbors:
+    """Hold the neighbors of particles that are spread over devices. A pytree; made by `search`.
+
+    Attributes:
+        local: For each shard a `jfrnn.NeighborList` of its own particles and those of its halo; all arrays have a first axis more,
+            the shards.
+        halo: Which particles were sent where when the list was made (`Halo`).
+        count: True number of neighbors of each particle, shape [N], int32, as in `jfrnn.NeighborList`; 0 in unused rows.
+        status: Bits of `Status`, shape [], int32.
+        required: How much room would have been enough (`Required`).
+        asked: What was asked. Static.
+    """
+
+    local: NeighborList
+    halo: Halo
+    count: Array
+    status: Array
+    required: Required
+    asked: Asked = dataclasses.field(metadata={"static": True})
+
+    def __repr__(self) -> str:
+        """Say in a line what it holds; waits for the devices."""
+        shape, (cutoff, skin, *_) = shape_of(self.local.idx), self.asked
+        kept = f", skin {skin:.6g}" if skin else ""
+        rest = pairs_and_status(self.count, self.status)
+        return (
+            f"Neighbors({shape[0]} shards, capacity {shape[-1]}, cutoff {cutoff:.6g}{kept}, engine {self.asked.backend!r}, {rest})"
+        )
+
+    @property
+    def capacity(self) -> int:
+        """Slots per row."""
+        return self.local.capacity
+
+    @property
+    def overflow(self) -> Array:
+        """Whether pairs may be missing because room was, shape [], bool."""
+        return (self.status & OVERFLOWS.value) != 0
+
+    @property
+    def rebuild_count(self) -> Array:
+        """How often updates made the list anew, shape [shards], int32, the same number for each; known for a list with a skin."""
+        return self.local.rebuild_count
+
+    def update(self, particles: Particles) -> tuple[Particles, "Neighbors"]:
+        """Make the list anew if any particle has moved skin/2, or may have by rounding, or rows changed; without a skin, always.
+
+        Before a list is made, particles go to the shards in whose regions they are (`migrate`): rows change places, so go on with
+        the particles that come back.
+
+        Args:
+            particles: Where they are now.
+
+        Returns:
+            The particles and the list, in the same shapes. Bits and what was required are kept over all updates, in both.
+
+        Raises:
+            ValueError: The particles are not laid out as those for which the list was made.
+
+        Cost: one pass over the positions and one number from each device; or `migrate` and `search`. Differentiable: no gradient
+        flows through. Jit: yes. vmap: no.
+        """
+        self._check_fits(particles)
+        return _updated(particles, self)
+
+    def grow(self, particles: Particles, slack: float = 1.25) -> "Neighbors":
+        """Make a list with room for what overflowed, for particles that have grown. Not inside jit.
+
+        Args:
+            particles: Where they are now, after their own `grow`.
+            slack: Factor >= 1 on the longest row that was ever met.
+
+        Returns:
+            A list with the same options, and no bits from the past.
+
+        Raises:
+            TypeError: Called inside jit.
+            ValueError: The particles are of another kind than those for which the list was made.
+        """
+        self._check_kind(particles)
+        if any(isinstance(x, Tracer) for x in jax.tree.leaves((particles, self.required))):
+            raise TypeError("grow() changes shapes and cannot run inside jax.jit: call it on what jit returns.")
+        counted = counted_capacity(particles, self.asked, slack)
+        met = rounded_capacity(math.ceil(slack * int(self.required.row))) if int(self.required.row) > self.capacity else 0
+        return listed(particles, self.asked, max(self.capacity, counted, met))
+
+    def check(self) -> None:
+        """Raise what the status bits report; wait for the devices. Not inside jit: there, read `overflow`.
+
+        Raises:
+            RuntimeError: Room was missing; the message says how much is needed.
+            ValueError: Positions hold NaN or infinity, or do not fit the box.
+        """
+        check(self, f"row {self.capacity}, halo {[sends.shape[1] for sends in self.halo.sends]}")
+
+    def _check_kind(self, particles: Any) -> None:  # noqa: ANN401
+        """Refuse particles of another dtype or dimension, in another kind of box, or on other devices than those of the list."""
+        if not isinstance(particles, Particles):
+            raise TypeError(f"particles must be what jfrnn.distributed.scatter returns, got {type(particles).__name__}.")
+        check_devices("particles", particles.ids, self.count)
+        made, came = (
+            f"{dtype}, {dim}D, {'in open space' if box is None else f'box with periodic={box.periodic}'}"
+            for dtype, dim, box in (
+                (self.local.dtype, self.local.dim, self.local.box),
+                (np.dtype(particles.positions.dtype), particles.dim, particles.box),
+            )
+        )
+        if made != came:
+            raise ValueError(f"particles must be of the kind for which the list was made ({made}), got {came}: search anew.")
+
+    def _check_fits(self, particles: Any) -> None:  # noqa: ANN401
+        """Refuse particles of another kind, or laid out otherwise, than those for which the list was made."""
+        self._check_kind(particles)
+        checked_halo(self.halo, particles)
+
+    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ids (i, j) of all pairs, once for each direction and image, sorted, in every process all of them.
+
+        Returns:
+            Two host arrays of one length, int32: as `jfrnn.search` on one device lists them, in another order.
+
+        Raises:
+            RuntimeError, ValueError: As `check`.
+            TypeError: Called inside jit.
+
+        Communication: everything goes everywhere, for checks. Differentiable: no. Jit: no.
+        """
+        self.check()
+        mine, theirs = (fetched(x) for x in _named_pairs(self))
+        found = theirs >= 0
+        i, j = np.broadcast_to(mine[:, None], theirs.shape)[found], theirs[found]
+        order = np.lexsort((j, i))
+        return i[order], j[order]
+
+
+@functools.partial(jax.jit, static_argnames=("asked", "capacity"))
+def listed(particles: Particles, asked: Asked, capacity: int) -> Neighbors:
+    mesh, rows = particles.mesh, of_shards(particles.mesh)
+    same: Any = PartitionSpec()
+
+    def of_shard(particles: Particles) -> tuple[Any, ...]:
+        halo = halo_in_shard(particles)
+        x, active = seen(particles, halo)
+        made = search(
+            x,
+            asked.cutoff,
+            box=particles.box,
+            include_self=asked.include_self,
+            closed=asked.closed,
+            skin=asked.skin,
+            active=active,
+            capacity=capacity,
+            backend=asked.backend,
+        )
+        status = shared_bits(made.status | halo.status, mesh)
+        required = halo.required._replace(row=lax.pmax(made.required, mesh.axis_names))
+        return jax.tree.map(lambda leaf: leaf[None], made), halo, made.count[: particles.sizes.particles], status, required
+
+    out = rows, halo_spec(particles), rows, same, Required(same, same, same, same)
+    made, halo, counts, status, required = over_shards(of_shard, particles, out, lax.stop_gradient(particles))
+    return Neighbors(made, halo, counts, status, required, asked)
+
+
+@jax.jit
+def _updated(particles: Particles, nbrs: Neighbors) -> tuple[Particles, Neighbors]:
+    particles, asked = lax.stop_gradient(particles), nbrs.asked
+
+    def remake(particles: Particles, nbrs: Neighbors) -> tuple[Particles, Neighbors]:
+        moved = migrate(particles)
+        made, local = listed(moved, asked, nbrs.capacity), nbrs.local
+        if local.verlet is not None and made.local.verlet is not None:
+            verlet = dataclasses.replace(made.local.verlet, rebuild_count=local.verlet.rebuild_count + 1)
+            made = dataclasses.replace(made, local=dataclasses.replace(made.local, verlet=verlet))
+        status, required = made.status | nbrs.status, made.required.joined(nbrs.required)
+        return moved, dataclasses.replace(made, status=status, required=required)
+
+    if not asked.skin:
+        return remake(particles, nbrs)
+    stale: Array = over_shards(_is_stale, particles, PartitionSpec(), particles, nbrs.halo, nbrs.local)
+    # a loop of at most one round, as in `NeighborList.update`
+    carry = lax.while_loop(
+        lambda carry: carry[0], lambda carry: (jnp.zeros_like(stale), *remake(*carry[1:])), (stale, particles, nbrs)
+    )
+    return carry[1:]
+
+
+def _is_stale(particles: Particles, halo: Halo, local: NeighborList) -> Array:
+    """Say on every shard whether any shard's particles moved too far, or are others; [] bool."""
+    local, own = jax.tree.map(lambda leaf: leaf[0], local), particles.sizes.particles
+    if local.verlet is None:
+        raise TypeError("a list without a skin is always stale.")
+    before = dataclasses.replace(local.verlet, positions=local.verlet.positions[:own])
+    now = jnp.where((particles.ids >= 0)[:, None], particles.positions, jnp.inf)
+    moved = moved_too_far(before, now, None, local.box, local.box_kind, None, local.skin)
+    return lax.pmax(moved | jnp.any(halo.ids[:own] != particles.ids), particles.mesh.axis_names)
+
+
+@jax.jit
+def _named_pairs(nbrs: Neighbors) -> tuple[Array, Array]:
+    """Return ids of all rows [N], and of their neighbors [N, capacity], -1 where there is none."""
+    shards = nbrs.local.idx.shape[0]
+    ids = nbrs.halo.ids.reshape(shards, -1)
+    own = nbrs.count.shape[0] // shards
+    idx, mine = nbrs.local.idx[:, :own], ids[:, :own]
+    theirs = jax.vmap(lambda idx, ids: ids.at[idx].get(mode="fill", fill_value=-1))(idx, ids)
+    return mine.reshape(-1), jnp.where((mine >= 0)[..., None], theirs, -1).reshape(-1, nbrs.capacity)

@@ -1,0 +1,188 @@
+"""The verbs of `jfrnn.distributed`: `search`, `count` and `pair_sum`."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.core import Tracer
+
+from jfrnn._geometry import Status, checked_capacity, checked_flag, checked_slack, known_status
+from jfrnn._search import ROWS_ARE_WHOLE, NeighborList
+from jfrnn._shards.calls import Asked, checked_asked, checked_halo, counted_capacity, counts, is_good, marked, over_shards, seen
+from jfrnn._shards.halo import Halo, exchanged, halo_in_shard
+from jfrnn._shards.particles import Particles, of_shards
+from jfrnn._shards.sharded_list import Neighbors, listed
+from jfrnn._sums import pair_sum as pair_sum_on_one
+
+
+def search(
+    particles: Particles,
+    cutoff: float,
+    *,
+    skin: float = 0.0,
+    include_self: bool = False,
+    closed: bool = False,
+    capacity: int | None = None,
+    slack: float = 1.0,
+    backend: str = "auto",
+) -> Neighbors:
+    """Find every pair of particles closer than a cutoff, wherever they are: the pairs of `jfrnn.search` on one device, exactly.
+
+    Args:
+        particles: Spread particles.
+        cutoff: Interaction radius [length], a static number > 0; with the skin at most the reach of the particles.
+        skin: As in `jfrnn.search`.
+        include_self: As in `jfrnn.search`.
+        closed: As in `jfrnn.search`.
+        capacity: As in `jfrnn.search`.
+        slack: As in `jfrnn.search`.
+        backend: "warp", "jax", "brute" or "auto", as in `jfrnn.search`.
+
+    Returns:
+        `Neighbors`.
+
+    Raises:
+        TypeError, ValueError: An argument is of the wrong kind, shape or range, or `capacity` is missing under jit.
+
+    Cost: on each device that of `jfrnn.search` for its own particles and those of its halo. Communication: positions of halos.
+    Differentiable: no. Jit: yes, with capacity. vmap: no.
+    """
+    asked, slack = checked_asked(particles, cutoff, skin, include_self, closed, backend), checked_slack(slack)
+    if capacity is None:
+        if isinstance(particles.ids, Tracer):
+            raise ValueError(
+                "capacity must be given where particles are traced, because it is a shape: pass that of an earlier search."
+            )
+        capacity = counted_capacity(particles, asked, slack)
+    return listed(particles, asked, checked_capacity(capacity))
+
+
+def count(
+    particles: Particles,
+    cutoff: float,
+    *,
+    include_self: bool = False,
+    closed: bool = False,
+    backend: str = "auto",
+    halo: Halo | None = None,
+) -> Array:
+    """Count the neighbors that `search` would list.
+
+    Args:
+        particles: Spread particles.
+        cutoff: As in `search`.
+        include_self: As in `search`.
+        closed: As in `search`.
+        backend: As in `search`.
+        halo: A halo of these positions; default: it is made.
+
+    Returns:
+        Neighbors of each particle, shape [N], int32, 0 in unused rows. Where a halo has no room for what it should hold, all are
+        the smallest int32: `migrate` and `halo` tell what is needed.
+
+    Raises:
+        TypeError, ValueError: As `search`.
+
+    Differentiable: no. Jit: yes. vmap: no.
+    """
+    if halo is not None:
+        checked_halo(halo, particles)
+    return counts(particles, halo, checked_asked(particles, cutoff, 0.0, include_self, closed, backend))
+
+
+def pair_sum(
+    fn: Callable[[Array, Any, Any], Any],
+    particles: Particles,
+    cutoff: float | None,
+    values: Any = None,  # noqa: ANN401
+    *,
+    reduce: str = "sum",
+    include_self: bool = False,
+    closed: bool = False,
+    compensated: bool = False,
+    backend: str = "auto",
+    neighbors: Neighbors | None = None,
+    halo: Halo | None = None,
+) -> Any:  # noqa: ANN401
+    """Sum a function of pairs over the neighbors of each particle: `jfrnn.pair_sum`, wherever the neighbors are.
+
+    Args:
+        fn: As in `jfrnn.pair_sum`.
+        particles: Spread particles; derivatives in `particles.positions` are those in the positions.
+        cutoff: As in `search`; with `neighbors` None.
+        values: A pytree of arrays of shape [N, ...], rows as in `particles.positions`, and spread like them. Default: None.
+        reduce: As in `jfrnn.pair_sum`.
+        include_self: As in `search`.
+        closed: As in `search`.
+        compensated: As in `jfrnn.pair_sum`.
+        backend: As in `search`.
+        neighbors: A list of these particles, whose pairs and halos are taken.
+        halo: A halo of these positions; default: that of the list, or it is made.
+
+    Returns:
+        A pytree as fn returns it, leaves [N, ...], 0 in unused rows. Where a halo has no room for what it should hold, or list or
+        halo are of other rows, all floats are NaN and all integers the smallest of their kind: `migrate` tells what is needed. So
+        are rows of particles that are not finite, and those of shards on which rows of the list overflowed.
+
+    Raises:
+        RuntimeError: Outside jit, room was missing in `neighbors`: as its `check`.
+        TypeError, ValueError, NotImplementedError: As `jfrnn.pair_sum` and `search`.
+
+    Order of summation: that of each device; sums differ from those on one device by rounding. Communication: positions of halos
+    and their values; in derivatives as much again, in the other direction. Differentiable: to every order in positions, values and
+    whatever fn closes over. Jit: yes; outside of it, define fn once. vmap: no.
+    """
+    if not callable(fn):
+        raise TypeError(f"fn must be a function of (r, i, j), got {type(fn).__name__}.")
+    if neighbors is not None:
+        if not isinstance(neighbors, Neighbors):
+            raise TypeError(f"neighbors must be what jfrnn.distributed.search returns, got {type(neighbors).__name__}.")
+        neighbors._check_fits(particles)
+        if cutoff is not None or include_self or closed or backend != "auto":
+            raise ValueError("cutoff, include_self, closed and backend were said when the list was made: leave them out.")
+        if (known_status(neighbors.status) or Status.OK) & ~ROWS_ARE_WHOLE:
+            neighbors.check()
+        asked, halo = neighbors.asked, neighbors.halo if halo is None else halo
+    elif cutoff is None:
+        raise ValueError("cutoff must be given: only a list (neighbors=) has its own.")
+    else:
+        asked = checked_asked(particles, cutoff, 0.0, include_self, closed, backend)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(values):
+        if tuple(jnp.shape(leaf)[:1]) != particles.ids.shape:
+            name, shape = f"values{jax.tree_util.keystr(path)}", list(jnp.shape(leaf))
+            raise ValueError(f"{name} must have shape [{particles.ids.shape[0]}, ...], a row per row of particles, got {shape}.")
+    if halo is not None:
+        checked_halo(halo, particles)
+    local = None if neighbors is None else neighbors.local
+    return _sums(particles, halo, local, values, fn, asked, reduce, checked_flag("compensated", compensated))
+
+
+@functools.partial(jax.jit, static_argnames=("fn", "asked", "reduce", "compensated"))
+def _sums(
+    particles: Particles,
+    halo: Halo | None,
+    local: NeighborList | None,
+    values: Any,  # noqa: ANN401
+    fn: Callable[[Array, Any, Any], Any],
+    asked: Asked,
+    reduce: str,
+    compensated: bool,
+) -> Any:  # noqa: ANN401
+    def summed(particles: Particles, halo: Halo | None, local: NeighborList | None, values: Any) -> Any:  # noqa: ANN401
+        halo = halo_in_shard(particles) if halo is None else halo
+        x, active = seen(particles, halo)
+        theirs = jax.tree.map(lambda leaf: exchanged(leaf, halo, particles), values)
+        options: dict[str, Any] = {"reduce": reduce, "compensated": compensated}
+        if local is None:
+            options |= {"box": particles.box, "include_self": asked.include_self, "closed": asked.closed}
+            options |= {"active": active, "backend": asked.backend}
+            sums = pair_sum_on_one(fn, x, asked.cutoff, theirs, **options)
+        else:
+            sums = pair_sum_on_one(fn, x, None, theirs, neighbors=jax.tree.map(lambda leaf: leaf[0], local), **options)
+        good = is_good(particles, halo)
+        return jax.tree.map(lambda leaf: marked(leaf[: particles.sizes.particles], good), sums)
+
+    return over_shards(summed, particles, of_shards(particles.mesh), particles, halo, local, values)

@@ -1,0 +1,113 @@
+"""The largest or smallest summand of each row: which pair it is, found without derivatives, then that pair alone, with them."""
+
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jfrnn._engine import Block, Slots
+from jfrnn._sums.fused import check, extremes
+from jfrnn._sums.relations import Listed, Relation, Searched, evaluate, is_fused
+from jfrnn._sums.summation import bind_sum
+from jfrnn._sums.terms import Derived, Groups, Term, chosen, fresh_labels, joined, make_term
+from jfrnn._tracing import call_apart, compiled
+
+_Best = tuple[Array, Array, Array | None]  # of each row and element [b, k]: the largest, its source (n: none), its shift [b, k, d]
+
+
+def bind_extremes(relation: Relation, term: Term, operands: Groups, largest: bool) -> list[Array]:
+    """Return the largest (or smallest) of each element of the summands in each row; -inf (inf) where there is no pair.
+
+    NaN counts as the most extreme. Of equal ones that of the smallest j counts, and with it its derivative.
+    """
+    m, n = relation.sizes
+    if isinstance(relation, Searched):
+        check(relation.inputs, relation.options, term)
+    find = functools.partial(_find, term=term, largest=largest)
+    found = call_apart(lambda *given: find(given[0], operands=given[1]), lax.stop_gradient(relation), lax.stop_gradient(operands))
+    results = []
+    for k, (like, (_, source, shift)) in enumerate(zip(term.summands, found, strict=True)):
+        has, elements = source < n, source.shape[1]
+        shifts = None if shift is None else shift.reshape(-1, 1, shift.shape[-1])
+        one_each = Listed(jnp.where(has, source, 0).reshape(-1, 1), has.reshape(-1, 1), shifts, n, symmetric=False)
+        element, needed = _element(term, k)
+        own = tuple(jnp.repeat(x, elements, axis=0) for x in operands.own)
+        number = (jnp.tile(lax.iota(jnp.int32, elements), m),)
+        (value,) = bind_sum(one_each, element, chosen(joined(operands._replace(own=own), Groups((), number, ())), needed), False)
+        none = jnp.asarray(-np.inf if largest else np.inf, like.dtype)
+        results.append(jnp.where(has, value.reshape(has.shape), none).reshape(m, *like.shape))
+    return results
+
+
+@functools.lru_cache(maxsize=256)
+def _element(term: Term, k: int) -> Derived:
+    """Make the term of one element of summand k; its number is the last of the own operands."""
+
+    def summand(real: Array, shift: Array, operands: Groups) -> Sequence[Array]:
+        *own, number = operands.own
+        return [jnp.ravel(term(real, shift, operands._replace(own=tuple(own)))[k])[number]]
+
+    number = jax.ShapeDtypeStruct((), np.int32)
+    mine, theirs = fresh_labels(len(term.operands.own) + 1, term.labels), term.labels[1]  # a row of i for each element
+    return make_term(summand, joined(term.operands, Groups((), (number,), ())), term.shift, (mine, theirs))
+
+
+@functools.partial(compiled, static_argnames=("term", "largest"))
+def _find(relation: Relation, term: Term, operands: Groups, largest: bool) -> list[_Best]:
+    if is_fused(relation, term):
+        return extremes(relation.inputs, relation.options, term, operands, largest)
+    m, n = relation.sizes
+
+    def start(rows: int, like: jax.ShapeDtypeStruct) -> _Best:
+        elements = int(np.prod(like.shape))
+        best, source = jnp.full((rows, elements), -jnp.inf, like.dtype), jnp.full((rows, elements), n, jnp.int32)
+        return best, source, jnp.zeros((rows, elements, *term.shift.shape), term.shift.dtype) if relation.periodic else None
+
+    def visit(block: Block, out: list[_Best]) -> list[_Best]:
+        def add(slots: Slots, state: list[_Best]) -> list[_Best]:
+            summands = evaluate(relation, term, operands, block, slots)
+            return [_better(old, _best_of(x if largest else -x, slots, n), n) for old, x in zip(state, summands, strict=True)]
+
+        done = block.fold(add, [start(block.query.size, like) for like in term.summands])
+        place = jnp.where(block.fresh, block.query, m)
+        return jax.tree.map(lambda all_rows, some: all_rows.at[place].set(some, mode="drop"), out, done)
+
+    return relation.fold(term.elements, visit, [start(m, like) for like in term.summands])
+
+
+def _best_of(values: Array, slots: Slots, n: int) -> _Best:
+    """Return the largest of the values [b, g, ...] in each row.
+
+    One reduction of values and numbers together: XLA may evaluate values anew for each that asks, and round them otherwise.
+    """
+    values = values.reshape(*slots.real.shape, -1)
+    source = jnp.broadcast_to(jnp.where(slots.real, slots.source, n)[..., None], values.shape)
+    slot = lax.broadcasted_iota(jnp.int32, values.shape, 1)
+
+    def larger(a: tuple[Array, Array, Array], b: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        take = _is_better(b[:2], a[:2], n) | (~_is_better(a[:2], b[:2], n) & (b[2] < a[2]))
+        return jnp.where(take, b[0], a[0]), jnp.where(take, b[1], a[1]), jnp.where(take, b[2], a[2])
+
+    start = jnp.asarray(-jnp.inf, values.dtype), jnp.int32(n), jnp.int32(values.shape[1])
+    best, source, slot = lax.reduce((values, source, slot), start, larger, (1,))
+    if slots.shift is None:
+        return best, source, None
+    slot = jnp.minimum(slot, values.shape[1] - 1)[..., None]
+    return best, source, jnp.take_along_axis(slots.shift, slot, axis=1)
+
+
+def _better(old: _Best, new: _Best, n: int) -> _Best:
+    is_new = _is_better(new[:2], old[:2], n)
+    shift = None if old[2] is None or new[2] is None else jnp.where(is_new[..., None], new[2], old[2])
+    return jnp.where(is_new, new[0], old[0]), jnp.where(is_new, new[1], old[1]), shift
+
+
+def _is_better(new: tuple[Array, Array], old: tuple[Array, Array], n: int) -> Array:
+    """Say which values and sources come before others; a source n is none."""
+    (value, source), (than, other) = new, old
+    larger = (value > than) | (jnp.isnan(value) & ~jnp.isnan(than))
+    same = (value == than) | (jnp.isnan(value) & jnp.isnan(than))
+    return (source < n) & ((other == n) | larger | (same & (source < other)))

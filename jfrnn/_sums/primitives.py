@@ -1,0 +1,366 @@
+"""How each primitive of JAX becomes operations on scalars: one row per primitive, in TABLE at the end.
+
+A rule gets the equation and its inputs, arrays of numbers of scalars (see `jfrnn._sums.scalars`), and returns its outputs. A
+primitive that only moves elements needs no operations: its rule moves their numbers.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax import numpy as jnp
+
+from jfrnn._sums.scalars import TYPES, NoTranslationError, Scalars
+
+MOST_REPEATED = 8  # the largest constant exponent of `pow` that is multiplied out, within a few ulp
+
+Values = np.ndarray  # numbers of scalars, in the shape of the array they make up
+
+
+class Spec(NamedTuple):
+    """The shape and dtype of an array."""
+
+    shape: tuple[int, ...]
+    dtype: str
+
+
+class Equation(NamedTuple):
+    """What a rule knows beside its inputs; `run` translates a jaxpr that is nested in the parameters."""
+
+    scalars: Scalars
+    primitive: Any
+    params: dict[str, Any]
+    outputs: Sequence[Spec]
+    run: Callable[[Any, Sequence[Values]], list[Values]]
+
+    def each(self, operation: str, *arrays: Values, dtype: str | None = None) -> Values:
+        """Return the result of an operation on every element; a scalar goes with every shape."""
+        arrays = np.broadcast_arrays(*arrays)
+        rows = zip(*(a.reshape(-1).tolist() for a in arrays), strict=True)
+        dtype = dtype or self.outputs[0].dtype
+        return np.array([self.scalars.apply(operation, row, dtype) for row in rows], int).reshape(arrays[0].shape)
+
+    def full(self, value: Any, shape: tuple[int, ...] = (), dtype: str | None = None) -> Values:  # noqa: ANN401
+        """Return an array of one constant."""
+        return np.full(shape, self.scalars.constant(value, dtype or self.outputs[0].dtype))
+
+    def known(self, numbers: Values) -> np.ndarray:
+        """Return the values of constants, of the indices that say what goes where."""
+        values = [self.scalars.value(k) for k in numbers.reshape(-1).tolist()]
+        if any(value is None for value in values):
+            raise NoTranslationError(
+                f"the primitive {self.primitive.name!r} has no translation into a kernel where its indices depend on data: index "
+                'with constants, select with jnp.where, or pass backend="jax".'
+            )
+        return np.array(values, values[0].dtype if values else np.int32).reshape(numbers.shape)
+
+    def cast(self, x: Values, dtype: str) -> Values:
+        """Return values of another dtype."""
+        return self.each(f"to_{TYPES[dtype]}", x, dtype=dtype)
+
+
+Rule = Callable[[Equation, list[Values]], list[Values]]
+
+
+def _each(operation: str) -> Rule:
+    """Return the rule of a function of `Math` on every element."""
+    return lambda eqn, inputs: [eqn.each(operation, *inputs)]
+
+
+def _move(move: Callable[..., Values]) -> Rule:
+    """Return the rule of what moves elements of one array; `move` gets their numbers and the parameters of the equation."""
+    return lambda eqn, inputs: [np.asarray(move(inputs[0], eqn.params))]
+
+
+def _same(_: Equation, inputs: list[Values]) -> list[Values]:
+    return inputs
+
+
+# --- element-wise -----------------------------------------------------------------------------------------------------
+
+
+def _convert(eqn: Equation, inputs: list[Values]) -> list[Values]:
+    return [eqn.cast(inputs[0], eqn.outputs[0].dtype)]
+
+
+def _power(eqn: Equation, inputs: list[Values]) -> list[Values]:
+    (x, y), dtype = inputs, eqn.outputs[0].dtype
+    if not dtype.startswith("float"):
+        raise NoTranslationError(f"the primitive 'pow' has no translation into a kernel for {dtype}: convert it to a float.")
+    exponents = {eqn.scalars.value(k) for k in y.reshape(-1).tolist()}
+    exponent = exponents.pop() if len(exponents) == 1 else None
+    if exponent is not None and abs(exponent) <= MOST_REPEATED and exponent == int(exponent):
+        return [_repeated(eqn, np.broadcast_to(x, eqn.outputs[0].shape), int(exponent))]
+    return [eqn.each("pow", x, eqn.cast(y, dtype))]
+
+
+def _integer_power(eqn: Equation, inputs: list[Values]) -> list[Values]:
+    return [_repeated(eqn, inputs[0], eqn.params["y"])]
+
+
+def _repeated(eqn: Equation, x: Values, exponent: int) -> Values:
+    """Return a power by repeated multiplication."""
+    result, square, left = eqn.full(1), x, abs(exponent)
+    while left:
+        if left & 1:
+            result = eqn.each("mul", result, square)
+        left >>= 1
+        if left:
+            square = eqn.each("mul", square, square)
+    result = np.broadcast_to(result, x.shape)
+    return eqn.each("div", eqn.full(1), result) if exponent < 0 else result
+
+
+def _round(eqn: Equation, inputs: list[Values]) -> list[Values]:
+    away = int(eqn.params["rounding_method"]) == 0
+    return [eqn.each("round" if away else "round_even", *inputs)]
+
+
+def _select(eqn: Equation, inputs: list[Values]) -> list[Values]:
+    which, first, *others = inputs
+    if not others:
+        return [np.broadcast_to(first, eqn.outputs[0].shape)]
+    return [_choose(eqn, which, [first, *others], eqn.outputs[0].dtype)]
+
+
+def _choose(eqn: Equation, which: Values, cases: Sequence[Values], dtype: str) -> Values:
+    """Return the case that `which` says, a truth or an integer; out of range the nearest one."""
+    kind = eqn.scalars.nodes[int(which.flat[0])].dtype if which.size else "bool"
+    if kind == "bool":
+        return eqn.each("select", which, cases[1], cases[0], dtype=dtype)
+    result = cases[0]
+    for k, case in enumerate(cases[1:], 1):
+        beyond = eqn.each("ge", which, eqn.full(k, dtype=kind), dtype="bool")
+        result = eqn.each("select", beyond, case, result, dtype=dtype)
+    return result
+
+
+# --- reductions -------------------------------------------------------------------------------------------------------
+
+
+def _reduce(operation: str, empty: Callable[[np.dtype], Any]) -> Rule:
+    """Return the rule of a reduction from the first element to the last; `empty` is the result of none, by dtype."""
+
+    def rule(eqn: Equation, inputs: list[Values]) -> list[Values]:
+        axes, x = tuple(eqn.params["axes"]), inputs[0]
+        kept = [k for k in range(x.ndim) if k not in axes]
+        rows = x.transpose([*kept, *axes]).reshape(math.prod(x.shape[k] for k in kept), -1)
+        shape, dtype = eqn.outputs[0]
+        if rows.shape[1] == 0 or x.size == 0:
+            return [eqn.full(empty(np.dtype(dtype)), shape)]
+        result = rows[:, 0]
+        for column in rows.T[1:]:
+            result = eqn.each(operation, result, column)
+        return [result.reshape(shape)]
+
+    return rule
+
+
+def _least(dtype: np.dtype) -> Any:  # noqa: ANN401
+    return -np.inf if dtype.kind == "f" else False if dtype.kind == "b" else np.iinfo(dtype).min
+
+
+def _most(dtype: np.dtype) -> Any:  # noqa: ANN401
+    return np.inf if dtype.kind == "f" else True if dtype.kind == "b" else np.iinfo(dtype).max
+
+
+def _accumulate(operation: str) -> Rule:
+    """Return the rule of a running reduction along an axis."""
+
+    def rule(eqn: Equation, inputs: list[Values]) -> list[Values]:
+        backward = slice(None, None, -1 if eqn.params["reverse"] else 1)
+        slices = list(np.moveaxis(inputs[0], eqn.params["axis"], 0)[backward])
+        for k in range(1, len(slices)):
+            slices[k] = eqn.each(operation, slices[k - 1], slices[k])
+        return [np.moveaxis(np.array(slices, int).reshape(-1, *_without(inputs[0].shape, eqn))[backward], 0, eqn.params["axis"])]
+
+    return rule
+
+
+def _without(shape: tuple[int, ...], eqn: Equation) -> tuple[int, ...]:
+    axis = eqn.params["axis"]
+    return shape[:axis] + shape[axis + 1 :]
+
+
+def _dot_general(eqn: Equation, inputs: list[Values]) -> list[Values]:
+    (left_sum, right_sum), (left_batch, right_batch) = eqn.params["dimension_numbers"]
+    shape, dtype = eqn.outputs[0]
+
+    def arrange(x: Values, summed: Sequence[int], batch: Sequence[int]) -> Values:  # [batch, kept, summed]
+        kept = [k for k in range(x.ndim) if k not in (*summed, *batch)]
+        sizes = [math.prod(x.shape[k] for k in axes) for axes in (batch, kept, summed)]
+        return eqn.cast(x, dtype).transpose([*batch, *kept, *summed]).reshape(sizes)
+
+    left, right = arrange(inputs[0], left_sum, left_batch), arrange(inputs[1], right_sum, right_batch)
+    result = eqn.full(0, (left.shape[0], left.shape[1], right.shape[1]))
+    for k in range(left.shape[2]):
+        product = eqn.each("mul", left[:, :, None, k], right[:, None, :, k])
+        result = product if k == 0 else eqn.each("add", result, product)
+    return [result.reshape(shape)]
+
+
+# --- moves ------------------------------------------------------------------------------------------------------------
+
+
+def _broadcast(x: Values, params: dict[str, Any]) -> Values:
+    shape = [1] * len(params["shape"])
+    for axis, size in zip(params["broadcast_dimensions"], x.shape, strict=True):
+        shape[axis] = size
+    return np.broadcast_to(x.reshape(shape), params["shape"])
+
+
+def _reshape(x: Values, params: dict[str, Any]) -> Values:
+    order = params.get("dimensions")
+    return (x if order is None else x.transpose(order)).reshape(params["new_sizes"])
+
+
+def _slice(x: Values, params: dict[str, Any]) -> Values:
+    strides = params["strides"] or (1,) * x.ndim
+    return x[tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]
+
+
+def _split(eqn: Equation, inputs: list[Values]) -> list[Values]:
+    return np.split(inputs[0], np.cumsum(eqn.params["sizes"])[:-1], eqn.params["axis"])
+
+
+def _unstack(eqn: Equation, inputs: list[Values]) -> list[Values]:
+    return list(np.moveaxis(inputs[0], eqn.params["axis"], 0))
+
+
+def _iota(eqn: Equation, _: list[Values]) -> list[Values]:
+    (shape, dtype), axis = eqn.outputs[0], eqn.params["dimension"]
+    line = np.array([eqn.scalars.constant(k, dtype) for k in range(shape[axis])], int)
+    return [np.broadcast_to(line.reshape([-1 if k == axis else 1 for k in range(len(shape))]), shape)]
+
+
+def _pad(eqn: Equation, inputs: list[Values]) -> list[Values]:
+    x, value = inputs
+    for axis, (low, high, interior) in enumerate(eqn.params["padding_config"]):
+        size = x.shape[axis] + max(x.shape[axis] - 1, 0) * interior
+        at = np.arange(-low, size + high)  # where each element comes from, with the gaps counted
+        taken = (at >= 0) & (at < size) & (at % (interior + 1) == 0)
+        source = np.insert(x, x.shape[axis], value, axis)
+        x = np.take(source, np.where(taken, at // (interior + 1), x.shape[axis]), axis)
+    return [x]
+
+
+def _by_index(*sources: int) -> Rule:
+    """Return the rule of what moves elements to where constants say: JAX moves their numbers; the other inputs are indices."""
+
+    def rule(eqn: Equation, inputs: list[Values]) -> list[Values]:
+        with jax.ensure_compile_time_eval():
+            arrays = [jnp.asarray(x.astype(np.int32) if k in sources else eqn.known(x)) for k, x in enumerate(inputs)]
+            params = {**eqn.params, "fill_value": -1} if "fill_value" in eqn.params else eqn.params
+            moved = np.asarray(eqn.primitive.bind(*arrays, **params)).astype(int)
+        kind = np.dtype(eqn.outputs[0].dtype).kind
+        fill = eqn.params.get("fill_value")
+        fill = fill if fill is not None else np.nan if kind == "f" else _least(np.dtype(eqn.outputs[0].dtype))
+        return [np.where(moved < 0, eqn.full(fill), moved)]
+
+    return rule
+
+
+def _scatter_add(eqn: Equation, inputs: list[Values]) -> list[Values]:
+    """Add each update where JAX puts a one for it."""
+    (operand, indices, updates), dtype = inputs, eqn.outputs[0].dtype
+    with jax.ensure_compile_time_eval():
+        where = jnp.asarray(eqn.known(indices))
+        nothing = jnp.zeros(operand.shape, dtype)
+        ones = jnp.eye(updates.size, dtype=dtype).reshape(-1, *updates.shape)
+        places = [np.asarray(eqn.primitive.bind(nothing, where, one, **eqn.params)).reshape(-1) for one in ones]
+    result = operand.reshape(-1).copy()
+    for update, row in zip(updates.reshape(-1), places, strict=True):
+        for k in np.flatnonzero(row):
+            result[k] = eqn.each("add", result[k], update)
+    return [result.reshape(operand.shape)]
+
+
+# --- nested functions -------------------------------------------------------------------------------------------------
+
+
+def _inline(eqn: Equation, inputs: list[Values]) -> list[Values]:
+    nested = next(eqn.params[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in eqn.params)
+    return eqn.run(nested, inputs)
+
+
+def _cond(eqn: Equation, inputs: list[Values]) -> list[Values]:
+    """Take all branches and select: they are pure."""
+    results = [eqn.run(branch, inputs[1:]) for branch in eqn.params["branches"]]
+    return [_choose(eqn, inputs[0], cases, spec.dtype) for spec, cases in zip(eqn.outputs, zip(*results, strict=True), strict=True)]
+
+
+# --- all of it --------------------------------------------------------------------------------------------------------
+
+_SAME_NAME = [
+    *("add", "sub", "mul", "div", "rem", "neg", "abs", "sign", "max", "min", "clamp", "eq", "ne", "lt", "le", "gt", "ge"),
+    *("floor", "ceil", "sqrt", "rsqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p", "logistic", "erf", "erfc", "is_finite"),
+    *("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh"),
+]
+
+TABLE: dict[str, Rule] = {name: _each(name) for name in _SAME_NAME} | {
+    # element-wise, under another name
+    "add_any": _each("add"),
+    "and": _each("both"),
+    "or": _each("either"),
+    "xor": _each("differ"),
+    "not": _each("inverse"),
+    "square": lambda eqn, inputs: [eqn.each("mul", inputs[0], inputs[0])],
+    "pow": _power,
+    "integer_pow": _integer_power,
+    "round": _round,
+    "select_n": _select,
+    "convert_element_type": _convert,
+    "copy": _same,
+    "copy_p": _same,
+    "reshard": _same,  # of what a function closes over from outside of shard_map: every device has all of it
+    "name": _same,
+    "optimization_barrier": _same,
+    "stop_gradient": _same,
+    # reductions
+    "reduce_sum": _reduce("add", lambda _: 0),
+    "reduce_prod": _reduce("mul", lambda _: 1),
+    "reduce_max": _reduce("max", _least),
+    "reduce_min": _reduce("min", _most),
+    "reduce_and": _reduce("both", lambda dtype: True if dtype.kind == "b" else -1),
+    "reduce_or": _reduce("either", lambda _: 0),
+    "reduce_xor": _reduce("differ", lambda _: 0),
+    "cumsum": _accumulate("add"),
+    "cumprod": _accumulate("mul"),
+    "cummax": _accumulate("max"),
+    "cummin": _accumulate("min"),
+    "dot_general": _dot_general,
+    # moves
+    "broadcast_in_dim": _move(_broadcast),
+    "expand_dims": _move(lambda x, params: np.expand_dims(x, params["dimensions"])),
+    "reshape": _move(_reshape),
+    "rev": _move(lambda x, params: np.flip(x, params["dimensions"])),
+    "slice": _move(_slice),
+    "squeeze": _move(lambda x, params: np.squeeze(x, tuple(params["dimensions"]))),
+    "transpose": _move(lambda x, params: x.transpose(params["permutation"])),
+    "tile": _move(lambda x, params: np.tile(x, params["reps"])),
+    "concatenate": lambda eqn, inputs: [np.concatenate(inputs, eqn.params["dimension"])],
+    "stack": lambda eqn, inputs: [np.stack(inputs, eqn.params["axis"])],
+    "split": _split,
+    "unstack": _unstack,
+    "iota": _iota,
+    "pad": _pad,
+    "dynamic_slice": _by_index(0),
+    "dynamic_update_slice": _by_index(0, 1),
+    "gather": _by_index(0),
+    "scatter": _by_index(0, 2),
+    "scatter-add": _scatter_add,
+    # nested functions
+    "jit": _inline,
+    "pjit": _inline,
+    "closed_call": _inline,
+    "core_call": _inline,
+    "custom_jvp_call": _inline,
+    "custom_vjp_call": _inline,
+    "custom_vjp_call_jaxpr": _inline,
+    "checkpoint": _inline,
+    "remat": _inline,
+    "remat2": _inline,
+    "cond": _cond,
+}

@@ -1,0 +1,284 @@
+"""What `pair_sum` reduces: pairs that are searched or listed, and the summand that a function of one pair becomes."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.core import Tracer
+
+from jfrnn._engine import Inputs, Options, is_decidable, without_inactive
+from jfrnn._geometry import Box, Images, Lattice, Radii, Status, checked_cutoff, make_cutoffs, make_lattice, translation
+from jfrnn._search import ROWS_ARE_WHOLE, NeighborList
+from jfrnn._sums.extremes import bind_extremes
+from jfrnn._sums.pair_function import call_with_pair
+from jfrnn._sums.relations import Listed, Relation, Searched
+from jfrnn._sums.summation import bind_sum
+from jfrnn._sums.terms import OF_QUERIES, OF_SOURCES, Groups, Labels, Summand, Term, chosen, fresh_labels, traced
+from jfrnn._tracing import call_apart, compiled, on_device
+
+
+class Pairs(NamedTuple):
+    """Which pairs, and what their displacements are made of.
+
+    `mark` gives sums what is no result in rows that have none: where the data show that pairs may be missing, or where the position
+    is not finite, unless the particle is inactive.
+    """
+
+    relation: Relation
+    half: bool  # each pair stands there once: its mirror image is summed, too
+    sources: Array
+    rows: Array
+    lattice: Lattice | None
+    largest: Any  # cutoff
+    directionless: bool
+    mark: Callable[[list[Array]], list[Array]]
+
+
+def searched(inputs: Inputs, options: Options) -> Pairs:
+    """Return the pairs that a search finds."""
+    sources, queries, active, box, cutoff, _ = inputs
+    fixed = lax.stop_gradient(inputs._replace(sources=without_inactive(sources, active), active=None))
+    relation, several = Searched(fixed, options), isinstance(cutoff, Radii)
+    largest = make_cutoffs(cutoff, options.closed).largest if isinstance(cutoff, Radii) else cutoff.radius
+    lattice = _lattice(box, options.images, sources)
+    static = options, several or box is not None
+    sources, rows, mark = _telling(sources, queries, _good_rows_of_search, (inputs,), static)
+    return Pairs(relation, False, sources, rows, lattice, largest, relation.symmetric, mark)
+
+
+def listed(
+    nbrs: NeighborList,
+    positions: Array,
+    cutoff: Any,  # noqa: ANN401
+    queries: Array | None,
+    box: Box | None,
+    given: dict[str, bool],
+    full: bool,
+) -> Pairs:
+    """Return the pairs of a list, after checking that what was `given` besides fits it; `full`: a half list does not do."""
+    if not isinstance(nbrs, NeighborList):
+        raise TypeError(f"neighbors must be a jfrnn.NeighborList, got {type(nbrs).__name__}.")
+    for name in (name for name, is_given in given.items() if is_given):
+        raise ValueError(f"{name} was said when the list was made: leave it out where neighbors is given.")
+    if full and nbrs.half:
+        raise ValueError("neighbors must be a full list for reduce='max', 'min' and compensated=True: search without half=True.")
+    sources, rows = nbrs._geometry_inputs(positions, queries)
+    dtype = np.dtype(sources.dtype)
+    if cutoff is not None and (nbrs.cutoff is None or float(checked_cutoff(cutoff, dtype).radius) != nbrs.cutoff):
+        has = "a cutoff per particle" if nbrs.cutoff is None else f"cutoff={nbrs.cutoff}"
+        raise ValueError(f"cutoff must be None or that of the list, which has {has}, got {cutoff!r}.")
+    own = nbrs.own_queries
+    fixed, fixed_rows, fixed_box = lax.stop_gradient((sources, rows, box))
+    _, mask, shifts = nbrs._geometry(fixed, fixed_rows if own else None, fixed_box)
+    directionless = not own and (nbrs.radii is None or nbrs.radii.rule not in ("gather", "scatter"))
+    relation = Listed(nbrs.idx, mask, shifts, nbrs.source_count, symmetric=directionless and not nbrs.half)
+    lattice = _lattice(nbrs._box_now(box, sources), nbrs.box_kind, sources)
+    largest = nbrs.cutoff if nbrs.radii is None else make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest
+    data = nbrs.status, nbrs.count if nbrs.masked and not own else None, fixed_rows
+    sources, rows, mark = _telling(sources, rows if own else None, _good_rows_of_list, data)
+    return Pairs(relation, nbrs.half, sources, rows, lattice, largest, directionless, mark)
+
+
+@compiled
+def _good_rows(points: Array, active: Array | None, whole: Array | None) -> Array:
+    """Say which rows [m] have a sum: those of finite points, and of inactive ones, if pairs are known to be whole."""
+    fixed = lax.stop_gradient(points)
+    columns = (jnp.isfinite(fixed[:, k]) for k in range(fixed.shape[1]))
+    finite = functools.reduce(jnp.logical_and, columns)  # not a reduction, which XLA would not fuse
+    good = finite if active is None else finite | ~active
+    return good if whole is None else good & whole
+
+
+@functools.partial(compiled, static_argnames=("options", "doubtful"))
+def _good_rows_of_search(inputs: Inputs, options: Options, doubtful: bool) -> Array:
+    """Say which rows [m] of a search have a sum; `doubtful`: the data may show that pairs cannot be decided."""
+    whole = is_decidable(inputs, options) if doubtful else None
+    return _good_rows(inputs.sources, inputs.active, whole) if inputs.queries is None else _good_rows(inputs.queries, None, whole)
+
+
+@compiled
+def _good_rows_of_list(status: Array, count: Array | None, points: Array) -> Array:
+    """Say which rows [m] of a list have a sum. Where particles may be inactive, `count` is given: those with neighbors are not."""
+    whole = (status & ~ROWS_ARE_WHOLE.value) == 0
+    active = None if count is None else (count > 0) | ((status & Status.NONFINITE.value) != 0)
+    return _good_rows(points, active, whole)
+
+
+def _telling(
+    sources: Array, queries: Array | None, good_rows: Callable[..., Array], data: tuple, static: tuple = ()
+) -> tuple[Array, Array, Callable[[list[Array]], list[Array]]]:
+    """Return the sources, the rows, which derivatives reach as NaN where there is no sum, and what marks sums likewise.
+
+    `good_rows(*data, *static)` says which rows have a sum. Concrete arrays are marked by the program that finds it out.
+    """
+    points = sources if queries is None else queries
+    if not isinstance(points, Tracer):  # there are no derivatives
+        return sources, points, functools.partial(_marked_by, data=data, good_rows=good_rows, static=static)
+    good = call_apart(lambda *data: good_rows(*data, *static), *data)
+    points = _told(points, good)
+    return points if queries is None else sources, points, functools.partial(_marked, good=good)
+
+
+@jax.custom_jvp
+def _told(points: Array, good: Array) -> Array:
+    del good
+    return points
+
+
+@_told.defjvp
+def _told_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Any]) -> tuple[Array, Array]:
+    points, good = primals
+    return points, tangents[0] * _one_or_nan(good, tangents[0])
+
+
+def _one_or_nan(good: Array, like: Array) -> Array:
+    """Return 1 or NaN for each row, to be multiplied with `like` [rows, ...]."""
+    return jnp.where(good, 1, jnp.nan).astype(like.dtype).reshape(-1, *[1] * (like.ndim - 1))
+
+
+def _lattice(box: Box | None, images: Images | None, like: Array) -> Lattice | None:
+    return None if box is None or images is None else make_lattice(box, images, np.dtype(like.dtype))
+
+
+def reduced(
+    fn: Callable[[Array, Any, Any], Any],
+    pairs: Pairs,
+    mine: Any,  # noqa: ANN401
+    theirs: Any,  # noqa: ANN401
+    reduce: str,
+    symmetry: str | None,
+    compensated: bool,
+) -> Any:  # noqa: ANN401
+    """Trace fn, sum it, and give the sums the structure of what it returns."""
+    operands, summand, structure = _summand(fn, pairs, mine, theirs, symmetry)
+    one_pair = Groups(
+        tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in operands.shared),
+        *(tuple(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in group) for group in operands[1:]),
+    )
+    shift = jax.ShapeDtypeStruct(pairs.sources.shape[1:], pairs.sources.dtype)
+    term, needed, closed_over = traced(
+        summand, one_pair, shift, _labels(operands, pairs.rows is pairs.sources and mine is theirs), fn
+    )
+    if reduce != "sum" and not all(jnp.issubdtype(x.dtype, jnp.floating) for x in term.summands):
+        raise TypeError(f"fn must return floats for reduce={reduce!r}, whose rows may be infinite: convert them with .astype.")
+    operands = chosen(operands, needed)
+    known = not isinstance(pairs.sources, Tracer)
+    operands = Groups(
+        *(tuple(_numbers(x, known) if isinstance(x, jax.ShapeDtypeStruct) else x for x in group) for group in operands)
+    )
+    operands = operands._replace(shared=(*closed_over, *operands.shared))
+    if reduce != "sum":
+        leaves = bind_extremes(pairs.relation, term, operands, reduce == "max")
+    elif pairs.half and isinstance(pairs.relation, Listed):
+        leaves = _sums_of_half(pairs.relation, term, operands, compensated)
+    else:
+        leaves = bind_sum(pairs.relation, term, operands, compensated)
+    leaves = pairs.mark(leaves)
+    return jax.tree.unflatten(structure[0], leaves)
+
+
+@functools.partial(compiled, static_argnames=("term", "compensated"))
+def _sums_of_half(listed: Listed, term: Term, operands: Groups, compensated: bool) -> list[Array]:
+    """Sum over a half list and over its mirror image, in which no pair of a particle with itself stands again."""
+    apart = listed.idx != lax.iota(jnp.int32, listed.idx.shape[0])[:, None]
+    apart = apart if listed.shifts is None else apart | (listed.shifts != 0).any(axis=-1)
+    mirrored = dataclasses.replace(listed, mask=listed.mask & apart, flipped=True)
+    parts = (bind_sum(relation, term, operands, compensated) for relation in (listed, mirrored))
+    return [x + y for x, y in zip(*parts, strict=True)]
+
+
+def _numbers(like: jax.ShapeDtypeStruct, known: bool) -> Array:
+    """Number particles: while tracing by the program, where they are known on the host, which needs no program."""
+    n = like.shape[0]
+    return on_device(np.arange(n, dtype=np.int32)) if known else lax.iota(jnp.int32, n)
+
+
+def _summand(
+    fn: Callable[[Array, Any, Any], Any],
+    pairs: Pairs,
+    mine: Any,  # noqa: ANN401
+    theirs: Any,  # noqa: ANN401
+    symmetry: str | None,
+) -> tuple[Groups, Summand, list]:
+    """Return the operands, fn as a function of one pair of them, and a list that takes the structure of what fn returns."""
+    sources, rows, lattice = pairs.sources, pairs.rows, pairs.lattice
+    dtype = sources.dtype
+    harmless = jnp.zeros(sources.shape[1], dtype).at[0].set(jnp.asarray(pairs.largest, dtype) / 2)
+    turning = [] if lattice is None else [lattice.matrix]
+    numbers = [jax.ShapeDtypeStruct((len(x),), np.int32) for x in (rows, sources)]  # arrays where they are needed
+    (own, own_tree), (others, other_tree) = jax.tree.flatten(mine), jax.tree.flatten(theirs)
+    operands = Groups((harmless, *turning), (rows, numbers[0], *own), (sources, numbers[1], *others))
+    structure: list = []
+
+    def summand(real: Array, shift: Array, operands: Groups) -> list[Array]:
+        (harmless, *matrix), (x_i, number_i, *own), (x_j, number_j, *others) = operands
+        r = x_j - x_i
+        if lattice is not None:
+            r = r + translation(shift, dataclasses.replace(lattice, matrix=matrix[0]))
+        r = jnp.where(real, r, harmless)  # what fn gets where there is no pair must not stop it, or raise in debug modes
+        i, j = jax.tree.unflatten(own_tree, own), jax.tree.unflatten(other_tree, others)
+        if symmetry is None:
+            return leaves_of(call_with_pair(fn, r, i, j))
+        ahead = (number_i < number_j) | ((number_i == number_j) & ~_is_backward(shift))
+        i, j = (jax.tree.map(functools.partial(jnp.where, ahead), *sides) for sides in ((i, j), (j, i)))
+        leaves = leaves_of(call_with_pair(fn, jnp.where(ahead, r, -r), i, j))
+        return leaves if symmetry == "symmetric" else [jnp.where(ahead, x, -x) for x in leaves]
+
+    def leaves_of(result: Any) -> list[Array]:  # noqa: ANN401
+        leaves, tree = jax.tree.flatten(result)
+        if not leaves:
+            raise TypeError(f"fn must return arrays, got {result!r}: let it end with `return`.")
+        structure[:] = [tree]
+        return [_summable(x, dtype) for x in leaves]
+
+    return operands, summand, structure
+
+
+def _labels(operands: Groups, same: bool) -> Labels:
+    """Label the operands of i and of j, of which positions are the first; `same`: they are the same arrays."""
+    theirs = OF_SOURCES, *fresh_labels(len(operands.others) - 1, ((), ()))
+    if same:
+        return theirs, theirs
+    return (OF_QUERIES, *fresh_labels(len(operands.own) - 1, ((), theirs))), theirs
+
+
+def _is_backward(shift: Array) -> Array:
+    """Say whether the first number of a shift [d] that is not zero is negative."""
+    result = jnp.zeros((), bool)
+    for k in reversed(range(shift.shape[0])):
+        result = (shift[k] < 0) | ((shift[k] == 0) & result)
+    return result
+
+
+def _summable(x: Any, dtype: np.dtype) -> Array:  # noqa: ANN401
+    if isinstance(x, str | bytes) or callable(x):
+        raise TypeError(
+            f"fn must return floats or integers, got {type(x).__name__}: return arrays, in a pytree if there are several."
+        )
+    array = jnp.asarray(x)
+    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
+        raise TypeError(f"fn must return floats or integers, got {array.dtype}: convert it, e.g. with .astype(jnp.int32).")
+    is_loose = jnp.issubdtype(array.dtype, jnp.floating) and jax.typeof(array).weak_type
+    return array.astype(dtype if is_loose else array.dtype)
+
+
+@compiled
+def _marked(leaves: list[Array], good: Array) -> list[Array]:
+    """Return what is no result in rows that have no sum; its derivatives likewise."""
+
+    def marked(x: Array) -> Array:
+        if jnp.issubdtype(x.dtype, jnp.floating):
+            return x * _one_or_nan(good, x)
+        return jnp.where(good.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.iinfo(x.dtype).min)
+
+    return [marked(x) for x in leaves]
+
+
+@functools.partial(compiled, static_argnames=("good_rows", "static"))
+def _marked_by(leaves: list[Array], data: tuple, good_rows: Callable[..., Array], static: tuple) -> list[Array]:
+    return _marked(leaves, good_rows(*data, *static))

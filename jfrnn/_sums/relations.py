@@ -1,0 +1,240 @@
+"""Which pairs a pair sum runs over, found by a search or standing in a list, and the engines that run over them."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, TypeGuard
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from jfrnn._engine import FOLD_GROUP, Block, Inputs, Options, Slots, Visit, fold_pairs
+from jfrnn._geometry import Batch, Radii, compensated_sum, rounded_sum
+from jfrnn._sums.fused import is_fused as is_fusible
+from jfrnn._sums.fused import sums as fused_sums
+from jfrnn._sums.terms import Groups, Term
+
+_LIST_SLOTS = 1 << 22  # numbers of pairs of a list that are in work at a time: 16 MB of float32
+_EXCHANGED = {"gather": "scatter", "scatter": "gather"}
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Searched:
+    """The pairs that a search finds, anew in every sum; nothing of them is stored.
+
+    Attributes:
+        inputs: Infinite where a particle is inactive; no mask.
+        options: Static.
+    """
+
+    inputs: Inputs
+    options: Options = dataclasses.field(metadata={"static": True})
+
+    flipped = False
+
+    @property
+    def periodic(self) -> bool:
+        """Whether pairs have lattice shifts."""
+        return self.inputs.box is not None
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Number of rows, and of their sources."""
+        n = self.inputs.sources.shape[0]
+        return n if self.inputs.queries is None else self.inputs.queries.shape[0], n
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether it is the same, seen from the other side."""
+        radii = self.inputs.cutoff
+        return self.inputs.queries is None and not (isinstance(radii, Radii) and radii.rule in _EXCHANGED)
+
+    def reversed(self) -> "Searched":
+        """Return the same pairs with the roles of i and j exchanged, and shifts of the other sign."""
+        sources, queries, active, box, cutoff, batch = self.inputs
+        if isinstance(cutoff, Radii):
+            cutoff = Radii(cutoff.queries, cutoff.sources, _EXCHANGED.get(cutoff.rule, cutoff.rule))
+        if queries is not None:
+            sources, queries = queries, sources
+            batch = batch if batch is None else Batch(batch.of_queries, batch.sources)
+        return Searched(Inputs(sources, queries, active, box, cutoff, batch), self.options)
+
+    def fold(self, elements: int, visit: Visit, out: Any) -> Any:  # noqa: ANN401
+        """Walk over all pairs: see `fold_neighbors`."""
+        return fold_pairs(self.inputs, self.options, elements, visit, out)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Listed:
+    """The pairs of a list.
+
+    Attributes:
+        idx: [m, c] int32, valid wherever `mask` is set.
+        mask: [m, c] bool.
+        shifts: [m, c, d] whole floats, or None where space is open.
+        source_count: Static.
+        symmetric: Whether it is the same, seen from the other side. Static.
+        flipped: The roles of i and j are exchanged: i are the sources of the list, j its rows, shifts have the other sign. Static.
+    """
+
+    idx: Array
+    mask: Array
+    shifts: Array | None
+    source_count: int = dataclasses.field(metadata={"static": True})
+    symmetric: bool = dataclasses.field(metadata={"static": True})
+    flipped: bool = dataclasses.field(default=False, metadata={"static": True})
+
+    @property
+    def periodic(self) -> bool:
+        """Whether pairs have lattice shifts."""
+        return self.shifts is not None
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Number of rows, and of their sources; exchanged where roles are."""
+        m, n = self.idx.shape[0], self.source_count
+        return (n, m) if self.flipped else (m, n)
+
+    def reversed(self) -> "Listed":
+        """Return the same pairs with the roles of i and j exchanged, and shifts of the other sign."""
+        return self if self.symmetric else dataclasses.replace(self, flipped=not self.flipped)
+
+    def fold(self, elements: int, visit: Visit, out: Any) -> Any:  # noqa: ANN401
+        """Walk over all pairs, in blocks of rows: see `fold_neighbors`."""
+        m, capacity = self.idx.shape
+        if 0 in (m, capacity, self.source_count):
+            return out
+        group = min(FOLD_GROUP, capacity)
+        size = min(max(_LIST_SLOTS // (group * elements), 1), m)
+
+        def fold_block(b: Array, out: Any) -> Any:  # noqa: ANN401
+            first = jnp.minimum(b * size, m - size)
+            row = first + lax.iota(jnp.int32, size)
+            fresh = row >= b * size
+
+            def fold(add: Callable[[Slots, Any], Any], state: Any) -> Any:  # noqa: ANN401
+                def add_group(g: Array, state: Any) -> Any:  # noqa: ANN401
+                    start = jnp.minimum(g * group, capacity - group)
+                    new = start + lax.iota(jnp.int32, group) >= g * group
+                    idx, mask = (lax.dynamic_slice(x, (first, start), (size, group)) for x in (self.idx, self.mask))
+                    zero = jnp.zeros_like(first)
+                    shift = self.shifts
+                    shift = None if shift is None else lax.dynamic_slice(shift, (first, start, zero), (size, group, shift.shape[2]))
+                    real = mask & new[None] & fresh[:, None]
+                    return add(Slots(jnp.where(real, idx, 0), shift, real), state)
+
+                return lax.fori_loop(0, -(-capacity // group), add_group, state)
+
+            return visit(Block(row, fresh, fold), out)
+
+        return lax.fori_loop(0, -(-m // size), fold_block, out)
+
+
+Relation = Searched | Listed
+
+
+def is_fused(relation: Relation, term: Term) -> TypeGuard[Searched]:
+    """Say whether the fused engine runs over a relation with this term."""
+    return isinstance(relation, Searched) and 0 not in relation.sizes and is_fusible(relation.inputs, relation.options, term)
+
+
+def sum_pairs(relation: Relation, term: Term, operands: Groups, compensated: bool) -> list[Array]:
+    """Sum a term over all pairs of a relation: what an engine has to do.
+
+    Args:
+        relation: Which pairs (i, j), with lattice shifts S.
+        term: Its summands t = term(True, S, (shared, own[i], others[j])).
+        operands: Arrays; `shared` as they are, `own` [rows, ...], `others` [sources, ...].
+        compensated: Carry the rounding errors of the sums along, and add them in the end.
+
+    Returns:
+        For each summand its sums over the neighbors j of each i, [rows, ...]; where `term.totals` says so, over all pairs, [...].
+        Rows without neighbors are 0, whatever their operands hold.
+    """
+    adder = _Adder(compensated)
+    rows = relation.sizes[0]
+    if is_fused(relation, term):
+        return fused_sums(relation.inputs, relation.options, term, operands, compensated)
+    start = [adder.zeros(() if total else (rows,), x) for x, total in zip(term.summands, term.totals, strict=True)]
+
+    def visit(block: Block, out: list) -> list:
+        def add(slots: Slots, state: list) -> list:
+            summands = evaluate(relation, term, operands, block, slots)
+            return [add_one(*parts) for add_one, *parts in zip(adders, state, summands, strict=True)]
+
+        def add_total(state: tuple, terms: Array) -> tuple:
+            return adder.add(state, terms.reshape(1, -1, *terms.shape[2:]), squeeze=True)
+
+        kinds = {True: add_total, False: adder.add}
+        adders = [kinds[total] for total in term.totals]
+        begin = [
+            old if total else adder.zeros(block.query.shape, x)
+            for old, x, total in zip(out, term.summands, term.totals, strict=True)
+        ]
+        done = block.fold(add, begin)
+        place = jnp.where(block.fresh, block.query, rows)
+        return [
+            new if total else jax.tree.map(lambda all_rows, some: all_rows.at[place].set(some, mode="drop"), old, new)
+            for old, new, total in zip(out, done, term.totals, strict=True)
+        ]
+
+    def visit_flipped(block: Block, out: list) -> list:
+        def add(slots: Slots, state: list) -> list:
+            summands = evaluate(relation, term, operands, block, slots)
+            place = jnp.where(slots.real, slots.source, rows)
+            return [
+                adder.add(old, terms.reshape(1, -1, *terms.shape[2:]), squeeze=True) if total else adder.scatter(old, place, terms)
+                for old, terms, total in zip(state, summands, term.totals, strict=True)
+            ]
+
+        return block.fold(add, out)
+
+    found = relation.fold(term.elements, visit_flipped if relation.flipped else visit, start)
+    return [adder.result(state) for state in found]
+
+
+def evaluate(relation: Relation, term: Term, operands: Groups, block: Block, slots: Slots) -> list[Array]:
+    """Evaluate a term on slots [b, g] of a block: [b, g, ...], 0 where there is no pair."""
+    mine, theirs = (operands.others, operands.own) if relation.flipped else (operands.own, operands.others)
+    of_query, of_source = tuple(x[block.query] for x in mine), tuple(x[slots.source] for x in theirs)
+    shift = jnp.zeros((*slots.real.shape, *term.shift.shape), term.shift.dtype) if slots.shift is None else slots.shift
+
+    def one(real: Array, shift: Array, of_query: tuple, of_source: tuple) -> list[Array]:
+        if relation.flipped:
+            return list(term(real, -shift, Groups(operands.shared, of_source, of_query)))
+        return list(term(real, shift, Groups(operands.shared, of_query, of_source)))
+
+    each = jax.vmap(jax.vmap(one, (0, 0, None, 0)), (0, 0, 0, 0))
+    summands = each(slots.real, shift, of_query, of_source)
+    return [jnp.where(slots.real.reshape(*slots.real.shape, *[1] * (x.ndim - 2)), x, jnp.zeros_like(x)) for x in summands]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Adder:
+    """How sums are carried: one array, or with compensation two, the sum and what rounding took of it."""
+
+    compensated: bool
+
+    def zeros(self, rows: tuple[int, ...], like: jax.ShapeDtypeStruct) -> tuple[Array, ...]:
+        return tuple(jnp.zeros((*rows, *like.shape), like.dtype) for _ in range(1 + self.compensated))
+
+    def result(self, state: tuple[Array, ...]) -> Array:
+        if not self.compensated:
+            return state[0]
+        return rounded_sum(*state)
+
+    def scatter(self, state: tuple[Array, ...], place: Array, terms: Array) -> tuple[Array, ...]:
+        """Add terms [b, g, ...] to rows, in place; their errors are not known."""
+        return state[0].at[place].add(terms, mode="drop"), *state[1:]
+
+    def add(self, state: tuple[Array, ...], terms: Array, squeeze: bool = False) -> tuple[Array, ...]:
+        """Add terms [b, g, ...] to sums [b, ...]: first those of a row, then their sum to the row's."""
+        if not self.compensated:
+            added = jnp.sum(terms, axis=1, dtype=terms.dtype)
+            return (state[0] + (added[0] if squeeze else added),)
+        zero = jnp.zeros((), terms.dtype)  # one reduction of both: XLA may evaluate terms anew for each that asks
+        sums = lax.reduce((terms, jnp.zeros_like(terms)), (zero, zero), compensated_sum, (1,))
+        value, error = (x[0] if squeeze else x for x in sums)
+        return compensated_sum(state, (value, error))

@@ -1,0 +1,130 @@
+"""The primitive of pair sums: a sum over pairs whose derivatives, of every order, are sums over the same pairs.
+
+Its operands are the leaves of a relation, which have no derivative, then those of a term. The tangent of a sum is the sum of the
+tangent of its term. A sum that is linear in some operands is transposed by transposing its term: what belongs to i and to all pairs
+is summed over the same pairs, what belongs to j over the reversed relation. Nothing is added to a neighbor, no pair is stored.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from jfrnn._sums.fused import check
+from jfrnn._sums.relations import Relation, Searched, sum_pairs
+from jfrnn._sums.terms import Derived, Groups, Term, chosen, is_moving, joined, tangent, transposed
+from jfrnn._tracing import compiled, result_aval, unvaried, varied, varying_axes
+
+_pair_sum_p = Primitive("pair_sum")
+_pair_sum_p.multiple_results = True
+
+
+def bind_sum(relation: Relation, term: Term, operands: Groups, compensated: bool) -> list[Array]:
+    """Sum a term over the pairs of a relation, differentiable in the operands to every order: see `sum_pairs`."""
+    leaves, structure = jax.tree.flatten(relation)
+    return _bind([jnp.asarray(x) for x in leaves], operands, term, structure, compensated)
+
+
+def _bind(leaves: list[Array], operands: Groups, term: Term, structure: Any, compensated: bool) -> list[Array]:  # noqa: ANN401
+    flat = [jnp.asarray(x) for group in operands for x in group]  # tangents of scalars may be of Python
+    relation = jax.tree.unflatten(structure, leaves)
+    if isinstance(relation, Searched):
+        check(relation.inputs, relation.options, term)
+    axes = varying_axes((leaves, flat))
+    leaves, flat = varied((leaves, flat), axes)
+    return _pair_sum_p.bind(*leaves, *flat, term=term, structure=structure, compensated=compensated)
+
+
+def _sums(*args: Array, term: Term, structure: Any, compensated: bool) -> list[Array]:  # noqa: ANN401
+    cut = structure.num_leaves
+    return sum_pairs(jax.tree.unflatten(structure, args[:cut]), term, term.split(args[cut:]), compensated)
+
+
+def _result_shapes(*args: Any, term: Term, structure: Any, compensated: bool) -> list[ShapedArray]:  # noqa: ANN401
+    del compensated
+    rows = jax.tree.unflatten(structure, args[: structure.num_leaves]).sizes[0]
+    return [
+        result_aval(x.shape if total else (rows, *x.shape), x.dtype, args)
+        for x, total in zip(term.summands, term.totals, strict=True)
+    ]
+
+
+def _jvp(primals: tuple, tangents: tuple, *, term: Term, structure: Any, compensated: bool) -> tuple[list, list]:  # noqa: ANN401
+    sums = _pair_sum_p.bind(*primals, term=term, structure=structure, compensated=compensated)
+    cut = structure.num_leaves
+    leaves, operands, moves = list(primals[:cut]), term.split(primals[cut:]), term.split(tangents[cut:])
+    moving = Groups(*(tuple(not isinstance(x, ad.Zero) and is_moving(jax.typeof(x)) for x in group) for group in moves))
+    none = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in sums]
+    if not any(map(any, moving)):
+        return sums, none
+    derived = tangent(term, moving)
+    needed = chosen(joined(operands, chosen(moves, moving)), derived.needed)
+    moved = iter(_bind(leaves, needed, derived.term, structure, compensated))
+    return sums, [next(moved) if is_moving(x) else zero for x, zero in zip(term.summands, none, strict=True)]
+
+
+def _transpose(cotangents: list, *args: Any, term: Term, structure: Any, compensated: bool) -> list:  # noqa: ANN401
+    cut = structure.num_leaves
+    leaves, operands = list(args[:cut]), term.split(args[cut:])
+    relation = jax.tree.unflatten(structure, leaves)
+    linear = Groups(*(tuple(map(ad.is_undefined_primal, group)) for group in operands))
+    there = tuple(not isinstance(x, ad.Zero) for x in cotangents)
+    if not any(there):
+        return [None] * len(args)
+    still = chosen(operands, Groups(*(tuple(not flag for flag in group) for group in linear)))
+    of_kind = {
+        kind: tuple(x for x, flag, total in zip(cotangents, there, term.totals, strict=True) if flag and total == kind)
+        for kind in (True, False)
+    }
+    given = joined(still, Groups(of_kind[True], of_kind[False], ()))
+    rules = transposed(term, linear, there, relation.symmetric)
+    results: list[Array] = []
+    if rules.along is not None:
+        if rules.sides:
+            side = tuple((given.own + given.others)[k] for k in rules.sides)
+            given = Groups(given.shared, side, side)
+        results += _bind_derived(leaves, given, rules.along, structure, compensated)
+    if rules.across is not None:
+        exchanged, other_structure = jax.tree.flatten(relation.reversed())
+        results += _bind_derived(
+            exchanged, Groups(given.shared, given.others, given.own), rules.across, other_structure, compensated
+        )
+    found, joint = iter(results), iter(rules.joint)
+    flags = [flag for group in linear[:2] for flag in group] + [flag and not next(joint, False) for flag in linear.others]
+    return [None] * cut + [next(found) if flag else None for flag in flags]
+
+
+def _bind_derived(leaves: list, operands: Groups, derived: Derived, structure: Any, compensated: bool) -> list[Array]:  # noqa: ANN401
+    return _bind(leaves, chosen(operands, derived.needed), derived.term, structure, compensated)
+
+
+def _batch(args: tuple, dims: tuple, **params: Any) -> tuple[list[Array], list[int]]:  # noqa: ANN401
+    """One after the other: the searches of a batch have loops of different lengths."""
+    mapped = [d is not None for d in dims]
+    batched = [jnp.moveaxis(x, d, 0) for x, d, is_mapped in zip(args, dims, mapped, strict=True) if is_mapped]
+
+    def one(some: list[Array]) -> list[Array]:
+        left = iter(some)
+        return _pair_sum_p.bind(*(next(left) if is_mapped else x for x, is_mapped in zip(args, mapped, strict=True)), **params)
+
+    sums = lax.map(one, batched)
+    return sums, [0] * len(sums)
+
+
+def _lower(ctx: Any, *args: Any, **params: Any) -> Any:  # noqa: ANN401
+    """Trace the sums as they are on one device: see `jfrnn._tracing.manual`."""
+    return mlir.lower_fun(_sums, multiple_results=True)(ctx.replace(avals_in=unvaried(ctx.avals_in)), *args, **params)
+
+
+_compiled = functools.partial(compiled, static_argnames=("term", "structure", "compensated"))(_sums)
+_pair_sum_p.def_impl(lambda *args, **params: _compiled(*args, **params))
+_pair_sum_p.def_abstract_eval(_result_shapes)
+ad.primitive_jvps[_pair_sum_p] = _jvp
+ad.primitive_transposes[_pair_sum_p] = _transpose
+batching.primitive_batchers[_pair_sum_p] = _batch
+mlir.register_lowering(_pair_sum_p, _lower)

@@ -1,0 +1,130 @@
+"""From a function in JAX to native text: a jaxpr of small arrays becomes straight-line scalar code in C++.
+
+    translated = translate(jax.make_jaxpr(function)(*examples))
+
+Every array is taken apart into scalars, in C order. The text reads `in0_0`, `in0_1`, ... and defines `out0_0`, ...; it calls
+`Math`, whose definitions stand in `jfrnn.kernels._math`, one for each kind of number: plain scalars on the CPU and on CUDA, vectors
+of lanes on the CPU. How a primitive is written stands in `jfrnn._sums.primitives`.
+
+What is promised: JAX's answer up to a few ulp, NaN and infinities included. Every operation is a statement, so it is the block
+around the text that decides about contraction: there is none under `#pragma clang fp contract(off)`, or on CUDA without `fuse_fp`.
+Sums run from the first element to the last. Nothing is simplified that NaN, an infinity or the sign of a zero could tell. Of a
+`cond` all branches are taken, and one is selected.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jax.core import Tracer
+from jax.extend.core import ClosedJaxpr, Literal
+
+from jfrnn._sums.primitives import TABLE, Equation, Spec, Values
+from jfrnn._sums.scalars import TYPES, NoTranslationError, Scalars, hash_of
+
+MOST_ELEMENTS = 256  # of an array
+
+
+class Translated(NamedTuple):
+    """A function of small arrays as native text.
+
+    `text` is a piece of a function body. For each (k, e) in `reads` it needs `input_name(k, e)`, element e of input k, of the type
+    that `Math` has for its dtype; it defines `output_name(k, e)` for every element of every output. `key` is a hash of all of it,
+    the same in every process.
+    """
+
+    text: str
+    inputs: tuple[Spec, ...]
+    outputs: tuple[Spec, ...]
+    reads: tuple[tuple[int, int], ...]
+    key: str
+
+
+def input_name(k: int, e: int) -> str:
+    """Return the name of element e, in C order, of input k."""
+    return f"in{k}_{e}"
+
+
+def output_name(k: int, e: int) -> str:
+    """Return the name of element e, in C order, of output k."""
+    return f"out{k}_{e}"
+
+
+def translate(closed: ClosedJaxpr) -> Translated:
+    """Translate a closed jaxpr into native text.
+
+    Args:
+        closed: from `jax.make_jaxpr`: arrays of float32, float64, int32, int64 or bool, of at most MOST_ELEMENTS elements each.
+
+    Returns:
+        The text, what it reads, and what it defines.
+
+    Raises:
+        NoTranslationError: for a primitive or dtype without translation, an index that depends on data, an array of more than
+            MOST_ELEMENTS elements, or more than `jfrnn._sums.scalars.MOST_SCALARS` operations.
+    """
+    scalars = Scalars()
+    inputs = tuple(_spec(v.aval, "an input") for v in closed.jaxpr.invars)
+    places: dict[int, tuple[int, int]] = {}
+    arguments = []
+    for k, (shape, dtype) in enumerate(inputs):
+        numbers = {scalars.named(input_name(k, e), dtype): (k, e) for e in range(math.prod(shape))}
+        places |= numbers
+        arguments.append(np.array(list(numbers), int).reshape(shape))
+    results = _run(scalars, closed, arguments)
+    outputs = tuple(_spec(v.aval, "an output") for v in closed.jaxpr.outvars)
+    defined = {output_name(k, e): x for k, result in enumerate(results) for e, x in enumerate(result.reshape(-1).tolist())}
+    text = scalars.text(defined)
+    reads = tuple(places[number] for number in sorted(scalars.needed(defined.values()) & places.keys()))
+    return Translated(text, inputs, outputs, reads, hash_of(text, inputs, outputs))
+
+
+def _spec(aval: Any, what: str) -> Spec:  # noqa: ANN401
+    """Return the shape and dtype of a value, if kernels have them."""
+    shape, dtype = tuple(getattr(aval, "shape", ())), str(getattr(aval, "dtype", aval))
+    if dtype not in TYPES:
+        known = ", ".join(TYPES)
+        raise NoTranslationError(f'{what} has the dtype {dtype}, kernels know {known}: convert it, or pass backend="jax".')
+    if math.prod(shape) > MOST_ELEMENTS:
+        raise NoTranslationError(
+            f"{what} has the shape {shape}, more than the {MOST_ELEMENTS} elements that an array in a kernel may have: "
+            'make it smaller, or pass backend="jax".'
+        )
+    return Spec(shape, dtype)
+
+
+def _constants(scalars: Scalars, array: Any) -> Values:  # noqa: ANN401
+    if isinstance(array, Tracer):
+        raise NoTranslationError("the function closes over an array that is being traced: hand it over as an argument.")
+    dtype = _spec(array, "a constant").dtype
+    numbers = [scalars.constant(x, dtype) for x in np.asarray(array).reshape(-1)]
+    return np.array(numbers, int).reshape(np.shape(array))
+
+
+def _run(scalars: Scalars, nested: Any, inputs: Sequence[Values]) -> list[Values]:  # noqa: ANN401
+    """Translate the equations of a jaxpr, closed or without constants, and return its results."""
+    jaxpr, consts = (nested.jaxpr, nested.consts) if hasattr(nested, "consts") else (nested, ())
+    known: dict[Any, Values] = dict(zip(jaxpr.invars, inputs, strict=True))
+    known |= {var: _constants(scalars, x) for var, x in zip(jaxpr.constvars, consts, strict=True)}
+
+    def read(atom: Any) -> Values:  # noqa: ANN401
+        return (
+            _constants(scalars, np.asarray(atom.val, _spec(atom.aval, "a constant").dtype))
+            if isinstance(atom, Literal)
+            else known[atom]
+        )
+
+    def run(nested: Any, inputs: Sequence[Values]) -> list[Values]:  # noqa: ANN401
+        return _run(scalars, nested, inputs)
+
+    for eqn in jaxpr.eqns:
+        name = eqn.primitive.name
+        if name not in TABLE:
+            raise NoTranslationError(
+                f'the primitive {name!r} has no translation into a kernel: write the function without it, or pass backend="jax".'
+            )
+        specs = [_spec(v.aval, f"a result of {name!r}") for v in eqn.outvars]
+        results = TABLE[name](Equation(scalars, eqn.primitive, eqn.params, specs, run), [read(v) for v in eqn.invars])
+        known |= zip(eqn.outvars, results, strict=True)
+    return [read(v) for v in jaxpr.outvars]

@@ -1,0 +1,176 @@
+"""The public verb `pair_sum`: sums over neighbors without a list of them."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax import Array
+
+from jfrnn._engine import Options, platform_of
+from jfrnn._geometry import Box, checked_backend, checked_flag
+from jfrnn._search import NeighborList, Problem, checked_problem
+from jfrnn._tracing import on_device, own_transfers
+
+REDUCTIONS = ("sum", "max", "min")
+SYMMETRIES = (None, "symmetric", "antisymmetric")
+
+
+def pair_sum(
+    fn: Callable[[Array, Any, Any], Any],
+    positions: Array,
+    cutoff: float | Array | tuple[Array, Array] | None,
+    values: Any = None,  # noqa: ANN401
+    *,
+    query_values: Any = None,  # noqa: ANN401
+    reduce: str = "sum",
+    symmetry: str | None = None,
+    queries: Array | None = None,
+    box: Box | None = None,
+    batch: Array | tuple[Array, Array] | None = None,
+    radius_rule: str = "gather",
+    include_self: bool = False,
+    closed: bool = False,
+    active: Array | None = None,
+    compensated: bool = False,
+    backend: str = "auto",
+    neighbors: NeighborList | None = None,
+) -> Any:  # noqa: ANN401
+    """Sum a function of pairs over the neighbors of each particle, without a list of them; differentiable to every order.
+
+    result[i] = sum over the neighbors j of i of fn(r_ij, i, j), r_ij = x_j - x_i (in a periodic box + S·(lattice vectors), a term
+    for each image). The neighbors are exactly those of `search` with the same options.
+
+    Args:
+        fn: A JAX function of one pair: of the displacement r [length], shape [d], of the values of i and those of j; it returns a
+            pytree of arrays of floats or integers. It may close over arrays, traced ones too, and be differentiated in them. Python
+            numbers that it closes over are constants of the compiled program: each new value compiles it anew, for about a second;
+            one that changes is closed over as `jnp.asarray(number)`. Where particles may coincide or are their own neighbors, fn
+            must itself be safe at r = 0 (the derivative of sqrt is not).
+        positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64. n = 0 is allowed.
+        cutoff: As in `search`; with `neighbors` that of the list, or None.
+        values: A pytree of arrays of shape [n, ...]; fn gets leaves [...], of j and, without queries, of i. Default: None.
+        query_values: Likewise of the queries, leaves [m, ...], what fn gets of i. Only with queries.
+        reduce: "sum"; or "max" or "min", of each element of what fn returns, floats. Rows without neighbors then are -inf or inf.
+        symmetry: None: fn is asked about (i, j) and about (j, i). "symmetric" or "antisymmetric": fn is asked in one direction,
+            from the smaller index to the larger (of its own images: where the first number of S that is not zero is positive);
+            the other direction gets the same, or its negative, bit for bit. So forces balance to the rounding of the sums. Every
+            row gets its whole sum in any case. Not with queries, nor with the rules "gather" and "scatter".
+        queries: As in `search`: rows belong to them.
+        box: As in `search`; with `neighbors` as in `NeighborList.vectors`.
+        batch: As in `search`.
+        radius_rule: As in `search`.
+        include_self: As in `search`; r is 0 then.
+        closed: As in `search`.
+        active: As in `search`.
+        compensated: Carry the rounding errors of the sums along (two-sum, Knuth 1969) and add them in the end: the result is as if
+            summed in twice the precision. Derivatives are summed so, too. "max" and "min" are not concerned.
+        backend: "jax" (cells, any device), "brute" (all n·m candidates), "warp" (cells, on the CPU and on CUDA: fn is translated
+            into the kernel that finds the pairs), or "auto": on the CPU "warp" where it can do what is asked, else "jax". "warp"
+            sums floats of the dtype of positions; values, and what fn closes over, are of that dtype or smaller floats, bool,
+            int32 or (float64) int64; with a cutoff per particle on the CPU alone. Where fn or its derivative has no translation,
+            "auto" warns.
+        neighbors: A list whose pairs are taken instead of a search: those that are closer than its cutoff at these positions, as
+            `NeighborList.vectors` says. A half list gives whole sums, too. Options with which it was made are left out. Of a list
+            that may lack pairs (rows overflowed, see `NeighborList.check`) there are no sums: outside jit it raises.
+
+    Returns:
+        A pytree as fn returns it, leaves [m, ...]. Rows without neighbors, and those of particles that are inactive, are 0 ("max":
+        -inf, "min": inf). Where there is no sum, floats are NaN, and so are their derivatives in the positions, and integers are
+        the smallest of their kind: in the row of a particle with NaN or infinite coordinates; and in all rows where the data show
+        that a search cannot answer (a box that is too small, a particle too far outside of it, a cutoff per particle that is
+        negative or not finite), or that the list lacks pairs. The `status` of a `search`, or of the list, says what it was.
+
+    Raises:
+        NeighborOverflowError, ValueError: outside jit, `neighbors` may lack pairs.
+        TypeError, ValueError: an argument is of the wrong kind, shape or range; fn does not take (r, i, j), asks what a number is
+            (as `if` does), or returns what cannot be summed; "warp" was named and cannot do what is asked. What else fn raises
+            comes up as itself, with a note that says what fn was given.
+        NotImplementedError: "warp" was named, and fn or its derivative has no translation: the message says which primitive.
+
+    Order of summation: the neighbors of a particle as the engine meets them (cell by cell, or by index in "brute", or as listed) in
+    groups of up to 32; first within a group, then one group after the other. The
+    same input gives the same bits. With k neighbors the error is at most 4 eps·sqrt(k) of the sum of |terms| for k up to 60 000;
+    compensated a few eps of the sum itself, and some eps²·k of the sum of |terms|. "warp" on the CPU adds up 4 to 16 sums side by
+    side, and these by halves; the bound is the same, and the bits depend on the processor's vector width, not on the number of
+    threads. On CUDA it adds those among up to 704 candidates one after the other, then their sums; again with that bound.
+    Denormal numbers count as zero in what fn computes on the CPU, as everywhere in XLA; pairs are decided with them.
+    Products of matrices in fn, such as r @ r, are made in all bits, also where a GPU by itself takes fewer (TF32), unless fn says
+    otherwise (`precision`).
+    Memory: what `search` takes without its list, the results, and at most 16 MB (float32) for each array that fn needs for the
+    pairs that are in work; nothing grows with the number of pairs, in derivatives neither. "warp" has no pairs in work, but two
+    copies of the numbers that fn reads of each j, and one of those of each i, but for coordinates in open space; in a box one
+    number more of each. `memory_plan` knows beforehand.
+    Differentiable: to every order, forward and backward, in positions, queries, values, query_values, the lattice vectors of the
+    box and whatever fn closes over; who is a neighbor is a constant. A derivative is a sum over the same pairs, gathered
+    by each particle (over a list that is not its own mirror image, scattered). What is no pair has no part in it, whatever fn
+    makes of it. "max" and "min" have the derivative of the pair that is the extreme one; of several, of that with the smallest j.
+    Jit: yes; outside of it, define fn once: one that is defined anew for each call is compiled anew. A Python number that fn closes
+    over is part of its text: with "warp" each new value is another kernel, which takes a second to compile. Close over an array,
+    jnp.asarray(number, x.dtype), where values change: it is data, and the kernel stays the same. vmap: yes, one after the
+    other. Source: sums over neighbors as in SPH (Gingold & Monaghan 1977, doi:10.1093/mnras/181.3.375); derivatives by
+    transposition (Radul et al. 2023, doi:10.1145/3571236).
+    """
+    from jfrnn._sums.reduction import listed, reduced, searched
+
+    if not callable(fn):
+        raise TypeError(f"fn must be a function of (r, i, j), got {type(fn).__name__}.")
+    if reduce not in REDUCTIONS:
+        raise ValueError(f"reduce must be one of {', '.join(map(repr, REDUCTIONS))}, got {reduce!r}.")
+    if symmetry not in SYMMETRIES:
+        raise ValueError(f"symmetry must be None, 'symmetric' or 'antisymmetric', got {symmetry!r}.")
+    compensated = checked_flag("compensated", compensated)
+    if neighbors is None:
+        if cutoff is None:
+            raise ValueError("cutoff must be given: only a list (neighbors=) has its own.")
+        if checked_backend(backend) == "hashgrid":
+            raise ValueError("backend='hashgrid' cannot sum over pairs: pass 'warp', 'jax', 'brute' or 'auto'.")
+        problem = checked_problem(
+            positions, cutoff, queries, box, batch, radius_rule, False, include_self, closed, backend, 0.0, active
+        )
+        with own_transfers():
+            pairs = searched(problem.inputs, _with_engine(problem, backend))
+    else:
+        given = {"batch": batch is not None, "radius_rule": radius_rule != "gather", "include_self": include_self}
+        given |= {"closed": closed, "active": active is not None, "backend": backend != "auto"}
+        with own_transfers():
+            pairs = listed(neighbors, positions, cutoff, queries, box, given, reduce != "sum" or compensated)
+    if symmetry is not None and not pairs.directionless:
+        raise ValueError(
+            f"symmetry={symmetry!r} is about pairs without direction: not with queries, nor with a cutoff of one side."
+        )
+    if queries is None and query_values is not None:
+        raise ValueError("query_values belong to queries: without them fn gets values of i and of j.")
+    theirs = _checked_values("values", values, pairs.sources.shape[0], "particle")
+    mine = theirs if queries is None else _checked_values("query_values", query_values, pairs.rows.shape[0], "query")
+    with own_transfers():
+        return reduced(fn, pairs, mine, theirs, reduce, symmetry, compensated)
+
+
+def _with_engine(problem: Problem, backend: str) -> Options:
+    """Return options with an engine that can answer: "auto" stays where it depends on the term, else becomes "jax"."""
+    from jfrnn._sums.fused import refusal
+
+    (sources, queries, *_), options = problem.inputs, problem.options
+    if options.backend != "warp":
+        return options
+    platform = platform_of(sources, sources if queries is None else queries)
+    reason = refusal(problem.inputs, platform)
+    if reason is not None and backend == "warp":
+        raise ValueError(f"backend='warp' cannot sum over pairs {reason}: pass backend='jax'.")
+    return options._replace(backend=backend if reason is None else "jax")
+
+
+def _checked_values(name: str, values: Any, size: int, what: str) -> Any:  # noqa: ANN401
+    def checked(path: Any, leaf: Any) -> Array:  # noqa: ANN401
+        if not hasattr(leaf, "shape") or not hasattr(leaf, "dtype"):
+            raise TypeError(
+                f"{name}{jax.tree_util.keystr(path)} must be an array with a row per {what}, got {type(leaf).__name__}."
+            )
+        if tuple(leaf.shape[:1]) != (size,):
+            raise ValueError(
+                f"{name}{jax.tree_util.keystr(path)} must have shape [{size}, ...], one row per {what}, got {list(leaf.shape)}: "
+                "what all pairs share fn may close over."
+            )
+        return on_device(leaf)
+
+    return jax.tree_util.tree_map_with_path(checked, values)

@@ -1,0 +1,22 @@
+"""What JAX asks of the library while it traces and runs programs: its modes, `shard_map`, and how many programs are kept."""
+
+from jfrnn._tracing.flags import set_places
+from jfrnn._tracing.manual import call_apart, result_aval, unvaried, varied, varying_axes
+from jfrnn._tracing.modes import gathered, leading_axes, own_transfers
+from jfrnn._tracing.programs import at_once, compiled, made_on_host, on_device
+
+__all__ = [
+    "at_once",
+    "call_apart",
+    "compiled",
+    "gathered",
+    "leading_axes",
+    "made_on_host",
+    "on_device",
+    "own_transfers",
+    "result_aval",
+    "set_places",
+    "unvaried",
+    "varied",
+    "varying_axes",
+]

@@ -1,0 +1,232 @@
+"""In which cells a triangle (in 2D: a segment) has to be looked for: a hashed grid of many sizes of cells.
+
+A triangle stands in every cell from which it may be closer than the cutoff. So a particle looks into the one cell that it is in,
+meets no triangle twice, and none has to be told apart from earlier ones. Triangles differ in size by orders of magnitude: each
+takes the smallest cells, from about a cutoff on by powers of two, of which at most `MOST_CELLS` hold it; in the largest, one cell
+is all of space. The number of entries is therefore bounded by the number of triangles alone, however large they are: nothing can
+overflow. A particle looks once into each size that is in use.
+
+Why no pair is missed: a particle closer than r to a triangle has each coordinate between fl(low - r') and fl(high + r'), with r'
+slightly above r and low, high those of the corners, since rounding is monotone and the particle is a float. So is the cell,
+floor(x·2^k) in exact arithmetic; its cell is therefore in the box of cells between theirs. Of that box, a cell is left out only if
+a direction separates it, widened by r', from the triangle by more than what rounding may have done.
+"""
+
+from itertools import product
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jfrnn._geometry import Cutoff
+from jfrnn._triangles.exact import Vector, cross, dot, minus
+
+MOST_CELLS = {2: 8, 3: 16}  # per triangle, by dimension
+LANES = {2: 32, 3: 128}  # cells of a box that are looked at one by one; a larger box takes larger cells
+_BLOCK = 1024  # triangles that are in work at a time
+_FARTHEST = 2.0**22  # cells from the origin, so that their centers are floats
+_BUCKETS_PER_TRIANGLE = 8
+_FEWEST_BUCKETS = 1024
+
+
+class TriangleCells(NamedTuple):
+    """Triangles sorted by the bucket into which their cells are hashed. A pytree.
+
+    Attributes:
+        start: First entry of each bucket, shape [buckets + 1], int32.
+        triangles: Entries: indices of triangles, shape [entries], int32; the number of triangles where a bucket holds one
+            already.
+        levels: Sizes of cells in use, the smallest first, as biased exponents of their inverse edge, shape [levels], int32; then 0.
+        level_count: Shape [], int32.
+        level_of: The level of each triangle, shape [f], int32: what a bucket holds of other levels is of other cells.
+    """
+
+    start: Array
+    triangles: Array
+    levels: Array
+    level_count: Array
+    level_of: Array
+
+
+def entry_count(faces: int, dim: int) -> int:
+    """Return the number of entries for a number of triangles."""
+    return faces * MOST_CELLS[dim]
+
+
+def bucket_count(faces: int) -> int:
+    """Return the number of buckets for a number of triangles, a power of two."""
+    return max(_FEWEST_BUCKETS, 1 << (_BUCKETS_PER_TRIANGLE * faces - 1).bit_length())
+
+
+def level_limit(dtype: np.dtype) -> int:
+    """Return how many sizes of cells there may be."""
+    return 256 if dtype == np.float32 else 2048
+
+
+def scale_of(level: Array, dtype: np.dtype) -> Array:
+    """Return the inverse edge of the cells of a level: 2^(level - bias); of level 0, where one cell is all of space, 0."""
+    unsigned, nmant = (jnp.uint32, 23) if dtype == np.float32 else (jnp.uint64, 52)
+    return lax.bitcast_convert_type(level.astype(unsigned) << unsigned(nmant), dtype)
+
+
+def cells_of(x: Array, scale: Array) -> Array:
+    """Return the cell along an axis of each coordinate, int32: exact, but for those too far away to be told apart."""
+    return jnp.clip(jnp.floor(x * scale), -(2.0**30), 2.0**30).astype(jnp.int32)
+
+
+def bucket_of(level: Array, cells: list[Array], buckets: int) -> Array:
+    """Hash cells: cells that collide share their triangles, which then are mere candidates. int32."""
+    word = level.astype(jnp.uint32) * np.uint32(0x9E3779B1)
+    for cell in cells:
+        word = (word ^ cell.astype(jnp.uint32)) * np.uint32(0x85EBCA6B)
+        word = word ^ (word >> np.uint32(15))
+    word = word * np.uint32(0xC2B2AE35)
+    return ((word ^ (word >> np.uint32(16))) & np.uint32(buckets - 1)).astype(jnp.int32)
+
+
+def sort_triangles(corners: Array, good: Array, cutoff: Cutoff) -> TriangleCells:
+    """Sort triangles [f, corner, axis] with f > 0 into cells; those that are not `good` [f] bool stand nowhere."""
+    faces, dim = corners.shape[:2]
+    entries, buckets, block = entry_count(faces, dim), bucket_count(faces), min(_BLOCK, faces)
+
+    def add_block(b: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        bucket, triangle, level_of, filled = state
+        first = jnp.minimum(b * block, faces - block)
+        which = first + lax.iota(jnp.int32, block)
+        fresh = good[which] & (which >= b * block)  # the last block reaches back, to be as long as the others
+        level, held, cells = _held_cells(jnp.where(fresh[:, None, None], corners[which], 0), cutoff)
+        held = held & fresh[:, None]
+        place = filled + (jnp.cumsum(held.reshape(-1), dtype=jnp.int32) - 1).reshape(held.shape)
+        place = jnp.where(held, place, entries)
+        bucket = bucket.at[place].set(bucket_of(level[:, None], cells, buckets), mode="drop")
+        triangle = triangle.at[place].set(jnp.broadcast_to(which[:, None], held.shape), mode="drop")
+        level_of = level_of.at[jnp.where(fresh, which, faces)].set(level, mode="drop")
+        return bucket, triangle, level_of, filled + jnp.sum(held, dtype=jnp.int32)
+
+    empty = jnp.full(entries, buckets, jnp.int32), jnp.full(entries, faces, jnp.int32)
+    start = (*empty, jnp.zeros(faces, jnp.int32), jnp.int32(0))
+    bucket, triangle, level_of, _ = lax.fori_loop(0, -(-faces // block), add_block, start)
+    limit = level_limit(np.dtype(corners.dtype))
+    used = jnp.zeros(limit, bool).at[jnp.where(good, level_of, limit)].set(True, mode="drop")
+    key, triangle = lax.sort((bucket.astype(jnp.uint32), triangle), num_keys=1, is_stable=True)
+    bucket = key.astype(jnp.int32)
+    again = (bucket[1:] == bucket[:-1]) & (triangle[1:] == triangle[:-1])  # two cells of a triangle, hashed alike
+    triangle = jnp.where(jnp.concatenate([jnp.zeros(1, bool), again]), faces, triangle)
+    start = jnp.cumsum(jnp.zeros(buckets + 1, jnp.int32).at[bucket + 1].add(1, mode="drop"), dtype=jnp.int32)
+    levels = limit - 1 - jnp.nonzero(used[::-1], size=limit, fill_value=limit - 1)[0].astype(jnp.int32)
+    return TriangleCells(start, triangle, levels, jnp.sum(used, dtype=jnp.int32), level_of)
+
+
+def _held_cells(corners: Array, cutoff: Cutoff) -> tuple[Array, Array, list[Array]]:
+    """Choose the cells of each of [b] triangles: its level [b], which of [b, lanes] cells hold it, and those cells."""
+    dim, dtype = corners.shape[1], corners.dtype
+    finfo = jnp.finfo(dtype)
+    radius = jnp.asarray(cutoff.radius * (1 + 8 * finfo.eps))
+    low = jnp.clip(jnp.min(corners, axis=1) - radius, -finfo.max, finfo.max)
+    high = jnp.clip(jnp.max(corners, axis=1) + radius, -finfo.max, finfo.max)
+
+    start = _finest_level(low, high, cutoff)
+    state = (start, jnp.zeros((start.size, LANES[dim]), bool), jnp.ones(start.size, bool))
+
+    def try_level(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        level, _, undecided = state
+        held, complete = _cells_at(level, corners, low, high, radius)
+        too_many = undecided & (~complete | (jnp.sum(held, axis=1, dtype=jnp.int32) > MOST_CELLS[dim])) & (level > 0)
+        return level - too_many.astype(jnp.int32), held, too_many
+
+    level, held, _ = lax.while_loop(lambda state: jnp.any(state[2]), try_level, state)
+    return level, held, _box_cells(level, low, high)[0]
+
+
+def _finest_level(low: Array, high: Array, cutoff: Cutoff) -> Array:
+    """Return the level of the smallest cells that triangles may take: about a cutoff, and not too many or too far away; [b]."""
+    bias = 127 if low.dtype == jnp.float32 else 1023
+    lanes = LANES[low.shape[1]]
+    farthest = _exponent(jnp.max(jnp.maximum(jnp.abs(low), jnp.abs(high)), axis=1))
+    extent = _exponent(jnp.max(high - low, axis=1))
+    level = jnp.minimum(2 * bias + int(np.log2(_FARTHEST)) - 1 - farthest, 2 * bias + int(np.log2(lanes)) - extent)
+    return jnp.clip(level, 0, _exponent(jnp.asarray(cutoff.unit_scale)))
+
+
+def _exponent(x: Array) -> Array:
+    """Return the biased exponent of floats >= 0, of infinity that of the largest, int32."""
+    unsigned, nmant, most = (jnp.uint32, 23, 0xFE) if x.dtype == jnp.float32 else (jnp.uint64, 52, 0x7FE)
+    return jnp.minimum((lax.bitcast_convert_type(x, unsigned) >> unsigned(nmant)).astype(jnp.int32), most)
+
+
+def _cells_at(level: Array, corners: Array, low: Array, high: Array, radius: Array) -> tuple[Array, Array]:
+    """Return which of [b, lanes] cells hold each triangle, and whether all cells of its box were looked at, [b] bool."""
+    cells, there, complete = _box_cells(level, low, high)
+    apart = _is_apart(cells, corners, scale_of(level, np.dtype(corners.dtype)), radius)
+    return there & ~apart & complete[:, None], complete
+
+
+def _box_cells(level: Array, low: Array, high: Array) -> tuple[list[Array], Array, Array]:
+    """Number the cells of boxes: cells [b, lanes] axis by axis, which of them there are, and of which boxes these are all."""
+    dim = low.shape[1]
+    scale = scale_of(level, np.dtype(low.dtype))
+    first, last = (cells_of(x, scale[:, None]) for x in (low, high))
+    lanes, span = LANES[dim], last - first + 1
+    lane, cells = lax.iota(jnp.int32, lanes)[None], []
+    for k in range(dim - 1):
+        width = jnp.minimum(span[:, k, None], lanes)
+        cells.append(first[:, k, None] + lane % width)
+        lane = lane // width
+    cells.append(first[:, dim - 1, None] + lane)
+    return cells, lane < span[:, dim - 1, None], jnp.prod(span.astype(jnp.float32), axis=1) <= lanes
+
+
+def _is_apart(cells: list[Array], corners: Array, scale: Array, radius: Array) -> Array:
+    """Say which cells [b, lanes] a direction separates from their triangle by the radius, in units of a cell.
+
+    Directions: the normal of the triangle, and those across one of its sides and an axis; in 2D the normal of the segment.
+    The sides of the box stand for the axes. Whatever rounding made of a direction: if it separates, it does.
+    """
+    dim, dtype = corners.shape[1], corners.dtype
+    x = [[(corners[:, c, k] * scale)[:, None] - (cells[k].astype(dtype) + 0.5) for k in range(dim)] for c in range(dim)]
+    reach = (radius * scale)[:, None]
+    fixed = [[(corners[:, c, k] * scale)[:, None] for k in range(dim)] for c in range(dim)]
+    apart = jnp.zeros(cells[0].shape, bool)
+    nowhere = jnp.any(corners != corners, axis=(1, 2))[:, None]  # never, but only the data tell
+    for direction in _directions(fixed, nowhere.astype(jnp.uint32 if dtype == jnp.float32 else jnp.uint64)):
+        apart = apart | _separates(direction, x, reach)
+    return apart
+
+
+def _directions(corners: list[Vector], zero: Array) -> list[Vector]:
+    if len(corners) == 2:
+        along = minus(corners[1], corners[0])
+        return [[-along[1], along[0]]]
+    sides = [minus(corners[(i + 1) % 3], corners[i]) for i in range(3)]
+    directions = [cross(sides[0], sides[1], zero)]
+    for side, axis in product(sides, range(3)):
+        across = [jnp.zeros_like(side[0]) for _ in range(3)]
+        across[(axis + 1) % 3], across[(axis + 2) % 3] = -side[(axis + 2) % 3], side[(axis + 1) % 3]
+        directions.append(across)
+    return directions
+
+
+def _separates(direction: Vector, x: list[Vector], reach: Array) -> Array:
+    eps, size = jnp.finfo(reach.dtype).eps, [jnp.abs(component) for component in direction]
+    whole = size[0]
+    for component in size[1:]:
+        whole = whole + component
+    heights = [dot(direction, corner) for corner in x]
+    doubt = [dot(size, [jnp.abs(component) for component in corner]) for corner in x]
+    least, most, largest = heights[0], heights[0], doubt[0]
+    for height, error in zip(heights[1:], doubt[1:], strict=True):
+        least, most, largest = jnp.minimum(least, height), jnp.maximum(most, height), jnp.maximum(largest, error)
+    room = (0.5 * whole + reach * jnp.sqrt(dot(direction, direction))) * (1 + 8 * eps) + 8 * eps * largest
+    sound = (whole > 2.0**-60) & (room < jnp.finfo(reach.dtype).max)  # squares neither vanish nor overflow
+    return sound & ((least > room) | (most < -room))
+
+
+def without_faults(vertices: Array, faces: Array) -> tuple[Array, Array, Array]:
+    """Return the corners [f, corner, axis] of triangles, which are finite [f] bool, and which have vertices that exist [f] bool."""
+    there = jnp.all((faces >= 0) & (faces < vertices.shape[0]), axis=1)
+    if vertices.shape[0] == 0:
+        return jnp.zeros((*faces.shape, vertices.shape[1]), vertices.dtype), jnp.ones_like(there), there
+    corners = vertices[jnp.where(there[:, None], faces, 0)]
+    finite = jnp.all(jnp.isfinite(corners), axis=(1, 2))
+    return jnp.where((finite & there)[:, None, None], corners, 0), finite | ~there, there

@@ -1,0 +1,173 @@
+"""Nearest points on triangles (in 2D: segments), and on which side of a closed mesh a particle is."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from jfrnn._tracing import set_places
+from jfrnn._triangles.exact import Vector, cross, dot, minus
+
+# where the nearest point lies: corners are 0, 1, 2, sides (from that corner to the next) _SIDE + 0, 1, 2, the face _FACE
+_SIDE, _FACE = 3, 6
+_BLOCK = 1 << 16  # slots in work at a time
+
+
+class Nearest(NamedTuple):
+    """Where the nearest points of shapes are, as seen from points.
+
+    Attributes:
+        vectors: From the point to its nearest, [..., d].
+        feature: On which corner, side or face it lies, [...] int32.
+    """
+
+    vectors: Array
+    feature: Array
+
+
+def nearest_of(points: Array, corners: Array) -> Nearest:
+    """Compute the nearest points of closed shapes [..., corner, d] to points [..., d].
+
+    What is compared are a foot on each side and one on the face, each right for a shape whose corners are a few roundings of the
+    largest coordinate seen from the point away, so that distances are, too, even of slivers. Differentiable: to any order, also
+    where shapes are degenerate.
+    Source: Ericson (2005), Real-Time Collision Detection, sect. 5.1, for the feet.
+    """
+    raw = corners - points[..., None, :]
+    largest = lax.stop_gradient(jnp.max(jnp.abs(raw), axis=(-2, -1)))
+    unit = jnp.where(largest > 0, largest, 1)  # lengths around 1: no square leaves the float range
+    dim = points.shape[-1]
+    x = [[raw[..., c, k] / unit for k in range(dim)] for c in range(dim)]
+    best, foot, feature = None, [], jnp.zeros(unit.shape, jnp.int32)
+    for i in range(3 if dim == 3 else 1):
+        j = (i + 1) % dim
+        along = minus(x[j], x[i])
+        length = dot(along, along)
+        place = jnp.clip(jnp.where(length > 0, -dot(x[i], along) / jnp.where(length > 0, length, 1), 0), 0, 1)
+        here = [a + place * b for a, b in zip(x[i], along, strict=True)]
+        here = [jnp.where(place < 1, h, b) for h, b in zip(here, x[j], strict=True)]
+        what = jnp.where(place <= 0, i, jnp.where(place >= 1, j, _SIDE + i))
+        best, foot, feature = _nearer(best, foot, feature, dot(here, here), here, what)
+    if dim == 3:
+        on_face, square = _foot_on_face(x)
+        best, foot, feature = _nearer(best, foot, feature, square, on_face, jnp.full_like(feature, _FACE))
+    return Nearest(jnp.stack(foot, axis=-1) * unit[..., None], feature)
+
+
+def _nearer(
+    best: Array | None, foot: Vector, feature: Array, square: Array, here: Vector, what: Array
+) -> tuple[Array, Vector, Array]:
+    if best is None:
+        return square, here, what.astype(jnp.int32)
+    nearer = square < best
+    foot = [jnp.where(nearer, new, old) for new, old in zip(here, foot, strict=True)]
+    return jnp.where(nearer, square, best), foot, jnp.where(nearer, what, feature).astype(jnp.int32)
+
+
+def _foot_on_face(x: list[Vector]) -> tuple[Vector, Array]:
+    """Return the foot of the origin on a triangle, and its squared distance: infinite where it lies outside.
+
+    Its plane is spanned by one side and the height on it, made orthogonal twice, so that all is exact for a triangle whose corners
+    are a few roundings from the given ones, however thin; one as thin as a rounding is left to its sides.
+    Source: Giraud et al. (2005), doi:10.1007/s00211-005-0615-4, for the second time.
+    """
+    side, slant = minus(x[1], x[0]), minus(x[2], x[0])
+    length, thinnest = dot(side, side), (4 * jnp.finfo(side[0].dtype).eps) ** 2
+    is_line = length > thinnest
+    height, along = slant, jnp.zeros_like(length)
+    for _ in range(2):
+        step = dot(height, side) / jnp.where(is_line, length, 1)
+        height, along = [h - step * s for h, s in zip(height, side, strict=True)], along + step
+    square = dot(height, height)
+    is_face = is_line & (square > thinnest)
+    of_third = -dot(x[0], height) / jnp.where(is_face, square, 1)
+    of_second = -dot(x[0], side) / jnp.where(is_line, length, 1) - along * of_third
+    inside = is_face & (of_third > 0) & (of_second > 0) & (of_second + of_third < 1)
+    normal = cross(side, height)
+    area = jnp.where(inside, dot(normal, normal), 1)
+    along_normal = jnp.where(inside, dot(x[0], normal) / area, 0)
+    foot = [along_normal * n for n in normal]
+    return foot, jnp.where(inside, dot(foot, foot), jnp.inf)
+
+
+class Rows(NamedTuple):
+    """Triangles near points, and where the nearest of each row is met.
+
+    Attributes:
+        idx: Shape [n, capacity], int32.
+        used: How many slots of each row are used, shape [n], int32.
+        triangle: The nearest triangle, shape [n], int32.
+        feature: On which of its corners, sides or its face the nearest point lies, shape [n], int32.
+    """
+
+    idx: Array
+    used: Array
+    triangle: Array
+    feature: Array
+
+
+def pseudonormals(rows: Rows, faces: Array, corners: Array, good: Array, asked: Array) -> Array:
+    """Return unit pseudonormals at the nearest points of rows [n, d] that are `asked` for; 0 where shapes have no area.
+
+    A face has its normal, a side the sum of those of the faces that share it, a vertex the sum over the faces around it, times
+    their angles; in 2D a vertex that of both segments. All of these faces are as near, so that they are in the same row.
+    Faces run counterclockwise as seen from outside; so do segments around what they enclose.
+    Source: Baerentzen & Aanaes (2005), doi:10.1109/TVCG.2005.49.
+
+    Args:
+        rows: The rows.
+        faces: Vertices of shapes, shape [f, corner], int32.
+        corners: Shape [f, corner, d].
+        good: Which shapes there are, shape [f], bool.
+        asked: Shape [n], bool.
+    """
+    n, capacity = rows.idx.shape
+    block = min(max(_BLOCK // capacity, 1), n)
+    queue, total = set_places(asked, n + block), jnp.sum(asked, dtype=jnp.int32)
+
+    def add_block(b: Array, normals: Array) -> Array:
+        place = lax.dynamic_slice_in_dim(queue, b * block, block)
+        own = jnp.minimum(place, n - 1)
+        slots, feature = rows.idx[own], rows.feature[own]
+        shape = jnp.where(lax.broadcasted_iota(jnp.int32, slots.shape, 1) < rows.used[own, None], slots, len(faces))
+        known = jnp.minimum(shape, len(faces) - 1)
+        there = (shape < len(faces)) & good[known]
+        weights = _weights(faces[known], faces[rows.triangle[own]], corners[known], feature)
+        alone = feature >= (_FACE if faces.shape[1] == 3 else _SIDE)
+        weights = jnp.where(alone[:, None], (slots == rows.triangle[own, None]).astype(weights.dtype), weights)
+        sums = jnp.sum(jnp.where(there, weights, 0)[..., None] * _face_normals(corners[known]), axis=1)
+        return normals.at[place].set(_unit(sums), mode="drop")
+
+    none = jnp.zeros((n, corners.shape[2]), corners.dtype)
+    return lax.fori_loop(0, -(-total // block), add_block, none)
+
+
+def _weights(named: Array, nearest: Array, corners: Array, feature: Array) -> Array:
+    """Return what faces [b, k, corner] count at corners or sides [b] of the nearest ones [b, corner]: [b, k]."""
+    dim = named.shape[2]
+    start = jnp.take_along_axis(nearest, jnp.minimum(feature % _SIDE, dim - 1)[:, None], axis=1)
+    has_start = named == start[..., None]
+    if dim == 2:
+        return jnp.any(has_start, axis=2).astype(corners.dtype)
+    end = jnp.take_along_axis(nearest, ((feature + 1) % _SIDE)[:, None], axis=1)
+    one = _unit(jnp.roll(corners, -1, axis=2) - corners)
+    two = _unit(jnp.roll(corners, 1, axis=2) - corners)
+    angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(one, two), axis=-1), jnp.sum(one * two, axis=-1))
+    around = jnp.sum(jnp.where(has_start, angle, 0), axis=2)
+    beside = jnp.any(has_start, axis=2) & jnp.any(named == end[..., None], axis=2)
+    return jnp.where((feature < _SIDE)[:, None], around, beside.astype(around.dtype))
+
+
+def _face_normals(corners: Array) -> Array:
+    """Return unit normals of shapes [..., corner, d]; 0 where a shape has no area (2D: length)."""
+    along = corners[..., 1, :] - corners[..., 0, :]
+    if corners.shape[-1] == 2:
+        return _unit(jnp.stack([along[..., 1], -along[..., 0]], axis=-1))
+    return _unit(jnp.cross(_unit(along), _unit(corners[..., 2, :] - corners[..., 0, :])))
+
+
+def _unit(vectors: Array) -> Array:
+    largest = jnp.max(jnp.abs(vectors), axis=-1, keepdims=True)
+    scaled = vectors / jnp.where(largest > 0, largest, 1)
+    square = jnp.sum(scaled * scaled, axis=-1, keepdims=True)
+    return jnp.where(largest > 0, scaled / jnp.sqrt(jnp.where(largest > 0, square, 1)), 0)

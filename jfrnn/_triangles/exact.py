@@ -1,0 +1,172 @@
+"""Where a particle and a triangle (in 2D: a segment) are decided: distance < cutoff, exactly as on the given floats.
+
+Step 1, in working precision, looks for a proof of either answer that holds whatever rounding did to the nearest point:
+
+- near: a point of the triangle, sum of w_i v_i with w_i >= 0, that is closer than r;
+- far: a direction u along which all corners are at least r away, min of u·(v_i - p) >= r |u|.
+
+At the exact nearest point q, with u = q - p, both bounds meet (duality of convex distance), so that only pairs within rounding of
+the cutoff, or of thin triangles whose nearest point floats do not find, are left open. They go to integers
+(`_triangles_integers`).
+
+With u = eps/2: a component of v_i - p carries u, a product u more, sums of three 2u, in all at most 4u (1 + small) of the sum of
+absolute values, twice of which, 4 eps, is taken. Weights and directions are whatever floats came out: their errors do not matter,
+as long as all that is computed from one uses the same floats. A compiler may compute them once for each use, and join a product and
+a sum in one place but not in another: `steady` keeps it from that.
+"""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jfrnn._geometry import Cutoff
+from jfrnn._tracing import set_places
+from jfrnn._triangles.integers import Shapes, bit_range, is_near, limb_counts
+
+ShapesAt = Callable[[Array], Shapes]
+Vector = list[Array]
+
+_USUAL, _WIDE = 2, 3  # what an open pair waits for
+_USUAL_CHUNK = 256  # pairs that one round decides
+_WIDE_CHUNK = 8
+
+
+def is_near_of(points: Vector, corners: list[Vector], cutoff: Cutoff, shapes_at: ShapesAt, asked: Array, zero: Array) -> Array:
+    """Decide [q] pairs of points and shapes, given axis by axis; False where not `asked`.
+
+    `shapes_at` gives the pairs at [k]; `zero` [q] is that of `steady`.
+    """
+    surely, open_pairs = sure_pairs(points, corners, cutoff, zero)
+    return (surely & asked) | _refine(open_pairs & asked, shapes_at)
+
+
+def sure_pairs(points: Vector, corners: list[Vector], cutoff: Cutoff, zero: Array) -> tuple[Array, Array]:
+    """Return which pairs are near without doubt, and which are left open: [q] bool each."""
+    scale = cutoff.unit_scale if cutoff.scaled else 1
+    x = [[(v - p) * scale if cutoff.scaled else v - p for v, p in zip(corner, points, strict=True)] for corner in corners]
+    radius = jnp.asarray(cutoff.radius * scale)
+    weights, direction = _nearest(x, zero)
+    largest = sum_of([jnp.abs(component) for component in direction])
+    unit = [component / largest for component in direction]  # squares that underflow then mean nothing
+    near = _is_surely_near(x, weights, radius)
+    return near, ~near & ~_is_surely_far(x, unit, radius)
+
+
+def _is_surely_near(x: list[Vector], weights: Vector, radius: Array) -> Array:
+    eps = jnp.finfo(weights[0].dtype).eps
+    foot = _combined(weights, x)
+    size = sum_of([w * sum_of([jnp.abs(component) for component in corner]) for w, corner in zip(weights, x, strict=True)])
+    reach = radius * sum_of(weights) * (1 - 8 * eps) - 4 * eps * size
+    return (reach > 0) & (dot(foot, foot) * (1 + 16 * eps) < reach * reach)
+
+
+def _is_surely_far(x: list[Vector], unit: Vector, radius: Array) -> Array:
+    eps = jnp.finfo(unit[0].dtype).eps
+    heights = [dot(unit, corner) - 4 * eps * dot([jnp.abs(c) for c in unit], [jnp.abs(c) for c in corner]) for corner in x]
+    least = heights[0]
+    for height in heights[1:]:
+        least = jnp.minimum(least, height)
+    return (least > 0) & (least * least > radius * radius * dot(unit, unit) * (1 + 16 * eps))
+
+
+def _nearest(x: list[Vector], zero: Array) -> tuple[Vector, Vector]:
+    """Return weights of the corners that make about the nearest point, and about the direction to it from the origin."""
+    sides = [(0, 1), (1, 2), (2, 0)] if len(x) == 3 else [(0, 1)]
+    best, weights, foot = None, [], []
+    for i, j in sides:
+        along = minus(x[j], x[i])
+        length = dot(along, along, zero)
+        place = jnp.where(length > 0, -dot(x[i], along, zero) / jnp.where(length > 0, length, 1), 0)
+        place = jnp.clip(place, 0, 1)
+        here = [jnp.zeros_like(place) for _ in x]
+        here[i], here[j] = 1 - place, place
+        point = _combined(here, x, zero)
+        square = dot(point, point, zero)
+        if best is None:
+            best, weights, foot = square, here, point
+            continue
+        nearer = square < best
+        best = jnp.where(nearer, square, best)
+        weights = [jnp.where(nearer, new, old) for new, old in zip(here, weights, strict=True)]
+        foot = [jnp.where(nearer, new, old) for new, old in zip(point, foot, strict=True)]
+    if len(x) == 2:
+        return weights, foot
+    normal = cross(minus(x[1], x[0]), minus(x[2], x[0]), zero)
+    parts = [dot(cross(x[i], x[j], zero), normal, zero) for i, j in ((1, 2), (2, 0), (0, 1))]
+    inside = (parts[0] > 0) & (parts[1] > 0) & (parts[2] > 0)
+    whole = jnp.where(inside, sum_of(parts), 1)
+    toward = jnp.where(dot(x[0], normal, zero) < 0, -1, 1).astype(whole.dtype)
+    weights = [jnp.where(inside, part / whole, w) for part, w in zip(parts, weights, strict=True)]
+    return weights, [jnp.where(inside, toward * n, f) for n, f in zip(normal, foot, strict=True)]
+
+
+def sum_of(parts: Vector) -> Array:
+    """Add arrays up, from the first on."""
+    total = parts[0]
+    for part in parts[1:]:
+        total = total + part
+    return total
+
+
+def steady(x: Array, zero: Array | None) -> Array:
+    """Return x in a way that no compiler sees through, so that a product stays a rounded product, wherever it is computed.
+
+    `zero` [q] is an unsigned integer as wide as x that is 0 by what the data are alone: the sign bit of indices, for example.
+    """
+    if zero is None:
+        return x
+    return lax.bitcast_convert_type(lax.bitcast_convert_type(x, zero.dtype) ^ zero, x.dtype)
+
+
+def zero_of(indices: Array, dtype: np.dtype) -> Array:
+    """Return the `zero` of indices >= 0 that come from memory, for floats of this dtype."""
+    return (indices < 0).astype(jnp.uint32 if dtype == np.float32 else jnp.uint64)
+
+
+def dot(a: Vector, b: Vector, zero: Array | None = None) -> Array:
+    """Multiply vectors that are given axis by axis."""
+    return sum_of([steady(x * y, zero) for x, y in zip(a, b, strict=True)])
+
+
+def cross(a: Vector, b: Vector, zero: Array | None = None) -> Vector:
+    """Return the vector product of vectors in 3D."""
+    pairs = ((1, 2), (2, 0), (0, 1))
+    return [steady(a[i] * b[j], zero) - steady(a[j] * b[i], zero) for i, j in pairs]
+
+
+def minus(a: Vector, b: Vector) -> Vector:
+    """Subtract vectors."""
+    return [x - y for x, y in zip(a, b, strict=True)]
+
+
+def _combined(weights: Vector, x: list[Vector], zero: Array | None = None) -> Vector:
+    return [dot(weights, [corner[k] for corner in x], zero) for k in range(len(x[0]))]
+
+
+def _refine(open_pairs: Array, shapes_at: ShapesAt) -> Array:
+    """Decide the pairs that step 1 left open, a few at a time; False elsewhere. Costs nothing where none is open."""
+
+    def decide(open_pairs: Array) -> Array:
+        state = jnp.where(open_pairs, _USUAL, 0).astype(jnp.int32)
+        for waiting, chunk in ((_USUAL, _USUAL_CHUNK), (_WIDE, _WIDE_CHUNK)):
+            state = _decided(state, waiting, min(chunk, state.size), shapes_at)
+        return state == 1
+
+    return lax.cond(jnp.any(open_pairs), decide, jnp.zeros_like, open_pairs)
+
+
+def _decided(state: Array, waiting: int, chunk: int, shapes_at: ShapesAt) -> Array:
+    """Let integers decide [q] pairs that wait for these: 0 far, 1 near, or, where they are not wide enough, _WIDE."""
+
+    def decide_chunk(state: Array) -> Array:
+        at = set_places(state == waiting, chunk)
+        shapes = shapes_at(jnp.minimum(at, state.size - 1))
+        usual, most = limb_counts(shapes.points.dtype)
+        count = usual if waiting == _USUAL else most
+        origin, width = bit_range(shapes)
+        near = is_near(shapes, origin, count).astype(jnp.int32)
+        return state.at[at].set(jnp.where(width <= 11 * count, near, _WIDE), mode="drop")
+
+    return lax.while_loop(lambda state: jnp.any(state == waiting), decide_chunk, state)

@@ -1,0 +1,425 @@
+"""The result of a search for triangles, and the compiled programs that make it."""
+
+import dataclasses
+import functools
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.core import Tracer
+
+from jfrnn._geometry import (
+    Cutoff,
+    NeighborOverflowError,
+    Status,
+    check_devices,
+    checked_again,
+    checked_slack,
+    known_status,
+    make_cutoff,
+    pairs_and_status,
+    shape_of,
+)
+from jfrnn._search import norms, rounded_capacity
+from jfrnn._tracing import at_once, call_apart, compiled, own_transfers
+from jfrnn._triangles.cells import TriangleCells, sort_triangles, without_faults
+from jfrnn._triangles.closest import Rows, nearest_of, pseudonormals
+from jfrnn._triangles.contacts import are_contacts
+from jfrnn._triangles.rows import are_near, decide_pairs, list_triangles, nearest_slots
+from jfrnn._triangles.tree import TriangleTree, grow_tree
+from jfrnn._triangles.warp import cast_rays as cast_by_warp
+from jfrnn._triangles.warp import decide_pairs as decide_by_warp
+from jfrnn._triangles.warp import list_triangles as list_by_warp
+from jfrnn._triangles.warp import sort_triangles as sort_by_warp
+from jfrnn._triangles.winding import cast_rays, is_closed, least_winding, ray_ways
+
+_ENGINES = {
+    "jax": (sort_triangles, list_triangles),
+    "warp": (sort_by_warp, list_by_warp),
+    "bvh": (grow_tree, list_by_warp),
+}
+
+
+class SignedDistance(NamedTuple):
+    """On which side of a closed wall particles are.
+
+    Attributes:
+        distance: To the nearest triangle of the row [length], shape [n]: negative inside, 0 where there is none within the cutoff.
+        mask: There is one, shape [n], bool.
+        normal: Where the distance grows fastest, of unit length, shape [n, d]: away from the wall outside, toward it inside; at
+            contact the pseudonormal; 0 where there is no triangle.
+        watertight: Triangles run through each side as often one way as the other (in 2D, as many segments begin at each vertex as
+            end there), shape [], bool. Where False, they enclose nothing, and signs tell the sides of faces alone.
+    """
+
+    distance: Array
+    mask: Array
+    normal: Array
+    watertight: Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class TriangleList:
+    """Hold the triangles (in 2D: segments) near n particles, one row of `capacity` slots per particle. A pytree.
+
+    Attributes:
+        idx: Indices of triangles, shape [n, capacity], int32; the first min(count, capacity) slots are used, the others hold f.
+        count: True number of triangles per row, shape [n], int32; it may exceed the capacity.
+        status: Bits of `Status`, shape [], int32.
+        required: The capacity that holds every row, shape [], int32; like the status, over all updates.
+        vertices: Corners of the wall [length], shape [v, d].
+        faces: Vertices of each triangle, shape [f, d], int32.
+        cells: The wall, sorted into cells (`TriangleCells`) or, by "bvh", in a tree (`TriangleTree`); None where there is none.
+        cutoff: Distance [length], rounded to the dtype of the positions. Static.
+        backend: The engine that made the list. Static.
+        closed: What `signed_distance` needs to know of faces alone, shape [], bool: they bound a solid. None where faces were
+            traced; each call then finds out.
+    """
+
+    idx: Array
+    count: Array
+    status: Array
+    required: Array
+    vertices: Array
+    faces: Array
+    cells: TriangleCells | TriangleTree | None
+    cutoff: float = dataclasses.field(metadata={"static": True})
+    backend: str = dataclasses.field(metadata={"static": True})
+    closed: Array | None = None
+
+    def __repr__(self) -> str:
+        """Say in a line what it holds; waits for the device."""
+        *batch, n, capacity = shape_of(self.idx)
+        rows = f"batch of {batch}, {n} particles" if batch else f"{n} particles"
+        faces = shape_of(self.faces)[-2]
+        rest = f"engine {self.backend!r}, {pairs_and_status(self.count, self.status)}"
+        return f"TriangleList({rows}, {faces} triangles, capacity {capacity}, cutoff {self.cutoff:.6g}, {rest})"
+
+    @property
+    def capacity(self) -> int:
+        """Slots per row."""
+        return self.idx.shape[-1]
+
+    @property
+    def overflow(self) -> Array:
+        """Say whether a row lost triangles, shape [], bool."""
+        with own_transfers():
+            return (self.status & Status.ROW_OVERFLOW.value) != 0
+
+    def update(self, positions: Array, *, vertices: Array | None = None) -> "TriangleList":
+        """Make the list anew at these positions, in the same shapes: a step of a simulation inside `jax.jit` or `lax.scan`.
+
+        Status bits and `required` are kept over all updates; look at `overflow` after a chunk of steps, `grow` and run it again.
+
+        Args:
+            positions: Particles [length], shape [n, d], where they are now. Where the wall moves as a whole: in its frame.
+            vertices: Corners [length], shape [v, d], where the wall is deformed: it is then sorted anew. Default: those that the
+                list has, whose cells or tree it keeps.
+
+        Returns:
+            A `TriangleList` of the same shapes and options.
+
+        Raises:
+            ValueError, TypeError: an argument does not fit the list.
+
+        Differentiable: no gradient flows through. Jit: yes. vmap: yes.
+        """
+        points, corners = self._checked(positions, vertices)
+        cells = self.cells if vertices is None else None
+        found = found_triangles(points, corners, self.faces, cells, self.cutoff, self.backend, self.capacity)
+        found |= {"status": found["status"] | self.status, "required": jnp.maximum(found["required"], self.required)}
+        return dataclasses.replace(self, **found, closed=self._closed_again())
+
+    def grow(self, positions: Array, *, vertices: Array | None = None, slack: float = 1.25) -> "TriangleList":
+        """Make a list with room for what overflowed, at these positions. Not inside jit: the capacity is a shape.
+
+        Args:
+            positions: As in `update`.
+            vertices: As in `update`.
+            slack: Factor >= 1 on the longest row that was ever met, here or by updates of this list.
+
+        Returns:
+            A `TriangleList` with the same options, a capacity not smaller than before, and no bits from the past.
+
+        Raises:
+            TypeError: positions, vertices or the list are traced.
+            ValueError, TypeError: an argument does not fit the list.
+        """
+        points, corners = self._checked(positions, vertices)
+        if any(isinstance(x, Tracer) for x in jax.tree.leaves((points, corners, self.required))):
+            raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
+        with own_transfers():
+            met = rounded_capacity(math.ceil(checked_slack(slack) * int(np.max(np.asarray(self.required)))))
+        counted = counted_slots(points, corners, self.faces, self.cutoff, self.backend, slack)
+        capacity, cells = max(self.capacity, met, counted), self.cells if vertices is None else None
+        found = found_triangles(points, corners, self.faces, cells, self.cutoff, self.backend, capacity)
+        return dataclasses.replace(self, **found, closed=self._closed_again())
+
+    def _closed_again(self) -> Array | None:
+        """Return `closed` for a list made of this one: no two lists share memory, either may be donated."""
+        return None if self.closed is None else jnp.array(self.closed, copy=True)
+
+    def check(self) -> None:
+        """Raise what the status bits report; wait for the device. Not inside jit: there, read `status` and `overflow`.
+
+        Raises:
+            NeighborOverflowError: a row holds more triangles than `capacity`; `.required` is the capacity needed.
+            ValueError: positions or vertices hold NaN or infinity, or faces name vertices that do not exist.
+            TypeError: called on a list that is being traced.
+        """
+        if isinstance(self.status, Tracer):
+            raise TypeError("check() reads values and cannot run inside jax.jit: call it on the list that jit returns.")
+        self._check_rows()
+        status = known_status(self.status)
+        if status:
+            raise ValueError(status.message)
+
+    def _check_rows(self) -> None:
+        """Raise where rows are known to lack triangles: not on a list that is being traced."""
+        if Status.ROW_OVERFLOW in (known_status(self.status) or Status.OK):
+            raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self.capacity)
+
+    def closest(self, positions: Array, *, vertices: Array | None = None) -> tuple[Array, Array, Array]:
+        """Compute the nearest point of every triangle of a row.
+
+        Distances, of slivers too, are within 4 eps of the dtype times the largest coordinate of a corner as seen from the particle:
+        what rounding moves is a triangle's corners, by as much. The mask is exact.
+
+        Args:
+            positions: Particles [length], shape [n, d], where they are now.
+            vertices: Corners [length], shape [v, d]; default: those that the list has, constants to derivatives.
+
+        Returns:
+            Points [length], shape [n, capacity, d], the particle's own in masked slots; distances [length], shape [n, capacity], 0
+            there; and the mask, shape [n, capacity], bool: the slot is used and its triangle is closer than the cutoff, at these
+            positions and exactly.
+
+        Raises:
+            ValueError, TypeError: an argument does not fit the list.
+            NeighborOverflowError: outside jit, a row lacks triangles; inside, look at `overflow`.
+
+        Differentiable: to any order in positions and vertices, where the nearest point does not jump; the gradient of a distance
+        of 0 is 0. Jit: yes. vmap: yes. Source: Ericson (2005), sect. 5.1.
+        """
+        points, corners = self._checked(positions, vertices)
+        self._check_rows()
+        if 0 in (*self.idx.shape, self.faces.shape[0]):
+            none = jnp.zeros(self.idx.shape, points.dtype)
+            return jnp.broadcast_to(points[:, None], (*self.idx.shape, points.shape[1])), none, none > 0
+        vectors, _, mask = _nearest_in_rows(self, points, corners)
+        return points[:, None] + vectors, norms(vectors), mask
+
+    def contacts(self, positions: Array, *, vertices: Array | None = None) -> tuple[Array, Array, Array]:
+        """Compute the contacts of spheres with walls: the nearest points of `closest`, one per wall instead of one per triangle.
+
+        A triangle gives way to another one of its row that holds the corner or side on which its nearest point lies and that is
+        nearer, or as near and of a lower index; so does one of two whose nearest points are the same within rounding. A sphere has
+        one contact on a flat wall of many triangles, over a convex edge and over a corner, and one per wall in a concave edge or
+        corner. On a surface that curves around it, such as the inside of a pipe, it has one with each triangle whose face it is
+        over. The nearest triangle of a row is always a contact.
+
+        Triangles are neighbors by the numbers of their vertices: `jfrnn.merge_vertices` joins those that are written apart, as in
+        STL files. A vertex in the middle of a side, which the triangle there does not have, joins nothing: contacts may double.
+
+        Args:
+            positions: As in `closest`.
+            vertices: As in `closest`.
+
+        Returns:
+            Points [n, capacity, d], distances [n, capacity] and the mask [n, capacity], as `closest` returns them; slots that are
+            no contacts are masked.
+
+        Raises:
+            ValueError, TypeError, NeighborOverflowError: as `closest`.
+
+        Cost: n times the longest row, squared; memory is that of `closest`. Differentiable: as `closest`; the mask is constant.
+        Jit: yes. vmap: yes.
+
+        Example:
+        >>> import jax.numpy as jnp
+        >>> import jfrnn
+        >>> plate = jnp.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+        >>> x = jnp.array([[0.5, 0.4, 0.1]])
+        >>> tri = jfrnn.search_triangles(x, plate, jnp.array([[0, 1, 2], [0, 2, 3]]), 0.3, capacity=2)
+        >>> tri.count, tri.contacts(x)[2].sum()
+        (Array([2], dtype=int32), Array(1, dtype=int32))
+        """
+        points, corners = self._checked(positions, vertices)
+        if 0 in (*self.idx.shape, self.faces.shape[0]):
+            return self.closest(points, vertices=vertices)
+        self._check_rows()
+        vectors, feature, mask = _nearest_in_rows(self, points, corners)
+        vectors, mask = _contacts_in_rows(self, points, corners, vectors, feature, mask)
+        return points[:, None] + vectors, norms(vectors), mask
+
+    def signed_distance(self, positions: Array, *, vertices: Array | None = None) -> SignedDistance:
+        """Compute the distance to the nearest triangle of each row, negative inside what the triangles enclose.
+
+        Inside is where the winding number of the triangles is 1 or more, so that closed parts which overlap, touch, nest or are
+        doubled make one solid; of a wall that encloses less than nothing, as one around a fluid that its faces look at, it is where
+        the number is 0 or more. Faces run counterclockwise as seen from outside of what is solid (in 2D, segments
+        counterclockwise around it). The distance is to the nearest triangle, even to one inside the solid, within another part.
+        Within rounding of a triangle, about 100 eps of the dtype times its largest coordinate as seen from the particle, and
+        where a wall is not watertight, the sign is that of the angle-weighted pseudonormal of the nearest face, side or vertex.
+
+        Args:
+            positions: As in `closest`.
+            vertices: As in `closest`.
+
+        Returns:
+            A `SignedDistance`: distance [n], mask [n], normal [n, d], and whether the mesh is watertight.
+
+        Raises:
+            ValueError, TypeError: an argument does not fit the list.
+            NeighborOverflowError: as `closest`.
+
+        Cost: beside the rows, a ray through a tree of boxes for each particle that has a triangle. The tree is that of the list
+        where "bvh" made it; otherwise, and with `vertices`, each call makes one. Differentiable: to any order in positions and
+        vertices, where the nearest point does not jump; at contact the derivative is that of the plane of the normal. Jit: yes.
+        vmap: yes.
+        Source: Baerentzen & Aanaes (2005), doi:10.1109/TVCG.2005.49.
+        """
+        points, corners = self._checked(positions, vertices)
+        self._check_rows()
+        if 0 in (*self.idx.shape, self.faces.shape[0]):
+            none = jnp.zeros(points.shape[0], points.dtype)
+            return SignedDistance(none, none > 0, jnp.zeros_like(points), jnp.asarray(self.faces.shape[0] == 0))
+        tri = self if vertices is None else dataclasses.replace(self, cells=None)
+        return _signed_distance(tri, points, corners)
+
+    def _checked(self, positions: Array, vertices: Array | None) -> tuple[Array, Array]:
+        dtype, (count, dim) = np.dtype(self.vertices.dtype), self.vertices.shape
+        points = checked_again("positions", positions, dtype, dim, self.idx.shape[0])
+        check_devices("positions", points, self.idx)
+        if vertices is None:
+            return points, self.vertices
+        corners = checked_again("vertices", vertices, dtype, dim, count)
+        check_devices("vertices", corners, self.idx)
+        return points, corners
+
+
+def counted_slots(points: Array, vertices: Array, faces: Array, cutoff: float, backend: str, slack: float) -> int:
+    """Count the triangles near concrete positions and return a capacity that holds `slack` times the longest row."""
+    with at_once(), own_transfers():
+        found = found_triangles(points, vertices, faces, None, cutoff, backend, None)
+        longest = int(found["required"])
+    return rounded_capacity(math.ceil(max(longest, 1) * slack))
+
+
+def found_triangles(
+    points: Array,
+    vertices: Array,
+    faces: Array,
+    cells: TriangleCells | TriangleTree | None,
+    cutoff: float,
+    backend: str,
+    capacity: int | None,
+) -> dict[str, Any]:
+    """Return the fields of a list that come from data; with capacity=None only counts. `cells`: those of an earlier list."""
+    radius = make_cutoff(cutoff, np.dtype(points.dtype), closed=False)
+    with own_transfers():
+        find = functools.partial(find_triangles, backend=backend, capacity=capacity)
+        return call_apart(find, *lax.stop_gradient((points, vertices, faces, cells)), radius)
+
+
+@functools.partial(compiled, static_argnames=("backend", "capacity"))
+def find_triangles(
+    points: Array,
+    vertices: Array,
+    faces: Array,
+    cells: TriangleCells | TriangleTree | None,
+    cutoff: Cutoff,
+    backend: str,
+    capacity: int | None,
+) -> dict[str, Any]:
+    """List or count triangles: the compiled program of a search.
+
+    With a list come the wall and its cells, so that, as results, they share no memory with the caller's arrays or another list.
+    """
+    corners, finite, there = without_faults(vertices, faces)
+    sound = {
+        Status.NONFINITE: jnp.all(jnp.isfinite(points)),
+        Status.NONFINITE_VERTEX: jnp.all(finite),
+        Status.FACE_OUT_OF_RANGE: jnp.all(there),
+    }
+    n, f, slots = points.shape[0], faces.shape[0], capacity or 0
+    sort, listed = _ENGINES[backend]
+    if cells is None and f > 0:
+        cells = sort(corners, finite & there, cutoff)
+    if cells is None or n == 0:
+        idx, count = jnp.full((n, slots), f, jnp.int32), jnp.zeros(n, jnp.int32)
+    else:
+        idx, count = listed(points, corners, cells, cutoff, capacity)
+    required = jnp.max(count, initial=0)
+    if capacity is not None:
+        sound[Status.ROW_OVERFLOW] = required <= slots
+    bits = [jnp.where(good, 0, bit.value).astype(jnp.int32) for bit, good in sound.items()]
+    status = functools.reduce(jnp.bitwise_or, bits)
+    fields = {"idx": idx, "count": count, "status": status, "required": required}
+    return fields if capacity is None else fields | {"cells": cells, "vertices": vertices, "faces": faces}
+
+
+@compiled
+def _nearest_in_rows(tri: TriangleList, points: Array, vertices: Array) -> tuple[Array, Array, Array]:
+    """Return vectors to nearest points [n, capacity, d], on which feature they lie, and which slots hold a pair."""
+    used = lax.broadcasted_iota(jnp.int32, tri.idx.shape, 1) < tri.count[:, None]
+    corners, finite, there = without_faults(vertices, tri.faces)
+    triangle = jnp.where(used, tri.idx, 0)
+    cutoff = make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False)
+    decide = decide_pairs if tri.backend == "jax" else decide_by_warp
+    are_pairs = functools.partial(are_near, decide=decide)
+    near = call_apart(are_pairs, *lax.stop_gradient((points, corners)), triangle, cutoff, used & (finite & there)[triangle])
+    mask = near & jnp.all(jnp.isfinite(points), axis=1)[:, None]
+    shapes = jnp.where(mask[..., None, None], corners[triangle], 0)
+    vectors, feature = nearest_of(jnp.where(mask[..., None], points[:, None], 0), shapes)
+    return jnp.where(mask[..., None], vectors, 0), feature, mask
+
+
+@compiled
+def _contacts_in_rows(
+    tri: TriangleList, points: Array, vertices: Array, vectors: Array, feature: Array, mask: Array
+) -> tuple[Array, Array]:
+    """Return the vectors to nearest points [n, capacity, d] of contacts, 0 elsewhere, and which slots these are."""
+    points, vertices, fixed = lax.stop_gradient((points, vertices, vectors))
+    triangle = jnp.where(mask, tri.idx, 0)
+    seen = jnp.where(mask[..., None, None], vertices[tri.faces[triangle]] - points[:, None, None], 0)
+    kept = are_contacts(mask, triangle, tri.faces, seen, fixed, norms(fixed), feature)
+    return jnp.where(kept[..., None], vectors, 0), kept
+
+
+@compiled
+def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> SignedDistance:
+    corners, finite, there = without_faults(vertices, tri.faces)
+    fixed, at, good = *lax.stop_gradient((corners, points)), finite & there
+    cutoff, used = make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False), jnp.minimum(tri.count, tri.capacity)
+    decide = decide_pairs if tri.backend == "jax" else decide_by_warp
+    slot, some = call_apart(functools.partial(nearest_slots, decide=decide), at, fixed, tri.idx, used, good, cutoff)
+    triangle = jnp.where(some, jnp.take_along_axis(tri.idx, slot[:, None], axis=1)[:, 0], 0)
+    shapes = jnp.where(some[:, None, None], corners[triangle], 0)
+    vectors, feature = nearest_of(jnp.where(some[:, None], points, 0), shapes)
+    away, distance = -vectors, norms(vectors)
+    apart = some & (distance > 0)
+    watertight = (is_closed(tri.faces) if tri.closed is None else tri.closed) & jnp.all(good)
+    tree = tri.cells if isinstance(tri.cells, TriangleTree) else None
+    inside, unknown = call_apart(functools.partial(_sides, tri.backend), tree, fixed, at, good, apart & watertight, cutoff)
+    by_normal = some & (unknown | ~(apart & watertight))
+    normal = call_apart(pseudonormals, Rows(tri.idx, used, triangle, feature), tri.faces, fixed, good, by_normal)
+    height = jnp.sum(normal * away, axis=1)
+    signed = jnp.where(jnp.where(by_normal, height < 0, inside), -distance, distance)
+    signed = jnp.where(distance > 0, signed, height)
+    grows = jnp.where(apart[:, None], away / jnp.where(apart, signed, 1)[:, None], jnp.where(some[:, None], normal, 0))
+    return SignedDistance(jnp.where(some, signed, 0), some, grows, watertight)
+
+
+def _sides(
+    backend: str, tree: TriangleTree | None, corners: Array, points: Array, good: Array, asked: Array, cutoff: Cutoff
+) -> tuple[Array, Array]:
+    """Say which of the points that are asked for are inside, and of which no ray tells: [n] bool each."""
+    tree = grow_tree(corners, good, cutoff) if tree is None else tree
+    cast = cast_rays if backend == "jax" else cast_by_warp
+    rays, least = ray_ways(points.shape[1], np.dtype(points.dtype)), least_winding(corners, good)
+    return cast(tree, corners, points, rays, asked, least, cutoff)

@@ -1,0 +1,131 @@
+"""The public verb `search_triangles`: which triangles of a wall are closer to each particle than a cutoff."""
+
+from typing import Any
+
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+
+from jfrnn._engine import PLATFORMS, choose_engine, platform_of
+from jfrnn._geometry import check_is_known, checked_capacity, checked_cutoff, checked_positions, checked_slack
+from jfrnn._tracing import gathered, made_on_host
+from jfrnn._triangles.triangle_list import TriangleList, counted_slots, found_triangles
+from jfrnn._triangles.winding import is_closed
+
+TRIANGLE_BACKENDS = ("auto", "jax", "warp", "bvh")
+
+# Where Warp runs: which of its two engines "auto" takes, by platform. `python -m experiments triangles` and `gpu
+# experiments/configs/h200_triangles.toml`, rows in experiments/results/triangles: on the CPU the tree takes 0.2 to 1.2 times as
+# long as the cells around gears of 1 280 to 200 640 faces, at cutoffs from a hundredth of a module to 0.8, a wall anew 0.1 to 0.9
+# times. On an H200 it takes 1.0 to 2.1 times as long, a wall anew 0.3 to 0.8 times.
+_FASTER = {"cpu": "bvh", "gpu": "warp"}
+
+
+def search_triangles(
+    positions: Array,
+    vertices: Array,
+    faces: Array,
+    cutoff: float,
+    *,
+    capacity: int | None = None,
+    slack: float = 1.0,
+    backend: str = "auto",
+) -> TriangleList:
+    """Find all triangles of a wall that are closer to a particle than a cutoff, exactly, each once; in 2D all segments.
+
+    (i, t) stands in the list iff the distance of particle i to the closed triangle t (its face, sides and vertices) is below the
+    cutoff in exact arithmetic on the given floats, the cutoff being rounded once to their dtype. Triangles may be slivers, segments
+    or points, and of any size beside the cutoff. Cost: O(particles + faces + candidates), the candidates of a particle being the
+    triangles in its cell, whose edge is about the cutoff, or about a quarter of a larger triangle; in a tree those whose boxes, and
+    their neighbors' along a curve, hold it.
+
+    A wall that stays is sorted once: `TriangleList.update` keeps the cells, or the tree, that the list has. One that moves as a
+    whole stays too, if the particles are taken into its frame. One that is deformed is sorted anew: `update(positions,
+    vertices=...)`.
+
+    Args:
+        positions: Particle positions [length], shape [n, 3] or [n, 2], float32 or float64. n = 0 is allowed.
+        vertices: Corners [length], shape [v, 3] or [v, 2], same dtype.
+        faces: Indices of vertices, integers, shape [f, 3] for triangles, [f, 2] for segments in 2D. f = 0 is allowed. Which way
+            round they run matters to `TriangleList.signed_distance` alone.
+        cutoff: Distance [length], a static number > 0.
+        capacity: Slots per row, a static int. Required where positions, vertices or faces are traced. Default: `slack` times the
+            longest row, rounded up to a multiple of 8.
+        slack: Factor >= 1 on the counted capacity, room for later motion.
+        backend: Where triangles are looked for: "warp" (compiled kernels, on the CPU and on CUDA) and "jax" (any device) in
+            cells, "bvh" (compiled kernels) in a tree of boxes, which is made anew sooner; or "auto": "bvh" on the CPU, "warp" on
+            CUDA (where Warp is missing "jax", with a warning), elsewhere "jax".
+
+    Returns:
+        A `TriangleList`; `idx` has shape [n, capacity], unused slots hold f. Rows are in no promised order, but the same input
+        gives the same bits.
+
+    Raises:
+        TypeError, ValueError: an argument is of the wrong kind, shape or range, or `capacity` is missing under jit.
+        ImportError, RuntimeError: "warp" or "bvh", and Warp is not installed or cannot run on the platform.
+        Overflow of a given capacity, coordinates that are not finite and faces without vertices are known only from data: `status`,
+        `overflow` and `check` tell.
+
+    Memory: 4 B per slot and particle for the list; 100 to 132 B per triangle for the cells, which the list keeps, whatever the
+    sizes of the triangles and of space, or 30 B for the tree (float64: 56); while "warp" lists on CUDA 12 B per particle, 0.6 kB
+    per triangle (float64: 1.1; "bvh" at most 0.13) and at most 58 MB. Differentiable: the list is topology, without gradient; see
+    `TriangleList.closest`.
+    Jit: yes, with capacity. vmap: yes, with capacity. `jax.shard_map`: yes, with particles spread and the wall on every device.
+    Source: strict cutoff (Peifle 2019, §2.2).
+
+    >>> import jax.numpy as jnp, jfrnn
+    >>> x = jnp.array([[0.2, 0.2, 0.05], [0.2, 0.2, -0.2], [1.05, 0.0, 0.0]])
+    >>> corners = jnp.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    >>> tri = jfrnn.search_triangles(x, corners, jnp.array([[0, 1, 2]]), 0.1)
+    >>> tri.count
+    Array([1, 0, 1], dtype=int32)
+    """
+    points = checked_positions("positions", positions)
+    corners = checked_positions("vertices", vertices, like=points)
+    named = _checked_faces(faces, points.shape[1], corners.shape[0])
+    radius = float(checked_cutoff(cutoff, np.dtype(points.dtype)).radius)
+    engine, slack = _chosen_engine(backend, points), checked_slack(slack)
+    if capacity is None:
+        if any(isinstance(x, Tracer) for x in (points, corners, named)):
+            raise ValueError(
+                "capacity must be given where positions, vertices or faces are traced (jax.jit, vmap, grad, scan), because it is a "
+                "shape: pass the capacity of an earlier search, with room to move, and check tri.overflow."
+            )
+        capacity = counted_slots(points, corners, named, radius, engine, slack)
+    found = found_triangles(points, corners, named, None, radius, engine, checked_capacity(capacity))
+    closed = None if isinstance(named, Tracer) else is_closed(named)
+    return TriangleList(**found, cutoff=radius, backend=engine, closed=closed)
+
+
+def _checked_faces(faces: Any, dim: int, vertices: int) -> Array:  # noqa: ANN401
+    """Return faces as int32 [f, dim]; what names no vertex stays out of range."""
+    kind = "triangles" if dim == 3 else "segments"
+    if not hasattr(faces, "dtype") or not np.issubdtype(faces.dtype, np.integer):
+        given = f"{np.dtype(faces.dtype)}" if hasattr(faces, "dtype") else type(faces).__name__
+        raise TypeError(f"faces must be an array of integers of shape [f, {dim}], the vertices of {kind}, got {given}.")
+    if len(faces.shape) != 2 or faces.shape[1] != dim:
+        raise ValueError(f"faces must have shape [f, {dim}], the vertices of {kind} in {dim}D, got shape {list(faces.shape)}.")
+    check_is_known("faces", faces.shape)
+    least = 0 if np.issubdtype(faces.dtype, np.unsignedinteger) else -1
+    if isinstance(faces, Tracer):
+        return _clipped(gathered(faces), least, vertices)
+    return made_on_host(faces, lambda known: _clipped(known, least, vertices))
+
+
+def _clipped(faces: Any, least: int, most: int) -> Any:  # noqa: ANN401
+    return (faces.clip(least, most) if np.iinfo(faces.dtype).max > most else faces).astype(np.int32)
+
+
+def _chosen_engine(backend: Any, points: Array) -> str:  # noqa: ANN401
+    if backend not in TRIANGLE_BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(map(repr, TRIANGLE_BACKENDS))}, got {backend!r}.")
+    platform = platform_of(points)
+    if backend in ("warp", "bvh") and platform not in PLATFORMS:
+        raise RuntimeError(f"backend={backend!r} finds triangles on the CPU and on CUDA, got {platform!r}: pass backend='jax'.")
+    engine = choose_engine("warp" if backend == "bvh" else backend, points, None)  # a tree needs what "warp" needs
+    return fastest_of(platform, engine) if backend == "auto" else backend
+
+
+def fastest_of(platform: str, engine: str) -> str:
+    """Return the engine that "auto" takes for triangles where it takes this one for neighbors."""
+    return _FASTER.get(platform, engine) if engine == "warp" else engine
