@@ -5,38 +5,15 @@ a program on, the main thread included: there, a handler that raises would end a
 """
 
 import warp as wp
+from jfrnn.kernels._series import fill
+from jfrnn.kernels._text import read_part
 
 # Places in the array of words that is given: addresses of functions and locks, and numbers.
-ANSWER_HERE, THREAD, MAIN_THREAD, ACQUIRE, RELEASE, ASKED, ANSWERED, FRAME, ANSWER = range(9)
-WORDS = 9
+_PLACES = ("ANSWER_HERE", "THREAD", "MAIN_THREAD", "ACQUIRE", "RELEASE", "ASKED", "ANSWERED", "FRAME", "ANSWER")
+WORDS = len(_PLACES)
+ANSWER_HERE, THREAD, MAIN_THREAD, ACQUIRE, RELEASE, ASKED, ANSWERED, FRAME, ANSWER = range(WORDS)
 
-_TEXT = f"""
-{{
-    struct Relay {{
-        using word = unsigned long long;
-        using integer = decltype(0);  // `int` is a macro of Warp's
-        using Answer = void* (*)(void*);
-        using Thread = unsigned long (*)();
-        using Acquire = integer (*)(void*, integer);
-        using Release = void (*)(void*);
-        static word*& desk() {{
-            static word* words = nullptr;
-            return words;
-        }}
-        static void* answer(void* frame) {{
-            word* words = desk();
-            if (((Thread)words[{THREAD}])() != words[{MAIN_THREAD}])
-                return ((Answer)words[{ANSWER_HERE}])(frame);
-            words[{FRAME}] = (word)frame;
-            ((Release)words[{RELEASE}])((void*)words[{ASKED}]);
-            ((Acquire)words[{ACQUIRE}])((void*)words[{ANSWERED}], 1);
-            return (void*)words[{ANSWER}];
-        }}
-    }};
-    Relay::desk() = (unsigned long long*)words.data;
-    address_out.data[0] = (unsigned long long)&Relay::answer;
-}}
-"""
+_TEXT = fill(read_part("relay.h", "relay"), **{name: str(place) for place, name in enumerate(_PLACES)})
 
 _Words = wp.array(dtype=wp.uint64)
 

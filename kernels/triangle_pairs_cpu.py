@@ -7,24 +7,12 @@ import functools
 
 import warp as wp
 from jfrnn.kernels._native import ENTER, LEAVE, snippet
+from jfrnn.kernels._text import read_part
 from jfrnn.kernels._triangles import DECIDE, constants
 
 CHUNK = 4096  # pairs that a thread takes at a time
 
-_DECIDE_PAIRS = r"""
-const double scale = Bits::unit_scale(radius);
-int room[ROOM];
-for (;;) {
-    const long long begin = (long long)__atomic_fetch_add(&info.data[0], 1, __ATOMIC_RELAXED) * CHUNK;
-    if (begin >= n)
-        break;
-    for (long long q = begin; q < n && q < begin + CHUNK; ++q) {
-        const real* p = positions.data + (long long)DIM * particle.data[q];
-        const real* shape = corners.data + (long long)DIM * DIM * triangle.data[q];
-        near.data[q] = asked.data[q] && Shape::near(p, shape, radius, scale, room);
-    }
-}
-"""
+_DECIDE_PAIRS = read_part("triangle_pairs_cpu.h", "decide_pairs")
 
 
 @functools.cache

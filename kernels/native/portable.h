@@ -1,0 +1,161 @@
+// --- part: no_contraction
+
+#if !defined(__CUDA_ARCH__)
+#pragma clang fp contract(off)
+#endif
+// --- part: portable
+
+const real radius = cutoff.data[0];
+#if defined(__CUDA_ARCH__)
+#define JFRNN_FUNCTION static __device__ __forceinline__
+#define JFRNN_MEMBER __device__ __forceinline__
+#define JFRNN_CALL static __device__ __noinline__
+#else
+#define JFRNN_FUNCTION static
+#define JFRNN_MEMBER
+#define JFRNN_CALL static __attribute__((noinline))
+#endif
+constexpr int ROW = DIM + (PERIODIC ? 1 : 0) + BATCHED;  // numbers per particle
+constexpr int LATTICE_END = PERIODIC ? (SKEWED ? 47 : 29) : 1;  // numbers in `cutoff`, but for the last one of a batch
+struct Bits {  // of floats
+    enum { MANTISSA = DOUBLE ? 52 : 23, EXPONENTS = DOUBLE ? 0x7ff : 0xff, BIAS = DOUBLE ? 1023 : 127 };
+    JFRNN_FUNCTION unsigned long long of(real x) {
+        if constexpr (DOUBLE) {
+            unsigned long long b;
+            memcpy(&b, &x, 8);
+            return b;
+        } else {
+            unsigned int b;
+            memcpy(&b, &x, 4);
+            return b;
+        }
+    }
+    JFRNN_FUNCTION int exponent(real x) { return (int)(of(x) >> MANTISSA) & EXPONENTS; }
+    JFRNN_FUNCTION bool finite(real x) { return exponent(x) != EXPONENTS; }
+    JFRNN_FUNCTION bool negative(real x) { return of(x) >> (DOUBLE ? 63 : 31) & 1; }
+    JFRNN_FUNCTION real not_finite() {
+        const unsigned long long b = (unsigned long long)EXPONENTS << MANTISSA;
+        real x;
+        memcpy(&x, &b, sizeof(real));
+        return x;
+    }
+    JFRNN_FUNCTION double power_of_two(int e) {
+        const unsigned long long b = (unsigned long long)(e + 1023) << 52;
+        double x;
+        memcpy(&x, &b, 8);
+        return x;
+    }
+    // power of two that brings r into [1, 4) and is itself a normal float
+    JFRNN_FUNCTION double unit_scale(real r) {
+        const int e = exponent(r) - BIAS, largest = BIAS - 1;
+        return power_of_two(e > largest ? -largest : -e);
+    }
+};
+auto finite_point = [](const real* p) {
+    bool finite = true;
+    for (int k = 0; k < DIM; ++k)
+        finite = finite && Bits::finite(p[k]);
+    return finite;
+};
+auto unsigned_of = [](real x) -> unsigned int {
+    unsigned int bits;
+    if constexpr (DOUBLE) bits = (unsigned int)x;
+    else memcpy(&bits, &x, 4);
+    return bits;
+};
+auto system_of = [&](const real* row) -> unsigned int { return BATCHED ? unsigned_of(row[ROW - 1]) : 0u; };
+struct Lattice {
+    enum { NONE = 512 | 512 << 10 | (DIM == 3 ? 512 << 20 : 0) };  // packed turns of what lies in the cell
+    const real* numbers;
+    JFRNN_MEMBER real vector(int l, int k) const { return numbers[1 + 3 * l + k]; }
+    // the vectors that the caller gave, in which pairs are decided, and how many of each there are in vector l
+    JFRNN_MEMBER real given(int l, int k) const { return numbers[(SKEWED ? 29 : 1) + 3 * l + k]; }
+    JFRNN_MEMBER int number(int l, int k) const { return SKEWED ? (int)numbers[38 + 3 * l + k] : l == k; }
+    JFRNN_MEMBER real transform(int k, int axis) const { return numbers[10 + 3 * k + axis]; }
+    JFRNN_MEMBER real origin(int k) const { return numbers[19 + k]; }
+    JFRNN_MEMBER real reach(int axis) const { return numbers[22 + axis]; }
+    JFRNN_MEMBER int images(int axis) const { return (int)numbers[25 + axis]; }
+    JFRNN_MEMBER real slack() const { return numbers[28]; }
+    JFRNN_MEMBER bool periodic(int axis) const { return images(axis) > 0; }
+    // uncontracted, so that a coordinate is the same wherever it is computed
+#if defined(__CUDA_ARCH__)
+    JFRNN_FUNCTION real add(real a, real b) {
+        if constexpr (DOUBLE) return __dadd_rn(a, b);
+        else return __fadd_rn(a, b);
+    }
+    JFRNN_FUNCTION real mul(real a, real b) {
+        if constexpr (DOUBLE) return __dmul_rn(a, b);
+        else return __fmul_rn(a, b);
+    }
+#else
+    JFRNN_FUNCTION real add(real a, real b) { return a + b; }
+    JFRNN_FUNCTION real mul(real a, real b) { return a * b; }
+#endif
+    // turns of a row: how many lattice vectors lie between the cell and the particle
+    JFRNN_FUNCTION int packed_turns(real last) {
+        int packed;
+        if constexpr (DOUBLE) packed = (int)last;
+        else memcpy(&packed, &last, 4);
+        return packed;
+    }
+    JFRNN_FUNCTION int turn(real last, int axis) { return ((packed_turns(last) >> (10 * axis)) & 1023) - 512; }
+    // component k of S·A
+    JFRNN_MEMBER real translation(int sx, int sy, int sz, int k) const {
+        if constexpr (!SKEWED)  // its vectors lie along the axes, and what others would add is 0
+            return mul(real(k == 0 ? sx : k == 1 ? sy : sz), vector(k, k));
+        real sum = mul(real(sx), vector(0, k));
+        sum = add(sum, mul(real(sy), vector(1, k)));
+        return DIM == 3 ? add(sum, mul(real(sz), vector(2, k))) : sum;
+    }
+    // a row of positions brought into the cell; one that is too far away for that is not finite
+    JFRNN_MEMBER void wrap(const real* numbers, real* p) const {
+        struct alignas(ROW % 4 ? sizeof(real) : 16) Row { real numbers[ROW]; };  // loaded at once, if it can be
+        const Row loaded = *(const Row*)numbers;
+        const real* row = loaded.numbers;
+        if (packed_turns(row[DIM]) == NONE) {  // as nearly everywhere
+            for (int k = 0; k < DIM; ++k)
+                p[k] = row[k];
+            return;
+        }
+        const int t[3] = {turn(row[DIM], 0), turn(row[DIM], 1), DIM == 3 ? turn(row[DIM], 2) : 0};
+        for (int k = 0; k < DIM; ++k)
+            p[k] = t[0] | t[1] | t[2] ? add(row[k], -translation(t[0], t[1], t[2], k)) : row[k];
+        if (Bits::negative(row[DIM]))
+            p[0] = Bits::not_finite();
+    }
+    // coordinate of a wrapped point along an axis of cells: a fraction where that is periodic, else a length
+    JFRNN_MEMBER real along(int axis, const real* p) const {
+        real sum = mul(add(p[axis], -origin(axis)), transform(axis, axis));
+        if constexpr (SKEWED) {
+            sum = mul(add(p[0], -origin(0)), transform(0, axis));
+            for (int k = 1; k < DIM; ++k)
+                sum = add(sum, mul(add(p[k], -origin(k)), transform(k, axis)));
+        }
+        if (!periodic(axis))
+            return sum;
+        return sum < 0 ? real(0) : sum > 1 ? real(1) : sum;
+    }
+};
+#if defined(__CUDA_ARCH__)
+const Lattice lattice{cutoff.data};
+#else
+real numbers[LATTICE_END];  // not the caller's: nothing that is written may change them
+for (int k = 0; PERIODIC && k < LATTICE_END; ++k)
+    numbers[k] = cutoff.data[k];
+const Lattice lattice{numbers};
+#endif
+// the point of a row of positions, wrapped where space is periodic
+auto point_of = [&](const real* row, real* p) {
+    if constexpr (PERIODIC)
+        lattice.wrap(row, p);
+    else
+        for (int k = 0; k < DIM; ++k)
+            p[k] = row[k];
+};
+// the bounding box [low, high] grows to hold the box [l, h]
+auto widen = [](real* low, real* high, const real* l, const real* h) {
+    for (int k = 0; k < DIM; ++k) {
+        low[k] = l[k] < low[k] ? l[k] : low[k];
+        high[k] = h[k] > high[k] ? h[k] : high[k];
+    }
+};
