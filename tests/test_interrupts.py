@@ -15,6 +15,7 @@ def run(tries):
     environment = os.environ | {"JAX_ENABLE_X64": "0"}
     done = subprocess.run([sys.executable, PROGRAM, str(tries)], capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 0, done.stderr
+    print(done.stderr)  # what was dropped, and where
     words = done.stdout.split()
     return {kind: int(times) for kind, times in zip(words[::2], words[1::2])}
 

@@ -199,7 +199,7 @@ def test_what_is_the_same_bit_by_bit_is_written_once():
 
 KEY = """
 import jax
-from jfrnn._translate import translate
+from jfrnn._sums.translate import translate
 print(translate(jax.make_jaxpr(lambda x: x * jax.numpy.sin(x) + 2)(1.0)).key)
 """
 
