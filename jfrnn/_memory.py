@@ -12,9 +12,19 @@ import numpy as np
 from jax import Array
 from jax.sharding import SingleDeviceSharding
 
-from jfrnn._engine import WARP_ENGINES, Filter, Inputs, Options, count_rows, default_platform, fastest_engine, list_rows
-from jfrnn._engine import scratch_bytes as warp_scratch_bytes
-from jfrnn._geometry import Cutoff, checked_backend, checked_capacity, checked_cutoff, checked_kind, checked_size, checked_skin
+from jfrnn._engine import (
+    ENGINES,
+    Engine,
+    Filter,
+    Inputs,
+    Options,
+    checked_backend,
+    count_rows,
+    default_platform,
+    fastest_engine,
+    list_rows,
+)
+from jfrnn._geometry import Cutoff, checked_capacity, checked_cutoff, checked_kind, checked_size, checked_skin
 from jfrnn._sums import pair_sum
 from jfrnn._triangles import TRIANGLE_BACKENDS, fastest_of, find_triangles
 
@@ -137,18 +147,16 @@ def memory_plan(
     if values is not None or gradient:
         raise ValueError("values and gradient belong to a pair sum: say its fn, too.")
     capacity = None if capacity is None else checked_capacity(capacity)
-    if engine == "auto":
-        engine = fastest_engine(_device_of(where).platform, n)
-    if engine in WARP_ENGINES:
-        scratch = warp_scratch_bytes(engine, where, n, rows, dim, dtype == np.float64, queries is None)
-    else:
+    chosen = fastest_engine(_device_of(where).platform, n) if engine == "auto" else ENGINES[engine]
+    scratch = chosen.scratch_bytes(where, n, rows, dim, dtype == np.float64, queries is None)
+    if scratch is None:
         at = SingleDeviceSharding(_device_of(where))
         points = [None if size is None else jax.ShapeDtypeStruct((size, dim), dtype, sharding=at) for size in (n, queries)]
-        scratch = _compiled_scratch(points, radius, engine, capacity)
+        scratch = _compiled_scratch(points, radius, chosen, capacity)
     if capacity is None:
-        return MemoryPlan(0, scratch, engine, counts_bytes=4 * rows)
+        return MemoryPlan(0, scratch, chosen.name, counts_bytes=4 * rows)
     kept = (n + (queries or 0)) * dim * dtype.itemsize + 4 if checked_skin(skin, float(radius.radius), dtype) else 0
-    return MemoryPlan(4 * rows * (capacity + 1) + 8 + kept, scratch, engine)
+    return MemoryPlan(4 * rows * (capacity + 1) + 8 + kept, scratch, chosen.name)
 
 
 def _device_of(platform: str) -> Any:  # noqa: ANN401
@@ -161,7 +169,7 @@ def _device_of(platform: str) -> Any:  # noqa: ANN401
         ) from error
 
 
-def _compiled_scratch(points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff, engine: str, capacity: int | None) -> int:
+def _compiled_scratch(points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff, engine: Engine, capacity: int | None) -> int:
     """Compile the search, or the count, for these shapes, and return what XLA says of its temporary arrays [B]."""
     options = Options(Filter(drop_self=points[1] is None, later_only=False), engine, closed=False)
     inputs: Any = Inputs(points[0], points[1], None, None, cutoff)  # pyright: ignore[reportArgumentType] (shapes of arrays)
@@ -176,7 +184,7 @@ def _plan_of_triangles(sizes: tuple[int, int, int, int], dtype: np.dtype, cutoff
     if engine not in TRIANGLE_BACKENDS:
         raise ValueError(f"backend={engine!r} finds no triangles: pass one of {', '.join(map(repr, TRIANGLE_BACKENDS))}.")
     if engine == "auto":
-        engine = fastest_of(device.platform, fastest_engine(device.platform, n))
+        engine = fastest_of(device.platform, fastest_engine(device.platform, n).name)
     points, corners = (jax.ShapeDtypeStruct((size, dim), dtype, sharding=at) for size in (n, faces // 2 + 2))
     named: Any = jax.ShapeDtypeStruct((faces, dim), np.int32, sharding=at)
     analysis = _analysis(find_triangles.lower(points, corners, named, None, cutoff, engine, capacity))
@@ -218,7 +226,7 @@ def _plan_of_sum(
     with jax.default_device(device):
         if engine != "auto":
             return plan(engine)
-        if fastest_engine(device.platform, 1) == "warp":
+        if fastest_engine(device.platform, 1).translates:
             with contextlib.suppress(TypeError, ValueError, NotImplementedError):  # "jax" takes it, or says what is wrong
                 return plan("warp")
         return plan("jax")

@@ -10,7 +10,7 @@ import pytest
 from jfrnn.kernels.hashgrid import grid_shape
 
 import jfrnn
-from jfrnn._engine import warp as _warp
+from jfrnn._engine import load_warp
 
 
 @pytest.mark.parametrize(
@@ -93,6 +93,6 @@ def test_the_program_names_the_cutoff():
 
 
 def test_warp_1_18_is_refused(monkeypatch):
-    monkeypatch.setattr(_warp.load_warp(), "__version__", "1.18.0")
+    monkeypatch.setattr(load_warp(), "__version__", "1.18.0")
     with pytest.raises(ImportError, match=r"needs warp-lang 1\.19: the HashGrid of 1\.18\.0 can list a pair twice"):
         jfrnn.count(np.zeros((3, 2), np.float32), 1.1875, backend="hashgrid")

@@ -13,7 +13,7 @@ import warp as wp
 from jfrnn.kernels import cells_cuda, pair_sum_cpu, pair_sum_cuda
 
 import jfrnn
-from jfrnn._engine import warp as _warp
+from jfrnn._engine import warp_sums
 from jfrnn._search.search import checked_problem
 from jfrnn._sums import fused as _fused
 from jfrnn._sums.verb import _with_engine
@@ -170,17 +170,18 @@ def test_auto_takes_the_kernel_on_cuda_and_jax_elsewhere(monkeypatch):
     x = np.zeros((4, 3), np.float32)
     problem = checked_problem(x, 1.0, None, None, None, "gather", False, False, False, "auto", 0.0, None)
     monkeypatch.setattr("jfrnn._sums.verb.platform_of", lambda *_: "gpu")
-    assert _with_engine(problem, "auto").backend == "auto"
-    assert _with_engine(problem, "warp").backend == "warp"
+    for backend in ("auto", "warp"):
+        options = _with_engine(problem, backend)
+        assert (options.engine.name, options.may_change) == ("warp", backend == "auto")
     monkeypatch.setattr("jfrnn._sums.verb.platform_of", lambda *_: "rocm")
-    assert _with_engine(problem, "auto").backend == "jax"
+    assert _with_engine(problem, "auto").engine.name == "jax"
     with pytest.raises(ValueError, match="on the platform 'rocm', only on the CPU and on CUDA"):
         _with_engine(problem, "warp")
 
 
 def test_a_box_holds_as_many_particles_as_their_numbers_leave_room_for(monkeypatch):
     """An image's code takes bits of the number; on the CPU it does not."""
-    monkeypatch.setattr(_warp, "MOST_IN_BOX", 4)
+    monkeypatch.setattr(_fused, "MOST_IN_BOX", 4)
     x, box = np.zeros((4, 3), np.float32), jfrnn.Box([4.0] * 3)
     inputs = checked_problem(x, 1.0, None, box, None, "gather", False, False, False, "warp", 0.0, None).inputs
     assert _fused.refusal(inputs, "cpu") is None
@@ -195,11 +196,11 @@ def test_programs_for_cuda_call_it_and_launches_have_the_arguments_of_their_kern
     assert f'"jfrnn_pair_sum_cuda_3d_f32_own_dropself_{"nearest_" * periodic}' in program
     plan = plan_of(functools.partial(square_sum, box=box), *arguments(np.float32, 3)[:3])
     assert f'"jfrnn_sorting_cuda_3d_f32_own{"_nearest" * periodic}@' in program
-    variant = _warp._SumVariant(3, False, False, True, False, True, periodic, False, False, False, plan.key, True)
+    variant = warp_sums._SumVariant(3, False, False, True, False, True, periodic, False, False, False, plan.key, True)
     rows, line = wp.zeros((40, 3), dtype=float, device="cpu"), wp.zeros(40, dtype=float, device="cpu")
     ints = wp.zeros(40, dtype=int, device="cpu")
-    sorting = _warp._sorting_commands(_warp._sorting(variant), rows, rows, line, ints, ints)
-    summing = _warp._sum_commands(variant, plan.text, rows, rows, line, line, rows, rows, ints, ints, rows, line, line, line)
+    sorting = warp_sums._sorting_commands(warp_sums._sorting(variant), rows, rows, line, ints, ints)
+    summing = warp_sums._sum_commands(variant, plan.text, rows, rows, line, line, rows, rows, ints, ints, rows, line, line, line)
     assert (len(sorting), len(summing)) == (6, 2 + periodic)
     assert [command.beside for command in summing] == [False] * (1 + periodic) + [bool(periodic)]
     for command in (*sorting, *summing):

@@ -1,51 +1,59 @@
 """The engines, each a way to find the same pairs, and how their kernels are launched."""
 
-from jfrnn._engine.auto import WARP_ENGINES, choose_engine, default_platform, fastest_engine, level_of_caller, platform_of
-from jfrnn._engine.backends import (
-    Inputs,
-    Options,
-    count_rows,
-    fold_pairs,
-    is_decidable,
-    levels_of,
-    list_rows,
-    prepared,
-    without_inactive,
+from jfrnn._engine.arrays import levels_of
+from jfrnn._engine.auto import (
+    ARRAYS,
+    ENGINES,
+    WARP,
+    checked_backend,
+    choose_engine,
+    default_platform,
+    fastest_engine,
+    platform_of,
 )
+from jfrnn._engine.cores import ask_for_huge_pages, on_every_core, on_one_core
 from jfrnn._engine.cuda import Command
 from jfrnn._engine.launch import Kernel, kernel
-from jfrnn._engine.levels_warp import level_sums
-from jfrnn._engine.runs import FOLD_GROUP, Block, Filter, Slots, Visit
-from jfrnn._engine.start import load_warp
-from jfrnn._engine.warp import (
-    MOST_IN_BOX,
-    PLATFORMS,
-    as_float,
-    ask_for_huge_pages,
-    kernels_of,
-    on_cpu,
-    on_cuda,
-    on_every_core,
-    on_one_core,
-    pair_sums,
-    scratch_bytes,
+from jfrnn._engine.operands import MOST_IN_BOX, as_float
+from jfrnn._engine.problem import (
+    Engine,
+    Filter,
+    Inputs,
+    Kind,
+    Options,
+    Search,
+    is_decidable,
+    prepare_search,
+    without_inactive,
 )
+from jfrnn._engine.rows import count_rows, fold_pairs, list_rows
+from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit
+from jfrnn._engine.serving import on_cpu, on_cuda
+from jfrnn._engine.start import kernels_of, level_of_caller, load_warp
+from jfrnn._engine.warp import PLATFORMS
+from jfrnn._engine.warp_sums import pair_sums
 
 __all__ = [
+    "ARRAYS",
+    "ENGINES",
     "FOLD_GROUP",
     "MOST_IN_BOX",
     "PLATFORMS",
-    "WARP_ENGINES",
+    "WARP",
     "Block",
     "Command",
+    "Engine",
     "Filter",
     "Inputs",
     "Kernel",
+    "Kind",
     "Options",
+    "Search",
     "Slots",
     "Visit",
     "as_float",
     "ask_for_huge_pages",
+    "checked_backend",
     "choose_engine",
     "count_rows",
     "default_platform",
@@ -55,7 +63,6 @@ __all__ = [
     "kernel",
     "kernels_of",
     "level_of_caller",
-    "level_sums",
     "levels_of",
     "list_rows",
     "load_warp",
@@ -65,7 +72,6 @@ __all__ = [
     "on_one_core",
     "pair_sums",
     "platform_of",
-    "prepared",
-    "scratch_bytes",
+    "prepare_search",
     "without_inactive",
 ]

@@ -2,15 +2,22 @@
 
 import functools
 import warnings
+from typing import Any
 
 import jax
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._engine.start import level_of_caller
-from jfrnn._engine.warp import load_warp, missing
+from jfrnn._engine.arrays import ArrayEngine
+from jfrnn._engine.hashgrid import HashGridEngine
+from jfrnn._engine.problem import ANYTHING, Engine, Kind
+from jfrnn._engine.start import level_of_caller, load_warp
+from jfrnn._engine.warp import WarpEngine
 
-WARP_ENGINES = ("warp", "hashgrid")
+WARP, ARRAYS = WarpEngine(), ArrayEngine("jax", by_cells=True)
+ENGINES: dict[str, Engine] = {
+    engine.name: engine for engine in (ARRAYS, WARP, HashGridEngine(), ArrayEngine("brute", by_cells=False))
+}
 
 
 # From how many sources on Warp is the engine to take, by platform; below, and where nothing was measured, it is "jax".
@@ -23,37 +30,40 @@ WARP_ENGINES = ("warp", "hashgrid")
 _WARP_FROM = {"cpu": 0, "gpu": 0}
 
 
-def choose_engine(
-    backend: str, sources: Array, queries: Array | None, *, periodic: bool = False, radii: bool = False, batch: bool = False
-) -> str:
-    """Return the engine that a backend stands for; raise where one that was named cannot run on the platform.
-
-    Raises:
-        ImportError: "warp" or "hashgrid", and Warp is not installed.
-        RuntimeError: "warp" or "hashgrid", and Warp cannot run on the platform.
-        ValueError: "hashgrid", and space is periodic, there is a batch, or cutoffs differ from particle to particle.
-    """
-    if backend == "hashgrid" and radii:
-        raise ValueError("backend='hashgrid' takes one cutoff for all particles: pass backend='warp', 'jax' or 'brute'.")
-    if backend == "hashgrid" and batch:
-        raise ValueError("backend='hashgrid' knows one system at a time: pass backend='warp', 'jax' or 'brute'.")
-    if backend == "hashgrid" and periodic:
-        raise ValueError("backend='hashgrid' knows no periodic box: pass backend='warp', 'jax' or 'brute'.")
-    if backend not in ("auto", *WARP_ENGINES):
-        return backend
-    platform = platform_of(sources, sources if queries is None else queries)
-    if backend == "auto":
-        return fastest_engine(platform, sources.shape[0])
-    load_warp()
-    if reason := _what_is_missing(platform):
-        raise RuntimeError(f"backend={backend!r} cannot run on the platform {platform!r}: {reason}. Pass backend='jax'.")
+def checked_backend(backend: Any) -> str:  # noqa: ANN401
+    """Return the name of a backend."""
+    names = ("auto", *ENGINES)
+    if backend not in names:
+        raise ValueError(f"backend must be one of {', '.join(map(repr, names))}, got {backend!r}.")
     return backend
 
 
-def fastest_engine(platform: str, sources: int) -> str:
+def choose_engine(backend: str, sources: Array, queries: Array | None, kind: Kind = ANYTHING) -> Engine:
+    """Return the engine that a backend stands for; raise where one that was named cannot answer, or cannot run on the platform.
+
+    Raises:
+        ImportError: It needs Warp, which is not installed.
+        RuntimeError: It needs Warp, which cannot run on the platform.
+        ValueError: It cannot answer what is asked for.
+    """
+    if backend == "auto":
+        return fastest_engine(platform_of(sources, sources if queries is None else queries), sources.shape[0])
+    engine = ENGINES[checked_backend(backend)]
+    if reason := engine.refuse(kind):
+        raise ValueError(f"backend={backend!r} {reason}")
+    if isinstance(engine, ArrayEngine):
+        return engine
+    load_warp()
+    platform = platform_of(sources, sources if queries is None else queries)
+    if reason := _what_is_missing(engine, platform):
+        raise RuntimeError(f"backend={backend!r} cannot run on the platform {platform!r}: {reason}. Pass backend='jax'.")
+    return engine
+
+
+def fastest_engine(platform: str, sources: int) -> Engine:
     """Return the engine that "auto" takes on a platform for a number of sources; warn once where Warp cannot run."""
     warp_from = _WARP_FROM.get(platform)
-    return "warp" if warp_from is not None and sources >= warp_from and _can_warp(platform) else "jax"
+    return WARP if warp_from is not None and sources >= warp_from and _can_warp(platform) else ARRAYS
 
 
 def default_platform() -> str:
@@ -72,13 +82,13 @@ def platform_of(*arrays: Array) -> str:
 
 
 @functools.cache
-def _what_is_missing(platform: str) -> str | None:
-    return missing(platform)
+def _what_is_missing(engine: Engine, platform: str) -> str | None:
+    return engine.missing(platform)
 
 
 @functools.cache
 def _can_warp(platform: str) -> bool:
-    reason = _what_is_missing(platform)
+    reason = _what_is_missing(WARP, platform)
     if reason is None:
         return True
     warnings.warn(

@@ -7,23 +7,15 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
+from jfrnn._engine.cores import PLACES_PER_THREAD, on_every_core
 from jfrnn._engine.cuda import Command
 from jfrnn._engine.launch import Kernel, kernel
-from jfrnn._engine.runs import Filter
+from jfrnn._engine.operands import lattice_numbers, particle_rows, periodic_kind, space_flags
+from jfrnn._engine.problem import Filter, Rows, Search
+from jfrnn._engine.serving import on_cpu, on_cuda
 from jfrnn._engine.start import kernels_of, load_warp
-from jfrnn._engine.warp import (
-    PLACES_PER_THREAD,
-    Rows,
-    SumsOf,
-    lattice_numbers,
-    on_cpu,
-    on_cuda,
-    on_every_core,
-    particle_rows,
-    periodic_kind,
-    space_flags,
-)
-from jfrnn._geometry import GROUPS, HALVINGS, Batch, Cutoffs, Lattice, Levels, Wrapped
+from jfrnn._engine.sum_results import SumsOf
+from jfrnn._geometry import GROUPS, HALVINGS, Levels
 
 
 class _LevelVariant(NamedTuple):
@@ -41,101 +33,56 @@ class _LevelVariant(NamedTuple):
     cuda: bool
 
 
-def level_neighbors(
-    sources: Array,
-    queries: Array | None,
-    cutoffs: Cutoffs,
-    levels: Levels,
-    keep: Filter,
-    capacity: int | None,
-    batch: Batch | None = None,
-    torus: tuple[Lattice, Wrapped] | None = None,
-) -> Rows:
+def level_neighbors(search: Search, levels: Levels, keep: Filter, capacity: int | None) -> Rows:
     """Search with a cutoff per particle, among sources that XLA has sorted; capacity=None only counts."""
 
-    def on(cuda: bool) -> Callable[..., Rows]:
-        def call(*inputs: Any) -> Rows:  # noqa: ANN401
-            return _call_levels(cuda, *inputs, keep=keep, capacity=capacity)
+    def on(cuda: bool) -> Callable[[Search, Levels], Rows]:
+        return functools.partial(_call_levels, cuda, keep, capacity)
 
-        return call
-
-    return lax.platform_dependent(sources, queries, cutoffs, levels, batch, torus, cpu=on(False), cuda=on(True))
+    return lax.platform_dependent(search._replace(checks={}), levels, cpu=on(False), cuda=on(True))
 
 
-def _call_levels(
-    cuda: bool,
-    sources: Array,
-    queries: Array | None,
-    cutoffs: Cutoffs,
-    levels: Levels,
-    batch: Batch | None,
-    torus: tuple[Lattice, Wrapped] | None,
-    *,
-    keep: Filter,
-    capacity: int | None,
-) -> Rows:
-    lists, m = capacity is not None, (sources if queries is None else queries).shape[0]
-    variant = _variant_of(sources, queries, cutoffs, keep, batch, torus, lists, cuda)
+def _call_levels(cuda: bool, keep: Filter, capacity: int | None, search: Search, levels: Levels) -> Rows:
+    lists, (_, m) = capacity is not None, search.sizes
+    variant = _variant_of(search, keep, lists, cuda)
     dims: dict[str, Any] = {"count": m, "info": 2} | ({"idx": (m, capacity)} if lists else {})
-    *idx, count, info = _level_callable(variant)(*_operands(sources, queries, cutoffs, levels, torus), output_dims=dims)
+    *idx, count, info = _level_callable(variant)(*_operands(search, levels), output_dims=dims)
     overflow = info[0] > capacity if lists else jnp.zeros((), bool)
     return Rows(idx[0] if lists else None, count, info[0], overflow.astype(jnp.int32))  # Status.ROW_OVERFLOW
 
 
 def level_sums(
-    sources: Array,
-    queries: Array | None,
-    cutoffs: Cutoffs,
+    search: Search,
     levels: Levels,
     keep: Filter,
-    batch: Batch | None,
-    torus: tuple[Lattice, Wrapped] | None,
     term: Any,  # noqa: ANN401
     key: str,
     values: tuple[Array, Array, Array],
     compensated: bool,
     extremes: bool,
 ) -> tuple[Array, Array, Array]:
-    """Sum a term as `jfrnn._engine.warp.pair_sums` does, on the CPU, among sources that XLA has sorted."""
+    """Sum a term as `jfrnn._engine.warp_sums.pair_sums` does, on the CPU, among sources that XLA has sorted."""
 
-    def sums_on_cpu(
-        sources: Array,
-        queries: Array | None,
-        cutoffs: Cutoffs,
-        levels: Levels,
-        batch: Batch | None,
-        torus: tuple[Lattice, Wrapped] | None,
-        values: tuple[Array, Array, Array],
-    ) -> tuple[Array, Array, Array]:
-        shared, own, others = values
-        m = (sources if queries is None else queries).shape[0]
+    def sums_on_cpu(search: Search, levels: Levels, values: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        (shared, own, others), (_, m) = values, search.sizes
         results = SumsOf(term, m, kernels_of("pair_sum_levels").slots(m), compensated, extremes)
-        call = _sum_callable(_variant_of(sources, queries, cutoffs, keep, batch, torus, False, False), results, key)
+        call = _sum_callable(_variant_of(search, keep, False, False), results, key)
         columns = jnp.zeros(1, others.dtype) if term.source_columns == 0 else others[levels.order].T.reshape(-1)
-        operands = _operands(sources, queries, cutoffs, levels, torus)
+        operands = _operands(search, levels)
         return results.unpacked(*call(*operands, shared, own, columns, output_dims=results.dims() | {"info": 2})[:3])
 
-    return lax.platform_dependent(sources, queries, cutoffs, levels, batch, torus, values, cpu=sums_on_cpu)
+    return lax.platform_dependent(search._replace(checks={}), levels, values, cpu=sums_on_cpu)
 
 
-def _variant_of(
-    sources: Array,
-    queries: Array | None,
-    cutoffs: Cutoffs,
-    keep: Filter,
-    batch: Batch | None,
-    torus: tuple[Lattice, Wrapped] | None,
-    lists: bool,
-    cuda: bool,
-) -> _LevelVariant:
-    kind = (queries is None, cutoffs.closed, keep, cutoffs.rule, periodic_kind(torus), batch is not None, cuda)
+def _variant_of(search: Search, keep: Filter, lists: bool, cuda: bool) -> _LevelVariant:
+    sources, cutoffs = search.sources, search.cutoffs
+    kind = (search.queries is None, cutoffs.closed, keep, cutoffs.rule, periodic_kind(search.torus), search.batch is not None, cuda)
     return _LevelVariant(sources.shape[1], sources.dtype == jnp.float64, lists, *kind)
 
 
-def _operands(
-    sources: Array, queries: Array | None, cutoffs: Cutoffs, levels: Levels, torus: tuple[Lattice, Wrapped] | None
-) -> list[Array]:
+def _operands(search: Search, levels: Levels) -> list[Array]:
     """Return what the kernels read, in the order of `_inputs`."""
+    sources, queries, cutoffs, torus = search.sources, search.queries, search.cutoffs, search.torus
     given, dim, padding = sources if queries is None else queries, sources.shape[1], kernels_of("levels").PADDING
 
     def ordered(x: Array | None, order: Array, more: int) -> Array:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._engine.problem import Filter
 from jfrnn._geometry import Cutoff, Cutoffs, Images, Pair, flat_take, refine, shift_in_given, squared_distance, step_one_bounds
 
 LANES = 16  # candidates per word: hits in its lower half, doubtful ones in its upper half
@@ -65,13 +66,6 @@ class Torus(NamedTuple):
     raw: tuple[Array, Array]
     turns: tuple[Array, Array]
     slack: Array
-
-
-class Filter(NamedTuple):
-    """Which candidates may be neighbors apart from their distance; static."""
-
-    drop_self: bool
-    later_only: bool
 
 
 class Candidates(NamedTuple):

@@ -15,7 +15,6 @@ from jfrnn._geometry.box import Box
 from jfrnn._geometry.exact import RULES, Cutoff, Radii, largest_cutoff, make_cutoff, smallest_cutoff
 from jfrnn._tracing import gathered, made_on_host, on_device
 
-BACKENDS = ("auto", "jax", "warp", "hashgrid", "brute")
 _MOST_POINTS = 2**31 - 32
 
 
@@ -271,13 +270,6 @@ def checked_kind(dim: Any, dtype: Any) -> tuple[int, np.dtype]:  # noqa: ANN401
             'jax.config.update("jax_enable_x64", True) at start-up, or pass dtype=np.float32.'
         )
     return int(dim), np.dtype(dtype)
-
-
-def checked_backend(backend: Any) -> str:  # noqa: ANN401
-    """Return the name of a backend."""
-    if backend not in BACKENDS:
-        raise ValueError(f"backend must be one of {', '.join(map(repr, BACKENDS))}, got {backend!r}.")
-    return backend
 
 
 def _describe(value: Any) -> str:  # noqa: ANN401

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._engine import Filter, Inputs, Options, count_rows, list_rows, without_inactive
+from jfrnn._engine import ENGINES, Engine, Filter, Inputs, Options, count_rows, list_rows, without_inactive
 from jfrnn._geometry import (
     LARGEST_TURN,
     Batch,
@@ -566,18 +566,18 @@ def made_options(
     cutoff: "float | Radii | None",
     keep: Filter,
     box_kind: Images | None,
-    backend: str,
+    engine: Engine,
     dtype: np.dtype,
     closed: bool,
     skin: float,
 ) -> tuple[Cutoff | Radii, Options]:
     """Return the operand and the static options of a search with this radius, which holds the skin, or radii, which do not."""
     if isinstance(cutoff, Radii):
-        return cutoff, Options(keep, backend, closed, skin, images=box_kind)
+        return cutoff, Options(keep, engine, closed, skin, images=box_kind)
     if cutoff is None:
         raise TypeError("made_options() needs a radius or radii.")
-    radius = cutoff if backend == "hashgrid" else None
-    return make_cutoff(cutoff, dtype, closed), Options(keep, backend, closed, images=box_kind, radius=radius)
+    radius = cutoff if engine.static_radius else None
+    return make_cutoff(cutoff, dtype, closed), Options(keep, engine, closed, images=box_kind, radius=radius)
 
 
 def _inputs_of(
@@ -587,7 +587,7 @@ def _inputs_of(
     dtype = np.dtype(sources.dtype)
     keep = Filter(drop_self=not (nbrs.own_queries or nbrs.include_self), later_only=nbrs.half)
     reach = radii if nbrs.cutoff is None else list_radius(nbrs.cutoff, nbrs.skin, dtype)
-    cutoff, options = made_options(reach, keep, nbrs.box_kind, nbrs.backend, dtype, nbrs.closed, nbrs.skin)
+    cutoff, options = made_options(reach, keep, nbrs.box_kind, ENGINES[nbrs.backend], dtype, nbrs.closed, nbrs.skin)
     return Inputs(sources, queries, active, box, cutoff, nbrs.batch), options
 
 

@@ -7,11 +7,10 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._engine import Filter, Inputs, Options, choose_engine, count_rows
+from jfrnn._engine import Filter, Inputs, Kind, Options, checked_backend, choose_engine, count_rows
 from jfrnn._geometry import (
     Box,
     checked_active,
-    checked_backend,
     checked_batch,
     checked_box,
     checked_capacity,
@@ -149,7 +148,7 @@ def search(
         source_count=inputs.sources.shape[0],
         dim=inputs.sources.shape[1],
         dtype=np.dtype(inputs.sources.dtype),
-        backend=options.backend,
+        backend=options.engine.name,
     )
 
 
@@ -244,9 +243,8 @@ def checked_problem(
         reach = None if largest is None else list_radius(largest, skin, dtype)
     box = None if box is None else checked_box(box, sources)
     kind = None if box is None else images_of(box, reach, dtype, sources.shape[0])
-    engine = choose_engine(
-        checked_backend(backend), sources, queries, periodic=box is not None, radii=radii is not None, batch=batch is not None
-    )
+    kind_of_search = Kind(periodic=box is not None, radii=radii is not None, batch=batch is not None)
+    engine = choose_engine(checked_backend(backend), sources, queries, kind_of_search)
     systems = None if batch is None else checked_batch(batch, sources, queries)
     list_cutoff, options = made_options(radii or reach, keep, kind, engine, dtype, closed, skin)
     box = None if box is None else fixed_box(box, dtype)

@@ -21,15 +21,14 @@ from jfrnn._engine import (
     PLATFORMS,
     Inputs,
     Options,
+    Search,
     as_float,
     kernels_of,
     level_of_caller,
-    level_sums,
-    levels_of,
     pair_sums,
-    prepared,
+    prepare_search,
 )
-from jfrnn._geometry import Cutoffs, Radii, unpacked_turns
+from jfrnn._geometry import Radii, unpacked_turns
 from jfrnn._sums.scalars import NoTranslationError, hash_of
 from jfrnn._sums.terms import POSITIONS, Groups, Term, joined
 from jfrnn._sums.translate import input_name, output_name, translate
@@ -63,9 +62,9 @@ def refusal(inputs: Inputs, platform: str) -> str | None:
 
 def is_fused(inputs: Inputs, options: Options, term: Term) -> bool:
     """Say whether a sum is one for this engine: it was named, or it is "auto" and can do it."""
-    if options.backend not in ("warp", "auto"):
+    if not options.engine.translates:
         return False
-    return options.backend == "warp" or _why_not(term, *_kind(inputs)) is None
+    return not options.may_change or _why_not(term, *_kind(inputs)) is None
 
 
 def check(inputs: Inputs, options: Options, term: Term) -> None:
@@ -75,12 +74,12 @@ def check(inputs: Inputs, options: Options, term: Term) -> None:
         NoTranslationError: a primitive of the term, or of its derivative, has no translation.
         TypeError: a dtype cannot travel.
     """
-    if options.backend not in ("warp", "auto"):
+    if not options.engine.translates:
         return
     reason = _why_not(term, *_kind(inputs))
     if reason is None:
         return
-    if options.backend == "warp":
+    if not options.may_change:
         raise reason
     if isinstance(reason, NoTranslationError):
         warnings.warn(
@@ -154,7 +153,7 @@ def planned(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: bo
 def sums(inputs: Inputs, options: Options, term: Term, operands: Groups, compensated: bool) -> list[Array]:
     """Sum a term over all pairs of a search: see `jfrnn._sums.relations.sum_pairs`."""
     plan = planned(term, *_kind(inputs))
-    found, totals, _ = _launched(prepared(inputs, options), options, plan, operands, compensated)
+    found, totals, _ = _launched(prepare_search(inputs, options), options, plan, operands, compensated)
     return _unpacked(term, found, totals)
 
 
@@ -167,7 +166,7 @@ def extremes(
         For each summand, with its elements in one row: the largest [rows, elements]; of which source that is, int32, n where there
         is none; and in a box its lattice shift [rows, elements, d]. Of equal ones the smallest source, then any image.
     """
-    search = prepared(inputs, options)
+    search = prepare_search(inputs, options)
     values, _, which = _launched(search, options, planned(term, *_kind(inputs), not largest), operands, False, extremes=True)
     source, shifts = which[..., 0], None
     if search.torus is not None:
@@ -182,7 +181,7 @@ def extremes(
 
 
 def _launched(
-    search: Any,  # noqa: ANN401
+    search: Search,
     options: Options,
     plan: Plan,
     operands: Groups,
@@ -190,16 +189,15 @@ def _launched(
     extremes: bool = False,
 ) -> tuple[Array, Array, Array]:
     """Hand a prepared search and what a plan reads to the kernel."""
-    sources, queries, cutoff, batch, torus, _ = search
+    sources, torus = search.sources, search.torus
     if torus is not None:
         operands = joined(operands, Groups((), (torus[1].query_turns,), (torus[1].turns,)))
-    sizes = None, (sources if queries is None else queries).shape[0], sources.shape[0]
+    n, m = search.sizes
+    sizes = None, m, n
     columns = plan.shared, plan.own, plan.others
     shared, own, others = (_packed(*group, sources.dtype) for group in zip(operands, columns, sizes, strict=True))
-    given = options.filter, batch, torus, plan.text, plan.key, (shared, own, others), compensated, extremes
-    if isinstance(cutoff, Cutoffs):
-        return level_sums(sources, queries, cutoff, levels_of(sources, queries, cutoff, batch, torus), *given)
-    return pair_sums(sources, queries, cutoff, *given)
+    values = shared, own, others
+    return pair_sums(search, options.filter, plan.text, plan.key, values, compensated, extremes)
 
 
 def _packed(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) -> Array:

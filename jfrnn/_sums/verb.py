@@ -6,8 +6,8 @@ from typing import Any
 import jax
 from jax import Array
 
-from jfrnn._engine import Options, platform_of
-from jfrnn._geometry import Box, checked_backend, checked_flag
+from jfrnn._engine import ARRAYS, Options, checked_backend, platform_of
+from jfrnn._geometry import Box, checked_flag
 from jfrnn._search import NeighborList, Problem, checked_problem
 from jfrnn._tracing import on_device, own_transfers
 
@@ -147,17 +147,17 @@ def pair_sum(
 
 
 def _with_engine(problem: Problem, backend: str) -> Options:
-    """Return options with an engine that can answer: "auto" stays where it depends on the term, else becomes "jax"."""
+    """Return options with an engine that can answer; where "auto" was asked for, it may change with the term."""
     from jfrnn._sums.fused import refusal
 
     (sources, queries, *_), options = problem.inputs, problem.options
-    if options.backend != "warp":
+    if not options.engine.translates:
         return options
     platform = platform_of(sources, sources if queries is None else queries)
     reason = refusal(problem.inputs, platform)
-    if reason is not None and backend == "warp":
+    if reason is not None and backend != "auto":
         raise ValueError(f"backend='warp' cannot sum over pairs {reason}: pass backend='jax'.")
-    return options._replace(backend=backend if reason is None else "jax")
+    return options._replace(may_change=backend == "auto") if reason is None else options._replace(engine=ARRAYS)
 
 
 def _checked_values(name: str, values: Any, size: int, what: str) -> Any:  # noqa: ANN401

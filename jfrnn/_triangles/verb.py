@@ -123,7 +123,7 @@ def _chosen_engine(backend: Any, points: Array) -> str:  # noqa: ANN401
     if backend in ("warp", "bvh") and platform not in PLATFORMS:
         raise RuntimeError(f"backend={backend!r} finds triangles on the CPU and on CUDA, got {platform!r}: pass backend='jax'.")
     engine = choose_engine("warp" if backend == "bvh" else backend, points, None)  # a tree needs what "warp" needs
-    return fastest_of(platform, engine) if backend == "auto" else backend
+    return fastest_of(platform, engine.name) if backend == "auto" else backend
 
 
 def fastest_of(platform: str, engine: str) -> str:

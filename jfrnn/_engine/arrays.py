@@ -1,0 +1,196 @@
+"""Array programming: where the candidates of each query lie among sources that are sorted, and the engines made of it."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jfrnn._engine.problem import Kind, Options, Rows, Search, largest_radius
+from jfrnn._engine.runs import Candidates, Points, Torus, count_neighbors, list_neighbors
+from jfrnn._geometry import (
+    Axes,
+    Batch,
+    CellAxes,
+    Cutoff,
+    Cutoffs,
+    Lattice,
+    Levels,
+    Status,
+    Wrapped,
+    build_grid,
+    cell_edge,
+    cell_order,
+    fractions_of,
+    grid_coordinates,
+    level_runs,
+    open_axes,
+    sort_by_levels,
+    stencil_runs,
+    translation,
+    unpacked_turns,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class ArrayEngine:
+    """Cells, or all sources, met by array programming, wherever XLA runs.
+
+    Attributes:
+        name: "jax" or "brute".
+        by_cells: Candidates are the sources in the cells around a query, instead of all.
+    """
+
+    name: str
+    by_cells: bool
+    static_radius = False
+    translates = False
+
+    def refuse(self, kind: Kind) -> str | None:
+        """Refuse nothing."""
+        return None
+
+    def missing(self, platform: str) -> str | None:
+        """Lack nothing."""
+        return None
+
+    def rows(self, search: Search, options: Options, capacity: int | None) -> Rows:
+        """Find the candidates of every query, and keep those that are neighbors."""
+        candidates = find_candidates(search, self.by_cells)
+        if capacity is None:
+            return complete_rows(search, None, count_neighbors(candidates, search.cutoff, options.filter), None)
+        return complete_rows(search, *list_neighbors(candidates, search.cutoff, options.filter, capacity), capacity)
+
+    def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool) -> int | None:
+        """Leave it to the compiler."""
+        return None
+
+
+def complete_rows(search: Search, idx: Array | None, count: Array, capacity: int | None) -> Rows:
+    """Return rows with the longest of them, and bits for those that overflow and for positions that are not finite."""
+    required = jnp.max(count, initial=0)
+    finite = jnp.isfinite(search.sources).all() & (True if search.queries is None else jnp.isfinite(search.queries).all())
+    overflow = False if capacity is None else required > capacity
+    status = jnp.where(overflow, Status.ROW_OVERFLOW.value, 0) | jnp.where(finite, 0, Status.NONFINITE.value)
+    return Rows(idx, count, required, status.astype(jnp.int32))
+
+
+def find_candidates(search: Search, by_cells: bool) -> Candidates:
+    """Say where the candidates of a query lie, in particle order (brute force), by cells, or by cells of many sizes."""
+    sources, queries, cutoff, batch, given, _ = search
+    torus = None if given is None else _torus(sources, queries, *given)
+    clouds = (sources, queries) if given is None else (given[1].sources, None if queries is None else given[1].queries)
+    if not by_cells:
+        return _all_sources(*clouds, cutoff, batch, torus)
+    if isinstance(cutoff, Cutoff):
+        along, axes = _cells_along(sources, queries, cutoff, given)
+        return _cell_stencil(*clouds, along, axes.cells, batch, torus)
+    images, levels = None if torus is None else torus.images, levels_of(search)
+    points = _in_order(clouds[0], levels.order, cutoff.sources)
+    rows = _in_order(clouds[0] if clouds[1] is None else clouds[1], levels.query_order, cutoff.queries)
+    return Candidates(points, rows, level_runs(levels, cutoff, images), torus, levels.passes)
+
+
+def levels_of(search: Search) -> Levels:
+    """Sort a search with a cutoff per particle into cells of many sizes."""
+    cutoff = search.cutoffs
+    along, axes = _cells_along(search.sources, search.queries, cutoff, search.torus)
+    systems = None if search.batch is None else search.batch.of_all
+    return sort_by_levels(along, axes, cutoff, search.sources.shape[0], search.queries is None, systems)
+
+
+def _cells_along(
+    sources: Array, queries: Array | None, cutoff: Cutoff | Cutoffs, torus: tuple[Lattice, Wrapped] | None
+) -> tuple[Array, Axes]:
+    """Return the coordinates [d, n + m] that are cut into cells, those of the queries last, and how."""
+    if torus is not None:
+        return _cells_of_lattice(sources, queries, largest_radius(cutoff), *torus)
+    points = sources if queries is None else jnp.concatenate([sources, queries])
+    one = jnp.ones(points.shape[1], points.dtype)
+    return points.T, Axes(open_axes(cell_edge(largest_radius(cutoff)), points.shape[1]), one, 0 * one)
+
+
+def _torus(sources: Array, queries: Array | None, lattice: Lattice, wrapped: Wrapped) -> Torus:
+    raw = (sources, sources if queries is None else queries)
+    turns = tuple(unpacked_turns(x, lattice.dim).astype(sources.dtype) for x in (wrapped.turns, wrapped.query_turns))
+    shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)
+    return Torus(lattice.images, translation(shifts, lattice), lattice.given, raw, (turns[0], turns[1]), wrapped.slack)
+
+
+def _all_sources(
+    sources: Array, queries: Array | None, cutoff: Cutoff | Cutoffs, batch: Batch | None, torus: Torus | None
+) -> Candidates:
+    """Brute force: a run of all sources, or of those of the query's system, O(n·m), for each image."""
+    images = 1 if torus is None else torus.images.total
+    order = query_order = None
+    first = end = jnp.zeros((), jnp.int32)
+    if batch is not None:
+        order = jnp.argsort(batch.sources).astype(jnp.int32)
+        query_order = order if batch.queries is None else lax.iota(jnp.int32, batch.queries.size)
+        systems, wanted = batch.sources[order], batch.of_queries[query_order]
+        first, end = (jnp.searchsorted(systems, wanted, side=side).astype(jnp.int32) for side in ("left", "right"))
+
+    def runs(place: Array, _: Array) -> tuple[Array, Array, Array | None]:
+        start, stop = jnp.zeros((place.size, images), jnp.int32), jnp.int32(sources.shape[0])
+        if batch is not None:
+            start, stop = start + first[place][:, None], end[place][:, None]
+        codes = None if torus is None else jnp.zeros_like(start) + lax.iota(jnp.int32, images)[None]
+        return start, jnp.broadcast_to(stop, start.shape), codes
+
+    of_sources, of_queries = (cutoff.sources, cutoff.queries) if isinstance(cutoff, Cutoffs) else (None, None)
+    points = _in_order(sources, order, of_sources)
+    return Candidates(points, _in_order(sources if queries is None else queries, query_order, of_queries), runs, torus)
+
+
+def _cell_stencil(
+    sources: Array, queries: Array | None, along: Array, axes: CellAxes, batch: Batch | None, torus: Torus | None
+) -> Candidates:
+    """Cells: sources and queries sorted by cell; the runs of a query are the rows of cells around its own.
+
+    `along` [d, n + m] are the coordinates of the sources, then of the queries, that `axes` cuts into cells.
+    """
+    finite = jnp.isfinite(along).all(axis=0)
+    coords, extent = grid_coordinates(along, axes, finite, None if batch is None else batch.of_all)
+    n, total = sources.shape[0], along.shape[1]
+    grid = build_grid(coords[:, :n], finite[:n], extent, total)
+    if queries is None:
+        order = grid.order
+    else:
+        coords, finite = coords[:, n:], finite[n:]
+        order = cell_order(coords, finite, extent, grid.dense)
+    query_coords = coords[:, order]
+    images = None if torus is None else torus.images
+
+    def runs(place: Array, _: Array) -> tuple[Array, Array, Array | None]:
+        return stencil_runs(grid, query_coords.at[:, place].get(mode="promise_in_bounds"), len(along), images)
+
+    points = _in_order(sources, grid.order)
+    return Candidates(points, points if queries is None else _in_order(queries, order), runs, torus)
+
+
+def _cells_of_lattice(
+    sources: Array, queries: Array | None, radius: np.floating | Array, lattice: Lattice, wrapped: Wrapped
+) -> tuple[Array, Axes]:
+    """Cut a lattice cell along its vectors; what is open, and not skewed, is cut as it is without a box."""
+    points, packed = sources, wrapped.turns
+    if queries is not None:
+        points = jnp.concatenate([sources, queries])
+        packed = jnp.concatenate([packed, wrapped.query_turns])
+    units, turns = fractions_of(points, lattice), unpacked_turns(packed, lattice.dim).astype(points.dtype)
+    along, edges, cells, scales, margins = [], [], [], [], []
+    for k, periodic in enumerate(lattice.images.periodic):
+        straight = lattice.images.orthogonal and not periodic
+        x = points[:, k] if straight else jnp.clip(units[:, k] - turns[:, k], 0, 1) if periodic else units[:, k]
+        along.append(jnp.where(packed >= 0, x, jnp.nan))
+        edges.append(cell_edge(radius if straight else wrapped.reach[k]))
+        cells.append(jnp.clip(jnp.floor(1 / wrapped.reach[k]), 1, 2.0**23) if periodic else None)
+        scales.append(jnp.ones_like(wrapped.reach[k]) if straight else (wrapped.reach[k] - wrapped.margin[k]) / radius)
+        margins.append(0 * wrapped.margin[k] if straight else wrapped.margin[k])
+    scale = jnp.stack(scales) * (1 + 8 * jnp.finfo(points.dtype).eps)
+    return jnp.stack(along), Axes(CellAxes(edges, cells), scale, jnp.stack(margins))
+
+
+def _in_order(positions: Array, order: Array | None, radii: Array | None = None) -> Points:
+    if order is None:
+        return Points(list(positions.T), lax.iota(jnp.int32, positions.shape[0]), radii)
+    return Points([x[order] for x in positions.T], order, None if radii is None else radii[order])

@@ -1,0 +1,71 @@
+"""What all kernels of Warp are given: rows of particles, and the numbers of a cutoff and of a lattice."""
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jfrnn._engine.problem import Search, largest_radius
+from jfrnn._geometry import Lattice, Wrapped
+
+MOST_IN_BOX = 1 << 27  # positions: an id shares its bits with the code of an image
+
+
+def periodic_kind(torus: tuple[Lattice, Wrapped] | None) -> int:
+    """Return the PERIODIC of `jfrnn.kernels._native.snippet`."""
+    if torus is None:
+        return 0
+    images = torus[0].images
+    return (1 if images.nearest else 2) + (0 if images.orthogonal else 2)
+
+
+def space_flags(periodic: int) -> dict[str, bool]:
+    return {"nearest": periodic in (1, 3), "images": periodic in (2, 4), "skewed": periodic > 2}
+
+
+def particle_rows(points: Array, turns: Array | None, systems: Array | None) -> Array:
+    """Return rows of positions as the kernels read them: coordinates, packed turns, the number of the system."""
+    columns, dim = [as_float(x, points.dtype) for x in (turns, systems) if x is not None], points.shape[1]
+    rows = jnp.pad(points, ((0, 0), (0, len(columns))))
+    for k, column in enumerate(columns):  # on a GPU, XLA takes twice as long to concatenate them
+        rows = jnp.where(np.arange(rows.shape[1]) == dim + k, column[:, None], rows)
+    return rows
+
+
+def as_float(x: Array, dtype: np.dtype) -> Array:
+    """Let values travel among floats: integers of the same width as their bits, what is smaller as a value."""
+    if x.dtype == dtype:
+        return x
+    same_width = jnp.issubdtype(x.dtype, jnp.integer) and x.dtype.itemsize == dtype.itemsize
+    return lax.bitcast_convert_type(x, dtype) if same_width else x.astype(dtype)
+
+
+def as_integer(x: Array) -> Array:
+    """Return int32 that traveled among floats."""
+    return lax.bitcast_convert_type(x, jnp.int32) if x.dtype == jnp.float32 else x.astype(jnp.int32)
+
+
+def lattice_numbers(lattice: Lattice, wrapped: Wrapped) -> Array:
+    """Return what the kernels know of a lattice, in the order that `jfrnn.kernels._native` states."""
+    more = 3 - lattice.dim
+    square, line = ((0, more), (0, more)), (0, more)
+    images = jnp.asarray(lattice.images.reach).astype(lattice.matrix.dtype)
+    parts = [jnp.pad(lattice.matrix, square), jnp.pad(lattice.transform, square), jnp.pad(lattice.origin, line)]
+    parts += [jnp.pad(wrapped.reach, line, constant_values=1), jnp.pad(images, line), wrapped.slack]
+    if not lattice.images.orthogonal:
+        parts += [jnp.pad(lattice.given, square), jnp.pad(lattice.images.numbers.astype(images.dtype), square)]
+    return jnp.concatenate([part.reshape(-1) for part in parts])
+
+
+def pack_particles(search: Search) -> tuple[Array, Array, Array]:
+    """Return rows of positions, those of the queries, and the numbers that all share, as the kernels of cells read them."""
+    sources, queries, cutoff, batch, torus, _ = search
+    numbers = [jnp.reshape(jnp.asarray(largest_radius(cutoff)), 1)]
+    turns = query_turns = None
+    if torus is not None:
+        turns, query_turns = torus[1].turns, torus[1].query_turns
+        numbers.append(lattice_numbers(*torus))
+    if batch is not None:
+        numbers.append(as_float(jnp.max(batch.of_all)[None], sources.dtype))
+    sources = particle_rows(sources, turns, None if batch is None else batch.sources)
+    rows = sources if queries is None else particle_rows(queries, query_turns, None if batch is None else batch.queries)
+    return sources, rows, jnp.concatenate(numbers)

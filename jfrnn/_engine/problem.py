@@ -1,0 +1,199 @@
+"""What a search is asked, and what an engine has to answer: one problem, one protocol."""
+
+import functools
+from typing import NamedTuple, Protocol
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jfrnn._geometry import (
+    TOO_FAR,
+    Batch,
+    Box,
+    Cutoff,
+    Cutoffs,
+    Images,
+    Lattice,
+    Radii,
+    Status,
+    Wrapped,
+    is_radius,
+    is_valid,
+    make_cutoffs,
+    make_lattice,
+    ranked,
+    wrap,
+)
+from jfrnn._tracing import compiled
+
+
+class Filter(NamedTuple):
+    """Which candidates may be neighbors apart from their distance; static."""
+
+    drop_self: bool
+    later_only: bool
+
+
+class Rows(NamedTuple):
+    """Neighbors of m queries: [m, capacity] int32 source indices, unused slots n (None: only counted), and [m] int32 true counts.
+
+    `required` [] int32 is the longest row, `status` [] int32 the bits of `Status`.
+    """
+
+    idx: Array | None
+    counts: Array
+    required: Array
+    status: Array
+
+
+class Search(NamedTuple):
+    """The operands of a search as engines take them: not finite where a particle takes no part."""
+
+    sources: Array
+    queries: Array | None
+    cutoff: Cutoff | Cutoffs
+    batch: Batch | None
+    torus: tuple[Lattice, Wrapped] | None
+    checks: dict[Status, Array]
+
+    @property
+    def cutoffs(self) -> Cutoffs:
+        """Cutoffs of the particles, of a search with one for each."""
+        if not isinstance(self.cutoff, Cutoffs):
+            raise TypeError("this search has one cutoff for all particles.")
+        return self.cutoff
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Number of sources, and of queries."""
+        return self.sources.shape[0], (self.sources if self.queries is None else self.queries).shape[0]
+
+
+class Kind(NamedTuple):
+    """What an engine is asked for, as far as it matters to whether it can answer."""
+
+    periodic: bool = False
+    batch: bool = False
+    radii: bool = False
+
+
+ANYTHING = Kind()  # what every engine can answer
+
+
+class Engine(Protocol):
+    """A way to find the pairs of a search. All engines find the same ones.
+
+    Attributes:
+        name: What users call it.
+        static_radius: It has to know the cutoff while tracing.
+        translates: It can sum a function over pairs that it translates to native text.
+        by_cells: Where array programming takes its place, candidates are found by cells; else they are all sources.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def static_radius(self) -> bool: ...
+    @property
+    def translates(self) -> bool: ...
+    @property
+    def by_cells(self) -> bool: ...
+
+    def refuse(self, kind: Kind) -> str | None:
+        """Say why it cannot answer what is asked for; None: it can."""
+        ...
+
+    def missing(self, platform: str) -> str | None:
+        """Say what it lacks to run on a JAX platform; None: nothing."""
+        ...
+
+    def rows(self, search: Search, options: "Options", capacity: int | None) -> Rows:
+        """List the neighbors of every query, or only count them (capacity=None). There are sources and queries."""
+        ...
+
+    def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool) -> int | None:
+        """Return what n sources and m queries take beside the list [B]; None: the compiler of the program knows."""
+        ...
+
+
+class Options(NamedTuple):
+    """What is static about a search, apart from its capacity."""
+
+    filter: Filter
+    engine: Engine
+    closed: bool
+    skin: float = 0.0  # that cutoffs of particles grow by; one cutoff for all holds it already
+    images: Images | None = None  # of a box
+    radius: float | None = None  # of the cutoff, for an engine that has to know it while tracing
+    may_change: bool = False  # of sums: the array engine takes what this one cannot translate
+
+
+class Inputs(NamedTuple):
+    """The operands of a search; a pytree."""
+
+    sources: Array
+    queries: Array | None
+    active: Array | None
+    box: Box | None
+    cutoff: Cutoff | Radii  # of the list: one for all, with the skin; of each particle, without
+    batch: Batch | None = None
+
+
+def without_inactive(positions: Array, active: Array | None) -> Array:
+    """Return positions that are infinite where a particle is inactive: no engine gives such a one neighbors, or to others.
+
+    The mark is not NaN, because JAX's mode `jax_debug_nans` takes every NaN that leaves a program for an error.
+    """
+    return positions if active is None else jnp.where(active[:, None], positions, jnp.inf)
+
+
+def prepare_search(inputs: Inputs, options: Options) -> Search:
+    """Prepare a search. No gradient flows through."""
+    given, queries, active, box, cutoff, batch = lax.stop_gradient(inputs)
+    sources, images = without_inactive(given, active), options.images
+    batch = None if batch is None else ranked(batch)
+    checks: dict[Status, Array] = {}
+    if isinstance(cutoff, Radii):
+        sources, queries, checks = _with_valid_radii(sources, queries, active, cutoff)
+        cutoff = make_cutoffs(cutoff, options.closed, options.skin)
+    if box is None or images is None:
+        return Search(sources, queries, cutoff, batch, None, checks)
+    lattice = make_lattice(box, images, np.dtype(sources.dtype))
+    wrapped = wrap(sources, queries, lattice, largest_radius(cutoff))
+    checks[Status.BOX_TOO_SMALL] = wrapped.enough & is_valid(lattice)
+    checks[Status.OUT_OF_RANGE] = (wrapped.met & TOO_FAR) == 0
+    return Search(sources, queries, cutoff, batch, (lattice, wrapped), checks)
+
+
+@functools.partial(compiled, static_argnames="options")
+def is_decidable(inputs: Inputs, options: Options) -> Array:
+    """Say whether a search can answer for all particles that take part: cutoffs, box and positions are in range; [] bool."""
+    return functools.reduce(jnp.logical_and, prepare_search(inputs, options).checks.values(), jnp.ones((), bool))
+
+
+def _with_valid_radii(
+    sources: Array, queries: Array | None, active: Array | None, radii: Radii
+) -> tuple[Array, Array | None, dict[Status, Array]]:
+    """Return positions and queries, infinite where the cutoff is none, and whether all those of particles that take part are."""
+    of_sources, of_queries = (None if x is None else is_radius(x) for x in (radii.sources, radii.queries))
+    right = [jnp.ones((), bool)]
+    if queries is None:
+        valid = next(x for x in (of_sources, of_queries) if x is not None)
+        return _where_rows(valid, sources), None, {Status.INVALID_CUTOFF: (valid if active is None else valid | ~active).all()}
+    if of_sources is not None:
+        right.append((of_sources if active is None else of_sources | ~active).all())
+        sources = _where_rows(of_sources, sources)
+    if of_queries is not None:
+        right.append(of_queries.all())
+        queries = _where_rows(of_queries, queries)
+    return sources, queries, {Status.INVALID_CUTOFF: functools.reduce(jnp.logical_and, right)}
+
+
+def _where_rows(valid: Array, points: Array) -> Array:
+    return jnp.where(valid[:, None], points, jnp.inf)
+
+
+def largest_radius(cutoff: Cutoff | Cutoffs) -> np.floating | Array:
+    """Return the cutoff that no pair exceeds."""
+    return cutoff.largest if isinstance(cutoff, Cutoffs) else cutoff.radius

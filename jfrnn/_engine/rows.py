@@ -1,0 +1,85 @@
+"""The compiled programs of a search: its operands prepared, an engine asked, the status completed."""
+
+import functools
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from jfrnn._engine.arrays import complete_rows, find_candidates
+from jfrnn._engine.problem import Inputs, Options, Rows, Search, prepare_search
+from jfrnn._engine.runs import State, Visit, fold_neighbors
+from jfrnn._geometry import NOT_FINITE, Cutoff, Status
+from jfrnn._tracing import compiled
+
+
+class Found(NamedTuple):
+    """What a search finds: the rows, and of which images of the sources they tell.
+
+    `images` [m, capacity] codes and `turns`, packed, [n] and [m] int32 (or None), stand only where images must be told apart.
+    """
+
+    rows: Rows
+    images: Array | None
+    turns: tuple[Array, Array | None] | None
+
+
+@functools.partial(compiled, static_argnames=("options", "capacity"))
+def list_rows(inputs: Inputs, options: Options, capacity: int) -> Found:
+    """List the neighbors of every query: the compiled program of `search`."""
+    return _find(inputs, options, capacity)
+
+
+@functools.partial(compiled, static_argnames="options")
+def count_rows(inputs: Inputs, options: Options) -> tuple[Array, Array]:
+    """Count the neighbors of every query, [m] int32, and return the largest number with them: the compiled program of `count`."""
+    rows = _find(inputs, options, None).rows
+    return rows.counts, rows.required
+
+
+def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
+    """List the neighbors of every query, or only count them (capacity=None). Integers: no gradient flows through."""
+    given, given_queries, active = lax.stop_gradient(inputs[:3])
+    search = prepare_search(inputs, options)
+    sources, queries, cutoff, _, torus, checks = search
+    rows = _empty_rows(search, options, capacity) if 0 in search.sizes else options.engine.rows(search, options, capacity)
+    if torus is not None and active is None and isinstance(cutoff, Cutoff):  # else positions are not finite for other reasons, too
+        checks = checks | {Status.NONFINITE: (torus[1].met & NOT_FINITE) == 0}
+    rows = _with_status(rows, given, given_queries, active, checks)
+    images = options.images
+    if rows.idx is None or torus is None or images is None or images.nearest:
+        return Found(rows, None, None)
+    n = max(sources.shape[0], 1)
+    codes = (rows.idx // n).astype(images.dtype)
+    idx = jnp.where(rows.idx == n * images.total, sources.shape[0], rows.idx % n)
+    _, wrapped = torus
+    return Found(rows._replace(idx=idx), codes, (wrapped.turns, None if queries is None else wrapped.query_turns))
+
+
+def fold_pairs(inputs: Inputs, options: Options, elements: int, visit: Visit[State], out: State) -> State:
+    """Walk over all pairs of a search, of which none is stored: see `fold_neighbors`. By array programming, whatever the engine."""
+    search = prepare_search(inputs, options)
+    if 0 in search.sizes:
+        return out
+    return fold_neighbors(find_candidates(search, options.engine.by_cells), search.cutoff, options.filter, elements, visit, out)
+
+
+def _with_status(rows: Rows, sources: Array, queries: Array | None, active: Array | None, checks: dict[Status, Array]) -> Rows:
+    """Set the bits of what the engine cannot know: positions are not finite where particles are inactive or out of range."""
+    if active is None and not checks:
+        return rows
+    if Status.NONFINITE not in checks:
+        finite = (jnp.isfinite(sources).all(axis=1) | (False if active is None else ~active)).all()
+        checks = checks | {Status.NONFINITE: finite & (True if queries is None else jnp.isfinite(queries).all())}
+    status = rows.status & ~Status.NONFINITE.value
+    for bit, right in checks.items():
+        status = status | jnp.where(right, 0, bit.value).astype(jnp.int32)
+    return rows._replace(status=status)
+
+
+def _empty_rows(search: Search, options: Options, capacity: int | None) -> Rows:
+    """Return rows without neighbors, of no queries or no sources."""
+    n, m = search.sizes
+    fill = n if options.images is None or options.images.nearest else max(n, 1) * options.images.total
+    idx = None if capacity is None else jnp.full((m, capacity), fill, jnp.int32)
+    return complete_rows(search, idx, jnp.zeros(m, jnp.int32), capacity)

@@ -1,0 +1,47 @@
+"""The arrays that a kernel writes sums to, and the sums in them."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from jfrnn._engine.operands import as_integer
+from jfrnn._geometry import compensated_sum, rounded_sum
+
+
+class SumsOf(NamedTuple):
+    """The results of a kernel that sums a term: for each of `rows` queries, and over all pairs in `slots` parts."""
+
+    term: Any
+    rows: int
+    slots: int
+    compensated: bool
+    extremes: bool
+
+    def dims(self) -> dict[str, Any]:
+        """Return the shapes of the arrays that the kernel writes."""
+        return {
+            "sums": (self.rows, max(self._width, 1)),
+            "totals": max(2 * self.slots * self._totals, 1),
+            "errors": max(self.rows * self._width * (2 * self.extremes + self.compensated), 1),
+        }
+
+    def unpacked(self, sums: Array, parts: Array, rest: Array) -> tuple[Array, Array, Array]:
+        """Return what `pair_sums` returns: parts of sums over all pairs are added, with what rounding took of them."""
+        width, totals = self._width, self._totals
+        which = as_integer(rest).reshape(self.rows, width, 2) if self.extremes else jnp.zeros((self.rows, width, 0), jnp.int32)
+        return sums, _added(parts[: 2 * self.slots * totals].reshape(self.slots, 2, totals)), which
+
+    @property
+    def _totals(self) -> int:
+        return sum(part.total for part in self.term.sums)
+
+    @property
+    def _width(self) -> int:
+        return len(self.term.sums) - self._totals
+
+
+def _added(parts: Array) -> Array:
+    """Add parts [slots, 2, width], sums and their errors, in twice the precision."""
+    zero = jnp.zeros((), parts.dtype)
+    return rounded_sum(*lax.reduce((parts[:, 0], parts[:, 1]), (zero, zero), compensated_sum, (0,)))
