@@ -220,3 +220,13 @@ def test_memory_maps_are_given_back():
     before, between, after = map(int, printed.split())
     assert between > before + 60
     assert after <= before + 20
+
+
+@pytest.mark.parametrize(("box", "most"), [(None, 30), (BOX, 40)], ids=["open", "box"])
+def test_vectors_are_few_kernels(box, most):
+    """Kernels are what XLA's CPU compiler spends its time on, about 20 ms each."""
+    x = scene(39)
+    nbrs = jfrnn.search(x, 0.6, box=box)
+    text = jax.jit(lambda x: nbrs.vectors(x)).lower(x).compile().as_text()
+    assert text is not None
+    assert text.count(" fusion(") <= most

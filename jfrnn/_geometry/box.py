@@ -526,15 +526,18 @@ def _wrapping_error(most: Array, lattice: Lattice) -> Array:
     return u * jnp.max(2 * wrapping + moving, initial=0)
 
 
-def shifted_pairs(difference: Array, shifts: Array, points: Sequence[Array], lattice: Lattice) -> Shifted:
-    """Return x_j - x_i + S·A for differences [m, k, d] of these points, differentiable, and what their exact test needs."""
-    finite = [lax.stop_gradient(jnp.where(jnp.isfinite(x), jnp.abs(x), 0)) for x in points]
-    size = functools.reduce(jnp.maximum, (jnp.max(x, axis=0, initial=0) for x in finite))
-    spans = jnp.max(jnp.abs(shifts), initial=0) + 1
-    fixed = lax.stop_gradient(lattice)
-    vectors = difference + translation(shifts, lattice)
-    moved = jnp.abs(fixed.matrix).sum(axis=0)  # 0 for components that no lattice vector has: nothing is added to them
-    slack = 8 * jnp.finfo(moved.dtype).eps * jnp.max(size + spans * moved, initial=0, where=moved > 0)
+def shifted_pairs(difference: Array, shifts: Array, lattice: Lattice) -> Shifted:
+    """Return x_j - x_i + S·A for differences [m, k, d], differentiable, and what their exact test needs.
+
+    In units of u = eps/2, a component is off by at most u|x_j - x_i|, (2d + 1) u|S·A| and u of their sum; 8 eps covers that.
+    """
+    vectors, fixed = difference + translation(shifts, lattice), lax.stop_gradient(lattice)
+    sizes = lax.stop_gradient(jnp.where(jnp.isfinite(difference), jnp.abs(difference), 0))
+    spans = functools.reduce(jnp.maximum, (jnp.abs(shifts[..., k]) for k in range(lattice.dim))) + 1
+    rows = [jnp.abs(fixed.matrix[k]) for k in range(lattice.dim)]
+    moved = functools.reduce(jnp.add, rows)  # 0 for components that no lattice vector has: nothing is added to them
+    parts = [jnp.where(moved[k] > 0, sizes[..., k] + spans * moved[k], 0) for k in range(lattice.dim)]
+    slack = 8 * jnp.finfo(moved.dtype).eps * functools.reduce(jnp.maximum, parts)
     return Shifted(vectors, shifts, slack, fixed.given, lattice.images.orthogonal, lattice.images.basis)
 
 

@@ -10,7 +10,7 @@ Three steps, each exact where it answers and each asked only what the one before
 2. `_sum_sign`: error-free transformations (Dekker 1971; Ogita, Rump & Oishi 2005, doi:10.1137/030601818). Factors are split
    by integer operations into halves of at most half the mantissa, so that every product is exact and a fused multiply-add
    gives the same float as a product and a sum.
-3. `_integer_sign`: fixed-point integers as wide as the float format (limbs of 11 bits in int32). No rounding exists there;
+3. `_integer_sign`: fixed-point integers as wide as the float format (`jfrnn._geometry.integers`). No rounding exists there;
    it answers for coordinates whose exponents lie so far apart that step 2 would underflow or need more terms.
 """
 
@@ -24,8 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._geometry.integers import beside, carried_limbs, full_count, limb_product, limb_sign, limb_type, limbs_of
 from jfrnn._geometry.reduced import Basis
-from jfrnn._tracing import leading_axes, set_places
+from jfrnn._tracing import any_of_rows, first_set
 
 
 class Pair(NamedTuple):
@@ -83,8 +84,6 @@ def combined(basis: Basis, matrix: Array) -> Array:
 
 PointsAt = Callable[[Array | None], Pair]
 
-LIMB_BITS = 11
-_LIMB_MASK = (1 << LIMB_BITS) - 1
 _UNKNOWN = 2  # a sign that step 2 could not prove
 _INTEGER_CHUNK = 64  # pairs that one round of the integer test decides
 
@@ -257,8 +256,13 @@ def squared_distance(difference: list[Array], cutoff: "Cutoff | Cutoffs") -> Arr
     return total
 
 
-def is_pair_of(rows: Array, sources: Array, neighbor: Array, cutoff: "Cutoff | Cutoffs", shifted: "Shifted | None" = None) -> Array:
-    """Decide exactly, for rows [m, d], sources [n, d] and source indices [m, k], which pairs there are: [m, k] bool."""
+def is_pair_of(
+    rows: Array, sources: Array, neighbor: Array, asked: Array, cutoff: "Cutoff | Cutoffs", shifted: "Shifted | None" = None
+) -> Array:
+    """Decide exactly, for rows [m, d], sources [n, d] and source indices [m, k], which pairs there are: [m, k] bool.
+
+    False where not `asked`, [m, k] bool.
+    """
     axes = range(sources.shape[1])
     if shifted is None:
         difference = [sources[neighbor, axis] - rows[:, axis, None] for axis in axes]
@@ -281,10 +285,11 @@ def is_pair_of(rows: Array, sources: Array, neighbor: Array, cutoff: "Cutoff | C
 
     def points(at: Array | None) -> Pair:
         source = neighbor if at is None else flat_take(neighbor, at)
+        others = list(jnp.moveaxis(sources[source], -1, 0))
         if at is None:
-            own, others = [of_rows(rows[:, axis], at) for axis in axes], [sources[source, axis] for axis in axes]
+            own = [of_rows(rows[:, axis], at) for axis in axes]
         else:
-            own, others = list(rows.at[at // neighbor.shape[1]].get(mode="clip").T), list(sources[source].T)
+            own = list(rows.at[at // neighbor.shape[1]].get(mode="clip").T)
         pair = Pair(own, others, radii_of(at, source))
         if shifted is None:
             return pair
@@ -293,8 +298,13 @@ def is_pair_of(rows: Array, sources: Array, neighbor: Array, cutoff: "Cutoff | C
         shift, matrix = shift_in_given(shift, shifted.basis, shifted.matrix)
         return pair._replace(shift=shift, matrix=matrix, orthogonal=shifted.orthogonal)
 
-    surely = square < inside
-    return surely | refine((square <= outside) & ~surely, points, cutoff)
+    no, yes, open_pair = np.arange(3, dtype=np.int8)
+    step_one = jnp.where(asked & (square <= outside), jnp.where(square < inside, yes, open_pair), no)  # one array: one kernel
+
+    def refined(step_one: Array) -> Array:
+        return (step_one == yes) | _refine_some(step_one == open_pair, points, cutoff)
+
+    return lax.cond(jnp.max(step_one, initial=no) == open_pair, refined, lambda step_one: step_one == yes, step_one)
 
 
 def step_one_bounds(
@@ -336,19 +346,30 @@ def refine(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array
 
 def _refine_some(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
     pairs = points(None)
-    signs = jnp.where(doubtful, _sum_sign(pairs, _threshold(pairs, cutoff)), 1).reshape(-1)
+    signs = jnp.where(doubtful, _sum_sign(pairs, _threshold(pairs, cutoff)), 1).astype(jnp.int8)
+    decide = functools.partial(_decide_unknown, points=points, cutoff=cutoff)
+    # a branch, as what is computed for it is computed once: XLA would compile step 2 for each use of its signs
+    signs = lax.cond(jnp.max(signs) == _UNKNOWN, decide, lambda signs: signs, signs)
+    return signs <= 0 if cutoff.closed else signs < 0
+
+
+def _decide_unknown(signs: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
+    """Put integers' signs in place of unknown ones, int8, a chunk of pairs at a time."""
+    shape, signs = signs.shape, signs.reshape(-1)
     chunk = min(_INTEGER_CHUNK, signs.size)
+    chunks = -(-signs.size // chunk)
+    unknown = any_of_rows(jnp.pad(signs == _UNKNOWN, (0, chunks * chunk - signs.size)).reshape(chunks, chunk))
 
-    def decide_at(signs: Array, at: Array) -> Array:
-        pairs = points(at)
-        return signs.at[at].set(_integer_sign(pairs, _threshold(pairs, cutoff)), mode="drop")
+    def decide_chunk(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        signs, which = state
+        first = jnp.minimum(which * chunk, signs.size - chunk)  # the last chunk reaches back, to be as long as the others
+        here = points(first + lax.iota(jnp.int32, chunk))
+        known = lax.dynamic_slice_in_dim(signs, first, chunk)
+        known = jnp.where(known == _UNKNOWN, _integer_sign(here, _threshold(here, cutoff)).astype(jnp.int8), known)
+        return lax.dynamic_update_slice_in_dim(signs, known, first, axis=0), first_set(unknown, which)
 
-    def decide_chunk(signs: Array) -> Array:
-        at = set_places(signs == _UNKNOWN, chunk)  # there is one: the branch is a wall, or XLA finds `at` anew for each use of it
-        return lax.cond(at[0] < signs.size, decide_at, lambda signs, _: signs, signs, at)
-
-    signs = lax.while_loop(lambda signs: jnp.any(signs == _UNKNOWN), decide_chunk, signs)
-    return (signs <= 0 if cutoff.closed else signs < 0).reshape(doubtful.shape)
+    start = signs, first_set(unknown, jnp.int32(-1))
+    return lax.while_loop(lambda state: state[1] < chunks, decide_chunk, start)[0].reshape(shape)
 
 
 class _Threshold(NamedTuple):
@@ -491,108 +512,33 @@ def _is_plain(x: Array, least: Array) -> Array:
 def _integer_sign(pair: Pair, threshold: _Threshold) -> Array:
     """Return the sign of |b - a|² - r² for [k] pairs of finite points, in integer arithmetic throughout.
 
-    A coordinate fills at most 6 limbs of 11 bits, a difference at most 12, each below 2^12 in magnitude; a limb of the sum of
-    squares collects at most 3·12 products below 2^24 and stays below 2^31. With a lattice, limbs of a difference are below 2^30
-    (shifts are below 2^16, doubled or not); carried into [-2^10, 2^10), all of them may be filled, 193 at most: 4·193·2^20 < 2^31.
-    So are two radii, added up, and twice the differences that are compared with them.
+    Limbs of a difference are below 2^12 (float64: 2^27), with a lattice below 2^30 (2^46: shifts are below 2^16, doubled or not).
+    So are two radii, added up, and twice the differences that are compared with them. A limb of the sum of squares is the sum of
+    4·29 (4·84) products of what `carried_limbs` returns, below 2^30 (2^61).
     """
-    dim, times = len(pair.a), threshold.times
-    columns = jnp.stack([*pair.a, *pair.b, *(jnp.broadcast_to(radius, pair.a[0].shape) for radius in threshold.radii)])
-    numbers = columns.reshape(-1) if pair.matrix is None else jnp.concatenate([columns.reshape(-1), pair.matrix.reshape(-1)])
-    limbs = _limbs(numbers)  # of all at once: what is written here is compiled wherever a pair is decided
-    of_pairs, of_lattice = limbs[: columns.size].reshape(*columns.shape, -1), limbs[columns.size :]
-    squared = times * (of_pairs[dim : 2 * dim] - of_pairs[:dim])
-    if pair.shift is not None:
-        squared = squared + _translation_limbs(times * jnp.stack(pair.shift).astype(jnp.int32), of_lattice, dim, pair.orthogonal)
-    squared = jnp.concatenate([squared, of_pairs[2 * dim :].sum(axis=0, keepdims=True, dtype=jnp.int32)])  # [d + 1, k, count]
-    if pair.shift is not None or times > 1:
-        squared = _carried(jnp.pad(squared, ((0, 0), (0, 0), (0, 3))))
-    signs, count = np.array([1] * dim + [-1], np.int32)[:, None, None], squared.shape[-1]
-
-    def add_shifted(i: Array, total: Array) -> Array:
-        squares = jnp.sum(signs * limb_of(squared, i) * squared, axis=0, dtype=jnp.int32)
-        window = lax.dynamic_slice_in_dim(total, i, count, axis=1)
-        return lax.dynamic_update_slice_in_dim(total, window + squares, i, axis=1)
-
-    total = jnp.zeros((squared.shape[1], 2 * count), jnp.int32)
-    return sign_of_limbs(lax.fori_loop(0, count, add_shifted, total))
+    dim, radii, dtype = len(pair.a), threshold.radii, np.dtype(pair.a[0].dtype)
+    count, whole = full_count(dtype) + 3, limb_type(dtype)  # with room for carries and the sign
+    ends = radii[0], -radii[1] if len(radii) == 2 else jnp.zeros((), dtype)
+    limbs = limbs_of(beside([*pair.b, ends[0], *pair.a, ends[1]]), count)  # [k, 2 (d + 1), ...]
+    times = np.array([threshold.times] * dim + [1], whole)[None, :, None]
+    squared = (limbs[:, : dim + 1] - limbs[:, dim + 1 :]) * times
+    if pair.shift is not None and pair.matrix is not None:
+        shift = beside(pair.shift).astype(whole)
+        squared = squared + _translation_limbs(shift, pair.matrix, count, pair.orthogonal) * times
+    squared = carried_limbs(squared)
+    signs = np.array([1] * dim + [-1], whole)[None, :, None]
+    return limb_sign(jnp.sum(limb_product(squared * signs, squared), axis=1, dtype=whole))
 
 
-def _translation_limbs(shift: Array, limbs: Array, dim: int, orthogonal: bool) -> Array:
-    """Return shifts [t, k] times lattice vectors, of which limbs [t·d, count] are given, added up: [d, k, count]."""
-    vectors = limbs.reshape(-1, dim, 1, limbs.shape[-1])
+def _translation_limbs(shift: Array, vectors: Array, count: int, orthogonal: bool) -> Array:
+    """Return shifts [k, t] times lattice vectors [t, d], added up: limbs [k, d + 1, ...], the last ones 0."""
+    dim = vectors.shape[1]
+    limbs, shift = limbs_of(jnp.pad(vectors, ((0, 0), (0, 1))), count), shift[..., None]  # [t, d + 1, ...]
     if orthogonal:
-        return shift[:dim, :, None] * jnp.stack([vectors[axis, axis] for axis in range(dim)])
-    return jnp.sum(shift[:, None, :, None] * vectors, axis=0, dtype=jnp.int32)
-
-
-def _carried(limbs: Array) -> Array:
-    """Bring limbs [..., count] into [-2^10, 2^10), the number that they write staying the same."""
-
-    def carry_on(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        limbs, carry = state
-        value = limb_of(limbs, i) + carry
-        carry = (value + (1 << (LIMB_BITS - 1))) >> LIMB_BITS
-        return lax.dynamic_update_slice_in_dim(limbs, value - (carry << LIMB_BITS), i, axis=-1), carry
-
-    return lax.fori_loop(0, limbs.shape[-1], carry_on, (limbs, jnp.zeros_like(limbs[..., :1])))[0]
-
-
-def limb_of(x: Array, i: Array) -> Array:
-    return lax.dynamic_slice_in_dim(x, i, 1, axis=-1)
-
-
-def sign_of_limbs(total: Array) -> Array:
-    """Carry upwards with floor division: the last carry holds the sign, the remainders tell zero from positive."""
-
-    def carry_on(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        carry, seen = state
-        value = limb_of(total, i)[:, 0] + carry
-        return value >> LIMB_BITS, seen | (value & _LIMB_MASK)
-
-    zero = jnp.zeros(total.shape[0], jnp.int32)
-    carry, seen = lax.fori_loop(0, total.shape[1], carry_on, (zero, zero))
-    return jnp.where(carry < 0, -1, ((seen != 0) | (carry != 0)).astype(jnp.int32))
-
-
-def _limbs(x: Array) -> Array:
-    """Write finite floats [...] as signed int32 limbs [..., count], in units of the smallest denormal, lowest limb first."""
-    finfo = jnp.finfo(x.dtype)
-    sign, exponent, high, low = fields_of(x)
-    place = jnp.maximum(exponent, 1) - 1
-    width = finfo.nmant + 1
-    count = -(-(finfo.maxexp - finfo.minexp + width) // LIMB_BITS)
-    shift = leading_axes(jnp.arange(count, dtype=jnp.int32) * LIMB_BITS, place.ndim + 1) - place[..., None]
-    limbs = shift_right(high[..., None], low[..., None], shift) & np.uint32(_LIMB_MASK)
-    return jnp.where(sign[..., None], -1, 1) * limbs.astype(jnp.int32)
-
-
-def fields_of(x: Array) -> tuple[Array, Array, Array, Array]:
-    """Split floats into sign, biased exponent and the mantissa with its leading bit, as high and low uint32 words."""
-    bits = lax.bitcast_convert_type(x, jnp.uint32)
-    top, below = (bits, None) if x.dtype == jnp.float32 else (bits[..., 1], bits[..., 0])
-    nmant = 23 if below is None else 20
-    exponent = ((top >> nmant) & np.uint32(0xFF if below is None else 0x7FF)).astype(jnp.int32)
-    lead = (exponent > 0).astype(jnp.uint32) << nmant
-    mantissa = (top & np.uint32((1 << nmant) - 1)) | lead
-    sign = (top >> 31) == 1
-    if below is None:
-        return sign, exponent, jnp.zeros_like(mantissa), mantissa
-    return sign, exponent, mantissa, below
-
-
-def shift_right(high: Array, low: Array, shift: Array) -> Array:
-    """Return the low word of (high·2^32 + low) >> shift; a negative shift goes left."""
-
-    def shifted(word: Array, by: Array) -> Array:  # XLA leaves shifts by 32 or more to the hardware: clamp, then mask
-        return jnp.where((by >= 0) & (by < 32), word >> jnp.clip(by, 0, 31).astype(jnp.uint32), np.uint32(0))
-
-    def lifted(word: Array, by: Array) -> Array:
-        return jnp.where((by >= 0) & (by < 32), word << jnp.clip(by, 0, 31).astype(jnp.uint32), np.uint32(0))
-
-    from_low = jnp.where(shift >= 0, shifted(low, shift), lifted(low, -shift))
-    from_high = jnp.where(shift >= 32, shifted(high, shift - 32), lifted(high, 32 - shift))
-    return from_low | from_high
+        vectors_of = np.eye(dim, dim + 1, dtype=limbs.dtype)
+        limbs = jnp.sum(vectors_of[..., None] * limbs[:dim], axis=0, dtype=limbs.dtype)
+        return jnp.pad(shift[:, :dim], ((0, 0), (0, 1), (0, 0))) * limbs[None]
+    return functools.reduce(jnp.add, (shift[:, k, None] * limbs[None, k] for k in range(len(limbs))))
 
 
 def smallest_cutoff(dtype: np.dtype) -> float:

@@ -648,7 +648,7 @@ def _vectors(
     cutoff = _pair_cutoff(given, closed)
     used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
     neighbor = jnp.where(used, idx, 0)
-    mask = used & call_apart(is_pair_of, lax.stop_gradient(rows), lax.stop_gradient(sources), neighbor, cutoff)
+    mask = call_apart(is_pair_of, lax.stop_gradient(rows), lax.stop_gradient(sources), neighbor, used, cutoff)
     return jnp.where(mask[..., None], sources[neighbor] - rows[:, None, :], 0), mask
 
 
@@ -709,9 +709,9 @@ def _periodic_vectors(
     lattice = make_lattice(box, kind, np.dtype(sources.dtype))
     used, neighbor, difference, shifts = _slots(idx, count, images, sources, rows, lattice, half)
     fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
-    pairs = shifted_pairs(difference, shifts, (fixed_sources, fixed_rows), lattice)
+    pairs = shifted_pairs(difference, shifts, lattice)
     fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
-    mask = used & call_apart(is_pair_of, fixed_rows, fixed_sources, neighbor, cutoff, fixed_pairs)
+    mask = call_apart(is_pair_of, fixed_rows, fixed_sources, neighbor, used, cutoff, fixed_pairs)
     return jnp.where(mask[..., None], pairs.vectors, 0), mask, shifts
 
 

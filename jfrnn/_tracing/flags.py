@@ -1,5 +1,7 @@
 """Which of many flags are set, in order."""
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -39,3 +41,19 @@ def set_places(flags: Array, most: int) -> Array:
         before, place = jnp.where(beyond, before - low, before), jnp.where(beyond, place + width, place)
         left = jnp.where(beyond, left >> np.uint32(width), left)
     return jnp.where(found < words, place, n)
+
+
+def any_of_rows(flags: Array) -> Array:
+    """Say of each row of flags [n, k] whether any is set, k being 32 or less or a multiple of it: [n] bool.
+
+    XLA's CPU compiler makes a chain of kernels of a reduction over a longer axis, and kernels take most of the time to compile.
+    """
+    parts = jnp.split(flags, max(flags.shape[1] // _BITS, 1), axis=1)
+    return jnp.any(functools.reduce(jnp.logical_or, parts), axis=1)
+
+
+def first_set(flags: Array, after: Array) -> Array:
+    """Return the first place behind another one at which flags [n] are set, or n: [] int32."""
+    places = lax.iota(jnp.int32, len(flags) + 1)
+    there = jnp.concatenate([flags, jnp.ones(1, bool)]) & (places > after)
+    return lax.argmax(there, 0, jnp.int32)  # one kernel, where a minimum of places were a chain

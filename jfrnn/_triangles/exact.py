@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._geometry import Cutoff
+from jfrnn._geometry import Cutoff, limb_bits
 from jfrnn._tracing import set_places
 from jfrnn._triangles.integers import Shapes, bit_range, is_near, limb_counts
 
@@ -167,6 +167,6 @@ def _decided(state: Array, waiting: int, chunk: int, shapes_at: ShapesAt) -> Arr
         count = usual if waiting == _USUAL else most
         origin, width = bit_range(shapes)
         near = is_near(shapes, origin, count).astype(jnp.int32)
-        return state.at[at].set(jnp.where(width <= 11 * count, near, _WIDE), mode="drop")
+        return state.at[at].set(jnp.where(width <= limb_bits(np.dtype(shapes.points.dtype)) * count, near, _WIDE), mode="drop")
 
     return lax.while_loop(lambda state: jnp.any(state == waiting), decide_chunk, state)
