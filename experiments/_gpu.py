@@ -607,17 +607,11 @@ def _study_rows(config: Config, n: int) -> Iterator[dict[str, Any]]:
 
 _STUDIED: dict[str, dict[str, Any]] = {
     "float32, exact, cells of r/6 along x": {},
-    "float32, working precision alone": {"exact": False},
     "float64, exact": {"double": True},
-    "float64, working precision alone": {"double": True, "exact": False},
     "counts alone": {"lists": False},
     "cells of r/4 along x": {"reach_x": 4},
     "cells of r": {"reach_x": 1},
     "cells of r/2": {"reach": 2, "reach_x": 2},
-    "cells of r, Morton": {"reach_x": 1, "order": 1},
-    "cells of r, Hilbert": {"reach_x": 1, "order": 2},
-    "cells of r/2, Morton": {"reach": 2, "reach_x": 2, "order": 1},
-    "cells of r/2, Hilbert": {"reach": 2, "reach_x": 2, "order": 2},
 }
 
 
@@ -632,15 +626,13 @@ def _kernel_time(
     kernels = cells_cuda.cell_kernels(3, double, False, lists, **options)
     kernels.load("cuda:0")
     x = wp.array(points.astype(np.float64 if double else np.float32), dtype=scalar, ndim=2, device="cuda")
-    # a space-filling curve fills a cube of 2^k cells per axis
-    side = 1 << max(1, int(np.ptp(points) / cutoff * options.get("reach", 1) + 2).bit_length())
-    table = max(cells_cuda.table_cells(n), side**3 if options.get("order") else 0)
-    scratch = wp.empty(cells_cuda.scratch_words(n, n, 3, 2 if double else 1, True, table), dtype=wp.int32, device="cuda")
+    table = cells_cuda.table_cells(n)
+    scratch = wp.empty(cells_cuda.scratch_words(n, n, 3, 2 if double else 1, True), dtype=wp.int32, device="cuda")
     idx = wp.empty((n, capacity) if lists else (1, 1), dtype=wp.int32, device="cuda")
     count, info = wp.empty(n, dtype=wp.int32, device="cuda"), wp.empty(2, dtype=wp.int32, device="cuda")
     radius = wp.array([cutoff], dtype=scalar, device="cuda")
     arguments = [x, x, radius, idx, count, info, scratch, n, n, 1, table, capacity if lists else 0, 0, 1]
-    launches = kernels.launches(n, n, True, table)
+    launches = kernels.launches(n, n, True)
 
     commands = [(launch.kernel, [*arguments, int(launch.of_queries)], launch.threads, launch.block) for launch in launches]
     until = _measure.time_kernels(commands, config.repeats)

@@ -44,7 +44,7 @@ def snippet(scalar: str, dim: int, *pieces: str, **constants: int) -> str:
 
 SKEWED = 2
 SPACES = ("", "_nearest", "_images", "_nearest_skewed", "_images_skewed")  # in names of variants
-_DEFAULTS = {"ORDER": 0, "PERIODIC": 0, "BATCHED": 0, "SUM": 0}
+_DEFAULTS = {"PERIODIC": 0, "BATCHED": 0, "SUM": 0}
 
 
 def table_cells(sources: int) -> int:

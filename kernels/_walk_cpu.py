@@ -24,7 +24,7 @@ def walk(
 ) -> str:
     """Return the text of a kernel that walks over all queries; around it stand the pieces CELLS, the layout and EXACT.
 
-    Constants it needs: CANDIDATES, how many are held at a time; EXACTLY; LIST, whether `scan` leaves ids of pairs in `row`; SUMS,
+    Constants it needs: CANDIDATES, how many are held at a time; LIST, whether `scan` leaves ids of pairs in `row`; SUMS,
     whether squares of distances are computed as a term does it; with 2 `candidate_ids` are known in open space, too.
 
     Args:

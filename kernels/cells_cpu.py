@@ -57,19 +57,15 @@ class Kernels(NamedTuple):
 
 
 @functools.cache
-def cell_kernels(
-    dim: int, double: bool, scaled: bool, lists: bool, periodic: int = 0, batched: bool = False, exact: bool = True
-) -> Kernels:
+def cell_kernels(dim: int, double: bool, scaled: bool, lists: bool, periodic: int = 0, batched: bool = False) -> Kernels:
     """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts alone.
 
     `periodic` and `batched` are those of `jfrnn.kernels._native.snippet`.
-
-    With exact=False the working precision alone decides (`|d|^2 < r^2 (1 - 4 eps)`): only to measure what exactness costs.
     """
     scalar = wp.float64 if double else wp.float32
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}"
-    variant += f"{SPACES[periodic]}{'_batched' * batched}{'' if exact else '_inexact'}"
-    options = {"SCALED": scaled, "LIST": lists, **GRID, "EXACTLY": exact, "PERIODIC": periodic}
+    variant += f"{SPACES[periodic]}{'_batched' * batched}"
+    options = {"SCALED": scaled, "LIST": lists, **GRID, "PERIODIC": periodic}
     options |= {"BATCHED": batched, "SUMS": 0, "CHUNK": CHUNK, "MANY": MANY}
     options |= {"CANDIDATES": 1024 if double else 1536}  # what fits into a first-level cache beside a row
     points = wp.array2d(dtype=scalar)

@@ -45,10 +45,10 @@ SHARE = read_part("cells.cuh", "share")
 LAYOUT = SHARE + read_part("cells.cuh", "layout")
 
 
-def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, table: int | None = None) -> int:
+def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -> int:
     """Return the int32 words of scratch that the kernels need; `width` is 1 for float32 and 2 for float64."""
     del dim
-    table = table_cells(sources) if table is None else table
+    table = table_cells(sources)
     tiles = 2 * ((table + 1) // _TILE + 1)
     longest = max(sources, queries)
     parts = [_HEADER_WORDS, _PART * _PARTS * width, 4 * width * sources, table + 2, tiles, longest, longest, sources]
@@ -89,7 +89,7 @@ def walk(*, opened: str = "", none: str, begun: str, settled: str, done: str = "
     """Return the text of a kernel in which a block of one warp serves its share of the queries, from `begin` on, in groups.
 
     Around it stand the pieces CELLS, LAYOUT and EXACT. Constants it needs: LIST, or SUMS, or neither, and the pairs are counted:
-    `found`; LATER, EXACTLY, CROSSING. With SUMS candidates are images of places in `sorted`, not of sources.
+    `found`; LATER, CROSSING. With SUMS candidates are images of places in `sorted`, not of sources.
 
     Args:
         opened: Comes before the queries from `place` to `stop`; they may be none.
@@ -131,13 +131,13 @@ class Kernels(NamedTuple):
     query: wp.Kernel
     crossing: wp.Kernel | None
 
-    def launches(self, n: int, m: int, own: bool, table: int | None = None) -> list[Launch]:
+    def launches(self, n: int, m: int, own: bool) -> list[Launch]:
         """Return what is launched, in order, for n sources and m queries."""
-        return self.stages(n, m, own, table) + walks(self.query, self.crossing, m)
+        return self.stages(n, m, own) + walks(self.query, self.crossing, m)
 
-    def stages(self, n: int, m: int, own: bool, table: int | None = None) -> list[Launch]:
+    def stages(self, n: int, m: int, own: bool) -> list[Launch]:
         """Return those that sort sources and queries by cell."""
-        table = table_cells(n) if table is None else table
+        table = table_cells(n)
         tiles = min((table + 1) // _TILE + 1, _RESIDENT)
         clearing = min(-(-table // (8 * BLOCK)), _RESIDENT) * BLOCK
         launches = [Launch(self.bounds, _PARTS * BLOCK, BLOCK, False), Launch(self.lay_out, clearing, BLOCK, False)]
@@ -201,27 +201,22 @@ def cell_kernels(
     scaled: bool,
     lists: bool,
     later: bool = False,
-    exact: bool = True,
     reach: int = GRID["REACH"],
     reach_x: int = GRID["REACH_X"],
-    blocks: int | None = None,
-    order: int = 0,
     periodic: int = 0,
     batched: bool = False,
 ) -> Kernels:
     """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts, half lists or whole.
 
-    The rest is there to be measured. exact=False lets the working precision decide alone (`|d|^2 < r^2 (1 - 8 eps)`); `reach` is
-    the number of cell edges in a cutoff along y and z, `reach_x` along x; `blocks` per multiprocessor bound the registers; `order`
-    of the cells: 0 row-major, 1 Morton, 2 Hilbert. `periodic` and `batched` are those of
-    `jfrnn.kernels._native.snippet`.
+    `periodic` and `batched` are those of `jfrnn.kernels._native.snippet`. `reach` is the number of cell edges in a cutoff along y
+    and z, `reach_x` along x; other numbers than these are slower, and only measurements ask for them.
     """
-    blocks = blocks or (24 if not lists else 16 if double else 20)  # registers against occupancy, measured on an H200
-    kind = f"{dim}d_{'f64' if double else 'f32'}_r{reach}x{reach_x}{('', '_morton', '_hilbert')[order]}"
+    blocks = 24 if not lists else 16 if double else 20  # registers against occupancy, measured on an H200
+    kind = f"{dim}d_{'f64' if double else 'f32'}_r{reach}x{reach_x}"
     kind += SPACES[periodic] + "_batched" * batched
-    variant = f"{kind}{'_scaled' * scaled}{'_list' * lists}{'_later' * later}{'' if exact else '_inexact'}"
-    grid = {**GRID, "REACH": reach, "REACH_X": reach_x, "ORDER": order, "PERIODIC": periodic, "BATCHED": batched}
-    query = {"SCALED": scaled, "LIST": lists, "SUMS": 0, "LATER": later, "EXACTLY": exact}
+    variant = f"{kind}{'_scaled' * scaled}{'_list' * lists}{'_later' * later}"
+    grid = {**GRID, "REACH": reach, "REACH_X": reach_x, "PERIODIC": periodic, "BATCHED": batched}
+    query = {"SCALED": scaled, "LIST": lists, "SUMS": 0, "LATER": later}
     query |= grid
 
     def query_kernel(name: str, crossing: bool = False) -> wp.Kernel:

@@ -306,7 +306,7 @@ def query_kernel(
     packed = work(term.text) > LITTLE_WORK if packed is None else packed
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
     variant += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}_{key}"
-    constants = {"SCALED": scaled, "LIST": 0, **GRID, "EXACTLY": 1, **constants_of(term, compensated, extremes)}
+    constants = {"SCALED": scaled, "LIST": 0, **GRID, **constants_of(term, compensated, extremes)}
     constants |= {"PERIODIC": periodic, "BATCHED": batched, "CHUNK": CHUNK, "CANDIDATES": _candidates(term, dim, double)}
     reduction = reduction_of(term, extremes)
     text = walk(

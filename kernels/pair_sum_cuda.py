@@ -194,25 +194,24 @@ def _own_columns(term: TermText) -> int:
 @functools.cache
 def sum_kernels(
     term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: bool = False,
-    extremes: bool = False, blocks: int | None = None, taken: int | None = None,
+    extremes: bool = False,
 ) -> Kernels:  # fmt: skip
     """Return the kernels that sum a term; `key` tells it from all others in the names of programs.
 
     `extremes`: they find the largest summands instead; `errors` [m, width, 2] then gets their sources (n: there is none), and the
     codes of their images, as integers travel among floats.
-    The rest is there to be measured: `blocks` per multiprocessor bound the registers, `taken` is how many pairs a lane adds before
-    it looks for the next block; None: as was fastest on an H200.
     """
-    # rows of several loads, each of which waits in registers: 1.3 times slower for sums of SPH, if so many are loaded ahead
+    # `taken` is how many pairs a lane adds before it looks for the next block; `blocks` per multiprocessor bound registers. Both
+    # are what was fastest on an H200: rows of several loads wait in registers, and are 1.3 times slower if four are loaded ahead.
     cheap = work(term.text) <= LITTLE_WORK and row_length(term, dim, double) <= 4
-    taken = taken or (4 if cheap else 2)
-    blocks = blocks or (16 if double or not cheap else 20)
+    taken = 4 if cheap else 2
+    blocks = 16 if double or not cheap else 20
     totals, columns = sum(part.total for part in term.sums), term.source_columns
     kind = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
     kind += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}"
     module = f"{kind}_b{blocks}_t{taken}_{key}"
     constants = {**GRID, "PERIODIC": periodic, "BATCHED": batched, "SCALED": scaled}
-    constants |= {"LIST": 0, "SUMS": 1, "LATER": 0, "EXACTLY": 1, "COMPENSATED": compensated, "TAKEN": taken}
+    constants |= {"LIST": 0, "SUMS": 1, "LATER": 0, "COMPENSATED": compensated, "TAKEN": taken}
     constants |= {"OTHERS": columns, "ROW_LENGTH": max(row_length(term, dim, double), 1), "OWN": _own_columns(term)}
     constants |= {"PLACED": _placed_columns(term, dim)}
     constants |= {"TOTALS": totals, "ROW_SUMS": len(term.sums) - totals}

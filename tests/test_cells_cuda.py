@@ -28,11 +28,6 @@ def test_variants_compile(dim, double, scaled, lists, later, tmp_path):
     assert len(compiles(cells_cuda.cell_kernels(dim, double, scaled, lists, later), tmp_path)) == 2
 
 
-@pytest.mark.parametrize("order", [1, 2])
-def test_space_filling_curves_compile(order, tmp_path):
-    assert compiles(cells_cuda.cell_kernels(3, False, False, True, reach_x=1, order=order), tmp_path)
-
-
 def test_boxes_batches_and_cutoffs_per_particle_compile(tmp_path):
     assert compiles(cells_cuda.cell_kernels(3, False, False, True, periodic=2, batched=True), tmp_path)
     for rule, periodic in (("mean", 2), ("gather", 0)):

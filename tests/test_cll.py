@@ -99,7 +99,7 @@ def test_the_same_input_gives_the_same_list():
 
 
 def test_cells_cover_the_box_and_are_wider_than_the_cutoff():
-    edge, shape = adapter.cll.size_grid([0.0, -1.0, 2.0], [5.0, 9.0, 2.0], 0.5, 2.0**-23)
+    edge, shape = adapter._cll_kernels.size_grid([0.0, -1.0, 2.0], [5.0, 9.0, 2.0], 0.5, 2.0**-23)
     assert 0.5 < edge < 0.5 * (1 + 1e-4)
     assert shape == [10, 20, 1]
     assert all(count * edge > length for count, length in zip(shape, (5.0, 10.0, 0.0), strict=True))
@@ -108,4 +108,4 @@ def test_cells_cover_the_box_and_are_wider_than_the_cutoff():
 def test_a_box_that_needs_too_many_cells_is_refused():
     positions = wp.array(np.array([[0, 0, 0], [1e4, 1e4, 1e4]], np.float32), dtype=wp.vec3f, device="cpu")
     with pytest.raises(ValueError, match=r"one entry per cell of the box: \d+ cells, at most 268435456 allowed"):
-        adapter.cll.search_pairs(positions, [0.0] * 3, [1e4] * 3, 1.0)
+        adapter._cll_kernels.search_pairs(positions, [0.0] * 3, [1e4] * 3, 1.0)

@@ -4,9 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 import warp as wp
-from jfrnn.kernels import cll  # pyright: ignore[reportMissingImports]
 
-from experiments.methods import Found
+from experiments.methods import Found, _cll_kernels
 
 
 def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], wp.array]:
@@ -16,7 +15,7 @@ def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], wp.array]:
 
     def search(points: np.ndarray = points) -> wp.array:
         lower, upper = points.min(axis=0).tolist(), points.max(axis=0).tolist()
-        return cll.search_pairs(wp.array(points, dtype=vector, device="cpu", copy=False), lower, upper, cutoff)
+        return _cll_kernels.search_pairs(wp.array(points, dtype=vector, device="cpu", copy=False), lower, upper, cutoff)
 
     search(points[:1])  # compiles the kernels
     return search

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 import warp
 
-from experiments.methods import Found
+from experiments.methods import Found, _hashgrid_kernels
 from experiments.methods._padded import found_in_rows
-from jfrnn._engine.warp import kernels_of
 
 wp: Any = warp  # whose types are those of kernels, not of what the host gets
 CELLS = (128, 128, 128)  # of Warp's examples
@@ -22,7 +21,7 @@ def allocate(positions: np.ndarray, cutoff: float) -> int:
 def prepare(positions: np.ndarray, cutoff: float, capacity: int) -> Callable[[], tuple[Any, Any]]:
     """Compile the kernel, and return the search."""
     device = wp.get_preferred_device()
-    kernel = kernels_of("hashgrid_plain").list_neighbors_kernel
+    kernel = _hashgrid_kernels.list_neighbors_kernel
     points = wp.array(positions.astype(np.float32, copy=False), dtype=wp.vec3, device=device)
     grid = wp.HashGrid(*CELLS, device=device)
 

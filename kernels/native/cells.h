@@ -130,37 +130,6 @@ auto ring = [](whole x, int cells) -> int {
     const whole r = x % cells;
     return (int)(r < 0 ? r + cells : r);
 };
-// place of a cell on a space-filling curve, in boxes of 2^bits cells per axis: to be compared with row-major order
-auto curve = [](const Grid& grid, unsigned int x, unsigned int y, unsigned int z) -> int {
-    int bits = 1;
-    for (int k = 0; k < DIM; ++k)
-        while ((1 << bits) < grid.extent[k])
-            ++bits;
-    if (ORDER == 2) {  // Hilbert (Skilling 2004, doi:10.1063/1.1751381)
-        unsigned int c[3] = {z, y, x};
-        for (unsigned int q = 1u << (bits - 1); q > 1; q >>= 1)
-            for (int k = 0; k < 3; ++k)
-                if (c[k] & q)
-                    c[0] ^= q - 1;
-                else {
-                    const unsigned int t = (c[0] ^ c[k]) & (q - 1);
-                    c[0] ^= t;
-                    c[k] ^= t;
-                }
-        c[1] ^= c[0];
-        c[2] ^= c[1];
-        unsigned int t = 0;
-        for (unsigned int q = 1u << (bits - 1); q > 1; q >>= 1)
-            t ^= c[2] & q ? q - 1 : 0;
-        z = c[0] ^ t;
-        y = c[1] ^ t;
-        x = c[2] ^ t;
-    }
-    unsigned int key = 0;  // Morton: the bits of all axes in turn
-    for (int b = 0; b < bits; ++b)
-        key |= (x >> b & 1) << 3 * b | (y >> b & 1) << (3 * b + 1) | (z >> b & 1) << (3 * b + 2);
-    return (int)key;
-};
 // of a finite point; one outside a dense box is sorted into its border
 auto cell_key = [&](const Grid& grid, const real* p, unsigned int system) -> int {
     whole cell[3] = {0, 0, 0};
@@ -168,8 +137,6 @@ auto cell_key = [&](const Grid& grid, const real* p, unsigned int system) -> int
         const whole c = axis_cell(grid, k, coordinate(k, p)), end = grid.extent[k] - 1;
         cell[k] = !grid.dense ? c : c < 0 ? 0 : c > end ? end : c;
     }
-    if (ORDER != 0)
-        return curve(grid, (unsigned int)cell[0], (unsigned int)cell[1], (unsigned int)cell[2]);
     const int row = row_start(grid, cell[1], cell[2], system);
     return grid.dense ? row + (int)cell[0] : ring(row + ring(cell[0], grid.cells), grid.cells);
 };
@@ -181,13 +148,6 @@ auto lay_out = [&](Grid& grid, const real* low, const real* high, int table) {
         const double extent = is_periodic(k) ? double(inverse_edge[k]) : double(cell_of(k, high[k])) - double(grid.low[k]) + 1;
         cells = extent <= table ? cells * extent : 2.0 * table;
         grid.extent[k] = extent <= table ? (int)extent : 1;
-    }
-    if (ORDER != 0) {  // a cube of 2^bits cells per axis; the caller's table must hold it
-        int side = 2;
-        for (int k = 0; k < DIM; ++k)
-            while (side < grid.extent[k])
-                side *= 2;
-        cells = double(side) * side * side;
     }
     grid.dense = cells <= table;
     grid.cells = grid.dense ? (int)cells : table;

@@ -197,7 +197,7 @@ while (place < stop) {
     for (int a = 0; a < DIM; ++a) {
         my_place[a] = coordinate(a, mine.p);
         const whole here = axis_cell(grid, a, my_place[a]), there = __shfl_sync(ALL, here, 0);
-        beside = beside && (ORDER != 0 || (a == 0 ? grid.dense || (here >= there && here - there < 2 * REACH_X) : here == there));
+        beside = beside && (a == 0 ? grid.dense || (here >= there && here - there < 2 * REACH_X) : here == there);
     }
     unsigned int system = 0;
     if constexpr (BATCHED) {
@@ -314,7 +314,7 @@ while (place < stop) {
             reached = 0;
     }
     auto cells_along = [&](int a) { return (int)(__shfl_sync(ALL, reached, 2 * a + 1) - __shfl_sync(ALL, reached, 2 * a)) + 1; };
-    int rows = ORDER != 0 ? cells_along(0) : 1;  // on a curve, cells along x are no run
+    int rows = 1;
     if (!inside && is_periodic(0))  // a row is cut where it enters another image
         rows = period_of(0, __shfl_sync(ALL, reached, 1)) - period_of(0, __shfl_sync(ALL, reached, 0)) + 1;
     if (cells_along(0) <= 0 || cells_along(1) <= 0 || cells_along(2) <= 0)
@@ -326,7 +326,7 @@ while (place < stop) {
 #pragma unroll
         for (int a = 0; a < 3; ++a)
             first[a] = __shfl_sync(ALL, reached, 2 * a);
-        const int wide = cells_along(1), deep = cells_along(2), across = ORDER != 0 ? cells_along(0) : rows / (wide * deep);
+        const int wide = cells_along(1), deep = cells_along(2), across = rows / (wide * deep);
         int length = cells_along(0), from = 0, size = 0, image = home;
         const int row = base + lane, line = row / across, level = line / wide;
         whole y = first[1] + (line - level * wide), z = first[2] + level;
@@ -372,10 +372,9 @@ while (place < stop) {
         }
         if (grid.dense) {
             if (row < rows) {
-                const int s = ORDER != 0 ? curve(grid, (unsigned int)(first[0] + row % across), (unsigned int)y, (unsigned int)z)
-                                         : row_start(grid, y, z, system) + (int)first[0];
+                const int s = row_start(grid, y, z, system) + (int)first[0];
                 from = start[s];
-                size = length > 0 ? start[s + (ORDER != 0 ? 1 : length)] - from : 0;
+                size = length > 0 ? start[s + length] - from : 0;
             }
         } else {
             const int begins = ring(row_start(grid, y, z, system) + ring(first[0], grid.cells), grid.cells);
@@ -689,11 +688,10 @@ while (place < stop) {
                             p[a] = loaded[a].x[e];
                         const unsigned int over = upper_word(excess(mine.p, p));
                         hits = __funnelshift_l(over, hits, 1);
-                        if constexpr (EXACTLY)
-                            closest = min(closest, over);
+                        closest = min(closest, over);
                     }
                 }
-                if (EXACTLY && __any_sync(ALL, (int)closest <= (int)upper_word(2 * band)))
+                if (__any_sync(ALL, (int)closest <= (int)upper_word(2 * band)))
 #pragma unroll 4
                     for (int j = 0; j < 32; ++j) {
                         real p[DIM];
@@ -716,7 +714,7 @@ while (place < stop) {
                     load_image(id, p);
                     const real over = excess(query.p, p);
                     bool hit = over < 0;
-                    if (EXACTLY && over >= 0 && over <= 2 * band) {
+                    if (over >= 0 && over <= 2 * band) {
                         if constexpr (inside)
                             hit = exact_pair(query.p, p);
                         else {

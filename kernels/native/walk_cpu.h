@@ -290,14 +290,11 @@ auto scan = [&](const real* q, int own_id, int count, auto only_later) -> int {
         const vec square = square_of(q, candidates_at(b).p);
         const unsigned int allowed = later(b);
         const unsigned int hit = mask_of(square, inside, Below{}) & allowed;
-        if constexpr (EXACTLY)
-            unsure[v] = hit ^ (mask_of(square, outside, BelowOrAt{}) & allowed);
+        unsure[v] = hit ^ (mask_of(square, outside, BelowOrAt{}) & allowed);
         if constexpr (LIST)
             pack(*(const ints*)(candidate_ids + b), row + hits, hit);
         hits += __builtin_popcount(hit);
     }
-    if constexpr (!EXACTLY)
-        return hits;
     const int doubts = collect_doubtful(count);
     for (int b = 0; b < doubts; b += LANES) {
         unsigned int pairs = decided(q, own_id, doubtful_at(b), doubtful + b, lanes_before(doubts - b));
