@@ -1,5 +1,6 @@
 """The engine of `wp.HashGrid`, as Warp ships it: the reference that the fused kernels are compared with."""
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from jfrnn._engine.warp import Arrays, Variant, array_types, call_kernels, check
 from jfrnn._geometry import Cutoff, make_cutoff
 
 
+@dataclasses.dataclass(frozen=True)  # all are one
 class HashGridEngine:
     """`wp.HashGrid`, on the CPU and on CUDA. The grid is built from the host, which has to know the cutoff."""
 

@@ -4,6 +4,7 @@ Each combination of static options is a kernel of its own, named after them, so 
 depends on (JAX's persistent compilation cache sees no more than that).
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -25,6 +26,7 @@ from jfrnn._geometry import Cutoffs
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
 
 
+@dataclasses.dataclass(frozen=True)  # all are one
 class WarpEngine:
     """Cells, met by compiled kernels, on the CPU and on CUDA."""
 

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from typing import Any, NamedTuple, overload
+from typing import Any, overload
 
 import jax
 import jax.numpy as jnp
@@ -11,15 +11,11 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._engine import ENGINES, Engine, Filter, Inputs, Options, count_rows, list_rows, without_inactive
+from jfrnn._engine import Inputs, Options, count_rows, list_rows, without_inactive
 from jfrnn._geometry import (
-    LARGEST_TURN,
     Batch,
     Box,
-    Cutoff,
-    Cutoffs,
     Images,
-    Lattice,
     NeighborOverflowError,
     Radii,
     Status,
@@ -30,43 +26,20 @@ from jfrnn._geometry import (
     checked_radii,
     checked_slack,
     fixed_box,
-    forward_shifts,
-    given_shifts,
     grown_images,
-    is_pair_of,
     known_status,
-    largest_known,
     make_cutoff,
-    make_cutoffs,
-    make_lattice,
-    nearest_shifts,
     pairs_and_status,
     shape_of,
-    shifted_pairs,
-    turns_between,
-    unpacked_turns,
 )
 from jfrnn._search.exports import DenseNeighbors, checked_total, flat_pairs, pair_total
-from jfrnn._search.verlet import Verlet, first_verlet, list_radius, moved_too_far
+from jfrnn._search.geometry import ImageCodes, ImagesMade, lattice_shifts, norms, open_vectors, periodic_vectors
+from jfrnn._search.problem import Problem
+from jfrnn._search.verlet import Verlet, first_verlet, moved_too_far
 from jfrnn._tracing import at_once, call_apart, compiled, own_transfers
 
 _CAPACITY_STEP = 8
 ROWS_ARE_WHOLE = Status.NONFINITE | Status.TOTAL_OVERFLOW  # bits with which every row has all its neighbors
-
-
-class ImageCodes(NamedTuple):
-    """Of which image of its source each slot tells, where the nearest is not the only one.
-
-    Attributes:
-        codes: shape [m, capacity], uint8 up to 256 images, int16 up to 32 768, else int32: which of the shifts within reach, of
-            wrapped particles. These shifts and turns count the vectors of `Images.basis`.
-        turns: shape [n], int32: how many lattice vectors each source was from the box when the list was made, packed.
-        query_turns: shape [m], int32, or None where the sources are the queries.
-    """
-
-    codes: Array
-    turns: Array
-    query_turns: Array | None
 
 
 @jax.tree_util.register_dataclass
@@ -85,18 +58,7 @@ class NeighborList:
         images: Of which image of its source each slot tells (`ImageCodes`), 1 B per slot; None where the nearest is the only one.
         radii: Cutoffs of the particles (`Radii`: sources [n], queries [m], the rule), or None where one serves all.
         batch: To which system each particle belongs (`Batch`: sources [n], queries [m] or None), or None; updates keep it.
-        cutoff: Interaction radius [length], rounded to the dtype of the positions; None where particles have their own. Static.
-        skin: Extra shell [length]. Static.
-        half: Each unordered pair stands once, in the row of its smaller index. Static.
-        include_self: Each particle is its own neighbor. Static.
-        closed: Pairs at exactly the cutoff count. Static.
-        own_queries: The rows belong to `queries`, not to the positions themselves. Static.
-        masked: Particles may be inactive. Static.
-        box_kind: Along which axes the box is periodic and how far pairs reach in it; None where space is open. Static.
-        source_count: n, the fill value of unused slots. Static.
-        dim: Axes of the positions, 2 or 3. Static.
-        dtype: Of the positions. Static.
-        backend: The engine that made the list. Static.
+        problem: What was asked for (`Problem`). Static.
     """
 
     idx: Array
@@ -108,18 +70,7 @@ class NeighborList:
     images: ImageCodes | None
     radii: Radii | None
     batch: Batch | None
-    cutoff: float | None = dataclasses.field(metadata={"static": True})
-    skin: float = dataclasses.field(metadata={"static": True})
-    half: bool = dataclasses.field(metadata={"static": True})
-    include_self: bool = dataclasses.field(metadata={"static": True})
-    closed: bool = dataclasses.field(metadata={"static": True})
-    own_queries: bool = dataclasses.field(metadata={"static": True})
-    masked: bool = dataclasses.field(metadata={"static": True})
-    box_kind: Images | None = dataclasses.field(metadata={"static": True})
-    source_count: int = dataclasses.field(metadata={"static": True})
-    dim: int = dataclasses.field(metadata={"static": True})
-    dtype: np.dtype = dataclasses.field(metadata={"static": True})
-    backend: str = dataclasses.field(metadata={"static": True})
+    problem: Problem = dataclasses.field(metadata={"static": True})
 
     def __repr__(self) -> str:
         """Say in a line what it holds; waits for the device."""
@@ -130,6 +81,66 @@ class NeighborList:
         skin = f", skin {self.skin:.6g}" if self.skin else ""
         rest = pairs_and_status(self.count, self.status)
         return f"NeighborList({rows}, capacity {capacity}, cutoff {reach}{skin}, engine {self.backend!r}, {rest})"
+
+    @property
+    def cutoff(self) -> float | None:
+        """Interaction radius [length], rounded to the dtype of the positions; None where particles have their own."""
+        return self.problem.cutoff
+
+    @property
+    def skin(self) -> float:
+        """Extra shell [length]."""
+        return self.problem.skin
+
+    @property
+    def half(self) -> bool:
+        """Whether each unordered pair stands once, in the row of its smaller index."""
+        return self.problem.options.filter.later_only
+
+    @property
+    def include_self(self) -> bool:
+        """Whether each particle is its own neighbor."""
+        return self.problem.include_self
+
+    @property
+    def closed(self) -> bool:
+        """Whether pairs at exactly the cutoff count."""
+        return self.problem.options.closed
+
+    @property
+    def own_queries(self) -> bool:
+        """Whether the rows belong to `queries`, not to the positions themselves."""
+        return self.problem.own_queries
+
+    @property
+    def masked(self) -> bool:
+        """Whether particles may be inactive."""
+        return self.problem.masked
+
+    @property
+    def box_kind(self) -> Images | None:
+        """Along which axes the box is periodic and how far pairs reach in it; None where space is open."""
+        return self.problem.options.images
+
+    @property
+    def source_count(self) -> int:
+        """n, the fill value of unused slots."""
+        return self.problem.source_count
+
+    @property
+    def dim(self) -> int:
+        """Axes of the positions, 2 or 3."""
+        return self.problem.dim
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Type of the positions."""
+        return self.problem.dtype
+
+    @property
+    def backend(self) -> str:
+        """Name of the engine that made the list."""
+        return self.problem.options.engine.name
 
     @property
     def capacity(self) -> int:
@@ -220,11 +231,11 @@ class NeighborList:
         box, radii = self._box_now(box, sources), self._radii_now(cutoff, sources, queries)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, radii, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
-        wider = dataclasses.replace(self, box_kind=self._grown_images(box, radii, np.dtype(sources.dtype)))
-        inputs, options = _inputs_of(wider, sources, queries, active, box, radii)
+        wider = dataclasses.replace(self, problem=self.problem.with_images(self._grown_images(box, radii)))
+        inputs, options = self.problem.inputs(sources, queries, active, box, radii, self.batch), wider.problem.options
         with own_transfers():
             met = rounded_capacity(math.ceil(slack * int(np.max(np.asarray(self.required)))))
-            made = _remade(wider, inputs, options, max(self.capacity, met, counted_capacity(inputs, options, slack)))
+            made = _remade(wider, inputs, max(self.capacity, met, counted_capacity(inputs, options, slack)))
         made.check()
         return made
 
@@ -332,7 +343,7 @@ class NeighborList:
         with own_transfers():
             if box is None or self.box_kind is None or 0 in (sources.shape[0], *self.idx.shape):
                 return jnp.zeros((*self.idx.shape, sources.shape[1]), jnp.int32)
-            return _shifts(self.idx, self.count, self._images_made(), sources, rows, box, self.box_kind, self.half)
+            return lattice_shifts(self.idx, self.count, self._images_made(), sources, rows, box, self.box_kind, self.half)
 
     def distances(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> tuple[Array, Array]:
         """Compute the distance to every neighbor.
@@ -510,13 +521,12 @@ class NeighborList:
         checked = checked_box(box, sources, like=self.box)
         return None if checked is None else fixed_box(checked, np.dtype(sources.dtype))
 
-    def _grown_images(self, box: Box | None, radii: Radii | None, dtype: np.dtype) -> Images | None:
+    def _grown_images(self, box: Box | None, radii: Radii | None) -> Images | None:
         if self.box_kind is None or self.box is None or box is None:
             return self.box_kind
-        largest = self.cutoff or 0.0 if radii is None else largest_known(radii)
-        reach = None if largest is None else list_radius(largest, self.skin, dtype)
         short = bool(np.any(np.asarray(jax.device_get(self.status)) & Status.BOX_TOO_SMALL.value))
-        return grown_images(self.box_kind, (box, self.box), reach, dtype, self.source_count, short)
+        reach = self.problem.reach(radii)
+        return grown_images(self.box_kind, (box, self.box), reach, self.dtype, self.source_count, short)
 
     def _geometry(self, positions: Array, queries: Array | None, box: Box | None) -> tuple[Array, Array, Array | None]:
         sources, rows = self._geometry_inputs(positions, queries)
@@ -528,11 +538,11 @@ class NeighborList:
         cutoff = self.radii if self.cutoff is None else make_cutoff(self.cutoff, np.dtype(sources.dtype), self.closed)
         with own_transfers():
             if box is None or self.box_kind is None:
-                return *_vectors(self.idx, self.count, sources, rows, cutoff, self.closed), None
+                return *open_vectors(self.idx, self.count, sources, rows, cutoff, self.closed), None
             given = (self.box_kind, cutoff, self.closed, self.half)
-            return _periodic_vectors(self.idx, self.count, self._images_made(), sources, rows, box, *given)
+            return periodic_vectors(self.idx, self.count, self._images_made(), sources, rows, box, *given)
 
-    def _images_made(self) -> "_ImagesMade":
+    def _images_made(self) -> ImagesMade:
         made = None if self.images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
         return self.images, made
 
@@ -562,44 +572,15 @@ def counted_capacity(inputs: Inputs, options: Options, slack: float) -> int:
     return min(rounded_capacity(wanted), max(wanted, inputs.sources.shape[0]))
 
 
-def made_options(
-    cutoff: "float | Radii | None",
-    keep: Filter,
-    box_kind: Images | None,
-    engine: Engine,
-    dtype: np.dtype,
-    closed: bool,
-    skin: float,
-) -> tuple[Cutoff | Radii, Options]:
-    """Return the operand and the static options of a search with this radius, which holds the skin, or radii, which do not."""
-    if isinstance(cutoff, Radii):
-        return cutoff, Options(keep, engine, closed, skin, images=box_kind)
-    if cutoff is None:
-        raise TypeError("made_options() needs a radius or radii.")
-    radius = cutoff if engine.static_radius else None
-    return make_cutoff(cutoff, dtype, closed), Options(keep, engine, closed, images=box_kind, radius=radius)
-
-
-def _inputs_of(
-    nbrs: NeighborList, sources: Array, queries: Array | None, active: Array | None, box: Box | None, radii: Radii | None
-) -> tuple[Inputs, Options]:
-    """Return what a search takes that makes this list at these positions."""
-    dtype = np.dtype(sources.dtype)
-    keep = Filter(drop_self=not (nbrs.own_queries or nbrs.include_self), later_only=nbrs.half)
-    reach = radii if nbrs.cutoff is None else list_radius(nbrs.cutoff, nbrs.skin, dtype)
-    cutoff, options = made_options(reach, keep, nbrs.box_kind, ENGINES[nbrs.backend], dtype, nbrs.closed, nbrs.skin)
-    return Inputs(sources, queries, active, box, cutoff, nbrs.batch), options
-
-
 @compiled
 def _update(
     nbrs: NeighborList, sources: Array, queries: Array | None, active: Array | None, box: Box | None, radii: Radii | None
 ) -> NeighborList:
     sources, queries, box, radii = lax.stop_gradient((sources, queries, box, radii))
-    inputs, options = _inputs_of(nbrs, sources, queries, active, box, radii)
+    inputs = nbrs.problem.inputs(sources, queries, active, box, radii, nbrs.batch)
 
     def remake(nbrs: NeighborList) -> NeighborList:
-        made, verlet = _remade(nbrs, inputs, options, nbrs.capacity), nbrs.verlet
+        made, verlet = _remade(nbrs, inputs, nbrs.capacity), nbrs.verlet
         if made.verlet is not None and verlet is not None:
             made = dataclasses.replace(made, verlet=dataclasses.replace(made.verlet, rebuild_count=verlet.rebuild_count + 1))
         return dataclasses.replace(made, status=made.status | nbrs.status, required=jnp.maximum(made.required, nbrs.required))
@@ -613,9 +594,9 @@ def _update(
     return lax.while_loop(lambda state: state[0], lambda state: (jnp.zeros_like(state[0]), remake(state[1])), (moved, nbrs))[1]
 
 
-def _remade(nbrs: NeighborList, inputs: Inputs, options: Options, capacity: int) -> NeighborList:
+def _remade(nbrs: NeighborList, inputs: Inputs, capacity: int) -> NeighborList:
     """Make a list with the options of this one, and nothing of its past."""
-    return dataclasses.replace(nbrs, **found_fields(inputs, options, capacity, nbrs.skin > 0))
+    return dataclasses.replace(nbrs, **found_fields(inputs, nbrs.problem.options, capacity, nbrs.skin > 0))
 
 
 @functools.partial(compiled, static_argnames=("options", "capacity", "moving"))
@@ -631,110 +612,3 @@ def found_fields(inputs: Inputs, options: Options, capacity: int, moving: bool) 
     verlet = first_verlet(sources, inputs.queries, inputs.box, radii) if moving else None
     fields = {"idx": rows.idx, "count": rows.counts, "status": rows.status, "required": rows.required}
     return fields | {"verlet": verlet, "box": lax.stop_gradient(inputs.box), "images": codes, "radii": radii, "batch": inputs.batch}
-
-
-def _pair_cutoff(cutoff: Cutoff | Radii | None, closed: bool) -> Cutoff | Cutoffs:
-    if isinstance(cutoff, Cutoff):
-        return cutoff
-    if cutoff is None:
-        raise TypeError("a list has a cutoff or radii.")
-    return make_cutoffs(lax.stop_gradient(cutoff), closed)
-
-
-@functools.partial(compiled, static_argnames="closed")
-def _vectors(
-    idx: Array, count: Array, sources: Array, rows: Array, given: Cutoff | Radii | None, closed: bool
-) -> tuple[Array, Array]:
-    cutoff = _pair_cutoff(given, closed)
-    used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
-    neighbor = jnp.where(used, idx, 0)
-    mask = call_apart(is_pair_of, lax.stop_gradient(rows), lax.stop_gradient(sources), neighbor, used, cutoff)
-    return jnp.where(mask[..., None], sources[neighbor] - rows[:, None, :], 0), mask
-
-
-_ImagesMade = tuple[ImageCodes | None, tuple[Array, Array | None] | None]  # and where all were when a list with a skin was made
-
-
-class _Slots(NamedTuple):
-    """Of every slot: whether it is used, its source, x_j - x_i, and its lattice shift in whole floats; 0 where it is not used."""
-
-    used: Array
-    neighbor: Array
-    difference: Array
-    shifts: Array
-
-
-def _slots(idx: Array, count: Array, images: _ImagesMade, sources: Array, rows: Array, lattice: Lattice, half: bool) -> _Slots:
-    used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
-    neighbor = jnp.where(used, idx, 0)
-    difference = sources[neighbor] - rows[:, None, :]
-    codes, made = images
-    if codes is None:
-        shifts = nearest_shifts(difference, lattice)
-    else:
-        turns, query_turns = _turns_now(codes, made, sources, rows, lattice)
-        image = jnp.where(used, codes.codes.astype(jnp.int32), lattice.images.home)
-        shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)[image] + query_turns[:, None] - turns[neighbor]
-    kind = lattice.images
-    if half and kind.basis is not None:  # of an image of its own, a particle keeps the one ahead in the given vectors
-        own = neighbor == lax.broadcasted_iota(jnp.int32, idx.shape, 0)
-        shifts = jnp.where(own[..., None], forward_shifts(shifts, kind), shifts)
-    most = 2 * LARGEST_TURN + max(kind.reach)  # farther apart, nothing is decided exactly
-    used = used & (jnp.abs(shifts) <= most).all(axis=-1)
-    return _Slots(used, neighbor, difference, jnp.where(used[..., None], shifts, 0))
-
-
-@functools.partial(compiled, static_argnames=("kind", "half"))
-def _shifts(
-    idx: Array, count: Array, images: _ImagesMade, sources: Array, rows: Array, box: Box, kind: Images, half: bool
-) -> Array:
-    lattice = make_lattice(box, kind, np.dtype(sources.dtype))
-    return given_shifts(lax.stop_gradient(_slots(idx, count, images, sources, rows, lattice, half).shifts), kind)
-
-
-@functools.partial(compiled, static_argnames=("kind", "closed", "half"))
-def _periodic_vectors(
-    idx: Array,
-    count: Array,
-    images: _ImagesMade,
-    sources: Array,
-    rows: Array,
-    box: Box,
-    kind: Images,
-    given: Cutoff | Radii | None,
-    closed: bool,
-    half: bool,
-) -> tuple[Array, Array, Array]:
-    cutoff = _pair_cutoff(given, closed)
-    lattice = make_lattice(box, kind, np.dtype(sources.dtype))
-    used, neighbor, difference, shifts = _slots(idx, count, images, sources, rows, lattice, half)
-    fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
-    pairs = shifted_pairs(difference, shifts, lattice)
-    fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
-    mask = call_apart(is_pair_of, fixed_rows, fixed_sources, neighbor, used, cutoff, fixed_pairs)
-    return jnp.where(mask[..., None], pairs.vectors, 0), mask, shifts
-
-
-def _turns_now(
-    images: ImageCodes, made: tuple[Array, Array | None] | None, sources: Array, rows: Array, lattice: Lattice
-) -> tuple[Array, Array]:
-    """Return how many lattice vectors lie between the cell and the sources [n, d], and the rows [m, d]: whole floats.
-
-    They are those that the list was made with, and those by which a point has been moved since (`made`: where all were then), as
-    wrapping it does: the image that a code tells of is the same one before and after.
-    """
-    both = [images.turns] if images.query_turns is None else [images.turns, images.query_turns]
-    turns = [unpacked_turns(x, lattice.dim).astype(sources.dtype) for x in both]
-    if made is not None:
-        since = zip(turns, made, (sources, rows), strict=False)
-        turns = [x if before is None else x + turns_between(before, now, lattice) for x, before, now in since]
-    return turns[0], turns[-1]
-
-
-@compiled
-def norms(vectors: Array) -> Array:
-    largest = lax.stop_gradient(jnp.max(jnp.abs(vectors), axis=-1, initial=0))
-    apart = largest > 0
-    unit = jnp.where(apart, largest, 1)  # squares of very small or large lengths would leave the float range
-    square = jnp.sum((vectors / unit[..., None]) ** 2, axis=-1)
-    return jnp.where(apart, unit * jnp.sqrt(jnp.where(apart, square, 1)), 0)

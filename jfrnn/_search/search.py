@@ -1,31 +1,17 @@
 """The two public verbs: `search` and `count`."""
 
-from typing import Any, NamedTuple
-
 import jax
-import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._engine import Filter, Inputs, Kind, Options, checked_backend, choose_engine, count_rows
+from jfrnn._engine import Inputs, Options, count_rows
 from jfrnn._geometry import (
     Box,
-    checked_active,
-    checked_batch,
-    checked_box,
     checked_capacity,
-    checked_cutoff,
-    checked_flag,
-    checked_positions,
-    checked_radii,
-    checked_skin,
     checked_slack,
-    fixed_box,
-    images_of,
-    largest_known,
 )
-from jfrnn._search.neighbor_list import NeighborList, counted_capacity, found_fields, made_options
-from jfrnn._search.verlet import list_radius
+from jfrnn._search.neighbor_list import NeighborList, counted_capacity, found_fields
+from jfrnn._search.problem import checked_problem
 from jfrnn._tracing import call_apart, own_transfers
 
 
@@ -125,31 +111,16 @@ def search(
     >>> searched([[0.1, 0.1, 0.1], [2.9, 0.1, 0.1], [1.5, 0.1, 0.1]], [3.0, 2.0, 2.0]).count[:3]
     Array([1, 1, 0], dtype=int32)
     """
-    problem = checked_problem(
+    problem, inputs = checked_problem(
         positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, skin, active
     )
     slack = checked_slack(slack)
-    inputs, options = problem.inputs, problem.options
     if capacity is None:
-        capacity = _counted_capacity(inputs, options, slack)
+        capacity = _counted_capacity(inputs, problem.options, slack)
     capacity = checked_capacity(capacity)
     with own_transfers():
-        fields = call_apart(lambda inputs: found_fields(inputs, options, capacity, problem.skin > 0), inputs)
-    return NeighborList(
-        **fields,
-        cutoff=problem.radius,
-        skin=problem.skin,
-        half=options.filter.later_only,
-        include_self=queries is None and not options.filter.drop_self,
-        closed=options.closed,
-        own_queries=queries is not None,
-        masked=active is not None,
-        box_kind=options.images,
-        source_count=inputs.sources.shape[0],
-        dim=inputs.sources.shape[1],
-        dtype=np.dtype(inputs.sources.dtype),
-        backend=options.engine.name,
-    )
+        fields = call_apart(lambda inputs: found_fields(inputs, problem.options, capacity, problem.skin > 0), inputs)
+    return NeighborList(**fields, problem=problem)
 
 
 def count(
@@ -189,66 +160,11 @@ def count(
 
     Memory: as in `search`, without the list. Differentiable: no (integers). Jit: yes. vmap: yes.
     """
-    problem = checked_problem(positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, 0.0, active)
-    with own_transfers():
-        return call_apart(lambda inputs: count_rows(inputs, problem.options)[0], problem.inputs)
-
-
-class Problem(NamedTuple):
-    """What was asked for, checked."""
-
-    inputs: Inputs
-    options: Options
-    radius: float | None  # of a pair, without the skin; None where particles have their own
-    skin: float
-
-
-def checked_problem(
-    positions: Any,  # noqa: ANN401
-    cutoff: Any,  # noqa: ANN401
-    queries: Any,  # noqa: ANN401
-    box: Any,  # noqa: ANN401
-    batch: Any,  # noqa: ANN401
-    radius_rule: Any,  # noqa: ANN401
-    half: bool,
-    include_self: bool,
-    closed: bool,
-    backend: str,
-    skin: Any,  # noqa: ANN401
-    active: Any,  # noqa: ANN401
-) -> Problem:
-    """Check the arguments that all public verbs share."""
-    sources = checked_positions("positions", positions)
-    if queries is not None:
-        queries = checked_positions("queries", queries, like=sources)
-        for name, value in (("half", half), ("include_self", include_self)):
-            if checked_flag(name, value):
-                raise ValueError(f"{name}=True pairs particles with themselves or each other: it cannot be used with queries.")
-    active = None if active is None else checked_active(active, sources)
-    keep = Filter(
-        drop_self=queries is None and not checked_flag("include_self", include_self),
-        later_only=checked_flag("half", half),
+    problem, inputs = checked_problem(
+        positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, 0.0, active
     )
-    dtype = np.dtype(sources.dtype)
-    radii, closed = checked_radii(cutoff, radius_rule, sources, queries), checked_flag("closed", closed)
-    if radii is None:
-        radius = float(checked_cutoff(cutoff, dtype).radius)
-        skin = checked_skin(skin, radius, dtype)
-        reach = list_radius(radius, skin, dtype)
-    else:
-        if keep.later_only and radii.rule in ("gather", "scatter"):
-            raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
-        largest = largest_known(radii)
-        radius, skin = None, checked_skin(skin, largest or 0.0, dtype)
-        reach = None if largest is None else list_radius(largest, skin, dtype)
-    box = None if box is None else checked_box(box, sources)
-    kind = None if box is None else images_of(box, reach, dtype, sources.shape[0])
-    kind_of_search = Kind(periodic=box is not None, radii=radii is not None, batch=batch is not None)
-    engine = choose_engine(checked_backend(backend), sources, queries, kind_of_search)
-    systems = None if batch is None else checked_batch(batch, sources, queries)
-    list_cutoff, options = made_options(radii or reach, keep, kind, engine, dtype, closed, skin)
-    box = None if box is None else fixed_box(box, dtype)
-    return Problem(Inputs(sources, queries, active, box, list_cutoff, systems), options, radius, skin)
+    with own_transfers():
+        return call_apart(lambda inputs: count_rows(inputs, problem.options)[0], inputs)
 
 
 def _counted_capacity(inputs: Inputs, options: Options, slack: float) -> int:

@@ -6,9 +6,9 @@ from typing import Any
 import jax
 from jax import Array
 
-from jfrnn._engine import ARRAYS, Options, checked_backend, platform_of
+from jfrnn._engine import ARRAYS, Inputs, Options, checked_backend, platform_of
 from jfrnn._geometry import Box, checked_flag
-from jfrnn._search import NeighborList, Problem, checked_problem
+from jfrnn._search import NeighborList, checked_problem
 from jfrnn._tracing import on_device, own_transfers
 
 REDUCTIONS = ("sum", "max", "min")
@@ -124,11 +124,11 @@ def pair_sum(
             raise ValueError("cutoff must be given: only a list (neighbors=) has its own.")
         if checked_backend(backend) == "hashgrid":
             raise ValueError("backend='hashgrid' cannot sum over pairs: pass 'warp', 'jax', 'brute' or 'auto'.")
-        problem = checked_problem(
+        problem, inputs = checked_problem(
             positions, cutoff, queries, box, batch, radius_rule, False, include_self, closed, backend, 0.0, active
         )
         with own_transfers():
-            pairs = searched(problem.inputs, _with_engine(problem, backend))
+            pairs = searched(inputs, _with_engine(problem.options, inputs, backend))
     else:
         given = {"batch": batch is not None, "radius_rule": radius_rule != "gather", "include_self": include_self}
         given |= {"closed": closed, "active": active is not None, "backend": backend != "auto"}
@@ -146,15 +146,15 @@ def pair_sum(
         return reduced(fn, pairs, mine, theirs, reduce, symmetry, compensated)
 
 
-def _with_engine(problem: Problem, backend: str) -> Options:
+def _with_engine(options: Options, inputs: Inputs, backend: str) -> Options:
     """Return options with an engine that can answer; where "auto" was asked for, it may change with the term."""
     from jfrnn._sums.fused import refusal
 
-    (sources, queries, *_), options = problem.inputs, problem.options
+    sources, queries = inputs.sources, inputs.queries
     if not options.engine.translates:
         return options
     platform = platform_of(sources, sources if queries is None else queries)
-    reason = refusal(problem.inputs, platform)
+    reason = refusal(inputs, platform)
     if reason is not None and backend != "auto":
         raise ValueError(f"backend='warp' cannot sum over pairs {reason}: pass backend='jax'.")
     return options._replace(may_change=backend == "auto") if reason is None else options._replace(engine=ARRAYS)

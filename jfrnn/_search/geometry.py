@@ -1,0 +1,150 @@
+"""Where the neighbors of a list are: displacements, lattice shifts and which pairs are closer than the cutoff now."""
+
+import functools
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jfrnn._geometry import (
+    LARGEST_TURN,
+    Box,
+    Cutoff,
+    Cutoffs,
+    Images,
+    Lattice,
+    Radii,
+    forward_shifts,
+    given_shifts,
+    is_pair_of,
+    make_cutoffs,
+    make_lattice,
+    nearest_shifts,
+    shifted_pairs,
+    turns_between,
+    unpacked_turns,
+)
+from jfrnn._tracing import call_apart, compiled
+
+
+class ImageCodes(NamedTuple):
+    """Of which image of its source each slot tells, where the nearest is not the only one.
+
+    Attributes:
+        codes: shape [m, capacity], uint8 up to 256 images, int16 up to 32 768, else int32: which of the shifts within reach, of
+            wrapped particles. These shifts and turns count the vectors of `Images.basis`.
+        turns: shape [n], int32: how many lattice vectors each source was from the box when the list was made, packed.
+        query_turns: shape [m], int32, or None where the sources are the queries.
+    """
+
+    codes: Array
+    turns: Array
+    query_turns: Array | None
+
+
+ImagesMade = tuple[ImageCodes | None, tuple[Array, Array | None] | None]  # and where all were when a list with a skin was made
+
+
+def _pair_cutoff(cutoff: Cutoff | Radii | None, closed: bool) -> Cutoff | Cutoffs:
+    if isinstance(cutoff, Cutoff):
+        return cutoff
+    if cutoff is None:
+        raise TypeError("a list has a cutoff or radii.")
+    return make_cutoffs(lax.stop_gradient(cutoff), closed)
+
+
+@functools.partial(compiled, static_argnames="closed")
+def open_vectors(
+    idx: Array, count: Array, sources: Array, rows: Array, given: Cutoff | Radii | None, closed: bool
+) -> tuple[Array, Array]:
+    cutoff = _pair_cutoff(given, closed)
+    used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
+    neighbor = jnp.where(used, idx, 0)
+    mask = call_apart(is_pair_of, lax.stop_gradient(rows), lax.stop_gradient(sources), neighbor, used, cutoff)
+    return jnp.where(mask[..., None], sources[neighbor] - rows[:, None, :], 0), mask
+
+
+class _Slots(NamedTuple):
+    """Of every slot: whether it is used, its source, x_j - x_i, and its lattice shift in whole floats; 0 where it is not used."""
+
+    used: Array
+    neighbor: Array
+    difference: Array
+    shifts: Array
+
+
+def _find_slots(idx: Array, count: Array, images: ImagesMade, sources: Array, rows: Array, lattice: Lattice, half: bool) -> _Slots:
+    used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
+    neighbor = jnp.where(used, idx, 0)
+    difference = sources[neighbor] - rows[:, None, :]
+    codes, made = images
+    if codes is None:
+        shifts = nearest_shifts(difference, lattice)
+    else:
+        turns, query_turns = _turns_now(codes, made, sources, rows, lattice)
+        image = jnp.where(used, codes.codes.astype(jnp.int32), lattice.images.home)
+        shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)[image] + query_turns[:, None] - turns[neighbor]
+    kind = lattice.images
+    if half and kind.basis is not None:  # of an image of its own, a particle keeps the one ahead in the given vectors
+        own = neighbor == lax.broadcasted_iota(jnp.int32, idx.shape, 0)
+        shifts = jnp.where(own[..., None], forward_shifts(shifts, kind), shifts)
+    most = 2 * LARGEST_TURN + max(kind.reach)  # farther apart, nothing is decided exactly
+    used = used & (jnp.abs(shifts) <= most).all(axis=-1)
+    return _Slots(used, neighbor, difference, jnp.where(used[..., None], shifts, 0))
+
+
+@functools.partial(compiled, static_argnames=("kind", "half"))
+def lattice_shifts(
+    idx: Array, count: Array, images: ImagesMade, sources: Array, rows: Array, box: Box, kind: Images, half: bool
+) -> Array:
+    lattice = make_lattice(box, kind, np.dtype(sources.dtype))
+    return given_shifts(lax.stop_gradient(_find_slots(idx, count, images, sources, rows, lattice, half).shifts), kind)
+
+
+@functools.partial(compiled, static_argnames=("kind", "closed", "half"))
+def periodic_vectors(
+    idx: Array,
+    count: Array,
+    images: ImagesMade,
+    sources: Array,
+    rows: Array,
+    box: Box,
+    kind: Images,
+    given: Cutoff | Radii | None,
+    closed: bool,
+    half: bool,
+) -> tuple[Array, Array, Array]:
+    cutoff = _pair_cutoff(given, closed)
+    lattice = make_lattice(box, kind, np.dtype(sources.dtype))
+    used, neighbor, difference, shifts = _find_slots(idx, count, images, sources, rows, lattice, half)
+    fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
+    pairs = shifted_pairs(difference, shifts, lattice)
+    fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
+    mask = call_apart(is_pair_of, fixed_rows, fixed_sources, neighbor, used, cutoff, fixed_pairs)
+    return jnp.where(mask[..., None], pairs.vectors, 0), mask, shifts
+
+
+def _turns_now(
+    images: ImageCodes, made: tuple[Array, Array | None] | None, sources: Array, rows: Array, lattice: Lattice
+) -> tuple[Array, Array]:
+    """Return how many lattice vectors lie between the cell and the sources [n, d], and the rows [m, d]: whole floats.
+
+    They are those that the list was made with, and those by which a point has been moved since (`made`: where all were then), as
+    wrapping it does: the image that a code tells of is the same one before and after.
+    """
+    both = [images.turns] if images.query_turns is None else [images.turns, images.query_turns]
+    turns = [unpacked_turns(x, lattice.dim).astype(sources.dtype) for x in both]
+    if made is not None:
+        since = zip(turns, made, (sources, rows), strict=False)
+        turns = [x if before is None else x + turns_between(before, now, lattice) for x, before, now in since]
+    return turns[0], turns[-1]
+
+
+@compiled
+def norms(vectors: Array) -> Array:
+    largest = lax.stop_gradient(jnp.max(jnp.abs(vectors), axis=-1, initial=0))
+    apart = largest > 0
+    unit = jnp.where(apart, largest, 1)  # squares of very small or large lengths would leave the float range
+    square = jnp.sum((vectors / unit[..., None]) ** 2, axis=-1)
+    return jnp.where(apart, unit * jnp.sqrt(jnp.where(apart, square, 1)), 0)

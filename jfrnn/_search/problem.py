@@ -1,0 +1,134 @@
+"""What was asked: the arguments that all verbs share, checked, and what a list remembers of them."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from jax import Array
+
+from jfrnn._engine import Filter, Inputs, Kind, Options, checked_backend, choose_engine
+from jfrnn._geometry import (
+    Batch,
+    Box,
+    Images,
+    Radii,
+    checked_active,
+    checked_batch,
+    checked_box,
+    checked_cutoff,
+    checked_flag,
+    checked_positions,
+    checked_radii,
+    checked_skin,
+    fixed_box,
+    images_of,
+    largest_known,
+    make_cutoff,
+)
+from jfrnn._search.verlet import list_radius
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """What is static about a search and its list, apart from the capacity.
+
+    Attributes:
+        options: What engines are told.
+        cutoff: Of a pair [length], rounded to the dtype, without the skin; None where particles have their own.
+        skin: Extra shell [length].
+        own_queries: The rows belong to queries, not to the sources themselves.
+        masked: Particles may be inactive.
+        source_count: Number of sources.
+        dim: Axes of the positions.
+        dtype: Of the positions.
+    """
+
+    options: Options
+    cutoff: float | None
+    skin: float
+    own_queries: bool
+    masked: bool
+    source_count: int
+    dim: int
+    dtype: np.dtype
+
+    @property
+    def include_self(self) -> bool:
+        """Whether each particle is its own neighbor."""
+        return not self.own_queries and not self.options.filter.drop_self
+
+    def reach(self, radii: Radii | None) -> float | None:
+        """Return how far the list reaches, skin included; None where it is not known while tracing."""
+        largest = self.cutoff if radii is None else largest_known(radii)
+        return None if largest is None else list_radius(largest, self.skin, self.dtype)
+
+    def inputs(
+        self,
+        sources: Array,
+        queries: Array | None,
+        active: Array | None,
+        box: Box | None,
+        radii: Radii | None,
+        batch: Batch | None,
+    ) -> Inputs:
+        """Return the operands of this search for such particles."""
+        if radii is not None:
+            return Inputs(sources, queries, active, box, radii, batch)
+        if self.cutoff is None:
+            raise TypeError("a search needs a cutoff or radii.")
+        reach = list_radius(self.cutoff, self.skin, self.dtype)
+        return Inputs(sources, queries, active, box, make_cutoff(reach, self.dtype, self.options.closed), batch)
+
+    def with_images(self, images: Images | None) -> "Problem":
+        """Return the same problem with other images within reach."""
+        return dataclasses.replace(self, options=self.options._replace(images=images))
+
+
+def checked_problem(
+    positions: Any,  # noqa: ANN401
+    cutoff: Any,  # noqa: ANN401
+    queries: Any,  # noqa: ANN401
+    box: Any,  # noqa: ANN401
+    batch: Any,  # noqa: ANN401
+    radius_rule: Any,  # noqa: ANN401
+    half: bool,
+    include_self: bool,
+    closed: bool,
+    backend: str,
+    skin: Any,  # noqa: ANN401
+    active: Any,  # noqa: ANN401
+) -> tuple["Problem", Inputs]:
+    """Check the arguments that all public verbs share; return what is static of them, and the operands."""
+    sources = checked_positions("positions", positions)
+    if queries is not None:
+        queries = checked_positions("queries", queries, like=sources)
+        for name, value in (("half", half), ("include_self", include_self)):
+            if checked_flag(name, value):
+                raise ValueError(f"{name}=True pairs particles with themselves or each other: it cannot be used with queries.")
+    active = None if active is None else checked_active(active, sources)
+    keep = Filter(
+        drop_self=queries is None and not checked_flag("include_self", include_self),
+        later_only=checked_flag("half", half),
+    )
+    dtype = np.dtype(sources.dtype)
+    radii, closed = checked_radii(cutoff, radius_rule, sources, queries), checked_flag("closed", closed)
+    if radii is None:
+        radius = float(checked_cutoff(cutoff, dtype).radius)
+        skin = checked_skin(skin, radius, dtype)
+        largest = radius
+    else:
+        if keep.later_only and radii.rule in ("gather", "scatter"):
+            raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
+        radius, largest = None, largest_known(radii)
+        skin = checked_skin(skin, largest or 0.0, dtype)
+    reach = None if largest is None else list_radius(largest, skin, dtype)
+    box = None if box is None else checked_box(box, sources)
+    images = None if box is None else images_of(box, reach, dtype, sources.shape[0])
+    kind = Kind(periodic=box is not None, radii=radii is not None, batch=batch is not None)
+    engine = choose_engine(checked_backend(backend), sources, queries, kind)
+    systems = None if batch is None else checked_batch(batch, sources, queries)
+    options = Options(keep, engine, closed, 0.0 if radii is None else skin, images, reach if engine.static_radius else None)
+    shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}
+    problem = Problem(options, radius, skin, **shape, dim=sources.shape[1], dtype=dtype)
+    box = None if box is None else fixed_box(box, dtype)
+    return problem, problem.inputs(sources, queries, active, box, radii, systems)
