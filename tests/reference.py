@@ -109,17 +109,18 @@ def reference_images(
     zero = (0,) * dim
     found = set()
     for (i, (x, y, z)), (j, (u, v, w)) in product(starts.items(), ends.items()):
+        if queries is None and j < i:
+            continue  # the negative vectors of (j, i) are as long: they are added there
         for steps in _shifts((u - x, v - y, w - z), levels, limit):
             shift = zero
             if any(steps):
                 moved = dict(zip(axes, steps, strict=True))
                 shift = tuple(moved.get(k, 0) for k in range(dim))
-            if queries is None:
-                if i == j and shift == zero and not include_self:
-                    continue
-                if half and (j < i or (j == i and shift < zero)):
-                    continue
+            if queries is None and i == j and ((shift == zero and not include_self) or (half and shift < zero)):
+                continue
             found.add((i, j, shift))
+            if queries is None and i < j and not half:
+                found.add((j, i, tuple(-s for s in shift)))
     return found
 
 
@@ -273,8 +274,8 @@ def compare(found: Any, expected: Iterable[Pair]) -> tuple[set[Pair], set[Pair]]
     if isinstance(found, tuple) and len(found) == 2 and all(getattr(part, "ndim", 0) == 1 for part in found):
         found = zip(np.asarray(found[0]).tolist(), np.asarray(found[1]).tolist(), strict=True)
     pairs, wanted = [(int(i), int(j)) for i, j in found], set(expected)
-    _refuse_repeats(pairs)
-    return wanted - set(pairs), set(pairs) - wanted
+    once = _refuse_repeats(pairs)
+    return wanted - once, once - wanted
 
 
 def pairs_of(idx: Any, count: Any, n_sources: int) -> list[Pair]:
@@ -287,22 +288,25 @@ def pairs_of(idx: Any, count: Any, n_sources: int) -> list[Pair]:
         raise AssertionError(f"idx must be [n, capacity] and count [n]: got {idx.shape} and {count.shape}")
     if idx.dtype != np.int32 or count.dtype != np.int32:
         raise AssertionError(f"idx and count must be int32: got {idx.dtype} and {count.dtype}")
-    pairs: list[Pair] = []
-    for i, (row, used) in enumerate(zip(idx.tolist(), count.tolist(), strict=True)):
+    filled = np.arange(idx.shape[1]) < count[:, None]
+    strange = np.where(filled, (idx < 0) | (idx >= n_sources), idx != n_sources).any(axis=1) | (count < 0)
+    for i in np.flatnonzero(strange)[:1].tolist():
+        row, used = idx[i].tolist(), int(count[i])
         if used < 0:
             raise AssertionError(f"row {i} counts {used} neighbors")
         if any(not 0 <= j < n_sources for j in row[:used]):
             raise AssertionError(f"row {i} counts {used} neighbors of {n_sources} sources, but holds {row[:used]}")
-        if any(j != n_sources for j in row[used:]):
-            raise AssertionError(f"unused slots of row {i} must hold {n_sources}: got {row[used:]}")
-        pairs += [(i, j) for j in row[:used]]
+        raise AssertionError(f"unused slots of row {i} must hold {n_sources}: got {row[used:]}")
+    pairs = list(zip(np.nonzero(filled)[0].tolist(), idx[filled].tolist(), strict=True))
     _refuse_repeats(pairs)
     return pairs
 
 
-def _refuse_repeats(pairs: list[Pair]) -> None:
-    if len(set(pairs)) == len(pairs):
-        return
+def _refuse_repeats(pairs: list[Pair]) -> set[Pair]:
+    """Return the pairs as a set, if each stands there once."""
+    once = set(pairs)
+    if len(once) == len(pairs):
+        return once
     seen: set[Pair] = set()
     repeated = sorted({pair for pair in pairs if pair in seen or seen.add(pair)})
     raise AssertionError(f"found more than once: {repeated[:5]} ({len(repeated)} such pairs)")
