@@ -12,6 +12,8 @@ MOST_SECONDS ?= 20
 STAMP  := $(VENV)/.installed
 # What pip and setuptools say of themselves in every set-up: that there is a newer pip, that root installs, how an editable install works.
 PIP    := PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore PYTHONWARNINGS='ignore:Editable installation' $(PY) -m pip install --quiet
+# Where nothing may keep what Python compiles, each of the many processes that tests start compiles JAX anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: sweep sweeps peers notebooks test test-slow lint clean
 .DEFAULT_GOAL := test

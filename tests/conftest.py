@@ -9,13 +9,17 @@ import jax
 import numpy as np
 import pytest
 import warp
+from jax._src import compiler
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"  # in processes that tests start, as `_compiled_soon` in this one
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # to compile the sources of JAX takes each of them a second and a half
 gc.freeze()  # imported modules are no garbage; tracing makes many objects that stay: to look through them takes a tenth of the time
 gc.set_threshold(50_000, 20, 20)
 TESTS = count(1)
+XLA_FLAGS = os.environ.get("XLA_FLAGS", "")
+UNFUSED = {"xla_cpu_use_fusion_emitters": False}  # which write loops, and take most of the time of a compilation
 warp.config.log_level = warp.LOG_WARNING  # else it prints what it compiles, into doctests too
 
 
@@ -35,13 +39,36 @@ def _both_widths():
     jax.config.update("jax_enable_x64", True)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _quick_options():
+    """Return a function that asks for a quick compilation, as JAX asks for any, and processes that tests start do so, too.
+
+    None where this JAX knows of no such thing.
+    """
+    whole = getattr(compiler, "get_compile_options", None)
+    try:
+        jax.jit(lambda: 0, compiler_options=UNFUSED)()  # XLA_FLAGS are read here, and not again
+    except jax.errors.JaxRuntimeError:
+        return None
+    flags = " ".join(f"--{name}={str(value).lower()}" for name, value in UNFUSED.items())
+    os.environ["XLA_FLAGS"] = f"{XLA_FLAGS} {flags}"
+
+    def quick(*args, env_options_overrides=None, **kwargs):
+        return whole(*args, env_options_overrides=UNFUSED | (env_options_overrides or {}), **kwargs)
+
+    return whole and quick
+
+
 @pytest.fixture(autouse=True)
-def _compiled_soon(request, monkeypatch):
-    """Leave out what LLVM takes long for, but in slow tests, those of memory, and where the last digits of floats are tested."""
+def _compiled_soon(request, monkeypatch, _quick_options):
+    """Leave out what takes long to compile, but in slow tests, those of memory, and where the last digits of floats are tested."""
     marked = any(request.node.get_closest_marker(name) for name in ("slow", "fully_compiled"))
     fully = marked or "memory" in request.node.nodeid
     if fully:
         monkeypatch.delenv("JAX_DISABLE_MOST_OPTIMIZATIONS")
+        monkeypatch.setenv("XLA_FLAGS", XLA_FLAGS)
+    elif _quick_options:
+        monkeypatch.setattr(compiler, "get_compile_options", _quick_options)
     jax.config.update("jax_disable_most_optimizations", not fully)
     yield
     jax.config.update("jax_disable_most_optimizations", False)

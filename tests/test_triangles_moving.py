@@ -99,7 +99,7 @@ print(found[0][1].sum())
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_one_and_four_devices_find_the_same(backend):
     """Particles spread, the wall on every device: bit for bit."""
-    given = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
+    given = os.environ | {"XLA_FLAGS": os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=4"}
     run = subprocess.run([sys.executable, "-c", SPREAD, backend], env=given, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     assert int(run.stdout.split()[-1]) > 500
