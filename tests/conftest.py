@@ -21,6 +21,17 @@ TESTS = count(1)
 XLA_FLAGS = os.environ.get("XLA_FLAGS", "")
 UNFUSED = {"xla_cpu_use_fusion_emitters": False}  # which write loops, and take most of the time of a compilation
 warp.config.log_level = warp.LOG_WARNING  # else it prints what it compiles, into doctests too
+LONGEST = (  # files, those first that take longest: what is left at the end is short, and no worker waits for another's long file
+    *("hard_cases", "pair_sum", "experiments_sweep", "notebooks", "radii", "box", "triangles_closest", "search", "triangles"),
+    *("memory", "modes", "order", "verlet", "distributed", "batch", "reference", "cases_periodic", "transforms", "exports"),
+    *("experiments_sums", "experiments_distributed", "spread", "start", "travel", "house", "interrupts"),
+)
+
+
+def pytest_collection_modifyitems(items):
+    """Put the longest files first; their tests stay in order."""
+    place = {f"test_{name}.py": k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.name, len(place)))
 
 
 @pytest.fixture(autouse=True)
