@@ -12,7 +12,7 @@ DOMAIN = cases.Domain()
 
 
 def pairs_at(positions, radius):
-    return len(KDTree(positions).query_pairs(radius))
+    return len(KDTree(positions).query_pairs(radius, output_type="ndarray"))
 
 
 @pytest.mark.parametrize("name", ["turned", "tumbled", "cut", "grown"])
