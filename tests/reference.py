@@ -59,10 +59,11 @@ def reference_pairs(
     Floor is monotone and floor(t + 1) = floor(t) + 1, so the cells of a pair differ by at most one on every axis.
     """
     sources, asking = _clouds(positions, queries, half or include_self)
-    found = _within(_rounded(cutoff, sources.dtype), asking, sources, closed)
-    if queries is None:
-        found = ((i, j) for i, j in found if i < j or (i == j and include_self) or (i > j and not half))
-    return set(found)
+    radius = _rounded(cutoff, sources.dtype)
+    if queries is not None:
+        return set(_within(radius, asking, sources, closed))
+    found = {(i, j) for i, j in _within(radius, sources, sources, closed, once=True) if i < j or include_self}
+    return found if half else found | {(j, i) for i, j in found}
 
 
 def reference_images(
@@ -368,8 +369,11 @@ def _integers(cutoff: float, *clouds: np.ndarray) -> tuple[int, list[dict[int, l
     return top * (scale // bottom), scaled
 
 
-def _within(cutoff: float, queries: np.ndarray, sources: np.ndarray, closed: bool) -> Iterator[Pair]:
-    """Yield every (query, source) within the cutoff: by integer cells of that edge, then by squared distance."""
+def _within(cutoff: float, queries: np.ndarray, sources: np.ndarray, closed: bool, once: bool = False) -> Iterator[Pair]:
+    """Yield every (query i, source j) within the cutoff: by integer cells of that edge, then by squared distance.
+
+    `once` leaves out those with j < i: of points among themselves, they are as far apart as (j, i).
+    """
     edge, (asking, sites) = _integers(cutoff, queries, sources)
     cells: defaultdict[tuple[int, int, int], list[tuple[int, int, int, int]]] = defaultdict(list)
     for j, (x, y, z) in sites.items():
@@ -380,7 +384,7 @@ def _within(cutoff: float, queries: np.ndarray, sources: np.ndarray, closed: boo
         a, b, c = x // edge, y // edge, z // edge
         for da, db, dc in steps:
             for j, u, v, w in cells.get((a + da, b + db, c + dc), ()):
-                if (u - x) ** 2 + (v - y) ** 2 + (w - z) ** 2 <= limit:
+                if (j >= i or not once) and (u - x) ** 2 + (v - y) ** 2 + (w - z) ** 2 <= limit:
                     yield i, j
 
 
