@@ -22,7 +22,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry import Cutoff, limb_bits
-from jfrnn._tracing import set_places
+from jfrnn._tracing import first_set, set_places
 from jfrnn._triangles.integers import Shapes, bit_range, is_near, limb_counts
 
 ShapesAt = Callable[[Array], Shapes]
@@ -159,14 +159,23 @@ def _refine(open_pairs: Array, shapes_at: ShapesAt) -> Array:
 
 def _decided(state: Array, waiting: int, chunk: int, shapes_at: ShapesAt) -> Array:
     """Let integers decide [q] pairs that wait for these: 0 far, 1 near, or, where they are not wide enough, _WIDE."""
+    size = len(state)
 
-    def decide_chunk(state: Array) -> Array:
-        at = set_places(state == waiting, chunk)
-        shapes = shapes_at(jnp.minimum(at, state.size - 1))
+    def decide_chunk(carried: tuple[Array, Array]) -> tuple[Array, Array]:
+        state, first = carried
+        if waiting == _USUAL:
+            at = set_places(state == waiting, chunk)
+        else:  # so rare that looking for more than the first of them is not worth its kernels
+            at = jnp.minimum(first, size - chunk) + lax.iota(jnp.int32, chunk)
+            at = jnp.where(lax.dynamic_slice_in_dim(state, at[0], chunk) == waiting, at, size)
+        shapes = shapes_at(jnp.minimum(at, size - 1))
         usual, most = limb_counts(shapes.points.dtype)
         count = usual if waiting == _USUAL else most
         origin, width = bit_range(shapes)
         near = is_near(shapes, origin, count).astype(jnp.int32)
-        return state.at[at].set(jnp.where(width <= limb_bits(np.dtype(shapes.points.dtype)) * count, near, _WIDE), mode="drop")
+        fits = width <= limb_bits(np.dtype(shapes.points.dtype)) * count
+        state = state.at[at].set(jnp.where(fits, near, _WIDE), mode="drop")
+        return state, first_set(state == waiting, jnp.int32(-1))
 
-    return lax.while_loop(lambda state: jnp.any(state == waiting), decide_chunk, state)
+    start = state, first_set(state == waiting, jnp.int32(-1))
+    return lax.while_loop(lambda carried: carried[1] < size, decide_chunk, start)[0]

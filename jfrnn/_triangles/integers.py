@@ -15,15 +15,17 @@ takes, or, where exponents lie far apart, as the float format can take. The long
 takes up to 27 (float64: 82), is of 2·4·27 (2·4·82) of them: below 2^30.5 (2^61.5).
 """
 
-from typing import NamedTuple
+import functools
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._geometry import GUARDS, carried_limbs, fields_of, full_count, limb_product, limb_sign, limbs_of
+from jfrnn._geometry import GUARDS, carried_limbs, fields_of, full_count, limb_sign, limbs_of
 
 _NONE = 1 << 20  # beyond every place of a bit
+_MOST_PRODUCTS = 64  # of a round
 _USUAL_LIMBS = {4: 5, 8: 4}  # by bytes of a float: 55 and 104 bits from the highest to the lowest one set
 
 
@@ -59,59 +61,117 @@ def bit_range(shapes: Shapes) -> tuple[Array, Array]:
 def is_near(shapes: Shapes, origin: Array, count: int) -> Array:
     """Decide [k] pairs whose bits lie within `count` limbs from `origin` [k] on: is the triangle closer than the cutoff?"""
     dim = shapes.points.shape[0]
-    limbs = limbs_of(_numbers(shapes), count + 1, origin[None])  # one more for the sign
-    points, radius = limbs[:dim], limbs[-1:, :, GUARDS:]
-    corners = limbs[dim:-1].reshape(dim, dim, *points.shape[1:])
-    x = corners - points[None]  # [corner, axis, k, limbs]
-    vectors = carried_limbs(jnp.concatenate([x, jnp.roll(x, -1, axis=0) - x]))
-    return _near_triangle(vectors[:3], vectors[3:], radius) if dim == 3 else _near_segment(vectors[:2], vectors[2], radius)
+    numbers = _numbers(shapes)
+    points, corners, radius = np.tile(np.arange(dim), dim), np.arange(dim, dim + dim * dim), len(numbers) - 1
+    after = np.roll(corners.reshape(dim, dim), -1, axis=0).reshape(-1)
+    ends, starts = np.concatenate([corners, after, [radius, radius]]), np.concatenate([points, corners, [radius, radius]])
+    limbs, lower = (limbs_of(_rows(numbers, rows), count + 1, origin[None]) for rows in (ends, starts))  # one more for the sign
+    times = (np.arange(len(ends)) != len(ends) - 2).astype(limbs.dtype)[:, None, None]  # nothing is taken off the cutoff
+    vectors = carried_limbs(limbs - lower * times)
+    one = np.zeros((len(ends), 1, count + 1), limbs.dtype)
+    one[-1, 0, 0] = 1
+    vectors = vectors + one  # corners seen from the point, sides, the cutoff and one: [rows, k, limbs]
+    return _near_triangle(vectors) if dim == 3 else _near_segment(vectors)
 
 
-def _near_segment(x: Array, along: Array, radius: Array) -> Array:
+def _near_segment(vectors: Array) -> Array:
+    x, along, radius = vectors[:4].reshape(2, 2, *vectors.shape[1:]), vectors[4:6], vectors[-2:-1]
     sums = _dots([(x[0], x[0]), (x[1], x[1]), (x[0], along), (along, along)])
-    limit = limb_product(radius, radius)
+    limit = _product(radius, radius)
     square = jnp.stack([sums[0], sums[1]]) - limit
     place, length = -sums[2:3], sums[3:]
     square, place, length, rest = _split(carried_limbs(jnp.concatenate([square, place, length, length - place])), 2, 1, 1, 1)
-    beside = carried_limbs(limb_product(square[:1], length) - limb_product(place, place))
-    return _any_near(square, place, rest, beside)
+    beside = _product(square[:1], length) - _product(place, place)
+    return _near_parts(_signs(square), _signs(place), _signs(rest), limb_sign(beside))
 
 
-def _near_triangle(x: Array, along: Array, radius: Array) -> Array:
-    """Stack what is alike: three rounds of products, which compile in less time than a dozen."""
-    after, last = jnp.roll(x, -1, axis=0), jnp.roll(x, -2, axis=0)
-    one, two = [1, 2, 0], [2, 0, 1]
-    left = [x, x, along, after[:, one], after[:, two]]
-    right = [x, along, along, last[:, two], last[:, one]]
-    products = limb_product(jnp.stack(left), jnp.stack(right))  # [5, corner, axis, k, limbs]
-    sums = products[:3].sum(axis=2, dtype=x.dtype)
-    crosses = products[3] - products[4]
-    normal = crosses.sum(axis=0, dtype=x.dtype)
-    limit = limb_product(radius, radius)
-    parts = [sums[0] - limit, -sums[1], sums[2], sums[2] + sums[1], crosses.reshape(9, *limit.shape[1:]), normal, limit]
-    square, place, length, rest, crosses, normal, limit = _split(carried_limbs(jnp.concatenate(parts)), 3, 3, 3, 3, 9, 3, 1)
-    normals = jnp.concatenate([normal] * 3)
-    left = [square, place, crosses, normal, _widened(x[0], normal)]
-    right = [length, place, normals, normal, normal]
-    products = limb_product(jnp.concatenate(left), jnp.concatenate(right))
-    ahead, behind, inside, area, height = _split(products, 3, 3, 9, 3, 3)
-    inside = inside.reshape(3, 3, *inside.shape[1:]).sum(axis=1, dtype=x.dtype)
-    parts = [ahead - behind, inside, area.sum(axis=0, keepdims=True, dtype=x.dtype)]
-    parts.append(height.sum(axis=0, keepdims=True, dtype=x.dtype))
-    beside, inside, area, height = _split(carried_limbs(jnp.concatenate(parts)), 3, 3, 1, 1)
-    products = limb_product(jnp.concatenate([height, _widened(limit, area)]), jnp.concatenate([height, area]))
-    above = carried_limbs(products[:1] - products[1:])
-    *signs, inside, above = _signs(square, place, rest, beside, inside, above)
-    return _near_parts(*signs) | (jnp.all(inside > 0, axis=0) & (above[0] < 0))
+def _near_triangle(vectors: Array) -> Array:
+    """Decide in three rounds: products of rows of the round before, and sums of products, as tables say.
+
+    A table makes one kernel of what were dozens, which took XLA seconds to compile.
+    """
+    found, signs = vectors, []
+    for left, right, table in _triangle_rounds():
+        found = carried_limbs(_summed(table, _product(_rows(found, left), _rows(found, right))))
+        signs.append(_signs(found))
+    first, second, third = signs
+    near = _near_parts(first[0:3], first[3:6], first[9:12], second[:3])
+    return near | (jnp.all(second[3:6] > 0, axis=0) & (third[0] < 0))
 
 
-def _any_near(*parts: Array) -> Array:
-    return _near_parts(*_signs(*parts))
+def _rows(x: Array, which: np.ndarray) -> Array:
+    return x.at[which.astype(np.int32)].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def _summed(table: np.ndarray, products: Array) -> Array:
+    """Return sums [rows, k, limbs] of products [n, k, limbs]: of a table [rows, n] of 1, -1 and 0, what belongs to each."""
+    terms = int(np.abs(table).sum(axis=1).max())
+    which = np.argsort(table == 0, axis=1, kind="stable")[:, :terms]  # those that belong to it first
+    signs = np.take_along_axis(table, which, axis=1).astype(products.dtype)[:, :, None, None]
+    return (_rows(products, which) * signs).sum(axis=1, dtype=products.dtype)
+
+
+class _Table:
+    """Products that are to be computed, each of two rows, and sums of them: vectors of 1, -1 and 0."""
+
+    def __init__(self) -> None:
+        self.left: list[int] = []
+        self.right: list[int] = []
+
+    def dot(self, left: Any, right: Any, signs: Any = (1, 1, 1)) -> np.ndarray:  # noqa: ANN401
+        """Return the sum of the products of these rows."""
+        total = np.zeros(_MOST_PRODUCTS, np.int32)
+        for a, b, sign in zip(left, right, signs, strict=False):
+            total[len(self.left)] = sign
+            self.left.append(int(a))
+            self.right.append(int(b))
+        return total
+
+    def made(self, sums: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the rows of both factors of each product, and the table of sums."""
+        return np.array(self.left), np.array(self.right), np.stack(sums)[:, : len(self.left)]
+
+
+@functools.cache
+def _triangle_rounds() -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]:
+    """Return the products and sums of `_near_triangle`: of x, sides, the cutoff r and one, axis by axis, in 20 rows.
+
+    The first round makes |x|² - r², t, |d|², |d|² - t, x_j × x_k, n, r², x_0 and one; the second what decides sides and the inside,
+    then |n|², x_0·n and r²; the third (x_0·n)² - r² |n|².
+    """
+    x, along, axes = np.arange(9).reshape(3, 3), np.arange(9, 18).reshape(3, 3), ((1, 2), (2, 0), (0, 1))
+    table, of_corners = _Table(), range(3)
+    squares, places, lengths = ([table.dot(a[i], b[i]) for i in of_corners] for a, b in ((x, x), (x, along), (along, along)))
+    (limit,), one, seen = [table.dot([18], [18])], table.dot([19], [19]), [table.dot([row], [19]) for row in x[0]]
+    one_two = [(x[(i + 1) % 3], x[(i + 2) % 3]) for i in of_corners]
+    crosses = [[table.dot(a[[j, k]], b[[k, j]], (1, -1)) for j, k in axes] for a, b in one_two]
+    normal = [crosses[0][k] + crosses[1][k] + crosses[2][k] for k in range(3)]
+    sums = [*(s - limit for s in squares), *(-p for p in places), *lengths, *(q + p for q, p in zip(lengths, places, strict=True))]
+    first = table.made([*sums, *crosses[0], *crosses[1], *crosses[2], *normal, limit, *seen, one])
+    table, cross, normal = _Table(), np.arange(12, 21).reshape(3, 3), np.arange(21, 24)
+    beside = [table.dot([i, 3 + i], [6 + i, 3 + i], (1, -1)) for i in of_corners]
+    inside = [table.dot(cross[i], normal) for i in of_corners]
+    area, height = table.dot(normal, normal), table.dot(range(25, 28), normal)
+    second = table.made([*beside, *inside, area, height, table.dot([24], [28])])
+    table = _Table()
+    return first, second, table.made([table.dot([7, 8], [7, 6], (1, -1))])
 
 
 def _near_parts(square: Array, place: Array, rest: Array, beside: Array) -> Array:
     """Say where a vertex is near, or a side between its ends, of the signs of what decides it: [parts, k]."""
     return jnp.any(square < 0, axis=0) | jnp.any((place > 0) & (rest > 0) & (beside < 0), axis=0)
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Multiply as `limb_product`, limb by limb: in a fifth of the time where there are many rows, and a loop to compile."""
+    shape, width = jnp.broadcast_shapes(a.shape[:-1], b.shape[:-1]), b.shape[-1]
+
+    def add_moved(i: Array, total: Array) -> Array:
+        window = lax.dynamic_slice_in_dim(total, GUARDS + i, width, axis=-1)
+        more = lax.dynamic_slice_in_dim(a, i, 1, axis=-1) * b
+        return lax.dynamic_update_slice_in_dim(total, window + more, GUARDS + i, axis=-1)
+
+    return lax.fori_loop(0, a.shape[-1], add_moved, jnp.zeros((*shape, GUARDS + a.shape[-1] + width), a.dtype))
 
 
 def _numbers(shapes: Shapes) -> Array:
@@ -127,20 +187,13 @@ def _trailing_zeros(word: Array) -> Array:
 def _dots(pairs: list[tuple[Array, Array]]) -> Array:
     """Multiply pairs of vectors [axis, k, limbs]: [pairs, k, limbs]."""
     left, right = (jnp.stack(vectors) for vectors in zip(*pairs, strict=True))
-    return limb_product(left, right).sum(axis=1, dtype=left.dtype)
+    return _product(left, right).sum(axis=1, dtype=left.dtype)
 
 
 def _split(rows: Array, *sizes: int) -> list[Array]:
     return jnp.split(rows, np.cumsum(sizes)[:-1])
 
 
-def _widened(x: Array, like: Array) -> Array:
-    return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, like.shape[-1] - x.shape[-1])])
-
-
-def _signs(*parts: Array) -> list[Array]:
-    """Return the signs of numbers [rows, k, limbs], carried and of any widths: [rows, k] each."""
-    widest = max(parts, key=lambda part: part.shape[-1])
-    rows = jnp.concatenate([_widened(part, widest) for part in parts])
-    rows = jnp.pad(rows, ((0, 0), (0, 0), (GUARDS, 0)))
-    return _split(limb_sign(rows), *(part.shape[0] for part in parts))
+def _signs(rows: Array) -> Array:
+    """Return the signs of carried numbers [rows, k, limbs]: [rows, k]."""
+    return limb_sign(jnp.pad(rows, ((0, 0), (0, 0), (GUARDS, 0))))
