@@ -230,3 +230,17 @@ def test_vectors_are_few_kernels(box, most):
     text = jax.jit(lambda x: nbrs.vectors(x)).lower(x).compile().as_text()
     assert text is not None
     assert text.count(" fusion(") <= most
+
+
+def test_kernels_of_many_cutoffs_are_let_go(monkeypatch):
+    """Programs that call a kernel which was let go go on: it is made again."""
+    from jfrnn._engine import launch
+
+    monkeypatch.setattr(launch, "_MOST", 3)
+    x = scene(38)
+    searches = [jax.jit(lambda x, r=r: jfrnn.search(x, r, capacity=16, backend="hashgrid").count) for r in (0.3, 0.4, 0.5, 0.6)]
+    counts = [np.asarray(search(x)) for search in searches]
+    assert len(launch._served) == 3
+    for search, count in zip(searches, counts, strict=True):
+        np.testing.assert_array_equal(search(x), count)
+    assert len(launch._served) == 3

@@ -42,7 +42,9 @@ class Kernel(NamedTuple):
 
 
 _makers: dict[str, Callable[..., Any]] = {}
-_served: dict[bytes, Serve] = {}  # by names, as long as the process: nobody knows which programs are still kept
+_MOST = 512  # kernels that are kept, as many as compiled programs: what a program calls that is gone is made again
+_served: dict[bytes, Serve] = {}  # by names, those that were made last at the end
+_keeping = threading.Lock()
 
 
 def kernel(make: Callable[..., Kernel]) -> Callable[..., Callable[..., Any]]:
@@ -52,13 +54,12 @@ def kernel(make: Callable[..., Kernel]) -> Callable[..., Callable[..., Any]]:
     """
     place = f"{make.__module__}.{make.__name__}"
 
-    @functools.cache
     @functools.wraps(make)
     def made(*arguments: Any) -> Callable[..., Any]:  # noqa: ANN401
         return apart(functools.partial(_made, make, place, arguments))
 
     _makers[place] = made
-    return made
+    return functools.lru_cache(_MOST)(made)
 
 
 def _made(make: Callable[..., Kernel], place: str, arguments: tuple[Any, ...]) -> Callable[..., Any]:
@@ -67,8 +68,16 @@ def _made(make: Callable[..., Kernel], place: str, arguments: tuple[Any, ...]) -
     found = make(*arguments)
     name = f"{found.name}@{_sources()}"
     recipe = json.dumps([place, _encoded(arguments)])
-    _served[name.encode()] = found.serve
+    _keep(name.encode(), found.serve)
     return functools.partial(_call, found, name, recipe)
+
+
+def _keep(name: bytes, serve: Serve) -> None:
+    with _keeping:
+        _served.pop(name, None)
+        _served[name] = serve
+        while len(_served) > _MOST:
+            _served.pop(next(iter(_served)))
 
 
 def _call(found: Kernel, name: str, recipe: str, *inputs: Array, output_dims: dict[str, Any]) -> Sequence[Array]:
@@ -136,13 +145,13 @@ def _server_of(frame: CallFrame) -> Serve:
     if known is not None:
         return known
     name = frame.text(b"kernel")
-    if name not in _served:
+    while (known := _served.get(name)) is None:
         _make_again(name.decode(), frame.text(b"recipe").decode())
-    return _served[name]
+    return known
 
 
 def _make_again(name: str, recipe: str) -> None:
-    """Make a kernel of a program that this process has not traced."""
+    """Make a kernel of a program that this process has not traced, or that was not among the last ones."""
     if not name.endswith(f"@{_sources()}"):
         raise RuntimeError("this program was made with another version of jfrnn. Export or compile it again with this one.")
     place, arguments = json.loads(recipe)
