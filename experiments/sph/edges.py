@@ -6,7 +6,7 @@ are summed. Source: Toshev et al. (2024), arXiv:2403.04750; https://github.com/t
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,33 +14,9 @@ import numpy as np
 from jax import Array
 
 import jfrnn
-
-if TYPE_CHECKING:
-    from experiments.sph.model import Model, State
+from experiments.sph.particles import Model, State
 
 _SLACK = 1.25  # room for more edges, as jax-sph has it
-
-
-class Edges(Protocol):
-    """Edges (i, j) that follow positions; some may lead from n to n, and are no pairs."""
-
-    @property
-    def overflow(self) -> Array:
-        """Whether edges are missing, shape [], bool."""
-        ...
-
-    @property
-    def rebuild_count(self) -> Array:
-        """How often they were made anew, shape [], int32."""
-        ...
-
-    def update(self, positions: Array, *, active: Array | None = None) -> Any:  # noqa: ANN401
-        """Return the edges at these positions [m], shape [n, d]."""
-        ...
-
-    def sum(self, fn: Callable[[Array, Any, Any], Any], positions: Array, values: Any) -> Any:  # noqa: ANN401
-        """Sum fn(r, values of i, values of j) over the edges of each i, leaves [n, ...]."""
-        ...
 
 
 def _summed(fn: Callable[[Array, Any, Any], Any], x: Array, values: Any, i: Array, j: Array) -> Any:  # noqa: ANN401
@@ -126,14 +102,14 @@ class JaxMdEdges:
         return _summed(fn, positions, values, i, j)
 
 
-def of_own_list(model: "Model", s: "State", skin: float) -> OwnEdges:
+def of_own_list(model: Model, s: State, skin: float) -> OwnEdges:
     """Return edges of a list of jfrnn with a skin [m]."""
     nbrs = jfrnn.search(s.x, model.cutoff, skin=skin, slack=_SLACK)
     i, j = nbrs.pairs(round(_SLACK * int(np.asarray(nbrs.count).sum(dtype=np.int64))))
     return OwnEdges(nbrs, i, j)
 
 
-def of_jax_md(model: "Model", s: "State", skin: float) -> JaxMdEdges:
+def of_jax_md(model: Model, s: State, skin: float) -> JaxMdEdges:
     """Return edges of jax-md with a skin [m]; 0: made anew in every step, as jax-sph does.
 
     Raises:

@@ -8,10 +8,9 @@ from jax import Array
 
 import jfrnn
 from experiments.sph import correction, density, solids, states, surface, transport, viscosity, walls
-from experiments.sph.edges import Edges
 from experiments.sph.kernels import KERNELS
 from experiments.sph.model import Model, State
-from experiments.sph.pairs import Pair, Term, Values, total
+from experiments.sph.pairs import Edges, Pair, Term, Values, total
 from experiments.sph.pressure import PRESSURES
 
 Neighbors = jfrnn.NeighborList | Edges | None

@@ -1,98 +1,23 @@
-"""What a scene is made of once it is in JAX: a model, which stays, and a state, which moves. Both are pytrees."""
+"""The first model and state of a scene: what acts in it, and its particles, put into JAX."""
 
-from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
 
 import jfrnn
 from experiments.sph import solids
-from experiments.sph.kernels import KERNELS, Kernel
+from experiments.sph.kernels import KERNELS
 from experiments.sph.pairs import reach
+from experiments.sph.particles import Model, State
 
 if TYPE_CHECKING:
-    from jfrnn.cases.fluids import FluidScene, Physics, Turning  # pyright: ignore[reportMissingImports]
+    from jfrnn.cases.fluids import FluidScene, Physics  # pyright: ignore[reportMissingImports]
 
-jax.tree_util.register_dataclass(
-    fluids.Physics,
-    data_fields=[item.name for item in fields(fluids.Physics) if item.name not in fluids.WORDS],
-    meta_fields=list(fluids.WORDS),
-)
-jax.tree_util.register_dataclass(fluids.Turning, data_fields=["center", "axis", "rate"], meta_fields=[])
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Model:
-    """What acts on which particles. Whatever is None is no part of the compiled program.
-
-    Attributes:
-        physics: `cases.fluids.Physics`; its words are static, its numbers may be traced.
-        m: Masses [kg], shape [n].
-        wall: Which particles are dummies of a wall, shape [n], bool.
-        box: Periodic box.
-        tank: Lower and upper corner [m] of a tank, shape [d] each.
-        enters: When each particle enters [s], shape [n].
-        step: Time step [s]; None: the Courant condition gives it.
-        guided: How long a particle that entered keeps its velocity [s], shape [].
-        spacing: Particle distance [m]. Static.
-        fluid_count: How many particles stand before those of walls; None where there are no walls, or among the fluid. Static.
-        backend: Of `jfrnn.pair_sum`. Static.
-        turning: How the wall of triangles turns; None: it stays, or there is none.
-    """
-
-    physics: "Physics"
-    m: Array
-    wall: Array | None
-    box: jfrnn.Box | None
-    tank: tuple[Array, Array] | None
-    enters: Array | None
-    step: Array | None
-    guided: Array | None
-    spacing: float = field(metadata={"static": True})
-    fluid_count: int | None = field(metadata={"static": True})
-    backend: str = field(default="auto", metadata={"static": True})
-    turning: "Turning | None" = None
-
-    @property
-    def kernel(self) -> Kernel:
-        """The smoothing kernel."""
-        return KERNELS[self.physics.kernel]
-
-    @property
-    def cutoff(self) -> float:
-        """Interaction radius of pairs [m]: that of the kernel and a little more, see `pairs.reach`."""
-        return reach(self.kernel, self.physics.smoothing)
-
-
-class State(NamedTuple):
-    """What moves. Fields that the scene has no use for are None.
-
-    Attributes:
-        x: Positions [m], shape [n, d].
-        v: Velocities [m/s], shape [n, d]; of "leapfrog" half a step behind.
-        time: [s], shape [].
-        a: Accelerations of the last evaluation [m/s²], shape [n, d].
-        last: Step before this one [s], shape []; 0 at first.
-        rho: Carried densities [kg/m³], shape [n].
-        p: Carried pressures [Pa], shape [n].
-        w: Velocities with which particles move besides v [m/s], shape [n, d].
-        solid: The wall of triangles as particles see it.
-    """
-
-    x: Array
-    v: Array
-    time: Array
-    a: Array
-    last: Array
-    rho: Array | None = None
-    p: Array | None = None
-    w: Array | None = None
-    solid: solids.Beside | None = None
+__all__ = ["Model", "State", "make_model", "make_state"]
 
 
 def make_model(scene: "FluidScene", dtype: type = np.float64, backend: str = "auto") -> Model:

@@ -2,19 +2,40 @@
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import jax.numpy as jnp
 from jax import Array
 
 import jfrnn
-from experiments.sph.edges import Edges
 from experiments.sph.kernels import Kernel
 
 Values = dict[str, Array]
 """What is known of each particle: m [kg], rho [kg/m³], volume m/rho, specific 1/rho, p [Pa], v, u, w [m/s], wall, inverse."""
 Term = Callable[["Pair", Values, Values], Any]
 _BEYOND = 1 + 2**-12  # a lattice has many pairs at exactly the support, which take long to decide (10 times the sum) and add 0
+
+
+class Edges(Protocol):
+    """Edges (i, j) that follow positions; some may lead from n to n, and are no pairs."""
+
+    @property
+    def overflow(self) -> Array:
+        """Whether edges are missing, shape [], bool."""
+        ...
+
+    @property
+    def rebuild_count(self) -> Array:
+        """How often they were made anew, shape [], int32."""
+        ...
+
+    def update(self, positions: Array, *, active: Array | None = None) -> Any:  # noqa: ANN401
+        """Return the edges at these positions [m], shape [n, d]."""
+        ...
+
+    def sum(self, fn: Callable[[Array, Any, Any], Any], positions: Array, values: Any) -> Any:  # noqa: ANN401
+        """Sum fn(r, values of i, values of j) over the edges of each i, leaves [n, ...]."""
+        ...
 
 
 class Pair:
@@ -62,7 +83,7 @@ def total(
     values: Values,
     kernel: Kernel,
     h: float,
-    nbrs: "jfrnn.NeighborList | Edges | None" = None,
+    nbrs: jfrnn.NeighborList | Edges | None = None,
     **options: Any,  # noqa: ANN401
 ) -> Any:  # noqa: ANN401
     """Sum a term over the neighbors of each particle.

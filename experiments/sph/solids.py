@@ -22,33 +22,14 @@ from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
 import jfrnn
 from experiments.sph.kernels import KERNELS, Kernel
 from experiments.sph.pairs import reach
+from experiments.sph.particles import Beside, Model, State
 
 if TYPE_CHECKING:
     from jfrnn.cases.fluids import FluidScene, Turning  # pyright: ignore[reportMissingImports]
 
-    from experiments.sph.model import Model, State
-
 GAP = 0.2  # particle spacings: on a lattice, particles at a wall are half a spacing away
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _PLACES, _SHARES = (_NODES + 1) / 2, _WEIGHTS / 2
-
-
-class Beside(NamedTuple):
-    """The wall as particles see it, where they are.
-
-    Attributes:
-        tri: Triangles that are near, in the frame of the wall.
-        angle: By which it has turned [rad], shape []; None: it stands.
-        mask: It is within reach, shape [n], bool.
-        distance: To it [m], shape [n].
-        normal: Away from it, of unit length, in its frame, shape [n, d].
-    """
-
-    tri: jfrnn.TriangleList
-    angle: Array | None
-    mask: Array
-    distance: Array
-    normal: Array
 
 
 def begin(scene: "FluidScene", x: Array, angle: Array | None = None) -> Beside | None:
@@ -127,7 +108,7 @@ def _across(r: Array, turning: "Turning") -> Array:
     return jnp.stack([-r[:, 1], r[:, 0]], axis=1) if turning.axis is None else jnp.cross(turning.axis, r)
 
 
-def keep_out(model: "Model", s: "State", x: Array, v: Array, dt: Array, rests: Array | None) -> "State":
+def keep_out(model: Model, s: State, x: Array, v: Array, dt: Array, rests: Array | None) -> State:
     """Return the state after a step, at positions near x that are outside of the wall; see the head of this file.
 
     A particle that meets the wall loses the velocity toward it, one that stays with it takes its velocity.
@@ -220,7 +201,7 @@ class _Acting(NamedTuple):
     acceleration: Array | None
 
 
-def _acting(model: "Model", s: "State", beside: Beside) -> _Acting:
+def _acting(model: Model, s: State, beside: Beside) -> _Acting:
     mask = beside.mask if model.enters is None else beside.mask & (s.time >= model.enters)
     distance = jnp.where(mask, jnp.maximum(beside.distance, 0), 0)
     sums = missing(model.kernel, distance, model.physics.smoothing, s.x.shape[1])
@@ -232,13 +213,13 @@ def _acting(model: "Model", s: "State", beside: Beside) -> _Acting:
     return _Acting(area, weight, distance, normal, s.v - velocity, turning.rate * _across(velocity, turning))
 
 
-def compression(model: "Model", s: "State", beside: Beside, rho: Array) -> Array:
+def compression(model: Model, s: State, beside: Beside, rho: Array) -> Array:
     """Return what the wall adds to dρ/dt [kg/m³/s], shape [n]: -ρ A (v - v_wall)·n."""
     wall = _acting(model, s, beside)
     return -rho * wall.area * jnp.sum(wall.slip * wall.normal, axis=1)
 
 
-def push(model: "Model", s: "State", beside: Beside, rho: Array, p: Array) -> Array:
+def push(model: Model, s: State, beside: Beside, rho: Array, p: Array) -> Array:
     """Return what the wall adds to accelerations [m/s²], shape [n, d].
 
     Pressure: 2p/ρ A n - (g - a_wall)·n (d A + Γ) n, the wall's pressure being that of the particle, carried on by what acts on the
@@ -260,7 +241,7 @@ def push(model: "Model", s: "State", beside: Beside, rho: Array, p: Array) -> Ar
     return a
 
 
-def rim_speed(model: "Model", beside: Beside) -> Array:
+def rim_speed(model: Model, beside: Beside) -> Array:
     """Return the largest speed of the wall [m/s], shape []."""
     corners = beside.tri.vertices
     if model.turning is None:
@@ -268,7 +249,7 @@ def rim_speed(model: "Model", beside: Beside) -> Array:
     return jnp.abs(model.turning.rate) * jnp.max(jnp.linalg.norm(corners - model.turning.center, axis=1))
 
 
-def clearance(scene: "FluidScene", s: "State") -> np.ndarray | None:
+def clearance(scene: "FluidScene", s: State) -> np.ndarray | None:
     """Return the signed distances [m] of the fluid to the solid of its scene, shape [n], infinite where it is beyond reach.
 
     Triangles are searched and distances computed anew, at the positions of the state.

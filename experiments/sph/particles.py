@@ -1,0 +1,110 @@
+"""What a scene is made of once it is in JAX: a model, which stays, and a state, which moves. Both are pytrees."""
+
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+from jax import Array
+from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
+
+import jfrnn
+from experiments.sph.kernels import KERNELS, Kernel
+from experiments.sph.pairs import reach
+
+if TYPE_CHECKING:
+    from jfrnn.cases.fluids import Physics, Turning  # pyright: ignore[reportMissingImports]
+
+jax.tree_util.register_dataclass(
+    fluids.Physics,
+    data_fields=[item.name for item in fields(fluids.Physics) if item.name not in fluids.WORDS],
+    meta_fields=list(fluids.WORDS),
+)
+jax.tree_util.register_dataclass(fluids.Turning, data_fields=["center", "axis", "rate"], meta_fields=[])
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Model:
+    """What acts on which particles. Whatever is None is no part of the compiled program.
+
+    Attributes:
+        physics: `cases.fluids.Physics`; its words are static, its numbers may be traced.
+        m: Masses [kg], shape [n].
+        wall: Which particles are dummies of a wall, shape [n], bool.
+        box: Periodic box.
+        tank: Lower and upper corner [m] of a tank, shape [d] each.
+        enters: When each particle enters [s], shape [n].
+        step: Time step [s]; None: the Courant condition gives it.
+        guided: How long a particle that entered keeps its velocity [s], shape [].
+        spacing: Particle distance [m]. Static.
+        fluid_count: How many particles stand before those of walls; None where there are no walls, or among the fluid. Static.
+        backend: Of `jfrnn.pair_sum`. Static.
+        turning: How the wall of triangles turns; None: it stays, or there is none.
+    """
+
+    physics: "Physics"
+    m: Array
+    wall: Array | None
+    box: jfrnn.Box | None
+    tank: tuple[Array, Array] | None
+    enters: Array | None
+    step: Array | None
+    guided: Array | None
+    spacing: float = field(metadata={"static": True})
+    fluid_count: int | None = field(metadata={"static": True})
+    backend: str = field(default="auto", metadata={"static": True})
+    turning: "Turning | None" = None
+
+    @property
+    def kernel(self) -> Kernel:
+        """The smoothing kernel."""
+        return KERNELS[self.physics.kernel]
+
+    @property
+    def cutoff(self) -> float:
+        """Interaction radius of pairs [m]: that of the kernel and a little more, see `pairs.reach`."""
+        return reach(self.kernel, self.physics.smoothing)
+
+
+class Beside(NamedTuple):
+    """The wall as particles see it, where they are.
+
+    Attributes:
+        tri: Triangles that are near, in the frame of the wall.
+        angle: By which it has turned [rad], shape []; None: it stands.
+        mask: It is within reach, shape [n], bool.
+        distance: To it [m], shape [n].
+        normal: Away from it, of unit length, in its frame, shape [n, d].
+    """
+
+    tri: jfrnn.TriangleList
+    angle: Array | None
+    mask: Array
+    distance: Array
+    normal: Array
+
+
+class State(NamedTuple):
+    """What moves. Fields that the scene has no use for are None.
+
+    Attributes:
+        x: Positions [m], shape [n, d].
+        v: Velocities [m/s], shape [n, d]; of "leapfrog" half a step behind.
+        time: [s], shape [].
+        a: Accelerations of the last evaluation [m/s²], shape [n, d].
+        last: Step before this one [s], shape []; 0 at first.
+        rho: Carried densities [kg/m³], shape [n].
+        p: Carried pressures [Pa], shape [n].
+        w: Velocities with which particles move besides v [m/s], shape [n, d].
+        solid: The wall of triangles as particles see it.
+    """
+
+    x: Array
+    v: Array
+    time: Array
+    a: Array
+    last: Array
+    rho: Array | None = None
+    p: Array | None = None
+    w: Array | None = None
+    solid: Beside | None = None
