@@ -1,13 +1,12 @@
-"""The command line: sweeps, scenes, questions of one table each; the solver's commands are in `experiments._cli_sph`."""
+"""The command line: sweeps, scenes, and groups of commands that are imported when they are asked for."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from experiments import _cli_sph, _commands
+from experiments import _commands
 from experiments._commands import (
-    MOST_POINTS,
     Dim,
     Fill,
     Layout,
@@ -15,7 +14,6 @@ from experiments._commands import (
     RowsFolder,
     Seed,
     Spacing,
-    finite,
     positive,
     stoppable,
     take_file,
@@ -24,15 +22,44 @@ from experiments._commands import (
 )
 from experiments._errors import UsageError
 
-SWEEPS, SCENES, QUESTIONS, DEVICES = "sweeps", "scenes", "questions", "devices"
-ENGINES = ("auto", "jax", "warp", "brute")
-WALLS = ("warp", "bvh", "jax")
 app = typer.Typer(cls=_commands.Commands, no_args_is_help=True, add_completion=False, rich_markup_mode=None)
 
-Rounds = Annotated[int, typer.Option(min=2, max=100_000, help="Timed runs of each.")]
+
+class Bench(_commands.Commands):
+    """Questions of one table each."""
+
+    there = {  # noqa: RUF012
+        name.removesuffix("_report"): (f"experiments.bench.{name}", "command", text)
+        for name, text in {
+            "crossover": "Time the backends over sizes.",
+            "distributed": "Time lists, sums and fluids on 1 to k devices.",
+            "domain": "Time what empty space costs.",
+            "options": "Time each option of a search.",
+            "peers": "Ask other libraries for the hard cases.",
+            "skin": "Time a list that is kept while particles move.",
+            "sums_report": "Measure one sum over neighbors in many ways.",
+            "ties": "Time lattices full of exact ties.",
+            "triangles": "Time the triangles that are near particles.",
+            "use": "Time what uses a list: sorted particles, compressed rows.",
+        }.items()
+    }
 
 
-@app.command(rich_help_panel=SWEEPS, short_help="Run a sweep, or go on with it.")
+class Sph(_commands.Commands):
+    """The fluid solver."""
+
+    there = {  # noqa: RUF012
+        name: ("experiments.sph.commands", name, text)
+        for name, text in {
+            "run": "Run a fluid scene, or go on with it.",
+            "validate": "Run fluid scenes with known answers.",
+            "speed": "Time steps of a fluid scene.",
+            "gradients": "Solve inverse problems by gradients.",
+        }.items()
+    }
+
+
+@app.command(short_help="Run a sweep, or go on with it.")
 def run(
     config: Annotated[Path, typer.Argument(help="Sweep config, TOML.")],
     out: RowsFolder = None,
@@ -66,16 +93,16 @@ def _read_shard(text: str) -> tuple[int, int]:
     return int(part), int(parts)
 
 
-@app.command(rich_help_panel=SWEEPS, short_help="Print the table of a sweep, draw its pictures.")
-def report(folder: Annotated[Path, typer.Argument(help="Folder of a sweep.")]) -> None:
-    """Print a short table of a sweep; write the whole one, beside the thesis's, and draw its pictures."""
+@app.command(short_help="Print the tables of a folder of rows, draw pictures.")
+def report(folder: Annotated[Path, typer.Argument(help="Folder with rows.jsonl.")]) -> None:
+    """Print the table of what was measured, and write it and pictures beside the rows: of a sweep, beside the thesis's figures."""
     with usage_errors():
-        from experiments import _report
+        from experiments import _reports
 
-        _report.report(folder)
+        _reports.report(folder)
 
 
-@app.command(rich_help_panel=SWEEPS, short_help="Put rows of shards, or of machines, together.")
+@app.command(short_help="Put rows of shards, or of machines, together.")
 def merge(
     out: Annotated[Path, typer.Argument(help="Folder that takes the rows.")],
     parts: Annotated[list[Path] | None, typer.Argument(help="Folders with rows; all OUT/shard-* without.")] = None,
@@ -88,23 +115,7 @@ def merge(
         typer.echo(f"{came} rows came; all are in {out / 'rows.jsonl'}")
 
 
-@app.command(rich_help_panel=SWEEPS, short_help="Measure one sum over neighbors in many ways.")
-def sums(
-    config: Annotated[Path, typer.Argument(help="Config of sums, TOML.")] = Path("experiments/configs/sums.toml"),
-    out: RowsFolder = None,
-    retry_failed: RetryFailed = False,
-) -> None:
-    """Measure one sum over neighbors in many ways, or go on with it; then print a table, and draw pictures beside the rows."""
-    with usage_errors():
-        from experiments import _config, _sums, _sums_report
-
-        given, folder = _config.load(config, _sums.Config), take_folder(out or Path("out") / config.stem)
-        with stoppable():
-            rows = _sums.run(given, folder, retry_failed)
-        typer.echo(_sums_report.report(rows, folder))
-
-
-@app.command(name="list", rich_help_panel=SCENES, short_help="Say what there is, and what a scene can be told.")
+@app.command(name="list", short_help="Say what there is, and what a scene can be told.")
 def list_names(
     scene: Annotated[str | None, typer.Argument(help="Fluid scene whose settings are asked for; all names without.")] = None,
 ) -> None:
@@ -115,7 +126,7 @@ def list_names(
         typer.echo(_list.names() if scene is None else _list.scene(scene))
 
 
-@app.command(rich_help_panel=SCENES, short_help="Draw a layout.")
+@app.command(short_help="Draw a layout.")
 def show(
     layout: Layout,
     fill: Fill = None,
@@ -134,7 +145,7 @@ def show(
         typer.echo(_show.draw(scene, take_file(path)))
 
 
-@app.command(rich_help_panel=SCENES, short_help="Write the points of a layout to a file.")
+@app.command(short_help="Write the points of a layout to a file.")
 def export(
     layout: Layout,
     out: Annotated[Path, typer.Option(help="File: .csv, .vtp or .vtk.")],
@@ -154,184 +165,26 @@ def export(
         typer.echo(_export.write(scene, take_file(out), counts))
 
 
-_cli_sph.add_to(app)
+_BENCH = typer.Typer(cls=Bench, no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(_BENCH, name="bench", short_help="Answer a question with a table: bench NAME.")
 
 
-@app.command(rich_help_panel=QUESTIONS, short_help="Time what empty space costs.")
-def domain(
-    separations: Annotated[
-        list[float] | None, typer.Argument(callback=positive, help="Distances of the blobs [cutoffs]; 10 to 1e6 without.")
-    ] = None,
-    points: Annotated[int, typer.Option(min=2, max=10_000, help="Particles in both blobs together.")] = 1000,
-) -> None:
-    """Time a search of two blobs ever further apart: what empty space costs."""
-    with usage_errors():
-        from experiments import _domain
-
-        table = _domain.domain_table(separations or [10.0, 1e2, 1e3, 1e4, 1e5, 1e6], points)
-        typer.echo(table.to_string(index=False, float_format="%.3g"))
-
-
-@app.command(rich_help_panel=QUESTIONS, short_help="Time a list that is kept while particles move.")
-def skin(
-    spacing: Spacing = 1e-4,
-    steps: Annotated[int, typer.Option(min=1, max=1_000_000, help="Steps of a compiled scan.")] = 100,
-    repeats: Annotated[int, typer.Option(min=2, max=100_000, help="Timed scans.")] = 3,
-) -> None:
-    """Time a step that keeps its neighbor list beside one that makes it anew."""
-    with usage_errors():
-        from experiments import _skin
-
-        typer.echo(_skin.skin_table(spacing, steps, repeats).to_string(index=False, float_format="%.3g"))
-
-
-@app.command(rich_help_panel=QUESTIONS, short_help="Time each option of a search.")
-def options(
-    out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform and backend.")] = Path("out") / "options",
-    points: Annotated[int, typer.Option(min=100, max=MOST_POINTS, help="Random points.")] = 100_000,
-    rounds: Rounds = 15,
-    backend: Annotated[str, typer.Option(help="As in jfrnn.search: auto, warp, jax or brute.")] = "warp",
-) -> None:
-    """Time each option of a search beside a plain one."""
-    with usage_errors():
-        _commands.check_choice("--backend", backend, ENGINES)
-        import jax
-
-        jax.config.update("jax_enable_x64", True)
-        from experiments import _options
-
-        path = _options.measure(take_folder(out), points, rounds, backend)
-        typer.echo(_options.table(path))
-        typer.echo(path)
-
-
-@app.command(rich_help_panel=QUESTIONS, short_help="Time lattices full of exact ties.")
-def ties(
-    scenes: Annotated[Path, typer.Argument(help="Config of a sweep whose layouts are measured, TOML.")] = Path(
-        "experiments/configs/thesis.toml"
-    ),
-    out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform and backend.")] = Path("out") / "ties",
-    rounds: Rounds = 15,
-    backend: Annotated[str, typer.Option(help="As in jfrnn.search: auto, warp, jax or brute.")] = "warp",
-    cube: Annotated[
-        int | None, typer.Option(min=1000, max=MOST_POINTS, help="Sites of a cube to measure instead of these layouts.")
-    ] = None,
-) -> None:
-    """Time lattices full of pairs at exactly the cutoff beside the same scenes moved at random."""
-    with usage_errors():
-        _commands.check_choice("--backend", backend, ENGINES)
-        import jax
-
-        jax.config.update("jax_enable_x64", True)
-        from experiments import _config, _ties
-
-        _config.load(scenes)  # what is wrong with it is said before a folder is made
-        path = _ties.measure(take_folder(out), rounds, backend, scenes, cube)
-        typer.echo(_ties.table(path))
-        typer.echo(path)
-
-
-@app.command(rich_help_panel=QUESTIONS, short_help="Time what uses a list.")
-def use(
-    points: Annotated[int, typer.Option(min=100, max=MOST_POINTS, help="Random points.")] = 250_000,
-    rounds: Rounds = 9,
-) -> None:
-    """Time what uses a list: particles in random order or sorted, rows padded or compressed."""
-    with usage_errors():
-        from experiments import _use
-
-        for table in (_use.order_table(points, rounds), _use.rows_table(points // 5, rounds)):
-            typer.echo(table.to_string(index=False, float_format="%.3g") + "\n")
-
-
-@app.command(rich_help_panel=QUESTIONS, short_help="Time the backends over sizes.")
-def crossover(
-    out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform.")] = Path("out") / "crossovers",
-    repeats: Annotated[int, typer.Option(min=20, max=100_000, help="Timed runs of each backend.")] = 30,
-) -> None:
-    """Time the backends side by side over sizes and neighbors: what `backend="auto"` goes by."""
-    with usage_errors():
-        from experiments import _crossover
-
-        typer.echo(_crossover.measure(take_folder(out), repeats=repeats))
-
-
-_FACES = [500, 12_000, 200_000]
-_CUTOFFS = [0.01, 0.03, 0.1, 0.3, 0.8]
-
-
-@app.command(rich_help_panel=QUESTIONS, short_help="Time the triangles that are near particles.")
-def triangles(
-    out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform and backend.")] = Path("out") / "triangles",
-    points: Annotated[int, typer.Option(min=100, max=MOST_POINTS, help="Random points in the box of a gear.")] = 250_000,
-    faces: Annotated[list[int], typer.Option(min=100, max=10_000_000, help="Of gears, about; may be said several times.")] = _FACES,
-    cutoff: Annotated[list[float], typer.Option(callback=positive, help="[modules]; may be said several times.")] = _CUTOFFS,
-    rounds: Rounds = 9,
-    backend: Annotated[str, typer.Option(help="warp (beside bvh), bvh or jax.")] = "warp",
-) -> None:
-    """Time the triangles of a gear that are near particles, beside trimesh and libigl where they are installed."""
-    with usage_errors():
-        _commands.check_choice("--backend", backend, WALLS)
-        from experiments import _triangles
-
-        path = _triangles.measure(take_folder(out), points, tuple(faces), rounds, backend, tuple(cutoff))
-        typer.echo(_triangles.table(path))
-
-
-@app.command(rich_help_panel=QUESTIONS, short_help="Ask other libraries for the hard cases.")
-def peers(
-    names: Annotated[list[str] | None, typer.Argument(help="Of libraries; all that are known without.")] = None,
-    out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "peers",
-    limit: Annotated[float, typer.Option(min=1, max=1e6, callback=finite, help="Time for one answer [s].")] = 60.0,
-) -> None:
-    """Ask other libraries for the hard cases, and print a table of their answers (pip install -e '.[peers]')."""
-    with usage_errors():
-        from experiments import _peers
-
-        unknown = [name for name in names or [] if name not in _peers.PEERS]
-        if unknown:
-            raise UsageError(f"no peer {unknown[0]!r}: {', '.join(_peers.PEERS)}")
-        path = _peers.measure(take_folder(out), names or list(_peers.PEERS), limit)
-        typer.echo(_peers.table(path))
-        typer.echo(path)
-
-
-@app.command(rich_help_panel=DEVICES, short_help="Decide the hard cases on a GPU, take timings.")
+@app.command(short_help="Decide the hard cases on a GPU, take timings.")
 def gpu(
     config: Annotated[Path, typer.Argument(help="GPU config, TOML.")],
     out: Annotated[Path, typer.Option(help="Folder of the rows.")],
 ) -> None:
     """Decide every hard case on the GPU, then take all timings; rows are added to OUT/rows.jsonl one by one."""
     with usage_errors():
-        from experiments import _gpu
+        from experiments import _config
+        from experiments.gpu import run
+        from experiments.gpu.config import Config
 
-        wrong = _gpu.run(_gpu.load(config), take_folder(out))
-        typer.echo(f"{wrong} wrong; rows in {out / 'rows.jsonl'}; python -m experiments gpu-report {out} makes a table of them")
+        wrong = run.run(_config.load(config, Config), take_folder(out))
+        typer.echo(f"{wrong} wrong; rows in {out / 'rows.jsonl'}; python -m experiments report {out} makes a table of them")
         if wrong:
             raise typer.Exit(1)
 
 
-@app.command(rich_help_panel=DEVICES, short_help="Print the tables of a GPU run.")
-def gpu_report(folder: Annotated[Path, typer.Argument(help="Folder of a GPU run.")]) -> None:
-    """Print the tables of a GPU run, and write them and a picture against the floor beside the rows."""
-    with usage_errors():
-        from experiments import _gpu_report
-
-        typer.echo(_gpu_report.report(folder))
-
-
-@app.command(name="distributed", rich_help_panel=DEVICES, short_help="Time lists, sums and fluids on 1 to k devices.")
-def over_devices(
-    config: Annotated[Path, typer.Argument(help="Config of scaling over devices, TOML.")],
-    out: RowsFolder = None,
-    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Measure failed rows again.")] = False,
-) -> None:
-    """Time lists, sums and steps of a fluid on 1 to k devices, or go on with it; then print a table."""
-    with usage_errors():
-        from experiments import _config, _distributed
-
-        given, folder = _config.load(config, _distributed.Config), take_folder(out or Path("out") / config.stem)
-        _distributed.prepare(given)
-        with stoppable():
-            rows = _distributed.run(given, folder, retry_failed)
-        typer.echo(_distributed.report(rows, folder))
+_SPH = typer.Typer(cls=Sph, no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(_SPH, name="sph", short_help="Run fluids, validate, time and differentiate them.")

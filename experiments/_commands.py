@@ -1,12 +1,14 @@
 """What all commands share: how they are listed, options that are checked where they enter, and errors that fit into a line."""
 
+import functools
+import importlib
 import math
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import typer
 from typer.core import TyperGroup
@@ -17,22 +19,35 @@ MOST_POINTS = 100_000_000
 
 
 class Commands(TyperGroup):
-    """Commands listed by group, a line each; what is wrong with a command line is said in one line, with exit code 2."""
+    """Commands listed a line each; what is wrong with a command line is said in one line, with exit code 2.
+
+    Attributes:
+        there: Of commands that are imported when they are run: module, function, and what they do. The function returns what is
+            printed; where it is stopped, the same command goes on.
+    """
+
+    there: ClassVar[dict[str, tuple[str, str, str]]] = {}
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ANN401
-        """Return the names by group, groups in the order in which they were first met."""
-        groups = list(dict.fromkeys(str(command.rich_help_panel) for command in self.commands.values()))  # pyright: ignore
-        return sorted(self.commands, key=lambda name: groups.index(str(self.commands[name].rich_help_panel)))  # pyright: ignore
+        """Return the names, in the order in which they were written down."""
+        return [*self.commands, *self.there]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ANN401
+        """Return a command, after importing it where that has to be."""
+        if cmd_name not in self.there:
+            return super().get_command(ctx, cmd_name)
+        module, function, _ = self.there[cmd_name]
+        app = typer.Typer(add_completion=False, rich_markup_mode=None)
+        app.command(name=cmd_name)(_told(getattr(importlib.import_module(module), function)))
+        return typer.main.get_command(app)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
-        """Write the list, groups on the left: less than the 24 lines of a screen."""
-        formatter.write(f"Usage: {ctx.command_path} COMMAND [ARGS]...   (COMMAND --help says more)\n")
-        previous = None
+        """Write the list: less than the 24 lines of a screen."""
+        formatter.write(f"Usage: {ctx.command_path} COMMAND ...   (COMMAND --help says more)\n")
         for name in self.list_commands(ctx):
-            command: Any = self.commands[name]
-            group = command.rich_help_panel
-            formatter.write(f"{group if group != previous else '':<10} {name:<14} {command.get_short_help_str(54)}\n")
-            previous = group
+            command: Any = self.commands.get(name)
+            text = self.there[name][2] if command is None else command.get_short_help_str(66)
+            formatter.write(f"  {name:<12}{text}\n")
 
     def main(self, args: Sequence[str] | None = None, *more: Any, standalone_mode: bool = True, **others: Any) -> Any:  # noqa: ANN401
         """Run, and say mistakes in a line."""
@@ -45,11 +60,25 @@ class Commands(TyperGroup):
         sys.exit(code if isinstance(code, int) else 0)
 
 
+def _told(function: Callable[..., Any]) -> Callable[..., None]:
+    """Return a command that prints what a function returns, and says its mistakes in a line."""
+
+    @functools.wraps(function)
+    def command(*args: Any, **options: Any) -> None:  # noqa: ANN401
+        with usage_errors(), stoppable():
+            typer.echo(function(*args, **options))
+
+    return command
+
+
 def _said(error: Exception, given: Sequence[str]) -> int:
     """Print a mistake in the command line and return the exit code; what else went wrong is raised again."""
     if isinstance(error, typer.Abort):
         typer.echo("aborted", err=True)
         return 1
+    if isinstance(error, UsageError):
+        typer.echo(f"error: {error}", err=True)
+        return 2
     tell, context = getattr(error, "format_message", None), getattr(error, "ctx", None)
     if tell is None:
         raise error
@@ -91,6 +120,11 @@ def positive(value: Any) -> Any:  # noqa: ANN401
     for number in finite(value) if isinstance(value, list | tuple) else [finite(value)]:
         if number is not None and not number > 0:
             raise typer.BadParameter(f"{number} is not in the range x>0.")
+    return value
+
+
+def _known_engine(value: str) -> str:
+    check_choice("--backend", value, ("auto", "jax", "warp", "brute"))
     return value
 
 
@@ -165,3 +199,9 @@ Dim = Annotated[int, typer.Option(min=2, max=3, help="Dimensions.")]
 Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of random layouts.")]
 RetryFailed = Annotated[bool, typer.Option("--retry-failed", help="Measure missing, failed and timed-out rows again.")]
 RowsFolder = Annotated[Path | None, typer.Option(help="Folder of the rows; out/NAME without it.")]
+Points = Annotated[int, typer.Option(min=100, max=MOST_POINTS, help="Random points.")]
+Rounds = Annotated[int, typer.Option(min=2, max=100_000, help="Timed runs of each.")]
+Engine = Annotated[
+    str,
+    typer.Option(callback=_known_engine, help="As in jfrnn.search: auto, warp, jax or brute."),
+]

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, ValidationInfo, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, ValidationInfo, field_validator
 from pydantic_core import ErrorDetails
 
 from experiments import _layouts, _rows, methods
@@ -19,6 +19,7 @@ from experiments._errors import UsageError
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Timeout = Annotated[FiniteFloat, Field(gt=0, le=1e6)]  # [s]; the system waits no longer than some weeks
 Fill = Annotated[FiniteFloat, Field(gt=0, le=1)]
+Dtype = Literal["float32", "float64"]
 LIMITS = ("most_seconds", "timeout")  # when a row is given up, not what it measures
 
 
@@ -28,38 +29,29 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+def _known_layout(name: str) -> str:
+    if not _layouts.is_layout(name):
+        raise ValueError(f"unknown layout {name!r}; allowed: {', '.join(_layouts.names())}")
+    return name
+
+
+LayoutName = Annotated[str, AfterValidator(_known_layout)]
+
+
 class Scenes(Table):
-    """Every layout at every fill and whatever else is given several times; without fills, each layout at its own.
+    """Every layout at every fill and whatever else is given several times; without fills, each layout at its own."""
 
-    Attributes:
-        layouts: Names of layouts.
-        fills: Shares of the full domain.
-        spacings: Instead of the config's.
-        cutoff_ratios: Instead of the config's.
-        seeds: Instead of the config's.
-        angles: Of turnedN and cutN [degrees].
-        growths: Of grownN: how many times larger the domain becomes.
-        orders: Of the particles: as the layout has them, shuffled, or sorted by cells of a cutoff.
-        motions: How far every particle goes between two searches, for methods that follow motion [spacings].
-    """
-
-    layouts: tuple[str, ...] = Field(min_length=1)
-    fills: tuple[Fill, ...] = ()
-    spacings: tuple[Positive, ...] = ()
+    layouts: tuple[LayoutName, ...] = Field(min_length=1)
+    fills: tuple[Fill, ...] = ()  # shares of the full domain
+    spacings: tuple[Positive, ...] = ()  # instead of the config's, as are the next two
     cutoff_ratios: tuple[Positive, ...] = ()
     seeds: tuple[Annotated[int, Field(ge=0)], ...] = ()
-    angles: tuple[FiniteFloat, ...] = ()
-    growths: tuple[Annotated[FiniteFloat, Field(ge=1)], ...] = ()
+    angles: tuple[FiniteFloat, ...] = ()  # of turnedN and cutN [degrees]
+    growths: tuple[Annotated[FiniteFloat, Field(ge=1)], ...] = ()  # of grownN: how many times larger the domain becomes
+    # Of the particles: as the layout has them, shuffled, or sorted by cells of a cutoff.
     orders: tuple[Literal["layout", "shuffled", "sorted"], ...] = ()
+    # How far every particle goes between two searches, for methods that follow motion [spacings].
     motions: tuple[Annotated[FiniteFloat, Field(ge=0)], ...] = ()
-
-    @field_validator("layouts")
-    @classmethod
-    def _layouts_exist(cls, layouts: tuple[str, ...]) -> tuple[str, ...]:
-        for layout in layouts:
-            if not _layouts.is_layout(layout):
-                raise ValueError(f"unknown layout {layout!r}; allowed: {', '.join(_layouts.names())}")
-        return layouts
 
     def scenes(self) -> Iterator[dict[str, Any]]:
         """Yield what each scene says, as fields of a `Spec`; what is not given is left out."""
@@ -70,47 +62,19 @@ class Scenes(Table):
             yield dict(zip(axes, values, strict=True))
 
 
-class Config(Table):
-    """A sweep: scenes × methods, and how each row is measured.
+def _known_method(name: str) -> str:
+    if name not in methods.names():
+        raise ValueError(f"unknown method {name!r}; allowed: {', '.join(methods.names())}")
+    return name
 
-    Attributes:
-        methods: Names of adapters, one file each in experiments/methods.
-        scenes: Tables of layouts × fills × what else is given several times.
-        processes: Every row is measured in so many processes, each of them in a round of its own over all scenes.
-        spacing: Distance of lattice neighbors [m].
-        cutoff_ratio: Cutoff in spacings.
-        dtype: Precision of the positions.
-        dim: 2 or 3.
-        seed: Seed of random layouts.
-        repeats: Fewest timed runs in a process.
-        min_seconds: Runs go on until they took this long together [s].
-        max_repeats: Most timed runs in a process; 1: the first run is the only one.
-        most_seconds: No run begins when they took this long together, be they as few as they may [s]. Where a later sweep allows
-            more, rows with too few repeats are measured again.
-        timeout: A row's process is ended after this time [s].
-    """
 
-    methods: tuple[str, ...] = Field(min_length=1)
-    scenes: tuple[Scenes, ...] = Field(min_length=1)
-    spacing: Positive = 1e-4
-    cutoff_ratio: Positive = 3.0
-    dtype: Literal["float32", "float64"] = "float32"
-    dim: Literal[2, 3] = 3
-    seed: Annotated[int, Field(ge=0)] = 0
-    processes: Annotated[int, Field(ge=1)] = 1
-    repeats: Annotated[int, Field(ge=1)] = 5
-    min_seconds: Annotated[FiniteFloat, Field(ge=0)] = 0.5
-    max_repeats: Annotated[int, Field(ge=1)] = 50
-    most_seconds: Positive = 60.0
-    timeout: Timeout = 300.0
+class Repeats(Table):
+    """How often something is timed."""
 
-    @field_validator("methods")
-    @classmethod
-    def _methods_exist(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        for name in names:
-            if name not in methods.names():
-                raise ValueError(f"unknown method {name!r}; allowed: {', '.join(methods.names())}")
-        return names
+    repeats: Annotated[int, Field(ge=1)] = 5  # fewest timed runs in a process
+    min_seconds: Annotated[FiniteFloat, Field(ge=0)] = 0.5  # runs go on until they took this long together [s] ...
+    max_repeats: Annotated[int, Field(ge=1)] = 50  # ... or until there are so many; 1: the first run is the only one
+    timeout: Timeout = 300.0  # a row's process is ended after this time [s]
 
     @field_validator("max_repeats")
     @classmethod
@@ -118,6 +82,22 @@ class Config(Table):
         if most < (fewest := info.data.get("repeats", 1)):
             raise ValueError(f"got {most}; it must not be less than repeats, {fewest}")
         return most
+
+
+class Config(Repeats):
+    """A sweep: scenes × methods, and how each row is measured."""
+
+    methods: tuple[Annotated[str, AfterValidator(_known_method)], ...] = Field(min_length=1)  # of experiments/methods
+    scenes: tuple[Scenes, ...] = Field(min_length=1)
+    processes: Annotated[int, Field(ge=1)] = 1  # every row is measured in so many, each in a round of its own over all scenes
+    spacing: Positive = 1e-4  # distance of lattice neighbors [m]
+    cutoff_ratio: Positive = 3.0  # cutoff in spacings
+    dtype: Dtype = "float32"  # of the positions
+    dim: Literal[2, 3] = 3
+    seed: Annotated[int, Field(ge=0)] = 0  # of random layouts
+    # No run begins when they took this long together, be they as few as they may [s]. Where a later sweep allows more, rows with
+    # too few repeats are measured again.
+    most_seconds: Positive = 60.0
 
     @property
     def hash(self) -> str:
@@ -140,7 +120,17 @@ class Config(Table):
 
 
 @dataclass(frozen=True)
-class Spec:
+class Keyed:
+    """What a row measures, and how."""
+
+    @property
+    def key(self) -> str:
+        """Digest of all fields, 12 hex digits: a row with the same key need not run again."""
+        return digest(asdict(self))
+
+
+@dataclass(frozen=True)
+class Spec(Keyed):
     """What one row measures: a scene, a method, and how to measure it."""
 
     layout: str
@@ -180,7 +170,7 @@ class Spec:
         """
         return digest({name: value for name, value in asdict(self).items() if name not in LIMITS})
 
-    def cut_short(self, row: _rows.Row) -> bool:
+    def cut_short(self, row: _rows.SearchRow) -> bool:
         """Whether a row has fewer repeats than asked, where `most_seconds` would have let another begin."""
         return row.status == "ok" and len(row.seconds) < self.repeats and sum(row.seconds) < self.most_seconds
 
@@ -206,7 +196,11 @@ def load(path: Path, kind: type[ConfigT] = Config) -> ConfigT:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: no valid TOML: {error}") from error
     except ValidationError as error:
-        raise UsageError("\n".join(f"{path}: {_explain(item, kind)}" for item in error.errors())) from error
+        items = error.errors()  # of a list whose only item is wrong, it also says that the list is empty
+        items = [
+            item for item in items if not any(item["loc"] == other["loc"][: len(item["loc"])] != other["loc"] for other in items)
+        ]
+        raise UsageError("\n".join(f"{path}: {_explain(item, kind)}" for item in items)) from error
 
 
 def _table_of(kind: type[BaseModel], location: Sequence[int | str]) -> type[BaseModel]:

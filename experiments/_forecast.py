@@ -7,7 +7,7 @@ from typing import Any
 
 from experiments import methods
 from experiments._config import Spec
-from experiments._rows import SCENE_FIELDS, Row
+from experiments._rows import SCENE_FIELDS, SearchRow
 
 RESULTS = Path(__file__).parent / "results"
 STARTED_S = 3.0  # what a process takes besides its search: imports, positions, comparison with the exact pairs [s]
@@ -22,7 +22,7 @@ class Forecast:
         absent: Methods of the sweep that cannot be imported here; their rows take no time.
     """
 
-    def __init__(self, pending: Iterable[Spec], here: Iterable[Row] = (), results: Path = RESULTS) -> None:
+    def __init__(self, pending: Iterable[Spec], here: Iterable[SearchRow] = (), results: Path = RESULTS) -> None:
         """Look up the rows.
 
         Args:

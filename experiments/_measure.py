@@ -161,7 +161,7 @@ def time_kernels(launches: Sequence[tuple[Any, Sequence[Any], int, int]], repeat
         launches: Kernel, arguments, threads in all and per block of each.
         repeats: How often each graph is timed, ten runs at a time.
     """
-    from jfrnn._engine.warp import load_warp
+    from experiments._library import load_warp
 
     wp = load_warp()
 

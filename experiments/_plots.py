@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
 from experiments import _table, _thesis
-from experiments._rows import Row
+from experiments._rows import SearchRow
 
 # Colors of M. Okabe and K. Ito, distinct to color-blind eyes too; other methods take those that are left.
 COLORS = {
@@ -31,14 +31,14 @@ MARKERS = {
     **{"scipy-kdtree": "^", "scipy-kdtree-nolist": "v", "brute": "D"},
 }
 PLAIN = FuncFormatter(lambda number, _: _table.count(int(number)) if number >= 1000 else f"{number:g}")
-Value = Callable[[Row], float | None]
+Value = Callable[[SearchRow], float | None]
 ThesisValue = Callable[[_thesis.Figures], float]
 
 SECONDS = "time of a search [s], median; bars: its interval"
 MEGABYTES = "peak memory of a search over its start [MB]"
 
 
-def draw_all(rows: Sequence[Row], folder: Path, origin: str) -> list[Path]:
+def draw_all(rows: Sequence[SearchRow], folder: Path, origin: str) -> list[Path]:
     """Draw every picture into the folder and return their paths; none where no row has figures.
 
     Args:
@@ -50,10 +50,10 @@ def draw_all(rows: Sequence[Row], folder: Path, origin: str) -> list[Path]:
     if not good:
         return []
 
-    def seconds(row: Row) -> float | None:
+    def seconds(row: SearchRow) -> float | None:
         return row.median_s
 
-    def memory(row: Row) -> float | None:
+    def memory(row: SearchRow) -> float | None:
         return _table.megabytes(row.search_bytes or row.peak_bytes)
 
     def thesis_seconds(figures: _thesis.Figures) -> float:
@@ -62,7 +62,7 @@ def draw_all(rows: Sequence[Row], folder: Path, origin: str) -> list[Path]:
     def thesis_memory(figures: _thesis.Figures) -> float:
         return figures.megabytes
 
-    def density(row: Row) -> float | None:
+    def density(row: SearchRow) -> float | None:
         return row.density_error
 
     speed = SECONDS.split(";")[0]
@@ -84,7 +84,7 @@ def draw_all(rows: Sequence[Row], folder: Path, origin: str) -> list[Path]:
     return paths
 
 
-def _methods(rows: Iterable[Row]) -> list[str]:
+def _methods(rows: Iterable[SearchRow]) -> list[str]:
     """Return the methods of the rows, known ones first."""
     present = {row.method for row in rows}
     return [*(name for name in COLORS if name in present), *sorted(present - set(COLORS))]
@@ -133,7 +133,7 @@ def _legend(axes: Axes, methods: list[str], thesis: Iterable[tuple[str, str]], *
     axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9)
 
 
-def _theirs(rows: list[Row], value: ThesisValue) -> dict[tuple[str, str], list[tuple[Row, float]]]:
+def _theirs(rows: list[SearchRow], value: ThesisValue) -> dict[tuple[str, str], list[tuple[SearchRow, float]]]:
     """Return the thesis's values on the scenes of these rows, by our method and its counterpart."""
     scenes = {row.scene_key: row for row in rows}
     found = defaultdict(list)
@@ -144,7 +144,7 @@ def _theirs(rows: list[Row], value: ThesisValue) -> dict[tuple[str, str], list[t
     return dict(found)
 
 
-def _by_layout(rows: list[Row], value: Value, thesis_value: ThesisValue, label: str) -> Figure:
+def _by_layout(rows: list[SearchRow], value: Value, thesis_value: ThesisValue, label: str) -> Figure:
     """Draw a mark per row: scenes downwards, values to the right on a log axis."""
     names, methods = _table.name_scenes(rows), _methods(rows)
     theirs = _theirs(rows, thesis_value)
@@ -177,7 +177,7 @@ def _by_layout(rows: list[Row], value: Value, thesis_value: ThesisValue, label: 
     return figure
 
 
-def _by_fill(rows: list[Row], value: Value, thesis_value: ThesisValue, label: str) -> Figure:
+def _by_fill(rows: list[SearchRow], value: Value, thesis_value: ThesisValue, label: str) -> Figure:
     """Draw the geometric mean of the layouts that are asked to fill the same, and a bar from the least to the most of them."""
     methods, theirs = _methods(rows), _theirs(rows, thesis_value)
     figure, axes = _figure(10.5, 6.0, f"{_title(label)}, by fill (mean and range of the layouts)")
@@ -200,7 +200,7 @@ def _by_fill(rows: list[Row], value: Value, thesis_value: ThesisValue, label: st
     return figure
 
 
-def _draw_over_fill(axes: Axes, values: list[tuple[Row, float]], shift: float, **style: str) -> None:
+def _draw_over_fill(axes: Axes, values: list[tuple[SearchRow, float]], shift: float, **style: str) -> None:
     """Draw the values of one method; the shift keeps marks of methods apart."""
     groups = defaultdict(list)
     for row, number in values:
@@ -214,7 +214,7 @@ def _draw_over_fill(axes: Axes, values: list[tuple[Row, float]], shift: float, *
     axes.plot(x, y, markersize=6, linewidth=1.2, **style)  # pyright: ignore[reportArgumentType]
 
 
-def _against_error(rows: list[Row], value: Value, label: str, title: str) -> Figure:
+def _against_error(rows: list[SearchRow], value: Value, label: str, title: str) -> Figure:
     """Draw a value over missing and extra pairs: exact methods stand on the left edge, good ones low."""
     methods = _methods(rows)
     figure, axes = _figure(
@@ -232,12 +232,12 @@ def _against_error(rows: list[Row], value: Value, label: str, title: str) -> Fig
     return figure
 
 
-def _against_sum_error(rows: list[Row]) -> Figure:
+def _against_sum_error(rows: list[SearchRow]) -> Figure:
     """Draw time over the largest error of a sum over neighbors: what wrong pairs do, and rounding to sums without a list."""
     methods = _methods(rows)
     figure, axes = _figure(10.5, max(6.0, 2 + 0.2 * len(methods)), "Speed against the error of a sum over neighbors")
 
-    def error(row: Row) -> float | None:
+    def error(row: SearchRow) -> float | None:
         known = [value for value in (row.density_error, row.jump_error) if value is not None]
         return max(known) if known else None
 
@@ -253,7 +253,7 @@ def _against_sum_error(rows: list[Row]) -> Figure:
     return figure
 
 
-def _scatter(axes: Axes, rows: list[Row], x: Value, y: Value) -> None:
+def _scatter(axes: Axes, rows: list[SearchRow], x: Value, y: Value) -> None:
     """Draw a mark per row, larger for more points; rows that lack a value are left out."""
     methods = _methods(rows)
     for row in rows:

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from experiments import _table, methods
 from experiments._errors import UsageError
-from experiments._rows import Row, read_latest
+from experiments._rows import SearchRow, read_latest
 
 TITLES = ("scene", "points", "method", "s", "±", "/ {}", "MB", "/ {}", "missing", "extra", "density error", "gradient error")
 TITLES += ("thesis", "s", "/ CLL", "MB", "/ CLL")
@@ -76,11 +76,11 @@ def report(folder: Path) -> None:
         console.print(str(path), soft_wrap=True)
 
 
-def _title(rows: list[Row]) -> str:
+def _title(rows: list[SearchRow]) -> str:
     return ", ".join(_distinct(row.config or "" for row in rows)) or "rows"
 
 
-def describe_origin(rows: Iterable[Row]) -> str:
+def describe_origin(rows: Iterable[SearchRow]) -> str:
     """Say on what, with what, beside what and when the rows were measured, from the rows alone."""
     rows = list(rows)
     machines = _distinct(_describe_machine(row.machine) for row in rows if row.machine)
@@ -213,7 +213,7 @@ def write_csv(lines: list[dict[str, Any]], path: Path) -> None:
         writer.writerows(lines)
 
 
-def markdown(rows: list[Row], lines: list[dict[str, Any]], pictures: list[Path]) -> str:
+def markdown(rows: list[SearchRow], lines: list[dict[str, Any]], pictures: list[Path]) -> str:
     """Return report.md."""
     head = [" | ".join(titles(lines)), " | ".join(":---" if title in TEXT_COLUMNS else "---:" for title in TITLES)]
     body = [" | ".join(cells(line)) for line in lines]

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar
 
 from experiments._errors import UsageError
 
@@ -17,129 +17,86 @@ SCENE_FIELDS = ("spacing", "cutoff_ratio", "dtype", "dim", "seed", "angle", "gro
 """What decides, beside layout and fill, where particles are and what a pair is."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Row:
-    """One method on one scene, measured in one process of its own. What was not reached is None.
+    """What every row says, whatever it measures; a study adds its columns. What was not reached is None."""
 
-    Attributes:
-        key: Digest of scene, method, process and way of measuring; rows with the same key replace each other.
-        layout: Name of the layout.
-        method: Name of the adapter.
-        fill_asked: Fill that the config asked for, as a share of the full domain.
-        spacing: Distance of lattice neighbors [m].
-        cutoff_ratio: Cutoff in spacings.
-        dtype: Precision of the positions.
-        dim: Dimensions.
-        seed: Seed of random layouts.
-        process: Which of the processes that measured the same, from 0.
-        angle: Of turnedN and cutN [degrees].
-        growth: Of grownN: how many times larger the domain became.
-        order: Of the particles: layout, shuffled, or sorted.
-        motion: How far particles went between two searches [spacings].
-        status: One of `STATUSES`.
-        reason: Why the status is not ok; of several processes as one row, why some of them have no figures.
-        fill: Fill that the scene has.
-        cutoff: Cutoff [m], rounded to the dtype.
-        points: Number of particles n.
-        allocate_s: Time to find the capacity of the list, for methods that need one before they search [s].
-        compile_s: Time of what else is done once: compilation [s].
-        first_s: First run after that [s].
-        median_s: Median of the repeats, from raw positions to the result [s].
-        p10_s: 10th percentile of the repeats [s].
-        p90_s: 90th percentile of the repeats [s].
-        parts: Median seconds of the parts of a search, by name, where a method tells them apart.
-        rebuilt: Share of the searches that made a list anew, of methods that keep one while particles move.
-        repeats: Number of timed runs after the first.
-        seconds: All their times [s].
-        others_cores: Cores that other processes of the machine kept busy meanwhile, on average; None below 0.2 s.
-        peak_bytes: Peak resident memory over the start (imports done, positions made), allocation, compilation and the first search
-            included.
-        search_bytes: That of the first search over what was resident after compilation: what it takes itself, at least list_bytes;
-            unknown where the peak cannot be reset. On an accelerator `device_bytes`.
-        list_bytes: Size of the result.
-        scratch_bytes: search_bytes - list_bytes.
-        device_bytes: Peak of the accelerator's memory over what it held before, as JAX and Warp count it: positions, and what the
-            compiler tries out, included; None on a CPU.
-        planned_list_bytes: The list as `jfrnn.memory_plan` says beforehand; the library's own methods, process 0.
-        planned_scratch_bytes: What is needed besides, as it says.
-        memory_source: Of search_bytes: VmHWM, reset at both starts; ru_maxrss, which cannot be: earlier peaks hide later ones;
-            device.
-        pairs: Unordered pairs that the method found.
-        directed_pairs: Entries (i, j) of a full list.
-        exact_pairs: Unordered pairs of the oracle.
-        missing: Unordered pairs that the oracle has and the method has not.
-        extra: Unordered pairs that the method has and the oracle has not, repeated ones included.
-        compared: `pairs`; `counts` where a method gives only neighbors per particle; or `sample`: the same of 20 000 particles,
-            where there are more than two million. `exact_pairs`, `missing` and `extra` are theirs then, `pairs` still those of all.
-        density_error: Largest error of a poly6 density over the neighbors that were found, over the mean density.
-        gradient_error: The same of the length of its gradient, over the mean density per cutoff.
-        jump_error: The same of a sum of unit vectors, the gradient of 1 - r / cutoff, over the mean number of neighbors: it does
-            not vanish at the cutoff, where methods differ.
-        device: Where it ran.
-        versions: Python and the packages.
-        machine: Processor, cores, memory [bytes], operating system.
-        commit: Commit of the project.
-        dirty: Whether the working tree differed from it.
-        config: Name of the config.
-        config_hash: Digest of what the config says.
-        time: When the row was finished, UTC.
-    """
+    key: str  # digest of what is measured and how: rows with the same key replace each other
+    status: str = "failed"  # one of STATUSES
+    reason: str | None = None  # why the status is not ok; of several processes as one row, why some of them have no figures
+    others_cores: float | None = None  # that other processes kept busy meanwhile, on average; None below 0.2 s
+    device: str | None = None  # where it ran
+    versions: dict[str, str | None] = field(default_factory=dict)  # of Python and of packages
+    machine: dict[str, Any] = field(default_factory=dict)  # processor, cores, memory [bytes], operating system
+    commit: str | None = None  # of the project
+    dirty: bool | None = None  # whether the working tree differed from it
+    time: str | None = None  # when the row was finished, UTC
 
-    key: str
-    layout: str
-    method: str
-    fill_asked: float | None
-    spacing: float
-    cutoff_ratio: float
-    dtype: str
-    dim: int
-    seed: int
-    process: int = 0
-    angle: float | None = None
-    growth: float | None = None
-    order: str = "layout"
-    motion: float = 0.0
-    status: str = "failed"
-    reason: str | None = None
-    fill: float | None = None
-    cutoff: float | None = None
-    points: int | None = None
-    allocate_s: float | None = None
-    compile_s: float | None = None
-    first_s: float | None = None
-    median_s: float | None = None
+
+@dataclass(kw_only=True)
+class TimedRow(Row):
+    """A row with a time that is measured several times."""
+
+    first_s: float | None = None  # first run, compilation included where it is not told apart [s]
+    median_s: float | None = None  # of the repeats [s]
     p10_s: float | None = None
     p90_s: float | None = None
-    parts: dict[str, float] = field(default_factory=dict)
-    rebuilt: float | None = None
-    repeats: int | None = None
-    seconds: list[float] = field(default_factory=list)
-    others_cores: float | None = None
+    repeats: int | None = None  # number of timed runs after the first
+
+
+@dataclass(kw_only=True)
+class SearchRow(TimedRow):
+    """One method on one scene, measured in one process of its own; times are from raw positions to the result."""
+
+    layout: str
+    method: str  # name of the adapter
+    fill_asked: float | None  # share of the full domain that the config asked for
+    spacing: float  # distance of lattice neighbors [m]
+    cutoff_ratio: float  # cutoff in spacings
+    dtype: str
+    dim: int
+    seed: int  # of random layouts
+    process: int = 0  # which of the processes that measured the same
+    angle: float | None = None  # of turnedN and cutN [degrees]
+    growth: float | None = None  # of grownN: how many times larger the domain became
+    order: str = "layout"  # of the particles: layout, shuffled, or sorted
+    motion: float = 0.0  # how far particles went between two searches [spacings]
+    fill: float | None = None  # that the scene has
+    cutoff: float | None = None  # [m], rounded to the dtype
+    points: int | None = None  # number of particles n
+    allocate_s: float | None = None  # to find the capacity of the list, for methods that need one before they search [s]
+    compile_s: float | None = None  # what else is done once: compilation [s]
+    parts: dict[str, float] = field(default_factory=dict)  # median seconds of its parts, where a method tells them apart
+    rebuilt: float | None = None  # share of the searches that made a list anew, of methods that keep one while particles move
+    seconds: list[float] = field(default_factory=list)  # all times [s]
+    # Peak resident memory over the start (imports done, positions made): allocation, compilation and first search included.
     peak_bytes: int | None = None
+    # That of the first search over what was resident after compilation: what it takes itself, at least list_bytes; unknown where
+    # the peak cannot be reset. On an accelerator device_bytes.
     search_bytes: int | None = None
-    list_bytes: int | None = None
-    scratch_bytes: int | None = None
+    list_bytes: int | None = None  # size of the result
+    scratch_bytes: int | None = None  # search_bytes - list_bytes
+    # Peak of the accelerator's memory over what it held before, as JAX and Warp count it: positions, and what the compiler tries
+    # out, included; None on a CPU.
     device_bytes: int | None = None
-    planned_list_bytes: int | None = None
-    planned_scratch_bytes: int | None = None
-    memory_source: str | None = None
-    pairs: int | None = None
-    directed_pairs: int | None = None
-    exact_pairs: int | None = None
-    missing: int | None = None
-    extra: int | None = None
+    planned_list_bytes: int | None = None  # as `jfrnn.memory_plan` says beforehand; the library's own methods, process 0
+    planned_scratch_bytes: int | None = None  # what is needed besides, as it says
+    memory_source: str | None = None  # VmHWM, reset at both starts; ru_maxrss, where earlier peaks hide later ones; device
+    pairs: int | None = None  # unordered pairs that the method found
+    directed_pairs: int | None = None  # entries (i, j) of a full list
+    exact_pairs: int | None = None  # unordered pairs of the oracle
+    missing: int | None = None  # unordered pairs that the oracle has and the method has not
+    extra: int | None = None  # unordered pairs that the method has and the oracle has not, repeated ones included
+    # `pairs`; `counts` where a method gives only neighbors per particle; or `sample`: the same of 20 000 particles, where there are
+    # more than two million. exact_pairs, missing and extra are theirs then, pairs still those of all.
     compared: str | None = None
-    density_error: float | None = None
-    gradient_error: float | None = None
+    density_error: float | None = None  # largest error of a poly6 density over the neighbors that were found, over the mean density
+    gradient_error: float | None = None  # of the length of its gradient, over the mean density per cutoff
+    # Of a sum of unit vectors, the gradient of 1 - r / cutoff, over the mean number of neighbors: it does not vanish at the cutoff,
+    # where methods differ.
     jump_error: float | None = None
-    device: str | None = None
-    versions: dict[str, str | None] = field(default_factory=dict)
-    machine: dict[str, Any] = field(default_factory=dict)
-    commit: str | None = None
-    dirty: bool | None = None
-    config: str | None = None
-    config_hash: str | None = None
-    time: str | None = None
+    config: str | None = None  # its name
+    config_hash: str | None = None  # digest of what it says
 
     @property
     def scene_name(self) -> str:
@@ -167,16 +124,21 @@ def name_scene(layout: str, fill: float | None) -> str:
     return layout if fill is None else f"{layout} {100 * fill:.4g} %"
 
 
-RowT = TypeVar("RowT")
+RowT = TypeVar("RowT")  # a dataclass that is a `Row`, or a dict
+
+
+def values_of(row: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Return the columns of a row by name."""
+    return dict(row) if isinstance(row, dict) else asdict(row)
 
 
 class RowFile(Generic[RowT]):
-    """Rows of one kind, dataclasses with a key, in DIR/rows.jsonl.
+    """Rows of one kind in DIR/rows.jsonl: dataclasses, whose fields are the columns, or dicts, which have any.
 
     Whatever was written before a kill stays; half a last line is cut off.
     """
 
-    def __init__(self, folder: Path, kind: type[RowT] = Row) -> None:
+    def __init__(self, folder: Path, kind: type[RowT] = SearchRow) -> None:
         """Name the file; nothing is read or written yet."""
         self.path, self._kind = folder / "rows.jsonl", kind
 
@@ -214,7 +176,7 @@ class RowFile(Generic[RowT]):
 
     def append(self, row: RowT) -> None:
         """Write a row and wait until it is on the disk."""
-        self._write(json.dumps(asdict(cast(Any, row)), allow_nan=False).encode() + b"\n")
+        self._write(json.dumps(values_of(row), allow_nan=False).encode() + b"\n")
 
     def _write(self, data: bytes) -> None:
         with self.path.open("ab") as stream:
@@ -228,7 +190,8 @@ class RowFile(Generic[RowT]):
         Raises:
             UsageError: A line is no row.
         """
-        return list({cast(Any, row).key: row for row in self.read_all()}.values())
+        rows = self.read_all()
+        return list({_key(row, number): row for number, row in enumerate(rows)}.values())
 
     def read_all(self) -> list[RowT]:
         """Return the rows as they stand in the file, also those that others with their key have replaced.
@@ -238,20 +201,26 @@ class RowFile(Generic[RowT]):
         """
         if not self.path.exists():
             return []
-        known = {item.name for item in fields(cast(Any, self._kind))}
-        rows: list[RowT] = []
+        kind: Any = self._kind
+        known = None if kind is dict else {item.name for item in fields(kind)}
+        rows: list[Any] = []
         lines = self.path.read_text(encoding="utf-8", errors="replace").split("\n")  # what is no text is no row, and is named
         for number, line in enumerate(lines, start=1):
             try:
                 values = json.loads(line)
-                rows.append(self._kind(**{name: value for name, value in values.items() if name in known}))
+                rows.append(kind(**{name: value for name, value in values.items() if known is None or name in known}))
             except (ValueError, TypeError, KeyError, AttributeError) as error:
                 if number < len(lines):  # what follows the last line feed is empty, or what a kill left
                     raise UsageError(f"{self.path}: line {number} is no row ({error}): repair or remove that line") from error
         return rows
 
 
-def read_latest(folder: Path) -> list[Row]:
+def _key(row: Any, number: int) -> Any:  # noqa: ANN401
+    """Return the key of a row; rows that have none are all different."""
+    return row.get("key", number) if isinstance(row, dict) else row.key
+
+
+def read_latest(folder: Path) -> list[SearchRow]:
     """Return the rows of a sweep that count: of one method on one scene in one round, the last in the file.
 
     A config that changes how it measures, by how many repeats say, gives its rows other keys, and those from before stay.

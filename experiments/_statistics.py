@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
-from experiments._rows import Row
+from experiments._rows import SearchRow
 
 CONFIDENCE = 0.95
 LEAST_CONFIDENCE = 0.7  # two rounds tell with 50 %, three with 75 %: below it, nothing is said
@@ -43,7 +43,7 @@ def median_interval(values: Sequence[float], confidence: float = CONFIDENCE) -> 
 
 
 @dataclass
-class Summary(Row):
+class Summary(SearchRow):
     """All processes of one method on one scene as one row; times are medians of the processes' medians.
 
     Attributes:
@@ -68,18 +68,18 @@ class Summary(Row):
         return list(self.medians.values()) if len(self.medians) > 1 else self.seconds
 
 
-def summarize(rows: Iterable[Row]) -> list[Summary]:
+def summarize(rows: Iterable[SearchRow]) -> list[Summary]:
     """Return one row for each method on each scene, in the order of their first appearance."""
-    groups: dict[tuple[Any, ...], list[Row]] = defaultdict(list)
+    groups: dict[tuple[Any, ...], list[SearchRow]] = defaultdict(list)
     for row in rows:
         groups[(*row.scene_key, row.method)].append(row)
     return [_summary(sorted(group, key=lambda row: row.process)) for group in groups.values()]
 
 
-def _summary(group: list[Row]) -> Summary:
+def _summary(group: list[SearchRow]) -> Summary:
     good = [row for row in group if row.status == "ok" and row.median_s is not None]
     known = (good or group)[0]
-    summary = Summary(**{item.name: getattr(known, item.name) for item in fields(Row)})
+    summary = Summary(**{item.name: getattr(known, item.name) for item in fields(SearchRow)})
     if not good:
         return summary
     summary.medians = {row.process: row.median_s for row in good if row.median_s is not None}
@@ -113,7 +113,7 @@ def _summary(group: list[Row]) -> Summary:
     )
 
 
-def _middle(rows: list[Row], name: str) -> int | None:
+def _middle(rows: list[SearchRow], name: str) -> int | None:
     values = [value for row in rows if (value := getattr(row, name)) is not None]
     return int(np.median(values)) if values else None
 

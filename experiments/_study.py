@@ -14,7 +14,7 @@ from scipy import stats
 
 from experiments import _config, _sweep, _table, _worker
 from experiments._config import Config, Scenes
-from experiments._rows import SCENE_FIELDS, Row, read_latest
+from experiments._rows import SCENE_FIELDS, SearchRow, read_latest
 
 ROOT = Path(__file__).resolve().parent
 Frame = Any  # a pd.DataFrame; what its columns hold, its annotations do not know
@@ -22,7 +22,7 @@ LIGHT = ("cll", "scipy-kdtree", "scipy-kdtree-nolist", "ann-kd", "ann-kd-nolist"
 """Methods whose processes start within a second."""
 
 
-def rows(sweep: str, small: bool, results: str | None = None) -> list[Row]:
+def rows(sweep: str, small: bool, results: str | None = None) -> list[SearchRow]:
     """Return the committed rows of a sweep, or, where there are none or `small` is asked for, rows of a small one made now.
 
     Args:
@@ -67,12 +67,12 @@ def _few(axis: str, values: Sequence[Any]) -> tuple[Any, ...]:
     return tuple(values[:2]) if axis == "layouts" or len(values) < 2 else (values[0], values[-1])
 
 
-def table(found: list[Row]) -> Frame:
+def table(found: list[SearchRow]) -> Frame:
     """Return the lines of a report, one for each method on each scene."""
     return pd.DataFrame(_table.lines(found))
 
 
-def rounds(found: list[Row]) -> Frame:
+def rounds(found: list[SearchRow]) -> Frame:
     """Return a line per process with figures: method, scene, process, machine, median_s [s], search_mb [MB], pairs."""
     names = ("method", "layout", "fill_asked", *SCENE_FIELDS, "process", "points", "median_s", "pairs", "rebuilt")
     good = [row for row in found if row.status == "ok"]

@@ -8,28 +8,25 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, replace
-from datetime import UTC, datetime
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-from experiments import _machine, methods
+from experiments import methods
 from experiments._config import Config, Spec, digest
 from experiments._errors import UsageError
 from experiments._forecast import Forecast, in_words
-from experiments._rows import RETRIED, SCENE_FIELDS, Row, RowFile
+from experiments._loop import Shown, Task, fill
+from experiments._rows import RETRIED, SCENE_FIELDS, RowFile, SearchRow
 from experiments._worker import RUNNER
 
 ROOT = Path(__file__).resolve().parent.parent
 REASON_LENGTH = 600
 
 
-def run(config: Config, name: str, folder: Path, retry_failed: bool = False, shard: tuple[int, int] = (1, 1)) -> list[Row]:
+def run(config: Config, name: str, folder: Path, retry_failed: bool = False, shard: tuple[int, int] = (1, 1)) -> list[SearchRow]:
     """Measure every row of the config that the folder does not hold yet, and return all rows of the config.
 
     Args:
@@ -39,10 +36,12 @@ def run(config: Config, name: str, folder: Path, retry_failed: bool = False, sha
         retry_failed: Whether rows that are missing, failed or ran out of time are measured again.
         shard: (k, n): only every n-th scene from the k-th on, with all its methods and processes, which are to be compared.
     """
-    file = RowFile(folder)
-    with file.locked():
-        file.repair()
-        return _run(config, name, file, retry_failed, shard)
+    sweep, specs = _Sweep(folder), shard_specs(config.specs(), shard)
+    sweep.tasks = {
+        spec.key: (spec, Task((spec.key,), spec.scene_name, partial(sweep.measure, spec), spec.cut_short)) for spec in specs
+    }
+    about, tasks = {"config": name, "config_hash": config.hash}, [task for _, task in sweep.tasks.values()]
+    return fill(RowFile(folder), tasks, sweep.describe, retry_failed=retry_failed, about=about, begin=sweep.begin)
 
 
 def shard_specs(specs: Iterable[Spec], shard: tuple[int, int]) -> list[Spec]:
@@ -53,71 +52,63 @@ def shard_specs(specs: Iterable[Spec], shard: tuple[int, int]) -> list[Spec]:
     return [spec for spec in specs if scenes[spec.scene_key] % parts == part - 1]
 
 
-def _run(config: Config, name: str, file: RowFile, retry_failed: bool, shard: tuple[int, int]) -> list[Row]:
-    """Do the work of `run` with the file of rows at hand."""
-    folder, specs = file.path.parent, shard_specs(config.specs(), shard)
-    rows = {row.key: row for row in file.read() if not (retry_failed and row.status in RETRIED)}
-    pending = [spec for spec in specs if (row := rows.get(spec.key)) is None or spec.cut_short(row)]
-    about = {"machine": _machine.machine(), **_machine.commit(), "config": name, "config_hash": config.hash}
-    forecast, scene, prepared, absent = Forecast(pending, rows.values()), None, set(), {}
-    with progress(len(specs)) as shown:
-        bar = shown.add_task("", total=len(specs), completed=len(specs) - len(pending))
-        _announce(shown.console, specs, pending, forecast)
-        for done, spec in enumerate(pending):
-            begin, left = perf_counter(), f"left: {in_words(forecast.left(pending[done:]))}"
-            if spec.scene_key != scene:
-                scene = spec.scene_key
-                shown.console.print(f"{spec.scene_name}: {done} of {len(pending)} rows measured, {left}", highlight=False)
-            if scene not in prepared:
-                prepared.add(scene)
-                shown.update(bar, description=f"{left} · {spec.scene_name} · exact pairs")
-                _prepare_oracle(spec, folder, shown.console)
-            shown.update(bar, description=f"{left} · {spec.scene_name} · {spec.method}")
-            row = replace(measure(spec, folder, absent.get(spec.method)), **about)
-            forecast.note(spec, perf_counter() - begin)
-            file.append(row)
-            if spec.method not in absent:
-                shown.console.print(describe(row), highlight=False, markup=False, soft_wrap=True)
-            if row.status == "missing":
-                absent[spec.method] = {"status": row.status, "reason": row.reason}  # it will not appear while this runs
-            shown.advance(bar)
-    keys = {spec.key for spec in specs}
-    return [row for row in file.read() if row.key in keys]
+class _Sweep:
+    """What a sweep knows while it runs: how long it will take, which scene is measured, and which methods are not there."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.tasks = folder, {}
+        self._scene, self._prepared, self._absent = None, set(), {}
+
+    def begin(self, left: list[Task[SearchRow]], there: list[SearchRow], shown: Shown) -> None:
+        """Say what is there, what is not installed, and how long the rest will take."""
+        self.pending = [self.tasks[task.keys[0]][0] for task in left]
+        self.done, self.forecast = 0, Forecast(self.pending, there)
+        if len(left) < len(self.tasks):
+            shown.say(f"{len(self.tasks) - len(left)} of {len(self.tasks)} rows are there already")
+        if absent := self.forecast.absent:
+            count = sum(spec.method in absent for spec in self.pending)
+            names = f"{', '.join(absent)} ({methods.HOW_TO_INSTALL})"
+            shown.say(f"not installed, so that {count} rows will have no figures: {names}")
+        if left:
+            shown.say(f"{len(left)} rows to measure: {in_words(self.forecast.left(self.pending))}")
+
+    def measure(self, spec: Spec, shown: Shown) -> Iterator[SearchRow]:
+        """Measure a row in a process of its own."""
+        begin, left = perf_counter(), f"left: {in_words(self.forecast.left(self.pending[self.done :]))}"
+        if spec.scene_key != self._scene:
+            self._scene = spec.scene_key
+            shown.say(f"{spec.scene_name}: {self.done} of {len(self.pending)} rows measured, {left}")
+        if spec.scene_key not in self._prepared:
+            self._prepared.add(spec.scene_key)
+            shown.label(f"{left} · {spec.scene_name} · exact pairs")
+            _prepare_oracle(spec, self.folder, shown)
+        shown.label(f"{left} · {spec.scene_name} · {spec.method}")
+        row = measure(spec, self.folder, self._absent.get(spec.method))
+        self.forecast.note(spec, perf_counter() - begin)
+        self.done += 1
+        yield row
+
+    def describe(self, row: SearchRow) -> str | None:
+        """Return a row as a line for the reader; of a method that is not there, only the first time."""
+        text = None if row.method in self._absent else describe(row)
+        if row.status == "missing":
+            self._absent[row.method] = {"status": row.status, "reason": row.reason}  # it will not appear while this runs
+        return text
 
 
-def _announce(console: Console, specs: list[Spec], pending: list[Spec], forecast: Forecast) -> None:
-    """Say what is there, what is not installed, and how long the rest will take."""
-    if len(pending) < len(specs):
-        console.print(f"{len(specs) - len(pending)} of {len(specs)} rows are there already")
-    if forecast.absent:
-        count = sum(spec.method in forecast.absent for spec in pending)
-        names = f"{', '.join(forecast.absent)} ({methods.HOW_TO_INSTALL})"
-        console.print(f"not installed, so that {count} rows will have no figures: {names}", highlight=False, markup=False)
-    if pending:
-        console.print(f"{len(pending)} rows to measure: {in_words(forecast.left(pending))}", highlight=False, markup=False)
-
-
-@contextmanager
-def progress(total: int) -> Iterator[Progress]:
-    """Show a bar on stderr."""
-    columns = (BarColumn(16), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True, force_jupyter=False), disable=total == 0) as shown:
-        yield shown
-
-
-def _prepare_oracle(spec: Spec, folder: Path, console: Console) -> None:
+def _prepare_oracle(spec: Spec, folder: Path, shown: Shown) -> None:
     """Find the exact pairs of a scene before its rows run, so that no row's time limit pays for them; once per folder."""
     there = folder / "oracle" / f"{digest(spec.scene_key)}.there"
     if there.exists():
         return
     answer = ask(_task("oracle", spec, folder), spec.timeout)
     if "reason" in answer:
-        console.print(f"{spec.scene_name}: no exact pairs: {answer['reason']}", highlight=False, markup=False)
+        shown.say(f"{spec.scene_name}: no exact pairs: {answer['reason']}")
     else:
         there.touch()
 
 
-def measure(spec: Spec, folder: Path, known: dict[str, Any] | None = None) -> Row:
+def measure(spec: Spec, folder: Path, known: dict[str, Any] | None = None) -> SearchRow:
     """Measure one row in a fresh process; never raises for what happens there.
 
     The first process of a row compiles its kernels, which is timed; the others take them from the folder.
@@ -131,7 +122,7 @@ def measure(spec: Spec, folder: Path, known: dict[str, Any] | None = None) -> Ro
     answer = known or ask(_task("measure", spec, folder), spec.timeout, kernels=kernels)
     asked = {"layout": spec.layout, "method": spec.method, "fill_asked": spec.fill, "process": spec.process}
     asked |= {name: getattr(spec, name) for name in SCENE_FIELDS}
-    return Row(key=spec.key, **asked, **answer, time=datetime.now(UTC).isoformat(timespec="seconds"))
+    return SearchRow(key=spec.key, **asked, **answer)
 
 
 def _task(do: str, spec: Spec, folder: Path) -> dict[str, Any]:
@@ -196,12 +187,12 @@ def merge(folder: Path, parts: Iterable[Path]) -> int:
     return came
 
 
-def _worth(row: Row) -> tuple[bool, int]:
+def _worth(row: SearchRow) -> tuple[bool, int]:
     """Return what makes a row count before another of its key: that there need not be a next one, and its repeats."""
     return row.status not in RETRIED, len(row.seconds)
 
 
-def count_results(rows: list[Row]) -> str:
+def count_results(rows: list[SearchRow]) -> str:
     """Say how many rows have a result, and why the others have none."""
     statuses = Counter(row.status for row in rows)
     good = statuses.pop("ok", 0)
@@ -209,7 +200,7 @@ def count_results(rows: list[Row]) -> str:
     return f"{good} of {len(rows)} rows ok" + (f", {len(rows) - good} without a result ({others})" if others else "")
 
 
-def describe(row: Row) -> str:
+def describe(row: SearchRow) -> str:
     """Return a row as a line for the reader."""
     start = f"{row.scene_name:<17} {row.method:<20} {row.status:<8}"
     if row.status != "ok":

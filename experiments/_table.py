@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from experiments import _statistics, _thesis
-from experiments._rows import Row
+from experiments._rows import SearchRow
 from experiments._statistics import Summary
 
-RowT = TypeVar("RowT", bound=Row)
+RowT = TypeVar("RowT", bound=SearchRow)
 
 YARDSTICKS = ("cll", "warp", "warp-counts", "warp-rebuild")
 """What ratios divide by: the first of these that a sweep has."""
@@ -36,7 +36,7 @@ COLUMNS = (
 )
 
 
-def lines(rows: list[Row]) -> list[dict[str, Any]]:
+def lines(rows: list[SearchRow]) -> list[dict[str, Any]]:
     """Return a line per method and scene, with the keys `COLUMNS`, None where there is nothing to say.
 
     Scenes stand in order of their points; within one, the methods stand as the rows do. `seconds_ratio` and `mb_ratio` divide by
@@ -60,7 +60,7 @@ def in_order(rows: Sequence[RowT]) -> list[RowT]:
     return sorted(rows, key=lambda row: (points.get(row.scene_key, 0), first[row.scene_key]))
 
 
-def name_scenes(rows: Sequence[Row]) -> dict[tuple[Any, ...], str]:
+def name_scenes(rows: Sequence[SearchRow]) -> dict[tuple[Any, ...], str]:
     """Return a name of each scene: layout and fill, and whatever else differs within these rows."""
     differing = {
         "spacing": lambda row: f"dx {row.spacing:g} m",

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
-from experiments._rows import Row
+from experiments._rows import SearchRow
 
 FILE = Path(__file__).parent / "reference" / "table_6_1.csv"
 COUNTERPARTS = {
@@ -58,7 +58,7 @@ def counterparts(present: Iterable[str]) -> dict[str, str]:
     return chosen
 
 
-def figures(row: Row, method: str | None = None) -> Figures | None:
+def figures(row: SearchRow, method: str | None = None) -> Figures | None:
     """Return what the thesis says about the scene of a row, None where it says nothing.
 
     Args:

@@ -38,9 +38,9 @@ def main() -> None:
 def _answer(task: dict[str, Any]) -> dict[str, Any]:
     """Do a task: {"do": "oracle" or "measure", "spec", "oracle": folder}, or {"do": "sum" or "sph", "spec"}."""
     if task["do"] == "sum":
-        from experiments import _ways
+        from experiments.bench import ways
 
-        return _ways.measure(_ways.Spec(**task["spec"]))
+        return ways.measure(ways.Spec(**task["spec"]))
     if task["do"] == "sph":
         from experiments.sph import tradeoff
 

@@ -12,17 +12,18 @@ import typer
 from jfrnn.cases import fluids
 from typer.testing import CliRunner
 
-from experiments import _commands, _gpu
+from experiments import _commands, _config
 from experiments._cli import app
 from experiments._errors import UsageError
+from experiments.gpu.config import Config
 from experiments.sph import ranges, settings, snapshots
 
 ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
-COMMANDS = (
-    *("run", "report", "merge", "sums", "list", "show", "export", "sph", "sph-validate", "sph-speed", "sph-gradients", "domain"),
-    *("skin", "options", "ties", "use", "crossover", "triangles", "peers", "gpu", "gpu-report", "distributed"),
-)
+TOP = ("run", "report", "merge", "list", "show", "export", "gpu", "bench", "sph")
+BENCH = ("crossover", "distributed", "domain", "options", "peers", "skin", "sums", "ties", "triangles", "use")
+SPH = ("run", "validate", "speed", "gradients")
+COMMANDS = (*TOP[:7], *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))
 
 
 def refused(*arguments):
@@ -47,26 +48,19 @@ def told(*arguments):
 # --- lists and help ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_list_of_commands_fits_a_screen():
-    lines = told("--help").splitlines()
+@pytest.mark.parametrize(("group", "names"), [((), TOP), (("bench",), BENCH), (("sph",), SPH)])
+def test_the_list_of_commands_fits_a_screen(group, names):
+    lines = told(*group, "--help").splitlines()
     assert (len(lines) <= 24, max(map(len, lines)) <= 80) == (True, True)
-    assert [line[11:].split()[0] for line in lines[1:]] == list(COMMANDS)
-    assert [line.split()[0] for line in lines[1:] if line[0] != " "] == ["sweeps", "scenes", "fluids", "questions", "devices"]
-    assert told() == told("--help")
+    assert [line.split()[0] for line in lines[1:]] == list(names)
+    assert told(*group) == told(*group, "--help")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_keeps_what_stands_in_brackets(command):
-    units = {
-        "show": ["[m]"],
-        "export": ["[m]"],
-        "skin": ["[m]"],
-        "run": ["[s]"],
-        "domain": ["[cutoffs]"],
-        "triangles": ["[modules]"],
-    }
-    units |= {"peers": ["[s]", "'.[peers]'"]}
-    text = told(command, "--help")
+    units = {"show": ["[m]"], "export": ["[m]"], "run": ["[s]"], "bench skin": ["[m]"], "bench domain": ["[cutoffs]"]}
+    units |= {"bench triangles": ["[modules]"], "bench peers": ["[s]", "'.[peers]'"]}
+    text = told(*command.split(), "--help")
     assert text.startswith(f"Usage: python -m experiments {command} ")
     assert [unit for unit in units.get(command, []) if unit not in text] == []
 
@@ -137,7 +131,7 @@ def test_every_number_that_can_be_set_has_a_range_and_defaults_are_within():
     ],
 )
 def test_a_setting_of_a_fluid_that_is_out_of_range(tmp_path, scene, setting, message):
-    assert refused("sph", scene, "--set", setting, "--out", tmp_path / "out").startswith(message)
+    assert refused("sph", "run", scene, "--set", setting, "--out", tmp_path / "out").startswith(message)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -168,52 +162,55 @@ def test_particles_that_cannot_be_used(tmp_path, name, content, message):
     path = tmp_path / name
     if content is not None:
         path.write_bytes(content)
-    assert refused("sph", "dam", "--initial", path, "--out", tmp_path / "out").startswith(message.format(path))
+    assert refused("sph", "run", "dam", "--initial", path, "--out", tmp_path / "out").startswith(message.format(path))
     assert not (tmp_path / "out").exists()
 
 
 def test_arrays_of_words_are_no_particles(tmp_path):
     path = tmp_path / "words.npz"
     np.savez(path, positions=np.array([["a", "b"]]))
-    assert refused("sph", "dam", "--initial", path).startswith(f"{path}: holds what are no numbers: ")
+    assert refused("sph", "run", "dam", "--initial", path).startswith(f"{path}: holds what are no numbers: ")
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("skin", "--steps", "0"), "--steps 0: "),
-        (("skin", "--repeats=1"), "--repeats 1: "),
-        (("skin", "--spacing", "nan"), "--spacing nan: "),
-        (("skin", "--spacing", "-1"), "--spacing -1: "),
-        (("domain", "nan"), "Invalid value for "),
-        (("domain", "0"), "Invalid value for "),
-        (("domain", "--points", "1"), "--points 1: "),
-        (("domain", "--points", "10000000000"), "--points 10000000000: "),
-        (("use", "--points", "abc"), "--points abc: "),
-        (("use", "--rounds", "1"), "--rounds 1: "),
-        (("options", "--backend", "cuda"), "--backend cuda: allowed: auto, jax, warp, brute"),
-        (("ties", "--backend", "cuda"), "--backend cuda: allowed: auto, jax, warp, brute"),
-        (("ties", "--cube", "1"), "--cube 1: "),
-        (("triangles", "--backend", "brute"), "--backend brute: allowed: warp, bvh, jax"),
-        (("triangles", "--cutoff", "0"), "--cutoff 0: "),
-        (("triangles", "--faces", "1"), "--faces 1: "),
-        (("crossover", "--repeats", "1"), "--repeats 1: "),
-        (("peers", "--limit", "nan"), "--limit nan: "),
-        (("peers", "ann"), "no peer 'ann': jfrnn, scipy, "),
+        (("bench", "skin", "--steps", "0"), "--steps 0: "),
+        (("bench", "skin", "--repeats=1"), "--repeats 1: "),
+        (("bench", "skin", "--spacing", "nan"), "--spacing nan: "),
+        (("bench", "skin", "--spacing", "-1"), "--spacing -1: "),
+        (("bench", "domain", "nan"), "Invalid value for "),
+        (("bench", "domain", "0"), "Invalid value for "),
+        (("bench", "domain", "--points", "1"), "--points 1: "),
+        (("bench", "domain", "--points", "10000000000"), "--points 10000000000: "),
+        (("bench", "use", "--points", "abc"), "--points abc: "),
+        (("bench", "use", "--rounds", "1"), "--rounds 1: "),
+        (("bench", "options", "--backend", "cuda"), "--backend cuda: allowed: auto, jax, warp, brute"),
+        (("bench", "ties", "--backend", "cuda"), "--backend cuda: allowed: auto, jax, warp, brute"),
+        (("bench", "ties", "--cube", "1"), "--cube 1: "),
+        (("bench", "triangles", "--backend", "brute"), "--backend brute: allowed: warp, bvh, jax"),
+        (("bench", "triangles", "--cutoff", "0"), "--cutoff 0: "),
+        (("bench", "triangles", "--faces", "1"), "--faces 1: "),
+        (("bench", "crossover", "--repeats", "1"), "--repeats 1: "),
+        (("bench", "peers", "--limit", "nan"), "--limit nan: "),
+        (("bench", "peers", "ann"), "no peer 'ann': jfrnn, scipy, "),
         (("show", "corners", "--dim", "4"), "--dim 4: "),
         (("show", "corners", "--fill", "nan"), "--fill nan: "),
         (("show", "corners", "--seed", "-1"), "--seed -1: "),
         (("show", "corners", "--spacing", "1e-3", "--out", "p.abc"), "--out p.abc: unknown ending '.abc'; allowed: "),
-        (("sph", "dam", "--skin", "nan"), "--skin nan: "),
-        (("sph", "dam", "--frames", "0"), "--frames 0: "),
-        (("sph", "jet", "--solid", "part.stl", "--solid-unit", "-1"), "--solid-unit -1: "),
-        (("sph", "jet", "--solid", "part.stl", "--solid-unit", "nan"), "--solid-unit nan: "),
-        (("sph", "jet", "--solid", "part.stl"), "--solid part.stl is no file: name an STL, OBJ or PLY."),
-        (("sph", "jet", "--solid-unit", "0.001"), "--solid-unit 0.001: is the unit of the file of --solid; name that file too"),
-        (("sph", "dam", "--neighbors", "tree"), "--neighbors tree: allowed: pair_sum, list"),
-        (("sph-validate", "sea"), "no case 'sea'; allowed: "),
-        (("sph-gradients", "sea"), "no problem 'sea'; allowed: "),
-        (("sph-gradients", "--evaluations", "0"), "--evaluations 0: "),
+        (("sph", "run", "dam", "--skin", "nan"), "--skin nan: "),
+        (("sph", "run", "dam", "--frames", "0"), "--frames 0: "),
+        (("sph", "run", "jet", "--solid", "part.stl", "--solid-unit", "-1"), "--solid-unit -1: "),
+        (("sph", "run", "jet", "--solid", "part.stl", "--solid-unit", "nan"), "--solid-unit nan: "),
+        (("sph", "run", "jet", "--solid", "part.stl"), "--solid part.stl is no file: name an STL, OBJ or PLY."),
+        (
+            ("sph", "run", "jet", "--solid-unit", "0.001"),
+            "--solid-unit 0.001: is the unit of the file of --solid; name that file too",
+        ),
+        (("sph", "run", "dam", "--neighbors", "tree"), "--neighbors tree: allowed: pair_sum, list"),
+        (("sph", "validate", "sea"), "no case 'sea'; allowed: "),
+        (("sph", "gradients", "sea"), "no problem 'sea'; allowed: "),
+        (("sph", "gradients", "--evaluations", "0"), "--evaluations 0: "),
         (("run", "none.toml", "--most-seconds", "nan"), "--most-seconds nan: "),
         (("run", "none.toml", "--processes", "0"), "--processes 0: "),
         (("rum",), "No such command 'rum'. Did you mean 'run'?"),
@@ -228,15 +225,15 @@ def test_an_option_that_is_out_of_range(tmp_path, monkeypatch, arguments, messag
 BROKEN = {"cut.toml": b"methods = [", "bytes.toml": b"\xff\xfe\x00", "unknown.toml": b"speed = 1\n"}
 
 
-@pytest.mark.parametrize("command", ["run", "sums", "ties", "distributed", "gpu", "sph-speed"])
+@pytest.mark.parametrize("command", ["run", "bench sums", "bench ties", "bench distributed", "gpu", "sph speed"])
 def test_configs_that_are_none(tmp_path, command):
-    assert refused(command, tmp_path / "none.toml", "--out", tmp_path / "out").startswith(
+    assert refused(*command.split(), tmp_path / "none.toml", "--out", tmp_path / "out").startswith(
         f"{tmp_path / 'none.toml'}: cannot be read (No such"
     )
-    assert refused(command, tmp_path, "--out", tmp_path / "out").startswith(f"{tmp_path}: cannot be read (Is a directory)")
+    assert refused(*command.split(), tmp_path, "--out", tmp_path / "out").startswith(f"{tmp_path}: cannot be read (Is a directory)")
     for name, text in BROKEN.items():
         (tmp_path / name).write_bytes(text)
-        said = CliRunner().invoke(app, [command, str(tmp_path / name), "--out", str(tmp_path / "out")])
+        said = CliRunner().invoke(app, [*command.split(), str(tmp_path / name), "--out", str(tmp_path / "out")])
         assert said.exit_code == 2
         assert all(line.startswith(("error: ", str(tmp_path / name))) for line in said.stderr.splitlines())
         assert str(tmp_path / name) in said.stderr.splitlines()[0]
@@ -251,7 +248,7 @@ def test_a_key_in_a_table_of_a_config_is_told_what_its_table_allows(tmp_path):
         + "\n[[triangles]]\npoints = [1]\nfaces = 500\ncutoffs = [nan]\ndtypes = []\nspeed = 1\n"
     )
     with pytest.raises(UsageError) as caught:
-        _gpu.load(path)
+        _config.load(path, Config)
     lines = str(caught.value).splitlines()
     assert f"{path}: triangles[0].speed: unknown key (value 1); allowed: points, faces, cutoffs, dtypes" in lines
     assert f"{path}: triangles[0].cutoffs[0]: got nan; input should be a finite number" in lines
@@ -273,7 +270,7 @@ def test_a_number_of_a_config_that_is_out_of_range(tmp_path, config, message):
 def test_steps_are_timed_of_scenes_that_have_an_nx(tmp_path):
     path = tmp_path / "steps.toml"
     path.write_text('scene = "jet"\nnx = [4]\n')
-    assert refused("sph-speed", path).startswith(f"{path}: scene: fluid scene 'jet' has no nx")
+    assert refused("sph", "speed", path).startswith(f"{path}: scene: fluid scene 'jet' has no nx")
 
 
 # --- folders that cannot be written, and what they hold ---------------------------------------------------------------------
@@ -283,16 +280,17 @@ def test_steps_are_timed_of_scenes_that_have_an_nx(tmp_path):
     "arguments",
     [
         ("run", CONFIGS / "smoke.toml"),
-        ("sums", CONFIGS / "sums_smoke.toml"),
-        ("distributed", CONFIGS / "distributed_smoke.toml"),
+        ("bench", "sums", CONFIGS / "sums_smoke.toml"),
+        ("bench", "distributed", CONFIGS / "distributed_smoke.toml"),
         ("gpu", CONFIGS / "h200.toml"),
-        ("sph-speed", CONFIGS / "sph_speed.toml"),
-        ("sph", "one"),
-        ("sph-validate", "one"),
-        ("sph-gradients", "memory"),
-        *(("options",), ("ties",), ("crossover",), ("triangles",), ("peers", "scipy")),
+        ("sph", "speed", CONFIGS / "sph_speed.toml"),
+        ("sph", "run", "one"),
+        ("sph", "validate", "one"),
+        ("sph", "gradients", "memory"),
+        *(("bench", name) for name in ("options", "ties", "crossover", "triangles", "skin", "use", "domain")),
+        ("bench", "peers", "scipy"),
     ],
-    ids=lambda arguments: arguments[0],
+    ids=lambda arguments: " ".join(map(str, arguments[:2])),
 )
 def test_a_folder_that_cannot_be_written_names_its_option(tmp_path, arguments):
     (tmp_path / "file").write_text("")
@@ -313,13 +311,14 @@ def test_files_that_cannot_be_written_name_their_option(tmp_path):
 
 def test_folders_that_hold_something_else(tmp_path):
     rows = tmp_path / "rows.jsonl"
-    for text in (b"no json\n", b'{"kind": "ceiling"}\n', b"[]\n", b"\xff\xff\n"):
+    rows.write_bytes(b'{"kind": "ceiling"}\n')
+    assert refused("report", tmp_path).startswith(f"{rows}: holds no rows of a GPU run")
+    for text in (b"no json\n", b"[]\n", b"\xff\xff\n"):
         rows.write_bytes(text)
         assert refused("report", tmp_path).startswith(f"{rows}: line 1 is no row")
-        assert refused("gpu-report", tmp_path).startswith(f"{rows}: holds no rows of a GPU run")
     assert refused("merge", tmp_path, tmp_path / "none").startswith(f"{rows}: line 1 is no row")
     (tmp_path / "run.json").write_text("[1]")
-    assert refused("sph", "one", "--out", tmp_path).startswith(f"{tmp_path / 'run.json'}: says no run (")
+    assert refused("sph", "run", "one", "--out", tmp_path).startswith(f"{tmp_path / 'run.json'}: says no run (")
 
 
 def test_a_snapshot_that_is_cut_off_is_named(tmp_path):
@@ -337,7 +336,9 @@ def test_too_little_memory_is_said_in_a_line(capsys):
 
 
 def test_a_mistake_ends_a_process_with_2_and_a_line():
-    done = subprocess.run([sys.executable, "-m", "experiments", "skin", "--steps", "0"], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments", "bench", "skin", "--steps", "0"], cwd=ROOT, capture_output=True, text=True
+    )
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("error: --steps 0: ")
-    assert done.stderr.endswith("(see python -m experiments skin --help)\n")
+    assert done.stderr.endswith("(see python -m experiments bench skin --help)\n")

@@ -58,7 +58,7 @@ def test_limits_of_time_change_no_key_but_rows_that_they_cut_short_are_wanted_ag
     short, long = (load(tmp_path, f"most_seconds = {most}\ntimeout = {2 * most}\n" + GOOD) for most in (1.0, 9.0))
     assert [spec.key for spec in short.specs()] == [spec.key for spec in long.specs()]
     spec, later = next(short.specs()), next(long.specs())
-    row = _rows.Row(
+    row = _rows.SearchRow(
         **{name: getattr(spec, name) for name in ("key", "layout", "method", *_rows.SCENE_FIELDS)}, fill_asked=spec.fill
     )
     assert spec.repeats == 5
@@ -72,11 +72,15 @@ def test_limits_of_time_change_no_key_but_rows_that_they_cut_short_are_wanted_ag
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("repeats = 5", "repeat = 5", r"sweep\.toml: repeat: unknown key \(value 5\); allowed: methods, scenes, spacing, "),
+        ("repeats = 5", "repeat = 5", r"sweep\.toml: repeat: unknown key \(value 5\); allowed: repeats, .*methods, scenes, "),
         ("fills =", "fill =", r"sweep\.toml: scenes\[0\]\.fill: unknown key \(value \[0\.02, 0\.11\]\); allowed: layouts, fills"),
-        ('"full"', '"fulll"', r"scenes\[1\]\.layouts: unknown layout 'fulll'; allowed: full, corners, .*clustersN"),
-        ('"clusters7"', '"clustersN"', r"scenes\[0\]\.layouts: unknown layout 'clustersN'; allowed: "),
-        ('"cll"', '"ccl"', r"methods: unknown method 'ccl'; allowed: .*brute, cll, freud, hashgrid, hashgrid-plain, jax, .*, warp"),
+        ('"full"', '"fulll"', r"scenes\[1\]\.layouts\[0\]: unknown layout 'fulll'; allowed: full, corners, .*clustersN"),
+        ('"clusters7"', '"clustersN"', r"scenes\[0\]\.layouts\[1\]: unknown layout 'clustersN'; allowed: "),
+        (
+            '"cll"',
+            '"ccl"',
+            r"methods\[1\]: unknown method 'ccl'; allowed: .*brute, cll, freud, hashgrid, hashgrid-plain, jax, .*, warp",
+        ),
         ("0.11]", "1.5]", r"scenes\[0\]\.fills\[1\]: got 1\.5; input should be less than or equal to 1"),
         ("0.02,", "0.0,", r"scenes\[0\]\.fills\[0\]: got 0\.0; input should be greater than 0"),
         ("repeats = 5", "repeats = 0", r"repeats: got 0; input should be greater than or equal to 1"),
@@ -109,7 +113,7 @@ def test_the_command_ends_with_2_and_no_traceback(tmp_path):
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
     assert done.stdout == ""
-    assert done.stderr.startswith(f"error: {path}: repeat: unknown key (value 5); allowed: methods, ")
+    assert done.stderr.startswith(f"error: {path}: repeat: unknown key (value 5); allowed: repeats, ")
     assert len(done.stderr.splitlines()) == 1
     assert not (tmp_path / "out").exists()
 

@@ -1,4 +1,4 @@
-"""`python -m experiments distributed`: rows, what is sent, and the table; in a process of its own, which asks for its devices."""
+"""`python -m experiments bench distributed`: rows, what is sent, the table; in a process of its own, which asks for its devices."""
 
 import json
 import os
@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments import _distributed
 from experiments._config import load
+from experiments.bench import distributed
 
 ROOT = Path(__file__).parent.parent
 CONFIG = """
@@ -28,7 +28,16 @@ backend = "warp"
 
 def run(tmp_path, text):
     (tmp_path / "tiny.toml").write_text(text)
-    command = [sys.executable, "-m", "experiments", "distributed", str(tmp_path / "tiny.toml"), "--out", str(tmp_path / "out")]
+    command = [
+        sys.executable,
+        "-m",
+        "experiments",
+        "bench",
+        "distributed",
+        str(tmp_path / "tiny.toml"),
+        "--out",
+        str(tmp_path / "out"),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT, env=os.environ | {"JAX_PLATFORMS": "cpu"})
     assert done.returncode == 0, done.stderr
     rows = [json.loads(line) for line in (tmp_path / "out" / "rows.jsonl").read_text().splitlines()]
@@ -63,7 +72,7 @@ def test_all_kinds_of_work(tmp_path):
 
 def test_configs_can_be_read():
     for name in ("distributed_smoke", "distributed_cpu", "distributed_h200", "distributed_h200_x2", "distributed_h200_x2_full"):
-        config = load(ROOT / "experiments" / "configs" / f"{name}.toml", _distributed.Config)
+        config = load(ROOT / "experiments" / "configs" / f"{name}.toml", distributed.Config)
         rows = len(config.scaling) * len(config.work) * len(config.axes) * len(config.devices)
         assert len({spec.key for spec in config.specs()}) == rows
 
@@ -79,4 +88,4 @@ def test_bytes_that_a_program_sends():
         "%h = s32[5]{0} collective-permute-done(%c)",
         "%i = f32[9]{0} add(%j, %k)",
     ]
-    assert _distributed.sent_bytes("\n".join(lines)) == 2 * (24 + 20 + (28 + 32) + (72 + 24) + (16 + 12))
+    assert distributed.sent_bytes("\n".join(lines)) == 2 * (24 + 20 + (28 + 32) + (72 + 24) + (16 + 12))

@@ -1,4 +1,4 @@
-"""`python -m experiments options`: one option at a time, beside a plain search."""
+"""`python -m experiments bench options`: one option at a time, beside a plain search."""
 
 import pandas as pd
 import pytest
@@ -9,7 +9,9 @@ from experiments._cli import app
 
 @pytest.mark.slow  # nineteen programs
 def test_every_option_gets_a_row(tmp_path):
-    result = CliRunner().invoke(app, ["options", "--points", "500", "--rounds", "2", "--backend", "warp", "--out", str(tmp_path)])
+    result = CliRunner().invoke(
+        app, ["bench", "options", "--points", "500", "--rounds", "2", "--backend", "warp", "--out", str(tmp_path)]
+    )
     assert result.exit_code == 0, result.output
     table = pd.read_csv(tmp_path / "cpu_warp.csv")
     assert table["option"].is_unique

@@ -1,4 +1,4 @@
-"""`python -m experiments peers`: what others answer on the catalog of hard cases, here of peers that are always there."""
+"""`python -m experiments bench peers`: what others answer on the catalog of hard cases, here of peers that are always there."""
 
 import csv
 
@@ -7,8 +7,8 @@ import pytest
 from jfrnn.cases.catalog import CATALOG, TABLES, problem
 from typer.testing import CliRunner
 
-from experiments import _peers
 from experiments._cli import app
+from experiments.bench import peers
 
 
 def test_every_case_of_the_catalog_exists():
@@ -22,8 +22,8 @@ def test_every_case_of_the_catalog_exists():
 
 def test_answers_are_judged_and_tabled(tmp_path, monkeypatch):
     kept = ("distances that equal the cutoff", "left-handed and skewed boxes", "batches")
-    monkeypatch.setattr(_peers, "CATALOG", tuple(row for row in CATALOG if row.title in kept))
-    result = CliRunner().invoke(app, ["peers", "jfrnn", "scipy", "--out", str(tmp_path)])
+    monkeypatch.setattr(peers, "CATALOG", tuple(row for row in CATALOG if row.title in kept))
+    result = CliRunner().invoke(app, ["bench", "peers", "jfrnn", "scipy", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
     with (tmp_path / "answers.csv").open() as stream:
         answers = {(row["peer"], row["case"]): row for row in csv.DictReader(stream)}
@@ -48,19 +48,19 @@ def _sleep(given):
 
 @pytest.mark.parametrize(("ask", "said"), [(_stop, "crash (3)"), (_sleep, "none in 2 s")], ids=["crash", "endless"])
 def test_a_peer_that_crashes_or_does_not_end_says_so(ask, said, monkeypatch):
-    monkeypatch.setattr(_peers, "_serve", _serve_with)
-    monkeypatch.setattr(_peers, "PEERS", {ask.__name__: _peers._Peer("jfrnn", ask)})
-    answers = list(_peers._answers(ask.__name__, ["hard/n_1", "hard/n_2"], 2.0))
+    monkeypatch.setattr(peers, "_serve", _serve_with)
+    monkeypatch.setattr(peers, "PEERS", {ask.__name__: peers._Peer("jfrnn", ask)})
+    answers = list(peers._answers(ask.__name__, ["hard/n_1", "hard/n_2"], 2.0))
     assert [answer["answer"] for answer in answers] == [said, said]
 
 
 def _serve_with(name, pipe):
     """Serve a peer of this file: a process of its own does not know what the test has patched."""
-    _peers.PEERS[name] = _peers._Peer("jfrnn", {"_stop": _stop, "_sleep": _sleep}[name])
-    _peers._serve(name, pipe)
+    peers.PEERS[name] = peers._Peer("jfrnn", {"_stop": _stop, "_sleep": _sleep}[name])
+    peers._serve(name, pipe)
 
 
 def test_an_unknown_peer_is_named(tmp_path):
-    result = CliRunner().invoke(app, ["peers", "nobody", "--out", str(tmp_path)])
+    result = CliRunner().invoke(app, ["bench", "peers", "nobody", "--out", str(tmp_path)])
     assert result.exit_code == 2
     assert "no peer 'nobody': jfrnn, scipy" in result.output

@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 from experiments import _plots, _report, _table, _thesis
 from experiments._cli import app
-from experiments._rows import Row, RowFile
+from experiments._rows import RowFile, SearchRow
 
 PICTURES = ("runtime_by_layout", "memory_by_layout", "runtime_by_fill", "memory_by_fill", "speed_against_error")
 PICTURES += ("memory_against_error", "speed_against_sum_error")
@@ -23,7 +23,7 @@ SCENES = (
 
 def make_row(scene, method, seconds, megabytes, **options):
     layout, fill_asked, points, fill = scene
-    row = Row(
+    row = SearchRow(
         **{"key": f"{layout} {fill_asked} {method}", "layout": layout, "method": method, "fill_asked": fill_asked, "fill": fill},
         **{"spacing": 1e-4, "cutoff_ratio": 3.0, "dtype": "float32", "dim": 3, "seed": 0, "status": "ok", "points": points},
         **{"compile_s": 0.5, "first_s": seconds, "median_s": seconds, "p10_s": 0.9 * seconds, "p90_s": 1.2 * seconds, "repeats": 5},

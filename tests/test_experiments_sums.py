@@ -1,4 +1,4 @@
-"""`python -m experiments sums`: one sum in many ways, a process per row."""
+"""`python -m experiments bench sums`: one sum in many ways, a process per row."""
 
 import math
 from dataclasses import replace
@@ -10,9 +10,10 @@ import pytest
 from typer.testing import CliRunner
 
 import jfrnn
-from experiments import _config, _sums, _sums_report, _ways
+from experiments import _config
 from experiments._cli import app
 from experiments._errors import UsageError
+from experiments.bench import sums, sums_report, ways
 from experiments.sph import speed
 
 CONFIGS = Path(__file__).parent.parent / "experiments" / "configs"
@@ -30,7 +31,7 @@ min_seconds = 0.0
 
 def scene(n=300, dtype=np.float32):
     random = np.random.default_rng(0)
-    return _ways.Given(jnp.asarray(random.random((n, 3)), dtype), jnp.asarray(random.uniform(0.5, 1.5, n), dtype), 0.2)
+    return ways.Given(jnp.asarray(random.random((n, 3)), dtype), jnp.asarray(random.uniform(0.5, 1.5, n), dtype), 0.2)
 
 
 @pytest.fixture(scope="module")
@@ -38,14 +39,14 @@ def folder(tmp_path_factory):
     """Run the command once; its folder holds the config, too."""
     there = tmp_path_factory.mktemp("sums")
     (there / "tiny.toml").write_text(TINY)
-    result = CliRunner().invoke(app, ["sums", str(there / "tiny.toml"), "--out", str(there)], catch_exceptions=False)
+    result = CliRunner().invoke(app, ["bench", "sums", str(there / "tiny.toml"), "--out", str(there)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     (there / "said.txt").write_text(result.output)
     return there
 
 
 def read(folder):
-    return {row.way: row for row in _sums.RowFile(folder, _sums.Row).read()}
+    return {row.way: row for row in sums.RowFile(folder, sums.SumRow).read()}
 
 
 def test_every_way_gets_a_row(folder):
@@ -80,45 +81,46 @@ def test_rows_that_are_there_are_not_measured_again(folder, monkeypatch):
     def fail(*args, **options):
         raise AssertionError("measured again")
 
-    monkeypatch.setattr(_sums._sweep, "ask", fail)
-    config = _config.load(folder / "tiny.toml", _sums.Config)
-    assert [row.way for row in _sums.run(config, folder)] == list(config.ways)
+    monkeypatch.setattr(sums._sweep, "ask", fail)
+    config = _config.load(folder / "tiny.toml", sums.Config)
+    assert [row.way for row in sums.run(config, folder)] == list(config.ways)
     with pytest.raises(AssertionError, match="measured again"):
-        _sums.run(config.model_copy(update={"repeats": 3}), folder)
+        sums.run(config.model_copy(update={"repeats": 3}), folder)
 
 
 def test_a_row_is_on_disk_before_the_next_one_starts(tmp_path, monkeypatch):
-    config = _sums.Config(ways=("pair_sum warp", "list, sum"), layouts=("full",), spacings=(1e-3,), gradients=(False,))
+    config = sums.Config(ways=("pair_sum warp", "list, sum"), layouts=("full",), spacings=(1e-3,), gradients=(False,))
     answers = [{"status": "skipped"}]
-    monkeypatch.setattr(_sums._sweep, "ask", lambda *args, **options: answers.pop())
+    monkeypatch.setattr(sums._sweep, "ask", lambda *args, **options: answers.pop())
     with pytest.raises(IndexError):
-        _sums.run(config, tmp_path)
+        sums.run(config, tmp_path)
     assert [row.way for row in read(tmp_path).values()] == ["pair_sum warp"]
 
 
 def test_where_a_list_pays_off():
-    assert _sums_report.pays_from(10.0, 1.0, 6.0) == 3  # 10 + 2·1 = 2·6 is no gain yet
-    assert _sums_report.pays_from(10.0, 6.0, 6.0) == math.inf
-    row = _sums.Row(
+    assert sums_report.pays_from(10.0, 1.0, 6.0) == 3  # 10 + 2·1 = 2·6 is no gain yet
+    assert sums_report.pays_from(10.0, 6.0, 6.0) == math.inf
+    row = sums.SumRow(
         **{"key": "a", "layout": "full", "spacing": 1.0, "cutoff_ratio": 3.0, "dtype": "float32", "seed": 0, "gradient": False},
         **{"way": "pair_sum warp", "compensated": False, "status": "ok", "points": 100, "error": 1.0, "peak_bytes": 4000},
         **{"median_s": 6.0, "sum_s": 6.0},
     )
     listed = replace(row, key="b", way="list, sum", median_s=11.0, sum_s=1.0, build_s=10.0)
-    first, second = _sums_report.table([row, listed])
+    first, second = sums_report.table([row, listed])
     assert (first["ratio"], first["B per particle"], second["ratio"], second["pays_from"]) == (1.0, 40.0, 11 / 6, 3)
 
 
 def test_an_error_is_said_with_its_unit(tmp_path):
-    row = _sums.Row(
+    row = sums.SumRow(
         **{"key": "a", "layout": "full", "spacing": 1.0, "cutoff_ratio": 3.0, "dtype": "float32", "seed": 0, "gradient": False},
         **{"way": "pair_sum warp", "compensated": False, "status": "ok", "points": 100, "error": 0.19, "peak_bytes": 4000},
         **{"median_s": 6.0, "sum_s": 6.0},
     )
-    assert _sums.describe(row).endswith(", error 0.19 eps·√neighbors")
-    assert "error [eps·√neighbors]" in _sums_report.report([row], tmp_path).splitlines()[0]
-    run = speed.Row(
-        "a", "tradeoff", "list", "taylor-green", 8, "float32", 10, 0.3, "ok", seconds=1.0, error={"l2 of velocity": 0.19}
+    assert sums.describe(row).endswith(", error 0.19 eps·√neighbors")
+    assert "error [eps·√neighbors]" in sums_report.report([row], tmp_path).splitlines()[0]
+    run = speed.StepRow(
+        **{"key": "a", "kind": "tradeoff", "way": "list", "scene": "taylor-green", "nx": 8, "dtype": "float32", "steps": 10},
+        **{"skin": 0.3, "status": "ok", "seconds": 1.0, "error": {"l2 of velocity": 0.19}},
     )
     assert speed.describe(run).endswith("1 s, error of l2 of velocity 19 %")
 
@@ -126,28 +128,28 @@ def test_an_error_is_said_with_its_unit(tmp_path):
 @pytest.mark.parametrize("gradient", [False, True])
 def test_float64_is_exact_and_an_error_is_seen(gradient):
     given = scene(dtype=np.float64)
-    steps = _ways.WAYS["list, sum"].prepare(given, gradient, False)
+    steps = ways.WAYS["list, sum"].prepare(given, gradient, False)
     found = steps.sums(given.x, given.m, steps.build(given.x))
-    assert _ways.error_of(given, found, gradient) < 4
+    assert ways.error_of(given, found, gradient) < 4
     sums = (found[0], found[1] * 1.001) if gradient else found * 1.001
-    assert _ways.error_of(given, sums, gradient) > 1e6
+    assert ways.error_of(given, sums, gradient) > 1e6
 
 
 def test_the_ways_agree():
     given = scene()
     results = {}
     for name in ("pair_sum warp", "list, pair_sum", "list, sum"):
-        steps = _ways.WAYS[name].prepare(given, True, False)
+        steps = ways.WAYS[name].prepare(given, True, False)
         made = None if steps.build is None else steps.build(given.x)
-        assert _ways.error_of(given, steps.sums(given.x, given.m, made), True) < 40, name  # few neighbors, some near the cutoff
+        assert ways.error_of(given, steps.sums(given.x, given.m, made), True) < 40, name  # few neighbors, some near the cutoff
         results[name] = made
     assert isinstance(results["list, sum"], jfrnn.NeighborList)
 
 
 @pytest.mark.parametrize("name", ["sums", "sums_smoke"])
 def test_configs(name):
-    config = _config.load(CONFIGS / f"{name}.toml", _sums.Config)
-    assert set(config.ways) == set(_ways.WAYS)
+    config = _config.load(CONFIGS / f"{name}.toml", sums.Config)
+    assert set(config.ways) == set(ways.WAYS)
     specs = list(config.specs())
     assert len({spec.key for spec in specs}) == len(specs)
     assert not any(spec.gradient for spec in specs if spec.way == "scipy pairs alone")
@@ -156,4 +158,4 @@ def test_configs(name):
 def test_an_unknown_way_is_named(tmp_path):
     (tmp_path / "bad.toml").write_text('ways = ["magic"]\nlayouts = ["full"]\nspacings = [1e-3]\nspeed = 1\n')
     with pytest.raises(UsageError, match=r"unknown way 'magic'; allowed: pair_sum warp.*\n.*speed: unknown key.*most_points"):
-        _config.load(tmp_path / "bad.toml", _sums.Config)
+        _config.load(tmp_path / "bad.toml", sums.Config)

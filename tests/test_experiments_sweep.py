@@ -70,7 +70,7 @@ def test_each_method_gives_a_whole_row(swept):
     if _machine.commit()["commit"] is None:  # no git here, or no repository
         optional |= {"commit", "dirty"}
     for row in rows:
-        assert set(row) == {field.name for field in fields(_rows.Row)}
+        assert set(row) == {field.name for field in fields(_rows.SearchRow)}
         assert row["status"] == "ok"
         assert {name for name, value in row.items() if value in (None, [], {})} <= optional, row["method"]
         assert (row["layout"], row["fill_asked"], row["points"], row["fill"]) == ("corners", 0.11, 256, 0.128)
@@ -318,7 +318,7 @@ def test_where_one_run_takes_minutes_it_is_the_only_one(tmp_path):
     assert (row["status"], row["repeats"], row["first_s"]) == ("ok", 1, row["median_s"])
 
 
-ROW = _rows.Row(key="a", layout="full", method="m", fill_asked=None, spacing=1.0, cutoff_ratio=3.0, dtype="f", dim=3, seed=0)
+ROW = _rows.SearchRow(key="a", layout="full", method="m", fill_asked=None, spacing=1.0, cutoff_ratio=3.0, dtype="f", dim=3, seed=0)
 
 
 def test_rows_come_back_as_they_were_and_the_latest_of_a_key_counts(tmp_path):

@@ -1,4 +1,4 @@
-"""`python -m experiments ties`: lattices beside the same scenes moved at random, each count compared with the oracle."""
+"""`python -m experiments bench ties`: lattices beside the same scenes moved at random, each count compared with the oracle."""
 
 import pandas as pd
 import pytest
@@ -9,7 +9,7 @@ from experiments._cli import app
 
 @pytest.mark.slow  # thirty programs
 def test_every_kind_of_sites_gets_a_row_that_was_checked(tmp_path):
-    result = CliRunner().invoke(app, ["ties", "--cube", "1000", "--rounds", "2", "--out", str(tmp_path)])
+    result = CliRunner().invoke(app, ["bench", "ties", "--cube", "1000", "--rounds", "2", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
     table = pd.read_csv(tmp_path / "cpu_warp.csv")
     assert len(table) == 2 * 5

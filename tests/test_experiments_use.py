@@ -1,12 +1,13 @@
-"""`python -m experiments use`: what lists cost those who use them."""
+"""`python -m experiments bench use`: what lists cost those who use them."""
 
+import pandas as pd
 import pytest
 
-from experiments import _use
+from experiments.bench import use
 
 
 def test_every_order_gets_a_row():
-    table = _use.order_table(300, 2).set_index("order")
+    table = pd.DataFrame(use._order_rows(300, 2)).set_index("order")
     assert list(table.index) == ["random", "row", "morton", "hilbert"]
     assert table.loc["random", "gain"] == 1
     assert (table[["search_ms", "sum_ms", "gain"]] > 0).all(axis=None)
@@ -14,8 +15,9 @@ def test_every_order_gets_a_row():
 
 
 @pytest.mark.parametrize("clump", [0, 40])
-def test_both_sums_agree_and_a_clump_makes_a_row_longer(clump):
-    (row,) = _use.rows_table(300, 2, (clump,)).to_dict("records")  # compares the sums itself
+def test_both_sums_agree_and_a_clump_makes_a_row_longer(monkeypatch, clump):
+    monkeypatch.setattr(use, "CLUMPS", (clump,))
+    (row,) = use._padding_rows(300, 2)  # compares the sums itself
     assert row["longest"] >= max(clump - 1, row["mean"])
     assert row["compressed_MB"] == pytest.approx(8e-6 * row["mean"] * (300 + clump))
     assert min(row["padded_ms"], row["compressed_ms"], row["make_ms"]) > 0

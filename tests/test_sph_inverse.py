@@ -57,6 +57,6 @@ def test_a_descent_keeps_what_it_tried():
 
 
 def test_unknown_problems_are_refused(tmp_path):
-    result = CliRunner().invoke(app, ["sph-gradients", "sea", "--out", str(tmp_path)])
+    result = CliRunner().invoke(app, ["sph", "gradients", "sea", "--out", str(tmp_path)])
     assert result.exit_code == 2
     assert "no problem 'sea'; allowed: viscosity, jet, droplet, memory" in result.stderr

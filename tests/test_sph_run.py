@@ -19,7 +19,7 @@ FEW = ("--frames", 3, "--set", "duration=0.003")
 
 
 def invoke(*arguments):
-    result = CliRunner().invoke(app, ["sph", *(str(argument) for argument in arguments)])
+    result = CliRunner().invoke(app, ["sph", "run", *(str(argument) for argument in arguments)])
     if result.exit_code not in (0, 2):
         raise result.exception
     return result.exit_code, result.stdout, result.stderr

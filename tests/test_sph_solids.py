@@ -267,7 +267,7 @@ def test_a_coarse_jet_that_breaks_up_stays_calm():
 def test_a_run_of_the_jet_onto_the_gear(tmp_path):
     options = ["jet-gear", "--set", "layers=3", "--set", "faces=400", "--set", "duration=0.0006", "--set", "height=0.001"]
     options += ["--frames", "2", "--dtype", "float32", "--out", str(tmp_path)]
-    result = CliRunner().invoke(app, ["sph", *options])
+    result = CliRunner().invoke(app, ["sph", "run", *options])
     assert result.exit_code == 0, result.output
     table = np.genfromtxt(tmp_path / "energies.csv", delimiter=",", names=True)
     assert len(list((tmp_path / "frames").glob("*.png"))) == 3
@@ -276,6 +276,6 @@ def test_a_run_of_the_jet_onto_the_gear(tmp_path):
     with np.load(last) as saved:
         before = saved["x"]
     last.unlink()
-    assert CliRunner().invoke(app, ["sph", *options]).exit_code == 0
+    assert CliRunner().invoke(app, ["sph", "run", *options]).exit_code == 0
     with np.load(last) as saved:
         np.testing.assert_allclose(saved["x"], before, atol=1e-6)

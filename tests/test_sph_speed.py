@@ -1,4 +1,4 @@
-"""`python -m experiments sph-speed`: steps by ways to find pairs, where their time goes, and error against seconds."""
+"""`python -m experiments sph speed`: steps by ways to find pairs, where their time goes, and error against seconds."""
 
 import importlib.util
 import json
@@ -36,7 +36,7 @@ def folder(tmp_path_factory):
     """Run the command once; its folder holds the config, too."""
     there = tmp_path_factory.mktemp("speed")
     (there / "tiny.toml").write_text(TINY)
-    result = CliRunner().invoke(app, ["sph-speed", str(there / "tiny.toml"), "--out", str(there)], catch_exceptions=False)
+    result = CliRunner().invoke(app, ["sph", "speed", str(there / "tiny.toml"), "--out", str(there)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return there
 
@@ -71,7 +71,7 @@ def test_the_stages_of_a_step_add_up(folder):
 
 def test_the_same_command_goes_on(folder):
     before = read(folder)
-    result = CliRunner().invoke(app, ["sph-speed", str(folder / "tiny.toml"), "--out", str(folder)], catch_exceptions=False)
+    result = CliRunner().invoke(app, ["sph", "speed", str(folder / "tiny.toml"), "--out", str(folder)], catch_exceptions=False)
     assert result.exit_code == 0
     assert read(folder) == before
 
@@ -149,7 +149,7 @@ def test_edges_of_a_list_are_pairs_of_it():
 @pytest.mark.skipif(importlib.util.find_spec("jax_md") is None, reason="jax-md is not installed")
 def test_jax_md_finds_the_same_edges(tmp_path):
     (tmp_path / "peer.toml").write_text('nx = [4]\nways = ["pair_sum", "jax-sph", "jax-sph, skin"]\nsteps = 3\nrounds = 1\n')
-    command = [sys.executable, "-m", "experiments", "sph-speed", str(tmp_path / "peer.toml"), "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "experiments", "sph", "speed", str(tmp_path / "peer.toml"), "--out", str(tmp_path)]
     subprocess.run(command, check=True, capture_output=True)  # jax-md mixes dtypes, which tests refuse
     rows = read(tmp_path)
     assert [row["status"] for row in rows] == ["ok"] * 3
@@ -168,7 +168,7 @@ def test_the_error_of_a_known_flow(skin):
 def test_the_report_draws_error_against_seconds(tmp_path):
     spec = {"kind": "tradeoff", "way": "list", "scene": "taylor-green", "dtype": "float32", "steps": 10, "status": "ok"}
     rows = [
-        speed.Row(key=f"{nx} {skin}", nx=nx, skin=skin, seconds=nx * (1 + skin), error={"l2 of velocity": 1 / nx}, **spec)
+        speed.StepRow(key=f"{nx} {skin}", nx=nx, skin=skin, seconds=nx * (1 + skin), error={"l2 of velocity": 1 / nx}, **spec)
         for nx in (10, 20)
         for skin in (0.0, 0.3)
     ]

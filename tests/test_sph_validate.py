@@ -1,4 +1,4 @@
-"""`python -m experiments sph-validate`: known answers, rows, and how it goes on."""
+"""`python -m experiments sph validate`: known answers, rows, and how it goes on."""
 
 import json
 from dataclasses import replace
@@ -87,7 +87,7 @@ def fluids_velocity(x, time):
 
 
 def invoke(*arguments):
-    result = CliRunner().invoke(app, ["sph-validate", *map(str, arguments)])
+    result = CliRunner().invoke(app, ["sph", "validate", *map(str, arguments)])
     if result.exit_code not in (0, 2):
         raise result.exception
     return result.exit_code, result.stdout, result.stderr
@@ -110,11 +110,11 @@ def test_rows_are_kept_and_missed_targets_say_so(tmp_path, monkeypatch):
 
 def test_a_run_that_diverges_is_a_row(tmp_path, monkeypatch):
     wild = replace(SHORT, judge=lambda scene, seen: ([Figure("nothing", np.nan, None, 1.0)], {}))
-    assert validate.measure("wild", wild, {}, str).figures == [
+    assert validate.measure("wild", wild, str).figures == [
         {"quantity": "nothing", "measured": None, "low": None, "high": 1.0, "met": False}
     ]
     monkeypatch.setattr(validate.health, "complaint", lambda scene, s: "particle 0 is gone")
-    row = validate.measure("wild", wild, {}, str)
+    row = validate.measure("wild", wild, str)
     assert (row.figures, row.reason) == ([], "diverged until t = 0.001 s: particle 0 is gone")
     assert list(validate.table([row])["met"]) == ["no"]
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,32 +15,29 @@ PACKAGES = ("jax-md",)
 MAX_POINTS = 130_000  # 19 GB at 250 000
 
 
-class Lists(NamedTuple):
-    """Its functions, an allocated list, and the lowest coordinates of the particles, shape [dim]."""
-
-    functions: Any
-    nbrs: Any
-    low: np.ndarray
-
-
-def allocate(positions: np.ndarray, cutoff: float) -> Lists:
-    """Return a list with its capacity; it is found with the list itself."""
+def allocate(positions: np.ndarray, cutoff: float) -> tuple[Any, np.ndarray]:
+    """Return a list with its capacity, which is found with the list itself, and the lowest coordinates, shape [dim]."""
     jax.config.update("jax_enable_x64", positions.dtype == np.float64)
-    low = positions.min(axis=0)
-    size = jnp.asarray(positions.max(axis=0) - low + positions.dtype.type(cutoff))  # its cells begin at 0
+    low = np.asarray(positions).min(axis=0)
+    size = jnp.asarray(np.asarray(positions).max(axis=0) - low + positions.dtype.type(cutoff))  # its cells begin at 0
     made: Any = partition.neighbor_list(space.free()[0], size, cutoff, format=partition.NeighborListFormat.Dense)  # pyright: ignore
-    return Lists(made, made.allocate(jnp.asarray(positions - low)), low)
+    return made.allocate(jnp.asarray(positions - low)), low
+
+
+def compile_update(positions: Any, cutoff: float, lists: Any = None) -> Callable[[Any], jax.Array]:  # noqa: ANN401
+    """Return a compiled update of a list, from positions to the list, which is not waited for."""
+    nbrs, low = lists or allocate(positions, cutoff)
+    moved = replace(nbrs, reference_position=nbrs.reference_position + 2 * cutoff)  # else it keeps what it has
+    update = jax.jit(lambda x, nbrs: nbrs.update(x - low))
+    if update(jnp.asarray(positions), moved).did_buffer_overflow:
+        raise RuntimeError("the list overflowed right after it was allocated")
+    return lambda x: update(x, moved).idx
 
 
 def prepare(positions: np.ndarray, cutoff: float, lists: Any) -> Callable[[], jax.Array]:  # noqa: ANN401
     """Compile the update, and return it."""
-    nbrs = lists.nbrs
-    moved = replace(nbrs, reference_position=nbrs.reference_position + 2 * cutoff)  # else it keeps what it has
-    update = jax.jit(lambda x, nbrs: nbrs.update(x - lists.low))
-    if update(jnp.asarray(positions), moved).did_buffer_overflow:
-        raise RuntimeError("the list overflowed right after it was allocated")
-    x = at_hand(positions)
-    return lambda: jax.block_until_ready(update(jnp.asarray(x), moved).idx)
+    update, x = compile_update(positions, cutoff, lists), at_hand(positions)
+    return lambda: jax.block_until_ready(update(jnp.asarray(x)))
 
 
 def read(result: jax.Array) -> Found:

@@ -1,6 +1,7 @@
 """nvalchemi-toolkit-ops: cells and a padded list with Warp kernels inside `jax.jit`."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,15 +21,20 @@ def allocate(positions: np.ndarray, cutoff: float) -> int:
     return int(KDTree(positions).query_ball_point(positions, cutoff, return_length=True, workers=-1).max())
 
 
-def prepare(positions: np.ndarray, cutoff: float, capacity: int) -> Callable[[], tuple[jax.Array, jax.Array]]:
-    """Compile the search, and return it; open space as a box that nothing wraps around."""
-    jax.config.update("jax_enable_x64", positions.dtype == np.float64)
-    low = positions.min(axis=0)  # its cells begin at 0
-    cell = jnp.diag(jnp.asarray(positions.max(axis=0) - low + positions.dtype.type(cutoff)))[None]
+def compile_search(positions: Any, cutoff: float, capacity: int) -> Callable[[Any], tuple[jax.Array, jax.Array]]:  # noqa: ANN401
+    """Return a compiled search of such positions, which is not waited for; open space as a box that nothing wraps around."""
+    low = jnp.min(positions, axis=0)  # its cells begin at 0
+    cell = jnp.diag(jnp.max(positions, axis=0) - low + cutoff)[None]
     periodic = jnp.zeros((1, positions.shape[1]), bool)
     cells, _, radius = estimate_cell_list_sizes(jnp.asarray(positions - low), cell, cutoff, periodic)
     most = {"max_neighbors": capacity, "max_total_cells": int(cells), "neighbor_search_radius": radius}
-    search = jax.jit(lambda x: cell_list(x - low, cutoff, cell, periodic, **most)[:2])
+    return jax.jit(lambda x: cell_list(x - low, cutoff, cell, periodic, **most)[:2])
+
+
+def prepare(positions: np.ndarray, cutoff: float, capacity: int) -> Callable[[], tuple[jax.Array, jax.Array]]:
+    """Compile the search, and return it."""
+    jax.config.update("jax_enable_x64", positions.dtype == np.float64)
+    search = compile_search(positions, cutoff, capacity)
     jax.block_until_ready(search(jnp.asarray(positions)))
     x = at_hand(positions)
     return lambda: jax.block_until_ready(search(jnp.asarray(x)))

@@ -1,4 +1,4 @@
-"""Inverse problems and the memory of reverse mode, as rows, tables and pictures: `python -m experiments sph-gradients`."""
+"""Inverse problems and the memory of reverse mode, as rows, tables and pictures: `python -m experiments sph gradients`."""
 
 from pathlib import Path
 from time import perf_counter

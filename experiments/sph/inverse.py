@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
-from jfrnn.cases._fluid import lattice  # pyright: ignore[reportMissingImports]
-from jfrnn.cases._fluid_free import LAYERS, free  # pyright: ignore[reportMissingImports]
 from scipy.optimize import minimize
 
+from experiments._library import LAYERS, free, lattice
 from experiments.sph import answers, solver
 from experiments.sph.model import Model, State, make_model, make_state
 

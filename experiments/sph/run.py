@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 import jfrnn
-from experiments import _sweep
+from experiments import _loop
 from experiments._errors import UsageError
 from experiments.sph import forces, frames, health, settings, snapshots, solids, solver
 from experiments.sph.forces import Neighbors
@@ -70,8 +70,8 @@ def run(scene: "FluidScene", folder: Path, how: How) -> State:
     if saved is None:
         s = jax.jit(solver.begin)(model, s, nbrs)
         _keep(scene, model, s, nbrs, folder, step, how)
-    with _sweep.progress(how.frames) as shown:
-        bar = shown.add_task(scene.name, total=how.frames, completed=round(how.frames * float(s.time) / scene.duration))
+    with _loop.show(how.frames, round(how.frames * float(s.time) / scene.duration)) as shown:
+        shown.label(scene.name)
         while (steps := _steps_to_next(scene, model, s, how.frames)) > 0:
             start, before, nbrs_before = perf_counter(), s, nbrs
             s, nbrs = _chunk(model, s, nbrs, steps)
@@ -83,7 +83,8 @@ def run(scene: "FluidScene", folder: Path, how: How) -> State:
             step += steps
             line = _keep(scene, model, s, nbrs, folder, step, how)
             text = f"t {line['time']:.4g} s · {steps / seconds:.0f} steps/s · energy {line['total']:.4g} J"
-            shown.update(bar, advance=1, description=text + ("" if nbrs is None else f" · {int(nbrs.rebuild_count)} rebuilds"))
+            shown.label(text + ("" if nbrs is None else f" · {int(nbrs.rebuild_count)} rebuilds"))
+            shown.advance()
     if how.pictures:
         frames.animate(folder / "frames", folder / f"{scene.name}.gif")
     return s

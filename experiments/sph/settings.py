@@ -11,7 +11,6 @@ from zipfile import BadZipFile
 import numpy as np
 from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
 
-from experiments import _mesh_files
 from experiments._errors import UsageError
 from experiments.sph import ranges
 
@@ -138,10 +137,7 @@ def with_solid(scene: "FluidScene", path: Path, scale: float) -> "FluidScene":
     """
     if scene.dim != len("xyz"):
         raise UsageError(f"--solid {path}: triangles are a wall in 3D; {scene.name} is in {scene.dim}D")
-    try:
-        vertices, faces = _mesh_files.read(path)
-    except UsageError as error:
-        raise UsageError(f"--solid {error}") from error
+    vertices, faces = _read_mesh(path)
     vertices = vertices * scale
     if not (finite := np.isfinite(vertices).all(axis=1)).all():
         raise UsageError(f"--solid {path}: vertices must be finite; one is {vertices[~finite][0].tolist()}")
@@ -154,6 +150,22 @@ def with_solid(scene: "FluidScene", path: Path, scale: float) -> "FluidScene":
     if size < scene.spacing or size > _LARGEST_SOLID * span:
         raise UsageError(f"--solid {path}: is {size:.3g} m long, {where}; name its unit: --solid-unit 0.001 for mm")
     return replace(scene, solid=fluids.Solid(vertices, faces))
+
+
+def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices [v, 3] and faces [f, 3] of a file; vertices that coincide, as STL writes them, are one."""
+    import trimesh
+
+    if not path.is_file():
+        raise UsageError(f"--solid {path} is no file: name an STL, OBJ or PLY.")
+    try:
+        mesh = trimesh.load(path, force="mesh")  # which merges vertices
+    except Exception as error:  # readers of trimesh raise of any kind
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise UsageError(f"--solid {path} is no mesh that trimesh reads ({reason}): name an STL, OBJ or PLY.") from error
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise UsageError(f"--solid {path} holds no triangles.")
+    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
 
 
 def _place(corner: np.ndarray) -> str:

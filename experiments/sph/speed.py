@@ -5,7 +5,6 @@ import inspect
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -17,8 +16,9 @@ from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
 from pydantic import Field, FiniteFloat, field_validator
 
 from experiments import _machine, _measure, _sweep
-from experiments._config import Positive, Table, digest
-from experiments._rows import RETRIED, RowFile
+from experiments._config import Dtype, Keyed, Positive, Table
+from experiments._loop import Task, fill
+from experiments._rows import RowFile, TimedRow
 from experiments.sph import edges, solver
 from experiments.sph import tradeoff as known_flow
 from experiments.sph.model import Model, State, make_model, make_state
@@ -42,35 +42,21 @@ MOST_ROUNDINGS = 64  # by which two ways may differ after a step, see `differenc
 
 
 class Config(Table):
-    """What is measured.
+    """What is measured."""
 
-    Attributes:
-        scene: Name of a fluid scene; walls count as particles.
-        nx: Resolutions, as the scene takes them.
-        ways: Of `WAYS`; all are compared with the first.
-        most_particles: Of ways that larger scenes are skipped for.
-        stages: Ways whose stages are timed besides ...
-        staged: ... at these resolutions; none: at all.
-        dtype: Of all numbers.
-        steps: Per timed run, from the same state each time.
-        rounds: Timed runs of each way.
-        skin: In particle spacings.
-        rate: The fluid begins with velocities rate·(x, 0, -z) [1/s]: a column in mid-collapse, whose lists are made anew.
-        tradeoff: Runs of a flow with a known answer: error against seconds.
-    """
-
-    scene: str = "dam-break-3d"
-    nx: tuple[Annotated[int, Field(ge=2)], ...] = ()
-    ways: tuple[str, ...] = ("pair_sum", "list")
-    most_particles: dict[str, int] = Field(default_factory=dict)
-    stages: tuple[Literal["pair_sum", "list"], ...] = ()
-    staged: tuple[int, ...] = ()
-    dtype: Literal["float32", "float64"] = "float32"
-    steps: Annotated[int, Field(ge=1)] = 10
-    rounds: Annotated[int, Field(ge=1)] = 5
-    skin: Positive = 0.3
+    scene: str = "dam-break-3d"  # a fluid scene; walls count as particles
+    nx: tuple[Annotated[int, Field(ge=2)], ...] = ()  # resolutions, as the scene takes them
+    ways: tuple[str, ...] = ("pair_sum", "list")  # of `WAYS`; all are compared with the first
+    most_particles: dict[str, int] = Field(default_factory=dict)  # of ways that larger scenes are skipped for
+    stages: tuple[Literal["pair_sum", "list"], ...] = ()  # ways whose stages are timed besides ...
+    staged: tuple[int, ...] = ()  # ... at these resolutions; none: at all
+    dtype: Dtype = "float32"  # of all numbers
+    steps: Annotated[int, Field(ge=1)] = 10  # per timed run, from the same state each time
+    rounds: Annotated[int, Field(ge=1)] = 5  # timed runs of each way
+    skin: Positive = 0.3  # in particle spacings
+    # The fluid begins with velocities rate·(x, 0, -z) [1/s]: a column in mid-collapse, whose lists are made anew.
     rate: FiniteFloat = 1.5
-    tradeoff: known_flow.Config | None = None
+    tradeoff: known_flow.Config | None = None  # runs of a flow with a known answer: error against seconds
 
     @field_validator("scene")
     @classmethod
@@ -99,7 +85,7 @@ class Config(Table):
 
 
 @dataclass(frozen=True)
-class Spec:
+class Spec(Keyed):
     """What one row measures, and how: fields as in `Config`."""
 
     kind: str
@@ -113,109 +99,55 @@ class Spec:
     rate: float
     most_particles: int | None
 
-    @property
-    def key(self) -> str:
-        """Digest of all fields, 12 hex digits: a row with the same key need not run again."""
-        return digest(asdict(self))
 
-
-@dataclass
-class Row:
+@dataclass(kw_only=True)
+class StepRow(TimedRow):
     """Steps of a scene by one way ("step"), its stages ("stages"), or a run with a known answer ("tradeoff").
 
-    Attributes:
-        key: Digest of what is measured and how; rows with the same key replace each other.
-        kind, way, scene, nx, dtype, steps, skin: As in `Spec`; steps of the whole run in a "tradeoff", of one timed run else.
-        status, reason: As in `experiments._rows.Row`.
-        particles: Walls included.
-        fluid: Those of the fluid.
-        first_s: First run, compilation included [s].
-        median_s: Of one step, with the list's share of being made anew [s].
-        p10_s, p90_s: Percentiles of it.
-        steps_per_s, particle_steps_per_s: By the median; of all particles.
-        rebuilds: How often the list was made anew in a run; None where there is none.
-        bytes: What the compiled run takes: arguments, results and scratch.
-        difference: Largest difference from the first way after one step, see `speed.difference`.
-        parts: Seconds of a step by stage.
-        error: Of a "tradeoff": by name.
-        seconds: Of a "tradeoff": the run without compilation.
-        others_cores, device, versions, machine, commit, dirty, time: As in `experiments._rows.Row`.
+    Times are of one step, with the list's share of being made anew.
     """
 
-    key: str
     kind: str
     way: str
     scene: str
     nx: int
     dtype: str
-    steps: int
-    skin: float
-    status: str = "failed"
-    reason: str | None = None
-    particles: int | None = None
-    fluid: int | None = None
-    first_s: float | None = None
-    median_s: float | None = None
-    p10_s: float | None = None
-    p90_s: float | None = None
-    steps_per_s: float | None = None
-    particle_steps_per_s: float | None = None
-    rebuilds: int | None = None
-    bytes: int | None = None
-    difference: float | None = None
-    parts: dict[str, float] = field(default_factory=dict)
-    error: dict[str, float] = field(default_factory=dict)
-    seconds: float | None = None
-    others_cores: float | None = None
-    device: str | None = None
-    versions: dict[str, str | None] = field(default_factory=dict)
-    machine: dict[str, Any] = field(default_factory=dict)
-    commit: str | None = None
-    dirty: bool | None = None
-    time: str | None = None
+    steps: int  # of the whole run in a "tradeoff", of one timed run else
+    skin: float  # in particle spacings
+    particles: int | None = None  # walls included
+    fluid: int | None = None  # those of the fluid
+    steps_per_s: float | None = None  # by the median
+    particle_steps_per_s: float | None = None  # of all particles
+    rebuilds: int | None = None  # how often the list was made anew in a run; None where there is none
+    bytes: int | None = None  # what the compiled run takes: arguments, results and scratch
+    difference: float | None = None  # largest difference from the first way after one step, see `speed.difference`
+    parts: dict[str, float] = field(default_factory=dict)  # seconds of a step by stage
+    error: dict[str, float] = field(default_factory=dict)  # of a "tradeoff": by name
+    seconds: float | None = None  # of a "tradeoff": the run without compilation
 
 
-def run(config: Config, folder: Path, retry_failed: bool = False) -> list[Row]:
+def run(config: Config, folder: Path, retry_failed: bool = False) -> list[StepRow]:
     """Measure what the folder does not hold yet, and return all rows of the config.
 
     Ways of one scene are timed in turns: where a row of them is missing, all are measured again.
-
-    Args:
-        config: What is measured.
-        folder: Holds rows.jsonl.
-        retry_failed: Whether rows that are missing or failed are measured again.
     """
-    file, specs = RowFile(folder, Row), list(config.specs())
-    runs = [] if config.tradeoff is None else list(config.tradeoff.specs())
-    with file.locked(), _sweep.progress(len(specs) + len(runs)) as shown:
-        file.repair()
-        done = {row.key for row in file.read() if not (retry_failed and row.status in RETRIED)}
-        bar = shown.add_task("", total=len(specs) + len(runs))
-        about = {"machine": _machine.machine(), "versions": _machine.versions(["jax-md"]), **_machine.commit()}
-        for (nx, kind), same in itertools.groupby(specs, lambda spec: (spec.nx, spec.kind)):
-            group = list(same)
-            shown.update(bar, description=f"{config.scene} · nx {nx} · {kind}")
-            if not all(spec.key in done for spec in group):
-                for row in _measured(group):
-                    file.append(_stamped(row, about))
-                    shown.console.print(describe(row), highlight=False, markup=False, soft_wrap=True)
-            shown.advance(bar, len(group))
-        for spec in runs:
-            shown.update(bar, description=f"{spec.scene} · nx {spec.nx} · {spec.way}")
-            if spec.key not in done:
-                row = _row(spec, "tradeoff", _sweep.ask({"do": "sph", "spec": asdict(spec)}, 3600.0, cold=False))
-                file.append(_stamped(row, about))
-                shown.console.print(describe(row), highlight=False, markup=False, soft_wrap=True)
-            shown.advance(bar)
-        rows = {row.key: row for row in file.read()}
-    return [rows[spec.key] for spec in (*specs, *runs)]
+    tasks = []
+    for (nx, kind), same in itertools.groupby(config.specs(), lambda spec: (spec.nx, spec.kind)):
+        group = list(same)
+        tasks.append(
+            Task(tuple(x.key for x in group), f"{config.scene} · nx {nx} · {kind}", lambda _, group=group: _measured(group))
+        )
+    for spec in () if config.tradeoff is None else config.tradeoff.specs():
+        tasks.append(Task((spec.key,), f"{spec.scene} · nx {spec.nx} · {spec.way}", lambda _, spec=spec: [_flow(spec)]))
+    about = {"versions": _machine.versions(["jax-md"])}
+    return fill(RowFile(folder, StepRow), tasks, describe, retry_failed=retry_failed, about=about)
 
 
-def _stamped(row: Row, about: dict[str, Any]) -> Row:
-    return replace(row, **about, time=datetime.now(UTC).isoformat(timespec="seconds"))
+def _flow(spec: known_flow.Spec) -> StepRow:
+    return _row(spec, "tradeoff", _sweep.ask({"do": "sph", "spec": asdict(spec)}, 3600.0, cold=False))
 
 
-def _measured(group: list[Spec]) -> list[Row]:
+def _measured(group: list[Spec]) -> list[StepRow]:
     """Measure the rows of one scene."""
     first = group[0]
     scene, model, s = _begun(first.scene, first.nx, first.rate, first.dtype)
@@ -239,10 +171,10 @@ def _begun(name: str, nx: int, rate: float, dtype: str) -> tuple["FluidScene", M
     return scene, model, jax.block_until_ready(jax.jit(solver.begin)(model, make_state(scene, number)))
 
 
-def _row(spec: "Spec | known_flow.Spec", kind: str, seen: dict[str, Any]) -> Row:
-    shared = {name: value for name, value in asdict(spec).items() if name in Row.__dataclass_fields__}
+def _row(spec: "Spec | known_flow.Spec", kind: str, seen: dict[str, Any]) -> StepRow:
+    shared = {name: value for name, value in asdict(spec).items() if name in StepRow.__dataclass_fields__}
     values: dict[str, Any] = shared | {"kind": kind, "key": spec.key} | seen
-    return Row(**values)
+    return StepRow(**values)
 
 
 def moving(scene: "FluidScene", rate: float) -> "FluidScene":
@@ -252,7 +184,7 @@ def moving(scene: "FluidScene", rate: float) -> "FluidScene":
     return replace(scene, velocities=flow if scene.wall is None else np.where(scene.wall[:, None], scene.velocities, flow))
 
 
-def _step_rows(group: list[Spec], model: Model, s: State) -> list[Row]:
+def _step_rows(group: list[Spec], model: Model, s: State) -> list[StepRow]:
     """Make every way ready, compare what a step of each gives, then time those that agree, in turns."""
     rows, ready, reference = {}, {}, None
     for spec in group:
@@ -323,7 +255,7 @@ def difference(model: Model, one: State, other: State) -> float:
     return max(found, key=lambda value: (value != value, value))  # NaN is the largest
 
 
-def describe(row: Row) -> str:
+def describe(row: StepRow) -> str:
     """Return a row as a line for the reader."""
     what = f"{row.kind:<9} {row.way:<16} {row.particles or 0:>9} particles"
     if row.status != "ok":

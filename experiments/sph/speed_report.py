@@ -1,4 +1,4 @@
-"""What rows of `sph-speed` say: a table; pictures of where a step's time goes, and of error against seconds."""
+"""What rows of `sph speed` say: a table; pictures of where a step's time goes, and of error against seconds."""
 
 from pathlib import Path
 from typing import Any
@@ -8,14 +8,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from experiments._plots import COLORS, OTHER_COLORS, label_logarithmic
-from experiments.sph.speed import Row
+from experiments.sph.speed import StepRow
 from experiments.sph.stages import STAGES
 
 _PALETTE = (*COLORS.values(), *OTHER_COLORS)
 _MARKERS = "o^sDvX*P"
 
 
-def report(rows: list[Row], folder: Path) -> str:
+def report(rows: list[StepRow], folder: Path) -> str:
     """Write table.csv, stages.png and tradeoff.png into the folder, as far as there are rows, and return tables as text."""
     texts = []
     for kind, lines in (("step", steps(rows)), ("stages", stages(rows)), ("tradeoff", tradeoff(rows))):
@@ -29,7 +29,7 @@ def report(rows: list[Row], folder: Path) -> str:
     return "\n\n".join(texts)
 
 
-def steps(rows: list[Row]) -> list[dict[str, Any]]:
+def steps(rows: list[StepRow]) -> list[dict[str, Any]]:
     """Return a line per way and scene; `faster` is how many times faster the scene's first way is."""
     lines, first = [], {}
     for row in (row for row in rows if row.kind == "step"):
@@ -46,7 +46,7 @@ def steps(rows: list[Row]) -> list[dict[str, Any]]:
     return lines
 
 
-def stages(rows: list[Row]) -> list[dict[str, Any]]:
+def stages(rows: list[StepRow]) -> list[dict[str, Any]]:
     """Return a line per way and scene, milliseconds by stage."""
     of = [row for row in rows if row.kind == "stages"]
     return [
@@ -57,7 +57,7 @@ def stages(rows: list[Row]) -> list[dict[str, Any]]:
     ]
 
 
-def tradeoff(rows: list[Row]) -> list[dict[str, Any]]:
+def tradeoff(rows: list[StepRow]) -> list[dict[str, Any]]:
     """Return a line per run with a known answer."""
     of = [row for row in rows if row.kind == "tradeoff"]
     return [
@@ -68,11 +68,11 @@ def tradeoff(rows: list[Row]) -> list[dict[str, Any]]:
     ]
 
 
-def _status(row: Row) -> str:
+def _status(row: StepRow) -> str:
     return (row.status if row.reason is None else f"{row.status}: {row.reason}")[:100]
 
 
-def draw_stages(rows: list[Row]) -> Figure:
+def draw_stages(rows: list[StepRow]) -> Figure:
     """Draw where a step's time goes, nanoseconds per particle, a bar for each way and scene; each has its own scale."""
     figure = Figure(figsize=(6.4, 1.2 + 0.85 * len(rows)), layout="constrained")
     panels = figure.subplots(len(rows), squeeze=False)[:, 0]
@@ -91,7 +91,7 @@ def draw_stages(rows: list[Row]) -> Figure:
     return figure
 
 
-def draw_tradeoff(rows: list[Row]) -> Figure:
+def draw_tradeoff(rows: list[StepRow]) -> Figure:
     """Draw the error of velocities over the seconds of a run: a line per precision and skin, a mark per resolution."""
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     axes, lines = figure.add_subplot(), {}

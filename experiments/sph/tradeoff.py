@@ -4,14 +4,14 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import product
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
-from jfrnn.cases._fluid_flows import taylor_green_velocity  # pyright: ignore[reportMissingImports]
 from pydantic import Field, FiniteFloat
 
-from experiments._config import Positive, Table, digest
+from experiments._config import Dtype, Positive, Table, digest
+from experiments._library import taylor_green_velocity
 
 if TYPE_CHECKING:
     from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
@@ -20,19 +20,12 @@ _REYNOLDS = 100.0  # of the scene, by default
 
 
 class Config(Table):
-    """Runs of one flow.
+    """Runs of one flow."""
 
-    Attributes:
-        nx: Resolutions.
-        dtypes: Precisions.
-        skins: Of lists, in particle spacings; 0: no list, sums search.
-        duration: Time that is simulated [s].
-    """
-
-    nx: tuple[Annotated[int, Field(ge=8)], ...]
-    dtypes: tuple[Literal["float32", "float64"], ...] = ("float32", "float64")
-    skins: tuple[Annotated[FiniteFloat, Field(ge=0)], ...] = (0.0,)
-    duration: Positive = 0.5
+    nx: tuple[Annotated[int, Field(ge=8)], ...]  # resolutions
+    dtypes: tuple[Dtype, ...] = ("float32", "float64")
+    skins: tuple[Annotated[FiniteFloat, Field(ge=0)], ...] = (0.0,)  # of lists, in particle spacings; 0: no list, sums search
+    duration: Positive = 0.5  # time that is simulated [s]
 
     def specs(self) -> Iterator["Spec"]:
         """Yield the runs."""

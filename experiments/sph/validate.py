@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -12,47 +11,25 @@ import pandas as pd
 from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
 from matplotlib.figure import Figure as Picture
 
-from experiments import _machine, _sweep
+from experiments import _machine
 from experiments._errors import UsageError
-from experiments._rows import RowFile
+from experiments._loop import Task, fill
+from experiments._rows import Row, RowFile
 from experiments.sph import health, solver
 from experiments.sph.model import make_model, make_state
 from experiments.sph.validation import CASES, Case, Curves, Seen, look
 
 
-@dataclass(frozen=True)
-class Row:
-    """A case.
+@dataclass(kw_only=True)
+class CaseRow(Row):
+    """A case, whose name is the key; the reason says why there are no figures."""
 
-    Attributes:
-        key: Its name.
-        figures: What was measured: quantity, measured, low, high (what it has to be), met; none where the run diverged.
-        reason: Why there are none.
-        particles: Walls included.
-        steps: Of the run.
-        seconds: Of the run, compilation included.
-        curves: What the picture shows, [x, y] by name.
-        axes: Its axes.
-        versions: Of packages.
-        machine: Processor, cores, memory.
-        commit: Of the project.
-        dirty: Whether its files differed from that.
-        time: When the row was written.
-    """
-
-    key: str
-    figures: list[dict[str, Any]]
-    reason: str | None
-    particles: int
-    steps: int
-    seconds: float
-    curves: Curves = field(default_factory=dict)
-    axes: tuple[str, str] = ("", "")
-    versions: dict[str, str | None] = field(default_factory=dict)
-    machine: dict[str, Any] = field(default_factory=dict)
-    commit: str | None = None
-    dirty: bool | None = None
-    time: str | None = None
+    figures: list[dict[str, Any]]  # what was measured: quantity, measured, low, high (what it has to be), met; none: it diverged
+    particles: int  # walls included
+    steps: int  # of the run
+    seconds: float  # of the run, compilation included
+    curves: Curves = field(default_factory=dict)  # what the picture shows, [x, y] by name
+    axes: tuple[str, str] = ("", "")  # of the picture
 
 
 def check(names: list[str]) -> None:
@@ -66,35 +43,18 @@ def check(names: list[str]) -> None:
         raise UsageError(f"no case {unknown[0]!r}; allowed: {', '.join(CASES)}")
 
 
-def run(names: list[str], folder: Path) -> list[Row]:
-    """Run the cases that the folder does not hold yet, and return the rows of all that were asked for.
-
-    Args:
-        names: Of `CASES`; all, where there are none.
-        folder: Gets rows.jsonl.
+def run(names: list[str], folder: Path) -> list[CaseRow]:
+    """Run the cases that the folder does not hold yet, and return the rows of all that were asked for: all, where none are.
 
     Raises:
         UsageError: There is no such case.
     """
     check(names)
-    names, file = names or list(CASES), RowFile(folder, Row)
-    with file.locked():
-        file.repair()
-        done = {row.key for row in file.read()}
-        about = {"machine": _machine.machine(), "versions": _machine.versions(), **_machine.commit()}
-        with _sweep.progress(len(names)) as shown:
-            bar = shown.add_task("", total=len(names), completed=sum(name in done for name in names))
-            for name in names:
-                if name not in done:
-                    row = measure(name, CASES[name], about, lambda text: shown.update(bar, description=text))
-                    file.append(row)
-                    shown.console.print(_in_words(row), highlight=False, markup=False, soft_wrap=True)
-                    shown.advance(bar)
-        rows = {row.key: row for row in file.read()}
-    return [rows[name] for name in names]
+    tasks = [Task((name,), name, lambda shown, name=name: [measure(name, CASES[name], shown.label)]) for name in names or CASES]
+    return fill(RowFile(folder, CaseRow), tasks, _in_words, about={"versions": _machine.versions()})
 
 
-def measure(name: str, case: Case, about: dict[str, Any], say: Any = print) -> Row:  # noqa: ANN401
+def measure(name: str, case: Case, say: Any = print) -> CaseRow:  # noqa: ANN401
     """Run a case and judge it; a run that diverges makes a row that says so."""
     scene = fluids.fluid(case.scene, **case.settings)
     assert scene.step is not None, "cases are looked at after whole steps"
@@ -111,8 +71,8 @@ def measure(name: str, case: Case, about: dict[str, Any], say: Any = print) -> R
         seen.append(look(scene, model, s))
         say(f"{name} · t {float(s.time):.4g} s · {step / (perf_counter() - start):.0f} steps/s")
     figures, curves = _judged(case, scene, seen) if reason is None else ([], {})
-    seconds, now = round(perf_counter() - start, 1), datetime.now(UTC).isoformat(timespec="seconds")
-    return Row(name, figures, reason, scene.n, step, seconds, curves, case.axes, **about, time=now)
+    about = {"particles": scene.n, "steps": step, "seconds": round(perf_counter() - start, 1), "axes": case.axes}
+    return CaseRow(key=name, status="ok" if figures else "failed", reason=reason, figures=figures, curves=curves, **about)
 
 
 def _judged(case: Case, scene: Any, seen: list[Seen]) -> tuple[list[dict[str, Any]], Curves]:  # noqa: ANN401
@@ -121,7 +81,7 @@ def _judged(case: Case, scene: Any, seen: list[Seen]) -> tuple[list[dict[str, An
     return [figure._asdict() | {"measured": number, "met": figure.met} for figure, number in measured], curves
 
 
-def report(rows: list[Row], folder: Path) -> str:
+def report(rows: list[CaseRow], folder: Path) -> str:
     """Write table.csv and a picture per case into the folder, and return the table as text."""
     frame = table(rows)
     frame.to_csv(folder / "table.csv", index=False)
@@ -131,7 +91,7 @@ def report(rows: list[Row], folder: Path) -> str:
     return frame.to_string(index=False)
 
 
-def table(rows: list[Row]) -> pd.DataFrame:
+def table(rows: list[CaseRow]) -> pd.DataFrame:
     """Return a line per figure, and one for each case that has none."""
     lines = []
     for row in rows:
@@ -144,7 +104,7 @@ def table(rows: list[Row]) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def draw(row: Row) -> Picture:
+def draw(row: CaseRow) -> Picture:
     """Draw what was measured as dots or dashes, what is known as lines."""
     figure = Picture(figsize=(5.2, 3.6), layout="constrained")
     axes = figure.add_subplot()
@@ -173,7 +133,7 @@ def _target(figure: dict[str, Any]) -> str:
     return f"≤ {figure['high']:g}" if figure["low"] is None else f"{figure['low']:g} to {figure['high']:g}"
 
 
-def _in_words(row: Row) -> str:
+def _in_words(row: CaseRow) -> str:
     if not row.figures:
         return f"{row.key}: {row.reason}"
     return f"{row.key}: " + "; ".join(

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
-from jfrnn.cases._fluid_flows import taylor_green_velocity  # pyright: ignore[reportMissingImports]
 
+from experiments._library import taylor_green_velocity
 from experiments.sph import answers, budget, forces, potential
 from experiments.sph.model import Model, State
 

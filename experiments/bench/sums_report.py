@@ -3,16 +3,19 @@
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pandas as pd
+import typer
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
+from experiments._commands import RetryFailed, RowsFolder, take_folder
+from experiments._config import load
 from experiments._plots import COLORS, OTHER_COLORS, label_logarithmic
-from experiments._sums import ERROR_UNIT, Row
-from experiments._ways import WAYS
+from experiments.bench.sums import ERROR_UNIT, Config, SumRow, run
+from experiments.bench.ways import WAYS
 
 FUSED = "pair_sum warp"
 PANELS = {
@@ -26,7 +29,17 @@ _STYLES = {way: (color, marker) for way, color, marker in zip(WAYS, _COLORS, "*X
 _Line = dict[str, Any]
 
 
-def report(rows: list[Row], folder: Path) -> str:
+def command(
+    config: Annotated[Path, typer.Argument(help="Config of sums, TOML.")] = Path("experiments/configs/sums.toml"),
+    out: RowsFolder = None,
+    retry_failed: RetryFailed = False,
+) -> str:
+    """Measure one sum over neighbors in many ways, or go on with it; then print a table, and draw pictures beside the rows."""
+    given, folder = load(config, Config), take_folder(out or Path("out") / config.stem)
+    return report(run(given, folder, retry_failed), folder)
+
+
+def report(rows: list[SumRow], folder: Path) -> str:
     """Write table.csv, sums.png and payoff.png into the folder, and return the table as text."""
     lines = table(rows)
     frame = pd.DataFrame(lines)
@@ -37,7 +50,7 @@ def report(rows: list[Row], folder: Path) -> str:
     return shown.to_string(index=False, na_rep="", float_format="%.3g")
 
 
-def table(rows: list[Row]) -> list[_Line]:
+def table(rows: list[SumRow]) -> list[_Line]:
     """Return a line per row, None where there is nothing to say.
 
     `ratio` is that of the seconds to those of FUSED, without compensation, on the same scene. `pays_from` says from how many sums
@@ -59,7 +72,7 @@ def pays_from(build: float, each: float, direct: float) -> float:
     return math.floor(build / (direct - each)) + 1 if each < direct else math.inf
 
 
-def _line(row: Row) -> _Line:
+def _line(row: SumRow) -> _Line:
     return {
         **{"layout": row.layout, "points": row.points, "sums": "density, gradient" if row.gradient else "density"},
         **{"way": row.way, "compensated": row.compensated, "seconds": row.median_s},

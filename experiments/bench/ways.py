@@ -5,20 +5,20 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from time import perf_counter, sleep
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from experiments import _layouts, _machine
-from experiments._config import digest
+from experiments._config import Keyed
 
 MOST_ROWS = 20_000  # whose error is looked at; of more particles, evenly chosen ones
 
 
 @dataclass(frozen=True)
-class Spec:
+class Spec(Keyed):
     """What one row measures, and how: fields as in a config of sums.
 
     Attributes:
@@ -40,11 +40,6 @@ class Spec:
     min_seconds: float
     max_repeats: int
     timeout: float
-
-    @property
-    def key(self) -> str:
-        """Digest of all fields, 12 hex digits: a row with the same key need not run again."""
-        return digest(asdict(self))
 
 
 class Given(NamedTuple):
@@ -246,7 +241,7 @@ def _our_list(given: Given) -> Callable[[Any], Any]:
 
 def _capacity(given: Given) -> int:
     import jfrnn
-    from jfrnn._search.neighbor_list import rounded_capacity
+    from experiments._library import rounded_capacity
 
     return rounded_capacity(int(jfrnn.count(given.x, given.cutoff).max()))
 
@@ -270,39 +265,26 @@ def _pair_sum_listed(given: Given, gradient: bool, compensated: bool) -> Steps:
 
 def _jax_md(given: Given, gradient: bool, compensated: bool) -> Steps:
     del compensated
-    import jax
-    import jax.numpy as jnp
-    from jax_md import partition, space  # pyright: ignore[reportMissingImports]
+    from experiments.methods import jax_md
 
-    displacement, _ = space.free()
-    low = jnp.min(given.x, axis=0)
-    size = np.asarray(jnp.max(given.x, axis=0) - low) + given.cutoff  # its cells begin at 0
-    make: Any = partition.neighbor_list(displacement, jnp.asarray(size), given.cutoff, format=partition.NeighborListFormat.Dense)
-    nbrs = make.allocate(given.x - low)
-    moved = replace(nbrs, reference_position=nbrs.reference_position + 2 * given.cutoff)  # else it keeps what it has
-    update = jax.jit(lambda x, nbrs: nbrs.update(x - low))
-    if update(given.x, moved).did_buffer_overflow:
-        raise RuntimeError("the list overflowed")
-    kernel = poly6(given.cutoff)
-    return Steps(lambda x: update(x, moved).idx, _compiled(lambda x, m, idx: over_list(kernel, x, m, idx), gradient))
+    search, kernel = jax_md.compile_update(given.x, given.cutoff), poly6(given.cutoff)
+    return Steps(search, _compiled(lambda x, m, idx: over_list(kernel, x, m, idx), gradient))
 
 
 def _nvalchemi(given: Given, gradient: bool, compensated: bool) -> Steps:
     del compensated
     import jax
     import jax.numpy as jnp
-    from nvalchemiops.jax.neighbors.cell_list import cell_list, estimate_cell_list_sizes  # pyright: ignore
 
-    low, cutoff, capacity = jnp.min(given.x, axis=0), given.cutoff, _capacity(given)
-    cell, periodic = jnp.diag(jnp.max(given.x, axis=0) - low + 2 * cutoff)[None], jnp.zeros((1, 3), bool)
-    cells, _, radius = estimate_cell_list_sizes(given.x - low + cutoff, cell, cutoff, periodic)
-    most = {"max_neighbors": capacity, "max_total_cells": int(cells), "neighbor_search_radius": radius}
+    from experiments.methods import nvalchemi
+
+    capacity, kernel = _capacity(given), poly6(given.cutoff)
+    search = nvalchemi.compile_search(given.x, given.cutoff, capacity)
 
     def build(x: Any) -> Any:  # noqa: ANN401
-        idx, count, *_ = cell_list(x - low + cutoff, cutoff, cell, periodic, **most)
+        idx, count = search(x)
         return jnp.where(jnp.arange(capacity) < count[:, None], idx, len(x))
 
-    kernel = poly6(given.cutoff)
     return Steps(jax.jit(build), _compiled(lambda x, m, idx: over_list(kernel, x, m, idx), gradient))
 
 

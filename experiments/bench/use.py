@@ -1,35 +1,47 @@
 """What a list costs those who use it: particles in random order or sorted, rows padded or compressed."""
 
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
+import typer
 
 import jfrnn
 from experiments import _measure
-from jfrnn._search.neighbor_list import rounded_capacity
+from experiments._commands import Points, Rounds
+from experiments._library import rounded_capacity
+from experiments.bench import table
 
 ORDERS = ("random", "row", "morton", "hilbert")
+CLUMPS = (0, 100, 300, 1000, 3000)  # points that lie within half a cutoff of each other
+NEIGHBORS = 30  # about so many each, away from the faces of the unit cube
+ORDER_COLUMNS = ("order", "points", "sort_ms", "search_ms", "sum_ms", "gain")
+ROW_COLUMNS = ("longest", "mean", "padded_MB", "compressed_MB", "padded_ms", "compressed_ms", "make_ms")
 
 
-def order_table(points: int, rounds: int, neighbors: int = 30) -> pd.DataFrame:
+def command(
+    points: Points = 250_000,
+    rounds: Rounds = 9,
+    out: Annotated[Path, typer.Option(help="Folder of the tables.")] = Path("out") / "use",
+) -> str:
+    """Time what uses a list: particles in random order or sorted, rows padded or compressed."""
+    given = [points, rounds]
+    orders = table.measure(out, "orders", [("orders", lambda: _order_rows(points, rounds))], given, ORDER_COLUMNS)
+    rows = table.measure(out, "rows", [("rows", lambda: _padding_rows(points // 5, rounds))], given, ROW_COLUMNS)
+    return f"{table.text(orders)}\n\n{table.text(rows)}"
+
+
+def _order_rows(points: int, rounds: int) -> Iterator[table.Line]:
     """Time a search, and a sum over the distances of its list, for the same particles in several orders.
 
-    Args:
-        points: Random points in a unit cube, float32.
-        rounds: Of timed runs; medians of them count.
-        neighbors: About so many each, away from faces.
-
-    Returns:
-        One row per order: milliseconds of the sort (0 for none), of the search and of the sum, and how many times faster than in
-        random order search and sum together are.
+    `gain` says how many times faster than in random order search and sum together are; the sort takes 0 where there is none.
     """
     random = np.random.default_rng(0)
-    x, r = jnp.asarray(random.random((points, 3)), jnp.float32), (3 * neighbors / (4 * math.pi * points)) ** (1 / 3)
+    x, r = jnp.asarray(random.random((points, 3)), jnp.float32), (3 * NEIGHBORS / (4 * math.pi * points)) ** (1 / 3)
     capacity = rounded_capacity(int(jfrnn.count(x, r).max()))
     search = jax.jit(lambda x: jfrnn.search(x, r, capacity=capacity))
     calls: dict[str, Callable[[], Any]] = {}
@@ -43,29 +55,21 @@ def order_table(points: int, rounds: int, neighbors: int = 30) -> pd.DataFrame:
         calls[f"search {order}"] = lambda there=there: search(there).idx
         calls[f"sum {order}"] = lambda there=there, nbrs=nbrs: _padded_sum(there, nbrs, r)
     milliseconds = _medians(calls, rounds)
-    rows, first = [], milliseconds["search random"] + milliseconds["sum random"]
+    first = milliseconds["search random"] + milliseconds["sum random"]
     for order in ORDERS:
         sort, search_ms, sum_ms = (milliseconds.get(f"{what} {order}", 0.0) for what in ("sort", "search", "sum"))
         row = {"order": order, "points": points, "sort_ms": sort, "search_ms": search_ms, "sum_ms": sum_ms}
-        rows.append(row | {"gain": first / (search_ms + sum_ms)})
-    return pd.DataFrame(rows)
+        yield row | {"gain": first / (search_ms + sum_ms)}
 
 
-def rows_table(points: int, rounds: int, clumps: tuple[int, ...] = (0, 100, 300, 1000, 3000)) -> pd.DataFrame:
+def _padding_rows(points: int, rounds: int) -> Iterator[table.Line]:
     """Time a sum over padded rows beside one over compressed rows, while one clump makes the longest row ever longer.
 
-    Args:
-        points: Random points in a unit cube, about 30 neighbors each, float32.
-        rounds: Of timed runs; medians of them count.
-        clumps: So many points lie within half a cutoff of each other besides.
-
-    Returns:
-        One row per clump: longest row and mean, bytes of both kinds of rows, and milliseconds of both sums over a list that is
-        there; the compressed rows are made once (`make_ms`).
+    Both are sums over a list that is there; the compressed rows are made once (`make_ms`).
     """
-    random, rows = np.random.default_rng(0), []
+    random = np.random.default_rng(0)
     r = (3 * 30 / (4 * math.pi * points)) ** (1 / 3)
-    for clump in clumps:
+    for clump in CLUMPS:
         many = np.concatenate([random.random((points, 3)), 0.5 + r / 4 * (random.random((clump, 3)) - 0.5)])
         x = jnp.asarray(many, jnp.float32)
         nbrs = jfrnn.search(x, r)
@@ -79,9 +83,8 @@ def rows_table(points: int, rounds: int, clumps: tuple[int, ...] = (0, 100, 300,
         }
         np.testing.assert_allclose(calls["padded"](), calls["compressed"](), rtol=1e-3, atol=1e-6)
         milliseconds, n = _medians(calls, rounds), len(many)
-        row = {"longest": int(nbrs.count.max()), "mean": total / n, "padded_MB": 4e-6 * n * nbrs.capacity}
-        rows.append(row | {"compressed_MB": 8e-6 * total} | {f"{name}_ms": value for name, value in milliseconds.items()})
-    return pd.DataFrame(rows)
+        row = {"clump": clump, "longest": int(nbrs.count.max()), "mean": total / n, "padded_MB": 4e-6 * n * nbrs.capacity}
+        yield row | {"compressed_MB": 8e-6 * total} | {f"{name}_ms": value for name, value in milliseconds.items()}
 
 
 @jax.jit

@@ -1,40 +1,32 @@
 """Particles around a gear: what `search_triangles` takes, beside libraries that find the nearest triangle of each point."""
 
-import csv
 import importlib.util
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from time import process_time
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
+import typer
 from jfrnn.cases import meshes  # pyright: ignore[reportMissingImports]
 
 import jfrnn
 from experiments import _machine, _measure
+from experiments._commands import Points, Rounds, check_choice, positive
+from experiments.bench import table
 
 COLUMNS = (
-    *(
-        "method",
-        "n",
-        "faces",
-        "cutoff",
-        "pairs",
-        "longest_row",
-        "rounds",
-        "median_s",
-        "p10_s",
-        "p90_s",
-        "us_per_particle",
-        "processor_s",
-    ),
-    *("missing", "extra", "others_cores", "jax", "warp", "peer", "commit", "dirty"),
+    *("method", "n", "faces", "cutoff", "pairs", "longest_row", "rounds", "median_s", "p10_s", "p90_s", "us_per_particle"),
+    *("processor_s", "missing", "extra", "others_cores", "jax", "warp", "peer", "commit", "dirty"),
 )
+SHOWN = ("method", "n", "faces", "cutoff", "pairs", "median_s", "processor_s", "us_per_particle", "missing", "extra")
 _FEW = 2_000  # points that a peer is asked for whose time would be minutes
 _CURVES = ("row", "morton", "hilbert")
+Faces = Annotated[list[int], typer.Option(min=100, max=10_000_000, help="Of gears, about; may be said several times.")]
+Cutoffs = Annotated[list[float], typer.Option(callback=positive, help="[modules]; may be said several times.")]
 
 
 class _Asked(NamedTuple):
@@ -52,37 +44,34 @@ class _Scene(NamedTuple):
     faces: np.ndarray
 
 
-def measure(folder: Path, n: int, faces: tuple[int, ...], rounds: int, backend: str, cutoffs: tuple[float, ...]) -> Path:
-    """Write a table of seconds by method, number of faces and cutoff, and return its path.
+def command(
+    out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform and backend.")] = Path("out") / "triangles",
+    points: Points = 250_000,
+    faces: Faces = [500, 12_000, 200_000],  # noqa: B006 - Typer copies it
+    cutoff: Cutoffs = [0.01, 0.03, 0.1, 0.3, 0.8],  # noqa: B006
+    rounds: Rounds = 9,
+    backend: Annotated[str, typer.Option(help="warp (beside bvh), bvh or jax.")] = "warp",
+) -> str:
+    """Time the triangles of a gear that are near particles, beside trimesh and libigl where they are installed.
 
     jfrnn lists all triangles within the cutoff: "update" with the cells of a wall that stays, "rebuild" with one that is sorted
     anew, "morton order" and the like the first for points along a curve. Beside "warp" also "bvh", the same in a tree of boxes.
     Peers find the one nearest triangle of each point, however far, but for "wp.Mesh": "nearest" looks no farther than the cutoff,
     "boxes" only counts triangles whose boxes are as near, which is where a search through its tree of boxes begins; both run on one
-    core. `missing` and `extra` are particles of which jfrnn says
-    otherwise than a peer, in float64, whether a triangle is within the cutoff.
-
-    Args:
-        folder: Takes a file named after the backend, such as cpu_warp.csv; one that is there is replaced.
-        n: Random points in the bounding box of the gear.
-        faces: Of gears, about; their module is 1, their teeth are 20.
-        rounds: Of timed runs.
-        backend: As in `jfrnn.search_triangles`.
-        cutoffs: [modules].
+    core. `missing` and `extra` are particles of which jfrnn says otherwise than a peer, in float64, whether a triangle is near.
+    The module of gears is 1, their teeth are 20; points are random in their bounding boxes.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{jax.default_backend()}_{backend}.csv"
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, COLUMNS, restval="")
-        writer.writeheader()
-        for number in faces:
-            scene = _gear(n, number)
-            peers = {name: peer(scene) for name, peer in _PEERS.items() if importlib.util.find_spec(_MODULES[name])}
-            for cutoff in cutoffs:
-                for row in _rows(scene, cutoff, rounds, backend, peers):
-                    writer.writerow(row)
-                    stream.flush()
-    return path
+    check_choice("--backend", backend, ("warp", "bvh", "jax"))
+    parts = [(f"{number} faces", partial(_gear_rows, points, number, cutoff, rounds, backend)) for number in faces]
+    given = [points, cutoff, rounds]
+    return table.text(table.measure(out, f"{jax.default_backend()}_{backend}", parts, given, COLUMNS), SHOWN)
+
+
+def _gear_rows(n: int, faces: int, cutoffs: list[float], rounds: int, backend: str) -> Iterator[table.Line]:
+    scene = gear(n, faces)
+    peers = {name: peer(scene) for name, peer in _PEERS.items() if importlib.util.find_spec(_MODULES[name])}
+    for cutoff in cutoffs:
+        yield from _rows(scene, cutoff, rounds, backend, peers)
 
 
 def _rows(scene: _Scene, cutoff: float, rounds: int, backend: str, peers: dict[str, _Asked]) -> Iterator[dict[str, Any]]:
@@ -94,7 +83,7 @@ def _rows(scene: _Scene, cutoff: float, rounds: int, backend: str, peers: dict[s
     if any(np.any(np.asarray(other.count) != np.asarray(tri.count)) for _, other in lists.values()):
         raise RuntimeError(f"two engines count other triangles within {cutoff}: {', '.join(engines)}.")
     near = np.asarray(tri.count) > 0
-    common = {"faces": len(scene.faces), "cutoff": cutoff, "others_cores": others, **_versions()}
+    common = {"faces": len(scene.faces), "cutoff": cutoff, "others_cores": others}
     row = {"n": n, "pairs": int(tri.count.sum()), "longest_row": int(tri.required)}
     for way, call in calls.items():
         _, _, processor = _repeated(lambda call=call: jax.block_until_ready(call()))
@@ -108,13 +97,8 @@ def _rows(scene: _Scene, cutoff: float, rounds: int, backend: str, peers: dict[s
         yield common | row | _timed(taken, len(asked), processor)
 
 
-def table(path: Path) -> str:
-    """Return the table of a run as text."""
-    columns = ["method", "n", "faces", "cutoff", "pairs", "median_s", "processor_s", "us_per_particle", "missing", "extra"]
-    return pd.read_csv(path)[columns].to_string(index=False, na_rep="")
-
-
-def _gear(n: int, faces: int) -> _Scene:
+def gear(n: int, faces: int) -> _Scene:
+    """Return random points around a gear."""
     vertices, named = meshes.gear(20, faces)
     vertices = vertices.astype(np.float32)
     low, high = vertices.min(axis=0) - 0.5, vertices.max(axis=0) + 0.5
@@ -158,10 +142,10 @@ def _trees(scene: _Scene, cutoff: float) -> dict[str, _Asked]:
     """Ask the tree of boxes that Warp has of a mesh, by name of the way; empty where Warp is missing."""
     if importlib.util.find_spec("warp") is None:
         return {}
-    from experiments import _bvh
+    from experiments.bench import bvh
 
     everyone = np.arange(len(scene.points))
-    tree = _bvh.Tree(scene.points, scene.vertices, scene.faces, cutoff, "cpu")
+    tree = bvh.Tree(scene.points, scene.vertices, scene.faces, cutoff, "cpu")
     found, seconds, processor = _repeated(lambda: tree.ask("nearest"))
     _, taken, busy = _repeated(lambda: tree.ask("boxes"))
     return {
@@ -178,10 +162,7 @@ def _repeated(call: Callable[[], Any]) -> tuple[Any, list[float], float]:
     return result, seconds, (process_time() - begin) / len(seconds)
 
 
-_PEERS: dict[str, Callable[[_Scene], _Asked]] = {
-    "libigl": _libigl,
-    "trimesh": _trimesh,
-}
+_PEERS: dict[str, Callable[[_Scene], _Asked]] = {"libigl": _libigl, "trimesh": _trimesh}
 _MODULES = {"libigl": "igl", "trimesh": "trimesh"}
 
 
@@ -192,15 +173,5 @@ def _peer_version(name: str) -> str:
 
 def _timed(seconds: list[float], n: int, processor: float) -> dict[str, Any]:
     said = _measure.summarize(seconds)
-    times = {name: f"{said[name]:.3e}" for name in ("median_s", "p10_s", "p90_s")}
-    return {
-        "rounds": said["repeats"],
-        **times,
-        "us_per_particle": f"{1e6 * said['median_s'] / n:.3g}",
-        "processor_s": f"{processor:.3e}",
-    }
-
-
-def _versions() -> dict[str, Any]:
-    found = _machine.versions()
-    return {"jax": found["jax"], "warp": found["warp-lang"], **_machine.commit()}
+    times = {name: said[name] for name in ("median_s", "p10_s", "p90_s")}
+    return times | {"rounds": said["repeats"], "us_per_particle": 1e6 * said["median_s"] / n, "processor_s": processor}

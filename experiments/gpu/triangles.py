@@ -6,18 +6,21 @@ A time stands in a row that also says how many lists were wrong: those that diff
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
-from experiments import _compare, _measure, _triangles
-from jfrnn._engine.warp import load_warp
+import jfrnn
+from experiments import _compare, _measure
+from experiments._library import triangle_query
+from experiments.bench import bvh
+from experiments.bench.triangles import gear
 
 
 def decisions(oracle: Any, dtype: str, dim: int, capacity: int, backend: str) -> Iterator[tuple[str, bool]]:  # noqa: ANN401
     """Say of every hard case whether its list is the oracle's, and its distances are as near as they are promised to be."""
-    import jax.numpy as jnp
     from jfrnn.cases.triangles import TRIANGLE_CASES, padded  # pyright: ignore[reportMissingImports]
-
-    import jfrnn
 
     for name, case in TRIANGLE_CASES.items():
         plain = case.build(np.dtype(dtype), dim)
@@ -64,14 +67,9 @@ def rows(
         cutoff: [modules].
         dtype: Of all floats.
         steps: Of the scan.
-        timed: Times a call: `experiments._gpu._timed`, of a config.
+        timed: Times a call: `experiments.gpu.timings.timed`, of a config.
     """
-    import jax
-    import jax.numpy as jnp
-
-    import jfrnn
-
-    scene = _triangles._gear(n, faces)
+    scene = gear(n, faces)
     x, vertices, named = (
         jnp.asarray(scene.points.astype(dtype)),
         jnp.asarray(scene.vertices.astype(dtype)),
@@ -101,9 +99,7 @@ def tree_rows(base: dict[str, Any], scene: Any, count: Any, device: str) -> Iter
 
     `differing` says of how many particles the tree has a triangle within the cutoff and the list has none, or the other way round.
     """
-    from experiments import _bvh
-
-    tree = _bvh.Tree(scene.points, scene.vertices, scene.faces, base["cutoff"], device)
+    tree = bvh.Tree(scene.points, scene.vertices, scene.faces, base["cutoff"], device)
     differs = (tree.ask("nearest") < base["cutoff"]) != (np.asarray(count) > 0)
     for name, launch in tree.launches.items():
         told = {"differing": int(differs.sum())} if name == "nearest" else {"boxes": int(tree.ask(name).sum(dtype=np.int64))}
@@ -111,11 +107,6 @@ def tree_rows(base: dict[str, Any], scene: Any, count: Any, device: str) -> Iter
 
 
 def _calls(tri: Any, x: Any, vertices: Any, steps: int) -> dict[str, Callable[[], Any]]:  # noqa: ANN401
-    import jax
-    from jax import lax
-
-    import jfrnn
-
     if tri.backend == "jax":  # takes long, to compile too: what `rows` has compiled says enough
         return {"update": lambda: tri.update(x).idx, "rebuild": lambda: tri.update(x, vertices=vertices).idx}
 
@@ -138,31 +129,9 @@ def _calls(tri: Any, x: Any, vertices: Any, steps: int) -> dict[str, Callable[[]
     }
 
 
-def launchable(tri: Any, x: Any, device: str) -> tuple[list[Any], Any, Any, Any]:  # noqa: ANN401
-    """Return the commands of a query with the cells of a list, and its arrays on a device: idx, count, scratch."""
-    wp = load_warp()
-    from jfrnn._engine.warp import kernels_of
-    from jfrnn._geometry.exact import make_cutoff
-    from jfrnn._triangles import warp as _triangles_warp
-    from jfrnn._triangles.cells import without_faults
-
-    n, dim = x.shape
-    variant = _triangles_warp._Variant(dim, x.dtype == np.float64, lists=True, tree=tri.backend == "bvh")
-    corners, _, _ = without_faults(tri.vertices, tri.faces)
-    inputs = _triangles_warp.query_inputs(x, corners, tri.cells, make_cutoff(tri.cutoff, np.dtype(x.dtype), closed=False))
-    sizes = _triangles_warp.sizes_on_cuda(variant, inputs)
-    words = kernels_of("triangles_cuda").scratch_words(n, *sizes, dim, variant.double)
-    arrays = [wp.array(np.asarray(given), device=device) for given in inputs]
-    arrays[1] = wp.array(np.asarray(corners), dtype=arrays[0].dtype, ndim=3, device=device)
-    arrays += [wp.empty(shape, dtype=wp.int32, device=device) for shape in ((n, tri.capacity), n, words)]
-    if device != "cpu":
-        _triangles_warp._cuda_kernels(variant).load(device)
-    return _triangles_warp._commands(variant, *arrays), *arrays[-3:]
-
-
 def stages(tri: Any, x: Any, repeats: int = 5) -> dict[str, Any]:  # noqa: ANN401
     """Return the seconds of the kernels of a query on CUDA, each alone on the device's clock, and what waited for integers."""
-    commands, _, _, scratch = launchable(tri, x, "cuda:0")
+    commands, _, _, scratch = triangle_query(tri, x, "cuda:0")
     until = _measure.time_kernels([command[:4] for command in commands], repeats)
     names = [f"{command.kernel.key.split('_')[0]}_s" for command in commands]
     near, queued = scratch.numpy()[:2]

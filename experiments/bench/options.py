@@ -1,25 +1,28 @@
 """What each option of a search costs: the same scene with one option at a time, side by side in one run."""
 
-import csv
 import itertools
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
+import typer
 
 import jfrnn
-from experiments import _machine, _measure
-from jfrnn._search.neighbor_list import rounded_capacity
+from experiments import _measure
+from experiments._commands import Engine, Points, Rounds
+from experiments._library import rounded_capacity
+from experiments.bench import table
 
 COLUMNS = (
     *("platform", "backend", "n", "option", "entries", "capacity", "rounds", "list_s", "count_s", "list_ratio", "count_ratio"),
     *("others_cores", "device", "jax", "warp", "commit", "dirty"),
 )
+SHOWN = ("option", "entries", "capacity", "list_s", "list_ratio", "count_s", "count_ratio")
+NEIGHBORS = 30  # about so many each, away from the faces of the unit cube
 
 
 class _Option(NamedTuple):
@@ -31,19 +34,21 @@ class _Option(NamedTuple):
     more: dict[str, Any]
 
 
-def measure(folder: Path, n: int, rounds: int, backend: str, neighbors: int = 30) -> Path:
-    """Write a table of seconds by option, and return its path; every option is timed once per round.
+def command(
+    out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform and backend.")] = Path("out") / "options",
+    points: Points = 100_000,
+    rounds: Rounds = 15,
+    backend: Engine = "warp",
+) -> str:
+    """Time each option of a search beside a plain one."""
+    jax.config.update("jax_enable_x64", True)
+    parts = [("all options", lambda: _rows(points, rounds, backend))]
+    return table.text(table.measure(out, f"{jax.default_backend()}_{backend}", parts, [points, rounds], COLUMNS), SHOWN)
 
-    Args:
-        folder: Takes a file named after platform and backend, such as cpu_warp.csv; one that is there is replaced.
-        n: Random points in a unit cube.
-        rounds: Of timed runs; medians of them count.
-        backend: As in `jfrnn.search`.
-        neighbors: About so many each, away from faces.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{jax.default_backend()}_{backend}.csv"
-    options = list(_options(n, neighbors))
+
+def _rows(n: int, rounds: int, backend: str) -> Iterator[table.Line]:
+    """Time every option once per round; medians of rounds count."""
+    options = list(_options(n, NEIGHBORS))
     calls = [_compiled(option, backend) for option in options]
     for search, count in calls:
         jax.block_until_ready((search(), count()))
@@ -51,28 +56,12 @@ def measure(folder: Path, n: int, rounds: int, backend: str, neighbors: int = 30
     burst = 20 if jax.default_backend() == "gpu" else 1
     seconds, others = _measure.time_in_turns(numbered, rounds, burst)
     medians = np.median(list(seconds.values()), axis=1).reshape(len(options), 2)
-    versions, commit, device = _machine.versions(), _machine.commit(), jax.devices()[0]
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, COLUMNS)
-        writer.writeheader()
-        for option, (search, _), median in zip(options, calls, medians, strict=True):
-            idx, count = search()
-            ratios = median / medians[0]
-            writer.writerow(
-                {"platform": device.platform, "backend": backend, "n": n, "option": option.name}
-                | {"entries": int(np.asarray(count).sum(dtype=np.int64)), "capacity": idx.shape[1], "rounds": rounds}
-                | {"list_s": f"{median[0]:.3e}", "count_s": f"{median[1]:.3e}"}
-                | {"list_ratio": round(ratios[0], 2), "count_ratio": round(ratios[1], 2)}
-                | {"others_cores": others, "device": device.device_kind}
-                | {"jax": versions["jax"], "warp": versions["warp-lang"], **commit}
-            )
-    return path
-
-
-def table(path: Path) -> str:
-    """Return the table of a run as text."""
-    columns = ["option", "entries", "capacity", "list_s", "list_ratio", "count_s", "count_ratio"]
-    return pd.read_csv(path)[columns].to_string(index=False)
+    for option, (search, _), median in zip(options, calls, medians, strict=True):
+        idx, count = search()
+        list_ratio, count_ratio = (round(float(ratio), 2) for ratio in median / medians[0])
+        row = {"backend": backend, "n": n, "option": option.name, "entries": int(np.asarray(count).sum(dtype=np.int64))}
+        row |= {"capacity": idx.shape[1], "rounds": rounds, "list_s": float(median[0]), "count_s": float(median[1])}
+        yield row | {"list_ratio": list_ratio, "count_ratio": count_ratio, "others_cores": others}
 
 
 def _options(n: int, neighbors: int) -> Iterator[_Option]:

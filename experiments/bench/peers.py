@@ -1,22 +1,24 @@
 """What other libraries answer on the hard cases: each in a process of its own, against exact arithmetic, within a time limit."""
 
-import csv
 import importlib
 import multiprocessing
 import resource
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+import typer
 from jfrnn.cases.catalog import CATALOG, Problem, problem  # pyright: ignore[reportMissingImports]
-from tqdm import tqdm
 
-from experiments import _machine
+from experiments._commands import finite
+from experiments._errors import UsageError
+from experiments.bench import table
 
 Pairs = tuple[np.ndarray, np.ndarray]
 COLUMNS = ("row", "case", "peer", "version", "answer", "missing", "extra", "pairs", "reason", "commit", "dirty")
@@ -182,35 +184,30 @@ def _judge(found: Counter, case: str) -> dict[str, Any]:
 # --- one process per peer -------------------------------------------------------------------------------------------------
 
 
-def measure(folder: Path, names: list[str], limit_s: float) -> Path:
-    """Ask each peer for each case of the catalog; write answers.csv row by row, and return its path.
+def command(
+    names: Annotated[list[str] | None, typer.Argument(help="Of libraries; all that are known without.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "peers",
+    limit: Annotated[float, typer.Option(min=1, max=1e6, callback=finite, help="Time for one answer [s].")] = 60.0,
+) -> str:
+    """Ask other libraries for the hard cases, and print a table of their answers (pip install -e '.[peers]').
 
-    Args:
-        folder: Takes the table; one that is there is replaced.
-        names: Of peers.
-        limit_s: Time for one answer [s], compilation included; beyond, the process is ended and the next case asked.
+    The time for an answer includes compilation; beyond, the process is ended and the next case asked.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    path, commit = folder / "answers.csv", _machine.commit()
+    if unknown := [name for name in names or [] if name not in PEERS]:
+        raise UsageError(f"no peer {unknown[0]!r}: {', '.join(PEERS)}")
+    parts = [(name, partial(_rows, name, limit)) for name in names or PEERS]
+    return markdown(table.measure(out, "answers", parts, limit, COLUMNS).astype(object).fillna("").astype(str).to_dict("records"))
+
+
+def _rows(name: str, limit_s: float) -> Iterator[dict[str, Any]]:
+    """Yield a row for each case of the catalog."""
     cases = [(row.title, case) for row in CATALOG for case in row.cases]
-    with path.open("w", encoding="utf-8", newline="") as stream, tqdm(total=len(names) * len(cases)) as bar:
-        writer: csv.DictWriter[str] = csv.DictWriter(stream, COLUMNS)
-        writer.writeheader()
-        for name in names:
-            for (title, case), fields in zip(cases, _answers(name, [case for _, case in cases], limit_s), strict=True):
-                writer.writerow(
-                    {"row": title, "case": case, "peer": name, "version": _version(PEERS[name].package)} | fields | commit
-                )
-                stream.flush()
-                bar.set_postfix_str(f"{name}: {case}")
-                bar.update()
-    return path
+    for (title, case), answer in zip(cases, _answers(name, [case for _, case in cases], limit_s), strict=True):
+        yield {"row": title, "case": case, "peer": name, "version": _version(PEERS[name].package)} | answer
 
 
-def table(path: Path) -> str:
-    """Return the answers as a table in Markdown, a line for each row of the catalog and a column for each peer."""
-    with path.open(encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream))
+def markdown(rows: Sequence[dict[Any, str]]) -> str:
+    """Return answers as a table in Markdown, a line for each row of the catalog and a column for each peer."""
     peers = list(dict.fromkeys(row["peer"] for row in rows))
     titles = {peer: next(row["version"] for row in rows if row["peer"] == peer) for peer in peers}
     head = ["case", *(f"{peer} {titles[peer]}" for peer in peers)]
@@ -222,7 +219,7 @@ def table(path: Path) -> str:
     return "\n".join(lines)
 
 
-def _said(rows: list[dict[str, str]]) -> str:
+def _said(rows: list[dict[Any, str]]) -> str:
     """Say in a word or two what a peer answered on all cases of a row."""
     if all(row["answer"] == "right" for row in rows):
         return "right"

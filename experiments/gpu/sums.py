@@ -3,22 +3,29 @@
 from collections.abc import Iterator
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+
+import jfrnn
 
 COLUMNS = (1, 5, 9, 14)  # numbers of a neighbor that a term reads, besides its position
 _LARGEST = 512  # such that no sum of a row leaves the integers of float32
 
 
-def decisions(dtype: str, dim: int, capacity: int, backend: str) -> Iterator[tuple[str, bool]]:
-    """Say of every scene, and of every number of columns, whether sums and counts of pairs are those of the list."""
-    import jax
-    import jax.numpy as jnp
+def decisions(dtype: str, dim: int, capacity: int, backend: str, least_rows: int = 0) -> Iterator[tuple[str, bool]]:
+    """Say of every scene, and of every number of columns, whether sums and counts of pairs are those of the list.
 
-    import jfrnn
-
+    Scenes of fewer rows than the least are filled up with points that are nowhere.
+    """
     random = np.random.default_rng(1)
 
     def is_right(x: np.ndarray, cutoff: float, columns: int, capacity: int = capacity, **options: Any) -> bool:  # noqa: ANN401
+        if "queries" in options:
+            options["queries"] = _filled(options["queries"], least_rows)
+        else:
+            n, x = len(x), _filled(x, least_rows)
+            options |= {"batch": np.pad(options["batch"], (0, len(x) - n))} if "batch" in options else {}
         n, points = len(x), jnp.asarray(x)
         weights = random.integers(1, _LARGEST, (n, columns)).astype(dtype)
         nbrs = jfrnn.search(points, cutoff, capacity=capacity, backend="warp", **options)
@@ -43,14 +50,16 @@ def decisions(dtype: str, dim: int, capacity: int, backend: str) -> Iterator[tup
         yield "large-5", is_right(_lattice(257, 3, dtype), 1.1, 5, capacity=8)
 
 
+def _filled(points: np.ndarray, rows: int) -> np.ndarray:
+    return np.concatenate([points, np.full((max(rows - len(points), 0), points.shape[1]), np.nan, points.dtype)])
+
+
 def _lattice(side: int, dim: int, dtype: str) -> np.ndarray:
     return np.stack(np.meshgrid(*[np.arange(side, dtype=dtype)] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
 
 
 def _scenes(random: np.random.Generator, dtype: str, dim: int) -> Iterator[tuple[str, np.ndarray, float, dict[str, Any]]]:
     """Yield names, positions, cutoffs and options of searches with up to 256 neighbors."""
-    import jfrnn
-
     x = random.random((3000, dim)).astype(dtype)
     cutoff = {2: 0.06, 3: 0.15}[dim]
     beyond = (random.random((1501, dim)) * 1.3 - 0.1).astype(dtype)

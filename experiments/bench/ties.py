@@ -4,21 +4,22 @@ The scenes are those of the thesis. On its lattice, as on a crystal, 30 of the 1
 cutoff of 3 spacings. Whether floats can tell depends on the spacing: 1 and 1/64 are powers of two, 1e-4 is not.
 """
 
-import csv
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
+import typer
 from jax.typing import DTypeLike
-from tqdm import tqdm
 
 import jfrnn
-from experiments import _config, _layouts, _machine, _measure, _oracle
-from jfrnn._search.neighbor_list import rounded_capacity
+from experiments import _config, _layouts, _measure, _oracle
+from experiments._commands import MOST_POINTS, Engine, Rounds
+from experiments._library import rounded_capacity
+from experiments.bench import table
 
 JITTER = 0.3  # of a spacing, to either side
 SAMPLE = 2000  # particles whose neighbors are compared with the oracle's
@@ -31,6 +32,11 @@ COLUMNS = (
 )
 
 
+SHOWN = ("scene", "dtype", "sites", "n", "wrong", *(f"{what}_s" for what in TIMED), *(f"{what}_ratio" for what in TIMED))
+Scenes = Annotated[Path, typer.Argument(help="Config of a sweep whose layouts are measured, TOML.")]
+Cube = Annotated[int | None, typer.Option(min=1000, max=MOST_POINTS, help="Sites of a cube to measure instead of these layouts.")]
+
+
 class _Sites(NamedTuple):
     """Where the particles of a scene are: positions [n, 3] in the dtype of the run, and the cutoff."""
 
@@ -39,42 +45,36 @@ class _Sites(NamedTuple):
     cutoff: float
 
 
-def measure(folder: Path, rounds: int, backend: str, scenes: Path, largest: int | None = None) -> Path:
-    """Write a table of seconds, one row for each scene, dtype and kind of sites, as they are measured; return its path.
-
-    Args:
-        folder: Takes a file named after platform and backend, such as cpu_warp.csv; one that is there is replaced.
-        rounds: Of timed runs; medians of them count.
-        backend: As in `jfrnn.search`.
-        scenes: Config of a sweep, whose layouts are taken.
-        largest: Measure a cube of about so many sites instead, without other scenes.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{jax.default_backend()}_{backend}.csv"
-    integers = dict(_scenes(scenes)) if largest is None else {"cube": _cube(largest)}
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, COLUMNS)
-        writer.writeheader()
-        for scene, sites in tqdm(integers.items(), desc="scenes"):
-            for dtype in (np.float32, np.float64):
-                writer.writerows(_rows(scene, sites, dtype, rounds, backend))
-                stream.flush()
-    return path
+def command(
+    scenes: Scenes = Path("experiments/configs/thesis.toml"),
+    out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform and backend.")] = Path("out") / "ties",
+    rounds: Rounds = 15,
+    backend: Engine = "warp",
+    cube: Cube = None,
+) -> str:
+    """Time lattices full of pairs at exactly the cutoff beside the same scenes moved at random."""
+    jax.config.update("jax_enable_x64", True)
+    given = _config.load(scenes)
+    integers = dict(_scenes(given)) if cube is None else {f"cube {cube}": partial(_cube, cube)}
+    parts = [
+        (f"{scene} {np.dtype(dtype).name}", partial(_rows, scene, sites, dtype, rounds, backend))
+        for scene, sites in integers.items()
+        for dtype in (np.float32, np.float64)
+    ]
+    return table.text(table.measure(out, f"{jax.default_backend()}_{backend}", parts, rounds, COLUMNS), SHOWN)
 
 
-def table(path: Path) -> str:
-    """Return the table of a run as text: ratios to the same scene moved at random."""
-    columns = ["scene", "dtype", "sites", "n", "wrong", *(f"{what}_s" for what in TIMED), *(f"{what}_ratio" for what in TIMED)]
-    return pd.read_csv(path)[columns].to_string(index=False)
-
-
-def _scenes(config: Path) -> Iterator[tuple[str, np.ndarray]]:
+def _scenes(config: _config.Config) -> Iterator[tuple[str, Callable[[], np.ndarray]]]:
     """Yield the scenes of a sweep by name, as whole numbers of spacings [n, 3]."""
-    for part in _config.load(config).scenes:
+    for part in config.scenes:
         for layout in part.layouts:
             for fill in part.fills:
-                scene = _layouts.make(layout, fill=fill)
-                yield f"{layout} {fill:.0%}", np.rint(scene.positions / scene.spacing)
+                yield f"{layout} {fill:.0%}", partial(_sites, layout, fill)
+
+
+def _sites(layout: str, fill: float) -> np.ndarray:
+    scene = _layouts.make(layout, fill=fill)
+    return np.rint(scene.positions / scene.spacing)
 
 
 def _cube(size: int) -> np.ndarray:
@@ -99,29 +99,25 @@ def _placed(integers: np.ndarray, dtype: DTypeLike) -> Iterator[_Sites]:
         yield _Sites(name, (sites * spacing).astype(dtype), float(np.asarray(3 * spacing, dtype)))
 
 
-def _rows(scene: str, integers: np.ndarray, dtype: DTypeLike, rounds: int, backend: str) -> Iterator[dict[str, Any]]:
-    placed = list(_placed(integers, dtype))
-    calls = [_compiled(sites, backend) for sites in placed]
+def _rows(scene: str, sites: Callable[[], np.ndarray], dtype: DTypeLike, rounds: int, backend: str) -> Iterator[table.Line]:
+    """Time one scene in one dtype: a row for each kind of sites; medians of rounds count."""
+    placed = list(_placed(sites(), dtype))
+    calls = [_compiled(each, backend) for each in placed]
     numbered = {f"{k} {what}": call for k, each in enumerate(calls) for what, call in each.items()}
     for call in numbered.values():
         jax.block_until_ready(call())
-    burst = 20 if jax.default_backend() == "gpu" else 1
-    seconds, others = _measure.time_in_turns(numbered, rounds, burst)
+    seconds, others = _measure.time_in_turns(numbered, rounds, 20 if jax.default_backend() == "gpu" else 1)
     medians = np.median(list(seconds.values()), axis=1).reshape(len(placed), len(TIMED))
-    versions, commit, device = _machine.versions(), _machine.commit(), jax.devices()[0]
-    for sites, each, median in zip(placed, calls, medians, strict=True):
+    for place, each, median in zip(placed, calls, medians, strict=True):
         count = np.asarray(each["count"]())
         rows = np.sort(np.random.default_rng(1).choice(len(count), min(SAMPLE, len(count)), replace=False))
-        keys = _oracle.find_sample(sites.positions, sites.cutoff, rows)
+        keys = _oracle.find_sample(place.positions, place.cutoff, rows)
         exact = np.bincount(keys // len(count), minlength=len(count))[rows]
-        yield (
-            {"platform": device.platform, "backend": backend, "dtype": np.dtype(dtype).name, "scene": scene, "sites": sites.name}
-            | {"n": len(count), "neighbors": round(float(count.mean()), 1), "checked": len(rows)}
-            | {"wrong": int((count[rows] != exact).sum()), "rounds": rounds, "others_cores": others, "device": device.device_kind}
-            | {f"{what}_s": f"{value:.3e}" for what, value in zip(TIMED, median, strict=True)}
-            | {f"{what}_ratio": round(value, 2) for what, value in zip(TIMED, median / medians[0], strict=True)}
-            | {"jax": versions["jax"], "warp": versions["warp-lang"], **commit}
-        )
+        row = {"backend": backend, "dtype": np.dtype(dtype).name, "scene": scene.split()[0] if "cube" in scene else scene}
+        row |= {"sites": place.name, "n": len(count), "neighbors": round(float(count.mean()), 1), "checked": len(rows)}
+        row |= {"wrong": int((count[rows] != exact).sum()), "rounds": rounds, "others_cores": others}
+        row |= {f"{what}_s": float(value) for what, value in zip(TIMED, median, strict=True)}
+        yield row | {f"{what}_ratio": round(float(value), 2) for what, value in zip(TIMED, median / medians[0], strict=True)}
 
 
 def _compiled(sites: _Sites, backend: str) -> dict[str, Callable[[], Any]]:

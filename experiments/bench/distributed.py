@@ -5,8 +5,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,18 +14,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+import typer
 from jax import Array
 from jax.sharding import Mesh
 from pydantic import Field, FiniteFloat
 
 import jfrnn
-from experiments import _machine, _measure, _sweep, _trace
-from experiments._config import Positive, Table, digest
-from experiments._rows import RETRIED, RowFile
+from experiments import _machine, _measure
+from experiments._commands import RetryFailed, RowsFolder, take_folder
+from experiments._config import Dtype, Keyed, Positive, Table, load
+from experiments._loop import Task, fill
+from experiments._rows import RowFile, TimedRow
+from experiments.bench import trace
 from jfrnn import distributed
-from jfrnn._shards.scatter import fetched
 
-_WORK = ("list", "pair_sum", "sph")
 _SENDS = re.compile(r"= (.*?) collective-permute(?:-start)?\((.*?)\),.*?source_target_pairs=\{(.*?)\}\}")
 _NESTED = re.compile(r"\[.*?\]|\{.*?\}")  # shape and layout of an operand, which hold commas too
 _ARRAY = re.compile(r"(\w+)\[([\d,]*)\]")
@@ -34,38 +35,22 @@ _BYTES = {"pred": 1, "s32": 4, "u32": 4, "f32": 4, "f64": 8, "s64": 8}
 
 
 class Config(Table):
-    """What is measured.
+    """What is measured."""
 
-    Attributes:
-        devices: Numbers of devices; those that are not there are skipped.
-        scaling: "strong": the same particles on all of them; "weak": the same number on each.
-        work: Of "list" (a list is made), "pair_sum" (a density), "sph" (a step of the 3D dam break).
-        side: Particles along an edge of the cube, in all ("strong") or per device ("weak").
-        nx: Likewise of the dam break: particles along the width of its column.
-        axes: Along how many axes space is cut, at most, one after the other; devices are split among them evenly.
-        cutoff_ratio: Cutoff of lists and sums, in spacings of a jittered lattice.
-        dtype: Of all numbers.
-        repeats: Fewest timed runs.
-        min_seconds: Runs go on until they took this long together [s].
-        steps: Of the fluid, per timed run.
-        check_most: One device counts pairs, and runs the fluid, too, up to so many particles.
-        virtual_devices: Of the CPU; 0: the devices that there are.
-        backend: As in `jfrnn.search`.
-    """
-
-    devices: tuple[Annotated[int, Field(ge=1)], ...] = (1, 2, 4, 8)
-    scaling: tuple[Literal["strong", "weak"], ...] = ("strong", "weak")
-    work: tuple[Literal["list", "pair_sum", "sph"], ...] = _WORK
-    side: Annotated[int, Field(ge=2)] = 317
-    nx: Annotated[int, Field(ge=2)] = 250
-    axes: tuple[Literal[1, 2, 3], ...] = (1,)
-    cutoff_ratio: Positive = 3.0
-    dtype: Literal["float32", "float64"] = "float32"
-    repeats: Annotated[int, Field(ge=1)] = 20
-    min_seconds: Annotated[FiniteFloat, Field(ge=0)] = 0.5
-    steps: Annotated[int, Field(ge=1)] = 10
-    check_most: Annotated[int, Field(ge=0)] = 40_000_000
-    virtual_devices: Annotated[int, Field(ge=0)] = 0
+    devices: tuple[Annotated[int, Field(ge=1)], ...] = (1, 2, 4, 8)  # numbers of devices; those that are not there are skipped
+    scaling: tuple[Literal["strong", "weak"], ...] = ("strong", "weak")  # the same particles on all of them; as many on each
+    # A list is made; a density; a step of the 3D dam break.
+    work: tuple[Literal["list", "pair_sum", "sph"], ...] = ("list", "pair_sum", "sph")
+    side: Annotated[int, Field(ge=2)] = 317  # particles along an edge of the cube, in all ("strong") or per device ("weak")
+    nx: Annotated[int, Field(ge=2)] = 250  # likewise of the dam break: particles along the width of its column
+    axes: tuple[Literal[1, 2, 3], ...] = (1,)  # along how many space is cut, at most; devices are split among them evenly
+    cutoff_ratio: Positive = 3.0  # cutoff of lists and sums, in spacings of a jittered lattice
+    dtype: Dtype = "float32"  # of all numbers
+    repeats: Annotated[int, Field(ge=1)] = 20  # fewest timed runs
+    min_seconds: Annotated[FiniteFloat, Field(ge=0)] = 0.5  # runs go on until they took this long together [s]
+    steps: Annotated[int, Field(ge=1)] = 10  # of the fluid, per timed run
+    check_most: Annotated[int, Field(ge=0)] = 40_000_000  # one device counts pairs, and runs the fluid, up to so many particles
+    virtual_devices: Annotated[int, Field(ge=0)] = 0  # of the CPU; 0: the devices that there are
     backend: Literal["auto", "warp", "jax"] = "auto"
 
     def specs(self) -> Iterator["Spec"]:
@@ -76,7 +61,7 @@ class Config(Table):
 
 
 @dataclass(frozen=True)
-class Spec:
+class Spec(Keyed):
     """What one row measures, and how: fields as in `Config`."""
 
     scaling: str
@@ -93,69 +78,31 @@ class Spec:
     check_most: int
     backend: str
 
-    @property
-    def key(self) -> str:
-        """Digest of all fields, 12 hex digits: a row with the same key need not run again."""
-        return digest(asdict(self))
 
+@dataclass(kw_only=True)
+class DeviceRow(TimedRow):
+    """One kind of work on a number of devices; times are of a list, a sum, or a step."""
 
-@dataclass
-class Row:
-    """One kind of work on a number of devices.
-
-    Attributes:
-        key, scaling, work, axes, devices, dtype: As in `Spec`.
-        status, reason: As in `experiments._rows.Row`.
-        particles: Of all devices.
-        fluid: Of these, those that are no wall; None but for "sph".
-        fullest: Of the fullest device.
-        halo: Particles that are sent to others, of all devices and messages, each time positions are exchanged.
-        halo_bytes: Their coordinates [bytes].
-        sent_bytes: What all devices send to others per run or step, padding, values and ids included, as compiled [bytes].
-        halo_s: What it takes to choose the halo; a list, and each update of the solver, begins with it [s].
-        migrate_s: What it takes to balance the load and to move particles, few after the first time; with a halo [s].
-        pairs: Neighbors of all particles together; None for "sph".
-        pairs_of_one: As one device counts them, up to `check_most` particles.
-        differing: Particles whose number of neighbors is another on one device; of a fluid those that are elsewhere after `steps`,
-            by more than a hundredth of a spacing, or were at any other place when it began.
-        first_s: First run, compilation included [s].
-        median_s, p10_s, p90_s: Of a list, a sum, or a step.
-        repeats: Timed runs.
-        busy: Of one run of a list or sum, of all `steps` of a fluid, what each GPU did (`_trace.Busy`); None on a CPU.
-        device, versions, machine, commit, dirty, time: As in `experiments._rows.Row`.
-    """
-
-    key: str
     scaling: str
     work: str
     axes: int
     devices: int
     dtype: str
-    status: str = "failed"
-    reason: str | None = None
-    particles: int | None = None
-    fluid: int | None = None
-    fullest: int | None = None
-    halo: int | None = None
-    halo_bytes: int | None = None
+    particles: int | None = None  # of all devices
+    fluid: int | None = None  # of these, those that are no wall; None but for "sph"
+    fullest: int | None = None  # of the fullest device
+    halo: int | None = None  # particles that are sent to others, of all devices and messages, each time positions are exchanged
+    halo_bytes: int | None = None  # their coordinates [bytes]
+    # What all devices send to others per run or step, padding, values and ids included, as compiled [bytes].
     sent_bytes: int | None = None
-    halo_s: float | None = None
-    migrate_s: float | None = None
-    pairs: int | None = None
-    pairs_of_one: int | None = None
+    halo_s: float | None = None  # to choose the halo, with which a list, and each update of the solver, begins [s]
+    migrate_s: float | None = None  # to balance the load and to move particles, few after the first time; with a halo [s]
+    pairs: int | None = None  # neighbors of all particles together; None for "sph"
+    pairs_of_one: int | None = None  # as one device counts them, up to `check_most` particles
+    # Particles whose number of neighbors is another on one device; of a fluid those that are elsewhere after `steps`, by more than
+    # a hundredth of a spacing, or were at any other place when it began.
     differing: int | None = None
-    first_s: float | None = None
-    median_s: float | None = None
-    p10_s: float | None = None
-    p90_s: float | None = None
-    repeats: int | None = None
-    busy: list[dict[str, Any]] | None = None
-    device: str | None = None
-    versions: dict[str, str | None] = field(default_factory=dict)
-    machine: dict[str, Any] = field(default_factory=dict)
-    commit: str | None = None
-    dirty: bool | None = None
-    time: str | None = None
+    busy: list[dict[str, Any]] | None = None  # in one run of a list or sum, all `steps` of a fluid: `trace.Busy` of each GPU
 
 
 def prepare(config: Config) -> None:
@@ -167,35 +114,32 @@ def prepare(config: Config) -> None:
         jax.config.update("jax_platforms", "cpu")
 
 
-def run(config: Config, folder: Path, retry_failed: bool = False) -> list[Row]:
+def command(
+    config: Annotated[Path, typer.Argument(help="Config of scaling over devices, TOML.")],
+    out: RowsFolder = None,
+    retry_failed: RetryFailed = False,
+) -> str:
+    """Time lists, sums and steps of a fluid on 1 to k devices, or go on with it; then print a table."""
+    given, folder = load(config, Config), take_folder(out or Path("out") / config.stem)
+    prepare(given)
+    return report(run(given, folder, retry_failed), folder)
+
+
+def run(config: Config, folder: Path, retry_failed: bool = False) -> list[DeviceRow]:
     """Measure all rows that are not there yet; they are added to rows.jsonl one by one."""
-    rows, specs = RowFile(folder, Row), list(config.specs())
-    with rows.locked():
-        rows.repair()
-        done = {row.key for row in rows.read() if not (retry_failed and row.status in RETRIED)}
-        left = [spec for spec in specs if spec.key not in done]
-        with _sweep.progress(len(left)) as shown:
-            bar = shown.add_task("", total=len(left))
-            for spec in left:
-                shown.update(bar, description=f"{spec.scaling} {spec.work} on {spec.devices}")
-                rows.append(_row(spec))
-                shown.advance(bar)
-    wanted = {spec.key for spec in specs}
-    return [row for row in rows.read() if row.key in wanted]
+    tasks = [Task((x.key,), f"{x.scaling} {x.work} on {x.devices}", lambda _, x=x: [_row(x)]) for x in config.specs()]
+    about = {"device": jax.devices()[0].device_kind, "versions": _machine.versions()}
+    return fill(RowFile(folder, DeviceRow), tasks, lambda row: row.reason, retry_failed=retry_failed, about=about)
 
 
-def _row(spec: Spec) -> Row:
-    row = Row(spec.key, spec.scaling, spec.work, spec.axes, spec.devices, spec.dtype)
-    row.device, row.versions, row.machine = jax.devices()[0].device_kind, _machine.versions(), _machine.machine()
-    row.commit, row.dirty = _machine.commit().values()
+def _row(spec: Spec) -> DeviceRow:
+    row = DeviceRow(key=spec.key, scaling=spec.scaling, work=spec.work, axes=spec.axes, devices=spec.devices, dtype=spec.dtype)
     if spec.devices > jax.device_count():
-        row.status, row.reason = "skipped", f"there are {jax.device_count()} devices"
-    else:
-        try:
-            (_sph if spec.work == "sph" else _search)(spec, row)
-        except Exception as error:
-            row.status, row.reason = "failed", f"{type(error).__name__}: {error}"[:500]
-    row.time = datetime.now(UTC).isoformat(timespec="seconds")
+        return replace(row, status="skipped", reason=f"there are {jax.device_count()} devices")
+    try:
+        (_sph if spec.work == "sph" else _search)(spec, row)
+    except Exception as error:
+        row.status, row.reason = "failed", f"{type(error).__name__}: {error}"[:500]
     return row
 
 
@@ -221,12 +165,12 @@ def _weight(r: Array, i: Any, j: Any) -> Array:  # noqa: ANN401
     return j["m"] * jnp.maximum(1 - (r @ r) / 9, 0) ** 3
 
 
-def _search(spec: Spec, row: Row) -> None:
+def _search(spec: Spec, row: DeviceRow) -> None:
     x, cutoff, backend = lattice(spec), spec.cutoff_ratio, spec.backend
     particles = distributed.scatter(x, cutoff, {"m": np.ones(len(x), x.dtype)}, mesh=mesh_of(spec.devices, spec.axes))
     _describe(particles, spec, row)
     counts = distributed.count(particles, cutoff, backend=backend)
-    row.pairs = int(fetched(counts).sum(dtype=np.int64))
+    row.pairs = int(np.asarray(counts).sum(dtype=np.int64))
     if spec.work == "list":
         capacity = -(-int(jnp.max(counts)) // 8) * 8
         work = jax.jit(lambda p: distributed.search(p, cutoff, capacity=capacity, backend=backend))
@@ -235,7 +179,7 @@ def _search(spec: Spec, row: Row) -> None:
     _time(work, particles, 1, spec, row)
     row.status = "ok"
     if len(x) <= spec.check_most:
-        ids, ours = fetched(particles.ids), fetched(counts)
+        ids, ours = np.asarray(particles.ids), np.asarray(counts)
         one = np.asarray(jfrnn.count(jnp.asarray(x), cutoff, backend=backend))
         row.pairs_of_one = int(one.sum(dtype=np.int64))
         there = ids >= 0
@@ -244,7 +188,7 @@ def _search(spec: Spec, row: Row) -> None:
             row.status, row.reason = "failed", "neighbors differ from those of one device"
 
 
-def _sph(spec: Spec, row: Row) -> None:
+def _sph(spec: Spec, row: DeviceRow) -> None:
     from experiments.sph import spread
     from experiments.sph.model import make_model, make_state
     from experiments.sph.settings import make_scene
@@ -278,11 +222,11 @@ def _elsewhere(far: float, one: np.ndarray | distributed.Particles, other: distr
     return int((~(np.abs(x - y) <= far)).any(axis=1).sum())
 
 
-def _describe(particles: distributed.Particles, spec: Spec, row: Row) -> None:
+def _describe(particles: distributed.Particles, spec: Spec, row: DeviceRow) -> None:
     """Say how many particles there are, on the fullest device, and in halos, and what halos and migration take."""
     halo = distributed.halo(particles)
     row.particles, row.halo = particles.total, int(halo.sent)
-    row.fullest = int(fetched(particles.active).reshape(row.devices, -1).sum(axis=1).max())
+    row.fullest = int(np.asarray(particles.active).reshape(row.devices, -1).sum(axis=1).max())
     row.halo_bytes = row.halo * particles.dim * particles.positions.dtype.itemsize
     row.halo_s = _repeated(lambda: distributed.halo(particles), spec)["median_s"]
     settled = distributed.migrate(particles)
@@ -294,7 +238,7 @@ def _repeated(call: Callable[[], Any], spec: Spec) -> dict[str, Any]:
     return _measure.summarize(seconds)
 
 
-def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: Row, compiled: Any = None) -> None:  # noqa: ANN401
+def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: DeviceRow, compiled: Any = None) -> None:  # noqa: ANN401
     """Time calls of compiled work, and add up what it sends."""
     arguments = (given,) if compiled is None else (given, spec.steps)
     program: Any = compiled or work
@@ -304,7 +248,7 @@ def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: Row
     timed = _repeated(lambda: work(given), spec)
     row.median_s, row.p10_s, row.p90_s = (timed[name] / per for name in ("median_s", "p10_s", "p90_s"))
     row.repeats = timed["repeats"]
-    row.busy = [device._asdict() for device in _trace.of_run(lambda: work(given))] or None
+    row.busy = [device._asdict() for device in trace.of_run(lambda: work(given))] or None
 
 
 def sent_bytes(program: str) -> int:
@@ -321,7 +265,7 @@ def sent_bytes(program: str) -> int:
     return total
 
 
-def report(rows: list[Row], folder: Path) -> str:
+def report(rows: list[DeviceRow], folder: Path) -> str:
     """Return the table of a run, and write it beside the rows: efficiency is a device's particles per second over one alone."""
     table = pd.DataFrame([asdict(row) for row in rows])
     rates = [None if not row.median_s or not row.particles else row.particles / row.median_s / row.devices for row in rows]

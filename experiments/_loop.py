@@ -1,0 +1,125 @@
+"""The loop of everything that measures: what is there is not measured again, and each row is on disk before the next one starts."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
+from datetime import UTC, datetime
+from typing import Any, Generic
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from experiments import _machine
+from experiments._rows import RETRIED, RowFile, RowT
+
+
+class Shown:
+    """What the user sees while it runs: a bar with a label, and lines above it."""
+
+    def __init__(self, progress: Progress, total: int, completed: int = 0) -> None:
+        """Begin the bar."""
+        self._progress, self._bar = progress, progress.add_task("", total=total, completed=completed)
+
+    def label(self, text: str) -> None:
+        """Say beside the bar what is going on."""
+        self._progress.update(self._bar, description=text)
+
+    def say(self, text: str) -> None:
+        """Print a line above the bar."""
+        self._progress.console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    def advance(self, count: int = 1) -> None:
+        """Move the bar."""
+        self._progress.advance(self._bar, count)
+
+
+@contextmanager
+def show(total: int, completed: int = 0) -> Iterator[Shown]:
+    """Show a bar on stderr."""
+    columns = (BarColumn(16), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True, force_jupyter=False), disable=total == 0) as progress:
+        yield Shown(progress, total, completed)
+
+
+@dataclass(frozen=True)
+class Task(Generic[RowT]):
+    """Rows that are measured together.
+
+    Attributes:
+        keys: Of the rows that there have to be; where one is missing, all are measured again.
+        label: What is shown meanwhile.
+        measure: Makes the rows; they may be more than there are keys.
+        stale: Whether a row that is there has to be measured again.
+    """
+
+    keys: tuple[str, ...]
+    label: str
+    measure: Callable[[Shown], Iterable[RowT]]
+    stale: Callable[[RowT], bool] = lambda row: False
+
+
+def fill(
+    file: RowFile[RowT],
+    tasks: Sequence[Task[RowT]],
+    describe: Callable[[RowT], str | None],
+    *,
+    retry_failed: bool = False,
+    about: dict[str, Any] | None = None,
+    begin: Callable[[list[Task[RowT]], list[RowT], Shown], None] | None = None,
+) -> list[RowT]:
+    """Measure what a file does not hold yet, and return the rows of all tasks.
+
+    Args:
+        file: Gets each row as it comes, with machine, commit and time.
+        tasks: What is measured, in this order.
+        describe: Returns a row as a line for the reader; None: nothing is said.
+        retry_failed: Whether rows that are missing, failed or ran out of time are measured again.
+        about: What else all new rows say, as far as they do not say it themselves.
+        begin: Is told what is left to measure, and which rows are there.
+
+    Raises:
+        UsageError: Another process fills this file, or a line of it is no row.
+    """
+    with file.locked():
+        file.repair()
+        there = {_column(row, "key"): row for row in file.read() if not (retry_failed and _column(row, "status") in RETRIED)}
+        left = [task for task in tasks if any(key not in there or task.stale(there[key]) for key in task.keys)]
+        total, missing = (sum(len(task.keys) for task in some) for some in (tasks, left))
+        told = {"machine": _machine.machine(), **_machine.commit(), **(about or {})} if left else {}
+        with show(total, total - missing) as shown:
+            if begin is not None:
+                begin(left, list(there.values()), shown)
+            for task in left:
+                shown.label(task.label)
+                for row in task.measure(shown):
+                    stamped = _stamp(row, told)
+                    file.append(stamped)
+                    if (line := describe(stamped)) is not None:
+                        shown.say(line)
+                shown.advance(len(task.keys))
+        place = {key: number for number, key in enumerate(key for task in tasks for key in task.keys)}
+        rows = [(place.get(str(_column(row, "key")).partition("/")[0]), row) for row in file.read()]
+        return [row for number, row in sorted(((n, r) for n, r in rows if n is not None), key=lambda pair: pair[0])]
+
+
+def in_parts(key: str, rows: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Yield rows as they come, with keys: the last one has the key of the whole, which is done only when that one is there."""
+    previous = None
+    for number, row in enumerate(rows):
+        if previous is not None:
+            yield {"key": f"{key}/{number}"} | previous
+        previous = row
+    if previous is not None:
+        yield {"key": key} | previous
+
+
+def _column(row: Any, name: str) -> Any:  # noqa: ANN401
+    return row.get(name) if isinstance(row, dict) else getattr(row, name)
+
+
+def _stamp(row: Any, about: dict[str, Any]) -> Any:  # noqa: ANN401
+    about = about | {"time": datetime.now(UTC).isoformat(timespec="seconds")}
+    if isinstance(row, dict):
+        return row | {name: value for name, value in about.items() if name not in row}
+    known = {item.name for item in fields(row)}
+    return replace(row, **{name: value for name, value in about.items() if name in known and not getattr(row, name)})
