@@ -28,6 +28,10 @@ from jfrnn._geometry import Cutoff, checked_capacity, checked_cutoff, checked_ki
 from jfrnn._sums import pair_sum
 from jfrnn._triangles import TRIANGLE_BACKENDS, fastest_of, find_triangles
 
+Device = Any  # jax.Device, which type checkers take for a variable
+Tree = Any  # a pytree of arrays, or of their shapes
+MemoryStats = Any  # what XLA reports of a compiled program
+
 
 @dataclasses.dataclass(frozen=True)
 class MemoryPlan:
@@ -74,11 +78,11 @@ def memory_plan(
     capacity: int | None = None,
     *,
     dim: int = 3,
-    dtype: Any = np.float32,  # noqa: ANN401
+    dtype: np.dtype | type | str = np.float32,
     queries: int | None = None,
     skin: float = 0.0,
     fn: Callable[[Any, Any, Any], Any] | None = None,
-    values: Any = None,  # noqa: ANN401
+    values: Tree = None,
     gradient: bool = False,
     faces: int | None = None,
     backend: str = "auto",
@@ -159,7 +163,7 @@ def memory_plan(
     return MemoryPlan(4 * rows * (capacity + 1) + 8 + kept, scratch, chosen.name)
 
 
-def _device_of(platform: str) -> Any:  # noqa: ANN401
+def _device_of(platform: str) -> Device:
     try:
         return jax.local_devices(backend=platform)[0]
     except RuntimeError as error:
@@ -177,7 +181,9 @@ def _compiled_scratch(points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff,
     return int(_analysis(lowered).temp_size_in_bytes)
 
 
-def _plan_of_triangles(sizes: tuple[int, int, int, int], dtype: np.dtype, cutoff: Cutoff, engine: str, device: Any) -> MemoryPlan:  # noqa: ANN401
+def _plan_of_triangles(
+    sizes: tuple[int, int, int, int], dtype: np.dtype, cutoff: Cutoff, engine: str, device: Device
+) -> MemoryPlan:
     """Compile a search of n particles for faces, in dim dimensions, with this capacity."""
     n, faces, dim, capacity = sizes
     at = SingleDeviceSharding(device)
@@ -192,7 +198,7 @@ def _plan_of_triangles(sizes: tuple[int, int, int, int], dtype: np.dtype, cutoff
     return MemoryPlan(int(analysis.output_size_in_bytes) + closed, int(analysis.temp_size_in_bytes), engine)
 
 
-def _analysis(lowered: Any) -> Any:  # noqa: ANN401
+def _analysis(lowered: jax.stages.Lowered) -> MemoryStats:
     analysis = lowered.compile().memory_analysis()
     if analysis is None:
         raise RuntimeError("the compiler of this platform does not say what memory a program takes: plan another backend.")
@@ -203,15 +209,15 @@ def _plan_of_sum(
     fn: Callable[[Any, Any, Any], Any],
     points: list[jax.ShapeDtypeStruct | None],
     cutoff: float,
-    values: Any,  # noqa: ANN401
+    values: Tree,
     gradient: bool,
     engine: str,
-    device: Any,  # noqa: ANN401
+    device: Device,
 ) -> MemoryPlan:
     """Compile a pair sum for sources and queries of these shapes, with the engine that "auto" stands for."""
 
-    def program(x: Array, queries: Array | None, values: Any, *, backend: str) -> Any:  # noqa: ANN401
-        def loss(x: Array) -> Any:  # noqa: ANN401
+    def program(x: Array, queries: Array | None, values: Tree, *, backend: str) -> Tree:
+        def loss(x: Array) -> Tree:
             sums = pair_sum(fn, x, cutoff, values, queries=queries, backend=backend)
             floats = (leaf for leaf in jax.tree.leaves(sums) if jnp.issubdtype(leaf.dtype, jnp.floating))
             return sum(jnp.vdot(leaf, leaf) for leaf in floats), sums

@@ -2,7 +2,6 @@
 
 import functools
 import warnings
-from typing import Any
 
 import jax
 from jax import Array
@@ -30,10 +29,10 @@ ENGINES: dict[str, Engine] = {
 _WARP_FROM = {"cpu": 0, "gpu": 0}
 
 
-def checked_backend(backend: Any) -> str:  # noqa: ANN401
+def checked_backend(backend: object) -> str:
     """Return the name of a backend."""
     names = ("auto", *ENGINES)
-    if backend not in names:
+    if not isinstance(backend, str) or backend not in names:
         raise ValueError(f"backend must be one of {', '.join(map(repr, names))}, got {backend!r}.")
     return backend
 

@@ -8,19 +8,19 @@ import sys
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
 
-from jfrnn._engine.start import kernels_of, load_warp
+from jfrnn._engine.start import WarpKernel, WarpModule, kernels_of, load_warp
 
 PLACES_PER_THREAD = 2048  # below, a second thread costs more than it saves
 _HUGE = 1 << 22  # bytes from which a buffer is worth a request for huge pages
 
 
-def on_one_core(kernel: Any, inputs: list[Any]) -> None:  # noqa: ANN401
+def on_one_core(kernel: WarpKernel, inputs: list[Any]) -> None:
     """Launch a kernel once on the CPU."""
     load_on_cpu(kernel.module)
     load_warp().launch(kernel, dim=1, inputs=inputs, device="cpu")
 
 
-def on_every_core(kernel: Any, inputs: list[Any], most: int) -> None:  # noqa: ANN401
+def on_every_core(kernel: WarpKernel, inputs: list[Any], most: int) -> None:
     """Launch a kernel once per core, at most `most` times; a launch releases the interpreter's lock while it runs."""
     launch = functools.partial(on_one_core, kernel, inputs)
     if most <= 1:
@@ -40,7 +40,7 @@ def on_every_core(kernel: Any, inputs: list[Any], most: int) -> None:  # noqa: A
 
 
 @functools.cache
-def load_on_cpu(module: Any) -> None:  # noqa: ANN401
+def load_on_cpu(module: WarpModule) -> None:
     """Compile a module before several threads launch from it, and always in the same one: each has its own precompiled headers."""
     load = functools.partial(kernels_of("_load").load_module, module, "cpu")
     try:

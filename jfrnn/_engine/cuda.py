@@ -9,9 +9,11 @@ import functools
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import Any, NamedTuple
 
 from jfrnn._engine.ffi import Buffer, CallFrame
+from jfrnn._engine.start import WarpDevice, WarpStream
 
 _SOON = 16  # calls with other addresses, within which the same ones must come back to be worth a graph
 _GRAPHS = 32  # that are kept per function: more than can come back so soon
@@ -45,7 +47,7 @@ class _Recorded(NamedTuple):
     beside: list[bool]
     addresses: list[tuple[Any, int]]
 
-    def launch(self, stream: Any, side: Any = None) -> None:  # noqa: ANN401
+    def launch(self, stream: WarpStream, side: WarpStream = None) -> None:
         """Launch all in order; those that may run beside others do, if there is a stream for them."""
         for k, launch in enumerate(self.launches):
             if side is None or not self.beside[k]:
@@ -64,7 +66,7 @@ class _Calls:
     devices, and what waits for a stream that is being recorded is recorded, too.
     """
 
-    def __init__(self, wp: Any, stream: _Stream, dtypes: Sequence[Any], commands: Callable[..., list[Command]]) -> None:  # noqa: ANN401
+    def __init__(self, wp: ModuleType, stream: _Stream, dtypes: Sequence[Any], commands: Callable[..., list[Command]]) -> None:
         self._wp, self._stream, self._dtypes, self._commands = wp, stream, dtypes, commands
         self._recorded: dict[tuple[int, ...], _Recorded] = {}
         self._recent: OrderedDict[tuple[int, ...], None] = OrderedDict()
@@ -106,11 +108,11 @@ class _Calls:
 
 
 @functools.cache
-def _recording_streams(wp: Any, device: str) -> tuple[Any, Any]:  # noqa: ANN401
+def _recording_streams(wp: ModuleType, device: str) -> tuple[WarpStream, WarpStream]:
     return wp.Stream(device), wp.Stream(device)
 
 
-def serve(wp: Any, dtypes: Sequence[Any], commands: Callable[..., list[Command]]) -> Callable[[CallFrame], None]:  # noqa: ANN401
+def serve(wp: ModuleType, dtypes: Sequence[Any], commands: Callable[..., list[Command]]) -> Callable[[CallFrame], None]:
     """Return what launches kernels when XLA calls, on CUDA.
 
     Args:
@@ -132,8 +134,8 @@ def serve(wp: Any, dtypes: Sequence[Any], commands: Callable[..., list[Command]]
 
 
 def _record(
-    wp: Any,  # noqa: ANN401
-    device: Any,  # noqa: ANN401
+    wp: ModuleType,
+    device: WarpDevice,
     buffers: list[Buffer],
     dtypes: Sequence[Any],
     commands: Callable[..., list[Command]],

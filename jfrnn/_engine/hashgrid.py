@@ -13,9 +13,11 @@ from jfrnn._engine.cores import load_on_cpu
 from jfrnn._engine.launch import Kernel, kernel
 from jfrnn._engine.problem import Kind, Options, Rows, Search
 from jfrnn._engine.serving import on_cpu, on_stream
-from jfrnn._engine.start import INSTALL, kernels_of, load_warp
+from jfrnn._engine.start import INSTALL, WarpArray, kernels_of, load_warp
 from jfrnn._engine.warp import Arrays, Variant, array_types, call_kernels, check_platform, missing, name_arrays, name_of_call
 from jfrnn._geometry import Cutoff, make_cutoff
+
+HashGrid = Any  # wp.HashGrid, whose type cannot be named before Warp is imported
 
 
 @dataclasses.dataclass(frozen=True)  # all are one
@@ -51,7 +53,7 @@ class HashGridEngine:
             raise TypeError("the backend 'hashgrid' needs a cutoff that is known while tracing.")
 
         def on(cuda: bool) -> Callable[[Search], Rows]:
-            def make(variant: Variant) -> Any:  # noqa: ANN401
+            def make(variant: Variant) -> Callable[..., Any]:
                 return _hashgrid_callable(variant, radius, cuda)
 
             return functools.partial(call_kernels, "hashgrid", make, keep=options.filter, capacity=capacity)
@@ -75,7 +77,7 @@ def _hashgrid_callable(variant: Variant, radius: float, cuda: bool) -> Kernel:
     bounds = make_cutoff(radius, np.dtype(np.float64 if variant.double else np.float32), variant.closed)
     types, name = array_types(variant), name_of_call("hashgrid_cuda" if cuda else "hashgrid_cpu", variant)
 
-    def run(*arrays: Any) -> None:  # noqa: ANN401
+    def run(*arrays: WarpArray) -> None:
         _run_hashgrid(bounds, variant, name_arrays(types, arrays))
 
     return (on_stream if cuda else on_cpu)(f"{name}_{radius.hex()}", run, types, 3 + variant.lists)
@@ -102,7 +104,7 @@ def _run_hashgrid(bounds: Cutoff, variant: Variant, arrays: Arrays) -> None:
 
 
 @functools.cache
-def _hash_grid(device: str, shape: tuple[int, int, int], double: bool) -> Any:  # noqa: ANN401
+def _hash_grid(device: str, shape: tuple[int, int, int], double: bool) -> HashGrid:
     """Keep one grid per device and shape: launches on a device run one after the other."""
     wp = load_warp()
     return wp.HashGrid(*shape, device=device, dtype=wp.float64 if double else wp.float32)

@@ -18,6 +18,7 @@ import importlib
 import json
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from importlib.abc import Traversable
 from importlib.resources import files
 from typing import Any, NamedTuple
 
@@ -30,6 +31,8 @@ from jfrnn._engine.start import apart, kernels_of, load_warp
 
 TARGET = "jfrnn"  # what programs call; jax.export wants to be told that it stays
 Serve = Callable[[CallFrame], None]
+Static = Any  # what a kernel is made of, and a program carries: NamedTuples of the library, tuples, texts, numbers
+CFunction = Any  # a function that ctypes can call, or that can be called from C
 
 
 class Kernel(NamedTuple):
@@ -55,7 +58,7 @@ def kernel(make: Callable[..., Kernel]) -> Callable[..., Callable[..., Any]]:
     place = f"{make.__module__}.{make.__name__}"
 
     @functools.wraps(make)
-    def made(*arguments: Any) -> Callable[..., Any]:  # noqa: ANN401
+    def made(*arguments: Static) -> Callable[..., Any]:
         return apart(functools.partial(_made, make, place, arguments))
 
     _makers[place] = made
@@ -87,7 +90,7 @@ def _call(found: Kernel, name: str, recipe: str, *inputs: Array, output_dims: di
     return jax.ffi.ffi_call(TARGET, shapes, vmap_method="sequential")(*inputs, kernel=name, recipe=recipe)
 
 
-def _shape(dims: Any) -> tuple[int, ...]:  # noqa: ANN401
+def _shape(dims: int | tuple[int, ...]) -> tuple[int, ...]:
     return dims if isinstance(dims, tuple) else (dims,)
 
 
@@ -105,14 +108,14 @@ def _varying(inputs: Sequence[Array]) -> dict[str, Any]:
 # --- what a program carries -------------------------------------------------------------------------------------------
 
 
-def _encoded(value: Any) -> Any:  # noqa: ANN401
+def _encoded(value: Static) -> Static:
     if not isinstance(value, tuple):
         return value
     parts = [_encoded(part) for part in value]
     return {f"{type(value).__module__}.{type(value).__name__}": parts} if hasattr(value, "_fields") else parts
 
 
-def _decoded(value: Any) -> Any:  # noqa: ANN401
+def _decoded(value: Static) -> Static:
     if isinstance(value, list):
         return tuple(_decoded(part) for part in value)
     if not isinstance(value, dict):
@@ -131,7 +134,7 @@ def _sources() -> str:
     return hashlib.sha256(b"".join(texts)).hexdigest()[:12]
 
 
-def _files(folder: Any) -> Iterator[Any]:  # noqa: ANN401
+def _files(folder: Traversable) -> Iterator[Traversable]:
     """Yield the sources in a folder and below it; packages that are installed beneath the library are asked for by themselves."""
     for path in sorted(folder.iterdir(), key=lambda path: path.name):
         if path.is_dir() and path.name not in ("cases", "kernels"):
@@ -266,7 +269,7 @@ def _relay() -> list[Any]:
     return [int(address[0]), here, words, given]
 
 
-def _address(function: Any) -> int:  # noqa: ANN401
+def _address(function: CFunction) -> int:
     return ctypes.cast(function, ctypes.c_void_p).value or 0
 
 

@@ -13,8 +13,8 @@ from jfrnn._engine.launch import Kernel, kernel
 from jfrnn._engine.operands import lattice_numbers, particle_rows, periodic_kind, space_flags
 from jfrnn._engine.problem import Filter, Rows, Search
 from jfrnn._engine.serving import on_cpu, on_cuda
-from jfrnn._engine.start import kernels_of, load_warp
-from jfrnn._engine.sum_results import SumsOf
+from jfrnn._engine.start import WarpArray, WarpKernel, kernels_of, load_warp
+from jfrnn._engine.sum_results import SumsOf, TermText
 from jfrnn._geometry import GROUPS, HALVINGS, Levels
 
 
@@ -55,7 +55,7 @@ def level_sums(
     search: Search,
     levels: Levels,
     keep: Filter,
-    term: Any,  # noqa: ANN401
+    term: TermText,
     key: str,
     values: tuple[Array, Array, Array],
     compensated: bool,
@@ -159,7 +159,7 @@ def _sum_callable(variant: _LevelVariant, results: SumsOf, key: str) -> Kernel:
     types |= {"sums": rows, "totals": reals, "errors": reals, "info": wp.array(dtype=wp.int32)}
     kind = {"compensated": results.compensated, "extremes": results.extremes}
 
-    def run(*arrays: Any) -> None:  # noqa: ANN401
+    def run(*arrays: WarpArray) -> None:
         of_search = variant.dim, variant.double, variant.rule, GROUPS, HALVINGS, results.compensated, variant.periodic
         make = kernels_of("pair_sum_levels").query_kernel
         query = make(results.term, key, *of_search, variant.batched, results.extremes)
@@ -171,7 +171,7 @@ def _sum_callable(variant: _LevelVariant, results: SumsOf, key: str) -> Kernel:
     return on_cpu(_name("pair_sum_levels_cpu", variant, **kind, **{key: True}), run, types, 4)
 
 
-def _level_kernel(variant: _LevelVariant) -> Any:  # noqa: ANN401
+def _level_kernel(variant: _LevelVariant) -> WarpKernel:
     kind = (variant.dim, variant.double, variant.lists, variant.rule, GROUPS, HALVINGS, variant.periodic, variant.batched)
     return kernels_of("levels").query_kernel(*kind)
 
@@ -186,13 +186,13 @@ def _level_arguments(variant: _LevelVariant, arrays: Sequence[Any]) -> list[Any]
     return [*inputs, count, info, n, m, capacity, *flags]
 
 
-def _run_levels_on_cpu(variant: _LevelVariant, *arrays: Any) -> None:  # noqa: ANN401
+def _run_levels_on_cpu(variant: _LevelVariant, *arrays: WarpArray) -> None:
     arrays[-1].zero_()
     places = len(arrays[-2])
     on_every_core(_level_kernel(variant), _level_arguments(variant, arrays), -(-places // PLACES_PER_THREAD))
 
 
-def _level_commands(variant: _LevelVariant, *arrays: Any) -> list[Command]:  # noqa: ANN401
+def _level_commands(variant: _LevelVariant, *arrays: WarpArray) -> list[Command]:
     levels, (*_, count, info) = kernels_of("levels"), arrays
     query = Command(_level_kernel(variant), _level_arguments(variant, arrays), len(count), levels.BLOCK)
     return [Command(levels.clear, [info], 2, 2), query]

@@ -32,6 +32,7 @@ Runs = Callable[[Array, Array], tuple[Array, Array, Array | None]]
 
 
 State = TypeVar("State")
+Carry = Any  # what a loop over pairs carries
 
 
 class Points(NamedTuple):
@@ -198,8 +199,8 @@ def fold_neighbors(
         place, ids = engine.block(b)
         fresh = place >= b * engine.block_size
 
-        def fold(add: Callable[[Slots, Any], Any], state: Any) -> Any:  # noqa: ANN401
-            def add_pass(which: Array, state: Any) -> Any:  # noqa: ANN401
+        def fold(add: Callable[[Slots, Carry], Carry], state: Carry) -> Carry:
+            def add_pass(which: Array, state: Carry) -> Carry:
                 table = engine.word_table(place, which)
 
                 def add_chunk(state: tuple[Array, Any]) -> tuple[Array, Any]:

@@ -2,13 +2,14 @@
 
 import threading
 from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import Any
 
 from jfrnn._engine.cuda import Command
 from jfrnn._engine.cuda import serve as serve_on_cuda
 from jfrnn._engine.ffi import CallFrame
 from jfrnn._engine.launch import Kernel
-from jfrnn._engine.start import load_warp
+from jfrnn._engine.start import WarpArray, WarpDevice, load_warp
 
 _one_at_a_time = threading.Lock()  # is served: on the CPU it takes all cores, and a hash grid is kept for all
 
@@ -46,6 +47,6 @@ def on_stream(name: str, run: Callable[..., None], types: dict[str, Any], output
     return Kernel(name, types, outputs, serve)
 
 
-def _arrays(wp: Any, frame: CallFrame, dtypes: Sequence[Any], device: Any) -> list[Any]:  # noqa: ANN401
+def _arrays(wp: ModuleType, frame: CallFrame, dtypes: Sequence[Any], device: WarpDevice) -> list[WarpArray]:
     buffers = zip(frame.buffers(), dtypes, strict=True)
     return [wp.array(ptr=x.data, shape=x.shape, dtype=dtype, device=device) for x, dtype in buffers]

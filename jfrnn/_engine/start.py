@@ -11,15 +11,19 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeVar
 
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 _LINUX = sys.platform == "linux"
+Result = TypeVar("Result")
+# Objects of Warp, whose types cannot be named before it is imported.
+WarpArray = WarpKernel = WarpModule = WarpStream = WarpDevice = Any
 INSTALL = "pip install 'warp-lang==1.19.*'"
 
 
 @functools.cache
-def load_warp() -> Any:  # noqa: ANN401
+def load_warp() -> ModuleType:
     """Import Warp and start it, without a word of its own.
 
     Warns once where it takes a temporary folder for its kernels.
@@ -52,7 +56,7 @@ def _load_warp() -> tuple[Any, str | None]:
             warp.config.log_level = level
 
 
-def _init(warp: Any) -> str | None:  # noqa: ANN401
+def _init(warp: ModuleType) -> str | None:
     given, warning = warp.config.kernel_cache_dir, None
     try:
         try:
@@ -90,18 +94,18 @@ def _without_a_word_of_drivers() -> Iterator[None]:
             os.write(2, b"".join(lines))
 
 
-def kernels_of(name: str) -> Any:  # noqa: ANN401
+def kernels_of(name: str) -> ModuleType:
     """Return a module of jfrnn.kernels, which imports Warp."""
     return sys.modules.get(f"jfrnn.kernels.{name}") or _import_kernels(name)
 
 
 @functools.cache
-def _import_kernels(name: str) -> Any:  # noqa: ANN401
+def _import_kernels(name: str) -> ModuleType:
     load_warp()
     return apart(functools.partial(importlib.import_module, f"jfrnn.kernels.{name}"))
 
 
-def apart(work: Callable[[], Any]) -> Any:  # noqa: ANN401
+def apart(work: Callable[[], Result]) -> Result:
     """Do work that must not stop midway where no handler of a signal runs, in another thread than the main one, and wait for it."""
     if threading.current_thread() is not threading.main_thread():
         return work()

@@ -8,11 +8,13 @@ from jax import Array, lax
 from jfrnn._engine.operands import as_integer
 from jfrnn._geometry import compensated_sum, rounded_sum
 
+TermText = Any  # jfrnn.kernels.pair_sum_cpu.TermText, a term in native text
+
 
 class SumsOf(NamedTuple):
     """The results of a kernel that sums a term: for each of `rows` queries, and over all pairs in `slots` parts."""
 
-    term: Any
+    term: TermText
     rows: int
     slots: int
     compensated: bool

@@ -15,10 +15,12 @@ from jfrnn._engine.levels_warp import level_sums
 from jfrnn._engine.operands import pack_particles, periodic_kind, space_flags
 from jfrnn._engine.problem import Filter, Search
 from jfrnn._engine.serving import on_cpu, on_cuda
-from jfrnn._engine.start import kernels_of, load_warp
-from jfrnn._engine.sum_results import SumsOf
+from jfrnn._engine.start import WarpArray, WarpKernel, kernels_of, load_warp
+from jfrnn._engine.sum_results import SumsOf, TermText
 from jfrnn._engine.warp import sort_on_cpu
 from jfrnn._geometry import Cutoffs
+
+CellKernels = Any  # the kernels of a variant, of jfrnn.kernels
 
 
 class _SumVariant(NamedTuple):
@@ -41,7 +43,7 @@ class _SumVariant(NamedTuple):
 def pair_sums(
     search: Search,
     keep: Filter,
-    term: Any,  # noqa: ANN401
+    term: TermText,
     key: str,
     values: tuple[Array, Array, Array],
     compensated: bool,
@@ -71,7 +73,7 @@ def pair_sums(
 
 def _call_sums(
     variant: _SumVariant,
-    term: Any,  # noqa: ANN401
+    term: TermText,
     particles: tuple[Array, Array, Array],
     values: tuple[Array, Array, Array],
 ) -> tuple[Array, Array, Array]:
@@ -97,7 +99,7 @@ def _module_of(variant: _SumVariant) -> str:
 
 
 @kernel
-def _sum_callable(variant: _SumVariant, term: Any) -> Kernel:  # noqa: ANN401
+def _sum_callable(variant: _SumVariant, term: TermText) -> Kernel:
     wp = load_warp()
     scalar = wp.float64 if variant.double else wp.float32
     rows, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
@@ -136,12 +138,12 @@ def _sorting_callable(variant: _SumVariant) -> Kernel:
     return on_cuda(_name_of_sum("sorting_cuda", variant), types, 2, functools.partial(_sorting_commands, variant))
 
 
-def _stages_on_cuda(variant: _SumVariant) -> Any:  # noqa: ANN401
+def _stages_on_cuda(variant: _SumVariant) -> CellKernels:
     kind = {"periodic": variant.periodic, "batched": variant.batched}
     return kernels_of("cells_cuda").cell_kernels(variant.dim, variant.double, variant.scaled, False, **kind)
 
 
-def _sorting_commands(variant: _SumVariant, *arrays: Any) -> list[Command]:  # noqa: ANN401
+def _sorting_commands(variant: _SumVariant, *arrays: WarpArray) -> list[Command]:
     positions, queries, cutoff, info, scratch = arrays
     n, m = positions.shape[0], queries.shape[0]
     # what sorts particles takes the arguments of a search that only counts
@@ -153,7 +155,7 @@ def _sorting_commands(variant: _SumVariant, *arrays: Any) -> list[Command]:  # n
 
 
 @functools.cache
-def _sum_kernels_on_cpu(variant: _SumVariant, term: Any) -> tuple[Any, Any, Any]:  # noqa: ANN401
+def _sum_kernels_on_cpu(variant: _SumVariant, term: TermText) -> tuple[CellKernels, WarpKernel, WarpKernel]:
     """Return the kernels that sort particles, sort values, and sum."""
     sums = kernels_of("pair_sum_cpu")
     dim, double, scaled = variant[:3]
@@ -163,7 +165,7 @@ def _sum_kernels_on_cpu(variant: _SumVariant, term: Any) -> tuple[Any, Any, Any]
     return cells, sums.sort_kernel(dim, double), query
 
 
-def _run_sums_on_cpu(variant: _SumVariant, term: Any, *arrays: Any) -> None:  # noqa: ANN401
+def _run_sums_on_cpu(variant: _SumVariant, term: TermText, *arrays: WarpArray) -> None:
     cells, sort_values, query = _sum_kernels_on_cpu(variant, term)
     positions, queries, cutoff, shared, own, others, sums, totals, errors, columns, info, scratch = arrays
     n, m = positions.shape[0], queries.shape[0]
@@ -177,14 +179,14 @@ def _run_sums_on_cpu(variant: _SumVariant, term: Any, *arrays: Any) -> None:  # 
     on_every_core(query, arguments, -(-m // PLACES_PER_THREAD))
 
 
-def _sum_kernels_on_cuda(variant: _SumVariant, term: Any) -> Any:  # noqa: ANN401
+def _sum_kernels_on_cuda(variant: _SumVariant, term: TermText) -> CellKernels:
     dim, double, scaled = variant[:3]
     make = kernels_of("pair_sum_cuda").sum_kernels
     kind = {"periodic": variant.periodic, "batched": variant.batched, "extremes": variant.extremes}
     return make(term, variant.key, dim, double, scaled, variant.compensated, **kind)
 
 
-def _sum_commands(variant: _SumVariant, term: Any, *arrays: Any) -> list[Command]:  # noqa: ANN401
+def _sum_commands(variant: _SumVariant, term: TermText, *arrays: WarpArray) -> list[Command]:
     *given, info, scratch, sums, totals, errors, columns = arrays
     n, m = given[0].shape[0], given[1].shape[0]
     sizes = [n, m, int(variant.own), kernels_of("_native").table_cells(n)]

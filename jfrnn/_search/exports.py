@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +35,7 @@ class DenseNeighbors:
         return (self.status & Status.ROW_OVERFLOW.value) != 0
 
 
-def checked_total(total: Any) -> int:  # noqa: ANN401
+def checked_total(total: object) -> int:
     """Return a static number of pairs that int32 offsets can number."""
     if isinstance(total, bool) or not isinstance(total, int | np.integer):
         raise TypeError(f"total must be a static int, the length of the arrays, got {type(total).__name__} {total!r}.")

@@ -34,7 +34,7 @@ from jfrnn._geometry import (
 )
 from jfrnn._search.exports import DenseNeighbors, checked_total, flat_pairs, pair_total
 from jfrnn._search.geometry import ImageCodes, ImagesMade, lattice_shifts, norms, open_vectors, periodic_vectors
-from jfrnn._search.problem import Problem
+from jfrnn._search.problem import Given, Problem
 from jfrnn._search.verlet import Verlet, first_verlet, moved_too_far
 from jfrnn._tracing import at_once, call_apart, compiled, own_transfers
 
@@ -503,7 +503,7 @@ class NeighborList:
             raise ValueError(f"this list was made {state}.")
         return None if active is None else checked_active(active, sources)
 
-    def _radii_now(self, cutoff: Any, sources: Array, queries: Array | None) -> Radii | None:  # noqa: ANN401
+    def _radii_now(self, cutoff: Given, sources: Array, queries: Array | None) -> Radii | None:
         if cutoff is None:
             return self.radii
         if self.radii is None:

@@ -27,6 +27,8 @@ from jfrnn._geometry import (
 )
 from jfrnn._search.verlet import list_radius
 
+Given = Any  # an argument as the user passed it, not yet checked
+
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
@@ -85,18 +87,18 @@ class Problem:
 
 
 def checked_problem(
-    positions: Any,  # noqa: ANN401
-    cutoff: Any,  # noqa: ANN401
-    queries: Any,  # noqa: ANN401
-    box: Any,  # noqa: ANN401
-    batch: Any,  # noqa: ANN401
-    radius_rule: Any,  # noqa: ANN401
+    positions: Given,
+    cutoff: Given,
+    queries: Given,
+    box: Given,
+    batch: Given,
+    radius_rule: Given,
     half: bool,
     include_self: bool,
     closed: bool,
     backend: str,
-    skin: Any,  # noqa: ANN401
-    active: Any,  # noqa: ANN401
+    skin: Given,
+    active: Given,
 ) -> tuple["Problem", Inputs]:
     """Check the arguments that all public verbs share; return what is static of them, and the operands."""
     sources = checked_positions("positions", positions)
