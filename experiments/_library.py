@@ -3,7 +3,6 @@
 - `load_warp`: Warp as the library starts it, quietly and once, so that kernels of both share its settings.
 - `rounded_capacity`: how the library rounds the slots of a row, so that lists here are as long as those that it makes itself.
 - `triangle_query`: the kernels of a search for triangles one by one, with what they are given: a call of the library runs them all.
-- `plain_hashgrid_kernel`: the loop over `wp.HashGrid` as Warp's examples have it, which stands beside the library's kernels.
 - `taylor_green_velocity`, `lattice`, `free`, `LAYERS`: parts of scenes of `jfrnn.cases`, for answers and scenes beside them.
 """
 
@@ -52,8 +51,3 @@ def triangle_query(tri: Any, x: Any, device: str) -> TriangleQuery:  # noqa: ANN
     if device != "cpu":
         _triangles_warp._cuda_kernels(variant).load(device)
     return TriangleQuery(_triangles_warp._commands(variant, *arrays), *arrays[-3:])
-
-
-def plain_hashgrid_kernel() -> Any:  # noqa: ANN401
-    """Return the kernel that lists neighbors with `wp.HashGrid`: inputs id, points, cutoff, capacity; outputs idx, count."""
-    return kernels_of("hashgrid_plain").list_neighbors_kernel

@@ -13,7 +13,7 @@ from jax import lax
 
 import jfrnn
 from experiments import _compare, _measure
-from experiments._library import load_warp, plain_hashgrid_kernel, rounded_capacity
+from experiments._library import load_warp, rounded_capacity
 from experiments.bench import ways
 from experiments.gpu.config import Config
 
@@ -226,7 +226,9 @@ class _Waited:
 
 def _plain_hashgrid(x: Any, cutoff: float, capacity: int) -> tuple[Callable[[], Any], int]:  # noqa: ANN401
     """Return a call of `wp.HashGrid` as Warp's examples use it, without JAX: build, then one thread per particle."""
-    wp, kernel = load_warp(), plain_hashgrid_kernel()
+    from experiments.methods._hashgrid_kernels import list_neighbors_kernel
+
+    wp = load_warp()
     points = wp.array(np.asarray(x), dtype=wp.vec3, device="cuda")
     n = len(points)
     grid = wp.HashGrid(128, 128, 128, device="cuda")
@@ -234,7 +236,7 @@ def _plain_hashgrid(x: Any, cutoff: float, capacity: int) -> tuple[Callable[[], 
 
     def call() -> None:
         grid.build(points, cutoff)
-        wp.launch(kernel, dim=n, inputs=[grid.id, points, cutoff, capacity], outputs=[idx, count], device="cuda")
+        wp.launch(list_neighbors_kernel, dim=n, inputs=[grid.id, points, cutoff, capacity], outputs=[idx, count], device="cuda")
 
     call()
     return _Waited(call), int(count.numpy().sum(dtype=np.int64))
