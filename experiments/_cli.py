@@ -34,6 +34,7 @@ class Bench(_commands.Commands):
             "crossover": "Time the backends over sizes.",
             "distributed": "Time lists, sums and fluids on 1 to k devices.",
             "domain": "Time what empty space costs.",
+            "house": "Count files, lines and floors.",
             "options": "Time each option of a search.",
             "peers": "Ask other libraries for the hard cases.",
             "skin": "Time a list that is kept while particles move.",

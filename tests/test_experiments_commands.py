@@ -21,7 +21,7 @@ from experiments.sph import ranges, settings, snapshots
 ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
 TOP = ("run", "report", "merge", "list", "show", "export", "gpu", "bench", "sph")
-BENCH = ("crossover", "distributed", "domain", "options", "peers", "skin", "sums", "ties", "triangles", "use")
+BENCH = ("crossover", "distributed", "domain", "house", "options", "peers", "skin", "sums", "ties", "triangles", "use")
 SPH = ("run", "validate", "speed", "gradients")
 COMMANDS = (*TOP[:7], *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))
 
@@ -289,6 +289,7 @@ def test_steps_are_timed_of_scenes_that_have_an_nx(tmp_path):
         ("sph", "gradients", "memory"),
         *(("bench", name) for name in ("options", "ties", "crossover", "triangles", "skin", "use", "domain")),
         ("bench", "peers", "scipy"),
+        ("bench", "house", "HEAD"),
     ],
     ids=lambda arguments: " ".join(map(str, arguments[:2])),
 )
