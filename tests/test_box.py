@@ -11,7 +11,7 @@ import reference
 from jfrnn.cases.periodic import PERIODIC_CASES
 
 import jfrnn
-from jfrnn._geometry.box import unpacked_turns
+from jfrnn._geometry.wrapping import unpacked_turns
 
 CAPACITY = 400
 LENGTH = 304

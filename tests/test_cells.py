@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jfrnn._geometry import cells as _cells
-from jfrnn._geometry.box import Images
-from jfrnn._geometry.exact import smallest_cutoff
+from jfrnn._geometry.cutoffs import smallest_cutoff
+from jfrnn._geometry.images import Images
 
 
 def edge_of(cutoff, dtype):

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import jfrnn
-from jfrnn._geometry.exact import _UNKNOWN, Pair, _integer_sign, _sum_sign, _threshold, largest_cutoff, make_cutoff, smallest_cutoff
+from jfrnn._geometry.cutoffs import largest_cutoff, make_cutoff, smallest_cutoff
+from jfrnn._geometry.exact import _UNKNOWN, Pair, _integer_sign, _sum_sign, _threshold
 
 POINTS = 12
 

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jfrnn._geometry.order import hilbert_decode, hilbert_encode, morton_decode, morton_encode, sort_order
+from jfrnn._geometry.curves import hilbert_decode, hilbert_encode, morton_decode, morton_encode
+from jfrnn._geometry.order import sort_order
 
 CURVES = {"morton": (morton_encode, morton_decode), "hilbert": (hilbert_encode, hilbert_decode)}
 MOST_BITS = {2: 31, 3: 21}

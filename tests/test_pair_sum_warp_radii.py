@@ -15,7 +15,7 @@ from test_pair_sum_warp_boxes import assert_marks, marks
 from test_radii import LENGTH, radii_of
 
 import jfrnn
-from jfrnn._geometry.exact import RULES
+from jfrnn._geometry.cutoffs import RULES
 
 fused = functools.partial(jfrnn.pair_sum, backend="warp")
 

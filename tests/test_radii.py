@@ -13,7 +13,7 @@ from jfrnn.cases.radii import RADII_CASES
 from test_box import image_pairs, masked_images
 
 import jfrnn
-from jfrnn._geometry.exact import RULES, is_radius, smallest_cutoff
+from jfrnn._geometry.cutoffs import RULES, is_radius, smallest_cutoff
 
 SLOW = pytest.mark.slow
 LENGTH, CAPACITY = 128, 256

@@ -11,7 +11,7 @@ import reference
 from jfrnn.cases.triangles import TRIANGLE_CASES, padded
 
 import jfrnn
-from jfrnn._geometry.exact import make_cutoff
+from jfrnn._geometry.cutoffs import make_cutoff
 from jfrnn._triangles import cells as _triangles_cells
 from jfrnn._triangles import tree as _triangles_tree
 from jfrnn._triangles import warp as _triangles_warp

@@ -13,7 +13,7 @@ from jfrnn.cases.triangles import TRIANGLE_CASES, padded
 from jfrnn.kernels import winding
 
 import jfrnn
-from jfrnn._geometry.exact import make_cutoff
+from jfrnn._geometry.cutoffs import make_cutoff
 from jfrnn._triangles import rows as _triangles_rows
 from jfrnn._triangles import warp as _triangles_warp
 from jfrnn._triangles.closest import nearest_of

@@ -20,7 +20,7 @@ from jfrnn.kernels._triangles import pending
 
 import jfrnn
 from jfrnn._engine import auto as _auto
-from jfrnn._geometry.exact import make_cutoff
+from jfrnn._geometry.cutoffs import make_cutoff
 from jfrnn._triangles import verb as _triangles
 from jfrnn._triangles import warp as _triangles_warp
 from jfrnn._triangles.cells import without_faults

@@ -1,32 +1,7 @@
 """What a pair is: cutoffs, boxes, cells, orders, batches, checked inputs, and the status of a result."""
 
 from jfrnn._geometry.batch import Batch, ranked
-from jfrnn._geometry.box import (
-    LARGEST_TURN,
-    NOT_FINITE,
-    TOO_FAR,
-    Box,
-    Images,
-    Lattice,
-    Motion,
-    Wrapped,
-    box_change,
-    fixed_box,
-    forward_shifts,
-    fractions_of,
-    given_shifts,
-    grown_images,
-    images_of,
-    is_valid,
-    make_lattice,
-    motion_of,
-    nearest_shifts,
-    shifted_pairs,
-    translation,
-    turns_between,
-    unpacked_turns,
-    wrap,
-)
+from jfrnn._geometry.box import Box, fixed_box
 from jfrnn._geometry.cells import (
     CellAxes,
     build_grid,
@@ -37,24 +12,11 @@ from jfrnn._geometry.cells import (
     ordered_bits,
     stencil_runs,
 )
-from jfrnn._geometry.exact import (
-    Cutoff,
-    Cutoffs,
-    Pair,
-    Radii,
-    compensated_sum,
-    flat_take,
-    is_pair_of,
-    is_radius,
-    make_cutoff,
-    make_cutoffs,
-    refine,
-    rounded_sum,
-    shift_in_given,
-    squared_distance,
-    step_one_bounds,
-    widened,
-)
+from jfrnn._geometry.curves import hilbert_decode, hilbert_encode, morton_decode, morton_encode
+from jfrnn._geometry.cutoffs import Cutoff, Cutoffs, Radii, is_radius, make_cutoff, make_cutoffs, step_one_bounds, widened
+from jfrnn._geometry.exact import Pair, flat_take, is_pair_of, refine, shift_in_given, squared_distance
+from jfrnn._geometry.floats import compensated_sum, rounded_sum
+from jfrnn._geometry.images import LARGEST_TURN, Images, grown_images, images_of
 from jfrnn._geometry.inputs import (
     check_devices,
     check_is_known,
@@ -74,10 +36,23 @@ from jfrnn._geometry.inputs import (
     largest_known,
 )
 from jfrnn._geometry.integers import GUARDS, carried_limbs, fields_of, full_count, limb_bits, limb_product, limb_sign, limbs_of
+from jfrnn._geometry.lattice import (
+    Lattice,
+    forward_shifts,
+    fractions_of,
+    given_shifts,
+    is_valid,
+    make_lattice,
+    nearest_shifts,
+    shifted_pairs,
+    translation,
+)
 from jfrnn._geometry.levels import GROUPS, HALVINGS, Axes, Levels, level_runs, sort_by_levels
 from jfrnn._geometry.meshes import merge_vertices
-from jfrnn._geometry.order import hilbert_decode, hilbert_encode, hilbert_order, morton_decode, morton_encode, sort_order
+from jfrnn._geometry.motion import Motion, box_change, motion_of, turns_between
+from jfrnn._geometry.order import hilbert_order, sort_order
 from jfrnn._geometry.status import NeighborOverflowError, Status, known_status, names_of_bits, pairs_and_status, shape_of
+from jfrnn._geometry.wrapping import NOT_FINITE, TOO_FAR, Wrapped, unpacked_turns, wrap
 
 __all__ = [
     "GROUPS",

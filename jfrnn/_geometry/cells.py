@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._geometry.box import Images
+from jfrnn._geometry.images import Images
 
 _CELLS_PER_PARTICLE = 4  # a dense table holds at most this many cells per particle: 16 B per particle
 _SMALLEST_TABLE = 4096

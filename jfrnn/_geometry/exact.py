@@ -14,19 +14,22 @@ Three steps, each exact where it answers and each asked only what the one before
    it answers for coordinates whose exponents lie so far apart that step 2 would underflow or need more terms.
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._geometry.cutoffs import Cutoff, Cutoffs, step_one_bounds
+from jfrnn._geometry.floats import WHOLE_BITS, distill, exact_square, half_mantissa, is_plain, two_difference, two_sum, unit_scale
 from jfrnn._geometry.integers import beside, carried_limbs, full_count, limb_product, limb_sign, limb_type, limbs_of
 from jfrnn._geometry.reduced import Basis
 from jfrnn._tracing import any_of_rows, first_set
+
+_UNKNOWN = 2  # a sign that step 2 could not prove
+_INTEGER_CHUNK = 64  # pairs that one round of the integer test decides
 
 
 class Pair(NamedTuple):
@@ -50,7 +53,7 @@ class Pair(NamedTuple):
         return [(self.shift[k], self.matrix[k, axis]) for k in rows]
 
 
-_WHOLE_BITS = 12  # of whole numbers whose products with half mantissas are exact
+PointsAt = Callable[[Array | None], Pair]
 
 
 def shift_in_given(shift: list[Array], basis: Basis | None, matrix: Array) -> tuple[list[Array], Array]:
@@ -62,188 +65,9 @@ def shift_in_given(shift: list[Array], basis: Basis | None, matrix: Array) -> tu
         return shift, matrix
     counts = [x.astype(jnp.int32) for x in shift]
     given = [functools.reduce(jnp.add, (x * row[k] for x, row in zip(counts, basis, strict=True))) for k in range(len(shift))]
-    high = [(x + (1 << (_WHOLE_BITS - 1))) >> _WHOLE_BITS for x in given]
-    low = [x - (h << _WHOLE_BITS) for x, h in zip(given, high, strict=True)]
-    return [x.astype(matrix.dtype) for x in (*low, *high)], jnp.concatenate([matrix, matrix * 2**_WHOLE_BITS])
-
-
-def combined(basis: Basis, matrix: Array) -> Array:
-    """Return basis @ matrix, whole numbers times lattice vectors, each component rounded about once; differentiable."""
-    whole = np.array(basis)
-    high = (whole + (1 << (_WHOLE_BITS - 1))) >> _WHOLE_BITS
-    half = _half_mantissa(lax.stop_gradient(matrix))
-    terms = []
-    for numbers, size in ((whole - (high << _WHOLE_BITS), 1), (high, 2**_WHOLE_BITS)):
-        if numbers.any():
-            times = numbers.astype(matrix.dtype)
-            terms += [times[:, k, None] * (part[k] * size)[None] for k in range(len(whole)) for part in (matrix - half, half)]
-    for _ in range(3):
-        terms = _distill(terms)
-    return functools.reduce(jnp.add, terms)
-
-
-PointsAt = Callable[[Array | None], Pair]
-
-_UNKNOWN = 2  # a sign that step 2 could not prove
-_INTEGER_CHUNK = 64  # pairs that one round of the integer test decides
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Cutoff:
-    """A cutoff, rounded once to the dtype of the positions, with all that the pair test derives from it.
-
-    The numbers are operands of the compiled program, not constants in it: one program serves every cutoff.
-
-    Attributes:
-        radius: r.
-        inside: scaled squared distances below this belong to pairs, without doubt.
-        outside: scaled squared distances above this do not, without doubt.
-        unit_scale: power of two, itself a normal float, that brings r into [1, 4).
-        plain_bits: magnitude bits of the smallest coordinate for which step 2 cannot underflow.
-        closed: pairs at exactly r count. Static.
-        scaled: r is so small or large that differences take `unit_scale` before they are squared. Static.
-    """
-
-    radius: np.floating | Array
-    inside: np.floating | Array
-    outside: np.floating | Array
-    unit_scale: np.floating | Array
-    plain_bits: np.unsignedinteger | Array
-    closed: bool = dataclasses.field(metadata={"static": True})
-    scaled: bool = dataclasses.field(metadata={"static": True})
-
-
-RULES = ("gather", "scatter", "either", "both", "mean")  # whose cutoff is a pair's: i's, j's, the larger, the smaller, the mean
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Radii:
-    """Cutoffs that differ from particle to particle, as they were given; data, so that they may be traced.
-
-    Attributes:
-        sources: [n] of the sources, or None where the rule does not ask for them.
-        queries: [m] of the queries, likewise.
-        rule: Which of both is a pair's (`RULES`). Static.
-    """
-
-    sources: Array | None
-    queries: Array | None
-    rule: str = dataclasses.field(metadata={"static": True})
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Cutoffs:
-    """What the pair test derives from radii, which are 0 or positive and finite wherever a particle takes part, else 0.
-
-    Attributes:
-        sources: [n], or None where the rule does not ask for them.
-        queries: [m], likewise.
-        largest: [] the largest of them all.
-        unit_scale: [] power of two, itself a normal float, that brings the largest into [1, 4).
-        rule: Static.
-        closed: Pairs at exactly the cutoff count. Static.
-    """
-
-    sources: Array | None
-    queries: Array | None
-    largest: Array
-    unit_scale: Array
-    rule: str = dataclasses.field(metadata={"static": True})
-    closed: bool = dataclasses.field(metadata={"static": True})
-    scaled = True
-
-    def of_pairs(self, queries: Array | None, sources: Array | None) -> list[Array]:
-        """Return the cutoff of each pair, or two of which it is the mean, from those of its query and its source."""
-        if sources is None or queries is None:
-            return [x for x in (queries, sources) if x is not None]
-        if self.rule == "mean":
-            return [queries, sources]
-        return [jnp.maximum(queries, sources) if self.rule == "either" else jnp.minimum(queries, sources)]
-
-
-def is_radius(radii: Array | np.ndarray) -> Any:  # noqa: ANN401
-    """Say which cutoffs the pair test can decide: 0, which reaches what coincides, is one of them. NumPy's arrays give NumPy's."""
-    dtype = np.dtype(radii.dtype)
-    unsigned = np.uint32 if dtype == np.float32 else np.uint64  # compared as floats, denormal numbers were 0
-    low, high = (np.array(x, dtype).view(unsigned)[()] for x in (smallest_cutoff(dtype), largest_cutoff(dtype)))
-    bits = radii.view(unsigned) if isinstance(radii, np.ndarray) else lax.bitcast_convert_type(radii, unsigned)
-    magnitude = bits << unsigned(1) >> unsigned(1)
-    negative_zero = np.array(-0.0, dtype).view(unsigned)[()]
-    return (bits <= negative_zero) & (magnitude - unsigned(1) >= low - unsigned(1)) & (magnitude <= high)  # 0 - 1 is the largest
-
-
-def make_cutoffs(radii: Radii, closed: bool, skin: float = 0.0) -> Cutoffs:
-    """Derive what the pair test needs; with a skin, of radii that are that much larger, rounded up."""
-    parts = [
-        None if x is None else jnp.where(is_radius(x), _sum_rounded_up(jnp.abs(x), skin), 0) for x in (radii.sources, radii.queries)
-    ]
-    largest = functools.reduce(jnp.maximum, (jnp.max(x, initial=0) for x in parts if x is not None))
-    largest = jnp.where(largest > 0, largest, 1)
-    return Cutoffs(parts[0], parts[1], largest, _unit_scale(largest), radii.rule, closed)
-
-
-def _sum_rounded_up(x: Array, skin: float) -> Array:
-    if skin == 0:
-        return x
-    total, error = two_sum(x, jnp.asarray(skin, x.dtype))
-    return jnp.where(error > 0, jnp.nextafter(total, jnp.asarray(jnp.inf, x.dtype)), total)
-
-
-def bounds_of_pairs(cutoffs: Cutoffs, radii: list[Array], slack: Array | None = None) -> tuple[Array, Array]:
-    """Return what step 1 compares scaled squared distances with: below the first a pair without doubt, above the second none.
-
-    A mean is rounded, and so are its halves: 32 eps instead of 8 cover that generously. A cutoff so small against the largest
-    that squares could underflow leaves to the next steps whatever is not surely farther.
-    """
-    finfo = jnp.finfo(cutoffs.largest.dtype)
-    scaled = [radius * cutoffs.unit_scale for radius in radii]
-    radius = scaled[0] if len(scaled) == 1 else (scaled[0] + scaled[1]) / 2
-    off = 0 if slack is None else 2 * slack * cutoffs.unit_scale
-    least = 2.0 ** (finfo.minexp // 2 + finfo.nmant)
-    sure = radius > jnp.maximum(off, least)
-    inside = jnp.where(sure, (radius - off) ** 2 * (1 - 32 * finfo.eps), -1)
-    outside = (jnp.maximum(radius, least) + off) ** 2 * (1 + 32 * finfo.eps)
-    return inside, outside
-
-
-def _unit_scale(x: Array) -> Array:
-    """Return the power of two that brings positive floats into [1, 4) and is itself a normal float."""
-    unsigned, nmant, bias = (jnp.uint32, 23, 127) if x.dtype == jnp.float32 else (jnp.uint64, 52, 1023)
-    exponent = lax.bitcast_convert_type(x, unsigned) >> unsigned(nmant)  # biased: 2·bias - e is that of 2^-(e - bias)
-    return lax.bitcast_convert_type(jnp.maximum(unsigned(2 * bias) - exponent, unsigned(1)) << unsigned(nmant), x.dtype)
-
-
-def make_cutoff(value: float, dtype: np.dtype, closed: bool) -> Cutoff:
-    """Round a cutoff within `smallest_cutoff` and `largest_cutoff` to a dtype and derive the bounds of the pair test."""
-    finfo = np.finfo(dtype)
-    narrow = dtype == np.float32
-    radius = dtype.type(value)
-    exponent = int(np.frexp(radius)[1]) - 1
-    unit_scale = dtype.type(2.0 ** -min(exponent, -int(finfo.minexp)))
-    scaled = abs(exponent) > (30 if narrow else 400)
-    square = (radius * unit_scale if scaled else radius) ** 2
-    lowest = max(exponent - (35 if narrow else 450), int(finfo.minexp) + finfo.nmant + 1)
-    return Cutoff(
-        radius=radius,
-        inside=square * dtype.type(1 - 8 * finfo.eps),
-        outside=square * dtype.type(1 + 8 * finfo.eps),
-        unit_scale=unit_scale,
-        plain_bits=np.frombuffer(dtype.type(2.0**lowest).tobytes(), np.uint32 if narrow else np.uint64)[0],
-        closed=closed,
-        scaled=scaled,
-    )
-
-
-def widened(cutoff: Cutoff, slack: Array) -> Cutoff:
-    """Return a cutoff whose step 1 leaves open what differences off by `slack` per component (at most 3) may not decide."""
-    eps = jnp.finfo(slack.dtype).eps
-    scale = cutoff.unit_scale if cutoff.scaled else slack.dtype.type(1)
-    radius, off = cutoff.radius * scale, 2 * (slack * scale)
-    inside = jnp.where(radius > off, (radius - off) ** 2 * (1 - 16 * eps), 0)
-    return dataclasses.replace(cutoff, inside=inside, outside=(radius + off) ** 2 * (1 + 16 * eps))
+    high = [(x + (1 << (WHOLE_BITS - 1))) >> WHOLE_BITS for x in given]
+    low = [x - (h << WHOLE_BITS) for x, h in zip(given, high, strict=True)]
+    return [x.astype(matrix.dtype) for x in (*low, *high)], jnp.concatenate([matrix, matrix * 2**WHOLE_BITS])
 
 
 def squared_distance(difference: list[Array], cutoff: "Cutoff | Cutoffs") -> Array:
@@ -305,17 +129,6 @@ def is_pair_of(
         return (step_one == yes) | _refine_some(step_one == open_pair, points, cutoff)
 
     return lax.cond(jnp.max(step_one, initial=no) == open_pair, refined, lambda step_one: step_one == yes, step_one)
-
-
-def step_one_bounds(
-    cutoff: "Cutoff | Cutoffs", radii: list[Array] | None, slack: Array | None = None
-) -> tuple[np.floating | Array, np.floating | Array]:
-    """Return the bounds of step 1: of one cutoff, or of pairs with these radii; differences may be off by `slack` per component."""
-    if isinstance(cutoff, Cutoffs):
-        return bounds_of_pairs(cutoff, radii or [], slack)
-    if slack is not None:
-        cutoff = widened(cutoff, slack)
-    return cutoff.inside, cutoff.outside
 
 
 class Shifted(NamedTuple):
@@ -402,111 +215,46 @@ def _threshold(pair: Pair, cutoff: Cutoff | Cutoffs) -> _Threshold:
     exponent = lax.bitcast_convert_type(larger, unsigned) >> unsigned(nmant)
     below = unsigned(35 if narrow else 450)
     lowest = jnp.maximum(jnp.maximum(exponent, below) - below, unsigned(nmant + 2))
-    return _Threshold(radii, _unit_scale(larger), lowest << unsigned(nmant))
-
-
-# --- step 2: error-free transformations -------------------------------------------------------------------------------
+    return _Threshold(radii, unit_scale(larger), lowest << unsigned(nmant))
 
 
 def _sum_sign(pair: Pair, threshold: _Threshold) -> Array:
     """Return the sign of |b - a|² - r² where it is proven, ties of representable differences included, else _UNKNOWN; int32."""
     radii, scale, least = threshold
     terms, slack = [], jnp.zeros_like(pair.a[0])
-    plain = [_is_plain(x, least) for x in (*pair.a, *pair.b, *(radii if len(radii) == 2 else ()))]
+    plain = [is_plain(x, least) for x in (*pair.a, *pair.b, *(radii if len(radii) == 2 else ()))]
     distance_scale = scale * threshold.times
     for axis, (ak, bk) in enumerate(zip(pair.a, pair.b, strict=True)):
-        high, low = _two_difference(bk, ak)
+        high, low = two_difference(bk, ak)
         rest = jnp.zeros_like(ak)
         for shift, component in pair.lattice_terms(axis):
-            half = _half_mantissa(component)  # times a shift of at most half a mantissa: exact
-            *others, low, high = _distill(_distill([low, shift * (component - half), shift * half, high]))
+            half = half_mantissa(component)  # times a shift of at most half a mantissa: exact
+            *others, low, high = distill(distill([low, shift * (component - half), shift * half, high]))
             rest = sum((jnp.abs(x * distance_scale) for x in others), rest)
-            plain += [_is_plain(component, least), jnp.abs(shift) <= 2**_WHOLE_BITS]
+            plain += [is_plain(component, least), jnp.abs(shift) <= 2**WHOLE_BITS]
         if pair.shift is not None:
             slack = slack + (4 * jnp.abs(high * distance_scale) * rest + 2 * rest * rest)
         high, low = high * distance_scale, low * distance_scale
-        terms += _exact_square(high)
+        terms += exact_square(high)
         tail = 2 * high * low
         terms.append(tail)
         slack = slack + (jnp.abs(tail) * jnp.finfo(slack.dtype).eps + 2 * low * low)
     radius, low = radii[0] * scale, None
     if len(radii) == 2:
         radius, low = two_sum(radius, radii[1] * scale)
-    terms += [-term for term in _exact_square(jnp.broadcast_to(radius, slack.shape))]
+    terms += [-term for term in exact_square(jnp.broadcast_to(radius, slack.shape))]
     if low is not None:
         tail = -2 * radius * low
         terms.append(tail)
         slack = slack + (jnp.abs(tail) * jnp.finfo(slack.dtype).eps + 2 * low * low)
     for _ in range(3):
-        terms = _distill(terms)
+        terms = distill(terms)
     rest = sum(jnp.abs(term) for term in terms[:-1])
     bound = 2 * (rest + slack)  # twice: covers the rounding of the sums of absolute values above
     leading = terms[-1]
     known = (jnp.abs(leading) > bound) | ((leading == 0) & (bound == 0))
     known = functools.reduce(jnp.logical_and, plain, known)
     return jnp.where(known, jnp.sign(leading).astype(jnp.int32), _UNKNOWN)
-
-
-def _two_difference(a: Array, b: Array) -> tuple[Array, Array]:
-    """Return fl(a - b) and its rounding error (Knuth 1969)."""
-    difference = a - b
-    b_virtual = a - difference
-    a_virtual = difference + b_virtual
-    return difference, (a - a_virtual) + (b_virtual - b)
-
-
-def compensated_sum(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[Array, Array]:
-    """Add sums with what rounding took of them (value, error): nearly as in twice the precision."""
-    total, rounding = two_sum(a[0], b[0])
-    return total, a[1] + b[1] + rounding
-
-
-def rounded_sum(value: Array, error: Array) -> Array:
-    """Return what a compensated sum comes to; errors mean nothing where it is not finite."""
-    return jnp.where(jnp.isfinite(value), value + error, value)
-
-
-def two_sum(a: Array, b: Array) -> tuple[Array, Array]:
-    """Return fl(a + b) and its rounding error (Knuth 1969)."""
-    total = a + b
-    b_virtual = total - a
-    a_virtual = total - b_virtual
-    return total, (a - a_virtual) + (b - b_virtual)
-
-
-def _exact_square(x: Array) -> list[Array]:
-    """Return three floats that sum to x² exactly, smallest first."""
-    high = _half_mantissa(x)
-    low = x - high
-    return [low * low, 2 * high * low, high * high]
-
-
-def _half_mantissa(x: Array) -> Array:
-    """Round x to half its mantissa by integer operations on its bits: 12 bits of 24, 26 of 53."""
-    unsigned, dropped = (jnp.uint32, 12) if x.dtype == jnp.float32 else (jnp.uint64, 27)
-    bits = lax.bitcast_convert_type(x, unsigned)
-    rounded = (bits + unsigned(1 << (dropped - 1))) >> unsigned(dropped) << unsigned(dropped)
-    return lax.bitcast_convert_type(rounded, x.dtype)
-
-
-def _distill(terms: list[Array]) -> list[Array]:
-    """Add the terms up, keeping each rounding error in place: same exact sum, most of it in the last (VecSum)."""
-    result = []
-    total = terms[0]
-    for term in terms[1:]:
-        total, error = two_sum(total, term)
-        result.append(error)
-    return [*result, total]
-
-
-def _is_plain(x: Array, least: Array) -> Array:
-    """Say where x is 0 or large enough that no product of step 2 underflows."""
-    unsigned = jnp.uint32 if x.dtype == jnp.float32 else jnp.uint64
-    magnitude = lax.bitcast_convert_type(x, unsigned) << unsigned(1) >> unsigned(1)
-    return (magnitude == 0) | (magnitude >= least)
-
-
-# --- step 3: integers as wide as the float format ---------------------------------------------------------------------
 
 
 def _integer_sign(pair: Pair, threshold: _Threshold) -> Array:
@@ -539,14 +287,3 @@ def _translation_limbs(shift: Array, vectors: Array, count: int, orthogonal: boo
         limbs = jnp.sum(vectors_of[..., None] * limbs[:dim], axis=0, dtype=limbs.dtype)
         return jnp.pad(shift[:, :dim], ((0, 0), (0, 1), (0, 0))) * limbs[None]
     return functools.reduce(jnp.add, (shift[:, k, None] * limbs[None, k] for k in range(len(limbs))))
-
-
-def smallest_cutoff(dtype: np.dtype) -> float:
-    """Return the smallest cutoff that keeps flushed denormals inside the band of step 1."""
-    finfo = np.finfo(dtype)
-    return 2.0 ** (finfo.minexp + finfo.nmant + 7)
-
-
-def largest_cutoff(dtype: np.dtype) -> float:
-    """Return the largest cutoff for which a cell edge is still finite."""
-    return 2.0 ** (np.finfo(dtype).maxexp - 1)

@@ -12,7 +12,7 @@ from jax.core import Tracer
 
 from jfrnn._geometry.batch import Batch
 from jfrnn._geometry.box import Box
-from jfrnn._geometry.exact import RULES, Cutoff, Radii, largest_cutoff, make_cutoff, smallest_cutoff
+from jfrnn._geometry.cutoffs import RULES, Cutoff, Radii, largest_cutoff, make_cutoff, smallest_cutoff
 from jfrnn._tracing import gathered, made_on_host, on_device
 
 _MOST_POINTS = 2**31 - 32

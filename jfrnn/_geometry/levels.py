@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._geometry.box import Images
 from jfrnn._geometry.cells import (
     CellAxes,
     Grid,
@@ -27,8 +26,9 @@ from jfrnn._geometry.cells import (
     grid_coordinates,
     places_between,
 )
-from jfrnn._geometry.exact import Cutoffs
-from jfrnn._geometry.order import spread
+from jfrnn._geometry.curves import spread
+from jfrnn._geometry.cutoffs import Cutoffs
+from jfrnn._geometry.images import Images
 
 HALVINGS = 7  # of a top cell, along each axis
 GROUPS = 8  # of cutoffs, by powers of two below the largest; the last one holds all that are smaller still

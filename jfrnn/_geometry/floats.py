@@ -1,0 +1,75 @@
+"""Sums and products of floats whose rounding errors are kept, by error-free transformations.
+
+Sources: Dekker (1971); Ogita, Rump & Oishi (2005), doi:10.1137/030601818.
+"""
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+WHOLE_BITS = 12  # of whole numbers whose products with half mantissas are exact
+
+
+def two_difference(a: Array, b: Array) -> tuple[Array, Array]:
+    """Return fl(a - b) and its rounding error (Knuth 1969)."""
+    difference = a - b
+    b_virtual = a - difference
+    a_virtual = difference + b_virtual
+    return difference, (a - a_virtual) + (b_virtual - b)
+
+
+def two_sum(a: Array, b: Array) -> tuple[Array, Array]:
+    """Return fl(a + b) and its rounding error (Knuth 1969)."""
+    total = a + b
+    b_virtual = total - a
+    a_virtual = total - b_virtual
+    return total, (a - a_virtual) + (b - b_virtual)
+
+
+def compensated_sum(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[Array, Array]:
+    """Add sums with what rounding took of them (value, error): nearly as in twice the precision."""
+    total, rounding = two_sum(a[0], b[0])
+    return total, a[1] + b[1] + rounding
+
+
+def rounded_sum(value: Array, error: Array) -> Array:
+    """Return what a compensated sum comes to; errors mean nothing where it is not finite."""
+    return jnp.where(jnp.isfinite(value), value + error, value)
+
+
+def exact_square(x: Array) -> list[Array]:
+    """Return three floats that sum to x² exactly, smallest first."""
+    high = half_mantissa(x)
+    low = x - high
+    return [low * low, 2 * high * low, high * high]
+
+
+def half_mantissa(x: Array) -> Array:
+    """Round x to half its mantissa by integer operations on its bits: 12 bits of 24, 26 of 53."""
+    unsigned, dropped = (jnp.uint32, 12) if x.dtype == jnp.float32 else (jnp.uint64, 27)
+    bits = lax.bitcast_convert_type(x, unsigned)
+    rounded = (bits + unsigned(1 << (dropped - 1))) >> unsigned(dropped) << unsigned(dropped)
+    return lax.bitcast_convert_type(rounded, x.dtype)
+
+
+def distill(terms: list[Array]) -> list[Array]:
+    """Add the terms up, keeping each rounding error in place: same exact sum, most of it in the last (VecSum)."""
+    result = []
+    total = terms[0]
+    for term in terms[1:]:
+        total, error = two_sum(total, term)
+        result.append(error)
+    return [*result, total]
+
+
+def is_plain(x: Array, least: Array) -> Array:
+    """Say where x is 0 or large enough that no product of step 2 underflows."""
+    unsigned = jnp.uint32 if x.dtype == jnp.float32 else jnp.uint64
+    magnitude = lax.bitcast_convert_type(x, unsigned) << unsigned(1) >> unsigned(1)
+    return (magnitude == 0) | (magnitude >= least)
+
+
+def unit_scale(x: Array) -> Array:
+    """Return the power of two that brings positive floats into [1, 4) and is itself a normal float."""
+    unsigned, nmant, bias = (jnp.uint32, 23, 127) if x.dtype == jnp.float32 else (jnp.uint64, 52, 1023)
+    exponent = lax.bitcast_convert_type(x, unsigned) >> unsigned(nmant)  # biased: 2·bias - e is that of 2^-(e - bias)
+    return lax.bitcast_convert_type(jnp.maximum(unsigned(2 * bias) - exponent, unsigned(1)) << unsigned(nmant), x.dtype)

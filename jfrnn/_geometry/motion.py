@@ -1,0 +1,68 @@
+"""Motion: how far particles have moved between two moments, and how far a change of the box moves their images."""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jfrnn._geometry.lattice import Lattice, nearest_shifts, product, translation, units_of
+from jfrnn._geometry.wrapping import packed_turns, unpacked_turns
+
+
+class Motion(NamedTuple):
+    """How far points moved, whole lattice vectors apart: one that was wrapped into the box has not moved.
+
+    Attributes:
+        axes: d arrays [n], what is left of each component, rounded up.
+        sure: [n] bool: no rounding can make the lattice vectors that were taken off others, and S·A is exact with them.
+        home: [n, d] int32, how many lattice vectors a point would lie from the box without those.
+    """
+
+    axes: list[Array]
+    sure: Array
+    home: Array
+
+
+def motion_of(before: Array, now: Array, lattice: Lattice) -> Motion:
+    """Measure motion [n, d] modulo the lattice."""
+    eps, periodic = jnp.finfo(now.dtype).eps, np.array(lattice.images.periodic)
+    difference, matrix, transform = now - before, jnp.abs(lattice.matrix), jnp.abs(lattice.transform)
+    units, turns = units_of(difference, lattice), turns_between(before, now, lattice)
+    size, taken = jnp.abs(difference), jnp.abs(turns)
+    rounding = 4 * eps * (size + translation(taken, dataclasses.replace(lattice, matrix=matrix)))
+    was_turned = (turns != 0).any(axis=1)
+    left = jnp.abs(difference - translation(turns, lattice)) + jnp.where(was_turned[:, None], rounding, 0)
+    residual = jnp.abs(product(lattice.matrix, lattice.transform) - jnp.diag(jnp.asarray(periodic, now.dtype)))
+    most = jnp.max(taken, axis=1, keepdims=True, initial=0) + 1
+    unsure = 8 * eps * units_of(size, dataclasses.replace(lattice, transform=transform)) + 2 * most * residual.sum(axis=0)[None]
+    sure = jnp.where(periodic[None], jnp.abs(units - turns) + unsure < 0.5, True).all(axis=1)
+    packed = packed_turns(now, lattice)
+    home = unpacked_turns(packed, lattice.dim) - jnp.clip(turns, -(2.0**20), 2.0**20).astype(jnp.int32)
+    return Motion(list(left.T), sure & ((packed >= 0) | ~was_turned), home)
+
+
+def turns_between(before: Array, now: Array, lattice: Lattice) -> Array:
+    """Count the lattice vectors by which points [n, d] were moved, as wrapping does: whole floats, 0 along open axes."""
+    before, now = lax.stop_gradient((before, now))
+    return -nearest_shifts(jnp.where(jnp.isfinite(now - before).all(axis=1, keepdims=True), now - before, 0), lattice)
+
+
+def box_change(before: Lattice, now: Lattice, home: Sequence[Array]) -> Array:
+    """Bound how far the change of a box can move one image of points against another, for pairs within reach.
+
+    `home`, arrays [n, d] int32, says how many lattice vectors the points lie from the box (`Motion`).
+    """
+    dtype, places = now.matrix.dtype, [x for x in home if len(x)]
+    if not places:
+        return jnp.zeros((), dtype)
+    highest = functools.reduce(jnp.maximum, (jnp.max(x, axis=0) for x in places))
+    lowest = functools.reduce(jnp.minimum, (jnp.min(x, axis=0) for x in places))
+    eps = jnp.finfo(dtype).eps
+    moved = jnp.sqrt(jnp.sum((now.matrix - before.matrix) ** 2, axis=1)) * (1 + 16 * eps)
+    if now.images.basis is not None:  # short vectors are rounded
+        moved = jnp.where(moved > 0, moved + 4 * eps * jnp.sum(jnp.abs(now.matrix), axis=1), moved)
+    return jnp.sum(((highest - lowest).astype(dtype) + np.array(now.images.reach, dtype)) * moved)
