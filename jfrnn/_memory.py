@@ -26,7 +26,7 @@ from jfrnn._engine import (
 )
 from jfrnn._geometry import Cutoff, checked_capacity, checked_cutoff, checked_kind, checked_size, checked_skin
 from jfrnn._sums import pair_sum
-from jfrnn._triangles import TRIANGLE_BACKENDS, fastest_of, find_triangles
+from jfrnn._triangles import TRIANGLE_BACKENDS, TRIANGLE_ENGINES, fastest_of, find_triangles
 
 Device = Any  # jax.Device, which type checkers take for a variable
 Tree = Any  # a pytree of arrays, or of their shapes
@@ -189,13 +189,13 @@ def _plan_of_triangles(
     at = SingleDeviceSharding(device)
     if engine not in TRIANGLE_BACKENDS:
         raise ValueError(f"backend={engine!r} finds no triangles: pass one of {', '.join(map(repr, TRIANGLE_BACKENDS))}.")
-    if engine == "auto":
-        engine = fastest_of(device.platform, fastest_engine(device.platform, n).name)
+    auto = engine == "auto"
+    chosen = fastest_of(device.platform, fastest_engine(device.platform, n)) if auto else TRIANGLE_ENGINES[engine]
     points, corners = (jax.ShapeDtypeStruct((size, dim), dtype, sharding=at) for size in (n, faces // 2 + 2))
     named: Any = jax.ShapeDtypeStruct((faces, dim), np.int32, sharding=at)
-    analysis = _analysis(find_triangles.lower(points, corners, named, None, cutoff, engine, capacity))
+    analysis = _analysis(find_triangles.lower(points, corners, named, None, cutoff, chosen, capacity))
     closed = 1  # byte: whether the wall is, which a program of its own finds out
-    return MemoryPlan(int(analysis.output_size_in_bytes) + closed, int(analysis.temp_size_in_bytes), engine)
+    return MemoryPlan(int(analysis.output_size_in_bytes) + closed, int(analysis.temp_size_in_bytes), chosen.name)
 
 
 def _analysis(lowered: jax.stages.Lowered) -> MemoryStats:

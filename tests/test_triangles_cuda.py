@@ -151,6 +151,6 @@ def test_platforms_without_kernels_take_arrays(monkeypatch):
     x = jnp.zeros((4, 3), np.float32)
     for module in (_auto, _triangles):
         monkeypatch.setattr(module, "platform_of", lambda *_: "rocm")
-    assert _triangles._chosen_engine("auto", x) == "jax"
+    assert _triangles._choose_engine("auto", x).name == "jax"
     with pytest.raises(RuntimeError, match="on the CPU and on CUDA, got 'rocm'"):
-        _triangles._chosen_engine("bvh", x)
+        _triangles._choose_engine("bvh", x)

@@ -11,12 +11,14 @@ import numpy as np
 from jax import Array, lax
 from jax.sharding import PartitionSpec
 
+from jfrnn._engine import ENGINES, Kind
 from jfrnn._geometry import checked_cutoff, checked_flag, checked_skin
 from jfrnn._search import count, list_radius, rounded_capacity
 from jfrnn._shards.halo import Halo, exchanged, halo_in_shard, halo_spec, rows_seen
 from jfrnn._shards.particles import OVERFLOWS, Particles, of_shards, spec_of
 
-_ENGINES = ("auto", "jax", "warp", "brute")
+# The engines that can answer in a periodic box, which spread particles may have.
+_BACKENDS = ("auto", *(name for name, engine in ENGINES.items() if engine.refuse(Kind(periodic=True)) is None))
 
 
 class Asked(NamedTuple):
@@ -32,8 +34,8 @@ class Asked(NamedTuple):
 def checked_asked(particles: Any, cutoff: Any, skin: Any, include_self: Any, closed: Any, backend: Any) -> Asked:  # noqa: ANN401
     if not isinstance(particles, Particles):
         raise TypeError(f"particles must be what jfrnn.distributed.scatter returns, got {type(particles).__name__}.")
-    if backend not in _ENGINES:
-        raise ValueError(f"backend must be one of {', '.join(map(repr, _ENGINES))} on several devices, got {backend!r}.")
+    if backend not in _BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(map(repr, _BACKENDS))} on several devices, got {backend!r}.")
     dtype = np.dtype(particles.positions.dtype)
     radius = float(checked_cutoff(cutoff, dtype).radius)
     skin = checked_skin(skin, radius, dtype)

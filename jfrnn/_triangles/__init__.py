@@ -1,10 +1,13 @@
 """Walls of triangles: which are near which particle, and where they are nearest."""
 
-from jfrnn._triangles.triangle_list import TriangleList, find_triangles
-from jfrnn._triangles.verb import TRIANGLE_BACKENDS, fastest_of, search_triangles
+from jfrnn._triangles.engines import TRIANGLE_BACKENDS, TRIANGLE_ENGINES, fastest_of
+from jfrnn._triangles.programs import find_triangles
+from jfrnn._triangles.triangle_list import TriangleList
+from jfrnn._triangles.verb import search_triangles
 
 __all__ = [
     "TRIANGLE_BACKENDS",
+    "TRIANGLE_ENGINES",
     "TriangleList",
     "fastest_of",
     "find_triangles",

@@ -1,9 +1,9 @@
-"""The result of a search for triangles, and the compiled programs that make it."""
+"""The result of a search for triangles, and what it computes at the positions of particles."""
 
 import dataclasses
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,23 +24,15 @@ from jfrnn._geometry import (
     shape_of,
 )
 from jfrnn._search import norms, rounded_capacity
-from jfrnn._tracing import at_once, call_apart, compiled, own_transfers
-from jfrnn._triangles.cells import TriangleCells, sort_triangles, without_faults
+from jfrnn._tracing import call_apart, compiled, own_transfers
+from jfrnn._triangles.cells import TriangleCells, without_faults
 from jfrnn._triangles.closest import Rows, nearest_of, pseudonormals
 from jfrnn._triangles.contacts import are_contacts
-from jfrnn._triangles.rows import are_near, decide_pairs, list_triangles, nearest_slots
+from jfrnn._triangles.engines import TRIANGLE_ENGINES, TriangleEngine
+from jfrnn._triangles.programs import counted_slots, found_triangles
+from jfrnn._triangles.rows import are_near, nearest_slots
 from jfrnn._triangles.tree import TriangleTree, grow_tree
-from jfrnn._triangles.warp import cast_rays as cast_by_warp
-from jfrnn._triangles.warp import decide_pairs as decide_by_warp
-from jfrnn._triangles.warp import list_triangles as list_by_warp
-from jfrnn._triangles.warp import sort_triangles as sort_by_warp
-from jfrnn._triangles.winding import cast_rays, is_closed, least_winding, ray_ways
-
-_ENGINES = {
-    "jax": (sort_triangles, list_triangles),
-    "warp": (sort_by_warp, list_by_warp),
-    "bvh": (grow_tree, list_by_warp),
-}
+from jfrnn._triangles.winding import is_closed, least_winding, ray_ways
 
 
 class SignedDistance(NamedTuple):
@@ -105,6 +97,10 @@ class TriangleList:
         return self.idx.shape[-1]
 
     @property
+    def _engine(self) -> TriangleEngine:
+        return TRIANGLE_ENGINES[self.backend]
+
+    @property
     def overflow(self) -> Array:
         """Say whether a row lost triangles, shape [], bool."""
         with own_transfers():
@@ -130,7 +126,7 @@ class TriangleList:
         """
         points, corners = self._checked(positions, vertices)
         cells = self.cells if vertices is None else None
-        found = found_triangles(points, corners, self.faces, cells, self.cutoff, self.backend, self.capacity)
+        found = found_triangles(points, corners, self.faces, cells, self.cutoff, self._engine, self.capacity)
         found |= {"status": found["status"] | self.status, "required": jnp.maximum(found["required"], self.required)}
         return dataclasses.replace(self, **found, closed=self._closed_again())
 
@@ -154,9 +150,9 @@ class TriangleList:
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
         with own_transfers():
             met = rounded_capacity(math.ceil(checked_slack(slack) * int(np.max(np.asarray(self.required)))))
-        counted = counted_slots(points, corners, self.faces, self.cutoff, self.backend, slack)
+        counted = counted_slots(points, corners, self.faces, self.cutoff, self._engine, slack)
         capacity, cells = max(self.capacity, met, counted), self.cells if vertices is None else None
-        found = found_triangles(points, corners, self.faces, cells, self.cutoff, self.backend, capacity)
+        found = found_triangles(points, corners, self.faces, cells, self.cutoff, self._engine, capacity)
         return dataclasses.replace(self, **found, closed=self._closed_again())
 
     def _closed_again(self) -> Array | None:
@@ -302,67 +298,6 @@ class TriangleList:
         return points, corners
 
 
-def counted_slots(points: Array, vertices: Array, faces: Array, cutoff: float, backend: str, slack: float) -> int:
-    """Count the triangles near concrete positions and return a capacity that holds `slack` times the longest row."""
-    with at_once(), own_transfers():
-        found = found_triangles(points, vertices, faces, None, cutoff, backend, None)
-        longest = int(found["required"])
-    return rounded_capacity(math.ceil(max(longest, 1) * slack))
-
-
-def found_triangles(
-    points: Array,
-    vertices: Array,
-    faces: Array,
-    cells: TriangleCells | TriangleTree | None,
-    cutoff: float,
-    backend: str,
-    capacity: int | None,
-) -> dict[str, Any]:
-    """Return the fields of a list that come from data; with capacity=None only counts. `cells`: those of an earlier list."""
-    radius = make_cutoff(cutoff, np.dtype(points.dtype), closed=False)
-    with own_transfers():
-        find = functools.partial(find_triangles, backend=backend, capacity=capacity)
-        return call_apart(find, *lax.stop_gradient((points, vertices, faces, cells)), radius)
-
-
-@functools.partial(compiled, static_argnames=("backend", "capacity"))
-def find_triangles(
-    points: Array,
-    vertices: Array,
-    faces: Array,
-    cells: TriangleCells | TriangleTree | None,
-    cutoff: Cutoff,
-    backend: str,
-    capacity: int | None,
-) -> dict[str, Any]:
-    """List or count triangles: the compiled program of a search.
-
-    With a list come the wall and its cells, so that, as results, they share no memory with the caller's arrays or another list.
-    """
-    corners, finite, there = without_faults(vertices, faces)
-    sound = {
-        Status.NONFINITE: jnp.all(jnp.isfinite(points)),
-        Status.NONFINITE_VERTEX: jnp.all(finite),
-        Status.FACE_OUT_OF_RANGE: jnp.all(there),
-    }
-    n, f, slots = points.shape[0], faces.shape[0], capacity or 0
-    sort, listed = _ENGINES[backend]
-    if cells is None and f > 0:
-        cells = sort(corners, finite & there, cutoff)
-    if cells is None or n == 0:
-        idx, count = jnp.full((n, slots), f, jnp.int32), jnp.zeros(n, jnp.int32)
-    else:
-        idx, count = listed(points, corners, cells, cutoff, capacity)
-    required = jnp.max(count, initial=0)
-    if capacity is not None:
-        sound[Status.ROW_OVERFLOW] = required <= slots
-    bits = [jnp.where(good, 0, bit.value).astype(jnp.int32) for bit, good in sound.items()]
-    status = functools.reduce(jnp.bitwise_or, bits)
-    fields = {"idx": idx, "count": count, "status": status, "required": required}
-    return fields if capacity is None else fields | {"cells": cells, "vertices": vertices, "faces": faces}
-
-
 @compiled
 def _nearest_in_rows(tri: TriangleList, points: Array, vertices: Array) -> tuple[Array, Array, Array]:
     """Return vectors to nearest points [n, capacity, d], on which feature they lie, and which slots hold a pair."""
@@ -370,8 +305,7 @@ def _nearest_in_rows(tri: TriangleList, points: Array, vertices: Array) -> tuple
     corners, finite, there = without_faults(vertices, tri.faces)
     triangle = jnp.where(used, tri.idx, 0)
     cutoff = make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False)
-    decide = decide_pairs if tri.backend == "jax" else decide_by_warp
-    are_pairs = functools.partial(are_near, decide=decide)
+    are_pairs = functools.partial(are_near, decide=tri._engine.decide)
     near = call_apart(are_pairs, *lax.stop_gradient((points, corners)), triangle, cutoff, used & (finite & there)[triangle])
     mask = near & jnp.all(jnp.isfinite(points), axis=1)[:, None]
     shapes = jnp.where(mask[..., None, None], corners[triangle], 0)
@@ -396,8 +330,7 @@ def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> Signe
     corners, finite, there = without_faults(vertices, tri.faces)
     fixed, at, good = *lax.stop_gradient((corners, points)), finite & there
     cutoff, used = make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False), jnp.minimum(tri.count, tri.capacity)
-    decide = decide_pairs if tri.backend == "jax" else decide_by_warp
-    slot, some = call_apart(functools.partial(nearest_slots, decide=decide), at, fixed, tri.idx, used, good, cutoff)
+    slot, some = call_apart(functools.partial(nearest_slots, decide=tri._engine.decide), at, fixed, tri.idx, used, good, cutoff)
     triangle = jnp.where(some, jnp.take_along_axis(tri.idx, slot[:, None], axis=1)[:, 0], 0)
     shapes = jnp.where(some[:, None, None], corners[triangle], 0)
     vectors, feature = nearest_of(jnp.where(some[:, None], points, 0), shapes)
@@ -405,7 +338,7 @@ def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> Signe
     apart = some & (distance > 0)
     watertight = (is_closed(tri.faces) if tri.closed is None else tri.closed) & jnp.all(good)
     tree = tri.cells if isinstance(tri.cells, TriangleTree) else None
-    inside, unknown = call_apart(functools.partial(_sides, tri.backend), tree, fixed, at, good, apart & watertight, cutoff)
+    inside, unknown = call_apart(functools.partial(_sides, tri._engine), tree, fixed, at, good, apart & watertight, cutoff)
     by_normal = some & (unknown | ~(apart & watertight))
     normal = call_apart(pseudonormals, Rows(tri.idx, used, triangle, feature), tri.faces, fixed, good, by_normal)
     height = jnp.sum(normal * away, axis=1)
@@ -416,10 +349,9 @@ def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> Signe
 
 
 def _sides(
-    backend: str, tree: TriangleTree | None, corners: Array, points: Array, good: Array, asked: Array, cutoff: Cutoff
+    engine: TriangleEngine, tree: TriangleTree | None, corners: Array, points: Array, good: Array, asked: Array, cutoff: Cutoff
 ) -> tuple[Array, Array]:
     """Say which of the points that are asked for are inside, and of which no ray tells: [n] bool each."""
     tree = grow_tree(corners, good, cutoff) if tree is None else tree
-    cast = cast_rays if backend == "jax" else cast_by_warp
     rays, least = ray_ways(points.shape[1], np.dtype(points.dtype)), least_winding(corners, good)
-    return cast(tree, corners, points, rays, asked, least, cutoff)
+    return engine.cast(tree, corners, points, rays, asked, least, cutoff)

@@ -9,16 +9,10 @@ from jax.core import Tracer
 from jfrnn._engine import PLATFORMS, choose_engine, platform_of
 from jfrnn._geometry import check_is_known, checked_capacity, checked_cutoff, checked_positions, checked_slack
 from jfrnn._tracing import gathered, made_on_host
-from jfrnn._triangles.triangle_list import TriangleList, counted_slots, found_triangles
+from jfrnn._triangles.engines import TRIANGLE_BACKENDS, TRIANGLE_ENGINES, TriangleEngine, fastest_of
+from jfrnn._triangles.programs import counted_slots, found_triangles
+from jfrnn._triangles.triangle_list import TriangleList
 from jfrnn._triangles.winding import is_closed
-
-TRIANGLE_BACKENDS = ("auto", "jax", "warp", "bvh")
-
-# Where Warp runs: which of its two engines "auto" takes, by platform. `python -m experiments triangles` and `gpu
-# experiments/configs/h200_triangles.toml`, rows in experiments/results/triangles: on the CPU the tree takes 0.2 to 1.2 times as
-# long as the cells around gears of 1 280 to 200 640 faces, at cutoffs from a hundredth of a module to 0.8, a wall anew 0.1 to 0.9
-# times. On an H200 it takes 1.0 to 2.1 times as long, a wall anew 0.3 to 0.8 times.
-_FASTER = {"cpu": "bvh", "gpu": "warp"}
 
 
 def search_triangles(
@@ -84,7 +78,7 @@ def search_triangles(
     corners = checked_positions("vertices", vertices, like=points)
     named = _checked_faces(faces, points.shape[1], corners.shape[0])
     radius = float(checked_cutoff(cutoff, np.dtype(points.dtype)).radius)
-    engine, slack = _chosen_engine(backend, points), checked_slack(slack)
+    engine, slack = _choose_engine(backend, points), checked_slack(slack)
     if capacity is None:
         if any(isinstance(x, Tracer) for x in (points, corners, named)):
             raise ValueError(
@@ -94,7 +88,7 @@ def search_triangles(
         capacity = counted_slots(points, corners, named, radius, engine, slack)
     found = found_triangles(points, corners, named, None, radius, engine, checked_capacity(capacity))
     closed = None if isinstance(named, Tracer) else is_closed(named)
-    return TriangleList(**found, cutoff=radius, backend=engine, closed=closed)
+    return TriangleList(**found, cutoff=radius, backend=engine.name, closed=closed)
 
 
 def _checked_faces(faces: Any, dim: int, vertices: int) -> Array:  # noqa: ANN401
@@ -116,16 +110,15 @@ def _clipped(faces: Any, least: int, most: int) -> Any:  # noqa: ANN401
     return (faces.clip(least, most) if np.iinfo(faces.dtype).max > most else faces).astype(np.int32)
 
 
-def _chosen_engine(backend: Any, points: Array) -> str:  # noqa: ANN401
+def _choose_engine(backend: object, points: Array) -> TriangleEngine:
+    """Return the engine that a backend stands for; raise where it cannot run on the platform of the points."""
     if backend not in TRIANGLE_BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(map(repr, TRIANGLE_BACKENDS))}, got {backend!r}.")
     platform = platform_of(points)
-    if backend in ("warp", "bvh") and platform not in PLATFORMS:
+    if backend == "auto":
+        return fastest_of(platform, choose_engine("auto", points, None))
+    engine = TRIANGLE_ENGINES[str(backend)]
+    if engine.uses_warp and platform not in PLATFORMS:
         raise RuntimeError(f"backend={backend!r} finds triangles on the CPU and on CUDA, got {platform!r}: pass backend='jax'.")
-    engine = choose_engine("warp" if backend == "bvh" else backend, points, None)  # a tree needs what "warp" needs
-    return fastest_of(platform, engine.name) if backend == "auto" else backend
-
-
-def fastest_of(platform: str, engine: str) -> str:
-    """Return the engine that "auto" takes for triangles where it takes this one for neighbors."""
-    return _FASTER.get(platform, engine) if engine == "warp" else engine
+    choose_engine("warp" if engine.uses_warp else "jax", points, None)  # raises where Warp is needed and missing
+    return engine

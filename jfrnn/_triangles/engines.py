@@ -1,0 +1,58 @@
+"""The engines that look for triangles, in one table: how each sorts a wall, lists triangles, decides pairs and casts rays."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from jax import Array
+
+from jfrnn._engine import WARP, Engine
+from jfrnn._geometry import Cutoff
+from jfrnn._triangles.cells import sort_triangles
+from jfrnn._triangles.rows import Decide, decide_pairs, list_triangles
+from jfrnn._triangles.tree import TriangleTree, grow_tree
+from jfrnn._triangles.warp import cast_rays as cast_by_warp
+from jfrnn._triangles.warp import decide_pairs as decide_by_warp
+from jfrnn._triangles.warp import list_triangles as list_by_warp
+from jfrnn._triangles.warp import sort_triangles as sort_by_warp
+from jfrnn._triangles.winding import cast_rays
+
+Wall = Any  # a sorted wall: the `TriangleCells` or the `TriangleTree` that the engine's own `sort` returns
+
+
+class TriangleEngine(NamedTuple):
+    """One way to find triangles. Engines differ in speed, never in what they find.
+
+    Attributes:
+        name: What users call it, as `backend`.
+        uses_warp: Whether it needs Warp, and so one of Warp's platforms.
+        sort: (corners [f, corner, axis], good [f], cutoff) -> the sorted wall.
+        list: (positions, corners, wall, cutoff, capacity or None) -> rows [n, capacity] and true counts [n].
+        decide: Says which particles are near which triangles, as `rows.decide_pairs` does.
+        cast: Says which points are inside, as `winding.cast_rays` does.
+    """
+
+    name: str
+    uses_warp: bool
+    sort: Callable[[Array, Array, Cutoff], Wall]
+    list: Callable[[Array, Array, Wall, Cutoff, int | None], tuple[Array, Array]]
+    decide: Decide
+    cast: Callable[[TriangleTree, Array, Array, Array, Array, Array, Cutoff], tuple[Array, Array]]
+
+
+_BY_WARP = (list_by_warp, decide_by_warp, cast_by_warp)
+_JAX = TriangleEngine("jax", False, sort_triangles, list_triangles, decide_pairs, cast_rays)
+_CELLS = TriangleEngine("warp", True, sort_by_warp, *_BY_WARP)
+_TREE = TriangleEngine("bvh", True, grow_tree, *_BY_WARP)
+TRIANGLE_ENGINES = {engine.name: engine for engine in (_JAX, _CELLS, _TREE)}
+TRIANGLE_BACKENDS = ("auto", *TRIANGLE_ENGINES)
+
+# Where Warp runs: which of its two engines "auto" takes, by platform. `python -m experiments triangles` and `gpu
+# experiments/configs/h200_triangles.toml`, rows in experiments/results/triangles: on the CPU the tree takes 0.2 to 1.2 times as
+# long as the cells around gears of 1 280 to 200 640 faces, at cutoffs from a hundredth of a module to 0.8, a wall anew 0.1 to 0.9
+# times. On an H200 it takes 1.0 to 2.1 times as long, a wall anew 0.3 to 0.8 times.
+_FASTER = {"cpu": _TREE, "gpu": _CELLS}
+
+
+def fastest_of(platform: str, engine: Engine) -> TriangleEngine:
+    """Return the engine that "auto" takes for triangles where it takes this one for neighbors."""
+    return _FASTER.get(platform, _CELLS) if engine is WARP else _JAX
