@@ -5,7 +5,7 @@ import importlib
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -138,6 +138,17 @@ def check_choice(option: str, value: str, allowed: Sequence[str]) -> None:
         raise UsageError(f"{option} {value}: allowed: {', '.join(allowed)}")
 
 
+def check_names(kind: str, names: Sequence[str] | None, allowed: Iterable[str]) -> None:
+    """Refuse names of what there is none of.
+
+    Raises:
+        UsageError: Names the first of them, and what is allowed.
+    """
+    allowed = list(allowed)
+    if unknown := [name for name in names or () if name not in allowed]:
+        raise UsageError(f"no {kind} {unknown[0]!r}; allowed: {', '.join(allowed)}")
+
+
 def take_folder(folder: Path, option: str = "--out") -> Path:
     """Make the folder that takes what a command writes, and return it.
 
@@ -201,7 +212,4 @@ RetryFailed = Annotated[bool, typer.Option("--retry-failed", help="Measure missi
 RowsFolder = Annotated[Path | None, typer.Option(help="Folder of the rows; out/NAME without it.")]
 Points = Annotated[int, typer.Option(min=100, max=MOST_POINTS, help="Random points.")]
 Rounds = Annotated[int, typer.Option(min=2, max=100_000, help="Timed runs of each.")]
-Engine = Annotated[
-    str,
-    typer.Option(callback=_known_engine, help="As in jfrnn.search: auto, warp, jax or brute."),
-]
+Engine = Annotated[str, typer.Option(callback=_known_engine, help="As in jfrnn.search: auto, warp, jax or brute.")]

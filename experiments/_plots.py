@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 
 from experiments import _table, _thesis
 from experiments._rows import SearchRow
@@ -120,6 +120,16 @@ def label_logarithmic(axis: Axis, short: float = 1000) -> None:
     low, high = axis.get_view_interval()
     axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < short * low else (1,)))
     axis.set_major_formatter(PLAIN)
+
+
+def dress(axes: Axes, xlabel: str, ylabel: str) -> None:
+    """Make both axes logarithmic and name them."""
+    axes.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
+    for axis, short in ((axes.xaxis, 100), (axes.yaxis, 1000)):  # numbers side by side take more room
+        label_logarithmic(axis, short)
+        axis.set_minor_formatter(NullFormatter())
+    axes.grid(True, which="major", color="0.9", linewidth=0.8)
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 def _legend(axes: Axes, methods: list[str], thesis: Iterable[tuple[str, str]], *, lines: bool = False) -> None:

@@ -1,39 +1,39 @@
-"""Which report a folder of rows gets, by what its first row says."""
+"""Which rows a folder holds, by what the first of them says, and which report it gets."""
 
 import json
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import typer
 
-from experiments import _report
-from experiments._rows import RowFile
+from experiments._rows import RowFile, SearchRow
+
+_KINDS = (  # columns by which rows are known, the module of their kind and its name, and that of their report
+    ({"figures", "curves"}, "sph.validate", "CaseRow", "sph.validate"),
+    ({"particle_steps_per_s", "way"}, "sph.speed", "StepRow", "sph.speed_report"),
+    ({"compensated", "way"}, "bench.sums", "SumRow", "bench.sums_report"),
+    ({"scaling", "halo"}, "bench.distributed", "DeviceRow", "bench.distributed"),
+)
+
+
+def kind_of(folder: Path) -> tuple[Any, str]:
+    """Return the kind of the rows of a folder, and the module of their report; those of a GPU run are dicts of any columns."""
+    columns = _columns(folder / "rows.jsonl")
+    for known, module, name, table in _KINDS:
+        if known <= columns:
+            return getattr(import_module(f"experiments.{module}"), name), f"experiments.{table}"
+    return (dict, "experiments.gpu.report") if "kind" in columns else (SearchRow, "experiments._report")
 
 
 def report(folder: Path) -> None:
     """Print the tables of a folder, and write them and pictures beside the rows."""
-    columns = _columns(folder / "rows.jsonl")
-    if {"figures", "curves"} <= columns:
-        from experiments.sph import validate
-
-        typer.echo(validate.report(RowFile(folder, validate.CaseRow).read(), folder))
-    elif {"particle_steps_per_s", "way"} <= columns:
-        from experiments.sph import speed, speed_report
-
-        typer.echo(speed_report.report(RowFile(folder, speed.StepRow).read(), folder))
-    elif {"compensated", "way"} <= columns:
-        from experiments.bench import sums, sums_report
-
-        typer.echo(sums_report.report(RowFile(folder, sums.SumRow).read(), folder))
-    elif {"scaling", "halo"} <= columns:
-        from experiments.bench import distributed
-
-        typer.echo(distributed.report(RowFile(folder, distributed.DeviceRow).read(), folder))
-    elif "kind" in columns:
-        from experiments.gpu import report as gpu_report
-
-        typer.echo(gpu_report.report(folder))
+    kind, module = kind_of(folder)
+    table = import_module(module).report
+    if kind is SearchRow:
+        table(folder)
     else:
-        _report.report(folder)
+        typer.echo(table(folder) if kind is dict else table(RowFile(folder, kind).read(), folder))
 
 
 def _columns(path: Path) -> set[str]:

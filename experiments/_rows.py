@@ -32,6 +32,11 @@ class Row:
     dirty: bool | None = None  # whether the working tree differed from it
     time: str | None = None  # when the row was finished, UTC
 
+    @property
+    def outcome(self) -> str:
+        """Status and reason, for a table."""
+        return (self.status if self.reason is None else f"{self.status}: {self.reason}")[:100]
+
 
 @dataclass(kw_only=True)
 class TimedRow(Row):

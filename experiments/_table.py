@@ -87,6 +87,14 @@ def count(value: int) -> str:
     return f"{value:,}".replace(",", " ")
 
 
+def markdown(lines: Sequence[dict[str, Any]]) -> str:
+    """Return lines with the same keys as a table in Markdown."""
+    if not lines:
+        return "No rows."
+    cells = [list(lines[0]), ["---"] * len(lines[0]), *(map(str, line.values()) for line in lines)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+
+
 def ratio(value: float | None, yardstick: float | None) -> float | None:
     """Return value / yardstick, None where either is unknown or there is nothing to divide by."""
     return value / yardstick if value is not None and yardstick else None

@@ -193,7 +193,7 @@ def test_arrays_of_words_are_no_particles(tmp_path):
         (("bench", "triangles", "--faces", "1"), "--faces 1: "),
         (("bench", "crossover", "--repeats", "1"), "--repeats 1: "),
         (("bench", "peers", "--limit", "nan"), "--limit nan: "),
-        (("bench", "peers", "ann"), "no peer 'ann': jfrnn, scipy, "),
+        (("bench", "peers", "ann"), "no peer 'ann'; allowed: jfrnn, scipy, "),
         (("show", "corners", "--dim", "4"), "--dim 4: "),
         (("show", "corners", "--fill", "nan"), "--fill nan: "),
         (("show", "corners", "--seed", "-1"), "--seed -1: "),

@@ -81,7 +81,7 @@ def test_an_inexact_answer_is_counted_as_wrong(config, monkeypatch):
     import jfrnn
 
     monkeypatch.setattr(hard, "HARD_CASES", {"integers_14": hard.HARD_CASES["integers_14"]})
-    part = config.exactness[0].model_copy(update={"dims": [3], "dtypes": ["float32"]})
+    part = config.exactness[0].model_copy(update={"dims": [3], "dtypes": ["float32"], "least_rows": 800})
     assert [row["wrong"] for row in decided(part)] == [0]
     search = jfrnn.search
     monkeypatch.setattr(jfrnn, "search", lambda x, cutoff, **options: search(x, 0.9 * cutoff, **options))
@@ -113,7 +113,7 @@ def test_sums_are_decided_against_lists(monkeypatch):
     monkeypatch.setattr(sums, "_scenes", some)
     monkeypatch.setattr(sums, "COLUMNS", (1,))
     (part,) = (part for part in load(CONFIG.with_name("h200_options.toml")).exactness if part.cases == "sums")
-    part = part.model_copy(update={"dims": [2], "dtypes": ["float32"]})
+    part = part.model_copy(update={"dims": [2], "dtypes": ["float32"], "least_rows": 3100})
     (row,) = decided(part)
     assert (row["method"], row["cases"], row["wrong"]) == ("jfrnn warp, sums", 2, 0)
     search = jfrnn.search

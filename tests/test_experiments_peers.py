@@ -63,4 +63,4 @@ def _serve_with(name, pipe):
 def test_an_unknown_peer_is_named(tmp_path):
     result = CliRunner().invoke(app, ["bench", "peers", "nobody", "--out", str(tmp_path)])
     assert result.exit_code == 2
-    assert "no peer 'nobody': jfrnn, scipy" in result.output
+    assert "no peer 'nobody'; allowed: jfrnn, scipy" in result.output

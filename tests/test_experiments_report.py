@@ -1,13 +1,15 @@
 import csv
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from matplotlib.image import imread
 from typer.testing import CliRunner
 
-from experiments import _plots, _report, _table, _thesis
+from experiments import _plots, _report, _reports, _table, _thesis
 from experiments._cli import app
-from experiments._rows import RowFile, SearchRow
+from experiments._rows import RowFile, SearchRow, values_of
 
 PICTURES = ("runtime_by_layout", "memory_by_layout", "runtime_by_fill", "memory_by_fill", "speed_against_error")
 PICTURES += ("memory_against_error", "speed_against_sum_error")
@@ -231,3 +233,17 @@ def test_without_memory_there_are_no_pictures_of_it(tmp_path):
 def test_short_times_keep_three_figures():
     shown = [_report._seconds(value) for value in (12.3456, 0.01234, 0.0099, 0.000151, 0.0, None)]
     assert shown == ["12.3456", "0.0123", "0.00990", "0.000151", "0.0000", "·"]
+
+
+RESULTS = Path(_report.__file__).parent / "results"
+
+
+@pytest.mark.parametrize("path", sorted(RESULTS.rglob("*.jsonl")), ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_rows_of_earlier_runs_are_read_with_their_columns(tmp_path, path):
+    """Every study reads the rows that are kept of it: what a row says is what is read."""
+    (tmp_path / "rows.jsonl").write_bytes(path.read_bytes())
+    kind, _ = _reports.kind_of(tmp_path)
+    rows = RowFile(tmp_path, kind).read_all()
+    first, read = json.loads(path.read_text().splitlines()[0]), values_of(rows[0])
+    assert {name: read[name] for name in first} == first
+    assert (kind is dict) == ("kind" in first and "way" not in first)

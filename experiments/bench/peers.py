@@ -16,8 +16,8 @@ import numpy as np
 import typer
 from jfrnn.cases.catalog import CATALOG, Problem, problem  # pyright: ignore[reportMissingImports]
 
-from experiments._commands import finite
-from experiments._errors import UsageError
+from experiments import _table
+from experiments._commands import check_names, finite
 from experiments.bench import table
 
 Pairs = tuple[np.ndarray, np.ndarray]
@@ -193,8 +193,7 @@ def command(
 
     The time for an answer includes compilation; beyond, the process is ended and the next case asked.
     """
-    if unknown := [name for name in names or [] if name not in PEERS]:
-        raise UsageError(f"no peer {unknown[0]!r}: {', '.join(PEERS)}")
+    check_names("peer", names, PEERS)
     parts = [(name, partial(_rows, name, limit)) for name in names or PEERS]
     return markdown(table.measure(out, "answers", parts, limit, COLUMNS).astype(object).fillna("").astype(str).to_dict("records"))
 
@@ -208,15 +207,12 @@ def _rows(name: str, limit_s: float) -> Iterator[dict[str, Any]]:
 
 def markdown(rows: Sequence[dict[Any, str]]) -> str:
     """Return answers as a table in Markdown, a line for each row of the catalog and a column for each peer."""
-    peers = list(dict.fromkeys(row["peer"] for row in rows))
-    titles = {peer: next(row["version"] for row in rows if row["peer"] == peer) for peer in peers}
-    head = ["case", *(f"{peer} {titles[peer]}" for peer in peers)]
-    lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
-    for row in CATALOG:
-        answers = [_said([r for r in rows if r["row"] == row.title and r["peer"] == peer]) for peer in peers]
-        if row.cases:
-            lines.append(f"| {row.title} | {' | '.join(answers)} |")
-    return "\n".join(lines)
+    versions = {row["peer"]: row["version"] for row in rows}
+    lines = []
+    for row in (row for row in CATALOG if row.cases):
+        answers = {peer: [r for r in rows if r["row"] == row.title and r["peer"] == peer] for peer in versions}
+        lines.append({"case": row.title} | {f"{peer} {versions[peer]}": _said(found) for peer, found in answers.items()})
+    return _table.markdown(lines)
 
 
 def _said(rows: list[dict[Any, str]]) -> str:

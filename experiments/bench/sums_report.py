@@ -9,11 +9,10 @@ import pandas as pd
 import typer
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 
 from experiments._commands import RetryFailed, RowsFolder, take_folder
 from experiments._config import load
-from experiments._plots import COLORS, OTHER_COLORS, label_logarithmic
+from experiments._plots import COLORS, OTHER_COLORS, dress
 from experiments.bench.sums import ERROR_UNIT, Config, SumRow, run
 from experiments.bench.ways import WAYS
 
@@ -81,7 +80,7 @@ def _line(row: SumRow) -> _Line:
         "build_ms": None if row.build_s is None else 1e3 * row.build_s,
         "sum_ms": None if row.sum_s is None else 1e3 * row.sum_s,
         **{"ratio": None, "pays_from": None},
-        "status": (row.status if row.reason is None else f"{row.status}: {row.reason}")[:100],
+        "status": row.outcome,
     }
 
 
@@ -106,7 +105,7 @@ def draw(lines: list[_Line]) -> Figure:
             there = [line for line in scenes if line[column]]
             for (way, compensated), of_way in _grouped(there, "way", "compensated").items():
                 _plot(axes, [x["points"] for x in of_way], [x[column] for x in of_way], way, compensated)
-            _dress(axes, "particles", label)
+            dress(axes, "particles", label)
             if column == "error":
                 axes.set(yscale="linear", ylim=(0, None))
         panel[0].set_title(f"{layout}: {what}", loc="left", fontsize=11, fontweight="bold")
@@ -122,7 +121,7 @@ def draw_payoff(lines: list[_Line]) -> Figure:
         largest = max(line["points"] for line in scenes)
         for line in (line for line in scenes if line["points"] == largest):
             _plot(axes, SHARED, [(line["build_ms"] or 0) / k + line["sum_ms"] for k in SHARED], line["way"], False)
-        _dress(axes, "sums per rebuild of the list", "time of a sum and its share of the list [ms]")
+        dress(axes, "sums per rebuild of the list", "time of a sum and its share of the list [ms]")
         axes.set_title(f"{layout}, {largest} particles: {what}", loc="left", fontsize=11, fontweight="bold")
     _name_ways(figure, panels[0])
     return figure
@@ -138,15 +137,6 @@ def _plot(axes: Axes, x: Iterable[float], y: Iterable[float], way: str, compensa
     (line,) = axes.plot([*x], [*y], color=color, marker=marker, markersize=6, label=label)
     if compensated:
         line.set(linestyle="--", markerfacecolor="white")
-
-
-def _dress(axes: Axes, xlabel: str, ylabel: str) -> None:
-    axes.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
-    for axis, short in ((axes.xaxis, 100), (axes.yaxis, 1000)):  # numbers side by side take more room
-        label_logarithmic(axis, short)
-        axis.set_minor_formatter(NullFormatter())
-    axes.grid(True, which="major", color="0.9", linewidth=0.8)
-    axes.spines[["top", "right"]].set_visible(False)
 
 
 def _name_ways(figure: Figure, panels: Iterable[Axes]) -> None:

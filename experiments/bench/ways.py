@@ -156,7 +156,7 @@ def _measure_way(way: Way, spec: Spec, positions: np.ndarray, cutoff: float, row
     jax.config.update("jax_enable_x64", spec.dtype == "float64")
     masses = np.random.default_rng(spec.seed).uniform(0.5, 1.5, len(positions)).astype(positions.dtype)
     given = Given(jax.numpy.asarray(positions), jax.numpy.asarray(masses), cutoff)
-    used_before = _device_bytes("bytes_in_use")
+    used_before = _measure.device_bytes("bytes_in_use")
     steps, building = way.prepare(given, spec.gradient, spec.compensated), []
 
     def once() -> Any:  # noqa: ANN401
@@ -185,14 +185,8 @@ def _measure_way(way: Way, spec: Spec, positions: np.ndarray, cutoff: float, row
     memory = _measure.PeakMemory()
     once()
     row |= {"peak_bytes": memory.peak() - memory.start, "memory_source": memory.source}
-    if (peak := _device_bytes("peak_bytes_in_use")) is not None:  # which is never forgotten; compiling does not raise it
+    if (peak := _measure.device_bytes("peak_bytes_in_use")) is not None:  # which is never forgotten; compiling does not raise it
         row |= {"peak_bytes": peak - (used_before or 0), "memory_source": "memory_stats"}
-
-
-def _device_bytes(what: str) -> int | None:
-    import jax
-
-    return (jax.devices()[0].memory_stats() or {}).get(what)
 
 
 # --- the ways ---------------------------------------------------------------------------------------------------------

@@ -4,13 +4,14 @@ The floor of a search is the bytes that it cannot avoid, positions read once and
 that a copy reached in the same run.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 
 from experiments._errors import UsageError
+from experiments._rows import RowFile
+from experiments._table import count, markdown
 
 OURS = "jfrnn warp"
 _TRIANGLE_KERNELS = ("prepare_s", "place_s", "fill_s", "allocate_s", "scatter_s", "query_s", "settle_s")
@@ -22,7 +23,7 @@ def report(folder: Path) -> str:
     if not path.exists():
         raise UsageError(f"{path} does not exist: run python -m experiments gpu CONFIG --out {folder} first")
     try:
-        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        rows = RowFile(folder, dict).read()
         parts = [part(rows) for part in (_head, _exactness, _calls, _sums, _study, _memory, _triangles)]
     except (ValueError, KeyError, TypeError, StopIteration) as error:
         raise UsageError(f"{path}: holds no rows of a GPU run ({type(error).__name__}: {error}); name the folder of one") from error
@@ -59,7 +60,7 @@ def _exactness(rows: list[dict[str, Any]]) -> str:
         {"method": r["method"], "dtype": r["dtype"], "dim": r["dim"], "hard cases": r["cases"], "wrong": r["wrong"]}
         for r in _of(rows, "exactness")
     ]
-    return "## Hard cases against the oracle\n\n" + _markdown(table)
+    return "## Hard cases against the oracle\n\n" + markdown(table)
 
 
 def _calls(rows: list[dict[str, Any]]) -> str:
@@ -69,7 +70,7 @@ def _calls(rows: list[dict[str, Any]]) -> str:
         seconds, reference = r.get("median_s"), ours.get((r["layout"], r["points"]))
         exact = r.get("exact_directed_pairs")
         table.append({
-            "scene": r["layout"], "points": f"{r['points']:,}".replace(",", " "),
+            "scene": r["layout"], "points": count(r["points"]),
             "method": r["method"] + (", per step of a scan" if r["kind"] == "scan" else ""),
             "ms": "·" if seconds is None else f"{1e3 * seconds:.4g}",
             "/ ours": "·" if seconds is None or reference is None else f"{seconds / reference:.3g}",
@@ -77,7 +78,7 @@ def _calls(rows: list[dict[str, Any]]) -> str:
             "pairs - exact": "·" if exact is None or r.get("directed_pairs") is None else r["directed_pairs"] - exact,
             "reason": r.get("reason", "")[:80],
         })  # fmt: skip
-    return "## Calls that are not waited for one by one\n\n" + _markdown(table)
+    return "## Calls that are not waited for one by one\n\n" + markdown(table)
 
 
 def _sums(rows: list[dict[str, Any]]) -> str:
@@ -86,7 +87,7 @@ def _sums(rows: list[dict[str, Any]]) -> str:
     for r in sums:
         seconds, ours = r.get("median_s"), without_list.get((r["points"], r["gradient"]))
         table.append({
-            "scene": r["layout"], "points": f"{r['points']:,}".replace(",", " "), "way": r["method"],
+            "scene": r["layout"], "points": count(r["points"]), "way": r["method"],
             "what": "density, gradient" if r["gradient"] else "density",
             "ms": "·" if seconds is None else f"{1e3 * seconds:.4g}",
             "/ pair_sum warp": "·" if seconds is None or ours is None else f"{seconds / ours:.3g}",
@@ -94,7 +95,7 @@ def _sums(rows: list[dict[str, Any]]) -> str:
             "B per particle": f"{r['compiled_bytes'] / r['points']:.1f}" if "compiled_bytes" in r else "·",
             "reason": r.get("reason", "")[:80],
         })  # fmt: skip
-    return "## Sums over neighbors\n\n" + _markdown(table)
+    return "## Sums over neighbors\n\n" + markdown(table)
 
 
 def _study(rows: list[dict[str, Any]]) -> str:
@@ -106,12 +107,12 @@ def _study(rows: list[dict[str, Any]]) -> str:
             "/ first": f"{r['median_s'] / first['median_s']:.3g}", "query ms": f"{1e3 * r['query_s']:.4g}",
             "pairs - exact": r["directed_pairs"] - r["exact_directed_pairs"],
         })  # fmt: skip
-    return "## What the choices cost, kernels alone\n\n" + (_markdown(table) if table else "No CUDA device: not measured.")
+    return "## What the choices cost, kernels alone\n\n" + (markdown(table) if table else "No CUDA device: not measured.")
 
 
 def _memory(rows: list[dict[str, Any]]) -> str:
     names = ("layout", "points", "capacity", "planned_bytes", "compiled_bytes", "peak_bytes", "warp_pool_bytes")
-    return "## Memory, planned and measured\n\n" + _markdown([{name: r[name] for name in names} for r in _of(rows, "memory")])
+    return "## Memory, planned and measured\n\n" + markdown([{name: r[name] for name in names} for r in _of(rows, "memory")])
 
 
 def _triangles(rows: list[dict[str, Any]]) -> str:
@@ -120,18 +121,11 @@ def _triangles(rows: list[dict[str, Any]]) -> str:
         wrong = r.get("wrong", r.get("differing", ""))
         stages = ", ".join(f"{name.removesuffix('_s')} {1e3 * r[name]:.3g}" for name in _TRIANGLE_KERNELS if name in r)
         table.append({
-            "points": f"{r['points']:,}".replace(",", " "), "dtype": r["dtype"], "cutoff": r["cutoff"], "slots": r["capacity"],
+            "points": count(r["points"]), "dtype": r["dtype"], "cutoff": r["cutoff"], "slots": r["capacity"],
             "pairs": r["pairs"], "method": r["method"], "ms": f"{1e3 * r['median_s']:.4g}", "wrong rows": wrong,
             "kernels, ms": stages, "settled": r.get("settled", ""),
         })  # fmt: skip
-    return "## Triangles around a gear\n\n" + _markdown(table) if table else ""
-
-
-def _markdown(table: list[dict[str, Any]]) -> str:
-    if not table:
-        return "No rows."
-    cells = [list(table[0]), ["---"] * len(table[0]), *(map(str, line.values()) for line in table)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+    return "## Triangles around a gear\n\n" + markdown(table) if table else ""
 
 
 def _draw(rows: list[dict[str, Any]], path: Path) -> None:

@@ -56,19 +56,15 @@ def memory_rows() -> Iterator[dict[str, Any]]:
         capacity = rounded_capacity(int(jfrnn.count(x, 1.0, backend="warp").max()))
         search = jax.jit(functools.partial(_listed, cutoff=1.0, capacity=capacity, backend="warp"))
         compiled: Any = search.lower(x).compile().memory_analysis()
-        before = _device_bytes("bytes_in_use")
+        before = _measure.device_bytes("bytes_in_use")
         jax.block_until_ready(search(x))
         plan = jfrnn.memory_plan(len(points), 1.0, capacity, backend="warp")
         yield {
             "kind": "memory", "method": "warp", "layout": name, "points": len(points), "capacity": capacity,
             "planned_bytes": plan.total_bytes, "planned_scratch_bytes": plan.scratch_bytes,
             "compiled_bytes": compiled.temp_size_in_bytes + compiled.output_size_in_bytes,
-            "peak_bytes": _device_bytes("peak_bytes_in_use") - before, "warp_pool_bytes": _warp_pool_bytes(),
+            "peak_bytes": (_measure.device_bytes("peak_bytes_in_use") or 0) - (before or 0), "warp_pool_bytes": _warp_pool_bytes(),
         }  # fmt: skip
-
-
-def _device_bytes(what: str) -> int:
-    return (jax.devices()[0].memory_stats() or {}).get(what, 0)
 
 
 def _warp_pool_bytes() -> int:
@@ -264,7 +260,7 @@ def large_rows(config: Config, n: int) -> Iterator[dict[str, Any]]:
     base = {"layout": "random", "points": n, "dtype": "float32"}
     counts = jax.jit(lambda x: jfrnn.count(x, cutoff, backend="warp"))
     row = {"kind": "call", "method": "jfrnn warp, counts", **base, "directed_pairs": int(np.asarray(counts(x)).sum(dtype=np.int64))}
-    yield row | timed(config, lambda: counts(x), calls=2) | {"peak_bytes": _device_bytes("peak_bytes_in_use")}
+    yield row | timed(config, lambda: counts(x), calls=2) | {"peak_bytes": _measure.device_bytes("peak_bytes_in_use")}
     given = ways.Given(x, jnp.ones(n, jnp.float32), cutoff)
     for gradient in (False, True) if config.sums else ():
         sums = ways.WAYS["pair_sum warp"].prepare(given, gradient, False).sums

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from experiments._commands import RetryFailed, RowsFolder, check_choice, finite, take_folder
+from experiments._commands import RetryFailed, RowsFolder, check_choice, check_names, finite, take_folder
 from experiments._errors import UsageError
 
 
@@ -55,7 +55,7 @@ def validate(
     jax.config.update("jax_enable_x64", True)
     from experiments.sph import validate
 
-    validate.check(cases or [])
+    check_names("case", cases, validate.CASES)
     return validate.report(validate.run(cases or [], take_folder(out)), out)
 
 
@@ -86,5 +86,5 @@ def gradients(
     jax.config.update("jax_enable_x64", True)
     from experiments.sph import gradients
 
-    gradients.check(names or [])
+    check_names("problem", names, gradients.NAMES)
     return gradients.run(names or [], take_folder(out), evaluations)

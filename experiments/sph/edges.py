@@ -122,11 +122,6 @@ def of_jax_md(model: Model, s: State, skin: float) -> JaxMdEdges:
     size = jnp.max(s.x, axis=0) - low + margin
     displacement, _ = space.free()
     make: Any = partition.neighbor_list(
-        displacement,
-        size,
-        model.cutoff,
-        skin,
-        capacity_multiplier=_SLACK,
-        format=partition.NeighborListFormat.Sparse,
+        displacement, size, model.cutoff, skin, capacity_multiplier=_SLACK, format=partition.NeighborListFormat.Sparse
     )
     return JaxMdEdges(make.allocate(s.x - low), low, jnp.zeros((), jnp.int32), always=skin == 0)

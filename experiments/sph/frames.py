@@ -1,9 +1,9 @@
 """Pictures of a run: a frame per snapshot, and all of them as a GIF."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
@@ -12,13 +12,10 @@ from PIL import Image
 
 from experiments.sph import view
 
-if TYPE_CHECKING:
-    from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
-
 WALL = "0.75"
 
 
-def draw(scene: "FluidScene", x: np.ndarray, v: np.ndarray, time: float, top_speed: float, path: Path) -> None:
+def draw(scene: FluidScene, x: np.ndarray, v: np.ndarray, time: float, top_speed: float, path: Path) -> None:
     """Draw particles from the side, colored by speed: the first axis to the right, the last one upwards; a solid in 3D aslant.
 
     Args:
@@ -56,7 +53,7 @@ def draw(scene: "FluidScene", x: np.ndarray, v: np.ndarray, time: float, top_spe
     figure.savefig(path, dpi=100)
 
 
-def _draw_in_space(scene: "FluidScene", x: np.ndarray, v: np.ndarray, time: float, top_speed: float, path: Path) -> None:
+def _draw_in_space(scene: FluidScene, x: np.ndarray, v: np.ndarray, time: float, top_speed: float, path: Path) -> None:
     """Draw particles that have come, and the solid, aslant from above."""
     there = np.ones(scene.n, bool) if scene.enters is None else scene.enters <= time
     scale = ScalarMappable(Normalize(0, top_speed or 1.0), "viridis")
@@ -71,14 +68,14 @@ def _draw_in_space(scene: "FluidScene", x: np.ndarray, v: np.ndarray, time: floa
     figure.savefig(path, dpi=100)
 
 
-def picture_bounds(scene: "FluidScene") -> tuple[np.ndarray, np.ndarray]:
+def picture_bounds(scene: FluidScene) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower and upper corner of what is shown."""
     if scene.bounds is None:
         return scene.positions.min(axis=0), scene.positions.max(axis=0)
     return np.array(scene.bounds.lower), np.array(scene.bounds.upper)
 
 
-def wrapped(scene: "FluidScene", x: np.ndarray) -> np.ndarray:
+def wrapped(scene: FluidScene, x: np.ndarray) -> np.ndarray:
     """Return positions inside the periodic box, where there is one."""
     if scene.periodic is None:
         return x

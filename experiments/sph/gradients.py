@@ -11,23 +11,12 @@ from jax import Array
 from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
 from matplotlib.figure import Figure
 
-from experiments._errors import UsageError
+from experiments._commands import check_names
 from experiments.sph import solver
 from experiments.sph.inverse import PROBLEMS, Found, Problem, solve
 from experiments.sph.model import Model, State, make_model, make_state
 
 NAMES = (*PROBLEMS, "memory")
-
-
-def check(names: list[str]) -> None:
-    """Refuse names that are no problems.
-
-    Raises:
-        UsageError: There is no such name.
-    """
-    unknown = [name for name in names if name not in NAMES]
-    if unknown:
-        raise UsageError(f"no problem {unknown[0]!r}; allowed: {', '.join(NAMES)}")
 
 
 def run(names: list[str], folder: Path, evaluations: int = 25) -> str:
@@ -41,7 +30,7 @@ def run(names: list[str], folder: Path, evaluations: int = 25) -> str:
     Raises:
         UsageError: There is no such name.
     """
-    check(names)
+    check_names("problem", names, NAMES)
     folder.mkdir(parents=True, exist_ok=True)
     texts = []
     for name in names or NAMES:

@@ -1,23 +1,19 @@
 """Whether a run diverges, in which step, and which particle says so."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 from experiments._errors import UsageError
 from experiments.sph import solids, solver
 from experiments.sph.forces import Neighbors
 from experiments.sph.model import Model, State
 
-if TYPE_CHECKING:
-    from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
-
 
 class DivergedError(UsageError):
     """A run went wrong; the message says in which step, and which particle."""
 
 
-def complaint(scene: "FluidScene", s: State) -> str | None:
+def complaint(scene: FluidScene, s: State) -> str | None:
     """Say which particle is not finite or went through a wall by more than half a spacing; None: all is well."""
     for name in ("x", "v", "rho", "p"):
         value = getattr(s, name)
@@ -39,7 +35,7 @@ def complaint(scene: "FluidScene", s: State) -> str | None:
     return f"particle {particle} went through a wall, to {x[particle]} at {np.asarray(s.v)[particle]} m/s"
 
 
-def check(scene: "FluidScene", model: Model, before: State, nbrs: Neighbors, after: State, steps: int, first: int) -> None:
+def check(scene: FluidScene, model: Model, before: State, nbrs: Neighbors, after: State, steps: int, first: int) -> None:
     """Raise where a chunk of steps ended badly; its steps are run again to find the one in which it began.
 
     Args:

@@ -2,21 +2,19 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
+from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 from scipy.optimize import minimize
 
 from experiments._library import LAYERS, free, lattice
 from experiments.sph import answers, solver
 from experiments.sph.model import Model, State, make_model, make_state
-
-if TYPE_CHECKING:
-    from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 
 @dataclass(frozen=True)
@@ -124,7 +122,7 @@ def jet(*, known: tuple[float, float] = (1.5, 0.8), guess: tuple[float, float] =
     return Problem("jet", "velocity at the nozzle [m/s]", np.array(guess), loss, np.array(known), steps, scene.n)
 
 
-def _jet_scene(spacing: float = 0.02, rows: int = 6, height: float = 0.3, speed: float = 1.7) -> "FluidScene":
+def _jet_scene(spacing: float = 0.02, rows: int = 6, height: float = 0.3, speed: float = 1.7) -> FluidScene:
     across = lattice((0.0, height - 1.5 * spacing), (1, 3), spacing)
     positions = np.tile(across, (rows, 1))
     physics = replace(free(1000.0, 10 * speed, spacing), artificial=0.1, gravity=(0.0, -9.81))
@@ -193,7 +191,7 @@ def steered(model: Model, s: State, forces: Array, each: int) -> State:
     return jax.lax.scan(interval, solver.begin(model, s), forces)[0]
 
 
-def droplet_scene(spacing: float = 0.04 / 3, radius: float = 0.04, length: float = 0.8) -> "FluidScene":
+def droplet_scene(spacing: float = 0.04 / 3, radius: float = 0.04, length: float = 0.8) -> FluidScene:
     """Return a droplet above the ground, which it will reach in 0.06 s."""
     grid = lattice((-radius, -radius), (round(2 * radius / spacing),) * 2, spacing)
     disc = grid[(grid**2).sum(axis=1) <= radius**2] + (0.0, 0.06)  # 2 cm above the ground
@@ -211,7 +209,7 @@ def droplet_scene(spacing: float = 0.04 / 3, radius: float = 0.04, length: float
     )
 
 
-def _at_rest(name: str, positions: np.ndarray, spacing: float, **more: Any) -> "FluidScene":  # noqa: ANN401
+def _at_rest(name: str, positions: np.ndarray, spacing: float, **more: Any) -> FluidScene:  # noqa: ANN401
     """Return a scene of particles that do not move, a square of the spacing [m] of water each; `more`: further fields."""
     masses = np.full(len(positions), 1000.0 * spacing**2)
     return fluids.FluidScene(

@@ -1,12 +1,13 @@
 """The first model and state of a scene: what acts in it, and its particles, put into JAX."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jfrnn.cases.fluids import FluidScene, Physics  # pyright: ignore[reportMissingImports]
 
 import jfrnn
 from experiments.sph import solids
@@ -14,13 +15,10 @@ from experiments.sph.kernels import KERNELS
 from experiments.sph.pairs import reach
 from experiments.sph.particles import Model, State
 
-if TYPE_CHECKING:
-    from jfrnn.cases.fluids import FluidScene, Physics  # pyright: ignore[reportMissingImports]
-
 __all__ = ["Model", "State", "make_model", "make_state"]
 
 
-def make_model(scene: "FluidScene", dtype: type = np.float64, backend: str = "auto") -> Model:
+def make_model(scene: FluidScene, dtype: type = np.float64, backend: str = "auto") -> Model:
     """Put what acts in a scene into JAX, numbers of one dtype.
 
     Raises:
@@ -50,7 +48,7 @@ def make_model(scene: "FluidScene", dtype: type = np.float64, backend: str = "au
     )
 
 
-def _check_box(scene: "FluidScene") -> None:
+def _check_box(scene: FluidScene) -> None:
     """Refuse a periodic box in which a particle might meet two images of another: the solver traces its box."""
     if scene.periodic is None:
         return
@@ -62,7 +60,7 @@ def _check_box(scene: "FluidScene") -> None:
             )
 
 
-def _check_parts(scene: "FluidScene") -> None:
+def _check_parts(scene: FluidScene) -> None:
     """Refuse what compiles and means nothing."""
     physics = scene.physics
     if physics.integrator == "leapfrog" and physics.evolve != "summation":
@@ -79,7 +77,7 @@ def _check_parts(scene: "FluidScene") -> None:
         )
 
 
-def _check_solid(physics: "Physics") -> None:
+def _check_solid(physics: Physics) -> None:
     """Refuse what walls of triangles have no integrals for."""
     for name, allowed in (
         ("evolve", ("continuity",)),
@@ -95,7 +93,7 @@ def _check_solid(physics: "Physics") -> None:
         raise ValueError("corrected must be False beside a solid: what it corrects is what the wall lacks in particles.")
 
 
-def make_state(scene: "FluidScene", dtype: type = np.float64) -> State:
+def make_state(scene: FluidScene, dtype: type = np.float64) -> State:
     """Put the particles of a scene into JAX, where they are at first; `solver.begin` does the rest.
 
     Raises:

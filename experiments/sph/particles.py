@@ -1,18 +1,16 @@
 """What a scene is made of once it is in JAX: a model, which stays, and a state, which moves. Both are pytrees."""
 
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 from jax import Array
 from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
+from jfrnn.cases.fluids import Physics, Turning  # pyright: ignore[reportMissingImports]
 
 import jfrnn
 from experiments.sph.kernels import KERNELS, Kernel
 from experiments.sph.pairs import reach
-
-if TYPE_CHECKING:
-    from jfrnn.cases.fluids import Physics, Turning  # pyright: ignore[reportMissingImports]
 
 jax.tree_util.register_dataclass(
     fluids.Physics,
@@ -42,7 +40,7 @@ class Model:
         turning: How the wall of triangles turns; None: it stays, or there is none.
     """
 
-    physics: "Physics"
+    physics: Physics
     m: Array
     wall: Array | None
     box: jfrnn.Box | None
@@ -53,7 +51,7 @@ class Model:
     spacing: float = field(metadata={"static": True})
     fluid_count: int | None = field(metadata={"static": True})
     backend: str = field(default="auto", metadata={"static": True})
-    turning: "Turning | None" = None
+    turning: Turning | None = None
 
     @property
     def kernel(self) -> Kernel:

@@ -5,10 +5,10 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
+from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 import jfrnn
 from experiments import _loop
@@ -16,9 +16,6 @@ from experiments._errors import UsageError
 from experiments.sph import forces, frames, health, settings, snapshots, solids, solver
 from experiments.sph.forces import Neighbors
 from experiments.sph.model import Model, State, make_model, make_state
-
-if TYPE_CHECKING:
-    from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 
 @dataclass(frozen=True)
@@ -40,7 +37,7 @@ class How:
     pictures: bool = True
 
 
-def run(scene: "FluidScene", folder: Path, how: How) -> State:
+def run(scene: FluidScene, folder: Path, how: How) -> State:
     """Run a scene from its beginning, or from the last snapshot of the folder, to its end.
 
     Args:
@@ -110,7 +107,7 @@ def _chunk_of_particles(model: Model, s: State, nbrs: Neighbors, steps: int) -> 
         return solver.advance(model, s, nbrs, steps)
 
 
-def _steps_to_next(scene: "FluidScene", model: Model, s: State, count: int) -> int:
+def _steps_to_next(scene: FluidScene, model: Model, s: State, count: int) -> int:
     """Return how many steps it is to the next snapshot; 0 at the end."""
     time, step = float(s.time), float(solver.courant(model, s)) if scene.step is None else scene.step
     if time > scene.duration - step / 2:
@@ -120,7 +117,7 @@ def _steps_to_next(scene: "FluidScene", model: Model, s: State, count: int) -> i
     return max(1, round((goal - time) / step))
 
 
-def _keep(scene: "FluidScene", model: Model, s: State, nbrs: Neighbors, folder: Path, step: int, how: How) -> dict[str, float]:
+def _keep(scene: FluidScene, model: Model, s: State, nbrs: Neighbors, folder: Path, step: int, how: How) -> dict[str, float]:
     """Write what belongs to a moment; return its energies."""
     line = snapshots.energies(model, s, scene)
     snapshots.add_line(line, folder / "energies.csv", step)

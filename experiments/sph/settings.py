@@ -5,17 +5,15 @@ import json
 import math
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import Any, get_type_hints
 from zipfile import BadZipFile
 
 import numpy as np
 from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
+from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 from experiments._errors import UsageError
 from experiments.sph import ranges
-
-if TYPE_CHECKING:
-    from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 PHYSICS = get_type_hints(fluids.Physics)
 LEAST_SMOOTHING, MOST_SMOOTHING = 0.1, 50.0  # in particle spacings
@@ -23,7 +21,7 @@ MOST_STEPS = 1e9
 _LARGEST_SOLID = 100  # times what the scene shows: files in millimeters are 1000 times as large as they say
 
 
-def make_scene(name: str, settings: list[str]) -> "FluidScene":
+def make_scene(name: str, settings: list[str]) -> FluidScene:
     """Return a scene with settings "key=value": of the scene's function, or of `Physics`.
 
     Raises:
@@ -62,7 +60,7 @@ def parameters(name: str) -> dict[str, Any]:
     return {key: item.annotation for key, item in inspect.signature(fluids.FLUIDS[name]).parameters.items() if key != "name"}
 
 
-def _complaint(scene: "FluidScene") -> str | None:
+def _complaint(scene: FluidScene) -> str | None:
     """Say which settings do not go together, None where they do."""
     gravity, smoothing = scene.physics.gravity, scene.physics.smoothing / scene.spacing
     fluid = scene.n if scene.wall is None else int((~scene.wall).sum())
@@ -94,7 +92,7 @@ def _value(scene: str, key: str, text: str, kind: Any) -> Any:  # noqa: ANN401
         raise UsageError(f"--set {key}: got {text!r}; {error}") from error
 
 
-def with_particles(scene: "FluidScene", path: Path) -> "FluidScene":
+def with_particles(scene: FluidScene, path: Path) -> FluidScene:
     """Return the scene with the fluid of a file; its walls stay.
 
     Args:
@@ -124,7 +122,7 @@ def with_particles(scene: "FluidScene", path: Path) -> "FluidScene":
     return _replaced(scene, positions, velocities, masses)
 
 
-def with_solid(scene: "FluidScene", path: Path, scale: float) -> "FluidScene":
+def with_solid(scene: FluidScene, path: Path, scale: float) -> FluidScene:
     """Return the scene with the triangles of a file as its solid, which stands.
 
     Args:
@@ -172,7 +170,7 @@ def _place(corner: np.ndarray) -> str:
     return "(" + ", ".join(f"{x:.3g}" for x in corner) + ")"
 
 
-def _replaced(scene: "FluidScene", positions: np.ndarray, velocities: np.ndarray, masses: np.ndarray) -> "FluidScene":
+def _replaced(scene: FluidScene, positions: np.ndarray, velocities: np.ndarray, masses: np.ndarray) -> FluidScene:
     """Return the scene with these particles, all of them there from the beginning, before its walls."""
     walls = np.zeros(scene.n, bool) if scene.wall is None else scene.wall
     return replace(
@@ -212,7 +210,7 @@ def _columns(table: np.ndarray, axes: str) -> dict[str, np.ndarray]:
     return given | ({"masses": table["m"]} if "m" in names else {})
 
 
-def described(scene: "FluidScene") -> dict[str, Any]:
+def described(scene: FluidScene) -> dict[str, Any]:
     """Return what a scene says, but its particles: what a run must have in common with one that it goes on with."""
     physics = {item.name: getattr(scene.physics, item.name) for item in fields(scene.physics)}
     return {"name": scene.name, "particles": scene.n, "duration": scene.duration, "step": scene.step, "physics": physics}

@@ -2,22 +2,20 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from zipfile import BadZipFile
 
 import jax.numpy as jnp
 import numpy as np
+from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 from experiments._commands import take_folder
 from experiments._errors import UsageError
 from experiments.sph import budget, solids
 from experiments.sph.model import Model, State
 
-if TYPE_CHECKING:
-    from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
-
-def save(state: State, scene: "FluidScene", rho: np.ndarray, p: np.ndarray, folder: Path, step: int) -> None:
+def save(state: State, scene: FluidScene, rho: np.ndarray, p: np.ndarray, folder: Path, step: int) -> None:
     """Write a state as STEP.npz, complete or not at all, and its particles that have entered as STEP.vtp."""
     folder.mkdir(parents=True, exist_ok=True)
     arrays = {name: np.asarray(value) for name, value in state._asdict().items() if value is not None and name != "solid"}
@@ -29,7 +27,7 @@ def save(state: State, scene: "FluidScene", rho: np.ndarray, p: np.ndarray, fold
     part.replace(whole)
 
 
-def latest(folder: Path, scene: "FluidScene") -> tuple[State, int] | None:
+def latest(folder: Path, scene: FluidScene) -> tuple[State, int] | None:
     """Return the last state that was saved of a scene, and its step; None where there is none."""
     paths = sorted(path for path in folder.glob("*.npz") if path.stem.isdigit())
     if not paths:
@@ -62,7 +60,7 @@ def check_same(about: dict[str, Any], folder: Path) -> None:
         raise UsageError(f"{folder}: holds a run with another {', '.join(different)}; take another folder, or remove it")
 
 
-def energies(model: Model, state: State, scene: "FluidScene") -> dict[str, float]:
+def energies(model: Model, state: State, scene: FluidScene) -> dict[str, float]:
     """Return a line of the energies: time [s], kinetic and potential energy [J], momentum [kg m/s], largest speed [m/s].
 
     Where there is a solid, also the least signed distance to it [m], infinite where nothing is within its reach.
@@ -91,7 +89,7 @@ def add_line(line: dict[str, float], path: Path, step: int) -> None:
     part.replace(path)
 
 
-def _write_vtk(arrays: dict[str, np.ndarray], scene: "FluidScene", values: dict[str, np.ndarray], path: Path) -> None:
+def _write_vtk(arrays: dict[str, np.ndarray], scene: FluidScene, values: dict[str, np.ndarray], path: Path) -> None:
     import pyvista
 
     there = np.ones(scene.n, bool) if scene.enters is None else scene.enters <= arrays["time"]

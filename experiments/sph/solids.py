@@ -11,28 +11,26 @@ that ends nearer than a gap is put one gap away; one that after that is not outs
 the wall. Rounding is many orders smaller than the gap.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
+from jfrnn.cases.fluids import FluidScene, Turning  # pyright: ignore[reportMissingImports]
 
 import jfrnn
 from experiments.sph.kernels import KERNELS, Kernel
 from experiments.sph.pairs import reach
 from experiments.sph.particles import Beside, Model, State
 
-if TYPE_CHECKING:
-    from jfrnn.cases.fluids import FluidScene, Turning  # pyright: ignore[reportMissingImports]
-
 GAP = 0.2  # particle spacings: on a lattice, particles at a wall are half a spacing away
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _PLACES, _SHARES = (_NODES + 1) / 2, _WEIGHTS / 2
 
 
-def begin(scene: "FluidScene", x: Array, angle: Array | None = None) -> Beside | None:
+def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | None:
     """Look at the solid of a scene from where its particles are; None where it has no solid.
 
     Args:
@@ -70,11 +68,11 @@ def begin(scene: "FluidScene", x: Array, angle: Array | None = None) -> Beside |
     return Beside(tri, angle, signed.mask, signed.distance, signed.normal)
 
 
-def _reach(scene: "FluidScene") -> float:
+def _reach(scene: FluidScene) -> float:
     return reach(KERNELS[scene.physics.kernel], scene.physics.smoothing)
 
 
-def turning_of(scene: "FluidScene", dtype: np.dtype | type) -> "Turning | None":
+def turning_of(scene: FluidScene, dtype: np.dtype | type) -> Turning | None:
     """Return how the solid of a scene turns, numbers of a dtype; None where it stands, or is none."""
     turning = scene.solid and scene.solid.turning
     if turning is None:
@@ -83,16 +81,16 @@ def turning_of(scene: "FluidScene", dtype: np.dtype | type) -> "Turning | None":
     return fluids.Turning(jnp.asarray(turning.center, dtype), axis, jnp.asarray(turning.rate, dtype))
 
 
-def into_frame(x: Array, turning: "Turning | None", angle: Array | None) -> Array:
+def into_frame(x: Array, turning: Turning | None, angle: Array | None) -> Array:
     """Return positions [n, d] as the wall sees them that has turned by an angle [rad]: it stands, they have turned back."""
     return x if turning is None or angle is None else turning.center + _turned(x - turning.center, turning, -angle)
 
 
-def _out_of_frame(x: Array, turning: "Turning | None", angle: Array | None) -> Array:
+def _out_of_frame(x: Array, turning: Turning | None, angle: Array | None) -> Array:
     return x if turning is None or angle is None else turning.center + _turned(x - turning.center, turning, angle)
 
 
-def _turned(r: Array, turning: "Turning | None", angle: Array | None) -> Array:
+def _turned(r: Array, turning: Turning | None, angle: Array | None) -> Array:
     """Turn vectors [n, d]. Source: Rodrigues (1840)."""
     if turning is None or angle is None:
         return r
@@ -103,7 +101,7 @@ def _turned(r: Array, turning: "Turning | None", angle: Array | None) -> Array:
     return along + (r - along) * cosine + _across(r, turning) * sine
 
 
-def _across(r: Array, turning: "Turning") -> Array:
+def _across(r: Array, turning: Turning) -> Array:
     """Return axis × r, shape [n, d]."""
     return jnp.stack([-r[:, 1], r[:, 0]], axis=1) if turning.axis is None else jnp.cross(turning.axis, r)
 
@@ -249,7 +247,7 @@ def rim_speed(model: Model, beside: Beside) -> Array:
     return jnp.abs(model.turning.rate) * jnp.max(jnp.linalg.norm(corners - model.turning.center, axis=1))
 
 
-def clearance(scene: "FluidScene", s: State) -> np.ndarray | None:
+def clearance(scene: FluidScene, s: State) -> np.ndarray | None:
     """Return the signed distances [m] of the fluid to the solid of its scene, shape [n], infinite where it is beyond reach.
 
     Triangles are searched and distances computed anew, at the positions of the state.

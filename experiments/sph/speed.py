@@ -7,12 +7,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
+from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 from pydantic import Field, FiniteFloat, field_validator
 
 from experiments import _machine, _measure, _sweep
@@ -23,9 +24,6 @@ from experiments.sph import edges, solver
 from experiments.sph import tradeoff as known_flow
 from experiments.sph.model import Model, State, make_model, make_state
 from experiments.sph.stages import part_times
-
-if TYPE_CHECKING:
-    from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 Prepare = Callable[[Model, State, float], Any]
 WAYS: dict[str, Prepare] = {
@@ -164,7 +162,7 @@ def _measured(group: list[Spec]) -> list[StepRow]:
 
 
 @functools.lru_cache(maxsize=1)
-def _begun(name: str, nx: int, rate: float, dtype: str) -> tuple["FluidScene", Model, State]:
+def _begun(name: str, nx: int, rate: float, dtype: str) -> tuple[FluidScene, Model, State]:
     """Return a moving scene and its first state; the last one is kept, since rows of it follow."""
     scene, number = moving(fluids.fluid(name, nx=nx), rate), np.dtype(dtype).type
     model = make_model(scene, number)
@@ -177,7 +175,7 @@ def _row(spec: "Spec | known_flow.Spec", kind: str, seen: dict[str, Any]) -> Ste
     return StepRow(**values)
 
 
-def moving(scene: "FluidScene", rate: float) -> "FluidScene":
+def moving(scene: FluidScene, rate: float) -> FluidScene:
     """Return the scene with a fluid that moves by rate·(x, 0, -z), in 2D rate·(x, -z): without divergence, along its walls."""
     flow = np.zeros_like(scene.positions)
     flow[:, 0], flow[:, -1] = rate * scene.positions[:, 0], -rate * scene.positions[:, -1]

@@ -5,9 +5,8 @@ from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 
-from experiments._plots import COLORS, OTHER_COLORS, label_logarithmic
+from experiments._plots import COLORS, OTHER_COLORS, dress
 from experiments.sph.speed import StepRow
 from experiments.sph.stages import STAGES
 
@@ -42,7 +41,7 @@ def steps(rows: list[StepRow]) -> list[dict[str, Any]]:
             "particle-steps/s": row.particle_steps_per_s,
         }
         line |= {"faster": faster, "rebuilds": row.rebuilds, "MB": row.bytes and row.bytes / 1e6, "roundings": row.difference}
-        lines.append(line | {"status": _status(row)})
+        lines.append(line | {"status": row.outcome})
     return lines
 
 
@@ -52,7 +51,7 @@ def stages(rows: list[StepRow]) -> list[dict[str, Any]]:
     return [
         {"particles": row.particles, "way": row.way}
         | {f"{name} [ms]": 1e3 * row.parts[name] if row.parts else None for name in STAGES}
-        | {"status": _status(row)}
+        | {"status": row.outcome}
         for row in of
     ]
 
@@ -63,13 +62,9 @@ def tradeoff(rows: list[StepRow]) -> list[dict[str, Any]]:
     return [
         {"nx": row.nx, "dtype": row.dtype, "way": row.way, "skin": row.skin, "steps": row.steps, "seconds": row.seconds}
         | row.error
-        | {"rebuilds": row.rebuilds, "status": _status(row)}
+        | {"rebuilds": row.rebuilds, "status": row.outcome}
         for row in of
     ]
-
-
-def _status(row: StepRow) -> str:
-    return (row.status if row.reason is None else f"{row.status}: {row.reason}")[:100]
 
 
 def draw_stages(rows: list[StepRow]) -> Figure:
@@ -106,12 +101,7 @@ def draw_tradeoff(rows: list[StepRow]) -> Figure:
     for row in (row for row in rows if (row.dtype, row.skin) == (rows[0].dtype, rows[0].skin)):
         at = row.seconds or 0, row.error["l2 of velocity"]
         axes.annotate(f"{row.nx}²", at, xytext=(4, 4), textcoords="offset points", fontsize=8)
-    axes.set(xscale="log", yscale="log", xlabel="run, compilation left out [s]", ylabel="velocity, relative L2 error")
+    dress(axes, "run, compilation left out [s]", "velocity, relative L2 error")
     axes.set_title(f"Taylor-Green vortices, Re = 100, {rows[0].device}", fontsize=10)
-    for axis in (axes.xaxis, axes.yaxis):
-        label_logarithmic(axis)
-        axis.set_minor_formatter(NullFormatter())
-    axes.grid(True, which="major", color="0.9", linewidth=0.8)
-    axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize=8, frameon=False)
     return figure

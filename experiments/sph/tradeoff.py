@@ -4,17 +4,15 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import product
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
+from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 from pydantic import Field, FiniteFloat
 
 from experiments._config import Dtype, Positive, Table, digest
 from experiments._library import taylor_green_velocity
-
-if TYPE_CHECKING:
-    from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 _REYNOLDS = 100.0  # of the scene, by default
 
@@ -80,7 +78,7 @@ def measure(spec: Spec) -> dict[str, Any]:
     return row | {"status": "ok", "error": error}
 
 
-def _errors(scene: "FluidScene", x: np.ndarray, v: np.ndarray, time: float) -> dict[str, float]:
+def _errors(scene: FluidScene, x: np.ndarray, v: np.ndarray, time: float) -> dict[str, float]:
     """Return relative errors of positions and velocities [n, 2] at a time [s], by name."""
     exact = taylor_green_velocity(x, time, _REYNOLDS)
     speed, known = (np.linalg.norm(u, axis=1) for u in (v, exact))

@@ -12,7 +12,7 @@ from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
 from matplotlib.figure import Figure as Picture
 
 from experiments import _machine
-from experiments._errors import UsageError
+from experiments._commands import check_names
 from experiments._loop import Task, fill
 from experiments._rows import Row, RowFile
 from experiments.sph import health, solver
@@ -32,24 +32,13 @@ class CaseRow(Row):
     axes: tuple[str, str] = ("", "")  # of the picture
 
 
-def check(names: list[str]) -> None:
-    """Refuse names that are no cases.
-
-    Raises:
-        UsageError: There is no such case.
-    """
-    unknown = [name for name in names if name not in CASES]
-    if unknown:
-        raise UsageError(f"no case {unknown[0]!r}; allowed: {', '.join(CASES)}")
-
-
 def run(names: list[str], folder: Path) -> list[CaseRow]:
     """Run the cases that the folder does not hold yet, and return the rows of all that were asked for: all, where none are.
 
     Raises:
         UsageError: There is no such case.
     """
-    check(names)
+    check_names("case", names, CASES)
     tasks = [Task((name,), name, lambda shown, name=name: [measure(name, CASES[name], shown.label)]) for name in names or CASES]
     return fill(RowFile(folder, CaseRow), tasks, _in_words, about={"versions": _machine.versions()})
 

@@ -4,17 +4,15 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 from experiments._library import taylor_green_velocity
 from experiments.sph import answers, budget, forces, potential
 from experiments.sph.model import Model, State
-
-if TYPE_CHECKING:
-    from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 Curves = dict[str, list[list[float]]]
 
@@ -59,7 +57,7 @@ class Case:
 
     scene: str
     times: tuple[float, ...]
-    judge: Callable[["FluidScene", list[Seen]], tuple[list[Figure], Curves]]
+    judge: Callable[[FluidScene, list[Seen]], tuple[list[Figure], Curves]]
     settings: dict[str, Any] = field(default_factory=dict)
     backend: str = "auto"
     axes: tuple[str, str] = ("time [s]", "energy [J]")
@@ -70,7 +68,7 @@ def _measures(model: Model, s: State) -> tuple[jax.Array, ...]:
     return forces.density_and_pressure(model, s)[1], budget.kinetic_energy(model, s), budget.potential_energy(model, s)
 
 
-def look(scene: "FluidScene", model: Model, s: State) -> Seen:
+def look(scene: FluidScene, model: Model, s: State) -> Seen:
     """Return what is to be seen of a state."""
     fluid = np.ones(scene.n, bool) if scene.wall is None else ~scene.wall
     p, kinetic, potential = _measures(model, s)
@@ -96,7 +94,7 @@ def means(x: np.ndarray, y: np.ndarray, edges: np.ndarray) -> list[list[float]]:
     return curve(x_sums[some] / counts[some], y_sums[some] / counts[some])
 
 
-def few(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
+def few(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
     """Energies of one to four particles; what is below 1 mJ is compared to 1e-12 J."""
     expected = answers.table(f"sph2d_{scene.name}_simultaneous")
     found = np.array([[at.kinetic, at.potential] for at in seen])
@@ -108,7 +106,7 @@ def few(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
     return [Figure("energies, largest relative error", float(error.max()), None, 1e-9)], curves
 
 
-def taylor_green(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
+def taylor_green(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
     """Kinetic energy against the exact decay, and the mean error of speeds."""
     times = np.array([at.time for at in seen])
     kinetic, exact = np.array([at.kinetic for at in seen]), 0.25 * np.exp(-16 * np.pi**2 * times / 100)
@@ -122,7 +120,7 @@ def taylor_green(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], C
     return figures, {"measured": curve(times, kinetic), "known": curve(times, exact)}
 
 
-def channel(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
+def channel(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
     """Profiles between plates."""
     exact = {"poiseuille": answers.poiseuille, "couette": answers.couette}[scene.name]
     errors = [relative(at.v[:, 0], exact(at.x[:, 1], at.time)) for at in seen]
@@ -138,7 +136,7 @@ def channel(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves
     return figures, curves
 
 
-def cavity(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
+def cavity(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
     """Velocities along the middle lines of the cavity, Re = 100."""
     figures, curves, last = [], {}, seen[-1]
     for k, (name, line, target) in enumerate((("u", "ghia1982_u_x0.5", 0.008), ("v", "ghia1982_v_y0.5", 0.010))):
@@ -156,7 +154,7 @@ def cavity(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]
     return figures, curves
 
 
-def drop(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
+def drop(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
     """The half major axis of the ellipse: by second moments and by its outermost particle, against the disc."""
     times, start = np.array([at.time for at in seen]), (scene.positions[:, 1] ** 2).mean()
     exact = answers.drop_axis(times)
@@ -169,7 +167,7 @@ def drop(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
     return figures, {"measured": curve(times, moments), "known": curve(times, exact)}
 
 
-def square_drop(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
+def square_drop(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
     """Pressure in the middle over Laplace's σ/R, and how round the rim is: its distance from the center over R, the volume's."""
     tension = scene.physics.surface_tension
     assert tension is not None, "a drop that nothing makes round"
@@ -188,7 +186,7 @@ def square_drop(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Cu
     return figures, {"measured": curve(times, np.array(inside)), "known": curve(times, np.ones_like(times))}
 
 
-def hydrostatic(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Curves]:
+def hydrostatic(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
     """Pressure over height, damping being over, and the largest speed left."""
     height, last = 0.9, seen[-1]
     worst = max(relative(at.p, 1000 * (height - at.x[:, 1])) for at in seen)
@@ -197,7 +195,7 @@ def hydrostatic(scene: "FluidScene", seen: list[Seen]) -> tuple[list[Figure], Cu
     return figures, {"measured": means(last.x[:, 1], last.p, np.linspace(0, 0.95, 39)), "known": curve(y, 1000 * (height - y))}
 
 
-def dam_break(scene: "FluidScene", seen: list[Seen], perfect: bool = True) -> tuple[list[Figure], Curves]:
+def dam_break(scene: FluidScene, seen: list[Seen], perfect: bool = True) -> tuple[list[Figure], Curves]:
     """The front in column widths over t√(2g/a), as far as the tank lets it run; times count from the start, nothing is shifted.
 
     A perfect fluid is 20 % ahead of the experiment at T = 1.2: what holds the front back there (how the column was let go; friction

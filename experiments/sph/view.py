@@ -1,11 +1,9 @@
 """A look at fluid and solid in space, aslant from above: a depth buffer that holds triangles and balls."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from jfrnn.cases.fluids import FluidScene, Turning  # pyright: ignore[reportMissingImports]
+from jfrnn.cases.fluids import FluidScene, Turning  # pyright: ignore[reportMissingImports]
 
 PIXELS = 640  # of the wider side
 _AZIMUTH, _ELEVATION = np.radians(35.0), np.radians(25.0)
@@ -30,7 +28,7 @@ class _Canvas(NamedTuple):
         return flat, points @ _AHEAD
 
 
-def render(scene: "FluidScene", x: np.ndarray, colors: np.ndarray, time: float) -> np.ndarray:
+def render(scene: FluidScene, x: np.ndarray, colors: np.ndarray, time: float) -> np.ndarray:
     """Return a picture of the solid of a scene in 3D and of particles, as balls of their volume.
 
     Args:
@@ -50,7 +48,7 @@ def render(scene: "FluidScene", x: np.ndarray, colors: np.ndarray, time: float) 
     return canvas.colors[::-1]
 
 
-def turned(vertices: np.ndarray, turning: "Turning | None", time: float) -> np.ndarray:
+def turned(vertices: np.ndarray, turning: Turning | None, time: float) -> np.ndarray:
     """Return the corners of a solid [v, d] at a time [s]."""
     if turning is None:
         return vertices
@@ -63,7 +61,7 @@ def turned(vertices: np.ndarray, turning: "Turning | None", time: float) -> np.n
     return np.array(turning.center) + along + (r - along) * np.cos(angle) + across * np.sin(angle)
 
 
-def _canvas(scene: "FluidScene") -> _Canvas:
+def _canvas(scene: FluidScene) -> _Canvas:
     bounds = np.stack([scene.positions.min(axis=0), scene.positions.max(axis=0)])
     if scene.bounds is not None:
         bounds = np.array([scene.bounds.lower, scene.bounds.upper])
