@@ -3,7 +3,8 @@
 from jfrnn._search.chunks import run_chunk
 from jfrnn._search.exports import MOST_PAIRS, saturating_add
 from jfrnn._search.geometry import norms
-from jfrnn._search.neighbor_list import ROWS_ARE_WHOLE, NeighborList, rounded_capacity
+from jfrnn._search.making import rounded_capacity
+from jfrnn._search.neighbor_list import ROWS_ARE_WHOLE, NeighborList
 from jfrnn._search.problem import Problem, checked_problem
 from jfrnn._search.search import count, search
 from jfrnn._search.verlet import list_radius, moved_too_far

@@ -1,9 +1,12 @@
-"""The result of a search: a padded neighbor list, its checks, its geometry and its exports."""
+"""The result of a search: a padded neighbor list, its checks, its geometry and its exports.
+
+The file is long because every method of a public class stands in it with its whole docstring; what methods do stands in the files
+beside it.
+"""
 
 import dataclasses
-import functools
 import math
-from typing import Any, overload
+from typing import overload
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +14,7 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._engine import Inputs, Options, count_rows, list_rows, without_inactive
+from jfrnn._engine import Inputs, without_inactive
 from jfrnn._geometry import (
     Batch,
     Box,
@@ -34,11 +37,11 @@ from jfrnn._geometry import (
 )
 from jfrnn._search.exports import DenseNeighbors, checked_total, flat_pairs, pair_total
 from jfrnn._search.geometry import ImageCodes, ImagesMade, lattice_shifts, norms, open_vectors, periodic_vectors
+from jfrnn._search.making import counted_capacity, found_fields, rounded_capacity
 from jfrnn._search.problem import Given, Problem
-from jfrnn._search.verlet import Verlet, first_verlet, moved_too_far
+from jfrnn._search.verlet import Verlet, moved_too_far
 from jfrnn._tracing import at_once, call_apart, compiled, own_transfers
 
-_CAPACITY_STEP = 8
 ROWS_ARE_WHOLE = Status.NONFINITE | Status.TOTAL_OVERFLOW  # bits with which every row has all its neighbors
 
 
@@ -559,19 +562,6 @@ class NeighborList:
         return sources, rows
 
 
-def rounded_capacity(slots: int) -> int:
-    """Round a capacity up, so that similar scenes share one compiled program."""
-    return -(-slots // _CAPACITY_STEP) * _CAPACITY_STEP
-
-
-def counted_capacity(inputs: Inputs, options: Options, slack: float) -> int:
-    """Count the neighbors of concrete positions and return a capacity that holds `slack` times the longest row."""
-    with at_once(), own_transfers():
-        longest = int(count_rows(inputs, options)[1])
-    wanted = math.ceil(max(longest, 1) * slack)
-    return min(rounded_capacity(wanted), max(wanted, inputs.sources.shape[0]))
-
-
 @compiled
 def _update(
     nbrs: NeighborList, sources: Array, queries: Array | None, active: Array | None, box: Box | None, radii: Radii | None
@@ -597,18 +587,3 @@ def _update(
 def _remade(nbrs: NeighborList, inputs: Inputs, capacity: int) -> NeighborList:
     """Make a list with the options of this one, and nothing of its past."""
     return dataclasses.replace(nbrs, **found_fields(inputs, nbrs.problem.options, capacity, nbrs.skin > 0))
-
-
-@functools.partial(compiled, static_argnames=("options", "capacity", "moving"))
-def found_fields(inputs: Inputs, options: Options, capacity: int, moving: bool) -> dict[str, Any]:
-    """Search, and return the fields of a list that come from data; `moving`: it has a skin. The compiled program of `search`.
-
-    Being results of one program, they share no memory with the caller's arrays, or with each other: either may be donated.
-    """
-    found = list_rows(inputs, options, capacity)
-    rows, sources = found.rows, without_inactive(inputs.sources, inputs.active)
-    codes = None if found.images is None or found.turns is None else ImageCodes(found.images, *found.turns)
-    radii = lax.stop_gradient(inputs.cutoff) if isinstance(inputs.cutoff, Radii) else None
-    verlet = first_verlet(sources, inputs.queries, inputs.box, radii) if moving else None
-    fields = {"idx": rows.idx, "count": rows.counts, "status": rows.status, "required": rows.required}
-    return fields | {"verlet": verlet, "box": lax.stop_gradient(inputs.box), "images": codes, "radii": radii, "batch": inputs.batch}

@@ -10,7 +10,8 @@ from jfrnn._geometry import (
     checked_capacity,
     checked_slack,
 )
-from jfrnn._search.neighbor_list import NeighborList, counted_capacity, found_fields
+from jfrnn._search.making import counted_capacity, found_fields
+from jfrnn._search.neighbor_list import NeighborList
 from jfrnn._search.problem import checked_problem
 from jfrnn._tracing import call_apart, own_transfers
 
