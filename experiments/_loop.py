@@ -65,7 +65,7 @@ def fill(
     *,
     retry_failed: bool = False,
     about: dict[str, Any] | None = None,
-    begin: Callable[[list[Task[RowT]], list[RowT], Shown], None] | None = None,
+    begin: Callable[[list[Task[RowT]], list[RowT], Shown], None] = lambda left, there, shown: None,
 ) -> list[RowT]:
     """Measure what a file does not hold yet, and return the rows of all tasks.
 
@@ -87,19 +87,26 @@ def fill(
         total, missing = (sum(len(task.keys) for task in some) for some in (tasks, left))
         told = {"machine": _machine.machine(), **_machine.commit(), **(about or {})} if left else {}
         with show(total, total - missing) as shown:
-            if begin is not None:
-                begin(left, list(there.values()), shown)
+            if missing < total:
+                shown.say(f"{total - missing} of {total} rows are there already")
+            begin(left, list(there.values()), shown)
             for task in left:
-                shown.label(task.label)
-                for row in task.measure(shown):
-                    stamped = _stamp(row, told)
-                    file.append(stamped)
-                    if (line := describe(stamped)) is not None:
-                        shown.say(line)
-                shown.advance(len(task.keys))
+                _measure(task, file, describe, told, shown)
         place = {key: number for number, key in enumerate(key for task in tasks for key in task.keys)}
         rows = [(place.get(str(_column(row, "key")).partition("/")[0]), row) for row in file.read()]
         return [row for number, row in sorted(((n, r) for n, r in rows if n is not None), key=lambda pair: pair[0])]
+
+
+def _measure(
+    task: Task[RowT], file: RowFile[RowT], describe: Callable[[RowT], str | None], about: dict[str, Any], shown: Shown
+) -> None:
+    shown.label(task.label)
+    for row in task.measure(shown):
+        stamped = _stamp(row, about)
+        file.append(stamped)
+        if (line := describe(stamped)) is not None:
+            shown.say(line)
+    shown.advance(len(task.keys))
 
 
 def in_parts(key: str, rows: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:

@@ -4,6 +4,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from statistics import geometric_mean
 
@@ -50,21 +51,10 @@ def draw_all(rows: Sequence[SearchRow], folder: Path, origin: str) -> list[Path]
     if not good:
         return []
 
-    def seconds(row: SearchRow) -> float | None:
-        return row.median_s
-
     def memory(row: SearchRow) -> float | None:
         return _table.megabytes(row.search_bytes or row.peak_bytes)
 
-    def thesis_seconds(figures: _thesis.Figures) -> float:
-        return figures.seconds
-
-    def thesis_memory(figures: _thesis.Figures) -> float:
-        return figures.megabytes
-
-    def density(row: SearchRow) -> float | None:
-        return row.density_error
-
+    seconds, density, thesis_seconds, thesis_memory = map(attrgetter, ("median_s", "density_error", "seconds", "megabytes"))
     speed = SECONDS.split(";")[0]
     wanted: tuple[tuple[str, Value, Callable[[], Figure]], ...] = (
         ("runtime_by_layout", seconds, partial(_by_layout, good, seconds, thesis_seconds, SECONDS)),

@@ -63,8 +63,6 @@ class _Sweep:
         """Say what is there, what is not installed, and how long the rest will take."""
         self.pending = [self.tasks[task.keys[0]][0] for task in left]
         self.done, self.forecast = 0, Forecast(self.pending, there)
-        if len(left) < len(self.tasks):
-            shown.say(f"{len(self.tasks) - len(left)} of {len(self.tasks)} rows are there already")
         if absent := self.forecast.absent:
             count = sum(spec.method in absent for spec in self.pending)
             names = f"{', '.join(absent)} ({methods.HOW_TO_INSTALL})"

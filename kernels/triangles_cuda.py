@@ -14,8 +14,8 @@ are sorted by cells of a grid over the wall.
 A thread writes its own row, in the order of the CPU kernel: rows are the same bits in every run, and those of the CPU for the same
 cells or tree. No product is contracted with a sum, so that the same text on the CPU decides with the same floats.
 
-The floor of 1 000 000 particles at random around a gear of 12 160 faces (`python -m experiments triangles`), float32, counted on
-the CPU, for cutoffs of 0.1 | 0.3 | 0.8 modules: 4 | 3 | 2 sizes of cells; 0.68 | 0.66 | 0.78 million particles with candidates;
+The floor of 1 000 000 particles at random around a gear of 12 160 faces (`python -m experiments bench triangles`), float32, counted
+on the CPU, for cutoffs of 0.1 | 0.3 | 0.8 modules: 4 | 3 | 2 sizes of cells; 0.68 | 0.66 | 0.78 million particles with candidates;
 9.9 | 19 | 121 million candidates, of which 0.67 | 3.0 | 19 million boxes hold the particle; 0.15 | 1.2 | 9.9 million pairs.
 Bytes: rows of 16 | 32 | 128 slots, 64 | 128 | 512 MB, 12 MB of positions, 4 MB of counts, 20 MB to sort by: 23 | 38 | 130 us at
 4.3 TB/s; entries (4 MB) and tables stay in L2. Operations: 20 per candidate, 350 per box, in all 0.4 | 1.4 | 9.1 billion, which 30

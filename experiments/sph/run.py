@@ -52,9 +52,7 @@ def run(scene: FluidScene, folder: Path, how: How) -> State:
         UsageError: The folder holds another run, or the scene cannot be run.
         DivergedError: A particle is not finite, or went through a wall.
     """
-    arrays = (scene.positions, scene.velocities, scene.masses, *((scene.solid.vertices, scene.solid.faces) if scene.solid else ()))
-    given = hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays))
-    about = settings.described(scene) | {"dtype": how.dtype, "frames": how.frames, "given": given.hexdigest()[:12]}
+    about = settings.described(scene) | {"dtype": how.dtype, "frames": how.frames, "given": _digest(scene)}
     try:
         model = make_model(scene, np.dtype(how.dtype).type)
         first = None if (folder / "run.json").exists() else make_state(scene, np.dtype(how.dtype).type)  # refused before
@@ -85,6 +83,12 @@ def run(scene: FluidScene, folder: Path, how: How) -> State:
     if how.pictures:
         frames.animate(folder / "frames", folder / f"{scene.name}.gif")
     return s
+
+
+def _digest(scene: FluidScene) -> str:
+    """Return 12 hex digits that stand for the particles and the solid of a scene."""
+    arrays = (scene.positions, scene.velocities, scene.masses, *((scene.solid.vertices, scene.solid.faces) if scene.solid else ()))
+    return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()[:12]
 
 
 def _chunk(model: Model, s: State, nbrs: Neighbors, steps: int) -> tuple[State, Neighbors]:

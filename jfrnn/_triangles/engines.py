@@ -46,7 +46,7 @@ _TREE = TriangleEngine("bvh", True, grow_tree, *_BY_WARP)
 TRIANGLE_ENGINES = {engine.name: engine for engine in (_JAX, _CELLS, _TREE)}
 TRIANGLE_BACKENDS = ("auto", *TRIANGLE_ENGINES)
 
-# Where Warp runs: which of its two engines "auto" takes, by platform. `python -m experiments triangles` and `gpu
+# Where Warp runs: which of its two engines "auto" takes, by platform. `python -m experiments bench triangles` and `gpu
 # experiments/configs/h200_triangles.toml`, rows in experiments/results/triangles: on the CPU the tree takes 0.2 to 1.2 times as
 # long as the cells around gears of 1 280 to 200 640 faces, at cutoffs from a hundredth of a module to 0.8, a wall anew 0.1 to 0.9
 # times. On an H200 it takes 1.0 to 2.1 times as long, a wall anew 0.3 to 0.8 times.
