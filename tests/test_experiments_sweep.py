@@ -86,7 +86,7 @@ def test_times_and_memory_of_a_row_fit_together(swept):
         assert row["first_s"] > 0
         assert row["list_bytes"] + row["scratch_bytes"] == row["search_bytes"] <= row["peak_bytes"]
     for row in swept.rows()[:3]:
-        assert row["first_s"] < 0.1 < row["compile_s"], row["method"]
+        assert row["first_s"] < row["compile_s"], row["method"]  # compiled before, whatever the machine does besides
         assert row["allocate_s"] > 0
 
 
