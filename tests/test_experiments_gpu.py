@@ -133,7 +133,7 @@ def test_triangles_are_decided_timed_and_reported(tmp_path, monkeypatch):
     given = load(CONFIG.with_name("h200_triangles.toml"))
     gear = given.triangles[0].model_copy(update={"points": [500], "faces": 500, "cutoffs": [0.5], "dtypes": ["float32"]})
     exact = given.exactness[0].model_copy(update={"dims": [2], "dtypes": ["float64"]})
-    small = {"exactness": [exact], "triangles": [gear], "calls": 2, "steps": 2, "repeats": 2, "seconds_per_timing": 0.1}
+    small = {"exactness": [exact], "triangles": (gear,), "calls": 2, "steps": 2, "repeats": 2, "seconds_per_timing": 0.1}
     assert run.run(given.model_copy(update=small), tmp_path) == 0
     rows = [json.loads(line) for line in (tmp_path / "rows.jsonl").read_text().splitlines()]
     assert [row["kind"] for row in rows] == ["exactness", "ceiling", *["triangles"] * 12]

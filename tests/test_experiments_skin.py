@@ -15,7 +15,7 @@ def test_rows_say_how_often_the_list_was_made(monkeypatch, tmp_path, backends):
     table = pd.read_csv(tmp_path / "cpu.csv")
     assert tuple(table["backend"]) == backends
     assert set(table["keep_rebuilds"]) == {0}
-    assert set(table["rebuild_rebuilds"]) == {3}
+    assert (table["rebuild_rebuilds"] == table["steps"]).all()
     assert (table[["keep_ms", "rebuild_ms"]] > 0).all(axis=None)
 
 
