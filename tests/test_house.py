@@ -141,6 +141,17 @@ def test_no_circles(folder, name):
     assert circles(graph) == []
 
 
+def test_experiments_take_what_is_private_in_one_file():
+    private = re.compile(r"jfrnn\.(_|kernels|cases\._)")
+    found = {
+        path.name
+        for path in (ROOT / "experiments").rglob("*.py")
+        for source, name in taken_from(path)
+        if private.match(f"{source}.{name}")
+    }
+    assert found == {"_library.py"}
+
+
 def test_nothing_imports_experiments():
     for folder in ALLOWED:
         for path in (ROOT / folder).rglob("*.py"):
