@@ -29,7 +29,7 @@ from jfrnn._engine.problem import (
 from jfrnn._engine.rows import count_rows, fold_pairs, list_rows
 from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit
 from jfrnn._engine.serving import on_cpu, on_cuda
-from jfrnn._engine.start import kernels_of, level_of_caller, load_warp
+from jfrnn._engine.start import WarpArray, WarpKernel, kernels_of, level_of_caller, load_warp
 from jfrnn._engine.warp import PLATFORMS
 from jfrnn._engine.warp_sums import pair_sums
 
@@ -51,6 +51,8 @@ __all__ = [
     "Search",
     "Slots",
     "Visit",
+    "WarpArray",
+    "WarpKernel",
     "as_float",
     "ask_for_huge_pages",
     "checked_backend",

@@ -1,7 +1,7 @@
 """The public `Box`: along which lattice vectors space repeats itself."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jfrnn._tracing import own_transfers
+from jfrnn._tracing import Given, own_transfers
+
+Numbers = Any  # an array of NumPy or of JAX, traced or not
 
 
 @jax.tree_util.register_pytree_with_keys_class
@@ -24,16 +26,16 @@ class Box:
         images: For each axis, over how many cells to either side a pair may reach; None: see `Box`. Static.
     """
 
-    vectors: Any
-    origin: Any
+    vectors: Numbers
+    origin: Numbers
     periodic: tuple[bool, ...]
     images: tuple[int, ...] | None
 
     def __init__(
         self,
-        lengths_or_matrix: Any,  # noqa: ANN401
+        lengths_or_matrix: Given,
         periodic: bool | Sequence[bool] = True,
-        origin: Any = 0.0,  # noqa: ANN401
+        origin: Given = 0.0,
         *,
         images: int | Sequence[int] | None = None,
     ) -> None:
@@ -71,7 +73,7 @@ class Box:
             check_box_values(vectors, corner, flags)
         self._set(vectors, corner if corner.shape else corner + np.zeros(dim, corner.dtype), flags, reach)
 
-    def _set(self, vectors: Any, origin: Any, periodic: tuple[bool, ...], images: tuple[int, ...] | None) -> None:  # noqa: ANN401
+    def _set(self, vectors: Numbers, origin: Numbers, periodic: tuple[bool, ...], images: tuple[int, ...] | None) -> None:
         for name, value in (("vectors", vectors), ("origin", origin), ("periodic", periodic), ("images", images)):
             object.__setattr__(self, name, value)
 
@@ -81,10 +83,11 @@ class Box:
         return tuple(zip(keys, (self.vectors, self.origin), strict=True)), (self.periodic, self.images)
 
     @classmethod
-    def tree_unflatten(cls, static: Any, arrays: Any) -> "Box":  # noqa: ANN401
+    def tree_unflatten(cls, static: tuple[tuple[bool, ...], tuple[int, ...] | None], arrays: Iterable[Numbers]) -> "Box":
         """Make a box of arrays that nobody checks again."""
         box = object.__new__(cls)
-        box._set(*arrays, *static)
+        vectors, origin = arrays
+        box._set(vectors, origin, *static)
         return box
 
     @property
@@ -98,7 +101,7 @@ class Box:
         return np.ndim(self.vectors) == 1
 
 
-def _real(name: str, value: Any) -> Any:  # noqa: ANN401
+def _real(name: str, value: Given) -> Numbers:
     """Return floats, a traced array as it is and everything else as a NumPy array of its own."""
     if isinstance(value, Tracer):
         if not jnp.issubdtype(value.dtype, jnp.floating):
@@ -110,7 +113,7 @@ def _real(name: str, value: Any) -> Any:  # noqa: ANN401
     return array.astype(array.dtype if array.dtype in (np.float32, np.float64) else np.float64)  # a copy, whoever changes the other
 
 
-def _per_axis(name: str, value: Any, dim: int, kinds: tuple[type, ...], what: str, least: int | None = None) -> tuple[Any, ...]:  # noqa: ANN401
+def _per_axis(name: str, value: Given, dim: int, kinds: tuple[type, ...], what: str, least: int | None = None) -> tuple[Any, ...]:
     values = tuple(value) if isinstance(value, Sequence | np.ndarray) else (value,) * dim
     right = all(isinstance(v, kinds) and (least is None or (not isinstance(v, bool) and v >= least)) for v in values)
     if not right:
@@ -120,7 +123,7 @@ def _per_axis(name: str, value: Any, dim: int, kinds: tuple[type, ...], what: st
     return tuple(v.item() if isinstance(v, np.generic) else v for v in values)
 
 
-def check_box_values(vectors: Any, origin: Any, periodic: tuple[bool, ...]) -> None:  # noqa: ANN401
+def check_box_values(vectors: Numbers, origin: Numbers, periodic: tuple[bool, ...]) -> None:
     for name, value in (("lengths_or_matrix", vectors), ("origin", origin)):
         if not isinstance(value, Tracer) and not np.isfinite(value).all():
             raise ValueError(f"{name} must be finite, got {value.tolist()}.")

@@ -5,7 +5,6 @@ Keys are computed in two uint32 words, whatever the mode of JAX. Only `_pack` de
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._tracing import at_once, compiled, own_transfers
+from jfrnn._tracing import Given, at_once, compiled, own_transfers
 
 Words = tuple[Array, Array]  # the high and the low half of a key, uint32
 _MOST_BITS = {2: 31, 3: 21}
@@ -231,7 +230,7 @@ def _unpack(keys: Array, key_bits: int) -> Words:
     return ((keys >> 32).astype(jnp.uint32), keys.astype(jnp.uint32)) if _wide() else (keys[..., 0], keys[..., 1])
 
 
-def _checked_coords(coords: Any, bits: Any, default: bool = False) -> tuple[Array, int]:  # noqa: ANN401
+def _checked_coords(coords: Given, bits: object, default: bool = False) -> tuple[Array, int]:
     """Return coordinates [..., 2] or [..., 3] within the cube, and the bits."""
     dtype = getattr(coords, "dtype", type(coords).__name__)
     if isinstance(dtype, str) or not jnp.issubdtype(dtype, jnp.integer):
@@ -247,7 +246,7 @@ def _checked_coords(coords: Any, bits: Any, default: bool = False) -> tuple[Arra
     return jnp.asarray(coords), bits
 
 
-def _checked_keys(keys: Any, dim: Any, bits: Any, default: bool = False) -> tuple[Array, int, int]:  # noqa: ANN401
+def _checked_keys(keys: Given, dim: object, bits: object, default: bool = False) -> tuple[Array, int, int]:
     """Return keys of the type that encoding gives, the dimension and the bits."""
     if isinstance(dim, bool) or not isinstance(dim, int | np.integer) or dim not in (2, 3):
         raise ValueError(f"dim must be 2 or 3, a static int, got {dim!r}.")
@@ -267,7 +266,7 @@ def _checked_keys(keys: Any, dim: Any, bits: Any, default: bool = False) -> tupl
     return jnp.asarray(keys), dim, bits
 
 
-def _checked_bits(bits: Any, dim: int, default: bool) -> int:  # noqa: ANN401
+def _checked_bits(bits: object, dim: int, default: bool) -> int:
     most = _MOST_BITS[dim]
     if bits is None and default:
         return most
@@ -278,7 +277,7 @@ def _checked_bits(bits: Any, dim: int, default: bool) -> int:  # noqa: ANN401
     return int(bits)
 
 
-def _check_range(name: str, values: Any, limit: int, advice: str) -> None:  # noqa: ANN401
+def _check_range(name: str, values: Given, limit: int, advice: str) -> None:
     """Refuse concrete integers outside [0, limit), before a conversion could drop their high bits."""
     if isinstance(values, Tracer) or not values.size:
         return

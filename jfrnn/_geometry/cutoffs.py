@@ -11,6 +11,7 @@ from jax import Array, lax
 
 from jfrnn._geometry.floats import two_sum, unit_scale
 
+Flags = Any  # bools in an array of the kind that was given, of NumPy or of JAX
 RULES = ("gather", "scatter", "either", "both", "mean")  # whose cutoff is a pair's: i's, j's, the larger, the smaller, the mean
 
 
@@ -87,7 +88,7 @@ class Cutoffs:
         return [jnp.maximum(queries, sources) if self.rule == "either" else jnp.minimum(queries, sources)]
 
 
-def is_radius(radii: Array | np.ndarray) -> Any:  # noqa: ANN401
+def is_radius(radii: Array | np.ndarray) -> Flags:
     """Say which cutoffs the pair test can decide: 0, which reaches what coincides, is one of them. NumPy's arrays give NumPy's."""
     dtype = np.dtype(radii.dtype)
     unsigned = np.uint32 if dtype == np.float32 else np.uint64  # compared as floats, denormal numbers were 0

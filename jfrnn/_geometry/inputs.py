@@ -13,12 +13,12 @@ from jax.core import Tracer
 from jfrnn._geometry.batch import Batch
 from jfrnn._geometry.box import Box
 from jfrnn._geometry.cutoffs import RULES, Cutoff, Radii, largest_cutoff, make_cutoff, smallest_cutoff
-from jfrnn._tracing import gathered, made_on_host, on_device
+from jfrnn._tracing import Given, gathered, made_on_host, on_device
 
 _MOST_POINTS = 2**31 - 32
 
 
-def checked_positions(name: str, positions: Any, like: Array | None = None) -> Array:  # noqa: ANN401
+def checked_positions(name: str, positions: Given, like: Array | None = None) -> Array:
     """Return positions as a float32 or float64 array [n, 2] or [n, 3], of the same kind as `like` where that is given."""
     if not hasattr(positions, "dtype") or not hasattr(positions, "shape"):
         raise TypeError(
@@ -56,7 +56,7 @@ def check_is_known(name: str, shape: tuple[Any, ...]) -> None:
         )
 
 
-def checked_again(name: str, positions: Any, dtype: np.dtype, dim: int, rows: int, what: str = "the list") -> Array:  # noqa: ANN401
+def checked_again(name: str, positions: Given, dtype: np.dtype, dim: int, rows: int, what: str = "the list") -> Array:
     """Return positions that are of the kind and number for which something, such as a list, was made."""
     points = checked_positions(name, positions)
     if (points.dtype, points.shape[1]) != (dtype, dim):
@@ -72,7 +72,7 @@ def checked_again(name: str, positions: Any, dtype: np.dtype, dim: int, rows: in
     return points
 
 
-def check_devices(name: str, given: Any, made: Any, what: str = "the list") -> None:  # noqa: ANN401
+def check_devices(name: str, given: Given, made: Given, what: str = "the list") -> None:
     """Raise where an array and what was made before are bound to different devices, as far as that is known."""
     if isinstance(given, Tracer) or isinstance(made, Tracer):
         return
@@ -85,7 +85,7 @@ def check_devices(name: str, given: Any, made: Any, what: str = "the list") -> N
     )
 
 
-def checked_cutoff(cutoff: Any, dtype: np.dtype) -> Cutoff:  # noqa: ANN401
+def checked_cutoff(cutoff: Given, dtype: np.dtype) -> Cutoff:
     """Return the cutoff, rounded once to the dtype of the positions."""
     if isinstance(cutoff, Tracer):
         raise TypeError(
@@ -108,7 +108,7 @@ def checked_cutoff(cutoff: Any, dtype: np.dtype) -> Cutoff:  # noqa: ANN401
     return make_cutoff(value, dtype, closed=False)
 
 
-def checked_radii(cutoff: Any, rule: Any, sources: Array, queries: Array | None) -> Radii | None:  # noqa: ANN401
+def checked_radii(cutoff: Given, rule: object, sources: Array, queries: Array | None) -> Radii | None:
     """Return cutoffs that differ from particle to particle, in the dtype of the positions; None where it is one number."""
     if rule not in RULES:
         raise ValueError(f"radius_rule must be one of {', '.join(map(repr, RULES))}, got {rule!r}.")
@@ -131,7 +131,7 @@ def checked_radii(cutoff: Any, rule: Any, sources: Array, queries: Array | None)
     return Radii(of_sources, _checked_radii_of("cutoff[1]", cutoff[1], m, "query", sources), rule)
 
 
-def _checked_radii_of(name: str, radii: Any, size: int, what: str, like: Array) -> Array:  # noqa: ANN401
+def _checked_radii_of(name: str, radii: Given, size: int, what: str, like: Array) -> Array:
     if not hasattr(radii, "dtype") or not np.issubdtype(radii.dtype, np.floating):
         raise TypeError(f"{name} must be a number, or an array of floats with one per {what}, got {_describe_array(radii)}.")
     if tuple(radii.shape) != (size,):
@@ -139,7 +139,7 @@ def _checked_radii_of(name: str, radii: Any, size: int, what: str, like: Array) 
     return _as_dtype(radii, like.dtype)
 
 
-def _as_dtype(x: Any, dtype: Any) -> Array:  # noqa: ANN401
+def _as_dtype(x: Given, dtype: np.dtype) -> Array:
     """Convert an array; one that is known on the host, where no program is compiled for its shape."""
     if isinstance(x, Tracer):
         return gathered(x).astype(dtype)
@@ -156,7 +156,7 @@ def largest_known(radii: Radii) -> float | None:
     return float(np.max(values[(values >= low) & (values <= high)], initial=0)) or 1.0
 
 
-def checked_skin(skin: Any, cutoff: float, dtype: np.dtype) -> float:  # noqa: ANN401
+def checked_skin(skin: object, cutoff: float, dtype: np.dtype) -> float:
     """Return a static skin, rounded once to the dtype of the positions; 0 means that there is none."""
     if isinstance(skin, Tracer | bool) or not isinstance(skin, int | float | np.number):
         raise TypeError(f"skin must be a number known while tracing, got {_describe(skin)}.")
@@ -170,7 +170,7 @@ def checked_skin(skin: Any, cutoff: float, dtype: np.dtype) -> float:  # noqa: A
     return value
 
 
-def checked_active(active: Any, positions: Array) -> Array:  # noqa: ANN401
+def checked_active(active: Given, positions: Array) -> Array:
     """Return the mask of the particles that take part, [n] bool."""
     if not hasattr(active, "dtype") or np.dtype(active.dtype) != np.bool_:
         raise TypeError(f"active must be an array of bool, one per particle, got {_describe_array(active)}.")
@@ -179,7 +179,7 @@ def checked_active(active: Any, positions: Array) -> Array:  # noqa: ANN401
     return on_device(active)
 
 
-def checked_batch(batch: Any, sources: Array, queries: Array | None) -> Batch:  # noqa: ANN401
+def checked_batch(batch: Given, sources: Array, queries: Array | None) -> Batch:
     """Return the systems of the particles, and of the queries if there are any, as int32."""
     if queries is None:
         return Batch(_checked_systems("batch", batch, sources.shape[0], "particle"), None)
@@ -192,7 +192,7 @@ def checked_batch(batch: Any, sources: Array, queries: Array | None) -> Batch:  
     return Batch(of_sources, _checked_systems("batch[1]", batch[1], queries.shape[0], "query"))
 
 
-def _checked_systems(name: str, systems: Any, size: int, what: str) -> Array:  # noqa: ANN401
+def _checked_systems(name: str, systems: Given, size: int, what: str) -> Array:
     if not hasattr(systems, "dtype") or not np.issubdtype(systems.dtype, np.integer):
         raise TypeError(f"{name} must be an array of integers, the system of each {what}, got {_describe_array(systems)}.")
     if tuple(systems.shape) != (size,):
@@ -207,7 +207,7 @@ def _checked_systems(name: str, systems: Any, size: int, what: str) -> Array:  #
     return made_on_host(systems, lambda known: known.astype(np.int32))
 
 
-def checked_box(box: Any, positions: Array, like: Box | None = None) -> Box | None:  # noqa: ANN401
+def checked_box(box: object, positions: Array, like: Box | None = None) -> Box | None:
     """Return a box that repeats space along some axis of the positions, of the same kind as `like` where that is given; or None."""
     if not isinstance(box, Box):
         raise TypeError(f"box must be a jfrnn.Box, got {_describe(box)}: write e.g. jfrnn.Box([1.0, 1.0, 1.0]).")
@@ -221,14 +221,14 @@ def checked_box(box: Any, positions: Array, like: Box | None = None) -> Box | No
     return box if any(box.periodic) else None
 
 
-def checked_flag(name: str, value: Any) -> bool:  # noqa: ANN401
+def checked_flag(name: str, value: object) -> bool:
     """Return a static bool."""
     if isinstance(value, bool | np.bool_):
         return bool(value)
     raise TypeError(f"{name} must be True or False, known while tracing, got {_describe(value)}.")
 
 
-def checked_capacity(capacity: Any) -> int:  # noqa: ANN401
+def checked_capacity(capacity: object) -> int:
     """Return a static capacity of at least one slot per row."""
     if isinstance(capacity, bool) or not isinstance(capacity, int | np.integer):
         raise TypeError(
@@ -240,7 +240,7 @@ def checked_capacity(capacity: Any) -> int:  # noqa: ANN401
     return int(capacity)
 
 
-def checked_slack(slack: Any) -> float:  # noqa: ANN401
+def checked_slack(slack: object) -> float:
     """Return a static factor of at least 1."""
     if isinstance(slack, bool) or not isinstance(slack, int | float | np.number):
         raise TypeError(f"slack must be a number of at least 1, known while tracing, got {_describe(slack)}.")
@@ -249,7 +249,7 @@ def checked_slack(slack: Any) -> float:  # noqa: ANN401
     return float(slack)
 
 
-def checked_size(name: str, size: Any) -> int:  # noqa: ANN401
+def checked_size(name: str, size: object) -> int:
     """Return a number of points that are not there yet."""
     if isinstance(size, bool) or not isinstance(size, int | np.integer):
         raise TypeError(f"{name} must be an int, the number of points, got {_describe(size)}.")
@@ -258,7 +258,7 @@ def checked_size(name: str, size: Any) -> int:  # noqa: ANN401
     return int(size)
 
 
-def checked_kind(dim: Any, dtype: Any) -> tuple[int, np.dtype]:  # noqa: ANN401
+def checked_kind(dim: object, dtype: Given) -> tuple[int, np.dtype]:
     """Return the dimensions and the dtype of positions that are not there yet."""
     if isinstance(dim, bool) or not isinstance(dim, int | np.integer) or dim not in (2, 3):
         raise ValueError(f"dim must be 2 or 3, got {_describe(dim)}.")
@@ -272,9 +272,9 @@ def checked_kind(dim: Any, dtype: Any) -> tuple[int, np.dtype]:  # noqa: ANN401
     return int(dim), np.dtype(dtype)
 
 
-def _describe(value: Any) -> str:  # noqa: ANN401
+def _describe(value: object) -> str:
     return f"a traced value {value}" if isinstance(value, Tracer) else f"{type(value).__name__} {value!r}"
 
 
-def _describe_array(value: Any) -> str:  # noqa: ANN401
+def _describe_array(value: Given) -> str:
     return f"{np.dtype(value.dtype)} of shape {list(np.shape(value))}" if hasattr(value, "dtype") else _describe(value)

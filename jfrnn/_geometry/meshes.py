@@ -1,13 +1,11 @@
 """Meshes as `search_triangles` takes them: corners that triangles have in common."""
 
-from typing import Any
-
 import jax
 import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._tracing import on_device, own_transfers
+from jfrnn._tracing import Given, on_device, own_transfers
 
 
 def merge_vertices(vertices: Array, faces: Array) -> tuple[Array, Array]:
@@ -54,7 +52,7 @@ def merge_vertices(vertices: Array, faces: Array) -> tuple[Array, Array]:
         return on_device(points[np.sort(first)]), on_device(of_vertex[named])
 
 
-def _checked(vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: ANN401
+def _checked(vertices: Given, faces: Given) -> tuple[np.ndarray, np.ndarray]:
     points, named = np.asarray(jax.device_get(vertices)), np.asarray(jax.device_get(faces))
     if points.dtype not in (np.float32, np.float64):
         raise TypeError(f"vertices must be float32 or float64, got {points.dtype}.")

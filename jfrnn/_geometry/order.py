@@ -3,7 +3,6 @@
 import functools
 from collections.abc import Callable
 from numbers import Real
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +11,7 @@ from jax.core import Tracer
 
 from jfrnn._geometry.curves import Words, hilbert_words, morton_words
 from jfrnn._geometry.inputs import checked_positions
-from jfrnn._tracing import compiled, on_device, own_transfers
+from jfrnn._tracing import Given, compiled, on_device, own_transfers
 
 _SORT_BITS = 21  # float32 numbers 2^24 cells exactly: also the cells of a sort stay below it
 _LAYOUT = {np.dtype(np.float32): (np.int32, 23, 127), np.dtype(np.float64): (np.int64, 52, 1023)}  # bits, of the mantissa, bias
@@ -120,7 +119,7 @@ def _row_words(axes: list[Array], bits: int) -> Words:
 _CURVES = {"row": _row_words, "morton": morton_words, "hilbert": hilbert_words}
 
 
-def _checked_cell_size(cell_size: Any, dtype: np.dtype) -> np.floating:  # noqa: ANN401
+def _checked_cell_size(cell_size: Given, dtype: np.dtype) -> np.floating:
     """Return the edge of a cell, rounded once to the dtype of the positions."""
     if isinstance(cell_size, Tracer):
         raise TypeError("cell_size must be a static number, got a traced value: pass a Python float, or make it a static argument.")

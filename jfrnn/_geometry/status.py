@@ -9,6 +9,8 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
+from jfrnn._tracing import Given
+
 
 class Status(enum.IntFlag):
     """Say what a search met in its data; the bits are sticky and `NeighborList.check` turns them into errors."""
@@ -74,13 +76,13 @@ def known_status(status: Array) -> Status | None:
     return Status(int(np.bitwise_or.reduce(bits, axis=None)))
 
 
-def shape_of(rows: Any) -> tuple[Any, ...]:  # noqa: ANN401
+def shape_of(rows: Given) -> tuple[Any, ...]:
     """Return the shape of an array of rows, or that of none."""
     shape = tuple(getattr(rows, "shape", ()))
     return shape if len(shape) > 1 else (None, None)
 
 
-def told(x: Any, how: Callable[[Any], Any]) -> str:  # noqa: ANN401
+def told(x: Given, how: Callable[[np.ndarray], object]) -> str:
     """Say what an array comes to, for a line about what holds it; or why that is not known."""
     if isinstance(x, Tracer):
         return "traced"
@@ -93,7 +95,7 @@ def told(x: Any, how: Callable[[Any], Any]) -> str:  # noqa: ANN401
     return str(how(jax.device_get(x)))
 
 
-def names_of_bits(status: Any) -> str:  # noqa: ANN401
+def names_of_bits(status: Given) -> str:
     """Say which bits are set."""
 
     def names(bits: np.ndarray) -> str:
@@ -103,7 +105,7 @@ def names_of_bits(status: Any) -> str:  # noqa: ANN401
     return told(status, names)
 
 
-def pairs_and_status(count: Any, status: Any) -> str:  # noqa: ANN401
+def pairs_and_status(count: Given, status: Given) -> str:
     """Say how many pairs rows have, and which bits are set."""
     return f"{told(count, lambda x: np.sum(x, dtype=np.int64))} pairs, status {names_of_bits(status)}"
 

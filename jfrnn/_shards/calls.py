@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from jfrnn._geometry import checked_cutoff, checked_flag, checked_skin
 from jfrnn._search import count, list_radius, rounded_capacity
 from jfrnn._shards.halo import Halo, exchanged, halo_in_shard, halo_spec, rows_seen
 from jfrnn._shards.particles import OVERFLOWS, Particles, of_shards, spec_of
+from jfrnn._tracing import Given, Tree
 
 # The engines that can answer in a periodic box, which spread particles may have.
 _BACKENDS = ("auto", *(name for name, engine in ENGINES.items() if engine.refuse(Kind(periodic=True)) is None))
@@ -31,7 +32,7 @@ class Asked(NamedTuple):
     backend: str
 
 
-def checked_asked(particles: Any, cutoff: Any, skin: Any, include_self: Any, closed: Any, backend: Any) -> Asked:  # noqa: ANN401
+def checked_asked(particles: object, cutoff: Given, skin: object, include_self: object, closed: object, backend: Given) -> Asked:
     if not isinstance(particles, Particles):
         raise TypeError(f"particles must be what jfrnn.distributed.scatter returns, got {type(particles).__name__}.")
     if backend not in _BACKENDS:
@@ -47,10 +48,10 @@ def checked_asked(particles: Any, cutoff: Any, skin: Any, include_self: Any, clo
     return Asked(radius, skin, checked_flag("include_self", include_self), checked_flag("closed", closed), backend)
 
 
-def over_shards(fn: Callable[..., Any], particles: Particles, out: Any, *arguments: Any) -> Any:  # noqa: ANN401
+def over_shards(fn: Callable[..., Tree], particles: Particles, out: Tree, *arguments: Tree) -> Tree:
     """Run a function of the parts of a shard on every shard; arguments of no kind that is known here have spread rows."""
 
-    def spec(argument: Any) -> Any:  # noqa: ANN401
+    def spec(argument: Tree) -> Tree:
         if isinstance(argument, Particles):
             return spec_of(argument)
         if isinstance(argument, Halo):
@@ -61,7 +62,7 @@ def over_shards(fn: Callable[..., Any], particles: Particles, out: Any, *argumen
     return jax.shard_map(fn, mesh=particles.mesh, in_specs=specs, out_specs=out, check_vma=False)(*arguments)
 
 
-def checked_halo(halo: Any, particles: Particles) -> None:  # noqa: ANN401
+def checked_halo(halo: object, particles: Particles) -> None:
     """Refuse a halo of particles that are laid out otherwise: after `grow`, what was made before is of no use.
 
     Raises:
@@ -77,7 +78,7 @@ def checked_halo(halo: Any, particles: Particles) -> None:  # noqa: ANN401
         )
 
 
-def on_each(fn: Callable[..., Any], particles: Particles, *same: Any) -> Any:  # noqa: ANN401
+def on_each(fn: Callable[..., Tree], particles: Particles, *same: Tree) -> Tree:
     """Run a function on every device, on its own particles alone: what needs no neighbors, such as walls that all devices know.
 
     Args:

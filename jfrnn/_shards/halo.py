@@ -122,7 +122,7 @@ def halo_in_shard(particles: Particles) -> Halo:
     return Halo(tuple(sends), numbers - 1, shared_bits(status, particles.mesh), required, _psum(sent, names))
 
 
-def _psum(x: Array, names: Any) -> Array:  # noqa: ANN401
+def _psum(x: Array, names: str | tuple[str, ...]) -> Array:
     """Add up int32 of all shards that are not negative; a sum that int32 cannot hold is the largest int32."""
     high, low = lax.psum((x >> 15, x & 0x7FFF), names)  # of up to 32 768 shards, neither overflows
     high = high + (low >> 15)

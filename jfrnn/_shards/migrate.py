@@ -12,7 +12,7 @@ from jax import Array, lax
 from jfrnn._geometry import Status, ordered_bits
 from jfrnn._shards.halo import halo_in_shard
 from jfrnn._shards.particles import Particles, shared_bits, spec_of
-from jfrnn._tracing import set_places
+from jfrnn._tracing import Tree, set_places
 
 _DIGIT = 2  # bits of a bound that are found in one round
 _BUCKETS = 32  # a round of migration moves up to this part of a shard, as much of it to each other shard
@@ -70,7 +70,7 @@ def _counts(goes: Array, shards: int) -> Array:
     return jnp.sum(goes[None] == lax.iota(jnp.int32, shards)[:, None], axis=1, dtype=jnp.int32)
 
 
-def _moved(rows: Any, goes: Array, particles: Particles) -> Any:  # noqa: ANN401
+def _moved(rows: Tree, goes: Array, particles: Particles) -> Tree:
     """Send rows to the shards where they go, into rows that are free there; `shards` stands for rows that are unused."""
     mesh, room = particles.mesh, particles.sizes.particles
     shards, here = mesh.devices.size, lax.axis_index(mesh.axis_names)

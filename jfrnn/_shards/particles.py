@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from jfrnn._geometry import Box, Status, checked_again, names_of_bits, shape_of
+from jfrnn._tracing import Given, Tree
 
 _STEP = 8  # sizes are rounded up to multiples, so that similar scenes share a compiled program
 OVERFLOWS = Status.ROW_OVERFLOW | Status.SHARD_OVERFLOW | Status.HALO_OVERFLOW | Status.HALO_TOO_FAR
@@ -128,7 +129,7 @@ class Particles:
         """Axes of space, 2 or 3."""
         return self.positions.shape[1]
 
-    def replace(self, positions: Array | None = None, values: Any = None) -> "Particles":  # noqa: ANN401
+    def replace(self, positions: Array | None = None, values: Tree = None) -> "Particles":
         """Return the same particles with other positions [N, d], or other values (leaves [N, ...]). Jit: yes.
 
         Raises:
@@ -178,7 +179,9 @@ class Particles:
         return _spread_again, (fields, [d.id for d in mesh.devices.flat], mesh.devices.shape, mesh.axis_names, mesh.axis_types)
 
 
-def _spread_again(fields: dict[str, Any], ids: list[int], shape: tuple[int, ...], names: Any, kinds: Any) -> Particles:  # noqa: ANN401
+def _spread_again(
+    fields: dict[str, Any], ids: list[int], shape: tuple[int, ...], names: tuple[str, ...], kinds: tuple[AxisType, ...]
+) -> Particles:
     """Make particles of the fields of others, on devices of the same numbers.
 
     Raises:
@@ -241,7 +244,7 @@ def of_shards(mesh: Mesh) -> PartitionSpec:
 def placed(mesh: Mesh, rows: np.ndarray, source: np.ndarray) -> Array:
     """Put rows of a host array, the same in every process, on their devices: those that `source` names, 0 where it is negative."""
 
-    def part(index: Any) -> np.ndarray:  # noqa: ANN401
+    def part(index: Given) -> np.ndarray:
         wanted = source[index[0]]
         taken = np.zeros((len(wanted), *rows.shape[1:]), rows.dtype)
         taken[wanted >= 0] = rows[wanted[wanted >= 0]]
@@ -250,7 +253,7 @@ def placed(mesh: Mesh, rows: np.ndarray, source: np.ndarray) -> Array:
     return jax.make_array_from_callback((len(source), *rows.shape[1:]), NamedSharding(mesh, of_shards(mesh)), part)
 
 
-def replicated(mesh: Mesh, value: Any) -> Array:  # noqa: ANN401
+def replicated(mesh: Mesh, value: Given) -> Array:
     """Put a host array on every device."""
     array = np.asarray(value)
     return jax.make_array_from_callback(array.shape, NamedSharding(mesh, PartitionSpec()), lambda index: array[index])
@@ -263,7 +266,7 @@ def resized(particles: Particles, sizes: Sizes) -> Particles:
     status, required = jax.tree.map(functools.partial(replicated, mesh), (np.zeros((), np.int32), none))
     kept = particles.positions, particles.ids, particles.values
 
-    def wider(rows: Any) -> Any:  # noqa: ANN401
+    def wider(rows: Tree) -> Tree:
         def padded(x: Array, fill: int) -> Array:
             return jnp.concatenate([x, jnp.full((new - old, *x.shape[1:]), fill, x.dtype)])
 

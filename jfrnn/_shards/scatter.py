@@ -9,11 +9,13 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 from jax.sharding import Mesh
+from jax.tree_util import KeyPath
 
 from jfrnn._geometry import Box, checked_box, checked_cutoff, checked_positions, checked_skin, checked_slack, images_of
 from jfrnn._search import list_radius
 from jfrnn._shards.migrate import migrate
 from jfrnn._shards.particles import Particles, Sizes, no_requirements, placed, replicated, resized, room
+from jfrnn._tracing import Given, Tree
 
 _MOST = 2**31 - 1
 _SMALL = 1024  # particles that may travel at first without a thought: a wrong guess is compiled anew
@@ -22,7 +24,7 @@ _SMALL = 1024  # particles that may travel at first without a thought: a wrong g
 def scatter(
     positions: np.ndarray | Array,
     cutoff: float,
-    values: Any = None,  # noqa: ANN401
+    values: Tree = None,
     *,
     mesh: Mesh,
     skin: float = 0.0,
@@ -64,7 +66,7 @@ def scatter(
     return _settled(_in_blocks(x, values, fixed, mesh, cut, reach), slack)
 
 
-def _in_blocks(x: np.ndarray, values: Any, box: Box | None, mesh: Mesh, along: tuple[int, ...], reach: float) -> Particles:  # noqa: ANN401
+def _in_blocks(x: np.ndarray, values: Tree, box: Box | None, mesh: Mesh, along: tuple[int, ...], reach: float) -> Particles:
     """Put equally many rows on each device as they come: `migrate` knows where they belong."""
     shape, shards = mesh.devices.shape, mesh.devices.size
     share = -(-len(x) // shards)
@@ -118,7 +120,7 @@ def fetched(array: Array) -> np.ndarray:
     return np.asarray(multihost_utils.process_allgather(array, tiled=True))
 
 
-def _checked_value(path: Any, leaf: Any, total: int) -> np.ndarray:  # noqa: ANN401
+def _checked_value(path: KeyPath, leaf: Given, total: int) -> np.ndarray:
     name = f"values{jax.tree_util.keystr(path)}"
     if not hasattr(leaf, "shape") or not hasattr(leaf, "dtype"):
         raise TypeError(f"{name} must be an array with a row per particle, got {type(leaf).__name__}.")
@@ -127,12 +129,12 @@ def _checked_value(path: Any, leaf: Any, total: int) -> np.ndarray:  # noqa: ANN
     return np.asarray(leaf)
 
 
-def _checked_reach(cutoff: Any, skin: Any, dtype: np.dtype) -> float:  # noqa: ANN401
+def _checked_reach(cutoff: Given, skin: object, dtype: np.dtype) -> float:
     radius = float(checked_cutoff(cutoff, dtype).radius)
     return list_radius(radius, checked_skin(skin, radius, dtype), dtype)
 
 
-def _checked_mesh(mesh: Any, dim: int) -> Mesh:  # noqa: ANN401
+def _checked_mesh(mesh: object, dim: int) -> Mesh:
     if not isinstance(mesh, Mesh):
         raise TypeError(f"mesh must be a jax.sharding.Mesh, got {type(mesh).__name__}: write e.g. jax.make_mesh((8,), ('x',)).")
     if not 1 <= mesh.devices.ndim <= dim:
@@ -154,7 +156,7 @@ def _checked_along(along: Sequence[int] | None, x: np.ndarray, mesh: Mesh) -> tu
     return given
 
 
-def _checked_box(box: Any, x: np.ndarray, reach: float, mesh: Mesh) -> Box | None:  # noqa: ANN401
+def _checked_box(box: object, x: np.ndarray, reach: float, mesh: Mesh) -> Box | None:
     """Return the box in the dtype of positions, its images chosen as on one device, on every device."""
     checked = checked_box(box, cast(Any, x))
     if checked is None:

@@ -118,7 +118,7 @@ class Neighbors:
         """
         check(self, f"row {self.capacity}, halo {[sends.shape[1] for sends in self.halo.sends]}")
 
-    def _check_kind(self, particles: Any) -> None:  # noqa: ANN401
+    def _check_kind(self, particles: object) -> None:
         """Refuse particles of another dtype or dimension, in another kind of box, or on other devices than those of the list."""
         if not isinstance(particles, Particles):
             raise TypeError(f"particles must be what jfrnn.distributed.scatter returns, got {type(particles).__name__}.")
@@ -133,7 +133,7 @@ class Neighbors:
         if made != came:
             raise ValueError(f"particles must be of the kind for which the list was made ({made}), got {came}: search anew.")
 
-    def _check_fits(self, particles: Any) -> None:  # noqa: ANN401
+    def _check_fits(self, particles: Particles) -> None:
         """Refuse particles of another kind, or laid out otherwise, than those for which the list was made."""
         self._check_kind(particles)
         checked_halo(self.halo, particles)

@@ -16,6 +16,7 @@ from jfrnn._shards.halo import Halo, exchanged, halo_in_shard
 from jfrnn._shards.particles import Particles, of_shards
 from jfrnn._shards.sharded_list import Neighbors, listed
 from jfrnn._sums import pair_sum as pair_sum_on_one
+from jfrnn._tracing import Tree
 
 
 def search(
@@ -97,7 +98,7 @@ def pair_sum(
     fn: Callable[[Array, Any, Any], Any],
     particles: Particles,
     cutoff: float | None,
-    values: Any = None,  # noqa: ANN401
+    values: Tree = None,
     *,
     reduce: str = "sum",
     include_self: bool = False,
@@ -106,7 +107,7 @@ def pair_sum(
     backend: str = "auto",
     neighbors: Neighbors | None = None,
     halo: Halo | None = None,
-) -> Any:  # noqa: ANN401
+) -> Tree:
     """Sum a function of pairs over the neighbors of each particle: `jfrnn.pair_sum`, wherever the neighbors are.
 
     Args:
@@ -165,13 +166,13 @@ def _sums(
     particles: Particles,
     halo: Halo | None,
     local: NeighborList | None,
-    values: Any,  # noqa: ANN401
+    values: Tree,
     fn: Callable[[Array, Any, Any], Any],
     asked: Asked,
     reduce: str,
     compensated: bool,
-) -> Any:  # noqa: ANN401
-    def summed(particles: Particles, halo: Halo | None, local: NeighborList | None, values: Any) -> Any:  # noqa: ANN401
+) -> Tree:
+    def summed(particles: Particles, halo: Halo | None, local: NeighborList | None, values: Tree) -> Tree:
         halo = halo_in_shard(particles) if halo is None else halo
         x, active = seen(particles, halo)
         theirs = jax.tree.map(lambda leaf: exchanged(leaf, halo, particles), values)

@@ -3,10 +3,11 @@
 import functools
 import inspect
 from collections.abc import Callable
-from typing import Any
 
 import jax
 from jax import Array
+
+from jfrnn._tracing import Tree
 
 _NEEDS_A_VALUE = (
     jax.errors.ConcretizationTypeError,
@@ -16,7 +17,7 @@ _NEEDS_A_VALUE = (
 )
 
 
-def call_with_pair(fn: Callable[[Array, Any, Any], Any], r: Array, i: Any, j: Any) -> Any:  # noqa: ANN401
+def call_with_pair(fn: Callable[[Array, Tree, Tree], Tree], r: Array, i: Tree, j: Tree) -> Tree:
     """Return fn(r, i, j) of one traced pair.
 
     Raises:
@@ -37,7 +38,7 @@ def call_with_pair(fn: Callable[[Array, Any, Any], Any], r: Array, i: Any, j: An
         raise
 
 
-def _check_signature(fn: Callable[..., Any], r: Array, i: Any, j: Any) -> None:  # noqa: ANN401
+def _check_signature(fn: Callable[..., Tree], r: Array, i: Tree, j: Tree) -> None:
     try:
         signature = inspect.signature(fn)
     except (TypeError, ValueError):  # some built-in functions do not say what they take
@@ -52,7 +53,7 @@ def _check_signature(fn: Callable[..., Any], r: Array, i: Any, j: Any) -> None: 
         ) from error
 
 
-def _name_of(fn: Any) -> str:  # noqa: ANN401
+def _name_of(fn: object) -> str:
     while isinstance(fn, functools.partial):
         fn = fn.func
     return getattr(fn, "__name__", type(fn).__name__)
@@ -64,10 +65,10 @@ class _Shape(str):
     __repr__ = str.__str__
 
 
-def _given(r: Array, i: Any, j: Any) -> str:  # noqa: ANN401
+def _given(r: Array, i: Tree, j: Tree) -> str:
     """Say what fn gets of a pair."""
 
-    def described(values: Any) -> str:  # noqa: ANN401
+    def described(values: Tree) -> str:
         if not jax.tree.leaves(values):
             return f"{values!r}, as no values were given"
         return repr(jax.tree.map(lambda x: _Shape(f"{x.dtype}{list(x.shape)}"), values))

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jax import numpy as jnp
 
-from jfrnn._sums.scalars import TYPES, NoTranslationError, Scalars
+from jfrnn._sums.scalars import TYPES, NoTranslationError, Number, Scalars
 
 MOST_REPEATED = 8  # the largest constant exponent of `pow` that is multiplied out, within a few ulp
 
@@ -42,7 +42,7 @@ class Equation(NamedTuple):
         dtype = dtype or self.outputs[0].dtype
         return np.array([self.scalars.apply(operation, row, dtype) for row in rows], int).reshape(arrays[0].shape)
 
-    def full(self, value: Any, shape: tuple[int, ...] = (), dtype: str | None = None) -> Values:  # noqa: ANN401
+    def full(self, value: Number, shape: tuple[int, ...] = (), dtype: str | None = None) -> Values:
         """Return an array of one constant."""
         return np.full(shape, self.scalars.constant(value, dtype or self.outputs[0].dtype))
 
@@ -140,7 +140,7 @@ def _choose(eqn: Equation, which: Values, cases: Sequence[Values], dtype: str) -
 # --- reductions -------------------------------------------------------------------------------------------------------
 
 
-def _reduce(operation: str, empty: Callable[[np.dtype], Any]) -> Rule:
+def _reduce(operation: str, empty: Callable[[np.dtype], Number]) -> Rule:
     """Return the rule of a reduction from the first element to the last; `empty` is the result of none, by dtype."""
 
     def rule(eqn: Equation, inputs: list[Values]) -> list[Values]:
@@ -158,11 +158,11 @@ def _reduce(operation: str, empty: Callable[[np.dtype], Any]) -> Rule:
     return rule
 
 
-def _least(dtype: np.dtype) -> Any:  # noqa: ANN401
+def _least(dtype: np.dtype) -> Number:
     return -np.inf if dtype.kind == "f" else False if dtype.kind == "b" else np.iinfo(dtype).min
 
 
-def _most(dtype: np.dtype) -> Any:  # noqa: ANN401
+def _most(dtype: np.dtype) -> Number:
     return np.inf if dtype.kind == "f" else True if dtype.kind == "b" else np.iinfo(dtype).max
 
 

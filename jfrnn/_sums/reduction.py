@@ -19,7 +19,7 @@ from jfrnn._sums.pair_function import call_with_pair
 from jfrnn._sums.relations import Listed, Relation, Searched
 from jfrnn._sums.summation import bind_sum
 from jfrnn._sums.terms import OF_QUERIES, OF_SOURCES, Groups, Labels, Summand, Term, chosen, fresh_labels, traced
-from jfrnn._tracing import call_apart, compiled, on_device
+from jfrnn._tracing import Given, Tree, call_apart, compiled, on_device
 
 
 class Pairs(NamedTuple):
@@ -54,7 +54,7 @@ def searched(inputs: Inputs, options: Options) -> Pairs:
 def listed(
     nbrs: NeighborList,
     positions: Array,
-    cutoff: Any,  # noqa: ANN401
+    cutoff: Given,
     queries: Array | None,
     box: Box | None,
     given: dict[str, bool],
@@ -148,12 +148,12 @@ def _lattice(box: Box | None, images: Images | None, like: Array) -> Lattice | N
 def reduced(
     fn: Callable[[Array, Any, Any], Any],
     pairs: Pairs,
-    mine: Any,  # noqa: ANN401
-    theirs: Any,  # noqa: ANN401
+    mine: Tree,
+    theirs: Tree,
     reduce: str,
     symmetry: str | None,
     compensated: bool,
-) -> Any:  # noqa: ANN401
+) -> Tree:
     """Trace fn, sum it, and give the sums the structure of what it returns."""
     operands, summand, structure = _summand(fn, pairs, mine, theirs, symmetry)
     one_pair = Groups(
@@ -201,8 +201,8 @@ def _numbers(like: jax.ShapeDtypeStruct, known: bool) -> Array:
 def _summand(
     fn: Callable[[Array, Any, Any], Any],
     pairs: Pairs,
-    mine: Any,  # noqa: ANN401
-    theirs: Any,  # noqa: ANN401
+    mine: Tree,
+    theirs: Tree,
     symmetry: str | None,
 ) -> tuple[Groups, Summand, list]:
     """Return the operands, fn as a function of one pair of them, and a list that takes the structure of what fn returns."""
@@ -229,7 +229,7 @@ def _summand(
         leaves = leaves_of(call_with_pair(fn, jnp.where(ahead, r, -r), i, j))
         return leaves if symmetry == "symmetric" else [jnp.where(ahead, x, -x) for x in leaves]
 
-    def leaves_of(result: Any) -> list[Array]:  # noqa: ANN401
+    def leaves_of(result: Tree) -> list[Array]:
         leaves, tree = jax.tree.flatten(result)
         if not leaves:
             raise TypeError(f"fn must return arrays, got {result!r}: let it end with `return`.")
@@ -255,7 +255,7 @@ def _is_backward(shift: Array) -> Array:
     return result
 
 
-def _summable(x: Any, dtype: np.dtype) -> Array:  # noqa: ANN401
+def _summable(x: Given, dtype: np.dtype) -> Array:
     if isinstance(x, str | bytes) or callable(x):
         raise TypeError(
             f"fn must return floats or integers, got {type(x).__name__}: return arrays, in a pytree if there are several."

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, TypeGuard
+from typing import TypeGuard
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ from jfrnn._geometry import Batch, Radii, compensated_sum, rounded_sum
 from jfrnn._sums.fused import is_fused as is_fusible
 from jfrnn._sums.fused import sums as fused_sums
 from jfrnn._sums.terms import Groups, Term
+from jfrnn._tracing import Tree
 
 _LIST_SLOTS = 1 << 22  # numbers of pairs of a list that are in work at a time: 16 MB of float32
 _EXCHANGED = {"gather": "scatter", "scatter": "gather"}
@@ -60,7 +61,7 @@ class Searched:
             batch = batch if batch is None else Batch(batch.of_queries, batch.sources)
         return Searched(Inputs(sources, queries, active, box, cutoff, batch), self.options)
 
-    def fold(self, elements: int, visit: Visit, out: Any) -> Any:  # noqa: ANN401
+    def fold(self, elements: int, visit: Visit, out: Tree) -> Tree:
         """Walk over all pairs: see `fold_neighbors`."""
         return fold_pairs(self.inputs, self.options, elements, visit, out)
 
@@ -101,7 +102,7 @@ class Listed:
         """Return the same pairs with the roles of i and j exchanged, and shifts of the other sign."""
         return self if self.symmetric else dataclasses.replace(self, flipped=not self.flipped)
 
-    def fold(self, elements: int, visit: Visit, out: Any) -> Any:  # noqa: ANN401
+    def fold(self, elements: int, visit: Visit, out: Tree) -> Tree:
         """Walk over all pairs, in blocks of rows: see `fold_neighbors`."""
         m, capacity = self.idx.shape
         if 0 in (m, capacity, self.source_count):
@@ -109,13 +110,13 @@ class Listed:
         group = min(FOLD_GROUP, capacity)
         size = min(max(_LIST_SLOTS // (group * elements), 1), m)
 
-        def fold_block(b: Array, out: Any) -> Any:  # noqa: ANN401
+        def fold_block(b: Array, out: Tree) -> Tree:
             first = jnp.minimum(b * size, m - size)
             row = first + lax.iota(jnp.int32, size)
             fresh = row >= b * size
 
-            def fold(add: Callable[[Slots, Any], Any], state: Any) -> Any:  # noqa: ANN401
-                def add_group(g: Array, state: Any) -> Any:  # noqa: ANN401
+            def fold(add: Callable[[Slots, Tree], Tree], state: Tree) -> Tree:
+                def add_group(g: Array, state: Tree) -> Tree:
                     start = jnp.minimum(g * group, capacity - group)
                     new = start + lax.iota(jnp.int32, group) >= g * group
                     idx, mask = (lax.dynamic_slice(x, (first, start), (size, group)) for x in (self.idx, self.mask))

@@ -4,7 +4,7 @@ A node is named by its number. Operands come before what is made of them, so the
 """
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +24,9 @@ _FOLDED = {  # what is known of integers and truths is computed here, as indices
 }  # fmt: skip
 
 
+Number = Any  # a number or truth, of Python or NumPy; None where it is not known
+
+
 class NoTranslationError(NotImplementedError):
     """The function holds something that has no translation into a kernel."""
 
@@ -34,10 +37,10 @@ class Node(NamedTuple):
     form: str
     operands: tuple[int, ...]
     dtype: str
-    value: Any = None
+    value: Number = None
 
 
-def literal(scalar: Any) -> str:  # noqa: ANN401
+def literal(scalar: Number) -> str:
     """Return a scalar of NumPy in C++, bit by bit the same."""
     dtype = scalar.dtype.name
     if dtype == "bool":
@@ -67,7 +70,7 @@ class Scalars:
         """Return a scalar that is defined elsewhere."""
         return self._number((name, dtype), Node(name, (), dtype))
 
-    def constant(self, value: Any, dtype: str) -> int:  # noqa: ANN401
+    def constant(self, value: Number, dtype: str) -> int:
         """Return a constant; constants are the same if their bits are."""
         scalar = np.asarray(value, dtype)[()]
         return self._number((dtype, scalar.tobytes()), Node(literal(scalar), (), dtype, scalar))
@@ -88,7 +91,7 @@ class Scalars:
         form = _INFIX[operation] if infix else f"Math::{operation}({arguments})"
         return self._number((form, *operands), Node(form, tuple(operands), dtype))
 
-    def value(self, number: int) -> Any:  # noqa: ANN401
+    def value(self, number: int) -> Number:
         """Return the value of a constant, else None."""
         return self.nodes[number].value
 
@@ -181,6 +184,6 @@ class Scalars:
         return self.constant(_quietly(_FOLDED[operation], *values), dtype)
 
 
-def _quietly(function: Any, *arguments: Any) -> Any:  # noqa: ANN401
+def _quietly(function: Callable[..., Number], *arguments: Number) -> Number:
     with np.errstate(all="ignore"):
         return function(*arguments)

@@ -18,7 +18,9 @@ from jax.interpreters import ad, batching, mlir
 from jfrnn._sums.fused import check
 from jfrnn._sums.relations import Relation, Searched, sum_pairs
 from jfrnn._sums.terms import Derived, Groups, Term, chosen, is_moving, joined, tangent, transposed
-from jfrnn._tracing import compiled, result_aval, unvaried, varied, varying_axes
+from jfrnn._tracing import Aval, Internal, compiled, result_aval, unvaried, varied, varying_axes
+
+Structure = Any  # how the leaves of a relation stand in it: a `PyTreeDef`, which is no type to type checkers
 
 _pair_sum_p = Primitive("pair_sum")
 _pair_sum_p.multiple_results = True
@@ -30,7 +32,7 @@ def bind_sum(relation: Relation, term: Term, operands: Groups, compensated: bool
     return _bind([jnp.asarray(x) for x in leaves], operands, term, structure, compensated)
 
 
-def _bind(leaves: list[Array], operands: Groups, term: Term, structure: Any, compensated: bool) -> list[Array]:  # noqa: ANN401
+def _bind(leaves: list[Array], operands: Groups, term: Term, structure: Structure, compensated: bool) -> list[Array]:
     flat = [jnp.asarray(x) for group in operands for x in group]  # tangents of scalars may be of Python
     relation = jax.tree.unflatten(structure, leaves)
     if isinstance(relation, Searched):
@@ -40,12 +42,12 @@ def _bind(leaves: list[Array], operands: Groups, term: Term, structure: Any, com
     return _pair_sum_p.bind(*leaves, *flat, term=term, structure=structure, compensated=compensated)
 
 
-def _sums(*args: Array, term: Term, structure: Any, compensated: bool) -> list[Array]:  # noqa: ANN401
+def _sums(*args: Array, term: Term, structure: Structure, compensated: bool) -> list[Array]:
     cut = structure.num_leaves
     return sum_pairs(jax.tree.unflatten(structure, args[:cut]), term, term.split(args[cut:]), compensated)
 
 
-def _result_shapes(*args: Any, term: Term, structure: Any, compensated: bool) -> list[ShapedArray]:  # noqa: ANN401
+def _result_shapes(*args: Aval, term: Term, structure: Structure, compensated: bool) -> list[ShapedArray]:
     del compensated
     rows = jax.tree.unflatten(structure, args[: structure.num_leaves]).sizes[0]
     return [
@@ -54,7 +56,7 @@ def _result_shapes(*args: Any, term: Term, structure: Any, compensated: bool) ->
     ]
 
 
-def _jvp(primals: tuple, tangents: tuple, *, term: Term, structure: Any, compensated: bool) -> tuple[list, list]:  # noqa: ANN401
+def _jvp(primals: tuple, tangents: tuple, *, term: Term, structure: Structure, compensated: bool) -> tuple[list, list]:
     sums = _pair_sum_p.bind(*primals, term=term, structure=structure, compensated=compensated)
     cut = structure.num_leaves
     leaves, operands, moves = list(primals[:cut]), term.split(primals[cut:]), term.split(tangents[cut:])
@@ -68,7 +70,7 @@ def _jvp(primals: tuple, tangents: tuple, *, term: Term, structure: Any, compens
     return sums, [next(moved) if is_moving(x) else zero for x, zero in zip(term.summands, none, strict=True)]
 
 
-def _transpose(cotangents: list, *args: Any, term: Term, structure: Any, compensated: bool) -> list:  # noqa: ANN401
+def _transpose(cotangents: list, *args: Internal, term: Term, structure: Structure, compensated: bool) -> list:
     cut = structure.num_leaves
     leaves, operands = list(args[:cut]), term.split(args[cut:])
     relation = jax.tree.unflatten(structure, leaves)
@@ -99,11 +101,11 @@ def _transpose(cotangents: list, *args: Any, term: Term, structure: Any, compens
     return [None] * cut + [next(found) if flag else None for flag in flags]
 
 
-def _bind_derived(leaves: list, operands: Groups, derived: Derived, structure: Any, compensated: bool) -> list[Array]:  # noqa: ANN401
+def _bind_derived(leaves: list, operands: Groups, derived: Derived, structure: Structure, compensated: bool) -> list[Array]:
     return _bind(leaves, chosen(operands, derived.needed), derived.term, structure, compensated)
 
 
-def _batch(args: tuple, dims: tuple, **params: Any) -> tuple[list[Array], list[int]]:  # noqa: ANN401
+def _batch(args: tuple, dims: tuple, **params: Internal) -> tuple[list[Array], list[int]]:
     """One after the other: the searches of a batch have loops of different lengths."""
     mapped = [d is not None for d in dims]
     batched = [jnp.moveaxis(x, d, 0) for x, d, is_mapped in zip(args, dims, mapped, strict=True) if is_mapped]
@@ -116,7 +118,7 @@ def _batch(args: tuple, dims: tuple, **params: Any) -> tuple[list[Array], list[i
     return sums, [0] * len(sums)
 
 
-def _lower(ctx: Any, *args: Any, **params: Any) -> Any:  # noqa: ANN401
+def _lower(ctx: Internal, *args: Internal, **params: Internal) -> Internal:
     """Trace the sums as they are on one device: see `jfrnn._tracing.manual`."""
     return mlir.lower_fun(_sums, multiple_results=True)(ctx.replace(avals_in=unvaried(ctx.avals_in)), *args, **params)
 

@@ -22,6 +22,8 @@ from jax.core import eval_jaxpr
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jax.interpreters import partial_eval
 
+from jfrnn._tracing import Given
+
 
 class Groups(NamedTuple):
     """Something for each operand of a term: arrays, their shapes, flags."""
@@ -90,7 +92,7 @@ def traced(
     operands: Groups,
     shift: jax.ShapeDtypeStruct,
     labels: Labels,
-    owner: Any,  # noqa: ANN401
+    owner: object,
 ) -> tuple[Term, Groups, tuple[Array, ...]]:
     """Trace a summand that may close over anything; return its term, which operands it needs, and what it closes over.
 
@@ -114,7 +116,7 @@ def traced(
 _KNOWN: "weakref.WeakKeyDictionary[Any, dict[Any, Derived]]" = weakref.WeakKeyDictionary()
 
 
-def _kept(owner: Any, derived: "Derived") -> "Derived":  # noqa: ANN401
+def _kept(owner: object, derived: "Derived") -> "Derived":
     """Return an equal term that the owner had before, or this one, which it has from now on."""
     closed = derived.term.jaxpr
     if closed.consts:
@@ -187,7 +189,7 @@ def joined(*groups: Groups) -> Groups:
     return Groups(*(sum(parts, ()) for parts in zip(*groups, strict=True)))
 
 
-def is_moving(x: Any) -> bool:  # noqa: ANN401
+def is_moving(x: Given) -> bool:
     """Say whether something with a dtype has derivatives."""
     return jnp.issubdtype(x.dtype, jnp.inexact)
 

@@ -22,6 +22,7 @@ from jax.extend.core import ClosedJaxpr, Literal
 
 from jfrnn._sums.primitives import TABLE, Equation, Spec, Values
 from jfrnn._sums.scalars import TYPES, NoTranslationError, Scalars, hash_of
+from jfrnn._tracing import Aval, Given, Internal
 
 MOST_ELEMENTS = 256  # of an array
 
@@ -80,7 +81,7 @@ def translate(closed: ClosedJaxpr) -> Translated:
     return Translated(text, inputs, outputs, reads, hash_of(text, inputs, outputs))
 
 
-def _spec(aval: Any, what: str) -> Spec:  # noqa: ANN401
+def _spec(aval: Aval, what: str) -> Spec:
     """Return the shape and dtype of a value, if kernels have them."""
     shape, dtype = tuple(getattr(aval, "shape", ())), str(getattr(aval, "dtype", aval))
     if dtype not in TYPES:
@@ -94,7 +95,7 @@ def _spec(aval: Any, what: str) -> Spec:  # noqa: ANN401
     return Spec(shape, dtype)
 
 
-def _constants(scalars: Scalars, array: Any) -> Values:  # noqa: ANN401
+def _constants(scalars: Scalars, array: Given) -> Values:
     if isinstance(array, Tracer):
         raise NoTranslationError("the function closes over an array that is being traced: hand it over as an argument.")
     dtype = _spec(array, "a constant").dtype
@@ -102,20 +103,20 @@ def _constants(scalars: Scalars, array: Any) -> Values:  # noqa: ANN401
     return np.array(numbers, int).reshape(np.shape(array))
 
 
-def _run(scalars: Scalars, nested: Any, inputs: Sequence[Values]) -> list[Values]:  # noqa: ANN401
+def _run(scalars: Scalars, nested: Internal, inputs: Sequence[Values]) -> list[Values]:
     """Translate the equations of a jaxpr, closed or without constants, and return its results."""
     jaxpr, consts = (nested.jaxpr, nested.consts) if hasattr(nested, "consts") else (nested, ())
     known: dict[Any, Values] = dict(zip(jaxpr.invars, inputs, strict=True))
     known |= {var: _constants(scalars, x) for var, x in zip(jaxpr.constvars, consts, strict=True)}
 
-    def read(atom: Any) -> Values:  # noqa: ANN401
+    def read(atom: Internal) -> Values:
         return (
             _constants(scalars, np.asarray(atom.val, _spec(atom.aval, "a constant").dtype))
             if isinstance(atom, Literal)
             else known[atom]
         )
 
-    def run(nested: Any, inputs: Sequence[Values]) -> list[Values]:  # noqa: ANN401
+    def run(nested: Internal, inputs: Sequence[Values]) -> list[Values]:
         return _run(scalars, nested, inputs)
 
     for eqn in jaxpr.eqns:

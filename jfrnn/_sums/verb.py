@@ -5,11 +5,12 @@ from typing import Any
 
 import jax
 from jax import Array
+from jax.tree_util import KeyPath
 
 from jfrnn._engine import ARRAYS, Inputs, Options, checked_backend, platform_of
 from jfrnn._geometry import Box, checked_flag
 from jfrnn._search import NeighborList, checked_problem
-from jfrnn._tracing import on_device, own_transfers
+from jfrnn._tracing import Given, Tree, on_device, own_transfers
 
 REDUCTIONS = ("sum", "max", "min")
 SYMMETRIES = (None, "symmetric", "antisymmetric")
@@ -19,9 +20,9 @@ def pair_sum(
     fn: Callable[[Array, Any, Any], Any],
     positions: Array,
     cutoff: float | Array | tuple[Array, Array] | None,
-    values: Any = None,  # noqa: ANN401
+    values: Tree = None,
     *,
-    query_values: Any = None,  # noqa: ANN401
+    query_values: Tree = None,
     reduce: str = "sum",
     symmetry: str | None = None,
     queries: Array | None = None,
@@ -34,7 +35,7 @@ def pair_sum(
     compensated: bool = False,
     backend: str = "auto",
     neighbors: NeighborList | None = None,
-) -> Any:  # noqa: ANN401
+) -> Tree:
     """Sum a function of pairs over the neighbors of each particle, without a list of them; differentiable to every order.
 
     result[i] = sum over the neighbors j of i of fn(r_ij, i, j), r_ij = x_j - x_i (in a periodic box + S·(lattice vectors), a term
@@ -160,8 +161,8 @@ def _with_engine(options: Options, inputs: Inputs, backend: str) -> Options:
     return options._replace(may_change=backend == "auto") if reason is None else options._replace(engine=ARRAYS)
 
 
-def _checked_values(name: str, values: Any, size: int, what: str) -> Any:  # noqa: ANN401
-    def checked(path: Any, leaf: Any) -> Array:  # noqa: ANN401
+def _checked_values(name: str, values: Tree, size: int, what: str) -> Tree:
+    def checked(path: KeyPath, leaf: Given) -> Array:
         if not hasattr(leaf, "shape") or not hasattr(leaf, "dtype"):
             raise TypeError(
                 f"{name}{jax.tree_util.keystr(path)} must be an array with a row per {what}, got {type(leaf).__name__}."

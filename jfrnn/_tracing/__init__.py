@@ -1,11 +1,16 @@
 """What JAX asks of the library while it traces and runs programs: its modes, `shard_map`, and how many programs are kept."""
 
 from jfrnn._tracing.flags import any_of_rows, first_set, set_places
+from jfrnn._tracing.kinds import Aval, Given, Internal, Tree
 from jfrnn._tracing.manual import call_apart, result_aval, unvaried, varied, varying_axes
 from jfrnn._tracing.modes import gathered, leading_axes, own_transfers
 from jfrnn._tracing.programs import at_once, compiled, made_on_host, on_device
 
 __all__ = [
+    "Aval",
+    "Given",
+    "Internal",
+    "Tree",
     "any_of_rows",
     "at_once",
     "call_apart",

@@ -6,16 +6,18 @@ its operands does.
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
-from jax import lax
+import numpy as np
+from jax import Array, lax
 from jax.core import ShapedArray, Tracer
 
+from jfrnn._tracing.kinds import Aval, Internal, Tree
 
-def varying_axes(tree: Any) -> tuple[str, ...]:  # noqa: ANN401
+
+def varying_axes(tree: Tree) -> tuple[str, ...]:
     """Return the axes of the mesh over which any array of a pytree varies."""
     found: set[str] = set()
     for leaf in jax.tree.leaves(tree):
@@ -24,22 +26,22 @@ def varying_axes(tree: Any) -> tuple[str, ...]:  # noqa: ANN401
     return tuple(sorted(found))
 
 
-def _axes_of(aval: Any) -> frozenset[str]:  # noqa: ANN401
+def _axes_of(aval: Aval) -> frozenset[str]:
     kind = getattr(aval, "manual_axis_type", None)  # as JAX says it from 0.10 on
     return frozenset(getattr(aval, "vma", ()) if kind is None else kind.varying)
 
 
-def varied(tree: Any, axes: tuple[str, ...]) -> Any:  # noqa: ANN401
+def varied(tree: Tree, axes: tuple[str, ...]) -> Tree:
     """Return the same arrays as ones that vary over these axes, and over whatever they do."""
 
-    def vary(x: Any) -> Any:  # noqa: ANN401
+    def vary(x: Array) -> Array:
         more = tuple(name for name in axes if name not in _axes_of(jax.typeof(x)))
         return lax.pcast(x, more, to="varying") if more else x
 
     return jax.tree.map(vary, tree) if axes else tree
 
 
-def result_aval(shape: tuple[int, ...], dtype: Any, operands: Any) -> ShapedArray:  # noqa: ANN401
+def result_aval(shape: tuple[int, ...], dtype: np.dtype, operands: Iterable[Aval]) -> ShapedArray:
     """Return the type of a result that varies as the first of the operands does, which all vary alike."""
     for aval in operands:
         if hasattr(aval, "update") and _axes_of(aval):
@@ -48,12 +50,12 @@ def result_aval(shape: tuple[int, ...], dtype: Any, operands: Any) -> ShapedArra
     return ShapedArray(shape, dtype)
 
 
-def unvaried(avals: Any) -> list[ShapedArray]:  # noqa: ANN401
+def unvaried(avals: Iterable[Aval]) -> list[ShapedArray]:
     """Return types of arrays that vary over nothing."""
     return [ShapedArray(aval.shape, aval.dtype) if _axes_of(aval) else aval for aval in avals]
 
 
-def call_apart(fn: Callable[..., Any], *args: Any) -> Any:  # noqa: ANN401
+def call_apart(fn: Callable[..., Tree], *args: Tree) -> Tree:
     """Call a function of pytrees that has no derivative; where an argument varies over axes of a mesh, as a program of its own."""
     axes = varying_axes(args)
     if not axes:
@@ -62,7 +64,7 @@ def call_apart(fn: Callable[..., Any], *args: Any) -> Any:  # noqa: ANN401
     is_static = [isinstance(x, int) for x in leaves]
     arrays = [lax.stop_gradient(jnp.asarray(x)) for x, static in zip(leaves, is_static, strict=True) if not static]
 
-    def flat(*arrays: Any) -> Any:  # noqa: ANN401
+    def flat(*arrays: Array) -> Tree:
         given = iter(arrays)
         whole = [x if static else next(given) for x, static in zip(leaves, is_static, strict=True)]
         return fn(*jax.tree.unflatten(structure, whole))
@@ -74,7 +76,7 @@ def call_apart(fn: Callable[..., Any], *args: Any) -> Any:  # noqa: ANN401
 
 
 @functools.cache
-def _program() -> Any:  # noqa: ANN401
+def _program() -> Internal:
     """Return the primitive of a program that varies over nothing; `varied` then says over what its results do."""
     from jax.extend.core import Primitive, jaxpr_as_fun
     from jax.interpreters import batching, mlir
@@ -84,10 +86,10 @@ def _program() -> Any:  # noqa: ANN401
     program.def_impl(lambda *args, jaxpr: jax.jit(jaxpr_as_fun(jaxpr))(*args))
     program.def_abstract_eval(lambda *_, jaxpr: [ShapedArray(x.shape, x.dtype) for x in jaxpr.out_avals])
 
-    def lower(ctx: Any, *args: Any, jaxpr: Any) -> Any:  # noqa: ANN401
+    def lower(ctx: Internal, *args: Internal, jaxpr: Internal) -> Internal:
         return mlir.lower_fun(jaxpr_as_fun(jaxpr))(ctx.replace(avals_in=jaxpr.in_avals), *args)
 
-    def batch(args: Any, dims: Any, *, jaxpr: Any) -> Any:  # noqa: ANN401
+    def batch(args: Sequence[Array], dims: Sequence[int | None], *, jaxpr: Internal) -> tuple[list[Array], list[int]]:
         mapped = jax.vmap(jaxpr_as_fun(jaxpr), dims)
         results = program.bind(*args, jaxpr=jax.make_jaxpr(mapped)(*(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in args)))
         return results, [0] * len(results)

@@ -18,11 +18,15 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
+from jfrnn._tracing.kinds import Given, Tree
 from jfrnn._tracing.modes import gathered, guards_transfers, own_transfers
 
 MOST = 512  # programs of all functions together: 1 to 4 MB each
 _LOOK_EVERY = 16  # new programs after which memory maps are counted: a millisecond or twenty, against a second of compilation
 _SHARE = 0.5  # of the memory maps that a process may have, from which on programs are given up
+
+Option = Any  # a keyword of `jax.jit`
+Lowered = Any  # what `lower` of `jax.jit` returns: a program that can be compiled for shapes
 
 _Args = ParamSpec("_Args")
 _Result = TypeVar("_Result")
@@ -33,7 +37,7 @@ _seen = 0  # how many programs there were when memory maps were last counted
 class Program(Generic[_Args, _Result]):
     """A compiled function, one of those of which the library keeps only so many programs."""
 
-    def __init__(self, function: Callable[_Args, _Result], **options: Any) -> None:  # noqa: ANN401
+    def __init__(self, function: Callable[_Args, _Result], **options: Option) -> None:
         self._jitted: Any = jax.jit(function, **options)
         _functions.append(self)
         functools.update_wrapper(self, function)
@@ -52,12 +56,12 @@ class Program(Generic[_Args, _Result]):
         """Let go of the programs of this function."""
         self._jitted.clear_cache()
 
-    def lower(self, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
+    def lower(self, *args: Tree, **kwargs: Tree) -> Lowered:
         """Do as `lower` of what `jax.jit` returns: shapes may stand for arrays."""
         return self._jitted.lower(*args, **kwargs)
 
 
-def compiled(function: Callable[_Args, _Result], **options: Any) -> Program[_Args, _Result]:  # noqa: ANN401
+def compiled(function: Callable[_Args, _Result], **options: Option) -> Program[_Args, _Result]:
     """Compile a function as `jax.jit` does, and let go of all programs of the library when there are too many.
 
     What is in use elsewhere, such as a program of the caller that calls this function, stays as it is.
@@ -85,7 +89,7 @@ def at_once() -> AbstractContextManager[None]:
     return jax.core.eval_context()
 
 
-def on_device(x: Any) -> Array:  # noqa: ANN401
+def on_device(x: Given) -> Array:
     """Return `jnp.asarray(x)` in one piece, concrete where x is.
 
     Of NumPy's arrays it does so without the program that this compiles for each shape, but where a guard is to see the transfer.
@@ -99,7 +103,7 @@ def on_device(x: Any) -> Array:  # noqa: ANN401
         return jnp.asarray(copied) if guards_transfers() else jax.device_put(copied)
 
 
-def made_on_host(x: Any, how: Callable[[np.ndarray], np.ndarray]) -> Array:  # noqa: ANN401
+def made_on_host(x: Given, how: Callable[[np.ndarray], np.ndarray]) -> Array:
     """Return on the device what a function of NumPy makes of an array that is known: no program is compiled for its shape."""
     with own_transfers() if isinstance(x, Array) else contextlib.nullcontext():
         return on_device(how(np.asarray(jax.device_get(x))))

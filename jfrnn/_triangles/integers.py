@@ -16,7 +16,8 @@ takes up to 27 (float64: 82), is of 2·4·27 (2·4·82) of them: below 2^30.5 (2
 """
 
 import functools
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -118,7 +119,7 @@ class _Table:
         self.left: list[int] = []
         self.right: list[int] = []
 
-    def dot(self, left: Any, right: Any, signs: Any = (1, 1, 1)) -> np.ndarray:  # noqa: ANN401
+    def dot(self, left: Iterable[int], right: Iterable[int], signs: Sequence[int] = (1, 1, 1)) -> np.ndarray:
         """Return the sum of the products of these rows."""
         total = np.zeros(_MOST_PRODUCTS, np.int32)
         for a, b, sign in zip(left, right, signs, strict=False):

@@ -1,14 +1,12 @@
 """The public verb `search_triangles`: which triangles of a wall are closer to each particle than a cutoff."""
 
-from typing import Any
-
 import numpy as np
 from jax import Array
 from jax.core import Tracer
 
 from jfrnn._engine import PLATFORMS, choose_engine, platform_of
 from jfrnn._geometry import check_is_known, checked_capacity, checked_cutoff, checked_positions, checked_slack
-from jfrnn._tracing import gathered, made_on_host
+from jfrnn._tracing import Given, gathered, made_on_host
 from jfrnn._triangles.engines import TRIANGLE_BACKENDS, TRIANGLE_ENGINES, TriangleEngine, fastest_of
 from jfrnn._triangles.programs import counted_slots, found_triangles
 from jfrnn._triangles.triangle_list import TriangleList
@@ -91,7 +89,7 @@ def search_triangles(
     return TriangleList(**found, cutoff=radius, backend=engine.name, closed=closed)
 
 
-def _checked_faces(faces: Any, dim: int, vertices: int) -> Array:  # noqa: ANN401
+def _checked_faces(faces: Given, dim: int, vertices: int) -> Array:
     """Return faces as int32 [f, dim]; what names no vertex stays out of range."""
     kind = "triangles" if dim == 3 else "segments"
     if not hasattr(faces, "dtype") or not np.issubdtype(faces.dtype, np.integer):
@@ -106,7 +104,7 @@ def _checked_faces(faces: Any, dim: int, vertices: int) -> Array:  # noqa: ANN40
     return made_on_host(faces, lambda known: _clipped(known, least, vertices))
 
 
-def _clipped(faces: Any, least: int, most: int) -> Any:  # noqa: ANN401
+def _clipped(faces: Given, least: int, most: int) -> Given:
     return (faces.clip(least, most) if np.iinfo(faces.dtype).max > most else faces).astype(np.int32)
 
 

@@ -4,14 +4,25 @@ They look for triangles in cells, which on CUDA are those of `jfrnn._triangles.c
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._engine import Command, Kernel, ask_for_huge_pages, kernel, kernels_of, load_warp, on_every_core, on_one_core
+from jfrnn._engine import (
+    Command,
+    Kernel,
+    WarpArray,
+    WarpKernel,
+    ask_for_huge_pages,
+    kernel,
+    kernels_of,
+    load_warp,
+    on_every_core,
+    on_one_core,
+)
 from jfrnn._engine import on_cpu as launch_on_cpu
 from jfrnn._engine import on_cuda as launch_on_cuda
 from jfrnn._geometry import Cutoff
@@ -19,6 +30,8 @@ from jfrnn._triangles.cells import LANES, MOST_CELLS, TriangleCells, bucket_coun
 from jfrnn._triangles.cells import sort_triangles as sort_by_jax
 from jfrnn._triangles.rows import decide_pairs as decide_by_jax
 from jfrnn._triangles.tree import WIDTH, TriangleTree, level_starts, widened
+
+TriangleKernels = Any  # what `triangle_kernels` of a module of `jfrnn.kernels` returns
 
 _LONGEST_VECTOR = 16
 _PARTICLES_PER_THREAD = 1024  # below, a second thread costs more than it saves
@@ -102,7 +115,7 @@ def _name(name: str, variant: _Variant) -> str:
     return f"jfrnn_triangles_{name}_{variant.dim}d_{'f64' if variant.double else 'f32'}{options}"
 
 
-def _kernels(variant: _Variant) -> Any:  # noqa: ANN401
+def _kernels(variant: _Variant) -> TriangleKernels:
     return kernels_of("triangles_cpu").triangle_kernels(*variant, MOST_CELLS[variant.dim], LANES[variant.dim], WIDTH)
 
 
@@ -113,7 +126,7 @@ def _build_callable(variant: _Variant) -> Kernel:
     types = {"corners": wp.array3d(dtype=scalar), "good": ints, "cutoff": wp.array(dtype=scalar), "start": ints, "triangles": ints}
     types |= {"levels": ints, "level_count": ints, "level_of": ints, "scratch": ints}
 
-    def run(*arrays: Any) -> None:  # noqa: ANN401
+    def run(*arrays: WarpArray) -> None:
         named = dict(zip(types, arrays, strict=True))
         sizes = [named["corners"].shape[0], named["start"].shape[0] - 1]
         on_one_core(_kernels(variant).build, [*arrays, *sizes])
@@ -136,7 +149,7 @@ def _query_callable(variant: _Variant) -> Kernel:
     wp = load_warp()
     types = _query_types(variant) | {"info": wp.array(dtype=wp.int32)}
 
-    def run(*arrays: Any) -> None:  # noqa: ANN401
+    def run(*arrays: WarpArray) -> None:
         named = dict(zip(types, arrays, strict=True))
         n, capacity = named["positions"].shape[0], named["idx"].shape[1]
         sizes = [n, named["corners"].shape[0], named["start"].shape[0] - 1, capacity, named["boxes"].shape[1]]
@@ -156,11 +169,11 @@ def _cuda_callable(variant: _Variant) -> Kernel:
     return launch_on_cuda(_name("cuda", variant), types, 3, functools.partial(_commands, variant))
 
 
-def _cuda_kernels(variant: _Variant) -> Any:  # noqa: ANN401
+def _cuda_kernels(variant: _Variant) -> TriangleKernels:
     return kernels_of("triangles_cuda").triangle_kernels(*variant, WIDTH)
 
 
-def _commands(variant: _Variant, *arrays: Any) -> list[Command]:  # noqa: ANN401
+def _commands(variant: _Variant, *arrays: WarpArray) -> list[Command]:
     (n, _), faces, capacity = arrays[0].shape, arrays[1].shape[0], arrays[9].shape[1]
     sizes, workers = sizes_on_cuda(variant, arrays), kernels_of("triangles_cuda").workers_for(n, variant.double)
     launches = _cuda_kernels(variant).launches(n, *sizes, capacity, variant.double)
@@ -175,7 +188,7 @@ def cast_rays(
     radius, starts = jnp.reshape(jnp.asarray(cutoff.radius), 1), jnp.asarray(level_starts(len(corners)))
     inputs = points, corners, tree.boxes, radius, rays, starts, tree.triangles, asked.astype(jnp.int32), jnp.reshape(least, 1)
 
-    def call(of: Any, *given: Array) -> Array:  # noqa: ANN401
+    def call(of: Callable[[int, bool], Callable[..., Sequence[Array]]], *given: Array) -> Array:
         return of(points.shape[1], bool(points.dtype == jnp.float64))(*given, output_dims={"side": len(points), "info": 1})[0]
 
     on_cpu, on_cuda = (functools.partial(call, of) for of in (_rays_on_cpu, _rays_on_cuda))
@@ -208,7 +221,7 @@ def _pairs_on_cpu(dim: int, double: bool) -> Kernel:
     types = {"positions": wp.array2d(dtype=scalar), "corners": wp.array3d(dtype=scalar), "cutoff": wp.array(dtype=scalar)}
     types |= {"particle": ints, "triangle": ints, "asked": ints, "near": ints, "info": ints}
 
-    def run(*arrays: Any) -> None:  # noqa: ANN401
+    def run(*arrays: WarpArray) -> None:
         arrays[-1].numpy()[:] = 0
         kernels, n = kernels_of("triangle_pairs_cpu"), arrays[3].shape[0]
         on_every_core(kernels.pairs_kernel(dim, double), [*arrays, n], -(-n // kernels.CHUNK))
@@ -230,7 +243,7 @@ def _ray_sizes(arrays: Sequence[Any]) -> list[int]:
     return [arrays[0].shape[0], arrays[5].shape[0] - 1, arrays[2].shape[1]]
 
 
-def _ray_kernel(dim: int, double: bool, cuda: bool) -> Any:  # noqa: ANN401
+def _ray_kernel(dim: int, double: bool, cuda: bool) -> WarpKernel:
     return kernels_of("winding").side_kernel(dim, double, WIDTH, cuda)
 
 
@@ -240,7 +253,7 @@ def _ray_name(dim: int, double: bool, where: str) -> str:
 
 @kernel
 def _rays_on_cpu(dim: int, double: bool) -> Kernel:
-    def run(*arrays: Any) -> None:  # noqa: ANN401
+    def run(*arrays: WarpArray) -> None:
         arrays[-1].numpy()[:] = 0
         sizes = _ray_sizes(arrays)
         most = -(-sizes[0] // kernels_of("winding").CHUNK)
@@ -255,7 +268,7 @@ def _rays_on_cuda(dim: int, double: bool) -> Kernel:
     if wp.is_cuda_available():
         kernels_of("_load").load_module(_ray_kernel(dim, double, cuda=True).module, wp.get_cuda_device(), block)
 
-    def commands(*arrays: Any) -> list[Command]:  # noqa: ANN401
+    def commands(*arrays: WarpArray) -> list[Command]:
         sizes = _ray_sizes(arrays)
         return [Command(_ray_kernel(dim, double, cuda=True), [*arrays, *sizes], -(-sizes[0] // block) * block, block)]
 

@@ -13,8 +13,6 @@ the sum of absolute values; 8 eps is taken.
 Source: Ericson (2005), Real-Time Collision Detection, sect. 5.3.4, for the products.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +20,7 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn._geometry import Cutoff
-from jfrnn._tracing import on_device, own_transfers, set_places
+from jfrnn._tracing import Given, on_device, own_transfers, set_places
 from jfrnn._triangles.exact import Vector, cross, dot, sum_of
 from jfrnn._triangles.tree import WIDTH, TriangleTree, level_starts
 
@@ -51,7 +49,7 @@ def is_closed(faces: Array) -> Array:
         return on_device(np.array_equal(one, two))
 
 
-def _sides(faces: Any) -> tuple[list[Any], list[Any]]:  # noqa: ANN401
+def _sides(faces: Given) -> tuple[list[Given], list[Given]]:
     """Return both ends of each side, and those of each side run through the other way."""
     if faces.shape[1] == 2:
         return [faces[:, 0]], [faces[:, 1]]
