@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jfrnn._geometry.batch import Batch
 from jfrnn._geometry.box import Box
 from jfrnn._geometry.cutoffs import RULES, Cutoff, Radii, largest_cutoff, make_cutoff, smallest_cutoff
-from jfrnn._tracing import Given, gathered, made_on_host, on_device
+from jfrnn._tracing import Given, gather, make_on_host, on_device
 
 _MOST_POINTS = 2**31 - 32
 
@@ -142,8 +142,8 @@ def _checked_radii_of(name: str, radii: Given, size: int, what: str, like: Array
 def _as_dtype(x: Given, dtype: np.dtype) -> Array:
     """Convert an array; one that is known on the host, where no program is compiled for its shape."""
     if isinstance(x, Tracer):
-        return gathered(x).astype(dtype)
-    return on_device(x) if x.dtype == dtype else made_on_host(x, lambda known: known.astype(dtype))
+        return gather(x).astype(dtype)
+    return on_device(x) if x.dtype == dtype else make_on_host(x, lambda known: known.astype(dtype))
 
 
 def largest_known(radii: Radii) -> float | None:
@@ -204,7 +204,7 @@ def _checked_systems(name: str, systems: Given, size: int, what: str) -> Array:
     values: Any = np.asarray(jax.device_get(systems))
     if values.size and not -(2**31) <= int(values.min()) <= int(values.max()) < 2**31:
         raise ValueError(f"{name} holds numbers from {values.min()} to {values.max()}, but systems are numbered in int32.")
-    return made_on_host(systems, lambda known: known.astype(np.int32))
+    return make_on_host(systems, lambda known: known.astype(np.int32))
 
 
 def checked_box(box: object, positions: Array, like: Box | None = None) -> Box | None:

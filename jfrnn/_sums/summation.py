@@ -18,7 +18,7 @@ from jax.interpreters import ad, batching, mlir
 from jfrnn._sums.fused import check
 from jfrnn._sums.relations import Relation, Searched, sum_pairs
 from jfrnn._sums.terms import Derived, Groups, Term, chosen, is_moving, joined, tangent, transposed
-from jfrnn._tracing import Aval, Internal, compiled, result_aval, unvaried, varied, varying_axes
+from jfrnn._tracing import Aval, Internal, compiled, result_aval, unvarying_types, vary, varying_axes
 
 Structure = Any  # how the leaves of a relation stand in it: a `PyTreeDef`, which is no type to type checkers
 
@@ -38,7 +38,7 @@ def _bind(leaves: list[Array], operands: Groups, term: Term, structure: Structur
     if isinstance(relation, Searched):
         check(relation.inputs, relation.options, term)
     axes = varying_axes((leaves, flat))
-    leaves, flat = varied((leaves, flat), axes)
+    leaves, flat = vary((leaves, flat), axes)
     return _pair_sum_p.bind(*leaves, *flat, term=term, structure=structure, compensated=compensated)
 
 
@@ -120,7 +120,7 @@ def _batch(args: tuple, dims: tuple, **params: Internal) -> tuple[list[Array], l
 
 def _lower(ctx: Internal, *args: Internal, **params: Internal) -> Internal:
     """Trace the sums as they are on one device: see `jfrnn._tracing.manual`."""
-    return mlir.lower_fun(_sums, multiple_results=True)(ctx.replace(avals_in=unvaried(ctx.avals_in)), *args, **params)
+    return mlir.lower_fun(_sums, multiple_results=True)(ctx.replace(avals_in=unvarying_types(ctx.avals_in)), *args, **params)
 
 
 _compiled = functools.partial(compiled, static_argnames=("term", "structure", "compensated"))(_sums)

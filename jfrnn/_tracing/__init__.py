@@ -2,9 +2,9 @@
 
 from jfrnn._tracing.flags import any_of_rows, first_set, set_places
 from jfrnn._tracing.kinds import Aval, Given, Internal, Tree
-from jfrnn._tracing.manual import call_apart, result_aval, unvaried, varied, varying_axes
-from jfrnn._tracing.modes import gathered, leading_axes, own_transfers
-from jfrnn._tracing.programs import at_once, compiled, made_on_host, on_device
+from jfrnn._tracing.manual import call_apart, result_aval, unvarying_types, vary, varying_axes
+from jfrnn._tracing.modes import gather, leading_axes, own_transfers
+from jfrnn._tracing.programs import at_once, compiled, make_on_host, on_device
 
 __all__ = [
     "Aval",
@@ -16,14 +16,14 @@ __all__ = [
     "call_apart",
     "compiled",
     "first_set",
-    "gathered",
+    "gather",
     "leading_axes",
-    "made_on_host",
+    "make_on_host",
     "on_device",
     "own_transfers",
     "result_aval",
     "set_places",
-    "unvaried",
-    "varied",
+    "unvarying_types",
+    "vary",
     "varying_axes",
 ]

@@ -31,14 +31,14 @@ def _axes_of(aval: Aval) -> frozenset[str]:
     return frozenset(getattr(aval, "vma", ()) if kind is None else kind.varying)
 
 
-def varied(tree: Tree, axes: tuple[str, ...]) -> Tree:
+def vary(tree: Tree, axes: tuple[str, ...]) -> Tree:
     """Return the same arrays as ones that vary over these axes, and over whatever they do."""
 
-    def vary(x: Array) -> Array:
+    def vary_leaf(x: Array) -> Array:
         more = tuple(name for name in axes if name not in _axes_of(jax.typeof(x)))
         return lax.pcast(x, more, to="varying") if more else x
 
-    return jax.tree.map(vary, tree) if axes else tree
+    return jax.tree.map(vary_leaf, tree) if axes else tree
 
 
 def result_aval(shape: tuple[int, ...], dtype: np.dtype, operands: Iterable[Aval]) -> ShapedArray:
@@ -50,7 +50,7 @@ def result_aval(shape: tuple[int, ...], dtype: np.dtype, operands: Iterable[Aval
     return ShapedArray(shape, dtype)
 
 
-def unvaried(avals: Iterable[Aval]) -> list[ShapedArray]:
+def unvarying_types(avals: Iterable[Aval]) -> list[ShapedArray]:
     """Return types of arrays that vary over nothing."""
     return [ShapedArray(aval.shape, aval.dtype) if _axes_of(aval) else aval for aval in avals]
 
@@ -71,13 +71,13 @@ def call_apart(fn: Callable[..., Tree], *args: Tree) -> Tree:
 
     shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays]
     jaxpr, out = jax.make_jaxpr(flat, return_shape=True)(*shapes)
-    results = varied(_program().bind(*arrays, jaxpr=jaxpr), axes)
+    results = vary(_program().bind(*arrays, jaxpr=jaxpr), axes)
     return jax.tree.unflatten(jax.tree.structure(out), results)
 
 
 @functools.cache
 def _program() -> Internal:
-    """Return the primitive of a program that varies over nothing; `varied` then says over what its results do."""
+    """Return the primitive of a program that varies over nothing; `vary_leaf` then says over what its results do."""
     from jax.extend.core import Primitive, jaxpr_as_fun
     from jax.interpreters import batching, mlir
 

@@ -20,7 +20,7 @@ def leading_axes(x: Array, ndim: int) -> Array:
     return x.reshape((1,) * (ndim - x.ndim) + x.shape)
 
 
-def gathered(x: Array) -> Array:
+def gather(x: Array) -> Array:
     """Return x in one piece on every device, where its type says that it is spread over explicit axes of a mesh.
 
     Along automatic axes the compiler does so where it has to. `jfrnn.distributed` spreads the work as well.

@@ -19,7 +19,7 @@ from jax import Array
 from jax.core import Tracer
 
 from jfrnn._tracing.kinds import Given, Tree
-from jfrnn._tracing.modes import gathered, guards_transfers, own_transfers
+from jfrnn._tracing.modes import gather, guards_transfers, own_transfers
 
 MOST = 512  # programs of all functions together: 1 to 4 MB each
 _LOOK_EVERY = 16  # new programs after which memory maps are counted: a millisecond or twenty, against a second of compilation
@@ -95,15 +95,15 @@ def on_device(x: Given) -> Array:
     Of NumPy's arrays it does so without the program that this compiles for each shape, but where a guard is to see the transfer.
     """
     if isinstance(x, Tracer):
-        return gathered(jnp.asarray(x))
+        return gather(jnp.asarray(x))
     with at_once():
         if isinstance(x, Array):
-            return gathered(jnp.asarray(x))
+            return gather(jnp.asarray(x))
         copied = np.array(x)  # where JAX shares memory with an array, it must not be the caller's
         return jnp.asarray(copied) if guards_transfers() else jax.device_put(copied)
 
 
-def made_on_host(x: Given, how: Callable[[np.ndarray], np.ndarray]) -> Array:
+def make_on_host(x: Given, how: Callable[[np.ndarray], np.ndarray]) -> Array:
     """Return on the device what a function of NumPy makes of an array that is known: no program is compiled for its shape."""
     with own_transfers() if isinstance(x, Array) else contextlib.nullcontext():
         return on_device(how(np.asarray(jax.device_get(x))))

@@ -6,7 +6,7 @@ from jax.core import Tracer
 
 from jfrnn._engine import PLATFORMS, choose_engine, platform_of
 from jfrnn._geometry import check_is_known, checked_capacity, checked_cutoff, checked_positions, checked_slack
-from jfrnn._tracing import Given, gathered, made_on_host
+from jfrnn._tracing import Given, gather, make_on_host
 from jfrnn._triangles.engines import TRIANGLE_BACKENDS, TRIANGLE_ENGINES, TriangleEngine, fastest_of
 from jfrnn._triangles.programs import counted_slots, found_triangles
 from jfrnn._triangles.triangle_list import TriangleList
@@ -100,8 +100,8 @@ def _checked_faces(faces: Given, dim: int, vertices: int) -> Array:
     check_is_known("faces", faces.shape)
     least = 0 if np.issubdtype(faces.dtype, np.unsignedinteger) else -1
     if isinstance(faces, Tracer):
-        return _clipped(gathered(faces), least, vertices)
-    return made_on_host(faces, lambda known: _clipped(known, least, vertices))
+        return _clipped(gather(faces), least, vertices)
+    return make_on_host(faces, lambda known: _clipped(known, least, vertices))
 
 
 def _clipped(faces: Given, least: int, most: int) -> Given:
