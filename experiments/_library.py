@@ -1,7 +1,7 @@
 """The one place where experiments take what is private to the library. All else they ask by its public names, as users do.
 
 - `load_warp`: Warp as the library starts it, quietly and once, so that kernels of both share its settings.
-- `rounded_capacity`: how the library rounds the slots of a row, so that lists here are as long as those that it makes itself.
+- `round_capacity`: how the library rounds the slots of a row, so that lists here are as long as those that it makes itself.
 - `triangle_query`: the kernels of a search for triangles one by one, with what they are given: a call of the library runs them all.
 - `taylor_green_velocity`, `lattice`, `free`, `LAYERS`: parts of scenes of `jfrnn.cases`, for answers and scenes beside them.
 """
@@ -13,11 +13,11 @@ from jfrnn.cases import _fluid, _fluid_flows, _fluid_free  # pyright: ignore[rep
 
 from jfrnn._engine import kernels_of, load_warp
 from jfrnn._geometry import make_cutoff
-from jfrnn._search import rounded_capacity
+from jfrnn._search import round_capacity
 from jfrnn._triangles import warp as _triangles_warp
 from jfrnn._triangles.cells import without_faults
 
-__all__ = ["LAYERS", "free", "lattice", "load_warp", "rounded_capacity", "taylor_green_velocity", "triangle_query"]
+__all__ = ["LAYERS", "free", "lattice", "load_warp", "round_capacity", "taylor_green_velocity", "triangle_query"]
 
 lattice, taylor_green_velocity, free, LAYERS = (
     _fluid.lattice,

@@ -18,7 +18,7 @@ from jfrnn._engine import (
     Filter,
     Inputs,
     Options,
-    checked_backend,
+    check_backend,
     count_rows,
     default_platform,
     fastest_engine,
@@ -142,7 +142,7 @@ def memory_plan(
             raise ValueError("faces belong to a search for triangles, which knows neither fn nor queries: leave them out.")
         sizes = (n, checked_size("faces", faces), dim, checked_capacity(capacity))
         return _plan_of_triangles(sizes, dtype, radius, backend, _device_of(where))
-    engine = checked_backend(backend)
+    engine = check_backend(backend)
     if fn is not None:
         if capacity is not None:
             raise ValueError(f"capacity is that of a list, which a pair sum does not make: leave it out, or fn, got {capacity}.")

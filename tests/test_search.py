@@ -198,14 +198,14 @@ def test_jit_traces_once_for_new_positions():
 
 @pytest.mark.parametrize("backend", ["jax", "warp"])
 def test_one_program_serves_every_cutoff(backend):
-    from jfrnn._search.making import found_fields
+    from jfrnn._search.making import find_fields
 
     points = random_points(77, 2, np.float32)
     jfrnn.search(points, 0.1, capacity=76, backend=backend)
-    before = found_fields.cache_size()
+    before = find_fields.cache_size()
     for cutoff in (0.2, 0.5, 3.0):
         checked.assert_exact(jfrnn.search(points, cutoff, capacity=76, backend=backend), points, cutoff)
-    assert found_fields.cache_size() == before
+    assert find_fields.cache_size() == before
 
 
 @pytest.mark.parametrize("backend", [pytest.param("jax", marks=SLOW), "warp"])

@@ -14,7 +14,7 @@ import typer
 import jfrnn
 from experiments import _measure
 from experiments._commands import Engine, Points, Rounds
-from experiments._library import rounded_capacity
+from experiments._library import round_capacity
 from experiments.bench import table
 
 COLUMNS = (
@@ -99,7 +99,7 @@ def _compiled(option: _Option, backend: str) -> tuple[Callable[[], Any], Callabl
     given = {name: value for name, value in option.more.items() if name != "skin"}
     skin = option.more.get("skin", 0.0)
     longest = int(jfrnn.count(option.x, option.cutoff + skin, backend=backend, **given).max())
-    capacity = rounded_capacity(longest)
+    capacity = round_capacity(longest)
     given["cutoff"] = option.cutoff
     data: dict[str, Any] = {name: value for name, value in given.items() if hasattr(value, "shape")}  # operands, no constants
     more = {name: value for name, value in given.items() if name not in data}

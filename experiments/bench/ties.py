@@ -18,7 +18,7 @@ from jax.typing import DTypeLike
 import jfrnn
 from experiments import _config, _layouts, _measure, _oracle
 from experiments._commands import MOST_POINTS, Engine, Rounds
-from experiments._library import rounded_capacity
+from experiments._library import round_capacity
 from experiments.bench import table
 
 JITTER = 0.3  # of a spacing, to either side
@@ -123,7 +123,7 @@ def _rows(scene: str, sites: Callable[[], np.ndarray], dtype: DTypeLike, rounds:
 def _compiled(sites: _Sites, backend: str) -> dict[str, Callable[[], Any]]:
     x, r = jnp.asarray(sites.positions), sites.cutoff
     count = jax.jit(lambda x: jfrnn.count(x, r, backend=backend))
-    capacity = rounded_capacity(int(np.asarray(count(x)).max()))
+    capacity = round_capacity(int(np.asarray(count(x)).max()))
     search = jax.jit(lambda x: jfrnn.search(x, r, capacity=capacity, backend=backend).idx)
 
     def kernel(d: jax.Array, i: Any, j: Any) -> jax.Array:  # noqa: ANN401

@@ -13,7 +13,7 @@ import typer
 import jfrnn
 from experiments import _measure
 from experiments._commands import Points, Rounds
-from experiments._library import rounded_capacity
+from experiments._library import round_capacity
 from experiments.bench import table
 
 ORDERS = ("random", "row", "morton", "hilbert")
@@ -42,7 +42,7 @@ def _order_rows(points: int, rounds: int) -> Iterator[table.Line]:
     """
     random = np.random.default_rng(0)
     x, r = jnp.asarray(random.random((points, 3)), jnp.float32), (3 * NEIGHBORS / (4 * math.pi * points)) ** (1 / 3)
-    capacity = rounded_capacity(int(jfrnn.count(x, r).max()))
+    capacity = round_capacity(int(jfrnn.count(x, r).max()))
     search = jax.jit(lambda x: jfrnn.search(x, r, capacity=capacity))
     calls: dict[str, Callable[[], Any]] = {}
     for order in ORDERS:

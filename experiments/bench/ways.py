@@ -235,9 +235,9 @@ def _our_list(given: Given) -> Callable[[Any], Any]:
 
 def _capacity(given: Given) -> int:
     import jfrnn
-    from experiments._library import rounded_capacity
+    from experiments._library import round_capacity
 
-    return rounded_capacity(int(jfrnn.count(given.x, given.cutoff).max()))
+    return round_capacity(int(jfrnn.count(given.x, given.cutoff).max()))
 
 
 def _listed(given: Given, gradient: bool, compensated: bool) -> Steps:

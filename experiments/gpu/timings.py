@@ -13,7 +13,7 @@ from jax import lax
 
 import jfrnn
 from experiments import _compare, _measure
-from experiments._library import load_warp, rounded_capacity
+from experiments._library import load_warp, round_capacity
 from experiments.bench import ways
 from experiments.gpu.config import Config
 
@@ -53,7 +53,7 @@ def memory_rows() -> Iterator[dict[str, Any]]:
     jax.block_until_ready(jfrnn.search(jnp.asarray(blob[:1000], jnp.float32), 1.0, backend="warp").idx)  # libraries
     for name, points in scenes.items():
         x = jnp.asarray(points, jnp.float32)
-        capacity = rounded_capacity(int(jfrnn.count(x, 1.0, backend="warp").max()))
+        capacity = round_capacity(int(jfrnn.count(x, 1.0, backend="warp").max()))
         search = jax.jit(functools.partial(_listed, cutoff=1.0, capacity=capacity, backend="warp"))
         compiled: Any = search.lower(x).compile().memory_analysis()
         before = _measure.device_bytes("bytes_in_use")
@@ -103,7 +103,7 @@ def scene_rows(config: Config, layout: str, size: float) -> Iterator[dict[str, A
     points = jitter_lattice(config, int(size)) if layout == "jitter" else _corners(config, size)
     x, cutoff, n = jnp.asarray(points), config.reach_in_spacings, len(points)
     exact = np.asarray(jfrnn.count(x, cutoff, backend="jax"))
-    capacity = rounded_capacity(int(exact.max()))
+    capacity = round_capacity(int(exact.max()))
     base = {"layout": layout, "points": n, "capacity": capacity, "dtype": "float32", "exact_directed_pairs": int(exact.sum())}
     listed = functools.partial(_listed, cutoff=cutoff, capacity=capacity)
 
@@ -141,7 +141,7 @@ def _loop_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> I
     """What a time loop adds: a periodic box, whose faces close the lattice, and updates of a list with a skin."""
     box = jfrnn.Box([float(round(base["points"] ** (1 / 3)))] * 3, origin=-0.5)
     counts = np.asarray(jfrnn.count(x, cutoff, box=box, backend="warp"))
-    capacity = rounded_capacity(int(counts.max()))
+    capacity = round_capacity(int(counts.max()))
 
     def periodic(x: Any) -> Any:  # noqa: ANN401
         nbrs = jfrnn.search(x, cutoff, box=box, capacity=capacity, backend="warp")
@@ -157,7 +157,7 @@ def _loop_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> I
     if base["points"] > 1_000_000:
         return
     skin = 0.1 * cutoff
-    wider = rounded_capacity(int(jfrnn.count(x, cutoff + skin, backend="warp").max()))
+    wider = round_capacity(int(jfrnn.count(x, cutoff + skin, backend="warp").max()))
     nbrs = jfrnn.search(x, cutoff, skin=skin, capacity=wider, backend="warp")
     for name, velocity in (("keeps", 0.0), ("rebuilds", skin)):
 

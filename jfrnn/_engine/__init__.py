@@ -5,7 +5,7 @@ from jfrnn._engine.auto import (
     ARRAYS,
     ENGINES,
     WARP,
-    checked_backend,
+    check_backend,
     choose_engine,
     default_platform,
     fastest_engine,
@@ -22,9 +22,9 @@ from jfrnn._engine.problem import (
     Kind,
     Options,
     Search,
+    hide_inactive,
     is_decidable,
     prepare_search,
-    without_inactive,
 )
 from jfrnn._engine.rows import count_rows, fold_pairs, list_rows
 from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit
@@ -55,12 +55,13 @@ __all__ = [
     "WarpKernel",
     "as_float",
     "ask_for_huge_pages",
-    "checked_backend",
+    "check_backend",
     "choose_engine",
     "count_rows",
     "default_platform",
     "fastest_engine",
     "fold_pairs",
+    "hide_inactive",
     "is_decidable",
     "kernel",
     "kernels_of",
@@ -75,5 +76,4 @@ __all__ = [
     "pair_sums",
     "platform_of",
     "prepare_search",
-    "without_inactive",
 ]

@@ -29,7 +29,7 @@ ENGINES: dict[str, Engine] = {
 _WARP_FROM = {"cpu": 0, "gpu": 0}
 
 
-def checked_backend(backend: object) -> str:
+def check_backend(backend: object) -> str:
     """Return the name of a backend."""
     names = ("auto", *ENGINES)
     if not isinstance(backend, str) or backend not in names:
@@ -47,7 +47,7 @@ def choose_engine(backend: str, sources: Array, queries: Array | None, kind: Kin
     """
     if backend == "auto":
         return fastest_engine(platform_of(sources, sources if queries is None else queries), sources.shape[0])
-    engine = ENGINES[checked_backend(backend)]
+    engine = ENGINES[check_backend(backend)]
     if reason := engine.refuse(kind):
         raise ValueError(f"backend={backend!r} {reason}")
     if isinstance(engine, ArrayEngine):

@@ -70,7 +70,7 @@ def _made(make: Callable[..., Kernel], place: str, arguments: tuple[Any, ...]) -
     _finish_before_exit()
     found = make(*arguments)
     name = f"{found.name}@{_sources()}"
-    recipe = json.dumps([place, _encoded(arguments)])
+    recipe = json.dumps([place, _encode(arguments)])
     _keep(name.encode(), found.serve)
     return functools.partial(_call, found, name, recipe)
 
@@ -108,23 +108,23 @@ def _varying(inputs: Sequence[Array]) -> dict[str, Any]:
 # --- what a program carries -------------------------------------------------------------------------------------------
 
 
-def _encoded(value: Static) -> Static:
+def _encode(value: Static) -> Static:
     if not isinstance(value, tuple):
         return value
-    parts = [_encoded(part) for part in value]
+    parts = [_encode(part) for part in value]
     return {f"{type(value).__module__}.{type(value).__name__}": parts} if hasattr(value, "_fields") else parts
 
 
-def _decoded(value: Static) -> Static:
+def _decode(value: Static) -> Static:
     if isinstance(value, list):
-        return tuple(_decoded(part) for part in value)
+        return tuple(_decode(part) for part in value)
     if not isinstance(value, dict):
         return value
     ((name, parts),) = value.items()
     module, _, kind = name.rpartition(".")
     if not module.startswith("jfrnn."):
         raise ValueError(f"no type of the library: {name}")
-    return getattr(importlib.import_module(module), kind)(*map(_decoded, parts))
+    return getattr(importlib.import_module(module), kind)(*map(_decode, parts))
 
 
 @functools.cache
@@ -158,7 +158,7 @@ def _make_again(name: str, recipe: str) -> None:
     if not name.endswith(f"@{_sources()}"):
         raise RuntimeError("this program was made with another version of jfrnn. Export or compile it again with this one.")
     place, arguments = json.loads(recipe)
-    _makers[place](*_decoded(arguments))
+    _makers[place](*_decode(arguments))
 
 
 # --- what XLA calls ---------------------------------------------------------------------------------------------------

@@ -140,7 +140,7 @@ class Inputs(NamedTuple):
     batch: Batch | None = None
 
 
-def without_inactive(positions: Array, active: Array | None) -> Array:
+def hide_inactive(positions: Array, active: Array | None) -> Array:
     """Return positions that are infinite where a particle is inactive: no engine gives such a one neighbors, or to others.
 
     The mark is not NaN, because JAX's mode `jax_debug_nans` takes every NaN that leaves a program for an error.
@@ -151,7 +151,7 @@ def without_inactive(positions: Array, active: Array | None) -> Array:
 def prepare_search(inputs: Inputs, options: Options) -> Search:
     """Prepare a search. No gradient flows through."""
     given, queries, active, box, cutoff, batch = lax.stop_gradient(inputs)
-    sources, images = without_inactive(given, active), options.images
+    sources, images = hide_inactive(given, active), options.images
     batch = None if batch is None else ranked(batch)
     checks: dict[Status, Array] = {}
     if isinstance(cutoff, Radii):

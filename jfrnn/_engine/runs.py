@@ -84,7 +84,7 @@ class Candidates(NamedTuple):
 
 def count_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter) -> Array:
     """Count the neighbors of every query: [m] int32, in the order of the queries' ids."""
-    engine = _Engine(candidates._replace(sources=_padded(candidates.sources)), cutoff, keep, capacity=1)
+    engine = _Engine(candidates._replace(sources=_pad(candidates.sources)), cutoff, keep, capacity=1)
     queries = candidates.queries
 
     def count_block(b: Array, out: Array) -> Array:
@@ -110,7 +110,7 @@ def list_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filte
     Where images must be told apart, an index is that of the source plus n times the code of its image, unused slots n·images.
     """
     sources, queries, torus = candidates.sources, candidates.queries, candidates.torus
-    engine = _Engine(candidates._replace(sources=_padded(sources)), cutoff, keep, capacity)
+    engine = _Engine(candidates._replace(sources=_pad(sources)), cutoff, keep, capacity)
     n, images = sources.ids.size, 1 if torus is None or torus.images.nearest else torus.images.total
     group = min(_SLOT_GROUP, capacity)
     slots = lax.iota(jnp.int32, group)
@@ -192,7 +192,7 @@ def fold_neighbors(
 
     `elements` is how many numbers a visitor holds per pair: blocks are cut so that 16 MB of float32 hold them.
     """
-    engine = _Engine(candidates._replace(sources=_padded(candidates.sources)), cutoff, keep, FOLD_GROUP * elements)
+    engine = _Engine(candidates._replace(sources=_pad(candidates.sources)), cutoff, keep, FOLD_GROUP * elements)
     slots, torus = lax.iota(jnp.int32, FOLD_GROUP), candidates.torus
 
     def fold_block(b: Array, out: State) -> State:
@@ -417,7 +417,7 @@ class _Engine(NamedTuple):
         return Pair(*raw, radii, *shift_in_given(shift, torus.images.basis, torus.matrix), torus.images.orthogonal)
 
 
-def _padded(sources: Points) -> Points:
+def _pad(sources: Points) -> Points:
     """Lengthen the sources so that a window of 16 never reaches past the end; masks keep the padding out."""
     radii = None if sources.radii is None else jnp.pad(sources.radii, (0, LANES))
     return Points([jnp.pad(x, (0, LANES)) for x in sources.axes], jnp.pad(sources.ids, (0, LANES)), radii)

@@ -3,9 +3,9 @@
 from jfrnn._search.chunks import run_chunk
 from jfrnn._search.exports import MOST_PAIRS, saturating_add
 from jfrnn._search.geometry import norms
-from jfrnn._search.making import rounded_capacity
+from jfrnn._search.making import round_capacity
 from jfrnn._search.neighbor_list import ROWS_ARE_WHOLE, NeighborList
-from jfrnn._search.problem import Problem, checked_problem
+from jfrnn._search.problem import Problem, check_problem
 from jfrnn._search.search import count, search
 from jfrnn._search.verlet import list_radius, moved_too_far
 
@@ -14,12 +14,12 @@ __all__ = [
     "ROWS_ARE_WHOLE",
     "NeighborList",
     "Problem",
-    "checked_problem",
+    "check_problem",
     "count",
     "list_radius",
     "moved_too_far",
     "norms",
-    "rounded_capacity",
+    "round_capacity",
     "run_chunk",
     "saturating_add",
     "search",

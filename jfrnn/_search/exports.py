@@ -35,7 +35,7 @@ class DenseNeighbors:
         return (self.status & Status.ROW_OVERFLOW.value) != 0
 
 
-def checked_total(total: object) -> int:
+def check_total(total: object) -> int:
     """Return a static number of pairs that int32 offsets can number."""
     if isinstance(total, bool) or not isinstance(total, int | np.integer):
         raise TypeError(f"total must be a static int, the length of the arrays, got {type(total).__name__} {total!r}.")

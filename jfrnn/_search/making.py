@@ -6,7 +6,7 @@ from typing import Any
 
 from jax import lax
 
-from jfrnn._engine import Inputs, Options, count_rows, list_rows, without_inactive
+from jfrnn._engine import Inputs, Options, count_rows, hide_inactive, list_rows
 from jfrnn._geometry import Radii
 from jfrnn._search.geometry import ImageCodes
 from jfrnn._search.verlet import first_verlet
@@ -15,27 +15,27 @@ from jfrnn._tracing import at_once, compiled, own_transfers
 _CAPACITY_STEP = 8
 
 
-def rounded_capacity(slots: int) -> int:
+def round_capacity(slots: int) -> int:
     """Round a capacity up, so that similar scenes share one compiled program."""
     return -(-slots // _CAPACITY_STEP) * _CAPACITY_STEP
 
 
-def counted_capacity(inputs: Inputs, options: Options, slack: float) -> int:
+def count_capacity(inputs: Inputs, options: Options, slack: float) -> int:
     """Count the neighbors of concrete positions and return a capacity that holds `slack` times the longest row."""
     with at_once(), own_transfers():
         longest = int(count_rows(inputs, options)[1])
     wanted = math.ceil(max(longest, 1) * slack)
-    return min(rounded_capacity(wanted), max(wanted, inputs.sources.shape[0]))
+    return min(round_capacity(wanted), max(wanted, inputs.sources.shape[0]))
 
 
 @functools.partial(compiled, static_argnames=("options", "capacity", "moving"))
-def found_fields(inputs: Inputs, options: Options, capacity: int, moving: bool) -> dict[str, Any]:
+def find_fields(inputs: Inputs, options: Options, capacity: int, moving: bool) -> dict[str, Any]:
     """Search, and return the fields of a list that come from data; `moving`: it has a skin. The compiled program of `search`.
 
     Being results of one program, they share no memory with the caller's arrays, or with each other: either may be donated.
     """
     found = list_rows(inputs, options, capacity)
-    rows, sources = found.rows, without_inactive(inputs.sources, inputs.active)
+    rows, sources = found.rows, hide_inactive(inputs.sources, inputs.active)
     codes = None if found.images is None or found.turns is None else ImageCodes(found.images, *found.turns)
     radii = lax.stop_gradient(inputs.cutoff) if isinstance(inputs.cutoff, Radii) else None
     verlet = first_verlet(sources, inputs.queries, inputs.box, radii) if moving else None

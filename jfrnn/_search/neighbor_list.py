@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._engine import Inputs, without_inactive
+from jfrnn._engine import Inputs, hide_inactive
 from jfrnn._geometry import (
     Batch,
     Box,
@@ -35,9 +35,9 @@ from jfrnn._geometry import (
     pairs_and_status,
     shape_of,
 )
-from jfrnn._search.exports import DenseNeighbors, checked_total, flat_pairs, pair_total
+from jfrnn._search.exports import DenseNeighbors, check_total, flat_pairs, pair_total
 from jfrnn._search.geometry import ImageCodes, ImagesMade, lattice_shifts, norms, open_vectors, periodic_vectors
-from jfrnn._search.making import counted_capacity, found_fields, rounded_capacity
+from jfrnn._search.making import count_capacity, find_fields, round_capacity
 from jfrnn._search.problem import Given, Problem
 from jfrnn._search.verlet import Verlet, moved_too_far
 from jfrnn._tracing import at_once, call_apart, compiled, own_transfers
@@ -194,7 +194,7 @@ class NeighborList:
         sources, rows = self._geometry_inputs(positions, queries)
         rows = rows if self.own_queries else None
         radii = self._radii_now(cutoff, sources, rows)
-        active, box = self._checked_active(active, sources), self._box_now(box, sources)
+        active, box = self._check_active(active, sources), self._box_now(box, sources)
         with own_transfers():
             return call_apart(_update, self, sources, rows, active, box, radii)
 
@@ -230,15 +230,15 @@ class NeighborList:
                 (`check`): no room makes positions finite, or a degenerate box one.
         """
         sources, rows = self._geometry_inputs(positions, queries)
-        queries, active, slack = rows if self.own_queries else None, self._checked_active(active, sources), checked_slack(slack)
+        queries, active, slack = rows if self.own_queries else None, self._check_active(active, sources), checked_slack(slack)
         box, radii = self._box_now(box, sources), self._radii_now(cutoff, sources, queries)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, radii, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
         wider = dataclasses.replace(self, problem=self.problem.with_images(self._grown_images(box, radii)))
         inputs, options = self.problem.inputs(sources, queries, active, box, radii, self.batch), wider.problem.options
         with own_transfers():
-            met = rounded_capacity(math.ceil(slack * int(np.max(np.asarray(self.required)))))
-            made = _remade(wider, inputs, max(self.capacity, met, counted_capacity(inputs, options, slack)))
+            met = round_capacity(math.ceil(slack * int(np.max(np.asarray(self.required)))))
+            made = _remake(wider, inputs, max(self.capacity, met, count_capacity(inputs, options, slack)))
         made.check()
         return made
 
@@ -281,7 +281,7 @@ class NeighborList:
         """
         self._check_single()
         with own_transfers():
-            missing = pair_total(self.count, self.capacity) > checked_total(total)
+            missing = pair_total(self.count, self.capacity) > check_total(total)
             status = self.status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
         return dataclasses.replace(self, status=status)
 
@@ -392,7 +392,7 @@ class NeighborList:
         Differentiable: no (integers). Jit: yes, with total. vmap: yes, with total.
         """
         if total is None:
-            count, idx = self._checked_rows("pairs")
+            count, idx = self._check_rows("pairs")
             return np.repeat(np.arange(count.size, dtype=np.int32), count), idx
         rows, indices, _ = self._flat(total)
         return rows, indices
@@ -420,7 +420,7 @@ class NeighborList:
         Differentiable: no (integers). Jit: yes, with total. vmap: yes, with total.
         """
         if total is None:
-            count, idx = self._checked_rows("csr")
+            count, idx = self._check_rows("csr")
             return np.concatenate([[0], np.cumsum(count, dtype=np.int64)]), idx
         _, indices, offsets = self._flat(total)
         return offsets, indices
@@ -474,7 +474,7 @@ class NeighborList:
 
     def _flat(self, total: int) -> tuple[Array, Array, Array]:
         """Return rows and sources of the pairs, padded to a static length, and the offsets of the rows."""
-        total = checked_total(total)
+        total = check_total(total)
         self._check_single()
         self._check_known()
         if not isinstance(self.count, Tracer):
@@ -484,7 +484,7 @@ class NeighborList:
                 raise ValueError(f"total={total} is too small: the list holds {held} pairs. Pass total={held} or more.")
         return flat_pairs(self.idx, self.count, self.source_count, total)
 
-    def _checked_rows(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+    def _check_rows(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         if isinstance(self.status, Tracer):
             raise TypeError(
                 f"{name}() returns as many pairs as there are and cannot run inside jax.jit: write {name}(total), total being the "
@@ -500,7 +500,7 @@ class NeighborList:
         if self.idx.ndim != 2:
             raise ValueError(f"exports take one list at a time, got idx of shape {list(self.idx.shape)}: index the batch first.")
 
-    def _checked_active(self, active: Array | None, sources: Array) -> Array | None:
+    def _check_active(self, active: Array | None, sources: Array) -> Array | None:
         if self.masked != (active is not None):
             state = "with active: pass active=" if self.masked else "without active: leave active out"
             raise ValueError(f"this list was made {state}.")
@@ -570,20 +570,20 @@ def _update(
     inputs = nbrs.problem.inputs(sources, queries, active, box, radii, nbrs.batch)
 
     def remake(nbrs: NeighborList) -> NeighborList:
-        made, verlet = _remade(nbrs, inputs, nbrs.capacity), nbrs.verlet
+        made, verlet = _remake(nbrs, inputs, nbrs.capacity), nbrs.verlet
         if made.verlet is not None and verlet is not None:
             made = dataclasses.replace(made, verlet=dataclasses.replace(made.verlet, rebuild_count=verlet.rebuild_count + 1))
         return dataclasses.replace(made, status=made.status | nbrs.status, required=jnp.maximum(made.required, nbrs.required))
 
     if nbrs.verlet is None:
         return remake(nbrs)
-    now = without_inactive(sources, active)
+    now = hide_inactive(sources, active)
     moved = moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin)
     nbrs = dataclasses.replace(nbrs, box=box, radii=radii)
     # a loop of at most one round: XLA keeps what a loop carries in place, but copies what a branch returns
     return lax.while_loop(lambda state: state[0], lambda state: (jnp.zeros_like(state[0]), remake(state[1])), (moved, nbrs))[1]
 
 
-def _remade(nbrs: NeighborList, inputs: Inputs, capacity: int) -> NeighborList:
+def _remake(nbrs: NeighborList, inputs: Inputs, capacity: int) -> NeighborList:
     """Make a list with the options of this one, and nothing of its past."""
-    return dataclasses.replace(nbrs, **found_fields(inputs, nbrs.problem.options, capacity, nbrs.skin > 0))
+    return dataclasses.replace(nbrs, **find_fields(inputs, nbrs.problem.options, capacity, nbrs.skin > 0))

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jax import Array
 
-from jfrnn._engine import Filter, Inputs, Kind, Options, checked_backend, choose_engine
+from jfrnn._engine import Filter, Inputs, Kind, Options, check_backend, choose_engine
 from jfrnn._geometry import (
     Batch,
     Box,
@@ -86,7 +86,7 @@ class Problem:
         return dataclasses.replace(self, options=self.options._replace(images=images))
 
 
-def checked_problem(
+def check_problem(
     positions: Given,
     cutoff: Given,
     queries: Given,
@@ -127,7 +127,7 @@ def checked_problem(
     box = None if box is None else checked_box(box, sources)
     images = None if box is None else images_of(box, reach, dtype, sources.shape[0])
     kind = Kind(periodic=box is not None, radii=radii is not None, batch=batch is not None)
-    engine = choose_engine(checked_backend(backend), sources, queries, kind)
+    engine = choose_engine(check_backend(backend), sources, queries, kind)
     systems = None if batch is None else checked_batch(batch, sources, queries)
     options = Options(keep, engine, closed, 0.0 if radii is None else skin, images, reach if engine.static_radius else None)
     shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}

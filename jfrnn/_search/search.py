@@ -10,9 +10,9 @@ from jfrnn._geometry import (
     checked_capacity,
     checked_slack,
 )
-from jfrnn._search.making import counted_capacity, found_fields
+from jfrnn._search.making import count_capacity, find_fields
 from jfrnn._search.neighbor_list import NeighborList
-from jfrnn._search.problem import checked_problem
+from jfrnn._search.problem import check_problem
 from jfrnn._tracing import call_apart, own_transfers
 
 
@@ -112,15 +112,15 @@ def search(
     >>> searched([[0.1, 0.1, 0.1], [2.9, 0.1, 0.1], [1.5, 0.1, 0.1]], [3.0, 2.0, 2.0]).count[:3]
     Array([1, 1, 0], dtype=int32)
     """
-    problem, inputs = checked_problem(
+    problem, inputs = check_problem(
         positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, skin, active
     )
     slack = checked_slack(slack)
     if capacity is None:
-        capacity = _counted_capacity(inputs, problem.options, slack)
+        capacity = _count_capacity(inputs, problem.options, slack)
     capacity = checked_capacity(capacity)
     with own_transfers():
-        fields = call_apart(lambda inputs: found_fields(inputs, problem.options, capacity, problem.skin > 0), inputs)
+        fields = call_apart(lambda inputs: find_fields(inputs, problem.options, capacity, problem.skin > 0), inputs)
     return NeighborList(**fields, problem=problem)
 
 
@@ -161,18 +161,18 @@ def count(
 
     Memory: as in `search`, without the list. Differentiable: no (integers). Jit: yes. vmap: yes.
     """
-    problem, inputs = checked_problem(
+    problem, inputs = check_problem(
         positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, 0.0, active
     )
     with own_transfers():
         return call_apart(lambda inputs: count_rows(inputs, problem.options)[0], inputs)
 
 
-def _counted_capacity(inputs: Inputs, options: Options, slack: float) -> int:
+def _count_capacity(inputs: Inputs, options: Options, slack: float) -> int:
     if any(isinstance(x, Tracer) for x in jax.tree.leaves(inputs)):
         raise ValueError(
             "capacity must be given where positions are traced (jax.jit, vmap, grad, scan), because it is a shape: pass "
             "capacity=int(jfrnn.count(positions, cutoff + skin).max()) of concrete positions, with room to move, or the capacity "
             "of an earlier search, and check nbrs.overflow."
         )
-    return counted_capacity(inputs, options, slack)
+    return count_capacity(inputs, options, slack)

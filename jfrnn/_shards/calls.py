@@ -13,7 +13,7 @@ from jax.sharding import PartitionSpec
 
 from jfrnn._engine import ENGINES, Kind
 from jfrnn._geometry import checked_cutoff, checked_flag, checked_skin
-from jfrnn._search import count, list_radius, rounded_capacity
+from jfrnn._search import count, list_radius, round_capacity
 from jfrnn._shards.halo import Halo, exchanged, halo_in_shard, halo_spec, rows_seen
 from jfrnn._shards.particles import OVERFLOWS, Particles, of_shards, spec_of
 from jfrnn._tracing import Given, Tree
@@ -151,6 +151,6 @@ def counts(particles: Particles, halo: Halo | None, asked: Asked) -> Array:
     return over_shards(counted, particles, of_shards(particles.mesh), lax.stop_gradient(particles), halo)
 
 
-def counted_capacity(particles: Particles, asked: Asked, slack: float) -> int:
+def count_capacity(particles: Particles, asked: Asked, slack: float) -> int:
     longest = int(jnp.max(counts(particles, None, asked), initial=0))
-    return rounded_capacity(math.ceil(max(longest, 1) * slack))
+    return round_capacity(math.ceil(max(longest, 1) * slack))

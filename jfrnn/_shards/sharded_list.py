@@ -13,8 +13,8 @@ from jax.core import Tracer
 from jax.sharding import PartitionSpec
 
 from jfrnn._geometry import check_devices, pairs_and_status, shape_of
-from jfrnn._search import NeighborList, moved_too_far, rounded_capacity, search
-from jfrnn._shards.calls import Asked, checked_halo, counted_capacity, over_shards, seen
+from jfrnn._search import NeighborList, moved_too_far, round_capacity, search
+from jfrnn._shards.calls import Asked, checked_halo, count_capacity, over_shards, seen
 from jfrnn._shards.halo import Halo, halo_in_shard, halo_spec
 from jfrnn._shards.migrate import migrate
 from jfrnn._shards.particles import OVERFLOWS, Particles, Required, check, of_shards, shared_bits
@@ -105,8 +105,8 @@ class Neighbors:
         self._check_kind(particles)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((particles, self.required))):
             raise TypeError("grow() changes shapes and cannot run inside jax.jit: call it on what jit returns.")
-        counted = counted_capacity(particles, self.asked, slack)
-        met = rounded_capacity(math.ceil(slack * int(self.required.row))) if int(self.required.row) > self.capacity else 0
+        counted = count_capacity(particles, self.asked, slack)
+        met = round_capacity(math.ceil(slack * int(self.required.row))) if int(self.required.row) > self.capacity else 0
         return listed(particles, self.asked, max(self.capacity, counted, met))
 
     def check(self) -> None:

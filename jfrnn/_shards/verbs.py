@@ -11,7 +11,7 @@ from jax.core import Tracer
 
 from jfrnn._geometry import Status, checked_capacity, checked_flag, checked_slack, known_status
 from jfrnn._search import ROWS_ARE_WHOLE, NeighborList
-from jfrnn._shards.calls import Asked, checked_asked, checked_halo, counted_capacity, counts, is_good, marked, over_shards, seen
+from jfrnn._shards.calls import Asked, checked_asked, checked_halo, count_capacity, counts, is_good, marked, over_shards, seen
 from jfrnn._shards.halo import Halo, exchanged, halo_in_shard
 from jfrnn._shards.particles import Particles, of_shards
 from jfrnn._shards.sharded_list import Neighbors, listed
@@ -57,7 +57,7 @@ def search(
             raise ValueError(
                 "capacity must be given where particles are traced, because it is a shape: pass that of an earlier search."
             )
-        capacity = counted_capacity(particles, asked, slack)
+        capacity = count_capacity(particles, asked, slack)
     return listed(particles, asked, checked_capacity(capacity))
 
 

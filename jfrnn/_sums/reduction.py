@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._engine import Inputs, Options, is_decidable, without_inactive
+from jfrnn._engine import Inputs, Options, hide_inactive, is_decidable
 from jfrnn._geometry import Box, Images, Lattice, Radii, Status, checked_cutoff, make_cutoffs, make_lattice, translation
 from jfrnn._search import ROWS_ARE_WHOLE, NeighborList
 from jfrnn._sums.extremes import bind_extremes
@@ -42,7 +42,7 @@ class Pairs(NamedTuple):
 def searched(inputs: Inputs, options: Options) -> Pairs:
     """Return the pairs that a search finds."""
     sources, queries, active, box, cutoff, _ = inputs
-    fixed = lax.stop_gradient(inputs._replace(sources=without_inactive(sources, active), active=None))
+    fixed = lax.stop_gradient(inputs._replace(sources=hide_inactive(sources, active), active=None))
     relation, several = Searched(fixed, options), isinstance(cutoff, Radii)
     largest = make_cutoffs(cutoff, options.closed).largest if isinstance(cutoff, Radii) else cutoff.radius
     lattice = _lattice(box, options.images, sources)

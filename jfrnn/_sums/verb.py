@@ -7,9 +7,9 @@ import jax
 from jax import Array
 from jax.tree_util import KeyPath
 
-from jfrnn._engine import ARRAYS, Inputs, Options, checked_backend, platform_of
+from jfrnn._engine import ARRAYS, Inputs, Options, check_backend, platform_of
 from jfrnn._geometry import Box, checked_flag
-from jfrnn._search import NeighborList, checked_problem
+from jfrnn._search import NeighborList, check_problem
 from jfrnn._tracing import Given, Tree, on_device, own_transfers
 
 REDUCTIONS = ("sum", "max", "min")
@@ -123,9 +123,9 @@ def pair_sum(
     if neighbors is None:
         if cutoff is None:
             raise ValueError("cutoff must be given: only a list (neighbors=) has its own.")
-        if checked_backend(backend) == "hashgrid":
+        if check_backend(backend) == "hashgrid":
             raise ValueError("backend='hashgrid' cannot sum over pairs: pass 'warp', 'jax', 'brute' or 'auto'.")
-        problem, inputs = checked_problem(
+        problem, inputs = check_problem(
             positions, cutoff, queries, box, batch, radius_rule, False, include_self, closed, backend, 0.0, active
         )
         with own_transfers():

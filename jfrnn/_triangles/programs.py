@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry import Cutoff, Status, make_cutoff
-from jfrnn._search import rounded_capacity
+from jfrnn._search import round_capacity
 from jfrnn._tracing import at_once, call_apart, compiled, own_transfers
 from jfrnn._triangles.cells import without_faults
 from jfrnn._triangles.engines import TriangleEngine, Wall
@@ -20,7 +20,7 @@ def counted_slots(points: Array, vertices: Array, faces: Array, cutoff: float, e
     with at_once(), own_transfers():
         found = found_triangles(points, vertices, faces, None, cutoff, engine, None)
         longest = int(found["required"])
-    return rounded_capacity(math.ceil(max(longest, 1) * slack))
+    return round_capacity(math.ceil(max(longest, 1) * slack))
 
 
 def found_triangles(

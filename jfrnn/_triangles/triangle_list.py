@@ -23,7 +23,7 @@ from jfrnn._geometry import (
     pairs_and_status,
     shape_of,
 )
-from jfrnn._search import norms, rounded_capacity
+from jfrnn._search import norms, round_capacity
 from jfrnn._tracing import call_apart, compiled, own_transfers
 from jfrnn._triangles.cells import TriangleCells, without_faults
 from jfrnn._triangles.closest import Rows, nearest_of, pseudonormals
@@ -149,7 +149,7 @@ class TriangleList:
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((points, corners, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
         with own_transfers():
-            met = rounded_capacity(math.ceil(checked_slack(slack) * int(np.max(np.asarray(self.required)))))
+            met = round_capacity(math.ceil(checked_slack(slack) * int(np.max(np.asarray(self.required)))))
         counted = counted_slots(points, corners, self.faces, self.cutoff, self._engine, slack)
         capacity, cells = max(self.capacity, met, counted), self.cells if vertices is None else None
         found = found_triangles(points, corners, self.faces, cells, self.cutoff, self._engine, capacity)
