@@ -5,8 +5,8 @@ types, on the CPU; where it stands, `LANES` is a constant expression, a power of
 `Math::f32`, `f64`, `i32`, `i64` and `flag`, so that one text compiles for each. Both are pieces of a function body.
 
 Edge cases are JAX's: max and min hand NaN on, sign(0) is 0, integers wrap, x / 0 is -1 and x % 0 is x for integers, floats beyond
-the range of integers saturate, and NaN becomes 0. Denormals are kept, if the block clears the processor's flush modes (`ENTER` of
-`jfrnn.kernels._native`); XLA on the CPU flushes them. Nothing uses CUDA's fast approximations.
+the range of integers saturate, and NaN becomes 0. Denormals are kept, if the processor's flush modes are cleared (`FloatControl` in
+`native/float_control.h`); XLA on the CPU flushes them. Nothing uses CUDA's fast approximations.
 
 Warp's compiler for the CPU links the functions of the C library from a list of its own, which has neither expm1 nor log1p: there
 these two are series in both kinds. `VECTOR` takes more series, several times faster than one call per lane (see
@@ -35,27 +35,30 @@ _TYPES = (
 
 # --- types and arithmetic ---------------------------------------------------------------------------------------------
 
-_SCALAR_START = read_part("math.h", "scalar_start")
-_VECTOR_START = read_part("math.h", "vector_start")
-_END = read_part("math.h", "end")
+_SCALAR_START = read_part("math_parts.h", "scalar_start")
+_VECTOR_START = read_part("math_parts.h", "vector_start")
+_END = read_part("math_parts.h", "end")
 
-_SCALAR_FLOAT = read_part("math.h", "scalar_float")
-_VECTOR_FLOAT = read_part("math.h", "vector_float")
-_SCALAR_SELECT = read_part("math.h", "scalar_select")
-_VECTOR_SELECT = read_part("math.h", "vector_select")
-_COMPARISONS = read_part("math.h", "comparisons")
-_FLAGS = read_part("math.h", "flags")
-_FLOAT = read_part("math.h", "float")
-_WHOLE = read_part("math.h", "whole")
-_WHOLE_OF = read_part("math.h", "whole_of")
-_CONVERSIONS = read_part("math.h", "conversions")
+_SCALAR_FLOAT = read_part("math_parts.h", "scalar_float")
+_VECTOR_FLOAT = read_part("math_parts.h", "vector_float")
+_SCALAR_SELECT = read_part("math_parts.h", "scalar_select")
+_VECTOR_SELECT = read_part("math_parts.h", "vector_select")
+_COMPARISONS = read_part("math_parts.h", "comparisons")
+_FLAGS = read_part("math_parts.h", "flags")
+_FLOAT = read_part("math_parts.h", "float")
+_WHOLE = read_part("math_parts.h", "whole")
+_WHOLE_OF = read_part("math_parts.h", "whole_of")
+_CONVERSIONS = read_part("math_parts.h", "conversions")
 
 # --- functions --------------------------------------------------------------------------------------------------------
 
-_CALL = {"SCALAR": read_part("math.h", "scalar_call"), "VECTOR": read_part("math.h", "vector_call")}
-_CALL_OF_TWO = {"SCALAR": read_part("math.h", "scalar_call_of_two"), "VECTOR": read_part("math.h", "vector_call_of_two")}
+_CALL = {"SCALAR": read_part("math_parts.h", "scalar_call"), "VECTOR": read_part("math_parts.h", "vector_call")}
+_CALL_OF_TWO = {
+    "SCALAR": read_part("math_parts.h", "scalar_call_of_two"),
+    "VECTOR": read_part("math_parts.h", "vector_call_of_two"),
+}
 _WHOLE_CALL = {
-    "SCALAR": read_part("math.h", "scalar_whole_call"),
+    "SCALAR": read_part("math_parts.h", "scalar_whole_call"),
     "VECTOR": _CALL_OF_TWO["VECTOR"].replace("REAL", "WHOLE").replace("::CALL_S", "CALL"),
 }
 
@@ -71,7 +74,7 @@ _FLOAT_SERIES = {name: name for name in ("sinh", "cosh")}  # in float32 alone
 _NOT_LINKED = {name: name for name in ("expm1", "log1p")}
 _TWO = {"atan2": "atan2", "rem": "fmod"}
 _FAR = {f"called_{name}": name for name in ("sin", "cos", "tan")}
-_LOGISTIC = read_part("math.h", "logistic")
+_LOGISTIC = read_part("math_parts.h", "logistic")
 
 
 def _shared(kind: str) -> str:

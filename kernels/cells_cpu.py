@@ -2,23 +2,19 @@
 
 `build` sorts the sources (and the queries, if they are others) by cell. `gather` puts the coordinates of many sources into that
 order: to read them from anywhere takes longer than all that `build` does. It and `query` are launched once per thread: the threads
-hand themselves chunks of places from an atomic counter (see `jfrnn.kernels._walk_cpu`).
+hand themselves chunks of places from an atomic counter (see `native/walk_cpu.h`).
 """
 
 import functools
 from typing import NamedTuple
 
 import warp as wp
-from jfrnn.kernels._native import CELLS, ENTER, EXACT, LEAVE, SPACES, snippet, table_cells
-from jfrnn.kernels._text import read_part
-from jfrnn.kernels._walk_cpu import CHUNK, walk
+from jfrnn.kernels._native import SPACES, bind, program, table_cells
 
+CHUNK = 2048  # places that a thread takes at a time
 _HEADER_WORDS = 64
 MANY = 1 << 15  # sources from which several threads gather their coordinates
 GRID = {"REACH": 1, "REACH_X": 2}  # finer cells along x alone: fewer candidates, but no more rows of cells that are copied
-
-# Where things lie in the scratch: one text, so that `build` and `query` agree; `scratch_words` below is its sum.
-LAYOUT = read_part("cells_cpu.h", "layout")
 
 
 def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -> int:
@@ -28,24 +24,6 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -
     if not own:
         parts += [queries, table + 2]
     return sum((words + 15) // 16 * 16 for words in parts)
-
-
-_BUILD = read_part("cells_cpu.h", "build")
-
-_GATHER = read_part("cells_cpu.h", "gather")
-
-_BEGIN_ROWS = read_part("cells_cpu.h", "begin_rows")
-_ADD_TO_ROW = read_part("cells_cpu.h", "add_to_row")
-_NO_ROW = read_part("cells_cpu.h", "no_row")
-_END_ROWS = read_part("cells_cpu.h", "end_rows")
-
-_QUERY = walk(
-    begin=_BEGIN_ROWS,
-    meet="const int hits = later_only ? scan(q, id, filled, Later{}) : scan(q, id, filled, All{});",
-    met=_ADD_TO_ROW,
-    none=_NO_ROW,
-    end=_END_ROWS,
-)
 
 
 class Kernels(NamedTuple):
@@ -60,7 +38,7 @@ class Kernels(NamedTuple):
 def cell_kernels(dim: int, double: bool, scaled: bool, lists: bool, periodic: int = 0, batched: bool = False) -> Kernels:
     """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts alone.
 
-    `periodic` and `batched` are those of `jfrnn.kernels._native.snippet`.
+    `periodic` and `batched` are those of `jfrnn.kernels._native.program`.
     """
     scalar = wp.float64 if double else wp.float32
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}"
@@ -84,10 +62,12 @@ def cell_kernels(dim: int, double: bool, scaled: bool, lists: bool, periodic: in
 
     for native in (build_native, gather_native, query_native):
         native.__name__ = native.__qualname__ = f"{native.__name__}_{variant}"
-    native_text = functools.partial(snippet, "double" if double else "float", dim, CELLS, LAYOUT, **options)
-    build_function = wp.func_native(ENTER + native_text(_BUILD) + LEAVE)(build_native)
-    gather_function = wp.func_native(ENTER + native_text(_GATHER) + LEAVE)(gather_native)
-    query_function = wp.func_native(ENTER + native_text(EXACT, _QUERY) + LEAVE)(query_native)
+    module = wp.get_module(f"jfrnn.kernels.cells_cpu.{variant}")
+    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
+    text = program(double, dim, "rows_cpu.h", **options)
+    build_function = bind(build_native, module, "Sort.build", text)
+    gather_function = bind(gather_native, module, "Gather.gather", text)
+    query_function = bind(query_native, module, "Rows.run", text)
 
     def build(positions: points, queries: points, cutoff: reals, info: ints, scratch: ints, n: int, m: int, own: int, table: int):
         build_function(positions, queries, cutoff, info, scratch, n, m, own, table)
@@ -103,6 +83,4 @@ def cell_kernels(dim: int, double: bool, scaled: bool, lists: bool, periodic: in
             positions, queries, cutoff, idx, count, info, scratch, n, m, own, table, capacity, closed, drop_self, later_only
         )
 
-    module = wp.get_module(f"jfrnn.kernels.cells_cpu.{variant}")
-    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
     return Kernels(*(wp.kernel(kernel, module=module) for kernel in (build, gather, query)))

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import warp as wp
 from jfrnn.kernels._load import load_module
-from jfrnn.kernels._native import CELLS, EXACT, SPACES, snippet, table_cells
+from jfrnn.kernels._native import SPACES, bind, program, table_cells
 from jfrnn.kernels._text import read_part
 
 BLOCK = 256
@@ -39,11 +39,6 @@ _GATHERING = (8, 6)  # blocks of `gather` that are at work at once per multiproc
 # leave out what they should have done.
 MOST_IN_STRIDES = 2**24
 
-# What `share_bits` and `query_blocks` return.
-SHARE = read_part("cells.cuh", "share")
-
-LAYOUT = SHARE + read_part("cells.cuh", "layout")
-
 
 def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -> int:
     """Return the int32 words of scratch that the kernels need; `width` is 1 for float32 and 2 for float64."""
@@ -57,41 +52,21 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -
     return sum((words + 15) // 16 * 16 for words in parts)
 
 
-# Bounds and numbers of finite points of all threads of a block, and which bits they have, into those of its first thread.
-_REDUCE = read_part("cells.cuh", "reduce")
-
-_BOUNDS = read_part("cells.cuh", "bounds")
-
-_LAY_OUT = read_part("cells.cuh", "lay_out")
-
-_COUNT = read_part("cells.cuh", "count")
-
-_SCAN = read_part("cells.cuh", "scan")
-
-_SCATTER = read_part("cells.cuh", "scatter")
-
-_GATHER = read_part("cells.cuh", "gather")
-
-_WALK = Template(read_part("walk.cuh", "walk"))
+_WALK = Template(read_part("walk.cuh", "begin") + read_part("walk.cuh", "walk") + read_part("walk.cuh", "end"))
 
 # How a lane walks over the bits of its query, block by block that has any: `hits` are those of a block that are left, `ids` the
 # address of the block's ids. Behind the last block stands one, `behind` as a bit, that is never left.
 HELD_PAIRS = read_part("walk.cuh", "held_pairs")
 
-_WRITE_ROWS = read_part("rows.cuh", "begin_write_rows") + HELD_PAIRS + read_part("rows.cuh", "write_rows")
 
-_NO_ROW = read_part("rows.cuh", "no_row")
+def walk(kind: str, *, opened: str = "", none: str, begun: str, settled: str, done: str = "", closed: str = "") -> str:
+    """Return the text of the struct `Query`, in which a block of one warp serves its share of the queries, in groups.
 
-_ROW_DONE = read_part("rows.cuh", "row_done")
-
-
-def walk(*, opened: str = "", none: str, begun: str, settled: str, done: str = "", closed: str = "") -> str:
-    """Return the text of a kernel in which a block of one warp serves its share of the queries, from `begin` on, in groups.
-
-    Around it stand the pieces CELLS, LAYOUT and EXACT. Constants it needs: LIST, or SUMS, or neither, and the pairs are counted:
+    Constants it needs: LIST, or SUMS, or neither, and the pairs are counted:
     `found`; LATER, CROSSING. With SUMS candidates are images of places in `sorted`, not of sources.
 
     Args:
+        kind: The struct that it derives from, made of `{kind}Arguments`.
         opened: Comes before the queries from `place` to `stop`; they may be none.
         none: What is done with a query, `id`, that is not finite.
         begun: Of a group, of which `my_id`, its first `place` and its size, `group`, are known: defines what `settled` calls.
@@ -100,10 +75,16 @@ def walk(*, opened: str = "", none: str, begun: str, settled: str, done: str = "
         done: After the last ones.
         closed: After the last group.
     """
-    return _WALK.substitute(opened=opened, none=none, begun=begun, settled=settled, done=done, closed=closed)
+    return _WALK.substitute(kind=kind, opened=opened, none=none, begun=begun, settled=settled, done=done, closed=closed)
 
 
-_ROWS = walk(none=_NO_ROW, begun=_WRITE_ROWS, settled="write_rows(finished);", done=_ROW_DONE)
+_ROWS = walk(
+    "Search",
+    none=read_part("rows.cuh", "no_row"),
+    begun=read_part("rows.cuh", "begin_write_rows") + HELD_PAIRS + read_part("rows.cuh", "write_rows"),
+    settled="write_rows(finished);",
+    done=read_part("rows.cuh", "row_done"),
+)
 
 
 class Launch(NamedTuple):
@@ -208,7 +189,7 @@ def cell_kernels(
 ) -> Kernels:
     """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts, half lists or whole.
 
-    `periodic` and `batched` are those of `jfrnn.kernels._native.snippet`. `reach` is the number of cell edges in a cutoff along y
+    `periodic` and `batched` are those of `jfrnn.kernels._native.program`. `reach` is the number of cell edges in a cutoff along y
     and z, `reach_x` along x; other numbers than these are slower, and only measurements ask for them.
     """
     blocks = 24 if not lists else 16 if double else 20  # registers against occupancy, measured on an H200
@@ -221,15 +202,21 @@ def cell_kernels(
 
     def query_kernel(name: str, crossing: bool = False) -> wp.Kernel:
         module, kind = f"{name}_{variant}_b{blocks}", {"CROSSING": crossing, "SHIFTED": periodic if crossing else 0}
-        return _kernel(module, module, dim, double, QUERY_BLOCK, blocks, query | kind, EXACT, _ROWS)
+        text = program(double, dim, "cells.cuh", "exact.h", **query | kind) + _ROWS
+        return _kernel(module, module, double, QUERY_BLOCK, blocks, "Query.run", text)
+
+    sorting = program(double, dim, "cells.cuh", **grid)
+
+    def stage(name: str, method: str, blocks: int = 1) -> wp.Kernel:
+        return _kernel(f"{name}_{kind}", kind, double, BLOCK, blocks, f"Search.{method}", sorting)
 
     return Kernels(
-        _kernel(f"bounds_{kind}", kind, dim, double, BLOCK, 1, grid, _REDUCE, _BOUNDS),
-        _kernel(f"lay_out_{kind}", kind, dim, double, BLOCK, 1, grid, _REDUCE, _LAY_OUT),
-        _kernel(f"count_{kind}", kind, dim, double, BLOCK, 1, grid, _COUNT),
-        _kernel(f"scan_{kind}", kind, dim, double, BLOCK, 1, grid, _SCAN),
-        _kernel(f"scatter_{kind}", kind, dim, double, BLOCK, 1, grid, _SCATTER),
-        _kernel(f"gather_{kind}", kind, dim, double, BLOCK, _GATHERING[periodic > 0], grid, _GATHER),
+        stage("bounds", "find_bounds"),
+        stage("lay_out", "lay_out_grid"),
+        stage("count", "count_cells"),
+        stage("scan", "scan_counts"),
+        stage("scatter", "scatter_ids"),
+        stage("gather", "gather_places", _GATHERING[periodic > 0]),
         query_kernel("query"),
         query_kernel("crossing", crossing=True) if periodic else None,
     )
@@ -238,9 +225,7 @@ def cell_kernels(
 _made: dict[str, wp.Kernel] = {}
 
 
-def _kernel(
-    name: str, module_name: str, dim: int, double: bool, block: int, blocks: int, constants: dict[str, int], *pieces: str
-) -> wp.Kernel:
+def _kernel(name: str, module_name: str, double: bool, block: int, blocks: int, call: str, text: str) -> wp.Kernel:
     if name in _made:
         return _made[name]
     scalar = wp.float64 if double else wp.float32
@@ -253,7 +238,9 @@ def _kernel(
     ): ...  # fmt: skip
 
     native.__name__ = native.__qualname__ = f"{name}_native"
-    function = wp.func_native(snippet("double" if double else "float", dim, CELLS, LAYOUT, *pieces, **constants))(native)
+    module = wp.get_module(f"jfrnn.kernels.cells_cuda.{module_name}")
+    wp.set_module_options({"enable_backward": False, "max_unroll": 1}, module)
+    function = bind(native, module, call, text)
 
     def kernel(
         positions: points, queries: points, cutoff: reals, idx: rows, count: ints, info: ints, scratch: ints,
@@ -263,7 +250,5 @@ def _kernel(
             positions, queries, cutoff, idx, count, info, scratch, n, m, own, table, capacity, closed, drop_self, of_queries
         )  # fmt: skip
 
-    module = wp.get_module(f"jfrnn.kernels.cells_cuda.{module_name}")
-    wp.set_module_options({"enable_backward": False, "max_unroll": 1}, module)
     _made[name] = wp.kernel(kernel, name=name, module=module, grid_stride=False, launch_bounds=(block, blocks))
     return _made[name]

@@ -18,16 +18,11 @@ import functools
 from typing import Any, NamedTuple
 
 import warp as wp
-from jfrnn.kernels._native import ENTER, EXACT, LEAVE, snippet
+from jfrnn.kernels._native import add_program, program
 
 _CELLS_PER_PARTICLE = 2  # at least, and less than twice that; 8 B each
 _SMALLEST_BITS = 4  # per axis: 16 cells
 _LARGEST_BITS = 24  # in all: 256^3 or 4096^2 cells
-
-_DECIDE = """
-const real p[3] = {query[0], query[1], query[2]}, s[3] = {source[0], source[1], source[2]};
-pair = exact_pair(p, s);
-"""
 
 
 class Kernels(NamedTuple):
@@ -58,9 +53,10 @@ def hashgrid_kernels(dim: int, double: bool, scaled: bool, lists: bool) -> Kerne
     module = wp.get_module(f"jfrnn.kernels.hashgrid.{variant}")
     wp.set_module_options({"enable_backward": False, "fuse_fp": False}, module)
     point_at = _point_function(dim, double)
+    is_pair = _exact_function(dim, double, scaled, add_program(module, program(double, dim, "hashgrid.h", SCALED=scaled)))
     return Kernels(
         wp.kernel(_pack_kernel(double, point_at), module=module),
-        wp.kernel(_query_kernel(double, scaled, lists, point_at, _exact_function(dim, double, scaled)), module=module),
+        wp.kernel(_query_kernel(double, scaled, lists, point_at, is_pair), module=module),
     )
 
 
@@ -97,12 +93,11 @@ class _Variant(NamedTuple):
 
 
 @functools.cache
-def _exact_function(dim: int, double: bool, scaled: bool) -> wp.Function:
+def _exact_function(dim: int, double: bool, scaled: bool, space: str) -> wp.Function:
     scalar, vector = _types(double)
-    text = snippet("double" if double else "float", dim, EXACT, _DECIDE, SCALED=scaled)
     variant = _Variant(f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}")
 
-    @variant.func_native(f"bool pair;{ENTER}{text}{LEAVE}return pair;")
+    @variant.func_native(f"return {space}::decide_pair(query, source, cutoff.data, closed);")
     def is_pair(query: vector, source: vector, cutoff: wp.array(dtype=scalar), closed: int) -> bool: ...
 
     return is_pair

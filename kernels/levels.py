@@ -5,43 +5,23 @@ Morton curve. A query finds the candidates of a group in the cells around it tha
 """
 
 import functools
-from string import Template
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import warp as wp
-from jfrnn.kernels._native import ENTER, EXACT, LEAVE, SPACES, snippet
-from jfrnn.kernels._text import read_part
+from jfrnn.kernels._native import SPACES, bind, program
 
 PADDING = 16  # sources behind the last one, which nobody meets: the CPU tests so many at a time
 CHUNK = 256  # queries that a thread of the CPU takes at a time
 BLOCK = 128  # threads of CUDA
 RULES = ("gather", "scatter", "either", "both", "mean")
 
-# `header` holds the cells of the table along each axis (4), whether there is a table, and how many groups are in use. `cutoff`
-# holds the largest cutoff and the lattice, then the largest of each group, and along each axis: the width of a top cell, how many
-# of those units a cutoff of 1 reaches, and what is added to that (3 each). Where space is periodic, `axes` and `query_axes` are
-# wrapped, and `positions` and `queries` hold what was given, with turns. Of a batch, the last axis of `top` is the system.
-_QUERY = Template(read_part("levels.h", "query"))
 
-_BEGIN_ROW = read_part("levels.h", "begin_row")
-_ADD_TO_ROW = read_part("levels.h", "add_to_row")
-_END_ROW = read_part("levels.h", "end_row")
-
-
-def native_text(
-    dim: int,
-    double: bool,
-    rule: str,
-    groups: int,
-    halvings: int,
-    *,
-    begin: str = "",
-    begin_query: str,
-    pair: str,
-    end_query: str,
-    end_chunk: str = "",
+def level_program(
+    dim: int, double: bool, rule: str, groups: int, halvings: int, header: str, given: Mapping[str, str] = MappingProxyType({}),
     **constants: int,
-) -> str:
-    """Return the text of a kernel in which queries meet their candidates; texts say what becomes of the pairs.
+) -> str:  # fmt: skip
+    """Return the text of a kernel in which queries meet their candidates; a header says what becomes of the pairs.
 
     Args:
         dim: 2 or 3.
@@ -49,17 +29,13 @@ def native_text(
         rule: One of `RULES`.
         groups: Of cutoffs.
         halvings: Of a top cell.
-        begin: Comes before all queries.
-        begin_query: Of the query `id`, at `q`.
-        pair: With the source at place `c`, whose number is `other`, in the `image` that `shift` leads to.
-        end_query: After the last pair of the query `id`.
-        end_chunk: After the last query of the chunk `chunk`; on the CPU alone.
-        constants: Further ones, such as PERIODIC and BATCHED of `jfrnn.kernels._native.snippet`.
+        header: A file of `kernels/native`.
+        given: Texts in place of some files.
+        constants: Further ones, such as PERIODIC and BATCHED of `jfrnn.kernels._native.program`.
     """
     constants |= {"RULE": RULES.index(rule), "SUM": rule == "mean", "GROUPS": groups, "HALVINGS": halvings}
-    constants |= {"SCALED": True, "PADDING": PADDING, "CHUNK": CHUNK}
-    query = _QUERY.substitute(begin=begin, begin_query=begin_query, pair=pair, end_query=end_query, end_chunk=end_chunk)
-    return ENTER + snippet("double" if double else "float", dim, EXACT, query, **constants) + LEAVE
+    constants |= {"SCALED": True, "PADDING": PADDING, "CHUNK": CHUNK, "ONE_BY_ONE": True}
+    return program(double, dim, header, given=given, **constants)
 
 
 @wp.kernel(enable_backward=False)
@@ -75,15 +51,15 @@ def query_kernel(
     """Return the kernel for a dimension, a dtype and a rule, for lists or counts alone.
 
     It is launched on the CPU with dim = 1, once per thread, on CUDA once, with a thread per query. `info`, zeros at first, gets the
-    longest row. `periodic` and `batched` are those of `jfrnn.kernels._native.snippet`.
+    longest row. `periodic` and `batched` are those of `jfrnn.kernels._native.program`.
     """
     scalar = wp.float64 if double else wp.float32
     variant = f"{dim}d_{'f64' if double else 'f32'}_{rule}{'_list' * lists}"
     variant += f"{SPACES[periodic]}{'_batched' * batched}"
-    text = native_text(
-        dim, double, rule, groups, halvings,
-        begin_query=_BEGIN_ROW, pair=_ADD_TO_ROW, end_query=_END_ROW, LIST=lists, PERIODIC=periodic, BATCHED=batched,
-    )  # fmt: skip
+    constants = {"LIST": lists, "PERIODIC": periodic, "BATCHED": batched}
+    text = level_program(dim, double, rule, groups, halvings, "level_rows.h", **constants)
+    module = wp.get_module(f"jfrnn.kernels.levels.{variant}")
+    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
     points = wp.array2d(dtype=scalar)
     reals, ints, rows = wp.array(dtype=scalar), wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
 
@@ -95,7 +71,7 @@ def query_kernel(
     ): ...  # fmt: skip
 
     native.__name__ = native.__qualname__ = f"query_{variant}_native"
-    function = wp.func_native(text)(native)
+    function = bind(native, module, "LevelRows.run", text)
 
     def query(
         positions: points, queries: points, axes: reals, radii: reals, ids: ints, keys: ints, top: ints, table: ints, header: ints,
@@ -109,6 +85,4 @@ def query_kernel(
             own_queries, closed, drop_self, later_only,
         )  # fmt: skip
 
-    module = wp.get_module(f"jfrnn.kernels.levels.{variant}")
-    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
     return wp.kernel(query, name=f"query_{variant}", module=module, grid_stride=False)

@@ -24,12 +24,11 @@ from typing import NamedTuple
 
 import warp as wp
 from jfrnn.kernels._math import SCALAR
-from jfrnn.kernels._native import CELLS, EXACT, SPACES, snippet
+from jfrnn.kernels._native import SPACES, bind, program
 from jfrnn.kernels._text import read_part
 from jfrnn.kernels.cells_cuda import (
     GRID,
     HELD_PAIRS,
-    LAYOUT,
     MOST_IN_STRIDES,
     QUERY_BLOCK,
     Launch,
@@ -38,7 +37,7 @@ from jfrnn.kernels.cells_cuda import (
     walk,
     walks,
 )
-from jfrnn.kernels.pair_sum_cpu import LITTLE_WORK, TAKE_LARGER, TermText, Value, loaded, placed, work
+from jfrnn.kernels.pair_sum_cpu import LITTLE_WORK, TermText, Value, loaded, placed, work
 
 
 def slots(queries: int) -> int:
@@ -61,7 +60,7 @@ def row_length(term: TermText, dim: int, double: bool) -> int:
     return next((length for length in (0, 1, 2) if columns <= length <= at_once), -(-columns // at_once) * at_once)
 
 
-_SORT_VALUES = read_part("pair_sum.cuh", "sort_values")
+_SUMS = read_part("pair_sum.cuh", "sums")
 
 _OPENED = read_part("pair_sum.cuh", "opened")
 
@@ -70,6 +69,7 @@ _NO_EXTREME = read_part("pair_sum.cuh", "no_extreme")
 
 # Sums, and what rounding took of them, which is added in the end, or goes on as they do.
 _ADD = read_part("pair_sum.cuh", "add")
+_TAKE_LARGER = read_part("pair_sum.cuh", "take_larger")
 _KEEP_LARGEST = read_part("pair_sum.cuh", "keep_largest")
 
 # What is loaded here comes in the order of the text, all of several pairs before any of it is used: else the compiler saves
@@ -144,10 +144,10 @@ def _evaluation(term: TermText, double: bool, extremes: bool) -> str:
         return any(value.axis is not None for value in values)
 
     reduction = _largest(term) if extremes else _added(term)
-    values = [defined(term.shared, "shared_values.data[{}]", "")]
+    values = [defined(term.shared, "shared_values[{}]", "")]
     if has_positions(term.own):
         values.append("const Place here = lane < group ? load_query(place + lane) : Place{{0, 0, 0}, 0};\n")
-    values.append(defined(term.own, "own_values.data[own_at + {}]", "here.p[{}]"))
+    values.append(defined(term.own, "own_values[own_at + {}]", "here.p[{}]"))
     from_place = has_positions(term.others) and not term.source_columns
     numbers = defined(term.others, "row.at[PLACED + {}]", "there.p[{}]" if from_place else "row.at[{}]")
     fields, arrays, row = [], [], []
@@ -163,7 +163,7 @@ def _evaluation(term: TermText, double: bool, extremes: bool) -> str:
     if term.source_columns:
         ahead("Row", "row", "load_row(source_of(taken.id[k]))")
     if term.steps:  # inside of a box there are none
-        turns = f"own_values.data[own_at + {_own_columns(term) - 1}]"
+        turns = f"own_values[own_at + {_own_columns(term) - 1}]"
         values += [f"const int turn{c} = Lattice::turn({turns}, {step.axis});\n" for c, step in enumerate(term.steps)]
         row.append("int shift[3] = {0, 0, 0};\nif constexpr (CROSSING)\n    shift_of(image_of(id), shift);\n")
         for c, (name, axis) in enumerate(term.steps):
@@ -215,25 +215,27 @@ def sum_kernels(
     constants |= {"OTHERS": columns, "ROW_LENGTH": max(row_length(term, dim, double), 1), "OWN": _own_columns(term)}
     constants |= {"PLACED": _placed_columns(term, dim)}
     constants |= {"TOTALS": totals, "ROW_SUMS": len(term.sums) - totals}
-    text = SCALAR + walk(
-        opened=_OPENED + (f"typedef Math::{'f64' if double else 'f32'} number;\n" + TAKE_LARGER + _KEEP_LARGEST) * extremes,
+    query = walk(
+        "Sums",
+        opened=_OPENED + (f"typedef Math::{'f64' if double else 'f32'} number;\n" + _TAKE_LARGER + _KEEP_LARGEST) * extremes,
         none=_NO_SUM + _NO_EXTREME * extremes,
         begun="".join([_ADD, _LOAD_ROW, _evaluation(term, double, extremes)]),
         settled="add_pairs(finished);",
     )
 
-    def query_kernel(name: str, crossing: bool = False) -> wp.Kernel:
+    def kernel_of(name: str, call: str, crossing: bool = False, text: str = "") -> wp.Kernel:
         where = {"CROSSING": crossing, "SHIFTED": periodic if crossing else 0}
-        return _kernel(name, module, dim, double, blocks, constants | where, EXACT, text)
+        whole = program(double, dim, "cells.cuh", "exact.h", "math.h", given={"math.h": SCALAR}, **constants | where)
+        return _kernel(name, module, double, 32 if call == "Sums.sort_values" else blocks, call, whole + _SUMS + text)
 
     return Kernels(
-        _kernel("sort_values", module, dim, double, 32, constants, _SORT_VALUES) if columns else None,
-        query_kernel("pair_sum"),
-        query_kernel("crossing_pair_sum", crossing=True) if periodic else None,
+        kernel_of("sort_values", "Sums.sort_values") if columns else None,
+        kernel_of("pair_sum", "Query.run", text=query),
+        kernel_of("crossing_pair_sum", "Query.run", crossing=True, text=query) if periodic else None,
     )
 
 
-def _kernel(name: str, module: str, dim: int, double: bool, blocks: int, constants: dict[str, int], *pieces: str) -> wp.Kernel:
+def _kernel(name: str, module: str, double: bool, blocks: int, call: str, text: str) -> wp.Kernel:
     scalar = wp.float64 if double else wp.float32
     table_of, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
 
@@ -244,8 +246,9 @@ def _kernel(name: str, module: str, dim: int, double: bool, blocks: int, constan
     ): ...  # fmt: skip
 
     native.__name__ = native.__qualname__ = f"{name}_{module}_native"
-    text = snippet("double" if double else "float", dim, CELLS, LAYOUT, *pieces, **constants)
-    function = wp.func_native(text)(native)
+    home = wp.get_module(f"jfrnn.kernels.pair_sum_cuda.{module}")
+    wp.set_module_options({"enable_backward": False, "max_unroll": 1}, home)
+    function = bind(native, home, call, text)
 
     def kernel(
         positions: table_of, queries: table_of, cutoff: reals, shared_values: reals, own_values: table_of, others: table_of,
@@ -257,6 +260,4 @@ def _kernel(name: str, module: str, dim: int, double: bool, blocks: int, constan
             n, m, own, table, closed, drop_self,
         )  # fmt: skip
 
-    home = wp.get_module(f"jfrnn.kernels.pair_sum_cuda.{module}")
-    wp.set_module_options({"enable_backward": False, "max_unroll": 1}, home)
     return wp.kernel(kernel, name=f"{name}_{module}", module=home, grid_stride=False, launch_bounds=(QUERY_BLOCK, blocks))

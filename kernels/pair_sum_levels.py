@@ -5,21 +5,11 @@ ROOM of them, or the query has no more; then the term is evaluated for 16 of the
 """
 
 import functools
-from string import Template
 
 import warp as wp
-from jfrnn.kernels._native import FLUSH, KEEP, SPACES
-from jfrnn.kernels._text import read_part
-from jfrnn.kernels.levels import CHUNK, native_text
-from jfrnn.kernels.pair_sum_cpu import (
-    CHUNK_DONE,
-    TermText,
-    begin_query,
-    beginning,
-    constants_of,
-    evaluation,
-    reduction_of,
-)
+from jfrnn.kernels._native import SPACES, bind
+from jfrnn.kernels.levels import CHUNK, level_program
+from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
 ROOM = 256  # a multiple of 16
 
@@ -27,13 +17,6 @@ ROOM = 256  # a multiple of 16
 def slots(queries: int) -> int:
     """Return the number of partial sums that make up a sum over all pairs."""
     return -(-queries // CHUNK)
-
-
-_BEGIN = read_part("pair_sum_levels.h", "begin")
-_BEGIN_QUERY = Template(read_part("pair_sum_levels.h", "begin_query"))
-_PAIR = read_part("pair_sum_levels.h", "pair")
-_STEP = Template(read_part("pair_sum_levels.h", "step"))
-_END_PAIR = read_part("pair_sum_levels.h", "end_pair")
 
 
 @functools.cache
@@ -49,17 +32,11 @@ def query_kernel(
     variant = f"{dim}d_{'f64' if double else 'f32'}_{rule}{'_compensated' * compensated}"
     variant += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}_{key}"
     points, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
-    reduction = reduction_of(term, extremes)
-    begin = _BEGIN_QUERY.substitute(
-        flush=FLUSH, keep=KEEP, begin=begin_query(term, double) + reduction.before, after=reduction.after,
-        each=evaluation(term, reduction, double, "*(const number*)(near_column[{}] + b)", "b + l"),
-    )  # fmt: skip
-    steps = "".join(_STEP.substitute(c=c, axis=step.axis) for c, step in enumerate(term.steps))
-    text = native_text(
-        dim, double, rule, groups, halvings,
-        begin=beginning(term, double, extremes) + _BEGIN, begin_query=begin, pair=_PAIR + steps + _END_PAIR, end_query="add(true);",
-        end_chunk=CHUNK_DONE, PERIODIC=periodic, BATCHED=batched, CANDIDATES=ROOM, **constants_of(term, compensated, extremes),
-    )  # fmt: skip
+    constants = {"PERIODIC": periodic, "BATCHED": batched, "CANDIDATES": ROOM, **constants_of(term, compensated, extremes)}
+    given = term_header(term, double)
+    text = level_program(dim, double, rule, groups, halvings, "level_sums.h", given, **constants)
+    module = wp.get_module(f"jfrnn.kernels.pair_sum_levels.{variant}")
+    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
 
     def native(
         positions: points, queries: points, axes: reals, radii: reals, ids: ints, keys: ints, top: ints, table: ints, header: ints,
@@ -69,7 +46,7 @@ def query_kernel(
     ): ...  # fmt: skip
 
     native.__name__ = native.__qualname__ = f"pair_sum_levels_{variant}_native"
-    function = wp.func_native(text)(native)
+    function = bind(native, module, "LevelSumsKernel.run", text)
 
     def query(
         positions: points, queries: points, axes: reals, radii: reals, ids: ints, keys: ints, top: ints, table: ints, header: ints,
@@ -83,6 +60,4 @@ def query_kernel(
             n, m, own_queries, closed, drop_self, later_only,
         )  # fmt: skip
 
-    module = wp.get_module(f"jfrnn.kernels.pair_sum_levels.{variant}")
-    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
     return wp.kernel(query, name=f"query_{variant}", module=module, grid_stride=False)

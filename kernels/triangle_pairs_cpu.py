@@ -6,13 +6,10 @@ Threads hand themselves chunks of pairs from an atomic counter.
 import functools
 
 import warp as wp
-from jfrnn.kernels._native import ENTER, LEAVE, snippet
-from jfrnn.kernels._text import read_part
-from jfrnn.kernels._triangles import DECIDE, constants
+from jfrnn.kernels._native import bind, program
+from jfrnn.kernels._triangles import constants
 
 CHUNK = 4096  # pairs that a thread takes at a time
-
-_DECIDE_PAIRS = read_part("triangle_pairs_cpu.h", "decide_pairs")
 
 
 @functools.cache
@@ -29,8 +26,9 @@ def pairs_kernel(dim: int, double: bool) -> wp.Kernel:
 
     native.__name__ = native.__qualname__ = f"triangle_pairs_native_{variant}"
     options = {"CHUNK": CHUNK, **constants(dim, double, stride=1)}
-    text = snippet("double" if double else "float", dim, DECIDE, _DECIDE_PAIRS, **options)
-    function = wp.func_native(ENTER + text + LEAVE)(native)
+    module = wp.get_module(f"jfrnn.kernels.triangle_pairs_cpu.{variant}")
+    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
+    function = bind(native, module, "TrianglePairs.run", program(double, dim, "triangle_pairs.h", **options))
 
     def kernel(
         positions: points, corners: shapes, cutoff: reals, particle: ints, triangle: ints, asked: ints, near: ints, info: ints,
@@ -38,6 +36,4 @@ def pairs_kernel(dim: int, double: bool) -> wp.Kernel:
     ):  # fmt: skip
         function(positions, corners, cutoff, particle, triangle, asked, near, info, n)
 
-    module = wp.get_module(f"jfrnn.kernels.triangle_pairs_cpu.{variant}")
-    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
     return wp.kernel(kernel, module=module)

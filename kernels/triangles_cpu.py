@@ -6,33 +6,13 @@
 """
 
 import functools
-from string import Template
 from typing import NamedTuple
 
 import warp as wp
-from jfrnn.kernels._native import ENTER, LEAVE, snippet
-from jfrnn.kernels._text import read_part
-from jfrnn.kernels._triangles import BOUNDS, DECIDE, LEVELS, constants, pending
+from jfrnn.kernels._native import bind, program
+from jfrnn.kernels._triangles import constants, pending
 
 CHUNK = 1024  # particles that a thread takes at a time
-
-# corners [f][DIM][DIM], good [f], start [buckets + 1], triangles [f MOST_CELLS], levels [limit], level_count [1], level_of [f],
-# scratch [f MOST_CELLS]: the buckets of each triangle, -1 behind the last
-_BUILD = read_part("triangles_cpu.h", "build")
-
-# WIDTH triangles side by side: the `vec` of `BOUNDS`
-_LANES = read_part("triangles_cpu.h", "lanes")
-
-# `surely_near(p, which, open)`: which of WIDTH triangles are near, one bit each, and which floats leave open
-_MANY = read_part("triangles_cpu.h", "many")
-
-# boxes [2 DIM][stride]: corners of the boxes of entries, which hold nothing where there is no triangle; a vector reaches no farther
-_QUERY = Template(read_part("triangles_cpu.h", "query"))
-
-_IN_CELLS = read_part("triangles_cpu.h", "in_cells")
-
-# start [levels + 1]: the first entry of each level of the tree; `buckets` is how many there are
-_IN_TREE = read_part("triangles_cpu.h", "in_tree")
 
 
 class Kernels(NamedTuple):
@@ -50,8 +30,8 @@ def triangle_kernels(dim: int, double: bool, lists: bool, tree: bool, most_cells
     """
     scalar = wp.float64 if double else wp.float32
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_list' * lists}{'_tree' * tree}"
-    options = {"LIST": lists, "MOST_CELLS": most_cells, "LANES": lanes, "LANES_LOG2": lanes.bit_length() - 1, "CHUNK": CHUNK}
-    options |= {"NODE": node, "PENDING": pending(node)}
+    options = {"LIST": lists, "MOST_CELLS": most_cells, "MOST_ALONG": lanes, "CHUNK": CHUNK}
+    options |= {"MOST_ALONG_LOG2": lanes.bit_length() - 1, "NODE": node, "PENDING": pending(node), "TREE": tree}
     options |= constants(dim, double, stride=1)
     reals, ints = wp.array(dtype=scalar), wp.array(dtype=wp.int32)
     points, rows, shapes = wp.array2d(dtype=scalar), wp.array2d(dtype=wp.int32), wp.array3d(dtype=scalar)
@@ -69,10 +49,11 @@ def triangle_kernels(dim: int, double: bool, lists: bool, tree: bool, most_cells
 
     for native in (build_native, query_native):
         native.__name__ = native.__qualname__ = f"triangles_{native.__name__}_{variant}"
-    text = functools.partial(snippet, "double" if double else "float", dim, DECIDE, LEVELS, **options)
-    build_function = wp.func_native(ENTER + text(_BUILD) + LEAVE)(build_native)
-    candidates = _QUERY.substitute(candidates=_IN_TREE if tree else _IN_CELLS)
-    query_function = wp.func_native(ENTER + text(_LANES, BOUNDS, _MANY, candidates) + LEAVE)(query_native)
+    module = wp.get_module(f"jfrnn.kernels.triangles_cpu.{variant}")
+    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
+    text = program(double, dim, "triangles_cpu.h", **options)
+    build_function = bind(build_native, module, "TriangleSort.build", text)
+    query_function = bind(query_native, module, "TriangleRows.run", text)
 
     def build(
         corners: shapes, good: ints, cutoff: reals, start: ints, triangles: ints, levels: ints, level_count: ints, level_of: ints,
@@ -105,6 +86,4 @@ def triangle_kernels(dim: int, double: bool, lists: bool, tree: bool, most_cells
             stride,
         )
 
-    module = wp.get_module(f"jfrnn.kernels.triangles_cpu.{variant}")
-    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
     return Kernels(None if tree else wp.kernel(build, module=module), wp.kernel(query, module=module))

@@ -29,9 +29,8 @@ from typing import NamedTuple
 
 import warp as wp
 from jfrnn.kernels._load import load_module
-from jfrnn.kernels._native import snippet
-from jfrnn.kernels._text import read_part
-from jfrnn.kernels._triangles import BOUNDS, DECIDE, LEVELS, constants, pending
+from jfrnn.kernels._native import bind, program
+from jfrnn.kernels._triangles import constants, pending
 
 BLOCK = 256
 QUERY_BLOCK = 128
@@ -41,25 +40,6 @@ _SWEEP = 132 * 2048  # threads of `fill`: all at work at once
 _WORKERS = {False: 8448, True: 2112}  # threads of `settle`, by width: 38 and 58 MB of integers
 _HEADER_WORDS = 16
 _QUERY_BLOCKS = {False: 5, True: 3}  # per multiprocessor, which bounds the registers; by width
-
-LAYOUT = read_part("triangles.cuh", "layout")
-
-_PREPARE = read_part("triangles.cuh", "prepare")
-
-_PLACE = read_part("triangles.cuh", "place")
-
-_FILL = read_part("triangles.cuh", "fill")
-
-_ALLOCATE = read_part("triangles.cuh", "allocate")
-
-_SCATTER = read_part("triangles.cuh", "scatter")
-
-# `list_row(i, decide)`: lists the triangles near particle i; are all pairs decided? `decide(p, corners)`: 1 near, 0 far, -1 open
-_ROW = read_part("triangles.cuh", "row")
-
-_QUERY = read_part("triangles.cuh", "query")
-
-_SETTLE = read_part("triangles.cuh", "settle")
 
 
 def workers_for(n: int, double: bool) -> int:
@@ -124,21 +104,20 @@ def triangle_kernels(dim: int, double: bool, lists: bool, tree: bool, node: int)
     rows = f"{kind}{'_list' * lists}"
     where = {"TREE": tree, "NODE": node, "PENDING": pending(node)}
 
-    def sorting(name: str, text: str) -> wp.Kernel:
-        return _kernel(f"{name}_{kind}", f"sort_{kind}", dim, double, (BLOCK, 1), lists, where, LEVELS, LAYOUT, text)
+    def sorting(name: str) -> wp.Kernel:
+        return _kernel(name, kind, f"sort_{kind}", dim, double, (BLOCK, 1), lists, where)
 
-    def deciding(name: str, block: int, blocks: int, text: str) -> wp.Kernel:
-        pieces = (DECIDE, LEVELS, "using vec = real;", BOUNDS, LAYOUT, _ROW, text)
-        return _kernel(f"{name}_{rows}", f"{name}_{rows}", dim, double, (block, blocks), lists, where, *pieces)
+    def deciding(name: str, block: int, blocks: int) -> wp.Kernel:
+        return _kernel(name, rows, f"{name}_{rows}", dim, double, (block, blocks), lists, where)
 
     return Kernels(
-        sorting("prepare", _PREPARE),
-        sorting("place", _PLACE),
-        sorting("fill", _FILL) if lists else None,
-        sorting("allocate", _ALLOCATE),
-        sorting("scatter", _SCATTER),
-        deciding("query", QUERY_BLOCK, _QUERY_BLOCKS[double], _QUERY),
-        deciding("settle", _SETTLE_BLOCK, 1, _SETTLE),
+        sorting("prepare"),
+        sorting("place"),
+        sorting("fill") if lists else None,
+        sorting("allocate"),
+        sorting("scatter"),
+        deciding("query", QUERY_BLOCK, _QUERY_BLOCKS[double]),
+        deciding("settle", _SETTLE_BLOCK, 1),
     )
 
 
@@ -147,8 +126,9 @@ _WAITING = 16  # candidates of a thread whose boxes hold its particle, until the
 
 
 def _kernel(
-    name: str, module_name: str, dim: int, double: bool, bounds: tuple[int, int], lists: bool, where: dict[str, int], *pieces: str
+    stage: str, variant: str, module_name: str, dim: int, double: bool, bounds: tuple[int, int], lists: bool, where: dict[str, int]
 ) -> wp.Kernel:
+    name = f"{stage}_{variant}"
     if name in _made:
         return _made[name]
     scalar = wp.float64 if double else wp.float32
@@ -164,8 +144,10 @@ def _kernel(
     ): ...  # fmt: skip
 
     native.__name__ = native.__qualname__ = f"triangles_{name}_native"
-    text = snippet("double" if double else "float", dim, *pieces, **options, **constants(dim, double, stride=32))
-    function = wp.func_native(text)(native)
+    module = wp.get_module(f"jfrnn.kernels.triangles_cuda.{module_name}")
+    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
+    text = program(double, dim, "triangles.cuh", **options, **constants(dim, double, stride=32))
+    function = bind(native, module, f"Triangles.{stage}", text)
 
     def kernel(
         positions: points, corners: shapes, boxes: points, cutoff: reals, start: ints, triangles: ints, levels: ints,
@@ -178,7 +160,5 @@ def _kernel(
             n, f, buckets, entries, capacity, workers, threads, thread,
         )  # fmt: skip
 
-    module = wp.get_module(f"jfrnn.kernels.triangles_cuda.{module_name}")
-    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
     _made[name] = wp.kernel(kernel, name=name, module=module, grid_stride=False, launch_bounds=bounds)
     return _made[name]

@@ -9,19 +9,11 @@ a ray then tells the side but for some 1e-14 of the largest coordinate.
 import functools
 
 import warp as wp
-from jfrnn.kernels._native import ENTER, LEAVE, snippet
-from jfrnn.kernels._text import read_part
+from jfrnn.kernels._native import bind, program
 from jfrnn.kernels._triangles import pending
 
 CHUNK = 256  # points that a thread takes at a time on the CPU
 BLOCK = 128
-
-# `side_of(i)`: 1 inside, 0 outside, 2: no ray tells. boxes [2 DIM][entries]; start [levels + 1]: the first entry of each level
-_SIDE = read_part("winding.h", "side")
-
-_ON_CPU = read_part("winding.h", "on_cpu")
-
-_ON_CUDA = read_part("winding.h", "on_cuda")
 
 
 @functools.cache
@@ -43,8 +35,9 @@ def side_kernel(dim: int, double: bool, node: int, cuda: bool) -> wp.Kernel:
 
     native.__name__ = native.__qualname__ = f"winding_native_{variant}"
     options = {"NODE": node, "PENDING": pending(node), "CHUNK": CHUNK}
-    text = snippet("double" if double else "float", dim, _SIDE, _ON_CUDA if cuda else _ON_CPU, **options)
-    function = wp.func_native(text if cuda else ENTER + text + LEAVE)(native)
+    module = wp.get_module(f"jfrnn.kernels.winding.{variant}")
+    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
+    function = bind(native, module, "Winding.run", program(double, dim, "winding.h", **options))
 
     def kernel(
         positions: points, corners: shapes, boxes: points, cutoff: reals, rays: points, start: ints, triangles: ints, asked: ints,
@@ -55,8 +48,6 @@ def side_kernel(dim: int, double: bool, node: int, cuda: bool) -> wp.Kernel:
             positions, corners, boxes, cutoff, rays, start, triangles, asked, least, side, info, n, levels, entries, thread
         )  # fmt: skip
 
-    module = wp.get_module(f"jfrnn.kernels.winding.{variant}")
-    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
     if cuda:
         return wp.kernel(kernel, name=f"winding_{variant}", module=module, grid_stride=False, launch_bounds=(BLOCK, 1))
     return wp.kernel(kernel, module=module)

@@ -8,6 +8,7 @@ import itertools
 import pytest
 import warp as wp
 from jfrnn.kernels import cells_cpu, cells_cuda, levels
+from jfrnn.kernels._native import add_program, program
 
 from jfrnn._geometry.levels import GROUPS, HALVINGS
 
@@ -74,11 +75,12 @@ def test_few_queries_are_shared_among_more_warps():
 
 
 def test_kernels_share_queries_as_launches_do():
-    text = "{\n" + f"constexpr int WARPS = {cells_cuda.GRID['WARPS']};" + cells_cuda.SHARE
-    text += "shared.data[0] = share_bits;\nshared.data[1] = query_blocks;\n}"
+    module = wp.get_module("tests.shares")
+    space = add_program(module, program(False, 3, "shares.h", WARPS=cells_cuda.GRID["WARPS"]))
 
     def share_native(m: int, shared: wp.array(dtype=int)): ...
 
+    text = f"const {space}::Shares found(m);\nshared.data[0] = found.share_bits;\nshared.data[1] = found.query_blocks;\n"
     function = wp.func_native(text)(share_native)
 
     def share(queries: wp.array(dtype=int), shared: wp.array2d(dtype=int)):
@@ -87,6 +89,6 @@ def test_kernels_share_queries_as_launches_do():
     edges = [cells_cuda.GRID["WARPS"] * 2**bits + k for bits in range(7) for k in (-1, 0, 1)]
     queries = [0, 1, 31, 32, 33, 1000, *edges, 10**6, 2**31 - 1]
     found = wp.zeros((len(queries), 2), dtype=int, device="cpu")
-    kernel = wp.kernel(share, module="unique")
+    kernel = wp.kernel(share, module=module)
     wp.launch(kernel, dim=len(queries), inputs=[wp.array(queries, dtype=int, device="cpu"), found], device="cpu")
     assert found.numpy().tolist() == [[cells_cuda.share_bits(m), cells_cuda.query_blocks(m)] for m in queries]

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import warp as wp
 from jfrnn.kernels import _math
-from jfrnn.kernels._native import ENTER, LEAVE
+from jfrnn.kernels._native import add_program, program
 
 from jfrnn._sums import translate as _translate
 from jfrnn._sums.scalars import TYPES
@@ -61,10 +61,12 @@ def statements(text, real):
     return "\n".join(lines)
 
 
-def native_text(texts, real, kind):
+def native_text(texts, real, kind, module):
     """Return a function body that runs the text of the number `which` on n columns."""
     lanes, number, of_real = LANES[real] if kind == "vector" else 1, NUMBER[real], TYPES[real]
-    start = [f"constexpr int LANES = {lanes};", _math.VECTOR if kind == "vector" else _math.SCALAR]
+    given = {"math.h": f"constexpr int LANES = {lanes};\n{_math.VECTOR if kind == 'vector' else _math.SCALAR}"}
+    space = add_program(module, program(real == "float64", 3, "float_control.h", "math.h", given=given))
+    start = [f"using namespace {space};", "const FloatControl floats;"]
     if kind == "vector":
         start.append(
             f"auto load = [](const {number}* from) {{ Math::{of_real} x; __builtin_memcpy(&x, from, sizeof x); return x; }};"
@@ -77,8 +79,7 @@ def native_text(texts, real, kind):
         f"case {k}:\nfor (int i = 0; i < n; i += LANES) {{\n{text}\n}}\nbreak;"
         for k, text in enumerate(texts)
     ]  # fmt: skip
-    no_contraction = "#if !defined(__CUDA_ARCH__)\n#pragma clang fp contract(off)\n#endif"
-    return "\n".join(["", ENTER, "{", no_contraction, *start, "switch (which) {", *cases, "}", "}", LEAVE, ""])
+    return "\n".join(["", *start, "switch (which) {", *cases, "}", ""])
 
 
 def kernel_of(cases, real, kind, name):
@@ -90,13 +91,13 @@ def kernel_of(cases, real, kind, name):
 
     native.__name__ = native.__qualname__ = f"{name}_{kind}_{real}"
     texts = [statements(translated(case, real), real) for case in cases]
-    function = wp.func_native(native_text(texts, real, kind))(native)
+    module = wp.get_module(f"tests.translated.{name}.{kind}.{real}")
+    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
+    function = wp.func_native(native_text(texts, real, kind, module))(native)
 
     def run(given: reals, found: reals, n: int, which: int):
         function(given, found, n, which)
 
-    module = wp.get_module(f"tests.translated.{name}.{kind}.{real}")
-    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
     return wp.kernel(run, module=module)
 
 

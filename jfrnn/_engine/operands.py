@@ -11,7 +11,7 @@ MOST_IN_BOX = 1 << 27  # positions: an id shares its bits with the code of an im
 
 
 def periodic_kind(torus: tuple[Lattice, Wrapped] | None) -> int:
-    """Return the PERIODIC of `jfrnn.kernels._native.snippet`."""
+    """Return the PERIODIC of `jfrnn.kernels._native.program`."""
     if torus is None:
         return 0
     images = torus[0].images

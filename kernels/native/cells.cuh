@@ -1,326 +1,385 @@
-// --- part: share
+// How particles are sorted by cell on CUDA: seven or eight launches, in which every thread knows the same of the search.
+#pragma once
+#include "cells.h"
+#include "shares.h"
 
-int share_bits = 5;
-while (share_bits > 0 && ((m - 1) >> (share_bits - 1)) + 1 <= WARPS)
-    --share_bits;
-const int query_blocks = ((m - 1) >> share_bits) + 1;
-// --- part: layout
-
+struct SearchArguments {
+    const real *positions, *queries, *cutoff;
+    int *idx, *count, *info, *scratch;
+    int n, m, own, table, capacity, closed, drop_self, of_queries;
+};
 struct Shared {
     Grid grid;
     int finite_queries;
     int behind[2];  // non-finite particles so far: sources, queries
-    int tiles[2];  // tiles of the scan that have begun
-    int crossing;  // blocks of queries that cross the box: the reach of one of them leaves it
-    float depth;  // how far a source from outside the box may be from its faces, in reaches: as far as they may be, queries cross
-    real unit;  // of the lattice on which all coordinates lie, or 0
+    int tiles[2];   // tiles of the scan that have begun
+    int crossing;   // blocks of queries that cross the box: the reach of one of them leaves it
+    float depth;    // how far a source from outside the box may be from its faces, in reaches: as far as they may be, queries cross
+    real unit;      // of the lattice on which all coordinates lie, or 0
 };
-constexpr int WIDTH = DOUBLE ? 2 : 1;
-struct alignas(4 * sizeof(real)) Place { real p[3]; real id; };  // id: the bits of an int
-const int tile_count = (table + 1) / TILE + 1;
-auto up = [](long long words) { return (words + 15) & ~15ll; };
-int* cursor = scratch.data;
-auto take = [&](long long words) { int* here = cursor; cursor += up(words); return here; };
-Shared& shared = *(Shared*)take(64);
-real* parts = (real*)take(PART * PARTS * WIDTH);
-Place* sorted = (Place*)take(4 * WIDTH * (long long)n);
-int* start = take(table + 2);
-unsigned long long* tile_state = (unsigned long long*)take(2 * tile_count);
-const int longest = n > m ? n : m;
-int* key = take(longest);
-int* slot = take(longest);
-int* order = take(n);
-int* query_start = own ? start : take(table + 2);
-unsigned long long* query_tile_state = own ? tile_state : (unsigned long long*)take(2 * tile_count);
-int* query_order = own ? order : take(m);
-int* crossing = key;  // their numbers: nobody asks for keys and slots once particles are scattered
-int* crosses = slot;  // whether a block does
-const int lane = threadIdx.x & 31, warp_in_block = threadIdx.x >> 5;
-// Warp spreads more than 65535 blocks over y and z
-const int block = (blockIdx.z * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x;
-const long long thread = (long long)block * blockDim.x + threadIdx.x;
-const long long threads = (long long)gridDim.z * gridDim.y * gridDim.x * blockDim.x;
+struct alignas(4 * sizeof(real)) Place {
+    real p[3];
+    real id;
+};  // id: the bits of an int
 constexpr unsigned int ALL = 0xffffffffu;
-auto id_of = [](real bits) -> int { return DOUBLE ? (int)__double_as_longlong(bits) : __float_as_int(bits); };
-auto bits_as_real = [](int id) -> real { return DOUBLE ? (real)__longlong_as_double(id) : (real)__int_as_float(id); };
-// of a point that comes from outside the box: how far from the nearest face it is, in reaches, rounded up
-auto depth_of = [&](const real* at) -> float {
-    float depth = INFINITY;
-    for (int k = 0; k < DIM; ++k)
-        if (is_periodic(k))
-            depth = fminf(depth, 1.0001f * (float)((at[k] < real(0.5) ? at[k] : 1 - at[k]) / reach_along(k)));
-    return depth;
-};
-auto is_turned = [](const real* row) { return PERIODIC && Lattice::packed_turns(row[DIM]) != Lattice::NONE; };
-const real INF = DOUBLE ? (real)__longlong_as_double(0x7ff0000000000000ll) : (real)__int_as_float(0x7f800000);
-// --- part: reduce
 
-auto reduce_over_block = [&](real* low, real* high, int& finite, float& depth, int& lowest, int& highest) {
-    __shared__ real lows[3][BLOCK / 32], highs[3][BLOCK / 32];
-    __shared__ int finites[BLOCK / 32];
-    __shared__ float depths[BLOCK / 32];
-    __shared__ int lowests[BLOCK / 32], highests[BLOCK / 32];
-    lowest = __reduce_min_sync(ALL, lowest);
-    highest = __reduce_max_sync(ALL, highest);
-    for (int step = 16; step > 0; step /= 2) {
-        finite += __shfl_down_sync(ALL, finite, step);
-        if constexpr (PERIODIC)
-            depth = fmaxf(depth, __shfl_down_sync(ALL, depth, step));
-        for (int k = 0; k < DIM; ++k) {
-            const real l = __shfl_down_sync(ALL, low[k], step), h = __shfl_down_sync(ALL, high[k], step);
-            low[k] = l < low[k] ? l : low[k];
-            high[k] = h > high[k] ? h : high[k];
-        }
+// What a thread is: its number in its warp, the number of its warp in the block, the number of its block, and its number among all.
+// Warp spreads more than 65535 blocks over y and z.
+struct Thread {
+    int lane, warp_in_block, block;
+    long long thread, threads;
+    JFRNN_MEMBER Thread()
+        : lane(threadIdx.x & 31),
+          warp_in_block(threadIdx.x >> 5),
+          block((blockIdx.z * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x),
+          thread((long long)block * blockDim.x + threadIdx.x),
+          threads((long long)gridDim.z * gridDim.y * gridDim.x * blockDim.x) {}
+};
+
+// The scratch of a search: `jfrnn.kernels.cells_cuda.scratch_words` is the sum of its parts.
+struct Scratch {
+    Shared& shared;
+    int* cursor;
+    real* parts;
+    Place* sorted;
+    int* start;
+    unsigned long long* tile_state;
+    int *key, *slot, *order;
+    int* query_start;
+    unsigned long long* query_tile_state;
+    int* query_order;
+    int* crossing;  // their numbers: nobody asks for keys and slots once particles are scattered
+    int* crosses;   // whether a block does
+
+    JFRNN_MEMBER Scratch(int* scratch, int n, int m, int own, int table) : shared(*(Shared*)scratch), cursor(scratch + up(64)) {
+        constexpr int WIDTH = DOUBLE ? 2 : 1;
+        const int tile_count = (table + 1) / TILE + 1, longest = n > m ? n : m;
+        parts = (real*)take(PART * PARTS * WIDTH);
+        sorted = (Place*)take(4 * WIDTH * (long long)n);
+        start = take(table + 2);
+        tile_state = (unsigned long long*)take(2 * tile_count);
+        key = take(longest);
+        slot = take(longest);
+        order = take(n);
+        query_start = own ? start : take(table + 2);
+        query_tile_state = own ? tile_state : (unsigned long long*)take(2 * tile_count);
+        query_order = own ? order : take(m);
+        crossing = key;
+        crosses = slot;
     }
-    if (lane == 0) {
-        finites[warp_in_block] = finite;
-        depths[warp_in_block] = depth;
-        lowests[warp_in_block] = lowest;
-        highests[warp_in_block] = highest;
-        for (int k = 0; k < DIM; ++k) {
-            lows[k][warp_in_block] = low[k];
-            highs[k][warp_in_block] = high[k];
-        }
+    JFRNN_FUNCTION long long up(long long words) { return (words + 15) & ~15ll; }
+    JFRNN_MEMBER int* take(long long words) {
+        int* here = cursor;
+        cursor += up(words);
+        return here;
     }
-    __syncthreads();
-    if (threadIdx.x == 0)
-        for (int w = 1; w < BLOCK / 32; ++w) {
-            finite += finites[w];
-            depth = fmaxf(depth, depths[w]);
-            lowest = lowests[w] < lowest ? lowests[w] : lowest;
-            highest = highests[w] > highest ? highests[w] : highest;
+};
+
+JFRNN_FUNCTION int id_of(real bits) { return DOUBLE ? (int)__double_as_longlong(bits) : __float_as_int(bits); }
+JFRNN_FUNCTION real bits_as_real(int id) { return DOUBLE ? (real)__longlong_as_double(id) : (real)__int_as_float(id); }
+JFRNN_FUNCTION bool is_turned(const real* row) { return PERIODIC && Lattice::packed_turns(row[DIM]) != Lattice::NONE; }
+
+struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
+    const real INF;
+    JFRNN_MEMBER explicit Search(const SearchArguments& given)
+        : SearchArguments(given),
+          Cells(given.cutoff),
+          Shares(given.m),
+          Scratch(given.scratch, given.n, given.m, given.own, given.table),
+          INF(DOUBLE ? (real)__longlong_as_double(0x7ff0000000000000ll) : (real)__int_as_float(0x7f800000)) {}
+
+    // Of a point that comes from outside the box: how far from the nearest face it is, in reaches, rounded up.
+    JFRNN_MEMBER float depth_of(const real* at) const {
+        float depth = INFINITY;
+        for (int k = 0; k < DIM; ++k)
+            if (is_periodic(k))
+                depth = fminf(depth, 1.0001f * (float)((at[k] < real(0.5) ? at[k] : 1 - at[k]) / reach_along(k)));
+        return depth;
+    }
+
+    // Reduces bounds, numbers of finite points and the bits that they have over all threads of a block, into those of its first thread.
+    JFRNN_MEMBER void reduce_over_block(real* low, real* high, int& finite, float& depth, int& lowest, int& highest) const {
+        __shared__ real lows[3][BLOCK / 32], highs[3][BLOCK / 32];
+        __shared__ int finites[BLOCK / 32];
+        __shared__ float depths[BLOCK / 32];
+        __shared__ int lowests[BLOCK / 32], highests[BLOCK / 32];
+        lowest = __reduce_min_sync(ALL, lowest);
+        highest = __reduce_max_sync(ALL, highest);
+        for (int step = 16; step > 0; step /= 2) {
+            finite += __shfl_down_sync(ALL, finite, step);
+            if constexpr (PERIODIC)
+                depth = fmaxf(depth, __shfl_down_sync(ALL, depth, step));
             for (int k = 0; k < DIM; ++k) {
-                low[k] = lows[k][w] < low[k] ? lows[k][w] : low[k];
-                high[k] = highs[k][w] > high[k] ? highs[k][w] : high[k];
+                const real l = __shfl_down_sync(ALL, low[k], step), h = __shfl_down_sync(ALL, high[k], step);
+                low[k] = l < low[k] ? l : low[k];
+                high[k] = h > high[k] ? h : high[k];
             }
         }
-};
-// --- part: bounds
-
-real low[3], high[3];
-for (int k = 0; k < DIM; ++k) {
-    low[k] = INF;
-    high[k] = -INF;
-}
-int finite = 0, lowest = 1 << 20, highest = 0;
-float depth = 0;
-auto look_at_bits = [&](const real* row) {
-#pragma unroll
-    for (int k = 0; k < DIM; ++k) {
-        const int low_bit = lowest_bit(row[k]), exponent = Bits::exponent(row[k]);
-        lowest = low_bit < lowest ? low_bit : lowest;
-        highest = exponent > highest ? exponent : highest;
-    }
-};
-for (long long i = thread; !own && i < m; i += threads)
-    if (finite_point(queries.data + ROW * i))
-        look_at_bits(queries.data + ROW * i);
-for (long long i = thread; i < n; i += threads) {
-    real p[3], at[3];
-    point_of(positions.data + ROW * i, p);
-    if (!finite_point(p))
-        continue;
-    ++finite;
-    look_at_bits(positions.data + ROW * i);
-    for (int k = 0; k < DIM; ++k)
-        at[k] = coordinate(k, p);
-    widen(low, high, at, at);
-    if (is_turned(positions.data + ROW * i))
-        depth = fmaxf(depth, depth_of(at));
-}
-reduce_over_block(low, high, finite, depth, lowest, highest);
-if (threadIdx.x == 0) {
-    real* part = parts + PART * block;
-    for (int k = 0; k < DIM; ++k) {
-        part[k] = low[k];
-        part[3 + k] = high[k];
-    }
-    part[6] = bits_as_real(finite);
-    part[7] = depth;
-    part[8] = bits_as_real(lowest);
-    part[9] = bits_as_real(highest);
-}
-if (thread == 0) {
-    shared.behind[0] = shared.behind[1] = shared.tiles[0] = shared.tiles[1] = shared.crossing = 0;
-    info.data[0] = info.data[1] = 0;
-}
-// --- part: lay_out
-
-__shared__ Grid grid;
-real low[3], high[3];
-const real* part = parts + PART * threadIdx.x;
-int finite = id_of(part[6]), lowest = id_of(part[8]), highest = id_of(part[9]);
-float depth = (float)part[7];
-for (int k = 0; k < DIM; ++k) {
-    low[k] = part[k];
-    high[k] = part[3 + k];
-}
-reduce_over_block(low, high, finite, depth, lowest, highest);
-if (threadIdx.x == 0) {
-    if (finite == 0)
-        for (int k = 0; k < DIM; ++k)
-            low[k] = high[k] = 0;
-    lay_out(grid, low, high, table);
-    grid.finite = finite;
-    if (block == 0) {
-        shared.grid = grid;
-        shared.depth = depth;
-        shared.unit = lattice_unit(lowest, highest);
-        if (finite < n)
-            atomicOr(&info.data[1], 2);
-    }
-}
-__syncthreads();
-const int cells = grid.cells, tiles = (cells + 1) / TILE + 1;  // of the table, what is in use
-for (long long c = thread; c < cells + 2; c += threads) {
-    start[c] = 0;
-    if (!own)
-        query_start[c] = 0;
-}
-for (long long t = thread; t < tiles; t += threads) {
-    tile_state[t] = 0;
-    if (!own)
-        query_tile_state[t] = 0;
-}
-// --- part: count
-
-const Grid grid = shared.grid;
-// the sources are counted first, then, in a second launch, the queries
-const int size = of_queries ? m : n;
-const real* points = of_queries ? queries.data : positions.data;
-int* counts = of_queries ? query_start : start;
-for (long long i = thread; i < size; i += threads) {
-    real p[3];
-    point_of(points + ROW * i, p);
-    const bool finite = finite_point(p);
-    const int cell = finite ? cell_key(grid, p, system_of(points + ROW * i)) : -1;
-    key[i] = cell;
-    slot[i] = atomicAdd(finite ? counts + cell : &shared.behind[of_queries], 1);
-    if (!finite && of_queries)
-        atomicOr(&info.data[1], 2);
-}
-// --- part: scan
-
-__shared__ int sums[8];
-__shared__ int tile_shared, before_shared;
-unsigned long long volatile* state = of_queries ? query_tile_state : tile_state;
-int* counts = of_queries ? query_start : start;
-const int cells = shared.grid.cells + 1;  // one more entry: the end of the last cell
-for (;;) {
-    if (threadIdx.x == 0)
-        tile_shared = atomicAdd(&shared.tiles[of_queries], 1);
-    __syncthreads();
-    const int tile = tile_shared;
-    if ((long long)tile * TILE >= cells)
-        break;
-    constexpr int EACH = TILE / BLOCK;
-    const long long first = (long long)tile * TILE + threadIdx.x * EACH;
-    int value[EACH], total = 0;
-    for (int e = 0; e < EACH; ++e) {
-        value[e] = total;
-        total += first + e < cells ? counts[first + e] : 0;
-    }
-    int inclusive = total;
-    for (int step = 1; step < 32; step *= 2) {
-        const int other = __shfl_up_sync(ALL, inclusive, step);
-        inclusive += lane >= step ? other : 0;
-    }
-    if (lane == 31)
-        sums[warp_in_block] = inclusive;
-    __syncthreads();
-    int before = inclusive - total, tile_total = 0;
-    for (int w = 0; w < 8; ++w) {
-        before += w < warp_in_block ? sums[w] : 0;
-        tile_total += sums[w];
-    }
-    if (threadIdx.x == 0)  // 1: the sum of this tile, 2: of all tiles up to it; one word, so that both arrive together
-        state[tile] = ((tile == 0 ? 2ull : 1ull) << 32) | (unsigned int)tile_total;
-    if (warp_in_block == 0) {
-        int earlier = 0;
-        for (int back = tile - 1; back >= 0; back -= 32) {
-            const int seen = back - lane;
-            unsigned long long word = seen >= 0 ? 0 : 2ull << 32;
-            while (__any_sync(ALL, (word >> 32) == 0))
-                word = (word >> 32) == 0 ? state[seen] : word;
-            const unsigned int full = __ballot_sync(ALL, (word >> 32) == 2);
-            const int until = full ? __ffs(full) - 1 : 31;
-            int part = lane <= until ? (int)(word & 0xffffffffull) : 0;
-            for (int step = 16; step > 0; step /= 2)
-                part += __shfl_down_sync(ALL, part, step);
-            earlier += __shfl_sync(ALL, part, 0);
-            if (full)
-                break;
-        }
         if (lane == 0) {
-            before_shared = earlier;
-            if (tile > 0)
-                state[tile] = (2ull << 32) | (unsigned int)(earlier + tile_total);
+            finites[warp_in_block] = finite;
+            depths[warp_in_block] = depth;
+            lowests[warp_in_block] = lowest;
+            highests[warp_in_block] = highest;
+            for (int k = 0; k < DIM; ++k) {
+                lows[k][warp_in_block] = low[k];
+                highs[k][warp_in_block] = high[k];
+            }
+        }
+        __syncthreads();
+        if (threadIdx.x == 0)
+            for (int w = 1; w < BLOCK / 32; ++w) {
+                finite += finites[w];
+                depth = fmaxf(depth, depths[w]);
+                lowest = lowests[w] < lowest ? lowests[w] : lowest;
+                highest = highests[w] > highest ? highests[w] : highest;
+                for (int k = 0; k < DIM; ++k) {
+                    low[k] = lows[k][w] < low[k] ? lows[k][w] : low[k];
+                    high[k] = highs[k][w] > high[k] ? highs[k][w] : high[k];
+                }
+            }
+    }
+
+    // Finds the lowest bit and the largest exponent of coordinates.
+    JFRNN_FUNCTION void look_at_bits(const real* row, int& lowest, int& highest) {
+#pragma unroll
+        for (int k = 0; k < DIM; ++k) {
+            const int low_bit = lowest_bit(row[k]), exponent = Bits::exponent(row[k]);
+            lowest = low_bit < lowest ? low_bit : lowest;
+            highest = exponent > highest ? exponent : highest;
         }
     }
-    __syncthreads();
-    before += before_shared;
-    for (int e = 0; e < EACH; ++e)
-        if (first + e < cells)
-            counts[first + e] = before + value[e];
-    __syncthreads();
-}
-// --- part: scatter
 
-const int size = of_queries ? m : n;
-const int* first = of_queries ? query_start : start;
-int* out = of_queries ? query_order : order;
-const int finite = size - shared.behind[of_queries];
-for (long long i = thread; i < size; i += threads) {
-    out[(key[i] >= 0 ? first[key[i]] : finite) + slot[i]] = (int)i;
-    if constexpr (PERIODIC)
-        slot[i] = 0;  // of `crosses`, from now on
-}
-if (thread == 0 && (own || of_queries))
-    shared.finite_queries = finite;
-// --- part: gather
+    // Finds the bounds of all sources with finite coordinates, per block.
+    JFRNN_MEMBER void find_bounds() {
+        real low[3], high[3];
+        for (int k = 0; k < DIM; ++k) {
+            low[k] = INF;
+            high[k] = -INF;
+        }
+        int finite = 0, lowest = 1 << 20, highest = 0;
+        float depth = 0;
+        for (long long i = thread; !own && i < m; i += threads)
+            if (finite_point(queries + ROW * i))
+                look_at_bits(queries + ROW * i, lowest, highest);
+        for (long long i = thread; i < n; i += threads) {
+            real p[3], at[3];
+            point_of(positions + ROW * i, p);
+            if (!finite_point(p))
+                continue;
+            ++finite;
+            look_at_bits(positions + ROW * i, lowest, highest);
+            for (int k = 0; k < DIM; ++k)
+                at[k] = coordinate(k, p);
+            widen(low, high, at, at);
+            if (is_turned(positions + ROW * i))
+                depth = fmaxf(depth, depth_of(at));
+        }
+        reduce_over_block(low, high, finite, depth, lowest, highest);
+        if (threadIdx.x == 0) {
+            real* part = parts + PART * block;
+            for (int k = 0; k < DIM; ++k) {
+                part[k] = low[k];
+                part[3 + k] = high[k];
+            }
+            part[6] = bits_as_real(finite);
+            part[7] = depth;
+            part[8] = bits_as_real(lowest);
+            part[9] = bits_as_real(highest);
+        }
+        if (thread == 0) {
+            shared.behind[0] = shared.behind[1] = shared.tiles[0] = shared.tiles[1] = shared.crossing = 0;
+            info[0] = info[1] = 0;
+        }
+    }
 
-const Grid grid = shared.grid;
-real crossing_low[3], crossing_high[3];  // beyond, a query reaches out of the box, or may meet what comes from outside
-for (int a = 0; a < DIM; ++a) {
-    const real reach = reach_along(a) * (real(1.00001) + real(shared.depth));  // rounding does no harm
-    crossing_low[a] = is_periodic(a) ? reach : -INF;
-    crossing_high[a] = is_periodic(a) ? real(0.999999) - reach : INF;
-}
-auto mark = [&](const real* row, const real* p, long long place) {  // a query's block, if it crosses the box
-    bool crosses_box = is_turned(row);
+    // Lets every block reduce those bounds to the grid, and clear its part of what the others count in.
+    JFRNN_MEMBER void lay_out_grid() {
+        __shared__ Grid grid;
+        real low[3], high[3];
+        const real* part = parts + PART * threadIdx.x;
+        int finite = id_of(part[6]), lowest = id_of(part[8]), highest = id_of(part[9]);
+        float depth = (float)part[7];
+        for (int k = 0; k < DIM; ++k) {
+            low[k] = part[k];
+            high[k] = part[3 + k];
+        }
+        reduce_over_block(low, high, finite, depth, lowest, highest);
+        if (threadIdx.x == 0) {
+            if (finite == 0)
+                for (int k = 0; k < DIM; ++k)
+                    low[k] = high[k] = 0;
+            lay_out(grid, low, high, table);
+            grid.finite = finite;
+            if (block == 0) {
+                shared.grid = grid;
+                shared.depth = depth;
+                shared.unit = lattice_unit(lowest, highest);
+                if (finite < n)
+                    atomicOr(&info[1], 2);
+            }
+        }
+        __syncthreads();
+        const int cells = grid.cells, tiles = (cells + 1) / TILE + 1;  // of the table, what is in use
+        for (long long c = thread; c < cells + 2; c += threads) {
+            start[c] = 0;
+            if (!own)
+                query_start[c] = 0;
+        }
+        for (long long t = thread; t < tiles; t += threads) {
+            tile_state[t] = 0;
+            if (!own)
+                query_tile_state[t] = 0;
+        }
+    }
+
+    // Counts every particle in its cell: the sources first, then, in a second launch, the queries.
+    JFRNN_MEMBER void count_cells() {
+        const Grid grid = shared.grid;
+        const int size = of_queries ? m : n;
+        const real* points = of_queries ? queries : positions;
+        int* counts = of_queries ? query_start : start;
+        for (long long i = thread; i < size; i += threads) {
+            real p[3];
+            point_of(points + ROW * i, p);
+            const bool finite = finite_point(p);
+            const int cell = finite ? cell_key(grid, p, system_of(points + ROW * i)) : -1;
+            key[i] = cell;
+            slot[i] = atomicAdd(finite ? counts + cell : &shared.behind[of_queries], 1);
+            if (!finite && of_queries)
+                atomicOr(&info[1], 2);
+        }
+    }
+
+    // Turns counts into first places, in one pass (Merrill & Garland 2016, decoupled look-back).
+    JFRNN_MEMBER void scan_counts() {
+        __shared__ int sums[8];
+        __shared__ int tile_shared, before_shared;
+        unsigned long long volatile* state = of_queries ? query_tile_state : tile_state;
+        int* counts = of_queries ? query_start : start;
+        const int cells = shared.grid.cells + 1;  // one more entry: the end of the last cell
+        for (;;) {
+            if (threadIdx.x == 0)
+                tile_shared = atomicAdd(&shared.tiles[of_queries], 1);
+            __syncthreads();
+            const int tile = tile_shared;
+            if ((long long)tile * TILE >= cells)
+                break;
+            constexpr int EACH = TILE / BLOCK;
+            const long long first = (long long)tile * TILE + threadIdx.x * EACH;
+            int value[EACH], total = 0;
+            for (int e = 0; e < EACH; ++e) {
+                value[e] = total;
+                total += first + e < cells ? counts[first + e] : 0;
+            }
+            int inclusive = total;
+            for (int step = 1; step < 32; step *= 2) {
+                const int other = __shfl_up_sync(ALL, inclusive, step);
+                inclusive += lane >= step ? other : 0;
+            }
+            if (lane == 31)
+                sums[warp_in_block] = inclusive;
+            __syncthreads();
+            int before = inclusive - total, tile_total = 0;
+            for (int w = 0; w < 8; ++w) {
+                before += w < warp_in_block ? sums[w] : 0;
+                tile_total += sums[w];
+            }
+            if (threadIdx.x == 0)  // 1: the sum of this tile, 2: of all tiles up to it; one word, so that both arrive together
+                state[tile] = ((tile == 0 ? 2ull : 1ull) << 32) | (unsigned int)tile_total;
+            if (warp_in_block == 0) {
+                int earlier = 0;
+                for (int back = tile - 1; back >= 0; back -= 32) {
+                    const int seen = back - lane;
+                    unsigned long long word = seen >= 0 ? 0 : 2ull << 32;
+                    while (__any_sync(ALL, (word >> 32) == 0))
+                        word = (word >> 32) == 0 ? state[seen] : word;
+                    const unsigned int full = __ballot_sync(ALL, (word >> 32) == 2);
+                    const int until = full ? __ffs(full) - 1 : 31;
+                    int part = lane <= until ? (int)(word & 0xffffffffull) : 0;
+                    for (int step = 16; step > 0; step /= 2)
+                        part += __shfl_down_sync(ALL, part, step);
+                    earlier += __shfl_sync(ALL, part, 0);
+                    if (full)
+                        break;
+                }
+                if (lane == 0) {
+                    before_shared = earlier;
+                    if (tile > 0)
+                        state[tile] = (2ull << 32) | (unsigned int)(earlier + tile_total);
+                }
+            }
+            __syncthreads();
+            before += before_shared;
+            for (int e = 0; e < EACH; ++e)
+                if (first + e < cells)
+                    counts[first + e] = before + value[e];
+            __syncthreads();
+        }
+    }
+
+    // Puts particles into their cells, in the order in which they came.
+    JFRNN_MEMBER void scatter_ids() {
+        const int size = of_queries ? m : n;
+        const int* first = of_queries ? query_start : start;
+        int* out = of_queries ? query_order : order;
+        const int finite = size - shared.behind[of_queries];
+        for (long long i = thread; i < size; i += threads) {
+            out[(key[i] >= 0 ? first[key[i]] : finite) + slot[i]] = (int)i;
+            if constexpr (PERIODIC)
+                slot[i] = 0;  // of `crosses`, from now on
+        }
+        if (thread == 0 && (own || of_queries))
+            shared.finite_queries = finite;
+    }
+
+    // Puts positions into the order of cells, ranked by index within a cell: the same order in every run.
+    JFRNN_MEMBER void gather_places() {
+        const Grid grid = shared.grid;
+        real crossing_low[3], crossing_high[3];  // beyond, a query reaches out of the box, or may meet what comes from outside
+        for (int a = 0; a < DIM; ++a) {
+            const real reach = reach_along(a) * (real(1.00001) + real(shared.depth));  // rounding does no harm
+            crossing_low[a] = is_periodic(a) ? reach : -INF;
+            crossing_high[a] = is_periodic(a) ? real(0.999999) - reach : INF;
+        }
+        auto mark = [&](const real* row, const real* p, long long place) {  // a query's block, if it crosses the box
+            bool crosses_box = is_turned(row);
 #pragma unroll
-    for (int a = 0; a < DIM; ++a) {
-        const real x = coordinate(a, p);
-        crosses_box = crosses_box || !(x > crossing_low[a] && x < crossing_high[a]);
+            for (int a = 0; a < DIM; ++a) {
+                const real x = coordinate(a, p);
+                crosses_box = crosses_box || !(x > crossing_low[a] && x < crossing_high[a]);
+            }
+            // one lane for all of its warp that belong to the same block
+            const int of_block = (int)(place >> share_bits);
+            const unsigned int alike = __match_any_sync(__activemask(), crosses_box ? of_block : -1);
+            if (crosses_box && (alike & ((1u << lane) - 1)) == 0 && crosses[of_block] == 0 &&
+                atomicExch(crosses + of_block, 1) == 0)
+                crossing[atomicAdd(&shared.crossing, 1)] = of_block;
+        };
+        for (long long place = thread; of_queries && place < shared.finite_queries; place += threads) {
+            real p[3];
+            const real* row = queries + (long long)ROW * query_order[place];
+            point_of(row, p);
+            mark(row, p, place);
+        }
+        for (long long place = thread; !of_queries && place < n; place += threads) {
+            const int i = order[place];
+            Place mine;
+            point_of(positions + (long long)ROW * i, mine.p);
+            mine.id = bits_as_real(i);
+            const unsigned int system = system_of(positions + (long long)ROW * i);
+            const int cell =
+                finite_point(mine.p) ? cell_key(grid, mine.p, system) : -1;  // cheaper than to fetch key[i] from anywhere
+            long long to = place;
+            if (cell >= 0) {
+                const int first = start[cell], end = start[cell + 1];
+                int rank = 0;
+                for (int other = first; other < end; ++other)
+                    rank += order[other] < i;
+                to = first + rank;
+            }
+            sorted[to] = mine;
+            if (PERIODIC && own && cell >= 0)
+                mark(positions + (long long)ROW * i, mine.p, to);
+        }
     }
-    // one lane for all of its warp that belong to the same block
-    const int of_block = (int)(place >> share_bits);
-    const unsigned int alike = __match_any_sync(__activemask(), crosses_box ? of_block : -1);
-    if (crosses_box && (alike & ((1u << lane) - 1)) == 0 && crosses[of_block] == 0 && atomicExch(crosses + of_block, 1) == 0)
-        crossing[atomicAdd(&shared.crossing, 1)] = of_block;
 };
-for (long long place = thread; of_queries && place < shared.finite_queries; place += threads) {
-    real p[3];
-    const real* row = queries.data + (long long)ROW * query_order[place];
-    point_of(row, p);
-    mark(row, p, place);
-}
-for (long long place = thread; !of_queries && place < n; place += threads) {
-    const int i = order[place];
-    Place mine;
-    point_of(positions.data + (long long)ROW * i, mine.p);
-    mine.id = bits_as_real(i);
-    const unsigned int system = system_of(positions.data + (long long)ROW * i);
-    const int cell = finite_point(mine.p) ? cell_key(grid, mine.p, system) : -1;  // cheaper than to fetch key[i] from anywhere
-    long long to = place;
-    if (cell >= 0) {
-        const int first = start[cell], end = start[cell + 1];
-        int rank = 0;
-        for (int other = first; other < end; ++other)
-            rank += order[other] < i;
-        to = first + rank;
-    }
-    sorted[to] = mine;
-    if (PERIODIC && own && cell >= 0)
-        mark(positions.data + (long long)ROW * i, mine.p, to);
-}

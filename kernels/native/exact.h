@@ -1,8 +1,10 @@
-// --- part: exact
-
-const real step_scale = SCALED ? real(Bits::unit_scale(radius)) : real(1);
-const real step_radius = SCALED ? radius * step_scale : radius;
-const real step_eps = DOUBLE ? real(2.220446049250313e-16) : real(1.1920929e-07f);
+// Where a pair is decided.
+//
+// Step 1 belongs to the kernels: working precision and a band of 8 eps around r^2 (4 on the CPU, see jfrnn/_geometry/exact.py).
+// `Exact::pair` answers for what falls into the band: in twice the precision (float32), then by error-free sums, then in integers as
+// wide as the float format. It is a call, not inlined, so that what it needs is not held in registers elsewhere.
+#pragma once
+#include "space.h"
 
 struct Exact {
 #if defined(__CUDA_ARCH__)
@@ -45,7 +47,7 @@ struct Exact {
 
     // sign of |b + S·A - a|^2 - r^2 by error-free transformations (Ogita, Rump & Oishi 2005, doi:10.1137/030601818); 2: not proven.
     // Where cutoffs are sums, r is that of `radius` and `more`, here and below.
-    JFRNN_FUNCTION int sum_sign(const real* a, const real* b, real radius, real more, const int* shift, Lattice lattice) {
+    JFRNN_FUNCTION int sum_sign(const real* a, const real* b, real radius, real more, const int* shift, Lattice::Argument lattice) {
         constexpr int TERMS = 3 * DIM + 2 + SUM;
         double term[TERMS];
         double slack = 0;
@@ -189,7 +191,7 @@ struct Exact {
 
     // the same with a lattice: the difference may fill all limbs
     JFRNN_CALL int integer_sign_of_image(
-        const real* a, const real* b, real radius, real more, const int* shift, Lattice lattice) {
+        const real* a, const real* b, real radius, real more, const int* shift, Lattice::Argument lattice) {
         constexpr int LIMBS = DOUBLE ? 4 : 2, ALL = DOUBLE ? 92 : 15;
         long long total[2 * ALL], part[ALL];
         for (int t = 0; t < 2 * ALL; ++t)
@@ -247,7 +249,7 @@ struct Exact {
 
     // does b + S·A lie within the cutoff of a? S are the whole numbers of given vectors that turns and image add up to
     JFRNN_CALL bool image_pair(
-        const real* a, const real* b, real radius, real more, bool closed, const int* shift, Lattice lattice) {
+        const real* a, const real* b, real radius, real more, bool closed, const int* shift, Lattice::Argument lattice) {
         if constexpr (!DOUBLE) {
             double square = 0, doubt = 0;
             const double r = SUM ? double(radius) + double(more) : double(radius), r2 = r * r;
@@ -299,18 +301,20 @@ struct Exact {
         return sign < 0 || (sign == 0 && closed);
     }
 };
+
 // Where coordinates lie on a lattice: the square, in units, that separates those of pairs from all others, half a unit from both.
-auto square_between = [&](real unit) -> double {
+JFRNN_FUNCTION double square_between(real radius, real unit, bool closed) {
     const double r = double(radius) / double(unit), square = r * r, error = Exact::product_error(r, r, square);
     double whole_part = double((long long)square);
     if (whole_part == square && error < 0)
         whole_part -= 1;
     const bool tie = whole_part == square && error == 0;
     return (tie && !closed ? whole_part - 1 : whole_part) + 0.5;
-};
-// the image of a source that a query meets: rows of positions as they were given, the code of the image of wrapped points, and the
-// cutoff, where it is a sum of two numbers
-auto exact_image_within = [&](const real* query, const real* source, int image, real radius, real more) {
+}
+// Is the image of a source within the cutoff of a query? Both are rows of positions as they were given, `image` is the code of the
+// image of wrapped points; the cutoff is `radius`, or the sum of `radius` and `more`.
+JFRNN_FUNCTION bool exact_image(
+    const Lattice& lattice, const real* query, const real* source, int image, real radius, real more, bool closed) {
     int shift[3] = {0, 0, 0};
     for (int axis = DIM - 1; axis >= 0; --axis) {
         const int k = lattice.images(axis), codes = 2 * k + 1;
@@ -326,10 +330,8 @@ auto exact_image_within = [&](const real* query, const real* source, int image, 
             shift[k] = sums[k];
     }
     return Exact::image_pair(query, source, radius, more, closed, shift, lattice);
-};
-auto exact_image = [&](const real* query, const real* source, int image) {
-    return exact_image_within(query, source, image, radius, 0);
-};
-auto exact_pair = [&](const real* a, const real* b) {
-    return Exact::pair(a[0], a[1], DIM == 3 ? a[DIM - 1] : 0, b[0], b[1], DIM == 3 ? b[DIM - 1] : 0, radius, 0, closed);
-};
+}
+// Is a point within the cutoff of another? Both are as they were given; the cutoff is `radius`, or the sum of `radius` and `more`.
+JFRNN_FUNCTION bool exact_pair(const real* a, const real* b, real radius, real more, bool closed) {
+    return Exact::pair(a[0], a[1], DIM == 3 ? a[DIM - 1] : 0, b[0], b[1], DIM == 3 ? b[DIM - 1] : 0, radius, more, closed);
+}

@@ -1,29 +1,28 @@
-// --- part: keep
+// How the processor treats denormals.
+//
+// XLA's threads flush denormals to zero on the CPU. While native code runs they are kept, since they decide about pairs; what users
+// compute in between is flushed, as XLA does, and for its speed. CUDA has no such mode.
+#pragma once
+#include "device.h"
 
-#if defined(__SSE__) && !defined(__CUDA_ARCH__)
-__builtin_ia32_ldmxcsr(float_control & ~0x8040u);
-#elif defined(__aarch64__) && !defined(__CUDA_ARCH__)
-asm volatile("msr fpcr, %0" : : "r"(float_control & ~(1ull << 24)));
+struct FloatControl {
+#if defined(__SSE__) && !defined(__CUDACC__)
+    unsigned int before;
+    FloatControl() : before(__builtin_ia32_stmxcsr()) { keep(); }
+    ~FloatControl() { __builtin_ia32_ldmxcsr(before); }
+    void keep() const { __builtin_ia32_ldmxcsr(before & ~0x8040u); }
+    void flush() const { __builtin_ia32_ldmxcsr(before | 0x8040u); }
+#elif defined(__aarch64__) && !defined(__CUDACC__)
+    unsigned long long before;
+    FloatControl() {
+        asm volatile("mrs %0, fpcr" : "=r"(before));
+        keep();
+    }
+    ~FloatControl() { asm volatile("msr fpcr, %0" : : "r"(before)); }
+    void keep() const { asm volatile("msr fpcr, %0" : : "r"(before & ~(1ull << 24))); }
+    void flush() const { asm volatile("msr fpcr, %0" : : "r"(before | (1ull << 24))); }
+#else
+    JFRNN_MEMBER void keep() const {}
+    JFRNN_MEMBER void flush() const {}
 #endif
-// --- part: flush
-
-#if defined(__SSE__) && !defined(__CUDA_ARCH__)
-__builtin_ia32_ldmxcsr(float_control | 0x8040u);
-#elif defined(__aarch64__) && !defined(__CUDA_ARCH__)
-asm volatile("msr fpcr, %0" : : "r"(float_control | (1ull << 24)));
-#endif
-// --- part: enter
-
-#if defined(__SSE__) && !defined(__CUDA_ARCH__)
-const unsigned int float_control = __builtin_ia32_stmxcsr();
-#elif defined(__aarch64__) && !defined(__CUDA_ARCH__)
-unsigned long long float_control;
-asm volatile("mrs %0, fpcr" : "=r"(float_control));
-#endif
-// --- part: leave
-
-#if defined(__SSE__) && !defined(__CUDA_ARCH__)
-__builtin_ia32_ldmxcsr(float_control);
-#elif defined(__aarch64__) && !defined(__CUDA_ARCH__)
-asm volatile("msr fpcr, %0" : : "r"(float_control));
-#endif
+};

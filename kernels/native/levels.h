@@ -1,135 +1,65 @@
-// --- part: query
+// Search with a cutoff per particle: queries one by one, on the CPU in chunks on every core, on CUDA one per thread.
+//
+// `header` holds the cells of the table along each axis (4), whether there is a table, and how many groups are in use. `cutoff`
+// holds the largest cutoff and the lattice, then the largest of each group, and along each axis: the width of a top cell, how many
+// of those units a cutoff of 1 reaches, and what is added to that (3 each). Where space is periodic, `axes` and `query_axes` are
+// wrapped, and `positions` and `queries` hold what was given, with turns. Of a batch, the last axis of `top` is the system.
+//
+// What becomes of the pairs is said by the struct that derives from `Levels`, by these members:
+//   State                  what is known of a query, a variable of its own, which stays in registers
+//   begin_query(one)       a query begins: returns its state
+//   pair(state, one, other, place, image)  the source `other` at `place` is a pair, in an image
+//   end_query(state, one), chunk_done(chunk)  come after the last pair of a query, and (on the CPU) after the last query of a chunk
+#pragma once
+#include "exact.h"
+#include "lane_count.h"
 
-#if defined(__CUDA_ARCH__)
-constexpr int LANES = 1;
-#else
-constexpr int LANES = 16;
-#endif
 constexpr int GATHER = 0, SCATTER = 1, EITHER = 2, BOTH = 3;
-const int* extent = header.data;
-const bool dense = header.data[4] != 0;
-const int groups = header.data[5];
-const real* largest = cutoff.data + LATTICE_END;
-const real* width = largest + GROUPS;
-const real* scale = width + 3;
-const real* margin = scale + 3;
-const long long stride = n + PADDING;
-const real unit = real(Bits::unit_scale(radius));
+constexpr int TOP = DIM + BATCHED;  // axes of top cells
 constexpr real EPS = DOUBLE ? real(2.220446049250313e-16) : real(1.1920929e-07f);
 constexpr real LEAST = DOUBLE ? real(0x1p-459) : real(0x1p-40f);  // below, squares might underflow
 
-// cutoff of a pair; a mean is rounded
-auto of_pair = [](real own, real other) -> real {
-    if constexpr (RULE == GATHER) return own;
-    if constexpr (RULE == SCATTER) return other;
-    if constexpr (RULE == EITHER) return own > other ? own : other;
-    if constexpr (RULE == BOTH) return own < other ? own : other;
-    return own / 2 + other / 2;
-};
-constexpr int TOP = DIM + BATCHED;  // axes of top cells
-const real slack = PERIODIC ? 2 * lattice.slack() * unit : real(0);  // by which distances of images may be wrong
-int codes = 1, home = 0;  // of images
-for (int k = 0; PERIODIC && k < DIM; ++k)
-    codes *= 2 * lattice.images(k) + 1;
-home = (codes - 1) / 2;
-const int fill_value = PERIODIC == 2 ? n * codes : n;
-auto exactly = [&](int query, int source, const real* q, const real* p, int image, real own, real other) -> bool {
-    const real first = SUM ? own / 2 : of_pair(own, other), more = SUM ? other / 2 : real(0);
-    if constexpr (PERIODIC) {
-        const real *a = queries.data + (long long)ROW * query, *b = positions.data + (long long)ROW * source;
-        return exact_image_within(a, b, image, first, more);
-    }
-    return Exact::pair(q[0], q[1], DIM == 3 ? q[DIM - 1] : 0, p[0], p[1], DIM == 3 ? p[DIM - 1] : 0, first, more, closed);
-};
-auto row_major = [&](const int* cell) -> int {
-    int index = cell[TOP - 1];
-    for (int k = TOP - 2; k >= 0; --k)
-        index = index * extent[k] + cell[k];
-    return index;
-};
-// first source whose top cell is not below this one, the last axis compared first
-auto first_not_below = [&](const int* cell) -> int {
-    int low = 0, high = n;
-    while (low < high) {
-        const int middle = low + (high - low) / 2;
-        bool below = false;
-        for (int k = 0; k < TOP; ++k) {
-            const int here = top.data[(long long)k * n + middle];
-            below = here < cell[k] || (here == cell[k] && below);
-        }
-        if (below)
-            low = middle + 1;
-        else
-            high = middle;
-    }
-    return low;
-};
-auto first_key_from = [&](unsigned int key, int low, int high) -> int {
-    while (low < high) {
-        const int middle = low + (high - low) / 2;
-        if ((unsigned int)keys.data[middle] < key)
-            low = middle + 1;
-        else
-            high = middle;
-    }
-    return low;
-};
-auto spread = [](unsigned int c) -> unsigned int {  // bit b goes to place DIM * b
-    unsigned int result = 0;
-    for (int b = 0; b < HALVINGS; ++b)
-        result |= (c >> b & 1) << (DIM * b);
-    return result;
+struct LevelArguments {
+    const real *positions, *queries, *axes, *radii;
+    const int *ids, *keys, *top, *table, *header;
+    const real *cutoff, *query_axes, *query_radii;
+    const int *query_ids, *query_top, *places;
+    int* info;
+    int n, m, own_queries, closed, drop_self, later_only;
 };
 
-// how far the cells around a query reach: where images lie close, over many of the largest cells
-auto reach_of = [&](int k, int level) -> int {
-    return PERIODIC && level == 0 && lattice.images(k) > 1 ? lattice.images(k) : 1;
+// LANES numbers side by side, and the bits of what is true of them.
+#if defined(__CUDACC__)
+typedef real lanes;
+struct Side {
+    JFRNN_FUNCTION lanes load(const real* from) { return *from; }
+    JFRNN_FUNCTION unsigned int bits(bool is_so) { return is_so; }
+    JFRNN_FUNCTION real choose(bool is_so, real yes, real no) { return is_so ? yes : no; }
+    JFRNN_FUNCTION int lowest(unsigned int) { return 0; }
 };
-// for each cell around a query that holds sources of a group: its run of them, and the code of their image
-auto each_run = [&](int g, int at, int level, auto use) {
-    const int shift = HALVINGS - level, mask = (1 << level) - 1;
-    const int reach[3] = {reach_of(0, level), reach_of(1, level), DIM == 3 ? reach_of(2, level) : 0};
-    for (int z = -reach[2]; z <= reach[2]; ++z)
-        for (int y = -reach[1]; y <= reach[1]; ++y)
-            for (int x = -reach[0]; x <= reach[0]; ++x) {
-                const int steps[3] = {x, y, z};
-                int around[4] = {0, 0, 0, 0}, image = 0;
-                unsigned int key = 0;
-                bool there = true;
-                for (int k = 0; k < DIM; ++k) {
-                    const int fine = (places.data[(long long)k * m + at] >> shift) + steps[k];
-                    around[k] = query_top.data[(long long)k * m + at] + (fine >> level);
-                    key |= spread((unsigned int)(fine & mask)) << k;
-                    if constexpr (PERIODIC) {
-                        const int most = lattice.images(k), e = extent[k];
-                        const int turn = most == 0 ? 0 : around[k] >= 0 ? around[k] / e : -1 - (-1 - around[k]) / e;
-                        around[k] -= turn * e;
-                        image = image * (2 * most + 1) + turn + most;
-                        there = there && turn >= -most && turn <= most;
-                    }
-                }
-                if (!there)
-                    continue;
-                if constexpr (BATCHED)
-                    around[DIM] = query_top.data[(long long)DIM * m + at];
-                int from, to;
-                if (dense) {
-                    from = table.data[row_major(around)];
-                    to = table.data[row_major(around) + 1];
-                } else {
-                    from = first_not_below(around);
-                    ++around[0];
-                    to = from < n ? first_not_below(around) : from;
-                }
-                if (from == to)
-                    continue;
-                key = ((unsigned int)g << (DIM * HALVINGS)) | (key << (DIM * shift));
-                from = first_key_from(key, from, to);
-                to = first_key_from(key + (1u << (DIM * shift)), from, to);
-                if (from < to)
-                    use(from, to, image);
-            }
+#else
+typedef real lanes __attribute__((vector_size(LANES * sizeof(real))));
+struct Side {
+    static lanes load(const real* from) {
+        lanes x;
+        __builtin_memcpy(&x, from, sizeof(x));
+        return x;
+    }
+    template <class Truth>
+    static unsigned int bits(Truth is_so) {
+        typedef bool flags __attribute__((ext_vector_type(LANES)));
+        const flags f = __builtin_convertvector(is_so, flags);
+        unsigned short b;
+        __builtin_memcpy(&b, &f, 2);
+        return b;
+    }
+    template <class Truth>
+    static lanes choose(Truth is_so, lanes yes, lanes no) {
+        return is_so ? yes : no;
+    }
+    static int lowest(unsigned int bits) { return __builtin_ctz(bits); }
 };
+#endif
 
 // Runs of candidates of one group, around a cell: sorted, those that touch joined. Queries that follow each other often share them,
 // so a thread of the CPU keeps them for each group, where there are no images.
@@ -138,192 +68,319 @@ struct Runs {
     long long cell[4];  // of the query, at that level, and its system
     int count, begin[27], end[27];
 };
-#if defined(__CUDA_ARCH__)
-Runs kept[1];
+#if defined(__CUDACC__)
+constexpr int KEPT = 1;
 #else
-Runs kept[GROUPS];
+constexpr int KEPT = GROUPS;
 #endif
-for (Runs& runs : kept)
-    runs.level = -1;
-auto find_runs = [&](Runs& runs, int g, int at, int level) {
-    const int shift = HALVINGS - level;
-    bool same = LANES > 1 && runs.level == level;
-    for (int k = 0; k < TOP; ++k) {
-        const long long first = query_top.data[(long long)k * m + at];
-        const long long cell = k == DIM ? first : (first << level) + (places.data[(long long)k * m + at] >> shift);
-        same = same && runs.cell[k] == cell;
-        runs.cell[k] = cell;
-    }
-    if (same)
-        return;
-    runs.level = level;
-    runs.count = 0;
-    each_run(g, at, level, [&](int from, int to, int) {
-        int place = runs.count++;
-        for (; place > 0 && runs.begin[place - 1] > from; --place) {
-            runs.begin[place] = runs.begin[place - 1];
-            runs.end[place] = runs.end[place - 1];
-        }
-        runs.begin[place] = from;
-        runs.end[place] = to;
-    });
-    int joined = 0;
-    for (int r = 1; r < runs.count; ++r)
-        if (runs.begin[r] == runs.end[joined])
-            runs.end[joined] = runs.end[r];
-        else {
-            ++joined;
-            runs.begin[joined] = runs.begin[r];
-            runs.end[joined] = runs.end[r];
-        }
-    runs.count = runs.count ? joined + 1 : 0;
+
+// A query: its place, its number, where it is, its cutoff, and the image that it meets, in lattice vectors.
+struct One {
+    int at, id;
+    real q[3], own;
+    int shift[3];
 };
 
-// Which of LANES sources from `first` on are not surely too far from a query, a bit each, and which of those are surely pairs.
-#if defined(__CUDA_ARCH__)
-auto lowest_bit = [](unsigned int) -> int { return 0; };
-#else
-typedef real lanes __attribute__((vector_size(LANES * sizeof(real))));
-typedef bool flags __attribute__((ext_vector_type(LANES)));
-auto lowest_bit = [](unsigned int bits) -> int { return __builtin_ctz(bits); };
-#endif
-auto test = [&](const real* q, real own, int first, unsigned int& sure) -> unsigned int {
-#if defined(__CUDA_ARCH__)
-    using lanes = real;
-    auto load = [&](const real* from) -> lanes { return *from; };
-    auto bits = [](bool is_so) -> unsigned int { return is_so; };
-    auto choose = [](bool is_so, real yes, real no) -> real { return is_so ? yes : no; };
-#else
-    auto load = [&](const real* from) -> lanes {
-        lanes x;
-        __builtin_memcpy(&x, from, sizeof(x));
-        return x;
-    };
-    auto bits = [](auto is_so) -> unsigned int {
-        const flags f = __builtin_convertvector(is_so, flags);
-        unsigned short b;
-        __builtin_memcpy(&b, &f, 2);
-        return b;
-    };
-    auto choose = [](auto is_so, lanes yes, lanes no) -> lanes { return is_so ? yes : no; };
-#endif
-    lanes square = lanes{};
-    for (int k = 0; k < DIM; ++k) {
-        const lanes d = (load(axes.data + k * stride + first) - q[k]) * unit;
-        square += d * d;
-    }
-    lanes r = lanes{} + own;
-    if constexpr (RULE != GATHER) {
-        const lanes other = load(radii.data + first);
-        if constexpr (RULE == SCATTER) r = other;
-        else if constexpr (RULE == EITHER) r = choose(other > r, other, r);
-        else if constexpr (RULE == BOTH) r = choose(other < r, other, r);
-        else r = r / 2 + other / 2;
-    }
-    r *= unit;
-    const lanes least = lanes{} + LEAST, inner = r - slack, outer = choose(r > least, r, least) + slack;
-    sure = bits(square < inner * inner * (1 - 32 * EPS)) & bits(r > least) & bits(inner > lanes{});
-    return bits(square <= outer * outer * (1 + 32 * EPS));
-};
+template <class Query>
+struct Levels : LevelArguments, Space {
+    const int* extent;
+    bool dense;
+    int groups;
+    const real *largest, *width, *scale, *margin;
+    long long stride;
+    real unit, slack;             // slack: by which distances of images may be wrong
+    int codes, home, fill_value;  // of images
+    int longest;
+    Runs kept[KEPT];
 
-int longest = 0;
-$begin
-auto serve = [&](int at) {
-    const int id = query_ids.data[at];
-    real q[3] = {0, 0, 0};
-    for (int k = 0; k < DIM; ++k)
-        q[k] = query_axes.data[(long long)k * m + at];
-    const real own = RULE == SCATTER ? real(0) : query_radii.data[at];
-    int shift[3] = {0, 0, 0};  // of the image that is met, in lattice vectors
-    $begin_query
-    auto meet = [&](int from, int to, int image, const real* from_where) {
+    JFRNN_INLINE explicit Levels(const LevelArguments& given)
+        : LevelArguments(given),
+          Space(given.cutoff),
+          extent(header),
+          dense(header[4] != 0),
+          groups(header[5]),
+          largest(cutoff + LATTICE_END),
+          width(largest + GROUPS),
+          scale(width + 3),
+          margin(scale + 3),
+          stride(n + PADDING),
+          unit(real(Bits::unit_scale(radius))),
+          slack(PERIODIC ? 2 * lattice.slack() * unit : real(0)),
+          codes(1),
+          longest(0) {
+        for (int k = 0; PERIODIC && k < DIM; ++k)
+            codes *= 2 * lattice.images(k) + 1;
+        home = (codes - 1) / 2;
+        fill_value = PERIODIC == 2 ? n * codes : n;
+        for (Runs& runs : kept)
+            runs.level = -1;
+    }
+    JFRNN_INLINE Query& query() { return *(Query*)this; }
+
+    // The cutoff of a pair; a mean is rounded.
+    JFRNN_FUNCTION real of_pair(real own, real other) {
+        if constexpr (RULE == GATHER)
+            return own;
+        if constexpr (RULE == SCATTER)
+            return other;
+        if constexpr (RULE == EITHER)
+            return own > other ? own : other;
+        if constexpr (RULE == BOTH)
+            return own < other ? own : other;
+        return own / 2 + other / 2;
+    }
+    // Is a source a pair of a query, given both points as they are, their numbers, and the image of the source?
+    JFRNN_INLINE bool exactly(int query, int source, const real* q, const real* p, int image, real own, real other) const {
+        const real first = SUM ? own / 2 : of_pair(own, other), more = SUM ? other / 2 : real(0);
+        if constexpr (PERIODIC) {
+            const real *a = queries + (long long)ROW * query, *b = positions + (long long)ROW * source;
+            return exact_image(lattice, a, b, image, first, more, closed);
+        }
+        return exact_pair(q, p, first, more, closed);
+    }
+    // The number of a top cell in the table.
+    JFRNN_INLINE int row_major(const int* cell) const {
+        int index = cell[TOP - 1];
+        for (int k = TOP - 2; k >= 0; --k)
+            index = index * extent[k] + cell[k];
+        return index;
+    }
+    // The first source whose top cell is not below this one; the last axis is compared first.
+    JFRNN_INLINE int first_not_below(const int* cell) const {
+        int low = 0, high = n;
+        while (low < high) {
+            const int middle = low + (high - low) / 2;
+            bool below = false;
+            for (int k = 0; k < TOP; ++k) {
+                const int here = top[(long long)k * n + middle];
+                below = here < cell[k] || (here == cell[k] && below);
+            }
+            if (below)
+                low = middle + 1;
+            else
+                high = middle;
+        }
+        return low;
+    }
+    // The first source in [low, high) whose key is not below this one.
+    JFRNN_INLINE int first_key_from(unsigned int key, int low, int high) const {
+        while (low < high) {
+            const int middle = low + (high - low) / 2;
+            if ((unsigned int)keys[middle] < key)
+                low = middle + 1;
+            else
+                high = middle;
+        }
+        return low;
+    }
+    // Spreads bits: bit b goes to place DIM * b.
+    JFRNN_FUNCTION unsigned int spread(unsigned int c) {
+        unsigned int result = 0;
+        for (int b = 0; b < HALVINGS; ++b)
+            result |= (c >> b & 1) << (DIM * b);
+        return result;
+    }
+
+    // How far the cells around a query reach: where images lie close, over many of the largest cells.
+    JFRNN_INLINE int reach_of(int k, int level) const {
+        return PERIODIC && level == 0 && lattice.images(k) > 1 ? lattice.images(k) : 1;
+    }
+    // Calls `use` for each cell around a query that holds sources of a group: with its run of them, and the code of their image.
+    template <class Use>
+    JFRNN_INLINE void each_run(int g, int at, int level, Use use) const {
+        const int shift = HALVINGS - level, mask = (1 << level) - 1;
+        const int reach[3] = {reach_of(0, level), reach_of(1, level), DIM == 3 ? reach_of(2, level) : 0};
+        for (int z = -reach[2]; z <= reach[2]; ++z)
+            for (int y = -reach[1]; y <= reach[1]; ++y)
+                for (int x = -reach[0]; x <= reach[0]; ++x) {
+                    const int steps[3] = {x, y, z};
+                    int around[4] = {0, 0, 0, 0}, image = 0;
+                    unsigned int key = 0;
+                    bool there = true;
+                    for (int k = 0; k < DIM; ++k) {
+                        const int fine = (places[(long long)k * m + at] >> shift) + steps[k];
+                        around[k] = query_top[(long long)k * m + at] + (fine >> level);
+                        key |= spread((unsigned int)(fine & mask)) << k;
+                        if constexpr (PERIODIC) {
+                            const int most = lattice.images(k), e = extent[k];
+                            const int turn = most == 0 ? 0 : around[k] >= 0 ? around[k] / e : -1 - (-1 - around[k]) / e;
+                            around[k] -= turn * e;
+                            image = image * (2 * most + 1) + turn + most;
+                            there = there && turn >= -most && turn <= most;
+                        }
+                    }
+                    if (!there)
+                        continue;
+                    if constexpr (BATCHED)
+                        around[DIM] = query_top[(long long)DIM * m + at];
+                    int from, to;
+                    if (dense) {
+                        from = table[row_major(around)];
+                        to = table[row_major(around) + 1];
+                    } else {
+                        from = first_not_below(around);
+                        ++around[0];
+                        to = from < n ? first_not_below(around) : from;
+                    }
+                    if (from == to)
+                        continue;
+                    key = ((unsigned int)g << (DIM * HALVINGS)) | (key << (DIM * shift));
+                    from = first_key_from(key, from, to);
+                    to = first_key_from(key + (1u << (DIM * shift)), from, to);
+                    if (from < to)
+                        use(from, to, image);
+                }
+    }
+    // Finds the runs of a group around the cell of a query, if they are not those that are kept.
+    JFRNN_INLINE void find_runs(Runs& runs, int g, int at, int level) const {
+        const int shift = HALVINGS - level;
+        bool same = LANES > 1 && runs.level == level;
+        for (int k = 0; k < TOP; ++k) {
+            const long long first = query_top[(long long)k * m + at];
+            const long long cell = k == DIM ? first : (first << level) + (places[(long long)k * m + at] >> shift);
+            same = same && runs.cell[k] == cell;
+            runs.cell[k] = cell;
+        }
+        if (same)
+            return;
+        runs.level = level;
+        runs.count = 0;
+        each_run(g, at, level, [&](int from, int to, int) {
+            int place = runs.count++;
+            for (; place > 0 && runs.begin[place - 1] > from; --place) {
+                runs.begin[place] = runs.begin[place - 1];
+                runs.end[place] = runs.end[place - 1];
+            }
+            runs.begin[place] = from;
+            runs.end[place] = to;
+        });
+        int joined = 0;
+        for (int r = 1; r < runs.count; ++r)
+            if (runs.begin[r] == runs.end[joined])
+                runs.end[joined] = runs.end[r];
+            else {
+                ++joined;
+                runs.begin[joined] = runs.begin[r];
+                runs.end[joined] = runs.end[r];
+            }
+        runs.count = runs.count ? joined + 1 : 0;
+    }
+
+    // Which of LANES sources from `first` on are not surely too far from a query, a bit each, and which of those are surely pairs.
+    JFRNN_INLINE unsigned int test(const real* q, real own, int first, unsigned int& sure) const {
+        const real unit = this->unit, slack = PERIODIC ? this->slack : real(0);
+        lanes square = lanes{};
+        for (int k = 0; k < DIM; ++k) {
+            const lanes d = (Side::load(axes + k * stride + first) - q[k]) * unit;
+            square += d * d;
+        }
+        lanes r = lanes{} + own;
+        if constexpr (RULE != GATHER) {
+            const lanes other = Side::load(radii + first);
+            if constexpr (RULE == SCATTER)
+                r = other;
+            else if constexpr (RULE == EITHER)
+                r = Side::choose(other > r, other, r);
+            else if constexpr (RULE == BOTH)
+                r = Side::choose(other < r, other, r);
+            else
+                r = r / 2 + other / 2;
+        }
+        r *= unit;
+        const lanes least = lanes{} + LEAST, inner = r - slack, outer = Side::choose(r > least, r, least) + slack;
+        sure = Side::bits(square < inner * inner * (1 - 32 * EPS)) & Side::bits(r > least) & Side::bits(inner > lanes{});
+        return Side::bits(square <= outer * outer * (1 + 32 * EPS));
+    }
+
+    // Lets a query meet the sources of a run, of an image, from where it meets them at home.
+    template <class State>
+    JFRNN_INLINE void meet(State& state, const One& one, int from, int to, int image, const real* from_where) {
         for (int first = from; first < to; first += LANES) {
-            unsigned int sure, near = test(from_where, own, first, sure);
+            unsigned int sure, near = test(from_where, one.own, first, sure);
             if (to - first < LANES)
                 near &= (1u << (to - first)) - 1;
             for (; near; near &= near - 1) {
-                const int e = LANES > 1 ? lowest_bit(near) : 0, c = first + e, other = ids.data[c];
-                const bool itself = own_queries && c == at && image == home;
-                const bool earlier = other < id || (PERIODIC == 2 && other == id && image < home);
+                const int e = LANES > 1 ? Side::lowest(near) : 0, c = first + e, other = ids[c];
+                const bool itself = own_queries && c == one.at && image == home;
+                const bool earlier = other < one.id || (PERIODIC == 2 && other == one.id && image < home);
                 if ((drop_self && itself) || (later_only && earlier))
                     continue;
                 bool pair = sure >> e & 1;
                 if (!pair) {
                     real p[3];
                     for (int k = 0; k < DIM; ++k)
-                        p[k] = axes.data[k * stride + c];
-                    pair = exactly(id, other, q, p, image, own, RULE == GATHER ? real(0) : radii.data[c]);
+                        p[k] = axes[k * stride + c];
+                    pair = exactly(one.id, other, one.q, p, image, one.own, RULE == GATHER ? real(0) : radii[c]);
                 }
                 if (!pair)
                     continue;
-                $pair
+                query().pair(state, one, other, c, image);
             }
         }
-    };
-    for (int g = 0; finite_point(q) && g < groups; ++g) {
-        if (RULE != GATHER && largest[g] < 0)
-            continue;
-        const real reach = of_pair(own, largest[g]) * (1 + 8 * EPS);
-        int level = 0;  // the finest one whose cells are wider than the reach
-        for (bool fits = true; fits && level < HALVINGS; level += fits)
-            for (int k = 0; k < DIM; ++k)
-                fits = fits && width[k] / real(2 << level) > reach * scale[k] + margin[k];
-        if constexpr (PERIODIC) {
-            each_run(g, at, level, [&](int from, int to, int image) {
-                int rest = image;
-                for (int k = DIM - 1; k >= 0; --k) {
-                    const int each = 2 * lattice.images(k) + 1;
-                    shift[k] = rest % each - lattice.images(k);
-                    rest /= each;
-                }
-                real moved[3] = {0, 0, 0};  // the query goes to where it meets the image at home
-                for (int k = 0; k < DIM; ++k)
-                    moved[k] = image == home ? q[k] : Lattice::add(q[k], -lattice.translation(shift[0], shift[1], shift[2], k));
-                meet(from, to, image, moved);
-            });
-            continue;
-        }
-        Runs& runs = kept[LANES > 1 ? g : 0];
-        find_runs(runs, g, at, level);
-        for (int r = 0; r < runs.count; ++r)
-            meet(runs.begin[r], runs.end[r], home, q);
     }
-    $end_query
-};
 
-#if defined(__CUDA_ARCH__)
-const long long at = ((long long)(blockIdx.z * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x) * blockDim.x + threadIdx.x;
-if (at < m) {
-    serve((int)at);
-    if (longest > 0)
-        atomicMax(&info.data[0], longest);
-}
-#else
-for (;;) {
-    const long long chunk = __atomic_fetch_add(&info.data[1], 1, __ATOMIC_RELAXED), begin = chunk * CHUNK;
-    if (begin >= m)
-        break;
-    for (long long at = begin; at < begin + CHUNK && at < m; ++at)
+    // Lets the query at a place meet all its candidates, group by group.
+    JFRNN_INLINE void serve(int at) {
+        One one{at, query_ids[at], {0, 0, 0}, RULE == SCATTER ? real(0) : query_radii[at], {0, 0, 0}};
+        for (int k = 0; k < DIM; ++k)
+            one.q[k] = query_axes[(long long)k * m + at];
+        typename Query::State state = query().begin_query(one);
+        for (int g = 0; finite_point(one.q) && g < groups; ++g) {
+            if (RULE != GATHER && largest[g] < 0)
+                continue;
+            const real reach = of_pair(one.own, largest[g]) * (1 + 8 * EPS);
+            int level = 0;  // the finest one whose cells are wider than the reach
+            for (bool fits = true; fits && level < HALVINGS; level += fits)
+                for (int k = 0; k < DIM; ++k)
+                    fits = fits && width[k] / real(2 << level) > reach * scale[k] + margin[k];
+            if constexpr (PERIODIC) {
+                each_run(g, at, level, [&](int from, int to, int image) {
+                    int rest = image;
+                    for (int k = DIM - 1; k >= 0; --k) {
+                        const int each = 2 * lattice.images(k) + 1;
+                        one.shift[k] = rest % each - lattice.images(k);
+                        rest /= each;
+                    }
+                    real moved[3] = {0, 0, 0};  // the query goes to where it meets the image at home
+                    for (int k = 0; k < DIM; ++k)
+                        moved[k] = image == home
+                                       ? one.q[k]
+                                       : Lattice::add(one.q[k], -lattice.translation(one.shift[0], one.shift[1], one.shift[2], k));
+                    meet(state, one, from, to, image, moved);
+                });
+                continue;
+            }
+            Runs& runs = kept[LANES > 1 ? g : 0];
+            find_runs(runs, g, at, level);
+            for (int r = 0; r < runs.count; ++r)
+                meet(state, one, runs.begin[r], runs.end[r], home, one.q);
+        }
+        query().end_query(state, one);
+    }
+
+#if defined(__CUDACC__)
+    JFRNN_INLINE void run() {
+        const long long block = (long long)(blockIdx.z * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x;
+        const long long at = block * blockDim.x + threadIdx.x;
+        if (at >= m)
+            return;
         serve((int)at);
-    $end_chunk
-}
-int known = __atomic_load_n(&info.data[0], __ATOMIC_RELAXED);
-while (known < longest && !__atomic_compare_exchange_n(&info.data[0], &known, longest, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
-}
+        if (longest > 0)
+            atomicMax(&info[0], longest);
+    }
+#else
+    void run() {
+        for (;;) {
+            const long long chunk = __atomic_fetch_add(&info[1], 1, __ATOMIC_RELAXED), begin = chunk * CHUNK;
+            if (begin >= m)
+                break;
+            for (long long at = begin; at < begin + CHUNK && at < m; ++at)
+                serve((int)at);
+            query().chunk_done((int)chunk);
+        }
+        int known = __atomic_load_n(&info[0], __ATOMIC_RELAXED);
+        while (
+            known < longest && !__atomic_compare_exchange_n(&info[0], &known, longest, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
+    }
 #endif
-// --- part: begin_row
-
-    int* row = idx.data + (long long)id * capacity;
-    int found = 0;
-// --- part: add_to_row
-
-                if (LIST && found < capacity)
-                    row[found] = PERIODIC == 2 ? other + n * image : other;
-                ++found;
-// --- part: end_row
-
-    if constexpr (LIST)
-        for (int s = found; s < capacity; ++s)
-            row[s] = fill_value;
-    count.data[id] = found;
-    longest = found > longest ? found : longest;
+};

@@ -1,28 +1,47 @@
-// --- part: sort_values
+// --- part: sums
+struct SumsArguments {
+    const real *positions, *queries, *cutoff, *shared_values, *own_values, *others;
+    real *sums, *totals, *errors, *values;
+    int *info, *scratch;
+    int n, m, own, table, closed, drop_self;
+};
+// What a thread knows of a sum; of a search nothing is written but scratch.
+struct Sums : Search {
+    const real *shared_values, *own_values, *others;
+    real *sums, *totals, *errors, *values;
+    JFRNN_MEMBER explicit Sums(const SumsArguments& a)
+        : Search({a.positions, a.queries, a.cutoff, nullptr, nullptr, a.info, a.scratch, a.n, a.m, a.own, a.table, 0, a.closed,
+                  a.drop_self, 0}),
+          shared_values(a.shared_values), own_values(a.own_values), others(a.others), sums(a.sums), totals(a.totals),
+          errors(a.errors), values(a.values) {}
 
-constexpr int AT_ONCE = 16 / sizeof(real), CHUNK = ROW_LENGTH < AT_ONCE ? ROW_LENGTH : AT_ONCE, CHUNKS = ROW_LENGTH / CHUNK;
-struct alignas(CHUNK * sizeof(real)) Chunk { real at[CHUNK]; };  // what a thread writes at once
-for (long long t = thread; t < (long long)CHUNKS * n; t += threads) {
-    const Place from = sorted[t / CHUNKS];
-    const real* const row = others.data + (long long)OTHERS * id_of(from.id);
-    Chunk chunk;
+    // Puts what a term reads of the sources into the order of cells, a row each, 16 bytes at a time.
+    JFRNN_MEMBER void sort_values() {
+        constexpr int AT_ONCE = 16 / sizeof(real), CHUNK = ROW_LENGTH < AT_ONCE ? ROW_LENGTH : AT_ONCE, CHUNKS = ROW_LENGTH / CHUNK;
+        struct alignas(CHUNK * sizeof(real)) Chunk { real at[CHUNK]; };  // what a thread writes at once
+        for (long long t = thread; t < (long long)CHUNKS * n; t += threads) {
+            const Place from = sorted[t / CHUNKS];
+            const real* const row = others + (long long)OTHERS * id_of(from.id);
+            Chunk chunk;
 #pragma unroll
-    for (int k = 0; k < CHUNK; ++k) {
-        const int c = (int)(t % CHUNKS) * CHUNK + k, column = c - PLACED;
-        const real along = c == 0 ? from.p[0] : c == 1 ? from.p[1] : from.p[2];
-        chunk.at[k] = column < 0 ? along : column < OTHERS ? row[column] : real(0);
+            for (int k = 0; k < CHUNK; ++k) {
+                const int c = (int)(t % CHUNKS) * CHUNK + k, column = c - PLACED;
+                const real along = c == 0 ? from.p[0] : c == 1 ? from.p[1] : from.p[2];
+                chunk.at[k] = column < 0 ? along : column < OTHERS ? row[column] : real(0);
+            }
+            ((Chunk*)values)[t] = chunk;
+        }
     }
-    ((Chunk*)values.data)[t] = chunk;
-}
+};
 // --- part: opened
 
 const long long slot_of_totals = begin >> share_bits;
 for (int t = lane; slot_of_totals < query_blocks && t < 2 * TOTALS; t += 32)
-    totals.data[2 * TOTALS * slot_of_totals + t] = 0;
+    totals[2 * TOTALS * slot_of_totals + t] = 0;
 // --- part: no_sum
 
 for (int r = lane; r < ROW_SUMS; r += 32)
-    sums.data[(long long)id * ROW_SUMS + r] = 0;
+    sums[(long long)id * ROW_SUMS + r] = 0;
 // --- part: no_extreme
 
 for (int r = lane; r < 2 * ROW_SUMS; r += 32)
@@ -41,14 +60,14 @@ auto add = [&](real& sum, real& error, bool is_pair, real x) {
         sum = is_pair ? sum + x : sum;
 };
 auto store = [&](long long at, real sum, real error, bool fresh, bool finished) {
-    real all = fresh ? real(0) : sums.data[at], carried = fresh || !COMPENSATED ? real(0) : errors.data[at];
+    real all = fresh ? real(0) : sums[at], carried = fresh || !COMPENSATED ? real(0) : errors[at];
     add(all, carried, true, sum);
     carried += error;
     if (COMPENSATED && finished && Bits::finite(all))
         all += carried;
     if (COMPENSATED && !finished)
-        errors.data[at] = carried;
-    sums.data[at] = all;
+        errors[at] = carried;
+    sums[at] = all;
 };
 auto add_total = [&](int t, real sum, real error) {  // of all lanes, always in the same order
     for (int step = 16; step > 0; step /= 2) {
@@ -57,7 +76,7 @@ auto add_total = [&](int t, real sum, real error) {  // of all lanes, always in 
         error += other_error;
     }
     if (lane == 0) {
-        real* const part = totals.data + 2 * TOTALS * slot_of_totals + t;
+        real* const part = totals + 2 * TOTALS * slot_of_totals + t;
         two_sum(part[0], part[TOTALS], sum);
         part[TOTALS] += error;
     }
@@ -69,10 +88,10 @@ for (int k = 0; PERIODIC && k < DIM; ++k)
     code_at_home *= 2 * lattice.images(k) + 1;
 code_at_home /= 2;
 auto keep_largest = [&](long long at, real best, int of, int code, bool fresh) {
-    real x = fresh ? -INF : sums.data[at];
+    real x = fresh ? -INF : sums[at];
     int source = fresh ? n : integer_at(2 * at), image = fresh ? 0 : integer_at(2 * at + 1);
     take_larger(best, of, code, true, x, source, image);
-    sums.data[at] = x;
+    sums[at] = x;
     put_integer(2 * at, source);
     put_integer(2 * at + 1, image);
 };
@@ -102,7 +121,7 @@ auto load_row = [&](int place) -> Row {
 #pragma unroll
     for (int p = 0; p < ROW_LENGTH / TOGETHER; ++p) {
         Part part;
-        load_words((const Part*)(values.data + (long long)ROW_LENGTH * place) + p, &part);
+        load_words((const Part*)(values + (long long)ROW_LENGTH * place) + p, &part);
 #pragma unroll
         for (int c = 0; c < TOGETHER; ++c)
             row.at[TOGETHER * p + c] = part.at[c];
@@ -176,4 +195,23 @@ auto add_pairs = [&](bool finished) {
     $stored
     met_in = 0;
     fresh = false;
+};
+// --- part: take_larger
+
+auto take_larger = [](number x, Math::i32 source, Math::i32 code, Math::flag among, number& best, Math::i32& of, Math::i32& at) {
+    const Math::flag is_nan = Math::ne(x, x), was_nan = Math::ne(best, best);
+    const Math::flag larger = Math::either(Math::gt(x, best), Math::both(is_nan, Math::inverse(was_nan)));
+    const Math::flag same = Math::either(Math::eq(x, best), Math::both(is_nan, was_nan));
+    const Math::flag first = Math::either(Math::lt(source, of), Math::both(Math::eq(source, of), Math::lt(code, at)));
+    const Math::flag taken = Math::both(among, Math::either(larger, Math::both(same, first)));
+    best = Math::select(taken, x, best);
+    of = Math::select(taken, source, of);
+    at = Math::select(taken, code, at);
+};
+auto integer_at = [&](long long at) -> int { return Lattice::packed_turns(errors[at]); };
+auto put_integer = [&](long long at, int x) {
+    if constexpr (DOUBLE)
+        errors[at] = x;
+    else
+        memcpy(errors + at, &x, 4);
 };

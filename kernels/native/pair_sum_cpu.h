@@ -1,171 +1,139 @@
-// --- part: sort_values
+// Sums over pairs on the CPU: terms are evaluated where their pairs are found, 8 or 16 at a time.
+#pragma once
+#include "walk_cpu.h"
+#include "reduction_cpu.h"
 
-for (;;) {
-    const int chunk = __atomic_fetch_add(&shared.next_sorted, 1, __ATOMIC_RELAXED);
-    if ((long long)chunk * CHUNK >= n)
-        break;
-    const int begin = chunk * CHUNK, end = n - begin < CHUNK ? n : begin + CHUNK;
-    const long long width = others.shape[1];
-    for (int place = begin; place < end; ++place)
-        for (int c = 0; c < width; ++c)
-            columns.data[(long long)c * n + place] = others.data[width * ids[place] + c];
-}
-// --- part: add
+struct SumArguments {
+    const real *positions, *queries, *cutoff, *shared_values, *own_values, *columns;
+    real *sums, *totals, *errors;
+    int* scratch;
+    int n, m, own, table, closed, drop_self;
+};
 
-typedef Math::NUMBER_LANES number;
-auto lanes_of = [](unsigned int bits) -> Math::flag {
-    Math::flag lanes;
-    __builtin_memcpy(&lanes, &bits, sizeof lanes);
-    return lanes;
-};
-auto bits_of = [](const real& x) {
-    whole bits;
-    memcpy(&bits, &x, sizeof bits);
-    return bits;
-};
-auto two_sum = [](auto& sum, auto& error, auto x) {  // Knuth 1969
-    const auto s = sum + x, b = s - sum;
-    error = error + ((sum - (s - b)) + (x - b));
-    sum = s;
-};
-auto add_lanes = [&](number sum, number error, real& total, real& carried) {  // always in the same order
-    real s[LANES], e[LANES];
-    memcpy(s, &sum, sizeof s);
-    memcpy(e, &error, sizeof e);
-    for (int size = LANES / 2; size > 0; size /= 2)
-        for (int l = 0; l < size; ++l)
-            if constexpr (COMPENSATED) {
-                two_sum(s[l], e[l], s[l + size]);
-                e[l] += e[l + size];
-            } else
-                s[l] += s[l + size];
-    if constexpr (COMPENSATED) {
-        two_sum(total, carried, s[0]);
-        carried += e[0];
-    } else
-        total += s[0];
-};
-real total[TOTALS + 1], total_carried[TOTALS + 1];
-for (int t = 0; t <= TOTALS; ++t)
-    total[t] = total_carried[t] = 0;
-// --- part: candidates
+// What the term reads of the sources stands in `columns`, in the order of cells; columns of the candidates lie beside their
+// coordinates. In a periodic box turns stand behind what is read of i and j, packed as in jfrnn/_geometry/box.py: with the image of a
+// candidate they make the lattice shift of the pair, a step along each axis.
+struct Sums : Walk<Sums> {
+    static constexpr bool FLUSHED = !SCALED;  // where cutoffs are so small that they are scaled, so may be what decides
+    alignas(64) real column[OTHERS + STEPS + 1][CANDIDATES + LANES];
+    alignas(64) real near_points[PACKED ? 3 : 1][PACKED ? CANDIDATES + LANES : 1];
+    alignas(64) real near_column[PACKED ? OTHERS + STEPS + 1 : 1][PACKED ? CANDIDATES + LANES : 1];
+    const real *own_values, *columns;
+    const Term term;
+    Results results;
 
-alignas(64) real column[OTHERS + STEPS + 1][CANDIDATES + LANES];
-memset(column, 0, sizeof column);
-memset(candidate, 0, sizeof candidate);
-memset(doubtful, 0, sizeof doubtful);
-alignas(64) real near_points[3][CANDIDATES + LANES];  // packed
-alignas(64) real near_column[OTHERS + STEPS + 1][CANDIDATES + LANES];
-// --- part: take_larger
-
-auto take_larger = [](number x, Math::i32 source, Math::i32 code, Math::flag among, number& best, Math::i32& of, Math::i32& at) {
-    const Math::flag is_nan = Math::ne(x, x), was_nan = Math::ne(best, best);
-    const Math::flag larger = Math::either(Math::gt(x, best), Math::both(is_nan, Math::inverse(was_nan)));
-    const Math::flag same = Math::either(Math::eq(x, best), Math::both(is_nan, was_nan));
-    const Math::flag first = Math::either(Math::lt(source, of), Math::both(Math::eq(source, of), Math::lt(code, at)));
-    const Math::flag taken = Math::both(among, Math::either(larger, Math::both(same, first)));
-    best = Math::select(taken, x, best);
-    of = Math::select(taken, source, of);
-    at = Math::select(taken, code, at);
-};
-auto integer_at = [&](long long at) -> int { return Lattice::packed_turns(errors.data[at]); };
-auto put_integer = [&](long long at, int x) {
-    if constexpr (DOUBLE)
-        errors.data[at] = x;
-    else
-        memcpy(errors.data + at, &x, 4);
-};
-// --- part: keep_largest
-
-auto keep_largest = [&](number best, Math::i32 of, Math::i32 code, long long at, bool fresh) {
-    real x = fresh ? -Bits::not_finite() : sums.data[at];
-    int source = fresh ? n : integer_at(2 * at), image_of_it = fresh ? 0 : integer_at(2 * at + 1);
-    for (int l = 0; l < LANES; ++l) {
-        const bool same = x == best[l] || (x != x && best[l] != best[l]);
-        const bool first = of[l] < source || (of[l] == source && code[l] < image_of_it);
-        if (!(best[l] > x || (best[l] != best[l] && x == x) || (same && first)))
-            continue;
-        x = best[l];
-        source = of[l];
-        image_of_it = code[l];
+    explicit Sums(const SumArguments& a)
+        : Walk({a.positions, a.queries, a.cutoff, a.scratch, a.n, a.m, a.own, a.table, a.closed, a.drop_self}),
+          own_values(a.own_values),
+          columns(a.columns),
+          term(a.shared_values),
+          results(a.sums, a.totals, a.errors, a.n) {
+        memset(column, 0, sizeof column);
+        memset(candidate, 0, sizeof candidate);
+        memset(doubtful, 0, sizeof doubtful);
     }
-    sums.data[at] = x;
-    put_integer(2 * at, source);
-    put_integer(2 * at + 1, image_of_it);
-};
-// --- part: copy
 
-            for (int c = 0; c < OTHERS; ++c)
-                pack(lanes_from(columns.data + (long long)c * n + from), column[c] + filled, near);
-// --- part: copy_step
-
-            {
-                const vec turns = lanes_from(columns.data + (long long)OTHERS * n + from);
+    void copied(int from, unsigned int near) {
+        for (int c = 0; c < OTHERS; ++c)
+            pack(lanes_from(columns + (long long)c * n + from), column[c] + filled, near);
+        if constexpr (STEPS > 0) {
+            const vec turns = lanes_from(columns + (long long)OTHERS * n + from);
+            for (int c = 0; c < STEPS; ++c) {
                 vec steps;
                 for (int l = 0; l < LANES; ++l)
-                    steps[l] = real(shift[$axis] - Lattice::turn(turns[l], $axis));
-                pack(steps, column[OTHERS + $c] + filled, near);
+                    steps[l] = real(shift[STEP_AXES[c]] - Lattice::turn(turns[l], STEP_AXES[c]));
+                pack(steps, column[OTHERS + c] + filled, near);
             }
-// --- part: no_sum
-
-            for (int r = 0; r < ROW_SUMS; ++r)
-                sums.data[(long long)id * ROW_SUMS + r] = 0;
-// --- part: no_extreme
-
-            for (int r = 0; r < ROW_SUMS; ++r)
-                put_integer(2 * ((long long)id * ROW_SUMS + r), n);
-// --- part: chunk_done
-
-    for (int t = 0; t < TOTALS; ++t) {
-        totals.data[(2ll * chunk) * TOTALS + t] = total[t];
-        totals.data[(2ll * chunk + 1) * TOTALS + t] = total_carried[t];
-        total[t] = total_carried[t] = 0;
-    }
-// --- part: in_place
-
-    for (int b = 0, v = 0; b < filled; b += LANES, ++v) {
-        const Points points = candidates_at(b);
-        const vec square = square_of(q, points.p);
-        const unsigned int hit = mask_of(square, inside, Below{});
-        unsure[v] = hit ^ mask_of(square, outside, BelowOrAt{});
-        $skip
-        const Math::flag real_lanes = lanes_of(hit);
-        $in_place
-    }
-    const int doubts = collect_doubtful(filled);
-    for (int b = 0; b < doubts; b += LANES) {
-        const Points points = doubtful_at(b);
-        $keep
-        const unsigned int hit = decided(q, id, points, doubtful + b, lanes_before(doubts - b));
-        $flush
-        const Math::flag real_lanes = lanes_of(hit);
-        $of_doubtful
-    }
-// --- part: packed
-
-    int held = 0;
-    for (int b = 0; b < filled; b += LANES) {
-        const Points points = candidates_at(b);
-        const unsigned int near = mask_of(square_of(q, points.p), outside, BelowOrAt{});
-        for (int k = 0; k < DIM; ++k)
-            pack(points.p[k], near_points[k] + held, near);
-        for (int c = 0; c < OTHERS + STEPS; ++c)
-            pack(*(const number*)(column[c] + b), near_column[c] + held, near);
-        if constexpr (PERIODIC || SUMS == 2)
-            pack(first_numbers + b, doubtful + held, near);
-        held += __builtin_popcount(near);
-    }
-    for (int b = 0; b < held; b += LANES) {
-        Points points;
-        for (int k = 0; k < DIM; ++k)
-            points.p[k] = *(const vec*)(near_points[k] + b);
-        const unsigned int there = lanes_before(held - b);
-        unsigned int hit = mask_of(square_of(q, points.p), inside, Below{}) & there;
-        if (const unsigned int open = there & ~hit) {
-            $keep
-            hit |= decided(q, id, points, doubtful + b, open);
-            $flush
         }
-        const Math::flag real_lanes = lanes_of(hit);
-        $of_packed
     }
+    void none(int id) { results.clear(id); }
+    void chunk_done(int chunk) { results.store_totals(chunk); }
+    void finish() {}
+
+    void meet(const real* q, int id, bool fresh, bool finished) {
+        const Term::Own own_part = term.own(own_values + (long long)id * OWN, q);
+        Reduction reduction(n);
+        if constexpr (PACKED)
+            meet_packed(q, id, own_part, reduction);
+        else
+            meet_in_place(q, id, own_part, reduction);
+        reduction.store(results, id, fresh, finished);
+    }
+    // Evaluates the term for vectors of candidates as they are, under a mask; those in doubt follow.
+    void meet_in_place(const real* q, int id, const Term::Own& own_part, Reduction& reduction) {
+        const real inside = this->inside, outside = this->outside;
+        const int filled = this->filled;
+        for (int b = 0, v = 0; b < filled; b += LANES, ++v) {
+            const Points points = candidates_at(b);
+            const vec square = square_of(q, points.p);
+            const unsigned int hit = mask_of(square, inside, Below{});
+            unsure[v] = hit ^ mask_of(square, outside, BelowOrAt{});
+            if (SKIPPED && hit == 0)
+                continue;
+            number summand[SUMMANDS];
+            term.evaluate(own_part, points.p, [&](int c) { return *(const number*)(column[c] + b); }, summand);
+            reduction.add(summand, flags_of(hit), [&](Math::i32& source, Math::i32& code) {
+                for (int l = 0; l < LANES; ++l)
+                    name(b + l, l, source, code);
+            });
+        }
+        const int doubts = collect_doubtful(filled);
+        for (int b = 0; b < doubts; b += LANES) {
+            const Points points = doubtful_at(b);
+            if constexpr (FLUSHED)
+                floats.keep();
+            const unsigned int hit = decided(q, id, points, doubtful + b, lanes_before(doubts - b));
+            if constexpr (FLUSHED)
+                floats.flush();
+            number summand[SUMMANDS];
+            term.evaluate(own_part, points.p, [&](int c) { return gathered(column[c], doubtful + b); }, summand);
+            reduction.add(summand, flags_of(hit), [&](Math::i32& source, Math::i32& code) {
+                for (int l = 0; l < LANES; ++l)
+                    name(doubtful[b + l], l, source, code);
+            });
+        }
+    }
+    // Packs what is near first, so that the term is evaluated for hardly more than the pairs.
+    void meet_packed(const real* q, int id, const Term::Own& own_part, Reduction& reduction) {
+        const real inside = this->inside, outside = this->outside;
+        const int filled = this->filled;
+        const ints numbers = first_numbers();
+        int held = 0;
+        for (int b = 0; b < filled; b += LANES) {
+            const Points points = candidates_at(b);
+            const unsigned int near = mask_of(square_of(q, points.p), outside, BelowOrAt{});
+            for (int k = 0; k < DIM; ++k)
+                pack(points.p[k], near_points[k] + held, near);
+            for (int c = 0; c < OTHERS + STEPS; ++c)
+                pack(*(const number*)(column[c] + b), near_column[c] + held, near);
+            if constexpr (PERIODIC || SUMS == 2)
+                pack(numbers + b, doubtful + held, near);
+            held += __builtin_popcount(near);
+        }
+        for (int b = 0; b < held; b += LANES) {
+            Points points;
+            for (int k = 0; k < DIM; ++k)
+                points.p[k] = *(const vec*)(near_points[k] + b);
+            const unsigned int there = lanes_before(held - b);
+            unsigned int hit = mask_of(square_of(q, points.p), inside, Below{}) & there;
+            if (const unsigned int open = there & ~hit) {
+                if constexpr (FLUSHED)
+                    floats.keep();
+                hit |= decided(q, id, points, doubtful + b, open);
+                if constexpr (FLUSHED)
+                    floats.flush();
+            }
+            number summand[SUMMANDS];
+            term.evaluate(own_part, points.p, [&](int c) { return *(const number*)(near_column[c] + b); }, summand);
+            reduction.add(summand, flags_of(hit), [&](Math::i32& source, Math::i32& code) {
+                for (int l = 0; l < LANES; ++l)
+                    name(doubtful[b + l], l, source, code);
+            });
+        }
+    }
+    // Names the candidate of a number in a lane.
+    void name(int number_of_it, int l, Math::i32& source, Math::i32& code) const {
+        source[l] = candidate_ids[number_of_it];
+        code[l] = PERIODIC && several ? candidate_images[number_of_it] : image;
+    }
+};

@@ -41,7 +41,7 @@ auto write_rows = [&](bool finished) {
         const int before = lane < group && ready > 0 ? written : capacity;
         __syncwarp();
         auto row_of = [&](int k) { return k + lane / 8; };
-        char* const column = (char*)(idx.data + lane % 8 * 4);
+        char* const column = (char*)(idx + lane % 8 * 4);
         const unsigned int row_bytes = 4u * (unsigned int)capacity;
         auto four_of = [&](int k) {
             const unsigned short* const from = (const unsigned short*)warp.lists[row_of(k)] + lane % 8 * 4;
@@ -99,16 +99,16 @@ auto write_rows = [&](bool finished) {
 
 if (LIST)
     for (int s = lane; s < capacity; s += 32)
-        idx.data[(long long)id * capacity + s] = fill_value;
+        idx[(long long)id * capacity + s] = fill_value;
 if (lane == 0)
-    count.data[id] = 0;
+    count[id] = 0;
 // --- part: row_done
 
 if (lane < group)
-    count.data[my_id] = found;
+    count[my_id] = found;
 const int longest_row = __reduce_max_sync(ALL, lane < group ? found : 0);
 if (lane == 0 && longest_row > longest_before) {
-    atomicMax(&info.data[0], longest_row);
+    atomicMax(&info[0], longest_row);
     if (LIST && longest_row > capacity)
-        atomicOr(&info.data[1], 1);
+        atomicOr(&info[1], 1);
 }

@@ -1,4 +1,11 @@
-// --- part: decide
+// Whether a particle and a triangle are closer than the cutoff; in 2D "triangles" are segments.
+//
+// `Shape::sure(p, corners, radius, scale)`: is the distance below the radius? 1: it is, 0: it is not, -1: float64 cannot tell.
+// `Shape::near(p, corners, radius, scale, room)` can, with integers of 24-bit limbs, only as many as a number needs. p [DIM],
+// corners [DIM][DIM]; room: ROOM ints, each STRIDE behind the last, so that threads beside each other use memory side by side. What
+// is decided, and why it is right, stands in jfrnn/_triangles/exact.py and jfrnn/_triangles/integers.py.
+#pragma once
+#include "space.h"
 
 struct Whole {  // an integer times a power of two: sum of limb(i) 2^(24 (low + i)), limbs in [-2^23, 2^23), the outermost not 0
     int* at;
@@ -101,7 +108,18 @@ struct Shape {
 
     // the last word: signs of polynomials in integers
     JFRNN_CALL bool surely_near(const real* p, const real* corners, real radius, int* room) {
-        ROOM_OF_NUMBERS
+        Room left{room};  // how many numbers in 3D and in 2D, and products of how many coordinates: see `_NUMBERS` in _triangles.py
+        const Wholes x = left.take(DIM == 3 ? 9 : 4, 1);
+        const Wholes along = left.take(DIM == 3 ? 3 : 2, 1);
+        const Wholes square = left.take(DIM == 3 ? 3 : 2, 2);
+        const Wholes limit = left.take(DIM == 3 ? 1 : 1, 2);
+        const Wholes side = left.take(DIM == 3 ? 9 : 0, 2);
+        const Wholes normal = left.take(DIM == 3 ? 3 : 0, 2);
+        const Wholes place = left.take(DIM == 3 ? 1 : 1, 3);
+        const Wholes length = left.take(DIM == 3 ? 1 : 1, 4);
+        const Wholes rest = left.take(DIM == 3 ? 1 : 1, 6);
+        const Wholes other = left.take(DIM == 3 ? 1 : 1, 6);
+        const Wholes spare = left.take(DIM == 3 ? 2 : 2, 6);
         const Whole none = spare[0];
         read(other[0], radius);
         multiply(limit[0], other[0], other[0]);

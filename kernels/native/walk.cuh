@@ -1,3 +1,10 @@
+// --- part: begin
+struct Query : $kind {
+    JFRNN_MEMBER explicit Query(const ${kind}Arguments& given) : $kind(given) {}
+    JFRNN_MEMBER void run() {
+// --- part: end
+    }
+};
 // --- part: walk
 
 constexpr bool HELD = LIST || SUMS;  // pairs are held until many can be written, or evaluated, together
@@ -55,7 +62,7 @@ auto load_image = [&](int id, real* p) {
         for (int k = 0; k < DIM; ++k)
             p[k] = here.p[k];
     } else
-        point_of(positions.data + (long long)ROW * source_of(id), p);
+        point_of(positions + (long long)ROW * source_of(id), p);
     if constexpr (!inside) {
         real moved[3];
         translate(image_of(id), moved);
@@ -96,10 +103,10 @@ __shared__ int finite_queries, longest_before;
 __shared__ real site, between;  // the unit of a lattice, and the square, in such units, between those of pairs and of others; or 0
 if (lane == 0) {
     site = SCALED ? real(0) : shared.unit;
-    between = site > 0 ? (real)square_between(site) : real(0);
+    between = site > 0 ? (real)square_between(radius, site, closed) : real(0);
     grid = shared.grid;
     finite_queries = shared.finite_queries;
-    longest_before = SUMS ? 0 : *(volatile int*)&info.data[0];
+    longest_before = SUMS ? 0 : *(volatile int*)&info[0];
 }
 __syncwarp();
 const unsigned int lanes_below = (1u << lane) - 1;
@@ -117,7 +124,7 @@ auto load_query = [&](int at) -> Place {
         return load(sorted + at);
     Place q;
     const int i = query_order[at];
-    point_of(queries.data + (long long)ROW * i, q.p);
+    point_of(queries + (long long)ROW * i, q.p);
     q.id = bits_as_real(i);
     return q;
 };
@@ -201,7 +208,7 @@ while (place < stop) {
     }
     unsigned int system = 0;
     if constexpr (BATCHED) {
-        system = beside ? system_of(queries.data + (long long)ROW * id_of(mine.id)) : 0;
+        system = beside ? system_of(queries + (long long)ROW * id_of(mine.id)) : 0;
         const unsigned int of_first = __shfl_sync(ALL, system, 0);
         beside = beside && system == of_first;
         system = of_first;
@@ -636,7 +643,7 @@ while (place < stop) {
                 }
                 near[k] = square <= box.center[3];
                 if (BATCHED && !grid.dense && near[k])
-                    near[k] = system_of(positions.data + (long long)ROW * source_named(id_of(candidates[k].id))) == system;
+                    near[k] = system_of(positions + (long long)ROW * source_named(id_of(candidates[k].id))) == system;
             }
 #pragma unroll
             for (int k = 0; k < FETCHED; ++k) {
@@ -716,10 +723,10 @@ while (place < stop) {
                     bool hit = over < 0;
                     if (over >= 0 && over <= 2 * band) {
                         if constexpr (inside)
-                            hit = exact_pair(query.p, p);
+                            hit = exact_pair(query.p, p, radius, 0, closed);
                         else {
-                            const real* source = positions.data + (long long)ROW * source_named(id);
-                            hit = exact_image(queries.data + (long long)ROW * my_id, source, image_of(id));
+                            const real* source = positions + (long long)ROW * source_named(id);
+                            hit = exact_image(lattice, queries + (long long)ROW * my_id, source, image_of(id), radius, 0, closed);
                         }
                     }
                     hits |= hit ? 1u << j : 0;

@@ -1,72 +1,26 @@
-// --- part: no_contraction
+// The lattice of a periodic box: its numbers stand behind the radius in the array `cutoff` (see jfrnn/kernels/_native.py).
+#pragma once
+#include "bits.h"
 
-#if !defined(__CUDA_ARCH__)
-#pragma clang fp contract(off)
-#endif
-// --- part: portable
-
-const real radius = cutoff.data[0];
-#if defined(__CUDA_ARCH__)
-#define JFRNN_FUNCTION static __device__ __forceinline__
-#define JFRNN_MEMBER __device__ __forceinline__
-#define JFRNN_CALL static __device__ __noinline__
-#else
-#define JFRNN_FUNCTION static
-#define JFRNN_MEMBER
-#define JFRNN_CALL static __attribute__((noinline))
-#endif
-constexpr int ROW = DIM + (PERIODIC ? 1 : 0) + BATCHED;  // numbers per particle
+constexpr int ROW = DIM + (PERIODIC ? 1 : 0) + BATCHED;         // numbers per particle
 constexpr int LATTICE_END = PERIODIC ? (SKEWED ? 47 : 29) : 1;  // numbers in `cutoff`, but for the last one of a batch
-struct Bits {  // of floats
-    enum { MANTISSA = DOUBLE ? 52 : 23, EXPONENTS = DOUBLE ? 0x7ff : 0xff, BIAS = DOUBLE ? 1023 : 127 };
-    JFRNN_FUNCTION unsigned long long of(real x) {
-        if constexpr (DOUBLE) {
-            unsigned long long b;
-            memcpy(&b, &x, 8);
-            return b;
-        } else {
-            unsigned int b;
-            memcpy(&b, &x, 4);
-            return b;
-        }
-    }
-    JFRNN_FUNCTION int exponent(real x) { return (int)(of(x) >> MANTISSA) & EXPONENTS; }
-    JFRNN_FUNCTION bool finite(real x) { return exponent(x) != EXPONENTS; }
-    JFRNN_FUNCTION bool negative(real x) { return of(x) >> (DOUBLE ? 63 : 31) & 1; }
-    JFRNN_FUNCTION real not_finite() {
-        const unsigned long long b = (unsigned long long)EXPONENTS << MANTISSA;
-        real x;
-        memcpy(&x, &b, sizeof(real));
-        return x;
-    }
-    JFRNN_FUNCTION double power_of_two(int e) {
-        const unsigned long long b = (unsigned long long)(e + 1023) << 52;
-        double x;
-        memcpy(&x, &b, 8);
-        return x;
-    }
-    // power of two that brings r into [1, 4) and is itself a normal float
-    JFRNN_FUNCTION double unit_scale(real r) {
-        const int e = exponent(r) - BIAS, largest = BIAS - 1;
-        return power_of_two(e > largest ? -largest : -e);
-    }
-};
-auto finite_point = [](const real* p) {
-    bool finite = true;
-    for (int k = 0; k < DIM; ++k)
-        finite = finite && Bits::finite(p[k]);
-    return finite;
-};
-auto unsigned_of = [](real x) -> unsigned int {
-    unsigned int bits;
-    if constexpr (DOUBLE) bits = (unsigned int)x;
-    else memcpy(&bits, &x, 4);
-    return bits;
-};
-auto system_of = [&](const real* row) -> unsigned int { return BATCHED ? unsigned_of(row[ROW - 1]) : 0u; };
+
 struct Lattice {
     enum { NONE = 512 | 512 << 10 | (DIM == 3 ? 512 << 20 : 0) };  // packed turns of what lies in the cell
+#if defined(__CUDACC__)
     const real* numbers;
+    JFRNN_MEMBER explicit Lattice(const real* cutoff) : numbers(cutoff) {}
+    JFRNN_MEMBER Lattice() : numbers(nullptr) {}
+    typedef Lattice Argument;
+#else
+    real numbers[LATTICE_END];  // copies of the caller's: no store of the kernel can change them, which spares the compiler loads
+    explicit Lattice(const real* cutoff) {
+        for (int k = 0; PERIODIC && k < LATTICE_END; ++k)
+            numbers[k] = cutoff[k];
+    }
+    Lattice() {}
+    typedef const Lattice& Argument;
+#endif
     JFRNN_MEMBER real vector(int l, int k) const { return numbers[1 + 3 * l + k]; }
     // the vectors that the caller gave, in which pairs are decided, and how many of each there are in vector l
     JFRNN_MEMBER real given(int l, int k) const { return numbers[(SKEWED ? 29 : 1) + 3 * l + k]; }
@@ -80,12 +34,16 @@ struct Lattice {
     // uncontracted, so that a coordinate is the same wherever it is computed
 #if defined(__CUDA_ARCH__)
     JFRNN_FUNCTION real add(real a, real b) {
-        if constexpr (DOUBLE) return __dadd_rn(a, b);
-        else return __fadd_rn(a, b);
+        if constexpr (DOUBLE)
+            return __dadd_rn(a, b);
+        else
+            return __fadd_rn(a, b);
     }
     JFRNN_FUNCTION real mul(real a, real b) {
-        if constexpr (DOUBLE) return __dmul_rn(a, b);
-        else return __fmul_rn(a, b);
+        if constexpr (DOUBLE)
+            return __dmul_rn(a, b);
+        else
+            return __fmul_rn(a, b);
     }
 #else
     JFRNN_FUNCTION real add(real a, real b) { return a + b; }
@@ -94,8 +52,10 @@ struct Lattice {
     // turns of a row: how many lattice vectors lie between the cell and the particle
     JFRNN_FUNCTION int packed_turns(real last) {
         int packed;
-        if constexpr (DOUBLE) packed = (int)last;
-        else memcpy(&packed, &last, 4);
+        if constexpr (DOUBLE)
+            packed = (int)last;
+        else
+            memcpy(&packed, &last, 4);
         return packed;
     }
     JFRNN_FUNCTION int turn(real last, int axis) { return ((packed_turns(last) >> (10 * axis)) & 1023) - 512; }
@@ -109,7 +69,9 @@ struct Lattice {
     }
     // a row of positions brought into the cell; one that is too far away for that is not finite
     JFRNN_MEMBER void wrap(const real* numbers, real* p) const {
-        struct alignas(ROW % 4 ? sizeof(real) : 16) Row { real numbers[ROW]; };  // loaded at once, if it can be
+        struct alignas(ROW % 4 ? sizeof(real) : 16) Row {
+            real numbers[ROW];
+        };  // loaded at once, if it can be
         const Row loaded = *(const Row*)numbers;
         const real* row = loaded.numbers;
         if (packed_turns(row[DIM]) == NONE) {  // as nearly everywhere
@@ -134,28 +96,5 @@ struct Lattice {
         if (!periodic(axis))
             return sum;
         return sum < 0 ? real(0) : sum > 1 ? real(1) : sum;
-    }
-};
-#if defined(__CUDA_ARCH__)
-const Lattice lattice{cutoff.data};
-#else
-real numbers[LATTICE_END];  // not the caller's: nothing that is written may change them
-for (int k = 0; PERIODIC && k < LATTICE_END; ++k)
-    numbers[k] = cutoff.data[k];
-const Lattice lattice{numbers};
-#endif
-// the point of a row of positions, wrapped where space is periodic
-auto point_of = [&](const real* row, real* p) {
-    if constexpr (PERIODIC)
-        lattice.wrap(row, p);
-    else
-        for (int k = 0; k < DIM; ++k)
-            p[k] = row[k];
-};
-// the bounding box [low, high] grows to hold the box [l, h]
-auto widen = [](real* low, real* high, const real* l, const real* h) {
-    for (int k = 0; k < DIM; ++k) {
-        low[k] = l[k] < low[k] ? l[k] : low[k];
-        high[k] = h[k] > high[k] ? h[k] : high[k];
     }
 };

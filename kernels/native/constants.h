@@ -1,0 +1,36 @@
+// Constants of a kernel, as an example: `jfrnn.kernels._native.program` puts those of each variant in place of this file.
+#pragma once
+
+using real = float;  // of positions
+using whole = int;   // as wide as `real`
+constexpr bool DOUBLE = false;
+constexpr int DIM = 3;
+constexpr int PERIODIC = 0;            // 1: a pair has one image at most, 2: images are told apart
+constexpr bool SKEWED = false;         // vectors of the lattice do not lie along the axes
+constexpr int SHIFTED = 0;             // PERIODIC where images of points are decided, 0 where all points are decided as they are
+constexpr bool BATCHED = false;        // rows of positions end with the number of a system
+constexpr bool SUM = false;            // cutoffs of pairs are sums of two numbers
+constexpr bool SCALED = false;         // the cutoff is so small or so large that squares need a unit
+constexpr int REACH = 1, REACH_X = 2;  // cells per cutoff along y and z, and along x
+constexpr int CHUNK = 2048;            // places that a thread takes at a time
+constexpr int MANY = 1 << 15;          // sources from which several threads gather their coordinates
+constexpr int CANDIDATES = 1024;       // that are held at a time, a multiple of 64
+constexpr bool LIST = true;            // ids of neighbors are written, they are not only counted
+constexpr int SUMS = 0;                // 1: summands are added up, 2: the largest ones are found
+constexpr bool ONE_BY_ONE = false;     // candidates are met one by one
+// Of a term that is summed: columns of numbers of j and of lattice steps, numbers of i, sums over all pairs and of each i.
+constexpr int OTHERS = 1, STEPS = 0, OWN = 0, TOTALS = 1, ROW_SUMS = 1;
+constexpr bool COMPENSATED = true;  // sums are carried in twice the precision
+constexpr bool PACKED = false;   // what is near comes together first, so that the term is evaluated for hardly more than the pairs
+constexpr bool SKIPPED = false;  // the term is not evaluated for vectors without a pair
+// Of CUDA: what a search allocates, and how it is launched (see jfrnn/kernels/cells_cuda.py).
+constexpr int PARTS = 256, PART = 10, TILE = 2048, BLOCK = 256, WARPS = 4224;
+constexpr bool LATER = false;     // only those neighbors that come after the query
+constexpr bool CROSSING = false;  // queries whose reach leaves a periodic box
+// Of searches with a cutoff per particle (see jfrnn/kernels/levels.py).
+constexpr int RULE = 0, GROUPS = 8, HALVINGS = 5, PADDING = 16;
+// Of triangles (see jfrnn/kernels/_triangles.py, triangles_cpu.py and triangles_cuda.py).
+constexpr int LIMBS = 14, ROOM = 1202, STRIDE = 1;
+constexpr int MOST_CELLS = 8, MOST_ALONG = 64, MOST_ALONG_LOG2 = 6;
+constexpr int NODE = 16, PENDING = 106, WAITING = 16, THREADS = 128, RUN = 64, HEADER = 16;
+constexpr bool TREE = false;  // boxes stand in a tree, not in cells

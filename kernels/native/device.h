@@ -1,0 +1,15 @@
+// What functions are for each compiler: Clang on the CPU, NVRTC or nvcc on CUDA.
+#pragma once
+
+#if defined(__CUDACC__)
+#define JFRNN_FUNCTION static __device__ __forceinline__
+#define JFRNN_MEMBER __device__ __forceinline__
+#define JFRNN_INLINE JFRNN_MEMBER
+#define JFRNN_CALL static __device__ __noinline__
+#else
+#pragma clang fp contract(off)
+#define JFRNN_FUNCTION static
+#define JFRNN_MEMBER
+#define JFRNN_INLINE __attribute__((always_inline))
+#define JFRNN_CALL static __attribute__((noinline))
+#endif

@@ -1,0 +1,12 @@
+// How many numbers stand side by side: as many as a register of the CPU holds, 16 where queries meet candidates one by one, 1 on CUDA.
+#pragma once
+#include "constants.h"
+#include "device.h"
+
+#if defined(__CUDACC__)
+constexpr int LANES = 1;
+#elif defined(__AVX512F__) && defined(__AVX512VL__)
+constexpr int LANES = ONE_BY_ONE || !DOUBLE ? 16 : 8;
+#else
+constexpr int LANES = ONE_BY_ONE ? 16 : DOUBLE ? 4 : 8;
+#endif

@@ -1,0 +1,80 @@
+// Vectors of Clang: as many numbers side by side as a register of the CPU holds.
+#pragma once
+#include "lane_count.h"
+
+typedef real vec __attribute__((vector_size(LANES * sizeof(real))));
+typedef int ints __attribute__((vector_size(LANES * 4)));
+typedef bool flags __attribute__((ext_vector_type(LANES)));
+
+struct Below {
+    enum { value = 17 };
+};
+struct BelowOrAt {
+    enum { value = 18 };
+};
+// One bit per lane: is it below a bound, or at it?
+template <class Comparison>
+static unsigned int mask_of(vec a, real bound, Comparison) {
+#if defined(__AVX512F__) && defined(__AVX512VL__)
+    typedef float floats __attribute__((vector_size(64)));
+    typedef double doubles __attribute__((vector_size(64)));
+    const vec bounds = vec{} + bound;
+    if constexpr (DOUBLE)
+        return (unsigned char)__builtin_ia32_cmppd512_mask((doubles)a, (doubles)bounds, Comparison::value, -1, 4);
+    else
+        return (unsigned short)__builtin_ia32_cmpps512_mask((floats)a, (floats)bounds, Comparison::value, -1, 4);
+#else
+    const auto lanes = Comparison::value == 18 ? a <= bound : a < bound;
+    const flags f = __builtin_convertvector(lanes, flags);
+    unsigned char bits;
+    __builtin_memcpy(&bits, &f, 1);
+    return LANES == 4 ? bits & 15 : bits;
+#endif
+}
+// One bit per lane of flags.
+static unsigned int bits_of_flags(flags f) {
+    unsigned short bits = 0;
+    __builtin_memcpy(&bits, &f, LANES == 16 ? 2 : 1);
+    return bits & ((1u << LANES) - 1);
+}
+static unsigned int lanes_before(int count) { return count < LANES ? (1u << count) - 1 : (1u << LANES) - 1; }
+
+// Stores the lanes of a mask one after the other; up to LANES elements at `to` are overwritten.
+template <class Vector, class Element>
+static void pack(Vector from, Element* to, unsigned int mask) {
+#if defined(__AVX512F__) && defined(__AVX512VL__)
+    typedef int ints8 __attribute__((vector_size(32)));
+    typedef int ints16 __attribute__((vector_size(64)));
+    typedef double doubles8 __attribute__((vector_size(64)));
+    if constexpr (sizeof(Element) == 8)
+        from = (Vector)__builtin_ia32_compressdf512_mask((doubles8)from, doubles8{}, mask);
+    else if constexpr (LANES == 8)
+        from = (Vector)__builtin_ia32_compresssi256_mask((ints8)from, ints8{}, mask);
+    else
+        from = (Vector)__builtin_ia32_compresssi512_mask((ints16)from, ints16{}, mask);
+    __builtin_memcpy(to, &from, sizeof from);
+#else
+    for (; mask; mask &= mask - 1)
+        *to++ = from[__builtin_ctz(mask)];
+#endif
+}
+// What `from` holds at the places `numbers`; the processor's instructions that gather take longer.
+static vec gathered(const real* from, const int* numbers) {
+    vec lanes;
+    for (int l = 0; l < LANES; ++l)
+        lanes[l] = from[numbers[l]];
+    return lanes;
+}
+// A vector of numbers from anywhere.
+template <class Element>
+static auto lanes_from(const Element* from) {
+    Element __attribute__((vector_size(LANES * sizeof(Element)))) lanes;
+    __builtin_memcpy(&lanes, from, sizeof lanes);
+    return lanes;
+}
+static ints first_numbers() {
+    ints numbers;
+    for (int l = 0; l < LANES; ++l)
+        numbers[l] = l;
+    return numbers;
+}

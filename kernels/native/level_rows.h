@@ -1,0 +1,43 @@
+// Rows of neighbors, or their counts, where cutoffs differ from particle to particle.
+#pragma once
+#include "levels.h"
+
+struct LevelRowArguments {
+    const real *positions, *queries, *axes, *radii;
+    const int *ids, *keys, *top, *table, *header;
+    const real *cutoff, *query_axes, *query_radii;
+    const int *query_ids, *query_top, *places;
+    int *idx, *count, *info;
+    int n, m, capacity, own_queries, closed, drop_self, later_only;
+};
+struct LevelRows : Levels<LevelRows> {
+    int *idx, *counts;
+    int capacity;
+    struct State {
+        int* row;
+        int found;  // neighbors
+    };
+
+    JFRNN_INLINE explicit LevelRows(const LevelRowArguments& a)
+        : Levels({a.positions, a.queries, a.axes, a.radii, a.ids, a.keys, a.top, a.table, a.header, a.cutoff, a.query_axes,
+              a.query_radii, a.query_ids, a.query_top, a.places, a.info, a.n, a.m, a.own_queries, a.closed, a.drop_self,
+              a.later_only}),
+          idx(a.idx),
+          counts(a.count),
+          capacity(a.capacity) {}
+
+    JFRNN_INLINE State begin_query(const One& one) { return State{idx + (long long)one.id * capacity, 0}; }
+    JFRNN_INLINE void pair(State& state, const One&, int other, int, int image) {
+        if (LIST && state.found < capacity)
+            state.row[state.found] = PERIODIC == 2 ? other + n * image : other;
+        ++state.found;
+    }
+    JFRNN_INLINE void end_query(const State& state, const One& one) {
+        if constexpr (LIST)
+            for (int s = state.found; s < capacity; ++s)
+                state.row[s] = fill_value;
+        counts[one.id] = state.found;
+        longest = state.found > longest ? state.found : longest;
+    }
+    JFRNN_INLINE void chunk_done(int) {}
+};

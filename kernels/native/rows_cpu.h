@@ -1,0 +1,87 @@
+// Rows of neighbors, or their counts, on the CPU.
+#pragma once
+#include "walk_cpu.h"
+
+typedef int eight_ints __attribute__((vector_size(32)));
+
+struct RowArguments {
+    const real *positions, *queries, *cutoff;
+    int *idx, *count, *info, *scratch;
+    int n, m, own, table, capacity, closed, drop_self, later_only;
+};
+
+struct Rows : Walk<Rows> {
+    static constexpr bool FLUSHED = false;
+    int *idx, *counts, *info;
+    int capacity, later_only;
+    int longest;
+    int fill_value;
+
+    explicit Rows(const RowArguments& a)
+        : Walk({a.positions, a.queries, a.cutoff, a.scratch, a.n, a.m, a.own, a.table, a.closed, a.drop_self}),
+          idx(a.idx),
+          counts(a.count),
+          info(a.info),
+          capacity(a.capacity),
+          later_only(a.later_only),
+          longest(0) {
+        int codes = 1;  // of images
+        for (int k = 0; PERIODIC == 2 && k < DIM; ++k)
+            codes *= 2 * lattice.images(k) + 1;
+        fill_value = n * codes;
+    }
+
+    void meet(const real* q, int id, bool fresh, bool finished) {
+        const int hits = later_only ? scan<true>(q, id, filled) : scan<false>(q, id, filled);
+        const int before = fresh ? 0 : counts[id];
+        if constexpr (LIST)
+            write_row(id, before, hits, finished);
+        counts[id] = before + hits;
+        longest = before + hits > longest ? before + hits : longest;
+    }
+    void none(int id) {
+        counts[id] = 0;
+        if constexpr (LIST)
+            write_row(id, 0, 0, true);
+    }
+    void copied(int, unsigned int) {}
+    void chunk_done(int) {}
+    void finish() {
+        int known = __atomic_load_n(&info[0], __ATOMIC_RELAXED);
+        while (
+            known < longest && !__atomic_compare_exchange_n(&info[0], &known, longest, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
+        if (LIST && longest > capacity)
+            __atomic_fetch_or(&info[1], 1, __ATOMIC_RELAXED);
+    }
+
+    // Writes `hits` ids from `row` into the slots of a row from `from` on, and behind the last ones the fill value.
+    void write_row(int id, int from, int hits, bool last) {
+        int* out = idx + (long long)id * capacity;
+        const int stop = from + hits < capacity ? from + hits : capacity;
+        if (from == 0 && last && (capacity & 7) == 0 && ((unsigned long long)idx & 31) == 0) {
+            write_whole_row(out, stop);
+            return;
+        }
+        for (int s = from; s < stop; ++s)
+            out[s] = row[s - from];
+        if (last)
+            for (int s = stop; s < capacity; ++s)
+                out[s] = fill_value;
+    }
+    // Writes a row eight slots at a time, past the caches.
+    void write_whole_row(int* out, int stop) {
+        const eight_ints filled_up = eight_ints{} + fill_value;
+        int s = 0;
+        for (; s + 8 <= stop; s += 8)
+            __builtin_nontemporal_store(*(const eight_ints*)(row + s), (eight_ints*)(out + s));
+        if (s < stop) {
+            eight_ints mixed = *(const eight_ints*)(row + s);
+            for (int e = 0; e < 8; ++e)
+                mixed[e] = s + e < stop ? mixed[e] : fill_value;
+            __builtin_nontemporal_store(mixed, (eight_ints*)(out + s));
+            s += 8;
+        }
+        for (; s < capacity; s += 8)
+            __builtin_nontemporal_store(filled_up, (eight_ints*)(out + s));
+    }
+};

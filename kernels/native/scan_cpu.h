@@ -1,0 +1,151 @@
+// Candidates of the queries of a cell, copied side by side into the first-level cache, and which of them are pairs of a query.
+#pragma once
+#include "cells_cpu.h"
+#include "wide.h"
+
+struct SearchArguments {
+    const real *positions, *queries, *cutoff;
+    int* scratch;
+    int n, m, own, table, closed, drop_self;
+};
+struct Points {
+    vec p[3];
+};
+
+struct Scan : SearchArguments, Cells, Scratch {
+    const Wide wide;
+    real inside, outside;  // squares of distances below are surely those of pairs, squares beyond surely not
+    int image;             // that candidates are copied from, its code
+    bool several;          // images among them: each says which one it is of
+    alignas(64) real candidate[3][CANDIDATES + LANES];
+    alignas(64) int candidate_ids[CANDIDATES + LANES];
+    alignas(64) int row[CANDIDATES + LANES];                                  // ids of pairs
+    alignas(64) unsigned short unsure[CANDIDATES / LANES + LANES];            // one bit per candidate that step 1 leaves open
+    alignas(64) int doubtful[CANDIDATES + LANES];                             // their numbers
+    alignas(64) int vectors_in_doubt[CANDIDATES / LANES + LANES];             // numbers of the vectors that have any
+    alignas(64) int candidate_images[PERIODIC ? CANDIDATES + LANES : 1];      // their codes
+    alignas(64) int candidate_order[PERIODIC == 2 ? CANDIDATES + LANES : 1];  // by source, then by image: behind, at home, ahead
+
+    explicit Scan(const SearchArguments& given)
+        : SearchArguments(given),
+          Cells(given.cutoff),
+          Scratch(given.scratch, given.n, given.m, given.own, given.table),
+          wide(radius, given.closed),
+          image(0),
+          several(false) {
+        const real off = PERIODIC ? 2 * lattice.slack() * step_scale : real(0);  // by which distances of images may be wrong
+        const real inner = step_radius > off ? step_radius - off : real(0), outer = step_radius + off;
+        // 7 roundings of eps/2, 5 in a square and 2 in a bound (jfrnn/_geometry/exact.py); images are farther off
+        const real band = (PERIODIC ? 8 * (1 + PERIODIC) : 4) * step_eps, unit = shared.unit;
+        const real between = !SCALED && unit > 0 ? real(square_between(radius, unit, closed)) * unit * unit : real(0);
+        inside = between > 0 ? between : inner * inner * (1 - band);
+        outside = between > 0 ? between : outer * outer * (1 + band);
+    }
+
+    // Candidates whose id is above the query's, or its own id where a particle is its own neighbor.
+    unsigned int later_mask(int b, int own_id) const {
+        const ints ids = *(const ints*)((PERIODIC == 2 ? candidate_order : candidate_ids) + b);
+        const int first = PERIODIC == 2 ? 3 * own_id + 1 + drop_self : own_id + drop_self;
+        return bits_of_flags(__builtin_convertvector(ids >= first, flags));
+    }
+    Points candidates_at(int b) const {
+        Points points;
+        for (int k = 0; k < DIM; ++k)
+            points.p[k] = *(const vec*)(candidate[k] + b);
+        return points;
+    }
+    Points doubtful_at(int b) const {
+        Points points;
+        for (int k = 0; k < DIM; ++k)
+            points.p[k] = gathered(candidate[k], doubtful + b);
+        return points;
+    }
+    // Squares of the distances of points in lanes.
+    vec square_of(const real* q, const vec* p) const {
+        vec square;
+        for (int k = 0; k < DIM; ++k) {
+            vec d = p[k] - q[k];
+            if constexpr (SCALED)
+                d *= step_scale;
+#if defined(__FMA__)
+            if constexpr (SUMS)  // as a term computes it, too
+                square = k == 0 ? d * d : square + d * d;
+            else
+                square = k == 0 ? d * d : __builtin_elementwise_fma(d, d, square);
+#else
+            square = k == 0 ? d * d : square + d * d;
+#endif
+        }
+        return square;
+    }
+
+    // Is a candidate a pair, given where it is and its number?
+    bool exactly_decided(const real* q, int own_id, const real* p, int number) const {
+        if constexpr (PERIODIC) {
+            const int source = PERIODIC == 2 && !SUMS ? candidate_ids[number] % n : candidate_ids[number];
+            const real* there = positions + (long long)ROW * source;
+            const int code = several ? candidate_images[number] : image;
+            return exact_image(lattice, queries + (long long)ROW * own_id, there, code, radius, 0, closed);
+        }
+        return exact_pair(q, p, radius, 0, closed);
+    }
+    // Which of the points in lanes, of which some are `open`, are pairs; `numbers` are theirs among the candidates.
+    unsigned int decided(const real* q, int own_id, const Points& points, const int* numbers, unsigned int open) const {
+        unsigned int pairs = PERIODIC ? 0 : wide.decided(q, points.p, open);
+        for (; open; open &= open - 1) {
+            const int lane = __builtin_ctz(open);
+            real p[3];
+            for (int k = 0; k < DIM; ++k)
+                p[k] = points.p[k][lane];
+            pairs |= exactly_decided(q, own_id, p, numbers[lane]) ? 1u << lane : 0;
+        }
+        return pairs;
+    }
+    // Collects the numbers of what is unsure among `count` candidates in `doubtful`, and returns how many there are. Loops are of
+    // known length: what would be a branch per vector is hard to predict.
+    int collect_doubtful(int count) {
+        const ints numbers = first_numbers();
+        const int vectors = (count + LANES - 1) / LANES;
+        for (int e = vectors; e < vectors + LANES; ++e)
+            unsure[e] = 0;
+        int chosen = 0, doubts = 0;
+        for (int v = 0; v < vectors; v += LANES) {
+            typedef unsigned short shorts __attribute__((vector_size(2 * LANES)));
+            const shorts masks = *(const shorts*)(unsure + v);
+            const unsigned int bits = bits_of_flags(__builtin_convertvector(masks != 0, flags));
+            pack(numbers + v, vectors_in_doubt + chosen, bits);
+            chosen += __builtin_popcount(bits);
+        }
+        for (int k = 0; k < chosen; ++k) {
+            const int v = vectors_in_doubt[k];
+            pack(numbers + v * LANES, doubtful + doubts, unsure[v]);
+            doubts += __builtin_popcount(unsure[v]);
+        }
+        for (int e = 0; e < LANES; ++e)
+            doubtful[doubts + e] = 0;
+        return doubts;
+    }
+    // Counts which of `count` candidates are pairs of a query; LIST: leaves their ids in `row`. ONLY_LATER: those alone that come
+    // after the query. It takes a load, a difference, a product and a comparison per axis or candidate, LANES at a time.
+    template <bool ONLY_LATER>
+    int scan(const real* q, int own_id, int count) {
+        const real inside = this->inside, outside = this->outside;  // stays in registers, whatever is stored
+        int hits = 0;
+        for (int b = 0, v = 0; b < count; b += LANES, ++v) {
+            const vec square = square_of(q, candidates_at(b).p);
+            const unsigned int allowed = ONLY_LATER ? later_mask(b, own_id) : ~0u;
+            const unsigned int hit = mask_of(square, inside, Below{}) & allowed;
+            unsure[v] = hit ^ (mask_of(square, outside, BelowOrAt{}) & allowed);
+            if constexpr (LIST)
+                pack(*(const ints*)(candidate_ids + b), row + hits, hit);
+            hits += __builtin_popcount(hit);
+        }
+        const int doubts = collect_doubtful(count);
+        for (int b = 0; b < doubts; b += LANES) {
+            unsigned int pairs = decided(q, own_id, doubtful_at(b), doubtful + b, lanes_before(doubts - b));
+            for (; pairs; pairs &= pairs - 1)
+                row[hits++] = candidate_ids[doubtful[b + __builtin_ctz(pairs)]];
+        }
+        return hits;
+    }
+};

@@ -1,0 +1,23 @@
+// Puts values of the sources into the order of cells, a column each, on the CPU: threads hand themselves chunks of places.
+#pragma once
+#include "cells_cpu.h"
+
+struct SortValues {
+    const real *others, *cutoff;
+    real* columns;
+    int* scratch;
+    int n, m, own, table, width;
+
+    void run() {
+        const Scratch in(scratch, n, m, own, table);
+        for (;;) {
+            const int chunk = __atomic_fetch_add(&in.shared.next_sorted, 1, __ATOMIC_RELAXED);
+            if ((long long)chunk * CHUNK >= n)
+                break;
+            const int begin = chunk * CHUNK, end = n - begin < CHUNK ? n : begin + CHUNK;
+            for (int place = begin; place < end; ++place)
+                for (int c = 0; c < width; ++c)
+                    columns[(long long)c * n + place] = others[(long long)width * in.ids[place] + c];
+        }
+    }
+};

@@ -1,0 +1,23 @@
+// A term of pairs, as an example: `jfrnn.kernels.pair_sum_cpu` puts what a user's function becomes in place of this file.
+#pragma once
+#include "lattice.h"
+#include "math.h"
+
+typedef Math::f32 number;
+// Is a summand added up over all pairs, or over the neighbors of each i? And which one of these sums is it?
+constexpr bool IS_TOTAL[] = {true, false};
+constexpr int PLACE[] = {0, 0};
+constexpr int STEP_AXES[] = {0};
+
+struct Term {
+    struct Own {};  // what is read of i
+    explicit Term(const real*) {}
+    Own own(const real*, const real*) const { return {}; }
+    // The summands of pairs: of i, of those j whose coordinates are `p` and whose numbers are `column(c)`.
+    template <class Column>
+    void evaluate(const Own&, const number* p, Column column, number* summand) const {
+        const auto v = p[0] * column(0);
+        summand[0] = v;
+        summand[1] = v * v;
+    }
+};
