@@ -56,6 +56,7 @@ lint: $(STAMP)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/pyright
+	$(VENV)/bin/clang-format --dry-run -Werror kernels/native/*
 
 clean:
 	rm -rf $(VENV) out build *.egg-info

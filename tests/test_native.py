@@ -1,0 +1,104 @@
+"""Headers of `kernels/native` compile by themselves, and structures that mirror XLA's C interface are those of its header."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import jax
+import pytest
+import warp as wp
+from jfrnn.kernels import _math
+from jfrnn.kernels._native import add_program
+from jfrnn.kernels._text import resolve
+
+from jfrnn._engine import ffi
+
+NATIVE = Path(__file__).parents[1] / "kernels" / "native"
+WHOLE = sorted(path.name for path in NATIVE.iterdir() if "// --- part:" not in path.read_text())  # others hold pieces of programs
+
+
+def is_cpu_only(header):
+    """Tell headers with Clang's vectors, or with calls of the CPU alone; where cutoffs differ, one text has both."""
+    if header in ("levels.h", "level_rows.h", "winding.h"):
+        return False
+    text = resolve(header, given={"math.h": ""})
+    words = ("vector_size", "__builtin_prefetch", "__atomic_fetch_add", "_cpu.h", "level_sums", "__builtin_sqrt")
+    return any(word in text or word in header for word in words) and not header.endswith(".cuh")
+
+
+def headers(cuda):
+    found = [name for name in WHOLE if (name.endswith(".h") or cuda) and not (cuda and is_cpu_only(name))]
+    return [name for name in found if not (cuda and name in ("term.h", "level_sums.h"))]
+
+
+def text_of(header, cuda):
+    given = {"math.h": '#include "lane_count.h"\n' + (_math.SCALAR if cuda else _math.VECTOR)}
+    return resolve(header, given=given)
+
+
+@pytest.mark.filterwarnings("ignore:compile_aot_module")
+@pytest.mark.parametrize("cuda", [False, True], ids=["cpu", "cuda"])
+def test_headers_compile_by_themselves(cuda, tmp_path):
+    module = wp.get_module(f"tests.headers.{'cuda' if cuda else 'cpu'}")
+    spaces = {add_program(module, f"// {name}\n{text_of(name, cuda)}") for name in headers(cuda)}
+    assert len(spaces) == len(headers(cuda)) >= 15
+
+    def nothing(x: wp.array(dtype=float)): ...
+
+    wp.kernel(nothing, module=module)
+    options = {"arch": 90, "use_ptx": True} if cuda else {"device": "cpu"}
+    wp.compile_aot_module(module, module_dir=tmp_path, **options)
+    assert list(tmp_path.glob("*.ptx" if cuda else "*.o"))
+
+
+def test_nvcc_compiles_headers(tmp_path):
+    nvcc = shutil.which("nvcc")
+    if nvcc is None:
+        pytest.skip("no nvcc")
+    pieces = [f"namespace space_{k} {{\n{text_of(name, True)}\n}}\n" for k, name in enumerate(headers(cuda=True))]
+    source = tmp_path / "headers.cu"
+    source.write_text("#include <cuda_fp16.h>\n" + "".join(pieces))
+    done = subprocess.run(
+        [nvcc, "-ptx", "-std=c++17", "-arch=sm_90", "-o", tmp_path / "x.ptx", source], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[:2000]
+
+
+MIRRORED = {
+    ffi._Version: ("XLA_FFI_Api_Version", {"major": "major_version", "minor": "minor_version", "extension": "extension_start"}),
+    ffi.Extension: ("XLA_FFI_Extension_Base", {"metadata": None}),
+    ffi.Buffer: ("XLA_FFI_Buffer", {"extension": "extension_start"}),
+    ffi.Text: ("XLA_FFI_ByteSpan", {"start": "ptr", "size": "len"}),
+    ffi.CallFrame: (
+        "XLA_FFI_CallFrame",
+        {"extension": "extension_start", "context": "ctx", "inputs": "args", "outputs": "rets", "attributes": "attrs"},
+    ),
+    ffi.Api: (
+        "XLA_FFI_Api",
+        {"extension": "extension_start", "version": "api_version", "internal": "internal_api", "others": None, "more": None}
+        | {"fail": "XLA_FFI_Error_Create", "get_stream": "XLA_FFI_Stream_Get", "get_device": "XLA_FFI_DeviceOrdinal_Get"},
+    ),
+}
+
+
+def test_structures_are_those_of_xla(tmp_path):
+    """Places and sizes of what is read, as a C compiler lays out the header that JAX ships."""
+    compiler = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
+    if compiler is None:
+        pytest.skip("no C compiler")
+    lines, expected = [], []
+    for structure, (name, renamed) in MIRRORED.items():
+        for field, *_ in structure._fields_:
+            there = renamed.get(field, field)
+            if there is not None:
+                lines.append(f'printf("%zu\\n", offsetof({name}, {there}));')
+                expected.append((name, field, getattr(structure, field).offset))
+    source = tmp_path / "offsets.c"
+    body = "\n".join(lines)
+    source.write_text(
+        f'#include <stddef.h>\n#include <stdio.h>\n#include "xla/ffi/api/c_api.h"\nint main() {{\n{body}\nreturn 0;\n}}\n'
+    )
+    command = [compiler, f"-I{jax.ffi.include_dir()}", "-o", tmp_path / "offsets", source]
+    subprocess.run(command, check=True, capture_output=True)
+    found = subprocess.run([tmp_path / "offsets"], check=True, capture_output=True, text=True).stdout.split()
+    assert [(name, field, int(at)) for (name, field, _), at in zip(expected, found)] == expected
