@@ -24,7 +24,7 @@ from jfrnn._engine import (
     fastest_engine,
     list_rows,
 )
-from jfrnn._geometry import Cutoff, checked_capacity, checked_cutoff, checked_kind, checked_size, checked_skin
+from jfrnn._geometry import Cutoff, check_capacity, check_cutoff, check_kind, check_size, check_skin
 from jfrnn._sums import pair_sum
 from jfrnn._triangles import TRIANGLE_BACKENDS, TRIANGLE_ENGINES, fastest_of, find_triangles
 
@@ -132,15 +132,15 @@ def memory_plan(
       scratch      44.03 MB
       total       304.03 MB
     """
-    n, queries = checked_size("n", n), None if queries is None else checked_size("queries", queries)
-    dim, dtype = checked_kind(dim, dtype)
-    radius = checked_cutoff(cutoff, dtype)
+    n, queries = check_size("n", n), None if queries is None else check_size("queries", queries)
+    dim, dtype = check_kind(dim, dtype)
+    radius = check_cutoff(cutoff, dtype)
     rows = n if queries is None else queries
     where = default_platform() if platform is None else platform
     if faces is not None:
         if fn is not None or queries is not None:
             raise ValueError("faces belong to a search for triangles, which knows neither fn nor queries: leave them out.")
-        sizes = (n, checked_size("faces", faces), dim, checked_capacity(capacity))
+        sizes = (n, check_size("faces", faces), dim, check_capacity(capacity))
         return _plan_of_triangles(sizes, dtype, radius, backend, _device_of(where))
     engine = check_backend(backend)
     if fn is not None:
@@ -150,7 +150,7 @@ def memory_plan(
         return _plan_of_sum(fn, points, cutoff, values, gradient, engine, _device_of(where))
     if values is not None or gradient:
         raise ValueError("values and gradient belong to a pair sum: say its fn, too.")
-    capacity = None if capacity is None else checked_capacity(capacity)
+    capacity = None if capacity is None else check_capacity(capacity)
     chosen = fastest_engine(_device_of(where).platform, n) if engine == "auto" else ENGINES[engine]
     scratch = chosen.scratch_bytes(where, n, rows, dim, dtype == np.float64, queries is None)
     if scratch is None:
@@ -159,7 +159,7 @@ def memory_plan(
         scratch = _compiled_scratch(points, radius, chosen, capacity)
     if capacity is None:
         return MemoryPlan(0, scratch, chosen.name, counts_bytes=4 * rows)
-    kept = (n + (queries or 0)) * dim * dtype.itemsize + 4 if checked_skin(skin, float(radius.radius), dtype) else 0
+    kept = (n + (queries or 0)) * dim * dtype.itemsize + 4 if check_skin(skin, float(radius.radius), dtype) else 0
     return MemoryPlan(4 * rows * (capacity + 1) + 8 + kept, scratch, chosen.name)
 
 

@@ -11,7 +11,7 @@ import reference
 from jfrnn.cases.periodic import PERIODIC_CASES
 
 import jfrnn
-from jfrnn._geometry.wrapping import unpacked_turns
+from jfrnn._geometry.wrapping import unpack_turns
 
 CAPACITY = 400
 LENGTH = 304
@@ -33,7 +33,7 @@ def image_pairs(nbrs, positions, queries=None):
         shifts = np.zeros((len(i), x.shape[1]), int)
         shifts[:, periodic] = -np.rint((x[j] - q[i]) @ np.linalg.pinv(vectors))
     else:
-        turns, query_turns = (None if t is None else np.asarray(unpacked_turns(t, nbrs.box.dim)) for t in nbrs.images[1:])
+        turns, query_turns = (None if t is None else np.asarray(unpack_turns(t, nbrs.box.dim)) for t in nbrs.images[1:])
         shifts = kind.shifts[np.asarray(nbrs.images.codes)[i, k]] + (turns if query_turns is None else query_turns)[i] - turns[j]
         shifts = shifts @ kind.numbers  # of given vectors, where the list counts short ones
     pairs = list(zip(i.tolist(), j.tolist(), map(tuple, shifts.tolist()), strict=True))

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from jfrnn._geometry.integers import GUARDS, carried_limbs, full_count, limb_bits, limb_product, limb_sign, limb_type, limbs_of
+from jfrnn._geometry.integers import GUARDS, carry_limbs, full_count, limb_bits, limb_product, limb_sign, limb_type, limbs_of
 
 
 def number(limbs, bits):
@@ -44,7 +44,7 @@ def test_carrying_keeps_numbers_and_signs(dtype, count):
     whole, narrow = limb_type(np.dtype(dtype)), np.dtype(dtype).itemsize == 4
     bits, most = limb_bits(whole), 2**31 - 2**10 - 1 if narrow else 2**62
     rows = raw_limbs(np.random.default_rng(1), whole, count, most)
-    limbs, signs = (np.asarray(jax.jit(f)(rows)) for f in (carried_limbs, limb_sign))
+    limbs, signs = (np.asarray(jax.jit(f)(rows)) for f in (carry_limbs, limb_sign))
     assert np.abs(limbs[:, :-1]).max() <= 1.26 * 2**bits
     for row, carried, sign in zip(rows[:, GUARDS:], limbs, signs, strict=True):
         value = number(row, bits)

@@ -28,7 +28,7 @@ from jfrnn._geometry import (
     sort_by_levels,
     stencil_runs,
     translation,
-    unpacked_turns,
+    unpack_turns,
 )
 
 
@@ -112,7 +112,7 @@ def _cells_along(
 
 def _torus(sources: Array, queries: Array | None, lattice: Lattice, wrapped: Wrapped) -> Torus:
     raw = (sources, sources if queries is None else queries)
-    turns = tuple(unpacked_turns(x, lattice.dim).astype(sources.dtype) for x in (wrapped.turns, wrapped.query_turns))
+    turns = tuple(unpack_turns(x, lattice.dim).astype(sources.dtype) for x in (wrapped.turns, wrapped.query_turns))
     shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)
     return Torus(lattice.images, translation(shifts, lattice), lattice.given, raw, (turns[0], turns[1]), wrapped.slack)
 
@@ -176,7 +176,7 @@ def _cells_of_lattice(
     if queries is not None:
         points = jnp.concatenate([sources, queries])
         packed = jnp.concatenate([packed, wrapped.query_turns])
-    units, turns = fractions_of(points, lattice), unpacked_turns(packed, lattice.dim).astype(points.dtype)
+    units, turns = fractions_of(points, lattice), unpack_turns(packed, lattice.dim).astype(points.dtype)
     along, edges, cells, scales, margins = [], [], [], [], []
     for k, periodic in enumerate(lattice.images.periodic):
         straight = lattice.images.orthogonal and not periodic

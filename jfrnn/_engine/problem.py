@@ -22,7 +22,7 @@ from jfrnn._geometry import (
     is_valid,
     make_cutoffs,
     make_lattice,
-    ranked,
+    rank_systems,
     wrap,
 )
 from jfrnn._tracing import compiled
@@ -152,7 +152,7 @@ def prepare_search(inputs: Inputs, options: Options) -> Search:
     """Prepare a search. No gradient flows through."""
     given, queries, active, box, cutoff, batch = lax.stop_gradient(inputs)
     sources, images = hide_inactive(given, active), options.images
-    batch = None if batch is None else ranked(batch)
+    batch = None if batch is None else rank_systems(batch)
     checks: dict[Status, Array] = {}
     if isinstance(cutoff, Radii):
         sources, queries, checks = _with_valid_radii(sources, queries, active, cutoff)

@@ -1,7 +1,7 @@
 """What a pair is: cutoffs, boxes, cells, orders, batches, checked inputs, and the status of a result."""
 
-from jfrnn._geometry.batch import Batch, ranked
-from jfrnn._geometry.box import Box, fixed_box
+from jfrnn._geometry.batch import Batch, rank_systems
+from jfrnn._geometry.box import Box, round_box
 from jfrnn._geometry.cells import (
     CellAxes,
     build_grid,
@@ -13,29 +13,29 @@ from jfrnn._geometry.cells import (
     stencil_runs,
 )
 from jfrnn._geometry.curves import hilbert_decode, hilbert_encode, morton_decode, morton_encode
-from jfrnn._geometry.cutoffs import Cutoff, Cutoffs, Radii, is_radius, make_cutoff, make_cutoffs, step_one_bounds, widened
+from jfrnn._geometry.cutoffs import Cutoff, Cutoffs, Radii, is_radius, make_cutoff, make_cutoffs, step_one_bounds, widen
 from jfrnn._geometry.exact import Pair, flat_take, is_pair_of, refine, shift_in_given, squared_distance
 from jfrnn._geometry.floats import compensated_sum, rounded_sum
-from jfrnn._geometry.images import LARGEST_TURN, Images, grown_images, images_of
+from jfrnn._geometry.images import LARGEST_TURN, Images, grow_images, images_of
 from jfrnn._geometry.inputs import (
+    check_active,
+    check_again,
+    check_batch,
+    check_box,
+    check_capacity,
+    check_cutoff,
     check_devices,
+    check_flag,
     check_is_known,
-    checked_active,
-    checked_again,
-    checked_batch,
-    checked_box,
-    checked_capacity,
-    checked_cutoff,
-    checked_flag,
-    checked_kind,
-    checked_positions,
-    checked_radii,
-    checked_size,
-    checked_skin,
-    checked_slack,
+    check_kind,
+    check_positions,
+    check_radii,
+    check_size,
+    check_skin,
+    check_slack,
     largest_known,
 )
-from jfrnn._geometry.integers import GUARDS, carried_limbs, fields_of, full_count, limb_bits, limb_product, limb_sign, limbs_of
+from jfrnn._geometry.integers import GUARDS, carry_limbs, fields_of, full_count, limb_bits, limb_product, limb_sign, limbs_of
 from jfrnn._geometry.lattice import (
     Lattice,
     forward_shifts,
@@ -44,7 +44,7 @@ from jfrnn._geometry.lattice import (
     is_valid,
     make_lattice,
     nearest_shifts,
-    shifted_pairs,
+    shift_pairs,
     translation,
 )
 from jfrnn._geometry.levels import GROUPS, HALVINGS, Axes, Levels, level_runs, sort_by_levels
@@ -52,7 +52,7 @@ from jfrnn._geometry.meshes import merge_vertices
 from jfrnn._geometry.motion import Motion, box_change, motion_of, turns_between
 from jfrnn._geometry.order import hilbert_order, sort_order
 from jfrnn._geometry.status import NeighborOverflowError, Status, known_status, names_of_bits, pairs_and_status, shape_of
-from jfrnn._geometry.wrapping import NOT_FINITE, TOO_FAR, Wrapped, unpacked_turns, wrap
+from jfrnn._geometry.wrapping import NOT_FINITE, TOO_FAR, Wrapped, unpack_turns, wrap
 
 __all__ = [
     "GROUPS",
@@ -78,34 +78,33 @@ __all__ = [
     "Wrapped",
     "box_change",
     "build_grid",
-    "carried_limbs",
+    "carry_limbs",
     "cell_edge",
     "cell_order",
+    "check_active",
+    "check_again",
+    "check_batch",
+    "check_box",
+    "check_capacity",
+    "check_cutoff",
     "check_devices",
+    "check_flag",
     "check_is_known",
-    "checked_active",
-    "checked_again",
-    "checked_batch",
-    "checked_box",
-    "checked_capacity",
-    "checked_cutoff",
-    "checked_flag",
-    "checked_kind",
-    "checked_positions",
-    "checked_radii",
-    "checked_size",
-    "checked_skin",
-    "checked_slack",
+    "check_kind",
+    "check_positions",
+    "check_radii",
+    "check_size",
+    "check_skin",
+    "check_slack",
     "compensated_sum",
     "fields_of",
-    "fixed_box",
     "flat_take",
     "forward_shifts",
     "fractions_of",
     "full_count",
     "given_shifts",
     "grid_coordinates",
-    "grown_images",
+    "grow_images",
     "hilbert_decode",
     "hilbert_encode",
     "hilbert_order",
@@ -132,12 +131,13 @@ __all__ = [
     "open_axes",
     "ordered_bits",
     "pairs_and_status",
-    "ranked",
+    "rank_systems",
     "refine",
+    "round_box",
     "rounded_sum",
     "shape_of",
     "shift_in_given",
-    "shifted_pairs",
+    "shift_pairs",
     "sort_by_levels",
     "sort_order",
     "squared_distance",
@@ -145,7 +145,7 @@ __all__ = [
     "step_one_bounds",
     "translation",
     "turns_between",
-    "unpacked_turns",
-    "widened",
+    "unpack_turns",
+    "widen",
     "wrap",
 ]

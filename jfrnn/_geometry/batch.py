@@ -29,7 +29,7 @@ class Batch(NamedTuple):
         return self.sources if self.queries is None else jnp.concatenate([self.sources, self.queries])
 
 
-def ranked(batch: Batch) -> Batch:
+def rank_systems(batch: Batch) -> Batch:
     """Number systems from 0 on, as uint32, by what they are above the lowest: the range of int32 holds no surprise."""
     sources = _in_order(batch.sources)
     queries = None if batch.queries is None else _in_order(batch.queries)

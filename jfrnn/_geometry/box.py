@@ -138,7 +138,7 @@ def check_box_values(vectors: Numbers, origin: Numbers, periodic: tuple[bool, ..
             raise ValueError(f"periodic lattice vectors must be linearly independent, got the rows {vectors.tolist()}.")
 
 
-def fixed_box(box: Box, dtype: np.dtype) -> Box:
+def round_box(box: Box, dtype: np.dtype) -> Box:
     """Round a box to a dtype; what is left of it are its arrays and its periodic axes."""
     with own_transfers():
         return Box.tree_unflatten((box.periodic, None), tuple(jnp.asarray(x).astype(dtype) for x in (box.vectors, box.origin)))

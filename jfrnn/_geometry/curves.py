@@ -40,7 +40,7 @@ def morton_encode(coords: Array, bits: int | None = None) -> Array:
 
     Differentiable: no (integers). Jit: yes, bits static. vmap: yes. Source: Morton (1966), A computer oriented geodetic data base.
     """
-    coords, bits = _checked_coords(coords, bits, default=True)
+    coords, bits = _check_coords(coords, bits, default=True)
     return _encode(coords, bits, morton_words)
 
 
@@ -60,7 +60,7 @@ def morton_decode(keys: Array, dim: int, bits: int | None = None) -> Array:
 
     Differentiable: no (integers). Jit: yes, dim and bits static. vmap: yes. Source: as in `morton_encode`.
     """
-    keys, dim, bits = _checked_keys(keys, dim, bits, default=True)
+    keys, dim, bits = _check_keys(keys, dim, bits, default=True)
     return _decode(keys, dim, bits, _morton_axes)
 
 
@@ -85,7 +85,7 @@ def hilbert_encode(coords: Array, bits: int) -> Array:
     Differentiable: no (integers). Jit: yes, bits static. vmap: yes. Source: Skilling (2004), Programming the Hilbert curve,
     doi:10.1063/1.1751381.
     """
-    coords, bits = _checked_coords(coords, bits)
+    coords, bits = _check_coords(coords, bits)
     return _encode(coords, bits, hilbert_words)
 
 
@@ -105,7 +105,7 @@ def hilbert_decode(keys: Array, dim: int, bits: int) -> Array:
 
     Differentiable: no (integers). Jit: yes, dim and bits static. vmap: yes. Source: as in `hilbert_encode`.
     """
-    keys, dim, bits = _checked_keys(keys, dim, bits)
+    keys, dim, bits = _check_keys(keys, dim, bits)
     return _decode(keys, dim, bits, _hilbert_axes)
 
 
@@ -230,7 +230,7 @@ def _unpack(keys: Array, key_bits: int) -> Words:
     return ((keys >> 32).astype(jnp.uint32), keys.astype(jnp.uint32)) if _wide() else (keys[..., 0], keys[..., 1])
 
 
-def _checked_coords(coords: Given, bits: object, default: bool = False) -> tuple[Array, int]:
+def _check_coords(coords: Given, bits: object, default: bool = False) -> tuple[Array, int]:
     """Return coordinates [..., 2] or [..., 3] within the cube, and the bits."""
     dtype = getattr(coords, "dtype", type(coords).__name__)
     if isinstance(dtype, str) or not jnp.issubdtype(dtype, jnp.integer):
@@ -241,17 +241,17 @@ def _checked_coords(coords: Given, bits: object, default: bool = False) -> tuple
     shape = list(coords.shape)
     if not shape or shape[-1] not in (2, 3):
         raise ValueError(f"coords must have shape [..., 2] or [..., 3], one row per cell, got shape {shape}.")
-    bits = _checked_bits(bits, shape[-1], default)
+    bits = _check_bits(bits, shape[-1], default)
     _check_range("coords", coords, 2**bits, "give more bits, or count the cells from the lowest one")
     return jnp.asarray(coords), bits
 
 
-def _checked_keys(keys: Given, dim: object, bits: object, default: bool = False) -> tuple[Array, int, int]:
+def _check_keys(keys: Given, dim: object, bits: object, default: bool = False) -> tuple[Array, int, int]:
     """Return keys of the type that encoding gives, the dimension and the bits."""
     if isinstance(dim, bool) or not isinstance(dim, int | np.integer) or dim not in (2, 3):
         raise ValueError(f"dim must be 2 or 3, a static int, got {dim!r}.")
     dim = int(dim)
-    bits = _checked_bits(bits, dim, default)
+    bits = _check_bits(bits, dim, default)
     words = dim * bits > 32 and not _wide()
     wanted = np.dtype(np.uint64 if dim * bits > 32 and not words else np.uint32)
     dtype, shape = getattr(keys, "dtype", type(keys).__name__), list(np.shape(keys))
@@ -266,7 +266,7 @@ def _checked_keys(keys: Given, dim: object, bits: object, default: bool = False)
     return jnp.asarray(keys), dim, bits
 
 
-def _checked_bits(bits: object, dim: int, default: bool) -> int:
+def _check_bits(bits: object, dim: int, default: bool) -> int:
     most = _MOST_BITS[dim]
     if bits is None and default:
         return most

@@ -137,7 +137,7 @@ def _sum_rounded_up(x: Array, skin: float) -> Array:
     return jnp.where(error > 0, jnp.nextafter(total, jnp.asarray(jnp.inf, x.dtype)), total)
 
 
-def widened(cutoff: Cutoff, slack: Array) -> Cutoff:
+def widen(cutoff: Cutoff, slack: Array) -> Cutoff:
     """Return a cutoff whose step 1 leaves open what differences off by `slack` per component (at most 3) may not decide."""
     eps = jnp.finfo(slack.dtype).eps
     scale = cutoff.unit_scale if cutoff.scaled else slack.dtype.type(1)
@@ -153,7 +153,7 @@ def step_one_bounds(
     if isinstance(cutoff, Cutoffs):
         return _bounds_of_pairs(cutoff, radii or [], slack)
     if slack is not None:
-        cutoff = widened(cutoff, slack)
+        cutoff = widen(cutoff, slack)
     return cutoff.inside, cutoff.outside
 
 

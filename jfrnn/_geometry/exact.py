@@ -4,7 +4,7 @@ Three steps, each exact where it answers and each asked only what the one before
 
 1. `squared_distance` against `Cutoff.inside` and `Cutoff.outside`, in working precision. With u = eps/2, each difference
    carries a relative error u, each square 3u, the sum of three at most 5u, and r², times 1 ± the band, 2u more: in all at most
-   3.5 eps. Flushed denormals add at most 3·2^-126 to a difference, which is below 2^-28 of any cutoff that `checked_cutoff` lets
+   3.5 eps. Flushed denormals add at most 3·2^-126 to a difference, which is below 2^-28 of any cutoff that `check_cutoff` lets
    pass. A band of 8 eps on either side is therefore safe whatever the compiler fuses into multiply-adds; the kernels of the CPU,
    which flush nothing that matters here, take 4.
 2. `_sum_sign`: error-free transformations (Dekker 1971; Ogita, Rump & Oishi 2005, doi:10.1137/030601818). Factors are split
@@ -24,7 +24,7 @@ from jax import Array, lax
 
 from jfrnn._geometry.cutoffs import Cutoff, Cutoffs, step_one_bounds
 from jfrnn._geometry.floats import WHOLE_BITS, distill, exact_square, half_mantissa, is_plain, two_difference, two_sum, unit_scale
-from jfrnn._geometry.integers import beside, carried_limbs, full_count, limb_product, limb_sign, limb_type, limbs_of
+from jfrnn._geometry.integers import beside, carry_limbs, full_count, limb_product, limb_sign, limb_type, limbs_of
 from jfrnn._geometry.reduced import Basis
 from jfrnn._tracing import any_of_rows, first_set
 
@@ -125,10 +125,10 @@ def is_pair_of(
     no, yes, open_pair = np.arange(3, dtype=np.int8)
     step_one = jnp.where(asked & (square <= outside), jnp.where(square < inside, yes, open_pair), no)  # one array: one kernel
 
-    def refined(step_one: Array) -> Array:
+    def refine_open(step_one: Array) -> Array:
         return (step_one == yes) | _refine_some(step_one == open_pair, points, cutoff)
 
-    return lax.cond(jnp.max(step_one, initial=no) == open_pair, refined, lambda step_one: step_one == yes, step_one)
+    return lax.cond(jnp.max(step_one, initial=no) == open_pair, refine_open, lambda step_one: step_one == yes, step_one)
 
 
 class Shifted(NamedTuple):
@@ -262,7 +262,7 @@ def _integer_sign(pair: Pair, threshold: _Threshold) -> Array:
 
     Limbs of a difference are below 2^12 (float64: 2^27), with a lattice below 2^30 (2^46: shifts are below 2^16, doubled or not).
     So are two radii, added up, and twice the differences that are compared with them. A limb of the sum of squares is the sum of
-    4·29 (4·84) products of what `carried_limbs` returns, below 2^30 (2^61).
+    4·29 (4·84) products of what `carry_limbs` returns, below 2^30 (2^61).
     """
     dim, radii, dtype = len(pair.a), threshold.radii, np.dtype(pair.a[0].dtype)
     count, whole = full_count(dtype) + 3, limb_type(dtype)  # with room for carries and the sign
@@ -273,7 +273,7 @@ def _integer_sign(pair: Pair, threshold: _Threshold) -> Array:
     if pair.shift is not None and pair.matrix is not None:
         shift = beside(pair.shift).astype(whole)
         squared = squared + _translation_limbs(shift, pair.matrix, count, pair.orthogonal) * times
-    squared = carried_limbs(squared)
+    squared = carry_limbs(squared)
     signs = np.array([1] * dim + [-1], whole)[None, :, None]
     return limb_sign(jnp.sum(limb_product(squared * signs, squared), axis=1, dtype=whole))
 

@@ -80,11 +80,11 @@ def images_of(box: Box, radius: float | None, dtype: np.dtype, sources: int) -> 
             basis, short = reduced_basis(vectors, box.periodic)
             reduced = _needed_images(short, box, radius, basis)
             images = reduced if reduced.total < images.total and _are_exact(reduced) else images
-        return checked_images(images, sources)
+        return check_images(images, sources)
     wanted = (0,) * box.dim if box.images is None else box.images
     nearest = not any(k for k, p in zip(wanted, box.periodic, strict=True) if p)
     reach = tuple(max(k, 1) if p else 0 for k, p in zip(wanted, box.periodic, strict=True))
-    return checked_images(Images(box.periodic, box.orthogonal, reach, nearest), sources)
+    return check_images(Images(box.periodic, box.orthogonal, reach, nearest), sources)
 
 
 def _needed_images(vectors: np.ndarray, box: Box, radius: float, basis: Basis | None) -> Images:
@@ -104,7 +104,7 @@ def _are_exact(images: Images) -> bool:
     return (2 * LARGEST_TURN + max(images.reach)) * np.abs(images.numbers).sum(axis=0).max() <= _MOST_VECTORS
 
 
-def checked_images(images: Images, sources: int) -> Images:
+def check_images(images: Images, sources: int) -> Images:
     """Return images of which there are not too many.
 
     Raises:
@@ -123,7 +123,7 @@ def checked_images(images: Images, sources: int) -> Images:
     return images
 
 
-def grown_images(kind: Images, boxes: Sequence[Box], radius: float | None, dtype: np.dtype, sources: int, short: bool) -> Images:
+def grow_images(kind: Images, boxes: Sequence[Box], radius: float | None, dtype: np.dtype, sources: int, short: bool) -> Images:
     """Choose the images of a list that is made again: those that it has, and those that this radius needs in each of these boxes.
 
     `short`: a search met a box that needs more of them. Where none of these boxes does, it was another: then twice as many.
@@ -140,7 +140,7 @@ def grown_images(kind: Images, boxes: Sequence[Box], radius: float | None, dtype
     reach, nearest = tuple(map(max, *(k.reach for k in kinds), kind.reach)), all(k.nearest for k in kinds)
     if short and (reach, nearest) == (kind.reach, kind.nearest):
         reach, nearest = reach if nearest else tuple(2 * k for k in reach), False
-    return checked_images(kind._replace(reach=reach, nearest=nearest), sources)
+    return check_images(kind._replace(reach=reach, nearest=nearest), sources)
 
 
 def _in_basis(box: Box, radius: float | None, dtype: np.dtype, like: Images) -> Images:

@@ -18,7 +18,7 @@ from jfrnn._tracing import Given, gather, make_on_host, on_device
 _MOST_POINTS = 2**31 - 32
 
 
-def checked_positions(name: str, positions: Given, like: Array | None = None) -> Array:
+def check_positions(name: str, positions: Given, like: Array | None = None) -> Array:
     """Return positions as a float32 or float64 array [n, 2] or [n, 3], of the same kind as `like` where that is given."""
     if not hasattr(positions, "dtype") or not hasattr(positions, "shape"):
         raise TypeError(
@@ -56,9 +56,9 @@ def check_is_known(name: str, shape: tuple[Any, ...]) -> None:
         )
 
 
-def checked_again(name: str, positions: Given, dtype: np.dtype, dim: int, rows: int, what: str = "the list") -> Array:
+def check_again(name: str, positions: Given, dtype: np.dtype, dim: int, rows: int, what: str = "the list") -> Array:
     """Return positions that are of the kind and number for which something, such as a list, was made."""
-    points = checked_positions(name, positions)
+    points = check_positions(name, positions)
     if (points.dtype, points.shape[1]) != (dtype, dim):
         raise ValueError(
             f"{name} must be {dtype} with {dim} columns, for which {what} was made, got {points.dtype} with {points.shape[1]} "
@@ -85,7 +85,7 @@ def check_devices(name: str, given: Given, made: Given, what: str = "the list") 
     )
 
 
-def checked_cutoff(cutoff: Given, dtype: np.dtype) -> Cutoff:
+def check_cutoff(cutoff: Given, dtype: np.dtype) -> Cutoff:
     """Return the cutoff, rounded once to the dtype of the positions."""
     if isinstance(cutoff, Tracer):
         raise TypeError(
@@ -108,7 +108,7 @@ def checked_cutoff(cutoff: Given, dtype: np.dtype) -> Cutoff:
     return make_cutoff(value, dtype, closed=False)
 
 
-def checked_radii(cutoff: Given, rule: object, sources: Array, queries: Array | None) -> Radii | None:
+def check_radii(cutoff: Given, rule: object, sources: Array, queries: Array | None) -> Radii | None:
     """Return cutoffs that differ from particle to particle, in the dtype of the positions; None where it is one number."""
     if rule not in RULES:
         raise ValueError(f"radius_rule must be one of {', '.join(map(repr, RULES))}, got {rule!r}.")
@@ -116,22 +116,22 @@ def checked_radii(cutoff: Given, rule: object, sources: Array, queries: Array | 
         return None
     n, m = sources.shape[0], None if queries is None else queries.shape[0]
     if m is None:
-        radii = _checked_radii_of("cutoff", cutoff, n, "particle", sources)
+        radii = _check_radii_of("cutoff", cutoff, n, "particle", sources)
         return Radii(None if rule == "gather" else radii, None if rule == "scatter" else radii, rule)
     if rule == "gather":
-        return Radii(None, _checked_radii_of("cutoff", cutoff, m, "query (radius_rule='gather')", sources), rule)
+        return Radii(None, _check_radii_of("cutoff", cutoff, m, "query (radius_rule='gather')", sources), rule)
     if rule == "scatter":
-        return Radii(_checked_radii_of("cutoff", cutoff, n, "position (radius_rule='scatter')", sources), None, rule)
+        return Radii(_check_radii_of("cutoff", cutoff, n, "position (radius_rule='scatter')", sources), None, rule)
     if not isinstance(cutoff, tuple) or len(cutoff) != 2:
         raise ValueError(
             f"cutoff must be a pair of arrays, of the positions [{n}] and of the queries [{m}], where radius_rule={rule!r} asks "
             f"for both, got {_describe_array(cutoff)}."
         )
-    of_sources = _checked_radii_of("cutoff[0]", cutoff[0], n, "position", sources)
-    return Radii(of_sources, _checked_radii_of("cutoff[1]", cutoff[1], m, "query", sources), rule)
+    of_sources = _check_radii_of("cutoff[0]", cutoff[0], n, "position", sources)
+    return Radii(of_sources, _check_radii_of("cutoff[1]", cutoff[1], m, "query", sources), rule)
 
 
-def _checked_radii_of(name: str, radii: Given, size: int, what: str, like: Array) -> Array:
+def _check_radii_of(name: str, radii: Given, size: int, what: str, like: Array) -> Array:
     if not hasattr(radii, "dtype") or not np.issubdtype(radii.dtype, np.floating):
         raise TypeError(f"{name} must be a number, or an array of floats with one per {what}, got {_describe_array(radii)}.")
     if tuple(radii.shape) != (size,):
@@ -156,7 +156,7 @@ def largest_known(radii: Radii) -> float | None:
     return float(np.max(values[(values >= low) & (values <= high)], initial=0)) or 1.0
 
 
-def checked_skin(skin: object, cutoff: float, dtype: np.dtype) -> float:
+def check_skin(skin: object, cutoff: float, dtype: np.dtype) -> float:
     """Return a static skin, rounded once to the dtype of the positions; 0 means that there is none."""
     if isinstance(skin, Tracer | bool) or not isinstance(skin, int | float | np.number):
         raise TypeError(f"skin must be a number known while tracing, got {_describe(skin)}.")
@@ -170,7 +170,7 @@ def checked_skin(skin: object, cutoff: float, dtype: np.dtype) -> float:
     return value
 
 
-def checked_active(active: Given, positions: Array) -> Array:
+def check_active(active: Given, positions: Array) -> Array:
     """Return the mask of the particles that take part, [n] bool."""
     if not hasattr(active, "dtype") or np.dtype(active.dtype) != np.bool_:
         raise TypeError(f"active must be an array of bool, one per particle, got {_describe_array(active)}.")
@@ -179,20 +179,20 @@ def checked_active(active: Given, positions: Array) -> Array:
     return on_device(active)
 
 
-def checked_batch(batch: Given, sources: Array, queries: Array | None) -> Batch:
+def check_batch(batch: Given, sources: Array, queries: Array | None) -> Batch:
     """Return the systems of the particles, and of the queries if there are any, as int32."""
     if queries is None:
-        return Batch(_checked_systems("batch", batch, sources.shape[0], "particle"), None)
+        return Batch(_check_systems("batch", batch, sources.shape[0], "particle"), None)
     if not isinstance(batch, tuple) or len(batch) != 2:
         raise ValueError(
             f"batch must be a pair of arrays, of the positions [{sources.shape[0]}] and of the queries [{queries.shape[0]}], got "
             f"{_describe_array(batch)}."
         )
-    of_sources = _checked_systems("batch[0]", batch[0], sources.shape[0], "position")
-    return Batch(of_sources, _checked_systems("batch[1]", batch[1], queries.shape[0], "query"))
+    of_sources = _check_systems("batch[0]", batch[0], sources.shape[0], "position")
+    return Batch(of_sources, _check_systems("batch[1]", batch[1], queries.shape[0], "query"))
 
 
-def _checked_systems(name: str, systems: Given, size: int, what: str) -> Array:
+def _check_systems(name: str, systems: Given, size: int, what: str) -> Array:
     if not hasattr(systems, "dtype") or not np.issubdtype(systems.dtype, np.integer):
         raise TypeError(f"{name} must be an array of integers, the system of each {what}, got {_describe_array(systems)}.")
     if tuple(systems.shape) != (size,):
@@ -207,7 +207,7 @@ def _checked_systems(name: str, systems: Given, size: int, what: str) -> Array:
     return make_on_host(systems, lambda known: known.astype(np.int32))
 
 
-def checked_box(box: object, positions: Array, like: Box | None = None) -> Box | None:
+def check_box(box: object, positions: Array, like: Box | None = None) -> Box | None:
     """Return a box that repeats space along some axis of the positions, of the same kind as `like` where that is given; or None."""
     if not isinstance(box, Box):
         raise TypeError(f"box must be a jfrnn.Box, got {_describe(box)}: write e.g. jfrnn.Box([1.0, 1.0, 1.0]).")
@@ -221,14 +221,14 @@ def checked_box(box: object, positions: Array, like: Box | None = None) -> Box |
     return box if any(box.periodic) else None
 
 
-def checked_flag(name: str, value: object) -> bool:
+def check_flag(name: str, value: object) -> bool:
     """Return a static bool."""
     if isinstance(value, bool | np.bool_):
         return bool(value)
     raise TypeError(f"{name} must be True or False, known while tracing, got {_describe(value)}.")
 
 
-def checked_capacity(capacity: object) -> int:
+def check_capacity(capacity: object) -> int:
     """Return a static capacity of at least one slot per row."""
     if isinstance(capacity, bool) or not isinstance(capacity, int | np.integer):
         raise TypeError(
@@ -240,7 +240,7 @@ def checked_capacity(capacity: object) -> int:
     return int(capacity)
 
 
-def checked_slack(slack: object) -> float:
+def check_slack(slack: object) -> float:
     """Return a static factor of at least 1."""
     if isinstance(slack, bool) or not isinstance(slack, int | float | np.number):
         raise TypeError(f"slack must be a number of at least 1, known while tracing, got {_describe(slack)}.")
@@ -249,7 +249,7 @@ def checked_slack(slack: object) -> float:
     return float(slack)
 
 
-def checked_size(name: str, size: object) -> int:
+def check_size(name: str, size: object) -> int:
     """Return a number of points that are not there yet."""
     if isinstance(size, bool) or not isinstance(size, int | np.integer):
         raise TypeError(f"{name} must be an int, the number of points, got {_describe(size)}.")
@@ -258,7 +258,7 @@ def checked_size(name: str, size: object) -> int:
     return int(size)
 
 
-def checked_kind(dim: object, dtype: Given) -> tuple[int, np.dtype]:
+def check_kind(dim: object, dtype: Given) -> tuple[int, np.dtype]:
     """Return the dimensions and the dtype of positions that are not there yet."""
     if isinstance(dim, bool) or not isinstance(dim, int | np.integer) or dim not in (2, 3):
         raise ValueError(f"dim must be 2 or 3, got {_describe(dim)}.")

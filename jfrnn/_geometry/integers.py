@@ -77,7 +77,7 @@ def limbs_of(x: Array, count: int, origin: Array | None = None) -> Array:
     return jnp.where(sign[..., None], -limbs, limbs)
 
 
-def carried_limbs(limbs: Array) -> Array:
+def carry_limbs(limbs: Array) -> Array:
     """Return the same numbers, [..., count], in limbs of at most 1.26·2^bits; the top one keeps what is left.
 
     Limbs [..., GUARDS + count] are below 2^31 - 2^10 (float64: 2^62), the top ones below half of that. Each is written as
@@ -100,11 +100,11 @@ def limb_product(a: Array, b: Array) -> Array:
     lead, stride = b.shape[:-1], b.shape[-1]
     copies = jnp.broadcast_to(b[..., None, :], (*lead, rows, stride)).reshape(*lead, rows * stride)
     moved = copies[..., : rows * (stride - 1)].reshape(*lead, rows, stride - 1)[..., :length]
-    return jnp.sum(_folded(a[..., None] * moved, groups, jnp.add, axis=-2), axis=-2, dtype=a.dtype)
+    return jnp.sum(_fold(a[..., None] * moved, groups, jnp.add, axis=-2), axis=-2, dtype=a.dtype)
 
 
 def limb_sign(limbs: Array) -> Array:
-    """Return the signs of numbers [..., GUARDS + count], which are as `carried_limbs` takes them: [...] int32.
+    """Return the signs of numbers [..., GUARDS + count], which are as `carry_limbs` takes them: [...] int32.
 
     Carried once more, each limb but the top one is below 2^bits - 1, so that all below a limb is less than one unit of it: the
     highest limb that is not 0 has the sign.
@@ -117,7 +117,7 @@ def limb_sign(limbs: Array) -> Array:
     key = jnp.where(digits == 0, 0, jnp.where(digits > 0, places + 3, places + 2))
     groups = -(-at.shape[-1] // _SHORT)
     key = jnp.pad(key, [(0, 0)] * (limbs.ndim - 1) + [(0, groups * _SHORT - at.shape[-1] if groups > 1 else 0)])
-    highest = jnp.max(_folded(key, groups, jnp.maximum, axis=-1), axis=-1)
+    highest = jnp.max(_fold(key, groups, jnp.maximum, axis=-1), axis=-1)
     return jnp.where(highest == 0, 0, 2 * (highest & 1) - 1)
 
 
@@ -149,6 +149,6 @@ def _along_limbs(x: np.ndarray, ndim: int) -> np.ndarray:
     return x.reshape((1,) * (ndim - 1) + x.shape)
 
 
-def _folded(x: Array, groups: int, add: Callable[[Array, Array], Array], axis: int) -> Array:
+def _fold(x: Array, groups: int, add: Callable[[Array, Array], Array], axis: int) -> Array:
     """Lay the parts of an axis above each other, so that it is short enough for one kernel to reduce it."""
     return functools.reduce(add, jnp.split(x, groups, axis=axis))

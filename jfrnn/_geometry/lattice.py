@@ -56,11 +56,11 @@ def make_lattice(box: Box, images: Images, dtype: np.dtype) -> Lattice:
         lengths = jnp.where(flags, vectors, 1)
         return Lattice(matrix, given, jnp.diag(1 / lengths), origin, images)
     if images.basis is not None:
-        matrix = combined(images.basis, given)
-    return Lattice(matrix, given, _inverse(_completed(matrix, box.periodic)), origin, images)
+        matrix = combine(images.basis, given)
+    return Lattice(matrix, given, _inverse(_complete(matrix, box.periodic)), origin, images)
 
 
-def combined(basis: Basis, matrix: Array) -> Array:
+def combine(basis: Basis, matrix: Array) -> Array:
     """Return basis @ matrix, whole numbers times lattice vectors, each component rounded about once; differentiable."""
     whole = np.array(basis)
     high = (whole + (1 << (WHOLE_BITS - 1))) >> WHOLE_BITS
@@ -75,7 +75,7 @@ def combined(basis: Basis, matrix: Array) -> Array:
     return functools.reduce(jnp.add, terms)
 
 
-def _completed(matrix: Array, periodic: tuple[bool, ...]) -> Array:
+def _complete(matrix: Array, periodic: tuple[bool, ...]) -> Array:
     """Replace the rows of axes that are not periodic by unit vectors normal to all that are, and to each other."""
     dim, free = len(periodic), [k for k, p in enumerate(periodic) if not p]
     rows = [matrix[k] / jnp.max(jnp.abs(matrix[k])) if p else matrix[k] for k, p in enumerate(periodic)]
@@ -143,7 +143,7 @@ def translation(shifts: Array, lattice: Lattice) -> Array:
     return sum((shifts[..., k, None] * rows[k] for k, p in enumerate(lattice.images.periodic) if p), jnp.zeros_like(shifts))
 
 
-def shifted_pairs(difference: Array, shifts: Array, lattice: Lattice) -> Shifted:
+def shift_pairs(difference: Array, shifts: Array, lattice: Lattice) -> Shifted:
     """Return x_j - x_i + S·A for differences [m, k, d], differentiable, and what their exact test needs.
 
     In units of u = eps/2, a component is off by at most u|x_j - x_i|, (2d + 1) u|S·A| and u of their sum; 8 eps covers that.

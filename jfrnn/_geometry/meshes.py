@@ -38,7 +38,7 @@ def merge_vertices(vertices: Array, faces: Array) -> tuple[Array, Array]:
     """
     if isinstance(vertices, Tracer) or isinstance(faces, Tracer):
         raise TypeError("merge_vertices() makes a shape of what it finds and cannot run inside jax.jit: call it before.")
-    points, named = _checked(vertices, faces)
+    points, named = _check_mesh(vertices, faces)
     order = np.lexsort(points.T[::-1])
     ordered = points[order]
     fresh = np.concatenate([np.ones(min(len(points), 1), bool), np.any(ordered[1:] != ordered[:-1], axis=1)])
@@ -52,7 +52,7 @@ def merge_vertices(vertices: Array, faces: Array) -> tuple[Array, Array]:
         return on_device(points[np.sort(first)]), on_device(of_vertex[named])
 
 
-def _checked(vertices: Given, faces: Given) -> tuple[np.ndarray, np.ndarray]:
+def _check_mesh(vertices: Given, faces: Given) -> tuple[np.ndarray, np.ndarray]:
     points, named = np.asarray(jax.device_get(vertices)), np.asarray(jax.device_get(faces))
     if points.dtype not in (np.float32, np.float64):
         raise TypeError(f"vertices must be float32 or float64, got {points.dtype}.")

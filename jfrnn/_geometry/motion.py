@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry.lattice import Lattice, nearest_shifts, product, translation, units_of
-from jfrnn._geometry.wrapping import packed_turns, unpacked_turns
+from jfrnn._geometry.wrapping import pack_turns, unpack_turns
 
 
 class Motion(NamedTuple):
@@ -40,8 +40,8 @@ def motion_of(before: Array, now: Array, lattice: Lattice) -> Motion:
     most = jnp.max(taken, axis=1, keepdims=True, initial=0) + 1
     unsure = 8 * eps * units_of(size, dataclasses.replace(lattice, transform=transform)) + 2 * most * residual.sum(axis=0)[None]
     sure = jnp.where(periodic[None], jnp.abs(units - turns) + unsure < 0.5, True).all(axis=1)
-    packed = packed_turns(now, lattice)
-    home = unpacked_turns(packed, lattice.dim) - jnp.clip(turns, -(2.0**20), 2.0**20).astype(jnp.int32)
+    packed = pack_turns(now, lattice)
+    home = unpack_turns(packed, lattice.dim) - jnp.clip(turns, -(2.0**20), 2.0**20).astype(jnp.int32)
     return Motion(list(left.T), sure & ((packed >= 0) | ~was_turned), home)
 
 

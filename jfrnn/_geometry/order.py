@@ -10,7 +10,7 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn._geometry.curves import Words, hilbert_words, morton_words
-from jfrnn._geometry.inputs import checked_positions
+from jfrnn._geometry.inputs import check_positions
 from jfrnn._tracing import Given, compiled, on_device, own_transfers
 
 _SORT_BITS = 21  # float32 numbers 2^24 cells exactly: also the cells of a sort stay below it
@@ -41,8 +41,8 @@ def sort_order(positions: Array, cell_size: float, *, curve: str = "hilbert") ->
 
     Differentiable: no (integers). Jit: yes, cell_size and curve static. vmap: yes. Source: see the encoders.
     """
-    positions = checked_positions("positions", positions)
-    size = _checked_cell_size(cell_size, np.dtype(positions.dtype))
+    positions = check_positions("positions", positions)
+    size = _check_cell_size(cell_size, np.dtype(positions.dtype))
     if not isinstance(curve, str) or curve not in _CURVES:
         raise ValueError(f"curve must be one of {', '.join(map(repr, _CURVES))}, got {curve!r}.")
     with own_transfers():
@@ -119,7 +119,7 @@ def _row_words(axes: list[Array], bits: int) -> Words:
 _CURVES = {"row": _row_words, "morton": morton_words, "hilbert": hilbert_words}
 
 
-def _checked_cell_size(cell_size: Given, dtype: np.dtype) -> np.floating:
+def _check_cell_size(cell_size: Given, dtype: np.dtype) -> np.floating:
     """Return the edge of a cell, rounded once to the dtype of the positions."""
     if isinstance(cell_size, Tracer):
         raise TypeError("cell_size must be a static number, got a traced value: pass a Python float, or make it a static argument.")

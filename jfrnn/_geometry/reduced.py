@@ -19,12 +19,12 @@ def reduced_basis(vectors: np.ndarray, periodic: Sequence[bool]) -> tuple[Basis,
     rows = [[Fraction(x) for x in row] for row in vectors.tolist()]
     numbers = [[int(k == j) for j in range(len(rows))] for k in range(len(rows))]
     axes = [k for k, p in enumerate(periodic) if p]
-    while any(_shortened(rows, numbers, k, [j for j in axes if j != k]) for k in axes):
+    while any(_shorten(rows, numbers, k, [j for j in axes if j != k]) for k in axes):
         pass
     return tuple(map(tuple, numbers)), np.array([[float(x) for x in row] for row in rows])
 
 
-def _shortened(rows: list[list[Fraction]], numbers: list[list[int]], k: int, others: list[int]) -> bool:
+def _shorten(rows: list[list[Fraction]], numbers: list[list[int]], k: int, others: list[int]) -> bool:
     """Take whole numbers of the other vectors off row k if that makes it shorter."""
     best: tuple[int, ...] = (0,) * len(others)
     tried = list(product((-1, 0, 1), repeat=len(others)))

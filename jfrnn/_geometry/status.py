@@ -82,7 +82,7 @@ def shape_of(rows: Given) -> tuple[Any, ...]:
     return shape if len(shape) > 1 else (None, None)
 
 
-def told(x: Given, how: Callable[[np.ndarray], object]) -> str:
+def tell(x: Given, how: Callable[[np.ndarray], object]) -> str:
     """Say what an array comes to, for a line about what holds it; or why that is not known."""
     if isinstance(x, Tracer):
         return "traced"
@@ -102,12 +102,12 @@ def names_of_bits(status: Given) -> str:
         found = Status(int(np.bitwise_or.reduce(bits, axis=None)))
         return " | ".join(bit.name or "" for bit in Status if bit and bit in found) or "OK"
 
-    return told(status, names)
+    return tell(status, names)
 
 
 def pairs_and_status(count: Given, status: Given) -> str:
     """Say how many pairs rows have, and which bits are set."""
-    return f"{told(count, lambda x: np.sum(x, dtype=np.int64))} pairs, status {names_of_bits(status)}"
+    return f"{tell(count, lambda x: np.sum(x, dtype=np.int64))} pairs, status {names_of_bits(status)}"
 
 
 class NeighborOverflowError(RuntimeError):

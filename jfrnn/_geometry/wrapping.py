@@ -25,7 +25,7 @@ class Wrapped(NamedTuple):
     Attributes:
         sources: [n, d] wrapped, near enough: x - turns @ matrix but for rounding; NaN where they are out of range.
         queries: [m, d] likewise; the sources again where they are the queries.
-        turns: [n] int32, see `packed_turns`.
+        turns: [n] int32, see `pack_turns`.
         query_turns: [m] int32.
         slack: [] bound on the error of a component of a difference of wrapped coordinates, with a shift within reach.
         reach: [d] half the width of the stencil, in units of the transform: no pair is farther apart along an axis.
@@ -45,7 +45,7 @@ class Wrapped(NamedTuple):
     met: Array
 
 
-def packed_turns(points: Array, lattice: Lattice) -> Array:
+def pack_turns(points: Array, lattice: Lattice) -> Array:
     """Count the lattice vectors between the cell and each point, 0 along open axes: [n] int32, 10 bits for each axis.
 
     -1 where a point is not finite, -2 where it is farther away than `LARGEST_TURN`.
@@ -64,13 +64,13 @@ def _met(packed: Array, dim: int) -> Array:
 
     Reductions that any number of devices can do together: XLA has no bitwise one of integers for that.
     """
-    most = jnp.max(jnp.abs(unpacked_turns(packed, dim)), initial=0)
+    most = jnp.max(jnp.abs(unpack_turns(packed, dim)), initial=0)
     nowhere, far = jnp.any(packed == -1), jnp.any(packed == -2)
     return most | jnp.where(nowhere, NOT_FINITE, 0).astype(jnp.int32) | jnp.where(far, TOO_FAR, 0).astype(jnp.int32)
 
 
-def unpacked_turns(packed: Array, dim: int) -> Array:
-    """Read what `packed_turns` wrote: [..., d] int32, 0 where it is negative."""
+def unpack_turns(packed: Array, dim: int) -> Array:
+    """Read what `pack_turns` wrote: [..., d] int32, 0 where it is negative."""
     places = np.arange(dim, dtype=np.int32) * _TURN_BITS
     parts = packed[..., None] >> places.reshape((1,) * packed.ndim + (dim,))
     return jnp.where(packed[..., None] < 0, 0, (parts & ((1 << _TURN_BITS) - 1)) - (LARGEST_TURN + 1))
@@ -86,9 +86,9 @@ def wrap(sources: Array, queries: Array | None, lattice: Lattice, radius: np.flo
     dtype, images, dim = np.dtype(sources.dtype), lattice.images, lattice.dim
     eps, periodic = jnp.finfo(dtype).eps, np.array(images.periodic)
     clouds = [sources] if queries is None else [sources, queries]
-    packed, wrapped = [packed_turns(points, lattice) for points in clouds], []
+    packed, wrapped = [pack_turns(points, lattice) for points in clouds], []
     for points, turns in zip(clouds, packed, strict=True):
-        off = unpacked_turns(turns, dim).astype(dtype)
+        off = unpack_turns(turns, dim).astype(dtype)
         moved = jnp.where((off == 0).all(axis=1, keepdims=True), points, points - translation(off, lattice))
         wrapped.append(jnp.where(turns[:, None] >= 0, moved, jnp.nan))
     met = functools.reduce(jnp.bitwise_or, (_met(turns, dim) for turns in packed))

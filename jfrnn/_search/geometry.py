@@ -21,9 +21,9 @@ from jfrnn._geometry import (
     make_cutoffs,
     make_lattice,
     nearest_shifts,
-    shifted_pairs,
+    shift_pairs,
     turns_between,
-    unpacked_turns,
+    unpack_turns,
 )
 from jfrnn._tracing import call_apart, compiled
 
@@ -119,7 +119,7 @@ def periodic_vectors(
     lattice = make_lattice(box, kind, np.dtype(sources.dtype))
     used, neighbor, difference, shifts = _find_slots(idx, count, images, sources, rows, lattice, half)
     fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
-    pairs = shifted_pairs(difference, shifts, lattice)
+    pairs = shift_pairs(difference, shifts, lattice)
     fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
     mask = call_apart(is_pair_of, fixed_rows, fixed_sources, neighbor, used, cutoff, fixed_pairs)
     return jnp.where(mask[..., None], pairs.vectors, 0), mask, shifts
@@ -134,7 +134,7 @@ def _turns_now(
     wrapping it does: the image that a code tells of is the same one before and after.
     """
     both = [images.turns] if images.query_turns is None else [images.turns, images.query_turns]
-    turns = [unpacked_turns(x, lattice.dim).astype(sources.dtype) for x in both]
+    turns = [unpack_turns(x, lattice.dim).astype(sources.dtype) for x in both]
     if made is not None:
         since = zip(turns, made, (sources, rows), strict=False)
         turns = [x if before is None else x + turns_between(before, now, lattice) for x, before, now in since]

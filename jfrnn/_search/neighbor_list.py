@@ -22,17 +22,17 @@ from jfrnn._geometry import (
     NeighborOverflowError,
     Radii,
     Status,
+    check_active,
+    check_again,
+    check_box,
     check_devices,
-    checked_active,
-    checked_again,
-    checked_box,
-    checked_radii,
-    checked_slack,
-    fixed_box,
-    grown_images,
+    check_radii,
+    check_slack,
+    grow_images,
     known_status,
     make_cutoff,
     pairs_and_status,
+    round_box,
     shape_of,
 )
 from jfrnn._search.exports import DenseNeighbors, check_total, flat_pairs, pair_total
@@ -230,7 +230,7 @@ class NeighborList:
                 (`check`): no room makes positions finite, or a degenerate box one.
         """
         sources, rows = self._geometry_inputs(positions, queries)
-        queries, active, slack = rows if self.own_queries else None, self._check_active(active, sources), checked_slack(slack)
+        queries, active, slack = rows if self.own_queries else None, self._check_active(active, sources), check_slack(slack)
         box, radii = self._box_now(box, sources), self._radii_now(cutoff, sources, queries)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, radii, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
@@ -504,14 +504,14 @@ class NeighborList:
         if self.masked != (active is not None):
             state = "with active: pass active=" if self.masked else "without active: leave active out"
             raise ValueError(f"this list was made {state}.")
-        return None if active is None else checked_active(active, sources)
+        return None if active is None else check_active(active, sources)
 
     def _radii_now(self, cutoff: Given, sources: Array, queries: Array | None) -> Radii | None:
         if cutoff is None:
             return self.radii
         if self.radii is None:
             raise ValueError("this list was made with one cutoff for all particles: leave cutoff out.")
-        radii = checked_radii(cutoff, self.radii.rule, sources, queries)
+        radii = check_radii(cutoff, self.radii.rule, sources, queries)
         if radii is None:
             raise ValueError("this list was made with a cutoff for each particle: pass such an array, or leave cutoff out.")
         return radii
@@ -521,15 +521,15 @@ class NeighborList:
             return self.box
         if self.box is None:
             raise ValueError("this list was made without a periodic box: leave box out.")
-        checked = checked_box(box, sources, like=self.box)
-        return None if checked is None else fixed_box(checked, np.dtype(sources.dtype))
+        checked = check_box(box, sources, like=self.box)
+        return None if checked is None else round_box(checked, np.dtype(sources.dtype))
 
     def _grown_images(self, box: Box | None, radii: Radii | None) -> Images | None:
         if self.box_kind is None or self.box is None or box is None:
             return self.box_kind
         short = bool(np.any(np.asarray(jax.device_get(self.status)) & Status.BOX_TOO_SMALL.value))
         reach = self.problem.reach(radii)
-        return grown_images(self.box_kind, (box, self.box), reach, self.dtype, self.source_count, short)
+        return grow_images(self.box_kind, (box, self.box), reach, self.dtype, self.source_count, short)
 
     def _geometry(self, positions: Array, queries: Array | None, box: Box | None) -> tuple[Array, Array, Array | None]:
         sources, rows = self._geometry_inputs(positions, queries)
@@ -550,14 +550,14 @@ class NeighborList:
         return self.images, made
 
     def _geometry_inputs(self, positions: Array, queries: Array | None) -> tuple[Array, Array]:
-        sources = checked_again("positions", positions, self.dtype, self.dim, self.source_count)
+        sources = check_again("positions", positions, self.dtype, self.dim, self.source_count)
         check_devices("positions", sources, self.idx)
         if self.own_queries != (queries is not None):
             state = "with queries: pass queries=" if self.own_queries else "without queries: leave queries out"
             raise ValueError(f"this list was made {state}.")
         if queries is None:
             return sources, sources
-        rows = checked_again("queries", queries, self.dtype, self.dim, self.idx.shape[0])
+        rows = check_again("queries", queries, self.dtype, self.dim, self.idx.shape[0])
         check_devices("queries", rows, self.idx)
         return sources, rows
 

@@ -12,18 +12,18 @@ from jfrnn._geometry import (
     Box,
     Images,
     Radii,
-    checked_active,
-    checked_batch,
-    checked_box,
-    checked_cutoff,
-    checked_flag,
-    checked_positions,
-    checked_radii,
-    checked_skin,
-    fixed_box,
+    check_active,
+    check_batch,
+    check_box,
+    check_cutoff,
+    check_flag,
+    check_positions,
+    check_radii,
+    check_skin,
     images_of,
     largest_known,
     make_cutoff,
+    round_box,
 )
 from jfrnn._search.verlet import list_radius
 
@@ -101,36 +101,36 @@ def check_problem(
     active: Given,
 ) -> tuple["Problem", Inputs]:
     """Check the arguments that all public verbs share; return what is static of them, and the operands."""
-    sources = checked_positions("positions", positions)
+    sources = check_positions("positions", positions)
     if queries is not None:
-        queries = checked_positions("queries", queries, like=sources)
+        queries = check_positions("queries", queries, like=sources)
         for name, value in (("half", half), ("include_self", include_self)):
-            if checked_flag(name, value):
+            if check_flag(name, value):
                 raise ValueError(f"{name}=True pairs particles with themselves or each other: it cannot be used with queries.")
-    active = None if active is None else checked_active(active, sources)
+    active = None if active is None else check_active(active, sources)
     keep = Filter(
-        drop_self=queries is None and not checked_flag("include_self", include_self),
-        later_only=checked_flag("half", half),
+        drop_self=queries is None and not check_flag("include_self", include_self),
+        later_only=check_flag("half", half),
     )
     dtype = np.dtype(sources.dtype)
-    radii, closed = checked_radii(cutoff, radius_rule, sources, queries), checked_flag("closed", closed)
+    radii, closed = check_radii(cutoff, radius_rule, sources, queries), check_flag("closed", closed)
     if radii is None:
-        radius = float(checked_cutoff(cutoff, dtype).radius)
-        skin = checked_skin(skin, radius, dtype)
+        radius = float(check_cutoff(cutoff, dtype).radius)
+        skin = check_skin(skin, radius, dtype)
         largest = radius
     else:
         if keep.later_only and radii.rule in ("gather", "scatter"):
             raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
         radius, largest = None, largest_known(radii)
-        skin = checked_skin(skin, largest or 0.0, dtype)
+        skin = check_skin(skin, largest or 0.0, dtype)
     reach = None if largest is None else list_radius(largest, skin, dtype)
-    box = None if box is None else checked_box(box, sources)
+    box = None if box is None else check_box(box, sources)
     images = None if box is None else images_of(box, reach, dtype, sources.shape[0])
     kind = Kind(periodic=box is not None, radii=radii is not None, batch=batch is not None)
     engine = choose_engine(check_backend(backend), sources, queries, kind)
-    systems = None if batch is None else checked_batch(batch, sources, queries)
+    systems = None if batch is None else check_batch(batch, sources, queries)
     options = Options(keep, engine, closed, 0.0 if radii is None else skin, images, reach if engine.static_radius else None)
     shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}
     problem = Problem(options, radius, skin, **shape, dim=sources.shape[1], dtype=dtype)
-    box = None if box is None else fixed_box(box, dtype)
+    box = None if box is None else round_box(box, dtype)
     return problem, problem.inputs(sources, queries, active, box, radii, systems)

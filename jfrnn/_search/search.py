@@ -7,8 +7,8 @@ from jax.core import Tracer
 from jfrnn._engine import Inputs, Options, count_rows
 from jfrnn._geometry import (
     Box,
-    checked_capacity,
-    checked_slack,
+    check_capacity,
+    check_slack,
 )
 from jfrnn._search.making import count_capacity, find_fields
 from jfrnn._search.neighbor_list import NeighborList
@@ -115,10 +115,10 @@ def search(
     problem, inputs = check_problem(
         positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, skin, active
     )
-    slack = checked_slack(slack)
+    slack = check_slack(slack)
     if capacity is None:
         capacity = _count_capacity(inputs, problem.options, slack)
-    capacity = checked_capacity(capacity)
+    capacity = check_capacity(capacity)
     with own_transfers():
         fields = call_apart(lambda inputs: find_fields(inputs, problem.options, capacity, problem.skin > 0), inputs)
     return NeighborList(**fields, problem=problem)

@@ -25,7 +25,7 @@ from jfrnn._geometry import (
     make_lattice,
     motion_of,
     squared_distance,
-    widened,
+    widen,
 )
 
 
@@ -90,7 +90,7 @@ def moved_too_far(
                 moved = moved | (is_radius(before) != is_radius(now)).any()
                 grown = jnp.maximum(grown, _growth(before, now))
     if box is not None or radii is not None:
-        half = widened(half, (used + grown) / 4)
+        half = widen(half, (used + grown) / 4)
     for cloud, motion in zip(clouds, motions, strict=True):
         moved = moved | _any_beyond(*cloud, motion, half)
     return moved

@@ -12,7 +12,7 @@ from jax import Array, lax
 from jax.sharding import PartitionSpec
 
 from jfrnn._engine import ENGINES, Kind
-from jfrnn._geometry import checked_cutoff, checked_flag, checked_skin
+from jfrnn._geometry import check_cutoff, check_flag, check_skin
 from jfrnn._search import count, list_radius, round_capacity
 from jfrnn._shards.halo import Halo, exchanged, halo_in_shard, halo_spec, rows_seen
 from jfrnn._shards.particles import OVERFLOWS, Particles, of_shards, spec_of
@@ -38,14 +38,14 @@ def checked_asked(particles: object, cutoff: Given, skin: object, include_self: 
     if backend not in _BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(map(repr, _BACKENDS))} on several devices, got {backend!r}.")
     dtype = np.dtype(particles.positions.dtype)
-    radius = float(checked_cutoff(cutoff, dtype).radius)
-    skin = checked_skin(skin, radius, dtype)
+    radius = float(check_cutoff(cutoff, dtype).radius)
+    skin = check_skin(skin, radius, dtype)
     if list_radius(radius, skin, dtype) > particles.reach:
         raise ValueError(
             f"cutoff + skin must be at most {particles.reach}, the reach with which the particles were spread, got "
             f"{radius} + {skin}: pass larger ones to scatter."
         )
-    return Asked(radius, skin, checked_flag("include_self", include_self), checked_flag("closed", closed), backend)
+    return Asked(radius, skin, check_flag("include_self", include_self), check_flag("closed", closed), backend)
 
 
 def over_shards(fn: Callable[..., Tree], particles: Particles, out: Tree, *arguments: Tree) -> Tree:

@@ -17,7 +17,7 @@ from jax import Array, lax
 from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from jfrnn._geometry import Box, Status, checked_again, names_of_bits, shape_of
+from jfrnn._geometry import Box, Status, check_again, names_of_bits, shape_of
 from jfrnn._tracing import Given, Tree
 
 _STEP = 8  # sizes are rounded up to multiples, so that similar scenes share a compiled program
@@ -137,7 +137,7 @@ class Particles:
         """
         rows, dim = self.positions.shape
         if positions is not None:
-            positions = checked_again("positions", positions, np.dtype(self.positions.dtype), dim, rows, "this")
+            positions = check_again("positions", positions, np.dtype(self.positions.dtype), dim, rows, "this")
         for path, leaf in jax.tree_util.tree_leaves_with_path(values):
             if tuple(np.shape(leaf)[:1]) != (rows,):
                 name = f"values{jax.tree_util.keystr(path)}"

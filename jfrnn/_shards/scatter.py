@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jax.sharding import Mesh
 from jax.tree_util import KeyPath
 
-from jfrnn._geometry import Box, checked_box, checked_cutoff, checked_positions, checked_skin, checked_slack, images_of
+from jfrnn._geometry import Box, check_box, check_cutoff, check_positions, check_skin, check_slack, images_of
 from jfrnn._search import list_radius
 from jfrnn._shards.migrate import migrate
 from jfrnn._shards.particles import Particles, Sizes, no_requirements, placed, replicated, resized, room
@@ -55,12 +55,12 @@ def scatter(
     """
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((positions, values, box))):
         raise TypeError("scatter() chooses shapes from data and cannot run inside jax.jit: call it before, on arrays.")
-    checked_positions("positions", positions[:0] if hasattr(positions, "shape") and np.ndim(positions) else positions)
+    check_positions("positions", positions[:0] if hasattr(positions, "shape") and np.ndim(positions) else positions)
     x = np.asarray(positions)
     if len(x) > _MOST:
         raise ValueError(f"positions hold {len(x)} particles, but ids are int32: at most {_MOST}.")
     values = jax.tree_util.tree_map_with_path(lambda path, leaf: _checked_value(path, leaf, len(x)), values)
-    slack, reach = checked_slack(slack), _checked_reach(cutoff, skin, x.dtype)
+    slack, reach = check_slack(slack), _checked_reach(cutoff, skin, x.dtype)
     mesh, cut = _checked_mesh(mesh, x.shape[1]), _checked_along(along, x, mesh)
     fixed = None if box is None else _checked_box(box, x, reach, mesh)
     return _settled(_in_blocks(x, values, fixed, mesh, cut, reach), slack)
@@ -130,8 +130,8 @@ def _checked_value(path: KeyPath, leaf: Given, total: int) -> np.ndarray:
 
 
 def _checked_reach(cutoff: Given, skin: object, dtype: np.dtype) -> float:
-    radius = float(checked_cutoff(cutoff, dtype).radius)
-    return list_radius(radius, checked_skin(skin, radius, dtype), dtype)
+    radius = float(check_cutoff(cutoff, dtype).radius)
+    return list_radius(radius, check_skin(skin, radius, dtype), dtype)
 
 
 def _checked_mesh(mesh: object, dim: int) -> Mesh:
@@ -158,7 +158,7 @@ def _checked_along(along: Sequence[int] | None, x: np.ndarray, mesh: Mesh) -> tu
 
 def _checked_box(box: object, x: np.ndarray, reach: float, mesh: Mesh) -> Box | None:
     """Return the box in the dtype of positions, its images chosen as on one device, on every device."""
-    checked = checked_box(box, cast(Any, x))
+    checked = check_box(box, cast(Any, x))
     if checked is None:
         return None
     if not checked.orthogonal:

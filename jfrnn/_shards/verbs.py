@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._geometry import Status, checked_capacity, checked_flag, checked_slack, known_status
+from jfrnn._geometry import Status, check_capacity, check_flag, check_slack, known_status
 from jfrnn._search import ROWS_ARE_WHOLE, NeighborList
 from jfrnn._shards.calls import Asked, checked_asked, checked_halo, count_capacity, counts, is_good, marked, over_shards, seen
 from jfrnn._shards.halo import Halo, exchanged, halo_in_shard
@@ -51,14 +51,14 @@ def search(
     Cost: on each device that of `jfrnn.search` for its own particles and those of its halo. Communication: positions of halos.
     Differentiable: no. Jit: yes, with capacity. vmap: no.
     """
-    asked, slack = checked_asked(particles, cutoff, skin, include_self, closed, backend), checked_slack(slack)
+    asked, slack = checked_asked(particles, cutoff, skin, include_self, closed, backend), check_slack(slack)
     if capacity is None:
         if isinstance(particles.ids, Tracer):
             raise ValueError(
                 "capacity must be given where particles are traced, because it is a shape: pass that of an earlier search."
             )
         capacity = count_capacity(particles, asked, slack)
-    return listed(particles, asked, checked_capacity(capacity))
+    return listed(particles, asked, check_capacity(capacity))
 
 
 def count(
@@ -158,7 +158,7 @@ def pair_sum(
     if halo is not None:
         checked_halo(halo, particles)
     local = None if neighbors is None else neighbors.local
-    return _sums(particles, halo, local, values, fn, asked, reduce, checked_flag("compensated", compensated))
+    return _sums(particles, halo, local, values, fn, asked, reduce, check_flag("compensated", compensated))
 
 
 @functools.partial(jax.jit, static_argnames=("fn", "asked", "reduce", "compensated"))

@@ -28,7 +28,7 @@ from jfrnn._engine import (
     pair_sums,
     prepare_search,
 )
-from jfrnn._geometry import Radii, unpacked_turns
+from jfrnn._geometry import Radii, unpack_turns
 from jfrnn._sums.scalars import NoTranslationError, hash_of
 from jfrnn._sums.terms import POSITIONS, Groups, Term, joined
 from jfrnn._sums.translate import input_name, output_name, translate
@@ -171,7 +171,7 @@ def extremes(
     source, shifts = which[..., 0], None
     if search.torus is not None:
         lattice, wrapped = search.torus
-        mine, theirs = (unpacked_turns(x, lattice.dim) for x in (wrapped.query_turns, wrapped.turns))
+        mine, theirs = (unpack_turns(x, lattice.dim) for x in (wrapped.query_turns, wrapped.turns))
         shifts = jnp.asarray(lattice.images.shifts)[which[..., 1]] + mine[:, None] - theirs.at[source].get(mode="clip")
         shifts = shifts.astype(values.dtype)
     ends = np.cumsum([math.prod(like.shape) for like in term.summands])[:-1]

@@ -12,7 +12,7 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn._engine import Inputs, Options, hide_inactive, is_decidable
-from jfrnn._geometry import Box, Images, Lattice, Radii, Status, checked_cutoff, make_cutoffs, make_lattice, translation
+from jfrnn._geometry import Box, Images, Lattice, Radii, Status, check_cutoff, make_cutoffs, make_lattice, translation
 from jfrnn._search import ROWS_ARE_WHOLE, NeighborList
 from jfrnn._sums.extremes import bind_extremes
 from jfrnn._sums.pair_function import call_with_pair
@@ -69,7 +69,7 @@ def listed(
         raise ValueError("neighbors must be a full list for reduce='max', 'min' and compensated=True: search without half=True.")
     sources, rows = nbrs._geometry_inputs(positions, queries)
     dtype = np.dtype(sources.dtype)
-    if cutoff is not None and (nbrs.cutoff is None or float(checked_cutoff(cutoff, dtype).radius) != nbrs.cutoff):
+    if cutoff is not None and (nbrs.cutoff is None or float(check_cutoff(cutoff, dtype).radius) != nbrs.cutoff):
         has = "a cutoff per particle" if nbrs.cutoff is None else f"cutoff={nbrs.cutoff}"
         raise ValueError(f"cutoff must be None or that of the list, which has {has}, got {cutoff!r}.")
     own = nbrs.own_queries

@@ -8,7 +8,7 @@ from jax import Array
 from jax.tree_util import KeyPath
 
 from jfrnn._engine import ARRAYS, Inputs, Options, check_backend, platform_of
-from jfrnn._geometry import Box, checked_flag
+from jfrnn._geometry import Box, check_flag
 from jfrnn._search import NeighborList, check_problem
 from jfrnn._tracing import Given, Tree, on_device, own_transfers
 
@@ -119,7 +119,7 @@ def pair_sum(
         raise ValueError(f"reduce must be one of {', '.join(map(repr, REDUCTIONS))}, got {reduce!r}.")
     if symmetry not in SYMMETRIES:
         raise ValueError(f"symmetry must be None, 'symmetric' or 'antisymmetric', got {symmetry!r}.")
-    compensated = checked_flag("compensated", compensated)
+    compensated = check_flag("compensated", compensated)
     if neighbors is None:
         if cutoff is None:
             raise ValueError("cutoff must be given: only a list (neighbors=) has its own.")

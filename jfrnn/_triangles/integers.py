@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._geometry import GUARDS, carried_limbs, fields_of, full_count, limb_sign, limbs_of
+from jfrnn._geometry import GUARDS, carry_limbs, fields_of, full_count, limb_sign, limbs_of
 
 _NONE = 1 << 20  # beyond every place of a bit
 _MOST_PRODUCTS = 64  # of a round
@@ -68,7 +68,7 @@ def is_near(shapes: Shapes, origin: Array, count: int) -> Array:
     ends, starts = np.concatenate([corners, after, [radius, radius]]), np.concatenate([points, corners, [radius, radius]])
     limbs, lower = (limbs_of(_rows(numbers, rows), count + 1, origin[None]) for rows in (ends, starts))  # one more for the sign
     times = (np.arange(len(ends)) != len(ends) - 2).astype(limbs.dtype)[:, None, None]  # nothing is taken off the cutoff
-    vectors = carried_limbs(limbs - lower * times)
+    vectors = carry_limbs(limbs - lower * times)
     one = np.zeros((len(ends), 1, count + 1), limbs.dtype)
     one[-1, 0, 0] = 1
     vectors = vectors + one  # corners seen from the point, sides, the cutoff and one: [rows, k, limbs]
@@ -81,7 +81,7 @@ def _near_segment(vectors: Array) -> Array:
     limit = _product(radius, radius)
     square = jnp.stack([sums[0], sums[1]]) - limit
     place, length = -sums[2:3], sums[3:]
-    square, place, length, rest = _split(carried_limbs(jnp.concatenate([square, place, length, length - place])), 2, 1, 1, 1)
+    square, place, length, rest = _split(carry_limbs(jnp.concatenate([square, place, length, length - place])), 2, 1, 1, 1)
     beside = _product(square[:1], length) - _product(place, place)
     return _near_parts(_signs(square), _signs(place), _signs(rest), limb_sign(beside))
 
@@ -93,7 +93,7 @@ def _near_triangle(vectors: Array) -> Array:
     """
     found, signs = vectors, []
     for left, right, table in _triangle_rounds():
-        found = carried_limbs(_summed(table, _product(_rows(found, left), _rows(found, right))))
+        found = carry_limbs(_summed(table, _product(_rows(found, left), _rows(found, right))))
         signs.append(_signs(found))
     first, second, third = signs
     near = _near_parts(first[0:3], first[3:6], first[9:12], second[:3])

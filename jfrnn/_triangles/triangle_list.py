@@ -15,9 +15,9 @@ from jfrnn._geometry import (
     Cutoff,
     NeighborOverflowError,
     Status,
+    check_again,
     check_devices,
-    checked_again,
-    checked_slack,
+    check_slack,
     known_status,
     make_cutoff,
     pairs_and_status,
@@ -149,7 +149,7 @@ class TriangleList:
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((points, corners, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
         with own_transfers():
-            met = round_capacity(math.ceil(checked_slack(slack) * int(np.max(np.asarray(self.required)))))
+            met = round_capacity(math.ceil(check_slack(slack) * int(np.max(np.asarray(self.required)))))
         counted = counted_slots(points, corners, self.faces, self.cutoff, self._engine, slack)
         capacity, cells = max(self.capacity, met, counted), self.cells if vertices is None else None
         found = found_triangles(points, corners, self.faces, cells, self.cutoff, self._engine, capacity)
@@ -289,11 +289,11 @@ class TriangleList:
 
     def _checked(self, positions: Array, vertices: Array | None) -> tuple[Array, Array]:
         dtype, (count, dim) = np.dtype(self.vertices.dtype), self.vertices.shape
-        points = checked_again("positions", positions, dtype, dim, self.idx.shape[0])
+        points = check_again("positions", positions, dtype, dim, self.idx.shape[0])
         check_devices("positions", points, self.idx)
         if vertices is None:
             return points, self.vertices
-        corners = checked_again("vertices", vertices, dtype, dim, count)
+        corners = check_again("vertices", vertices, dtype, dim, count)
         check_devices("vertices", corners, self.idx)
         return points, corners
 

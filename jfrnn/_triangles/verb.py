@@ -5,7 +5,7 @@ from jax import Array
 from jax.core import Tracer
 
 from jfrnn._engine import PLATFORMS, choose_engine, platform_of
-from jfrnn._geometry import check_is_known, checked_capacity, checked_cutoff, checked_positions, checked_slack
+from jfrnn._geometry import check_capacity, check_cutoff, check_is_known, check_positions, check_slack
 from jfrnn._tracing import Given, gather, make_on_host
 from jfrnn._triangles.engines import TRIANGLE_BACKENDS, TRIANGLE_ENGINES, TriangleEngine, fastest_of
 from jfrnn._triangles.programs import counted_slots, found_triangles
@@ -72,11 +72,11 @@ def search_triangles(
     >>> tri.count
     Array([1, 0, 1], dtype=int32)
     """
-    points = checked_positions("positions", positions)
-    corners = checked_positions("vertices", vertices, like=points)
+    points = check_positions("positions", positions)
+    corners = check_positions("vertices", vertices, like=points)
     named = _checked_faces(faces, points.shape[1], corners.shape[0])
-    radius = float(checked_cutoff(cutoff, np.dtype(points.dtype)).radius)
-    engine, slack = _choose_engine(backend, points), checked_slack(slack)
+    radius = float(check_cutoff(cutoff, np.dtype(points.dtype)).radius)
+    engine, slack = _choose_engine(backend, points), check_slack(slack)
     if capacity is None:
         if any(isinstance(x, Tracer) for x in (points, corners, named)):
             raise ValueError(
@@ -84,7 +84,7 @@ def search_triangles(
                 "shape: pass the capacity of an earlier search, with room to move, and check tri.overflow."
             )
         capacity = counted_slots(points, corners, named, radius, engine, slack)
-    found = found_triangles(points, corners, named, None, radius, engine, checked_capacity(capacity))
+    found = found_triangles(points, corners, named, None, radius, engine, check_capacity(capacity))
     closed = None if isinstance(named, Tracer) else is_closed(named)
     return TriangleList(**found, cutoff=radius, backend=engine.name, closed=closed)
 
