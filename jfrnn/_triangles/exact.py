@@ -56,7 +56,7 @@ def sure_pairs(points: Vector, corners: list[Vector], cutoff: Cutoff, zero: Arra
 
 def _is_surely_near(x: list[Vector], weights: Vector, radius: Array) -> Array:
     eps = jnp.finfo(weights[0].dtype).eps
-    foot = _combined(weights, x)
+    foot = _combine(weights, x)
     size = sum_of([w * sum_of([jnp.abs(component) for component in corner]) for w, corner in zip(weights, x, strict=True)])
     reach = radius * sum_of(weights) * (1 - 8 * eps) - 4 * eps * size
     return (reach > 0) & (dot(foot, foot) * (1 + 16 * eps) < reach * reach)
@@ -82,7 +82,7 @@ def _nearest(x: list[Vector], zero: Array) -> tuple[Vector, Vector]:
         place = jnp.clip(place, 0, 1)
         here = [jnp.zeros_like(place) for _ in x]
         here[i], here[j] = 1 - place, place
-        point = _combined(here, x, zero)
+        point = _combine(here, x, zero)
         square = dot(point, point, zero)
         if best is None:
             best, weights, foot = square, here, point
@@ -141,7 +141,7 @@ def minus(a: Vector, b: Vector) -> Vector:
     return [x - y for x, y in zip(a, b, strict=True)]
 
 
-def _combined(weights: Vector, x: list[Vector], zero: Array | None = None) -> Vector:
+def _combine(weights: Vector, x: list[Vector], zero: Array | None = None) -> Vector:
     return [dot(weights, [corner[k] for corner in x], zero) for k in range(len(x[0]))]
 
 
@@ -151,13 +151,13 @@ def _refine(open_pairs: Array, shapes_at: ShapesAt) -> Array:
     def decide(open_pairs: Array) -> Array:
         state = jnp.where(open_pairs, _USUAL, 0).astype(jnp.int32)
         for waiting, chunk in ((_USUAL, _USUAL_CHUNK), (_WIDE, _WIDE_CHUNK)):
-            state = _decided(state, waiting, min(chunk, state.size), shapes_at)
+            state = _decide(state, waiting, min(chunk, state.size), shapes_at)
         return state == 1
 
     return lax.cond(jnp.any(open_pairs), decide, jnp.zeros_like, open_pairs)
 
 
-def _decided(state: Array, waiting: int, chunk: int, shapes_at: ShapesAt) -> Array:
+def _decide(state: Array, waiting: int, chunk: int, shapes_at: ShapesAt) -> Array:
     """Let integers decide [q] pairs that wait for these: 0 far, 1 near, or, where they are not wide enough, _WIDE."""
     size = len(state)
 

@@ -93,7 +93,7 @@ def _near_triangle(vectors: Array) -> Array:
     """
     found, signs = vectors, []
     for left, right, table in _triangle_rounds():
-        found = carry_limbs(_summed(table, _product(_rows(found, left), _rows(found, right))))
+        found = carry_limbs(_sum_rows(table, _product(_rows(found, left), _rows(found, right))))
         signs.append(_signs(found))
     first, second, third = signs
     near = _near_parts(first[0:3], first[3:6], first[9:12], second[:3])
@@ -104,7 +104,7 @@ def _rows(x: Array, which: np.ndarray) -> Array:
     return x.at[which.astype(np.int32)].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
-def _summed(table: np.ndarray, products: Array) -> Array:
+def _sum_rows(table: np.ndarray, products: Array) -> Array:
     """Return sums [rows, k, limbs] of products [n, k, limbs]: of a table [rows, n] of 1, -1 and 0, what belongs to each."""
     terms = int(np.abs(table).sum(axis=1).max())
     which = np.argsort(table == 0, axis=1, kind="stable")[:, :terms]  # those that belong to it first
@@ -128,7 +128,7 @@ class _Table:
             self.right.append(int(b))
         return total
 
-    def made(self, sums: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def make(self, sums: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the rows of both factors of each product, and the table of sums."""
         return np.array(self.left), np.array(self.right), np.stack(sums)[:, : len(self.left)]
 
@@ -148,14 +148,14 @@ def _triangle_rounds() -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]:
     crosses = [[table.dot(a[[j, k]], b[[k, j]], (1, -1)) for j, k in axes] for a, b in one_two]
     normal = [crosses[0][k] + crosses[1][k] + crosses[2][k] for k in range(3)]
     sums = [*(s - limit for s in squares), *(-p for p in places), *lengths, *(q + p for q, p in zip(lengths, places, strict=True))]
-    first = table.made([*sums, *crosses[0], *crosses[1], *crosses[2], *normal, limit, *seen, one])
+    first = table.make([*sums, *crosses[0], *crosses[1], *crosses[2], *normal, limit, *seen, one])
     table, cross, normal = _Table(), np.arange(12, 21).reshape(3, 3), np.arange(21, 24)
     beside = [table.dot([i, 3 + i], [6 + i, 3 + i], (1, -1)) for i in of_corners]
     inside = [table.dot(cross[i], normal) for i in of_corners]
     area, height = table.dot(normal, normal), table.dot(range(25, 28), normal)
-    second = table.made([*beside, *inside, area, height, table.dot([24], [28])])
+    second = table.make([*beside, *inside, area, height, table.dot([24], [28])])
     table = _Table()
-    return first, second, table.made([table.dot([7, 8], [7, 6], (1, -1))])
+    return first, second, table.make([table.dot([7, 8], [7, 6], (1, -1))])
 
 
 def _near_parts(square: Array, place: Array, rest: Array, beside: Array) -> Array:

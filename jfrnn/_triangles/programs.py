@@ -15,15 +15,15 @@ from jfrnn._triangles.cells import without_faults
 from jfrnn._triangles.engines import TriangleEngine, Wall
 
 
-def counted_slots(points: Array, vertices: Array, faces: Array, cutoff: float, engine: TriangleEngine, slack: float) -> int:
+def count_slots(points: Array, vertices: Array, faces: Array, cutoff: float, engine: TriangleEngine, slack: float) -> int:
     """Count the triangles near concrete positions and return a capacity that holds `slack` times the longest row."""
     with at_once(), own_transfers():
-        found = found_triangles(points, vertices, faces, None, cutoff, engine, None)
+        found = find_fields(points, vertices, faces, None, cutoff, engine, None)
         longest = int(found["required"])
     return round_capacity(math.ceil(max(longest, 1) * slack))
 
 
-def found_triangles(
+def find_fields(
     points: Array,
     vertices: Array,
     faces: Array,

@@ -45,7 +45,7 @@ def level_starts(faces: int) -> np.ndarray:
         faces = size // WIDTH
 
 
-def widened(corners: Array, cutoff: Cutoff) -> tuple[Array, Array]:
+def boxes_around(corners: Array, cutoff: Cutoff) -> tuple[Array, Array]:
     """Return the corners, low and high, [f, d] each, of boxes that hold all particles near triangles [f, corner, axis]."""
     wide = jnp.asarray(cutoff.radius) * (1 + 8 * jnp.finfo(corners.dtype).eps)  # subtraction rounds monotonously
     return jnp.min(corners, axis=1) - wide, jnp.max(corners, axis=1) + wide
@@ -54,7 +54,7 @@ def widened(corners: Array, cutoff: Cutoff) -> tuple[Array, Array]:
 def grow_tree(corners: Array, good: Array, cutoff: Cutoff) -> TriangleTree:
     """Put triangles [f, corner, axis] with f > 0 into a tree; those that are not `good` [f] bool are in no box."""
     faces, dim = corners.shape[:2]
-    low, high = widened(corners, cutoff)
+    low, high = boxes_around(corners, cutoff)
     middle = jnp.where(good[:, None], 0.5 * low + 0.5 * high, jnp.nan)
     finite, finfo = jnp.isfinite(middle), jnp.finfo(corners.dtype)
     least = jnp.min(middle, axis=0, initial=finfo.max, where=finite)

@@ -29,7 +29,7 @@ from jfrnn._triangles.cells import TriangleCells, without_faults
 from jfrnn._triangles.closest import Rows, nearest_of, pseudonormals
 from jfrnn._triangles.contacts import are_contacts
 from jfrnn._triangles.engines import TRIANGLE_ENGINES, TriangleEngine
-from jfrnn._triangles.programs import counted_slots, found_triangles
+from jfrnn._triangles.programs import count_slots, find_fields
 from jfrnn._triangles.rows import are_near, nearest_slots
 from jfrnn._triangles.tree import TriangleTree, grow_tree
 from jfrnn._triangles.winding import is_closed, least_winding, ray_ways
@@ -124,11 +124,11 @@ class TriangleList:
 
         Differentiable: no gradient flows through. Jit: yes. vmap: yes.
         """
-        points, corners = self._checked(positions, vertices)
+        points, corners = self._check_points(positions, vertices)
         cells = self.cells if vertices is None else None
-        found = found_triangles(points, corners, self.faces, cells, self.cutoff, self._engine, self.capacity)
+        found = find_fields(points, corners, self.faces, cells, self.cutoff, self._engine, self.capacity)
         found |= {"status": found["status"] | self.status, "required": jnp.maximum(found["required"], self.required)}
-        return dataclasses.replace(self, **found, closed=self._closed_again())
+        return dataclasses.replace(self, **found, closed=self._copy_closed())
 
     def grow(self, positions: Array, *, vertices: Array | None = None, slack: float = 1.25) -> "TriangleList":
         """Make a list with room for what overflowed, at these positions. Not inside jit: the capacity is a shape.
@@ -145,17 +145,17 @@ class TriangleList:
             TypeError: positions, vertices or the list are traced.
             ValueError, TypeError: an argument does not fit the list.
         """
-        points, corners = self._checked(positions, vertices)
+        points, corners = self._check_points(positions, vertices)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((points, corners, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
         with own_transfers():
             met = round_capacity(math.ceil(check_slack(slack) * int(np.max(np.asarray(self.required)))))
-        counted = counted_slots(points, corners, self.faces, self.cutoff, self._engine, slack)
+        counted = count_slots(points, corners, self.faces, self.cutoff, self._engine, slack)
         capacity, cells = max(self.capacity, met, counted), self.cells if vertices is None else None
-        found = found_triangles(points, corners, self.faces, cells, self.cutoff, self._engine, capacity)
-        return dataclasses.replace(self, **found, closed=self._closed_again())
+        found = find_fields(points, corners, self.faces, cells, self.cutoff, self._engine, capacity)
+        return dataclasses.replace(self, **found, closed=self._copy_closed())
 
-    def _closed_again(self) -> Array | None:
+    def _copy_closed(self) -> Array | None:
         """Return `closed` for a list made of this one: no two lists share memory, either may be donated."""
         return None if self.closed is None else jnp.array(self.closed, copy=True)
 
@@ -201,7 +201,7 @@ class TriangleList:
         Differentiable: to any order in positions and vertices, where the nearest point does not jump; the gradient of a distance
         of 0 is 0. Jit: yes. vmap: yes. Source: Ericson (2005), sect. 5.1.
         """
-        points, corners = self._checked(positions, vertices)
+        points, corners = self._check_points(positions, vertices)
         self._check_rows()
         if 0 in (*self.idx.shape, self.faces.shape[0]):
             none = jnp.zeros(self.idx.shape, points.dtype)
@@ -244,7 +244,7 @@ class TriangleList:
         >>> tri.count, tri.contacts(x)[2].sum()
         (Array([2], dtype=int32), Array(1, dtype=int32))
         """
-        points, corners = self._checked(positions, vertices)
+        points, corners = self._check_points(positions, vertices)
         if 0 in (*self.idx.shape, self.faces.shape[0]):
             return self.closest(points, vertices=vertices)
         self._check_rows()
@@ -279,7 +279,7 @@ class TriangleList:
         vmap: yes.
         Source: Baerentzen & Aanaes (2005), doi:10.1109/TVCG.2005.49.
         """
-        points, corners = self._checked(positions, vertices)
+        points, corners = self._check_points(positions, vertices)
         self._check_rows()
         if 0 in (*self.idx.shape, self.faces.shape[0]):
             none = jnp.zeros(points.shape[0], points.dtype)
@@ -287,7 +287,7 @@ class TriangleList:
         tri = self if vertices is None else dataclasses.replace(self, cells=None)
         return _signed_distance(tri, points, corners)
 
-    def _checked(self, positions: Array, vertices: Array | None) -> tuple[Array, Array]:
+    def _check_points(self, positions: Array, vertices: Array | None) -> tuple[Array, Array]:
         dtype, (count, dim) = np.dtype(self.vertices.dtype), self.vertices.shape
         points = check_again("positions", positions, dtype, dim, self.idx.shape[0])
         check_devices("positions", points, self.idx)

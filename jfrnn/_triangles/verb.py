@@ -8,7 +8,7 @@ from jfrnn._engine import PLATFORMS, choose_engine, platform_of
 from jfrnn._geometry import check_capacity, check_cutoff, check_is_known, check_positions, check_slack
 from jfrnn._tracing import Given, gather, make_on_host
 from jfrnn._triangles.engines import TRIANGLE_BACKENDS, TRIANGLE_ENGINES, TriangleEngine, fastest_of
-from jfrnn._triangles.programs import counted_slots, found_triangles
+from jfrnn._triangles.programs import count_slots, find_fields
 from jfrnn._triangles.triangle_list import TriangleList
 from jfrnn._triangles.winding import is_closed
 
@@ -74,7 +74,7 @@ def search_triangles(
     """
     points = check_positions("positions", positions)
     corners = check_positions("vertices", vertices, like=points)
-    named = _checked_faces(faces, points.shape[1], corners.shape[0])
+    named = _check_faces(faces, points.shape[1], corners.shape[0])
     radius = float(check_cutoff(cutoff, np.dtype(points.dtype)).radius)
     engine, slack = _choose_engine(backend, points), check_slack(slack)
     if capacity is None:
@@ -83,13 +83,13 @@ def search_triangles(
                 "capacity must be given where positions, vertices or faces are traced (jax.jit, vmap, grad, scan), because it is a "
                 "shape: pass the capacity of an earlier search, with room to move, and check tri.overflow."
             )
-        capacity = counted_slots(points, corners, named, radius, engine, slack)
-    found = found_triangles(points, corners, named, None, radius, engine, check_capacity(capacity))
+        capacity = count_slots(points, corners, named, radius, engine, slack)
+    found = find_fields(points, corners, named, None, radius, engine, check_capacity(capacity))
     closed = None if isinstance(named, Tracer) else is_closed(named)
     return TriangleList(**found, cutoff=radius, backend=engine.name, closed=closed)
 
 
-def _checked_faces(faces: Given, dim: int, vertices: int) -> Array:
+def _check_faces(faces: Given, dim: int, vertices: int) -> Array:
     """Return faces as int32 [f, dim]; what names no vertex stays out of range."""
     kind = "triangles" if dim == 3 else "segments"
     if not hasattr(faces, "dtype") or not np.issubdtype(faces.dtype, np.integer):
@@ -100,11 +100,11 @@ def _checked_faces(faces: Given, dim: int, vertices: int) -> Array:
     check_is_known("faces", faces.shape)
     least = 0 if np.issubdtype(faces.dtype, np.unsignedinteger) else -1
     if isinstance(faces, Tracer):
-        return _clipped(gather(faces), least, vertices)
-    return make_on_host(faces, lambda known: _clipped(known, least, vertices))
+        return _clip(gather(faces), least, vertices)
+    return make_on_host(faces, lambda known: _clip(known, least, vertices))
 
 
-def _clipped(faces: Given, least: int, most: int) -> Given:
+def _clip(faces: Given, least: int, most: int) -> Given:
     return (faces.clip(least, most) if np.iinfo(faces.dtype).max > most else faces).astype(np.int32)
 
 

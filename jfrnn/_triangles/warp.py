@@ -29,7 +29,7 @@ from jfrnn._geometry import Cutoff
 from jfrnn._triangles.cells import LANES, MOST_CELLS, TriangleCells, bucket_count, entry_count, level_limit
 from jfrnn._triangles.cells import sort_triangles as sort_by_jax
 from jfrnn._triangles.rows import decide_pairs as decide_by_jax
-from jfrnn._triangles.tree import WIDTH, TriangleTree, level_starts, widened
+from jfrnn._triangles.tree import WIDTH, TriangleTree, boxes_around, level_starts
 
 TriangleKernels = Any  # what `triangle_kernels` of a module of `jfrnn.kernels` returns
 
@@ -80,7 +80,7 @@ def query_inputs(positions: Array, corners: Array, cells: TriangleCells | Triang
     if isinstance(cells, TriangleTree):
         starts, none = jnp.asarray(level_starts(len(corners))), jnp.zeros(1, jnp.int32)
         return positions, corners, cells.boxes, radius, starts, cells.triangles, none, none, none
-    boxes = jnp.concatenate(widened(corners, cutoff), axis=1)
+    boxes = jnp.concatenate(boxes_around(corners, cutoff), axis=1)
     return positions, corners, boxes, radius, *cells._replace(level_count=jnp.reshape(cells.level_count, 1))
 
 
