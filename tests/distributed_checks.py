@@ -148,9 +148,9 @@ def particles_move_across_several_shards():
 def roomy(particles):
     """Return particles with room for a halo of all others, and for all on one shard."""
     sizes = distributed.Sizes(particles.total, (particles.total,) * len(particles.along), (7,) * len(particles.along))
-    from jfrnn._shards.particles import resized
+    from jfrnn._shards.particles import resize
 
-    return resized(particles, sizes)
+    return resize(particles, sizes)
 
 
 @check

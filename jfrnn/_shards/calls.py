@@ -14,7 +14,7 @@ from jax.sharding import PartitionSpec
 from jfrnn._engine import ENGINES, Kind
 from jfrnn._geometry import check_cutoff, check_flag, check_skin
 from jfrnn._search import count, list_radius, round_capacity
-from jfrnn._shards.halo import Halo, exchanged, halo_in_shard, halo_spec, rows_seen
+from jfrnn._shards.halo import Halo, exchange, halo_in_shard, halo_spec, rows_seen
 from jfrnn._shards.particles import OVERFLOWS, Particles, of_shards, spec_of
 from jfrnn._tracing import Given, Tree
 
@@ -32,7 +32,7 @@ class Asked(NamedTuple):
     backend: str
 
 
-def checked_asked(particles: object, cutoff: Given, skin: object, include_self: object, closed: object, backend: Given) -> Asked:
+def check_asked(particles: object, cutoff: Given, skin: object, include_self: object, closed: object, backend: Given) -> Asked:
     if not isinstance(particles, Particles):
         raise TypeError(f"particles must be what jfrnn.distributed.scatter returns, got {type(particles).__name__}.")
     if backend not in _BACKENDS:
@@ -62,7 +62,7 @@ def over_shards(fn: Callable[..., Tree], particles: Particles, out: Tree, *argum
     return jax.shard_map(fn, mesh=particles.mesh, in_specs=specs, out_specs=out, check_vma=False)(*arguments)
 
 
-def checked_halo(halo: object, particles: Particles) -> None:
+def check_halo(halo: object, particles: Particles) -> None:
     """Refuse a halo of particles that are laid out otherwise: after `grow`, what was made before is of no use.
 
     Raises:
@@ -121,7 +121,7 @@ class Seen(NamedTuple):
 
 
 def seen(particles: Particles, halo: Halo) -> Seen:
-    return Seen(exchanged(particles.positions, halo, particles), halo.ids >= 0)
+    return Seen(exchange(particles.positions, halo, particles), halo.ids >= 0)
 
 
 def is_good(particles: Particles, halo: Halo) -> Array:
@@ -130,7 +130,7 @@ def is_good(particles: Particles, halo: Halo) -> Array:
     return ~lax.pmax(other, particles.mesh.axis_names) & ((halo.status & OVERFLOWS.value) == 0)
 
 
-def marked(x: Array, good: Array) -> Array:
+def mark(x: Array, good: Array) -> Array:
     """Return what is no result where pairs may be missing; its derivatives likewise."""
     if jnp.issubdtype(x.dtype, jnp.floating):
         return x * jnp.where(good, 1, jnp.nan).astype(x.dtype)
@@ -139,16 +139,16 @@ def marked(x: Array, good: Array) -> Array:
 
 @functools.partial(jax.jit, static_argnames="asked")
 def counts(particles: Particles, halo: Halo | None, asked: Asked) -> Array:
-    def counted(particles: Particles, halo: Halo | None) -> Array:
+    def count_shard(particles: Particles, halo: Halo | None) -> Array:
         halo = halo_in_shard(particles) if halo is None else halo
         x, active = seen(particles, halo)
         radius = list_radius(asked.cutoff, asked.skin, np.dtype(x.dtype))
         counts = count(
             x, radius, box=particles.box, include_self=asked.include_self, closed=asked.closed, active=active, backend=asked.backend
         )
-        return marked(counts[: particles.sizes.particles], is_good(particles, halo))
+        return mark(counts[: particles.sizes.particles], is_good(particles, halo))
 
-    return over_shards(counted, particles, of_shards(particles.mesh), lax.stop_gradient(particles), halo)
+    return over_shards(count_shard, particles, of_shards(particles.mesh), lax.stop_gradient(particles), halo)
 
 
 def count_capacity(particles: Particles, asked: Asked, slack: float) -> int:

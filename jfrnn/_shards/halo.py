@@ -26,7 +26,7 @@ from jax import Array, lax
 
 from jfrnn._geometry import Status
 from jfrnn._search import MOST_PAIRS, saturating_add
-from jfrnn._shards.particles import Particles, Required, of_shards, shared_bits
+from jfrnn._shards.particles import Particles, Required, of_shards, share_bits
 from jfrnn._tracing import set_places
 
 
@@ -116,10 +116,10 @@ def halo_in_shard(particles: Particles) -> Halo:
         status = status | jnp.where(largest > room, Status.HALO_OVERFLOW.value, 0)
         status = status | jnp.where(farthest > particles.sizes.hops[stage.number], Status.HALO_TOO_FAR.value, 0)
         sizes, hops, sent = [*sizes, largest], [*hops, farthest], functools.reduce(saturating_add, counts, sent)
-        x, numbers = (_with_received(leaf, sends[-1], particles, stage) for leaf in (x, numbers))
+        x, numbers = (_append_received(leaf, sends[-1], particles, stage) for leaf in (x, numbers))
     names, none = particles.mesh.axis_names, jnp.int32(0)
     required = Required(none, lax.pmax(jnp.stack(sizes), names), lax.pmax(jnp.stack(hops), names), none)
-    return Halo(tuple(sends), numbers - 1, shared_bits(status, particles.mesh), required, _psum(sent, names))
+    return Halo(tuple(sends), numbers - 1, share_bits(status, particles.mesh), required, _psum(sent, names))
 
 
 def _psum(x: Array, names: str | tuple[str, ...]) -> Array:
@@ -129,18 +129,18 @@ def _psum(x: Array, names: str | tuple[str, ...]) -> Array:
     return jnp.where(high > 0xFFFF, MOST_PAIRS, (high << 15) | (low & 0x7FFF))
 
 
-def exchanged(leaf: Array, halo: Halo, particles: Particles) -> Array:
+def exchange(leaf: Array, halo: Halo, particles: Particles) -> Array:
     """Return a shard's own rows of an array and those of its halo, inside `shard_map`; unused ones are 0. Linear.
 
     Arrays travel one by one, so that the compiler sends what several sums read once, and what none reads not at all. Packed into
     one message per sum, a step of the solver took longer on two GPUs.
     """
     for stage in stages(particles):
-        leaf = _with_received(leaf, halo.sends[stage.number], particles, stage)
+        leaf = _append_received(leaf, halo.sends[stage.number], particles, stage)
     return leaf
 
 
-def _with_received(leaf: Array, sends: Array, particles: Particles, stage: _Stage) -> Array:
+def _append_received(leaf: Array, sends: Array, particles: Particles, stage: _Stage) -> Array:
     received = [
         lax.ppermute(leaf.at[rows].get(mode="fill", fill_value=0), stage.name, stage.moves(offset))
         for rows, offset in zip(sends, stage.offsets(particles.sizes.hops[stage.number]), strict=True)

@@ -11,7 +11,7 @@ from jax import Array, lax
 
 from jfrnn._geometry import Status, ordered_bits
 from jfrnn._shards.halo import halo_in_shard
-from jfrnn._shards.particles import Particles, shared_bits, spec_of
+from jfrnn._shards.particles import Particles, share_bits, spec_of
 from jfrnn._tracing import Tree, set_places
 
 _DIGIT = 2  # bits of a bound that are found in one round
@@ -38,21 +38,21 @@ def migrate(particles: Particles) -> Particles:
     """
     particles = lax.stop_gradient(particles)
     spec = spec_of(particles)
-    return jax.shard_map(_migrated, mesh=particles.mesh, in_specs=(spec,), out_specs=spec, check_vma=False)(particles)
+    return jax.shard_map(_migrate_shard, mesh=particles.mesh, in_specs=(spec,), out_specs=spec, check_vma=False)(particles)
 
 
-def _migrated(particles: Particles) -> Particles:
+def _migrate_shard(particles: Particles) -> Particles:
     mesh, x, room = particles.mesh, particles.positions, particles.sizes.particles
     shards, here = mesh.devices.size, lax.axis_index(mesh.axis_names)
     there = particles.ids >= 0
-    bounds, wanted = _balanced(particles, there & jnp.isfinite(x).all(axis=1))
+    bounds, wanted = _balance(particles, there & jnp.isfinite(x).all(axis=1))
     wanted = jnp.where(jnp.isfinite(x).all(axis=1), wanted, here)
     fullest = jnp.max(lax.psum(_counts(jnp.where(there, wanted, shards), shards), mesh.axis_names))
     fits = fullest <= room
     goes = jnp.where(there, jnp.where(fits, wanted, here), shards)
-    rows = _moved((x, particles.ids, particles.values), goes, particles)
+    rows = _move((x, particles.ids, particles.values), goes, particles)
     positions, ids, values = jax.tree.map(lambda leaf: _where_used(rows[1], leaf), rows)
-    status = particles.status | shared_bits(jnp.where(fits, 0, Status.SHARD_OVERFLOW.value).astype(jnp.int32), mesh)
+    status = particles.status | share_bits(jnp.where(fits, 0, Status.SHARD_OVERFLOW.value).astype(jnp.int32), mesh)
     bounds = tuple(jnp.where(fits, new, old) for new, old in zip(bounds, particles.bounds, strict=True))
     moved = dataclasses.replace(particles, positions=positions, ids=ids, values=values, bounds=bounds)
     halo = halo_in_shard(moved)
@@ -70,7 +70,7 @@ def _counts(goes: Array, shards: int) -> Array:
     return jnp.sum(goes[None] == lax.iota(jnp.int32, shards)[:, None], axis=1, dtype=jnp.int32)
 
 
-def _moved(rows: Tree, goes: Array, particles: Particles) -> Tree:
+def _move(rows: Tree, goes: Array, particles: Particles) -> Tree:
     """Send rows to the shards where they go, into rows that are free there; `shards` stands for rows that are unused."""
     mesh, room = particles.mesh, particles.sizes.particles
     shards, here = mesh.devices.size, lax.axis_index(mesh.axis_names)
@@ -96,7 +96,7 @@ def _moved(rows: Tree, goes: Array, particles: Particles) -> Tree:
     return lax.while_loop(lambda carry: carry[0] < rounds, send, (jnp.int32(0), leaves, kept))[2]
 
 
-def _balanced(particles: Particles, counted: Array) -> tuple[tuple[Array, ...], Array]:
+def _balance(particles: Particles, counted: Array) -> tuple[tuple[Array, ...], Array]:
     """Return bounds between which equally many particles lie, and the shard in whose region each particle is, [rows] int32.
 
     The first axis of the mesh cuts space into slabs, the next each slab on its own (recursive coordinate bisection with as many

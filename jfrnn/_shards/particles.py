@@ -170,7 +170,7 @@ class Particles:
         if any(isinstance(x, Tracer) for x in jax.tree.leaves(self)):
             raise TypeError("grow() changes shapes and cannot run inside jax.jit: call it on what jit returns.")
         required = functools.reduce(Required.joined, (met.required for met in seen), self.required)
-        return resized(self, _enough(self.sizes, required, self.mesh, slack))
+        return resize(self, _enough(self.sizes, required, self.mesh, slack))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Say how to make them anew, on devices of the same numbers: a mesh itself cannot be pickled."""
@@ -241,7 +241,7 @@ def of_shards(mesh: Mesh) -> PartitionSpec:
     return PartitionSpec(mesh.axis_names)
 
 
-def placed(mesh: Mesh, rows: np.ndarray, source: np.ndarray) -> Array:
+def place_rows(mesh: Mesh, rows: np.ndarray, source: np.ndarray) -> Array:
     """Put rows of a host array, the same in every process, on their devices: those that `source` names, 0 where it is negative."""
 
     def part(index: Given) -> np.ndarray:
@@ -253,17 +253,17 @@ def placed(mesh: Mesh, rows: np.ndarray, source: np.ndarray) -> Array:
     return jax.make_array_from_callback((len(source), *rows.shape[1:]), NamedSharding(mesh, of_shards(mesh)), part)
 
 
-def replicated(mesh: Mesh, value: Given) -> Array:
+def replicate(mesh: Mesh, value: Given) -> Array:
     """Put a host array on every device."""
     array = np.asarray(value)
     return jax.make_array_from_callback(array.shape, NamedSharding(mesh, PartitionSpec()), lambda index: array[index])
 
 
-def resized(particles: Particles, sizes: Sizes) -> Particles:
+def resize(particles: Particles, sizes: Sizes) -> Particles:
     """Return particles with other sizes, no smaller ones, and no bits from the past."""
     mesh, old, new = particles.mesh, particles.sizes.particles, sizes.particles
     none = no_requirements(mesh.devices.ndim)
-    status, required = jax.tree.map(functools.partial(replicated, mesh), (np.zeros((), np.int32), none))
+    status, required = jax.tree.map(functools.partial(replicate, mesh), (np.zeros((), np.int32), none))
     kept = particles.positions, particles.ids, particles.values
 
     def wider(rows: Tree) -> Tree:
@@ -280,7 +280,7 @@ def resized(particles: Particles, sizes: Sizes) -> Particles:
     return dataclasses.replace(particles, **changed, status=status, required=required, sizes=sizes)
 
 
-def shared_bits(status: Array, mesh: Mesh) -> Array:
+def share_bits(status: Array, mesh: Mesh) -> Array:
     """Return the bits that are set on any shard, inside `shard_map`."""
     each = np.arange(Status(max(Status)).value.bit_length(), dtype=np.int32)
     return jnp.sum(lax.pmax((status >> each) & 1, mesh.axis_names) << each, dtype=jnp.int32)

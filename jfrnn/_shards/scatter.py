@@ -14,7 +14,7 @@ from jax.tree_util import KeyPath
 from jfrnn._geometry import Box, check_box, check_cutoff, check_positions, check_skin, check_slack, images_of
 from jfrnn._search import list_radius
 from jfrnn._shards.migrate import migrate
-from jfrnn._shards.particles import Particles, Sizes, no_requirements, placed, replicated, resized, room
+from jfrnn._shards.particles import Particles, Sizes, no_requirements, place_rows, replicate, resize, room
 from jfrnn._tracing import Given, Tree
 
 _MOST = 2**31 - 1
@@ -59,11 +59,11 @@ def scatter(
     x = np.asarray(positions)
     if len(x) > _MOST:
         raise ValueError(f"positions hold {len(x)} particles, but ids are int32: at most {_MOST}.")
-    values = jax.tree_util.tree_map_with_path(lambda path, leaf: _checked_value(path, leaf, len(x)), values)
-    slack, reach = check_slack(slack), _checked_reach(cutoff, skin, x.dtype)
-    mesh, cut = _checked_mesh(mesh, x.shape[1]), _checked_along(along, x, mesh)
-    fixed = None if box is None else _checked_box(box, x, reach, mesh)
-    return _settled(_in_blocks(x, values, fixed, mesh, cut, reach), slack)
+    values = jax.tree_util.tree_map_with_path(lambda path, leaf: _check_value(path, leaf, len(x)), values)
+    slack, reach = check_slack(slack), _check_reach(cutoff, skin, x.dtype)
+    mesh, cut = _check_mesh(mesh, x.shape[1]), _check_along(along, x, mesh)
+    fixed = None if box is None else _check_box(box, x, reach, mesh)
+    return _settle(_in_blocks(x, values, fixed, mesh, cut, reach), slack)
 
 
 def _in_blocks(x: np.ndarray, values: Tree, box: Box | None, mesh: Mesh, along: tuple[int, ...], reach: float) -> Particles:
@@ -77,13 +77,13 @@ def _in_blocks(x: np.ndarray, values: Tree, box: Box | None, mesh: Mesh, along: 
     source = np.where(source < len(x), source, -1).astype(np.int32)
     bounds = tuple(np.zeros((*shape[:k], size - 1), x.dtype) for k, size in enumerate(shape))
     same = (bounds, np.zeros((), np.int32), no_requirements(len(along)))
-    bounds, status, required = jax.tree.map(lambda leaf: replicated(mesh, leaf), same)
-    rows = jax.tree.map(lambda leaf: placed(mesh, leaf, source), (x, values))
-    ids = placed(mesh, source, np.arange(len(source)))
+    bounds, status, required = jax.tree.map(lambda leaf: replicate(mesh, leaf), same)
+    rows = jax.tree.map(lambda leaf: place_rows(mesh, leaf, source), (x, values))
+    ids = place_rows(mesh, source, np.arange(len(source)))
     return Particles(rows[0], ids, rows[1], bounds, box, status, required, mesh, along, len(x), reach, sizes)
 
 
-def _settled(particles: Particles, slack: float) -> Particles:
+def _settle(particles: Particles, slack: float) -> Particles:
     """Move particles to their shards, making room until it is enough: what later axes of a mesh need is known last."""
     while True:
         moved = migrate(particles)
@@ -92,7 +92,7 @@ def _settled(particles: Particles, slack: float) -> Particles:
         particles = particles.grow(moved, slack=1.0)
     needed = (int(moved.required.particles), *np.asarray(moved.required.halo).tolist())
     fullest, *halo = (room(math.ceil(slack * size)) for size in needed)
-    return resized(moved, Sizes(max(fullest, moved.sizes.particles), tuple(halo), moved.sizes.hops))
+    return resize(moved, Sizes(max(fullest, moved.sizes.particles), tuple(halo), moved.sizes.hops))
 
 
 def collect(particles: Particles) -> tuple[np.ndarray, Any]:
@@ -105,13 +105,13 @@ def collect(particles: Particles) -> tuple[np.ndarray, Any]:
     """
     if isinstance(particles.ids, Tracer):
         raise TypeError("collect() makes host arrays and cannot run inside jax.jit: call it on what jit returns.")
-    ids = fetched(particles.ids)
+    ids = fetch(particles.ids)
     rows = np.flatnonzero(ids >= 0)
     order = rows[np.argsort(ids[rows], kind="stable")]
-    return jax.tree.map(lambda leaf: fetched(leaf)[order], (particles.positions, particles.values))
+    return jax.tree.map(lambda leaf: fetch(leaf)[order], (particles.positions, particles.values))
 
 
-def fetched(array: Array) -> np.ndarray:
+def fetch(array: Array) -> np.ndarray:
     """Return all of a global array on the host, in every process."""
     if array.is_fully_addressable or array.is_fully_replicated:
         return np.asarray(array)
@@ -120,7 +120,7 @@ def fetched(array: Array) -> np.ndarray:
     return np.asarray(multihost_utils.process_allgather(array, tiled=True))
 
 
-def _checked_value(path: KeyPath, leaf: Given, total: int) -> np.ndarray:
+def _check_value(path: KeyPath, leaf: Given, total: int) -> np.ndarray:
     name = f"values{jax.tree_util.keystr(path)}"
     if not hasattr(leaf, "shape") or not hasattr(leaf, "dtype"):
         raise TypeError(f"{name} must be an array with a row per particle, got {type(leaf).__name__}.")
@@ -129,12 +129,12 @@ def _checked_value(path: KeyPath, leaf: Given, total: int) -> np.ndarray:
     return np.asarray(leaf)
 
 
-def _checked_reach(cutoff: Given, skin: object, dtype: np.dtype) -> float:
+def _check_reach(cutoff: Given, skin: object, dtype: np.dtype) -> float:
     radius = float(check_cutoff(cutoff, dtype).radius)
     return list_radius(radius, check_skin(skin, radius, dtype), dtype)
 
 
-def _checked_mesh(mesh: object, dim: int) -> Mesh:
+def _check_mesh(mesh: object, dim: int) -> Mesh:
     if not isinstance(mesh, Mesh):
         raise TypeError(f"mesh must be a jax.sharding.Mesh, got {type(mesh).__name__}: write e.g. jax.make_mesh((8,), ('x',)).")
     if not 1 <= mesh.devices.ndim <= dim:
@@ -142,7 +142,7 @@ def _checked_mesh(mesh: object, dim: int) -> Mesh:
     return Mesh(mesh.devices, mesh.axis_names)  # its axes for `shard_map` and for the compiler, not for types
 
 
-def _checked_along(along: Sequence[int] | None, x: np.ndarray, mesh: Mesh) -> tuple[int, ...]:
+def _check_along(along: Sequence[int] | None, x: np.ndarray, mesh: Mesh) -> tuple[int, ...]:
     dim, axes = x.shape[1], mesh.devices.ndim
     if along is None:
         finite = x[np.isfinite(x).all(axis=1)]
@@ -156,7 +156,7 @@ def _checked_along(along: Sequence[int] | None, x: np.ndarray, mesh: Mesh) -> tu
     return given
 
 
-def _checked_box(box: object, x: np.ndarray, reach: float, mesh: Mesh) -> Box | None:
+def _check_box(box: object, x: np.ndarray, reach: float, mesh: Mesh) -> Box | None:
     """Return the box in the dtype of positions, its images chosen as on one device, on every device."""
     checked = check_box(box, cast(Any, x))
     if checked is None:
@@ -164,5 +164,5 @@ def _checked_box(box: object, x: np.ndarray, reach: float, mesh: Mesh) -> Box | 
     if not checked.orthogonal:
         raise ValueError("box must be given by lengths: particles in a skewed lattice cannot be spread yet; run it on one device.")
     kind = images_of(checked, reach, x.dtype, len(x))
-    arrays = (replicated(mesh, np.asarray(a).astype(x.dtype)) for a in (checked.vectors, checked.origin))
+    arrays = (replicate(mesh, np.asarray(a).astype(x.dtype)) for a in (checked.vectors, checked.origin))
     return Box.tree_unflatten((checked.periodic, (0,) * checked.dim if kind.nearest else kind.reach), tuple(arrays))

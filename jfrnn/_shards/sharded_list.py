@@ -14,11 +14,11 @@ from jax.sharding import PartitionSpec
 
 from jfrnn._geometry import check_devices, pairs_and_status, shape_of
 from jfrnn._search import NeighborList, moved_too_far, round_capacity, search
-from jfrnn._shards.calls import Asked, checked_halo, count_capacity, over_shards, seen
+from jfrnn._shards.calls import Asked, check_halo, count_capacity, over_shards, seen
 from jfrnn._shards.halo import Halo, halo_in_shard, halo_spec
 from jfrnn._shards.migrate import migrate
-from jfrnn._shards.particles import OVERFLOWS, Particles, Required, check, of_shards, shared_bits
-from jfrnn._shards.scatter import fetched
+from jfrnn._shards.particles import OVERFLOWS, Particles, Required, check, of_shards, share_bits
+from jfrnn._shards.scatter import fetch
 
 
 @jax.tree_util.register_dataclass
@@ -86,7 +86,7 @@ class Neighbors:
         flows through. Jit: yes. vmap: no.
         """
         self._check_fits(particles)
-        return _updated(particles, self)
+        return _update(particles, self)
 
     def grow(self, particles: Particles, slack: float = 1.25) -> "Neighbors":
         """Make a list with room for what overflowed, for particles that have grown. Not inside jit.
@@ -136,7 +136,7 @@ class Neighbors:
     def _check_fits(self, particles: Particles) -> None:
         """Refuse particles of another kind, or laid out otherwise, than those for which the list was made."""
         self._check_kind(particles)
-        checked_halo(self.halo, particles)
+        check_halo(self.halo, particles)
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the ids (i, j) of all pairs, once for each direction and image, sorted, in every process all of them.
@@ -151,7 +151,7 @@ class Neighbors:
         Communication: everything goes everywhere, for checks. Differentiable: no. Jit: no.
         """
         self.check()
-        mine, theirs = (fetched(x) for x in _named_pairs(self))
+        mine, theirs = (fetch(x) for x in _named_pairs(self))
         found = theirs >= 0
         i, j = np.broadcast_to(mine[:, None], theirs.shape)[found], theirs[found]
         order = np.lexsort((j, i))
@@ -177,7 +177,7 @@ def listed(particles: Particles, asked: Asked, capacity: int) -> Neighbors:
             capacity=capacity,
             backend=asked.backend,
         )
-        status = shared_bits(made.status | halo.status, mesh)
+        status = share_bits(made.status | halo.status, mesh)
         required = halo.required._replace(row=lax.pmax(made.required, mesh.axis_names))
         return jax.tree.map(lambda leaf: leaf[None], made), halo, made.count[: particles.sizes.particles], status, required
 
@@ -187,7 +187,7 @@ def listed(particles: Particles, asked: Asked, capacity: int) -> Neighbors:
 
 
 @jax.jit
-def _updated(particles: Particles, nbrs: Neighbors) -> tuple[Particles, Neighbors]:
+def _update(particles: Particles, nbrs: Neighbors) -> tuple[Particles, Neighbors]:
     particles, asked = lax.stop_gradient(particles), nbrs.asked
 
     def remake(particles: Particles, nbrs: Neighbors) -> tuple[Particles, Neighbors]:

@@ -11,8 +11,8 @@ from jax.core import Tracer
 
 from jfrnn._geometry import Status, check_capacity, check_flag, check_slack, known_status
 from jfrnn._search import ROWS_ARE_WHOLE, NeighborList
-from jfrnn._shards.calls import Asked, checked_asked, checked_halo, count_capacity, counts, is_good, marked, over_shards, seen
-from jfrnn._shards.halo import Halo, exchanged, halo_in_shard
+from jfrnn._shards.calls import Asked, check_asked, check_halo, count_capacity, counts, is_good, mark, over_shards, seen
+from jfrnn._shards.halo import Halo, exchange, halo_in_shard
 from jfrnn._shards.particles import Particles, of_shards
 from jfrnn._shards.sharded_list import Neighbors, listed
 from jfrnn._sums import pair_sum as pair_sum_on_one
@@ -51,7 +51,7 @@ def search(
     Cost: on each device that of `jfrnn.search` for its own particles and those of its halo. Communication: positions of halos.
     Differentiable: no. Jit: yes, with capacity. vmap: no.
     """
-    asked, slack = checked_asked(particles, cutoff, skin, include_self, closed, backend), check_slack(slack)
+    asked, slack = check_asked(particles, cutoff, skin, include_self, closed, backend), check_slack(slack)
     if capacity is None:
         if isinstance(particles.ids, Tracer):
             raise ValueError(
@@ -90,8 +90,8 @@ def count(
     Differentiable: no. Jit: yes. vmap: no.
     """
     if halo is not None:
-        checked_halo(halo, particles)
-    return counts(particles, halo, checked_asked(particles, cutoff, 0.0, include_self, closed, backend))
+        check_halo(halo, particles)
+    return counts(particles, halo, check_asked(particles, cutoff, 0.0, include_self, closed, backend))
 
 
 def pair_sum(
@@ -150,13 +150,13 @@ def pair_sum(
     elif cutoff is None:
         raise ValueError("cutoff must be given: only a list (neighbors=) has its own.")
     else:
-        asked = checked_asked(particles, cutoff, 0.0, include_self, closed, backend)
+        asked = check_asked(particles, cutoff, 0.0, include_self, closed, backend)
     for path, leaf in jax.tree_util.tree_leaves_with_path(values):
         if tuple(jnp.shape(leaf)[:1]) != particles.ids.shape:
             name, shape = f"values{jax.tree_util.keystr(path)}", list(jnp.shape(leaf))
             raise ValueError(f"{name} must have shape [{particles.ids.shape[0]}, ...], a row per row of particles, got {shape}.")
     if halo is not None:
-        checked_halo(halo, particles)
+        check_halo(halo, particles)
     local = None if neighbors is None else neighbors.local
     return _sums(particles, halo, local, values, fn, asked, reduce, check_flag("compensated", compensated))
 
@@ -172,10 +172,10 @@ def _sums(
     reduce: str,
     compensated: bool,
 ) -> Tree:
-    def summed(particles: Particles, halo: Halo | None, local: NeighborList | None, values: Tree) -> Tree:
+    def sum_shard(particles: Particles, halo: Halo | None, local: NeighborList | None, values: Tree) -> Tree:
         halo = halo_in_shard(particles) if halo is None else halo
         x, active = seen(particles, halo)
-        theirs = jax.tree.map(lambda leaf: exchanged(leaf, halo, particles), values)
+        theirs = jax.tree.map(lambda leaf: exchange(leaf, halo, particles), values)
         options: dict[str, Any] = {"reduce": reduce, "compensated": compensated}
         if local is None:
             options |= {"box": particles.box, "include_self": asked.include_self, "closed": asked.closed}
@@ -184,6 +184,6 @@ def _sums(
         else:
             sums = pair_sum_on_one(fn, x, None, theirs, neighbors=jax.tree.map(lambda leaf: leaf[0], local), **options)
         good = is_good(particles, halo)
-        return jax.tree.map(lambda leaf: marked(leaf[: particles.sizes.particles], good), sums)
+        return jax.tree.map(lambda leaf: mark(leaf[: particles.sizes.particles], good), sums)
 
-    return over_shards(summed, particles, of_shards(particles.mesh), particles, halo, local, values)
+    return over_shards(sum_shard, particles, of_shards(particles.mesh), particles, halo, local, values)
