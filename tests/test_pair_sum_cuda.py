@@ -46,9 +46,9 @@ def plan_of(function, *args):
         found.append(original(*args))
         return found[-1]
 
-    original = _fused.planned
+    original = _fused.make_plan
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_fused, "planned", planned)
+        patch.setattr(_fused, "make_plan", planned)
         jax.jit(lambda *args: function(*args)).lower(*args)
     return found[-1]
 

@@ -12,7 +12,7 @@ from jfrnn._engine import Block, Slots
 from jfrnn._sums.fused import check, extremes
 from jfrnn._sums.relations import Listed, Relation, Searched, evaluate, is_fused
 from jfrnn._sums.summation import bind_sum
-from jfrnn._sums.terms import Derived, Groups, Term, chosen, fresh_labels, joined, make_term
+from jfrnn._sums.terms import Derived, Groups, Term, choose, fresh_labels, join, make_term
 from jfrnn._tracing import call_apart, compiled
 
 _Best = tuple[Array, Array, Array | None]  # of each row and element [b, k]: the largest, its source (n: none), its shift [b, k, d]
@@ -36,7 +36,7 @@ def bind_extremes(relation: Relation, term: Term, operands: Groups, largest: boo
         element, needed = _element(term, k)
         own = tuple(jnp.repeat(x, elements, axis=0) for x in operands.own)
         number = (jnp.tile(lax.iota(jnp.int32, elements), m),)
-        (value,) = bind_sum(one_each, element, chosen(joined(operands._replace(own=own), Groups((), number, ())), needed), False)
+        (value,) = bind_sum(one_each, element, choose(join(operands._replace(own=own), Groups((), number, ())), needed), False)
         none = jnp.asarray(-np.inf if largest else np.inf, like.dtype)
         results.append(jnp.where(has, value.reshape(has.shape), none).reshape(m, *like.shape))
     return results
@@ -52,7 +52,7 @@ def _element(term: Term, k: int) -> Derived:
 
     number = jax.ShapeDtypeStruct((), np.int32)
     mine, theirs = fresh_labels(len(term.operands.own) + 1, term.labels), term.labels[1]  # a row of i for each element
-    return make_term(summand, joined(term.operands, Groups((), (number,), ())), term.shift, (mine, theirs))
+    return make_term(summand, join(term.operands, Groups((), (number,), ())), term.shift, (mine, theirs))
 
 
 @functools.partial(compiled, static_argnames=("term", "largest"))

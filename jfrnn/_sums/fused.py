@@ -30,7 +30,7 @@ from jfrnn._engine import (
 )
 from jfrnn._geometry import Radii, unpack_turns
 from jfrnn._sums.scalars import NoTranslationError, hash_of
-from jfrnn._sums.terms import POSITIONS, Groups, Term, joined
+from jfrnn._sums.terms import POSITIONS, Groups, Term, join
 from jfrnn._sums.translate import input_name, output_name, translate
 
 _Columns = tuple[tuple[int, int], ...]  # of each column: which operand of a group, which element of it
@@ -104,7 +104,7 @@ def _why_not(term: Term, dtype: np.dtype, periodic: tuple[bool, ...]) -> Excepti
                     "convert it, or pass backend='jax'."
                 )
     try:
-        planned(term, dtype, periodic)
+        make_plan(term, dtype, periodic)
     except NoTranslationError as error:
         return error
     return None
@@ -117,7 +117,7 @@ def _travelling(dtype: np.dtype) -> set[np.dtype]:
 
 
 @functools.lru_cache(maxsize=256)
-def planned(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: bool = False) -> Plan:
+def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: bool = False) -> Plan:
     """Translate a term, or its negative, for positions of a dtype and shifts along periodic axes."""
     kernels = kernels_of("pair_sum_cpu")
 
@@ -152,9 +152,9 @@ def planned(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: bo
 
 def sums(inputs: Inputs, options: Options, term: Term, operands: Groups, compensated: bool) -> list[Array]:
     """Sum a term over all pairs of a search: see `jfrnn._sums.relations.sum_pairs`."""
-    plan = planned(term, *_kind(inputs))
-    found, totals, _ = _launched(prepare_search(inputs, options), options, plan, operands, compensated)
-    return _unpacked(term, found, totals)
+    plan = make_plan(term, *_kind(inputs))
+    found, totals, _ = _launch(prepare_search(inputs, options), options, plan, operands, compensated)
+    return _unpack(term, found, totals)
 
 
 def extremes(
@@ -167,7 +167,7 @@ def extremes(
         is none; and in a box its lattice shift [rows, elements, d]. Of equal ones the smallest source, then any image.
     """
     search = prepare_search(inputs, options)
-    values, _, which = _launched(search, options, planned(term, *_kind(inputs), not largest), operands, False, extremes=True)
+    values, _, which = _launch(search, options, make_plan(term, *_kind(inputs), not largest), operands, False, extremes=True)
     source, shifts = which[..., 0], None
     if search.torus is not None:
         lattice, wrapped = search.torus
@@ -180,7 +180,7 @@ def extremes(
     return list(zip(*parts[:3], strict=True))
 
 
-def _launched(
+def _launch(
     search: Search,
     options: Options,
     plan: Plan,
@@ -191,16 +191,16 @@ def _launched(
     """Hand a prepared search and what a plan reads to the kernel."""
     sources, torus = search.sources, search.torus
     if torus is not None:
-        operands = joined(operands, Groups((), (torus[1].query_turns,), (torus[1].turns,)))
+        operands = join(operands, Groups((), (torus[1].query_turns,), (torus[1].turns,)))
     n, m = search.sizes
     sizes = None, m, n
     columns = plan.shared, plan.own, plan.others
-    shared, own, others = (_packed(*group, sources.dtype) for group in zip(operands, columns, sizes, strict=True))
+    shared, own, others = (_pack(*group, sources.dtype) for group in zip(operands, columns, sizes, strict=True))
     values = shared, own, others
     return pair_sums(search, options.filter, plan.text, plan.key, values, compensated, extremes)
 
 
-def _packed(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) -> Array:
+def _pack(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) -> Array:
     """Return the columns of a group of operands: [size, width], or where all pairs share them, [width]; never empty."""
     if not columns:
         return jnp.zeros(1 if size is None else (1, 1), dtype)
@@ -209,7 +209,7 @@ def _packed(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) 
     return jnp.concatenate([flat[k][..., e : e + 1] for k, e in columns], axis=-1)
 
 
-def _unpacked(term: Term, sums: Array, totals: Array) -> list[Array]:
+def _unpack(term: Term, sums: Array, totals: Array) -> list[Array]:
     """Return the sums of each summand from the columns of all."""
     found, row, total = [], 0, 0
     for like, is_total in zip(term.summands, term.totals, strict=True):

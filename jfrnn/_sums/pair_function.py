@@ -68,9 +68,9 @@ class _Shape(str):
 def _given(r: Array, i: Tree, j: Tree) -> str:
     """Say what fn gets of a pair."""
 
-    def described(values: Tree) -> str:
+    def describe(values: Tree) -> str:
         if not jax.tree.leaves(values):
             return f"{values!r}, as no values were given"
         return repr(jax.tree.map(lambda x: _Shape(f"{x.dtype}{list(x.shape)}"), values))
 
-    return f"What it gets of a pair: r = x_j - x_i, {r.dtype}{list(r.shape)}; i = {described(i)}; j = {described(j)}."
+    return f"What it gets of a pair: r = x_j - x_i, {r.dtype}{list(r.shape)}; i = {describe(i)}; j = {describe(j)}."

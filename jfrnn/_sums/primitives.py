@@ -92,15 +92,15 @@ def _power(eqn: Equation, inputs: list[Values]) -> list[Values]:
     exponents = {eqn.scalars.value(k) for k in y.reshape(-1).tolist()}
     exponent = exponents.pop() if len(exponents) == 1 else None
     if exponent is not None and abs(exponent) <= MOST_REPEATED and exponent == int(exponent):
-        return [_repeated(eqn, np.broadcast_to(x, eqn.outputs[0].shape), int(exponent))]
+        return [_repeat(eqn, np.broadcast_to(x, eqn.outputs[0].shape), int(exponent))]
     return [eqn.each("pow", x, eqn.cast(y, dtype))]
 
 
 def _integer_power(eqn: Equation, inputs: list[Values]) -> list[Values]:
-    return [_repeated(eqn, inputs[0], eqn.params["y"])]
+    return [_repeat(eqn, inputs[0], eqn.params["y"])]
 
 
-def _repeated(eqn: Equation, x: Values, exponent: int) -> Values:
+def _repeat(eqn: Equation, x: Values, exponent: int) -> Values:
     """Return a power by repeated multiplication."""
     result, square, left = eqn.full(1), x, abs(exponent)
     while left:

@@ -18,7 +18,7 @@ from jfrnn._sums.extremes import bind_extremes
 from jfrnn._sums.pair_function import call_with_pair
 from jfrnn._sums.relations import Listed, Relation, Searched
 from jfrnn._sums.summation import bind_sum
-from jfrnn._sums.terms import OF_QUERIES, OF_SOURCES, Groups, Labels, Summand, Term, chosen, fresh_labels, traced
+from jfrnn._sums.terms import OF_QUERIES, OF_SOURCES, Groups, Labels, Summand, Term, choose, fresh_labels, trace
 from jfrnn._tracing import Given, Tree, call_apart, compiled, on_device
 
 
@@ -118,10 +118,10 @@ def _telling(
     """
     points = sources if queries is None else queries
     if not isinstance(points, Tracer):  # there are no derivatives
-        return sources, points, functools.partial(_marked_by, data=data, good_rows=good_rows, static=static)
+        return sources, points, functools.partial(_mark_by, data=data, good_rows=good_rows, static=static)
     good = call_apart(lambda *data: good_rows(*data, *static), *data)
     points = _told(points, good)
-    return points if queries is None else sources, points, functools.partial(_marked, good=good)
+    return points if queries is None else sources, points, functools.partial(_mark, good=good)
 
 
 @jax.custom_jvp
@@ -161,12 +161,12 @@ def reduced(
         *(tuple(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in group) for group in operands[1:]),
     )
     shift = jax.ShapeDtypeStruct(pairs.sources.shape[1:], pairs.sources.dtype)
-    term, needed, closed_over = traced(
+    term, needed, closed_over = trace(
         summand, one_pair, shift, _labels(operands, pairs.rows is pairs.sources and mine is theirs), fn
     )
     if reduce != "sum" and not all(jnp.issubdtype(x.dtype, jnp.floating) for x in term.summands):
         raise TypeError(f"fn must return floats for reduce={reduce!r}, whose rows may be infinite: convert them with .astype.")
-    operands = chosen(operands, needed)
+    operands = choose(operands, needed)
     known = not isinstance(pairs.sources, Tracer)
     operands = Groups(
         *(tuple(_numbers(x, known) if isinstance(x, jax.ShapeDtypeStruct) else x for x in group) for group in operands)
@@ -268,7 +268,7 @@ def _summable(x: Given, dtype: np.dtype) -> Array:
 
 
 @compiled
-def _marked(leaves: list[Array], good: Array) -> list[Array]:
+def _mark(leaves: list[Array], good: Array) -> list[Array]:
     """Return what is no result in rows that have no sum; its derivatives likewise."""
 
     def marked(x: Array) -> Array:
@@ -280,5 +280,5 @@ def _marked(leaves: list[Array], good: Array) -> list[Array]:
 
 
 @functools.partial(compiled, static_argnames=("good_rows", "static"))
-def _marked_by(leaves: list[Array], data: tuple, good_rows: Callable[..., Array], static: tuple) -> list[Array]:
-    return _marked(leaves, good_rows(*data, *static))
+def _mark_by(leaves: list[Array], data: tuple, good_rows: Callable[..., Array], static: tuple) -> list[Array]:
+    return _mark(leaves, good_rows(*data, *static))

@@ -77,9 +77,9 @@ class Scalars:
 
     def apply(self, operation: str, operands: Sequence[int], dtype: str) -> int:
         """Return the result of an operation, a function of `Math`: simplified, or folded where all is known, or written."""
-        known = self._simplified(operation, operands, dtype)
+        known = self._simplify(operation, operands, dtype)
         if known is None:
-            known = self._folded(operation, operands, dtype)
+            known = self._fold(operation, operands, dtype)
         if known is not None:
             return known
         if operation in ("add", "mul"):
@@ -139,7 +139,7 @@ class Scalars:
         known = self.value(number)
         return known is not None and known == value and bool(np.signbit(known) == np.signbit(value))
 
-    def _simplified(self, operation: str, operands: Sequence[int], dtype: str) -> int | None:
+    def _simplify(self, operation: str, operands: Sequence[int], dtype: str) -> int | None:
         """Return what the result is without any work, where no NaN, infinity or sign of a zero can tell."""
         first, last = operands[0], operands[-1]
         if operation == f"to_{TYPES[dtype]}" and self.nodes[first].dtype == dtype:
@@ -172,7 +172,7 @@ class Scalars:
         parts = [self._reciprocal(k) for k in operands[1:]]
         return None if None in parts else self.apply("select", [operands[0], *(k for k in parts if k is not None)], dtype)
 
-    def _folded(self, operation: str, operands: Sequence[int], dtype: str) -> int | None:
+    def _fold(self, operation: str, operands: Sequence[int], dtype: str) -> int | None:
         values = [self.value(k) for k in operands]
         if any(value is None for value in values):
             return None

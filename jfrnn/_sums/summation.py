@@ -17,7 +17,7 @@ from jax.interpreters import ad, batching, mlir
 
 from jfrnn._sums.fused import check
 from jfrnn._sums.relations import Relation, Searched, sum_pairs
-from jfrnn._sums.terms import Derived, Groups, Term, chosen, is_moving, joined, tangent, transposed
+from jfrnn._sums.terms import Derived, Groups, Term, choose, is_moving, join, tangent, transpose
 from jfrnn._tracing import Aval, Internal, compiled, result_aval, unvarying_types, vary, varying_axes
 
 Structure = Any  # how the leaves of a relation stand in it: a `PyTreeDef`, which is no type to type checkers
@@ -65,7 +65,7 @@ def _jvp(primals: tuple, tangents: tuple, *, term: Term, structure: Structure, c
     if not any(map(any, moving)):
         return sums, none
     derived = tangent(term, moving)
-    needed = chosen(joined(operands, chosen(moves, moving)), derived.needed)
+    needed = choose(join(operands, choose(moves, moving)), derived.needed)
     moved = iter(_bind(leaves, needed, derived.term, structure, compensated))
     return sums, [next(moved) if is_moving(x) else zero for x, zero in zip(term.summands, none, strict=True)]
 
@@ -78,13 +78,13 @@ def _transpose(cotangents: list, *args: Internal, term: Term, structure: Structu
     there = tuple(not isinstance(x, ad.Zero) for x in cotangents)
     if not any(there):
         return [None] * len(args)
-    still = chosen(operands, Groups(*(tuple(not flag for flag in group) for group in linear)))
+    still = choose(operands, Groups(*(tuple(not flag for flag in group) for group in linear)))
     of_kind = {
         kind: tuple(x for x, flag, total in zip(cotangents, there, term.totals, strict=True) if flag and total == kind)
         for kind in (True, False)
     }
-    given = joined(still, Groups(of_kind[True], of_kind[False], ()))
-    rules = transposed(term, linear, there, relation.symmetric)
+    given = join(still, Groups(of_kind[True], of_kind[False], ()))
+    rules = transpose(term, linear, there, relation.symmetric)
     results: list[Array] = []
     if rules.along is not None:
         if rules.sides:
@@ -102,7 +102,7 @@ def _transpose(cotangents: list, *args: Internal, term: Term, structure: Structu
 
 
 def _bind_derived(leaves: list, operands: Groups, derived: Derived, structure: Structure, compensated: bool) -> list[Array]:
-    return _bind(leaves, chosen(operands, derived.needed), derived.term, structure, compensated)
+    return _bind(leaves, choose(operands, derived.needed), derived.term, structure, compensated)
 
 
 def _batch(args: tuple, dims: tuple, **params: Internal) -> tuple[list[Array], list[int]]:

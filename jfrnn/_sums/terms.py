@@ -87,7 +87,7 @@ def _jaxpr_of(summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct) -
         return jax.make_jaxpr(_flat(summand, operands))(*_one_pair(operands, shift))
 
 
-def traced(
+def trace(
     summand: Summand,
     operands: Groups,
     shift: jax.ShapeDtypeStruct,
@@ -108,7 +108,7 @@ def traced(
         shared, own, others = operands
         return eval_jaxpr(closed.jaxpr, shared[: len(consts)], real, shift, *shared[len(consts) :], *own, *others)
 
-    derived = _kept(owner, make_term(hoisted, joined(of_consts, operands), shift, labels))
+    derived = _keep(owner, make_term(hoisted, join(of_consts, operands), shift, labels))
     of_closed, needed = derived.needed.shared[: len(consts)], derived.needed.shared[len(consts) :]
     return derived.term, derived.needed._replace(shared=needed), tuple(compress(consts, of_closed))
 
@@ -116,7 +116,7 @@ def traced(
 _KNOWN: "weakref.WeakKeyDictionary[Any, dict[Any, Derived]]" = weakref.WeakKeyDictionary()
 
 
-def _kept(owner: object, derived: "Derived") -> "Derived":
+def _keep(owner: object, derived: "Derived") -> "Derived":
     """Return an equal term that the owner had before, or this one, which it has from now on."""
     closed = derived.term.jaxpr
     if closed.consts:
@@ -162,7 +162,7 @@ def make_term(
     mine, theirs = labels
     labels = tuple(compress(mine, needed.own)), tuple(compress(theirs, needed.others))
     totals = tuple(totals or [False] * len(jaxpr.outvars))
-    return Derived(Term(ClosedJaxpr(jaxpr, closed.consts), chosen(operands, needed), shift, labels, totals), needed)
+    return Derived(Term(ClosedJaxpr(jaxpr, closed.consts), choose(operands, needed), shift, labels, totals), needed)
 
 
 def fresh_labels(count: int, labels: Labels) -> tuple[int, ...]:
@@ -179,12 +179,12 @@ def _flat(summand: Summand, operands: Groups) -> Callable[..., list[Array]]:
     return lambda real, shift, *flat: [jnp.asarray(x) for x in summand(real, shift, _split(flat, operands))]
 
 
-def chosen(operands: Groups, flags: Groups) -> Groups:
+def choose(operands: Groups, flags: Groups) -> Groups:
     """Return the operands whose flag is set."""
     return Groups(*(tuple(compress(group, which)) for group, which in zip(operands, flags, strict=True)))
 
 
-def joined(*groups: Groups) -> Groups:
+def join(*groups: Groups) -> Groups:
     """Put operands one behind the other, group by group."""
     return Groups(*(sum(parts, ()) for parts in zip(*groups, strict=True)))
 
@@ -197,16 +197,16 @@ def is_moving(x: Given) -> bool:
 @functools.lru_cache(maxsize=256)
 def tangent(term: Term, moving: Groups) -> Derived:
     """Make the term of the tangents of the float summands: of all operands, then the tangents of the moving ones, by group."""
-    tangents = chosen(term.operands, moving)
+    tangents = choose(term.operands, moving)
 
     def summand(real: Array, shift: Array, operands: Groups) -> list[Array]:
         primals, moves = _halves(operands, term.operands)
 
         def of_moving(moved: Groups) -> list[Array]:
-            summands = term(real, shift, _merged(primals, moved, moving))
+            summands = term(real, shift, _merge(primals, moved, moving))
             return [x for x in summands if is_moving(x)]
 
-        return jax.jvp(of_moving, (chosen(primals, moving),), (moves,))[1]
+        return jax.jvp(of_moving, (choose(primals, moving),), (moves,))[1]
 
     totals = [total for total, x in zip(term.totals, term.summands, strict=True) if is_moving(x)]
     moved = sorted({label for labels, which in zip(term.labels, moving[1:], strict=True) for label in compress(labels, which)})
@@ -215,7 +215,7 @@ def tangent(term: Term, moving: Groups) -> Derived:
         labels + tuple(of_tangent[label] for label in compress(labels, which))
         for labels, which in zip(term.labels, moving[1:], strict=True)
     )
-    return make_term(summand, joined(term.operands, tangents), term.shift, (mine, theirs), totals)
+    return make_term(summand, join(term.operands, tangents), term.shift, (mine, theirs), totals)
 
 
 class Transposed(NamedTuple):
@@ -236,19 +236,19 @@ class Transposed(NamedTuple):
 
 
 @functools.lru_cache(maxsize=256)
-def transposed(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetric: bool) -> Transposed:
+def transpose(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetric: bool) -> Transposed:
     """Transpose a term in its linear operands; `cotangents` says of which sums there are any.
 
     `symmetric`: j is a neighbor of i where i is one of j, and both have operands of both kinds. Then one term does it: the sums of
     the linear operands of j are the last ones of `along`, whose operands of either side are all those of i and of j. Where an
     operand of j is one array with one of i, they are added to those of i.
     """
-    still = chosen(term.operands, Groups(*(tuple(not flag for flag in group) for group in linear)))
+    still = choose(term.operands, Groups(*(tuple(not flag for flag in group) for group in linear)))
     of_totals, of_sums = (
         tuple(x for x, total, there in zip(term.summands, term.totals, cotangents, strict=True) if there and total == kind)
         for kind in (True, False)
     )
-    given = joined(still, Groups(of_totals, of_sums, ()))
+    given = join(still, Groups(of_totals, of_sums, ()))
     mine, theirs = (
         tuple(label for label, flag in zip(labels, which, strict=True) if not flag)
         for labels, which in zip(term.labels, linear[1:], strict=True)
@@ -266,9 +266,9 @@ def transposed(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetr
         ordered = [by_kind[total].pop(0) for total, there in zip(term.totals, cotangents, strict=True) if there]
 
         def of_linear(unknown: Groups) -> list[Array]:
-            return list(compress(term(real, shift, _merged(known, unknown, linear)), cotangents))
+            return list(compress(term(real, shift, _merge(known, unknown, linear)), cotangents))
 
-        (result,) = jax.linear_transpose(of_linear, chosen(term.operands, linear))(ordered)
+        (result,) = jax.linear_transpose(of_linear, choose(term.operands, linear))(ordered)
         return result
 
     def along(real: Array, shift: Array, operands: Groups) -> list[Array]:
@@ -313,7 +313,7 @@ def _halves(operands: Groups, first: Groups) -> tuple[Groups, Groups]:
     )
 
 
-def _merged(unflagged: Groups, flagged: Groups, flags: Groups) -> Groups:
+def _merge(unflagged: Groups, flagged: Groups, flags: Groups) -> Groups:
     """Return all operands in order; of `unflagged`, those that are flagged may be missing or there."""
     groups = []
     for rest, some, which in zip(unflagged, flagged, flags, strict=True):

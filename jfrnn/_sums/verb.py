@@ -141,8 +141,8 @@ def pair_sum(
         )
     if queries is None and query_values is not None:
         raise ValueError("query_values belong to queries: without them fn gets values of i and of j.")
-    theirs = _checked_values("values", values, pairs.sources.shape[0], "particle")
-    mine = theirs if queries is None else _checked_values("query_values", query_values, pairs.rows.shape[0], "query")
+    theirs = _check_values("values", values, pairs.sources.shape[0], "particle")
+    mine = theirs if queries is None else _check_values("query_values", query_values, pairs.rows.shape[0], "query")
     with own_transfers():
         return reduced(fn, pairs, mine, theirs, reduce, symmetry, compensated)
 
@@ -161,7 +161,7 @@ def _with_engine(options: Options, inputs: Inputs, backend: str) -> Options:
     return options._replace(may_change=backend == "auto") if reason is None else options._replace(engine=ARRAYS)
 
 
-def _checked_values(name: str, values: Tree, size: int, what: str) -> Tree:
+def _check_values(name: str, values: Tree, size: int, what: str) -> Tree:
     def checked(path: KeyPath, leaf: Given) -> Array:
         if not hasattr(leaf, "shape") or not hasattr(leaf, "dtype"):
             raise TypeError(
