@@ -27,6 +27,12 @@ SPACES = ("", "_nearest", "_images", "_nearest_skewed", "_images_skewed")  # in 
 _DEFAULTS = {"PERIODIC": 0, "BATCHED": 0, "SUM": 0, "SCALED": 0, "ONE_BY_ONE": 0}
 
 
+_ALL_OR_NONE = """#if defined(__clang__)
+#pragma clang diagnostic error "-Wmissing-field-initializers"
+#endif
+"""
+
+
 def table_cells(sources: int) -> int:
     """Return the number of cells in the table for a number of sources."""
     return min(max(SMALLEST_TABLE, CELLS_PER_PARTICLE * sources), 2**30)
@@ -72,8 +78,10 @@ def add_program(module: Any, text: str) -> str:
 def bind(stub: Callable[..., None], module: Any, call: str, text: str) -> Any:
     """Return a native function of a module that calls a method of a struct in a program, as in `"Sort.build"`.
 
-    The struct is made of the arguments of `stub` in their order; of arrays it gets where their data is.
+    The struct is made of the arguments of `stub` in their order; of arrays it gets where their data is. Clang refuses a program in
+    which an argument is missing, which C++ would take for 0.
     """
     kernel, method = call.split(".")
     given = ", ".join(x if p.annotation is int else f"{x}.data" for x, p in inspect.signature(stub).parameters.items())
-    return wp.func_native(f"\n    {add_program(module, text)}::{kernel}({{{given}}}).{method}();\n")(stub)
+    call = f"{add_program(module, text)}::{kernel}({{{given}}}).{method}();"
+    return wp.func_native(f"\n{_ALL_OR_NONE}    {call}\n")(stub)

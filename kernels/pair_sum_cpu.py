@@ -180,7 +180,9 @@ def sort_kernel(dim: int, double: bool) -> wp.Kernel:
     table_of, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
     variant = f"{dim}d_{'f64' if double else 'f32'}"
 
-    def sort_native(others: table_of, cutoff: reals, columns: reals, scratch: ints, n: int, m: int, own: int, table: int): ...
+    def sort_native(
+        others: table_of, cutoff: reals, columns: reals, scratch: ints, n: int, m: int, own: int, table: int, width: int
+    ): ...  # fmt: skip
 
     sort_native.__name__ = sort_native.__qualname__ = f"sort_values_{variant}"
     module = wp.get_module(f"jfrnn.kernels.pair_sum_cpu.sort_values_{variant}")
@@ -188,7 +190,7 @@ def sort_kernel(dim: int, double: bool) -> wp.Kernel:
     function = bind(sort_native, module, "SortValues.run", program(double, dim, "sort_values.h", **GRID, CHUNK=CHUNK, MANY=0))
 
     def sort_values(others: table_of, cutoff: reals, columns: reals, scratch: ints, n: int, m: int, own: int, table: int):
-        function(others, cutoff, columns, scratch, n, m, own, table)
+        function(others, cutoff, columns, scratch, n, m, own, table, others.shape[1])
 
     return wp.kernel(sort_values, module=module)
 

@@ -29,7 +29,7 @@ struct Lattice {
     JFRNN_MEMBER real origin(int k) const { return numbers[19 + k]; }
     JFRNN_MEMBER real reach(int axis) const { return numbers[22 + axis]; }
     JFRNN_MEMBER int images(int axis) const { return (int)numbers[25 + axis]; }
-    JFRNN_MEMBER real slack() const { return numbers[28]; }
+    JFRNN_MEMBER real slack() const { return numbers[PERIODIC ? 28 : 0]; }
     JFRNN_MEMBER bool periodic(int axis) const { return images(axis) > 0; }
     // uncontracted, so that a coordinate is the same wherever it is computed
 #if defined(__CUDA_ARCH__)
