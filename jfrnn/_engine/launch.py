@@ -18,8 +18,8 @@ import importlib
 import json
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from importlib.abc import Traversable
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from typing import Any, NamedTuple
 
 import jax
