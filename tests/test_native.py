@@ -64,9 +64,11 @@ def test_nvcc_compiles_headers(tmp_path):
     assert done.returncode == 0, done.stderr[:2000]
 
 
+HEADER = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text()
+EXTENSION = "XLA_FFI_InternalExtension" if "XLA_FFI_InternalExtension" in HEADER else "XLA_FFI_Extension_Base"  # by version
 MIRRORED = {
     ffi._Version: ("XLA_FFI_Api_Version", {"major": "major_version", "minor": "minor_version", "extension": "extension_start"}),
-    ffi.Extension: ("XLA_FFI_Extension_Base", {"metadata": None}),
+    ffi.Extension: (EXTENSION, {"metadata": None}),
     ffi.Buffer: ("XLA_FFI_Buffer", {"extension": "extension_start"}),
     ffi.Text: ("XLA_FFI_ByteSpan", {"start": "ptr", "size": "len"}),
     ffi.CallFrame: (
@@ -99,6 +101,7 @@ def test_structures_are_those_of_xla(tmp_path):
         f'#include <stddef.h>\n#include <stdio.h>\n#include "xla/ffi/api/c_api.h"\nint main() {{\n{body}\nreturn 0;\n}}\n'
     )
     command = [compiler, f"-I{jax.ffi.include_dir()}", "-o", tmp_path / "offsets", source]
-    subprocess.run(command, check=True, capture_output=True)
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
     found = subprocess.run([tmp_path / "offsets"], check=True, capture_output=True, text=True).stdout.split()
     assert [(name, field, int(at)) for (name, field, _), at in zip(expected, found)] == expected
