@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from experiments import _accuracy, _compare, _oracle
-from experiments.methods import Found, _pad
+from experiments.methods import Found, _padded
 
 POSITIONS = np.random.default_rng(5).random((200, 3)).astype(np.float32)
 CUTOFF = _oracle.round_cutoff(0.3, np.float32)
@@ -98,18 +98,18 @@ def test_of_a_large_padded_list_the_sample_alone_is_read(monkeypatch):
     idx = np.full((729, count.max() + 2), 729, np.int32)
     for k, row in enumerate(rows):
         idx[k, : len(row)] = row
-    whole = _pad.found_in_rows(idx, count, "cpu")
+    whole = _padded.found_in_rows(idx, count, "cpu")
     assert (len(whole.pairs[0]), whole.total) == (2 * len(i), 2 * len(i))
     monkeypatch.setattr(_compare, "MOST_LISTED", 728)
     monkeypatch.setattr(_compare, "sample", lambda n: SAMPLE)
-    part = _pad.found_in_rows(idx, count, "cpu")
+    part = _padded.found_in_rows(idx, count, "cpu")
     assert len(part.pairs[0]) == count[SAMPLE].sum() < part.total == count.sum()
     assert sampled(part) == sampled(whole) == (0, 0, len(i))
     idx[SAMPLE[3], 0] = SAMPLE[5]  # far away: a pair of two that are compared, and one that is lost
-    assert sampled(_pad.found_in_rows(idx, count, "cpu"))[:2] == (1, 1)
+    assert sampled(_padded.found_in_rows(idx, count, "cpu"))[:2] == (1, 1)
     count[5] = idx.shape[1] + 1
     with pytest.raises(RuntimeError, match=f"a row has {idx.shape[1] + 1} neighbors and {idx.shape[1]} slots"):
-        _pad.found_in_rows(idx, count, "cpu")
+        _padded.found_in_rows(idx, count, "cpu")
 
 
 @pytest.mark.parametrize("directed", [False, True])

@@ -94,13 +94,12 @@ def _without_a_word_of_drivers() -> Iterator[None]:
             os.write(2, b"".join(lines))
 
 
-def kernels_of(name: str) -> ModuleType:
-    """Return a module of jfrnn.kernels, which imports Warp."""
-    return sys.modules.get(f"jfrnn.kernels.{name}") or _import_kernels(name)
-
-
 @functools.cache
-def _import_kernels(name: str) -> ModuleType:
+def kernels_of(name: str) -> ModuleType:
+    """Return a module of jfrnn.kernels, which imports Warp.
+
+    Not from `sys.modules`, where a module stands while another thread still imports it.
+    """
     load_warp()
     return apart(functools.partial(importlib.import_module, f"jfrnn.kernels.{name}"))
 
