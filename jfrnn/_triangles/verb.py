@@ -63,6 +63,7 @@ def search_triangles(
     per triangle (float64: 1.1; "bvh" at most 0.13) and at most 58 MB. Differentiable: the list is topology, without gradient; see
     `TriangleList.closest`.
     Jit: yes, with capacity. vmap: yes, with capacity. `jax.shard_map`: yes, with particles spread and the wall on every device.
+    Compilation: for each new number of particles, slots or faces; with "jax" it takes several seconds.
     Source: strict cutoff (Peifle 2019, §2.2).
 
     >>> import jax.numpy as jnp, jfrnn
