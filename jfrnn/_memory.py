@@ -26,10 +26,10 @@ from jfrnn._engine import (
 )
 from jfrnn._geometry import Cutoff, check_capacity, check_cutoff, check_kind, check_size, check_skin
 from jfrnn._sums import pair_sum
+from jfrnn._tracing import Tree
 from jfrnn._triangles import TRIANGLE_BACKENDS, TRIANGLE_ENGINES, fastest_of, find_triangles
 
 Device = Any  # jax.Device, which type checkers take for a variable
-Tree = Any  # a pytree of arrays, or of their shapes
 MemoryStats = Any  # what XLA reports of a compiled program
 
 

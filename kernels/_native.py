@@ -25,8 +25,7 @@ SMALLEST_TABLE = 4096
 SKEWED = 2
 SPACES = ("", "_nearest", "_images", "_nearest_skewed", "_images_skewed")  # in names of variants
 _DEFAULTS = {"PERIODIC": 0, "BATCHED": 0, "SUM": 0, "SCALED": 0, "ONE_BY_ONE": 0}
-
-
+# C++ takes an argument that is missing for 0.
 _ALL_OR_NONE = """#if defined(__clang__)
 #pragma clang diagnostic error "-Wmissing-field-initializers"
 #endif

@@ -109,6 +109,14 @@ def test_floors_and_doors(module):
         assert name in getattr(door, "__all__", [name]), f"{module} takes {name}, which is not at the door of {other}"
 
 
+@pytest.mark.parametrize("room", sorted({room_of(module) for module in LIBRARY if module.count(".") > 1}))
+def test_what_a_door_lists_is_taken(room):
+    """A name at a door that no other package takes stands there for nobody."""
+    others = [path for module, path in LIBRARY.items() if room_of(module) != room]
+    taken = {name for path in others for source, name in taken_from(path) if source == f"jfrnn.{room}"}
+    assert sorted(set(importlib.import_module(f"jfrnn.{room}").__all__) - taken) == []
+
+
 def circles(graph):
     """Return the modules that reach themselves."""
 

@@ -1,6 +1,5 @@
 """The engines, each a way to find the same pairs, and how their kernels are launched."""
 
-from jfrnn._engine.arrays import levels_of
 from jfrnn._engine.auto import (
     ARRAYS,
     ENGINES,
@@ -66,7 +65,6 @@ __all__ = [
     "kernel",
     "kernels_of",
     "level_of_caller",
-    "levels_of",
     "list_rows",
     "load_warp",
     "on_cpu",

@@ -12,7 +12,7 @@ from jfrnn._engine.cuda import Command
 from jfrnn._engine.launch import Kernel, kernel
 from jfrnn._engine.operands import lattice_numbers, particle_rows, periodic_kind, space_flags
 from jfrnn._engine.problem import Filter, Rows, Search
-from jfrnn._engine.serving import on_cpu, on_cuda
+from jfrnn._engine.serving import on_cpu, on_cuda, stand_in
 from jfrnn._engine.start import WarpArray, WarpKernel, kernels_of, load_warp
 from jfrnn._engine.sum_results import SumsOf, TermText
 from jfrnn._geometry import GROUPS, HALVINGS, Levels
@@ -177,11 +177,11 @@ def _level_kernel(variant: _LevelVariant) -> WarpKernel:
 
 
 def _level_arguments(variant: _LevelVariant, arrays: Sequence[Any]) -> list[Any]:
-    """Return what the kernel takes; without rows, something of their kind that nobody writes to stands in their place."""
+    """Return what the kernel takes."""
     *inputs, count, info = arrays
     n, m, capacity = len(inputs[4]), len(count), inputs[-1].shape[1] if variant.lists else 0
     if not variant.lists:
-        inputs.append(load_warp().array(ptr=count.ptr, shape=(m, 1), dtype=count.dtype, device=count.device))
+        inputs.append(stand_in(count, m))
     flags = [int(variant.own), int(variant.closed), int(variant.keep.drop_self), int(variant.keep.later_only)]
     return [*inputs, count, info, n, m, capacity, *flags]
 

@@ -141,8 +141,9 @@ class Inputs(NamedTuple):
 
 
 def hide_inactive(positions: Array, active: Array | None) -> Array:
-    """Return positions that are infinite where a particle is inactive: no engine gives such a one neighbors, or to others.
+    """Return positions that are infinite where a particle is inactive.
 
+    Inactive particles have no neighbors and are never listed as neighbors, on any engine.
     The mark is not NaN, because JAX's mode `jax_debug_nans` takes every NaN that leaves a program for an error.
     """
     return positions if active is None else jnp.where(active[:, None], positions, jnp.inf)

@@ -47,6 +47,11 @@ def on_stream(name: str, run: Callable[..., None], types: dict[str, Any], output
     return Kernel(name, types, outputs, serve)
 
 
+def stand_in(like: WarpArray, rows: int) -> WarpArray:
+    """Return what a kernel is given in place of rows of int32 that it neither reads nor writes: memory that is there anyway."""
+    return load_warp().array(ptr=like.ptr, shape=(rows, 1), dtype=like.dtype, device=like.device)
+
+
 def _arrays(wp: ModuleType, frame: CallFrame, dtypes: Sequence[Any], device: WarpDevice) -> list[WarpArray]:
     buffers = zip(frame.buffers(), dtypes, strict=True)
     return [wp.array(ptr=x.data, shape=x.shape, dtype=dtype, device=device) for x, dtype in buffers]

@@ -19,11 +19,13 @@ from jfrnn._engine.launch import Kernel, kernel, open_relay
 from jfrnn._engine.levels_warp import level_neighbors
 from jfrnn._engine.operands import MOST_IN_BOX, pack_particles, periodic_kind, space_flags
 from jfrnn._engine.problem import Filter, Kind, Options, Rows, Search
-from jfrnn._engine.serving import on_cpu, on_cuda
-from jfrnn._engine.start import apart, kernels_of, load_warp
+from jfrnn._engine.serving import on_cpu, on_cuda, stand_in
+from jfrnn._engine.start import WarpArray, apart, kernels_of, load_warp
 from jfrnn._geometry import Cutoffs
 
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
+
+CellKernels = Any  # the kernels of a variant, of jfrnn.kernels
 
 
 @dataclasses.dataclass(frozen=True)  # all are one
@@ -78,13 +80,13 @@ class Variant(NamedTuple):
 class Arrays(NamedTuple):
     """What a call gets from XLA, as `warp.array`s; without rows `idx` is None."""
 
-    positions: Any
-    queries: Any
-    cutoff: Any
-    idx: Any
-    count: Any
-    info: Any
-    scratch: Any
+    positions: WarpArray
+    queries: WarpArray
+    cutoff: WarpArray
+    idx: WarpArray
+    count: WarpArray
+    info: WarpArray
+    scratch: WarpArray
 
 
 def missing(platform: str) -> str | None:
@@ -133,7 +135,7 @@ def call_kernels(module: str, make: Callable[[Variant], Any], search: Search, *,
 def _cpu_callable(variant: Variant) -> Kernel:
     types = array_types(variant)
 
-    def run(*arrays: Any) -> None:  # noqa: ANN401
+    def run(*arrays: WarpArray) -> None:
         _run_cells_on_cpu(variant, name_arrays(types, arrays))
 
     return on_cpu(name_of_call("cells_cpu", variant), run, types, 3 + variant.lists)
@@ -159,25 +161,27 @@ def array_types(variant: Variant) -> dict[str, Any]:
     return types | {"count": ints, "info": ints, "scratch": ints}
 
 
-def name_arrays(types: dict[str, Any], arrays: Sequence[Any]) -> Arrays:
+def name_arrays(types: dict[str, Any], arrays: Sequence[WarpArray]) -> Arrays:
+    """Return the arrays of a call by their names."""
     return Arrays(**{"idx": None, **dict(zip(types, arrays, strict=True))})
 
 
 def name_of_call(name: str, variant: Variant) -> str:
+    """Return the name of what XLA calls: of the kernels, and of all that is static."""
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
     flags |= {**space_flags(variant.periodic), "batched": variant.batched}
     flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
     return "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
 
 
-def _cuda_kernels(variant: Variant) -> Any:  # noqa: ANN401
+def _cuda_kernels(variant: Variant) -> CellKernels:
     make = kernels_of("cells_cuda").cell_kernels
     keep = variant.keep
     kind = {"periodic": variant.periodic, "batched": variant.batched}
     return make(variant.dim, variant.double, variant.scaled, variant.lists, keep.later_only, **kind)
 
 
-def _commands(variant: Variant, *buffers: Any) -> list[Command]:  # noqa: ANN401
+def _commands(variant: Variant, *buffers: WarpArray) -> list[Command]:
     arrays, sizes, capacity = _launchable(variant, name_arrays(array_types(variant), buffers))
     arguments = [*arrays, *sizes, capacity, int(variant.closed), int(variant.keep.drop_self)]
     launches = _cuda_kernels(variant).launches(*sizes[:2], variant.own)
@@ -197,14 +201,15 @@ def _run_cells_on_cpu(variant: Variant, arrays: Arrays) -> None:
 
 
 def sort_on_cpu(
-    kernels: Any,  # noqa: ANN401
-    positions: Any,  # noqa: ANN401
-    queries: Any,  # noqa: ANN401
-    cutoff: Any,  # noqa: ANN401
-    info: Any,  # noqa: ANN401
-    scratch: Any,  # noqa: ANN401
+    kernels: CellKernels,
+    positions: WarpArray,
+    queries: WarpArray,
+    cutoff: WarpArray,
+    info: WarpArray,
+    scratch: WarpArray,
     sizes: list[int],
 ) -> None:
+    """Sort sources and queries by cell; several cores put the coordinates of many sources in order."""
     n = sizes[0]
     on_one_core(kernels.build, [positions, queries, cutoff, info, scratch, *sizes])
     if n >= kernels_of("cells_cpu").MANY:
@@ -212,14 +217,15 @@ def sort_on_cpu(
         on_every_core(kernels.gather, arguments, -(-n // PLACES_PER_THREAD))
 
 
-def _launchable(variant: Variant, arrays: Arrays) -> tuple[Arrays, list[int], int]:
-    """Return the arrays, the sizes n, m, own and cells of the table, and the capacity, as the cell kernels take them.
+def cell_sizes(n: int, m: int, own: bool) -> list[int]:
+    """Return n, m, own and the cells of the table, as all kernels of cells take them."""
+    return [n, m, int(own), kernels_of("_native").table_cells(n)]
 
-    Without rows, something of their kind that nobody writes to stands in their place, and the capacity is 0.
-    """
+
+def _launchable(variant: Variant, arrays: Arrays) -> tuple[Arrays, list[int], int]:
+    """Return the arrays, the sizes (`cell_sizes`) and the capacity, as the cell kernels take them; without rows it is 0."""
     n, m, count = arrays.positions.shape[0], arrays.queries.shape[0], arrays.count
-    sizes = [n, m, int(variant.own), kernels_of("_native").table_cells(n)]
+    sizes = cell_sizes(n, m, variant.own)
     if arrays.idx is not None:
         return arrays, sizes, arrays.idx.shape[1]
-    unused = load_warp().array(ptr=count.ptr, shape=(m, 1), dtype=count.dtype, device=count.device)
-    return arrays._replace(idx=unused), sizes, 0
+    return arrays._replace(idx=stand_in(count, m)), sizes, 0

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -14,13 +14,11 @@ from jfrnn._engine.launch import Kernel, kernel
 from jfrnn._engine.levels_warp import level_sums
 from jfrnn._engine.operands import pack_particles, periodic_kind, space_flags
 from jfrnn._engine.problem import Filter, Search
-from jfrnn._engine.serving import on_cpu, on_cuda
+from jfrnn._engine.serving import on_cpu, on_cuda, stand_in
 from jfrnn._engine.start import WarpArray, WarpKernel, kernels_of, load_warp
 from jfrnn._engine.sum_results import SumsOf, TermText
-from jfrnn._engine.warp import sort_on_cpu
+from jfrnn._engine.warp import CellKernels, cell_sizes, sort_on_cpu
 from jfrnn._geometry import Cutoffs
-
-CellKernels = Any  # the kernels of a variant, of jfrnn.kernels
 
 
 class _SumVariant(NamedTuple):
@@ -84,9 +82,7 @@ def _call_sums(
     dims |= {"columns": max(engine.sorted_numbers(term, n, variant.dim, variant.double), 1)}
     cells = kernels_of(f"cells_{'cuda' if variant.cuda else 'cpu'}")
     of_search = {"info": 2, "scratch": cells.scratch_words(n, m, variant.dim, 2 if variant.double else 1, variant.own)}
-    if (
-        variant.cuda
-    ):  # a call of its own sorts particles, which XLA leaves out where it was made before: for a sum and its derivative
+    if variant.cuda:  # particles are sorted by a call of its own, which XLA makes once for a sum and its derivative
         values = (*values, *_sorting_callable(_sorting(variant))(*particles, output_dims=of_search))
     else:
         dims |= of_search
@@ -147,9 +143,8 @@ def _sorting_commands(variant: _SumVariant, *arrays: WarpArray) -> list[Command]
     positions, queries, cutoff, info, scratch = arrays
     n, m = positions.shape[0], queries.shape[0]
     # what sorts particles takes the arguments of a search that only counts
-    unused = load_warp().array(ptr=info.ptr, shape=(1, 1), dtype=info.dtype, device=info.device)
-    sizes = [n, m, int(variant.own), kernels_of("_native").table_cells(n)]
-    arguments = [positions, queries, cutoff, unused, info, info, scratch, *sizes, 0, 0, 0]
+    sizes = cell_sizes(n, m, variant.own)
+    arguments = [positions, queries, cutoff, stand_in(info, 1), info, info, scratch, *sizes, 0, 0, 0]
     stages = _stages_on_cuda(variant).stages(n, m, variant.own)
     return [Command(x.kernel, [*arguments, int(x.of_queries)], x.threads, x.block) for x in stages]
 
@@ -169,7 +164,7 @@ def _run_sums_on_cpu(variant: _SumVariant, term: TermText, *arrays: WarpArray) -
     cells, sort_values, query = _sum_kernels_on_cpu(variant, term)
     positions, queries, cutoff, shared, own, others, sums, totals, errors, columns, info, scratch = arrays
     n, m = positions.shape[0], queries.shape[0]
-    sizes = [n, m, int(variant.own), kernels_of("_native").table_cells(n)]
+    sizes = cell_sizes(n, m, variant.own)
     sort_on_cpu(cells, positions, queries, cutoff, info, scratch, sizes)
     if term.source_columns:
         sorting = [others, cutoff, columns, scratch, *sizes]
@@ -189,7 +184,7 @@ def _sum_kernels_on_cuda(variant: _SumVariant, term: TermText) -> CellKernels:
 def _sum_commands(variant: _SumVariant, term: TermText, *arrays: WarpArray) -> list[Command]:
     *given, info, scratch, sums, totals, errors, columns = arrays
     n, m = given[0].shape[0], given[1].shape[0]
-    sizes = [n, m, int(variant.own), kernels_of("_native").table_cells(n)]
+    sizes = cell_sizes(n, m, variant.own)
     arguments = [*given, sums, totals, errors, columns, info, scratch, *sizes, int(variant.closed), int(variant.drop_self)]
     launches = _sum_kernels_on_cuda(variant, term).launches(n, m)
     return [Command(x.kernel, arguments, x.threads, x.block, x.beside) for x in launches]

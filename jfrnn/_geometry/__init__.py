@@ -35,7 +35,7 @@ from jfrnn._geometry.inputs import (
     check_slack,
     largest_known,
 )
-from jfrnn._geometry.integers import GUARDS, carry_limbs, fields_of, full_count, limb_bits, limb_product, limb_sign, limbs_of
+from jfrnn._geometry.integers import GUARDS, carry_limbs, fields_of, full_count, limb_bits, limb_sign, limbs_of
 from jfrnn._geometry.lattice import (
     Lattice,
     forward_shifts,
@@ -116,7 +116,6 @@ __all__ = [
     "largest_known",
     "level_runs",
     "limb_bits",
-    "limb_product",
     "limb_sign",
     "limbs_of",
     "make_cutoff",

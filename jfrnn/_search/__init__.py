@@ -5,7 +5,7 @@ from jfrnn._search.exports import MOST_PAIRS, saturating_add
 from jfrnn._search.geometry import norms
 from jfrnn._search.making import round_capacity
 from jfrnn._search.neighbor_list import ROWS_ARE_WHOLE, NeighborList
-from jfrnn._search.problem import Problem, check_problem
+from jfrnn._search.problem import check_problem
 from jfrnn._search.search import count, search
 from jfrnn._search.verlet import list_radius, moved_too_far
 
@@ -13,7 +13,6 @@ __all__ = [
     "MOST_PAIRS",
     "ROWS_ARE_WHOLE",
     "NeighborList",
-    "Problem",
     "check_problem",
     "count",
     "list_radius",

@@ -38,9 +38,9 @@ from jfrnn._geometry import (
 from jfrnn._search.exports import DenseNeighbors, check_total, flat_pairs, pair_total
 from jfrnn._search.geometry import ImageCodes, ImagesMade, lattice_shifts, norms, open_vectors, periodic_vectors
 from jfrnn._search.making import count_capacity, find_fields, round_capacity
-from jfrnn._search.problem import Given, Problem
+from jfrnn._search.problem import Problem
 from jfrnn._search.verlet import Verlet, moved_too_far
-from jfrnn._tracing import at_once, call_apart, compiled, own_transfers
+from jfrnn._tracing import Given, at_once, call_apart, compiled, own_transfers
 
 ROWS_ARE_WHOLE = Status.NONFINITE | Status.TOTAL_OVERFLOW  # bits with which every row has all its neighbors
 

@@ -1,7 +1,6 @@
 """What was asked: the arguments that all verbs share, checked, and what a list remembers of them."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 from jax import Array
@@ -26,8 +25,7 @@ from jfrnn._geometry import (
     round_box,
 )
 from jfrnn._search.verlet import list_radius
-
-Given = Any  # an argument as the user passed it, not yet checked
+from jfrnn._tracing import Given
 
 
 @dataclasses.dataclass(frozen=True)
