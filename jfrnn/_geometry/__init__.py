@@ -1,4 +1,4 @@
-"""What a pair is: cutoffs, boxes, cells, orders, batches, checked inputs, and the status of a result."""
+"""Geometry: the exact pair test, cutoffs, periodic boxes, cells, particle orders, batches, argument checks and status bits."""
 
 from jfrnn._geometry.batch import Batch, rank_systems
 from jfrnn._geometry.box import Box, round_box

@@ -1,4 +1,4 @@
-"""Batches: particles of many systems in one call, told apart by the number of their system."""
+"""Batches: particles of many independent systems in one call. A system number per particle keeps the systems apart."""
 
 from typing import NamedTuple
 
@@ -8,11 +8,11 @@ from jax import Array, lax
 
 
 class Batch(NamedTuple):
-    """To which system each particle belongs; a pytree.
+    """The system number of each particle; only particles of one system can be neighbors. A pytree.
 
     Attributes:
-        sources: [n] int32, whatever the user numbers systems with; or uint32, ranked.
-        queries: [m] of the queries; None where the sources are the queries.
+        sources: [n] system of each source: int32 as the user numbers systems, or uint32 after `rank_systems`.
+        queries: [m] system of each query; None if the sources are the queries.
     """
 
     sources: Array
@@ -20,17 +20,17 @@ class Batch(NamedTuple):
 
     @property
     def of_queries(self) -> Array:
-        """Systems of the queries, or of the sources where those are the queries."""
+        """System numbers of the queries, which are those of the sources if the sources are the queries."""
         return self.sources if self.queries is None else self.queries
 
     @property
     def of_all(self) -> Array:
-        """Systems of the sources, then those of the queries unless the sources are the queries."""
+        """System numbers of the sources, followed by those of the queries if these are separate."""
         return self.sources if self.queries is None else jnp.concatenate([self.sources, self.queries])
 
 
 def rank_systems(batch: Batch) -> Batch:
-    """Number systems from 0 on, as uint32, by what they are above the lowest: the range of int32 holds no surprise."""
+    """Replace system numbers by their differences to the smallest one, as uint32, which holds every difference of two int32."""
     sources = _in_order(batch.sources)
     queries = None if batch.queries is None else _in_order(batch.queries)
     lowest = jnp.min(Batch(sources, queries).of_all, initial=np.uint32(2**32 - 1))
@@ -38,5 +38,5 @@ def rank_systems(batch: Batch) -> Batch:
 
 
 def _in_order(x: Array) -> Array:
-    """Map int32 to uint32 of the same order."""
+    """Map int32 to uint32 so that the order of numbers is kept."""
     return lax.bitcast_convert_type(x, jnp.uint32) ^ np.uint32(1 << 31)

@@ -1,4 +1,4 @@
-"""The public `Box`: along which lattice vectors space repeats itself."""
+"""The public class `Box`: the periodic cell, given by edge lengths or by lattice vectors."""
 
 import dataclasses
 from collections.abc import Iterable, Sequence
@@ -11,19 +11,19 @@ from jax.core import Tracer
 
 from jfrnn._tracing import Given, own_transfers
 
-Numbers = Any  # an array of NumPy or of JAX, traced or not
+Numbers = Any  # an array of NumPy or JAX, concrete or traced
 
 
 @jax.tree_util.register_pytree_with_keys_class
 @dataclasses.dataclass(frozen=True, init=False)
 class Box:
-    """Say along which lattice vectors space repeats itself. A pytree; lengths, vectors and origin may be traced.
+    """A periodic box: space repeats along its lattice vectors. A pytree; lengths, vectors and origin may be traced.
 
     Attributes:
-        vectors: Lengths of the edges [length], shape [d], or lattice vectors, one per row, shape [d, d].
+        vectors: Edge lengths [length], shape [d], or lattice vectors, one per row, shape [d, d].
         origin: A corner of the cell [length], shape [d].
-        periodic: For each axis, whether space repeats itself along it. Static.
-        images: For each axis, over how many cells to either side a pair may reach; None: see `Box`. Static.
+        periodic: Whether each axis is periodic. Static.
+        images: How many cells away a periodic image may lie and still be a neighbor, per axis; None: see `Box`. Static.
     """
 
     vectors: Numbers
@@ -39,20 +39,19 @@ class Box:
         *,
         images: int | Sequence[int] | None = None,
     ) -> None:
-        """Make a box from the lengths of its edges or from its lattice vectors.
+        """Make a box from its edge lengths or from its lattice vectors.
 
         Args:
-            lengths_or_matrix: Lengths [length], shape [2] or [3], all > 0, of edges along the axes; or lattice vectors [length],
-                one per row, shape [2, 2] or [3, 3], of any handedness and skew (where they are known while tracing, short ones of
-                the same lattice are found; shifts count the given ones). Along an axis that is not periodic nothing but
-                finite numbers is asked of them. Rounded once to the dtype of the positions.
+            lengths_or_matrix: Edge lengths [length], shape [2] or [3], all > 0; or lattice vectors [length], one per row, shape [2,
+                2] or [3, 3], of any handedness and skew. If skewed vectors are known while tracing, the search works in short
+                vectors of the same lattice; shifts still count the given vectors. Rows of axes that are not periodic only need to
+                be finite. Values are rounded once to the dtype of the positions.
             periodic: One bool for all axes, or one per axis (per row of the matrix).
-            origin: A corner of the cell [length], a number or shape [d]. It changes no pair; a search is fastest where particles
-                lie between origin and origin + vectors.
-            images: Over how many cells to either side a pair may reach, a static int or one per axis. Default: as many as the
-                cutoff needs where the box is known while tracing; where it is traced, nothing but the nearest image of a particle
-                is looked at, which needs a box at least 2.05 (cutoff + skin) wide along every periodic axis. A box that
-                is too small for that sets a status bit.
+            origin: A corner of the cell [length], a number or shape [d]. It changes no pair; a search is fastest if particles lie
+                between origin and origin + vectors.
+            images: How many cells away a periodic image may lie and still be a neighbor: a static int, or one per axis. Default: as
+                many as the cutoff needs if the box is known while tracing. For a traced box the default is the minimum image alone,
+                which needs a box at least 2.05 (cutoff + skin) wide along every periodic axis; a smaller box sets a status bit.
 
         Raises:
             TypeError, ValueError: an argument is of the wrong kind, shape or range.
@@ -78,13 +77,13 @@ class Box:
             object.__setattr__(self, name, value)
 
     def tree_flatten_with_keys(self) -> tuple[Any, Any]:
-        """Return the arrays with their names, and what is static."""
+        """Return the arrays with their names, and the static fields."""
         keys = (jax.tree_util.GetAttrKey("vectors"), jax.tree_util.GetAttrKey("origin"))
         return tuple(zip(keys, (self.vectors, self.origin), strict=True)), (self.periodic, self.images)
 
     @classmethod
     def tree_unflatten(cls, static: tuple[tuple[bool, ...], tuple[int, ...] | None], arrays: Iterable[Numbers]) -> "Box":
-        """Make a box of arrays that nobody checks again."""
+        """Make a box from its parts without checking them again."""
         box = object.__new__(cls)
         vectors, origin = arrays
         box._set(vectors, origin, *static)
@@ -102,7 +101,7 @@ class Box:
 
 
 def _real(name: str, value: Given) -> Numbers:
-    """Return floats, a traced array as it is and everything else as a NumPy array of its own."""
+    """Return floats: a traced array unchanged, everything else as a new NumPy array."""
     if isinstance(value, Tracer):
         if not jnp.issubdtype(value.dtype, jnp.floating):
             raise TypeError(f"{name} must be real numbers, got a traced {value.dtype}.")
@@ -110,7 +109,7 @@ def _real(name: str, value: Given) -> Numbers:
     array = np.asarray(value)
     if array.dtype.kind not in "fiu":
         raise TypeError(f"{name} must be real numbers, got {type(value).__name__} {value!r}.")
-    return array.astype(array.dtype if array.dtype in (np.float32, np.float64) else np.float64)  # a copy, whoever changes the other
+    return array.astype(array.dtype if array.dtype in (np.float32, np.float64) else np.float64)  # a copy of the user's array
 
 
 def _per_axis(name: str, value: Given, dim: int, kinds: tuple[type, ...], what: str, least: int | None = None) -> tuple[Any, ...]:
@@ -139,6 +138,6 @@ def check_box_values(vectors: Numbers, origin: Numbers, periodic: tuple[bool, ..
 
 
 def round_box(box: Box, dtype: np.dtype) -> Box:
-    """Round a box to a dtype; what is left of it are its arrays and its periodic axes."""
+    """Return a box with its arrays rounded to a dtype; it keeps which axes are periodic, but not `images`."""
     with own_transfers():
         return Box.tree_unflatten((box.periodic, None), tuple(jnp.asarray(x).astype(dtype) for x in (box.vectors, box.origin)))

@@ -1,7 +1,7 @@
-"""Cells: which cell a particle is in, in which order the cells stand, and where the particles of a cell lie.
+"""Cell lists: the cell of each particle, the order of the cells in memory, and where the particles of a cell start.
 
-A cell is a cube of edge `cell_edge(cutoff)`, a float slightly above the cutoff. Cells along x are adjacent in the order, so that
-the stencil of a particle is one contiguous run of sorted particles per row of cells: 3 runs in 2D, 9 in 3D.
+A cell is a cube of edge `cell_edge(cutoff)`, a float slightly larger than the cutoff. Cells along x are adjacent in memory, so the
+3^d cells around a query form one contiguous run of sorted sources per row of cells: 3 runs in 2D, 9 in 3D.
 """
 
 from collections.abc import Sequence
@@ -13,21 +13,21 @@ from jax import Array, lax
 
 from jfrnn._geometry.images import Images
 
-_CELLS_PER_PARTICLE = 4  # a dense table holds at most this many cells per particle: 16 B per particle
+_CELLS_PER_PARTICLE = 4  # the largest dense table, in cells per particle: 16 B per particle
 _SMALLEST_TABLE = 4096
 _FAR = np.int32(2**31 - 1)
 
 
 class Grid(NamedTuple):
-    """Sources in cell order, and what is needed to find a cell among them.
+    """Sources sorted by cell, and the tables that find the sources of a cell.
 
     Attributes:
-        order: [n] int32, the particle at each place of the cell order; non-finite ones last.
-        coords: [d, n] int32 in that order, the cell of each particle (x, y[, z]); [d + 1, n] where systems are told apart, the last
-            being the system.
-        extent: [d] or [d + 1] int32, cells per axis; with a margin of one empty cell on either side where space is open.
-        dense: [] bool, whether the box is small enough for `table`.
-        table: [cells + 1] int32, the first place of each cell in row-major order (zeros where not dense).
+        order: [n] int32, the source at each position of the cell order; non-finite ones come last.
+        coords: [d, n] int32, the cell (x, y[, z]) of each source in that order; [d + 1, n] with a batch, the system being the last
+            row.
+        extent: [d] or [d + 1] int32, number of cells per axis. Open axes have an empty cell at either end.
+        dense: [] bool, whether the bounding box is small enough for `table`.
+        table: [cells + 1] int32, where each cell starts in the order, cells in row-major order; zeros if not dense.
     """
 
     order: Array
@@ -38,7 +38,7 @@ class Grid(NamedTuple):
 
 
 def cell_edge(radius: np.floating | Array) -> Array:
-    """Return the smallest float with half a mantissa (12 or 26 bits) above the cutoff."""
+    """Return the smallest float above the cutoff that has half a mantissa (12 or 26 bits)."""
     radius = jnp.asarray(radius)
     unsigned, dropped = (jnp.uint32, 12) if radius.dtype == jnp.float32 else (jnp.uint64, 27)
     bits = lax.bitcast_convert_type(radius, unsigned)
@@ -46,14 +46,13 @@ def cell_edge(radius: np.floating | Array) -> Array:
 
 
 def cell_coordinate(x: Array, edge: Array) -> Array:
-    """Return the index of the cell that holds each coordinate, as a whole float: the exact floor of |x|/edge, mirrored below 0.
+    """Return the cell index of each coordinate as a whole float: floor(|x| / edge) exactly, mirrored for x < 0.
 
-    Why no pair leaves the stencil: cells are intervals of width `edge` (x >= 0: [k·edge, (k+1)·edge) is cell k; x < 0: the mirror
-    image is cell -1-k), and `edge` exceeds the cutoff, so that two coordinates with a whole cell between them are further apart
-    than the cutoff. The quotient's rounding is undone: with half a mantissa in `edge` and in either half of q, the products
-    q_high·edge and q_low·edge are exact, and so is |x| - q_high·edge; the sign of the remainder is therefore right. From
-    q = 2^24 (2^53) on, neighboring floats are further apart than the cutoff, so that only equal coordinates, which share a cell,
-    can belong to a pair.
+    No pair leaves the 3^d cells around a particle. Cell k >= 0 is the interval [k·edge, (k+1)·edge), and cell -1-k is its mirror
+    image. Since `edge` exceeds the cutoff, two coordinates with a whole cell between them are farther apart than the cutoff. The
+    rounding of the quotient is corrected: `edge` and both halves of the quotient q have half a mantissa, so q_high·edge, q_low·edge
+    and |x| - q_high·edge are exact, and the sign of the remainder is right. From q = 2^24 (2^53) on, neighboring floats are farther
+    apart than the cutoff; only equal coordinates, which share a cell, can then form a pair.
     """
     magnitude = jnp.abs(x)
     quotient = jnp.floor(magnitude / edge)
@@ -63,7 +62,7 @@ def cell_coordinate(x: Array, edge: Array) -> Array:
 
 
 def cell_remainder(x: Array, edge: Array) -> Array:
-    """Return how far |x| lies beyond the beginning of its cell, exactly: in [0, edge) while cells are told apart."""
+    """Return the distance of |x| from the start of its cell, exactly; in [0, edge) unless cells are too far away to resolve."""
     cell = cell_coordinate(x, edge)
     return _remainder(jnp.abs(x), jnp.where(x < 0, -1 - cell, cell), edge)
 
@@ -75,24 +74,24 @@ def _remainder(magnitude: Array, quotient: Array, edge: Array) -> Array:
 
 
 class CellAxes(NamedTuple):
-    """How each axis is cut into cells: one entry per axis, `turns` [] whole float where it is periodic (cells in its length)."""
+    """How each axis is divided into cells: the edge, and for periodic axes `turns` [], the whole number of cells in the box."""
 
     edges: list[Array]
     turns: list[Array | None]
 
 
 def open_axes(edge: Array, dim: int) -> CellAxes:
-    """Cut every axis of an open space into cells of one edge."""
+    """Divide all axes of an open space into cells of one edge."""
     return CellAxes([edge] * dim, [None] * dim)
 
 
 def grid_coordinates(positions: Array, axes: CellAxes, finite: Array, batch: Array | None = None) -> tuple[Array, Array]:
-    """Number the cells of [d, n] coordinates along each axis: [d, n] int32, and the [d] extents; systems are a further axis.
+    """Number the cells of coordinates [d, n] along each axis: return [d, n] int32 and the extents [d]. A batch adds an axis.
 
-    Open axes count from 1 on, with margins: a small bounding box keeps its empty cells; in a large one, runs of empty planes
-    shrink to a single one, axis by axis: cells that touch still touch, cells that do not still do not, and no axis is longer than
-    2n + 1, however far apart the particles are. Periodic axes, whose coordinates are fractions from 0 to 1, count from 0 on.
-    Of `batch`, [n] uint32 from 0 on, equal numbers stay equal and different ones different; n are the most that there can be.
+    Open axes count from 1, with a margin of one empty cell. If the bounding box is small, empty cells are kept. If it is large,
+    each run of empty planes shrinks to one, axis by axis: adjacent cells stay adjacent, others do not become so, and no axis is
+    longer than 2n + 1 cells. Periodic axes, whose coordinates are fractions from 0 to 1, count from 0.
+    `batch` [n] uint32 holds system numbers; they are renumbered from 0 with small gaps, and distinct systems stay distinct.
     """
     some = jnp.any(finite)
     is_open = [turn is None for turn in axes.turns]
@@ -130,7 +129,7 @@ def grid_coordinates(positions: Array, axes: CellAxes, finite: Array, batch: Arr
 
 
 def _squeeze_gaps(cells: Array) -> Array:
-    """Renumber whole floats, or uint32, [n] from 0 on, in order, with steps of at most 2."""
+    """Renumber whole floats or uint32 [n] from 0, keeping their order, so that consecutive values differ by at most 2."""
     _, order = _sort_by(cells if cells.dtype == jnp.uint32 else ordered_bits(cells), _iota(cells.size))
     ascending = cells[order]
     before, after = ascending[:-1], ascending[1:]
@@ -140,7 +139,7 @@ def _squeeze_gaps(cells: Array) -> Array:
 
 
 def ordered_bits(x: Array) -> Array:
-    """Map floats to unsigned integers of the same order."""
+    """Map floats to unsigned integers so that the order is kept."""
     unsigned = jnp.uint32 if x.dtype == jnp.float32 else jnp.uint64
     top = unsigned(1 << (32 if x.dtype == jnp.float32 else 64) - 1)
     bits = lax.bitcast_convert_type(x, unsigned)
@@ -148,7 +147,7 @@ def ordered_bits(x: Array) -> Array:
 
 
 def _sort_by(key: Array, payload: Array) -> tuple[Array, Array]:
-    # two operands: XLA's fast sort on every device
+    # With two operands, XLA uses its fast sort on every device.
     ascending, carried = lax.sort((key, payload), num_keys=1, is_stable=True)
     return ascending, carried
 
@@ -162,8 +161,8 @@ def _table_size(n: int) -> int:
 
 
 def build_grid(coords: Array, finite: Array, extent: Array, capacity: int) -> Grid:
-    """Sort n >= 1 sources by cell; `capacity` particles (sources and queries) bound the size of a dense table."""
-    cells = jnp.prod(extent.astype(jnp.float32)) * np.float32(1 + 1e-6)  # rounded up: a table is never too small
+    """Sort n >= 1 sources by cell; `capacity`, the number of sources and queries, bounds the size of a dense table."""
+    cells = jnp.prod(extent.astype(jnp.float32)) * np.float32(1 + 1e-6)  # rounded up, so that the table is never too small
     size = _table_size(capacity)
     dense = cells <= size
     order = cell_order(coords, finite, extent, dense)
@@ -178,7 +177,7 @@ def build_grid(coords: Array, finite: Array, extent: Array, capacity: int) -> Gr
 
 
 def cell_order(coords: Array, finite: Array, extent: Array, dense: Array) -> Array:
-    """Return the [n] int32 order of particles by cell (x fastest), ties by index, non-finite ones last."""
+    """Return particles sorted by cell (x fastest), [n] int32; ties are sorted by index, non-finite particles come last."""
 
     def by_row_major_key(coords: Array) -> Array:
         key = jnp.where(finite, _row_major(coords, extent), _FAR)
@@ -199,13 +198,12 @@ def _row_major(coords: Sequence[Array] | Array, extent: Array) -> Array:
 
 
 def stencil_runs(grid: Grid, coords: Array, dim: int, images: Images | None = None) -> tuple[Array, Array, Array | None]:
-    """Find the sources in the cells around each query cell [d, m]: [m, runs] int32 first places, ends, and codes of their images.
+    """Find the sources in the cells around each query's cell [d, m]: starts, ends and image codes of their runs, [m, runs] int32.
 
-    Where systems are told apart, the cells are [d + 1, m], and the system is that of the query.
-
-    An open space has a run per row of 3 cells, 3^(d-1) of them. Along a periodic axis cells are numbered on beyond either end,
-    where they are those of an image; a row is cut where it enters another image.
-    Dense: two loads from the table per run. Otherwise: two binary searches per run among the sorted cells of the sources.
+    With a batch, query cells are [d + 1, m], the last row being the system.
+    In open space each query has 3^(d-1) runs, one per row of 3 cells. Along a periodic axis the cells beyond either end are those
+    of a periodic image, and a row is split where it enters another image.
+    A dense grid needs two table loads per run, any other two binary searches among the sorted source cells.
     """
     cells, code = _stencil_rows(coords, grid.extent, dim, images)
     start, stop = places_between(grid, cells)
@@ -213,7 +211,7 @@ def stencil_runs(grid: Grid, coords: Array, dim: int, images: Images | None = No
 
 
 def places_between(grid: Grid, cells: list[Array]) -> tuple[Array, Array]:
-    """Return the first place and the end of rows of cells [m, r]: given are their first and last cell along x, then y[, z]."""
+    """Return start and end [m, r] of rows of cells, given by their first and last cell along x and by y[, z]."""
 
     def from_table(cells: list[Array]) -> tuple[Array, Array]:
         first, last, *rest = cells
@@ -229,7 +227,7 @@ def places_between(grid: Grid, cells: list[Array]) -> tuple[Array, Array]:
 
 
 def _stencil_rows(coords: Array, extent: Array, dim: int, images: Images | None) -> tuple[list[Array], Array | None]:
-    """Return first and last cell along x and the cells along the other axes of each run, [m, runs] each, and their images."""
+    """Return the first and last cell along x, the cells along the other axes, and the image code of each run, [m, runs] each."""
     reach = (0,) * dim if images is None else images.reach
     steps = [range(-max(k, 1), max(k, 1) + 1) for k in reach]
     if len(coords) > dim:
@@ -237,7 +235,7 @@ def _stencil_rows(coords: Array, extent: Array, dim: int, images: Images | None)
     parts = _parts_of_rows(coords[0], extent[0], reach[0], images)
     rows = np.stack(np.meshgrid(*steps[1:], indexing="ij"), -1).reshape(-1, len(coords) - 1).astype(np.int32)
 
-    def each(parts: Sequence[Array]) -> Array:  # [m, runs]: the rows of the first part, then those of the next
+    def each(parts: Sequence[Array]) -> Array:  # [m, runs]: all rows of the first part come first
         return jnp.repeat(jnp.stack(parts, axis=1), len(rows), axis=1)
 
     first, last, shift = (each([part[what] for part in parts]) for what in range(3))
@@ -256,10 +254,10 @@ def _stencil_rows(coords: Array, extent: Array, dim: int, images: Images | None)
 
 
 def _parts_of_rows(x: Array, extent: Array, reach: int, images: Images | None) -> list[tuple[Array, Array, Array]]:
-    """Cut the row of cells around x [m] where images meet: for each part its first and last cell and its image, [m] each."""
+    """Split the row of cells around x [m] at the borders of images: first cell, last cell and image of each part, [m] each."""
     if images is None or reach == 0:
         return [(x - 1, x + 1, jnp.zeros_like(x))]
-    if images.nearest:  # at least two cells: only one other image is met
+    if images.nearest:  # The box has at least two cells, so a row enters only one other image.
         other = jnp.where(x == 0, -1, 1)
         shifts = [jnp.zeros_like(x), other]
     else:
@@ -269,11 +267,11 @@ def _parts_of_rows(x: Array, extent: Array, reach: int, images: Images | None) -
 
 
 def _lower_bound(cells: Array, target: list[Array]) -> Array:
-    """Return the first place among sorted cells [d, n] that is not below the target, the last axis compared first."""
+    """Return the first index among sorted cells [d, n] that is not below the target; the last axis is compared first."""
 
     def is_below(place: Array) -> Array:
         below = jnp.zeros(place.shape, bool)
-        for c, t in zip(cells, target, strict=True):  # x first: a later axis overrules an earlier one
+        for c, t in zip(cells, target, strict=True):  # x first: later axes take precedence
             here = c.at[place].get(mode="clip")
             below = (here < t) | ((here == t) & below)
         return below

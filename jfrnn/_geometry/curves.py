@@ -1,6 +1,6 @@
-"""Space-filling curves: keys of cells along the Morton and the Hilbert curve, and cells of such keys.
+"""Space-filling curves: encode cells as keys along the Morton and Hilbert curves, and decode them.
 
-Keys are computed in two uint32 words, whatever the mode of JAX. Only `_pack` depends on that mode.
+Keys are computed in two uint32 words, whether or not JAX's 64-bit mode is on. Only `_pack` and `_unpack` depend on that mode.
 """
 
 import functools
@@ -14,7 +14,7 @@ from jax.core import Tracer
 
 from jfrnn._tracing import Given, at_once, compiled, own_transfers
 
-Words = tuple[Array, Array]  # the high and the low half of a key, uint32
+Words = tuple[Array, Array]  # high and low half of a key, uint32
 _MOST_BITS = {2: 31, 3: 21}
 
 
@@ -35,8 +35,8 @@ def morton_encode(coords: Array, bits: int | None = None) -> Array:
         The keys.
 
     Raises:
-        TypeError, ValueError: an argument is of the wrong kind, shape or range. Coordinates out of range are seen where they are
-            concrete; where they are traced, their lowest `bits` bits count.
+        TypeError, ValueError: an argument is of the wrong kind, shape or range. Coordinates out of range raise if they are
+            concrete; of traced ones only the lowest `bits` bits are used.
 
     Differentiable: no (integers). Jit: yes, bits static. vmap: yes. Source: Morton (1966), A computer oriented geodetic data base.
     """
@@ -65,11 +65,11 @@ def morton_decode(keys: Array, dim: int, bits: int | None = None) -> Array:
 
 
 def hilbert_encode(coords: Array, bits: int) -> Array:
-    """Compute the places of cells along the Hilbert curve through the cube of 2^bits cells per axis.
+    """Compute the positions of cells along the Hilbert curve through the cube of 2^bits cells per axis.
 
     Two cells that follow each other on the curve share a face. The convention is Skilling's: the curve starts at the origin and
     ends at the far end of x; of the first 2^d cells, the second is one step along the last axis. bits = 1 in 3D visits (x, y, z) =
-    000 001 011 010 110 111 101 100. The keys of the lowest cells stay the same where `bits` grows by a multiple of d.
+    000 001 011 010 110 111 101 100. Keys do not change if `bits` grows by a multiple of d.
 
     Args:
         coords: Cell coordinates, integers of any width, shape [..., 2] or [..., 3], 0 <= c < 2^bits.
@@ -131,18 +131,18 @@ def _morton_axes(words: Words, dim: int, _: int) -> list[Array]:
 
 
 def hilbert_words(axes: list[Array], bits: int) -> Words:
-    """Skilling's AxestoTranspose; x holds the highest bit of each group of d bits in the key."""
+    """Return Hilbert keys by Skilling's AxestoTranspose; x contributes the highest of each group of d bits in the key."""
     axes = _turn_levels(axes, bits, upwards=False)
     for axis in range(1, len(axes)):
         axes[axis] = axes[axis] ^ axes[axis - 1]
-    parity = axes[-1]  # of all bits above each bit
+    parity = axes[-1]  # becomes the parity of all bits above each bit
     for step in (1, 2, 4, 8, 16):
         parity = parity ^ parity >> step
     return _interleave([c ^ parity >> 1 for c in reversed(axes)])
 
 
 def _hilbert_axes(words: Words, dim: int, bits: int) -> list[Array]:
-    """Skilling's TransposetoAxes: the steps of `hilbert_words` backwards."""
+    """Invert `hilbert_words`: Skilling's TransposetoAxes."""
     axes = _separate(words, dim)[::-1]
     parity = axes[-1] >> 1
     for axis in range(dim - 1, 0, -1):
@@ -152,13 +152,13 @@ def _hilbert_axes(words: Words, dim: int, bits: int) -> list[Array]:
 
 
 def _turn_levels(axes: list[Array], bits: int, *, upwards: bool) -> list[Array]:
-    """Level by level, axis by axis: mirror x below a level where the axis has the bit of the level, else swap the two there.
+    """For each level and axis, invert the bits of x below the level if the axis has the level's bit, else swap them with x's.
 
-    Each turn is its own inverse. A loop, because XLA may take minutes to compile a program of 60 turns.
+    Each such step is its own inverse. The steps form a loop because XLA may take minutes to compile 60 of them unrolled.
     """
 
     def turn(step: Array, axes: list[Array]) -> list[Array]:
-        level = jnp.asarray(step if upwards else bits - step).astype(jnp.uint32)  # a number without jit
+        level = jnp.asarray(step if upwards else bits - step).astype(jnp.uint32)  # without jit, `step` is a Python int
         below = (jnp.uint32(1) << level) - 1
         for axis in range(len(axes))[:: -1 if upwards else 1]:
             upper = (axes[axis] >> level & 1) == 1
@@ -171,7 +171,7 @@ def _turn_levels(axes: list[Array], bits: int, *, upwards: bool) -> list[Array]:
 
 
 def _interleave(axes: list[Array]) -> Words:
-    """Put bit b of axis a in place d * b + a of the key."""
+    """Move bit b of axis a to bit d * b + a of the key."""
     high = low = jnp.zeros_like(axes[0])
     for axis, c in enumerate(axes):
         first, shift = _high_part(axis, len(axes))
@@ -187,13 +187,13 @@ def _separate(words: Words, dim: int) -> list[Array]:
 
 
 def _high_part(axis: int, dim: int) -> tuple[int, int]:
-    """Return the lowest bit of an axis that stands in the high word, and its place there."""
+    """Return the lowest bit of an axis that goes to the high word, and its position there."""
     first = -(-(32 - axis) // dim)
     return first, dim * first + axis - 32
 
 
 def spread(c: Array, dim: int) -> Array:
-    """Move bit b to place d * b, for as many bits as one word has places (2D: 16, 3D: 11)."""
+    """Move bit b to bit d * b, for as many bits as fit into one word (2D: 16, 3D: 11)."""
     c = c & np.uint32(2 ** -(-32 // dim) - 1)
     for group in (8, 4, 2, 1):
         c = (c | c << (dim - 1) * group) & _groups(group, dim)
@@ -201,7 +201,7 @@ def spread(c: Array, dim: int) -> Array:
 
 
 def _gather(c: Array, dim: int) -> Array:
-    """Move bit d * b to place b: the inverse of `_spread`."""
+    """Move bit d * b to bit b: the inverse of `spread`."""
     c = c & _groups(1, dim)
     for group in (1, 2, 4, 8):
         c = (c | c >> (dim - 1) * group) & _groups(2 * group, dim)
@@ -209,7 +209,7 @@ def _gather(c: Array, dim: int) -> Array:
 
 
 def _groups(length: int, dim: int) -> np.uint32:
-    """Return a mask of as many set bits, at every d-th multiple of their number."""
+    """Return a mask in which `length` bits are set at every multiple of dim * length."""
     mask = sum((2**length - 1) << start for start in range(0, 32, dim * length))
     return np.uint32(mask & (2**32 - 1))
 
@@ -231,7 +231,7 @@ def _unpack(keys: Array, key_bits: int) -> Words:
 
 
 def _check_coords(coords: Given, bits: object, default: bool = False) -> tuple[Array, int]:
-    """Return coordinates [..., 2] or [..., 3] within the cube, and the bits."""
+    """Return checked coordinates, [..., 2] or [..., 3], and the number of bits."""
     dtype = getattr(coords, "dtype", type(coords).__name__)
     if isinstance(dtype, str) or not jnp.issubdtype(dtype, jnp.integer):
         raise TypeError(
@@ -247,7 +247,7 @@ def _check_coords(coords: Given, bits: object, default: bool = False) -> tuple[A
 
 
 def _check_keys(keys: Given, dim: object, bits: object, default: bool = False) -> tuple[Array, int, int]:
-    """Return keys of the type that encoding gives, the dimension and the bits."""
+    """Return checked keys of the dtype that encoding gives, the dimension and the number of bits."""
     if isinstance(dim, bool) or not isinstance(dim, int | np.integer) or dim not in (2, 3):
         raise ValueError(f"dim must be 2 or 3, a static int, got {dim!r}.")
     dim = int(dim)
@@ -278,10 +278,10 @@ def _check_bits(bits: object, dim: int, default: bool) -> int:
 
 
 def _check_range(name: str, values: Given, limit: int, advice: str) -> None:
-    """Refuse concrete integers outside [0, limit), before a conversion could drop their high bits."""
+    """Raise for concrete integers outside [0, limit), before a conversion could drop their high bits."""
     if isinstance(values, Tracer) or not values.size:
         return
-    with at_once(), own_transfers():  # concrete inside jit too
+    with at_once(), own_transfers():  # also evaluates concrete values inside jit
         low, high = (int(x) for x in _range(values))
     if not 0 <= low <= high < limit:
         raise ValueError(f"{name} must be in [0, {limit}), got values from {low} to {high}: {advice}.")

@@ -1,4 +1,4 @@
-"""Cutoffs of pairs, one for all (`Cutoff`) or one per particle (`Cutoffs`), and what step 1 of the pair test derives from them."""
+"""Cutoffs, one for all particles (`Cutoff`) or one per particle (`Cutoffs`), with the derived constants of the pair test."""
 
 import dataclasses
 import functools
@@ -11,25 +11,25 @@ from jax import Array, lax
 
 from jfrnn._geometry.floats import two_sum, unit_scale
 
-Flags = Any  # bools in an array of the kind that was given, of NumPy or of JAX
-RULES = ("gather", "scatter", "either", "both", "mean")  # whose cutoff is a pair's: i's, j's, the larger, the smaller, the mean
+Flags = Any  # bool array of NumPy or JAX, like the argument
+RULES = ("gather", "scatter", "either", "both", "mean")  # cutoff of a pair: i's, j's, larger, smaller, mean
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Cutoff:
-    """A cutoff, rounded once to the dtype of the positions, with all that the pair test derives from it.
+    """One cutoff for all pairs, rounded to the dtype of the positions, with the derived constants of the pair test.
 
     The numbers are operands of the compiled program, not constants in it: one program serves every cutoff.
 
     Attributes:
-        radius: r.
-        inside: scaled squared distances below this belong to pairs, without doubt.
-        outside: scaled squared distances above this do not, without doubt.
-        unit_scale: power of two, itself a normal float, that brings r into [1, 4).
-        plain_bits: magnitude bits of the smallest coordinate for which step 2 cannot underflow.
-        closed: pairs at exactly r count. Static.
-        scaled: r is so small or large that differences take `unit_scale` before they are squared. Static.
+        radius: The cutoff r.
+        inside: A scaled squared distance below this certainly belongs to a pair.
+        outside: A scaled squared distance above this certainly does not.
+        unit_scale: Power of two, a normal float, that scales r into [1, 4).
+        plain_bits: Magnitude bits of the smallest coordinate for which step 2 cannot underflow.
+        closed: Whether pairs at exactly r count. Static.
+        scaled: Whether r is so small or large that differences are multiplied by `unit_scale` before squaring. Static.
     """
 
     radius: np.floating | Array
@@ -44,12 +44,12 @@ class Cutoff:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Radii:
-    """Cutoffs that differ from particle to particle, as they were given; data, so that they may be traced.
+    """Cutoffs per particle as the user gave them; arrays, so they may be traced.
 
     Attributes:
-        sources: [n] of the sources, or None where the rule does not ask for them.
-        queries: [m] of the queries, likewise.
-        rule: Which of both is a pair's (`RULES`). Static.
+        sources: [n] cutoffs of the sources, or None if the rule does not use them.
+        queries: [m] cutoffs of the queries, likewise.
+        rule: How the cutoff of a pair follows from both (`RULES`). Static.
     """
 
     sources: Array | None
@@ -60,15 +60,15 @@ class Radii:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Cutoffs:
-    """What the pair test derives from radii, which are 0 or positive and finite wherever a particle takes part, else 0.
+    """Checked cutoffs per particle with the derived constants of the pair test. Invalid cutoffs are replaced by 0.
 
     Attributes:
-        sources: [n], or None where the rule does not ask for them.
-        queries: [m], likewise.
-        largest: [] the largest of them all.
-        unit_scale: [] power of two, itself a normal float, that brings the largest into [1, 4).
-        rule: Static.
-        closed: Pairs at exactly the cutoff count. Static.
+        sources: [n] cutoffs of the sources, or None if the rule does not use them.
+        queries: [m] cutoffs of the queries, likewise.
+        largest: [] the largest of all.
+        unit_scale: [] power of two, a normal float, that scales the largest into [1, 4).
+        rule: How the cutoff of a pair follows from both (`RULES`). Static.
+        closed: Whether pairs at exactly the cutoff count. Static.
     """
 
     sources: Array | None
@@ -80,7 +80,7 @@ class Cutoffs:
     scaled = True
 
     def of_pairs(self, queries: Array | None, sources: Array | None) -> list[Array]:
-        """Return the cutoff of each pair, or two of which it is the mean, from those of its query and its source."""
+        """Return the cutoff of each pair in a list of one array, or of two arrays if the rule is their mean."""
         if sources is None or queries is None:
             return [x for x in (queries, sources) if x is not None]
         if self.rule == "mean":
@@ -89,18 +89,18 @@ class Cutoffs:
 
 
 def is_radius(radii: Array | np.ndarray) -> Flags:
-    """Say which cutoffs the pair test can decide: 0, which reaches what coincides, is one of them. NumPy's arrays give NumPy's."""
+    """Say which cutoffs the pair test can decide; 0 is valid: it finds coincident particles. NumPy input gives NumPy output."""
     dtype = np.dtype(radii.dtype)
-    unsigned = np.uint32 if dtype == np.float32 else np.uint64  # compared as floats, denormal numbers were 0
+    unsigned = np.uint32 if dtype == np.float32 else np.uint64  # bits are compared: as floats, denormals would be flushed to 0
     low, high = (np.array(x, dtype).view(unsigned)[()] for x in (smallest_cutoff(dtype), largest_cutoff(dtype)))
     bits = radii.view(unsigned) if isinstance(radii, np.ndarray) else lax.bitcast_convert_type(radii, unsigned)
     magnitude = bits << unsigned(1) >> unsigned(1)
     negative_zero = np.array(-0.0, dtype).view(unsigned)[()]
-    return (bits <= negative_zero) & (magnitude - unsigned(1) >= low - unsigned(1)) & (magnitude <= high)  # 0 - 1 is the largest
+    return (bits <= negative_zero) & (magnitude - unsigned(1) >= low - unsigned(1)) & (magnitude <= high)  # 0 - 1 wraps around
 
 
 def make_cutoff(value: float, dtype: np.dtype, closed: bool) -> Cutoff:
-    """Round a cutoff within `smallest_cutoff` and `largest_cutoff` to a dtype and derive the bounds of the pair test."""
+    """Round a cutoff between `smallest_cutoff` and `largest_cutoff` to a dtype and derive the constants of the pair test."""
     finfo = np.finfo(dtype)
     narrow = dtype == np.float32
     radius = dtype.type(value)
@@ -121,7 +121,7 @@ def make_cutoff(value: float, dtype: np.dtype, closed: bool) -> Cutoff:
 
 
 def make_cutoffs(radii: Radii, closed: bool, skin: float = 0.0) -> Cutoffs:
-    """Derive what the pair test needs; with a skin, of radii that are that much larger, rounded up."""
+    """Derive the constants of the pair test from cutoffs per particle; a skin is added to each, rounded up."""
     parts = [
         None if x is None else jnp.where(is_radius(x), _sum_rounded_up(jnp.abs(x), skin), 0) for x in (radii.sources, radii.queries)
     ]
@@ -138,7 +138,7 @@ def _sum_rounded_up(x: Array, skin: float) -> Array:
 
 
 def widen(cutoff: Cutoff, slack: Array) -> Cutoff:
-    """Return a cutoff whose step 1 leaves open what differences off by `slack` per component (at most 3) may not decide."""
+    """Return a cutoff whose step 1 tolerates an error of up to `slack` in each of at most 3 components of a displacement."""
     eps = jnp.finfo(slack.dtype).eps
     scale = cutoff.unit_scale if cutoff.scaled else slack.dtype.type(1)
     radius, off = cutoff.radius * scale, 2 * (slack * scale)
@@ -149,7 +149,7 @@ def widen(cutoff: Cutoff, slack: Array) -> Cutoff:
 def step_one_bounds(
     cutoff: "Cutoff | Cutoffs", radii: list[Array] | None, slack: Array | None = None
 ) -> tuple[np.floating | Array, np.floating | Array]:
-    """Return the bounds of step 1: of one cutoff, or of pairs with these radii; differences may be off by `slack` per component."""
+    """Return the inner and outer bound of step 1, for one cutoff or per pair; `slack` bounds the error of each component."""
     if isinstance(cutoff, Cutoffs):
         return _bounds_of_pairs(cutoff, radii or [], slack)
     if slack is not None:
@@ -158,10 +158,10 @@ def step_one_bounds(
 
 
 def _bounds_of_pairs(cutoffs: Cutoffs, radii: list[Array], slack: Array | None = None) -> tuple[Array, Array]:
-    """Return what step 1 compares scaled squared distances with: below the first a pair without doubt, above the second none.
+    """Return per-pair bounds of step 1: squared distances below the first are pairs, above the second are not.
 
-    A mean is rounded, and so are its halves: 32 eps instead of 8 cover that generously. A cutoff so small against the largest
-    that squares could underflow leaves to the next steps whatever is not surely farther.
+    The band is 32 eps instead of 8 because a mean and its halves are rounded. If a cutoff is so much smaller than the largest that
+    its square could underflow, only distances that are certainly larger are decided here.
     """
     finfo = jnp.finfo(cutoffs.largest.dtype)
     scaled = [radius * cutoffs.unit_scale for radius in radii]
@@ -175,11 +175,11 @@ def _bounds_of_pairs(cutoffs: Cutoffs, radii: list[Array], slack: Array | None =
 
 
 def smallest_cutoff(dtype: np.dtype) -> float:
-    """Return the smallest cutoff that keeps flushed denormals inside the band of step 1."""
+    """Return the smallest cutoff for which flushed denormals stay within the band of step 1."""
     finfo = np.finfo(dtype)
     return 2.0 ** (finfo.minexp + finfo.nmant + 7)
 
 
 def largest_cutoff(dtype: np.dtype) -> float:
-    """Return the largest cutoff for which a cell edge is still finite."""
+    """Return the largest cutoff whose cell edge is finite."""
     return 2.0 ** (np.finfo(dtype).maxexp - 1)

@@ -1,17 +1,17 @@
-"""Where a pair is decided: `|x_j - x_i| < cutoff` exactly as real arithmetic on the given floats decides it.
+"""The pair test: decide `|x_j - x_i| < cutoff` as exact arithmetic on the given floats would.
 
-Three steps, each exact where it answers and each asked only what the one before left open:
+There are three steps. Each is exact where it decides, and only evaluated for what the previous one left open:
 
-1. `squared_distance` against `Cutoff.inside` and `Cutoff.outside`, in working precision. With u = eps/2, each difference
-   carries a relative error u, each square 3u, the sum of three at most 5u, and r², times 1 ± the band, 2u more: in all at most
-   3.5 eps. Flushed denormals add at most 3·2^-126 to a difference, which is below 2^-28 of any cutoff that `check_cutoff` lets
-   pass. A band of 8 eps on either side is therefore safe whatever the compiler fuses into multiply-adds; the kernels of the CPU,
-   which flush nothing that matters here, take 4.
-2. `_sum_sign`: error-free transformations (Dekker 1971; Ogita, Rump & Oishi 2005, doi:10.1137/030601818). Factors are split
-   by integer operations into halves of at most half the mantissa, so that every product is exact and a fused multiply-add
-   gives the same float as a product and a sum.
-3. `_integer_sign`: fixed-point integers as wide as the float format (`jfrnn._geometry.integers`). No rounding exists there;
-   it answers for coordinates whose exponents lie so far apart that step 2 would underflow or need more terms.
+1. `squared_distance` is compared with `Cutoff.inside` and `Cutoff.outside` in working precision. With u = eps/2, a difference has a
+   relative error of u, a square 3u, a sum of three at most 5u, and r² times 1 ± the band 2u more: at most 3.5 eps in all. Flushed
+   denormals add at most 3·2^-126 to a difference, less than 2^-28 of any cutoff that `check_cutoff` accepts. A band of 8 eps on
+   either side is therefore safe however the compiler fuses multiply-adds; the CPU kernels, which flush nothing that matters here,
+   use 4 eps.
+2. `_sum_sign` uses error-free transformations (Dekker 1971; Ogita, Rump & Oishi 2005, doi:10.1137/030601818). Integer operations
+   split factors into halves of at most half a mantissa, so every product is exact and a fused multiply-add gives the same float as
+   a product and a sum.
+3. `_integer_sign` uses fixed-point integers as wide as the float format (`jfrnn._geometry.integers`), which never round. It decides
+   pairs whose exponents lie so far apart that step 2 would underflow or need more terms.
 """
 
 import functools
@@ -28,28 +28,28 @@ from jfrnn._geometry.integers import beside, carry_limbs, full_count, limb_produ
 from jfrnn._geometry.reduced import Basis
 from jfrnn._tracing import any_of_rows, first_set
 
-_UNKNOWN = 2  # a sign that step 2 could not prove
-_INTEGER_CHUNK = 64  # pairs that one round of the integer test decides
+_UNKNOWN = 2  # the sign that step 2 could not prove
+_INTEGER_CHUNK = 64  # pairs per iteration of the integer test
 
 
 class Pair(NamedTuple):
-    """Points a and b of pairs, axis by axis, and the lattice shift that b takes (None: no lattice): x_b + shift·matrix - x_a.
+    """Points a and b of pairs, per axis, and the lattice shift of b (None in open space): x_b + shift·matrix - x_a.
 
-    `radii`, where cutoffs differ: one array, the cutoff of each pair; or two, of which the cutoff is the mean.
+    `radii` is used with cutoffs per particle: one array of pair cutoffs, or two arrays whose mean is the cutoff.
     """
 
     a: list[Array]
     b: list[Array]
     radii: list[Array] | None = None
     shift: list[Array] | None = None  # whole floats
-    matrix: Array | None = None  # [d, d], lattice vectors in rows, 0 where space is open
+    matrix: Array | None = None  # [d, d], one lattice vector per row, 0 for open axes
     orthogonal: bool = True
 
     def lattice_terms(self, axis: int) -> list[tuple[Array, Array]]:
-        """Return the shifts and the components of lattice vectors whose products belong to one axis."""
+        """Return the pairs (shift, lattice vector component) whose products sum to the translation along an axis."""
         if self.shift is None or self.matrix is None:
             return []
-        rows = [axis] if self.orthogonal else range(len(self.shift))  # more than axes where numbers are cut into two
+        rows = [axis] if self.orthogonal else range(len(self.shift))  # twice the axes if `shift_in_given` split the shifts
         return [(self.shift[k], self.matrix[k, axis]) for k in rows]
 
 
@@ -57,9 +57,10 @@ PointsAt = Callable[[Array | None], Pair]
 
 
 def shift_in_given(shift: list[Array], basis: Basis | None, matrix: Array) -> tuple[list[Array], Array]:
-    """Return terms of a translation, shifts and lattice vectors, that say it exactly in the given vectors [d, d].
+    """Return shifts and lattice vectors that express a translation exactly in the given vectors [d, d].
 
-    `shift`, whole floats, counts vectors of the basis; in the given ones numbers may be large: they are cut into two.
+    `shift` holds whole floats that count vectors of the basis. Counts of the given vectors may be too large for one product to be
+    exact, so each is split into two.
     """
     if basis is None:
         return shift, matrix
@@ -83,9 +84,9 @@ def squared_distance(difference: list[Array], cutoff: "Cutoff | Cutoffs") -> Arr
 def is_pair_of(
     rows: Array, sources: Array, neighbor: Array, asked: Array, cutoff: "Cutoff | Cutoffs", shifted: "Shifted | None" = None
 ) -> Array:
-    """Decide exactly, for rows [m, d], sources [n, d] and source indices [m, k], which pairs there are: [m, k] bool.
+    """Decide exactly which of the pairs of rows [m, d] and sources [n, d] at indices [m, k] are within the cutoff: [m, k] bool.
 
-    False where not `asked`, [m, k] bool.
+    The result is False where `asked`, [m, k] bool, is False.
     """
     axes = range(sources.shape[1])
     if shifted is None:
@@ -93,7 +94,7 @@ def is_pair_of(
     else:
         difference = list(jnp.moveaxis(shifted.vectors, -1, 0))
 
-    def of_rows(column: Array, at: Array | None) -> Array:  # no index array of all slots: XLA would make constants of it
+    def of_rows(column: Array, at: Array | None) -> Array:  # without an index array of all slots, a large constant for XLA
         if at is None:
             return jnp.broadcast_to(column[:, None], neighbor.shape)
         return column.at[at // neighbor.shape[1]].get(mode="clip")
@@ -123,7 +124,7 @@ def is_pair_of(
         return pair._replace(shift=shift, matrix=matrix, orthogonal=shifted.orthogonal)
 
     no, yes, open_pair = np.arange(3, dtype=np.int8)
-    step_one = jnp.where(asked & (square <= outside), jnp.where(square < inside, yes, open_pair), no)  # one array: one kernel
+    step_one = jnp.where(asked & (square <= outside), jnp.where(square < inside, yes, open_pair), no)  # one int8 array, one kernel
 
     def refine_open(step_one: Array) -> Array:
         return (step_one == yes) | _refine_some(step_one == open_pair, points, cutoff)
@@ -132,26 +133,26 @@ def is_pair_of(
 
 
 class Shifted(NamedTuple):
-    """What a lattice adds to pairs [m, k]: their computed vectors and shifts [m, k, d], and a bound on the vectors' error."""
+    """The lattice part of pairs [m, k]: displacements and shifts [m, k, d], a bound on the error of displacements, the lattice."""
 
     vectors: Array
     shifts: Array
     slack: Array
     matrix: Array
     orthogonal: bool
-    basis: Basis | None = None  # in which shifts count, of the vectors in `matrix`; None: those
+    basis: Basis | None = None  # the vectors that shifts count, in terms of `matrix`; None: those of `matrix`
 
 
 def flat_take(x: Array, at: Array) -> Array:
-    """Return the elements of x at flat indices, which are clipped to its size."""
+    """Return the elements of x at flat indices, which are clipped to the valid range."""
     return x.reshape(-1).at[at].get(mode="clip")
 
 
 def refine(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
-    """Decide the pairs that step 1 left open (steps 2 and 3); False elsewhere. Costs nothing where none is open.
+    """Decide the pairs that step 1 left open by steps 2 and 3; False elsewhere. Does nothing if no pair is open.
 
-    `points(None)` gives both points of every pair in the shape of `doubtful`; `points(at)` those of the pairs at the flat indices
-    `at`, so that nobody has to store what is rarely asked for.
+    `points(None)` returns both points of every pair in the shape of `doubtful`, and `points(at)` those at the flat indices `at`. So
+    points are gathered only when they are needed.
     """
     decide = functools.partial(_refine_some, points=points, cutoff=cutoff)
     return lax.cond(jnp.any(doubtful), decide, jnp.zeros_like, doubtful)
@@ -161,13 +162,13 @@ def _refine_some(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) ->
     pairs = points(None)
     signs = jnp.where(doubtful, _sum_sign(pairs, _threshold(pairs, cutoff)), 1).astype(jnp.int8)
     decide = functools.partial(_decide_unknown, points=points, cutoff=cutoff)
-    # a branch, as what is computed for it is computed once: XLA would compile step 2 for each use of its signs
+    # A branch, so that step 2 is computed once: XLA would otherwise compile it into each use of its signs.
     signs = lax.cond(jnp.max(signs) == _UNKNOWN, decide, lambda signs: signs, signs)
     return signs <= 0 if cutoff.closed else signs < 0
 
 
 def _decide_unknown(signs: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
-    """Put integers' signs in place of unknown ones, int8, a chunk of pairs at a time."""
+    """Replace unknown signs by those of the integer test, a chunk of pairs at a time; int8."""
     shape, signs = signs.shape, signs.reshape(-1)
     chunk = min(_INTEGER_CHUNK, signs.size)
     chunks = -(-signs.size // chunk)
@@ -175,7 +176,7 @@ def _decide_unknown(signs: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) ->
 
     def decide_chunk(state: tuple[Array, Array]) -> tuple[Array, Array]:
         signs, which = state
-        first = jnp.minimum(which * chunk, signs.size - chunk)  # the last chunk reaches back, to be as long as the others
+        first = jnp.minimum(which * chunk, signs.size - chunk)  # the last chunk overlaps, so that all have one length
         here = points(first + lax.iota(jnp.int32, chunk))
         known = lax.dynamic_slice_in_dim(signs, first, chunk)
         known = jnp.where(known == _UNKNOWN, _integer_sign(here, _threshold(here, cutoff)).astype(jnp.int8), known)
@@ -186,12 +187,12 @@ def _decide_unknown(signs: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) ->
 
 
 class _Threshold(NamedTuple):
-    """What steps 2 and 3 know of the cutoff of pairs: scalars, or one value per pair.
+    """The cutoff as steps 2 and 3 use it: scalars, or one value per pair.
 
     Attributes:
-        radii: r; or two, of which r is the mean: then twice the distance is compared with their sum.
-        scale: power of two that brings the larger one into [1, 4).
-        plain_bits: magnitude bits of the smallest number for which step 2 cannot underflow.
+        radii: The cutoff r; or two radii with mean r, in which case twice the distance is compared with their sum.
+        scale: Power of two that scales the larger radius into [1, 4).
+        plain_bits: Magnitude bits of the smallest number for which step 2 cannot underflow.
     """
 
     radii: list[Array]
@@ -200,14 +201,15 @@ class _Threshold(NamedTuple):
 
     @property
     def times(self) -> int:
-        """How often the distance is compared with the sum of the radii."""
+        """The factor of the distance that is compared with the sum of the radii."""
         return len(self.radii)
 
 
 def _threshold(pair: Pair, cutoff: Cutoff | Cutoffs) -> _Threshold:
     if isinstance(cutoff, Cutoff):
-        radius, scale, plain = lax.optimization_barrier((cutoff.radius, cutoff.unit_scale, cutoff.plain_bits))  # no constants:
-        return _Threshold([radius], scale, plain)  # they could be regrouped
+        # Without the barrier, XLA would treat them as constants and could regroup products with them.
+        radius, scale, plain = lax.optimization_barrier((cutoff.radius, cutoff.unit_scale, cutoff.plain_bits))
+        return _Threshold([radius], scale, plain)
     radii = pair.radii or []
     larger = functools.reduce(jnp.maximum, radii)
     narrow = larger.dtype == jnp.float32
@@ -219,7 +221,7 @@ def _threshold(pair: Pair, cutoff: Cutoff | Cutoffs) -> _Threshold:
 
 
 def _sum_sign(pair: Pair, threshold: _Threshold) -> Array:
-    """Return the sign of |b - a|² - r² where it is proven, ties of representable differences included, else _UNKNOWN; int32."""
+    """Return the sign of |b - a|² - r² where it is proven, ties included, else _UNKNOWN; int32."""
     radii, scale, least = threshold
     terms, slack = [], jnp.zeros_like(pair.a[0])
     plain = [is_plain(x, least) for x in (*pair.a, *pair.b, *(radii if len(radii) == 2 else ()))]
@@ -228,7 +230,7 @@ def _sum_sign(pair: Pair, threshold: _Threshold) -> Array:
         high, low = two_difference(bk, ak)
         rest = jnp.zeros_like(ak)
         for shift, component in pair.lattice_terms(axis):
-            half = half_mantissa(component)  # times a shift of at most half a mantissa: exact
+            half = half_mantissa(component)  # its product with a shift of at most half a mantissa is exact
             *others, low, high = distill(distill([low, shift * (component - half), shift * half, high]))
             rest = sum((jnp.abs(x * distance_scale) for x in others), rest)
             plain += [is_plain(component, least), jnp.abs(shift) <= 2**WHOLE_BITS]
@@ -250,7 +252,7 @@ def _sum_sign(pair: Pair, threshold: _Threshold) -> Array:
     for _ in range(3):
         terms = distill(terms)
     rest = sum(jnp.abs(term) for term in terms[:-1])
-    bound = 2 * (rest + slack)  # twice: covers the rounding of the sums of absolute values above
+    bound = 2 * (rest + slack)  # the factor 2 covers the rounding of the sums above
     leading = terms[-1]
     known = (jnp.abs(leading) > bound) | ((leading == 0) & (bound == 0))
     known = functools.reduce(jnp.logical_and, plain, known)
@@ -258,14 +260,14 @@ def _sum_sign(pair: Pair, threshold: _Threshold) -> Array:
 
 
 def _integer_sign(pair: Pair, threshold: _Threshold) -> Array:
-    """Return the sign of |b - a|² - r² for [k] pairs of finite points, in integer arithmetic throughout.
+    """Return the sign of |b - a|² - r² for [k] pairs of finite points, in integer arithmetic only.
 
-    Limbs of a difference are below 2^12 (float64: 2^27), with a lattice below 2^30 (2^46: shifts are below 2^16, doubled or not).
-    So are two radii, added up, and twice the differences that are compared with them. A limb of the sum of squares is the sum of
-    4·29 (4·84) products of what `carry_limbs` returns, below 2^30 (2^61).
+    Limbs of a difference are below 2^12 (float64: 2^27), in a lattice below 2^30 (2^46, as shifts are below 2^16); so are the sum
+    of two radii and twice the differences. A limb of the sum of squares adds 4·29 (4·84) products of limbs carried by
+    `carry_limbs`, which stays below 2^30 (2^61).
     """
     dim, radii, dtype = len(pair.a), threshold.radii, np.dtype(pair.a[0].dtype)
-    count, whole = full_count(dtype) + 3, limb_type(dtype)  # with room for carries and the sign
+    count, whole = full_count(dtype) + 3, limb_type(dtype)  # room for carries and the sign
     ends = radii[0], -radii[1] if len(radii) == 2 else jnp.zeros((), dtype)
     limbs = limbs_of(beside([*pair.b, ends[0], *pair.a, ends[1]]), count)  # [k, 2 (d + 1), ...]
     times = np.array([threshold.times] * dim + [1], whole)[None, :, None]
@@ -279,7 +281,7 @@ def _integer_sign(pair: Pair, threshold: _Threshold) -> Array:
 
 
 def _translation_limbs(shift: Array, vectors: Array, count: int, orthogonal: bool) -> Array:
-    """Return shifts [k, t] times lattice vectors [t, d], added up: limbs [k, d + 1, ...], the last ones 0."""
+    """Return the sum of shifts [k, t] times lattice vectors [t, d] as limbs [k, d + 1, ...]; the last axis entry is 0."""
     dim = vectors.shape[1]
     limbs, shift = limbs_of(jnp.pad(vectors, ((0, 0), (0, 1))), count), shift[..., None]  # [t, d + 1, ...]
     if orthogonal:

@@ -1,4 +1,4 @@
-"""Sums and products of floats whose rounding errors are kept, by error-free transformations.
+"""Error-free transformations: float operations that return their result together with its exact rounding error.
 
 Sources: Dekker (1971); Ogita, Rump & Oishi (2005), doi:10.1137/030601818.
 """
@@ -6,7 +6,7 @@ Sources: Dekker (1971); Ogita, Rump & Oishi (2005), doi:10.1137/030601818.
 import jax.numpy as jnp
 from jax import Array, lax
 
-WHOLE_BITS = 12  # of whole numbers whose products with half mantissas are exact
+WHOLE_BITS = 12  # whole numbers of so many bits have exact products with half mantissas
 
 
 def two_difference(a: Array, b: Array) -> tuple[Array, Array]:
@@ -26,13 +26,13 @@ def two_sum(a: Array, b: Array) -> tuple[Array, Array]:
 
 
 def compensated_sum(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[Array, Array]:
-    """Add sums with what rounding took of them (value, error): nearly as in twice the precision."""
+    """Add two compensated sums (value, error): nearly as accurate as twice the working precision."""
     total, rounding = two_sum(a[0], b[0])
     return total, a[1] + b[1] + rounding
 
 
 def rounded_sum(value: Array, error: Array) -> Array:
-    """Return what a compensated sum comes to; errors mean nothing where it is not finite."""
+    """Return value + error of a compensated sum, or the value if it is not finite, since its error then means nothing."""
     return jnp.where(jnp.isfinite(value), value + error, value)
 
 
@@ -44,7 +44,7 @@ def exact_square(x: Array) -> list[Array]:
 
 
 def half_mantissa(x: Array) -> Array:
-    """Round x to half its mantissa by integer operations on its bits: 12 bits of 24, 26 of 53."""
+    """Round x to half its mantissa (12 of 24 bits, 26 of 53) by integer operations."""
     unsigned, dropped = (jnp.uint32, 12) if x.dtype == jnp.float32 else (jnp.uint64, 27)
     bits = lax.bitcast_convert_type(x, unsigned)
     rounded = (bits + unsigned(1 << (dropped - 1))) >> unsigned(dropped) << unsigned(dropped)
@@ -52,7 +52,7 @@ def half_mantissa(x: Array) -> Array:
 
 
 def distill(terms: list[Array]) -> list[Array]:
-    """Add the terms up, keeping each rounding error in place: same exact sum, most of it in the last (VecSum)."""
+    """Replace terms by others with the same exact sum, most of it in the last one (VecSum of Ogita, Rump & Oishi)."""
     result = []
     total = terms[0]
     for term in terms[1:]:
@@ -62,14 +62,14 @@ def distill(terms: list[Array]) -> list[Array]:
 
 
 def is_plain(x: Array, least: Array) -> Array:
-    """Say where x is 0 or large enough that no product of step 2 underflows."""
+    """Say where x is 0, or large enough that no product of step 2 of the pair test underflows."""
     unsigned = jnp.uint32 if x.dtype == jnp.float32 else jnp.uint64
     magnitude = lax.bitcast_convert_type(x, unsigned) << unsigned(1) >> unsigned(1)
     return (magnitude == 0) | (magnitude >= least)
 
 
 def unit_scale(x: Array) -> Array:
-    """Return the power of two that brings positive floats into [1, 4) and is itself a normal float."""
+    """Return the power of two, a normal float, that scales positive floats into [1, 4)."""
     unsigned, nmant, bias = (jnp.uint32, 23, 127) if x.dtype == jnp.float32 else (jnp.uint64, 52, 1023)
-    exponent = lax.bitcast_convert_type(x, unsigned) >> unsigned(nmant)  # biased: 2·bias - e is that of 2^-(e - bias)
+    exponent = lax.bitcast_convert_type(x, unsigned) >> unsigned(nmant)  # biased; 2·bias - e is the exponent of the inverse
     return lax.bitcast_convert_type(jnp.maximum(unsigned(2 * bias) - exponent, unsigned(1)) << unsigned(nmant), x.dtype)

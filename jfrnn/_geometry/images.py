@@ -1,7 +1,7 @@
-"""Images: which lattice shifts of a particle a search looks at, chosen while tracing.
+"""Periodic images: choose, while tracing, which lattice shifts of each particle a search considers.
 
-A pair of images (i, j, S) is a pair iff |x_j - x_i + S·A| < cutoff. The rows A_k of A are the lattice vectors, and S is a vector of
-integers that is 0 along axes that are not periodic.
+An image pair (i, j, S) is a pair iff |x_j - x_i + S·A| < cutoff. The rows of A are the lattice vectors; S is a vector of integers
+that is 0 along axes that are not periodic.
 """
 
 import math
@@ -15,22 +15,22 @@ from jfrnn._geometry.box import Box, check_box_values
 from jfrnn._geometry.reduced import Basis, reduced_basis
 from jfrnn._tracing import own_transfers
 
-LARGEST_TURN = 511  # cells between a particle and the box: three such numbers share an int32, and S·A is exact in half mantissas
-_NEAREST = 0.49  # cutoff over width up to which the nearest image is the only one, with room for rounding
-_MANY_IMAGES = 2**15 - 1  # from which on shorter lattice vectors are looked for
-_MOST_IMAGES = 2**22  # of which tables take 100 MB
-_MOST_VECTORS = 2**23  # of the given ones in a shift: float32 says whole numbers below 2^24 exactly
+LARGEST_TURN = 511  # most cells between a particle and the box: three such numbers fit into an int32, and S·A is exact
+_NEAREST = 0.49  # largest cutoff / width for which the minimum image suffices, with a margin for rounding
+_MANY_IMAGES = 2**15 - 1  # with more images, shorter lattice vectors are looked for
+_MOST_IMAGES = 2**22  # their tables take 100 MB
+_MOST_VECTORS = 2**23  # largest sum of given vectors in a shift: float32 holds whole numbers up to 2^24 exactly
 
 
 class Images(NamedTuple):
-    """How the images of a search are told apart; static.
+    """The periodic images that a search considers; static.
 
     Attributes:
         periodic: One bool per axis.
-        orthogonal: Lattice vectors lie along the axes.
-        reach: Over how many cells to either side a pair may reach, per axis; 0 along axes that are not periodic.
-        nearest: No pair has more than one image within the cutoff, the nearest one: no image need be stored.
-        basis: Of which whole numbers of the given lattice vectors those consist that shifts count; None: of themselves.
+        orthogonal: Whether the lattice vectors lie along the axes.
+        reach: How many cells away an image may lie and still be a neighbor, per axis; 0 along axes that are not periodic.
+        nearest: Whether the minimum image of a pair is its only one within the cutoff, so that lists store no images.
+        basis: The vectors that shifts count, as whole-number combinations of the given ones; None: the given ones.
     """
 
     periodic: tuple[bool, ...]
@@ -41,13 +41,13 @@ class Images(NamedTuple):
 
     @property
     def shifts(self) -> np.ndarray:
-        """All lattice shifts within reach, shape [images, d], int32; the row number is the code of the image."""
+        """All lattice shifts within reach, shape [images, d], int32; the row number is the image code."""
         axes = np.meshgrid(*(np.arange(-k, k + 1, dtype=np.int32) for k in self.reach), indexing="ij")
         return np.stack(axes, axis=-1).reshape(-1, len(self.reach))
 
     @property
     def numbers(self) -> np.ndarray:
-        """The basis, shape [d, d], int64."""
+        """The basis as an array, shape [d, d], int64."""
         return np.eye(len(self.reach), dtype=np.int64) if self.basis is None else np.array(self.basis)
 
     @property
@@ -57,20 +57,20 @@ class Images(NamedTuple):
 
     @property
     def home(self) -> int:
-        """The code of the shift 0."""
+        """The image code of the shift 0."""
         return (self.total - 1) // 2
 
     @property
     def dtype(self) -> np.dtype:
-        """Of the codes in a list: 1 B up to 256 of them, 2 B up to 32 768."""
+        """Dtype of image codes in a list: 1 B for up to 256 images, 2 B for up to 32 768."""
         return np.dtype(np.uint8 if self.total <= 256 else np.int16 if self.total <= 2**15 else np.int32)
 
 
 def images_of(box: Box, radius: float | None, dtype: np.dtype, sources: int) -> Images:
-    """Choose which images a search with this radius, the largest one, looks at; None: it is known only from data.
+    """Choose the images for a search with this largest cutoff; `radius` is None if only the data tell it.
 
     Raises:
-        ValueError: the cutoff spans more images than can be told apart.
+        ValueError: the cutoff spans more images than the codes can number.
     """
     if box.images is None and radius is not None and not isinstance(box.vectors, Tracer):
         with own_transfers():
@@ -88,9 +88,9 @@ def images_of(box: Box, radius: float | None, dtype: np.dtype, sources: int) -> 
 
 
 def _needed_images(vectors: np.ndarray, box: Box, radius: float, basis: Basis | None) -> Images:
-    """Return the images that a radius needs in a lattice of these vectors."""
+    """Return the images that a cutoff needs in a lattice of these vectors."""
     share = radius / _widths(vectors, box.periodic)
-    # room for the rounding of coordinates: far fewer than a hundredth of a cell
+    # The margin of a hundredth of a cell is far more than the rounding of coordinates.
     reach = tuple(math.ceil(s + 0.01) if p else 0 for s, p in zip(share.tolist(), box.periodic, strict=True))
     return Images(box.periodic, box.orthogonal, reach, bool((share <= _NEAREST).all()), basis)
 
@@ -100,15 +100,15 @@ def _too_many(images: Images, sources: int, most: int) -> bool:
 
 
 def _are_exact(images: Images) -> bool:
-    """Say whether shifts in the given vectors are whole numbers that every dtype holds."""
+    """Say whether shifts in the given vectors are whole numbers that every dtype holds exactly."""
     return (2 * LARGEST_TURN + max(images.reach)) * np.abs(images.numbers).sum(axis=0).max() <= _MOST_VECTORS
 
 
 def check_images(images: Images, sources: int) -> Images:
-    """Return images of which there are not too many.
+    """Return the images, after checking that there are not too many.
 
     Raises:
-        ValueError: there are more images than can be told apart.
+        ValueError: there are more images than the codes can number.
     """
     if images.total > _MOST_IMAGES:
         raise ValueError(
@@ -124,17 +124,17 @@ def check_images(images: Images, sources: int) -> Images:
 
 
 def grow_images(kind: Images, boxes: Sequence[Box], radius: float | None, dtype: np.dtype, sources: int, short: bool) -> Images:
-    """Choose the images of a list that is made again: those that it has, and those that this radius needs in each of these boxes.
+    """Choose the images of a list that is made again: its present ones and those that the cutoff needs in each of these boxes.
 
-    `short`: a search met a box that needs more of them. Where none of these boxes does, it was another: then twice as many.
+    `short` says that a search met a box that needs more images. If none of these boxes does, the reach is doubled.
 
     Raises:
-        ValueError: a box is none, or too small for this radius.
+        ValueError: a box is degenerate, or too small for this cutoff.
     """
     for box in boxes:
         check_box_values(np.asarray(box.vectors), np.asarray(box.origin), box.periodic)
     kinds = [kind, *(images_of(box, radius, dtype, sources) for box in boxes)]
-    if len({k.basis for k in kinds}) > 1:  # numbers of images can be compared in one basis only: that of the last box
+    if len({k.basis for k in kinds}) > 1:  # reaches are comparable in one basis only: that of the last box
         kinds = [_in_basis(box, radius, dtype, kinds[-1]) for box in boxes]
         kind = Images(kind.periodic, kind.orthogonal, kinds[-1].reach, kinds[-1].nearest, kinds[-1].basis)
     reach, nearest = tuple(map(max, *(k.reach for k in kinds), kind.reach)), all(k.nearest for k in kinds)
@@ -151,7 +151,7 @@ def _in_basis(box: Box, radius: float | None, dtype: np.dtype, like: Images) -> 
 
 
 def _widths(vectors: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
-    """Return the distances of opposite faces [d], infinite along axes that are not periodic."""
+    """Return the distances between opposite faces [d]; infinite along axes that are not periodic."""
     rows = np.diag(vectors) if vectors.ndim == 1 else vectors
     widths = np.full(len(rows), np.inf)
     span = rows[list(periodic)]

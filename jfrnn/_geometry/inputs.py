@@ -1,4 +1,4 @@
-"""What a search accepts: every argument checked while tracing, with errors that name it, what came and what to do."""
+"""Argument checks while tracing: each error names the argument, what it was, what was expected and what to do."""
 
 import math
 from numbers import Integral, Real
@@ -19,7 +19,7 @@ _MOST_POINTS = 2**31 - 32
 
 
 def check_positions(name: str, positions: Given, like: Array | None = None) -> Array:
-    """Return positions as a float32 or float64 array [n, 2] or [n, 3], of the same kind as `like` where that is given."""
+    """Return positions as a float32 or float64 array [n, 2] or [n, 3]; with `like`, of the same dtype and dimension."""
     if not hasattr(positions, "dtype") or not hasattr(positions, "shape"):
         raise TypeError(
             f"{name} must be a JAX or NumPy array of shape [n, 2] or [n, 3], got {type(positions).__name__}: "
@@ -42,11 +42,11 @@ def check_positions(name: str, positions: Given, like: Array | None = None) -> A
         raise ValueError(
             f"{name} must match positions ({like.dtype}, {like.shape[1]} columns), got {dtype} with {shape[1]} columns."
         )
-    return on_device(positions)  # concrete inside jit too: search can then count what it closes over
+    return on_device(positions)  # stays concrete inside jit, so that `search` can count its neighbors
 
 
 def check_is_known(name: str, shape: tuple[Any, ...]) -> None:
-    """Raise where a shape holds a symbol of `jax.export` in place of a number."""
+    """Raise if a shape holds a symbol of `jax.export` in place of a number."""
     symbols = [str(size) for size in shape if not isinstance(size, Integral)]
     if symbols:
         raise ValueError(
@@ -57,7 +57,7 @@ def check_is_known(name: str, shape: tuple[Any, ...]) -> None:
 
 
 def check_again(name: str, positions: Given, dtype: np.dtype, dim: int, rows: int, what: str = "the list") -> Array:
-    """Return positions that are of the kind and number for which something, such as a list, was made."""
+    """Return positions, after checking that they have the dtype, dimension and number that e.g. a list was made for."""
     points = check_positions(name, positions)
     if (points.dtype, points.shape[1]) != (dtype, dim):
         raise ValueError(
@@ -73,7 +73,7 @@ def check_again(name: str, positions: Given, dtype: np.dtype, dim: int, rows: in
 
 
 def check_devices(name: str, given: Given, made: Given, what: str = "the list") -> None:
-    """Raise where an array and what was made before are bound to different devices, as far as that is known."""
+    """Raise if an array and an earlier result are committed to different devices; traced values are not checked."""
     if isinstance(given, Tracer) or isinstance(made, Tracer):
         return
     if not (getattr(given, "committed", False) and getattr(made, "committed", False)) or given.devices() == made.devices():
@@ -86,7 +86,7 @@ def check_devices(name: str, given: Given, made: Given, what: str = "the list") 
 
 
 def check_cutoff(cutoff: Given, dtype: np.dtype) -> Cutoff:
-    """Return the cutoff, rounded once to the dtype of the positions."""
+    """Return one cutoff for all particles, rounded to the dtype of the positions."""
     if isinstance(cutoff, Tracer):
         raise TypeError(
             "cutoff must be a static number, got a traced value: pass a Python float, mark the argument with "
@@ -109,7 +109,7 @@ def check_cutoff(cutoff: Given, dtype: np.dtype) -> Cutoff:
 
 
 def check_radii(cutoff: Given, rule: object, sources: Array, queries: Array | None) -> Radii | None:
-    """Return cutoffs that differ from particle to particle, in the dtype of the positions; None where it is one number."""
+    """Return cutoffs per particle in the dtype of the positions, or None if the cutoff is one number."""
     if rule not in RULES:
         raise ValueError(f"radius_rule must be one of {', '.join(map(repr, RULES))}, got {rule!r}.")
     if not isinstance(cutoff, tuple | list) and np.ndim(cutoff) == 0:
@@ -140,14 +140,14 @@ def _check_radii_of(name: str, radii: Given, size: int, what: str, like: Array) 
 
 
 def _as_dtype(x: Given, dtype: np.dtype) -> Array:
-    """Convert an array; one that is known on the host, where no program is compiled for its shape."""
+    """Convert an array; a concrete one on the host, so that no program is compiled for its shape."""
     if isinstance(x, Tracer):
         return gather(x).astype(dtype)
     return on_device(x) if x.dtype == dtype else make_on_host(x, lambda known: known.astype(dtype))
 
 
 def largest_known(radii: Radii) -> float | None:
-    """Return the largest cutoff of those that are valid, 1 where none is; None where they are traced."""
+    """Return the largest valid cutoff, or 1 if none is valid; None if cutoffs are traced."""
     given = [x for x in (radii.sources, radii.queries) if x is not None]
     if any(isinstance(x, Tracer) for x in given):
         return None
@@ -157,7 +157,7 @@ def largest_known(radii: Radii) -> float | None:
 
 
 def check_skin(skin: object, cutoff: float, dtype: np.dtype) -> float:
-    """Return a static skin, rounded once to the dtype of the positions; 0 means that there is none."""
+    """Return a static skin, rounded to the dtype of the positions; 0 means no skin."""
     if isinstance(skin, Tracer | bool) or not isinstance(skin, int | float | np.number):
         raise TypeError(f"skin must be a number known while tracing, got {_describe(skin)}.")
     value = float(dtype.type(skin))
@@ -171,7 +171,7 @@ def check_skin(skin: object, cutoff: float, dtype: np.dtype) -> float:
 
 
 def check_active(active: Given, positions: Array) -> Array:
-    """Return the mask of the particles that take part, [n] bool."""
+    """Return the mask of active particles, [n] bool."""
     if not hasattr(active, "dtype") or np.dtype(active.dtype) != np.bool_:
         raise TypeError(f"active must be an array of bool, one per particle, got {_describe_array(active)}.")
     if tuple(active.shape) != positions.shape[:1]:
@@ -180,7 +180,7 @@ def check_active(active: Given, positions: Array) -> Array:
 
 
 def check_batch(batch: Given, sources: Array, queries: Array | None) -> Batch:
-    """Return the systems of the particles, and of the queries if there are any, as int32."""
+    """Return the system numbers of the particles, and of separate queries, as int32."""
     if queries is None:
         return Batch(_check_systems("batch", batch, sources.shape[0], "particle"), None)
     if not isinstance(batch, tuple) or len(batch) != 2:
@@ -208,7 +208,7 @@ def _check_systems(name: str, systems: Given, size: int, what: str) -> Array:
 
 
 def check_box(box: object, positions: Array, like: Box | None = None) -> Box | None:
-    """Return a box that repeats space along some axis of the positions, of the same kind as `like` where that is given; or None."""
+    """Return a box, with `like` of the same kind, or None if no axis is periodic."""
     if not isinstance(box, Box):
         raise TypeError(f"box must be a jfrnn.Box, got {_describe(box)}: write e.g. jfrnn.Box([1.0, 1.0, 1.0]).")
     if box.dim != positions.shape[1]:
@@ -250,7 +250,7 @@ def check_slack(slack: object) -> float:
 
 
 def check_size(name: str, size: object) -> int:
-    """Return a number of points that are not there yet."""
+    """Return the number of points of a planned search."""
     if isinstance(size, bool) or not isinstance(size, int | np.integer):
         raise TypeError(f"{name} must be an int, the number of points, got {_describe(size)}.")
     if not 0 <= size <= _MOST_POINTS:
@@ -259,7 +259,7 @@ def check_size(name: str, size: object) -> int:
 
 
 def check_kind(dim: object, dtype: Given) -> tuple[int, np.dtype]:
-    """Return the dimensions and the dtype of positions that are not there yet."""
+    """Return the dimension and dtype of the positions of a planned search."""
     if isinstance(dim, bool) or not isinstance(dim, int | np.integer) or dim not in (2, 3):
         raise ValueError(f"dim must be 2 or 3, got {_describe(dim)}.")
     if np.dtype(dtype) not in (np.float32, np.float64):

@@ -1,11 +1,11 @@
-"""Fixed-point integers as wide as a float format, for what rounding leaves open: no rounding exists here.
+"""Fixed-point integers as wide as a float format: arithmetic without rounding for pairs that floats leave undecided.
 
-A number is limbs [..., count], the lowest first, of which each counts units of 2^(bits·place): 11 bits in int32 for float32, 26
-bits in int64 for float64. Limbs have any sign. Those of sums and products grow beyond their bits, until they are carried. What is
-not has `GUARDS` zeros before its lowest limb, so that carrying reads limbs from below without a border.
+A number is an array of limbs [..., count], the lowest first; limb k counts units of 2^(bits·k), with 11 bits in int32 for float32
+and 26 bits in int64 for float64. Limbs are signed, and sums and products may exceed their bits until `carry_limbs` is called.
+Numbers that are not carried have `GUARDS` zeros below the lowest limb, so that carrying needs no special case at the end.
 
-Nothing loops: each step is a few operations on whole arrays, of which XLA makes one or two kernels, and the time to compile a
-program is about proportional to the number of its kernels.
+There are no loops: each step is a few operations on whole arrays, which XLA fuses into one or two kernels. Compile time is roughly
+proportional to the number of kernels.
 """
 
 import functools
@@ -16,29 +16,29 @@ import numpy as np
 from jax import Array, lax
 
 GUARDS = 3
-_SHORT = 32  # XLA's CPU compiler makes a chain of kernels of a reduction over a longer axis
+_SHORT = 32  # XLA's CPU compiler splits a reduction over a longer axis into a chain of kernels
 
 
 def limb_bits(dtype: np.dtype) -> int:
-    """Return the bits of a limb of floats or limbs of this dtype."""
+    """Return the bits per limb for this dtype of floats or limbs."""
     return 11 if dtype.itemsize == 4 else 26
 
 
 def full_count(dtype: np.dtype) -> int:
-    """Return how many limbs hold any float of this dtype, in units of the smallest denormal."""
+    """Return the number of limbs that hold any float of this dtype, in units of the smallest denormal."""
     finfo = np.finfo(dtype)
     return -(-(finfo.maxexp - finfo.minexp + finfo.nmant + 1) // limb_bits(dtype))
 
 
 def limb_type(dtype: np.dtype) -> np.dtype:
-    """Return the dtype of the limbs of floats of this dtype."""
+    """Return the integer dtype of limbs for floats of this dtype."""
     return np.dtype(np.int32 if dtype.itemsize == 4 else np.int64)
 
 
 def fields_of(x: Array) -> tuple[Array, Array, Array]:
-    """Split floats into sign [...] bool, place of the lowest mantissa bit [...] int32, and mantissa with its leading bit, unsigned.
+    """Split floats into sign (bool), position of the lowest mantissa bit (int32) and mantissa with its leading bit (unsigned).
 
-    Places count bits from that of the smallest denormal.
+    Positions count bits from that of the smallest denormal.
     """
     unsigned, nmant = (np.uint32, 23) if x.dtype == jnp.float32 else (np.uint64, 52)
     bits = lax.bitcast_convert_type(x, unsigned)
@@ -50,16 +50,16 @@ def fields_of(x: Array) -> tuple[Array, Array, Array]:
 
 
 def beside(columns: list[Array]) -> Array:
-    """Return columns, [k] or scalars, as [k, columns]: `jnp.stack`, of which XLA's CPU compiler makes a loop for each column."""
+    """Stack columns, [k] or scalars, to [k, columns]. `jnp.stack` would become one loop per column on the CPU."""
     place = np.arange(len(columns), dtype=np.int32)[None]
     rows = [jnp.reshape(column, (-1, 1)) for column in columns]
     return functools.reduce(lambda left, k: jnp.where(place == k, rows[k], left), range(1, len(rows)), rows[0])
 
 
 def limbs_of(x: Array, count: int, origin: Array | None = None) -> Array:
-    """Write finite floats [...] as limbs [..., GUARDS + count] below 2^bits, in units of the bit at a place `origin` [...], or 0.
+    """Return finite floats [...] as limbs [..., GUARDS + count] below 2^bits; the unit is the bit at position `origin` [...], or 0.
 
-    No bit that is set may lie below the origin.
+    No set bit may lie below the origin.
     """
     dtype = np.dtype(x.dtype)
     bits, width, unsigned = limb_bits(dtype), 8 * dtype.itemsize, np.dtype(f"uint{8 * dtype.itemsize}").type
@@ -67,7 +67,7 @@ def limbs_of(x: Array, count: int, origin: Array | None = None) -> Array:
     place = place if origin is None else place - origin
     shift = -place[..., None] + _along_limbs(np.arange(-GUARDS, count, dtype=np.int32) * bits, place.ndim + 1)
 
-    def by(amount: Array) -> Array:  # XLA leaves longer shifts to the hardware
+    def by(amount: Array) -> Array:  # the result of longer shifts would depend on the hardware
         return jnp.clip(amount, 0, width - 1).astype(unsigned)
 
     mantissa = mantissa[..., None]
@@ -78,10 +78,10 @@ def limbs_of(x: Array, count: int, origin: Array | None = None) -> Array:
 
 
 def carry_limbs(limbs: Array) -> Array:
-    """Return the same numbers, [..., count], in limbs of at most 1.26·2^bits; the top one keeps what is left.
+    """Return the same numbers [..., count] with limbs of at most 1.26·2^bits; the top limb keeps the rest.
 
-    Limbs [..., GUARDS + count] are below 2^31 - 2^10 (float64: 2^62), the top ones below half of that. Each is written as
-    three, of which the lower two lie within half of 2^bits, and the third is below 2^9 + 1 (2^10 + 1).
+    Limbs [..., GUARDS + count] must be below 2^31 - 2^10 (float64: 2^62), top limbs below half of that. Each limb is split into
+    three parts: the lower two lie within half of 2^bits, and the third is below 2^9 + 1 (2^10 + 1).
     """
     return _digits(*_windows(limbs)[:3], is_top=_is_top(limbs))
 
@@ -89,8 +89,8 @@ def carry_limbs(limbs: Array) -> Array:
 def limb_product(a: Array, b: Array) -> Array:
     """Multiply numbers [..., la] and [..., lb] with carried limbs: [..., GUARDS + la + lb], not carried. Leading axes broadcast.
 
-    A limb is a sum of min(la, lb) products. b, between zeros, is written la times side by side, each time moved by a limb; that is
-    a reshape of copies that are one limb longer than a row.
+    A limb of the product is a sum of min(la, lb) products. All shifted copies of b come from one reshape: la copies of b, padded
+    with zeros to be one limb longer than a row, lie shifted by one limb each when read as rows.
     """
     la, lb = a.shape[-1], b.shape[-1]
     groups, length = -(-la // _SHORT), GUARDS + la + lb
@@ -104,10 +104,10 @@ def limb_product(a: Array, b: Array) -> Array:
 
 
 def limb_sign(limbs: Array) -> Array:
-    """Return the signs of numbers [..., GUARDS + count], which are as `carry_limbs` takes them: [...] int32.
+    """Return the signs of numbers [..., GUARDS + count] that satisfy the bounds of `carry_limbs`: [...] int32.
 
-    Carried once more, each limb but the top one is below 2^bits - 1, so that all below a limb is less than one unit of it: the
-    highest limb that is not 0 has the sign.
+    After one more carry, each limb but the top one is below 2^bits - 1, so the lower limbs together are less than one unit of the
+    next. The highest nonzero limb has the sign of the number.
     """
     bits, is_top = limb_bits(np.dtype(limbs.dtype)), _is_top(limbs)
     at, below, lower, lowest = _windows(limbs)
@@ -122,7 +122,7 @@ def limb_sign(limbs: Array) -> Array:
 
 
 def _digits(at: Array, below: Array, lower: Array, is_top: np.ndarray) -> Array:
-    """Return what carrying leaves in a place, of the limb there, that below it and the next lower one."""
+    """Return the carried limb, from the limb, the one below it and the one below that."""
     bits = limb_bits(np.dtype(at.dtype))
     once = _carry(below, bits)
     middle = once - jnp.where(is_top, 0, _carry(once, bits) << bits)
@@ -130,12 +130,12 @@ def _digits(at: Array, below: Array, lower: Array, is_top: np.ndarray) -> Array:
 
 
 def _carry(limbs: Array, bits: int) -> Array:
-    """Return what a limb within half of 2^bits leaves."""
+    """Return what remains of a limb above the part within half of 2^bits, in units of 2^bits."""
     return (limbs + (1 << (bits - 1))) >> bits
 
 
 def _windows(limbs: Array) -> list[Array]:
-    """Return limbs without guards, and those one, two and three places below each."""
+    """Return the limbs without guards, then shifted by one, two and three positions."""
     count = limbs.shape[-1] - GUARDS
     return [limbs[..., GUARDS - by : GUARDS - by + count] for by in range(GUARDS + 1)]
 
@@ -150,5 +150,5 @@ def _along_limbs(x: np.ndarray, ndim: int) -> np.ndarray:
 
 
 def _fold(x: Array, groups: int, add: Callable[[Array, Array], Array], axis: int) -> Array:
-    """Lay the parts of an axis above each other, so that it is short enough for one kernel to reduce it."""
+    """Split an axis into parts and combine them, so that the axis is short enough for one kernel to reduce it."""
     return functools.reduce(add, jnp.split(x, groups, axis=axis))

@@ -1,7 +1,7 @@
-"""The `Lattice`: a box in the dtype of the positions, its inverse, and the shifts of pairs in it.
+"""The `Lattice`: a periodic box in the dtype of the positions, its inverse, and lattice shifts of pairs.
 
-Shifts are whole numbers of lattice vectors. Where a lattice is skew, a search counts them in short vectors of the same lattice, and
-`given_shifts` returns them in the vectors that were given.
+A shift is a vector of whole numbers of lattice vectors. In a strongly skewed lattice a search counts short vectors of the same
+lattice; `given_shifts` converts such shifts to the given vectors.
 """
 
 import dataclasses
@@ -23,15 +23,15 @@ from jfrnn._tracing import leading_axes
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Lattice:
-    """A box in the dtype of the positions, ready to wrap them.
+    """A periodic box in the dtype of the positions, ready to wrap them.
 
     Attributes:
-        matrix: [d, d] lattice vectors, one per row; rows of axes that are not periodic are 0. Short ones, and rounded, where the
-            images have a basis.
-        given: [d, d] those that were given: what is exact is said in them.
-        transform: [d, d]; (x - origin) @ transform are fractions of the lattice vectors along periodic axes, lengths along others.
-        origin: [d].
-        images: Static.
+        matrix: [d, d] lattice vectors that shifts count, one per row; rows of open axes are 0. Short, rounded vectors if `images`
+            has a basis.
+        given: [d, d] lattice vectors that the user gave; exact decisions use these.
+        transform: [d, d]; (x - origin) @ transform are fractional coordinates along periodic axes, lengths along open ones.
+        origin: [d] a corner of the cell.
+        images: The images that the search considers. Static.
     """
 
     matrix: Array
@@ -47,7 +47,7 @@ class Lattice:
 
 
 def make_lattice(box: Box, images: Images, dtype: np.dtype) -> Lattice:
-    """Round a box to a dtype, once, and find its transform."""
+    """Round a box to a dtype once and compute its transform."""
     vectors, origin = jnp.asarray(box.vectors).astype(dtype), jnp.asarray(box.origin).astype(dtype)
     rows = jnp.diag(vectors) if box.orthogonal else vectors
     flags = np.array(box.periodic)
@@ -61,7 +61,7 @@ def make_lattice(box: Box, images: Images, dtype: np.dtype) -> Lattice:
 
 
 def combine(basis: Basis, matrix: Array) -> Array:
-    """Return basis @ matrix, whole numbers times lattice vectors, each component rounded about once; differentiable."""
+    """Return basis @ matrix, the short vectors, with about one rounding per component; differentiable."""
     whole = np.array(basis)
     high = (whole + (1 << (WHOLE_BITS - 1))) >> WHOLE_BITS
     half = half_mantissa(lax.stop_gradient(matrix))
@@ -76,7 +76,7 @@ def combine(basis: Basis, matrix: Array) -> Array:
 
 
 def _complete(matrix: Array, periodic: tuple[bool, ...]) -> Array:
-    """Replace the rows of axes that are not periodic by unit vectors normal to all that are, and to each other."""
+    """Replace the rows of open axes by unit vectors orthogonal to all periodic ones and to each other."""
     dim, free = len(periodic), [k for k, p in enumerate(periodic) if not p]
     rows = [matrix[k] / jnp.max(jnp.abs(matrix[k])) if p else matrix[k] for k, p in enumerate(periodic)]
     spans = [rows[k] for k, p in enumerate(periodic) if p]
@@ -99,7 +99,7 @@ def _complete(matrix: Array, periodic: tuple[bool, ...]) -> Array:
 
 
 def _inverse(matrix: Array) -> Array:
-    """Invert a [d, d] matrix by cofactors of its scaled rows, then once by Newton's step."""
+    """Invert a [d, d] matrix by cofactors of its scaled rows, followed by one Newton step."""
     size = jnp.max(jnp.abs(matrix), axis=1, keepdims=True)
     rows = matrix / size
     if len(matrix) == 2:
@@ -112,15 +112,15 @@ def _inverse(matrix: Array) -> Array:
 
 
 def _diagonal(matrix: Array) -> Array:
-    return jnp.stack([matrix[k, k] for k in range(len(matrix))])  # not a gather, which would be a kernel of its own
+    return jnp.stack([matrix[k, k] for k in range(len(matrix))])  # without a gather, which would be a separate kernel
 
 
 def product(a: Array, b: Array) -> Array:
-    return jnp.sum(a[:, :, None] * b[None, :, :], axis=1)  # not a matmul, which may be made in fewer bits
+    return jnp.sum(a[:, :, None] * b[None, :, :], axis=1)  # without a matmul, which GPUs may compute in fewer bits
 
 
 def is_valid(lattice: Lattice) -> Array:
-    """Say whether a lattice is one: finite, its vectors independent, lengths positive; [] bool."""
+    """Say whether a lattice is finite, its vectors independent and its lengths positive; [] bool."""
     right = jnp.isfinite(lattice.matrix).all() & jnp.isfinite(lattice.transform).all() & jnp.isfinite(lattice.origin).all()
     if lattice.images.orthogonal:
         right = right & (_diagonal(lattice.matrix) >= 0).all()
@@ -128,7 +128,7 @@ def is_valid(lattice: Lattice) -> Array:
 
 
 def fractions_of(points: Array, lattice: Lattice) -> Array:
-    """Return points [n, d] in units of the transform."""
+    """Return the fractional coordinates of points [n, d] (lengths along open axes)."""
     from_origin = points - lattice.origin[None]
     if lattice.images.orthogonal:
         return from_origin * _diagonal(lattice.transform)[None]
@@ -136,7 +136,7 @@ def fractions_of(points: Array, lattice: Lattice) -> Array:
 
 
 def translation(shifts: Array, lattice: Lattice) -> Array:
-    """Return shifts @ matrix, [..., d], for whole floats; differentiable in the lattice."""
+    """Return the lattice translations shifts @ matrix, [..., d], of whole floats; differentiable in the lattice."""
     if lattice.images.orthogonal:
         return shifts * leading_axes(_diagonal(lattice.matrix), shifts.ndim)
     rows = [leading_axes(lattice.matrix[k], shifts.ndim) for k in range(lattice.dim)]
@@ -144,22 +144,22 @@ def translation(shifts: Array, lattice: Lattice) -> Array:
 
 
 def shift_pairs(difference: Array, shifts: Array, lattice: Lattice) -> Shifted:
-    """Return x_j - x_i + S·A for differences [m, k, d], differentiable, and what their exact test needs.
+    """Return the displacements x_j - x_i + S·A [m, k, d], differentiable, with the data that their exact test needs.
 
-    In units of u = eps/2, a component is off by at most u|x_j - x_i|, (2d + 1) u|S·A| and u of their sum; 8 eps covers that.
+    With u = eps/2, the errors of a component are at most u|x_j - x_i|, (2d + 1) u|S·A| and u times their sum; 8 eps covers them.
     """
     vectors, fixed = difference + translation(shifts, lattice), lax.stop_gradient(lattice)
     sizes = lax.stop_gradient(jnp.where(jnp.isfinite(difference), jnp.abs(difference), 0))
     spans = functools.reduce(jnp.maximum, (jnp.abs(shifts[..., k]) for k in range(lattice.dim))) + 1
     rows = [jnp.abs(fixed.matrix[k]) for k in range(lattice.dim)]
-    moved = functools.reduce(jnp.add, rows)  # 0 for components that no lattice vector has: nothing is added to them
+    moved = functools.reduce(jnp.add, rows)  # 0 for components to which no lattice vector contributes
     parts = [jnp.where(moved[k] > 0, sizes[..., k] + spans * moved[k], 0) for k in range(lattice.dim)]
     slack = 8 * jnp.finfo(moved.dtype).eps * functools.reduce(jnp.maximum, parts)
     return Shifted(vectors, shifts, slack, fixed.given, lattice.images.orthogonal, lattice.images.basis)
 
 
 def given_shifts(shifts: Array, images: Images) -> Array:
-    """Return shifts [..., d], whole numbers, in the lattice vectors as they were given: int32."""
+    """Return shifts [..., d] of whole numbers in terms of the given lattice vectors, int32."""
     counts = shifts.astype(jnp.int32)
     if images.basis is None:
         return counts
@@ -168,7 +168,7 @@ def given_shifts(shifts: Array, images: Images) -> Array:
 
 
 def forward_shifts(shifts: Array, images: Images) -> Array:
-    """Return shifts [..., d] with the sign for which their first number that is not 0, in the given vectors, is positive."""
+    """Return shifts [..., d], negated if needed so that the first nonzero number in the given vectors is positive."""
     given, backward = given_shifts(shifts, images), jnp.zeros(shifts.shape[:-1], bool)
     for k in reversed(range(shifts.shape[-1])):
         backward = (given[..., k] < 0) | ((given[..., k] == 0) & backward)
@@ -176,13 +176,13 @@ def forward_shifts(shifts: Array, images: Images) -> Array:
 
 
 def nearest_shifts(difference: Array, lattice: Lattice) -> Array:
-    """Return the lattice shifts [..., d], whole floats, that bring differences x_j - x_i [..., d] nearest to 0."""
+    """Return the lattice shifts [..., d], whole floats, of the minimum images of differences x_j - x_i [..., d]."""
     units = units_of(lax.stop_gradient(difference), lattice)
     return lax.stop_gradient(jnp.where(np.array(lattice.images.periodic), -jnp.round(units), 0))
 
 
 def units_of(difference: Array, lattice: Lattice) -> Array:
-    """Return differences [..., d] in units of the transform."""
+    """Return differences [..., d] in fractional coordinates (lengths along open axes)."""
     if lattice.images.orthogonal:
         return difference * leading_axes(_diagonal(lattice.transform), difference.ndim)
     rows = [leading_axes(lattice.transform[m], difference.ndim) for m in range(lattice.dim)]

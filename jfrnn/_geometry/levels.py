@@ -1,10 +1,10 @@
-"""Cells of many sizes, for cutoffs that differ from particle to particle: a large one must not make all others pay.
+"""Cells of many sizes, for cutoffs per particle: a few large cutoffs must not slow down all other particles.
 
-Sources stand in cells as wide as the largest cutoff (`jfrnn._geometry.cells`). Within such a top cell they are sorted by group,
-those whose cutoffs lie between the same powers of two, and then along a Morton curve, which halves the cell up to 7 times: at each
-level, the sources of a group in a cell are one contiguous run. A query looks, for each group, at the 3^d cells around it at the
-finest level whose cells are wider than what the rule lets the group reach. Its candidates are thereby, up to a constant, as many as
-there are particles within that reach, whatever the cutoffs of others: no (largest/smallest)^d.
+Sources are sorted into top cells as wide as the largest cutoff (`jfrnn._geometry.cells`). Within a top cell they are sorted by
+group, a range of cutoffs between two powers of two, and then along a Morton curve that halves the cell up to 7 times. So at each
+level, the sources of a group in a cell form one contiguous run. For each group, a query visits the 3^d cells around it at the
+finest level whose cells are wider than the cutoff of such pairs. The number of candidates is thereby proportional to the number of
+particles within that cutoff, whatever the cutoffs of other particles; no factor (largest / smallest)^d arises.
 """
 
 import functools
@@ -30,12 +30,12 @@ from jfrnn._geometry.curves import spread
 from jfrnn._geometry.cutoffs import Cutoffs
 from jfrnn._geometry.images import Images
 
-HALVINGS = 7  # of a top cell, along each axis
-GROUPS = 8  # of cutoffs, by powers of two below the largest; the last one holds all that are smaller still
+HALVINGS = 7  # levels below a top cell, each halving its edges
+GROUPS = 8  # ranges of cutoffs, by powers of two below the largest; the last one holds all smaller ones
 
 
 class Axes(NamedTuple):
-    """How top cells are cut, and how far a cutoff r reaches along each axis: `scale`·r + `margin`, [d] each."""
+    """How axes are divided into top cells, and how far a cutoff r reaches along each of them: `scale`·r + `margin`, [d] each."""
 
     cells: CellAxes
     scale: Array
@@ -43,20 +43,20 @@ class Axes(NamedTuple):
 
 
 class Levels(NamedTuple):
-    """Sources and queries in the order in which they are walked, and what is needed to find the sources of a group in a cell.
+    """Sources and queries in the order in which they are visited, and the tables that find the sources of a group in a cell.
 
     Attributes:
-        order: [n] int32, the source at each place.
-        query_order: [m] int32, likewise; the same where the sources are the queries.
+        order: [n] int32, the source at each position of the order.
+        query_order: [m] int32, likewise for queries; the same array if the sources are the queries.
         grid: The top cells of the sources.
-        keys: [n] uint32 in order: group, then the place within the top cell along the Morton curve.
-        query_top: [d, m] int32, the top cell of each query; [d + 1, m] where systems are told apart.
-        query_place: [d, m] int32, the finest cell within it, counted from 0 along each axis.
-        largest: [GROUPS] the largest cutoff of each group, -1 where there is none; None: the rule asks for no cutoffs of sources,
-            and all are one group.
-        passes: [] int32, groups that are in use; None likewise.
-        widths: [d] of top cells.
-        axes: What a cutoff reaches, in the units of the widths.
+        keys: [n] uint32 in that order: the group, then the Morton key within the top cell.
+        query_top: [d, m] int32, the top cell of each query; [d + 1, m] with a batch.
+        query_place: [d, m] int32, the finest cell of each query within its top cell, counted from 0 along each axis.
+        largest: [GROUPS] largest cutoff of each group, -1 if empty; None if the rule does not use cutoffs of sources, which then
+            form one group.
+        passes: [] int32, the number of groups to visit; None likewise.
+        widths: [d] widths of the top cells.
+        axes: How axes are divided, in the units of the widths.
     """
 
     order: Array
@@ -72,9 +72,9 @@ class Levels(NamedTuple):
 
 
 def sort_by_levels(along: Array, axes: Axes, cutoffs: Cutoffs, n: int, own: bool, batch: Array | None = None) -> Levels:
-    """Sort n sources, and the queries unless the sources are `own` queries, whose coordinates along the axes are [d, n + m].
+    """Sort n sources, and separate queries if not `own`; coordinates of all of them along the axes are [d, n + m].
 
-    `batch` [n + m] uint32 are the systems to which they belong.
+    `batch` [n + m] uint32 holds their system numbers.
     """
     dim, total = along.shape
     finite = jnp.isfinite(along).all(axis=0)
@@ -103,7 +103,7 @@ def sort_by_levels(along: Array, axes: Axes, cutoffs: Cutoffs, n: int, own: bool
 def level_runs(
     levels: Levels, cutoffs: Cutoffs, images: Images | None
 ) -> Callable[[Array, Array], tuple[Array, Array, Array | None]]:
-    """Return what finds the runs of candidates of queries at some places in one group, as `jfrnn._engine.runs.Runs`."""
+    """Return a function that finds the candidate runs of some queries in one group, in the form of `jfrnn._engine.runs.Runs`."""
     dim, keys, largest = len(levels.widths), levels.keys, levels.largest
     query_radii = None if cutoffs.queries is None else cutoffs.queries[levels.query_order]
 
@@ -125,7 +125,7 @@ def level_runs(
 
 
 def _place_in_cell(x: Array, edge: Array, turns: Array | None) -> Array:
-    """Number the finest cells within the top cell of each coordinate from 0 on, exactly: halves of a cell are cells themselves."""
+    """Number the finest cells within each coordinate's top cell from 0, exactly: halves of a cell are cells themselves."""
     finest = 1 << HALVINGS
     if turns is not None:
         scaled = x * turns
@@ -137,7 +137,7 @@ def _place_in_cell(x: Array, edge: Array, turns: Array | None) -> Array:
 
 
 def _groups(radii: Array, largest: Array) -> Array:
-    """Return how many powers of two lie between each cutoff and the largest one, [n] uint32, at most GROUPS - 1."""
+    """Return the group of each cutoff, [n] uint32: its binary exponent below that of the largest, at most GROUPS - 1."""
     unsigned, nmant = (jnp.uint32, 23) if radii.dtype == jnp.float32 else (jnp.uint64, 52)
 
     def exponent(x: Array) -> Array:
@@ -151,14 +151,14 @@ def _morton(axes: list[Array]) -> Array:
 
 
 def _finest_level(reach: Array, widths: Array, axes: Axes) -> Array:
-    """Return the finest level whose cells are wider than a reach [b], along every axis: [b] int32; 0 are the top cells."""
+    """Return the finest level whose cells are wider than the cutoffs [b] along every axis: [b] int32; level 0 are the top cells."""
     along = reach[:, None] * axes.scale[None] + axes.margin[None]
     fits = [((widths * 2.0**-level)[None] > along).all(axis=1).astype(jnp.int32) for level in range(1, HALVINGS + 1)]
     return functools.reduce(jnp.add, fits)
 
 
 class _Around(NamedTuple):
-    """Cells around queries, [b, r] each: the top cells that hold them (one array per axis), their first keys, their images."""
+    """Cells around queries, [b, r] each: their top cells (one array per axis), first keys and image codes, and which ones exist."""
 
     top: list[Array]
     key: Array
@@ -167,7 +167,7 @@ class _Around(NamedTuple):
 
 
 def _cells_around(top: Array, place: Array, level: Array, extent: Array, images: Images | None) -> _Around:
-    """Return the cells around queries [d, b] at their level [b]; many steps of top cells where images lie so close."""
+    """Return the cells around queries [d, b] at their level [b]; in small boxes these span several periodic images."""
     reach = (0,) * len(place) if images is None else images.reach
     steps = [np.arange(-max(k, 1), max(k, 1) + 1, dtype=np.int32) for k in reach]
     which = np.array(list(product(*(range(len(axis)) for axis in steps)))).T  # [d, r]
@@ -187,7 +187,7 @@ def _cells_around(top: Array, place: Array, level: Array, extent: Array, images:
 
 
 def _lower_bound(keys: Array, target: Array, low: Array, high: Array) -> Array:
-    """Return the first place in [low, high) whose key is not below the target, for places [b, r] and targets [2, b, r]."""
+    """Return the first index in [low, high) whose key is not below the target, for indices [b, r] and targets [2, b, r]."""
 
     def halve(bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bounds

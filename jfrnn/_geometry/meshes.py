@@ -1,4 +1,4 @@
-"""Meshes as `search_triangles` takes them: corners that triangles have in common."""
+"""Mesh preparation for `search_triangles`: join the corners that triangles share."""
 
 import jax
 import numpy as np
@@ -9,26 +9,25 @@ from jfrnn._tracing import Given, on_device, own_transfers
 
 
 def merge_vertices(vertices: Array, faces: Array) -> tuple[Array, Array]:
-    """Make one vertex of all that coincide, so that triangles written apart, as in STL files, share sides and corners.
+    """Join coincident vertices, so that triangles stored separately, as in STL files, share sides and corners.
 
-    `TriangleList.signed_distance` knows by the numbers of vertices which triangles hang together.
-    Vertices are the same where all coordinates are equal, exactly (0 and -0 are; NaN is equal to nothing). Those that
-    are left stand in the order in which each came first. Triangles stay in order, also those that are left with a corner twice,
-    which bound nothing.
+    `TriangleList.signed_distance` and `contacts` recognize adjacent triangles by common vertex numbers. Vertices coincide if all
+    coordinates are exactly equal (0 equals -0; NaN equals nothing). The remaining vertices keep the order of their first
+    occurrence. Triangles keep their order; one that has a corner twice afterwards is kept as well, and bounds nothing.
 
     Args:
-        vertices: Corners [length], shape [v, 3] or [v, 2], float32 or float64. Of triangles alone, `corners` [f, 3, 3]:
+        vertices: Corners [length], shape [v, 3] or [v, 2], float32 or float64. For separate triangles `corners` [f, 3, 3] pass
             `corners.reshape(-1, 3)`.
-        faces: Indices of vertices, integers, shape [f, k]. Of triangles alone: `jnp.arange(3 * f).reshape(f, 3)`.
+        faces: Vertex indices, integers, shape [f, k]. For separate triangles pass `jnp.arange(3 * f).reshape(f, 3)`.
 
     Returns:
-        The vertices that are left, shape [w, d], same dtype, and faces that name these, shape [f, k], int32.
+        The remaining vertices, shape [w, d], same dtype, and faces that index them, shape [f, k], int32.
 
     Raises:
-        TypeError: an argument is traced (how many vertices are left is a shape), or of another dtype.
-        ValueError: an argument has another shape, or a face names a vertex that does not exist.
+        TypeError: an argument is traced (the number of vertices is a shape), or of another dtype.
+        ValueError: an argument has another shape, or a face has an index that no vertex has.
 
-    Jit: no; on the host. Cost: a sort of all vertices.
+    Jit: no; runs on the host. Cost: a sort of all vertices.
 
     >>> import jax.numpy as jnp, jfrnn
     >>> soup = jnp.array([[0.0, 0], [1, 0], [1, 0], [1, 1], [1, 1], [0, 0]])

@@ -1,4 +1,4 @@
-"""Motion: how far particles have moved between two moments, and how far a change of the box moves their images."""
+"""Motion: how far particles have moved since a list was made, and how far a change of the box moved periodic images."""
 
 import dataclasses
 import functools
@@ -14,12 +14,12 @@ from jfrnn._geometry.wrapping import pack_turns, unpack_turns
 
 
 class Motion(NamedTuple):
-    """How far points moved, whole lattice vectors apart: one that was wrapped into the box has not moved.
+    """How far points moved, not counting lattice translations: a point that was wrapped into the box has not moved.
 
     Attributes:
-        axes: d arrays [n], what is left of each component, rounded up.
-        sure: [n] bool: no rounding can make the lattice vectors that were taken off others, and S·A is exact with them.
-        home: [n, d] int32, how many lattice vectors a point would lie from the box without those.
+        axes: d arrays [n], the magnitude of each component, rounded up.
+        sure: [n] bool, whether rounding cannot have changed the translations that were subtracted, and S·A is exact for them.
+        home: [n, d] int32, how many lattice vectors each point would lie from the box without those translations.
     """
 
     axes: list[Array]
@@ -28,7 +28,7 @@ class Motion(NamedTuple):
 
 
 def motion_of(before: Array, now: Array, lattice: Lattice) -> Motion:
-    """Measure motion [n, d] modulo the lattice."""
+    """Measure the motion of points [n, d] modulo the lattice."""
     eps, periodic = jnp.finfo(now.dtype).eps, np.array(lattice.images.periodic)
     difference, matrix, transform = now - before, jnp.abs(lattice.matrix), jnp.abs(lattice.transform)
     units, turns = units_of(difference, lattice), turns_between(before, now, lattice)
@@ -46,15 +46,15 @@ def motion_of(before: Array, now: Array, lattice: Lattice) -> Motion:
 
 
 def turns_between(before: Array, now: Array, lattice: Lattice) -> Array:
-    """Count the lattice vectors by which points [n, d] were moved, as wrapping does: whole floats, 0 along open axes."""
+    """Count the lattice vectors by which points [n, d] were translated, as by wrapping: whole floats, 0 along open axes."""
     before, now = lax.stop_gradient((before, now))
     return -nearest_shifts(jnp.where(jnp.isfinite(now - before).all(axis=1, keepdims=True), now - before, 0), lattice)
 
 
 def box_change(before: Lattice, now: Lattice, home: Sequence[Array]) -> Array:
-    """Bound how far the change of a box can move one image of points against another, for pairs within reach.
+    """Bound the change in displacement that a changed box causes for any pair within reach.
 
-    `home`, arrays [n, d] int32, says how many lattice vectors the points lie from the box (`Motion`).
+    `home`, arrays [n, d] int32, tells how many lattice vectors the points lie from the box (`Motion`).
     """
     dtype, places = now.matrix.dtype, [x for x in home if len(x)]
     if not places:
@@ -63,6 +63,6 @@ def box_change(before: Lattice, now: Lattice, home: Sequence[Array]) -> Array:
     lowest = functools.reduce(jnp.minimum, (jnp.min(x, axis=0) for x in places))
     eps = jnp.finfo(dtype).eps
     moved = jnp.sqrt(jnp.sum((now.matrix - before.matrix) ** 2, axis=1)) * (1 + 16 * eps)
-    if now.images.basis is not None:  # short vectors are rounded
+    if now.images.basis is not None:  # short vectors carry a rounding error
         moved = jnp.where(moved > 0, moved + 4 * eps * jnp.sum(jnp.abs(now.matrix), axis=1), moved)
     return jnp.sum(((highest - lowest).astype(dtype) + np.array(now.images.reach, dtype)) * moved)

@@ -1,4 +1,4 @@
-"""Orders of particles: permutations that bring particles which are close in space close together in memory."""
+"""Orders of particles: permutations that place particles which are close in space close together in memory."""
 
 import functools
 from collections.abc import Callable
@@ -13,20 +13,20 @@ from jfrnn._geometry.curves import Words, hilbert_words, morton_words
 from jfrnn._geometry.inputs import check_positions
 from jfrnn._tracing import Given, compiled, on_device, own_transfers
 
-_SORT_BITS = 21  # float32 numbers 2^24 cells exactly: also the cells of a sort stay below it
-_LAYOUT = {np.dtype(np.float32): (np.int32, 23, 127), np.dtype(np.float64): (np.int64, 52, 1023)}  # bits, of the mantissa, bias
-_NO_CELL = np.uint32(2**32 - 1)  # sorts last: no key has such a high word
+_SORT_BITS = 21  # bits per axis, fewer than the 24 up to which float32 holds cell numbers exactly
+_LAYOUT = {np.dtype(np.float32): (np.int32, 23, 127), np.dtype(np.float64): (np.int64, 52, 1023)}  # type, mantissa bits, bias
+_NO_CELL = np.uint32(2**32 - 1)  # sorts last, as no key has such a high word
 _DISTINCT = 100  # from 2^100 cells on, neighboring floats are more than 2^21 cells apart, in float64 too
 
 
 def sort_order(positions: Array, cell_size: float, *, curve: str = "hilbert") -> Array:
     """Order particles by their cells along a curve, so that `positions[order]` has neighbors in space close in memory.
 
-    A particle is in the cell floor(x / cell_size), rounded as the dtype rounds the quotient; cells are counted from the lowest
-    occupied one on each axis. Where an axis needs more than 2^21 cells, the cells of all axes are merged, by the smallest power
-    of two that suffices: one particle extremely far away therefore costs locality. Particles of one cell keep their order, and
-    those with a non-finite coordinate come last, in theirs. Cost: one 32-bit sort where all keys fit into 32 bits (1024 cells
-    per axis in 3D, 65 536 in 2D; "row": 2^31 cells in all), else two; under vmap always two.
+    The cell of a particle is floor(x / cell_size), with the quotient as the dtype rounds it; cells are counted from the lowest
+    occupied one on each axis. If an axis needs more than 2^21 cells, the cells of all axes are merged by the smallest sufficient
+    power of two, so a single particle extremely far away costs locality. Particles of one cell keep their order; those with a
+    non-finite coordinate come last, in their order. Cost: one 32-bit sort if all keys fit into 32 bits (1024 cells per axis in 3D,
+    65 536 in 2D; "row": 2^31 cells in all), else two; under vmap always two.
 
     Args:
         positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64. n = 0 is allowed.
@@ -34,7 +34,7 @@ def sort_order(positions: Array, cell_size: float, *, curve: str = "hilbert") ->
         curve: "hilbert" (by `hilbert_encode` with 21 bits), "morton" (by `morton_encode`), or "row" (by z, then y, then x).
 
     Returns:
-        The permutation, int32, shape [n]: place k of the order is taken by particle order[k].
+        The permutation, int32, shape [n]: position k of the order holds particle order[k].
 
     Raises:
         TypeError, ValueError: an argument is of the wrong kind, shape or range.
@@ -50,7 +50,7 @@ def sort_order(positions: Array, cell_size: float, *, curve: str = "hilbert") ->
 
 
 def hilbert_order(positions: Array, size: Array) -> Array:
-    """Order particles as `sort_order` does, by cells whose edge, normal and finite, only data tell."""
+    """Order particles as `sort_order` does, with a cell edge that is an array (normal and finite)."""
     return _sort_order(positions, size, hilbert_words)
 
 
@@ -61,7 +61,7 @@ def _sort_order(positions: Array, size: Array, curve: Callable[[list[Array], int
     one_word = jnp.all(~finite | ((high == 0) & (low != _NO_CELL)))
     high, low = (jnp.where(finite, word, _NO_CELL) for word in (high, low))
 
-    def sort_by(word: Array, order: Array) -> Array:  # one uint32 key and an int32 payload: XLA's fast sort on every device
+    def sort_by(word: Array, order: Array) -> Array:  # a uint32 key with an int32 payload, which XLA sorts fast
         return lax.sort((word, order), num_keys=1, is_stable=True)[1]
 
     order = sort_by(low, lax.iota(jnp.int32, len(positions)))
@@ -71,38 +71,38 @@ def _sort_order(positions: Array, size: Array, curve: Callable[[list[Array], int
 def _cells_from_lowest(x: Array, size: Array, finite: Array) -> list[Array]:
     """Number the cells of coordinates [d, n] along each axis from the lowest occupied one: d arrays [n] uint32, below 2^21.
 
-    Quotients that could overflow are first taken in cells of size * 2^ahead, axis by axis. That far out the particles of an axis
-    share one coordinate or span so many cells that these are merged by more than 2^ahead anyhow. `cells - lowest` is exact up to
-    2^24 cells; beyond, it is off by at most 1/16 of a merged cell.
+    Quotients that could overflow are first taken in cells of edge size * 2^ahead, axis by axis. So far out, the particles of an
+    axis either share one coordinate or span so many cells that these are merged by more than 2^ahead anyhow. `cells - lowest` is
+    exact up to 2^24 cells; beyond that, its error is at most 1/16 of a merged cell.
     """
     x = jnp.where(finite, x, 0)
     largest = jnp.max(jnp.abs(x), axis=1, initial=0)
     ahead = jnp.maximum(_exponent(largest) - _exponent(size) - _DISTINCT, 0)
     cells = jnp.floor(x / _times_power_of_two(size, ahead)[:, None])
-    cells = jnp.where(x < 0, jnp.minimum(cells, -1), cells)  # a quotient that underflows would be in cell 0
+    cells = jnp.where(x < 0, jnp.minimum(cells, -1), cells)  # otherwise a quotient that underflows would be in cell 0
     lowest = jnp.min(cells, axis=1, initial=jnp.inf, where=finite)
-    span = jnp.max(cells, axis=1, initial=-jnp.inf, where=finite) - lowest  # no particle: -inf
+    span = jnp.max(cells, axis=1, initial=-jnp.inf, where=finite) - lowest  # -inf if there is no particle
     excess = jnp.where(span > 0, _exponent(span) + 1 - _SORT_BITS + ahead, 0)
-    merged = jnp.maximum(jnp.max(excess), 0)  # cells are merged by 2^merged; span < 2^(1 + exponent), so that they fit
+    merged = jnp.maximum(jnp.max(excess), 0)  # merging cells by 2^merged suffices, as span < 2^(1 + exponent)
     scale = _times_power_of_two(jnp.ones((), x.dtype), jnp.clip(ahead - merged, -120, 0))
     index = jnp.floor((cells - lowest[:, None]) * scale[:, None])
     return list(jnp.where(finite, index, 0).astype(jnp.uint32))
 
 
 def _exponent(x: Array) -> Array:
-    """Return floor(log2(x)) of normal x >= 0, int32; below all others for 0."""
+    """Return floor(log2(x)) of normal x > 0, int32; for 0 a value below all others."""
     signed, mantissa, bias = _LAYOUT[x.dtype]
     return (lax.bitcast_convert_type(x, signed) >> mantissa).astype(jnp.int32) - bias
 
 
 def _times_power_of_two(x: Array, power: Array) -> Array:
-    """Return x * 2^power of normal x > 0 and normal results, also where 2^power itself is out of range."""
+    """Return x * 2^power for normal x > 0 and a normal result, even if 2^power itself is out of range."""
     signed, mantissa, _ = _LAYOUT[x.dtype]
     return lax.bitcast_convert_type(lax.bitcast_convert_type(x, signed) + (power.astype(signed) << mantissa), x.dtype)
 
 
 def _row_words(axes: list[Array], bits: int) -> Words:
-    """Row-major index where there are at most 2^31 cells, else the coordinates side by side: the same order in both."""
+    """Return the row-major index if there are at most 2^31 cells, else the concatenated coordinates, which sort alike."""
     x, y, *z = axes
     low, high = x | y << bits, y >> 32 - bits
     for c in z:
@@ -120,7 +120,7 @@ _CURVES = {"row": _row_words, "morton": morton_words, "hilbert": hilbert_words}
 
 
 def _check_cell_size(cell_size: Given, dtype: np.dtype) -> np.floating:
-    """Return the edge of a cell, rounded once to the dtype of the positions."""
+    """Return the edge of a cell, rounded to the dtype of the positions."""
     if isinstance(cell_size, Tracer):
         raise TypeError("cell_size must be a static number, got a traced value: pass a Python float, or make it a static argument.")
     shape = list(np.shape(cell_size))

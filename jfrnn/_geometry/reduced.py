@@ -1,7 +1,7 @@
-"""Short vectors of a lattice: the same points of space, so that far fewer images of a particle are within reach.
+"""Lattice reduction: short vectors of the same lattice, with which far fewer periodic images are within reach.
 
-A basis B of short vectors is B = U·A with whole numbers U of determinant ±1 (Semaev 2001, doi:10.1007/3-540-44670-2_13). What is
-exact stays so: a shift S in the short vectors is the shift S·U in the given ones, in which pairs are decided.
+A basis B of short vectors is B = U·A with a whole-number matrix U of determinant ±1 (Semaev 2001, doi:10.1007/3-540-44670-2_13). A
+shift S in short vectors is the shift S·U in the given ones, in which pairs are decided, so decisions stay exact.
 """
 
 import functools
@@ -11,11 +11,11 @@ from itertools import product
 
 import numpy as np
 
-Basis = tuple[tuple[int, ...], ...]  # U: a row for each short vector, numbers of given ones
+Basis = tuple[tuple[int, ...], ...]  # U: one row of whole numbers per short vector
 
 
 def reduced_basis(vectors: np.ndarray, periodic: Sequence[bool]) -> tuple[Basis, np.ndarray]:
-    """Return U [d, d] and U·A in float64 for lattice vectors A, rows [d, d]; rows of axes that are not periodic stay."""
+    """Return U [d, d] and U·A in float64 for lattice vectors A (rows of [d, d]); rows of open axes are unchanged."""
     rows = [[Fraction(x) for x in row] for row in vectors.tolist()]
     numbers = [[int(k == j) for j in range(len(rows))] for k in range(len(rows))]
     axes = [k for k, p in enumerate(periodic) if p]
@@ -25,7 +25,7 @@ def reduced_basis(vectors: np.ndarray, periodic: Sequence[bool]) -> tuple[Basis,
 
 
 def _shorten(rows: list[list[Fraction]], numbers: list[list[int]], k: int, others: list[int]) -> bool:
-    """Take whole numbers of the other vectors off row k if that makes it shorter."""
+    """Subtract whole multiples of the other vectors from row k if that makes it shorter; return whether it did."""
     best: tuple[int, ...] = (0,) * len(others)
     tried = list(product((-1, 0, 1), repeat=len(others)))
     tried += [tuple(round(_dot(rows[k], rows[j]) / _dot(rows[j], rows[j])) if j == i else 0 for j in others) for i in others]

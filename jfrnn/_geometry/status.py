@@ -1,4 +1,4 @@
-"""What can go wrong with the data of a search: one bit each, and the error that reports it."""
+"""Status bits: each names a problem that only the data reveal; and the error for lists that are too small."""
 
 import enum
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from jfrnn._tracing import Given
 
 
 class Status(enum.IntFlag):
-    """Say what a search met in its data; the bits are sticky and `NeighborList.check` turns them into errors."""
+    """Problems that a search found in its data. Bits stay set over updates; `NeighborList.check` turns them into errors."""
 
     OK = 0
     ROW_OVERFLOW = 1
@@ -30,7 +30,7 @@ class Status(enum.IntFlag):
 
     @property
     def message(self) -> str:
-        """Describe every bit that is set, with the remedy, one sentence each."""
+        """One sentence for each bit that is set, with the remedy."""
         return " ".join(text for bit, text in _MESSAGES.items() if bit in self) or "nothing to report."
 
 
@@ -69,21 +69,21 @@ _MESSAGES = {
 
 
 def known_status(status: Array) -> Status | None:
-    """Return the bits of a list, or of any of a batch; None while it is being traced."""
+    """Return the bits of a list, or the union over a batch of lists; None while traced."""
     if isinstance(status, Tracer):
         return None
-    bits: Any = jax.device_get(status)  # stays with the array: to ask again costs nothing
+    bits: Any = jax.device_get(status)  # the array caches it: asking again costs nothing
     return Status(int(np.bitwise_or.reduce(bits, axis=None)))
 
 
 def shape_of(rows: Given) -> tuple[Any, ...]:
-    """Return the shape of an array of rows, or that of none."""
+    """Return the shape of an array of rows, or (None, None) for anything else."""
     shape = tuple(getattr(rows, "shape", ()))
     return shape if len(shape) > 1 else (None, None)
 
 
 def tell(x: Given, how: Callable[[np.ndarray], object]) -> str:
-    """Say what an array comes to, for a line about what holds it; or why that is not known."""
+    """Summarize an array for a `repr`, or say why its values are not available."""
     if isinstance(x, Tracer):
         return "traced"
     if not isinstance(x, np.ndarray | Array):
@@ -96,7 +96,7 @@ def tell(x: Given, how: Callable[[np.ndarray], object]) -> str:
 
 
 def names_of_bits(status: Given) -> str:
-    """Say which bits are set."""
+    """Return the names of the bits that are set, for a `repr`."""
 
     def names(bits: np.ndarray) -> str:
         found = Status(int(np.bitwise_or.reduce(bits, axis=None)))
@@ -106,16 +106,16 @@ def names_of_bits(status: Given) -> str:
 
 
 def pairs_and_status(count: Given, status: Given) -> str:
-    """Say how many pairs rows have, and which bits are set."""
+    """Return the number of pairs and the names of set bits, for a `repr`."""
     return f"{tell(count, lambda x: np.sum(x, dtype=np.int64))} pairs, status {names_of_bits(status)}"
 
 
 class NeighborOverflowError(RuntimeError):
-    """Report that a neighbor list was too small; `required` is the capacity that holds every row.
+    """A neighbor list was too small; `required` is the capacity that holds every row.
 
     Attributes:
-        required: the largest number of neighbors of one row.
-        capacity: the slots per row that the list had.
+        required: The largest number of neighbors of one row.
+        capacity: The slots per row that the list had.
     """
 
     def __init__(self, required: int, capacity: int) -> None:
@@ -127,5 +127,5 @@ class NeighborOverflowError(RuntimeError):
         )
 
     def __reduce__(self) -> tuple[type, tuple[int, int]]:
-        """Say how to make it anew: pickle would pass the message alone, and a process pool would wait for ever."""
+        """Return how to unpickle the error; by default only the message is pickled, which makes process pools hang."""
         return type(self), (self.required, self.capacity)

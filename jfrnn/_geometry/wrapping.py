@@ -1,8 +1,8 @@
-"""Wrapping: particles brought into one cell of the lattice, and bounds on what rounding does there.
+"""Wrapped coordinates: translate particles into one cell of the lattice and bound the rounding errors that this causes.
 
-No pair is decided on wrapped coordinates. Wrapping only brings particles into one cell, so that few images need be looked at.
-`Wrapped.slack` bounds the rounding of coordinates and `Wrapped.reach` that of cells. Whatever lies within these bounds of the
-cutoff is decided on the given floats.
+No pair is decided on wrapped coordinates; wrapping only limits the number of periodic images to consider. `Wrapped.slack` bounds
+the error of coordinates and `Wrapped.reach` includes that of cells. Pairs within these bounds of the cutoff are decided on the
+given floats.
 """
 
 import functools
@@ -20,18 +20,18 @@ NOT_FINITE, TOO_FAR = 1 << _TURN_BITS, 2 << _TURN_BITS
 
 
 class Wrapped(NamedTuple):
-    """Particles in one cell of the lattice, and what rounding may have done on the way.
+    """Wrapped coordinates of particles, with bounds on their rounding errors.
 
     Attributes:
-        sources: [n, d] wrapped, near enough: x - turns @ matrix but for rounding; NaN where they are out of range.
-        queries: [m, d] likewise; the sources again where they are the queries.
-        turns: [n] int32, see `pack_turns`.
-        query_turns: [m] int32.
-        slack: [] bound on the error of a component of a difference of wrapped coordinates, with a shift within reach.
-        reach: [d] half the width of the stencil, in units of the transform: no pair is farther apart along an axis.
-        margin: [d] of the reach, what does not depend on the radius.
-        enough: [] bool: the images that are looked at are all that there can be.
-        met: [] int32, the bits `NOT_FINITE` and `TOO_FAR` where there is such a particle; the lower bits are of turns.
+        sources: [n, d] wrapped coordinates, x - turns @ matrix up to rounding; NaN for particles out of range.
+        queries: [m, d] likewise; the same array if the sources are the queries.
+        turns: [n] int32, the lattice vectors that were subtracted, as `pack_turns` returns them.
+        query_turns: [m] int32, likewise.
+        slack: [] bound on the error of each component of a displacement of wrapped coordinates, for any shift within reach.
+        reach: [d] the largest distance of a pair along each axis, in fractional coordinates (lengths along open axes).
+        margin: [d] the part of `reach` that does not depend on the cutoff.
+        enough: [] bool, whether no pair needs other images than those considered.
+        met: [] int32, the bits `NOT_FINITE` and `TOO_FAR` if there are such particles; the lower bits bound the turns.
     """
 
     sources: Array
@@ -46,9 +46,9 @@ class Wrapped(NamedTuple):
 
 
 def pack_turns(points: Array, lattice: Lattice) -> Array:
-    """Count the lattice vectors between the cell and each point, 0 along open axes: [n] int32, 10 bits for each axis.
+    """Count the lattice vectors between the cell and each point (0 along open axes): [n] int32, 10 bits per axis.
 
-    -1 where a point is not finite, -2 where it is farther away than `LARGEST_TURN`.
+    The result is -1 for points that are not finite, and -2 for those farther away than `LARGEST_TURN`.
     """
     fractions, periodic = fractions_of(points, lattice), lattice.images.periodic
     turns = [jnp.floor(fractions[:, k]) if p else jnp.zeros_like(fractions[:, k]) for k, p in enumerate(periodic)]
@@ -56,13 +56,13 @@ def pack_turns(points: Array, lattice: Lattice) -> Array:
     near = functools.reduce(jnp.logical_and, (jnp.abs(x) <= LARGEST_TURN for x in turns), finite)
     parts = [(x.astype(jnp.int32) + (LARGEST_TURN + 1)) << (k * _TURN_BITS) for k, x in enumerate(turns)]
     packed = jnp.where(near, functools.reduce(jnp.bitwise_or, parts), jnp.where(finite, -2, -1))
-    return lax.optimization_barrier(packed)  # computed once, so that whoever asks gets the same
+    return lax.optimization_barrier(packed)  # computed once, so that all users see the same value
 
 
 def _met(packed: Array, dim: int) -> Array:
-    """Return the largest number of turns, and the bits of what is none, [] int32.
+    """Return a bound on the number of turns, and the bits for points out of range, [] int32.
 
-    Reductions that any number of devices can do together: XLA has no bitwise one of integers for that.
+    These are reductions that XLA supports across devices; it has no bitwise one for integers.
     """
     most = jnp.max(jnp.abs(unpack_turns(packed, dim)), initial=0)
     nowhere, far = jnp.any(packed == -1), jnp.any(packed == -2)
@@ -70,18 +70,18 @@ def _met(packed: Array, dim: int) -> Array:
 
 
 def unpack_turns(packed: Array, dim: int) -> Array:
-    """Read what `pack_turns` wrote: [..., d] int32, 0 where it is negative."""
+    """Invert `pack_turns`: [..., d] int32, 0 for negative values."""
     places = np.arange(dim, dtype=np.int32) * _TURN_BITS
     parts = packed[..., None] >> places.reshape((1,) * packed.ndim + (dim,))
     return jnp.where(packed[..., None] < 0, 0, (parts & ((1 << _TURN_BITS) - 1)) - (LARGEST_TURN + 1))
 
 
 def wrap(sources: Array, queries: Array | None, lattice: Lattice, radius: np.floating | Array) -> Wrapped:
-    """Bring particles into one cell of the lattice, and bound what rounding does.
+    """Translate particles into one cell of the lattice and bound the rounding errors.
 
-    With u the computed units of the transform, u' the exact ones of the same transform, and R = matrix @ transform - 1 its
-    residual (periodic columns), |u_j + S - u_i - (x_j - x_i + S·A) @ transform| is at most the rounding of u_i and u_j and
-    sum |S|·|R|; and |d @ transform| <= |d|·|column of the transform|. `reach` adds these up, each rounded up generously.
+    Let u be the computed fractional coordinates, R = matrix @ transform - 1 the residual of the transform (periodic columns). Then
+    |u_j + S - u_i - (x_j - x_i + S·A) @ transform| is at most the rounding errors of u_i and u_j plus sum |S|·|R|, and |d @
+    transform| <= |d|·|column of the transform|. `reach` is the sum of these terms, each rounded up generously.
     """
     dtype, images, dim = np.dtype(sources.dtype), lattice.images, lattice.dim
     eps, periodic = jnp.finfo(dtype).eps, np.array(images.periodic)
@@ -92,11 +92,11 @@ def wrap(sources: Array, queries: Array | None, lattice: Lattice, radius: np.flo
         moved = jnp.where((off == 0).all(axis=1, keepdims=True), points, points - translation(off, lattice))
         wrapped.append(jnp.where(turns[:, None] >= 0, moved, jnp.nan))
     met = functools.reduce(jnp.bitwise_or, (_met(turns, dim) for turns in packed))
-    most = (met & LARGEST_TURN).astype(dtype)  # at least as many as the largest number of turns, less than twice as many
+    most = (met & LARGEST_TURN).astype(dtype)  # at least the largest number of turns, and less than twice that
 
     matrix, transform = jnp.abs(lattice.matrix), jnp.abs(lattice.transform)
     spans = matrix.sum(axis=0)
-    size = jnp.abs(lattice.origin) + (most + 1) * spans  # of what lies so many lattice vectors away
+    size = jnp.abs(lattice.origin) + (most + 1) * spans  # largest coordinate so many lattice vectors away
     if not (images.orthogonal or periodic.all()):
         finite = [jnp.max(jnp.abs(x), axis=0, initial=0, where=jnp.isfinite(x)) for x in wrapped]
         size = size + functools.reduce(jnp.maximum, finite)
@@ -105,7 +105,7 @@ def wrap(sources: Array, queries: Array | None, lattice: Lattice, radius: np.flo
     shifts = most + max(images.reach) + 1
     rounding = 8 * eps * product(size[None], transform)[0] + 2 * shifts * residual.sum(axis=0)
     if images.orthogonal:
-        rounding = jnp.where(periodic, rounding, 0)  # open axes are walked in raw coordinates
+        rounding = jnp.where(periodic, rounding, 0)  # cells along open axes use the given coordinates
     length = jnp.sqrt(jnp.sum((transform * radius) ** 2, axis=0)) * (1 + 16 * eps)
     margin = 2 * rounding + jnp.where(periodic, 8 * eps, 0)
     reach = length + margin
@@ -116,14 +116,14 @@ def wrap(sources: Array, queries: Array | None, lattice: Lattice, radius: np.flo
 
 
 def _wrapping_error(most: Array, lattice: Lattice) -> Array:
-    """Bound the error of a component of x_j - x_i that wrapping both, by at most so many turns, and moving one to an image made.
+    """Bound the error of a component of x_j - x_i from wrapping both by at most `most` turns and moving one to an image.
 
-    In units of u = eps/2: t·A of whole numbers takes u|t·A|, nothing for 0, 1, 2, and d times that where d such products add up;
-    the sum with a coordinate of the cell takes u of it. What is not wrapped loses nothing.
+    With u = eps/2: a product t·A with a whole number t has an error of u|t·A|, or none for t = 0, 1, 2; with d such products, d
+    times that. Adding a coordinate of the cell costs another u of it. Points that are not wrapped have no error.
     """
     dim, images = lattice.dim, lattice.images
-    u = 0.525 * jnp.finfo(lattice.matrix.dtype).eps  # a twentieth more than half: for second orders, and for this sum
-    spans = jnp.abs(lattice.matrix).sum(axis=0)  # 0 for components that no lattice vector has
+    u = 0.525 * jnp.finfo(lattice.matrix.dtype).eps  # 5 % more than eps/2 covers second-order terms and the rounding of this sum
+    spans = jnp.abs(lattice.matrix).sum(axis=0)  # 0 for components to which no lattice vector contributes
     cell = jnp.where(spans > 0, jnp.abs(lattice.origin) + spans, 0)
     products = 1 if images.orthogonal else 2 * dim
     wrapping = jnp.where(most > 0, products * most * spans + cell, 0)
