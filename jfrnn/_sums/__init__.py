@@ -1,4 +1,4 @@
-"""Sums over pairs: what they are, their derivatives, and their translation to native text."""
+"""Sums over pairs, their derivatives, and the translation of the summand to native code."""
 
 from jfrnn._sums.verb import pair_sum
 

@@ -1,4 +1,4 @@
-"""The largest or smallest summand of each row: which pair it is, found without derivatives, then that pair alone, with them."""
+"""Maxima and minima over pairs: find the extreme pair of each row without derivatives, then evaluate that pair with them."""
 
 import functools
 from collections.abc import Sequence
@@ -15,13 +15,13 @@ from jfrnn._sums.summation import bind_sum
 from jfrnn._sums.terms import Derived, Groups, Term, choose, fresh_labels, join, make_term
 from jfrnn._tracing import call_apart, compiled
 
-_Best = tuple[Array, Array, Array | None]  # of each row and element [b, k]: the largest, its source (n: none), its shift [b, k, d]
+_Best = tuple[Array, Array, Array | None]  # per row and element [b, k]: largest value, its source (n: none), its shift [b, k, d]
 
 
 def bind_extremes(relation: Relation, term: Term, operands: Groups, largest: bool) -> list[Array]:
-    """Return the largest (or smallest) of each element of the summands in each row; -inf (inf) where there is no pair.
+    """Return the largest (or smallest) summand of each row, element by element; -inf (inf) in rows without pairs.
 
-    NaN counts as the most extreme. Of equal ones that of the smallest j counts, and with it its derivative.
+    NaN is more extreme than any number. Of equal values, that of the smallest j is chosen, and so is its derivative.
     """
     m, n = relation.sizes
     if isinstance(relation, Searched):
@@ -44,14 +44,14 @@ def bind_extremes(relation: Relation, term: Term, operands: Groups, largest: boo
 
 @functools.lru_cache(maxsize=256)
 def _element(term: Term, k: int) -> Derived:
-    """Make the term of one element of summand k; its number is the last of the own operands."""
+    """Make the term of a single element of summand k; the element number is the last operand of i."""
 
     def summand(real: Array, shift: Array, operands: Groups) -> Sequence[Array]:
         *own, number = operands.own
         return [jnp.ravel(term(real, shift, operands._replace(own=tuple(own)))[k])[number]]
 
     number = jax.ShapeDtypeStruct((), np.int32)
-    mine, theirs = fresh_labels(len(term.operands.own) + 1, term.labels), term.labels[1]  # a row of i for each element
+    mine, theirs = fresh_labels(len(term.operands.own) + 1, term.labels), term.labels[1]  # one row per element of i
     return make_term(summand, join(term.operands, Groups((), (number,), ())), term.shift, (mine, theirs))
 
 
@@ -79,9 +79,9 @@ def _find(relation: Relation, term: Term, operands: Groups, largest: bool) -> li
 
 
 def _best_of(values: Array, slots: Slots, n: int) -> _Best:
-    """Return the largest of the values [b, g, ...] in each row.
+    """Return the largest of the values [b, g, ...] in each row, with its source and shift.
 
-    One reduction of values and numbers together: XLA may evaluate values anew for each that asks, and round them otherwise.
+    Values and sources are reduced together: in separate reductions XLA may evaluate values twice, with different rounding.
     """
     values = values.reshape(*slots.real.shape, -1)
     source = jnp.broadcast_to(jnp.where(slots.real, slots.source, n)[..., None], values.shape)
@@ -106,7 +106,7 @@ def _better(old: _Best, new: _Best, n: int) -> _Best:
 
 
 def _is_better(new: tuple[Array, Array], old: tuple[Array, Array], n: int) -> Array:
-    """Say which values and sources come before others; a source n is none."""
+    """Say which (value, source) takes precedence over the other; source n means that there is none."""
     (value, source), (than, other) = new, old
     larger = (value > than) | (jnp.isnan(value) & ~jnp.isnan(than))
     same = (value == than) | (jnp.isnan(value) & jnp.isnan(than))

@@ -1,8 +1,7 @@
-"""The fused engine of pair sums: the term becomes part of the kernel that finds the pairs, so that no list is made.
+"""The fused engine of pair sums: the translated term becomes part of the kernel that finds the pairs, so no list is made.
 
-What a term reads travels packed, a column for each number, in the dtype of positions: of the pair sum as a whole, of each query, of
-each source. Where this engine cannot do what is asked, it says so while tracing; none of its answers is another than "jax" gives,
-but for rounding.
+Operands are packed into columns, one per scalar, in the dtype of the positions: one set for the whole sum, one per query and one
+per source. While tracing, the engine reports what it cannot do. Its results agree with those of "jax" up to rounding.
 """
 
 import functools
@@ -33,13 +32,13 @@ from jfrnn._sums.scalars import NoTranslationError, hash_of
 from jfrnn._sums.terms import POSITIONS, Groups, Term, join
 from jfrnn._sums.translate import input_name, output_name, translate
 
-_Columns = tuple[tuple[int, int], ...]  # of each column: which operand of a group, which element of it
+_Columns = tuple[tuple[int, int], ...]  # per column: the operand of a group and the element of it
 
 
 class Plan(NamedTuple):
-    """A term in native text, where its columns come from, and a key that is the same in every process.
+    """A term in native code, the origin of its columns, and a cache key that is the same in every process.
 
-    Positions need no columns: the kernel has them.
+    Positions need no columns, since the kernel has them anyway.
     """
 
     text: Any  # jfrnn.kernels.pair_sum_cpu.TermText
@@ -50,7 +49,7 @@ class Plan(NamedTuple):
 
 
 def refusal(inputs: Inputs, platform: str) -> str | None:
-    """Say what of a search this engine cannot do; None: nothing."""
+    """Return why this engine cannot run on such a search, or None if it can."""
     if platform not in PLATFORMS:
         return f"on the platform {platform!r}, only on the CPU and on CUDA"
     if platform != "cpu" and isinstance(inputs.cutoff, Radii):
@@ -61,18 +60,18 @@ def refusal(inputs: Inputs, platform: str) -> str | None:
 
 
 def is_fused(inputs: Inputs, options: Options, term: Term) -> bool:
-    """Say whether a sum is one for this engine: it was named, or it is "auto" and can do it."""
+    """Say whether this engine computes a sum: it was chosen by name, or by "auto" and supports the term."""
     if not options.engine.translates:
         return False
     return not options.may_change or _why_not(term, *_kind(inputs)) is None
 
 
 def check(inputs: Inputs, options: Options, term: Term) -> None:
-    """Raise where this engine was named and cannot sum a term; warn where "auto" takes a slower one for lack of a translation.
+    """Raise if this engine was chosen by name and does not support the term; warn if "auto" falls back to a slower one.
 
     Raises:
         NoTranslationError: a primitive of the term, or of its derivative, has no translation.
-        TypeError: a dtype cannot travel.
+        TypeError: the kernel does not support a dtype.
     """
     if not options.engine.translates:
         return
@@ -88,7 +87,7 @@ def check(inputs: Inputs, options: Options, term: Term) -> None:
 
 
 def _kind(inputs: Inputs) -> tuple[np.dtype, tuple[bool, ...]]:
-    """Return on what a translation depends besides its term: the dtype of positions, and which axes are periodic."""
+    """Return what a translation depends on besides its term: the dtype of the positions and the periodic axes."""
     return np.dtype(inputs.sources.dtype), (False,) * inputs.sources.shape[1] if inputs.box is None else inputs.box.periodic
 
 
@@ -111,14 +110,14 @@ def _why_not(term: Term, dtype: np.dtype, periodic: tuple[bool, ...]) -> Excepti
 
 
 def _travelling(dtype: np.dtype) -> set[np.dtype]:
-    """Return the dtypes that lose nothing among floats of a dtype."""
+    """Return the dtypes whose values the kernel can hold exactly in columns of this dtype."""
     names = ("float32", "bool", "int32") if dtype == np.float32 else ("float32", "float64", "bool", "int32", "int64")
     return {np.dtype(name) for name in names}
 
 
 @functools.lru_cache(maxsize=256)
 def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: bool = False) -> Plan:
-    """Translate a term, or its negative, for positions of a dtype and shifts along periodic axes."""
+    """Translate a term, or its negative, for positions of this dtype and shifts along periodic axes."""
     kernels = kernels_of("pair_sum_cpu")
 
     def of_pair(shift: Array, operands: Groups) -> Sequence[Array]:
@@ -127,7 +126,7 @@ def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: 
 
     translated = translate(jax.make_jaxpr(of_pair)(term.shift, term.operands))
     steps = tuple(kernels.Step(input_name(k, e), e) for k, e in translated.reads if k == 0)
-    at_hand = () if any(periodic) else POSITIONS  # in a box the kernel has those of images
+    at_hand = () if any(periodic) else POSITIONS  # in a box, the kernel holds wrapped positions instead
     columns, values, before = [], [], 1
     for group, labels in zip(term.operands, ((), *term.labels), strict=True):
         reads = [(k - before, e) for k, e in translated.reads if before <= k < before + len(group)]
@@ -146,12 +145,12 @@ def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: 
         for e in range(math.prod(spec.shape))
     )
     text = kernels.TermText(translated.text, steps, values[0], values[1], values[2], sums)
-    turns = [((len(group), 0),) if steps else () for group in term.operands]  # behind all operands
+    turns = [((len(group), 0),) if steps else () for group in term.operands]  # the columns of turns follow those of the operands
     return Plan(text, columns[0], columns[1] + turns[1], columns[2] + turns[2], hash_of(tuple(text), dtype.name)[:20])
 
 
 def sums(inputs: Inputs, options: Options, term: Term, operands: Groups, compensated: bool) -> list[Array]:
-    """Sum a term over all pairs of a search: see `jfrnn._sums.relations.sum_pairs`."""
+    """Sum a term over all pairs of a search, as `jfrnn._sums.relations.sum_pairs` specifies."""
     plan = make_plan(term, *_kind(inputs))
     found, totals, _ = _launch(prepare_search(inputs, options), options, plan, operands, compensated)
     return _unpack(term, found, totals)
@@ -163,8 +162,9 @@ def extremes(
     """Find the largest summands (or the negatives of the smallest) over all pairs of a search.
 
     Returns:
-        For each summand, with its elements in one row: the largest [rows, elements]; of which source that is, int32, n where there
-        is none; and in a box its lattice shift [rows, elements, d]. Of equal ones the smallest source, then any image.
+        For each summand, with its elements in one row: the largest values [rows, elements]; their sources, int32, n for none; and
+            in a box their lattice shifts [rows, elements, d]. Of equal values, that of the smallest source is chosen, of its images
+            any.
     """
     search = prepare_search(inputs, options)
     values, _, which = _launch(search, options, make_plan(term, *_kind(inputs), not largest), operands, False, extremes=True)
@@ -188,7 +188,7 @@ def _launch(
     compensated: bool,
     extremes: bool = False,
 ) -> tuple[Array, Array, Array]:
-    """Hand a prepared search and what a plan reads to the kernel."""
+    """Run the kernel for a prepared search with the operands that a plan needs."""
     sources, torus = search.sources, search.torus
     if torus is not None:
         operands = join(operands, Groups((), (torus[1].query_turns,), (torus[1].turns,)))
@@ -201,7 +201,7 @@ def _launch(
 
 
 def _pack(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) -> Array:
-    """Return the columns of a group of operands: [size, width], or where all pairs share them, [width]; never empty."""
+    """Return the columns of a group of operands, [size, width] or, if all pairs share them, [width]; never empty."""
     if not columns:
         return jnp.zeros(1 if size is None else (1, 1), dtype)
     leading = () if size is None else (size,)
@@ -210,7 +210,7 @@ def _pack(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) ->
 
 
 def _unpack(term: Term, sums: Array, totals: Array) -> list[Array]:
-    """Return the sums of each summand from the columns of all."""
+    """Return the sums of each summand from the columns of all summands."""
     found, row, total = [], 0, 0
     for like, is_total in zip(term.summands, term.totals, strict=True):
         size = math.prod(like.shape)

@@ -1,4 +1,4 @@
-"""How the function of a pair sum is called, and what its errors say: what it was given, and what to do."""
+"""Call the user's function of a pair, and explain its errors."""
 
 import functools
 import inspect
@@ -18,11 +18,11 @@ _NEEDS_A_VALUE = (
 
 
 def call_with_pair(fn: Callable[[Array, Tree, Tree], Tree], r: Array, i: Tree, j: Tree) -> Tree:
-    """Return fn(r, i, j) of one traced pair.
+    """Return fn(r, i, j) for one traced pair.
 
     Raises:
-        TypeError: fn does not take three arguments, or needs to know a number to go on, as `if` does.
-        Exception: what else fn raises, with a note that says what it was given.
+        TypeError: fn does not take three arguments, or needs a concrete value, as `if` does.
+        Exception: any other error of fn, with a note that describes its arguments.
     """
     _check_signature(fn, r, i, j)
     try:
@@ -41,7 +41,7 @@ def call_with_pair(fn: Callable[[Array, Tree, Tree], Tree], r: Array, i: Tree, j
 def _check_signature(fn: Callable[..., Tree], r: Array, i: Tree, j: Tree) -> None:
     try:
         signature = inspect.signature(fn)
-    except (TypeError, ValueError):  # some built-in functions do not say what they take
+    except (TypeError, ValueError):  # some built-in functions have no signature
         return
     try:
         signature.bind(r, i, j)
@@ -60,13 +60,13 @@ def _name_of(fn: object) -> str:
 
 
 class _Shape(str):
-    """A text that is its own representation, so that a pytree of shapes prints as one is written."""
+    """A text that is its own `repr`, so that a pytree of shapes prints readably."""
 
     __repr__ = str.__str__
 
 
 def _given(r: Array, i: Tree, j: Tree) -> str:
-    """Say what fn gets of a pair."""
+    """Describe the arguments that fn gets for a pair."""
 
     def describe(values: Tree) -> str:
         if not jax.tree.leaves(values):

@@ -1,7 +1,7 @@
-"""How each primitive of JAX becomes operations on scalars: one row per primitive, in TABLE at the end.
+"""Translate each primitive of JAX to operations on scalars; the TABLE at the end has one entry per primitive.
 
-A rule gets the equation and its inputs, arrays of numbers of scalars (see `jfrnn._sums.scalars`), and returns its outputs. A
-primitive that only moves elements needs no operations: its rule moves their numbers.
+A rule gets the equation and its inputs, arrays of scalar numbers (see `jfrnn._sums.scalars`), and returns its outputs. A primitive
+that only moves elements needs no operations: its rule moves their numbers.
 """
 
 import math
@@ -14,9 +14,9 @@ from jax import numpy as jnp
 
 from jfrnn._sums.scalars import TYPES, NoTranslationError, Number, Scalars
 
-MOST_REPEATED = 8  # the largest constant exponent of `pow` that is multiplied out, within a few ulp
+MOST_REPEATED = 8  # largest constant exponent of `pow` that becomes repeated multiplication, within a few ulp
 
-Values = np.ndarray  # numbers of scalars, in the shape of the array they make up
+Values = np.ndarray  # scalar numbers in the shape of the array that the scalars form
 
 
 class Spec(NamedTuple):
@@ -27,7 +27,7 @@ class Spec(NamedTuple):
 
 
 class Equation(NamedTuple):
-    """What a rule knows beside its inputs; `run` translates a jaxpr that is nested in the parameters."""
+    """What a rule knows besides its inputs; `run` translates a nested jaxpr from the equation's parameters."""
 
     scalars: Scalars
     primitive: Any
@@ -36,18 +36,18 @@ class Equation(NamedTuple):
     run: Callable[[Any, Sequence[Values]], list[Values]]
 
     def each(self, operation: str, *arrays: Values, dtype: str | None = None) -> Values:
-        """Return the result of an operation on every element; a scalar goes with every shape."""
+        """Apply an operation to every element, broadcasting scalars."""
         arrays = np.broadcast_arrays(*arrays)
         rows = zip(*(a.reshape(-1).tolist() for a in arrays), strict=True)
         dtype = dtype or self.outputs[0].dtype
         return np.array([self.scalars.apply(operation, row, dtype) for row in rows], int).reshape(arrays[0].shape)
 
     def full(self, value: Number, shape: tuple[int, ...] = (), dtype: str | None = None) -> Values:
-        """Return an array of one constant."""
+        """Return an array filled with one constant."""
         return np.full(shape, self.scalars.constant(value, dtype or self.outputs[0].dtype))
 
     def known(self, numbers: Values) -> np.ndarray:
-        """Return the values of constants, of the indices that say what goes where."""
+        """Return the values of constants, such as the indices of a gather."""
         values = [self.scalars.value(k) for k in numbers.reshape(-1).tolist()]
         if any(value is None for value in values):
             raise NoTranslationError(
@@ -57,7 +57,7 @@ class Equation(NamedTuple):
         return np.array(values, values[0].dtype if values else np.int32).reshape(numbers.shape)
 
     def cast(self, x: Values, dtype: str) -> Values:
-        """Return values of another dtype."""
+        """Convert values to another dtype."""
         return self.each(f"to_{TYPES[dtype]}", x, dtype=dtype)
 
 
@@ -65,12 +65,12 @@ Rule = Callable[[Equation, list[Values]], list[Values]]
 
 
 def _each(operation: str) -> Rule:
-    """Return the rule of a function of `Math` on every element."""
+    """Return a rule that applies a function of `Math` to every element."""
     return lambda eqn, inputs: [eqn.each(operation, *inputs)]
 
 
 def _move(move: Callable[..., Values]) -> Rule:
-    """Return the rule of what moves elements of one array; `move` gets their numbers and the parameters of the equation."""
+    """Return a rule that rearranges the elements of one array; `move` gets their numbers and the equation's parameters."""
     return lambda eqn, inputs: [np.asarray(move(inputs[0], eqn.params))]
 
 
@@ -126,7 +126,7 @@ def _select(eqn: Equation, inputs: list[Values]) -> list[Values]:
 
 
 def _choose(eqn: Equation, which: Values, cases: Sequence[Values], dtype: str) -> Values:
-    """Return the case that `which` says, a truth or an integer; out of range the nearest one."""
+    """Return the case that `which` selects, a bool or an integer; an integer out of range selects the nearest case."""
     kind = eqn.scalars.nodes[int(which.flat[0])].dtype if which.size else "bool"
     if kind == "bool":
         return eqn.each("select", which, cases[1], cases[0], dtype=dtype)
@@ -141,7 +141,7 @@ def _choose(eqn: Equation, which: Values, cases: Sequence[Values], dtype: str) -
 
 
 def _reduce(operation: str, empty: Callable[[np.dtype], Number]) -> Rule:
-    """Return the rule of a reduction from the first element to the last; `empty` is the result of none, by dtype."""
+    """Return the rule of a reduction from the first element to the last; `empty` is its result for no elements, per dtype."""
 
     def rule(eqn: Equation, inputs: list[Values]) -> list[Values]:
         axes, x = tuple(eqn.params["axes"]), inputs[0]
@@ -239,7 +239,7 @@ def _pad(eqn: Equation, inputs: list[Values]) -> list[Values]:
     x, value = inputs
     for axis, (low, high, interior) in enumerate(eqn.params["padding_config"]):
         size = x.shape[axis] + max(x.shape[axis] - 1, 0) * interior
-        at = np.arange(-low, size + high)  # where each element comes from, with the gaps counted
+        at = np.arange(-low, size + high)  # origin of each element, counting the gaps
         taken = (at >= 0) & (at < size) & (at % (interior + 1) == 0)
         source = np.insert(x, x.shape[axis], value, axis)
         x = np.take(source, np.where(taken, at // (interior + 1), x.shape[axis]), axis)
@@ -247,7 +247,7 @@ def _pad(eqn: Equation, inputs: list[Values]) -> list[Values]:
 
 
 def _by_index(*sources: int) -> Rule:
-    """Return the rule of what moves elements to where constants say: JAX moves their numbers; the other inputs are indices."""
+    """Return a rule for moves by constant indices: JAX moves the scalar numbers; all inputs but the first are indices."""
 
     def rule(eqn: Equation, inputs: list[Values]) -> list[Values]:
         with jax.ensure_compile_time_eval():
@@ -263,7 +263,7 @@ def _by_index(*sources: int) -> Rule:
 
 
 def _scatter_add(eqn: Equation, inputs: list[Values]) -> list[Values]:
-    """Add each update where JAX puts a one for it."""
+    """Add each update to the elements to which JAX scatters it."""
     (operand, indices, updates), dtype = inputs, eqn.outputs[0].dtype
     with jax.ensure_compile_time_eval():
         where = jnp.asarray(eqn.known(indices))
@@ -286,7 +286,7 @@ def _inline(eqn: Equation, inputs: list[Values]) -> list[Values]:
 
 
 def _cond(eqn: Equation, inputs: list[Values]) -> list[Values]:
-    """Take all branches and select: they are pure."""
+    """Evaluate all branches, which have no side effects, and select one."""
     results = [eqn.run(branch, inputs[1:]) for branch in eqn.params["branches"]]
     return [_choose(eqn, inputs[0], cases, spec.dtype) for spec, cases in zip(eqn.outputs, zip(*results, strict=True), strict=True)]
 
@@ -314,7 +314,7 @@ TABLE: dict[str, Rule] = {name: _each(name) for name in _SAME_NAME} | {
     "convert_element_type": _convert,
     "copy": _same,
     "copy_p": _same,
-    "reshard": _same,  # of what a function closes over from outside of shard_map: every device has all of it
+    "reshard": _same,  # for arrays that fn closes over from outside `shard_map`: every device has all of them
     "name": _same,
     "optimization_barrier": _same,
     "stop_gradient": _same,

@@ -1,4 +1,4 @@
-"""What `pair_sum` reduces: pairs that are searched or listed, and the summand that a function of one pair becomes."""
+"""What `pair_sum` reduces: the pairs of a search or of a list, and the summand made from the user's function."""
 
 import dataclasses
 import functools
@@ -23,18 +23,18 @@ from jfrnn._tracing import Given, Tree, call_apart, compiled, on_device
 
 
 class Pairs(NamedTuple):
-    """Which pairs, and what their displacements are made of.
+    """The pairs of a sum and the operands of their displacements.
 
-    `mark` gives sums what is no result in rows that have none: where the data show that pairs may be missing, or where the position
-    is not finite, unless the particle is inactive.
+    `mark` replaces sums by NaN (integers: the smallest one) in invalid rows: where pairs may be missing, and where the position of
+    an active particle is not finite.
     """
 
     relation: Relation
-    half: bool  # each pair stands there once: its mirror image is summed, too
+    half: bool  # each pair is listed once, and counts for both particles
     sources: Array
     rows: Array
     lattice: Lattice | None
-    largest: Any  # cutoff
+    largest: Any  # the largest cutoff
     directionless: bool
     mark: Callable[[list[Array]], list[Array]]
 
@@ -60,7 +60,7 @@ def listed(
     given: dict[str, bool],
     full: bool,
 ) -> Pairs:
-    """Return the pairs of a list, after checking that what was `given` besides fits it; `full`: a half list does not do."""
+    """Return the pairs of a list, after checking that no argument in `given` contradicts it; `full` refuses half lists."""
     if not isinstance(nbrs, NeighborList):
         raise TypeError(f"neighbors must be a jfrnn.NeighborList, got {type(nbrs).__name__}.")
     for name in (name for name, is_given in given.items() if is_given):
@@ -86,24 +86,24 @@ def listed(
 
 @compiled
 def _good_rows(points: Array, active: Array | None, whole: Array | None) -> Array:
-    """Say which rows [m] have a sum: those of finite points, and of inactive ones, if pairs are known to be whole."""
+    """Say which rows [m] are valid: those of finite points and of inactive particles, provided that no pairs are missing."""
     fixed = lax.stop_gradient(points)
     columns = (jnp.isfinite(fixed[:, k]) for k in range(fixed.shape[1]))
-    finite = functools.reduce(jnp.logical_and, columns)  # not a reduction, which XLA would not fuse
+    finite = functools.reduce(jnp.logical_and, columns)  # without a reduction, which XLA would not fuse
     good = finite if active is None else finite | ~active
     return good if whole is None else good & whole
 
 
 @functools.partial(compiled, static_argnames=("options", "doubtful"))
 def _good_rows_of_search(inputs: Inputs, options: Options, doubtful: bool) -> Array:
-    """Say which rows [m] of a search have a sum; `doubtful`: the data may show that pairs cannot be decided."""
+    """Say which rows [m] of a search are valid; `doubtful` says that the data decide whether pairs may be missing."""
     whole = is_decidable(inputs, options) if doubtful else None
     return _good_rows(inputs.sources, inputs.active, whole) if inputs.queries is None else _good_rows(inputs.queries, None, whole)
 
 
 @compiled
 def _good_rows_of_list(status: Array, count: Array | None, points: Array) -> Array:
-    """Say which rows [m] of a list have a sum. Where particles may be inactive, `count` is given: those with neighbors are not."""
+    """Say which rows [m] of a list are valid. If particles may be inactive, `count` is given: those with neighbors are active."""
     whole = (status & ~ROWS_ARE_WHOLE.value) == 0
     active = None if count is None else (count > 0) | ((status & Status.NONFINITE.value) != 0)
     return _good_rows(points, active, whole)
@@ -112,12 +112,12 @@ def _good_rows_of_list(status: Array, count: Array | None, points: Array) -> Arr
 def _telling(
     sources: Array, queries: Array | None, good_rows: Callable[..., Array], data: tuple, static: tuple = ()
 ) -> tuple[Array, Array, Callable[[list[Array]], list[Array]]]:
-    """Return the sources, the rows, which derivatives reach as NaN where there is no sum, and what marks sums likewise.
+    """Return sources, rows and a function that marks invalid rows; derivatives in invalid rows of the positions are NaN.
 
-    `good_rows(*data, *static)` says which rows have a sum. Concrete arrays are marked by the program that finds it out.
+    `good_rows(*data, *static)` says which rows are valid. For concrete arrays one program evaluates and applies it.
     """
     points = sources if queries is None else queries
-    if not isinstance(points, Tracer):  # there are no derivatives
+    if not isinstance(points, Tracer):  # no derivatives are taken
         return sources, points, functools.partial(_mark_by, data=data, good_rows=good_rows, static=static)
     good = call_apart(lambda *data: good_rows(*data, *static), *data)
     points = _told(points, good)
@@ -137,7 +137,7 @@ def _told_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Any]) -> tupl
 
 
 def _one_or_nan(good: Array, like: Array) -> Array:
-    """Return 1 or NaN for each row, to be multiplied with `like` [rows, ...]."""
+    """Return 1 for valid rows and NaN for others, in a shape that multiplies `like` [rows, ...]."""
     return jnp.where(good, 1, jnp.nan).astype(like.dtype).reshape(-1, *[1] * (like.ndim - 1))
 
 
@@ -154,7 +154,7 @@ def reduced(
     symmetry: str | None,
     compensated: bool,
 ) -> Tree:
-    """Trace fn, sum it, and give the sums the structure of what it returns."""
+    """Trace fn, reduce it over the pairs, and return the results in the structure that fn returns."""
     operands, summand, structure = _summand(fn, pairs, mine, theirs, symmetry)
     one_pair = Groups(
         tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in operands.shared),
@@ -184,7 +184,7 @@ def reduced(
 
 @functools.partial(compiled, static_argnames=("term", "compensated"))
 def _sums_of_half(listed: Listed, term: Term, operands: Groups, compensated: bool) -> list[Array]:
-    """Sum over a half list and over its mirror image, in which no pair of a particle with itself stands again."""
+    """Sum over a half list and over its mirror image; a particle's pair with itself counts once."""
     apart = listed.idx != lax.iota(jnp.int32, listed.idx.shape[0])[:, None]
     apart = apart if listed.shifts is None else apart | (listed.shifts != 0).any(axis=-1)
     mirrored = dataclasses.replace(listed, mask=listed.mask & apart, flipped=True)
@@ -193,7 +193,7 @@ def _sums_of_half(listed: Listed, term: Term, operands: Groups, compensated: boo
 
 
 def _numbers(like: jax.ShapeDtypeStruct, known: bool) -> Array:
-    """Number particles: while tracing by the program, where they are known on the host, which needs no program."""
+    """Return the particle numbers 0, 1, ...: made on the host if data are concrete, which needs no compilation."""
     n = like.shape[0]
     return on_device(np.arange(n, dtype=np.int32)) if known else lax.iota(jnp.int32, n)
 
@@ -205,12 +205,12 @@ def _summand(
     theirs: Tree,
     symmetry: str | None,
 ) -> tuple[Groups, Summand, list]:
-    """Return the operands, fn as a function of one pair of them, and a list that takes the structure of what fn returns."""
+    """Return the operands, fn as a function of one pair of them, and a list that receives the structure of fn's result."""
     sources, rows, lattice = pairs.sources, pairs.rows, pairs.lattice
     dtype = sources.dtype
     harmless = jnp.zeros(sources.shape[1], dtype).at[0].set(jnp.asarray(pairs.largest, dtype) / 2)
     turning = [] if lattice is None else [lattice.matrix]
-    numbers = [jax.ShapeDtypeStruct((len(x),), np.int32) for x in (rows, sources)]  # arrays where they are needed
+    numbers = [jax.ShapeDtypeStruct((len(x),), np.int32) for x in (rows, sources)]  # become arrays only if the term needs them
     (own, own_tree), (others, other_tree) = jax.tree.flatten(mine), jax.tree.flatten(theirs)
     operands = Groups((harmless, *turning), (rows, numbers[0], *own), (sources, numbers[1], *others))
     structure: list = []
@@ -220,7 +220,7 @@ def _summand(
         r = x_j - x_i
         if lattice is not None:
             r = r + translation(shift, dataclasses.replace(lattice, matrix=matrix[0]))
-        r = jnp.where(real, r, harmless)  # what fn gets where there is no pair must not stop it, or raise in debug modes
+        r = jnp.where(real, r, harmless)  # for masked slots, an input for which fn raises nothing in debug modes
         i, j = jax.tree.unflatten(own_tree, own), jax.tree.unflatten(other_tree, others)
         if symmetry is None:
             return leaves_of(call_with_pair(fn, r, i, j))
@@ -240,7 +240,7 @@ def _summand(
 
 
 def _labels(operands: Groups, same: bool) -> Labels:
-    """Label the operands of i and of j, of which positions are the first; `same`: they are the same arrays."""
+    """Label the operands of i and of j, positions first; `same` says that both sides are the same arrays."""
     theirs = OF_SOURCES, *fresh_labels(len(operands.others) - 1, ((), ()))
     if same:
         return theirs, theirs
@@ -248,7 +248,7 @@ def _labels(operands: Groups, same: bool) -> Labels:
 
 
 def _is_backward(shift: Array) -> Array:
-    """Say whether the first number of a shift [d] that is not zero is negative."""
+    """Say whether the first nonzero number of a shift [d] is negative."""
     result = jnp.zeros((), bool)
     for k in reversed(range(shift.shape[0])):
         result = (shift[k] < 0) | ((shift[k] == 0) & result)
@@ -269,7 +269,7 @@ def _summable(x: Given, dtype: np.dtype) -> Array:
 
 @compiled
 def _mark(leaves: list[Array], good: Array) -> list[Array]:
-    """Return what is no result in rows that have no sum; its derivatives likewise."""
+    """Replace invalid rows by NaN (integers: the smallest one); their derivatives become NaN too."""
 
     def marked(x: Array) -> Array:
         if jnp.issubdtype(x.dtype, jnp.floating):

@@ -1,4 +1,4 @@
-"""Which pairs a pair sum runs over, found by a search or standing in a list, and the engines that run over them."""
+"""Relations: the pairs of a sum, from a search or from a list, and the loops that sum over them."""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,18 +15,18 @@ from jfrnn._sums.fused import sums as fused_sums
 from jfrnn._sums.terms import Groups, Term
 from jfrnn._tracing import Tree
 
-_LIST_SLOTS = 1 << 22  # numbers of pairs of a list that are in work at a time: 16 MB of float32
+_LIST_SLOTS = 1 << 22  # scalars of list slots that are processed at a time: 16 MB of float32
 _EXCHANGED = {"gather": "scatter", "scatter": "gather"}
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Searched:
-    """The pairs that a search finds, anew in every sum; nothing of them is stored.
+    """The pairs of a search, which every sum repeats; no pair is stored.
 
     Attributes:
-        inputs: Infinite where a particle is inactive; no mask.
-        options: Static.
+        inputs: The operands of the search, without a mask: inactive particles are at infinity.
+        options: The options of the search. Static.
     """
 
     inputs: Inputs
@@ -41,18 +41,18 @@ class Searched:
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """Number of rows, and of their sources."""
+        """Number of rows and of sources."""
         n = self.inputs.sources.shape[0]
         return n if self.inputs.queries is None else self.inputs.queries.shape[0], n
 
     @property
     def symmetric(self) -> bool:
-        """Whether it is the same, seen from the other side."""
+        """Whether exchanging i and j gives the same pairs."""
         radii = self.inputs.cutoff
         return self.inputs.queries is None and not (isinstance(radii, Radii) and radii.rule in _EXCHANGED)
 
     def reversed(self) -> "Searched":
-        """Return the same pairs with the roles of i and j exchanged, and shifts of the other sign."""
+        """Return the same pairs with i and j exchanged and shifts negated."""
         sources, queries, active, box, cutoff, batch = self.inputs
         if isinstance(cutoff, Radii):
             cutoff = Radii(cutoff.queries, cutoff.sources, _EXCHANGED.get(cutoff.rule, cutoff.rule))
@@ -62,7 +62,7 @@ class Searched:
         return Searched(Inputs(sources, queries, active, box, cutoff, batch), self.options)
 
     def fold(self, elements: int, visit: Visit, out: Tree) -> Tree:
-        """Walk over all pairs: see `fold_neighbors`."""
+        """Visit all pairs, as `fold_neighbors` does."""
         return fold_pairs(self.inputs, self.options, elements, visit, out)
 
 
@@ -72,12 +72,12 @@ class Listed:
     """The pairs of a list.
 
     Attributes:
-        idx: [m, c] int32, valid wherever `mask` is set.
-        mask: [m, c] bool.
-        shifts: [m, c, d] whole floats, or None where space is open.
-        source_count: Static.
-        symmetric: Whether it is the same, seen from the other side. Static.
-        flipped: The roles of i and j are exchanged: i are the sources of the list, j its rows, shifts have the other sign. Static.
+        idx: [m, c] int32 source indices, valid where `mask` is set.
+        mask: [m, c] bool, which slots hold a pair.
+        shifts: [m, c, d] whole floats, or None in open space.
+        source_count: Number of sources. Static.
+        symmetric: Whether exchanging i and j gives the same pairs. Static.
+        flipped: Whether i and j are exchanged: i are the sources of the list, j its rows, and shifts are negated. Static.
     """
 
     idx: Array
@@ -94,16 +94,16 @@ class Listed:
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """Number of rows, and of their sources; exchanged where roles are."""
+        """Number of rows and of sources; exchanged if flipped."""
         m, n = self.idx.shape[0], self.source_count
         return (n, m) if self.flipped else (m, n)
 
     def reversed(self) -> "Listed":
-        """Return the same pairs with the roles of i and j exchanged, and shifts of the other sign."""
+        """Return the same pairs with i and j exchanged and shifts negated."""
         return self if self.symmetric else dataclasses.replace(self, flipped=not self.flipped)
 
     def fold(self, elements: int, visit: Visit, out: Tree) -> Tree:
-        """Walk over all pairs, in blocks of rows: see `fold_neighbors`."""
+        """Visit all pairs in blocks of rows, as `fold_neighbors` does."""
         m, capacity = self.idx.shape
         if 0 in (m, capacity, self.source_count):
             return out
@@ -137,22 +137,22 @@ Relation = Searched | Listed
 
 
 def is_fused(relation: Relation, term: Term) -> TypeGuard[Searched]:
-    """Say whether the fused engine runs over a relation with this term."""
+    """Say whether the fused engine sums this term over this relation."""
     return isinstance(relation, Searched) and 0 not in relation.sizes and is_fusible(relation.inputs, relation.options, term)
 
 
 def sum_pairs(relation: Relation, term: Term, operands: Groups, compensated: bool) -> list[Array]:
-    """Sum a term over all pairs of a relation: what an engine has to do.
+    """Sum a term over all pairs of a relation; this specifies what every engine computes.
 
     Args:
-        relation: Which pairs (i, j), with lattice shifts S.
-        term: Its summands t = term(True, S, (shared, own[i], others[j])).
-        operands: Arrays; `shared` as they are, `own` [rows, ...], `others` [sources, ...].
-        compensated: Carry the rounding errors of the sums along, and add them in the end.
+        relation: The pairs (i, j), with lattice shifts S.
+        term: Its summands are t = term(True, S, (shared, own[i], others[j])).
+        operands: Arrays: `shared` of any shape, `own` [rows, ...], `others` [sources, ...].
+        compensated: Carry the rounding errors of the sums along, and add them at the end.
 
     Returns:
-        For each summand its sums over the neighbors j of each i, [rows, ...]; where `term.totals` says so, over all pairs, [...].
-        Rows without neighbors are 0, whatever their operands hold.
+        For each summand its sums over the neighbors j of each i, [rows, ...], or with `term.totals` over all pairs, [...]. Rows
+        without neighbors are 0, whatever their operands hold.
     """
     adder = _Adder(compensated)
     rows = relation.sizes[0]
@@ -197,7 +197,7 @@ def sum_pairs(relation: Relation, term: Term, operands: Groups, compensated: boo
 
 
 def evaluate(relation: Relation, term: Term, operands: Groups, block: Block, slots: Slots) -> list[Array]:
-    """Evaluate a term on slots [b, g] of a block: [b, g, ...], 0 where there is no pair."""
+    """Evaluate a term on slots [b, g] of a block: [b, g, ...], 0 in masked slots."""
     mine, theirs = (operands.others, operands.own) if relation.flipped else (operands.own, operands.others)
     of_query, of_source = tuple(x[block.query] for x in mine), tuple(x[slots.source] for x in theirs)
     shift = jnp.zeros((*slots.real.shape, *term.shift.shape), term.shift.dtype) if slots.shift is None else slots.shift
@@ -214,7 +214,7 @@ def evaluate(relation: Relation, term: Term, operands: Groups, block: Block, slo
 
 @dataclasses.dataclass(frozen=True)
 class _Adder:
-    """How sums are carried: one array, or with compensation two, the sum and what rounding took of it."""
+    """How sums are accumulated: as one array, or with compensation as two, the sum and its rounding error."""
 
     compensated: bool
 
@@ -227,15 +227,15 @@ class _Adder:
         return rounded_sum(*state)
 
     def scatter(self, state: tuple[Array, ...], place: Array, terms: Array) -> tuple[Array, ...]:
-        """Add terms [b, g, ...] to rows, in place; their errors are not known."""
+        """Add terms [b, g, ...] to the rows at `place`; these additions are not compensated."""
         return state[0].at[place].add(terms, mode="drop"), *state[1:]
 
     def add(self, state: tuple[Array, ...], terms: Array, squeeze: bool = False) -> tuple[Array, ...]:
-        """Add terms [b, g, ...] to sums [b, ...]: first those of a row, then their sum to the row's."""
+        """Add terms [b, g, ...] to sums [b, ...]: first sum the terms of a row, then add that to the row's sum."""
         if not self.compensated:
             added = jnp.sum(terms, axis=1, dtype=terms.dtype)
             return (state[0] + (added[0] if squeeze else added),)
-        zero = jnp.zeros((), terms.dtype)  # one reduction of both: XLA may evaluate terms anew for each that asks
+        zero = jnp.zeros((), terms.dtype)  # one reduction of both, as XLA may evaluate terms once per reduction
         sums = lax.reduce((terms, jnp.zeros_like(terms)), (zero, zero), compensated_sum, (1,))
         value, error = (x[0] if squeeze else x for x in sums)
         return compensated_sum(state, (value, error))

@@ -1,6 +1,6 @@
-"""Straight-line scalar code as a graph: what is written once is computed once, and what no output needs is not written.
+"""Straight-line scalar code as a graph: equal expressions are computed once, and unused ones are not emitted.
 
-A node is named by its number. Operands come before what is made of them, so the order of the numbers is an order of execution.
+Nodes are numbered, operands before their results, so ascending numbers are an order of execution.
 """
 
 import hashlib
@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 TYPES = {"float32": "f32", "float64": "f64", "int32": "i32", "int64": "i64", "bool": "flag"}  # dtypes, and their names in `Math`
-MOST_SCALARS = 20_000  # nodes, which bounds what a compiler is given
+MOST_SCALARS = 20_000  # most nodes of a graph, to bound the native compiler's work
 
-_INFIX = {"add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}"}  # of floats
+_INFIX = {"add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}"}  # for floats
 _SUFFIX = {"float32": "f", "float64": "", "int32": "", "int64": "ll"}
 _BITS = {"float32": (np.uint32, "u"), "float64": (np.uint64, "ull")}
-_FOLDED = {  # what is known of integers and truths is computed here, as indices are
+_FOLDED = {  # operations on constant integers and bools, such as indices, which are computed here
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative, "abs": np.abs, "sign": np.sign,
     "max": np.maximum, "min": np.minimum, "both": np.bitwise_and, "either": np.bitwise_or, "differ": np.bitwise_xor,
     "inverse": np.invert, "eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater,
@@ -24,15 +24,15 @@ _FOLDED = {  # what is known of integers and truths is computed here, as indices
 }  # fmt: skip
 
 
-Number = Any  # a number or truth, of Python or NumPy; None where it is not known
+Number = Any  # a number or bool of Python or NumPy; None if unknown
 
 
 class NoTranslationError(NotImplementedError):
-    """The function holds something that has no translation into a kernel."""
+    """The function contains an operation that has no translation into a kernel."""
 
 
 class Node(NamedTuple):
-    """How a scalar is written, with {0}, {1}, ... where its operands stand; its dtype; its value where that is known."""
+    """How a scalar is written, with {0}, {1}, ... in place of its operands; its dtype; and its value if that is constant."""
 
     form: str
     operands: tuple[int, ...]
@@ -41,7 +41,7 @@ class Node(NamedTuple):
 
 
 def literal(scalar: Number) -> str:
-    """Return a scalar of NumPy in C++, bit by bit the same."""
+    """Return a NumPy scalar as a C++ literal with the same bits."""
     dtype = scalar.dtype.name
     if dtype == "bool":
         return f"Math::of({str(bool(scalar)).lower()})"
@@ -55,28 +55,28 @@ def literal(scalar: Number) -> str:
 
 
 def hash_of(*parts: object) -> str:
-    """Return a key that is the same in every process."""
+    """Return a hash that is the same in every process."""
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
 class Scalars:
-    """Nodes, each written once."""
+    """The nodes of a graph, each stored once."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
         self._numbers: dict[Any, int] = {}
 
     def named(self, name: str, dtype: str) -> int:
-        """Return a scalar that is defined elsewhere."""
+        """Return a scalar that is defined elsewhere under this name."""
         return self._number((name, dtype), Node(name, (), dtype))
 
     def constant(self, value: Number, dtype: str) -> int:
-        """Return a constant; constants are the same if their bits are."""
+        """Return a constant; constants with the same bits are one node."""
         scalar = np.asarray(value, dtype)[()]
         return self._number((dtype, scalar.tobytes()), Node(literal(scalar), (), dtype, scalar))
 
     def apply(self, operation: str, operands: Sequence[int], dtype: str) -> int:
-        """Return the result of an operation, a function of `Math`: simplified, or folded where all is known, or written."""
+        """Return the result of an operation of `Math`: simplified, folded if all operands are constant, or a new node."""
         known = self._simplify(operation, operands, dtype)
         if known is None:
             known = self._fold(operation, operands, dtype)
@@ -92,11 +92,11 @@ class Scalars:
         return self._number((form, *operands), Node(form, tuple(operands), dtype))
 
     def value(self, number: int) -> Number:
-        """Return the value of a constant, else None."""
+        """Return the value of a constant, None for other nodes."""
         return self.nodes[number].value
 
     def needed(self, outputs: Iterable[int]) -> set[int]:
-        """Return all that the outputs are made of, themselves included."""
+        """Return all nodes on which the outputs depend, themselves included."""
         found: set[int] = set()
         left = list(outputs)
         while left:
@@ -107,12 +107,12 @@ class Scalars:
         return found
 
     def text(self, outputs: dict[str, int]) -> str:
-        """Return the statements that define the outputs by name, without what they do not need."""
+        """Return the statements that define the outputs by name, without unused ones."""
         names, lines = {}, []
         for number in sorted(self.needed(outputs.values())):
             node = self.nodes[number]
             names[number] = node.form.format(*(names[k] for k in node.operands))
-            if node.operands:  # inputs and constants stand where they are used
+            if node.operands:  # inputs and constants are written inline
                 name = f"v{len(lines)}"
                 lines.append(f"const auto {name} = {names[number]};\n")
                 names[number] = name
@@ -131,7 +131,7 @@ class Scalars:
         return self._numbers[key]
 
     def _known_up_to_sign(self, number: int) -> int:
-        """Return b - a for a - b, if it is there: its square is the same, bit by bit."""
+        """Return the node b - a for a - b if it exists, since its square has the same bits."""
         form, operands, *_ = self.nodes[number]
         return self._numbers.get((form, *reversed(operands)), number) if form == _INFIX["sub"] else number
 
@@ -140,7 +140,7 @@ class Scalars:
         return known is not None and known == value and bool(np.signbit(known) == np.signbit(value))
 
     def _simplify(self, operation: str, operands: Sequence[int], dtype: str) -> int | None:
-        """Return what the result is without any work, where no NaN, infinity or sign of a zero can tell."""
+        """Return the result of an operation without computing it, if this is right for NaN, infinities and signed zeros too."""
         first, last = operands[0], operands[-1]
         if operation == f"to_{TYPES[dtype]}" and self.nodes[first].dtype == dtype:
             return first
@@ -162,10 +162,10 @@ class Scalars:
         return None if reciprocal is None else self.apply("mul", (first, reciprocal), dtype)
 
     def _reciprocal(self, number: int) -> int | None:
-        """Return 1 / a for a number and choices of such, as in the derivative of max: XLA multiplies by it, too."""
+        """Return 1 / a for a constant, or a choice of constants as in the derivative of max; XLA multiplies by it too."""
         form, operands, dtype, value = self.nodes[number]
         if value is not None and dtype.startswith("float"):
-            moderate = 1e-30 < abs(value) < 1e30  # it is a normal number
+            moderate = 1e-30 < abs(value) < 1e30  # the reciprocal is a normal number
             return self.constant(value.dtype.type(1) / value, dtype) if moderate else None
         if not form.startswith("Math::select"):
             return None

@@ -1,8 +1,9 @@
-"""The primitive of pair sums: a sum over pairs whose derivatives, of every order, are sums over the same pairs.
+"""The JAX primitive of pair sums, whose derivatives of every order are sums over the same pairs.
 
-Its operands are the leaves of a relation, which have no derivative, then those of a term. The tangent of a sum is the sum of the
-tangent of its term. A sum that is linear in some operands is transposed by transposing its term: what belongs to i and to all pairs
-is summed over the same pairs, what belongs to j over the reversed relation. Nothing is added to a neighbor, no pair is stored.
+Its operands are the leaves of a relation, which have no derivative, followed by those of a term. The tangent of a sum is the sum of
+the tangent of its term. A sum that is linear in some operands is transposed by transposing its term: cotangents of operands of i,
+and of shared ones, are summed over the same pairs, those of operands of j over the reversed relation. So no sum scatters to
+neighbors, and no pair is stored.
 """
 
 import functools
@@ -20,20 +21,20 @@ from jfrnn._sums.relations import Relation, Searched, sum_pairs
 from jfrnn._sums.terms import Derived, Groups, Term, choose, is_moving, join, tangent, transpose
 from jfrnn._tracing import Aval, Internal, compiled, result_aval, unvarying_types, vary, varying_axes
 
-Structure = Any  # how the leaves of a relation stand in it: a `PyTreeDef`, which is no type to type checkers
+Structure = Any  # the `PyTreeDef` of a relation, which type checkers do not accept as a type
 
 _pair_sum_p = Primitive("pair_sum")
 _pair_sum_p.multiple_results = True
 
 
 def bind_sum(relation: Relation, term: Term, operands: Groups, compensated: bool) -> list[Array]:
-    """Sum a term over the pairs of a relation, differentiable in the operands to every order: see `sum_pairs`."""
+    """Sum a term over the pairs of a relation, differentiable in the operands to every order; see `sum_pairs`."""
     leaves, structure = jax.tree.flatten(relation)
     return _bind([jnp.asarray(x) for x in leaves], operands, term, structure, compensated)
 
 
 def _bind(leaves: list[Array], operands: Groups, term: Term, structure: Structure, compensated: bool) -> list[Array]:
-    flat = [jnp.asarray(x) for group in operands for x in group]  # tangents of scalars may be of Python
+    flat = [jnp.asarray(x) for group in operands for x in group]  # tangents of scalars may be Python numbers
     relation = jax.tree.unflatten(structure, leaves)
     if isinstance(relation, Searched):
         check(relation.inputs, relation.options, term)
@@ -106,7 +107,7 @@ def _bind_derived(leaves: list, operands: Groups, derived: Derived, structure: S
 
 
 def _batch(args: tuple, dims: tuple, **params: Internal) -> tuple[list[Array], list[int]]:
-    """One after the other: the searches of a batch have loops of different lengths."""
+    """Run the sums of a batch one after the other, since their loops have different lengths."""
     mapped = [d is not None for d in dims]
     batched = [jnp.moveaxis(x, d, 0) for x, d, is_mapped in zip(args, dims, mapped, strict=True) if is_mapped]
 
@@ -119,7 +120,7 @@ def _batch(args: tuple, dims: tuple, **params: Internal) -> tuple[list[Array], l
 
 
 def _lower(ctx: Internal, *args: Internal, **params: Internal) -> Internal:
-    """Trace the sums as they are on one device: see `jfrnn._tracing.manual`."""
+    """Trace the sums as on a single device; see `jfrnn._tracing.manual`."""
     return mlir.lower_fun(_sums, multiple_results=True)(ctx.replace(avals_in=unvarying_types(ctx.avals_in)), *args, **params)
 
 

@@ -1,9 +1,9 @@
-"""The summand of a pair sum, as a jaxpr of one pair, and what derivatives make of it: again summands.
+"""Terms: the summand of a pair sum as a jaxpr of one pair, and the terms of its derivatives.
 
-A term g gets, of a pair (i, j): whether it is real, the lattice shift of j, operands that all pairs share, those of i ("own") and
-those of j ("others"). Positions are operands like all others: the displacement is computed inside. So its tangent is a term, with
-tangents as further operands; and the transpose of a linear term is one for each side of the pair, with cotangents of the sums,
-which belong to i, as further operands.
+A term gets, for a pair (i, j): whether the pair is real, the lattice shift of j, operands shared by all pairs, operands of i
+("own") and operands of j ("others"). Positions are ordinary operands, and the displacement is computed inside the term. So the
+tangent of a term is a term that takes tangents as further operands, and the transpose of a linear term is one term per side of the
+pair that takes the cotangents of the sums, which belong to i, as further operands.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ from jfrnn._tracing import Given
 
 
 class Groups(NamedTuple):
-    """Something for each operand of a term: arrays, their shapes, flags."""
+    """One value per operand of a term, in three groups: arrays, shapes or flags."""
 
     shared: tuple
     own: tuple
@@ -34,20 +34,21 @@ class Groups(NamedTuple):
 
 
 Labels = tuple[tuple[int, ...], tuple[int, ...]]
-POSITIONS = OF_SOURCES, OF_QUERIES = 0, 1  # labels of positions; where sources are the queries, both are those of sources
+POSITIONS = OF_SOURCES, OF_QUERIES = 0, 1  # labels of positions; if the sources are the queries, both sides have OF_SOURCES
 Summand = Callable[[Array, Array, Groups], Sequence[Array]]  # real [] bool, shift [d], operands -> summands
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Term:
-    """A traced summand; static, told from others by its identity.
+    """A traced summand; static, and compared by identity.
 
     Attributes:
         jaxpr: (real, shift, *shared, *own, *others) -> summands.
-        operands: What one pair gets of them (shapes and dtypes), but real and shift.
+        operands: Shapes and dtypes of the operands of one pair, without real and shift.
         shift: Shape and dtype of the shift, [d] whole floats.
-        labels: Of the operands of i and of j: equal ones are one array, though on both sides. Those in `POSITIONS` are positions.
-        totals: For each summand, whether it is summed over all pairs, instead of over the neighbors j of each i.
+        labels: One label per operand of i and of j; operands with equal labels are the same array. Those in `POSITIONS` are
+            positions.
+        totals: For each summand, whether it is summed over all pairs instead of over the neighbors j of each i.
     """
 
     jaxpr: ClosedJaxpr
@@ -58,12 +59,12 @@ class Term:
 
     @property
     def summands(self) -> tuple[jax.ShapeDtypeStruct, ...]:
-        """Shapes and dtypes of what one pair gives."""
+        """Shapes and dtypes of the summands of one pair."""
         return tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in self.jaxpr.out_avals)
 
     @property
     def elements(self) -> int:
-        """How many numbers the largest array holds that one pair needs."""
+        """Number of scalars in the largest array that one pair needs."""
         of_equations = (v.aval for equation in self.jaxpr.jaxpr.eqns for v in equation.outvars)
         return max(math.prod(getattr(aval, "shape", ())) for aval in (*of_equations, *self.jaxpr.in_avals))
 
@@ -72,7 +73,7 @@ class Term:
         return jaxpr_as_fun(self.jaxpr)(real, shift, *operands.shared, *operands.own, *operands.others)
 
     def split(self, operands: Sequence) -> Groups:
-        """Sort what belongs to the operands, one after the other, into their groups."""
+        """Split a flat list of operands into the three groups."""
         return _split(operands, self.operands)
 
 
@@ -82,7 +83,7 @@ def _split(operands: Sequence, like: Groups) -> Groups:
 
 
 def _jaxpr_of(summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct) -> ClosedJaxpr:
-    """Trace what one pair adds. Products of matrices are made in all bits, whatever a device takes by itself: on GPUs TF32."""
+    """Trace the summand of one pair, with matrix products in full precision, where GPUs would use TF32 by default."""
     with jax.default_matmul_precision("highest"):
         return jax.make_jaxpr(_flat(summand, operands))(*_one_pair(operands, shift))
 
@@ -94,11 +95,10 @@ def trace(
     labels: Labels,
     owner: object,
 ) -> tuple[Term, Groups, tuple[Array, ...]]:
-    """Trace a summand that may close over anything; return its term, which operands it needs, and what it closes over.
+    """Trace a summand that may close over arrays; return its term, the operands that it needs, and the closed-over arrays.
 
-    `operands` are the shapes and dtypes of what one pair gets. What it closes over becomes the first of the shared operands.
-    While the `owner`, the function that the summand calls, lives and is traced to the same again, the same term comes back, and
-    with it the programs that were compiled for it.
+    `operands` are the shapes and dtypes of the operands of one pair. Closed-over arrays become the first shared operands.
+    While the user's function `owner` lives, equal traces return the same term, so that compiled programs are reused.
     """
     closed = _jaxpr_of(summand, operands, shift)
     consts = tuple(jnp.asarray(x) for x in closed.consts)
@@ -117,7 +117,7 @@ _KNOWN: "weakref.WeakKeyDictionary[Any, dict[Any, Derived]]" = weakref.WeakKeyDi
 
 
 def _keep(owner: object, derived: "Derived") -> "Derived":
-    """Return an equal term that the owner had before, or this one, which it has from now on."""
+    """Return an equal term that was made for the owner before; otherwise remember this one."""
     closed = derived.term.jaxpr
     if closed.consts:
         return derived
@@ -130,12 +130,12 @@ def _keep(owner: object, derived: "Derived") -> "Derived":
     )
     try:
         return _KNOWN.setdefault(owner, {}).setdefault(key, derived)
-    except TypeError:  # such an owner can have nothing
+    except TypeError:  # an owner that cannot be a weak key is not cached
         return derived
 
 
 def _literals(jaxpr: Jaxpr) -> Iterator[bytes]:
-    """Yield the numbers that are written into a jaxpr, of which its text may show few digits."""
+    """Yield the constants in a jaxpr, whose printed form may show only a few digits of them."""
     for equation in jaxpr.eqns:
         yield from (np.asarray(v.val).tobytes() for v in equation.invars if isinstance(v, Literal))
         for inner in (x for value in equation.params.values() for x in (value if isinstance(value, tuple) else (value,))):
@@ -145,7 +145,7 @@ def _literals(jaxpr: Jaxpr) -> Iterator[bytes]:
 
 
 class Derived(NamedTuple):
-    """A term, and which of the operands that were foreseen it needs."""
+    """A term, and flags that say which of the offered operands it needs."""
 
     term: Term
     needed: Groups
@@ -154,7 +154,7 @@ class Derived(NamedTuple):
 def make_term(
     summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct, labels: Labels, totals: Sequence[bool] | None = None
 ) -> Derived:
-    """Trace a summand of these operands that closes over nothing, and drop the operands that it does not need."""
+    """Trace a summand that closes over nothing, and drop the operands that it does not need."""
     closed = _jaxpr_of(summand, operands, shift)
     always = [True, True] + [False] * sum(map(len, operands))
     jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), always)
@@ -166,7 +166,7 @@ def make_term(
 
 
 def fresh_labels(count: int, labels: Labels) -> tuple[int, ...]:
-    """Return labels that no operand has."""
+    """Return labels that are not in use."""
     first = max((*labels[0], *labels[1], *POSITIONS)) + 1
     return tuple(range(first, first + count))
 
@@ -185,18 +185,18 @@ def choose(operands: Groups, flags: Groups) -> Groups:
 
 
 def join(*groups: Groups) -> Groups:
-    """Put operands one behind the other, group by group."""
+    """Concatenate operands, group by group."""
     return Groups(*(sum(parts, ()) for parts in zip(*groups, strict=True)))
 
 
 def is_moving(x: Given) -> bool:
-    """Say whether something with a dtype has derivatives."""
+    """Say whether a dtype has derivatives."""
     return jnp.issubdtype(x.dtype, jnp.inexact)
 
 
 @functools.lru_cache(maxsize=256)
 def tangent(term: Term, moving: Groups) -> Derived:
-    """Make the term of the tangents of the float summands: of all operands, then the tangents of the moving ones, by group."""
+    """Make the term of the tangents of the float summands; operands are all operands, then the tangents of the moving ones."""
     tangents = choose(term.operands, moving)
 
     def summand(real: Array, shift: Array, operands: Groups) -> list[Array]:
@@ -219,14 +219,14 @@ def tangent(term: Term, moving: Groups) -> Derived:
 
 
 class Transposed(NamedTuple):
-    """The terms of the cotangents of a term's linear operands; None where there are none.
+    """The terms of the cotangents of a term's linear operands; None for a side without any.
 
     Attributes:
-        along: Summed as the term was: totals of the shared linear operands, then sums of those of i. Operands: those that are not
-            linear, then the cotangents: of totals shared, of sums with i.
-        across: Summed over the i of each j, or None: sums of the linear operands of j, the roles of i and j exchanged.
-        sides: Where one term does it: which of the operands of i and then of j either side of it has.
-        joint: For each linear operand of j, whether it is one of i, too: that one's sums hold those of both.
+        along: Summed over the same pairs: totals for shared linear operands, then sums for those of i. Its operands are the
+            nonlinear ones, then the cotangents, which are shared for totals and belong to i for sums.
+        across: Summed over the reversed pairs, or None: sums for the linear operands of j.
+        sides: If one term serves both sides: the indices of the operands of i and then of j that either side holds.
+        joint: For each linear operand of j, whether it is also one of i, whose sums then include both.
     """
 
     along: Derived | None
@@ -237,11 +237,11 @@ class Transposed(NamedTuple):
 
 @functools.lru_cache(maxsize=256)
 def transpose(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetric: bool) -> Transposed:
-    """Transpose a term in its linear operands; `cotangents` says of which sums there are any.
+    """Transpose a term in its linear operands; `cotangents` says for which sums there are any.
 
-    `symmetric`: j is a neighbor of i where i is one of j, and both have operands of both kinds. Then one term does it: the sums of
-    the linear operands of j are the last ones of `along`, whose operands of either side are all those of i and of j. Where an
-    operand of j is one array with one of i, they are added to those of i.
+    `symmetric` means that j is a neighbor of i whenever i is one of j, and that both sides have the same kinds of operands. Then
+    one term suffices: the sums for the linear operands of j are the last ones of `along`, whose operands on either side are all
+    those of i and of j. If an operand of j is the same array as one of i, its sums are added to those of i.
     """
     still = choose(term.operands, Groups(*(tuple(not flag for flag in group) for group in linear)))
     of_totals, of_sums = (
@@ -255,7 +255,7 @@ def transpose(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetri
     )
     mine += fresh_labels(len(of_sums), term.labels)
     each = mine + theirs
-    sides = tuple(k for k, label in enumerate(each) if label not in each[:k])  # what is one array is there once
+    sides = tuple(k for k, label in enumerate(each) if label not in each[:k])  # each array occurs once
     place = [sides.index(each.index(label)) for label in each]
     moving_i, moving_j = (tuple(compress(labels, which)) for labels, which in zip(term.labels, linear[1:], strict=True))
     joint = tuple(label in moving_i for label in moving_j)
@@ -305,7 +305,7 @@ def transpose(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetri
 
 
 def _halves(operands: Groups, first: Groups) -> tuple[Groups, Groups]:
-    """Cut each group where `first` ends."""
+    """Split each group at the end of `first`."""
     cuts = [len(group) for group in first]
     return (
         Groups(*(group[:cut] for group, cut in zip(operands, cuts, strict=True))),
@@ -314,7 +314,7 @@ def _halves(operands: Groups, first: Groups) -> tuple[Groups, Groups]:
 
 
 def _merge(unflagged: Groups, flagged: Groups, flags: Groups) -> Groups:
-    """Return all operands in order; of `unflagged`, those that are flagged may be missing or there."""
+    """Return all operands in order; `unflagged` holds the others, or a value for every operand."""
     groups = []
     for rest, some, which in zip(unflagged, flagged, flags, strict=True):
         whole = len(rest) == len(which)

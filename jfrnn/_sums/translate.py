@@ -1,15 +1,15 @@
-"""From a function in JAX to native text: a jaxpr of small arrays becomes straight-line scalar code in C++.
+"""Translate a JAX function of small arrays to native code: its jaxpr becomes straight-line scalar C++.
 
     translated = translate(jax.make_jaxpr(function)(*examples))
 
-Every array is taken apart into scalars, in C order. The text reads `in0_0`, `in0_1`, ... and defines `out0_0`, ...; it calls
-`Math`, whose definitions stand in `jfrnn.kernels._math`, one for each kind of number: plain scalars on the CPU and on CUDA, vectors
-of lanes on the CPU. How a primitive is written stands in `jfrnn._sums.primitives`.
+Every array is split into scalars in C order. The text reads `in0_0`, `in0_1`, ... and defines `out0_0`, ...; it calls functions of
+`Math`, defined in `jfrnn.kernels._math` for scalars on the CPU and on CUDA, and for vectors of lanes on the CPU.
+`jfrnn._sums.primitives` translates the single primitives.
 
-What is promised: JAX's answer up to a few ulp, NaN and infinities included. Every operation is a statement, so it is the block
-around the text that decides about contraction: there is none under `#pragma clang fp contract(off)`, or on CUDA without `fuse_fp`.
-Sums run from the first element to the last. Nothing is simplified that NaN, an infinity or the sign of a zero could tell. Of a
-`cond` all branches are taken, and one is selected.
+Results agree with JAX up to a few ulp, including NaN and infinities. Every operation is one statement, so the enclosing block
+controls contraction: it is off under `#pragma clang fp contract(off)`, and on CUDA without `fuse_fp`. Sums run from the first
+element to the last. Simplifications respect NaN, infinities and signed zeros. All branches of a `cond` are evaluated, and one is
+selected.
 """
 
 import math
@@ -24,14 +24,14 @@ from jfrnn._sums.primitives import TABLE, Equation, Spec, Values
 from jfrnn._sums.scalars import TYPES, NoTranslationError, Scalars, hash_of
 from jfrnn._tracing import Aval, Given, Internal
 
-MOST_ELEMENTS = 256  # of an array
+MOST_ELEMENTS = 256  # most elements of an array
 
 
 class Translated(NamedTuple):
     """A function of small arrays as native text.
 
-    `text` is a piece of a function body. For each (k, e) in `reads` it needs `input_name(k, e)`, element e of input k, of the type
-    that `Math` has for its dtype; it defines `output_name(k, e)` for every element of every output. `key` is a hash of all of it,
+    `text` is a piece of a function body. For each (k, e) in `reads` it needs `input_name(k, e)`, element e of input k, in the type
+    that `Math` has for its dtype; it defines `output_name(k, e)` for every element of every output. `key` is a hash of all of this,
     the same in every process.
     """
 
@@ -56,13 +56,14 @@ def translate(closed: ClosedJaxpr) -> Translated:
     """Translate a closed jaxpr into native text.
 
     Args:
-        closed: from `jax.make_jaxpr`: arrays of float32, float64, int32, int64 or bool, of at most MOST_ELEMENTS elements each.
+        closed: A result of `jax.make_jaxpr`, with arrays of float32, float64, int32, int64 or bool, each of at most MOST_ELEMENTS
+            elements.
 
     Returns:
-        The text, what it reads, and what it defines.
+        The text, its inputs and its outputs.
 
     Raises:
-        NoTranslationError: for a primitive or dtype without translation, an index that depends on data, an array of more than
+        NoTranslationError: a primitive or dtype without translation, an index that depends on data, an array of more than
             MOST_ELEMENTS elements, or more than `jfrnn._sums.scalars.MOST_SCALARS` operations.
     """
     scalars = Scalars()
@@ -82,7 +83,7 @@ def translate(closed: ClosedJaxpr) -> Translated:
 
 
 def _spec(aval: Aval, what: str) -> Spec:
-    """Return the shape and dtype of a value, if kernels have them."""
+    """Return the shape and dtype of a value, after checking that kernels support it."""
     shape, dtype = tuple(getattr(aval, "shape", ())), str(getattr(aval, "dtype", aval))
     if dtype not in TYPES:
         known = ", ".join(TYPES)

@@ -1,4 +1,4 @@
-"""The public verb `pair_sum`: sums over neighbors without a list of them."""
+"""The public function `pair_sum`: sums over neighbors without a neighbor list."""
 
 from collections.abc import Callable
 from typing import Any
@@ -36,80 +36,78 @@ def pair_sum(
     backend: str = "auto",
     neighbors: NeighborList | None = None,
 ) -> Tree:
-    """Sum a function of pairs over the neighbors of each particle, without a list of them; differentiable to every order.
+    """Sum a function of pairs over the neighbors of each particle, without a neighbor list; differentiable to every order.
 
-    result[i] = sum over the neighbors j of i of fn(r_ij, i, j), r_ij = x_j - x_i (in a periodic box + S·(lattice vectors), a term
-    for each image). The neighbors are exactly those of `search` with the same options.
+    result[i] = sum over the neighbors j of i of fn(r_ij, i, j), with the displacement r_ij = x_j - x_i (in a periodic box +
+    S·(lattice vectors), one term per image). The neighbors are exactly those of `search` with the same options.
 
     Args:
-        fn: A JAX function of one pair: of the displacement r [length], shape [d], of the values of i and those of j; it returns a
-            pytree of arrays of floats or integers. It may close over arrays, traced ones too, and be differentiated in them. Python
-            numbers that it closes over are constants of the compiled program: each new value compiles it anew, for about a second;
-            one that changes is closed over as `jnp.asarray(number)`. Where particles may coincide or are their own neighbors, fn
-            must itself be safe at r = 0 (the derivative of sqrt is not).
+        fn: A JAX function of one pair. It gets the displacement r [length], shape [d], the values of i and those of j, and returns
+            a pytree of arrays of floats or integers. It may close over arrays, traced ones too, and be differentiated in them.
+            Python numbers that it closes over are compiled in: each new value costs about a second of compilation, so close over
+            `jnp.asarray(number, x.dtype)` if a number changes. If particles may coincide or are their own neighbors, fn must be
+            safe at r = 0 (the derivative of sqrt is not).
         positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64. n = 0 is allowed.
         cutoff: As in `search`; with `neighbors` that of the list, or None.
         values: A pytree of arrays of shape [n, ...]; fn gets leaves [...], of j and, without queries, of i. Default: None.
-        query_values: Likewise of the queries, leaves [m, ...], what fn gets of i. Only with queries.
-        reduce: "sum"; or "max" or "min", of each element of what fn returns, floats. Rows without neighbors then are -inf or inf.
-        symmetry: None: fn is asked about (i, j) and about (j, i). "symmetric" or "antisymmetric": fn is asked in one direction,
-            from the smaller index to the larger (of its own images: where the first number of S that is not zero is positive);
-            the other direction gets the same, or its negative, bit for bit. So forces balance to the rounding of the sums. Every
-            row gets its whole sum in any case. Not with queries, nor with the rules "gather" and "scatter".
-        queries: As in `search`: rows belong to them.
+        query_values: Values of the queries, leaves [m, ...], which fn gets for i. Only with queries.
+        reduce: "sum"; or "max" or "min" of each element of fn's result, which must be floats. Rows without neighbors are -inf or
+            inf then.
+        symmetry: None: fn is evaluated for (i, j) and for (j, i). "symmetric" or "antisymmetric": fn is evaluated in one direction,
+            from the smaller index to the larger (for a particle's own images: with the first nonzero number of S positive); the
+            other direction gets the same value, or its negative, bit for bit. So forces balance up to the rounding of the sums.
+            Every row gets its whole sum in any case. Not with queries, nor with the rules "gather" and "scatter".
+        queries: As in `search`; the result has one row per query.
         box: As in `search`; with `neighbors` as in `NeighborList.vectors`.
         batch: As in `search`.
         radius_rule: As in `search`.
         include_self: As in `search`; r is 0 then.
         closed: As in `search`.
         active: As in `search`.
-        compensated: Carry the rounding errors of the sums along (two-sum, Knuth 1969) and add them in the end: the result is as if
-            summed in twice the precision. Derivatives are summed so, too. "max" and "min" are not concerned.
+        compensated: Carry the rounding errors of the sums along (two-sum, Knuth 1969) and add them at the end, as if summed in
+            twice the precision; also in derivatives. Has no effect on "max" and "min".
         backend: "jax" (cells, any device), "brute" (all n·m candidates), "warp" (cells, on the CPU and on CUDA: fn is translated
-            into the kernel that finds the pairs), or "auto": on the CPU "warp" where it can do what is asked, else "jax". "warp"
-            sums floats of the dtype of positions; values, and what fn closes over, are of that dtype or smaller floats, bool,
-            int32 or (float64) int64; with a cutoff per particle on the CPU alone. Where fn or its derivative has no translation,
-            "auto" warns.
-        neighbors: A list whose pairs are taken instead of a search: those that are closer than its cutoff at these positions, as
-            `NeighborList.vectors` says. A half list gives whole sums, too. Options with which it was made are left out. Of a list
-            that may lack pairs (rows overflowed, see `NeighborList.check`) there are no sums: outside jit it raises.
+            into the kernel that finds the pairs), or "auto": on the CPU "warp" if it supports the sum, else "jax". "warp" sums
+            floats of the dtype of the positions; values and closed-over arrays have that dtype, or are smaller floats, bool, int32
+            or (float64) int64; cutoffs per particle work on the CPU only. If fn or its derivative has no translation, "auto" warns.
+        neighbors: A list to use instead of a search: its pairs that are closer than its cutoff at these positions, as in
+            `NeighborList.vectors`. A half list gives whole sums too. Leave out the options with which it was made. If the list may
+            lack pairs (see `NeighborList.check`), this raises outside jit.
 
     Returns:
-        A pytree as fn returns it, leaves [m, ...]. Rows without neighbors, and those of particles that are inactive, are 0 ("max":
-        -inf, "min": inf). Where there is no sum, floats are NaN, and so are their derivatives in the positions, and integers are
-        the smallest of their kind: in the row of a particle with NaN or infinite coordinates; and in all rows where the data show
-        that a search cannot answer (a box that is too small, a particle too far outside of it, a cutoff per particle that is
-        negative or not finite), or that the list lacks pairs. The `status` of a `search`, or of the list, says what it was.
+        A pytree as fn returns it, leaves [m, ...]. Rows of inactive particles, and rows without neighbors, are 0 ("max": -inf,
+        "min": inf). Invalid rows are NaN, as are their derivatives in the positions, and integers are the smallest of their dtype.
+        Invalid are rows of particles with NaN or infinite coordinates; and all rows if the data show that pairs may be missing (a
+        box that is too small, a particle too far outside of it, a cutoff per particle that is negative or not finite, a list that
+        overflowed). The `status` of a `search`, or of the list, tells the reason.
 
     Raises:
         NeighborOverflowError, ValueError: outside jit, `neighbors` may lack pairs.
-        TypeError, ValueError: an argument is of the wrong kind, shape or range; fn does not take (r, i, j), asks what a number is
-            (as `if` does), or returns what cannot be summed; "warp" was named and cannot do what is asked. What else fn raises
-            comes up as itself, with a note that says what fn was given.
-        NotImplementedError: "warp" was named, and fn or its derivative has no translation: the message says which primitive.
+        TypeError, ValueError: an argument is of the wrong kind, shape or range; fn does not take (r, i, j), needs a concrete value
+            (as `if` does), or returns what cannot be summed; or "warp" was chosen by name and does not support the sum. Other
+            errors of fn are raised unchanged, with a note that describes its arguments.
+        NotImplementedError: "warp" was chosen by name, and a primitive of fn or its derivative, named in the message, has no
+            translation.
 
-    Order of summation: the neighbors of a particle as the engine meets them (cell by cell, or by index in "brute", or as listed) in
-    groups of up to 32; first within a group, then one group after the other. The
-    same input gives the same bits. With k neighbors the error is at most 4 eps·sqrt(k) of the sum of |terms| for k up to 60 000;
-    compensated a few eps of the sum itself, and some eps²·k of the sum of |terms|. "warp" on the CPU adds up 4 to 16 sums side by
-    side, and these by halves; the bound is the same, and the bits depend on the processor's vector width, not on the number of
-    threads. On CUDA it adds those among up to 704 candidates one after the other, then their sums; again with that bound.
-    Denormal numbers count as zero in what fn computes on the CPU, as everywhere in XLA; pairs are decided with them.
-    Products of matrices in fn, such as r @ r, are made in all bits, also where a GPU by itself takes fewer (TF32), unless fn says
-    otherwise (`precision`).
-    Memory: what `search` takes without its list, the results, and at most 16 MB (float32) for each array that fn needs for the
-    pairs that are in work; nothing grows with the number of pairs, in derivatives neither. "warp" has no pairs in work, but two
-    copies of the numbers that fn reads of each j, and one of those of each i, but for coordinates in open space; in a box one
-    number more of each. `memory_plan` knows beforehand.
+    Order of summation: neighbors are added in the order in which the engine meets them (cell by cell; "brute" by index; a list as
+    listed) in groups of up to 32, first within a group, then group by group. The same input gives the same bits. With k neighbors
+    the error is at most 4 eps·sqrt(k) of the sum of |terms| for k up to 60 000; compensated a few eps of the sum itself plus some
+    eps²·k of the sum of |terms|. "warp" on the CPU adds 4 to 16 partial sums, and then these pairwise; its bits depend on the
+    processor's vector width, not on the number of threads. On CUDA it adds the terms among up to 704 candidates one by one, then
+    their sums. The error bound is the same for all.
+    In fn, denormal numbers count as zero on the CPU, as everywhere in XLA; pairs are decided with them. Matrix products in fn, such
+    as r @ r, have full precision, also on GPUs whose default is TF32, unless fn sets `precision`.
+    Memory: that of `search` without its list, the results, and at most 16 MB (float32) for each array that fn needs for the pairs
+    being processed; nothing grows with the number of pairs, nor in derivatives. "warp" needs instead two copies of the numbers that
+    fn reads of each j and one of those of each i, except coordinates in open space, and in a box one more number for each. See
+    `memory_plan`.
     Differentiable: to every order, forward and backward, in positions, queries, values, query_values, the lattice vectors of the
-    box and whatever fn closes over; who is a neighbor is a constant. A derivative is a sum over the same pairs, gathered
-    by each particle (over a list that is not its own mirror image, scattered). What is no pair has no part in it, whatever fn
-    makes of it. "max" and "min" have the derivative of the pair that is the extreme one; of several, of that with the smallest j.
-    Jit: yes; outside of it, define fn once: one that is defined anew for each call is compiled anew. A Python number that fn closes
-    over is part of its text: with "warp" each new value is another kernel, which takes a second to compile. Close over an array,
-    jnp.asarray(number, x.dtype), where values change: it is data, and the kernel stays the same. vmap: yes, one after the
-    other. Source: sums over neighbors as in SPH (Gingold & Monaghan 1977, doi:10.1093/mnras/181.3.375); derivatives by
-    transposition (Radul et al. 2023, doi:10.1145/3571236).
+    box and whatever fn closes over; which particles are neighbors is constant. A derivative is a sum over the same pairs, gathered
+    by each particle (scattered for a list that is not its own mirror image). "max" and "min" have the derivative of the extreme
+    pair, of several the one with the smallest j.
+    Jit: yes; outside of it, define fn once, since each new definition is compiled anew. vmap: yes, one after the other. Source:
+    sums over neighbors as in SPH (Gingold & Monaghan 1977, doi:10.1093/mnras/181.3.375); derivatives by transposition (Radul et al.
+    2023, doi:10.1145/3571236).
     """
     from jfrnn._sums.reduction import listed, reduced, searched
 
@@ -148,7 +146,7 @@ def pair_sum(
 
 
 def _with_engine(options: Options, inputs: Inputs, backend: str) -> Options:
-    """Return options with an engine that can answer; where "auto" was asked for, it may change with the term."""
+    """Return options with an engine that supports this search; if "auto" was asked for, the term may change the engine later."""
     from jfrnn._sums.fused import refusal
 
     sources, queries = inputs.sources, inputs.queries
