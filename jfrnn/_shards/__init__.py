@@ -1,4 +1,4 @@
-"""Particles spread over devices."""
+"""Particles distributed over the devices of a mesh."""
 
 from jfrnn._shards.calls import halo, on_each
 from jfrnn._shards.connect import connect

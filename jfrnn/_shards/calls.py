@@ -1,4 +1,4 @@
-"""What a shard asks the library on one device about its own particles and those of its halo."""
+"""What each shard asks the single-device library about its own particles and its halo particles."""
 
 import functools
 import math
@@ -18,12 +18,12 @@ from jfrnn._shards.halo import Halo, exchange, halo_in_shard, halo_spec, rows_se
 from jfrnn._shards.particles import OVERFLOWS, Particles, of_shards, spec_of
 from jfrnn._tracing import Given, Tree
 
-# The engines that can answer in a periodic box, which spread particles may have.
+# The engines that support periodic boxes, which distributed particles may have.
 _BACKENDS = ("auto", *(name for name, engine in ENGINES.items() if engine.refuse(Kind(periodic=True)) is None))
 
 
 class Asked(NamedTuple):
-    """What is asked about pairs; static."""
+    """The options of a query about pairs; static."""
 
     cutoff: float
     skin: float
@@ -49,7 +49,7 @@ def check_asked(particles: object, cutoff: Given, skin: object, include_self: ob
 
 
 def over_shards(fn: Callable[..., Tree], particles: Particles, out: Tree, *arguments: Tree) -> Tree:
-    """Run a function of the parts of a shard on every shard; arguments of no kind that is known here have spread rows."""
+    """Run a function of one shard's arrays on every shard; arguments of other types than those of this package have spread rows."""
 
     def spec(argument: Tree) -> Tree:
         if isinstance(argument, Particles):
@@ -63,10 +63,10 @@ def over_shards(fn: Callable[..., Tree], particles: Particles, out: Tree, *argum
 
 
 def check_halo(halo: object, particles: Particles) -> None:
-    """Refuse a halo of particles that are laid out otherwise: after `grow`, what was made before is of no use.
+    """Raise for a halo of particles with another layout; a halo made before `grow` has another layout.
 
     Raises:
-        TypeError, ValueError: It is no halo, or one of other shapes.
+        TypeError, ValueError: the argument is no halo, or has other shapes.
     """
     if not isinstance(halo, Halo):
         raise TypeError(f"halo must be what jfrnn.distributed.halo returns, got {type(halo).__name__}.")
@@ -79,18 +79,18 @@ def check_halo(halo: object, particles: Particles) -> None:
 
 
 def on_each(fn: Callable[..., Tree], particles: Particles, *same: Tree) -> Tree:
-    """Run a function on every device, on its own particles alone: what needs no neighbors, such as walls that all devices know.
+    """Run a function on every device on its own particles, for what needs no neighbors, such as walls known to all devices.
 
     Args:
-        fn: (particles, *same) -> a pytree of arrays with a row for each row of the particles that it gets: `positions`, `ids`,
+        fn: (particles, *same) -> a pytree of arrays with one row per row of the particles that it gets; their `positions`, `ids`,
             `active` and `values` are those of one device.
-        particles: Spread particles.
+        particles: Distributed particles.
         *same: Pytrees of arrays that every device gets whole, such as vertices and faces.
 
     Returns:
-        What fn returns, leaves [N, ...], rows as in `particles.positions`.
+        The result of fn, leaves [N, ...], rows as in `particles.positions`.
 
-    Differentiable: as fn. Jit: yes, and only there fast. vmap: no.
+    Differentiable: as fn. Jit: yes, and fast only there. vmap: no.
     """
     specs = spec_of(particles), *(jax.tree.map(lambda _: PartitionSpec(), each) for each in same)
     rows = of_shards(particles.mesh)
@@ -99,22 +99,22 @@ def on_each(fn: Callable[..., Tree], particles: Particles, *same: Tree) -> Tree:
 
 @jax.jit
 def halo(particles: Particles) -> Halo:
-    """Choose which particles are sent where, once for several sums at the same positions.
+    """Choose which particles are sent to which shards, once for several sums at the same positions.
 
     Args:
-        particles: Where they are now, on whatever shard.
+        particles: Distributed particles at these positions, on any shard.
 
     Returns:
-        A `Halo` for particles at these positions.
+        A `Halo` for these positions.
 
-    Cost: a pass over a shard for each shard along an axis of the mesh. Differentiable: no gradient flows through. Jit: yes.
-    vmap: no.
+    Cost: a pass over the shard's particles per shard along an axis of the mesh. Differentiable: no gradient flows through. Jit:
+    yes. vmap: no.
     """
     return over_shards(halo_in_shard, particles, halo_spec(particles), lax.stop_gradient(particles))
 
 
 class Seen(NamedTuple):
-    """What a shard sees: its own particles and those of its halo."""
+    """The particles that a shard sees: its own and those of its halo."""
 
     positions: Array
     active: Array
@@ -125,13 +125,13 @@ def seen(particles: Particles, halo: Halo) -> Seen:
 
 
 def is_good(particles: Particles, halo: Halo) -> Array:
-    """Say on every shard whether a halo has all it should have, of these rows; [] bool."""
+    """Say on every shard whether a halo belongs to these rows and no particle is missing in it; [] bool."""
     other = jnp.any(halo.ids[: particles.sizes.particles] != particles.ids)
     return ~lax.pmax(other, particles.mesh.axis_names) & ((halo.status & OVERFLOWS.value) == 0)
 
 
 def mark(x: Array, good: Array) -> Array:
-    """Return what is no result where pairs may be missing; its derivatives likewise."""
+    """Replace values by NaN (integers: the smallest one) if pairs may be missing; their derivatives become NaN too."""
     if jnp.issubdtype(x.dtype, jnp.floating):
         return x * jnp.where(good, 1, jnp.nan).astype(x.dtype)
     return jnp.where(good, x, jnp.iinfo(x.dtype).min)

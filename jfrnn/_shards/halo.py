@@ -1,18 +1,18 @@
-"""Halos: which particles of other shards a shard needs, and how they get there.
+"""Halos: the ghost particles that each shard needs from other shards, and their exchange.
 
-Each shard tells the others along an axis of the mesh the smallest box, its extent, that holds its own particles. Whoever has a
-particle within reach of that extent sends it. So ownership is never a matter of correctness: a particle that left the region of its
-shard only makes extents overlap. Axes of the mesh are served one after the other; what came along one is sent on along the next, so
-that diagonal neighbors are reached without messages of their own (Plimpton 1995, section 3.3, doi:10.1006/jcph.1995.1039).
+Each shard publishes its extent, the bounding box of its own particles, to the others along an axis of the mesh. Every shard sends
+the particles that are within reach of another's extent. Correctness therefore never depends on which shard owns a particle: a
+particle that left its shard's region only makes extents overlap. Mesh axes are served one after the other, and ghosts received
+along one axis are forwarded along the next, which reaches diagonal neighbors without extra messages (Plimpton 1995, section 3.3,
+doi:10.1006/jcph.1995.1039).
 
-No pair is lost to rounding. On an open axis, particle j is sent where fl(low - x_j) <= w and fl(x_j - high) <= w. If
-|x_j - x_i| < w (or <=) for a particle i of the extent, low <= x_i, then low - x_j <= x_i - x_j <= w exactly, and rounding, which
-is monotonic, leaves it at most w, a float. On a periodic axis of length L, distances are taken from an arbitrary point c:
-t = x - c, u = t - L·round(t/L). Three roundings make u wrong, but for a multiple of L, by at most eps/2·(|t| + |t| + L/2 + |u|);
-with |u| <= L/2 (and a little, where round() took the other integer) that is less than eps·(|t| + L). Extents are widened by 4
-times that bound of their own particles, and w by 4 times that of the particle that is asked about. The images u + S·L with S = -1,
-0, 1 are all that there can be: extents reach L/2 to either side of c, so that an image with another S is at least L away, and
-another one, with one of these S, at most L/2.
+No pair is lost to rounding. On an open axis, particle j is sent if fl(low - x_j) <= w and fl(x_j - high) <= w. If |x_j - x_i| < w
+(or <=) for a particle i of the extent, then low <= x_i and low - x_j <= x_i - x_j <= w exactly; rounding is monotonic and w is a
+float, so the test holds. On a periodic axis of length L, coordinates are taken from a point c: t = x - c, u = t - L·round(t/L). Up
+to a multiple of L, three roundings change u by at most eps/2·(|t| + |t| + L/2 + |u|); with |u| <= L/2 (slightly more if round()
+chose the other integer) that is less than eps·(|t| + L). Extents are widened by 4 times that bound for their own particles, and w
+by 4 times that of the particle tested. The images u + S·L with S = -1, 0, 1 suffice: extents reach L/2 to either side of c, so an
+image with another S is at least L away, while one with these S is at most L/2 away.
 """
 
 import dataclasses
@@ -33,17 +33,17 @@ from jfrnn._tracing import set_places
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Halo:
-    """Say which particles are sent where, so that each shard sees all neighbors of its own. A pytree; made by `halo`.
+    """Which particles are sent to which shards, so that each shard sees all neighbors of its own. A pytree; made by `halo`.
 
-    It serves for the positions for which it was made, and while no particle has moved more than half of what the reach of the
-    particles exceeds the cutoff in use: half the skin.
+    It is valid at the positions for which it was made, and until a particle has moved more than half of the difference between the
+    reach of the particles and the cutoff in use: half the skin.
 
     Attributes:
-        sends: For each axis of the mesh, rows that each message takes, shape [shards · messages, size], int32.
-        ids: Of a shard's own particles and those of its halo, shape [shards · rows], int32; -1 where there is none.
+        sends: For each axis of the mesh, the rows that each message takes, shape [shards · messages, size], int32.
+        ids: Ids of a shard's own particles and those of its halo, shape [shards · rows], int32; -1 in unused rows.
         status: Bits of `Status`, shape [], int32.
-        required: How much room would have been enough (`Required`).
-        sent: Particles that were sent, over all shards and messages, shape [], int32; at most the largest int32.
+        required: The buffer sizes that would have sufficed (`Required`).
+        sent: Particles sent, over all shards and messages, shape [], int32; saturates at the largest int32.
     """
 
     sends: tuple[Array, ...]
@@ -54,7 +54,7 @@ class Halo:
 
 
 class _Stage(NamedTuple):
-    """One axis of the mesh: its number and name, shards along it, the axis of space, whether that is periodic."""
+    """One axis of the mesh: its number and name, its shards, the axis of space that it divides, and whether that is periodic."""
 
     number: int
     name: Any
@@ -62,13 +62,13 @@ class _Stage(NamedTuple):
     periodic: bool
 
     def offsets(self, hops: int) -> list[int]:
-        """Return to which shards messages go, each once: relative numbers, not 0."""
+        """Return the relative numbers, not 0, of the shards that get messages, each once."""
         if self.periodic:
             return sorted({k % self.shards for k in range(-hops, hops + 1)} - {0})
         return [k for k in range(-hops, hops + 1) if k and abs(k) < self.shards]
 
     def hops_to(self, offset: Array) -> Array:
-        """Return over how many shards a message goes."""
+        """Return how many shards away the receiver of a message is."""
         there = jnp.abs(offset)
         return jnp.minimum(there, self.shards - there) if self.periodic else there
 
@@ -87,7 +87,7 @@ def stages(particles: Particles) -> list[_Stage]:
 
 
 def halo_spec(particles: Particles) -> Halo:
-    """Return how the arrays of a halo are spread."""
+    """Return the partition specs of a halo's arrays."""
     rows: Any = of_shards(particles.mesh)
     same: Any = jax.sharding.PartitionSpec()
     return Halo((rows,) * len(particles.along), rows, same, Required(same, same, same, same), same)
@@ -102,7 +102,7 @@ def rows_seen(particles: Particles) -> int:
 
 def halo_in_shard(particles: Particles) -> Halo:
     """Make a halo, inside `shard_map`."""
-    x, numbers = lax.stop_gradient(particles.positions), particles.ids + 1  # where nothing is received are zeros
+    x, numbers = lax.stop_gradient(particles.positions), particles.ids + 1  # ids from 1 on: rows that receive nothing are 0
     sends, sizes, hops = [], [], []
     status, sent = jnp.int32(0), jnp.int32(0)
     for stage in stages(particles):
@@ -123,16 +123,16 @@ def halo_in_shard(particles: Particles) -> Halo:
 
 
 def _psum(x: Array, names: str | tuple[str, ...]) -> Array:
-    """Add up int32 of all shards that are not negative; a sum that int32 cannot hold is the largest int32."""
-    high, low = lax.psum((x >> 15, x & 0x7FFF), names)  # of up to 32 768 shards, neither overflows
+    """Sum nonnegative int32 over all shards, saturating at the largest int32."""
+    high, low = lax.psum((x >> 15, x & 0x7FFF), names)  # neither overflows for up to 32 768 shards
     high = high + (low >> 15)
     return jnp.where(high > 0xFFFF, MOST_PAIRS, (high << 15) | (low & 0x7FFF))
 
 
 def exchange(leaf: Array, halo: Halo, particles: Particles) -> Array:
-    """Return a shard's own rows of an array and those of its halo, inside `shard_map`; unused ones are 0. Linear.
+    """Return an array's rows of the shard's own and halo particles, inside `shard_map`; unused rows are 0. Linear.
 
-    Arrays travel one by one, so that the compiler sends what several sums read once, and what none reads not at all. Packed into
+    Each array travels separately, so the compiler sends arrays that several sums read once, and unused ones not at all. Packed into
     one message per sum, a step of the solver took longer on two GPUs.
     """
     for stage in stages(particles):
@@ -149,7 +149,7 @@ def _append_received(leaf: Array, sends: Array, particles: Particles, stage: _St
 
 
 class _Extents(NamedTuple):
-    """Boxes around the own particles of all shards along an axis, shape [shards, d] each; periodic axes count from `center`."""
+    """Bounding boxes of all shards' own particles along an axis, shape [shards, d] each; periodic axes count from `center`."""
 
     low: Array
     high: Array
@@ -157,12 +157,12 @@ class _Extents(NamedTuple):
 
 
 def _extents(particles: Particles, stage: _Stage) -> _Extents:
-    """Share the extents along an axis; of shards that differ in later axes, which will be served from there, the union."""
+    """Share the extents along an axis; shards that differ only in later axes form a union, as those axes are served from there."""
     x = lax.stop_gradient(particles.positions)
     there = (particles.ids >= 0) & jnp.isfinite(x).all(axis=1)
     center = _center(particles, stage)
     u, error = _from_center(x, center, particles)
-    # one column after the other: all at once take 4 to 7 times as long on a GPU, more than the rest of a halo
+    # One column at a time: all at once take 4 to 7 times as long on a GPU, more than the rest of a halo.
     low = jnp.stack([jnp.min((u - error)[:, k], initial=jnp.inf, where=there) for k in range(particles.dim)])
     high = jnp.stack([jnp.max((u + error)[:, k], initial=-jnp.inf, where=there) for k in range(particles.dim)])
     later = particles.mesh.axis_names[stage.number + 1 :]
@@ -172,7 +172,7 @@ def _extents(particles: Particles, stage: _Stage) -> _Extents:
 
 
 def _center(particles: Particles, stage: _Stage) -> Array:
-    """Return the middle of the region of the shards that differ in later axes alone, [d], and of the box along other axes."""
+    """Return the middle [d] of the region of shards that differ only in later axes; along other axes, of the box."""
     box, dtype = particles.box, particles.positions.dtype
     if box is None:
         return jnp.zeros(particles.dim, dtype)
@@ -189,7 +189,7 @@ def _center(particles: Particles, stage: _Stage) -> Array:
 
 
 def _from_center(x: Array, center: Array, particles: Particles) -> tuple[Array, Array]:
-    """Return coordinates from the center, brought near it along periodic axes, and 4 times the bound of their error."""
+    """Return coordinates relative to the center, wrapped along periodic axes, and 4 times their error bound."""
     box = particles.box
     if box is None:
         return x, jnp.zeros_like(x)
@@ -201,7 +201,7 @@ def _from_center(x: Array, center: Array, particles: Particles) -> tuple[Array, 
 
 
 def _members(x: Array, there: Array, extents: _Extents, particles: Particles, stage: _Stage) -> tuple[list[Array], Array]:
-    """Say for each message which rows belong into it, [rows] bool each; and to how many shards away any should have gone."""
+    """Say which rows [rows] belong into each message, and return the number of hops that the farthest should have gone."""
     here, served = lax.axis_index(stage.name), stage.offsets(particles.sizes.hops[stage.number])
 
     def needed(offset: Array | int) -> Array:
@@ -227,7 +227,7 @@ def _members(x: Array, there: Array, extents: _Extents, particles: Particles, st
 
 
 def _is_near(x: Array, extent: _Extents, particles: Particles) -> Array:
-    """Say which points are within reach of an extent along every axis, [rows] bool; see the head of this file for rounding."""
+    """Say which points are within reach of an extent along every axis, [rows] bool; the module docstring covers rounding."""
     u, error = _from_center(x, extent.center, particles)
 
     def distance(u: Array) -> Array:

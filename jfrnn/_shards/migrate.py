@@ -1,4 +1,4 @@
-"""Migration: bounds that give each shard as many particles, and particles that go to the shard in whose region they are."""
+"""Migration: choose bounds that balance the shards, and move each particle to the shard of its region."""
 
 import dataclasses
 import math
@@ -14,27 +14,27 @@ from jfrnn._shards.halo import halo_in_shard
 from jfrnn._shards.particles import Particles, share_bits, spec_of
 from jfrnn._tracing import Tree, set_places
 
-_DIGIT = 2  # bits of a bound that are found in one round
-_BUCKETS = 32  # a round of migration moves up to this part of a shard, as much of it to each other shard
+_DIGIT = 2  # bits of a bound per round of counting
+_BUCKETS = 32  # a round of migration sends up to 1/32 of a shard, in equal parts to the other shards
 
 
 @jax.jit
 def migrate(particles: Particles) -> Particles:
-    """Move the bounds of shards so that each has as many particles, and particles to the shard in whose region they are.
+    """Balance the bounds of the shards, and move each particle to the shard in whose region it lies.
 
-    Rows change places; values travel along. Nothing depends on it but speed: `search` and `pair_sum` find the same pairs however
-    particles are spread. Where a shard would get more particles than it has room for, all stay where they are, and a bit says so.
+    Rows change places, and values travel along. Only speed depends on it: `search` and `pair_sum` find the same pairs for any
+    distribution. If a shard would get more particles than it has room for, all stay where they are, and a status bit is set.
 
     Args:
-        particles: Particles, wherever they have moved to, also across several shards.
+        particles: Distributed particles; they may have moved across several shards.
 
     Returns:
-        The same particles, n in all; with status bits, and what was required, of this arrangement's halo too.
+        The same n particles, with status bits and requirements that include those of this arrangement's halo.
 
-    Cost: to find the bounds, each shard counts 16 times for each axis of the mesh (float64: 32), three numbers for each cut; then
-    rounds, in each of which messages of a 32nd of a shard in all go to the other shards, until all have moved. Those that stay keep
-    their rows. Differentiable: no gradient flows through. Jit: yes. vmap: no. Source: bounds by counting (Warren & Salmon 1993,
-    doi:10.1145/169627.169640), found digit by digit.
+    Cost: to find the bounds, each shard counts 16 times per axis of the mesh (float64: 32), three numbers per cut; then particles
+    move in rounds, in each of which a shard sends up to a 32nd of its room. Particles that stay keep their rows. Differentiable: no
+    gradient flows through. Jit: yes. vmap: no. Source: bounds by counting (Warren & Salmon 1993, doi:10.1145/169627.169640), found
+    digit by digit.
     """
     particles = lax.stop_gradient(particles)
     spec = spec_of(particles)
@@ -61,24 +61,24 @@ def _migrate_shard(particles: Particles) -> Particles:
 
 
 def _where_used(ids: Array, leaf: Array) -> Array:
-    """Return rows with 0 where there is no particle, -1 of ids themselves."""
+    """Return rows with 0 in unused ones; ids get -1 there."""
     return leaf if leaf is ids else jnp.where((ids >= 0).reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.zeros((), leaf.dtype))
 
 
 def _counts(goes: Array, shards: int) -> Array:
-    """Count the rows that go to each shard, [shards] int32: sums of flags, since millions would wait to be added to few numbers."""
+    """Count the rows that go to each shard, [shards] int32, by sums of flags: scatter-adds to so few numbers are slow."""
     return jnp.sum(goes[None] == lax.iota(jnp.int32, shards)[:, None], axis=1, dtype=jnp.int32)
 
 
 def _move(rows: Tree, goes: Array, particles: Particles) -> Tree:
-    """Send rows to the shards where they go, into rows that are free there; `shards` stands for rows that are unused."""
+    """Send rows to the shards given by `goes`, into free rows there; the value `shards` marks unused rows."""
     mesh, room = particles.mesh, particles.sizes.particles
     shards, here = mesh.devices.size, lax.axis_index(mesh.axis_names)
     bucket = max(math.ceil(room / (_BUCKETS * shards)), 1)
     positions, ids, values = rows
     leaves = jnp.where(goes == here, shards, goes)
     rounds = -(-lax.pmax(jnp.max(_counts(leaves, shards)), mesh.axis_names) // bucket)
-    # what leaves is taken from `rows`, where it stays: no room is wanted beyond that of those who are here in the end
+    # Rows that leave are read from `rows`, so a shard only needs room for the particles that it has in the end.
     kept = positions, jnp.where(goes == here, ids, -1), values
 
     def send(carry: tuple[Array, Array, Any]) -> tuple[Array, Array, Any]:
@@ -97,10 +97,11 @@ def _move(rows: Tree, goes: Array, particles: Particles) -> Tree:
 
 
 def _balance(particles: Particles, counted: Array) -> tuple[tuple[Array, ...], Array]:
-    """Return bounds between which equally many particles lie, and the shard in whose region each particle is, [rows] int32.
+    """Return bounds that divide the particles evenly, and the shard in whose region each particle lies, [rows] int32.
 
-    The first axis of the mesh cuts space into slabs, the next each slab on its own (recursive coordinate bisection with as many
-    parts as there are devices, Berger & Bokhari 1987, doi:10.1109/TC.1987.1676942). Particles at a bound belong above it.
+    The first axis of the mesh divides space into slabs, and the next axis divides each slab separately (recursive coordinate
+    bisection with as many parts as there are devices, Berger & Bokhari 1987, doi:10.1109/TC.1987.1676942). Particles at a bound
+    belong above it.
     """
     x, mesh = lax.stop_gradient(particles.positions), particles.mesh
     part, bounds, groups = jnp.zeros(len(x), jnp.int32), [], 1
@@ -116,7 +117,7 @@ def _balance(particles: Particles, counted: Array) -> tuple[tuple[Array, ...], A
 
 
 def _in_box(x: Array, axis: int, particles: Particles) -> Array:
-    """Bring a coordinate between the ends of a periodic box, near enough."""
+    """Wrap a coordinate into a periodic box, up to rounding."""
     box = particles.box
     if box is None or not box.periodic[axis]:
         return x
@@ -125,15 +126,7 @@ def _in_box(x: Array, axis: int, particles: Particles) -> Array:
 
 
 def _bounds(bits: Array, group: Array, groups: int, shards: int, particles: Particles) -> Array:
-    """Find, for each group, the largest keys below which at most 1/shards, 2/shards ... of its particles lie, [groups, shards - 1].
-
-    Args:
-        bits: Keys, shape [rows], unsigned, in the order of coordinates.
-        group: Shape [rows], int32; `groups` where a row does not count.
-        groups: How many.
-        shards: Parts.
-        particles: Name the devices.
-    """
+    """Return the largest keys below which at most 1/shards, 2/shards ... of a group's particles lie: [groups, shards - 1]."""
     total = lax.psum(_counts(group, groups), particles.mesh.axis_names)[:, None]
     share = np.arange(1, shards, dtype=np.int32)
     wanted = total // shards * share + total % shards * share // shards
@@ -152,7 +145,7 @@ def _bounds(bits: Array, group: Array, groups: int, shards: int, particles: Part
 
 
 def _floats(keys: Array, dtype: np.dtype) -> Array:
-    """Return the coordinates of keys, the inverse of `ordered_bits`; infinite beyond all floats."""
+    """Return the coordinates of keys, inverting `ordered_bits`; infinite for keys beyond all floats."""
     top = keys.dtype.type(1 << (keys.dtype.itemsize * 8 - 1))
     x = lax.bitcast_convert_type(jnp.where(keys >= top, keys ^ top, ~keys), dtype)
     return jnp.where(jnp.isnan(x), jnp.inf, x)

@@ -1,8 +1,8 @@
-"""Particles spread over a mesh of devices: what each shard holds, how it is laid out, and how much room it has.
+"""Particles distributed over a mesh of devices: the contents, layout and buffer sizes of a shard.
 
-A shard is one device's part. All arrays are global ones of JAX, rows of one shard after those of another, sharded along their
-first axis over all axes of the mesh; whatever works row by row on such arrays needs to know nothing of shards. Which particle lies
-on which shard decides how much is sent and how even the load is, never who is a neighbor (`_shards_halo`).
+A shard is the part of one device. All arrays are global JAX arrays: the rows of all shards one after the other, sharded along their
+first axis over all axes of the mesh. Row-wise functions of such arrays need not know about shards. Which shard holds a particle
+affects communication and load balance, never which particles are neighbors (`jfrnn._shards.halo`).
 """
 
 import dataclasses
@@ -20,17 +20,17 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jfrnn._geometry import Box, Status, check_again, names_of_bits, shape_of
 from jfrnn._tracing import Given, Tree
 
-_STEP = 8  # sizes are rounded up to multiples, so that similar scenes share a compiled program
+_STEP = 8  # sizes are rounded up to multiples of this, so that similar scenes share a compiled program
 OVERFLOWS = Status.ROW_OVERFLOW | Status.SHARD_OVERFLOW | Status.HALO_OVERFLOW | Status.HALO_TOO_FAR
 
 
 class Sizes(NamedTuple):
-    """How much room there is; static.
+    """Buffer sizes; static.
 
     Attributes:
         particles: Rows of a shard.
         halo: Particles per message, for each axis of the mesh.
-        hops: Over how many shards messages go to either side, for each axis of the mesh.
+        hops: Number of shards to either side that get messages, for each axis of the mesh.
     """
 
     particles: int
@@ -39,13 +39,13 @@ class Sizes(NamedTuple):
 
 
 class Required(NamedTuple):
-    """How much room would have been enough, over all that was met; int32, the same on every device.
+    """The buffer sizes that would have sufficed for everything so far; int32, equal on all devices.
 
     Attributes:
         particles: Rows of the fullest shard, shape [].
         halo: Particles of the largest message along each axis of the mesh, shape [axes].
-        hops: Shards to the farthest one that a message had to go to, shape [axes].
-        row: Neighbors of the longest row of a list, shape [].
+        hops: Shards to the farthest receiver of a message, shape [axes].
+        row: Neighbors in the longest row of a list, shape [].
     """
 
     particles: Array
@@ -54,12 +54,12 @@ class Required(NamedTuple):
     row: Array
 
     def joined(self, other: "Required") -> "Required":
-        """Return what is enough for both."""
+        """Return the sizes that suffice for both."""
         return Required(*(jnp.maximum(a, b) for a, b in zip(self, other, strict=True)))
 
 
 class Met(Protocol):
-    """Whatever knows how much room would have been enough: particles, halos, lists."""
+    """Anything that records which buffer sizes would have sufficed: particles, halos, lists."""
 
     @property
     def status(self) -> Array:
@@ -68,31 +68,31 @@ class Met(Protocol):
 
     @property
     def required(self) -> Required:
-        """How much room would have been enough."""
+        """The buffer sizes that would have sufficed."""
         ...
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Particles:
-    """Hold particles spread over a mesh of devices. A pytree; made by `scatter`, kept on the right shards by `migrate`.
+    """Particles distributed over a mesh of devices. A pytree; made by `scatter` and kept on the right shards by `migrate`.
 
-    Rows of all shards stand one after the other, N = shards · capacity of them, sharded over the mesh; unused rows have id -1.
+    The rows of all shards stand one after the other, N = shards · capacity of them, sharded over the mesh; unused rows have id -1.
 
     Attributes:
-        positions: Positions [length], shape [N, d]; `scatter` and `migrate` leave 0 in unused rows, of which nobody reads.
-        ids: Row of the plain array that each particle came from, shape [N], int32; -1 where there is none.
-        values: A pytree of arrays of shape [N, ...] that travel along; likewise.
+        positions: Positions [length], shape [N, d]; 0 in unused rows after `scatter` and `migrate`.
+        ids: Row of each particle in the arrays given to `scatter`, shape [N], int32; -1 in unused rows.
+        values: A pytree of arrays of shape [N, ...] that travel along; 0 in unused rows likewise.
         bounds: For each axis of the mesh, where it is cut [length], shape [*mesh.shape[:k], mesh.shape[k] - 1]: each part of an
-            axis is cut on its own along the next.
+            axis is cut separately along the next.
         box: The periodic box, or None.
         status: Bits of `Status`, shape [], int32; kept until `grow`.
-        required: How much room would have been enough (`Required`).
+        required: The buffer sizes that would have sufficed (`Required`).
         mesh: The devices. Static.
-        along: Which axis of space each axis of the mesh cuts. Static.
+        along: The axis of space that each axis of the mesh divides. Static.
         total: Number of particles n. Static.
-        reach: Up to which distance pairs are found [length]: cutoff + skin, rounded up to the dtype of positions. Static.
-        sizes: How much room there is (`Sizes`). Static.
+        reach: Largest distance at which pairs are found [length]: cutoff + skin, rounded up to the dtype of the positions. Static.
+        sizes: The buffer sizes (`Sizes`). Static.
     """
 
     positions: Array
@@ -109,7 +109,7 @@ class Particles:
     sizes: Sizes = dataclasses.field(metadata={"static": True})
 
     def __repr__(self) -> str:
-        """Say in a line what they are; waits for the devices."""
+        """Summarize the particles in a line; waits for the devices."""
         shards, dim = self.mesh.devices.size, shape_of(self.positions)[-1]
         room, status = self.sizes.particles, names_of_bits(self.status)
         return f"Particles({self.total} in {dim}D on {shards} shards of {room}, reach {self.reach:.6g}, status {status})"
@@ -121,7 +121,7 @@ class Particles:
 
     @property
     def overflow(self) -> Array:
-        """Whether room was missing anywhere, shape [], bool: results are not to be used, `grow` and run again."""
+        """Whether a buffer overflowed, shape [], bool: discard the results, `grow` and run again."""
         return (self.status & OVERFLOWS.value) != 0
 
     @property
@@ -133,7 +133,7 @@ class Particles:
         """Return the same particles with other positions [N, d], or other values (leaves [N, ...]). Jit: yes.
 
         Raises:
-            ValueError, TypeError: Positions are of another kind or number than before, or values have other rows.
+            ValueError, TypeError: positions are of another dtype or number than before, or values have other rows.
         """
         rows, dim = self.positions.shape
         if positions is not None:
@@ -149,23 +149,23 @@ class Particles:
         """Raise what the status bits report; wait for the devices. Not inside jit: there, read `overflow`.
 
         Raises:
-            RuntimeError: Room was missing; the message says how much is needed, `grow` makes it.
-            ValueError: Positions hold NaN or infinity, or do not fit the box.
+            RuntimeError: a buffer overflowed; the message gives the size needed, and `grow` provides it.
+            ValueError: positions hold NaN or infinity, or do not fit the box.
         """
         check(self, ", ".join(f"{name} {size}" for name, size in self.sizes._asdict().items()))
 
     def grow(self, *seen: Met, slack: float = 1.25) -> "Particles":
-        """Return the same particles with the room that was missing in `seen`. Not inside jit: sizes are shapes.
+        """Return the same particles with the buffer sizes that `seen` requires. Not inside jit: sizes are shapes.
 
         Args:
-            *seen: What came of a run that began with these particles: particles, lists or halos.
-            slack: Factor >= 1 on what was needed.
+            *seen: Results of a run that began with these particles: particles, lists or halos.
+            slack: Factor >= 1 on the required sizes.
 
         Returns:
-            These particles, as they are, with sizes not smaller than before and no bits from the past.
+            These particles, with sizes not smaller than before and status bits cleared.
 
         Raises:
-            TypeError: Called inside jit.
+            TypeError: called inside jit.
         """
         if any(isinstance(x, Tracer) for x in jax.tree.leaves(self)):
             raise TypeError("grow() changes shapes and cannot run inside jax.jit: call it on what jit returns.")
@@ -173,7 +173,7 @@ class Particles:
         return resize(self, _enough(self.sizes, required, self.mesh, slack))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Say how to make them anew, on devices of the same numbers: a mesh itself cannot be pickled."""
+        """Return how to unpickle the particles on devices of the same numbers; a mesh itself cannot be pickled."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "mesh"}
         mesh = self.mesh
         return _spread_again, (fields, [d.id for d in mesh.devices.flat], mesh.devices.shape, mesh.axis_names, mesh.axis_types)
@@ -182,10 +182,10 @@ class Particles:
 def _spread_again(
     fields: dict[str, Any], ids: list[int], shape: tuple[int, ...], names: tuple[str, ...], kinds: tuple[AxisType, ...]
 ) -> Particles:
-    """Make particles of the fields of others, on devices of the same numbers.
+    """Make particles from the fields of others, on devices of the same numbers.
 
     Raises:
-        RuntimeError: This process has no such devices.
+        RuntimeError: this process has no such devices.
     """
     devices = {device.id: device for device in jax.devices()}
     if missing := [k for k in ids if k not in devices]:
@@ -202,7 +202,7 @@ def _spread_again(
 
 
 def spec_of(particles: Particles) -> Particles:
-    """Return how the arrays of particles are spread, in their structure."""
+    """Return the partition specs of the particles' arrays, in the same structure."""
     rows, same = of_shards(particles.mesh), PartitionSpec()
     return dataclasses.replace(
         jax.tree.map(lambda _: same, particles),
@@ -218,7 +218,7 @@ def room(size: int) -> int:
 
 
 def _enough(sizes: Sizes, required: Required, mesh: Mesh, slack: float) -> Sizes:
-    """Return sizes that hold slack times what was required, and those that sufficed."""
+    """Return the present sizes if they hold the requirement, else sizes that hold slack times it."""
 
     def grown(had: int, needs: int) -> int:
         return had if needs <= had else room(math.ceil(slack * needs))
@@ -230,19 +230,19 @@ def _enough(sizes: Sizes, required: Required, mesh: Mesh, slack: float) -> Sizes
 
 
 def no_requirements(axes: int) -> Required:
-    """Return what nothing needs."""
+    """Return a requirement that any sizes satisfy."""
     none: Any = np.zeros((), np.int32)
     each: Any = np.zeros(axes, np.int32)
     return Required(none, each, each, none)
 
 
 def of_shards(mesh: Mesh) -> PartitionSpec:
-    """Return how arrays with rows of all shards are spread."""
+    """Return the partition spec of arrays with rows of all shards."""
     return PartitionSpec(mesh.axis_names)
 
 
 def place_rows(mesh: Mesh, rows: np.ndarray, source: np.ndarray) -> Array:
-    """Put rows of a host array, the same in every process, on their devices: those that `source` names, 0 where it is negative."""
+    """Put the rows `source` of a host array, equal in all processes, on their devices; 0 for a negative source."""
 
     def part(index: Given) -> np.ndarray:
         wanted = source[index[0]]
@@ -260,7 +260,7 @@ def replicate(mesh: Mesh, value: Given) -> Array:
 
 
 def resize(particles: Particles, sizes: Sizes) -> Particles:
-    """Return particles with other sizes, no smaller ones, and no bits from the past."""
+    """Return particles with these sizes, none smaller than before, and status bits cleared."""
     mesh, old, new = particles.mesh, particles.sizes.particles, sizes.particles
     none = no_requirements(mesh.devices.ndim)
     status, required = jax.tree.map(functools.partial(replicate, mesh), (np.zeros((), np.int32), none))
@@ -273,7 +273,7 @@ def resize(particles: Particles, sizes: Sizes) -> Particles:
         positions, ids, values = rows
         return padded(positions, 0), padded(ids, -1), jax.tree.map(lambda x: padded(x, 0), values)
 
-    # also where nothing is wider: results of a program share no memory with what it is given
+    # The programs run even if nothing grows: their results share no memory with the arrays of `particles`.
     kept = jax.jit(jax.shard_map(wider, mesh=mesh, in_specs=of_shards(mesh), out_specs=of_shards(mesh), check_vma=False))(kept)
     bounds, box = jax.jit(lambda same: same)((particles.bounds, particles.box))
     changed = {"positions": kept[0], "ids": kept[1], "values": kept[2], "bounds": bounds, "box": box}
@@ -287,12 +287,12 @@ def share_bits(status: Array, mesh: Mesh) -> Array:
 
 
 def check(met: Met, room: str) -> None:
-    """Raise what status bits report; `room` says how much there is.
+    """Raise what status bits report; `room` describes the present sizes.
 
     Raises:
-        RuntimeError: Room was missing.
-        ValueError: Data are not what they should be.
-        TypeError: Called inside jit.
+        RuntimeError: a buffer overflowed.
+        ValueError: the data are invalid.
+        TypeError: called inside jit.
     """
     if isinstance(met.status, Tracer):
         raise TypeError("check() reads values and cannot run inside jax.jit: call it on what jit returns.")

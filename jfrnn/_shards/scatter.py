@@ -1,4 +1,4 @@
-"""From plain arrays to particles spread over devices, and back."""
+"""Distribute plain arrays over devices, and collect them again."""
 
 import math
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from jfrnn._shards.particles import Particles, Sizes, no_requirements, place_row
 from jfrnn._tracing import Given, Tree
 
 _MOST = 2**31 - 1
-_SMALL = 1024  # particles that may travel at first without a thought: a wrong guess is compiled anew
+_SMALL = 1024  # particles per message for which the first guess leaves room: a wrong guess costs a compilation
 
 
 def scatter(
@@ -32,26 +32,26 @@ def scatter(
     along: Sequence[int] | None = None,
     slack: float = 1.25,
 ) -> Particles:
-    """Spread particles over a mesh of devices, evenly, each device getting a region of space.
+    """Distribute particles evenly over a mesh of devices, each device getting a region of space.
 
     Args:
-        positions: Positions [length], shape [n, 2] or [n, 3], float32 or float64; in every process all of them.
-        cutoff: Largest interaction radius that will be asked for [length], a number > 0.
+        positions: Positions [length], shape [n, 2] or [n, 3], float32 or float64; all of them in every process.
+        cutoff: Largest interaction radius of later calls [length], a number > 0.
         values: A pytree of arrays of shape [n, ...] that travel with the particles.
-        mesh: Devices, with as many axes as space is to be cut along, at most d: `jax.make_mesh((8,), ("x",))` cuts slabs,
-            `jax.make_mesh((4, 2), ("x", "y"))` slabs and each of them once more.
-        skin: Largest extra shell that will be asked for [length].
-        box: Periodic box, given by lengths: a lattice that is skewed is refused.
-        along: Which axis of space each axis of the mesh cuts; default: the longest ones first.
-        slack: Factor >= 1 on what shards and messages hold now, room to move.
+        mesh: Devices, with one axis per axis of space to divide, at most d: `jax.make_mesh((8,), ("x",))` makes slabs,
+            `jax.make_mesh((4, 2), ("x", "y"))` divides each slab once more.
+        skin: Largest Verlet skin of later calls [length].
+        box: Periodic box given by lengths; skewed lattices are refused.
+        along: The axis of space that each axis of the mesh divides; default: the longest ones first.
+        slack: Factor >= 1 on the present sizes of shards and messages, room for motion.
 
     Returns:
-        `Particles` with room for `slack` times what is there.
+        `Particles` with room for `slack` times the present sizes.
 
     Raises:
-        TypeError, ValueError: An argument is of the wrong kind, shape or range, or is traced.
+        TypeError, ValueError: an argument is of the wrong kind, shape or range, or is traced.
 
-    Memory: in each process what was given, on each device its share. Differentiable: no. Jit: no.
+    Memory: the given arrays in each process, its share on each device. Differentiable: no. Jit: no.
     """
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((positions, values, box))):
         raise TypeError("scatter() chooses shapes from data and cannot run inside jax.jit: call it before, on arrays.")
@@ -67,7 +67,7 @@ def scatter(
 
 
 def _in_blocks(x: np.ndarray, values: Tree, box: Box | None, mesh: Mesh, along: tuple[int, ...], reach: float) -> Particles:
-    """Put equally many rows on each device as they come: `migrate` knows where they belong."""
+    """Put equally many rows on each device in the given order; `migrate` moves them to their regions."""
     shape, shards = mesh.devices.shape, mesh.devices.size
     share = -(-len(x) // shards)
     guess = room(max(share // 4, min(share, _SMALL)))
@@ -84,7 +84,7 @@ def _in_blocks(x: np.ndarray, values: Tree, box: Box | None, mesh: Mesh, along: 
 
 
 def _settle(particles: Particles, slack: float) -> Particles:
-    """Move particles to their shards, making room until it is enough: what later axes of a mesh need is known last."""
+    """Migrate particles, growing buffers until they suffice: later mesh axes report their needs only after earlier ones fit."""
     while True:
         moved = migrate(particles)
         if not bool(moved.overflow):
@@ -96,12 +96,12 @@ def _settle(particles: Particles, slack: float) -> Particles:
 
 
 def collect(particles: Particles) -> tuple[np.ndarray, Any]:
-    """Return positions [n, d] and values (leaves [n, ...]) as plain host arrays, in the order of ids; in every process all.
+    """Return positions [n, d] and values (leaves [n, ...]) as plain host arrays, in the order of ids, in every process.
 
     Raises:
-        TypeError: Called inside jit.
+        TypeError: called inside jit.
 
-    Communication: everything goes everywhere, for checks and pictures. Differentiable: no. Jit: no.
+    Communication: every process gets everything; meant for checks and pictures. Differentiable: no. Jit: no.
     """
     if isinstance(particles.ids, Tracer):
         raise TypeError("collect() makes host arrays and cannot run inside jax.jit: call it on what jit returns.")
@@ -112,7 +112,7 @@ def collect(particles: Particles) -> tuple[np.ndarray, Any]:
 
 
 def fetch(array: Array) -> np.ndarray:
-    """Return all of a global array on the host, in every process."""
+    """Return a whole global array on the host, in every process."""
     if array.is_fully_addressable or array.is_fully_replicated:
         return np.asarray(array)
     from jax.experimental import multihost_utils
@@ -139,7 +139,7 @@ def _check_mesh(mesh: object, dim: int) -> Mesh:
         raise TypeError(f"mesh must be a jax.sharding.Mesh, got {type(mesh).__name__}: write e.g. jax.make_mesh((8,), ('x',)).")
     if not 1 <= mesh.devices.ndim <= dim:
         raise ValueError(f"mesh must have 1 to {dim} axes, as many as space is cut along, got {mesh.devices.ndim}.")
-    return Mesh(mesh.devices, mesh.axis_names)  # its axes for `shard_map` and for the compiler, not for types
+    return Mesh(mesh.devices, mesh.axis_names)  # default axis types: array types must not name the axes
 
 
 def _check_along(along: Sequence[int] | None, x: np.ndarray, mesh: Mesh) -> tuple[int, ...]:
@@ -157,7 +157,7 @@ def _check_along(along: Sequence[int] | None, x: np.ndarray, mesh: Mesh) -> tupl
 
 
 def _check_box(box: object, x: np.ndarray, reach: float, mesh: Mesh) -> Box | None:
-    """Return the box in the dtype of positions, its images chosen as on one device, on every device."""
+    """Return the box in the dtype of the positions, with images chosen as on one device, on every device."""
     checked = check_box(box, cast(Any, x))
     if checked is None:
         return None

@@ -1,4 +1,4 @@
-"""Lists of neighbors that are spread over devices."""
+"""Neighbor lists of distributed particles."""
 
 import dataclasses
 import functools
@@ -24,16 +24,16 @@ from jfrnn._shards.scatter import fetch
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Neighbors:
-    """Hold the neighbors of particles that are spread over devices. A pytree; made by `search`.
+    """The neighbors of distributed particles. A pytree; made by `search`.
 
     Attributes:
-        local: For each shard a `jfrnn.NeighborList` of its own particles and those of its halo; all arrays have a first axis more,
-            the shards.
-        halo: Which particles were sent where when the list was made (`Halo`).
+        local: The `jfrnn.NeighborList` of each shard, of its own and halo particles; all arrays have the shards as an additional
+            first axis.
+        halo: Which particles were sent to which shards when the list was made (`Halo`).
         count: True number of neighbors of each particle, shape [N], int32, as in `jfrnn.NeighborList`; 0 in unused rows.
         status: Bits of `Status`, shape [], int32.
-        required: How much room would have been enough (`Required`).
-        asked: What was asked. Static.
+        required: The buffer sizes that would have sufficed (`Required`).
+        asked: The options of the list. Static.
     """
 
     local: NeighborList
@@ -44,7 +44,7 @@ class Neighbors:
     asked: Asked = dataclasses.field(metadata={"static": True})
 
     def __repr__(self) -> str:
-        """Say in a line what it holds; waits for the devices."""
+        """Summarize the list in a line; waits for the devices."""
         shape, (cutoff, skin, *_) = shape_of(self.local.idx), self.asked
         kept = f", skin {skin:.6g}" if skin else ""
         rest = pairs_and_status(self.count, self.status)
@@ -59,48 +59,48 @@ class Neighbors:
 
     @property
     def overflow(self) -> Array:
-        """Whether pairs may be missing because room was, shape [], bool."""
+        """Whether a buffer overflowed, so that pairs may be missing, shape [], bool."""
         return (self.status & OVERFLOWS.value) != 0
 
     @property
     def rebuild_count(self) -> Array:
-        """How often updates made the list anew, shape [shards], int32, the same number for each; known for a list with a skin."""
+        """How often updates rebuilt the list, shape [shards], int32, equal for all shards; only for a list with a skin."""
         return self.local.rebuild_count
 
     def update(self, particles: Particles) -> tuple[Particles, "Neighbors"]:
-        """Make the list anew if any particle has moved skin/2, or may have by rounding, or rows changed; without a skin, always.
+        """Rebuild the list if any particle has moved skin/2, or may have by rounding, or if rows changed; without a skin, always.
 
-        Before a list is made, particles go to the shards in whose regions they are (`migrate`): rows change places, so go on with
-        the particles that come back.
+        Before a rebuild, particles move to the shards of their regions (`migrate`). Rows then change places, so continue with the
+        particles that are returned.
 
         Args:
-            particles: Where they are now.
+            particles: The particles at their present positions.
 
         Returns:
-            The particles and the list, in the same shapes. Bits and what was required are kept over all updates, in both.
+            The particles and the list, in the same shapes. Both keep status bits and requirements over all updates.
 
         Raises:
-            ValueError: The particles are not laid out as those for which the list was made.
+            ValueError: the particles have another layout than those for which the list was made.
 
-        Cost: one pass over the positions and one number from each device; or `migrate` and `search`. Differentiable: no gradient
-        flows through. Jit: yes. vmap: no.
+        Cost: one pass over the positions and one number from each device; for a rebuild `migrate` and `search`. Differentiable: no
+        gradient flows through. Jit: yes. vmap: no.
         """
         self._check_fits(particles)
         return _update(particles, self)
 
     def grow(self, particles: Particles, slack: float = 1.25) -> "Neighbors":
-        """Make a list with room for what overflowed, for particles that have grown. Not inside jit.
+        """Make a list with larger buffers where they overflowed, for particles that have grown. Not inside jit.
 
         Args:
-            particles: Where they are now, after their own `grow`.
-            slack: Factor >= 1 on the longest row that was ever met.
+            particles: The particles at their present positions, after their own `grow`.
+            slack: Factor >= 1 on the longest row so far.
 
         Returns:
-            A list with the same options, and no bits from the past.
+            A list with the same options and status bits cleared.
 
         Raises:
-            TypeError: Called inside jit.
-            ValueError: The particles are of another kind than those for which the list was made.
+            TypeError: called inside jit.
+            ValueError: the particles are of another kind than those for which the list was made.
         """
         self._check_kind(particles)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((particles, self.required))):
@@ -113,13 +113,13 @@ class Neighbors:
         """Raise what the status bits report; wait for the devices. Not inside jit: there, read `overflow`.
 
         Raises:
-            RuntimeError: Room was missing; the message says how much is needed.
-            ValueError: Positions hold NaN or infinity, or do not fit the box.
+            RuntimeError: a buffer overflowed; the message gives the size needed.
+            ValueError: positions hold NaN or infinity, or do not fit the box.
         """
         check(self, f"row {self.capacity}, halo {[sends.shape[1] for sends in self.halo.sends]}")
 
     def _check_kind(self, particles: object) -> None:
-        """Refuse particles of another dtype or dimension, in another kind of box, or on other devices than those of the list."""
+        """Raise for particles of another dtype or dimension, in another kind of box, or on other devices than those of the list."""
         if not isinstance(particles, Particles):
             raise TypeError(f"particles must be what jfrnn.distributed.scatter returns, got {type(particles).__name__}.")
         check_devices("particles", particles.ids, self.count)
@@ -134,21 +134,21 @@ class Neighbors:
             raise ValueError(f"particles must be of the kind for which the list was made ({made}), got {came}: search anew.")
 
     def _check_fits(self, particles: Particles) -> None:
-        """Refuse particles of another kind, or laid out otherwise, than those for which the list was made."""
+        """Raise for particles of another kind or layout than those for which the list was made."""
         self._check_kind(particles)
         check_halo(self.halo, particles)
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the ids (i, j) of all pairs, once for each direction and image, sorted, in every process all of them.
+        """Return the ids (i, j) of all pairs, for each direction and image, sorted, in every process.
 
         Returns:
-            Two host arrays of one length, int32: as `jfrnn.search` on one device lists them, in another order.
+            Two host arrays of equal length, int32: the pairs of `jfrnn.search` on one device, in another order.
 
         Raises:
-            RuntimeError, ValueError: As `check`.
-            TypeError: Called inside jit.
+            RuntimeError, ValueError: as `check`.
+            TypeError: called inside jit.
 
-        Communication: everything goes everywhere, for checks. Differentiable: no. Jit: no.
+        Communication: every process gets everything; meant for checks. Differentiable: no. Jit: no.
         """
         self.check()
         mine, theirs = (fetch(x) for x in _named_pairs(self))
@@ -202,7 +202,7 @@ def _update(particles: Particles, nbrs: Neighbors) -> tuple[Particles, Neighbors
     if not asked.skin:
         return remake(particles, nbrs)
     stale: Array = over_shards(_is_stale, particles, PartitionSpec(), particles, nbrs.halo, nbrs.local)
-    # a loop of at most one round, as in `NeighborList.update`
+    # a loop of at most one iteration, as in `NeighborList.update`
     carry = lax.while_loop(
         lambda carry: carry[0], lambda carry: (jnp.zeros_like(stale), *remake(*carry[1:])), (stale, particles, nbrs)
     )
@@ -210,7 +210,7 @@ def _update(particles: Particles, nbrs: Neighbors) -> tuple[Particles, Neighbors
 
 
 def _is_stale(particles: Particles, halo: Halo, local: NeighborList) -> Array:
-    """Say on every shard whether any shard's particles moved too far, or are others; [] bool."""
+    """Say on every shard whether particles of any shard moved too far, or are other ones; [] bool."""
     local, own = jax.tree.map(lambda leaf: leaf[0], local), particles.sizes.particles
     if local.verlet is None:
         raise TypeError("a list without a skin is always stale.")
@@ -222,7 +222,7 @@ def _is_stale(particles: Particles, halo: Halo, local: NeighborList) -> Array:
 
 @jax.jit
 def _named_pairs(nbrs: Neighbors) -> tuple[Array, Array]:
-    """Return ids of all rows [N], and of their neighbors [N, capacity], -1 where there is none."""
+    """Return the ids of all rows [N], and of their neighbors [N, capacity], -1 in unused slots."""
     shards = nbrs.local.idx.shape[0]
     ids = nbrs.halo.ids.reshape(shards, -1)
     own = nbrs.count.shape[0] // shards

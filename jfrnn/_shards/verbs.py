@@ -1,4 +1,4 @@
-"""The verbs of `jfrnn.distributed`: `search`, `count` and `pair_sum`."""
+"""The public functions of `jfrnn.distributed`: `search`, `count` and `pair_sum`."""
 
 import functools
 from collections.abc import Callable
@@ -30,10 +30,10 @@ def search(
     slack: float = 1.0,
     backend: str = "auto",
 ) -> Neighbors:
-    """Find every pair of particles closer than a cutoff, wherever they are: the pairs of `jfrnn.search` on one device, exactly.
+    """Find every pair of particles closer than a cutoff, on any devices: exactly the pairs of `jfrnn.search` on one device.
 
     Args:
-        particles: Spread particles.
+        particles: Distributed particles.
         cutoff: Interaction radius [length], a static number > 0; with the skin at most the reach of the particles.
         skin: As in `jfrnn.search`.
         include_self: As in `jfrnn.search`.
@@ -46,10 +46,10 @@ def search(
         `Neighbors`.
 
     Raises:
-        TypeError, ValueError: An argument is of the wrong kind, shape or range, or `capacity` is missing under jit.
+        TypeError, ValueError: an argument is of the wrong kind, shape or range, or `capacity` is missing under jit.
 
-    Cost: on each device that of `jfrnn.search` for its own particles and those of its halo. Communication: positions of halos.
-    Differentiable: no. Jit: yes, with capacity. vmap: no.
+    Cost: on each device that of `jfrnn.search` for its own and halo particles. Communication: positions of halos. Differentiable:
+    no. Jit: yes, with capacity. vmap: no.
     """
     asked, slack = check_asked(particles, cutoff, skin, include_self, closed, backend), check_slack(slack)
     if capacity is None:
@@ -73,19 +73,19 @@ def count(
     """Count the neighbors that `search` would list.
 
     Args:
-        particles: Spread particles.
+        particles: Distributed particles.
         cutoff: As in `search`.
         include_self: As in `search`.
         closed: As in `search`.
         backend: As in `search`.
-        halo: A halo of these positions; default: it is made.
+        halo: A halo at these positions; by default one is made.
 
     Returns:
-        Neighbors of each particle, shape [N], int32, 0 in unused rows. Where a halo has no room for what it should hold, all are
-        the smallest int32: `migrate` and `halo` tell what is needed.
+        Neighbors of each particle, shape [N], int32, 0 in unused rows. If a halo overflowed, all are the smallest int32; `migrate`
+        and `halo` report the size needed.
 
     Raises:
-        TypeError, ValueError: As `search`.
+        TypeError, ValueError: as `search`.
 
     Differentiable: no. Jit: yes. vmap: no.
     """
@@ -108,32 +108,32 @@ def pair_sum(
     neighbors: Neighbors | None = None,
     halo: Halo | None = None,
 ) -> Tree:
-    """Sum a function of pairs over the neighbors of each particle: `jfrnn.pair_sum`, wherever the neighbors are.
+    """Sum a function of pairs over the neighbors of each particle, like `jfrnn.pair_sum`, with neighbors on any device.
 
     Args:
         fn: As in `jfrnn.pair_sum`.
-        particles: Spread particles; derivatives in `particles.positions` are those in the positions.
+        particles: Distributed particles; derivatives in `particles.positions` are those in the positions.
         cutoff: As in `search`; with `neighbors` None.
-        values: A pytree of arrays of shape [N, ...], rows as in `particles.positions`, and spread like them. Default: None.
+        values: A pytree of arrays of shape [N, ...], rows and sharding as in `particles.positions`. Default: None.
         reduce: As in `jfrnn.pair_sum`.
         include_self: As in `search`.
         closed: As in `search`.
         compensated: As in `jfrnn.pair_sum`.
         backend: As in `search`.
-        neighbors: A list of these particles, whose pairs and halos are taken.
-        halo: A halo of these positions; default: that of the list, or it is made.
+        neighbors: A list of these particles, whose pairs and halos are used.
+        halo: A halo at these positions; default: that of the list, or a new one.
 
     Returns:
-        A pytree as fn returns it, leaves [N, ...], 0 in unused rows. Where a halo has no room for what it should hold, or list or
-        halo are of other rows, all floats are NaN and all integers the smallest of their kind: `migrate` tells what is needed. So
-        are rows of particles that are not finite, and those of shards on which rows of the list overflowed.
+        A pytree as fn returns it, leaves [N, ...], 0 in unused rows. If a halo overflowed, or list or halo belong to other rows,
+        all floats are NaN and all integers the smallest of their dtype; `migrate` reports the size needed. So are rows of particles
+        that are not finite, and those of shards on which rows of the list overflowed.
 
     Raises:
-        RuntimeError: Outside jit, room was missing in `neighbors`: as its `check`.
-        TypeError, ValueError, NotImplementedError: As `jfrnn.pair_sum` and `search`.
+        RuntimeError: outside jit, `neighbors` overflowed, as its `check` says.
+        TypeError, ValueError, NotImplementedError: as `jfrnn.pair_sum` and `search`.
 
-    Order of summation: that of each device; sums differ from those on one device by rounding. Communication: positions of halos
-    and their values; in derivatives as much again, in the other direction. Differentiable: to every order in positions, values and
+    Order of summation: as on each device; sums differ from those on one device by rounding. Communication: positions of halos and
+    their values; in derivatives as much again, in the other direction. Differentiable: to every order in positions, values and
     whatever fn closes over. Jit: yes; outside of it, define fn once. vmap: no.
     """
     if not callable(fn):
