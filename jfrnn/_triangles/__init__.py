@@ -1,4 +1,4 @@
-"""Walls of triangles: which are near which particle, and where they are nearest."""
+"""Walls of triangles: which triangles are near each particle, and their nearest points."""
 
 from jfrnn._triangles.engines import TRIANGLE_BACKENDS, TRIANGLE_ENGINES, fastest_of
 from jfrnn._triangles.programs import find_triangles

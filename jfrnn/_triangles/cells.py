@@ -1,15 +1,14 @@
-"""In which cells a triangle (in 2D: a segment) has to be looked for: a hashed grid of many sizes of cells.
+"""A hashed grid with cells of many sizes, in which triangles (in 2D: segments) are looked up.
 
-A triangle stands in every cell from which it may be closer than the cutoff. So a particle looks into the one cell that it is in,
-meets no triangle twice, and none has to be told apart from earlier ones. Triangles differ in size by orders of magnitude: each
-takes the smallest cells, from about a cutoff on by powers of two, of which at most `MOST_CELLS` hold it; in the largest, one cell
-is all of space. The number of entries is therefore bounded by the number of triangles alone, however large they are: nothing can
-overflow. A particle looks once into each size that is in use.
+A triangle is stored in every cell from which a particle may be closer to it than the cutoff. A particle thus visits only its own
+cell, and meets no triangle twice. Triangles may differ in size by orders of magnitude: each uses the smallest cells, from about the
+cutoff upwards in powers of two, of which it needs at most `MOST_CELLS`; at the largest level one cell is all of space. So the
+number of entries depends on the number of triangles only, and nothing can overflow. A particle does one lookup per level in use.
 
-Why no pair is missed: a particle closer than r to a triangle has each coordinate between fl(low - r') and fl(high + r'), with r'
-slightly above r and low, high those of the corners, since rounding is monotone and the particle is a float. So is the cell,
-floor(x·2^k) in exact arithmetic; its cell is therefore in the box of cells between theirs. Of that box, a cell is left out only if
-a direction separates it, widened by r', from the triangle by more than what rounding may have done.
+No pair is missed: if a particle is closer than r to a triangle, each coordinate lies between fl(low - r') and fl(high + r'), with
+r' slightly above r and the coordinates low, high of the corners, because rounding is monotonic and the particle's coordinate is a
+float. Its cell, floor(x·2^k) in exact arithmetic, is therefore in the box of cells between theirs. A cell of that box is omitted
+only if a direction separates it, widened by r', from the triangle by more than any rounding error.
 """
 
 from itertools import product
@@ -22,24 +21,23 @@ from jax import Array, lax
 from jfrnn._geometry import Cutoff
 from jfrnn._triangles.exact import Vector, cross, dot, minus
 
-MOST_CELLS = {2: 8, 3: 16}  # per triangle, by dimension
-LANES = {2: 32, 3: 128}  # cells of a box that are looked at one by one; a larger box takes larger cells
-_BLOCK = 1024  # triangles that are in work at a time
-_FARTHEST = 2.0**22  # cells from the origin, so that their centers are floats
+MOST_CELLS = {2: 8, 3: 16}  # most cells per triangle, by dimension
+LANES = {2: 32, 3: 128}  # most cells of a box that are tested one by one; a larger box uses larger cells
+_BLOCK = 1024  # triangles processed at a time
+_FARTHEST = 2.0**22  # most cells between the origin and a cell, so that cell centers are floats
 _BUCKETS_PER_TRIANGLE = 8
 _FEWEST_BUCKETS = 1024
 
 
 class TriangleCells(NamedTuple):
-    """Triangles sorted by the bucket into which their cells are hashed. A pytree.
+    """Triangles sorted by the hash bucket of their cells. A pytree.
 
     Attributes:
         start: First entry of each bucket, shape [buckets + 1], int32.
-        triangles: Entries: indices of triangles, shape [entries], int32; the number of triangles where a bucket holds one
-            already.
-        levels: Sizes of cells in use, the smallest first, as biased exponents of their inverse edge, shape [levels], int32; then 0.
-        level_count: Shape [], int32.
-        level_of: The level of each triangle, shape [f], int32: what a bucket holds of other levels is of other cells.
+        triangles: Triangle indices by bucket, shape [entries], int32; the number of triangles marks repetitions within a bucket.
+        levels: Cell sizes in use, smallest first, as biased exponents of the inverse edge, shape [levels], int32; padded with 0.
+        level_count: Number of levels in use, shape [], int32.
+        level_of: The level of each triangle, shape [f], int32, which tells entries of other levels in a bucket apart.
     """
 
     start: Array
@@ -50,33 +48,33 @@ class TriangleCells(NamedTuple):
 
 
 def entry_count(faces: int, dim: int) -> int:
-    """Return the number of entries for a number of triangles."""
+    """Return the number of entries for this number of triangles."""
     return faces * MOST_CELLS[dim]
 
 
 def bucket_count(faces: int) -> int:
-    """Return the number of buckets for a number of triangles, a power of two."""
+    """Return the number of buckets for this number of triangles, a power of two."""
     return max(_FEWEST_BUCKETS, 1 << (_BUCKETS_PER_TRIANGLE * faces - 1).bit_length())
 
 
 def level_limit(dtype: np.dtype) -> int:
-    """Return how many sizes of cells there may be."""
+    """Return the largest possible number of cell sizes."""
     return 256 if dtype == np.float32 else 2048
 
 
 def scale_of(level: Array, dtype: np.dtype) -> Array:
-    """Return the inverse edge of the cells of a level: 2^(level - bias); of level 0, where one cell is all of space, 0."""
+    """Return the inverse cell edge of a level, 2^(level - bias), or 0 for level 0, whose single cell is all of space."""
     unsigned, nmant = (jnp.uint32, 23) if dtype == np.float32 else (jnp.uint64, 52)
     return lax.bitcast_convert_type(level.astype(unsigned) << unsigned(nmant), dtype)
 
 
 def cells_of(x: Array, scale: Array) -> Array:
-    """Return the cell along an axis of each coordinate, int32: exact, but for those too far away to be told apart."""
+    """Return the cell index of each coordinate along an axis, int32; exact unless cells are too far away to resolve."""
     return jnp.clip(jnp.floor(x * scale), -(2.0**30), 2.0**30).astype(jnp.int32)
 
 
 def bucket_of(level: Array, cells: list[Array], buckets: int) -> Array:
-    """Hash cells: cells that collide share their triangles, which then are mere candidates. int32."""
+    """Return the hash of cells, int32. Cells that collide share a bucket; their triangles are then rejected as candidates."""
     word = level.astype(jnp.uint32) * np.uint32(0x9E3779B1)
     for cell in cells:
         word = (word ^ cell.astype(jnp.uint32)) * np.uint32(0x85EBCA6B)
@@ -86,7 +84,7 @@ def bucket_of(level: Array, cells: list[Array], buckets: int) -> Array:
 
 
 def sort_triangles(corners: Array, good: Array, cutoff: Cutoff) -> TriangleCells:
-    """Sort triangles [f, corner, axis] with f > 0 into cells; those that are not `good` [f] bool stand nowhere."""
+    """Sort triangles [f, corner, axis] with f > 0 into cells, except those that are not `good` [f] bool."""
     faces, dim = corners.shape[:2]
     entries, buckets, block = entry_count(faces, dim), bucket_count(faces), min(_BLOCK, faces)
 
@@ -94,7 +92,7 @@ def sort_triangles(corners: Array, good: Array, cutoff: Cutoff) -> TriangleCells
         bucket, triangle, level_of, filled = state
         first = jnp.minimum(b * block, faces - block)
         which = first + lax.iota(jnp.int32, block)
-        fresh = good[which] & (which >= b * block)  # the last block reaches back, to be as long as the others
+        fresh = good[which] & (which >= b * block)  # the last block overlaps, so that all have one length
         level, held, cells = _held_cells(jnp.where(fresh[:, None, None], corners[which], 0), cutoff)
         held = held & fresh[:, None]
         place = filled + (jnp.cumsum(held.reshape(-1), dtype=jnp.int32) - 1).reshape(held.shape)
@@ -111,7 +109,7 @@ def sort_triangles(corners: Array, good: Array, cutoff: Cutoff) -> TriangleCells
     used = jnp.zeros(limit, bool).at[jnp.where(good, level_of, limit)].set(True, mode="drop")
     key, triangle = lax.sort((bucket.astype(jnp.uint32), triangle), num_keys=1, is_stable=True)
     bucket = key.astype(jnp.int32)
-    again = (bucket[1:] == bucket[:-1]) & (triangle[1:] == triangle[:-1])  # two cells of a triangle, hashed alike
+    again = (bucket[1:] == bucket[:-1]) & (triangle[1:] == triangle[:-1])  # two cells of a triangle with the same hash
     triangle = jnp.where(jnp.concatenate([jnp.zeros(1, bool), again]), faces, triangle)
     start = jnp.cumsum(jnp.zeros(buckets + 1, jnp.int32).at[bucket + 1].add(1, mode="drop"), dtype=jnp.int32)
     levels = limit - 1 - jnp.nonzero(used[::-1], size=limit, fill_value=limit - 1)[0].astype(jnp.int32)
@@ -119,7 +117,7 @@ def sort_triangles(corners: Array, good: Array, cutoff: Cutoff) -> TriangleCells
 
 
 def _held_cells(corners: Array, cutoff: Cutoff) -> tuple[Array, Array, list[Array]]:
-    """Choose the cells of each of [b] triangles: its level [b], which of [b, lanes] cells hold it, and those cells."""
+    """Choose the cells of [b] triangles: return their levels [b], which of [b, lanes] cells are needed, and those cells."""
     dim, dtype = corners.shape[1], corners.dtype
     finfo = jnp.finfo(dtype)
     radius = jnp.asarray(cutoff.radius * (1 + 8 * finfo.eps))
@@ -140,7 +138,7 @@ def _held_cells(corners: Array, cutoff: Cutoff) -> tuple[Array, Array, list[Arra
 
 
 def _finest_level(low: Array, high: Array, cutoff: Cutoff) -> Array:
-    """Return the level of the smallest cells that triangles may take: about a cutoff, and not too many or too far away; [b]."""
+    """Return the level [b] of the smallest cells allowed: about a cutoff, and neither too many nor too far away."""
     bias = 127 if low.dtype == jnp.float32 else 1023
     lanes = LANES[low.shape[1]]
     farthest = _exponent(jnp.max(jnp.maximum(jnp.abs(low), jnp.abs(high)), axis=1))
@@ -150,20 +148,20 @@ def _finest_level(low: Array, high: Array, cutoff: Cutoff) -> Array:
 
 
 def _exponent(x: Array) -> Array:
-    """Return the biased exponent of floats >= 0, of infinity that of the largest, int32."""
+    """Return the biased exponent of floats >= 0, int32; for infinity that of the largest float."""
     unsigned, nmant, most = (jnp.uint32, 23, 0xFE) if x.dtype == jnp.float32 else (jnp.uint64, 52, 0x7FE)
     return jnp.minimum((lax.bitcast_convert_type(x, unsigned) >> unsigned(nmant)).astype(jnp.int32), most)
 
 
 def _cells_at(level: Array, corners: Array, low: Array, high: Array, radius: Array) -> tuple[Array, Array]:
-    """Return which of [b, lanes] cells hold each triangle, and whether all cells of its box were looked at, [b] bool."""
+    """Return which of [b, lanes] cells each triangle needs, and whether these lanes cover its whole box, [b] bool."""
     cells, there, complete = _box_cells(level, low, high)
     apart = _is_apart(cells, corners, scale_of(level, np.dtype(corners.dtype)), radius)
     return there & ~apart & complete[:, None], complete
 
 
 def _box_cells(level: Array, low: Array, high: Array) -> tuple[list[Array], Array, Array]:
-    """Number the cells of boxes: cells [b, lanes] axis by axis, which of them there are, and of which boxes these are all."""
+    """Return the cells of boxes [b, lanes] per axis, which lanes hold one, and which boxes have no further cells."""
     dim = low.shape[1]
     scale = scale_of(level, np.dtype(low.dtype))
     first, last = (cells_of(x, scale[:, None]) for x in (low, high))
@@ -180,15 +178,15 @@ def _box_cells(level: Array, low: Array, high: Array) -> tuple[list[Array], Arra
 def _is_apart(cells: list[Array], corners: Array, scale: Array, radius: Array) -> Array:
     """Say which cells [b, lanes] a direction separates from their triangle by the radius, in units of a cell.
 
-    Directions: the normal of the triangle, and those across one of its sides and an axis; in 2D the normal of the segment.
-    The sides of the box stand for the axes. Whatever rounding made of a direction: if it separates, it does.
+    Directions are the normal of the triangle and the cross products of a side and an axis; in 2D the normal of the segment. The
+    axes themselves are covered by the box. A direction need not be exact: whichever floats it has, it separates or not.
     """
     dim, dtype = corners.shape[1], corners.dtype
     x = [[(corners[:, c, k] * scale)[:, None] - (cells[k].astype(dtype) + 0.5) for k in range(dim)] for c in range(dim)]
     reach = (radius * scale)[:, None]
     fixed = [[(corners[:, c, k] * scale)[:, None] for k in range(dim)] for c in range(dim)]
     apart = jnp.zeros(cells[0].shape, bool)
-    nowhere = jnp.any(corners != corners, axis=(1, 2))[:, None]  # never, but only the data tell
+    nowhere = jnp.any(corners != corners, axis=(1, 2))[:, None]  # always False, but the compiler cannot know
     for direction in _directions(fixed, nowhere.astype(jnp.uint32 if dtype == jnp.float32 else jnp.uint64)):
         apart = apart | _separates(direction, x, reach)
     return apart
@@ -218,12 +216,12 @@ def _separates(direction: Vector, x: list[Vector], reach: Array) -> Array:
     for height, error in zip(heights[1:], doubt[1:], strict=True):
         least, most, largest = jnp.minimum(least, height), jnp.maximum(most, height), jnp.maximum(largest, error)
     room = (0.5 * whole + reach * jnp.sqrt(dot(direction, direction))) * (1 + 8 * eps) + 8 * eps * largest
-    sound = (whole > 2.0**-60) & (room < jnp.finfo(reach.dtype).max)  # squares neither vanish nor overflow
+    sound = (whole > 2.0**-60) & (room < jnp.finfo(reach.dtype).max)  # squares neither underflow nor overflow
     return sound & ((least > room) | (most < -room))
 
 
 def without_faults(vertices: Array, faces: Array) -> tuple[Array, Array, Array]:
-    """Return the corners [f, corner, axis] of triangles, which are finite [f] bool, and which have vertices that exist [f] bool."""
+    """Return triangle corners [f, corner, axis], which triangles are finite, and which have only valid indices: [f] bool each."""
     there = jnp.all((faces >= 0) & (faces < vertices.shape[0]), axis=1)
     if vertices.shape[0] == 0:
         return jnp.zeros((*faces.shape, vertices.shape[1]), vertices.dtype), jnp.ones_like(there), there

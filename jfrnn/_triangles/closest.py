@@ -1,4 +1,4 @@
-"""Nearest points on triangles (in 2D: segments), and on which side of a closed mesh a particle is."""
+"""Nearest points on triangles (in 2D: segments), and pseudonormals there."""
 
 from typing import NamedTuple
 
@@ -8,17 +8,17 @@ from jax import Array, lax
 from jfrnn._tracing import set_places
 from jfrnn._triangles.exact import Vector, cross, dot, minus
 
-# where the nearest point lies: corners are 0, 1, 2, sides (from that corner to the next) _SIDE + 0, 1, 2, the face _FACE
+# The feature on which the nearest point lies: corners 0, 1, 2; sides _SIDE + 0, 1, 2, from that corner to the next; _FACE.
 _SIDE, _FACE = 3, 6
-_BLOCK = 1 << 16  # slots in work at a time
+_BLOCK = 1 << 16  # slots processed at a time
 
 
 class Nearest(NamedTuple):
-    """Where the nearest points of shapes are, as seen from points.
+    """The nearest points of shapes, relative to points.
 
     Attributes:
-        vectors: From the point to its nearest, [..., d].
-        feature: On which corner, side or face it lies, [...] int32.
+        vectors: Vector from the point to its nearest point, [..., d].
+        feature: The corner, side or face on which that lies, [...] int32.
     """
 
     vectors: Array
@@ -28,14 +28,14 @@ class Nearest(NamedTuple):
 def nearest_of(points: Array, corners: Array) -> Nearest:
     """Compute the nearest points of closed shapes [..., corner, d] to points [..., d].
 
-    What is compared are a foot on each side and one on the face, each right for a shape whose corners are a few roundings of the
-    largest coordinate seen from the point away, so that distances are, too, even of slivers. Differentiable: to any order, also
-    where shapes are degenerate.
-    Source: Ericson (2005), Real-Time Collision Detection, sect. 5.1, for the feet.
+    The candidates are the foot of the point on each side and on the face. Each is exact for a shape whose corners are moved by a
+    few roundings of the largest coordinate relative to the point, so distances have that accuracy, even for slivers.
+    Differentiable: to any order, also for degenerate shapes. Source: Ericson (2005), Real-Time Collision Detection, sect. 5.1, for
+    the feet.
     """
     raw = corners - points[..., None, :]
     largest = lax.stop_gradient(jnp.max(jnp.abs(raw), axis=(-2, -1)))
-    unit = jnp.where(largest > 0, largest, 1)  # lengths around 1: no square leaves the float range
+    unit = jnp.where(largest > 0, largest, 1)  # lengths around 1, whose squares stay within the float range
     dim = points.shape[-1]
     x = [[raw[..., c, k] / unit for k in range(dim)] for c in range(dim)]
     best, foot, feature = None, [], jnp.zeros(unit.shape, jnp.int32)
@@ -65,11 +65,11 @@ def _nearer(
 
 
 def _foot_on_face(x: list[Vector]) -> tuple[Vector, Array]:
-    """Return the foot of the origin on a triangle, and its squared distance: infinite where it lies outside.
+    """Return the foot of the origin on a triangle, and its squared distance, which is infinite if the foot lies outside.
 
-    Its plane is spanned by one side and the height on it, made orthogonal twice, so that all is exact for a triangle whose corners
-    are a few roundings from the given ones, however thin; one as thin as a rounding is left to its sides.
-    Source: Giraud et al. (2005), doi:10.1007/s00211-005-0615-4, for the second time.
+    The plane is spanned by one side and the height on it, orthogonalized twice. So all results are exact for a triangle whose
+    corners are a few roundings from the given ones, however thin; one as thin as a rounding error is left to its sides.
+    Source: Giraud et al. (2005), doi:10.1007/s00211-005-0615-4, for the second orthogonalization.
     """
     side, slant = minus(x[1], x[0]), minus(x[2], x[0])
     length, thinnest = dot(side, side), (4 * jnp.finfo(side[0].dtype).eps) ** 2
@@ -91,13 +91,13 @@ def _foot_on_face(x: list[Vector]) -> tuple[Vector, Array]:
 
 
 class Rows(NamedTuple):
-    """Triangles near points, and where the nearest of each row is met.
+    """Triangles near points, and the feature of the nearest one in each row.
 
     Attributes:
-        idx: Shape [n, capacity], int32.
-        used: How many slots of each row are used, shape [n], int32.
+        idx: Triangle indices, shape [n, capacity], int32.
+        used: Number of slots in use per row, shape [n], int32.
         triangle: The nearest triangle, shape [n], int32.
-        feature: On which of its corners, sides or its face the nearest point lies, shape [n], int32.
+        feature: The corner, side or face of it on which the nearest point lies, shape [n], int32.
     """
 
     idx: Array
@@ -107,19 +107,20 @@ class Rows(NamedTuple):
 
 
 def pseudonormals(rows: Rows, faces: Array, corners: Array, good: Array, asked: Array) -> Array:
-    """Return unit pseudonormals at the nearest points of rows [n, d] that are `asked` for; 0 where shapes have no area.
+    """Return unit pseudonormals at the nearest points of the rows `asked` for, [n, d]; 0 if shapes have no area.
 
-    A face has its normal, a side the sum of those of the faces that share it, a vertex the sum over the faces around it, times
-    their angles; in 2D a vertex that of both segments. All of these faces are as near, so that they are in the same row.
-    Faces run counterclockwise as seen from outside; so do segments around what they enclose.
+    The pseudonormal of a face is its normal, that of a side the sum of the normals of the faces sharing it, and that of a vertex
+    the sum over the faces around it, weighted with their angles; in 2D a vertex has the sum of both segments. All these faces are
+    equally near, so they are in the same row. Faces run counterclockwise as seen from outside; so do segments around what they
+    enclose.
     Source: Baerentzen & Aanaes (2005), doi:10.1109/TVCG.2005.49.
 
     Args:
         rows: The rows.
-        faces: Vertices of shapes, shape [f, corner], int32.
-        corners: Shape [f, corner, d].
-        good: Which shapes there are, shape [f], bool.
-        asked: Shape [n], bool.
+        faces: Vertex indices of shapes, shape [f, corner], int32.
+        corners: Corners of shapes, shape [f, corner, d].
+        good: Which shapes are valid, shape [f], bool.
+        asked: Which rows to compute, shape [n], bool.
     """
     n, capacity = rows.idx.shape
     block = min(max(_BLOCK // capacity, 1), n)
@@ -143,7 +144,7 @@ def pseudonormals(rows: Rows, faces: Array, corners: Array, good: Array, asked: 
 
 
 def _weights(named: Array, nearest: Array, corners: Array, feature: Array) -> Array:
-    """Return what faces [b, k, corner] count at corners or sides [b] of the nearest ones [b, corner]: [b, k]."""
+    """Return the weights [b, k] of faces [b, k, corner] at the corners or sides [b] of the nearest faces [b, corner]."""
     dim = named.shape[2]
     start = jnp.take_along_axis(nearest, jnp.minimum(feature % _SIDE, dim - 1)[:, None], axis=1)
     has_start = named == start[..., None]
@@ -159,7 +160,7 @@ def _weights(named: Array, nearest: Array, corners: Array, feature: Array) -> Ar
 
 
 def _face_normals(corners: Array) -> Array:
-    """Return unit normals of shapes [..., corner, d]; 0 where a shape has no area (2D: length)."""
+    """Return unit normals of shapes [..., corner, d]; 0 for shapes without area (2D: length)."""
     along = corners[..., 1, :] - corners[..., 0, :]
     if corners.shape[-1] == 2:
         return _unit(jnp.stack([along[..., 1], -along[..., 0]], axis=-1))

@@ -1,4 +1,4 @@
-"""Which triangles near a particle are contacts of their own: those that only go on across a shared side or corner are not."""
+"""Contacts: select, among the triangles near a particle, one per wall; others only continue it across a side or corner."""
 
 from typing import NamedTuple
 
@@ -6,21 +6,21 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 _SIDE, _FACE = 3, 6  # as in `jfrnn._triangles.closest`
-_ROUNDING = 32  # of the largest coordinate as seen from the particle: distances are within 4, points on flat neighbors within a few
+_ROUNDING = 32  # error bound in eps of the largest relative coordinate: distances have 4, nearest points a few
 
 
 class _Slots(NamedTuple):
-    """What is known of each slot.
+    """The data of each slot.
 
     Attributes:
-        mask: It holds a pair, shape [n, k], bool.
-        triangle: Shape [n, k], int32.
-        named: Vertices of the triangle, shape [n, k, corner], int32.
-        start, end: Vertices of the corner (twice the same) or side on which the nearest point lies, shape [n, k]; -1: on neither.
-        order: 0 where the nearest point lies on a face, 1 on a side, 2 on a corner, shape [n, k], int32.
-        vectors: To the nearest points, shape [n, k, d].
-        distance: Shape [n, k].
-        error: Up to how far apart nearest points may be by rounding alone, shape [n, k].
+        mask: Whether the slot holds a pair, shape [n, k], bool.
+        triangle: Index of the triangle, shape [n, k], int32.
+        named: Vertex indices of the triangle, shape [n, k, corner], int32.
+        start, end: Vertices of the corner (twice the same) or side on which the nearest point lies, shape [n, k]; -1 for neither.
+        order: 0 if the nearest point lies on a face, 1 on a side, 2 on a corner, shape [n, k], int32.
+        vectors: Vectors to the nearest points, shape [n, k, d].
+        distance: Their lengths, shape [n, k].
+        error: Bound on the distance that rounding may put between equal nearest points, shape [n, k].
     """
 
     mask: Array
@@ -35,20 +35,20 @@ class _Slots(NamedTuple):
 
 
 def are_contacts(mask: Array, triangle: Array, faces: Array, seen: Array, vectors: Array, distance: Array, feature: Array) -> Array:
-    """Say which slots are contacts of their own, [n, k] bool.
+    """Say which slots are separate contacts, [n, k] bool.
 
-    A slot gives way where the triangle of another slot holds the corner or side on which its nearest point lies, or where rounding
-    does not tell that their nearest points are two, and the other comes first: by distance, by what is met (a face before a side
-    before a corner), then by index. The first of those that give way to one another remains.
+    A slot yields to another one that comes first if the other's triangle has the corner or side on which the slot's nearest point
+    lies, or if both nearest points are equal within rounding. Slots are ordered by distance, then by feature (face, side, corner),
+    then by index. The first of several such slots remains.
 
     Args:
         mask: Slots that hold a pair, shape [n, k], bool.
-        triangle: Shape [n, k], int32, 0 where masked.
-        faces: Vertices of triangles, shape [f, corner], int32.
-        seen: Corners as seen from the particle, shape [n, k, corner, d].
-        vectors: To the nearest points, shape [n, k, d].
+        triangle: Index of the triangle, shape [n, k], int32, 0 where masked.
+        faces: Vertex indices of triangles, shape [f, corner], int32.
+        seen: Corners relative to the particle, shape [n, k, corner, d].
+        vectors: Vectors to the nearest points, shape [n, k, d].
         distance: Their lengths, shape [n, k].
-        feature: Where the nearest point lies, shape [n, k], as in `jfrnn._triangles.closest`.
+        feature: The feature on which the nearest point lies, shape [n, k], as in `jfrnn._triangles.closest`.
     """
     dim = faces.shape[1]
     named, alone = faces[triangle], feature >= (_FACE if dim == 3 else _SIDE)
@@ -69,16 +69,16 @@ def are_contacts(mask: Array, triangle: Array, faces: Array, seen: Array, vector
 
 
 def _holds(one: _Slots, others: _Slots) -> Array:
-    """Say whether the triangle of a slot of each row, k = 1, holds the corners or sides on which nearest points of others lie."""
+    """Say whether the triangle of one slot per row (k = 1) has the corners or sides on which the nearest points of others lie."""
     start, end = (jnp.any(one.named == x[..., None], axis=2) for x in (others.start, others.end))
     return start & end
 
 
 def _is_same(one: _Slots, others: _Slots) -> Array:
-    """Say whether nearest points are one as far as rounding tells.
+    """Say whether nearest points are equal within rounding.
 
-    Feet on faces are as precise as coordinates. Which side or corner of touching triangles is nearest is told by distances alone,
-    whose error moves the nearest point by its root: sqrt(2 e r) at the distance r.
+    Feet on faces are as accurate as coordinates. The choice of a side or corner of touching triangles depends on distances alone,
+    whose error e at the distance r moves the nearest point by up to sqrt(2 e r).
     """
     apart = jnp.max(jnp.abs(one.vectors - others.vectors), axis=2)
     error = jnp.maximum(one.error, others.error)

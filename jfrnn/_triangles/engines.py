@@ -1,4 +1,4 @@
-"""The engines that look for triangles, in one table: how each sorts a wall, lists triangles, decides pairs and casts rays."""
+"""The table of engines for triangles: how each sorts a wall, lists triangles, decides pairs and casts rays."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,19 +16,19 @@ from jfrnn._triangles.warp import list_triangles as list_by_warp
 from jfrnn._triangles.warp import sort_triangles as sort_by_warp
 from jfrnn._triangles.winding import cast_rays
 
-Wall = Any  # a sorted wall: the `TriangleCells` or the `TriangleTree` that the engine's own `sort` returns
+Wall = Any  # a sorted wall: the `TriangleCells` or `TriangleTree` that the engine's `sort` returns
 
 
 class TriangleEngine(NamedTuple):
-    """One way to find triangles. Engines differ in speed, never in what they find.
+    """An engine that finds triangles. Engines differ in speed, never in their results.
 
     Attributes:
-        name: What users call it, as `backend`.
-        uses_warp: Whether it needs Warp, and so one of Warp's platforms.
+        name: The name that users pass as `backend`.
+        uses_warp: Whether it needs Warp, and one of Warp's platforms.
         sort: (corners [f, corner, axis], good [f], cutoff) -> the sorted wall.
         list: (positions, corners, wall, cutoff, capacity or None) -> rows [n, capacity] and true counts [n].
-        decide: Says which particles are near which triangles, as `rows.decide_pairs` does.
-        cast: Says which points are inside, as `winding.cast_rays` does.
+        decide: Decides which particles are near which triangles, as `rows.decide_pairs` does.
+        cast: Decides which points are inside, as `winding.cast_rays` does.
     """
 
     name: str
@@ -54,5 +54,5 @@ _FASTER = {"cpu": _TREE, "gpu": _CELLS}
 
 
 def fastest_of(platform: str, engine: Engine) -> TriangleEngine:
-    """Return the engine that "auto" takes for triangles where it takes this one for neighbors."""
+    """Return the engine that "auto" chooses for triangles on a platform where it chooses this one for neighbors."""
     return _FASTER.get(platform, _CELLS) if engine is WARP else _JAX

@@ -1,18 +1,18 @@
-"""Where a particle and a triangle (in 2D: a segment) are decided: distance < cutoff, exactly as on the given floats.
+"""The triangle test: decide whether a particle and a triangle (2D: segment) are closer than the cutoff, exactly.
 
-Step 1, in working precision, looks for a proof of either answer that holds whatever rounding did to the nearest point:
+Step 1, in working precision, looks for a proof of either answer that holds for any rounding of the nearest point:
 
 - near: a point of the triangle, sum of w_i v_i with w_i >= 0, that is closer than r;
 - far: a direction u along which all corners are at least r away, min of u·(v_i - p) >= r |u|.
 
-At the exact nearest point q, with u = q - p, both bounds meet (duality of convex distance), so that only pairs within rounding of
-the cutoff, or of thin triangles whose nearest point floats do not find, are left open. They go to integers
-(`_triangles_integers`).
+At the exact nearest point q, with u = q - p, both bounds coincide (duality of convex distance). So only pairs within rounding of
+the cutoff, or with thin triangles whose nearest point floats do not find, remain open. Integers decide them
+(`jfrnn._triangles.integers`).
 
-With u = eps/2: a component of v_i - p carries u, a product u more, sums of three 2u, in all at most 4u (1 + small) of the sum of
-absolute values, twice of which, 4 eps, is taken. Weights and directions are whatever floats came out: their errors do not matter,
-as long as all that is computed from one uses the same floats. A compiler may compute them once for each use, and join a product and
-a sum in one place but not in another: `steady` keeps it from that.
+Let u = eps/2. A component of v_i - p has a relative error u, a product adds u and a sum of three 2u: in all at most 4u (1 + small)
+of the sum of absolute values; 4 eps, twice as much, is used. Errors of weights and directions do not matter, as long as everything
+uses the same floats. A compiler may, however, compute them once per use, and fuse a product and a sum in one place but not in
+another; `steady` prevents that.
 """
 
 from collections.abc import Callable
@@ -28,28 +28,28 @@ from jfrnn._triangles.integers import Shapes, bit_range, is_near, limb_counts
 ShapesAt = Callable[[Array], Shapes]
 Vector = list[Array]
 
-_USUAL, _WIDE = 2, 3  # what an open pair waits for
-_USUAL_CHUNK = 256  # pairs that one round decides
+_USUAL, _WIDE = 2, 3  # open pairs: undecided yet, and too wide for the usual number of limbs
+_USUAL_CHUNK = 256  # pairs per iteration
 _WIDE_CHUNK = 8
 
 
 def is_near_of(points: Vector, corners: list[Vector], cutoff: Cutoff, shapes_at: ShapesAt, asked: Array, zero: Array) -> Array:
     """Decide [q] pairs of points and shapes, given axis by axis; False where not `asked`.
 
-    `shapes_at` gives the pairs at [k]; `zero` [q] is that of `steady`.
+    `shapes_at` returns the pairs at indices [k]; `zero` [q] is that of `steady`.
     """
     surely, open_pairs = sure_pairs(points, corners, cutoff, zero)
     return (surely & asked) | _refine(open_pairs & asked, shapes_at)
 
 
 def sure_pairs(points: Vector, corners: list[Vector], cutoff: Cutoff, zero: Array) -> tuple[Array, Array]:
-    """Return which pairs are near without doubt, and which are left open: [q] bool each."""
+    """Return which pairs are certainly near, and which are left open: [q] bool each."""
     scale = cutoff.unit_scale if cutoff.scaled else 1
     x = [[(v - p) * scale if cutoff.scaled else v - p for v, p in zip(corner, points, strict=True)] for corner in corners]
     radius = jnp.asarray(cutoff.radius * scale)
     weights, direction = _nearest(x, zero)
     largest = sum_of([jnp.abs(component) for component in direction])
-    unit = [component / largest for component in direction]  # squares that underflow then mean nothing
+    unit = [component / largest for component in direction]  # so scaled, squares that underflow do not matter
     near = _is_surely_near(x, weights, radius)
     return near, ~near & ~_is_surely_far(x, unit, radius)
 
@@ -72,7 +72,7 @@ def _is_surely_far(x: list[Vector], unit: Vector, radius: Array) -> Array:
 
 
 def _nearest(x: list[Vector], zero: Array) -> tuple[Vector, Vector]:
-    """Return weights of the corners that make about the nearest point, and about the direction to it from the origin."""
+    """Return corner weights of about the nearest point to the origin, and the direction to it."""
     sides = [(0, 1), (1, 2), (2, 0)] if len(x) == 3 else [(0, 1)]
     best, weights, foot = None, [], []
     for i, j in sides:
@@ -103,7 +103,7 @@ def _nearest(x: list[Vector], zero: Array) -> tuple[Vector, Vector]:
 
 
 def sum_of(parts: Vector) -> Array:
-    """Add arrays up, from the first on."""
+    """Add arrays in the given order."""
     total = parts[0]
     for part in parts[1:]:
         total = total + part
@@ -111,9 +111,9 @@ def sum_of(parts: Vector) -> Array:
 
 
 def steady(x: Array, zero: Array | None) -> Array:
-    """Return x in a way that no compiler sees through, so that a product stays a rounded product, wherever it is computed.
+    """Return x such that no compiler can fuse or recompute it differently: a product stays a rounded product.
 
-    `zero` [q] is an unsigned integer as wide as x that is 0 by what the data are alone: the sign bit of indices, for example.
+    `zero` [q] is an unsigned integer as wide as x that the data always make 0, for example the sign bit of indices.
     """
     if zero is None:
         return x
@@ -121,17 +121,17 @@ def steady(x: Array, zero: Array | None) -> Array:
 
 
 def zero_of(indices: Array, dtype: np.dtype) -> Array:
-    """Return the `zero` of indices >= 0 that come from memory, for floats of this dtype."""
+    """Return the `zero` of `steady` from indices >= 0 in memory, for floats of this dtype."""
     return (indices < 0).astype(jnp.uint32 if dtype == np.float32 else jnp.uint64)
 
 
 def dot(a: Vector, b: Vector, zero: Array | None = None) -> Array:
-    """Multiply vectors that are given axis by axis."""
+    """Return the scalar product of vectors given axis by axis."""
     return sum_of([steady(x * y, zero) for x, y in zip(a, b, strict=True)])
 
 
 def cross(a: Vector, b: Vector, zero: Array | None = None) -> Vector:
-    """Return the vector product of vectors in 3D."""
+    """Return the cross product of vectors in 3D."""
     pairs = ((1, 2), (2, 0), (0, 1))
     return [steady(a[i] * b[j], zero) - steady(a[j] * b[i], zero) for i, j in pairs]
 
@@ -146,7 +146,7 @@ def _combine(weights: Vector, x: list[Vector], zero: Array | None = None) -> Vec
 
 
 def _refine(open_pairs: Array, shapes_at: ShapesAt) -> Array:
-    """Decide the pairs that step 1 left open, a few at a time; False elsewhere. Costs nothing where none is open."""
+    """Decide the pairs that step 1 left open, a few at a time; False elsewhere. Does nothing if no pair is open."""
 
     def decide(open_pairs: Array) -> Array:
         state = jnp.where(open_pairs, _USUAL, 0).astype(jnp.int32)
@@ -158,14 +158,14 @@ def _refine(open_pairs: Array, shapes_at: ShapesAt) -> Array:
 
 
 def _decide(state: Array, waiting: int, chunk: int, shapes_at: ShapesAt) -> Array:
-    """Let integers decide [q] pairs that wait for these: 0 far, 1 near, or, where they are not wide enough, _WIDE."""
+    """Decide [q] waiting pairs by integers: 0 far, 1 near, or _WIDE if the integers are not wide enough."""
     size = len(state)
 
     def decide_chunk(carried: tuple[Array, Array]) -> tuple[Array, Array]:
         state, first = carried
         if waiting == _USUAL:
             at = set_places(state == waiting, chunk)
-        else:  # so rare that looking for more than the first of them is not worth its kernels
+        else:  # so rare that gathering more than those near the first one is not worth its kernels
             at = jnp.minimum(first, size - chunk) + lax.iota(jnp.int32, chunk)
             at = jnp.where(lax.dynamic_slice_in_dim(state, at[0], chunk) == waiting, at, size)
         shapes = shapes_at(jnp.minimum(at, size - 1))

@@ -1,18 +1,18 @@
-"""Whether a triangle lies within the cutoff of a point, in integers throughout: the last word, for what rounding leaves open.
+"""The triangle test in integers, without any rounding, for pairs that floats leave undecided.
 
-All that decides is signs of polynomials in x_i = v_i - p, the corners as the particle sees them (d_i = x_(i+1) - x_i):
+The decision needs only signs of polynomials in x_i = v_i - p, the corners relative to the particle (d_i = x_(i+1) - x_i):
 
 - a vertex is near:  |x_i|² < r²
 - a side is near between its ends:  0 < t < |d|²  and  (|x_i|² - r²) |d|² < t²,  with t = -x_i·d
 - the plane is near within the triangle:  (x_j × x_k)·n > 0 for each side  and  (x_0·n)² < r² |n|²,  with n = sum of x_j × x_k
 
-The distance is below r if and only if one of these holds: each of the three gives a point of the triangle closer than r, and
-the nearest point is a vertex, or inside a side, or inside the triangle. A nearest point on the border between two of them needs no
-care: the smaller one covers it, hence `>`. For degenerate triangles n, or d, is 0, and what they do not have is never near.
+The distance is below r if and only if one of these holds: each implies a point of the triangle closer than r, and the nearest point
+is a vertex, or inside a side, or inside the triangle. A nearest point on the border between two of these belongs to the smaller
+one, hence `>`. For degenerate triangles n or d is 0, and the conditions with it are false.
 
-Coordinates are written as whole multiples of one power of two, in limbs (`jfrnn._geometry.integers`): as many as a pair usually
-takes, or, where exponents lie far apart, as the float format can take. The longest sum of products of carried limbs, of which one
-takes up to 27 (float64: 82), is of 2·4·27 (2·4·82) of them: below 2^30.5 (2^61.5).
+Coordinates are whole multiples of one power of two, in limbs (`jfrnn._geometry.integers`): as many as pairs usually need or, if
+exponents lie far apart, as the float format may need. The longest sum of products of carried limbs has 2·4·27 (float64: 2·4·82)
+terms and stays below 2^30.5 (2^61.5).
 """
 
 import functools
@@ -25,17 +25,17 @@ from jax import Array, lax
 
 from jfrnn._geometry import GUARDS, carry_limbs, fields_of, full_count, limb_sign, limbs_of
 
-_NONE = 1 << 20  # beyond every place of a bit
-_MOST_PRODUCTS = 64  # of a round
-_USUAL_LIMBS = {4: 5, 8: 4}  # by bytes of a float: 55 and 104 bits from the highest to the lowest one set
+_NONE = 1 << 20  # larger than any bit position
+_MOST_PRODUCTS = 64  # most products per round
+_USUAL_LIMBS = {4: 5, 8: 4}  # by bytes of a float; enough for 55 and 104 bits between the highest and lowest set bit
 
 
 class Shapes(NamedTuple):
-    """Points and the corners of what they are compared with.
+    """Points and the corners of the shapes they are compared with.
 
     Attributes:
-        points: [d, k].
-        corners: [d, d, k]: corner, axis. Triangles in 3D, segments in 2D.
+        points: [d, k] coordinates.
+        corners: [d, d, k]: corner, axis; triangles in 3D, segments in 2D.
         radius: [] the cutoff.
     """
 
@@ -45,12 +45,12 @@ class Shapes(NamedTuple):
 
 
 def limb_counts(dtype: np.dtype) -> tuple[int, int]:
-    """Return how many limbs hold the numbers of a usual pair, and how many those of any pair."""
+    """Return how many limbs the numbers of a usual pair need, and those of any pair."""
     return _USUAL_LIMBS[dtype.itemsize], full_count(dtype)
 
 
 def bit_range(shapes: Shapes) -> tuple[Array, Array]:
-    """Return the place of the lowest bit set in any number of a pair, and how many bits reach from it to the highest: [k]."""
+    """Return the position of the lowest set bit in any number of a pair, and the number of bits from it to the highest: [k]."""
     _, place, mantissa = fields_of(_numbers(shapes))
     lowest = place + _trailing_zeros(mantissa)
     highest = place + 8 * mantissa.dtype.itemsize - lax.clz(mantissa).astype(jnp.int32)
@@ -60,18 +60,18 @@ def bit_range(shapes: Shapes) -> tuple[Array, Array]:
 
 
 def is_near(shapes: Shapes, origin: Array, count: int) -> Array:
-    """Decide [k] pairs whose bits lie within `count` limbs from `origin` [k] on: is the triangle closer than the cutoff?"""
+    """Decide [k] pairs whose bits lie within `count` limbs from position `origin` [k]: is the shape closer than the cutoff?"""
     dim = shapes.points.shape[0]
     numbers = _numbers(shapes)
     points, corners, radius = np.tile(np.arange(dim), dim), np.arange(dim, dim + dim * dim), len(numbers) - 1
     after = np.roll(corners.reshape(dim, dim), -1, axis=0).reshape(-1)
     ends, starts = np.concatenate([corners, after, [radius, radius]]), np.concatenate([points, corners, [radius, radius]])
-    limbs, lower = (limbs_of(_rows(numbers, rows), count + 1, origin[None]) for rows in (ends, starts))  # one more for the sign
-    times = (np.arange(len(ends)) != len(ends) - 2).astype(limbs.dtype)[:, None, None]  # nothing is taken off the cutoff
+    limbs, lower = (limbs_of(_rows(numbers, rows), count + 1, origin[None]) for rows in (ends, starts))  # and one for the sign
+    times = (np.arange(len(ends)) != len(ends) - 2).astype(limbs.dtype)[:, None, None]  # nothing is subtracted from the cutoff
     vectors = carry_limbs(limbs - lower * times)
     one = np.zeros((len(ends), 1, count + 1), limbs.dtype)
     one[-1, 0, 0] = 1
-    vectors = vectors + one  # corners seen from the point, sides, the cutoff and one: [rows, k, limbs]
+    vectors = vectors + one  # relative corners, sides, the cutoff and 1: [rows, k, limbs]
     return _near_triangle(vectors) if dim == 3 else _near_segment(vectors)
 
 
@@ -87,9 +87,9 @@ def _near_segment(vectors: Array) -> Array:
 
 
 def _near_triangle(vectors: Array) -> Array:
-    """Decide in three rounds: products of rows of the round before, and sums of products, as tables say.
+    """Decide in three rounds, each computing products of the previous round's rows and sums of them, as given by tables.
 
-    A table makes one kernel of what were dozens, which took XLA seconds to compile.
+    With tables, each round is one kernel instead of dozens, which took XLA seconds to compile.
     """
     found, signs = vectors, []
     for left, right, table in _triangle_rounds():
@@ -105,22 +105,22 @@ def _rows(x: Array, which: np.ndarray) -> Array:
 
 
 def _sum_rows(table: np.ndarray, products: Array) -> Array:
-    """Return sums [rows, k, limbs] of products [n, k, limbs]: of a table [rows, n] of 1, -1 and 0, what belongs to each."""
+    """Return sums [rows, k, limbs] of products [n, k, limbs] with the coefficients 1, -1 and 0 of a table [rows, n]."""
     terms = int(np.abs(table).sum(axis=1).max())
-    which = np.argsort(table == 0, axis=1, kind="stable")[:, :terms]  # those that belong to it first
+    which = np.argsort(table == 0, axis=1, kind="stable")[:, :terms]  # nonzero coefficients first
     signs = np.take_along_axis(table, which, axis=1).astype(products.dtype)[:, :, None, None]
     return (_rows(products, which) * signs).sum(axis=1, dtype=products.dtype)
 
 
 class _Table:
-    """Products that are to be computed, each of two rows, and sums of them: vectors of 1, -1 and 0."""
+    """Products of two rows each, and sums of products, as vectors of the coefficients 1, -1 and 0."""
 
     def __init__(self) -> None:
         self.left: list[int] = []
         self.right: list[int] = []
 
     def dot(self, left: Iterable[int], right: Iterable[int], signs: Sequence[int] = (1, 1, 1)) -> np.ndarray:
-        """Return the sum of the products of these rows."""
+        """Return the coefficients of the sum of products of these rows."""
         total = np.zeros(_MOST_PRODUCTS, np.int32)
         for a, b, sign in zip(left, right, signs, strict=False):
             total[len(self.left)] = sign
@@ -129,16 +129,16 @@ class _Table:
         return total
 
     def make(self, sums: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the rows of both factors of each product, and the table of sums."""
+        """Return the first and the second factor of each product, and the table of sums."""
         return np.array(self.left), np.array(self.right), np.stack(sums)[:, : len(self.left)]
 
 
 @functools.cache
 def _triangle_rounds() -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]:
-    """Return the products and sums of `_near_triangle`: of x, sides, the cutoff r and one, axis by axis, in 20 rows.
+    """Return the products and sums of `_near_triangle`, whose 20 input rows are x, sides, the cutoff r and 1, axis by axis.
 
-    The first round makes |x|² - r², t, |d|², |d|² - t, x_j × x_k, n, r², x_0 and one; the second what decides sides and the inside,
-    then |n|², x_0·n and r²; the third (x_0·n)² - r² |n|².
+    The first round computes |x|² - r², t, |d|², |d|² - t, x_j × x_k, n, r², x_0 and 1; the second the conditions of sides and of
+    the inside, |n|², x_0·n and r²; the third (x_0·n)² - r² |n|².
     """
     x, along, axes = np.arange(9).reshape(3, 3), np.arange(9, 18).reshape(3, 3), ((1, 2), (2, 0), (0, 1))
     table, of_corners = _Table(), range(3)
@@ -159,12 +159,12 @@ def _triangle_rounds() -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]:
 
 
 def _near_parts(square: Array, place: Array, rest: Array, beside: Array) -> Array:
-    """Say where a vertex is near, or a side between its ends, of the signs of what decides it: [parts, k]."""
+    """Say which vertices, and which sides between their ends, are near, from the signs of their conditions: [parts, k]."""
     return jnp.any(square < 0, axis=0) | jnp.any((place > 0) & (rest > 0) & (beside < 0), axis=0)
 
 
 def _product(a: Array, b: Array) -> Array:
-    """Multiply as `limb_product`, limb by limb: in a fifth of the time where there are many rows, and a loop to compile."""
+    """Multiply like `limb_product`, limb by limb: a fifth of its time for many rows, but a loop to compile."""
     shape, width = jnp.broadcast_shapes(a.shape[:-1], b.shape[:-1]), b.shape[-1]
 
     def add_moved(i: Array, total: Array) -> Array:
@@ -186,7 +186,7 @@ def _trailing_zeros(word: Array) -> Array:
 
 
 def _dots(pairs: list[tuple[Array, Array]]) -> Array:
-    """Multiply pairs of vectors [axis, k, limbs]: [pairs, k, limbs]."""
+    """Return scalar products of pairs of vectors [axis, k, limbs]: [pairs, k, limbs]."""
     left, right = (jnp.stack(vectors) for vectors in zip(*pairs, strict=True))
     return _product(left, right).sum(axis=1, dtype=left.dtype)
 

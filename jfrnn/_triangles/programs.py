@@ -1,4 +1,4 @@
-"""The compiled program of a search for triangles, and the counting that finds a capacity for it."""
+"""The compiled program of a triangle search, and the count that determines its capacity."""
 
 import functools
 import math
@@ -16,7 +16,7 @@ from jfrnn._triangles.engines import TriangleEngine, Wall
 
 
 def count_slots(points: Array, vertices: Array, faces: Array, cutoff: float, engine: TriangleEngine, slack: float) -> int:
-    """Count the triangles near concrete positions and return a capacity that holds `slack` times the longest row."""
+    """Count the triangles near concrete positions; return a capacity of `slack` times the longest row."""
     with at_once(), own_transfers():
         found = find_fields(points, vertices, faces, None, cutoff, engine, None)
         longest = int(found["required"])
@@ -32,7 +32,7 @@ def find_fields(
     engine: TriangleEngine,
     capacity: int | None,
 ) -> dict[str, Any]:
-    """Return the fields of a list that come from data; with capacity=None only counts. `cells`: an earlier list's sorted wall."""
+    """Return the list's fields that come from data, or only counts if capacity=None. `cells`: an earlier list's sorted wall."""
     radius = make_cutoff(cutoff, np.dtype(points.dtype), closed=False)
     with own_transfers():
         find = functools.partial(find_triangles, engine=engine, capacity=capacity)
@@ -51,7 +51,7 @@ def find_triangles(
 ) -> dict[str, Any]:
     """List or count triangles: the compiled program of a search.
 
-    With a list come the wall and its cells, so that, as results, they share no memory with the caller's arrays or another list.
+    The wall and its sorted form are returned too, so that as results they share no memory with the caller's arrays or another list.
     """
     corners, finite, there = without_faults(vertices, faces)
     sound = {

@@ -1,4 +1,4 @@
-"""The array engine of triangles: each particle meets the triangles of its cells, in chunks of candidates of a fixed size."""
+"""The array engine for triangles: tests each particle against the triangles of its cells, in chunks of candidates."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,28 +14,28 @@ from jfrnn._triangles.closest import nearest_of
 from jfrnn._triangles.exact import is_near_of, zero_of
 from jfrnn._triangles.integers import Shapes
 
-Decide = Callable[[Array, Array, Array, Array, Cutoff, Array], Array]  # `decide_pairs`, or what answers like it
+Decide = Callable[[Array, Array, Array, Array, Cutoff, Array], Array]  # the type of `decide_pairs`
 
-_BLOCK = 1 << 16  # particles in work at a time
-_CHUNK = 1 << 14  # candidates in work at a time
-_MOST_PAIRS = 2**31  # that int32 numbers
+_BLOCK = 1 << 16  # particles processed at a time
+_CHUNK = 1 << 14  # candidates processed at a time
+_MOST_PAIRS = 2**31  # int32 numbers fewer pairs than this
 
 
 class _Run(NamedTuple):
-    """Candidates of the particles of a block, of one size of cells: particle i has those up to place[i] of them all."""
+    """Candidates of a block of particles at one cell level; those of particle i end at place[i]."""
 
-    level: Array  # []
-    place: Array  # [b] int32, cumulative
-    start: Array  # [b] first entry
-    size: Array  # [b] their number
+    level: Array  # [] int32
+    place: Array  # [b] int32, cumulative number of candidates
+    start: Array  # [b] first entry of the particle's bucket
+    size: Array  # [b] number of entries
 
 
 def list_triangles(
     positions: Array, corners: Array, cells: TriangleCells, cutoff: Cutoff, capacity: int | None
 ) -> tuple[Array, Array]:
-    """List the triangles near every particle, n > 0 and f > 0: [n, capacity] int32, unused slots f, and true counts [n] int32.
+    """List the triangles near n > 0 particles of f > 0: [n, capacity] int32, unused slots f, and true counts [n] int32.
 
-    Rows are in the order of cell sizes, then of triangles. With capacity=None only the counts are made; rows then are [n, 0].
+    Rows are ordered by cell level, then by triangle. With capacity=None only the counts are made, and rows are [n, 0].
     """
     (n, dim), faces, slots = positions.shape, corners.shape[0], capacity or 0
     block = max(min(_BLOCK, n, (_MOST_PAIRS - _CHUNK) // (faces + 1)), 1)
@@ -67,7 +67,7 @@ def list_triangles(
 def _add_run(
     run: _Run, own: Array, corners: Array, cells: TriangleCells, cutoff: Cutoff, first: Array, found: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """Decide the candidates of a run, and put those that are near at the ends of the rows of their particles."""
+    """Decide the candidates of a run, and append those that are near to the rows of their particles."""
     block, faces, total = own.shape[0], corners.shape[0], run.place[-1]
 
     def add_chunk(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -81,7 +81,7 @@ def _add_run(
         known = jnp.minimum(triangle, faces - 1)
         near = decide_pairs(own, corners, particle, known, cutoff, there & (cells.level_of[known] == run.level))
         hits = jnp.cumsum(near, dtype=jnp.int32) - near.astype(jnp.int32)
-        rank = hits - hits[jnp.maximum(before - begin, 0)]  # among those of its particle in this chunk
+        rank = hits - hits[jnp.maximum(before - begin, 0)]  # rank among the hits of its particle in this chunk
         slot = jnp.where(near, count[particle] + rank, rows.shape[1])
         rows = rows.at[first + particle, slot].set(triangle, mode="drop")
         return chunk + 1, rows, count.at[particle].add(near.astype(jnp.int32))
@@ -106,19 +106,19 @@ def decide_pairs(own: Array, corners: Array, particle: Array, triangle: Array, c
 def nearest_slots(
     points: Array, corners: Array, idx: Array, count: Array, good: Array, cutoff: Cutoff, decide: Decide = decide_pairs
 ) -> tuple[Array, Array]:
-    """Find the nearest triangle of each row, n > 0 and f > 0, in chunks of as many pairs as there are particles in a block.
+    """Find the nearest triangle in each row, for n > 0 and f > 0, in chunks of one pair per particle of a block.
 
     Args:
-        points: Shape [n, d].
-        corners: Shape [f, corner, d].
+        points: Points, shape [n, d].
+        corners: Corners of triangles, shape [f, corner, d].
         idx: Rows, shape [n, capacity], int32.
-        count: How many slots of a row are used, shape [n], int32.
-        good: Which triangles are such, shape [f], bool.
-        cutoff: Triangles that are not closer do not count, exactly.
-        decide: Says which pairs are closer.
+        count: Number of slots in use per row, shape [n], int32.
+        good: Which triangles are valid, shape [f], bool.
+        cutoff: Only triangles closer than this count, exactly.
+        decide: Decides which pairs are closer.
 
     Returns:
-        The slot of the nearest, the first of those as near, shape [n], int32, and whether there is one, shape [n], bool.
+        The slot of the nearest triangle, of equally near ones the first, shape [n], int32, and whether there is one, [n] bool.
     """
     n, capacity = idx.shape
     block = max(min(n, (_MOST_PAIRS - n) // capacity), 1)

@@ -1,12 +1,12 @@
-"""A tree of boxes around triangles (in 2D: segments), the other structure in which a search looks for them.
+"""A tree of bounding boxes around triangles (in 2D: segments), the alternative to cells.
 
-Triangles stand along a Hilbert curve through the middles of their boxes; each `WIDTH` of them share a node, each `WIDTH` nodes one
-above, up to the children of the root (Kamel & Faloutsos 1993, doi:10.1145/170088.170403). So a tree is made by sorting and by
-minima and maxima of rows, in arrays whose shapes the number of triangles tells: inside `jax.jit`, too. The curve tells a millionth
-of the extent of all middles apart, so that a few triangles far away leave the others in order.
+Triangles are sorted along a Hilbert curve through the centers of their boxes; each `WIDTH` of them share a node, each `WIDTH` nodes
+a parent, up to the children of the root (Kamel & Faloutsos 1993, doi:10.1145/170088.170403). The tree is thus made by a sort and by
+row-wise minima and maxima, in arrays whose shapes follow from the number of triangles, so it can be made inside `jax.jit`. The
+curve resolves a millionth of the extent of all centers, so a few distant triangles leave the order of the others intact.
 
-Why no pair is missed: the box of a triangle is wider by r' on each side, slightly more than the cutoff, and holds all particles
-that are nearer, since rounding is monotone and a particle is a float; the box of a node holds those of its children.
+No pair is missed: a triangle's box is widened by r', slightly more than the cutoff, and holds all particles that are nearer,
+because rounding is monotonic and coordinates are floats; the box of a node holds those of its children.
 """
 
 from typing import NamedTuple
@@ -18,16 +18,16 @@ from jax import Array
 from jfrnn._geometry import Cutoff, hilbert_order
 
 WIDTH = 16  # children of a node
-_CELL = 2.0**-20  # of the curve, beside the extent of the middles of boxes
+_CELL = 2.0**-20  # cell of the curve, relative to the extent of all box centers
 
 
 class TriangleTree(NamedTuple):
     """Triangles in a tree of boxes. A pytree.
 
     Attributes:
-        triangles: Indices of triangles along the curve, shape [leaves], int32, their number behind the last.
-        boxes: Corners of boxes, wider by the cutoff, axis by axis, the low ones first: shape [2 d, entries]; of the leaves, then
-            of nodes, level by level. Where there is none, a box is empty: from infinity to -infinity.
+        triangles: Triangle indices along the curve, shape [leaves], int32, padded with the number of triangles.
+        boxes: Corners of boxes widened by the cutoff, the low ones axis by axis, then the high ones, shape [2 d, entries]; first
+            the leaves, then the nodes level by level. Unused boxes are empty: from infinity to -infinity.
     """
 
     triangles: Array
@@ -35,7 +35,7 @@ class TriangleTree(NamedTuple):
 
 
 def level_starts(faces: int) -> np.ndarray:
-    """Return the first entry of each level, the leaves first, and the number of all, shape [levels + 1], int32."""
+    """Return the first entry of each level, leaves first, and the total number of entries, shape [levels + 1], int32."""
     ends = [0]
     while True:
         size = -(-faces // WIDTH) * WIDTH
@@ -46,20 +46,20 @@ def level_starts(faces: int) -> np.ndarray:
 
 
 def boxes_around(corners: Array, cutoff: Cutoff) -> tuple[Array, Array]:
-    """Return the corners, low and high, [f, d] each, of boxes that hold all particles near triangles [f, corner, axis]."""
-    wide = jnp.asarray(cutoff.radius) * (1 + 8 * jnp.finfo(corners.dtype).eps)  # subtraction rounds monotonously
+    """Return low and high corners, [f, d] each, of boxes that hold all particles near triangles [f, corner, axis]."""
+    wide = jnp.asarray(cutoff.radius) * (1 + 8 * jnp.finfo(corners.dtype).eps)  # wide enough, as subtraction rounds monotonically
     return jnp.min(corners, axis=1) - wide, jnp.max(corners, axis=1) + wide
 
 
 def grow_tree(corners: Array, good: Array, cutoff: Cutoff) -> TriangleTree:
-    """Put triangles [f, corner, axis] with f > 0 into a tree; those that are not `good` [f] bool are in no box."""
+    """Sort triangles [f, corner, axis] with f > 0 into a tree; those that are not `good` [f] bool are in no box."""
     faces, dim = corners.shape[:2]
     low, high = boxes_around(corners, cutoff)
     middle = jnp.where(good[:, None], 0.5 * low + 0.5 * high, jnp.nan)
     finite, finfo = jnp.isfinite(middle), jnp.finfo(corners.dtype)
     least = jnp.min(middle, axis=0, initial=finfo.max, where=finite)
     most = jnp.max(middle, axis=0, initial=finfo.min, where=finite)
-    cell = jnp.max(most * _CELL - least * _CELL)  # the extent itself may be more than a float holds
+    cell = jnp.max(most * _CELL - least * _CELL)  # scaled first, as the extent itself may overflow
     order = hilbert_order(middle, jnp.clip(cell, finfo.tiny, finfo.max))
     low, high = jnp.where(good[:, None], low, jnp.inf)[order].T, jnp.where(good[:, None], high, -jnp.inf)[order].T
     levels = []

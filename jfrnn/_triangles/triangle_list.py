@@ -1,4 +1,4 @@
-"""The result of a search for triangles, and what it computes at the positions of particles."""
+"""The result of a triangle search, and the geometry that it computes at the positions of particles."""
 
 import dataclasses
 import functools
@@ -36,15 +36,15 @@ from jfrnn._triangles.winding import is_closed, least_winding, ray_ways
 
 
 class SignedDistance(NamedTuple):
-    """On which side of a closed wall particles are.
+    """Distances to a closed wall, negative inside.
 
     Attributes:
-        distance: To the nearest triangle of the row [length], shape [n]: negative inside, 0 where there is none within the cutoff.
-        mask: There is one, shape [n], bool.
-        normal: Where the distance grows fastest, of unit length, shape [n, d]: away from the wall outside, toward it inside; at
-            contact the pseudonormal; 0 where there is no triangle.
-        watertight: Triangles run through each side as often one way as the other (in 2D, as many segments begin at each vertex as
-            end there), shape [], bool. Where False, they enclose nothing, and signs tell the sides of faces alone.
+        distance: Distance to the nearest triangle of the row [length], shape [n]: negative inside, 0 if none is within the cutoff.
+        mask: Whether there is a triangle within the cutoff, shape [n], bool.
+        normal: Unit vector along which the distance grows fastest, shape [n, d]: away from the wall outside, toward it inside; at
+            contact the pseudonormal; 0 if there is no triangle.
+        watertight: Whether each side is run through equally often in both directions (in 2D, equally many segments start and end at
+            each vertex), shape [], bool. If False, the wall encloses nothing, and signs only tell the sides of faces.
     """
 
     distance: Array
@@ -56,20 +56,20 @@ class SignedDistance(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TriangleList:
-    """Hold the triangles (in 2D: segments) near n particles, one row of `capacity` slots per particle. A pytree.
+    """The triangles (in 2D: segments) near n particles, one row of `capacity` slots per particle. A pytree.
 
     Attributes:
-        idx: Indices of triangles, shape [n, capacity], int32; the first min(count, capacity) slots are used, the others hold f.
+        idx: Triangle indices, shape [n, capacity], int32; the first min(count, capacity) slots are used, the others hold f.
         count: True number of triangles per row, shape [n], int32; it may exceed the capacity.
         status: Bits of `Status`, shape [], int32.
         required: The capacity that holds every row, shape [], int32; like the status, over all updates.
         vertices: Corners of the wall [length], shape [v, d].
-        faces: Vertices of each triangle, shape [f, d], int32.
-        cells: The wall, sorted into cells (`TriangleCells`) or, by "bvh", in a tree (`TriangleTree`); None where there is none.
+        faces: Vertex indices of each triangle, shape [f, d], int32.
+        cells: The wall, sorted into cells (`TriangleCells`) or, by "bvh", into a tree (`TriangleTree`); None without triangles.
         cutoff: Distance [length], rounded to the dtype of the positions. Static.
         backend: The engine that made the list. Static.
-        closed: What `signed_distance` needs to know of faces alone, shape [], bool: they bound a solid. None where faces were
-            traced; each call then finds out.
+        closed: Whether the faces bound a solid, shape [], bool, for `signed_distance`. None if faces were traced; each call then
+            determines it.
     """
 
     idx: Array
@@ -84,7 +84,7 @@ class TriangleList:
     closed: Array | None = None
 
     def __repr__(self) -> str:
-        """Say in a line what it holds; waits for the device."""
+        """Summarize the list in a line; waits for the device."""
         *batch, n, capacity = shape_of(self.idx)
         rows = f"batch of {batch}, {n} particles" if batch else f"{n} particles"
         faces = shape_of(self.faces)[-2]
@@ -102,19 +102,19 @@ class TriangleList:
 
     @property
     def overflow(self) -> Array:
-        """Say whether a row lost triangles, shape [], bool."""
+        """Whether a row lost triangles, shape [], bool."""
         with own_transfers():
             return (self.status & Status.ROW_OVERFLOW.value) != 0
 
     def update(self, positions: Array, *, vertices: Array | None = None) -> "TriangleList":
-        """Make the list anew at these positions, in the same shapes: a step of a simulation inside `jax.jit` or `lax.scan`.
+        """Rebuild the list at these positions, in the same shapes: a simulation step inside `jax.jit` or `lax.scan`.
 
-        Status bits and `required` are kept over all updates; look at `overflow` after a chunk of steps, `grow` and run it again.
+        Status bits and `required` are kept over all updates; read `overflow` after a chunk of steps, `grow` and run it again.
 
         Args:
-            positions: Particles [length], shape [n, d], where they are now. Where the wall moves as a whole: in its frame.
-            vertices: Corners [length], shape [v, d], where the wall is deformed: it is then sorted anew. Default: those that the
-                list has, whose cells or tree it keeps.
+            positions: Particles [length], shape [n, d], where they are now; for a wall that moves as a whole, in the wall's frame.
+            vertices: Corners [length], shape [v, d], of a deformed wall, which is then sorted again. Default: the vertices of the
+                list, whose cells or tree are reused.
 
         Returns:
             A `TriangleList` of the same shapes and options.
@@ -131,15 +131,15 @@ class TriangleList:
         return dataclasses.replace(self, **found, closed=self._copy_closed())
 
     def grow(self, positions: Array, *, vertices: Array | None = None, slack: float = 1.25) -> "TriangleList":
-        """Make a list with room for what overflowed, at these positions. Not inside jit: the capacity is a shape.
+        """Make a list with a capacity that suffices at these positions. Not inside jit: the capacity is a shape.
 
         Args:
             positions: As in `update`.
             vertices: As in `update`.
-            slack: Factor >= 1 on the longest row that was ever met, here or by updates of this list.
+            slack: Factor >= 1 on the longest row so far, including updates of this list.
 
         Returns:
-            A `TriangleList` with the same options, a capacity not smaller than before, and no bits from the past.
+            A `TriangleList` with the same options, a capacity not smaller than before, and status bits cleared.
 
         Raises:
             TypeError: positions, vertices or the list are traced.
@@ -156,7 +156,7 @@ class TriangleList:
         return dataclasses.replace(self, **found, closed=self._copy_closed())
 
     def _copy_closed(self) -> Array | None:
-        """Return `closed` for a list made of this one: no two lists share memory, either may be donated."""
+        """Return a copy of `closed` for a new list: no two lists share memory, so either may be donated."""
         return None if self.closed is None else jnp.array(self.closed, copy=True)
 
     def check(self) -> None:
@@ -164,7 +164,7 @@ class TriangleList:
 
         Raises:
             NeighborOverflowError: a row holds more triangles than `capacity`; `.required` is the capacity needed.
-            ValueError: positions or vertices hold NaN or infinity, or faces name vertices that do not exist.
+            ValueError: positions or vertices hold NaN or infinity, or faces have indices that no vertex has.
             TypeError: called on a list that is being traced.
         """
         if isinstance(self.status, Tracer):
@@ -175,31 +175,31 @@ class TriangleList:
             raise ValueError(status.message)
 
     def _check_rows(self) -> None:
-        """Raise where rows are known to lack triangles: not on a list that is being traced."""
+        """Raise if rows are known to lack triangles; a traced list is not checked."""
         if Status.ROW_OVERFLOW in (known_status(self.status) or Status.OK):
             raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self.capacity)
 
     def closest(self, positions: Array, *, vertices: Array | None = None) -> tuple[Array, Array, Array]:
-        """Compute the nearest point of every triangle of a row.
+        """Compute the nearest point of every triangle in a row.
 
-        Distances, of slivers too, are within 4 eps of the dtype times the largest coordinate of a corner as seen from the particle:
-        what rounding moves is a triangle's corners, by as much. The mask is exact.
+        Distances, also to slivers, are accurate to 4 eps of the dtype times the largest coordinate of a corner relative to the
+        particle: rounding has the effect of moving a triangle's corners by that much. The mask is exact.
 
         Args:
             positions: Particles [length], shape [n, d], where they are now.
-            vertices: Corners [length], shape [v, d]; default: those that the list has, constants to derivatives.
+            vertices: Corners [length], shape [v, d]; default: those of the list, as constants in derivatives.
 
         Returns:
-            Points [length], shape [n, capacity, d], the particle's own in masked slots; distances [length], shape [n, capacity], 0
-            there; and the mask, shape [n, capacity], bool: the slot is used and its triangle is closer than the cutoff, at these
-            positions and exactly.
+            Points [length], shape [n, capacity, d], the particle's own position in masked slots; distances [length], shape [n,
+            capacity], 0 there; and the mask, shape [n, capacity], bool: the slot is used and its triangle is closer than the cutoff
+            at these positions, exactly.
 
         Raises:
             ValueError, TypeError: an argument does not fit the list.
-            NeighborOverflowError: outside jit, a row lacks triangles; inside, look at `overflow`.
+            NeighborOverflowError: outside jit, a row lacks triangles; inside, read `overflow`.
 
-        Differentiable: to any order in positions and vertices, where the nearest point does not jump; the gradient of a distance
-        of 0 is 0. Jit: yes. vmap: yes. Source: Ericson (2005), sect. 5.1.
+        Differentiable: to any order in positions and vertices, where the nearest point does not jump; the gradient of a distance of
+        0 is 0. Jit: yes. vmap: yes. Source: Ericson (2005), sect. 5.1.
         """
         points, corners = self._check_points(positions, vertices)
         self._check_rows()
@@ -212,14 +212,14 @@ class TriangleList:
     def contacts(self, positions: Array, *, vertices: Array | None = None) -> tuple[Array, Array, Array]:
         """Compute the contacts of spheres with walls: the nearest points of `closest`, one per wall instead of one per triangle.
 
-        A triangle gives way to another one of its row that holds the corner or side on which its nearest point lies and that is
-        nearer, or as near and of a lower index; so does one of two whose nearest points are the same within rounding. A sphere has
-        one contact on a flat wall of many triangles, over a convex edge and over a corner, and one per wall in a concave edge or
-        corner. On a surface that curves around it, such as the inside of a pipe, it has one with each triangle whose face it is
+        A triangle yields to another one of its row that has the corner or side on which its nearest point lies and that is nearer,
+        or equally near with a lower index; so does one of two triangles whose nearest points are equal within rounding. A sphere
+        has one contact on a flat wall of many triangles, over a convex edge and over a corner, and one per wall in a concave edge
+        or corner. On a surface that curves around it, such as the inside of a pipe, it has one with each triangle whose face it is
         over. The nearest triangle of a row is always a contact.
 
-        Triangles are neighbors by the numbers of their vertices: `jfrnn.merge_vertices` joins those that are written apart, as in
-        STL files. A vertex in the middle of a side, which the triangle there does not have, joins nothing: contacts may double.
+        Triangles are adjacent if they share vertex indices: `jfrnn.merge_vertices` joins vertices that are stored separately, as in
+        STL files. A vertex in the middle of another triangle's side joins nothing; contacts may double there.
 
         Args:
             positions: As in `closest`.
@@ -232,8 +232,8 @@ class TriangleList:
         Raises:
             ValueError, TypeError, NeighborOverflowError: as `closest`.
 
-        Cost: n times the longest row, squared; memory is that of `closest`. Differentiable: as `closest`; the mask is constant.
-        Jit: yes. vmap: yes.
+        Cost: n times the longest row, squared; memory as `closest`. Differentiable: as `closest`; the mask is constant. Jit: yes.
+        vmap: yes.
 
         Example:
         >>> import jax.numpy as jnp
@@ -253,14 +253,14 @@ class TriangleList:
         return points[:, None] + vectors, norms(vectors), mask
 
     def signed_distance(self, positions: Array, *, vertices: Array | None = None) -> SignedDistance:
-        """Compute the distance to the nearest triangle of each row, negative inside what the triangles enclose.
+        """Compute the distance to the nearest triangle of each row, negative inside the solid that the triangles enclose.
 
-        Inside is where the winding number of the triangles is 1 or more, so that closed parts which overlap, touch, nest or are
-        doubled make one solid; of a wall that encloses less than nothing, as one around a fluid that its faces look at, it is where
-        the number is 0 or more. Faces run counterclockwise as seen from outside of what is solid (in 2D, segments
-        counterclockwise around it). The distance is to the nearest triangle, even to one inside the solid, within another part.
-        Within rounding of a triangle, about 100 eps of the dtype times its largest coordinate as seen from the particle, and
-        where a wall is not watertight, the sign is that of the angle-weighted pseudonormal of the nearest face, side or vertex.
+        A point is inside if the winding number of the triangles is 1 or more, so closed parts that overlap, touch, nest or are
+        doubled form one solid. For a wall that encloses a negative volume, such as a container whose faces look at its fluid,
+        inside is where the number is 0 or more. Faces run counterclockwise as seen from outside the solid (in 2D, segments
+        counterclockwise around it). The distance is to the nearest triangle, even if that lies inside the solid, within another
+        part. Within rounding of a triangle, about 100 eps of the dtype times its largest coordinate relative to the particle, and
+        for a wall that is not watertight, the sign is that of the angle-weighted pseudonormal of the nearest face, side or vertex.
 
         Args:
             positions: As in `closest`.
@@ -273,12 +273,11 @@ class TriangleList:
             ValueError, TypeError: an argument does not fit the list.
             NeighborOverflowError: as `closest`.
 
-        Cost: beside the rows, a ray through a tree of boxes for each particle that has a triangle. The tree is that of the list
-        where "bvh" made it; otherwise, and with `vertices`, each call makes one. Differentiable: to any order in positions and
+        Cost: that of the rows, and a ray through a tree of boxes for each particle that has a triangle. The tree is that of the
+        list if "bvh" made it; otherwise, and with `vertices`, each call makes one. Compilation takes seconds for each new number of
+        particles, slots or faces, as for `closest`, however few faces there are. Differentiable: to any order in positions and
         vertices, where the nearest point does not jump; at contact the derivative is that of the plane of the normal. Jit: yes.
-        vmap: yes. Compilation: seconds for each new number of particles, slots or faces, as for `closest`, however few faces there
-        are.
-        Source: Baerentzen & Aanaes (2005), doi:10.1109/TVCG.2005.49.
+        vmap: yes. Source: Baerentzen & Aanaes (2005), doi:10.1109/TVCG.2005.49.
         """
         points, corners = self._check_points(positions, vertices)
         self._check_rows()
@@ -301,7 +300,7 @@ class TriangleList:
 
 @compiled
 def _nearest_in_rows(tri: TriangleList, points: Array, vertices: Array) -> tuple[Array, Array, Array]:
-    """Return vectors to nearest points [n, capacity, d], on which feature they lie, and which slots hold a pair."""
+    """Return vectors to nearest points [n, capacity, d], their features, and which slots hold a pair."""
     used = lax.broadcasted_iota(jnp.int32, tri.idx.shape, 1) < tri.count[:, None]
     corners, finite, there = without_faults(vertices, tri.faces)
     triangle = jnp.where(used, tri.idx, 0)
@@ -318,7 +317,7 @@ def _nearest_in_rows(tri: TriangleList, points: Array, vertices: Array) -> tuple
 def _contacts_in_rows(
     tri: TriangleList, points: Array, vertices: Array, vectors: Array, feature: Array, mask: Array
 ) -> tuple[Array, Array]:
-    """Return the vectors to nearest points [n, capacity, d] of contacts, 0 elsewhere, and which slots these are."""
+    """Return the vectors to nearest points [n, capacity, d] of contacts, 0 elsewhere, and which slots are contacts."""
     points, vertices, fixed = lax.stop_gradient((points, vertices, vectors))
     triangle = jnp.where(mask, tri.idx, 0)
     seen = jnp.where(mask[..., None, None], vertices[tri.faces[triangle]] - points[:, None, None], 0)
@@ -352,7 +351,7 @@ def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> Signe
 def _sides(
     engine: TriangleEngine, tree: TriangleTree | None, corners: Array, points: Array, good: Array, asked: Array, cutoff: Cutoff
 ) -> tuple[Array, Array]:
-    """Say which of the points that are asked for are inside, and of which no ray tells: [n] bool each."""
+    """Say which of the points asked for are inside, and which of them no ray decides: [n] bool each."""
     tree = grow_tree(corners, good, cutoff) if tree is None else tree
     rays, least = ray_ways(points.shape[1], np.dtype(points.dtype)), least_winding(corners, good)
     return engine.cast(tree, corners, points, rays, asked, least, cutoff)

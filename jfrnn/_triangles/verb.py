@@ -1,4 +1,4 @@
-"""The public verb `search_triangles`: which triangles of a wall are closer to each particle than a cutoff."""
+"""The public function `search_triangles`: find the triangles of a wall that are closer to particles than a cutoff."""
 
 import numpy as np
 from jax import Array
@@ -25,45 +25,42 @@ def search_triangles(
 ) -> TriangleList:
     """Find all triangles of a wall that are closer to a particle than a cutoff, exactly, each once; in 2D all segments.
 
-    (i, t) stands in the list iff the distance of particle i to the closed triangle t (its face, sides and vertices) is below the
-    cutoff in exact arithmetic on the given floats, the cutoff being rounded once to their dtype. Triangles may be slivers, segments
-    or points, and of any size beside the cutoff. Cost: O(particles + faces + candidates), the candidates of a particle being the
-    triangles in its cell, whose edge is about the cutoff, or about a quarter of a larger triangle; in a tree those whose boxes, and
-    their neighbors' along a curve, hold it.
+    (i, t) is listed iff the distance of particle i to the closed triangle t (face, sides and vertices) is below the cutoff in exact
+    arithmetic on the given floats, the cutoff being rounded once to their dtype. Triangles may be slivers, segments or points, of
+    any size. Cost: O(particles + faces + candidates). The candidates of a particle are the triangles in its cell, whose edge is
+    about the cutoff, or about a quarter of a larger triangle; in a tree, the triangles of nodes whose boxes hold it.
 
-    A wall that stays is sorted once: `TriangleList.update` keeps the cells, or the tree, that the list has. One that moves as a
-    whole stays too, if the particles are taken into its frame. One that is deformed is sorted anew: `update(positions,
-    vertices=...)`.
+    A static wall is sorted once: `TriangleList.update` reuses the list's cells or tree. A wall that moves as a whole stays static
+    if particle positions are given in its frame. A deformed wall is sorted again by `update(positions, vertices=...)`.
 
     Args:
         positions: Particle positions [length], shape [n, 3] or [n, 2], float32 or float64. n = 0 is allowed.
         vertices: Corners [length], shape [v, 3] or [v, 2], same dtype.
-        faces: Indices of vertices, integers, shape [f, 3] for triangles, [f, 2] for segments in 2D. f = 0 is allowed. Which way
-            round they run matters to `TriangleList.signed_distance` alone.
+        faces: Vertex indices, integers, shape [f, 3] for triangles, [f, 2] for segments in 2D. f = 0 is allowed. Their orientation
+            matters to `TriangleList.signed_distance` only.
         cutoff: Distance [length], a static number > 0.
-        capacity: Slots per row, a static int. Required where positions, vertices or faces are traced. Default: `slack` times the
+        capacity: Slots per row, a static int. Required if positions, vertices or faces are traced. Default: `slack` times the
             longest row, rounded up to a multiple of 8.
         slack: Factor >= 1 on the counted capacity, room for later motion.
-        backend: Where triangles are looked for: "warp" (compiled kernels, on the CPU and on CUDA) and "jax" (any device) in
-            cells, "bvh" (compiled kernels) in a tree of boxes, which is made anew sooner; or "auto": "bvh" on the CPU, "warp" on
-            CUDA (where Warp is missing "jax", with a warning), elsewhere "jax".
+        backend: "warp" (compiled kernels, on the CPU and on CUDA) and "jax" (any device) use cells; "bvh" (compiled kernels) uses a
+            tree of boxes, which is rebuilt faster. "auto" is "bvh" on the CPU, "warp" on CUDA (if Warp is missing "jax", with a
+            warning), and "jax" elsewhere.
 
     Returns:
-        A `TriangleList`; `idx` has shape [n, capacity], unused slots hold f. Rows are in no promised order, but the same input
-        gives the same bits.
+        A `TriangleList`; `idx` has shape [n, capacity], unused slots hold f. The order within rows is unspecified, but the same
+        input gives the same bits.
 
     Raises:
         TypeError, ValueError: an argument is of the wrong kind, shape or range, or `capacity` is missing under jit.
         ImportError, RuntimeError: "warp" or "bvh", and Warp is not installed or cannot run on the platform.
-        Overflow of a given capacity, coordinates that are not finite and faces without vertices are known only from data: `status`,
-        `overflow` and `check` tell.
+        Overflow of a given capacity, coordinates that are not finite and invalid vertex indices are known only from data: see
+            `status`, `overflow` and `check`.
 
     Memory: 4 B per slot and particle for the list; 100 to 132 B per triangle for the cells, which the list keeps, whatever the
     sizes of the triangles and of space, or 30 B for the tree (float64: 56); while "warp" lists on CUDA 12 B per particle, 0.6 kB
     per triangle (float64: 1.1; "bvh" at most 0.13) and at most 58 MB. Differentiable: the list is topology, without gradient; see
-    `TriangleList.closest`.
-    Jit: yes, with capacity. vmap: yes, with capacity. `jax.shard_map`: yes, with particles spread and the wall on every device.
-    Compilation: for each new number of particles, slots or faces; with "jax" it takes several seconds.
+    `TriangleList.closest`. Jit: yes, with capacity. vmap: yes, with capacity. `jax.shard_map`: yes, with distributed particles and
+    the wall on every device. Compilation: for each new number of particles, slots or faces; with "jax" it takes several seconds.
     Source: strict cutoff (Peifle 2019, §2.2).
 
     >>> import jax.numpy as jnp, jfrnn
@@ -91,7 +88,7 @@ def search_triangles(
 
 
 def _check_faces(faces: Given, dim: int, vertices: int) -> Array:
-    """Return faces as int32 [f, dim]; what names no vertex stays out of range."""
+    """Return faces as int32 [f, dim]; invalid indices stay out of range."""
     kind = "triangles" if dim == 3 else "segments"
     if not hasattr(faces, "dtype") or not np.issubdtype(faces.dtype, np.integer):
         given = f"{np.dtype(faces.dtype)}" if hasattr(faces, "dtype") else type(faces).__name__
@@ -110,7 +107,7 @@ def _clip(faces: Given, least: int, most: int) -> Given:
 
 
 def _choose_engine(backend: object, points: Array) -> TriangleEngine:
-    """Return the engine that a backend stands for; raise where it cannot run on the platform of the points."""
+    """Return the engine of a backend; raise if it cannot run on the platform of the points."""
     if backend not in TRIANGLE_BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(map(repr, TRIANGLE_BACKENDS))}, got {backend!r}.")
     platform = platform_of(points)
@@ -119,5 +116,5 @@ def _choose_engine(backend: object, points: Array) -> TriangleEngine:
     engine = TRIANGLE_ENGINES[str(backend)]
     if engine.uses_warp and platform not in PLATFORMS:
         raise RuntimeError(f"backend={backend!r} finds triangles on the CPU and on CUDA, got {platform!r}: pass backend='jax'.")
-    choose_engine("warp" if engine.uses_warp else "jax", points, None)  # raises where Warp is needed and missing
+    choose_engine("warp" if engine.uses_warp else "jax", points, None)  # raises if Warp is needed and missing
     return engine

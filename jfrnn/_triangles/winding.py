@@ -1,15 +1,15 @@
-"""On which side of a closed wall a point is, by how often the wall winds around it: the union of all its parts counts.
+"""Inside or outside a closed wall, by its winding number, for walls that may consist of several overlapping parts.
 
-A pseudonormal tells the sides of one surface that does not cross itself. Where closed parts overlap, touch, nest or are doubled,
-faces lie inside the solid, and only the winding number tells: it is the number of faces through which a ray leaves, less that of
-faces through which it enters, and 0 outside of everything.
+A pseudonormal tells the sides of a single surface that does not intersect itself. If closed parts overlap, touch, nest or are
+doubled, some faces lie inside the solid, and only the winding number decides: the number of faces through which a ray leaves, minus
+those through which it enters; outside everything it is 0.
 
-Faces that a ray meets are looked for in a tree of boxes. Each is decided with bounds on all rounding: it is met, it is not met, or
-it cannot be told (the ray passes a side, or starts on the face, within rounding). So each ray gives bounds on the winding number,
-and where these leave the side open another ray is sent. What no ray tells is within rounding of a face.
+The faces that a ray hits are found in a tree of boxes. With bounds on all rounding, each face is hit, not hit, or undecided (the
+ray passes a side, or starts on the face, within rounding). So each ray gives bounds on the winding number; if these leave the side
+open, another ray is cast. Points that no ray decides are within rounding of a face.
 
-With u = eps/2: components of corners, as seen from the point and divided by the largest, carry 2u, triple products at most 11u of
-the sum of absolute values; 8 eps is taken.
+With u = eps/2, components of corners, relative to the point and divided by the largest, have an error of 2u, and triple products at
+most 11u of the sum of absolute values; 8 eps is used.
 Source: Ericson (2005), Real-Time Collision Detection, sect. 5.3.4, for the products.
 """
 
@@ -24,10 +24,10 @@ from jfrnn._tracing import Given, on_device, own_transfers, set_places
 from jfrnn._triangles.exact import Vector, cross, dot, sum_of
 from jfrnn._triangles.tree import WIDTH, TriangleTree, level_starts
 
-_CHUNK = 1024  # nodes in work at a time
-_SHARES = 4  # in which the triangles of a chunk of nodes are decided
-_BEHIND = 64  # times eps: a corner as far behind the start of a ray, beside the largest, is behind it
-# No direction along which meshes are aligned, and no component that is 0: about along an axis, either way.
+_CHUNK = 1024  # nodes processed at a time
+_SHARES = 4  # parts in which the triangles of a chunk of nodes are processed
+_BEHIND = 64  # eps, relative to the largest coordinate, beyond which a corner is surely behind the start of a ray
+# Rays run roughly along an axis, either way, but not exactly, as meshes often do; no component is 0.
 _TILTS = {
     2: np.array([[1.0, 0.08371], [-0.11293, 1.0]]),
     3: np.array([[1.0, 0.08371, -0.13117], [-0.11293, 1.0, 0.07159], [0.09767, -0.12409, 1.0]]),
@@ -35,9 +35,9 @@ _TILTS = {
 
 
 def is_closed(faces: Array) -> Array:
-    """Say whether faces [f, d] bound a solid: each side is run through as often one way as the other; in 2D each vertex. [] bool.
+    """Say whether faces [f, d] bound a solid: each side (2D: vertex) is run through equally often in both directions. [] bool.
 
-    Faces that are known while tracing are sorted there and then, so that no program does it again.
+    Concrete faces are sorted while tracing, so that no compiled program sorts them again.
     """
     if isinstance(faces, Tracer):
         start, end = _sides(faces)
@@ -50,7 +50,7 @@ def is_closed(faces: Array) -> Array:
 
 
 def _sides(faces: Given) -> tuple[list[Given], list[Given]]:
-    """Return both ends of each side, and those of each side run through the other way."""
+    """Return both ends of each side, and both ends in reverse order."""
     if faces.shape[1] == 2:
         return [faces[:, 0]], [faces[:, 1]]
     start, end = faces.reshape(-1), faces[:, np.array([1, 2, 0])].reshape(-1)
@@ -58,9 +58,9 @@ def _sides(faces: Given) -> tuple[list[Given], list[Given]]:
 
 
 def least_winding(corners: Array, good: Array) -> Array:
-    """Return the least winding number inside of what triangles enclose, [] int32: 1, or of a wall around what is outside of it, 0.
+    """Return the least winding number of inside points, [] int32: 1, or 0 for a wall around the outside.
 
-    Such a wall, that of a container for example, encloses a signed volume (2D: area) below 0, by more than rounding.
+    Such a wall, a container for example, encloses a signed volume (2D: area) that is below 0 by more than rounding.
     """
     raw = corners - corners[:1, :1]
     raw = raw / jnp.maximum(jnp.max(jnp.abs(raw)), jnp.finfo(raw.dtype).tiny)
@@ -71,28 +71,28 @@ def least_winding(corners: Array, good: Array) -> Array:
 
 
 def ray_ways(dim: int, dtype: np.dtype) -> Array:
-    """Return the directions of rays, [2 dim, dim], those along axes first, then those against them."""
+    """Return the directions of rays, [2 dim, dim]: those along axes first, then the opposite ones."""
     return jnp.asarray(np.concatenate([_TILTS[dim], -_TILTS[dim]]), dtype)
 
 
 def cast_rays(
     tree: TriangleTree, corners: Array, points: Array, rays: Array, asked: Array, least: Array, cutoff: Cutoff
 ) -> tuple[Array, Array]:
-    """Say which of the points that are asked for are inside a closed wall, and of which no ray tells: [n] bool each.
+    """Say which of the points asked for are inside a closed wall, and which of them no ray decides: [n] bool each.
 
     Args:
-        tree: Its triangles, in boxes wider by the cutoff.
-        corners: Shape [f, corner, d], f > 0.
-        points: Shape [n, d].
-        rays: Those of `ray_ways`.
-        asked: Shape [n], bool.
-        least: Inside, the winding number is at least so much, shape [], int32.
-        cutoff: Of the boxes.
+        tree: The wall's triangles, in boxes widened by the cutoff.
+        corners: Corners of triangles, shape [f, corner, d], f > 0.
+        points: Points, shape [n, d].
+        rays: The directions from `ray_ways`.
+        asked: Which points to decide, shape [n], bool.
+        least: The least winding number of inside points, shape [], int32.
+        cutoff: The cutoff of the boxes.
     """
     dim = points.shape[1]
     top = tree.boxes[:, int(level_starts(len(corners))[-2]) :]
     exits = jnp.concatenate([jnp.max(top[dim:], axis=1)[None] - points, points - jnp.min(top[:dim], axis=1)[None]], axis=1)
-    ways = jnp.argsort(exits, axis=1)  # the shortest way out meets the fewest boxes
+    ways = jnp.argsort(exits, axis=1)  # the shortest way out hits the fewest boxes
 
     def cast(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         tried, inside, undecided = state
@@ -110,16 +110,16 @@ def _determinant(x: list[Vector]) -> Array:
 
 
 def _bounds(tree: TriangleTree, corners: Array, points: Array, rays: Array, asked: Array, cutoff: Cutoff) -> tuple[Array, Array]:
-    """Return the least and the largest winding number, [n] int32, that rays [n, d] leave possible; 0 where not asked for.
+    """Return the least and largest winding number, [n] int32, that are possible after rays [n, d]; 0 where not asked for.
 
-    Nodes wait on a stack, those of lower levels above the others, and are taken from its top a chunk at a time: of no level are
-    there ever more than the children of one chunk. Triangles whose boxes are met are decided before the next chunk.
+    Nodes wait on a stack, lower levels above higher ones, and are taken from its top a chunk at a time. So it never holds more
+    nodes of one level than the children of one chunk. Triangles whose boxes are hit are decided before the next chunk.
     """
     (n, dim), levels = points.shape, level_starts(len(corners))
     chunk, starts = min(_CHUNK, n), tuple(int(x) // WIDTH for x in levels)
     boxes, lanes = tree.boxes.reshape(2 * dim, -1, WIDTH), lax.iota(jnp.int32, WIDTH)
     queue, total = set_places(asked, n + chunk), jnp.sum(asked, dtype=jnp.int32)
-    room = chunk * WIDTH * (len(starts) - 1)  # the stack; entries of triangles follow
+    room = chunk * WIDTH * (len(starts) - 1)  # size of the stack, which entries of triangles follow
 
     def open_nodes(state: tuple[Array, ...]) -> tuple[Array, ...]:
         stack, height, low, high = state
@@ -162,7 +162,7 @@ def _bounds(tree: TriangleTree, corners: Array, points: Array, rays: Array, aske
 
 
 def _meets_boxes(boxes: Array, points: Array, rays: Array, cutoff: Cutoff) -> Array:
-    """Say which boxes [2 d, k, WIDTH], made narrower by the cutoff again, rays [k, d] may meet: [k, WIDTH] bool. None is missed."""
+    """Say which boxes [2 d, k, WIDTH], shrunk by the cutoff, rays [k, d] may hit: [k, WIDTH] bool. No hit is missed."""
     dim, eps = points.shape[1], jnp.finfo(points.dtype).eps
     inner = jnp.asarray(cutoff.radius) * (1 - 8 * eps)
     low = [(boxes[k] - points[:, k, None]) + (inner - 4 * eps * (jnp.abs(boxes[k]) + inner)) for k in range(dim)]
@@ -174,11 +174,11 @@ def _meets_boxes(boxes: Array, points: Array, rays: Array, cutoff: Cutoff) -> Ar
     for k in range(dim):
         one, two = (side / rays[:, k, None] for side in (low[k] - 16 * eps * largest, high[k] + 16 * eps * largest))
         first, last = jnp.maximum(first, jnp.minimum(one, two)), jnp.minimum(last, jnp.maximum(one, two))
-    return (boxes[0] <= boxes[dim]) & ~(last < first)  # NaN, of numbers that are too large, is met
+    return (boxes[0] <= boxes[dim]) & ~(last < first)  # NaN, from overflow, counts as a hit
 
 
 def _crossings(corners: Array, triangle: Array, points: Array, rays: Array) -> tuple[Array, Array]:
-    """Return bounds on how often rays [k, d] leave triangles [k], less how often they enter them: [k] int32 each."""
+    """Return bounds on the number of times rays [k, d] leave triangles [k], minus those they enter: [k] int32 each."""
     dim, finfo = points.shape[1], jnp.finfo(points.dtype)
     there = triangle < len(corners)
     raw = corners[jnp.where(there, triangle, 0)] - points[:, None]
@@ -203,9 +203,10 @@ def _crossings(corners: Array, triangle: Array, points: Array, rays: Array) -> t
 
 
 def _products(x: list[Vector], ray: Vector) -> tuple[Vector, Vector, Array, Array]:
-    """Return on which side of each side of a shape a line from the origin passes, all of one sign where it crosses the shape.
+    """Return triple products of a line through the origin with each side of a shape; all have one sign if it crosses the shape.
 
-    Then their sums of absolute values; then what has the sign of that where the shape is ahead; and its sum.
+    Further results are their sums of absolute values, a number that has the same sign if the shape is ahead, and its sum of
+    absolute values.
     """
     if len(x) == 2:
         flat = [ray[0] * corner[1] - ray[1] * corner[0] for corner in x]
