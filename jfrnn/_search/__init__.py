@@ -1,4 +1,4 @@
-"""Searches and counts, the list of neighbors, its geometry and what leaves it."""
+"""Searches and counts, the neighbor list, its geometry and its exports."""
 
 from jfrnn._search.chunks import run_chunk
 from jfrnn._search.exports import MOST_PAIRS, saturating_add

@@ -1,4 +1,4 @@
-"""Run a chunk of steps until its neighbor list was large enough: grow and replay."""
+"""Run a chunk of simulation steps; if its neighbor list overflowed, grow the list and run the chunk again."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -27,31 +27,31 @@ def run_chunk(
     cutoff: Callable[[State], Array] | None = None,
     slack: float = 1.25,
 ) -> tuple[State, NeighborList]:
-    """Run a jitted chunk of steps; where its list overflowed, grow the list and run the same chunk again from the same state.
+    """Run a jitted chunk of steps; if its list overflowed, grow the list and replay the chunk from the same state.
 
-    A chunk whose list overflowed has missed pairs, so that nothing of it may be kept; what it knows is how many slots were needed,
-    and whether a box needed more images. Each replay has at least that many slots, and more images, so that the loop ends, or
-    raises where no room helps: one host synchronization per run.
+    A chunk whose list overflowed has missed pairs, so its results are discarded; it only reports how many slots were needed, and
+    whether a box needed more images. Each replay has at least that many slots, and more images, so the loop ends, or raises if no
+    capacity helps. Each run synchronizes with the host once.
 
     Args:
         chunk: (state, nbrs) -> (state, nbrs), usually under `jax.jit`; it calls `nbrs.update` in every step, and must not donate
-            its arguments, since they are what is replayed.
+            its arguments, which are needed for a replay.
         state: A pytree.
-        nbrs: The list to begin with.
-        positions: state -> positions [length], shape [n, d]: where a larger list is made.
+        nbrs: The initial list.
+        positions: state -> positions [length], shape [n, d], at which a larger list is made.
         queries: state -> queries, exactly if the list was made with queries.
         active: state -> mask, exactly if the list was made with `active`.
-        box: state -> periodic box, where it changes; default: the one that the list has at the beginning.
-        cutoff: state -> cutoffs of the particles, where they change; default likewise.
+        box: state -> periodic box, if it changes; default: that of the initial list.
+        cutoff: state -> cutoffs of the particles, if they change; default: those of the initial list.
         slack: Factor >= 1 on the slots that were needed, as in `NeighborList.grow`.
 
     Returns:
-        The state and the list after a run in which nothing overflowed, and of which the list has nothing to report (`check`).
+        The state and the list after a run without overflow, and with nothing for `check` to raise.
 
     Raises:
         TypeError: called inside jit, where a shape cannot change.
         TypeError, ValueError: as `NeighborList.update`.
-        ValueError: the list reports what no room mends, as `NeighborList.check`: positions that are not finite, a degenerate box.
+        ValueError: the list reports what no capacity can fix, as `NeighborList.check`: non-finite positions, a degenerate box.
 
     >>> import jax, jax.numpy as jnp, jfrnn
     >>> @jax.jit
@@ -83,7 +83,7 @@ def run_chunk(
 
 
 def _given_cutoffs(nbrs: NeighborList) -> Array | tuple[Array, Array] | None:
-    """Return the cutoffs of the particles of a list as `NeighborList.grow` takes them."""
+    """Return the cutoffs per particle of a list, in the form that `NeighborList.grow` takes."""
     if nbrs.radii is None:
         return None
     known = [x for x in (nbrs.radii.sources, nbrs.radii.queries) if x is not None]

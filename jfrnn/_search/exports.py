@@ -1,4 +1,4 @@
-"""What leaves a list as pairs: flat arrays of a static length, how many pairs there are, and what jax-md reads."""
+"""Exports of a list: flat arrays of pairs with a static length, the number of pairs, and the view that jax-md reads."""
 
 import dataclasses
 import functools
@@ -11,18 +11,18 @@ from jax import Array, lax
 from jfrnn._geometry import Status
 from jfrnn._tracing import compiled
 
-MOST_PAIRS = 2**31 - 1  # that int32 offsets can number
+MOST_PAIRS = 2**31 - 1  # most pairs that int32 offsets can number
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class DenseNeighbors:
-    """What jax-md's energies and simulations read of a neighbor list.
+    """The part of a neighbor list that jax-md's energies and simulations read.
 
     Attributes:
         idx: Neighbors, shape [n, capacity], int32; unused slots hold n.
-        status: Bits of `Status` of the list that it was made of, shape [], int32.
-        format: None: neither of jax-md's two sparse formats, hence the dense one. Static.
+        status: Bits of `Status` of the exported list, shape [], int32.
+        format: None: not one of jax-md's two sparse formats, so jax-md treats it as dense. Static.
     """
 
     idx: Array
@@ -31,12 +31,12 @@ class DenseNeighbors:
 
     @property
     def did_buffer_overflow(self) -> Array:
-        """Say whether a row lost neighbors, shape [], bool: search again with more capacity."""
+        """Whether a row lost neighbors, shape [], bool: search again with more capacity."""
         return (self.status & Status.ROW_OVERFLOW.value) != 0
 
 
 def check_total(total: object) -> int:
-    """Return a static number of pairs that int32 offsets can number."""
+    """Return a static number of pairs, after checking that int32 offsets can number them."""
     if isinstance(total, bool) or not isinstance(total, int | np.integer):
         raise TypeError(f"total must be a static int, the length of the arrays, got {type(total).__name__} {total!r}.")
     if total < 0:
@@ -50,13 +50,13 @@ def check_total(total: object) -> int:
 
 
 def saturating_add(a: Array, b: Array) -> Array:
-    """Add int32 that are not negative; a sum that int32 cannot hold is the largest int32."""
+    """Add nonnegative int32, saturating at the largest int32."""
     return jnp.where(a > MOST_PAIRS - b, MOST_PAIRS, a + b)
 
 
 @functools.partial(compiled, static_argnames="capacity")
 def pair_total(count: Array, capacity: int) -> Array:
-    """Add up the used slots of all rows, [] int32; more than int32 can hold are the largest int32."""
+    """Return the number of used slots in all rows, [] int32, saturating at the largest int32."""
     used = jnp.minimum(count, capacity)
     if count.shape[0] * capacity <= MOST_PAIRS:
         return jnp.sum(used, dtype=jnp.int32)
@@ -64,7 +64,7 @@ def pair_total(count: Array, capacity: int) -> Array:
 
 
 def row_offsets(count: Array, capacity: int) -> Array:
-    """Say where each row begins, and behind the last where it ends, [m + 1] int32; from where int32 ends on all are the largest."""
+    """Return the start of each row and the end of the last, [m + 1] int32, saturating at the largest int32."""
     used = jnp.minimum(count, capacity)
     fits = count.shape[0] * capacity <= MOST_PAIRS
     ends = jnp.cumsum(used, dtype=jnp.int32) if fits else lax.associative_scan(saturating_add, used)
@@ -73,7 +73,7 @@ def row_offsets(count: Array, capacity: int) -> Array:
 
 @functools.partial(compiled, static_argnames=("sources", "total"))
 def flat_pairs(idx: Array, count: Array, sources: int, total: int) -> tuple[Array, Array, Array]:
-    """Return rows and sources of the pairs, [total] int32 each, padded with m and `sources`, and the offsets of the rows."""
+    """Return rows and sources of the pairs, [total] int32 each, padded with m and `sources`, and the row offsets."""
     m, capacity = idx.shape
     offsets = row_offsets(count, capacity)
     if 0 in (m, capacity, total):

@@ -1,4 +1,4 @@
-"""Where the neighbors of a list are: displacements, lattice shifts and which pairs are closer than the cutoff now."""
+"""The geometry of a list: displacements, lattice shifts, and which pairs are within the cutoff at present."""
 
 import functools
 from typing import NamedTuple
@@ -29,13 +29,13 @@ from jfrnn._tracing import call_apart, compiled
 
 
 class ImageCodes(NamedTuple):
-    """Of which image of its source each slot tells, where the nearest is not the only one.
+    """The periodic image that each slot refers to, for lists with more than the minimum image.
 
     Attributes:
-        codes: shape [m, capacity], uint8 up to 256 images, int16 up to 32 768, else int32: which of the shifts within reach, of
-            wrapped particles. These shifts and turns count the vectors of `Images.basis`.
-        turns: shape [n], int32: how many lattice vectors each source was from the box when the list was made, packed.
-        query_turns: shape [m], int32, or None where the sources are the queries.
+        codes: Index among the shifts within reach, for wrapped positions, shape [m, capacity]: uint8 for up to 256 images, int16
+            for up to 32 768, else int32. Shifts and turns count the vectors of `Images.basis`.
+        turns: How many lattice vectors each source was from the box when the list was made, packed, shape [n], int32.
+        query_turns: Likewise for queries, shape [m], int32; None if the sources are the queries.
     """
 
     codes: Array
@@ -43,7 +43,7 @@ class ImageCodes(NamedTuple):
     query_turns: Array | None
 
 
-ImagesMade = tuple[ImageCodes | None, tuple[Array, Array | None] | None]  # and where all were when a list with a skin was made
+ImagesMade = tuple[ImageCodes | None, tuple[Array, Array | None] | None]  # and the positions at which a list with a skin was made
 
 
 def _pair_cutoff(cutoff: Cutoff | Radii | None, closed: bool) -> Cutoff | Cutoffs:
@@ -66,7 +66,7 @@ def open_vectors(
 
 
 class _Slots(NamedTuple):
-    """Of every slot: whether it is used, its source, x_j - x_i, and its lattice shift in whole floats; 0 where it is not used."""
+    """Of every slot: whether it is used, its source, x_j - x_i, and its lattice shift in whole floats; 0 in unused slots."""
 
     used: Array
     neighbor: Array
@@ -86,10 +86,10 @@ def _find_slots(idx: Array, count: Array, images: ImagesMade, sources: Array, ro
         image = jnp.where(used, codes.codes.astype(jnp.int32), lattice.images.home)
         shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)[image] + query_turns[:, None] - turns[neighbor]
     kind = lattice.images
-    if half and kind.basis is not None:  # of an image of its own, a particle keeps the one ahead in the given vectors
+    if half and kind.basis is not None:  # of a particle's two opposite images, keep the forward one in the given vectors
         own = neighbor == lax.broadcasted_iota(jnp.int32, idx.shape, 0)
         shifts = jnp.where(own[..., None], forward_shifts(shifts, kind), shifts)
-    most = 2 * LARGEST_TURN + max(kind.reach)  # farther apart, nothing is decided exactly
+    most = 2 * LARGEST_TURN + max(kind.reach)  # at larger distances no pair is decided exactly
     used = used & (jnp.abs(shifts) <= most).all(axis=-1)
     return _Slots(used, neighbor, difference, jnp.where(used[..., None], shifts, 0))
 
@@ -128,10 +128,10 @@ def periodic_vectors(
 def _turns_now(
     images: ImageCodes, made: tuple[Array, Array | None] | None, sources: Array, rows: Array, lattice: Lattice
 ) -> tuple[Array, Array]:
-    """Return how many lattice vectors lie between the cell and the sources [n, d], and the rows [m, d]: whole floats.
+    """Return the lattice vectors between the cell and the sources [n, d] and rows [m, d], in whole floats.
 
-    They are those that the list was made with, and those by which a point has been moved since (`made`: where all were then), as
-    wrapping it does: the image that a code tells of is the same one before and after.
+    They are those of the time when the list was made, plus the translations since then (`made` holds the positions of that time).
+    So an image code denotes the same image after positions have been wrapped.
     """
     both = [images.turns] if images.query_turns is None else [images.turns, images.query_turns]
     turns = [unpack_turns(x, lattice.dim).astype(sources.dtype) for x in both]
@@ -145,6 +145,6 @@ def _turns_now(
 def norms(vectors: Array) -> Array:
     largest = lax.stop_gradient(jnp.max(jnp.abs(vectors), axis=-1, initial=0))
     apart = largest > 0
-    unit = jnp.where(apart, largest, 1)  # squares of very small or large lengths would leave the float range
+    unit = jnp.where(apart, largest, 1)  # unscaled squares of tiny or huge lengths would leave the float range
     square = jnp.sum((vectors / unit[..., None]) ** 2, axis=-1)
     return jnp.where(apart, unit * jnp.sqrt(jnp.where(apart, square, 1)), 0)

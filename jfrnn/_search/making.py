@@ -1,4 +1,4 @@
-"""How the arrays of a list are made, and how many slots its rows get."""
+"""Make the arrays of a list, and choose its capacity."""
 
 import functools
 import math
@@ -21,7 +21,7 @@ def round_capacity(slots: int) -> int:
 
 
 def count_capacity(inputs: Inputs, options: Options, slack: float) -> int:
-    """Count the neighbors of concrete positions and return a capacity that holds `slack` times the longest row."""
+    """Count the neighbors of concrete positions; return a capacity of `slack` times the longest row."""
     with at_once(), own_transfers():
         longest = int(count_rows(inputs, options)[1])
     wanted = math.ceil(max(longest, 1) * slack)
@@ -30,9 +30,9 @@ def count_capacity(inputs: Inputs, options: Options, slack: float) -> int:
 
 @functools.partial(compiled, static_argnames=("options", "capacity", "moving"))
 def find_fields(inputs: Inputs, options: Options, capacity: int, moving: bool) -> dict[str, Any]:
-    """Search, and return the fields of a list that come from data; `moving`: it has a skin. The compiled program of `search`.
+    """Search, and return the list's fields that come from data; `moving` says that it has a skin. The compiled program of `search`.
 
-    Being results of one program, they share no memory with the caller's arrays, or with each other: either may be donated.
+    As results of one program, they share no memory with the caller's arrays or each other, so either may be donated.
     """
     found = list_rows(inputs, options, capacity)
     rows, sources = found.rows, hide_inactive(inputs.sources, inputs.active)

@@ -1,7 +1,6 @@
 """The result of a search: a padded neighbor list, its checks, its geometry and its exports.
 
-The file is long because every method of a public class stands in it with its whole docstring; what methods do stands in the files
-beside it.
+The file is long because a public class has all its methods, with whole docstrings, in one place; their code is in other files.
 """
 
 import dataclasses
@@ -42,26 +41,26 @@ from jfrnn._search.problem import Problem
 from jfrnn._search.verlet import Verlet, moved_too_far
 from jfrnn._tracing import Given, at_once, call_apart, compiled, own_transfers
 
-ROWS_ARE_WHOLE = Status.NONFINITE | Status.TOTAL_OVERFLOW  # bits with which every row has all its neighbors
+ROWS_ARE_WHOLE = Status.NONFINITE | Status.TOTAL_OVERFLOW  # bits that do not mean missing neighbors in rows
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class NeighborList:
-    """Hold the neighbors of m queries among n sources, one row of `capacity` slots per query. A pytree.
+    """The neighbors of m queries among n sources, one row of `capacity` slots per query. A pytree.
 
     Attributes:
         idx: Source indices, shape [m, capacity], int32; the first min(count, capacity) slots of a row are used, the others hold n.
-        count: True number of neighbors per row, shape [m], int32; it may exceed the capacity. With a skin, of those within
-            cutoff + skin when the list was last made, and so are `idx`, `pairs` and `csr`.
+        count: True number of neighbors per row, shape [m], int32; it may exceed the capacity. With a skin, `count`, `idx`, `pairs`
+            and `csr` include neighbors within cutoff + skin when the list was last rebuilt.
         status: Bits of `Status`, shape [], int32.
         required: The capacity that holds every row, shape [], int32; like the status, over all updates.
-        verlet: With a skin, where the list was made and how often anew (`Verlet`); None without.
-        box: The periodic box, its floats rounded to the dtype of the positions; None where space is open.
-        images: Of which image of its source each slot tells (`ImageCodes`), 1 B per slot; None where the nearest is the only one.
-        radii: Cutoffs of the particles (`Radii`: sources [n], queries [m], the rule), or None where one serves all.
-        batch: To which system each particle belongs (`Batch`: sources [n], queries [m] or None), or None; updates keep it.
-        problem: What was asked for (`Problem`). Static.
+        verlet: With a skin, where the list was last rebuilt and how often (`Verlet`); None without.
+        box: The periodic box, rounded to the dtype of the positions; None in open space.
+        images: The periodic image of each slot (`ImageCodes`), 1 B per slot; None if the minimum image suffices.
+        radii: Cutoffs per particle (`Radii`: sources [n], queries [m], the rule), or None with one cutoff.
+        batch: System numbers (`Batch`: sources [n], queries [m] or None), or None; updates keep them.
+        problem: The options of the search (`Problem`). Static.
     """
 
     idx: Array
@@ -76,7 +75,7 @@ class NeighborList:
     problem: Problem = dataclasses.field(metadata={"static": True})
 
     def __repr__(self) -> str:
-        """Say in a line what it holds; waits for the device."""
+        """Summarize the list in a line; waits for the device."""
         *batch, m, capacity = shape_of(self.idx)
         rows = f"{m} queries of {self.source_count} particles" if self.own_queries else f"{self.source_count} particles"
         rows = f"batch of {batch}, {rows}" if batch else rows
@@ -87,17 +86,17 @@ class NeighborList:
 
     @property
     def cutoff(self) -> float | None:
-        """Interaction radius [length], rounded to the dtype of the positions; None where particles have their own."""
+        """Interaction radius [length], rounded to the dtype of the positions; None with cutoffs per particle."""
         return self.problem.cutoff
 
     @property
     def skin(self) -> float:
-        """Extra shell [length]."""
+        """Verlet skin [length]."""
         return self.problem.skin
 
     @property
     def half(self) -> bool:
-        """Whether each unordered pair stands once, in the row of its smaller index."""
+        """Whether each unordered pair is listed once, in the row of its smaller index."""
         return self.problem.options.filter.later_only
 
     @property
@@ -112,7 +111,7 @@ class NeighborList:
 
     @property
     def own_queries(self) -> bool:
-        """Whether the rows belong to `queries`, not to the positions themselves."""
+        """Whether rows belong to separate `queries` instead of the positions."""
         return self.problem.own_queries
 
     @property
@@ -122,7 +121,7 @@ class NeighborList:
 
     @property
     def box_kind(self) -> Images | None:
-        """Along which axes the box is periodic and how far pairs reach in it; None where space is open."""
+        """The periodic axes and the images that the search considers; None in open space."""
         return self.problem.options.images
 
     @property
@@ -132,12 +131,12 @@ class NeighborList:
 
     @property
     def dim(self) -> int:
-        """Axes of the positions, 2 or 3."""
+        """Dimension of the positions, 2 or 3."""
         return self.problem.dim
 
     @property
     def dtype(self) -> np.dtype:
-        """Type of the positions."""
+        """Dtype of the positions."""
         return self.problem.dtype
 
     @property
@@ -152,7 +151,7 @@ class NeighborList:
 
     @property
     def overflow(self) -> Array:
-        """Say whether pairs may be missing for want of room, which `grow` makes: slots of a row, or images in a box; [] bool."""
+        """Whether pairs may be missing because a row has too few slots or a box needs more images, [] bool; `grow` fixes both."""
         with own_transfers():
             return (self.status & (Status.ROW_OVERFLOW | Status.BOX_TOO_SMALL).value) != 0
 
@@ -165,22 +164,22 @@ class NeighborList:
         active: Array | None = None,
         box: Box | None = None,
     ) -> "NeighborList":
-        """Make the list anew if something has moved skin/2 since it was made, or may have by rounding; without a skin, always.
+        """Rebuild the list if anything has moved skin/2 since the last time, or may have by rounding; without a skin, always.
 
-        The list that comes back holds every pair within the cutoff at these positions, in the same shapes: a step of a simulation
-        inside `jax.jit`, `lax.scan` or `lax.fori_loop`. Lattice vectors of a periodic box are no motion: positions may be wrapped
-        into it in every step. Status bits and `required` are kept over all updates; look at `overflow`
-        after a chunk of steps, then `grow` and run the chunk again (`run_chunk` does that).
+        The returned list holds every pair within the cutoff at these positions, in the same shapes, so it can be a simulation step
+        inside `jax.jit`, `lax.scan` or `lax.fori_loop`. Lattice translations do not count as motion: positions may be wrapped in
+        every step. Status bits and `required` are kept over all updates; read `overflow` after a chunk of steps, then `grow` and
+        run the chunk again (`run_chunk` does that).
 
         Args:
             positions: Sources [length], shape [n, d], where they are now.
-            cutoff: Cutoffs of the particles now, as `search` takes them, if the list was made with such; default: those that it
-                has. The list keeps them. What the largest of them grew is taken off the skin.
+            cutoff: Present cutoffs per particle, as `search` takes them, if the list was made with such; default: those of the
+                list. The list keeps them. The growth of the largest one is subtracted from the skin.
             queries: Queries [length], shape [m, d], exactly if the list was made with queries.
-            active: Which particles take part now, shape [n], bool, exactly if the list was made with `active`; one that comes or
-                goes makes the list anew.
-            box: The box now, of the same kind; default: the one that the list has. The list keeps it. One that changed enough to
-                bring a new pair within the cutoff makes the list anew.
+            active: Which particles take part now, shape [n], bool, exactly if the list was made with `active`; a change causes a
+                rebuild.
+            box: The present box, of the same kind; default: that of the list. The list keeps it. A change that may bring a new pair
+                within the cutoff causes a rebuild.
 
         Returns:
             A `NeighborList` of the same shapes and options.
@@ -188,8 +187,8 @@ class NeighborList:
         Raises:
             ValueError, TypeError: an argument does not fit the list.
 
-        Cost: one pass over the positions, or a search. Differentiable: no gradient flows through. Jit: yes. vmap: yes, each list
-        being made anew where any of the batch is.
+        Cost: one pass over the positions, or a search. Differentiable: no gradient flows through. Jit: yes. vmap: yes; if any list
+        of the batch is stale, all are rebuilt.
         """
         sources, rows = self._geometry_inputs(positions, queries)
         rows = rows if self.own_queries else None
@@ -208,26 +207,26 @@ class NeighborList:
         box: Box | None = None,
         slack: float = 1.25,
     ) -> "NeighborList":
-        """Make a list with room for what overflowed, at these positions. Not inside jit: the capacity is a shape.
+        """Make a list with larger capacity at these positions, where it overflowed. Not inside jit: the capacity is a shape.
 
-        Room are the slots of a row and, in a periodic box, the images of a particle: as many as the cutoff needs in this box and
-        in that of the list, or twice as many where updates met a smaller box in between.
+        The capacity is the number of slots per row and, in a periodic box, of images: those that the cutoff needs in this box and
+        in that of the list, or twice as many if updates met a smaller box in between.
 
         Args:
             positions: Sources [length], shape [n, d].
             cutoff: As in `update`.
             queries: As in `update`.
             active: As in `update`.
-            box: The box at these positions; default: the one that the list has, which after a chunk is the last one.
-            slack: Factor >= 1 on the longest row that was ever met, here or by updates of this list.
+            box: The box at these positions; default: that of the list, which after a chunk is the last one.
+            slack: Factor >= 1 on the longest row so far, including updates of this list.
 
         Returns:
-            A `NeighborList` with the same options, room not smaller than before, no bits from the past, and nothing to `check`.
+            A `NeighborList` with the same options, a capacity not smaller than before, status bits cleared, and nothing to `check`.
 
         Raises:
             TypeError: positions or the list are traced.
-            ValueError, TypeError: an argument does not fit the list, or the list that was made says what is wrong with its data
-                (`check`): no room makes positions finite, or a degenerate box one.
+            ValueError, TypeError: an argument does not fit the list, or the new list reports invalid data (`check`), which no
+                capacity can fix: non-finite positions, or a degenerate box.
         """
         sources, rows = self._geometry_inputs(positions, queries)
         queries, active, slack = rows if self.own_queries else None, self._check_active(active, sources), check_slack(slack)
@@ -244,7 +243,7 @@ class NeighborList:
 
     @property
     def rebuild_count(self) -> Array:
-        """How often updates made the list anew, shape [], int32; known for a list with a skin."""
+        """How often updates rebuilt the list, shape [], int32; only for a list with a skin."""
         if self.verlet is None:
             raise ValueError("this list was made without a skin: every update makes it anew, and nothing counts them.")
         return self.verlet.rebuild_count
@@ -255,7 +254,7 @@ class NeighborList:
         Raises:
             NeighborOverflowError: a row holds more neighbors than `capacity`; `.required` is the capacity needed.
             ValueError: positions or queries hold NaN or infinity, or do not fit the box; or there were more pairs than `require`
-                was told.
+                allows.
             TypeError: called on a list that is being traced.
         """
         if isinstance(self.status, Tracer):
@@ -263,19 +262,19 @@ class NeighborList:
         self._check_known()
 
     def require(self, total: int) -> "NeighborList":
-        """Return this list with the bit `Status.TOTAL_OVERFLOW` set where it holds more pairs than exports of this length take.
+        """Return this list with the bit `Status.TOTAL_OVERFLOW` set if it holds more than `total` pairs.
 
-        For loops inside `jax.jit`, where `pairs(total)`, `csr(total)` and `to_jraph(total)` cannot raise: the bit is kept by
-        updates, and `check` names it afterwards.
+        Inside `jax.jit`, `pairs(total)`, `csr(total)` and `to_jraph(total)` cannot raise. Updates keep this bit, so `check` can
+        report it afterwards.
 
         Args:
             total: Number of pairs, a static int.
 
         Returns:
-            The same list, but for its status.
+            The same list, except for its status.
 
         Raises:
-            ValueError, TypeError: a wrong total.
+            ValueError, TypeError: total is invalid.
 
         Cost: a sum over the rows. Jit: yes. vmap: yes.
         """
@@ -286,7 +285,7 @@ class NeighborList:
         return dataclasses.replace(self, status=status)
 
     def _check_known(self, spared: Status = Status.OK) -> None:
-        """Raise what status bits report, but for the spared ones, where they are known: not on a list that is being traced."""
+        """Raise what status bits report, except the spared ones; a traced list is not checked."""
         status = (known_status(self.status) or Status.OK) & ~spared
         if Status.ROW_OVERFLOW in status:
             raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self.capacity)
@@ -297,21 +296,21 @@ class NeighborList:
             raise ValueError(status.message)
 
     def vectors(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> tuple[Array, Array]:
-        """Compute the displacement to every neighbor, r_ij = x_j - x_i, in a periodic box plus the lattice shift of the image.
+        """Compute the displacements x_j - x_i to all neighbors, in a periodic box plus the lattice translation of the image.
 
         Args:
             positions: Sources [length], shape [n, d], where they are now.
             queries: Queries [length], shape [m, d], exactly if the list was made with queries.
-            box: The box now; default: the one that the list has, a constant to derivatives.
+            box: The present box; default: that of the list, as a constant in derivatives.
 
         Returns:
             Displacements [length], shape [m, capacity, d], 0 in masked slots; and the mask, shape [m, capacity], bool: the slot is
-            used and its pair is, at these positions and exactly, closer than the cutoff.
+            used and its pair is closer than the cutoff at these positions, exactly.
 
         Raises:
             ValueError, TypeError: positions or queries do not fit the list.
-            NeighborOverflowError, ValueError: outside jit, the status says that pairs may be missing: rows overflowed, or the data
-                did not fit; inside, look at `status`. Particles that are not finite have no pairs, which is no error here.
+            NeighborOverflowError, ValueError: outside jit, pairs may be missing: rows overflowed, or data were invalid; inside,
+                read `status`. Particles that are not finite have no pairs, which is no error here.
 
         Differentiable: to any order in positions, queries and box; the mask is a constant. Jit: yes. vmap: yes.
         """
@@ -321,9 +320,9 @@ class NeighborList:
     def shifts(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> Array:
         """Compute the lattice shift S of every neighbor: its displacement is x_j - x_i + S·(lattice vectors).
 
-        Every used slot has its shift, also where its pair lies in the skin, and so beyond the cutoff: `vectors` and `distances`
-        mask such pairs, `shifts` and `pairs` do not. `nbrs.shifts(x)[nbrs.idx < nbrs.source_count]` has a row for each pair, in
-        the order of `pairs`.
+        Every used slot has a shift, even if its pair lies in the skin, beyond the cutoff; `vectors` and `distances` mask such
+        pairs, `shifts` and `pairs` do not. `nbrs.shifts(x)[nbrs.idx < nbrs.source_count]` has one row per pair, in the order of
+        `pairs`.
 
         Args:
             positions: Sources [length], shape [n, d], where they are now.
@@ -332,7 +331,7 @@ class NeighborList:
 
         Returns:
             Whole numbers, shape [m, capacity, d], int32; 0 in unused slots, along axes that are not periodic, and between positions
-            that now are more than 1022 lattice vectors apart.
+            that are now more than 1022 lattice vectors apart.
 
         Raises:
             ValueError, TypeError: an argument does not fit the list.
@@ -378,16 +377,16 @@ class NeighborList:
         """Export the pairs (i, j), row by row: to the host, or inside jit into arrays of a static length.
 
         Args:
-            total: Length of the arrays, a static int up to 2³¹ - 1; None: as many as there are, which is known only outside jit.
-                Where there are more pairs than `total`, a list outside jit raises. Inside jit the last pairs are missing then, and
-                nothing is left over: `require(total)` sets a bit that `check` names.
+            total: Length of the arrays, a static int up to 2³¹ - 1; None: the number of pairs, which is known only outside jit. If
+                there are more pairs than `total`, this raises outside jit. Inside jit the last pairs are missing then;
+                `require(total)` sets a bit that `check` reports.
 
         Returns:
-            Query indices i and source indices j, shape [pairs] or [total], int32 each; what is left over holds m and n.
+            Query indices i and source indices j, shape [pairs] or [total], int32 each; the padding holds m and n.
 
         Raises:
             NeighborOverflowError, ValueError: as `check`, outside jit; ValueError: more pairs than `total`, outside jit.
-            ValueError, TypeError: a wrong total, or none inside jit.
+            ValueError, TypeError: total is invalid, or missing inside jit.
 
         Differentiable: no (integers). Jit: yes, with total. vmap: yes, with total.
         """
@@ -407,12 +406,12 @@ class NeighborList:
         """Export compressed rows: the neighbors of row i are indices[offsets[i]:offsets[i + 1]].
 
         Args:
-            total: As in `pairs`; offsets[-1] then is the number of pairs in the rows, at most 2³¹ - 1, which inside jit may exceed
+            total: As in `pairs`; offsets[-1] is then the number of pairs in the rows, at most 2³¹ - 1, which inside jit may exceed
                 `total`.
 
         Returns:
-            Offsets, shape [m + 1], int64 on the host, int32 with `total`; and indices, shape [pairs] or [total], int32, n in what
-            is left over.
+            Offsets, shape [m + 1], int64 on the host, int32 with `total`; and indices, shape [pairs] or [total], int32, padded with
+            n.
 
         Raises:
             NeighborOverflowError, ValueError, TypeError: as in `pairs`.
@@ -428,18 +427,18 @@ class NeighborList:
     def to_jraph(self, total: int) -> tuple[Array, Array]:
         """Return senders and receivers of a graph: an edge from each neighbor j to its particle i.
 
-        Each pair has at most one image here, and in a periodic box the edge is to the nearest image of j. A list that tells images
-        apart is refused, since edges alone cannot: of such a list, `shifts` says of which image each slot of `idx` is.
+        In a periodic box the edge is to the minimum image of j. A list with several images per pair is refused, since edges cannot
+        tell them apart; for such a list, `shifts` returns the image of each slot of `idx`.
 
         Args:
             total: Number of edges, a static int: as in `pairs`.
 
         Returns:
-            Senders j and receivers i, shape [total], int32 each; edges that are left over lead from n to m, the node that
-            `jraph.pad_with_graphs` adds first. Stacked, they are an edge index as other graph libraries have it.
+            Senders j and receivers i, shape [total], int32 each; padding edges lead from n to m, the node that
+            `jraph.pad_with_graphs` adds first. Stacked, they are an edge index as other graph libraries use it.
 
         Raises:
-            ValueError: the list tells images apart.
+            ValueError: the list has several images per pair.
             ValueError, TypeError: as in `pairs`.
 
         Differentiable: no (integers). Jit: yes. vmap: yes.
@@ -456,14 +455,14 @@ class NeighborList:
         return indices, rows
 
     def to_jax_md(self) -> DenseNeighbors:
-        """Return this list as the neighbor-list energies of jax-md take it: `idx` as its format `Dense` has it.
+        """Return this list in the form that jax-md's energies take: `idx` as in its format `Dense`.
 
-        Such an energy computes displacements itself, so that it wants the full list of the particles among themselves, and at most
-        one image of each pair; the box goes into its displacement function. It sees what is within cutoff + skin. Inside jit the
-        `did_buffer_overflow` of what comes back says whether neighbors are missing.
+        Such an energy computes displacements itself, so it needs a full list of the particles among themselves with minimum images
+        only; the box goes into its displacement function. It sees all pairs within cutoff + skin. Inside jit, the result's
+        `did_buffer_overflow` says whether neighbors are missing.
 
         Raises:
-            ValueError: the list is a half one, has queries, or tells images apart.
+            ValueError: the list is half, has queries, or has several images per pair.
             NeighborOverflowError, ValueError: as `check`, outside jit.
         """
         wrong = {"half=True": self.half, "queries": self.own_queries, "several images of a pair": self.images is not None}
@@ -473,7 +472,7 @@ class NeighborList:
         return DenseNeighbors(self.idx, self.status)
 
     def _flat(self, total: int) -> tuple[Array, Array, Array]:
-        """Return rows and sources of the pairs, padded to a static length, and the offsets of the rows."""
+        """Return rows and sources of the pairs, padded to a static length, and the row offsets."""
         total = check_total(total)
         self._check_single()
         self._check_known()
@@ -580,10 +579,10 @@ def _update(
     now = hide_inactive(sources, active)
     moved = moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin)
     nbrs = dataclasses.replace(nbrs, box=box, radii=radii)
-    # a loop of at most one round: XLA keeps what a loop carries in place, but copies what a branch returns
+    # a loop of at most one iteration: XLA updates a loop's carry in place, but copies the results of a branch
     return lax.while_loop(lambda state: state[0], lambda state: (jnp.zeros_like(state[0]), remake(state[1])), (moved, nbrs))[1]
 
 
 def _remake(nbrs: NeighborList, inputs: Inputs, capacity: int) -> NeighborList:
-    """Make a list with the options of this one, and nothing of its past."""
+    """Make a new list with the options of this one."""
     return dataclasses.replace(nbrs, **find_fields(inputs, nbrs.problem.options, capacity, nbrs.skin > 0))

@@ -1,4 +1,4 @@
-"""What was asked: the arguments that all verbs share, checked, and what a list remembers of them."""
+"""The problem: the arguments that all public functions share, checked, and the static part that a list keeps."""
 
 import dataclasses
 
@@ -30,17 +30,17 @@ from jfrnn._tracing import Given
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """What is static about a search and its list, apart from the capacity.
+    """The static options of a search and its list, without the capacity.
 
     Attributes:
-        options: What engines are told.
-        cutoff: Of a pair [length], rounded to the dtype, without the skin; None where particles have their own.
-        skin: Extra shell [length].
-        own_queries: The rows belong to queries, not to the sources themselves.
-        masked: Particles may be inactive.
+        options: The options for engines.
+        cutoff: Cutoff of a pair [length], rounded to the dtype, without the skin; None with cutoffs per particle.
+        skin: Verlet skin [length].
+        own_queries: Whether rows belong to separate queries instead of the sources.
+        masked: Whether particles may be inactive.
         source_count: Number of sources.
-        dim: Axes of the positions.
-        dtype: Of the positions.
+        dim: Dimension of the positions.
+        dtype: Dtype of the positions.
     """
 
     options: Options
@@ -58,7 +58,7 @@ class Problem:
         return not self.own_queries and not self.options.filter.drop_self
 
     def reach(self, radii: Radii | None) -> float | None:
-        """Return how far the list reaches, skin included; None where it is not known while tracing."""
+        """Return the largest distance of listed pairs, skin included; None if it is not known while tracing."""
         largest = self.cutoff if radii is None else largest_known(radii)
         return None if largest is None else list_radius(largest, self.skin, self.dtype)
 
@@ -71,7 +71,7 @@ class Problem:
         radii: Radii | None,
         batch: Batch | None,
     ) -> Inputs:
-        """Return the operands of this search for such particles."""
+        """Return the operands of this search for these particles."""
         if radii is not None:
             return Inputs(sources, queries, active, box, radii, batch)
         if self.cutoff is None:
@@ -80,7 +80,7 @@ class Problem:
         return Inputs(sources, queries, active, box, make_cutoff(reach, self.dtype, self.options.closed), batch)
 
     def with_images(self, images: Images | None) -> "Problem":
-        """Return the same problem with other images within reach."""
+        """Return the same problem with other images."""
         return dataclasses.replace(self, options=self.options._replace(images=images))
 
 
@@ -98,7 +98,7 @@ def check_problem(
     skin: Given,
     active: Given,
 ) -> tuple["Problem", Inputs]:
-    """Check the arguments that all public verbs share; return what is static of them, and the operands."""
+    """Check the arguments that all public functions share; return their static part and the operands."""
     sources = check_positions("positions", positions)
     if queries is not None:
         queries = check_positions("queries", queries, like=sources)

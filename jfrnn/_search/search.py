@@ -1,4 +1,4 @@
-"""The two public verbs: `search` and `count`."""
+"""The public functions `search` and `count`."""
 
 import jax
 from jax import Array
@@ -35,81 +35,80 @@ def search(
 ) -> NeighborList:
     """Find every pair of particles closer than a cutoff, exactly.
 
-    (i, j) is a pair iff |x_j - x_i| < cutoff in exact arithmetic on the given floats, the cutoff being rounded once to their
-    dtype. Without `capacity` the neighbors are counted first, so that no row can overflow. Cost: O(n + candidates), a particle's
+    (i, j) is a pair iff |x_j - x_i| < cutoff in exact arithmetic on the given floats, the cutoff being rounded once to their dtype.
+    Without `capacity` the neighbors are counted first, so that no row can overflow. Cost: O(n + candidates), a particle's
     candidates being the particles in the 3^d cells around it; empty space costs nothing, however large.
 
     Args:
         positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64. n = 0 is allowed.
-        cutoff: Interaction radius [length]: a static number > 0 for all; or one per particle, an array of shape [n] of floats,
-            which may be traced and hold 0, and which `radius_rule` applies to. Of separate queries "gather" asks for [m], "scatter"
-            for [n], the other rules for a tuple of both, that of the positions first.
+        cutoff: Interaction radius [length]: a static number > 0; or one per particle, an array of floats of shape [n], which may be
+            traced and hold 0, and to which `radius_rule` applies. With separate queries "gather" needs [m], "scatter" [n], and the
+            other rules a tuple of both, that of the positions first.
         queries: Points [length] whose neighbors among `positions` are wanted, shape [m, d], same dtype; default: the positions
             themselves, each particle being excluded from its own row by index.
-        box: Periodic box (`Box`): then (i, j) stands in the list once for each image of j within the cutoff, its displacement
-            being x_j - x_i + S·(lattice vectors), S whole numbers; `NeighborList.shifts` tells them. Particles may be up to 511
-            lattice vectors away from the box (short ones, where a skewed box is searched in such); along axes that are not
-            periodic it has no meaning.
-        batch: The system to which each particle belongs, shape [n], integers that fit into int32, in any order; with queries a
-            tuple of [n] and [m]. Only particles of one system are neighbors. Many systems cost what their particles cost, also
-            where they lie on top of each other; all have the same box (for boxes of their own, `jax.vmap` over `search`).
-        radius_rule: Whose cutoff is that of a pair, where particles have their own: "gather" that of i, the row; "scatter" that of
-            j; "either" the larger, "both" the smaller, "mean" the exact mean of the two. Large ones cost nothing to those that are
-            small: spread over a factor of 128, each particle looks at cells of its own size.
-        half: Keep each unordered pair once, in the row of its smaller index; of the images of a particle that are its own
+        box: Periodic box (`Box`): (i, j) is then listed once for each periodic image of j within the cutoff, with displacement x_j
+            - x_i + S·(lattice vectors) for whole numbers S, which `NeighborList.shifts` returns. Particles may be up to 511 lattice
+            vectors away from the box (short vectors, if a skewed box is searched in those); along axes that are not periodic it has
+            no effect.
+        batch: System number of each particle, shape [n], integers that fit into int32, in any order; with queries a tuple of [n]
+            and [m]. Only particles of one system are neighbors. Many systems cost what their particles cost, even if they overlap
+            in space; all have the same box (for separate boxes, use `jax.vmap` over `search`).
+        radius_rule: How the cutoff of a pair follows from cutoffs per particle: "gather" is that of i, the row; "scatter" that of
+            j; "either" the larger, "both" the smaller, "mean" the exact mean. Large cutoffs do not slow down particles with small
+            ones: up to a ratio of 128, each particle searches cells of its own size.
+        half: List each unordered pair once, in the row of its smaller index; of the images of a particle that are its own
             neighbors, those whose shift S has a positive number first. Not with the rules "gather" and "scatter".
         include_self: Make each particle its own neighbor.
         closed: Count pairs at exactly the cutoff (<= instead of <).
-        skin: Extra shell [length], a static number >= 0: the list holds all pairs within cutoff + skin, so that
-            `NeighborList.update` need not make it anew before something has moved skin/2. `vectors` and `distances` mask to the
+        skin: Verlet skin [length], a static number >= 0: the list holds all pairs within cutoff + skin, so that
+            `NeighborList.update` need not rebuild it before something has moved skin/2. `vectors` and `distances` mask to the
             cutoff.
-        active: Which particles take part, shape [n], bool; default: all. An inactive one has no neighbors and is nobody's, and its
-            position may be anything. Room for particles to come: the shapes, and so the compiled program, stay the same.
-        capacity: Slots per row, a static int. Required where positions are traced. Default: `slack` times the longest row,
-            rounded up to a multiple of 8.
+        active: Which particles take part, shape [n], bool; default: all. Inactive particles have no neighbors and are never listed
+            as neighbors; their positions may be anything. They make room for later particles: shapes, and so the compiled program,
+            stay the same.
+        capacity: Slots per row, a static int. Required if positions are traced. Default: `slack` times the longest row, rounded up
+            to a multiple of 8.
         slack: Factor >= 1 on the counted capacity, room for later motion.
-        backend: "warp" (cells, compiled kernels, on CPU and NVIDIA GPUs), "hashgrid" (Warp's own `wp.HashGrid`, there too), "jax"
-            (cells, any device), "brute" (all n·m candidates), or "auto": what was measured to be fastest on the platform, "warp" on
-            the CPU and on NVIDIA GPUs (where Warp is missing "jax", with a warning), elsewhere "jax". The platform is that of the
-            positions, where they are traced that of `jax.default_device`. "hashgrid" knows neither boxes nor batches nor
-            a cutoff per particle.
+        backend: "warp" (cells, compiled kernels, on CPU and NVIDIA GPUs), "hashgrid" (Warp's own `wp.HashGrid`, likewise), "jax"
+            (cells, any device), "brute" (all n·m candidates), or "auto", the fastest measured on the platform: "warp" on the CPU
+            and on NVIDIA GPUs (if Warp is missing "jax", with a warning), elsewhere "jax". The platform is that of the positions,
+            or of `jax.default_device` if they are traced. "hashgrid" supports neither boxes nor batches nor cutoffs per particle.
 
     Returns:
-        A `NeighborList`; `idx` has shape [m, capacity], unused slots hold n. Rows are in no promised order, but the same input
-        gives the same bits.
+        A `NeighborList`; `idx` has shape [m, capacity], unused slots hold n. The order within rows is unspecified, but the same
+        input gives the same bits.
 
     Raises:
         TypeError, ValueError: an argument is of the wrong kind, shape or range, or `capacity` is missing under jit.
         ImportError: "warp" or "hashgrid" without the package that they need.
         RuntimeError: "warp" or "hashgrid" on a platform on which Warp cannot run.
-        Overflow of a given capacity and non-finite coordinates are known only from data: `status`, `overflow` and `check` tell.
+        Overflow of a given capacity and non-finite coordinates are known only from data: see `status`, `overflow` and `check`.
 
-    Memory: 4 B per slot for the list, which keeps copies of what updates look back at: with a skin positions and queries, with a
-    batch 4 B and with a cutoff per particle one float each (with a skin two). It shares no memory with the arrays that it is given,
-    so that they, or the list, may be donated (`jax.jit(..., donate_argnums=)`). Besides it, however large space is, "warp" takes at
-    most 64 B and "hashgrid" 84 B per particle, "jax" and "brute" at most 64 MB for the block in work and 100 B per particle
-    (float64: 125 B). See `memory_plan`. With a box or a batch "warp" takes a copy of the positions besides, at most 20 B per
-    particle (float64: 40 B); with a cutoff per particle 140 B in all (float64: 180 B).
+    Memory: 4 B per slot for the list, which keeps copies of what updates need: with a skin positions and queries, with a batch 4 B
+    and with cutoffs per particle one float each (with a skin two). It shares no memory with the given arrays, so they, or the list,
+    may be donated (`jax.jit(..., donate_argnums=)`). While searching, however large space is, "warp" takes at most 64 B and
+    "hashgrid" 84 B per particle, "jax" and "brute" at most 64 MB for the block being processed and 100 B per particle (float64: 125
+    B). With a box or a batch "warp" also copies the positions, at most 20 B per particle (float64: 40 B); with cutoffs per particle
+    it takes 140 B in all (float64: 180 B). See `memory_plan`.
     Differentiable: the list is topology, without gradient; see `NeighborList.vectors`. Jit: yes, with capacity. vmap: yes, with
-    capacity. Arrays that are spread over the devices of a mesh are gathered on each, and each does the whole work: to spread that
-    as well, see `jfrnn.distributed`. `jax.export`: yes, with
-    `disabled_checks=[jax.export.DisabledSafetyCheck.custom_call("jfrnn")]`; a process that runs such a program imports jfrnn of
-    the same version first. Shapes are numbers, not symbols.
+    capacity. Arrays that are sharded over a mesh are gathered on each device, and each does the whole work; `jfrnn.distributed`
+    divides the work. `jax.export`: yes, with `disabled_checks=[jax.export.DisabledSafetyCheck.custom_call("jfrnn")]`; a process
+    that runs such a program imports jfrnn of the same version first. Shapes must be numbers, not symbols.
     Source: cell lists (Hockney & Eastwood 1981, ch. 8); strict cutoff (Peifle 2019, §2.2).
 
-    Compilation: once for each number of particles, of queries and of slots, and once more for the count where `capacity` is
-    missing; cutoffs and boxes are data. Structures of many sizes share a program if they are padded to sizes that come again, with
-    `active=` for the particles that are there, one `capacity`, and `Box(..., images=)`, which fixes the number of images:
+    Compilation: once for each number of particles, of queries and of slots, and once more for the count if `capacity` is missing;
+    cutoffs and boxes are data. Structures of different sizes share a program if they are padded to common sizes, with `active=` for
+    the particles that exist, one `capacity`, and `Box(..., images=)`, which fixes the number of images:
 
     >>> import numpy as np, jfrnn
-    >>> def searched(x, lengths, size=8):
+    >>> def search_padded(x, lengths, size=8):
     ...     padded = np.zeros((size, 3), np.float32)
     ...     padded[: len(x)] = x
     ...     box = jfrnn.Box(lengths, images=1)
     ...     return jfrnn.search(padded, 1.0, active=np.arange(size) < len(x), box=box, capacity=8)
-    >>> searched([[0.1, 0.1, 0.1], [1.9, 0.1, 0.1]], [2.0, 2.0, 2.0]).count[:2]
+    >>> search_padded([[0.1, 0.1, 0.1], [1.9, 0.1, 0.1]], [2.0, 2.0, 2.0]).count[:2]
     Array([1, 1], dtype=int32)
-    >>> searched([[0.1, 0.1, 0.1], [2.9, 0.1, 0.1], [1.5, 0.1, 0.1]], [3.0, 2.0, 2.0]).count[:3]
+    >>> search_padded([[0.1, 0.1, 0.1], [2.9, 0.1, 0.1], [1.5, 0.1, 0.1]], [3.0, 2.0, 2.0]).count[:3]
     Array([1, 1, 0], dtype=int32)
     """
     problem, inputs = check_problem(
@@ -154,7 +153,7 @@ def count(
         backend: As in `search`.
 
     Returns:
-        Neighbors per row, shape [m], int32. A particle with a non-finite coordinate has none, and is nobody's.
+        Neighbors per row, shape [m], int32. Particles with a non-finite coordinate have none, and are never counted as neighbors.
 
     Raises:
         TypeError, ValueError, ImportError, RuntimeError: as in `search`.

@@ -1,7 +1,7 @@
 """The Verlet skin: a list of all pairs within cutoff + skin stays complete until something has moved more than half the skin.
 
-If no point moved farther than skin/2 since the list was made, a pair that is closer than the cutoff now was closer than
-cutoff + skin then (triangle inequality), so it stands in the list (Verlet 1967, doi:10.1103/PhysRev.159.98).
+If no point has moved farther than skin/2 since the list was made, a pair that is now closer than the cutoff was then closer than
+cutoff + skin (triangle inequality), so it is listed (Verlet 1967, doi:10.1103/PhysRev.159.98).
 """
 
 import dataclasses
@@ -32,14 +32,14 @@ from jfrnn._geometry import (
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Verlet:
-    """What a list with a skin remembers: where it was made, and how often it was made anew.
+    """What a list with a skin keeps of the time when it was last rebuilt.
 
     Attributes:
-        positions: Sources when the list was last made [length], shape [n, d]; inactive ones are infinite.
-        queries: Queries then [length], shape [m, d], or None.
-        box: The periodic box then, or None.
-        radii: Cutoffs of the particles then, or None where one serves all.
-        rebuild_count: How often `update` made the list anew, shape [], int32.
+        positions: Sources at that time [length], shape [n, d]; inactive ones are infinite.
+        queries: Queries at that time [length], shape [m, d], or None.
+        box: The periodic box at that time, or None.
+        radii: Cutoffs per particle at that time, or None with one cutoff.
+        rebuild_count: How often `update` rebuilt the list, shape [], int32.
     """
 
     positions: Array
@@ -50,7 +50,7 @@ class Verlet:
 
 
 def list_radius(cutoff: float, skin: float, dtype: np.dtype) -> float:
-    """Return cutoff + skin, both of this dtype, rounded up to it: no pair within the exact sum is lost."""
+    """Return cutoff + skin, both of this dtype, rounded up, so that no pair within the exact sum is lost."""
     exact = Fraction(cutoff) + Fraction(skin)
     radius = dtype.type(cutoff) + dtype.type(skin)
     while math.isfinite(radius) and Fraction(float(radius)) < exact:
@@ -69,10 +69,10 @@ def moved_too_far(
 ) -> Array:
     """Say whether any point is, or may be by rounding, skin/2 or more from where the list was made, [] bool.
 
-    One pass over the positions. A point that is not finite has no neighbors: it counts as moved when it becomes so or ceases to be.
-    Lattice vectors by which a point was wrapped are no motion, since its images stay where they are. A box that changed has moved
-    the images of a pair against each other, and cutoffs that grew reach farther: that much less of the skin is left for the
-    points. No rule makes a pair's cutoff grow by more than the two of which it is made.
+    This takes one pass over the positions. A point that is not finite has no neighbors; it counts as moved when it becomes finite
+    or ceases to be. Lattice translations do not count, since images stay where they are. A changed box has moved the images of a
+    pair against each other, and larger cutoffs reach farther; both reduce the skin that is left for motion. By any rule, a pair's
+    cutoff grows by no more than the two cutoffs from which it is made.
     """
     half = make_cutoff(skin / 2, np.dtype(positions.dtype), closed=False)
     used, grown, moved = jnp.zeros((), positions.dtype), jnp.zeros((), positions.dtype), jnp.zeros((), bool)
@@ -97,19 +97,19 @@ def moved_too_far(
 
 
 def _growth(before: Array, now: Array) -> Array:
-    """Return by how much a cutoff grew at most, rounded up."""
+    """Return an upper bound on the growth of a cutoff."""
     grown = jnp.where(is_radius(before) & is_radius(now), now - before, 0)
     return jnp.max(grown, initial=0) * (1 + 4 * jnp.finfo(grown.dtype).eps)
 
 
 def _any_beyond(before: Array, now: Array, motion: Motion | None, half_skin: Cutoff) -> Array:
     axes = list((now - before).T) if motion is None else motion.axes
-    near = squared_distance(axes, half_skin) < half_skin.inside  # 8 eps inside: surely closer
+    near = squared_distance(axes, half_skin) < half_skin.inside  # `inside` has a margin of 8 eps, so these are surely closer
     near = near if motion is None else near & motion.sure
     there = jnp.isfinite(before).all(axis=1) | jnp.isfinite(now).all(axis=1)
     return jnp.any(there & ~near)
 
 
 def first_verlet(positions: Array, queries: Array | None, box: Box | None, radii: Radii | None) -> Verlet:
-    """Return what a list remembers that was just made."""
+    """Return the state of a list that was just made."""
     return Verlet(*lax.stop_gradient((positions, queries, box, radii)), jnp.int32(0))
