@@ -15,7 +15,7 @@ from jfrnn._engine import kernels_of, load_warp
 from jfrnn._geometry import make_cutoff
 from jfrnn._search import round_capacity
 from jfrnn._triangles import warp as _triangles_warp
-from jfrnn._triangles.cells import without_faults
+from jfrnn._triangles.cells import gather_corners
 
 __all__ = ["LAYERS", "free", "lattice", "load_warp", "round_capacity", "taylor_green_velocity", "triangle_query"]
 
@@ -41,7 +41,7 @@ def triangle_query(tri: Any, x: Any, device: str) -> TriangleQuery:  # noqa: ANN
     wp = load_warp()
     n, dim = x.shape
     variant = _triangles_warp._Variant(dim, x.dtype == np.float64, lists=True, tree=tri.backend == "bvh")
-    corners, _, _ = without_faults(tri.vertices, tri.faces)
+    corners, _, _ = gather_corners(tri.vertices, tri.faces)
     inputs = _triangles_warp.query_inputs(x, corners, tri.cells, make_cutoff(tri.cutoff, np.dtype(x.dtype), closed=False))
     sizes = _triangles_warp.sizes_on_cuda(variant, inputs)
     words = kernels_of("triangles_cuda").scratch_words(n, *sizes, dim, variant.double)

@@ -23,7 +23,7 @@ from jfrnn._engine import auto as _auto
 from jfrnn._geometry.cutoffs import make_cutoff
 from jfrnn._triangles import verb as _triangles
 from jfrnn._triangles import warp as _triangles_warp
-from jfrnn._triangles.cells import without_faults
+from jfrnn._triangles.cells import gather_corners
 from jfrnn._triangles.tree import WIDTH
 from jfrnn._triangles.warp import _Variant, query_inputs, sizes_on_cuda
 
@@ -51,7 +51,7 @@ class Answer:
     def __init__(self, tri, positions, lists=True):
         n, dim = positions.shape
         self.variant = _Variant(dim, positions.dtype == np.float64, lists, tri.backend == "bvh")
-        corners, _, _ = without_faults(tri.vertices, tri.faces)
+        corners, _, _ = gather_corners(tri.vertices, tri.faces)
         inputs = query_inputs(positions, corners, tri.cells, make_cutoff(tri.cutoff, positions.dtype, closed=False))
         words = triangles_cuda.scratch_words(n, *sizes_on_cuda(self.variant, inputs), dim, self.variant.double)
         self.idx = np.full((n, tri.capacity) if lists else (1, 1), -7, np.int32)

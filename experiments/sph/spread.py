@@ -57,7 +57,7 @@ class Spread:
         """Make the halo of these positions [m], shape [N, d]; bits, and what was required, are kept over all updates."""
         particles = self._at(positions, active)
         halo = distributed.halo(particles)
-        required = self.particles.required.joined(halo.required)
+        required = self.particles.required.join(halo.required)
         particles = replace(self.particles, status=self.particles.status | halo.status, required=required)
         return replace(self, particles=particles, halo=halo, active=active)
 

@@ -25,7 +25,7 @@ from jfrnn._geometry import (
     rank_systems,
     wrap,
 )
-from jfrnn._tracing import compiled
+from jfrnn._tracing import compile_program
 
 
 class Filter(NamedTuple):
@@ -167,7 +167,7 @@ def prepare_search(inputs: Inputs, options: Options) -> Search:
     return Search(sources, queries, cutoff, batch, (lattice, wrapped), checks)
 
 
-@functools.partial(compiled, static_argnames="options")
+@functools.partial(compile_program, static_argnames="options")
 def is_decidable(inputs: Inputs, options: Options) -> Array:
     """Say whether a search can answer for all particles that take part: cutoffs, box and positions are in range; [] bool."""
     return functools.reduce(jnp.logical_and, prepare_search(inputs, options).checks.values(), jnp.ones((), bool))

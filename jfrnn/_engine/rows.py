@@ -10,7 +10,7 @@ from jfrnn._engine.arrays import complete_rows, find_candidates
 from jfrnn._engine.problem import Inputs, Options, Rows, Search, prepare_search
 from jfrnn._engine.runs import State, Visit, fold_neighbors
 from jfrnn._geometry import NOT_FINITE, Cutoff, Status
-from jfrnn._tracing import compiled
+from jfrnn._tracing import compile_program
 
 
 class Found(NamedTuple):
@@ -24,13 +24,13 @@ class Found(NamedTuple):
     turns: tuple[Array, Array | None] | None
 
 
-@functools.partial(compiled, static_argnames=("options", "capacity"))
+@functools.partial(compile_program, static_argnames=("options", "capacity"))
 def list_rows(inputs: Inputs, options: Options, capacity: int) -> Found:
     """List the neighbors of every query: the compiled program of `search`."""
     return _find(inputs, options, capacity)
 
 
-@functools.partial(compiled, static_argnames="options")
+@functools.partial(compile_program, static_argnames="options")
 def count_rows(inputs: Inputs, options: Options) -> tuple[Array, Array]:
     """Count the neighbors of every query, [m] int32, and return the largest number with them: the compiled program of `count`."""
     rows = _find(inputs, options, None).rows

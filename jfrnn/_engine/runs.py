@@ -337,7 +337,7 @@ class _Engine(NamedTuple):
         """Compare 16 candidates per word with the cutoff in working precision: hits low, doubtful ones high."""
         lane = lax.iota(jnp.int32, LANES)
         candidate = first[..., None] + lane[None, None]
-        allowed = (candidate < stop[..., None]) & self._wanted(first, candidate, image, place)
+        allowed = (candidate < stop[..., None]) & self._passes_filter(first, candidate, image, place)
         difference = [_windows(x, first) - q[..., None] for x, q in zip(self.sources.axes, query, strict=True)]
         square = squared_distance(difference, self.cutoff)
         own, others = self.queries.radii, self.sources.radii
@@ -355,7 +355,7 @@ class _Engine(NamedTuple):
         radii = self.cutoff.of_pairs(own, others) if isinstance(self.cutoff, Cutoffs) else None
         return step_one_bounds(self.cutoff, radii, slack)
 
-    def _wanted(self, first: Array, candidate: Array, image: Array | None, place: Array) -> Array:
+    def _passes_filter(self, first: Array, candidate: Array, image: Array | None, place: Array) -> Array:
         """Say which candidates [b, words, 16] may be neighbors apart from their distance."""
         if self.keep.later_only:
             own = self.queries.ids.at[place].get(mode="promise_in_bounds")[:, None]

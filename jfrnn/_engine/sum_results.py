@@ -32,7 +32,7 @@ class SumsOf(NamedTuple):
         """Return what `pair_sums` returns: parts of sums over all pairs are added, with what rounding took of them."""
         width, totals = self._width, self._totals
         which = as_integer(rest).reshape(self.rows, width, 2) if self.extremes else jnp.zeros((self.rows, width, 0), jnp.int32)
-        return sums, _added(parts[: 2 * self.slots * totals].reshape(self.slots, 2, totals)), which
+        return sums, _add_parts(parts[: 2 * self.slots * totals].reshape(self.slots, 2, totals)), which
 
     @property
     def _totals(self) -> int:
@@ -43,7 +43,7 @@ class SumsOf(NamedTuple):
         return len(self.term.sums) - self._totals
 
 
-def _added(parts: Array) -> Array:
+def _add_parts(parts: Array) -> Array:
     """Add parts [slots, 2, width], sums and their errors, in twice the precision."""
     zero = jnp.zeros((), parts.dtype)
     return rounded_sum(*lax.reduce((parts[:, 0], parts[:, 1]), (zero, zero), compensated_sum, (0,)))

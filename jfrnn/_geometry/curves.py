@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._tracing import Given, at_once, compiled, own_transfers
+from jfrnn._tracing import Given, at_once, compile_program, own_transfers
 
 Words = tuple[Array, Array]  # high and low half of a key, uint32
 _MOST_BITS = {2: 31, 3: 21}
@@ -109,14 +109,14 @@ def hilbert_decode(keys: Array, dim: int, bits: int) -> Array:
     return _decode(keys, dim, bits, _hilbert_axes)
 
 
-@functools.partial(compiled, static_argnames=("bits", "curve"))
+@functools.partial(compile_program, static_argnames=("bits", "curve"))
 def _encode(coords: Array, bits: int, curve: Callable[[list[Array], int], Words]) -> Array:
     dim = coords.shape[-1]
     mask = np.uint32(2**bits - 1)
     return _pack(*curve([coords[..., axis].astype(jnp.uint32) & mask for axis in range(dim)], bits), dim * bits)
 
 
-@functools.partial(compiled, static_argnames=("dim", "bits", "curve"))
+@functools.partial(compile_program, static_argnames=("dim", "bits", "curve"))
 def _decode(keys: Array, dim: int, bits: int, curve: Callable[[Words, int, int], list[Array]]) -> Array:
     mask = np.uint32(2**bits - 1)
     return jnp.stack([(c & mask).astype(jnp.int32) for c in curve(_unpack(keys, dim * bits), dim, bits)], axis=-1)
@@ -287,6 +287,6 @@ def _check_range(name: str, values: Given, limit: int, advice: str) -> None:
         raise ValueError(f"{name} must be in [0, {limit}), got values from {low} to {high}: {advice}.")
 
 
-@compiled
+@compile_program
 def _range(values: Array) -> tuple[Array, Array]:
     return jnp.min(values), jnp.max(values)

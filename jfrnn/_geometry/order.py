@@ -11,7 +11,7 @@ from jax.core import Tracer
 
 from jfrnn._geometry.curves import Words, hilbert_words, morton_words
 from jfrnn._geometry.inputs import check_positions
-from jfrnn._tracing import Given, compiled, on_device, own_transfers
+from jfrnn._tracing import Given, compile_program, on_device, own_transfers
 
 _SORT_BITS = 21  # bits per axis, fewer than the 24 up to which float32 holds cell numbers exactly
 _LAYOUT = {np.dtype(np.float32): (np.int32, 23, 127), np.dtype(np.float64): (np.int64, 52, 1023)}  # type, mantissa bits, bias
@@ -54,7 +54,7 @@ def hilbert_order(positions: Array, size: Array) -> Array:
     return _sort_order(positions, size, hilbert_words)
 
 
-@functools.partial(compiled, static_argnames="curve")
+@functools.partial(compile_program, static_argnames="curve")
 def _sort_order(positions: Array, size: Array, curve: Callable[[list[Array], int], Words]) -> Array:
     finite = jnp.all(jnp.isfinite(positions), axis=1)
     high, low = curve(_cells_from_lowest(positions.T, size, finite), _SORT_BITS)

@@ -7,7 +7,7 @@ from jfrnn._search.making import round_capacity
 from jfrnn._search.neighbor_list import ROWS_ARE_WHOLE, NeighborList
 from jfrnn._search.problem import check_problem
 from jfrnn._search.search import count, search
-from jfrnn._search.verlet import list_radius, moved_too_far
+from jfrnn._search.verlet import has_moved_too_far, list_radius
 
 __all__ = [
     "MOST_PAIRS",
@@ -15,8 +15,8 @@ __all__ = [
     "NeighborList",
     "check_problem",
     "count",
+    "has_moved_too_far",
     "list_radius",
-    "moved_too_far",
     "norms",
     "round_capacity",
     "run_chunk",

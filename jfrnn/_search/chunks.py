@@ -71,7 +71,7 @@ def run_chunk(
         raise TypeError("run_chunk() changes the shape of the list and cannot run inside jax.jit: jit the chunk, not the loop.")
     given: dict[str, Any] = {"queries": queries, "active": active, "box": box, "cutoff": cutoff}
     given = {name: of(state) for name, of in given.items() if of is not None}
-    given = {"box": nbrs.box, "cutoff": _given_cutoffs(nbrs)} | given
+    given = {"box": nbrs.box, "cutoff": _cutoffs_of(nbrs)} | given
     while True:
         after, seen = chunk(state, nbrs)
         with own_transfers():
@@ -82,7 +82,7 @@ def run_chunk(
         nbrs = seen.grow(positions(state), slack=slack, **given)
 
 
-def _given_cutoffs(nbrs: NeighborList) -> Array | tuple[Array, Array] | None:
+def _cutoffs_of(nbrs: NeighborList) -> Array | tuple[Array, Array] | None:
     """Return the cutoffs per particle of a list, in the form that `NeighborList.grow` takes."""
     if nbrs.radii is None:
         return None

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry import Status
-from jfrnn._tracing import compiled
+from jfrnn._tracing import compile_program
 
 MOST_PAIRS = 2**31 - 1  # most pairs that int32 offsets can number
 
@@ -54,7 +54,7 @@ def saturating_add(a: Array, b: Array) -> Array:
     return jnp.where(a > MOST_PAIRS - b, MOST_PAIRS, a + b)
 
 
-@functools.partial(compiled, static_argnames="capacity")
+@functools.partial(compile_program, static_argnames="capacity")
 def pair_total(count: Array, capacity: int) -> Array:
     """Return the number of used slots in all rows, [] int32, saturating at the largest int32."""
     used = jnp.minimum(count, capacity)
@@ -71,7 +71,7 @@ def row_offsets(count: Array, capacity: int) -> Array:
     return jnp.concatenate([jnp.zeros(1, jnp.int32), ends])
 
 
-@functools.partial(compiled, static_argnames=("sources", "total"))
+@functools.partial(compile_program, static_argnames=("sources", "total"))
 def flat_pairs(idx: Array, count: Array, sources: int, total: int) -> tuple[Array, Array, Array]:
     """Return rows and sources of the pairs, [total] int32 each, padded with m and `sources`, and the row offsets."""
     m, capacity = idx.shape

@@ -25,7 +25,7 @@ from jfrnn._geometry import (
     turns_between,
     unpack_turns,
 )
-from jfrnn._tracing import call_apart, compiled
+from jfrnn._tracing import call_apart, compile_program
 
 
 class ImageCodes(NamedTuple):
@@ -54,7 +54,7 @@ def _pair_cutoff(cutoff: Cutoff | Radii | None, closed: bool) -> Cutoff | Cutoff
     return make_cutoffs(lax.stop_gradient(cutoff), closed)
 
 
-@functools.partial(compiled, static_argnames="closed")
+@functools.partial(compile_program, static_argnames="closed")
 def open_vectors(
     idx: Array, count: Array, sources: Array, rows: Array, given: Cutoff | Radii | None, closed: bool
 ) -> tuple[Array, Array]:
@@ -94,7 +94,7 @@ def _find_slots(idx: Array, count: Array, images: ImagesMade, sources: Array, ro
     return _Slots(used, neighbor, difference, jnp.where(used[..., None], shifts, 0))
 
 
-@functools.partial(compiled, static_argnames=("kind", "half"))
+@functools.partial(compile_program, static_argnames=("kind", "half"))
 def lattice_shifts(
     idx: Array, count: Array, images: ImagesMade, sources: Array, rows: Array, box: Box, kind: Images, half: bool
 ) -> Array:
@@ -102,7 +102,7 @@ def lattice_shifts(
     return given_shifts(lax.stop_gradient(_find_slots(idx, count, images, sources, rows, lattice, half).shifts), kind)
 
 
-@functools.partial(compiled, static_argnames=("kind", "closed", "half"))
+@functools.partial(compile_program, static_argnames=("kind", "closed", "half"))
 def periodic_vectors(
     idx: Array,
     count: Array,
@@ -141,7 +141,7 @@ def _turns_now(
     return turns[0], turns[-1]
 
 
-@compiled
+@compile_program
 def norms(vectors: Array) -> Array:
     largest = lax.stop_gradient(jnp.max(jnp.abs(vectors), axis=-1, initial=0))
     apart = largest > 0

@@ -10,7 +10,7 @@ from jfrnn._engine import Inputs, Options, count_rows, hide_inactive, list_rows
 from jfrnn._geometry import Radii
 from jfrnn._search.geometry import ImageCodes
 from jfrnn._search.verlet import first_verlet
-from jfrnn._tracing import at_once, compiled, own_transfers
+from jfrnn._tracing import at_once, compile_program, own_transfers
 
 _CAPACITY_STEP = 8
 
@@ -28,7 +28,7 @@ def count_capacity(inputs: Inputs, options: Options, slack: float) -> int:
     return min(round_capacity(wanted), max(wanted, inputs.sources.shape[0]))
 
 
-@functools.partial(compiled, static_argnames=("options", "capacity", "moving"))
+@functools.partial(compile_program, static_argnames=("options", "capacity", "moving"))
 def find_fields(inputs: Inputs, options: Options, capacity: int, moving: bool) -> dict[str, Any]:
     """Search, and return the list's fields that come from data; `moving` says that it has a skin. The compiled program of `search`.
 

@@ -38,8 +38,8 @@ from jfrnn._search.exports import DenseNeighbors, check_total, flat_pairs, pair_
 from jfrnn._search.geometry import ImageCodes, ImagesMade, lattice_shifts, norms, open_vectors, periodic_vectors
 from jfrnn._search.making import count_capacity, find_fields, round_capacity
 from jfrnn._search.problem import Problem
-from jfrnn._search.verlet import Verlet, moved_too_far
-from jfrnn._tracing import Given, at_once, call_apart, compiled, own_transfers
+from jfrnn._search.verlet import Verlet, has_moved_too_far
+from jfrnn._tracing import Given, at_once, call_apart, compile_program, own_transfers
 
 ROWS_ARE_WHOLE = Status.NONFINITE | Status.TOTAL_OVERFLOW  # bits that do not mean missing neighbors in rows
 
@@ -233,7 +233,7 @@ class NeighborList:
         box, radii = self._box_now(box, sources), self._radii_now(cutoff, sources, queries)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, radii, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
-        wider = dataclasses.replace(self, problem=self.problem.with_images(self._grown_images(box, radii)))
+        wider = dataclasses.replace(self, problem=self.problem.with_images(self._grow_images(box, radii)))
         inputs, options = self.problem.inputs(sources, queries, active, box, radii, self.batch), wider.problem.options
         with own_transfers():
             met = round_capacity(math.ceil(slack * int(np.max(np.asarray(self.required)))))
@@ -523,7 +523,7 @@ class NeighborList:
         checked = check_box(box, sources, like=self.box)
         return None if checked is None else round_box(checked, np.dtype(sources.dtype))
 
-    def _grown_images(self, box: Box | None, radii: Radii | None) -> Images | None:
+    def _grow_images(self, box: Box | None, radii: Radii | None) -> Images | None:
         if self.box_kind is None or self.box is None or box is None:
             return self.box_kind
         short = bool(np.any(np.asarray(jax.device_get(self.status)) & Status.BOX_TOO_SMALL.value))
@@ -561,7 +561,7 @@ class NeighborList:
         return sources, rows
 
 
-@compiled
+@compile_program
 def _update(
     nbrs: NeighborList, sources: Array, queries: Array | None, active: Array | None, box: Box | None, radii: Radii | None
 ) -> NeighborList:
@@ -577,7 +577,7 @@ def _update(
     if nbrs.verlet is None:
         return remake(nbrs)
     now = hide_inactive(sources, active)
-    moved = moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin)
+    moved = has_moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin)
     nbrs = dataclasses.replace(nbrs, box=box, radii=radii)
     # a loop of at most one iteration: XLA updates a loop's carry in place, but copies the results of a branch
     return lax.while_loop(lambda state: state[0], lambda state: (jnp.zeros_like(state[0]), remake(state[1])), (moved, nbrs))[1]

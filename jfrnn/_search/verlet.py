@@ -58,7 +58,7 @@ def list_radius(cutoff: float, skin: float, dtype: np.dtype) -> float:
     return float(radius)
 
 
-def moved_too_far(
+def has_moved_too_far(
     verlet: Verlet,
     positions: Array,
     queries: Array | None,

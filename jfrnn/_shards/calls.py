@@ -120,7 +120,7 @@ class Seen(NamedTuple):
     active: Array
 
 
-def seen(particles: Particles, halo: Halo) -> Seen:
+def gather_seen(particles: Particles, halo: Halo) -> Seen:
     return Seen(exchange(particles.positions, halo, particles), halo.ids >= 0)
 
 
@@ -141,7 +141,7 @@ def mark(x: Array, good: Array) -> Array:
 def counts(particles: Particles, halo: Halo | None, asked: Asked) -> Array:
     def count_shard(particles: Particles, halo: Halo | None) -> Array:
         halo = halo_in_shard(particles) if halo is None else halo
-        x, active = seen(particles, halo)
+        x, active = gather_seen(particles, halo)
         radius = list_radius(asked.cutoff, asked.skin, np.dtype(x.dtype))
         counts = count(
             x, radius, box=particles.box, include_self=asked.include_self, closed=asked.closed, active=active, backend=asked.backend

@@ -204,12 +204,12 @@ def _members(x: Array, there: Array, extents: _Extents, particles: Particles, st
     """Say which rows [rows] belong into each message, and return the number of hops that the farthest should have gone."""
     here, served = lax.axis_index(stage.name), stage.offsets(particles.sizes.hops[stage.number])
 
-    def needed(offset: Array | int) -> Array:
+    def is_needed(offset: Array | int) -> Array:
         place = here + offset
         within = (place >= 0) & (place < stage.shards) | stage.periodic
         return there & within & _is_near(x, jax.tree.map(lambda each: each[place % stage.shards], extents), particles)
 
-    members = [needed(offset) for offset in served]
+    members = [is_needed(offset) for offset in served]
     if stage.periodic:
         others = sorted(set(range(1, stage.shards)) - set(served))
     else:
@@ -220,7 +220,7 @@ def _members(x: Array, there: Array, extents: _Extents, particles: Particles, st
         offsets = jnp.asarray(others, jnp.int32)
 
         def look(k: Array, farthest: Array) -> Array:
-            return jnp.maximum(farthest, jnp.where(needed(offsets[k]).any(), stage.hops_to(offsets[k]), 0))
+            return jnp.maximum(farthest, jnp.where(is_needed(offsets[k]).any(), stage.hops_to(offsets[k]), 0))
 
         farthest = lax.fori_loop(0, len(others), look, farthest)
     return members, farthest

@@ -56,7 +56,7 @@ def _migrate_shard(particles: Particles) -> Particles:
     bounds = tuple(jnp.where(fits, new, old) for new, old in zip(bounds, particles.bounds, strict=True))
     moved = dataclasses.replace(particles, positions=positions, ids=ids, values=values, bounds=bounds)
     halo = halo_in_shard(moved)
-    required = particles.required.joined(halo.required._replace(particles=fullest))
+    required = particles.required.join(halo.required._replace(particles=fullest))
     return dataclasses.replace(moved, status=status | halo.status, required=required)
 
 

@@ -53,7 +53,7 @@ class Required(NamedTuple):
     hops: Array
     row: Array
 
-    def joined(self, other: "Required") -> "Required":
+    def join(self, other: "Required") -> "Required":
         """Return the sizes that suffice for both."""
         return Required(*(jnp.maximum(a, b) for a, b in zip(self, other, strict=True)))
 
@@ -169,7 +169,7 @@ class Particles:
         """
         if any(isinstance(x, Tracer) for x in jax.tree.leaves(self)):
             raise TypeError("grow() changes shapes and cannot run inside jax.jit: call it on what jit returns.")
-        required = functools.reduce(Required.joined, (met.required for met in seen), self.required)
+        required = functools.reduce(Required.join, (met.required for met in seen), self.required)
         return resize(self, _enough(self.sizes, required, self.mesh, slack))
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -220,13 +220,13 @@ def room(size: int) -> int:
 def _enough(sizes: Sizes, required: Required, mesh: Mesh, slack: float) -> Sizes:
     """Return the present sizes if they hold the requirement, else sizes that hold slack times it."""
 
-    def grown(had: int, needs: int) -> int:
+    def grow_size(had: int, needs: int) -> int:
         return had if needs <= had else room(math.ceil(slack * needs))
 
-    halo = tuple(grown(had, int(needs)) for had, needs in zip(sizes.halo, np.asarray(required.halo), strict=True))
+    halo = tuple(grow_size(had, int(needs)) for had, needs in zip(sizes.halo, np.asarray(required.halo), strict=True))
     hops = tuple(max(had, int(needs)) for had, needs in zip(sizes.hops, np.asarray(required.hops), strict=True))
     most = tuple(size - 1 for size in mesh.devices.shape)
-    return Sizes(grown(sizes.particles, int(required.particles)), halo, tuple(map(min, hops, most)))
+    return Sizes(grow_size(sizes.particles, int(required.particles)), halo, tuple(map(min, hops, most)))
 
 
 def no_requirements(axes: int) -> Required:
@@ -267,11 +267,11 @@ def resize(particles: Particles, sizes: Sizes) -> Particles:
     kept = particles.positions, particles.ids, particles.values
 
     def wider(rows: Tree) -> Tree:
-        def padded(x: Array, fill: int) -> Array:
+        def pad(x: Array, fill: int) -> Array:
             return jnp.concatenate([x, jnp.full((new - old, *x.shape[1:]), fill, x.dtype)])
 
         positions, ids, values = rows
-        return padded(positions, 0), padded(ids, -1), jax.tree.map(lambda x: padded(x, 0), values)
+        return pad(positions, 0), pad(ids, -1), jax.tree.map(lambda x: pad(x, 0), values)
 
     # The programs run even if nothing grows: their results share no memory with the arrays of `particles`.
     kept = jax.jit(jax.shard_map(wider, mesh=mesh, in_specs=of_shards(mesh), out_specs=of_shards(mesh), check_vma=False))(kept)

@@ -13,8 +13,8 @@ from jax.core import Tracer
 from jax.sharding import PartitionSpec
 
 from jfrnn._geometry import check_devices, pairs_and_status, shape_of
-from jfrnn._search import NeighborList, moved_too_far, round_capacity, search
-from jfrnn._shards.calls import Asked, check_halo, count_capacity, over_shards, seen
+from jfrnn._search import NeighborList, has_moved_too_far, round_capacity, search
+from jfrnn._shards.calls import Asked, check_halo, count_capacity, gather_seen, over_shards
 from jfrnn._shards.halo import Halo, halo_in_shard, halo_spec
 from jfrnn._shards.migrate import migrate
 from jfrnn._shards.particles import OVERFLOWS, Particles, Required, check, of_shards, share_bits
@@ -165,7 +165,7 @@ def listed(particles: Particles, asked: Asked, capacity: int) -> Neighbors:
 
     def of_shard(particles: Particles) -> tuple[Any, ...]:
         halo = halo_in_shard(particles)
-        x, active = seen(particles, halo)
+        x, active = gather_seen(particles, halo)
         made = search(
             x,
             asked.cutoff,
@@ -196,7 +196,7 @@ def _update(particles: Particles, nbrs: Neighbors) -> tuple[Particles, Neighbors
         if local.verlet is not None and made.local.verlet is not None:
             verlet = dataclasses.replace(made.local.verlet, rebuild_count=local.verlet.rebuild_count + 1)
             made = dataclasses.replace(made, local=dataclasses.replace(made.local, verlet=verlet))
-        status, required = made.status | nbrs.status, made.required.joined(nbrs.required)
+        status, required = made.status | nbrs.status, made.required.join(nbrs.required)
         return moved, dataclasses.replace(made, status=status, required=required)
 
     if not asked.skin:
@@ -216,7 +216,7 @@ def _is_stale(particles: Particles, halo: Halo, local: NeighborList) -> Array:
         raise TypeError("a list without a skin is always stale.")
     before = dataclasses.replace(local.verlet, positions=local.verlet.positions[:own])
     now = jnp.where((particles.ids >= 0)[:, None], particles.positions, jnp.inf)
-    moved = moved_too_far(before, now, None, local.box, local.box_kind, None, local.skin)
+    moved = has_moved_too_far(before, now, None, local.box, local.box_kind, None, local.skin)
     return lax.pmax(moved | jnp.any(halo.ids[:own] != particles.ids), particles.mesh.axis_names)
 
 

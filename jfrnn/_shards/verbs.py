@@ -11,7 +11,7 @@ from jax.core import Tracer
 
 from jfrnn._geometry import Status, check_capacity, check_flag, check_slack, known_status
 from jfrnn._search import ROWS_ARE_WHOLE, NeighborList
-from jfrnn._shards.calls import Asked, check_asked, check_halo, count_capacity, counts, is_good, mark, over_shards, seen
+from jfrnn._shards.calls import Asked, check_asked, check_halo, count_capacity, counts, gather_seen, is_good, mark, over_shards
 from jfrnn._shards.halo import Halo, exchange, halo_in_shard
 from jfrnn._shards.particles import Particles, of_shards
 from jfrnn._shards.sharded_list import Neighbors, listed
@@ -174,7 +174,7 @@ def _sums(
 ) -> Tree:
     def sum_shard(particles: Particles, halo: Halo | None, local: NeighborList | None, values: Tree) -> Tree:
         halo = halo_in_shard(particles) if halo is None else halo
-        x, active = seen(particles, halo)
+        x, active = gather_seen(particles, halo)
         theirs = jax.tree.map(lambda leaf: exchange(leaf, halo, particles), values)
         options: dict[str, Any] = {"reduce": reduce, "compensated": compensated}
         if local is None:

@@ -13,7 +13,7 @@ from jfrnn._sums.fused import check, extremes
 from jfrnn._sums.relations import Listed, Relation, Searched, evaluate, is_fused
 from jfrnn._sums.summation import bind_sum
 from jfrnn._sums.terms import Derived, Groups, Term, choose, fresh_labels, join, make_term
-from jfrnn._tracing import call_apart, compiled
+from jfrnn._tracing import call_apart, compile_program
 
 _Best = tuple[Array, Array, Array | None]  # per row and element [b, k]: largest value, its source (n: none), its shift [b, k, d]
 
@@ -55,7 +55,7 @@ def _element(term: Term, k: int) -> Derived:
     return make_term(summand, join(term.operands, Groups((), (number,), ())), term.shift, (mine, theirs))
 
 
-@functools.partial(compiled, static_argnames=("term", "largest"))
+@functools.partial(compile_program, static_argnames=("term", "largest"))
 def _find(relation: Relation, term: Term, operands: Groups, largest: bool) -> list[_Best]:
     if is_fused(relation, term):
         return extremes(relation.inputs, relation.options, term, operands, largest)

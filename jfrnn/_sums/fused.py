@@ -94,7 +94,7 @@ def _kind(inputs: Inputs) -> tuple[np.dtype, tuple[bool, ...]]:
 @functools.lru_cache(maxsize=256)
 def _why_not(term: Term, dtype: np.dtype, periodic: tuple[bool, ...]) -> Exception | None:
     for what, specs in (("fn returns", term.summands), ("fn gets or closes over", sum(term.operands, ()))):
-        known = {dtype} if what == "fn returns" else _travelling(dtype)
+        known = {dtype} if what == "fn returns" else _exact_dtypes(dtype)
         for spec in specs:
             if spec.dtype not in known:
                 names = ", ".join(sorted(x.name for x in known))
@@ -109,7 +109,7 @@ def _why_not(term: Term, dtype: np.dtype, periodic: tuple[bool, ...]) -> Excepti
     return None
 
 
-def _travelling(dtype: np.dtype) -> set[np.dtype]:
+def _exact_dtypes(dtype: np.dtype) -> set[np.dtype]:
     """Return the dtypes whose values the kernel can hold exactly in columns of this dtype."""
     names = ("float32", "bool", "int32") if dtype == np.float32 else ("float32", "float64", "bool", "int32", "int64")
     return {np.dtype(name) for name in names}

@@ -31,10 +31,10 @@ def call_with_pair(fn: Callable[[Array, Tree, Tree], Tree], r: Array, i: Tree, j
         raise TypeError(
             f"fn ({_name_of(fn)}) asks what a number is, as `if`, `and`, `float()` and functions of NumPy do. It is traced once "
             "for all pairs, so numbers are not known: write jnp.where(condition, a, b) instead of `if`, & instead of `and`, "
-            f"and jnp instead of np. {_given(r, i, j)}"
+            f"and jnp instead of np. {_describe_arguments(r, i, j)}"
         ) from error
     except Exception as error:
-        error.add_note(f"Raised by fn ({_name_of(fn)}) of a pair sum. {_given(r, i, j)}")
+        error.add_note(f"Raised by fn ({_name_of(fn)}) of a pair sum. {_describe_arguments(r, i, j)}")
         raise
 
 
@@ -49,7 +49,7 @@ def _check_signature(fn: Callable[..., Tree], r: Array, i: Tree, j: Tree) -> Non
         names = ", ".join(map(str, signature.parameters))
         raise TypeError(
             f"fn must take three arguments, (r, i, j), also where it reads but one of them; {_name_of(fn)} takes ({names}). "
-            f"{_given(r, i, j)}"
+            f"{_describe_arguments(r, i, j)}"
         ) from error
 
 
@@ -65,7 +65,7 @@ class _Shape(str):
     __repr__ = str.__str__
 
 
-def _given(r: Array, i: Tree, j: Tree) -> str:
+def _describe_arguments(r: Array, i: Tree, j: Tree) -> str:
     """Describe the arguments that fn gets for a pair."""
 
     def describe(values: Tree) -> str:

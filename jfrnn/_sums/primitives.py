@@ -46,7 +46,7 @@ class Equation(NamedTuple):
         """Return an array filled with one constant."""
         return np.full(shape, self.scalars.constant(value, dtype or self.outputs[0].dtype))
 
-    def known(self, numbers: Values) -> np.ndarray:
+    def constants(self, numbers: Values) -> np.ndarray:
         """Return the values of constants, such as the indices of a gather."""
         values = [self.scalars.value(k) for k in numbers.reshape(-1).tolist()]
         if any(value is None for value in values):
@@ -174,12 +174,12 @@ def _accumulate(operation: str) -> Rule:
         slices = list(np.moveaxis(inputs[0], eqn.params["axis"], 0)[backward])
         for k in range(1, len(slices)):
             slices[k] = eqn.each(operation, slices[k - 1], slices[k])
-        return [np.moveaxis(np.array(slices, int).reshape(-1, *_without(inputs[0].shape, eqn))[backward], 0, eqn.params["axis"])]
+        return [np.moveaxis(np.array(slices, int).reshape(-1, *_rest_shape(inputs[0].shape, eqn))[backward], 0, eqn.params["axis"])]
 
     return rule
 
 
-def _without(shape: tuple[int, ...], eqn: Equation) -> tuple[int, ...]:
+def _rest_shape(shape: tuple[int, ...], eqn: Equation) -> tuple[int, ...]:
     axis = eqn.params["axis"]
     return shape[:axis] + shape[axis + 1 :]
 
@@ -251,7 +251,7 @@ def _by_index(*sources: int) -> Rule:
 
     def rule(eqn: Equation, inputs: list[Values]) -> list[Values]:
         with jax.ensure_compile_time_eval():
-            arrays = [jnp.asarray(x.astype(np.int32) if k in sources else eqn.known(x)) for k, x in enumerate(inputs)]
+            arrays = [jnp.asarray(x.astype(np.int32) if k in sources else eqn.constants(x)) for k, x in enumerate(inputs)]
             params = {**eqn.params, "fill_value": -1} if "fill_value" in eqn.params else eqn.params
             moved = np.asarray(eqn.primitive.bind(*arrays, **params)).astype(int)
         kind = np.dtype(eqn.outputs[0].dtype).kind
@@ -266,7 +266,7 @@ def _scatter_add(eqn: Equation, inputs: list[Values]) -> list[Values]:
     """Add each update to the elements to which JAX scatters it."""
     (operand, indices, updates), dtype = inputs, eqn.outputs[0].dtype
     with jax.ensure_compile_time_eval():
-        where = jnp.asarray(eqn.known(indices))
+        where = jnp.asarray(eqn.constants(indices))
         nothing = jnp.zeros(operand.shape, dtype)
         ones = jnp.eye(updates.size, dtype=dtype).reshape(-1, *updates.shape)
         places = [np.asarray(eqn.primitive.bind(nothing, where, one, **eqn.params)).reshape(-1) for one in ones]

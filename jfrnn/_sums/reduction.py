@@ -19,7 +19,7 @@ from jfrnn._sums.pair_function import call_with_pair
 from jfrnn._sums.relations import Listed, Relation, Searched
 from jfrnn._sums.summation import bind_sum
 from jfrnn._sums.terms import OF_QUERIES, OF_SOURCES, Groups, Labels, Summand, Term, choose, fresh_labels, trace
-from jfrnn._tracing import Given, Tree, call_apart, compiled, on_device
+from jfrnn._tracing import Given, Tree, call_apart, compile_program, on_device
 
 
 class Pairs(NamedTuple):
@@ -39,7 +39,7 @@ class Pairs(NamedTuple):
     mark: Callable[[list[Array]], list[Array]]
 
 
-def searched(inputs: Inputs, options: Options) -> Pairs:
+def pairs_of_search(inputs: Inputs, options: Options) -> Pairs:
     """Return the pairs that a search finds."""
     sources, queries, active, box, cutoff, _ = inputs
     fixed = lax.stop_gradient(inputs._replace(sources=hide_inactive(sources, active), active=None))
@@ -47,11 +47,11 @@ def searched(inputs: Inputs, options: Options) -> Pairs:
     largest = make_cutoffs(cutoff, options.closed).largest if isinstance(cutoff, Radii) else cutoff.radius
     lattice = _lattice(box, options.images, sources)
     static = options, several or box is not None
-    sources, rows, mark = _telling(sources, queries, _good_rows_of_search, (inputs,), static)
+    sources, rows, mark = _prepare_marks(sources, queries, _good_rows_of_search, (inputs,), static)
     return Pairs(relation, False, sources, rows, lattice, largest, relation.symmetric, mark)
 
 
-def listed(
+def pairs_of_list(
     nbrs: NeighborList,
     positions: Array,
     cutoff: Given,
@@ -80,11 +80,11 @@ def listed(
     lattice = _lattice(nbrs._box_now(box, sources), nbrs.box_kind, sources)
     largest = nbrs.cutoff if nbrs.radii is None else make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest
     data = nbrs.status, nbrs.count if nbrs.masked and not own else None, fixed_rows
-    sources, rows, mark = _telling(sources, rows if own else None, _good_rows_of_list, data)
+    sources, rows, mark = _prepare_marks(sources, rows if own else None, _good_rows_of_list, data)
     return Pairs(relation, nbrs.half, sources, rows, lattice, largest, directionless, mark)
 
 
-@compiled
+@compile_program
 def _good_rows(points: Array, active: Array | None, whole: Array | None) -> Array:
     """Say which rows [m] are valid: those of finite points and of inactive particles, provided that no pairs are missing."""
     fixed = lax.stop_gradient(points)
@@ -94,14 +94,14 @@ def _good_rows(points: Array, active: Array | None, whole: Array | None) -> Arra
     return good if whole is None else good & whole
 
 
-@functools.partial(compiled, static_argnames=("options", "doubtful"))
+@functools.partial(compile_program, static_argnames=("options", "doubtful"))
 def _good_rows_of_search(inputs: Inputs, options: Options, doubtful: bool) -> Array:
     """Say which rows [m] of a search are valid; `doubtful` says that the data decide whether pairs may be missing."""
     whole = is_decidable(inputs, options) if doubtful else None
     return _good_rows(inputs.sources, inputs.active, whole) if inputs.queries is None else _good_rows(inputs.queries, None, whole)
 
 
-@compiled
+@compile_program
 def _good_rows_of_list(status: Array, count: Array | None, points: Array) -> Array:
     """Say which rows [m] of a list are valid. If particles may be inactive, `count` is given: those with neighbors are active."""
     whole = (status & ~ROWS_ARE_WHOLE.value) == 0
@@ -109,7 +109,7 @@ def _good_rows_of_list(status: Array, count: Array | None, points: Array) -> Arr
     return _good_rows(points, active, whole)
 
 
-def _telling(
+def _prepare_marks(
     sources: Array, queries: Array | None, good_rows: Callable[..., Array], data: tuple, static: tuple = ()
 ) -> tuple[Array, Array, Callable[[list[Array]], list[Array]]]:
     """Return sources, rows and a function that marks invalid rows; derivatives in invalid rows of the positions are NaN.
@@ -120,18 +120,18 @@ def _telling(
     if not isinstance(points, Tracer):  # no derivatives are taken
         return sources, points, functools.partial(_mark_by, data=data, good_rows=good_rows, static=static)
     good = call_apart(lambda *data: good_rows(*data, *static), *data)
-    points = _told(points, good)
+    points = _mark_derivatives(points, good)
     return points if queries is None else sources, points, functools.partial(_mark, good=good)
 
 
 @jax.custom_jvp
-def _told(points: Array, good: Array) -> Array:
+def _mark_derivatives(points: Array, good: Array) -> Array:
     del good
     return points
 
 
-@_told.defjvp
-def _told_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Any]) -> tuple[Array, Array]:
+@_mark_derivatives.defjvp
+def _mark_derivatives_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Any]) -> tuple[Array, Array]:
     points, good = primals
     return points, tangents[0] * _one_or_nan(good, tangents[0])
 
@@ -145,7 +145,7 @@ def _lattice(box: Box | None, images: Images | None, like: Array) -> Lattice | N
     return None if box is None or images is None else make_lattice(box, images, np.dtype(like.dtype))
 
 
-def reduced(
+def reduce_pairs(
     fn: Callable[[Array, Any, Any], Any],
     pairs: Pairs,
     mine: Tree,
@@ -182,7 +182,7 @@ def reduced(
     return jax.tree.unflatten(structure[0], leaves)
 
 
-@functools.partial(compiled, static_argnames=("term", "compensated"))
+@functools.partial(compile_program, static_argnames=("term", "compensated"))
 def _sums_of_half(listed: Listed, term: Term, operands: Groups, compensated: bool) -> list[Array]:
     """Sum over a half list and over its mirror image; a particle's pair with itself counts once."""
     apart = listed.idx != lax.iota(jnp.int32, listed.idx.shape[0])[:, None]
@@ -267,18 +267,18 @@ def _summable(x: Given, dtype: np.dtype) -> Array:
     return array.astype(dtype if is_loose else array.dtype)
 
 
-@compiled
+@compile_program
 def _mark(leaves: list[Array], good: Array) -> list[Array]:
     """Replace invalid rows by NaN (integers: the smallest one); their derivatives become NaN too."""
 
-    def marked(x: Array) -> Array:
+    def mark_leaf(x: Array) -> Array:
         if jnp.issubdtype(x.dtype, jnp.floating):
             return x * _one_or_nan(good, x)
         return jnp.where(good.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.iinfo(x.dtype).min)
 
-    return [marked(x) for x in leaves]
+    return [mark_leaf(x) for x in leaves]
 
 
-@functools.partial(compiled, static_argnames=("good_rows", "static"))
+@functools.partial(compile_program, static_argnames=("good_rows", "static"))
 def _mark_by(leaves: list[Array], data: tuple, good_rows: Callable[..., Array], static: tuple) -> list[Array]:
     return _mark(leaves, good_rows(*data, *static))

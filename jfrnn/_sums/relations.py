@@ -51,7 +51,7 @@ class Searched:
         radii = self.inputs.cutoff
         return self.inputs.queries is None and not (isinstance(radii, Radii) and radii.rule in _EXCHANGED)
 
-    def reversed(self) -> "Searched":
+    def reverse(self) -> "Searched":
         """Return the same pairs with i and j exchanged and shifts negated."""
         sources, queries, active, box, cutoff, batch = self.inputs
         if isinstance(cutoff, Radii):
@@ -98,7 +98,7 @@ class Listed:
         m, n = self.idx.shape[0], self.source_count
         return (n, m) if self.flipped else (m, n)
 
-    def reversed(self) -> "Listed":
+    def reverse(self) -> "Listed":
         """Return the same pairs with i and j exchanged and shifts negated."""
         return self if self.symmetric else dataclasses.replace(self, flipped=not self.flipped)
 

@@ -66,7 +66,7 @@ class Scalars:
         self.nodes: list[Node] = []
         self._numbers: dict[Any, int] = {}
 
-    def named(self, name: str, dtype: str) -> int:
+    def declare(self, name: str, dtype: str) -> int:
         """Return a scalar that is defined elsewhere under this name."""
         return self._number((name, dtype), Node(name, (), dtype))
 
@@ -95,7 +95,7 @@ class Scalars:
         """Return the value of a constant, None for other nodes."""
         return self.nodes[number].value
 
-    def needed(self, outputs: Iterable[int]) -> set[int]:
+    def dependencies(self, outputs: Iterable[int]) -> set[int]:
         """Return all nodes on which the outputs depend, themselves included."""
         found: set[int] = set()
         left = list(outputs)
@@ -109,7 +109,7 @@ class Scalars:
     def text(self, outputs: dict[str, int]) -> str:
         """Return the statements that define the outputs by name, without unused ones."""
         names, lines = {}, []
-        for number in sorted(self.needed(outputs.values())):
+        for number in sorted(self.dependencies(outputs.values())):
             node = self.nodes[number]
             names[number] = node.form.format(*(names[k] for k in node.operands))
             if node.operands:  # inputs and constants are written inline

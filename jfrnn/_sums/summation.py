@@ -19,7 +19,7 @@ from jax.interpreters import ad, batching, mlir
 from jfrnn._sums.fused import check
 from jfrnn._sums.relations import Relation, Searched, sum_pairs
 from jfrnn._sums.terms import Derived, Groups, Term, choose, is_moving, join, tangent, transpose
-from jfrnn._tracing import Aval, Internal, compiled, result_aval, unvarying_types, vary, varying_axes
+from jfrnn._tracing import Aval, Internal, compile_program, result_aval, unvarying_types, vary, varying_axes
 
 Structure = Any  # the `PyTreeDef` of a relation, which type checkers do not accept as a type
 
@@ -93,7 +93,7 @@ def _transpose(cotangents: list, *args: Internal, term: Term, structure: Structu
             given = Groups(given.shared, side, side)
         results += _bind_derived(leaves, given, rules.along, structure, compensated)
     if rules.across is not None:
-        exchanged, other_structure = jax.tree.flatten(relation.reversed())
+        exchanged, other_structure = jax.tree.flatten(relation.reverse())
         results += _bind_derived(
             exchanged, Groups(given.shared, given.others, given.own), rules.across, other_structure, compensated
         )
@@ -124,7 +124,7 @@ def _lower(ctx: Internal, *args: Internal, **params: Internal) -> Internal:
     return mlir.lower_fun(_sums, multiple_results=True)(ctx.replace(avals_in=unvarying_types(ctx.avals_in)), *args, **params)
 
 
-_compiled = functools.partial(compiled, static_argnames=("term", "structure", "compensated"))(_sums)
+_compiled = functools.partial(compile_program, static_argnames=("term", "structure", "compensated"))(_sums)
 _pair_sum_p.def_impl(lambda *args, **params: _compiled(*args, **params))
 _pair_sum_p.def_abstract_eval(_result_shapes)
 ad.primitive_jvps[_pair_sum_p] = _jvp

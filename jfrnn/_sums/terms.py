@@ -104,11 +104,11 @@ def trace(
     consts = tuple(jnp.asarray(x) for x in closed.consts)
     of_consts = Groups(tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in consts), (), ())
 
-    def hoisted(real: Array, shift: Array, operands: Groups) -> Sequence[Array]:
+    def evaluate(real: Array, shift: Array, operands: Groups) -> Sequence[Array]:
         shared, own, others = operands
         return eval_jaxpr(closed.jaxpr, shared[: len(consts)], real, shift, *shared[len(consts) :], *own, *others)
 
-    derived = _keep(owner, make_term(hoisted, join(of_consts, operands), shift, labels))
+    derived = _keep(owner, make_term(evaluate, join(of_consts, operands), shift, labels))
     of_closed, needed = derived.needed.shared[: len(consts)], derived.needed.shared[len(consts) :]
     return derived.term, derived.needed._replace(shared=needed), tuple(compress(consts, of_closed))
 

@@ -71,14 +71,14 @@ def translate(closed: ClosedJaxpr) -> Translated:
     places: dict[int, tuple[int, int]] = {}
     arguments = []
     for k, (shape, dtype) in enumerate(inputs):
-        numbers = {scalars.named(input_name(k, e), dtype): (k, e) for e in range(math.prod(shape))}
+        numbers = {scalars.declare(input_name(k, e), dtype): (k, e) for e in range(math.prod(shape))}
         places |= numbers
         arguments.append(np.array(list(numbers), int).reshape(shape))
     results = _run(scalars, closed, arguments)
     outputs = tuple(_spec(v.aval, "an output") for v in closed.jaxpr.outvars)
     defined = {output_name(k, e): x for k, result in enumerate(results) for e, x in enumerate(result.reshape(-1).tolist())}
     text = scalars.text(defined)
-    reads = tuple(places[number] for number in sorted(scalars.needed(defined.values()) & places.keys()))
+    reads = tuple(places[number] for number in sorted(scalars.dependencies(defined.values()) & places.keys()))
     return Translated(text, inputs, outputs, reads, hash_of(text, inputs, outputs))
 
 

@@ -109,7 +109,7 @@ def pair_sum(
     sums over neighbors as in SPH (Gingold & Monaghan 1977, doi:10.1093/mnras/181.3.375); derivatives by transposition (Radul et al.
     2023, doi:10.1145/3571236).
     """
-    from jfrnn._sums.reduction import listed, reduced, searched
+    from jfrnn._sums.reduction import pairs_of_list, pairs_of_search, reduce_pairs
 
     if not callable(fn):
         raise TypeError(f"fn must be a function of (r, i, j), got {type(fn).__name__}.")
@@ -127,12 +127,12 @@ def pair_sum(
             positions, cutoff, queries, box, batch, radius_rule, False, include_self, closed, backend, 0.0, active
         )
         with own_transfers():
-            pairs = searched(inputs, _with_engine(problem.options, inputs, backend))
+            pairs = pairs_of_search(inputs, _with_engine(problem.options, inputs, backend))
     else:
         given = {"batch": batch is not None, "radius_rule": radius_rule != "gather", "include_self": include_self}
         given |= {"closed": closed, "active": active is not None, "backend": backend != "auto"}
         with own_transfers():
-            pairs = listed(neighbors, positions, cutoff, queries, box, given, reduce != "sum" or compensated)
+            pairs = pairs_of_list(neighbors, positions, cutoff, queries, box, given, reduce != "sum" or compensated)
     if symmetry is not None and not pairs.directionless:
         raise ValueError(
             f"symmetry={symmetry!r} is about pairs without direction: not with queries, nor with a cutoff of one side."
@@ -142,7 +142,7 @@ def pair_sum(
     theirs = _check_values("values", values, pairs.sources.shape[0], "particle")
     mine = theirs if queries is None else _check_values("query_values", query_values, pairs.rows.shape[0], "query")
     with own_transfers():
-        return reduced(fn, pairs, mine, theirs, reduce, symmetry, compensated)
+        return reduce_pairs(fn, pairs, mine, theirs, reduce, symmetry, compensated)
 
 
 def _with_engine(options: Options, inputs: Inputs, backend: str) -> Options:
@@ -160,7 +160,7 @@ def _with_engine(options: Options, inputs: Inputs, backend: str) -> Options:
 
 
 def _check_values(name: str, values: Tree, size: int, what: str) -> Tree:
-    def checked(path: KeyPath, leaf: Given) -> Array:
+    def check_leaf(path: KeyPath, leaf: Given) -> Array:
         if not hasattr(leaf, "shape") or not hasattr(leaf, "dtype"):
             raise TypeError(
                 f"{name}{jax.tree_util.keystr(path)} must be an array with a row per {what}, got {type(leaf).__name__}."
@@ -172,4 +172,4 @@ def _check_values(name: str, values: Tree, size: int, what: str) -> Tree:
             )
         return on_device(leaf)
 
-    return jax.tree_util.tree_map_with_path(checked, values)
+    return jax.tree_util.tree_map_with_path(check_leaf, values)

@@ -61,7 +61,7 @@ class Program(Generic[_Args, _Result]):
         return self._jitted.lower(*args, **kwargs)
 
 
-def compiled(function: Callable[_Args, _Result], **options: Option) -> Program[_Args, _Result]:
+def compile_program(function: Callable[_Args, _Result], **options: Option) -> Program[_Args, _Result]:
     """Compile a function as `jax.jit` does, and let go of all programs of the library when there are too many.
 
     What is in use elsewhere, such as a program of the caller that calls this function, stays as it is.

@@ -220,7 +220,7 @@ def _separates(direction: Vector, x: list[Vector], reach: Array) -> Array:
     return sound & ((least > room) | (most < -room))
 
 
-def without_faults(vertices: Array, faces: Array) -> tuple[Array, Array, Array]:
+def gather_corners(vertices: Array, faces: Array) -> tuple[Array, Array, Array]:
     """Return triangle corners [f, corner, axis], which triangles are finite, and which have only valid indices: [f] bool each."""
     there = jnp.all((faces >= 0) & (faces < vertices.shape[0]), axis=1)
     if vertices.shape[0] == 0:

@@ -61,11 +61,11 @@ def are_contacts(mask: Array, triangle: Array, faces: Array, seen: Array, vector
     slots = _Slots(mask, triangle, named, start, end, order, vectors, distance, error)
     longest = jnp.max(jnp.where(mask, lax.broadcasted_iota(jnp.int32, mask.shape, 1) + 1, 0), initial=0)
 
-    def without(j: Array, left: Array) -> Array:
+    def drop_yielding(j: Array, left: Array) -> Array:
         one = _Slots(*(lax.dynamic_slice_in_dim(x, j, 1, axis=1) for x in slots))
         return left & ~(one.mask & _is_first(one, slots) & (_holds(one, slots) | _is_same(one, slots)))
 
-    return lax.fori_loop(0, longest, without, mask)
+    return lax.fori_loop(0, longest, drop_yielding, mask)
 
 
 def _holds(one: _Slots, others: _Slots) -> Array:

@@ -10,8 +10,8 @@ from jax import Array, lax
 
 from jfrnn._geometry import Cutoff, Status, make_cutoff
 from jfrnn._search import round_capacity
-from jfrnn._tracing import at_once, call_apart, compiled, own_transfers
-from jfrnn._triangles.cells import without_faults
+from jfrnn._tracing import at_once, call_apart, compile_program, own_transfers
+from jfrnn._triangles.cells import gather_corners
 from jfrnn._triangles.engines import TriangleEngine, Wall
 
 
@@ -39,7 +39,7 @@ def find_fields(
         return call_apart(find, *lax.stop_gradient((points, vertices, faces, cells)), radius)
 
 
-@functools.partial(compiled, static_argnames=("engine", "capacity"))
+@functools.partial(compile_program, static_argnames=("engine", "capacity"))
 def find_triangles(
     points: Array,
     vertices: Array,
@@ -53,7 +53,7 @@ def find_triangles(
 
     The wall and its sorted form are returned too, so that as results they share no memory with the caller's arrays or another list.
     """
-    corners, finite, there = without_faults(vertices, faces)
+    corners, finite, there = gather_corners(vertices, faces)
     sound = {
         Status.NONFINITE: jnp.all(jnp.isfinite(points)),
         Status.NONFINITE_VERTEX: jnp.all(finite),

@@ -24,8 +24,8 @@ from jfrnn._geometry import (
     shape_of,
 )
 from jfrnn._search import norms, round_capacity
-from jfrnn._tracing import call_apart, compiled, own_transfers
-from jfrnn._triangles.cells import TriangleCells, without_faults
+from jfrnn._tracing import call_apart, compile_program, own_transfers
+from jfrnn._triangles.cells import TriangleCells, gather_corners
 from jfrnn._triangles.closest import Rows, nearest_of, pseudonormals
 from jfrnn._triangles.contacts import are_contacts
 from jfrnn._triangles.engines import TRIANGLE_ENGINES, TriangleEngine
@@ -298,11 +298,11 @@ class TriangleList:
         return points, corners
 
 
-@compiled
+@compile_program
 def _nearest_in_rows(tri: TriangleList, points: Array, vertices: Array) -> tuple[Array, Array, Array]:
     """Return vectors to nearest points [n, capacity, d], their features, and which slots hold a pair."""
     used = lax.broadcasted_iota(jnp.int32, tri.idx.shape, 1) < tri.count[:, None]
-    corners, finite, there = without_faults(vertices, tri.faces)
+    corners, finite, there = gather_corners(vertices, tri.faces)
     triangle = jnp.where(used, tri.idx, 0)
     cutoff = make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False)
     are_pairs = functools.partial(are_near, decide=tri._engine.decide)
@@ -313,7 +313,7 @@ def _nearest_in_rows(tri: TriangleList, points: Array, vertices: Array) -> tuple
     return jnp.where(mask[..., None], vectors, 0), feature, mask
 
 
-@compiled
+@compile_program
 def _contacts_in_rows(
     tri: TriangleList, points: Array, vertices: Array, vectors: Array, feature: Array, mask: Array
 ) -> tuple[Array, Array]:
@@ -325,9 +325,9 @@ def _contacts_in_rows(
     return jnp.where(kept[..., None], vectors, 0), kept
 
 
-@compiled
+@compile_program
 def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> SignedDistance:
-    corners, finite, there = without_faults(vertices, tri.faces)
+    corners, finite, there = gather_corners(vertices, tri.faces)
     fixed, at, good = *lax.stop_gradient((corners, points)), finite & there
     cutoff, used = make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False), jnp.minimum(tri.count, tri.capacity)
     slot, some = call_apart(functools.partial(nearest_slots, decide=tri._engine.decide), at, fixed, tri.idx, used, good, cutoff)
