@@ -38,7 +38,7 @@ class Commands(TyperGroup):
             return super().get_command(ctx, cmd_name)
         module, function, _ = self.there[cmd_name]
         app = typer.Typer(add_completion=False, rich_markup_mode=None)
-        app.command(name=cmd_name)(_told(getattr(importlib.import_module(module), function)))
+        app.command(name=cmd_name)(_make_command(getattr(importlib.import_module(module), function)))
         return typer.main.get_command(app)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
@@ -56,11 +56,11 @@ class Commands(TyperGroup):
         try:
             code = super().main(args, *more, standalone_mode=False, **others)
         except Exception as error:
-            code = _said(error, sys.argv[1:] if args is None else args)
+            code = _report_error(error, sys.argv[1:] if args is None else args)
         sys.exit(code if isinstance(code, int) else 0)
 
 
-def _told(function: Callable[..., Any]) -> Callable[..., None]:
+def _make_command(function: Callable[..., Any]) -> Callable[..., None]:
     """Return a command that prints what a function returns, and says its mistakes in a line."""
 
     @functools.wraps(function)
@@ -71,7 +71,7 @@ def _told(function: Callable[..., Any]) -> Callable[..., None]:
     return command
 
 
-def _said(error: Exception, given: Sequence[str]) -> int:
+def _report_error(error: Exception, given: Sequence[str]) -> int:
     """Print a mistake in the command line and return the exit code; what else went wrong is raised again."""
     if isinstance(error, typer.Abort):
         typer.echo("aborted", err=True)
@@ -123,7 +123,7 @@ def positive(value: Any) -> Any:  # noqa: ANN401
     return value
 
 
-def _known_engine(value: str) -> str:
+def _check_engine(value: str) -> str:
     check_choice("--backend", value, ("auto", "jax", "warp", "brute"))
     return value
 
@@ -212,4 +212,4 @@ RetryFailed = Annotated[bool, typer.Option("--retry-failed", help="Measure missi
 RowsFolder = Annotated[Path | None, typer.Option(help="Folder of the rows; out/NAME without it.")]
 Points = Annotated[int, typer.Option(min=100, max=MOST_POINTS, help="Random points.")]
 Rounds = Annotated[int, typer.Option(min=2, max=100_000, help="Timed runs of each.")]
-Engine = Annotated[str, typer.Option(callback=_known_engine, help="As in jfrnn.search: auto, warp, jax or brute.")]
+Engine = Annotated[str, typer.Option(callback=_check_engine, help="As in jfrnn.search: auto, warp, jax or brute.")]

@@ -29,13 +29,13 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-def _known_layout(name: str) -> str:
+def _check_layout(name: str) -> str:
     if not _layouts.is_layout(name):
         raise ValueError(f"unknown layout {name!r}; allowed: {', '.join(_layouts.names())}")
     return name
 
 
-LayoutName = Annotated[str, AfterValidator(_known_layout)]
+LayoutName = Annotated[str, AfterValidator(_check_layout)]
 
 
 class Scenes(Table):
@@ -62,7 +62,7 @@ class Scenes(Table):
             yield dict(zip(axes, values, strict=True))
 
 
-def _known_method(name: str) -> str:
+def _check_method(name: str) -> str:
     if name not in methods.names():
         raise ValueError(f"unknown method {name!r}; allowed: {', '.join(methods.names())}")
     return name
@@ -87,7 +87,7 @@ class Repeats(Table):
 class Config(Repeats):
     """A sweep: scenes × methods, and how each row is measured."""
 
-    methods: tuple[Annotated[str, AfterValidator(_known_method)], ...] = Field(min_length=1)  # of experiments/methods
+    methods: tuple[Annotated[str, AfterValidator(_check_method)], ...] = Field(min_length=1)  # of experiments/methods
     scenes: tuple[Scenes, ...] = Field(min_length=1)
     processes: Annotated[int, Field(ge=1)] = 1  # every row is measured in so many, each in a round of its own over all scenes
     spacing: Positive = 1e-4  # distance of lattice neighbors [m]
@@ -170,7 +170,7 @@ class Spec(Keyed):
         """
         return digest({name: value for name, value in asdict(self).items() if name not in LIMITS})
 
-    def cut_short(self, row: _rows.SearchRow) -> bool:
+    def is_cut_short(self, row: _rows.SearchRow) -> bool:
         """Whether a row has fewer repeats than asked, where `most_seconds` would have let another begin."""
         return row.status == "ok" and len(row.seconds) < self.repeats and sum(row.seconds) < self.most_seconds
 

@@ -18,7 +18,7 @@ SHOWN = {"CLL": ("cll",), "ANN-NL": ("ann-kd-nolist", "scipy-kdtree-nolist"), "A
 COLORS = {"CLL": _plots.COLORS["cll"], "ANN-NL": _plots.COLORS["scipy-kdtree-nolist"], "ANN": _plots.COLORS["scipy-kdtree"]}
 
 
-def compared(table: Frame) -> Frame:
+def compare_entries(table: Frame) -> Frame:
     """Return a line for each entry of Table 6.1: layout, fill [%], method, times [s] and memories [MB] of both, parts of the times.
 
     Args:
@@ -46,7 +46,7 @@ def bars(lines: Frame, ours: str, theirs: str, label: str, methods: Iterable[str
     """Draw two bars for each method on each scene, ours and the thesis's.
 
     Args:
-        lines: From `compared`, those that are to be shown.
+        lines: From `compare_entries`, those that are to be shown.
         ours: Column of our values.
         theirs: Column of the thesis's.
         label: Of the values.

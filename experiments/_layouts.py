@@ -43,7 +43,7 @@ def make(name: str, **options: Any) -> "Scene":  # noqa: ANN401 - those of `case
         raise UsageError(f"layout {name!r}: {error}") from error
 
 
-def ordered(scene: "Scene", order: str, seed: int) -> "Scene":
+def order_scene(scene: "Scene", order: str, seed: int) -> "Scene":
     """Return the scene with its particles as the layout has them, "shuffled", or "sorted" by cells of a cutoff, x slowest."""
     import cases
 

@@ -27,7 +27,7 @@ def names() -> str:
         "Methods that are not installed": absent,
         "Configs (experiments/configs)": sorted(path.stem for path in CONFIGS.glob("*.toml")),
     }
-    rows = [f"\n{title}:\n{_wrapped(', '.join(known))}" for title, known in parts.items() if known]
+    rows = [f"\n{title}:\n{_wrap(', '.join(known))}" for title, known in parts.items() if known]
     return "\n".join(["Scenes of sph (list SCENE says what --set takes):", *scenes, *rows])
 
 
@@ -58,7 +58,7 @@ def _settings(scene: str, defaults: dict[str, Any], meanings: dict[str, str]) ->
         shown = str(list(default)) if isinstance(default, tuple) else shown
         said = [(others | meanings).get(key, ""), "" if bounds is None else f"({ranges.in_words(bounds)})"]
         lines.append(f"  {key}={shown}")
-        lines += [_wrapped(" ".join(filter(None, said)), "      ")] if any(said) else []
+        lines += [_wrap(" ".join(filter(None, said)), "      ")] if any(said) else []
     return lines
 
 
@@ -79,5 +79,5 @@ def _meanings(documented: Any) -> dict[str, str]:  # noqa: ANN401
     return {name: " ".join(meaning.split()) for name, meaning in found}
 
 
-def _wrapped(text: str, indent: str = "  ") -> str:
+def _wrap(text: str, indent: str = "  ") -> str:
     return textwrap.fill(text, WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)

@@ -80,7 +80,7 @@ def fill(
     Raises:
         UsageError: Another process fills this file, or a line of it is no row.
     """
-    with file.locked():
+    with file.lock():
         file.repair()
         there = {_column(row, "key"): row for row in file.read() if not (retry_failed and _column(row, "status") in RETRIED)}
         left = [task for task in tasks if any(key not in there or task.stale(there[key]) for key in task.keys)]

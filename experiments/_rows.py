@@ -148,7 +148,7 @@ class RowFile(Generic[RowT]):
         self.path, self._kind = folder / "rows.jsonl", kind
 
     @contextmanager
-    def locked(self) -> Iterator[None]:
+    def lock(self) -> Iterator[None]:
         """Keep other runners off the folder; the system lets go of it when this process ends, however it does.
 
         Raises:

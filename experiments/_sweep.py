@@ -38,7 +38,7 @@ def run(config: Config, name: str, folder: Path, retry_failed: bool = False, sha
     """
     sweep, specs = _Sweep(folder), shard_specs(config.specs(), shard)
     sweep.tasks = {
-        spec.key: (spec, Task((spec.key,), spec.scene_name, partial(sweep.measure, spec), spec.cut_short)) for spec in specs
+        spec.key: (spec, Task((spec.key,), spec.scene_name, partial(sweep.measure, spec), spec.is_cut_short)) for spec in specs
     }
     about, tasks = {"config": name, "config_hash": config.hash}, [task for _, task in sweep.tasks.values()]
     return fill(RowFile(folder), tasks, sweep.describe, retry_failed=retry_failed, about=about, begin=sweep.begin)
@@ -169,7 +169,7 @@ def merge(folder: Path, parts: Iterable[Path]) -> int:
     file, came, parts = RowFile(folder), 0, list(parts)
     if not parts:
         raise UsageError(f"{folder}: no folders shard-K-of-N in it; name the folders whose rows are to go there")
-    with file.locked():
+    with file.lock():
         file.repair()
         rows = {row.key: row for row in file.read()}
         for part in parts:

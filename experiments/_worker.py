@@ -84,7 +84,7 @@ def make_scene(spec: Spec) -> "Scene":
     """Return the scene of a row."""
     options = {name: getattr(spec, name) for name in ("spacing", "cutoff_ratio", "dtype", "dim", "seed", "fill", "angle", "growth")}
     scene = _layouts.make(spec.layout, **options)
-    return _layouts.ordered(scene, spec.order, spec.seed)
+    return _layouts.order_scene(scene, spec.order, spec.seed)
 
 
 def _measure_search(adapter: methods.Adapter, spec: Spec, scene: "Scene", folder: Path, row: dict[str, Any]) -> None:

@@ -63,10 +63,10 @@ def test_limits_of_time_change_no_key_but_rows_that_they_cut_short_are_wanted_ag
     )
     assert spec.repeats == 5
     for seconds, again in (([0.6, 0.6], False), ([0.3] * 5, False), ([0.5], True)):
-        assert spec.cut_short(replace(row, status="ok", seconds=seconds)) is again
-    assert later.cut_short(replace(row, status="ok", seconds=[0.6, 0.6]))
-    assert not later.cut_short(replace(row, status="ok", seconds=[3.0] * 3))
-    assert not later.cut_short(replace(row, status="skipped"))
+        assert spec.is_cut_short(replace(row, status="ok", seconds=seconds)) is again
+    assert later.is_cut_short(replace(row, status="ok", seconds=[0.6, 0.6]))
+    assert not later.is_cut_short(replace(row, status="ok", seconds=[3.0] * 3))
+    assert not later.is_cut_short(replace(row, status="skipped"))
 
 
 @pytest.mark.parametrize(
@@ -159,13 +159,13 @@ def test_whatever_is_given_several_times_is_multiplied(tmp_path):
 
 
 def test_orders_keep_the_particles():
-    scenes = [_layouts.ordered(_layouts.make("jitter", spacing=5e-4), order, 3) for order in ("layout", "sorted", "shuffled")]
+    scenes = [_layouts.order_scene(_layouts.make("jitter", spacing=5e-4), order, 3) for order in ("layout", "sorted", "shuffled")]
     known = [np.unique(scene.positions, axis=0) for scene in scenes]
     assert all(np.array_equal(known[0], other) for other in known[1:])
     for scene, is_sorted in zip(scenes, (False, True, False), strict=True):
         cells = np.floor(scene.positions / scene.cutoff).astype(int)
         assert (np.diff(cells @ [10_000, 100, 1]) >= 0).all() == is_sorted
-    again = _layouts.ordered(scenes[0], "shuffled", 3)
+    again = _layouts.order_scene(scenes[0], "shuffled", 3)
     assert np.array_equal(again.positions, scenes[2].positions)
 
 

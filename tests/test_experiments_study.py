@@ -75,7 +75,7 @@ def test_every_sweep_has_a_small_version(path):
 
 
 def test_table_6_1_stands_beside_ours():
-    lines = _figures.compared(_study.table(make_rows()))
+    lines = _figures.compare_entries(_study.table(make_rows()))
     assert len(lines) == len(_thesis.table()) == 28
     cll = lines[(lines.method == "CLL") & (lines.scene == "full 100 %")].iloc[0]
     assert (cll.ours, cll.median_s, cll.thesis_s, cll.search_mb, cll.thesis_mb) == ("cll", 1.0, 2.14, 40.0, 116.75)

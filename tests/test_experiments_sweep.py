@@ -360,9 +360,9 @@ def test_a_line_that_is_no_row_is_named(tmp_path):
 
 def test_a_folder_is_filled_by_one_process_at_a_time(tmp_path):
     file = _rows.RowFile(tmp_path)
-    with file.locked(), pytest.raises(UsageError, match="another process fills this folder now"), file.locked():
+    with file.lock(), pytest.raises(UsageError, match="another process fills this folder now"), file.lock():
         pass
-    with file.locked():
+    with file.lock():
         file.append(ROW)
     assert file.read() == [ROW]
 

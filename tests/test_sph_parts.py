@@ -80,7 +80,7 @@ def forces(name, r, i, j):
         "artificial": lambda: viscosity.artificial(pair, i, j, 3.0) * gradient,
         "cohesion": lambda: surface.cohesion(pair, i, j, 2.0, 0.3),
         "transport": lambda: transport.transport(pair, i, j, 50.0),
-        "advected": lambda: transport.advected(pair, i, j, gradient),
+        "advected": lambda: transport.advect(pair, i, j, gradient),
     }
     return terms, i["m"]
 
@@ -181,8 +181,8 @@ def test_walls_show_hydrostatic_pressure_and_hold_the_fluid():
     p = jnp.where(wall, 0, 1000.0 * 9.81 * (1 - x[:, 1]))
     v = jnp.where(wall[:, None], jnp.array([0.2, 0.0]), jnp.array([1.0, 0.0]))
     values = {"wall": wall, "rho": jnp.full(100, 1000.0), "p": p, "v": v}
-    sums = total(walls.seen_by_wall, x, values, KERNELS["quintic"], 0.1, backend="brute")
-    shown, held = walls.extrapolated(sums, v, gravity)
+    sums = total(walls.wall_terms, x, values, KERNELS["quintic"], 0.1, backend="brute")
+    shown, held = walls.extrapolate(sums, v, gravity)
     met = np.asarray(wall & (sums["weight"] > 0))
     assert met.sum() == 20
     np.testing.assert_allclose(shown[met], 1000.0 * 9.81 * (1 - x[met, 1]), rtol=1e-12)

@@ -22,7 +22,7 @@ def test_a_wide_column_begins_to_move_as_pohle_says():
 def test_it_keeps_its_volume_and_falls_first_as_gravity_says():
     z, phi = potential.column(2.0, 0.04)
     for _ in range(20):
-        z, phi = potential.spread(*potential.advanced(z, phi, 0.02), 0.04)
+        z, phi = potential.spread(*potential.advance(z, phi, 0.02), 0.04)
     assert np.trapezoid(z[:, 1], z[:, 0]) == pytest.approx(2.0, rel=5e-3)
     assert 2.0 - z[0, 1] < 0.5 * potential.GRAVITY * 0.4**2  # the wall side falls more slowly than freely
     assert potential.fronts(np.array([0.4]), 0.04, 0.02)[0] == pytest.approx(z[-1, 0], rel=1e-6)

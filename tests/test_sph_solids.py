@@ -29,7 +29,7 @@ def winding_number(points, corners):
 
 def is_inside(x, scene, time):
     """Say which particles are in the solid of a scene, without the code under test."""
-    corners = view.turned(scene.solid.vertices, scene.solid.turning, time)[scene.solid.faces]
+    corners = view.turn_vertices(scene.solid.vertices, scene.solid.turning, time)[scene.solid.faces]
     if scene.dim == 3:
         return np.abs(winding_number(np.asarray(x, np.float64), corners)) > 0.5
     return Outline(corners[:, 0]).contains_points(x)
@@ -56,14 +56,14 @@ def test_kernels_behind_a_plane(name, dim):
     kernel, h = KERNELS[name], 0.13
     reach = kernel.support * h
     d = jnp.linspace(0, 1, 9) * reach
-    area, weight = solids.missing(kernel, d, h, dim)
+    area, weight = solids.integrate_missing(kernel, d, h, dim)
     t = (np.arange(200_000) + 0.5) / 200_000 * reach
     rings = {2: 2 * np.ones_like(t), 3: 2 * np.pi * t}[dim] * reach / len(t)
     expected = [np.sum(rings * np.asarray(kernel.value(jnp.sqrt(k**2 + t**2), h, dim))) for k in d]
     np.testing.assert_allclose(area, expected, atol=2e-3 * float(area[0]))
     assert float(weight[0]) == pytest.approx(0.5, abs=2e-3)  # half of space
     fine = jnp.linspace(0, 1, 4001) * reach
-    slopes = np.trapezoid(np.asarray(solids.missing(kernel, fine, h, dim)[0]), fine)
+    slopes = np.trapezoid(np.asarray(solids.integrate_missing(kernel, fine, h, dim)[0]), fine)
     assert slopes == pytest.approx(float(weight[0]), abs=2e-3)
 
 
@@ -78,8 +78,8 @@ def test_a_lattice_beside_a_wall_feels_no_gradient():
         r = sites - here
         pull = np.asarray(kernel.pull(jnp.asarray(np.linalg.norm(r, axis=1)), h, 3))
         fluid = -(spacing**3 * pull[:, None] * r).sum(axis=0)[2]
-        wall = -float(solids.missing(kernel, jnp.asarray(here[2:]), h, 3)[0][0])
-        scale = float(solids.missing(kernel, jnp.zeros(1), h, 3)[0][0])
+        wall = -float(solids.integrate_missing(kernel, jnp.asarray(here[2:]), h, 3)[0][0])
+        scale = float(solids.integrate_missing(kernel, jnp.zeros(1), h, 3)[0][0])
         assert abs(fluid + wall) < 0.04 * scale, layer  # what sums differ from integrals
 
 
@@ -89,7 +89,7 @@ def test_frames_turn_back(dim):
     x = np.random.default_rng(0).normal(size=(20, dim))
     scene = beside(fluids.Solid(x, np.zeros((0, dim), np.int32), turning), x)
     there = solids.turning_of(scene, np.float64)
-    moved = view.turned(x, turning, 0.7)
+    moved = view.turn_vertices(x, turning, 0.7)
     assert np.ptp(np.linalg.norm(moved - x, axis=1)) > 0.1
     np.testing.assert_allclose(solids.into_frame(jnp.asarray(moved), there, 0.7 * 3.0), x, atol=1e-14)
 

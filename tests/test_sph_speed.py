@@ -95,7 +95,7 @@ def test_states_that_differ_are_noticed():
 
 
 def test_the_column_keeps_to_its_walls():
-    scene = speed.moving(fluids.fluid("dam-break-3d", nx=4), 2.0)
+    scene = speed.set_in_motion(fluids.fluid("dam-break-3d", nx=4), 2.0)
     moving = scene.velocities[~scene.wall]
     np.testing.assert_array_equal(moving[:, 0], 2 * scene.positions[~scene.wall, 0])
     np.testing.assert_array_equal(moving[:, 1:], np.column_stack([np.zeros(len(moving)), -2 * scene.positions[~scene.wall, 2]]))
@@ -132,7 +132,7 @@ def test_walls_among_the_fluid_leave_no_rows_out():
 
 
 def test_edges_of_a_list_are_pairs_of_it():
-    scene = speed.moving(fluids.fluid("drop", nx=6), 50.0)
+    scene = speed.set_in_motion(fluids.fluid("drop", nx=6), 50.0)
     model, s = make_model(scene), make_state(scene)
     found = edges.of_own_list(model, s, 0.5 * scene.spacing)
     apart = np.linalg.norm(scene.positions[:, None] - scene.positions, axis=2)

@@ -27,7 +27,7 @@ def test_closed_forms_give_the_tabled_numbers():
 def test_interpolation_is_exact_for_planes_up_to_the_walls():
     x = np.random.default_rng(0).uniform(size=(400, 2))
     points = np.array([[0.0, 0.5], [0.5, 0.5], [1.0, 1.0]])
-    np.testing.assert_allclose(answers.interpolated(x, x @ [2.0, 3.0] - 1, points, 0.2), points @ [2.0, 3.0] - 1, rtol=1e-12)
+    np.testing.assert_allclose(answers.interpolate(x, x @ [2.0, 3.0] - 1, points, 0.2), points @ [2.0, 3.0] - 1, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["taylor-green", "poiseuille", "couette", "drop", "hydrostatic"])

@@ -197,22 +197,22 @@ def _sph(spec: Spec, row: DeviceRow) -> None:
     scene = make_scene("dam-break-3d", [f"nx={spec.nx}", f"depth={depth}"])
     kind = np.dtype(spec.dtype).type
 
-    def begun(mesh: Mesh) -> spread.Flow:
+    def begin(mesh: Mesh) -> spread.Flow:
         along = (1, 0, 2)[: mesh.devices.ndim]  # the tank's depth first: a slab has as much water and wall as any other
         return spread.begin(spread.spread(make_model(scene, kind, spec.backend), make_state(scene, kind), mesh, along=along))
 
-    first = begun(mesh_of(spec.devices, spec.axes))
+    first = begin(mesh_of(spec.devices, spec.axes))
     flow = spread.run(first, spec.steps)  # room that is missing is made before anything is timed
     _describe(flow.particles, spec, row)
     row.fluid = int(jnp.sum(flow.particles.active & ~flow.particles.values["wall"]))
     if spec.devices > 1 and flow.particles.total <= spec.check_most:
-        ways = [scene.positions, spread.run(begun(mesh_of(1, 1)), spec.steps).particles]
+        ways = [scene.positions, spread.run(begin(mesh_of(1, 1)), spec.steps).particles]
         row.differing = sum(map(partial(_elsewhere, 0.01 * scene.spacing), ways, (first.particles, flow.particles)))
         if row.differing:
             row.status, row.reason = "failed", "particles are elsewhere than on one device"
             return
     del first
-    _time(lambda flow: spread.advanced(flow, spec.steps), flow, spec.steps, spec, row, spread.advanced)
+    _time(lambda flow: spread.advance(flow, spec.steps), flow, spec.steps, spec, row, spread.advance)
     row.status = "ok"
 
 
@@ -228,12 +228,12 @@ def _describe(particles: distributed.Particles, spec: Spec, row: DeviceRow) -> N
     row.particles, row.halo = particles.total, int(halo.sent)
     row.fullest = int(np.asarray(particles.active).reshape(row.devices, -1).sum(axis=1).max())
     row.halo_bytes = row.halo * particles.dim * particles.positions.dtype.itemsize
-    row.halo_s = _repeated(lambda: distributed.halo(particles), spec)["median_s"]
+    row.halo_s = _time_repeats(lambda: distributed.halo(particles), spec)["median_s"]
     settled = distributed.migrate(particles)
-    row.migrate_s = _repeated(lambda: distributed.migrate(settled), spec)["median_s"]
+    row.migrate_s = _time_repeats(lambda: distributed.migrate(settled), spec)["median_s"]
 
 
-def _repeated(call: Callable[[], Any], spec: Spec) -> dict[str, Any]:
+def _time_repeats(call: Callable[[], Any], spec: Spec) -> dict[str, Any]:
     _, seconds = _measure.repeat(lambda: jax.block_until_ready(call()), spec.repeats, spec.min_seconds, 10 * spec.repeats)
     return _measure.summarize(seconds)
 
@@ -245,7 +245,7 @@ def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: Dev
     text = program.lower(*arguments).compile().as_text()
     row.sent_bytes = sent_bytes(text)
     (row.first_s,) = _measure.repeat(lambda: jax.block_until_ready(work(given)), 1, 0.0, 1)[1]  # what it made is gone, it is large
-    timed = _repeated(lambda: work(given), spec)
+    timed = _time_repeats(lambda: work(given), spec)
     row.median_s, row.p10_s, row.p90_s = (timed[name] / per for name in ("median_s", "p10_s", "p90_s"))
     row.repeats = timed["repeats"]
     row.busy = [device._asdict() for device in trace.of_run(lambda: work(given))] or None

@@ -49,7 +49,7 @@ def command(
 def _rows(n: int, rounds: int, backend: str) -> Iterator[table.Line]:
     """Time every option once per round; medians of rounds count."""
     options = list(_options(n, NEIGHBORS))
-    calls = [_compiled(option, backend) for option in options]
+    calls = [_compile(option, backend) for option in options]
     for search, count in calls:
         jax.block_until_ready((search(), count()))
     numbered = {str(place): call for place, call in enumerate(itertools.chain.from_iterable(calls))}
@@ -95,7 +95,7 @@ def _options(n: int, neighbors: int) -> Iterator[_Option]:
         yield _Option(name, graded, jnp.asarray(radii, jnp.float32), {"radius_rule": rule})
 
 
-def _compiled(option: _Option, backend: str) -> tuple[Callable[[], Any], Callable[[], Any]]:
+def _compile(option: _Option, backend: str) -> tuple[Callable[[], Any], Callable[[], Any]]:
     given = {name: value for name, value in option.more.items() if name != "skin"}
     skin = option.more.get("skin", 0.0)
     longest = int(jfrnn.count(option.x, option.cutoff + skin, backend=backend, **given).max())
@@ -104,10 +104,10 @@ def _compiled(option: _Option, backend: str) -> tuple[Callable[[], Any], Callabl
     data: dict[str, Any] = {name: value for name, value in given.items() if hasattr(value, "shape")}  # operands, no constants
     more = {name: value for name, value in given.items() if name not in data}
 
-    def listed(x: jax.Array, data: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
+    def list_pairs(x: jax.Array, data: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
         nbrs = jfrnn.search(x, skin=skin, capacity=capacity, backend=backend, **more, **data)
         return nbrs.idx, nbrs.count
 
-    search = jax.jit(listed)
+    search = jax.jit(list_pairs)
     count = jax.jit(lambda x, data: jfrnn.count(x, backend=backend, **more, **data))
     return lambda: search(option.x, data), lambda: count(option.x, data)

@@ -211,11 +211,11 @@ def markdown(rows: Sequence[dict[Any, str]]) -> str:
     lines = []
     for row in (row for row in CATALOG if row.cases):
         answers = {peer: [r for r in rows if r["row"] == row.title and r["peer"] == peer] for peer in versions}
-        lines.append({"case": row.title} | {f"{peer} {versions[peer]}": _said(found) for peer, found in answers.items()})
+        lines.append({"case": row.title} | {f"{peer} {versions[peer]}": _summarize(found) for peer, found in answers.items()})
     return _table.markdown(lines)
 
 
-def _said(rows: list[dict[Any, str]]) -> str:
+def _summarize(rows: list[dict[Any, str]]) -> str:
     """Say in a word or two what a peer answered on all cases of a row."""
     if all(row["answer"] == "right" for row in rows):
         return "right"

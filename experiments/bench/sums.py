@@ -13,7 +13,7 @@ from experiments import _sweep
 from experiments._config import Dtype, LayoutName, Positive, Repeats
 from experiments._loop import Shown, Task, fill
 from experiments._rows import RowFile, TimedRow
-from experiments.bench.ways import WAYS, Spec, known
+from experiments.bench.ways import WAYS, Spec, check_way
 
 ERROR_UNIT = "eps·√neighbors"
 """Of errors of sums: what rounding makes of a sum of so many terms, in machine epsilons."""
@@ -22,7 +22,7 @@ ERROR_UNIT = "eps·√neighbors"
 class Config(Repeats):
     """Scenes × ways, and how each row is measured."""
 
-    ways: tuple[Annotated[str, AfterValidator(known)], ...] = Field(min_length=1)  # of `ways.WAYS`
+    ways: tuple[Annotated[str, AfterValidator(check_way)], ...] = Field(min_length=1)  # of `ways.WAYS`
     layouts: tuple[LayoutName, ...] = Field(min_length=1)  # of full domains
     spacings: tuple[Positive, ...] = Field(min_length=1)  # distances of lattice neighbors [m], each a number of particles
     gradients: tuple[bool, ...] = (False, True)  # whether the gradient is asked for, too
@@ -69,11 +69,11 @@ class SumRow(TimedRow):
 
 def run(config: Config, folder: Path, retry_failed: bool = False) -> list[SumRow]:
     """Measure every row of the config that the folder does not hold yet, and return all rows of the config."""
-    tasks = [Task((x.key,), f"{x.layout} {x.spacing:g} m · {x.way}", partial(_measured, x)) for x in config.specs()]
+    tasks = [Task((x.key,), f"{x.layout} {x.spacing:g} m · {x.way}", partial(_measure, x)) for x in config.specs()]
     return fill(RowFile(folder, SumRow), tasks, describe, retry_failed=retry_failed)
 
 
-def _measured(spec: Spec, shown: Shown) -> list[SumRow]:
+def _measure(spec: Spec, shown: Shown) -> list[SumRow]:
     known = {item.name for item in fields(SumRow)} - {"repeats"}
     asked: dict[str, Any] = {name: value for name, value in asdict(spec).items() if name in known}
     return [SumRow(key=spec.key, **asked, **_sweep.ask({"do": "sum", "spec": asdict(spec)}, spec.timeout, cold=False))]

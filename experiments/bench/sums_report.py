@@ -56,7 +56,7 @@ def table(rows: list[SumRow]) -> list[_Line]:
     per rebuild on the list is faster than the fastest sum without one; infinite: never.
     """
     lines = [_line(row) for row in rows]
-    for scene in _grouped(lines, "layout", "points", "sums").values():
+    for scene in _group(lines, "layout", "points", "sums").values():
         direct = {x["way"]: x["seconds"] for x in _good(scene) if x["build_ms"] is None and not x["compensated"]}
         for line in _good(scene):
             if FUSED in direct:
@@ -89,7 +89,7 @@ def _good(lines: Iterable[_Line]) -> list[_Line]:
     return [line for line in lines if line["status"] == "ok" and line["error"] is not None]
 
 
-def _grouped(lines: Iterable[_Line], *names: str) -> dict[tuple, list[_Line]]:
+def _group(lines: Iterable[_Line], *names: str) -> dict[tuple, list[_Line]]:
     groups: dict[tuple, list[_Line]] = {}
     for line in lines:
         groups.setdefault(tuple(line[name] for name in names), []).append(line)
@@ -98,12 +98,12 @@ def _grouped(lines: Iterable[_Line], *names: str) -> dict[tuple, list[_Line]]:
 
 def draw(lines: list[_Line]) -> Figure:
     """Draw time, memory and error over the number of particles, a row of panels for each layout and sum."""
-    kinds = _grouped((line for line in lines if line["status"] == "ok"), "layout", "sums")
+    kinds = _group((line for line in lines if line["status"] == "ok"), "layout", "sums")
     figure, panels = _figure(max(len(kinds), 1), len(PANELS))
     for panel, ((layout, what), scenes) in zip(panels, kinds.items(), strict=False):
         for axes, (column, label) in zip(panel, PANELS.items(), strict=True):
             there = [line for line in scenes if line[column]]
-            for (way, compensated), of_way in _grouped(there, "way", "compensated").items():
+            for (way, compensated), of_way in _group(there, "way", "compensated").items():
                 _plot(axes, [x["points"] for x in of_way], [x[column] for x in of_way], way, compensated)
             dress(axes, "particles", label)
             if column == "error":
@@ -115,7 +115,7 @@ def draw(lines: list[_Line]) -> Figure:
 
 def draw_payoff(lines: list[_Line]) -> Figure:
     """Draw the time of one sum over the number of sums that share a list, of the largest scene of each layout and sum."""
-    kinds = _grouped((line for line in _good(lines) if not line["compensated"]), "layout", "sums")
+    kinds = _group((line for line in _good(lines) if not line["compensated"]), "layout", "sums")
     figure, panels = _figure(1, max(len(kinds), 1))
     for axes, ((layout, what), scenes) in zip(panels[0], kinds.items(), strict=False):
         largest = max(line["points"] for line in scenes)

@@ -82,7 +82,7 @@ def _cube(size: int) -> np.ndarray:
     return np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float64)
 
 
-def _placed(integers: np.ndarray, dtype: DTypeLike) -> Iterator[_Sites]:
+def _place(integers: np.ndarray, dtype: DTypeLike) -> Iterator[_Sites]:
     """Yield the same sites at several spacings, in random order; the first ones are moved at random."""
     random = np.random.default_rng(0)
     integers = random.permutation(integers)
@@ -101,8 +101,8 @@ def _placed(integers: np.ndarray, dtype: DTypeLike) -> Iterator[_Sites]:
 
 def _rows(scene: str, sites: Callable[[], np.ndarray], dtype: DTypeLike, rounds: int, backend: str) -> Iterator[table.Line]:
     """Time one scene in one dtype: a row for each kind of sites; medians of rounds count."""
-    placed = list(_placed(sites(), dtype))
-    calls = [_compiled(each, backend) for each in placed]
+    placed = list(_place(sites(), dtype))
+    calls = [_compile(each, backend) for each in placed]
     numbered = {f"{k} {what}": call for k, each in enumerate(calls) for what, call in each.items()}
     for call in numbered.values():
         jax.block_until_ready(call())
@@ -120,7 +120,7 @@ def _rows(scene: str, sites: Callable[[], np.ndarray], dtype: DTypeLike, rounds:
         yield row | {f"{what}_ratio": round(float(value), 2) for what, value in zip(TIMED, median / medians[0], strict=True)}
 
 
-def _compiled(sites: _Sites, backend: str) -> dict[str, Callable[[], Any]]:
+def _compile(sites: _Sites, backend: str) -> dict[str, Callable[[], Any]]:
     x, r = jnp.asarray(sites.positions), sites.cutoff
     count = jax.jit(lambda x: jfrnn.count(x, r, backend=backend))
     capacity = round_capacity(int(np.asarray(count(x)).max()))

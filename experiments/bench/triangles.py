@@ -86,15 +86,15 @@ def _rows(scene: _Scene, cutoff: float, rounds: int, backend: str, peers: dict[s
     common = {"faces": len(scene.faces), "cutoff": cutoff, "others_cores": others}
     row = {"n": n, "pairs": int(tri.count.sum()), "longest_row": int(tri.required)}
     for way, call in calls.items():
-        _, _, processor = _repeated(lambda call=call: jax.block_until_ready(call()))
-        yield common | row | {"method": f"jfrnn {way}"} | _timed(seconds[way], n, processor)
+        _, _, processor = _repeat(lambda call=call: jax.block_until_ready(call()))
+        yield common | row | {"method": f"jfrnn {way}"} | _times_of(seconds[way], n, processor)
     for name, (asked, distance, taken, processor) in (peers | _trees(scene, cutoff)).items():
         within = distance < cutoff
         wrong = {"missing": int(np.sum(within & ~near[asked])), "extra": int(np.sum(near[asked] & ~within))}
         if len(asked) == 0:
             asked, wrong = scene.points, {}
         row = {"n": len(asked), "method": name, "peer": _peer_version(name)} | wrong
-        yield common | row | _timed(taken, len(asked), processor)
+        yield common | row | _times_of(taken, len(asked), processor)
 
 
 def gear(n: int, faces: int) -> _Scene:
@@ -124,7 +124,7 @@ def _libigl(scene: _Scene) -> _Asked:
     import igl  # pyright: ignore[reportMissingImports]
 
     points, vertices = scene.points.astype(np.float64), scene.vertices.astype(np.float64)
-    (square, *_), seconds, processor = _repeated(lambda: igl.point_mesh_squared_distance(points, vertices, scene.faces))
+    (square, *_), seconds, processor = _repeat(lambda: igl.point_mesh_squared_distance(points, vertices, scene.faces))
     return _Asked(np.arange(len(points)), np.sqrt(square), seconds, processor)
 
 
@@ -134,7 +134,7 @@ def _trimesh(scene: _Scene) -> _Asked:
     mesh = trimesh.Trimesh(scene.vertices.astype(np.float64), scene.faces, process=False)
     asked = np.arange(min(_FEW, len(scene.points)))
     points = scene.points[asked].astype(np.float64)
-    (_, distance, _), seconds, processor = _repeated(lambda: trimesh.proximity.closest_point(mesh, points))
+    (_, distance, _), seconds, processor = _repeat(lambda: trimesh.proximity.closest_point(mesh, points))
     return _Asked(asked, distance, seconds, processor)
 
 
@@ -146,15 +146,15 @@ def _trees(scene: _Scene, cutoff: float) -> dict[str, _Asked]:
 
     everyone = np.arange(len(scene.points))
     tree = bvh.Tree(scene.points, scene.vertices, scene.faces, cutoff, "cpu")
-    found, seconds, processor = _repeated(lambda: tree.ask("nearest"))
-    _, taken, busy = _repeated(lambda: tree.ask("boxes"))
+    found, seconds, processor = _repeat(lambda: tree.ask("nearest"))
+    _, taken, busy = _repeat(lambda: tree.ask("boxes"))
     return {
         "wp.Mesh nearest": _Asked(everyone, found, seconds, processor),
         "wp.Mesh boxes": _Asked(everyone[:0], found[:0], taken, busy),
     }
 
 
-def _repeated(call: Callable[[], Any]) -> tuple[Any, list[float], float]:
+def _repeat(call: Callable[[], Any]) -> tuple[Any, list[float], float]:
     """Return a result, the seconds of three runs, and those of all processors per run, which other work disturbs less."""
     call()
     begin = process_time()
@@ -171,7 +171,7 @@ def _peer_version(name: str) -> str:
     return str(_machine.versions([package])[package])
 
 
-def _timed(seconds: list[float], n: int, processor: float) -> dict[str, Any]:
+def _times_of(seconds: list[float], n: int, processor: float) -> dict[str, Any]:
     said = _measure.summarize(seconds)
     times = {name: said[name] for name in ("median_s", "p10_s", "p90_s")}
     return times | {"rounds": said["repeats"], "us_per_particle": 1e6 * said["median_s"] / n, "processor_s": processor}

@@ -192,7 +192,7 @@ def _measure_way(way: Way, spec: Spec, positions: np.ndarray, cutoff: float, row
 # --- the ways ---------------------------------------------------------------------------------------------------------
 
 
-def _compiled(density: Callable[[Any, Any, Any], Any], gradient: bool) -> Callable[[Any, Any, Any], Any]:
+def _compile(density: Callable[[Any, Any, Any], Any], gradient: bool) -> Callable[[Any, Any, Any], Any]:
     """Return a jitted density(x, m, made), or it and the gradient of the sum of all densities in x."""
     import jax
 
@@ -210,7 +210,7 @@ def _compiled(density: Callable[[Any, Any, Any], Any], gradient: bool) -> Callab
     return jax.jit(both)
 
 
-def _without_list(backend: str) -> Callable[[Given, bool, bool], Steps]:
+def _steps_without_list(backend: str) -> Callable[[Given, bool, bool], Steps]:
     def prepare(given: Given, gradient: bool, compensated: bool) -> Steps:
         import jfrnn
 
@@ -219,7 +219,7 @@ def _without_list(backend: str) -> Callable[[Given, bool, bool], Steps]:
         def density(x: Any, m: Any, made: Any) -> Any:  # noqa: ANN401
             return jfrnn.pair_sum(kernel, x, cutoff, m, compensated=compensated, backend=backend)
 
-        return Steps(None, _compiled(density, gradient))
+        return Steps(None, _compile(density, gradient))
 
     return prepare
 
@@ -240,10 +240,10 @@ def _capacity(given: Given) -> int:
     return round_capacity(int(jfrnn.count(given.x, given.cutoff).max()))
 
 
-def _listed(given: Given, gradient: bool, compensated: bool) -> Steps:
+def _steps_of_list(given: Given, gradient: bool, compensated: bool) -> Steps:
     del compensated
     kernel = poly6(given.cutoff)
-    return Steps(_our_list(given), _compiled(lambda x, m, nbrs: over_list(kernel, x, m, nbrs.idx), gradient))
+    return Steps(_our_list(given), _compile(lambda x, m, nbrs: over_list(kernel, x, m, nbrs.idx), gradient))
 
 
 def _pair_sum_listed(given: Given, gradient: bool, compensated: bool) -> Steps:
@@ -254,7 +254,7 @@ def _pair_sum_listed(given: Given, gradient: bool, compensated: bool) -> Steps:
     def density(x: Any, m: Any, nbrs: Any) -> Any:  # noqa: ANN401
         return jfrnn.pair_sum(kernel, x, None, m, neighbors=nbrs, compensated=compensated)
 
-    return Steps(_our_list(given), _compiled(density, gradient))
+    return Steps(_our_list(given), _compile(density, gradient))
 
 
 def _jax_md(given: Given, gradient: bool, compensated: bool) -> Steps:
@@ -262,7 +262,7 @@ def _jax_md(given: Given, gradient: bool, compensated: bool) -> Steps:
     from experiments.methods import jax_md
 
     search, kernel = jax_md.compile_update(given.x, given.cutoff), poly6(given.cutoff)
-    return Steps(search, _compiled(lambda x, m, idx: over_list(kernel, x, m, idx), gradient))
+    return Steps(search, _compile(lambda x, m, idx: over_list(kernel, x, m, idx), gradient))
 
 
 def _nvalchemi(given: Given, gradient: bool, compensated: bool) -> Steps:
@@ -279,7 +279,7 @@ def _nvalchemi(given: Given, gradient: bool, compensated: bool) -> Steps:
         idx, count = search(x)
         return jnp.where(jnp.arange(capacity) < count[:, None], idx, len(x))
 
-    return Steps(jax.jit(build), _compiled(lambda x, m, idx: over_list(kernel, x, m, idx), gradient))
+    return Steps(jax.jit(build), _compile(lambda x, m, idx: over_list(kernel, x, m, idx), gradient))
 
 
 def _scipy(given: Given, gradient: bool, compensated: bool) -> Steps:
@@ -291,10 +291,10 @@ def _scipy(given: Given, gradient: bool, compensated: bool) -> Steps:
 
 
 WAYS = {
-    "pair_sum warp": Way(_without_list("warp"), compensates=True),
-    "pair_sum jax": Way(_without_list("jax"), compensates=True),
-    "brute force": Way(_without_list("brute"), compensates=True),
-    "list, sum": Way(_listed),
+    "pair_sum warp": Way(_steps_without_list("warp"), compensates=True),
+    "pair_sum jax": Way(_steps_without_list("jax"), compensates=True),
+    "brute force": Way(_steps_without_list("brute"), compensates=True),
+    "list, sum": Way(_steps_of_list),
     "list, pair_sum": Way(_pair_sum_listed, compensates=True),
     "jax-md list, sum": Way(_jax_md, "jax-md"),
     "nvalchemi list, sum": Way(_nvalchemi, "nvalchemi-toolkit-ops"),
@@ -302,7 +302,7 @@ WAYS = {
 }
 
 
-def known(name: str) -> str:
+def check_way(name: str) -> str:
     """Return the name of a way.
 
     Raises:

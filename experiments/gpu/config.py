@@ -41,7 +41,7 @@ class Config(Table):
     counts_only: list[PositiveInt]
     calls: PositiveInt
     steps: PositiveInt
-    sums: tuple[Annotated[str, AfterValidator(ways.known)], ...] = ()  # of a density and its gradient
+    sums: tuple[Annotated[str, AfterValidator(ways.check_way)], ...] = ()  # of a density and its gradient
     repeats: PositiveInt
     seconds_per_timing: Positive
     exactness: list[Exactness]

@@ -49,7 +49,7 @@ def oracle() -> Any:  # noqa: ANN401
     return importlib.import_module("tests.reference")
 
 
-def padded(points: np.ndarray, rows: int) -> np.ndarray:
+def pad_points(points: np.ndarray, rows: int) -> np.ndarray:
     """Fill up with points that are nowhere, so that cases of many sizes share a program."""
     return np.concatenate([points, np.full((rows - len(points), points.shape[1]), np.nan, points.dtype)])
 
@@ -60,21 +60,21 @@ def _decisions(config: Exactness, dtype: str, dim: int) -> Decisions:
         rows = max(case.rows, config.least_rows)
         given = dict(case.options)
         for name in ("queries", "batch", "cutoff"):
-            given[name] = _filled(given.get(name, case.cutoff if name == "cutoff" else None), rows)
+            given[name] = _pad_rows(given.get(name, case.cutoff if name == "cutoff" else None), rows)
         options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-        x = jnp.asarray(padded(case.positions, rows))
+        x = jnp.asarray(pad_points(case.positions, rows))
         nbrs = jfrnn.search(x, **options, capacity=config.capacity, backend=config.backend)
         yield case.name, found_pairs(nbrs, x, options.get("queries")) == case.expected
 
 
-def _filled(value: Any, rows: int) -> Any:  # noqa: ANN401
+def _pad_rows(value: Any, rows: int) -> Any:  # noqa: ANN401
     """Fill up what has a value per row: queries, cutoffs and numbers of systems, which matter to no point that is nowhere."""
     if isinstance(value, tuple):
-        return tuple(_filled(part, rows) for part in value)
+        return tuple(_pad_rows(part, rows) for part in value)
     if not isinstance(value, np.ndarray):
         return value
     if value.ndim == 2:
-        return jnp.asarray(padded(value, rows))
+        return jnp.asarray(pad_points(value, rows))
     return np.concatenate([value, np.ones(rows - len(value), value.dtype) * (value.dtype.kind == "f")]).astype(value.dtype)
 
 

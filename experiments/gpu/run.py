@@ -52,7 +52,7 @@ def parts(config: Config) -> Iterator[Part]:
         yield f"jitter {n}", functools.partial(timings.scene_rows, config, "jitter", n)
     for n in config.counts_only:
         yield f"counts {n}", functools.partial(timings.large_rows, config, n)
-    timed = functools.partial(timings.timed, config)
+    timed = functools.partial(timings.time_calls, config)
     for part in config.triangles:
         for n, cutoff, dtype in itertools.product(part.points, part.cutoffs, part.dtypes):
             name = f"triangles {n} {part.faces} {cutoff:g} {dtype}"

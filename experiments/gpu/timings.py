@@ -54,7 +54,7 @@ def memory_rows() -> Iterator[dict[str, Any]]:
     for name, points in scenes.items():
         x = jnp.asarray(points, jnp.float32)
         capacity = round_capacity(int(jfrnn.count(x, 1.0, backend="warp").max()))
-        search = jax.jit(functools.partial(_listed, cutoff=1.0, capacity=capacity, backend="warp"))
+        search = jax.jit(functools.partial(_list, cutoff=1.0, capacity=capacity, backend="warp"))
         compiled: Any = search.lower(x).compile().memory_analysis()
         before = _measure.device_bytes("bytes_in_use")
         jax.block_until_ready(search(x))
@@ -75,12 +75,12 @@ def _warp_pool_bytes() -> int:
 # --- timings -------------------------------------------------------------------------------------------------------
 
 
-def _listed(x: Any, *, cutoff: float, capacity: int, backend: str) -> Any:  # noqa: ANN401
+def _list(x: Any, *, cutoff: float, capacity: int, backend: str) -> Any:  # noqa: ANN401
     nbrs = jfrnn.search(x, cutoff, capacity=capacity, backend=backend)
     return nbrs.idx, nbrs.count
 
 
-def timed(config: Config, call: Callable[[], Any], calls: int | None = None) -> dict[str, Any]:
+def time_calls(config: Config, call: Callable[[], Any], calls: int | None = None) -> dict[str, Any]:
     """Time calls that are not waited for one by one; a repeat ends when the last is done."""
     jax.block_until_ready(call())
     start = time.perf_counter()
@@ -105,7 +105,7 @@ def scene_rows(config: Config, layout: str, size: float) -> Iterator[dict[str, A
     exact = np.asarray(jfrnn.count(x, cutoff, backend="jax"))
     capacity = round_capacity(int(exact.max()))
     base = {"layout": layout, "points": n, "capacity": capacity, "dtype": "float32", "exact_directed_pairs": int(exact.sum())}
-    listed = functools.partial(_listed, cutoff=cutoff, capacity=capacity)
+    listed = functools.partial(_list, cutoff=cutoff, capacity=capacity)
 
     for backend in ("warp", "hashgrid"):
         search = jax.jit(functools.partial(listed, backend=backend))
@@ -117,9 +117,9 @@ def scene_rows(config: Config, layout: str, size: float) -> Iterator[dict[str, A
         if n <= 1_000_000:
             row["wrong"] += _compare.different_rows(idx, jax.jit(functools.partial(listed, backend="jax"))(x)[0])
         del idx, count, again
-        yield row | timed(config, lambda search=search: search(x))
+        yield row | time_calls(config, lambda search=search: search(x))
     counts = jax.jit(lambda x: jfrnn.count(x, cutoff, backend="warp"))
-    yield {"kind": "call", "method": "jfrnn warp, counts", **base, "directed_pairs": int(counts(x).sum())} | timed(
+    yield {"kind": "call", "method": "jfrnn warp, counts", **base, "directed_pairs": int(counts(x).sum())} | time_calls(
         config, lambda: counts(x)
     )
     if n <= 1_000_000:
@@ -129,7 +129,7 @@ def scene_rows(config: Config, layout: str, size: float) -> Iterator[dict[str, A
             return x + 0 * (idx[0, 0] + count[0]).astype(x.dtype), None
 
         steps = jax.jit(lambda x: lax.scan(step, x, None, length=config.steps)[0])
-        seconds = [s / config.steps for s in timed(config, lambda: steps(x), calls=3)["seconds"]]
+        seconds = [s / config.steps for s in time_calls(config, lambda: steps(x), calls=3)["seconds"]]
         yield {"kind": "scan", "method": "jfrnn warp", **base, "steps": config.steps, **_measure.summarize(seconds)}
     if layout == "jitter":
         yield from _loop_rows(config, base, x, cutoff)
@@ -153,7 +153,7 @@ def _loop_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> I
     if base["points"] <= 300_000:
         exact = np.asarray(jfrnn.count(x, cutoff, box=box, backend="jax"))
         row |= {"wrong": int((counts != exact).sum()), "exact_directed_pairs": int(exact.sum(dtype=np.int64))}
-    yield row | timed(config, lambda: search(x))
+    yield row | time_calls(config, lambda: search(x))
     if base["points"] > 1_000_000:
         return
     skin = 0.1 * cutoff
@@ -171,7 +171,7 @@ def _loop_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> I
 
         steps = jax.jit(many)
         rebuilds = int(steps(x, nbrs))
-        seconds = [s / config.steps for s in timed(config, lambda steps=steps: steps(x, nbrs), calls=3)["seconds"]]
+        seconds = [s / config.steps for s in time_calls(config, lambda steps=steps: steps(x, nbrs), calls=3)["seconds"]]
         row = {"kind": "scan", "method": f"jfrnn warp, skin, {name}", **base, "capacity": wider, "steps": config.steps}
         yield row | {"rebuilds": rebuilds, **_measure.summarize(seconds)}
 
@@ -190,7 +190,7 @@ def sum_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> Ite
 
             if base["points"] <= 1_000_000:
                 row["error"] = ways.error_of(given, jax.device_get(call()), gradient)
-            yield row | timed(config, call)
+            yield row | time_calls(config, call)
         except Exception as error:  # a way that is missing or out of memory says so in its row
             yield row | {"status": "failed", "reason": f"{type(error).__name__}: {error}"[:300]}
 
@@ -200,7 +200,7 @@ def _peer_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> I
         row: dict[str, Any] = {"kind": "call", "method": name, **base}
         try:
             call, pairs = make(x, cutoff, base["capacity"])
-            yield row | {"directed_pairs": pairs} | timed(config, call)
+            yield row | {"directed_pairs": pairs} | time_calls(config, call)
         except Exception as error:  # a peer that is missing or out of memory says so in its row
             yield row | {"status": "failed", "reason": f"{type(error).__name__}: {error}"[:300]}
 
@@ -260,19 +260,19 @@ def large_rows(config: Config, n: int) -> Iterator[dict[str, Any]]:
     base = {"layout": "random", "points": n, "dtype": "float32"}
     counts = jax.jit(lambda x: jfrnn.count(x, cutoff, backend="warp"))
     row = {"kind": "call", "method": "jfrnn warp, counts", **base, "directed_pairs": int(np.asarray(counts(x)).sum(dtype=np.int64))}
-    yield row | timed(config, lambda: counts(x), calls=2) | {"peak_bytes": _measure.device_bytes("peak_bytes_in_use")}
+    yield row | time_calls(config, lambda: counts(x), calls=2) | {"peak_bytes": _measure.device_bytes("peak_bytes_in_use")}
     given = ways.Given(x, jnp.ones(n, jnp.float32), cutoff)
     for gradient in (False, True) if config.sums else ():
         sums = ways.WAYS["pair_sum warp"].prepare(given, gradient, False).sums
         memory: Any = jax.jit(sums).lower(x, given.m, None).compile().memory_analysis()
         row = {"kind": "sum", "method": "pair_sum warp", "gradient": gradient, **base}
         row |= {"compiled_bytes": memory.temp_size_in_bytes + memory.output_size_in_bytes}
-        yield row | timed(config, lambda sums=sums: sums(x, given.m, None), calls=2)
+        yield row | time_calls(config, lambda sums=sums: sums(x, given.m, None), calls=2)
 
 
 def bandwidth_rows(config: Config) -> Iterator[dict[str, Any]]:
     """Measure the ceiling: bytes read and written per second where nothing else is done."""
     x = jnp.ones(1 << 28, jnp.float32)
     copy = jax.jit(lambda x: x + 1)
-    seconds = timed(config, lambda: copy(x), calls=10)["median_s"]
+    seconds = time_calls(config, lambda: copy(x), calls=10)["median_s"]
     yield {"kind": "ceiling", "method": "read and write", "bytes_per_s": 2 * x.nbytes / seconds, "median_s": seconds}

@@ -21,7 +21,7 @@ def directions(positions: np.ndarray) -> np.ndarray:
     return (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(positions.dtype)
 
 
-def turning(cutoff: float, motion: float) -> int:
+def turning_step(cutoff: float, motion: float) -> int:
     """Return after how many steps particles turn back."""
     return max(1, int(cutoff / 3 / motion)) if motion > 0 else 1
 
@@ -50,7 +50,7 @@ def follow_list(positions: np.ndarray, cutoff: float, motion: float, *, skin: fl
     """
     jax.config.update("jax_enable_x64", positions.dtype == np.float64)
     start, rays = jnp.asarray(positions), jnp.asarray(motion * directions(positions), positions.dtype)
-    turn = turning(cutoff, motion)
+    turn = turning_step(cutoff, motion)
     first = first_list(start, cutoff, skin)
 
     @jax.jit

@@ -7,7 +7,7 @@ import numpy as np
 
 from experiments import _native
 from experiments.methods import Found
-from experiments.methods._moving import away, directions, turning
+from experiments.methods._moving import away, directions, turning_step
 
 LIBRARY = _native.load("nanoflann", "nanoflann.hpp", "libnanoflann-dev")
 for name in ("static_search", "dynamic_new", "dynamic_search"):
@@ -34,7 +34,7 @@ def read_pairs(result: np.ndarray) -> Found:
 
 def follow(positions: np.ndarray, cutoff: float, motion: float, *, dynamic: bool) -> Callable[[], Result]:
     """Return `STEPS` steps of motion and search; the first of them builds the index."""
-    rays, turn, (n, dim), at = directions(positions), turning(cutoff, motion), positions.shape, [0]
+    rays, turn, (n, dim), at = directions(positions), turning_step(cutoff, motion), positions.shape, [0]
     radius = ctypes.c_double(cutoff)
 
     def place() -> tuple[np.ndarray, np.ndarray]:

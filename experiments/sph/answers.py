@@ -48,7 +48,7 @@ def table(name: str) -> np.ndarray:
     return np.loadtxt(REFERENCE / f"{name}.csv", delimiter=",", comments=("#", "t,", "T,"))
 
 
-def interpolated(x: np.ndarray, values: np.ndarray, points: np.ndarray, reach: float) -> np.ndarray:
+def interpolate(x: np.ndarray, values: np.ndarray, points: np.ndarray, reach: float) -> np.ndarray:
     """Return values at points, from planes fitted to the particles within reach, weighed by a Wendland kernel.
 
     Args:

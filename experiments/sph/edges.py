@@ -19,7 +19,7 @@ from experiments.sph.particles import Model, State
 _SLACK = 1.25  # room for more edges, as jax-sph has it
 
 
-def _summed(fn: Callable[[Array, Any, Any], Any], x: Array, values: Any, i: Array, j: Array) -> Any:  # noqa: ANN401
+def _sum_edges(fn: Callable[[Array, Any, Any], Any], x: Array, values: Any, i: Array, j: Array) -> Any:  # noqa: ANN401
     mine, theirs = (jax.tree.map(lambda value, k=k: value[k], values) for k in (i, j))
     terms = jax.vmap(fn)(x[j] - x[i], mine, theirs)
     return jax.tree.map(lambda term: jax.ops.segment_sum(term, i, x.shape[0]), terms)
@@ -58,7 +58,7 @@ class OwnEdges:
 
     def sum(self, fn: Callable[[Array, Any, Any], Any], positions: Array, values: Any) -> Any:  # noqa: ANN401
         """Sum over the edges of each i."""
-        return _summed(fn, positions, values, self.i, self.j)
+        return _sum_edges(fn, positions, values, self.i, self.j)
 
 
 @jax.tree_util.register_dataclass
@@ -99,7 +99,7 @@ class JaxMdEdges:
     def sum(self, fn: Callable[[Array, Any, Any], Any], positions: Array, values: Any) -> Any:  # noqa: ANN401
         """Sum over the edges of each i."""
         i, j = self.nbrs.idx
-        return _summed(fn, positions, values, i, j)
+        return _sum_edges(fn, positions, values, i, j)
 
 
 def of_own_list(model: Model, s: State, skin: float) -> OwnEdges:

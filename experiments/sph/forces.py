@@ -30,12 +30,12 @@ def active(model: Model, time: Array) -> Array | None:
     return None if model.enters is None else time >= model.enters
 
 
-def resting(model: Model, time: Array) -> Array | None:
+def are_resting(model: Model, time: Array) -> Array | None:
     """Return which particles stay where they are, shape [n], bool: those of walls, and those that have not entered yet."""
     return model.wall if model.enters is None else _either(model.wall, time < model.enters)
 
 
-def guided(model: Model, time: Array) -> Array | None:
+def are_guided(model: Model, time: Array) -> Array | None:
     """Return which particles keep their velocity, shape [n], bool: those of walls, and those that have just entered."""
     if model.enters is None or model.guided is None:
         return model.wall
@@ -143,7 +143,7 @@ def carried_rate(model: Model, s: State, rho: Array, inverse: Array | None, nbrs
         return rate + fluid(j, within)
 
     rate = _sum(term, model, s, values, nbrs, "fluid")
-    return walls.fluid_only(model.wall, rate if s.solid is None else rate + solids.compression(model, s, s.solid, rho))
+    return walls.keep_fluid(model.wall, rate if s.solid is None else rate + solids.compression(model, s, s.solid, rho))
 
 
 def torn(model: Model, rho: Array) -> Array:
@@ -157,16 +157,16 @@ def fields(model: Model, s: State, rho: Array, inverse: Array | None, nbrs: Neig
     if model.wall is None:
         return Fields(rho, p, s.v, inverse)
     physics = model.physics
-    sums = _sum(walls.seen_by_wall, model, s, {"rho": rho, "p": p, "v": s.v}, nbrs, "wall")
-    wall_p, wall_u = walls.extrapolated(sums, s.v, physics.gravity)
+    sums = _sum(walls.wall_terms, model, s, {"rho": rho, "p": p, "v": s.v}, nbrs, "wall")
+    wall_p, wall_u = walls.extrapolate(sums, s.v, physics.gravity)
     if physics.evolve == "pressure":
         wall_rho = rho
     elif physics.state == "linear":
         wall_rho = states.linear_density(wall_p, physics.density, physics.sound_speed)
     else:
         wall_rho = states.tait_density(wall_p, physics.density, physics.sound_speed, physics.exponent)
-    u = s.v if physics.slip else walls.fluid_only(model.wall, s.v, wall_u)
-    return Fields(walls.fluid_only(model.wall, rho, wall_rho), walls.fluid_only(model.wall, p, wall_p), u, inverse)
+    u = s.v if physics.slip else walls.keep_fluid(model.wall, s.v, wall_u)
+    return Fields(walls.keep_fluid(model.wall, rho, wall_rho), walls.keep_fluid(model.wall, p, wall_p), u, inverse)
 
 
 def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tuple[Array, Array | None]:
@@ -188,7 +188,7 @@ def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tupl
         if physics.tension is not None:
             a = a + surface.cohesion(pair, i, j, physics.tension, model.kernel.support * physics.smoothing)
         if physics.transport is not None:
-            a = a + transport.advected(pair, i, j, gradient)
+            a = a + transport.advect(pair, i, j, gradient)
         if physics.shifting is not None:
             a = a + fluid(j, transport.advected_change(pair, i, j, gradient, "v"))
         sums = {"a": a}
@@ -206,7 +206,7 @@ def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tupl
         a = a + _tension(model, s, seen.rho, nbrs)
     if physics.damping is not None:
         a = a - _damping(model, s.time) * s.v
-    return walls.fluid_only(guided(model, s.time), a), sums.get("w")
+    return walls.keep_fluid(are_guided(model, s.time), a), sums.get("w")
 
 
 def _tension(model: Model, s: State, rho: Array, nbrs: Neighbors) -> Array:

@@ -33,7 +33,7 @@ def draw(scene: FluidScene, x: np.ndarray, v: np.ndarray, time: float, top_speed
     wide, high = (upper - lower)[[0, -1]]
     figure = Figure(figsize=(7.0, min(max(7.0 * high / wide, 2.5) + 0.8, 9.0)), layout="constrained")
     axes = figure.add_subplot()
-    x = wrapped(scene, x)
+    x = wrap_positions(scene, x)
     there = np.ones(scene.n, bool) if scene.enters is None else scene.enters <= time
     wall = np.zeros(scene.n, bool) if scene.wall is None else scene.wall
     depth = np.argsort(x[:, 1]) if scene.dim == 3 else np.arange(scene.n)
@@ -42,7 +42,8 @@ def draw(scene: FluidScene, x: np.ndarray, v: np.ndarray, time: float, top_speed
     shape = {"s": max(0.8 * pixels, 0.6) ** 2, "linewidths": 0}
     axes.scatter(*x[wall][:, [0, -1]].T, color=WALL, **shape)
     if scene.solid is not None:
-        axes.add_collection(LineCollection(list(view.turned(scene.solid.vertices, scene.solid.turning, time)[scene.solid.faces])))
+        vertices = view.turn_vertices(scene.solid.vertices, scene.solid.turning, time)
+        axes.add_collection(LineCollection(list(vertices[scene.solid.faces])))
     speed = np.linalg.norm(v[seen], axis=1)
     marks = axes.scatter(*x[seen][:, [0, -1]].T, c=speed, cmap="viridis", vmin=0, vmax=top_speed or 1.0, **shape)
     figure.colorbar(marks, ax=axes, label="speed [m/s]", shrink=0.8)
@@ -75,7 +76,7 @@ def picture_bounds(scene: FluidScene) -> tuple[np.ndarray, np.ndarray]:
     return np.array(scene.bounds.lower), np.array(scene.bounds.upper)
 
 
-def wrapped(scene: FluidScene, x: np.ndarray) -> np.ndarray:
+def wrap_positions(scene: FluidScene, x: np.ndarray) -> np.ndarray:
     """Return positions inside the periodic box, where there is one."""
     if scene.periodic is None:
         return x

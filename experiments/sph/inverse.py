@@ -61,12 +61,12 @@ def solve(problem: Problem, evaluations: int = 30) -> Found:
     both = jax.jit(jax.value_and_grad(problem.loss))
     tried: list[tuple[np.ndarray, float]] = []
 
-    def evaluated(guess: np.ndarray) -> tuple[float, np.ndarray]:
+    def evaluate(guess: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = both(jnp.asarray(guess))
         tried.append((guess.copy(), float(value)))
         return float(value), np.asarray(slope, np.float64)
 
-    minimize(evaluated, problem.start, jac=True, method="L-BFGS-B", options={"maxfun": evaluations, "ftol": 1e-10, "gtol": 1e-9})
+    minimize(evaluate, problem.start, jac=True, method="L-BFGS-B", options={"maxfun": evaluations, "ftol": 1e-10, "gtol": 1e-9})
     parameters, losses = np.array([guess for guess, _ in tried]), np.array([value for _, value in tried])
     return Found(parameters, losses, parameters[losses.argmin()], float(losses.min()))
 
@@ -174,14 +174,14 @@ def droplet(*, goal: float = 0.4, intervals: int = 8, backend: str = "auto") -> 
     each = _square(scene.duration / scene.step / intervals)
 
     def loss(forces: Array) -> Array:
-        end = steered(model, s, forces, each)
+        end = steer(model, s, forces, each)
         along, left = jnp.mean(end.x[fluid, 0]) - goal, jnp.mean(end.v[fluid, 0])
         return (along / 0.04) ** 2 + (left / 0.2) ** 2 + 1e-4 * jnp.mean(forces**2)
 
     return Problem("droplet", "force [9.81 m/s²]", np.zeros(intervals), loss, None, intervals * each, scene.n)
 
 
-def steered(model: Model, s: State, forces: Array, each: int) -> State:
+def steer(model: Model, s: State, forces: Array, each: int) -> State:
     """Return the state after runs of `each` steps, one per force along x [9.81 m/s²], shape [intervals], besides gravity."""
 
     def interval(s: State, force: Array) -> tuple[State, None]:

@@ -28,7 +28,7 @@ def fronts(times: Nodes, least: float = 0.02, step: float = 0.01, height: float 
     z, phi = column(height, least)
     seen, time = [(0.0, z[-1, 0])], 0.0
     while time < times[-1]:
-        z, phi = advanced(z, phi, step)
+        z, phi = advance(z, phi, step)
         z, phi = spread(z, phi, least)
         time += step
         seen.append((time, z[-1, 0]))
@@ -41,7 +41,7 @@ def column(height: float, least: float) -> tuple[Nodes, Nodes]:
     return spread(corners, np.zeros(3), least)
 
 
-def advanced(z: Nodes, phi: Nodes, step: float) -> tuple[Nodes, Nodes]:
+def advance(z: Nodes, phi: Nodes, step: float) -> tuple[Nodes, Nodes]:
     """Return nodes and potential after a step."""
     rates, at = [], (z, phi)
     for share in (0.5, 0.5, 1.0, 0.0):

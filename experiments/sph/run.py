@@ -52,7 +52,7 @@ def run(scene: FluidScene, folder: Path, how: How) -> State:
         UsageError: The folder holds another run, or the scene cannot be run.
         DivergedError: A particle is not finite, or went through a wall.
     """
-    about = settings.described(scene) | {"dtype": how.dtype, "frames": how.frames, "given": _digest(scene)}
+    about = settings.describe(scene) | {"dtype": how.dtype, "frames": how.frames, "given": _digest(scene)}
     try:
         model = make_model(scene, np.dtype(how.dtype).type)
         first = None if (folder / "run.json").exists() else make_state(scene, np.dtype(how.dtype).type)  # refused before

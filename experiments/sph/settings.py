@@ -119,7 +119,7 @@ def with_particles(scene: FluidScene, path: Path) -> FluidScene:
             raise UsageError(f"{path}: {name} must be finite; particle {int(np.argwhere(~np.isfinite(array))[0][0])} is not")
     if len(positions) == 0 or not (masses > 0).all():
         raise UsageError(f"{path}: expected at least one particle, and masses above 0")
-    return _replaced(scene, positions, velocities, masses)
+    return _replace_particles(scene, positions, velocities, masses)
 
 
 def with_solid(scene: FluidScene, path: Path, scale: float) -> FluidScene:
@@ -170,7 +170,7 @@ def _place(corner: np.ndarray) -> str:
     return "(" + ", ".join(f"{x:.3g}" for x in corner) + ")"
 
 
-def _replaced(scene: FluidScene, positions: np.ndarray, velocities: np.ndarray, masses: np.ndarray) -> FluidScene:
+def _replace_particles(scene: FluidScene, positions: np.ndarray, velocities: np.ndarray, masses: np.ndarray) -> FluidScene:
     """Return the scene with these particles, all of them there from the beginning, before its walls."""
     walls = np.zeros(scene.n, bool) if scene.wall is None else scene.wall
     return replace(
@@ -210,7 +210,7 @@ def _columns(table: np.ndarray, axes: str) -> dict[str, np.ndarray]:
     return given | ({"masses": table["m"]} if "m" in names else {})
 
 
-def described(scene: FluidScene) -> dict[str, Any]:
+def describe(scene: FluidScene) -> dict[str, Any]:
     """Return what a scene says, but its particles: what a run must have in common with one that it goes on with."""
     physics = {item.name: getattr(scene.physics, item.name) for item in fields(scene.physics)}
     return {"name": scene.name, "particles": scene.n, "duration": scene.duration, "step": scene.step, "physics": physics}

@@ -83,14 +83,14 @@ def turning_of(scene: FluidScene, dtype: np.dtype | type) -> Turning | None:
 
 def into_frame(x: Array, turning: Turning | None, angle: Array | None) -> Array:
     """Return positions [n, d] as the wall sees them that has turned by an angle [rad]: it stands, they have turned back."""
-    return x if turning is None or angle is None else turning.center + _turned(x - turning.center, turning, -angle)
+    return x if turning is None or angle is None else turning.center + _turn(x - turning.center, turning, -angle)
 
 
-def _out_of_frame(x: Array, turning: Turning | None, angle: Array | None) -> Array:
-    return x if turning is None or angle is None else turning.center + _turned(x - turning.center, turning, angle)
+def _leave_frame(x: Array, turning: Turning | None, angle: Array | None) -> Array:
+    return x if turning is None or angle is None else turning.center + _turn(x - turning.center, turning, angle)
 
 
-def _turned(r: Array, turning: Turning | None, angle: Array | None) -> Array:
+def _turn(r: Array, turning: Turning | None, angle: Array | None) -> Array:
     """Turn vectors [n, d]. Source: Rodrigues (1840)."""
     if turning is None or angle is None:
         return r
@@ -139,9 +139,9 @@ def keep_out(model: Model, s: State, x: Array, v: Array, dt: Array, rests: Array
     stays = far | (after[0] & (after[1] < gap / 2))
     if rests is not None:
         meets, stays = meets & ~rests, stays & ~rests
-    kept = _out_of_frame(jnp.where(stays[:, None], before, placed), turning, angle)
+    kept = _leave_frame(jnp.where(stays[:, None], before, placed), turning, angle)
     x = jnp.where((meets | stays)[:, None], kept, x)
-    wall, normal = jnp.zeros_like(v), _turned(normal, turning, angle)
+    wall, normal = jnp.zeros_like(v), _turn(normal, turning, angle)
     if turning is not None:
         wall = turning.rate * _across(x - turning.center, turning)
     toward = jnp.minimum(jnp.sum((v - wall) * normal, axis=1), 0)
@@ -154,7 +154,7 @@ def keep_out(model: Model, s: State, x: Array, v: Array, dt: Array, rests: Array
     return s._replace(x=x, v=v, solid=Beside(tri, angle, *seen))
 
 
-def missing(kernel: Kernel, distance: Array, h: float, dim: int) -> tuple[Array, Array]:
+def integrate_missing(kernel: Kernel, distance: Array, h: float, dim: int) -> tuple[Array, Array]:
     """Integrate a kernel behind a plane.
 
     A(d) = ∫ W over the plane [1/m]: the gradient at the particle of what lies behind is -A n. Γ(d) = ∫_d A, the weight of what
@@ -199,12 +199,12 @@ class _Acting(NamedTuple):
     acceleration: Array | None
 
 
-def _acting(model: Model, s: State, beside: Beside) -> _Acting:
+def _find_acting(model: Model, s: State, beside: Beside) -> _Acting:
     mask = beside.mask if model.enters is None else beside.mask & (s.time >= model.enters)
     distance = jnp.where(mask, jnp.maximum(beside.distance, 0), 0)
-    sums = missing(model.kernel, distance, model.physics.smoothing, s.x.shape[1])
+    sums = integrate_missing(model.kernel, distance, model.physics.smoothing, s.x.shape[1])
     area, weight = (jnp.where(mask, part, 0) for part in sums)
-    normal, turning = _turned(beside.normal, model.turning, beside.angle), model.turning
+    normal, turning = _turn(beside.normal, model.turning, beside.angle), model.turning
     if turning is None:
         return _Acting(area, weight, distance, normal, s.v, None)
     velocity = turning.rate * _across(s.x - distance[:, None] * normal - turning.center, turning)
@@ -213,7 +213,7 @@ def _acting(model: Model, s: State, beside: Beside) -> _Acting:
 
 def compression(model: Model, s: State, beside: Beside, rho: Array) -> Array:
     """Return what the wall adds to dρ/dt [kg/m³/s], shape [n]: -ρ A (v - v_wall)·n."""
-    wall = _acting(model, s, beside)
+    wall = _find_acting(model, s, beside)
     return -rho * wall.area * jnp.sum(wall.slip * wall.normal, axis=1)
 
 
@@ -226,7 +226,7 @@ def push(model: Model, s: State, beside: Beside, rho: Array, p: Array) -> Array:
     Source: Adami, Hu & Adams (2012), doi:10.1016/j.jcp.2012.05.005, eq. 23, for the pressure in the wall; Morris, Fox & Zhu (1997),
     doi:10.1006/jcph.1997.5776, eqs. 22 and 28; both integrated over a half-space.
     """
-    physics, wall = model.physics, _acting(model, s, beside)
+    physics, wall = model.physics, _find_acting(model, s, beside)
     along = 2 * p / rho * wall.area
     body = None if physics.gravity is None else jnp.broadcast_to(physics.gravity, s.x.shape)
     if wall.acceleration is not None:

@@ -126,15 +126,15 @@ def _besides(model: Model, sums: Array | None, dt: Array) -> Array | None:
     if sums is None:
         return None
     moved = -model.physics.shifting * sums if model.physics.shifting is not None else dt / 2 * sums
-    return walls.fluid_only(model.wall, moved)
+    return walls.keep_fluid(model.wall, moved)
 
 
-def _moving(model: Model, s: State) -> Array:
+def _transport_velocity(model: Model, s: State) -> Array:
     """Return the velocities with which positions change; dummies of walls stay, their velocity is along the wall."""
-    return walls.fluid_only(forces.resting(model, s.time), s.v if s.w is None else s.v + s.w)
+    return walls.keep_fluid(forces.are_resting(model, s.time), s.v if s.w is None else s.v + s.w)
 
 
-def _bounced(model: Model, s: State) -> State:
+def _bounce(model: Model, s: State) -> State:
     if model.tank is None:
         return s
     x, v = walls.bounce(s.x, s.v, *model.tank, model.physics.restitution)
@@ -146,7 +146,7 @@ def _leapfrog(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[State
     nbrs = _update(model, s, nbrs)
     s = _evaluate(model, s, nbrs)
     s = s._replace(v=s.v + (s.last + dt) / 2 * s.a)
-    return _bounced(model, s._replace(x=s.x + dt * _moving(model, s))), nbrs
+    return _bounce(model, s._replace(x=s.x + dt * _transport_velocity(model, s))), nbrs
 
 
 def _symplectic(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[State, Neighbors]:
@@ -156,9 +156,9 @@ def _symplectic(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[Sta
     energy drifts with dt; with `_midpoint`, with dt³ on the elliptical drop.
     """
     s = s._replace(v=s.v + dt / 2 * s.a)
-    moved = s.x + dt * _moving(model, s)
-    s = s._replace(x=moved) if s.solid is None else solids.keep_out(model, s, moved, s.v, dt, forces.resting(model, s.time))
-    s = _bounced(model, s)
+    moved = s.x + dt * _transport_velocity(model, s)
+    s = s._replace(x=moved) if s.solid is None else solids.keep_out(model, s, moved, s.v, dt, forces.are_resting(model, s.time))
+    s = _bounce(model, s)
     nbrs = _update(model, s, nbrs)
     s = _evaluate(model, s, nbrs, dt)
     return s._replace(v=s.v + dt / 2 * s.a), nbrs
@@ -174,14 +174,14 @@ def _midpoint(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[State
         a, w = forces.accelerations(model, at, forces.fields(model, at, rho, inverse, nbrs), nbrs)
         at = at._replace(a=a, w=_besides(model, w, dt))
         part = share * dt
-        moved = base.x + part * _moving(model, at)
+        moved = base.x + part * _transport_velocity(model, at)
         carried = {}
         if at.rho is not None and base.rho is not None:
             carried["rho"] = forces.torn(model, base.rho + part * forces.carried_rate(model, at, rho, inverse, nbrs))
         elif at.p is not None and base.p is not None:
             carried["p"] = base.p + part * forces.carried_rate(model, at, rho, inverse, nbrs)
         at = at._replace(x=moved, v=base.v + part * a, **carried)
-    return _bounced(model, at), nbrs
+    return _bounce(model, at), nbrs
 
 
 _INTEGRATORS = {"leapfrog": _leapfrog, "symplectic": _symplectic, "midpoint": _midpoint}

@@ -133,7 +133,7 @@ def run(config: Config, folder: Path, retry_failed: bool = False) -> list[StepRo
     for (nx, kind), same in itertools.groupby(config.specs(), lambda spec: (spec.nx, spec.kind)):
         group = list(same)
         tasks.append(
-            Task(tuple(x.key for x in group), f"{config.scene} · nx {nx} · {kind}", lambda _, group=group: _measured(group))
+            Task(tuple(x.key for x in group), f"{config.scene} · nx {nx} · {kind}", lambda _, group=group: _measure_scene(group))
         )
     for spec in () if config.tradeoff is None else config.tradeoff.specs():
         tasks.append(Task((spec.key,), f"{spec.scene} · nx {spec.nx} · {spec.way}", lambda _, spec=spec: [_flow(spec)]))
@@ -145,10 +145,10 @@ def _flow(spec: known_flow.Spec) -> StepRow:
     return _row(spec, "tradeoff", _sweep.ask({"do": "sph", "spec": asdict(spec)}, 3600.0, cold=False))
 
 
-def _measured(group: list[Spec]) -> list[StepRow]:
+def _measure_scene(group: list[Spec]) -> list[StepRow]:
     """Measure the rows of one scene."""
     first = group[0]
-    scene, model, s = _begun(first.scene, first.nx, first.rate, first.dtype)
+    scene, model, s = _begin(first.scene, first.nx, first.rate, first.dtype)
     about = {"particles": scene.n, "fluid": scene.n if scene.wall is None else int((~scene.wall).sum())}
     about |= {"device": jax.devices()[0].device_kind}
     if first.kind == "step":
@@ -162,9 +162,9 @@ def _measured(group: list[Spec]) -> list[StepRow]:
 
 
 @functools.lru_cache(maxsize=1)
-def _begun(name: str, nx: int, rate: float, dtype: str) -> tuple[FluidScene, Model, State]:
+def _begin(name: str, nx: int, rate: float, dtype: str) -> tuple[FluidScene, Model, State]:
     """Return a moving scene and its first state; the last one is kept, since rows of it follow."""
-    scene, number = moving(fluids.fluid(name, nx=nx), rate), np.dtype(dtype).type
+    scene, number = set_in_motion(fluids.fluid(name, nx=nx), rate), np.dtype(dtype).type
     model = make_model(scene, number)
     return scene, model, jax.block_until_ready(jax.jit(solver.begin)(model, make_state(scene, number)))
 
@@ -175,7 +175,7 @@ def _row(spec: "Spec | known_flow.Spec", kind: str, seen: dict[str, Any]) -> Ste
     return StepRow(**values)
 
 
-def moving(scene: FluidScene, rate: float) -> FluidScene:
+def set_in_motion(scene: FluidScene, rate: float) -> FluidScene:
     """Return the scene with a fluid that moves by rate·(x, 0, -z), in 2D rate·(x, -z): without divergence, along its walls."""
     flow = np.zeros_like(scene.positions)
     flow[:, 0], flow[:, -1] = rate * scene.positions[:, 0], -rate * scene.positions[:, -1]
@@ -191,7 +191,7 @@ def _step_rows(group: list[Spec], model: Model, s: State) -> list[StepRow]:
             rows[spec.way] = replace(row, status="skipped", reason=f"{spec.way} is run up to {most} particles")
             continue
         try:
-            run, fields = _prepared(spec, model, s)
+            run, fields = _prepare(spec, model, s)
             after = run(1)
             reference = after if reference is None else reference
             fields["difference"] = difference(model, reference, after)
@@ -204,7 +204,7 @@ def _step_rows(group: list[Spec], model: Model, s: State) -> list[StepRow]:
             rows[spec.way] = replace(row, reason=f"{type(error).__name__}: {error}"[:600])
     steps = group[0].steps
     calls = {way: lambda run=run: run(steps).x for way, run in ready.items()}
-    seconds, others = _timed(calls, group[0].rounds)
+    seconds, others = _time_in_turns(calls, group[0].rounds)
     for way, times in seconds.items():
         p10, median, p90 = (float(value) / steps for value in np.percentile(times, (10, 50, 90)))
         speed = {"steps_per_s": 1 / median, "particle_steps_per_s": model.m.shape[0] / median}
@@ -212,7 +212,7 @@ def _step_rows(group: list[Spec], model: Model, s: State) -> list[StepRow]:
     return list(rows.values())
 
 
-def _timed(calls: dict[str, Callable[[], Any]], rounds: int) -> tuple[dict[str, list[float]], float | None]:
+def _time_in_turns(calls: dict[str, Callable[[], Any]], rounds: int) -> tuple[dict[str, list[float]], float | None]:
     """Time calls in turns, and tell how many cores others kept busy; a run is long enough not to mind whose data caches hold."""
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     bystanders = _measure.Bystanders()
@@ -223,7 +223,7 @@ def _timed(calls: dict[str, Callable[[], Any]], rounds: int) -> tuple[dict[str, 
     return seconds, None if others is None else round(others, 2)
 
 
-def _prepared(spec: Spec, model: Model, s: State) -> tuple[Callable[[int], State], dict[str, Any]]:
+def _prepare(spec: Spec, model: Model, s: State) -> tuple[Callable[[int], State], dict[str, Any]]:
     """Return a compiled run of so many steps, whose list does not overflow, and what was seen of it."""
     nbrs = WAYS[spec.way](model, s, spec.skin * model.spacing)
     begin = perf_counter()

@@ -123,15 +123,15 @@ def begin(flow: Flow) -> Flow:
         nbrs = nbrs.update(s.x, active=forces.active(model, s.time))
         return solver.begin(model, s, nbrs), nbrs
 
-    return _ran(flow, jax.jit(partial(_with_solver, first)))
+    return _run(flow, jax.jit(partial(_with_solver, first)))
 
 
 def run(flow: Flow, steps: int) -> Flow:
     """Run steps; where room was missing, with more of it again, from where the run began."""
-    return _ran(flow, lambda flow: advanced(flow, steps))
+    return _run(flow, lambda flow: advance(flow, steps))
 
 
-def _ran(flow: Flow, chunk: Callable[[Flow], Flow]) -> Flow:
+def _run(flow: Flow, chunk: Callable[[Flow], Flow]) -> Flow:
     while True:
         after = chunk(flow)
         if not bool(after.particles.overflow):
@@ -147,14 +147,14 @@ def state_of(flow: Flow) -> State:
 
 
 @jax.jit
-def advanced(flow: Flow, steps: Array | int) -> Flow:
+def advance(flow: Flow, steps: Array | int) -> Flow:
     """Run steps, data; where `particles.overflow` is set afterwards, pairs may have been missing: `run` sees to that."""
 
     def step(k: Array, flow: Flow) -> Flow:
-        def settled(particles: Particles) -> Particles:
+        def migrate_if_due(particles: Particles) -> Particles:
             return jax.lax.cond(k % flow.settle == 0, distributed.migrate, lambda same: same, particles)
 
-        return _with_solver(solver.step, replace(flow, particles=settled(flow.particles)))
+        return _with_solver(solver.step, replace(flow, particles=migrate_if_due(flow.particles)))
 
     return jax.lax.fori_loop(0, steps, step, flow)
 

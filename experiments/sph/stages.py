@@ -36,7 +36,7 @@ def part_times(model: Model, s: State, way: str, skin: float, steps: int, rounds
         the whole step takes longer than all of these; less than 0 where it shares between them.
     """
     nbrs = None if way == "pair_sum" else solver.list_neighbors(model, s, skin)
-    calls = _finding(model, s) if nbrs is None else _updates(s, nbrs, skin)
+    calls = _count_calls(model, s) if nbrs is None else _updates(s, nbrs, skin)
     finding = tuple(calls)
     calls |= _sums(model, s, nbrs)
     _, after = jax.block_until_ready(solver.advance(model, s, nbrs, steps))
@@ -73,7 +73,7 @@ def _sums(model: Model, s: State, nbrs: forces.Neighbors) -> dict[str, Callable[
     }
 
 
-def _finding(model: Model, s: State) -> dict[str, Callable[[], Any]]:
+def _count_calls(model: Model, s: State) -> dict[str, Callable[[], Any]]:
     """Return calls that count the pairs of a sum for the fluid, and for walls over the fluid."""
     k, cutoff = model.fluid_count, model.cutoff
     if k is None:

@@ -14,7 +14,7 @@ def transport(pair: Pair, i: Values, j: Values, background: Array) -> Array:
     return volumes * background / i["m"] * pair.pull * pair.r
 
 
-def advected(pair: Pair, i: Values, j: Values, gradient: Array) -> Array:
+def advect(pair: Pair, i: Values, j: Values, gradient: Array) -> Array:
     """Return what transport by `w` besides v adds to the acceleration [m/s²]: the divergence of ρ v⊗w, in volume form.
 
     (V_i² + V_j²)/(2 m_i) (A_i + A_j)·∇W, A = ρ v⊗w. Source: Adami, Hu & Adams (2013), doi:10.1016/j.jcp.2013.01.043, eq. 8.

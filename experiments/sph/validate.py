@@ -59,12 +59,12 @@ def measure(name: str, case: Case, say: Any = print) -> CaseRow:  # noqa: ANN401
             break
         seen.append(look(scene, model, s))
         say(f"{name} · t {float(s.time):.4g} s · {step / (perf_counter() - start):.0f} steps/s")
-    figures, curves = _judged(case, scene, seen) if reason is None else ([], {})
+    figures, curves = _judge(case, scene, seen) if reason is None else ([], {})
     about = {"particles": scene.n, "steps": step, "seconds": round(perf_counter() - start, 1), "axes": case.axes}
     return CaseRow(key=name, status="ok" if figures else "failed", reason=reason, figures=figures, curves=curves, **about)
 
 
-def _judged(case: Case, scene: Any, seen: list[Seen]) -> tuple[list[dict[str, Any]], Curves]:  # noqa: ANN401
+def _judge(case: Case, scene: Any, seen: list[Seen]) -> tuple[list[dict[str, Any]], Curves]:  # noqa: ANN401
     figures, curves = case.judge(scene, seen)
     measured = ((figure, figure.measured if math.isfinite(figure.measured) else None) for figure in figures)  # JSON has no NaN
     return [figure._asdict() | {"measured": number, "met": figure.met} for figure, number in measured], curves

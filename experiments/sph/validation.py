@@ -143,13 +143,13 @@ def cavity(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
         known = answers.table(line)[:, :2]
         at = np.full((len(known), 2), 0.5)
         at[:, 1 - k] = known[:, 0]
-        found = answers.interpolated(last.x, last.v[:, k], at, 2.5 * scene.spacing)
+        found = answers.interpolate(last.x, last.v[:, k], at, 2.5 * scene.spacing)
         figures.append(
             Figure(f"{name}, RMS, t = {last.time:.3g}", float(np.sqrt(((found - known[:, 1]) ** 2).mean())), None, target)
         )
         dense = np.full((81, 2), 0.5)
         dense[:, 1 - k] = np.linspace(0, 1, 81)
-        curves[f"{name}, measured"] = curve(dense[:, 1 - k], answers.interpolated(last.x, last.v[:, k], dense, 2.5 * scene.spacing))
+        curves[f"{name}, measured"] = curve(dense[:, 1 - k], answers.interpolate(last.x, last.v[:, k], dense, 2.5 * scene.spacing))
         curves[f"{name}, known"] = curve(*known.T)
     return figures, curves
 

@@ -42,13 +42,13 @@ def render(scene: FluidScene, x: np.ndarray, colors: np.ndarray, time: float) ->
     """
     canvas = _canvas(scene)
     if scene.solid is not None:
-        vertices = turned(scene.solid.vertices, scene.solid.turning, time)
+        vertices = turn_vertices(scene.solid.vertices, scene.solid.turning, time)
         _add_triangles(canvas, vertices[scene.solid.faces])
     _add_balls(canvas, x, colors, 0.62 * scene.spacing)
     return canvas.colors[::-1]
 
 
-def turned(vertices: np.ndarray, turning: Turning | None, time: float) -> np.ndarray:
+def turn_vertices(vertices: np.ndarray, turning: Turning | None, time: float) -> np.ndarray:
     """Return the corners of a solid [v, d] at a time [s]."""
     if turning is None:
         return vertices

@@ -27,19 +27,19 @@ def bounce(x: Array, v: Array, lower: Array, upper: Array, restitution: Array) -
     return jnp.clip(x, lower, upper), jnp.where(outside, -restitution * v, v)
 
 
-def seen_by_wall(pair: Pair, i: Values, j: Values) -> dict[str, Array]:
+def wall_terms(pair: Pair, i: Values, j: Values) -> dict[str, Array]:
     """Return what a wall particle i takes from a fluid particle j, weighed by W: weight, pressure, velocity, ρ_j (x_i - x_j)."""
     weight = jnp.where(j["wall"], 0, pair.weight) if "wall" in j else pair.weight
     return {"weight": weight, "p": weight * j["p"], "v": weight * j["v"], "moment": -weight * j["rho"] * pair.r}
 
 
-def extrapolated(sums: dict[str, Array], wall_velocity: Array, gravity: Array | None) -> tuple[Array, Array]:
+def extrapolate(sums: dict[str, Array], wall_velocity: Array, gravity: Array | None) -> tuple[Array, Array]:
     """Return the pressures [Pa], shape [n], and velocities [m/s], shape [n, d], that wall particles show to the fluid.
 
     p = (Σ p_j W + g·Σ ρ_j (x_i - x_j) W)/Σ W; u = 2 v_wall - Σ v_j W/Σ W, so that the fluid is held at the wall.
 
     Args:
-        sums: Of `seen_by_wall`.
+        sums: Of `wall_terms`.
         wall_velocity: v_wall [m/s], shape [n, d].
         gravity: g [m/s²], shape [d], or None.
 
@@ -52,7 +52,7 @@ def extrapolated(sums: dict[str, Array], wall_velocity: Array, gravity: Array | 
     return jnp.where(met, pressure / weight, 0), jnp.where(met[:, None], held, wall_velocity)
 
 
-def fluid_only(wall: Array | None, rates: Any, rest: Any = 0) -> Any:  # noqa: ANN401
+def keep_fluid(wall: Array | None, rates: Any, rest: Any = 0) -> Any:  # noqa: ANN401
     """Return the rates of fluid particles, shape [n] or [n, d], and `rest` for those of a wall; all, where there is none."""
     if wall is None:
         return rates
