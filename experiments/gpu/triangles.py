@@ -67,7 +67,7 @@ def rows(
         cutoff: [modules].
         dtype: Of all floats.
         steps: Of the scan.
-        timed: Times a call: `experiments.gpu.timings.timed`, of a config.
+        timed: Times a call: `experiments.gpu.timings.time_calls`, of a config.
     """
     scene = gear(n, faces)
     x, vertices, named = (

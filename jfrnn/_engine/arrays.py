@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._engine.candidates import Candidates, Points, Torus
 from jfrnn._engine.problem import Kind, Options, Rows, Search, largest_radius
-from jfrnn._engine.runs import Candidates, Points, Torus, count_neighbors, list_neighbors
+from jfrnn._engine.runs import count_neighbors, list_neighbors
 from jfrnn._geometry import (
     Axes,
     Batch,

@@ -1,8 +1,8 @@
-"""The engine: from runs of candidates to rows of neighbors, in blocks of queries, with bounded scratch memory.
+"""From runs of candidates to rows of neighbors, by array programming in blocks of queries, with bounded scratch memory.
 
-A run is a contiguous range of sorted sources. Runs are cut into words of 16 candidates; one bit per candidate says whether it is a
-neighbor. A block holds `queries x words` words at a time, at most `_BLOCK_WORDS`, each of which takes a few tens of bytes: the
-scratch of a block stays below 64 MB whatever n, and nothing per candidate is ever stored.
+A run is a contiguous range of sorted sources. Runs are divided into words of 16 candidates, with one bit per candidate that says
+whether it is a neighbor. A block has at most `_BLOCK_WORDS` words at a time, of a few tens of bytes each. So the scratch memory of
+a block stays below 64 MB for any n, and nothing is stored per candidate.
 """
 
 import functools
@@ -14,72 +14,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._engine.candidates import Candidates, Points, Torus
 from jfrnn._engine.problem import Filter
-from jfrnn._geometry import Cutoff, Cutoffs, Images, Pair, flat_take, refine, shift_in_given, squared_distance, step_one_bounds
+from jfrnn._engine.words import LANES, VERDICTS, bit_counts, deposit, nth_bits, take, windows
+from jfrnn._geometry import Cutoff, Cutoffs, Pair, flat_take, refine, shift_in_given, squared_distance, step_one_bounds
 
-LANES = 16  # candidates per word: hits in its lower half, doubtful ones in its upper half
 _BLOCK_WORDS = 1 << 16
 _BLOCK_SLOTS = 1 << 22  # 16 MB of rows
-_SLOT_GROUP = 128  # slots of a row that are filled at a time
+_SLOT_GROUP = 128  # slots per row that are filled at a time
 _FEW_RUNS = 32
 _MANY_RUNS = 4096
-FOLD_GROUP = 32  # neighbors of a query that are folded at a time
-_DOUBTFUL = 32  # doubtful candidates per row that one round of the exact test takes
-
-# places of queries [b], and which pass over the sources -> first places and ends of their runs [b, r], and the codes of their
-# images (None: no lattice)
-Runs = Callable[[Array, Array], tuple[Array, Array, Array | None]]
-
+FOLD_GROUP = 32  # neighbors per query that are folded at a time
 
 State = TypeVar("State")
-Carry = Any  # what a loop over pairs carries
-
-
-class Points(NamedTuple):
-    """Particles in the order in which the engine walks them.
-
-    Attributes:
-        axes: d coordinate arrays [n].
-        ids: [n] int32.
-        radii: [n] their cutoffs, or None where one serves all, or the rule does not ask for them.
-    """
-
-    axes: list[Array]
-    ids: Array
-    radii: Array | None = None
-
-
-class Torus(NamedTuple):
-    """What a lattice adds: images of the sources are met, of which the wrapped coordinates tell all but what is doubtful.
-
-    Attributes:
-        images: Static.
-        translations: [images, d], near enough, of each image.
-        matrix: [d, d], the lattice vectors as they were given.
-        raw: [n, d] sources and [m, d] queries as they were given.
-        turns: [n, d] and [m, d] whole floats: how many lattice vectors were taken off.
-        slack: [] by how much a component of a difference of wrapped coordinates may be wrong.
-    """
-
-    images: Images
-    translations: Array
-    matrix: Array
-    raw: tuple[Array, Array]
-    turns: tuple[Array, Array]
-    slack: Array
-
-
-class Candidates(NamedTuple):
-    """Sources and queries in the order in which they are walked, and where the candidates of a query lie among the sources.
-
-    `passes` [] int32 is how often `runs` is asked for more; None: once.
-    """
-
-    sources: Points
-    queries: Points
-    runs: Runs
-    torus: Torus | None
-    passes: Array | None = None
+Carry = Any  # the state of a loop over pairs
 
 
 def count_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter) -> Array:
@@ -90,16 +38,10 @@ def count_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filt
     def count_block(b: Array, out: Array) -> Array:
         place, ids = engine.block(b)
 
-        def add_pass(which: Array, count: Array) -> Array:
-            table = engine.word_table(place, which)
+        def add(words: _HitWords, count: Array) -> Array:
+            return count + bit_counts(words.hits).sum(1, dtype=jnp.int32)
 
-            def add_chunk(state: tuple[Array, Array]) -> tuple[Array, Array]:
-                chunk, count = state
-                return chunk + 1, count + _bit_counts(engine.hit_words(place, table, chunk).hits).sum(1, dtype=jnp.int32)
-
-            return lax.while_loop(lambda state: state[0] * engine.words < table.longest, add_chunk, (jnp.int32(0), count))[1]
-
-        return out.at[ids].set(engine.all_passes(add_pass, jnp.zeros(place.shape, jnp.int32)))
+        return out.at[ids].set(engine.fold_words(place, add, jnp.zeros(place.shape, jnp.int32)))
 
     return lax.fori_loop(0, engine.block_count, count_block, jnp.zeros(queries.ids.shape, jnp.int32))
 
@@ -107,7 +49,7 @@ def count_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filt
 def list_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, capacity: int) -> tuple[Array, Array]:
     """List the neighbors of every query: [m, capacity] int32 source indices, unused slots n, and [m] int32 true counts.
 
-    Where images must be told apart, an index is that of the source plus n times the code of its image, unused slots n·images.
+    If images must be told apart, n times the image code is added to the source index; unused slots are n·images.
     """
     sources, queries, torus = candidates.sources, candidates.queries, candidates.torus
     engine = _Engine(candidates._replace(sources=_pad(sources)), cutoff, keep, capacity)
@@ -118,35 +60,28 @@ def list_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filte
     def list_block(b: Array, out: tuple[Array, Array]) -> tuple[Array, Array]:
         place, ids = engine.block(b)
 
-        def add_pass(which: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
-            table = engine.word_table(place, which)
+        def add(words: _HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
+            (rows, count), (hits, first, image) = found, words
+            total = bit_counts(hits).sum(1, dtype=jnp.int32)
 
-            def add_chunk(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-                chunk, rows, count = state
-                hits, first, image = engine.hit_words(place, table, chunk)
-                total = _bit_counts(hits).sum(1, dtype=jnp.int32)
+            def add_group(state: tuple[Array, Array]) -> tuple[Array, Array]:
+                g, rows = state
+                start = jnp.minimum(g * group, capacity - group)
+                ordinal = (start + slots)[None] - count[:, None]
+                word, bit = nth_bits(hits, ordinal)
+                neighbor = engine.sources.ids.at[take(first, word) + bit].get(mode="promise_in_bounds")
+                if image is not None and images > 1:
+                    neighbor = neighbor + n * take(image, word)
+                old = lax.dynamic_slice_in_dim(rows, start, group, axis=1)
+                new = jnp.where((ordinal >= 0) & (ordinal < total[:, None]), neighbor, old)
+                return g + 1, lax.dynamic_update_slice_in_dim(rows, new, start, axis=1)
 
-                def add_group(state: tuple[Array, Array]) -> tuple[Array, Array]:
-                    g, rows = state
-                    start = jnp.minimum(g * group, capacity - group)
-                    ordinal = (start + slots)[None] - count[:, None]
-                    word, bit = _nth_bits(hits, ordinal)
-                    neighbor = engine.sources.ids.at[_take(first, word) + bit].get(mode="promise_in_bounds")
-                    if image is not None and images > 1:
-                        neighbor = neighbor + n * _take(image, word)
-                    old = lax.dynamic_slice_in_dim(rows, start, group, axis=1)
-                    new = jnp.where((ordinal >= 0) & (ordinal < total[:, None]), neighbor, old)
-                    return g + 1, lax.dynamic_update_slice_in_dim(rows, new, start, axis=1)
-
-                until = jnp.minimum(jnp.max(count + total), capacity)
-                _, rows = lax.while_loop(lambda state: state[0] * group < until, add_group, (jnp.min(count) // group, rows))
-                return chunk + 1, rows, count + total
-
-            start = (jnp.int32(0), *found)
-            return lax.while_loop(lambda state: state[0] * engine.words < table.longest, add_chunk, start)[1:]
+            until = jnp.minimum(jnp.max(count + total), capacity)
+            _, rows = lax.while_loop(lambda state: state[0] * group < until, add_group, (jnp.min(count) // group, rows))
+            return rows, count + total
 
         rows = jnp.full((place.size, capacity), n * images, jnp.int32)
-        rows, count = engine.all_passes(add_pass, (rows, jnp.zeros(place.shape, jnp.int32)))
+        rows, count = engine.fold_words(place, add, (rows, jnp.zeros(place.shape, jnp.int32)))
         return out[0].at[ids].set(rows), out[1].at[ids].set(count)
 
     m = queries.ids.size
@@ -158,9 +93,9 @@ class Slots(NamedTuple):
     """Some neighbors of each query of a block.
 
     Attributes:
-        source: [b, g] int32 indices of sources, valid everywhere.
-        shift: [b, g, d] whole floats, the lattice shift of each; None where space is open.
-        real: [b, g] bool: there is such a pair.
+        source: [b, g] int32 source indices, valid everywhere.
+        shift: [b, g, d] whole floats, the lattice shifts; None in open space.
+        real: [b, g] bool, whether the slot holds a pair.
     """
 
     source: Array
@@ -169,12 +104,12 @@ class Slots(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Queries that are in work at a time.
+    """Queries that are processed together.
 
     Attributes:
-        query: [b] int32 their indices.
-        fresh: [b] bool: not in an earlier block; the others have no pairs here.
-        fold: (add, state) -> state; calls add(slots, state) -> state until all neighbors of all queries were seen.
+        query: [b] int32, their indices.
+        fresh: [b] bool, False for queries that an earlier block has processed; these have no pairs here.
+        fold: (add, state) -> state; calls add(slots, state) -> state until all neighbors of all queries were visited.
     """
 
     query: Array
@@ -188,9 +123,9 @@ Visit = Callable[[Block, State], State]
 def fold_neighbors(
     candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, elements: int, visit: Visit[State], out: State
 ) -> State:
-    """Walk over the neighbors of all queries without listing them: out = visit(block, out) for one block after the other.
+    """Visit the neighbors of all queries without listing them: out = visit(block, out) for one block after the other.
 
-    `elements` is how many numbers a visitor holds per pair: blocks are cut so that 16 MB of float32 hold them.
+    `elements` is the number of scalars per pair that a visitor needs; blocks are chosen such that 16 MB of float32 hold them.
     """
     engine = _Engine(candidates._replace(sources=_pad(candidates.sources)), cutoff, keep, FOLD_GROUP * elements)
     slots, torus = lax.iota(jnp.int32, FOLD_GROUP), candidates.torus
@@ -200,30 +135,24 @@ def fold_neighbors(
         fresh = place >= b * engine.block_size
 
         def fold(add: Callable[[Slots, Carry], Carry], state: Carry) -> Carry:
-            def add_pass(which: Array, state: Carry) -> Carry:
-                table = engine.word_table(place, which)
+            def add_words(words: _HitWords, state: Carry) -> Carry:
+                hits, first, image = words
+                total = jnp.where(fresh, bit_counts(hits).sum(1, dtype=jnp.int32), 0)
 
-                def add_chunk(state: tuple[Array, Any]) -> tuple[Array, Any]:
-                    chunk, state = state
-                    hits, first, image = engine.hit_words(place, table, chunk)
-                    total = jnp.where(fresh, _bit_counts(hits).sum(1, dtype=jnp.int32), 0)
+                def add_group(state: tuple[Array, Any]) -> tuple[Array, Any]:
+                    done, state = state
+                    ordinal = jnp.broadcast_to(done + slots, (place.size, slots.size))
+                    word, bit = nth_bits(hits, ordinal)
+                    source = engine.sources.ids.at[take(first, word) + bit].get(mode="promise_in_bounds")
+                    shift = None
+                    if torus is not None and image is not None:
+                        shift = _shifts_of(torus, ids[:, None], source, take(image, word))
+                    return done + FOLD_GROUP, add(Slots(source, shift, ordinal < total[:, None]), state)
 
-                    def add_group(state: tuple[Array, Any]) -> tuple[Array, Any]:
-                        done, state = state
-                        ordinal = jnp.broadcast_to(done + slots, (place.size, slots.size))
-                        word, bit = _nth_bits(hits, ordinal)
-                        source = engine.sources.ids.at[_take(first, word) + bit].get(mode="promise_in_bounds")
-                        shift = None
-                        if torus is not None and image is not None:
-                            shift = _shifts_of(torus, ids[:, None], source, _take(image, word))
-                        return done + FOLD_GROUP, add(Slots(source, shift, ordinal < total[:, None]), state)
+                most = jnp.max(total)
+                return lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), state))[1]
 
-                    most = jnp.max(total)
-                    return chunk + 1, lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), state))[1]
-
-                return lax.while_loop(lambda state: state[0] * engine.words < table.longest, add_chunk, (jnp.int32(0), state))[1]
-
-            return engine.all_passes(add_pass, state)
+            return engine.fold_words(place, add_words, state)
 
         return visit(Block(ids, fresh, fold), out)
 
@@ -237,21 +166,21 @@ def _shifts_of(torus: Torus, query: Array, source: Array, image: Array) -> Array
 
 
 class _WordTable(NamedTuple):
-    """How the runs of a block's queries are cut into words."""
+    """How the runs of a block's queries are divided into words."""
 
-    start: Array  # [b, r] first place of each run
+    start: Array  # [b, r] start of each run
     stop: Array  # [b, r] its end
-    image: Array | None  # [b, r] the code of its image
-    before: Array  # [b, r] words of the query's earlier runs
-    longest: Array  # [] words of the query that has most
+    image: Array | None  # [b, r] its image code
+    before: Array  # [b, r] number of words in the query's earlier runs
+    longest: Array  # [] largest number of words of a query
 
 
 class _HitWords(NamedTuple):
-    """Neighbors among a chunk of candidates: one bit per candidate, [b, words] each."""
+    """The neighbors in a chunk of candidates: one bit per candidate, [b, words] each."""
 
     hits: Array
-    first: Array  # place of each word's first candidate
-    image: Array | None  # code of its image
+    first: Array  # position of each word's first candidate
+    image: Array | None  # image code
 
 
 class _Engine(NamedTuple):
@@ -270,13 +199,13 @@ class _Engine(NamedTuple):
 
     @property
     def words(self) -> int:
-        """Words per query that are in work at a time: about what the 9 runs of 3D or the 3 runs of 2D need."""
+        """Words per query that are processed at a time: about as many as the 9 runs of 3D or the 3 runs of 2D need."""
         return 64 if len(self.sources.axes) == 3 else 16
 
     @property
     def block_size(self) -> int:
         torus = self.candidates.torus
-        runs = 1 if torus is None or torus.images.nearest else torus.images.total  # at least so many of each query
+        runs = 1 if torus is None or torus.images.nearest else torus.images.total  # every query has at least so many
         return min(_BLOCK_WORDS // self.words, max(_BLOCK_SLOTS // max(self.capacity, runs), 1), self.queries.ids.size)
 
     @property
@@ -284,13 +213,24 @@ class _Engine(NamedTuple):
         return -(-self.queries.ids.size // self.block_size)
 
     def block(self, b: Array) -> tuple[Array, Array]:
-        """Return the places and ids of block b's queries; the last block reaches back, to be as long as the others."""
+        """Return positions and ids of block b's queries; the last block overlaps, so that all have one length."""
         first = jnp.minimum(b * self.block_size, self.queries.ids.size - self.block_size)
         place = first + lax.iota(jnp.int32, self.block_size)
         return place, lax.dynamic_slice_in_dim(self.queries.ids, first, self.block_size)
 
-    def all_passes(self, add_pass: Callable[[Array, State], State], state: State) -> State:
-        """Go through the sources as often as the candidates ask for."""
+    def fold_words(self, place: Array, add: Callable[["_HitWords", State], State], state: State) -> State:
+        """Return the state after state = add(words, state) for each chunk of candidates of the queries at these positions."""
+
+        def add_pass(which: Array, state: State) -> State:
+            table = self.word_table(place, which)
+
+            def add_chunk(carried: tuple[Array, State]) -> tuple[Array, State]:
+                chunk, state = carried
+                state = add(self.hit_words(place, table, chunk), state)
+                return chunk + 1, state
+
+            return lax.while_loop(lambda carried: carried[0] * self.words < table.longest, add_chunk, (jnp.int32(0), state))[1]
+
         passes = self.candidates.passes
         return add_pass(jnp.int32(0), state) if passes is None else lax.fori_loop(0, passes, add_pass, state)
 
@@ -304,7 +244,7 @@ class _Engine(NamedTuple):
         """Test one chunk of words per query."""
         first, stop, image = self._locate_words(table, chunk)
         query = [x.at[place].get(mode="promise_in_bounds")[:, None] for x in self.queries.axes]
-        if image is not None and self.candidates.torus is not None:  # the query goes to where it meets the image at home
+        if image is not None and self.candidates.torus is not None:  # translate the query instead of the image
             query = [q - t[image] for q, t in zip(query, self.candidates.torus.translations.T, strict=True)]
         first, image, packed = lax.optimization_barrier((first, image, self._test(first, stop, image, query, place)))
         hits, doubtful = packed & np.uint32(0xFFFF), packed >> np.uint32(LANES)
@@ -319,9 +259,9 @@ class _Engine(NamedTuple):
                 run = jax.vmap(functools.partial(jnp.searchsorted, side="right"))(table.before, word).astype(jnp.int32) - 1
             else:
                 run = jnp.sum(word[..., None] >= table.before[:, None], axis=2, dtype=jnp.int32) - 1
-            first = _take(table.start, run) + LANES * (word - _take(table.before, run))
-            stop, image = _take(table.stop, run), None if table.image is None else _take(table.image, run)
-        else:  # a chain of selections: half the time of looking up
+            first = take(table.start, run) + LANES * (word - take(table.before, run))
+            stop, image = take(table.stop, run), None if table.image is None else take(table.image, run)
+        else:  # a chain of selections takes half the time of a lookup
             first, stop = jnp.zeros_like(word), jnp.zeros_like(word)
             image = None if table.image is None else jnp.zeros_like(word)
             for r in range(runs):
@@ -334,15 +274,15 @@ class _Engine(NamedTuple):
         return jnp.minimum(first, self.sources.ids.size - LANES), stop, image
 
     def _test(self, first: Array, stop: Array, image: Array | None, query: list[Array], place: Array) -> Array:
-        """Compare 16 candidates per word with the cutoff in working precision: hits low, doubtful ones high."""
+        """Compare 16 candidates per word with the cutoff in working precision: low half hits, high half doubtful ones."""
         lane = lax.iota(jnp.int32, LANES)
         candidate = first[..., None] + lane[None, None]
         allowed = (candidate < stop[..., None]) & self._passes_filter(first, candidate, image, place)
-        difference = [_windows(x, first) - q[..., None] for x, q in zip(self.sources.axes, query, strict=True)]
+        difference = [windows(x, first) - q[..., None] for x, q in zip(self.sources.axes, query, strict=True)]
         square = squared_distance(difference, self.cutoff)
         own, others = self.queries.radii, self.sources.radii
         own = None if own is None else own.at[place].get(mode="promise_in_bounds")[:, None, None]
-        inside, outside = self._bounds(own, None if others is None else _windows(others, first))
+        inside, outside = self._bounds(own, None if others is None else windows(others, first))
         surely = square < inside
         doubtful = (square <= outside) & ~surely
         bit = np.uint32(1) << lane.astype(jnp.uint32)
@@ -356,14 +296,14 @@ class _Engine(NamedTuple):
         return step_one_bounds(self.cutoff, radii, slack)
 
     def _passes_filter(self, first: Array, candidate: Array, image: Array | None, place: Array) -> Array:
-        """Say which candidates [b, words, 16] may be neighbors apart from their distance."""
+        """Say which candidates [b, words, 16] pass the filter, whatever their distance."""
         if self.keep.later_only:
             own = self.queries.ids.at[place].get(mode="promise_in_bounds")[:, None]
             later = own + int(self.keep.drop_self)
-            if image is not None and self.candidates.torus is not None:  # of its own images, those in the forward half of space
+            if image is not None and self.candidates.torus is not None:  # of its own images, keep the forward half
                 home = self.candidates.torus.images.home
                 later = jnp.where(image > home, own, jnp.where(image < home, own + 1, later))
-            return _windows(self.sources.ids, first) >= later[..., None]
+            return windows(self.sources.ids, first) >= later[..., None]
         if not self.keep.drop_self:
             return jnp.ones((), bool)
         others = candidate != place[:, None, None]
@@ -372,16 +312,16 @@ class _Engine(NamedTuple):
         return others | (image != self.candidates.torus.images.home)[..., None]
 
     def _decide_doubtful(self, doubtful: Array, first: Array, image: Array | None, place: Array) -> Array:
-        """Decide the doubtful candidates of each row exactly, 32 a round: [b, words] uint32 bits of those that are pairs."""
-        slots = lax.iota(jnp.int32, _DOUBTFUL)
-        until = jnp.cumsum(_bit_counts(doubtful), axis=1, dtype=jnp.int32)
-        before, total = until - _bit_counts(doubtful), until[:, -1]
+        """Decide the doubtful candidates of each row exactly, 32 per round: bits of those that are pairs, [b, words] uint32."""
+        slots = lax.iota(jnp.int32, VERDICTS)
+        until = jnp.cumsum(bit_counts(doubtful), axis=1, dtype=jnp.int32)
+        before, total = until - bit_counts(doubtful), until[:, -1]
         most = jnp.max(total)
 
         def decide_round(state: tuple[Array, Array]) -> tuple[Array, Array]:
             done, hits = state
-            word, bit = _nth_bits(doubtful, jnp.broadcast_to(slots + done, (first.shape[0], _DOUBTFUL)))
-            candidate = _take(first, word) + bit
+            word, bit = nth_bits(doubtful, jnp.broadcast_to(slots + done, (first.shape[0], VERDICTS)))
+            candidate = take(first, word) + bit
 
             def points(at: Array | None, word: Array = word, candidate: Array = candidate) -> Pair:
                 rows = jnp.broadcast_to(lax.iota(jnp.int32, first.shape[0])[:, None], candidate.shape)
@@ -391,13 +331,13 @@ class _Engine(NamedTuple):
 
             pair = refine((slots + done)[None] < total[:, None], points, self.cutoff)
             verdict = jnp.sum(jnp.where(pair, np.uint32(1) << slots.astype(jnp.uint32), np.uint32(0)), 1, dtype=jnp.uint32)
-            return done + _DOUBTFUL, hits | _deposit(verdict[:, None], doubtful, before - done)
+            return done + VERDICTS, hits | deposit(verdict[:, None], doubtful, before - done)
 
         start = (jnp.int32(0), jnp.zeros_like(doubtful))
         return lax.while_loop(lambda state: state[0] < most, decide_round, start)[1]
 
     def _pair(self, place: Array, candidate: Array, image: Array | None) -> Pair:
-        """Return the points, as they were given, of queries and candidates at these places."""
+        """Return the given (not wrapped) points of queries and candidates at these positions."""
         torus, radii = self.candidates.torus, None
         if isinstance(self.cutoff, Cutoffs):
             own, others = self.queries.radii, self.sources.radii
@@ -418,62 +358,6 @@ class _Engine(NamedTuple):
 
 
 def _pad(sources: Points) -> Points:
-    """Lengthen the sources so that a window of 16 never reaches past the end; masks keep the padding out."""
+    """Pad the sources so that a window of 16 never reaches past the end; masks exclude the padding."""
     radii = None if sources.radii is None else jnp.pad(sources.radii, (0, LANES))
     return Points([jnp.pad(x, (0, LANES)) for x in sources.axes], jnp.pad(sources.ids, (0, LANES)), radii)
-
-
-def _windows(x: Array, first: Array) -> Array:
-    """Gather x[first : first + 16] for every word: contiguous slices, several times faster than element by element."""
-    dimensions = lax.GatherDimensionNumbers(offset_dims=(2,), collapsed_slice_dims=(), start_index_map=(0,))
-    return lax.gather(x, first[..., None], dimensions, (LANES,), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
-
-
-def _bit_counts(words: Array) -> Array:
-    return lax.population_count(words).astype(jnp.int32)
-
-
-def _take(rows: Array, column: Array) -> Array:
-    """Return rows[i, column[i, k]] for [b, w] rows and [b, k] columns."""
-    flat = lax.broadcasted_iota(jnp.int32, column.shape, 0) * rows.shape[1] + column
-    return rows.reshape(-1).at[flat].get(mode="promise_in_bounds")
-
-
-def _nth_bits(words: Array, ordinal: Array) -> tuple[Array, Array]:
-    """Find the ordinal-th set bit of each row of words: its word and bit [b, k].
-
-    Ordinals outside [0, total) give some valid word and bit: the caller masks them.
-    """
-    count = _bit_counts(words)
-    count, until = lax.optimization_barrier((count, jnp.cumsum(count, axis=1, dtype=jnp.int32)))
-    word = jnp.minimum(_count_not_above(until, ordinal), words.shape[1] - 1)
-    within = ordinal - (_take(until, word) - _take(count, word))
-    return word, _nth_bit(_take(words, word), within)
-
-
-def _count_not_above(ascending: Array, value: Array) -> Array:
-    """Count the entries of each row [b, w] that are <= value [b, k]; half the time of a binary search up to w = 128."""
-    reached = ((ascending[:, i : i + 1] <= value).astype(jnp.int32) for i in range(ascending.shape[1]))
-    return functools.reduce(jnp.add, reached)
-
-
-def _nth_bit(word: Array, ordinal: Array) -> Array:
-    """Return the position of the ordinal-th set bit of 16, by halving."""
-    position = jnp.zeros_like(ordinal)
-    for width in (8, 4, 2, 1):
-        below = _bit_counts((word >> position.astype(jnp.uint32)) & np.uint32((1 << width) - 1))
-        skip = ordinal >= below
-        ordinal = jnp.where(skip, ordinal - below, ordinal)
-        position = jnp.where(skip, position + width, position)
-    return position
-
-
-def _deposit(verdict: Array, mask: Array, before: Array) -> Array:
-    """Spread verdict bits over the set bits of each mask: set bit k of a word takes verdict bit before + k, if below 32."""
-    result = jnp.zeros_like(mask)
-    for lane in range(LANES):
-        ordinal = before + _bit_counts(mask & np.uint32((1 << lane) - 1))
-        seen = (ordinal >= 0) & (ordinal < _DOUBTFUL)
-        bit = (verdict >> jnp.clip(ordinal, 0, _DOUBTFUL - 1).astype(jnp.uint32)) & (mask >> np.uint32(lane)) & np.uint32(1)
-        result = result | jnp.where(seen, bit << np.uint32(lane), np.uint32(0))
-    return result

@@ -103,7 +103,7 @@ def sort_by_levels(along: Array, axes: Axes, cutoffs: Cutoffs, n: int, own: bool
 def level_runs(
     levels: Levels, cutoffs: Cutoffs, images: Images | None
 ) -> Callable[[Array, Array], tuple[Array, Array, Array | None]]:
-    """Return a function that finds the candidate runs of some queries in one group, in the form of `jfrnn._engine.runs.Runs`."""
+    """Return a function that finds the candidate runs of queries in one group, as `jfrnn._engine.candidates.Runs`."""
     dim, keys, largest = len(levels.widths), levels.keys, levels.largest
     query_radii = None if cutoffs.queries is None else cutoffs.queries[levels.query_order]
 

@@ -1,0 +1,58 @@
+"""Candidates: sources and queries in the order in which array programs visit them, and the runs that each query has to test."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from jax import Array
+
+from jfrnn._geometry import Images
+
+# (positions of queries [b] in their order, number of the pass over the sources) -> starts, ends and image codes of runs [b, r]
+Runs = Callable[[Array, Array], tuple[Array, Array, Array | None]]
+
+
+class Points(NamedTuple):
+    """Particles in the order in which the engine visits them.
+
+    Attributes:
+        axes: d coordinate arrays [n].
+        ids: [n] int32, their indices.
+        radii: [n] cutoffs per particle, or None with one cutoff or if the rule does not use them.
+    """
+
+    axes: list[Array]
+    ids: Array
+    radii: Array | None = None
+
+
+class Torus(NamedTuple):
+    """What a lattice adds: periodic images of the sources, which wrapped coordinates decide up to doubtful pairs.
+
+    Attributes:
+        images: The images that the search considers. Static.
+        translations: [images, d] lattice translation of each image, up to rounding.
+        matrix: [d, d] lattice vectors as given.
+        raw: [n, d] sources and [m, d] queries as given.
+        turns: [n, d] and [m, d] whole floats, the lattice vectors that wrapping subtracted.
+        slack: [] bound on the error of a component of a displacement of wrapped coordinates.
+    """
+
+    images: Images
+    translations: Array
+    matrix: Array
+    raw: tuple[Array, Array]
+    turns: tuple[Array, Array]
+    slack: Array
+
+
+class Candidates(NamedTuple):
+    """Sources and queries in the order in which they are visited, and a function that finds the candidates of queries.
+
+    `passes` [] int32 is the number of passes over the sources; None for one.
+    """
+
+    sources: Points
+    queries: Points
+    runs: Runs
+    torus: Torus | None
+    passes: Array | None = None
