@@ -8,18 +8,3 @@ from jfrnn._search.neighbor_list import ROWS_ARE_WHOLE, NeighborList
 from jfrnn._search.problem import check_problem
 from jfrnn._search.search import count, search
 from jfrnn._search.verlet import has_moved_too_far, list_radius
-
-__all__ = [
-    "MOST_PAIRS",
-    "ROWS_ARE_WHOLE",
-    "NeighborList",
-    "check_problem",
-    "count",
-    "has_moved_too_far",
-    "list_radius",
-    "norms",
-    "round_capacity",
-    "run_chunk",
-    "saturating_add",
-    "search",
-]

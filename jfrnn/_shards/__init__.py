@@ -8,20 +8,3 @@ from jfrnn._shards.particles import Particles, Required, Sizes
 from jfrnn._shards.scatter import collect, scatter
 from jfrnn._shards.sharded_list import Neighbors
 from jfrnn._shards.verbs import count, pair_sum, search
-
-__all__ = [
-    "Halo",
-    "Neighbors",
-    "Particles",
-    "Required",
-    "Sizes",
-    "collect",
-    "connect",
-    "count",
-    "halo",
-    "migrate",
-    "on_each",
-    "pair_sum",
-    "scatter",
-    "search",
-]

@@ -1,7 +1,3 @@
 """Sums over pairs, their derivatives, and the translation of the summand to native code."""
 
 from jfrnn._sums.verb import pair_sum
-
-__all__ = [
-    "pair_sum",
-]

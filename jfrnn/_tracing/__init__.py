@@ -5,25 +5,3 @@ from jfrnn._tracing.kinds import Aval, Given, Internal, Tree
 from jfrnn._tracing.manual import call_apart, result_aval, unvarying_types, vary, varying_axes
 from jfrnn._tracing.modes import gather, leading_axes, own_transfers
 from jfrnn._tracing.programs import at_once, compile_program, make_on_host, on_device
-
-__all__ = [
-    "Aval",
-    "Given",
-    "Internal",
-    "Tree",
-    "any_of_rows",
-    "at_once",
-    "call_apart",
-    "compile_program",
-    "first_set",
-    "gather",
-    "leading_axes",
-    "make_on_host",
-    "on_device",
-    "own_transfers",
-    "result_aval",
-    "set_places",
-    "unvarying_types",
-    "vary",
-    "varying_axes",
-]

@@ -4,12 +4,3 @@ from jfrnn._triangles.engines import TRIANGLE_BACKENDS, TRIANGLE_ENGINES, fastes
 from jfrnn._triangles.programs import find_triangles
 from jfrnn._triangles.triangle_list import TriangleList
 from jfrnn._triangles.verb import search_triangles
-
-__all__ = [
-    "TRIANGLE_BACKENDS",
-    "TRIANGLE_ENGINES",
-    "TriangleList",
-    "fastest_of",
-    "find_triangles",
-    "search_triangles",
-]
