@@ -1,30 +1,11 @@
 """The engines, each a way to find the same pairs, and how their kernels are launched."""
 
-from jfrnn._engine.auto import (
-    ARRAYS,
-    ENGINES,
-    WARP,
-    check_backend,
-    choose_engine,
-    default_platform,
-    fastest_engine,
-    platform_of,
-)
+from jfrnn._engine.auto import ARRAYS, ENGINES, WARP, check_backend, choose_engine, default_platform, fastest_engine, platform_of
 from jfrnn._engine.cores import ask_for_huge_pages, on_every_core, on_one_core
 from jfrnn._engine.cuda import Command
 from jfrnn._engine.launch import Kernel, kernel
 from jfrnn._engine.operands import MOST_IN_BOX, as_float
-from jfrnn._engine.problem import (
-    Engine,
-    Filter,
-    Inputs,
-    Kind,
-    Options,
-    Search,
-    hide_inactive,
-    is_decidable,
-    prepare_search,
-)
+from jfrnn._engine.problem import Engine, Filter, Inputs, Kind, Options, Search, hide_inactive, is_decidable, prepare_search
 from jfrnn._engine.rows import count_rows, fold_pairs, list_rows
 from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit
 from jfrnn._engine.serving import on_cpu, on_cuda

@@ -63,13 +63,7 @@ class Problem:
         return None if largest is None else list_radius(largest, self.skin, self.dtype)
 
     def inputs(
-        self,
-        sources: Array,
-        queries: Array | None,
-        active: Array | None,
-        box: Box | None,
-        radii: Radii | None,
-        batch: Batch | None,
+        self, sources: Array, queries: Array | None, active: Array | None, box: Box | None, radii: Radii | None, batch: Batch | None
     ) -> Inputs:
         """Return the operands of this search for these particles."""
         if radii is not None:
@@ -106,10 +100,7 @@ def check_problem(
             if check_flag(name, value):
                 raise ValueError(f"{name}=True pairs particles with themselves or each other: it cannot be used with queries.")
     active = None if active is None else check_active(active, sources)
-    keep = Filter(
-        drop_self=queries is None and not check_flag("include_self", include_self),
-        later_only=check_flag("half", half),
-    )
+    keep = Filter(drop_self=queries is None and not check_flag("include_self", include_self), later_only=check_flag("half", half))
     dtype = np.dtype(sources.dtype)
     radii, closed = check_radii(cutoff, radius_rule, sources, queries), check_flag("closed", closed)
     if radii is None:

@@ -5,11 +5,7 @@ from jax import Array
 from jax.core import Tracer
 
 from jfrnn._engine import Inputs, Options, count_rows
-from jfrnn._geometry import (
-    Box,
-    check_capacity,
-    check_slack,
-)
+from jfrnn._geometry import Box, check_capacity, check_slack
 from jfrnn._search.making import count_capacity, find_fields
 from jfrnn._search.neighbor_list import NeighborList
 from jfrnn._search.problem import check_problem

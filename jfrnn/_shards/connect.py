@@ -10,11 +10,7 @@ _PATIENCE = 20.0
 
 
 def connect(
-    address: str | None = None,
-    processes: int | None = None,
-    process: int | None = None,
-    *,
-    patience: float = _PATIENCE,
+    address: str | None = None, processes: int | None = None, process: int | None = None, *, patience: float = _PATIENCE
 ) -> None:
     """Connect the processes of a run, before anything else asks JAX for a device; a single process need not call this.
 

@@ -205,10 +205,7 @@ def spec_of(particles: Particles) -> Particles:
     """Return the partition specs of the particles' arrays, in the same structure."""
     rows, same = of_shards(particles.mesh), PartitionSpec()
     return dataclasses.replace(
-        jax.tree.map(lambda _: same, particles),
-        positions=rows,
-        ids=rows,
-        values=jax.tree.map(lambda _: rows, particles.values),
+        jax.tree.map(lambda _: same, particles), positions=rows, ids=rows, values=jax.tree.map(lambda _: rows, particles.values)
     )
 
 

@@ -181,12 +181,7 @@ def extremes(
 
 
 def _launch(
-    search: Search,
-    options: Options,
-    plan: Plan,
-    operands: Groups,
-    compensated: bool,
-    extremes: bool = False,
+    search: Search, options: Options, plan: Plan, operands: Groups, compensated: bool, extremes: bool = False
 ) -> tuple[Array, Array, Array]:
     """Run the kernel for a prepared search with the operands that a plan needs."""
     sources, torus = search.sources, search.torus

@@ -52,13 +52,7 @@ def pairs_of_search(inputs: Inputs, options: Options) -> Pairs:
 
 
 def pairs_of_list(
-    nbrs: NeighborList,
-    positions: Array,
-    cutoff: Given,
-    queries: Array | None,
-    box: Box | None,
-    given: dict[str, bool],
-    full: bool,
+    nbrs: NeighborList, positions: Array, cutoff: Given, queries: Array | None, box: Box | None, given: dict[str, bool], full: bool
 ) -> Pairs:
     """Return the pairs of a list, after checking that no argument in `given` contradicts it; `full` refuses half lists."""
     if not isinstance(nbrs, NeighborList):
@@ -199,11 +193,7 @@ def _numbers(like: jax.ShapeDtypeStruct, known: bool) -> Array:
 
 
 def _summand(
-    fn: Callable[[Array, Any, Any], Any],
-    pairs: Pairs,
-    mine: Tree,
-    theirs: Tree,
-    symmetry: str | None,
+    fn: Callable[[Array, Any, Any], Any], pairs: Pairs, mine: Tree, theirs: Tree, symmetry: str | None
 ) -> tuple[Groups, Summand, list]:
     """Return the operands, fn as a function of one pair of them, and a list that receives the structure of fn's result."""
     sources, rows, lattice = pairs.sources, pairs.rows, pairs.lattice

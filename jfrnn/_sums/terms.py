@@ -89,11 +89,7 @@ def _jaxpr_of(summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct) -
 
 
 def trace(
-    summand: Summand,
-    operands: Groups,
-    shift: jax.ShapeDtypeStruct,
-    labels: Labels,
-    owner: object,
+    summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct, labels: Labels, owner: object
 ) -> tuple[Term, Groups, tuple[Array, ...]]:
     """Trace a summand that may close over arrays; return its term, the operands that it needs, and the closed-over arrays.
 

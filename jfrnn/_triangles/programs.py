@@ -24,13 +24,7 @@ def count_slots(points: Array, vertices: Array, faces: Array, cutoff: float, eng
 
 
 def find_fields(
-    points: Array,
-    vertices: Array,
-    faces: Array,
-    cells: Wall | None,
-    cutoff: float,
-    engine: TriangleEngine,
-    capacity: int | None,
+    points: Array, vertices: Array, faces: Array, cells: Wall | None, cutoff: float, engine: TriangleEngine, capacity: int | None
 ) -> dict[str, Any]:
     """Return the list's fields that come from data, or only counts if capacity=None. `cells`: an earlier list's sorted wall."""
     radius = make_cutoff(cutoff, np.dtype(points.dtype), closed=False)
@@ -41,13 +35,7 @@ def find_fields(
 
 @functools.partial(compile_program, static_argnames=("engine", "capacity"))
 def find_triangles(
-    points: Array,
-    vertices: Array,
-    faces: Array,
-    cells: Wall | None,
-    cutoff: Cutoff,
-    engine: TriangleEngine,
-    capacity: int | None,
+    points: Array, vertices: Array, faces: Array, cells: Wall | None, cutoff: Cutoff, engine: TriangleEngine, capacity: int | None
 ) -> dict[str, Any]:
     """List or count triangles: the compiled program of a search.
 
