@@ -17,8 +17,6 @@ from jfrnn._search import round_capacity
 from jfrnn._triangles import warp as _triangles_warp
 from jfrnn._triangles.cells import gather_corners
 
-__all__ = ["LAYERS", "free", "lattice", "load_warp", "round_capacity", "taylor_green_velocity", "triangle_query"]
-
 lattice, taylor_green_velocity, free, LAYERS = (
     _fluid.lattice,
     _fluid_flows.taylor_green_velocity,

@@ -5,6 +5,4 @@ from functools import partial
 from experiments.methods._ann import SANE, read
 from experiments.methods._ann import prepare as prepare_tree
 
-__all__ = ["prepare", "read"]
-
 prepare = partial(prepare_tree, tree="bd", processing=SANE)

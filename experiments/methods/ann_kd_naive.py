@@ -9,7 +9,5 @@ from functools import partial
 from experiments.methods._ann import NAIVE, read
 from experiments.methods._ann import prepare as prepare_tree
 
-__all__ = ["MAX_POINTS", "prepare", "read"]
-
 MAX_POINTS = 40_000
 prepare = partial(prepare_tree, tree="kd", processing=NAIVE)

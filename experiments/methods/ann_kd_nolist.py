@@ -6,6 +6,4 @@ from experiments.methods._ann import NO_LIST
 from experiments.methods._ann import prepare as prepare_tree
 from experiments.methods._ann import read_counts as read
 
-__all__ = ["prepare", "read"]
-
 prepare = partial(prepare_tree, tree="kd", processing=NO_LIST)

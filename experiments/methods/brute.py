@@ -4,8 +4,6 @@ from functools import partial
 
 from experiments.methods._padded import allocate_backend, plan_backend, prepare_backend, read
 
-__all__ = ["MAX_POINTS", "allocate", "plan", "prepare", "read"]
-
 MAX_POINTS = 20_000
 allocate = partial(allocate_backend, backend="brute")
 prepare = partial(prepare_backend, backend="brute")

@@ -2,11 +2,9 @@
 
 from functools import partial
 
-import warp as wp  # noqa: F401 - without it this method is missing, which is no failure
+import warp as wp  # without it this method is missing, which is no failure
 
 from experiments.methods._padded import allocate_backend, plan_backend, prepare_backend, read
-
-__all__ = ["allocate", "plan", "prepare", "read"]
 
 allocate = partial(allocate_backend, backend="hashgrid")
 prepare = partial(prepare_backend, backend="hashgrid", kernels=True)

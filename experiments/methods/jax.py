@@ -4,8 +4,6 @@ from functools import partial
 
 from experiments.methods._padded import allocate_backend, plan_backend, prepare_backend, read
 
-__all__ = ["allocate", "plan", "prepare", "read"]
-
 allocate = partial(allocate_backend, backend="jax")
 prepare = partial(prepare_backend, backend="jax")
 plan = partial(plan_backend, backend="jax")

@@ -2,5 +2,3 @@
 
 from experiments.methods._nanoflann import prepare
 from experiments.methods._nanoflann import read_pairs as read
-
-__all__ = ["prepare", "read"]

@@ -5,6 +5,4 @@ from functools import partial
 from experiments.methods._nanoflann import STEPS, read
 from experiments.methods._nanoflann import follow as follow_tree
 
-__all__ = ["STEPS", "follow", "read"]
-
 follow = partial(follow_tree, dynamic=False)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-import warp as wp  # noqa: F401 - without it this method is missing, which is no failure
+import warp as wp  # without it this method is missing, which is no failure
 
 import jfrnn
 from experiments.methods import Found

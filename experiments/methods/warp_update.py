@@ -2,12 +2,10 @@
 
 from functools import partial
 
-import warp as wp  # noqa: F401 - without it this method is missing, which is no failure
+import warp as wp  # without it this method is missing, which is no failure
 
 from experiments.methods._moving import SKIN, STEPS, follow_list, plan_list
 from experiments.methods._moving import read_list as read
-
-__all__ = ["STEPS", "follow", "plan", "read"]
 
 follow = partial(follow_list, skin=SKIN)
 plan = partial(plan_list, skin=SKIN)
