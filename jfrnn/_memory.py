@@ -1,4 +1,4 @@
-"""What a search or a pair sum will take of the memory, known from shapes alone: `memory_plan`."""
+"""The memory that a search or a pair sum will take, known from shapes alone: `memory_plan`."""
 
 import contextlib
 import dataclasses
@@ -29,21 +29,21 @@ from jfrnn._sums import pair_sum
 from jfrnn._tracing import Tree
 from jfrnn._triangles import TRIANGLE_BACKENDS, TRIANGLE_ENGINES, fastest_of, find_triangles
 
-Device = Any  # jax.Device, which type checkers take for a variable
-MemoryStats = Any  # what XLA reports of a compiled program
+Device = Any  # jax.Device, which type checkers treat as a variable
+MemoryStats = Any  # XLA's memory analysis of a compiled program
 
 
 @dataclasses.dataclass(frozen=True)
 class MemoryPlan:
-    """Say how many bytes one search, count or pair sum takes beside the positions and values that it is given.
+    """The bytes that one search, count or pair sum takes in addition to its given positions and values.
 
     Attributes:
         list_bytes: The result of a search [B]: 4 per slot, 4 per row for its count, 8 for `status` and `required`; with a skin,
-            copies of positions and queries, and 4.
-        scratch_bytes: What is needed besides while it runs [B].
+            also copies of positions and queries, and 4.
+        scratch_bytes: Memory needed in addition while it runs [B].
         backend: The engine, never "auto".
-        sums_bytes: The results of a pair sum, with a gradient that one too [B].
-        counts_bytes: The result of `count`, 4 per row [B]; None: the plan is not that of a count.
+        sums_bytes: The results of a pair sum, and of its gradient if planned [B].
+        counts_bytes: The result of `count`, 4 per row [B]; None if the plan is not that of a count.
     """
 
     list_bytes: int
@@ -63,7 +63,7 @@ class MemoryPlan:
         return self.result_bytes + self.scratch_bytes
 
     def __str__(self) -> str:
-        """Return a line each for the results, scratch and total, in MB of 10^6 B."""
+        """Return one line each for the results, scratch and total, in MB of 10^6 B."""
         done, given, result = ("search", "positions", "list") if self.list_bytes else ("pair sum", "positions and values", "sums")
         if self.counts_bytes is not None:
             done, given, result = "count", "positions", "counts"
@@ -88,33 +88,33 @@ def memory_plan(
     backend: str = "auto",
     platform: str | None = None,
 ) -> MemoryPlan:
-    """Say what a `search`, `count`, `pair_sum` (fn) or `search_triangles` (faces) of these shapes will take of the memory.
+    """Predict the memory of a `search`, `count`, `pair_sum` (fn) or `search_triangles` (faces) of these shapes.
 
-    Nothing depends on where the particles are. "warp" and "hashgrid": the sizes of the arrays that they ask for, known for a
-    platform that is elsewhere too. "jax" and "brute": what XLA reports of the program that it compiles for these shapes, which
-    takes seconds; not in it are the 32 B per point that a sort of "jax" takes for a moment on CPU. Pair sums are compiled, too,
-    with "warp" in a tenth of a second. That one takes the scratch of its search, two copies of the numbers that fn reads of each j,
-    one of those of each i (coordinates apart), and the sums; in a gradient, two sums for each coordinate.
+    Nothing depends on where the particles are. For "warp" and "hashgrid" the plan adds the sizes of the arrays that they allocate,
+    and works for platforms that this machine lacks. For "jax" and "brute" it is XLA's analysis of the program, compiled for these
+    shapes, which takes seconds; it excludes the 32 B per point that a sort of "jax" takes for a moment on CPU. Pair sums are
+    compiled too, with "warp" in a tenth of a second: they take the scratch of the search, two copies of the numbers that fn reads
+    of each j, one of those of each i (coordinates excluded), and the sums; in a gradient, two sums per coordinate.
 
-    Not in the plan is what lists of some scenes keep besides: of a batch 4 B per particle and query, of cutoffs per particle a
-    float each (with a skin two), of a box where images must be told apart 1 B per slot (2 B from 257 images on) and 4 B per
+    The plan excludes what lists of some scenes keep in addition: for a batch 4 B per particle and query, for cutoffs per particle a
+    float each (with a skin two), for a box whose images must be told apart 1 B per slot (2 B from 257 images on) and 4 B per
     particle and query.
 
     Args:
         n: Number of particles, from 0 to 2^31 - 32.
         cutoff: Interaction radius [length], checked as in `search`; it does not change the bytes.
-        capacity: Slots per row; None: no list is made, the plan is that of `count` or of a pair sum.
+        capacity: Slots per row; None: no list is made, and the plan is that of `count` or of a pair sum.
         dim: 2 or 3.
-        dtype: Of the positions, float32 or float64.
+        dtype: Dtype of the positions, float32 or float64.
         queries: Number of separate queries; None: the particles themselves are the queries.
         skin: As in `search`; only whether there is one changes the bytes.
-        fn: As in `pair_sum`, which is planned then.
-        values: Of it, a pytree of arrays or of their shapes (`jax.ShapeDtypeStruct`), [n, ...].
-        gradient: The plan is that of the sums and of a gradient in the positions, of a function of all sums of floats.
-        faces: Triangles of a wall, in 2D segments: the plan is that of `search_triangles`, compiled; the cells and a copy of the
-            wall, of faces / 2 + 2 vertices, are part of the list.
+        fn: As in `pair_sum`, which is then planned.
+        values: As in `pair_sum`, a pytree of arrays or of their shapes (`jax.ShapeDtypeStruct`), [n, ...].
+        gradient: Plan the sums together with a gradient in the positions, of a function of all sums of floats.
+        faces: Number of triangles of a wall, in 2D segments: `search_triangles` is then planned, by compilation; the cells and a
+            copy of the wall, of faces / 2 + 2 vertices, are part of the list.
         backend: As in `search`, `pair_sum` or `search_triangles`.
-        platform: JAX platform, such as "cpu" or "gpu"; default: the one on which JAX makes arrays now.
+        platform: JAX platform, such as "cpu" or "gpu"; default: the one on which JAX places arrays now.
 
     Returns:
         A `MemoryPlan`; `print` it for a table in MB. "hashgrid" keeps the grid itself, most of its scratch, for the next search.
@@ -122,8 +122,8 @@ def memory_plan(
     Raises:
         TypeError, ValueError: an argument is of the wrong kind or range, or `pair_sum` would raise it.
         ImportError: "warp" or "hashgrid", and Warp is not installed.
-        RuntimeError: "auto", "jax", "brute" or a pair sum, and JAX does not have the platform here; "warp" or "hashgrid", and it
-            is none of "cpu", "gpu" and "cuda".
+        RuntimeError: "auto", "jax", "brute" or a pair sum, and JAX does not have the platform here; "warp" or "hashgrid", and it is
+            none of "cpu", "gpu" and "cuda".
 
     >>> import jfrnn
     >>> print(jfrnn.memory_plan(1_000_000, 0.1, 64, backend="warp", platform="gpu"))
@@ -174,7 +174,7 @@ def _device_of(platform: str) -> Device:
 
 
 def _compiled_scratch(points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff, engine: Engine, capacity: int | None) -> int:
-    """Compile the search, or the count, for these shapes, and return what XLA says of its temporary arrays [B]."""
+    """Compile the search, or the count, for these shapes, and return XLA's size of its temporary arrays [B]."""
     options = Options(Filter(drop_self=points[1] is None, later_only=False), engine, closed=False)
     inputs: Any = Inputs(points[0], points[1], None, None, cutoff)  # pyright: ignore[reportArgumentType] (shapes of arrays)
     lowered = count_rows.lower(inputs, options) if capacity is None else list_rows.lower(inputs, options, capacity)
@@ -184,7 +184,7 @@ def _compiled_scratch(points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff,
 def _plan_of_triangles(
     sizes: tuple[int, int, int, int], dtype: np.dtype, cutoff: Cutoff, engine: str, device: Device
 ) -> MemoryPlan:
-    """Compile a search of n particles for faces, in dim dimensions, with this capacity."""
+    """Compile a search of n particles for triangles, in dim dimensions, with this capacity."""
     n, faces, dim, capacity = sizes
     at = SingleDeviceSharding(device)
     if engine not in TRIANGLE_BACKENDS:
@@ -194,7 +194,7 @@ def _plan_of_triangles(
     points, corners = (jax.ShapeDtypeStruct((size, dim), dtype, sharding=at) for size in (n, faces // 2 + 2))
     named: Any = jax.ShapeDtypeStruct((faces, dim), np.int32, sharding=at)
     analysis = _analysis(find_triangles.lower(points, corners, named, None, cutoff, chosen, capacity))
-    closed = 1  # byte: whether the wall is, which a program of its own finds out
+    closed = 1  # one byte for `closed`, which a separate program computes
     return MemoryPlan(int(analysis.output_size_in_bytes) + closed, int(analysis.temp_size_in_bytes), chosen.name)
 
 
@@ -214,7 +214,7 @@ def _plan_of_sum(
     engine: str,
     device: Device,
 ) -> MemoryPlan:
-    """Compile a pair sum for sources and queries of these shapes, with the engine that "auto" stands for."""
+    """Compile a pair sum for sources and queries of these shapes, with the engine that "auto" means."""
 
     def program(x: Array, queries: Array | None, values: Tree, *, backend: str) -> Tree:
         def loss(x: Array) -> Tree:
@@ -233,6 +233,6 @@ def _plan_of_sum(
         if engine != "auto":
             return plan(engine)
         if fastest_engine(device.platform, 1).translates:
-            with contextlib.suppress(TypeError, ValueError, NotImplementedError):  # "jax" takes it, or says what is wrong
+            with contextlib.suppress(TypeError, ValueError, NotImplementedError):  # then "jax" sums it, or explains the error
                 return plan("warp")
         return plan("jax")

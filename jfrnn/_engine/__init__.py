@@ -1,4 +1,4 @@
-"""The engines, each a way to find the same pairs, and how their kernels are launched."""
+"""The engines, each a way to find the same pairs, and how XLA calls their kernels."""
 
 from jfrnn._engine.auto import ARRAYS, ENGINES, WARP, check_backend, choose_engine, default_platform, fastest_engine, platform_of
 from jfrnn._engine.cores import ask_for_huge_pages, on_every_core, on_one_core

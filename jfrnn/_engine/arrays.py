@@ -1,4 +1,4 @@
-"""Array programming: where the candidates of each query lie among sources that are sorted, and the engines made of it."""
+"""The array engines "jax" and "brute": where the candidates of each query lie among the sorted sources, in array programming."""
 
 import dataclasses
 
@@ -35,11 +35,11 @@ from jfrnn._geometry import (
 
 @dataclasses.dataclass(frozen=True)
 class ArrayEngine:
-    """Cells, or all sources, met by array programming, wherever XLA runs.
+    """Tests candidates from cells, or all sources, by array programming, wherever XLA runs.
 
     Attributes:
         name: "jax" or "brute".
-        by_cells: Candidates are the sources in the cells around a query, instead of all.
+        by_cells: Whether candidates are the sources in the cells around a query instead of all sources.
     """
 
     name: str
@@ -48,11 +48,11 @@ class ArrayEngine:
     translates = False
 
     def refuse(self, kind: Kind) -> str | None:
-        """Refuse nothing."""
+        """Return None: it supports every search."""
         return None
 
     def missing(self, platform: str) -> str | None:
-        """Lack nothing."""
+        """Return None: it runs on every platform."""
         return None
 
     def rows(self, search: Search, options: Options, capacity: int | None) -> Rows:
@@ -63,12 +63,12 @@ class ArrayEngine:
         return complete_rows(search, *list_neighbors(candidates, search.cutoff, options.filter, capacity), capacity)
 
     def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool) -> int | None:
-        """Leave it to the compiler."""
+        """Return None: only the compiler knows."""
         return None
 
 
 def complete_rows(search: Search, idx: Array | None, count: Array, capacity: int | None) -> Rows:
-    """Return rows with the longest of them, and bits for those that overflow and for positions that are not finite."""
+    """Return rows with the length of the longest, and status bits for overflow and non-finite positions."""
     required = jnp.max(count, initial=0)
     finite = jnp.isfinite(search.sources).all() & (True if search.queries is None else jnp.isfinite(search.queries).all())
     overflow = False if capacity is None else required > capacity
@@ -77,7 +77,7 @@ def complete_rows(search: Search, idx: Array | None, count: Array, capacity: int
 
 
 def find_candidates(search: Search, by_cells: bool) -> Candidates:
-    """Say where the candidates of a query lie, in particle order (brute force), by cells, or by cells of many sizes."""
+    """Return the candidates of each query: all sources (brute force), by cells, or by cells of many sizes."""
     sources, queries, cutoff, batch, given, _ = search
     torus = None if given is None else _torus(sources, queries, *given)
     clouds = (sources, queries) if given is None else (given[1].sources, None if queries is None else given[1].queries)
@@ -93,7 +93,7 @@ def find_candidates(search: Search, by_cells: bool) -> Candidates:
 
 
 def levels_of(search: Search) -> Levels:
-    """Sort a search with a cutoff per particle into cells of many sizes."""
+    """Sort a search with cutoffs per particle into cells of many sizes."""
     cutoff = search.cutoffs
     along, axes = _cells_along(search.sources, search.queries, cutoff, search.torus)
     systems = None if search.batch is None else search.batch.of_all
@@ -103,7 +103,7 @@ def levels_of(search: Search) -> Levels:
 def _cells_along(
     sources: Array, queries: Array | None, cutoff: Cutoff | Cutoffs, torus: tuple[Lattice, Wrapped] | None
 ) -> tuple[Array, Axes]:
-    """Return the coordinates [d, n + m] that are cut into cells, those of the queries last, and how."""
+    """Return coordinates [d, n + m] along the axes that cells divide, sources first, and how the axes are divided."""
     if torus is not None:
         return _cells_of_lattice(sources, queries, largest_radius(cutoff), *torus)
     points = sources if queries is None else jnp.concatenate([sources, queries])
@@ -121,7 +121,7 @@ def _torus(sources: Array, queries: Array | None, lattice: Lattice, wrapped: Wra
 def _all_sources(
     sources: Array, queries: Array | None, cutoff: Cutoff | Cutoffs, batch: Batch | None, torus: Torus | None
 ) -> Candidates:
-    """Brute force: a run of all sources, or of those of the query's system, O(n·m), for each image."""
+    """Return as candidates of a query all sources, or those of its system, once per image: brute force, O(n·m)."""
     images = 1 if torus is None else torus.images.total
     order = query_order = None
     first = end = jnp.zeros((), jnp.int32)
@@ -146,9 +146,9 @@ def _all_sources(
 def _cell_stencil(
     sources: Array, queries: Array | None, along: Array, axes: CellAxes, batch: Batch | None, torus: Torus | None
 ) -> Candidates:
-    """Cells: sources and queries sorted by cell; the runs of a query are the rows of cells around its own.
+    """Sort sources and queries by cell; the runs of a query are the rows of cells around its own.
 
-    `along` [d, n + m] are the coordinates of the sources, then of the queries, that `axes` cuts into cells.
+    `along` [d, n + m] are the coordinates of the sources, then of the queries, which `axes` divides into cells.
     """
     finite = jnp.isfinite(along).all(axis=0)
     coords, extent = grid_coordinates(along, axes, finite, None if batch is None else batch.of_all)
@@ -172,7 +172,7 @@ def _cell_stencil(
 def _cells_of_lattice(
     sources: Array, queries: Array | None, radius: np.floating | Array, lattice: Lattice, wrapped: Wrapped
 ) -> tuple[Array, Axes]:
-    """Cut a lattice cell along its vectors; what is open, and not skewed, is cut as it is without a box."""
+    """Divide a lattice cell along its vectors; open axes of an orthogonal box are divided as without a box."""
     points, packed = sources, wrapped.turns
     if queries is not None:
         points = jnp.concatenate([sources, queries])

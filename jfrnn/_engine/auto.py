@@ -1,4 +1,4 @@
-"""Which engine answers: what "auto" stands for on a platform, and whether a named engine can run there. Decided while tracing."""
+"""The choice of an engine while tracing: what "auto" means on a platform, and whether a named engine can run there."""
 
 import functools
 import warnings
@@ -19,7 +19,7 @@ ENGINES: dict[str, Engine] = {
 }
 
 
-# From how many sources on Warp is the engine to take, by platform; below, and where nothing was measured, it is "jax".
+# The number of sources from which on "auto" is Warp, by platform; for fewer, and on other platforms, it is "jax".
 # `python -m experiments bench crossover`, rows in experiments/results/crossovers: compiled searches of 16 to 100 000 random points
 # in 3D with 30 and 108 neighbors. On the CPU no engine is faster than Warp at any size: brute force is level with it up to 32
 # points, 1.2x slower at 64; jax is 1.2x slower at 16, 3x at 256, 15x at 100 000. Warp compiles sooner too: in 0.05 s instead of
@@ -30,7 +30,7 @@ _WARP_FROM = {"cpu": 0, "gpu": 0}
 
 
 def check_backend(backend: object) -> str:
-    """Return the name of a backend."""
+    """Return the name of a backend, after checking that there is one."""
     names = ("auto", *ENGINES)
     if not isinstance(backend, str) or backend not in names:
         raise ValueError(f"backend must be one of {', '.join(map(repr, names))}, got {backend!r}.")
@@ -38,12 +38,12 @@ def check_backend(backend: object) -> str:
 
 
 def choose_engine(backend: str, sources: Array, queries: Array | None, kind: Kind = ANYTHING) -> Engine:
-    """Return the engine that a backend stands for; raise where one that was named cannot answer, or cannot run on the platform.
+    """Return the engine of a backend; raise if a named engine does not support the search or cannot run on the platform.
 
     Raises:
-        ImportError: It needs Warp, which is not installed.
-        RuntimeError: It needs Warp, which cannot run on the platform.
-        ValueError: It cannot answer what is asked for.
+        ImportError: it needs Warp, which is not installed.
+        RuntimeError: it needs Warp, which cannot run on the platform.
+        ValueError: it does not support the search.
     """
     if backend == "auto":
         return fastest_engine(platform_of(sources, sources if queries is None else queries), sources.shape[0])
@@ -60,13 +60,13 @@ def choose_engine(backend: str, sources: Array, queries: Array | None, kind: Kin
 
 
 def fastest_engine(platform: str, sources: int) -> Engine:
-    """Return the engine that "auto" takes on a platform for a number of sources; warn once where Warp cannot run."""
+    """Return the engine that "auto" means on a platform for this number of sources; warn once if Warp cannot run."""
     warp_from = _WARP_FROM.get(platform)
     return WARP if warp_from is not None and sources >= warp_from and _can_warp(platform) else ARRAYS
 
 
 def default_platform() -> str:
-    """Return the JAX platform on which arrays are made and programs run where nothing else is said."""
+    """Return the JAX platform on which arrays are placed and programs run by default."""
     device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     if device is None:
         return jax.default_backend()
@@ -74,7 +74,7 @@ def default_platform() -> str:
 
 
 def platform_of(*arrays: Array) -> str:
-    """Return the platform of concrete arrays; traced ones do not know where they will be."""
+    """Return the platform of concrete arrays, or the default one if all are traced."""
     if any(isinstance(x, Tracer) for x in arrays):
         return default_platform()
     return next(iter(arrays[0].devices())).platform

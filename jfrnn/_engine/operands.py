@@ -1,4 +1,4 @@
-"""What all kernels of Warp are given: rows of particles, and the numbers of a cutoff and of a lattice."""
+"""The arrays that all Warp kernels read: rows of particles, and the numbers of a cutoff and of a lattice."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,11 +7,11 @@ from jax import Array, lax
 from jfrnn._engine.problem import Search, largest_radius
 from jfrnn._geometry import Lattice, Wrapped
 
-MOST_IN_BOX = 1 << 27  # positions: an id shares its bits with the code of an image
+MOST_IN_BOX = 1 << 27  # most positions in a box, where ids share their bits with image codes
 
 
 def periodic_kind(torus: tuple[Lattice, Wrapped] | None) -> int:
-    """Return the PERIODIC of `jfrnn.kernels._native.program`."""
+    """Return the constant PERIODIC of `jfrnn.kernels._native.program`."""
     if torus is None:
         return 0
     images = torus[0].images
@@ -23,16 +23,16 @@ def space_flags(periodic: int) -> dict[str, bool]:
 
 
 def particle_rows(points: Array, turns: Array | None, systems: Array | None) -> Array:
-    """Return rows of positions as the kernels read them: coordinates, packed turns, the number of the system."""
+    """Return rows of particles as kernels read them: coordinates, packed turns, system number."""
     columns, dim = [as_float(x, points.dtype) for x in (turns, systems) if x is not None], points.shape[1]
     rows = jnp.pad(points, ((0, 0), (0, len(columns))))
-    for k, column in enumerate(columns):  # on a GPU, XLA takes twice as long to concatenate them
+    for k, column in enumerate(columns):  # on a GPU, XLA's concatenation takes twice as long
         rows = jnp.where(np.arange(rows.shape[1]) == dim + k, column[:, None], rows)
     return rows
 
 
 def as_float(x: Array, dtype: np.dtype) -> Array:
-    """Let values travel among floats: integers of the same width as their bits, what is smaller as a value."""
+    """Encode values as floats: integers of the same width by their bits, smaller types by value."""
     if x.dtype == dtype:
         return x
     same_width = jnp.issubdtype(x.dtype, jnp.integer) and x.dtype.itemsize == dtype.itemsize
@@ -40,12 +40,12 @@ def as_float(x: Array, dtype: np.dtype) -> Array:
 
 
 def as_integer(x: Array) -> Array:
-    """Return int32 that traveled among floats."""
+    """Decode int32 that `as_float` encoded."""
     return lax.bitcast_convert_type(x, jnp.int32) if x.dtype == jnp.float32 else x.astype(jnp.int32)
 
 
 def lattice_numbers(lattice: Lattice, wrapped: Wrapped) -> Array:
-    """Return what the kernels know of a lattice, in the order that `jfrnn.kernels._native` states."""
+    """Return the numbers of a lattice that kernels read, in the order that `jfrnn.kernels._native` specifies."""
     more = 3 - lattice.dim
     square, line = ((0, more), (0, more)), (0, more)
     images = jnp.asarray(lattice.images.reach).astype(lattice.matrix.dtype)
@@ -57,7 +57,7 @@ def lattice_numbers(lattice: Lattice, wrapped: Wrapped) -> Array:
 
 
 def pack_particles(search: Search) -> tuple[Array, Array, Array]:
-    """Return rows of positions, those of the queries, and the numbers that all share, as the kernels of cells read them."""
+    """Return rows of sources and of queries, and the shared numbers, as the cell kernels read them."""
     sources, queries, cutoff, batch, torus, _ = search
     numbers = [jnp.reshape(jnp.asarray(largest_radius(cutoff)), 1)]
     turns = query_turns = None

@@ -1,4 +1,4 @@
-"""What a search is asked, and what an engine has to answer: one problem, one protocol."""
+"""The operands and options of a search, and the protocol that every engine implements."""
 
 import functools
 from typing import NamedTuple, Protocol
@@ -29,16 +29,16 @@ from jfrnn._tracing import compile_program
 
 
 class Filter(NamedTuple):
-    """Which candidates may be neighbors apart from their distance; static."""
+    """Which candidates may be neighbors, whatever their distance; static."""
 
     drop_self: bool
     later_only: bool
 
 
 class Rows(NamedTuple):
-    """Neighbors of m queries: [m, capacity] int32 source indices, unused slots n (None: only counted), and [m] int32 true counts.
+    """Neighbors of m queries: [m, capacity] int32 source indices, unused slots n (None if only counted), and [m] int32 true counts.
 
-    `required` [] int32 is the longest row, `status` [] int32 the bits of `Status`.
+    `required` [] int32 is the length of the longest row, `status` [] int32 the bits of `Status`.
     """
 
     idx: Array | None
@@ -48,7 +48,7 @@ class Rows(NamedTuple):
 
 
 class Search(NamedTuple):
-    """The operands of a search as engines take them: not finite where a particle takes no part."""
+    """The operands of a search as engines take them; positions of particles that do not take part are not finite."""
 
     sources: Array
     queries: Array | None
@@ -59,36 +59,36 @@ class Search(NamedTuple):
 
     @property
     def cutoffs(self) -> Cutoffs:
-        """Cutoffs of the particles, of a search with one for each."""
+        """The cutoffs of a search with cutoffs per particle."""
         if not isinstance(self.cutoff, Cutoffs):
             raise TypeError("this search has one cutoff for all particles.")
         return self.cutoff
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """Number of sources, and of queries."""
+        """Number of sources and of queries."""
         return self.sources.shape[0], (self.sources if self.queries is None else self.queries).shape[0]
 
 
 class Kind(NamedTuple):
-    """What an engine is asked for, as far as it matters to whether it can answer."""
+    """The features of a search that not every engine supports."""
 
     periodic: bool = False
     batch: bool = False
     radii: bool = False
 
 
-ANYTHING = Kind()  # what every engine can answer
+ANYTHING = Kind()  # a search that every engine supports
 
 
 class Engine(Protocol):
-    """A way to find the pairs of a search. All engines find the same ones.
+    """A way to find the pairs of a search. All engines find the same pairs.
 
     Attributes:
-        name: What users call it.
-        static_radius: It has to know the cutoff while tracing.
-        translates: It can sum a function over pairs that it translates to native text.
-        by_cells: Where array programming takes its place, candidates are found by cells; else they are all sources.
+        name: The name that users pass as `backend`.
+        static_radius: Whether it has to know the cutoff while tracing.
+        translates: Whether it can sum a function over pairs, translated to native code.
+        by_cells: Whether array programs that run in its place find candidates by cells instead of testing all sources.
     """
 
     @property
@@ -101,32 +101,32 @@ class Engine(Protocol):
     def by_cells(self) -> bool: ...
 
     def refuse(self, kind: Kind) -> str | None:
-        """Say why it cannot answer what is asked for; None: it can."""
+        """Return why it cannot run such a search, or None if it can."""
         ...
 
     def missing(self, platform: str) -> str | None:
-        """Say what it lacks to run on a JAX platform; None: nothing."""
+        """Return what it lacks on a JAX platform, or None if it can run there."""
         ...
 
     def rows(self, search: Search, options: "Options", capacity: int | None) -> Rows:
-        """List the neighbors of every query, or only count them (capacity=None). There are sources and queries."""
+        """List the neighbors of every query, or only count them (capacity=None). There is at least one source and one query."""
         ...
 
     def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool) -> int | None:
-        """Return what n sources and m queries take beside the list [B]; None: the compiler of the program knows."""
+        """Return the scratch memory for n sources and m queries [B]; None if only the compiler of the program knows it."""
         ...
 
 
 class Options(NamedTuple):
-    """What is static about a search, apart from its capacity."""
+    """The static options of a search, without its capacity."""
 
     filter: Filter
     engine: Engine
     closed: bool
-    skin: float = 0.0  # that cutoffs of particles grow by; one cutoff for all holds it already
-    images: Images | None = None  # of a box
-    radius: float | None = None  # of the cutoff, for an engine that has to know it while tracing
-    may_change: bool = False  # of sums: the array engine takes what this one cannot translate
+    skin: float = 0.0  # to be added to cutoffs per particle; a single cutoff includes it already
+    images: Images | None = None  # the images that a search in a box considers
+    radius: float | None = None  # the cutoff, for an engine that has to know it while tracing
+    may_change: bool = False  # whether the array engine may sum a term that this engine cannot translate
 
 
 class Inputs(NamedTuple):
@@ -136,21 +136,21 @@ class Inputs(NamedTuple):
     queries: Array | None
     active: Array | None
     box: Box | None
-    cutoff: Cutoff | Radii  # of the list: one for all, with the skin; of each particle, without
+    cutoff: Cutoff | Radii  # cutoff of the list: a single one that includes the skin, or per-particle ones that do not
     batch: Batch | None = None
 
 
 def hide_inactive(positions: Array, active: Array | None) -> Array:
-    """Return positions that are infinite where a particle is inactive.
+    """Return positions with inactive particles moved to infinity.
 
-    Inactive particles have no neighbors and are never listed as neighbors, on any engine.
-    The mark is not NaN, because JAX's mode `jax_debug_nans` takes every NaN that leaves a program for an error.
+    Inactive particles have no neighbors and are never listed as neighbors, on any engine. NaN is not used, because JAX's mode
+    `jax_debug_nans` reports every NaN that leaves a program as an error.
     """
     return positions if active is None else jnp.where(active[:, None], positions, jnp.inf)
 
 
 def prepare_search(inputs: Inputs, options: Options) -> Search:
-    """Prepare a search. No gradient flows through."""
+    """Prepare the operands for engines. No gradient flows through."""
     given, queries, active, box, cutoff, batch = lax.stop_gradient(inputs)
     sources, images = hide_inactive(given, active), options.images
     batch = None if batch is None else rank_systems(batch)
@@ -169,14 +169,14 @@ def prepare_search(inputs: Inputs, options: Options) -> Search:
 
 @functools.partial(compile_program, static_argnames="options")
 def is_decidable(inputs: Inputs, options: Options) -> Array:
-    """Say whether a search can answer for all particles that take part: cutoffs, box and positions are in range; [] bool."""
+    """Say whether cutoffs, box and positions of all particles that take part are in range; [] bool."""
     return functools.reduce(jnp.logical_and, prepare_search(inputs, options).checks.values(), jnp.ones((), bool))
 
 
 def _with_valid_radii(
     sources: Array, queries: Array | None, active: Array | None, radii: Radii
 ) -> tuple[Array, Array | None, dict[Status, Array]]:
-    """Return positions and queries, infinite where the cutoff is none, and whether all those of particles that take part are."""
+    """Return positions and queries, moved to infinity if their cutoff is invalid, and whether all active ones have valid ones."""
     of_sources, of_queries = (None if x is None else is_radius(x) for x in (radii.sources, radii.queries))
     right = [jnp.ones((), bool)]
     if queries is None:
@@ -196,5 +196,5 @@ def _where_rows(valid: Array, points: Array) -> Array:
 
 
 def largest_radius(cutoff: Cutoff | Cutoffs) -> np.floating | Array:
-    """Return the cutoff that no pair exceeds."""
+    """Return an upper bound on the cutoff of any pair."""
     return cutoff.largest if isinstance(cutoff, Cutoffs) else cutoff.radius

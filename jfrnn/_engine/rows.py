@@ -1,4 +1,4 @@
-"""The compiled programs of a search: its operands prepared, an engine asked, the status completed."""
+"""The compiled programs of a search: prepare its operands, run an engine, complete the status."""
 
 import functools
 from typing import NamedTuple
@@ -14,9 +14,10 @@ from jfrnn._tracing import compile_program
 
 
 class Found(NamedTuple):
-    """What a search finds: the rows, and of which images of the sources they tell.
+    """The result of a search: rows of neighbors and the periodic images to which they belong.
 
-    `images` [m, capacity] codes and `turns`, packed, [n] and [m] int32 (or None), stand only where images must be told apart.
+    `images` [m, capacity] holds image codes, and `turns` [n] and [m] int32 (or None) are packed; both are None unless images must
+    be told apart.
     """
 
     rows: Rows
@@ -32,7 +33,7 @@ def list_rows(inputs: Inputs, options: Options, capacity: int) -> Found:
 
 @functools.partial(compile_program, static_argnames="options")
 def count_rows(inputs: Inputs, options: Options) -> tuple[Array, Array]:
-    """Count the neighbors of every query, [m] int32, and return the largest number with them: the compiled program of `count`."""
+    """Count the neighbors of every query, [m] int32, and return their maximum too: the compiled program of `count`."""
     rows = _find(inputs, options, None).rows
     return rows.counts, rows.required
 
@@ -43,7 +44,7 @@ def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
     search = prepare_search(inputs, options)
     sources, queries, cutoff, _, torus, checks = search
     rows = _empty_rows(search, options, capacity) if 0 in search.sizes else options.engine.rows(search, options, capacity)
-    if torus is not None and active is None and isinstance(cutoff, Cutoff):  # else positions are not finite for other reasons, too
+    if torus is not None and active is None and isinstance(cutoff, Cutoff):  # else positions may be infinite for other reasons
         checks = checks | {Status.NONFINITE: (torus[1].met & NOT_FINITE) == 0}
     rows = _with_status(rows, given, given_queries, active, checks)
     images = options.images
@@ -57,7 +58,7 @@ def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
 
 
 def fold_pairs(inputs: Inputs, options: Options, elements: int, visit: Visit[State], out: State) -> State:
-    """Walk over all pairs of a search, of which none is stored: see `fold_neighbors`. By array programming, whatever the engine."""
+    """Visit all pairs of a search without storing them, as `fold_neighbors` does; by array programming, whatever the engine."""
     search = prepare_search(inputs, options)
     if 0 in search.sizes:
         return out
@@ -65,7 +66,7 @@ def fold_pairs(inputs: Inputs, options: Options, elements: int, visit: Visit[Sta
 
 
 def _with_status(rows: Rows, sources: Array, queries: Array | None, active: Array | None, checks: dict[Status, Array]) -> Rows:
-    """Set the bits of what the engine cannot know: positions are not finite where particles are inactive or out of range."""
+    """Set the status bits that engines cannot know, as they see inactive and out-of-range particles as non-finite ones."""
     if active is None and not checks:
         return rows
     if Status.NONFINITE not in checks:
@@ -78,7 +79,7 @@ def _with_status(rows: Rows, sources: Array, queries: Array | None, active: Arra
 
 
 def _empty_rows(search: Search, options: Options, capacity: int | None) -> Rows:
-    """Return rows without neighbors, of no queries or no sources."""
+    """Return rows without neighbors, for searches without queries or sources."""
     n, m = search.sizes
     fill = n if options.images is None or options.images.nearest else max(n, 1) * options.images.total
     idx = None if capacity is None else jnp.full((m, capacity), fill, jnp.int32)

@@ -1,4 +1,4 @@
-"""The arrays that a kernel writes sums to, and the sums in them."""
+"""The arrays into which kernels write sums, and the sums in them."""
 
 from typing import Any, NamedTuple
 
@@ -8,11 +8,11 @@ from jax import Array, lax
 from jfrnn._engine.operands import as_integer
 from jfrnn._geometry import compensated_sum, rounded_sum
 
-TermText = Any  # jfrnn.kernels.pair_sum_cpu.TermText, a term in native text
+TermText = Any  # jfrnn.kernels.pair_sum_cpu.TermText, a term in native code
 
 
 class SumsOf(NamedTuple):
-    """The results of a kernel that sums a term: for each of `rows` queries, and over all pairs in `slots` parts."""
+    """The results of a kernel that sums a term: for each of `rows` queries, and over all pairs in `slots` partial sums."""
 
     term: TermText
     rows: int
@@ -29,7 +29,7 @@ class SumsOf(NamedTuple):
         }
 
     def unpacked(self, sums: Array, parts: Array, rest: Array) -> tuple[Array, Array, Array]:
-        """Return what `pair_sums` returns: parts of sums over all pairs are added, with what rounding took of them."""
+        """Return the results of `pair_sums`; partial sums over all pairs are added together with their rounding errors."""
         width, totals = self._width, self._totals
         which = as_integer(rest).reshape(self.rows, width, 2) if self.extremes else jnp.zeros((self.rows, width, 0), jnp.int32)
         return sums, _add_parts(parts[: 2 * self.slots * totals].reshape(self.slots, 2, totals)), which
@@ -44,6 +44,6 @@ class SumsOf(NamedTuple):
 
 
 def _add_parts(parts: Array) -> Array:
-    """Add parts [slots, 2, width], sums and their errors, in twice the precision."""
+    """Add partial sums [slots, 2, width], values and errors, in twice the precision."""
     zero = jnp.zeros((), parts.dtype)
     return rounded_sum(*lax.reduce((parts[:, 0], parts[:, 1]), (zero, zero), compensated_sum, (0,)))

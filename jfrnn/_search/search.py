@@ -133,20 +133,7 @@ def count(
     active: Array | None = None,
     backend: str = "auto",
 ) -> Array:
-    """Count the neighbors that `search` would list, without listing them.
-
-    Args:
-        positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64.
-        cutoff: As in `search`.
-        queries: As in `search`.
-        box: As in `search`.
-        batch: As in `search`.
-        radius_rule: As in `search`.
-        half: As in `search`.
-        include_self: As in `search`.
-        closed: As in `search`.
-        active: As in `search`.
-        backend: As in `search`.
+    """Count the neighbors that `search` would list, without listing them. All arguments are those of `search`.
 
     Returns:
         Neighbors per row, shape [m], int32. Particles with a non-finite coordinate have none, and are never counted as neighbors.

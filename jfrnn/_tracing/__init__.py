@@ -1,4 +1,4 @@
-"""What JAX asks of the library while it traces and runs programs: its modes, `shard_map`, and how many programs are kept."""
+"""What the library needs from JAX's tracing: its modes, `shard_map`, and a bound on the number of compiled programs."""
 
 from jfrnn._tracing.flags import any_of_rows, first_set, set_places
 from jfrnn._tracing.kinds import Aval, Given, Internal, Tree

@@ -1,4 +1,4 @@
-"""Which of many flags are set, in order."""
+"""Positions of the flags that are set in an array, in order."""
 
 import functools
 
@@ -10,18 +10,18 @@ _BITS = 32
 
 
 def set_places(flags: Array, most: int) -> Array:
-    """Return the places of the first flags that are set, as `jax.numpy.nonzero` with a size.
+    """Return the indices of the first flags that are set, like `jax.numpy.nonzero` with a size.
 
     Args:
         flags: Shape [n], bool.
-        most: How many places, static.
+        most: Number of indices, static.
 
     Returns:
-        Shape [most], int32, ascending; n where no more are set.
+        Indices, shape [most], int32, ascending, padded with n.
 
-    Cost: flags are read once and packed into words; words are summed up, and each place is looked for among the sums, and in its
-    word (Jacobson 1989, doi:10.1109/SFCS.1989.63533). `nonzero` adds every flag to a histogram instead, which takes longer on CPU
-    and GPU.
+    Cost: flags are read once and packed into words; each index is found in the cumulative counts of words, then in its word
+    (Jacobson 1989, doi:10.1109/SFCS.1989.63533). `nonzero` adds every flag to a histogram instead, which takes longer on CPU and
+    GPU.
     """
     n = len(flags)
     words = -(-n // _BITS)
@@ -34,7 +34,7 @@ def set_places(flags: Array, most: int) -> Array:
     found = jnp.searchsorted(until, number, side="right", method="scan_unrolled").astype(jnp.int32)
     word = jnp.minimum(found, words - 1)
     left, place = packed[word], word * _BITS
-    before = number - (until[word] - lax.population_count(left).astype(jnp.int32))  # flags that are set before, in this word
+    before = number - (until[word] - lax.population_count(left).astype(jnp.int32))  # number of earlier flags in this word
     for width in (16, 8, 4, 2, 1):
         low = lax.population_count(left & np.uint32((1 << width) - 1)).astype(jnp.int32)
         beyond = before >= low
@@ -44,16 +44,16 @@ def set_places(flags: Array, most: int) -> Array:
 
 
 def any_of_rows(flags: Array) -> Array:
-    """Say of each row of flags [n, k] whether any is set, k being 32 or less or a multiple of it: [n] bool.
+    """Say for each row of flags [n, k] whether any is set, k being at most 32 or a multiple of 32: [n] bool.
 
-    XLA's CPU compiler makes a chain of kernels of a reduction over a longer axis, and kernels take most of the time to compile.
+    XLA's CPU compiler splits a reduction over a longer axis into a chain of kernels, which dominate the time to compile.
     """
     parts = jnp.split(flags, max(flags.shape[1] // _BITS, 1), axis=1)
     return jnp.any(functools.reduce(jnp.logical_or, parts), axis=1)
 
 
 def first_set(flags: Array, after: Array) -> Array:
-    """Return the first place behind another one at which flags [n] are set, or n: [] int32."""
+    """Return the first index after another one at which flags [n] are set, or n: [] int32."""
     places = lax.iota(jnp.int32, len(flags) + 1)
     there = jnp.concatenate([flags, jnp.ones(1, bool)]) & (places > after)
-    return lax.argmax(there, 0, jnp.int32)  # one kernel, where a minimum of places were a chain
+    return lax.argmax(there, 0, jnp.int32)  # one kernel; a minimum of indices would be a chain of them

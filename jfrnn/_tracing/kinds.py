@@ -1,8 +1,8 @@
-"""Names for what has no type that Python can write down: they say what stands in the place of an `Any`."""
+"""Names for types that Python cannot express; each says what an `Any` stands for."""
 
 from typing import Any
 
-Tree = Any  # a pytree of arrays, of whatever structure
+Tree = Any  # a pytree of arrays, of any structure
 Given = Any  # an argument as the user passed it, before it is checked
-Aval = Any  # the type of an array as JAX's tracing knows it: its shape, its dtype and over which axes it varies
-Internal = Any  # an object of JAX's own machinery, such as a primitive, a jaxpr or the context of a lowering
+Aval = Any  # the type of an array in JAX's tracing: shape, dtype and the mesh axes over which it varies
+Internal = Any  # an internal object of JAX, such as a primitive, a jaxpr or a lowering context

@@ -1,8 +1,8 @@
-"""Programs of the library inside `jax.shard_map`, which checks by default over which axes of the mesh each array varies.
+"""Programs of the library inside `jax.shard_map`, which checks by default over which mesh axes each array varies.
 
-Loops and branches begin with constants, which vary over no axis, and end with what was computed, which does. Instead of saying so
-at each of them, a program is traced as it is on one device, where nothing varies; its results then vary over all axes that any of
-its operands does.
+Loops and branches start with constants, which vary over no axis, and end with results, which vary. Instead of annotating each of
+them, a program is traced as on a single device, where nothing varies; its results then vary over all axes over which any operand
+does.
 """
 
 import functools
@@ -18,7 +18,7 @@ from jfrnn._tracing.kinds import Aval, Internal, Tree
 
 
 def varying_axes(tree: Tree) -> tuple[str, ...]:
-    """Return the axes of the mesh over which any array of a pytree varies."""
+    """Return the mesh axes over which any array of a pytree varies."""
     found: set[str] = set()
     for leaf in jax.tree.leaves(tree):
         if isinstance(leaf, Tracer):
@@ -27,12 +27,12 @@ def varying_axes(tree: Tree) -> tuple[str, ...]:
 
 
 def _axes_of(aval: Aval) -> frozenset[str]:
-    kind = getattr(aval, "manual_axis_type", None)  # as JAX says it from 0.10 on
+    kind = getattr(aval, "manual_axis_type", None)  # the name in JAX 0.10 and later
     return frozenset(getattr(aval, "vma", ()) if kind is None else kind.varying)
 
 
 def vary(tree: Tree, axes: tuple[str, ...]) -> Tree:
-    """Return the same arrays as ones that vary over these axes, and over whatever they do."""
+    """Return the same arrays, marked as varying over these axes and those over which they do already."""
 
     def vary_leaf(x: Array) -> Array:
         more = tuple(name for name in axes if name not in _axes_of(jax.typeof(x)))
@@ -42,7 +42,7 @@ def vary(tree: Tree, axes: tuple[str, ...]) -> Tree:
 
 
 def result_aval(shape: tuple[int, ...], dtype: np.dtype, operands: Iterable[Aval]) -> ShapedArray:
-    """Return the type of a result that varies as the first of the operands does, which all vary alike."""
+    """Return the type of a result that varies like the operands, which all vary alike."""
     for aval in operands:
         if hasattr(aval, "update") and _axes_of(aval):
             sharding = aval.sharding.update(spec=jax.sharding.PartitionSpec(*[None] * len(shape)))
@@ -51,12 +51,12 @@ def result_aval(shape: tuple[int, ...], dtype: np.dtype, operands: Iterable[Aval
 
 
 def unvarying_types(avals: Iterable[Aval]) -> list[ShapedArray]:
-    """Return types of arrays that vary over nothing."""
+    """Return the types of these arrays as varying over nothing."""
     return [ShapedArray(aval.shape, aval.dtype) if _axes_of(aval) else aval for aval in avals]
 
 
 def call_apart(fn: Callable[..., Tree], *args: Tree) -> Tree:
-    """Call a function of pytrees that has no derivative; where an argument varies over axes of a mesh, as a program of its own."""
+    """Call a function of pytrees without derivatives; if arguments vary over mesh axes, as a separate program."""
     axes = varying_axes(args)
     if not axes:
         return fn(*args)
@@ -77,7 +77,7 @@ def call_apart(fn: Callable[..., Tree], *args: Tree) -> Tree:
 
 @functools.cache
 def _program() -> Internal:
-    """Return the primitive of a program that varies over nothing; `vary_leaf` then says over what its results do."""
+    """Return the primitive of a program that varies over nothing; `vary_leaf` marks its results afterwards."""
     from jax.extend.core import Primitive, jaxpr_as_fun
     from jax.interpreters import batching, mlir
 

@@ -1,8 +1,8 @@
-"""What JAX's own modes ask of the library: broadcasting that is written out, transfers that are asked for, arrays in one piece.
+"""JAX's modes: explicit broadcasting, explicit transfers, and arrays gathered from explicit mesh axes.
 
-`jax_numpy_rank_promotion="raise"` forbids operands of different rank. `jax.transfer_guard("disallow")` forbids whatever moves
-between host and device without being asked to, numbers of the library too. On a mesh with explicit axes an array's type says over
-which of them it is spread, and sorts, sums and lookups along such an axis are forbidden.
+`jax_numpy_rank_promotion="raise"` forbids operands of different rank. `jax.transfer_guard("disallow")` forbids implicit transfers
+between host and device, also of the library's own numbers. On a mesh with explicit axes, the type of an array tells over which axes
+it is sharded, and sorts, sums and lookups along such an axis are forbidden.
 """
 
 import contextlib
@@ -16,14 +16,14 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 
 def leading_axes(x: Array, ndim: int) -> Array:
-    """Return x with axes of length 1 in front, so that it has `ndim` of them."""
+    """Return x with leading axes of length 1, so that it has `ndim` axes."""
     return x.reshape((1,) * (ndim - x.ndim) + x.shape)
 
 
 def gather(x: Array) -> Array:
-    """Return x in one piece on every device, where its type says that it is spread over explicit axes of a mesh.
+    """Return x replicated on every device, if its type says that it is sharded over explicit mesh axes.
 
-    Along automatic axes the compiler does so where it has to. `jfrnn.distributed` spreads the work as well.
+    Along automatic axes the compiler does this where needed. `jfrnn.distributed` divides the work instead.
     """
     spread = jax.typeof(x).sharding
     if all(axes is None for axes in spread.spec):
@@ -31,16 +31,16 @@ def gather(x: Array) -> Array:
     if isinstance(x, Tracer) or not isinstance(x.sharding, NamedSharding):
         return jax.sharding.reshard(x, NamedSharding(spread.mesh, PartitionSpec()))
     mesh = x.sharding.mesh
-    if jax.sharding.get_abstract_mesh().empty:  # then its type is to say nothing of a mesh, as those of other arrays do
+    if jax.sharding.get_abstract_mesh().empty:  # outside a mesh, its type must not name one
         mesh = Mesh(np.asarray(mesh.devices), mesh.axis_names)
     return jax.device_put(x, NamedSharding(mesh, PartitionSpec()))
 
 
 def own_transfers() -> AbstractContextManager[object]:
-    """Let the library move its own numbers to the device, and read back those that it has to, as `device_put` and `device_get` do.
+    """Allow the library's own transfers between host and device, like explicit `device_put` and `device_get`.
 
-    Where `jax.transfer_guard("disallow_explicit")` forbids these as well, it does so here. What users pass is to be on the device
-    before: an array of NumPy is theirs to move.
+    `jax.transfer_guard("disallow_explicit")` forbids these too. Arrays of users must be on the device before: transferring their
+    NumPy arrays is left to them.
     """
     guards = (
         (_guard_of_moves(), jax.transfer_guard_host_to_device),
@@ -54,7 +54,7 @@ def own_transfers() -> AbstractContextManager[object]:
 
 
 def guards_transfers() -> bool:
-    """Say whether transfers to the device are looked at which nobody asked for."""
+    """Say whether implicit transfers to the device are guarded."""
     return _guard_of_moves() in ("disallow", "log")
 
 
