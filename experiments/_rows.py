@@ -11,7 +11,6 @@ from typing import Any, Generic, TypeVar
 
 from experiments._errors import UsageError
 
-STATUSES = ("ok", "missing", "failed", "timeout", "skipped")
 RETRIED = ("missing", "failed", "timeout")
 SCENE_FIELDS = ("spacing", "cutoff_ratio", "dtype", "dim", "seed", "angle", "growth", "order", "motion")
 """What decides, beside layout and fill, where particles are and what a pair is."""
@@ -22,7 +21,7 @@ class Row:
     """What every row says, whatever it measures; a study adds its columns. What was not reached is None."""
 
     key: str  # digest of what is measured and how: rows with the same key replace each other
-    status: str = "failed"  # one of STATUSES
+    status: str = "failed"  # or "ok", "missing", "timeout", "skipped"
     reason: str | None = None  # why the status is not ok; of several processes as one row, why some of them have no figures
     others_cores: float | None = None  # that other processes kept busy meanwhile, on average; None below 0.2 s
     device: str | None = None  # where it ran

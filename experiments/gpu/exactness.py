@@ -49,11 +49,6 @@ def oracle() -> Any:  # noqa: ANN401
     return importlib.import_module("tests.reference")
 
 
-def pad_points(points: np.ndarray, rows: int) -> np.ndarray:
-    """Fill up with points that are nowhere, so that cases of many sizes share a program."""
-    return np.concatenate([points, np.full((rows - len(points), points.shape[1]), np.nan, points.dtype)])
-
-
 def _decisions(config: Exactness, dtype: str, dim: int) -> Decisions:
     cases = {"hard": _hard, "periodic": _periodic, "radii": _radii, "batches": _batches}[config.cases]
     for case in cases(dtype, dim):
@@ -62,7 +57,7 @@ def _decisions(config: Exactness, dtype: str, dim: int) -> Decisions:
         for name in ("queries", "batch", "cutoff"):
             given[name] = _pad_rows(given.get(name, case.cutoff if name == "cutoff" else None), rows)
         options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-        x = jnp.asarray(pad_points(case.positions, rows))
+        x = jnp.asarray(sums.pad_points(case.positions, rows))
         nbrs = jfrnn.search(x, **options, capacity=config.capacity, backend=config.backend)
         yield case.name, found_pairs(nbrs, x, options.get("queries")) == case.expected
 
@@ -74,7 +69,7 @@ def _pad_rows(value: Any, rows: int) -> Any:  # noqa: ANN401
     if not isinstance(value, np.ndarray):
         return value
     if value.ndim == 2:
-        return jnp.asarray(pad_points(value, rows))
+        return jnp.asarray(sums.pad_points(value, rows))
     return np.concatenate([value, np.ones(rows - len(value), value.dtype) * (value.dtype.kind == "f")]).astype(value.dtype)
 
 

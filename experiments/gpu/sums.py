@@ -22,9 +22,9 @@ def decisions(dtype: str, dim: int, capacity: int, backend: str, least_rows: int
 
     def is_right(x: np.ndarray, cutoff: float, columns: int, capacity: int = capacity, **options: Any) -> bool:  # noqa: ANN401
         if "queries" in options:
-            options["queries"] = _pad_points(options["queries"], least_rows)
+            options["queries"] = pad_points(options["queries"], least_rows)
         else:
-            n, x = len(x), _pad_points(x, least_rows)
+            n, x = len(x), pad_points(x, least_rows)
             options |= {"batch": np.pad(options["batch"], (0, len(x) - n))} if "batch" in options else {}
         n, points = len(x), jnp.asarray(x)
         weights = random.integers(1, _LARGEST, (n, columns)).astype(dtype)
@@ -50,7 +50,8 @@ def decisions(dtype: str, dim: int, capacity: int, backend: str, least_rows: int
         yield "large-5", is_right(_lattice(257, 3, dtype), 1.1, 5, capacity=8)
 
 
-def _pad_points(points: np.ndarray, rows: int) -> np.ndarray:
+def pad_points(points: np.ndarray, rows: int) -> np.ndarray:
+    """Fill up with points that are nowhere, so that cases of many sizes share a program."""
     return np.concatenate([points, np.full((max(rows - len(points), 0), points.shape[1]), np.nan, points.dtype)])
 
 

@@ -237,7 +237,8 @@ def transpose(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetri
 
     `symmetric` means that j is a neighbor of i whenever i is one of j, and that both sides have the same kinds of operands. Then
     one term suffices: the sums for the linear operands of j are the last ones of `along`, whose operands on either side are all
-    those of i and of j. If an operand of j is the same array as one of i, its sums are added to those of i.
+    those of i and of j. If an operand of j is the same array as one of i, its sums are added to those of i. The function is long
+    because all terms that it makes close over the same bookkeeping of operands.
     """
     still = choose(term.operands, Groups(*(tuple(not flag for flag in group) for group in linear)))
     of_totals, of_sums = (

@@ -113,7 +113,8 @@ def _bounds(tree: TriangleTree, corners: Array, points: Array, rays: Array, aske
     """Return the least and largest winding number, [n] int32, that are possible after rays [n, d]; 0 where not asked for.
 
     Nodes wait on a stack, lower levels above higher ones, and are taken from its top a chunk at a time. So it never holds more
-    nodes of one level than the children of one chunk. Triangles whose boxes are hit are decided before the next chunk.
+    nodes of one level than the children of one chunk. Triangles whose boxes are hit are decided before the next chunk. The function
+    is long because its loops share that stack.
     """
     (n, dim), levels = points.shape, level_starts(len(corners))
     chunk, starts = min(_CHUNK, n), tuple(int(x) // WIDTH for x in levels)
