@@ -146,7 +146,7 @@ def carried_rate(model: Model, s: State, rho: Array, inverse: Array | None, nbrs
     return walls.keep_fluid(model.wall, rate if s.solid is None else rate + solids.compression(model, s, s.solid, rho))
 
 
-def torn(model: Model, rho: Array) -> Array:
+def limit_tearing(model: Model, rho: Array) -> Array:
     """Return carried densities [kg/m³]: where a fluid tears, not less than that at rest."""
     return jnp.maximum(rho, model.physics.density) if model.physics.tears else rho
 

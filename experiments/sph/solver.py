@@ -115,7 +115,7 @@ def _evaluate(model: Model, s: State, nbrs: Neighbors, dt: Array | None = None) 
 def _carry(model: Model, s: State, rho: Array, inverse: Array | None, nbrs: Neighbors, dt: Array) -> State:
     """Return the state with its carried density or pressure after dt; where nothing is carried, the state."""
     if s.rho is not None:
-        return s._replace(rho=forces.torn(model, s.rho + dt * forces.carried_rate(model, s, rho, inverse, nbrs)))
+        return s._replace(rho=forces.limit_tearing(model, s.rho + dt * forces.carried_rate(model, s, rho, inverse, nbrs)))
     if s.p is not None:
         return s._replace(p=s.p + dt * forces.carried_rate(model, s, rho, inverse, nbrs))
     return s
@@ -177,7 +177,7 @@ def _midpoint(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[State
         moved = base.x + part * _transport_velocity(model, at)
         carried = {}
         if at.rho is not None and base.rho is not None:
-            carried["rho"] = forces.torn(model, base.rho + part * forces.carried_rate(model, at, rho, inverse, nbrs))
+            carried["rho"] = forces.limit_tearing(model, base.rho + part * forces.carried_rate(model, at, rho, inverse, nbrs))
         elif at.p is not None and base.p is not None:
             carried["p"] = base.p + part * forces.carried_rate(model, at, rho, inverse, nbrs)
         at = at._replace(x=moved, v=base.v + part * a, **carried)

@@ -107,7 +107,7 @@ class Neighbors:
             raise TypeError("grow() changes shapes and cannot run inside jax.jit: call it on what jit returns.")
         counted = count_capacity(particles, self.asked, slack)
         met = round_capacity(math.ceil(slack * int(self.required.row))) if int(self.required.row) > self.capacity else 0
-        return listed(particles, self.asked, max(self.capacity, counted, met))
+        return list_on_shards(particles, self.asked, max(self.capacity, counted, met))
 
     def check(self) -> None:
         """Raise what the status bits report; wait for the devices. Not inside jit: there, read `overflow`.
@@ -159,7 +159,7 @@ class Neighbors:
 
 
 @functools.partial(jax.jit, static_argnames=("asked", "capacity"))
-def listed(particles: Particles, asked: Asked, capacity: int) -> Neighbors:
+def list_on_shards(particles: Particles, asked: Asked, capacity: int) -> Neighbors:
     mesh, rows = particles.mesh, of_shards(particles.mesh)
     same: Any = PartitionSpec()
 
@@ -192,7 +192,7 @@ def _update(particles: Particles, nbrs: Neighbors) -> tuple[Particles, Neighbors
 
     def remake(particles: Particles, nbrs: Neighbors) -> tuple[Particles, Neighbors]:
         moved = migrate(particles)
-        made, local = listed(moved, asked, nbrs.capacity), nbrs.local
+        made, local = list_on_shards(moved, asked, nbrs.capacity), nbrs.local
         if local.verlet is not None and made.local.verlet is not None:
             verlet = dataclasses.replace(made.local.verlet, rebuild_count=local.verlet.rebuild_count + 1)
             made = dataclasses.replace(made, local=dataclasses.replace(made.local, verlet=verlet))

@@ -14,7 +14,7 @@ from jfrnn._search import ROWS_ARE_WHOLE, NeighborList
 from jfrnn._shards.calls import Asked, check_asked, check_halo, count_capacity, counts, gather_seen, is_good, mark, over_shards
 from jfrnn._shards.halo import Halo, exchange, halo_in_shard
 from jfrnn._shards.particles import Particles, of_shards
-from jfrnn._shards.sharded_list import Neighbors, listed
+from jfrnn._shards.sharded_list import Neighbors, list_on_shards
 from jfrnn._sums import pair_sum as pair_sum_on_one
 from jfrnn._tracing import Tree
 
@@ -58,7 +58,7 @@ def search(
                 "capacity must be given where particles are traced, because it is a shape: pass that of an earlier search."
             )
         capacity = count_capacity(particles, asked, slack)
-    return listed(particles, asked, check_capacity(capacity))
+    return list_on_shards(particles, asked, check_capacity(capacity))
 
 
 def count(
