@@ -74,7 +74,7 @@ def default_platform() -> str:
 
 
 def platform_of(*arrays: Array) -> str:
-    """Return the platform of concrete arrays, or the default one if all are traced."""
+    """Return the platform of concrete arrays, or the default one if any of them is traced."""
     if any(isinstance(x, Tracer) for x in arrays):
         return default_platform()
     return next(iter(arrays[0].devices())).platform

@@ -130,7 +130,7 @@ def _digits(at: Array, below: Array, lower: Array, is_top: np.ndarray) -> Array:
 
 
 def _carry(limbs: Array, bits: int) -> Array:
-    """Return what remains of a limb above the part within half of 2^bits, in units of 2^bits."""
+    """Return the carry of a limb: what exceeds the part within half of 2^bits, in units of 2^bits."""
     return (limbs + (1 << (bits - 1))) >> bits
 
 

@@ -160,6 +160,7 @@ class Neighbors:
 
 @functools.partial(jax.jit, static_argnames=("asked", "capacity"))
 def list_on_shards(particles: Particles, asked: Asked, capacity: int) -> Neighbors:
+    """Make the list of every shard from its own particles and its halo."""
     mesh, rows = particles.mesh, of_shards(particles.mesh)
     same: Any = PartitionSpec()
 

@@ -90,7 +90,7 @@ def at_once() -> AbstractContextManager[None]:
 
 
 def on_device(x: Given) -> Array:
-    """Return `jnp.asarray(x)` on one device, concrete if x is.
+    """Return `jnp.asarray(x)`, replicated if it is sharded over explicit mesh axes, and concrete if x is.
 
     NumPy arrays are transferred without the program that `jnp.asarray` compiles for each shape, unless a guard has to see the
     transfer.

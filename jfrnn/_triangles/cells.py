@@ -74,7 +74,7 @@ def cells_of(x: Array, scale: Array) -> Array:
 
 
 def bucket_of(level: Array, cells: list[Array], buckets: int) -> Array:
-    """Return the hash of cells, int32. Cells that collide share a bucket; their triangles are then rejected as candidates."""
+    """Return the hash of cells, int32. If cells collide, the triangles of one are additional candidates in the other."""
     word = level.astype(jnp.uint32) * np.uint32(0x9E3779B1)
     for cell in cells:
         word = (word ^ cell.astype(jnp.uint32)) * np.uint32(0x85EBCA6B)
