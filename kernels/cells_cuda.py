@@ -13,13 +13,11 @@ crossing the same in a periodic box, for queries whose reach leaves it: images t
 """
 
 import functools
-from string import Template
 from typing import NamedTuple
 
 import warp as wp
 from jfrnn.kernels._load import load_module
 from jfrnn.kernels._native import SPACES, bind, program, table_cells
-from jfrnn.kernels._text import read_part
 
 BLOCK = 256
 QUERY_BLOCK = 32  # one warp: others need not wait for it to end
@@ -50,41 +48,6 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -
     if not own:
         parts += [table + 2, tiles, queries]
     return sum((words + 15) // 16 * 16 for words in parts)
-
-
-_WALK = Template(read_part("walk.cuh", "begin") + read_part("walk.cuh", "walk") + read_part("walk.cuh", "end"))
-
-# How a lane walks over the bits of its query, block by block that has any: `hits` are those of a block that are left, `ids` the
-# address of the block's ids. Behind the last block stands one, `behind` as a bit, that is never left.
-HELD_PAIRS = read_part("walk.cuh", "held_pairs")
-
-
-def walk(kind: str, *, opened: str = "", none: str, begun: str, settled: str, done: str = "", closed: str = "") -> str:
-    """Return the text of the struct `Query`, in which a block of one warp serves its share of the queries, in groups.
-
-    Constants it needs: LIST, or SUMS, or neither, and the pairs are counted:
-    `found`; LATER, CROSSING. With SUMS candidates are images of places in `sorted`, not of sources.
-
-    Args:
-        kind: The struct that it derives from, made of `{kind}Arguments`.
-        opened: Comes before the queries from `place` to `stop`; they may be none.
-        none: What is done with a query, `id`, that is not finite.
-        begun: Of a group, of which `my_id`, its first `place` and its size, `group`, are known: defines what `settled` calls.
-        settled: What is done with the pairs that are held: those of blocks of candidates below `tested`, whose ids stand in
-            `warp.ids`, and bits in `warp.hits`; `met_in` says in which. `finished`: they are the last ones of the group.
-        done: After the last ones.
-        closed: After the last group.
-    """
-    return _WALK.substitute(kind=kind, opened=opened, none=none, begun=begun, settled=settled, done=done, closed=closed)
-
-
-_ROWS = walk(
-    "Search",
-    none=read_part("rows.cuh", "no_row"),
-    begun=read_part("rows.cuh", "begin_write_rows") + HELD_PAIRS + read_part("rows.cuh", "write_rows"),
-    settled="write_rows(finished);",
-    done=read_part("rows.cuh", "row_done"),
-)
 
 
 class Launch(NamedTuple):
@@ -202,8 +165,8 @@ def cell_kernels(
 
     def query_kernel(name: str, crossing: bool = False) -> wp.Kernel:
         module, kind = f"{name}_{variant}_b{blocks}", {"CROSSING": crossing, "SHIFTED": periodic if crossing else 0}
-        text = program(double, dim, "cells.cuh", "exact.h", **query | kind) + _ROWS
-        return _kernel(module, module, double, QUERY_BLOCK, blocks, "Query.run", text)
+        text = program(double, dim, "rows.cuh", **query | kind)
+        return _kernel(module, module, double, QUERY_BLOCK, blocks, "Rows.run", text)
 
     sorting = program(double, dim, "cells.cuh", **grid)
 

@@ -127,18 +127,21 @@ def constants_of(term: TermText, compensated: bool, extremes: bool) -> dict[str,
     return found | {"OWN": own, "COMPENSATED": compensated, "SUMS": 1 + extremes}
 
 
-def term_header(term: TermText, double: bool) -> dict[str, str]:
-    """Return the headers of a program with a term: `term.h` holds the struct `Term`, as in the example of that name."""
+def term_header(term: TermText, double: bool, math: str = VECTOR) -> dict[str, str]:
+    """Return the headers of a program with a term: `term.h` holds the struct `Term`, as in the example of that name.
+
+    `math` is one of the two kinds of `jfrnn.kernels._math`.
+    """
     order = [itertools.count(), itertools.count()]
     places = [next(order[part.total]) for part in term.sums]
     lines = [f"typedef Math::{'f64' if double else 'f32'} number;"]
-    lines += [f"constexpr bool IS_TOTAL[] = {{{', '.join(str(int(part.total)) for part in term.sums)}}};"]
-    lines += [f"constexpr int PLACE[] = {{{', '.join(map(str, places))}}};"]
-    lines += [f"constexpr int STEP_AXES[] = {{{', '.join([str(step.axis) for step in term.steps] or ['0'])}}};"]
+    lines += [f"JFRNN_TABLE bool IS_TOTAL[] = {{{', '.join(str(int(part.total)) for part in term.sums)}}};"]
+    lines += [f"JFRNN_TABLE int PLACE[] = {{{', '.join(map(str, places))}}};"]
+    lines += [f"JFRNN_TABLE int STEP_AXES[] = {{{', '.join([str(step.axis) for step in term.steps] or ['0'])}}};"]
     lines += ["struct Term {", *_members(term.shared), "struct Own {", *_members(term.own)]
     lines += [*(f"number turned{c};" for c in range(len(term.steps))), "};", *_of_shared(term, double), *_of_own(term, double)]
     text = "\n".join([*lines, *_evaluation(term, double), "};", ""])
-    return {"math.h": '#include "lane_count.h"\n' + VECTOR, "term.h": '#include "lattice.h"\n#include "math.h"\n' + text}
+    return {"math.h": '#include "lane_count.h"\n' + math, "term.h": '#include "lattice.h"\n#include "math.h"\n' + text}
 
 
 def _members(values: tuple[Value, ...]) -> list[str]:
@@ -148,7 +151,7 @@ def _members(values: tuple[Value, ...]) -> list[str]:
 def _of_shared(term: TermText, double: bool) -> list[str]:
     """Return the lines that read what all pairs share."""
     made = [f"{value.name} = {_spread(value, f'shared_values[{c}]', double)};" for c, value in enumerate(term.shared)]
-    return ["explicit Term(const real* shared_values) {", *made, "}"]
+    return ["JFRNN_MEMBER explicit Term(const real* shared_values) {", *made, "}"]
 
 
 def _of_own(term: TermText, double: bool) -> list[str]:
@@ -158,18 +161,19 @@ def _of_own(term: TermText, double: bool) -> list[str]:
     column = sum(value.axis is None for value in term.own)
     turns = [f"real(Lattice::turn(row[{column}], {step.axis}))" for step in term.steps]
     lines += [f"own.turned{c} = Math::of({x});" for c, x in enumerate(turns)]
-    return ["Own own(const real* row, const real* q) const {", "Own own;", *lines, "return own;", "}"]
+    return ["JFRNN_MEMBER Own own(const real* row, const real* q) const {", "Own own;", *lines, "return own;", "}"]
 
 
 def _evaluation(term: TermText, double: bool) -> list[str]:
     """Return the lines that evaluate a term for a vector of pairs."""
     lines = ["template <class Column>"]
-    lines += ["void evaluate(const Own& own, const number* p, Column column, number* summand) const {"]
+    lines += ["JFRNN_MEMBER void evaluate(const Own& own, const number* p, Column column, number* summand) const {"]
     lines += [f"const Math::{_NAMES[value.dtype]} {value.name} = own.{value.name};" for value in term.own]
     numbers = placed(term.others, "column({})", "p[{}]")
     lines += [loaded(value, x, f"Math::bits({x})", double) for value, x in zip(term.others, numbers, strict=True)]
     for c, step in enumerate(term.steps):
-        lines.append(f"const number {step.name} = column({term.columns + c}) + own.turned{c};")
+        shift = f"column({term.columns + c}) + own.turned{c}"
+        lines.append(f"const number {step.name} = SHIFTED ? {shift} : number{{}};")
     return [*lines, term.text, *(f"summand[{k}] = {part.name};" for k, part in enumerate(term.sums)), "}"]
 
 

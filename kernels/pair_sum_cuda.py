@@ -19,25 +19,21 @@ many blocks then fit, and 12 % more instructions are executed: 0.59 to 0.65 ms, 
 """
 
 import functools
-from string import Template
 from typing import NamedTuple
 
 import warp as wp
 from jfrnn.kernels._math import SCALAR
 from jfrnn.kernels._native import SPACES, bind, program
-from jfrnn.kernels._text import read_part
 from jfrnn.kernels.cells_cuda import (
     GRID,
-    HELD_PAIRS,
     MOST_IN_STRIDES,
     QUERY_BLOCK,
     Launch,
     load_walks,
     query_blocks,
-    walk,
     walks,
 )
-from jfrnn.kernels.pair_sum_cpu import LITTLE_WORK, TermText, Value, loaded, placed, work
+from jfrnn.kernels.pair_sum_cpu import LITTLE_WORK, TermText, constants_of, term_header, work
 
 
 def slots(queries: int) -> int:
@@ -60,25 +56,6 @@ def row_length(term: TermText, dim: int, double: bool) -> int:
     return next((length for length in (0, 1, 2) if columns <= length <= at_once), -(-columns // at_once) * at_once)
 
 
-_SUMS = read_part("pair_sum.cuh", "sums")
-
-_OPENED = read_part("pair_sum.cuh", "opened")
-
-_NO_SUM = read_part("pair_sum.cuh", "no_sum")
-_NO_EXTREME = read_part("pair_sum.cuh", "no_extreme")
-
-# Sums, and what rounding took of them, which is added in the end, or goes on as they do.
-_ADD = read_part("pair_sum.cuh", "add")
-_TAKE_LARGER = read_part("pair_sum.cuh", "take_larger")
-_KEEP_LARGEST = read_part("pair_sum.cuh", "keep_largest")
-
-# What is loaded here comes in the order of the text, all of several pairs before any of it is used: else the compiler saves
-# registers, and every pair waits for its own.
-_LOAD_ROW = read_part("pair_sum.cuh", "load_row")
-
-_ADD_PAIRS = Template(read_part("pair_sum.cuh", "add_pairs"))
-
-
 class Kernels(NamedTuple):
     """The kernel that sorts values (None: there are none), and those that sum; `crossing` as in a search."""
 
@@ -97,98 +74,13 @@ class Kernels(NamedTuple):
         load_walks(self.query, self.crossing, device)
 
 
-class _Reduction(NamedTuple):
-    """What becomes of summands: text before the pairs that are held, for each of them (`is_pair`), and after the last one.
-
-    `kept` is for queries, `totalled` for all lanes.
-    """
-
-    started: str
-    each: str
-    kept: str
-    totalled: str = ""
-
-
-def _added(term: TermText) -> _Reduction:
-    """Return text that adds summands to what the query has already, and to the totals of the block."""
-    started, each, rows, totals = [], [], [], []
-    for k, part in enumerate(term.sums):
-        started.append(f"real sum{k} = 0, error{k} = 0;\n")
-        each.append(f"add(sum{k}, error{k}, is_pair, {part.name});\n")
-        if part.total:
-            totals.append(f"add_total({len(totals)}, sum{k}, error{k});\n")
-        else:
-            rows.append(f"store(at + {len(rows)}, sum{k}, error{k}, fresh, finished);\n")
-    return _Reduction(*("".join(lines) for lines in (started, each, rows, totals)))
-
-
-def _largest(term: TermText) -> _Reduction:
-    """Return text that keeps the largest summands of a query, their sources and their images."""
-    started, kept = [], []
-    each = ["const int source = id_of(there.id), code = CROSSING ? image_of(id) : code_at_home;\n"]
-    for k, part in enumerate(term.sums):
-        started.append(f"real best{k} = -INF;\nint of{k} = n, code{k} = 0;\n")
-        each.append(f"take_larger({part.name}, source, code, is_pair, best{k}, of{k}, code{k});\n")
-        kept.append(f"keep_largest(at + {k}, best{k}, of{k}, code{k}, fresh);\n")
-    return _Reduction(*("".join(lines) for lines in (started, each, kept)))
-
-
-def _evaluation(term: TermText, double: bool, extremes: bool) -> str:
-    """Return the text that defines `add_pairs`: it reduces the pairs that are held to what their queries get."""
-
-    def defined(values: tuple[Value, ...], column: str, axis: str) -> str:
-        numbers = placed(values, column, axis)
-        return "".join(loaded(value, x, f"Math::bits({x})", double) for value, x in zip(values, numbers, strict=True))
-
-    def has_positions(values: tuple[Value, ...]) -> bool:
-        return any(value.axis is not None for value in values)
-
-    reduction = _largest(term) if extremes else _added(term)
-    values = [defined(term.shared, "shared_values[{}]", "")]
-    if has_positions(term.own):
-        values.append("const Place here = lane < group ? load_query(place + lane) : Place{{0, 0, 0}, 0};\n")
-    values.append(defined(term.own, "own_values[own_at + {}]", "here.p[{}]"))
-    from_place = has_positions(term.others) and not term.source_columns
-    numbers = defined(term.others, "row.at[PLACED + {}]", "there.p[{}]" if from_place else "row.at[{}]")
-    fields, arrays, row = [], [], []
-
-    def ahead(kind: str, name: str, loaded: str) -> None:
-        fields.append(f"{kind} {name}[TAKEN];\n")
-        arrays.append(f"#pragma unroll\nfor (int k = 0; k < TAKEN; ++k)\n    taken.{name}[k] = {loaded};\n")
-        row.append(f"const {kind} {name} = now.{name}[k];\n")
-
-    ahead("int", "id", "load_id_now(at[k])")
-    if extremes or from_place:
-        ahead("Place", "there", "load_place(source_of(taken.id[k]))")
-    if term.source_columns:
-        ahead("Row", "row", "load_row(source_of(taken.id[k]))")
-    if term.steps:  # inside of a box there are none
-        turns = f"own_values[own_at + {_own_columns(term) - 1}]"
-        values += [f"const int turn{c} = Lattice::turn({turns}, {step.axis});\n" for c, step in enumerate(term.steps)]
-        row.append("int shift[3] = {0, 0, 0};\nif constexpr (CROSSING)\n    shift_of(image_of(id), shift);\n")
-        for c, (name, axis) in enumerate(term.steps):
-            step = f"shift[{axis}] - Lattice::turn(row.at[PLACED + {term.columns}], {axis}) + turn{c}"
-            row.append(f"const real {name} = CROSSING ? real({step}) : real(0);\n")
-    return _ADD_PAIRS.substitute(
-        values="".join(values),
-        started=reduction.started,
-        held_pairs=HELD_PAIRS,
-        fields="".join(fields),
-        loaded="".join(arrays),
-        row="".join(row),
-        term="".join([numbers, term.text, reduction.each]),
-        stored="".join(["if (lane < group) {\n", reduction.kept, "}\n", reduction.totalled]),
-    )
+def _reads_positions(term: TermText) -> bool:
+    return any(value.axis is not None for value in term.others)
 
 
 def _placed_columns(term: TermText, dim: int) -> int:
     """Return how many coordinates of j stand before its columns."""
-    return dim if term.source_columns and any(value.axis is not None for value in term.others) else 0
-
-
-def _own_columns(term: TermText) -> int:
-    """Return how many numbers of i have a column, turns among them."""
-    return sum(value.axis is None for value in term.own) + bool(term.steps)
+    return dim if term.source_columns and _reads_positions(term) else 0
 
 
 @functools.cache
@@ -206,32 +98,26 @@ def sum_kernels(
     cheap = work(term.text) <= LITTLE_WORK and row_length(term, dim, double) <= 4
     taken = 4 if cheap else 2
     blocks = 16 if double or not cheap else 20
-    totals, columns = sum(part.total for part in term.sums), term.source_columns
     kind = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
     kind += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}"
     module = f"{kind}_b{blocks}_t{taken}_{key}"
-    constants = {**GRID, "PERIODIC": periodic, "BATCHED": batched, "SCALED": scaled}
-    constants |= {"LIST": 0, "SUMS": 1, "LATER": 0, "COMPENSATED": compensated, "TAKEN": taken}
-    constants |= {"OTHERS": columns, "ROW_LENGTH": max(row_length(term, dim, double), 1), "OWN": _own_columns(term)}
-    constants |= {"PLACED": _placed_columns(term, dim)}
-    constants |= {"TOTALS": totals, "ROW_SUMS": len(term.sums) - totals}
-    query = walk(
-        "Sums",
-        opened=_OPENED + (f"typedef Math::{'f64' if double else 'f32'} number;\n" + _TAKE_LARGER + _KEEP_LARGEST) * extremes,
-        none=_NO_SUM + _NO_EXTREME * extremes,
-        begun="".join([_ADD, _LOAD_ROW, _evaluation(term, double, extremes)]),
-        settled="add_pairs(finished);",
-    )
+    constants = {**GRID, "PERIODIC": periodic, "BATCHED": batched, "SCALED": scaled, **constants_of(term, compensated, extremes)}
+    constants |= {"LIST": 0, "LATER": 0, "TAKEN": taken, "FROM_PLACES": _reads_positions(term) and not term.source_columns}
+    constants |= {"ROW_LENGTH": max(row_length(term, dim, double), 1), "PLACED": _placed_columns(term, dim)}
 
-    def kernel_of(name: str, call: str, crossing: bool = False, text: str = "") -> wp.Kernel:
+    def sorting_kernel() -> wp.Kernel:
+        text = program(double, dim, "sort_values.cuh", **constants)
+        return _kernel("sort_values", module, double, 32, "SortValues.run", text)
+
+    def query_kernel(name: str, crossing: bool = False) -> wp.Kernel:
         where = {"CROSSING": crossing, "SHIFTED": periodic if crossing else 0}
-        whole = program(double, dim, "cells.cuh", "exact.h", "math.h", given={"math.h": SCALAR}, **constants | where)
-        return _kernel(name, module, double, 32 if call == "Sums.sort_values" else blocks, call, whole + _SUMS + text)
+        text = program(double, dim, "pair_sum.cuh", given=term_header(term, double, SCALAR), **constants | where)
+        return _kernel(name, module, double, blocks, "Sums.run", text)
 
     return Kernels(
-        kernel_of("sort_values", "Sums.sort_values") if columns else None,
-        kernel_of("pair_sum", "Query.run", text=query),
-        kernel_of("crossing_pair_sum", "Query.run", crossing=True, text=query) if periodic else None,
+        sorting_kernel() if term.source_columns else None,
+        query_kernel("pair_sum"),
+        query_kernel("crossing_pair_sum", crossing=True) if periodic else None,
     )
 
 

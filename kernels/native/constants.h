@@ -27,6 +27,10 @@ constexpr bool SKIPPED = false;  // the term is not evaluated for vectors withou
 constexpr int PARTS = 256, PART = 10, TILE = 2048, BLOCK = 256, WARPS = 4224;
 constexpr bool LATER = false;     // only those neighbors that come after the query
 constexpr bool CROSSING = false;  // queries whose reach leaves a periodic box
+constexpr int TAKEN = 4;          // pairs that a lane evaluates at once
+constexpr int PLACED = 3;         // coordinates of j before its numbers, in a row of ROW_LENGTH
+constexpr int ROW_LENGTH = 4;
+constexpr bool FROM_PLACES = false;  // the term reads coordinates of j, and no numbers
 // Of searches with a cutoff per particle (see jfrnn/kernels/levels.py).
 constexpr int RULE = 0, GROUPS = 8, HALVINGS = 5, PADDING = 16;
 // Of triangles (see jfrnn/kernels/_triangles.py, triangles_cpu.py and triangles_cuda.py).

@@ -6,10 +6,12 @@
 #define JFRNN_MEMBER __device__ __forceinline__
 #define JFRNN_INLINE JFRNN_MEMBER
 #define JFRNN_CALL static __device__ __noinline__
+#define JFRNN_TABLE static __device__ constexpr
 #else
 #pragma clang fp contract(off)
 #define JFRNN_FUNCTION static
 #define JFRNN_MEMBER
 #define JFRNN_INLINE __attribute__((always_inline))
 #define JFRNN_CALL static __attribute__((noinline))
+#define JFRNN_TABLE constexpr
 #endif

@@ -1,217 +1,148 @@
-// --- part: sums
-struct SumsArguments {
-    const real *positions, *queries, *cutoff, *shared_values, *own_values, *others;
-    real *sums, *totals, *errors, *values;
-    int *info, *scratch;
-    int n, m, own, table, closed, drop_self;
-};
-// What a thread knows of a sum; of a search nothing is written but scratch.
-struct Sums : Search {
-    const real *shared_values, *own_values, *others;
-    real *sums, *totals, *errors, *values;
-    JFRNN_MEMBER explicit Sums(const SumsArguments& a)
-        : Search({a.positions, a.queries, a.cutoff, nullptr, nullptr, a.info, a.scratch, a.n, a.m, a.own, a.table, 0, a.closed,
-                  a.drop_self, 0}),
-          shared_values(a.shared_values), own_values(a.own_values), others(a.others), sums(a.sums), totals(a.totals),
-          errors(a.errors), values(a.values) {}
+// Sums over pairs on CUDA: terms are evaluated where their pairs are found, by the lane of the query.
+//
+// Several pairs are taken at once, and what is read of the next ones is loaded meanwhile: it takes longer than what is done with it.
+// Two sets take turns, since to copy one would be to wait for it. Whether more is left is asked in between, since the compiler puts
+// what is loaded off until it is used, but not beyond that question.
+#pragma once
+#include "held.cuh"
+#include "reduction.cuh"
+#include "sort_values.cuh"
+#include "walk.cuh"
 
-    // Puts what a term reads of the sources into the order of cells, a row each, 16 bytes at a time.
-    JFRNN_MEMBER void sort_values() {
-        constexpr int AT_ONCE = 16 / sizeof(real), CHUNK = ROW_LENGTH < AT_ONCE ? ROW_LENGTH : AT_ONCE, CHUNKS = ROW_LENGTH / CHUNK;
-        struct alignas(CHUNK * sizeof(real)) Chunk { real at[CHUNK]; };  // what a thread writes at once
-        for (long long t = thread; t < (long long)CHUNKS * n; t += threads) {
-            const Place from = sorted[t / CHUNKS];
-            const real* const row = others + (long long)OTHERS * id_of(from.id);
-            Chunk chunk;
-#pragma unroll
-            for (int k = 0; k < CHUNK; ++k) {
-                const int c = (int)(t % CHUNKS) * CHUNK + k, column = c - PLACED;
-                const real along = c == 0 ? from.p[0] : c == 1 ? from.p[1] : from.p[2];
-                chunk.at[k] = column < 0 ? along : column < OTHERS ? row[column] : real(0);
-            }
-            ((Chunk*)values)[t] = chunk;
-        }
-    }
-};
-// --- part: opened
-
-const long long slot_of_totals = begin >> share_bits;
-for (int t = lane; slot_of_totals < query_blocks && t < 2 * TOTALS; t += 32)
-    totals[2 * TOTALS * slot_of_totals + t] = 0;
-// --- part: no_sum
-
-for (int r = lane; r < ROW_SUMS; r += 32)
-    sums[(long long)id * ROW_SUMS + r] = 0;
-// --- part: no_extreme
-
-for (int r = lane; r < 2 * ROW_SUMS; r += 32)
-    put_integer(2ll * ROW_SUMS * id + r, r % 2 ? 0 : n);
-// --- part: add
-
-auto two_sum = [](real& sum, real& error, real x) {  // Knuth 1969
-    const real s = Lattice::add(sum, x), b = Lattice::add(s, -sum);
-    error = Lattice::add(error, Lattice::add(Lattice::add(sum, -Lattice::add(s, -b)), Lattice::add(x, -b)));
-    sum = s;
-};
-auto add = [&](real& sum, real& error, bool is_pair, real x) {
-    if constexpr (COMPENSATED)
-        two_sum(sum, error, is_pair ? x : real(0));
-    else
-        sum = is_pair ? sum + x : sum;
-};
-auto store = [&](long long at, real sum, real error, bool fresh, bool finished) {
-    real all = fresh ? real(0) : sums[at], carried = fresh || !COMPENSATED ? real(0) : errors[at];
-    add(all, carried, true, sum);
-    carried += error;
-    if (COMPENSATED && finished && Bits::finite(all))
-        all += carried;
-    if (COMPENSATED && !finished)
-        errors[at] = carried;
-    sums[at] = all;
-};
-auto add_total = [&](int t, real sum, real error) {  // of all lanes, always in the same order
-    for (int step = 16; step > 0; step /= 2) {
-        const real other = __shfl_down_sync(ALL, sum, step), other_error = __shfl_down_sync(ALL, error, step);
-        two_sum(sum, error, other);
-        error += other_error;
-    }
-    if (lane == 0) {
-        real* const part = totals + 2 * TOTALS * slot_of_totals + t;
-        two_sum(part[0], part[TOTALS], sum);
-        part[TOTALS] += error;
-    }
-};
-// --- part: keep_largest
-
-int code_at_home = 1;
-for (int k = 0; PERIODIC && k < DIM; ++k)
-    code_at_home *= 2 * lattice.images(k) + 1;
-code_at_home /= 2;
-auto keep_largest = [&](long long at, real best, int of, int code, bool fresh) {
-    real x = fresh ? -INF : sums[at];
-    int source = fresh ? n : integer_at(2 * at), image = fresh ? 0 : integer_at(2 * at + 1);
-    take_larger(best, of, code, true, x, source, image);
-    sums[at] = x;
-    put_integer(2 * at, source);
-    put_integer(2 * at + 1, image);
-};
-// --- part: load_row
-
-struct Row { real at[ROW_LENGTH]; };
-auto load_words = [](const void* from, auto* to) {
+// What is loaded here comes in the order of the text, all of several pairs before any of it is used: else the compiler saves
+// registers, and every pair waits for its own.
+template <class Words>
+JFRNN_FUNCTION void load_words(const void* from, Words* to) {
     unsigned int w[4];
     const size_t at = __cvta_generic_to_global(from);
-    if constexpr (sizeof(*to) == 16)
+    if constexpr (sizeof(Words) == 16)
         asm volatile("ld.global.nc.v4.b32 {%0, %1, %2, %3}, [%4];" : "=r"(w[0]), "=r"(w[1]), "=r"(w[2]), "=r"(w[3]) : "l"(at));
-    else if constexpr (sizeof(*to) == 8)
+    else if constexpr (sizeof(Words) == 8)
         asm volatile("ld.global.nc.v2.b32 {%0, %1}, [%2];" : "=r"(w[0]), "=r"(w[1]) : "l"(at));
     else
         asm volatile("ld.global.nc.b32 %0, [%1];" : "=r"(w[0]) : "l"(at));
-    memcpy(to, w, sizeof(*to));
-};
-auto load_id_now = [](unsigned int at) -> int {
+    memcpy(to, w, sizeof(Words));
+}
+JFRNN_FUNCTION int load_id_now(unsigned int at) {
     int id;
     asm volatile("ld.shared.u32 %0, [%1];" : "=r"(id) : "r"(at));
     return id;
-};
-auto load_row = [&](int place) -> Row {
-    constexpr int TOGETHER = ROW_LENGTH * sizeof(real) < 16 ? ROW_LENGTH : 16 / sizeof(real);
-    struct Part { real at[TOGETHER]; };
-    Row row;
+}
+// Loads LENGTH numbers, as many at once as 16 bytes hold.
+template <int LENGTH>
+JFRNN_FUNCTION void load_numbers(const void* from, real* to) {
+    constexpr int TOGETHER = LENGTH * sizeof(real) < 16 ? LENGTH : 16 / sizeof(real);
+    struct Part {
+        real at[TOGETHER];
+    };
 #pragma unroll
-    for (int p = 0; p < ROW_LENGTH / TOGETHER; ++p) {
+    for (int p = 0; p < LENGTH / TOGETHER; ++p) {
         Part part;
-        load_words((const Part*)(values + (long long)ROW_LENGTH * place) + p, &part);
+        load_words((const Part*)from + p, &part);
 #pragma unroll
         for (int c = 0; c < TOGETHER; ++c)
-            row.at[TOGETHER * p + c] = part.at[c];
+            to[TOGETHER * p + c] = part.at[c];
     }
-    return row;
-};
-auto load_place = [&](int place) -> Place {
-    struct Part { real at[16 / sizeof(real)]; };
-    Part parts[4 * sizeof(real) / 16];
-#pragma unroll
-    for (int p = 0; p < (int)(4 * sizeof(real) / 16); ++p)
-        load_words((const Part*)(sorted + place) + p, parts + p);
-    Place there;
-    memcpy(&there, parts, sizeof there);
-    return there;
-};
-// --- part: add_pairs
+}
 
-bool fresh = true;  // there are no sums of this group yet
-auto add_pairs = [&](bool finished) {
-    const unsigned int behind = 1u << tested / 32;  // the block behind the last one: nobody has met it
-    warp.hits[tested / 32][lane] = 0;
-    met_in |= behind;
-    // a lane that has no pair left reads the id behind a block's, and nothing comes of it; but it must be a place
-    if (lane < 2 && kept <= tested + 32 * lane)
-        warp.ids[tested + 32 * lane] = 0;
-    __syncwarp();
-    const long long own_at = (long long)my_id * OWN, at = (long long)my_id * ROW_SUMS;
-    $values
-    $started
-    $held_pairs
-    // Several pairs at once, and what is read of the next ones meanwhile: it takes longer than what is done with it. Two sets take
-    // turns, since to copy one would be to wait for it; and it is asked in between whether more is left, since the compiler puts
-    // what is loaded off until it is used, but not beyond that question.
-    struct Taken {
-        bool pairs[TAKEN];
-        $fields
-    };
-    auto take = [&](Taken& taken) {
+// Pairs that a lane takes at once, and what is loaded of them; only what is read takes registers.
+struct Taken {
+    bool pairs[TAKEN];
+    int id[TAKEN];
+    struct Numbers {
+        real at[ROW_LENGTH];  // what the term reads of j, coordinates first
+        real place[4];        // coordinates of j, and its id, as a `Place` has them
+    } numbers[TAKEN];
+};
+
+struct Sums : Walk<Sums> {
+    static constexpr bool NAMED = SUMS == 2;  // the sources of summands are asked for
+    const real *shared_values, *own_values, *values;
+    const Results results;
+    const int code_at_home;  // of the image in the box
+
+    JFRNN_MEMBER explicit Sums(const SumsArguments& a)
+        : Walk(a.of_search()),
+          shared_values(a.shared_values),
+          own_values(a.own_values),
+          values(a.values),
+          results{a.sums, a.errors, a.n, a.totals},
+          code_at_home(NAMED ? (count_codes() - 1) / 2 : 0) {}
+
+    JFRNN_MEMBER void open(int block) {
+        for (int t = lane; block < query_blocks && t < 2 * TOTALS; t += 32)
+            results.totals[2ll * TOTALS * block + t] = 0;
+    }
+    JFRNN_MEMBER void none(int id) { results.clear(id, lane, 32); }
+    JFRNN_MEMBER void done(const Group&, int) {}
+
+    // Reduces the pairs that are held to what their queries get.
+    JFRNN_MEMBER void settle(const Group& group, const Pairs& pairs, bool finished) {
+        Warp& warp = shared_warp();
+        warp.hits[pairs.tested / 32][lane] = 0;  // of the block behind the last one: nobody has met it
+        // a lane that has no pair left reads the id behind a block's, and nothing comes of it; but it must be a place
+        if (lane < 2 && pairs.kept <= pairs.tested + 32 * lane)
+            warp.ids[pairs.tested + 32 * lane] = 0;
+        __syncwarp();
+        const Term term(shared_values);
+        const Place here = lane < group.size ? load_query(group.place + lane) : Place{{0, 0, 0}, 0};
+        const Term::Own own_part = term.own(own_values + (long long)group.my_id * OWN, here.p);
+        Reduction reduction(n);
+        HeldPairs held(pairs, lane);
+        held.advance();
+        held.advance();
+        Taken some, others;
+        take(held, some);
+        while (__any_sync(ALL, some.pairs[0])) {
+            take(held, others);
+            evaluate(term, own_part, some, reduction);
+            if (!__any_sync(ALL, others.pairs[0]))
+                break;
+            take(held, some);
+            evaluate(term, own_part, others, reduction);
+        }
+        reduction.store(results, {lane, group.my_id, group.place >> share_bits, lane < group.size, pairs.fresh, finished});
+    }
+    // Takes the next pairs of a block, and loads what is read of them.
+    JFRNN_MEMBER void take(HeldPairs& held, Taken& taken) {
         unsigned int at[TAKEN];
 #pragma unroll
         for (int k = 0; k < TAKEN; ++k) {
-            const unsigned int below = hits - 1;
-            taken.pairs[k] = hits != 0;
-            at[k] = ids + 4 * __popc(below & ~hits);
-            hits &= below;
+            taken.pairs[k] = held.hits != 0;
+            at[k] = held.take();
         }
-        $loaded
-        advance();
-    };
-    auto evaluate = [&](const Taken& now) {
+#pragma unroll
+        for (int k = 0; k < TAKEN; ++k)
+            taken.id[k] = load_id_now(at[k]);
+        if constexpr (NAMED || FROM_PLACES)
+#pragma unroll
+            for (int k = 0; k < TAKEN; ++k)
+                load_numbers<4>(sorted + source_of(taken.id[k]), taken.numbers[k].place);
+        if constexpr (OTHERS + STEPS > 0)
+#pragma unroll
+            for (int k = 0; k < TAKEN; ++k)
+                load_numbers<ROW_LENGTH>(values + (long long)ROW_LENGTH * source_of(taken.id[k]), taken.numbers[k].at);
+        held.advance();
+    }
+    JFRNN_MEMBER void evaluate(const Term& term, const Term::Own& own_part, const Taken& taken, Reduction& reduction) {
 #pragma unroll
         for (int k = 0; k < TAKEN; ++k) {
-            const bool is_pair = now.pairs[k];
-            $row
-            $term
+            const Taken::Numbers& numbers = taken.numbers[k];
+            int shift[3] = {0, 0, 0};
+            if constexpr (CROSSING && STEPS > 0)
+                shift_of(image_of(taken.id[k]), shift);
+            auto column = [&](int c) -> number {  // of j, and behind them steps of the lattice
+                if (c < OTHERS)
+                    return numbers.at[PLACED + c];
+                const int axis = STEP_AXES[c - OTHERS];
+                return real(shift[axis] - Lattice::turn(numbers.at[PLACED + OTHERS], axis));
+            };
+            number summand[SUMMANDS];
+            term.evaluate(own_part, FROM_PLACES ? numbers.place : numbers.at, column, summand);
+            reduction.add(summand, taken.pairs[k], [&](int& source, int& code) {
+                source = id_of(numbers.place[3]);
+                code = CROSSING ? image_of(taken.id[k]) : code_at_home;
+            });
         }
-    };
-    advance();
-    advance();
-    Taken some, others;
-    take(some);
-    while (__any_sync(ALL, some.pairs[0])) {
-        take(others);
-        evaluate(some);
-        if (!__any_sync(ALL, others.pairs[0]))
-            break;
-        take(some);
-        evaluate(others);
     }
-    $stored
-    met_in = 0;
-    fresh = false;
-};
-// --- part: take_larger
-
-auto take_larger = [](number x, Math::i32 source, Math::i32 code, Math::flag among, number& best, Math::i32& of, Math::i32& at) {
-    const Math::flag is_nan = Math::ne(x, x), was_nan = Math::ne(best, best);
-    const Math::flag larger = Math::either(Math::gt(x, best), Math::both(is_nan, Math::inverse(was_nan)));
-    const Math::flag same = Math::either(Math::eq(x, best), Math::both(is_nan, was_nan));
-    const Math::flag first = Math::either(Math::lt(source, of), Math::both(Math::eq(source, of), Math::lt(code, at)));
-    const Math::flag taken = Math::both(among, Math::either(larger, Math::both(same, first)));
-    best = Math::select(taken, x, best);
-    of = Math::select(taken, source, of);
-    at = Math::select(taken, code, at);
-};
-auto integer_at = [&](long long at) -> int { return Lattice::packed_turns(errors[at]); };
-auto put_integer = [&](long long at, int x) {
-    if constexpr (DOUBLE)
-        errors[at] = x;
-    else
-        memcpy(errors + at, &x, 4);
 };

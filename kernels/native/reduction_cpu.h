@@ -1,9 +1,6 @@
 // What becomes of the summands of a query on the CPU: they are added up, or the largest ones are found.
 #pragma once
-#include "bits.h"
-#include "term.h"
-
-constexpr int SUMMANDS = TOTALS + ROW_SUMS;
+#include "reduction.h"
 
 static Math::flag flags_of(unsigned int bits) {
     Math::flag lanes;
@@ -11,29 +8,14 @@ static Math::flag flags_of(unsigned int bits) {
     return lanes;
 }
 
-// Where sums go: `sums` and `errors` have a row per query, `totals` two per chunk. `errors` is what rounding took, in sums that are
-// carried in twice the precision; of extremes it has the source and the code of the image of each, as integers among floats.
-struct Results {
-    real *sums, *totals, *errors;
-    int n;                                              // sources: that number of one is none
+// Where sums go: rows of queries, and of `totals` two per chunk, with what rounding took of them.
+struct Results : SumRows {
+    real* totals;
     real total[TOTALS + 1], total_carried[TOTALS + 1];  // of this chunk
 
-    Results(real* sums, real* totals, real* errors, int n) : sums(sums), totals(totals), errors(errors), n(n) {
+    Results(real* sums, real* totals, real* errors, int n) : SumRows{sums, errors, n}, totals(totals) {
         for (int t = 0; t <= TOTALS; ++t)
             total[t] = total_carried[t] = 0;
-    }
-    void put_integer(long long at, int x) {
-        if constexpr (DOUBLE)
-            errors[at] = x;
-        else
-            memcpy(errors + at, &x, 4);
-    }
-    int integer_at(long long at) const { return Lattice::packed_turns(errors[at]); }
-    void clear(int id) {
-        for (int r = 0; r < ROW_SUMS; ++r)
-            sums[(long long)id * ROW_SUMS + r] = 0;
-        for (int r = 0; SUMS == 2 && r < ROW_SUMS; ++r)
-            put_integer(2 * ((long long)id * ROW_SUMS + r), n);
     }
     void store_totals(int chunk) {
         for (int t = 0; t < TOTALS; ++t) {
@@ -43,14 +25,6 @@ struct Results {
         }
     }
 };
-
-// Knuth 1969: the exact sum stays in both.
-template <class Number>
-JFRNN_INLINE static void two_sum(Number& sum, Number& error, Number x) {
-    const Number s = sum + x, b = s - sum;
-    error = error + ((sum - (s - b)) + (x - b));
-    sum = s;
-}
 
 struct Added {
     number sum[SUMMANDS], error[SUMMANDS];
@@ -117,39 +91,8 @@ struct Added {
     }
 };
 
-// Of each summand the largest, its source and the code of its image. NaN is larger than all; of equal ones comes first the smallest
-// source, then the smallest image.
-struct Largest {
-    number best[SUMMANDS];
-    Math::i32 source_of[SUMMANDS], code_of[SUMMANDS];
-
-    explicit Largest(int n) {
-#pragma unroll
-        for (int k = 0; k < SUMMANDS; ++k) {
-            best[k] = Math::of(-Bits::not_finite());
-            source_of[k] = Math::i32{} + n;
-            code_of[k] = Math::i32{};
-        }
-    }
-    // `names` tells the sources and the images of the lanes.
-    template <class Names>
-    JFRNN_INLINE void add(const number* summand, Math::flag pairs, Names names) {
-        Math::i32 source, code;
-        names(source, code);
-#pragma unroll
-        for (int k = 0; k < SUMMANDS; ++k) {
-            const number x = summand[k];
-            const Math::flag is_nan = Math::ne(x, x), was_nan = Math::ne(best[k], best[k]);
-            const Math::flag larger = Math::either(Math::gt(x, best[k]), Math::both(is_nan, Math::inverse(was_nan)));
-            const Math::flag same = Math::either(Math::eq(x, best[k]), Math::both(is_nan, was_nan));
-            const Math::flag same_source = Math::both(Math::eq(source, source_of[k]), Math::lt(code, code_of[k]));
-            const Math::flag first = Math::either(Math::lt(source, source_of[k]), same_source);
-            const Math::flag taken = Math::both(pairs, Math::either(larger, Math::both(same, first)));
-            best[k] = Math::select(taken, x, best[k]);
-            source_of[k] = Math::select(taken, source, source_of[k]);
-            code_of[k] = Math::select(taken, code, code_of[k]);
-        }
-    }
+struct Largest : LargestSummands {
+    explicit Largest(int n) : LargestSummands(n) {}
     JFRNN_INLINE void store(Results& results, int id, bool fresh, bool) {
 #pragma unroll
         for (int k = 0; k < SUMMANDS; ++k) {
@@ -173,12 +116,4 @@ struct Largest {
     }
 };
 
-template <int WHICH>
-struct ReductionOf {
-    typedef Added type;
-};
-template <>
-struct ReductionOf<2> {
-    typedef Largest type;
-};
-typedef ReductionOf<SUMS>::type Reduction;
+typedef ReductionOf<SUMS, Added, Largest>::type Reduction;

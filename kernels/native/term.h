@@ -5,17 +5,17 @@
 
 typedef Math::f32 number;
 // Is a summand added up over all pairs, or over the neighbors of each i? And which one of these sums is it?
-constexpr bool IS_TOTAL[] = {true, false};
-constexpr int PLACE[] = {0, 0};
-constexpr int STEP_AXES[] = {0};
+JFRNN_TABLE bool IS_TOTAL[] = {true, false};
+JFRNN_TABLE int PLACE[] = {0, 0};
+JFRNN_TABLE int STEP_AXES[] = {0};
 
 struct Term {
     struct Own {};  // what is read of i
-    explicit Term(const real*) {}
-    Own own(const real*, const real*) const { return {}; }
+    JFRNN_MEMBER explicit Term(const real*) {}
+    JFRNN_MEMBER Own own(const real*, const real*) const { return {}; }
     // The summands of pairs: of i, of those j whose coordinates are `p` and whose numbers are `column(c)`.
     template <class Column>
-    void evaluate(const Own&, const number* p, Column column, number* summand) const {
+    JFRNN_MEMBER void evaluate(const Own&, const number* p, Column column, number* summand) const {
         const auto v = p[0] * column(0);
         summand[0] = v;
         summand[1] = v * v;

@@ -1,0 +1,102 @@
+// How the queries of a group meet a block of 32 candidates: a neighbor is a bit.
+#pragma once
+#include "candidates.cuh"
+
+// Bits of a block, one per candidate: those that are surely near the query of this lane, and those that are decided one by one.
+struct BlockBits {
+    unsigned int hits, open;
+};
+// Meets the block on tensor cores (float32).
+JFRNN_FUNCTION BlockBits meet_as_matrix(const Matrix& matrix, unsigned int first_candidate, int lane) {
+    unsigned int closest = 0x7fffffff, open = 0;
+    const unsigned int hits = matrix.meet(first_candidate, 0, closest, lane);
+    const unsigned int until = __float_as_uint((float)shared_warp().box.half[3]);
+    if (__any_sync(ALL, (int)closest <= (int)until))
+        open = matrix.meet(first_candidate, until + 1, closest, lane) & ~hits;
+    return {hits, open};
+}
+// Meets the block one by one (float64).
+JFRNN_FUNCTION BlockBits meet_one_by_one(const PairSearch& search, const real* q, unsigned int first_candidate) {
+    const Warp& warp = shared_warp();
+    unsigned int hits = 0, open = 0, closest = 0x7fffffff;
+    constexpr int ALONG = 16 / sizeof(real);  // candidates whose coordinate one load brings
+#pragma unroll
+    for (int j = 32 - ALONG; j >= 0; j -= ALONG) {
+        struct alignas(16) Loaded {
+            real x[ALONG];
+        } loaded[DIM];
+#pragma unroll
+        for (int a = 0; a < DIM; ++a)
+            loaded[a] = *(const Loaded*)(warp.candidates[a] + first_candidate + j);
+#pragma unroll
+        for (int e = ALONG - 1; e >= 0; --e) {
+            real p[DIM];
+#pragma unroll
+            for (int a = 0; a < DIM; ++a)
+                p[a] = loaded[a].x[e];
+            const unsigned int over = upper_word(search.excess(q, p));
+            hits = __funnelshift_l(over, hits, 1);
+            closest = min(closest, over);
+        }
+    }
+    if (__any_sync(ALL, (int)closest <= (int)upper_word(2 * search.band)))
+#pragma unroll 4
+        for (int j = 0; j < 32; ++j) {
+            real p[DIM];
+#pragma unroll
+            for (int a = 0; a < DIM; ++a)
+                p[a] = warp.candidates[a][first_candidate + j];
+            const real over = search.excess(q, p);
+            open |= over >= 0 && over <= 2 * search.band ? 1u << j : 0;
+        }
+    return {hits, open};
+}
+// Returns the candidates of a block that a query may meet at all: those that there are, not itself, and of half lists later ones.
+JFRNN_FUNCTION unsigned int find_met(const PairSearch& search, const Group& group, Pairs& pairs, unsigned int first_candidate) {
+    const unsigned int here = pairs.kept - pairs.tested < 32 ? pairs.kept - pairs.tested : 32;
+    unsigned int met = search.lane < group.size ? ALL >> (32 - here) : 0;
+    if (pairs.meets_itself)
+        met &= ~(1u << search.lane);
+    pairs.meets_itself = false;
+    if constexpr (LATER) {
+        unsigned int earlier = 0;
+#pragma unroll
+        for (int j = 31; j >= 0; --j) {
+            const int candidate = shared_warp().candidate_ids[first_candidate + j];
+            const int later_by = search.order_of(candidate) - search.first_after(group.my_id);
+            earlier = __funnelshift_l((unsigned int)later_by, earlier, 1);
+        }
+        met &= ~earlier;
+    }
+    return met;
+}
+// Lets the queries meet the next block of candidates.
+JFRNN_FUNCTION void meet_block(
+    const PairSearch& search, const Group& group, Matrix& matrix, Candidates& candidates, Aside& aside, Pairs& pairs) {
+    Warp& warp = shared_warp();
+    const unsigned int first_candidate = pairs.tested % RING;
+    const unsigned int met = find_met(search, group, pairs, first_candidate);
+    BlockBits block;
+    if constexpr (DOUBLE)
+        block = meet_one_by_one(search, group.mine.p, first_candidate);
+    else
+        block = meet_as_matrix(matrix, first_candidate, search.lane);
+    unsigned int hits = block.hits & met, open = block.open & met;
+    if (__any_sync(ALL, open)) {
+        aside.put(candidates, matrix);
+        const bool has_it = DOUBLE || CROSSING;
+        const Place query = has_it ? group.mine : open ? search.load_query(group.place + search.lane) : Place{{0, 0, 0}, 0};
+        for (; open; open &= open - 1) {
+            const int j = __ffs(open) - 1;
+            const int id = HELD ? warp.ids[pairs.tested + j] : warp.candidate_ids[first_candidate + j];
+            hits |= search.is_neighbor(query.p, group.my_id, id) ? 1u << j : 0;
+        }
+        aside.take_back(candidates, matrix);
+    }
+    pairs.found += __popc(hits);
+    if constexpr (HELD) {
+        warp.hits[pairs.tested / 32][search.lane] = hits;
+        pairs.met_in |= hits ? 1u << pairs.tested / 32 : 0;
+    }
+    pairs.tested += 32;
+}

@@ -1,0 +1,102 @@
+// What becomes of the summands of a query on CUDA: they are added up, or the largest ones are found.
+#pragma once
+#include "cells.cuh"
+#include "reduction.h"
+
+// Where sums go: rows of queries, and of sums over all pairs two numbers per block of shares: a part, and what rounding took of it.
+struct Results : SumRows {
+    real* totals;
+
+    // Adds numbers of all lanes, always in the same order, to the part of a block.
+    JFRNN_MEMBER void add_total(int t, real sum, real error, int block, int lane) const {
+        for (int step = 16; step > 0; step /= 2) {
+            const real other = __shfl_down_sync(ALL, sum, step), other_error = __shfl_down_sync(ALL, error, step);
+            two_sum(sum, error, other);
+            error += other_error;
+        }
+        if (lane == 0) {
+            real* const part = totals + 2ll * TOTALS * block + t;
+            two_sum(part[0], part[TOTALS], sum);
+            part[TOTALS] += error;
+        }
+    }
+};
+
+// The query whose summands are reduced; `fresh`: it has nothing yet, `finished`: nothing follows.
+struct Destination {
+    int lane, id, block;
+    bool is_query, fresh, finished;  // there is a query in this lane
+};
+
+// Sums, and what rounding took of them, which is added in the end, or goes on as they do.
+struct Added {
+    real sum[SUMMANDS], error[SUMMANDS];
+
+    JFRNN_MEMBER explicit Added(int) {
+#pragma unroll
+        for (int k = 0; k < SUMMANDS; ++k)
+            sum[k] = error[k] = 0;
+    }
+    JFRNN_FUNCTION void add_number(real& sum, real& error, bool is_pair, real x) {
+        if constexpr (COMPENSATED)
+            two_sum(sum, error, is_pair ? x : real(0));
+        else
+            sum = is_pair ? sum + x : sum;
+    }
+    template <class Names>
+    JFRNN_MEMBER void add(const number* summand, bool is_pair, Names) {
+#pragma unroll
+        for (int k = 0; k < SUMMANDS; ++k)
+            add_number(sum[k], error[k], is_pair, summand[k]);
+    }
+    // Adds to what the query has already, and to the totals of its block.
+    JFRNN_MEMBER void store(const Results& results, const Destination& of) const {
+        if (of.is_query)
+#pragma unroll
+            for (int k = 0; k < SUMMANDS; ++k)
+                if (!IS_TOTAL[k])
+                    store_row(results, (long long)of.id * ROW_SUMS + PLACE[k], sum[k], error[k], of);
+#pragma unroll
+        for (int k = 0; k < SUMMANDS; ++k)
+            if (IS_TOTAL[k])
+                results.add_total(PLACE[k], sum[k], error[k], of.block, of.lane);
+    }
+    JFRNN_FUNCTION void store_row(const Results& results, long long at, real sum, real error, const Destination& of) {
+        real all = of.fresh ? real(0) : results.sums[at];
+        real carried = of.fresh || !COMPENSATED ? real(0) : results.errors[at];
+        add_number(all, carried, true, sum);
+        carried += error;
+        if (COMPENSATED && of.finished && Bits::finite(all))
+            all += carried;
+        if (COMPENSATED && !of.finished)
+            results.errors[at] = carried;
+        results.sums[at] = all;
+    }
+};
+
+struct Largest : LargestSummands {
+    JFRNN_MEMBER explicit Largest(int n) : LargestSummands(n) {}
+    // Keeps what is larger than what the query has already.
+    JFRNN_MEMBER void store(const Results& results, const Destination& of) const {
+        if (!of.is_query)
+            return;
+        LargestSummands kept(results.n);
+        const long long at = (long long)of.id * SUMMANDS;
+        if (!of.fresh)
+#pragma unroll
+            for (int k = 0; k < SUMMANDS; ++k) {
+                kept.best[k] = results.sums[at + k];
+                kept.source_of[k] = results.integer_at(2 * (at + k));
+                kept.code_of[k] = results.integer_at(2 * (at + k) + 1);
+            }
+#pragma unroll
+        for (int k = 0; k < SUMMANDS; ++k) {
+            kept.take(k, best[k], source_of[k], code_of[k], true);
+            results.sums[at + k] = kept.best[k];
+            results.put_integer(2 * (at + k), kept.source_of[k]);
+            results.put_integer(2 * (at + k) + 1, kept.code_of[k]);
+        }
+    }
+};
+
+typedef ReductionOf<SUMS, Added, Largest>::type Reduction;
