@@ -24,15 +24,19 @@ QUERY_BLOCK = 32  # one warp: others need not wait for it to end
 _PARTS = 256  # blocks of `bounds`; one thread of a block reads one part
 _PART = 10  # numbers of a part
 _TILE = 2048  # cells that a block of `scan` takes
-# Among which few queries are shared, at most: 32 per multiprocessor of an H200; half and twice as many took longer there.
-_WARPS = 4224
+# How many warps few queries are shared among, at most. In which groups queries walk decides the order of rows and of sums, and the
+# number of shares the size of buffers that are laid out when a program is traced, maybe on another machine. So this is a property
+# of programs, not of the device: one with more or fewer multiprocessors runs as many warps, and gets the same bits. It is about 32
+# per multiprocessor of large GPUs; half and twice as many took longer on one of 132.
+_WARPS = 4096
 # what all kernels of a search must agree on
 GRID = {"REACH": 1, "REACH_X": 6, "PARTS": _PARTS, "PART": _PART, "TILE": _TILE, "BLOCK": BLOCK, "WARPS": _WARPS}
 _HEADER_WORDS = 64
-_SWEEP_BLOCKS = 1056  # blocks of the kernels that walk over all particles
-_CROSSING_BLOCKS = 8448  # blocks of the kernel for queries whose reach leaves a box: what is to do is known to the device only
-_RESIDENT = 132  # blocks of those that walk over the cells: all at work at once
-_GATHERING = (8, 6)  # blocks of `gather` that are at work at once per multiprocessor, in open space and in a box
+# Blocks of kernels that walk in strides, per multiprocessor: no result depends on how many there are.
+_SWEEP = 8  # over all particles
+_CROSSING = 64  # over queries whose reach leaves a box: how many there are is known to the device only
+_RESIDENT = 1  # over the cells
+_GATHERING = (8, 6)  # of `gather`, in open space and in a box: all are at work at once
 # Beyond, Warp rounds the grid up to whole multiples, and threads that do not run count in a stride: what walks in strides would
 # leave out what they should have done.
 MOST_IN_STRIDES = 2**24
@@ -75,26 +79,26 @@ class Kernels(NamedTuple):
     query: wp.Kernel
     crossing: wp.Kernel | None
 
-    def launches(self, n: int, m: int, own: bool) -> list[Launch]:
-        """Return what is launched, in order, for n sources and m queries."""
-        return self.stages(n, m, own) + walks(self.query, self.crossing, m)
+    def launches(self, n: int, m: int, own: bool, multiprocessors: int) -> list[Launch]:
+        """Return what is launched, in order, for n sources and m queries, on a device of so many multiprocessors."""
+        return self.stages(n, m, own, multiprocessors) + walks(self.query, self.crossing, m, multiprocessors)
 
-    def stages(self, n: int, m: int, own: bool) -> list[Launch]:
+    def stages(self, n: int, m: int, own: bool, multiprocessors: int) -> list[Launch]:
         """Return those that sort sources and queries by cell."""
-        table = table_cells(n)
-        tiles = min((table + 1) // _TILE + 1, _RESIDENT)
-        clearing = min(-(-table // (8 * BLOCK)), _RESIDENT) * BLOCK
+        table, resident = table_cells(n), _RESIDENT * multiprocessors
+        tiles = min((table + 1) // _TILE + 1, resident)
+        clearing = min(-(-table // (8 * BLOCK)), resident) * BLOCK
         launches = [Launch(self.bounds, _PARTS * BLOCK, BLOCK, False), Launch(self.lay_out, clearing, BLOCK, False)]
         for of_queries in (False,) if own else (False, True):
             size = m if of_queries else n
-            sweep = min(-(-size // BLOCK), _SWEEP_BLOCKS) * BLOCK
+            sweep = min(-(-size // BLOCK), _SWEEP * multiprocessors) * BLOCK
             launches += [
                 Launch(self.count, sweep, BLOCK, of_queries),
                 Launch(self.scan, tiles * BLOCK, BLOCK, of_queries),
                 Launch(self.scatter, sweep, BLOCK, of_queries),
             ]
             if not of_queries or self.crossing is not None:
-                most = _RESIDENT * _GATHERING[self.crossing is not None]
+                most = multiprocessors * _GATHERING[self.crossing is not None]
                 launches.append(Launch(self.gather, min(-(-size // BLOCK), most) * BLOCK, BLOCK, of_queries))
         return launches
 
@@ -122,12 +126,13 @@ def _shares(m: int, bits: int) -> int:
     return -(-m >> bits)
 
 
-def walks(query: wp.Kernel, crossing: wp.Kernel | None, m: int) -> list[Launch]:
+def walks(query: wp.Kernel, crossing: wp.Kernel | None, m: int, multiprocessors: int) -> list[Launch]:
     """Return the launches that walk over m queries: those whose reach leaves a periodic box have a kernel of their own."""
     threads = query_blocks(m) * QUERY_BLOCK
     if crossing is None:
         return [Launch(query, threads, QUERY_BLOCK, False)]
-    first = Launch(crossing, min(threads, _CROSSING_BLOCKS * QUERY_BLOCK), QUERY_BLOCK, False)  # what takes longest
+    most = _CROSSING * multiprocessors * QUERY_BLOCK
+    first = Launch(crossing, min(threads, most), QUERY_BLOCK, False)  # what takes longest
     return [first, Launch(query, threads, QUERY_BLOCK, False, beside=True)]
 
 

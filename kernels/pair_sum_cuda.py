@@ -63,11 +63,11 @@ class Kernels(NamedTuple):
     query: wp.Kernel
     crossing: wp.Kernel | None
 
-    def launches(self, n: int, m: int) -> list[Launch]:
-        """Return what is launched, in order, for n sources and m queries, which are sorted already."""
+    def launches(self, n: int, m: int, multiprocessors: int) -> list[Launch]:
+        """Return what is launched, in order, for n sources and m queries, which are sorted already; as in a search."""
         threads = min(-(-n // QUERY_BLOCK) * QUERY_BLOCK, MOST_IN_STRIDES)
         sorting = [] if self.sort_values is None else [Launch(self.sort_values, threads, QUERY_BLOCK, False)]
-        return sorting + walks(self.query, self.crossing, m)
+        return sorting + walks(self.query, self.crossing, m, multiprocessors)
 
     def load(self, device: wp.DeviceLike) -> None:
         """Compile and load what a launch needs: nothing is left to do while a CUDA graph is recorded."""

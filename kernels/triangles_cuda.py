@@ -36,8 +36,10 @@ BLOCK = 256
 QUERY_BLOCK = 128
 _SETTLE_BLOCK = 32
 _RUN = 64  # buckets that a thread of `allocate` takes: the cells of a block
-_SWEEP = 132 * 2048  # threads of `fill`: all at work at once
-_WORKERS = {False: 8448, True: 2112}  # threads of `settle`, by width: 38 and 58 MB of integers
+_SWEEP = 2048  # threads of `fill` per multiprocessor: all at work at once
+# Threads of `settle`, by width. Their integers take 38 and 58 MB of a buffer that is laid out when a program is traced, maybe on
+# another machine: as many on every device.
+_WORKERS = {False: 8448, True: 2112}
 _HEADER_WORDS = 16
 _QUERY_BLOCKS = {False: 5, True: 3}  # per multiprocessor, which bounds the registers; by width
 
@@ -74,13 +76,13 @@ class Kernels(NamedTuple):
     query: wp.Kernel
     settle: wp.Kernel
 
-    def launches(self, n: int, buckets: int, entries: int, capacity: int, double: bool) -> list[Launch]:
-        """Return what is launched, in order, for n particles."""
-        slots = n * capacity
+    def launches(self, n: int, buckets: int, entries: int, capacity: int, double: bool, multiprocessors: int) -> list[Launch]:
+        """Return what is launched, in order, for n particles, on a device of so many multiprocessors."""
+        filling = min(max(n * capacity // 4, 3), _SWEEP * multiprocessors)
         return [
             _launch(self.prepare, max(buckets, entries), BLOCK),
             _launch(self.place, n, BLOCK),
-            *([] if self.fill is None else [_launch(self.fill, min(max(slots // 4, 3), _SWEEP), BLOCK, beside=True)]),
+            *([] if self.fill is None else [_launch(self.fill, filling, BLOCK, beside=True)]),
             _launch(self.allocate, -(-buckets // _RUN), BLOCK),
             _launch(self.scatter, n, BLOCK),
             _launch(self.query, n, QUERY_BLOCK),

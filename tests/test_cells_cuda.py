@@ -49,7 +49,7 @@ def test_scratch_is_at_most_64_bytes_per_particle(module, n, dim):
 def test_queries_that_reach_out_of_a_box_have_a_kernel_of_their_own():
     kernels = cells_cuda.cell_kernels(3, False, False, True, periodic=1)
     for own, marks in ((True, 0), (False, 1)):
-        launches = kernels.launches(1000, 500, own)
+        launches = kernels.launches(1000, 500, own, 132)
         assert [launch.kernel for launch in launches[-2:]] == [kernels.crossing, kernels.query]
         assert [launch.beside for launch in launches] == [False] * (len(launches) - 1) + [True]
         assert [(launch.kernel, launch.of_queries) for launch in launches].count((kernels.gather, True)) == marks
@@ -58,10 +58,20 @@ def test_queries_that_reach_out_of_a_box_have_a_kernel_of_their_own():
 
 def test_queries_of_their_own_are_sorted_too():
     kernels = cells_cuda.cell_kernels(3, False, False, True)
-    own, others = (kernels.launches(1000, 500, own) for own in (True, False))
+    own, others = (kernels.launches(1000, 500, own, 132) for own in (True, False))
     assert [launch.of_queries for launch in own] == [False] * 7
     assert [launch.of_queries for launch in others].count(True) == 3
     assert all(launch.threads % launch.block == 0 for launch in own + others)
+
+
+def test_launches_follow_the_device_and_shares_of_queries_do_not():
+    kernels, n = cells_cuda.cell_kernels(3, False, False, True, periodic=1), 10**8
+    small, large = (kernels.launches(n, n, False, multiprocessors) for multiprocessors in (2, 160))
+    for few, many in zip(small, large, strict=True):
+        assert few.kernel is many.kernel
+        fixed = few.kernel in (kernels.bounds, kernels.query)
+        assert many.threads == (1 if fixed else 80) * few.threads
+    assert large[-1].threads == 32 * cells_cuda.query_blocks(n)
 
 
 def test_few_queries_are_shared_among_more_warps():

@@ -125,7 +125,7 @@ def test_terms_that_read_nothing_compile(tmp_path):
 def test_what_a_term_reads_is_sorted_before_it_is_summed():
     plan = plan_of(square_sum, *arguments(np.float32, 3)[:3])
     kernels = pair_sum_cuda.sum_kernels(plan.text, plan.key, 3, False, False, False)
-    sort_values, query = kernels.launches(1000, 500)
+    sort_values, query = kernels.launches(1000, 500, 132)
     assert (sort_values.kernel, query.kernel) == (kernels.sort_values, kernels.query)
     assert query.threads == 32 * pair_sum_cuda.slots(500)
     assert all(launch.threads % launch.block == 0 for launch in (sort_values, query))
@@ -137,9 +137,8 @@ def test_what_walks_in_strides_is_launched_as_one_grid(n):
     plan = plan_of(square_sum, *arguments(np.float32, 3)[:3])
     sums = pair_sum_cuda.sum_kernels(plan.text, plan.key, 3, False, False, False)
     search = cells_cuda.cell_kernels(3, False, False, True, periodic=1)
-    launches = [
-        launch for launch in sums.launches(n, n) + search.launches(n, n, False) if launch.kernel not in (sums.query, search.query)
-    ]
+    launches = [*sums.launches(n, n, 1000), *search.launches(n, n, False, 1000)]
+    launches = [launch for launch in launches if launch.kernel not in (sums.query, search.query)]
     assert sums.sort_values in [launch.kernel for launch in launches]
     assert all(launch.threads <= 2**24 for launch in launches)
 
@@ -148,7 +147,7 @@ def test_queries_that_leave_a_box_have_a_kernel_beside_the_others():
     masses, x, scale, _ = arguments(np.float32, 3)
     plan = plan_of(functools.partial(square_sum, box=jfrnn.Box([2.0, 2.0, 2.0])), masses, x, scale)
     kernels = pair_sum_cuda.sum_kernels(plan.text, plan.key, 3, False, False, False, periodic=1)
-    launches = kernels.launches(1000, 500)
+    launches = kernels.launches(1000, 500, 132)
     assert [launch.kernel for launch in launches] == [kernels.sort_values, kernels.crossing, kernels.query]
     assert [launch.beside for launch in launches] == [False, False, True]
 

@@ -140,6 +140,15 @@ def test_launches_have_the_arguments_of_their_kernels(lists):
         assert all(isinstance(x, wp.array) or 0 <= x < 2**31 for x in command.arguments)
 
 
+def test_slots_are_filled_by_as_many_threads_as_a_device_runs():
+    """All others are as many on each device: their buffers are laid out where a program is traced."""
+    kernels = triangles_cuda.triangle_kernels(3, False, True, False, WIDTH)
+    small, large = (kernels.launches(10**7, 1000, 1000, 32, False, multiprocessors) for multiprocessors in (2, 160))
+    factors = {few.kernel: many.threads / few.threads for few, many in zip(small, large, strict=True)}
+    assert factors.pop(kernels.fill) == 80
+    assert set(factors.values()) == {1}
+
+
 @pytest.mark.parametrize("double", [False, True])
 def test_scratch_follows_particles_and_triangles(double):
     for n in (10, 1_000_000, 100_000_000):

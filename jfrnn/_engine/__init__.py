@@ -2,7 +2,7 @@
 
 from jfrnn._engine.auto import ARRAYS, ENGINES, WARP, check_backend, choose_engine, default_platform, fastest_engine, platform_of
 from jfrnn._engine.cores import ask_for_huge_pages, on_every_core, on_one_core
-from jfrnn._engine.cuda import Command
+from jfrnn._engine.cuda import Command, multiprocessors_of
 from jfrnn._engine.launch import Kernel, kernel
 from jfrnn._engine.operands import MOST_IN_BOX, as_float
 from jfrnn._engine.problem import Engine, Filter, Inputs, Kind, Options, Search, hide_inactive, is_decidable, prepare_search

@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from jfrnn._engine.ffi import Buffer, CallFrame
-from jfrnn._engine.start import WarpDevice, WarpStream
+from jfrnn._engine.start import WarpArray, WarpDevice, WarpStream
 
 _SOON = 16  # calls with other addresses, within which the same ones must come back to be worth a graph
 _GRAPHS = 32  # that are kept per function: more than can come back so soon
@@ -27,6 +27,11 @@ class Command(NamedTuple):
     threads: int
     block: int
     beside: bool = False
+
+
+def multiprocessors_of(array: WarpArray) -> int:
+    """Return how many multiprocessors the device of an array has; the CPU, on which tests launch kernels, counts as one."""
+    return max(array.device.sm_count, 1)
 
 
 # Warp keeps one account of devices, streams and recordings for all threads; nothing is launched while this is held

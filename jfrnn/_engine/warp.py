@@ -14,7 +14,7 @@ from jax import lax
 
 from jfrnn._engine.arrays import levels_of
 from jfrnn._engine.cores import PLACES_PER_THREAD, ask_for_huge_pages, on_every_core, on_one_core
-from jfrnn._engine.cuda import Command
+from jfrnn._engine.cuda import Command, multiprocessors_of
 from jfrnn._engine.launch import Kernel, kernel, open_relay
 from jfrnn._engine.levels_warp import level_neighbors
 from jfrnn._engine.operands import MOST_IN_BOX, pack_particles, periodic_kind, space_flags
@@ -184,7 +184,7 @@ def _cuda_kernels(variant: Variant) -> CellKernels:
 def _commands(variant: Variant, *buffers: WarpArray) -> list[Command]:
     arrays, sizes, capacity = _launchable(variant, name_arrays(array_types(variant), buffers))
     arguments = [*arrays, *sizes, capacity, int(variant.closed), int(variant.keep.drop_self)]
-    launches = _cuda_kernels(variant).launches(*sizes[:2], variant.own)
+    launches = _cuda_kernels(variant).launches(*sizes[:2], variant.own, multiprocessors_of(arrays.positions))
     return [Command(x.kernel, [*arguments, int(x.of_queries)], x.threads, x.block, x.beside) for x in launches]
 
 

@@ -9,7 +9,7 @@ from jax import Array, lax
 
 from jfrnn._engine.arrays import levels_of
 from jfrnn._engine.cores import PLACES_PER_THREAD, on_every_core
-from jfrnn._engine.cuda import Command
+from jfrnn._engine.cuda import Command, multiprocessors_of
 from jfrnn._engine.launch import Kernel, kernel
 from jfrnn._engine.levels_warp import level_sums
 from jfrnn._engine.operands import pack_particles, periodic_kind, space_flags
@@ -145,7 +145,7 @@ def _sorting_commands(variant: _SumVariant, *arrays: WarpArray) -> list[Command]
     # what sorts particles takes the arguments of a search that only counts
     sizes = cell_sizes(n, m, variant.own)
     arguments = [positions, queries, cutoff, stand_in(info, 1), info, info, scratch, *sizes, 0, 0, 0]
-    stages = _stages_on_cuda(variant).stages(n, m, variant.own)
+    stages = _stages_on_cuda(variant).stages(n, m, variant.own, multiprocessors_of(positions))
     return [Command(x.kernel, [*arguments, int(x.of_queries)], x.threads, x.block) for x in stages]
 
 
@@ -186,5 +186,5 @@ def _sum_commands(variant: _SumVariant, term: TermText, *arrays: WarpArray) -> l
     n, m = given[0].shape[0], given[1].shape[0]
     sizes = cell_sizes(n, m, variant.own)
     arguments = [*given, sums, totals, errors, columns, info, scratch, *sizes, int(variant.closed), int(variant.drop_self)]
-    launches = _sum_kernels_on_cuda(variant, term).launches(n, m)
+    launches = _sum_kernels_on_cuda(variant, term).launches(n, m, multiprocessors_of(given[0]))
     return [Command(x.kernel, arguments, x.threads, x.block, x.beside) for x in launches]

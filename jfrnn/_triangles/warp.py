@@ -20,6 +20,7 @@ from jfrnn._engine import (
     kernel,
     kernels_of,
     load_warp,
+    multiprocessors_of,
     on_every_core,
     on_one_core,
 )
@@ -176,7 +177,7 @@ def _cuda_kernels(variant: _Variant) -> TriangleKernels:
 def _commands(variant: _Variant, *arrays: WarpArray) -> list[Command]:
     (n, _), faces, capacity = arrays[0].shape, arrays[1].shape[0], arrays[9].shape[1]
     sizes, workers = sizes_on_cuda(variant, arrays), kernels_of("triangles_cuda").workers_for(n, variant.double)
-    launches = _cuda_kernels(variant).launches(n, *sizes, capacity, variant.double)
+    launches = _cuda_kernels(variant).launches(n, *sizes, capacity, variant.double, multiprocessors_of(arrays[0]))
     arguments = [*arrays, n, faces, *sizes, capacity, workers]
     return [Command(x.kernel, [*arguments, x.threads], x.threads, x.block, x.beside) for x in launches]
 

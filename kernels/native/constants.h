@@ -24,7 +24,7 @@ constexpr bool COMPENSATED = true;  // sums are carried in twice the precision
 constexpr bool PACKED = false;   // what is near comes together first, so that the term is evaluated for hardly more than the pairs
 constexpr bool SKIPPED = false;  // the term is not evaluated for vectors without a pair
 // Of CUDA: what a search allocates, and how it is launched (see jfrnn/kernels/cells_cuda.py).
-constexpr int PARTS = 256, PART = 10, TILE = 2048, BLOCK = 256, WARPS = 4224;
+constexpr int PARTS = 256, PART = 10, TILE = 2048, BLOCK = 256, WARPS = 4096;
 constexpr bool LATER = false;     // only those neighbors that come after the query
 constexpr bool CROSSING = false;  // queries whose reach leaves a periodic box
 constexpr int TAKEN = 4;          // pairs that a lane evaluates at once
