@@ -22,6 +22,11 @@ def read_part(file: str, part: str) -> str:
     return dict(zip(found[::2], found[1::2], strict=True))[part]
 
 
+def fill(text: str, **names: str) -> str:
+    """Return the text with names replaced."""
+    return re.sub("|".join(rf"\b{name}\b" for name in names), lambda match: names[match[0]], text)
+
+
 def resolve(*headers: str, given: Mapping[str, str] = MappingProxyType({"constants.h": ""})) -> str:
     """Return the text of headers, each behind those that it includes, and each once.
 

@@ -14,7 +14,6 @@ import re
 from typing import NamedTuple
 
 import warp as wp
-from jfrnn.kernels._math import VECTOR
 from jfrnn.kernels._native import SPACES, bind, program
 from jfrnn.kernels.cells_cpu import CHUNK, GRID
 
@@ -127,11 +126,8 @@ def constants_of(term: TermText, compensated: bool, extremes: bool) -> dict[str,
     return found | {"OWN": own, "COMPENSATED": compensated, "SUMS": 1 + extremes}
 
 
-def term_header(term: TermText, double: bool, math: str = VECTOR) -> dict[str, str]:
-    """Return the headers of a program with a term: `term.h` holds the struct `Term`, as in the example of that name.
-
-    `math` is one of the two kinds of `jfrnn.kernels._math`.
-    """
+def term_header(term: TermText, double: bool) -> dict[str, str]:
+    """Return the header of a program with a term: `term.h` holds the struct `Term`, as in the example of that name."""
     order = [itertools.count(), itertools.count()]
     places = [next(order[part.total]) for part in term.sums]
     lines = [f"typedef Math::{'f64' if double else 'f32'} number;"]
@@ -141,7 +137,7 @@ def term_header(term: TermText, double: bool, math: str = VECTOR) -> dict[str, s
     lines += ["struct Term {", *_members(term.shared), "struct Own {", *_members(term.own)]
     lines += [*(f"number turned{c};" for c in range(len(term.steps))), "};", *_of_shared(term, double), *_of_own(term, double)]
     text = "\n".join([*lines, *_evaluation(term, double), "};", ""])
-    return {"math.h": '#include "lane_count.h"\n' + math, "term.h": '#include "lattice.h"\n#include "math.h"\n' + text}
+    return {"term.h": '#include "lattice.h"\n#include "math.h"\n' + text}
 
 
 def _members(values: tuple[Value, ...]) -> list[str]:

@@ -22,7 +22,6 @@ import functools
 from typing import NamedTuple
 
 import warp as wp
-from jfrnn.kernels._math import SCALAR
 from jfrnn.kernels._native import SPACES, bind, program
 from jfrnn.kernels.cells_cuda import (
     GRID,
@@ -111,7 +110,7 @@ def sum_kernels(
 
     def query_kernel(name: str, crossing: bool = False) -> wp.Kernel:
         where = {"CROSSING": crossing, "SHIFTED": periodic if crossing else 0}
-        text = program(double, dim, "pair_sum.cuh", given=term_header(term, double, SCALAR), **constants | where)
+        text = program(double, dim, "pair_sum.cuh", given=term_header(term, double), **constants | where)
         return _kernel(name, module, double, blocks, "Sums.run", text)
 
     return Kernels(

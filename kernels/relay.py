@@ -5,8 +5,7 @@ a program on, the main thread included: there, a handler that raises would end a
 """
 
 import warp as wp
-from jfrnn.kernels._series import fill
-from jfrnn.kernels._text import read_part
+from jfrnn.kernels._text import fill, read_part
 
 # Places in the array of words that is given: addresses of functions and locks, and numbers.
 _PLACES = ("ANSWER_HERE", "THREAD", "MAIN_THREAD", "ACQUIRE", "RELEASE", "ASKED", "ANSWERED", "FRAME", "ANSWER")

@@ -7,7 +7,6 @@ from pathlib import Path
 import jax
 import pytest
 import warp as wp
-from jfrnn.kernels import _math
 from jfrnn.kernels._native import add_program
 from jfrnn.kernels._text import resolve
 
@@ -21,7 +20,7 @@ def is_cpu_only(header):
     """Tell headers with Clang's vectors, or with calls of the CPU alone; where cutoffs differ, one text has both."""
     if header in ("levels.h", "level_rows.h", "winding.h"):
         return False
-    text = resolve(header, given={"math.h": ""})
+    text = resolve(header, given={"numbers.h": ""})
     words = ("vector_size", "__builtin_prefetch", "__atomic_fetch_add", "_cpu.h", "level_sums", "__builtin_sqrt")
     return any(word in text or word in header for word in words) and not header.endswith(".cuh")
 
@@ -31,16 +30,11 @@ def headers(cuda):
     return [name for name in found if not (cuda and name == "level_sums.h")]
 
 
-def text_of(header, cuda):
-    given = {"math.h": '#include "lane_count.h"\n' + (_math.SCALAR if cuda else _math.VECTOR)}
-    return resolve(header, given=given)
-
-
 @pytest.mark.filterwarnings("ignore:compile_aot_module")
 @pytest.mark.parametrize("cuda", [False, True], ids=["cpu", "cuda"])
 def test_headers_compile_by_themselves(cuda, tmp_path):
     module = wp.get_module(f"tests.headers.{'cuda' if cuda else 'cpu'}")
-    spaces = {add_program(module, f"// {name}\n{text_of(name, cuda)}") for name in headers(cuda)}
+    spaces = {add_program(module, f"// {name}\n{resolve(name, given={})}") for name in headers(cuda)}
     assert len(spaces) == len(headers(cuda)) >= 30
 
     def nothing(x: wp.array(dtype=float)): ...
@@ -55,7 +49,7 @@ def test_nvcc_compiles_headers(tmp_path):
     nvcc = shutil.which("nvcc")
     if nvcc is None:
         pytest.skip("no nvcc")
-    pieces = [f"namespace space_{k} {{\n{text_of(name, True)}\n}}\n" for k, name in enumerate(headers(cuda=True))]
+    pieces = [f"namespace space_{k} {{\n{resolve(name, given={})}\n}}\n" for k, name in enumerate(headers(cuda=True))]
     source = tmp_path / "headers.cu"
     source.write_text("#include <cuda_fp16.h>\n" + "".join(pieces))
     done = subprocess.run(

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import warp as wp
-from jfrnn.kernels import _math
 from jfrnn.kernels._native import add_program, program
 
 from jfrnn._sums import translate as _translate
@@ -64,7 +63,8 @@ def statements(text, real):
 def native_text(texts, real, kind, module):
     """Return a function body that runs the text of the number `which` on n columns."""
     lanes, number, of_real = LANES[real] if kind == "vector" else 1, NUMBER[real], TYPES[real]
-    given = {"math.h": f"constexpr int LANES = {lanes};\n{_math.VECTOR if kind == 'vector' else _math.SCALAR}"}
+    count = f"#define JFRNN_SCALAR {int(kind != 'vector')}\nconstexpr int LANES = {lanes};\n"
+    given = {"lane_count.h": '#include "constants.h"\n#include "device.h"\n' + count}
     space = add_program(module, program(real == "float64", 3, "float_control.h", "math.h", given=given))
     start = [f"using namespace {space};", "const FloatControl floats;"]
     if kind == "vector":

@@ -6,6 +6,7 @@
 #define JFRNN_MEMBER __device__ __forceinline__
 #define JFRNN_INLINE JFRNN_MEMBER
 #define JFRNN_CALL static __device__ __noinline__
+#define JFRNN_MATH static __device__ __forceinline__
 #define JFRNN_TABLE static __device__ constexpr
 #else
 #pragma clang fp contract(off)
@@ -13,5 +14,9 @@
 #define JFRNN_MEMBER
 #define JFRNN_INLINE __attribute__((always_inline))
 #define JFRNN_CALL static __attribute__((noinline))
+#define JFRNN_MATH static inline __attribute__((always_inline))
 #define JFRNN_TABLE constexpr
 #endif
+#define JFRNN_GENERIC  \
+    template <class T> \
+    JFRNN_MATH

@@ -4,9 +4,13 @@
 #include "device.h"
 
 #if defined(__CUDACC__)
+#define JFRNN_SCALAR 1
 constexpr int LANES = 1;
-#elif defined(__AVX512F__) && defined(__AVX512VL__)
+#else
+#define JFRNN_SCALAR 0
+#if defined(__AVX512F__) && defined(__AVX512VL__)
 constexpr int LANES = ONE_BY_ONE || !DOUBLE ? 16 : 8;
 #else
 constexpr int LANES = ONE_BY_ONE ? 16 : DOUBLE ? 4 : 8;
+#endif
 #endif
