@@ -23,15 +23,7 @@ from typing import NamedTuple
 
 import warp as wp
 from jfrnn.kernels._native import SPACES, bind, program
-from jfrnn.kernels.cells_cuda import (
-    GRID,
-    MOST_IN_STRIDES,
-    QUERY_BLOCK,
-    Launch,
-    load_walks,
-    query_blocks,
-    walks,
-)
+from jfrnn.kernels.cells_cuda import GRID, MOST_IN_STRIDES, QUERY_BLOCK, Launch, load_walks, query_blocks, walks
 from jfrnn.kernels.pair_sum_cpu import LITTLE_WORK, TermText, constants_of, term_header, work
 
 

@@ -67,7 +67,7 @@ struct Math : VectorSeries {
     JFRNN_GENERIC T ceil(T x) { return __builtin_elementwise_ceil(x); }
     JFRNN_GENERIC T round(T x) { return __builtin_elementwise_round(x); }
     JFRNN_GENERIC T round_even(T x) { return __builtin_elementwise_rint(x); }
-#define JFRNN_CALLED(Real, name, called)                                             \
+#define JFRNN_CALLED_AS(Real, name, called)                                          \
     JFRNN_MATH Real name(Real x) {                                                   \
         return each(x, x, [](Number<Real> a, Number<Real>) { return ::called(a); }); \
     }
@@ -75,30 +75,26 @@ struct Math : VectorSeries {
     JFRNN_MATH Real name(Real x, Real y) {                                                \
         return each(x, y, [](Number<Real> a, Number<Real> b) { return ::called(a, b); }); \
     }
-    JFRNN_CALLED(f32, asin, asinf)
-    JFRNN_CALLED(f32, acos, acosf)
-    JFRNN_CALLED(f32, atan, atanf)
-    JFRNN_CALLED(f32, cbrt, cbrtf)
-    JFRNN_CALLED(f32, erf, erff)
-    JFRNN_CALLED(f32, erfc, erfcf)
-    JFRNN_CALLED(f64, asin, asin)
-    JFRNN_CALLED(f64, acos, acos)
-    JFRNN_CALLED(f64, atan, atan)
-    JFRNN_CALLED(f64, cbrt, cbrt)
-    JFRNN_CALLED(f64, erf, erf)
-    JFRNN_CALLED(f64, erfc, erfc)
-    JFRNN_CALLED(f64, sinh, sinh)
-    JFRNN_CALLED(f64, cosh, cosh)
-    JFRNN_CALLED(f64, called_sin, sin)
-    JFRNN_CALLED(f64, called_cos, cos)
-    JFRNN_CALLED(f64, called_tan, tan)
+#define JFRNN_CALLED(name) JFRNN_CALLED_AS(f32, name, name##f) JFRNN_CALLED_AS(f64, name, name)
+    JFRNN_CALLED(asin)
+    JFRNN_CALLED(acos)
+    JFRNN_CALLED(atan)
+    JFRNN_CALLED(cbrt)
+    JFRNN_CALLED(erf)
+    JFRNN_CALLED(erfc)
+    JFRNN_CALLED_AS(f64, sinh, sinh)
+    JFRNN_CALLED_AS(f64, cosh, cosh)
+    JFRNN_CALLED_AS(f64, called_sin, sin)
+    JFRNN_CALLED_AS(f64, called_cos, cos)
+    JFRNN_CALLED_AS(f64, called_tan, tan)
     JFRNN_CALLED_OF_TWO(f32, atan2, atan2f)
     JFRNN_CALLED_OF_TWO(f64, atan2, atan2)
     JFRNN_CALLED_OF_TWO(f32, rem, fmodf)
     JFRNN_CALLED_OF_TWO(f64, rem, fmod)
     JFRNN_CALLED_OF_TWO(f64, pow, pow)
-#undef JFRNN_CALLED
+#undef JFRNN_CALLED_AS
 #undef JFRNN_CALLED_OF_TWO
+#undef JFRNN_CALLED
     JFRNN_GENERIC T rem(T x, T y) {
         return each(x, y, [](Number<T> a, Number<T> b) { return remainder(a, b); });
     }
