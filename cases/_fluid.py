@@ -1,17 +1,22 @@
 """A fluid scene: particles, and what acts on them, as plain data. What is None is not there, and will not be computed."""
 
+from __future__ import annotations  # `get_type_hints` can then be told what Number and Vector stand for
+
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Kernel = Literal["cubic", "quintic", "wendland2", "wendland4", "wendland6", "poly6"]
+Floats = tuple[float, ...]
+Number = TypeVar("Number", covariant=True)  # float in a scene; an array of shape [] in a solver, which may trace it
+Vector = TypeVar("Vector", covariant=True)  # likewise `Floats`, or an array of shape [d]
 
 
 @dataclass(frozen=True)
-class Physics:
+class Physics(Generic[Number, Vector]):
     """State what acts in a scene: words choose an equation, numbers are its constants, and None leaves it out.
 
     Args:
@@ -44,28 +49,28 @@ class Physics:
         integrator: "leapfrog" (kick, drift), "symplectic" (kick, drift, kick), or "midpoint" (Runge-Kutta of second order).
     """
 
-    density: float
-    sound_speed: float
+    density: Number
+    sound_speed: Number
     smoothing: float
     kernel: Kernel = "wendland2"
     evolve: Literal["summation", "continuity", "pressure"] = "continuity"
     state: Literal["linear", "tait"] = "tait"
     exponent: float = 7.0
     pressure: Literal["symmetric", "mean", "volume", "difference", "source"] = "symmetric"
-    viscosity: float | None = None
+    viscosity: Number | None = None
     viscosity_form: Literal["morris", "volume", "source"] = "morris"
-    artificial: float | None = None
-    density_diffusion: float | None = None
-    pressure_diffusion: float | None = None
-    transport: float | None = None
-    shifting: float | None = None
-    tension: float | None = None
-    surface_tension: float | None = None
+    artificial: Number | None = None
+    density_diffusion: Number | None = None
+    pressure_diffusion: Number | None = None
+    transport: Number | None = None
+    shifting: Number | None = None
+    tension: Number | None = None
+    surface_tension: Number | None = None
     corrected: bool = False
-    gravity: tuple[float, ...] | None = None
-    damping: float | None = None
-    damped_until: float | None = None
-    restitution: float | None = None
+    gravity: Vector | None = None
+    damping: Number | None = None
+    damped_until: Number | None = None
+    restitution: Number | None = None
     slip: bool = False
     tears: bool = False
     integrator: Literal["leapfrog", "symplectic", "midpoint"] = "symplectic"
@@ -111,17 +116,17 @@ class FluidScene:
     spacing: float
     duration: float
     step: float | None
-    physics: Physics
+    physics: Physics[float, Floats]
     wall: NDArray[np.bool_] | None = None
-    periodic: "Periodic | None" = None
-    tank: "Tank | None" = None
-    bounds: "Tank | None" = None
-    sealed: "Tank | None" = None
+    periodic: Periodic | None = None
+    tank: Tank | None = None
+    bounds: Tank | None = None
+    sealed: Tank | None = None
     enters: NDArray[np.float64] | None = None
     guided: float = 0.0
     densities: NDArray[np.float64] | None = None
     pressures: NDArray[np.float64] | None = None
-    solid: "Solid | None" = None
+    solid: Solid | None = None
 
     @property
     def n(self) -> int:
@@ -138,26 +143,26 @@ class FluidScene:
 class Tank:
     """A box by its lower and upper corner [m]."""
 
-    lower: tuple[float, ...]
-    upper: tuple[float, ...]
+    lower: Floats
+    upper: Floats
 
 
 @dataclass(frozen=True)
 class Periodic:
     """A box that repeats itself: lower corner and lengths [m], and along which axes it does."""
 
-    lower: tuple[float, ...]
-    lengths: tuple[float, ...]
+    lower: Floats
+    lengths: Floats
     axes: tuple[bool, ...]
 
 
 @dataclass(frozen=True)
-class Turning:
+class Turning(Generic[Number, Vector]):
     """How a solid turns: around a center [m], along an axis (in 2D none), at a rate [rad/s] counterclockwise as seen against it."""
 
-    center: tuple[float, ...]
-    axis: tuple[float, ...] | None
-    rate: float
+    center: Vector
+    axis: Vector | None
+    rate: Number
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +178,7 @@ class Solid:
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
-    turning: Turning | None = None
+    turning: Turning[float, Floats] | None = None
 
 
 def lattice(lower: Sequence[float], counts: Sequence[int], spacing: float) -> NDArray[np.float64]:

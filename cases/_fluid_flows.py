@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ._fluid import FluidScene, Periodic, Physics, Tank, lattice
+from ._fluid import Floats, FluidScene, Periodic, Physics, Tank, lattice
 
 LAYERS = 4  # of wall dummies: as far as a quintic kernel with h = dx reaches, and one more
 
 
-def confined(spacing: float, speed: float, sound_speed: float, viscosity: float) -> Physics:
+def confined(spacing: float, speed: float, sound_speed: float, viscosity: float) -> Physics[float, Floats]:
     """Return physics for flows without free surface: the pressure is carried (EDAC), gradients are corrected, particles shifted.
 
     Args:

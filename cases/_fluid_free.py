@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ._fluid import FluidScene, Physics, Tank, lattice
+from ._fluid import Floats, FluidScene, Physics, Tank, lattice
 
 LAYERS = 3  # of wall dummies: as far as a Wendland kernel with h = 1.5 dx reaches
 
 
-def free(density: float, sound_speed: float, spacing: float) -> Physics:
+def free(density: float, sound_speed: float, spacing: float) -> Physics[float, Floats]:
     """Return physics for flows with a free surface: density carried by continuity and smoothed (δ-SPH), Tait's equation of state.
 
     Args:
@@ -212,7 +212,7 @@ def jet(
 
 
 def _in_tank(
-    name: str, water: NDArray[np.float64], spacing: float, sides: tuple[float, ...], physics: Physics, duration: float
+    name: str, water: NDArray[np.float64], spacing: float, sides: Floats, physics: Physics[float, Floats], duration: float
 ) -> FluidScene:
     """Return water in a tank of dummy particles, open above; the last axis points up."""
     counts = [round(side / spacing) for side in sides]

@@ -8,7 +8,7 @@ import numpy as np
 from experiments._errors import UsageError
 
 if TYPE_CHECKING:
-    from jfrnn.cases import Scene  # pyright: ignore[reportMissingImports]
+    from cases import Scene
 
 ENDINGS = (".csv", ".vtp", ".vtk")
 NEIGHBORS = "neighbors"

@@ -6,16 +6,22 @@
 - `taylor_green_velocity`, `lattice`, `free`, `LAYERS`: parts of scenes of `jfrnn.cases`, for answers and scenes beside them.
 """
 
+import ctypes
+import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from jfrnn.cases import _fluid, _fluid_flows, _fluid_free  # pyright: ignore[reportMissingImports]
 
-from jfrnn._engine import kernels_of, load_warp
+from jfrnn._engine import Plan
+from jfrnn._engine.plans import cuda_driver
+from jfrnn._engine.start import compiler, load_warp
 from jfrnn._geometry import make_cutoff
 from jfrnn._search import round_capacity
 from jfrnn._triangles import warp as _triangles_warp
 from jfrnn._triangles.cells import gather_corners
+from jfrnn.cases import _fluid, _fluid_flows, _fluid_free
+from jfrnn.kernels import triangles_cuda
 
 lattice, taylor_green_velocity, free, LAYERS = (
     _fluid.lattice,
@@ -26,11 +32,9 @@ lattice, taylor_green_velocity, free, LAYERS = (
 
 
 class TriangleQuery(NamedTuple):
-    """Commands of a query (kernel, arguments, threads, threads of a block, ...), and the arrays that they write on a device."""
+    """What launches each kernel of a query on CUDA, by name and in order, and the scratch that they write."""
 
-    commands: list[Any]
-    idx: Any
-    count: Any
+    launches: dict[str, Callable[[], None]]
     scratch: Any
 
 
@@ -41,11 +45,25 @@ def triangle_query(tri: Any, x: Any, device: str) -> TriangleQuery:  # noqa: ANN
     variant = _triangles_warp._Variant(dim, x.dtype == np.float64, lists=True, tree=tri.backend == "bvh")
     corners, _, _ = gather_corners(tri.vertices, tri.faces)
     inputs = _triangles_warp.query_inputs(x, corners, tri.cells, make_cutoff(tri.cutoff, np.dtype(x.dtype), closed=False))
-    sizes = _triangles_warp.sizes_on_cuda(variant, inputs)
-    words = kernels_of("triangles_cuda").scratch_words(n, *sizes, dim, variant.double)
-    arrays = [wp.array(np.asarray(given), device=device) for given in inputs]
-    arrays[1] = wp.array(np.asarray(corners), dtype=arrays[0].dtype, ndim=3, device=device)
-    arrays += [wp.empty(shape, dtype=wp.int32, device=device) for shape in ((n, tri.capacity), n, words)]
-    if device != "cpu":
-        _triangles_warp._cuda_kernels(variant).load(device)
-    return TriangleQuery(_triangles_warp._commands(variant, *arrays), *arrays[-3:])
+    given = dict(zip(_triangles_warp._GIVEN, map(np.asarray, inputs), strict=True))
+    sizes = _triangles_warp.sizes_on_cuda(variant, *(given[name].shape for name in ("corners", "boxes", "start", "triangles")))
+    words = triangles_cuda.scratch_words(n, *sizes, dim, variant.double)
+    given |= {"idx": np.empty((n, tri.capacity), np.int32), "count": np.empty(n, np.int32), "scratch": np.empty(words, np.int32)}
+    arrays = {name: wp.array(array.reshape(-1), device=device) for name, array in given.items()}
+    multiprocessors = wp.get_device(device).sm_count
+    plan = _triangles_warp.plan_on_cuda(variant, {name: array.shape for name, array in given.items()}, multiprocessors)
+    steps = dict(zip(triangles_cuda.Kernels._fields, plan.steps, strict=True))
+    launches = {name: functools.partial(_launch_alone, step, plan, arrays, device) for name, step in steps.items()}
+    return TriangleQuery(launches, arrays["scratch"])
+
+
+def _launch_alone(step: Any, plan: Plan, arrays: dict[str, Any], device: str) -> None:  # noqa: ANN401
+    """Launch a kernel on the current stream of a CUDA device."""
+    packed = step.kernel.pack({**plan.numbers, **step.numbers, **{name: array.ptr for name, array in arrays.items()}})
+    given = (ctypes.c_ubyte * len(packed)).from_buffer(packed)
+    function = ctypes.c_void_p(compiler().load(step.kernel.program, device).address_of(step.kernel.name))
+    grid = -(-step.threads // step.kernel.block), 1, 1, step.kernel.block, 1, 1, 0
+    stream = ctypes.c_void_p(load_warp().get_stream(device).cuda_stream)
+    wrong = cuda_driver().cuLaunchKernel(function, *grid, stream, (ctypes.c_void_p * 1)(ctypes.addressof(given)), None)
+    if wrong:
+        raise RuntimeError(f"{step.kernel.name}: a launch failed with CUDA's error {wrong}")

@@ -7,11 +7,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
-
 from experiments import _layouts, methods
 from experiments._errors import UsageError
 from experiments.sph import ranges, settings
+from jfrnn.cases import fluids
 
 CONFIGS = Path(__file__).parent / "configs"
 WIDTH = 80

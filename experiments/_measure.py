@@ -161,11 +161,11 @@ def time_in_turns(calls: dict[str, Callable[[], Any]], rounds: int, burst: int =
     return seconds, None if others is None else round(others, 2)
 
 
-def time_kernels(launches: Sequence[tuple[Any, Sequence[Any], int, int]], repeats: int) -> list[float]:
+def time_kernels(launches: Sequence[Callable[[], Any]], repeats: int) -> list[float]:
     """Return the seconds on CUDA, by the device's clock, of the first launch, of the first two, and so on: medians of graphs.
 
     Args:
-        launches: Kernel, arguments, threads in all and per block of each.
+        launches: Functions that launch on the current stream of the device.
         repeats: How often each graph is timed, ten runs at a time.
     """
     from experiments._library import load_warp
@@ -174,8 +174,8 @@ def time_kernels(launches: Sequence[tuple[Any, Sequence[Any], int, int]], repeat
 
     def measure(until: int) -> float:
         with wp.ScopedCapture("cuda") as capture:
-            for kernel, arguments, threads, block in launches[:until]:
-                wp.launch(kernel, dim=threads, inputs=list(arguments), device="cuda", block_dim=block)
+            for launch in launches[:until]:
+                launch()
         times = []
         for _ in range(repeats):
             begin, end = wp.Event("cuda", enable_timing=True), wp.Event("cuda", enable_timing=True)

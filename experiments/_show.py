@@ -16,7 +16,7 @@ from experiments import _table
 from experiments._errors import UsageError
 
 if TYPE_CHECKING:
-    from jfrnn.cases import Scene  # pyright: ignore[reportMissingImports]
+    from cases import Scene
 
 MILLI = 1e3
 COLOR = "#0072B2"

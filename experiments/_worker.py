@@ -17,7 +17,7 @@ from experiments import _layouts, _machine, methods
 from experiments._config import Spec
 
 if TYPE_CHECKING:
-    from jfrnn.cases import Scene  # pyright: ignore[reportMissingImports]
+    from cases import Scene
 
 RUNNER = "JFRNN_RUNNER"  # environment variable: the process that asks, which this one is not to survive
 MOST_MEMORY = 0.8  # of the machine; a method that wants more gets an error instead of taking the machine down

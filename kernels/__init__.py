@@ -1,1 +1,5 @@
-"""Warp kernels and native functions. Imports warp and nothing else."""
+"""Kernels: each is declared in Python, and its C++ or CUDA stands in `native`. No import compiles or starts anything."""
+
+from jfrnn.kernels._program import Entry, Field, Kernel, Program, declare
+
+__all__ = ["Entry", "Field", "Kernel", "Program", "declare"]

@@ -1,8 +1,7 @@
-"""How C++ and CUDA of `kernels/native` become Warp kernels.
+"""How C++ and CUDA of `kernels/native` become the programs of variants.
 
 A kernel is a struct in a header, a method of which does the work. `program` is the whole text: what a variant fixes (the type of
-positions, their dimension, named integers), the headers that this one includes, and the header. Warp puts it, in a namespace of its
-own, before the code that it generates for a module; `bind` then makes a native function that calls the method.
+positions, their dimension, named integers), the headers that this one includes, and the header.
 
 `cutoff`, an array of one scalar, is an argument of all of them. Where space is periodic, the radius in it is followed by the
 lattice: its vectors and the transform, row by row (3 x 3 each); origin, half the width of the stencil in units of the transform,
@@ -11,13 +10,9 @@ vectors are (3 x 3 each). Of a batch, the highest number of a system comes last.
 of a double.
 """
 
-import hashlib
-import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
 
-import warp as wp
 from jfrnn.kernels._text import resolve
 
 CELLS_PER_PARTICLE = 4  # size of the cell table; 16 B per particle
@@ -25,11 +20,6 @@ SMALLEST_TABLE = 4096
 SKEWED = 2
 SPACES = ("", "_nearest", "_images", "_nearest_skewed", "_images_skewed")  # in names of variants
 _DEFAULTS = {"PERIODIC": 0, "BATCHED": 0, "SUM": 0, "SCALED": 0, "ONE_BY_ONE": 0}
-# C++ takes an argument that is missing for 0.
-_ALL_OR_NONE = """#if defined(__clang__)
-#pragma clang diagnostic error "-Wmissing-field-initializers"
-#endif
-"""
 
 
 def table_cells(sources: int) -> int:
@@ -60,27 +50,4 @@ def program(double: bool, dim: int, *headers: str, given: Mapping[str, str] = Ma
     lines = [f"using real = {'double' if double else 'float'};", f"using whole = {'long long' if double else 'int'};"]
     lines += [f"constexpr int DIM = {dim};", f"constexpr bool DOUBLE = {int(double)};"]
     lines += [f"constexpr int {name} = {int(value)};" for name, value in constants.items()]
-    return resolve(*headers, given={"constants.h": "\n".join([*lines, ""]), **given})
-
-
-def add_program(module: Any, text: str) -> str:
-    """Put a program before the code that Warp generates for a module, once, and return the namespace in which it stands."""
-    space = f"program_{hashlib.sha256(text.encode()).hexdigest()[:12]}"
-    options = module.options.get("extra_build_options") or wp.ModuleBuildOptions()
-    if space not in options.extra_cpu_preamble:
-        whole = f"namespace {{\nnamespace {space} {{\n{text}\n}}\n}}\n"
-        added = options.merged(wp.ModuleBuildOptions(extra_cpu_preamble=whole, extra_cuda_preamble=whole))
-        wp.set_module_options({"extra_build_options": added}, module)
-    return space
-
-
-def bind(stub: Callable[..., None], module: Any, call: str, text: str) -> Any:
-    """Return a native function of a module that calls a method of a struct in a program, as in `"Sort.build"`.
-
-    The struct is made of the arguments of `stub` in their order; of arrays it gets where their data is. Clang refuses a program in
-    which an argument is missing, which C++ would take for 0.
-    """
-    kernel, method = call.split(".")
-    given = ", ".join(x if p.annotation is int else f"{x}.data" for x, p in inspect.signature(stub).parameters.items())
-    call = f"{add_program(module, text)}::{kernel}({{{given}}}).{method}();"
-    return wp.func_native(f"\n{_ALL_OR_NONE}    {call}\n")(stub)
+    return resolve(*headers, given={"c_library.h": "", "constants.h": "\n".join([*lines, ""]), **given})

@@ -1,8 +1,7 @@
 """The native sources in `kernels/native`: C++ (`*.h`) for the CPU and for all devices, CUDA (`*.cuh`).
 
 A source is a header that includes those it needs. `resolve` puts them together: no compiler looks for files, and the text of a
-kernel tells all of what it is. Some files hold named parts instead. Each part begins behind a line `// --- part: NAME` and ends
-where the next one begins.
+kernel tells all of what it is.
 """
 
 import functools
@@ -11,20 +10,7 @@ from collections.abc import Mapping
 from importlib.resources import files
 from types import MappingProxyType
 
-_PART = re.compile(r"^// --- part: (\w+)\n", re.MULTILINE)
 _INCLUDE = re.compile(r'^#include "(.+)"\n', re.MULTILINE)
-
-
-@functools.cache
-def read_part(file: str, part: str) -> str:
-    """Return a part of a native source."""
-    _, *found = _PART.split(_read(file))
-    return dict(zip(found[::2], found[1::2], strict=True))[part]
-
-
-def fill(text: str, **names: str) -> str:
-    """Return the text with names replaced."""
-    return re.sub("|".join(rf"\b{name}\b" for name in names), lambda match: names[match[0]], text)
 
 
 def resolve(*headers: str, given: Mapping[str, str] = MappingProxyType({"constants.h": ""})) -> str:
@@ -52,4 +38,4 @@ def resolve(*headers: str, given: Mapping[str, str] = MappingProxyType({"constan
 
 @functools.cache
 def _read(file: str) -> str:
-    return (files(__package__) / "native" / file).read_text("utf-8")
+    return (files("jfrnn.kernels") / "native" / file).read_text("utf-8")

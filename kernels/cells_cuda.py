@@ -15,9 +15,8 @@ crossing the same in a periodic box, for queries whose reach leaves it: images t
 import functools
 from typing import NamedTuple
 
-import warp as wp
-from jfrnn.kernels._load import load_module
-from jfrnn.kernels._native import SPACES, bind, program, table_cells
+from jfrnn.kernels._native import SPACES, program, table_cells
+from jfrnn.kernels._program import Entry, Kernel, declare
 
 BLOCK = 256
 QUERY_BLOCK = 32  # one warp: others need not wait for it to end
@@ -37,9 +36,6 @@ _SWEEP = 8  # over all particles
 _CROSSING = 64  # over queries whose reach leaves a box: how many there are is known to the device only
 _RESIDENT = 1  # over the cells
 _GATHERING = (8, 6)  # of `gather`, in open space and in a box: all are at work at once
-# Beyond, Warp rounds the grid up to whole multiples, and threads that do not run count in a stride: what walks in strides would
-# leave out what they should have done.
-MOST_IN_STRIDES = 2**24
 
 
 def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -> int:
@@ -55,14 +51,13 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -
 
 
 class Launch(NamedTuple):
-    """A kernel, its threads in all and per block, and its last argument: whether it works on the queries.
+    """A kernel, its threads in all, and its last argument: whether it works on the queries.
 
     One that may run `beside` the launch before it needs nothing that this one computes.
     """
 
-    kernel: wp.Kernel
+    kernel: Kernel
     threads: int
-    block: int
     of_queries: bool
     beside: bool = False
 
@@ -70,14 +65,14 @@ class Launch(NamedTuple):
 class Kernels(NamedTuple):
     """The kernels of a variant, all with the same arguments."""
 
-    bounds: wp.Kernel
-    lay_out: wp.Kernel
-    count: wp.Kernel
-    scan: wp.Kernel
-    scatter: wp.Kernel
-    gather: wp.Kernel
-    query: wp.Kernel
-    crossing: wp.Kernel | None
+    bounds: Kernel
+    lay_out: Kernel
+    count_cells: Kernel
+    scan: Kernel
+    scatter: Kernel
+    gather: Kernel
+    query: Kernel
+    crossing: Kernel | None
 
     def launches(self, n: int, m: int, own: bool, multiprocessors: int) -> list[Launch]:
         """Return what is launched, in order, for n sources and m queries, on a device of so many multiprocessors."""
@@ -88,28 +83,19 @@ class Kernels(NamedTuple):
         table, resident = table_cells(n), _RESIDENT * multiprocessors
         tiles = min((table + 1) // _TILE + 1, resident)
         clearing = min(-(-table // (8 * BLOCK)), resident) * BLOCK
-        launches = [Launch(self.bounds, _PARTS * BLOCK, BLOCK, False), Launch(self.lay_out, clearing, BLOCK, False)]
+        launches = [Launch(self.bounds, _PARTS * BLOCK, False), Launch(self.lay_out, clearing, False)]
         for of_queries in (False,) if own else (False, True):
             size = m if of_queries else n
             sweep = min(-(-size // BLOCK), _SWEEP * multiprocessors) * BLOCK
             launches += [
-                Launch(self.count, sweep, BLOCK, of_queries),
-                Launch(self.scan, tiles * BLOCK, BLOCK, of_queries),
-                Launch(self.scatter, sweep, BLOCK, of_queries),
+                Launch(self.count_cells, sweep, of_queries),
+                Launch(self.scan, tiles * BLOCK, of_queries),
+                Launch(self.scatter, sweep, of_queries),
             ]
             if not of_queries or self.crossing is not None:
                 most = multiprocessors * _GATHERING[self.crossing is not None]
-                launches.append(Launch(self.gather, min(-(-size // BLOCK), most) * BLOCK, BLOCK, of_queries))
+                launches.append(Launch(self.gather, min(-(-size // BLOCK), most) * BLOCK, of_queries))
         return launches
-
-    def load_stages(self, device: wp.DeviceLike) -> None:
-        """Compile and load what sorts: nothing is left to do while a CUDA graph is recorded."""
-        load_module(self.bounds.module, device, BLOCK)
-
-    def load(self, device: wp.DeviceLike) -> None:
-        """Compile and load all."""
-        self.load_stages(device)
-        load_walks(self.query, self.crossing, device)
 
 
 def share_bits(m: int) -> int:
@@ -126,24 +112,17 @@ def _shares(m: int, bits: int) -> int:
     return -(-m >> bits)
 
 
-def walks(query: wp.Kernel, crossing: wp.Kernel | None, m: int, multiprocessors: int) -> list[Launch]:
+def walks(query: Kernel, crossing: Kernel | None, m: int, multiprocessors: int) -> list[Launch]:
     """Return the launches that walk over m queries: those whose reach leaves a periodic box have a kernel of their own."""
     threads = query_blocks(m) * QUERY_BLOCK
     if crossing is None:
-        return [Launch(query, threads, QUERY_BLOCK, False)]
+        return [Launch(query, threads, False)]
     most = _CROSSING * multiprocessors * QUERY_BLOCK
-    first = Launch(crossing, min(threads, most), QUERY_BLOCK, False)  # what takes longest
-    return [first, Launch(query, threads, QUERY_BLOCK, False, beside=True)]
+    first = Launch(crossing, min(threads, most), False)  # what takes longest
+    return [first, Launch(query, threads, False, beside=True)]
 
 
-def load_walks(query: wp.Kernel, crossing: wp.Kernel | None, device: wp.DeviceLike) -> None:
-    """Compile and load what walks over queries."""
-    for kernel in (query, crossing):
-        if kernel is not None:
-            load_module(kernel.module, device, QUERY_BLOCK)
-
-
-@functools.cache
+@functools.lru_cache(512)
 def cell_kernels(
     dim: int,
     double: bool,
@@ -168,55 +147,15 @@ def cell_kernels(
     query = {"SCALED": scaled, "LIST": lists, "SUMS": 0, "LATER": later}
     query |= grid
 
-    def query_kernel(name: str, crossing: bool = False) -> wp.Kernel:
-        module, kind = f"{name}_{variant}_b{blocks}", {"CROSSING": crossing, "SHIFTED": periodic if crossing else 0}
+    def query_kernel(name: str, crossing: bool = False) -> Kernel:
+        kind = {"CROSSING": crossing, "SHIFTED": periodic if crossing else 0}
         text = program(double, dim, "rows.cuh", **query | kind)
-        return _kernel(module, module, double, QUERY_BLOCK, blocks, "Rows.run", text)
+        return declare(f"{name}_cuda_{variant}", text, Entry("Rows.run", QUERY_BLOCK, blocks), cuda=True, fused=True)[0]
 
-    sorting = program(double, dim, "cells.cuh", **grid)
-
-    def stage(name: str, method: str, blocks: int = 1) -> wp.Kernel:
-        return _kernel(f"{name}_{kind}", kind, double, BLOCK, blocks, f"Search.{method}", sorting)
-
-    return Kernels(
-        stage("bounds", "find_bounds"),
-        stage("lay_out", "lay_out_grid"),
-        stage("count", "count_cells"),
-        stage("scan", "scan_counts"),
-        stage("scatter", "scatter_ids"),
-        stage("gather", "gather_places", _GATHERING[periodic > 0]),
-        query_kernel("query"),
-        query_kernel("crossing", crossing=True) if periodic else None,
-    )
-
-
-_made: dict[str, wp.Kernel] = {}
-
-
-def _kernel(name: str, module_name: str, double: bool, block: int, blocks: int, call: str, text: str) -> wp.Kernel:
-    if name in _made:
-        return _made[name]
-    scalar = wp.float64 if double else wp.float32
-    points = wp.array2d(dtype=scalar)
-    reals, ints, rows = wp.array(dtype=scalar), wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
-
-    def native(
-        positions: points, queries: points, cutoff: reals, idx: rows, count: ints, info: ints, scratch: ints,
-        n: int, m: int, own: int, table: int, capacity: int, closed: int, drop_self: int, of_queries: int,
-    ): ...  # fmt: skip
-
-    native.__name__ = native.__qualname__ = f"{name}_native"
-    module = wp.get_module(f"jfrnn.kernels.cells_cuda.{module_name}")
-    wp.set_module_options({"enable_backward": False, "max_unroll": 1}, module)
-    function = bind(native, module, call, text)
-
-    def kernel(
-        positions: points, queries: points, cutoff: reals, idx: rows, count: ints, info: ints, scratch: ints,
-        n: int, m: int, own: int, table: int, capacity: int, closed: int, drop_self: int, of_queries: int,
-    ):  # fmt: skip
-        function(
-            positions, queries, cutoff, idx, count, info, scratch, n, m, own, table, capacity, closed, drop_self, of_queries
-        )  # fmt: skip
-
-    _made[name] = wp.kernel(kernel, name=name, module=module, grid_stride=False, launch_bounds=(block, blocks))
-    return _made[name]
+    methods = ("find_bounds", "lay_out_grid", "count_cells", "scan_counts", "scatter_ids", "gather_places")
+    stages = [Entry(f"Search.{method}", BLOCK) for method in methods]
+    stages[-1] = stages[-1]._replace(blocks=_GATHERING[periodic > 0])
+    sorting = declare(f"cells_cuda_{kind}", program(double, dim, "cells.cuh", **grid), *stages, cuda=True, fused=True)
+    bounds, lay_out, count, scan, scatter, gather = sorting
+    crossing = query_kernel("crossing", crossing=True) if periodic else None
+    return Kernels(bounds, lay_out, count, scan, scatter, gather, query_kernel("query"), crossing)

@@ -18,7 +18,8 @@ import functools
 from typing import Any, NamedTuple
 
 import warp as wp
-from jfrnn.kernels._native import add_program, program
+
+from jfrnn.kernels._native import program
 
 _CELLS_PER_PARTICLE = 2  # at least, and less than twice that; 8 B each
 _SMALLEST_BITS = 4  # per axis: 16 cells
@@ -53,7 +54,9 @@ def hashgrid_kernels(dim: int, double: bool, scaled: bool, lists: bool) -> Kerne
     module = wp.get_module(f"jfrnn.kernels.hashgrid.{variant}")
     wp.set_module_options({"enable_backward": False, "fuse_fp": False}, module)
     point_at = _point_function(dim, double)
-    is_pair = _exact_function(dim, double, scaled, add_program(module, program(double, dim, "hashgrid.h", SCALED=scaled)))
+    text = f"namespace {{\n{program(double, dim, 'hashgrid.h', SCALED=scaled)}\n}}\n"
+    wp.set_module_options({"extra_build_options": wp.ModuleBuildOptions(extra_cpu_preamble=text, extra_cuda_preamble=text)}, module)
+    is_pair = _exact_function(dim, double, scaled)
     return Kernels(
         wp.kernel(_pack_kernel(double, point_at), module=module),
         wp.kernel(_query_kernel(double, scaled, lists, point_at, is_pair), module=module),
@@ -93,11 +96,11 @@ class _Variant(NamedTuple):
 
 
 @functools.cache
-def _exact_function(dim: int, double: bool, scaled: bool, space: str) -> wp.Function:
+def _exact_function(dim: int, double: bool, scaled: bool) -> wp.Function:
     scalar, vector = _types(double)
     variant = _Variant(f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}")
 
-    @variant.func_native(f"return {space}::decide_pair(query, source, cutoff.data, closed);")
+    @variant.func_native("return decide_pair(query, source, cutoff.data, closed);")
     def is_pair(query: vector, source: vector, cutoff: wp.array(dtype=scalar), closed: int) -> bool: ...
 
     return is_pair

@@ -13,8 +13,8 @@ import itertools
 import re
 from typing import NamedTuple
 
-import warp as wp
-from jfrnn.kernels._native import SPACES, bind, program
+from jfrnn.kernels._native import SPACES, program
+from jfrnn.kernels._program import Kernel, declare
 from jfrnn.kernels.cells_cpu import CHUNK, GRID
 
 CACHE_BYTES = 40 << 10  # for candidates: most of a first-level cache, and a little of the second
@@ -72,13 +72,6 @@ class TermText(NamedTuple):
     def source_columns(self) -> int:
         """How many columns are read of the sources."""
         return self.columns + bool(self.steps)
-
-
-class Kernels(NamedTuple):
-    """`sort_values` (where there are any) and `query`, each launched with dim = 1 once per thread."""
-
-    sort_values: wp.Kernel
-    query: wp.Kernel
 
 
 def slots(queries: int) -> int:
@@ -174,25 +167,11 @@ def _evaluation(term: TermText, double: bool) -> list[str]:
 
 
 @functools.cache
-def sort_kernel(dim: int, double: bool) -> wp.Kernel:
+def sort_kernel(dim: int, double: bool) -> Kernel:
     """Return the kernel that puts values of the sources [n, width] in the order of cells: columns [width * n]."""
-    scalar = wp.float64 if double else wp.float32
-    table_of, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
-    variant = f"{dim}d_{'f64' if double else 'f32'}"
-
-    def sort_native(
-        others: table_of, cutoff: reals, columns: reals, scratch: ints, n: int, m: int, own: int, table: int, width: int
-    ): ...  # fmt: skip
-
-    sort_native.__name__ = sort_native.__qualname__ = f"sort_values_{variant}"
-    module = wp.get_module(f"jfrnn.kernels.pair_sum_cpu.sort_values_{variant}")
-    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
-    function = bind(sort_native, module, "SortValues.run", program(double, dim, "sort_values.h", **GRID, CHUNK=CHUNK, MANY=0))
-
-    def sort_values(others: table_of, cutoff: reals, columns: reals, scratch: ints, n: int, m: int, own: int, table: int):
-        function(others, cutoff, columns, scratch, n, m, own, table, others.shape[1])
-
-    return wp.kernel(sort_values, module=module)
+    constants: dict[str, int] = {**GRID, "CHUNK": CHUNK, "MANY": 0}
+    text = program(double, dim, "sort_values.h", **constants)
+    return declare(f"sort_values_{dim}d_{'f64' if double else 'f32'}", text, "SortValues.run")[0]
 
 
 def work(text: str) -> int:
@@ -208,19 +187,17 @@ def _candidates(term: TermText, dim: int, double: bool) -> int:
     return max(64, min(fitting, MOST_CANDIDATES) // 64 * 64)
 
 
-@functools.cache
+@functools.lru_cache(512)
 def query_kernel(
     term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: bool = False,
     extremes: bool = False, packed: bool | None = None,
-) -> wp.Kernel:  # fmt: skip
+) -> Kernel:  # fmt: skip
     """Return the kernel that sums a term; `key` tells it from all others in the names of programs.
 
     `extremes`: it finds the largest summands instead; `errors` [m, width, 2] then gets their sources (n: there is none), and the
     codes of their images, as integers travel among floats.
     `packed`: the term is evaluated for what is near alone, not for other candidates; None: as is faster.
     """
-    scalar = wp.float64 if double else wp.float32
-    rows, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
     packed = work(term.text) > LITTLE_WORK if packed is None else packed
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
     variant += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}_{key}"
@@ -228,26 +205,4 @@ def query_kernel(
     constants |= {"PERIODIC": periodic, "BATCHED": batched, "CHUNK": CHUNK, "CANDIDATES": _candidates(term, dim, double)}
     constants |= {"MANY": 0, "PACKED": packed, "SKIPPED": work(term.text) > VERY_LITTLE_WORK}
     text = program(double, dim, "pair_sum_cpu.h", given=term_header(term, double), **constants)
-    module = wp.get_module(f"jfrnn.kernels.pair_sum_cpu.{variant}")
-    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
-
-    def query_native(
-        positions: rows, queries: rows, cutoff: reals, shared_values: reals, own_values: rows, columns: reals,
-        sums: rows, totals: reals, errors: reals, scratch: ints,
-        n: int, m: int, own: int, table: int, closed: int, drop_self: int,
-    ): ...  # fmt: skip
-
-    query_native.__name__ = query_native.__qualname__ = f"pair_sum_{variant}"
-    function = bind(query_native, module, "Sums.run", text)
-
-    def query(
-        positions: rows, queries: rows, cutoff: reals, shared_values: reals, own_values: rows, columns: reals,
-        sums: rows, totals: reals, errors: reals, scratch: ints,
-        n: int, m: int, own: int, table: int, closed: int, drop_self: int,
-    ):  # fmt: skip
-        function(
-            positions, queries, cutoff, shared_values, own_values, columns, sums, totals, errors, scratch,
-            n, m, own, table, closed, drop_self,
-        )  # fmt: skip
-
-    return wp.kernel(query, module=module)
+    return declare(f"pair_sum_cpu_{variant}", text, "Sums.run")[0]

@@ -21,9 +21,9 @@ many blocks then fit, and 12 % more instructions are executed: 0.59 to 0.65 ms, 
 import functools
 from typing import NamedTuple
 
-import warp as wp
-from jfrnn.kernels._native import SPACES, bind, program
-from jfrnn.kernels.cells_cuda import GRID, MOST_IN_STRIDES, QUERY_BLOCK, Launch, load_walks, query_blocks, walks
+from jfrnn.kernels._native import SPACES, program
+from jfrnn.kernels._program import Entry, Kernel, declare
+from jfrnn.kernels.cells_cuda import GRID, QUERY_BLOCK, Launch, query_blocks, walks
 from jfrnn.kernels.pair_sum_cpu import LITTLE_WORK, TermText, constants_of, term_header, work
 
 
@@ -50,19 +50,15 @@ def row_length(term: TermText, dim: int, double: bool) -> int:
 class Kernels(NamedTuple):
     """The kernel that sorts values (None: there are none), and those that sum; `crossing` as in a search."""
 
-    sort_values: wp.Kernel | None
-    query: wp.Kernel
-    crossing: wp.Kernel | None
+    sort_values: Kernel | None
+    query: Kernel
+    crossing: Kernel | None
 
     def launches(self, n: int, m: int, multiprocessors: int) -> list[Launch]:
         """Return what is launched, in order, for n sources and m queries, which are sorted already; as in a search."""
-        threads = min(-(-n // QUERY_BLOCK) * QUERY_BLOCK, MOST_IN_STRIDES)
-        sorting = [] if self.sort_values is None else [Launch(self.sort_values, threads, QUERY_BLOCK, False)]
+        threads = -(-n // QUERY_BLOCK) * QUERY_BLOCK
+        sorting = [] if self.sort_values is None else [Launch(self.sort_values, threads, False)]
         return sorting + walks(self.query, self.crossing, m, multiprocessors)
-
-    def load(self, device: wp.DeviceLike) -> None:
-        """Compile and load what a launch needs: nothing is left to do while a CUDA graph is recorded."""
-        load_walks(self.query, self.crossing, device)
 
 
 def _reads_positions(term: TermText) -> bool:
@@ -74,7 +70,7 @@ def _placed_columns(term: TermText, dim: int) -> int:
     return dim if term.source_columns and _reads_positions(term) else 0
 
 
-@functools.cache
+@functools.lru_cache(512)
 def sum_kernels(
     term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: bool = False,
     extremes: bool = False,
@@ -96,45 +92,17 @@ def sum_kernels(
     constants |= {"LIST": 0, "LATER": 0, "TAKEN": taken, "FROM_PLACES": _reads_positions(term) and not term.source_columns}
     constants |= {"ROW_LENGTH": max(row_length(term, dim, double), 1), "PLACED": _placed_columns(term, dim)}
 
-    def sorting_kernel() -> wp.Kernel:
-        text = program(double, dim, "sort_values.cuh", **constants)
-        return _kernel("sort_values", module, double, 32, "SortValues.run", text)
+    def declare_one(name: str, text: str, method: str, blocks: int) -> Kernel:
+        return declare(f"{name}_{module}", text, Entry(method, QUERY_BLOCK, blocks), cuda=True, fused=True)[0]
 
-    def query_kernel(name: str, crossing: bool = False) -> wp.Kernel:
+    def query_kernel(name: str, crossing: bool = False) -> Kernel:
         where = {"CROSSING": crossing, "SHIFTED": periodic if crossing else 0}
         text = program(double, dim, "pair_sum.cuh", given=term_header(term, double), **constants | where)
-        return _kernel(name, module, double, blocks, "Sums.run", text)
+        return declare_one(name, text, "Sums.run", blocks)
 
+    sorting = program(double, dim, "sort_values.cuh", given={}, **constants)
     return Kernels(
-        sorting_kernel() if term.source_columns else None,
+        declare_one("sort_values", sorting, "SortValues.run", 32) if term.source_columns else None,
         query_kernel("pair_sum"),
         query_kernel("crossing_pair_sum", crossing=True) if periodic else None,
     )
-
-
-def _kernel(name: str, module: str, double: bool, blocks: int, call: str, text: str) -> wp.Kernel:
-    scalar = wp.float64 if double else wp.float32
-    table_of, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
-
-    def native(
-        positions: table_of, queries: table_of, cutoff: reals, shared_values: reals, own_values: table_of, others: table_of,
-        sums: table_of, totals: reals, errors: reals, values: reals, info: ints, scratch: ints,
-        n: int, m: int, own: int, table: int, closed: int, drop_self: int,
-    ): ...  # fmt: skip
-
-    native.__name__ = native.__qualname__ = f"{name}_{module}_native"
-    home = wp.get_module(f"jfrnn.kernels.pair_sum_cuda.{module}")
-    wp.set_module_options({"enable_backward": False, "max_unroll": 1}, home)
-    function = bind(native, home, call, text)
-
-    def kernel(
-        positions: table_of, queries: table_of, cutoff: reals, shared_values: reals, own_values: table_of, others: table_of,
-        sums: table_of, totals: reals, errors: reals, values: reals, info: ints, scratch: ints,
-        n: int, m: int, own: int, table: int, closed: int, drop_self: int,
-    ):  # fmt: skip
-        function(
-            positions, queries, cutoff, shared_values, own_values, others, sums, totals, errors, values, info, scratch,
-            n, m, own, table, closed, drop_self,
-        )  # fmt: skip
-
-    return wp.kernel(kernel, name=f"{name}_{module}", module=home, grid_stride=False, launch_bounds=(QUERY_BLOCK, blocks))

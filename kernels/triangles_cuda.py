@@ -8,7 +8,7 @@ scatter  particles with candidates, those of neighboring cells side by side: the
 query    a thread per particle: boxes first; what they leave waits in shared memory, float bounds decide it, then float64
 settle   rows in which float64 left a pair open, anew, with integers: few threads, whose numbers take scratch
 
-In a tree of boxes (`jfrnn/_triangles_tree.py`) the same: what holds a particle is asked of boxes from the root on, and particles
+In a tree of boxes (`jfrnn/_triangles/tree.py`) the same: what holds a particle is asked of boxes from the root on, and particles
 are sorted by cells of a grid over the wall.
 
 A thread writes its own row, in the order of the CPU kernel: rows are the same bits in every run, and those of the CPU for the same
@@ -27,9 +27,8 @@ thread asks 16 boxes one after the other for each node (experiments/results/tria
 import functools
 from typing import NamedTuple
 
-import warp as wp
-from jfrnn.kernels._load import load_module
-from jfrnn.kernels._native import bind, program
+from jfrnn.kernels._native import program
+from jfrnn.kernels._program import Entry, Kernel, declare
 from jfrnn.kernels._triangles import constants, pending
 
 BLOCK = 256
@@ -56,111 +55,42 @@ def scratch_words(n: int, buckets: int, entries: int, dim: int, double: bool) ->
     return sum((words + 15) // 16 * 16 for words in parts)
 
 
-class Launch(NamedTuple):
-    """A kernel, its threads in all and per block, and whether it may run beside the launch before it."""
-
-    kernel: wp.Kernel
-    threads: int
-    block: int
-    beside: bool = False
-
-
 class Kernels(NamedTuple):
-    """The kernels of a variant, all with the same arguments, of which the last is the number of threads."""
+    """The kernels of a variant, all with the same arguments; `threads` is that of the launch."""
 
-    prepare: wp.Kernel
-    place: wp.Kernel
-    fill: wp.Kernel | None
-    allocate: wp.Kernel
-    scatter: wp.Kernel
-    query: wp.Kernel
-    settle: wp.Kernel
+    prepare: Kernel
+    place: Kernel
+    fill: Kernel
+    allocate: Kernel
+    scatter: Kernel
+    query: Kernel
+    settle: Kernel
 
-    def launches(self, n: int, buckets: int, entries: int, capacity: int, double: bool, multiprocessors: int) -> list[Launch]:
-        """Return what is launched, in order, for n particles, on a device of so many multiprocessors."""
-        filling = min(max(n * capacity // 4, 3), _SWEEP * multiprocessors)
-        return [
-            _launch(self.prepare, max(buckets, entries), BLOCK),
-            _launch(self.place, n, BLOCK),
-            *([] if self.fill is None else [_launch(self.fill, filling, BLOCK, beside=True)]),
-            _launch(self.allocate, -(-buckets // _RUN), BLOCK),
-            _launch(self.scatter, n, BLOCK),
-            _launch(self.query, n, QUERY_BLOCK),
-            _launch(self.settle, workers_for(n, double), _SETTLE_BLOCK),
-        ]
-
-    def load(self, device: wp.DeviceLike) -> None:
-        """Compile and load all: nothing is left to do while a CUDA graph is recorded."""
-        for kernel, block in ((self.prepare, BLOCK), (self.query, QUERY_BLOCK), (self.settle, _SETTLE_BLOCK)):
-            load_module(kernel.module, device, block)
+    def threads(
+        self, n: int, buckets: int, entries: int, capacity: int, double: bool, multiprocessors: int
+    ) -> list[tuple[Kernel, int]]:
+        """Return what is launched, in order, for n particles, and how many threads do work; without rows `fill` is left out."""
+        fill = [(self.fill, min(max(n * capacity // 4, 3), _SWEEP * multiprocessors))] if capacity else []
+        found = [(self.prepare, max(buckets, entries)), (self.place, n), *fill, (self.allocate, -(-buckets // _RUN))]
+        found += [(self.scatter, n), (self.query, n), (self.settle, workers_for(n, double))]
+        return [(kernel, -(-threads // kernel.block) * kernel.block) for kernel, threads in found]
 
 
-def _launch(kernel: wp.Kernel, threads: int, block: int, beside: bool = False) -> Launch:
-    return Launch(kernel, -(-threads // block) * block, block, beside)
-
-
-@functools.cache
-def triangle_kernels(dim: int, double: bool, lists: bool, tree: bool, node: int) -> Kernels:
-    """Return the kernels for a dimension and dtype, for lists or counts alone, in cells or in a tree of `node` children each."""
-    kind = f"{dim}d_{'f64' if double else 'f32'}{'_tree' * tree}"
-    rows = f"{kind}{'_list' * lists}"
-    where = {"TREE": tree, "NODE": node, "PENDING": pending(node)}
-
-    def sorting(name: str) -> wp.Kernel:
-        return _kernel(name, kind, f"sort_{kind}", dim, double, (BLOCK, 1), lists, where)
-
-    def deciding(name: str, block: int, blocks: int) -> wp.Kernel:
-        return _kernel(name, rows, f"{name}_{rows}", dim, double, (block, blocks), lists, where)
-
-    return Kernels(
-        sorting("prepare"),
-        sorting("place"),
-        sorting("fill") if lists else None,
-        sorting("allocate"),
-        sorting("scatter"),
-        deciding("query", QUERY_BLOCK, _QUERY_BLOCKS[double]),
-        deciding("settle", _SETTLE_BLOCK, 1),
-    )
-
-
-_made: dict[str, wp.Kernel] = {}
 _WAITING = 16  # candidates of a thread whose boxes hold its particle, until they are decided
 
 
-def _kernel(
-    stage: str, variant: str, module_name: str, dim: int, double: bool, bounds: tuple[int, int], lists: bool, where: dict[str, int]
-) -> wp.Kernel:
-    name = f"{stage}_{variant}"
-    if name in _made:
-        return _made[name]
-    scalar = wp.float64 if double else wp.float32
-    reals, ints = wp.array(dtype=scalar), wp.array(dtype=wp.int32)
-    points, rows, shapes = wp.array2d(dtype=scalar), wp.array2d(dtype=wp.int32), wp.array3d(dtype=scalar)
-    options = {"LIST": lists, "WAITING": _WAITING, "THREADS": bounds[0], "RUN": _RUN, "HEADER": _HEADER_WORDS}
-    options |= where
+@functools.lru_cache(512)
+def triangle_kernels(dim: int, double: bool, lists: bool, tree: bool, node: int) -> Kernels:
+    """Return the kernels for a dimension and dtype, for lists or counts alone, in cells or in a tree of `node` children each."""
+    kind = f"{dim}d_{'f64' if double else 'f32'}{'_tree' * tree}"
+    options = {"LIST": lists, "WAITING": _WAITING, "RUN": _RUN, "HEADER": _HEADER_WORDS, "TREE": tree, "NODE": node}
+    options |= {"PENDING": pending(node), **constants(dim, double, stride=32)}
 
-    def native(
-        positions: points, corners: shapes, boxes: points, cutoff: reals, start: ints, triangles: ints, levels: ints,
-        level_count: ints, level_of: ints, idx: rows, count: ints, scratch: ints,
-        n: int, f: int, buckets: int, entries: int, capacity: int, workers: int, threads: int, thread: int,
-    ): ...  # fmt: skip
+    def stages(name: str, *methods: str, block: int, blocks: int = 1) -> list[Kernel]:
+        text = program(double, dim, "triangles.cuh", THREADS=block, **options)
+        entries = [Entry(f"Triangles.{method}", block, blocks) for method in methods]
+        return declare(f"triangles_cuda_{name}_{kind}{'_list' * lists}", text, *entries, cuda=True)
 
-    native.__name__ = native.__qualname__ = f"triangles_{name}_native"
-    module = wp.get_module(f"jfrnn.kernels.triangles_cuda.{module_name}")
-    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
-    text = program(double, dim, "triangles.cuh", **options, **constants(dim, double, stride=32))
-    function = bind(native, module, f"Triangles.{stage}", text)
-
-    def kernel(
-        positions: points, corners: shapes, boxes: points, cutoff: reals, start: ints, triangles: ints, levels: ints,
-        level_count: ints, level_of: ints, idx: rows, count: ints, scratch: ints,
-        n: int, f: int, buckets: int, entries: int, capacity: int, workers: int, threads: int,
-    ):  # fmt: skip
-        thread = wp.tid()
-        function(
-            positions, corners, boxes, cutoff, start, triangles, levels, level_count, level_of, idx, count, scratch,
-            n, f, buckets, entries, capacity, workers, threads, thread,
-        )  # fmt: skip
-
-    _made[name] = wp.kernel(kernel, name=name, module=module, grid_stride=False, launch_bounds=bounds)
-    return _made[name]
+    sorting = stages("sort", "prepare", "place", "fill", "allocate", "scatter", block=BLOCK)
+    query = stages("query", "query", block=QUERY_BLOCK, blocks=_QUERY_BLOCKS[double])
+    return Kernels(*sorting, *query, *stages("settle", "settle", block=_SETTLE_BLOCK))

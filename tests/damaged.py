@@ -1,18 +1,13 @@
-"""Load kernels from the cache, one of them for each way in which files are damaged; `test_start.py` runs it in fresh processes."""
+"""Load programs from the cache, one of them for each way in which files are damaged; `test_start.py` runs it in fresh processes."""
 
+import ctypes
 import sys
 
-import warp as wp
-from jfrnn.kernels._load import load_module
+from jfrnn._engine.start import load_warp
+from jfrnn.kernels import Program, _compile
 
-wp.config.log_level = wp.LOG_WARNING
+load_warp()
 for name in sys.argv[1:]:
-
-    @wp.kernel(module=wp.get_module(f"damaged.{name}"))
-    def add(x: wp.array(dtype=int)):
-        x[0] = x[0] + 1
-
-    load_module(add.module, "cpu")
-    number = wp.zeros(1, dtype=int, device="cpu")
-    wp.launch(add, dim=1, inputs=[number], device="cpu")
-    print(name, number.numpy()[0])
+    text = f'extern "C" int add(int x) {{ return x + 1; }}  // {name}\n'
+    library = _compile.load(Program(f"damaged_{name}", text, cuda=False))
+    print(name, ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int)(library.address_of("add"))(0))

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from jfrnn.cases.batches import BATCH_CASES
 from test_box import image_pairs, masked_images
 
 import jfrnn
+from jfrnn.cases.batches import BATCH_CASES
 
 SLOW = pytest.mark.slow
 LENGTH, CAPACITY = 128, 256

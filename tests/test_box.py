@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from jfrnn.cases.periodic import PERIODIC_CASES
 
 import jfrnn
 from jfrnn._geometry.wrapping import unpack_turns
+from jfrnn.cases.periodic import PERIODIC_CASES
 
 CAPACITY = 400
 LENGTH = 304

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jfrnn.cases.meshes import cube
 
 import jfrnn
+from jfrnn.cases.meshes import cube
 
 N, CUTOFF, SKIN = 40, 0.3, 0.05
 X = np.random.default_rng(0).uniform(0, 1, (N, 3))

@@ -10,8 +10,9 @@ from itertools import product
 
 import numpy as np
 import pytest
-from jfrnn.cases.periodic import PERIODIC_CASES
 from reference import reference_images
+
+from jfrnn.cases.periodic import PERIODIC_CASES
 
 DTYPES = (np.float32, np.float64)
 DIMS = (2, 3)

@@ -6,8 +6,9 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from jfrnn.cases.triangles import TRIANGLE_CASES
 from reference import squared_distance, triangle_pairs
+
+from jfrnn.cases.triangles import TRIANGLE_CASES
 
 TIES = ["ties", "ties_far", "ties_small", "sheet", "axis_ulps", "residues"]
 CLOSE = ["ulps", "ulps_large", "ulps_far", "ties_up", "ties_down", "ties_spacing"]

@@ -5,12 +5,13 @@ What they answer is decided on a GPU: python -m experiments gpu experiments/conf
 
 import itertools
 
+import launched
+import numpy as np
 import pytest
-import warp as wp
-from jfrnn.kernels import cells_cpu, cells_cuda, levels
-from jfrnn.kernels._native import add_program, program
 
 from jfrnn._geometry.levels import GROUPS, HALVINGS
+from jfrnn.kernels import _compile, cells_cpu, cells_cuda, declare, few_cuda, levels
+from jfrnn.kernels._native import program
 
 VARIANTS = [(dim, double, False, lists, False) for dim, double, lists in itertools.product((2, 3), (False, True), (False, True))]
 VARIANTS += [
@@ -18,23 +19,29 @@ VARIANTS += [
 ]
 
 
-def compiles(kernels, folder):
-    for module in {kernel.module for kernel in (kernels.bounds, kernels.query, kernels.crossing) if kernel is not None}:
-        wp.compile_aot_module(module, arch=90, module_dir=folder, use_ptx=True)
-    return list(folder.glob("*.ptx"))
+def compiles(*kernels):
+    """Compile programs for a GPU that need not be there; return how many there are."""
+    programs = {kernel.program for kernel in kernels if kernel is not None}
+    for program_ in programs:
+        text = _compile.find_binary(program_, "cpu", arch=90).read_text()
+        assert all(f".entry {kernel.name}(" in text for kernel in kernels if kernel is not None and kernel.program == program_)
+    return len(programs)
 
 
 @pytest.mark.parametrize(("dim", "double", "scaled", "lists", "later"), VARIANTS)
-def test_variants_compile(dim, double, scaled, lists, later, tmp_path):
-    assert len(compiles(cells_cuda.cell_kernels(dim, double, scaled, lists, later), tmp_path)) == 2
+def test_variants_compile(dim, double, scaled, lists, later):
+    assert compiles(*cells_cuda.cell_kernels(dim, double, scaled, lists, later)) == 2
 
 
-def test_boxes_batches_and_cutoffs_per_particle_compile(tmp_path):
-    assert compiles(cells_cuda.cell_kernels(3, False, False, True, periodic=2, batched=True), tmp_path)
+def test_boxes_batches_and_cutoffs_per_particle_compile():
+    assert compiles(*cells_cuda.cell_kernels(3, False, False, True, periodic=2, batched=True)) == 3
     for rule, periodic in (("mean", 2), ("gather", 0)):
-        kernel = levels.query_kernel(3, False, True, rule, GROUPS, HALVINGS, periodic, batched=True)
-        wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
-    assert len(list(tmp_path.glob("*.ptx"))) == 5
+        assert compiles(levels.query_kernel(3, False, True, rule, GROUPS, HALVINGS, periodic, batched=True, cuda=True)) == 1
+
+
+def test_kernels_of_few_particles_compile(dim):
+    for double, lists, batched in itertools.product((False, True), repeat=3):
+        assert compiles(few_cuda.rows_kernel(dim, double, lists, batched)) == 1
 
 
 @pytest.mark.parametrize("module", [cells_cpu, cells_cuda], ids=["cpu", "cuda"])
@@ -53,7 +60,7 @@ def test_queries_that_reach_out_of_a_box_have_a_kernel_of_their_own():
         assert [launch.kernel for launch in launches[-2:]] == [kernels.crossing, kernels.query]
         assert [launch.beside for launch in launches] == [False] * (len(launches) - 1) + [True]
         assert [(launch.kernel, launch.of_queries) for launch in launches].count((kernels.gather, True)) == marks
-        assert all(launch.threads % launch.block == 0 for launch in launches)
+        assert all(launch.threads % launch.kernel.block == 0 for launch in launches)
 
 
 def test_queries_of_their_own_are_sorted_too():
@@ -61,7 +68,7 @@ def test_queries_of_their_own_are_sorted_too():
     own, others = (kernels.launches(1000, 500, own, 132) for own in (True, False))
     assert [launch.of_queries for launch in own] == [False] * 7
     assert [launch.of_queries for launch in others].count(True) == 3
-    assert all(launch.threads % launch.block == 0 for launch in own + others)
+    assert all(launch.threads % launch.kernel.block == 0 for launch in own + others)
 
 
 def test_launches_follow_the_device_and_shares_of_queries_do_not():
@@ -84,21 +91,29 @@ def test_few_queries_are_shared_among_more_warps():
     assert cells_cuda.query_blocks(0) == 0
 
 
+SHARE = """
+struct CountArguments {
+    const int* queries;
+    int* shared;
+    int n;
+};
+struct Count {
+    const CountArguments given;
+    void run() {
+        for (int k = 0; k < given.n; ++k) {
+            const Shares found(given.queries[k]);
+            given.shared[2 * k] = found.share_bits;
+            given.shared[2 * k + 1] = found.query_blocks;
+        }
+    }
+};
+"""
+
+
 def test_kernels_share_queries_as_launches_do():
-    module = wp.get_module("tests.shares")
-    space = add_program(module, program(False, 3, "shares.h", WARPS=cells_cuda.GRID["WARPS"]))
-
-    def share_native(m: int, shared: wp.array(dtype=int)): ...
-
-    text = f"const {space}::Shares found(m);\nshared.data[0] = found.share_bits;\nshared.data[1] = found.query_blocks;\n"
-    function = wp.func_native(text)(share_native)
-
-    def share(queries: wp.array(dtype=int), shared: wp.array2d(dtype=int)):
-        function(queries[wp.tid()], shared[wp.tid()])
-
+    (count,) = declare("shares", program(False, 3, "shares.h", WARPS=cells_cuda.GRID["WARPS"]) + SHARE, "Count.run")
     edges = [cells_cuda.GRID["WARPS"] * 2**bits + k for bits in range(7) for k in (-1, 0, 1)]
-    queries = [0, 1, 31, 32, 33, 1000, *edges, 10**6, 2**31 - 1]
-    found = wp.zeros((len(queries), 2), dtype=int, device="cpu")
-    kernel = wp.kernel(share, module=module)
-    wp.launch(kernel, dim=len(queries), inputs=[wp.array(queries, dtype=int, device="cpu"), found], device="cpu")
-    assert found.numpy().tolist() == [[cells_cuda.share_bits(m), cells_cuda.query_blocks(m)] for m in queries]
+    queries = np.array([0, 1, 31, 32, 33, 1000, *edges, 10**6, 2**31 - 1], np.int32)
+    found = np.zeros((len(queries), 2), np.int32)
+    launched.on_cpu(count, queries=queries, shared=found, n=len(queries))
+    assert found.tolist() == [[cells_cuda.share_bits(m), cells_cuda.query_blocks(m)] for m in queries.tolist()]

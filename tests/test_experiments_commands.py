@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from jfrnn.cases import fluids
 from typer.testing import CliRunner
 
 from experiments import _commands, _config
@@ -17,6 +16,7 @@ from experiments._cli import app
 from experiments._errors import UsageError
 from experiments.gpu.config import Config
 from experiments.sph import ranges, settings, snapshots
+from jfrnn.cases import fluids
 
 ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
@@ -127,6 +127,7 @@ def test_every_number_that_can_be_set_has_a_range_and_defaults_are_within():
         ("jet", "duration=1e-9", "scene 'jet' --set duration=1e-9: has no particle of fluid: "),
         ("jet", "duration=1e300", "scene 'jet' --set duration=1e300: cannot be made ("),
         ("jet-gear", "teeth=4", "--set teeth: got '4'; input should be greater than or equal to 5 (from 5 to 1 000)"),
+        ("one", "restitution=none", "scene 'one': restitution must be a number from 0 to 1 in a tank, got None"),
         ("taylor-green", "nx=4", "scene 'taylor-green': periodic box must be 2.05 cutoffs wide along x"),
     ],
 )

@@ -4,11 +4,11 @@ import csv
 
 import numpy as np
 import pytest
-from jfrnn.cases.catalog import CATALOG, TABLES, problem
 from typer.testing import CliRunner
 
 from experiments._cli import app
 from experiments.bench import peers
+from jfrnn.cases.catalog import CATALOG, TABLES, problem
 
 
 def test_every_case_of_the_catalog_exists():

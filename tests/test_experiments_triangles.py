@@ -3,11 +3,11 @@
 import numpy as np
 import pandas as pd
 import pytest
-from jfrnn.cases import meshes
 
 from experiments._errors import UsageError
 from experiments.bench import triangles
 from experiments.sph.settings import _read_mesh
+from jfrnn.cases import meshes
 
 
 def test_a_small_comparison(tmp_path):

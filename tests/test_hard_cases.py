@@ -7,9 +7,9 @@ import checked
 import numpy as np
 import pytest
 import reference
-from jfrnn.cases.hard import HARD_CASES
 
 import jfrnn
+from jfrnn.cases.hard import HARD_CASES
 
 BACKENDS = ("jax", "brute", "warp", "hashgrid")
 CAPACITY = 704  # the fullest row of all hard cases fits

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jfrnn.kernels.hashgrid import grid_shape
 
 import jfrnn
-from jfrnn._engine import load_warp
+from jfrnn._engine.start import load_warp
+from jfrnn.kernels.hashgrid import grid_shape
 
 
 @pytest.mark.parametrize(

@@ -3,9 +3,9 @@
 import jax
 import numpy as np
 import pytest
-from jfrnn.cases import meshes
 
 import jfrnn
+from jfrnn.cases import meshes
 
 
 def test_triangles_written_apart_hang_together_again(dtype):

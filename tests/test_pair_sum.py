@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from jfrnn.cases.batches import BATCH_CASES
-from jfrnn.cases.hard import HARD_CASES
-from jfrnn.cases.periodic import PERIODIC_CASES
-from jfrnn.cases.radii import RADII_CASES
 
 import jfrnn
 from jfrnn._engine import runs as _runs
 from jfrnn._sums import relations as _relations
 from jfrnn._sums import summation as _summation
+from jfrnn.cases.batches import BATCH_CASES
+from jfrnn.cases.hard import HARD_CASES
+from jfrnn.cases.periodic import PERIODIC_CASES
+from jfrnn.cases.radii import RADII_CASES
 
 SLOW = pytest.mark.slow
 LENGTH = 704  # so that cases share compiled programs

@@ -9,14 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import warp as wp
-from jfrnn.kernels import cells_cuda, pair_sum_cpu, pair_sum_cuda
 
 import jfrnn
 from jfrnn._engine import warp_sums
 from jfrnn._search.problem import check_problem
 from jfrnn._sums import fused as _fused
 from jfrnn._sums.verb import _with_engine
+from jfrnn.kernels import _compile, few_cuda, pair_sum_cpu, pair_sum_cuda
 
 CUTOFF = 0.1
 
@@ -58,12 +57,13 @@ def arguments(dtype, dim):
     return np.ones(4, dtype), jnp.zeros((4, dim), dtype), jnp.asarray(1, dtype), values
 
 
-def compiles_for(plan, dim, double, folder, **variant):
+def compiles_for(plan, dim, double, **variant):
     options = {"scaled": False, "compensated": False} | variant
-    kernels = pair_sum_cuda.sum_kernels(plan.text, plan.key, dim, double, **options)
-    assert kernels.crossing is None or kernels.crossing.module is kernels.query.module
-    wp.compile_aot_module(kernels.query.module, arch=90, module_dir=folder, use_ptx=True)
-    return len(list(folder.glob("*.ptx"))) == 1
+    kernels = [kernel for kernel in pair_sum_cuda.sum_kernels(plan.text, plan.key, dim, double, **options) if kernel is not None]
+    if not (options["scaled"] or options.get("periodic")):
+        few = {name: value for name, value in options.items() if name not in ("scaled", "periodic")}
+        kernels.append(few_cuda.sum_kernel(plan.text, plan.key, dim, double, **few))
+    return all(f".entry {x.name}(" in _compile.find_binary(x.program, "cpu", arch=90).read_text() for x in kernels)
 
 
 @pytest.mark.parametrize(
@@ -76,50 +76,50 @@ def compiles_for(plan, dim, double, folder, **variant):
         (3, np.float64, {"batched": True, "compensated": True}),
     ],
 )
-def test_densities_compile(dim, dtype, variant, tmp_path):
+def test_densities_compile(dim, dtype, variant):
     masses, x, scale, _ = arguments(dtype, dim)
-    assert compiles_for(plan_of(square_sum, masses, x, scale), dim, dtype == np.float64, tmp_path, **variant)
+    assert compiles_for(plan_of(square_sum, masses, x, scale), dim, dtype == np.float64, **variant)
 
 
 @pytest.mark.parametrize("argnums", [0, 1, 2], ids=["values", "positions", "closed over"])
-def test_derivatives_compile(argnums, tmp_path):
+def test_derivatives_compile(argnums):
     masses, x, scale, _ = arguments(np.float32, 3)
     plan = plan_of(jax.grad(square_sum, argnums), masses, x, scale)
     assert [part.total for part in plan.text.sums] == [argnums == 2] * len(plan.text.sums)
-    assert compiles_for(plan, 3, False, tmp_path)
+    assert compiles_for(plan, 3, False)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_functions_and_values_of_all_kinds_compile(dtype, tmp_path):
+def test_functions_and_values_of_all_kinds_compile(dtype):
     _, x, scale, values = arguments(dtype, 3)
     plan = plan_of(functools.partial(square_sum, fn=everything), values, x, scale)
     assert {value.dtype for value in plan.text.others} == {np.dtype(dtype).name, "bool", "int32"}
-    assert compiles_for(plan, 3, dtype == np.float64, tmp_path)
+    assert compiles_for(plan, 3, dtype == np.float64)
 
 
 @pytest.mark.parametrize(("dim", "dtype", "length"), [(3, np.float32, 2.0), (2, np.float64, 0.1)])
-def test_terms_in_boxes_compile(dim, dtype, length, tmp_path):
+def test_terms_in_boxes_compile(dim, dtype, length):
     """Of the nearest images, and of several; the lattice shift has no column, its turns have one."""
     masses, x, scale, _ = arguments(dtype, dim)
     periodic = (True, False, True)[:dim]
     plan = plan_of(jax.grad(functools.partial(square_sum, box=jfrnn.Box([length] * dim, periodic)), 1), masses, x, scale)
     assert {step.axis for step in plan.text.steps} == {k for k in range(dim) if periodic[k]}
-    assert compiles_for(plan, dim, dtype == np.float64, tmp_path, periodic=1 if length > CUTOFF else 2)
+    assert compiles_for(plan, dim, dtype == np.float64, periodic=1 if length > CUTOFF else 2)
 
 
 @pytest.mark.parametrize(("dtype", "variant"), [(np.float32, {}), (np.float64, {"periodic": 2, "batched": True})])
-def test_extremes_compile(dtype, variant, tmp_path):
+def test_extremes_compile(dtype, variant):
     masses, x, _, _ = arguments(dtype, 3)
     plan = plan_of(lambda x: jfrnn.pair_sum(poly6, x, CUTOFF, masses, reduce="min", backend="warp"), x)
-    assert compiles_for(plan, 3, dtype == np.float64, tmp_path, extremes=True, **variant)
+    assert compiles_for(plan, 3, dtype == np.float64, extremes=True, **variant)
 
 
-def test_terms_that_read_nothing_compile(tmp_path):
+def test_terms_that_read_nothing_compile():
     plan = plan_of(lambda x: jfrnn.pair_sum(lambda r, i, j: 1.0, x, CUTOFF, backend="warp"), jnp.zeros((4, 3), np.float32))
     assert not (plan.text.own or plan.text.source_columns)
     kernels = pair_sum_cuda.sum_kernels(plan.text, plan.key, 3, False, False, False)
     assert kernels.sort_values is None
-    assert compiles_for(plan, 3, False, tmp_path)
+    assert compiles_for(plan, 3, False)
 
 
 def test_what_a_term_reads_is_sorted_before_it_is_summed():
@@ -128,19 +128,7 @@ def test_what_a_term_reads_is_sorted_before_it_is_summed():
     sort_values, query = kernels.launches(1000, 500, 132)
     assert (sort_values.kernel, query.kernel) == (kernels.sort_values, kernels.query)
     assert query.threads == 32 * pair_sum_cuda.slots(500)
-    assert all(launch.threads % launch.block == 0 for launch in (sort_values, query))
-
-
-@pytest.mark.parametrize("n", [1, 1_000_000, 2**24 + 1, 200_000_000])
-def test_what_walks_in_strides_is_launched_as_one_grid(n):
-    """Warp rounds larger grids up to multiples of 2^24 threads: what those would do that are not run, nobody did."""
-    plan = plan_of(square_sum, *arguments(np.float32, 3)[:3])
-    sums = pair_sum_cuda.sum_kernels(plan.text, plan.key, 3, False, False, False)
-    search = cells_cuda.cell_kernels(3, False, False, True, periodic=1)
-    launches = [*sums.launches(n, n, 1000), *search.launches(n, n, False, 1000)]
-    launches = [launch for launch in launches if launch.kernel not in (sums.query, search.query)]
-    assert sums.sort_values in [launch.kernel for launch in launches]
-    assert all(launch.threads <= 2**24 for launch in launches)
+    assert all(launch.threads % launch.kernel.block == 0 for launch in (sort_values, query))
 
 
 def test_queries_that_leave_a_box_have_a_kernel_beside_the_others():
@@ -189,20 +177,38 @@ def test_a_box_holds_as_many_particles_as_their_numbers_leave_room_for(monkeypat
 
 
 @pytest.mark.parametrize("periodic", [0, 1])
-def test_programs_for_cuda_call_it_and_launches_have_the_arguments_of_their_kernels(periodic):
-    x, box = np.zeros((40, 3), np.float32), jfrnn.Box([2.0] * 3) if periodic else None
+def test_programs_for_cuda_call_it_and_plans_have_the_arguments_of_their_kernels(periodic):
+    x, box = np.zeros((few_cuda.MOST + 1, 3), np.float32), jfrnn.Box([2.0] * 3) if periodic else None
     program = jax.jit(lambda x: square_sum(x[:, 0], x, 1.0, box=box)).trace(x).lower(lowering_platforms=("cuda",)).as_text()
     assert f'"jfrnn_pair_sum_cuda_3d_f32_own_dropself_{"nearest_" * periodic}' in program
     plan = plan_of(functools.partial(square_sum, box=box), *arguments(np.float32, 3)[:3])
     assert f'"jfrnn_sorting_cuda_3d_f32_own{"_nearest" * periodic}@' in program
-    variant = warp_sums._SumVariant(3, False, False, True, False, True, periodic, False, False, False, plan.key, True)
-    rows, line = wp.zeros((40, 3), dtype=float, device="cpu"), wp.zeros(40, dtype=float, device="cpu")
-    ints = wp.zeros(40, dtype=int, device="cpu")
-    sorting = warp_sums._sorting_commands(warp_sums._sorting(variant), rows, rows, line, ints, ints)
-    summing = warp_sums._sum_commands(variant, plan.text, rows, rows, line, line, rows, rows, ints, ints, rows, line, line, line)
-    assert (len(sorting), len(summing)) == (6, 2 + periodic)
-    assert [command.beside for command in summing] == [False] * (1 + periodic) + [bool(periodic)]
-    for command in (*sorting, *summing):
-        types = [argument.type for argument in command.kernel.adj.args]
-        given = [(x.dtype, x.ndim) if isinstance(x, wp.array) else int for x in command.arguments]
-        assert given == [(kind.dtype, kind.ndim) if isinstance(kind, wp.array) else int for kind in types]
+    variant = warp_sums._SumVariant(3, False, False, True, False, True, periodic, False, False, False, plan.key, True, False)
+    given = {name: (40, 3) for name in warp_sums._GIVEN}
+    sorting = warp_sums._plan_sorting(warp_sums._sorting(variant), given, 132)
+    summing = warp_sums._plan_on_cuda(variant, plan.text, given, 132)
+    assert (len(sorting.steps), len(summing.steps)) == (6, 2 + periodic)
+    assert [step.beside for step in summing.steps] == [False] * (1 + periodic) + [bool(periodic)]
+    words = {"info", "scratch"}
+    for found, arrays in (
+        (sorting, {*warp_sums._GIVEN[:3], *words}),
+        (summing, {*given, *words, "sums", "totals", "errors", "values"}),
+    ):
+        for step in found.steps:
+            numbers = {**found.numbers, **step.numbers}
+            assert {field.name for field in step.kernel.fields if field.is_array} <= arrays | set(found.absent)
+            assert all(0 <= numbers[field.name] < 2**31 for field in step.kernel.fields if not field.is_array)
+
+
+def test_few_particles_take_one_launch():
+    x = jnp.zeros((40, 3), np.float32)
+    plan = plan_of(lambda x: jfrnn.pair_sum(poly6, x, CUTOFF, x[:, 0], backend="warp"), x)
+    variant = warp_sums._SumVariant(3, False, False, True, False, True, 0, False, False, False, plan.key, True, True)
+    found = warp_sums._plan_few(variant, plan.text, {name: (40, 3) for name in warp_sums._GIVEN}, 132)
+    (launch,) = found.steps
+    assert launch.threads // launch.kernel.block == -(-40 // few_cuda._QUERIES)
+    arrays = {*warp_sums._GIVEN, "sums", "totals", "errors"}
+    assert {field.name for field in launch.kernel.fields} <= arrays | set(found.numbers)
+    for size, few in ((few_cuda.MOST, True), (few_cuda.MOST + 1, False)):
+        program = jax.jit(lambda x: jfrnn.count(x, CUTOFF, backend="warp")).trace(jnp.zeros((size, 3), np.float32))
+        assert ("jfrnn_few_cuda_" in program.lower(lowering_platforms=("cuda",)).as_text()) == few

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from jfrnn.cases.hard import HARD_CASES
 from test_pair_sum import CUTOFF, HARD, LENGTH, SLOW, N, arrays_of, assert_same, everything, oracle_sum, scene, smooth, tangents_of
 
 import jfrnn
 from jfrnn._sums import translate as _translate
+from jfrnn.cases.hard import HARD_CASES
 
 fused = functools.partial(jfrnn.pair_sum, backend="warp")
 

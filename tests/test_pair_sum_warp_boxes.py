@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from jfrnn.cases.batches import BATCH_CASES
-from jfrnn.cases.periodic import PERIODIC_CASES
 from test_pair_sum import CUTOFF, SLOW, N, arrays_of, assert_same, everything, oracle_sum, scene, smooth, tangents_of
 
 import jfrnn
+from jfrnn.cases.batches import BATCH_CASES
+from jfrnn.cases.periodic import PERIODIC_CASES
 
 fused = functools.partial(jfrnn.pair_sum, backend="warp")
 NAMES = ["outside_100", "faces", "ulp_across_100", "thin_slab", "skewed_3_small", "skewed_slab", "queries_many_images"]

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from jfrnn.cases.radii import RADII_CASES
 from test_pair_sum import SLOW, N, assert_same, everything, oracle_sum, scene, smooth, tangents_of
 from test_pair_sum_warp_boxes import assert_marks, marks
 from test_radii import LENGTH, radii_of
 
 import jfrnn
 from jfrnn._geometry.cutoffs import RULES
+from jfrnn.cases.radii import RADII_CASES
 
 fused = functools.partial(jfrnn.pair_sum, backend="warp")
 

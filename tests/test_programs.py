@@ -1,5 +1,6 @@
 """How many programs an eager call compiles for a new number of particles, and how many the library keeps."""
 
+import gc
 import subprocess
 import sys
 
@@ -232,15 +233,20 @@ def test_vectors_are_few_kernels(box, most):
     assert text.count(" fusion(") <= most
 
 
-def test_kernels_of_many_cutoffs_are_let_go(monkeypatch):
-    """Programs that call a kernel which was let go go on: it is made again."""
+def test_kernels_of_many_sums_are_let_go(monkeypatch):
+    """Programs that call a kernel which was let go go on: it is made again. What was compiled is unloaded."""
     from jfrnn._engine import launch
+    from jfrnn.kernels import _compile
 
     monkeypatch.setattr(launch, "_MOST", 3)
     x = scene(38)
-    searches = [jax.jit(lambda x, r=r: jfrnn.search(x, r, capacity=16, backend="hashgrid").count) for r in (0.3, 0.4, 0.5, 0.6)]
-    counts = [np.asarray(search(x)) for search in searches]
-    assert len(launch._served) == 3
-    for search, count in zip(searches, counts, strict=True):
-        np.testing.assert_array_equal(search(x), count)
-    assert len(launch._served) == 3
+    sums = [jax.jit(lambda x, c=c: jfrnn.pair_sum(lambda r, i, j: c * (r @ r), x, 0.6)) for c in (2.0, 3.0, 4.0, 5.0)]
+    found = [np.asarray(pair_sum(x)) for pair_sum in sums]
+    assert len(launch._plans) == 3
+    gc.collect()
+    loaded = len(_compile._loaded)
+    for pair_sum, known in zip(sums, found, strict=True):
+        np.testing.assert_array_equal(pair_sum(x), known)
+    assert len(launch._plans) == 3
+    gc.collect()
+    assert len(_compile._loaded) == loaded

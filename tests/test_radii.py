@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from jfrnn.cases.radii import RADII_CASES
 from test_box import image_pairs, masked_images
 
 import jfrnn
 from jfrnn._geometry.cutoffs import RULES, is_radius, smallest_cutoff
+from jfrnn.cases.radii import RADII_CASES
 
 SLOW = pytest.mark.slow
 LENGTH, CAPACITY = 128, 256

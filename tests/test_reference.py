@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from jfrnn.cases.hard import HARD_CASES
 from reference import compare, is_pair, pairs_of, reference_images, reference_pairs
+
+from jfrnn.cases.hard import HARD_CASES
 
 DTYPES = (np.float32, np.float64)
 DIMS = (2, 3)

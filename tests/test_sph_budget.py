@@ -5,10 +5,10 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from jfrnn.cases import fluids
 
 from experiments.sph import budget, solver, states
 from experiments.sph.model import make_model, make_state
+from jfrnn.cases import fluids
 
 DROP = fluids.fluid("drop", nx=6, duration=0.003)
 

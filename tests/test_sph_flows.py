@@ -5,12 +5,12 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from jfrnn.cases import fluids
-from jfrnn.cases._fluid_flows import taylor_green_velocity
 
 import jfrnn
 from experiments.sph import budget, forces, health, solver
 from experiments.sph.model import make_model, make_state
+from jfrnn.cases import fluids
+from jfrnn.cases._fluid_flows import taylor_green_velocity
 
 
 def begun(scene, backend="auto"):

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jfrnn.cases import fluids
 
 from experiments.sph import solver
 from experiments.sph.model import make_model, make_state
+from jfrnn.cases import fluids
 
 RANDOM = np.random.default_rng(0)
 SITES = np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0)), axis=-1).reshape(-1, 2) / 6

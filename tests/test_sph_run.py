@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import pyvista
 import trimesh
-from jfrnn.cases import fluids, meshes
 from typer.testing import CliRunner
 
 from experiments._cli import app
@@ -14,6 +13,7 @@ from experiments.sph import health
 from experiments.sph.model import make_model, make_state
 from experiments.sph.settings import make_scene, with_solid
 from jfrnn._triangles.winding import is_closed
+from jfrnn.cases import fluids, meshes
 
 FEW = ("--frames", 3, "--set", "duration=0.003")
 

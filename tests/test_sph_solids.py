@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jfrnn.cases import fluids, meshes
 from matplotlib.path import Path as Outline
 from typer.testing import CliRunner
 
@@ -14,6 +13,7 @@ from experiments._cli import app
 from experiments.sph import budget, health, solids, solver, view
 from experiments.sph.kernels import KERNELS
 from experiments.sph.model import make_model, make_state
+from jfrnn.cases import fluids, meshes
 
 TURNS = fluids.Turning((0.1, -0.2, 0.3), (1.0, 2.0, -0.5), 3.0)
 

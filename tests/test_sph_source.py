@@ -5,10 +5,10 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from jfrnn.cases import fluids
 
 from experiments.sph import budget, solver
 from experiments.sph.model import make_model, make_state
+from jfrnn.cases import fluids
 
 REFERENCE = Path(__file__).parent.parent / "experiments" / "reference"
 

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jfrnn.cases import fluids
 from typer.testing import CliRunner
 
 from experiments import _config
@@ -18,6 +17,7 @@ from experiments._cli import app
 from experiments._errors import UsageError
 from experiments.sph import edges, forces, speed, speed_report, tradeoff
 from experiments.sph.model import make_model, make_state
+from jfrnn.cases import fluids
 
 TINY = """
 scene = "dam-break-2d"

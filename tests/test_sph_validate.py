@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from jfrnn.cases import fluids
 from typer.testing import CliRunner
 
 from experiments._cli import app
 from experiments.sph import answers, potential, validate
 from experiments.sph.validation import CASES, Case, Figure, Seen
+from jfrnn.cases import fluids
 
 SHORT = Case(
     "one", (0.001, 0.002), lambda scene, seen: ([Figure("fallen", 0.5 - seen[-1].x[0, 1], None, 1e-9)], {}), backend="brute"

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from jfrnn.cases.triangles import TRIANGLE_CASES, padded
 
 import jfrnn
 from jfrnn._geometry.cutoffs import make_cutoff
 from jfrnn._triangles import cells as _triangles_cells
 from jfrnn._triangles import tree as _triangles_tree
 from jfrnn._triangles import warp as _triangles_warp
+from jfrnn.cases.triangles import TRIANGLE_CASES, padded
 
 BACKENDS = ("jax", "warp", "bvh")
 IN_CELLS = ("jax", "warp")

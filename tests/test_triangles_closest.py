@@ -4,13 +4,10 @@ import re
 
 import jax
 import jax.numpy as jnp
+import launched
 import numpy as np
 import pytest
 import reference
-import warp as wp
-from jfrnn.cases import meshes
-from jfrnn.cases.triangles import TRIANGLE_CASES, padded
-from jfrnn.kernels import winding
 
 import jfrnn
 from jfrnn._geometry.cutoffs import make_cutoff
@@ -19,6 +16,9 @@ from jfrnn._triangles import warp as _triangles_warp
 from jfrnn._triangles.closest import nearest_of
 from jfrnn._triangles.tree import WIDTH, grow_tree, level_starts
 from jfrnn._triangles.winding import cast_rays, is_closed, least_winding, ray_ways
+from jfrnn.cases import meshes
+from jfrnn.cases.triangles import TRIANGLE_CASES, padded
+from jfrnn.kernels import _compile, winding
 
 # of cutoffs of their own, each a program anew, between the smallest and the largest
 _IN_BETWEEN = {"ties_small", "ties_spacing", "ulps", "ulps_far", "ulps_large", "axis_ulps", "cell_edges"}
@@ -282,21 +282,21 @@ def test_rays_through_a_tree_of_many_levels():
 
 @pytest.mark.parametrize("dim", [pytest.param(2, marks=pytest.mark.slow), 3])
 @pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
-def test_kernel_for_cuda(dim, dtype, tmp_path):
-    """It compiles for a GPU, nothing contracted, and its text tells on the CPU, thread by thread, what that of the CPU does."""
-    kernel = winding.side_kernel(dim, dtype == np.float64, WIDTH, cuda=True)
-    wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
-    (program,) = [path.read_text() for path in tmp_path.glob("*.ptx")]
+def test_kernel_for_cuda(dim, dtype):
+    """It compiles for a GPU, nothing contracted; its text for the CPU tells the sides, too."""
+    double = dtype == np.float64
+    program = _compile.find_binary(winding.side_kernel(dim, double, WIDTH, cuda=True).program, "cpu", arch=90).read_text()
     assert not re.search(r"\bfma\.|\b(mul|add|sub)\.f(32|64)", program)
     vertices, faces = joined(*walls(dim)["crossing"])
     vertices, x = vertices.astype(dtype), around(dim, dtype)
     tri = jfrnn.search_triangles(x, vertices, faces, 0.5, capacity=48, backend="bvh")
-    given = x, vertices[faces], tri.cells.boxes, np.array([0.5], dtype), ray_ways(dim, np.dtype(dtype)), level_starts(len(faces))
-    side, info = np.full(len(x), -7, np.int32), np.zeros(1, np.int32)
-    ones = np.ones(len(x), np.int32), np.ones(1, np.int32)
-    arrays = [wp.array(np.asarray(a), device="cpu", copy=False) for a in (*given, tri.cells.triangles, *ones, side, info)]
-    arrays[1] = wp.array(vertices[faces], device="cpu", dtype=arrays[0].dtype, ndim=3)
-    wp.launch(kernel, dim=256, inputs=[*arrays, len(x), len(given[5]) - 1, tri.cells.boxes.shape[1]], device="cpu")
+    given = {"positions": x, "corners": vertices[faces], "boxes": tri.cells.boxes, "cutoff": np.array([0.5], dtype)}
+    given |= {"rays": ray_ways(dim, np.dtype(dtype)), "start": level_starts(len(faces)), "triangles": tri.cells.triangles}
+    side = np.full(len(x), -7, np.int32)
+    given |= {"asked": np.ones(len(x), np.int32), "least": np.ones(1, np.int32), "side": side, "info": np.zeros(1, np.int32)}
+    arrays = {name: np.ascontiguousarray(array) for name, array in given.items()}
+    sizes = {"n": len(x), "levels": len(arrays["start"]) - 1, "entries": tri.cells.boxes.shape[1]}
+    launched.on_cpu(winding.side_kernel(dim, double, WIDTH, cuda=False), **arrays, **sizes)
     inside, on_face = expected_side(x, vertices, faces)
     assert np.array_equal(side[~on_face], inside[~on_face])
 

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.extend.core import jaxprs_in_params
-from jfrnn.cases import meshes
 
 import jfrnn
 from jfrnn._triangles import triangle_list as _triangles_list
 from jfrnn._triangles.closest import nearest_of
+from jfrnn.cases import meshes
 
 CAPACITY = 40
 

@@ -9,14 +9,10 @@ from itertools import product
 
 import jax
 import jax.numpy as jnp
+import launched
 import numpy as np
 import pytest
 import reference
-import warp as wp
-from jfrnn.cases import meshes
-from jfrnn.cases.triangles import TRIANGLE_CASES, padded
-from jfrnn.kernels import triangles_cuda
-from jfrnn.kernels._triangles import pending
 
 import jfrnn
 from jfrnn._engine import auto as _auto
@@ -26,23 +22,35 @@ from jfrnn._triangles import warp as _triangles_warp
 from jfrnn._triangles.cells import gather_corners
 from jfrnn._triangles.tree import WIDTH
 from jfrnn._triangles.warp import _Variant, query_inputs, sizes_on_cuda
+from jfrnn.cases import meshes
+from jfrnn.cases.triangles import TRIANGLE_CASES, padded
+from jfrnn.kernels import Program, _compile, triangles_cuda
+from jfrnn.kernels._triangles import pending
 
 KINDS = list(product((np.float32, np.float64), (2, 3)))
 GUARD = 64  # words behind the scratch, which nobody may touch
 
 
 @pytest.mark.parametrize(("dim", "double", "lists", "tree"), list(product((2, 3), *[(False, True)] * 3)))
-def test_variants_compile(dim, double, lists, tree, tmp_path):
+def test_variants_compile(dim, double, lists, tree):
     """For float bounds that hold, and are those of the CPU: nothing is contracted."""
-    kernels = triangles_cuda.triangle_kernels(dim, double, lists, tree, WIDTH)
-    for module in {kernel.module for kernel in kernels if kernel is not None}:
-        wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
-    programs = [path.read_text() for path in tmp_path.glob("*.ptx")]
+    programs = {kernel.program for kernel in triangles_cuda.triangle_kernels(dim, double, lists, tree, WIDTH)}
     assert len(programs) == 3
     for program in programs:
-        assert not re.search(r"\bfma\.|\b(mul|add|sub)\.f(32|64)", program)
+        text = _compile.find_binary(program, "cpu", arch=90).read_text()
+        assert not re.search(r"\bfma\.|\b(mul|add|sub)\.f(32|64)", text)
         # bytes of a thread: no big integer is among them, but what waits in a tree is
-        assert sum(map(int, re.findall(r"\.local .*\[(\d+)\]", program))) <= 32 + 4 * pending(WIDTH) * tree
+        assert sum(map(int, re.findall(r"\.local .*\[(\d+)\]", text))) <= 32 + 4 * pending(WIDTH) * tree
+
+
+def on_the_cpu(kernel):
+    """Return a kernel of CUDA as one of the CPU, whose threads come one after the other."""
+    name = f"{kernel.name}_on_the_cpu"
+    struct, _, method = kernel.name.partition("_")
+    text = kernel.program.text[: kernel.program.text.rindex("\n}\n")] + "\n}\n"
+    loop = f"for (; given.first_thread < given.threads; ++given.first_thread)\n{struct}{{given}}.{method}();"
+    entry = f'extern "C" void {name}(const {struct}Arguments* all) {{\n{struct}Arguments given = *all;\n{loop}\n}}\n'
+    return kernel._replace(name=name, program=Program(name, text + entry, cuda=False))
 
 
 class Answer:
@@ -53,15 +61,18 @@ class Answer:
         self.variant = _Variant(dim, positions.dtype == np.float64, lists, tri.backend == "bvh")
         corners, _, _ = gather_corners(tri.vertices, tri.faces)
         inputs = query_inputs(positions, corners, tri.cells, make_cutoff(tri.cutoff, positions.dtype, closed=False))
-        words = triangles_cuda.scratch_words(n, *sizes_on_cuda(self.variant, inputs), dim, self.variant.double)
+        given = dict(zip(_triangles_warp._GIVEN, map(np.ascontiguousarray, inputs), strict=True))
+        sizes = sizes_on_cuda(self.variant, *(given[name].shape for name in ("corners", "boxes", "start", "triangles")))
+        words = triangles_cuda.scratch_words(n, *sizes, dim, self.variant.double)
         self.idx = np.full((n, tri.capacity) if lists else (1, 1), -7, np.int32)
         self.count, scratch = (np.full(size, -7, np.int32) for size in (n, words + GUARD))
-        arrays = [wp.array(given, device="cpu", copy=False) for given in (*map(np.asarray, inputs), self.idx, self.count, scratch)]
-        arrays[1] = wp.array(np.asarray(corners), device="cpu", dtype=arrays[0].dtype, ndim=3)  # no matrices
-        self.commands = _triangles_warp._commands(self.variant, *arrays)
-        for kernel, arguments, threads, block, _ in self.commands:
-            assert threads % block == 0
-            wp.launch(kernel, dim=threads, inputs=list(arguments), device="cpu")
+        given |= {"idx": self.idx, "count": self.count, "scratch": scratch}
+        plan = _triangles_warp.plan_on_cuda(self.variant, {name: array.shape for name, array in given.items()}, 132)
+        self.steps = plan.steps
+        for kernel, threads, numbers, _ in plan.steps:
+            assert threads % kernel.block == 0
+            numbers = {**plan.numbers, **numbers}
+            launched.on_cpu(on_the_cpu(kernel), **{field.name: {**given, **numbers}[field.name] for field in kernel.fields})
         assert np.all(scratch[words:] == -7)
         self.near, self.queued = scratch[:2]
 
@@ -104,7 +115,7 @@ def test_around_a_gear(n, cutoff, backend):
     assert np.sum(answer.count > 0) <= answer.near <= n
     counted = Answer(tri, x, lists=False)
     assert np.array_equal(counted.count, tri.count)
-    assert len(counted.commands) == len(answer.commands) - 1  # no row is filled
+    assert len(counted.steps) == len(answer.steps) - 1  # no row is filled
     assert np.all(counted.idx == -7)
 
 
@@ -129,22 +140,16 @@ def test_programs_for_cuda_call_it():
 
 
 @pytest.mark.parametrize("lists", [False, True])
-def test_launches_have_the_arguments_of_their_kernels(lists):
+def test_rows_are_filled_beside_another_launch(lists):
     x, tri = around_a_gear(100, 0.5)
-    commands = Answer(tri, x, lists).commands
-    assert [command.beside for command in commands] == [False, False, *([True] if lists else []), False, False, False, False]
-    for command in commands:
-        types = [argument.type for argument in command.kernel.adj.args]
-        given = [(x.dtype, x.ndim) if isinstance(x, wp.array) else int for x in command.arguments]
-        assert given == [(kind.dtype, kind.ndim) if isinstance(kind, wp.array) else int for kind in types]
-        assert all(isinstance(x, wp.array) or 0 <= x < 2**31 for x in command.arguments)
+    assert [step.beside for step in Answer(tri, x, lists).steps] == [False, False, *[True] * lists, False, False, False, False]
 
 
 def test_slots_are_filled_by_as_many_threads_as_a_device_runs():
     """All others are as many on each device: their buffers are laid out where a program is traced."""
     kernels = triangles_cuda.triangle_kernels(3, False, True, False, WIDTH)
-    small, large = (kernels.launches(10**7, 1000, 1000, 32, False, multiprocessors) for multiprocessors in (2, 160))
-    factors = {few.kernel: many.threads / few.threads for few, many in zip(small, large, strict=True)}
+    small, large = (dict(kernels.threads(10**7, 1000, 1000, 32, False, multiprocessors)) for multiprocessors in (2, 160))
+    factors = {kernel: large[kernel] / threads for kernel, threads in small.items()}
     assert factors.pop(kernels.fill) == 80
     assert set(factors.values()) == {1}
 

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from jfrnn.cases import meshes
 
 import jfrnn
+from jfrnn.cases import meshes
 
 BACKENDS = [pytest.param("jax", marks=pytest.mark.slow), "warp", "bvh"]
 

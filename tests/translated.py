@@ -1,18 +1,31 @@
-"""Translate functions, put all of them into one Warp kernel, and run it on the CPU."""
+"""Translate functions, put all of them into one kernel, and run it on the CPU."""
 
 import functools
 from typing import Any, NamedTuple
 
 import jax
+import launched
 import numpy as np
-import warp as wp
-from jfrnn.kernels._native import add_program, program
 
 from jfrnn._sums import translate as _translate
 from jfrnn._sums.scalars import TYPES
+from jfrnn.kernels import declare
+from jfrnn.kernels._native import program
 
 LANES = {"float32": 16, "float64": 8}
 NUMBER = {"float32": "float", "float64": "double"}
+
+
+STRUCT = """
+struct ChooseArguments {
+const real* given;
+real* found;
+int n, which;
+};
+struct Choose : ChooseArguments {
+JFRNN_MEMBER explicit Choose(const ChooseArguments& a) : ChooseArguments(a) {}
+JFRNN_MEMBER void run() {
+"""
 
 
 class Case(NamedTuple):
@@ -47,7 +60,7 @@ def statements(text, real):
     before = np.cumsum([0, *(np.prod(spec.shape, dtype=int) for spec in text.inputs)])
     for k, e in text.reads:
         name, of = _translate.input_name(k, e), TYPES[text.inputs[k].dtype]
-        loaded = f"load(given.data + {before[k] + e} * n + i)"
+        loaded = f"load(given + {before[k] + e} * n + i)"
         lines.append(f"const Math::{of} {name} = {loaded if of == of_real else f'Math::to_{of}({loaded})'};")
     lines.append(text.text)
     row = 0
@@ -55,18 +68,18 @@ def statements(text, real):
         for e in range(int(np.prod(spec.shape))):
             y = _translate.output_name(k, e)
             y = y if TYPES[spec.dtype] == of_real else f"Math::to_{of_real}({y})"
-            lines.append(f"store(found.data + {row} * n + i, {y});")
+            lines.append(f"store(found + {row} * n + i, {y});")
             row += 1
     return "\n".join(lines)
 
 
-def native_text(texts, real, kind, module):
-    """Return a function body that runs the text of the number `which` on n columns."""
+def native_text(texts, real, kind):
+    """Return a program that runs the text of the number `which` on n columns."""
     lanes, number, of_real = LANES[real] if kind == "vector" else 1, NUMBER[real], TYPES[real]
     count = f"#define JFRNN_SCALAR {int(kind != 'vector')}\nconstexpr int LANES = {lanes};\n"
     given = {"lane_count.h": '#include "constants.h"\n#include "device.h"\n' + count}
-    space = add_program(module, program(real == "float64", 3, "float_control.h", "math.h", given=given))
-    start = [f"using namespace {space};", "const FloatControl floats;"]
+    text = program(real == "float64", 3, "constants.h", "float_control.h", "math.h", given=given)
+    start = ["const FloatControl floats;"]
     if kind == "vector":
         start.append(
             f"auto load = [](const {number}* from) {{ Math::{of_real} x; __builtin_memcpy(&x, from, sizeof x); return x; }};"
@@ -79,26 +92,13 @@ def native_text(texts, real, kind, module):
         f"case {k}:\nfor (int i = 0; i < n; i += LANES) {{\n{text}\n}}\nbreak;"
         for k, text in enumerate(texts)
     ]  # fmt: skip
-    return "\n".join(["", *start, "switch (which) {", *cases, "}", ""])
+    return text + STRUCT + "\n".join([*start, "switch (which) {", *cases, "}", "}", "};", ""])
 
 
-def kernel_of(cases, real, kind, name):
+def kernel_of(cases, real, kind, name, cuda=False):
     """Return a kernel that runs one of the cases: given [rows, n], found [rows, n], n, which."""
-    scalar = {"float32": wp.float32, "float64": wp.float64}[real]
-    reals = wp.array2d(dtype=scalar)
-
-    def native(given: reals, found: reals, n: int, which: int): ...
-
-    native.__name__ = native.__qualname__ = f"{name}_{kind}_{real}"
     texts = [statements(translated(case, real), real) for case in cases]
-    module = wp.get_module(f"tests.translated.{name}.{kind}.{real}")
-    wp.set_module_options({"enable_backward": False, "fuse_fp": False, "max_unroll": 1}, module)
-    function = wp.func_native(native_text(texts, real, kind, module))(native)
-
-    def run(given: reals, found: reals, n: int, which: int):
-        function(given, found, n, which)
-
-    return wp.kernel(run, module=module)
+    return declare(f"translated_{name}_{kind}_{real}", native_text(texts, real, kind), "Choose.run", cuda=cuda)[0]
 
 
 def run(kernel, which, case, inputs):
@@ -106,7 +106,7 @@ def run(kernel, which, case, inputs):
     n, outputs = len(inputs[0]), translated(case, inputs[0].dtype.name).outputs
     given = np.concatenate([x.reshape(n, -1).T for x in inputs])
     sizes = [int(np.prod(spec.shape)) for spec in outputs]
-    found = wp.zeros((sum(sizes), n), dtype=wp.float32 if given.dtype == np.float32 else wp.float64, device="cpu")
-    wp.launch(kernel, dim=1, inputs=[wp.array(given, device="cpu"), found, n, which], device="cpu")
-    rows = np.split(found.numpy(), np.cumsum(sizes)[:-1])
+    found = np.zeros((sum(sizes), n), given.dtype)
+    launched.on_cpu(kernel, given=np.ascontiguousarray(given), found=found, n=n, which=which)
+    rows = np.split(found, np.cumsum(sizes)[:-1])
     return [x.T.reshape(n, *spec.shape) for x, spec in zip(rows, outputs)]

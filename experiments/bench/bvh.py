@@ -56,8 +56,12 @@ class Tree:
             for name, kernel, out in (("nearest", _nearest_kernel, self.distance), ("boxes", _boxes_kernel, self.count))
         }
 
+    def launch(self, name: str) -> None:
+        """Launch a kernel by its name, on the current stream of the device."""
+        kernel, arguments, threads, block = self.launches[name]
+        wp.launch(kernel, threads, arguments, device=self.count.device, block_dim=block)
+
     def ask(self, name: str) -> np.ndarray:
         """Launch a kernel by its name; return what it wrote."""
-        kernel, arguments, threads, _ = self.launches[name]
-        wp.launch(kernel, threads, arguments, device=self.count.device)
-        return arguments[-1].numpy()
+        self.launch(name)
+        return self.launches[name][1][-1].numpy()

@@ -14,11 +14,11 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
-from jfrnn.cases.catalog import CATALOG, Problem, problem  # pyright: ignore[reportMissingImports]
 
 from experiments import _table
 from experiments._commands import check_names, finite
 from experiments.bench import table
+from jfrnn.cases.catalog import CATALOG, Problem, problem
 
 Pairs = tuple[np.ndarray, np.ndarray]
 COLUMNS = ("row", "case", "peer", "version", "answer", "missing", "extra", "pairs", "reason", "commit", "dirty")
@@ -41,10 +41,13 @@ class _Peer(NamedTuple):
 
 
 def _jfrnn(given: Problem) -> Pairs:
+    import jax.numpy as jnp
+
     import jfrnn
 
+    queries, batch = (None if part is None else jnp.asarray(part) for part in (given.queries, given.batch))
     box = None if given.matrix is None else jfrnn.Box(given.matrix, given.periodic)
-    nbrs = jfrnn.search(given.positions, given.cutoff, queries=given.queries, box=box, batch=given.batch)
+    nbrs = jfrnn.search(jnp.asarray(given.positions), given.cutoff, queries=queries, box=box, batch=batch)
     if jfrnn.Status(int(nbrs.status)) not in (jfrnn.Status.OK, jfrnn.Status.NONFINITE):
         nbrs.check()
     i, k = np.nonzero(np.arange(nbrs.capacity) < np.asarray(nbrs.count)[:, None])

@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import typer
-from jfrnn.cases import meshes  # pyright: ignore[reportMissingImports]
 
 import jfrnn
 from experiments import _machine, _measure
 from experiments._commands import Points, Rounds, check_choice, positive
 from experiments.bench import table
+from jfrnn.cases import meshes
 
 COLUMNS = (
     *("method", "n", "faces", "cutoff", "pairs", "longest_row", "rounds", "median_s", "p10_s", "p90_s", "us_per_particle"),

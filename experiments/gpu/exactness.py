@@ -87,7 +87,7 @@ def found_pairs(nbrs: Any, x: Any, queries: Any) -> list[tuple[int, int, tuple[i
 
 
 def _hard(dtype: str, dim: int) -> Iterator[Case]:
-    from jfrnn.cases.hard import HARD_CASES  # pyright: ignore[reportMissingImports]
+    from jfrnn.cases.hard import HARD_CASES
 
     for name, closed in itertools.product(HARD_CASES, (False, True)):
         if name == "denormal_lattice":  # a denormal cutoff is refused
@@ -101,7 +101,7 @@ def _hard(dtype: str, dim: int) -> Iterator[Case]:
 
 @functools.lru_cache(maxsize=1024)
 def _plain_pairs(name: str, dtype: str, dim: int, closed: bool) -> list[tuple[int, int, tuple[int, ...]]]:
-    from jfrnn.cases.hard import HARD_CASES  # pyright: ignore[reportMissingImports]
+    from jfrnn.cases.hard import HARD_CASES
 
     given = HARD_CASES[name].build(dtype, dim)
     pairs = oracle().reference_pairs(given.positions, given.cutoff, queries=given.queries, closed=closed)
@@ -109,7 +109,7 @@ def _plain_pairs(name: str, dtype: str, dim: int, closed: bool) -> list[tuple[in
 
 
 def _periodic(dtype: str, dim: int) -> Iterator[Case]:
-    from jfrnn.cases.periodic import PERIODIC_CASES  # pyright: ignore[reportMissingImports]
+    from jfrnn.cases.periodic import PERIODIC_CASES
 
     for name, half in itertools.product(PERIODIC_CASES, (False, True)):
         given = PERIODIC_CASES[name].build(dtype, dim)
@@ -122,7 +122,7 @@ def _periodic(dtype: str, dim: int) -> Iterator[Case]:
 
 
 def _radii(dtype: str, dim: int) -> Iterator[Case]:
-    from jfrnn.cases.radii import RADII_CASES  # pyright: ignore[reportMissingImports]
+    from jfrnn.cases.radii import RADII_CASES
 
     for name, rule in itertools.product(RADII_CASES, RULES):
         given = RADII_CASES[name].build(dtype, dim)
@@ -138,12 +138,12 @@ def _radii(dtype: str, dim: int) -> Iterator[Case]:
 
 
 def _batches(dtype: str, dim: int) -> Iterator[Case]:
-    from jfrnn.cases.batches import BATCH_CASES  # pyright: ignore[reportMissingImports]
+    from jfrnn.cases.batches import BATCH_CASES
 
     for name, closed in itertools.product(BATCH_CASES, (False, True)):
         given = BATCH_CASES[name].build(dtype, dim)
         of_queries, batch = given.batch, given.batch
-        if given.queries is not None:
+        if given.query_batch is not None:
             of_queries, batch = given.query_batch, (given.batch, given.query_batch)
         matrix = np.ones(dim) if given.lengths is None else given.lengths
         about = {"matrix": matrix, "periodic": (given.lengths is not None,) * dim, "queries": given.queries, "closed": closed}

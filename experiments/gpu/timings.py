@@ -31,7 +31,7 @@ def jitter_lattice(config: Config, n: int) -> np.ndarray:
 
 
 def _corners(config: Config, fill: float) -> np.ndarray:
-    from jfrnn.cases import scene  # pyright: ignore[reportMissingImports]
+    from jfrnn.cases import scene
 
     random = np.random.default_rng(config.seed)
     given = scene("corners", fill=fill)

@@ -203,23 +203,22 @@ def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tupl
     if s.solid is not None:
         a = a + solids.push(model, s, s.solid, seen.rho, seen.p)
     if physics.surface_tension is not None:
-        a = a + _tension(model, s, seen.rho, nbrs)
+        a = a + _tension(model, s, seen.rho, nbrs, physics.surface_tension)
     if physics.damping is not None:
-        a = a - _damping(model, s.time) * s.v
+        a = a - _damping(physics.damping, physics.damped_until, s.time) * s.v
     return walls.keep_fluid(are_guided(model, s.time), a), sums.get("w")
 
 
-def _tension(model: Model, s: State, rho: Array, nbrs: Neighbors) -> Array:
+def _tension(model: Model, s: State, rho: Array, nbrs: Neighbors, tension: Array) -> Array:
     """Return accelerations by surface tension as a continuum force [m/s²], shape [n, d]; at walls there is no surface."""
     n = _sum(lambda pair, i, j: surface.inward(pair, j), model, s, {"rho": rho}, nbrs)
     normal, known = surface.directions(n, model.physics.smoothing)
     sums = _sum(surface.bend, model, s, {"rho": rho, "normal": normal, "known": known}, nbrs)
-    return surface.continuum(sums, n, known, rho, model.physics.surface_tension)
+    return surface.continuum(sums, n, known, rho, tension)
 
 
-def _damping(model: Model, time: Array) -> Array:
+def _damping(rate: Array, until: Array | None, time: Array) -> Array:
     """Return the rate [1/s], shape [], at which velocities decay now."""
-    rate, until = model.physics.damping, model.physics.damped_until
     return rate if until is None else jnp.where(time < until, rate, 0)
 
 

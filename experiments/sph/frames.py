@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
@@ -11,6 +10,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from experiments.sph import view
+from jfrnn.cases.fluids import FluidScene
 
 WALL = "0.75"
 

@@ -8,13 +8,13 @@ import jax
 import numpy as np
 import pandas as pd
 from jax import Array
-from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
 from matplotlib.figure import Figure
 
 from experiments._commands import check_names
 from experiments.sph import solver
 from experiments.sph.inverse import PROBLEMS, Found, Problem, solve
 from experiments.sph.model import Model, State, make_model, make_state
+from jfrnn.cases import fluids
 
 NAMES = (*PROBLEMS, "memory")
 

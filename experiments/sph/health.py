@@ -1,12 +1,12 @@
 """Whether a run diverges, in which step, and which particle says so."""
 
 import numpy as np
-from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 from experiments._errors import UsageError
 from experiments.sph import solids, solver
 from experiments.sph.forces import Neighbors
 from experiments.sph.model import Model, State
+from jfrnn.cases.fluids import FluidScene
 
 
 class DivergedError(UsageError):

@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
-from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 from scipy.optimize import minimize
 
 from experiments._library import LAYERS, free, lattice
 from experiments.sph import answers, solver
 from experiments.sph.model import Model, State, make_model, make_state
+from jfrnn.cases import fluids
+from jfrnn.cases.fluids import FluidScene
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,7 @@ def viscosity(*, ny: int = 18, time: float = 1e-3, guess: float = 50.0, backend:
     """
     scene = fluids.fluid("poiseuille", ny=ny)
     model, s = make_model(scene, backend=backend), make_state(scene)
+    assert scene.wall is not None and scene.step is not None, "plates of dummies, and steps of one length"
     fluid, steps = ~scene.wall, _square(time / scene.step)
     seen = jnp.asarray(answers.poiseuille(scene.positions[fluid, 1], steps * scene.step))
 
@@ -105,6 +106,7 @@ def jet(*, known: tuple[float, float] = (1.5, 0.8), guess: tuple[float, float] =
     """
     scene = _jet_scene()
     model, s = make_model(scene, backend=backend), make_state(scene)
+    assert scene.step is not None, "steps are of one length"
     steps = _square(scene.duration / scene.step)
 
     @jax.jit
@@ -170,6 +172,7 @@ def droplet(*, goal: float = 0.4, intervals: int = 8, backend: str = "auto") -> 
     """
     scene = droplet_scene()
     model, s = make_model(scene, backend=backend), make_state(scene)
+    assert scene.wall is not None and scene.step is not None, "a ground of dummies, and steps of one length"
     fluid = ~scene.wall
     each = _square(scene.duration / scene.step / intervals)
 

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jfrnn.cases.fluids import FluidScene, Physics  # pyright: ignore[reportMissingImports]
 
 import jfrnn
 from experiments.sph import solids
 from experiments.sph.kernels import KERNELS
 from experiments.sph.pairs import reach
 from experiments.sph.particles import Model, State
+from jfrnn.cases.fluids import FluidScene, Physics
 
 __all__ = ["Model", "State", "make_model", "make_state"]
 
@@ -61,13 +61,15 @@ def _check_box(scene: FluidScene) -> None:
 
 
 def _check_parts(scene: FluidScene) -> None:
-    """Refuse what compiles and means nothing."""
+    """Refuse what does not compile, or compiles and means nothing."""
     physics = scene.physics
     if physics.integrator == "leapfrog" and physics.evolve != "summation":
         raise ValueError(
             f"integrator 'leapfrog' carries no density or pressure, got evolve {physics.evolve!r}: "
             "take evolve 'summation', or integrator 'symplectic' or 'midpoint'."
         )
+    if scene.tank is not None and physics.restitution is None:
+        raise ValueError("restitution must be a number from 0 to 1 in a tank, got None: take 1 for walls that take no speed away.")
     if scene.solid is not None:
         _check_solid(physics)
     if physics.pressure == "difference" and scene.periodic is None and scene.wall is None:
@@ -77,7 +79,7 @@ def _check_parts(scene: FluidScene) -> None:
         )
 
 
-def _check_solid(physics: Physics) -> None:
+def _check_solid(physics: Physics[float, tuple[float, ...]]) -> None:
     """Refuse what walls of triangles have no integrals for."""
     for name, allowed in (
         ("evolve", ("continuity",)),

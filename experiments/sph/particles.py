@@ -5,12 +5,12 @@ from typing import NamedTuple
 
 import jax
 from jax import Array
-from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
-from jfrnn.cases.fluids import Physics, Turning  # pyright: ignore[reportMissingImports]
 
 import jfrnn
 from experiments.sph.kernels import KERNELS, Kernel
 from experiments.sph.pairs import reach
+from jfrnn.cases import fluids
+from jfrnn.cases.fluids import Physics, Turning
 
 jax.tree_util.register_dataclass(
     fluids.Physics,
@@ -40,7 +40,7 @@ class Model:
         turning: How the wall of triangles turns; None: it stays, or there is none.
     """
 
-    physics: Physics
+    physics: Physics[Array, Array]
     m: Array
     wall: Array | None
     box: jfrnn.Box | None
@@ -51,7 +51,7 @@ class Model:
     spacing: float = field(metadata={"static": True})
     fluid_count: int | None = field(metadata={"static": True})
     backend: str = field(default="auto", metadata={"static": True})
-    turning: Turning | None = None
+    turning: Turning[Array, Array] | None = None
 
     @property
     def kernel(self) -> Kernel:

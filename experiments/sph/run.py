@@ -8,7 +8,6 @@ from time import perf_counter
 
 import jax
 import numpy as np
-from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 import jfrnn
 from experiments import _loop
@@ -16,6 +15,7 @@ from experiments._errors import UsageError
 from experiments.sph import forces, frames, health, settings, snapshots, solids, solver
 from experiments.sph.forces import Neighbors
 from experiments.sph.model import Model, State, make_model, make_state
+from jfrnn.cases.fluids import FluidScene
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,13 @@ from typing import Any, get_type_hints
 from zipfile import BadZipFile
 
 import numpy as np
-from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
-from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 from experiments._errors import UsageError
 from experiments.sph import ranges
+from jfrnn.cases import fluids
+from jfrnn.cases.fluids import FluidScene
 
-PHYSICS = get_type_hints(fluids.Physics)
+PHYSICS = get_type_hints(fluids.Physics, localns={"Number": float, "Vector": tuple[float, ...]})
 LEAST_SMOOTHING, MOST_SMOOTHING = 0.1, 50.0  # in particle spacings
 MOST_STEPS = 1e9
 _LARGEST_SOLID = 100  # times what the scene shows: files in millimeters are 1000 times as large as they say

@@ -7,12 +7,12 @@ from zipfile import BadZipFile
 
 import jax.numpy as jnp
 import numpy as np
-from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 from experiments._commands import take_folder
 from experiments._errors import UsageError
 from experiments.sph import budget, solids
 from experiments.sph.model import Model, State
+from jfrnn.cases.fluids import FluidScene
 
 
 def save(state: State, scene: FluidScene, rho: np.ndarray, p: np.ndarray, folder: Path, step: int) -> None:

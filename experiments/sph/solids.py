@@ -17,13 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
-from jfrnn.cases.fluids import FluidScene, Turning  # pyright: ignore[reportMissingImports]
 
 import jfrnn
 from experiments.sph.kernels import KERNELS, Kernel
 from experiments.sph.pairs import reach
 from experiments.sph.particles import Beside, Model, State
+from jfrnn.cases import fluids
+from jfrnn.cases.fluids import FluidScene, Turning
 
 GAP = 0.2  # particle spacings: on a lattice, particles at a wall are half a spacing away
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -72,7 +72,7 @@ def _reach(scene: FluidScene) -> float:
     return reach(KERNELS[scene.physics.kernel], scene.physics.smoothing)
 
 
-def turning_of(scene: FluidScene, dtype: np.dtype | type) -> Turning | None:
+def turning_of(scene: FluidScene, dtype: np.dtype | type) -> Turning[Array, Array] | None:
     """Return how the solid of a scene turns, numbers of a dtype; None where it stands, or is none."""
     turning = scene.solid and scene.solid.turning
     if turning is None:
@@ -81,16 +81,16 @@ def turning_of(scene: FluidScene, dtype: np.dtype | type) -> Turning | None:
     return fluids.Turning(jnp.asarray(turning.center, dtype), axis, jnp.asarray(turning.rate, dtype))
 
 
-def into_frame(x: Array, turning: Turning | None, angle: Array | None) -> Array:
+def into_frame(x: Array, turning: Turning[Array, Array] | None, angle: Array | None) -> Array:
     """Return positions [n, d] as the wall sees them that has turned by an angle [rad]: it stands, they have turned back."""
     return x if turning is None or angle is None else turning.center + _turn(x - turning.center, turning, -angle)
 
 
-def _leave_frame(x: Array, turning: Turning | None, angle: Array | None) -> Array:
+def _leave_frame(x: Array, turning: Turning[Array, Array] | None, angle: Array | None) -> Array:
     return x if turning is None or angle is None else turning.center + _turn(x - turning.center, turning, angle)
 
 
-def _turn(r: Array, turning: Turning | None, angle: Array | None) -> Array:
+def _turn(r: Array, turning: Turning[Array, Array] | None, angle: Array | None) -> Array:
     """Turn vectors [n, d]. Source: Rodrigues (1840)."""
     if turning is None or angle is None:
         return r
@@ -101,7 +101,7 @@ def _turn(r: Array, turning: Turning | None, angle: Array | None) -> Array:
     return along + (r - along) * cosine + _across(r, turning) * sine
 
 
-def _across(r: Array, turning: Turning) -> Array:
+def _across(r: Array, turning: Turning[Array, Array]) -> Array:
     """Return axis × r, shape [n, d]."""
     return jnp.stack([-r[:, 1], r[:, 0]], axis=1) if turning.axis is None else jnp.cross(turning.axis, r)
 

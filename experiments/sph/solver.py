@@ -137,6 +137,7 @@ def _transport_velocity(model: Model, s: State) -> Array:
 def _bounce(model: Model, s: State) -> State:
     if model.tank is None:
         return s
+    assert model.physics.restitution is not None, "`make_model` refuses a tank without it"
     x, v = walls.bounce(s.x, s.v, *model.tank, model.physics.restitution)
     return s._replace(x=x, v=v)
 

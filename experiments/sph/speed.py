@@ -12,8 +12,6 @@ from typing import Annotated, Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
-from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 from pydantic import Field, FiniteFloat, field_validator
 
 from experiments import _machine, _measure, _sweep
@@ -24,6 +22,8 @@ from experiments.sph import edges, solver
 from experiments.sph import tradeoff as known_flow
 from experiments.sph.model import Model, State, make_model, make_state
 from experiments.sph.stages import part_times
+from jfrnn.cases import fluids
+from jfrnn.cases.fluids import FluidScene
 
 Prepare = Callable[[Model, State, float], Any]
 WAYS: dict[str, Prepare] = {

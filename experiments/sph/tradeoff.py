@@ -7,12 +7,12 @@ from time import perf_counter
 from typing import Annotated, Any
 
 import numpy as np
-from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
-from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 from pydantic import Field, FiniteFloat
 
 from experiments._config import Dtype, Positive, Table, digest
 from experiments._library import taylor_green_velocity
+from jfrnn.cases import fluids
+from jfrnn.cases.fluids import FluidScene
 
 _REYNOLDS = 100.0  # of the scene, by default
 
@@ -59,6 +59,7 @@ def measure(spec: Spec) -> dict[str, Any]:
     from experiments.sph.model import make_model, make_state
 
     scene, dtype = fluids.fluid(spec.scene, nx=spec.nx), np.dtype(spec.dtype).type
+    assert scene.step is not None, "errors are those after whole steps"
     model = make_model(scene, dtype)
     s = jax.jit(solver.begin)(model, make_state(scene, dtype))
     nbrs = solver.list_neighbors(model, s, spec.skin * scene.spacing) if spec.way == "list" else None

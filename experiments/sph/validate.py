@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 import pandas as pd
-from jfrnn.cases import fluids  # pyright: ignore[reportMissingImports]
 from matplotlib.figure import Figure as Picture
 
 from experiments import _machine
@@ -18,6 +17,7 @@ from experiments._rows import Row, RowFile
 from experiments.sph import health, solver
 from experiments.sph.model import make_model, make_state
 from experiments.sph.validation import CASES, Case, Curves, Seen, look
+from jfrnn.cases import fluids
 
 
 @dataclass(kw_only=True)

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jfrnn.cases.fluids import FluidScene  # pyright: ignore[reportMissingImports]
 
 from experiments._library import taylor_green_velocity
 from experiments.sph import answers, budget, forces, potential
 from experiments.sph.model import Model, State
+from jfrnn.cases.fluids import FluidScene
 
 Curves = dict[str, list[list[float]]]
 

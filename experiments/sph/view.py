@@ -3,7 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from jfrnn.cases.fluids import FluidScene, Turning  # pyright: ignore[reportMissingImports]
+
+from jfrnn.cases.fluids import FluidScene, Turning
 
 PIXELS = 640  # of the wider side
 _AZIMUTH, _ELEVATION = np.radians(35.0), np.radians(25.0)
@@ -48,7 +49,7 @@ def render(scene: FluidScene, x: np.ndarray, colors: np.ndarray, time: float) ->
     return canvas.colors[::-1]
 
 
-def turn_vertices(vertices: np.ndarray, turning: Turning | None, time: float) -> np.ndarray:
+def turn_vertices(vertices: np.ndarray, turning: Turning[float, tuple[float, ...]] | None, time: float) -> np.ndarray:
     """Return the corners of a solid [v, d] at a time [s]."""
     if turning is None:
         return vertices

@@ -2,22 +2,25 @@
 
 import dataclasses
 import functools
+import importlib
 import math
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Mapping
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 from jax import lax
 
-from jfrnn._engine.cores import load_on_cpu
-from jfrnn._engine.launch import Kernel, kernel
+from jfrnn._engine.launch import Call, Shapes, kernel
+from jfrnn._engine.plans import Plan
 from jfrnn._engine.problem import Kind, Options, Rows, Search
-from jfrnn._engine.serving import on_cpu, on_stream
-from jfrnn._engine.start import INSTALL, WarpArray, kernels_of, load_warp
-from jfrnn._engine.warp import Arrays, Variant, array_types, call_kernels, check_platform, missing, name_arrays, name_of_call
+from jfrnn._engine.start import INSTALL, apart, load_warp
+from jfrnn._engine.warp import Variant, call_kernels, check_platform, describe_call, missing
 from jfrnn._geometry import Cutoff, make_cutoff
 
-HashGrid = Any  # wp.HashGrid, whose type cannot be named before Warp is imported
+HashGrid = Any  # types of Warp, which cannot be named before it is imported
+WarpArray = Any
 
 
 @dataclasses.dataclass(frozen=True)  # all are one
@@ -56,7 +59,7 @@ class HashGridEngine:
             def make(variant: Variant) -> Callable[..., Any]:
                 return _hashgrid_callable(variant, radius, cuda)
 
-            return functools.partial(call_kernels, "hashgrid", make, keep=options.filter, capacity=capacity)
+            return functools.partial(call_kernels, _kernels().scratch_words, make, keep=options.filter, capacity=capacity)
 
         return lax.platform_dependent(search._replace(checks={}), cpu=on(False), cuda=on(True))
 
@@ -65,34 +68,59 @@ class HashGridEngine:
         check_platform(self.name, platform)
         if 0 in (n, m):
             return 0
-        hashgrid = kernels_of("hashgrid")
+        hashgrid = _kernels()
         # warp/native/hashgrid.cpp: two ints per cell; of each point its cell and its id, room for 1.5 n, twice for the sort
         grid = 8 * math.prod(hashgrid.grid_shape(n, dim)) + 16 * (3 * n // 2)
         return 4 * hashgrid.scratch_words(n, m, dim, 2 if double else 1, own) + grid
 
 
+@functools.cache
+def _kernels() -> ModuleType:
+    """Return the module of kernels, which imports Warp."""
+    load_warp()
+    return apart(functools.partial(importlib.import_module, "jfrnn.kernels.hashgrid"))
+
+
 @kernel
-def _hashgrid_callable(variant: Variant, radius: float, cuda: bool) -> Kernel:
+def _hashgrid_callable(variant: Variant, radius: float, cuda: bool) -> Call:
     """Return what searches on a platform; it knows its radius, and bears it in its name."""
     bounds = make_cutoff(radius, np.dtype(np.float64 if variant.double else np.float32), variant.closed)
-    types, name = array_types(variant), name_of_call("hashgrid_cuda" if cuda else "hashgrid_cpu", variant)
-
-    def run(*arrays: WarpArray) -> None:
-        _run_hashgrid(bounds, variant, name_arrays(types, arrays))
-
-    return (on_stream if cuda else on_cpu)(f"{name}_{radius.hex()}", run, types, 3 + variant.lists)
+    found = describe_call("hashgrid_cuda" if cuda else "hashgrid_cpu", variant, lambda *_: Plan([], {}))
+    return found._replace(name=f"{found.name}_{radius.hex()}", serve=functools.partial(_serve, bounds, variant))
 
 
-def _run_hashgrid(bounds: Cutoff, variant: Variant, arrays: Arrays) -> None:
+_one_at_a_time = threading.Lock()  # is served: a hash grid is kept for all
+_streams: dict[int, Any] = {}  # Warp forgets one that is gone
+
+
+def _serve(bounds: Cutoff, variant: Variant, shapes: Shapes, addresses: Mapping[str, int], device: int, stream: int) -> None:
     wp = load_warp()
+    where = wp.get_device("cpu" if device < 0 else f"cuda:{device}")
+
+    def array_of(name: str) -> WarpArray:
+        is_real = name in ("positions", "queries", "cutoff")
+        dtype = wp.int32 if not is_real else wp.float64 if variant.double else wp.float32
+        shape = shapes.get(name, (shapes["queries"][0], 1))
+        return wp.array(ptr=addresses.get(name, addresses["count"]), shape=shape, dtype=dtype, device=where)
+
+    names = "positions", "queries", "cutoff", "idx", "count", "info", "scratch"
+    with _one_at_a_time:
+        if device < 0:
+            _run_hashgrid(bounds, variant, *map(array_of, names))
+            return
+        if stream not in _streams:
+            _streams[stream] = wp.Stream(where, cuda_stream=stream)
+        with wp.ScopedStream(_streams[stream], sync_enter=False):
+            _run_hashgrid(bounds, variant, *map(array_of, names))
+
+
+def _run_hashgrid(bounds: Cutoff, variant: Variant, *arrays: WarpArray) -> None:
+    wp, hashgrid = load_warp(), _kernels()
     positions, queries, cutoff, idx, count, info, scratch = arrays
     n, device = positions.shape[0], count.device
-    hashgrid = kernels_of("hashgrid")
     kernels = hashgrid.hashgrid_kernels(variant.dim, variant.double, variant.scaled, variant.lists)
     shape = hashgrid.grid_shape(n, variant.dim)
     packed = wp.array(ptr=scratch.ptr, shape=n, dtype=wp.vec3d if variant.double else wp.vec3f, device=device)
-    if not device.is_cuda:
-        load_on_cpu(kernels.pack.module)
     info.zero_()
     wp.launch(kernels.pack, dim=n, inputs=[positions, cutoff, wp.vec3i(*shape)], outputs=[packed, info], device=device)
     grid = _hash_grid(str(device), shape, variant.double)

@@ -1,11 +1,10 @@
 """Where compiled programs call the library: one target of XLA for all kernels, registered when the library is imported.
 
-A call names its kernel and says what it was made of. So a program also runs in a process that has not traced it: one that was
-exported, or that comes from JAX's persistent compilation cache.
+A call names its kernel, for the shapes of its arrays, and says what the kernel was made of. So a program also runs in a process
+that has not traced it: one that was exported, or that comes from JAX's persistent compilation cache.
 
-XLA calls from any thread, the main one included, on which Python runs the handlers of signals between any two instructions. No
-Python of the library ever runs there: a native relay (`jfrnn.kernels.relay`) lets another thread answer. An exception that a
-handler raises comes up as itself when the call has ended, and nothing that was begun is left unfinished.
+A call runs native code (`kernels/native/launch.h`), on the thread on which XLA calls, and no Python. Python is asked once for each
+kernel, by name: it compiles what is launched, and lays down in what order, with which arguments (`jfrnn._engine.plans`).
 """
 
 import _thread
@@ -16,42 +15,54 @@ import functools
 import hashlib
 import importlib
 import json
+import mmap
+import platform
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from importlib.resources.abc import Traversable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 from jax import Array
 
-from jfrnn._engine.ffi import EXECUTE, CallFrame
-from jfrnn._engine.start import apart, kernels_of, load_warp
+from jfrnn._engine.ffi import CallFrame
+from jfrnn._engine.plans import Desk, LaidPlan, Plan, lay_plan, multiprocessors_of, open_desk
+from jfrnn._engine.start import apart, compiler, load_warp
 
 TARGET = "jfrnn"  # what programs call; jax.export wants to be told that it stays
-Serve = Callable[[CallFrame], None]
 Static = Any  # what a kernel is made of, and a program carries: NamedTuples of the library, tuples, texts, numbers
-CFunction = Any  # a function that ctypes can call, or that can be called from C
+Shapes = Mapping[str, tuple[int, ...]]
+Addresses = Any  # a pointer of ctypes
+CFunction = Any
 
 
-class Kernel(NamedTuple):
-    """What XLA calls by a name: Warp's types of its arrays, of which the last ones are outputs, and what serves a call."""
+class Call(NamedTuple):
+    """What XLA calls by a name.
+
+    Attributes:
+        name: Tells the kernel from all others, apart from shapes.
+        inputs: The names of the arrays that are given.
+        results: The dtypes of those that are written, by name.
+        plan: Shapes of all arrays, by name, and the multiprocessors of the device (the CPU: 1) -> what is launched.
+        serve: Python in place of a plan, called with the shapes, and with addresses, a device's number (-1: the CPU) and a stream.
+    """
 
     name: str
-    types: dict[str, Any]
-    outputs: int
-    serve: Serve
+    inputs: Sequence[str]
+    results: Mapping[str, Any]
+    plan: Callable[[Shapes, int], Plan]
+    serve: Callable[[Shapes, Mapping[str, int], int, int], None] | None = None
 
 
-_makers: dict[str, Callable[..., Any]] = {}
-_MOST = 512  # kernels that are kept, as many as compiled programs: what a program calls that is gone is made again
-_served: dict[bytes, Serve] = {}  # by names, those that were made last at the end
-_keeping = threading.Lock()
+_makers: dict[str, Callable[..., Callable[..., Any]]] = {}
+_calls: dict[str, Callable[..., Call]] = {}
+_MOST = 512  # plans that are kept, as many as compiled programs: what a program calls that is gone is made again
 
 
-def kernel(make: Callable[..., Kernel]) -> Callable[..., Callable[..., Any]]:
-    """Make a function that XLA calls of what makes a kernel of static arguments, once for each of them.
+def kernel(make: Callable[..., Call]) -> Callable[..., Callable[..., Any]]:
+    """Make a function that XLA calls of what makes a call of static arguments, once for each of them.
 
     Programs carry the arguments: NamedTuples of the library, tuples, texts, numbers.
     """
@@ -59,35 +70,19 @@ def kernel(make: Callable[..., Kernel]) -> Callable[..., Callable[..., Any]]:
 
     @functools.wraps(make)
     def made(*arguments: Static) -> Callable[..., Any]:
-        return apart(functools.partial(_made, make, place, arguments))
+        found = make(*arguments)
+        return functools.partial(_call, found, json.dumps([place, _encode(arguments)]))
 
-    _makers[place] = made
+    _calls[place] = make
     return functools.lru_cache(_MOST)(made)
 
 
-def _made(make: Callable[..., Kernel], place: str, arguments: tuple[Any, ...]) -> Callable[..., Any]:
-    open_relay()
-    _finish_before_exit()
-    found = make(*arguments)
-    name = f"{found.name}@{_sources()}"
-    recipe = json.dumps([place, _encode(arguments)])
-    _keep(name.encode(), found.serve)
-    return functools.partial(_call, found, name, recipe)
-
-
-def _keep(name: bytes, serve: Serve) -> None:
-    with _keeping:
-        _served.pop(name, None)
-        _served[name] = serve
-        while len(_served) > _MOST:
-            _served.pop(next(iter(_served)))
-
-
-def _call(found: Kernel, name: str, recipe: str, *inputs: Array, output_dims: dict[str, Any]) -> Sequence[Array]:
-    wp, kind = load_warp(), _varying(inputs)
-    results = {key: wp.dtype_to_numpy(found.types[key].dtype) for key in list(found.types)[-found.outputs :]}
-    shapes = [jax.ShapeDtypeStruct(_shape(output_dims[key]), results[key], **kind) for key in results]
-    return jax.ffi.ffi_call(TARGET, shapes, vmap_method="sequential")(*inputs, kernel=name, recipe=recipe)
+def _call(found: Call, recipe: str, *inputs: Array, output_dims: dict[str, Any]) -> Sequence[Array]:
+    shapes = [x.shape for x in inputs] + [_shape(output_dims[key]) for key in found.results]
+    kind = _varying(inputs)
+    results = [jax.ShapeDtypeStruct(_shape(output_dims[key]), dtype, **kind) for key, dtype in found.results.items()]
+    name = f"{found.name}@{_sources()}@{'_'.join('x'.join(map(str, shape)) for shape in shapes)}"
+    return jax.ffi.ffi_call(TARGET, results, vmap_method="sequential")(*inputs, kernel=name, recipe=recipe)
 
 
 def _shape(dims: int | tuple[int, ...]) -> tuple[int, ...]:
@@ -143,139 +138,71 @@ def _files(folder: Traversable) -> Iterator[Traversable]:
             yield path
 
 
-def _server_of(frame: CallFrame) -> Serve:
-    known = _served.get(frame.first_text())  # names of kernels look like no other attribute
-    if known is not None:
-        return known
-    name = frame.text(b"kernel")
-    while (known := _served.get(name)) is None:
-        _make_again(name.decode(), frame.text(b"recipe").decode())
-    return known
+def _read_call(name: str, recipe: str) -> tuple[Call, Shapes]:
+    """Return what a program calls, and with which shapes.
 
-
-def _make_again(name: str, recipe: str) -> None:
-    """Make a kernel of a program that this process has not traced, or that was not among the last ones."""
-    if not name.endswith(f"@{_sources()}"):
+    Raises:
+        RuntimeError: Another version of the library made the program.
+    """
+    _, sources, shapes = name.split("@")
+    if sources != _sources():
         raise RuntimeError("this program was made with another version of jfrnn. Export or compile it again with this one.")
     place, arguments = json.loads(recipe)
-    _makers[place](*_decode(arguments))
+    module = place.rpartition(".")[0]
+    if place not in _calls and module.startswith("jfrnn."):
+        importlib.import_module(module)
+    found = _calls[place](*_decode(arguments))
+    numbers = [tuple(map(int, filter(None, shape.split("x")))) for shape in shapes.split("_")]
+    return found, dict(zip([*found.inputs, *found.results], numbers, strict=True))
 
 
-# --- what XLA calls ---------------------------------------------------------------------------------------------------
+# --- what native code asks of Python ----------------------------------------------------------------------------------
 
-_Answer = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)  # address of a call frame -> address of an error, or none
-_starting = threading.Lock()
-_kept: list[Any] = []  # functions live as long as programs that call them: as long as the process
-
-
-def _answer(address: int) -> int | None:
-    """Serve a call; XLA raises what goes wrong."""
-    frame = CallFrame.from_address(address)
-    try:
-        if frame.tell_version():
-            return None
-        serve = _server_of(frame)  # before anything runs, where XLA makes the program ready
-        if frame.stage == EXECUTE:
-            serve(frame)
-    except BaseException as error:
-        return frame.failure(f"{_name_in(frame)}: {type(error).__name__}: {error}")
-    return None
+_MakePlan = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_longlong, ctypes.c_void_p, ctypes.c_longlong, ctypes.c_int)
+_Serve = ctypes.CFUNCTYPE(
+    ctypes.c_void_p, ctypes.c_void_p, ctypes.c_longlong, ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(ctypes.c_void_p)
+)
+_plans: dict[tuple[str, int], LaidPlan] = {}  # by name and device, those that were made last at the end
+_served: dict[str, tuple[Call, Shapes]] = {}
+_planning = threading.Lock()
+_messages: dict[int, bytes] = {}  # by thread: XLA copies one before the thread can bring another
 
 
-def _name_in(frame: CallFrame) -> str:
-    try:
-        return frame.text(b"kernel").decode().partition("@")[0]
-    except Exception:
-        return TARGET
+def _make_plan(name: int, name_size: int, recipe: int, recipe_size: int, device: int) -> int | None:
+    texts = ctypes.string_at(name, name_size).decode(), ctypes.string_at(recipe, recipe_size).decode()
+    return _answer(lambda: _keep_plan(*texts, device))
 
 
-def _answer_first(address: int) -> int | None:
-    """Serve a call where there is no relay yet, of a program that this process has not traced."""
-    frame = CallFrame.from_address(address)
-    if frame.tell_version():
-        return None
-    once, done, answers = threading.Lock(), threading.Event(), list[int | None]()
-
+def _serve(name: int, name_size: int, device: int, stream: int | None, arrays: Addresses) -> int | None:
     def work() -> None:
-        if not once.acquire(blocking=False):
+        found, shapes = _served[ctypes.string_at(name, name_size).decode()]
+        assert found.serve is not None
+        found.serve(shapes, {key: arrays[k] or 0 for k, key in enumerate(shapes)}, device, stream or 0)
+
+    return _answer(work)
+
+
+def _keep_plan(name: str, recipe: str, device: int) -> None:
+    found, shapes = _read_call(name, recipe)
+    desk = _open()
+    with _planning:
+        if (name, device) in _plans:
             return
-        with contextlib.suppress(BaseException):  # the call itself says what is wrong
-            open_relay()
+        if found.serve is not None:
             _finish_before_exit()
-        answers.append(_answer(address))
-        done.set()
-
-    _finish_whatever_comes(work, done)
-    return answers[0]
-
-
-def _finish_whatever_comes(work: Callable[[], None], done: threading.Event) -> None:
-    """Let another thread work; what a handler of a signal raises here meanwhile is raised again when the call has ended."""
-    raised, begun = None, 0
-    while not done.is_set():
-        try:
-            begun = begun or _thread.start_new_thread(work, ())
-            done.wait()
-        except RuntimeError:  # while the interpreter exits, no thread can be started
-            work()
-        except BaseException as error:
-            raised = error
-    if raised is not None:
-        main = ctypes.c_ulong(threading.main_thread().ident or 0)
-        ctypes.pythonapi.PyThreadState_SetAsyncExc(main, ctypes.py_object(type(raised)))
-
-
-_behind_door = _Answer(_answer_first)
-_door = ctypes.cast(_behind_door, _Answer)  # its address is exchanged for the relay's
-_entrance = _Answer(_door)  # calls a function that is not Python: nothing runs in between
-
-
-def open_relay() -> None:
-    """Start Warp and the thread that answers in place of the main thread, and lead all calls there."""
-    with _starting:
-        if not _kept:
-            _kept.extend(_relay())
-            address = ctypes.c_void_p(_kept[0])
-            ctypes.memmove(ctypes.addressof(_door), ctypes.addressof(address), ctypes.sizeof(address))
-
-
-def _relay() -> list[Any]:
-    """Return the address of the relay, and what it needs; without Warp's compiler for CPUs, calls are answered where they come."""
-    wp, here = load_warp(), _Answer(_answer)
-    if not wp.is_cpu_available():
-        return [_address(here), here]
-    relay, python = kernels_of("relay"), ctypes.CDLL(None, handle=ctypes.pythonapi._handle)  # lets others run Python meanwhile
-    acquire, release, allocate = python.PyThread_acquire_lock, python.PyThread_release_lock, python.PyThread_allocate_lock
-    acquire.argtypes, release.argtypes, allocate.restype = (ctypes.c_void_p, ctypes.c_int), (ctypes.c_void_p,), ctypes.c_void_p
-    asked, answered = allocate(), allocate()
-    for lock in (asked, answered):
-        acquire(lock, 1)
-    words = np.zeros(relay.WORDS, np.uint64)
-    words[relay.ANSWER_HERE], words[relay.THREAD] = _address(here), _address(python.PyThread_get_thread_ident)
-    words[relay.ACQUIRE], words[relay.RELEASE] = _address(acquire), _address(release)
-    words[relay.MAIN_THREAD], words[relay.ASKED], words[relay.ANSWERED] = threading.main_thread().ident or 0, asked, answered
-
-    def work() -> None:
-        while True:
-            acquire(asked, 1)
-            words[relay.ANSWER] = _answer(int(words[relay.FRAME])) or 0
-            release(answered)
-
-    address = np.zeros(1, np.uint64)
-    given = [wp.array(array, dtype=wp.uint64, device="cpu", copy=False) for array in (words, address)]
-    kernels_of("_load").load_module(relay.open_relay.module, "cpu")
-    wp.launch(relay.open_relay, dim=1, inputs=given, device="cpu")
-    threading.Thread(target=work, name="jfrnn-relay", daemon=True).start()
-    return [int(address[0]), here, words, given]
-
-
-def _address(function: CFunction) -> int:
-    return ctypes.cast(function, ctypes.c_void_p).value or 0
+            _served[name] = found, shapes
+        laid = lay_plan(name, found.plan(shapes, multiprocessors_of(device)), list(shapes), device, python=found.serve is not None)
+        while len(_plans) >= _MOST:
+            gone = next(iter(_plans))
+            desk.drop(_plans.pop(gone))
+            _served.pop(gone[0], None)
+        _plans[name, device] = laid
+        desk.keep(laid)
 
 
 @functools.cache
 def _finish_before_exit() -> None:
-    """Let the interpreter wait for results that are under way: what computes them needs it, and would wait for ever."""
+    """Let the interpreter wait for results that are under way: what Python serves needs it, and would wait for ever."""
 
     def finish() -> None:
         for array in jax.live_arrays():
@@ -285,10 +212,128 @@ def _finish_before_exit() -> None:
     atexit.register(finish)
 
 
+def _answer(work: Callable[[], None]) -> int | None:
+    """Work, and return the address of a message where that fails."""
+    wrong = _try(work)
+    if wrong is None:
+        return None
+    message = wrong.encode(errors="replace")
+    _messages[threading.get_ident()] = message
+    return ctypes.cast(ctypes.c_char_p(message), ctypes.c_void_p).value
+
+
+def _try(work: Callable[[], object]) -> str | None:
+    """Work, and return what goes wrong.
+
+    XLA calls from any thread, the main one included, on which Python runs the handlers of signals between any two instructions:
+    there another thread works, and what a handler raises meanwhile is raised again when the call has ended.
+    """
+    errors = list[BaseException]()
+
+    def whole() -> None:
+        try:
+            work()
+        except BaseException as error:
+            errors.append(error)
+
+    if threading.current_thread() is threading.main_thread():
+        _finish_whatever_comes(whole)
+    else:
+        whole()
+    return f"{type(errors[0]).__name__}: {errors[0]}" if errors else None
+
+
+def _finish_whatever_comes(work: Callable[[], None]) -> None:
+    """Let another thread work; what a handler of a signal raises here meanwhile is raised again when the call has ended."""
+    once, done, raised, begun = threading.Lock(), threading.Event(), None, 0
+
+    def whole() -> None:
+        if once.acquire(blocking=False):
+            work()
+            done.set()
+
+    while not done.is_set():
+        try:
+            begun = begun or _thread.start_new_thread(whole, ())
+            done.wait()
+        except RuntimeError:  # while the interpreter exits, no thread can be started
+            whole()
+        except BaseException as error:
+            raised = error
+    if raised is not None:
+        main = ctypes.c_ulong(threading.main_thread().ident or 0)
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(main, ctypes.py_object(type(raised)))
+
+
+# --- what XLA calls ---------------------------------------------------------------------------------------------------
+
+_Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)  # address of a call frame -> address of an error, or none
+_PLATFORMS = ("cpu", "CUDA")
+# Instructions that jump to an address that stands behind them, by processor.
+_JUMPS = {"x86_64": b"\xff\x25\x02\x00\x00\x00\x90\x90", "aarch64": b"\x50\x00\x00\x58\x00\x02\x1f\xd6"}
+
+
+class _Door:
+    """What XLA is told to call: leads to Python until native code is there, and from then on to that."""
+
+    def __init__(self) -> None:
+        self._python = _Handler(self._enter)
+        self._native: Any = None
+        self.address = _address(self._python)
+        with contextlib.suppress(OSError, ValueError, AttributeError, KeyError):  # Python goes on to lead there
+            code = _JUMPS[platform.machine()]
+            room = mmap.mmap(-1, mmap.PAGESIZE, prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
+            room[: len(code)] = code
+            self._goal = ctypes.c_uint64.from_buffer(room, len(code))
+            self._goal.value = self.address
+            self.address = ctypes.addressof(self._goal) - len(code)
+
+    def lead_to(self, address: int) -> None:
+        """Lead to native code."""
+        self._native = _Handler(address)
+        if hasattr(self, "_goal"):
+            self._goal.value = address
+
+    def _enter(self, address: int) -> int | None:
+        frame = CallFrame.from_address(address)
+        if frame.tell_version():
+            return None
+        wrong = None if self._native else _try(_open)
+        return frame.fail(f"{TARGET}: {wrong}") if self._native is None else self._native(address)
+
+
+def _address(function: CFunction) -> int:
+    return ctypes.cast(function, ctypes.c_void_p).value or 0
+
+
+_doors = {name: _Door() for name in _PLATFORMS}
+_behind_desk = _MakePlan(_make_plan), _Serve(_serve)
+
+
+@functools.cache
+def _open() -> Desk:
+    """Compile the native code, and lead all calls there."""
+    load_warp()
+    header = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text("utf-8")
+    desk = open_desk(compiler().load_launcher(header), _address(_behind_desk[0]), _address(_behind_desk[1]), _MOST)
+    for name, address in zip(_PLATFORMS, desk.handlers, strict=True):
+        _doors[name].lead_to(address)
+    return desk
+
+
+def open_native() -> None:
+    """Compile what stands between XLA and the kernels, if it is not yet there.
+
+    Raises:
+        RuntimeError: It cannot be compiled.
+    """
+    apart(_open)
+
+
 def _register() -> None:
-    capsule = jax.ffi.pycapsule(_address(_entrance))
-    for platform in ("cpu", "CUDA"):
-        jax.ffi.register_ffi_target(TARGET, {"instantiate": capsule, "execute": capsule}, platform=platform)
+    for name, door in _doors.items():
+        capsule = jax.ffi.pycapsule(door.address)
+        jax.ffi.register_ffi_target(TARGET, {"instantiate": capsule, "execute": capsule}, platform=name)
 
 
 _register()

@@ -1,21 +1,21 @@
 """Warp inside JAX where cutoffs differ from particle to particle: lists, counts and sums over cells of many sizes."""
 
 import functools
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
-from jfrnn._engine.cores import PLACES_PER_THREAD, on_every_core
-from jfrnn._engine.cuda import Command
-from jfrnn._engine.launch import Kernel, kernel
+from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import lattice_numbers, particle_rows, periodic_kind, space_flags
+from jfrnn._engine.plans import Clear, Launch, Plan, share
 from jfrnn._engine.problem import Filter, Rows, Search
-from jfrnn._engine.serving import on_cpu, on_cuda, stand_in
-from jfrnn._engine.start import WarpArray, WarpKernel, kernels_of, load_warp
 from jfrnn._engine.sum_results import SumsOf, TermText
 from jfrnn._geometry import GROUPS, HALVINGS, Levels
+from jfrnn.kernels import levels as level_kernels
+from jfrnn.kernels import pair_sum_levels
 
 
 class _LevelVariant(NamedTuple):
@@ -45,7 +45,7 @@ def level_neighbors(search: Search, levels: Levels, keep: Filter, capacity: int 
 def _call_levels(cuda: bool, keep: Filter, capacity: int | None, search: Search, levels: Levels) -> Rows:
     lists, (_, m) = capacity is not None, search.sizes
     variant = _variant_of(search, keep, lists, cuda)
-    dims: dict[str, Any] = {"count": m, "info": 2} | ({"idx": (m, capacity)} if lists else {})
+    dims = {"idx": (m, capacity), "count": m, "info": 2}
     *idx, count, info = _level_callable(variant)(*_operands(search, levels), output_dims=dims)
     overflow = info[0] > capacity if lists else jnp.zeros((), bool)
     return Rows(idx[0] if lists else None, count, info[0], overflow.astype(jnp.int32))  # Status.ROW_OVERFLOW
@@ -65,11 +65,11 @@ def level_sums(
 
     def sums_on_cpu(search: Search, levels: Levels, values: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         (shared, own, others), (_, m) = values, search.sizes
-        results = SumsOf(term, m, kernels_of("pair_sum_levels").slots(m), compensated, extremes)
+        results = SumsOf(term, m, pair_sum_levels.slots(m), compensated, extremes)
         call = _sum_callable(_variant_of(search, keep, False, False), results, key)
         columns = jnp.zeros(1, others.dtype) if term.source_columns == 0 else others[levels.order].T.reshape(-1)
         operands = _operands(search, levels)
-        return results.unpacked(*call(*operands, shared, own, columns, output_dims=results.dims() | {"info": 2})[:3])
+        return results.unpack(*call(*operands, shared, own, columns, output_dims=results.dims() | {"info": 2})[:3])
 
     return lax.platform_dependent(search._replace(checks={}), levels, values, cpu=sums_on_cpu)
 
@@ -81,9 +81,9 @@ def _variant_of(search: Search, keep: Filter, lists: bool, cuda: bool) -> _Level
 
 
 def _operands(search: Search, levels: Levels) -> list[Array]:
-    """Return what the kernels read, in the order of `_inputs`."""
+    """Return what the kernels read, in the order of `_GIVEN`."""
     sources, queries, cutoffs, torus = search.sources, search.queries, search.cutoffs, search.torus
-    given, dim, padding = sources if queries is None else queries, sources.shape[1], kernels_of("levels").PADDING
+    given, dim, padding = sources if queries is None else queries, sources.shape[1], level_kernels.PADDING
 
     def ordered(x: Array | None, order: Array, more: int) -> Array:
         return jnp.zeros(1, sources.dtype) if x is None else jnp.pad(x[order], (0, more)).reshape(-1)
@@ -118,15 +118,8 @@ def _operands(search: Search, levels: Levels) -> list[Array]:
     ]
 
 
-def _inputs(double: bool) -> dict[str, Any]:
-    """Return Warp's types of what `_operands` returns."""
-    wp = load_warp()
-    scalar = wp.float64 if double else wp.float32
-    points, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
-    types = {"positions": points, "queries": points}
-    types |= {"axes": reals, "radii": reals, "ids": ints, "keys": ints, "top": ints, "table": ints, "header": ints}
-    types |= {"cutoff": reals, "query_axes": reals, "query_radii": reals, "query_ids": ints, "query_top": ints}
-    return types | {"places": ints}
+_GIVEN = ("positions", "queries", "axes", "radii", "ids", "keys", "top", "table", "header", "cutoff")
+_GIVEN += ("query_axes", "query_radii", "query_ids", "query_top", "places")
 
 
 def _name(name: str, variant: _LevelVariant, **more: bool) -> str:
@@ -137,62 +130,37 @@ def _name(name: str, variant: _LevelVariant, **more: bool) -> str:
 
 
 @kernel
-def _level_callable(variant: _LevelVariant) -> Kernel:
-    wp, types = load_warp(), _inputs(variant.double)
-    ints = wp.array(dtype=wp.int32)
-    types |= {"idx": wp.array2d(dtype=wp.int32)} if variant.lists else {}
-    types |= {"count": ints, "info": ints}
+def _level_callable(variant: _LevelVariant) -> Call:
+    results = dict.fromkeys([*["idx"] * variant.lists, "count", "info"], np.int32)
     name = _name(f"levels_{'cuda' if variant.cuda else 'cpu'}", variant)
-    if not variant.cuda:
-        return on_cpu(name, functools.partial(_run_levels_on_cpu, variant), types, 2 + variant.lists)
-    if wp.is_cuda_available():
-        for launched, block in ((_level_kernel(variant), kernels_of("levels").BLOCK), (kernels_of("levels").clear, 2)):
-            kernels_of("_load").load_module(launched.module, wp.get_cuda_device(), block)
-    return on_cuda(name, types, 2 + variant.lists, functools.partial(_level_commands, variant))
+    return Call(name, _GIVEN, results, functools.partial(_plan_rows, variant))
 
 
 @kernel
-def _sum_callable(variant: _LevelVariant, results: SumsOf, key: str) -> Kernel:
-    wp, types = load_warp(), _inputs(variant.double)
-    rows, reals = types["positions"], types["axes"]
-    types |= {"shared_values": reals, "own_values": rows, "columns": reals}
-    types |= {"sums": rows, "totals": reals, "errors": reals, "info": wp.array(dtype=wp.int32)}
+def _sum_callable(variant: _LevelVariant, results: SumsOf, key: str) -> Call:
     kind = {"compensated": results.compensated, "extremes": results.extremes}
-
-    def run(*arrays: WarpArray) -> None:
-        of_search = variant.dim, variant.double, variant.rule, GROUPS, HALVINGS, results.compensated, variant.periodic
-        make = kernels_of("pair_sum_levels").query_kernel
-        query = make(results.term, key, *of_search, variant.batched, results.extremes)
-        n, m = len(arrays[4]), len(arrays[12])
-        flags = variant.own, variant.closed, variant.keep.drop_self, variant.keep.later_only
-        arrays[-1].zero_()
-        on_every_core(query, [*arrays, n, m, *map(int, flags)], -(-m // PLACES_PER_THREAD))
-
-    return on_cpu(_name("pair_sum_levels_cpu", variant, **kind, **{key: True}), run, types, 4)
+    name = _name("pair_sum_levels_cpu", variant, **kind, **{key: True})
+    dtypes = dict.fromkeys(("sums", "totals", "errors"), np.float64 if variant.double else np.float32) | {"info": np.int32}
+    plan = functools.partial(_plan_sums, variant, results, key)
+    return Call(name, (*_GIVEN, "shared_values", "own_values", "columns"), dtypes, plan)
 
 
-def _level_kernel(variant: _LevelVariant) -> WarpKernel:
+def _plan_sums(variant: _LevelVariant, results: SumsOf, key: str, shapes: Shapes, multiprocessors: int) -> Plan:
+    of_search = variant.dim, variant.double, variant.rule, GROUPS, HALVINGS, results.compensated, variant.periodic
+    query = pair_sum_levels.query_kernel(results.term, key, *of_search, variant.batched, results.extremes)
+    numbers = _numbers(variant, shapes)
+    return Plan([Clear("info", 8), share(query, numbers["m"])], numbers)
+
+
+def _numbers(variant: _LevelVariant, shapes: Shapes) -> dict[str, int]:
+    flags = {"own_queries": variant.own, "closed": variant.closed}
+    flags |= {"drop_self": variant.keep.drop_self, "later_only": variant.keep.later_only}
+    return {"n": shapes["ids"][0], "m": shapes["query_ids"][0], **flags}
+
+
+def _plan_rows(variant: _LevelVariant, shapes: Shapes, multiprocessors: int) -> Plan:
     kind = (variant.dim, variant.double, variant.lists, variant.rule, GROUPS, HALVINGS, variant.periodic, variant.batched)
-    return kernels_of("levels").query_kernel(*kind)
-
-
-def _level_arguments(variant: _LevelVariant, arrays: Sequence[Any]) -> list[Any]:
-    """Return what the kernel takes."""
-    *inputs, count, info = arrays
-    n, m, capacity = len(inputs[4]), len(count), inputs[-1].shape[1] if variant.lists else 0
-    if not variant.lists:
-        inputs.append(stand_in(count, m))
-    flags = [int(variant.own), int(variant.closed), int(variant.keep.drop_self), int(variant.keep.later_only)]
-    return [*inputs, count, info, n, m, capacity, *flags]
-
-
-def _run_levels_on_cpu(variant: _LevelVariant, *arrays: WarpArray) -> None:
-    arrays[-1].zero_()
-    places = len(arrays[-2])
-    on_every_core(_level_kernel(variant), _level_arguments(variant, arrays), -(-places // PLACES_PER_THREAD))
-
-
-def _level_commands(variant: _LevelVariant, *arrays: WarpArray) -> list[Command]:
-    levels, (*_, count, info) = kernels_of("levels"), arrays
-    query = Command(_level_kernel(variant), _level_arguments(variant, arrays), len(count), levels.BLOCK)
-    return [Command(levels.clear, [info], 2, 2), query]
+    query = level_kernels.query_kernel(*kind, variant.cuda)
+    numbers = _numbers(variant, shapes) | {"capacity": shapes["idx"][1] if variant.lists else 0}
+    launch = Launch(query, numbers["m"]) if variant.cuda else share(query, numbers["m"])
+    return Plan([Clear("info", 8), launch], numbers, [] if variant.lists else ["idx"])

@@ -17,8 +17,6 @@ from typing import Any, TypeVar
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 _LINUX = sys.platform == "linux"
 Result = TypeVar("Result")
-# Objects of Warp, whose types cannot be named before it is imported.
-WarpArray = WarpKernel = WarpModule = WarpStream = WarpDevice = Any
 INSTALL = "pip install 'warp-lang==1.19.*'"
 
 
@@ -62,7 +60,7 @@ def _init(warp: ModuleType) -> str | None:
         try:
             warp.init()
         except OSError:
-            warning = importlib.import_module("jfrnn.kernels._load").temporary_folder()
+            warning = importlib.import_module("jfrnn.kernels._compile").temporary_folder()
             warp.init()
     except RuntimeError:
         warp.config.kernel_cache_dir = given  # what it makes of the path, it would make again of that
@@ -95,13 +93,10 @@ def _without_a_word_of_drivers() -> Iterator[None]:
 
 
 @functools.cache
-def kernels_of(name: str) -> ModuleType:
-    """Return a module of jfrnn.kernels, which imports Warp.
-
-    Not from `sys.modules`, where a module stands while another thread still imports it.
-    """
+def compiler() -> ModuleType:
+    """Return `jfrnn.kernels._compile`, which imports Warp."""
     load_warp()
-    return apart(functools.partial(importlib.import_module, f"jfrnn.kernels.{name}"))
+    return apart(functools.partial(importlib.import_module, "jfrnn.kernels._compile"))
 
 
 def apart(work: Callable[[], Result]) -> Result:

@@ -7,8 +7,7 @@ from jax import Array, lax
 
 from jfrnn._engine.operands import as_integer
 from jfrnn._geometry import compensated_sum, rounded_sum
-
-TermText = Any  # jfrnn.kernels.pair_sum_cpu.TermText, a term in native code
+from jfrnn.kernels.pair_sum_cpu import TermText
 
 
 class SumsOf(NamedTuple):
@@ -28,7 +27,7 @@ class SumsOf(NamedTuple):
             "errors": max(self.rows * self._width * (2 * self.extremes + self.compensated), 1),
         }
 
-    def unpacked(self, sums: Array, parts: Array, rest: Array) -> tuple[Array, Array, Array]:
+    def unpack(self, sums: Array, parts: Array, rest: Array) -> tuple[Array, Array, Array]:
         """Return the results of `pair_sums`; partial sums over all pairs are added together with their rounding errors."""
         width, totals = self._width, self._totals
         which = as_integer(rest).reshape(self.rows, width, 2) if self.extremes else jnp.zeros((self.rows, width, 0), jnp.int32)

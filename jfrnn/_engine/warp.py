@@ -7,25 +7,27 @@ depends on (JAX's persistent compilation cache sees no more than that).
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jfrnn._engine.arrays import levels_of
-from jfrnn._engine.cores import PLACES_PER_THREAD, ask_for_huge_pages, on_every_core, on_one_core
-from jfrnn._engine.cuda import Command, multiprocessors_of
-from jfrnn._engine.launch import Kernel, kernel, open_relay
+from jfrnn._engine.launch import Call, Shapes, kernel, open_native
 from jfrnn._engine.levels_warp import level_neighbors
 from jfrnn._engine.operands import MOST_IN_BOX, pack_particles, periodic_kind, space_flags
+from jfrnn._engine.plans import Clear, HugePages, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.problem import Filter, Kind, Options, Rows, Search
-from jfrnn._engine.serving import on_cpu, on_cuda, stand_in
-from jfrnn._engine.start import WarpArray, apart, kernels_of, load_warp
+from jfrnn._engine.start import load_warp
 from jfrnn._geometry import Cutoffs
+from jfrnn.kernels import cells_cpu, cells_cuda, few_cuda
+from jfrnn.kernels._native import table_cells
 
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
-
-CellKernels = Any  # the kernels of a variant, of jfrnn.kernels
+_CELLS = {"cpu": cells_cpu, "cuda": cells_cuda}
+_PARTICLES = ("positions", "queries", "cutoff")  # what kernels of cells are given
 
 
 @dataclasses.dataclass(frozen=True)  # all are one
@@ -50,17 +52,22 @@ class WarpEngine:
         if isinstance(search.cutoff, Cutoffs):
             return level_neighbors(search, levels_of(search), options.filter, capacity)
 
-        def on(module: str, make: Callable[[Variant], Any]) -> Callable[[Search], Rows]:
-            return functools.partial(call_kernels, module, make, keep=options.filter, capacity=capacity)
+        def on(module: ModuleType, make: Callable[[Variant], Any]) -> Callable[[Search], Rows]:
+            return functools.partial(call_kernels, module.scratch_words, make, keep=options.filter, capacity=capacity)
 
-        cpu, cuda = on("cells_cpu", _cpu_callable), on("cells_cuda", _cuda_callable)
+        few = are_few(search)
+        cpu, cuda = on(cells_cpu, _cpu_callable), on(few_cuda, _few_callable) if few else on(cells_cuda, _cuda_callable)
         return lax.platform_dependent(search._replace(checks={}), cpu=cpu, cuda=cuda)
 
     def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool) -> int:
         """Return the scratch that the kernels are given [B]."""
         check_platform(self.name, platform)
-        module = kernels_of(f"cells_{PLATFORMS[platform]}")
-        return 4 * module.scratch_words(n, m, dim, 2 if double else 1, own) if n and m else 0
+        return 4 * _CELLS[PLATFORMS[platform]].scratch_words(n, m, dim, 2 if double else 1, own) if n and m else 0
+
+
+def are_few(search: Search) -> bool:
+    """Say whether particles are so few that on CUDA all of them meet, in one launch."""
+    return search.torus is None and not search.cutoff.scaled and max(search.sizes) <= few_cuda.MOST
 
 
 class Variant(NamedTuple):
@@ -77,24 +84,12 @@ class Variant(NamedTuple):
     batched: bool = False
 
 
-class Arrays(NamedTuple):
-    """What a call gets from XLA, as `warp.array`s; without rows `idx` is None."""
-
-    positions: WarpArray
-    queries: WarpArray
-    cutoff: WarpArray
-    idx: WarpArray
-    count: WarpArray
-    info: WarpArray
-    scratch: WarpArray
-
-
 def missing(platform: str) -> str | None:
     """Say what keeps Warp from running on a JAX platform; None: nothing does."""
     try:
         warp = load_warp()
         if platform in PLATFORMS:
-            apart(open_relay)
+            open_native()
     except (ImportError, RuntimeError) as error:
         return str(error).rstrip(".")
     if platform == "cpu":
@@ -111,8 +106,10 @@ def check_platform(name: str, platform: str) -> None:
         raise RuntimeError(f"backend={name!r} runs on the platforms {', '.join(map(repr, PLATFORMS))}, got {platform!r}.")
 
 
-def call_kernels(module: str, make: Callable[[Variant], Any], search: Search, *, keep: Filter, capacity: int | None) -> Rows:
-    """Let XLA call what `make` returns, with the scratch that the module of kernels asks for."""
+def call_kernels(
+    scratch_words: Callable[..., int], make: Callable[[Variant], Any], search: Search, *, keep: Filter, capacity: int | None
+) -> Rows:
+    """Let XLA call what `make` returns, with the scratch that its kernels ask for."""
     sources, queries, cutoff, batch, torus, _ = search
     own, lists = queries is None, capacity is not None
     (n, m), dim = search.sizes, sources.shape[1]
@@ -123,109 +120,84 @@ def call_kernels(module: str, make: Callable[[Variant], Any], search: Search, *,
         raise ValueError(
             f"backend='warp' numbers at most {MOST_IN_BOX - 1} positions in a periodic box, got {n}: pass backend='jax'."
         )
-    words = kernels_of(module).scratch_words(n, m, dim, 2 if double else 1, own)
-    dims: dict[str, Any] = {"count": m, "info": 2, "scratch": max(words, 1)}
-    if lists:
-        dims["idx"] = (m, capacity)
+    words = scratch_words(n, m, dim, 2 if double else 1, own)
+    dims = {"idx": (m, capacity), "count": m, "info": 2, "scratch": max(words, 1)}
     *idx, count, info, _ = make(variant)(*pack_particles(search), output_dims=dims)
     return Rows(idx[0] if lists else None, count, info[0], info[1])
 
 
 @kernel
-def _cpu_callable(variant: Variant) -> Kernel:
-    types = array_types(variant)
-
-    def run(*arrays: WarpArray) -> None:
-        _run_cells_on_cpu(variant, name_arrays(types, arrays))
-
-    return on_cpu(name_of_call("cells_cpu", variant), run, types, 3 + variant.lists)
+def _cpu_callable(variant: Variant) -> Call:
+    return describe_call("cells_cpu", variant, functools.partial(_plan_on_cpu, variant))
 
 
 @kernel
-def _cuda_callable(variant: Variant) -> Kernel:
-    wp = load_warp()
-    if wp.is_cuda_available():
-        _cuda_kernels(variant).load(wp.get_cuda_device())
-    return on_cuda(
-        name_of_call("cells_cuda", variant), array_types(variant), 3 + variant.lists, functools.partial(_commands, variant)
-    )
+def _cuda_callable(variant: Variant) -> Call:
+    return describe_call("cells_cuda", variant, functools.partial(_plan_on_cuda, variant))
 
 
-def array_types(variant: Variant) -> dict[str, Any]:
-    """Return Warp's types of what a call gets."""
-    wp = load_warp()
-    scalar = wp.float64 if variant.double else wp.float32
-    points, ints = wp.array2d(dtype=scalar), wp.array(dtype=wp.int32)
-    types = {"positions": points, "queries": points, "cutoff": wp.array(dtype=scalar)}
-    types |= {"idx": wp.array2d(dtype=wp.int32)} if variant.lists else {}
-    return types | {"count": ints, "info": ints, "scratch": ints}
+@kernel
+def _few_callable(variant: Variant) -> Call:
+    return describe_call("few_cuda", variant, functools.partial(_plan_few, variant))
 
 
-def name_arrays(types: dict[str, Any], arrays: Sequence[WarpArray]) -> Arrays:
-    """Return the arrays of a call by their names."""
-    return Arrays(**{"idx": None, **dict(zip(types, arrays, strict=True))})
-
-
-def name_of_call(name: str, variant: Variant) -> str:
-    """Return the name of what XLA calls: of the kernels, and of all that is static."""
+def describe_call(name: str, variant: Variant, plan: Callable[[Shapes, int], Plan]) -> Call:
+    """Return what XLA calls for rows or counts: its name tells the kernels, and all that is static."""
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
     flags |= {**space_flags(variant.periodic), "batched": variant.batched}
     flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
-    return "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
+    whole = "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
+    results = [*["idx"] * variant.lists, "count", "info", "scratch"]
+    return Call(whole, _PARTICLES, dict.fromkeys(results, np.int32), plan)
 
 
-def _cuda_kernels(variant: Variant) -> CellKernels:
-    make = kernels_of("cells_cuda").cell_kernels
-    keep = variant.keep
+def _numbers(variant: Variant, shapes: Shapes) -> dict[str, int]:
+    """Return the numbers that kernels of cells take, by name; without rows the capacity is 0."""
+    flags = {"closed": variant.closed, "drop_self": variant.keep.drop_self, "later_only": variant.keep.later_only}
+    capacity = shapes["idx"][1] if variant.lists else 0
+    return size_numbers(shapes, variant.own) | {"capacity": capacity, **flags}
+
+
+def _absent(variant: Variant) -> list[str]:
+    return [] if variant.lists else ["idx"]
+
+
+def _plan_on_cuda(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan:
     kind = {"periodic": variant.periodic, "batched": variant.batched}
-    return make(variant.dim, variant.double, variant.scaled, variant.lists, keep.later_only, **kind)
+    kernels = cells_cuda.cell_kernels(variant[0], variant.double, variant.scaled, variant.lists, variant.keep.later_only, **kind)
+    numbers = _numbers(variant, shapes)
+    return Plan(
+        place_launches(kernels.launches(numbers["n"], numbers["m"], variant.own, multiprocessors)), numbers, _absent(variant)
+    )
 
 
-def _commands(variant: Variant, *buffers: WarpArray) -> list[Command]:
-    arrays, sizes, capacity = _launchable(variant, name_arrays(array_types(variant), buffers))
-    arguments = [*arrays, *sizes, capacity, int(variant.closed), int(variant.keep.drop_self)]
-    launches = _cuda_kernels(variant).launches(*sizes[:2], variant.own, multiprocessors_of(arrays.positions))
-    return [Command(x.kernel, [*arguments, int(x.of_queries)], x.threads, x.block, x.beside) for x in launches]
+def _plan_few(variant: Variant, shapes: Shapes, _: int) -> Plan:
+    numbers = _numbers(variant, shapes)
+    numbers["drop_self"] &= variant.own
+    query = few_cuda.rows_kernel(variant.dim, variant.double, variant.lists, variant.batched)
+    return Plan([Clear("info", 8), Launch(query, few_cuda.threads(numbers["m"]))], numbers, _absent(variant))
 
 
-def _run_cells_on_cpu(variant: Variant, arrays: Arrays) -> None:
+def place_launches(launches: Sequence[cells_cuda.Launch]) -> list[Launch]:
+    """Return launches of kernels of cells, each told whether it works on the queries."""
+    return [Launch(x.kernel, x.threads, {"of_queries": int(x.of_queries)}, x.beside) for x in launches]
+
+
+def _plan_on_cpu(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan:
     kind = {"periodic": variant.periodic, "batched": variant.batched}
-    kernels = kernels_of("cells_cpu").cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, **kind)
-    arrays, sizes, capacity = _launchable(variant, arrays)
-    positions, queries, cutoff, idx, _, info, scratch = arrays
-    sort_on_cpu(kernels, positions, queries, cutoff, info, scratch, sizes)
-    ask_for_huge_pages(idx.ptr, 4 * len(queries) * capacity)
-    flags = [int(variant.closed), int(variant.keep.drop_self), int(variant.keep.later_only)]
-    arguments = [*arrays, *sizes, capacity, *flags]
-    on_every_core(kernels.query, arguments, -(-len(queries) // PLACES_PER_THREAD))
+    kernels = cells_cpu.cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, **kind)
+    numbers = _numbers(variant, shapes)
+    rows = ask_for_huge_pages("idx", 4 * numbers["m"] * numbers["capacity"]) if variant.lists else []
+    steps = [*sort_on_cpu(kernels, numbers["n"]), *rows, share(kernels.query, numbers["m"])]
+    return Plan(steps, numbers, _absent(variant))
 
 
-def sort_on_cpu(
-    kernels: CellKernels,
-    positions: WarpArray,
-    queries: WarpArray,
-    cutoff: WarpArray,
-    info: WarpArray,
-    scratch: WarpArray,
-    sizes: list[int],
-) -> None:
-    """Sort sources and queries by cell; several cores put the coordinates of many sources in order."""
-    n = sizes[0]
-    on_one_core(kernels.build, [positions, queries, cutoff, info, scratch, *sizes])
-    if n >= kernels_of("cells_cpu").MANY:
-        arguments = [positions, cutoff, scratch, *sizes]
-        on_every_core(kernels.gather, arguments, -(-n // PLACES_PER_THREAD))
+def sort_on_cpu(kernels: cells_cpu.Kernels, n: int) -> list[Launch | HugePages]:
+    """Return what sorts sources and queries by cell; several threads put the coordinates of many sources in order."""
+    return [Launch(kernels.build), *([share(kernels.gather, n)] if n >= cells_cpu.MANY else [])]
 
 
-def cell_sizes(n: int, m: int, own: bool) -> list[int]:
+def size_numbers(shapes: Shapes, own: bool) -> dict[str, int]:
     """Return n, m, own and the cells of the table, as all kernels of cells take them."""
-    return [n, m, int(own), kernels_of("_native").table_cells(n)]
-
-
-def _launchable(variant: Variant, arrays: Arrays) -> tuple[Arrays, list[int], int]:
-    """Return the arrays, the sizes (`cell_sizes`) and the capacity, as the cell kernels take them; without rows it is 0."""
-    n, m, count = arrays.positions.shape[0], arrays.queries.shape[0], arrays.count
-    sizes = cell_sizes(n, m, variant.own)
-    if arrays.idx is not None:
-        return arrays, sizes, arrays.idx.shape[1]
-    return arrays._replace(idx=stand_in(count, m)), sizes, 0
+    n, m = shapes["positions"][0], shapes["queries"][0]
+    return {"n": n, "m": m, "own": int(own), "table": table_cells(n)}

@@ -5,20 +5,22 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.arrays import levels_of
-from jfrnn._engine.cores import PLACES_PER_THREAD, on_every_core
-from jfrnn._engine.cuda import Command, multiprocessors_of
-from jfrnn._engine.launch import Kernel, kernel
+from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.levels_warp import level_sums
 from jfrnn._engine.operands import pack_particles, periodic_kind, space_flags
+from jfrnn._engine.plans import Launch, Plan, share
 from jfrnn._engine.problem import Filter, Search
-from jfrnn._engine.serving import on_cpu, on_cuda, stand_in
-from jfrnn._engine.start import WarpArray, WarpKernel, kernels_of, load_warp
 from jfrnn._engine.sum_results import SumsOf, TermText
-from jfrnn._engine.warp import CellKernels, cell_sizes, sort_on_cpu
+from jfrnn._engine.warp import are_few, place_launches, size_numbers, sort_on_cpu
 from jfrnn._geometry import Cutoffs
+from jfrnn.kernels import cells_cpu, cells_cuda, few_cuda, pair_sum_cpu, pair_sum_cuda
+
+_GIVEN = ("positions", "queries", "cutoff", "shared_values", "own_values", "others")  # what a call is given
+_SORTED = {False: "columns", True: "values"}  # what is known of sources, in the order of cells, on the CPU and on CUDA
 
 
 class _SumVariant(NamedTuple):
@@ -36,6 +38,7 @@ class _SumVariant(NamedTuple):
     extremes: bool
     key: str
     cuda: bool
+    few: bool  # all of them meet
 
 
 def pair_sums(
@@ -60,7 +63,7 @@ def pair_sums(
         def call(search: Search, values: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             sources, queries, cutoff, batch, torus, _ = search
             flags = (queries is None, cutoff.closed, keep.drop_self, periodic_kind(torus), batch is not None)
-            double, kind = sources.dtype == jnp.float64, (compensated, extremes, key, cuda)
+            double, kind = sources.dtype == jnp.float64, (compensated, extremes, key, cuda, cuda and are_few(search))
             variant = _SumVariant(sources.shape[1], double, cutoff.scaled, *flags, *kind)
             return _call_sums(variant, term, pack_particles(search), values)
 
@@ -76,37 +79,46 @@ def _call_sums(
     values: tuple[Array, Array, Array],
 ) -> tuple[Array, Array, Array]:
     """Let XLA call the kernels."""
-    n, m, engine = len(particles[0]), len(particles[1]), kernels_of(_module_of(variant))
+    n, m = len(particles[0]), len(particles[1])
+    if variant.few:
+        results = SumsOf(term, m, few_cuda.slots(m), variant.compensated, variant.extremes)
+        return results.unpack(*_few_callable(variant, term)(*particles, *values, output_dims=results.dims()))
+    engine = pair_sum_cuda if variant.cuda else pair_sum_cpu
     results = SumsOf(term, m, engine.slots(m), variant.compensated, variant.extremes)
     dims = results.dims()
-    dims |= {"columns": max(engine.sorted_numbers(term, n, variant.dim, variant.double), 1)}
-    cells = kernels_of(f"cells_{'cuda' if variant.cuda else 'cpu'}")
+    dims |= {_SORTED[variant.cuda]: max(engine.sorted_numbers(term, n, variant.dim, variant.double), 1)}
+    cells = cells_cuda if variant.cuda else cells_cpu
     of_search = {"info": 2, "scratch": cells.scratch_words(n, m, variant.dim, 2 if variant.double else 1, variant.own)}
     if variant.cuda:  # particles are sorted by a call of its own, which XLA makes once for a sum and its derivative
         values = (*values, *_sorting_callable(_sorting(variant))(*particles, output_dims=of_search))
     else:
         dims |= of_search
     sums, parts, rest, *_ = _sum_callable(variant, term)(*particles, *values, output_dims=dims)
-    return results.unpacked(sums, parts, rest)
-
-
-def _module_of(variant: _SumVariant) -> str:
-    return f"pair_sum_{'cuda' if variant.cuda else 'cpu'}"
+    return results.unpack(sums, parts, rest)
 
 
 @kernel
-def _sum_callable(variant: _SumVariant, term: TermText) -> Kernel:
-    wp = load_warp()
-    scalar = wp.float64 if variant.double else wp.float32
-    rows, reals, ints = wp.array2d(dtype=scalar), wp.array(dtype=scalar), wp.array(dtype=wp.int32)
-    types = {"positions": rows, "queries": rows, "cutoff": reals, "shared_values": reals, "own_values": rows, "others": rows}
-    of_search, results = {"info": ints, "scratch": ints}, {"sums": rows, "totals": reals, "errors": reals, "columns": reals}
-    name = _name_of_sum(_module_of(variant), variant)
-    if not variant.cuda:
-        return on_cpu(name, functools.partial(_run_sums_on_cpu, variant, term), types | results | of_search, 6)
-    if wp.is_cuda_available():
-        _sum_kernels_on_cuda(variant, term).load(wp.get_cuda_device())
-    return on_cuda(name, types | of_search | results, 4, functools.partial(_sum_commands, variant, term))
+def _sum_callable(variant: _SumVariant, term: TermText) -> Call:
+    scalar, words = np.float64 if variant.double else np.float32, {"info": np.int32, "scratch": np.int32}
+    results, of_search = dict.fromkeys(("sums", "totals", "errors", _SORTED[variant.cuda]), scalar), tuple(words)
+    name = _name_of_sum(f"pair_sum_{'cuda' if variant.cuda else 'cpu'}", variant)
+    if variant.cuda:  # particles are sorted
+        return Call(name, (*_GIVEN, *of_search), results, functools.partial(_plan_on_cuda, variant, term))
+    return Call(name, _GIVEN, results | words, functools.partial(_plan_on_cpu, variant, term))
+
+
+@kernel
+def _few_callable(variant: _SumVariant, term: TermText) -> Call:
+    scalar, plan = np.float64 if variant.double else np.float32, functools.partial(_plan_few, variant, term)
+    return Call(_name_of_sum("pair_sum_few_cuda", variant), _GIVEN, dict.fromkeys(("sums", "totals", "errors"), scalar), plan)
+
+
+def _plan_few(variant: _SumVariant, term: TermText, shapes: Shapes, _: int) -> Plan:
+    kind = variant.compensated, variant.batched, variant.extremes
+    query = few_cuda.sum_kernel(term, variant.key, variant.dim, variant.double, *kind)
+    numbers = _numbers(variant, term, shapes)
+    numbers["drop_self"] &= variant.own
+    return Plan([Launch(query, few_cuda.threads(numbers["m"]))], numbers)
 
 
 def _name_of_sum(name: str, variant: _SumVariant) -> str:
@@ -123,68 +135,44 @@ def _sorting(variant: _SumVariant) -> _SumVariant:
 
 
 @kernel
-def _sorting_callable(variant: _SumVariant) -> Kernel:
-    """Make a function that XLA calls to sort particles on CUDA: positions, queries and cutoff in; info and scratch out."""
-    wp = load_warp()
-    if wp.is_cuda_available():
-        _stages_on_cuda(variant).load_stages(wp.get_cuda_device())
-    scalar = wp.float64 if variant.double else wp.float32
-    rows, ints = wp.array2d(dtype=scalar), wp.array(dtype=wp.int32)
-    types = {"positions": rows, "queries": rows, "cutoff": wp.array(dtype=scalar), "info": ints, "scratch": ints}
-    return on_cuda(_name_of_sum("sorting_cuda", variant), types, 2, functools.partial(_sorting_commands, variant))
+def _sorting_callable(variant: _SumVariant) -> Call:
+    """Make a function that XLA calls to sort particles on CUDA."""
+    words = {"info": np.int32, "scratch": np.int32}
+    return Call(_name_of_sum("sorting_cuda", variant), _GIVEN[:3], words, functools.partial(_plan_sorting, variant))
 
 
-def _stages_on_cuda(variant: _SumVariant) -> CellKernels:
-    kind = {"periodic": variant.periodic, "batched": variant.batched}
-    return kernels_of("cells_cuda").cell_kernels(variant.dim, variant.double, variant.scaled, False, **kind)
+def _space(variant: _SumVariant) -> dict[str, int]:
+    return {"periodic": variant.periodic, "batched": variant.batched}
 
 
-def _sorting_commands(variant: _SumVariant, *arrays: WarpArray) -> list[Command]:
-    positions, queries, cutoff, info, scratch = arrays
-    n, m = positions.shape[0], queries.shape[0]
+def _plan_sorting(variant: _SumVariant, shapes: Shapes, multiprocessors: int) -> Plan:
+    kernels = cells_cuda.cell_kernels(variant.dim, variant.double, variant.scaled, False, **_space(variant))
+    numbers = size_numbers(shapes, variant.own)
     # what sorts particles takes the arguments of a search that only counts
-    sizes = cell_sizes(n, m, variant.own)
-    arguments = [positions, queries, cutoff, stand_in(info, 1), info, info, scratch, *sizes, 0, 0, 0]
-    stages = _stages_on_cuda(variant).stages(n, m, variant.own, multiprocessors_of(positions))
-    return [Command(x.kernel, [*arguments, int(x.of_queries)], x.threads, x.block) for x in stages]
+    more = dict.fromkeys(("capacity", "closed", "drop_self"), 0)
+    stages = place_launches(kernels.stages(numbers["n"], numbers["m"], variant.own, multiprocessors))
+    return Plan(stages, numbers | more, ["idx", "count"])
 
 
-@functools.cache
-def _sum_kernels_on_cpu(variant: _SumVariant, term: TermText) -> tuple[CellKernels, WarpKernel, WarpKernel]:
-    """Return the kernels that sort particles, sort values, and sum."""
-    sums = kernels_of("pair_sum_cpu")
+def _numbers(variant: _SumVariant, term: TermText, shapes: Shapes) -> dict[str, int]:
+    flags = {"closed": variant.closed, "drop_self": variant.drop_self, "width": term.source_columns}
+    return size_numbers(shapes, variant.own) | flags
+
+
+def _plan_on_cpu(variant: _SumVariant, term: TermText, shapes: Shapes, multiprocessors: int) -> Plan:
     dim, double, scaled = variant[:3]
-    kind = {"periodic": variant.periodic, "batched": variant.batched}
-    cells = kernels_of("cells_cpu").cell_kernels(dim, double, scaled, False, **kind)
-    query = sums.query_kernel(term, variant.key, dim, double, scaled, variant.compensated, **kind, extremes=variant.extremes)
-    return cells, sums.sort_kernel(dim, double), query
+    cells = cells_cpu.cell_kernels(dim, double, scaled, False, **_space(variant))
+    more = _space(variant) | {"extremes": variant.extremes}
+    query = pair_sum_cpu.query_kernel(term, variant.key, dim, double, scaled, variant.compensated, **more)
+    numbers = _numbers(variant, term, shapes)
+    values = [share(pair_sum_cpu.sort_kernel(dim, double), numbers["n"])] if term.source_columns else []
+    return Plan([*sort_on_cpu(cells, numbers["n"]), *values, share(query, numbers["m"])], numbers)
 
 
-def _run_sums_on_cpu(variant: _SumVariant, term: TermText, *arrays: WarpArray) -> None:
-    cells, sort_values, query = _sum_kernels_on_cpu(variant, term)
-    positions, queries, cutoff, shared, own, others, sums, totals, errors, columns, info, scratch = arrays
-    n, m = positions.shape[0], queries.shape[0]
-    sizes = cell_sizes(n, m, variant.own)
-    sort_on_cpu(cells, positions, queries, cutoff, info, scratch, sizes)
-    if term.source_columns:
-        sorting = [others, cutoff, columns, scratch, *sizes]
-        on_every_core(sort_values, sorting, -(-n // PLACES_PER_THREAD))
-    arguments = [positions, queries, cutoff, shared, own, columns, sums, totals, errors, scratch, *sizes]
-    arguments += [int(variant.closed), int(variant.drop_self)]
-    on_every_core(query, arguments, -(-m // PLACES_PER_THREAD))
-
-
-def _sum_kernels_on_cuda(variant: _SumVariant, term: TermText) -> CellKernels:
+def _plan_on_cuda(variant: _SumVariant, term: TermText, shapes: Shapes, multiprocessors: int) -> Plan:
     dim, double, scaled = variant[:3]
-    make = kernels_of("pair_sum_cuda").sum_kernels
-    kind = {"periodic": variant.periodic, "batched": variant.batched, "extremes": variant.extremes}
-    return make(term, variant.key, dim, double, scaled, variant.compensated, **kind)
-
-
-def _sum_commands(variant: _SumVariant, term: TermText, *arrays: WarpArray) -> list[Command]:
-    *given, info, scratch, sums, totals, errors, columns = arrays
-    n, m = given[0].shape[0], given[1].shape[0]
-    sizes = cell_sizes(n, m, variant.own)
-    arguments = [*given, sums, totals, errors, columns, info, scratch, *sizes, int(variant.closed), int(variant.drop_self)]
-    launches = _sum_kernels_on_cuda(variant, term).launches(n, m, multiprocessors_of(given[0]))
-    return [Command(x.kernel, arguments, x.threads, x.block, x.beside) for x in launches]
+    more = _space(variant) | {"extremes": variant.extremes}
+    kernels = pair_sum_cuda.sum_kernels(term, variant.key, dim, double, scaled, variant.compensated, **more)
+    numbers = _numbers(variant, term, shapes)
+    launches = kernels.launches(numbers["n"], numbers["m"], multiprocessors)
+    return Plan([Launch(x.kernel, x.threads, beside=x.beside) for x in launches], numbers)

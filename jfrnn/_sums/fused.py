@@ -8,7 +8,7 @@ import functools
 import math
 import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,6 @@ from jfrnn._engine import (
     Options,
     Search,
     as_float,
-    kernels_of,
     level_of_caller,
     pair_sums,
     prepare_search,
@@ -31,6 +30,7 @@ from jfrnn._geometry import Radii, unpack_turns
 from jfrnn._sums.scalars import NoTranslationError, hash_of
 from jfrnn._sums.terms import POSITIONS, Groups, Term, join
 from jfrnn._sums.translate import input_name, output_name, translate
+from jfrnn.kernels.pair_sum_cpu import Step, Sum, TermText, Value
 
 _Columns = tuple[tuple[int, int], ...]  # per column: the operand of a group and the element of it
 
@@ -41,7 +41,7 @@ class Plan(NamedTuple):
     Positions need no columns, since the kernel has them anyway.
     """
 
-    text: Any  # jfrnn.kernels.pair_sum_cpu.TermText
+    text: TermText
     shared: _Columns
     own: _Columns
     others: _Columns
@@ -118,14 +118,13 @@ def _exact_dtypes(dtype: np.dtype) -> set[np.dtype]:
 @functools.lru_cache(maxsize=256)
 def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: bool = False) -> Plan:
     """Translate a term, or its negative, for positions of this dtype and shifts along periodic axes."""
-    kernels = kernels_of("pair_sum_cpu")
 
     def of_pair(shift: Array, operands: Groups) -> Sequence[Array]:
         summands = term(jnp.asarray(True), jnp.where(np.array(periodic), shift, 0), operands)
         return [-x for x in summands] if negated else summands
 
     translated = translate(jax.make_jaxpr(of_pair)(term.shift, term.operands))
-    steps = tuple(kernels.Step(input_name(k, e), e) for k, e in translated.reads if k == 0)
+    steps = tuple(Step(input_name(k, e), e) for k, e in translated.reads if k == 0)
     at_hand = () if any(periodic) else POSITIONS  # in a box, the kernel holds wrapped positions instead
     columns, values, before = [], [], 1
     for group, labels in zip(term.operands, ((), *term.labels), strict=True):
@@ -134,17 +133,17 @@ def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: 
         columns.append(tuple(read for read, known in zip(reads, there, strict=True) if not known))
         values.append(
             tuple(
-                kernels.Value(input_name(before + k, e), translated.inputs[before + k].dtype, e if known else None)
+                Value(input_name(before + k, e), translated.inputs[before + k].dtype, e if known else None)
                 for (k, e), known in zip(reads, there, strict=True)
             )
         )
         before += len(group)
     sums = tuple(
-        kernels.Sum(output_name(k, e), total)
+        Sum(output_name(k, e), total)
         for k, (spec, total) in enumerate(zip(translated.outputs, term.totals, strict=True))
         for e in range(math.prod(spec.shape))
     )
-    text = kernels.TermText(translated.text, steps, values[0], values[1], values[2], sums)
+    text = TermText(translated.text, steps, values[0], values[1], values[2], sums)
     turns = [((len(group), 0),) if steps else () for group in term.operands]  # the columns of turns follow those of the operands
     return Plan(text, columns[0], columns[1] + turns[1], columns[2] + turns[2], hash_of(tuple(text), dtype.name)[:20])
 

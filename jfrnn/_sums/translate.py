@@ -2,9 +2,9 @@
 
     translated = translate(jax.make_jaxpr(function)(*examples))
 
-Every array is taken apart into scalars, in C order. The text reads `in0_0`, `in0_1`, ... and defines `out0_0`, ...; it calls
-`Math`, whose definitions stand in `kernels/native/math.h`, for each kind of number: plain scalars on CUDA, vectors of lanes on the
-CPU. How a primitive is written stands in `jfrnn._sums.primitives`.
+Every array is split into scalars in C order. The text reads `in0_0`, `in0_1`, ... and defines `out0_0`, ...; it calls functions of
+`Math`, defined in `kernels/native/math.h` for scalars on the CPU and on CUDA, and for vectors of lanes on the CPU.
+`jfrnn._sums.primitives` translates the single primitives.
 
 Results agree with JAX up to a few ulp, including NaN and infinities. Every operation is one statement, so the enclosing block
 controls contraction: it is off under `#pragma clang fp contract(off)`, and on CUDA without `fuse_fp`. Sums run from the first

@@ -5,37 +5,25 @@ They look for triangles in cells, which on CUDA are those of `jfrnn._triangles.c
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._engine import (
-    Command,
-    Kernel,
-    WarpArray,
-    WarpKernel,
-    ask_for_huge_pages,
-    kernel,
-    kernels_of,
-    load_warp,
-    multiprocessors_of,
-    on_every_core,
-    on_one_core,
-)
-from jfrnn._engine import on_cpu as launch_on_cpu
-from jfrnn._engine import on_cuda as launch_on_cuda
+from jfrnn._engine import Call, Clear, Launch, Plan, Shapes, ask_for_huge_pages, kernel, share
 from jfrnn._geometry import Cutoff
 from jfrnn._triangles.cells import LANES, MOST_CELLS, TriangleCells, bucket_count, entry_count, level_limit
 from jfrnn._triangles.cells import sort_triangles as sort_by_jax
 from jfrnn._triangles.rows import decide_pairs as decide_by_jax
 from jfrnn._triangles.tree import WIDTH, TriangleTree, boxes_around, level_starts
-
-TriangleKernels = Any  # what `triangle_kernels` of a module of `jfrnn.kernels` returns
+from jfrnn.kernels import triangle_pairs_cpu, triangles_cpu, triangles_cuda, winding
 
 _LONGEST_VECTOR = 16
 _PARTICLES_PER_THREAD = 1024  # below, a second thread costs more than it saves
+
+
+Shape = tuple[int, ...]
 
 
 class _Variant(NamedTuple):
@@ -98,17 +86,15 @@ def _query_on_cpu(variant: _Variant, slots: int, *inputs: Array) -> tuple[Array,
 
 def _query_on_cuda(variant: _Variant, slots: int, *inputs: Array) -> tuple[Array, Array]:
     n, dim = inputs[0].shape
-    words = kernels_of("triangles_cuda").scratch_words(n, *sizes_on_cuda(variant, inputs), dim, variant.double)
+    words = triangles_cuda.scratch_words(n, *sizes_on_cuda(variant, *(inputs[k].shape for k in (1, 2, 4, 5))), dim, variant.double)
     sizes = {"idx": (n, slots) if variant.lists else (1, 1), "count": n, "scratch": words}
     idx, count, _ = _cuda_callable(variant)(*inputs, output_dims=sizes)
     return idx if variant.lists else jnp.zeros((n, 0), jnp.int32), count
 
 
-def sizes_on_cuda(variant: _Variant, inputs: Sequence[Any]) -> tuple[int, int]:
-    """Return the number of buckets, into which particles are sorted, and of entries."""
-    if variant.tree:
-        return bucket_count(inputs[1].shape[0]), inputs[2].shape[1]
-    return inputs[4].shape[0] - 1, inputs[5].shape[0]
+def sizes_on_cuda(variant: _Variant, corners: Shape, boxes: Shape, start: Shape, triangles: Shape) -> tuple[int, int]:
+    """Return the number of buckets, into which particles are sorted, and of entries; given shapes of what a query is given."""
+    return (bucket_count(corners[0]), boxes[1]) if variant.tree else (start[0] - 1, triangles[0])
 
 
 def _name(name: str, variant: _Variant) -> str:
@@ -116,70 +102,49 @@ def _name(name: str, variant: _Variant) -> str:
     return f"jfrnn_triangles_{name}_{variant.dim}d_{'f64' if variant.double else 'f32'}{options}"
 
 
-def _kernels(variant: _Variant) -> TriangleKernels:
-    return kernels_of("triangles_cpu").triangle_kernels(*variant, MOST_CELLS[variant.dim], LANES[variant.dim], WIDTH)
+def _kernels(variant: _Variant) -> triangles_cpu.Kernels:
+    return triangles_cpu.triangle_kernels(*variant, MOST_CELLS[variant.dim], LANES[variant.dim], WIDTH)
+
+
+_CELLS = ("start", "triangles", "levels", "level_count", "level_of")
+_GIVEN = ("positions", "corners", "boxes", "cutoff", *_CELLS)  # those of `query_inputs`
 
 
 @kernel
-def _build_callable(variant: _Variant) -> Kernel:
-    wp = load_warp()
-    scalar, ints = wp.float64 if variant.double else wp.float32, wp.array(dtype=wp.int32)
-    types = {"corners": wp.array3d(dtype=scalar), "good": ints, "cutoff": wp.array(dtype=scalar), "start": ints, "triangles": ints}
-    types |= {"levels": ints, "level_count": ints, "level_of": ints, "scratch": ints}
+def _build_callable(variant: _Variant) -> Call:
+    def plan(shapes: Shapes, multiprocessors: int) -> Plan:
+        return Plan([Launch(_kernels(variant).build)], {"f": shapes["corners"][0], "buckets": shapes["start"][0] - 1})
 
-    def run(*arrays: WarpArray) -> None:
-        named = dict(zip(types, arrays, strict=True))
-        sizes = [named["corners"].shape[0], named["start"].shape[0] - 1]
-        on_one_core(_kernels(variant).build, [*arrays, *sizes])
-
-    return launch_on_cpu(_name("build", variant), run, types, 6)
-
-
-def _query_types(variant: _Variant) -> dict[str, Any]:
-    """Return Warp's types of what a query is given, and of what it returns, but for its last output."""
-    wp = load_warp()
-    scalar, ints = wp.float64 if variant.double else wp.float32, wp.array(dtype=wp.int32)
-    points = wp.array2d(dtype=scalar)
-    types = {"positions": points, "corners": wp.array3d(dtype=scalar), "boxes": points, "cutoff": wp.array(dtype=scalar)}
-    types |= {"start": ints, "triangles": ints, "levels": ints, "level_count": ints, "level_of": ints}
-    return types | {"idx": wp.array2d(dtype=wp.int32), "count": ints}
+    return Call(_name("build", variant), ("corners", "good", "cutoff"), dict.fromkeys((*_CELLS, "scratch"), np.int32), plan)
 
 
 @kernel
-def _query_callable(variant: _Variant) -> Kernel:
-    wp = load_warp()
-    types = _query_types(variant) | {"info": wp.array(dtype=wp.int32)}
+def _query_callable(variant: _Variant) -> Call:
+    def plan(shapes: Shapes, multiprocessors: int) -> Plan:
+        n, capacity = shapes["idx"]
+        numbers = {"n": n, "f": shapes["corners"][0], "buckets": shapes["start"][0] - 1, "capacity": capacity}
+        query = share(_kernels(variant).query, n, _PARTICLES_PER_THREAD)
+        rows = ask_for_huge_pages("idx", 4 * n * capacity)
+        return Plan([Clear("info", 16), *rows, query], numbers | {"stride": shapes["boxes"][1]})
 
-    def run(*arrays: WarpArray) -> None:
-        named = dict(zip(types, arrays, strict=True))
-        n, capacity = named["positions"].shape[0], named["idx"].shape[1]
-        sizes = [n, named["corners"].shape[0], named["start"].shape[0] - 1, capacity, named["boxes"].shape[1]]
-        named["info"].numpy()[:] = 0
-        ask_for_huge_pages(named["idx"].ptr, 4 * n * capacity)
-        on_every_core(_kernels(variant).query, [*arrays, *sizes], -(-n // _PARTICLES_PER_THREAD))
-
-    return launch_on_cpu(_name("query", variant), run, types, 3)
+    return Call(_name("query", variant), _GIVEN, dict.fromkeys(("idx", "count", "info"), np.int32), plan)
 
 
 @kernel
-def _cuda_callable(variant: _Variant) -> Kernel:
-    wp = load_warp()
-    if wp.is_cuda_available():
-        _cuda_kernels(variant).load(wp.get_cuda_device())
-    types = _query_types(variant) | {"scratch": wp.array(dtype=wp.int32)}
-    return launch_on_cuda(_name("cuda", variant), types, 3, functools.partial(_commands, variant))
+def _cuda_callable(variant: _Variant) -> Call:
+    plan = functools.partial(plan_on_cuda, variant)
+    return Call(_name("cuda", variant), _GIVEN, dict.fromkeys(("idx", "count", "scratch"), np.int32), plan)
 
 
-def _cuda_kernels(variant: _Variant) -> TriangleKernels:
-    return kernels_of("triangles_cuda").triangle_kernels(*variant, WIDTH)
-
-
-def _commands(variant: _Variant, *arrays: WarpArray) -> list[Command]:
-    (n, _), faces, capacity = arrays[0].shape, arrays[1].shape[0], arrays[9].shape[1]
-    sizes, workers = sizes_on_cuda(variant, arrays), kernels_of("triangles_cuda").workers_for(n, variant.double)
-    launches = _cuda_kernels(variant).launches(n, *sizes, capacity, variant.double, multiprocessors_of(arrays[0]))
-    arguments = [*arrays, n, faces, *sizes, capacity, workers]
-    return [Command(x.kernel, [*arguments, x.threads], x.threads, x.block, x.beside) for x in launches]
+def plan_on_cuda(variant: _Variant, shapes: Shapes, multiprocessors: int) -> Plan:
+    """Return what is launched on CUDA."""
+    n, capacity = shapes["positions"][0], shapes["idx"][1] if variant.lists else 0
+    buckets, entries = sizes_on_cuda(variant, *(shapes[name] for name in ("corners", "boxes", "start", "triangles")))
+    kernels = triangles_cuda.triangle_kernels(*variant, WIDTH)
+    numbers = {"n": n, "f": shapes["corners"][0], "buckets": buckets, "entries": entries, "capacity": capacity}
+    numbers |= {"workers": triangles_cuda.workers_for(n, variant.double), "first_thread": 0}
+    launches = kernels.threads(n, buckets, entries, capacity, variant.double, multiprocessors)
+    return Plan([Launch(x, threads, {"threads": threads}, x == kernels.fill) for x, threads in launches], numbers)
 
 
 def cast_rays(
@@ -216,61 +181,33 @@ def decide_pairs(own: Array, corners: Array, particle: Array, triangle: Array, c
 
 
 @kernel
-def _pairs_on_cpu(dim: int, double: bool) -> Kernel:
-    wp = load_warp()
-    scalar, ints = wp.float64 if double else wp.float32, wp.array(dtype=wp.int32)
-    types = {"positions": wp.array2d(dtype=scalar), "corners": wp.array3d(dtype=scalar), "cutoff": wp.array(dtype=scalar)}
-    types |= {"particle": ints, "triangle": ints, "asked": ints, "near": ints, "info": ints}
+def _pairs_on_cpu(dim: int, double: bool) -> Call:
+    def plan(shapes: Shapes, multiprocessors: int) -> Plan:
+        (n,) = shapes["particle"]
+        query = share(triangle_pairs_cpu.pairs_kernel(dim, double), n, triangle_pairs_cpu.CHUNK)
+        return Plan([Clear("info", 4), query], {"n": n})
 
-    def run(*arrays: WarpArray) -> None:
-        arrays[-1].numpy()[:] = 0
-        kernels, n = kernels_of("triangle_pairs_cpu"), arrays[3].shape[0]
-        on_every_core(kernels.pairs_kernel(dim, double), [*arrays, n], -(-n // kernels.CHUNK))
-
-    return launch_on_cpu(f"jfrnn_triangle_pairs_{dim}d_{'f64' if double else 'f32'}", run, types, 2)
+    given = "positions", "corners", "cutoff", "particle", "triangle", "asked"
+    name = f"jfrnn_triangle_pairs_{dim}d_{'f64' if double else 'f32'}"
+    return Call(name, given, dict.fromkeys(("near", "info"), np.int32), plan)
 
 
-def _ray_types(double: bool) -> dict[str, Any]:
-    wp = load_warp()
-    scalar, ints = wp.float64 if double else wp.float32, wp.array(dtype=wp.int32)
-    points = wp.array2d(dtype=scalar)
-    types = {"positions": points, "corners": wp.array3d(dtype=scalar), "boxes": points, "cutoff": wp.array(dtype=scalar)}
-    types |= {"rays": points, "start": ints, "triangles": ints, "asked": ints, "least": ints}
-    return types | {"side": ints, "info": ints}
+def _rays_callable(dim: int, double: bool, cuda: bool) -> Call:
+    def plan(shapes: Shapes, multiprocessors: int) -> Plan:
+        n, side = shapes["positions"][0], winding.side_kernel(dim, double, WIDTH, cuda)
+        numbers = {"n": n, "levels": shapes["start"][0] - 1, "entries": shapes["boxes"][1]}
+        return Plan([Launch(side, n)] if cuda else [Clear("info", 4), share(side, n, winding.CHUNK)], numbers)
 
-
-def _ray_sizes(arrays: Sequence[Any]) -> list[int]:
-    """Return the numbers of points, of levels and of entries."""
-    return [arrays[0].shape[0], arrays[5].shape[0] - 1, arrays[2].shape[1]]
-
-
-def _ray_kernel(dim: int, double: bool, cuda: bool) -> WarpKernel:
-    return kernels_of("winding").side_kernel(dim, double, WIDTH, cuda)
-
-
-def _ray_name(dim: int, double: bool, where: str) -> str:
-    return f"jfrnn_winding_{where}_{dim}d_{'f64' if double else 'f32'}"
+    given = "positions", "corners", "boxes", "cutoff", "rays", "start", "triangles", "asked", "least"
+    name = f"jfrnn_winding_{'cuda' if cuda else 'cpu'}_{dim}d_{'f64' if double else 'f32'}"
+    return Call(name, given, dict.fromkeys(("side", "info"), np.int32), plan)
 
 
 @kernel
-def _rays_on_cpu(dim: int, double: bool) -> Kernel:
-    def run(*arrays: WarpArray) -> None:
-        arrays[-1].numpy()[:] = 0
-        sizes = _ray_sizes(arrays)
-        most = -(-sizes[0] // kernels_of("winding").CHUNK)
-        on_every_core(_ray_kernel(dim, double, cuda=False), [*arrays, *sizes], most)
-
-    return launch_on_cpu(_ray_name(dim, double, "cpu"), run, _ray_types(double), 2)
+def _rays_on_cpu(dim: int, double: bool) -> Call:
+    return _rays_callable(dim, double, cuda=False)
 
 
 @kernel
-def _rays_on_cuda(dim: int, double: bool) -> Kernel:
-    wp, block = load_warp(), kernels_of("winding").BLOCK
-    if wp.is_cuda_available():
-        kernels_of("_load").load_module(_ray_kernel(dim, double, cuda=True).module, wp.get_cuda_device(), block)
-
-    def commands(*arrays: WarpArray) -> list[Command]:
-        sizes = _ray_sizes(arrays)
-        return [Command(_ray_kernel(dim, double, cuda=True), [*arrays, *sizes], -(-sizes[0] // block) * block, block)]
-
-    return launch_on_cuda(_ray_name(dim, double, "cuda"), _ray_types(double), 2, commands)
+def _rays_on_cuda(dim: int, double: bool) -> Call:
+    return _rays_callable(dim, double, cuda=True)

@@ -24,16 +24,15 @@ struct alignas(4 * sizeof(real)) Place {
 constexpr unsigned int ALL = 0xffffffffu;
 
 // What a thread is: its number in its warp, the number of its warp in the block, the number of its block, and its number among all.
-// Warp spreads more than 65535 blocks over y and z.
 struct Thread {
     int lane, warp_in_block, block;
     long long thread, threads;
     JFRNN_MEMBER Thread()
         : lane(threadIdx.x & 31),
           warp_in_block(threadIdx.x >> 5),
-          block((blockIdx.z * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x),
-          thread((long long)block * blockDim.x + threadIdx.x),
-          threads((long long)gridDim.z * gridDim.y * gridDim.x * blockDim.x) {}
+          block(blockIdx.x),
+          thread(thread_index()),
+          threads((long long)gridDim.x * blockDim.x) {}
 };
 
 // The scratch of a search: `jfrnn.kernels.cells_cuda.scratch_words` is the sum of its parts.
@@ -90,7 +89,7 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
 
     // Of a point that comes from outside the box: how far from the nearest face it is, in reaches, rounded up.
     JFRNN_MEMBER float depth_of(const real* at) const {
-        float depth = INFINITY;
+        float depth = (float)INF;
         for (int k = 0; k < DIM; ++k)
             if (is_periodic(k))
                 depth = fminf(depth, 1.0001f * (float)((at[k] < real(0.5) ? at[k] : 1 - at[k]) / reach_along(k)));

@@ -31,6 +31,8 @@ constexpr int TAKEN = 4;          // pairs that a lane evaluates at once
 constexpr int PLACED = 3;         // coordinates of j before its numbers, in a row of ROW_LENGTH
 constexpr int ROW_LENGTH = 4;
 constexpr bool FROM_PLACES = false;  // the term reads coordinates of j, and no numbers
+// Of few particles on CUDA (see jfrnn/kernels/few_cuda.py).
+constexpr int FEW_TILE = 1024, FEW_QUERIES = 16;
 // Of searches with a cutoff per particle (see jfrnn/kernels/levels.py).
 constexpr int RULE = 0, GROUPS = 8, HALVINGS = 5, PADDING = 16;
 // Of triangles (see jfrnn/kernels/_triangles.py, triangles_cpu.py and triangles_cuda.py).

@@ -1,5 +1,6 @@
 // What functions are for each compiler: Clang on the CPU, NVRTC or nvcc on CUDA.
 #pragma once
+#include "c_library.h"
 
 #if defined(__CUDACC__)
 #define JFRNN_FUNCTION static __device__ __forceinline__
@@ -8,6 +9,7 @@
 #define JFRNN_CALL static __device__ __noinline__
 #define JFRNN_MATH static __device__ __forceinline__
 #define JFRNN_TABLE static __device__ constexpr
+static __device__ __forceinline__ long long thread_index() { return (long long)blockIdx.x * blockDim.x + threadIdx.x; }
 #else
 #pragma clang fp contract(off)
 #define JFRNN_FUNCTION static
@@ -16,6 +18,7 @@
 #define JFRNN_CALL static __attribute__((noinline))
 #define JFRNN_MATH static inline __attribute__((always_inline))
 #define JFRNN_TABLE constexpr
+static inline long long thread_index() { return 0; }
 #endif
 #define JFRNN_GENERIC  \
     template <class T> \

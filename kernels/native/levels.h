@@ -360,8 +360,7 @@ struct Levels : LevelArguments, Space {
 
 #if defined(__CUDACC__)
     JFRNN_INLINE void run() {
-        const long long block = (long long)(blockIdx.z * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x;
-        const long long at = block * blockDim.x + threadIdx.x;
+        const long long at = thread_index();
         if (at >= m)
             return;
         serve((int)at);

@@ -2,11 +2,14 @@
 #pragma once
 #include "cells_cpu.h"
 
-struct SortValues {
-    const real *others, *cutoff;
+struct SortValuesArguments {
+    const real* others;
     real* columns;
     int* scratch;
     int n, m, own, table, width;
+};
+struct SortValues : SortValuesArguments {
+    explicit SortValues(const SortValuesArguments& given) : SortValuesArguments(given) {}
 
     void run() {
         const Scratch in(scratch, n, m, own, table);

@@ -9,7 +9,7 @@ struct TrianglesArguments {
     const real *positions, *corners, *boxes, *cutoff;
     const int *start, *triangles, *levels, *level_count, *level_of;
     int *idx, *count, *scratch;
-    int n, f, buckets, entries, capacity, workers, threads, thread;
+    int n, f, buckets, entries, capacity, workers, threads, first_thread;
 };
 struct Shared {
     int near;    // particles with candidates
@@ -32,6 +32,7 @@ JFRNN_FUNCTION int add_to(int* sum, int number) {
 }
 
 struct Triangles : TrianglesArguments, Space {
+    const int thread;  // counted from `first_thread` on, which is 0 on CUDA
     const Bounds<real> bounds;
     Shared& shared;
     int* cursor;
@@ -42,7 +43,12 @@ struct Triangles : TrianglesArguments, Space {
     int* room;  // for integers
 
     JFRNN_MEMBER explicit Triangles(const TrianglesArguments& given)
-        : TrianglesArguments(given), Space(given.cutoff), bounds(radius), shared(*(Shared*)scratch), cursor(scratch) {
+        : TrianglesArguments(given),
+          Space(given.cutoff),
+          thread(first_thread + (int)thread_index()),
+          bounds(radius),
+          shared(*(Shared*)scratch),
+          cursor(scratch) {
         take(HEADER);
         first = take(buckets);
         key = take(n);

@@ -10,7 +10,7 @@ struct WindingArguments {
     const real *positions, *corners, *boxes, *cutoff, *rays;
     const int *start, *triangles, *asked, *least;
     int *side, *info;
-    int n, levels, entries, thread;
+    int n, levels, entries;
 };
 struct Siblings {
     int first, level;
@@ -161,8 +161,9 @@ struct Winding : WindingArguments, Space {
 
 #if defined(__CUDACC__)
     JFRNN_MEMBER void run() {
-        if (thread < n)
-            side[thread] = asked[thread] ? side_of(thread) : 0;
+        const long long i = thread_index();
+        if (i < n)
+            side[i] = asked[i] ? side_of((int)i) : 0;
     }
 #else
     void run() {

@@ -1,0 +1,242 @@
+"""What is launched when XLA calls: plans, and how they are laid down for native code (`kernels/native/launch.h`)."""
+
+import ctypes
+import dataclasses
+import functools
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from jfrnn._engine.start import compiler, load_warp
+from jfrnn.kernels import Kernel
+
+if TYPE_CHECKING:
+    from jfrnn.kernels._compile import Library
+
+PLACES_PER_THREAD = 2048  # below, a second thread costs more than it saves
+_HUGE = 1 << 22  # bytes from which an array is worth a request for huge pages
+_MOST_BYTES, _MOST_ARRAYS = 1024, 48  # those of the native code
+_ONCE, _SHARED, _CUDA, _CUDA_BESIDE, _CLEAR, _HUGE_PAGES, _PYTHON = range(7)
+
+
+class Launch(NamedTuple):
+    """A kernel is launched.
+
+    Attributes:
+        kernel: Its arguments are the arrays and numbers of the plan that have their names.
+        threads: On CUDA in all; on the CPU, so many may share the work.
+        numbers: Arguments of this launch alone, by name.
+        beside: Whether it may run while the launch before it does (CUDA).
+    """
+
+    kernel: Kernel
+    threads: int = 1
+    numbers: Mapping[str, int] = {}
+    beside: bool = False
+
+
+class Clear(NamedTuple):
+    """Zeros are written to an array, of so many bytes."""
+
+    array: str
+    size: int
+
+
+class HugePages(NamedTuple):
+    """The operating system is asked to back an array of so many bytes with huge pages."""
+
+    array: str
+    size: int
+
+
+class Plan(NamedTuple):
+    """What is launched, in order, the numbers that are arguments, and arrays that no kernel touches, though it names them."""
+
+    steps: Sequence[Launch | Clear | HugePages]
+    numbers: Mapping[str, int]
+    absent: Sequence[str] = ()
+
+
+def share(kernel: Kernel, places: int, each: int = PLACES_PER_THREAD, **numbers: int) -> Launch:
+    """Return the launch of a kernel of the CPU whose work threads share, at least `each` places a thread."""
+    return Launch(kernel, -(-places // each), numbers)
+
+
+def ask_for_huge_pages(array: str, size: int) -> list[HugePages]:
+    """Return the request for a large array; a small one is not worth it."""
+    return [HugePages(array, size)] if size >= _HUGE else []
+
+
+# --- as native code reads them ----------------------------------------------------------------------------------------
+
+
+class _Step(ctypes.Structure):
+    _fields_ = (
+        ("function", ctypes.c_void_p),
+        ("arguments", ctypes.c_void_p),
+        ("arrays", ctypes.c_void_p),
+        ("size", ctypes.c_int),
+        ("array_count", ctypes.c_int),
+        ("kind", ctypes.c_int),
+        ("block", ctypes.c_int),
+        ("threads", ctypes.c_longlong),
+    )
+
+
+class _Plan(ctypes.Structure):
+    _fields_ = (
+        ("name", ctypes.c_char_p),
+        ("name_size", ctypes.c_longlong),
+        ("hash", ctypes.c_ulonglong),
+        ("users", ctypes.c_longlong),
+        ("steps", ctypes.c_void_p),
+        ("side", ctypes.c_void_p),
+        ("begun", ctypes.c_void_p),
+        ("ended", ctypes.c_void_p),
+        ("device", ctypes.c_int),
+        ("step_count", ctypes.c_int),
+    )
+
+
+class _Desk(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("make_plan", "serve", "yield", "advise", "launch", "clear", "record", "wait")),
+        ("plans", ctypes.c_void_p),
+        ("plan_count", ctypes.c_longlong),
+        ("locked", ctypes.c_int),
+        ("forking", ctypes.c_int),
+    )
+
+
+class LaidPlan(NamedTuple):
+    """A plan as native code reads it, and all that has to live as long."""
+
+    plan: _Plan
+    held: list[Any]
+
+
+def lay_plan(name: str, plan: Plan, arrays: list[str], device: int, *, python: bool = False) -> LaidPlan:
+    """Compile what a plan launches, and lay it down.
+
+    Args:
+        name: By which it is found.
+        plan: What is launched.
+        arrays: The names of the arrays that a call brings, in order.
+        device: The number of a CUDA device, or -1 for the CPU.
+        python: Whether Python serves the calls.
+    """
+    if len(arrays) > _MOST_ARRAYS:
+        raise ValueError(f"{name} takes {len(arrays)} arrays, more than {_MOST_ARRAYS}")
+    held: list[Any] = [text := name.encode()]
+    lay = functools.partial(_lay_step, plan, {array: k for k, array in enumerate(arrays)}, device, held)
+    laid = [_Step(kind=_PYTHON)] if python else [lay(step) for step in plan.steps]
+    steps = (_Step * len(laid))(*laid)
+    found = _Plan(name=text, name_size=len(text), steps=ctypes.addressof(steps), device=device, step_count=len(laid))
+    if any(step.kind == _CUDA_BESIDE for step in laid):
+        found.side, found.begun, found.ended = _second_stream(device)
+    return LaidPlan(found, [*held, steps])
+
+
+def _lay_step(plan: Plan, places: dict[str, int], device: int, held: list[Any], step: Launch | Clear | HugePages) -> _Step:
+    if not isinstance(step, Launch):
+        arrays = (ctypes.c_int * 2)(0, places[step.array])
+        held.append(arrays)
+        kind = _CLEAR if isinstance(step, Clear) else _HUGE_PAGES
+        return _Step(arrays=ctypes.addressof(arrays), array_count=1, kind=kind, threads=step.size)
+    kernel, numbers = step.kernel, {**plan.numbers, **step.numbers}
+    if kernel.size > _MOST_BYTES:
+        raise ValueError(f"{kernel.name} takes {kernel.size} bytes of arguments, more than {_MOST_BYTES}")
+    arrays = [field for field in kernel.fields if field.is_array and field.name not in plan.absent]
+    pairs = [number for field in arrays for number in (field.place, places[field.name])]
+    given = kernel.pack(numbers)
+    library = compiler().load(kernel.program, "cpu" if device < 0 else f"cuda:{device}")
+    template, places_of_arrays = (ctypes.c_ubyte * len(given)).from_buffer(given), (ctypes.c_int * len(pairs))(*pairs)
+    held += [library, template, places_of_arrays]
+    return _Step(
+        function=library.address_of(kernel.name),
+        arguments=ctypes.addressof(template),
+        arrays=ctypes.addressof(places_of_arrays),
+        size=len(given),
+        array_count=len(arrays),
+        kind=(_SHARED if step.threads > 1 else _ONCE) if device < 0 else _CUDA_BESIDE if step.beside else _CUDA,
+        block=kernel.block,
+        threads=step.threads,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Desk:
+    """What both sides know of each other: `handlers` are the addresses of what XLA calls, on the CPU and on CUDA."""
+
+    handlers: tuple[int, int]
+    _held: list[Any]
+    _keep: Callable[[int], None]
+    _drop: Callable[[int], None]
+
+    def keep(self, laid: LaidPlan) -> None:
+        """Let calls find a plan."""
+        self._keep(ctypes.addressof(laid.plan))
+
+    def drop(self, laid: LaidPlan) -> None:
+        """Let no call find a plan any longer, and wait for those that have found it."""
+        self._drop(ctypes.addressof(laid.plan))
+
+
+def open_desk(library: "Library", make_plan: int, serve: int, most: int) -> Desk:
+    """Open the native code.
+
+    Args:
+        library: The compiled program.
+        make_plan: The address of what is asked for plans.
+        serve: The address of what serves calls in Python.
+        most: How many plans are kept.
+    """
+    plans, c = (ctypes.c_void_p * (most + 1))(), _c_library()
+    desk = _Desk(make_plan=make_plan, serve=serve, plans=ctypes.addressof(plans))
+    setattr(desk, "yield", _address(c, "sched_yield") or _address(ctypes.pythonapi, "PyThread_get_thread_ident"))
+    desk.advise = _address(c, "madvise") if sys.platform.startswith("linux") else None
+    if load_warp().is_cuda_available():
+        driver = cuda_driver()
+        desk.launch, desk.clear = _address(driver, "cuLaunchKernel"), _address(driver, "cuMemsetD32Async")
+        desk.record, desk.wait = _address(driver, "cuEventRecord"), _address(driver, "cuStreamWaitEvent")
+    size = ctypes.c_longlong
+    take = ctypes.CFUNCTYPE(ctypes.c_bool, ctypes.c_void_p, size, size, size)(library.address_of("open_desk"))
+    if not take(ctypes.addressof(desk), *map(ctypes.sizeof, (_Desk, _Plan, _Step))):
+        raise RuntimeError("native code and Python lay plans in different ways")
+    change = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
+    keep, drop = (change(library.address_of(name)) for name in ("keep_plan", "drop_plan"))
+    handlers = library.address_of("answer_on_cpu"), library.address_of("answer_on_cuda")
+    return Desk(handlers, [desk, library, plans], keep, drop)
+
+
+def _address(library: ctypes.CDLL, name: str) -> int | None:
+    function = getattr(library, name, None)
+    return None if function is None else ctypes.cast(function, ctypes.c_void_p).value
+
+
+def _c_library() -> ctypes.CDLL:
+    return ctypes.CDLL("ucrtbase" if os.name == "nt" else None)
+
+
+def multiprocessors_of(device: int) -> int:
+    """Return how many multiprocessors a CUDA device has; the CPU, -1, counts as one."""
+    return 1 if device < 0 else load_warp().get_device(f"cuda:{device}").sm_count
+
+
+@functools.cache
+def cuda_driver() -> ctypes.CDLL:
+    """Return the library of CUDA's driver."""
+    return ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
+
+
+@functools.cache
+def _second_stream(device: int) -> tuple[int, int, int]:
+    """Return a stream of a CUDA device, and two events, for launches that run beside others."""
+    wp = load_warp()
+    made = wp.Stream(f"cuda:{device}"), wp.Event(f"cuda:{device}"), wp.Event(f"cuda:{device}")
+    _held.extend(made)
+    return made[0].cuda_stream, made[1].cuda_event, made[2].cuda_event
+
+
+_held: list[Any] = []  # streams and events, which Warp gives back once nobody has them

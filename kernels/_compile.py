@@ -1,0 +1,221 @@
+"""Programs compiled by the compilers that Warp ships (Clang for the CPU, NVRTC for CUDA), loaded, and kept in a folder.
+
+Files stand in the folder in which Warp keeps kernels, `wp_jfrnn` there, so that `warp.clear_kernel_cache` clears them, too. A file
+is named after all that it was made of, and ends with a digest of what stands before: a file that is cut or spoiled, after a full
+disk or in a job that was killed, is compiled anew. It is written elsewhere and moved, so that processes do not see each other's
+halves.
+"""
+
+import atexit
+import functools
+import hashlib
+import platform
+import shutil
+import tempfile
+import threading
+import warnings
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+from warp._src import build, context
+
+from jfrnn.kernels._program import Program
+from jfrnn.kernels.launch import launcher
+
+_FOLDER = "wp_jfrnn"
+_END = b"\n//"  # a comment of PTX, and nothing to objects
+_DIGEST = 64  # hexadecimal digits
+_compiling = threading.RLock()
+_loaded: weakref.WeakValueDictionary[tuple[Program, str], "Library"] = weakref.WeakValueDictionary()
+
+
+class Library:
+    """A program that is loaded on a device; it is unloaded when nobody has it any longer."""
+
+    def __init__(self, program: Program, device: str) -> None:
+        self._program, self._device = program, wp.get_device(device)
+        self._handle = self._load()
+        weakref.finalize(self, self._unloading()).atexit = False  # programs may still run while the interpreter exits
+
+    def address_of(self, function: str) -> int:
+        """Return the address of a function on the CPU, or its handle in CUDA.
+
+        Raises:
+            RuntimeError: The library does not hold it.
+        """
+        name = function.encode()
+        if self._program.cuda:
+            found = context.runtime.core.wp_cuda_get_kernel(self._device.context, self._handle, name)
+        else:
+            found = _clang().wp_lookup(self._handle, name)
+        if not found:
+            raise RuntimeError(f"the compiled program {self._program.name!r} holds no function {function!r}")
+        return found
+
+    def _load(self) -> int | bytes:
+        path = find_binary(self._program, self._device)
+        found = self._take(path)
+        if not found:
+            path.unlink(missing_ok=True)
+            found = self._take(find_binary(self._program, self._device))
+        if not found:
+            raise RuntimeError(f"the compiled program {path} cannot be loaded on {self._device}")
+        return found
+
+    def _take(self, path: Path) -> int | bytes | None:
+        if self._program.cuda:
+            return context.runtime.core.wp_cuda_load_module(self._device.context, str(path).encode())
+        handle = f"jfrnn_{id(self)}_{path.stem}".encode()
+        return None if _clang().wp_load_obj(str(path).encode(), handle, wp.config.legacy_cpu_linker) else handle
+
+    def _unloading(self) -> Callable[[], None]:
+        if self._program.cuda:
+            return functools.partial(_unload_cuda, self._device, self._handle)
+        return functools.partial(_clang().wp_unload_obj, self._handle)
+
+
+def load(program: Program, device: str = "cpu") -> Library:
+    """Return a program that is loaded on a device; it is compiled where no whole file of it is kept.
+
+    Raises:
+        RuntimeError: It does not compile, or cannot be loaded.
+    """
+    with _compiling:
+        found = _loaded.get((program, device))
+        if found is None:
+            found = _loaded[program, device] = Library(program, device)
+        return found
+
+
+def _clang() -> Any:
+    """Return Warp's library of Clang."""
+    return context.runtime.llvm
+
+
+def _kernel_folder() -> Path:
+    return Path(wp.config.kernel_cache_dir or tempfile.gettempdir()) / _FOLDER
+
+
+def load_launcher(header: str) -> Library:
+    """Return what stands between XLA and the kernels (`jfrnn.kernels.launch`)."""
+    return load(launcher(header))
+
+
+def find_binary(program: Program, device: wp.DeviceLike, arch: int | None = None) -> Path:
+    """Return a file that holds the compiled program, whole.
+
+    Args:
+        program: What is compiled.
+        device: A device of Warp.
+        arch: The architecture in place of that of the device, as in 90; then PTX is made.
+    """
+    target = _target(program, wp.get_device(device), arch)
+    key = hashlib.sha256("\0".join((*map(str, program), *target, wp.config.version)).encode()).hexdigest()[:20]
+    name = f"{program.name[:80]}_{key}{target[0]}"
+    kept = _kernel_folder()
+    if _is_whole(kept / name):
+        return kept / name
+    try:
+        return _compile(program, target, kept / name)
+    except OSError:
+        warnings.warn(temporary_folder(), RuntimeWarning, stacklevel=2)
+        return _compile(program, target, _kernel_folder() / name)
+
+
+def temporary_folder() -> str:
+    """Let kernels be compiled into a folder that is removed when the process ends; return what users should know.
+
+    Raises:
+        RuntimeError: There is none that can be written.
+    """
+    before = wp.config.kernel_cache_dir
+    place = "the folder in which Warp keeps compiled kernels" + (f", {before}," if before else "")
+    hint = "Set the environment variable WARP_CACHE_PATH to a folder that can be written"
+    try:
+        folder = tempfile.mkdtemp(prefix="jfrnn-warp-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        (Path(folder) / "room").write_bytes(bytes(1 << 20))
+    except OSError as error:
+        raise RuntimeError(f"{place} cannot be written, nor is there a temporary one ({error}). {hint}.") from error
+    wp.config.kernel_cache_dir = folder
+    return f"{place} cannot be written: kernels are compiled into {folder} for this process alone. {hint} to keep them."
+
+
+def _target(program: Program, device: wp.Device, arch: int | None) -> tuple[str, str]:
+    """Return the kind of file, and what it runs on: objects use all instructions of the processor that compiles them."""
+    if not program.cuda:
+        return ".o", _processor()
+    if arch is not None:
+        return ".ptx", str(arch)
+    return f".{device.get_cuda_output_format()}", str(device.get_cuda_compile_arch())
+
+
+@functools.cache
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line for line in lines if line.startswith(("flags", "Features"))), platform.machine())
+
+
+def _compile(program: Program, target: tuple[str, str], path: Path) -> Path:
+    """Compile a program to a file.
+
+    Raises:
+        OSError: It cannot be written.
+        RuntimeError: It does not compile.
+    """
+    kind, arch = target
+    with _new_folder(path) as folder:
+        source, binary = folder / f"program.{'cu' if program.cuda else 'cpp'}", folder / f"program{kind}"
+        source.write_text(program.text, "utf-8")
+        try:
+            if program.cuda:
+                options = {"config": "release", "fuse_fp": program.fused, "use_precompiled_headers": False, "pch_dir": None}
+                build.build_cuda(str(source), int(arch), str(binary), **options)
+            else:
+                build.build_cpu(str(binary), str(source), fuse_fp=program.fused)
+        except Exception as error:
+            _check_room(folder)
+            raise RuntimeError(f"the program {program.name!r} does not compile: {error}") from error
+        whole = binary.read_bytes()
+        if not whole:
+            raise OSError(f"{binary} is empty")
+        binary.write_bytes(whole + _END + hashlib.sha256(whole).hexdigest().encode())
+        binary.replace(path)
+    return path
+
+
+@contextmanager
+def _new_folder(path: Path) -> Iterator[Path]:
+    """Make the folder of a file, and one beside it that is gone afterwards."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(dir=path.parent))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _check_room(folder: Path) -> None:
+    """Raise an OSError where compilers failed for want of room."""
+    (folder / "room").write_bytes(bytes(1 << 22))
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return False
+    body, digest = data[: -_DIGEST - len(_END)], data[-_DIGEST:]
+    return hashlib.sha256(body).hexdigest().encode() == digest
+
+
+def _unload_cuda(device: wp.Device, handle: int | bytes) -> None:
+    wp.synchronize_device(device)
+    context.runtime.core.wp_cuda_unload_module(device.context, handle)

@@ -1,0 +1,62 @@
+// Sums over pairs of few particles on CUDA: what the term reads is gathered until there are 32 pairs of a query, one per lane.
+#pragma once
+#include "few.cuh"
+#include "reduction.cuh"
+
+struct FewSumsArguments {
+    const real *positions, *queries, *cutoff, *shared_values, *own_values, *others;
+    real *sums, *totals, *errors;
+    int n, m, closed, drop_self;
+};
+
+struct FewSums : FewSumsArguments {
+    JFRNN_MEMBER explicit FewSums(const FewSumsArguments& given) : FewSumsArguments(given) {}
+
+    JFRNN_MEMBER void run() {
+        __shared__ int waiting_of[FEW_QUERIES][64];
+        const FewPairs pairs(*this, false);
+        const int lane = pairs.lane, id = pairs.is_query ? pairs.query : 0;
+        int* const waiting = waiting_of[threadIdx.x >> 5];
+        const unsigned int lanes_below = (1u << lane) - 1;
+        const Term term(shared_values);
+        const Term::Own own_part = term.own(own_values + (long long)id * OWN, pairs.q);
+        Reduction reduction(n);
+        int held = 0;
+        auto evaluate = [&]() {  // the first 32 that wait, or as many as there are
+            const int j = lane < held ? waiting[lane] : 0;
+            real p[3];
+            pairs.point_of(positions + (long long)ROW * j, p);
+            number summand[SUMMANDS];
+            term.evaluate(own_part, p, [&](int c) -> number { return others[(long long)OTHERS * j + c]; }, summand);
+            reduction.add(summand, lane < held, [&](int& source, int& code) {
+                source = j;
+                code = 0;
+            });
+        };
+        pairs.meet_all([&](int j, bool hit) {
+            const unsigned int hits = __ballot_sync(EVERY, hit);
+            if (hit)
+                waiting[held + __popc(hits & lanes_below)] = j;
+            held += __popc(hits);
+            __syncwarp();
+            if (held < 32)
+                return;
+            evaluate();
+            held -= 32;
+            const int rest = waiting[32 + lane];
+            __syncwarp();
+            waiting[lane] = rest;
+            __syncwarp();
+        });
+        if (!pairs.is_query)
+            return;
+        if (held > 0)
+            evaluate();
+        const Results results{sums, errors, n, totals};
+        for (int t = lane; t < 2 * TOTALS; t += 32)
+            totals[2ll * TOTALS * id + t] = 0;
+        __syncwarp();
+        reduction.reduce_over_warp();
+        reduction.store(results, {lane, id, id, lane == 0, true, true});
+    }
+};

@@ -1,0 +1,379 @@
+// How a call of XLA becomes launches of kernels: native code on the thread of the call, which neither runs nor waits for Python.
+//
+// Python lays down a plan for each kernel, for the shapes of a call and, on CUDA, for a device: which functions are launched, in order,
+// and the bytes of their arguments, but for the addresses of arrays, which a call brings. Plans are found by the name that a program
+// carries. A name that is not known yet, of a program that another process has traced, is asked of Python once.
+#pragma once
+#include "c_library.h"
+#include "xla_ffi.h"
+
+typedef void (*Function)(const void* arguments);
+
+enum Kind { ONCE, SHARED, CUDA, CUDA_BESIDE, CLEAR, HUGE_PAGES, PYTHON };
+
+struct Step {
+    void* function;                  // CPU: called with the address of the arguments; CUDA: a function of the driver
+    const unsigned char* arguments;  // their bytes
+    const int* arrays;               // places among these bytes, each behind it the number of the array whose address belongs there
+    int size, array_count;
+    int kind;
+    int block;          // CUDA: threads of a block
+    long long threads;  // CPU: how many may share the work; CUDA: in all; of what is cleared or in huge pages: bytes
+};
+struct Plan {
+    const char* name;
+    long long name_size;
+    unsigned long long hash;
+    long long users;  // calls that are under way
+    const Step* steps;
+    void *side, *begun, *ended;  // a second stream of the device, and two events
+    int device, step_count;
+};
+
+// What Python tells once: functions that are called, and the plans there are.
+struct Desk {
+    // asks for the plan of a name; returns an error, or nothing
+    const char* (*make_plan)(const char* name, long long name_size, const char* recipe, long long recipe_size, int device);
+    const char* (*serve)(const char* name, long long name_size, int device, void* stream, void* const* arrays);
+    int (*yield)();
+    int (*advise)(void* address, size_t size, int advice);
+    int (*launch)(void* function, unsigned int, unsigned int, unsigned int, unsigned int, unsigned int, unsigned int, unsigned int,
+        void* stream, void** arguments, void** extra);
+    int (*clear)(unsigned long long address, unsigned int word, size_t words, void* stream);
+    int (*record)(void* event, void* stream);
+    int (*wait)(void* stream, void* event, unsigned int);
+    Plan** plans;
+    long long plan_count;
+    int locked, forking;
+};
+static Desk* desk;
+
+static constexpr int MOST_ARRAYS = 48, MOST_BYTES = 1024;
+
+struct Lock {
+    int* const locked;
+    explicit Lock(int* given) : locked(given) {
+        while (__atomic_exchange_n(locked, 1, __ATOMIC_ACQUIRE))
+            desk->yield();
+    }
+    ~Lock() { __atomic_store_n(locked, 0, __ATOMIC_RELEASE); }
+};
+
+static unsigned long long hash_of(const char* name, long long size) {
+    unsigned long long hash = 0x9e3779b97f4a7c15ull + (unsigned long long)size, word;
+    for (; size > 0; size -= 8, name += 8) {
+        word = 0;
+        memcpy(&word, name, size < 8 ? (size_t)size : 8);
+        hash = (hash ^ word) * 0xff51afd7ed558ccdull;
+        hash ^= hash >> 32;
+    }
+    return hash;
+}
+
+// A message, for XLA to raise.
+struct Message {
+    char text[1024];
+    int size = 0;
+    void add(const char* words, long long most = 1 << 20) {
+        for (; *words && most > 0 && size < (int)sizeof(text) - 1; --most)
+            text[size++] = *words++;
+        text[size] = 0;
+    }
+    void add_number(int number) {
+        char digits[12];
+        int at = 11;
+        digits[at] = 0;
+        for (unsigned int rest = number < 0 ? 0u - number : number; at == 11 || rest; rest /= 10)
+            digits[--at] = (char)('0' + rest % 10);
+        if (number < 0)
+            digits[--at] = '-';
+        add(digits + at);
+    }
+    // Adds the name of a kernel, which ends where the sources it was made of are named.
+    void add_name(XLA_FFI_ByteSpan name) {
+        long long size = 0;
+        while (size < (long long)name.len && name.ptr[size] != '@')
+            ++size;
+        add(name.ptr, size);
+        add(": ");
+    }
+};
+
+struct Call {
+    XLA_FFI_CallFrame* const frame;
+    explicit Call(XLA_FFI_CallFrame* given) : frame(given) {}
+
+    XLA_FFI_Error* fail(const char* words) const {
+        XLA_FFI_Error_Create_Args given = {sizeof(given), nullptr, words, XLA_FFI_Error_Code_INTERNAL};
+        return frame->api->XLA_FFI_Error_Create(&given);
+    }
+    XLA_FFI_Error* fail_at(const char* words, int number) const {
+        Message message;
+        message.add_name(text("kernel"));
+        message.add(words);
+        message.add_number(number);
+        return fail(message.text);
+    }
+    XLA_FFI_ByteSpan text(const char* name) const {
+        const XLA_FFI_Attrs& given = frame->attrs;
+        for (long long k = 0; k < given.size; ++k) {
+            const XLA_FFI_ByteSpan* here = given.names[k];
+            size_t l = 0;
+            while (l < here->len && name[l] == here->ptr[l])
+                ++l;
+            if (l == here->len && name[l] == 0)
+                return *(const XLA_FFI_ByteSpan*)given.attrs[k];
+        }
+        return XLA_FFI_ByteSpan{"", 0};
+    }
+    void discard(XLA_FFI_Error* error) const {
+        XLA_FFI_Error_Destroy_Args given = {sizeof(given), nullptr, error};
+        frame->api->XLA_FFI_Error_Destroy(&given);
+    }
+    int device() const {
+        XLA_FFI_DeviceOrdinal_Get_Args given = {sizeof(given), nullptr, frame->ctx, 0};
+        XLA_FFI_Error* error = frame->api->XLA_FFI_DeviceOrdinal_Get(&given);
+        if (error)
+            discard(error);
+        return given.device_ordinal;
+    }
+    void* stream() const {
+        XLA_FFI_Stream_Get_Args given = {sizeof(given), nullptr, frame->ctx, nullptr};
+        XLA_FFI_Error* error = frame->api->XLA_FFI_Stream_Get(&given);
+        if (error)
+            discard(error);
+        return given.stream;
+    }
+    int thread_count() const {
+        int64_t count = 1;
+        XLA_FFI_ThreadPool_NumThreads_Args given = {sizeof(given), nullptr, frame->ctx, &count};
+        XLA_FFI_Error* error = frame->api->XLA_FFI_ThreadPool_NumThreads(&given);
+        if (error) {
+            discard(error);
+            return 1;
+        }
+        return (int)count;
+    }
+    bool schedule(XLA_FFI_Task* task, void* data) const {
+        XLA_FFI_ThreadPool_Schedule_Args given = {sizeof(given), nullptr, frame->ctx, task, data};
+        XLA_FFI_Error* error = frame->api->XLA_FFI_ThreadPool_Schedule(&given);
+        if (error)
+            discard(error);
+        return error == nullptr;
+    }
+    // Puts down the addresses of the arrays, inputs first.
+    int arrays(void** found) const {
+        int count = 0;
+        for (long long k = 0; k < frame->args.size && count < MOST_ARRAYS; ++k)
+            found[count++] = ((XLA_FFI_Buffer*)frame->args.args[k])->data;
+        for (long long k = 0; k < frame->rets.size && count < MOST_ARRAYS; ++k)
+            found[count++] = ((XLA_FFI_Buffer*)frame->rets.rets[k])->data;
+        return count;
+    }
+};
+
+// Finds a plan, which stays until `leave`.
+static Plan* enter(XLA_FFI_ByteSpan name, int device) {
+    const unsigned long long hash = hash_of(name.ptr, (long long)name.len);
+    const Lock lock(&desk->locked);
+    for (long long k = 0; k < desk->plan_count; ++k) {
+        Plan* plan = desk->plans[k];
+        if (plan->hash != hash || plan->device != device || plan->name_size != (long long)name.len)
+            continue;
+        bool same = true;
+        for (size_t l = 0; same && l < name.len; ++l)
+            same = plan->name[l] == name.ptr[l];
+        if (same) {
+            __atomic_fetch_add(&plan->users, 1, __ATOMIC_RELAXED);
+            return plan;
+        }
+    }
+    return nullptr;
+}
+static void leave(Plan* plan) { __atomic_fetch_sub(&plan->users, 1, __ATOMIC_RELEASE); }
+
+// A step of the CPU, which threads of XLA's pool may join until the thread of the call has found nothing left to do.
+struct Team {
+    static constexpr int CLOSED = 1 << 30;
+    Function function;
+    const void* arguments;
+    int inside;   // threads that have joined and not left, and whether the step is CLOSED to others
+    int holders;  // who has yet to let go of this memory
+
+    static void release(Team* team) {
+        if (__atomic_sub_fetch(&team->holders, 1, __ATOMIC_ACQ_REL) == 0)
+            free(team);
+    }
+    static void join(void* data) {
+        Team* team = (Team*)data;
+        int inside = __atomic_load_n(&team->inside, __ATOMIC_RELAXED);
+        while (!(inside & CLOSED))
+            if (__atomic_compare_exchange_n(&team->inside, &inside, inside + 1, true, __ATOMIC_ACQUIRE, __ATOMIC_RELAXED)) {
+                team->function(team->arguments);
+                __atomic_fetch_sub(&team->inside, 1, __ATOMIC_RELEASE);
+                break;
+            }
+        release(team);
+    }
+    static void run(const Call& call, Function function, const void* arguments, long long most) {
+        const int threads = most > 1 ? call.thread_count() : 1, others = (int)(most < threads ? most : threads) - 1;
+        Team* team = others > 0 ? (Team*)malloc(sizeof(Team)) : nullptr;
+        if (team == nullptr) {
+            function(arguments);
+            return;
+        }
+        *team = Team{function, arguments, 0, others + 1};
+        for (int k = 0; k < others; ++k)
+            if (!call.schedule(join, team))
+                release(team);
+        function(arguments);
+        int inside = __atomic_or_fetch(&team->inside, CLOSED, __ATOMIC_ACQUIRE);
+        for (int spins = 0; inside != CLOSED; inside = __atomic_load_n(&team->inside, __ATOMIC_ACQUIRE))
+            if (++spins > 64)
+                desk->yield();
+        release(team);
+    }
+};
+
+// What a call does on a device.
+struct Work {
+    const Call& call;
+    const Plan& plan;
+    void* const stream;
+    void* arrays[MOST_ARRAYS];
+
+    Work(const Call& given, const Plan& found, void* of_call) : call(given), plan(found), stream(of_call) { call.arrays(arrays); }
+
+    void fill(const Step& step, unsigned char* bytes) const {
+        memcpy(bytes, step.arguments, (size_t)step.size);
+        for (int k = 0; k < step.array_count; ++k)
+            memcpy(bytes + step.arrays[2 * k], &arrays[step.arrays[2 * k + 1]], sizeof(void*));
+    }
+    int launch(const Step& step, void* on) const {
+        alignas(16) unsigned char bytes[MOST_BYTES];
+        fill(step, bytes);
+        void* arguments[1] = {bytes};
+        const unsigned int blocks = (unsigned int)((step.threads + step.block - 1) / step.block);
+        return blocks ? desk->launch(step.function, blocks, 1, 1, (unsigned int)step.block, 1, 1, 0, on, arguments, nullptr) : 0;
+    }
+    // Launches a step and the one behind it, which waits for what came before both alone.
+    int launch_both(const Step* step) const {
+        const Lock lock(&desk->forking);  // the second stream and its events are those of all calls on a device
+        int wrong = desk->record(plan.begun, stream);
+        wrong = wrong ? wrong : desk->wait(plan.side, plan.begun, 0);
+        wrong = wrong ? wrong : launch(step[0], stream);
+        wrong = wrong ? wrong : launch(step[1], plan.side);
+        wrong = wrong ? wrong : desk->record(plan.ended, plan.side);
+        return wrong ? wrong : desk->wait(stream, plan.ended, 0);
+    }
+    int run_on_cuda() const {
+        int wrong = 0;
+        for (int k = 0; k < plan.step_count && !wrong; ++k) {
+            const Step& step = plan.steps[k];
+            if (step.kind == CLEAR)
+                wrong = desk->clear((unsigned long long)arrays[step.arrays[1]], 0, (size_t)step.threads / 4, stream);
+            else if (k + 1 < plan.step_count && plan.steps[k + 1].kind == CUDA_BESIDE)
+                wrong = launch_both(plan.steps + k++);
+            else
+                wrong = launch(step, stream);
+        }
+        return wrong;
+    }
+    void run_on_cpu() const {
+        alignas(16) unsigned char bytes[MOST_BYTES];
+        for (int k = 0; k < plan.step_count; ++k) {
+            const Step& step = plan.steps[k];
+            void* array = step.array_count ? arrays[step.arrays[1]] : nullptr;
+            if (step.kind == CLEAR)
+                memset(array, 0, (size_t)step.threads);
+            else if (step.kind == HUGE_PAGES)
+                ask_for_huge_pages(array, step.threads);
+            else {
+                fill(step, bytes);
+                Team::run(call, (Function)step.function, bytes, step.kind == SHARED ? step.threads : 1);
+            }
+        }
+    }
+    // Lets Linux back a large array with huge pages: its first touch then costs a few faults instead of one per 4 KiB.
+    static void ask_for_huge_pages(void* address, long long size) {
+        constexpr unsigned long long PAGE = 4096;
+        const unsigned long long begin = ((unsigned long long)address + PAGE - 1) / PAGE * PAGE;
+        const unsigned long long end = ((unsigned long long)address + (unsigned long long)size) / PAGE * PAGE;
+        if (desk->advise && end > begin)
+            desk->advise((void*)begin, end - begin, 14);
+    }
+};
+
+static XLA_FFI_Error* answer(XLA_FFI_CallFrame* frame, bool cuda) {
+    const Call call(frame);
+    for (auto* extension = frame->extension_start; extension; extension = extension->next)
+        if ((int)extension->type == 1) {  // a question for the version of the interface, whatever the header calls it
+            XLA_FFI_Metadata* asked = ((XLA_FFI_Metadata_Extension*)extension)->metadata;
+            asked->api_version.major_version = XLA_FFI_API_MAJOR;
+            asked->api_version.minor_version = XLA_FFI_API_MINOR;
+            return nullptr;
+        }
+    const bool executes = frame->stage == XLA_FFI_ExecutionStage_EXECUTE;
+    if (!executes && frame->stage != XLA_FFI_ExecutionStage_INSTANTIATE)
+        return nullptr;
+    const XLA_FFI_ByteSpan name = call.text("kernel");
+    const int device = !cuda ? -1 : executes ? call.device() : 0;  // a program that is made is most likely for the first one
+    Plan* plan = enter(name, device);
+    while (plan == nullptr) {
+        const XLA_FFI_ByteSpan recipe = call.text("recipe");
+        const char* wrong = desk->make_plan(name.ptr, (long long)name.len, recipe.ptr, (long long)recipe.len, device);
+        if (wrong != nullptr) {
+            Message message;
+            message.add_name(name);
+            message.add(wrong);
+            return call.fail(message.text);
+        }
+        plan = enter(name, device);
+    }
+    XLA_FFI_Error* error = nullptr;
+    if (executes && plan->step_count > 0 && plan->steps[0].kind == PYTHON) {
+        void* arrays[MOST_ARRAYS];
+        call.arrays(arrays);
+        const char* wrong = desk->serve(name.ptr, (long long)name.len, device, cuda ? call.stream() : nullptr, arrays);
+        if (wrong != nullptr) {
+            Message message;
+            message.add_name(name);
+            message.add(wrong);
+            error = call.fail(message.text);
+        }
+    } else if (executes && cuda) {
+        const int wrong = Work(call, *plan, call.stream()).run_on_cuda();
+        error = wrong ? call.fail_at("a launch failed with CUDA's error ", wrong) : nullptr;
+    } else if (executes)
+        Work(call, *plan, nullptr).run_on_cpu();
+    leave(plan);
+    return error;
+}
+
+// --- what Python calls ---
+
+extern "C" {
+// Takes the desk, where both sides mean the same by what stands on it.
+bool open_desk(Desk* given, long long desk_size, long long plan_size, long long step_size) {
+    desk = given;
+    return desk_size == sizeof(Desk) && plan_size == sizeof(Plan) && step_size == sizeof(Step);
+}
+XLA_FFI_Error* answer_on_cpu(XLA_FFI_CallFrame* frame) { return answer(frame, false); }
+XLA_FFI_Error* answer_on_cuda(XLA_FFI_CallFrame* frame) { return answer(frame, true); }
+void keep_plan(Plan* plan) {
+    plan->hash = hash_of(plan->name, plan->name_size);
+    const Lock lock(&desk->locked);
+    desk->plans[desk->plan_count++] = plan;
+}
+// Lets nobody find a plan any longer, and waits for those who have.
+void drop_plan(Plan* plan) {
+    {
+        const Lock lock(&desk->locked);
+        for (long long k = 0; k < desk->plan_count; ++k)
+            if (desk->plans[k] == plan)
+                desk->plans[k--] = desk->plans[--desk->plan_count];
+    }
+    while (__atomic_load_n(&plan->users, __ATOMIC_ACQUIRE))
+        desk->yield();
+}
+}

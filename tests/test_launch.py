@@ -1,0 +1,260 @@
+"""Native code between XLA and the kernels, called by frames as XLA lays them out, with a driver that notes what it is asked."""
+
+import ctypes
+import functools
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from jfrnn._engine import Clear, Launch, Plan, plans
+from jfrnn._engine.start import load_warp
+from jfrnn.kernels import Field, Kernel, Program, _compile
+from jfrnn.kernels.launch import write_launcher
+
+HEADER = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text()
+HARNESS = r"""
+static long long events[4096][4];
+static int event_count;
+static void note(long long kind, long long a, long long b, long long c) {
+    long long* event = events[__atomic_fetch_add(&event_count, 1, __ATOMIC_RELAXED) % 4096];
+    event[0] = kind, event[1] = a, event[2] = b, event[3] = c;
+}
+static int launch(void* f, unsigned x, unsigned, unsigned, unsigned block, unsigned, unsigned, unsigned, void* stream, void** given,
+                  void**) {
+    note(1, (long long)stream, *(long long*)given[0], 1000000 * ((int*)given[0])[2] + 1000 * x + block);
+    return ((int*)given[0])[2] == 13 ? 700 : 0;
+}
+static int clear(unsigned long long address, unsigned, size_t words, void* stream) {
+    note(2, (long long)stream, (long long)address, (long long)words);
+    return 0;
+}
+static int record(void* event, void* stream) { note(3, (long long)stream, (long long)event, 0); return 0; }
+static int wait(void* stream, void* event, unsigned) { note(4, (long long)stream, (long long)event, 0); return 0; }
+
+struct Task { XLA_FFI_Task* run; void* data; };
+static Task tasks[64];
+static int task_count, device_number;
+static char failure[1024];
+static XLA_FFI_Error* create(XLA_FFI_Error_Create_Args* a) {
+    int k = 0;
+    for (; a->message[k] && k < 1023; ++k) failure[k] = a->message[k];
+    failure[k] = 0;
+    return (XLA_FFI_Error*)failure;
+}
+static XLA_FFI_Error* get_stream(XLA_FFI_Stream_Get_Args* a) { a->stream = (void*)(99ll + device_number); return nullptr; }
+static XLA_FFI_Error* get_device(XLA_FFI_DeviceOrdinal_Get_Args* a) { a->device_ordinal = device_number; return nullptr; }
+static XLA_FFI_Error* schedule(XLA_FFI_ThreadPool_Schedule_Args* a) {
+    tasks[task_count++] = Task{a->task, a->data};
+    return nullptr;
+}
+static XLA_FFI_Error* threads(XLA_FFI_ThreadPool_NumThreads_Args* a) { *a->num_threads = 4; return nullptr; }
+
+extern "C" {
+void add_one(const void* given) { __atomic_fetch_add(*(int* const*)given, ((const int*)given)[2], __ATOMIC_RELAXED); }
+void* driver(int k) { void* all[] = {(void*)launch, (void*)clear, (void*)record, (void*)wait}; return all[k]; }
+int take_events(long long* out) {
+    const int count = event_count;
+    memcpy(out, events, sizeof(events[0]) * count);
+    event_count = 0;
+    return count;
+}
+int run_tasks() {  // those that were scheduled, whoever waits for them
+    const int count = task_count;
+    for (int k = 0; k < count; ++k) tasks[k].run(tasks[k].data);
+    task_count = 0;
+    return count;
+}
+const char* call(const char* kernel, int size, int device, int cuda, void* input, void* output, int stage, int extension) {
+    XLA_FFI_Api api = {};
+    api.XLA_FFI_Error_Create = create;
+    api.XLA_FFI_Stream_Get = get_stream;
+    api.XLA_FFI_DeviceOrdinal_Get = get_device;
+    api.XLA_FFI_ThreadPool_Schedule = schedule;
+    api.XLA_FFI_ThreadPool_NumThreads = threads;
+    device_number = device;
+    XLA_FFI_Buffer buffers[2] = {};
+    buffers[0].data = input, buffers[1].data = output;
+    void *in[1] = {buffers}, *out[1] = {buffers + 1};
+    XLA_FFI_ByteSpan names[2] = {{"kernel", 6}, {"recipe", 6}}, texts[2] = {{kernel, (size_t)size}, {"made so", 7}};
+    XLA_FFI_ByteSpan* all_names[2] = {names, names + 1};
+    void* all_texts[2] = {texts, texts + 1};
+    XLA_FFI_Metadata metadata = {};
+    metadata.api_version.minor_version = -1;
+    XLA_FFI_Metadata_Extension asked = {};
+    asked.metadata = &metadata;
+    *(int*)((char*)&asked + sizeof(size_t)) = extension;
+    XLA_FFI_CallFrame frame = {};
+    frame.api = &api;
+    frame.stage = (XLA_FFI_ExecutionStage)stage;
+    if (extension) frame.extension_start = (decltype(frame.extension_start))&asked;
+    frame.args.size = frame.rets.size = 1;
+    frame.args.args = in, frame.rets.rets = out;
+    frame.attrs.size = 2, frame.attrs.names = all_names, frame.attrs.attrs = all_texts;
+    XLA_FFI_Error* error = cuda ? answer_on_cuda(&frame) : answer_on_cpu(&frame);
+    return error ? failure : extension == 1 && metadata.api_version.minor_version == XLA_FFI_API_MINOR ? "told" : nullptr;
+}
+}
+"""
+EXECUTE, INSTANTIATE = 3, 0
+LAUNCH, CLEAR, RECORD, WAIT = range(1, 5)
+_MAKE_PLAN = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_longlong, ctypes.c_void_p, ctypes.c_longlong, ctypes.c_int)
+
+
+class Native:
+    """The native code, with plans of its own: `made` are the names, recipes and devices for which it asked."""
+
+    def __init__(self):
+        load_warp()
+        self.library = _compile.load(Program("harness", write_launcher(HEADER) + HARNESS, cuda=False))
+        self.made, self.refused, self.laid = [], None, {}
+        self.make_plan = _MAKE_PLAN(self.make)
+        self.desk = plans.open_desk(self.library, ctypes.cast(self.make_plan, ctypes.c_void_p).value, 0, 8)
+        for k, name in enumerate(("launch", "clear", "record", "wait")):
+            setattr(self.desk._held[0], name, self.function("driver", ctypes.c_void_p)(k))
+
+    def function(self, name, result=ctypes.c_int):
+        return ctypes.CFUNCTYPE(result)(self.library.address_of(name))
+
+    def make(self, name, name_size, recipe, recipe_size, device):
+        name, recipe = ctypes.string_at(name, name_size).decode(), ctypes.string_at(recipe, recipe_size).decode()
+        self.made.append((name, recipe, device))
+        if self.refused is not None:
+            return ctypes.cast(ctypes.c_char_p(self.refused), ctypes.c_void_p).value
+        self.keep(name, device, Plan([self.step()], {"number": 5}))
+        return None
+
+    def step(self, threads=1, **more):
+        fields = Field("x", 0, True), Field("number", 8, False)
+        return Launch(Kernel(self, "add_one", fields, 16, 32), threads, **more)  # this is its own program
+
+    def keep(self, name, device, plan):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(plans, "compiler", lambda: self)
+            patch.setattr(plans, "_second_stream", lambda device: (7, 71, 72))
+            self.laid[name, device] = plans.lay_plan(name, plan, ["x", "y"], device)
+        self.desk.keep(self.laid[name, device])
+
+    def load(self, program, device):
+        assert program is self
+        return self.library
+
+    def call(self, name, x=0, y=0, *, device=0, cuda=True, stage=EXECUTE, extension=0):
+        kinds = (
+            ctypes.c_char_p,
+            ctypes.c_int,
+            ctypes.c_int,
+            ctypes.c_int,
+            ctypes.c_void_p,
+            ctypes.c_void_p,
+            ctypes.c_int,
+            ctypes.c_int,
+        )
+        call = ctypes.CFUNCTYPE(ctypes.c_char_p, *kinds)(self.library.address_of("call"))
+        return call(name.encode(), len(name), device, cuda, x, y, stage, extension)
+
+    def events(self):
+        found = np.zeros((4096, 4), np.int64)
+        take = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(self.library.address_of("take_events"))
+        return [tuple(row) for row in found[: take(found.ctypes.data)].tolist() or found[:0].tolist()]
+
+
+@pytest.fixture
+def native():
+    found = Native()
+    found.events()
+    yield found
+    for laid in found.laid.values():
+        found.desk.drop(laid)
+
+
+def launched(stream, address, number, blocks):
+    return LAUNCH, stream, address, 1000000 * number + 1000 * blocks + 32
+
+
+def test_launches_get_numbers_of_the_plan_and_addresses_of_the_call(native):
+    steps = [Clear("y", 40), native.step(64), native.step(65, numbers={"number": 6}), native.step(0)]
+    native.keep("many@", 0, Plan(steps, {"number": 4}))
+    for k in range(3):
+        assert native.call("many@", 1000 + k, 2000 + k) is None
+        cleared = CLEAR, 99, 2000 + k, 10
+        assert native.events() == [cleared, launched(99, 1000 + k, 4, 2), launched(99, 1000 + k, 6, 3)]
+    assert native.made == []
+
+
+def test_what_may_run_beside_the_one_before_waits_for_what_came_before_both(native):
+    steps = [
+        native.step(1),
+        native.step(2, numbers={"number": 2}),
+        native.step(3, numbers={"number": 3}, beside=True),
+        native.step(4),
+    ]
+    native.keep("beside@", 0, Plan(steps, {"number": 1}))
+    assert native.call("beside@", 1000) is None
+    both = [launched(99, 1000, 2, 1), launched(7, 1000, 3, 1)]
+    before, after = [(RECORD, 99, 71, 0), (WAIT, 7, 71, 0)], [(RECORD, 7, 72, 0), (WAIT, 99, 72, 0)]
+    assert native.events() == [launched(99, 1000, 1, 1), *before, *both, *after, launched(99, 1000, 1, 1)]
+
+
+def test_an_unknown_name_is_asked_for_once_per_device(native):
+    for device in (0, 1, 1, 0):
+        assert native.call("asked@here@4", 1000, device=device) is None
+    assert native.made == [("asked@here@4", "made so", 0), ("asked@here@4", "made so", 1)]
+    assert [event[1] for event in native.events()] == [99, 100, 100, 99]
+    native.desk.drop(native.laid["asked@here@4", 1])
+    assert native.call("asked@here@4", 1000, device=1) is None
+    assert native.made[2:] == [("asked@here@4", "made so", 1)]
+
+
+def test_programs_that_are_made_ready_ask_and_launch_nothing(native):
+    assert native.call("ready@", stage=INSTANTIATE) is None
+    assert native.call("ready@", stage=INSTANTIATE, cuda=False) is None
+    assert [device for _, _, device in native.made] == [0, -1]
+    assert native.events() == []
+
+
+def test_what_goes_wrong_is_told_to_xla(native):
+    native.refused = b"RuntimeError: no such kernel"
+    assert native.call("refused@here") == b"refused: RuntimeError: no such kernel"
+    native.keep("fails@here", 0, Plan([native.step(1), native.step(1)], {"number": 13}))
+    assert native.call("fails@here") == b"fails: a launch failed with CUDA's error 700"
+    assert len(native.events()) == 1  # nothing is launched behind
+
+
+def test_the_version_of_the_interface_is_told(native):
+    assert native.call("any@", extension=1) == b"told"
+    assert native.made == []
+    native.keep("known@", 0, Plan([native.step(1)], {"number": 1}))
+    assert native.call("known@", extension=7) is None  # with any other extension it is a call
+    assert len(native.events()) == 1
+
+
+def test_threads_that_come_late_find_nothing_to_do(native):
+    """The step is over when the thread of the call has found nothing left, whoever else was asked to join."""
+    native.keep("shared@", -1, Plan([native.step(3), native.step(1)], {"number": 1}))
+    total = np.zeros(1, np.int32)
+    assert native.call("shared@", total.ctypes.data, cuda=False) is None
+    assert total[0] == 2
+    assert native.function("run_tasks")() == 2
+    assert total[0] == 2
+
+
+def test_plans_are_dropped_while_others_call(native):
+    """Nobody meets a plan that is gone, and a call that has found one ends first."""
+    total = np.zeros(1, np.int32)
+    lasting = functools.partial(native.call, "lasting@", total.ctypes.data, cuda=False)
+    native.keep("lasting@", -1, Plan([native.step(1)], {"number": 1}))
+
+    def change(k):
+        native.keep(f"other{k % 3}@", -1, Plan([native.step(1)], {"number": 1}))
+        native.desk.drop(native.laid.pop((f"other{k % 3}@", -1)))
+
+    with ThreadPoolExecutor(3) as threads:
+        calls = [threads.submit(lasting) for _ in range(2000)]
+        for k in range(500):
+            change(k)
+        assert all(call.result() is None for call in calls)
+    assert total[0] == 2000
+    assert native.made == []
