@@ -11,10 +11,16 @@ from typing import NamedTuple
 from jfrnn.kernels._native import SPACES, program, table_cells
 from jfrnn.kernels._program import Kernel, declare
 
-CHUNK = 2048  # places that a thread takes at a time
+CHUNK = 2048  # places that a thread takes at a time, where it puts them in order
+QUERY_CHUNK = 256  # and where it serves queries
 _HEADER_WORDS = 64
 MANY = 1 << 15  # sources from which several threads gather their coordinates
-GRID = {"REACH": 1, "REACH_X": 2}  # finer cells along x alone: fewer candidates, but no more rows of cells that are copied
+FEW = 384  # sources up to which all are candidates of all queries
+GRID = {
+    "FEW": FEW,
+    "REACH": 1,
+    "REACH_X": 2,
+}  # finer cells along x alone: fewer candidates, but no more rows of cells that are copied
 
 
 def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -> int:
@@ -43,7 +49,7 @@ def cell_kernels(dim: int, double: bool, scaled: bool, lists: bool, periodic: in
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}"
     variant += f"{SPACES[periodic]}{'_batched' * batched}"
     options = {"SCALED": scaled, "LIST": lists, **GRID, "PERIODIC": periodic}
-    options |= {"BATCHED": batched, "SUMS": 0, "CHUNK": CHUNK, "MANY": MANY}
+    options |= {"BATCHED": batched, "SUMS": 0, "CHUNK": CHUNK, "QUERY_CHUNK": QUERY_CHUNK, "MANY": MANY}
     options |= {"CANDIDATES": 1024 if double else 1536}  # what fits into a first-level cache beside a row
     text = program(double, dim, "rows_cpu.h", **options)
     return Kernels(*declare(f"cells_cpu_{variant}", text, "Sort.build", "Gather.gather", "Rows.run"))

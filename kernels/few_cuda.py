@@ -1,6 +1,7 @@
-"""Few particles on CUDA, in open space: a search or a sum is one launch, in which a warp serves one query and meets all sources.
+"""Few particles on CUDA: a search or a sum is one launch, in which a warp serves one query and meets all sources.
 
-To sort particles by cell takes six launches, of which each waits for the one before: longer than to meet a few thousand sources.
+To sort particles by cell takes six launches, of which each waits for the one before: longer than to meet a few thousand sources. In
+a box that stands along the axes, and in which no pair has two images, the nearest image of each source is met.
 """
 
 import functools
@@ -12,6 +13,7 @@ from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
 MOST = 4096  # sources, and queries, up to which all of them meet
 _QUERIES = 16  # of a block: one per warp
+_BLOCKS = 2  # that share a multiprocessor: all are at work at once
 _TILE = {False: 1024, True: 512}  # sources that a block holds at a time, by width
 
 
@@ -32,22 +34,38 @@ def slots(queries: int) -> int:
 
 
 @functools.lru_cache(64)
-def rows_kernel(dim: int, double: bool, lists: bool, batched: bool) -> Kernel:
+def rows_kernel(dim: int, double: bool, lists: bool, batched: bool, boxed: bool = False) -> Kernel:
     """Return the kernel for a dimension and dtype, for lists or counts alone; `info` is zeros at first."""
-    variant = f"{dim}d_{'f64' if double else 'f32'}{'_list' * lists}{'_batched' * batched}"
-    constants = {"LIST": lists, "BATCHED": batched, "FEW_TILE": _TILE[double], "FEW_QUERIES": _QUERIES}
+    variant = f"{dim}d_{'f64' if double else 'f32'}{'_list' * lists}{'_nearest' * boxed}{'_batched' * batched}"
+    constants = {
+        "LIST": lists,
+        "SUMS": 0,
+        "PERIODIC": boxed,
+        "BATCHED": batched,
+        "FEW_TILE": _TILE[double],
+        "FEW_QUERIES": _QUERIES,
+    }
     text = program(double, dim, "few_rows.cuh", **constants)
-    return declare(f"few_cuda_{variant}", text, Entry("FewRows.run", 32 * _QUERIES), cuda=True, fused=True)[0]
+    return declare(f"few_cuda_{variant}", text, Entry("FewRows.run", 32 * _QUERIES, _BLOCKS), cuda=True, fused=True)[0]
 
 
 @functools.lru_cache(512)
 def sum_kernel(
-    term: TermText, key: str, dim: int, double: bool, compensated: bool, batched: bool = False, extremes: bool = False
+    term: TermText,
+    key: str,
+    dim: int,
+    double: bool,
+    compensated: bool,
+    batched: bool = False,
+    extremes: bool = False,
+    boxed: bool = False,
 ) -> Kernel:
     """Return the kernel that sums a term; the arguments are those of `jfrnn.kernels.pair_sum_cuda.sum_kernels`."""
-    variant = f"{dim}d_{'f64' if double else 'f32'}{'_compensated' * compensated}{'_batched' * batched}{'_extremes' * extremes}"
+    variant = f"{dim}d_{'f64' if double else 'f32'}{'_compensated' * compensated}{'_nearest' * boxed}"
+    variant += f"{'_batched' * batched}{'_extremes' * extremes}"
     constants = {
         **GRID,
+        "PERIODIC": boxed,
         "BATCHED": batched,
         "LIST": 0,
         "FEW_TILE": _TILE[double],
@@ -55,4 +73,4 @@ def sum_kernel(
         **constants_of(term, compensated, extremes),
     }
     text = program(double, dim, "few_sums.cuh", given=term_header(term, double), **constants)
-    return declare(f"few_sums_cuda_{variant}_{key}", text, Entry("FewSums.run", 32 * _QUERIES), cuda=True, fused=True)[0]
+    return declare(f"few_sums_cuda_{variant}_{key}", text, Entry("FewSums.run", 32 * _QUERIES, _BLOCKS), cuda=True, fused=True)[0]

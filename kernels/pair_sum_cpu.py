@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from jfrnn.kernels._native import SPACES, program
 from jfrnn.kernels._program import Kernel, declare
-from jfrnn.kernels.cells_cpu import CHUNK, GRID
+from jfrnn.kernels.cells_cpu import CHUNK, GRID, QUERY_CHUNK
 
 CACHE_BYTES = 40 << 10  # for candidates: most of a first-level cache, and a little of the second
 MOST_CANDIDATES = 1024
@@ -76,7 +76,7 @@ class TermText(NamedTuple):
 
 def slots(queries: int) -> int:
     """Return the number of partial sums that make up a sum over all pairs."""
-    return -(-queries // CHUNK)
+    return -(-queries // QUERY_CHUNK)
 
 
 def sorted_numbers(term: TermText, sources: int, dim: int, double: bool) -> int:
@@ -202,7 +202,13 @@ def query_kernel(
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
     variant += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}_{key}"
     constants = {"SCALED": scaled, "LIST": 0, **GRID, **constants_of(term, compensated, extremes)}
-    constants |= {"PERIODIC": periodic, "BATCHED": batched, "CHUNK": CHUNK, "CANDIDATES": _candidates(term, dim, double)}
+    constants |= {
+        "PERIODIC": periodic,
+        "BATCHED": batched,
+        "CHUNK": CHUNK,
+        "QUERY_CHUNK": QUERY_CHUNK,
+        "CANDIDATES": _candidates(term, dim, double),
+    }
     constants |= {"MANY": 0, "PACKED": packed, "SKIPPED": work(term.text) > VERY_LITTLE_WORK}
     text = program(double, dim, "pair_sum_cpu.h", given=term_header(term, double), **constants)
     return declare(f"pair_sum_cpu_{variant}", text, "Sums.run")[0]

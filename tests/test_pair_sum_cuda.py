@@ -60,9 +60,9 @@ def arguments(dtype, dim):
 def compiles_for(plan, dim, double, **variant):
     options = {"scaled": False, "compensated": False} | variant
     kernels = [kernel for kernel in pair_sum_cuda.sum_kernels(plan.text, plan.key, dim, double, **options) if kernel is not None]
-    if not (options["scaled"] or options.get("periodic")):
+    if not options["scaled"] and options.get("periodic", 0) <= 1:
         few = {name: value for name, value in options.items() if name not in ("scaled", "periodic")}
-        kernels.append(few_cuda.sum_kernel(plan.text, plan.key, dim, double, **few))
+        kernels.append(few_cuda.sum_kernel(plan.text, plan.key, dim, double, **few, boxed=options.get("periodic") == 1))
     return all(f".entry {x.name}(" in _compile.find_binary(x.program, "cpu", arch=90).read_text() for x in kernels)
 
 

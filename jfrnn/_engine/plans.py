@@ -14,7 +14,7 @@ from jfrnn.kernels import Kernel
 if TYPE_CHECKING:
     from jfrnn.kernels._compile import Library
 
-PLACES_PER_THREAD = 2048  # below, a second thread costs more than it saves
+PLACES_PER_THREAD = 512  # below, a second thread costs more than it saves
 _HUGE = 1 << 22  # bytes from which an array is worth a request for huge pages
 _MOST_BYTES, _MOST_ARRAYS = 1024, 48  # those of the native code
 _ONCE, _SHARED, _CUDA, _CUDA_BESIDE, _CLEAR, _HUGE_PAGES, _PYTHON = range(7)

@@ -67,7 +67,7 @@ class WarpEngine:
 
 def are_few(search: Search) -> bool:
     """Say whether particles are so few that on CUDA all of them meet, in one launch."""
-    return search.torus is None and not search.cutoff.scaled and max(search.sizes) <= few_cuda.MOST
+    return periodic_kind(search.torus) <= 1 and not search.cutoff.scaled and max(search.sizes) <= few_cuda.MOST
 
 
 class Variant(NamedTuple):
@@ -174,7 +174,7 @@ def _plan_on_cuda(variant: Variant, shapes: Shapes, multiprocessors: int) -> Pla
 def _plan_few(variant: Variant, shapes: Shapes, _: int) -> Plan:
     numbers = _numbers(variant, shapes)
     numbers["drop_self"] &= variant.own
-    query = few_cuda.rows_kernel(variant.dim, variant.double, variant.lists, variant.batched)
+    query = few_cuda.rows_kernel(variant.dim, variant.double, variant.lists, variant.batched, variant.periodic == 1)
     return Plan([Clear("info", 8), Launch(query, few_cuda.threads(numbers["m"]))], numbers, _absent(variant))
 
 

@@ -114,7 +114,7 @@ def _few_callable(variant: _SumVariant, term: TermText) -> Call:
 
 
 def _plan_few(variant: _SumVariant, term: TermText, shapes: Shapes, _: int) -> Plan:
-    kind = variant.compensated, variant.batched, variant.extremes
+    kind = variant.compensated, variant.batched, variant.extremes, variant.periodic == 1
     query = few_cuda.sum_kernel(term, variant.key, variant.dim, variant.double, *kind)
     numbers = _numbers(variant, term, shapes)
     numbers["drop_self"] &= variant.own

@@ -82,7 +82,7 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
     const real INF;
     JFRNN_MEMBER explicit Search(const SearchArguments& given)
         : SearchArguments(given),
-          Cells(given.cutoff),
+          Cells(given.cutoff, false),
           Shares(given.m),
           Scratch(given.scratch, given.n, given.m, given.own, given.table),
           INF(DOUBLE ? (real)__longlong_as_double(0x7ff0000000000000ll) : (real)__int_as_float(0x7f800000)) {}

@@ -34,8 +34,9 @@ JFRNN_FUNCTION int lowest_bit(real x) {
 struct Cells : Space {
     real inverse_edge[3];  // cells per length; along a periodic axis a whole number per period
     int periodic_axes;     // a bit each
+    bool one_cell;         // sources are so few that they share one: all of them are candidates
 
-    JFRNN_MEMBER explicit Cells(const real* cutoff) : Space(cutoff), periodic_axes(0) {
+    JFRNN_MEMBER Cells(const real* cutoff, bool one_cell) : Space(cutoff), periodic_axes(0), one_cell(one_cell) {
         for (int axis = 0; axis < 3; ++axis)
             inverse_edge[axis] = axis < DIM ? cells_per_length(axis) : real(1);
         for (int axis = 0; PERIODIC && axis < DIM; ++axis)
@@ -48,6 +49,8 @@ struct Cells : Space {
             return cells / radius;
         const real count = cells / lattice.reach(axis);
         const bool periodic = lattice.periodic(axis);
+        if (periodic && one_cell)
+            return 1;
         constexpr real MOST = real(1 << 22);
         return !periodic ? count : count < 1 ? real(1) : count < MOST ? real((int)count) : MOST;
     }
@@ -132,6 +135,8 @@ struct Cells : Space {
         }
         if (!grid.dense)
             return cell_number(cell_of(k, in_range(x)));
+        if (one_cell)
+            return 0;
         const real from_low = cell - grid.low[k];
         return from_low < 0 ? -1 : from_low < real(grid.extent[k]) ? (whole)from_low : (whole)grid.extent[k];
     }
@@ -167,8 +172,8 @@ struct Cells : Space {
         for (int k = 0; k < DIM; ++k) {
             grid.low[k] = is_periodic(k) ? real(0) : cell_of(k, low[k]);
             const double extent = is_periodic(k) ? double(inverse_edge[k]) : double(cell_of(k, high[k])) - double(grid.low[k]) + 1;
-            cells = extent <= table ? cells * extent : 2.0 * table;
-            grid.extent[k] = extent <= table ? (int)extent : 1;
+            cells = one_cell ? cells : extent <= table ? cells * extent : 2.0 * table;
+            grid.extent[k] = extent <= table && !one_cell ? (int)extent : 1;
         }
         grid.dense = cells <= table;
         grid.cells = grid.dense ? (int)cells : table;

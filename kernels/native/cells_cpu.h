@@ -38,7 +38,7 @@ struct Scratch {
 
 struct Places : Cells, Scratch {
     Places(const real* cutoff, int* scratch, int n, int m, int own, int table)
-        : Cells(cutoff), Scratch(scratch, n, m, own, table) {}
+        : Cells(cutoff, n <= FEW), Scratch(scratch, n, m, own, table) {}
     void put_coordinates(const real* points, int i, int place) {
         real p[3];
         point_of(points + (long long)ROW * i, p);

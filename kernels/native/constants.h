@@ -12,7 +12,9 @@ constexpr bool BATCHED = false;        // rows of positions end with the number 
 constexpr bool SUM = false;            // cutoffs of pairs are sums of two numbers
 constexpr bool SCALED = false;         // the cutoff is so small or so large that squares need a unit
 constexpr int REACH = 1, REACH_X = 2;  // cells per cutoff along y and z, and along x
-constexpr int CHUNK = 2048;            // places that a thread takes at a time
+constexpr int CHUNK = 2048;            // places that a thread takes at a time, where it puts them in order
+constexpr int QUERY_CHUNK = 256;       // and where it serves queries
+constexpr int FEW = 384;               // sources up to which all are candidates of all queries
 constexpr int MANY = 1 << 15;          // sources from which several threads gather their coordinates
 constexpr int CANDIDATES = 1024;       // that are held at a time, a multiple of 64
 constexpr bool LIST = true;            // ids of neighbors are written, they are not only counted

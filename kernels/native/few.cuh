@@ -1,7 +1,8 @@
-// Few particles on CUDA, in open space: one launch, in which every query meets all sources, and nothing is sorted.
+// Few particles on CUDA: one launch, in which every query meets all sources, and nothing is sorted.
 //
 // A warp serves one query. The warps of a block share tiles of sources, of which a lane meets one at a time. Sources come in ascending
-// order, so that rows are ascending, and the same in every run.
+// order, so that rows are ascending, and the same in every run. In a box each source is met where its nearest image is; boxes whose
+// vectors do not lie along the axes, or of which several images may be neighbors, have other kernels.
 #pragma once
 #include "exact.h"
 
@@ -14,6 +15,8 @@ struct FewPairs : Space {
     const bool is_query, drop_self, later_only;
     real q[3];
     real sure_square, band;  // what is closer surely is a neighbor, squared; and how much farther it may be and still be one
+    real length[3];          // of the box along each axis, 0 where it is not periodic
+    bool tight;              // the cutoff is about half of a length: on which side the nearest image is may be in doubt
     unsigned int system;
 
     template <class Arguments>
@@ -27,17 +30,70 @@ struct FewPairs : Space {
           query((int)(thread_index() >> 5)),
           is_query(query < a.m),
           drop_self(a.drop_self),
-          later_only(later_only) {
-        const real* row = queries + (long long)ROW * (is_query ? query : 0);
+          later_only(later_only),
+          tight(false) {
+        const real* row = query_row();
         point_of(row, q);
         system = system_of(row);
-        const real square = step_radius * step_radius;
-        band = 16 * step_eps * square;
-        sure_square = square - real(0.5) * band;
+        const real off = PERIODIC ? 2 * lattice.slack() : real(0);  // by which differences of images may be wrong
+        const real inner = radius > off ? radius - off : real(0), outer = radius + off;
+        sure_square = inner * inner - 8 * (1 + SHIFTED) * step_eps * radius * radius;
+        band = outer * outer * (1 + 16 * step_eps) - sure_square;
+        for (int k = 0; k < DIM; ++k) {
+            length[k] = PERIODIC && lattice.periodic(k) ? lattice.vector(k, k) : real(0);
+            tight = tight || (length[k] != 0 && outer > real(0.49) * size_of(length[k]));
+        }
+    }
+    JFRNN_FUNCTION real size_of(real x) { return x < 0 ? -x : x; }
+    JFRNN_MEMBER const real* query_row() const { return queries + (long long)ROW * (is_query ? query : 0); }
+
+    // The image of a source that is nearest along an axis; `other`: the next nearest one.
+    JFRNN_MEMBER int nearest(int k, real p, bool other = false) const {
+        const real d = p - q[k], half = real(0.5) * size_of(length[k]);
+        const int ahead = (d > 0) == (length[k] > 0) ? -1 : 1;
+        return length[k] != 0 && (size_of(d) > half) != other ? ahead : 0;
+    }
+    JFRNN_MEMBER real moved(int k, real p, int image) const {
+        return image == 0 ? p : Lattice::add(p, Lattice::mul(real(image), length[k]));
+    }
+    // |p - q|^2 - r^2 and a band in working precision, as in `PairSearch`: negative where the nearest image surely is a neighbor.
+    JFRNN_MEMBER real excess(const real (*tile)[FEW_TILE], int s) const {
+        real sum = -sure_square;
+#pragma unroll
+        for (int k = 0; k < DIM; ++k) {
+            const real p = tile[k][s], d = (PERIODIC ? moved(k, p, nearest(k, p)) : p) - q[k];
+            sum += d * d;
+        }
+        return sum;
+    }
+    // Decides exactly. `code` becomes that of the image that is a neighbor.
+    JFRNN_MEMBER bool is_exact_pair(const real (*tile)[FEW_TILE], int s, int j, int& code) const {
+        const real p[3] = {tile[0][s], tile[1][s], DIM == 3 ? tile[2][s] : real(0)};
+        if constexpr (!PERIODIC)
+            return exact_pair(q, p, radius, 0, closed);
+        for (int others = 0; others < (tight ? 1 << DIM : 1); ++others) {  // axes along which the next nearest one is asked for
+            code = code_of(p, others);
+            if (exact_image(lattice, query_row(), positions + (long long)ROW * j, code, radius, 0, closed))
+                return true;
+        }
+        return false;
+    }
+    JFRNN_MEMBER int code_of(const real* p, int others = 0) const {
+        int code = 0;
+        for (int k = 0; PERIODIC && k < DIM; ++k)
+            code = code * (2 * lattice.images(k) + 1) + nearest(k, p[k], others >> k & 1) * (length[k] != 0) + lattice.images(k);
+        return code;
     }
 
-    // Calls `meet(j, hit)` for 32 sources after the other, one per lane, unless none of them is a neighbor. All warps of a block call
-    // this together. Returns whether the sources that this thread has loaded are finite.
+    // The whole number of lattice vectors along an axis by which an image is moved.
+    JFRNN_MEMBER int shift_in(int code, int axis) const {
+        for (int k = DIM - 1; PERIODIC && k > axis; --k)
+            code /= 2 * lattice.images(k) + 1;
+        return PERIODIC ? code % (2 * lattice.images(axis) + 1) - lattice.images(axis) : 0;
+    }
+
+    // Calls `meet(j, code, hit)` for 32 sources after the other, one per lane, unless none of them is a neighbor: source, image, and
+    // whether it is one. All warps of a block call this together. Returns whether the sources that this thread has loaded are finite.
     template <class Meet>
     JFRNN_MEMBER bool meet_all(Meet meet) const {
         __shared__ real tile[3][FEW_TILE];
@@ -76,27 +132,18 @@ struct FewPairs : Space {
                     bool hit = over[c] <= band && !(drop_self && j == query) && !(later_only && j < query);
                     if constexpr (BATCHED)
                         hit = hit && systems[s] == system;
+                    int code = 0;
+                    if (PERIODIC && SUMS && hit) {
+                        const real p[3] = {tile[0][s], tile[1][s], DIM == 3 ? tile[2][s] : real(0)};
+                        code = code_of(p);
+                    }
                     if (hit && over[c] >= 0)
-                        hit = is_exact_pair(tile, s);
+                        hit = is_exact_pair(tile, s, j, code);
                     if (__any_sync(EVERY, hit))
-                        meet(j, hit);
+                        meet(j, code, hit);
                 }
             }
         }
         return finite;
-    }
-    // |p - q|^2 - r^2 and a band in working precision, as in `PairSearch`: negative where the source surely is a neighbor.
-    JFRNN_MEMBER real excess(const real (*tile)[FEW_TILE], int s) const {
-        real sum = -sure_square;
-#pragma unroll
-        for (int k = 0; k < DIM; ++k) {
-            const real d = tile[k][s] - q[k];
-            sum += d * d;
-        }
-        return sum;
-    }
-    JFRNN_MEMBER bool is_exact_pair(const real (*tile)[FEW_TILE], int s) const {
-        const real p[3] = {tile[0][s], tile[1][s], DIM == 3 ? tile[2][s] : real(0)};
-        return exact_pair(q, p, radius, 0, closed);
     }
 };

@@ -16,7 +16,7 @@ struct FewRows : FewRowsArguments {
         int* const row = idx + (long long)pairs.query * capacity;
         const unsigned int lanes_below = (1u << pairs.lane) - 1;
         int found = 0;
-        const bool finite = pairs.meet_all([&](int j, bool hit) {
+        const bool finite = pairs.meet_all([&](int j, int, bool hit) {
             const unsigned int hits = __ballot_sync(EVERY, hit);
             const int slot = found + __popc(hits & lanes_below);
             if (LIST && hit && slot < capacity)

@@ -13,6 +13,8 @@ struct FewSums : FewSumsArguments {
     JFRNN_MEMBER explicit FewSums(const FewSumsArguments& given) : FewSumsArguments(given) {}
 
     JFRNN_MEMBER void run() {
+        constexpr int CODE = 16;                       // bits of the number of a source; the code of its image stands above
+        constexpr int COLUMNS = OTHERS + (STEPS > 0);  // turns stand behind the others
         __shared__ int waiting_of[FEW_QUERIES][64];
         const FewPairs pairs(*this, false);
         const int lane = pairs.lane, id = pairs.is_query ? pairs.query : 0;
@@ -23,20 +25,27 @@ struct FewSums : FewSumsArguments {
         Reduction reduction(n);
         int held = 0;
         auto evaluate = [&]() {  // the first 32 that wait, or as many as there are
-            const int j = lane < held ? waiting[lane] : 0;
+            const int named = lane < held ? waiting[lane] : 0, j = named & ((1 << CODE) - 1), of_image = named >> CODE;
+            const real* const row = others + (long long)COLUMNS * j;
             real p[3];
             pairs.point_of(positions + (long long)ROW * j, p);
             number summand[SUMMANDS];
-            term.evaluate(own_part, p, [&](int c) -> number { return others[(long long)OTHERS * j + c]; }, summand);
+            auto column = [&](int c) -> number {
+                if (c < OTHERS)
+                    return row[c];
+                const int axis = STEP_AXES[c - OTHERS];
+                return real(pairs.shift_in(of_image, axis) - Lattice::turn(row[OTHERS], axis));
+            };
+            term.evaluate(own_part, p, column, summand);
             reduction.add(summand, lane < held, [&](int& source, int& code) {
                 source = j;
-                code = 0;
+                code = of_image;
             });
         };
-        pairs.meet_all([&](int j, bool hit) {
+        pairs.meet_all([&](int j, int code, bool hit) {
             const unsigned int hits = __ballot_sync(EVERY, hit);
             if (hit)
-                waiting[held + __popc(hits & lanes_below)] = j;
+                waiting[held + __popc(hits & lanes_below)] = j | code << CODE;
             held += __popc(hits);
             __syncwarp();
             if (held < 32)

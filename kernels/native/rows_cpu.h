@@ -16,6 +16,7 @@ struct Rows : Walk<Rows> {
     int capacity, later_only;
     int longest;
     int fill_value;
+    bool past_caches;  // rows are so many that they will not be read from the caches
 
     explicit Rows(const RowArguments& a)
         : Walk({a.positions, a.queries, a.cutoff, a.scratch, a.n, a.m, a.own, a.table, a.closed, a.drop_self}),
@@ -24,7 +25,8 @@ struct Rows : Walk<Rows> {
           info(a.info),
           capacity(a.capacity),
           later_only(a.later_only),
-          longest(0) {
+          longest(0),
+          past_caches((long long)m * capacity >= 1 << 18) {
         int codes = 1;  // of images
         for (int k = 0; PERIODIC == 2 && k < DIM; ++k)
             codes *= 2 * lattice.images(k) + 1;
@@ -59,7 +61,7 @@ struct Rows : Walk<Rows> {
         int* out = idx + (long long)id * capacity;
         const int stop = from + hits < capacity ? from + hits : capacity;
         if (from == 0 && last && (capacity & 7) == 0 && ((unsigned long long)idx & 31) == 0) {
-            write_whole_row(out, stop);
+            past_caches ? write_whole_row<true>(out, stop) : write_whole_row<false>(out, stop);
             return;
         }
         for (int s = from; s < stop; ++s)
@@ -68,20 +70,28 @@ struct Rows : Walk<Rows> {
             for (int s = stop; s < capacity; ++s)
                 out[s] = fill_value;
     }
-    // Writes a row eight slots at a time, past the caches.
+    template <bool PAST_CACHES>
+    static void store(eight_ints eight, int* to) {
+        if constexpr (PAST_CACHES)
+            __builtin_nontemporal_store(eight, (eight_ints*)to);
+        else
+            *(eight_ints*)to = eight;
+    }
+    // Writes a row eight slots at a time.
+    template <bool PAST_CACHES>
     void write_whole_row(int* out, int stop) {
         const eight_ints filled_up = eight_ints{} + fill_value;
         int s = 0;
         for (; s + 8 <= stop; s += 8)
-            __builtin_nontemporal_store(*(const eight_ints*)(row + s), (eight_ints*)(out + s));
+            store<PAST_CACHES>(*(const eight_ints*)(row + s), out + s);
         if (s < stop) {
             eight_ints mixed = *(const eight_ints*)(row + s);
             for (int e = 0; e < 8; ++e)
                 mixed[e] = s + e < stop ? mixed[e] : fill_value;
-            __builtin_nontemporal_store(mixed, (eight_ints*)(out + s));
+            store<PAST_CACHES>(mixed, out + s);
             s += 8;
         }
         for (; s < capacity; s += 8)
-            __builtin_nontemporal_store(filled_up, (eight_ints*)(out + s));
+            store<PAST_CACHES>(filled_up, out + s);
     }
 };

@@ -28,7 +28,7 @@ struct Scan : SearchArguments, Cells, Scratch {
 
     explicit Scan(const SearchArguments& given)
         : SearchArguments(given),
-          Cells(given.cutoff),
+          Cells(given.cutoff, given.n <= FEW),
           Scratch(given.scratch, given.n, given.m, given.own, given.table),
           wide(radius, given.closed),
           image(0),

@@ -245,11 +245,12 @@ struct Walk : Scan {
             same = same && a[k] == b[k];
         return same;
     }
-    // Serves the cells that begin among the places [place, chunk_end): a cell belongs to the chunk that holds its first place.
+    // Serves the cells that begin among the places [place, chunk_end): a cell belongs to the chunk that holds its first place, but
+    // where there is one cell alone, of which each chunk serves its own part.
     void serve_chunk(int place, int chunk_end) {
         whole cell[4], other[4];
         real at[3];
-        if (place > 0 && place < finite_places) {
+        if (!one_cell && place > 0 && place < finite_places) {
             locate(place - 1, at, cell);
             for (; place < finite_places; ++place) {
                 locate(place, at, other);
@@ -270,7 +271,7 @@ struct Walk : Scan {
             for (int k = 0; k < DIM + BATCHED; ++k)
                 cell[k] = other[k];
             int stop = place + 1;
-            for (; stop < finite_places; ++stop) {
+            for (const int end = one_cell && chunk_end < finite_places ? chunk_end : finite_places; stop < end; ++stop) {
                 locate(stop, at, other);
                 if (!same_cell(cell, other))
                     break;
@@ -283,10 +284,10 @@ struct Walk : Scan {
     void run() {
         for (;;) {
             const int chunk = __atomic_fetch_add(&shared.next_chunk, 1, __ATOMIC_RELAXED);
-            if ((long long)chunk * CHUNK >= m)
+            if ((long long)chunk * QUERY_CHUNK >= m)
                 break;
-            const int place = chunk * CHUNK;
-            serve_chunk(place, m - place < CHUNK ? m : place + CHUNK);
+            const int place = chunk * QUERY_CHUNK;
+            serve_chunk(place, m - place < QUERY_CHUNK ? m : place + QUERY_CHUNK);
             query().chunk_done(chunk);
         }
         query().finish();
