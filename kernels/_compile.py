@@ -13,16 +13,13 @@ import platform
 import shutil
 import tempfile
 import threading
-import warnings
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import warp as wp
-from warp._src import build, context
-
+from jfrnn.kernels import _clang
 from jfrnn.kernels._program import Program
 from jfrnn.kernels.launch import launcher
 
@@ -37,7 +34,7 @@ class Library:
     """A program that is loaded on a device; it is unloaded when nobody has it any longer."""
 
     def __init__(self, program: Program, device: str) -> None:
-        self._program, self._device = program, wp.get_device(device)
+        self._program, self._device = program, _cuda().device(device) if program.cuda else None
         self._handle = self._load()
         weakref.finalize(self, self._unloading()).atexit = False  # programs may still run while the interpreter exits
 
@@ -47,35 +44,50 @@ class Library:
         Raises:
             RuntimeError: The library does not hold it.
         """
-        name = function.encode()
         if self._program.cuda:
-            found = context.runtime.core.wp_cuda_get_kernel(self._device.context, self._handle, name)
+            found = _cuda().core.wp_cuda_get_kernel(self._device.context, self._handle, function.encode())
         else:
-            found = _clang().wp_lookup(self._handle, name)
+            found = _clang.find_function(self._handle, function)
         if not found:
             raise RuntimeError(f"the compiled program {self._program.name!r} holds no function {function!r}")
         return found
 
-    def _load(self) -> int | bytes:
+    def _load(self) -> Any:
         path = find_binary(self._program, self._device)
         found = self._take(path)
         if not found:
             path.unlink(missing_ok=True)
             found = self._take(find_binary(self._program, self._device))
         if not found:
-            raise RuntimeError(f"the compiled program {path} cannot be loaded on {self._device}")
+            raise RuntimeError(f"the compiled program {path} cannot be loaded")
         return found
 
-    def _take(self, path: Path) -> int | bytes | None:
+    def _take(self, path: Path) -> Any:
         if self._program.cuda:
-            return context.runtime.core.wp_cuda_load_module(self._device.context, str(path).encode())
-        handle = f"jfrnn_{id(self)}_{path.stem}".encode()
-        return None if _clang().wp_load_obj(str(path).encode(), handle, wp.config.legacy_cpu_linker) else handle
+            return _cuda().core.wp_cuda_load_module(self._device.context, str(path).encode())
+        return _clang.load_object(path, f"jfrnn_{id(self)}_{path.stem}")
 
     def _unloading(self) -> Callable[[], None]:
         if self._program.cuda:
             return functools.partial(_unload_cuda, self._device, self._handle)
-        return functools.partial(_clang().wp_unload_obj, self._handle)
+        return functools.partial(_clang.unload_object, self._handle)
+
+
+class _Cuda(NamedTuple):
+    """What is used of Warp, which has to be started, for CUDA."""
+
+    core: Any
+    build: Any
+    device: Callable[[str], Any]
+    synchronize: Callable[[Any], None]
+
+
+@functools.cache
+def _cuda() -> _Cuda:
+    import warp
+    from warp._src import build, context
+
+    return _Cuda(context.runtime.core, build.build_cuda, warp.get_device, warp.synchronize_device)
 
 
 def load(program: Program, device: str = "cpu") -> Library:
@@ -91,13 +103,24 @@ def load(program: Program, device: str = "cpu") -> Library:
         return found
 
 
-def _clang() -> Any:
-    """Return Warp's library of Clang."""
-    return context.runtime.llvm
+_notes: list[str] = []
 
 
-def _kernel_folder() -> Path:
-    return Path(wp.config.kernel_cache_dir or tempfile.gettempdir()) / _FOLDER
+def take_notes() -> list[str]:
+    """Return what users should be warned of since this was last asked."""
+    found, _notes[:] = list(_notes), []
+    return found
+
+
+def kernel_folder() -> Path:
+    """Return the folder in which programs are kept, and in which Warp may keep its own."""
+    return _folders()[-1]
+
+
+@functools.cache
+def _folders() -> list[Path]:
+    """Return where programs are kept, in a list of which the last one counts."""
+    return [_clang.cache_folder()]
 
 
 def load_launcher(header: str) -> Library:
@@ -105,25 +128,25 @@ def load_launcher(header: str) -> Library:
     return load(launcher(header))
 
 
-def find_binary(program: Program, device: wp.DeviceLike, arch: int | None = None) -> Path:
+def find_binary(program: Program, device: Any = None, arch: int | None = None) -> Path:
     """Return a file that holds the compiled program, whole.
 
     Args:
         program: What is compiled.
-        device: A device of Warp.
+        device: For CUDA, a device of Warp.
         arch: The architecture in place of that of the device, as in 90; then PTX is made.
     """
-    target = _target(program, wp.get_device(device), arch)
-    key = hashlib.sha256("\0".join((*map(str, program), *target, wp.config.version)).encode()).hexdigest()[:20]
+    target = _target(program, device, arch)
+    key = hashlib.sha256("\0".join((*map(str, program), *target, _clang.warp_version())).encode()).hexdigest()[:20]
     name = f"{program.name[:80]}_{key}{target[0]}"
-    kept = _kernel_folder()
+    kept = kernel_folder() / _FOLDER
     if _is_whole(kept / name):
         return kept / name
     try:
         return _compile(program, target, kept / name)
     except OSError:
-        warnings.warn(temporary_folder(), RuntimeWarning, stacklevel=2)
-        return _compile(program, target, _kernel_folder() / name)
+        _notes.append(temporary_folder())
+        return _compile(program, target, kernel_folder() / _FOLDER / name)
 
 
 def temporary_folder() -> str:
@@ -132,8 +155,7 @@ def temporary_folder() -> str:
     Raises:
         RuntimeError: There is none that can be written.
     """
-    before = wp.config.kernel_cache_dir
-    place = "the folder in which Warp keeps compiled kernels" + (f", {before}," if before else "")
+    place = f"the folder in which Warp keeps compiled kernels, {_folders()[0]},"
     hint = "Set the environment variable WARP_CACHE_PATH to a folder that can be written"
     try:
         folder = tempfile.mkdtemp(prefix="jfrnn-warp-")
@@ -141,11 +163,11 @@ def temporary_folder() -> str:
         (Path(folder) / "room").write_bytes(bytes(1 << 20))
     except OSError as error:
         raise RuntimeError(f"{place} cannot be written, nor is there a temporary one ({error}). {hint}.") from error
-    wp.config.kernel_cache_dir = folder
+    _folders().append(Path(folder))
     return f"{place} cannot be written: kernels are compiled into {folder} for this process alone. {hint} to keep them."
 
 
-def _target(program: Program, device: wp.Device, arch: int | None) -> tuple[str, str]:
+def _target(program: Program, device: Any, arch: int | None) -> tuple[str, str]:
     """Return the kind of file, and what it runs on: objects use all instructions of the processor that compiles them."""
     if not program.cuda:
         return ".o", _processor()
@@ -177,9 +199,9 @@ def _compile(program: Program, target: tuple[str, str], path: Path) -> Path:
         try:
             if program.cuda:
                 options = {"config": "release", "fuse_fp": program.fused, "use_precompiled_headers": False, "pch_dir": None}
-                build.build_cuda(str(source), int(arch), str(binary), **options)
+                _cuda().build(str(source), int(arch), str(binary), **options)
             else:
-                build.build_cpu(str(binary), str(source), fuse_fp=program.fused)
+                _clang.compile_object(program.text, source, binary, program.fused)
         except Exception as error:
             _check_room(folder)
             raise RuntimeError(f"the program {program.name!r} does not compile: {error}") from error
@@ -216,6 +238,6 @@ def _is_whole(path: Path) -> bool:
     return hashlib.sha256(body).hexdigest().encode() == digest
 
 
-def _unload_cuda(device: wp.Device, handle: int | bytes) -> None:
-    wp.synchronize_device(device)
-    context.runtime.core.wp_cuda_unload_module(device.context, handle)
+def _unload_cuda(device: Any, handle: int) -> None:
+    _cuda().synchronize(device)
+    _cuda().core.wp_cuda_unload_module(device.context, handle)

@@ -113,7 +113,7 @@ class Native:
         self.make_plan = _MAKE_PLAN(self.make)
         self.desk = plans.open_desk(self.library, ctypes.cast(self.make_plan, ctypes.c_void_p).value, 0, 8)
         for k, name in enumerate(("launch", "clear", "record", "wait")):
-            setattr(self.desk._held[0], name, self.function("driver", ctypes.c_void_p)(k))
+            setattr(self.desk._desk, name, self.function("driver", ctypes.c_void_p)(k))
 
     def function(self, name, result=ctypes.c_int):
         return ctypes.CFUNCTYPE(result)(self.library.address_of(name))

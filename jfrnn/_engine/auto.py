@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jfrnn._engine.arrays import ArrayEngine
 from jfrnn._engine.hashgrid import HashGridEngine
 from jfrnn._engine.problem import ANYTHING, Engine, Kind
-from jfrnn._engine.start import level_of_caller, load_warp
+from jfrnn._engine.start import check_warp, level_of_caller
 from jfrnn._engine.warp import WarpEngine
 
 WARP, ARRAYS = WarpEngine(), ArrayEngine("jax", by_cells=True)
@@ -52,7 +52,7 @@ def choose_engine(backend: str, sources: Array, queries: Array | None, kind: Kin
         raise ValueError(f"backend={backend!r} {reason}")
     if isinstance(engine, ArrayEngine):
         return engine
-    load_warp()
+    check_warp()
     platform = platform_of(sources, sources if queries is None else queries)
     if reason := _what_is_missing(engine, platform):
         raise RuntimeError(f"backend={backend!r} cannot run on the platform {platform!r}: {reason}. Pass backend='jax'.")

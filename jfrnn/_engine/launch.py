@@ -29,7 +29,7 @@ from jax import Array
 
 from jfrnn._engine.ffi import CallFrame
 from jfrnn._engine.plans import Desk, LaidPlan, Plan, lay_plan, multiprocessors_of, open_desk
-from jfrnn._engine.start import apart, compiler, load_warp
+from jfrnn._engine.start import apart, compiler, warn_of_folders
 
 TARGET = "jfrnn"  # what programs call; jax.export wants to be told that it stays
 Static = Any  # what a kernel is made of, and a program carries: NamedTuples of the library, tuples, texts, numbers
@@ -313,7 +313,6 @@ _behind_desk = _MakePlan(_make_plan), _Serve(_serve)
 @functools.cache
 def _open() -> Desk:
     """Compile the native code, and lead all calls there."""
-    load_warp()
     header = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text("utf-8")
     desk = open_desk(compiler().load_launcher(header), _address(_behind_desk[0]), _address(_behind_desk[1]), _MOST)
     for name, address in zip(_PLATFORMS, desk.handlers, strict=True):
@@ -328,6 +327,7 @@ def open_native() -> None:
         RuntimeError: It cannot be compiled.
     """
     apart(_open)
+    warn_of_folders()
 
 
 def _register() -> None:

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jfrnn._engine.start import compiler, load_warp
+from jfrnn._engine.start import compiler, load_warp, warn_of_folders
 from jfrnn.kernels import Kernel
 
 if TYPE_CHECKING:
@@ -131,6 +131,7 @@ def lay_plan(name: str, plan: Plan, arrays: list[str], device: int, *, python: b
     held: list[Any] = [text := name.encode()]
     lay = functools.partial(_lay_step, plan, {array: k for k, array in enumerate(arrays)}, device, held)
     laid = [_Step(kind=_PYTHON)] if python else [lay(step) for step in plan.steps]
+    warn_of_folders()
     steps = (_Step * len(laid))(*laid)
     found = _Plan(name=text, name_size=len(text), steps=ctypes.addressof(steps), device=device, step_count=len(laid))
     if any(step.kind == _CUDA_BESIDE for step in laid):
@@ -150,6 +151,8 @@ def _lay_step(plan: Plan, places: dict[str, int], device: int, held: list[Any], 
     arrays = [field for field in kernel.fields if field.is_array and field.name not in plan.absent]
     pairs = [number for field in arrays for number in (field.place, places[field.name])]
     given = kernel.pack(numbers)
+    if device >= 0:
+        load_warp()
     library = compiler().load(kernel.program, "cpu" if device < 0 else f"cuda:{device}")
     template, places_of_arrays = (ctypes.c_ubyte * len(given)).from_buffer(given), (ctypes.c_int * len(pairs))(*pairs)
     held += [library, template, places_of_arrays]
@@ -170,12 +173,17 @@ class Desk:
     """What both sides know of each other: `handlers` are the addresses of what XLA calls, on the CPU and on CUDA."""
 
     handlers: tuple[int, int]
+    _desk: _Desk
     _held: list[Any]
     _keep: Callable[[int], None]
     _drop: Callable[[int], None]
 
     def keep(self, laid: LaidPlan) -> None:
         """Let calls find a plan."""
+        if laid.plan.device >= 0 and not self._desk.launch:
+            driver, desk = cuda_driver(), self._desk
+            desk.launch, desk.clear = _address(driver, "cuLaunchKernel"), _address(driver, "cuMemsetD32Async")
+            desk.record, desk.wait = _address(driver, "cuEventRecord"), _address(driver, "cuStreamWaitEvent")
         self._keep(ctypes.addressof(laid.plan))
 
     def drop(self, laid: LaidPlan) -> None:
@@ -196,10 +204,6 @@ def open_desk(library: "Library", make_plan: int, serve: int, most: int) -> Desk
     desk = _Desk(make_plan=make_plan, serve=serve, plans=ctypes.addressof(plans))
     setattr(desk, "yield", _address(c, "sched_yield") or _address(ctypes.pythonapi, "PyThread_get_thread_ident"))
     desk.advise = _address(c, "madvise") if sys.platform.startswith("linux") else None
-    if load_warp().is_cuda_available():
-        driver = cuda_driver()
-        desk.launch, desk.clear = _address(driver, "cuLaunchKernel"), _address(driver, "cuMemsetD32Async")
-        desk.record, desk.wait = _address(driver, "cuEventRecord"), _address(driver, "cuStreamWaitEvent")
     size = ctypes.c_longlong
     take = ctypes.CFUNCTYPE(ctypes.c_bool, ctypes.c_void_p, size, size, size)(library.address_of("open_desk"))
     if not take(ctypes.addressof(desk), *map(ctypes.sizeof, (_Desk, _Plan, _Step))):
@@ -207,7 +211,7 @@ def open_desk(library: "Library", make_plan: int, serve: int, most: int) -> Desk
     change = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
     keep, drop = (change(library.address_of(name)) for name in ("keep_plan", "drop_plan"))
     handlers = library.address_of("answer_on_cpu"), library.address_of("answer_on_cuda")
-    return Desk(handlers, [desk, library, plans], keep, drop)
+    return Desk(handlers, desk, [library, plans], keep, drop)
 
 
 def _address(library: ctypes.CDLL, name: str) -> int | None:

@@ -14,6 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
 from typing import Any, TypeVar
 
+from jfrnn.kernels import _clang
+
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 _LINUX = sys.platform == "linux"
 Result = TypeVar("Result")
@@ -36,15 +38,27 @@ def load_warp() -> ModuleType:
     return warp
 
 
-def _load_warp() -> tuple[Any, str | None]:
-    """Return Warp, and what is to be said of the folder in which it keeps kernels."""
-    fresh = "warp" not in sys.modules
+@functools.cache
+def check_warp() -> None:
+    """Look for Warp, without importing it.
+
+    Raises:
+        ImportError: It is not installed, or another version is.
+    """
     try:
-        import warp
+        version = _clang.warp_version()
     except ImportError as error:
         raise ImportError(f"the backends 'warp' and 'hashgrid' need the package warp-lang (1.18 or 1.19): {INSTALL}") from error
-    if not hasattr(warp, "jax_callable"):
-        raise ImportError(f"the backends 'warp' and 'hashgrid' need warp-lang 1.18 or 1.19, found {warp.__version__}: {INSTALL}")
+    if version.split(".")[:2] not in (["1", "18"], ["1", "19"]):
+        raise ImportError(f"the backends 'warp' and 'hashgrid' need warp-lang 1.18 or 1.19, found {version}: {INSTALL}")
+
+
+def _load_warp() -> tuple[Any, str | None]:
+    """Return Warp, and what is to be said of the folder in which it keeps kernels."""
+    check_warp()
+    fresh = "warp" not in sys.modules
+    import warp
+
     level, warp.config.log_level = warp.config.log_level, warp.LOG_WARNING
     try:
         with _without_a_word_of_drivers():
@@ -60,7 +74,8 @@ def _init(warp: ModuleType) -> str | None:
         try:
             warp.init()
         except OSError:
-            warning = importlib.import_module("jfrnn.kernels._compile").temporary_folder()
+            warning = compiler().temporary_folder()
+            warp.config.kernel_cache_dir = str(compiler().kernel_folder())
             warp.init()
     except RuntimeError:
         warp.config.kernel_cache_dir = given  # what it makes of the path, it would make again of that
@@ -94,9 +109,15 @@ def _without_a_word_of_drivers() -> Iterator[None]:
 
 @functools.cache
 def compiler() -> ModuleType:
-    """Return `jfrnn.kernels._compile`, which imports Warp."""
-    load_warp()
+    """Return `jfrnn.kernels._compile`, which needs Warp, but imports it for CUDA alone."""
+    check_warp()
     return apart(functools.partial(importlib.import_module, "jfrnn.kernels._compile"))
+
+
+def warn_of_folders() -> None:
+    """Warn of a folder in which programs cannot be kept."""
+    for note in compiler().take_notes():
+        warnings.warn(note, RuntimeWarning, stacklevel=level_of_caller())
 
 
 def apart(work: Callable[[], Result]) -> Result:

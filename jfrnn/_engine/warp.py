@@ -20,7 +20,7 @@ from jfrnn._engine.levels_warp import level_neighbors
 from jfrnn._engine.operands import MOST_IN_BOX, pack_particles, periodic_kind, space_flags
 from jfrnn._engine.plans import Clear, HugePages, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.problem import Filter, Kind, Options, Rows, Search
-from jfrnn._engine.start import load_warp
+from jfrnn._engine.start import check_warp, load_warp
 from jfrnn._geometry import Cutoffs
 from jfrnn.kernels import cells_cpu, cells_cuda, few_cuda
 from jfrnn.kernels._native import table_cells
@@ -87,21 +87,21 @@ class Variant(NamedTuple):
 def missing(platform: str) -> str | None:
     """Say what keeps Warp from running on a JAX platform; None: nothing does."""
     try:
-        warp = load_warp()
+        check_warp()
         if platform in PLATFORMS:
             open_native()
+        if platform in ("gpu", "cuda"):
+            return None if load_warp().is_cuda_available() else "Warp found no CUDA driver"
     except (ImportError, RuntimeError) as error:
         return str(error).rstrip(".")
     if platform == "cpu":
-        return None if warp.is_cpu_available() else "this Warp was built without its CPU compiler"
-    if platform in ("gpu", "cuda"):
-        return None if warp.is_cuda_available() else "Warp found no CUDA driver"
+        return None
     return f"Warp has no engine for the JAX platform {platform!r}"
 
 
 def check_platform(name: str, platform: str) -> None:
     """Raise where Warp is not installed, or a platform is none of its own."""
-    load_warp()
+    check_warp()
     if platform not in PLATFORMS:
         raise RuntimeError(f"backend={name!r} runs on the platforms {', '.join(map(repr, PLATFORMS))}, got {platform!r}.")
 
