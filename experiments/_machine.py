@@ -41,18 +41,16 @@ def _processor() -> str:
     return models[0] if models else platform.processor() or platform.machine()
 
 
-def commit() -> dict[str, Any]:
-    """Return the commit of the project and whether the working tree differs from it; None where that is unknown."""
-    head, changes = _git("rev-parse", "HEAD"), _git("status", "--porcelain")
+def commit(checkout: Path = Path(__file__).parent) -> dict[str, Any]:
+    """Return the commit of a checkout and whether the working tree differs from it; None where that is unknown."""
+    head, changes = _git(checkout, "rev-parse", "HEAD"), _git(checkout, "status", "--porcelain")
     return {"commit": head, "dirty": None if changes is None else bool(changes)}
 
 
-def _git(*arguments: str) -> str | None:
+def _git(checkout: Path, *arguments: str) -> str | None:
     """Return what git prints, None where it fails or is not there."""
     try:
-        done = subprocess.run(
-            ["git", "-C", str(Path(__file__).parent), *arguments], capture_output=True, text=True, check=True, timeout=20
-        )
+        done = subprocess.run(["git", "-C", str(checkout), *arguments], capture_output=True, text=True, check=True, timeout=20)
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()

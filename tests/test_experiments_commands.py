@@ -21,7 +21,10 @@ from jfrnn.cases import fluids
 ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
 TOP = ("run", "report", "merge", "list", "show", "export", "gpu", "bench", "sph")
-BENCH = ("crossover", "distributed", "domain", "house", "options", "peers", "skin", "sums", "ties", "triangles", "use")
+BENCH = (
+    *("crossover", "distributed", "domain", "house", "latency", "options", "peers", "skin", "start", "sums", "ties", "triangles"),
+    "use",
+)
 SPH = ("run", "validate", "speed", "gradients")
 COMMANDS = (*TOP[:7], *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))
 
@@ -60,6 +63,7 @@ def test_the_list_of_commands_fits_a_screen(group, names):
 def test_help_keeps_what_stands_in_brackets(command):
     units = {"show": ["[m]"], "export": ["[m]"], "run": ["[s]"], "bench skin": ["[m]"], "bench domain": ["[cutoffs]"]}
     units |= {"bench triangles": ["[modules]"], "bench peers": ["[s]", "'.[peers]'"]}
+    units |= {"bench latency": ["[µs]"], "bench start": ["[s]"]}
     text = told(*command.split(), "--help")
     assert text.startswith(f"Usage: python -m experiments {command} ")
     assert [unit for unit in units.get(command, []) if unit not in text] == []
@@ -194,6 +198,10 @@ def test_arrays_of_words_are_no_particles(tmp_path):
         (("bench", "triangles", "--faces", "1"), "--faces 1: "),
         (("bench", "crossover", "--repeats", "1"), "--repeats 1: "),
         (("bench", "peers", "--limit", "nan"), "--limit nan: "),
+        (("bench", "latency", "--sizes", "1"), "--sizes 1: "),
+        (("bench", "latency", "--repeats", "1"), "--repeats 1: "),
+        (("bench", "start", "--repeats", "0"), "--repeats 0: "),
+        (("bench", "start", "--before", "none"), "--before none: is no checkout of this project; there is no jfrnn/__init__.py"),
         (("bench", "peers", "ann"), "no peer 'ann'; allowed: jfrnn, scipy, "),
         (("show", "corners", "--dim", "4"), "--dim 4: "),
         (("show", "corners", "--fill", "nan"), "--fill nan: "),
@@ -288,7 +296,7 @@ def test_steps_are_timed_of_scenes_that_have_an_nx(tmp_path):
         ("sph", "run", "one"),
         ("sph", "validate", "one"),
         ("sph", "gradients", "memory"),
-        *(("bench", name) for name in ("options", "ties", "crossover", "triangles", "skin", "use", "domain")),
+        *(("bench", name) for name in ("options", "ties", "crossover", "triangles", "skin", "use", "domain", "latency", "start")),
         ("bench", "peers", "scipy"),
         ("bench", "house", "HEAD"),
     ],

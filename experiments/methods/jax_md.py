@@ -15,12 +15,16 @@ PACKAGES = ("jax-md",)
 MAX_POINTS = 130_000  # 19 GB at 250 000
 
 
-def allocate(positions: np.ndarray, cutoff: float) -> tuple[Any, np.ndarray]:
-    """Return a list with its capacity, which is found with the list itself, and the lowest coordinates, shape [dim]."""
+def allocate(positions: np.ndarray, cutoff: float, sparse: bool = False) -> tuple[Any, np.ndarray]:
+    """Return a list with its capacity, which is found with the list itself, and the lowest coordinates, shape [dim].
+
+    Rows of a dense list are padded, [n, capacity]; a sparse one holds pairs, [2, capacity]. Unused slots hold n.
+    """
     jax.config.update("jax_enable_x64", positions.dtype == np.float64)
     low = np.asarray(positions).min(axis=0)
     size = jnp.asarray(np.asarray(positions).max(axis=0) - low + positions.dtype.type(cutoff))  # its cells begin at 0
-    made: Any = partition.neighbor_list(space.free()[0], size, cutoff, format=partition.NeighborListFormat.Dense)  # pyright: ignore
+    formats: Any = partition.NeighborListFormat  # pyright: ignore
+    made: Any = partition.neighbor_list(space.free()[0], size, cutoff, format=formats.Sparse if sparse else formats.Dense)  # pyright: ignore
     return made.allocate(jnp.asarray(positions - low)), low
 
 

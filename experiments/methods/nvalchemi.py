@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from nvalchemiops.jax.neighbors.cell_list import cell_list, estimate_cell_list_sizes  # pyright: ignore
+from nvalchemiops.jax.neighbors.naive import naive_neighbor_list  # pyright: ignore
 
 from experiments.methods import Found, at_hand
 from experiments.methods._padded import found_in_rows
@@ -29,6 +30,11 @@ def compile_search(positions: Any, cutoff: float, capacity: int) -> Callable[[An
     cells, _, radius = estimate_cell_list_sizes(jnp.asarray(positions - low), cell, cutoff, periodic)
     most = {"max_neighbors": capacity, "max_total_cells": int(cells), "neighbor_search_radius": radius}
     return jax.jit(lambda x: cell_list(x - low, cutoff, cell, periodic, **most)[:2])
+
+
+def compile_naive(cutoff: float, capacity: int, strategy: str) -> Callable[[Any], tuple[jax.Array, jax.Array]]:
+    """Return a compiled search that looks at all pairs, by the strategy `scalar` or, on CUDA, `tile`; it is not waited for."""
+    return jax.jit(lambda x: naive_neighbor_list(x, cutoff, max_neighbors=capacity, strategy=strategy)[:2])
 
 
 def prepare(positions: np.ndarray, cutoff: float, capacity: int) -> Callable[[], tuple[jax.Array, jax.Array]]:
