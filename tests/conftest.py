@@ -93,3 +93,12 @@ def dtype(request):
 @pytest.fixture(params=[2, 3], ids=["2d", "3d"])
 def dim(request):
     return request.param
+
+
+@pytest.fixture
+def foreign():
+    """Let other libraries mix dtypes, as they do, and adapters set how wide floats are, for a test alone."""
+    wide = jax.config.jax_enable_x64
+    with jax.numpy_dtype_promotion("standard"):
+        yield
+    jax.config.update("jax_enable_x64", wide)

@@ -18,7 +18,8 @@ def scene():
     return latency._make_scene(N)
 
 
-def test_every_way_gets_a_row_and_none_twice(tmp_path):
+@pytest.mark.filterwarnings("ignore")  # of other libraries
+def test_every_way_gets_a_row_and_none_twice(tmp_path, foreign):
     words = ["bench", "latency", "--sizes", str(N), "--repeats", "2", "--out", str(tmp_path)]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0, result.output

@@ -3,7 +3,6 @@
 import os
 import shutil
 
-import jax
 import numpy as np
 import pytest
 
@@ -12,15 +11,6 @@ from experiments import _compare, _native, _oracle, methods
 OURS = {"brute", "cll", "hashgrid", "jax", "pair-sum", "warp", "warp-counts"}  # run by the tests of the sweep and of the engines
 MOVING = ["nanoflann-dynamic", "nanoflann-rebuild", "warp-rebuild", "warp-update"]
 OTHERS = [name for name in methods.names() if name not in OURS and name not in MOVING]
-
-
-@pytest.fixture
-def foreign():
-    """Let other libraries mix dtypes, as they do, and adapters set how wide floats are, for a test alone."""
-    wide = jax.config.jax_enable_x64
-    with jax.numpy_dtype_promotion("standard"):
-        yield
-    jax.config.update("jax_enable_x64", wide)
 
 
 def find(name, positions, cutoff):

@@ -109,7 +109,7 @@ def _rows(n: int, repeats: int) -> Iterator[table.Line]:
         if isinstance(made, _Timed):
             timed[name] = made
             rows[name] |= {"status": "ok", "wrong": made.wrong}
-            rows[name] |= {"peer": _machine.versions([way.package])[way.package]} if way.method else {"backend": _engine(scene)}
+            rows[name] |= _tell_version(way, scene)
         else:
             rows[name] |= made
     for name, times in _time(scene, timed, repeats).items():
@@ -138,8 +138,12 @@ def _sum_rows(x: np.ndarray, idx: np.ndarray, cutoff: float) -> tuple[np.ndarray
     return (rest**3).sum(axis=1), 12 / cutoff * np.einsum("nk,nkd->nd", rest**2, r)
 
 
-def _engine(scene: _Scene) -> str:
-    return jax.eval_shape(lambda x: jfrnn.search(x, scene.cutoff, capacity=scene.capacity), scene.x).backend
+def _tell_version(way: _Way, scene: _Scene) -> table.Line:
+    if way.method is not None:
+        return {"peer": _machine.versions([way.package])[way.package]}
+    if way.make is None:
+        return {}
+    return {"backend": jax.eval_shape(lambda x: jfrnn.search(x, scene.cutoff, capacity=scene.capacity), scene.x).backend}
 
 
 def _prepare(way: _Way, scene: _Scene) -> _Timed | table.Line:
