@@ -12,7 +12,6 @@ import hashlib
 import platform
 import shutil
 import tempfile
-import threading
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -21,12 +20,12 @@ from typing import Any, NamedTuple
 
 from jfrnn.kernels import _clang
 from jfrnn.kernels._program import Program
+from jfrnn.kernels._turns import one_at_a_time
 from jfrnn.kernels.launch import launcher
 
 _FOLDER = "wp_jfrnn"
 _END = b"\n//"  # a comment of PTX, and nothing to objects
 _DIGEST = 64  # hexadecimal digits
-_compiling = threading.RLock()
 _loaded: weakref.WeakValueDictionary[tuple[Program, str], "Library"] = weakref.WeakValueDictionary()
 
 
@@ -36,7 +35,7 @@ class Library:
     def __init__(self, program: Program, device: str) -> None:
         self._program, self._device = program, _cuda().device(device) if program.cuda else None
         self._handle = self._load()
-        weakref.finalize(self, self._unloading()).atexit = False  # programs may still run while the interpreter exits
+        weakref.finalize(self, _unload, self._unloading()).atexit = False  # programs may still run while the interpreter exits
 
     def address_of(self, function: str) -> int:
         """Return the address of a function on the CPU, or its handle in CUDA.
@@ -96,7 +95,7 @@ def load(program: Program, device: str = "cpu") -> Library:
     Raises:
         RuntimeError: It does not compile, or cannot be loaded.
     """
-    with _compiling:
+    with one_at_a_time:
         found = _loaded.get((program, device))
         if found is None:
             found = _loaded[program, device] = Library(program, device)
@@ -236,6 +235,11 @@ def _is_whole(path: Path) -> bool:
         return False
     body, digest = data[: -_DIGEST - len(_END)], data[-_DIGEST:]
     return hashlib.sha256(body).hexdigest().encode() == digest
+
+
+def _unload(work: Callable[[], None]) -> None:
+    with one_at_a_time:
+        work()
 
 
 def _unload_cuda(device: Any, handle: int) -> None:

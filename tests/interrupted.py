@@ -5,6 +5,7 @@ must be the right one, bit for bit, and the exception must arrive as the very ob
 """
 
 import gc
+import mmap
 import os
 import signal
 import statistics
@@ -16,6 +17,8 @@ import traceback
 import jax
 import numpy as np
 
+if "unmapped" in sys.argv:  # as where a process may not have memory that it both writes and executes
+    del mmap.PROT_EXEC
 import jfrnn
 
 RANDOM = np.random.default_rng(0)

@@ -1,19 +1,29 @@
 """Handlers of signals that raise while searches run: no wrong result, nothing lost, no memory written after it was given back."""
 
 import os
+import signal
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
+
+import jfrnn
+from jfrnn._engine import hashgrid, launch
 
 PROGRAM = Path(__file__).parent / "interrupted.py"
 
 
-def run(tries):
+def run(tries, *more):
     """Raise so many times in each of 16 works; return how often a result was wrong, and an exception lost."""
     environment = os.environ | {"JAX_ENABLE_X64": "0"}
-    done = subprocess.run([sys.executable, PROGRAM, str(tries)], capture_output=True, text=True, check=False, env=environment)
+    done = subprocess.run(
+        [sys.executable, PROGRAM, str(tries), *more], capture_output=True, text=True, check=False, env=environment
+    )
     assert done.returncode == 0, done.stderr
     print(done.stderr)  # what was dropped, and where
     words = done.stdout.split()
@@ -28,6 +38,49 @@ def assert_sound(found, tries):
 
 def test_interrupted_searches_are_right_or_raise():
     assert_sound(run(24), 24)
+
+
+def forget_plans():
+    for key in list(launch._plans):
+        launch._open().drop(launch._plans.pop(key))
+
+
+@pytest.mark.parametrize(("backend", "module", "asked"), [("warp", launch, "_keep_plan"), ("hashgrid", hashgrid, "_run_hashgrid")])
+def test_what_a_handler_raises_while_python_is_asked_is_raised_when_the_call_has_ended(backend, module, asked, monkeypatch):
+    """A program whose plan is gone asks on the main thread."""
+    x = np.random.default_rng(0).random((40, 3), np.float32)
+    count = jax.jit(lambda x: jfrnn.search(x, 0.3, capacity=40, backend=backend).count)
+    right, threads, work = np.asarray(count(x)), [], getattr(module, asked)
+
+    def interrupted(*given):
+        threads.append(threading.current_thread())
+        os.kill(os.getpid(), signal.SIGUSR1)
+        time.sleep(0.1)
+        return work(*given)
+
+    def handle(number, _):
+        raise error
+
+    error = KeyboardInterrupt("itself")
+    forget_plans()
+    monkeypatch.setattr(module, asked, interrupted)
+    before = signal.signal(signal.SIGUSR1, handle)
+    try:
+        with pytest.raises(KeyboardInterrupt, match="itself") as raised:
+            jax.block_until_ready(count(x))
+            time.sleep(1)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert raised.value is error
+    assert threads
+    assert threading.main_thread() not in threads
+    monkeypatch.undo()
+    np.testing.assert_array_equal(count(x), right)
+
+
+@pytest.mark.slow
+def test_without_memory_for_instructions_interrupted_searches_are_right_or_raise():
+    assert_sound(run(48, "unmapped"), 48)
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import ctypes
 import functools
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -100,7 +101,8 @@ const char* call(const char* kernel, int size, int device, int cuda, void* input
 """
 EXECUTE, INSTANTIATE = 3, 0
 LAUNCH, CLEAR, RECORD, WAIT = range(1, 5)
-_MAKE_PLAN = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_longlong, ctypes.c_void_p, ctypes.c_longlong, ctypes.c_int)
+_TEXT = ctypes.c_void_p, ctypes.c_longlong
+_MAKE_PLAN = ctypes.CFUNCTYPE(None, *_TEXT, *_TEXT, ctypes.c_int, ctypes.c_void_p)
 
 
 class Native:
@@ -118,13 +120,14 @@ class Native:
     def function(self, name, result=ctypes.c_int):
         return ctypes.CFUNCTYPE(result)(self.library.address_of(name))
 
-    def make(self, name, name_size, recipe, recipe_size, device):
+    def make(self, name, name_size, recipe, recipe_size, device, wrong):
         name, recipe = ctypes.string_at(name, name_size).decode(), ctypes.string_at(recipe, recipe_size).decode()
         self.made.append((name, recipe, device))
-        if self.refused is not None:
-            return ctypes.cast(ctypes.c_char_p(self.refused), ctypes.c_void_p).value
-        self.keep(name, device, Plan([self.step()], {"number": 5}))
-        return None
+        if isinstance(self.refused, BaseException):
+            raise self.refused
+        ctypes.memmove(wrong, (self.refused or b"") + b"\0", len(self.refused or b"") + 1)
+        if self.refused is None:
+            self.keep(name, device, Plan([self.step()], {"number": 5}))
 
     def step(self, threads=1, **more):
         fields = Field("x", 0, True), Field("number", 8, False)
@@ -218,9 +221,21 @@ def test_programs_that_are_made_ready_ask_and_launch_nothing(native):
 def test_what_goes_wrong_is_told_to_xla(native):
     native.refused = b"RuntimeError: no such kernel"
     assert native.call("refused@here") == b"refused: RuntimeError: no such kernel"
+    native.refused = b"x" * (plans.MOST_WORDS - 1)
+    assert native.call("refused@here") == (b"refused: " + native.refused)[:1023]  # what this driver notes
     native.keep("fails@here", 0, Plan([native.step(1), native.step(1)], {"number": 13}))
     assert native.call("fails@here") == b"fails: a launch failed with CUDA's error 700"
     assert len(native.events()) == 1  # nothing is launched behind
+
+
+def test_what_python_leaves_unanswered_is_told_to_xla(native, monkeypatch):
+    ignored = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda given: ignored.append(given.exc_value))
+    native.refused = KeyboardInterrupt()
+    assert native.call("dropped@here") == b"dropped: Python stopped before it had answered. Call again."
+    assert ignored == [native.refused]
+    native.refused = None
+    assert native.call("dropped@here", 1000) is None
 
 
 def test_the_version_of_the_interface_is_told(native):

@@ -19,7 +19,7 @@ def choose(backend):
     for warning in caught:
         print(warning.category.__name__, warning.filename, warning.message)
 """
-DAMAGED = Path(__file__).with_name("damaged.py")
+DAMAGED, BEGUN = (Path(__file__).with_name(name) for name in ("damaged.py", "begun.py"))
 
 
 def run(*command, cache, limits=""):
@@ -104,3 +104,20 @@ def test_damaged_files_are_compiled_anew(tmp_path):
     for path, (before, made) in damaged.items():
         assert path.read_bytes() == before
         assert (path.stat().st_mtime_ns == made) == ("whole" in path.name)
+
+
+def begin(how):
+    """Run `begun.py` with the kernels that are there."""
+    import warp
+
+    warp.init()
+    return run(BEGUN, how, cache=Path(warp.config.kernel_cache_dir).parent)
+
+
+def test_threads_that_search_first_at_the_same_moment_start_all_once():
+    assert begin("together") == (["opened 1 right 4"], "")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks with memory for instructions")
+def test_processes_that_fork_share_no_door_and_leave_no_lock_behind():
+    assert begin("fork") == (["led elsewhere 0", "ended 0 0 0 0 0 0"], "")

@@ -7,7 +7,6 @@ A call runs native code (`kernels/native/launch.h`), on the thread on which XLA 
 kernel, by name: it compiles what is launched, and lays down in what order, with which arguments (`jfrnn._engine.plans`).
 """
 
-import _thread
 import atexit
 import contextlib
 import ctypes
@@ -16,8 +15,8 @@ import hashlib
 import importlib
 import json
 import mmap
+import os
 import platform
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -28,8 +27,9 @@ import jax
 from jax import Array
 
 from jfrnn._engine.ffi import CallFrame
-from jfrnn._engine.plans import Desk, LaidPlan, Plan, lay_plan, multiprocessors_of, open_desk
-from jfrnn._engine.start import apart, compiler, warn_of_folders
+from jfrnn._engine.plans import MOST_WORDS, Desk, LaidPlan, Plan, lay_plan, multiprocessors_of, open_desk
+from jfrnn._engine.start import alone, apart, compiler, warn_of_folders
+from jfrnn.kernels import one_at_a_time
 
 TARGET = "jfrnn"  # what programs call; jax.export wants to be told that it stays
 Static = Any  # what a kernel is made of, and a program carries: NamedTuples of the library, tuples, texts, numbers
@@ -158,44 +158,43 @@ def _read_call(name: str, recipe: str) -> tuple[Call, Shapes]:
 
 # --- what native code asks of Python ----------------------------------------------------------------------------------
 
-_MakePlan = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_longlong, ctypes.c_void_p, ctypes.c_longlong, ctypes.c_int)
-_Serve = ctypes.CFUNCTYPE(
-    ctypes.c_void_p, ctypes.c_void_p, ctypes.c_longlong, ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(ctypes.c_void_p)
-)
+_Text = ctypes.c_void_p, ctypes.c_longlong
+_MakePlan = ctypes.CFUNCTYPE(None, *_Text, *_Text, ctypes.c_int, ctypes.c_void_p)
+_Serve = ctypes.CFUNCTYPE(None, *_Text, ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(ctypes.c_void_p), ctypes.c_void_p)
 _plans: dict[tuple[str, int], LaidPlan] = {}  # by name and device, those that were made last at the end
-_served: dict[str, tuple[Call, Shapes]] = {}
-_planning = threading.Lock()
-_messages: dict[int, bytes] = {}  # by thread: XLA copies one before the thread can bring another
+_served: dict[tuple[str, int], tuple[Call, Shapes]] = {}
 
 
-def _make_plan(name: int, name_size: int, recipe: int, recipe_size: int, device: int) -> int | None:
-    texts = ctypes.string_at(name, name_size).decode(), ctypes.string_at(recipe, recipe_size).decode()
-    return _answer(lambda: _keep_plan(*texts, device))
-
-
-def _serve(name: int, name_size: int, device: int, stream: int | None, arrays: Addresses) -> int | None:
+def _make_plan(name: int, name_size: int, recipe: int, recipe_size: int, device: int, wrong: int) -> None:
     def work() -> None:
-        found, shapes = _served[ctypes.string_at(name, name_size).decode()]
+        _keep_plan(ctypes.string_at(name, name_size).decode(), ctypes.string_at(recipe, recipe_size).decode(), device)
+
+    _answer(work, wrong)
+
+
+def _serve(name: int, name_size: int, device: int, stream: int | None, arrays: Addresses, wrong: int) -> None:
+    def work() -> None:
+        found, shapes = _served[ctypes.string_at(name, name_size).decode(), device]
         assert found.serve is not None
         found.serve(shapes, {key: arrays[k] or 0 for k, key in enumerate(shapes)}, device, stream or 0)
 
-    return _answer(work)
+    _answer(work, wrong)
 
 
 def _keep_plan(name: str, recipe: str, device: int) -> None:
     found, shapes = _read_call(name, recipe)
     desk = _open()
-    with _planning:
+    with one_at_a_time:
         if (name, device) in _plans:
             return
         if found.serve is not None:
             _finish_before_exit()
-            _served[name] = found, shapes
+            _served[name, device] = found, shapes
         laid = lay_plan(name, found.plan(shapes, multiprocessors_of(device)), list(shapes), device, python=found.serve is not None)
         while len(_plans) >= _MOST:
             gone = next(iter(_plans))
             desk.drop(_plans.pop(gone))
-            _served.pop(gone[0], None)
+            _served.pop(gone, None)
         _plans[name, device] = laid
         desk.keep(laid)
 
@@ -212,57 +211,18 @@ def _finish_before_exit() -> None:
     atexit.register(finish)
 
 
-def _answer(work: Callable[[], None]) -> int | None:
-    """Work, and return the address of a message where that fails."""
-    wrong = _try(work)
-    if wrong is None:
-        return None
-    message = wrong.encode(errors="replace")
-    _messages[threading.get_ident()] = message
-    return ctypes.cast(ctypes.c_char_p(message), ctypes.c_void_p).value
+def _answer(work: Callable[[], None], wrong: int) -> None:
+    """Work, and write down what goes wrong, for native code to read."""
+    try:
+        work()
+        message = b""
+    except BaseException as error:
+        message = _describe(error).encode(errors="replace")[: MOST_WORDS - 1].decode(errors="ignore").encode()
+    ctypes.memmove(wrong, message + b"\0", len(message) + 1)
 
 
-def _try(work: Callable[[], object]) -> str | None:
-    """Work, and return what goes wrong.
-
-    XLA calls from any thread, the main one included, on which Python runs the handlers of signals between any two instructions:
-    there another thread works, and what a handler raises meanwhile is raised again when the call has ended.
-    """
-    errors = list[BaseException]()
-
-    def whole() -> None:
-        try:
-            work()
-        except BaseException as error:
-            errors.append(error)
-
-    if threading.current_thread() is threading.main_thread():
-        _finish_whatever_comes(whole)
-    else:
-        whole()
-    return f"{type(errors[0]).__name__}: {errors[0]}" if errors else None
-
-
-def _finish_whatever_comes(work: Callable[[], None]) -> None:
-    """Let another thread work; what a handler of a signal raises here meanwhile is raised again when the call has ended."""
-    once, done, raised, begun = threading.Lock(), threading.Event(), None, 0
-
-    def whole() -> None:
-        if once.acquire(blocking=False):
-            work()
-            done.set()
-
-    while not done.is_set():
-        try:
-            begun = begun or _thread.start_new_thread(whole, ())
-            done.wait()
-        except RuntimeError:  # while the interpreter exits, no thread can be started
-            whole()
-        except BaseException as error:
-            raised = error
-    if raised is not None:
-        main = ctypes.c_ulong(threading.main_thread().ident or 0)
-        ctypes.pythonapi.PyThreadState_SetAsyncExc(main, ctypes.py_object(type(raised)))
+def _describe(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"
 
 
 # --- what XLA calls ---------------------------------------------------------------------------------------------------
@@ -277,12 +237,15 @@ class _Door:
     """What XLA is told to call: leads to Python until native code is there, and from then on to that."""
 
     def __init__(self) -> None:
-        self._python = _Handler(self._enter)
-        self._native: Any = None
+        # XLA's call becomes that of a class, which changes what it leads to: native code is then called without Python between,
+        # on which a handler of a signal could raise
+        self._way: Any = type("Way", (), {"__call__": staticmethod(self._enter)})
+        self._python = _Handler(self._way())
         self.address = _address(self._python)
         with contextlib.suppress(OSError, ValueError, AttributeError, KeyError):  # Python goes on to lead there
             code = _JUMPS[platform.machine()]
-            room = mmap.mmap(-1, mmap.PAGESIZE, prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
+            kind = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS  # processes that fork lead elsewhere
+            room = mmap.mmap(-1, mmap.PAGESIZE, kind, mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
             room[: len(code)] = code
             self._goal = ctypes.c_uint64.from_buffer(room, len(code))
             self._goal.value = self.address
@@ -290,16 +253,19 @@ class _Door:
 
     def lead_to(self, address: int) -> None:
         """Lead to native code."""
-        self._native = _Handler(address)
+        self._native = self._way.__call__ = _Handler(address)
         if hasattr(self, "_goal"):
             self._goal.value = address
 
     def _enter(self, address: int) -> int | None:
         frame = CallFrame.from_address(address)
-        if frame.tell_version():
-            return None
-        wrong = None if self._native else _try(_open)
-        return frame.fail(f"{TARGET}: {wrong}") if self._native is None else self._native(address)
+        try:
+            if frame.tell_version():
+                return None
+            apart(_open)
+            return self._native(address)
+        except BaseException as error:
+            return frame.fail(f"{TARGET}: {_describe(error)}")
 
 
 def _address(function: CFunction) -> int:
@@ -310,13 +276,21 @@ _doors = {name: _Door() for name in _PLATFORMS}
 _behind_desk = _MakePlan(_make_plan), _Serve(_serve)
 
 
-@functools.cache
 def _open() -> Desk:
-    """Compile the native code, and lead all calls there."""
+    """Compile the native code, once, and lead all calls there."""
+    compiler()
+    return _opened()
+
+
+@alone
+@functools.cache
+def _opened() -> Desk:
     header = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text("utf-8")
     desk = open_desk(compiler().load_launcher(header), _address(_behind_desk[0]), _address(_behind_desk[1]), _MOST)
     for name, address in zip(_PLATFORMS, desk.handlers, strict=True):
         _doors[name].lead_to(address)
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=desk.begin_anew)
     return desk
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import os
 import sys
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 PLACES_PER_THREAD = 512  # below, a second thread costs more than it saves
 _HUGE = 1 << 22  # bytes from which an array is worth a request for huge pages
-_MOST_BYTES, _MOST_ARRAYS = 1024, 48  # those of the native code
+_MOST_BYTES, _MOST_ARRAYS, MOST_WORDS = 1024, 48, 1024  # those of the native code
 _ONCE, _SHARED, _CUDA, _CUDA_BESIDE, _CLEAR, _HUGE_PAGES, _PYTHON = range(7)
 
 
@@ -99,11 +100,25 @@ class _Plan(ctypes.Structure):
     )
 
 
+_OF_PYTHON = {
+    "is_alive": "Py_IsInitialized",
+    "has_lock": "PyGILState_Check",
+    "this_thread": "PyThread_get_thread_ident",
+    "start_thread": "PyThread_start_new_thread",
+    "make_lock": "PyThread_allocate_lock",
+    "take_lock": "PyThread_acquire_lock",
+    "give_lock": "PyThread_release_lock",
+    "free_lock": "PyThread_free_lock",
+}
+
+
 class _Desk(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_void_p) for name in ("make_plan", "serve", "yield", "advise", "launch", "clear", "record", "wait")),
+        *((name, ctypes.c_void_p) for name in _OF_PYTHON),
         ("plans", ctypes.c_void_p),
         ("plan_count", ctypes.c_longlong),
+        ("main_thread", ctypes.c_ulong),
         ("locked", ctypes.c_int),
         ("forking", ctypes.c_int),
     )
@@ -177,6 +192,7 @@ class Desk:
     _held: list[Any]
     _keep: Callable[[int], None]
     _drop: Callable[[int], None]
+    _begin_anew: Callable[[int], None]
 
     def keep(self, laid: LaidPlan) -> None:
         """Let calls find a plan."""
@@ -189,6 +205,10 @@ class Desk:
     def drop(self, laid: LaidPlan) -> None:
         """Let no call find a plan any longer, and wait for those that have found it."""
         self._drop(ctypes.addressof(laid.plan))
+
+    def begin_anew(self) -> None:
+        """Forget what threads were at, in a process that has begun by a fork."""
+        self._begin_anew(threading.main_thread().ident or 0)
 
 
 def open_desk(library: "Library", make_plan: int, serve: int, most: int) -> Desk:
@@ -203,6 +223,9 @@ def open_desk(library: "Library", make_plan: int, serve: int, most: int) -> Desk
     plans, c = (ctypes.c_void_p * (most + 1))(), _c_library()
     desk = _Desk(make_plan=make_plan, serve=serve, plans=ctypes.addressof(plans))
     setattr(desk, "yield", _address(c, "sched_yield") or _address(ctypes.pythonapi, "PyThread_get_thread_ident"))
+    for key, function in _OF_PYTHON.items():
+        setattr(desk, key, _address(ctypes.pythonapi, function))
+    desk.main_thread = threading.main_thread().ident or 0
     desk.advise = _address(c, "madvise") if sys.platform.startswith("linux") else None
     size = ctypes.c_longlong
     take = ctypes.CFUNCTYPE(ctypes.c_bool, ctypes.c_void_p, size, size, size)(library.address_of("open_desk"))
@@ -210,8 +233,9 @@ def open_desk(library: "Library", make_plan: int, serve: int, most: int) -> Desk
         raise RuntimeError("native code and Python lay plans in different ways")
     change = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
     keep, drop = (change(library.address_of(name)) for name in ("keep_plan", "drop_plan"))
+    begin_anew = ctypes.CFUNCTYPE(None, ctypes.c_ulong)(library.address_of("begin_anew"))
     handlers = library.address_of("answer_on_cpu"), library.address_of("answer_on_cuda")
-    return Desk(handlers, desk, [library, plans], keep, drop)
+    return Desk(handlers, desk, [library, plans], keep, drop, begin_anew)
 
 
 def _address(library: ctypes.CDLL, name: str) -> int | None:

@@ -14,12 +14,23 @@ from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
 from typing import Any, TypeVar
 
-from jfrnn.kernels import _clang
+from jfrnn.kernels import _clang, one_at_a_time
 
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 _LINUX = sys.platform == "linux"
 Result = TypeVar("Result")
 INSTALL = "pip install 'warp-lang==1.19.*'"
+
+
+def alone(work: Callable[[], Result]) -> Callable[[], Result]:
+    """Make work of which no thread does any while another does."""
+
+    @functools.wraps(work)
+    def whole() -> Result:
+        with one_at_a_time:
+            return work()
+
+    return whole
 
 
 @functools.cache
@@ -53,6 +64,7 @@ def check_warp() -> None:
         raise ImportError(f"the backends 'warp' and 'hashgrid' need warp-lang 1.18 or 1.19, found {version}: {INSTALL}")
 
 
+@alone
 def _load_warp() -> tuple[Any, str | None]:
     """Return Warp, and what is to be said of the folder in which it keeps kernels."""
     check_warp()
@@ -122,7 +134,8 @@ def warn_of_folders() -> None:
 
 def apart(work: Callable[[], Result]) -> Result:
     """Do work that must not stop midway where no handler of a signal runs, in another thread than the main one, and wait for it."""
-    if threading.current_thread() is not threading.main_thread():
+    holds = one_at_a_time._is_owned()  # pyright: ignore[reportAttributeAccessIssue]  # another thread would wait for this one
+    if holds or threading.current_thread() is not threading.main_thread():
         return work()
     try:
         begun = _others().submit(work)
@@ -134,6 +147,10 @@ def apart(work: Callable[[], Result]) -> Result:
 @functools.cache
 def _others() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(thread_name_prefix="jfrnn-start")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_others.cache_clear)  # its threads stay behind
 
 
 def level_of_caller() -> int:

@@ -32,9 +32,9 @@ struct Plan {
 
 // What Python tells once: functions that are called, and the plans there are.
 struct Desk {
-    // asks for the plan of a name; returns an error, or nothing
-    const char* (*make_plan)(const char* name, long long name_size, const char* recipe, long long recipe_size, int device);
-    const char* (*serve)(const char* name, long long name_size, int device, void* stream, void* const* arrays);
+    // What asks for the plan of a name, and what serves a call: they write down what goes wrong, or an empty text.
+    void (*make_plan)(const char* name, long long name_size, const char* recipe, long long recipe_size, int device, char* wrong);
+    void (*serve)(const char* name, long long name_size, int device, void* stream, void* const* arrays, char* wrong);
     int (*yield)();
     int (*advise)(void* address, size_t size, int advice);
     int (*launch)(void* function, unsigned int, unsigned int, unsigned int, unsigned int, unsigned int, unsigned int, unsigned int,
@@ -42,13 +42,23 @@ struct Desk {
     int (*clear)(unsigned long long address, unsigned int word, size_t words, void* stream);
     int (*record)(void* event, void* stream);
     int (*wait)(void* stream, void* event, unsigned int);
+    // of Python, all of them called without its lock
+    int (*is_alive)();
+    int (*has_lock)();
+    unsigned long (*this_thread)();
+    unsigned long (*start_thread)(void (*work)(void*), void* given);
+    void* (*make_lock)();
+    int (*take_lock)(void* lock, int wait);
+    void (*give_lock)(void* lock);
+    void (*free_lock)(void* lock);
     Plan** plans;
     long long plan_count;
+    unsigned long main_thread;
     int locked, forking;
 };
 static Desk* desk;
 
-static constexpr int MOST_ARRAYS = 48, MOST_BYTES = 1024;
+static constexpr int MOST_ARRAYS = 48, MOST_BYTES = 1024, MOST_WORDS = 1024;
 
 struct Lock {
     int* const locked;
@@ -72,7 +82,7 @@ static unsigned long long hash_of(const char* name, long long size) {
 
 // A message, for XLA to raise.
 struct Message {
-    char text[1024];
+    char text[2 * MOST_WORDS];
     int size = 0;
     void add(const char* words, long long most = 1 << 20) {
         for (; *words && most > 0 && size < (int)sizeof(text) - 1; --most)
@@ -191,6 +201,52 @@ static Plan* enter(XLA_FFI_ByteSpan name, int device) {
     return nullptr;
 }
 static void leave(Plan* plan) { __atomic_fetch_sub(&plan->users, 1, __ATOMIC_RELEASE); }
+
+// A question to Python. Where nothing comes back, something went wrong.
+struct Question {
+    XLA_FFI_ByteSpan name, recipe;
+    int device;
+    void* stream;
+    void* const* arrays;  // of a call that is to be served; none: for a plan
+    char wrong[MOST_WORDS] = "Python stopped before it had answered. Call again.";
+    void* answered = nullptr;
+
+    void ask() {
+        if (arrays)
+            desk->serve(name.ptr, (long long)name.len, device, stream, arrays, wrong);
+        else
+            desk->make_plan(name.ptr, (long long)name.len, recipe.ptr, (long long)recipe.len, device, wrong);
+    }
+    static void ask_apart(void* given) {
+        Question* question = (Question*)given;
+        question->ask();
+        desk->give_lock(question->answered);
+    }
+    // Asks, on another thread where this is the main one: there Python runs handlers of signals, and what they raise would be raised
+    // in the midst of the answer, and be lost. They run when this call has ended.
+    bool succeeds() {
+        if (desk->this_thread() == desk->main_thread && desk->is_alive() && !desk->has_lock())
+            answered = desk->make_lock();
+        if (answered == nullptr)
+            ask();
+        else {
+            desk->take_lock(answered, 1);
+            if (desk->start_thread(ask_apart, this) == ~0ul)
+                ask();
+            else
+                desk->take_lock(answered, 1);
+            desk->give_lock(answered);
+            desk->free_lock(answered);
+        }
+        return wrong[0] == 0;
+    }
+    XLA_FFI_Error* fail(const Call& call) const {
+        Message message;
+        message.add_name(name);
+        message.add(wrong);
+        return call.fail(message.text);
+    }
+};
 
 // A step of the CPU, which threads of XLA's pool may join until the thread of the call has found nothing left to do.
 struct Team {
@@ -320,27 +376,17 @@ static XLA_FFI_Error* answer(XLA_FFI_CallFrame* frame, bool cuda) {
     const int device = !cuda ? -1 : executes ? call.device() : 0;  // a program that is made is most likely for the first one
     Plan* plan = enter(name, device);
     while (plan == nullptr) {
-        const XLA_FFI_ByteSpan recipe = call.text("recipe");
-        const char* wrong = desk->make_plan(name.ptr, (long long)name.len, recipe.ptr, (long long)recipe.len, device);
-        if (wrong != nullptr) {
-            Message message;
-            message.add_name(name);
-            message.add(wrong);
-            return call.fail(message.text);
-        }
+        Question question = {name, call.text("recipe"), device, nullptr, nullptr};
+        if (!question.succeeds())
+            return question.fail(call);
         plan = enter(name, device);
     }
     XLA_FFI_Error* error = nullptr;
     if (executes && plan->step_count > 0 && plan->steps[0].kind == PYTHON) {
         void* arrays[MOST_ARRAYS];
         call.arrays(arrays);
-        const char* wrong = desk->serve(name.ptr, (long long)name.len, device, cuda ? call.stream() : nullptr, arrays);
-        if (wrong != nullptr) {
-            Message message;
-            message.add_name(name);
-            message.add(wrong);
-            error = call.fail(message.text);
-        }
+        Question question = {name, {}, device, cuda ? call.stream() : nullptr, arrays};
+        error = question.succeeds() ? nullptr : question.fail(call);
     } else if (executes && cuda) {
         const int wrong = Work(call, *plan, call.stream()).run_on_cuda();
         error = wrong ? call.fail_at("a launch failed with CUDA's error ", wrong) : nullptr;
@@ -360,6 +406,13 @@ bool open_desk(Desk* given, long long desk_size, long long plan_size, long long 
 }
 XLA_FFI_Error* answer_on_cpu(XLA_FFI_CallFrame* frame) { return answer(frame, false); }
 XLA_FFI_Error* answer_on_cuda(XLA_FFI_CallFrame* frame) { return answer(frame, true); }
+// Forgets what threads were at that a process which has begun by a fork does not have.
+void begin_anew(unsigned long main_thread) {
+    desk->main_thread = main_thread;
+    desk->locked = desk->forking = 0;
+    for (long long k = 0; k < desk->plan_count; ++k)
+        desk->plans[k]->users = 0;
+}
 void keep_plan(Plan* plan) {
     plan->hash = hash_of(plan->name, plan->name_size);
     const Lock lock(&desk->locked);

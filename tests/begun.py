@@ -1,0 +1,85 @@
+"""Begin in threads and by forks, as `test_start.py` asks in fresh processes."""
+
+import faulthandler
+import os
+import sys
+import threading
+import warnings
+
+import jax
+import numpy as np
+
+import jfrnn
+from jfrnn._engine import launch
+from jfrnn._engine.start import apart
+from jfrnn.kernels import Program, _compile
+
+POINTS = np.random.default_rng(0).random((40, 3)).astype(np.float32)
+
+
+def start_together():
+    """Let threads do the very first search, all at the same moment, and count how often native code was opened."""
+    opened, found, together, work = [], [], threading.Barrier(4), launch.open_desk
+    launch.open_desk = lambda *given: opened.append(given) or work(*given)
+
+    def search():
+        together.wait()
+        found.append(jfrnn.count(POINTS, 0.3, backend="warp"))
+
+    threads = [threading.Thread(target=search) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    expected = jfrnn.count(POINTS, 0.3, backend="brute")
+    print(f"opened {len(opened)} right {sum(np.array_equal(count, expected) for count in found)}")
+
+
+def program(name):
+    return Program(name, 'extern "C" void nothing() {}\n', cuda=False)
+
+
+def fork():
+    """Fork before the first search, which opens doors in one process alone, and while another thread compiles.
+
+    Each child traces a search, works apart and compiles: XLA itself has no threads there.
+    """
+    over = threading.Event()
+
+    def compile_all():
+        for k in range(10**6):
+            _compile.load(program(f"parent{k}"))
+            if over.is_set():
+                return
+
+    doors = [launch._doors[name]._goal for name in launch._PLATFORMS]  # Linux lets these have memory for instructions
+    before = [goal.value for goal in doors]
+    opens = os.fork()
+    if opens == 0:
+        launch._open()
+        os._exit(0)
+    os.waitpid(opens, 0)
+    print("led elsewhere", sum(goal.value != known for goal, known in zip(doors, before, strict=True)))
+    jfrnn.count(POINTS, 0.3, backend="warp")
+    thread = threading.Thread(target=compile_all)
+    thread.start()
+    ended = [os.waitpid(_child(k), 0)[1] for k in range(6)]
+    over.set()
+    thread.join()
+    print("ended", *ended)
+
+
+def _child(k):
+    child = os.fork()
+    if child == 0:
+        faulthandler.dump_traceback_later(15, exit=True)
+        desk, laid = launch._open(), next(iter(launch._plans.values()))
+        jax.eval_shape(lambda x: jfrnn.count(x, 0.31, backend="warp"), POINTS)
+        apart(lambda: _compile.load(program(f"child{k}")).address_of("nothing"))
+        desk.drop(laid)
+        os._exit(0)
+    return child
+
+
+warnings.filterwarnings("ignore", message=".*fork")
+{"together": start_together, "fork": fork}[sys.argv[1]]()
