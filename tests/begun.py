@@ -4,6 +4,7 @@ import faulthandler
 import os
 import sys
 import threading
+import time
 import warnings
 
 import jax
@@ -81,5 +82,28 @@ def _child(k):
     return child
 
 
+def end():
+    """End while a search, whose result nobody waits for, asks for a plan."""
+
+    @jax.jit
+    def search(x):  # with a product that makes XLA go on behind the call
+        return jfrnn.count(x, 0.3, backend="warp").sum() + (x @ x.T).sum().astype(np.int32)
+
+    def keep(*given):
+        asked.set()
+        time.sleep(0.5)
+        work(*given)
+
+    asked, work, x = threading.Event(), launch._keep_plan, jax.device_put(np.resize(POINTS, (8000, 3)))
+    search(x).block_until_ready()
+    for key in list(launch._plans):
+        launch._open().drop(launch._plans.pop(key))
+    launch._keep_plan = keep
+    faulthandler.dump_traceback_later(15, exit=True)
+    search(x)
+    asked.wait()
+    print("ends")
+
+
 warnings.filterwarnings("ignore", message=".*fork")
-{"together": start_together, "fork": fork}[sys.argv[1]]()
+{"together": start_together, "fork": fork, "end": end}[sys.argv[1]]()

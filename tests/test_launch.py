@@ -232,10 +232,21 @@ def test_what_python_leaves_unanswered_is_told_to_xla(native, monkeypatch):
     ignored = []
     monkeypatch.setattr(sys, "unraisablehook", lambda given: ignored.append(given.exc_value))
     native.refused = KeyboardInterrupt()
-    assert native.call("dropped@here") == b"dropped: Python stopped before it had answered. Call again."
+    assert native.call("dropped@here") == b"dropped: Python ended, or stopped, before it had answered."
     assert ignored == [native.refused]
     native.refused = None
     assert native.call("dropped@here", 1000) is None
+
+
+def test_at_the_end_of_python_other_threads_than_the_main_one_ask_no_more(native):
+    native.keep("known@", 0, Plan([native.step(1)], {"number": 1}))
+    native.desk.close()
+    with ThreadPoolExecutor(1) as other:
+        unknown = other.submit(native.call, "unknown@here").result()
+        assert other.submit(native.call, "known@").result() is None
+    assert unknown == b"unknown: Python ended, or stopped, before it had answered."
+    assert native.made == []
+    assert native.call("unknown@here") is None
 
 
 def test_the_version_of_the_interface_is_told(native):

@@ -118,6 +118,10 @@ def test_threads_that_search_first_at_the_same_moment_start_all_once():
     assert begin("together") == (["opened 1 right 4"], "")
 
 
+def test_a_process_ends_while_results_that_nobody_waits_for_need_python():
+    assert begin("end") == (["ends"], "")
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="forks with memory for instructions")
 def test_processes_that_fork_share_no_door_and_leave_no_lock_behind():
     assert begin("fork") == (["led elsewhere 0", "ended 0 0 0 0 0 0"], "")

@@ -289,6 +289,7 @@ def _opened() -> Desk:
     desk = open_desk(compiler().load_launcher(header), _address(_behind_desk[0]), _address(_behind_desk[1]), _MOST)
     for name, address in zip(_PLATFORMS, desk.handlers, strict=True):
         _doors[name].lead_to(address)
+    atexit.register(desk.close)
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=desk.begin_anew)
     return desk

@@ -121,6 +121,8 @@ class _Desk(ctypes.Structure):
         ("main_thread", ctypes.c_ulong),
         ("locked", ctypes.c_int),
         ("forking", ctypes.c_int),
+        ("asking", ctypes.c_int),
+        ("closed", ctypes.c_int),
     )
 
 
@@ -193,6 +195,7 @@ class Desk:
     _keep: Callable[[int], None]
     _drop: Callable[[int], None]
     _begin_anew: Callable[[int], None]
+    close: Callable[[], None]  # let Python end: waits for what it was asked, and answers other threads than the main one no more
 
     def keep(self, laid: LaidPlan) -> None:
         """Let calls find a plan."""
@@ -235,7 +238,8 @@ def open_desk(library: "Library", make_plan: int, serve: int, most: int) -> Desk
     keep, drop = (change(library.address_of(name)) for name in ("keep_plan", "drop_plan"))
     begin_anew = ctypes.CFUNCTYPE(None, ctypes.c_ulong)(library.address_of("begin_anew"))
     handlers = library.address_of("answer_on_cpu"), library.address_of("answer_on_cuda")
-    return Desk(handlers, desk, [library, plans], keep, drop, begin_anew)
+    close = ctypes.CFUNCTYPE(None)(library.address_of("close_desk"))
+    return Desk(handlers, desk, [library, plans], keep, drop, begin_anew, close)
 
 
 def _address(library: ctypes.CDLL, name: str) -> int | None:

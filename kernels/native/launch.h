@@ -55,6 +55,7 @@ struct Desk {
     long long plan_count;
     unsigned long main_thread;
     int locked, forking;
+    int asking, closed;  // questions that are open, and whether there will be no more answers
 };
 static Desk* desk;
 
@@ -208,7 +209,7 @@ struct Question {
     int device;
     void* stream;
     void* const* arrays;  // of a call that is to be served; none: for a plan
-    char wrong[MOST_WORDS] = "Python stopped before it had answered. Call again.";
+    char wrong[MOST_WORDS] = "Python ended, or stopped, before it had answered.";
     void* answered = nullptr;
 
     void ask() {
@@ -225,7 +226,15 @@ struct Question {
     // Asks, on another thread where this is the main one: there Python runs handlers of signals, and what they raise would be raised
     // in the midst of the answer, and be lost. They run when this call has ended.
     bool succeeds() {
-        if (desk->this_thread() == desk->main_thread && desk->is_alive() && !desk->has_lock())
+        const bool on_main = desk->this_thread() == desk->main_thread;
+        __atomic_fetch_add(&desk->asking, 1, __ATOMIC_SEQ_CST);
+        if (on_main || !__atomic_load_n(&desk->closed, __ATOMIC_SEQ_CST))
+            wait(on_main && desk->is_alive() && !desk->has_lock());
+        __atomic_fetch_sub(&desk->asking, 1, __ATOMIC_SEQ_CST);
+        return wrong[0] == 0;
+    }
+    void wait(bool apart) {
+        if (apart)
             answered = desk->make_lock();
         if (answered == nullptr)
             ask();
@@ -238,7 +247,6 @@ struct Question {
             desk->give_lock(answered);
             desk->free_lock(answered);
         }
-        return wrong[0] == 0;
     }
     XLA_FFI_Error* fail(const Call& call) const {
         Message message;
@@ -409,9 +417,15 @@ XLA_FFI_Error* answer_on_cuda(XLA_FFI_CallFrame* frame) { return answer(frame, t
 // Forgets what threads were at that a process which has begun by a fork does not have.
 void begin_anew(unsigned long main_thread) {
     desk->main_thread = main_thread;
-    desk->locked = desk->forking = 0;
+    desk->locked = desk->forking = desk->asking = 0;
     for (long long k = 0; k < desk->plan_count; ++k)
         desk->plans[k]->users = 0;
+}
+// Waits for all answers, and lets other threads than the main one ask no more: at its end, Python does not come back to them.
+void close_desk() {
+    __atomic_store_n(&desk->closed, 1, __ATOMIC_SEQ_CST);
+    while (__atomic_load_n(&desk->asking, __ATOMIC_SEQ_CST) > 0)
+        desk->yield();
 }
 void keep_plan(Plan* plan) {
     plan->hash = hash_of(plan->name, plan->name_size);
