@@ -21,6 +21,7 @@ _POINTER, _INTEGER = 8, 4  # bytes
 _CONSTRUCTOR = r"explicit {struct}\(const (\w+)&"
 _HELD = r"^struct {struct}\b[^{{;]*{{\n\s+const (\w+Arguments) given;"
 _FIELDS = r"^struct {struct} {{\n(.*?)^}};"
+_NAME = re.compile(r"^\s*(\*?)\s*([A-Za-z_]\w*)\s*$")  # as in `int* a`, or `int *a, *b`
 _LINE = re.compile(r"^\s*(?:const )?(real|int|whole)\b(.*);$")
 
 
@@ -51,10 +52,17 @@ class Kernel(NamedTuple):
     block: int = 1
 
     def pack(self, given: Mapping[str, int]) -> bytearray:
-        """Return the bytes of all arguments: integers, and addresses of arrays, 0 where none is given."""
+        """Return the bytes of all arguments: integers, and addresses of arrays, 0 where none is given.
+
+        Raises:
+            ValueError: An integer is missing, or does not fit into 32 bits.
+        """
         packed = bytearray(self.size)
         for field in self.fields:
-            value, size = (given.get(field.name, 0), _POINTER) if field.is_array else (given[field.name], _INTEGER)
+            if not field.is_array and not -(1 << 31) <= given.get(field.name, 1 << 31) < 1 << 31:
+                told = f"must be an integer of 32 bits, got {given[field.name]}" if field.name in given else "is missing"
+                raise ValueError(f"the argument {field.name!r} of the kernel {self.name} {told}")
+            value, size = given.get(field.name, 0), _POINTER if field.is_array else _INTEGER
             packed[field.place : field.place + size] = int(value).to_bytes(size, sys.byteorder, signed=not field.is_array)
         return packed
 
@@ -85,9 +93,10 @@ def declare(name: str, text: str, *entries: Entry | str, cuda: bool = False, fus
     called = [Entry(entry) if isinstance(entry, str) else entry for entry in entries]
     given = [_find_arguments(text, entry.method.split(".")[0]) for entry in called]
     lines = [_write_entry(entry, arguments, cuda) for entry, arguments in zip(called, given, strict=True)]
-    whole = "\n".join([resolve("c_library.h"), "namespace {", text, "}", *lines, ""])
-    program = Program(name, whole, cuda, fused)
     found = [read_fields(text, arguments) for arguments in given]
+    checks = dict.fromkeys(_write_check(arguments, *read) for arguments, read in zip(given, found, strict=True))
+    whole = "\n".join([resolve("c_library.h"), "namespace {", text, *checks, "}", *lines, ""])
+    program = Program(name, whole, cuda, fused)
     return [Kernel(program, x.name, fields, size, x.block) for x, (fields, size) in zip(called, found, strict=True)]
 
 
@@ -118,12 +127,10 @@ def _read_names(struct: str, lines: list[str]) -> Iterable[tuple[str, bool]]:
         if not code:
             continue
         match = _LINE.match(code)
-        names = [] if match is None else [name.strip() for name in match[2].split(",")]
-        if match is None or (match[1] != "int" and not all(name.startswith("*") for name in names)):
+        names = [] if match is None else [_NAME.match(name) for name in match[2].split(",")]
+        if match is None or not all(name and (name[1] or match[1] == "int") for name in names):
             raise ValueError(f"{struct} must hold arrays of real and int, and integers alone, got {code.strip()!r}")
-        first = match[2].startswith("*")  # as in `int* a`, or `int *a, *b`
-        for k, name in enumerate(names):
-            yield name.lstrip("* "), name.startswith("*") or (k == 0 and first)
+        yield from ((name[2], name[1] == "*") for name in names if name)
 
 
 def _find_arguments(text: str, struct: str) -> str:
@@ -135,6 +142,14 @@ def _find_arguments(text: str, struct: str) -> str:
     if base is None:
         raise ValueError(f"no struct {struct} that is made of arguments in the program")
     return _find_arguments(text, base[1])
+
+
+def _write_check(arguments: str, fields: Iterable[Field], size: int) -> str:
+    """Let the compiler, which knows it, confirm what was read."""
+    places = [f"__builtin_offsetof({arguments}, {field.name}) == {field.place}" for field in fields]
+    sizes = [f"sizeof({arguments}::{field.name}) == {_POINTER if field.is_array else _INTEGER}" for field in fields]
+    whole = f"(sizeof({arguments}) + {_POINTER - 1}) / {_POINTER} * {_POINTER} == {size}"
+    return f'static_assert({" && ".join([whole, *places, *sizes])}, "arguments were read wrongly");'
 
 
 def _write_entry(entry: Entry, arguments: str, cuda: bool) -> str:
