@@ -9,9 +9,11 @@ halves.
 import atexit
 import functools
 import hashlib
+import os
 import platform
 import shutil
 import tempfile
+import threading
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -26,6 +28,8 @@ from jfrnn.kernels.launch import launcher
 _FOLDER = "wp_jfrnn"
 _END = b"\n//"  # a comment of PTX, and nothing to objects
 _DIGEST = 64  # hexadecimal digits
+_ROOM = 1 << 22  # bytes that a compiler may need
+_ATTEMPTS = 10
 _loaded: weakref.WeakValueDictionary[tuple[Program, str], "Library"] = weakref.WeakValueDictionary()
 
 
@@ -159,7 +163,7 @@ def temporary_folder() -> str:
     try:
         folder = tempfile.mkdtemp(prefix="jfrnn-warp-")
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        (Path(folder) / "room").write_bytes(bytes(1 << 20))
+        _check_room(Path(folder))
     except OSError as error:
         raise RuntimeError(f"{place} cannot be written, nor is there a temporary one ({error}). {hint}.") from error
     _folders().append(Path(folder))
@@ -192,7 +196,9 @@ def _compile(program: Program, target: tuple[str, str], path: Path) -> Path:
         RuntimeError: It does not compile.
     """
     kind, arch = target
-    with _new_folder(path) as folder:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tempfile.TemporaryFile(dir=path.parent).close()  # before the compiler has worked for nothing
+    with _new_folder(path.parent) as folder:
         source, binary = folder / f"program.{'cu' if program.cuda else 'cpp'}", folder / f"program{kind}"
         source.write_text(program.text, "utf-8")
         try:
@@ -207,16 +213,29 @@ def _compile(program: Program, target: tuple[str, str], path: Path) -> Path:
         whole = binary.read_bytes()
         if not whole:
             raise OSError(f"{binary} is empty")
-        binary.write_bytes(whole + _END + hashlib.sha256(whole).hexdigest().encode())
-        binary.replace(path)
+    _put(path, whole + _END + hashlib.sha256(whole).hexdigest().encode())
     return path
 
 
 @contextmanager
-def _new_folder(path: Path) -> Iterator[Path]:
-    """Make the folder of a file, and one beside it that is gone afterwards."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    folder = Path(tempfile.mkdtemp(dir=path.parent))
+def _new_folder(place: Path) -> Iterator[Path]:
+    """Make a folder for a compiler, which is gone afterwards.
+
+    Clang ends the process where it cannot write. So there is room, and the folder is none in which others clear kernels, unless
+    there is no other.
+    """
+    for parent in (None, place):
+        folder = None
+        try:
+            folder = Path(tempfile.mkdtemp(prefix="jfrnn-", dir=parent))
+            _check_room(folder)
+            break
+        except OSError:
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+            if parent is not None:
+                raise
+    assert folder is not None
     try:
         yield folder
     finally:
@@ -224,8 +243,26 @@ def _new_folder(path: Path) -> Iterator[Path]:
 
 
 def _check_room(folder: Path) -> None:
-    """Raise an OSError where compilers failed for want of room."""
-    (folder / "room").write_bytes(bytes(1 << 22))
+    """Raise an OSError where a compiler has no room."""
+    (folder / "room").write_bytes(bytes(_ROOM))
+    (folder / "room").unlink()
+
+
+def _put(path: Path, data: bytes) -> None:
+    """Write a file that others see as a whole, into a folder that others may clear."""
+    part = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}")
+    for attempt in range(_ATTEMPTS):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part.write_bytes(data)
+            part.replace(path)
+            return
+        except FileNotFoundError:
+            if attempt == _ATTEMPTS - 1:
+                raise
+        except OSError:
+            part.unlink(missing_ok=True)
+            raise
 
 
 def _is_whole(path: Path) -> bool:

@@ -2,6 +2,7 @@
 
 import faulthandler
 import os
+import shutil
 import sys
 import threading
 import time
@@ -105,5 +106,25 @@ def end():
     print("ends")
 
 
+def clear():
+    """Compile while another process clears the folder in which kernels are kept."""
+    work, folder = _compile._clang.compile_object, _compile.kernel_folder() / _compile._FOLDER
+
+    def compile_in_vain(*given, **more):
+        shutil.rmtree(folder)
+        work(*given, **more)
+
+    _compile._clang.compile_object = compile_in_vain
+    print("cleared", _compile.load(program("cleared")).address_of("nothing") > 0, len([*folder.iterdir()]))
+
+
+def fill():
+    """Compile what a disk has no room for."""
+    try:
+        _compile.load(Program("filled", 'extern "C" char many[1 << 20] = {1};\n', cuda=False))
+    except RuntimeError as error:
+        print(error)
+
+
 warnings.filterwarnings("ignore", message=".*fork")
-{"together": start_together, "fork": fork, "end": end}[sys.argv[1]]()
+{"together": start_together, "fork": fork, "end": end, "clear": clear, "fill": fill}[sys.argv[1]]()

@@ -1,6 +1,7 @@
 """How Warp starts where its folder cannot be written or holds damaged files, and what it says; each in a fresh process."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -120,6 +121,16 @@ def test_threads_that_search_first_at_the_same_moment_start_all_once():
 
 def test_a_process_ends_while_results_that_nobody_waits_for_need_python():
     assert begin("end") == (["ends"], "")
+
+
+def test_a_folder_that_is_cleared_while_a_compiler_works_holds_the_program_afterwards(tmp_path):
+    assert run(BEGUN, "clear", cache=tmp_path) == (["cleared True 1"], "")
+
+
+def test_a_compiler_without_room_does_not_end_the_process(tmp_path):
+    (told,), errors = run(BEGUN, "fill", cache=tmp_path, limits="ulimit -f 512;")
+    assert re.match("the folder in which .* cannot be written, nor is there a temporary one .* Set .* WARP_CACHE_PATH to", told)
+    assert errors == ""
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks with memory for instructions")
