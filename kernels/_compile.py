@@ -262,6 +262,8 @@ def _put(path: Path, data: bytes) -> None:
                 raise
         except OSError:
             part.unlink(missing_ok=True)
+            if _is_whole(path):  # another process was first, and has it open, which Windows does not let go
+                return
             raise
 
 

@@ -3,6 +3,7 @@
 import ctypes
 import functools
 import sys
+import types
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from jfrnn._engine import Clear, Launch, Plan, plans
+from jfrnn._engine import Clear, Launch, Plan, launch, plans
 from jfrnn._engine.start import load_warp
 from jfrnn.kernels import Field, Kernel, Program, _compile
 from jfrnn.kernels.launch import write_launcher
@@ -214,7 +215,7 @@ def test_an_unknown_name_is_asked_for_once_per_device(native):
 def test_programs_that_are_made_ready_ask_and_launch_nothing(native):
     assert native.call("ready@", stage=INSTANTIATE) is None
     assert native.call("ready@", stage=INSTANTIATE, cuda=False) is None
-    assert [device for _, _, device in native.made] == [0, -1]
+    assert [device for _, _, device in native.made] == [-2, -1]  # the first one of those that the process uses
     assert native.events() == []
 
 
@@ -284,3 +285,18 @@ def test_plans_are_dropped_while_others_call(native):
         assert all(call.result() is None for call in calls)
     assert total[0] == 2000
     assert native.made == []
+
+
+def test_a_program_for_cuda_is_made_ready_on_a_device_of_the_process(monkeypatch):
+    """Processes of one host have a device each, by its number on the host."""
+    found, shapes, laid = launch.Call("ready", ["x"], {}, lambda *_: Plan([], {})), {"x": (3,)}, []
+    monkeypatch.setattr(launch, "_read_call", lambda name, recipe: (found, shapes))
+    monkeypatch.setattr(launch, "multiprocessors_of", lambda device: laid.append(device) or 1)
+    monkeypatch.setattr(
+        jax, "local_devices", lambda backend: [types.SimpleNamespace(local_hardware_id=3)] if backend == "cuda" else 1 / 0
+    )
+    monkeypatch.setattr(plans, "cuda_driver", lambda: ctypes.pythonapi)
+    launch._keep_plan("ready@here@3", "made so", -2)
+    launch._keep_plan("ready@here@3", "made so", 3)
+    launch._open().drop(launch._plans.pop(("ready@here@3", 3)))
+    assert laid == [3]

@@ -56,7 +56,6 @@ class Call(NamedTuple):
     serve: Callable[[Shapes, Mapping[str, int], int, int], None] | None = None
 
 
-_makers: dict[str, Callable[..., Callable[..., Any]]] = {}
 _calls: dict[str, Callable[..., Call]] = {}
 _MOST = 512  # plans that are kept, as many as compiled programs: what a program calls that is gone is made again
 
@@ -181,9 +180,14 @@ def _serve(name: int, name_size: int, device: int, stream: int | None, arrays: A
     _answer(work, wrong)
 
 
+_ON_FIRST = -2  # in place of a device's number: the first one that the process uses
+
+
 def _keep_plan(name: str, recipe: str, device: int) -> None:
     found, shapes = _read_call(name, recipe)
     desk = _open()
+    if device == _ON_FIRST:
+        device = jax.local_devices(backend="cuda")[0].local_hardware_id  # there may be others, that are not for this process
     with one_at_a_time:
         if (name, device) in _plans:
             return

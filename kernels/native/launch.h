@@ -59,6 +59,7 @@ struct Desk {
 };
 static Desk* desk;
 
+static constexpr int ON_CPU = -1, ON_FIRST = -2;  // in place of the number of a CUDA device; the first one that a process uses
 static constexpr int MOST_ARRAYS = 48, MOST_BYTES = 1024, MOST_WORDS = 1024;
 
 struct Lock {
@@ -381,7 +382,11 @@ static XLA_FFI_Error* answer(XLA_FFI_CallFrame* frame, bool cuda) {
     if (!executes && frame->stage != XLA_FFI_ExecutionStage_INSTANTIATE)
         return nullptr;
     const XLA_FFI_ByteSpan name = call.text("kernel");
-    const int device = !cuda ? -1 : executes ? call.device() : 0;  // a program that is made is most likely for the first one
+    if (!executes && cuda) {  // XLA does not say for which device a program is made: most likely for the first one
+        Question question = {name, call.text("recipe"), ON_FIRST, nullptr, nullptr};
+        return question.succeeds() ? nullptr : question.fail(call);
+    }
+    const int device = cuda ? call.device() : ON_CPU;
     Plan* plan = enter(name, device);
     while (plan == nullptr) {
         Question question = {name, call.text("recipe"), device, nullptr, nullptr};
