@@ -44,11 +44,11 @@ def stop(*_):
 
 
 def interrupted(given):
-    """Return what a compiled program gives that was interrupted when it was loaded, while Warp started."""
+    """Return what a compiled program gives that was interrupted when it was loaded, while native code was compiled or loaded."""
     gc.disable()  # Python drops what is raised while it collects garbage
     signal.signal(signal.SIGALRM, stop)
     try:
-        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        signal.setitimer(signal.ITIMER_REAL, 0.02)
         serialize_executable.deserialize_and_load(*given)
     except TimeoutError:
         return serialize_executable.deserialize_and_load(*given)(points())
