@@ -3,6 +3,7 @@
 import ctypes
 import gc
 import math
+import os
 import resource
 import sys
 from collections.abc import Callable, Sequence
@@ -103,10 +104,10 @@ class Bystanders:
         return max(busy - own, 0.0) / wall if wall >= self.SHORTEST else None
 
     def _read(self) -> tuple[float, float, float]:
-        """Return wall time, busy time of all cores and time of this process [s]."""
-        times = psutil.cpu_times()
-        kinds = ("user", "nice", "system", "irq", "softirq", "steal")
-        return perf_counter(), sum(getattr(times, kind, 0.0) for kind in kinds), process_time()
+        """Return wall time, busy time of all cores, and time of this process and of those that it has waited for [s]."""
+        times, kinds = psutil.cpu_times(), ("user", "nice", "system", "irq", "softirq", "steal")
+        own = process_time() + os.times().children_user + os.times().children_system
+        return perf_counter(), sum(getattr(times, kind, 0.0) for kind in kinds), own
 
 
 def repeat(

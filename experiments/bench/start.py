@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 import typer
 
-from experiments import _machine
+from experiments import _machine, _measure
 from experiments._errors import UsageError
 from experiments.bench import first_result, table
 
@@ -25,7 +25,7 @@ WHAT = ("search", "gradient")
 PARTS = ("import_jax_s", "array_s", "import_jfrnn_s", "first_s", "again_s", "process_s")
 COLUMNS = (
     *("platform", "who", "what", "cache", "repeat", "wait_s", *PARTS, "said_lines", "answer", "status", "reason"),
-    *("device", "jax", "warp", "commit", "dirty"),
+    *("others_cores", "device", "jax", "warp", "commit", "dirty"),
 )
 ROOT = Path(__file__).resolve().parents[2]
 _MOST_S = 300  # of a process
@@ -83,17 +83,17 @@ def measure_process(what: str, packages: Path, kernels: Path) -> table.Line:
     environment = {name: value for name, value in os.environ.items() if name not in not_given}
     environment |= {"PYTHONPATH": str(packages), "WARP_CACHE_PATH": str(kernels), "CUDA_CACHE_PATH": str(kernels / "cuda")}
     words = [sys.executable, "-P", "-W", "error::RuntimeWarning", first_result.__file__, what]
-    begin = perf_counter()
+    begin, bystanders = perf_counter(), _measure.Bystanders()
     try:
         done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment, cwd=kernels, timeout=_MOST_S)
     except subprocess.TimeoutExpired:
         return {"status": "timeout", "reason": f"no result in {_MOST_S} s"}
-    seconds, lines = perf_counter() - begin, done.stdout.splitlines()
+    seconds, lines, others = perf_counter() - begin, done.stdout.splitlines(), bystanders.cores()
     if done.returncode != 0:
         return {"status": "failed", "reason": " ".join(done.stderr.split())[-300:]}
     row: dict[str, Any] = json.loads(lines[-1])
     row |= {"wait_s": row["import_jfrnn_s"] + row["first_s"], "process_s": seconds, "said_lines": len(lines) - 1}
-    return row | {"status": "ok"}
+    return row | {"others_cores": None if others is None else round(others, 2), "status": "ok"}
 
 
 def _summarize(frame: pd.DataFrame) -> pd.DataFrame:
