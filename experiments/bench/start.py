@@ -73,7 +73,8 @@ def _link(checkout: Path, packages: Path) -> None:
     parts = {part.name: part for part in (checkout / "jfrnn").iterdir()}
     for name, part in (parts | {name: checkout / name for name in ("kernels", "cases")}).items():
         (packages / "jfrnn" / name).symlink_to(part)
-    compileall.compile_dir(packages, quiet=2)  # as an installation does: no process waits for bytecode
+    for name in ("jfrnn", "kernels", "cases"):  # as an installation does: no process waits for bytecode
+        compileall.compile_dir(checkout / name, quiet=2)
 
 
 def measure_process(what: str, packages: Path, kernels: Path) -> table.Line:
