@@ -14,6 +14,9 @@ from pathlib import Path
 _NAMES = {"win32": ("warp.dll", "warp-clang.dll"), "darwin": ("libwarp.dylib", "libwarp-clang.dylib")}
 _LINUX = ("warp.so", "warp-clang.so")
 _TEXT, _FLAG, _NUMBER = ctypes.c_char_p, ctypes.c_bool, ctypes.c_int
+# What Warp compiles kernels with: all instructions of this processor, and functions that are inlined wherever they are called.
+OPTIONS = ("-march=native", "-mllvm", "-inline-threshold=9000", "-mllvm", "-inline-cold-callsite-threshold=3000")
+OPTIONS += ("-mllvm", "-slp-recursion-max-depth=4")
 _COMPILED_WITH = (_TEXT, _TEXT, _TEXT, _TEXT, _FLAG, _FLAG, _FLAG, _FLAG, ctypes.c_void_p, _NUMBER, _FLAG, _FLAG, _TEXT, _NUMBER)
 
 
@@ -98,8 +101,8 @@ def compile_object(text: str, source: Path, target: Path, fused: bool) -> None:
         RuntimeError: It does not compile.
     """
     files = str(source).encode(), str(warp_root() / "native").encode(), str(target).encode()
-    no_more_flags = (ctypes.c_char_p * 1)(None)
-    options = False, False, fused, True, ctypes.addressof(no_more_flags), 2, False, False, None, 256
+    flags = (ctypes.c_char_p * (len(OPTIONS) + 1))(*(option.encode() for option in OPTIONS), None)
+    options = False, False, fused, True, ctypes.addressof(flags), 2, False, False, None, 256
     if _library().wp_compile_cpp(text.encode(), *files, *options):
         raise RuntimeError("see what Clang says on standard error")
 

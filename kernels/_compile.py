@@ -173,7 +173,7 @@ def temporary_folder() -> str:
 def _target(program: Program, device: Any, arch: int | None) -> tuple[str, str]:
     """Return the kind of file, and what it runs on: objects use all instructions of the processor that compiles them."""
     if not program.cuda:
-        return ".o", _processor()
+        return ".o", " ".join((*_clang.OPTIONS, _processor()))
     if arch is not None:
         return ".ptx", str(arch)
     return f".{device.get_cuda_output_format()}", str(device.get_cuda_compile_arch())
