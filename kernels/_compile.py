@@ -120,6 +120,11 @@ def kernel_folder() -> Path:
     return _folders()[-1]
 
 
+def keeps_no_programs() -> bool:
+    """Say whether programs are kept for this process alone, since their folder could not be written."""
+    return len(_folders()) > 1
+
+
 @functools.cache
 def _folders() -> list[Path]:
     """Return where programs are kept, in a list of which the last one counts."""

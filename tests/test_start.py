@@ -64,6 +64,26 @@ def test_in_a_folder_that_can_only_be_read_kernels_are_compiled_elsewhere(read_o
     assert errors.count("RuntimeWarning: the folder in which Warp keeps compiled kernels,") == 1
 
 
+BOTH = """
+import warnings
+import numpy as np
+import jfrnn
+
+x = np.zeros((8, 2), np.float32)
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    print(*(int(jfrnn.count(x, 0.2, backend=backend)[0]) for backend in ("warp", "hashgrid")))
+print(len(caught), caught[0].message)
+"""
+
+
+def test_without_a_folder_kernels_and_warp_share_one_warning(nowhere):
+    (counts, warned), errors = run("-c", BOTH, cache=nowhere)
+    assert counts == "7 7"
+    assert warned.startswith(f"1 the folder in which Warp keeps compiled kernels, {nowhere}/")
+    assert errors == ""
+
+
 def test_without_any_folder_auto_takes_jax_with_one_warning_and_warp_says_what_to_set(nowhere):
     code = "\ntry:\n    choose('warp')\nexcept RuntimeError as error:\n    print(error)\nchoose('auto')\nchoose('auto')"
     (refused, answer, warned, again), errors = run("-c", CHOOSE + code, cache=nowhere, limits="ulimit -f 0;")

@@ -86,8 +86,8 @@ def _init(warp: ModuleType) -> str | None:
         try:
             warp.init()
         except OSError:
-            warning = compiler().temporary_folder()
-            warp.config.kernel_cache_dir = str(compiler().kernel_folder())
+            warning = None if compiler().keeps_no_programs() else compiler().temporary_folder()
+            warp.config.kernel_cache_dir = str(compiler().kernel_folder() / "warp")  # it wonders about others' files beside its own
             warp.init()
     except RuntimeError:
         warp.config.kernel_cache_dir = given  # what it makes of the path, it would make again of that
