@@ -78,16 +78,6 @@ def _library() -> ctypes.CDLL:
     return clang
 
 
-def check_compiler() -> None:
-    """Load the compiler, if it is not yet there.
-
-    Raises:
-        ImportError: Warp is not installed.
-        RuntimeError: It has no compiler for the CPU, or that cannot be loaded.
-    """
-    _library()
-
-
 def compile_object(text: str, source: Path, target: Path, fused: bool) -> None:
     """Compile C++ for this processor.
 

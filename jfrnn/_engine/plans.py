@@ -59,9 +59,9 @@ class Plan(NamedTuple):
     absent: Sequence[str] = ()
 
 
-def share(kernel: Kernel, places: int, each: int = PLACES_PER_THREAD, **numbers: int) -> Launch:
+def share(kernel: Kernel, places: int, each: int = PLACES_PER_THREAD) -> Launch:
     """Return the launch of a kernel of the CPU whose work threads share, at least `each` places a thread."""
-    return Launch(kernel, -(-places // each), numbers)
+    return Launch(kernel, -(-places // each))
 
 
 def ask_for_huge_pages(array: str, size: int) -> list[HugePages]:

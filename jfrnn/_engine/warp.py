@@ -164,7 +164,8 @@ def _absent(variant: Variant) -> list[str]:
 
 def _plan_on_cuda(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan:
     kind = {"periodic": variant.periodic, "batched": variant.batched}
-    kernels = cells_cuda.cell_kernels(variant[0], variant.double, variant.scaled, variant.lists, variant.keep.later_only, **kind)
+    dim, later = variant.dim, variant.keep.later_only
+    kernels = cells_cuda.cell_kernels(dim, variant.double, variant.scaled, variant.lists, later, **kind)
     numbers = _numbers(variant, shapes)
     return Plan(
         place_launches(kernels.launches(numbers["n"], numbers["m"], variant.own, multiprocessors)), numbers, _absent(variant)

@@ -1,4 +1,5 @@
-// How a call of XLA becomes launches of kernels: native code on the thread of the call, which neither runs nor waits for Python.
+// How a call of XLA becomes launches of kernels: native code on the thread of the call, which neither runs nor waits for Python, but for
+// the two cases that `Desk` names: a plan that is not known yet, and a launch that only Python can make (hash grid).
 //
 // Python lays down a plan for each kernel, for the shapes of a call and, on CUDA, for a device: which functions are launched, in order,
 // and the bytes of their arguments, but for the addresses of arrays, which a call brings. Plans are found by the name that a program
