@@ -35,6 +35,7 @@ class Bench(_commands.Commands):
             "distributed": "Time lists, sums and fluids on 1 to k devices.",
             "domain": "Time what empty space costs.",
             "house": "Count files, lines and floors.",
+            "arrays": "Time the array engine beside jax-md.",
             "latency": "Time calls for few particles.",
             "options": "Time each option of a search.",
             "peers": "Ask other libraries for the hard cases.",

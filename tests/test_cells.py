@@ -8,7 +8,6 @@ import pytest
 
 from jfrnn._geometry import cells as _cells
 from jfrnn._geometry.cutoffs import smallest_cutoff
-from jfrnn._geometry.images import Images
 
 
 def edge_of(cutoff, dtype):
@@ -79,14 +78,8 @@ def test_extent_is_bounded_by_the_particles(dtype, spread):
     assert (extent <= max(_cells._SMALLEST_TABLE, 2 * 50 + 2)).all()
 
 
-def runs_of_brute_force(grid, query):
-    offsets = [(0, dy, dz) for dy in (-1, 0, 1) for dz in (-1, 0, 1)]
-    near = [np.all(np.abs(np.asarray(grid.coords).T - (query + o)) <= [1, 0, 0], axis=1) for o in offsets]
-    return [set(np.flatnonzero(hit).tolist()) for hit in near]
-
-
 @pytest.mark.parametrize("dense", [True, False])
-def test_table_and_binary_search_find_the_same_runs(dense):
+def test_table_and_binary_search_find_the_same_rows(dense):
     rng = np.random.default_rng(4)
     coords = jnp.asarray(rng.integers(1, 6, (3, 80)), jnp.int32)
     finite = jnp.asarray(rng.random(80) > 0.1)
@@ -96,41 +89,12 @@ def test_table_and_binary_search_find_the_same_runs(dense):
     if not dense:
         order = _cells.cell_order(coords, finite, grid.extent, grid.dense)
         np.testing.assert_array_equal(order, grid.order)
-    queries = jnp.asarray(rng.integers(1, 6, (3, 40)), jnp.int32)
-    start, stop, image = _cells.stencil_runs(grid, queries, 3)
-    assert image is None
-    assert start.shape == stop.shape == (40, 9)
-    for q in range(40):
-        found = [set(range(a, b)) for a, b in zip(start[q].tolist(), stop[q].tolist(), strict=True)]
-        assert found == runs_of_brute_force(grid, np.asarray(queries[:, q]))
+    x, y, z = (jnp.asarray(c, jnp.int32)[:, None] for c in rng.integers(1, 6, (3, 40)))
+    start, stop = _cells.places_between(grid, [x - 1, x + 1, y, z])
+    found = [set(range(a, b)) for a, b in zip(start[:, 0].tolist(), stop[:, 0].tolist(), strict=True)]
+    sorted_coords = np.asarray(grid.coords).T
+    for q, of_query in enumerate(found):
+        near = np.abs(sorted_coords - [int(x[q, 0]), int(y[q, 0]), int(z[q, 0])]) <= [1, 0, 0]
+        assert of_query == set(np.flatnonzero(near.all(axis=1)).tolist())
     assert sorted(grid.order.tolist()) == list(range(80))
     assert not finite[grid.order[int(finite.sum()) :]].any()
-
-
-@pytest.mark.parametrize("dense", [True, False])
-@pytest.mark.parametrize(
-    "images", [Images((True,) * 3, True, (1, 1, 1), True), Images((True, False, True), True, (2, 0, 1), False)]
-)
-def test_runs_of_a_torus_meet_every_image_once(dense, images):
-    """Cells within reach, images told apart, against all shifts of all sources."""
-    rng = np.random.default_rng(5)
-    cells = np.array([4, 7, 2]) if images.nearest else np.array([1, 7, 2])
-    low = np.where(images.periodic, 0, 1)  # open axes have a margin
-    high = np.where(images.periodic, cells, cells - 1)
-    coords = jnp.asarray(rng.integers(low, high, (60, 3)).T, jnp.int32)
-    grid = _cells.build_grid(coords, jnp.ones(60, bool), jnp.asarray(cells, jnp.int32), 60)
-    grid = grid._replace(dense=jnp.asarray(dense))
-    queries = rng.integers(low, high, (20, 3))
-    start, stop, image = _cells.stencil_runs(grid, jnp.asarray(queries.T, jnp.int32), 3, images)
-    width = [max(k, 1) for k in images.reach]
-    for q, query in enumerate(queries):
-        found = [
-            (p, c) for a, b, c in zip(start[q].tolist(), stop[q].tolist(), image[q].tolist(), strict=True) for p in range(a, b)
-        ]
-        expected = [
-            (p, code)
-            for code, shift in enumerate(images.shifts)
-            for p in range(60)
-            if (np.abs(np.asarray(grid.coords)[:, p] + shift * cells - query) <= width).all()
-        ]
-        assert sorted(found) == sorted(expected)

@@ -11,7 +11,7 @@ import pytest
 import reference
 
 import jfrnn
-from jfrnn._engine import runs as _runs
+from jfrnn._engine import tuning as _tuning
 from jfrnn._sums import relations as _relations
 from jfrnn._sums import summation as _summation
 from jfrnn.cases.batches import BATCH_CASES
@@ -337,7 +337,7 @@ def test_derivatives_in_a_box(backend, second):
 @pytest.mark.parametrize("backend", ["jax", "list", pytest.param("brute", marks=SLOW)])
 def test_many_blocks(backend, monkeypatch):
     """Blocks of which the last reaches back, in sums over rows and over all pairs."""
-    monkeypatch.setattr(_runs, "_BLOCK_WORDS", 16 * 25)
+    monkeypatch.setattr(_tuning, "CPU", _tuning.CPU._replace(words=64 * 25, few_pairs=0))
     monkeypatch.setattr(_relations, "_LIST_SLOTS", 25 * 32 * 4)
     (x, m), weights = scene(0), jnp.arange(2.0)
     given = {"neighbors": jfrnn.search(x, CUTOFF, capacity=47, backend="warp")} if backend == "list" else {"backend": backend}

@@ -1,6 +1,18 @@
-"""The array engines "jax" and "brute": where the candidates of each query lie among the sorted sources, in array programming."""
+"""The array engines "jax" and "brute": four steps of array programming, wherever XLA runs.
+
+1. Sort: particles are sorted by the number of their cell, and a table tells where each number begins (`jfrnn._geometry.cell_line`).
+2. Stencil: the rows of cells around a query are runs of sorted particles, its candidates (`line_runs`; `find_candidates` below).
+3. Gather: runs are read as words of 16 particles and compared with the cutoff, a bit each (`jfrnn._engine.runs`, `_test`). What
+   rounding leaves open is decided exactly, in one place (`_decide_doubtful`).
+4. Compaction: the k-th neighbor of a query is its k-th set bit (`jfrnn._engine.words.BitRows`).
+
+"brute" has no sorting: all particles are one run. What is chosen by platform stands in `jfrnn._engine.tuning`.
+"""
 
 import dataclasses
+import functools
+import math
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +21,10 @@ from jax import Array, lax
 from jfrnn._engine.candidates import Candidates, Points, Torus
 from jfrnn._engine.problem import Kind, Options, Rows, Search, largest_radius
 from jfrnn._engine.runs import count_neighbors, list_neighbors
+from jfrnn._engine.tuning import Tuning, by_platform
+from jfrnn._engine.words import LANES
 from jfrnn._geometry import (
+    FINE,
     Axes,
     Batch,
     CellAxes,
@@ -19,15 +34,14 @@ from jfrnn._geometry import (
     Levels,
     Status,
     Wrapped,
-    build_grid,
     cell_edge,
-    cell_order,
     fractions_of,
-    grid_coordinates,
     level_runs,
+    line_runs,
     open_axes,
+    sort_along_line,
     sort_by_levels,
-    stencil_runs,
+    sort_queries,
     translation,
     unpack_turns,
 )
@@ -57,14 +71,27 @@ class ArrayEngine:
 
     def rows(self, search: Search, options: Options, capacity: int | None) -> Rows:
         """Find the candidates of every query, and keep those that are neighbors."""
-        candidates = find_candidates(search, self.by_cells)
+
+        def on(tuning: Tuning) -> Callable[[Search], Rows]:
+            return functools.partial(self._rows, options, capacity, tuning)
+
+        return by_platform(on, search._replace(checks={}))
+
+    def _rows(self, options: Options, capacity: int | None, tuning: Tuning, search: Search) -> Rows:
+        candidates = find_candidates(search, self.by_cells and not is_few(search, tuning), tuning)
         if capacity is None:
-            return complete_rows(search, None, count_neighbors(candidates, search.cutoff, options.filter), None)
-        return complete_rows(search, *list_neighbors(candidates, search.cutoff, options.filter, capacity), capacity)
+            return complete_rows(search, None, count_neighbors(candidates, search.cutoff, options.filter, tuning), None)
+        return complete_rows(search, *list_neighbors(candidates, search.cutoff, options.filter, capacity, tuning), capacity)
 
     def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool) -> int | None:
         """Return None: only the compiler knows."""
         return None
+
+
+def is_few(search: Search, tuning: Tuning) -> bool:
+    """Say whether testing all pairs takes less time than sorting."""
+    images = 1 if search.torus is None else search.torus[0].images.total
+    return math.prod(search.sizes) * images <= tuning.few_pairs
 
 
 def complete_rows(search: Search, idx: Array | None, count: Array, capacity: int | None) -> Rows:
@@ -76,7 +103,7 @@ def complete_rows(search: Search, idx: Array | None, count: Array, capacity: int
     return Rows(idx, count, required, status.astype(jnp.int32))
 
 
-def find_candidates(search: Search, by_cells: bool) -> Candidates:
+def find_candidates(search: Search, by_cells: bool, tuning: Tuning) -> Candidates:
     """Return the candidates of each query: all sources (brute force), by cells, or by cells of many sizes."""
     sources, queries, cutoff, batch, given, _ = search
     torus = None if given is None else _torus(sources, queries, *given)
@@ -85,11 +112,12 @@ def find_candidates(search: Search, by_cells: bool) -> Candidates:
         return _all_sources(*clouds, cutoff, batch, torus)
     if isinstance(cutoff, Cutoff):
         along, axes = _cells_along(sources, queries, cutoff, given)
-        return _cell_stencil(*clouds, along, axes.cells, batch, torus)
+        return _cell_stencil(*clouds, along, axes.cells, batch, torus, tuning)
     images, levels = None if torus is None else torus.images, levels_of(search)
     points = _in_order(clouds[0], levels.order, cutoff.sources)
     rows = _in_order(clouds[0] if clouds[1] is None else clouds[1], levels.query_order, cutoff.queries)
-    return Candidates(points, rows, level_runs(levels, cutoff, images), torus, levels.passes)
+    words = {2: 16, 3: 64}[sources.shape[1]]
+    return Candidates(points, rows, level_runs(levels, cutoff, images), torus, len(sources), lambda _: words, levels.passes)
 
 
 def levels_of(search: Search) -> Levels:
@@ -132,7 +160,7 @@ def _all_sources(
         first, end = (jnp.searchsorted(systems, wanted, side=side).astype(jnp.int32) for side in ("left", "right"))
 
     def runs(place: Array, _: Array) -> tuple[Array, Array, Array | None]:
-        start, stop = jnp.zeros((place.size, images), jnp.int32), jnp.int32(sources.shape[0])
+        start, stop = jnp.zeros((place.size, images), jnp.int32), jnp.int32(len(sources))
         if batch is not None:
             start, stop = start + first[place][:, None], end[place][:, None]
         codes = None if torus is None else jnp.zeros_like(start) + lax.iota(jnp.int32, images)[None]
@@ -140,33 +168,49 @@ def _all_sources(
 
     of_sources, of_queries = (cutoff.sources, cutoff.queries) if isinstance(cutoff, Cutoffs) else (None, None)
     points = _in_order(sources, order, of_sources)
-    return Candidates(points, _in_order(sources if queries is None else queries, query_order, of_queries), runs, torus)
+    rows = _in_order(sources if queries is None else queries, query_order, of_queries)
+    words = images * -(-len(sources) // LANES)
+    return Candidates(points, rows, runs, torus, len(sources), lambda _: words, in_order=query_order is None)
 
 
 def _cell_stencil(
-    sources: Array, queries: Array | None, along: Array, axes: CellAxes, batch: Batch | None, torus: Torus | None
+    sources: Array,
+    queries: Array | None,
+    along: Array,
+    axes: CellAxes,
+    batch: Batch | None,
+    torus: Torus | None,
+    tuning: Tuning,
 ) -> Candidates:
     """Sort sources and queries by cell; the runs of a query are the rows of cells around its own.
 
     `along` [d, n + m] are the coordinates of the sources, then of the queries, which `axes` divides into cells.
     """
-    finite = jnp.isfinite(along).all(axis=0)
-    coords, extent = grid_coordinates(along, axes, finite, None if batch is None else batch.of_all)
-    n, total = sources.shape[0], along.shape[1]
-    grid = build_grid(coords[:, :n], finite[:n], extent, total)
-    if queries is None:
-        order = grid.order
-    else:
-        coords, finite = coords[:, n:], finite[n:]
-        order = cell_order(coords, finite, extent, grid.dense)
-    query_coords = coords[:, order]
+    n, systems = len(sources), None if batch is None else batch.of_all
+    line, cells = sort_along_line(along, axes, n, systems, tuning.least_sorted, tuning.searched)
+    order = line.order if queries is None else sort_queries(line, cells, n, tuning.least_sorted)
+    at = order if queries is None else order + n
     images = None if torus is None else torus.images
 
     def runs(place: Array, _: Array) -> tuple[Array, Array, Array | None]:
-        return stencil_runs(grid, query_coords.at[:, place].get(mode="promise_in_bounds"), len(along), images)
+        here = at.at[place].get(mode="promise_in_bounds")
+        return line_runs(line, cells.of(here), images)
 
-    points = _in_order(sources, grid.order)
-    return Candidates(points, points if queries is None else _in_order(queries, order), runs, torus)
+    twice = line.twice
+    points = _in_order(sources, twice)._replace(systems=None if batch is None else batch.sources[twice])
+    rows = points._replace(ids=order) if queries is None else _in_order(queries, order)
+    if batch is not None:
+        rows = rows._replace(systems=batch.of_queries[order])
+    return Candidates(points, rows, runs, torus, n, functools.partial(_stencil_words, sources.shape[1]), again=line.inside)
+
+
+def _stencil_words(dim: int, slots: int | None) -> int:
+    """Return the words around a query that has as many neighbors as slots, in a uniform density."""
+    runs = 3 ** (dim - 1)
+    share = (2 + 1 / FINE) * runs / {2: np.pi, 3: 4 * np.pi / 3}[dim]  # candidates per neighbor
+    slots = {2: 32, 3: 128}[dim] if slots is None else slots
+    most = {2: 32, 3: 64}[dim]
+    return min(max(4 * round((0.9 * share * slots / LANES + runs) / 4), 8), most)
 
 
 def _cells_of_lattice(

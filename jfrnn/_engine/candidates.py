@@ -18,11 +18,13 @@ class Points(NamedTuple):
         axes: d coordinate arrays [n].
         ids: [n] int32, their indices.
         radii: [n] cutoffs per particle, or None with one cutoff or if the rule does not use them.
+        systems: [n] systems of a batch, or None if runs meet no other system than that of their query.
     """
 
     axes: list[Array]
     ids: Array
     radii: Array | None = None
+    systems: Array | None = None
 
 
 class Torus(NamedTuple):
@@ -48,11 +50,24 @@ class Torus(NamedTuple):
 class Candidates(NamedTuple):
     """Sources and queries in the order in which they are visited, and a function that finds the candidates of queries.
 
-    `passes` [] int32 is the number of passes over the sources; None for one.
+    Attributes:
+        sources: The sources as runs read them.
+        queries: The queries; if these are the sources, their positions come first among `sources`.
+        runs: The function that finds the runs of queries.
+        torus: What a lattice adds.
+        size: Number of sources. Static.
+        words: From slots per query (None: unknown) to the words of candidates that are tested at a time. Static.
+        passes: [] int32, number of passes over the sources; None for one.
+        again: [] int32, after how many positions the sources start again; None if each has one position.
+        in_order: Whether queries are visited by their indices. Static.
     """
 
     sources: Points
     queries: Points
     runs: Runs
     torus: Torus | None
+    size: int
+    words: Callable[[int | None], int]
     passes: Array | None = None
+    again: Array | None = None
+    in_order: bool = False

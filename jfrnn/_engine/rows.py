@@ -1,14 +1,16 @@
 """The compiled programs of a search: prepare its operands, run an engine, complete the status."""
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jfrnn._engine.arrays import complete_rows, find_candidates
+from jfrnn._engine.arrays import complete_rows, find_candidates, is_few
 from jfrnn._engine.problem import Inputs, Options, Rows, Search, prepare_search
 from jfrnn._engine.runs import State, Visit, fold_neighbors
+from jfrnn._engine.tuning import Tuning, by_platform
 from jfrnn._geometry import NOT_FINITE, Cutoff, Status
 from jfrnn._tracing import compile_program
 
@@ -62,7 +64,16 @@ def fold_pairs(inputs: Inputs, options: Options, elements: int, visit: Visit[Sta
     search = prepare_search(inputs, options)
     if 0 in search.sizes:
         return out
-    return fold_neighbors(find_candidates(search, options.engine.by_cells), search.cutoff, options.filter, elements, visit, out)
+
+    def on(tuning: Tuning) -> Callable[[tuple[Search, State]], State]:
+        def fold(operands: tuple[Search, State]) -> State:
+            search, out = operands
+            candidates = find_candidates(search, options.engine.by_cells and not is_few(search, tuning), tuning)
+            return fold_neighbors(candidates, search.cutoff, options.filter, elements, tuning, visit, out)
+
+        return fold
+
+    return by_platform(on, (search._replace(checks={}), out))
 
 
 def _with_status(rows: Rows, sources: Array, queries: Array | None, active: Array | None, checks: dict[Status, Array]) -> Rows:

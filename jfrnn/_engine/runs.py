@@ -1,8 +1,8 @@
 """From runs of candidates to rows of neighbors, by array programming in blocks of queries, with bounded scratch memory.
 
 A run is a contiguous range of sorted sources. Runs are divided into words of 16 candidates, with one bit per candidate that says
-whether it is a neighbor. A block has at most `_BLOCK_WORDS` words at a time, of a few tens of bytes each. So the scratch memory of
-a block stays below 64 MB for any n, and nothing is stored per candidate.
+whether it is a neighbor. A block has a bounded number of words and slots (`jfrnn._engine.tuning`), so its scratch memory is bounded
+for any n, and nothing is stored per candidate.
 """
 
 import functools
@@ -16,77 +16,75 @@ from jax import Array, lax
 
 from jfrnn._engine.candidates import Candidates, Points, Torus
 from jfrnn._engine.problem import Filter
-from jfrnn._engine.words import LANES, VERDICTS, bit_counts, deposit, nth_bits, take, windows
-from jfrnn._geometry import Cutoff, Cutoffs, Pair, flat_take, refine, shift_in_given, squared_distance, step_one_bounds
+from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
+from jfrnn._engine.words import LANES, VERDICTS, BitRows, bit_counts, deposit, take, windows
+from jfrnn._geometry import Cutoff, Cutoffs, Pair, decide_pairs, flat_take, shift_in_given, squared_distance, step_one_bounds
+from jfrnn._tracing import Tree
 
-_BLOCK_WORDS = 1 << 16
-_BLOCK_SLOTS = 1 << 22  # 16 MB of rows
-_SLOT_GROUP = 128  # slots per row that are filled at a time
 _FEW_RUNS = 32
+_HITS = np.uint32((1 << LANES) - 1)
 _MANY_RUNS = 4096
+_MOST_WORDS = 256  # per query, that are tested at a time; (words << 16) has to be an int32
 FOLD_GROUP = 32  # neighbors per query that are folded at a time
 
 State = TypeVar("State")
 Carry = Any  # the state of a loop over pairs
 
 
-def count_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter) -> Array:
+def count_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, tuning: Tuning) -> Array:
     """Count the neighbors of every query: [m] int32, in the order of the queries' ids."""
-    engine = _Engine(candidates._replace(sources=_pad(candidates.sources)), cutoff, keep, capacity=1)
-    queries = candidates.queries
+    engine = _Engine(_pad(candidates), cutoff, keep, tuning, slots=1, capacity=None)
 
-    def count_block(b: Array, out: Array) -> Array:
-        place, ids = engine.block(b)
-
+    def count_block(place: Array) -> Array:
         def add(words: _HitWords, count: Array) -> Array:
-            return count + bit_counts(words.hits).sum(1, dtype=jnp.int32)
+            return count + bit_counts(words.hits & _HITS).sum(1, dtype=jnp.int32)
 
-        return out.at[ids].set(engine.fold_words(place, add, jnp.zeros(place.shape, jnp.int32)))
+        return engine.fold_words(place, add, jnp.zeros(place.shape, jnp.int32))
 
-    return lax.fori_loop(0, engine.block_count, count_block, jnp.zeros(queries.ids.shape, jnp.int32))
+    return engine.map_blocks(count_block)
 
 
-def list_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, capacity: int) -> tuple[Array, Array]:
+def list_neighbors(
+    candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, capacity: int, tuning: Tuning
+) -> tuple[Array, Array]:
     """List the neighbors of every query: [m, capacity] int32 source indices, unused slots n, and [m] int32 true counts.
 
     If images must be told apart, n times the image code is added to the source index; unused slots are n·images.
     """
-    sources, queries, torus = candidates.sources, candidates.queries, candidates.torus
-    engine = _Engine(candidates._replace(sources=_pad(sources)), cutoff, keep, capacity)
-    n, images = sources.ids.size, 1 if torus is None or torus.images.nearest else torus.images.total
-    group = min(_SLOT_GROUP, capacity)
+    torus = candidates.torus
+    engine = _Engine(_pad(candidates), cutoff, keep, tuning, slots=capacity, capacity=capacity)
+    n, images = candidates.size, 1 if torus is None or torus.images.nearest else torus.images.total
+    group = min(tuning.group, capacity)
     slots = lax.iota(jnp.int32, group)
 
-    def list_block(b: Array, out: tuple[Array, Array]) -> tuple[Array, Array]:
-        place, ids = engine.block(b)
-
+    def list_block(place: Array) -> tuple[Array, Array]:
         def add(words: _HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
             (rows, count), (hits, first, image) = found, words
-            total = bit_counts(hits).sum(1, dtype=jnp.int32)
+            bits = BitRows.of(hits, tuning.in_groups)
+            total = bits.total
 
-            def add_group(state: tuple[Array, Array]) -> tuple[Array, Array]:
-                g, rows = state
+            def add_group(g: Array, rows: Array) -> Array:
                 start = jnp.minimum(g * group, capacity - group)
                 ordinal = (start + slots)[None] - count[:, None]
-                word, bit = nth_bits(hits, ordinal)
+                word, bit = bits.nth(ordinal)
                 neighbor = engine.sources.ids.at[take(first, word) + bit].get(mode="promise_in_bounds")
                 if image is not None and images > 1:
                     neighbor = neighbor + n * take(image, word)
-                old = lax.dynamic_slice_in_dim(rows, start, group, axis=1)
+                old = rows if group == capacity else lax.dynamic_slice_in_dim(rows, start, group, axis=1)
                 new = jnp.where((ordinal >= 0) & (ordinal < total[:, None]), neighbor, old)
-                return g + 1, lax.dynamic_update_slice_in_dim(rows, new, start, axis=1)
+                return new if group == capacity else lax.dynamic_update_slice_in_dim(rows, new, start, axis=1)
 
-            until = jnp.minimum(jnp.max(count + total), capacity)
-            _, rows = lax.while_loop(lambda state: state[0] * group < until, add_group, (jnp.min(count) // group, rows))
+            if group == capacity:
+                rows = add_group(jnp.int32(0), rows)
+            else:
+                until = (jnp.minimum(jnp.max(count + total), capacity) + group - 1) // group
+                rows = lax.fori_loop(jnp.min(count) // group, until, add_group, rows)
             return rows, count + total
 
         rows = jnp.full((place.size, capacity), n * images, jnp.int32)
-        rows, count = engine.fold_words(place, add, (rows, jnp.zeros(place.shape, jnp.int32)))
-        return out[0].at[ids].set(rows), out[1].at[ids].set(count)
+        return engine.fold_words(place, add, (rows, jnp.zeros(place.shape, jnp.int32)))
 
-    m = queries.ids.size
-    start = (jnp.zeros((m, capacity), jnp.int32), jnp.zeros(m, jnp.int32))
-    return lax.fori_loop(0, engine.block_count, list_block, start)
+    return engine.map_blocks(list_block)
 
 
 class Slots(NamedTuple):
@@ -121,13 +119,13 @@ Visit = Callable[[Block, State], State]
 
 
 def fold_neighbors(
-    candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, elements: int, visit: Visit[State], out: State
+    candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, elements: int, tuning: Tuning, visit: Visit[State], out: State
 ) -> State:
     """Visit the neighbors of all queries without listing them: out = visit(block, out) for one block after the other.
 
-    `elements` is the number of scalars per pair that a visitor needs; blocks are chosen such that 16 MB of float32 hold them.
+    `elements` is the number of scalars per pair that a visitor needs; they count as slots of a block.
     """
-    engine = _Engine(candidates._replace(sources=_pad(candidates.sources)), cutoff, keep, FOLD_GROUP * elements)
+    engine = _Engine(_pad(candidates), cutoff, keep, tuning, slots=FOLD_GROUP * elements, capacity=None)
     slots, torus = lax.iota(jnp.int32, FOLD_GROUP), candidates.torus
 
     def fold_block(b: Array, out: State) -> State:
@@ -137,12 +135,13 @@ def fold_neighbors(
         def fold(add: Callable[[Slots, Carry], Carry], state: Carry) -> Carry:
             def add_words(words: _HitWords, state: Carry) -> Carry:
                 hits, first, image = words
-                total = jnp.where(fresh, bit_counts(hits).sum(1, dtype=jnp.int32), 0)
+                bits = BitRows.of(hits, tuning.in_groups)
+                total = jnp.where(fresh, bits.total, 0)
 
                 def add_group(state: tuple[Array, Any]) -> tuple[Array, Any]:
                     done, state = state
                     ordinal = jnp.broadcast_to(done + slots, (place.size, slots.size))
-                    word, bit = nth_bits(hits, ordinal)
+                    word, bit = bits.nth(ordinal)
                     source = engine.sources.ids.at[take(first, word) + bit].get(mode="promise_in_bounds")
                     shift = None
                     if torus is not None and image is not None:
@@ -156,7 +155,7 @@ def fold_neighbors(
 
         return visit(Block(ids, fresh, fold), out)
 
-    return lax.fori_loop(0, engine.block_count, fold_block, out)
+    return fold_block(jnp.int32(0), out) if engine.block_count == 1 else lax.fori_loop(0, engine.block_count, fold_block, out)
 
 
 def _shifts_of(torus: Torus, query: Array, source: Array, image: Array) -> Array:
@@ -178,7 +177,7 @@ class _WordTable(NamedTuple):
 class _HitWords(NamedTuple):
     """The neighbors in a chunk of candidates: one bit per candidate, [b, words] each."""
 
-    hits: Array
+    hits: Array  # in the lower half
     first: Array  # position of each word's first candidate
     image: Array | None  # image code
 
@@ -187,7 +186,9 @@ class _Engine(NamedTuple):
     candidates: Candidates
     cutoff: Cutoff | Cutoffs
     keep: Filter
-    capacity: int
+    tuning: Tuning
+    slots: int  # scalars per query that a block holds
+    capacity: int | None  # expected number of neighbors per query
 
     @property
     def sources(self) -> Points:
@@ -199,18 +200,25 @@ class _Engine(NamedTuple):
 
     @property
     def words(self) -> int:
-        """Words per query that are processed at a time: about as many as the 9 runs of 3D or the 3 runs of 2D need."""
-        return 64 if len(self.sources.axes) == 3 else 16
-
-    @property
-    def block_size(self) -> int:
-        torus = self.candidates.torus
-        runs = 1 if torus is None or torus.images.nearest else torus.images.total  # every query has at least so many
-        return min(_BLOCK_WORDS // self.words, max(_BLOCK_SLOTS // max(self.capacity, runs), 1), self.queries.ids.size)
+        """Words per query that are processed at a time."""
+        words = self.candidates.words(self.capacity)
+        if self.tuning.in_groups:
+            return min(words, _MOST_WORDS)
+        return min(-(-words // 8) * 8, _MOST_WORDS // 4)
 
     @property
     def block_count(self) -> int:
-        return -(-self.queries.ids.size // self.block_size)
+        """Number of blocks, whose words and slots fit into the scratch memory."""
+        torus = self.candidates.torus
+        runs = 1 if torus is None or torus.images.nearest else torus.images.total  # every query has at least so many
+        words = max(self.words, runs)
+        most = min(self.tuning.words // words, self.tuning.scratch // (words * WORD_BYTES + self.slots * SLOT_BYTES))
+        return -(-self.queries.ids.size // max(most, 1))
+
+    @property
+    def block_size(self) -> int:
+        """Number of queries in a block."""
+        return -(-self.queries.ids.size // self.block_count)
 
     def block(self, b: Array) -> tuple[Array, Array]:
         """Return positions and ids of block b's queries; the last block overlaps, so that all have one length."""
@@ -218,18 +226,30 @@ class _Engine(NamedTuple):
         place = first + lax.iota(jnp.int32, self.block_size)
         return place, lax.dynamic_slice_in_dim(self.queries.ids, first, self.block_size)
 
+    def map_blocks(self, of_block: Callable[[Array], Tree]) -> Tree:
+        """Return of_block(place), arrays with a row per query, for all queries in the order of their indices."""
+        if self.block_count == 1 and self.candidates.in_order:
+            return of_block(self.block(jnp.int32(0))[0])
+
+        def put(b: Array, out: Tree) -> Tree:
+            place, ids = self.block(b)
+            rows = of_block(place)
+            return jax.tree.map(lambda out, rows: out.at[ids].set(rows, unique_indices=True), out, rows)
+
+        shapes = jax.eval_shape(of_block, self.block(jnp.int32(0))[0])
+        start = jax.tree.map(lambda x: jnp.zeros((self.queries.ids.size, *x.shape[1:]), x.dtype), shapes)
+        return put(jnp.int32(0), start) if self.block_count == 1 else lax.fori_loop(0, self.block_count, put, start)
+
     def fold_words(self, place: Array, add: Callable[["_HitWords", State], State], state: State) -> State:
         """Return the state after state = add(words, state) for each chunk of candidates of the queries at these positions."""
 
         def add_pass(which: Array, state: State) -> State:
             table = self.word_table(place, which)
 
-            def add_chunk(carried: tuple[Array, State]) -> tuple[Array, State]:
-                chunk, state = carried
-                state = add(self.hit_words(place, table, chunk), state)
-                return chunk + 1, state
+            def add_chunk(chunk: Array, state: State) -> State:
+                return add(self.hit_words(place, table, chunk), state)
 
-            return lax.while_loop(lambda carried: carried[0] * self.words < table.longest, add_chunk, (jnp.int32(0), state))[1]
+            return lax.fori_loop(0, (table.longest + self.words - 1) // self.words, add_chunk, state)
 
         passes = self.candidates.passes
         return add_pass(jnp.int32(0), state) if passes is None else lax.fori_loop(0, passes, add_pass, state)
@@ -246,10 +266,10 @@ class _Engine(NamedTuple):
         query = [x.at[place].get(mode="promise_in_bounds")[:, None] for x in self.queries.axes]
         if image is not None and self.candidates.torus is not None:  # translate the query instead of the image
             query = [q - t[image] for q, t in zip(query, self.candidates.torus.translations.T, strict=True)]
-        first, image, packed = lax.optimization_barrier((first, image, self._test(first, stop, image, query, place)))
-        hits, doubtful = packed & np.uint32(0xFFFF), packed >> np.uint32(LANES)
-        hits = lax.optimization_barrier(hits | self._decide_doubtful(doubtful, first, image, place))
-        return _HitWords(hits, first, image)
+        allowed = self._allowed_lanes(first, stop, image, place)
+        packed = self._test(first, image, query, place) & (allowed | allowed << np.uint32(LANES))
+        first, image, packed = lax.optimization_barrier((first, image, packed))
+        return _HitWords(self._decide_doubtful(packed, first, image, place), first, image)
 
     def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
         word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (table.start.shape[0], self.words))
@@ -273,21 +293,21 @@ class _Engine(NamedTuple):
                     image = jnp.where(reached, table.image[:, r, None], image)
         return jnp.minimum(first, self.sources.ids.size - LANES), stop, image
 
-    def _test(self, first: Array, stop: Array, image: Array | None, query: list[Array], place: Array) -> Array:
+    def _test(self, first: Array, image: Array | None, query: list[Array], place: Array) -> Array:
         """Compare 16 candidates per word with the cutoff in working precision: low half hits, high half doubtful ones."""
-        lane = lax.iota(jnp.int32, LANES)
-        candidate = first[..., None] + lane[None, None]
-        allowed = (candidate < stop[..., None]) & self._passes_filter(first, candidate, image, place)
         difference = [windows(x, first) - q[..., None] for x, q in zip(self.sources.axes, query, strict=True)]
         square = squared_distance(difference, self.cutoff)
         own, others = self.queries.radii, self.sources.radii
         own = None if own is None else own.at[place].get(mode="promise_in_bounds")[:, None, None]
         inside, outside = self._bounds(own, None if others is None else windows(others, first))
-        surely = square < inside
-        doubtful = (square <= outside) & ~surely
-        bit = np.uint32(1) << lane.astype(jnp.uint32)
-        value = jnp.where(surely, bit, np.uint32(0)) | jnp.where(doubtful, bit << np.uint32(LANES), np.uint32(0))
-        return lax.reduce(jnp.where(allowed, value, np.uint32(0)), np.uint32(0), lax.bitwise_or, (2,))
+        doubtful = jnp.where(square <= outside, np.uint32(1 << LANES), np.uint32(0))
+        value = jnp.where(square < inside, np.uint32(1), doubtful) << lax.iota(jnp.uint32, LANES)
+        if self.keep.later_only:
+            value = jnp.where(self._is_later(first, image, place), value, np.uint32(0))
+        if self.queries.systems is not None and self.sources.systems is not None:
+            system = self.queries.systems.at[place].get(mode="promise_in_bounds")[:, None, None]
+            value = jnp.where(windows(self.sources.systems, first) == system, value, np.uint32(0))
+        return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,))
 
     def _bounds(self, own: Array | None, others: Array | None) -> tuple[np.floating | Array, np.floating | Array]:
         torus = self.candidates.torus
@@ -295,46 +315,71 @@ class _Engine(NamedTuple):
         radii = self.cutoff.of_pairs(own, others) if isinstance(self.cutoff, Cutoffs) else None
         return step_one_bounds(self.cutoff, radii, slack)
 
-    def _passes_filter(self, first: Array, candidate: Array, image: Array | None, place: Array) -> Array:
-        """Say which candidates [b, words, 16] pass the filter, whatever their distance."""
-        if self.keep.later_only:
-            own = self.queries.ids.at[place].get(mode="promise_in_bounds")[:, None]
-            later = own + int(self.keep.drop_self)
-            if image is not None and self.candidates.torus is not None:  # of its own images, keep the forward half
-                home = self.candidates.torus.images.home
-                later = jnp.where(image > home, own, jnp.where(image < home, own + 1, later))
-            return windows(self.sources.ids, first) >= later[..., None]
-        if not self.keep.drop_self:
-            return jnp.ones((), bool)
-        others = candidate != place[:, None, None]
-        if image is None or self.candidates.torus is None:
-            return others
-        return others | (image != self.candidates.torus.images.home)[..., None]
+    def _allowed_lanes(self, first: Array, stop: Array, image: Array | None, place: Array) -> Array:
+        """Return which of a word's 16 candidates belong to its run and are not the query itself: bits, [b, words] uint32."""
+        one = np.uint32(1)
+        lanes = (one << jnp.clip(stop - first, 0, LANES).astype(jnp.uint32)) - one
+        if not self.keep.drop_self or self.keep.later_only:
+            return lanes
+        again, own = self.candidates.again, jnp.zeros_like(lanes)
+        for where in (place,) if again is None else (place, place + again):
+            lane = where[:, None] - first
+            here = (lane >= 0) & (lane < LANES)
+            own = own | jnp.where(here, one << jnp.clip(lane, 0, LANES).astype(jnp.uint32), np.uint32(0))
+        if image is not None and self.candidates.torus is not None:
+            own = jnp.where(image == self.candidates.torus.images.home, own, np.uint32(0))
+        return lanes & ~own
 
-    def _decide_doubtful(self, doubtful: Array, first: Array, image: Array | None, place: Array) -> Array:
-        """Decide the doubtful candidates of each row exactly, 32 per round: bits of those that are pairs, [b, words] uint32."""
-        slots = lax.iota(jnp.int32, VERDICTS)
-        until = jnp.cumsum(bit_counts(doubtful), axis=1, dtype=jnp.int32)
-        before, total = until - bit_counts(doubtful), until[:, -1]
-        most = jnp.max(total)
+    def _is_later(self, first: Array, image: Array | None, place: Array) -> Array:
+        """Say which candidates [b, words, 16] are the later ones of their pairs: of a query's own images, the forward half."""
+        own = self.queries.ids.at[place].get(mode="promise_in_bounds")[:, None]
+        later = own + int(self.keep.drop_self)
+        if image is not None and self.candidates.torus is not None:
+            home = self.candidates.torus.images.home
+            later = jnp.where(image > home, own, jnp.where(image < home, own + 1, later))
+        return windows(self.sources.ids, first) >= later[..., None]
 
-        def decide_round(state: tuple[Array, Array]) -> tuple[Array, Array]:
-            done, hits = state
-            word, bit = nth_bits(doubtful, jnp.broadcast_to(slots + done, (first.shape[0], VERDICTS)))
-            candidate = take(first, word) + bit
+    def _decide_doubtful(self, packed: Array, first: Array, image: Array | None, place: Array) -> Array:
+        """Add the doubtful candidates that are pairs to the hits: [b, words] uint32, of which the lower half is decided then.
 
-            def points(at: Array | None, word: Array = word, candidate: Array = candidate) -> Pair:
-                rows = jnp.broadcast_to(lax.iota(jnp.int32, first.shape[0])[:, None], candidate.shape)
+        Rows with doubtful candidates are decided in parts of a block, 32 candidates of each row per round.
+        """
+        rows, slots = len(packed), lax.iota(jnp.int32, VERDICTS)
+        many = min(max(-(-rows // self.tuning.doubtful_share), self.tuning.doubtful_rows), rows)
+        open_rows = jnp.max(packed, axis=1) > _HITS
+        if many == rows:
+            queue, waiting = lax.iota(jnp.int32, rows), jnp.where(jnp.any(open_rows), rows, 0)
+        else:
+            until = jnp.cumsum(open_rows.astype(jnp.int32), dtype=jnp.int32)
+            waiting, queue = until[-1], jnp.full(rows + many, rows, jnp.int32)
+            queue = queue.at[jnp.where(open_rows, until - 1, rows + many)].set(lax.iota(jnp.int32, rows), mode="drop")
+
+        def decide_round(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            at, done, packed = state
+            row = lax.dynamic_slice_in_dim(queue, at, many)
+            here = jnp.minimum(row, rows - 1)
+            both = packed[here]
+            asked = jnp.where((row < rows)[:, None], both >> np.uint32(LANES), np.uint32(0))
+            ordinal = jnp.broadcast_to(slots + done, (many, VERDICTS))
+            bits = BitRows.of(asked, self.tuning.in_groups)
+            word, bit = bits.nth(ordinal)
+            flat = here[:, None] * packed.shape[1] + word
+            candidate = flat_take(first, flat) + bit
+
+            def points(at: Array | None) -> Pair:
+                of_row, source, of_word = place[here][:, None], candidate, flat
                 if at is not None:
-                    rows, word, candidate = flat_take(rows, at), flat_take(word, at), flat_take(candidate, at)
-                return self._pair(place[rows], candidate, None if image is None else image[rows, word])
+                    of_row, source, of_word = place[here[at // VERDICTS]], flat_take(source, at), flat_take(of_word, at)
+                return self._pair(of_row, source, None if image is None else flat_take(image, of_word))
 
-            pair = refine((slots + done)[None] < total[:, None], points, self.cutoff)
+            pair = decide_pairs(ordinal < bits.total[:, None], points, self.cutoff)
             verdict = jnp.sum(jnp.where(pair, np.uint32(1) << slots.astype(jnp.uint32), np.uint32(0)), 1, dtype=jnp.uint32)
-            return done + VERDICTS, hits | deposit(verdict[:, None], doubtful, before - done)
+            both = both | deposit(verdict[:, None], asked, (bits.before >> LANES) - done)
+            packed = packed.at[row].set(both, mode="drop", unique_indices=True)
+            more = jnp.max(bits.total) > done + VERDICTS
+            return jnp.where(more, at, at + many), jnp.where(more, done + VERDICTS, 0), packed
 
-        start = (jnp.int32(0), jnp.zeros_like(doubtful))
-        return lax.while_loop(lambda state: state[0] < most, decide_round, start)[1]
+        return lax.while_loop(lambda state: state[0] < waiting, decide_round, (jnp.int32(0), jnp.int32(0), packed))[2]
 
     def _pair(self, place: Array, candidate: Array, image: Array | None) -> Pair:
         """Return the given (not wrapped) points of queries and candidates at these positions."""
@@ -357,7 +402,12 @@ class _Engine(NamedTuple):
         return Pair(*raw, radii, *shift_in_given(shift, torus.images.basis, torus.matrix), torus.images.orthogonal)
 
 
-def _pad(sources: Points) -> Points:
+def _pad(candidates: Candidates) -> Candidates:
     """Pad the sources so that a window of 16 never reaches past the end; masks exclude the padding."""
-    radii = None if sources.radii is None else jnp.pad(sources.radii, (0, LANES))
-    return Points([jnp.pad(x, (0, LANES)) for x in sources.axes], jnp.pad(sources.ids, (0, LANES)), radii)
+    axes, ids, radii, systems = candidates.sources
+
+    def pad(x: Array | None) -> Array | None:
+        return None if x is None else jnp.pad(x, (0, LANES))
+
+    padded = Points([jnp.pad(x, (0, LANES)) for x in axes], jnp.pad(ids, (0, LANES)), pad(radii), pad(systems))
+    return candidates._replace(sources=padded)

@@ -1,7 +1,6 @@
-"""Cell lists: the cell of each particle, the order of the cells in memory, and where the particles of a cell start.
+"""Cells: the cell of each particle, and the top cells of `jfrnn._geometry.levels`: their order and where their particles start.
 
-A cell is a cube of edge `cell_edge(cutoff)`, a float slightly larger than the cutoff. Cells along x are adjacent in memory, so the
-3^d cells around a query form one contiguous run of sorted sources per row of cells: 3 runs in 2D, 9 in 3D.
+A cell is a cube of edge `cell_edge(cutoff)`, a float slightly larger than the cutoff.
 """
 
 from collections.abc import Sequence
@@ -10,8 +9,6 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-
-from jfrnn._geometry.images import Images
 
 _CELLS_PER_PARTICLE = 4  # the largest dense table, in cells per particle: 16 B per particle
 _SMALLEST_TABLE = 4096
@@ -197,19 +194,6 @@ def _row_major(coords: Sequence[Array] | Array, extent: Array) -> Array:
     return index
 
 
-def stencil_runs(grid: Grid, coords: Array, dim: int, images: Images | None = None) -> tuple[Array, Array, Array | None]:
-    """Find the sources in the cells around each query's cell [d, m]: starts, ends and image codes of their runs, [m, runs] int32.
-
-    With a batch, query cells are [d + 1, m], the last row being the system.
-    In open space each query has 3^(d-1) runs, one per row of 3 cells. Along a periodic axis the cells beyond either end are those
-    of a periodic image, and a row is split where it enters another image.
-    A dense grid needs two table loads per run, any other two binary searches among the sorted source cells.
-    """
-    cells, code = _stencil_rows(coords, grid.extent, dim, images)
-    start, stop = places_between(grid, cells)
-    return (start, stop, None) if code is None else (start, jnp.where(cells[0] <= cells[1], stop, start), code)
-
-
 def places_between(grid: Grid, cells: list[Array]) -> tuple[Array, Array]:
     """Return start and end [m, r] of rows of cells, given by their first and last cell along x and by y[, z]."""
 
@@ -224,46 +208,6 @@ def places_between(grid: Grid, cells: list[Array]) -> tuple[Array, Array]:
         return bounds[0], bounds[1]
 
     return lax.cond(grid.dense, from_table, by_binary_search, cells)
-
-
-def _stencil_rows(coords: Array, extent: Array, dim: int, images: Images | None) -> tuple[list[Array], Array | None]:
-    """Return the first and last cell along x, the cells along the other axes, and the image code of each run, [m, runs] each."""
-    reach = (0,) * dim if images is None else images.reach
-    steps = [range(-max(k, 1), max(k, 1) + 1) for k in reach]
-    if len(coords) > dim:
-        reach, steps = (*reach, 0), [*steps, range(1)]
-    parts = _parts_of_rows(coords[0], extent[0], reach[0], images)
-    rows = np.stack(np.meshgrid(*steps[1:], indexing="ij"), -1).reshape(-1, len(coords) - 1).astype(np.int32)
-
-    def each(parts: Sequence[Array]) -> Array:  # [m, runs]: all rows of the first part come first
-        return jnp.repeat(jnp.stack(parts, axis=1), len(rows), axis=1)
-
-    first, last, shift = (each([part[what] for part in parts]) for what in range(3))
-    shifts, cells = [shift], [first, last]
-    for axis in range(1, len(coords)):
-        cell = coords[axis][:, None] + np.tile(rows[:, axis - 1], len(parts))[None]
-        turn = jnp.zeros_like(cell) if reach[axis] == 0 else cell // extent[axis]
-        cells.append(cell - turn * extent[axis])
-        shifts.append(turn)
-    if images is None:
-        return cells, None
-    code = jnp.zeros_like(first)
-    for shift, k in zip(shifts, reach, strict=True):
-        code = code * (2 * k + 1) + (shift + k)
-    return cells, code
-
-
-def _parts_of_rows(x: Array, extent: Array, reach: int, images: Images | None) -> list[tuple[Array, Array, Array]]:
-    """Split the row of cells around x [m] at the borders of images: first cell, last cell and image of each part, [m] each."""
-    if images is None or reach == 0:
-        return [(x - 1, x + 1, jnp.zeros_like(x))]
-    if images.nearest:  # The box has at least two cells, so a row enters only one other image.
-        other = jnp.where(x == 0, -1, 1)
-        shifts = [jnp.zeros_like(x), other]
-    else:
-        shifts = [jnp.full_like(x, s) for s in range(-reach, reach + 1)]
-    most = extent - 1
-    return [(jnp.maximum(x - reach - s * extent, 0), jnp.minimum(x + reach - s * extent, most), s) for s in shifts]
 
 
 def _lower_bound(cells: Array, target: list[Array]) -> Array:

@@ -27,7 +27,6 @@ class Cutoff:
         inside: A scaled squared distance below this certainly belongs to a pair.
         outside: A scaled squared distance above this certainly does not.
         unit_scale: Power of two, a normal float, that scales r into [1, 4).
-        plain_bits: Magnitude bits of the smallest coordinate for which step 2 cannot underflow.
         closed: Whether pairs at exactly r count. Static.
         scaled: Whether r is so small or large that differences are multiplied by `unit_scale` before squaring. Static.
     """
@@ -36,7 +35,6 @@ class Cutoff:
     inside: np.floating | Array
     outside: np.floating | Array
     unit_scale: np.floating | Array
-    plain_bits: np.unsignedinteger | Array
     closed: bool = dataclasses.field(metadata={"static": True})
     scaled: bool = dataclasses.field(metadata={"static": True})
 
@@ -108,13 +106,11 @@ def make_cutoff(value: float, dtype: np.dtype, closed: bool) -> Cutoff:
     unit_scale = dtype.type(2.0 ** -min(exponent, -int(finfo.minexp)))
     scaled = abs(exponent) > (30 if narrow else 400)
     square = (radius * unit_scale if scaled else radius) ** 2
-    lowest = max(exponent - (35 if narrow else 450), int(finfo.minexp) + finfo.nmant + 1)
     return Cutoff(
         radius=radius,
         inside=square * dtype.type(1 - 8 * finfo.eps),
         outside=square * dtype.type(1 + 8 * finfo.eps),
         unit_scale=unit_scale,
-        plain_bits=np.frombuffer(dtype.type(2.0**lowest).tobytes(), np.uint32 if narrow else np.uint64)[0],
         closed=closed,
         scaled=scaled,
     )

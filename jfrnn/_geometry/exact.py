@@ -7,11 +7,11 @@ There are three steps. Each is exact where it decides, and only evaluated for wh
    denormals add at most 3·2^-126 to a difference, less than 2^-28 of any cutoff that `check_cutoff` accepts. A band of 8 eps on
    either side is therefore safe however the compiler fuses multiply-adds; the CPU kernels, which flush nothing that matters here,
    use 4 eps.
-2. `_sum_sign` uses error-free transformations (Dekker 1971; Ogita, Rump & Oishi 2005, doi:10.1137/030601818). Integer operations
-   split factors into halves of at most half a mantissa, so every product is exact and a fused multiply-add gives the same float as
-   a product and a sum.
+2. `_fixed_sign` counts distances in units of about 2^-28 cutoffs (float64: 2^-60), in one machine integer per axis. Integers wrap
+   around, so coordinates and lattice translations of any size may be added; only the displacement has to fit. It decides all pairs
+   whose coordinates are whole numbers of units, which floats from about a thirtieth of the cutoff on always are.
 3. `_integer_sign` uses fixed-point integers as wide as the float format (`jfrnn._geometry.integers`), which never round. It decides
-   pairs whose exponents lie so far apart that step 2 would underflow or need more terms.
+   the pairs that are left.
 """
 
 import functools
@@ -23,7 +23,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry.cutoffs import Cutoff, Cutoffs, step_one_bounds
-from jfrnn._geometry.floats import WHOLE_BITS, distill, exact_square, half_mantissa, is_plain, two_difference, two_sum, unit_scale
+from jfrnn._geometry.floats import WHOLE_BITS, unit_scale
 from jfrnn._geometry.integers import beside, carry_limbs, full_count, limb_product, limb_sign, limb_type, limbs_of
 from jfrnn._geometry.reduced import Basis
 from jfrnn._tracing import any_of_rows, first_set
@@ -35,6 +35,7 @@ _INTEGER_CHUNK = 64  # pairs per iteration of the integer test
 class Pair(NamedTuple):
     """Points a and b of pairs, per axis, and the lattice shift of b (None in open space): x_b + shift·matrix - x_a.
 
+    Where pairs form rows, a may have one column for all pairs of a row.
     `radii` is used with cutoffs per particle: one array of pair cutoffs, or two arrays whose mean is the cutoff.
     """
 
@@ -127,7 +128,7 @@ def is_pair_of(
     step_one = jnp.where(asked & (square <= outside), jnp.where(square < inside, yes, open_pair), no)  # one int8 array, one kernel
 
     def refine_open(step_one: Array) -> Array:
-        return (step_one == yes) | _refine_some(step_one == open_pair, points, cutoff)
+        return (step_one == yes) | decide_pairs(step_one == open_pair, points, cutoff)
 
     return lax.cond(jnp.max(step_one, initial=no) == open_pair, refine_open, lambda step_one: step_one == yes, step_one)
 
@@ -148,19 +149,13 @@ def flat_take(x: Array, at: Array) -> Array:
     return x.reshape(-1).at[at].get(mode="clip")
 
 
-def refine(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
-    """Decide the pairs that step 1 left open by steps 2 and 3; False elsewhere. Does nothing if no pair is open.
+def decide_pairs(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
+    """Decide the pairs that step 1 left open by steps 2 and 3; False elsewhere.
 
-    `points(None)` returns both points of every pair in the shape of `doubtful`, and `points(at)` those at the flat indices `at`. So
-    points are gathered only when they are needed.
+    `points(None)` returns both points of every pair in the shape of `doubtful`, and `points(at)` those at the flat indices `at`.
     """
-    decide = functools.partial(_refine_some, points=points, cutoff=cutoff)
-    return lax.cond(jnp.any(doubtful), decide, jnp.zeros_like, doubtful)
-
-
-def _refine_some(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
     pairs = points(None)
-    signs = jnp.where(doubtful, _sum_sign(pairs, _threshold(pairs, cutoff)), 1).astype(jnp.int8)
+    signs = jnp.where(doubtful, _fixed_sign(pairs, _threshold(pairs, cutoff)), 1).astype(jnp.int8)
     decide = functools.partial(_decide_unknown, points=points, cutoff=cutoff)
     # A branch, so that step 2 is computed once: XLA would otherwise compile it into each use of its signs.
     signs = lax.cond(jnp.max(signs) == _UNKNOWN, decide, lambda signs: signs, signs)
@@ -192,12 +187,10 @@ class _Threshold(NamedTuple):
     Attributes:
         radii: The cutoff r; or two radii with mean r, in which case twice the distance is compared with their sum.
         scale: Power of two that scales the larger radius into [1, 4).
-        plain_bits: Magnitude bits of the smallest number for which step 2 cannot underflow.
     """
 
     radii: list[Array]
     scale: Array
-    plain_bits: Array
 
     @property
     def times(self) -> int:
@@ -207,56 +200,71 @@ class _Threshold(NamedTuple):
 
 def _threshold(pair: Pair, cutoff: Cutoff | Cutoffs) -> _Threshold:
     if isinstance(cutoff, Cutoff):
-        # Without the barrier, XLA would treat them as constants and could regroup products with them.
-        radius, scale, plain = lax.optimization_barrier((cutoff.radius, cutoff.unit_scale, cutoff.plain_bits))
-        return _Threshold([radius], scale, plain)
+        return _Threshold([jnp.asarray(cutoff.radius)], jnp.asarray(cutoff.unit_scale))
     radii = pair.radii or []
-    larger = functools.reduce(jnp.maximum, radii)
-    narrow = larger.dtype == jnp.float32
-    unsigned, nmant = (jnp.uint32, 23) if narrow else (jnp.uint64, 52)
-    exponent = lax.bitcast_convert_type(larger, unsigned) >> unsigned(nmant)
-    below = unsigned(35 if narrow else 450)
-    lowest = jnp.maximum(jnp.maximum(exponent, below) - below, unsigned(nmant + 2))
-    return _Threshold(radii, unit_scale(larger), lowest << unsigned(nmant))
+    return _Threshold(radii, unit_scale(functools.reduce(jnp.maximum, radii)))
 
 
-def _sum_sign(pair: Pair, threshold: _Threshold) -> Array:
-    """Return the sign of |b - a|² - r² where it is proven, ties included, else _UNKNOWN; int32."""
-    radii, scale, least = threshold
-    terms, slack = [], jnp.zeros_like(pair.a[0])
-    plain = [is_plain(x, least) for x in (*pair.a, *pair.b, *(radii if len(radii) == 2 else ()))]
-    distance_scale = scale * threshold.times
+def _fixed_sign(pair: Pair, threshold: _Threshold) -> Array:
+    """Return the sign of |b - a|² - r² where units of step 2 express all its parts, ties included, else _UNKNOWN; int32.
+
+    A cutoff is below 4 in scaled lengths, and so is each component of a displacement that step 1 leaves open, up to its band.
+    """
+    dtype = np.dtype(pair.a[0].dtype)
+    bits = 32 if dtype == np.float32 else 64
+    fraction = bits - 3 - threshold.times  # so that `times` displacements are below 2^(bits - 1) units
+    finfo = jnp.finfo(dtype)
+    known, total = jnp.ones(pair.b[0].shape, bool), None
+
+    def fixed(x: Array) -> Array:
+        nonlocal known
+        number, whole = _fixed_point(x, threshold.scale, fraction)
+        known = known & whole
+        return number
+
     for axis, (ak, bk) in enumerate(zip(pair.a, pair.b, strict=True)):
-        high, low = two_difference(bk, ak)
-        rest = jnp.zeros_like(ak)
+        displacement, estimate = fixed(bk) - fixed(ak), bk - ak
+        error = jnp.zeros((), dtype)
         for shift, component in pair.lattice_terms(axis):
-            half = half_mantissa(component)  # its product with a shift of at most half a mantissa is exact
-            *others, low, high = distill(distill([low, shift * (component - half), shift * half, high]))
-            rest = sum((jnp.abs(x * distance_scale) for x in others), rest)
-            plain += [is_plain(component, least), jnp.abs(shift) <= 2**WHOLE_BITS]
-        if pair.shift is not None:
-            slack = slack + (4 * jnp.abs(high * distance_scale) * rest + 2 * rest * rest)
-        high, low = high * distance_scale, low * distance_scale
-        terms += exact_square(high)
-        tail = 2 * high * low
-        terms.append(tail)
-        slack = slack + (jnp.abs(tail) * jnp.finfo(slack.dtype).eps + 2 * low * low)
-    radius, low = radii[0] * scale, None
-    if len(radii) == 2:
-        radius, low = two_sum(radius, radii[1] * scale)
-    terms += [-term for term in exact_square(jnp.broadcast_to(radius, slack.shape))]
-    if low is not None:
-        tail = -2 * radius * low
-        terms.append(tail)
-        slack = slack + (jnp.abs(tail) * jnp.finfo(slack.dtype).eps + 2 * low * low)
-    for _ in range(3):
-        terms = distill(terms)
-    rest = sum(jnp.abs(term) for term in terms[:-1])
-    bound = 2 * (rest + slack)  # the factor 2 covers the rounding of the sums above
-    leading = terms[-1]
-    known = (jnp.abs(leading) > bound) | ((leading == 0) & (bound == 0))
-    known = functools.reduce(jnp.logical_and, plain, known)
-    return jnp.where(known, jnp.sign(leading).astype(jnp.int32), _UNKNOWN)
+            displacement = displacement + shift.astype(displacement.dtype) * fixed(component)
+            estimate = estimate + shift * component
+            error = error + 16 * finfo.eps * (jnp.abs(ak) + jnp.abs(bk) + jnp.abs(shift * component))
+        known = known & ((jnp.abs(estimate) + error) * threshold.scale < 4.5)
+        square = _square_limbs(jnp.abs(displacement) * threshold.times)
+        total = square if total is None else [x + y for x, y in zip(total, square, strict=True)]
+    radius = _square_limbs(functools.reduce(jnp.add, [fixed(x) for x in threshold.radii]))
+    sign = _sign_of_limbs([x - y for x, y in zip(total or [], radius, strict=True)])
+    return jnp.where(known, sign, _UNKNOWN)
+
+
+def _fixed_point(x: Array, scale: Array, fraction: int) -> tuple[Array, Array]:
+    """Return x·scale·2^fraction modulo 2^32 (float64: 2^64) as a signed integer, and whether that is a whole number."""
+    narrow = x.dtype == jnp.float32
+    unsigned, width, signed = (jnp.uint32, 32, jnp.int32) if narrow else (jnp.uint64, 64, jnp.int64)
+    y = x * scale * 2.0**fraction
+    is_zero = lax.bitcast_convert_type(x, unsigned) << unsigned(1) == 0  # products of other numbers may be flushed to 0
+    whole = (jnp.floor(y) == y) & (jnp.abs(y) < jnp.finfo(x.dtype).max) & ((y != 0) | is_zero)
+    rest = y - jnp.round(y * 2.0**-width) * 2.0**width  # exact: from -2^31 to 2^31, in whole units of y's last digit
+    rest = jnp.where(rest == 2.0 ** (width - 1), -rest, rest)
+    return jnp.where(whole, rest, 0).astype(signed), whole
+
+
+def _square_limbs(x: Array) -> list[Array]:
+    """Return the square of integers from 0 on in five limbs of 11 bits (int64: 21), the lowest first; the last keeps the rest."""
+    bits = 11 if x.dtype == jnp.int32 else 21
+    low, middle, high = x & ((1 << bits) - 1), (x >> bits) & ((1 << bits) - 1), x >> (2 * bits)
+    return [low * low, 2 * low * middle, 2 * low * high + middle * middle, 2 * middle * high, high * high]
+
+
+def _sign_of_limbs(limbs: list[Array]) -> Array:
+    """Return the sign of a sum of squares of `_square_limbs`, int32."""
+    bits = 11 if limbs[0].dtype == jnp.int32 else 21
+    carry, rest = jnp.zeros_like(limbs[0]), jnp.zeros_like(limbs[0])
+    for limb in limbs[:-1]:
+        limb = limb + carry
+        carry, rest = limb >> bits, rest | (limb & ((1 << bits) - 1))
+    highest = limbs[-1] + carry
+    return jnp.where(highest == 0, (rest != 0).astype(highest.dtype), jnp.sign(highest)).astype(jnp.int32)
 
 
 def _integer_sign(pair: Pair, threshold: _Threshold) -> Array:

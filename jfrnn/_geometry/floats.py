@@ -9,14 +9,6 @@ from jax import Array, lax
 WHOLE_BITS = 12  # whole numbers of so many bits have exact products with half mantissas
 
 
-def two_difference(a: Array, b: Array) -> tuple[Array, Array]:
-    """Return fl(a - b) and its rounding error (Knuth 1969)."""
-    difference = a - b
-    b_virtual = a - difference
-    a_virtual = difference + b_virtual
-    return difference, (a - a_virtual) + (b_virtual - b)
-
-
 def two_sum(a: Array, b: Array) -> tuple[Array, Array]:
     """Return fl(a + b) and its rounding error (Knuth 1969)."""
     total = a + b
@@ -36,13 +28,6 @@ def rounded_sum(value: Array, error: Array) -> Array:
     return jnp.where(jnp.isfinite(value), value + error, value)
 
 
-def exact_square(x: Array) -> list[Array]:
-    """Return three floats that sum to x² exactly, smallest first."""
-    high = half_mantissa(x)
-    low = x - high
-    return [low * low, 2 * high * low, high * high]
-
-
 def half_mantissa(x: Array) -> Array:
     """Round x to half its mantissa (12 of 24 bits, 26 of 53) by integer operations."""
     unsigned, dropped = (jnp.uint32, 12) if x.dtype == jnp.float32 else (jnp.uint64, 27)
@@ -59,13 +44,6 @@ def distill(terms: list[Array]) -> list[Array]:
         total, error = two_sum(total, term)
         result.append(error)
     return [*result, total]
-
-
-def is_plain(x: Array, least: Array) -> Array:
-    """Say where x is 0, or large enough that no product of step 2 of the pair test underflows."""
-    unsigned = jnp.uint32 if x.dtype == jnp.float32 else jnp.uint64
-    magnitude = lax.bitcast_convert_type(x, unsigned) << unsigned(1) >> unsigned(1)
-    return (magnitude == 0) | (magnitude >= least)
 
 
 def unit_scale(x: Array) -> Array:

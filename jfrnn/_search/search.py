@@ -83,9 +83,10 @@ def search(
     Memory: 4 B per slot for the list, which keeps copies of what updates need: with a skin positions and queries, with a batch 4 B
     and with cutoffs per particle one float each (with a skin two). It shares no memory with the given arrays, so they, or the list,
     may be donated (`jax.jit(..., donate_argnums=)`). While searching, however large space is, "warp" takes at most 64 B and
-    "hashgrid" 84 B per particle, "jax" and "brute" at most 64 MB for the block being processed and 100 B per particle (float64: 125
-    B). With a box or a batch "warp" also copies the positions, at most 20 B per particle (float64: 40 B); with cutoffs per particle
-    it takes 140 B in all (float64: 180 B). See `memory_plan`.
+    "hashgrid" 84 B per particle, "jax" and "brute" 100 B per particle (float64: 125 B) and, for the block being processed, at most
+    64 MB on a CPU, elsewhere 1 GB or an eighth of the device's memory, whichever is less. With a box or a batch "warp" also copies
+    the positions, at most 20 B per particle (float64: 40 B); with cutoffs per particle it takes 140 B in all (float64: 180 B). See
+    `memory_plan`.
     Differentiable: the list is topology, without gradient; see `NeighborList.vectors`. Jit: yes, with capacity. vmap: yes, with
     capacity. Arrays that are sharded over a mesh are gathered on each device, and each does the whole work; `jfrnn.distributed`
     divides the work. `jax.export`: yes, with `disabled_checks=[jax.export.DisabledSafetyCheck.custom_call("jfrnn")]`; a process

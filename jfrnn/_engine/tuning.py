@@ -1,0 +1,82 @@
+"""What the array engine chooses by platform. Results are the same with any of these numbers; time and scratch memory are not."""
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import jax
+from jax import lax
+
+from jfrnn._tracing import Tree
+
+WORD_BYTES = 24  # what a word of 16 candidates takes while it is tested
+SLOT_BYTES = 16  # what a slot of a row takes while it is filled
+_SHARE = 8  # scratch is at most one of so many parts of a device's memory
+
+Operands = TypeVar("Operands")
+
+
+class Tuning(NamedTuple):
+    """How the array engine divides its work.
+
+    Attributes:
+        scratch: Memory of a block of queries [B], apart from the sorted particles.
+        words: Most words of 16 candidates in a block.
+        few_pairs: Up to so many pairs of a query and a source, all are tested, and nothing is sorted.
+        least_sorted: Fewer keys are sorted together with padding; XLA sorts with CUB from 16 385 keys on.
+        searched: Up to so many sources, the table of cells is made by binary searches instead of by counting.
+        doubtful_share: Rows with pairs that are decided exactly are processed in parts of a block, one of so many,
+        doubtful_rows: but at least so many rows at a time.
+        in_groups: Whether the word of a slot is found in a group of words instead of by looking at every word of its row.
+        group: Slots of a row that are filled at a time.
+    """
+
+    scratch: int
+    words: int
+    few_pairs: int
+    least_sorted: int
+    searched: int
+    doubtful_share: int
+    doubtful_rows: int
+    in_groups: bool
+    group: int
+
+
+CPU = Tuning(  # a block fits into the caches, and loops cost little
+    scratch=48_000_000,
+    words=1 << 16,
+    few_pairs=1 << 14,
+    least_sorted=0,
+    searched=0,
+    doubtful_share=4,
+    doubtful_rows=64,
+    in_groups=False,
+    group=128,
+)
+ACCELERATOR = Tuning(  # few large kernels, in at most 1 GB
+    scratch=900_000_000,
+    words=1 << 26,
+    few_pairs=1 << 25,
+    least_sorted=17 << 10,
+    searched=1 << 18,
+    doubtful_share=16,
+    doubtful_rows=4096,
+    in_groups=True,
+    group=256,
+)
+
+
+def by_platform(make: Callable[[Tuning], Callable[[Operands], Tree]], operands: Operands) -> Tree:
+    """Call make(tuning)(operands) with the numbers of the platform for which the program is compiled.
+
+    Operands that are known while tracing, such as cutoffs, are hidden from the compiler, which would else make another program of
+    another size where they are constants than where they are arguments.
+    """
+    operands = lax.optimization_barrier(operands)
+    return lax.platform_dependent(operands, cpu=make(CPU), default=make(_fit_memory(ACCELERATOR)))
+
+
+def _fit_memory(tuning: Tuning) -> Tuning:
+    """Limit the scratch to a share of the smallest accelerator's memory, where JAX has one and knows its memory."""
+    stats = [device.memory_stats() for device in jax.local_devices() if device.platform != "cpu"]
+    limits = [limit for stat in stats if stat and (limit := stat.get("bytes_limit"))]
+    return tuning._replace(scratch=min([tuning.scratch, *(limit // _SHARE for limit in limits)]))

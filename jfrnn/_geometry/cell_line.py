@@ -1,0 +1,251 @@
+"""Cells numbered along one line: particles sorted by that number, and one table that finds the particles of any cell.
+
+The number of the cell (x, y, z) is x + A·y + B·z modulo the length of the table, a power of two. In a domain that fits into the
+table, A and B are the lengths of a row and of a plane of cells, and each cell has a number of its own. In any other domain A and B
+are constants that strew the rows of cells over the table, so that the table follows the particles and never the domain. Cells that
+then share a number are candidates of each other; the pair test refuses their particles.
+
+Neighboring rows of cells differ by A or B wherever they are. So the rows around a query share no number, and no candidate is met
+twice: `_constants` makes sure of that, and the lengths of rows and planes leave room for it.
+
+Rows of cells are read along x. There a cell is divided into `FINE` parts, so that a query reads fewer particles beyond its cutoff.
+"""
+
+import functools
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jfrnn._geometry.cells import CellAxes, cell_coordinate, cell_remainder
+from jfrnn._geometry.images import Images
+
+FINE = 4  # parts of a cell along x
+_RUN = 2 * FINE + 1  # most parts that a run covers
+_SMALLEST_TABLE = 4096
+_LARGEST_TABLE = 1 << 30
+_LONGEST_SPAN = 2.0**23  # of cells along an axis, if each is to have a number of its own: whole floats up to there are exact
+
+
+class Cells(NamedTuple):
+    """The cells of points, as uint32 with wrap-around: parts of cells along x, cells along the other axes, then systems.
+
+    Attributes:
+        along: One array [n] per axis, and one for the systems of a batch.
+        there: [n] bool, which points are finite; others have no cell.
+    """
+
+    along: list[Array]
+    there: Array
+
+    def of(self, points: Array) -> "Cells":
+        """Return the cells of the points at these indices."""
+        along = [x.at[points].get(mode="promise_in_bounds") for x in self.along]
+        return Cells(along, self.there.at[points].get(mode="promise_in_bounds"))
+
+
+class CellLine(NamedTuple):
+    """Sources sorted by the number of their cell, and the table that finds them.
+
+    Attributes:
+        order: [n] int32, the source at each position; those without a cell come last.
+        inside: [] int32, how many sources have a cell.
+        table: [size + 2·FINE + 2] int32, the position at which each number begins. After its last number the table starts again,
+            with positions that go on from `inside`: runs may reach over the end.
+        strides: Per axis but the first, then for systems: what a step along it adds to the number, uint32.
+        turns: Per axis the number of cells, along x of parts, after which a periodic one starts again, int32; None for open ones.
+    """
+
+    order: Array
+    inside: Array
+    table: Array
+    strides: list[Array]
+    turns: list[Array | None]
+
+    @property
+    def twice(self) -> Array:
+        """The sources with a cell, twice in a row, as runs read them: [2·n] int32. Those that are queries come first."""
+        place = lax.iota(jnp.int32, 2 * self.order.size)
+        return self.order.at[jnp.where(place < self.inside, place, place - self.inside)].get(mode="clip")
+
+
+def sort_along_line(
+    points: Array, axes: CellAxes, sources: int, systems: Array | None, least_sorted: int = 0, searched: int = 0
+) -> tuple[CellLine, Cells]:
+    """Sort the first of the points [d, n + m], the `sources`, by cell; return also the cells of all points.
+
+    `systems` [n + m] uint32 are the systems of a batch. At least `least_sorted` keys are sorted, and the table of up to `searched`
+    sources is searched for in them instead of counted; both decide about time alone.
+    """
+    there = jnp.isfinite(points).all(axis=0)
+    size = table_size(sources)
+    whole = [
+        x if turn is not None else cell_coordinate(x, edge) for x, edge, turn in zip(points, axes.edges, axes.turns, strict=True)
+    ]
+    among = jnp.where(there[:sources], jnp.stack([x[:sources] for x in whole]), jnp.inf)
+    ends = jnp.min(jnp.concatenate([among, jnp.where(there[:sources], -among, jnp.inf)]), axis=1, initial=jnp.inf)  # at once
+    along, lengths = [], []
+    for axis, (x, edge, turns) in enumerate(zip(points, axes.edges, axes.turns, strict=True)):
+        limits = ends[axis], -ends[len(whole) + axis]
+        cells, length = _cells_along(x, whole[axis], limits, edge, turns, FINE if axis == 0 else 1)
+        along.append(cells)
+        lengths.append(length)
+    if systems is not None:
+        along.append(systems)
+        lengths.append(jnp.max(systems[:sources], initial=0).astype(points.dtype) + 1)
+    strides = _strides(lengths, size)
+    key = jnp.where(there[:sources], _number([cells[:sources] for cells in along], strides) & np.uint32(size - 1), np.uint32(size))
+    ascending, order = _sort(key, least_sorted)
+    if sources <= searched:
+        numbers = lax.iota(jnp.uint32, size + 1)
+        begin = jnp.searchsorted(ascending, numbers, side="left", method="scan_unrolled").astype(jnp.int32)
+    else:
+        counts = jnp.zeros(size + 1, jnp.int32).at[ascending.astype(jnp.int32) + 1].add(1, mode="drop")
+        begin = jnp.cumsum(counts, dtype=jnp.int32)
+    inside = begin[size]
+    table = jnp.concatenate([begin[:size], inside + begin[: _RUN + 1]])
+    turns = [None if turn is None else turn.astype(jnp.int32) * (1 if k else FINE) for k, turn in enumerate(axes.turns)]
+    return CellLine(order, inside, table, strides, turns), Cells(along, there)
+
+
+def sort_queries(line: CellLine, cells: Cells, sources: int, least_sorted: int) -> Array:
+    """Return queries, whose cells follow those of the `sources`, sorted by cell: [m] int32."""
+    there = cells.there[sources:]
+    number = _number([x[sources:] for x in cells.along], line.strides) & np.uint32(line.table.size - _RUN - 2)
+    key = jnp.where(there, number, np.uint32(line.table.size))
+    return _sort(key, least_sorted)[1]
+
+
+def _sort(key: Array, least: int) -> tuple[Array, Array]:
+    """Sort keys [n] uint32; return them and their indices. Fewer than `least` are sorted together with others that stay behind."""
+    more = max(least - key.size, 0)
+    padded = jnp.pad(key, (0, more), constant_values=np.uint32(2**32 - 1))
+    ascending, order = lax.sort((padded, lax.iota(jnp.int32, padded.size)), num_keys=1, is_stable=True)
+    return ascending[: key.size], order[: key.size]
+
+
+def table_size(sources: int) -> int:
+    """Return the length of the table for this number of sources, a power of two."""
+    return min(max(_SMALLEST_TABLE, 1 << (2 * sources - 1).bit_length()), _LARGEST_TABLE)
+
+
+def _cells_along(
+    x: Array, whole: Array, ends: tuple[Array, Array], edge: Array, turns: Array | None, parts: int
+) -> tuple[Array, Array]:
+    """Number the parts of cells along an axis; return also how many numbers that takes, with a margin, as a float.
+
+    Open axes, whose cells are the floats `whole`, begin where the sources do; `ends` are their first and last cell. Periodic ones,
+    whose coordinates are fractions from 0 to 1, begin at 0.
+    """
+    if turns is not None:
+        fine = turns * parts
+        return jnp.clip(jnp.floor(x * fine), 0, fine - 1).astype(jnp.int32).astype(jnp.uint32), fine + 2 * parts
+    lowest, highest = ends
+    lowest = jnp.where(lowest <= highest, lowest, 0)
+    cells = (_whole_number(whole) - _whole_number(lowest) + np.uint32(1)) * np.uint32(parts)
+    if parts > 1:
+        part = cell_coordinate(cell_remainder(x, edge), edge / parts)
+        part = jnp.clip(jnp.where(x < 0, parts - 1 - part, part), 0, parts - 1)  # below 0, cells are mirrored
+        cells = cells + part.astype(jnp.int32).astype(jnp.uint32)
+    span = jnp.maximum(highest - lowest, 0) + 1
+    return cells, jnp.where(span <= _LONGEST_SPAN, span * parts + 2 * parts, jnp.inf)
+
+
+def _whole_number(x: Array) -> Array:
+    """Return whole floats modulo 2^32 as uint32.
+
+    From 2^24 (float64: 2^53) on, pairs have equal coordinates: any function of them will do, and this one tells them apart.
+    """
+    if x.dtype == jnp.float32:
+        exact = jnp.abs(x) < 2.0**24
+        number = jnp.where(exact, x, 0).astype(jnp.int32).astype(jnp.uint32)
+        bits = lax.bitcast_convert_type(x, jnp.uint32)
+    else:
+        exact = jnp.abs(x) < 2.0**53
+        number = jnp.where(exact, x, 0).astype(jnp.int64).astype(jnp.uint32)
+        wide = lax.bitcast_convert_type(x, jnp.uint64)
+        bits = (wide >> np.uint64(32)).astype(jnp.uint32) ^ wide.astype(jnp.uint32)
+    return jnp.where(exact, number, bits * np.uint32(0x9E3779B1))
+
+
+def _strides(lengths: list[Array], size: int) -> list[Array]:
+    """Return what a step along each axis but the first adds to the number of a cell."""
+    total = functools.reduce(jnp.multiply, lengths) * (1 + 1e-5)  # rounded up
+    fits = total <= size
+    strides, stride = [], np.uint32(1)
+    for length, constant in zip(lengths[:-1], _constants(len(lengths) - 1, size), strict=True):
+        stride = stride * jnp.where(fits, length, 1).astype(jnp.uint32)
+        strides.append(jnp.where(fits, stride, constant))
+    return strides
+
+
+@functools.cache
+def _constants(count: int, size: int) -> list[np.uint32]:
+    """Return odd strides that strew rows over a table evenly, as the multiples of powers of an irrational number are (R2 sequence).
+
+    Rows up to two steps apart along each axis are at least a run apart.
+    """
+    ratio = 1.0
+    for _ in range(64):  # the root of x^(count + 1) = x + 1
+        ratio = (1 + ratio) ** (1 / (count + 1))
+    strides = [int(size / ratio ** (k + 1)) | 1 for k in range(count)]
+    for steps in itertools.product(range(-2, 3), repeat=count):
+        apart = sum(step * stride for step, stride in zip(steps, strides, strict=True)) % size
+        if any(steps) and min(apart, size - apart) < _RUN:
+            raise AssertionError(f"rows of cells overlap in a table of {size}: strides {strides}.")
+    return [np.uint32(stride) for stride in strides]
+
+
+def _number(cells: Sequence[Array], strides: list[Array]) -> Array:
+    return functools.reduce(jnp.add, (c * stride for c, stride in zip(cells[1:], strides, strict=True)), cells[0])
+
+
+def line_runs(line: CellLine, cells: Cells, images: Images | None) -> tuple[Array, Array, Array | None]:
+    """Find the sources in the cells around each query: starts, ends and image codes of their runs, [m, runs] int32.
+
+    In open space each query has 3^(d-1) runs, one per row of cells. Along a periodic axis the cells beyond either end are those of
+    a periodic image, and a row is split where it enters another image.
+    """
+    dim = len(line.turns)
+    reach = (0,) * dim if images is None else images.reach
+    steps = [range(-max(k, 1), max(k, 1) + 1) for k in reach[1:]]
+    rows = np.stack(np.meshgrid(*steps, indexing="ij"), -1).reshape(-1, dim - 1).astype(np.int32)
+    parts = _parts_of_rows(cells.along[0].astype(jnp.int32), line.turns[0], reach[0], images)
+
+    def each(values: list[Array]) -> Array:  # [m, runs]: all rows of the first part come first
+        return jnp.repeat(jnp.stack(values, axis=1), len(rows), axis=1)
+
+    first, last, turn = (each([part[what] for part in parts]) for what in range(3))
+    number, turned = [first.astype(jnp.uint32)], [turn]
+    for axis in range(1, dim):
+        cell = cells.along[axis].astype(jnp.int32)[:, None] + np.tile(rows[:, axis - 1], len(parts))[None]
+        turns = line.turns[axis]
+        turn = jnp.zeros_like(cell) if turns is None else cell // turns
+        turned.append(turn)
+        number.append((cell if turns is None else cell - turn * turns).astype(jnp.uint32))
+    number += [system[:, None] for system in cells.along[dim:]]
+    size = line.table.size - _RUN - 1
+    begin = (_number(number, line.strides) & np.uint32(size - 1)).astype(jnp.int32)
+    length = jnp.where(cells.there[:, None], jnp.maximum(last - first + 1, 0), 0)
+    start, stop = (line.table.at[at].get(mode="promise_in_bounds") for at in (begin, begin + length))
+    if images is None:
+        return start, stop, None
+    code = jnp.zeros_like(first)
+    for turn, k in zip(turned, reach, strict=True):
+        code = code * (2 * k + 1) + (turn + k)
+    return start, stop, code
+
+
+def _parts_of_rows(x: Array, turns: Array | None, reach: int, images: Images | None) -> list[tuple[Array, Array, Array]]:
+    """Split the row of parts around x [m] at the borders of images: first and last part, and image of each piece, [m] each."""
+    if images is None or turns is None:
+        return [(x - FINE, x + FINE, jnp.zeros_like(x))]
+    if images.nearest:  # The box has at least two cells, so a row enters only one other image.
+        shifts = [jnp.zeros_like(x), jnp.where(x < FINE, -1, 1)]
+    else:
+        shifts = [jnp.full_like(x, s) for s in range(-reach, reach + 1)]
+    beyond, most = FINE * reach, turns - 1
+    return [(jnp.maximum(x - beyond - s * turns, 0), jnp.minimum(x + beyond - s * turns, most), s) for s in shifts]

@@ -1,0 +1,87 @@
+"""The array engine: the numbers of accelerators decide as those of the CPU do, and its programs are pure array programs."""
+
+import re
+
+import checked
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+
+import jfrnn
+from jfrnn._engine import tuning
+from jfrnn.cases.hard import HARD_CASES
+
+# blocks as small as these cases, so that each has several
+ELSEWHERE = tuning.ACCELERATOR._replace(words=1 << 12, few_pairs=1000, searched=300, doubtful_rows=16)
+TIES = ("lattice_1e-4_at_0", "ulps_far", "cell_edges_far", "queries_fewer")
+
+
+@pytest.fixture
+def elsewhere(monkeypatch):
+    """Compile for the CPU with the numbers of accelerators."""
+    jax.clear_caches()
+    monkeypatch.setattr(tuning, "CPU", ELSEWHERE)
+    yield
+    jax.clear_caches()
+
+
+@pytest.mark.parametrize("name", [name if name in TIES else pytest.param(name, marks=pytest.mark.slow) for name in HARD_CASES])
+def test_numbers_of_accelerators_find_the_same_pairs(name, elsewhere):
+    if name == "denormal_lattice":
+        pytest.skip("its cutoff is refused")
+    given = HARD_CASES[name].build(np.float32, 3)
+    nbrs = checked.search_padded(given, max(704, len(given.positions)), 704, backend="jax")
+    checked.assert_pairs(nbrs, reference.reference_pairs(given.positions, given.cutoff, queries=given.queries))
+
+
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.usefixtures("elsewhere")
+@pytest.mark.parametrize(
+    "kind", ["batch", "images", *(pytest.param(kind, marks=SLOW) for kind in ("half", "nearest images", "a cutoff per particle"))]
+)
+def test_options_with_the_numbers_of_accelerators(kind):
+    rng = np.random.default_rng(1)
+    x, cutoff, options = rng.random((600, 3)).astype(np.float32), 0.2, {}
+    if kind == "a cutoff per particle":
+        cutoff = rng.uniform(0.02, 0.2, 600).astype(np.float32)
+    else:
+        options = {
+            "batch": {"batch": rng.integers(0, 5, 600)},
+            "half": {"half": True},
+            "images": {"box": jfrnn.Box([1.0, 0.3, 1.0])},
+            "nearest images": {"box": jfrnn.Box([1.0, 1.0, 1.0])},
+        }[kind]
+    found, right = (jfrnn.search(x, cutoff, backend=backend, **options) for backend in ("jax", "warp"))
+    assert pairs_of(found) == pairs_of(right)
+    np.testing.assert_array_equal(found.count, right.count)
+
+
+def pairs_of(nbrs):
+    i, j = nbrs.pairs()
+    pairs = sorted(zip(i.tolist(), j.tolist(), strict=True))
+    assert len(pairs) > 1000
+    return pairs
+
+
+def spring(r, i, j):
+    return jnp.maximum(0.2 - jnp.sqrt(jnp.sum(r * r) + 1e-6), 0) ** 2
+
+
+def everything(x):
+    nbrs = jfrnn.search(x, 0.2, capacity=64, backend="jax")
+    sums = jax.value_and_grad(lambda x: jfrnn.pair_sum(spring, x, 0.2, backend="jax").sum())(x)
+    return nbrs.idx, nbrs.count, jfrnn.count(x, 0.2, backend="jax"), *sums
+
+
+@pytest.mark.parametrize("box", [False, True])
+def test_programs_are_exported_for_every_platform(box):
+    """One program for CPUs, GPUs of two makers and TPUs, with no custom call but what XLA itself means by one."""
+    fn = everything if not box else lambda x: jfrnn.search(x, 0.2, capacity=64, box=jfrnn.Box([1.0] * 3), backend="jax").idx
+    x = jax.ShapeDtypeStruct((5000, 3), np.float32)
+    program = jax.export.export(jax.jit(fn), platforms=["cpu", "cuda", "rocm", "tpu"])(x)
+    assert program.platforms == ("cpu", "cuda", "rocm", "tpu")
+    assert set(re.findall(r"custom_call @(\w+)", str(program.mlir_module()))) <= {"Sharding", "annotate_device_placement"}
