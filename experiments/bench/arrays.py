@@ -23,6 +23,7 @@ MOST_ON_CPU = 63**3  # particles, unless sizes are asked for
 CUTOFF = 3.0  # spacings
 JITTER = 0.3  # spacings
 STEPS = 10  # of a scan
+ROUNDED = 1e-3  # share of the particles whose rows of a peer may differ: its distances are rounded
 MOST_OF_PEERS = 300_000  # jax-md takes a gigabyte per 13 000 particles of this density while it allocates
 COLUMNS = (
     *("platform", "n", "layout", "who", "what", "neighbors", "lower_s", "compile_s", "waited_ms", "step_ms", "scratch_mb", "wrong"),
@@ -134,7 +135,7 @@ def _prepare(way: _Way, scene: _Scene) -> tuple[table.Line, Callable[[], Any], C
     end = perf_counter()
     jax.config.update("jax_enable_compilation_cache", cache)
     wrong = way.wrong(scene, compiled(scene.x))
-    if wrong:
+    if wrong > (0 if way.method is None else ROUNDED * len(scene.x)):
         raise ValueError(f"the answer is wrong for {wrong} particles")
     analysis = compiled.memory_analysis()
     scratch = None if analysis is None else analysis.temp_size_in_bytes / 1e6
