@@ -151,7 +151,7 @@ def describe_call(name: str, variant: Variant, plan: Callable[[Shapes, int], Pla
     return Call(whole, _PARTICLES, dict.fromkeys(results, np.int32), plan)
 
 
-def _numbers(variant: Variant, shapes: Shapes) -> dict[str, int]:
+def plan_numbers(variant: Variant, shapes: Shapes) -> dict[str, int]:
     """Return the numbers that kernels of cells take, by name; without rows the capacity is 0."""
     flags = {"closed": variant.closed, "drop_self": variant.keep.drop_self, "later_only": variant.keep.later_only}
     capacity = shapes["idx"][1] if variant.lists else 0
@@ -166,14 +166,14 @@ def _plan_on_cuda(variant: Variant, shapes: Shapes, multiprocessors: int) -> Pla
     kind = {"periodic": variant.periodic, "batched": variant.batched}
     dim, later = variant.dim, variant.keep.later_only
     kernels = cells_cuda.cell_kernels(dim, variant.double, variant.scaled, variant.lists, later, **kind)
-    numbers = _numbers(variant, shapes)
+    numbers = plan_numbers(variant, shapes)
     return Plan(
         place_launches(kernels.launches(numbers["n"], numbers["m"], variant.own, multiprocessors)), numbers, _absent(variant)
     )
 
 
 def _plan_few(variant: Variant, shapes: Shapes, _: int) -> Plan:
-    numbers = _numbers(variant, shapes)
+    numbers = plan_numbers(variant, shapes)
     numbers["drop_self"] &= variant.own
     query = few_cuda.rows_kernel(variant.dim, variant.double, variant.lists, variant.batched, variant.periodic == 1)
     return Plan([Clear("info", 8), Launch(query, few_cuda.threads(numbers["m"]))], numbers, _absent(variant))
@@ -187,7 +187,7 @@ def place_launches(launches: Sequence[cells_cuda.Launch]) -> list[Launch]:
 def _plan_on_cpu(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan:
     kind = {"periodic": variant.periodic, "batched": variant.batched}
     kernels = cells_cpu.cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, **kind)
-    numbers = _numbers(variant, shapes)
+    numbers = plan_numbers(variant, shapes)
     rows = ask_for_huge_pages("idx", 4 * numbers["m"] * numbers["capacity"]) if variant.lists else []
     steps = [*sort_on_cpu(kernels, numbers["n"]), *rows, share(kernels.query, numbers["m"])]
     return Plan(steps, numbers, _absent(variant))

@@ -1,5 +1,5 @@
-// How a call of XLA becomes launches of kernels: native code on the thread of the call, which neither runs nor waits for Python, but for
-// the two cases that `Desk` names: a plan that is not known yet, and a launch that only Python can make (hash grid).
+// How a call of XLA becomes launches of kernels: native code on the thread of the call, which neither runs nor waits for Python, unless
+// its plan is not known yet.
 //
 // Python lays down a plan for each kernel, for the shapes of a call and, on CUDA, for a device: which functions are launched, in order,
 // and the bytes of their arguments, but for the addresses of arrays, which a call brings. Plans are found by the name that a program
@@ -10,7 +10,7 @@
 
 typedef void (*Function)(const void* arguments);
 
-enum Kind { ONCE, SHARED, CUDA, CUDA_BESIDE, CLEAR, HUGE_PAGES, PYTHON };
+enum Kind { ONCE, SHARED, CUDA, CUDA_BESIDE, CLEAR, HUGE_PAGES };  // ONCE: on the CPU, also among launches on CUDA
 
 struct Step {
     void* function;                  // CPU: called with the address of the arguments; CUDA: a function of the driver
@@ -27,15 +27,15 @@ struct Plan {
     unsigned long long hash;
     long long users;  // calls that are under way
     const Step* steps;
-    void *side, *begun, *ended;  // a second stream of the device, and two events
+    void *side, *begun, *ended;  // a second stream of the device, and two events; of those that take turns the last event alone
     int device, step_count;
+    int in_turns;  // whether calls take turns, as they share what is kept on a device
 };
 
 // What Python tells once: functions that are called, and the plans there are.
 struct Desk {
-    // What asks for the plan of a name, and what serves a call: they write down what goes wrong, or an empty text.
+    // What asks for the plan of a name: it writes down what goes wrong, or an empty text.
     void (*make_plan)(const char* name, long long name_size, const char* recipe, long long recipe_size, int device, char* wrong);
-    void (*serve)(const char* name, long long name_size, int device, void* stream, void* const* arrays, char* wrong);
     int (*yield)();
     int (*advise)(void* address, size_t size, int advice);
     int (*launch)(void* function, unsigned int, unsigned int, unsigned int, unsigned int, unsigned int, unsigned int, unsigned int,
@@ -57,6 +57,7 @@ struct Desk {
     unsigned long main_thread;
     int locked, forking;
     int asking, closed;  // questions that are open, and whether there will be no more answers
+    void* turn;          // a lock of calls that take turns
 };
 static Desk* desk;
 
@@ -174,7 +175,7 @@ struct Call {
             discard(error);
         return error == nullptr;
     }
-    // Puts down the addresses of the arrays, inputs first.
+    // Puts down the addresses of the arrays, inputs first, and returns how many there are.
     int arrays(void** found) const {
         int count = 0;
         for (long long k = 0; k < frame->args.size && count < MOST_ARRAYS; ++k)
@@ -205,21 +206,14 @@ static Plan* enter(XLA_FFI_ByteSpan name, int device) {
 }
 static void leave(Plan* plan) { __atomic_fetch_sub(&plan->users, 1, __ATOMIC_RELEASE); }
 
-// A question to Python. Where nothing comes back, something went wrong.
+// A question to Python for a plan. Where nothing comes back, something went wrong.
 struct Question {
     XLA_FFI_ByteSpan name, recipe;
     int device;
-    void* stream;
-    void* const* arrays;  // of a call that is to be served; none: for a plan
     char wrong[MOST_WORDS] = "Python ended, or stopped, before it had answered.";
     void* answered = nullptr;
 
-    void ask() {
-        if (arrays)
-            desk->serve(name.ptr, (long long)name.len, device, stream, arrays, wrong);
-        else
-            desk->make_plan(name.ptr, (long long)name.len, recipe.ptr, (long long)recipe.len, device, wrong);
-    }
+    void ask() { desk->make_plan(name.ptr, (long long)name.len, recipe.ptr, (long long)recipe.len, device, wrong); }
     static void ask_apart(void* given) {
         Question* question = (Question*)given;
         question->ask();
@@ -301,14 +295,30 @@ struct Team {
     }
 };
 
+// The turn of a call, where calls take turns.
+struct Turn {
+    const bool is_taken;
+    explicit Turn(const Plan& plan) : is_taken(plan.in_turns) {
+        if (is_taken)
+            desk->take_lock(desk->turn, 1);
+    }
+    ~Turn() {
+        if (is_taken)
+            desk->give_lock(desk->turn);
+    }
+};
+
 // What a call does on a device.
 struct Work {
     const Call& call;
     const Plan& plan;
     void* const stream;
-    void* arrays[MOST_ARRAYS];
+    void* arrays[MOST_ARRAYS + 1];  // behind them the stream
+    const Turn turn;
 
-    Work(const Call& given, const Plan& found, void* of_call) : call(given), plan(found), stream(of_call) { call.arrays(arrays); }
+    Work(const Call& given, const Plan& found, void* of_call) : call(given), plan(found), stream(of_call), turn(found) {
+        arrays[call.arrays(arrays)] = stream;
+    }
 
     void fill(const Step& step, unsigned char* bytes) const {
         memcpy(bytes, step.arguments, (size_t)step.size);
@@ -332,12 +342,27 @@ struct Work {
         wrong = wrong ? wrong : desk->record(plan.ended, plan.side);
         return wrong ? wrong : desk->wait(stream, plan.ended, 0);
     }
+    void run_once(const Step& step) const {
+        alignas(16) unsigned char bytes[MOST_BYTES];
+        fill(step, bytes);
+        ((Function)step.function)(bytes);
+    }
     int run_on_cuda() const {
+        if (!plan.in_turns)
+            return launch_all();
+        int wrong = desk->wait(stream, plan.ended, 0);  // for calls before, on other streams
+        wrong = wrong ? wrong : launch_all();
+        const int lost = desk->record(plan.ended, stream);
+        return wrong ? wrong : lost;
+    }
+    int launch_all() const {
         int wrong = 0;
         for (int k = 0; k < plan.step_count && !wrong; ++k) {
             const Step& step = plan.steps[k];
             if (step.kind == CLEAR)
                 wrong = desk->clear((unsigned long long)arrays[step.arrays[1]], 0, (size_t)step.threads / 4, stream);
+            else if (step.kind == ONCE)
+                run_once(step);
             else if (k + 1 < plan.step_count && plan.steps[k + 1].kind == CUDA_BESIDE)
                 wrong = launch_both(plan.steps + k++);
             else
@@ -384,24 +409,19 @@ static XLA_FFI_Error* answer(XLA_FFI_CallFrame* frame, bool cuda) {
         return nullptr;
     const XLA_FFI_ByteSpan name = call.text("kernel");
     if (!executes && cuda) {  // XLA does not say for which device a program is made: most likely for the first one
-        Question question = {name, call.text("recipe"), ON_FIRST, nullptr, nullptr};
+        Question question = {name, call.text("recipe"), ON_FIRST};
         return question.succeeds() ? nullptr : question.fail(call);
     }
     const int device = cuda ? call.device() : ON_CPU;
     Plan* plan = enter(name, device);
     while (plan == nullptr) {
-        Question question = {name, call.text("recipe"), device, nullptr, nullptr};
+        Question question = {name, call.text("recipe"), device};
         if (!question.succeeds())
             return question.fail(call);
         plan = enter(name, device);
     }
     XLA_FFI_Error* error = nullptr;
-    if (executes && plan->step_count > 0 && plan->steps[0].kind == PYTHON) {
-        void* arrays[MOST_ARRAYS];
-        call.arrays(arrays);
-        Question question = {name, {}, device, cuda ? call.stream() : nullptr, arrays};
-        error = question.succeeds() ? nullptr : question.fail(call);
-    } else if (executes && cuda) {
+    if (executes && cuda) {
         const int wrong = Work(call, *plan, call.stream()).run_on_cuda();
         error = wrong ? call.fail_at("a launch failed with CUDA's error ", wrong) : nullptr;
     } else if (executes)
@@ -416,6 +436,7 @@ extern "C" {
 // Takes the desk, where both sides mean the same by what stands on it.
 bool open_desk(Desk* given, long long desk_size, long long plan_size, long long step_size) {
     desk = given;
+    desk->turn = desk->make_lock();
     return desk_size == sizeof(Desk) && plan_size == sizeof(Plan) && step_size == sizeof(Step);
 }
 XLA_FFI_Error* answer_on_cpu(XLA_FFI_CallFrame* frame) { return answer(frame, false); }
@@ -424,6 +445,7 @@ XLA_FFI_Error* answer_on_cuda(XLA_FFI_CallFrame* frame) { return answer(frame, t
 void begin_anew(unsigned long main_thread) {
     desk->main_thread = main_thread;
     desk->locked = desk->forking = desk->asking = 0;
+    desk->turn = desk->make_lock();
     for (long long k = 0; k < desk->plan_count; ++k)
         desk->plans[k]->users = 0;
 }
