@@ -18,6 +18,7 @@ import jfrnn
 import jfrnn._memory
 from experiments import _measure
 from jfrnn._engine import hashgrid, launch
+from jfrnn.kernels import few_cuda
 
 ROOT = Path(__file__).parent.parent
 SIZES = [(1000, 40), (30_000, 256), (300_000, 40)]
@@ -75,6 +76,17 @@ def test_warp_takes_at_most_64_bytes_per_particle(dim, dtype):
     for (n, capacity), platform in itertools.product([(10, 1), *SIZES, (10**9, 64)], ["cpu", "gpu"]):
         plan = jfrnn.memory_plan(n, 0.1, capacity, dim=dim, dtype=dtype, backend="warp", platform=platform)
         assert plan.total_bytes <= 4 * n * capacity + 64 * n + 64_000
+
+
+def test_few_particles_take_no_scratch_on_a_gpu():
+    """All of them meet in one kernel, unless the cutoff is so small that squares need a unit."""
+
+    def scratch(n, cutoff=0.1, platform="gpu", **more):
+        return jfrnn.memory_plan(n, cutoff, 8, backend="warp", platform=platform, **more).scratch_bytes
+
+    assert scratch(few_cuda.MOST) == scratch(10, queries=few_cuda.MOST) == 0
+    others = scratch(few_cuda.MOST + 1), scratch(10, queries=few_cuda.MOST + 1), scratch(10, 2.0**-90), scratch(10, platform="cpu")
+    assert min(others) > 40
 
 
 @pytest.mark.parametrize("backend", ["jax", pytest.param("brute", marks=pytest.mark.slow)])

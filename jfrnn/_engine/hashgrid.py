@@ -59,7 +59,7 @@ class HashGridEngine:
 
         return lax.platform_dependent(search._replace(checks={}), cpu=on(False), cuda=on(True))
 
-    def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool) -> int:
+    def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool, scaled: bool) -> int:
         """Return the scratch that the kernels are given, and what Warp allocates for the grid [B]."""
         check_platform(self.name, platform)
         if 0 in (n, m):

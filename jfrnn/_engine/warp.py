@@ -59,15 +59,22 @@ class WarpEngine:
         cpu, cuda = on(cells_cpu, _cpu_callable), on(few_cuda, _few_callable) if few else on(cells_cuda, _cuda_callable)
         return lax.platform_dependent(search._replace(checks={}), cpu=cpu, cuda=cuda)
 
-    def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool) -> int:
+    def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool, scaled: bool) -> int:
         """Return the scratch that the kernels are given [B]."""
         check_platform(self.name, platform)
-        return 4 * _CELLS[PLATFORMS[platform]].scratch_words(n, m, dim, 2 if double else 1, own) if n and m else 0
+        cells = _CELLS[PLATFORMS[platform]]
+        if 0 in (n, m) or (cells is cells_cuda and _all_meet((n, m), scaled)):
+            return 0
+        return 4 * cells.scratch_words(n, m, dim, 2 if double else 1, own)
 
 
 def are_few(search: Search) -> bool:
     """Say whether particles are so few that on CUDA all of them meet, in one launch."""
-    return periodic_kind(search.torus) <= 1 and not search.cutoff.scaled and max(search.sizes) <= few_cuda.MOST
+    return periodic_kind(search.torus) <= 1 and _all_meet(search.sizes, search.cutoff.scaled)
+
+
+def _all_meet(sizes: tuple[int, int], scaled: bool) -> bool:
+    return not scaled and max(sizes) <= few_cuda.MOST
 
 
 class Variant(NamedTuple):
