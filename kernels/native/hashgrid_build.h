@@ -1,4 +1,7 @@
 // Builds `wp.HashGrid` by the function of Warp's library that `wp.HashGrid.build` calls: on the host, for the CPU and for CUDA.
+//
+// On CUDA that function works in a static variable, so calls take turns whatever grid they build. It launches on the stream that Warp
+// has for the context, which is set to that of the call meanwhile.
 #pragma once
 #include "constants.h"
 #include "float_control.h"
