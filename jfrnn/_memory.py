@@ -96,7 +96,10 @@ def memory_plan(
     compiled too, with "warp" in a tenth of a second: they take the scratch of the search, two copies of the numbers that fn reads
     of each j, one of those of each i (coordinates excluded), and the sums; in a gradient, two sums per coordinate.
 
-    The plan excludes what lists of some scenes keep in addition: for a batch 4 B per particle and query, for cutoffs per particle a
+    The plan is that of open space. On a GPU "warp" takes no scratch for up to 4096 particles, unless their box is skewed or so
+    small that images must be told apart: then less than 400 kB.
+
+    It excludes what lists of some scenes keep in addition: for a batch 4 B per particle and query, for cutoffs per particle a
     float each (with a skin two), for a box whose images must be told apart 1 B per slot (2 B from 257 images on) and 4 B per
     particle and query.
 
@@ -137,30 +140,40 @@ def memory_plan(
     radius = check_cutoff(cutoff, dtype)
     rows = n if queries is None else queries
     where = default_platform() if platform is None else platform
+    _check_parts(faces, queries, fn, capacity, gradient or values is not None)
     if faces is not None:
-        if fn is not None or queries is not None:
-            raise ValueError("faces belong to a search for triangles, which knows neither fn nor queries: leave them out.")
         sizes = (n, check_size("faces", faces), dim, check_capacity(capacity))
         return _plan_of_triangles(sizes, dtype, radius, backend, _device_of(where))
     engine = check_backend(backend)
     if fn is not None:
-        if capacity is not None:
-            raise ValueError(f"capacity is that of a list, which a pair sum does not make: leave it out, or fn, got {capacity}.")
-        points = [None if size is None else jax.ShapeDtypeStruct((size, dim), dtype) for size in (n, queries)]
+        points = _shapes_of(n, queries, dim, dtype)
         return _plan_of_sum(fn, points, cutoff, values, gradient, engine, _device_of(where))
-    if values is not None or gradient:
-        raise ValueError("values and gradient belong to a pair sum: say its fn, too.")
     capacity = None if capacity is None else check_capacity(capacity)
     chosen = fastest_engine(_device_of(where).platform, n) if engine == "auto" else ENGINES[engine]
-    scratch = chosen.scratch_bytes(where, n, rows, dim, dtype == np.float64, queries is None)
+    scratch = chosen.scratch_bytes(where, n, rows, dim, dtype == np.float64, queries is None, radius.scaled)
     if scratch is None:
-        at = SingleDeviceSharding(_device_of(where))
-        points = [None if size is None else jax.ShapeDtypeStruct((size, dim), dtype, sharding=at) for size in (n, queries)]
-        scratch = _compiled_scratch(points, radius, chosen, capacity)
+        scratch = _compiled_scratch(_shapes_of(n, queries, dim, dtype, _device_of(where)), radius, chosen, capacity)
     if capacity is None:
         return MemoryPlan(0, scratch, chosen.name, counts_bytes=4 * rows)
     kept = (n + (queries or 0)) * dim * dtype.itemsize + 4 if check_skin(skin, float(radius.radius), dtype) else 0
     return MemoryPlan(4 * rows * (capacity + 1) + 8 + kept, scratch, chosen.name)
+
+
+def _check_parts(
+    faces: int | None, queries: int | None, fn: Callable[..., Any] | None, capacity: int | None, of_sums: bool
+) -> None:
+    """Refuse arguments that do not belong to what is planned."""
+    if faces is not None and (fn is not None or queries is not None):
+        raise ValueError("faces belong to a search for triangles, which knows neither fn nor queries: leave them out.")
+    if faces is None and fn is not None and capacity is not None:
+        raise ValueError(f"capacity is that of a list, which a pair sum does not make: leave it out, or fn, got {capacity}.")
+    if faces is None and fn is None and of_sums:
+        raise ValueError("values and gradient belong to a pair sum: say its fn, too.")
+
+
+def _shapes_of(n: int, queries: int | None, dim: int, dtype: np.dtype, device: Device = None) -> list[jax.ShapeDtypeStruct | None]:
+    at = None if device is None else SingleDeviceSharding(device)
+    return [None if size is None else jax.ShapeDtypeStruct((size, dim), dtype, sharding=at) for size in (n, queries)]
 
 
 def _device_of(platform: str) -> Device:

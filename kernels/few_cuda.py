@@ -37,15 +37,7 @@ def slots(queries: int) -> int:
 def rows_kernel(dim: int, double: bool, lists: bool, batched: bool, boxed: bool = False) -> Kernel:
     """Return the kernel for a dimension and dtype, for lists or counts alone; `info` is zeros at first."""
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_list' * lists}{'_nearest' * boxed}{'_batched' * batched}"
-    constants = {
-        "LIST": lists,
-        "SUMS": 0,
-        "PERIODIC": boxed,
-        "BATCHED": batched,
-        "FEW_TILE": _TILE[double],
-        "FEW_QUERIES": _QUERIES,
-    }
-    text = program(double, dim, "few_rows.cuh", **constants)
+    text = program(double, dim, "few_rows.cuh", SUMS=0, **_constants(double, lists, batched, boxed))
     return declare(f"few_cuda_{variant}", text, Entry("FewRows.run", 32 * _QUERIES, _BLOCKS), cuda=True, fused=True)[0]
 
 
@@ -63,14 +55,11 @@ def sum_kernel(
     """Return the kernel that sums a term; the arguments are those of `jfrnn.kernels.pair_sum_cuda.sum_kernels`."""
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_compensated' * compensated}{'_nearest' * boxed}"
     variant += f"{'_batched' * batched}{'_extremes' * extremes}"
-    constants = {
-        **GRID,
-        "PERIODIC": boxed,
-        "BATCHED": batched,
-        "LIST": 0,
-        "FEW_TILE": _TILE[double],
-        "FEW_QUERIES": _QUERIES,
-        **constants_of(term, compensated, extremes),
-    }
+    constants = GRID | _constants(double, False, batched, boxed) | constants_of(term, compensated, extremes)
     text = program(double, dim, "few_sums.cuh", given=term_header(term, double), **constants)
     return declare(f"few_sums_cuda_{variant}_{key}", text, Entry("FewSums.run", 32 * _QUERIES, _BLOCKS), cuda=True, fused=True)[0]
+
+
+def _constants(double: bool, lists: bool, batched: bool, boxed: bool) -> dict[str, int]:
+    sizes = {"FEW_TILE": _TILE[double], "FEW_QUERIES": _QUERIES}
+    return {"LIST": lists, "PERIODIC": boxed, "BATCHED": batched, **sizes}

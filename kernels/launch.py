@@ -17,10 +17,15 @@ typedef __UINT64_TYPE__ uint64_t;
 """
 
 
-def write_launcher(header: str) -> str:
-    """Return the text of the program; `header` is that of XLA's foreign function interface (`xla/ffi/api/c_api.h`)."""
+def write_launcher(header: str, file: str = "launch.h") -> str:
+    """Return the text of the program, or of a file of it.
+
+    Args:
+        header: That of XLA's foreign function interface (`xla/ffi/api/c_api.h`).
+        file: A file of `kernels/native`.
+    """
     interface = _TYPES + re.sub(r"^#include <.*>\n", "", header, flags=re.MULTILINE)
-    return resolve("launch.h", given={"xla_ffi.h": interface})
+    return resolve(file, given={"xla_ffi.h": interface})
 
 
 def launcher(header: str) -> Program:

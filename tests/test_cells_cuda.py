@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jfrnn._geometry.levels import GROUPS, HALVINGS
-from jfrnn.kernels import _compile, cells_cpu, cells_cuda, declare, few_cuda, levels
+from jfrnn.kernels import _compile, cells_cpu, cells_cuda, declare, few_cuda, hashgrid, levels
 from jfrnn.kernels._native import program
 
 VARIANTS = [(dim, double, False, lists, False) for dim, double, lists in itertools.product((2, 3), (False, True), (False, True))]
@@ -31,6 +31,11 @@ def compiles(*kernels):
 @pytest.mark.parametrize(("dim", "double", "scaled", "lists", "later"), VARIANTS)
 def test_variants_compile(dim, double, scaled, lists, later):
     assert compiles(*cells_cuda.cell_kernels(dim, double, scaled, lists, later)) == 2
+
+
+@pytest.mark.parametrize(("dim", "double", "scaled", "lists"), [*itertools.product((2, 3), *3 * [(False, True)])])
+def test_hashgrid_compiles(dim, double, scaled, lists):
+    assert compiles(*hashgrid.search_kernels(dim, double, scaled, lists, cuda=True)) == 1
 
 
 def test_boxes_batches_and_cutoffs_per_particle_compile():

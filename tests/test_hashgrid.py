@@ -1,16 +1,18 @@
 """`backend="hashgrid"` where `wp.HashGrid` has its corners: shared buckets, cells beyond 32 bits, NaN, one program per cutoff."""
 
+import ctypes
 import re
+from concurrent.futures import ThreadPoolExecutor
 
 import checked
 import jax
 import jax.numpy as jnp
+import launched
 import numpy as np
 import pytest
 
 import jfrnn
-from jfrnn._engine.start import load_warp
-from jfrnn.kernels.hashgrid import grid_shape
+from jfrnn.kernels import _clang, hashgrid
 
 
 @pytest.mark.parametrize(
@@ -27,7 +29,7 @@ from jfrnn.kernels.hashgrid import grid_shape
     ],
 )
 def test_grid_follows_the_particles(sources, dim, shape):
-    assert grid_shape(sources, dim) == shape
+    assert hashgrid.grid_shape(sources, dim) == shape
 
 
 def test_distant_cells_that_share_a_bucket(dtype, dim):
@@ -71,6 +73,46 @@ def test_sizes_and_cutoffs_take_turns():
         checked.assert_exact(jfrnn.search(points, cutoff, backend="hashgrid"), points, cutoff)
 
 
+def test_threads_that_search_at_once_get_what_is_theirs():
+    """They share one grid, and each builds its own points into it."""
+    cases = [np.random.default_rng(n).random((n, 3)).astype(np.float32) for n in range(1500, 1516)]
+    search = [jax.jit(lambda x, r=0.1 + 0.01 * k: jfrnn.search(x, r, capacity=400, backend="hashgrid").idx) for k in range(16)]
+    expected = [np.asarray(work(x)) for work, x in zip(search, cases)]
+    with ThreadPoolExecutor(4) as threads:
+        found = [threads.submit(work, x) for _ in range(5) for work, x in zip(search, cases)]
+        for k, each in enumerate(found):
+            np.testing.assert_array_equal(each.result(), expected[k % 16])
+    checked.assert_exact(jfrnn.search(cases[3], 0.13, backend="hashgrid"), cases[3], 0.13)
+
+
+@pytest.mark.parametrize("others", [None, 9])
+def test_on_cuda_warp_builds_on_the_stream_of_the_call(dtype, others):
+    """Warp's functions are called as its own Python does, and go back to their stream, unless others set theirs meanwhile."""
+    told, stream = [], [5]
+
+    def update(grid, kind, width, points, groups):
+        told.append((grid, kind, width, points[0], groups, stream[0]))
+        stream[0] = others or stream[0]
+
+    def set_stream(context, given, wait):
+        assert (context, wait) == (11, 0)
+        stream[0] = given
+
+    word, number = ctypes.c_void_p, ctypes.c_int
+    kinds = word, number, ctypes.c_double, ctypes.POINTER(word), word
+    functions = {
+        "update": ctypes.CFUNCTYPE(None, *kinds)(update),
+        "get_stream": ctypes.CFUNCTYPE(word, word)(lambda context: stream[0]),
+        "set_stream": ctypes.CFUNCTYPE(None, word, word, number)(set_stream),
+    }
+    given = {name: ctypes.cast(function, word).value for name, function in functions.items()}
+    points, width = np.zeros(8), 0.1 + 2.0**-60
+    given |= {"scratch": 3, "stream": 7, "grid": 13, "points": points, "context": 11}
+    launched.on_cpu(hashgrid.build_kernel(dtype == np.float64), **given, **hashgrid.split_width(width))
+    assert told == [(13, 2 if dtype == np.float64 else 1, width, 3, None, 7)]
+    assert stream == [others or 5]
+
+
 def test_two_cutoffs_in_one_program():
     points = np.random.default_rng(4).random((300, 2)).astype(np.float32)
 
@@ -93,6 +135,6 @@ def test_the_program_names_the_cutoff():
 
 
 def test_warp_1_18_is_refused(monkeypatch):
-    monkeypatch.setattr(load_warp(), "__version__", "1.18.0")
+    monkeypatch.setattr(_clang, "warp_version", lambda: "1.18.0")
     with pytest.raises(ImportError, match=r"needs warp-lang 1\.19: the HashGrid of 1\.18\.0 can list a pair twice"):
         jfrnn.count(np.zeros((3, 2), np.float32), 1.1875, backend="hashgrid")

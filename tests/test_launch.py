@@ -55,6 +55,14 @@ static XLA_FFI_Error* schedule(XLA_FFI_ThreadPool_Schedule_Args* a) {
 static XLA_FFI_Error* threads(XLA_FFI_ThreadPool_NumThreads_Args* a) { *a->num_threads = 4; return nullptr; }
 
 extern "C" {
+static int inside;
+void work_alone(const void* given) {
+    const long long others = __atomic_fetch_add(&inside, 1, __ATOMIC_ACQ_REL);
+    for (int k = 0; k < 100; ++k) desk->yield();
+    note(5, ((const long long*)given)[2], *(const long long*)given, ((const int*)given)[2] + 1000 * others);
+    __atomic_fetch_sub(&inside, 1, __ATOMIC_ACQ_REL);
+}
+void take_turn() { desk->take_lock(desk->turn, 1); }
 void add_one(const void* given) { __atomic_fetch_add(*(int* const*)given, ((const int*)given)[2], __ATOMIC_RELAXED); }
 void* driver(int k) { void* all[] = {(void*)launch, (void*)clear, (void*)record, (void*)wait}; return all[k]; }
 int take_events(long long* out) {
@@ -101,20 +109,25 @@ const char* call(const char* kernel, int size, int device, int cuda, void* input
 }
 """
 EXECUTE, INSTANTIATE = 3, 0
-LAUNCH, CLEAR, RECORD, WAIT = range(1, 5)
+LAUNCH, CLEAR, RECORD, WAIT, WORK = range(1, 6)
 _TEXT = ctypes.c_void_p, ctypes.c_longlong
 _MAKE_PLAN = ctypes.CFUNCTYPE(None, *_TEXT, *_TEXT, ctypes.c_int, ctypes.c_void_p)
 
 
+HOST = types.SimpleNamespace(cuda=False)
+
+
 class Native:
     """The native code, with plans of its own: `made` are the names, recipes and devices for which it asked."""
+
+    cuda = True  # as the program of what is launched
 
     def __init__(self):
         load_warp()
         self.library = _compile.load(Program("harness", write_launcher(HEADER) + HARNESS, cuda=False))
         self.made, self.refused, self.laid = [], None, {}
         self.make_plan = _MAKE_PLAN(self.make)
-        self.desk = plans.open_desk(self.library, ctypes.cast(self.make_plan, ctypes.c_void_p).value, 0, 8)
+        self.desk = plans.open_desk(self.library, ctypes.cast(self.make_plan, ctypes.c_void_p).value, 8)
         for k, name in enumerate(("launch", "clear", "record", "wait")):
             setattr(self.desk._desk, name, self.function("driver", ctypes.c_void_p)(k))
 
@@ -134,15 +147,20 @@ class Native:
         fields = Field("x", 0, True), Field("number", 8, False)
         return Launch(Kernel(self, "add_one", fields, 16, 32), threads, **more)  # this is its own program
 
+    def step_on_host(self, **more):
+        fields = Field("x", 0, True), Field("number", 8, False), Field("stream", 16, True)
+        return Launch(Kernel(HOST, "work_alone", fields, 24), **more)
+
     def keep(self, name, device, plan):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(plans, "compiler", lambda: self)
             patch.setattr(plans, "_second_stream", lambda device: (7, 71, 72))
+            patch.setattr(plans, "_end_of_turn", lambda device: 80 + device)
             self.laid[name, device] = plans.lay_plan(name, plan, ["x", "y"], device)
         self.desk.keep(self.laid[name, device])
 
     def load(self, program, device):
-        assert program is self
+        assert program is (self if device.startswith("cuda") else HOST) or device == "cpu"
         return self.library
 
     def call(self, name, x=0, y=0, *, device=0, cuda=True, stage=EXECUTE, extension=0):
@@ -256,6 +274,40 @@ def test_the_version_of_the_interface_is_told(native):
     native.keep("known@", 0, Plan([native.step(1)], {"number": 1}))
     assert native.call("known@", extension=7) is None  # with any other extension it is a call
     assert len(native.events()) == 1
+
+
+def taking_turns(*steps):
+    return Plan(steps, {"number": 1}, keep=lambda device: plans.Kept({"x": 1000}, None))
+
+
+def test_calls_that_share_what_is_kept_wait_for_the_last_one_on_any_stream(native):
+    native.keep("shares@", 1, taking_turns(native.step_on_host(), native.step(1)))
+    for _ in range(2):
+        assert native.call("shares@", 5, device=1) is None
+        assert native.events() == [(WAIT, 100, 81, 0), (WORK, 100, 1000, 1), launched(100, 1000, 1, 1), (RECORD, 100, 81, 0)]
+
+
+def test_a_call_that_fails_ends_its_turn(native):
+    native.keep("fails@", 0, taking_turns(native.step(1, numbers={"number": 13}), native.step(1)))
+    for _ in range(2):
+        assert native.call("fails@") == b"fails: a launch failed with CUDA's error 700"
+        assert [event[0] for event in native.events()] == [WAIT, LAUNCH, RECORD]
+
+
+def test_calls_that_share_what_is_kept_take_turns(native):
+    for name in ("one@", "other@"):
+        native.keep(name, -1, taking_turns(native.step_on_host(), native.step_on_host(numbers={"number": 2})))
+    with ThreadPoolExecutor(4) as threads:
+        calls = [threads.submit(native.call, ("one@", "other@")[k % 2], cuda=False) for k in range(200)]
+        assert all(call.result() is None for call in calls)
+    assert [event[3] for event in native.events()] == 200 * [1, 2]
+
+
+def test_a_process_that_begins_by_a_fork_takes_the_turn_of_a_thread_that_it_does_not_have(native):
+    native.keep("shares@", -1, taking_turns(native.step_on_host()))
+    native.function("take_turn", None)()
+    native.desk.begin_anew()
+    assert native.call("shares@", cuda=False) is None
 
 
 def test_threads_that_come_late_find_nothing_to_do(native):

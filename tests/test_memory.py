@@ -17,7 +17,8 @@ import warp as wp
 import jfrnn
 import jfrnn._memory
 from experiments import _measure
-from jfrnn._engine import hashgrid
+from jfrnn._engine import hashgrid, launch
+from jfrnn.kernels import few_cuda
 
 ROOT = Path(__file__).parent.parent
 SIZES = [(1000, 40), (30_000, 256), (300_000, 40)]
@@ -77,6 +78,17 @@ def test_warp_takes_at_most_64_bytes_per_particle(dim, dtype):
         assert plan.total_bytes <= 4 * n * capacity + 64 * n + 64_000
 
 
+def test_few_particles_take_no_scratch_on_a_gpu():
+    """All of them meet in one kernel, unless the cutoff is so small that squares need a unit."""
+
+    def scratch(n, cutoff=0.1, platform="gpu", **more):
+        return jfrnn.memory_plan(n, cutoff, 8, backend="warp", platform=platform, **more).scratch_bytes
+
+    assert scratch(few_cuda.MOST) == scratch(10, queries=few_cuda.MOST) == 0
+    others = scratch(few_cuda.MOST + 1), scratch(10, queries=few_cuda.MOST + 1), scratch(10, 2.0**-90), scratch(10, platform="cpu")
+    assert min(others) > 40
+
+
 @pytest.mark.parametrize("backend", ["jax", pytest.param("brute", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("n", "capacity", "dim", "dtype", "queries"),
@@ -94,10 +106,12 @@ def test_compiled_engines_take_what_was_planned(n, capacity, dim, dtype, queries
 
 @pytest.mark.parametrize(("n", "dim"), [(1000, 2), (30_000, 3), (70_000, 3)])
 def test_hashgrid_takes_what_was_planned(n, dim, dtype):
-    hashgrid._hash_grid.cache_clear()  # a grid of an earlier test would take nothing any more
     x = np.random.default_rng(0).random((n, dim)).astype(dtype)
     plan = jfrnn.memory_plan(n, 0.02, 8, dim=dim, dtype=dtype, backend="hashgrid")
     listed, given = compiled_bytes(n, 8, dim, dtype, "hashgrid")
+    for key in list(launch._plans):  # a grid that is there would take nothing any more
+        launch._open().drop(launch._plans.pop(key))
+    hashgrid._hash_grid.cache_clear()
     with wp.ScopedMemoryTracker(print=False) as tracker:
         tracker.clear()
         jax.block_until_ready(jfrnn.search(x, 0.02, capacity=8, backend="hashgrid"))

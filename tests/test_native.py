@@ -11,9 +11,11 @@ from jfrnn._engine import ffi
 from jfrnn._engine.start import load_warp
 from jfrnn.kernels import Program, _compile
 from jfrnn.kernels._text import resolve
+from jfrnn.kernels.hashgrid import warp_header
 from jfrnn.kernels.launch import write_launcher
 
 NATIVE = Path(__file__).parents[1] / "kernels" / "native"
+LAUNCHING = ("calls.h", "desk.h", "launch.h")  # which need XLA's header
 WHOLE = sorted(path.name for path in NATIVE.iterdir())
 
 
@@ -21,8 +23,8 @@ def is_cpu_only(header):
     """Tell headers with Clang's vectors, or with calls of the CPU alone; where cutoffs differ, one text has both."""
     if header in ("levels.h", "level_rows.h", "winding.h"):
         return False
-    text = resolve(header, given={"numbers.h": "", "xla_ffi.h": ""})
-    if header in ("c_library.h", "launch.h"):
+    text = resolve(header, given={"numbers.h": "", "xla_ffi.h": "", "warp_hashgrid.h": ""})
+    if header in ("c_library.h", "hashgrid_build.h", *LAUNCHING):
         return True
     words = ("vector_size", "__builtin_prefetch", "__atomic_fetch_add", "_cpu.h", "level_sums", "__builtin_sqrt")
     return any(word in text or word in header for word in words) and not header.endswith(".cuh")
@@ -34,7 +36,7 @@ def headers(cuda):
 
 
 def text_of(header):
-    return write_launcher(HEADER) if header == "launch.h" else resolve(header, given={})
+    return write_launcher(HEADER, header) if header in LAUNCHING else resolve(header, given={"warp_hashgrid.h": warp_header()})
 
 
 @pytest.mark.parametrize("cuda", [False, True], ids=["cpu", "cuda"])

@@ -355,7 +355,7 @@ def test_float32_works_without_x64(dim, backend):
 
 @pytest.mark.parametrize("backend", ["warp", "hashgrid"])
 def test_a_program_may_end_before_its_results(backend):
-    """What computes them calls back into the interpreter, which would wait for it for ever."""
+    """Native code computes them while the interpreter ends: it needs neither Python nor what Python gives back."""
     program = (
         "import jax, jfrnn\n"
         "x = jax.random.uniform(jax.random.key(0), (300_000, 3))\n"

@@ -83,7 +83,7 @@ class ArrayEngine:
             return complete_rows(search, None, count_neighbors(candidates, search.cutoff, options.filter, tuning), None)
         return complete_rows(search, *list_neighbors(candidates, search.cutoff, options.filter, capacity, tuning), capacity)
 
-    def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool) -> int | None:
+    def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool, scaled: bool) -> int | None:
         """Return None: only the compiler knows."""
         return None
 

@@ -34,7 +34,6 @@ from jfrnn.kernels import one_at_a_time
 TARGET = "jfrnn"  # what programs call; jax.export wants to be told that it stays
 Static = Any  # what a kernel is made of, and a program carries: NamedTuples of the library, tuples, texts, numbers
 Shapes = Mapping[str, tuple[int, ...]]
-Addresses = Any  # a pointer of ctypes
 CFunction = Any
 
 
@@ -46,14 +45,12 @@ class Call(NamedTuple):
         inputs: The names of the arrays that are given.
         results: The dtypes of those that are written, by name.
         plan: Shapes of all arrays, by name, and the multiprocessors of the device (the CPU: 1) -> what is launched.
-        serve: Python in place of a plan, called with the shapes, and with addresses, a device's number (-1: the CPU) and a stream.
     """
 
     name: str
     inputs: Sequence[str]
     results: Mapping[str, Any]
     plan: Callable[[Shapes, int], Plan]
-    serve: Callable[[Shapes, Mapping[str, int], int, int], None] | None = None
 
 
 _calls: dict[str, Callable[..., Call]] = {}
@@ -159,23 +156,12 @@ def _read_call(name: str, recipe: str) -> tuple[Call, Shapes]:
 
 _Text = ctypes.c_void_p, ctypes.c_longlong
 _MakePlan = ctypes.CFUNCTYPE(None, *_Text, *_Text, ctypes.c_int, ctypes.c_void_p)
-_Serve = ctypes.CFUNCTYPE(None, *_Text, ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(ctypes.c_void_p), ctypes.c_void_p)
 _plans: dict[tuple[str, int], LaidPlan] = {}  # by name and device, those that were made last at the end
-_served: dict[tuple[str, int], tuple[Call, Shapes]] = {}
 
 
 def _make_plan(name: int, name_size: int, recipe: int, recipe_size: int, device: int, wrong: int) -> None:
     def work() -> None:
         _keep_plan(ctypes.string_at(name, name_size).decode(), ctypes.string_at(recipe, recipe_size).decode(), device)
-
-    _answer(work, wrong)
-
-
-def _serve(name: int, name_size: int, device: int, stream: int | None, arrays: Addresses, wrong: int) -> None:
-    def work() -> None:
-        found, shapes = _served[ctypes.string_at(name, name_size).decode(), device]
-        assert found.serve is not None
-        found.serve(shapes, {key: arrays[k] or 0 for k, key in enumerate(shapes)}, device, stream or 0)
 
     _answer(work, wrong)
 
@@ -191,28 +177,11 @@ def _keep_plan(name: str, recipe: str, device: int) -> None:
     with one_at_a_time:
         if (name, device) in _plans:
             return
-        if found.serve is not None:
-            _finish_before_exit()
-            _served[name, device] = found, shapes
-        laid = lay_plan(name, found.plan(shapes, multiprocessors_of(device)), list(shapes), device, python=found.serve is not None)
+        laid = lay_plan(name, found.plan(shapes, multiprocessors_of(device)), list(shapes), device)
         while len(_plans) >= _MOST:
-            gone = next(iter(_plans))
-            desk.drop(_plans.pop(gone))
-            _served.pop(gone, None)
+            desk.drop(_plans.pop(next(iter(_plans))))
         _plans[name, device] = laid
         desk.keep(laid)
-
-
-@functools.cache
-def _finish_before_exit() -> None:
-    """Let the interpreter wait for results that are under way: what Python serves needs it, and would wait for ever."""
-
-    def finish() -> None:
-        for array in jax.live_arrays():
-            with contextlib.suppress(Exception):  # it has nobody left to be told to
-                array.block_until_ready()
-
-    atexit.register(finish)
 
 
 def _answer(work: Callable[[], None], wrong: int) -> None:
@@ -277,7 +246,7 @@ def _address(function: CFunction) -> int:
 
 
 _doors = {name: _Door() for name in _PLATFORMS}
-_behind_desk = _MakePlan(_make_plan), _Serve(_serve)
+_behind_desk = _MakePlan(_make_plan)
 
 
 def _open() -> Desk:
@@ -290,7 +259,7 @@ def _open() -> Desk:
 @functools.cache
 def _opened() -> Desk:
     header = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text("utf-8")
-    desk = open_desk(compiler().load_launcher(header), _address(_behind_desk[0]), _address(_behind_desk[1]), _MOST)
+    desk = open_desk(compiler().load_launcher(header), _address(_behind_desk), _MOST)
     for name, address in zip(_PLATFORMS, desk.handlers, strict=True):
         _doors[name].lead_to(address)
     atexit.register(desk.close)

@@ -1,4 +1,4 @@
-"""What is launched when XLA calls: plans, and how they are laid down for native code (`kernels/native/launch.h`)."""
+"""What is launched when XLA calls: plans, and how they are laid down for native code (`kernels/native/desk.h`)."""
 
 import ctypes
 import dataclasses
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 PLACES_PER_THREAD = 512  # below, a second thread costs more than it saves
 _HUGE = 1 << 22  # bytes from which an array is worth a request for huge pages
 _MOST_BYTES, _MOST_ARRAYS, MOST_WORDS = 1024, 48, 1024  # those of the native code
-_ONCE, _SHARED, _CUDA, _CUDA_BESIDE, _CLEAR, _HUGE_PAGES, _PYTHON = range(7)
+_ONCE, _SHARED, _CUDA, _CUDA_BESIDE, _CLEAR, _HUGE_PAGES = range(6)
+_STREAM = "stream"  # the name of an argument that gets the stream of the call, as if that were an array
 
 
 class Launch(NamedTuple):
@@ -51,12 +52,27 @@ class HugePages(NamedTuple):
     size: int
 
 
+class Kept(NamedTuple):
+    """Addresses by the names of arguments, and what has to live as long as they are used."""
+
+    addresses: Mapping[str, int]
+    held: Any
+
+
 class Plan(NamedTuple):
-    """What is launched, in order, the numbers that are arguments, and arrays that no kernel touches, though it names them."""
+    """What is launched.
+
+    Attributes:
+        steps: Launches, in order. One of a kernel for the CPU runs on the host, also among those on CUDA.
+        numbers: Arguments of kernels, by name.
+        absent: Arrays that no kernel touches, though it names them.
+        keep: The number of a CUDA device, or -1 -> what is kept there for all calls, which take turns then.
+    """
 
     steps: Sequence[Launch | Clear | HugePages]
     numbers: Mapping[str, int]
     absent: Sequence[str] = ()
+    keep: Callable[[int], Kept] | None = None
 
 
 def share(kernel: Kernel, places: int, each: int = PLACES_PER_THREAD) -> Launch:
@@ -97,6 +113,7 @@ class _Plan(ctypes.Structure):
         ("ended", ctypes.c_void_p),
         ("device", ctypes.c_int),
         ("step_count", ctypes.c_int),
+        ("in_turns", ctypes.c_int),
     )
 
 
@@ -114,7 +131,7 @@ _OF_PYTHON = {
 
 class _Desk(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("make_plan", "serve", "yield", "advise", "launch", "clear", "record", "wait")),
+        *((name, ctypes.c_void_p) for name in ("make_plan", "yield", "advise", "launch", "clear", "record", "wait")),
         *((name, ctypes.c_void_p) for name in _OF_PYTHON),
         ("plans", ctypes.c_void_p),
         ("plan_count", ctypes.c_longlong),
@@ -123,6 +140,7 @@ class _Desk(ctypes.Structure):
         ("forking", ctypes.c_int),
         ("asking", ctypes.c_int),
         ("closed", ctypes.c_int),
+        ("turn", ctypes.c_void_p),
     )
 
 
@@ -133,7 +151,7 @@ class LaidPlan(NamedTuple):
     held: list[Any]
 
 
-def lay_plan(name: str, plan: Plan, arrays: list[str], device: int, *, python: bool = False) -> LaidPlan:
+def lay_plan(name: str, plan: Plan, arrays: list[str], device: int) -> LaidPlan:
     """Compile what a plan launches, and lay it down.
 
     Args:
@@ -141,18 +159,24 @@ def lay_plan(name: str, plan: Plan, arrays: list[str], device: int, *, python: b
         plan: What is launched.
         arrays: The names of the arrays that a call brings, in order.
         device: The number of a CUDA device, or -1 for the CPU.
-        python: Whether Python serves the calls.
     """
     if len(arrays) > _MOST_ARRAYS:
         raise ValueError(f"{name} takes {len(arrays)} arrays, more than {_MOST_ARRAYS}")
     held: list[Any] = [text := name.encode()]
-    lay = functools.partial(_lay_step, plan, {array: k for k, array in enumerate(arrays)}, device, held)
-    laid = [_Step(kind=_PYTHON)] if python else [lay(step) for step in plan.steps]
+    if plan.keep is not None:
+        kept = plan.keep(device)
+        held.append(kept)
+        plan = plan._replace(numbers={**plan.numbers, **kept.addresses}, absent=[*plan.absent, *kept.addresses])
+    lay = functools.partial(_lay_step, plan, {array: k for k, array in enumerate([*arrays, _STREAM])}, device, held)
+    laid = [lay(step) for step in plan.steps]
     warn_of_folders()
     steps = (_Step * len(laid))(*laid)
     found = _Plan(name=text, name_size=len(text), steps=ctypes.addressof(steps), device=device, step_count=len(laid))
+    found.in_turns = plan.keep is not None
     if any(step.kind == _CUDA_BESIDE for step in laid):
         found.side, found.begun, found.ended = _second_stream(device)
+    elif plan.keep is not None and device >= 0:
+        found.ended = _end_of_turn(device)
     return LaidPlan(found, [*held, steps])
 
 
@@ -170,7 +194,8 @@ def _lay_step(plan: Plan, places: dict[str, int], device: int, held: list[Any], 
     given = kernel.pack(numbers)
     if device >= 0:
         load_warp()
-    library = compiler().load(kernel.program, "cpu" if device < 0 else f"cuda:{device}")
+    on_cuda = device >= 0 and kernel.program.cuda
+    library = compiler().load(kernel.program, f"cuda:{device}" if on_cuda else "cpu")
     template, places_of_arrays = (ctypes.c_ubyte * len(given)).from_buffer(given), (ctypes.c_int * len(pairs))(*pairs)
     held += [library, template, places_of_arrays]
     return _Step(
@@ -179,7 +204,7 @@ def _lay_step(plan: Plan, places: dict[str, int], device: int, held: list[Any], 
         arrays=ctypes.addressof(places_of_arrays),
         size=len(given),
         array_count=len(arrays),
-        kind=(_SHARED if step.threads > 1 else _ONCE) if device < 0 else _CUDA_BESIDE if step.beside else _CUDA,
+        kind=(_CUDA_BESIDE if step.beside else _CUDA) if on_cuda else _SHARED if step.threads > 1 else _ONCE,
         block=kernel.block,
         threads=step.threads,
     )
@@ -214,17 +239,16 @@ class Desk:
         self._begin_anew(threading.main_thread().ident or 0)
 
 
-def open_desk(library: "Library", make_plan: int, serve: int, most: int) -> Desk:
+def open_desk(library: "Library", make_plan: int, most: int) -> Desk:
     """Open the native code.
 
     Args:
         library: The compiled program.
         make_plan: The address of what is asked for plans.
-        serve: The address of what serves calls in Python.
         most: How many plans are kept.
     """
     plans, c = (ctypes.c_void_p * (most + 1))(), _c_library()
-    desk = _Desk(make_plan=make_plan, serve=serve, plans=ctypes.addressof(plans))
+    desk = _Desk(make_plan=make_plan, plans=ctypes.addressof(plans))
     setattr(desk, "yield", _address(c, "sched_yield") or _address(ctypes.pythonapi, "PyThread_get_thread_ident"))
     for key, function in _OF_PYTHON.items():
         setattr(desk, key, _address(ctypes.pythonapi, function))
@@ -269,6 +293,13 @@ def _second_stream(device: int) -> tuple[int, int, int]:
     made = wp.Stream(f"cuda:{device}"), wp.Event(f"cuda:{device}"), wp.Event(f"cuda:{device}")
     _held.extend(made)
     return made[0].cuda_stream, made[1].cuda_event, made[2].cuda_event
+
+
+@functools.cache
+def _end_of_turn(device: int) -> int:
+    """Return an event of a CUDA device, for calls that take turns."""
+    _held.append(made := load_warp().Event(f"cuda:{device}"))
+    return made.cuda_event
 
 
 _held: list[Any] = []  # streams and events, which Warp gives back once nobody has them

@@ -112,8 +112,12 @@ class Engine(Protocol):
         """List the neighbors of every query, or only count them (capacity=None). There is at least one source and one query."""
         ...
 
-    def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool) -> int | None:
-        """Return the scratch memory for n sources and m queries [B]; None if only the compiler of the program knows it."""
+    def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool, scaled: bool) -> int | None:
+        """Return the scratch memory for n sources and m queries in open space [B]; None if only the program's compiler knows it.
+
+        `double`: of float64; `own`: the sources are the queries; `scaled`: the cutoff is so small, or so large, that its square
+        needs a unit.
+        """
         ...
 
 

@@ -59,15 +59,22 @@ class WarpEngine:
         cpu, cuda = on(cells_cpu, _cpu_callable), on(few_cuda, _few_callable) if few else on(cells_cuda, _cuda_callable)
         return lax.platform_dependent(search._replace(checks={}), cpu=cpu, cuda=cuda)
 
-    def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool) -> int:
+    def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool, scaled: bool) -> int:
         """Return the scratch that the kernels are given [B]."""
         check_platform(self.name, platform)
-        return 4 * _CELLS[PLATFORMS[platform]].scratch_words(n, m, dim, 2 if double else 1, own) if n and m else 0
+        cells = _CELLS[PLATFORMS[platform]]
+        if 0 in (n, m) or (cells is cells_cuda and _all_meet((n, m), scaled)):
+            return 0
+        return 4 * cells.scratch_words(n, m, dim, 2 if double else 1, own)
 
 
 def are_few(search: Search) -> bool:
     """Say whether particles are so few that on CUDA all of them meet, in one launch."""
-    return periodic_kind(search.torus) <= 1 and not search.cutoff.scaled and max(search.sizes) <= few_cuda.MOST
+    return periodic_kind(search.torus) <= 1 and _all_meet(search.sizes, search.cutoff.scaled)
+
+
+def _all_meet(sizes: tuple[int, int], scaled: bool) -> bool:
+    return not scaled and max(sizes) <= few_cuda.MOST
 
 
 class Variant(NamedTuple):
@@ -151,7 +158,7 @@ def describe_call(name: str, variant: Variant, plan: Callable[[Shapes, int], Pla
     return Call(whole, _PARTICLES, dict.fromkeys(results, np.int32), plan)
 
 
-def _numbers(variant: Variant, shapes: Shapes) -> dict[str, int]:
+def plan_numbers(variant: Variant, shapes: Shapes) -> dict[str, int]:
     """Return the numbers that kernels of cells take, by name; without rows the capacity is 0."""
     flags = {"closed": variant.closed, "drop_self": variant.keep.drop_self, "later_only": variant.keep.later_only}
     capacity = shapes["idx"][1] if variant.lists else 0
@@ -166,14 +173,14 @@ def _plan_on_cuda(variant: Variant, shapes: Shapes, multiprocessors: int) -> Pla
     kind = {"periodic": variant.periodic, "batched": variant.batched}
     dim, later = variant.dim, variant.keep.later_only
     kernels = cells_cuda.cell_kernels(dim, variant.double, variant.scaled, variant.lists, later, **kind)
-    numbers = _numbers(variant, shapes)
+    numbers = plan_numbers(variant, shapes)
     return Plan(
         place_launches(kernels.launches(numbers["n"], numbers["m"], variant.own, multiprocessors)), numbers, _absent(variant)
     )
 
 
 def _plan_few(variant: Variant, shapes: Shapes, _: int) -> Plan:
-    numbers = _numbers(variant, shapes)
+    numbers = plan_numbers(variant, shapes)
     numbers["drop_self"] &= variant.own
     query = few_cuda.rows_kernel(variant.dim, variant.double, variant.lists, variant.batched, variant.periodic == 1)
     return Plan([Clear("info", 8), Launch(query, few_cuda.threads(numbers["m"]))], numbers, _absent(variant))
@@ -187,7 +194,7 @@ def place_launches(launches: Sequence[cells_cuda.Launch]) -> list[Launch]:
 def _plan_on_cpu(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan:
     kind = {"periodic": variant.periodic, "batched": variant.batched}
     kernels = cells_cpu.cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, **kind)
-    numbers = _numbers(variant, shapes)
+    numbers = plan_numbers(variant, shapes)
     rows = ask_for_huge_pages("idx", 4 * numbers["m"] * numbers["capacity"]) if variant.lists else []
     steps = [*sort_on_cpu(kernels, numbers["n"]), *rows, share(kernels.query, numbers["m"])]
     return Plan(steps, numbers, _absent(variant))

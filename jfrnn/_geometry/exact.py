@@ -82,57 +82,6 @@ def squared_distance(difference: list[Array], cutoff: "Cutoff | Cutoffs") -> Arr
     return total
 
 
-def is_pair_of(
-    rows: Array, sources: Array, neighbor: Array, asked: Array, cutoff: "Cutoff | Cutoffs", shifted: "Shifted | None" = None
-) -> Array:
-    """Decide exactly which of the pairs of rows [m, d] and sources [n, d] at indices [m, k] are within the cutoff: [m, k] bool.
-
-    The result is False where `asked`, [m, k] bool, is False.
-    """
-    axes = range(sources.shape[1])
-    if shifted is None:
-        difference = [sources[neighbor, axis] - rows[:, axis, None] for axis in axes]
-    else:
-        difference = list(jnp.moveaxis(shifted.vectors, -1, 0))
-
-    def of_rows(column: Array, at: Array | None) -> Array:  # without an index array of all slots, a large constant for XLA
-        if at is None:
-            return jnp.broadcast_to(column[:, None], neighbor.shape)
-        return column.at[at // neighbor.shape[1]].get(mode="clip")
-
-    def radii_of(at: Array | None, source: Array) -> list[Array] | None:
-        if isinstance(cutoff, Cutoff):
-            return None
-        own, other = cutoff.queries, cutoff.sources
-        return cutoff.of_pairs(None if own is None else of_rows(own, at), None if other is None else other[source])
-
-    inside, outside = step_one_bounds(cutoff, radii_of(None, neighbor), None if shifted is None else shifted.slack)
-    square = squared_distance(difference, cutoff)
-
-    def points(at: Array | None) -> Pair:
-        source = neighbor if at is None else flat_take(neighbor, at)
-        others = list(jnp.moveaxis(sources[source], -1, 0))
-        if at is None:
-            own = [of_rows(rows[:, axis], at) for axis in axes]
-        else:
-            own = list(rows.at[at // neighbor.shape[1]].get(mode="clip").T)
-        pair = Pair(own, others, radii_of(at, source))
-        if shifted is None:
-            return pair
-        shifts = shifted.shifts if at is None else shifted.shifts.reshape(-1, len(axes)).at[at].get(mode="clip")
-        shift = list(jnp.moveaxis(shifts, -1, 0))
-        shift, matrix = shift_in_given(shift, shifted.basis, shifted.matrix)
-        return pair._replace(shift=shift, matrix=matrix, orthogonal=shifted.orthogonal)
-
-    no, yes, open_pair = np.arange(3, dtype=np.int8)
-    step_one = jnp.where(asked & (square <= outside), jnp.where(square < inside, yes, open_pair), no)  # one int8 array, one kernel
-
-    def refine_open(step_one: Array) -> Array:
-        return (step_one == yes) | decide_pairs(step_one == open_pair, points, cutoff)
-
-    return lax.cond(jnp.max(step_one, initial=no) == open_pair, refine_open, lambda step_one: step_one == yes, step_one)
-
-
 class Shifted(NamedTuple):
     """The lattice part of pairs [m, k]: displacements and shifts [m, k, d], a bound on the error of displacements, the lattice."""
 
@@ -142,6 +91,69 @@ class Shifted(NamedTuple):
     matrix: Array
     orthogonal: bool
     basis: Basis | None = None  # the vectors that shifts count, in terms of `matrix`; None: those of `matrix`
+
+
+class _Slots(NamedTuple):
+    """Pairs of rows [m, d] and of the sources [n, d] at indices [m, k]."""
+
+    rows: Array
+    sources: Array
+    neighbor: Array
+    cutoff: Cutoff | Cutoffs
+    shifted: Shifted | None
+
+    def differences(self) -> list[Array]:
+        """Return source minus row, per axis [m, k]."""
+        if self.shifted is not None:
+            return list(jnp.moveaxis(self.shifted.vectors, -1, 0))
+        return [self.sources[self.neighbor, axis] - self.rows[:, axis, None] for axis in range(self.sources.shape[1])]
+
+    def radii(self, at: Array | None, source: Array) -> list[Array] | None:
+        """Return the cutoffs of a `Pair` at flat indices, or of all pairs, with these sources."""
+        if isinstance(self.cutoff, Cutoff):
+            return None
+        own, other = self.cutoff.queries, self.cutoff.sources
+        return self.cutoff.of_pairs(None if own is None else self._spread(own, at), None if other is None else other[source])
+
+    def points(self, at: Array | None) -> Pair:
+        """Return the points at flat indices, or of all pairs."""
+        axes, source = range(self.sources.shape[1]), self.neighbor if at is None else flat_take(self.neighbor, at)
+        others = list(jnp.moveaxis(self.sources[source], -1, 0))
+        if at is None:
+            own = [self._spread(self.rows[:, axis], at) for axis in axes]
+        else:
+            own = list(self.rows.at[at // self.neighbor.shape[1]].get(mode="clip").T)
+        pair, shifted = Pair(own, others, self.radii(at, source)), self.shifted
+        if shifted is None:
+            return pair
+        shifts = shifted.shifts if at is None else shifted.shifts.reshape(-1, len(axes)).at[at].get(mode="clip")
+        shift, matrix = shift_in_given(list(jnp.moveaxis(shifts, -1, 0)), shifted.basis, shifted.matrix)
+        return pair._replace(shift=shift, matrix=matrix, orthogonal=shifted.orthogonal)
+
+    def _spread(self, column: Array, at: Array | None) -> Array:  # without an index array of all slots, a large constant for XLA
+        if at is None:
+            return jnp.broadcast_to(column[:, None], self.neighbor.shape)
+        return column.at[at // self.neighbor.shape[1]].get(mode="clip")
+
+
+def is_pair_of(
+    rows: Array, sources: Array, neighbor: Array, asked: Array, cutoff: Cutoff | Cutoffs, shifted: Shifted | None = None
+) -> Array:
+    """Decide exactly which of the pairs of rows [m, d] and sources [n, d] at indices [m, k] are within the cutoff: [m, k] bool.
+
+    The result is False where `asked`, [m, k] bool, is False.
+    """
+    slots = _Slots(rows, sources, neighbor, cutoff, shifted)
+    difference = slots.differences()
+    inside, outside = step_one_bounds(cutoff, slots.radii(None, neighbor), None if shifted is None else shifted.slack)
+    square = squared_distance(difference, cutoff)
+    no, yes, open_pair = np.arange(3, dtype=np.int8)
+    step_one = jnp.where(asked & (square <= outside), jnp.where(square < inside, yes, open_pair), no)  # one int8 array, one kernel
+
+    def refine_open(step_one: Array) -> Array:
+        return (step_one == yes) | decide_pairs(step_one == open_pair, slots.points, cutoff)
+
+    return lax.cond(jnp.max(step_one, initial=no) == open_pair, refine_open, lambda step_one: step_one == yes, step_one)
 
 
 def flat_take(x: Array, at: Array) -> Array:

@@ -36,6 +36,7 @@ from jfrnn._geometry import (
 )
 from jfrnn._search.exports import DenseNeighbors, check_total, flat_pairs, pair_total
 from jfrnn._search.geometry import ImageCodes, ImagesMade, lattice_shifts, norms, open_vectors, periodic_vectors
+from jfrnn._search.kept_options import KeptOptions
 from jfrnn._search.making import count_capacity, find_fields, round_capacity
 from jfrnn._search.problem import Problem
 from jfrnn._search.verlet import Verlet, has_moved_too_far
@@ -46,7 +47,7 @@ ROWS_ARE_WHOLE = Status.NONFINITE | Status.TOTAL_OVERFLOW  # bits that do not me
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class NeighborList:
+class NeighborList(KeptOptions):
     """The neighbors of m queries among n sources, one row of `capacity` slots per query. A pytree.
 
     Attributes:
@@ -83,66 +84,6 @@ class NeighborList:
         skin = f", skin {self.skin:.6g}" if self.skin else ""
         rest = pairs_and_status(self.count, self.status)
         return f"NeighborList({rows}, capacity {capacity}, cutoff {reach}{skin}, engine {self.backend!r}, {rest})"
-
-    @property
-    def cutoff(self) -> float | None:
-        """Interaction radius [length], rounded to the dtype of the positions; None with cutoffs per particle."""
-        return self.problem.cutoff
-
-    @property
-    def skin(self) -> float:
-        """Verlet skin [length]."""
-        return self.problem.skin
-
-    @property
-    def half(self) -> bool:
-        """Whether each unordered pair is listed once, in the row of its smaller index."""
-        return self.problem.options.filter.later_only
-
-    @property
-    def include_self(self) -> bool:
-        """Whether each particle is its own neighbor."""
-        return self.problem.include_self
-
-    @property
-    def closed(self) -> bool:
-        """Whether pairs at exactly the cutoff count."""
-        return self.problem.options.closed
-
-    @property
-    def own_queries(self) -> bool:
-        """Whether rows belong to separate `queries` instead of the positions."""
-        return self.problem.own_queries
-
-    @property
-    def masked(self) -> bool:
-        """Whether particles may be inactive."""
-        return self.problem.masked
-
-    @property
-    def box_kind(self) -> Images | None:
-        """The periodic axes and the images that the search considers; None in open space."""
-        return self.problem.options.images
-
-    @property
-    def source_count(self) -> int:
-        """n, the fill value of unused slots."""
-        return self.problem.source_count
-
-    @property
-    def dim(self) -> int:
-        """Dimension of the positions, 2 or 3."""
-        return self.problem.dim
-
-    @property
-    def dtype(self) -> np.dtype:
-        """Dtype of the positions."""
-        return self.problem.dtype
-
-    @property
-    def backend(self) -> str:
-        """Name of the engine that made the list."""
-        return self.problem.options.engine.name
 
     @property
     def capacity(self) -> int:

@@ -103,15 +103,11 @@ def check_problem(
     keep = Filter(drop_self=queries is None and not check_flag("include_self", include_self), later_only=check_flag("half", half))
     dtype = np.dtype(sources.dtype)
     radii, closed = check_radii(cutoff, radius_rule, sources, queries), check_flag("closed", closed)
-    if radii is None:
-        radius = float(check_cutoff(cutoff, dtype).radius)
-        skin = check_skin(skin, radius, dtype)
-        largest = radius
-    else:
-        if keep.later_only and radii.rule in ("gather", "scatter"):
-            raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
-        radius, largest = None, largest_known(radii)
-        skin = check_skin(skin, largest or 0.0, dtype)
+    if keep.later_only and radii is not None and radii.rule in ("gather", "scatter"):
+        raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
+    radius = float(check_cutoff(cutoff, dtype).radius) if radii is None else None
+    largest = radius if radii is None else largest_known(radii)
+    skin = check_skin(skin, largest or 0.0, dtype)
     reach = None if largest is None else list_radius(largest, skin, dtype)
     box = None if box is None else check_box(box, sources)
     images = None if box is None else images_of(box, reach, dtype, sources.shape[0])

@@ -1,189 +1,11 @@
-// How a call of XLA becomes launches of kernels: native code on the thread of the call, which neither runs nor waits for Python, but for
-// the two cases that `Desk` names: a plan that is not known yet, and a launch that only Python can make (hash grid).
+// How a call of XLA becomes launches of kernels: native code on the thread of the call, which neither runs nor waits for Python, unless
+// its plan is not known yet.
 //
 // Python lays down a plan for each kernel, for the shapes of a call and, on CUDA, for a device: which functions are launched, in order,
 // and the bytes of their arguments, but for the addresses of arrays, which a call brings. Plans are found by the name that a program
 // carries. A name that is not known yet, of a program that another process has traced, is asked of Python once.
 #pragma once
-#include "c_library.h"
-#include "xla_ffi.h"
-
-typedef void (*Function)(const void* arguments);
-
-enum Kind { ONCE, SHARED, CUDA, CUDA_BESIDE, CLEAR, HUGE_PAGES, PYTHON };
-
-struct Step {
-    void* function;                  // CPU: called with the address of the arguments; CUDA: a function of the driver
-    const unsigned char* arguments;  // their bytes
-    const int* arrays;               // places among these bytes, each behind it the number of the array whose address belongs there
-    int size, array_count;
-    int kind;
-    int block;          // CUDA: threads of a block
-    long long threads;  // CPU: how many may share the work; CUDA: in all; of what is cleared or in huge pages: bytes
-};
-struct Plan {
-    const char* name;
-    long long name_size;
-    unsigned long long hash;
-    long long users;  // calls that are under way
-    const Step* steps;
-    void *side, *begun, *ended;  // a second stream of the device, and two events
-    int device, step_count;
-};
-
-// What Python tells once: functions that are called, and the plans there are.
-struct Desk {
-    // What asks for the plan of a name, and what serves a call: they write down what goes wrong, or an empty text.
-    void (*make_plan)(const char* name, long long name_size, const char* recipe, long long recipe_size, int device, char* wrong);
-    void (*serve)(const char* name, long long name_size, int device, void* stream, void* const* arrays, char* wrong);
-    int (*yield)();
-    int (*advise)(void* address, size_t size, int advice);
-    int (*launch)(void* function, unsigned int, unsigned int, unsigned int, unsigned int, unsigned int, unsigned int, unsigned int,
-        void* stream, void** arguments, void** extra);
-    int (*clear)(unsigned long long address, unsigned int word, size_t words, void* stream);
-    int (*record)(void* event, void* stream);
-    int (*wait)(void* stream, void* event, unsigned int);
-    // of Python, all of them called without its lock
-    int (*is_alive)();
-    int (*has_lock)();
-    unsigned long (*this_thread)();
-    unsigned long (*start_thread)(void (*work)(void*), void* given);
-    void* (*make_lock)();
-    int (*take_lock)(void* lock, int wait);
-    void (*give_lock)(void* lock);
-    void (*free_lock)(void* lock);
-    Plan** plans;
-    long long plan_count;
-    unsigned long main_thread;
-    int locked, forking;
-    int asking, closed;  // questions that are open, and whether there will be no more answers
-};
-static Desk* desk;
-
-static constexpr int ON_CPU = -1, ON_FIRST = -2;  // in place of the number of a CUDA device; the first one that a process uses
-static constexpr int MOST_ARRAYS = 48, MOST_BYTES = 1024, MOST_WORDS = 1024;
-
-struct Lock {
-    int* const locked;
-    explicit Lock(int* given) : locked(given) {
-        while (__atomic_exchange_n(locked, 1, __ATOMIC_ACQUIRE))
-            desk->yield();
-    }
-    ~Lock() { __atomic_store_n(locked, 0, __ATOMIC_RELEASE); }
-};
-
-static unsigned long long hash_of(const char* name, long long size) {
-    unsigned long long hash = 0x9e3779b97f4a7c15ull + (unsigned long long)size, word;
-    for (; size > 0; size -= 8, name += 8) {
-        word = 0;
-        memcpy(&word, name, size < 8 ? (size_t)size : 8);
-        hash = (hash ^ word) * 0xff51afd7ed558ccdull;
-        hash ^= hash >> 32;
-    }
-    return hash;
-}
-
-// A message, for XLA to raise.
-struct Message {
-    char text[2 * MOST_WORDS];
-    int size = 0;
-    void add(const char* words, long long most = 1 << 20) {
-        for (; *words && most > 0 && size < (int)sizeof(text) - 1; --most)
-            text[size++] = *words++;
-        text[size] = 0;
-    }
-    void add_number(int number) {
-        char digits[12];
-        int at = 11;
-        digits[at] = 0;
-        for (unsigned int rest = number < 0 ? 0u - number : number; at == 11 || rest; rest /= 10)
-            digits[--at] = (char)('0' + rest % 10);
-        if (number < 0)
-            digits[--at] = '-';
-        add(digits + at);
-    }
-    // Adds the name of a kernel, which ends where the sources it was made of are named.
-    void add_name(XLA_FFI_ByteSpan name) {
-        long long size = 0;
-        while (size < (long long)name.len && name.ptr[size] != '@')
-            ++size;
-        add(name.ptr, size);
-        add(": ");
-    }
-};
-
-struct Call {
-    XLA_FFI_CallFrame* const frame;
-    explicit Call(XLA_FFI_CallFrame* given) : frame(given) {}
-
-    XLA_FFI_Error* fail(const char* words) const {
-        XLA_FFI_Error_Create_Args given = {sizeof(given), nullptr, words, XLA_FFI_Error_Code_INTERNAL};
-        return frame->api->XLA_FFI_Error_Create(&given);
-    }
-    XLA_FFI_Error* fail_at(const char* words, int number) const {
-        Message message;
-        message.add_name(text("kernel"));
-        message.add(words);
-        message.add_number(number);
-        return fail(message.text);
-    }
-    XLA_FFI_ByteSpan text(const char* name) const {
-        const XLA_FFI_Attrs& given = frame->attrs;
-        for (long long k = 0; k < given.size; ++k) {
-            const XLA_FFI_ByteSpan* here = given.names[k];
-            size_t l = 0;
-            while (l < here->len && name[l] == here->ptr[l])
-                ++l;
-            if (l == here->len && name[l] == 0)
-                return *(const XLA_FFI_ByteSpan*)given.attrs[k];
-        }
-        return XLA_FFI_ByteSpan{"", 0};
-    }
-    void discard(XLA_FFI_Error* error) const {
-        XLA_FFI_Error_Destroy_Args given = {sizeof(given), nullptr, error};
-        frame->api->XLA_FFI_Error_Destroy(&given);
-    }
-    int device() const {
-        XLA_FFI_DeviceOrdinal_Get_Args given = {sizeof(given), nullptr, frame->ctx, 0};
-        XLA_FFI_Error* error = frame->api->XLA_FFI_DeviceOrdinal_Get(&given);
-        if (error)
-            discard(error);
-        return given.device_ordinal;
-    }
-    void* stream() const {
-        XLA_FFI_Stream_Get_Args given = {sizeof(given), nullptr, frame->ctx, nullptr};
-        XLA_FFI_Error* error = frame->api->XLA_FFI_Stream_Get(&given);
-        if (error)
-            discard(error);
-        return given.stream;
-    }
-    int thread_count() const {
-        int64_t count = 1;
-        XLA_FFI_ThreadPool_NumThreads_Args given = {sizeof(given), nullptr, frame->ctx, &count};
-        XLA_FFI_Error* error = frame->api->XLA_FFI_ThreadPool_NumThreads(&given);
-        if (error) {
-            discard(error);
-            return 1;
-        }
-        return (int)count;
-    }
-    bool schedule(XLA_FFI_Task* task, void* data) const {
-        XLA_FFI_ThreadPool_Schedule_Args given = {sizeof(given), nullptr, frame->ctx, task, data};
-        XLA_FFI_Error* error = frame->api->XLA_FFI_ThreadPool_Schedule(&given);
-        if (error)
-            discard(error);
-        return error == nullptr;
-    }
-    // Puts down the addresses of the arrays, inputs first.
-    int arrays(void** found) const {
-        int count = 0;
-        for (long long k = 0; k < frame->args.size && count < MOST_ARRAYS; ++k)
-            found[count++] = ((XLA_FFI_Buffer*)frame->args.args[k])->data;
-        for (long long k = 0; k < frame->rets.size && count < MOST_ARRAYS; ++k)
-            found[count++] = ((XLA_FFI_Buffer*)frame->rets.rets[k])->data;
-        return count;
-    }
-};
+#include "calls.h"
 
 // Finds a plan, which stays until `leave`.
 static Plan* enter(XLA_FFI_ByteSpan name, int device) {
@@ -205,21 +27,14 @@ static Plan* enter(XLA_FFI_ByteSpan name, int device) {
 }
 static void leave(Plan* plan) { __atomic_fetch_sub(&plan->users, 1, __ATOMIC_RELEASE); }
 
-// A question to Python. Where nothing comes back, something went wrong.
+// A question to Python for a plan. Where nothing comes back, something went wrong.
 struct Question {
     XLA_FFI_ByteSpan name, recipe;
     int device;
-    void* stream;
-    void* const* arrays;  // of a call that is to be served; none: for a plan
     char wrong[MOST_WORDS] = "Python ended, or stopped, before it had answered.";
     void* answered = nullptr;
 
-    void ask() {
-        if (arrays)
-            desk->serve(name.ptr, (long long)name.len, device, stream, arrays, wrong);
-        else
-            desk->make_plan(name.ptr, (long long)name.len, recipe.ptr, (long long)recipe.len, device, wrong);
-    }
+    void ask() { desk->make_plan(name.ptr, (long long)name.len, recipe.ptr, (long long)recipe.len, device, wrong); }
     static void ask_apart(void* given) {
         Question* question = (Question*)given;
         question->ask();
@@ -301,14 +116,30 @@ struct Team {
     }
 };
 
+// The turn of a call, where calls take turns.
+struct Turn {
+    const bool is_taken;
+    explicit Turn(const Plan& plan) : is_taken(plan.in_turns) {
+        if (is_taken)
+            desk->take_lock(desk->turn, 1);
+    }
+    ~Turn() {
+        if (is_taken)
+            desk->give_lock(desk->turn);
+    }
+};
+
 // What a call does on a device.
 struct Work {
     const Call& call;
     const Plan& plan;
     void* const stream;
-    void* arrays[MOST_ARRAYS];
+    void* arrays[MOST_ARRAYS + 1];  // behind them the stream
+    const Turn turn;
 
-    Work(const Call& given, const Plan& found, void* of_call) : call(given), plan(found), stream(of_call) { call.arrays(arrays); }
+    Work(const Call& given, const Plan& found, void* of_call) : call(given), plan(found), stream(of_call), turn(found) {
+        arrays[call.arrays(arrays)] = stream;
+    }
 
     void fill(const Step& step, unsigned char* bytes) const {
         memcpy(bytes, step.arguments, (size_t)step.size);
@@ -332,12 +163,27 @@ struct Work {
         wrong = wrong ? wrong : desk->record(plan.ended, plan.side);
         return wrong ? wrong : desk->wait(stream, plan.ended, 0);
     }
+    void run_once(const Step& step) const {
+        alignas(16) unsigned char bytes[MOST_BYTES];
+        fill(step, bytes);
+        ((Function)step.function)(bytes);
+    }
     int run_on_cuda() const {
+        if (!plan.in_turns)
+            return launch_all();
+        int wrong = desk->wait(stream, plan.ended, 0);  // for calls before, on other streams
+        wrong = wrong ? wrong : launch_all();
+        const int lost = desk->record(plan.ended, stream);
+        return wrong ? wrong : lost;
+    }
+    int launch_all() const {
         int wrong = 0;
         for (int k = 0; k < plan.step_count && !wrong; ++k) {
             const Step& step = plan.steps[k];
             if (step.kind == CLEAR)
                 wrong = desk->clear((unsigned long long)arrays[step.arrays[1]], 0, (size_t)step.threads / 4, stream);
+            else if (step.kind == ONCE)
+                run_once(step);
             else if (k + 1 < plan.step_count && plan.steps[k + 1].kind == CUDA_BESIDE)
                 wrong = launch_both(plan.steps + k++);
             else
@@ -384,24 +230,19 @@ static XLA_FFI_Error* answer(XLA_FFI_CallFrame* frame, bool cuda) {
         return nullptr;
     const XLA_FFI_ByteSpan name = call.text("kernel");
     if (!executes && cuda) {  // XLA does not say for which device a program is made: most likely for the first one
-        Question question = {name, call.text("recipe"), ON_FIRST, nullptr, nullptr};
+        Question question = {name, call.text("recipe"), ON_FIRST};
         return question.succeeds() ? nullptr : question.fail(call);
     }
     const int device = cuda ? call.device() : ON_CPU;
     Plan* plan = enter(name, device);
     while (plan == nullptr) {
-        Question question = {name, call.text("recipe"), device, nullptr, nullptr};
+        Question question = {name, call.text("recipe"), device};
         if (!question.succeeds())
             return question.fail(call);
         plan = enter(name, device);
     }
     XLA_FFI_Error* error = nullptr;
-    if (executes && plan->step_count > 0 && plan->steps[0].kind == PYTHON) {
-        void* arrays[MOST_ARRAYS];
-        call.arrays(arrays);
-        Question question = {name, {}, device, cuda ? call.stream() : nullptr, arrays};
-        error = question.succeeds() ? nullptr : question.fail(call);
-    } else if (executes && cuda) {
+    if (executes && cuda) {
         const int wrong = Work(call, *plan, call.stream()).run_on_cuda();
         error = wrong ? call.fail_at("a launch failed with CUDA's error ", wrong) : nullptr;
     } else if (executes)
@@ -416,6 +257,7 @@ extern "C" {
 // Takes the desk, where both sides mean the same by what stands on it.
 bool open_desk(Desk* given, long long desk_size, long long plan_size, long long step_size) {
     desk = given;
+    desk->turn = desk->make_lock();
     return desk_size == sizeof(Desk) && plan_size == sizeof(Plan) && step_size == sizeof(Step);
 }
 XLA_FFI_Error* answer_on_cpu(XLA_FFI_CallFrame* frame) { return answer(frame, false); }
@@ -424,6 +266,7 @@ XLA_FFI_Error* answer_on_cuda(XLA_FFI_CallFrame* frame) { return answer(frame, t
 void begin_anew(unsigned long main_thread) {
     desk->main_thread = main_thread;
     desk->locked = desk->forking = desk->asking = 0;
+    desk->turn = desk->make_lock();
     for (long long k = 0; k < desk->plan_count; ++k)
         desk->plans[k]->users = 0;
 }
