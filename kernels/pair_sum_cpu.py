@@ -37,10 +37,14 @@ class Value(NamedTuple):
 
 
 class Sum(NamedTuple):
-    """What is added up: its name in the text, of the dtype of positions; over the neighbors of each i, or (`total`) all pairs."""
+    """What is added up: its name in the text, of the dtype of positions; over the neighbors of each i, or (`total`) all pairs.
+
+    Where it is marked, sums of an i whose position is not finite are NaN, otherwise 0.
+    """
 
     name: str
     total: bool
+    mark: bool
 
 
 class Step(NamedTuple):
@@ -126,6 +130,8 @@ def term_header(term: TermText, double: bool) -> dict[str, str]:
     lines = [f"typedef Math::{'f64' if double else 'f32'} number;"]
     lines += [f"JFRNN_TABLE bool IS_TOTAL[] = {{{', '.join(str(int(part.total)) for part in term.sums)}}};"]
     lines += [f"JFRNN_TABLE int PLACE[] = {{{', '.join(map(str, places))}}};"]
+    marks = [str(int(part.mark)) for part in term.sums if not part.total]
+    lines += [f"JFRNN_TABLE bool MARKED[] = {{{', '.join(marks or ['0'])}}};"]
     lines += [f"JFRNN_TABLE int STEP_AXES[] = {{{', '.join([str(step.axis) for step in term.steps] or ['0'])}}};"]
     lines += ["struct Term {", *_members(term.shared), "struct Own {", *_members(term.own)]
     lines += [*(f"number turned{c};" for c in range(len(term.steps))), "};", *_of_shared(term, double), *_of_own(term, double)]

@@ -65,6 +65,10 @@ struct FewSums : FewSumsArguments {
         for (int t = lane; t < 2 * TOTALS; t += 32)
             totals[2ll * TOTALS * id + t] = 0;
         __syncwarp();
+        if (!finite_point(pairs.q)) {
+            results.clear(id, lane, 32);
+            return;
+        }
         reduction.reduce_over_warp();
         reduction.store(results, {lane, id, id, lane == 0, true, true});
     }
