@@ -15,13 +15,14 @@ from typing import NamedTuple
 
 from jfrnn.kernels._native import SPACES, program
 from jfrnn.kernels._program import Kernel, declare
-from jfrnn.kernels.cells_cpu import CHUNK, GRID, QUERY_CHUNK
+from jfrnn.kernels.cells_cpu import CHUNK, GRID, QUERY_CHUNK, TOGETHER
 
 CACHE_BYTES = 40 << 10  # for candidates: most of a first-level cache, and a little of the second
 MOST_CANDIDATES = 1024
 MOST_LANES = 16
 LITTLE_WORK = 50  # operations up to which the term is evaluated for candidates that are no pairs, too
 VERY_LITTLE_WORK = 20  # up to which it is, though none of a vector is a pair
+TOGETHER_AT_WORK = 4  # as `TOGETHER`, where it takes longer to evaluate a term for farther candidates than to copy nearer ones
 _SERIES = 20  # operations that a function like exp takes
 _SERIES_NAMES = ("exp", "log", "pow", "sin", "cos", "tan", "cbrt", "erf", "logistic", "rem")  # and what holds them in its name
 
@@ -215,6 +216,7 @@ def query_kernel(
         "QUERY_CHUNK": QUERY_CHUNK,
         "CANDIDATES": _candidates(term, dim, double),
     }
-    constants |= {"MANY": 0, "PACKED": packed, "SKIPPED": work(term.text) > VERY_LITTLE_WORK}
+    works = work(term.text) > VERY_LITTLE_WORK
+    constants |= {"MANY": 0, "PACKED": packed, "SKIPPED": works, "TOGETHER": TOGETHER_AT_WORK if works else TOGETHER}
     text = program(double, dim, "pair_sum_cpu.h", given=term_header(term, double), **constants)
     return declare(f"pair_sum_cpu_{variant}", text, "Sums.run")[0]
