@@ -42,9 +42,8 @@ struct FewSums : FewSumsArguments {
                 code = of_image;
             });
         };
-        pairs.meet_all([&](int j, int code, bool hit) {
-            const unsigned int hits = __ballot_sync(EVERY, hit);
-            if (hit)
+        pairs.meet_all([&](int j, int code, unsigned int hits) {
+            if (hits >> lane & 1)
                 waiting[held + __popc(hits & lanes_below)] = j | code << CODE;
             held += __popc(hits);
             __syncwarp();
