@@ -20,9 +20,9 @@ from jfrnn._engine.levels_warp import level_neighbors
 from jfrnn._engine.operands import MOST_IN_BOX, pack_particles, periodic_kind, space_flags
 from jfrnn._engine.plans import HugePages, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.problem import Filter, Kind, Options, Rows, Search
-from jfrnn._engine.start import check_warp, load_warp
+from jfrnn._engine.start import check_warp
 from jfrnn._geometry import Cutoffs
-from jfrnn.kernels import cells_cpu, cells_cuda, few_cuda
+from jfrnn.kernels import _driver, cells_cpu, cells_cuda, few_cuda
 from jfrnn.kernels._native import table_cells
 
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
@@ -94,7 +94,7 @@ def missing(platform: str) -> str | None:
         if platform in PLATFORMS:
             open_native()
         if platform in ("gpu", "cuda"):
-            return None if load_warp().is_cuda_available() else "Warp found no CUDA driver"
+            return None if _driver.device_count() else "there is no CUDA device"
     except (ImportError, RuntimeError) as error:
         return str(error).rstrip(".")
     if platform == "cpu":
