@@ -192,7 +192,7 @@ def _summand(
     """Return the operands, fn as a function of one pair of them, and a list that receives the structure of fn's result."""
     sources, rows, lattice = pairs.sources, pairs.rows, pairs.lattice
     dtype = sources.dtype
-    harmless = jnp.zeros(sources.shape[1], dtype).at[0].set(jnp.asarray(pairs.largest, dtype) / 2)
+    harmless = _along_first_axis(pairs.largest, sources.shape[1], dtype)
     turning = [] if lattice is None else [lattice.matrix]
     numbers = [jax.ShapeDtypeStruct((len(x),), np.int32) for x in (rows, sources)]  # become arrays only if the term needs them
     (own, own_tree), (others, other_tree) = jax.tree.flatten(mine), jax.tree.flatten(theirs)
@@ -221,6 +221,15 @@ def _summand(
         return [_summable(x, dtype) for x in leaves]
 
     return operands, summand, structure
+
+
+def _along_first_axis(largest: np.floating | Array, dim: int, dtype: np.dtype) -> Array:
+    """Return a vector of half that length; of a number that is known it is made on the host, which needs no compilation."""
+    if isinstance(largest, Array):
+        return jnp.zeros(dim, dtype).at[0].set(jnp.asarray(largest, dtype) / 2)
+    vector = np.zeros(dim, dtype)
+    vector[0] = np.asarray(largest, dtype) / 2
+    return on_device(vector)
 
 
 def _labels(operands: Groups, same: bool) -> Labels:
