@@ -27,6 +27,7 @@ from jfrnn.kernels._native import table_cells
 
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
 _CELLS = {"cpu": cells_cpu, "cuda": cells_cuda}
+QUERIES_PER_THREAD = 1024  # on the CPU, at least: among 1000, to wake a second thread takes as long as it saves
 _PARTICLES = ("positions", "queries", "cutoff")  # what kernels of cells are given
 
 
@@ -204,7 +205,7 @@ def _plan_on_cpu(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan
     kernels = cells_cpu.cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, **kind)
     numbers = _numbers(variant, shapes)
     rows = ask_for_huge_pages("idx", 4 * numbers["m"] * numbers["capacity"]) if variant.lists else []
-    steps = [*sort_on_cpu(kernels, numbers["n"]), *rows, share(kernels.query, numbers["m"])]
+    steps = [*sort_on_cpu(kernels, numbers["n"]), *rows, share(kernels.query, numbers["m"], QUERIES_PER_THREAD)]
     return Plan(steps, numbers, _absent(variant))
 
 
