@@ -14,14 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jfrnn._engine import Plan
-from jfrnn._engine.plans import cuda_driver
 from jfrnn._engine.start import compiler, load_warp
 from jfrnn._geometry import make_cutoff
 from jfrnn._search import round_capacity
 from jfrnn._triangles import warp as _triangles_warp
 from jfrnn._triangles.cells import gather_corners
 from jfrnn.cases import _fluid, _fluid_flows, _fluid_free
-from jfrnn.kernels import triangles_cuda
+from jfrnn.kernels import _driver, triangles_cuda
 
 lattice, taylor_green_velocity, free, LAYERS = (
     _fluid.lattice,
@@ -64,6 +63,6 @@ def _launch_alone(step: Any, plan: Plan, arrays: dict[str, Any], device: str) ->
     function = ctypes.c_void_p(compiler().load(step.kernel.program, device).address_of(step.kernel.name))
     grid = -(-step.threads // step.kernel.block), 1, 1, step.kernel.block, 1, 1, 0
     stream = ctypes.c_void_p(load_warp().get_stream(device).cuda_stream)
-    wrong = cuda_driver().cuLaunchKernel(function, *grid, stream, (ctypes.c_void_p * 1)(ctypes.addressof(given)), None)
+    wrong = _driver.driver().cuLaunchKernel(function, *grid, stream, (ctypes.c_void_p * 1)(ctypes.addressof(given)), None)
     if wrong:
         raise RuntimeError(f"{step.kernel.name}: a launch failed with CUDA's error {wrong}")

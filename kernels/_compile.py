@@ -12,34 +12,37 @@ import hashlib
 import os
 import platform
 import shutil
+import sys
 import tempfile
 import threading
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import Any
 
-from jfrnn.kernels import _clang
+from jfrnn.kernels import _clang, _driver
 from jfrnn.kernels._program import Program
 from jfrnn.kernels._turns import one_at_a_time
 from jfrnn.kernels.launch import launcher
 
-Device = Any  # of Warp, for CUDA
 Handle = Any  # of a program that is loaded, by Clang or by CUDA
 _FOLDER = "wp_jfrnn"
 _END = b"\n//"  # a comment of PTX, and nothing to objects
 _DIGEST = 64  # hexadecimal digits
 _ROOM = 1 << 22  # bytes that a compiler may need
 _ATTEMPTS = 10
+Start = Callable[[], Any]
 _loaded: weakref.WeakValueDictionary[tuple[Program, str], "Library"] = weakref.WeakValueDictionary()
 
 
 class Library:
     """A program that is loaded on a device; it is unloaded when nobody has it any longer."""
 
-    def __init__(self, program: Program, device: str) -> None:
-        self._program, self._device = program, _cuda().device(device) if program.cuda else None
+    def __init__(self, program: Program, device: str, start: Start) -> None:
+        self._program, self._start = program, start
+        self._device = _driver.find_device(int(device.partition(":")[2])) if program.cuda else None
         self._handle = self._load()
         weakref.finalize(self, _unload, self._unloading()).atexit = False  # programs may still run while the interpreter exits
 
@@ -49,8 +52,8 @@ class Library:
         Raises:
             RuntimeError: The library does not hold it.
         """
-        if self._program.cuda:
-            found = _cuda().core.wp_cuda_get_kernel(self._device.context, self._handle, function.encode())
+        if self._device is not None:
+            found = _driver.find_function(self._handle, function)
         else:
             found = _clang.find_function(self._handle, function)
         if not found:
@@ -58,45 +61,40 @@ class Library:
         return found
 
     def _load(self) -> Handle:
-        path = find_binary(self._program, self._device)
+        path = find_binary(self._program, self._device, start=self._start)
         found = self._take(path)
         if not found:
             path.unlink(missing_ok=True)
-            found = self._take(find_binary(self._program, self._device))
+            found = self._take(find_binary(self._program, self._device, start=self._start))
         if not found:
             raise RuntimeError(f"the compiled program {path} cannot be loaded")
         return found
 
     def _take(self, path: Path) -> Handle:
-        if self._program.cuda:
-            return _cuda().core.wp_cuda_load_module(self._device.context, str(path).encode())
+        if self._device is not None:
+            return _driver.load_module(self._device, path.read_bytes()[: -_DIGEST - len(_END)])
         return _clang.load_object(path, f"jfrnn_{id(self)}_{path.stem}")
 
     def _unloading(self) -> Callable[[], None]:
-        if self._program.cuda:
-            return functools.partial(_unload_cuda, self._device, self._handle)
+        if self._device is not None:
+            return functools.partial(_driver.unload_module, self._device, self._handle)
         return functools.partial(_clang.unload_object, self._handle)
 
 
-class _Cuda(NamedTuple):
-    """What is used of Warp, which has to be started, for CUDA."""
-
-    core: Any
-    build: Any
-    device: Callable[[str], Device]
-    synchronize: Callable[[Device], None]
-
-
-@functools.cache
-def _cuda() -> _Cuda:
+def _start_warp() -> ModuleType:
     import warp
-    from warp._src import build, context
 
-    return _Cuda(context.runtime.core, build.build_cuda, warp.get_device, warp.synchronize_device)
+    warp.init()
+    return warp
 
 
-def load(program: Program, device: str = "cpu") -> Library:
+def load(program: Program, device: str = "cpu", start: Start = _start_warp) -> Library:
     """Return a program that is loaded on a device; it is compiled where no whole file of it is kept.
+
+    Args:
+        program: What is loaded.
+        device: As Warp names it.
+        start: Imports Warp and starts it, which it takes to compile a program for CUDA.
 
     Raises:
         RuntimeError: It does not compile, or cannot be loaded.
@@ -104,7 +102,7 @@ def load(program: Program, device: str = "cpu") -> Library:
     with one_at_a_time:
         found = _loaded.get((program, device))
         if found is None:
-            found = _loaded[program, device] = Library(program, device)
+            found = _loaded[program, device] = Library(program, device, start)
         return found
 
 
@@ -138,25 +136,29 @@ def load_launcher(header: str) -> Library:
     return load(launcher(header))
 
 
-def find_binary(program: Program, device: Device = None, arch: int | None = None) -> Path:
+def find_binary(
+    program: Program, device: _driver.CudaDevice | None = None, arch: int | None = None, start: Start = _start_warp
+) -> Path:
     """Return a file that holds the compiled program, whole.
 
     Args:
         program: What is compiled.
-        device: For CUDA, a device of Warp.
-        arch: The architecture in place of that of the device, as in 90; then PTX is made.
+        device: For CUDA, a device.
+        arch: The architecture in place of a device, as in 90; then PTX is made.
+        start: As in `load`.
     """
     target = _target(program, device, arch)
+    build = functools.partial(_build_cuda, start, device, arch) if program.cuda else _build_object
     key = hashlib.sha256("\0".join((*map(str, program), *target, _clang.warp_version())).encode()).hexdigest()[:20]
     name = f"{program.name[:80]}_{key}{target[0]}"
     kept = kernel_folder() / _FOLDER
     if _is_whole(kept / name):
         return kept / name
     try:
-        return _compile(program, target, kept / name)
+        return _compile(program, build, kept / name)
     except OSError:
         _notes.append(temporary_folder())
-        return _compile(program, target, kernel_folder() / _FOLDER / name)
+        return _compile(program, build, kernel_folder() / _FOLDER / name)
 
 
 def temporary_folder() -> str:
@@ -177,13 +179,19 @@ def temporary_folder() -> str:
     return f"{place} cannot be written: kernels are compiled into {folder} for this process alone. {hint} to keep them."
 
 
-def _target(program: Program, device: Device, arch: int | None) -> tuple[str, str]:
-    """Return the kind of file, and what it runs on: objects use all instructions of the processor that compiles them."""
+def _target(program: Program, device: _driver.CudaDevice | None, arch: int | None) -> tuple[str, str]:
+    """Return the kind of file, and what it runs on: objects use all instructions of the processor that compiles them.
+
+    From the device, the driver, and what users ask of Warp, Warp decides whether a program becomes a cubin or PTX.
+    """
     if not program.cuda:
         return ".o", " ".join((*_clang.OPTIONS, _processor()))
     if arch is not None:
         return ".ptx", str(arch)
-    return f".{device.get_cuda_output_format()}", str(device.get_cuda_compile_arch())
+    assert device is not None
+    config = getattr(sys.modules.get("warp"), "config", None)
+    asked = [getattr(config, key, None) for key in ("cuda_output", "ptx_target_arch")]
+    return ".cuda", f"{device.arch} {_driver.version()} {asked}"
 
 
 @functools.cache
@@ -195,25 +203,40 @@ def _processor() -> str:
     return next((line for line in lines if line.startswith(("flags", "Features"))), platform.machine())
 
 
-def _compile(program: Program, target: tuple[str, str], path: Path) -> Path:
+def _build_object(program: Program, source: Path) -> Path:
+    binary = source.with_suffix(".o")
+    _clang.compile_object(program.text, source, binary, program.fused)
+    return binary
+
+
+def _build_cuda(start: Start, device: _driver.CudaDevice | None, arch: int | None, program: Program, source: Path) -> Path:
+    """Compile a program by Warp, which knows from the name of the file whether PTX is asked for."""
+    warp, kind = start(), "ptx"
+    from warp._src.build import build_cuda
+
+    if arch is None and device is not None:
+        target = warp.get_device(f"cuda:{device.number}")
+        kind, arch = target.get_cuda_output_format(), target.get_cuda_compile_arch()
+    binary = source.with_suffix(f".{kind}")
+    options = {"config": "release", "fuse_fp": program.fused, "use_precompiled_headers": False, "pch_dir": None}
+    build_cuda(str(source), arch, str(binary), **options)
+    return binary
+
+
+def _compile(program: Program, build: Callable[[Program, Path], Path], path: Path) -> Path:
     """Compile a program to a file.
 
     Raises:
         OSError: It cannot be written.
         RuntimeError: It does not compile.
     """
-    kind, arch = target
     path.parent.mkdir(parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=path.parent).close()  # before the compiler has worked for nothing
     with _new_folder(path.parent) as folder:
-        source, binary = folder / f"program.{'cu' if program.cuda else 'cpp'}", folder / f"program{kind}"
+        source = folder / f"program.{'cu' if program.cuda else 'cpp'}"
         source.write_text(program.text, "utf-8")
         try:
-            if program.cuda:
-                options = {"config": "release", "fuse_fp": program.fused, "use_precompiled_headers": False, "pch_dir": None}
-                _cuda().build(str(source), int(arch), str(binary), **options)
-            else:
-                _clang.compile_object(program.text, source, binary, program.fused)
+            binary = build(program, source)
         except Exception as error:
             _check_room(folder)
             raise RuntimeError(f"the program {program.name!r} does not compile: {error}") from error
@@ -286,8 +309,3 @@ def _is_whole(path: Path) -> bool:
 def _unload(work: Callable[[], None]) -> None:
     with one_at_a_time:
         work()
-
-
-def _unload_cuda(device: Device, handle: int) -> None:
-    _cuda().synchronize(device)
-    _cuda().core.wp_cuda_unload_module(device.context, handle)

@@ -15,7 +15,8 @@ CHUNK = 2048  # places that a thread takes at a time, where it puts them in orde
 QUERY_CHUNK = 256  # and where it serves queries
 _HEADER_WORDS = 64
 MANY = 1 << 15  # sources from which several threads gather their coordinates
-FEW = 384  # sources up to which all are candidates of all queries
+FEW = 160  # sources up to which all are candidates of all queries
+TOGETHER = 12  # queries that cells of a row are served for at once
 GRID = {
     "FEW": FEW,
     "REACH": 1,
@@ -50,6 +51,6 @@ def cell_kernels(dim: int, double: bool, scaled: bool, lists: bool, periodic: in
     variant += f"{SPACES[periodic]}{'_batched' * batched}"
     options = {"SCALED": scaled, "LIST": lists, **GRID, "PERIODIC": periodic}
     options |= {"BATCHED": batched, "SUMS": 0, "CHUNK": CHUNK, "QUERY_CHUNK": QUERY_CHUNK, "MANY": MANY}
-    options |= {"CANDIDATES": 1024 if double else 1536}  # what fits into a first-level cache beside a row
+    options |= {"TOGETHER": TOGETHER, "CANDIDATES": 1024 if double else 1536}  # what fits into a first-level cache beside a row
     text = program(double, dim, "rows_cpu.h", **options)
     return Kernels(*declare(f"cells_cpu_{variant}", text, "Sort.build", "Gather.gather", "Rows.run"))

@@ -25,7 +25,12 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -
 
 def threads(queries: int) -> int:
     """Return the threads of a launch."""
-    return 32 * _QUERIES * -(-queries // _QUERIES)
+    return 32 * _QUERIES * blocks(queries)
+
+
+def blocks(queries: int) -> int:
+    """Return the blocks of a launch: of so many, `info` has a row each."""
+    return -(-queries // _QUERIES)
 
 
 def slots(queries: int) -> int:
@@ -35,7 +40,7 @@ def slots(queries: int) -> int:
 
 @functools.lru_cache(64)
 def rows_kernel(dim: int, double: bool, lists: bool, batched: bool, boxed: bool = False) -> Kernel:
-    """Return the kernel for a dimension and dtype, for lists or counts alone; `info` is zeros at first."""
+    """Return the kernel for a dimension and dtype, for lists or counts alone."""
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_list' * lists}{'_nearest' * boxed}{'_batched' * batched}"
     text = program(double, dim, "few_rows.cuh", SUMS=0, **_constants(double, lists, batched, boxed))
     return declare(f"few_cuda_{variant}", text, Entry("FewRows.run", 32 * _QUERIES, _BLOCKS), cuda=True, fused=True)[0]

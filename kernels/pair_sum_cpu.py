@@ -15,13 +15,14 @@ from typing import NamedTuple
 
 from jfrnn.kernels._native import SPACES, program
 from jfrnn.kernels._program import Kernel, declare
-from jfrnn.kernels.cells_cpu import CHUNK, GRID, QUERY_CHUNK
+from jfrnn.kernels.cells_cpu import CHUNK, GRID, QUERY_CHUNK, TOGETHER
 
 CACHE_BYTES = 40 << 10  # for candidates: most of a first-level cache, and a little of the second
 MOST_CANDIDATES = 1024
 MOST_LANES = 16
 LITTLE_WORK = 50  # operations up to which the term is evaluated for candidates that are no pairs, too
 VERY_LITTLE_WORK = 20  # up to which it is, though none of a vector is a pair
+TOGETHER_AT_WORK = 4  # as `TOGETHER`, where it takes longer to evaluate a term for farther candidates than to copy nearer ones
 _SERIES = 20  # operations that a function like exp takes
 _SERIES_NAMES = ("exp", "log", "pow", "sin", "cos", "tan", "cbrt", "erf", "logistic", "rem")  # and what holds them in its name
 
@@ -37,10 +38,14 @@ class Value(NamedTuple):
 
 
 class Sum(NamedTuple):
-    """What is added up: its name in the text, of the dtype of positions; over the neighbors of each i, or (`total`) all pairs."""
+    """What is added up: its name in the text, of the dtype of positions; over the neighbors of each i, or (`total`) all pairs.
+
+    Where it is marked, sums of an i whose position is not finite are NaN, otherwise 0.
+    """
 
     name: str
     total: bool
+    mark: bool
 
 
 class Step(NamedTuple):
@@ -126,6 +131,8 @@ def term_header(term: TermText, double: bool) -> dict[str, str]:
     lines = [f"typedef Math::{'f64' if double else 'f32'} number;"]
     lines += [f"JFRNN_TABLE bool IS_TOTAL[] = {{{', '.join(str(int(part.total)) for part in term.sums)}}};"]
     lines += [f"JFRNN_TABLE int PLACE[] = {{{', '.join(map(str, places))}}};"]
+    marks = [str(int(part.mark)) for part in term.sums if not part.total]
+    lines += [f"JFRNN_TABLE bool MARKED[] = {{{', '.join(marks or ['0'])}}};"]
     lines += [f"JFRNN_TABLE int STEP_AXES[] = {{{', '.join([str(step.axis) for step in term.steps] or ['0'])}}};"]
     lines += ["struct Term {", *_members(term.shared), "struct Own {", *_members(term.own)]
     lines += [*(f"number turned{c};" for c in range(len(term.steps))), "};", *_of_shared(term, double), *_of_own(term, double)]
@@ -209,6 +216,7 @@ def query_kernel(
         "QUERY_CHUNK": QUERY_CHUNK,
         "CANDIDATES": _candidates(term, dim, double),
     }
-    constants |= {"MANY": 0, "PACKED": packed, "SKIPPED": work(term.text) > VERY_LITTLE_WORK}
+    works = work(term.text) > VERY_LITTLE_WORK
+    constants |= {"MANY": 0, "PACKED": packed, "SKIPPED": works, "TOGETHER": TOGETHER_AT_WORK if works else TOGETHER}
     text = program(double, dim, "pair_sum_cpu.h", given=term_header(term, double), **constants)
     return declare(f"pair_sum_cpu_{variant}", text, "Sums.run")[0]

@@ -13,7 +13,7 @@ import pytest
 
 from jfrnn._engine import Clear, Launch, Plan, launch, plans
 from jfrnn._engine.start import load_warp
-from jfrnn.kernels import Field, Kernel, Program, _compile
+from jfrnn.kernels import Field, Kernel, Program, _compile, _driver
 from jfrnn.kernels.launch import write_launcher
 
 HEADER = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text()
@@ -159,7 +159,7 @@ class Native:
             self.laid[name, device] = plans.lay_plan(name, plan, ["x", "y"], device)
         self.desk.keep(self.laid[name, device])
 
-    def load(self, program, device):
+    def load(self, program, device, start):
         assert program is (self if device.startswith("cuda") else HOST) or device == "cpu"
         return self.library
 
@@ -347,8 +347,82 @@ def test_a_program_for_cuda_is_made_ready_on_a_device_of_the_process(monkeypatch
     monkeypatch.setattr(
         jax, "local_devices", lambda backend: [types.SimpleNamespace(local_hardware_id=3)] if backend == "cuda" else 1 / 0
     )
-    monkeypatch.setattr(plans, "cuda_driver", lambda: ctypes.pythonapi)
+    monkeypatch.setattr(_driver, "driver", lambda: ctypes.pythonapi)
     launch._keep_plan("ready@here@3", "made so", -2)
     launch._keep_plan("ready@here@3", "made so", 3)
     launch._open().drop(launch._plans.pop(("ready@here@3", 3)))
     assert laid == [3]
+
+
+class Driver:
+    """A driver of CUDA that has one device, and loads whatever begins as it should."""
+
+    def __init__(self):
+        self.loaded, self.contexts = [], []
+
+    def cuInit(self, _):
+        return 0
+
+    def cuDriverGetVersion(self, found):
+        return self.put(found, 13000)
+
+    def cuDeviceGet(self, found, number):
+        return self.put(found, number)
+
+    def cuDevicePrimaryCtxRetain(self, found, _):
+        return self.put(found, 0x100)
+
+    def cuDeviceGetAttribute(self, found, kind, _):
+        return self.put(found, {16: 132, 75: 9, 76: 0}[kind])
+
+    def cuCtxPushCurrent_v2(self, context):
+        self.contexts.append(context)
+        return 0
+
+    def cuCtxPopCurrent_v2(self, _):
+        self.contexts.pop()
+        return 0
+
+    def cuModuleLoadData(self, found, binary):
+        self.loaded.append((binary, list(self.contexts)))
+        return 200 if b"broken" in binary else self.put(found, 0x200)
+
+    def cuModuleGetFunction(self, found, module, name):
+        return self.put(found, module + len(name))
+
+    def cuCtxSynchronize(self):
+        return 0
+
+    def cuModuleUnload(self, _):
+        return 0
+
+    def put(self, found, value):
+        found._obj.value = value
+        return 0
+
+
+def test_a_program_for_cuda_that_is_kept_is_loaded_without_warp(monkeypatch, tmp_path):
+    """Warp is started to compile alone: where nothing is kept, or what is kept cannot be loaded."""
+    driver, started = Driver(), []
+    monkeypatch.setattr(_driver, "driver", lambda: driver)
+    monkeypatch.setattr(_compile, "_folders", lambda: [tmp_path])
+    monkeypatch.setattr(_driver, "find_device", _driver.find_device.__wrapped__)
+
+    def build(start, device, arch, program, source):
+        started.append(start)
+        assert (device, arch) == (_driver.CudaDevice(1, 0x100, 90, 132), None)
+        source.with_suffix(".ptx").write_text(program.text)
+        return source.with_suffix(".ptx")
+
+    monkeypatch.setattr(_compile, "_build_cuda", build)
+    program = Program("kept", ".entry kept(", cuda=True)
+    for _ in range(2):
+        library = _compile.load(program, "cuda:1", "start")
+        assert library.address_of("twelve chars") == 0x20C
+        del library
+    assert started == ["start"]
+    assert driver.loaded == [(b".entry kept(", [0x100])] * 2
+    with pytest.raises(RuntimeError, match="cannot be loaded"):
+        _compile.load(Program("broken", "broken", cuda=True), "cuda:1", "start")
+    assert started == ["start"] * 3
+    assert driver.contexts == []

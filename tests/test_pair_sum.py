@@ -674,6 +674,35 @@ def test_a_query_that_is_nowhere_has_no_sum():
         np.testing.assert_array_equal(np.flatnonzero(np.isnan(sums)), [4])
 
 
+@pytest.mark.parametrize("queries", [False, True])
+@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
+def test_what_has_no_sum_has_no_derivative_in_its_position(backend, queries):
+    """Of two orders; in positions alone, and where queries are given, in theirs."""
+    x, m = scene(2)
+    x = x.at[3, 1].set(jnp.nan).at[18, 0].set(jnp.inf)
+    q = x[::3] if queries else x[:0]
+
+    def sums(x, q, m):
+        given = {"queries": q, "query_values": m[: len(q)]} if queries else {}
+        return jfrnn.pair_sum(lambda r, i, j: i * j * (r @ r) * r, x, CUTOFF, m, backend=backend, **given)
+
+    def pull(x, q, m, into):
+        rows, back = jax.vjp(sums, x, q, m)
+        return rows, back(into)
+
+    @jax.jit
+    def both(*given):
+        (rows, pulled), back = jax.vjp(pull, *given)
+        return rows, pulled, back(jax.tree.map(jnp.ones_like, (rows, pulled)))
+
+    rows, pulled, again = both(x, q, m, jnp.ones((len(q) or len(x), 2)))
+    lost, none = {len(x): [3, 18], len(q): [1, 6]}, []
+    nowhere = [np.flatnonzero(np.isnan(a).all(axis=tuple(range(1, a.ndim)))).tolist() for a in (rows, *pulled, *again)]
+    of_x = none if queries else lost[len(x)]
+    assert nowhere == [lost[len(rows)], *2 * [of_x, lost[len(q)] if queries else none, none], lost[len(rows)]]
+    assert all(np.isfinite(np.delete(a, which, axis=0)).all() for a, which in zip((rows, *pulled, *again), nowhere, strict=True))
+
+
 @pytest.mark.parametrize(("half", "reduce"), [(False, "sum"), pytest.param(True, "sum", marks=SLOW), (False, "max")])
 def test_a_list_that_lacks_pairs_has_no_sums(half, reduce):
     """Outside jit, and where it is closed over, it raises; inside, no row looks like a sum, nor does a force."""

@@ -285,7 +285,7 @@ def test_rays_through_a_tree_of_many_levels():
 def test_kernel_for_cuda(dim, dtype):
     """It compiles for a GPU, nothing contracted; its text for the CPU tells the sides, too."""
     double = dtype == np.float64
-    program = _compile.find_binary(winding.side_kernel(dim, double, WIDTH, cuda=True).program, "cpu", arch=90).read_text()
+    program = _compile.find_binary(winding.side_kernel(dim, double, WIDTH, cuda=True).program, arch=90).read_text()
     assert not re.search(r"\bfma\.|\b(mul|add|sub)\.f(32|64)", program)
     vertices, faces = joined(*walls(dim)["crossing"])
     vertices, x = vertices.astype(dtype), around(dim, dtype)

@@ -37,7 +37,7 @@ def test_variants_compile(dim, double, lists, tree):
     programs = {kernel.program for kernel in triangles_cuda.triangle_kernels(dim, double, lists, tree, WIDTH)}
     assert len(programs) == 3
     for program in programs:
-        text = _compile.find_binary(program, "cpu", arch=90).read_text()
+        text = _compile.find_binary(program, arch=90).read_text()
         assert not re.search(r"\bfma\.|\b(mul|add|sub)\.f(32|64)", text)
         # bytes of a thread: no big integer is among them, but what waits in a tree is
         assert sum(map(int, re.findall(r"\.local .*\[(\d+)\]", text))) <= 32 + 4 * pending(WIDTH) * tree

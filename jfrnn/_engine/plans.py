@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jfrnn._engine.start import compiler, load_warp, warn_of_folders
-from jfrnn.kernels import Kernel
+from jfrnn.kernels import Kernel, _driver
 
 if TYPE_CHECKING:
     from jfrnn.kernels._compile import Library
@@ -192,10 +192,8 @@ def _lay_step(plan: Plan, places: dict[str, int], device: int, held: list[Any], 
     arrays = [field for field in kernel.fields if field.is_array and field.name not in plan.absent]
     pairs = [number for field in arrays for number in (field.place, places[field.name])]
     given = kernel.pack(numbers)
-    if device >= 0:
-        load_warp()
     on_cuda = device >= 0 and kernel.program.cuda
-    library = compiler().load(kernel.program, f"cuda:{device}" if on_cuda else "cpu")
+    library = compiler().load(kernel.program, f"cuda:{device}" if on_cuda else "cpu", load_warp)
     template, places_of_arrays = (ctypes.c_ubyte * len(given)).from_buffer(given), (ctypes.c_int * len(pairs))(*pairs)
     held += [library, template, places_of_arrays]
     return _Step(
@@ -225,7 +223,7 @@ class Desk:
     def keep(self, laid: LaidPlan) -> None:
         """Let calls find a plan."""
         if laid.plan.device >= 0 and not self._desk.launch:
-            driver, desk = cuda_driver(), self._desk
+            driver, desk = _driver.driver(), self._desk
             desk.launch, desk.clear = _address(driver, "cuLaunchKernel"), _address(driver, "cuMemsetD32Async")
             desk.record, desk.wait = _address(driver, "cuEventRecord"), _address(driver, "cuStreamWaitEvent")
         self._keep(ctypes.addressof(laid.plan))
@@ -277,29 +275,17 @@ def _c_library() -> ctypes.CDLL:
 
 def multiprocessors_of(device: int) -> int:
     """Return how many multiprocessors a CUDA device has; the CPU, -1, counts as one."""
-    return 1 if device < 0 else load_warp().get_device(f"cuda:{device}").sm_count
-
-
-@functools.cache
-def cuda_driver() -> ctypes.CDLL:
-    """Return the library of CUDA's driver."""
-    return ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
+    return 1 if device < 0 else _driver.find_device(device).multiprocessors
 
 
 @functools.cache
 def _second_stream(device: int) -> tuple[int, int, int]:
     """Return a stream of a CUDA device, and two events, for launches that run beside others."""
-    wp = load_warp()
-    made = wp.Stream(f"cuda:{device}"), wp.Event(f"cuda:{device}"), wp.Event(f"cuda:{device}")
-    _held.extend(made)
-    return made[0].cuda_stream, made[1].cuda_event, made[2].cuda_event
+    found = _driver.find_device(device)
+    return _driver.make_stream(found), _driver.make_event(found), _driver.make_event(found)
 
 
 @functools.cache
 def _end_of_turn(device: int) -> int:
     """Return an event of a CUDA device, for calls that take turns."""
-    _held.append(made := load_warp().Event(f"cuda:{device}"))
-    return made.cuda_event
-
-
-_held: list[Any] = []  # streams and events, which Warp gives back once nobody has them
+    return _driver.make_event(_driver.find_device(device))

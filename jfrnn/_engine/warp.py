@@ -18,15 +18,16 @@ from jfrnn._engine.arrays import levels_of
 from jfrnn._engine.launch import Call, Shapes, kernel, open_native
 from jfrnn._engine.levels_warp import level_neighbors
 from jfrnn._engine.operands import MOST_IN_BOX, pack_particles, periodic_kind, space_flags
-from jfrnn._engine.plans import Clear, HugePages, Launch, Plan, ask_for_huge_pages, share
+from jfrnn._engine.plans import HugePages, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.problem import Filter, Kind, Options, Rows, Search
-from jfrnn._engine.start import check_warp, load_warp
+from jfrnn._engine.start import check_warp
 from jfrnn._geometry import Cutoffs
-from jfrnn.kernels import cells_cpu, cells_cuda, few_cuda
+from jfrnn.kernels import _driver, cells_cpu, cells_cuda, few_cuda
 from jfrnn.kernels._native import table_cells
 
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
 _CELLS = {"cpu": cells_cpu, "cuda": cells_cuda}
+QUERIES_PER_THREAD = 1024  # on the CPU, at least: among 1000, to wake a second thread takes as long as it saves
 _PARTICLES = ("positions", "queries", "cutoff")  # what kernels of cells are given
 
 
@@ -53,7 +54,10 @@ class WarpEngine:
             return level_neighbors(search, levels_of(search), options.filter, capacity)
 
         def on(module: ModuleType, make: Callable[[Variant], Any]) -> Callable[[Search], Rows]:
-            return functools.partial(call_kernels, module.scratch_words, make, keep=options.filter, capacity=capacity)
+            blocks = few_cuda.blocks(search.sizes[1]) if module is few_cuda else None
+            return functools.partial(
+                call_kernels, module.scratch_words, make, keep=options.filter, capacity=capacity, blocks=blocks
+            )
 
         few = are_few(search)
         cpu, cuda = on(cells_cpu, _cpu_callable), on(few_cuda, _few_callable) if few else on(cells_cuda, _cuda_callable)
@@ -98,7 +102,7 @@ def missing(platform: str) -> str | None:
         if platform in PLATFORMS:
             open_native()
         if platform in ("gpu", "cuda"):
-            return None if load_warp().is_cuda_available() else "Warp found no CUDA driver"
+            return None if _driver.device_count() else "there is no CUDA device"
     except (ImportError, RuntimeError) as error:
         return str(error).rstrip(".")
     if platform == "cpu":
@@ -114,9 +118,18 @@ def check_platform(name: str, platform: str) -> None:
 
 
 def call_kernels(
-    scratch_words: Callable[..., int], make: Callable[[Variant], Any], search: Search, *, keep: Filter, capacity: int | None
+    scratch_words: Callable[..., int],
+    make: Callable[[Variant], Any],
+    search: Search,
+    *,
+    keep: Filter,
+    capacity: int | None,
+    blocks: int | None = None,
 ) -> Rows:
-    """Let XLA call what `make` returns, with the scratch that its kernels ask for."""
+    """Let XLA call what `make` returns, with the scratch that its kernels ask for.
+
+    With `blocks`, so many tell of their own queries how long rows are, and their status; otherwise one tells of all.
+    """
     sources, queries, cutoff, batch, torus, _ = search
     own, lists = queries is None, capacity is not None
     (n, m), dim = search.sizes, sources.shape[1]
@@ -128,9 +141,12 @@ def call_kernels(
             f"backend='warp' numbers at most {MOST_IN_BOX - 1} positions in a periodic box, got {n}: pass backend='jax'."
         )
     words = scratch_words(n, m, dim, 2 if double else 1, own)
-    dims = {"idx": (m, capacity), "count": m, "info": 2, "scratch": max(words, 1)}
+    dims = {"idx": (m, capacity), "count": m, "info": 2 if blocks is None else (blocks, 2), "scratch": max(words, 1)}
     *idx, count, info, _ = make(variant)(*pack_particles(search), output_dims=dims)
-    return Rows(idx[0] if lists else None, count, info[0], info[1])
+    longest, status = (
+        (info[0], info[1]) if blocks is None else (info[:, 0].max(), lax.reduce(info[:, 1], np.int32(0), lax.bitwise_or, (0,)))
+    )
+    return Rows(idx[0] if lists else None, count, longest, status)
 
 
 @kernel
@@ -183,7 +199,7 @@ def _plan_few(variant: Variant, shapes: Shapes, _: int) -> Plan:
     numbers = plan_numbers(variant, shapes)
     numbers["drop_self"] &= variant.own
     query = few_cuda.rows_kernel(variant.dim, variant.double, variant.lists, variant.batched, variant.periodic == 1)
-    return Plan([Clear("info", 8), Launch(query, few_cuda.threads(numbers["m"]))], numbers, _absent(variant))
+    return Plan([Launch(query, few_cuda.threads(numbers["m"]))], numbers, _absent(variant))
 
 
 def place_launches(launches: Sequence[cells_cuda.Launch]) -> list[Launch]:
@@ -196,7 +212,7 @@ def _plan_on_cpu(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan
     kernels = cells_cpu.cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, **kind)
     numbers = plan_numbers(variant, shapes)
     rows = ask_for_huge_pages("idx", 4 * numbers["m"] * numbers["capacity"]) if variant.lists else []
-    steps = [*sort_on_cpu(kernels, numbers["n"]), *rows, share(kernels.query, numbers["m"])]
+    steps = [*sort_on_cpu(kernels, numbers["n"]), *rows, share(kernels.query, numbers["m"], QUERIES_PER_THREAD)]
     return Plan(steps, numbers, _absent(variant))
 
 

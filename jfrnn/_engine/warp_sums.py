@@ -15,7 +15,7 @@ from jfrnn._engine.operands import pack_particles, periodic_kind, space_flags
 from jfrnn._engine.plans import Launch, Plan, share
 from jfrnn._engine.problem import Filter, Search
 from jfrnn._engine.sum_results import SumsOf, TermText
-from jfrnn._engine.warp import are_few, place_launches, size_numbers, sort_on_cpu
+from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, place_launches, size_numbers, sort_on_cpu
 from jfrnn._geometry import Cutoffs
 from jfrnn.kernels import cells_cpu, cells_cuda, few_cuda, pair_sum_cpu, pair_sum_cuda
 
@@ -166,7 +166,7 @@ def _plan_on_cpu(variant: _SumVariant, term: TermText, shapes: Shapes, multiproc
     query = pair_sum_cpu.query_kernel(term, variant.key, dim, double, scaled, variant.compensated, **more)
     numbers = _numbers(variant, term, shapes)
     values = [share(pair_sum_cpu.sort_kernel(dim, double), numbers["n"])] if term.source_columns else []
-    return Plan([*sort_on_cpu(cells, numbers["n"]), *values, share(query, numbers["m"])], numbers)
+    return Plan([*sort_on_cpu(cells, numbers["n"]), *values, share(query, numbers["m"], QUERIES_PER_THREAD)], numbers)
 
 
 def _plan_on_cuda(variant: _SumVariant, term: TermText, shapes: Shapes, multiprocessors: int) -> Plan:

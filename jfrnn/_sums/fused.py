@@ -139,8 +139,8 @@ def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: 
         )
         before += len(group)
     sums = tuple(
-        Sum(output_name(k, e), total)
-        for k, (spec, total) in enumerate(zip(translated.outputs, term.totals, strict=True))
+        Sum(output_name(k, e), total, mark)
+        for k, (spec, total, mark) in enumerate(zip(translated.outputs, term.totals, term.marks, strict=True))
         for e in range(math.prod(spec.shape))
     )
     text = TermText(translated.text, steps, values[0], values[1], values[2], sums)

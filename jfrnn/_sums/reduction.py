@@ -16,7 +16,7 @@ from jfrnn._geometry import Box, Images, Lattice, Radii, Status, check_cutoff, m
 from jfrnn._search import ROWS_ARE_WHOLE, NeighborList
 from jfrnn._sums.extremes import bind_extremes
 from jfrnn._sums.pair_function import call_with_pair
-from jfrnn._sums.relations import Listed, Relation, Searched
+from jfrnn._sums.relations import Listed, Relation, Searched, are_finite, mark_rows, one_or_nan
 from jfrnn._sums.summation import bind_sum
 from jfrnn._sums.terms import OF_QUERIES, OF_SOURCES, Groups, Labels, Summand, Term, choose, fresh_labels, trace
 from jfrnn._tracing import Given, Tree, call_apart, compile_program, on_device
@@ -26,7 +26,7 @@ class Pairs(NamedTuple):
     """The pairs of a sum and the operands of their displacements.
 
     `mark` replaces sums by NaN (integers: the smallest one) in invalid rows: where pairs may be missing, and where the position of
-    an active particle is not finite.
+    an active particle is not finite. None: nothing else makes rows invalid, so the sums mark them themselves.
     """
 
     relation: Relation
@@ -36,18 +36,20 @@ class Pairs(NamedTuple):
     lattice: Lattice | None
     largest: Any  # the largest cutoff
     directionless: bool
-    mark: Callable[[list[Array]], list[Array]]
+    mark: Callable[[list[Array]], list[Array]] | None
 
 
-def pairs_of_search(inputs: Inputs, options: Options) -> Pairs:
-    """Return the pairs that a search finds."""
+def pairs_of_search(inputs: Inputs, options: Options, summed: bool) -> Pairs:
+    """Return the pairs that a search finds; `summed` says that they are summed, rather than reduced to an extreme."""
     sources, queries, active, box, cutoff, _ = inputs
     fixed = lax.stop_gradient(inputs._replace(sources=hide_inactive(sources, active), active=None))
     relation, several = Searched(fixed, options), isinstance(cutoff, Radii)
     largest = make_cutoffs(cutoff, options.closed).largest if isinstance(cutoff, Radii) else cutoff.radius
     lattice = _lattice(box, options.images, sources)
-    static = options, several or box is not None
-    sources, rows, mark = _prepare_marks(sources, queries, _good_rows_of_search, (inputs,), static)
+    doubtful = several or box is not None
+    if summed and active is None and not doubtful:
+        return Pairs(relation, False, sources, sources if queries is None else queries, lattice, largest, relation.symmetric, None)
+    sources, rows, mark = _prepare_marks(sources, queries, _good_rows_of_search, (inputs,), (options, doubtful))
     return Pairs(relation, False, sources, rows, lattice, largest, relation.symmetric, mark)
 
 
@@ -81,9 +83,7 @@ def pairs_of_list(
 @compile_program
 def _good_rows(points: Array, active: Array | None, whole: Array | None) -> Array:
     """Say which rows [m] are valid: those of finite points and of inactive particles, provided that no pairs are missing."""
-    fixed = lax.stop_gradient(points)
-    columns = (jnp.isfinite(fixed[:, k]) for k in range(fixed.shape[1]))
-    finite = functools.reduce(jnp.logical_and, columns)  # without a reduction, which XLA would not fuse
+    finite = are_finite(lax.stop_gradient(points))
     good = finite if active is None else finite | ~active
     return good if whole is None else good & whole
 
@@ -127,12 +127,7 @@ def _mark_derivatives(points: Array, good: Array) -> Array:
 @_mark_derivatives.defjvp
 def _mark_derivatives_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Any]) -> tuple[Array, Array]:
     points, good = primals
-    return points, tangents[0] * _one_or_nan(good, tangents[0])
-
-
-def _one_or_nan(good: Array, like: Array) -> Array:
-    """Return 1 for valid rows and NaN for others, in a shape that multiplies `like` [rows, ...]."""
-    return jnp.where(good, 1, jnp.nan).astype(like.dtype).reshape(-1, *[1] * (like.ndim - 1))
+    return points, tangents[0] * one_or_nan(good, tangents[0])
 
 
 def _lattice(box: Box | None, images: Images | None, like: Array) -> Lattice | None:
@@ -155,9 +150,8 @@ def reduce_pairs(
         *(tuple(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in group) for group in operands[1:]),
     )
     shift = jax.ShapeDtypeStruct(pairs.sources.shape[1:], pairs.sources.dtype)
-    term, needed, closed_over = trace(
-        summand, one_pair, shift, _labels(operands, pairs.rows is pairs.sources and mine is theirs), fn
-    )
+    labels = _labels(operands, pairs.rows is pairs.sources and mine is theirs)
+    term, needed, closed_over = trace(summand, one_pair, shift, labels, fn, pairs.mark is None)
     if reduce != "sum" and not all(jnp.issubdtype(x.dtype, jnp.floating) for x in term.summands):
         raise TypeError(f"fn must return floats for reduce={reduce!r}, whose rows may be infinite: convert them with .astype.")
     operands = choose(operands, needed)
@@ -172,7 +166,7 @@ def reduce_pairs(
         leaves = _sums_of_half(pairs.relation, term, operands, compensated)
     else:
         leaves = bind_sum(pairs.relation, term, operands, compensated)
-    leaves = pairs.mark(leaves)
+    leaves = leaves if pairs.mark is None else pairs.mark(leaves)
     return jax.tree.unflatten(structure[0], leaves)
 
 
@@ -198,7 +192,7 @@ def _summand(
     """Return the operands, fn as a function of one pair of them, and a list that receives the structure of fn's result."""
     sources, rows, lattice = pairs.sources, pairs.rows, pairs.lattice
     dtype = sources.dtype
-    harmless = jnp.zeros(sources.shape[1], dtype).at[0].set(jnp.asarray(pairs.largest, dtype) / 2)
+    harmless = _along_first_axis(pairs.largest, sources.shape[1], dtype)
     turning = [] if lattice is None else [lattice.matrix]
     numbers = [jax.ShapeDtypeStruct((len(x),), np.int32) for x in (rows, sources)]  # become arrays only if the term needs them
     (own, own_tree), (others, other_tree) = jax.tree.flatten(mine), jax.tree.flatten(theirs)
@@ -227,6 +221,15 @@ def _summand(
         return [_summable(x, dtype) for x in leaves]
 
     return operands, summand, structure
+
+
+def _along_first_axis(largest: np.floating | Array, dim: int, dtype: np.dtype) -> Array:
+    """Return a vector of half that length; of a number that is known it is made on the host, which needs no compilation."""
+    if isinstance(largest, Array):
+        return jnp.zeros(dim, dtype).at[0].set(jnp.asarray(largest, dtype) / 2)
+    vector = np.zeros(dim, dtype)
+    vector[0] = np.asarray(largest, dtype) / 2
+    return on_device(vector)
 
 
 def _labels(operands: Groups, same: bool) -> Labels:
@@ -260,13 +263,7 @@ def _summable(x: Given, dtype: np.dtype) -> Array:
 @compile_program
 def _mark(leaves: list[Array], good: Array) -> list[Array]:
     """Replace invalid rows by NaN (integers: the smallest one); their derivatives become NaN too."""
-
-    def mark_leaf(x: Array) -> Array:
-        if jnp.issubdtype(x.dtype, jnp.floating):
-            return x * _one_or_nan(good, x)
-        return jnp.where(good.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.iinfo(x.dtype).min)
-
-    return [mark_leaf(x) for x in leaves]
+    return [mark_rows(x, good) for x in leaves]
 
 
 @functools.partial(compile_program, static_argnames=("good_rows", "static"))

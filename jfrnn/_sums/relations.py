@@ -1,6 +1,7 @@
 """Relations: the pairs of a sum, from a search or from a list, and the loops that sum over them."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import TypeGuard
 
@@ -50,6 +51,11 @@ class Searched:
         """Whether exchanging i and j gives the same pairs."""
         radii = self.inputs.cutoff
         return self.inputs.queries is None and not (isinstance(radii, Radii) and radii.rule in _EXCHANGED)
+
+    @property
+    def finite_rows(self) -> Array:
+        """Which rows are those of finite positions."""
+        return are_finite(self.inputs.sources if self.inputs.queries is None else self.inputs.queries)
 
     def reverse(self) -> "Searched":
         """Return the same pairs with i and j exchanged and shifts negated."""
@@ -152,7 +158,8 @@ def sum_pairs(relation: Relation, term: Term, operands: Groups, compensated: boo
 
     Returns:
         For each summand its sums over the neighbors j of each i, [rows, ...], or with `term.totals` over all pairs, [...]. Rows
-        without neighbors are 0, whatever their operands hold.
+        without neighbors are 0, whatever their operands hold; but with `term.marks` those of an i whose position is not finite are
+        NaN (integers: the smallest one).
     """
     adder = _Adder(compensated)
     rows = relation.sizes[0]
@@ -193,7 +200,28 @@ def sum_pairs(relation: Relation, term: Term, operands: Groups, compensated: boo
         return block.fold(add, out)
 
     found = relation.fold(term.elements, visit_flipped if relation.flipped else visit, start)
-    return [adder.result(state) for state in found]
+    results = [adder.result(state) for state in found]
+    if not isinstance(relation, Searched) or not any(term.marks):
+        return results
+    good = relation.finite_rows
+    return [mark_rows(x, good) if mark else x for x, mark in zip(results, term.marks, strict=True)]
+
+
+def mark_rows(x: Array, good: Array) -> Array:
+    """Replace rows that are not good by NaN (integers: the smallest one); their derivatives become NaN too."""
+    if jnp.issubdtype(x.dtype, jnp.floating):
+        return x * one_or_nan(good, x)
+    return jnp.where(good.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.iinfo(x.dtype).min)
+
+
+def one_or_nan(good: Array, like: Array) -> Array:
+    """Return 1 for good rows and NaN for others, in a shape that multiplies `like` [rows, ...]."""
+    return jnp.where(good, 1, jnp.nan).astype(like.dtype).reshape(-1, *[1] * (like.ndim - 1))
+
+
+def are_finite(points: Array) -> Array:
+    """Say which points have finite coordinates: [rows] bool. It takes no reduction, which XLA would not fuse."""
+    return functools.reduce(jnp.logical_and, (jnp.isfinite(points[:, k]) for k in range(points.shape[1])))
 
 
 def evaluate(relation: Relation, term: Term, operands: Groups, block: Block, slots: Slots) -> list[Array]:

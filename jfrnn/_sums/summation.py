@@ -19,7 +19,7 @@ from jax.interpreters import ad, batching, mlir
 from jfrnn._sums.fused import check
 from jfrnn._sums.relations import Relation, Searched, sum_pairs
 from jfrnn._sums.terms import Derived, Groups, Term, choose, is_moving, join, tangent, transpose
-from jfrnn._tracing import Aval, Internal, compile_program, result_aval, unvarying_types, vary, varying_axes
+from jfrnn._tracing import Aval, Internal, compile_program, on_device, result_aval, unvarying_types, vary, varying_axes
 
 Structure = Any  # the `PyTreeDef` of a relation, which type checkers do not accept as a type
 
@@ -30,11 +30,12 @@ _pair_sum_p.multiple_results = True
 def bind_sum(relation: Relation, term: Term, operands: Groups, compensated: bool) -> list[Array]:
     """Sum a term over the pairs of a relation, differentiable in the operands to every order; see `sum_pairs`."""
     leaves, structure = jax.tree.flatten(relation)
-    return _bind([jnp.asarray(x) for x in leaves], operands, term, structure, compensated)
+    leaves = [x if isinstance(x, Array) else on_device(x) for x in leaves]  # numbers take no program to get there
+    return _bind(leaves, operands, term, structure, compensated)
 
 
 def _bind(leaves: list[Array], operands: Groups, term: Term, structure: Structure, compensated: bool) -> list[Array]:
-    flat = [jnp.asarray(x) for group in operands for x in group]  # tangents of scalars may be Python numbers
+    flat = [x if isinstance(x, Array) else jnp.asarray(x) for group in operands for x in group]  # tangents may be Python numbers
     relation = jax.tree.unflatten(structure, leaves)
     if isinstance(relation, Searched):
         check(relation.inputs, relation.options, term)

@@ -49,6 +49,9 @@ class Term:
         labels: One label per operand of i and of j; operands with equal labels are the same array. Those in `POSITIONS` are
             positions.
         totals: For each summand, whether it is summed over all pairs instead of over the neighbors j of each i.
+        marks: For each summand, whether its sums are NaN (integers: the smallest one) where the position of i is not finite. Lists
+            have no such sums.
+        marking: Labels of operands whose cotangents are marked so.
     """
 
     jaxpr: ClosedJaxpr
@@ -56,6 +59,8 @@ class Term:
     shift: jax.ShapeDtypeStruct
     labels: "Labels"
     totals: tuple[bool, ...]
+    marks: tuple[bool, ...]
+    marking: frozenset[int]
 
     @property
     def summands(self) -> tuple[jax.ShapeDtypeStruct, ...]:
@@ -89,11 +94,12 @@ def _jaxpr_of(summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct) -
 
 
 def trace(
-    summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct, labels: Labels, owner: object
+    summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct, labels: Labels, owner: object, marked: bool
 ) -> tuple[Term, Groups, tuple[Array, ...]]:
     """Trace a summand that may close over arrays; return its term, the operands that it needs, and the closed-over arrays.
 
-    `operands` are the shapes and dtypes of the operands of one pair. Closed-over arrays become the first shared operands.
+    `operands` are the shapes and dtypes of the operands of one pair. Closed-over arrays become the first shared operands. `marked`
+    says whether all sums are marked, and so are the cotangents of the first operand of i.
     While the user's function `owner` lives, equal traces return the same term, so that compiled programs are reused.
     """
     closed = _jaxpr_of(summand, operands, shift)
@@ -104,7 +110,11 @@ def trace(
         shared, own, others = operands
         return eval_jaxpr(closed.jaxpr, shared[: len(consts)], real, shift, *shared[len(consts) :], *own, *others)
 
-    derived = _keep(owner, make_term(evaluate, join(of_consts, operands), shift, labels))
+    derived = make_term(evaluate, join(of_consts, operands), shift, labels)
+    if marked:
+        marks = dict(marks=(True,) * len(derived.term.totals), marking=frozenset(labels[0][:1]))
+        derived = derived._replace(term=dataclasses.replace(derived.term, **marks))
+    derived = _keep(owner, derived)
     of_closed, needed = derived.needed.shared[: len(consts)], derived.needed.shared[len(consts) :]
     return derived.term, derived.needed._replace(shared=needed), tuple(compress(consts, of_closed))
 
@@ -123,6 +133,7 @@ def _keep(owner: object, derived: "Derived") -> "Derived":
         jax.tree.structure(derived.needed),
         tuple(jax.tree.leaves(derived.needed)),
         derived.term.labels,
+        derived.term.marks,
     )
     try:
         return _KNOWN.setdefault(owner, {}).setdefault(key, derived)
@@ -148,7 +159,13 @@ class Derived(NamedTuple):
 
 
 def make_term(
-    summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct, labels: Labels, totals: Sequence[bool] | None = None
+    summand: Summand,
+    operands: Groups,
+    shift: jax.ShapeDtypeStruct,
+    labels: Labels,
+    totals: Sequence[bool] | None = None,
+    marks: Sequence[bool] | None = None,
+    marking: frozenset[int] = frozenset(),
 ) -> Derived:
     """Trace a summand that closes over nothing, and drop the operands that it does not need."""
     closed = _jaxpr_of(summand, operands, shift)
@@ -157,8 +174,8 @@ def make_term(
     needed = _split(used[2:], operands)
     mine, theirs = labels
     labels = tuple(compress(mine, needed.own)), tuple(compress(theirs, needed.others))
-    totals = tuple(totals or [False] * len(jaxpr.outvars))
-    return Derived(Term(ClosedJaxpr(jaxpr, closed.consts), choose(operands, needed), shift, labels, totals), needed)
+    totals, marks = (tuple(flags or [False] * len(jaxpr.outvars)) for flags in (totals, marks))
+    return Derived(Term(ClosedJaxpr(jaxpr, closed.consts), choose(operands, needed), shift, labels, totals, marks, marking), needed)
 
 
 def fresh_labels(count: int, labels: Labels) -> tuple[int, ...]:
@@ -204,14 +221,16 @@ def tangent(term: Term, moving: Groups) -> Derived:
 
         return jax.jvp(of_moving, (choose(primals, moving),), (moves,))[1]
 
-    totals = [total for total, x in zip(term.totals, term.summands, strict=True) if is_moving(x)]
+    kept = [is_moving(x) for x in term.summands]
+    totals, marks = list(compress(term.totals, kept)), list(compress(term.marks, kept))
     moved = sorted({label for labels, which in zip(term.labels, moving[1:], strict=True) for label in compress(labels, which)})
     of_tangent = dict(zip(moved, fresh_labels(len(moved), term.labels), strict=True))
     mine, theirs = (
         labels + tuple(of_tangent[label] for label in compress(labels, which))
         for labels, which in zip(term.labels, moving[1:], strict=True)
     )
-    return make_term(summand, join(term.operands, tangents), term.shift, (mine, theirs), totals)
+    marking = term.marking | {of_tangent[label] for label in term.marking & of_tangent.keys()}
+    return make_term(summand, join(term.operands, tangents), term.shift, (mine, theirs), totals, marks, marking)
 
 
 class Transposed(NamedTuple):
@@ -250,7 +269,10 @@ def transpose(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetri
         tuple(label for label, flag in zip(labels, which, strict=True) if not flag)
         for labels, which in zip(term.labels, linear[1:], strict=True)
     )
-    mine += fresh_labels(len(of_sums), term.labels)
+    of_cotangents = fresh_labels(len(of_sums), term.labels)
+    mine += of_cotangents
+    marked = [mark for mark, total, there in zip(term.marks, term.totals, cotangents, strict=True) if there and not total]
+    marking = term.marking | set(compress(of_cotangents, marked))
     each = mine + theirs
     sides = tuple(k for k, label in enumerate(each) if label not in each[:k])  # each array occurs once
     place = [sides.index(each.index(label)) for label in each]
@@ -287,17 +309,21 @@ def transpose(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetri
         return [*result.shared, *own, *(x for x, there in zip(others, joint, strict=True) if not there)]
 
     totals, sums, across_sums = ([flag for flag in group if flag] for group in linear)
+    rests = [label for label, there in zip(moving_j, joint, strict=True) if not there]
+    marks_i, marks_j, marks_rest = ([label in term.marking for label in labels] for labels in (moving_i, moving_j, rests))
     if symmetric and across_sums and (totals or sums):
         operands = given.own + given.others
         side, labels = tuple(operands[k] for k in sides), tuple(each[k] for k in sides)
         flags = [True] * len(totals) + [False] * (len(sums) + joint.count(False))
-        of_both = make_term(both, Groups(given.shared, side, side), term.shift, (labels, labels), flags)
+        marks = [*[False] * len(totals), *marks_i, *marks_rest]
+        of_both = make_term(both, Groups(given.shared, side, side), term.shift, (labels, labels), flags, marks, marking)
         return Transposed(of_both, None, sides, joint)
     exchanged = Groups(given.shared, given.others, given.own)
     flags = [True] * len(totals) + [False] * len(sums)
+    marks = [*[False] * len(totals), *marks_i]
     return Transposed(
-        make_term(along, given, term.shift, (mine, theirs), flags) if flags else None,
-        make_term(across, exchanged, term.shift, (theirs, mine)) if across_sums else None,
+        make_term(along, given, term.shift, (mine, theirs), flags, marks, marking) if flags else None,
+        make_term(across, exchanged, term.shift, (theirs, mine), None, marks_j, marking) if across_sums else None,
     )
 
 

@@ -127,7 +127,7 @@ def pair_sum(
             positions, cutoff, queries, box, batch, radius_rule, False, include_self, closed, backend, 0.0, active
         )
         with own_transfers():
-            pairs = pairs_of_search(inputs, _with_engine(problem.options, inputs, backend))
+            pairs = pairs_of_search(inputs, _with_engine(problem.options, inputs, backend), reduce == "sum")
     else:
         given = {"batch": batch is not None, "radius_rule": radius_rule != "gather", "include_self": include_self}
         given |= {"closed": closed, "active": active is not None, "backend": backend != "auto"}

@@ -96,7 +96,7 @@ def on_device(x: Given) -> Array:
     transfer.
     """
     if isinstance(x, Tracer):
-        return gather(jnp.asarray(x))
+        return gather(x)
     with at_once():
         if isinstance(x, Array):
             return gather(jnp.asarray(x))

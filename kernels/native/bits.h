@@ -25,6 +25,12 @@ struct Bits {  // of floats
         memcpy(&x, &b, sizeof(real));
         return x;
     }
+    JFRNN_FUNCTION real no_number() {
+        const unsigned long long b = (2ull * EXPONENTS + 1) << (MANTISSA - 1);
+        real x;
+        memcpy(&x, &b, sizeof(real));
+        return x;
+    }
     JFRNN_FUNCTION double power_of_two(int e) {
         const unsigned long long b = (unsigned long long)(e + 1023) << 52;
         double x;

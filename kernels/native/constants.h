@@ -14,6 +14,7 @@ constexpr bool SCALED = false;         // the cutoff is so small or so large tha
 constexpr int REACH = 1, REACH_X = 2;  // cells per cutoff along y and z, and along x
 constexpr int CHUNK = 2048;            // places that a thread takes at a time, where it puts them in order
 constexpr int QUERY_CHUNK = 256;       // and where it serves queries
+constexpr int TOGETHER = 12;           // queries that cells of a row are served for at once
 constexpr int FEW = 384;               // sources up to which all are candidates of all queries
 constexpr int MANY = 1 << 15;          // sources from which several threads gather their coordinates
 constexpr int CANDIDATES = 1024;       // that are held at a time, a multiple of 64

@@ -7,7 +7,7 @@
 #include "exact.h"
 
 constexpr unsigned int EVERY = 0xffffffffu;
-constexpr int AT_ONCE = 4;  // sources that a lane meets before it asks whether one of them is a neighbor
+constexpr int AT_ONCE = 4;  // sources that a lane meets before any of them is looked at again
 
 struct FewPairs : Space {
     const real *positions, *queries;
@@ -92,8 +92,9 @@ struct FewPairs : Space {
         return PERIODIC ? code % (2 * lattice.images(axis) + 1) - lattice.images(axis) : 0;
     }
 
-    // Calls `meet(j, code, hit)` for 32 sources after the other, one per lane, unless none of them is a neighbor: source, image, and
-    // whether it is one. All warps of a block call this together. Returns whether the sources that this thread has loaded are finite.
+    // Calls `meet(j, code, hits)` for 32 sources after the other, one per lane, unless none of them is a neighbor: source, image, and
+    // which lanes have one. All warps of a block call this together. Returns whether the sources that this thread has loaded are
+    // finite.
     template <class Meet>
     JFRNN_MEMBER bool meet_all(Meet meet) const {
         __shared__ real tile[3][FEW_TILE];
@@ -118,16 +119,16 @@ struct FewPairs : Space {
             const int size = n - first < FEW_TILE ? n - first : FEW_TILE;
             for (int begin = 0; is_query && begin < size; begin += 32 * AT_ONCE) {
                 real over[AT_ONCE];
-                bool near = false;
+                unsigned int near[AT_ONCE];  // the same in all lanes: most often none is
 #pragma unroll
                 for (int c = 0; c < AT_ONCE; ++c) {
                     over[c] = excess(tile, begin + 32 * c + lane);
-                    near = near || over[c] <= band;
+                    near[c] = __ballot_sync(EVERY, over[c] <= band);
                 }
-                if (!__any_sync(EVERY, near))
-                    continue;
 #pragma unroll
                 for (int c = 0; c < AT_ONCE; ++c) {
+                    if (near[c] == 0)
+                        continue;
                     const int s = begin + 32 * c + lane, j = first + s;
                     bool hit = over[c] <= band && !(drop_self && j == query) && !(later_only && j < query);
                     if constexpr (BATCHED)
@@ -139,8 +140,8 @@ struct FewPairs : Space {
                     }
                     if (hit && over[c] >= 0)
                         hit = is_exact_pair(tile, s, j, code);
-                    if (__any_sync(EVERY, hit))
-                        meet(j, code, hit);
+                    if (const unsigned int hits = __ballot_sync(EVERY, hit))
+                        meet(j, code, hits);
                 }
             }
         }

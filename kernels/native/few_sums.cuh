@@ -42,9 +42,8 @@ struct FewSums : FewSumsArguments {
                 code = of_image;
             });
         };
-        pairs.meet_all([&](int j, int code, bool hit) {
-            const unsigned int hits = __ballot_sync(EVERY, hit);
-            if (hit)
+        pairs.meet_all([&](int j, int code, unsigned int hits) {
+            if (hits >> lane & 1)
                 waiting[held + __popc(hits & lanes_below)] = j | code << CODE;
             held += __popc(hits);
             __syncwarp();
@@ -65,6 +64,10 @@ struct FewSums : FewSumsArguments {
         for (int t = lane; t < 2 * TOTALS; t += 32)
             totals[2ll * TOTALS * id + t] = 0;
         __syncwarp();
+        if (!finite_point(pairs.q)) {
+            results.clear(id, lane, 32);
+            return;
+        }
         reduction.reduce_over_warp();
         reduction.store(results, {lane, id, id, lane == 0, true, true});
     }

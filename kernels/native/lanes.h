@@ -58,6 +58,23 @@ static void pack(Vector from, Element* to, unsigned int mask) {
         *to++ = from[__builtin_ctz(mask)];
 #endif
 }
+// As `pack`, but nothing beyond the first `room` elements at `to` is overwritten: lanes for which there is none are left out.
+template <class Vector>
+static void pack_within(Vector from, int* to, unsigned int mask, int room) {
+    const int count = __builtin_popcount(mask), stored = count < room ? count : room;
+#if defined(__AVX512F__) && defined(__AVX512VL__)
+    typedef int ints8 __attribute__((vector_size(32)));
+    typedef int ints16 __attribute__((vector_size(64)));
+    const unsigned int first = stored > 0 ? (1u << stored) - 1 : 0;
+    if constexpr (LANES == 8)
+        __builtin_ia32_storedqusi256_mask((ints8*)to, (ints8)__builtin_ia32_compresssi256_mask((ints8)from, ints8{}, mask), first);
+    else
+        __builtin_ia32_storedqusi512_mask(to, (ints16)__builtin_ia32_compresssi512_mask((ints16)from, ints16{}, mask), first);
+#else
+    for (int k = 0; k < stored; ++k, mask &= mask - 1)
+        to[k] = from[__builtin_ctz(mask)];
+#endif
+}
 // What `from` holds at the places `numbers`; the processor's instructions that gather take longer.
 static vec gathered(const real* from, const int* numbers) {
     vec lanes;

@@ -63,11 +63,13 @@ struct Sums : Walk<Sums> {
     void meet_in_place(const real* q, int id, const Term::Own& own_part, Reduction& reduction) {
         const real inside = this->inside, outside = this->outside;
         const int filled = this->filled;
+        unsigned int any_unsure = 0;
         for (int b = 0, v = 0; b < filled; b += LANES, ++v) {
             const Points points = candidates_at(b);
             const vec square = square_of(q, points.p);
-            const unsigned int hit = mask_of(square, inside, Below{});
-            unsure[v] = hit ^ mask_of(square, outside, BelowOrAt{});
+            const unsigned int allowed = others_mask(b), hit = mask_of(square, inside, Below{}) & allowed;
+            unsure[v] = hit ^ (mask_of(square, outside, BelowOrAt{}) & allowed);
+            any_unsure |= unsure[v];
             if (SKIPPED && hit == 0)
                 continue;
             number summand[SUMMANDS];
@@ -77,7 +79,7 @@ struct Sums : Walk<Sums> {
                     name(b + l, l, source, code);
             });
         }
-        const int doubts = collect_doubtful(filled);
+        const int doubts = any_unsure ? collect_doubtful(filled) : 0;
         for (int b = 0; b < doubts; b += LANES) {
             const Points points = doubtful_at(b);
             if constexpr (FLUSHED)
@@ -101,7 +103,7 @@ struct Sums : Walk<Sums> {
         int held = 0;
         for (int b = 0; b < filled; b += LANES) {
             const Points points = candidates_at(b);
-            const unsigned int near = mask_of(square_of(q, points.p), outside, BelowOrAt{});
+            const unsigned int near = mask_of(square_of(q, points.p), outside, BelowOrAt{}) & others_mask(b);
             for (int k = 0; k < DIM; ++k)
                 pack(points.p[k], near_points[k] + held, near);
             for (int c = 0; c < OTHERS + STEPS; ++c)

@@ -34,10 +34,18 @@ struct Rows : Walk<Rows> {
     }
 
     void meet(const real* q, int id, bool fresh, bool finished) {
-        const int hits = later_only ? scan<true>(q, id, filled) : scan<false>(q, id, filled);
         const int before = fresh ? 0 : counts[id];
-        if constexpr (LIST)
-            write_row(id, before, hits, finished);
+        int hits;
+        if (LIST && !past_caches) {
+            int* const out = idx + (long long)id * capacity;
+            if (fresh)
+                fill(out);
+            hits = scan_within(q, id, out + before, capacity - before);
+        } else {
+            hits = later_only ? scan<true, false>(q, id, filled, row, 0) : scan<false, false>(q, id, filled, row, 0);
+            if constexpr (LIST)
+                write_row(id, before, hits, finished);
+        }
         counts[id] = before + hits;
         longest = before + hits > longest ? before + hits : longest;
     }
@@ -54,6 +62,20 @@ struct Rows : Walk<Rows> {
             known < longest && !__atomic_compare_exchange_n(&info[0], &known, longest, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
         if (LIST && longest > capacity)
             __atomic_fetch_or(&info[1], 1, __ATOMIC_RELAXED);
+    }
+
+    // What is written to the caches alone is written in place: nothing waits for what was written before.
+    int scan_within(const real* q, int id, int* to, int room) {
+        return later_only ? scan<true, true>(q, id, filled, to, room) : scan<false, true>(q, id, filled, to, room);
+    }
+    void fill(int* out) const {
+        const ints filling = ints{} + fill_value;
+        for (int s = 0; s + LANES <= capacity; s += LANES)
+            __builtin_memcpy(out + s, &filling, sizeof filling);
+        if (capacity >= LANES)
+            __builtin_memcpy(out + capacity - LANES, &filling, sizeof filling);
+        for (int s = 0; capacity < LANES && s < capacity; ++s)
+            out[s] = fill_value;
     }
 
     // Writes `hits` ids from `row` into the slots of a row from `from` on, and behind the last ones the fill value.

@@ -14,9 +14,10 @@ struct Points {
 
 struct Scan : SearchArguments, Cells, Scratch {
     const Wide wide;
-    real inside, outside;  // squares of distances below are surely those of pairs, squares beyond surely not
-    int image;             // that candidates are copied from, its code
-    bool several;          // images among them: each says which one it is of
+    real inside, outside;       // squares of distances below are surely those of pairs, squares beyond surely not
+    int image;                  // that candidates are copied from, its code
+    bool several;               // images among them: each says which one it is of
+    int self_from, self_lanes;  // of the candidate that the query itself is: the first number of its vector (-1: none), and its bit
     alignas(64) real candidate[3][CANDIDATES + LANES];
     alignas(64) int candidate_ids[CANDIDATES + LANES];
     alignas(64) int row[CANDIDATES + LANES];                                  // ids of pairs
@@ -32,7 +33,9 @@ struct Scan : SearchArguments, Cells, Scratch {
           Scratch(given.scratch, given.n, given.m, given.own, given.table),
           wide(radius, given.closed),
           image(0),
-          several(false) {
+          several(false),
+          self_from(-1),
+          self_lanes(0) {
         const real off = PERIODIC ? 2 * lattice.slack() * step_scale : real(0);  // by which distances of images may be wrong
         const real inner = step_radius > off ? step_radius - off : real(0), outer = step_radius + off;
         // 7 roundings of eps/2, 5 in a square and 2 in a bound (jfrnn/_geometry/exact.py); images are farther off
@@ -42,6 +45,8 @@ struct Scan : SearchArguments, Cells, Scratch {
         outside = between > 0 ? between : outer * outer * (1 + band);
     }
 
+    // Candidates but for the query itself, in the vector that begins with the number b.
+    unsigned int others_mask(int b) const { return b == self_from ? ~self_lanes : ~0u; }
     // Candidates whose id is above the query's, or its own id where a particle is its own neighbor.
     unsigned int later_mask(int b, int own_id) const {
         const ints ids = *(const ints*)((PERIODIC == 2 ? candidate_order : candidate_ids) + b);
@@ -125,26 +130,32 @@ struct Scan : SearchArguments, Cells, Scratch {
             doubtful[doubts + e] = 0;
         return doubts;
     }
-    // Counts which of `count` candidates are pairs of a query; LIST: leaves their ids in `row`. ONLY_LATER: those alone that come
-    // after the query. It takes a load, a difference, a product and a comparison per axis or candidate, LANES at a time.
-    template <bool ONLY_LATER>
-    int scan(const real* q, int own_id, int count) {
+    // Counts which of `count` candidates are pairs of a query; LIST: leaves their ids in `to`, of which as many as fit into `room`;
+    // without BOUNDED there is room for all. ONLY_LATER: those alone that come after the query. It takes a load, a difference, a
+    // product and a comparison per axis or candidate, LANES at a time.
+    template <bool ONLY_LATER, bool BOUNDED>
+    int scan(const real* q, int own_id, int count, int* to, int room) {
         const real inside = this->inside, outside = this->outside;  // stays in registers, whatever is stored
+        unsigned int any_unsure = 0;
         int hits = 0;
         for (int b = 0, v = 0; b < count; b += LANES, ++v) {
             const vec square = square_of(q, candidates_at(b).p);
-            const unsigned int allowed = ONLY_LATER ? later_mask(b, own_id) : ~0u;
+            const unsigned int allowed = others_mask(b) & (ONLY_LATER ? later_mask(b, own_id) : ~0u);
             const unsigned int hit = mask_of(square, inside, Below{}) & allowed;
             unsure[v] = hit ^ (mask_of(square, outside, BelowOrAt{}) & allowed);
-            if constexpr (LIST)
-                pack(*(const ints*)(candidate_ids + b), row + hits, hit);
+            any_unsure |= unsure[v];
+            if constexpr (LIST && BOUNDED)
+                pack_within(*(const ints*)(candidate_ids + b), to + hits, hit, room - hits);
+            else if constexpr (LIST)
+                pack(*(const ints*)(candidate_ids + b), to + hits, hit);
             hits += __builtin_popcount(hit);
         }
-        const int doubts = collect_doubtful(count);
+        const int doubts = any_unsure ? collect_doubtful(count) : 0;
         for (int b = 0; b < doubts; b += LANES) {
             unsigned int pairs = decided(q, own_id, doubtful_at(b), doubtful + b, lanes_before(doubts - b));
-            for (; pairs; pairs &= pairs - 1)
-                row[hits++] = candidate_ids[doubtful[b + __builtin_ctz(pairs)]];
+            for (; pairs; pairs &= pairs - 1, ++hits)
+                if (LIST && (!BOUNDED || hits < room))
+                    to[hits] = candidate_ids[doubtful[b + __builtin_ctz(pairs)]];
         }
         return hits;
     }

@@ -7,6 +7,8 @@ typedef Math::f32 number;
 // Is a summand added up over all pairs, or over the neighbors of each i? And which one of these sums is it?
 JFRNN_TABLE bool IS_TOTAL[] = {true, false};
 JFRNN_TABLE int PLACE[] = {0, 0};
+// Is the sum NaN, not 0, where the position of i is not finite? One for each sum over neighbors.
+JFRNN_TABLE bool MARKED[] = {true};
 JFRNN_TABLE int STEP_AXES[] = {0};
 
 struct Term {

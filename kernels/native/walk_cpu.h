@@ -53,11 +53,9 @@ struct Walk : Scan {
             real q[3];
             position_of(place, q);
             const int self = drop_self && place >= own_from && place < own_to ? own_at + place - own_from : -1;
-            if (self >= 0)
-                candidate[0][self] = __builtin_nanf("");
+            self_from = self < 0 ? -1 : self & -LANES;  // to change it among the candidates would delay all loads of them
+            self_lanes = 1 << (self & (LANES - 1));
             query().meet(q, query_ids[place], fresh, finished);
-            if (self >= 0)
-                candidate[0][self] = q[0];
         }
         if constexpr (Query::FLUSHED)
             floats.keep();
@@ -239,14 +237,16 @@ struct Walk : Scan {
         }
         cell[DIM] = (whole)system_at(place);
     }
-    static bool same_cell(const whole* a, const whole* b) {
+    static bool same_row(const whole* a, const whole* b) {
         bool same = true;
-        for (int k = 0; k < DIM + BATCHED; ++k)
+        for (int k = 1; k < DIM + BATCHED; ++k)
             same = same && a[k] == b[k];
         return same;
     }
+    static bool same_cell(const whole* a, const whole* b) { return a[0] == b[0] && same_row(a, b); }
     // Serves the cells that begin among the places [place, chunk_end): a cell belongs to the chunk that holds its first place, but
-    // where there is one cell alone, of which each chunk serves its own part.
+    // where there is one cell alone, of which each chunk serves its own part. Cells of a row are served together until they hold
+    // `TOGETHER` queries, since to copy candidates takes longer than to meet some that are farther away.
     void serve_chunk(int place, int chunk_end) {
         whole cell[4], other[4];
         real at[3];
@@ -273,8 +273,11 @@ struct Walk : Scan {
             int stop = place + 1;
             for (const int end = one_cell && chunk_end < finite_places ? chunk_end : finite_places; stop < end; ++stop) {
                 locate(stop, at, other);
-                if (!same_cell(cell, other))
-                    break;
+                if (!same_cell(cell, other)) {
+                    if (!grid.dense || stop - place >= TOGETHER || stop >= chunk_end || !same_row(cell, other))
+                        break;
+                    cell[0] = other[0];
+                }
                 widen(low, high, at, at);
             }
             serve(place, stop, low, high);
