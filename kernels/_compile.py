@@ -25,8 +25,6 @@ from jfrnn.kernels._program import Program
 from jfrnn.kernels._turns import one_at_a_time
 from jfrnn.kernels.launch import launcher
 
-Device = Any  # of Warp, for CUDA
-Handle = Any  # of a program that is loaded, by Clang or by CUDA
 _FOLDER = "wp_jfrnn"
 _END = b"\n//"  # a comment of PTX, and nothing to objects
 _DIGEST = 64  # hexadecimal digits
@@ -57,7 +55,7 @@ class Library:
             raise RuntimeError(f"the compiled program {self._program.name!r} holds no function {function!r}")
         return found
 
-    def _load(self) -> Handle:
+    def _load(self) -> Any:
         path = find_binary(self._program, self._device)
         found = self._take(path)
         if not found:
@@ -67,7 +65,7 @@ class Library:
             raise RuntimeError(f"the compiled program {path} cannot be loaded")
         return found
 
-    def _take(self, path: Path) -> Handle:
+    def _take(self, path: Path) -> Any:
         if self._program.cuda:
             return _cuda().core.wp_cuda_load_module(self._device.context, str(path).encode())
         return _clang.load_object(path, f"jfrnn_{id(self)}_{path.stem}")
@@ -83,8 +81,8 @@ class _Cuda(NamedTuple):
 
     core: Any
     build: Any
-    device: Callable[[str], Device]
-    synchronize: Callable[[Device], None]
+    device: Callable[[str], Any]
+    synchronize: Callable[[Any], None]
 
 
 @functools.cache
@@ -138,7 +136,7 @@ def load_launcher(header: str) -> Library:
     return load(launcher(header))
 
 
-def find_binary(program: Program, device: Device = None, arch: int | None = None) -> Path:
+def find_binary(program: Program, device: Any = None, arch: int | None = None) -> Path:
     """Return a file that holds the compiled program, whole.
 
     Args:
@@ -177,7 +175,7 @@ def temporary_folder() -> str:
     return f"{place} cannot be written: kernels are compiled into {folder} for this process alone. {hint} to keep them."
 
 
-def _target(program: Program, device: Device, arch: int | None) -> tuple[str, str]:
+def _target(program: Program, device: Any, arch: int | None) -> tuple[str, str]:
     """Return the kind of file, and what it runs on: objects use all instructions of the processor that compiles them."""
     if not program.cuda:
         return ".o", " ".join((*_clang.OPTIONS, _processor()))
@@ -288,6 +286,6 @@ def _unload(work: Callable[[], None]) -> None:
         work()
 
 
-def _unload_cuda(device: Device, handle: int) -> None:
+def _unload_cuda(device: Any, handle: int) -> None:
     _cuda().synchronize(device)
     _cuda().core.wp_cuda_unload_module(device.context, handle)

@@ -155,7 +155,7 @@ class Native:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(plans, "compiler", lambda: self)
             patch.setattr(plans, "_second_stream", lambda device: (7, 71, 72))
-            patch.setattr(plans, "_end_of_turn", lambda device: 80 + device)
+            patch.setattr(plans, "_end_of_turn", lambda device: types.SimpleNamespace(cuda_event=80 + device))
             self.laid[name, device] = plans.lay_plan(name, plan, ["x", "y"], device)
         self.desk.keep(self.laid[name, device])
 

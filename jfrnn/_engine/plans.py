@@ -15,6 +15,7 @@ from jfrnn.kernels import Kernel
 if TYPE_CHECKING:
     from jfrnn.kernels._compile import Library
 
+Event = Any  # of Warp
 PLACES_PER_THREAD = 512  # below, a second thread costs more than it saves
 _HUGE = 1 << 22  # bytes from which an array is worth a request for huge pages
 _MOST_BYTES, _MOST_ARRAYS, MOST_WORDS = 1024, 48, 1024  # those of the native code
@@ -176,7 +177,7 @@ def lay_plan(name: str, plan: Plan, arrays: list[str], device: int) -> LaidPlan:
     if any(step.kind == _CUDA_BESIDE for step in laid):
         found.side, found.begun, found.ended = _second_stream(device)
     elif plan.keep is not None and device >= 0:
-        found.ended = _end_of_turn(device)
+        found.ended = _end_of_turn(device).cuda_event
     return LaidPlan(found, [*held, steps])
 
 
@@ -208,6 +209,12 @@ def _lay_step(plan: Plan, places: dict[str, int], device: int, held: list[Any], 
         block=kernel.block,
         threads=step.threads,
     )
+
+
+@functools.cache
+def _end_of_turn(device: int) -> Event:
+    """Return an event of Warp on a CUDA device, for calls that take turns."""
+    return load_warp().Event(f"cuda:{device}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -293,13 +300,6 @@ def _second_stream(device: int) -> tuple[int, int, int]:
     made = wp.Stream(f"cuda:{device}"), wp.Event(f"cuda:{device}"), wp.Event(f"cuda:{device}")
     _held.extend(made)
     return made[0].cuda_stream, made[1].cuda_event, made[2].cuda_event
-
-
-@functools.cache
-def _end_of_turn(device: int) -> int:
-    """Return an event of a CUDA device, for calls that take turns."""
-    _held.append(made := load_warp().Event(f"cuda:{device}"))
-    return made.cuda_event
 
 
 _held: list[Any] = []  # streams and events, which Warp gives back once nobody has them
