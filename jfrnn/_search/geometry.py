@@ -25,6 +25,7 @@ from jfrnn._geometry import (
     turns_between,
     unpack_turns,
 )
+from jfrnn._search.topology import Topology
 from jfrnn._tracing import call_apart, compile_program
 
 
@@ -56,13 +57,15 @@ def _pair_cutoff(cutoff: Cutoff | Radii | None, closed: bool) -> Cutoff | Cutoff
 
 @functools.partial(compile_program, static_argnames="closed")
 def open_vectors(
-    idx: Array, count: Array, sources: Array, rows: Array, given: Cutoff | Radii | None, closed: bool
+    topology: Topology, count: Array, sources: Array, rows: Array, given: Cutoff | Radii | None, closed: bool
 ) -> tuple[Array, Array]:
-    cutoff = _pair_cutoff(given, closed)
+    from jfrnn._search.gathers import gather
+
+    cutoff, idx = _pair_cutoff(given, closed), topology.idx
     used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
     neighbor = jnp.where(used, idx, 0)
     mask = call_apart(is_pair_of, lax.stop_gradient(rows), lax.stop_gradient(sources), neighbor, used, cutoff)
-    return jnp.where(mask[..., None], sources[neighbor] - rows[:, None, :], 0), mask
+    return jnp.where(mask[..., None], gather(sources, topology) - rows[:, None, :], 0), mask
 
 
 class _Slots(NamedTuple):
@@ -74,10 +77,15 @@ class _Slots(NamedTuple):
     shifts: Array
 
 
-def _find_slots(idx: Array, count: Array, images: ImagesMade, sources: Array, rows: Array, lattice: Lattice, half: bool) -> _Slots:
+def _find_slots(
+    topology: Topology, count: Array, images: ImagesMade, sources: Array, rows: Array, lattice: Lattice, half: bool
+) -> _Slots:
+    from jfrnn._search.gathers import gather
+
+    idx = topology.idx
     used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
     neighbor = jnp.where(used, idx, 0)
-    difference = sources[neighbor] - rows[:, None, :]
+    difference = gather(sources, topology) - rows[:, None, :]
     codes, made = images
     if codes is None:
         shifts = nearest_shifts(difference, lattice)
@@ -96,15 +104,15 @@ def _find_slots(idx: Array, count: Array, images: ImagesMade, sources: Array, ro
 
 @functools.partial(compile_program, static_argnames=("kind", "half"))
 def lattice_shifts(
-    idx: Array, count: Array, images: ImagesMade, sources: Array, rows: Array, box: Box, kind: Images, half: bool
+    topology: Topology, count: Array, images: ImagesMade, sources: Array, rows: Array, box: Box, kind: Images, half: bool
 ) -> Array:
     lattice = make_lattice(box, kind, np.dtype(sources.dtype))
-    return given_shifts(lax.stop_gradient(_find_slots(idx, count, images, sources, rows, lattice, half).shifts), kind)
+    return given_shifts(lax.stop_gradient(_find_slots(topology, count, images, sources, rows, lattice, half).shifts), kind)
 
 
 @functools.partial(compile_program, static_argnames=("kind", "closed", "half"))
 def periodic_vectors(
-    idx: Array,
+    topology: Topology,
     count: Array,
     images: ImagesMade,
     sources: Array,
@@ -117,7 +125,7 @@ def periodic_vectors(
 ) -> tuple[Array, Array, Array]:
     cutoff = _pair_cutoff(given, closed)
     lattice = make_lattice(box, kind, np.dtype(sources.dtype))
-    used, neighbor, difference, shifts = _find_slots(idx, count, images, sources, rows, lattice, half)
+    used, neighbor, difference, shifts = _find_slots(topology, count, images, sources, rows, lattice, half)
     fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
     pairs = shift_pairs(difference, shifts, lattice)
     fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))

@@ -38,6 +38,8 @@ from jfrnn._search.exports import DenseNeighbors, check_total, flat_pairs, pair_
 from jfrnn._search.geometry import ImageCodes, ImagesMade, lattice_shifts, norms, open_vectors, periodic_vectors
 from jfrnn._search.making import count_capacity, find_fields, round_capacity
 from jfrnn._search.problem import Problem
+from jfrnn._search.reverse import Reverse
+from jfrnn._search.topology import Topology, make_topology
 from jfrnn._search.verlet import Verlet, has_moved_too_far
 from jfrnn._tracing import Given, at_once, call_apart, compile_program, own_transfers
 
@@ -60,6 +62,8 @@ class NeighborList:
         images: The periodic image of each slot (`ImageCodes`), 1 B per slot; None if the minimum image suffices.
         radii: Cutoffs per particle (`Radii`: sources [n], queries [m], the rule), or None with one cutoff.
         batch: System numbers (`Batch`: sources [n], queries [m] or None), or None; updates keep them.
+        reverse: Where pairs stand the other way round (`Reverse`), if the list was made with `reverse=True`; updates find it anew
+            whenever they rebuild the list.
         problem: The options of the search (`Problem`). Static.
     """
 
@@ -72,6 +76,7 @@ class NeighborList:
     images: ImageCodes | None
     radii: Radii | None
     batch: Batch | None
+    reverse: Reverse | None
     problem: Problem = dataclasses.field(metadata={"static": True})
 
     def __repr__(self) -> str:
@@ -345,7 +350,7 @@ class NeighborList:
         with own_transfers():
             if box is None or self.box_kind is None or 0 in (sources.shape[0], *self.idx.shape):
                 return jnp.zeros((*self.idx.shape, sources.shape[1]), jnp.int32)
-            return lattice_shifts(self.idx, self.count, self._images_made(), sources, rows, box, self.box_kind, self.half)
+            return lattice_shifts(self._topology(), self.count, self._images_made(), sources, rows, box, self.box_kind, self.half)
 
     def distances(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> tuple[Array, Array]:
         """Compute the distance to every neighbor.
@@ -540,9 +545,14 @@ class NeighborList:
         cutoff = self.radii if self.cutoff is None else make_cutoff(self.cutoff, np.dtype(sources.dtype), self.closed)
         with own_transfers():
             if box is None or self.box_kind is None:
-                return *open_vectors(self.idx, self.count, sources, rows, cutoff, self.closed), None
+                return *open_vectors(self._topology(), self.count, sources, rows, cutoff, self.closed), None
             given = (self.box_kind, cutoff, self.closed, self.half)
-            return periodic_vectors(self.idx, self.count, self._images_made(), sources, rows, box, *given)
+            return periodic_vectors(self._topology(), self.count, self._images_made(), sources, rows, box, *given)
+
+    def _topology(self) -> Topology:
+        problem, codes = self.problem, None if self.images is None else self.images.codes
+        kind = problem.options, problem.source_count, problem.own_queries, self.radii
+        return make_topology(*kind, self.idx, codes, self.reverse)
 
     def _images_made(self) -> ImagesMade:
         made = None if self.images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
@@ -585,4 +595,4 @@ def _update(
 
 def _remake(nbrs: NeighborList, inputs: Inputs, capacity: int) -> NeighborList:
     """Make a new list with the options of this one."""
-    return dataclasses.replace(nbrs, **find_fields(inputs, nbrs.problem.options, capacity, nbrs.skin > 0))
+    return dataclasses.replace(nbrs, **find_fields(inputs, nbrs.problem.options, capacity, nbrs.skin > 0, nbrs.reverse is not None))
