@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._engine import KeptList, kept_mask
 from jfrnn._geometry import (
     LARGEST_TURN,
     Box,
@@ -64,7 +65,12 @@ def open_vectors(
     cutoff, idx = _pair_cutoff(given, closed), topology.idx
     used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
     neighbor = jnp.where(used, idx, 0)
-    mask = call_apart(is_pair_of, lax.stop_gradient(rows), lax.stop_gradient(sources), neighbor, used, cutoff)
+    fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
+    if topology.native:
+        given_list = kept_list(topology, count, (None, None), fixed_sources, fixed_rows, given, closed, None)
+        mask = call_apart(kept_mask, given_list)
+    else:
+        mask = call_apart(is_pair_of, fixed_rows, fixed_sources, neighbor, used, cutoff)
     return jnp.where(mask[..., None], gather(sources, topology) - rows[:, None, :], 0), mask
 
 
@@ -128,9 +134,52 @@ def periodic_vectors(
     used, neighbor, difference, shifts = _find_slots(topology, count, images, sources, rows, lattice, half)
     fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
     pairs = shift_pairs(difference, shifts, lattice)
-    fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
-    mask = call_apart(is_pair_of, fixed_rows, fixed_sources, neighbor, used, cutoff, fixed_pairs)
+    if is_native(topology, kind, half):
+        given_list = kept_list(topology, count, images, fixed_sources, fixed_rows, given, closed, lattice)
+        mask = call_apart(kept_mask, given_list)
+    else:
+        fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
+        mask = call_apart(is_pair_of, fixed_rows, fixed_sources, neighbor, used, cutoff, fixed_pairs)
     return jnp.where(mask[..., None], pairs.vectors, 0), mask, shifts
+
+
+def is_native(topology: Topology, kind: Images | None, half: bool) -> bool:
+    """Say whether Warp's kernels decide which slots hold a pair: not in half lists of short vectors, whose images JAX chooses."""
+    return topology.native and not (half and kind is not None and kind.basis is not None)
+
+
+def kept_list(
+    topology: Topology,
+    count: Array,
+    images: ImagesMade,
+    sources: Array,
+    rows: Array,
+    cutoff: Cutoff | Radii | None,
+    closed: bool,
+    lattice: Lattice | None,
+) -> KeptList:
+    """Return a list at these positions as Warp's kernels take it."""
+    codes, made = images
+    of_pairs = _pair_cutoff(cutoff, closed)
+    turns = None if codes is None or lattice is None else _turns_now(codes, made, sources, rows, lattice)
+    fixed = lax.stop_gradient((sources, rows, turns, of_pairs, lattice))
+    return KeptList(topology.idx, count, topology.codes, *fixed, None)
+
+
+def kept_shifts(given: KeptList) -> Array:
+    """Return the lattice shifts of the slots of a list in a box, [m, capacity, d] whole floats, 0 in unused slots."""
+    if given.lattice is None:
+        raise TypeError("a list in open space has no shifts.")
+    lattice = given.lattice
+    used = given.idx < given.sources.shape[0]
+    neighbor = jnp.where(used, given.idx, 0)
+    if given.codes is None or given.turns is None:
+        shifts = nearest_shifts(given.sources[neighbor] - given.rows[:, None, :], lattice)
+    else:
+        image = jnp.where(used, given.codes.astype(jnp.int32), lattice.images.home)
+        table = jnp.asarray(lattice.images.shifts).astype(given.sources.dtype)
+        shifts = table[image] + given.turns[1][:, None] - given.turns[0][neighbor]
+    return jnp.where(used[..., None], shifts, 0)
 
 
 def _turns_now(
