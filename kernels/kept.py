@@ -1,9 +1,9 @@
 """Lists that are kept: which of their slots hold a pair now, and sums over these pairs.
 
 On the CPU, LANES slots of a row are taken at a time. Numbers of their sources are read four at a time, where these stand, and rows
-and columns of what was read are exchanged in registers. On CUDA, eight lanes serve a row, each four slots at a time: ids of a row
-are read at once, then the numbers of their sources. Nothing is sorted: what is read of the sources of a row stands anywhere, and
-rows that follow each other share it if particles that follow each other are close.
+and columns of what was read are exchanged in registers. On CUDA, a lane serves a row, or eight lanes where rows are few. A lane
+takes four slots at a time: it reads their ids at once, then the numbers of their sources. Nothing is sorted: these numbers may
+stand anywhere, and rows that follow each other share them if particles that follow each other are close.
 """
 
 import functools
@@ -15,7 +15,7 @@ from jfrnn.kernels.cells_cuda import GRID
 from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
 ROWS_AT_ONCE = 64  # that a thread of the CPU takes
-LANES_PER_ROW = 8  # of CUDA
+_FEW_ROWS = 1 << 17  # up to which eight lanes of CUDA serve a row; of more rows, each has a lane of its own
 _BLOCK = 128
 RADII = {"gather": 1, "scatter": 2, "either": 3, "both": 4, "mean": 5}
 
@@ -32,7 +32,7 @@ class ListKind(NamedTuple):
         rule: Whose cutoff is that of a pair, one of `RADII`; "" if all have one.
         reversed: Whether rows are those of the sources of the list.
         aligned: Whether rows of ids begin at multiples of 16 bytes.
-        cuda: Whether it is on CUDA.
+        lanes: How many lanes of CUDA serve a row; 0 on the CPU.
     """
 
     dim: int
@@ -43,14 +43,19 @@ class ListKind(NamedTuple):
     rule: str
     reversed: bool
     aligned: bool
-    cuda: bool
+    lanes: int
+
+    @property
+    def cuda(self) -> bool:
+        """Whether it is on CUDA."""
+        return self.lanes > 0
 
     @property
     def name(self) -> str:
         """Tells kernels of such lists from others."""
         flags = {"scaled": self.scaled, "reversed": self.reversed, "aligned": self.aligned, self.rule: bool(self.rule)}
         parts = [f"{self.dim}d", "f64" if self.double else "f32", *(flag for flag, on in flags.items() if on)]
-        return "_".join(parts) + f"{SPACES[self.periodic]}_{self.code_bytes}{'_cuda' if self.cuda else '_cpu'}"
+        return "_".join(parts) + f"{SPACES[self.periodic]}_{self.code_bytes}{f'_cuda{self.lanes}' if self.cuda else '_cpu'}"
 
     @property
     def own_length(self) -> int:
@@ -67,17 +72,22 @@ class ListKind(NamedTuple):
         """Return the named integers of a program."""
         found = {"PERIODIC": self.periodic, "SCALED": self.scaled, "CODE_BYTES": self.code_bytes, "REVERSED": self.reversed}
         found |= {"RADII": RADII.get(self.rule, 0), "SUM": self.rule == "mean", "ALIGNED": self.aligned}
-        return found | {"LENGTH": self.length(columns), "LANES_PER_ROW": LANES_PER_ROW, "QUERY_CHUNK": ROWS_AT_ONCE, **GRID}
+        return found | {"LENGTH": self.length(columns), "LANES_PER_ROW": max(self.lanes, 1), "QUERY_CHUNK": ROWS_AT_ONCE, **GRID}
 
 
-def slots(rows: int, cuda: bool) -> int:
+def lanes_of(rows: int) -> int:
+    """Return how many lanes of CUDA serve a row where terms are summed: so many that few rows keep all of them busy."""
+    return 8 if rows <= _FEW_ROWS else 1
+
+
+def slots(rows: int, lanes: int) -> int:
     """Return the number of partial sums that make up a sum over all pairs."""
-    return -(-rows // (32 // LANES_PER_ROW if cuda else ROWS_AT_ONCE))
+    return -(-rows // (32 // lanes if lanes else ROWS_AT_ONCE))
 
 
-def threads(rows: int) -> int:
+def threads(rows: int, lanes: int) -> int:
     """Return the threads of a launch on CUDA."""
-    return 32 * slots(rows, True)
+    return 32 * slots(rows, lanes)
 
 
 @functools.lru_cache(256)

@@ -25,7 +25,7 @@ from jfrnn._engine.problem import (
     is_decidable,
     prepare_search,
 )
-from jfrnn._engine.reverse_warp import reverse_slots, slots_by_source
+from jfrnn._engine.reverse_warp import collect_slots, reverse_slots, slots_by_source
 from jfrnn._engine.rows import count_rows, fold_pairs, list_rows
 from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit
 from jfrnn._engine.start import level_of_caller

@@ -52,8 +52,8 @@ def kept_mask(given: KeptList) -> Array:
 
     def on(cuda: bool) -> Callable[[KeptList], Array]:
         def call(given: KeptList) -> Array:
-            dims = {"mask": given.idx.shape, "info": 2}
-            return _mask_callable(_kind_of(given, cuda))(*_operands(given, _kind_of(given, cuda), 0, None), output_dims=dims)[0]
+            dims, kind = {"mask": given.idx.shape, "info": 2}, _kind_of(given, 8 if cuda else 0)
+            return _mask_callable(kind)(*_operands(given, kind, 0, None), output_dims=dims)[0]
 
         return call
 
@@ -78,8 +78,9 @@ def kept_sums(
     def on(cuda: bool) -> Callable[[KeptList, tuple[Array, Array, Array]], tuple[Array, Array, Array]]:
         def call(given: KeptList, values: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             shared, own, others = values
-            kind, rows = _kind_of(given, cuda), (given.sources if given.reversal is not None else given.rows).shape[0]
-            results = SumsOf(term, rows, kept.slots(rows, cuda), compensated, extremes)
+            rows = (given.sources if given.reversal is not None else given.rows).shape[0]
+            lanes = kept.lanes_of(rows) if cuda else 0
+            kind, results = _kind_of(given, lanes), SumsOf(term, rows, kept.slots(rows, lanes), compensated, extremes)
             call_sums = _sum_callable(kind, term, key, compensated, extremes, apart)
             operands = _operands(given, kind, term.columns, others)
             return results.unpack(*call_sums(*operands, shared, own, output_dims=results.dims() | {"info": 2})[:3])
@@ -97,14 +98,14 @@ class _Extra(NamedTuple):
     kind: kept.ListKind
 
 
-def _kind_of(given: KeptList, cuda: bool) -> _Extra:
+def _kind_of(given: KeptList, lanes: int) -> _Extra:
     cutoff, lattice, is_reversed = given.cutoff, given.lattice, given.reversal is not None
     periodic = 0 if lattice is None else (1 if lattice.images.nearest else 2) + (0 if lattice.images.orthogonal else 2)
     width = 0 if given.codes is None else given.codes.dtype.itemsize
     rule = cutoff.rule if isinstance(cutoff, Cutoffs) else ""
     rule = _EXCHANGED.get(rule, rule) if is_reversed else rule
     dim, double, aligned = given.sources.shape[1], given.sources.dtype == jnp.float64, given.idx.shape[1] % 4 == 0
-    kind = kept.ListKind(dim, double, cutoff.scaled, periodic, width, rule, is_reversed, aligned, cuda)
+    kind = kept.ListKind(dim, double, cutoff.scaled, periodic, width, rule, is_reversed, aligned, lanes)
     return _Extra(cutoff.closed, 1 if lattice is None else lattice.images.total, kind)
 
 
@@ -177,7 +178,11 @@ def _numbers(extra: _Extra, shapes: Shapes, apart: bool) -> dict[str, int]:
 
 
 def _launch(extra: _Extra, found: kept.Kernel, numbers: dict[str, int]) -> Plan:
-    launch = Launch(found, kept.threads(numbers["m"])) if extra.kind.cuda else share(found, numbers["m"], kept.ROWS_AT_ONCE)
+    launch = (
+        Launch(found, kept.threads(numbers["m"], extra.kind.lanes))
+        if extra.kind.cuda
+        else share(found, numbers["m"], kept.ROWS_AT_ONCE)
+    )
     return Plan([launch] if extra.kind.cuda else [Clear("info", 8), launch], numbers)
 
 

@@ -26,6 +26,29 @@ def slots_by_source(idx: Array, sources: int) -> tuple[Array, Array, Array]:
     return slots, starts, lengths
 
 
+def collect_slots(values: Array, slots: Array, starts: Array | None, lengths: Array | None, sources: int, cuda: bool) -> Array:
+    """Return the sums of values [slots, width] over the slots of each source [sources, width]; see `jfrnn._search.reverse`."""
+    by_source, nothing = starts is not None, jnp.zeros(1, jnp.int32)
+    call = _collect_callable(values.shape[1], values.dtype == jnp.float64, by_source, cuda)
+    given = values, slots, *(nothing if x is None else x for x in (starts, lengths))
+    return call(*given, output_dims={"sums": (sources, values.shape[1]), "info": 2})[0]
+
+
+@kernel
+def _collect_callable(width: int, double: bool, by_source: bool, cuda: bool) -> Call:
+    name = f"jfrnn_collect_{'cuda' if cuda else 'cpu'}_{width}_{'f64' if double else 'f32'}{'_sorted' * by_source}"
+    results = {"sums": np.float64 if double else np.float32, "info": np.int32}
+    return Call(name, ("values", "slots", "starts", "lengths"), results, functools.partial(_plan_collect, by_source, double, cuda))
+
+
+def _plan_collect(by_source: bool, double: bool, cuda: bool, shapes: Shapes, _: int) -> Plan:
+    (n, width), slots = shapes["sums"], shapes["slots"]
+    found = reverse.collect_kernel(width, double, by_source, cuda)
+    numbers = {"n": n, "capacity": slots[-1], "all": shapes["values"][0]}
+    launch = Launch(found, reverse.LANES_PER_SLOT * n) if cuda else share(found, n, reverse.ROWS_AT_ONCE)
+    return Plan([launch] if cuda else [Clear("info", 8), launch], numbers)
+
+
 @kernel
 def _reverse_callable(code_bytes: int, images: int, cuda: bool) -> Call:
     name = f"jfrnn_reverse_{'cuda' if cuda else 'cpu'}_{code_bytes}_{images}"
@@ -35,9 +58,10 @@ def _reverse_callable(code_bytes: int, images: int, cuda: bool) -> Call:
 
 def _plan_reverse(code_bytes: int, images: int, cuda: bool, shapes: Shapes, _: int) -> Plan:
     n, capacity = shapes["idx"]
-    found = reverse.reverse_kernel(code_bytes, cuda)
-    launch = Launch(found, reverse.LANES_PER_SLOT * n * capacity) if cuda else share(found, n, reverse.ROWS_AT_ONCE)
-    return Plan([Clear("info", 8), launch], {"n": n, "capacity": capacity, "images": images})
+    clear, find = reverse.reverse_kernels(code_bytes, cuda)
+    launch = Launch(find, reverse.LANES_PER_SLOT * n * capacity) if cuda else share(find, n, reverse.ROWS_AT_ONCE)
+    first = Launch(clear, n * capacity if cuda else 1)
+    return Plan([Clear("info", 8), first, launch], {"n": n, "capacity": capacity, "images": images})
 
 
 @kernel

@@ -10,16 +10,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from jfrnn._engine import collect_slots
 from jfrnn._search.reverse import MOST_SLOTS
 from jfrnn._search.topology import Topology
 from jfrnn._tracing import Aval, Internal, compile_program, result_aval, unvarying_types, vary, varying_axes
 
 Structure = Any  # the `PyTreeDef` of a topology, which type checkers do not accept as a type
+_WIDEST = 16  # numbers of a slot that kernels add
 _GROUP = 16  # slots of each source that are added at a time in lists that are not their own mirror image
 
 
@@ -46,6 +49,11 @@ def _collect(y: Array, topology: Topology) -> Array:
     reverse, flat = topology.with_reverse(), y.reshape(topology.idx.size, *y.shape[2:])
     if 0 in (topology.sources, *y.shape):
         return jnp.zeros((topology.sources, *y.shape[2:]), y.dtype)
+    if topology.native and flat.dtype in (np.float32, np.float64) and 0 < flat[0].size <= _WIDEST:
+        given = flat.reshape(len(flat), -1), reverse.slots, reverse.starts, reverse.lengths
+        on_cpu, on_cuda = (functools.partial(collect_slots, sources=topology.sources, cuda=cuda) for cuda in (False, True))
+        sums = lax.platform_dependent(*given, cpu=on_cpu, cuda=on_cuda)
+        return sums.reshape(topology.sources, *y.shape[2:])
     if reverse.starts is None or reverse.lengths is None:
         return jnp.sum(flat.at[reverse.slots].get(mode="fill", fill_value=0), axis=1)
     starts, lengths, slots = reverse.starts, reverse.lengths, reverse.slots

@@ -3,6 +3,7 @@
 import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -198,10 +199,22 @@ def _turns_now(
     return turns[0], turns[-1]
 
 
+@jax.custom_jvp
 @compile_program
 def norms(vectors: Array) -> Array:
-    largest = lax.stop_gradient(jnp.max(jnp.abs(vectors), axis=-1, initial=0))
+    """Return the lengths of vectors [..., d]; the derivative of a length of 0 is 0."""
+    columns = [vectors[..., k] for k in range(vectors.shape[-1])]  # reductions over so short an axis are slow
+    largest = functools.reduce(jnp.maximum, map(jnp.abs, columns))
     apart = largest > 0
     unit = jnp.where(apart, largest, 1)  # unscaled squares of tiny or huge lengths would leave the float range
-    square = jnp.sum((vectors / unit[..., None]) ** 2, axis=-1)
+    square = functools.reduce(jnp.add, ((x / unit) ** 2 for x in columns))
     return jnp.where(apart, unit * jnp.sqrt(jnp.where(apart, square, 1)), 0)
+
+
+@norms.defjvp
+def _norms_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (vectors,), (moved,) = primals, tangents
+    lengths = norms(vectors)
+    apart = jnp.where(lengths > 0, lengths, 1)
+    along = (vectors[..., k] / apart * moved[..., k] for k in range(vectors.shape[-1]))
+    return lengths, functools.reduce(jnp.add, along)

@@ -40,6 +40,7 @@ constexpr int RULE = 0, GROUPS = 8, HALVINGS = 5, PADDING = 16;
 // Of lists that are kept (see jfrnn/kernels/reverse.py and kept.py).
 constexpr int CODE_BYTES = 1;     // of the code of an image, 0: pairs have one image
 constexpr int RADII = 0;          // whose cutoff is that of a pair (kept.h), 0: all have one
+constexpr int WIDTH = 3;          // numbers of each slot
 constexpr int LENGTH = 4;         // numbers of each source
 constexpr bool REVERSED = false;  // rows are those of the sources of a list
 constexpr bool ALIGNED = true;    // rows of ids begin at multiples of 16 bytes

@@ -42,7 +42,8 @@ struct KeptLane : Kept {
                 if (some.used[k])
                     read_entry(first + place + k, some.ids[k], some.codes[k]);
     }
-    // Calls `visit(place, id, numbers, verdict, pair)` for the entries of the row that this lane takes.
+    // Calls `visit(place, id, numbers, verdict, pair)` for the entries of the row that this lane takes. Those in doubt come once more,
+    // after they were decided: so rare a call stands outside of what every entry takes.
     template <class Visit>
     JFRNN_MEMBER void walk(const OwnPoint& own, Visit visit) const {
         const long long first = is_row ? first_entry(row) : 0;
@@ -56,19 +57,31 @@ struct KeptLane : Kept {
                 load_numbers<LENGTH>(points + (long long)LENGTH * some.ids[k], numbers[k]);
             Entries next;
             read(first, place + AT_A_TIME * LANES_PER_ROW, all, next);
+            unsigned int open = 0;
 #pragma unroll
             for (int k = 0; k < AT_A_TIME; ++k) {
-                real step[3] = {0, 0, 0};
-                for (int a = 0; CODED && a < DIM; ++a)
-                    step[a] = steps[DIM * some.codes[k] + a];
-                const Verdict verdict = judge(own, numbers[k], step, apart && some.ids[k] == row, some.used[k]);
-                bool pair = verdict.sure;
-                if (verdict.open)
-                    pair = decide(own, numbers[k], verdict);
-                visit(place + k, some.ids[k], numbers[k], verdict, pair);
+                const Verdict verdict = judged(own, numbers[k], some.ids[k], some.codes[k], some.used[k]);
+                open |= verdict.open ? 1u << k : 0;
+                visit(place + k, some.ids[k], numbers[k], verdict, verdict.sure);
+            }
+            for (; open; open &= open - 1) {
+                const int k = __ffs(open) - 1;
+                int id, code;
+                read_entry(first + place + k, id, code);
+                real doubted[LENGTH];
+                load_numbers<LENGTH>(points + (long long)LENGTH * id, doubted);
+                const Verdict verdict = judged(own, doubted, id, code, true);
+                if (decide(own, doubted, verdict))
+                    visit(place + k, id, doubted, verdict, true);
             }
             some = next;
         }
+    }
+    JFRNN_MEMBER Verdict judged(const OwnPoint& own, const real* numbers, int id, int code, bool used) const {
+        real step[3] = {0, 0, 0};
+        for (int a = 0; CODED && a < DIM; ++a)
+            step[a] = steps[DIM * code + a];
+        return judge(own, numbers, step, apart && id == row, used);
     }
     JFRNN_MEMBER bool decide(const OwnPoint& own, const real* numbers, const Verdict& verdict) const {
         int shift[3] = {0, 0, 0};

@@ -23,9 +23,8 @@ struct KeptMask : KeptLane {
         unsigned char* const out = mask + (long long)row * capacity;
         for (int place = entries(row) + lane; place < capacity; place += LANES_PER_ROW)
             out[place] = 0;
-        const int all = entries(row);
         walk(own_point(row), [&](int place, int, const real*, const Verdict&, bool pair) {
-            if (place < all)
+            if (place < entries(row))
                 out[place] = pair;
         });
     }

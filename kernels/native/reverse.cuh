@@ -1,4 +1,5 @@
-// Reverse slots on CUDA: for the pair (i, j) in a row of i, eight lanes read the row of j together until i is found.
+// Reverse slots on CUDA: for the pair (i, j) in a row of i, eight lanes read the row of j together until i is found. Pairs whose j
+// comes before i are found from the other side.
 #pragma once
 #include "reverse.h"
 
@@ -14,7 +15,7 @@ struct Reverse : ListOfRows {
         const int i = there ? slot / capacity : 0, j = there ? idx[slot] : n;
         const int code = j < n ? opposite(code_at(slot)) : 0, row = j < n ? j * capacity : 0;
         int found = capacity;
-        bool searching = j < n;
+        bool searching = j < n && j >= i;
         for (int b = 0; __any_sync(ALL_LANES, searching); b += 32) {
             const int from = b + 4 * lane;
             if (searching)
@@ -32,7 +33,14 @@ struct Reverse : ListOfRows {
             }
             searching = searching && found == capacity && b + 32 < capacity;
         }
-        if (there && lane == 0)
-            slots[slot] = found < capacity ? j * capacity + found : none();
+        if (found < capacity && lane == 0) {
+            slots[slot] = row + found;
+            slots[row + found] = slot;
+        }
+    }
+    // Before that, no slot has any.
+    JFRNN_MEMBER void clear() const {
+        if (thread_index() < none())
+            slots[thread_index()] = none();
     }
 };

@@ -23,12 +23,21 @@ struct Reverse : ListOfRows {
                 return b;
         return capacity;
     }
+    // Finds the reverse slots of those whose source does not come before the row, and is found for these, too.
     void reverse_row(int i) const {
         for (int k = 0; k < capacity; ++k) {
             const int slot = i * capacity + k, j = idx[slot];
-            const int place = j < n ? place_of(j, i, opposite(code_at(slot))) : capacity;
-            slots[slot] = place < capacity ? j * capacity + place : none();
+            const int place = j < n && j >= i ? place_of(j, i, opposite(code_at(slot))) : capacity;
+            if (place < capacity) {
+                slots[slot] = j * capacity + place;
+                slots[j * capacity + place] = slot;
+            }
         }
+    }
+    // Before that, no slot has any.
+    void clear() const {
+        for (int slot = 0; slot < none(); ++slot)
+            slots[slot] = none();
     }
     void run() const {
         for (;;) {
