@@ -219,7 +219,7 @@ def _run(way: _Way, liquid: _Liquid, skin: float, steps: int, repeats: int) -> _
 
 
 def _total(potential: Array, v: Array) -> float:
-    return float(np.sum(potential, dtype=np.float64) + np.sum(np.square(np.asarray(v, np.float64))) / 2)
+    return float(np.sum(np.asarray(potential, np.float64)) + np.sum(np.square(np.asarray(v, np.float64))) / 2)
 
 
 def _temperature(v: Array) -> float:
