@@ -77,7 +77,10 @@ def _define(
     transposed: Primitive,
     shape_of: Callable[[tuple[int, ...], Topology], tuple[int, ...]],
 ) -> None:
-    """Define a primitive that is linear in its first operand; the others are the leaves of a topology."""
+    """Define a primitive that is linear in its first operand; the others are the leaves of a topology.
+
+    The function is long because all rules of a primitive stand in it.
+    """
 
     def run(x: Array, *leaves: Array, structure: Structure) -> Array:
         return work(x, jax.tree.unflatten(structure, leaves))
