@@ -33,20 +33,22 @@ constexpr int OF_ROW = 1, OF_SOURCE = 2, LARGER = 3, SMALLER = 4,
 struct Kept : KeptArguments, Space {
     static constexpr real LEAST = DOUBLE ? real(0x1p-459) : real(0x1p-40f);  // below, squares of cutoffs might underflow
     real inside, outside;  // squares below are surely those of pairs, squares above surely not, where all cutoffs are one
-    real moved[3];         // the most that a shift of 1 along each axis adds up to, per component
+    real moved;            // the most that a shift of 1 along each axis adds up to in a component
     real most;             // the largest number of a shift for which pairs are decided
 
-    JFRNN_MEMBER explicit Kept(const KeptArguments& given) : KeptArguments(given), Space(given.cutoff), most(0) {
+    JFRNN_MEMBER explicit Kept(const KeptArguments& given) : KeptArguments(given), Space(given.cutoff), moved(0), most(0) {
         inside = step_radius * step_radius * (1 - 8 * step_eps);
         outside = step_radius * step_radius * (1 + 8 * step_eps);
         for (int k = 0; SHIFTED && k < DIM; ++k) {
-            moved[k] = 0;
+            real sum = 0;
             for (int l = 0; l < DIM; ++l)
-                moved[k] += size_of(lattice.vector(l, k));
+                sum += size_of(lattice.vector(l, k));
+            moved = sum > moved ? sum : moved;
         }
         if constexpr (SHIFTED)
             most = cutoff[LATTICE_END];
     }
+    JFRNN_INLINE static Number larger(Number x, Number y) { return Math::select(Math::gt(x, y), x, y); }
     JFRNN_FUNCTION real size_of(real x) { return x < 0 ? -x : x; }
 
     JFRNN_MEMBER int code_at(long long slot) const {
@@ -97,18 +99,17 @@ struct Kept : KeptArguments, Space {
             d[k] = numbers[k] - own.q[k];
         Number off{};
         if constexpr (SHIFTED) {
-            Number spans{};
+            Number spans{}, size{};
             for (int k = 0; k < DIM; ++k) {
                 found.shift[k] =
                     lattice.periodic(k) ? (CODED ? step[k] + own.turn[k] - numbers[TURNS + k] : nearest(d, k)) : Number{};
-                spans = Math::max(spans, Math::abs(found.shift[k]));
+                spans = larger(Math::abs(found.shift[k]), spans);
+                size = larger(Math::abs(d[k]), size);
             }
             used = Math::both(used, Math::le(spans, Math::of(most)));
             used = Math::both(used, Math::inverse(Math::both(same, Math::eq(spans, Number{}))));
-            for (int k = 0; k < DIM; ++k)
-                if (moved[k] > 0)
-                    off = Math::max(off, Math::abs(d[k]) + (spans + real(1)) * moved[k]);
-            off = off * (16 * step_eps * step_scale);  // twice the error of a component (jfrnn/_geometry/lattice.py)
+            // twice the most that a component is off by (jfrnn/_geometry/lattice.py)
+            off = (size + (spans + real(1)) * moved) * (16 * step_eps * step_scale);
             for (int k = 0; k < DIM; ++k)
                 d[k] = d[k] + translation(found.shift, k);
         } else
@@ -120,12 +121,12 @@ struct Kept : KeptArguments, Space {
         Number inner = Math::of(inside), outer = Math::of(outside);
         if constexpr (RADII > 0) {
             const Number radius = cutoff_of(own, numbers) * step_scale, least = Math::of(LEAST);
-            const Math::flag clear = Math::gt(radius, Math::max(off, least));
-            const Number near = radius - off, far = Math::max(radius, least) + off;
+            const Math::flag clear = Math::gt(radius, larger(off, least));
+            const Number near = radius - off, far = larger(radius, least) + off;
             inner = Math::select(clear, near * near * (1 - 32 * step_eps), Math::of(real(-1)));
             outer = far * far * (1 + 32 * step_eps);
         } else if constexpr (SHIFTED) {
-            const Number near = Math::max(Math::of(step_radius) - off, Number{}), far = Math::of(step_radius) + off;
+            const Number near = larger(Math::of(step_radius) - off, Number{}), far = Math::of(step_radius) + off;
             inner = near * near * (1 - 16 * step_eps);
             outer = far * far * (1 + 16 * step_eps);
         }
