@@ -11,7 +11,8 @@ static Math::flag truths(unsigned int bits) {
 
 // Of LANES slots: their sources, the numbers of these, and which of them are pairs.
 struct KeptSlots {
-    int ids[LANES], places;  // their places in the row, from `places` on
+    const int* ids;
+    int places;  // their places in the row, from `places` on
     Number numbers[LENGTH];
     Kept::Verdict verdict;
     unsigned int pairs;
@@ -87,23 +88,23 @@ struct KeptRows : Kept {
         const long long first = first_entry(row);
         const int all = entries(row);
         KeptSlots some;
+        int last[LANES];  // ids, where the row ends among them
         for (int b = 0; b < all; b += LANES) {
             const unsigned int there = lanes_before(all - b);
             some.places = b;
             Number step[3] = {Number{}, Number{}, Number{}};
-            if (!REVERSED && !CODED && (b + LANES <= all || b + LANES <= capacity)) {
-                __builtin_memcpy(some.ids, idx + first + b, sizeof some.ids);
-                for (int l = 0; l < LANES; ++l)
-                    some.ids[l] = b + l < all ? some.ids[l] : 0;
-            } else
+            some.ids = idx + first + b;
+            if (REVERSED || CODED || b + LANES > all) {
+                some.ids = last;
                 for (int l = 0; l < LANES; ++l) {
                     int code = 0;
-                    some.ids[l] = 0;
+                    last[l] = 0;
                     if (b + l < all)
-                        read_entry(first + b + l, some.ids[l], code);
+                        read_entry(first + b + l, last[l], code);
                     for (int k = 0; CODED && k < DIM; ++k)
                         step[k][l] = steps[DIM * code + k];
                 }
+            }
             read_points(some.ids, some.numbers);
             const ints ids = lanes_from(some.ids);
             const Math::flag same = apart ? __builtin_convertvector(ids == row, Math::flag) : Math::flag{};
