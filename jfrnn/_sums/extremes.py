@@ -27,7 +27,7 @@ def bind_extremes(relation: Relation, term: Term, operands: Groups, largest: boo
     if isinstance(relation, Searched):
         check(relation.inputs, relation.options, term)
     elif isinstance(relation, Kept) and not can_sum_list(relation.given, term):
-        relation = relation.listed()
+        relation = call_apart(Kept.listed, relation)
     find = functools.partial(_find, term=term, largest=largest)
     found = call_apart(lambda *given: find(given[0], operands=given[1]), lax.stop_gradient(relation), lax.stop_gradient(operands))
     results = []
