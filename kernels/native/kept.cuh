@@ -43,9 +43,10 @@ struct KeptLane : Kept {
                     read_entry(first + place + k, some.ids[k], some.codes[k]);
     }
     // Calls `visit(place, id, numbers, verdict, pair)` for the entries of the row that this lane takes. Those in doubt come once more,
-    // after they were decided: so rare a call stands outside of what every entry takes.
-    template <class Visit>
-    JFRNN_MEMBER void walk(const OwnPoint& own, Visit visit) const {
+    // after they were decided: so rare a call stands outside of what every entry takes. `settle(place, pairs)` comes last: one bit for
+    // each of the entries from `place` on.
+    template <class Visit, class Settle>
+    JFRNN_MEMBER void walk(const OwnPoint& own, Visit visit, Settle settle) const {
         const long long first = is_row ? first_entry(row) : 0;
         const int all = is_row ? entries(row) : 0;
         Entries some;
@@ -57,11 +58,12 @@ struct KeptLane : Kept {
                 load_numbers<LENGTH>(points + (long long)LENGTH * some.ids[k], numbers[k]);
             Entries next;
             read(first, place + AT_A_TIME * LANES_PER_ROW, all, next);
-            unsigned int open = 0;
+            unsigned int open = 0, pairs = 0;
 #pragma unroll
             for (int k = 0; k < AT_A_TIME; ++k) {
                 const Verdict verdict = judged(own, numbers[k], some.ids[k], some.codes[k], some.used[k]);
                 open |= verdict.open ? 1u << k : 0;
+                pairs |= verdict.sure ? 1u << k : 0;
                 visit(place + k, some.ids[k], numbers[k], verdict, verdict.sure);
             }
             for (; open; open &= open - 1) {
@@ -71,9 +73,12 @@ struct KeptLane : Kept {
                 real doubted[LENGTH];
                 load_numbers<LENGTH>(points + (long long)LENGTH * id, doubted);
                 const Verdict verdict = judged(own, doubted, id, code, true);
-                if (decide(own, doubted, verdict))
+                if (decide(own, doubted, verdict)) {
+                    pairs |= 1u << k;
                     visit(place + k, id, doubted, verdict, true);
+                }
             }
+            settle(place, pairs);
             some = next;
         }
     }

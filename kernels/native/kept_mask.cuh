@@ -23,9 +23,13 @@ struct KeptMask : KeptLane {
         unsigned char* const out = mask + (long long)row * capacity;
         for (int place = entries(row) + lane; place < capacity; place += LANES_PER_ROW)
             out[place] = 0;
-        walk(own_point(row), [&](int place, int, const real*, const Verdict&, bool pair) {
-            if (place < entries(row))
-                out[place] = pair;
+        auto nothing = [](int, int, const real*, const Verdict&, bool) {};
+        walk(own_point(row), nothing, [&](int place, unsigned int pairs) {
+            if constexpr (ALIGNED && AT_A_TIME == 4)
+                *(unsigned int*)(out + place) = (pairs & 1) | (pairs & 2) << 7 | (pairs & 4) << 14 | (pairs & 8) << 21;
+            else
+                for (int k = 0; k < AT_A_TIME && place + k < capacity; ++k)
+                    out[place + k] = pairs >> k & 1;
         });
     }
 };

@@ -37,7 +37,7 @@ struct KeptSums : KeptLane {
         const Term term(shared_values);
         const Term::Own own_part = term.own(own_values + (long long)(is_row ? row : 0) * OWN, own.q);
         Reduction reduction(n);
-        walk(own, [&](int place, int id, const real* numbers, const Verdict& verdict, bool pair) {
+        auto visit = [&](int place, int id, const real* numbers, const Verdict& verdict, bool pair) {
             number summand[SUMMANDS];
             auto column = [&](int c) -> number { return c < OTHERS ? numbers[DIM + c] : verdict.shift[STEP_AXES[c - OTHERS]]; };
             term.evaluate(own_part, numbers, column, summand);
@@ -45,7 +45,8 @@ struct KeptSums : KeptLane {
                 source = id;
                 code = place;
             });
-        });
+        };
+        walk(own, visit, [](int, unsigned int) {});
         __syncwarp();
         reduction.reduce_over_warp<LANES_PER_ROW>();
         reduction.store(results, {lane_of_warp, row, (int)warp, is_row && lane == 0, true, true});
