@@ -37,6 +37,7 @@ class Bench(_commands.Commands):
             "house": "Count files, lines and floors.",
             "arrays": "Time the array engine beside jax-md.",
             "latency": "Time calls for few particles.",
+            "lj": "Time a Lennard-Jones liquid, beside jax-md's.",
             "options": "Time each option of a search.",
             "peers": "Ask other libraries for the hard cases.",
             "skin": "Time a list that is kept while particles move.",

@@ -24,7 +24,7 @@ from jfrnn._engine import (
     fastest_engine,
     list_rows,
 )
-from jfrnn._geometry import Cutoff, check_capacity, check_cutoff, check_kind, check_size, check_skin
+from jfrnn._geometry import Cutoff, check_capacity, check_cutoff, check_flag, check_kind, check_size, check_skin
 from jfrnn._sums import pair_sum
 from jfrnn._tracing import Tree
 from jfrnn._triangles import TRIANGLE_BACKENDS, TRIANGLE_ENGINES, fastest_of, find_triangles
@@ -39,7 +39,7 @@ class MemoryPlan:
 
     Attributes:
         list_bytes: The result of a search [B]: 4 per slot, 4 per row for its count, 8 for `status` and `required`; with a skin,
-            also copies of positions and queries, and 4.
+            also copies of positions and queries, and 4; with `reverse`, another 4 per slot, and for queries 8 per source.
         scratch_bytes: Memory needed in addition while it runs [B].
         backend: The engine, never "auto".
         sums_bytes: The results of a pair sum, and of its gradient if planned [B].
@@ -81,6 +81,7 @@ def memory_plan(
     dtype: np.dtype | type | str = np.float32,
     queries: int | None = None,
     skin: float = 0.0,
+    reverse: bool = False,
     fn: Callable[[Any, Any, Any], Any] | None = None,
     values: Tree = None,
     gradient: bool = False,
@@ -111,6 +112,7 @@ def memory_plan(
         dtype: Dtype of the positions, float32 or float64.
         queries: Number of separate queries; None: the particles themselves are the queries.
         skin: As in `search`; only whether there is one changes the bytes.
+        reverse: As in `search`, for a full list, or one of queries.
         fn: As in `pair_sum`, which is then planned.
         values: As in `pair_sum`, a pytree of arrays or of their shapes (`jax.ShapeDtypeStruct`), [n, ...].
         gradient: Plan the sums together with a gradient in the positions, of a function of all sums of floats.
@@ -156,6 +158,8 @@ def memory_plan(
     if capacity is None:
         return MemoryPlan(0, scratch, chosen.name, counts_bytes=4 * rows)
     kept = (n + (queries or 0)) * dim * dtype.itemsize + 4 if check_skin(skin, float(radius.radius), dtype) else 0
+    if check_flag("reverse", reverse):
+        kept += 4 * rows * capacity + (0 if queries is None else 8 * n)
     return MemoryPlan(4 * rows * (capacity + 1) + 8 + kept, scratch, chosen.name)
 
 

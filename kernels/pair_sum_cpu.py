@@ -116,16 +116,22 @@ def placed(values: tuple[Value, ...], column: str, axis: str) -> list[str]:
     return [column.format(next(numbers)) if value.axis is None else axis.format(value.axis) for value in values]
 
 
-def constants_of(term: TermText, compensated: bool, extremes: bool) -> dict[str, int]:
-    """Return the named integers that a program with a term needs, but for CANDIDATES, how many pairs are held."""
+def constants_of(term: TermText, compensated: bool, extremes: bool, turned: bool = True) -> dict[str, int]:
+    """Return the named integers that a program with a term needs, but for CANDIDATES, how many pairs are held.
+
+    `turned`: a column of turns stands behind those of i, if the term reads lattice shifts.
+    """
     totals = sum(part.total for part in term.sums)
     found = {"OTHERS": term.columns, "STEPS": len(term.steps), "TOTALS": totals, "ROW_SUMS": len(term.sums) - totals}
-    own = sum(value.axis is None for value in term.own) + bool(term.steps)
+    own = sum(value.axis is None for value in term.own) + (turned and bool(term.steps))
     return found | {"OWN": own, "COMPENSATED": compensated, "SUMS": 1 + extremes}
 
 
-def term_header(term: TermText, double: bool) -> dict[str, str]:
-    """Return the header of a program with a term: `term.h` holds the struct `Term`, as in the example of that name."""
+def term_header(term: TermText, double: bool, turned: bool = True) -> dict[str, str]:
+    """Return the header of a program with a term: `term.h` holds the struct `Term`, as in the example of that name.
+
+    `turned`: the lattice shift of a pair is what stands in its columns, and turns of i are added to that.
+    """
     order = [itertools.count(), itertools.count()]
     places = [next(order[part.total]) for part in term.sums]
     lines = [f"typedef Math::{'f64' if double else 'f32'} number;"]
@@ -135,8 +141,9 @@ def term_header(term: TermText, double: bool) -> dict[str, str]:
     lines += [f"JFRNN_TABLE bool MARKED[] = {{{', '.join(marks or ['0'])}}};"]
     lines += [f"JFRNN_TABLE int STEP_AXES[] = {{{', '.join([str(step.axis) for step in term.steps] or ['0'])}}};"]
     lines += ["struct Term {", *_members(term.shared), "struct Own {", *_members(term.own)]
-    lines += [*(f"number turned{c};" for c in range(len(term.steps))), "};", *_of_shared(term, double), *_of_own(term, double)]
-    text = "\n".join([*lines, *_evaluation(term, double), "};", ""])
+    lines += [*(f"number turned{c};" for c in range(len(term.steps) if turned else 0)), "};"]
+    lines += [*_of_shared(term, double), *_of_own(term, double, turned)]
+    text = "\n".join([*lines, *_evaluation(term, double, turned), "};", ""])
     return {"term.h": '#include "lattice.h"\n#include "math.h"\n' + text}
 
 
@@ -150,17 +157,17 @@ def _of_shared(term: TermText, double: bool) -> list[str]:
     return ["JFRNN_MEMBER explicit Term(const real* shared_values) {", *made, "}"]
 
 
-def _of_own(term: TermText, double: bool) -> list[str]:
+def _of_own(term: TermText, double: bool, turned: bool) -> list[str]:
     """Return the lines that read what is known of a query at `q`, of its row of numbers."""
     given = zip(term.own, placed(term.own, "row[{}]", "q[{}]"), strict=True)
     lines = [f"own.{value.name} = {_spread(value, at, double)};" for value, at in given]
     column = sum(value.axis is None for value in term.own)
-    turns = [f"real(Lattice::turn(row[{column}], {step.axis}))" for step in term.steps]
+    turns = [f"real(Lattice::turn(row[{column}], {step.axis}))" for step in term.steps if turned]
     lines += [f"own.turned{c} = Math::of({x});" for c, x in enumerate(turns)]
     return ["JFRNN_MEMBER Own own(const real* row, const real* q) const {", "Own own;", *lines, "return own;", "}"]
 
 
-def _evaluation(term: TermText, double: bool) -> list[str]:
+def _evaluation(term: TermText, double: bool, turned: bool) -> list[str]:
     """Return the lines that evaluate a term for a vector of pairs."""
     lines = ["template <class Column>"]
     lines += ["JFRNN_MEMBER void evaluate(const Own& own, const number* p, Column column, number* summand) const {"]
@@ -168,7 +175,7 @@ def _evaluation(term: TermText, double: bool) -> list[str]:
     numbers = placed(term.others, "column({})", "p[{}]")
     lines += [loaded(value, x, f"Math::bits({x})", double) for value, x in zip(term.others, numbers, strict=True)]
     for c, step in enumerate(term.steps):
-        shift = f"column({term.columns + c}) + own.turned{c}"
+        shift = f"column({term.columns + c})" + f" + own.turned{c}" * turned
         lines.append(f"const number {step.name} = SHIFTED ? {shift} : number{{}};")
     return [*lines, term.text, *(f"summand[{k}] = {part.name};" for k, part in enumerate(term.sums)), "}"]
 

@@ -52,12 +52,29 @@ def summed(x, r):
     return jfrnn.pair_sum(weight, x, 0.5, r), jax.grad(loss)(x)
 
 
+def over_lists(x, r):
+    nbrs = jfrnn.search(x, 0.5, capacity=16, skin=0.1, reverse=True)
+    energies = (
+        lambda x: jnp.sum(jfrnn.pair_sum(weight, x, None, r, neighbors=nbrs)),
+        lambda x: jnp.sum(nbrs.distances(x)[0] ** 3),
+        lambda x: jnp.sum(nbrs.edges(x, 200).displacement ** 3),
+    )
+    return [jax.grad(energy)(x) for energy in energies]
+
+
 def near_walls(x, r):
     tri = jfrnn.search_triangles(x, CORNERS, SIDES, 0.4, capacity=8)
     return tri, tri.update(x)
 
 
-QUICK = {"list": listed, "box": in_a_box, "sum": summed, "walls": near_walls, "order": lambda x, r: jfrnn.sort_order(x, 0.5)}
+QUICK = {
+    "list": listed,
+    "box": in_a_box,
+    "sum": summed,
+    "lists": over_lists,
+    "walls": near_walls,
+    "order": lambda x, r: jfrnn.sort_order(x, 0.5),
+}
 MORE = {
     "radii": lambda x, r: jfrnn.count(x, r),
     "distances": lambda x, r: jfrnn.search(X, 0.5, capacity=16).distances(x),

@@ -57,6 +57,7 @@ FUNCTIONS = {
     "pairs": lambda x: LISTS["half"](x).pairs(200),
     "csr": lambda x: LISTS["open"](x).csr(300),
     "to_jraph": lambda x: LISTS["open"](x).to_jraph(300),
+    "edges": lambda x: LISTS["open"](x).edges(x, 300),
     "require": lambda x: LISTS["open"](x).require(200),
     "to_jax_md": lambda x: LISTS["open"](x).to_jax_md(),
     "pair_sum": lambda x: jfrnn.pair_sum(lambda r, i, j: {"r": r * j, "s": r @ r}, x, None, x[:, 0], neighbors=LISTS["open"](x)),

@@ -10,6 +10,7 @@ from jfrnn._engine.auto import (
     fastest_engine,
     platform_of,
 )
+from jfrnn._engine.kept_warp import KeptList, kept_mask, kept_sums
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import MOST_IN_BOX, as_float
 from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
@@ -24,6 +25,7 @@ from jfrnn._engine.problem import (
     is_decidable,
     prepare_search,
 )
+from jfrnn._engine.reverse_warp import collect_slots, reverse_slots, slots_by_source
 from jfrnn._engine.rows import count_rows, fold_pairs, list_rows
 from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit
 from jfrnn._engine.start import level_of_caller

@@ -95,7 +95,7 @@ def _operands(search: Search, levels: Levels) -> list[Array]:
         raw = [particle_rows(sources, torus[1].turns, None), particle_rows(given, torus[1].query_turns, None)]
     line = (0, 3 - dim)
     largest = jnp.zeros(GROUPS, sources.dtype) if levels.largest is None else levels.largest
-    numbers = [] if torus is None else [lattice_numbers(*torus)]
+    numbers = [] if torus is None else [lattice_numbers(torus[0], torus[1].reach, torus[1].slack)]
     numbers += [largest, *(jnp.pad(x, line) for x in (levels.widths, levels.axes.scale, levels.axes.margin))]
     passes = jnp.int32(1) if levels.passes is None else levels.passes
     extent = levels.grid.extent

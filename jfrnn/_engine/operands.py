@@ -44,13 +44,13 @@ def as_integer(x: Array) -> Array:
     return lax.bitcast_convert_type(x, jnp.int32) if x.dtype == jnp.float32 else x.astype(jnp.int32)
 
 
-def lattice_numbers(lattice: Lattice, wrapped: Wrapped) -> Array:
+def lattice_numbers(lattice: Lattice, reach: Array, slack: Array) -> Array:
     """Return the numbers of a lattice that kernels read, in the order that `jfrnn.kernels._native` specifies."""
     more = 3 - lattice.dim
     square, line = ((0, more), (0, more)), (0, more)
     images = jnp.asarray(lattice.images.reach).astype(lattice.matrix.dtype)
     parts = [jnp.pad(lattice.matrix, square), jnp.pad(lattice.transform, square), jnp.pad(lattice.origin, line)]
-    parts += [jnp.pad(wrapped.reach, line, constant_values=1), jnp.pad(images, line), wrapped.slack]
+    parts += [jnp.pad(reach, line, constant_values=1), jnp.pad(images, line), slack]
     if not lattice.images.orthogonal:
         parts += [jnp.pad(lattice.given, square), jnp.pad(lattice.images.numbers.astype(images.dtype), square)]
     return jnp.concatenate([part.reshape(-1) for part in parts])
@@ -63,7 +63,7 @@ def pack_particles(search: Search) -> tuple[Array, Array, Array]:
     turns = query_turns = None
     if torus is not None:
         turns, query_turns = torus[1].turns, torus[1].query_turns
-        numbers.append(lattice_numbers(*torus))
+        numbers.append(lattice_numbers(torus[0], torus[1].reach, torus[1].slack))
     if batch is not None:
         numbers.append(as_float(jnp.max(batch.of_all)[None], sources.dtype))
     sources = particle_rows(sources, turns, None if batch is None else batch.sources)

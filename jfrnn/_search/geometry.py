@@ -3,10 +3,12 @@
 import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._engine import KeptList, kept_mask
 from jfrnn._geometry import (
     LARGEST_TURN,
     Box,
@@ -25,6 +27,7 @@ from jfrnn._geometry import (
     turns_between,
     unpack_turns,
 )
+from jfrnn._search.topology import Topology
 from jfrnn._tracing import call_apart, compile_program
 
 
@@ -56,13 +59,20 @@ def _pair_cutoff(cutoff: Cutoff | Radii | None, closed: bool) -> Cutoff | Cutoff
 
 @functools.partial(compile_program, static_argnames="closed")
 def open_vectors(
-    idx: Array, count: Array, sources: Array, rows: Array, given: Cutoff | Radii | None, closed: bool
+    topology: Topology, count: Array, sources: Array, rows: Array, given: Cutoff | Radii | None, closed: bool
 ) -> tuple[Array, Array]:
-    cutoff = _pair_cutoff(given, closed)
+    from jfrnn._search.gathers import gather
+
+    cutoff, idx = _pair_cutoff(given, closed), topology.idx
     used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
     neighbor = jnp.where(used, idx, 0)
-    mask = call_apart(is_pair_of, lax.stop_gradient(rows), lax.stop_gradient(sources), neighbor, used, cutoff)
-    return jnp.where(mask[..., None], sources[neighbor] - rows[:, None, :], 0), mask
+    fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
+    if topology.native:
+        given_list = kept_list(topology, count, (None, None), fixed_sources, fixed_rows, given, closed, None)
+        mask = call_apart(kept_mask, given_list)
+    else:
+        mask = call_apart(is_pair_of, fixed_rows, fixed_sources, neighbor, used, cutoff)
+    return jnp.where(mask[..., None], gather(sources, topology) - rows[:, None, :], 0), mask
 
 
 class _Slots(NamedTuple):
@@ -74,10 +84,15 @@ class _Slots(NamedTuple):
     shifts: Array
 
 
-def _find_slots(idx: Array, count: Array, images: ImagesMade, sources: Array, rows: Array, lattice: Lattice, half: bool) -> _Slots:
+def _find_slots(
+    topology: Topology, count: Array, images: ImagesMade, sources: Array, rows: Array, lattice: Lattice, half: bool
+) -> _Slots:
+    from jfrnn._search.gathers import gather
+
+    idx = topology.idx
     used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
     neighbor = jnp.where(used, idx, 0)
-    difference = sources[neighbor] - rows[:, None, :]
+    difference = gather(sources, topology) - rows[:, None, :]
     codes, made = images
     if codes is None:
         shifts = nearest_shifts(difference, lattice)
@@ -96,15 +111,15 @@ def _find_slots(idx: Array, count: Array, images: ImagesMade, sources: Array, ro
 
 @functools.partial(compile_program, static_argnames=("kind", "half"))
 def lattice_shifts(
-    idx: Array, count: Array, images: ImagesMade, sources: Array, rows: Array, box: Box, kind: Images, half: bool
+    topology: Topology, count: Array, images: ImagesMade, sources: Array, rows: Array, box: Box, kind: Images, half: bool
 ) -> Array:
     lattice = make_lattice(box, kind, np.dtype(sources.dtype))
-    return given_shifts(lax.stop_gradient(_find_slots(idx, count, images, sources, rows, lattice, half).shifts), kind)
+    return given_shifts(lax.stop_gradient(_find_slots(topology, count, images, sources, rows, lattice, half).shifts), kind)
 
 
 @functools.partial(compile_program, static_argnames=("kind", "closed", "half"))
 def periodic_vectors(
-    idx: Array,
+    topology: Topology,
     count: Array,
     images: ImagesMade,
     sources: Array,
@@ -117,12 +132,55 @@ def periodic_vectors(
 ) -> tuple[Array, Array, Array]:
     cutoff = _pair_cutoff(given, closed)
     lattice = make_lattice(box, kind, np.dtype(sources.dtype))
-    used, neighbor, difference, shifts = _find_slots(idx, count, images, sources, rows, lattice, half)
+    used, neighbor, difference, shifts = _find_slots(topology, count, images, sources, rows, lattice, half)
     fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
     pairs = shift_pairs(difference, shifts, lattice)
-    fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
-    mask = call_apart(is_pair_of, fixed_rows, fixed_sources, neighbor, used, cutoff, fixed_pairs)
+    if is_native(topology, kind, half):
+        given_list = kept_list(topology, count, images, fixed_sources, fixed_rows, given, closed, lattice)
+        mask = call_apart(kept_mask, given_list)
+    else:
+        fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
+        mask = call_apart(is_pair_of, fixed_rows, fixed_sources, neighbor, used, cutoff, fixed_pairs)
     return jnp.where(mask[..., None], pairs.vectors, 0), mask, shifts
+
+
+def is_native(topology: Topology, kind: Images | None, half: bool) -> bool:
+    """Say whether Warp's kernels decide which slots hold a pair: not in half lists of short vectors, whose images JAX chooses."""
+    return topology.native and not (half and kind is not None and kind.basis is not None)
+
+
+def kept_list(
+    topology: Topology,
+    count: Array,
+    images: ImagesMade,
+    sources: Array,
+    rows: Array,
+    cutoff: Cutoff | Radii | None,
+    closed: bool,
+    lattice: Lattice | None,
+) -> KeptList:
+    """Return a list at these positions as Warp's kernels take it."""
+    codes, made = images
+    of_pairs = _pair_cutoff(cutoff, closed)
+    turns = None if codes is None or lattice is None else _turns_now(codes, made, sources, rows, lattice)
+    fixed = lax.stop_gradient((sources, rows, turns, of_pairs, lattice))
+    return KeptList(topology.idx, count, topology.codes, *fixed, None)
+
+
+def kept_shifts(given: KeptList) -> Array:
+    """Return the lattice shifts of the slots of a list in a box, [m, capacity, d] whole floats, 0 in unused slots."""
+    if given.lattice is None:
+        raise TypeError("a list in open space has no shifts.")
+    lattice = given.lattice
+    used = given.idx < given.sources.shape[0]
+    neighbor = jnp.where(used, given.idx, 0)
+    if given.codes is None or given.turns is None:
+        shifts = nearest_shifts(given.sources[neighbor] - given.rows[:, None, :], lattice)
+    else:
+        image = jnp.where(used, given.codes.astype(jnp.int32), lattice.images.home)
+        table = jnp.asarray(lattice.images.shifts).astype(given.sources.dtype)
+        shifts = table[image] + given.turns[1][:, None] - given.turns[0][neighbor]
+    return jnp.where(used[..., None], shifts, 0)
 
 
 def _turns_now(
@@ -141,10 +199,22 @@ def _turns_now(
     return turns[0], turns[-1]
 
 
+@jax.custom_jvp
 @compile_program
 def norms(vectors: Array) -> Array:
-    largest = lax.stop_gradient(jnp.max(jnp.abs(vectors), axis=-1, initial=0))
+    """Return the lengths of vectors [..., d]; the derivative of a length of 0 is 0."""
+    columns = [vectors[..., k] for k in range(vectors.shape[-1])]  # reductions over so short an axis are slow
+    largest = functools.reduce(jnp.maximum, map(jnp.abs, columns))
     apart = largest > 0
     unit = jnp.where(apart, largest, 1)  # unscaled squares of tiny or huge lengths would leave the float range
-    square = jnp.sum((vectors / unit[..., None]) ** 2, axis=-1)
+    square = functools.reduce(jnp.add, ((x / unit) ** 2 for x in columns))
     return jnp.where(apart, unit * jnp.sqrt(jnp.where(apart, square, 1)), 0)
+
+
+@norms.defjvp
+def _norms_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (vectors,), (moved,) = primals, tangents
+    lengths = norms(vectors)
+    apart = jnp.where(lengths > 0, lengths, 1)
+    along = (vectors[..., k] / apart * moved[..., k] for k in range(vectors.shape[-1]))
+    return lengths, functools.reduce(jnp.add, along)

@@ -34,11 +34,14 @@ from jfrnn._geometry import (
     round_box,
     shape_of,
 )
+from jfrnn._search.edges import Edges, flat_edges, no_edges
 from jfrnn._search.exports import DenseNeighbors, check_total, flat_pairs, pair_total
 from jfrnn._search.geometry import ImageCodes, ImagesMade, lattice_shifts, norms, open_vectors, periodic_vectors
 from jfrnn._search.kept_options import KeptOptions
 from jfrnn._search.making import count_capacity, find_fields, round_capacity
 from jfrnn._search.problem import Problem
+from jfrnn._search.reverse import MOST_SLOTS, Reverse
+from jfrnn._search.topology import Topology, make_topology
 from jfrnn._search.verlet import Verlet, has_moved_too_far
 from jfrnn._tracing import Given, at_once, call_apart, compile_program, own_transfers
 
@@ -61,6 +64,8 @@ class NeighborList(KeptOptions):
         images: The periodic image of each slot (`ImageCodes`), 1 B per slot; None if the minimum image suffices.
         radii: Cutoffs per particle (`Radii`: sources [n], queries [m], the rule), or None with one cutoff.
         batch: System numbers (`Batch`: sources [n], queries [m] or None), or None; updates keep them.
+        reverse: Where pairs stand the other way round (`Reverse`), if the list was made with `reverse=True`; updates find it anew
+            whenever they rebuild the list.
         problem: The options of the search (`Problem`). Static.
     """
 
@@ -73,6 +78,7 @@ class NeighborList(KeptOptions):
     images: ImageCodes | None
     radii: Radii | None
     batch: Batch | None
+    reverse: Reverse | None
     problem: Problem = dataclasses.field(metadata={"static": True})
 
     def __repr__(self) -> str:
@@ -286,7 +292,7 @@ class NeighborList(KeptOptions):
         with own_transfers():
             if box is None or self.box_kind is None or 0 in (sources.shape[0], *self.idx.shape):
                 return jnp.zeros((*self.idx.shape, sources.shape[1]), jnp.int32)
-            return lattice_shifts(self.idx, self.count, self._images_made(), sources, rows, box, self.box_kind, self.half)
+            return lattice_shifts(self._topology(), self.count, self._images_made(), sources, rows, box, self.box_kind, self.half)
 
     def distances(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> tuple[Array, Array]:
         """Compute the distance to every neighbor.
@@ -307,6 +313,43 @@ class NeighborList(KeptOptions):
         """
         vectors, mask = self.vectors(positions, queries=queries, box=box)
         return norms(vectors), mask
+
+    def edges(self, positions: Array, total: int, *, queries: Array | None = None, box: Box | None = None) -> Edges:
+        """Return the pairs as edges of a graph, with their geometry, for graph networks inside jit.
+
+        Edges lead from neighbors j to particles i and are sorted by i, so `jax.ops.segment_sum(messages, edges.receivers, m,
+        indices_are_sorted=True)` sorts nothing; `messages` of edges outside the mask should be 0. With a skin, pairs beyond the
+        cutoff have edges too, which are not in the mask. In a periodic box each image of a neighbor has an edge of its own.
+
+        Args:
+            positions: As in `vectors`.
+            total: Number of edges, a static int: as in `pairs`. If the list holds more pairs, this raises outside jit. Inside jit,
+                all displacements are NaN then, and `status` says so; `require(total)` makes the list keep that bit.
+            queries: As in `vectors`.
+            box: As in `vectors`.
+
+        Returns:
+            An `Edges`: senders [total], receivers [total], displacement [total, d], shift [total, d], mask [total], status [].
+
+        Raises:
+            ValueError, TypeError: as in `vectors` and `pairs`; or the list has more than 2³¹ - 1 slots.
+            NeighborOverflowError, ValueError: as `vectors`.
+
+        Differentiable: displacements, to any order in positions, queries and box; derivatives gather, as those of `vectors`. Jit:
+        yes. vmap: yes.
+        """
+        if self.idx.size > MOST_SLOTS:
+            raise ValueError(
+                f"edges() numbers slots by int32, and this list has {self.idx.size}: take `vectors`, or fewer queries."
+            )
+        _, mask, shifts = self._geometry(*lax.stop_gradient((positions, queries, box)))
+        sources, rows = self._geometry_inputs(positions, queries)
+        total, box = self._check_total(total), self._box_now(box, sources)
+        if 0 in (sources.shape[0], *self.idx.shape, total):
+            return no_edges(self.idx.shape[0], self.source_count, sources, self.status, self.count, self.capacity, total)
+        with own_transfers():
+            given = self._topology(), self.count, self.status, mask, shifts, sources, rows, box
+            return flat_edges(*given, self.box_kind if box is not None else None, total)
 
     @overload
     def pairs(self, total: None = None) -> tuple[np.ndarray, np.ndarray]: ...
@@ -414,15 +457,19 @@ class NeighborList(KeptOptions):
 
     def _flat(self, total: int) -> tuple[Array, Array, Array]:
         """Return rows and sources of the pairs, padded to a static length, and the row offsets."""
+        self._check_known()
+        return flat_pairs(self.idx, self.count, self.source_count, self._check_total(total))
+
+    def _check_total(self, total: int) -> int:
+        """Return a static number of pairs that holds all of them, as far as that is known."""
         total = check_total(total)
         self._check_single()
-        self._check_known()
         if not isinstance(self.count, Tracer):
             with at_once():
                 held = int(jax.device_get(pair_total(self.count, self.capacity)))
             if held > total:
                 raise ValueError(f"total={total} is too small: the list holds {held} pairs. Pass total={held} or more.")
-        return flat_pairs(self.idx, self.count, self.source_count, total)
+        return total
 
     def _check_rows(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         if isinstance(self.status, Tracer):
@@ -481,9 +528,14 @@ class NeighborList(KeptOptions):
         cutoff = self.radii if self.cutoff is None else make_cutoff(self.cutoff, np.dtype(sources.dtype), self.closed)
         with own_transfers():
             if box is None or self.box_kind is None:
-                return *open_vectors(self.idx, self.count, sources, rows, cutoff, self.closed), None
+                return *open_vectors(self._topology(), self.count, sources, rows, cutoff, self.closed), None
             given = (self.box_kind, cutoff, self.closed, self.half)
-            return periodic_vectors(self.idx, self.count, self._images_made(), sources, rows, box, *given)
+            return periodic_vectors(self._topology(), self.count, self._images_made(), sources, rows, box, *given)
+
+    def _topology(self) -> Topology:
+        problem, codes = self.problem, None if self.images is None else self.images.codes
+        kind = problem.options, problem.source_count, problem.own_queries, self.radii
+        return make_topology(*kind, self.idx, codes, self.reverse)
 
     def _images_made(self) -> ImagesMade:
         made = None if self.images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
@@ -526,4 +578,4 @@ def _update(
 
 def _remake(nbrs: NeighborList, inputs: Inputs, capacity: int) -> NeighborList:
     """Make a new list with the options of this one."""
-    return dataclasses.replace(nbrs, **find_fields(inputs, nbrs.problem.options, capacity, nbrs.skin > 0))
+    return dataclasses.replace(nbrs, **find_fields(inputs, nbrs.problem.options, capacity, nbrs.skin > 0, nbrs.reverse is not None))

@@ -5,10 +5,11 @@ from jax import Array
 from jax.core import Tracer
 
 from jfrnn._engine import Inputs, Options, count_rows
-from jfrnn._geometry import Box, check_capacity, check_slack
+from jfrnn._geometry import Box, check_capacity, check_flag, check_slack
 from jfrnn._search.making import count_capacity, find_fields
 from jfrnn._search.neighbor_list import NeighborList
 from jfrnn._search.problem import check_problem
+from jfrnn._search.reverse import MOST_SLOTS
 from jfrnn._tracing import call_apart, own_transfers
 
 
@@ -27,6 +28,7 @@ def search(
     active: Array | None = None,
     capacity: int | None = None,
     slack: float = 1.0,
+    reverse: bool = False,
     backend: str = "auto",
 ) -> NeighborList:
     """Find every pair of particles closer than a cutoff, exactly.
@@ -65,6 +67,9 @@ def search(
         capacity: Slots per row, a static int. Required if positions are traced. Default: `slack` times the longest row, rounded up
             to a multiple of 8.
         slack: Factor >= 1 on the counted capacity, room for later motion.
+        reverse: Keep where each pair stands the other way round, 4 B per slot (and 8 B per source of half lists, lists of queries
+            and those with the rules "gather" and "scatter"), so that derivatives of `vectors`, `distances` and `edges` need not
+            find it in each call. They gather and never scatter in any case. `update` keeps it up to date.
         backend: "warp" (cells, compiled kernels, on CPU and NVIDIA GPUs), "hashgrid" (Warp's own `wp.HashGrid`, likewise), "jax"
             (cells, any device), "brute" (all n·m candidates), or "auto", the fastest measured on the platform: "warp" on the CPU
             and on NVIDIA GPUs (if Warp is missing "jax", with a warning), elsewhere "jax". The platform is that of the positions,
@@ -80,13 +85,13 @@ def search(
         RuntimeError: "warp" or "hashgrid" on a platform on which Warp cannot run.
         Overflow of a given capacity and non-finite coordinates are known only from data: see `status`, `overflow` and `check`.
 
-    Memory: 4 B per slot for the list, which keeps copies of what updates need: with a skin positions and queries, with a batch 4 B
-    and with cutoffs per particle one float each (with a skin two). It shares no memory with the given arrays, so they, or the list,
-    may be donated (`jax.jit(..., donate_argnums=)`). While searching, however large space is, "warp" takes at most 64 B and
-    "hashgrid" 84 B per particle, "jax" and "brute" 100 B per particle (float64: 125 B) and, for the block being processed, at most
-    64 MB on a CPU, elsewhere 1 GB or an eighth of the device's memory, whichever is less. With a box or a batch "warp" also copies
-    the positions, at most 20 B per particle (float64: 40 B); with cutoffs per particle it takes 140 B in all (float64: 180 B). See
-    `memory_plan`.
+    Memory: 4 B per slot for the list (8 B with `reverse`), which keeps copies of what updates need: with a skin positions and
+    queries, with a batch 4 B and with cutoffs per particle one float each (with a skin two). It shares no memory with the given
+    arrays, so they, or the list, may be donated (`jax.jit(..., donate_argnums=)`). While searching, however large space is, "warp"
+    takes at most 64 B and "hashgrid" 84 B per particle, "jax" and "brute" 100 B per particle (float64: 125 B) and, for the block
+    being processed, at most 64 MB on a CPU, elsewhere 1 GB or an eighth of the device's memory, whichever is less. With a box or a
+    batch "warp" also copies the positions, at most 20 B per particle (float64: 40 B); with cutoffs per particle it takes 140 B in
+    all (float64: 180 B). See `memory_plan`.
     Differentiable: the list is topology, without gradient; see `NeighborList.vectors`. Jit: yes, with capacity. vmap: yes, with
     capacity. Arrays that are sharded over a mesh are gathered on each device, and each does the whole work; `jfrnn.distributed`
     divides the work. `jax.export`: yes, with `disabled_checks=[jax.export.DisabledSafetyCheck.custom_call("jfrnn")]`; a process
@@ -114,9 +119,12 @@ def search(
     slack = check_slack(slack)
     if capacity is None:
         capacity = _count_capacity(inputs, problem.options, slack)
-    capacity = check_capacity(capacity)
+    capacity, reverse = check_capacity(capacity), check_flag("reverse", reverse)
+    rows = inputs.sources.shape[0] if inputs.queries is None else inputs.queries.shape[0]
+    if reverse and rows * capacity > MOST_SLOTS:
+        raise ValueError(f"reverse=True numbers slots by int32, got {rows} rows of {capacity} slots: search without.")
     with own_transfers():
-        fields = call_apart(lambda inputs: find_fields(inputs, problem.options, capacity, problem.skin > 0), inputs)
+        fields = call_apart(lambda inputs: find_fields(inputs, problem.options, capacity, problem.skin > 0, reverse), inputs)
     return NeighborList(**fields, problem=problem)
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine import Block, Slots
-from jfrnn._sums.fused import check, extremes
-from jfrnn._sums.relations import Listed, Relation, Searched, evaluate, is_fused
+from jfrnn._sums.fused import can_sum_list, check, extremes, extremes_of_list
+from jfrnn._sums.relations import Kept, Listed, Relation, Searched, evaluate, is_fused
 from jfrnn._sums.summation import bind_sum
 from jfrnn._sums.terms import Derived, Groups, Term, choose, fresh_labels, join, make_term
 from jfrnn._tracing import call_apart, compile_program
@@ -26,6 +26,8 @@ def bind_extremes(relation: Relation, term: Term, operands: Groups, largest: boo
     m, n = relation.sizes
     if isinstance(relation, Searched):
         check(relation.inputs, relation.options, term)
+    elif isinstance(relation, Kept) and not can_sum_list(relation.given, term):
+        relation = call_apart(Kept.listed, relation)
     find = functools.partial(_find, term=term, largest=largest)
     found = call_apart(lambda *given: find(given[0], operands=given[1]), lax.stop_gradient(relation), lax.stop_gradient(operands))
     results = []
@@ -57,6 +59,8 @@ def _element(term: Term, k: int) -> Derived:
 
 @functools.partial(compile_program, static_argnames=("term", "largest"))
 def _find(relation: Relation, term: Term, operands: Groups, largest: bool) -> list[_Best]:
+    if isinstance(relation, Kept):
+        return extremes_of_list(relation.given, term, operands, largest)
     if is_fused(relation, term):
         return extremes(relation.inputs, relation.options, term, operands, largest)
     m, n = relation.sizes

@@ -19,14 +19,17 @@ from jfrnn._engine import (
     MOST_IN_BOX,
     PLATFORMS,
     Inputs,
+    KeptList,
     Options,
     Search,
     as_float,
+    kept_sums,
     level_of_caller,
     pair_sums,
     prepare_search,
 )
 from jfrnn._geometry import Radii, unpack_turns
+from jfrnn._search import kept_shifts
 from jfrnn._sums.scalars import NoTranslationError, hash_of
 from jfrnn._sums.terms import POSITIONS, Groups, Term, join
 from jfrnn._sums.translate import input_name, output_name, translate
@@ -86,6 +89,22 @@ def check(inputs: Inputs, options: Options, term: Term) -> None:
         )
 
 
+def can_sum_list(given: KeptList, term: Term) -> bool:
+    """Say whether a term is summed over a list by this engine; warn if it has no translation."""
+    reason = _why_not(term, *_kind_of_list(given))
+    if isinstance(reason, NoTranslationError):
+        warnings.warn(
+            f"a pair sum over a list takes the slower engine 'jax': {reason}", RuntimeWarning, stacklevel=level_of_caller()
+        )
+    return reason is None
+
+
+def _kind_of_list(given: KeptList) -> tuple[np.dtype, tuple[bool, ...]]:
+    lattice = given.lattice
+    periodic = (False,) * given.sources.shape[1] if lattice is None else lattice.images.periodic
+    return np.dtype(given.sources.dtype), periodic
+
+
 def _kind(inputs: Inputs) -> tuple[np.dtype, tuple[bool, ...]]:
     """Return what a translation depends on besides its term: the dtype of the positions and the periodic axes."""
     return np.dtype(inputs.sources.dtype), (False,) * inputs.sources.shape[1] if inputs.box is None else inputs.box.periodic
@@ -116,8 +135,11 @@ def _exact_dtypes(dtype: np.dtype) -> set[np.dtype]:
 
 
 @functools.lru_cache(maxsize=256)
-def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: bool = False) -> Plan:
-    """Translate a term, or its negative, for positions of this dtype and shifts along periodic axes."""
+def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: bool = False, listed: bool = False) -> Plan:
+    """Translate a term, or its negative, for positions of this dtype and shifts along periodic axes.
+
+    `listed`: for the kernel of lists, which has positions as they are and shifts, also in a box.
+    """
 
     def of_pair(shift: Array, operands: Groups) -> Sequence[Array]:
         summands = term(jnp.asarray(True), jnp.where(np.array(periodic), shift, 0), operands)
@@ -125,7 +147,7 @@ def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: 
 
     translated = translate(jax.make_jaxpr(of_pair)(term.shift, term.operands))
     steps = tuple(Step(input_name(k, e), e) for k, e in translated.reads if k == 0)
-    at_hand = () if any(periodic) else POSITIONS  # in a box, the kernel holds wrapped positions instead
+    at_hand = () if any(periodic) and not listed else POSITIONS  # in a box, kernels of cells hold wrapped positions instead
     columns, values, before = [], [], 1
     for group, labels in zip(term.operands, ((), *term.labels), strict=True):
         reads = [(k - before, e) for k, e in translated.reads if before <= k < before + len(group)]
@@ -144,7 +166,9 @@ def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: 
         for e in range(math.prod(spec.shape))
     )
     text = TermText(translated.text, steps, values[0], values[1], values[2], sums)
-    turns = [((len(group), 0),) if steps else () for group in term.operands]  # the columns of turns follow those of the operands
+    turns = [
+        ((len(group), 0),) if steps and not listed else () for group in term.operands
+    ]  # the columns of turns follow those of the operands
     return Plan(text, columns[0], columns[1] + turns[1], columns[2] + turns[2], hash_of(tuple(text), dtype.name)[:20])
 
 
@@ -153,6 +177,33 @@ def sums(inputs: Inputs, options: Options, term: Term, operands: Groups, compens
     plan = make_plan(term, *_kind(inputs))
     found, totals, _ = _launch(prepare_search(inputs, options), options, plan, operands, compensated)
     return _unpack(term, found, totals)
+
+
+def sums_of_list(given: KeptList, term: Term, operands: Groups, compensated: bool, apart: bool) -> list[Array]:
+    """Sum a term over the pairs of a list; with `given.reversal` over those of its sources."""
+    plan = make_plan(term, *_kind_of_list(given), listed=True)
+    found, totals, _ = kept_sums(given, plan.text, plan.key, _values_of_list(given, plan, operands), compensated, apart)
+    return _unpack(term, found, totals)
+
+
+def extremes_of_list(given: KeptList, term: Term, operands: Groups, largest: bool) -> list[tuple[Array, Array, Array | None]]:
+    """Find the largest summands over the pairs of a list, as `extremes` does over those of a search."""
+    plan = make_plan(term, *_kind_of_list(given), not largest, listed=True)
+    values = _values_of_list(given, plan, operands)
+    found, _, which = kept_sums(given, plan.text, plan.key, values, False, extremes=True)
+    source, place, shifts = which[..., 0], which[..., 1], None
+    if given.lattice is not None:
+        codes = None if given.codes is None else jnp.take_along_axis(given.codes, place, axis=1)
+        shifts = kept_shifts(given._replace(idx=source, codes=codes))
+    return _split_extremes(term, found, source, shifts)
+
+
+def _values_of_list(given: KeptList, plan: Plan, operands: Groups) -> tuple[Array, Array, Array]:
+    n, m = given.sources.shape[0], given.rows.shape[0]
+    sizes = (None, m, n) if given.reversal is None else (None, n, m)
+    groups = zip(operands, (plan.shared, plan.own, plan.others), sizes, strict=True)
+    shared, own, others = (_pack(*group, given.sources.dtype) for group in groups)
+    return shared, own, others
 
 
 def extremes(
@@ -173,6 +224,10 @@ def extremes(
         mine, theirs = (unpack_turns(x, lattice.dim) for x in (wrapped.query_turns, wrapped.turns))
         shifts = jnp.asarray(lattice.images.shifts)[which[..., 1]] + mine[:, None] - theirs.at[source].get(mode="clip")
         shifts = shifts.astype(values.dtype)
+    return _split_extremes(term, values, source, shifts)
+
+
+def _split_extremes(term: Term, values: Array, source: Array, shifts: Array | None) -> list[tuple[Array, Array, Array | None]]:
     ends = np.cumsum([math.prod(like.shape) for like in term.summands])[:-1]
     of_each = (values, source) if shifts is None else (values, source, shifts)
     parts = [jnp.split(x, ends, axis=1) for x in of_each] + [[None] * len(term.summands)]

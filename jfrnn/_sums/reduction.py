@@ -12,11 +12,11 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn._engine import Inputs, Options, hide_inactive, is_decidable
-from jfrnn._geometry import Box, Images, Lattice, Radii, Status, check_cutoff, make_cutoffs, make_lattice, translation
-from jfrnn._search import ROWS_ARE_WHOLE, NeighborList
+from jfrnn._geometry import Box, Images, Lattice, Radii, Status, check_cutoff, make_cutoff, make_cutoffs, make_lattice, translation
+from jfrnn._search import MOST_SLOTS, ROWS_ARE_WHOLE, NeighborList, is_native, kept_list
 from jfrnn._sums.extremes import bind_extremes
 from jfrnn._sums.pair_function import call_with_pair
-from jfrnn._sums.relations import Listed, Relation, Searched, are_finite, mark_rows, one_or_nan
+from jfrnn._sums.relations import Kept, Listed, Relation, Searched, are_finite, mark_rows, one_or_nan
 from jfrnn._sums.summation import bind_sum
 from jfrnn._sums.terms import OF_QUERIES, OF_SOURCES, Groups, Labels, Summand, Term, choose, fresh_labels, trace
 from jfrnn._tracing import Given, Tree, call_apart, compile_program, on_device
@@ -69,15 +69,33 @@ def pairs_of_list(
         has = "a cutoff per particle" if nbrs.cutoff is None else f"cutoff={nbrs.cutoff}"
         raise ValueError(f"cutoff must be None or that of the list, which has {has}, got {cutoff!r}.")
     own = nbrs.own_queries
-    fixed, fixed_rows, fixed_box = lax.stop_gradient((sources, rows, box))
-    _, mask, shifts = nbrs._geometry(fixed, fixed_rows if own else None, fixed_box)
+    fixed_rows = lax.stop_gradient(rows)
     directionless = not own and (nbrs.radii is None or nbrs.radii.rule not in ("gather", "scatter"))
-    relation = Listed(nbrs.idx, mask, shifts, nbrs.source_count, symmetric=directionless and not nbrs.half)
+    relation = _relation_of_list(nbrs, *lax.stop_gradient((sources, rows, box)), symmetric=directionless and not nbrs.half)
     lattice = _lattice(nbrs._box_now(box, sources), nbrs.box_kind, sources)
     largest = nbrs.cutoff if nbrs.radii is None else make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest
     data = nbrs.status, nbrs.count if nbrs.masked and not own else None, fixed_rows
     sources, rows, mark = _prepare_marks(sources, rows if own else None, _good_rows_of_list, data)
     return Pairs(relation, nbrs.half, sources, rows, lattice, largest, directionless, mark)
+
+
+def _relation_of_list(nbrs: NeighborList, sources: Array, rows: Array, box: Box | None, symmetric: bool) -> Kept | Listed:
+    """Return the pairs of a list: Warp's kernels decide about them while they sum, or all is decided at once."""
+    topology, nobody = nbrs._topology(), 0 in (*nbrs.idx.shape, nbrs.source_count)
+    if nobody or not is_native(topology, nbrs.box_kind, nbrs.half) or nbrs.idx.size > MOST_SLOTS:
+        _, mask, shifts = nbrs._geometry(sources, rows if nbrs.own_queries else None, box)
+        return Listed(nbrs.idx, mask, shifts, nbrs.source_count, symmetric)
+    nbrs._check_known(spared=ROWS_ARE_WHOLE)
+    cutoff = nbrs.radii if nbrs.cutoff is None else make_cutoff(nbrs.cutoff, nbrs.dtype, nbrs.closed)
+    lattice = _lattice(nbrs._box_now(box, sources), nbrs.box_kind, sources)
+    given = call_apart(
+        lambda nbrs, sources, rows, cutoff, lattice: kept_list(
+            nbrs._topology(), nbrs.count, nbrs._images_made(), sources, rows, cutoff, nbrs.closed, lattice
+        ),
+        *(nbrs, sources, rows, cutoff, lattice),
+    )
+    known = nbrs.reverse if nbrs.reverse is not None and nbrs.reverse.starts is not None else None
+    return Kept(given, known, symmetric)
 
 
 @compile_program
@@ -162,7 +180,7 @@ def reduce_pairs(
     operands = operands._replace(shared=(*closed_over, *operands.shared))
     if reduce != "sum":
         leaves = bind_extremes(pairs.relation, term, operands, reduce == "max")
-    elif pairs.half and isinstance(pairs.relation, Listed):
+    elif pairs.half and not isinstance(pairs.relation, Searched):
         leaves = _sums_of_half(pairs.relation, term, operands, compensated)
     else:
         leaves = bind_sum(pairs.relation, term, operands, compensated)
@@ -171,8 +189,11 @@ def reduce_pairs(
 
 
 @functools.partial(compile_program, static_argnames=("term", "compensated"))
-def _sums_of_half(listed: Listed, term: Term, operands: Groups, compensated: bool) -> list[Array]:
+def _sums_of_half(listed: Listed | Kept, term: Term, operands: Groups, compensated: bool) -> list[Array]:
     """Sum over a half list and over its mirror image; a particle's pair with itself counts once."""
+    if isinstance(listed, Kept):
+        both = listed, dataclasses.replace(listed, apart=True, flipped=True)
+        return [x + y for x, y in zip(*(bind_sum(each, term, operands, compensated) for each in both), strict=True)]
     apart = listed.idx != lax.iota(jnp.int32, listed.idx.shape[0])[:, None]
     apart = apart if listed.shifts is None else apart | (listed.shifts != 0).any(axis=-1)
     mirrored = dataclasses.replace(listed, mask=listed.mask & apart, flipped=True)

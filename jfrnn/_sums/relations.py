@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jfrnn._engine import FOLD_GROUP, Block, Inputs, Options, Slots, Visit, fold_pairs
+from jfrnn._engine import FOLD_GROUP, Block, Inputs, KeptList, Options, Slots, Visit, fold_pairs, kept_mask
 from jfrnn._geometry import Batch, Radii, compensated_sum, rounded_sum
+from jfrnn._search import Reverse, find_reverse, kept_shifts
 from jfrnn._sums.fused import is_fused as is_fusible
 from jfrnn._sums.fused import sums as fused_sums
+from jfrnn._sums.fused import sums_of_list
 from jfrnn._sums.terms import Groups, Term
 from jfrnn._tracing import Tree
 
@@ -139,7 +141,61 @@ class Listed:
         return lax.fori_loop(0, -(-m // size), fold_block, out)
 
 
-Relation = Searched | Listed
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Kept:
+    """The pairs of a list whose slots Warp's kernels decide while they sum.
+
+    Attributes:
+        given: The list at present positions.
+        slots_by_source: The slots of each source (`Reverse`), if the list is not its own mirror image and they are known, or None.
+        symmetric: Whether exchanging i and j gives the same pairs. Static.
+        flipped: As in `Listed`. Static.
+        apart: Whether a particle's pair with itself, without a shift, is left out. Static.
+    """
+
+    given: KeptList
+    slots_by_source: Reverse | None
+    symmetric: bool = dataclasses.field(metadata={"static": True})
+    flipped: bool = dataclasses.field(default=False, metadata={"static": True})
+    apart: bool = dataclasses.field(default=False, metadata={"static": True})
+
+    @property
+    def periodic(self) -> bool:
+        """Whether pairs have lattice shifts."""
+        return self.given.lattice is not None
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Number of rows and of sources; exchanged if flipped."""
+        m, n = self.given.idx.shape[0], self.given.sources.shape[0]
+        return (n, m) if self.flipped else (m, n)
+
+    def reverse(self) -> "Kept":
+        """Return the same pairs with i and j exchanged and shifts negated."""
+        return self if self.symmetric else dataclasses.replace(self, flipped=not self.flipped)
+
+    def listed(self) -> Listed:
+        """Return the same pairs, decided at once, for array programming."""
+        given, n = self.given, self.given.sources.shape[0]
+        mask, shifts = kept_mask(given), kept_shifts(given) if self.periodic else None
+        if self.apart:
+            apart = given.idx != lax.iota(jnp.int32, given.idx.shape[0])[:, None]
+            mask = mask & (apart if shifts is None else apart | (shifts != 0).any(axis=-1))
+        return Listed(given.idx, mask, shifts, n, self.symmetric, self.flipped)
+
+    def directed(self) -> KeptList:
+        """Return the list, with the slots of each source if i and j are exchanged."""
+        if not self.flipped:
+            return self.given
+        given = self.given
+        found = self.slots_by_source or find_reverse(given.idx, None, 1, given.sources.shape[0], mutual=False, native=True)
+        if found.starts is None or found.lengths is None:
+            raise TypeError("a list that is its own mirror image is never flipped.")
+        return given._replace(reversal=(found.slots, found.starts, found.lengths))
+
+
+Relation = Searched | Listed | Kept
 
 
 def is_fused(relation: Relation, term: Term) -> TypeGuard[Searched]:
@@ -163,6 +219,8 @@ def sum_pairs(relation: Relation, term: Term, operands: Groups, compensated: boo
     """
     adder = _Adder(compensated)
     rows = relation.sizes[0]
+    if isinstance(relation, Kept):
+        return sums_of_list(relation.directed(), term, operands, compensated, relation.apart)
     if is_fused(relation, term):
         return fused_sums(relation.inputs, relation.options, term, operands, compensated)
     start = [adder.zeros(() if total else (rows,), x) for x, total in zip(term.summands, term.totals, strict=True)]
@@ -224,7 +282,7 @@ def are_finite(points: Array) -> Array:
     return functools.reduce(jnp.logical_and, (jnp.isfinite(points[:, k]) for k in range(points.shape[1])))
 
 
-def evaluate(relation: Relation, term: Term, operands: Groups, block: Block, slots: Slots) -> list[Array]:
+def evaluate(relation: Searched | Listed, term: Term, operands: Groups, block: Block, slots: Slots) -> list[Array]:
     """Evaluate a term on slots [b, g] of a block: [b, g, ...], 0 in masked slots."""
     mine, theirs = (operands.others, operands.own) if relation.flipped else (operands.own, operands.others)
     of_query, of_source = tuple(x[block.query] for x in mine), tuple(x[slots.source] for x in theirs)

@@ -158,8 +158,17 @@ class Scalars:
             return first
         if operation == "neg" and self.nodes[first].form == "-{0}":
             return self.nodes[first].operands[0]
+        if operation == "div" and self._is(first, 1) and (root := self._root(last)) is not None:
+            known = self._numbers.get((_INFIX["div"], first, root))  # 1 / a² for a known 1 / a, as derivatives of 1 / a have it
+            if known is not None:
+                return self.apply("mul", (known, known), dtype)
         reciprocal = self._reciprocal(last) if operation == "div" else None
         return None if reciprocal is None else self.apply("mul", (first, reciprocal), dtype)
+
+    def _root(self, number: int) -> int | None:
+        """Return the node a for a * a."""
+        form, operands, *_ = self.nodes[number]
+        return operands[0] if form == _INFIX["mul"] and operands[0] == operands[1] else None
 
     def _reciprocal(self, number: int) -> int | None:
         """Return 1 / a for a constant, or a choice of constants as in the derivative of max; XLA multiplies by it too."""

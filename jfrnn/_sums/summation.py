@@ -16,10 +16,10 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from jfrnn._sums.fused import check
-from jfrnn._sums.relations import Relation, Searched, sum_pairs
+from jfrnn._sums.fused import can_sum_list, check
+from jfrnn._sums.relations import Kept, Relation, Searched, sum_pairs
 from jfrnn._sums.terms import Derived, Groups, Term, choose, is_moving, join, tangent, transpose
-from jfrnn._tracing import Aval, Internal, compile_program, on_device, result_aval, unvarying_types, vary, varying_axes
+from jfrnn._tracing import Aval, Internal, call_apart, compile_program, on_device, result_aval, unvarying_types, vary, varying_axes
 
 Structure = Any  # the `PyTreeDef` of a relation, which type checkers do not accept as a type
 
@@ -39,6 +39,8 @@ def _bind(leaves: list[Array], operands: Groups, term: Term, structure: Structur
     relation = jax.tree.unflatten(structure, leaves)
     if isinstance(relation, Searched):
         check(relation.inputs, relation.options, term)
+    elif isinstance(relation, Kept) and not can_sum_list(relation.given, term):
+        leaves, structure = jax.tree.flatten(call_apart(Kept.listed, relation))  # once: derivatives are summed in the same way
     axes = varying_axes((leaves, flat))
     leaves, flat = vary((leaves, flat), axes)
     return _pair_sum_p.bind(*leaves, *flat, term=term, structure=structure, compensated=compensated)

@@ -72,7 +72,10 @@ def pair_sum(
             or (float64) int64; cutoffs per particle work on the CPU only. If fn or its derivative has no translation, "auto" warns.
         neighbors: A list to use instead of a search: its pairs that are closer than its cutoff at these positions, as in
             `NeighborList.vectors`. A half list gives whole sums too. Leave out the options with which it was made. If the list may
-            lack pairs (see `NeighborList.check`), this raises outside jit.
+            lack pairs (see `NeighborList.check`), this raises outside jit. Over lists that "warp" made, on the CPU and on CUDA, a
+            kernel reads the rows and evaluates the translated fn, with cutoffs per particle too; over others, and with a warning
+            if fn has no translation, array programming does. On a GPU it reads fastest if particles that follow each other are
+            close (`sort_order`).
 
     Returns:
         A pytree as fn returns it, leaves [m, ...]. Rows of inactive particles, and rows without neighbors, are 0 ("max": -inf,
@@ -94,17 +97,19 @@ def pair_sum(
     the error is at most 4 eps·sqrt(k) of the sum of |terms| for k up to 60 000; compensated a few eps of the sum itself plus some
     eps²·k of the sum of |terms|. "warp" on the CPU adds 4 to 16 partial sums, and then these pairwise; its bits depend on the
     processor's vector width, not on the number of threads. On CUDA it adds the terms among up to 704 candidates one by one, then
-    their sums. The error bound is the same for all.
+    their sums; over a list one by one, or as eight partial sums where rows are few. The error bound is the same for all.
     In fn, denormal numbers count as zero on the CPU, as everywhere in XLA; pairs are decided with them. Matrix products in fn, such
     as r @ r, have full precision, also on GPUs whose default is TF32, unless fn sets `precision`.
     Memory: that of `search` without its list, the results, and at most 16 MB (float32) for each array that fn needs for the pairs
     being processed; nothing grows with the number of pairs, nor in derivatives. "warp" needs instead two copies of the numbers that
-    fn reads of each j and one of those of each i, except coordinates in open space, and in a box one more number for each. See
+    fn reads of each j and one of those of each i, except coordinates in open space, and in a box one more number for each; over a
+    list a copy of the coordinates and numbers of each j, padded to multiples of 16 B, and one of those of each i. See
     `memory_plan`.
     Differentiable: to every order, forward and backward, in positions, queries, values, query_values, the lattice vectors of the
     box and whatever fn closes over; which particles are neighbors is constant. A derivative is a sum over the same pairs, gathered
-    by each particle (scattered for a list that is not its own mirror image). "max" and "min" have the derivative of the extreme
-    pair, of several the one with the smallest j.
+    by each particle. For a list that is not its own mirror image, the slots of each j are found by a sort, unless the list keeps
+    them (`reverse` of `search`); array programming scatters there. "max" and "min" have the derivative of the extreme pair, of
+    several the one with the smallest j.
     Jit: yes; outside of it, define fn once, since each new definition is compiled anew. vmap: yes, one after the other. Source:
     sums over neighbors as in SPH (Gingold & Monaghan 1977, doi:10.1093/mnras/181.3.375); derivatives by transposition (Radul et al.
     2023, doi:10.1145/3571236).

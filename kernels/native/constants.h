@@ -38,6 +38,14 @@ constexpr bool FROM_PLACES = false;  // the term reads coordinates of j, and no 
 constexpr int FEW_TILE = 1024, FEW_QUERIES = 16;
 // Of searches with a cutoff per particle (see jfrnn/kernels/levels.py).
 constexpr int RULE = 0, GROUPS = 8, HALVINGS = 5, PADDING = 16;
+// Of lists that are kept (see jfrnn/kernels/reverse.py and kept.py).
+constexpr int CODE_BYTES = 1;     // of the code of an image, 0: pairs have one image
+constexpr int RADII = 0;          // whose cutoff is that of a pair (kept.h), 0: all have one
+constexpr int WIDTH = 3;          // numbers of each slot
+constexpr int LENGTH = 4;         // numbers of each source
+constexpr bool REVERSED = false;  // rows are those of the sources of a list
+constexpr bool ALIGNED = true;    // rows of ids begin at multiples of 16 bytes
+constexpr int LANES_PER_ROW = 8;  // of CUDA
 // Of triangles (see jfrnn/kernels/_triangles.py, triangles_cpu.py and triangles_cuda.py).
 constexpr int LIMBS = 14, ROOM = 1202, STRIDE = 1;
 constexpr int MOST_CELLS = 8, MOST_ALONG = 64, MOST_ALONG_LOG2 = 6;

@@ -49,11 +49,12 @@ struct Added {
         for (int k = 0; k < SUMMANDS; ++k)
             add_number(sum[k], error[k], is_pair, summand[k]);
     }
-    // Adds up the sums of all lanes into those of the first one, always in the same order; totals stay as they are.
+    // Adds up the sums of WIDTH lanes into those of the first one, always in the same order; totals stay as they are.
+    template <int WIDTH = 32>
     JFRNN_MEMBER void reduce_over_warp() {
 #pragma unroll
         for (int k = 0; k < SUMMANDS; ++k)
-            for (int step = 16; !IS_TOTAL[k] && step > 0; step /= 2) {
+            for (int step = WIDTH / 2; !IS_TOTAL[k] && step > 0; step /= 2) {
                 const real other = __shfl_down_sync(ALL, sum[k], step), other_error = __shfl_down_sync(ALL, error[k], step);
                 add_number(sum[k], error[k], true, other);
                 error[k] += other_error;
@@ -86,11 +87,12 @@ struct Added {
 
 struct Largest : LargestSummands {
     JFRNN_MEMBER explicit Largest(int n) : LargestSummands(n) {}
-    // Finds the largest of all lanes for the first one.
+    // Finds the largest of WIDTH lanes for the first one.
+    template <int WIDTH = 32>
     JFRNN_MEMBER void reduce_over_warp() {
 #pragma unroll
         for (int k = 0; k < SUMMANDS; ++k)
-            for (int step = 16; step > 0; step /= 2) {
+            for (int step = WIDTH / 2; step > 0; step /= 2) {
                 const real other = __shfl_down_sync(ALL, best[k], step);
                 const int source = __shfl_down_sync(ALL, source_of[k], step), code = __shfl_down_sync(ALL, code_of[k], step);
                 take(k, other, source, code, true);

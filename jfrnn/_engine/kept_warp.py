@@ -1,0 +1,198 @@
+"""Lists that are kept, by Warp's kernels: which slots hold a pair at present positions, and sums over these pairs."""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jfrnn._engine.launch import Call, Shapes, kernel
+from jfrnn._engine.operands import lattice_numbers
+from jfrnn._engine.plans import Clear, Launch, Plan, share
+from jfrnn._engine.sum_results import SumsOf
+from jfrnn._geometry import LARGEST_TURN, Cutoff, Cutoffs, Lattice
+from jfrnn.kernels import kept
+from jfrnn.kernels.pair_sum_cpu import TermText
+
+_EXCHANGED = {"gather": "scatter", "scatter": "gather"}
+_LIST = ("rows", "points", "cutoff", "steps", "idx", "count", "codes", "slots", "starts", "lengths")  # what a call is given
+
+
+class KeptList(NamedTuple):
+    """A list at present positions; a pytree.
+
+    Attributes:
+        idx: [m, capacity] int32 sources.
+        counts: [m] int32 true counts.
+        codes: Image codes [m, capacity], or None.
+        sources: Positions [n, d].
+        rows: Positions of the rows [m, d].
+        turns: Lattice vectors between the cell and the sources and the rows, in whole floats [n, d] and [m, d], with codes.
+        cutoff: One for all, or one per particle.
+        lattice: The box, or None.
+        reversal: Slots by source, where they begin, and how many: the sums are then those of the sources, over the rows that list
+            them. Or None.
+    """
+
+    idx: Array
+    counts: Array
+    codes: Array | None
+    sources: Array
+    rows: Array
+    turns: tuple[Array, Array] | None
+    cutoff: Cutoff | Cutoffs
+    lattice: Lattice | None
+    reversal: tuple[Array, Array, Array] | None
+
+
+def kept_mask(given: KeptList) -> Array:
+    """Say which slots hold a pair that is closer than the cutoff, exactly: [m, capacity] bool."""
+
+    def on(cuda: bool) -> Callable[[KeptList], Array]:
+        def call(given: KeptList) -> Array:
+            dims, kind = {"mask": given.idx.shape, "info": 2}, _kind_of(given, 8 if cuda else 0)
+            return _mask_callable(kind)(*_operands(given, kind, 0, None), output_dims=dims)[0]
+
+        return call
+
+    return lax.platform_dependent(given, cpu=on(False), cuda=on(True))
+
+
+def kept_sums(
+    given: KeptList,
+    term: TermText,
+    key: str,
+    values: tuple[Array, Array, Array],
+    compensated: bool,
+    apart: bool = False,
+    extremes: bool = False,
+) -> tuple[Array, Array, Array]:
+    """Sum a term over the pairs of a list, as `jfrnn._engine.warp_sums.pair_sums` does over those of a search.
+
+    `apart`: a particle's pair with itself, without a shift, is left out. Of extremes, the place in the row stands for the code of
+    an image.
+    """
+
+    def on(cuda: bool) -> Callable[[KeptList, tuple[Array, Array, Array]], tuple[Array, Array, Array]]:
+        def call(given: KeptList, values: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            shared, own, others = values
+            rows = (given.sources if given.reversal is not None else given.rows).shape[0]
+            lanes = kept.lanes_of(rows) if cuda else 0
+            kind, results = _kind_of(given, lanes), SumsOf(term, rows, kept.slots(rows, lanes), compensated, extremes)
+            call_sums = _sum_callable(kind, term, key, compensated, extremes, apart)
+            operands = _operands(given, kind, term.columns, others)
+            return results.unpack(*call_sums(*operands, shared, own, output_dims=results.dims() | {"info": 2})[:3])
+
+        return call
+
+    return lax.platform_dependent(given, values, cpu=on(False), cuda=on(True))
+
+
+class _Extra(NamedTuple):
+    """What a program carries besides its kind, so that a call is described."""
+
+    closed: bool
+    images: int
+    kind: kept.ListKind
+
+
+def _kind_of(given: KeptList, lanes: int) -> _Extra:
+    cutoff, lattice, is_reversed = given.cutoff, given.lattice, given.reversal is not None
+    periodic = 0 if lattice is None else (1 if lattice.images.nearest else 2) + (0 if lattice.images.orthogonal else 2)
+    width = 0 if given.codes is None else given.codes.dtype.itemsize
+    rule = cutoff.rule if isinstance(cutoff, Cutoffs) else ""
+    rule = _EXCHANGED.get(rule, rule) if is_reversed else rule
+    dim, double, aligned = given.sources.shape[1], given.sources.dtype == jnp.float64, given.idx.shape[1] % 4 == 0
+    kind = kept.ListKind(dim, double, cutoff.scaled, periodic, width, rule, is_reversed, aligned, lanes)
+    return _Extra(cutoff.closed, 1 if lattice is None else lattice.images.total, kind)
+
+
+def _operands(given: KeptList, extra: _Extra, columns: int, others: Array | None) -> list[Array]:
+    """Return what kernels read of a list, in the order of `_LIST`, with columns of numbers of each source."""
+    kind, dtype = extra.kind, given.sources.dtype
+    sources, rows, turns = given.sources, given.rows, given.turns or (None, None)
+    if kind.reversed:
+        sources, rows, turns = rows, sources, turns[::-1]
+    of_sources, of_rows = _radii_of(given, kind)
+    points = _beside(kind.length(columns), sources, others if columns else None, turns[0], of_sources)
+    own = _beside(kind.own_length, rows, turns[1], of_rows)
+    cutoff = given.cutoff.largest if isinstance(given.cutoff, Cutoffs) else given.cutoff.radius
+    numbers, steps = [jnp.reshape(jnp.asarray(cutoff, dtype), 1)], jnp.zeros(1, dtype)
+    if given.lattice is not None:
+        images, dim = given.lattice.images, kind.dim
+        numbers += [lattice_numbers(given.lattice, jnp.ones(dim, dtype), jnp.zeros((), dtype))]
+        numbers += [jnp.full(1, 2 * LARGEST_TURN + max(images.reach), dtype)]
+        steps = jnp.asarray(images.shifts).astype(dtype).reshape(-1) if given.codes is not None else steps
+    nothing = jnp.zeros(1, jnp.int32)
+    codes = nothing if given.codes is None else given.codes
+    return [own, points, jnp.concatenate(numbers), steps, given.idx, given.counts, codes, *(given.reversal or [nothing] * 3)]
+
+
+def _radii_of(given: KeptList, kind: kept.ListKind) -> tuple[Array | None, Array | None]:
+    """Return the cutoffs beside sources and rows: halves if that of a pair is their mean, 0 if they are not read."""
+    if not isinstance(given.cutoff, Cutoffs):
+        return None, None
+    half = given.sources.dtype.type(0.5 if kind.rule == "mean" else 1)
+    both = zip((given.cutoff.sources, given.cutoff.queries), (given.sources, given.rows), strict=True)
+    found = [jnp.zeros(len(points), points.dtype) if x is None else x * half for x, points in both]
+    return (found[1], found[0]) if kind.reversed else (found[0], found[1])
+
+
+def _beside(length: int, *parts: Array | None) -> Array:
+    """Return arrays of points side by side, and zeros up to a length."""
+    given = [x if x.ndim == 2 else x[:, None] for x in parts if x is not None]
+    rows, filled = jnp.pad(given[0], ((0, 0), (0, length - given[0].shape[1]))), given[0].shape[1]
+    for column in (x[:, k] for x in given[1:] for k in range(x.shape[1])):  # on a GPU, XLA's concatenation takes twice as long
+        rows, filled = jnp.where(np.arange(length) == filled, column[:, None], rows), filled + 1
+    return rows
+
+
+@kernel
+def _mask_callable(extra: _Extra) -> Call:
+    results = {"mask": np.bool_, "info": np.int32}
+    return Call(f"jfrnn_kept_mask_{_name(extra)}", _LIST, results, functools.partial(_plan_mask, extra))
+
+
+@kernel
+def _sum_callable(extra: _Extra, term: TermText, key: str, compensated: bool, extremes: bool, apart: bool) -> Call:
+    scalar, flags = (
+        np.float64 if extra.kind.double else np.float32,
+        {"compensated": compensated, "extremes": extremes, "apart": apart},
+    )
+    name = "_".join(["jfrnn_kept_sums", _name(extra), *(flag for flag, on in flags.items() if on), key])
+    results = dict.fromkeys(("sums", "totals", "errors"), scalar) | {"info": np.int32}
+    plan = functools.partial(_plan_sums, extra, term, key, compensated, extremes, apart)
+    return Call(name, (*_LIST, "shared_values", "own_values"), results, plan)
+
+
+def _name(extra: _Extra) -> str:
+    return f"{extra.kind.name}{'_closed' * extra.closed}_{extra.images}"
+
+
+def _numbers(extra: _Extra, shapes: Shapes, apart: bool) -> dict[str, int]:
+    (m, capacity), n = shapes["idx"], shapes["points"][0]
+    m = shapes["rows"][0] if extra.kind.reversed else m
+    sizes = {"m": m, "n": n, "capacity": capacity, "images": extra.images}
+    return sizes | {"closed": int(extra.closed), "apart": int(apart)}
+
+
+def _launch(extra: _Extra, found: kept.Kernel, numbers: dict[str, int]) -> Plan:
+    launch = (
+        Launch(found, kept.threads(numbers["m"], extra.kind.lanes))
+        if extra.kind.cuda
+        else share(found, numbers["m"], kept.ROWS_AT_ONCE)
+    )
+    return Plan([launch] if extra.kind.cuda else [Clear("info", 8), launch], numbers)
+
+
+def _plan_mask(extra: _Extra, shapes: Shapes, _: int) -> Plan:
+    return _launch(extra, kept.mask_kernel(extra.kind), _numbers(extra, shapes, False))
+
+
+def _plan_sums(
+    extra: _Extra, term: TermText, key: str, compensated: bool, extremes: bool, apart: bool, shapes: Shapes, _: int
+) -> Plan:
+    found = kept.sum_kernel(extra.kind, term, key, compensated, extremes)
+    return _launch(extra, found, _numbers(extra, shapes, apart))

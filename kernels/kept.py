@@ -1,0 +1,113 @@
+"""Lists that are kept: which of their slots hold a pair now, and sums over these pairs.
+
+On the CPU, LANES slots of a row are taken at a time. Numbers of their sources are read four at a time, where these stand, and rows
+and columns of what was read are exchanged in registers. On CUDA, a lane serves a row, or eight lanes where rows are few. A lane
+takes four slots at a time: it reads their ids at once, then the numbers of their sources. Nothing is sorted: these numbers may
+stand anywhere, and rows that follow each other share them if particles that follow each other are close.
+"""
+
+import functools
+from typing import NamedTuple
+
+from jfrnn.kernels._native import SPACES, program
+from jfrnn.kernels._program import Entry, Kernel, declare
+from jfrnn.kernels.cells_cuda import GRID
+from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
+
+ROWS_AT_ONCE = 64  # that a thread of the CPU takes
+_FEW_ROWS = 1 << 17  # up to which eight lanes of CUDA serve a row; of more rows, each has a lane of its own
+_BLOCK = 128
+RADII = {"gather": 1, "scatter": 2, "either": 3, "both": 4, "mean": 5}
+
+
+class ListKind(NamedTuple):
+    """What is static about a list, apart from shapes.
+
+    Attributes:
+        dim: Dimension of the positions.
+        double: Whether they are float64.
+        scaled: Whether the cutoff is so small or large that squares need a unit.
+        periodic: As in `jfrnn.kernels._native.program`.
+        code_bytes: Of the image code of a slot; 0 without.
+        rule: Whose cutoff is that of a pair, one of `RADII`; "" if all have one.
+        reversed: Whether rows are those of the sources of the list.
+        aligned: Whether rows of ids begin at multiples of 16 bytes.
+        lanes: How many lanes of CUDA serve a row; 0 on the CPU.
+    """
+
+    dim: int
+    double: bool
+    scaled: bool
+    periodic: int
+    code_bytes: int
+    rule: str
+    reversed: bool
+    aligned: bool
+    lanes: int
+
+    @property
+    def cuda(self) -> bool:
+        """Whether it is on CUDA."""
+        return self.lanes > 0
+
+    @property
+    def name(self) -> str:
+        """Tells kernels of such lists from others."""
+        flags = {"scaled": self.scaled, "reversed": self.reversed, "aligned": self.aligned, self.rule: bool(self.rule)}
+        parts = [f"{self.dim}d", "f64" if self.double else "f32", *(flag for flag, on in flags.items() if on)]
+        return "_".join(parts) + f"{SPACES[self.periodic]}_{self.code_bytes}{f'_cuda{self.lanes}' if self.cuda else '_cpu'}"
+
+    @property
+    def own_length(self) -> int:
+        """How many numbers of a row are read to decide."""
+        return self.dim + (self.dim if self.code_bytes else 0) + bool(self.rule)
+
+    def length(self, columns: int) -> int:
+        """Return how many numbers each source has, of which a term reads some: several are loaded at once."""
+        least = self.dim + columns + (self.dim if self.code_bytes else 0) + bool(self.rule)
+        at_once = 2 if self.double and self.cuda else 4
+        return 2 if least == 2 and self.cuda else -(-least // at_once) * at_once
+
+    def constants(self, columns: int) -> dict[str, int]:
+        """Return the named integers of a program."""
+        found = {"PERIODIC": self.periodic, "SCALED": self.scaled, "CODE_BYTES": self.code_bytes, "REVERSED": self.reversed}
+        found |= {"RADII": RADII.get(self.rule, 0), "SUM": self.rule == "mean", "ALIGNED": self.aligned}
+        return found | {"LENGTH": self.length(columns), "LANES_PER_ROW": max(self.lanes, 1), "QUERY_CHUNK": ROWS_AT_ONCE, **GRID}
+
+
+def lanes_of(rows: int) -> int:
+    """Return how many lanes of CUDA serve a row where terms are summed: so many that few rows keep all of them busy."""
+    return 8 if rows <= _FEW_ROWS else 1
+
+
+def slots(rows: int, lanes: int) -> int:
+    """Return the number of partial sums that make up a sum over all pairs."""
+    return -(-rows // (32 // lanes if lanes else ROWS_AT_ONCE))
+
+
+def threads(rows: int, lanes: int) -> int:
+    """Return the threads of a launch on CUDA."""
+    return 32 * slots(rows, lanes)
+
+
+@functools.lru_cache(256)
+def mask_kernel(kind: ListKind) -> Kernel:
+    """Return the kernel that tells which slots hold a pair now."""
+    constants = {"OTHERS": 0, "SUMS": 0, "LIST": 0, **kind.constants(0)}
+    text = program(kind.double, kind.dim, "kept_mask.cuh" if kind.cuda else "kept_mask_cpu.h", **constants)
+    entry = Entry("KeptMask.run", _BLOCK if kind.cuda else 1, 8)
+    return declare(f"kept_mask_{kind.name}", text, entry, cuda=kind.cuda, fused=kind.cuda)[0]
+
+
+@functools.lru_cache(512)
+def sum_kernel(kind: ListKind, term: TermText, key: str, compensated: bool, extremes: bool) -> Kernel:
+    """Return the kernel that sums a term; `key` tells it from all others in the names of programs.
+
+    `extremes`: it finds the largest summands instead; `errors` [m, width, 2] then gets their sources (n: there is none), and their
+    places in the row.
+    """
+    constants = {"LIST": 0, **kind.constants(term.columns), **constants_of(term, compensated, extremes, turned=False)}
+    header = "kept_sums.cuh" if kind.cuda else "kept_sums_cpu.h"
+    text = program(kind.double, kind.dim, header, given=term_header(term, kind.double, turned=False), **constants)
+    name = f"kept_sums_{kind.name}{'_compensated' * compensated}{'_extremes' * extremes}_{key}"
+    return declare(name, text, Entry("KeptSums.run", _BLOCK if kind.cuda else 1, 8), cuda=kind.cuda, fused=kind.cuda)[0]

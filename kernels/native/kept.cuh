@@ -1,0 +1,100 @@
+// Lists that are kept, on CUDA: a few lanes serve a row, each of which takes some of its entries at a time.
+#pragma once
+#include "kept.h"
+#include "loads.cuh"
+
+constexpr int AT_A_TIME = LENGTH * sizeof(real) > 16 ? 2 : 4;  // entries of a lane
+
+struct KeptLane : Kept {
+    const int lane, row;  // of a row
+    const bool is_row;
+
+    JFRNN_MEMBER explicit KeptLane(const KeptArguments& given)
+        : Kept(given),
+          lane((int)(thread_index() % LANES_PER_ROW)),
+          row((int)(thread_index() / LANES_PER_ROW)),
+          is_row(row < given.m) {}
+
+    struct Entries {
+        int ids[AT_A_TIME], codes[AT_A_TIME];
+        bool used[AT_A_TIME];
+    };
+    // Reads the entries from `place` on: at once, where rows begin at multiples of 16 bytes.
+    JFRNN_MEMBER void read(long long first, int place, int all, Entries& some) const {
+#pragma unroll
+        for (int k = 0; k < AT_A_TIME; ++k) {
+            some.used[k] = place + k < all;
+            some.ids[k] = some.codes[k] = 0;
+        }
+        if constexpr (ALIGNED && !REVERSED && !CODED) {
+            struct alignas(4 * AT_A_TIME) Ids {
+                int at[AT_A_TIME];
+            } ids;
+            if (some.used[0]) {
+                load_words((const Ids*)(idx + first + place), &ids);
+#pragma unroll
+                for (int k = 0; k < AT_A_TIME; ++k)
+                    some.ids[k] = some.used[k] ? ids.at[k] : 0;
+            }
+        } else
+#pragma unroll
+            for (int k = 0; k < AT_A_TIME; ++k)
+                if (some.used[k])
+                    read_entry(first + place + k, some.ids[k], some.codes[k]);
+    }
+    // Calls `visit(place, id, numbers, verdict, pair)` for the entries of the row that this lane takes. Those in doubt come once more,
+    // after they were decided: so rare a call stands outside of what every entry takes. `settle(place, pairs)` comes last: one bit for
+    // each of the entries from `place` on.
+    template <class Visit, class Settle>
+    JFRNN_MEMBER void walk(const OwnPoint& own, Visit visit, Settle settle) const {
+        const long long first = is_row ? first_entry(row) : 0;
+        const int all = is_row ? entries(row) : 0;
+        Entries some;
+        read(first, AT_A_TIME * lane, all, some);
+        for (int place = AT_A_TIME * lane; place < all; place += AT_A_TIME * LANES_PER_ROW) {
+            real numbers[AT_A_TIME][LENGTH];
+#pragma unroll
+            for (int k = 0; k < AT_A_TIME; ++k)
+                load_numbers<LENGTH>(points + (long long)LENGTH * some.ids[k], numbers[k]);
+            Entries next;
+            read(first, place + AT_A_TIME * LANES_PER_ROW, all, next);
+            unsigned int open = 0, pairs = 0;
+#pragma unroll
+            for (int k = 0; k < AT_A_TIME; ++k) {
+                const Verdict verdict = judged(own, numbers[k], some.ids[k], some.codes[k], some.used[k]);
+                open |= verdict.open ? 1u << k : 0;
+                pairs |= verdict.sure ? 1u << k : 0;
+                visit(place + k, some.ids[k], numbers[k], verdict, verdict.sure);
+            }
+            for (; open; open &= open - 1) {
+                const int k = __ffs(open) - 1;
+                int id, code;
+                read_entry(first + place + k, id, code);
+                real doubted[LENGTH];
+                load_numbers<LENGTH>(points + (long long)LENGTH * id, doubted);
+                const Verdict verdict = judged(own, doubted, id, code, true);
+                if (decide(own, doubted, verdict)) {
+                    pairs |= 1u << k;
+                    visit(place + k, id, doubted, verdict, true);
+                }
+            }
+            settle(place, pairs);
+            some = next;
+        }
+    }
+    JFRNN_MEMBER Verdict judged(const OwnPoint& own, const real* numbers, int id, int code, bool used) const {
+        real step[3] = {0, 0, 0};
+        for (int a = 0; CODED && a < DIM; ++a)
+            step[a] = steps[DIM * code + a];
+        return judge(own, numbers, step, apart && id == row, used);
+    }
+    JFRNN_MEMBER bool decide(const OwnPoint& own, const real* numbers, const Verdict& verdict) const {
+        int shift[3] = {0, 0, 0};
+        real p[3] = {0, 0, 0};
+        for (int k = 0; k < DIM; ++k) {
+            p[k] = numbers[k];
+            shift[k] = SHIFTED ? (int)verdict.shift[k] : 0;
+        }
+        return is_exact_pair(own, p, RADII > OF_ROW ? numbers[RADII > OF_ROW ? RADIUS : 0] : real(0), shift);
+    }
+};

@@ -1,0 +1,182 @@
+// Which slots of a list that is kept hold a pair now: one text for a slot, on CUDA, and for LANES of them, on the CPU.
+//
+// Rows of the list have OWN_LENGTH numbers: coordinates as they are, then turns along each axis (PERIODIC == 2), then the cutoff of i
+// (RADII). Sources have LENGTH: coordinates, OTHERS numbers that a term reads, turns and the cutoff of j. `cutoff` holds the largest
+// cutoff, the lattice, and the largest number of a shift. `steps` are the shifts of image codes. REVERSED: rows are those of the sources
+// of the list, whose slots are `lengths` many in `slots` from `starts` on, and j is who has such a slot.
+#pragma once
+#include "exact.h"
+#include "math.h"
+
+struct KeptArguments {
+    const real *rows, *points, *cutoff, *steps;
+    const int *idx, *count, *codes, *slots, *starts, *lengths;
+    int m, n, capacity, images, closed, apart;
+};
+
+template <bool WIDE>
+struct NumberOfSlots {
+    typedef Math::f32 type;
+};
+template <>
+struct NumberOfSlots<true> {
+    typedef Math::f64 type;
+};
+typedef NumberOfSlots<DOUBLE>::type Number;  // one, or LANES of them
+
+constexpr bool CODED = PERIODIC == 2;
+constexpr int TURNS = DIM + OTHERS, RADIUS = TURNS + (CODED ? DIM : 0);  // where they stand among the numbers of a source
+constexpr int OWN_TURNS = DIM, OWN_RADIUS = OWN_TURNS + (CODED ? DIM : 0), OWN_LENGTH = OWN_RADIUS + (RADII > 0);
+constexpr int OF_ROW = 1, OF_SOURCE = 2, LARGER = 3, SMALLER = 4,
+              MEAN = 5;  // RADII: the cutoff of a pair; of MEAN halves are given
+
+struct Kept : KeptArguments, Space {
+    static constexpr real LEAST = DOUBLE ? real(0x1p-459) : real(0x1p-40f);  // below, squares of cutoffs might underflow
+    real inside, outside;  // squares below are surely those of pairs, squares above surely not, where all cutoffs are one
+    real moved;            // the most that a shift of 1 along each axis adds up to in a component
+    real most;             // the largest number of a shift for which pairs are decided
+
+    JFRNN_MEMBER explicit Kept(const KeptArguments& given) : KeptArguments(given), Space(given.cutoff), moved(0), most(0) {
+        inside = step_radius * step_radius * (1 - 8 * step_eps);
+        outside = step_radius * step_radius * (1 + 8 * step_eps);
+        for (int k = 0; SHIFTED && k < DIM; ++k) {
+            real sum = 0;
+            for (int l = 0; l < DIM; ++l)
+                sum += size_of(lattice.vector(l, k));
+            moved = sum > moved ? sum : moved;
+        }
+        if constexpr (SHIFTED)
+            most = cutoff[LATTICE_END];
+    }
+    JFRNN_INLINE static Number larger(Number x, Number y) { return Math::select(Math::gt(x, y), x, y); }
+    JFRNN_FUNCTION real size_of(real x) { return x < 0 ? -x : x; }
+
+    JFRNN_MEMBER int code_at(long long slot) const {
+        if constexpr (CODE_BYTES == 1)
+            return ((const unsigned char*)codes)[slot];
+        else if constexpr (CODE_BYTES == 2)
+            return ((const short*)codes)[slot];
+        else
+            return CODE_BYTES == 4 ? codes[slot] : 0;
+    }
+    // The source and the image code that an entry of a row names: the id in a slot of the list, or (REVERSED) a slot.
+    JFRNN_MEMBER void read_entry(long long entry, int& source, int& code) const {
+        const long long slot = REVERSED ? slots[entry] : entry;
+        source = REVERSED ? (int)(slot / capacity) : idx[entry];
+        code = !CODED ? 0 : REVERSED ? images - 1 - code_at(slot) : code_at(slot);
+    }
+    JFRNN_MEMBER long long first_entry(int row) const { return REVERSED ? starts[row] : (long long)row * capacity; }
+    JFRNN_MEMBER int entries(int row) const { return REVERSED ? lengths[row] : count[row] < capacity ? count[row] : capacity; }
+
+    // What is known of a row.
+    struct OwnPoint {
+        real q[3], turn[3], radius;
+    };
+    JFRNN_MEMBER OwnPoint own_point(int row) const {
+        OwnPoint own{{0, 0, 0}, {0, 0, 0}, 0};
+        const real* const from = rows + (long long)OWN_LENGTH * row;
+        for (int k = 0; k < DIM; ++k) {
+            own.q[k] = from[k];
+            if constexpr (CODED)
+                own.turn[k] = from[OWN_TURNS + k];
+        }
+        if constexpr (RADII > 0)
+            own.radius = from[OWN_RADIUS];
+        return own;
+    }
+
+    // What is found out about slots.
+    struct Verdict {
+        Number shift[3];
+        Math::flag sure, open;
+    };
+    // `step` (CODED): the shift of the image code of each slot; `same`: the source of a slot is its row.
+    JFRNN_INLINE Verdict judge(
+        const OwnPoint& own, const Number* numbers, const Number* step, Math::flag same, Math::flag used) const {
+        Number d[3], square{};
+        Verdict found{};
+        for (int k = 0; k < DIM; ++k)
+            d[k] = numbers[k] - own.q[k];
+        Number off{};
+        if constexpr (SHIFTED) {
+            Number spans{}, size{};
+            for (int k = 0; k < DIM; ++k) {
+                found.shift[k] =
+                    lattice.periodic(k) ? (CODED ? step[k] + own.turn[k] - numbers[TURNS + k] : nearest(d, k)) : Number{};
+                spans = larger(Math::abs(found.shift[k]), spans);
+                size = larger(Math::abs(d[k]), size);
+            }
+            used = Math::both(used, Math::le(spans, Math::of(most)));
+            used = Math::both(used, Math::inverse(Math::both(same, Math::eq(spans, Number{}))));
+            // twice the most that a component is off by (jfrnn/_geometry/lattice.py)
+            off = (size + (spans + real(1)) * moved) * (16 * step_eps * step_scale);
+            for (int k = 0; k < DIM; ++k)
+                d[k] = d[k] + translation(found.shift, k);
+        } else
+            used = Math::both(used, Math::inverse(same));
+        for (int k = 0; k < DIM; ++k) {
+            const Number scaled = d[k] * step_scale;
+            square = square + scaled * scaled;
+        }
+        Number inner = Math::of(inside), outer = Math::of(outside);
+        if constexpr (RADII > 0) {
+            const Number radius = cutoff_of(own, numbers) * step_scale, least = Math::of(LEAST);
+            const Math::flag clear = Math::gt(radius, larger(off, least));
+            const Number near = radius - off, far = larger(radius, least) + off;
+            inner = Math::select(clear, near * near * (1 - 32 * step_eps), Math::of(real(-1)));
+            outer = far * far * (1 + 32 * step_eps);
+        } else if constexpr (SHIFTED) {
+            const Number near = larger(Math::of(step_radius) - off, Number{}), far = Math::of(step_radius) + off;
+            inner = near * near * (1 - 16 * step_eps);
+            outer = far * far * (1 + 16 * step_eps);
+        }
+        found.sure = Math::both(used, Math::lt(square, inner));
+        found.open = Math::both(Math::both(used, Math::le(square, outer)), Math::inverse(found.sure));
+        return found;
+    }
+    JFRNN_INLINE Number nearest(const Number* d, int k) const {
+        Number along = d[k] * lattice.transform(k, k);
+        if constexpr (SKEWED) {
+            along = d[0] * lattice.transform(0, k);
+            for (int l = 1; l < DIM; ++l)
+                along = along + d[l] * lattice.transform(l, k);
+        }
+        return -Math::round_even(along);
+    }
+    JFRNN_INLINE Number translation(const Number* shift, int k) const {
+        Number sum = shift[k] * lattice.vector(k, k);
+        if constexpr (SKEWED)
+            for (int l = 0; l < DIM; ++l)
+                if (l != k)
+                    sum = sum + shift[l] * lattice.vector(l, k);
+        return sum;
+    }
+    JFRNN_INLINE Number cutoff_of(const OwnPoint& own, const Number* numbers) const {
+        const Number mine = Math::of(own.radius);
+        if constexpr (RADII == OF_ROW)
+            return mine;
+        const Number theirs = numbers[RADII > OF_ROW ? RADIUS : 0];
+        return RADII == OF_SOURCE ? theirs
+               : RADII == LARGER  ? Math::max(mine, theirs)
+               : RADII == SMALLER ? Math::min(mine, theirs)
+                                  : mine + theirs;
+    }
+    // Decides exactly about a source at `p`, whose cutoff is `theirs`.
+    JFRNN_MEMBER bool is_exact_pair(const OwnPoint& own, const real* p, real theirs, const int* shift) const {
+        real r = radius, more = 0;
+        if constexpr (RADII > 0) {
+            const bool first = RADII == OF_ROW || RADII == MEAN || (own.radius > theirs) == (RADII == LARGER);
+            r = RADII != OF_SOURCE && first ? own.radius : theirs;
+            more = RADII == MEAN ? theirs : real(0);
+        }
+        if constexpr (!SHIFTED)
+            return exact_pair(own.q, p, r, more, closed);
+        int whole_numbers[3] = {shift[0], shift[1], shift[2]};
+        for (int k = 0; SKEWED && k < DIM; ++k) {
+            whole_numbers[k] = 0;
+            for (int l = 0; l < DIM; ++l)
+                whole_numbers[k] += shift[l] * lattice.number(l, k);
+        }
+        return Exact::image_pair(own.q, p, r, more, closed, whole_numbers, lattice);
+    }
+};

@@ -1,0 +1,150 @@
+// Lists that are kept, on the CPU: LANES slots of a row at a time, whose pairs are told, or what a term makes of them.
+#pragma once
+#include "kept.h"
+#include "lanes.h"
+
+static Math::flag truths(unsigned int bits) {
+    Math::flag lanes;
+    __builtin_memcpy(&lanes, &bits, sizeof lanes);
+    return lanes;
+}
+
+// Of LANES slots: their sources, the numbers of these, and which of them are pairs.
+struct KeptSlots {
+    const int* ids;
+    int places;  // their places in the row, from `places` on
+    Number numbers[LENGTH];
+    Kept::Verdict verdict;
+    unsigned int pairs;
+};
+
+template <class Visitor>
+struct KeptRows : Kept {
+    static constexpr bool FLUSHED = !SCALED && RADII == 0;  // else what decides may be so small as to be flushed to zero
+    int* const next;                                        // chunk of rows, which threads hand themselves
+
+    KeptRows(const KeptArguments& given, int* next) : Kept(given), next(next) {}
+    Visitor& visitor() { return *(Visitor*)this; }
+
+    // Reads LENGTH numbers of each source: four at a time, and then exchanges rows and columns in registers.
+    JFRNN_INLINE void read_points(const int* ids, Number* numbers) const {
+#if defined(__x86_64__)
+        if constexpr (!DOUBLE && LENGTH % 4 == 0) {
+            typedef float four __attribute__((vector_size(16)));
+            typedef float eight __attribute__((vector_size(32)));
+            for (int c = 0; c < LENGTH; c += 4) {
+                auto row = [&](int l) {
+                    four x;
+                    __builtin_memcpy(&x, points + (long long)LENGTH * ids[l] + c, 16);
+                    return x;
+                };
+                auto two = [&](int l) { return __builtin_shufflevector(row(l), row(l + 4), 0, 1, 2, 3, 4, 5, 6, 7); };
+                Number a, b, d, e;
+                if constexpr (LANES == 16) {
+                    auto all = [&](int l) {
+                        const eight low = two(l), high = two(l + 8);
+                        return __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+                    };
+                    a = all(0), b = all(1), d = all(2), e = all(3);
+                    exchange16(a, b, d, e, numbers + c);
+                } else {
+                    a = two(0), b = two(1), d = two(2), e = two(3);
+                    exchange8(a, b, d, e, numbers + c);
+                }
+            }
+            return;
+        }
+#endif
+        for (int c = 0; c < LENGTH; ++c)
+            for (int l = 0; l < LANES; ++l)
+                numbers[c][l] = points[(long long)LENGTH * ids[l] + c];
+    }
+    template <class Vector>
+    JFRNN_INLINE static void exchange16(Vector a, Vector b, Vector d, Vector e, Number* to) {
+        const Vector al = __builtin_shufflevector(a, b, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29);
+        const Vector ah = __builtin_shufflevector(a, b, 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);
+        const Vector dl = __builtin_shufflevector(d, e, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29);
+        const Vector dh = __builtin_shufflevector(d, e, 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);
+        to[0] = __builtin_shufflevector(al, dl, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29);
+        to[1] = __builtin_shufflevector(al, dl, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+        to[2] = __builtin_shufflevector(ah, dh, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29);
+        to[3] = __builtin_shufflevector(ah, dh, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+    }
+    template <class Vector>
+    JFRNN_INLINE static void exchange8(Vector a, Vector b, Vector d, Vector e, Number* to) {
+        const Vector al = __builtin_shufflevector(a, b, 0, 8, 1, 9, 4, 12, 5, 13);
+        const Vector ah = __builtin_shufflevector(a, b, 2, 10, 3, 11, 6, 14, 7, 15);
+        const Vector dl = __builtin_shufflevector(d, e, 0, 8, 1, 9, 4, 12, 5, 13);
+        const Vector dh = __builtin_shufflevector(d, e, 2, 10, 3, 11, 6, 14, 7, 15);
+        to[0] = __builtin_shufflevector(al, dl, 0, 1, 8, 9, 4, 5, 12, 13);
+        to[1] = __builtin_shufflevector(al, dl, 2, 3, 10, 11, 6, 7, 14, 15);
+        to[2] = __builtin_shufflevector(ah, dh, 0, 1, 8, 9, 4, 5, 12, 13);
+        to[3] = __builtin_shufflevector(ah, dh, 2, 3, 10, 11, 6, 7, 14, 15);
+    }
+
+    // Calls `visit` with all entries of a row, LANES at a time; those in doubt are decided.
+    template <class Visit>
+    JFRNN_INLINE void walk(int row, const OwnPoint& own, Visit visit) const {
+        const long long first = first_entry(row);
+        const int all = entries(row);
+        KeptSlots some;
+        int last[LANES];  // ids, where the row ends among them
+        for (int b = 0; b < all; b += LANES) {
+            const unsigned int there = lanes_before(all - b);
+            some.places = b;
+            Number step[3] = {Number{}, Number{}, Number{}};
+            some.ids = idx + first + b;
+            if (REVERSED || CODED || b + LANES > all) {
+                some.ids = last;
+                for (int l = 0; l < LANES; ++l) {
+                    int code = 0;
+                    last[l] = 0;
+                    if (b + l < all)
+                        read_entry(first + b + l, last[l], code);
+                    for (int k = 0; CODED && k < DIM; ++k)
+                        step[k][l] = steps[DIM * code + k];
+                }
+            }
+            read_points(some.ids, some.numbers);
+            const ints ids = lanes_from(some.ids);
+            const Math::flag same = apart ? __builtin_convertvector(ids == row, Math::flag) : Math::flag{};
+            some.verdict = judge(own, some.numbers, step, same, truths(there));
+            some.pairs = bits_of_flags(some.verdict.sure);
+            if (unsigned int open = bits_of_flags(some.verdict.open))
+                some.pairs |= decide(own, some, open);
+            visit(some);
+        }
+    }
+    __attribute__((noinline)) unsigned int decide(const OwnPoint& own, const KeptSlots& some, unsigned int open) const {
+        unsigned int pairs = 0;
+        if constexpr (FLUSHED)
+            floats.keep();
+        for (; open; open &= open - 1) {
+            const int l = __builtin_ctz(open);
+            real p[3] = {0, 0, 0};
+            int shift[3] = {0, 0, 0};
+            for (int k = 0; k < DIM; ++k) {
+                p[k] = some.numbers[k][l];
+                shift[k] = SHIFTED ? (int)some.verdict.shift[k][l] : 0;
+            }
+            const real theirs = RADII > OF_ROW ? some.numbers[RADII > OF_ROW ? RADIUS : 0][l] : real(0);
+            pairs |= is_exact_pair(own, p, theirs, shift) ? 1u << l : 0;
+        }
+        if constexpr (FLUSHED)
+            floats.flush();
+        return pairs;
+    }
+    void run() {
+        if constexpr (FLUSHED)
+            floats.flush();
+        for (;;) {
+            const int chunk = __atomic_fetch_add(next, 1, __ATOMIC_RELAXED);
+            if ((long long)chunk * QUERY_CHUNK >= m)
+                break;
+            const int begin = chunk * QUERY_CHUNK, end = m - begin < QUERY_CHUNK ? m : begin + QUERY_CHUNK;
+            for (int row = begin; row < end; ++row)
+                visitor().serve(row, own_point(row));
+            visitor().finish_chunk(chunk);
+        }
+    }
+};

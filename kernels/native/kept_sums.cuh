@@ -1,0 +1,54 @@
+// Sums over the pairs of a list that is kept, on CUDA.
+#pragma once
+#include "kept.cuh"
+#include "reduction.cuh"
+
+struct KeptSumsArguments {
+    const real *rows, *points, *cutoff, *steps;
+    const int *idx, *count, *codes, *slots, *starts, *lengths;
+    const real *shared_values, *own_values;
+    real *sums, *totals, *errors;
+    int m, n, capacity, images, closed, apart;
+
+    JFRNN_MEMBER KeptArguments of_list() const {
+        return {rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, m, n, capacity, images, closed, apart};
+    }
+};
+struct KeptSums : KeptLane {
+    const real *shared_values, *own_values;
+    const Results results;
+
+    JFRNN_MEMBER explicit KeptSums(const KeptSumsArguments& a)
+        : KeptLane(a.of_list()),
+          shared_values(a.shared_values),
+          own_values(a.own_values),
+          results{a.sums, a.errors, a.n, a.totals} {}
+
+    // Of extremes, the place in the row stands for the code of an image.
+    JFRNN_MEMBER void run() const {
+        const int lane_of_warp = threadIdx.x & 31;
+        const long long warp = thread_index() >> 5;
+        if (warp * (32 / LANES_PER_ROW) >= m)
+            return;
+        for (int t = lane_of_warp; t < 2 * TOTALS; t += 32)
+            results.totals[2ll * TOTALS * warp + t] = 0;
+        __syncwarp();
+        const OwnPoint own = own_point(is_row ? row : 0);
+        const Term term(shared_values);
+        const Term::Own own_part = term.own(own_values + (long long)(is_row ? row : 0) * OWN, own.q);
+        Reduction reduction(n);
+        auto visit = [&](int place, int id, const real* numbers, const Verdict& verdict, bool pair) {
+            number summand[SUMMANDS];
+            auto column = [&](int c) -> number { return c < OTHERS ? numbers[DIM + c] : verdict.shift[STEP_AXES[c - OTHERS]]; };
+            term.evaluate(own_part, numbers, column, summand);
+            reduction.add(summand, pair, [&](int& source, int& code) {
+                source = id;
+                code = place;
+            });
+        };
+        walk(own, visit, [](int, unsigned int) {});
+        __syncwarp();
+        reduction.reduce_over_warp<LANES_PER_ROW>();
+        reduction.store(results, {lane_of_warp, row, (int)warp, is_row && lane == 0, true, true});
+    }
+};

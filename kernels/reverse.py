@@ -1,0 +1,37 @@
+"""Where the pairs of a list stand the other way round: the slot of (j, i) for each slot of (i, j), or the slots of each source."""
+
+import functools
+
+from jfrnn.kernels._native import program
+from jfrnn.kernels._program import Entry, Kernel, declare
+
+ROWS_AT_ONCE = 64  # that a thread of the CPU takes
+LANES_PER_SLOT = 8  # on CUDA
+
+
+@functools.cache
+def reverse_kernels(code_bytes: int, cuda: bool) -> tuple[Kernel, Kernel]:
+    """Return what clears, and finds, the reverse slots of a list whose image codes take so many bytes, 0 where there are none."""
+    header, block = ("reverse.cuh", 256) if cuda else ("reverse_cpu.h", 1)
+    text = program(False, 3, header, CODE_BYTES=code_bytes, QUERY_CHUNK=ROWS_AT_ONCE)
+    entries = (Entry(f"Reverse.{method}", block, 4) for method in ("clear", "run"))
+    clear, find = declare(f"reverse_{'cuda' if cuda else 'cpu'}_{code_bytes}", text, *entries, cuda=cuda)
+    return clear, find
+
+
+@functools.cache
+def collect_kernel(width: int, double: bool, by_source: bool, cuda: bool) -> Kernel:
+    """Return the kernel that sums `width` numbers of each slot for its source.
+
+    `by_source`: slots are sorted by source; otherwise each source has a row of them.
+    """
+    name = f"collect_{'cuda' if cuda else 'cpu'}_{width}_{'f64' if double else 'f32'}{'_sorted' * by_source}"
+    text = program(double, 3, "collect.h", WIDTH=width, REVERSED=by_source, QUERY_CHUNK=ROWS_AT_ONCE)
+    return declare(name, text, Entry("Collect.run", 128 if cuda else 1, 8), cuda=cuda)[0]
+
+
+@functools.cache
+def transpose_kernel() -> Kernel:
+    """Return the kernel that sorts the slots of a list by source, on the CPU."""
+    text = program(False, 3, "reverse_cpu.h", CODE_BYTES=0, QUERY_CHUNK=ROWS_AT_ONCE)
+    return declare("transpose_cpu", text, "Transpose.run")[0]

@@ -1,0 +1,49 @@
+"""Lists that are kept, on CUDA, as far as a machine without a GPU can tell: their kernels compile for one."""
+
+import pytest
+
+from jfrnn._engine.start import load_warp
+from jfrnn.kernels import _compile, kept, reverse
+from jfrnn.kernels.pair_sum_cpu import Step, Sum, TermText, Value
+
+TEXT = "const auto v0 = x * y;\nconst auto o = v0 + s;\n"
+KINDS = [
+    kept.ListKind(3, False, False, 0, 0, "", False, True, 1),
+    kept.ListKind(3, False, False, 1, 0, "", False, True, 8),
+    kept.ListKind(2, False, True, 1, 0, "mean", False, False, 8),
+    kept.ListKind(3, False, False, 2, 1, "", True, True, 8),
+    kept.ListKind(3, True, True, 4, 2, "either", False, True, 1),
+    kept.ListKind(2, True, False, 3, 0, "", False, True, 8),
+]
+
+
+def compiles(kernel):
+    load_warp()
+    return f".entry {kernel.name}(" in _compile.find_binary(kernel.program, "cpu", arch=90).read_text()
+
+
+def term_of(kind):
+    dtype = "float64" if kind.double else "float32"
+    steps = (Step("s", 0),) if kind.periodic else ()
+    text = TEXT if kind.periodic else TEXT.replace("+ s", "+ c")
+    others = (Value("x", dtype, 1), Value("c", dtype))
+    return TermText(text, steps, (), (Value("y", dtype, 0),), others, (Sum("o", False), Sum("o", True)))
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=[kind.name for kind in KINDS])
+def test_masks_and_sums_compile(kind):
+    assert kind.reversed or compiles(kept.mask_kernel(kind))
+    for compensated, extremes in ((False, False), (True, False)):
+        assert compiles(kept.sum_kernel(kind, term_of(kind), f"test_{bool(kind.periodic)}", compensated, extremes))
+    largest = term_of(kind)._replace(sums=(Sum("o", False),))
+    assert compiles(kept.sum_kernel(kind, largest, f"largest_{bool(kind.periodic)}", False, True))
+
+
+@pytest.mark.parametrize("code_bytes", [0, 1, 2, 4])
+def test_reverse_slots_compile(code_bytes):
+    assert all(map(compiles, reverse.reverse_kernels(code_bytes, True)))
+
+
+@pytest.mark.parametrize("by_source", [False, True])
+def test_sums_by_source_compile(by_source):
+    assert compiles(reverse.collect_kernel(3, by_source, by_source, True))

@@ -1,0 +1,177 @@
+"""Reverse slots: each pair's slot the other way round, and derivatives of the geometry of a list that gather and never scatter."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+import jfrnn
+
+BACKENDS = ["warp", "jax"]
+BOXES = {"open": None, "nearest": [1.0, 1.0, 1.0], "images": [0.7, 0.5, 1.0]}
+KINDS = {
+    "full": {},
+    "self": {"include_self": True},
+    "half": {"half": True},
+    "gather": {"radius_rule": "gather"},
+    "either": {"radius_rule": "either"},
+    "queries": {"queries": True},
+}
+
+
+def make(kind, backend, box="open", dtype=np.float64, reverse=True, n=40, skin=0.0):
+    rng = np.random.default_rng(3)
+    options, x = dict(KINDS[kind]), jnp.asarray(rng.random((n, 3)) * np.array(BOXES[box] or [1, 1, 1]), dtype)
+    cutoff = jnp.asarray(rng.uniform(0.1, 0.4, n), dtype) if "radius_rule" in options else 0.4
+    q = jnp.asarray(rng.random((17, 3)), dtype) if options.pop("queries", False) else None
+    lattice = None if BOXES[box] is None else jfrnn.Box(np.array(BOXES[box], dtype))
+    options |= {"slack": 1.5, "box": lattice, "queries": q, "reverse": reverse, "backend": backend, "skin": skin}
+    return jfrnn.search(x, cutoff, **options), x, q
+
+
+def slots_of(nbrs):
+    """Return the slots of each source, as sets, from what the list keeps."""
+    n, total = nbrs.source_count, nbrs.idx.size
+    kept = jax.tree.map(np.asarray, nbrs.reverse)
+    if kept.starts is None:
+        return [set(row[row < total].tolist()) for row in kept.slots]
+    return [set(kept.slots[a : a + k].tolist()) for a, k in zip(kept.starts[:n], kept.lengths[:n], strict=True)]
+
+
+SOME = [*((kind, box, "warp") for kind in KINDS for box in BOXES), ("half", "open", "jax"), ("queries", "images", "jax")]
+
+
+@pytest.mark.parametrize(("kind", "box", "backend"), SOME)
+def test_each_source_has_all_its_slots(kind, box, backend):
+    nbrs, *_ = make(kind, backend, box)
+    flat = np.asarray(nbrs.idx).reshape(-1)
+    assert (flat < nbrs.source_count).sum() > 100
+    assert slots_of(nbrs) == [set(np.flatnonzero(flat == j).tolist()) for j in range(nbrs.source_count)]
+
+
+MUTUAL = [*((kind, box, "warp") for kind in ("full", "self", "either") for box in BOXES), ("self", "images", "jax")]
+
+
+@pytest.mark.parametrize(("kind", "box", "backend"), MUTUAL)
+def test_each_image_has_its_own_reverse(kind, box, backend):
+    nbrs, x, _ = make(kind, backend, box)
+    rows, slots = np.asarray(nbrs.idx), np.asarray(nbrs.reverse.slots).reshape(-1)
+    shifts, used = np.asarray(nbrs.shifts(x)).reshape(-1, 3), rows.reshape(-1) < 40
+    row = np.repeat(np.arange(40), rows.shape[1])
+    np.testing.assert_array_equal(slots[slots[used]], np.flatnonzero(used))
+    np.testing.assert_array_equal(row[slots[used]], rows.reshape(-1)[used])
+    np.testing.assert_array_equal(shifts[slots[used]], -shifts[used])
+    assert (slots[~used] == rows.size).all()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_pairs_that_lost_their_reverse_have_none(backend):
+    x = jnp.asarray(np.random.default_rng(0).random((30, 3)))
+    nbrs = jfrnn.search(x, 0.5, capacity=4, reverse=True, backend=backend)
+    rows, slots = np.asarray(nbrs.idx), np.asarray(nbrs.reverse.slots)
+    for (i, k), slot in np.ndenumerate(slots):
+        back = np.flatnonzero(rows[rows[i, k]] == i) if rows[i, k] < 30 else []
+        assert slot == (4 * rows[i, k] + back[0] if len(back) else rows.size)
+    assert (slots == rows.size).any()
+
+
+DERIVED = [("full", "open", True), ("full", "images", False), ("half", "nearest", True), ("half", "images", False)]
+DERIVED += [("queries", "images", True), ("gather", "open", False)]
+
+
+@pytest.mark.parametrize(("kind", "box", "reverse"), DERIVED)
+def test_derivatives_are_those_of_scattering(kind, box, reverse):
+    """Against plain indexing, whose derivatives JAX scatters: first and second order, in positions, queries and the box."""
+    nbrs, x, q = make(kind, "warp", box, reverse=reverse)
+    shifts = nbrs.shifts(x, queries=q).astype(x.dtype)
+
+    def energy(vectors, mask):
+        weight = jnp.cos(jnp.arange(mask.size, dtype=x.dtype)).reshape(mask.shape)
+        return jnp.sum(jnp.where(mask[..., None], weight[..., None] * jnp.sin(3 * vectors), 0))
+
+    def ours(x, q, a):
+        cell = None if nbrs.box is None else jfrnn.Box(a)
+        return energy(*nbrs.vectors(x, queries=q, box=cell))
+
+    def scattering(x, q, a):
+        used = nbrs.idx < len(x)
+        vectors = x[jnp.where(used, nbrs.idx, 0)] - (x if q is None else q)[:, None] + shifts * a
+        return energy(vectors, nbrs.vectors(x, queries=q)[1])
+
+    a, which = jnp.asarray(BOXES[box] or [0.0] * 3), (0, 2) if q is None else (0, 1, 2)
+
+    def derivatives(f):
+        of_x = jax.grad(lambda x: f(x, q, a))
+        slope = jax.grad(lambda x: jnp.vdot(of_x(x), jnp.cos(x)))
+        return jax.jit(lambda: (jax.grad(f, which)(x, q, a), slope(x), jax.jvp(of_x, (x,), (x,))[1]))()
+
+    jax.tree.map(lambda p, r: np.testing.assert_allclose(p, r, atol=1e-11), derivatives(ours), derivatives(scattering))
+
+
+@pytest.mark.parametrize("kind", ["full", "half"])
+def test_against_finite_differences(kind):
+    nbrs, x, _ = make(kind, "warp", "nearest", n=12)
+    check_grads(lambda x: jnp.sum(nbrs.distances(x)[0] ** 3), (x,), order=2, modes=("fwd", "rev"), eps=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("kind", "reverse"), [("full", False), ("half", True), ("queries", False)])
+def test_derivatives_do_not_scatter(kind, reverse):
+    nbrs, x, q = make(kind, "jax", "images", reverse=reverse)
+    f = jax.grad(lambda x: jnp.sum(nbrs.distances(x, queries=q)[0] ** 3))
+    text = jax.jit(lambda x: jax.jvp(f, (x,), (x,))).lower(x).as_text()
+    floats = [line for line in text.splitlines() if "stablehlo.scatter" in line and "f64" in line]
+    assert floats == []
+
+
+@pytest.mark.parametrize("kind", ["full", "half"])
+def test_vmap(kind):
+    """Over positions, with one list; over lists too, which then become one."""
+    nbrs, x, _ = make(kind, "warp", "nearest")
+    f = jax.grad(lambda nbrs, x: jnp.sum(nbrs.distances(x)[0] ** 3), 1)
+    several = jnp.stack([x, x + 0.01, x[::-1]])
+    for each, result in zip(several, jax.vmap(f, (None, 0))(nbrs, several), strict=True):
+        np.testing.assert_allclose(result, f(nbrs, each), atol=1e-13)
+    lists = [jfrnn.search(each, 0.4, capacity=40, half=kind == "half", box=nbrs.box, reverse=True) for each in several]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *lists)
+    together, second = jax.vmap(f)(stacked, several), jax.vmap(lambda n, x: jax.jvp(lambda x: f(n, x), (x,), (x,))[1])
+    for k, each in enumerate(lists):
+        np.testing.assert_allclose(together[k], f(each, several[k]), atol=1e-13)
+        expected = jax.jvp(lambda x, each=each: f(each, x), (several[k],), (several[k],))[1]
+        np.testing.assert_allclose(second(stacked, several)[k], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["full", "half"])
+def test_updates_keep_it(kind):
+    nbrs, x, _ = make(kind, "warp", "nearest", skin=0.05)
+    moved = x + 0.2 * jnp.sin(9 * x)
+    updated = jax.jit(lambda nbrs, x: nbrs.update(x))(nbrs, moved)
+    assert updated.rebuild_count == nbrs.rebuild_count + 1
+    flat = np.asarray(updated.idx).reshape(-1)
+    assert slots_of(updated) == [set(np.flatnonzero(flat == j).tolist()) for j in range(40)]
+    grown = updated.grow(moved, slack=2.0)
+    flat = np.asarray(grown.idx).reshape(-1)
+    assert slots_of(grown) == [set(np.flatnonzero(flat == j).tolist()) for j in range(40)]
+
+
+@pytest.mark.parametrize("queries", [None, 17])
+def test_what_it_takes_is_planned(queries):
+    nbrs, *_ = make("full" if queries is None else "queries", "warp")
+    plan = jfrnn.memory_plan(40, 0.4, nbrs.capacity, dtype=np.float64, queries=queries, reverse=True, backend="warp")
+    assert plan.list_bytes == sum(leaf.nbytes for leaf in jax.tree.leaves(nbrs))
+
+
+@pytest.mark.parametrize("kind", ["full", "half", "queries"])
+def test_nobody(kind):
+    x = jnp.zeros((0, 3))
+    nbrs = jfrnn.search(x, 1.0, half=kind == "half", queries=x if kind == "queries" else None, reverse=True, capacity=8)
+    q = x if kind == "queries" else None
+    assert jax.grad(lambda x: jnp.sum(nbrs.distances(x, queries=q)[0]))(x).shape == (0, 3)
+
+
+def test_too_many_slots_are_refused():
+    x = jax.ShapeDtypeStruct((2**25, 3), np.float32)
+    with pytest.raises(ValueError, match="numbers slots by int32"):
+        jax.eval_shape(lambda x: jfrnn.search(x, 0.1, capacity=64, reverse=True), x)
+    with pytest.raises(TypeError, match="reverse"):
+        jfrnn.search(np.zeros((2, 3)), 1.0, reverse=1)
