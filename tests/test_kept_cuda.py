@@ -27,7 +27,7 @@ def term_of(kind):
     steps = (Step("s", 0),) if kind.periodic else ()
     text = TEXT if kind.periodic else TEXT.replace("+ s", "+ c")
     others = (Value("x", dtype, 1), Value("c", dtype))
-    return TermText(text, steps, (), (Value("y", dtype, 0),), others, (Sum("o", False), Sum("o", True)))
+    return TermText(text, steps, (), (Value("y", dtype, 0),), others, (Sum("o", False, False), Sum("o", True, False)))
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=[kind.name for kind in KINDS])
@@ -35,7 +35,7 @@ def test_masks_and_sums_compile(kind):
     assert kind.reversed or compiles(kept.mask_kernel(kind))
     for compensated, extremes in ((False, False), (True, False)):
         assert compiles(kept.sum_kernel(kind, term_of(kind), f"test_{bool(kind.periodic)}", compensated, extremes))
-    largest = term_of(kind)._replace(sums=(Sum("o", False),))
+    largest = term_of(kind)._replace(sums=(Sum("o", False, False),))
     assert compiles(kept.sum_kernel(kind, largest, f"largest_{bool(kind.periodic)}", False, True))
 
 
