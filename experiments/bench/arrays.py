@@ -22,7 +22,8 @@ SIDES = (10, 16, 25, 40, 64, 100)  # sites along an edge of the lattice
 MOST_ON_CPU = 63**3  # particles, unless sizes are asked for
 CUTOFF = 3.0  # spacings
 JITTER = 0.3  # spacings
-STEPS = 10  # of a scan
+STEPS = 10  # of a scan, fewer where calls are slow
+SLOW_S = 0.05  # calls that take longer are repeated a fifth as often, and scans of them have 2 steps
 ROUNDED = 1e-3  # share of the particles whose rows of a peer may differ: its distances are rounded
 MOST_OF_PEERS = 300_000  # jax-md takes a gigabyte per 13 000 particles of this density while it allocates
 COLUMNS = (
@@ -82,22 +83,25 @@ def command(
 
 def _rows(side: int, layout: str, repeats: int) -> Iterator[table.Line]:
     scene = _make_scene(side, layout)
-    rows, calls, scans = dict[str, table.Line](), dict[str, Callable[[], Any]](), dict[str, Callable[[], Any]]()
+    rows, calls, functions = dict[str, table.Line](), dict[str, Callable[[], Any]](), dict[str, Function]()
     for way in list(_ways())[: 2 if layout == "ties" else None]:
         name = f"{way.who} {way.what}"
         rows[name] = {"n": len(scene.x), "layout": layout, "who": way.who, "what": way.what}
         rows[name]["neighbors"] = round(float(scene.counts.mean()), 1)
         try:
-            found, calls[name], scans[name] = _prepare(way, scene)
+            found, calls[name], functions[name] = _prepare(way, scene)
             rows[name] |= found
         except Exception as error:  # what a peer raises is its answer
-            calls.pop(name, None)
             rows[name] |= {"status": "failed", "reason": " ".join(f"{type(error).__name__}: {error}".split())[:200]}
-    waited, others = _measure.time_in_turns(calls, repeats)
-    stepped, _ = _measure.time_in_turns(scans, max(repeats // 5, 3))
-    for name in calls:
-        times = {"waited_ms": 1e3 * float(np.median(waited[name])), "step_ms": 1e3 * float(np.median(stepped[name])) / STEPS}
-        rows[name] |= times | {"repeats": repeats, "others_cores": others}
+    first, _ = _measure.time_in_turns(calls, 1)
+    slow = {name for name, (seconds,) in first.items() if seconds > SLOW_S}
+    for names, rounds, steps in ((calls.keys() - slow, repeats, STEPS), (slow, max(repeats // 5, 3), 2)):
+        waited, others = _measure.time_in_turns({name: call for name, call in calls.items() if name in names}, rounds)
+        scans = {name: _compile_scan(scene.x, functions[name], steps) for name in calls if name in names}
+        stepped, _ = _measure.time_in_turns(scans, 3)
+        for name in scans:
+            times = {"waited_ms": 1e3 * float(np.median(waited[name])), "step_ms": 1e3 * float(np.median(stepped[name])) / steps}
+            rows[name] |= times | {"repeats": rounds, "others_cores": others}
     peer = rows.get("jax-md list", {}).get("waited_ms")
     for row in rows.values():
         if peer is not None and "waited_ms" in row:
@@ -117,8 +121,8 @@ def _make_scene(side: int, layout: str) -> _Scene:
     return _Scene(jnp.asarray(x, jnp.float32), counts)
 
 
-def _prepare(way: _Way, scene: _Scene) -> tuple[table.Line, Callable[[], Any], Callable[[], Any]]:
-    """Compile a way and look at its answer; return the first columns of its row, a call and a scan."""
+def _prepare(way: _Way, scene: _Scene) -> tuple[table.Line, Callable[[], Any], Function]:
+    """Compile a way and look at its answer; return the first columns of its row, a call, and the function that is called."""
     if way.method is not None:
         if (missing := methods.lacks(way.method)) is not None:
             raise ImportError(missing)
@@ -142,10 +146,10 @@ def _prepare(way: _Way, scene: _Scene) -> tuple[table.Line, Callable[[], Any], C
     row = {"status": "ok", "wrong": wrong, "lower_s": between - begin, "compile_s": end - between, "scratch_mb": scratch}
     if way.method is not None:
         row["peer"] = _machine.versions([way.package])[way.package]
-    return row, lambda: compiled(scene.x), _compile_scan(scene.x, function)
+    return row, lambda: compiled(scene.x), function
 
 
-def _compile_scan(x: Array, function: Function) -> Callable[[], Any]:
+def _compile_scan(x: Array, function: Function, steps: int) -> Callable[[], Any]:
     """Return a compiled scan that keeps what its last step makes."""
 
     def step(carry: tuple[Array, Any], _: None, velocity: Array) -> tuple[tuple[Array, Any], None]:
@@ -153,7 +157,7 @@ def _compile_scan(x: Array, function: Function) -> Callable[[], Any]:
         return (moved, function(moved)), None
 
     def run(x: Array, velocity: Array, made: Any) -> Any:  # noqa: ANN401
-        return jax.lax.scan(functools.partial(step, velocity=velocity), (x, made), None, length=STEPS)[0]
+        return jax.lax.scan(functools.partial(step, velocity=velocity), (x, made), None, length=steps)[0]
 
     compiled, made, rest = jax.jit(run), jax.jit(function)(x), jnp.zeros((), x.dtype)
     jax.block_until_ready(compiled(x, rest, made))
