@@ -15,7 +15,7 @@ from jfrnn.kernels.cells_cuda import GRID
 from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
 ROWS_AT_ONCE = 64  # that a thread of the CPU takes
-_FEW_ROWS = 1 << 17  # up to which eight lanes of CUDA serve a row; of more rows, each has a lane of its own
+LANES = 8  # of CUDA that serve a row where terms are summed
 _BLOCK = 128
 RADII = {"gather": 1, "scatter": 2, "either": 3, "both": 4, "mean": 5}
 
@@ -73,11 +73,6 @@ class ListKind(NamedTuple):
         found = {"PERIODIC": self.periodic, "SCALED": self.scaled, "CODE_BYTES": self.code_bytes, "REVERSED": self.reversed}
         found |= {"RADII": RADII.get(self.rule, 0), "SUM": self.rule == "mean", "ALIGNED": self.aligned}
         return found | {"LENGTH": self.length(columns), "LANES_PER_ROW": max(self.lanes, 1), "QUERY_CHUNK": ROWS_AT_ONCE, **GRID}
-
-
-def lanes_of(rows: int) -> int:
-    """Return how many lanes of CUDA serve a row where terms are summed: so many that few rows keep all of them busy."""
-    return 8 if rows <= _FEW_ROWS else 1
 
 
 def slots(rows: int, lanes: int) -> int:

@@ -79,7 +79,7 @@ def kept_sums(
         def call(given: KeptList, values: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             shared, own, others = values
             rows = (given.sources if given.reversal is not None else given.rows).shape[0]
-            lanes = kept.lanes_of(rows) if cuda else 0
+            lanes = kept.LANES if cuda else 0
             kind, results = _kind_of(given, lanes), SumsOf(term, rows, kept.slots(rows, lanes), compensated, extremes)
             call_sums = _sum_callable(kind, term, key, compensated, extremes, apart)
             operands = _operands(given, kind, term.columns, others)
