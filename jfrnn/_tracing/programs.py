@@ -107,7 +107,7 @@ def on_device(x: Given) -> Array:
 def make_on_host(x: Given, how: Callable[[np.ndarray], np.ndarray]) -> Array:
     """Return on the device what a NumPy function makes of a concrete array, so that no program is compiled for its shape."""
     with own_transfers() if isinstance(x, Array) else contextlib.nullcontext():
-        return on_device(how(np.asarray(jax.device_get(x))))
+        return on_device(how(np.asarray(jax.device_get(x) if isinstance(x, Array) else x)))
 
 
 def _keep_bounded() -> None:
