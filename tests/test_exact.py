@@ -88,8 +88,31 @@ def test_every_step_agrees_with_fractions(dtype, offset):
     assert {-1, 1} <= set(exact)
     np.testing.assert_array_equal(_integer_sign(pair, _threshold(pair, cutoff)), exact)
     sign = _fixed_sign(pair, _threshold(pair, cutoff))
-    assert np.mean(sign != _UNKNOWN) > (0.99 if offset > 1 else 0.75)  # coordinates near 0 have finer digits than step 2
+    assert np.mean(sign != _UNKNOWN) > 0.99
     np.testing.assert_array_equal(np.where(sign == _UNKNOWN, exact, sign), exact)
+
+
+@pytest.mark.parametrize("orthogonal", [True, False])
+@pytest.mark.parametrize("size", [1.0, 2.0**-22, 2.0**39])
+def test_steps_agree_in_lattices(size, orthogonal, dtype):
+    """Ties and near ties on a coarse lattice of points, far from the origin too, with images a few to a thousand cells away."""
+    rng = np.random.default_rng(11)
+    step, count = dtype(size) / 8, 4000
+    matrix = (np.diag([40, 48, 56]) + (0 if orthogonal else np.array([[0, 8, 16], [24, 0, 8], [16, 8, 0]]))) * step
+    shift = rng.integers(-1, 2, (count, 3)) * rng.choice([1, 500], (count, 1))
+    a = rng.integers(-100, 100, (count, 3)) * step
+    offset = rng.integers(-30, 31, (count, 3)) * step
+    b = a + offset - (shift @ matrix.astype(np.float64))
+    b[::3] += rng.integers(-2, 3, (len(b[::3]), 3)) * np.spacing(np.abs(b[::3]).astype(dtype))
+    columns = [jnp.asarray(x.astype(dtype)) for x in (*a.T, *b.T, *shift.T)]
+    pair = Pair(columns[:3], columns[3:6], None, columns[6:], jnp.asarray(matrix, dtype), orthogonal)
+    threshold = _threshold(pair, make_cutoff(float(21 * step), np.dtype(dtype), closed=False))  # 21² = 16² + 13² + 4²
+    near = jnp.asarray(np.linalg.norm(offset, axis=1) < 42 * step)  # what step 1 leaves open is no farther
+    sign, exact = _fixed_sign(pair, threshold), _integer_sign(pair, threshold)
+    known = (sign != _UNKNOWN) & near
+    assert np.mean(known) > 0.5
+    assert int((exact == 0).sum()) > 0
+    np.testing.assert_array_equal(jnp.where(known, sign, 0), jnp.where(known, exact, 0))
 
 
 def test_exact_ties_are_known_without_integers(dtype):

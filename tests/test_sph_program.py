@@ -77,9 +77,8 @@ def test_a_part_that_is_left_out_takes_no_operation(bare, part):
 
 def test_the_bare_program_holds_no_trace_of_other_parts(bare):
     text = bare[0].as_text()
-    for operation in ("power", "select_and_", "sort"):  # Tait; extremes; cells, lists
+    for operation in ("power", "select_and_", "floor", "round_nearest", "sort"):  # Tait; images; cells, lists
         assert f"stablehlo.{operation}" not in text, operation
-    assert text.count("tensor<2x2x") <= 1  # images would take lattices in hundreds of operations
 
 
 @pytest.mark.slow

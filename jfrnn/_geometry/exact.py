@@ -7,9 +7,9 @@ There are three steps. Each is exact where it decides, and only evaluated for wh
    denormals add at most 3·2^-126 to a difference, less than 2^-28 of any cutoff that `check_cutoff` accepts. A band of 8 eps on
    either side is therefore safe however the compiler fuses multiply-adds; the CPU kernels, which flush nothing that matters here,
    use 4 eps.
-2. `_fixed_sign` counts distances in units of about 2^-28 cutoffs (float64: 2^-60), in one machine integer per axis. Integers wrap
-   around, so coordinates and lattice translations of any size may be added; only the displacement has to fit. It decides all pairs
-   whose coordinates are whole numbers of units, which floats from about a thirtieth of the cutoff on always are.
+2. `_fixed_sign` counts distances in units of about 2^-39 cutoffs (float64: 2^-86), in two machine integers per axis. The upper one
+   wraps around, so coordinates and lattice translations of any size may be added; only the displacement has to fit. It decides all
+   pairs whose coordinates are whole numbers of units, as all floats are that exceed 2^-14 cutoffs (float64: 2^-32).
 3. `_integer_sign` uses fixed-point integers as wide as the float format (`jfrnn._geometry.integers`), which never round. It decides
    the pairs that are left.
 """
@@ -24,7 +24,17 @@ from jax import Array, lax
 
 from jfrnn._geometry.cutoffs import Cutoff, Cutoffs, step_one_bounds
 from jfrnn._geometry.floats import WHOLE_BITS, unit_scale
-from jfrnn._geometry.integers import beside, carry_limbs, full_count, limb_product, limb_sign, limb_type, limbs_of
+from jfrnn._geometry.integers import (
+    beside,
+    carry_limbs,
+    fields_of,
+    full_count,
+    limb_bits,
+    limb_product,
+    limb_sign,
+    limb_type,
+    limbs_of,
+)
 from jfrnn._geometry.reduced import Basis
 from jfrnn._tracing import any_of_rows, first_set
 
@@ -223,58 +233,84 @@ def _fixed_sign(pair: Pair, threshold: _Threshold) -> Array:
     A cutoff is below 4 in scaled lengths, and so is each component of a displacement that step 1 leaves open, up to its band.
     """
     dtype = np.dtype(pair.a[0].dtype)
-    bits = 32 if dtype == np.float32 else 64
-    fraction = bits - 3 - threshold.times  # so that `times` displacements are below 2^(bits - 1) units
-    finfo = jnp.finfo(dtype)
+    fraction = 8 * dtype.itemsize - 3 - threshold.times  # of the upper integers: `times` displacements are below half their range
+    eps, bits = jnp.finfo(dtype).eps, limb_bits(dtype)
     known, total = jnp.ones(pair.b[0].shape, bool), None
 
-    def fixed(x: Array) -> Array:
+    def fixed(x: Array) -> _Fixed:
         nonlocal known
         number, whole = _fixed_point(x, threshold.scale, fraction)
         known = known & whole
         return number
 
     for axis, (ak, bk) in enumerate(zip(pair.a, pair.b, strict=True)):
-        displacement, estimate = fixed(bk) - fixed(ak), bk - ak
+        displacement, estimate = _add(fixed(bk), fixed(ak), -1), bk - ak
         error = jnp.zeros((), dtype)
         for shift, component in pair.lattice_terms(axis):
-            displacement = displacement + shift.astype(displacement.dtype) * fixed(component)
+            displacement = _add(displacement, fixed(component), shift.astype(limb_type(dtype)))
             estimate = estimate + shift * component
-            error = error + 16 * finfo.eps * (jnp.abs(ak) + jnp.abs(bk) + jnp.abs(shift * component))
+            error = error + 16 * eps * (jnp.abs(ak) + jnp.abs(bk) + jnp.abs(shift * component))
+            known = known & (jnp.abs(shift) <= 2**WHOLE_BITS)
         known = known & ((jnp.abs(estimate) + error) * threshold.scale < 4.5)
-        square = _square_limbs(jnp.abs(displacement) * threshold.times)
+        square = _square_limbs(displacement, threshold.times, bits)
         total = square if total is None else [x + y for x, y in zip(total, square, strict=True)]
-    radius = _square_limbs(functools.reduce(jnp.add, [fixed(x) for x in threshold.radii]))
-    sign = _sign_of_limbs([x - y for x, y in zip(total or [], radius, strict=True)])
-    return jnp.where(known, sign, _UNKNOWN)
+    radius = _square_limbs(functools.reduce(_add, map(fixed, threshold.radii)), 1, bits)
+    return jnp.where(known, _sign_of_limbs([x - y for x, y in zip(total or [], radius, strict=True)], bits), _UNKNOWN)
 
 
-def _fixed_point(x: Array, scale: Array, fraction: int) -> tuple[Array, Array]:
-    """Return x·scale·2^fraction modulo 2^32 (float64: 2^64) as a signed integer, and whether that is a whole number."""
-    narrow = x.dtype == jnp.float32
-    unsigned, width, signed = (jnp.uint32, 32, jnp.int32) if narrow else (jnp.uint64, 64, jnp.int64)
-    y = x * scale * 2.0**fraction
-    is_zero = lax.bitcast_convert_type(x, unsigned) << unsigned(1) == 0  # products of other numbers may be flushed to 0
-    whole = (jnp.floor(y) == y) & (jnp.abs(y) < jnp.finfo(x.dtype).max) & ((y != 0) | is_zero)
-    rest = y - jnp.round(y * 2.0**-width) * 2.0**width  # exact: from -2^31 to 2^31, in whole units of y's last digit
-    rest = jnp.where(rest == 2.0 ** (width - 1), -rest, rest)
-    return jnp.where(whole, rest, 0).astype(signed), whole
+class _Fixed(NamedTuple):
+    """A number upper + lower / 2^bits in the units of step 2, `bits` being those of a limb. `upper` wraps around."""
+
+    upper: Array
+    lower: Array
 
 
-def _square_limbs(x: Array) -> list[Array]:
-    """Return the square of integers from 0 on in five limbs of 11 bits (int64: 21), the lowest first; the last keeps the rest."""
-    bits = 11 if x.dtype == jnp.int32 else 21
-    low, middle, high = x & ((1 << bits) - 1), (x >> bits) & ((1 << bits) - 1), x >> (2 * bits)
-    return [low * low, 2 * low * middle, 2 * low * high + middle * middle, 2 * middle * high, high * high]
+def _add(x: _Fixed, y: _Fixed, times: Array | int = 1) -> _Fixed:
+    return _Fixed(x.upper + y.upper * times, x.lower + y.lower * times)
 
 
-def _sign_of_limbs(limbs: list[Array]) -> Array:
+def _fixed_point(x: Array, scale: Array, fraction: int) -> tuple[_Fixed, Array]:
+    """Return x·scale·2^fraction, `scale` being a power of two, and whether it has no finer digits than such numbers have."""
+    dtype = np.dtype(x.dtype)
+    bits, width, whole = limb_bits(dtype), 8 * dtype.itemsize, limb_type(dtype)
+    unsigned = np.dtype(f"uint{width}").type
+    negative, place, mantissa = fields_of(x)
+    finfo = jnp.finfo(dtype)
+    exponent = (lax.bitcast_convert_type(scale, unsigned) >> unsigned(finfo.nmant)).astype(jnp.int32) - (finfo.maxexp - 1)
+    place = place + exponent + (fraction + bits + int(finfo.minexp) - finfo.nmant)  # of the lowest digit, in digits of `lower`
+
+    def by(amount: Array) -> Array:  # the result of longer shifts would depend on the hardware
+        return jnp.clip(amount, 0, width - 1).astype(unsigned)
+
+    finer = mantissa & ((unsigned(1) << by(-place)) - unsigned(1))
+    digits = mantissa >> by(-place)
+    left = jnp.maximum(place, 0)
+    upper = jnp.where(
+        left < bits, digits >> by(bits - left), jnp.where(left - bits < width, digits << by(left - bits), unsigned(0))
+    )
+    lower = jnp.where(left < bits, (digits << by(left)) & unsigned((1 << bits) - 1), unsigned(0))
+    signs = jnp.where(negative, -1, 1).astype(whole)
+    return _Fixed(upper.astype(whole) * signs, lower.astype(whole) * signs), finer == 0
+
+
+def _square_limbs(x: _Fixed, times: int, bits: int) -> list[Array]:
+    """Return (times·x)² in seven limbs, the lowest first, not carried; the highest keeps the rest."""
+    lower, mask = x.lower * times, (1 << bits) - 1
+    upper, lower = x.upper * times + (lower >> bits), lower & mask
+    negative = upper < 0
+    upper = jnp.where(negative, jnp.where(lower == 0, -upper, ~upper), upper)
+    lower = jnp.where(negative, -lower & mask, lower)
+    limbs = [lower, upper & mask, (upper >> bits) & mask, upper >> (2 * bits)]
+    pairs = [[(i, k - i) for i in range(4) if 0 <= k - i < 4] for k in range(7)]
+    return [functools.reduce(jnp.add, (limbs[i] * limbs[j] for i, j in of_limb)) for of_limb in pairs]
+
+
+def _sign_of_limbs(limbs: list[Array], bits: int) -> Array:
     """Return the sign of a sum of squares of `_square_limbs`, int32."""
-    bits = 11 if limbs[0].dtype == jnp.int32 else 21
     carry, rest = jnp.zeros_like(limbs[0]), jnp.zeros_like(limbs[0])
     for limb in limbs[:-1]:
-        limb = limb + carry
-        carry, rest = limb >> bits, rest | (limb & ((1 << bits) - 1))
+        total = limb + carry
+        carry, rest = total >> bits, rest | (total & ((1 << bits) - 1))
     highest = limbs[-1] + carry
     return jnp.where(highest == 0, (rest != 0).astype(highest.dtype), jnp.sign(highest)).astype(jnp.int32)
 
