@@ -36,12 +36,14 @@ def test_numbers_of_accelerators_find_the_same_pairs(name, elsewhere):
     checked.assert_pairs(nbrs, reference.reference_pairs(given.positions, given.cutoff, queries=given.queries))
 
 
-SLOW = pytest.mark.slow
-
-
 @pytest.mark.usefixtures("elsewhere")
 @pytest.mark.parametrize(
-    "kind", ["batch", "images", *(pytest.param(kind, marks=SLOW) for kind in ("half", "nearest images", "a cutoff per particle"))]
+    "kind",
+    [
+        "batch",
+        "images",
+        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("half", "nearest images", "a cutoff per particle")),
+    ],
 )
 def test_options_with_the_numbers_of_accelerators(kind):
     rng = np.random.default_rng(1)
@@ -75,6 +77,26 @@ def everything(x):
     nbrs = jfrnn.search(x, 0.2, capacity=64, backend="jax")
     sums = jax.value_and_grad(lambda x: jfrnn.pair_sum(spring, x, 0.2, backend="jax").sum())(x)
     return nbrs.idx, nbrs.count, jfrnn.count(x, 0.2, backend="jax"), *sums
+
+
+def test_more_particles_than_places_are_refused():
+    x = jax.ShapeDtypeStruct((2**30, 2), np.float32)
+    with pytest.raises(ValueError, match=r"positions: backend='jax' looks for neighbors among at most 1073741808 .*got 1073741824"):
+        jax.eval_shape(lambda x: jfrnn.count(x, 0.1, backend="jax"), x)
+
+
+@pytest.mark.parametrize(("told", "scratch"), [(None, 900_000_000), (-1, 900_000_000), (4 << 30, 1 << 29), (0, 900_000_000)])
+def test_scratch_is_a_share_of_the_device(told, scratch, monkeypatch):
+    class Device:
+        platform = "gpu"
+
+        def memory_stats(self):
+            if told == 0:
+                raise jax.errors.JaxRuntimeError("UNIMPLEMENTED")
+            return told and {"bytes_limit": told}
+
+    monkeypatch.setattr(jax, "local_devices", lambda: [Device()])
+    assert tuning._fit_memory(tuning.ACCELERATOR).scratch == scratch
 
 
 @pytest.mark.parametrize("box", [False, True])

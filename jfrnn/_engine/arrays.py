@@ -46,6 +46,8 @@ from jfrnn._geometry import (
     unpack_turns,
 )
 
+_MOST_SOURCES = 2**30 - LANES  # whose places are int32, as runs read the sources twice in a row
+
 
 @dataclasses.dataclass(frozen=True)
 class ArrayEngine:
@@ -187,6 +189,11 @@ def _cell_stencil(
     `along` [d, n + m] are the coordinates of the sources, then of the queries, which `axes` divides into cells.
     """
     n, systems = len(sources), None if batch is None else batch.of_all
+    if n > _MOST_SOURCES:
+        raise ValueError(
+            f"positions: backend='jax' looks for neighbors among at most {_MOST_SOURCES} particles, got {n}: pass "
+            "backend='warp', or divide the particles over devices with jfrnn.distributed."
+        )
     line, cells = sort_along_line(along, axes, n, systems, tuning.least_sorted, tuning.searched)
     order = line.order if queries is None else sort_queries(line, cells, n, tuning.least_sorted)
     at = order if queries is None else order + n
