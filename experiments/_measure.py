@@ -1,6 +1,7 @@
 """Time and memory of one search in this process."""
 
 import ctypes
+import functools
 import gc
 import math
 import os
@@ -131,6 +132,27 @@ def repeat(
         if enough or sum(seconds) >= most_seconds:
             return result, seconds
         del result
+
+
+def compile_scan(function: Callable[[Any], Any] | None, x: Any, steps: int) -> Callable[[], Any]:  # noqa: ANN401
+    """Return a compiled scan whose steps move x and call a function of it, or only move x; it keeps what the last step makes.
+
+    Nothing of a step can be left out, as all that it makes is carried along, and no step knows that nobody moves.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    def step(carry: Any, _: None, velocity: Any) -> tuple[Any, None]:  # noqa: ANN401
+        moved = carry[0] + velocity
+        return (moved, None if function is None else function(moved)), None
+
+    def run(x: Any, velocity: Any, made: Any) -> Any:  # noqa: ANN401
+        return jax.lax.scan(functools.partial(step, velocity=velocity), (x, made), None, length=steps)[0]
+
+    compiled, made = jax.jit(run), None if function is None else jax.jit(function)(x)
+    rest = jnp.zeros((), x.dtype)
+    jax.block_until_ready(compiled(x, rest, made))
+    return lambda: compiled(x, rest, made)
 
 
 def time_in_turns(calls: dict[str, Callable[[], Any]], rounds: int, burst: int = 1) -> tuple[dict[str, list[float]], float | None]:

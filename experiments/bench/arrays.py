@@ -25,7 +25,7 @@ JITTER = 0.3  # spacings
 STEPS = 10  # of a scan, fewer where calls are slow
 SLOW_S = 0.05  # calls that take longer are repeated a fifth as often, and scans of them have 2 steps
 ROUNDED = 1e-3  # share of the particles whose rows of a peer may differ: its distances are rounded
-MOST_OF_PEERS = 300_000  # jax-md takes a gigabyte per 13 000 particles of this density while it allocates
+MOST_ON_GPU = 300_000  # particles that jax-md is asked for; it took 19 GB for 250 000
 COLUMNS = (
     *("platform", "n", "layout", "who", "what", "neighbors", "lower_s", "compile_s", "waited_ms", "step_ms", "scratch_mb", "wrong"),
     *("ratio", "repeats", "status", "reason", "others_cores", "device", "jax", "warp", "peer", "commit", "dirty"),
@@ -88,6 +88,12 @@ def _rows(side: int, layout: str, repeats: int) -> Iterator[table.Line]:
         name = f"{way.who} {way.what}"
         rows[name] = {"n": len(scene.x), "layout": layout, "who": way.who, "what": way.what}
         rows[name]["neighbors"] = round(float(scene.counts.mean()), 1)
+        if way.method is not None and (missing := methods.lacks(way.method)) is not None:
+            rows[name] |= {"status": "missing", "reason": missing}
+            continue
+        if way.who == "jax-md" and len(scene.x) > (most := _most_of_jax_md()):
+            rows[name] |= {"status": "skipped", "reason": f"is not asked for more than {most} particles"}
+            continue
         try:
             found, calls[name], functions[name] = _prepare(way, scene)
             rows[name] |= found
@@ -97,7 +103,7 @@ def _rows(side: int, layout: str, repeats: int) -> Iterator[table.Line]:
     slow = {name for name, (seconds,) in first.items() if seconds > SLOW_S}
     for names, rounds, steps in ((calls.keys() - slow, repeats, STEPS), (slow, max(repeats // 5, 3), 2)):
         waited, others = _measure.time_in_turns({name: call for name, call in calls.items() if name in names}, rounds)
-        scans = {name: _compile_scan(scene.x, functions[name], steps) for name in calls if name in names}
+        scans = {name: _measure.compile_scan(functions[name], scene.x, steps) for name in calls if name in names}
         stepped, _ = _measure.time_in_turns(scans, 3)
         for name in scans:
             times = {"waited_ms": 1e3 * float(np.median(waited[name])), "step_ms": 1e3 * float(np.median(stepped[name])) / steps}
@@ -123,11 +129,6 @@ def _make_scene(side: int, layout: str) -> _Scene:
 
 def _prepare(way: _Way, scene: _Scene) -> tuple[table.Line, Callable[[], Any], Function]:
     """Compile a way and look at its answer; return the first columns of its row, a call, and the function that is called."""
-    if way.method is not None:
-        if (missing := methods.lacks(way.method)) is not None:
-            raise ImportError(missing)
-        if len(scene.x) > MOST_OF_PEERS and way.who == "jax-md":
-            raise MemoryError(f"is not asked for more than {MOST_OF_PEERS} particles")
     function = way.make(scene)
     cache = jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
     jax.config.update("jax_enable_compilation_cache", False)
@@ -147,21 +148,6 @@ def _prepare(way: _Way, scene: _Scene) -> tuple[table.Line, Callable[[], Any], F
     if way.method is not None:
         row["peer"] = _machine.versions([way.package])[way.package]
     return row, lambda: compiled(scene.x), function
-
-
-def _compile_scan(x: Array, function: Function, steps: int) -> Callable[[], Any]:
-    """Return a compiled scan that keeps what its last step makes."""
-
-    def step(carry: tuple[Array, Any], _: None, velocity: Array) -> tuple[tuple[Array, Any], None]:
-        moved = carry[0] + velocity
-        return (moved, function(moved)), None
-
-    def run(x: Array, velocity: Array, made: Any) -> Any:  # noqa: ANN401
-        return jax.lax.scan(functools.partial(step, velocity=velocity), (x, made), None, length=steps)[0]
-
-    compiled, made, rest = jax.jit(run), jax.jit(function)(x), jnp.zeros((), x.dtype)
-    jax.block_until_ready(compiled(x, rest, made))
-    return lambda: compiled(x, rest, made)
 
 
 # --- who does what ----------------------------------------------------------------------------------------------------
@@ -188,6 +174,12 @@ def _periodic(scene: _Scene) -> Function:
     """Return a search in a box that ends far enough from the particles that no image is a neighbor."""
     side = float(np.ptp(np.asarray(scene.x), axis=0).max()) + 2 * CUTOFF
     return _list(scene, box=jfrnn.Box([side] * 3))
+
+
+def _most_of_jax_md() -> int:
+    from experiments.methods import jax_md
+
+    return jax_md.MAX_POINTS if jax.default_backend() == "cpu" else MOST_ON_GPU
 
 
 def _jax_md(scene: _Scene) -> Function:

@@ -168,7 +168,7 @@ def _time(scene: _Scene, timed: dict[str, _Timed], repeats: int) -> dict[str, ta
     """Return the columns of times, by name: calls in turns first, then scans of as many steps as calls allow."""
     waited, others = _medians({name: each.call for name, each in timed.items()}, repeats)
     steps = {name: next((k for k in STEPS if k * seconds <= SCAN_S), STEPS[-1]) for name, seconds in waited.items()}
-    scans = {name: _compile_scan(scene.x, each, steps[name]) for name, each in timed.items()}
+    scans = {name: _measure.compile_scan(each.function, scene.x, steps[name]) for name, each in timed.items()}
     scanned, others_then = _medians(scans, max(repeats // 20, 3))
     others = max((each for each in (others, others_then) if each is not None), default=None)
     return {
@@ -188,23 +188,6 @@ def _medians(calls: dict[str, Callable[[], Any]], repeats: int) -> tuple[dict[st
         medians |= {name: float(np.median(each)) for name, each in seconds.items()}
         busy += [] if others is None else [others]
     return medians, max(busy, default=None)
-
-
-def _compile_scan(x: Array, timed: _Timed, steps: int) -> Callable[[], Any]:
-    """Return a compiled scan that keeps all that a step makes: nothing of it can be left out."""
-    function = timed.function
-
-    def step(carry: tuple[Array, Any], _: None, velocity: Array) -> tuple[tuple[Array, Any], None]:
-        moved = carry[0] + velocity
-        return (moved, None if function is None else function(moved)), None
-
-    def run(x: Array, velocity: Array, made: Any) -> Any:  # noqa: ANN401
-        return jax.lax.scan(functools.partial(step, velocity=velocity), (x, made), None, length=steps)[0]
-
-    compiled, made = jax.jit(run), None if function is None else timed.call()
-    rest = jnp.zeros((), x.dtype)  # an operand, so that no step knows that nobody moves
-    jax.block_until_ready(compiled(x, rest, made))
-    return lambda: compiled(x, rest, made)
 
 
 # --- who does what ----------------------------------------------------------------------------------------------------
