@@ -5,6 +5,7 @@
 // cutoff, the lattice, and the largest number of a shift. `steps` are the shifts of image codes. REVERSED: rows are those of the sources
 // of the list, whose slots are `lengths` many in `slots` from `starts` on, and j is who has such a slot.
 #pragma once
+#include "codes.h"
 #include "exact.h"
 #include "math.h"
 
@@ -51,14 +52,7 @@ struct Kept : KeptArguments, Space {
     JFRNN_INLINE static Number larger(Number x, Number y) { return Math::select(Math::gt(x, y), x, y); }
     JFRNN_FUNCTION real size_of(real x) { return x < 0 ? -x : x; }
 
-    JFRNN_MEMBER int code_at(long long slot) const {
-        if constexpr (CODE_BYTES == 1)
-            return ((const unsigned char*)codes)[slot];
-        else if constexpr (CODE_BYTES == 2)
-            return ((const short*)codes)[slot];
-        else
-            return CODE_BYTES == 4 ? codes[slot] : 0;
-    }
+    JFRNN_MEMBER int code_at(long long slot) const { return image_code(codes, slot); }
     // The source and the image code that an entry of a row names: the id in a slot of the list, or (REVERSED) a slot.
     JFRNN_MEMBER void read_entry(long long entry, int& source, int& code) const {
         const long long slot = REVERSED ? slots[entry] : entry;

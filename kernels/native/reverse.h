@@ -1,7 +1,6 @@
 // Where the pairs of a list stand the other way round: what all threads of the CPU and of CUDA know of the list.
 #pragma once
-#include "constants.h"
-#include "device.h"
+#include "codes.h"
 
 // `codes` are of CODE_BYTES each: 0 where a pair has one image. The slot of a pair is row * capacity + its place in the row.
 struct ReverseArguments {
@@ -14,14 +13,7 @@ struct ListOfRows : ReverseArguments {
     JFRNN_MEMBER explicit ListOfRows(const ReverseArguments& given) : ReverseArguments(given) {}
 
     JFRNN_MEMBER int none() const { return n * capacity; }
-    JFRNN_MEMBER int code_at(int slot) const {
-        if constexpr (CODE_BYTES == 1)
-            return ((const unsigned char*)codes)[slot];
-        else if constexpr (CODE_BYTES == 2)
-            return ((const short*)codes)[slot];
-        else
-            return CODE_BYTES == 4 ? codes[slot] : 0;
-    }
+    JFRNN_MEMBER int code_at(int slot) const { return image_code(codes, slot); }
     // The code of the opposite shift: codes number the shifts in an order that begins with the opposite of the last one.
     JFRNN_MEMBER int opposite(int code) const { return CODE_BYTES == 0 ? 0 : images - 1 - code; }
 };
