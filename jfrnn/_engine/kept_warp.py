@@ -12,11 +12,10 @@ from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import lattice_numbers
 from jfrnn._engine.plans import Clear, Launch, Plan, share
 from jfrnn._engine.sum_results import SumsOf
-from jfrnn._geometry import LARGEST_TURN, Cutoff, Cutoffs, Lattice
+from jfrnn._geometry import EXCHANGED, LARGEST_TURN, Cutoff, Cutoffs, Lattice
 from jfrnn.kernels import kept
 from jfrnn.kernels.pair_sum_cpu import TermText
 
-_EXCHANGED = {"gather": "scatter", "scatter": "gather"}
 _LIST = ("rows", "points", "cutoff", "steps", "idx", "count", "codes", "slots", "starts", "lengths")  # what a call is given
 
 
@@ -52,7 +51,7 @@ def kept_mask(given: KeptList) -> Array:
 
     def on(cuda: bool) -> Callable[[KeptList], Array]:
         def call(given: KeptList) -> Array:
-            dims, kind = {"mask": given.idx.shape, "info": 2}, _kind_of(given, 8 if cuda else 0)
+            dims, kind = {"mask": given.idx.shape, "info": 2}, _kind_of(given, kept.LANES if cuda else 0)
             return _mask_callable(kind)(*_operands(given, kind, 0, None), output_dims=dims)[0]
 
         return call
@@ -103,7 +102,7 @@ def _kind_of(given: KeptList, lanes: int) -> _Extra:
     periodic = 0 if lattice is None else (1 if lattice.images.nearest else 2) + (0 if lattice.images.orthogonal else 2)
     width = 0 if given.codes is None else given.codes.dtype.itemsize
     rule = cutoff.rule if isinstance(cutoff, Cutoffs) else ""
-    rule = _EXCHANGED.get(rule, rule) if is_reversed else rule
+    rule = EXCHANGED.get(rule, rule) if is_reversed else rule
     dim, double, aligned = given.sources.shape[1], given.sources.dtype == jnp.float64, given.idx.shape[1] % 4 == 0
     kind = kept.ListKind(dim, double, cutoff.scaled, periodic, width, rule, is_reversed, aligned, lanes)
     return _Extra(cutoff.closed, 1 if lattice is None else lattice.images.total, kind)

@@ -13,6 +13,7 @@ from jfrnn._geometry.floats import two_sum, unit_scale
 
 Flags = Any  # bool array of NumPy or JAX, like the argument
 RULES = ("gather", "scatter", "either", "both", "mean")  # cutoff of a pair: i's, j's, larger, smaller, mean
+EXCHANGED = {"gather": "scatter", "scatter": "gather"}  # rules that become another one where i and j are exchanged
 
 
 @jax.tree_util.register_dataclass

@@ -7,6 +7,7 @@ from jax import Array
 
 from jfrnn._engine import Filter, Inputs, Kind, Options, check_backend, choose_engine
 from jfrnn._geometry import (
+    EXCHANGED,
     Batch,
     Box,
     Images,
@@ -103,7 +104,7 @@ def check_problem(
     keep = Filter(drop_self=queries is None and not check_flag("include_self", include_self), later_only=check_flag("half", half))
     dtype = np.dtype(sources.dtype)
     radii, closed = check_radii(cutoff, radius_rule, sources, queries), check_flag("closed", closed)
-    if keep.later_only and radii is not None and radii.rule in ("gather", "scatter"):
+    if keep.later_only and radii is not None and radii.rule in EXCHANGED:
         raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
     radius = float(check_cutoff(cutoff, dtype).radius) if radii is None else None
     largest = radius if radii is None else largest_known(radii)

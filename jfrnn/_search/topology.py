@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jfrnn._engine import Options
-from jfrnn._geometry import Radii
+from jfrnn._geometry import EXCHANGED, Radii
 from jfrnn._search.reverse import Reverse, find_reverse
 
 
@@ -61,7 +61,7 @@ class Topology:
 
 def is_mutual(options: Options, own_queries: bool, radii: Radii | None) -> bool:
     """Say whether lists of such a search are their own mirror images."""
-    return not (own_queries or options.filter.later_only or (radii is not None and radii.rule in ("gather", "scatter")))
+    return not (own_queries or options.filter.later_only or (radii is not None and radii.rule in EXCHANGED))
 
 
 def make_topology(

@@ -12,7 +12,19 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn._engine import Inputs, Options, hide_inactive, is_decidable
-from jfrnn._geometry import Box, Images, Lattice, Radii, Status, check_cutoff, make_cutoff, make_cutoffs, make_lattice, translation
+from jfrnn._geometry import (
+    EXCHANGED,
+    Box,
+    Images,
+    Lattice,
+    Radii,
+    Status,
+    check_cutoff,
+    make_cutoff,
+    make_cutoffs,
+    make_lattice,
+    translation,
+)
 from jfrnn._search import MOST_SLOTS, ROWS_ARE_WHOLE, NeighborList, is_native, kept_list
 from jfrnn._sums.extremes import bind_extremes
 from jfrnn._sums.pair_function import call_with_pair
@@ -70,7 +82,7 @@ def pairs_of_list(
         raise ValueError(f"cutoff must be None or that of the list, which has {has}, got {cutoff!r}.")
     own = nbrs.own_queries
     fixed_rows = lax.stop_gradient(rows)
-    directionless = not own and (nbrs.radii is None or nbrs.radii.rule not in ("gather", "scatter"))
+    directionless = not own and (nbrs.radii is None or nbrs.radii.rule not in EXCHANGED)
     relation = _relation_of_list(nbrs, *lax.stop_gradient((sources, rows, box)), symmetric=directionless and not nbrs.half)
     lattice = _lattice(nbrs._box_now(box, sources), nbrs.box_kind, sources)
     largest = nbrs.cutoff if nbrs.radii is None else make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jfrnn._engine import FOLD_GROUP, Block, Inputs, KeptList, Options, Slots, Visit, fold_pairs, kept_mask
-from jfrnn._geometry import Batch, Radii, compensated_sum, rounded_sum
+from jfrnn._geometry import EXCHANGED, Batch, Radii, compensated_sum, rounded_sum
 from jfrnn._search import Reverse, find_reverse, kept_shifts
 from jfrnn._sums.fused import is_fused as is_fusible
 from jfrnn._sums.fused import sums as fused_sums
@@ -19,7 +19,6 @@ from jfrnn._sums.terms import Groups, Term
 from jfrnn._tracing import Tree
 
 _LIST_SLOTS = 1 << 22  # scalars of list slots that are processed at a time: 16 MB of float32
-_EXCHANGED = {"gather": "scatter", "scatter": "gather"}
 
 
 @jax.tree_util.register_dataclass
@@ -52,7 +51,7 @@ class Searched:
     def symmetric(self) -> bool:
         """Whether exchanging i and j gives the same pairs."""
         radii = self.inputs.cutoff
-        return self.inputs.queries is None and not (isinstance(radii, Radii) and radii.rule in _EXCHANGED)
+        return self.inputs.queries is None and not (isinstance(radii, Radii) and radii.rule in EXCHANGED)
 
     @property
     def finite_rows(self) -> Array:
@@ -63,7 +62,7 @@ class Searched:
         """Return the same pairs with i and j exchanged and shifts negated."""
         sources, queries, active, box, cutoff, batch = self.inputs
         if isinstance(cutoff, Radii):
-            cutoff = Radii(cutoff.queries, cutoff.sources, _EXCHANGED.get(cutoff.rule, cutoff.rule))
+            cutoff = Radii(cutoff.queries, cutoff.sources, EXCHANGED.get(cutoff.rule, cutoff.rule))
         if queries is not None:
             sources, queries = queries, sources
             batch = batch if batch is None else Batch(batch.of_queries, batch.sources)
