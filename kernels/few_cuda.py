@@ -12,9 +12,9 @@ from jfrnn.kernels.cells_cuda import GRID
 from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
 MOST = 4096  # sources, and queries, up to which all of them meet
-_QUERIES = 16  # of a block: one per warp
-_BLOCKS = 2  # that share a multiprocessor: all are at work at once
-_TILE = {False: 1024, True: 512}  # sources that a block holds at a time, by width
+_WARPS = 16  # of a block, which share the sources
+_PARTS = 4  # lanes of a warp that serve one query, where queries are few
+_FEWER = 1024  # queries up to which they are
 
 
 def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -> int:
@@ -23,27 +23,32 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -
     return 0
 
 
-def threads(queries: int) -> int:
-    """Return the threads of a launch."""
-    return 32 * _QUERIES * blocks(queries)
+def parts(queries: int) -> int:
+    """Return how many lanes of a warp serve one query."""
+    return _PARTS if queries <= _FEWER else 1
 
 
 def blocks(queries: int) -> int:
     """Return the blocks of a launch: of so many, `info` has a row each."""
-    return -(-queries // _QUERIES)
+    return -(-queries * parts(queries) // 32)
+
+
+def threads(queries: int) -> int:
+    """Return the threads of a launch."""
+    return 32 * _WARPS * blocks(queries)
 
 
 def slots(queries: int) -> int:
     """Return the number of partial sums that make up a sum over all pairs."""
-    return queries
+    return _WARPS * blocks(queries)
 
 
 @functools.lru_cache(64)
 def rows_kernel(dim: int, double: bool, lists: bool, batched: bool, boxed: bool = False) -> Kernel:
     """Return the kernel for a dimension and dtype, for lists or counts alone."""
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_list' * lists}{'_nearest' * boxed}{'_batched' * batched}"
-    text = program(double, dim, "few_rows.cuh", SUMS=0, **_constants(double, lists, batched, boxed))
-    return declare(f"few_cuda_{variant}", text, Entry("FewRows.run", 32 * _QUERIES, _BLOCKS), cuda=True, fused=True)[0]
+    text = program(double, dim, "few_rows.cuh", SUMS=0, **_constants(lists, batched, boxed))
+    return declare(f"few_cuda_{variant}", text, Entry("FewRows.run", 32 * _WARPS), cuda=True, fused=True)[0]
 
 
 @functools.lru_cache(512)
@@ -60,11 +65,11 @@ def sum_kernel(
     """Return the kernel that sums a term; the arguments are those of `jfrnn.kernels.pair_sum_cuda.sum_kernels`."""
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_compensated' * compensated}{'_nearest' * boxed}"
     variant += f"{'_batched' * batched}{'_extremes' * extremes}"
-    constants = GRID | _constants(double, False, batched, boxed) | constants_of(term, compensated, extremes)
+    constants = GRID | _constants(False, batched, boxed) | constants_of(term, compensated, extremes)
     text = program(double, dim, "few_sums.cuh", given=term_header(term, double), **constants)
-    return declare(f"few_sums_cuda_{variant}_{key}", text, Entry("FewSums.run", 32 * _QUERIES, _BLOCKS), cuda=True, fused=True)[0]
+    return declare(f"few_sums_cuda_{variant}_{key}", text, Entry("FewSums.run", 32 * _WARPS), cuda=True, fused=True)[0]
 
 
-def _constants(double: bool, lists: bool, batched: bool, boxed: bool) -> dict[str, int]:
-    sizes = {"FEW_TILE": _TILE[double], "FEW_QUERIES": _QUERIES}
+def _constants(lists: bool, batched: bool, boxed: bool) -> dict[str, int]:
+    sizes = {"FEW_MOST": MOST, "FEW_WARPS": _WARPS, "FEW_PARTS": _PARTS}
     return {"LIST": lists, "PERIODIC": boxed, "BATCHED": batched, **sizes}

@@ -206,7 +206,7 @@ def test_few_particles_take_one_launch():
     variant = warp_sums._SumVariant(3, False, False, True, False, True, 0, False, False, False, plan.key, True, True)
     found = warp_sums._plan_few(variant, plan.text, {name: (40, 3) for name in warp_sums._GIVEN}, 132)
     (launch,) = found.steps
-    assert launch.threads // launch.kernel.block == -(-40 // few_cuda._QUERIES)
+    assert launch.threads // launch.kernel.block == few_cuda.blocks(40) == 5
     arrays = {*warp_sums._GIVEN, "sums", "totals", "errors"}
     assert {field.name for field in launch.kernel.fields} <= arrays | set(found.numbers)
     for size, few in ((few_cuda.MOST, True), (few_cuda.MOST + 1, False)):

@@ -117,7 +117,7 @@ def _plan_few(variant: _SumVariant, term: TermText, shapes: Shapes, _: int) -> P
     kind = variant.compensated, variant.batched, variant.extremes, variant.periodic == 1
     query = few_cuda.sum_kernel(term, variant.key, variant.dim, variant.double, *kind)
     numbers = _numbers(variant, term, shapes)
-    numbers["drop_self"] &= variant.own
+    numbers |= {"drop_self": numbers["drop_self"] & variant.own, "parts": few_cuda.parts(numbers["m"])}
     return Plan([Launch(query, few_cuda.threads(numbers["m"]))], numbers)
 
 

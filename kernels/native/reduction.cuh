@@ -22,7 +22,8 @@ struct Results : SumRows {
     }
 };
 
-// The query whose summands are reduced; `fresh`: it has nothing yet, `finished`: nothing follows.
+constexpr int NO_BLOCK = -1;
+// The query whose summands are reduced; `fresh`: it has nothing yet, `finished`: nothing follows. NO_BLOCK gets no totals.
 struct Destination {
     int lane, id, block;
     bool is_query, fresh, finished;  // there is a query in this lane
@@ -69,7 +70,7 @@ struct Added {
                     store_row(results, (long long)of.id * ROW_SUMS + PLACE[k], sum[k], error[k], of);
 #pragma unroll
         for (int k = 0; k < SUMMANDS; ++k)
-            if (IS_TOTAL[k])
+            if (IS_TOTAL[k] && of.block != NO_BLOCK)
                 results.add_total(PLACE[k], sum[k], error[k], of.block, of.lane);
     }
     JFRNN_FUNCTION void store_row(const Results& results, long long at, real sum, real error, const Destination& of) {
