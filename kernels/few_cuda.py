@@ -12,9 +12,8 @@ from jfrnn.kernels.cells_cuda import GRID
 from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
 MOST = 4096  # sources, and queries, up to which all of them meet
-_WARPS = 16  # of a block, which share the sources
-_PARTS = 4  # lanes of a warp that serve one query, where queries are few
-_FEWER = 1024  # queries up to which they are
+_WARPS, _FEW_WARPS = 32, 8  # of a block: as many queries share it, fewer where they are few, so that all multiprocessors have some
+_FEW = 1024  # queries
 
 
 def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -> int:
@@ -23,36 +22,37 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -
     return 0
 
 
-def parts(queries: int) -> int:
-    """Return how many lanes of a warp serve one query."""
-    return _PARTS if queries <= _FEWER else 1
+def warps(queries: int) -> int:
+    """Return the warps of a block, which serves as many queries."""
+    return _FEW_WARPS if queries <= _FEW else _WARPS
 
 
 def blocks(queries: int) -> int:
     """Return the blocks of a launch: of so many, `info` has a row each."""
-    return -(-queries * parts(queries) // 32)
+    return -(-queries // warps(queries))
 
 
 def threads(queries: int) -> int:
     """Return the threads of a launch."""
-    return 32 * _WARPS * blocks(queries)
+    return 32 * warps(queries) * blocks(queries)
 
 
 def slots(queries: int) -> int:
     """Return the number of partial sums that make up a sum over all pairs."""
-    return _WARPS * blocks(queries)
+    return warps(queries) * blocks(queries)
 
 
 @functools.lru_cache(64)
-def rows_kernel(dim: int, double: bool, lists: bool, batched: bool, boxed: bool = False) -> Kernel:
+def rows_kernel(warps: int, dim: int, double: bool, lists: bool, batched: bool, boxed: bool = False) -> Kernel:
     """Return the kernel for a dimension and dtype, for lists or counts alone."""
-    variant = f"{dim}d_{'f64' if double else 'f32'}{'_list' * lists}{'_nearest' * boxed}{'_batched' * batched}"
-    text = program(double, dim, "few_rows.cuh", SUMS=0, **_constants(lists, batched, boxed))
-    return declare(f"few_cuda_{variant}", text, Entry("FewRows.run", 32 * _WARPS), cuda=True, fused=True)[0]
+    variant = f"{warps}w_{dim}d_{'f64' if double else 'f32'}{'_list' * lists}{'_nearest' * boxed}{'_batched' * batched}"
+    text = program(double, dim, "few_rows.cuh", SUMS=0, **_constants(warps, lists, batched, boxed))
+    return declare(f"few_cuda_{variant}", text, Entry("FewRows.run", 32 * warps), cuda=True, fused=True)[0]
 
 
 @functools.lru_cache(512)
 def sum_kernel(
+    warps: int,
     term: TermText,
     key: str,
     dim: int,
@@ -63,13 +63,13 @@ def sum_kernel(
     boxed: bool = False,
 ) -> Kernel:
     """Return the kernel that sums a term; the arguments are those of `jfrnn.kernels.pair_sum_cuda.sum_kernels`."""
-    variant = f"{dim}d_{'f64' if double else 'f32'}{'_compensated' * compensated}{'_nearest' * boxed}"
+    variant = f"{warps}w_{dim}d_{'f64' if double else 'f32'}{'_compensated' * compensated}{'_nearest' * boxed}"
     variant += f"{'_batched' * batched}{'_extremes' * extremes}"
-    constants = GRID | _constants(False, batched, boxed) | constants_of(term, compensated, extremes)
+    constants = GRID | _constants(warps, False, batched, boxed) | constants_of(term, compensated, extremes)
     text = program(double, dim, "few_sums.cuh", given=term_header(term, double), **constants)
-    return declare(f"few_sums_cuda_{variant}_{key}", text, Entry("FewSums.run", 32 * _WARPS), cuda=True, fused=True)[0]
+    return declare(f"few_sums_cuda_{variant}_{key}", text, Entry("FewSums.run", 32 * warps), cuda=True, fused=True)[0]
 
 
-def _constants(lists: bool, batched: bool, boxed: bool) -> dict[str, int]:
-    sizes = {"FEW_MOST": MOST, "FEW_WARPS": _WARPS, "FEW_PARTS": _PARTS}
+def _constants(warps: int, lists: bool, batched: bool, boxed: bool) -> dict[str, int]:
+    sizes = {"FEW_MOST": MOST, "FEW_WARPS": warps}
     return {"LIST": lists, "PERIODIC": boxed, "BATCHED": batched, **sizes}

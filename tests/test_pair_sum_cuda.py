@@ -62,7 +62,11 @@ def compiles_for(plan, dim, double, **variant):
     kernels = [kernel for kernel in pair_sum_cuda.sum_kernels(plan.text, plan.key, dim, double, **options) if kernel is not None]
     if not options["scaled"] and options.get("periodic", 0) <= 1:
         few = {name: value for name, value in options.items() if name not in ("scaled", "periodic")}
-        kernels.append(few_cuda.sum_kernel(plan.text, plan.key, dim, double, **few, boxed=options.get("periodic") == 1))
+        kernels.append(
+            few_cuda.sum_kernel(
+                few_cuda.warps(5000 * double), plan.text, plan.key, dim, double, **few, boxed=options.get("periodic") == 1
+            )
+        )
     return all(f".entry {x.name}(" in _compile.find_binary(x.program, arch=90).read_text() for x in kernels)
 
 

@@ -197,8 +197,10 @@ def _plan_on_cuda(variant: Variant, shapes: Shapes, multiprocessors: int) -> Pla
 
 def _plan_few(variant: Variant, shapes: Shapes, _: int) -> Plan:
     numbers = plan_numbers(variant, shapes)
-    numbers |= {"drop_self": numbers["drop_self"] & variant.own, "parts": few_cuda.parts(numbers["m"])}
-    query = few_cuda.rows_kernel(variant.dim, variant.double, variant.lists, variant.batched, variant.periodic == 1)
+    numbers["drop_self"] &= variant.own
+    query = few_cuda.rows_kernel(
+        few_cuda.warps(numbers["m"]), variant.dim, variant.double, variant.lists, variant.batched, variant.periodic == 1
+    )
     return Plan([Launch(query, few_cuda.threads(numbers["m"]))], numbers, _absent(variant))
 
 

@@ -115,9 +115,9 @@ def _few_callable(variant: _SumVariant, term: TermText) -> Call:
 
 def _plan_few(variant: _SumVariant, term: TermText, shapes: Shapes, _: int) -> Plan:
     kind = variant.compensated, variant.batched, variant.extremes, variant.periodic == 1
-    query = few_cuda.sum_kernel(term, variant.key, variant.dim, variant.double, *kind)
     numbers = _numbers(variant, term, shapes)
-    numbers |= {"drop_self": numbers["drop_self"] & variant.own, "parts": few_cuda.parts(numbers["m"])}
+    query = few_cuda.sum_kernel(few_cuda.warps(numbers["m"]), term, variant.key, variant.dim, variant.double, *kind)
+    numbers["drop_self"] &= variant.own
     return Plan([Launch(query, few_cuda.threads(numbers["m"]))], numbers)
 
 

@@ -35,7 +35,7 @@ constexpr int PLACED = 3;         // coordinates of j before its numbers, in a r
 constexpr int ROW_LENGTH = 4;
 constexpr bool FROM_PLACES = false;  // the term reads coordinates of j, and no numbers
 // Of few particles on CUDA (see jfrnn/kernels/few_cuda.py).
-constexpr int FEW_MOST = 4096, FEW_WARPS = 16, FEW_PARTS = 4;
+constexpr int FEW_MOST = 4096, FEW_WARPS = 32;
 // Of searches with a cutoff per particle (see jfrnn/kernels/levels.py).
 constexpr int RULE = 0, GROUPS = 8, HALVINGS = 5, PADDING = 16;
 // Of lists that are kept (see jfrnn/kernels/reverse.py and kept.py).

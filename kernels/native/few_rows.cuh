@@ -6,58 +6,57 @@
 struct FewRowsArguments {
     const real *positions, *queries, *cutoff;
     int *idx, *count, *info;
-    int n, m, capacity, closed, drop_self, later_only, parts;
+    int n, m, capacity, closed, drop_self, later_only;
 };
 
 struct FewRows : FewRowsArguments {
     JFRNN_MEMBER explicit FewRows(const FewRowsArguments& given) : FewRowsArguments(given) {}
 
     JFRNN_MEMBER void run() {
-        __shared__ unsigned int near[FEW_WORDS][FEW_THREADS];
-        __shared__ int found_by[FEW_WARPS][32];
+        __shared__ FewPairs::Bits32 near[WORDS];
+        __shared__ int counted[FEW_WARPS][SHARES + 1];
         const FewPairs pairs(*this, later_only);
         const bool finite = pairs.find(near);
         int found = 0;
         pairs.meet_all(near, [&](int, const real*, int) { ++found; });
-        found_by[pairs.warp][pairs.lane] = found;
+        counted[pairs.slot][pairs.share] = found;
         const bool not_finite = __syncthreads_or(!finite || (pairs.is_query && !pairs.is_finite));
-        int before = 0, all = 0;
-        for (int w = 0; w < FEW_WARPS; ++w)
-            for (int part = 0; part < parts; ++part) {
-                if (w * parts + part == pairs.share)
-                    before = all;
-                all += found_by[w][pairs.slot * parts + part];
-            }
+        // from here on a warp has the row of one query
+        const int mine = counted[pairs.warp][pairs.lane], until = add_up(mine, pairs.lane), all = __shfl_sync(EVERY, until, 31);
+        counted[pairs.warp][pairs.lane] = until - mine;
+        if (pairs.lane == 0)
+            counted[pairs.warp][SHARES] = all;
+        const int id = blockIdx.x * FEW_WARPS + pairs.warp;
+        if (pairs.lane == 0 && id < m)
+            count[id] = all;
+        for (int slot = all + pairs.lane; LIST && id < m && slot < capacity; slot += 32)
+            idx[(long long)id * capacity + slot] = n;
+        __syncthreads();
         if (LIST && found > 0)
-            write(pairs, near, idx + (long long)pairs.query * capacity, before);
-        if constexpr (LIST)
-            fill(pairs, all);
-        if (pairs.warp > 0)
-            return;
-        if (pairs.is_query && pairs.share == 0)
-            count[pairs.query] = all;
-        tell(pairs, all, not_finite);
+            write(pairs, near, idx + (long long)pairs.query * capacity, counted[pairs.slot][pairs.share]);
+        if (pairs.warp == 0)
+            tell(pairs.lane, pairs.lane < FEW_WARPS ? counted[pairs.lane % FEW_WARPS][SHARES] : 0, not_finite);
     }
-    JFRNN_MEMBER void write(const FewPairs& pairs, const unsigned int (*near)[FEW_THREADS], int* row, int slot) const {
+    // The sum over this lane and those below.
+    JFRNN_FUNCTION int add_up(int number, int lane) {
+        for (int step = 1; step < 32; step *= 2) {
+            const int below = __shfl_up_sync(EVERY, number, step);
+            number += lane >= step ? below : 0;
+        }
+        return number;
+    }
+    JFRNN_MEMBER void write(const FewPairs& pairs, const FewPairs::Bits32* near, int* row, int slot) const {
         for (int k = 0; k < pairs.words; ++k)
             for (unsigned int rest = near[k][threadIdx.x]; rest && slot < capacity; rest &= rest - 1)
                 row[slot++] = pairs.first_of(k) + __ffs(rest) - 1;
     }
-    // Fills what is left of rows, each by one warp.
-    JFRNN_MEMBER void fill(const FewPairs& pairs, int all) const {
-        for (int k = pairs.warp; k < 32 / parts; k += FEW_WARPS) {
-            const int query = pairs.query - pairs.slot + k, from = __shfl_sync(0xffffffffu, all, k * parts);
-            for (int slot = from + pairs.lane; query < m && slot < capacity; slot += 32)
-                idx[(long long)query * capacity + slot] = n;
-        }
-    }
     // Writes the row of `info` of this block.
-    JFRNN_MEMBER void tell(const FewPairs& pairs, int longest, bool not_finite) const {
+    JFRNN_MEMBER void tell(int lane, int longest, bool not_finite) const {
         for (int step = 16; step > 0; step /= 2) {
-            const int other = __shfl_down_sync(0xffffffffu, longest, step);
+            const int other = __shfl_down_sync(EVERY, longest, step);
             longest = other > longest ? other : longest;
         }
-        if (pairs.lane > 0)
+        if (lane > 0)
             return;
         info[2 * blockIdx.x] = longest;
         info[2 * blockIdx.x + 1] = (not_finite ? 2 : 0) | (LIST && longest > capacity ? 1 : 0);

@@ -6,7 +6,7 @@
 struct FewSumsArguments {
     const real *positions, *queries, *cutoff, *shared_values, *own_values, *others;
     real *sums, *totals, *errors;
-    int n, m, closed, drop_self, parts;
+    int n, m, closed, drop_self;
 };
 
 struct FewSums : FewSumsArguments {
@@ -14,7 +14,7 @@ struct FewSums : FewSumsArguments {
 
     JFRNN_MEMBER void run() {
         constexpr int COLUMNS = OTHERS + (STEPS > 0);  // turns stand behind the others
-        __shared__ unsigned int near[FEW_WORDS][FEW_THREADS];
+        __shared__ FewPairs::Bits32 near[WORDS];
         const FewPairs pairs(*this, false);
         const Term term(shared_values);
         const Term::Own own_part = term.own(own_values + (long long)OWN * (pairs.is_query ? pairs.query : 0), pairs.q);
@@ -37,10 +37,8 @@ struct FewSums : FewSumsArguments {
         });
         const Results results{sums, errors, n, totals};
         store_totals(pairs, results, reduction);
-        if (parts > 1)
-            reduction.template reduce_over_warp<FEW_PARTS>();
-        exchange(reduction, near);
-        store_rows(pairs, results, reduction);
+        exchange(pairs, reduction, near);
+        store_row(pairs, results, reduction);
     }
     // Each warp has parts of the sums over all pairs.
     JFRNN_MEMBER void store_totals(const FewPairs& pairs, const Results& results, const Reduction& reduction) const {
@@ -52,34 +50,34 @@ struct FewSums : FewSumsArguments {
         __syncwarp();
         reduction.store(results, {pairs.lane, 0, part, false, true, true});
     }
-    // Hands what each warp has of a query to FEW_WARPS lanes of one warp.
-    JFRNN_MEMBER void exchange(Reduction& reduction, unsigned int (*room)[FEW_THREADS]) const {
-        constexpr int WORDS = sizeof(Reduction) / 4;
-        unsigned int words[WORDS];
-        memcpy(words, &reduction, sizeof words);
-        const int slot = threadIdx.x / FEW_WARPS, from = threadIdx.x % FEW_WARPS * 32 + slot * parts % 32;
+    // Hands what there is of each query to one warp, share by share.
+    JFRNN_MEMBER void exchange(const FewPairs& pairs, Reduction& reduction, FewPairs::Bits32* room) const {
+        constexpr int NUMBERS = sizeof(Reduction) / 4;
+        unsigned int numbers[NUMBERS];
+        memcpy(numbers, &reduction, sizeof numbers);
+        const int from = 32 * (pairs.lane / OF_WARP) + OF_WARP * pairs.warp + pairs.lane % OF_WARP;
 #pragma unroll
-        for (int begin = 0; begin < WORDS; begin += FEW_WORDS) {
+        for (int begin = 0; begin < NUMBERS; begin += WORDS) {
             __syncthreads();
 #pragma unroll
-            for (int w = begin; w < begin + FEW_WORDS && w < WORDS; ++w)
-                room[w - begin][threadIdx.x] = words[w];
+            for (int k = begin; k < begin + WORDS && k < NUMBERS; ++k)
+                room[k - begin][threadIdx.x] = numbers[k];
             __syncthreads();
 #pragma unroll
-            for (int w = begin; w < begin + FEW_WORDS && w < WORDS; ++w)
-                words[w] = room[w - begin][from];
+            for (int k = begin; k < begin + WORDS && k < NUMBERS; ++k)
+                numbers[k] = room[k - begin][from];
         }
-        memcpy(&reduction, words, sizeof words);
+        memcpy(&reduction, numbers, sizeof numbers);
     }
-    JFRNN_MEMBER void store_rows(const FewPairs& pairs, const Results& results, Reduction& reduction) const {
-        const int slot = threadIdx.x / FEW_WARPS, id = pairs.query - pairs.slot + slot;
-        reduction.template reduce_over_warp<FEW_WARPS>();
-        if (threadIdx.x % FEW_WARPS > 0 || slot >= 32 / parts || id >= m)
+    JFRNN_MEMBER void store_row(const FewPairs& pairs, const Results& results, Reduction& reduction) const {
+        const int id = blockIdx.x * FEW_WARPS + pairs.warp;
+        reduction.reduce_over_warp();
+        if (pairs.lane > 0 || id >= m)
             return;
         real q[3];
         pairs.point_of(queries + (long long)ROW * id, q);
         if (finite_point(q))
-            reduction.store(results, {pairs.lane, id, NO_BLOCK, true, true, true});
+            reduction.store(results, {0, id, NO_BLOCK, true, true, true});
         else
             results.clear(id);
     }
