@@ -1,4 +1,4 @@
-"""Few particles on CUDA: a search or a sum is one launch, in which a warp serves one query and meets all sources.
+"""Few particles on CUDA: a search or a sum is one launch, in which all queries meet all sources, bit by bit.
 
 To sort particles by cell takes six launches, of which each waits for the one before: longer than to meet a few thousand sources. In
 a box that stands along the axes, and in which no pair has two images, the nearest image of each source is met.
@@ -12,8 +12,8 @@ from jfrnn.kernels.cells_cuda import GRID
 from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
 MOST = 4096  # sources, and queries, up to which all of them meet
-_WARPS, _FEW_WARPS = 32, 8  # of a block: as many queries share it, fewer where they are few, so that all multiprocessors have some
-_FEW = 1024  # queries
+_WARPS = 8, 16, 32  # of a block, which serves as many queries
+_BLOCKS = 128  # beyond, blocks become larger rather than more: about as many as are at work at once
 
 
 def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -> int:
@@ -24,7 +24,7 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -
 
 def warps(queries: int) -> int:
     """Return the warps of a block, which serves as many queries."""
-    return _FEW_WARPS if queries <= _FEW else _WARPS
+    return next((count for count in _WARPS if count * _BLOCKS >= queries), _WARPS[-1])
 
 
 def blocks(queries: int) -> int:
@@ -44,7 +44,7 @@ def slots(queries: int) -> int:
 
 @functools.lru_cache(64)
 def rows_kernel(warps: int, dim: int, double: bool, lists: bool, batched: bool, boxed: bool = False) -> Kernel:
-    """Return the kernel for a dimension and dtype, for lists or counts alone."""
+    """Return the kernel for warps of a block, a dimension and a dtype, for lists or counts alone."""
     variant = f"{warps}w_{dim}d_{'f64' if double else 'f32'}{'_list' * lists}{'_nearest' * boxed}{'_batched' * batched}"
     text = program(double, dim, "few_rows.cuh", SUMS=0, **_constants(warps, lists, batched, boxed))
     return declare(f"few_cuda_{variant}", text, Entry("FewRows.run", 32 * warps), cuda=True, fused=True)[0]
@@ -62,7 +62,7 @@ def sum_kernel(
     extremes: bool = False,
     boxed: bool = False,
 ) -> Kernel:
-    """Return the kernel that sums a term; the arguments are those of `jfrnn.kernels.pair_sum_cuda.sum_kernels`."""
+    """Return the kernel that sums a term; but for warps of a block, the arguments are those of `jfrnn.kernels.pair_sum_cuda.sum_kernels`."""
     variant = f"{warps}w_{dim}d_{'f64' if double else 'f32'}{'_compensated' * compensated}{'_nearest' * boxed}"
     variant += f"{'_batched' * batched}{'_extremes' * extremes}"
     constants = GRID | _constants(warps, False, batched, boxed) | constants_of(term, compensated, extremes)
@@ -71,5 +71,4 @@ def sum_kernel(
 
 
 def _constants(warps: int, lists: bool, batched: bool, boxed: bool) -> dict[str, int]:
-    sizes = {"FEW_MOST": MOST, "FEW_WARPS": warps}
-    return {"LIST": lists, "PERIODIC": boxed, "BATCHED": batched, **sizes}
+    return {"LIST": lists, "PERIODIC": boxed, "BATCHED": batched, "FEW_MOST": MOST, "FEW_WARPS": warps}

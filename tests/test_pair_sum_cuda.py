@@ -63,9 +63,7 @@ def compiles_for(plan, dim, double, **variant):
     if not options["scaled"] and options.get("periodic", 0) <= 1:
         few = {name: value for name, value in options.items() if name not in ("scaled", "periodic")}
         kernels.append(
-            few_cuda.sum_kernel(
-                few_cuda.warps(5000 * double), plan.text, plan.key, dim, double, **few, boxed=options.get("periodic") == 1
-            )
+            few_cuda.sum_kernel(32 if double else 8, plan.text, plan.key, dim, double, **few, boxed=options.get("periodic") == 1)
         )
     return all(f".entry {x.name}(" in _compile.find_binary(x.program, arch=90).read_text() for x in kernels)
 
@@ -211,6 +209,7 @@ def test_few_particles_take_one_launch():
     found = warp_sums._plan_few(variant, plan.text, {name: (40, 3) for name in warp_sums._GIVEN}, 132)
     (launch,) = found.steps
     assert launch.threads // launch.kernel.block == few_cuda.blocks(40) == 5
+    assert [few_cuda.warps(m) for m in (0, 1, 1024, 1025, 2048, 2049, few_cuda.MOST)] == [8, 8, 8, 16, 16, 32, 32]
     arrays = {*warp_sums._GIVEN, "sums", "totals", "errors"}
     assert {field.name for field in launch.kernel.fields} <= arrays | set(found.numbers)
     for size, few in ((few_cuda.MOST, True), (few_cuda.MOST + 1, False)):

@@ -10,9 +10,9 @@
 
 constexpr unsigned int EVERY = 0xffffffffu;
 constexpr int SHARES = 32, OF_WARP = SHARES / FEW_WARPS;  // of sources, and those of a warp
-constexpr int FEW_THREADS = 32 * FEW_WARPS,
-              WORDS = FEW_MOST / (32 * SHARES);  // of a block, and most words of 32 sources of a share
-constexpr int AT_ONCE = 4;                       // sources that a lane holds
+constexpr int FEW_THREADS = 32 * FEW_WARPS;               // of a block
+constexpr int WORDS = FEW_MOST / (32 * SHARES);           // of 32 sources: most of them that a share has
+constexpr int AT_ONCE = 4;                                // sources that a lane holds
 
 struct FewPairs : Space {
     struct alignas(DOUBLE ? 8 : 16) Point {
