@@ -62,7 +62,10 @@ def sum_kernel(
     extremes: bool = False,
     boxed: bool = False,
 ) -> Kernel:
-    """Return the kernel that sums a term; but for warps of a block, the arguments are those of `jfrnn.kernels.pair_sum_cuda.sum_kernels`."""
+    """Return the kernel that sums a term.
+
+    But for the warps of a block, the arguments are those of `jfrnn.kernels.pair_sum_cuda.sum_kernels`.
+    """
     variant = f"{warps}w_{dim}d_{'f64' if double else 'f32'}{'_compensated' * compensated}{'_nearest' * boxed}"
     variant += f"{'_batched' * batched}{'_extremes' * extremes}"
     constants = GRID | _constants(warps, False, batched, boxed) | constants_of(term, compensated, extremes)
