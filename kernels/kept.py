@@ -1,4 +1,4 @@
-"""Lists that are kept: which of their slots hold a pair now, and sums over these pairs.
+"""Lists that are kept: which of their slots hold a pair now, how far apart, what that gives to derivatives, and sums over the pairs.
 
 On the CPU, LANES slots of a row are taken at a time. Numbers of their sources are read four at a time, where these stand, and rows
 and columns of what was read are exchanged in registers. On CUDA, a lane serves a row, or eight lanes where rows are few. A lane
@@ -71,7 +71,7 @@ class ListKind(NamedTuple):
     def constants(self, columns: int) -> dict[str, int]:
         """Return the named integers of a program."""
         found = {"PERIODIC": self.periodic, "SCALED": self.scaled, "CODE_BYTES": self.code_bytes, "REVERSED": self.reversed}
-        found |= {"RADII": RADII.get(self.rule, 0), "SUM": self.rule == "mean", "ALIGNED": self.aligned}
+        found |= {"RADII": RADII.get(self.rule, 0), "SUM": self.rule == "mean", "ALIGNED": self.aligned, "DECIDED": 1}
         return found | {"LENGTH": self.length(columns), "LANES_PER_ROW": max(self.lanes, 1), "QUERY_CHUNK": ROWS_AT_ONCE, **GRID}
 
 
@@ -86,12 +86,22 @@ def threads(rows: int, lanes: int) -> int:
 
 
 @functools.lru_cache(256)
-def mask_kernel(kind: ListKind) -> Kernel:
-    """Return the kernel that tells which slots hold a pair now."""
-    constants = {"OTHERS": 0, "SUMS": 0, "LIST": 0, **kind.constants(0)}
-    text = program(kind.double, kind.dim, "kept_mask.cuh" if kind.cuda else "kept_mask_cpu.h", **constants)
-    entry = Entry("KeptMask.run", _BLOCK if kind.cuda else 1, 8)
-    return declare(f"kept_mask_{kind.name}", text, entry, cuda=kind.cuda, fused=kind.cuda)[0]
+def mask_kernel(kind: ListKind, measured: bool) -> Kernel:
+    """Return the kernel that tells which slots hold a pair now, and (`measured`) the distances."""
+    return _kernel(kind, "mask", measured, MEASURED=measured)
+
+
+@functools.lru_cache(256)
+def slope_kernel(kind: ListKind) -> Kernel:
+    """Return the kernel that makes derivatives by positions of those by distances, in a list that is its own mirror image."""
+    return _kernel(kind, "slopes", False, DECIDED=0)
+
+
+def _kernel(kind: ListKind, what: str, marked: bool, **constants: int) -> Kernel:
+    given = {"OTHERS": 0, "SUMS": 0, "LIST": 0, **kind.constants(0), **constants}
+    text = program(kind.double, kind.dim, f"kept_{what}.cuh" if kind.cuda else f"kept_{what}_cpu.h", **given)
+    entry = Entry(f"Kept{what.title()}.run", _BLOCK if kind.cuda else 1, 8)
+    return declare(f"kept_{what}_{kind.name}{'_measured' * marked}", text, entry, cuda=kind.cuda, fused=kind.cuda)[0]
 
 
 @functools.lru_cache(512)

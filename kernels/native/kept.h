@@ -79,12 +79,13 @@ struct Kept : KeptArguments, Space {
         return own;
     }
 
-    // What is found out about slots.
+    // What is found out about slots: the lattice shift, x_j - x_i with it, and whether it is a pair.
     struct Verdict {
-        Number shift[3];
+        Number shift[3], vector[3];
         Math::flag sure, open;
     };
-    // `step` (CODED): the shift of the image code of each slot; `same`: the source of a slot is its row.
+    // `step` (CODED): the shift of the image code of each slot; `same`: the source of a slot is its row. Where nothing is DECIDED, each
+    // slot that is used is sure.
     JFRNN_INLINE Verdict judge(
         const OwnPoint& own, const Number* numbers, const Number* step, Math::flag same, Math::flag used) const {
         Number d[3], square{};
@@ -108,6 +109,12 @@ struct Kept : KeptArguments, Space {
                 d[k] = d[k] + translation(found.shift, k);
         } else
             used = Math::both(used, Math::inverse(same));
+        for (int k = 0; k < DIM; ++k)
+            found.vector[k] = d[k];
+        if constexpr (!DECIDED) {
+            found.sure = used;
+            return found;
+        }
         for (int k = 0; k < DIM; ++k) {
             const Number scaled = d[k] * step_scale;
             square = square + scaled * scaled;
@@ -127,6 +134,20 @@ struct Kept : KeptArguments, Space {
         found.sure = Math::both(used, Math::lt(square, inner));
         found.open = Math::both(Math::both(used, Math::le(square, outer)), Math::inverse(found.sure));
         return found;
+    }
+    // The length of a vector: squares of very small ones would underflow, so these are taken in a unit of their own.
+    JFRNN_INLINE Number length_of(const Number* vector) const {
+        constexpr real SMALL = DOUBLE ? real(0x1p-480) : real(0x1p-50f), LARGE_UNIT = DOUBLE ? real(0x1p700) : real(0x1p90f);
+        Number size{}, square{};
+        for (int k = 0; k < DIM; ++k)
+            size = larger(Math::abs(vector[k]), size);
+        const Math::flag small = Math::lt(size * step_scale, Math::of(SMALL));
+        for (int k = 0; k < DIM; ++k) {
+            const Number plain = vector[k] * step_scale, scaled = Math::select(small, plain * LARGE_UNIT, plain);
+            square = square + scaled * scaled;
+        }
+        const Number length = Math::sqrt(square);
+        return Math::select(small, length / LARGE_UNIT, length) / step_scale;
     }
     JFRNN_INLINE Number nearest(const Number* d, int k) const {
         Number along = d[k] * lattice.transform(k, k);

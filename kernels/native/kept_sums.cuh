@@ -46,7 +46,7 @@ struct KeptSums : KeptLane {
                 code = place;
             });
         };
-        walk(own, visit, [](int, unsigned int) {});
+        walk(own, visit, [](int, unsigned int, const Verdict*) {});
         __syncwarp();
         reduction.reduce_over_warp<LANES_PER_ROW>();
         reduction.store(results, {lane_of_warp, row, (int)warp, is_row && lane == 0, true, true});

@@ -1,0 +1,53 @@
+// What distances of a list give to the derivatives of positions, on the CPU.
+#pragma once
+#include "kept_cpu.h"
+
+// Each slot has the slope of a function by its distance, and in `slots` the slot of the pair the other way round: what both give to
+// the row is along x_j - x_i. Distances of 0 give nothing.
+struct KeptSlopesArguments {
+    const real *rows, *points, *cutoff, *steps;
+    const int *idx, *count, *codes, *slots, *starts, *lengths;
+    const real *distances, *slopes;
+    real* sums;
+    int* info;
+    int m, n, capacity, images, closed, apart;
+
+    KeptArguments of_list() const {
+        return {rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, m, n, capacity, images, closed, apart};
+    }
+};
+struct KeptSlopes : KeptRows<KeptSlopes> {
+    const real *distances, *slopes;
+    real* const sums;
+
+    explicit KeptSlopes(const KeptSlopesArguments& a)
+        : KeptRows(a.of_list(), a.info), distances(a.distances), slopes(a.slopes), sums(a.sums) {}
+
+    void serve(int row, const OwnPoint& own) {
+        const long long first = (long long)row * capacity;
+        const int all = entries(row);
+        Number sum[DIM] = {};
+        walk(row, own, [&](const KeptSlots& some) {
+            const int left = all - some.places, count = left < LANES ? left : LANES;
+            Number distance{}, slope{};
+            memcpy(&distance, distances + first + some.places, sizeof(real) * count);
+            memcpy(&slope, slopes + first + some.places, sizeof(real) * count);
+            for (int l = 0; l < count; ++l) {
+                const unsigned int back = slots[first + some.places + l];
+                if (distance[l] > 0 && back < (unsigned int)(m * capacity))
+                    slope[l] += slopes[back];
+            }
+            const Math::flag apart = Math::gt(distance, Number{});
+            const Number along = slope / Math::select(apart, distance, Math::of(real(1)));
+            for (int k = 0; k < DIM; ++k)
+                sum[k] = sum[k] + Math::select(apart, along * some.verdict.vector[k], Number{});
+        });
+        for (int k = 0; k < DIM; ++k) {
+            real total = 0;
+            for (int l = 0; l < LANES; ++l)
+                total -= sum[k][l];
+            sums[(long long)DIM * row + k] = total;
+        }
+    }
+    void finish_chunk(int) {}
+};
