@@ -1,4 +1,4 @@
-"""Lists that are kept: which of their slots hold a pair now, how far apart, what that gives to derivatives, and sums over the pairs.
+"""Lists that are kept: which of their slots hold a pair now, how far apart, what derivatives are of that, and sums over the pairs.
 
 On the CPU, LANES slots of a row are taken at a time. Numbers of their sources are read four at a time, where these stand, and rows
 and columns of what was read are exchanged in registers. On CUDA, a lane serves a row, or eight lanes where rows are few. A lane

@@ -86,14 +86,17 @@ def define(
 ) -> None:
     """Define a primitive that is linear in its first operand; the others are the leaves of a pytree.
 
-    That is a topology, or, with `plain`, anything: an array program of the same meaning, which is what derivatives by the leaves are
-    those of, and what is mapped over a batch.
+    That is a topology, or, with `plain`, any. `plain` is an array program of the same meaning: derivatives by the leaves are those of
+    it, and it is what a batch maps.
 
     The function is long because all rules of a primitive stand in it.
     """
 
     def run(x: Array, *leaves: Array, structure: Structure) -> Array:
         return work(x, jax.tree.unflatten(structure, leaves))
+
+    def run_plain(x: Array, *leaves: Array, structure: Structure) -> Array:
+        return (plain or work)(x, jax.tree.unflatten(structure, leaves))
 
     def shape(x: Aval, *leaves: Aval, structure: Structure) -> ShapedArray:
         return result_aval(shape_of(x.shape, jax.tree.unflatten(structure, leaves)), x.dtype, (x, *leaves))
@@ -103,11 +106,11 @@ def define(
         moving = [k for k, tangent in enumerate(tangents) if not isinstance(tangent, ad.Zero)]
         parts = [primitive.bind(tangents[0], *primals[1:], structure=structure)] if 0 in moving else []
         moving = [k for k in moving if k > 0]
-        if moving and plain is not None:
+        if moving:
 
             def at(*moved: Array) -> Array:
-                x, *leaves = (dict(zip(moving, moved, strict=True)).get(k, primal) for k, primal in enumerate(primals))
-                return plain(x, jax.tree.unflatten(structure, leaves))
+                now = dict(zip(moving, moved, strict=True))
+                return run_plain(*(now.get(k, x) for k, x in enumerate(primals)), structure=structure)
 
             parts.append(jax.jvp(at, [primals[k] for k in moving], [tangents[k] for k in moving])[1])
         if not parts:
@@ -122,7 +125,7 @@ def define(
 
     def batch(args: tuple, dims: tuple, *, structure: Structure) -> tuple[Array, int]:
         if plain is not None:
-            return jax.vmap(lambda x, *leaves: plain(x, jax.tree.unflatten(structure, leaves)), dims)(*args), 0
+            return jax.vmap(functools.partial(run_plain, structure=structure), dims)(*args), 0
         if all(d is None for d in dims[1:]):  # one list for the whole batch, which becomes the last axis of the values
             result = primitive.bind(jnp.moveaxis(args[0], dims[0], -1), *args[1:], structure=structure)
             return result, result.ndim - 1

@@ -1,7 +1,7 @@
 """Distances of a list that is its own mirror image, by Warp's kernels, with derivatives by kernels that gather.
 
-A pair gives the opposite to j of what it gives to i. So derivatives by positions need of each slot its slope and that of its reverse
-slot, two numbers, and neither displacements nor what belongs to them is stored.
+A pair gives the opposite to j of what it gives to i. So derivatives by positions need two numbers of each slot: its slope and that
+of its reverse slot. Neither displacements nor what belongs to them is stored.
 """
 
 import functools
@@ -25,7 +25,7 @@ class _Given(NamedTuple):
     """A list without positions and box; see `kept_list`."""
 
     topology: Topology
-    count: Array
+    counts: Array
     images: ImagesMade
     cutoff: Cutoff | Radii | None
 
@@ -60,17 +60,17 @@ def _lengths(how: tuple[Images | None, bool], sources: Array, box: Box | None, g
 
 def _at(how: tuple[Images | None, bool], sources: Array, box: Box | None, given: _Given) -> KeptList:
     kind, closed = how
-    topology, count, images, cutoff = given
+    topology, counts, images, cutoff = given
     lattice = None if box is None or kind is None else make_lattice(box, kind, jnp.dtype(sources.dtype))
-    return kept_list(topology, count, images, sources, sources, cutoff, closed, lattice)
+    return kept_list(topology, counts, images, sources, sources, cutoff, closed, lattice)
 
 
 def _by_vectors(how: tuple[Images | None, bool], sources: Array, box: Box | None, given: _Given) -> tuple[Array, Array]:
-    (kind, closed), (topology, count, images, cutoff) = how, given
+    (kind, closed), (topology, counts, images, cutoff) = how, given
     if box is None or kind is None:
-        vectors, mask = open_vectors(topology, count, sources, sources, cutoff, closed)
+        vectors, mask = open_vectors(topology, counts, sources, sources, cutoff, closed)
     else:
-        vectors, mask, _ = periodic_vectors(topology, count, images, sources, sources, box, kind, cutoff, closed, False)
+        vectors, mask, _ = periodic_vectors(topology, counts, images, sources, sources, box, kind, cutoff, closed, False)
     return norms(vectors), mask
 
 

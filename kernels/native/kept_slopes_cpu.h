@@ -32,11 +32,14 @@ struct KeptSlopes : KeptRows<KeptSlopes> {
             Number distance{}, slope{};
             memcpy(&distance, distances + first + some.places, sizeof(real) * count);
             memcpy(&slope, slopes + first + some.places, sizeof(real) * count);
-            for (int l = 0; l < count; ++l) {
-                const unsigned int back = slots[first + some.places + l];
-                if (distance[l] > 0 && back < (unsigned int)(m * capacity))
-                    slope[l] += slopes[back];
-            }
+            ints back{};
+            memcpy(&back, slots + first + some.places, sizeof(int) * count);
+            const auto there = (back >= 0) & (back < m * capacity);
+            const ints from = back & there;  // without branches, which would be guessed wrongly while numbers are on their way
+            Number others;
+            for (int l = 0; l < LANES; ++l)
+                others[l] = slopes[from[l]];
+            slope = slope + Math::select(__builtin_convertvector(there, Math::flag), others, Number{});
             const Math::flag apart = Math::gt(distance, Number{});
             const Number along = slope / Math::select(apart, distance, Math::of(real(1)));
             for (int k = 0; k < DIM; ++k)
