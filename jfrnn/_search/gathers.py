@@ -86,8 +86,8 @@ def define(
 ) -> None:
     """Define a primitive that is linear in its first operand; the others are the leaves of a pytree.
 
-    That is a topology, or, with `plain`, any. `plain` is an array program of the same meaning: derivatives by the leaves are those of
-    it, and it is what a batch maps.
+    That is a topology, or, with `plain`, any. `plain` is an array program of the same meaning: derivatives by the leaves are those
+    of it, and it is what a batch maps.
 
     The function is long because all rules of a primitive stand in it.
     """
@@ -109,8 +109,10 @@ def define(
         if moving:
 
             def at(*moved: Array) -> Array:
-                now = dict(zip(moving, moved, strict=True))
-                return run_plain(*(now.get(k, x) for k, x in enumerate(primals)), structure=structure)
+                now = [*primals]
+                for k, x in zip(moving, moved, strict=True):
+                    now[k] = x
+                return run_plain(*now, structure=structure)
 
             parts.append(jax.jvp(at, [primals[k] for k in moving], [tangents[k] for k in moving])[1])
         if not parts:

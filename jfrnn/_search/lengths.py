@@ -79,9 +79,8 @@ def _lengths_jvp(how: tuple[Images | None, bool], primals: tuple, tangents: tupl
     sources, box, given = primals
     moved, stretched, _ = tangents
     if any(not isinstance(x, SymbolicZero) for x in jax.tree.leaves(stretched)):
-        moved, stretched = jax.tree.map(
-            lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x, (moved, stretched)
-        )
+        both = (moved, stretched), (sources, box)
+        moved, stretched = jax.tree.map(lambda x, at: jnp.zeros_like(at) if isinstance(x, SymbolicZero) else x, *both)
         (_, mask), (slopes, none) = jax.jvp(lambda x, box: _by_vectors(how, x, box, given), (sources, box), (moved, stretched))
         return (_lengths(how, sources, box, given)[0], mask), (slopes, none)
     distances, mask = _lengths(how, sources, box, given)

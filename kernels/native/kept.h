@@ -115,9 +115,9 @@ struct Kept : KeptArguments, Space {
             found.sure = used;
             return found;
         }
-        for (int k = 0; k < DIM; ++k) {
+        for (int k = 0; k < DIM; ++k) {  // as terms add squares, so that they are taken once
             const Number scaled = d[k] * step_scale;
-            square = square + scaled * scaled;
+            square = k > 0 ? square + scaled * scaled : scaled * scaled;
         }
         Number inner = Math::of(inside), outer = Math::of(outside);
         if constexpr (RADII > 0) {

@@ -3,7 +3,8 @@
 #include "kept.cuh"
 
 // Each slot has the slope of a function by its distance, and in `slots` the slot of the pair the other way round: what both give to
-// the row is along x_j - x_i. Distances of 0 give nothing.
+// the row is along x_j - x_i. Distances of 0, and those whose reciprocal is no float, give nothing.
+constexpr real LEAST_DISTANCE = DOUBLE ? real(0x1p-1022) : real(0x1p-126f);
 struct KeptSlopesArguments {
     const real *rows, *points, *cutoff, *steps;
     const int *idx, *count, *codes, *slots, *starts, *lengths;
@@ -48,7 +49,7 @@ struct KeptSlopes : KeptLane {
         read_slots(slopes + first, place, slope);
 #pragma unroll
         for (int k = 0; k < AT_A_TIME; ++k) {
-            some.used[k] = some.used[k] && distance[k] > 0;
+            some.used[k] = some.used[k] && distance[k] >= LEAST_DISTANCE;
             other[k] = 0;
             if (some.used[k]) {
                 load_numbers<LENGTH>(points + (long long)LENGTH * some.ids[k], numbers[k]);
@@ -60,9 +61,9 @@ struct KeptSlopes : KeptLane {
         for (int k = 0; k < AT_A_TIME; ++k)
             if (some.used[k]) {
                 const Verdict verdict = judged(own, numbers[k], some.ids[k], some.codes[k], true);
-                const real along = (slope[k] + other[k]) / distance[k];
+                const real reciprocal = 1 / distance[k], along = slope[k] + other[k];
                 for (int a = 0; a < DIM; ++a)
-                    sum[a] += along * verdict.vector[a];
+                    sum[a] += along * (verdict.vector[a] * reciprocal);
             }
     }
 };

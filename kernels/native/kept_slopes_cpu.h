@@ -3,7 +3,8 @@
 #include "kept_cpu.h"
 
 // Each slot has the slope of a function by its distance, and in `slots` the slot of the pair the other way round: what both give to
-// the row is along x_j - x_i. Distances of 0 give nothing.
+// the row is along x_j - x_i. Distances of 0, and those whose reciprocal is no float, give nothing.
+constexpr real LEAST_DISTANCE = DOUBLE ? real(0x1p-1022) : real(0x1p-126f);
 struct KeptSlopesArguments {
     const real *rows, *points, *cutoff, *steps;
     const int *idx, *count, *codes, *slots, *starts, *lengths;
@@ -27,6 +28,9 @@ struct KeptSlopes : KeptRows<KeptSlopes> {
         const long long first = (long long)row * capacity;
         const int all = entries(row);
         Number sum[DIM] = {};
+        // slopes of the next row are on their way while those of this one are added: they stand in as many rows as it has neighbors
+        for (int k = 0; row + 1 < m && k < entries(row + 1); ++k)
+            __builtin_prefetch(slopes + (unsigned int)slots[first + capacity + k]);
         walk(row, own, [&](const KeptSlots& some) {
             const int left = all - some.places, count = left < LANES ? left : LANES;
             Number distance{}, slope{};
@@ -40,10 +44,10 @@ struct KeptSlopes : KeptRows<KeptSlopes> {
             for (int l = 0; l < LANES; ++l)
                 others[l] = slopes[from[l]];
             slope = slope + Math::select(__builtin_convertvector(there, Math::flag), others, Number{});
-            const Math::flag apart = Math::gt(distance, Number{});
-            const Number along = slope / Math::select(apart, distance, Math::of(real(1)));
+            const Math::flag apart = Math::ge(distance, Math::of(LEAST_DISTANCE));
+            const Number reciprocal = real(1) / Math::select(apart, distance, Math::of(real(1)));
             for (int k = 0; k < DIM; ++k)
-                sum[k] = sum[k] + Math::select(apart, along * some.verdict.vector[k], Number{});
+                sum[k] = sum[k] + Math::select(apart, slope * (some.verdict.vector[k] * reciprocal), Number{});
         });
         for (int k = 0; k < DIM; ++k) {
             real total = 0;
