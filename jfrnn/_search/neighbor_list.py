@@ -584,9 +584,15 @@ def _update(
         return remake(nbrs)
     now = hide_inactive(sources, active)
     moved = has_moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin)
-    nbrs = dataclasses.replace(nbrs, box=box, radii=radii)
+    fixed = {"box": box, "radii": radii, "batch": nbrs.batch}
+    nobody = dict.fromkeys(fixed)  # what stays is no state of the loop, so that XLA derives from it once what steps of a scan need
+    state = moved, dataclasses.replace(nbrs, **nobody)
+
+    def body(state: tuple[Array, NeighborList]) -> tuple[Array, NeighborList]:
+        return jnp.zeros_like(state[0]), dataclasses.replace(remake(state[1]), **nobody)
+
     # a loop of at most one iteration: XLA updates a loop's carry in place, but copies the results of a branch
-    return lax.while_loop(lambda state: state[0], lambda state: (jnp.zeros_like(state[0]), remake(state[1])), (moved, nbrs))[1]
+    return dataclasses.replace(lax.while_loop(lambda state: state[0], body, state)[1], **fixed)
 
 
 def _remake(nbrs: NeighborList, inputs: Inputs, capacity: int) -> NeighborList:
