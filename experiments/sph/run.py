@@ -44,7 +44,7 @@ def faster_way(platform: str, particles: int) -> str:
     """Return "pair_sum" or "list", whichever makes more steps per second in 3D, in float32 and with a skin of 0.3 spacings.
 
     Of 107 660 particles sums that search are faster on the CPU, by a factor of 3, and sums over a list on a GPU, by 1.3; of 1.06
-    million sums that search are faster there, too, by 1.4 (`experiments/results/sph/speed_kept`).
+    million sums that search are faster there, too, by 1.5 (`experiments/results/sph/speed_kept`, `speed_kept_h100`).
     """
     return "list" if platform != "cpu" and particles <= MOST_FOR_LISTS else "pair_sum"
 
