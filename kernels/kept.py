@@ -71,7 +71,8 @@ class ListKind(NamedTuple):
     def constants(self, columns: int) -> dict[str, int]:
         """Return the named integers of a program."""
         found = {"PERIODIC": self.periodic, "SCALED": self.scaled, "CODE_BYTES": self.code_bytes, "REVERSED": self.reversed}
-        found |= {"RADII": RADII.get(self.rule, 0), "SUM": self.rule == "mean", "ALIGNED": self.aligned, "DECIDED": 1}
+        found |= {"RADII": RADII.get(self.rule, 0), "SUM": self.rule == "mean", "ALIGNED": self.aligned}
+        found |= {"DECIDED": 1, "MEASURED": 0}
         return found | {"LENGTH": self.length(columns), "LANES_PER_ROW": max(self.lanes, 1), "QUERY_CHUNK": ROWS_AT_ONCE, **GRID}
 
 

@@ -53,8 +53,8 @@ struct KeptLane : Kept {
                     read_entry(first + place + k, some.ids[k], some.codes[k]);
     }
     // Calls `visit(place, id, numbers, verdict, pair)` for the entries of the row that this lane takes. Those in doubt come once more,
-    // after they were decided: so rare a call stands outside of what every entry takes. `settle(place, pairs, verdicts)` comes last: one
-    // bit for each of the entries from `place` on.
+    // after they were decided: so rare a call stands outside of what every entry takes. `settle(place, pairs, lengths)` comes last: one
+    // bit for each of the entries from `place` on, and (MEASURED) distances.
     template <class Visit, class Settle>
     JFRNN_MEMBER void walk(const OwnPoint& own, Visit visit, Settle settle) const {
         const long long first = is_row ? first_entry(row) : 0;
@@ -69,10 +69,11 @@ struct KeptLane : Kept {
             Entries next;
             read(first, place + AT_A_TIME * LANES_PER_ROW, all, next);
             unsigned int open = 0, pairs = 0;
-            Verdict verdicts[AT_A_TIME];
+            real lengths[AT_A_TIME];
 #pragma unroll
             for (int k = 0; k < AT_A_TIME; ++k) {
-                const Verdict& verdict = verdicts[k] = judged(own, numbers[k], some.ids[k], some.codes[k], some.used[k]);
+                const Verdict verdict = judged(own, numbers[k], some.ids[k], some.codes[k], some.used[k]);
+                lengths[k] = MEASURED ? length_of(verdict.vector) : real(0);
                 open |= verdict.open ? 1u << k : 0;
                 pairs |= verdict.sure ? 1u << k : 0;
                 visit(place + k, some.ids[k], numbers[k], verdict, verdict.sure);
@@ -89,7 +90,7 @@ struct KeptLane : Kept {
                     visit(place + k, id, doubted, verdict, true);
                 }
             }
-            settle(place, pairs, verdicts);
+            settle(place, pairs, lengths);
             some = next;
         }
     }

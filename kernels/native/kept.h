@@ -36,6 +36,8 @@ struct Kept : KeptArguments, Space {
     real inside, outside;  // squares below are surely those of pairs, squares above surely not, where all cutoffs are one
     real moved;            // the most that a shift of 1 along each axis adds up to in a component
     real most;             // the largest number of a shift for which pairs are decided
+    // Where lattice vectors lie along the axes: their lengths, and the reciprocals; 0 where space is open. No store can change them.
+    real sides[3], units[3];
 
     JFRNN_MEMBER explicit Kept(const KeptArguments& given) : KeptArguments(given), Space(given.cutoff), moved(0), most(0) {
         inside = step_radius * step_radius * (1 - 8 * step_eps);
@@ -45,6 +47,11 @@ struct Kept : KeptArguments, Space {
             for (int l = 0; l < DIM; ++l)
                 sum += size_of(lattice.vector(l, k));
             moved = sum > moved ? sum : moved;
+        }
+        for (int k = 0; k < 3; ++k) {
+            const bool turns = SHIFTED && !SKEWED && k < DIM && lattice.periodic(k);
+            sides[k] = turns ? lattice.vector(k, k) : real(0);
+            units[k] = turns ? lattice.transform(k, k) : real(0);
         }
         if constexpr (SHIFTED)
             most = cutoff[LATTICE_END];
@@ -96,8 +103,11 @@ struct Kept : KeptArguments, Space {
         if constexpr (SHIFTED) {
             Number spans{}, size{};
             for (int k = 0; k < DIM; ++k) {
-                found.shift[k] =
-                    lattice.periodic(k) ? (CODED ? step[k] + own.turn[k] - numbers[TURNS + k] : nearest(d, k)) : Number{};
+                if constexpr (CODED || SKEWED)
+                    found.shift[k] =
+                        lattice.periodic(k) ? (CODED ? step[k] + own.turn[k] - numbers[TURNS + k] : nearest(d, k)) : Number{};
+                else
+                    found.shift[k] = -Math::round_even(d[k] * units[k]);
                 spans = larger(Math::abs(found.shift[k]), spans);
                 size = larger(Math::abs(d[k]), size);
             }
@@ -149,17 +159,15 @@ struct Kept : KeptArguments, Space {
         const Number length = Math::sqrt(square);
         return Math::select(small, length / LARGE_UNIT, length) / step_scale;
     }
+    // Where vectors of the lattice do not lie along the axes: the shift of the nearest image along one of them.
     JFRNN_INLINE Number nearest(const Number* d, int k) const {
-        Number along = d[k] * lattice.transform(k, k);
-        if constexpr (SKEWED) {
-            along = d[0] * lattice.transform(0, k);
-            for (int l = 1; l < DIM; ++l)
-                along = along + d[l] * lattice.transform(l, k);
-        }
+        Number along = d[0] * lattice.transform(0, k);
+        for (int l = 1; l < DIM; ++l)
+            along = along + d[l] * lattice.transform(l, k);
         return -Math::round_even(along);
     }
     JFRNN_INLINE Number translation(const Number* shift, int k) const {
-        Number sum = shift[k] * lattice.vector(k, k);
+        Number sum = shift[k] * (SKEWED ? lattice.vector(k, k) : sides[k]);
         if constexpr (SKEWED)
             for (int l = 0; l < DIM; ++l)
                 if (l != k)

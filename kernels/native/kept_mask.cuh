@@ -24,27 +24,27 @@ struct KeptMask : KeptLane {
         if (!is_row)
             return;
         unsigned char* const out = mask + (long long)row * capacity;
-        real* const lengths = MEASURED ? distances + (long long)row * capacity : distances;
+        real* const out_lengths = MEASURED ? distances + (long long)row * capacity : distances;
         const int all = entries(row);
         // where several slots are written at once, those behind the last pair may be among them
         for (int place = ALIGNED ? (all + AT_A_TIME - 1) / AT_A_TIME * AT_A_TIME + lane : all + lane; place < capacity;
             place += LANES_PER_ROW) {
             out[place] = 0;
             if constexpr (MEASURED)
-                lengths[place] = 0;
+                out_lengths[place] = 0;
         }
         auto nothing = [](int, int, const real*, const Verdict&, bool) {};
-        walk(own_point(row), nothing, [&](int place, unsigned int pairs, const Verdict* verdicts) {
+        walk(own_point(row), nothing, [&](int place, unsigned int pairs, const real* lengths) {
             unsigned char bits[AT_A_TIME];
             real length[AT_A_TIME];
 #pragma unroll
             for (int k = 0; k < AT_A_TIME; ++k) {
                 bits[k] = pairs >> k & 1;
-                length[k] = MEASURED && bits[k] ? length_of(verdicts[k].vector) : real(0);
+                length[k] = MEASURED && bits[k] ? lengths[k] : real(0);
             }
             write(bits, out, place);
             if constexpr (MEASURED)
-                write(length, lengths, place);
+                write(length, out_lengths, place);
         });
     }
     // Writes what belongs to the slots of a row from `place` on, as `read_slots` reads it.
