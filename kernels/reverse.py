@@ -10,15 +10,12 @@ LANES_PER_SLOT = 8  # on CUDA
 
 
 @functools.cache
-def reverse_kernels(code_bytes: int, aligned: bool, cuda: bool) -> tuple[Kernel, Kernel]:
-    """Return what clears, and finds, the reverse slots of a list whose image codes take so many bytes, 0 where there are none.
-
-    `aligned`: rows of ids begin at multiples of 16 bytes.
-    """
+def reverse_kernels(code_bytes: int, cuda: bool) -> tuple[Kernel, Kernel]:
+    """Return what clears, and finds, the reverse slots of a list whose image codes take so many bytes, 0 where there are none."""
     header, block = ("reverse.cuh", 256) if cuda else ("reverse_cpu.h", 1)
-    text = program(False, 3, header, CODE_BYTES=code_bytes, ALIGNED=aligned, QUERY_CHUNK=ROWS_AT_ONCE)
+    text = program(False, 3, header, CODE_BYTES=code_bytes, QUERY_CHUNK=ROWS_AT_ONCE)
     entries = (Entry(f"Reverse.{method}", block, 4) for method in ("clear", "run"))
-    clear, find = declare(f"reverse_{'cuda' if cuda else 'cpu'}_{code_bytes}{'_aligned' * aligned}", text, *entries, cuda=cuda)
+    clear, find = declare(f"reverse_{'cuda' if cuda else 'cpu'}_{code_bytes}", text, *entries, cuda=cuda)
     return clear, find
 
 

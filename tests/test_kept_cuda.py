@@ -41,9 +41,8 @@ def test_masks_and_sums_compile(kind):
 
 
 @pytest.mark.parametrize("code_bytes", [0, 1, 2, 4])
-@pytest.mark.parametrize("aligned", [False, True])
-def test_reverse_slots_compile(code_bytes, aligned):
-    assert all(map(compiles, reverse.reverse_kernels(code_bytes, aligned, True)))
+def test_reverse_slots_compile(code_bytes):
+    assert all(map(compiles, reverse.reverse_kernels(code_bytes, True)))
 
 
 @pytest.mark.parametrize("by_source", [False, True])

@@ -15,8 +15,7 @@ def reverse_slots(idx: Array, codes: Array | None, images: int, cuda: bool) -> A
     """Return the slot of (j, i) for each slot of (i, j), of the opposite image: [n, capacity] int32, n * capacity for none."""
     width = 0 if codes is None else codes.dtype.itemsize
     given = jnp.zeros(1, jnp.int32) if codes is None else codes
-    count = jnp.sum(idx < idx.shape[0], axis=1, dtype=jnp.int32)
-    slots, _ = _reverse_callable(width, images, cuda)(idx, given, count, output_dims={"slots": idx.shape, "info": 2})
+    slots, _ = _reverse_callable(width, images, cuda)(idx, given, output_dims={"slots": idx.shape, "info": 2})
     return slots
 
 
@@ -54,12 +53,12 @@ def _plan_collect(by_source: bool, double: bool, cuda: bool, shapes: Shapes, _: 
 def _reverse_callable(code_bytes: int, images: int, cuda: bool) -> Call:
     name = f"jfrnn_reverse_{'cuda' if cuda else 'cpu'}_{code_bytes}_{images}"
     plan = functools.partial(_plan_reverse, code_bytes, images, cuda)
-    return Call(name, ("idx", "codes", "count"), dict.fromkeys(("slots", "info"), np.int32), plan)
+    return Call(name, ("idx", "codes"), dict.fromkeys(("slots", "info"), np.int32), plan)
 
 
 def _plan_reverse(code_bytes: int, images: int, cuda: bool, shapes: Shapes, _: int) -> Plan:
     n, capacity = shapes["idx"]
-    clear, find = reverse.reverse_kernels(code_bytes, capacity % 4 == 0, cuda)
+    clear, find = reverse.reverse_kernels(code_bytes, cuda)
     launch = Launch(find, reverse.LANES_PER_SLOT * n * capacity) if cuda else share(find, n, reverse.ROWS_AT_ONCE)
     first = Launch(clear, n * capacity if cuda else 1)
     return Plan([Clear("info", 8), first, launch], {"n": n, "capacity": capacity, "images": images})

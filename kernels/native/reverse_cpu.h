@@ -1,5 +1,4 @@
-// Reverse slots on the CPU: for the pair (i, j) in a row of i, the row of j is read until i is found, LANES ids at a time: first where
-// it is likely to stand, then from the beginning.
+// Reverse slots on the CPU: for the pair (i, j) in a row of i, the row of j is read until i is found, LANES ids at a time.
 #pragma once
 #include "lanes.h"
 #include "reverse.h"
@@ -7,37 +6,28 @@
 struct Reverse : ListOfRows {
     explicit Reverse(const ReverseArguments& given) : ListOfRows(given) {}
 
-    // The place of a source with an image in a row, or `capacity`; it is likely to be near a place.
-    int place_of(int row, int source, int code, int likely) const {
-        const int first = likely - LANES, last = capacity - LANES;
-        for (int b = first > 0 ? first : 0; b <= last && b <= likely; b += LANES)
-            if (const int place = place_among(row, b, source, code); place < capacity)
-                return place;
-        for (int b = 0; b <= last; b += LANES)
-            if (const int place = place_among(row, b, source, code); place < capacity)
-                return place;
+    // The place of a source with an image in a row, or `capacity`.
+    int place_of(int row, int source, int code) const {
         const int* const ids = idx + (long long)row * capacity;
-        for (int b = capacity - capacity % LANES; b < capacity; ++b)
+        int b = 0;
+        for (; b + LANES <= capacity; b += LANES) {
+            unsigned int same = bits_of_flags(__builtin_convertvector(lanes_from(ids + b) == source, flags));
+            for (; same; same &= same - 1) {
+                const int place = b + __builtin_ctz(same);
+                if (CODE_BYTES == 0 || code_at(row * capacity + place) == code)
+                    return place;
+            }
+        }
+        for (; b < capacity; ++b)
             if (ids[b] == source && (CODE_BYTES == 0 || code_at(row * capacity + b) == code))
                 return b;
-        return capacity;
-    }
-    // The same among LANES places from `b` on.
-    int place_among(int row, int b, int source, int code) const {
-        unsigned int same =
-            bits_of_flags(__builtin_convertvector(lanes_from(idx + (long long)row * capacity + b) == source, flags));
-        for (; same; same &= same - 1) {
-            const int place = b + __builtin_ctz(same);
-            if (CODE_BYTES == 0 || code_at(row * capacity + place) == code)
-                return place;
-        }
         return capacity;
     }
     // Finds the reverse slots of those whose source does not come before the row, and is found for these, too.
     void reverse_row(int i) const {
         for (int k = 0; k < capacity; ++k) {
             const int slot = i * capacity + k, j = idx[slot];
-            const int place = j < n && j >= i ? place_of(j, i, opposite(code_at(slot)), likely_place(j, k)) : capacity;
+            const int place = j < n && j >= i ? place_of(j, i, opposite(code_at(slot))) : capacity;
             if (place < capacity) {
                 slots[slot] = j * capacity + place;
                 slots[j * capacity + place] = slot;
