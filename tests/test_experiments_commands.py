@@ -216,7 +216,7 @@ def test_arrays_of_words_are_no_particles(tmp_path):
             ("sph", "run", "jet", "--solid-unit", "0.001"),
             "--solid-unit 0.001: is the unit of the file of --solid; name that file too",
         ),
-        (("sph", "run", "dam", "--neighbors", "tree"), "--neighbors tree: allowed: pair_sum, list"),
+        (("sph", "run", "dam", "--neighbors", "tree"), "--neighbors tree: allowed: auto, pair_sum, list"),
         (("sph", "validate", "sea"), "no case 'sea'; allowed: "),
         (("sph", "gradients", "sea"), "no problem 'sea'; allowed: "),
         (("sph", "gradients", "--evaluations", "0"), "--evaluations 0: "),

@@ -32,7 +32,8 @@ def term_of(kind):
 
 @pytest.mark.parametrize("kind", KINDS, ids=[kind.name for kind in KINDS])
 def test_masks_and_sums_compile(kind):
-    assert kind.reversed or compiles(kept.mask_kernel(kind))
+    assert kind.reversed or all(compiles(kept.mask_kernel(kind, measured)) for measured in (False, True))
+    assert kind.reversed or compiles(kept.slope_kernel(kind))
     for compensated, extremes in ((False, False), (True, False)):
         assert compiles(kept.sum_kernel(kind, term_of(kind), f"test_{bool(kind.periodic)}", compensated, extremes))
     largest = term_of(kind)._replace(sums=(Sum("o", False, False),))

@@ -7,6 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 import jfrnn
+from jfrnn._search.geometry import norms
 
 BACKENDS = ["warp", "jax"]
 BOXES = {"open": None, "nearest": [1.0, 1.0, 1.0], "images": [0.7, 0.5, 1.0]}
@@ -175,3 +176,62 @@ def test_too_many_slots_are_refused():
         jax.eval_shape(lambda x: jfrnn.search(x, 0.1, capacity=64, reverse=True), x)
     with pytest.raises(TypeError, match="reverse"):
         jfrnn.search(np.zeros((2, 3)), 1.0, reverse=1)
+
+
+MEASURED = [(box, dim, scale) for box in BOXES for dim in (2, 3) for scale in (1.0,)] + [("open", 3, 1e-24), ("nearest", 3, 1e15)]
+
+
+@pytest.mark.parametrize(("box", "dim", "scale"), MEASURED)
+@pytest.mark.parametrize("skin", [0.0, 0.05])
+def test_distances_are_the_lengths_of_vectors(box, dim, scale, skin, dtype):
+    """Of points of which two coincide and two nearly do, in rows whose length is no multiple of four; derivatives, too."""
+    rng, sides = np.random.default_rng(0), np.array(BOXES[box] or [1, 1, 1])[:dim]
+    x = rng.random((50, dim)) * sides
+    x[1], x[3] = x[0], x[2] + 1e-12
+    x = jnp.asarray(x * scale, dtype)
+    lattice = None if BOXES[box] is None else jfrnn.Box((sides * scale).astype(dtype))
+    nbrs = jfrnn.search(x, 0.3 * scale, capacity=63, skin=skin * scale, box=lattice, reverse=True, backend="warp")
+    step = 0.004 * scale if skin else 0.0
+    moved = x + jnp.asarray(step * np.sin(np.arange(x.size)).reshape(x.shape), dtype)
+
+    def lengths(x):
+        vectors, mask = nbrs.vectors(x)
+        return norms(vectors), mask
+
+    (ours, mask), (theirs, same) = nbrs.distances(moved), lengths(moved)
+    eps = float(jnp.finfo(dtype).eps)
+    np.testing.assert_array_equal(mask, same)
+    assert 100 < int(mask.sum()) < int((nbrs.idx < 50).sum()) + (skin == 0)
+    np.testing.assert_allclose(ours, theirs, rtol=4 * eps)
+    weight = jnp.asarray(rng.random(mask.shape), dtype)
+    mine, other = (
+        jax.jit(jax.grad(lambda x, f=f: jnp.sum(weight * jnp.sin(f(x)[0] / scale))))(moved) for f in (nbrs.distances, lengths)
+    )
+    np.testing.assert_allclose(mine * scale, other * scale, atol=200 * eps)
+
+
+def test_derivatives_of_distances_in_the_box():
+    nbrs, x, _ = make("full", "warp", "nearest")
+    sides = jnp.ones(3)
+
+    def energy(f, x, sides):
+        return jnp.sum(f(x, jfrnn.Box(sides)) ** 3)
+
+    def plain(x, box):
+        vectors, mask = nbrs.vectors(x, box=box)
+        return jnp.where(mask, jnp.sqrt(jnp.where(mask, jnp.sum(vectors**2, axis=-1), 1)), 0)
+
+    def ours(x, box):
+        return nbrs.distances(x, box=box)[0]
+
+    for order in (jax.grad, jax.hessian):
+        found = [order(lambda x, a, f=f: energy(f, x, a), 1)(x, sides) for f in (ours, plain)]
+        np.testing.assert_allclose(*found, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("box", ["open", "images"])
+def test_gradients_of_distances_store_no_displacements(box):
+    nbrs, x, _ = make("full", "warp", box)
+    text = jax.jit(jax.grad(lambda x: jnp.sum(nbrs.distances(x)[0] ** 3))).lower(x).as_text()
+    assert f"tensor<40x{nbrs.capacity}x3x" not in text
+    assert f"tensor<40x{nbrs.capacity}xf64>" in text

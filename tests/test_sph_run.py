@@ -9,7 +9,7 @@ import trimesh
 from typer.testing import CliRunner
 
 from experiments._cli import app
-from experiments.sph import health
+from experiments.sph import health, run
 from experiments.sph.model import make_model, make_state
 from experiments.sph.settings import make_scene, with_solid
 from jfrnn._triangles.winding import is_closed
@@ -171,3 +171,17 @@ def test_a_wall_that_is_open_is_refused_before_a_folder_is_made(tmp_path):
     code, _, error = invoke("jet", "--solid", path, "--solid-unit", 0.001, "--out", tmp_path / "run")
     assert (code, "solid must be a closed mesh" in error, error.count("\n")) == (2, True, 1)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("platform", "particles", "way"), [("cpu", 1000, "pair_sum"), ("gpu", 107_660, "list"), ("gpu", 1_059_712, "pair_sum")]
+)
+def test_auto_takes_what_was_measured_to_be_faster(platform, particles, way, tmp_path, monkeypatch):
+    assert run.faster_way(platform, particles) == way
+    asked = []
+    monkeypatch.setattr(run, "faster_way", lambda *given: asked.append(given) or way)
+    made = []
+    monkeypatch.setattr(run.solver, "list_neighbors", lambda *given: made.append(given))
+    invoke("four", "--frames", 1, "--set", "duration=0.001", "--no-pictures", "--out", tmp_path)
+    assert asked == [("cpu", 4)]
+    assert len(made) == (way == "list")

@@ -22,13 +22,13 @@ def run(
     ] = None,
     frames: Annotated[int, typer.Option(min=1, max=1_000_000, help="Snapshots after the first.")] = 50,
     dtype: Annotated[str, typer.Option(help="float32 or float64.")] = "float64",
-    neighbors: Annotated[str, typer.Option(help="pair_sum, or list: a list with a skin.")] = "pair_sum",
+    neighbors: Annotated[str, typer.Option(help="pair_sum; list: a list with a skin; auto: what is faster here.")] = "auto",
     skin: Annotated[float, typer.Option(min=0.01, max=100, callback=finite, help="Of the list, in particle spacings.")] = 0.3,
     pictures: Annotated[bool, typer.Option(help="Draw frames and a GIF.")] = True,
 ) -> str:
     """Run a fluid scene, or go on with it from its last snapshot: snapshots, energies, pictures."""
     check_choice("--dtype", dtype, ("float32", "float64"))
-    check_choice("--neighbors", neighbors, ("pair_sum", "list"))
+    check_choice("--neighbors", neighbors, ("auto", "pair_sum", "list"))
     if solid is None and solid_unit is not None:
         raise UsageError(f"--solid-unit {solid_unit:g}: is the unit of the file of --solid; name that file too")
     import jax

@@ -1,6 +1,7 @@
-"""Lists that are kept, by Warp's kernels: which slots hold a pair at present positions, and sums over these pairs."""
+"""Lists that are kept, by Warp's kernels: which slots hold a pair at present positions, how far apart, and sums over the pairs."""
 
 import functools
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ from jax import Array, lax
 
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import lattice_numbers
-from jfrnn._engine.plans import Clear, Launch, Plan, share
+from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.sum_results import SumsOf
 from jfrnn._geometry import EXCHANGED, LARGEST_TURN, Cutoff, Cutoffs, Lattice
 from jfrnn.kernels import kept
@@ -50,13 +51,46 @@ def kept_mask(given: KeptList) -> Array:
     """Say which slots hold a pair that is closer than the cutoff, exactly: [m, capacity] bool."""
 
     def on(cuda: bool) -> Callable[[KeptList], Array]:
-        def call(given: KeptList) -> Array:
-            dims, kind = {"mask": given.idx.shape, "info": 2}, _kind_of(given, kept.LANES if cuda else 0)
-            return _mask_callable(kind)(*_operands(given, kind, 0, None), output_dims=dims)[0]
+        return lambda given: _measure(given, cuda, False)["mask"]
+
+    return lax.platform_dependent(given, cpu=on(False), cuda=on(True))
+
+
+def kept_distances(given: KeptList) -> tuple[Array, Array]:
+    """Return the distances of the pairs that are closer than the cutoff, exactly, [m, capacity], 0 in other slots; and the mask."""
+
+    def on(cuda: bool) -> Callable[[KeptList], tuple[Array, Array]]:
+        def call(given: KeptList) -> tuple[Array, Array]:
+            found = _measure(given, cuda, True)
+            return found["distances"], found["mask"]
 
         return call
 
     return lax.platform_dependent(given, cpu=on(False), cuda=on(True))
+
+
+def _measure(given: KeptList, cuda: bool, measured: bool) -> dict[str, Array]:
+    kind, shape = _kind_of(given, kept.LANES if cuda else 0), given.idx.shape
+    dims = {"mask": shape, **({"distances": shape} if measured else {}), "info": 2}
+    return dict(zip(dims, _mask_callable(kind, measured)(*_operands(given, kind, 0, None), output_dims=dims), strict=True))
+
+
+def kept_slopes(given: KeptList, slots: Array, distances: Array, slopes: Array) -> Array:
+    """Return the derivatives by positions [n, d] of a function whose derivatives by distances are `slopes` [n, capacity].
+
+    The list is its own mirror image, `slots` are its reverse slots, and distances those of `kept_distances`.
+    """
+
+    def on(cuda: bool) -> Callable[..., Array]:
+        def call(given: KeptList, slots: Array, distances: Array, slopes: Array) -> Array:
+            kind, nothing = _kind_of(given, kept.LANES if cuda else 0), jnp.zeros(1, jnp.int32)
+            operands = _operands(given._replace(reversal=None), kind, 0, None)[:-3]
+            dims = {"sums": given.sources.shape, "info": 2}
+            return _slope_callable(kind)(*operands, slots, nothing, nothing, distances, slopes, output_dims=dims)[0]
+
+        return call
+
+    return lax.platform_dependent(given, slots, distances, slopes, cpu=on(False), cuda=on(True))
 
 
 def kept_sums(
@@ -149,21 +183,30 @@ def _beside(length: int, *parts: Array | None) -> Array:
 
 
 @kernel
-def _mask_callable(extra: _Extra) -> Call:
-    results = {"mask": np.bool_, "info": np.int32}
-    return Call(f"jfrnn_kept_mask_{_name(extra)}", _LIST, results, functools.partial(_plan_mask, extra))
+def _mask_callable(extra: _Extra, measured: bool) -> Call:
+    results = {"mask": np.bool_, **({"distances": _scalar(extra)} if measured else {}), "info": np.int32}
+    name = f"jfrnn_kept_{'distances' if measured else 'mask'}_{_name(extra)}"
+    return Call(name, _LIST, results, functools.partial(_plan_mask, extra, measured))
+
+
+@kernel
+def _slope_callable(extra: _Extra) -> Call:
+    results = {"sums": _scalar(extra), "info": np.int32}
+    name = f"jfrnn_kept_slopes_{_name(extra)}"
+    return Call(name, (*_LIST, "distances", "slopes"), results, functools.partial(_plan_slopes, extra))
 
 
 @kernel
 def _sum_callable(extra: _Extra, term: TermText, key: str, compensated: bool, extremes: bool, apart: bool) -> Call:
-    scalar, flags = (
-        np.float64 if extra.kind.double else np.float32,
-        {"compensated": compensated, "extremes": extremes, "apart": apart},
-    )
+    scalar, flags = _scalar(extra), {"compensated": compensated, "extremes": extremes, "apart": apart}
     name = "_".join(["jfrnn_kept_sums", _name(extra), *(flag for flag, on in flags.items() if on), key])
     results = dict.fromkeys(("sums", "totals", "errors"), scalar) | {"info": np.int32}
     plan = functools.partial(_plan_sums, extra, term, key, compensated, extremes, apart)
     return Call(name, (*_LIST, "shared_values", "own_values"), results, plan)
+
+
+def _scalar(extra: _Extra) -> type:
+    return np.float64 if extra.kind.double else np.float32
 
 
 def _name(extra: _Extra) -> str:
@@ -186,8 +229,16 @@ def _launch(extra: _Extra, found: kept.Kernel, numbers: dict[str, int]) -> Plan:
     return Plan([launch] if extra.kind.cuda else [Clear("info", 8), launch], numbers)
 
 
-def _plan_mask(extra: _Extra, shapes: Shapes, _: int) -> Plan:
-    return _launch(extra, kept.mask_kernel(extra.kind), _numbers(extra, shapes, False))
+def _plan_mask(extra: _Extra, measured: bool, shapes: Shapes, _: int) -> Plan:
+    plan = _launch(extra, kept.mask_kernel(extra.kind, measured), _numbers(extra, shapes, False))
+    if not measured:
+        return plan._replace(absent=["distances"])
+    size = np.dtype(_scalar(extra)).itemsize * math.prod(shapes["distances"])
+    return plan if extra.kind.cuda else plan._replace(steps=[*ask_for_huge_pages("distances", size), *plan.steps])
+
+
+def _plan_slopes(extra: _Extra, shapes: Shapes, _: int) -> Plan:
+    return _launch(extra, kept.slope_kernel(extra.kind), _numbers(extra, shapes, False))
 
 
 def _plan_sums(

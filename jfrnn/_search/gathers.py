@@ -19,9 +19,9 @@ from jax.interpreters import ad, batching, mlir
 from jfrnn._engine import collect_slots
 from jfrnn._search.reverse import MOST_SLOTS
 from jfrnn._search.topology import Topology
-from jfrnn._tracing import Aval, Internal, compile_program, result_aval, unvarying_types, vary, varying_axes
+from jfrnn._tracing import Aval, Internal, Tree, compile_program, result_aval, unvarying_types, vary, varying_axes
 
-Structure = Any  # the `PyTreeDef` of a topology, which type checkers do not accept as a type
+Structure = Any  # a `PyTreeDef`, which type checkers do not accept as a type
 _WIDEST = 16  # numbers of a slot that kernels add
 _GROUP = 16  # slots of each source that are added at a time in lists that are not their own mirror image
 
@@ -30,11 +30,17 @@ def gather(x: Array, topology: Topology) -> Array:
     """Return x [n, ...] of the source of each slot, [m, capacity, ...], 0 in unused slots; differentiable to every order."""
     if topology.idx.size > MOST_SLOTS:
         return _gather(x, topology)
-    return _bind(_gather_p, x, topology)
+    return bind(_gather_p, x, topology)
 
 
-def _bind(primitive: Primitive, x: Array, topology: Topology) -> Array:
-    leaves, structure = jax.tree.flatten(topology)
+def collect(y: Array, topology: Topology) -> Array:
+    """Return the sums of y [m, capacity, ...] over the slots of each source, [n, ...]; differentiable to every order."""
+    return bind(_collect_p, y, topology)
+
+
+def bind(primitive: Primitive, x: Array, given: Tree) -> Array:
+    """Apply a primitive of `define` to x and a pytree of arrays."""
+    leaves, structure = jax.tree.flatten(given)
     axes = varying_axes((x, leaves))
     x, leaves = vary((x, leaves), axes)
     return primitive.bind(x, *leaves, structure=structure)
@@ -71,13 +77,17 @@ def _collect(y: Array, topology: Topology) -> Array:
 _gather_p, _collect_p = Primitive("jfrnn_gather"), Primitive("jfrnn_collect")
 
 
-def _define(
+def define(
     primitive: Primitive,
-    work: Callable[[Array, Topology], Array],
+    work: Callable[[Array, Any], Array],
     transposed: Primitive,
-    shape_of: Callable[[tuple[int, ...], Topology], tuple[int, ...]],
+    shape_of: Callable[[tuple[int, ...], Any], tuple[int, ...]],
+    plain: Callable[[Array, Any], Array] | None = None,
 ) -> None:
-    """Define a primitive that is linear in its first operand; the others are the leaves of a topology.
+    """Define a primitive that is linear in its first operand; the others are the leaves of a pytree.
+
+    That is a topology, or, with `plain`, any. `plain` is an array program of the same meaning: derivatives by the leaves are those
+    of it, and it is what a batch maps.
 
     The function is long because all rules of a primitive stand in it.
     """
@@ -85,14 +95,29 @@ def _define(
     def run(x: Array, *leaves: Array, structure: Structure) -> Array:
         return work(x, jax.tree.unflatten(structure, leaves))
 
+    def run_plain(x: Array, *leaves: Array, structure: Structure) -> Array:
+        return (plain or work)(x, jax.tree.unflatten(structure, leaves))
+
     def shape(x: Aval, *leaves: Aval, structure: Structure) -> ShapedArray:
         return result_aval(shape_of(x.shape, jax.tree.unflatten(structure, leaves)), x.dtype, (x, *leaves))
 
     def jvp(primals: tuple, tangents: tuple, *, structure: Structure) -> tuple[Array, Any]:
         result = primitive.bind(*primals, structure=structure)
-        if isinstance(tangents[0], ad.Zero):
+        moving = [k for k, tangent in enumerate(tangents) if not isinstance(tangent, ad.Zero)]
+        parts = [primitive.bind(tangents[0], *primals[1:], structure=structure)] if 0 in moving else []
+        moving = [k for k in moving if k > 0]
+        if moving:
+
+            def at(*moved: Array) -> Array:
+                now = [*primals]
+                for k, x in zip(moving, moved, strict=True):
+                    now[k] = x
+                return run_plain(*now, structure=structure)
+
+            parts.append(jax.jvp(at, [primals[k] for k in moving], [tangents[k] for k in moving])[1])
+        if not parts:
             return result, ad.Zero(jax.typeof(result).to_tangent_aval())
-        return result, primitive.bind(tangents[0], *primals[1:], structure=structure)
+        return result, functools.reduce(jnp.add, parts)
 
     def transpose(cotangent: Internal, x: Internal, *leaves: Array, structure: Structure) -> list:
         none = [None] * len(leaves)
@@ -101,6 +126,8 @@ def _define(
         return [transposed.bind(cotangent, *leaves, structure=structure), *none]
 
     def batch(args: tuple, dims: tuple, *, structure: Structure) -> tuple[Array, int]:
+        if plain is not None:
+            return jax.vmap(functools.partial(run_plain, structure=structure), dims)(*args), 0
         if all(d is None for d in dims[1:]):  # one list for the whole batch, which becomes the last axis of the values
             result = primitive.bind(jnp.moveaxis(args[0], dims[0], -1), *args[1:], structure=structure)
             return result, result.ndim - 1
@@ -112,7 +139,7 @@ def _define(
         if topology.idx.size > MOST_SLOTS:
             return lax.map(lambda each: primitive.bind(*each, structure=structure), (x, *leaves)), 0
         merged = topology.merge()
-        result = _bind(primitive, x.reshape(-1, *x.shape[2:]), merged)
+        result = bind(primitive, x.reshape(-1, *x.shape[2:]), merged)
         return result.reshape(size, -1, *result.shape[1:]), 0
 
     def lower(ctx: Internal, *args: Internal, **params: Internal) -> Internal:
@@ -127,5 +154,5 @@ def _define(
     mlir.register_lowering(primitive, lower)
 
 
-_define(_gather_p, _gather, _collect_p, lambda shape, topology: (*topology.idx.shape, *shape[1:]))
-_define(_collect_p, _collect, _gather_p, lambda shape, topology: (topology.sources, *shape[2:]))
+define(_gather_p, _gather, _collect_p, lambda shape, topology: (*topology.idx.shape, *shape[1:]))
+define(_collect_p, _collect, _gather_p, lambda shape, topology: (topology.sources, *shape[2:]))

@@ -17,6 +17,7 @@ from jfrnn._engine import Inputs, hide_inactive
 from jfrnn._geometry import (
     Batch,
     Box,
+    Cutoff,
     Images,
     NeighborOverflowError,
     Radii,
@@ -311,8 +312,17 @@ class NeighborList(KeptOptions):
 
         Differentiable: to any order; the gradient of a distance of 0 is 0. Jit: yes. vmap: yes.
         """
-        vectors, mask = self.vectors(positions, queries=queries, box=box)
-        return norms(vectors), mask
+        topology = self._topology()
+        if 0 in self.idx.shape or not topology.measured:
+            vectors, mask = self.vectors(positions, queries=queries, box=box)
+            return norms(vectors), mask
+        sources, _ = self._geometry_inputs(positions, queries)
+        self._check_known(spared=ROWS_ARE_WHOLE)
+        box, cutoff = self._box_now(box, sources), self._cutoff_of_pairs()
+        from jfrnn._search.lengths import lengths
+
+        with own_transfers():
+            return lengths(topology, self.count, self._images_made(), sources, box, self.box_kind, cutoff, self.closed)
 
     def edges(self, positions: Array, total: int, *, queries: Array | None = None, box: Box | None = None) -> Edges:
         """Return the pairs as edges of a graph, with their geometry, for graph networks inside jit.
@@ -525,12 +535,15 @@ class NeighborList(KeptOptions):
         if 0 in (sources.shape[0], *self.idx.shape):
             with own_transfers():
                 return jnp.zeros((*self.idx.shape, sources.shape[1]), sources.dtype), jnp.zeros(self.idx.shape, bool), None
-        cutoff = self.radii if self.cutoff is None else make_cutoff(self.cutoff, np.dtype(sources.dtype), self.closed)
+        cutoff = self._cutoff_of_pairs()
         with own_transfers():
             if box is None or self.box_kind is None:
                 return *open_vectors(self._topology(), self.count, sources, rows, cutoff, self.closed), None
             given = (self.box_kind, cutoff, self.closed, self.half)
             return periodic_vectors(self._topology(), self.count, self._images_made(), sources, rows, box, *given)
+
+    def _cutoff_of_pairs(self) -> Cutoff | Radii | None:
+        return self.radii if self.cutoff is None else make_cutoff(self.cutoff, self.dtype, self.closed)
 
     def _topology(self) -> Topology:
         problem, codes = self.problem, None if self.images is None else self.images.codes
@@ -571,9 +584,15 @@ def _update(
         return remake(nbrs)
     now = hide_inactive(sources, active)
     moved = has_moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin)
-    nbrs = dataclasses.replace(nbrs, box=box, radii=radii)
+    fixed = {"box": box, "radii": radii, "batch": nbrs.batch}
+    nobody = dict.fromkeys(fixed)  # what stays is no state of the loop, so that XLA derives from it once what steps of a scan need
+    state = moved, dataclasses.replace(nbrs, **nobody)
+
+    def body(state: tuple[Array, NeighborList]) -> tuple[Array, NeighborList]:
+        return jnp.zeros_like(state[0]), dataclasses.replace(remake(state[1]), **nobody)
+
     # a loop of at most one iteration: XLA updates a loop's carry in place, but copies the results of a branch
-    return lax.while_loop(lambda state: state[0], lambda state: (jnp.zeros_like(state[0]), remake(state[1])), (moved, nbrs))[1]
+    return dataclasses.replace(lax.while_loop(lambda state: state[0], body, state)[1], **fixed)
 
 
 def _remake(nbrs: NeighborList, inputs: Inputs, capacity: int) -> NeighborList:

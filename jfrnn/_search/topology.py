@@ -8,7 +8,7 @@ from jax import Array, lax
 
 from jfrnn._engine import Options
 from jfrnn._geometry import EXCHANGED, Radii
-from jfrnn._search.reverse import Reverse, find_reverse
+from jfrnn._search.reverse import MOST_SLOTS, Reverse, find_reverse
 
 
 @jax.tree_util.register_dataclass
@@ -33,6 +33,11 @@ class Topology:
     images: int = dataclasses.field(metadata={"static": True})
     mutual: bool = dataclasses.field(metadata={"static": True})
     native: bool = dataclasses.field(metadata={"static": True})
+
+    @property
+    def measured(self) -> bool:
+        """Whether kernels measure its distances (`jfrnn._search.lengths`)."""
+        return self.native and self.mutual and self.idx.size <= MOST_SLOTS
 
     def with_reverse(self) -> Reverse:
         """Return the slots of each source, found anew unless they are kept."""

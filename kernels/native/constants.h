@@ -46,6 +46,8 @@ constexpr int LENGTH = 4;         // numbers of each source
 constexpr bool REVERSED = false;  // rows are those of the sources of a list
 constexpr bool ALIGNED = true;    // rows of ids begin at multiples of 16 bytes
 constexpr int LANES_PER_ROW = 8;  // of CUDA
+constexpr bool DECIDED = true;    // which of its slots hold a pair
+constexpr bool MEASURED = false;  // distances are written, too
 // Of triangles (see jfrnn/kernels/_triangles.py, triangles_cpu.py and triangles_cuda.py).
 constexpr int LIMBS = 14, ROOM = 1202, STRIDE = 1;
 constexpr int MOST_CELLS = 8, MOST_ALONG = 64, MOST_ALONG_LOG2 = 6;

@@ -19,6 +19,18 @@ struct KeptLane : Kept {
         int ids[AT_A_TIME], codes[AT_A_TIME];
         bool used[AT_A_TIME];
     };
+    // Reads what belongs to the slots of a row from `place` on: at once, where rows begin at multiples of 16 bytes.
+    template <class Element>
+    JFRNN_MEMBER void read_slots(const Element* row, int place, Element* to) const {
+        struct alignas(sizeof(Element) * AT_A_TIME) Words {
+            Element at[AT_A_TIME];
+        } words;
+        if constexpr (ALIGNED)
+            load_words((const Words*)(row + place), &words);
+#pragma unroll
+        for (int k = 0; k < AT_A_TIME; ++k)
+            to[k] = ALIGNED ? words.at[k] : place + k < capacity ? row[place + k] : Element(0);
+    }
     // Reads the entries from `place` on: at once, where rows begin at multiples of 16 bytes.
     JFRNN_MEMBER void read(long long first, int place, int all, Entries& some) const {
 #pragma unroll
@@ -27,14 +39,12 @@ struct KeptLane : Kept {
             some.ids[k] = some.codes[k] = 0;
         }
         if constexpr (ALIGNED && !REVERSED && !CODED) {
-            struct alignas(4 * AT_A_TIME) Ids {
-                int at[AT_A_TIME];
-            } ids;
+            int ids[AT_A_TIME];
             if (some.used[0]) {
-                load_words((const Ids*)(idx + first + place), &ids);
+                read_slots(idx + first, place, ids);
 #pragma unroll
                 for (int k = 0; k < AT_A_TIME; ++k)
-                    some.ids[k] = some.used[k] ? ids.at[k] : 0;
+                    some.ids[k] = some.used[k] ? ids[k] : 0;
             }
         } else
 #pragma unroll
@@ -43,8 +53,8 @@ struct KeptLane : Kept {
                     read_entry(first + place + k, some.ids[k], some.codes[k]);
     }
     // Calls `visit(place, id, numbers, verdict, pair)` for the entries of the row that this lane takes. Those in doubt come once more,
-    // after they were decided: so rare a call stands outside of what every entry takes. `settle(place, pairs)` comes last: one bit for
-    // each of the entries from `place` on.
+    // after they were decided: so rare a call stands outside of what every entry takes. `settle(place, pairs, lengths)` comes last: one
+    // bit for each of the entries from `place` on, and (MEASURED) distances.
     template <class Visit, class Settle>
     JFRNN_MEMBER void walk(const OwnPoint& own, Visit visit, Settle settle) const {
         const long long first = is_row ? first_entry(row) : 0;
@@ -59,9 +69,11 @@ struct KeptLane : Kept {
             Entries next;
             read(first, place + AT_A_TIME * LANES_PER_ROW, all, next);
             unsigned int open = 0, pairs = 0;
+            real lengths[AT_A_TIME];
 #pragma unroll
             for (int k = 0; k < AT_A_TIME; ++k) {
                 const Verdict verdict = judged(own, numbers[k], some.ids[k], some.codes[k], some.used[k]);
+                lengths[k] = MEASURED ? length_of(verdict.vector) : real(0);
                 open |= verdict.open ? 1u << k : 0;
                 pairs |= verdict.sure ? 1u << k : 0;
                 visit(place + k, some.ids[k], numbers[k], verdict, verdict.sure);
@@ -78,7 +90,7 @@ struct KeptLane : Kept {
                     visit(place + k, id, doubted, verdict, true);
                 }
             }
-            settle(place, pairs);
+            settle(place, pairs, lengths);
             some = next;
         }
     }

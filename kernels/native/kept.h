@@ -36,6 +36,8 @@ struct Kept : KeptArguments, Space {
     real inside, outside;  // squares below are surely those of pairs, squares above surely not, where all cutoffs are one
     real moved;            // the most that a shift of 1 along each axis adds up to in a component
     real most;             // the largest number of a shift for which pairs are decided
+    // Where lattice vectors lie along the axes: their lengths, and the reciprocals; 0 where space is open. No store can change them.
+    real sides[3], units[3];
 
     JFRNN_MEMBER explicit Kept(const KeptArguments& given) : KeptArguments(given), Space(given.cutoff), moved(0), most(0) {
         inside = step_radius * step_radius * (1 - 8 * step_eps);
@@ -45,6 +47,11 @@ struct Kept : KeptArguments, Space {
             for (int l = 0; l < DIM; ++l)
                 sum += size_of(lattice.vector(l, k));
             moved = sum > moved ? sum : moved;
+        }
+        for (int k = 0; k < 3; ++k) {
+            const bool turns = SHIFTED && !SKEWED && k < DIM && lattice.periodic(k);
+            sides[k] = turns ? lattice.vector(k, k) : real(0);
+            units[k] = turns ? lattice.transform(k, k) : real(0);
         }
         if constexpr (SHIFTED)
             most = cutoff[LATTICE_END];
@@ -79,12 +86,13 @@ struct Kept : KeptArguments, Space {
         return own;
     }
 
-    // What is found out about slots.
+    // What is found out about slots: the lattice shift, x_j - x_i with it, and whether it is a pair.
     struct Verdict {
-        Number shift[3];
+        Number shift[3], vector[3];
         Math::flag sure, open;
     };
-    // `step` (CODED): the shift of the image code of each slot; `same`: the source of a slot is its row.
+    // `step` (CODED): the shift of the image code of each slot; `same`: the source of a slot is its row. Where nothing is DECIDED, each
+    // slot that is used is sure.
     JFRNN_INLINE Verdict judge(
         const OwnPoint& own, const Number* numbers, const Number* step, Math::flag same, Math::flag used) const {
         Number d[3], square{};
@@ -95,8 +103,11 @@ struct Kept : KeptArguments, Space {
         if constexpr (SHIFTED) {
             Number spans{}, size{};
             for (int k = 0; k < DIM; ++k) {
-                found.shift[k] =
-                    lattice.periodic(k) ? (CODED ? step[k] + own.turn[k] - numbers[TURNS + k] : nearest(d, k)) : Number{};
+                if constexpr (CODED || SKEWED)
+                    found.shift[k] =
+                        lattice.periodic(k) ? (CODED ? step[k] + own.turn[k] - numbers[TURNS + k] : nearest(d, k)) : Number{};
+                else
+                    found.shift[k] = -Math::round_even(d[k] * units[k]);
                 spans = larger(Math::abs(found.shift[k]), spans);
                 size = larger(Math::abs(d[k]), size);
             }
@@ -108,9 +119,15 @@ struct Kept : KeptArguments, Space {
                 d[k] = d[k] + translation(found.shift, k);
         } else
             used = Math::both(used, Math::inverse(same));
-        for (int k = 0; k < DIM; ++k) {
+        for (int k = 0; k < DIM; ++k)
+            found.vector[k] = d[k];
+        if constexpr (!DECIDED) {
+            found.sure = used;
+            return found;
+        }
+        for (int k = 0; k < DIM; ++k) {  // as terms add squares, so that they are taken once
             const Number scaled = d[k] * step_scale;
-            square = square + scaled * scaled;
+            square = k > 0 ? square + scaled * scaled : scaled * scaled;
         }
         Number inner = Math::of(inside), outer = Math::of(outside);
         if constexpr (RADII > 0) {
@@ -128,17 +145,29 @@ struct Kept : KeptArguments, Space {
         found.open = Math::both(Math::both(used, Math::le(square, outer)), Math::inverse(found.sure));
         return found;
     }
-    JFRNN_INLINE Number nearest(const Number* d, int k) const {
-        Number along = d[k] * lattice.transform(k, k);
-        if constexpr (SKEWED) {
-            along = d[0] * lattice.transform(0, k);
-            for (int l = 1; l < DIM; ++l)
-                along = along + d[l] * lattice.transform(l, k);
+    // The length of a vector: squares of very small ones would underflow, so these are taken in a unit of their own.
+    JFRNN_INLINE Number length_of(const Number* vector) const {
+        constexpr real SMALL = DOUBLE ? real(0x1p-480) : real(0x1p-50f), LARGE_UNIT = DOUBLE ? real(0x1p700) : real(0x1p90f);
+        Number size{}, square{};
+        for (int k = 0; k < DIM; ++k)
+            size = larger(Math::abs(vector[k]), size);
+        const Math::flag small = Math::lt(size * step_scale, Math::of(SMALL));
+        for (int k = 0; k < DIM; ++k) {
+            const Number plain = vector[k] * step_scale, scaled = Math::select(small, plain * LARGE_UNIT, plain);
+            square = square + scaled * scaled;
         }
+        const Number length = Math::sqrt(square);
+        return Math::select(small, length / LARGE_UNIT, length) / step_scale;
+    }
+    // Where vectors of the lattice do not lie along the axes: the shift of the nearest image along one of them.
+    JFRNN_INLINE Number nearest(const Number* d, int k) const {
+        Number along = d[0] * lattice.transform(0, k);
+        for (int l = 1; l < DIM; ++l)
+            along = along + d[l] * lattice.transform(l, k);
         return -Math::round_even(along);
     }
     JFRNN_INLINE Number translation(const Number* shift, int k) const {
-        Number sum = shift[k] * lattice.vector(k, k);
+        Number sum = shift[k] * (SKEWED ? lattice.vector(k, k) : sides[k]);
         if constexpr (SKEWED)
             for (int l = 0; l < DIM; ++l)
                 if (l != k)

@@ -39,14 +39,20 @@ struct KeptSums : KeptLane {
         Reduction reduction(n);
         auto visit = [&](int place, int id, const real* numbers, const Verdict& verdict, bool pair) {
             number summand[SUMMANDS];
-            auto column = [&](int c) -> number { return c < OTHERS ? numbers[DIM + c] : verdict.shift[STEP_AXES[c - OTHERS]]; };
+            auto column = [&](int c) -> number {  // chosen, not indexed: what is indexed by a table does not stay in registers
+                const int axis = STEP_AXES[c < OTHERS ? 0 : c - OTHERS];
+                return c < OTHERS  ? numbers[DIM + c]
+                       : axis == 0 ? verdict.shift[0]
+                       : axis == 1 ? verdict.shift[1]
+                                   : verdict.shift[2];
+            };
             term.evaluate(own_part, numbers, column, summand);
             reduction.add(summand, pair, [&](int& source, int& code) {
                 source = id;
                 code = place;
             });
         };
-        walk(own, visit, [](int, unsigned int) {});
+        walk(own, visit, [](int, unsigned int, const real*) {});
         __syncwarp();
         reduction.reduce_over_warp<LANES_PER_ROW>();
         reduction.store(results, {lane_of_warp, row, (int)warp, is_row && lane == 0, true, true});

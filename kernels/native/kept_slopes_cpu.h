@@ -1,0 +1,60 @@
+// What distances of a list give to the derivatives of positions, on the CPU.
+#pragma once
+#include "kept_cpu.h"
+
+// Each slot has the slope of a function by its distance, and in `slots` the slot of the pair the other way round: what both give to
+// the row is along x_j - x_i. Distances of 0, and those whose reciprocal is no float, give nothing.
+constexpr real LEAST_DISTANCE = DOUBLE ? real(0x1p-1022) : real(0x1p-126f);
+struct KeptSlopesArguments {
+    const real *rows, *points, *cutoff, *steps;
+    const int *idx, *count, *codes, *slots, *starts, *lengths;
+    const real *distances, *slopes;
+    real* sums;
+    int* info;
+    int m, n, capacity, images, closed, apart;
+
+    KeptArguments of_list() const {
+        return {rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, m, n, capacity, images, closed, apart};
+    }
+};
+struct KeptSlopes : KeptRows<KeptSlopes> {
+    const real *distances, *slopes;
+    real* const sums;
+
+    explicit KeptSlopes(const KeptSlopesArguments& a)
+        : KeptRows(a.of_list(), a.info), distances(a.distances), slopes(a.slopes), sums(a.sums) {}
+
+    void serve(int row, const OwnPoint& own) {
+        const long long first = (long long)row * capacity;
+        const int all = entries(row);
+        Number sum[DIM] = {};
+        // slopes of the next row are on their way while those of this one are added: they stand in as many rows as it has neighbors
+        for (int k = 0; row + 1 < m && k < entries(row + 1); ++k)
+            __builtin_prefetch(slopes + (unsigned int)slots[first + capacity + k]);
+        walk(row, own, [&](const KeptSlots& some) {
+            const int left = all - some.places, count = left < LANES ? left : LANES;
+            Number distance{}, slope{};
+            memcpy(&distance, distances + first + some.places, sizeof(real) * count);
+            memcpy(&slope, slopes + first + some.places, sizeof(real) * count);
+            ints back{};
+            memcpy(&back, slots + first + some.places, sizeof(int) * count);
+            const auto there = (back >= 0) & (back < m * capacity);
+            const ints from = back & there;  // without branches, which would be guessed wrongly while numbers are on their way
+            Number others;
+            for (int l = 0; l < LANES; ++l)
+                others[l] = slopes[from[l]];
+            slope = slope + Math::select(__builtin_convertvector(there, Math::flag), others, Number{});
+            const Math::flag apart = Math::ge(distance, Math::of(LEAST_DISTANCE));
+            const Number reciprocal = real(1) / Math::select(apart, distance, Math::of(real(1)));
+            for (int k = 0; k < DIM; ++k)
+                sum[k] = sum[k] + Math::select(apart, slope * (some.verdict.vector[k] * reciprocal), Number{});
+        });
+        for (int k = 0; k < DIM; ++k) {
+            real total = 0;
+            for (int l = 0; l < LANES; ++l)
+                total -= sum[k][l];
+            sums[(long long)DIM * row + k] = total;
+        }
+    }
+    void finish_chunk(int) {}
+};
