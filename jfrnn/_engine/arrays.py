@@ -14,6 +14,7 @@ import functools
 import math
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -45,6 +46,7 @@ from jfrnn._geometry import (
     translation,
     unpack_turns,
 )
+from jfrnn._tracing import call_late
 
 _MOST_SOURCES = 2**30 - LANES  # whose places are int32, as runs read the sources twice in a row
 
@@ -73,11 +75,15 @@ class ArrayEngine:
 
     def rows(self, search: Search, options: Options, capacity: int | None) -> Rows:
         """Find the candidates of every query, and keep those that are neighbors."""
+        refuse_many(search)
+        m = search.sizes[1]
 
         def on(tuning: Tuning) -> Callable[[Search], Rows]:
             return functools.partial(self._rows, options, capacity, tuning)
 
-        return by_platform(on, search._replace(checks={}))
+        count, one = jax.ShapeDtypeStruct((m,), np.int32), jax.ShapeDtypeStruct((), np.int32)
+        idx = None if capacity is None else jax.ShapeDtypeStruct((m, capacity), np.int32)
+        return call_late(functools.partial(by_platform, on), (search._replace(checks={}),), Rows(idx, count, one, one))
 
     def _rows(self, options: Options, capacity: int | None, tuning: Tuning, search: Search) -> Rows:
         candidates = find_candidates(search, self.by_cells and not is_few(search, tuning), tuning)
@@ -88,6 +94,15 @@ class ArrayEngine:
     def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool, scaled: bool) -> int | None:
         """Return None: only the compiler knows."""
         return None
+
+
+def refuse_many(search: Search) -> None:
+    """Raise an error if there are more sources than runs have places for."""
+    if (n := search.sizes[0]) > _MOST_SOURCES:
+        raise ValueError(
+            f"positions: backend='jax' looks for neighbors among at most {_MOST_SOURCES} particles, got {n}: pass "
+            "backend='warp', or divide the particles over devices with jfrnn.distributed."
+        )
 
 
 def is_few(search: Search, tuning: Tuning) -> bool:
@@ -189,11 +204,6 @@ def _cell_stencil(
     `along` [d, n + m] are the coordinates of the sources, then of the queries, which `axes` divides into cells.
     """
     n, systems = len(sources), None if batch is None else batch.of_all
-    if n > _MOST_SOURCES:
-        raise ValueError(
-            f"positions: backend='jax' looks for neighbors among at most {_MOST_SOURCES} particles, got {n}: pass "
-            "backend='warp', or divide the particles over devices with jfrnn.distributed."
-        )
     line, cells = sort_along_line(along, axes, n, systems, tuning.least_sorted, tuning.searched)
     order = line.order if queries is None else sort_queries(line, cells, n, tuning.least_sorted)
     at = order if queries is None else order + n
