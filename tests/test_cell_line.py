@@ -19,7 +19,7 @@ def line_of(x, sources, systems=None):
 def candidates_of(line, cells, queries, images=None):
     """Return the sources and image codes of each query's runs, one list per query."""
     start, stop, code = cell_line.line_runs(line, cells.of(jnp.asarray(queries)), images)
-    twice = np.asarray(line.twice)
+    twice = np.asarray(line.twice())
     code = np.zeros_like(start) if code is None else np.asarray(code)
     rows = [list(zip(*row, strict=True)) for row in zip(start.tolist(), stop.tolist(), code.tolist(), strict=True)]
     return [[(int(twice[p]), c) for a, b, c in row for p in range(a, b)] for row in rows]

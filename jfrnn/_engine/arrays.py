@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._engine.candidates import Candidates, Points, Torus
+from jfrnn._engine.candidates import Candidates, Points, Span, Torus
 from jfrnn._engine.problem import Kind, Options, Rows, Search, largest_radius
 from jfrnn._engine.runs import count_neighbors, list_neighbors
 from jfrnn._engine.tuning import Tuning, by_platform
@@ -29,6 +29,7 @@ from jfrnn._geometry import (
     Axes,
     Batch,
     CellAxes,
+    Cells,
     Cutoff,
     Cutoffs,
     Lattice,
@@ -131,10 +132,14 @@ def find_candidates(search: Search, by_cells: bool, tuning: Tuning) -> Candidate
         along, axes = _cells_along(sources, queries, cutoff, given)
         return _cell_stencil(*clouds, along, axes.cells, batch, torus, tuning)
     images, levels = None if torus is None else torus.images, levels_of(search)
-    points = _in_order(clouds[0], levels.order, cutoff.sources)
+    points = _in_order(clouds[0], jnp.pad(levels.order, (0, LANES)), cutoff.sources)
     rows = _in_order(clouds[0] if clouds[1] is None else clouds[1], levels.query_order, cutoff.queries)
-    words = {2: 16, 3: 64}[sources.shape[1]]
-    return Candidates(points, rows, level_runs(levels, cutoff, images), torus, len(sources), lambda _: words, levels.passes)
+    words, runs = {2: 16, 3: 64}[sources.shape[1]], level_runs(levels, cutoff, images)
+
+    def runs_of(span: Span, which: Array) -> tuple[Array, Array, Array | None]:
+        return runs(span.places, which)
+
+    return Candidates(points, rows, runs_of, torus, len(sources), lambda _: words, levels.passes)
 
 
 def levels_of(search: Search) -> Levels:
@@ -176,18 +181,19 @@ def _all_sources(
         systems, wanted = batch.sources[order], batch.of_queries[query_order]
         first, end = (jnp.searchsorted(systems, wanted, side=side).astype(jnp.int32) for side in ("left", "right"))
 
-    def runs(place: Array, _: Array) -> tuple[Array, Array, Array | None]:
-        start, stop = jnp.zeros((place.size, images), jnp.int32), jnp.int32(len(sources))
+    def runs(span: Span, _: Array) -> tuple[Array, Array, Array | None]:
+        start, stop = jnp.zeros((span.size, images), jnp.int32), jnp.int32(len(sources))
         if batch is not None:
-            start, stop = start + first[place][:, None], end[place][:, None]
+            start, stop = start + span.of(first)[:, None], span.of(end)[:, None]
         codes = None if torus is None else jnp.zeros_like(start) + lax.iota(jnp.int32, images)[None]
         return start, jnp.broadcast_to(stop, start.shape), codes
 
     of_sources, of_queries = (cutoff.sources, cutoff.queries) if isinstance(cutoff, Cutoffs) else (None, None)
-    points = _in_order(sources, order, of_sources)
+    padded = jnp.pad(lax.iota(jnp.int32, len(sources)) if order is None else order, (0, LANES))
     rows = _in_order(sources if queries is None else queries, query_order, of_queries)
-    words = images * -(-len(sources) // LANES)
-    return Candidates(points, rows, runs, torus, len(sources), lambda _: words, in_order=query_order is None)
+    words, unordered = images * -(-len(sources) // LANES), query_order is None
+    points = _in_order(sources, padded, of_sources)
+    return Candidates(points, rows, runs, torus, len(sources), lambda _: words, in_order=unordered, most_words=words)
 
 
 def _cell_stencil(
@@ -205,15 +211,15 @@ def _cell_stencil(
     """
     n, systems = len(sources), None if batch is None else batch.of_all
     line, cells = sort_along_line(along, axes, n, systems, tuning.least_sorted, tuning.searched)
-    order = line.order if queries is None else sort_queries(line, cells, n, tuning.least_sorted)
-    at = order if queries is None else order + n
+    numbers, order = (line.numbers, line.order) if queries is None else sort_queries(cells, n, tuning.least_sorted)
     images = None if torus is None else torus.images
+    ordered = None if images is None else cells.of(order if queries is None else order + n)
 
-    def runs(place: Array, _: Array) -> tuple[Array, Array, Array | None]:
-        here = at.at[place].get(mode="promise_in_bounds")
-        return line_runs(line, cells.of(here), images)
+    def runs(span: Span, _: Array) -> tuple[Array, Array, Array | None]:
+        along = cells.along if ordered is None else span.of(ordered.along)  # in open space, the number says all
+        return line_runs(line, Cells(along, span.of(numbers)), images)
 
-    twice = line.twice
+    twice = line.twice(more=LANES)
     points = _in_order(sources, twice)._replace(systems=None if batch is None else batch.sources[twice])
     rows = points._replace(ids=order) if queries is None else _in_order(queries, order)
     if batch is not None:
