@@ -84,7 +84,7 @@ class ArrayEngine:
 
         count, one = jax.ShapeDtypeStruct((m,), np.int32), jax.ShapeDtypeStruct((), np.int32)
         idx = None if capacity is None else jax.ShapeDtypeStruct((m, capacity), np.int32)
-        return call_late(functools.partial(by_platform, on), (search._replace(checks={}),), Rows(idx, count, one, one))
+        return Rows(*call_late(functools.partial(by_platform, on), (search._replace(checks={}),), (idx, count, one, one)))
 
     def _rows(self, options: Options, capacity: int | None, tuning: Tuning, search: Search) -> Rows:
         candidates = find_candidates(search, self.by_cells and not is_few(search, tuning), tuning)

@@ -18,8 +18,18 @@ from jfrnn._engine.candidates import Candidates, Points, Span, Torus
 from jfrnn._engine.problem import Filter
 from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
 from jfrnn._engine.words import LANES, BitRows, bit_counts, take, windows
-from jfrnn._geometry import Cutoff, Cutoffs, Pair, decide_pairs, flat_take, shift_in_given, squared_distance, step_one_bounds
-from jfrnn._tracing import Tree, largest_of
+from jfrnn._geometry import (
+    Cutoff,
+    Cutoffs,
+    Pair,
+    decide_pairs,
+    decide_some,
+    flat_take,
+    shift_in_given,
+    squared_distance,
+    step_one_bounds,
+)
+from jfrnn._tracing import largest_of
 
 _FEW_RUNS = 32
 _SLOTS = 32  # doubtful candidates of a row that are decided at a time
@@ -229,21 +239,25 @@ class _Engine(NamedTuple):
             return Span(0, self.block_size)
         return Span(jnp.minimum(b * self.block_size, self.queries.ids.size - self.block_size), self.block_size)
 
-    def map_blocks(self, of_block: Callable[[Span], Tree], columns: Tree) -> Tree:
+    def map_blocks(self, of_block: Callable[[Span], list[Array]], columns: list[tuple[int, ...]]) -> list[Array]:
         """Return of_block(span), int32 arrays with a row per query, for all queries in the order of their indices.
 
         `columns` are the shapes of a row of each array.
         """
-        if self.block_count == 1 and self.candidates.in_order:
-            return of_block(self.block(0))
+        ids = self.queries.ids
+        if self.block_count == 1:
+            rows = of_block(self.block(0))
+            if self.candidates.in_order:
+                return rows
+            place = jnp.zeros_like(ids).at[ids].set(lax.iota(jnp.int32, ids.size), unique_indices=True)
+            return [_at(x, place) for x in rows]
 
-        def put(b: Array | int, out: Tree) -> Tree:
+        def put(b: Array, out: list[Array]) -> list[Array]:
             span = self.block(b)
-            ids = span.of(self.queries.ids)
-            return jax.tree.map(lambda out, rows: out.at[ids].set(rows, unique_indices=True), out, of_block(span))
+            here = span.of(ids)
+            return [x.at[here].set(rows, unique_indices=True) for x, rows in zip(out, of_block(span), strict=True)]
 
-        start = [jnp.zeros((self.queries.ids.size, *shape), jnp.int32) for shape in columns]
-        return put(0, start) if self.block_count == 1 else lax.fori_loop(0, self.block_count, put, start)
+        return lax.fori_loop(0, self.block_count, put, [jnp.zeros((ids.size, *shape), jnp.int32) for shape in columns])
 
     def fold_words(self, span: Span, add: Callable[["_HitWords", State], State], state: State) -> State:
         """Return the state after state = add(words, state) for each chunk of candidates of the queries at these positions."""
@@ -256,12 +270,13 @@ class _Engine(NamedTuple):
             def add_chunk(chunk: Array, state: State) -> State:
                 return add(self.hit_words(span, query, table, chunk), state)
 
-            def add_next(now: tuple[Array, State]) -> tuple[Array, State]:
-                return now[0] + 1, add_chunk(*now)
+            def add_next(now: tuple[Array, Array, State]) -> tuple[Array, Array, State]:
+                _, chunk, state = now
+                return (chunk + 1) * self.words < table.longest, chunk + 1, add_chunk(chunk, state)
 
             if isinstance(table.longest, int) and table.longest <= self.words:
                 return add_chunk(jnp.int32(0), state)
-            return lax.while_loop(lambda now: now[0] * self.words < table.longest, add_next, (jnp.int32(0), state))[1]
+            return lax.while_loop(lambda now: now[0], add_next, (jnp.asarray(table.longest > 0), jnp.int32(0), state))[2]
 
         passes = self.candidates.passes
         return add_pass(jnp.int32(0), state) if passes is None else lax.fori_loop(0, passes, add_pass, state)
@@ -369,12 +384,9 @@ class _Engine(NamedTuple):
             waiting, queue = until[-1], jnp.full(rows + many, rows, jnp.int32)
             queue = queue.at[jnp.where(open_rows, until - 1, rows + many)].set(lax.iota(jnp.int32, rows), mode="drop")
 
-        def is_open(state: tuple[Array, Array]) -> Array:
-            return largest_of(state[1]) > _HITS if whole else state[0] < waiting
-
-        def decide_round(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        def decide_round(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             # The barrier keeps what follows in the loop: it is not worth computing where no round is needed.
-            at, packed, row = lax.optimization_barrier((*state, queue))
+            _, at, packed, row = lax.optimization_barrier((*state, queue))
             row = row if whole else lax.dynamic_slice_in_dim(row, at, many)
             here = jnp.minimum(row, rows - 1)
             both = packed if whole else jnp.where((row < rows)[:, None], packed[here], np.uint32(0))
@@ -392,18 +404,24 @@ class _Engine(NamedTuple):
                 return self._pair(span.first + of_row, source, None if image is None else flat_take(image, of_word))
 
             there = slot < bits.total[:, None]
-            pair = decide_pairs(there, points, self.cutoff)
+            if self.tuning.integers:
+                pair, known = decide_some(there, points, self.cutoff, self.tuning.integers)
+                there, pair = there & known, pair & known
+            else:
+                pair = decide_pairs(there, points, self.cutoff)
             one = np.uint32(1) << bit.astype(jnp.uint32)
             decided = jnp.where(there, one << np.uint32(LANES), np.uint32(0)) | jnp.where(pair, one, np.uint32(0))
             of_column = lax.broadcasted_iota(jnp.int32, (many, width, _SLOTS), 1) == column[:, None]
             change = lax.reduce(jnp.where(of_column, decided[:, None], np.uint32(0)), np.uint32(0), lax.bitwise_or, (2,))
             both = both ^ change  # the bit of a doubtful candidate becomes 0, that of a pair 1
+            more = largest_of(both) > _HITS
             if whole:
-                return at, both
-            at = jnp.where(largest_of(both) > _HITS, at, at + many)
-            return at, packed.at[row].set(both, mode="drop", unique_indices=True)
+                return more, at, both
+            at = jnp.where(more, at, at + many)
+            return at < waiting, at, packed.at[row].set(both, mode="drop", unique_indices=True)
 
-        return lax.while_loop(is_open, decide_round, (jnp.int32(0), packed))[1]
+        more = largest_of(packed) > _HITS if whole else waiting > 0
+        return lax.while_loop(lambda state: state[0], decide_round, (more, jnp.int32(0), packed))[2]
 
     def _pair(self, place: Array, candidate: Array, image: Array | None) -> Pair:
         """Return the given (not wrapped) points of queries and candidates at these positions."""

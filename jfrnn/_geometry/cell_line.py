@@ -196,7 +196,7 @@ def _constants(count: int, size: int) -> list[np.uint32]:
     return [np.uint32(stride) for stride in strides]
 
 
-def _number(cells: Sequence[Array | np.ndarray], strides: list[Array]) -> Array:
+def _number(cells: Sequence[Array], strides: list[Array]) -> Array:
     return functools.reduce(jnp.add, (c * stride for c, stride in zip(cells[1:], strides, strict=True)), cells[0])
 
 
@@ -211,20 +211,22 @@ def line_runs(line: CellLine, cells: Cells, images: Images | None) -> tuple[Arra
     steps = [range(-max(k, 1), max(k, 1) + 1) for k in reach[1:]]
     rows = np.stack(np.meshgrid(*steps, indexing="ij"), -1).reshape(-1, dim - 1).astype(np.int32)
     if images is None:
-        ahead = _number([np.uint32(0), *rows.astype(np.uint32).T], line.strides[: dim - 1]) - np.uint32(FINE)
+        ahead = _number(
+            list(jnp.asarray(np.pad(rows, ((0, 0), (1, 0)), constant_values=-FINE).astype(np.uint32).T)), line.strides[: dim - 1]
+        )
         begin = ((cells.number[:, None] + ahead[None]) & np.uint32(size - 1)).astype(jnp.int32)
         return *_ends(line, begin, jnp.where(cells.number < size, _RUN, 0)[:, None]), None
-    parts = _parts_of_rows(cells.along[0].astype(jnp.int32), line.turns[0], reach[0], images)
-
-    def each(values: list[Array]) -> Array:  # [m, runs]: all rows of the first part come first
-        return jnp.repeat(jnp.stack(values, axis=1), len(rows), axis=1)
-
-    first, last, turn = (each([part[what] for part in parts]) for what in range(3))
+    parts = _parts_of_rows(cells.along[0].astype(jnp.int32)[:, None], line.turns[0], reach[0], images)
+    first, last, turn = (jnp.repeat(x, len(rows), axis=1) for x in parts)  # [m, runs]: all rows of the first part come first
     number, turned = [first.astype(jnp.uint32)], [turn]
     for axis in range(1, dim):
-        cell = cells.along[axis].astype(jnp.int32)[:, None] + np.tile(rows[:, axis - 1], len(parts))[None]
+        cell = cells.along[axis].astype(jnp.int32)[:, None] + np.tile(rows[:, axis - 1], parts[0].shape[1])[None]
         turns = line.turns[axis]
-        turn = jnp.zeros_like(cell) if turns is None else cell // turns
+        turn = jnp.zeros_like(cell)
+        if turns is not None and reach[axis] == 1:  # without a division
+            turn = (cell >= turns).astype(jnp.int32) - (cell < 0).astype(jnp.int32)
+        elif turns is not None:
+            turn = cell // turns
         turned.append(turn)
         number.append((cell if turns is None else cell - turn * turns).astype(jnp.uint32))
     number += [system[:, None] for system in cells.along[dim:]]
@@ -242,13 +244,13 @@ def _ends(line: CellLine, begin: Array, length: Array) -> tuple[Array, Array]:
     return ends[0], ends[1]
 
 
-def _parts_of_rows(x: Array, turns: Array | None, reach: int, images: Images) -> list[tuple[Array, Array, Array]]:
-    """Split the row of parts around x [m] at the borders of images: first and last part, and image of each piece, [m] each."""
+def _parts_of_rows(x: Array, turns: Array | None, reach: int, images: Images) -> tuple[Array, Array, Array]:
+    """Split the row of parts around x [m, 1] at the borders of images: [m, pieces] first and last part, and image of each."""
     if turns is None:
-        return [(x - FINE, x + FINE, jnp.zeros_like(x))]
+        return x - FINE, x + FINE, jnp.zeros_like(x)
     if images.nearest:  # The box has at least two cells, so a row enters only one other image.
-        shifts = [jnp.zeros_like(x), jnp.where(x < FINE, -1, 1)]
+        shifts = jnp.concatenate([jnp.zeros_like(x), jnp.where(x < FINE, -1, 1)], axis=1)
     else:
-        shifts = [jnp.full_like(x, s) for s in range(-reach, reach + 1)]
-    beyond, most = FINE * reach, turns - 1
-    return [(jnp.maximum(x - beyond - s * turns, 0), jnp.minimum(x + beyond - s * turns, most), s) for s in shifts]
+        shifts = jnp.broadcast_to(np.arange(-reach, reach + 1, dtype=np.int32)[None], (len(x), 2 * reach + 1))
+    beyond, from_start = FINE * reach, x - shifts * turns
+    return jnp.maximum(from_start - beyond, 0), jnp.minimum(from_start + beyond, turns - 1), shifts

@@ -18,6 +18,7 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -56,12 +57,12 @@ class Pair(NamedTuple):
     matrix: Array | None = None  # [d, d], one lattice vector per row, 0 for open axes
     orthogonal: bool = True
 
-    def lattice_terms(self, axis: int) -> list[tuple[Array, Array]]:
-        """Return the pairs (shift, lattice vector component) whose products sum to the translation along an axis."""
+    def lattice_terms(self, axis: int) -> list[tuple[Array, tuple[int, int]]]:
+        """Return shifts, and the places in `matrix` of what they multiply, which sum to the translation along an axis."""
         if self.shift is None or self.matrix is None:
             return []
         rows = [axis] if self.orthogonal else range(len(self.shift))  # twice the axes if `shift_in_given` split the shifts
-        return [(self.shift[k], self.matrix[k, axis]) for k in rows]
+        return [(self.shift[k], (k, axis)) for k in rows]
 
 
 PointsAt = Callable[[Array | None], Pair]
@@ -176,20 +177,30 @@ def decide_pairs(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) ->
 
     `points(None)` returns both points of every pair in the shape of `doubtful`, and `points(at)` those at the flat indices `at`.
     """
-    pairs = points(None)
-    signs = jnp.where(doubtful, _fixed_sign(pairs, _threshold(pairs, cutoff)), 1).astype(jnp.int8)
-    chunk = min(_INTEGER_CHUNK, signs.size)
-
-    def decide_chunk(signs: Array) -> Array:
-        flat = signs.reshape(-1)
-        first = jnp.minimum(lax.argmax(flat, 0, jnp.int32), flat.size - chunk)  # that of an unknown sign, the largest value
-        here = points(first + lax.iota(jnp.int32, chunk))
-        known = lax.dynamic_slice_in_dim(flat, first, chunk)
-        known = jnp.where(known == _UNKNOWN, _integer_sign(here, _threshold(here, cutoff)).astype(jnp.int8), known)
-        return lax.dynamic_update_slice_in_dim(flat, known, first, axis=0).reshape(signs.shape)
-
-    signs = lax.while_loop(lambda signs: largest_of(signs) == _UNKNOWN, decide_chunk, signs)
+    decide = functools.partial(_decide_unknown, points=points, cutoff=cutoff, most=_INTEGER_CHUNK)
+    signs = lax.while_loop(lambda signs: largest_of(signs) == _UNKNOWN, decide, _signs(doubtful, points, cutoff))
     return signs <= 0 if cutoff.closed else signs < 0
+
+
+def decide_some(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs, most: int) -> tuple[Array, Array]:
+    """Decide pairs like `decide_pairs`, but by step 3 only up to `most` of them; return also which ones are decided."""
+    signs = _decide_unknown(_signs(doubtful, points, cutoff), points, cutoff, most)
+    return signs <= 0 if cutoff.closed else signs < 0, signs != _UNKNOWN
+
+
+def _signs(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
+    pairs = points(None)
+    return jnp.where(doubtful, _fixed_sign(pairs, _threshold(pairs, cutoff)), 1).astype(jnp.int8)
+
+
+def _decide_unknown(signs: Array, points: PointsAt, cutoff: Cutoff | Cutoffs, most: int) -> Array:
+    """Replace unknown signs by those of the integer test: the first one and others next to it, at most so many."""
+    flat, chunk = signs.reshape(-1), min(most, signs.size)
+    first = jnp.minimum(lax.argmax(flat, 0, jnp.int32), flat.size - chunk)  # that of an unknown sign, the largest value
+    here = points(first + lax.iota(jnp.int32, chunk))
+    known = lax.dynamic_slice_in_dim(flat, first, chunk)
+    known = jnp.where(known == _UNKNOWN, _integer_sign(here, _threshold(here, cutoff)).astype(jnp.int8), known)
+    return lax.dynamic_update_slice_in_dim(flat, known, first, axis=0).reshape(signs.shape)
 
 
 class _Threshold(NamedTuple):
@@ -227,7 +238,6 @@ def _fixed_sign(pair: Pair, threshold: _Threshold) -> Array:
     fraction = fraction_bits(dtype, threshold.times)
     eps, bits = jnp.finfo(dtype).eps, limb_bits(dtype)
     known, total = jnp.ones(pair.b[0].shape, bool), None
-
     unsigned, finfo = np.dtype(f"uint{8 * dtype.itemsize}").type, jnp.finfo(dtype)
     exponent = (lax.bitcast_convert_type(threshold.scale, unsigned) >> unsigned(finfo.nmant)).astype(jnp.int32)
     up = exponent + (fraction + bits + int(finfo.minexp) - finfo.nmant - (finfo.maxexp - 1))
@@ -238,11 +248,15 @@ def _fixed_sign(pair: Pair, threshold: _Threshold) -> Array:
         known = known & whole
         return number
 
+    matrix = jnp.zeros((0, 0), dtype) if pair.matrix is None else pair.matrix
+    lattice = _fixed_point(matrix.reshape(*matrix.shape, *[1] * up.ndim), up)
     for axis, (ak, bk) in enumerate(zip(pair.a, pair.b, strict=True)):
         displacement, estimate = _add(fixed(bk), fixed(ak), -1), bk - ak
         error = jnp.zeros((), dtype)
-        for shift, component in pair.lattice_terms(axis):
-            displacement = _add(displacement, fixed(component), shift.astype(limb_type(dtype)))
+        for shift, at in pair.lattice_terms(axis):
+            component, (number, whole) = matrix[at], jax.tree.map(lambda x, at=at: x[at], lattice)
+            known = known & whole
+            displacement = _add(displacement, number, shift.astype(limb_type(dtype)))
             estimate = estimate + shift * component
             error = error + 16 * eps * (jnp.abs(ak) + jnp.abs(bk) + jnp.abs(shift * component))
             known = known & (jnp.abs(shift) <= 2**WHOLE_BITS)
@@ -265,7 +279,7 @@ def _add(x: _Fixed, y: _Fixed, times: Array | int = 1) -> _Fixed:
 
 
 def _fixed_point(x: Array, up: Array) -> tuple[_Fixed, Array]:
-    """Return x·2^up as a number of digits of `lower`, and whether it has no finer digits; x counts units of the last mantissa bit."""
+    """Return x in the units of step 2, and whether it has no finer digits; `up` is where the lowest bit of denormals is there."""
     dtype = np.dtype(x.dtype)
     bits, width, whole = limb_bits(dtype), 8 * dtype.itemsize, limb_type(dtype)
     unsigned = np.dtype(f"uint{width}").type
