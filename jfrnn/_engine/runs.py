@@ -23,7 +23,6 @@ from jfrnn._geometry import (
     Cutoffs,
     Pair,
     decide_pairs,
-    decide_some,
     flat_take,
     shift_in_given,
     squared_distance,
@@ -404,11 +403,7 @@ class _Engine(NamedTuple):
                 return self._pair(span.first + of_row, source, None if image is None else flat_take(image, of_word))
 
             there = slot < bits.total[:, None]
-            if self.tuning.integers:
-                pair, known = decide_some(there, points, self.cutoff, self.tuning.integers)
-                there, pair = there & known, pair & known
-            else:
-                pair = decide_pairs(there, points, self.cutoff)
+            pair = decide_pairs(there, points, self.cutoff)
             one = np.uint32(1) << bit.astype(jnp.uint32)
             decided = jnp.where(there, one << np.uint32(LANES), np.uint32(0)) | jnp.where(pair, one, np.uint32(0))
             of_column = lax.broadcasted_iota(jnp.int32, (many, width, _SLOTS), 1) == column[:, None]

@@ -27,8 +27,6 @@ class Tuning(NamedTuple):
         searched: Up to so many sources, the table of cells is made by binary searches instead of by counting.
         doubtful_share: Rows with pairs that are decided exactly are processed in parts of a block, one of so many,
         doubtful_rows: but at least so many rows at a time.
-        integers: Of a part's pairs, so many are decided by wide integers at a time; 0: in a loop of their own, which on an
-            accelerator waits for the host.
         in_groups: Whether the word of a slot is found in a group of words instead of by looking at every word of its row.
         group: Slots of a row that are filled at a time.
     """
@@ -40,7 +38,6 @@ class Tuning(NamedTuple):
     searched: int
     doubtful_share: int
     doubtful_rows: int
-    integers: int
     in_groups: bool
     group: int
 
@@ -53,7 +50,6 @@ CPU = Tuning(  # a block fits into the caches, and loops cost little
     searched=0,
     doubtful_share=1,
     doubtful_rows=64,
-    integers=0,
     in_groups=False,
     group=128,
 )
@@ -65,7 +61,6 @@ ACCELERATOR = Tuning(  # few large kernels, in at most 1 GB
     searched=1 << 18,
     doubtful_share=16,
     doubtful_rows=4096,
-    integers=1024,
     in_groups=True,
     group=256,
 )

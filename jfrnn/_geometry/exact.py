@@ -177,30 +177,20 @@ def decide_pairs(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) ->
 
     `points(None)` returns both points of every pair in the shape of `doubtful`, and `points(at)` those at the flat indices `at`.
     """
-    decide = functools.partial(_decide_unknown, points=points, cutoff=cutoff, most=_INTEGER_CHUNK)
-    signs = lax.while_loop(lambda signs: largest_of(signs) == _UNKNOWN, decide, _signs(doubtful, points, cutoff))
-    return signs <= 0 if cutoff.closed else signs < 0
-
-
-def decide_some(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs, most: int) -> tuple[Array, Array]:
-    """Decide pairs like `decide_pairs`, but by step 3 only up to `most` of them; return also which ones are decided."""
-    signs = _decide_unknown(_signs(doubtful, points, cutoff), points, cutoff, most)
-    return signs <= 0 if cutoff.closed else signs < 0, signs != _UNKNOWN
-
-
-def _signs(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
     pairs = points(None)
-    return jnp.where(doubtful, _fixed_sign(pairs, _threshold(pairs, cutoff)), 1).astype(jnp.int8)
+    signs = jnp.where(doubtful, _fixed_sign(pairs, _threshold(pairs, cutoff)), 1).astype(jnp.int8)
+    chunk = min(_INTEGER_CHUNK, signs.size)
 
+    def decide_chunk(signs: Array) -> Array:
+        flat = signs.reshape(-1)
+        first = jnp.minimum(lax.argmax(flat, 0, jnp.int32), flat.size - chunk)  # that of an unknown sign, the largest value
+        here = points(first + lax.iota(jnp.int32, chunk))
+        known = lax.dynamic_slice_in_dim(flat, first, chunk)
+        known = jnp.where(known == _UNKNOWN, _integer_sign(here, _threshold(here, cutoff)).astype(jnp.int8), known)
+        return lax.dynamic_update_slice_in_dim(flat, known, first, axis=0).reshape(signs.shape)
 
-def _decide_unknown(signs: Array, points: PointsAt, cutoff: Cutoff | Cutoffs, most: int) -> Array:
-    """Replace unknown signs by those of the integer test: the first one and others next to it, at most so many."""
-    flat, chunk = signs.reshape(-1), min(most, signs.size)
-    first = jnp.minimum(lax.argmax(flat, 0, jnp.int32), flat.size - chunk)  # that of an unknown sign, the largest value
-    here = points(first + lax.iota(jnp.int32, chunk))
-    known = lax.dynamic_slice_in_dim(flat, first, chunk)
-    known = jnp.where(known == _UNKNOWN, _integer_sign(here, _threshold(here, cutoff)).astype(jnp.int8), known)
-    return lax.dynamic_update_slice_in_dim(flat, known, first, axis=0).reshape(signs.shape)
+    signs = lax.while_loop(lambda signs: largest_of(signs) == _UNKNOWN, decide_chunk, signs)
+    return signs <= 0 if cutoff.closed else signs < 0
 
 
 class _Threshold(NamedTuple):
