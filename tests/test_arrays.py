@@ -10,7 +10,8 @@ import pytest
 import reference
 
 import jfrnn
-from jfrnn._engine import tuning
+from jfrnn._engine import arrays, tuning
+from jfrnn._engine import rows as rows_module
 from jfrnn.cases.hard import HARD_CASES
 
 # blocks as small as these cases, so that each has several
@@ -107,3 +108,22 @@ def test_programs_are_exported_for_every_platform(box):
     program = jax.export.export(jax.jit(fn), platforms=["cpu", "cuda", "rocm", "tpu"])(x)
     assert program.platforms == ("cpu", "cuda", "rocm", "tpu")
     assert set(re.findall(r"custom_call @(\w+)", str(program.mlir_module()))) <= {"Sharding", "annotate_device_placement"}
+
+
+@pytest.mark.parametrize("platforms", [("cpu",), ("cuda",), ("cpu", "cuda")])
+def test_a_program_is_traced_for_its_platforms_alone(platforms, monkeypatch):
+    """A search, and the gradient of a sum."""
+    used, rows, fold = [], arrays.find_candidates, rows_module.find_candidates
+    monkeypatch.setattr(
+        arrays, "find_candidates", lambda search, by_cells, tuning: used.append(tuning) or rows(search, by_cells, tuning)
+    )
+    monkeypatch.setattr(rows_module, "find_candidates", lambda *given: used.append(given[2]) or fold(*given))
+
+    def both(x):
+        return jfrnn.search(x, 0.2, capacity=64, backend="jax").idx, jax.grad(
+            lambda x: jfrnn.pair_sum(spring, x, 0.2, backend="jax").sum()
+        )(x)
+
+    jax.export.export(jax.jit(both), platforms=platforms)(jax.ShapeDtypeStruct((601, 3), np.float32))
+    numbers = {"cpu": tuning.CPU, "cuda": tuning.ACCELERATOR}
+    assert set(used) == {numbers[name] for name in platforms}

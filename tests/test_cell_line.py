@@ -1,5 +1,6 @@
 """Cells numbered along a line: every candidate once, in domains that fit into the table and in others."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ def line_of(x, sources, systems=None):
 def candidates_of(line, cells, queries, images=None):
     """Return the sources and image codes of each query's runs, one list per query."""
     start, stop, code = cell_line.line_runs(line, cells.of(jnp.asarray(queries)), images)
-    twice = np.asarray(line.twice)
+    twice = np.asarray(line.twice())
     code = np.zeros_like(start) if code is None else np.asarray(code)
     rows = [list(zip(*row, strict=True)) for row in zip(start.tolist(), stop.tolist(), code.tolist(), strict=True)]
     return [[(int(twice[p]), c) for a, b, c in row for p in range(a, b)] for row in rows]
@@ -91,3 +92,19 @@ def test_runs_of_a_torus_meet_every_image_once(images, crowded, monkeypatch):
         ]
         assert len(found) == len(set(found))
         assert set(expected) <= set(found)
+
+
+def test_a_program_does_not_grow_with_the_images():
+    """One set of operations serves all pieces of a row: a program with 703 pieces took minutes to compile."""
+
+    def length(reach):
+        images, one = Images((True,) * 3, True, (reach, 2, 2), False), jnp.float32(1)
+        axes = CellAxes([one / 8] * 3, [one] * 3)
+
+        def runs(x):
+            line, cells = cell_line.sort_along_line(x.T, axes, len(x), None)
+            return cell_line.line_runs(line, cells, images)
+
+        return len(jax.make_jaxpr(runs)(jnp.zeros((60, 3), jnp.float32)).eqns)
+
+    assert length(2) == length(351)

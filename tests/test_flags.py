@@ -1,11 +1,11 @@
-"""Places of flags that are set, against NumPy."""
+"""Places of flags that are set, and largest numbers, against NumPy."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jfrnn._tracing.flags import set_places
+from jfrnn._tracing.flags import largest_of, set_places
 
 
 @pytest.mark.parametrize("n", [0, 1, 31, 32, 33, 1000])
@@ -25,3 +25,12 @@ def test_places_are_those_of_numpy(n, share):
 def test_the_last_and_the_first_flag_of_each_word_are_found():
     for k in (0, 31, 32, 63, 64, 95):
         assert set_places(jnp.arange(96) == k, 2).tolist() == [k, 96]
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.int32, np.uint32])
+@pytest.mark.parametrize("shape", [(1,), (33,), (40, 3)])
+def test_the_largest_number(dtype, shape):
+    x = np.random.default_rng(1).integers(0, np.iinfo(dtype).max, shape).astype(dtype)
+    found = jax.jit(largest_of)(x)
+    assert found.dtype == dtype
+    assert found == x.max()

@@ -14,11 +14,12 @@ import functools
 import math
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._engine.candidates import Candidates, Points, Torus
+from jfrnn._engine.candidates import Candidates, Points, Span, Torus
 from jfrnn._engine.problem import Kind, Options, Rows, Search, largest_radius
 from jfrnn._engine.runs import count_neighbors, list_neighbors
 from jfrnn._engine.tuning import Tuning, by_platform
@@ -28,6 +29,7 @@ from jfrnn._geometry import (
     Axes,
     Batch,
     CellAxes,
+    Cells,
     Cutoff,
     Cutoffs,
     Lattice,
@@ -45,6 +47,7 @@ from jfrnn._geometry import (
     translation,
     unpack_turns,
 )
+from jfrnn._tracing import call_late
 
 _MOST_SOURCES = 2**30 - LANES  # whose places are int32, as runs read the sources twice in a row
 
@@ -73,11 +76,15 @@ class ArrayEngine:
 
     def rows(self, search: Search, options: Options, capacity: int | None) -> Rows:
         """Find the candidates of every query, and keep those that are neighbors."""
+        refuse_many(search)
+        m = search.sizes[1]
 
         def on(tuning: Tuning) -> Callable[[Search], Rows]:
             return functools.partial(self._rows, options, capacity, tuning)
 
-        return by_platform(on, search._replace(checks={}))
+        count, one = jax.ShapeDtypeStruct((m,), np.int32), jax.ShapeDtypeStruct((), np.int32)
+        idx = None if capacity is None else jax.ShapeDtypeStruct((m, capacity), np.int32)
+        return Rows(*call_late(functools.partial(by_platform, on), (search._replace(checks={}),), (idx, count, one, one)))
 
     def _rows(self, options: Options, capacity: int | None, tuning: Tuning, search: Search) -> Rows:
         candidates = find_candidates(search, self.by_cells and not is_few(search, tuning), tuning)
@@ -88,6 +95,15 @@ class ArrayEngine:
     def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool, scaled: bool) -> int | None:
         """Return None: only the compiler knows."""
         return None
+
+
+def refuse_many(search: Search) -> None:
+    """Raise an error if there are more sources than runs have places for."""
+    if (n := search.sizes[0]) > _MOST_SOURCES:
+        raise ValueError(
+            f"positions: backend='jax' looks for neighbors among at most {_MOST_SOURCES} particles, got {n}: pass "
+            "backend='warp', or divide the particles over devices with jfrnn.distributed."
+        )
 
 
 def is_few(search: Search, tuning: Tuning) -> bool:
@@ -116,10 +132,14 @@ def find_candidates(search: Search, by_cells: bool, tuning: Tuning) -> Candidate
         along, axes = _cells_along(sources, queries, cutoff, given)
         return _cell_stencil(*clouds, along, axes.cells, batch, torus, tuning)
     images, levels = None if torus is None else torus.images, levels_of(search)
-    points = _in_order(clouds[0], levels.order, cutoff.sources)
+    points = _in_order(clouds[0], jnp.pad(levels.order, (0, LANES)), cutoff.sources)
     rows = _in_order(clouds[0] if clouds[1] is None else clouds[1], levels.query_order, cutoff.queries)
-    words = {2: 16, 3: 64}[sources.shape[1]]
-    return Candidates(points, rows, level_runs(levels, cutoff, images), torus, len(sources), lambda _: words, levels.passes)
+    words, runs = {2: 16, 3: 64}[sources.shape[1]], level_runs(levels, cutoff, images)
+
+    def runs_of(span: Span, which: Array) -> tuple[Array, Array, Array | None]:
+        return runs(span.places, which)
+
+    return Candidates(points, rows, runs_of, torus, len(sources), lambda _: words, levels.passes)
 
 
 def levels_of(search: Search) -> Levels:
@@ -161,18 +181,19 @@ def _all_sources(
         systems, wanted = batch.sources[order], batch.of_queries[query_order]
         first, end = (jnp.searchsorted(systems, wanted, side=side).astype(jnp.int32) for side in ("left", "right"))
 
-    def runs(place: Array, _: Array) -> tuple[Array, Array, Array | None]:
-        start, stop = jnp.zeros((place.size, images), jnp.int32), jnp.int32(len(sources))
+    def runs(span: Span, _: Array) -> tuple[Array, Array, Array | None]:
+        start, stop = jnp.zeros((span.size, images), jnp.int32), jnp.int32(len(sources))
         if batch is not None:
-            start, stop = start + first[place][:, None], end[place][:, None]
+            start, stop = start + span.of(first)[:, None], span.of(end)[:, None]
         codes = None if torus is None else jnp.zeros_like(start) + lax.iota(jnp.int32, images)[None]
         return start, jnp.broadcast_to(stop, start.shape), codes
 
     of_sources, of_queries = (cutoff.sources, cutoff.queries) if isinstance(cutoff, Cutoffs) else (None, None)
-    points = _in_order(sources, order, of_sources)
+    padded = jnp.pad(lax.iota(jnp.int32, len(sources)) if order is None else order, (0, LANES))
     rows = _in_order(sources if queries is None else queries, query_order, of_queries)
-    words = images * -(-len(sources) // LANES)
-    return Candidates(points, rows, runs, torus, len(sources), lambda _: words, in_order=query_order is None)
+    words, unordered = images * -(-len(sources) // LANES), query_order is None
+    points = _in_order(sources, padded, of_sources)
+    return Candidates(points, rows, runs, torus, len(sources), lambda _: words, in_order=unordered, most_words=words)
 
 
 def _cell_stencil(
@@ -189,21 +210,16 @@ def _cell_stencil(
     `along` [d, n + m] are the coordinates of the sources, then of the queries, which `axes` divides into cells.
     """
     n, systems = len(sources), None if batch is None else batch.of_all
-    if n > _MOST_SOURCES:
-        raise ValueError(
-            f"positions: backend='jax' looks for neighbors among at most {_MOST_SOURCES} particles, got {n}: pass "
-            "backend='warp', or divide the particles over devices with jfrnn.distributed."
-        )
     line, cells = sort_along_line(along, axes, n, systems, tuning.least_sorted, tuning.searched)
-    order = line.order if queries is None else sort_queries(line, cells, n, tuning.least_sorted)
-    at = order if queries is None else order + n
+    numbers, order = (line.numbers, line.order) if queries is None else sort_queries(cells, n, tuning.least_sorted)
     images = None if torus is None else torus.images
+    ordered = None if images is None else cells.of(order if queries is None else order + n)
 
-    def runs(place: Array, _: Array) -> tuple[Array, Array, Array | None]:
-        here = at.at[place].get(mode="promise_in_bounds")
-        return line_runs(line, cells.of(here), images)
+    def runs(span: Span, _: Array) -> tuple[Array, Array, Array | None]:
+        along = cells.along if ordered is None else span.of(ordered.along)  # in open space, the number says all
+        return line_runs(line, Cells(along, span.of(numbers)), images)
 
-    twice = line.twice
+    twice = line.twice(more=LANES)
     points = _in_order(sources, twice)._replace(systems=None if batch is None else batch.sources[twice])
     rows = points._replace(ids=order) if queries is None else _in_order(queries, order)
     if batch is not None:

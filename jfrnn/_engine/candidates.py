@@ -3,16 +3,39 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-from jax import Array
+import jax.numpy as jnp
+from jax import Array, lax
 
 from jfrnn._geometry import Images
 
-# (positions of queries [b] in their order, number of the pass over the sources) -> starts, ends and image codes of runs [b, r]
-Runs = Callable[[Array, Array], tuple[Array, Array, Array | None]]
+
+class Span(NamedTuple):
+    """Queries at consecutive positions of their order.
+
+    Attributes:
+        first: [] int32, the first position.
+        size: How many. Static.
+    """
+
+    first: Array | int
+    size: int
+
+    @property
+    def places(self) -> Array:
+        """The positions, [size] int32."""
+        return self.first + lax.iota(jnp.int32, self.size)
+
+    def of(self, x: Array) -> Array:
+        """Return the values of these queries from an array whose last axis is their order."""
+        return lax.dynamic_slice_in_dim(x, self.first, self.size, axis=-1)
+
+
+# (queries, number of the pass over the sources) -> starts, ends and image codes of runs [b, r]
+Runs = Callable[[Span, Array], tuple[Array, Array, Array | None]]
 
 
 class Points(NamedTuple):
-    """Particles in the order in which the engine visits them.
+    """Particles in the order in which the engine visits them. Sources are followed by at least 15 others, so that words end.
 
     Attributes:
         axes: d coordinate arrays [n].
@@ -56,6 +79,7 @@ class Candidates(NamedTuple):
         runs: The function that finds the runs of queries.
         torus: What a lattice adds.
         size: Number of sources. Static.
+        most_words: How many words of candidates a query has at most, if known. Static.
         words: From slots per query (None: unknown) to the words of candidates that are tested at a time. Static.
         passes: [] int32, number of passes over the sources; None for one.
         again: [] int32, after how many positions the sources start again; None if each has one position.
@@ -71,3 +95,4 @@ class Candidates(NamedTuple):
     passes: Array | None = None
     again: Array | None = None
     in_order: bool = False
+    most_words: int | None = None

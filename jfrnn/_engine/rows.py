@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jfrnn._engine.arrays import complete_rows, find_candidates, is_few
+from jfrnn._engine.arrays import complete_rows, find_candidates, is_few, refuse_many
 from jfrnn._engine.problem import Inputs, Options, Rows, Search, prepare_search
 from jfrnn._engine.runs import State, Visit, fold_neighbors
 from jfrnn._engine.tuning import Tuning, by_platform
@@ -64,6 +64,7 @@ def fold_pairs(inputs: Inputs, options: Options, elements: int, visit: Visit[Sta
     search = prepare_search(inputs, options)
     if 0 in search.sizes:
         return out
+    refuse_many(search)
 
     def on(tuning: Tuning) -> Callable[[tuple[Search, State]], State]:
         def fold(operands: tuple[Search, State]) -> State:

@@ -14,14 +14,24 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._engine.candidates import Candidates, Points, Torus
+from jfrnn._engine.candidates import Candidates, Points, Span, Torus
 from jfrnn._engine.problem import Filter
 from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
-from jfrnn._engine.words import LANES, VERDICTS, BitRows, bit_counts, deposit, take, windows
-from jfrnn._geometry import Cutoff, Cutoffs, Pair, decide_pairs, flat_take, shift_in_given, squared_distance, step_one_bounds
-from jfrnn._tracing import Tree
+from jfrnn._engine.words import LANES, BitRows, bit_counts, take, windows
+from jfrnn._geometry import (
+    Cutoff,
+    Cutoffs,
+    Pair,
+    decide_pairs,
+    flat_take,
+    shift_in_given,
+    squared_distance,
+    step_one_bounds,
+)
+from jfrnn._tracing import largest_of
 
 _FEW_RUNS = 32
+_SLOTS = 32  # doubtful candidates of a row that are decided at a time
 _HITS = np.uint32((1 << LANES) - 1)
 _MANY_RUNS = 4096
 _MOST_WORDS = 256  # per query, that are tested at a time; (words << 16) has to be an int32
@@ -33,15 +43,15 @@ Carry = Any  # the state of a loop over pairs
 
 def count_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, tuning: Tuning) -> Array:
     """Count the neighbors of every query: [m] int32, in the order of the queries' ids."""
-    engine = _Engine(_pad(candidates), cutoff, keep, tuning, slots=1, capacity=None)
+    engine = _Engine(candidates, cutoff, keep, tuning, slots=1, capacity=None)
 
-    def count_block(place: Array) -> Array:
+    def count_block(span: Span) -> list[Array]:
         def add(words: _HitWords, count: Array) -> Array:
-            return count + bit_counts(words.hits & _HITS).sum(1, dtype=jnp.int32)
+            return count + bit_counts(words.hits).sum(1, dtype=jnp.int32)
 
-        return engine.fold_words(place, add, jnp.zeros(place.shape, jnp.int32))
+        return [engine.fold_words(span, add, jnp.zeros(span.size, jnp.int32))]
 
-    return engine.map_blocks(count_block)
+    return engine.map_blocks(count_block, [()])[0]
 
 
 def list_neighbors(
@@ -52,12 +62,12 @@ def list_neighbors(
     If images must be told apart, n times the image code is added to the source index; unused slots are n·images.
     """
     torus = candidates.torus
-    engine = _Engine(_pad(candidates), cutoff, keep, tuning, slots=capacity, capacity=capacity)
+    engine = _Engine(candidates, cutoff, keep, tuning, slots=capacity, capacity=capacity)
     n, images = candidates.size, 1 if torus is None or torus.images.nearest else torus.images.total
     group = min(tuning.group, capacity)
     slots = lax.iota(jnp.int32, group)
 
-    def list_block(place: Array) -> tuple[Array, Array]:
+    def list_block(span: Span) -> list[Array]:
         def add(words: _HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
             (rows, count), (hits, first, image) = found, words
             bits = BitRows.of(hits, tuning.in_groups)
@@ -81,10 +91,11 @@ def list_neighbors(
                 rows = lax.fori_loop(jnp.min(count) // group, until, add_group, rows)
             return rows, count + total
 
-        rows = jnp.full((place.size, capacity), n * images, jnp.int32)
-        return engine.fold_words(place, add, (rows, jnp.zeros(place.shape, jnp.int32)))
+        rows = jnp.full((span.size, capacity), n * images, jnp.int32)
+        return [*engine.fold_words(span, add, (rows, jnp.zeros(span.size, jnp.int32)))]
 
-    return engine.map_blocks(list_block)
+    rows, count = engine.map_blocks(list_block, [(capacity,), ()])
+    return rows, count
 
 
 class Slots(NamedTuple):
@@ -125,12 +136,13 @@ def fold_neighbors(
 
     `elements` is the number of scalars per pair that a visitor needs; they count as slots of a block.
     """
-    engine = _Engine(_pad(candidates), cutoff, keep, tuning, slots=FOLD_GROUP * elements, capacity=None)
+    engine = _Engine(candidates, cutoff, keep, tuning, slots=FOLD_GROUP * elements, capacity=None)
     slots, torus = lax.iota(jnp.int32, FOLD_GROUP), candidates.torus
 
     def fold_block(b: Array, out: State) -> State:
-        place, ids = engine.block(b)
-        fresh = place >= b * engine.block_size
+        span = engine.block(b)
+        ids = span.of(engine.queries.ids)
+        fresh = span.places >= b * engine.block_size
 
         def fold(add: Callable[[Slots, Carry], Carry], state: Carry) -> Carry:
             def add_words(words: _HitWords, state: Carry) -> Carry:
@@ -140,7 +152,7 @@ def fold_neighbors(
 
                 def add_group(state: tuple[Array, Any]) -> tuple[Array, Any]:
                     done, state = state
-                    ordinal = jnp.broadcast_to(done + slots, (place.size, slots.size))
+                    ordinal = jnp.broadcast_to(done + slots, (span.size, slots.size))
                     word, bit = bits.nth(ordinal)
                     source = engine.sources.ids.at[take(first, word) + bit].get(mode="promise_in_bounds")
                     shift = None
@@ -151,7 +163,7 @@ def fold_neighbors(
                 most = jnp.max(total)
                 return lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), state))[1]
 
-            return engine.fold_words(place, add_words, state)
+            return engine.fold_words(span, add_words, state)
 
         return visit(Block(ids, fresh, fold), out)
 
@@ -171,7 +183,7 @@ class _WordTable(NamedTuple):
     stop: Array  # [b, r] its end
     image: Array | None  # [b, r] its image code
     before: Array  # [b, r] number of words in the query's earlier runs
-    longest: Array  # [] largest number of words of a query
+    longest: Array | int  # [] largest number of words of a query
 
 
 class _HitWords(NamedTuple):
@@ -220,56 +232,74 @@ class _Engine(NamedTuple):
         """Number of queries in a block."""
         return -(-self.queries.ids.size // self.block_count)
 
-    def block(self, b: Array) -> tuple[Array, Array]:
-        """Return positions and ids of block b's queries; the last block overlaps, so that all have one length."""
-        first = jnp.minimum(b * self.block_size, self.queries.ids.size - self.block_size)
-        place = first + lax.iota(jnp.int32, self.block_size)
-        return place, lax.dynamic_slice_in_dim(self.queries.ids, first, self.block_size)
+    def block(self, b: Array | int) -> Span:
+        """Return the positions of block b's queries; the last block overlaps, so that all have one length."""
+        if self.block_count == 1:
+            return Span(0, self.block_size)
+        return Span(jnp.minimum(b * self.block_size, self.queries.ids.size - self.block_size), self.block_size)
 
-    def map_blocks(self, of_block: Callable[[Array], Tree]) -> Tree:
-        """Return of_block(place), arrays with a row per query, for all queries in the order of their indices."""
-        if self.block_count == 1 and self.candidates.in_order:
-            return of_block(self.block(jnp.int32(0))[0])
+    def map_blocks(self, of_block: Callable[[Span], list[Array]], columns: list[tuple[int, ...]]) -> list[Array]:
+        """Return of_block(span), int32 arrays with a row per query, for all queries in the order of their indices.
 
-        def put(b: Array, out: Tree) -> Tree:
-            place, ids = self.block(b)
-            rows = of_block(place)
-            return jax.tree.map(lambda out, rows: out.at[ids].set(rows, unique_indices=True), out, rows)
+        `columns` are the shapes of a row of each array.
+        """
+        ids = self.queries.ids
+        if self.block_count == 1:
+            rows = of_block(self.block(0))
+            if self.candidates.in_order:
+                return rows
+            place = jnp.zeros_like(ids).at[ids].set(lax.iota(jnp.int32, ids.size), unique_indices=True)
+            return [_at(x, place) for x in rows]
 
-        shapes = jax.eval_shape(of_block, self.block(jnp.int32(0))[0])
-        start = jax.tree.map(lambda x: jnp.zeros((self.queries.ids.size, *x.shape[1:]), x.dtype), shapes)
-        return put(jnp.int32(0), start) if self.block_count == 1 else lax.fori_loop(0, self.block_count, put, start)
+        def put(b: Array, out: list[Array]) -> list[Array]:
+            span = self.block(b)
+            here = span.of(ids)
+            return [x.at[here].set(rows, unique_indices=True) for x, rows in zip(out, of_block(span), strict=True)]
 
-    def fold_words(self, place: Array, add: Callable[["_HitWords", State], State], state: State) -> State:
+        return lax.fori_loop(0, self.block_count, put, [jnp.zeros((ids.size, *shape), jnp.int32) for shape in columns])
+
+    def fold_words(self, span: Span, add: Callable[["_HitWords", State], State], state: State) -> State:
         """Return the state after state = add(words, state) for each chunk of candidates of the queries at these positions."""
 
         def add_pass(which: Array, state: State) -> State:
-            table = self.word_table(place, which)
+            table = self.word_table(span, which)
+
+            query = [span.of(x) for x in self.queries.axes]
 
             def add_chunk(chunk: Array, state: State) -> State:
-                return add(self.hit_words(place, table, chunk), state)
+                return add(self.hit_words(span, query, table, chunk), state)
 
-            return lax.fori_loop(0, (table.longest + self.words - 1) // self.words, add_chunk, state)
+            def add_next(now: tuple[Array, Array, State]) -> tuple[Array, Array, State]:
+                _, chunk, state = now
+                return (chunk + 1) * self.words < table.longest, chunk + 1, add_chunk(chunk, state)
+
+            if isinstance(table.longest, int) and table.longest <= self.words:
+                return add_chunk(jnp.int32(0), state)
+            return lax.while_loop(lambda now: now[0], add_next, (jnp.asarray(table.longest > 0), jnp.int32(0), state))[2]
 
         passes = self.candidates.passes
         return add_pass(jnp.int32(0), state) if passes is None else lax.fori_loop(0, passes, add_pass, state)
 
-    def word_table(self, place: Array, which: Array) -> _WordTable:
-        start, stop, image = self.candidates.runs(place, which)
-        count = (stop - start + (LANES - 1)) // LANES
-        total = jnp.cumsum(count, axis=1, dtype=jnp.int32)
-        return _WordTable(start, stop, image, total - count, jnp.max(total[:, -1]))
+    def word_table(self, span: Span, which: Array) -> _WordTable:
+        start, stop, image = self.candidates.runs(span, which)
+        count, runs = (stop - start + (LANES - 1)) >> (LANES.bit_length() - 1), start.shape[1]
+        if runs > _FEW_RUNS:
+            before = jnp.cumsum(count, axis=1, dtype=jnp.int32) - count
+        else:
+            before = jnp.sum(count[:, None] * np.tril(np.ones((runs, runs), np.int32), -1), axis=2, dtype=jnp.int32)
+        return _WordTable(start, stop, image, before, self.candidates.most_words or largest_of(before[:, -1] + count[:, -1]))
 
-    def hit_words(self, place: Array, table: _WordTable, chunk: Array) -> _HitWords:
-        """Test one chunk of words per query."""
+    def hit_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> _HitWords:
+        """Test one chunk of words per query; `own` are the d coordinates [b] of the queries."""
+        own, table, chunk = lax.optimization_barrier((own, table, chunk))  # as XLA would take small parts out of the loop
         first, stop, image = self._locate_words(table, chunk)
-        query = [x.at[place].get(mode="promise_in_bounds")[:, None] for x in self.queries.axes]
+        query = [x[:, None] for x in own]
         if image is not None and self.candidates.torus is not None:  # translate the query instead of the image
             query = [q - t[image] for q, t in zip(query, self.candidates.torus.translations.T, strict=True)]
-        allowed = self._allowed_lanes(first, stop, image, place)
-        packed = self._test(first, image, query, place) & (allowed | allowed << np.uint32(LANES))
+        allowed = self._allowed_lanes(first, stop, image, span)
+        packed = self._test(first, image, query, span) & (allowed | allowed << np.uint32(LANES))
         first, image, packed = lax.optimization_barrier((first, image, packed))
-        return _HitWords(self._decide_doubtful(packed, first, image, place), first, image)
+        return _HitWords(self._decide_doubtful(packed, first, image, span), first, image)
 
     def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
         word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (table.start.shape[0], self.words))
@@ -293,19 +323,19 @@ class _Engine(NamedTuple):
                     image = jnp.where(reached, table.image[:, r, None], image)
         return jnp.minimum(first, self.sources.ids.size - LANES), stop, image
 
-    def _test(self, first: Array, image: Array | None, query: list[Array], place: Array) -> Array:
+    def _test(self, first: Array, image: Array | None, query: list[Array], span: Span) -> Array:
         """Compare 16 candidates per word with the cutoff in working precision: low half hits, high half doubtful ones."""
         difference = [windows(x, first) - q[..., None] for x, q in zip(self.sources.axes, query, strict=True)]
         square = squared_distance(difference, self.cutoff)
         own, others = self.queries.radii, self.sources.radii
-        own = None if own is None else own.at[place].get(mode="promise_in_bounds")[:, None, None]
+        own = None if own is None else span.of(own)[:, None, None]
         inside, outside = self._bounds(own, None if others is None else windows(others, first))
         doubtful = jnp.where(square <= outside, np.uint32(1 << LANES), np.uint32(0))
         value = jnp.where(square < inside, np.uint32(1), doubtful) << lax.iota(jnp.uint32, LANES)
         if self.keep.later_only:
-            value = jnp.where(self._is_later(first, image, place), value, np.uint32(0))
+            value = jnp.where(self._is_later(first, image, span), value, np.uint32(0))
         if self.queries.systems is not None and self.sources.systems is not None:
-            system = self.queries.systems.at[place].get(mode="promise_in_bounds")[:, None, None]
+            system = span.of(self.queries.systems)[:, None, None]
             value = jnp.where(windows(self.sources.systems, first) == system, value, np.uint32(0))
         return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,))
 
@@ -315,14 +345,14 @@ class _Engine(NamedTuple):
         radii = self.cutoff.of_pairs(own, others) if isinstance(self.cutoff, Cutoffs) else None
         return step_one_bounds(self.cutoff, radii, slack)
 
-    def _allowed_lanes(self, first: Array, stop: Array, image: Array | None, place: Array) -> Array:
+    def _allowed_lanes(self, first: Array, stop: Array, image: Array | None, span: Span) -> Array:
         """Return which of a word's 16 candidates belong to its run and are not the query itself: bits, [b, words] uint32."""
         one = np.uint32(1)
         lanes = (one << jnp.clip(stop - first, 0, LANES).astype(jnp.uint32)) - one
         if not self.keep.drop_self or self.keep.later_only:
             return lanes
         again, own = self.candidates.again, jnp.zeros_like(lanes)
-        for where in (place,) if again is None else (place, place + again):
+        for where in (span.places,) if again is None else (span.places, span.places + again):
             lane = where[:, None] - first
             here = (lane >= 0) & (lane < LANES)
             own = own | jnp.where(here, one << jnp.clip(lane, 0, LANES).astype(jnp.uint32), np.uint32(0))
@@ -330,84 +360,81 @@ class _Engine(NamedTuple):
             own = jnp.where(image == self.candidates.torus.images.home, own, np.uint32(0))
         return lanes & ~own
 
-    def _is_later(self, first: Array, image: Array | None, place: Array) -> Array:
+    def _is_later(self, first: Array, image: Array | None, span: Span) -> Array:
         """Say which candidates [b, words, 16] are the later ones of their pairs: of a query's own images, the forward half."""
-        own = self.queries.ids.at[place].get(mode="promise_in_bounds")[:, None]
+        own = span.of(self.queries.ids)[:, None]
         later = own + int(self.keep.drop_self)
         if image is not None and self.candidates.torus is not None:
             home = self.candidates.torus.images.home
             later = jnp.where(image > home, own, jnp.where(image < home, own + 1, later))
         return windows(self.sources.ids, first) >= later[..., None]
 
-    def _decide_doubtful(self, packed: Array, first: Array, image: Array | None, place: Array) -> Array:
-        """Add the doubtful candidates that are pairs to the hits: [b, words] uint32, of which the lower half is decided then.
+    def _decide_doubtful(self, packed: Array, first: Array, image: Array | None, span: Span) -> Array:
+        """Add the doubtful candidates that are pairs to the hits: [b, words] uint32, of which the lower half is set then.
 
-        Rows with doubtful candidates are decided in parts of a block, 32 candidates of each row per round.
+        A round decides the first 32 doubtful candidates of each row that has some, a part of the block at a time.
         """
-        rows, slots = len(packed), lax.iota(jnp.int32, VERDICTS)
+        rows, width = packed.shape
         many = min(max(-(-rows // self.tuning.doubtful_share), self.tuning.doubtful_rows), rows)
-        open_rows = jnp.max(packed, axis=1) > _HITS
-        if many == rows:
-            queue, waiting = lax.iota(jnp.int32, rows), jnp.where(jnp.any(open_rows), rows, 0)
-        else:
+        whole, queue, waiting = many == rows, lax.iota(jnp.int32, rows), jnp.int32(0)
+        if not whole:
+            open_rows = jnp.max(packed, axis=1) > _HITS
             until = jnp.cumsum(open_rows.astype(jnp.int32), dtype=jnp.int32)
             waiting, queue = until[-1], jnp.full(rows + many, rows, jnp.int32)
             queue = queue.at[jnp.where(open_rows, until - 1, rows + many)].set(lax.iota(jnp.int32, rows), mode="drop")
 
         def decide_round(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            at, done, packed = state
-            row = lax.dynamic_slice_in_dim(queue, at, many)
+            # The barrier keeps what follows in the loop: it is not worth computing where no round is needed.
+            _, at, packed, row = lax.optimization_barrier((*state, queue))
+            row = row if whole else lax.dynamic_slice_in_dim(row, at, many)
             here = jnp.minimum(row, rows - 1)
-            both = packed[here]
-            asked = jnp.where((row < rows)[:, None], both >> np.uint32(LANES), np.uint32(0))
-            ordinal = jnp.broadcast_to(slots + done, (many, VERDICTS))
+            both = packed if whole else jnp.where((row < rows)[:, None], packed[here], np.uint32(0))
+            asked = both >> np.uint32(LANES)
             bits = BitRows.of(asked, self.tuning.in_groups)
-            word, bit = bits.nth(ordinal)
-            flat = here[:, None] * packed.shape[1] + word
-            candidate = flat_take(first, flat) + bit
+            slot = lax.broadcasted_iota(jnp.int32, (many, _SLOTS), 1)
+            column, bit = bits.nth(slot)
+            word = here[:, None] * width + column
+            candidate = flat_take(first, word) + bit
 
             def points(at: Array | None) -> Pair:
-                of_row, source, of_word = place[here][:, None], candidate, flat
+                of_row, source, of_word = here[:, None], candidate, word
                 if at is not None:
-                    of_row, source, of_word = place[here[at // VERDICTS]], flat_take(source, at), flat_take(of_word, at)
-                return self._pair(of_row, source, None if image is None else flat_take(image, of_word))
+                    of_row, source, of_word = here[at // _SLOTS], flat_take(source, at), flat_take(of_word, at)
+                return self._pair(span.first + of_row, source, None if image is None else flat_take(image, of_word))
 
-            pair = decide_pairs(ordinal < bits.total[:, None], points, self.cutoff)
-            verdict = jnp.sum(jnp.where(pair, np.uint32(1) << slots.astype(jnp.uint32), np.uint32(0)), 1, dtype=jnp.uint32)
-            both = both | deposit(verdict[:, None], asked, (bits.before >> LANES) - done)
-            packed = packed.at[row].set(both, mode="drop", unique_indices=True)
-            more = jnp.max(bits.total) > done + VERDICTS
-            return jnp.where(more, at, at + many), jnp.where(more, done + VERDICTS, 0), packed
+            there = slot < bits.total[:, None]
+            pair = decide_pairs(there, points, self.cutoff)
+            one = np.uint32(1) << bit.astype(jnp.uint32)
+            decided = jnp.where(there, one << np.uint32(LANES), np.uint32(0)) | jnp.where(pair, one, np.uint32(0))
+            of_column = lax.broadcasted_iota(jnp.int32, (many, width, _SLOTS), 1) == column[:, None]
+            change = lax.reduce(jnp.where(of_column, decided[:, None], np.uint32(0)), np.uint32(0), lax.bitwise_or, (2,))
+            both = both ^ change  # the bit of a doubtful candidate becomes 0, that of a pair 1
+            more = largest_of(both) > _HITS
+            if whole:
+                return more, at, both
+            at = jnp.where(more, at, at + many)
+            return at < waiting, at, packed.at[row].set(both, mode="drop", unique_indices=True)
 
-        return lax.while_loop(lambda state: state[0] < waiting, decide_round, (jnp.int32(0), jnp.int32(0), packed))[2]
+        more = largest_of(packed) > _HITS if whole else waiting > 0
+        return lax.while_loop(lambda state: state[0], decide_round, (more, jnp.int32(0), packed))[2]
 
     def _pair(self, place: Array, candidate: Array, image: Array | None) -> Pair:
         """Return the given (not wrapped) points of queries and candidates at these positions."""
         torus, radii = self.candidates.torus, None
         if isinstance(self.cutoff, Cutoffs):
             own, others = self.queries.radii, self.sources.radii
-            own = None if own is None else own.at[place].get(mode="clip")
-            radii = self.cutoff.of_pairs(own, None if others is None else others.at[candidate].get(mode="clip"))
-        if torus is None or image is None:
-            return Pair(
-                [x.at[place].get(mode="clip") for x in self.queries.axes],
-                [x.at[candidate].get(mode="clip") for x in self.sources.axes],
-                radii,
+            radii = self.cutoff.of_pairs(
+                None if own is None else _at(own, place), None if others is None else _at(others, candidate)
             )
-        i, j = self.queries.ids.at[place].get(mode="clip"), self.sources.ids.at[candidate].get(mode="clip")
-        axes = range(len(self.sources.axes))
+        if torus is None or image is None:
+            return Pair([_at(x, place) for x in self.queries.axes], [_at(x, candidate) for x in self.sources.axes], radii)
+        i, j = _at(self.queries.ids, place), _at(self.sources.ids, candidate)
         (sources, queries), shifts = torus.raw, _shifts_of(torus, i, j, image)
-        shift = [shifts[..., k] for k in axes]
-        raw = [queries[i, k] for k in axes], [sources[j, k] for k in axes]
+        shift = list(jnp.moveaxis(shifts, -1, 0))
+        raw = [_at(x, i) for x in queries.T], [_at(x, j) for x in sources.T]
         return Pair(*raw, radii, *shift_in_given(shift, torus.images.basis, torus.matrix), torus.images.orthogonal)
 
 
-def _pad(candidates: Candidates) -> Candidates:
-    """Pad the sources so that a window of 16 never reaches past the end; masks exclude the padding."""
-    axes, ids, radii, systems = candidates.sources
-
-    def pad(x: Array | None) -> Array | None:
-        return None if x is None else jnp.pad(x, (0, LANES))
-
-    padded = Points([jnp.pad(x, (0, LANES)) for x in axes], jnp.pad(ids, (0, LANES)), pad(radii), pad(systems))
-    return candidates._replace(sources=padded)
+def _at(x: Array, places: Array) -> Array:
+    """Return x[places]; all places are valid."""
+    return x.at[places].get(mode="promise_in_bounds")

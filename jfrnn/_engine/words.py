@@ -1,4 +1,4 @@
-"""Words of 16 candidates, one bit per candidate: gather their sources, find their set bits, and set them."""
+"""Words of 16 candidates, one bit per candidate: gather their sources and find their set bits."""
 
 import functools
 from typing import NamedTuple
@@ -8,7 +8,6 @@ import numpy as np
 from jax import Array, lax
 
 LANES = 16  # candidates per word: in a uint32 hits take the lower half, doubtful candidates the upper half
-VERDICTS = 32  # bits of a verdict
 _GROUP = 8  # words whose counts are added up together
 
 
@@ -101,14 +100,3 @@ def _nth_bit(word: Array, ordinal: Array) -> Array:
         ordinal = jnp.where(skip, ordinal - below, ordinal)
         position = jnp.where(skip, position + width, position)
     return position
-
-
-def deposit(verdict: Array, mask: Array, before: Array) -> Array:
-    """Distribute verdict bits to the set bits of each mask: set bit k of a word gets verdict bit before + k if that is below 32."""
-    result = jnp.zeros_like(mask)
-    for lane in range(LANES):
-        ordinal = before + bit_counts(mask & np.uint32((1 << lane) - 1))
-        seen = (ordinal >= 0) & (ordinal < VERDICTS)
-        bit = (verdict >> jnp.clip(ordinal, 0, VERDICTS - 1).astype(jnp.uint32)) & (mask >> np.uint32(lane)) & np.uint32(1)
-        result = result | jnp.where(seen, bit << np.uint32(lane), np.uint32(0))
-    return result

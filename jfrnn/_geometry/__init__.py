@@ -2,7 +2,7 @@
 
 from jfrnn._geometry.batch import Batch, rank_systems
 from jfrnn._geometry.box import Box, round_box
-from jfrnn._geometry.cell_line import FINE, line_runs, sort_along_line, sort_queries
+from jfrnn._geometry.cell_line import FINE, Cells, line_runs, sort_along_line, sort_queries
 from jfrnn._geometry.cells import CellAxes, cell_edge, open_axes, ordered_bits
 from jfrnn._geometry.curves import hilbert_decode, hilbert_encode, morton_decode, morton_encode
 from jfrnn._geometry.cutoffs import EXCHANGED, Cutoff, Cutoffs, Radii, is_radius, make_cutoff, make_cutoffs, step_one_bounds, widen

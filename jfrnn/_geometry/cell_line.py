@@ -34,17 +34,16 @@ class Cells(NamedTuple):
     """The cells of points, as uint32 with wrap-around: parts of cells along x, cells along the other axes, then systems.
 
     Attributes:
-        along: One array [n] per axis, and one for the systems of a batch.
-        there: [n] bool, which points are finite; others have no cell.
+        along: [d, n], and a row more for the systems of a batch.
+        number: [n] the number of the cell, or the length of the table for points that are not finite, which have no cell.
     """
 
-    along: list[Array]
-    there: Array
+    along: Array
+    number: Array
 
     def of(self, points: Array) -> "Cells":
         """Return the cells of the points at these indices."""
-        along = [x.at[points].get(mode="promise_in_bounds") for x in self.along]
-        return Cells(along, self.there.at[points].get(mode="promise_in_bounds"))
+        return Cells(self.along[:, points], self.number[points])
 
 
 class CellLine(NamedTuple):
@@ -52,6 +51,7 @@ class CellLine(NamedTuple):
 
     Attributes:
         order: [n] int32, the source at each position; those without a cell come last.
+        numbers: [n] uint32, the numbers of their cells, as `Cells.number`.
         inside: [] int32, how many sources have a cell.
         table: [size + 2·FINE + 2] int32, the position at which each number begins. After its last number the table starts again,
             with positions that go on from `inside`: runs may reach over the end.
@@ -60,15 +60,15 @@ class CellLine(NamedTuple):
     """
 
     order: Array
+    numbers: Array
     inside: Array
     table: Array
     strides: list[Array]
     turns: list[Array | None]
 
-    @property
-    def twice(self) -> Array:
-        """The sources with a cell, twice in a row, as runs read them: [2·n] int32. Those that are queries come first."""
-        place = lax.iota(jnp.int32, 2 * self.order.size)
+    def twice(self, more: int = 0) -> Array:
+        """Return the sources with a cell, twice in a row, as runs read them: [2·n + more] int32; those of queries come first."""
+        place = lax.iota(jnp.int32, 2 * self.order.size + more)
         return self.order.at[jnp.where(place < self.inside, place, place - self.inside)].get(mode="clip")
 
 
@@ -97,8 +97,8 @@ def sort_along_line(
         along.append(systems)
         lengths.append(jnp.max(systems[:sources], initial=0).astype(points.dtype) + 1)
     strides = _strides(lengths, size)
-    key = jnp.where(there[:sources], _number([cells[:sources] for cells in along], strides) & np.uint32(size - 1), np.uint32(size))
-    ascending, order = _sort(key, least_sorted)
+    number = jnp.where(there, _number(along, strides) & np.uint32(size - 1), np.uint32(size))
+    ascending, order = _sort(number[:sources], least_sorted)
     if sources <= searched:
         numbers = lax.iota(jnp.uint32, size + 1)
         begin = jnp.searchsorted(ascending, numbers, side="left", method="scan_unrolled").astype(jnp.int32)
@@ -108,15 +108,12 @@ def sort_along_line(
     inside = begin[size]
     table = jnp.concatenate([begin[:size], inside + begin[: _RUN + 1]])
     turns = [None if turn is None else turn.astype(jnp.int32) * (1 if k else FINE) for k, turn in enumerate(axes.turns)]
-    return CellLine(order, inside, table, strides, turns), Cells(along, there)
+    return CellLine(order, ascending, inside, table, strides, turns), Cells(jnp.stack(along), number)
 
 
-def sort_queries(line: CellLine, cells: Cells, sources: int, least_sorted: int) -> Array:
-    """Return queries, whose cells follow those of the `sources`, sorted by cell: [m] int32."""
-    there = cells.there[sources:]
-    number = _number([x[sources:] for x in cells.along], line.strides) & np.uint32(line.table.size - _RUN - 2)
-    key = jnp.where(there, number, np.uint32(line.table.size))
-    return _sort(key, least_sorted)[1]
+def sort_queries(cells: Cells, sources: int, least_sorted: int) -> tuple[Array, Array]:
+    """Return the numbers of the cells of queries, which follow those of the `sources`, and the queries in this order: [m] each."""
+    return _sort(cells.number[sources:], least_sorted)
 
 
 def _sort(key: Array, least: int) -> tuple[Array, Array]:
@@ -209,43 +206,51 @@ def line_runs(line: CellLine, cells: Cells, images: Images | None) -> tuple[Arra
     In open space each query has 3^(d-1) runs, one per row of cells. Along a periodic axis the cells beyond either end are those of
     a periodic image, and a row is split where it enters another image.
     """
-    dim = len(line.turns)
+    dim, size = len(line.turns), line.table.size - _RUN - 1
     reach = (0,) * dim if images is None else images.reach
     steps = [range(-max(k, 1), max(k, 1) + 1) for k in reach[1:]]
     rows = np.stack(np.meshgrid(*steps, indexing="ij"), -1).reshape(-1, dim - 1).astype(np.int32)
-    parts = _parts_of_rows(cells.along[0].astype(jnp.int32), line.turns[0], reach[0], images)
-
-    def each(values: list[Array]) -> Array:  # [m, runs]: all rows of the first part come first
-        return jnp.repeat(jnp.stack(values, axis=1), len(rows), axis=1)
-
-    first, last, turn = (each([part[what] for part in parts]) for what in range(3))
+    if images is None:
+        ahead = _number(
+            list(jnp.asarray(np.pad(rows, ((0, 0), (1, 0)), constant_values=-FINE).astype(np.uint32).T)), line.strides[: dim - 1]
+        )
+        begin = ((cells.number[:, None] + ahead[None]) & np.uint32(size - 1)).astype(jnp.int32)
+        return *_ends(line, begin, jnp.where(cells.number < size, _RUN, 0)[:, None]), None
+    parts = _parts_of_rows(cells.along[0].astype(jnp.int32)[:, None], line.turns[0], reach[0], images)
+    first, last, turn = (jnp.repeat(x, len(rows), axis=1) for x in parts)  # [m, runs]: all rows of the first part come first
     number, turned = [first.astype(jnp.uint32)], [turn]
     for axis in range(1, dim):
-        cell = cells.along[axis].astype(jnp.int32)[:, None] + np.tile(rows[:, axis - 1], len(parts))[None]
+        cell = cells.along[axis].astype(jnp.int32)[:, None] + np.tile(rows[:, axis - 1], parts[0].shape[1])[None]
         turns = line.turns[axis]
-        turn = jnp.zeros_like(cell) if turns is None else cell // turns
+        turn = jnp.zeros_like(cell)
+        if turns is not None and reach[axis] == 1:  # without a division
+            turn = (cell >= turns).astype(jnp.int32) - (cell < 0).astype(jnp.int32)
+        elif turns is not None:
+            turn = cell // turns
         turned.append(turn)
         number.append((cell if turns is None else cell - turn * turns).astype(jnp.uint32))
     number += [system[:, None] for system in cells.along[dim:]]
-    size = line.table.size - _RUN - 1
     begin = (_number(number, line.strides) & np.uint32(size - 1)).astype(jnp.int32)
-    length = jnp.where(cells.there[:, None], jnp.maximum(last - first + 1, 0), 0)
-    start, stop = (line.table.at[at].get(mode="promise_in_bounds") for at in (begin, begin + length))
-    if images is None:
-        return start, stop, None
+    length = jnp.where(cells.number[:, None] < size, jnp.maximum(last - first + 1, 0), 0)
     code = jnp.zeros_like(first)
     for turn, k in zip(turned, reach, strict=True):
         code = code * (2 * k + 1) + (turn + k)
-    return start, stop, code
+    return *_ends(line, begin, length), code
 
 
-def _parts_of_rows(x: Array, turns: Array | None, reach: int, images: Images | None) -> list[tuple[Array, Array, Array]]:
-    """Split the row of parts around x [m] at the borders of images: first and last part, and image of each piece, [m] each."""
-    if images is None or turns is None:
-        return [(x - FINE, x + FINE, jnp.zeros_like(x))]
+def _ends(line: CellLine, begin: Array, length: Array) -> tuple[Array, Array]:
+    """Return the positions at which runs begin and end that cover so many numbers from `begin` on."""
+    ends = line.table.at[jnp.stack([begin, begin + length])].get(mode="promise_in_bounds")
+    return ends[0], ends[1]
+
+
+def _parts_of_rows(x: Array, turns: Array | None, reach: int, images: Images) -> tuple[Array, Array, Array]:
+    """Split the row of parts around x [m, 1] at the borders of images: [m, pieces] first and last part, and image of each."""
+    if turns is None:
+        return x - FINE, x + FINE, jnp.zeros_like(x)
     if images.nearest:  # The box has at least two cells, so a row enters only one other image.
-        shifts = [jnp.zeros_like(x), jnp.where(x < FINE, -1, 1)]
+        shifts = jnp.concatenate([jnp.zeros_like(x), jnp.where(x < FINE, -1, 1)], axis=1)
     else:
-        shifts = [jnp.full_like(x, s) for s in range(-reach, reach + 1)]
-    beyond, most = FINE * reach, turns - 1
-    return [(jnp.maximum(x - beyond - s * turns, 0), jnp.minimum(x + beyond - s * turns, most), s) for s in shifts]
+        shifts = jnp.broadcast_to(np.arange(-reach, reach + 1, dtype=np.int32)[None], (len(x), 2 * reach + 1))
+    beyond, from_start = FINE * reach, x - shifts * turns
+    return jnp.maximum(from_start - beyond, 0), jnp.minimum(from_start + beyond, turns - 1), shifts

@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry.floats import two_sum, unit_scale
+from jfrnn._geometry.integers import limb_bits, limb_type
 
 Flags = Any  # bool array of NumPy or JAX, like the argument
 RULES = ("gather", "scatter", "either", "both", "mean")  # cutoff of a pair: i's, j's, larger, smaller, mean
@@ -28,6 +29,7 @@ class Cutoff:
         inside: A scaled squared distance below this certainly belongs to a pair.
         outside: A scaled squared distance above this certainly does not.
         unit_scale: Power of two, a normal float, that scales r into [1, 4).
+        less: [7] integers, the limbs of -r² in the units of step 2 of the pair test.
         closed: Whether pairs at exactly r count. Static.
         scaled: Whether r is so small or large that differences are multiplied by `unit_scale` before squaring. Static.
     """
@@ -36,6 +38,7 @@ class Cutoff:
     inside: np.floating | Array
     outside: np.floating | Array
     unit_scale: np.floating | Array
+    less: np.ndarray | Array
     closed: bool = dataclasses.field(metadata={"static": True})
     scaled: bool = dataclasses.field(metadata={"static": True})
 
@@ -112,9 +115,22 @@ def make_cutoff(value: float, dtype: np.dtype, closed: bool) -> Cutoff:
         inside=square * dtype.type(1 - 8 * finfo.eps),
         outside=square * dtype.type(1 + 8 * finfo.eps),
         unit_scale=unit_scale,
+        less=-_limbs_of_square(radius, unit_scale),
         closed=closed,
         scaled=scaled,
     )
+
+
+def _limbs_of_square(radius: np.floating, scale: np.floating) -> np.ndarray:
+    """Return (r·scale)² in units of step 2, which express it: [7] limbs, the lowest first, of which the highest keeps the rest."""
+    bits, whole = limb_bits(radius.dtype), limb_type(radius.dtype)
+    number = int(float(radius) * float(scale) * 2.0 ** (fraction_bits(radius.dtype, 1) + bits)) ** 2
+    return np.array([number >> (bits * k) & ((1 << bits) - 1) if k < 6 else number >> (bits * k) for k in range(7)], whole)
+
+
+def fraction_bits(dtype: np.dtype, times: int) -> int:
+    """Return the binary digits of the upper integers of step 2: `times` displacements are below half their range."""
+    return 8 * dtype.itemsize - 3 - times
 
 
 def make_cutoffs(radii: Radii, closed: bool, skin: float = 0.0) -> Cutoffs:

@@ -18,11 +18,12 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._geometry.cutoffs import Cutoff, Cutoffs, step_one_bounds
+from jfrnn._geometry.cutoffs import Cutoff, Cutoffs, fraction_bits, step_one_bounds
 from jfrnn._geometry.floats import WHOLE_BITS, unit_scale
 from jfrnn._geometry.integers import (
     beside,
@@ -36,7 +37,7 @@ from jfrnn._geometry.integers import (
     limbs_of,
 )
 from jfrnn._geometry.reduced import Basis
-from jfrnn._tracing import any_of_rows, first_set
+from jfrnn._tracing import largest_of
 
 _UNKNOWN = 2  # the sign that step 2 could not prove
 _INTEGER_CHUNK = 64  # pairs per iteration of the integer test
@@ -56,12 +57,12 @@ class Pair(NamedTuple):
     matrix: Array | None = None  # [d, d], one lattice vector per row, 0 for open axes
     orthogonal: bool = True
 
-    def lattice_terms(self, axis: int) -> list[tuple[Array, Array]]:
-        """Return the pairs (shift, lattice vector component) whose products sum to the translation along an axis."""
+    def lattice_terms(self, axis: int) -> list[tuple[Array, tuple[int, int]]]:
+        """Return shifts, and the places in `matrix` of what they multiply, which sum to the translation along an axis."""
         if self.shift is None or self.matrix is None:
             return []
         rows = [axis] if self.orthogonal else range(len(self.shift))  # twice the axes if `shift_in_given` split the shifts
-        return [(self.shift[k], self.matrix[k, axis]) for k in rows]
+        return [(self.shift[k], (k, axis)) for k in rows]
 
 
 PointsAt = Callable[[Array | None], Pair]
@@ -167,8 +168,8 @@ def is_pair_of(
 
 
 def flat_take(x: Array, at: Array) -> Array:
-    """Return the elements of x at flat indices, which are clipped to the valid range."""
-    return x.reshape(-1).at[at].get(mode="clip")
+    """Return the elements of x at flat indices."""
+    return x.reshape(-1).at[at].get(mode="promise_in_bounds")
 
 
 def decide_pairs(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
@@ -178,29 +179,18 @@ def decide_pairs(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) ->
     """
     pairs = points(None)
     signs = jnp.where(doubtful, _fixed_sign(pairs, _threshold(pairs, cutoff)), 1).astype(jnp.int8)
-    decide = functools.partial(_decide_unknown, points=points, cutoff=cutoff)
-    # A branch, so that step 2 is computed once: XLA would otherwise compile it into each use of its signs.
-    signs = lax.cond(jnp.max(signs) == _UNKNOWN, decide, lambda signs: signs, signs)
-    return signs <= 0 if cutoff.closed else signs < 0
-
-
-def _decide_unknown(signs: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
-    """Replace unknown signs by those of the integer test, a chunk of pairs at a time; int8."""
-    shape, signs = signs.shape, signs.reshape(-1)
     chunk = min(_INTEGER_CHUNK, signs.size)
-    chunks = -(-signs.size // chunk)
-    unknown = any_of_rows(jnp.pad(signs == _UNKNOWN, (0, chunks * chunk - signs.size)).reshape(chunks, chunk))
 
-    def decide_chunk(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        signs, which = state
-        first = jnp.minimum(which * chunk, signs.size - chunk)  # the last chunk overlaps, so that all have one length
+    def decide_chunk(signs: Array) -> Array:
+        flat = signs.reshape(-1)
+        first = jnp.minimum(lax.argmax(flat, 0, jnp.int32), flat.size - chunk)  # that of an unknown sign, the largest value
         here = points(first + lax.iota(jnp.int32, chunk))
-        known = lax.dynamic_slice_in_dim(signs, first, chunk)
+        known = lax.dynamic_slice_in_dim(flat, first, chunk)
         known = jnp.where(known == _UNKNOWN, _integer_sign(here, _threshold(here, cutoff)).astype(jnp.int8), known)
-        return lax.dynamic_update_slice_in_dim(signs, known, first, axis=0), first_set(unknown, which)
+        return lax.dynamic_update_slice_in_dim(flat, known, first, axis=0).reshape(signs.shape)
 
-    start = signs, first_set(unknown, jnp.int32(-1))
-    return lax.while_loop(lambda state: state[1] < chunks, decide_chunk, start)[0].reshape(shape)
+    signs = lax.while_loop(lambda signs: largest_of(signs) == _UNKNOWN, decide_chunk, signs)
+    return signs <= 0 if cutoff.closed else signs < 0
 
 
 class _Threshold(NamedTuple):
@@ -209,10 +199,12 @@ class _Threshold(NamedTuple):
     Attributes:
         radii: The cutoff r; or two radii with mean r, in which case twice the distance is compared with their sum.
         scale: Power of two that scales the larger radius into [1, 4).
+        less: The limbs of -r² with one cutoff for all pairs, or None.
     """
 
     radii: list[Array]
     scale: Array
+    less: list[Array] | None = None
 
     @property
     def times(self) -> int:
@@ -222,7 +214,7 @@ class _Threshold(NamedTuple):
 
 def _threshold(pair: Pair, cutoff: Cutoff | Cutoffs) -> _Threshold:
     if isinstance(cutoff, Cutoff):
-        return _Threshold([jnp.asarray(cutoff.radius)], jnp.asarray(cutoff.unit_scale))
+        return _Threshold([jnp.asarray(cutoff.radius)], jnp.asarray(cutoff.unit_scale), list(jnp.asarray(cutoff.less)))
     radii = pair.radii or []
     return _Threshold(radii, unit_scale(functools.reduce(jnp.maximum, radii)))
 
@@ -233,29 +225,36 @@ def _fixed_sign(pair: Pair, threshold: _Threshold) -> Array:
     A cutoff is below 4 in scaled lengths, and so is each component of a displacement that step 1 leaves open, up to its band.
     """
     dtype = np.dtype(pair.a[0].dtype)
-    fraction = 8 * dtype.itemsize - 3 - threshold.times  # of the upper integers: `times` displacements are below half their range
+    fraction = fraction_bits(dtype, threshold.times)
     eps, bits = jnp.finfo(dtype).eps, limb_bits(dtype)
     known, total = jnp.ones(pair.b[0].shape, bool), None
+    unsigned, finfo = np.dtype(f"uint{8 * dtype.itemsize}").type, jnp.finfo(dtype)
+    exponent = (lax.bitcast_convert_type(threshold.scale, unsigned) >> unsigned(finfo.nmant)).astype(jnp.int32)
+    up = exponent + (fraction + bits + int(finfo.minexp) - finfo.nmant - (finfo.maxexp - 1))
 
     def fixed(x: Array) -> _Fixed:
         nonlocal known
-        number, whole = _fixed_point(x, threshold.scale, fraction)
+        number, whole = _fixed_point(x, up)
         known = known & whole
         return number
 
+    matrix = jnp.zeros((0, 0), dtype) if pair.matrix is None else pair.matrix
+    lattice = _fixed_point(matrix.reshape(*matrix.shape, *[1] * up.ndim), up)
     for axis, (ak, bk) in enumerate(zip(pair.a, pair.b, strict=True)):
         displacement, estimate = _add(fixed(bk), fixed(ak), -1), bk - ak
         error = jnp.zeros((), dtype)
-        for shift, component in pair.lattice_terms(axis):
-            displacement = _add(displacement, fixed(component), shift.astype(limb_type(dtype)))
+        for shift, at in pair.lattice_terms(axis):
+            component, (number, whole) = matrix[at], jax.tree.map(lambda x, at=at: x[at], lattice)
+            known = known & whole
+            displacement = _add(displacement, number, shift.astype(limb_type(dtype)))
             estimate = estimate + shift * component
             error = error + 16 * eps * (jnp.abs(ak) + jnp.abs(bk) + jnp.abs(shift * component))
             known = known & (jnp.abs(shift) <= 2**WHOLE_BITS)
         known = known & ((jnp.abs(estimate) + error) * threshold.scale < 4.5)
         square = _square_limbs(displacement, threshold.times, bits)
         total = square if total is None else [x + y for x, y in zip(total, square, strict=True)]
-    radius = _square_limbs(functools.reduce(_add, map(fixed, threshold.radii)), 1, bits)
-    return jnp.where(known, _sign_of_limbs([x - y for x, y in zip(total or [], radius, strict=True)], bits), _UNKNOWN)
+    less = threshold.less or [-x for x in _square_limbs(functools.reduce(_add, map(fixed, threshold.radii)), 1, bits)]
+    return jnp.where(known, _sign_of_limbs([x + y for x, y in zip(total or [], less, strict=True)], bits), _UNKNOWN)
 
 
 class _Fixed(NamedTuple):
@@ -269,15 +268,13 @@ def _add(x: _Fixed, y: _Fixed, times: Array | int = 1) -> _Fixed:
     return _Fixed(x.upper + y.upper * times, x.lower + y.lower * times)
 
 
-def _fixed_point(x: Array, scale: Array, fraction: int) -> tuple[_Fixed, Array]:
-    """Return x·scale·2^fraction, `scale` being a power of two, and whether it has no finer digits than such numbers have."""
+def _fixed_point(x: Array, up: Array) -> tuple[_Fixed, Array]:
+    """Return x in the units of step 2, and whether it has no finer digits; `up` is where the lowest bit of denormals is there."""
     dtype = np.dtype(x.dtype)
     bits, width, whole = limb_bits(dtype), 8 * dtype.itemsize, limb_type(dtype)
     unsigned = np.dtype(f"uint{width}").type
     negative, place, mantissa = fields_of(x)
-    finfo = jnp.finfo(dtype)
-    exponent = (lax.bitcast_convert_type(scale, unsigned) >> unsigned(finfo.nmant)).astype(jnp.int32) - (finfo.maxexp - 1)
-    place = place + exponent + (fraction + bits + int(finfo.minexp) - finfo.nmant)  # of the lowest digit, in digits of `lower`
+    place = place + up  # of the lowest digit, in digits of `lower`
 
     def by(amount: Array) -> Array:  # the result of longer shifts would depend on the hardware
         return jnp.clip(amount, 0, width - 1).astype(unsigned)

@@ -62,11 +62,11 @@ def pack_turns(points: Array, lattice: Lattice) -> Array:
 def _met(packed: Array, dim: int) -> Array:
     """Return a bound on the number of turns, and the bits for points out of range, [] int32.
 
-    These are reductions that XLA supports across devices; it has no bitwise one for integers.
+    This is one reduction, which XLA supports across devices; it has no bitwise one for integers.
     """
-    most = jnp.max(jnp.abs(unpack_turns(packed, dim)), initial=0)
-    nowhere, far = jnp.any(packed == -1), jnp.any(packed == -2)
-    return most | jnp.where(nowhere, NOT_FINITE, 0).astype(jnp.int32) | jnp.where(far, TOO_FAR, 0).astype(jnp.int32)
+    turns = jnp.max(jnp.abs(unpack_turns(packed, dim)), axis=1)
+    parts = [turns, jnp.where(packed == -1, NOT_FINITE, 0), jnp.where(packed == -2, TOO_FAR, 0)]
+    return functools.reduce(jnp.bitwise_or, jnp.max(jnp.stack([x.astype(jnp.int32) for x in parts]), axis=1, initial=0))
 
 
 def unpack_turns(packed: Array, dim: int) -> Array:

@@ -19,7 +19,18 @@ from jax.interpreters import ad, batching, mlir
 from jfrnn._sums.fused import can_sum_list, check
 from jfrnn._sums.relations import Kept, Relation, Searched, sum_pairs
 from jfrnn._sums.terms import Derived, Groups, Term, choose, is_moving, join, tangent, transpose
-from jfrnn._tracing import Aval, Internal, call_apart, compile_program, on_device, result_aval, unvarying_types, vary, varying_axes
+from jfrnn._tracing import (
+    Aval,
+    Internal,
+    call_apart,
+    compile_program,
+    lower_late,
+    on_device,
+    result_aval,
+    unvarying_types,
+    vary,
+    varying_axes,
+)
 
 Structure = Any  # the `PyTreeDef` of a relation, which type checkers do not accept as a type
 
@@ -124,11 +135,11 @@ def _batch(args: tuple, dims: tuple, **params: Internal) -> tuple[list[Array], l
 
 def _lower(ctx: Internal, *args: Internal, **params: Internal) -> Internal:
     """Trace the sums as on a single device; see `jfrnn._tracing.manual`."""
-    return mlir.lower_fun(_sums, multiple_results=True)(ctx.replace(avals_in=unvarying_types(ctx.avals_in)), *args, **params)
+    return lower_late(_sums)(ctx.replace(avals_in=unvarying_types(ctx.avals_in)), *args, **params)
 
 
-_compiled = functools.partial(compile_program, static_argnames=("term", "structure", "compensated"))(_sums)
-_pair_sum_p.def_impl(lambda *args, **params: _compiled(*args, **params))
+_compiled = functools.partial(compile_program, static_argnames=("term", "structure", "compensated"))(_pair_sum_p.bind)
+_pair_sum_p.def_impl(lambda *args, **params: (_sums if jax.config.jax_disable_jit else _compiled)(*args, **params))  # pyright: ignore[reportAttributeAccessIssue]
 _pair_sum_p.def_abstract_eval(_result_shapes)
 ad.primitive_jvps[_pair_sum_p] = _jvp
 ad.primitive_transposes[_pair_sum_p] = _transpose

@@ -1,7 +1,8 @@
 """What the library needs from JAX's tracing: its modes, `shard_map`, and a bound on the number of compiled programs."""
 
-from jfrnn._tracing.flags import any_of_rows, first_set, set_places
+from jfrnn._tracing.flags import first_set, largest_of, set_places
 from jfrnn._tracing.kinds import Aval, Given, Internal, Tree
+from jfrnn._tracing.late import call_late, lower_late, platform_of_lowering
 from jfrnn._tracing.manual import call_apart, result_aval, unvarying_types, vary, varying_axes
 from jfrnn._tracing.modes import gather, leading_axes, own_transfers
 from jfrnn._tracing.programs import at_once, compile_program, make_on_host, on_device

@@ -1,7 +1,5 @@
 """Positions of the flags that are set in an array, in order."""
 
-import functools
-
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -43,13 +41,15 @@ def set_places(flags: Array, most: int) -> Array:
     return jnp.where(found < words, place, n)
 
 
-def any_of_rows(flags: Array) -> Array:
-    """Say for each row of flags [n, k] whether any is set, k being at most 32 or a multiple of 32: [n] bool.
+def largest_of(x: Array) -> Array:
+    """Return the largest of integers >= 0, of any shape: [].
 
-    XLA's CPU compiler splits a reduction over a longer axis into a chain of kernels, which dominate the time to compile.
+    It is found twice at once, because XLA's CPU compiler splits a reduction of one array of integers into a chain of kernels, which
+    dominate the time to compile.
     """
-    parts = jnp.split(flags, max(flags.shape[1] // _BITS, 1), axis=1)
-    return jnp.any(functools.reduce(jnp.logical_or, parts), axis=1)
+    x, zero = x.reshape(-1), np.zeros((), x.dtype)
+    twice = lax.reduce((x, x), (zero, zero), lambda a, b: (lax.max(a[0], b[0]), lax.max(a[1], b[1])), (0,))
+    return lax.max(*twice)
 
 
 def first_set(flags: Array, after: Array) -> Array:
