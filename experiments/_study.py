@@ -61,7 +61,7 @@ def shrink(config: Config) -> Config:
 def _few(axis: str, values: Sequence[Any]) -> tuple[Any, ...]:
     """Return two layouts, two coarse spacings, one seed, of all else the first and the last value."""
     if axis == "spacings" and values:
-        return (5e-4, 2.5e-4)
+        return (5e-4, 4e-4)
     if axis == "seeds":
         return tuple(values[:1])
     return tuple(values[:2]) if axis == "layouts" or len(values) < 2 else (values[0], values[-1])

@@ -90,12 +90,12 @@ def sorted_numbers(term: TermText, sources: int, dim: int, double: bool) -> int:
     return sources * term.source_columns + (MOST_LANES if term.source_columns else 0)
 
 
-def loaded(value: Value, lanes: str, bits: str, double: bool) -> str:
+def load_value(value: Value, lanes: str, bits: str, double: bool) -> str:
     """Return a statement that defines a value from `lanes` of the dtype of positions, or from their `bits`."""
-    return f"const Math::{_NAMES[value.dtype]} {value.name} = {_converted(value, lanes, bits, double)};\n"
+    return f"const Math::{_NAMES[value.dtype]} {value.name} = {_convert_lanes(value, lanes, bits, double)};\n"
 
 
-def _converted(value: Value, lanes: str, bits: str, double: bool) -> str:
+def _convert_lanes(value: Value, lanes: str, bits: str, double: bool) -> str:
     """Return what a value is in terms of `lanes` of the dtype of positions, or of their `bits`.
 
     Integers of the same width travel as their bits; in float64, integers of 32 bits as their values, and so do truths in both.
@@ -107,10 +107,10 @@ def _converted(value: Value, lanes: str, bits: str, double: bool) -> str:
 
 def _spread(value: Value, at: str, double: bool) -> str:
     """Return what a value is in terms of a number, the same in all lanes."""
-    return _converted(value, f"Math::of({at})", f"Math::of(bits_of_number({at}))", double)
+    return _convert_lanes(value, f"Math::of({at})", f"Math::of(bits_of_number({at}))", double)
 
 
-def placed(values: tuple[Value, ...], column: str, axis: str) -> list[str]:
+def place_values(values: tuple[Value, ...], column: str, axis: str) -> list[str]:
     """Return where values are: those that have a column, and positions along an axis."""
     numbers = itertools.count()
     return [column.format(next(numbers)) if value.axis is None else axis.format(value.axis) for value in values]
@@ -159,7 +159,7 @@ def _of_shared(term: TermText, double: bool) -> list[str]:
 
 def _of_own(term: TermText, double: bool, turned: bool) -> list[str]:
     """Return the lines that read what is known of a query at `q`, of its row of numbers."""
-    given = zip(term.own, placed(term.own, "row[{}]", "q[{}]"), strict=True)
+    given = zip(term.own, place_values(term.own, "row[{}]", "q[{}]"), strict=True)
     lines = [f"own.{value.name} = {_spread(value, at, double)};" for value, at in given]
     column = sum(value.axis is None for value in term.own)
     turns = [f"real(Lattice::turn(row[{column}], {step.axis}))" for step in term.steps if turned]
@@ -172,8 +172,8 @@ def _evaluation(term: TermText, double: bool, turned: bool) -> list[str]:
     lines = ["template <class Column>"]
     lines += ["JFRNN_MEMBER void evaluate(const Own& own, const number* p, Column column, number* summand) const {"]
     lines += [f"const Math::{_NAMES[value.dtype]} {value.name} = own.{value.name};" for value in term.own]
-    numbers = placed(term.others, "column({})", "p[{}]")
-    lines += [loaded(value, x, f"Math::bits({x})", double) for value, x in zip(term.others, numbers, strict=True)]
+    numbers = place_values(term.others, "column({})", "p[{}]")
+    lines += [load_value(value, x, f"Math::bits({x})", double) for value, x in zip(term.others, numbers, strict=True)]
     for c, step in enumerate(term.steps):
         shift = f"column({term.columns + c})" + f" + own.turned{c}" * turned
         lines.append(f"const number {step.name} = SHIFTED ? {shift} : number{{}};")

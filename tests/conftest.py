@@ -13,13 +13,15 @@ from jax._src import compiler
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_traceback_in_locations_limit", 0)
+os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"  # programs tell no line of the sources they were traced from: it takes long
 os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"  # in processes that tests start, as `_compiled_soon` in this one
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # to compile the sources of JAX takes each of them a second and a half
 gc.freeze()  # imported modules are no garbage; tracing makes many objects that stay: to look through them takes a tenth of the time
 gc.set_threshold(50_000, 20, 20)
 TESTS = count(1)
 XLA_FLAGS = os.environ.get("XLA_FLAGS", "")
-UNFUSED = {"xla_cpu_use_fusion_emitters": False}  # which write loops, and take most of the time of a compilation
+UNFUSED = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 warp.config.log_level = warp.LOG_WARNING  # else it prints what it compiles, into doctests too
 LONGEST = (  # files, those first that take longest: what is left at the end is short, and no worker waits for another's long file
     *("hard_cases", "pair_sum", "experiments_sweep", "notebooks", "radii", "box", "triangles_closest", "search", "triangles"),
@@ -72,9 +74,8 @@ def _quick_options():
 
 @pytest.fixture(autouse=True)
 def _compiled_soon(request, monkeypatch, _quick_options):
-    """Leave out what takes long to compile, but in slow tests, those of memory, and where the last digits of floats are tested."""
-    marked = any(request.node.get_closest_marker(name) for name in ("slow", "fully_compiled"))
-    fully = marked or "memory" in request.node.nodeid
+    """Leave out what takes long to compile, but in slow tests, and where memory or the last digits of floats are tested."""
+    fully = any(request.node.get_closest_marker(name) for name in ("slow", "fully_compiled"))
     if fully:
         monkeypatch.delenv("JAX_DISABLE_MOST_OPTIMIZATIONS")
         monkeypatch.setenv("XLA_FLAGS", XLA_FLAGS)

@@ -298,8 +298,10 @@ def pairs_of(idx: Any, count: Any, n_sources: int) -> list[Pair]:
         if any(not 0 <= j < n_sources for j in row[:used]):
             raise AssertionError(f"row {i} counts {used} neighbors of {n_sources} sources, but holds {row[:used]}")
         raise AssertionError(f"unused slots of row {i} must hold {n_sources}: got {row[used:]}")
-    pairs = list(zip(np.nonzero(filled)[0].tolist(), idx[filled].tolist(), strict=True))
-    _refuse_repeats(pairs)
+    rows, found = np.nonzero(filled)[0], idx[filled]
+    pairs = list(zip(rows.tolist(), found.tolist(), strict=True))
+    if len(np.unique(rows * (n_sources + 1) + found)) < len(pairs):
+        _refuse_repeats(pairs)
     return pairs
 
 

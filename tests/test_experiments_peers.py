@@ -50,8 +50,9 @@ def _sleep(given):
 def test_a_peer_that_crashes_or_does_not_end_says_so(ask, said, monkeypatch):
     monkeypatch.setattr(peers, "_serve", _serve_with)
     monkeypatch.setattr(peers, "PEERS", {ask.__name__: peers._Peer("jfrnn", ask)})
-    answers = list(peers._answers(ask.__name__, ["hard/n_1", "hard/n_2"], 2.0))
-    assert [answer["answer"] for answer in answers] == [said, said]
+    names = ["hard/n_1", "hard/n_2"][: 2 if ask is _stop else 1]  # the next one is asked of another process
+    answers = list(peers._answers(ask.__name__, names, 2.0))
+    assert [answer["answer"] for answer in answers] == [said] * len(names)
 
 
 def _serve_with(name, pipe):

@@ -55,7 +55,12 @@ def make(name, dtype=np.float64, dim=3, n=90, skin=0.05, reverse=False):
     )
 
 
-@pytest.mark.parametrize("name", LISTS)
+OFTEN = ("open", "images", "short vectors", "half images", "queries", "either")  # in single precision too; the others by hand
+PRECISIONS = [(name, np.float64) for name in LISTS]
+PRECISIONS += [pytest.param(name, np.float32, marks=[pytest.mark.slow] * (name not in OFTEN)) for name in LISTS]
+
+
+@pytest.mark.parametrize(("name", "dtype"), PRECISIONS)
 def test_pairs_at_new_positions(name, dtype):
     nbrs, x, q = make(name, dtype)
     ours, theirs = (np.asarray(each.vectors(x, queries=q)[1]) for each in (nbrs, by_arrays(nbrs)))
@@ -92,11 +97,15 @@ def summand(r, i, j):
     return {"a": i["m"] * j["m"] * jnp.exp(-square), "b": r * j["v"], "c": jnp.where(square > 0.01, j["k"], 0)}
 
 
-SUMMED = [*((name, False) for name in LISTS), ("images", True), ("scatter", True), ("queries", True)]
+ONCE = ("nearest", "skewed", "skewed images", "short vectors", "half self", "scatter", "both", "half mean")  # second ones by hand
+SUMMED = [(name, False, name not in ONCE) for name in LISTS] + [(name, True, False) for name in ("images", "scatter", "queries")]
+MORE = [(name, False, True) for name in ONCE] + [(name, True, True) for name in ("images", "scatter", "queries")]
+SUMMED += [pytest.param(*more, marks=pytest.mark.slow) for more in MORE]
 
 
-@pytest.mark.parametrize(("name", "compensated"), SUMMED)
-def test_sums_and_derivatives(name, compensated):
+@pytest.mark.parametrize(("name", "compensated", "twice"), SUMMED)
+def test_sums_and_derivatives(name, compensated, twice):
+    """Of first order, and where kinds of lists differ in how pairs are passed on (`twice`) of second order."""
     nbrs, x, q = make(name, reverse=name in ("half", "queries"))
     rng, n = np.random.default_rng(1), len(x)
     values = {"m": jnp.asarray(rng.random(n)), "v": jnp.asarray(rng.random((n, 3))), "k": jnp.arange(n, dtype=jnp.int32)}
@@ -118,7 +127,8 @@ def test_sums_and_derivatives(name, compensated):
         def slope(x):
             return jax.grad(lambda x: total(nbrs, x, m, q, scale)[0])(x)
 
-        return total(nbrs, x, m, q, scale), first(nbrs, x, m, q, scale), jax.jvp(slope, (x,), (jnp.cos(x),))[1]
+        second = jax.jvp(slope, (x,), (jnp.cos(x),))[1] if twice else None
+        return total(nbrs, x, m, q, scale), first(nbrs, x, m, q, scale), second
 
     given = (x, values["m"], q, jnp.asarray(1.5))
     ours, theirs = all_of(nbrs, *given), all_of(by_arrays(nbrs), *given)

@@ -85,7 +85,7 @@ def _operands(search: Search, levels: Levels) -> list[Array]:
     sources, queries, cutoffs, torus = search.sources, search.queries, search.cutoffs, search.torus
     given, dim, padding = sources if queries is None else queries, sources.shape[1], level_kernels.PADDING
 
-    def ordered(x: Array | None, order: Array, more: int) -> Array:
+    def put_in_order(x: Array | None, order: Array, more: int) -> Array:
         return jnp.zeros(1, sources.dtype) if x is None else jnp.pad(x[order], (0, more)).reshape(-1)
 
     raw = [jnp.zeros((1, 1), sources.dtype)] * 2
@@ -103,7 +103,7 @@ def _operands(search: Search, levels: Levels) -> list[Array]:
     return [
         *raw,
         jnp.pad(points[levels.order].T, ((0, 0), (0, padding))).reshape(-1),
-        ordered(cutoffs.sources, levels.order, padding),
+        put_in_order(cutoffs.sources, levels.order, padding),
         levels.order,
         lax.bitcast_convert_type(levels.keys, jnp.int32),
         levels.grid.coords.reshape(-1),
@@ -111,7 +111,7 @@ def _operands(search: Search, levels: Levels) -> list[Array]:
         jnp.concatenate(header),
         jnp.concatenate([cutoffs.largest[None], *numbers]),
         rows[levels.query_order].T.reshape(-1),
-        ordered(cutoffs.queries, levels.query_order, 0),
+        put_in_order(cutoffs.queries, levels.query_order, 0),
         levels.query_order,
         levels.query_top.reshape(-1),
         levels.query_place.reshape(-1),

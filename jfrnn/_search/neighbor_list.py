@@ -1,11 +1,10 @@
-"""The result of a search: a padded neighbor list, its checks, its geometry and its exports.
+"""The result of a search: a padded neighbor list, its checks and its geometry.
 
-The file is long because a public class has all its methods, with whole docstrings, in one place; their code is in other files.
+The methods of a public class stand here with whole docstrings; those that export it are in `list_exports`.
 """
 
 import dataclasses
 import math
-from typing import overload
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +18,6 @@ from jfrnn._geometry import (
     Box,
     Cutoff,
     Images,
-    NeighborOverflowError,
     Radii,
     Status,
     check_active,
@@ -29,29 +27,28 @@ from jfrnn._geometry import (
     check_radii,
     check_slack,
     grow_images,
-    known_status,
     make_cutoff,
     pairs_and_status,
     round_box,
     shape_of,
 )
 from jfrnn._search.edges import Edges, flat_edges, no_edges
-from jfrnn._search.exports import DenseNeighbors, check_total, flat_pairs, pair_total
+from jfrnn._search.exports import check_total, pair_total
 from jfrnn._search.geometry import ImageCodes, ImagesMade, lattice_shifts, norms, open_vectors, periodic_vectors
-from jfrnn._search.kept_options import KeptOptions
+from jfrnn._search.list_exports import ListExports
 from jfrnn._search.making import count_capacity, find_fields, round_capacity
 from jfrnn._search.problem import Problem
 from jfrnn._search.reverse import MOST_SLOTS, Reverse
 from jfrnn._search.topology import Topology, make_topology
 from jfrnn._search.verlet import Verlet, has_moved_too_far
-from jfrnn._tracing import Given, at_once, call_apart, compile_program, own_transfers
+from jfrnn._tracing import Given, call_apart, compile_program, own_transfers
 
 ROWS_ARE_WHOLE = Status.NONFINITE | Status.TOTAL_OVERFLOW  # bits that do not mean missing neighbors in rows
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class NeighborList(KeptOptions):
+class NeighborList(ListExports):
     """The neighbors of m queries among n sources, one row of `capacity` slots per query. A pytree.
 
     Attributes:
@@ -91,11 +88,6 @@ class NeighborList(KeptOptions):
         skin = f", skin {self.skin:.6g}" if self.skin else ""
         rest = pairs_and_status(self.count, self.status)
         return f"NeighborList({rows}, capacity {capacity}, cutoff {reach}{skin}, engine {self.backend!r}, {rest})"
-
-    @property
-    def capacity(self) -> int:
-        """Slots per row."""
-        return self.idx.shape[-1]
 
     @property
     def overflow(self) -> Array:
@@ -232,17 +224,6 @@ class NeighborList(KeptOptions):
             status = self.status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
         return dataclasses.replace(self, status=status)
 
-    def _check_known(self, spared: Status = Status.OK) -> None:
-        """Raise what status bits report, except the spared ones; a traced list is not checked."""
-        status = (known_status(self.status) or Status.OK) & ~spared
-        if Status.ROW_OVERFLOW in status:
-            raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self.capacity)
-        if Status.TOTAL_OVERFLOW in status:
-            now = int(np.sum(jax.device_get(self.count), dtype=np.int64))
-            raise ValueError(f"{status.message} At present it holds {now}.")
-        if status:
-            raise ValueError(status.message)
-
     def vectors(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> tuple[Array, Array]:
         """Compute the displacements x_j - x_i to all neighbors, in a periodic box plus the lattice translation of the image.
 
@@ -360,142 +341,6 @@ class NeighborList(KeptOptions):
         with own_transfers():
             given = self._topology(), self.count, self.status, mask, shifts, sources, rows, box
             return flat_edges(*given, self.box_kind if box is not None else None, total)
-
-    @overload
-    def pairs(self, total: None = None) -> tuple[np.ndarray, np.ndarray]: ...
-
-    @overload
-    def pairs(self, total: int) -> tuple[Array, Array]: ...
-
-    def pairs(self, total: int | None = None) -> tuple[Array | np.ndarray, Array | np.ndarray]:
-        """Export the pairs (i, j), row by row: to the host, or inside jit into arrays of a static length.
-
-        Args:
-            total: Length of the arrays, a static int up to 2³¹ - 1; None: the number of pairs, which is known only outside jit. If
-                there are more pairs than `total`, this raises outside jit. Inside jit the last pairs are missing then;
-                `require(total)` sets a bit that `check` reports.
-
-        Returns:
-            Query indices i and source indices j, shape [pairs] or [total], int32 each; the padding holds m and n.
-
-        Raises:
-            NeighborOverflowError, ValueError: as `check`, outside jit; ValueError: more pairs than `total`, outside jit.
-            ValueError, TypeError: total is invalid, or missing inside jit.
-
-        Differentiable: no (integers). Jit: yes, with total. vmap: yes, with total.
-        """
-        if total is None:
-            count, idx = self._check_rows("pairs")
-            return np.repeat(np.arange(count.size, dtype=np.int32), count), idx
-        rows, indices, _ = self._flat(total)
-        return rows, indices
-
-    @overload
-    def csr(self, total: None = None) -> tuple[np.ndarray, np.ndarray]: ...
-
-    @overload
-    def csr(self, total: int) -> tuple[Array, Array]: ...
-
-    def csr(self, total: int | None = None) -> tuple[Array | np.ndarray, Array | np.ndarray]:
-        """Export compressed rows: the neighbors of row i are indices[offsets[i]:offsets[i + 1]].
-
-        Args:
-            total: As in `pairs`; offsets[-1] is then the number of pairs in the rows, at most 2³¹ - 1, which inside jit may exceed
-                `total`.
-
-        Returns:
-            Offsets, shape [m + 1], int64 on the host, int32 with `total`; and indices, shape [pairs] or [total], int32, padded with
-            n.
-
-        Raises:
-            NeighborOverflowError, ValueError, TypeError: as in `pairs`.
-
-        Differentiable: no (integers). Jit: yes, with total. vmap: yes, with total.
-        """
-        if total is None:
-            count, idx = self._check_rows("csr")
-            return np.concatenate([[0], np.cumsum(count, dtype=np.int64)]), idx
-        _, indices, offsets = self._flat(total)
-        return offsets, indices
-
-    def to_jraph(self, total: int) -> tuple[Array, Array]:
-        """Return senders and receivers of a graph: an edge from each neighbor j to its particle i.
-
-        In a periodic box the edge is to the minimum image of j. A list with several images per pair is refused, since edges cannot
-        tell them apart; for such a list, `shifts` returns the image of each slot of `idx`.
-
-        Args:
-            total: Number of edges, a static int: as in `pairs`.
-
-        Returns:
-            Senders j and receivers i, shape [total], int32 each; padding edges lead from n to m, the node that
-            `jraph.pad_with_graphs` adds first. Stacked, they are an edge index as other graph libraries use it.
-
-        Raises:
-            ValueError: the list has several images per pair.
-            ValueError, TypeError: as in `pairs`.
-
-        Differentiable: no (integers). Jit: yes. vmap: yes.
-        """
-        if self.images is not None:
-            raise ValueError(
-                "to_jraph() returns edges without lattice shifts, which a list with several images of a pair needs: take "
-                "i, k = jnp.nonzero(nbrs.idx < nbrs.source_count, size=total, fill_value=len(nbrs.idx)), senders "
-                "nbrs.idx.at[i, k].get(mode='fill', fill_value=nbrs.source_count), receivers i and shifts "
-                "nbrs.shifts(positions).at[i, k].get(mode='fill', fill_value=0); or search in a box that is at least 2.05 "
-                "(cutoff + skin) wide."
-            )
-        rows, indices, _ = self._flat(total)
-        return indices, rows
-
-    def to_jax_md(self) -> DenseNeighbors:
-        """Return this list in the form that jax-md's energies take: `idx` as in its format `Dense`.
-
-        Such an energy computes displacements itself, so it needs a full list of the particles among themselves with minimum images
-        only; the box goes into its displacement function. It sees all pairs within cutoff + skin. Inside jit, the result's
-        `did_buffer_overflow` says whether neighbors are missing.
-
-        Raises:
-            ValueError: the list is half, has queries, or has several images per pair.
-            NeighborOverflowError, ValueError: as `check`, outside jit.
-        """
-        wrong = {"half=True": self.half, "queries": self.own_queries, "several images of a pair": self.images is not None}
-        for what in (name for name, is_so in wrong.items() if is_so):
-            raise ValueError(f"jax-md's Dense format cannot say what a list with {what} does: search without.")
-        self._check_known()
-        return DenseNeighbors(self.idx, self.status)
-
-    def _flat(self, total: int) -> tuple[Array, Array, Array]:
-        """Return rows and sources of the pairs, padded to a static length, and the row offsets."""
-        self._check_known()
-        return flat_pairs(self.idx, self.count, self.source_count, self._check_total(total))
-
-    def _check_total(self, total: int) -> int:
-        """Return a static number of pairs that holds all of them, as far as that is known."""
-        total = check_total(total)
-        self._check_single()
-        if not isinstance(self.count, Tracer):
-            with at_once():
-                held = int(jax.device_get(pair_total(self.count, self.capacity)))
-            if held > total:
-                raise ValueError(f"total={total} is too small: the list holds {held} pairs. Pass total={held} or more.")
-        return total
-
-    def _check_rows(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        if isinstance(self.status, Tracer):
-            raise TypeError(
-                f"{name}() returns as many pairs as there are and cannot run inside jax.jit: write {name}(total), total being the "
-                "static length of its arrays."
-            )
-        self._check_known()
-        self._check_single()
-        with own_transfers():
-            idx, count = np.asarray(self.idx), np.asarray(self.count)
-        return count, idx[np.arange(self.capacity) < count[:, None]]
-
-    def _check_single(self) -> None:
-        if self.idx.ndim != 2:
-            raise ValueError(f"exports take one list at a time, got idx of shape {list(self.idx.shape)}: index the batch first.")
 
     def _check_active(self, active: Array | None, sources: Array) -> Array | None:
         if self.masked != (active is not None):

@@ -151,7 +151,7 @@ class Neighbors:
         Communication: every process gets everything; meant for checks. Differentiable: no. Jit: no.
         """
         self.check()
-        mine, theirs = (fetch(x) for x in _named_pairs(self))
+        mine, theirs = (fetch(x) for x in _name_pairs(self))
         found = theirs >= 0
         i, j = np.broadcast_to(mine[:, None], theirs.shape)[found], theirs[found]
         order = np.lexsort((j, i))
@@ -222,7 +222,7 @@ def _is_stale(particles: Particles, halo: Halo, local: NeighborList) -> Array:
 
 
 @jax.jit
-def _named_pairs(nbrs: Neighbors) -> tuple[Array, Array]:
+def _name_pairs(nbrs: Neighbors) -> tuple[Array, Array]:
     """Return the ids of all rows [N], and of their neighbors [N, capacity], -1 in unused slots."""
     shards = nbrs.local.idx.shape[0]
     ids = nbrs.halo.ids.reshape(shards, -1)
