@@ -81,6 +81,7 @@ DIFFERENT = [
     pytest.param("ties_across_skewed_far", np.float32, 2, marks=pytest.mark.slow),
     pytest.param("cutoff_1.5_boxes", np.float32, 2, marks=pytest.mark.slow),
     ("queries_many_images", np.float64, 2),
+    ("far_from_reduced_alone", np.float32, 2),
     pytest.param("residues_across_100", np.float64, 2, marks=pytest.mark.slow),
 ]
 

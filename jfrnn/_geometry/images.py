@@ -75,10 +75,10 @@ def images_of(box: Box, radius: float | None, dtype: np.dtype, sources: int) -> 
     if box.images is None and radius is not None and not isinstance(box.vectors, Tracer):
         with own_transfers():
             vectors = np.asarray(box.vectors, dtype).astype(np.float64)
-        images = _needed_images(vectors, box, radius, None)
+        images = _needed_images(vectors, box, radius, dtype, None)
         if not box.orthogonal and _too_many(images, sources, _MANY_IMAGES):
             basis, short = reduced_basis(vectors, box.periodic)
-            reduced = _needed_images(short, box, radius, basis)
+            reduced = _needed_images(short, box, radius, dtype, basis)
             images = reduced if reduced.total < images.total and _are_exact(reduced) else images
         return check_images(images, sources)
     wanted = (0,) * box.dim if box.images is None else box.images
@@ -87,11 +87,18 @@ def images_of(box: Box, radius: float | None, dtype: np.dtype, sources: int) -> 
     return check_images(Images(box.periodic, box.orthogonal, reach, nearest), sources)
 
 
-def _needed_images(vectors: np.ndarray, box: Box, radius: float, basis: Basis | None) -> Images:
-    """Return the images that a cutoff needs in a lattice of these vectors."""
-    share = radius / _widths(vectors, box.periodic)
-    # The margin of a hundredth of a cell is far more than the rounding of coordinates.
-    reach = tuple(math.ceil(s + 0.01) if p else 0 for s, p in zip(share.tolist(), box.periodic, strict=True))
+def _needed_images(vectors: np.ndarray, box: Box, radius: float, dtype: np.dtype, basis: Basis | None) -> Images:
+    """Return the images that a cutoff needs in a lattice of these vectors.
+
+    A hundredth of a cell is far more than the rounding of coordinates, unless vectors are long beside the distances between their
+    faces: then the residual of the transform, times the cells that an image lies away, counts (`jfrnn._geometry.wrapping.wrap`).
+    """
+    span = (np.diag(vectors) if vectors.ndim == 1 else vectors)[list(box.periodic)]
+    inverse, share, residual = np.linalg.pinv(span), np.zeros(box.dim), np.zeros(box.dim)
+    share[list(box.periodic)] = radius * np.linalg.norm(inverse, axis=0)  # of the distances between opposite faces
+    residual[list(box.periodic)] = (np.abs(span) @ np.abs(inverse)).sum(axis=0)
+    margin = 0.01 + 32 * float(np.finfo(dtype).eps) * (share.max() + 3) * residual
+    reach = tuple(math.ceil(s) if p else 0 for s, p in zip((share + margin).tolist(), box.periodic, strict=True))
     return Images(box.periodic, box.orthogonal, reach, bool((share <= _NEAREST).all()), basis)
 
 
@@ -147,13 +154,4 @@ def _in_basis(box: Box, radius: float | None, dtype: np.dtype, like: Images) -> 
     if radius is None:
         return like
     vectors = np.asarray(box.vectors, dtype).astype(np.float64)
-    return _needed_images(like.numbers @ vectors, box, radius, like.basis)
-
-
-def _widths(vectors: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
-    """Return the distances between opposite faces [d]; infinite along axes that are not periodic."""
-    rows = np.diag(vectors) if vectors.ndim == 1 else vectors
-    widths = np.full(len(rows), np.inf)
-    span = rows[list(periodic)]
-    widths[list(periodic)] = 1 / np.linalg.norm(np.linalg.pinv(span), axis=0)
-    return widths
+    return _needed_images(like.numbers @ vectors, box, radius, dtype, like.basis)
