@@ -368,6 +368,13 @@ def _alone_far(dtype: np.dtype, dim: int) -> Parts:
     return np.zeros((1, dim)), 6.0, _FAR_FROM_REDUCED, _ALL
 
 
+def _crowded_far(dtype: np.dtype, dim: int) -> Parts:
+    cutoff = 0.485 / 3000
+    points = np.random.default_rng(3).uniform(0, 3 * cutoff, (24, dim))
+    points[::3, 0] += 1  # by a vector
+    return points, cutoff, [[1.0, 0.0, 0.0], [3000.0, 1.0, 0.0], [0.0, 0.0, 1.0]], _ALL
+
+
 _TABLE = (
     _case(
         "far_from_reduced",
@@ -375,6 +382,7 @@ _TABLE = (
         _filled(_FAR_FROM_REDUCED, n=(20, 12), cutoff=3.5),
     ),
     _case("far_from_reduced_alone", "a cubic lattice in disguise, of which 6 neighbors and 12 more lie at ties", _alone_far),
+    _case("far_from_reduced_crowded", "the minimum image would do, but for the rounding that a long vector brings", _crowded_far),
     _case(
         "far_from_reduced_turned",
         "long vectors that no float rounds well, particles up to 4 of them outside",

@@ -82,6 +82,7 @@ DIFFERENT = [
     pytest.param("cutoff_1.5_boxes", np.float32, 2, marks=pytest.mark.slow),
     ("queries_many_images", np.float64, 2),
     ("far_from_reduced_alone", np.float32, 2),
+    ("far_from_reduced_crowded", np.float32, 2),
     pytest.param("residues_across_100", np.float64, 2, marks=pytest.mark.slow),
 ]
 

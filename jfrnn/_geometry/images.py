@@ -16,7 +16,8 @@ from jfrnn._geometry.reduced import Basis, reduced_basis
 from jfrnn._tracing import own_transfers
 
 LARGEST_TURN = 511  # most cells between a particle and the box: three such numbers fit into an int32, and S·A is exact
-_NEAREST = 0.49  # largest cutoff / width for which the minimum image suffices, with a margin for rounding
+_ROUNDING = 0.01  # of a cell: the margin for rounding where vectors are about as long as their lattice is wide
+_NEAREST = 0.5  # largest cutoff / width, with the margin for rounding, for which the minimum image suffices
 _MANY_IMAGES = 2**15 - 1  # with more images, shorter lattice vectors are looked for
 _MOST_IMAGES = 2**22  # their tables take 100 MB
 _MOST_VECTORS = 2**23  # largest sum of given vectors in a shift: float32 holds whole numbers up to 2^24 exactly
@@ -90,16 +91,16 @@ def images_of(box: Box, radius: float | None, dtype: np.dtype, sources: int) -> 
 def _needed_images(vectors: np.ndarray, box: Box, radius: float, dtype: np.dtype, basis: Basis | None) -> Images:
     """Return the images that a cutoff needs in a lattice of these vectors.
 
-    A hundredth of a cell is far more than the rounding of coordinates, unless vectors are long beside the distances between their
-    faces: then the residual of the transform, times the cells that an image lies away, counts (`jfrnn._geometry.wrapping.wrap`).
+    `_ROUNDING` is far more than the rounding of coordinates, unless vectors are long beside the distances between their faces: then
+    the residual of the transform, times the cells that an image lies away, is more (`jfrnn._geometry.wrapping.wrap`).
     """
     span = (np.diag(vectors) if vectors.ndim == 1 else vectors)[list(box.periodic)]
     inverse, share, residual = np.linalg.pinv(span), np.zeros(box.dim), np.zeros(box.dim)
     share[list(box.periodic)] = radius * np.linalg.norm(inverse, axis=0)  # of the distances between opposite faces
     residual[list(box.periodic)] = (np.abs(span) @ np.abs(inverse)).sum(axis=0)
-    margin = 0.01 + 32 * float(np.finfo(dtype).eps) * (share.max() + 3) * residual
+    margin = np.maximum(_ROUNDING, 48 * float(np.finfo(dtype).eps) * (share.max() + 3) * residual)
     reach = tuple(math.ceil(s) if p else 0 for s, p in zip((share + margin).tolist(), box.periodic, strict=True))
-    return Images(box.periodic, box.orthogonal, reach, bool((share <= _NEAREST).all()), basis)
+    return Images(box.periodic, box.orthogonal, reach, bool((share + margin <= _NEAREST).all()), basis)
 
 
 def _too_many(images: Images, sources: int, most: int) -> bool:
