@@ -1,4 +1,4 @@
-"""Lists that are kept: which of their slots hold a pair now, how far apart, what derivatives are of that, and sums over the pairs.
+"""Lists that are kept: which slots hold a pair now, their distances and what these give to derivatives, and sums over the pairs.
 
 On the CPU, LANES slots of a row are taken at a time. Numbers of their sources are read four at a time, where these stand, and rows
 and columns of what was read are exchanged in registers. On CUDA, eight lanes serve a row. A lane
@@ -15,7 +15,7 @@ from jfrnn.kernels.cells_cuda import GRID
 from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
 ROWS_AT_ONCE = 64  # that a thread of the CPU takes
-LANES = 8  # of CUDA that serve a row where terms are summed
+LANES = 8  # of CUDA that serve a row
 _BLOCK = 128
 # that share a multiprocessor; in a box, its numbers stay in registers (forces of a million shuffled particles: 1.3 times faster)
 _BLOCKS, _BLOCKS_IN_BOX = 8, 5
@@ -91,24 +91,24 @@ def threads(rows: int, lanes: int) -> int:
 @functools.lru_cache(256)
 def mask_kernel(kind: ListKind, measured: bool) -> Kernel:
     """Return the kernel that tells which slots hold a pair now, and (`measured`) the distances."""
-    return _kernel(kind, "mask", measured, MEASURED=measured)
+    return _kernel(kind, "mask", "_measured" * measured, MEASURED=measured)
 
 
 @functools.lru_cache(256)
 def slope_kernel(kind: ListKind) -> Kernel:
     """Return the kernel that makes derivatives by positions of those by distances, in a list that is its own mirror image."""
-    return _kernel(kind, "slopes", False, DECIDED=0)
+    return _kernel(kind, "slopes", "", DECIDED=0)
 
 
 def _entry(kind: ListKind, method: str) -> Entry:
     return Entry(method, _BLOCK if kind.cuda else 1, _BLOCKS_IN_BOX if kind.periodic else _BLOCKS)
 
 
-def _kernel(kind: ListKind, what: str, marked: bool, **constants: int) -> Kernel:
+def _kernel(kind: ListKind, what: str, suffix: str, **constants: int) -> Kernel:
     given = {"OTHERS": 0, "SUMS": 0, "LIST": 0, **kind.constants(0), **constants}
     text = program(kind.double, kind.dim, f"kept_{what}.cuh" if kind.cuda else f"kept_{what}_cpu.h", **given)
     entry = _entry(kind, f"Kept{what.title()}.run")
-    return declare(f"kept_{what}_{kind.name}{'_measured' * marked}", text, entry, cuda=kind.cuda, fused=kind.cuda)[0]
+    return declare(f"kept_{what}_{kind.name}{suffix}", text, entry, cuda=kind.cuda, fused=kind.cuda)[0]
 
 
 @functools.lru_cache(512)

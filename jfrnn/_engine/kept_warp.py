@@ -83,10 +83,9 @@ def kept_slopes(given: KeptList, slots: Array, distances: Array, slopes: Array) 
 
     def on(cuda: bool) -> Callable[..., Array]:
         def call(given: KeptList, slots: Array, distances: Array, slopes: Array) -> Array:
-            kind, nothing = _kind_of(given, kept.LANES if cuda else 0), jnp.zeros(1, jnp.int32)
-            operands = _operands(given._replace(reversal=None), kind, 0, None)[:-3]
-            dims = {"sums": given.sources.shape, "info": 2}
-            return _slope_callable(kind)(*operands, slots, nothing, nothing, distances, slopes, output_dims=dims)[0]
+            kind, dims = _kind_of(given, kept.LANES if cuda else 0), {"sums": given.sources.shape, "info": 2}
+            operands = _operands(given, kind, 0, None, slots)
+            return _slope_callable(kind)(*operands, distances, slopes, output_dims=dims)[0]
 
         return call
 
@@ -142,8 +141,11 @@ def _kind_of(given: KeptList, lanes: int) -> _Extra:
     return _Extra(cutoff.closed, 1 if lattice is None else lattice.images.total, kind)
 
 
-def _operands(given: KeptList, extra: _Extra, columns: int, others: Array | None) -> list[Array]:
-    """Return what kernels read of a list, in the order of `_LIST`, with columns of numbers of each source."""
+def _operands(given: KeptList, extra: _Extra, columns: int, others: Array | None, slots: Array | None = None) -> list[Array]:
+    """Return what kernels read of a list, in the order of `_LIST`, with columns of numbers of each source.
+
+    `slots` are the reverse slots of a list that is not itself reversed.
+    """
     kind, dtype = extra.kind, given.sources.dtype
     sources, rows, turns = given.sources, given.rows, given.turns or (None, None)
     if kind.reversed:
@@ -160,7 +162,8 @@ def _operands(given: KeptList, extra: _Extra, columns: int, others: Array | None
         steps = jnp.asarray(images.shifts).astype(dtype).reshape(-1) if given.codes is not None else steps
     nothing = jnp.zeros(1, jnp.int32)
     codes = nothing if given.codes is None else given.codes
-    return [own, points, jnp.concatenate(numbers), steps, given.idx, given.counts, codes, *(given.reversal or [nothing] * 3)]
+    reversal = given.reversal or [nothing if slots is None else slots, nothing, nothing]
+    return [own, points, jnp.concatenate(numbers), steps, given.idx, given.counts, codes, *reversal]
 
 
 def _radii_of(given: KeptList, kind: kept.ListKind) -> tuple[Array | None, Array | None]:

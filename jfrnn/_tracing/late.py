@@ -35,8 +35,6 @@ def call_late(fn: Callable[..., Tree], args: tuple, like: Tree) -> Tree:
     def flat(*leaves: Array) -> list[Array]:
         return jax.tree.leaves(fn(*jax.tree.unflatten(structure, leaves)))
 
-    if not shapes:
-        return like
     return jax.tree.unflatten(out, _late().bind(*leaves, fn=flat, types=tuple((x.shape, np.dtype(x.dtype)) for x in shapes)))
 
 

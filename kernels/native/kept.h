@@ -31,6 +31,10 @@ constexpr int OWN_TURNS = DIM, OWN_RADIUS = OWN_TURNS + (CODED ? DIM : 0), OWN_L
 constexpr int OF_ROW = 1, OF_SOURCE = 2, LARGER = 3, SMALLER = 4,
               MEAN = 5;  // RADII: the cutoff of a pair; of MEAN halves are given
 
+// Derivatives by positions (KeptSlopes): each slot has the slope of a function by its distance, and in `slots` the slot of the pair the
+// other way round: what both give to the row is along x_j - x_i. Distances below this, whose reciprocal is no float, give nothing.
+constexpr real LEAST_DISTANCE = DOUBLE ? real(0x1p-1022) : real(0x1p-126f);
+
 struct Kept : KeptArguments, Space {
     static constexpr real LEAST = DOUBLE ? real(0x1p-459) : real(0x1p-40f);  // below, squares of cutoffs might underflow
     real inside, outside;  // squares below are surely those of pairs, squares above surely not, where all cutoffs are one

@@ -2,9 +2,6 @@
 #pragma once
 #include "kept_cpu.h"
 
-// Each slot has the slope of a function by its distance, and in `slots` the slot of the pair the other way round: what both give to
-// the row is along x_j - x_i. Distances of 0, and those whose reciprocal is no float, give nothing.
-constexpr real LEAST_DISTANCE = DOUBLE ? real(0x1p-1022) : real(0x1p-126f);
 struct KeptSlopesArguments {
     const real *rows, *points, *cutoff, *steps;
     const int *idx, *count, *codes, *slots, *starts, *lengths;
