@@ -18,16 +18,16 @@ from jfrnn._engine import (
     Filter,
     Inputs,
     Options,
-    check_backend,
     count_rows,
     default_platform,
     fastest_engine,
     list_rows,
+    parse_backend,
 )
 from jfrnn._geometry import Cutoff, check_capacity, check_cutoff, check_flag, check_kind, check_size, check_skin
 from jfrnn._sums import pair_sum
 from jfrnn._tracing import Tree
-from jfrnn._triangles import TRIANGLE_BACKENDS, TRIANGLE_ENGINES, fastest_of, find_triangles
+from jfrnn._triangles import TRIANGLE_ENGINES, TriangleEngine, fastest_of, find_triangles
 
 Device = Any  # jax.Device, which type checkers treat as a variable
 MemoryStats = Any  # XLA's memory analysis of a compiled program
@@ -145,13 +145,13 @@ def memory_plan(
     _check_parts(faces, queries, fn, capacity, gradient or values is not None)
     if faces is not None:
         sizes = (n, check_size("faces", faces), dim, check_capacity(capacity))
-        return _plan_of_triangles(sizes, dtype, radius, backend, _device_of(where))
-    engine = check_backend(backend)
+        return _plan_of_triangles(sizes, dtype, radius, parse_backend(backend, TRIANGLE_ENGINES, " with faces"), _device_of(where))
+    named = parse_backend(backend, ENGINES)
     if fn is not None:
         points = _shapes_of(n, queries, dim, dtype)
-        return _plan_of_sum(fn, points, cutoff, values, gradient, engine, _device_of(where))
+        return _plan_of_sum(fn, points, cutoff, values, gradient, named, _device_of(where))
     capacity = None if capacity is None else check_capacity(capacity)
-    chosen = fastest_engine(_device_of(where).platform, n) if engine == "auto" else ENGINES[engine]
+    chosen = named or fastest_engine(_device_of(where).platform, n)
     scratch = chosen.scratch_bytes(where, n, rows, dim, dtype == np.float64, queries is None, radius.scaled)
     if scratch is None:
         scratch = _compiled_scratch(_shapes_of(n, queries, dim, dtype, _device_of(where)), radius, chosen, capacity)
@@ -199,18 +199,15 @@ def _compiled_scratch(points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff,
 
 
 def _plan_of_triangles(
-    sizes: tuple[int, int, int, int], dtype: np.dtype, cutoff: Cutoff, engine: str, device: Device
+    sizes: tuple[int, int, int, int], dtype: np.dtype, cutoff: Cutoff, named: TriangleEngine | None, device: Device
 ) -> MemoryPlan:
     """Compile a search of n particles for triangles, in dim dimensions, with this capacity."""
     n, faces, dim, capacity = sizes
     at = SingleDeviceSharding(device)
-    if engine not in TRIANGLE_BACKENDS:
-        raise ValueError(f"backend={engine!r} finds no triangles: pass one of {', '.join(map(repr, TRIANGLE_BACKENDS))}.")
-    auto = engine == "auto"
-    chosen = fastest_of(device.platform, fastest_engine(device.platform, n)) if auto else TRIANGLE_ENGINES[engine]
+    chosen = named or fastest_of(device.platform, fastest_engine(device.platform, n))
     points, corners = (jax.ShapeDtypeStruct((size, dim), dtype, sharding=at) for size in (n, faces // 2 + 2))
-    named: Any = jax.ShapeDtypeStruct((faces, dim), np.int32, sharding=at)
-    analysis = _analysis(find_triangles.lower(points, corners, named, None, cutoff, chosen, capacity))
+    triples: Any = jax.ShapeDtypeStruct((faces, dim), np.int32, sharding=at)
+    analysis = _analysis(find_triangles.lower(points, corners, triples, None, cutoff, chosen, capacity))
     closed = 1  # one byte for `closed`, which a separate program computes
     return MemoryPlan(int(analysis.output_size_in_bytes) + closed, int(analysis.temp_size_in_bytes), chosen.name)
 
@@ -228,7 +225,7 @@ def _plan_of_sum(
     cutoff: float,
     values: Tree,
     gradient: bool,
-    engine: str,
+    named: Engine | None,
     device: Device,
 ) -> MemoryPlan:
     """Compile a pair sum for sources and queries of these shapes, with the engine that "auto" means."""
@@ -247,8 +244,8 @@ def _plan_of_sum(
 
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), values)
     with jax.default_device(device):
-        if engine != "auto":
-            return plan(engine)
+        if named is not None:
+            return plan(named.name)
         if fastest_engine(device.platform, 1).translates:
             with contextlib.suppress(TypeError, ValueError, NotImplementedError):  # then "jax" sums it, or explains the error
                 return plan("warp")

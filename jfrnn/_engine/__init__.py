@@ -4,10 +4,10 @@ from jfrnn._engine.auto import (
     ARRAYS,
     ENGINES,
     WARP,
-    check_backend,
     choose_engine,
     default_platform,
     fastest_engine,
+    parse_backend,
     platform_of,
 )
 from jfrnn._engine.kept_warp import KeptList, kept_distances, kept_mask, kept_slopes, kept_sums

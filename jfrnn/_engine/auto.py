@@ -2,6 +2,8 @@
 
 import functools
 import warnings
+from collections.abc import Mapping
+from typing import TypeVar
 
 import jax
 from jax import Array
@@ -12,6 +14,8 @@ from jfrnn._engine.hashgrid import HashGridEngine
 from jfrnn._engine.problem import ANYTHING, Engine, Kind
 from jfrnn._engine.start import check_warp, level_of_caller
 from jfrnn._engine.warp import WarpEngine
+
+AnyEngine = TypeVar("AnyEngine")
 
 WARP, ARRAYS = WarpEngine(), ArrayEngine("jax", by_cells=True)
 ENGINES: dict[str, Engine] = {
@@ -29,34 +33,33 @@ ENGINES: dict[str, Engine] = {
 _WARP_FROM = {"cpu": 0, "gpu": 0}
 
 
-def check_backend(backend: object) -> str:
-    """Return the name of a backend, after checking that there is one."""
-    names = ("auto", *ENGINES)
+def parse_backend(backend: object, engines: Mapping[str, AnyEngine], where: str = "") -> AnyEngine | None:
+    """Return the engine of a table that a backend names, or None if it is "auto"; raise a ValueError if it is neither."""
+    names = ("auto", *engines)
     if not isinstance(backend, str) or backend not in names:
-        raise ValueError(f"backend must be one of {', '.join(map(repr, names))}, got {backend!r}.")
-    return backend
+        raise ValueError(f"backend must be one of {', '.join(map(repr, names))}{where}, got {backend!r}.")
+    return engines.get(backend)
 
 
-def choose_engine(backend: str, sources: Array, queries: Array | None, kind: Kind = ANYTHING) -> Engine:
-    """Return the engine of a backend; raise if a named engine does not support the search or cannot run on the platform.
+def choose_engine(named: Engine | None, sources: Array, queries: Array | None, kind: Kind = ANYTHING) -> Engine:
+    """Return this engine, or the fastest (None); raise if a named engine does not support the search or cannot run here.
 
     Raises:
         ImportError: it needs Warp, which is not installed.
         RuntimeError: it needs Warp, which cannot run on the platform.
         ValueError: it does not support the search.
     """
-    if backend == "auto":
+    if named is None:
         return fastest_engine(platform_of(sources, sources if queries is None else queries), sources.shape[0])
-    engine = ENGINES[check_backend(backend)]
-    if reason := engine.refuse(kind):
-        raise ValueError(f"backend={backend!r} {reason}")
-    if isinstance(engine, ArrayEngine):
-        return engine
+    if reason := named.refuse(kind):
+        raise ValueError(f"backend={named.name!r} {reason}")
+    if isinstance(named, ArrayEngine):
+        return named
     check_warp()
     platform = platform_of(sources, sources if queries is None else queries)
-    if reason := _what_is_missing(engine, platform):
-        raise RuntimeError(f"backend={backend!r} cannot run on the platform {platform!r}: {reason}. Pass backend='jax'.")
-    return engine
+    if reason := _what_is_missing(named, platform):
+        raise RuntimeError(f"backend={named.name!r} cannot run on the platform {platform!r}: {reason}. Pass backend='jax'.")
+    return named
 
 
 def fastest_engine(platform: str, sources: int) -> Engine:

@@ -30,6 +30,8 @@ class HashGridEngine:
 
     def refuse(self, kind: Kind) -> str | None:
         """Refuse what `wp.HashGrid` has no way to say."""
+        if kind.summed:
+            return "cannot sum over pairs: pass 'warp', 'jax', 'brute' or 'auto'."
         if kind.radii:
             return "takes one cutoff for all particles: pass backend='warp', 'jax' or 'brute'."
         if kind.batch:

@@ -76,6 +76,7 @@ class Kind(NamedTuple):
     periodic: bool = False
     batch: bool = False
     radii: bool = False
+    summed: bool = False
 
 
 ANYTHING = Kind()  # a search that every engine supports

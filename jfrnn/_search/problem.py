@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from jax import Array
 
-from jfrnn._engine import Filter, Inputs, Kind, Options, check_backend, choose_engine
+from jfrnn._engine import ENGINES, Filter, Inputs, Kind, Options, choose_engine, parse_backend
 from jfrnn._geometry import (
     EXCHANGED,
     Batch,
@@ -113,7 +113,7 @@ def check_problem(
     box = None if box is None else check_box(box, sources)
     images = None if box is None else images_of(box, reach, dtype, sources.shape[0])
     kind = Kind(periodic=box is not None, radii=radii is not None, batch=batch is not None)
-    engine = choose_engine(check_backend(backend), sources, queries, kind)
+    engine = choose_engine(parse_backend(backend, ENGINES), sources, queries, kind)
     systems = None if batch is None else check_batch(batch, sources, queries)
     options = Options(keep, engine, closed, 0.0 if radii is None else skin, images, reach if engine.static_radius else None)
     shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}

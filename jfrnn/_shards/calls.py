@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array, lax
 from jax.sharding import PartitionSpec
 
-from jfrnn._engine import ENGINES, Kind
+from jfrnn._engine import ENGINES, Kind, parse_backend
 from jfrnn._geometry import check_cutoff, check_flag, check_skin
 from jfrnn._search import count, list_radius, round_capacity
 from jfrnn._shards.halo import Halo, exchange, halo_in_shard, halo_spec, rows_seen
@@ -19,7 +19,7 @@ from jfrnn._shards.particles import OVERFLOWS, Particles, of_shards, spec_of
 from jfrnn._tracing import Given, Tree
 
 # The engines that support periodic boxes, which distributed particles may have.
-_BACKENDS = ("auto", *(name for name, engine in ENGINES.items() if engine.refuse(Kind(periodic=True)) is None))
+BACKENDS = {name: engine for name, engine in ENGINES.items() if engine.refuse(Kind(periodic=True)) is None}
 
 
 class Asked(NamedTuple):
@@ -35,8 +35,7 @@ class Asked(NamedTuple):
 def check_asked(particles: object, cutoff: Given, skin: object, include_self: object, closed: object, backend: Given) -> Asked:
     if not isinstance(particles, Particles):
         raise TypeError(f"particles must be what jfrnn.distributed.scatter returns, got {type(particles).__name__}.")
-    if backend not in _BACKENDS:
-        raise ValueError(f"backend must be one of {', '.join(map(repr, _BACKENDS))} on several devices, got {backend!r}.")
+    parse_backend(backend, BACKENDS, " on several devices")
     dtype = np.dtype(particles.positions.dtype)
     radius = float(check_cutoff(cutoff, dtype).radius)
     skin = check_skin(skin, radius, dtype)

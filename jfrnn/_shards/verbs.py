@@ -9,9 +9,21 @@ import jax.numpy as jnp
 from jax import Array
 from jax.core import Tracer
 
+from jfrnn._engine import parse_backend
 from jfrnn._geometry import Status, check_capacity, check_flag, check_slack, known_status
 from jfrnn._search import ROWS_ARE_WHOLE, NeighborList
-from jfrnn._shards.calls import Asked, check_asked, check_halo, count_capacity, counts, gather_seen, is_good, mark, over_shards
+from jfrnn._shards.calls import (
+    BACKENDS,
+    Asked,
+    check_asked,
+    check_halo,
+    count_capacity,
+    counts,
+    gather_seen,
+    is_good,
+    mark,
+    over_shards,
+)
 from jfrnn._shards.halo import Halo, exchange, halo_in_shard
 from jfrnn._shards.particles import Particles, of_shards
 from jfrnn._shards.sharded_list import Neighbors, list_on_shards
@@ -142,7 +154,7 @@ def pair_sum(
         if not isinstance(neighbors, Neighbors):
             raise TypeError(f"neighbors must be what jfrnn.distributed.search returns, got {type(neighbors).__name__}.")
         neighbors._check_fits(particles)
-        if cutoff is not None or include_self or closed or backend != "auto":
+        if cutoff is not None or include_self or closed or parse_backend(backend, BACKENDS) is not None:
             raise ValueError("cutoff, include_self, closed and backend were said when the list was made: leave them out.")
         if (known_status(neighbors.status) or Status.OK) & ~ROWS_ARE_WHOLE:
             neighbors.check()

@@ -250,14 +250,28 @@ class Transposed(NamedTuple):
     joint: tuple[bool, ...] = ()
 
 
+def _pull_back(
+    term: Term, linear: Groups, cotangents: tuple[bool, ...], still: Groups, real: Array, shift: Array, operands: Groups
+) -> Groups:
+    """Return the cotangents of the linear operands of one pair; `operands` are the others and then the cotangents of sums."""
+    known, cts = _halves(operands, still)
+    by_kind = {True: list(cts.shared), False: list(cts.own)}
+    ordered = [by_kind[total].pop(0) for total, there in zip(term.totals, cotangents, strict=True) if there]
+
+    def of_linear(unknown: Groups) -> list[Array]:
+        return list(compress(term(real, shift, _merge(known, unknown, linear)), cotangents))
+
+    (result,) = jax.linear_transpose(of_linear, choose(term.operands, linear))(ordered)
+    return result
+
+
 @functools.lru_cache(maxsize=256)
 def transpose(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetric: bool) -> Transposed:
     """Transpose a term in its linear operands; `cotangents` says for which sums there are any.
 
     `symmetric` means that j is a neighbor of i whenever i is one of j, and that both sides have the same kinds of operands. Then
     one term suffices: the sums for the linear operands of j are the last ones of `along`, whose operands on either side are all
-    those of i and of j. If an operand of j is the same array as one of i, its sums are added to those of i. The function is long
-    because all terms that it makes close over the same bookkeeping of operands.
+    those of i and of j. If an operand of j is the same array as one of i, its sums are added to those of i.
     """
     still = choose(term.operands, Groups(*(tuple(not flag for flag in group) for group in linear)))
     of_totals, of_sums = (
@@ -278,17 +292,7 @@ def transpose(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetri
     place = [sides.index(each.index(label)) for label in each]
     moving_i, moving_j = (tuple(compress(labels, which)) for labels, which in zip(term.labels, linear[1:], strict=True))
     joint = tuple(label in moving_i for label in moving_j)
-
-    def pull(real: Array, shift: Array, operands: Groups) -> Groups:
-        known, cts = _halves(operands, still)
-        by_kind = {True: list(cts.shared), False: list(cts.own)}
-        ordered = [by_kind[total].pop(0) for total, there in zip(term.totals, cotangents, strict=True) if there]
-
-        def of_linear(unknown: Groups) -> list[Array]:
-            return list(compress(term(real, shift, _merge(known, unknown, linear)), cotangents))
-
-        (result,) = jax.linear_transpose(of_linear, choose(term.operands, linear))(ordered)
-        return result
+    pull = functools.partial(_pull_back, term, linear, cotangents, still)
 
     def along(real: Array, shift: Array, operands: Groups) -> list[Array]:
         result = pull(real, shift, operands)

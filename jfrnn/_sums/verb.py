@@ -7,7 +7,7 @@ import jax
 from jax import Array
 from jax.tree_util import KeyPath
 
-from jfrnn._engine import ARRAYS, Inputs, Options, check_backend, platform_of
+from jfrnn._engine import ARRAYS, ENGINES, Inputs, Kind, Options, parse_backend, platform_of
 from jfrnn._geometry import Box, check_flag
 from jfrnn._search import NeighborList, check_problem
 from jfrnn._tracing import Given, Tree, on_device, own_transfers
@@ -122,20 +122,20 @@ def pair_sum(
         raise ValueError(f"reduce must be one of {', '.join(map(repr, REDUCTIONS))}, got {reduce!r}.")
     if symmetry not in SYMMETRIES:
         raise ValueError(f"symmetry must be None, 'symmetric' or 'antisymmetric', got {symmetry!r}.")
-    compensated = check_flag("compensated", compensated)
+    compensated, named = check_flag("compensated", compensated), parse_backend(backend, ENGINES)
     if neighbors is None:
         if cutoff is None:
             raise ValueError("cutoff must be given: only a list (neighbors=) has its own.")
-        if check_backend(backend) == "hashgrid":
-            raise ValueError("backend='hashgrid' cannot sum over pairs: pass 'warp', 'jax', 'brute' or 'auto'.")
+        if named is not None and (reason := named.refuse(Kind(summed=True))):
+            raise ValueError(f"backend={backend!r} {reason}")
         problem, inputs = check_problem(
             positions, cutoff, queries, box, batch, radius_rule, False, include_self, closed, backend, 0.0, active
         )
         with own_transfers():
-            pairs = pairs_of_search(inputs, _with_engine(problem.options, inputs, backend), reduce == "sum")
+            pairs = pairs_of_search(inputs, _with_engine(problem.options, inputs, named is None), reduce == "sum")
     else:
         given = {"batch": batch is not None, "radius_rule": radius_rule != "gather", "include_self": include_self}
-        given |= {"closed": closed, "active": active is not None, "backend": backend != "auto"}
+        given |= {"closed": closed, "active": active is not None, "backend": named is not None}
         with own_transfers():
             pairs = pairs_of_list(neighbors, positions, cutoff, queries, box, given, reduce != "sum" or compensated)
     if symmetry is not None and not pairs.directionless:
@@ -150,8 +150,8 @@ def pair_sum(
         return reduce_pairs(fn, pairs, mine, theirs, reduce, symmetry, compensated)
 
 
-def _with_engine(options: Options, inputs: Inputs, backend: str) -> Options:
-    """Return options with an engine that supports this search; if "auto" was asked for, the term may change the engine later."""
+def _with_engine(options: Options, inputs: Inputs, may_change: bool) -> Options:
+    """Return options with an engine that supports this search; if none was named, the term may change the engine later."""
     from jfrnn._sums.fused import refusal
 
     sources, queries = inputs.sources, inputs.queries
@@ -159,9 +159,9 @@ def _with_engine(options: Options, inputs: Inputs, backend: str) -> Options:
         return options
     platform = platform_of(sources, sources if queries is None else queries)
     reason = refusal(inputs, platform)
-    if reason is not None and backend != "auto":
+    if reason is not None and not may_change:
         raise ValueError(f"backend='warp' cannot sum over pairs {reason}: pass backend='jax'.")
-    return options._replace(may_change=backend == "auto") if reason is None else options._replace(engine=ARRAYS)
+    return options._replace(may_change=may_change) if reason is None else options._replace(engine=ARRAYS)
 
 
 def _check_values(name: str, values: Tree, size: int, what: str) -> Tree:

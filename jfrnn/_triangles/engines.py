@@ -44,7 +44,6 @@ _JAX = TriangleEngine("jax", False, sort_triangles, list_triangles, decide_pairs
 _CELLS = TriangleEngine("warp", True, sort_by_warp, *_BY_WARP)
 _TREE = TriangleEngine("bvh", True, grow_tree, *_BY_WARP)
 TRIANGLE_ENGINES = {engine.name: engine for engine in (_JAX, _CELLS, _TREE)}
-TRIANGLE_BACKENDS = ("auto", *TRIANGLE_ENGINES)
 
 # Where Warp runs: which of its two engines "auto" takes, by platform. `python -m experiments bench triangles` and `gpu
 # experiments/configs/h200_triangles.toml`, rows in experiments/results/triangles: on the CPU the tree takes 0.2 to 1.2 times as

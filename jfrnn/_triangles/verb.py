@@ -4,10 +4,10 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._engine import PLATFORMS, choose_engine, platform_of
+from jfrnn._engine import ARRAYS, PLATFORMS, WARP, choose_engine, parse_backend, platform_of
 from jfrnn._geometry import check_capacity, check_cutoff, check_is_known, check_positions, check_slack
 from jfrnn._tracing import Given, gather, make_on_host
-from jfrnn._triangles.engines import TRIANGLE_BACKENDS, TRIANGLE_ENGINES, TriangleEngine, fastest_of
+from jfrnn._triangles.engines import TRIANGLE_ENGINES, TriangleEngine, fastest_of
 from jfrnn._triangles.programs import count_slots, find_fields
 from jfrnn._triangles.triangle_list import TriangleList
 from jfrnn._triangles.winding import is_closed
@@ -108,13 +108,10 @@ def _clip(faces: Given, least: int, most: int) -> Given:
 
 def _choose_engine(backend: object, points: Array) -> TriangleEngine:
     """Return the engine of a backend; raise if it cannot run on the platform of the points."""
-    if backend not in TRIANGLE_BACKENDS:
-        raise ValueError(f"backend must be one of {', '.join(map(repr, TRIANGLE_BACKENDS))}, got {backend!r}.")
-    platform = platform_of(points)
-    if backend == "auto":
-        return fastest_of(platform, choose_engine("auto", points, None))
-    engine = TRIANGLE_ENGINES[str(backend)]
+    engine, platform = parse_backend(backend, TRIANGLE_ENGINES), platform_of(points)
+    if engine is None:
+        return fastest_of(platform, choose_engine(None, points, None))
     if engine.uses_warp and platform not in PLATFORMS:
         raise RuntimeError(f"backend={backend!r} finds triangles on the CPU and on CUDA, got {platform!r}: pass backend='jax'.")
-    choose_engine("warp" if engine.uses_warp else "jax", points, None)  # raises if Warp is needed and missing
+    choose_engine(WARP if engine.uses_warp else ARRAYS, points, None)  # raises if Warp is needed and missing
     return engine
