@@ -25,7 +25,12 @@ from jfrnn._tracing import Aval, Internal
 
 _MOST = 16  # numbers that are summed together for each particle: registers have to hold them
 _PLACE = "jfrnn sums"  # where the sums of a module are, among what JAX keeps of it while it is lowered
-_MOVABLE = ("constant", "convert", "negate", "multiply", "divide", "add", "subtract", "reshape")  # operations on single numbers
+# Operations that may stand wherever their operands are known: they do nothing but compute.
+_PURE = (
+    "constant iota convert negate not multiply divide add subtract and or select compare is_finite reshape broadcast_in_dim slice"
+)
+_ARITHMETIC = frozenset(f"stablehlo.{name}" for name in ("broadcast_in_dim", "multiply", "divide", "negate"))
+_MOVABLE = frozenset(("func.call", *(f"stablehlo.{name}" for name in _PURE.split())))
 
 ir: Internal = mlir.ir  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -41,7 +46,8 @@ class _Known(NamedTuple):
 class _Lowered:
     """A sum that stands in a program; each operation of `results` passes one of its results on."""
 
-    pairs: tuple
+    same: tuple  # for sums over the same pairs
+    pairs: list[_Known]
     term: Term
     operands: Groups
     results: list[Internal]
@@ -64,38 +70,48 @@ def lower_sum(
     pairs, rest = known[: structure.num_leaves], known[structure.num_leaves :]
     term, operands = _share_numbers(term, term.split(rest))
 
-    def place(term: Term, operands: Groups) -> list[Internal]:
+    def place(pairs: list[_Known], term: Term, operands: Groups) -> list[Internal]:
         given = [*pairs, *sum(operands, ())]
         inside = ctx.replace(avals_in=[x.aval for x in given])
         return list(lower(inside, *(x.value for x in given), term=term, structure=structure, compensated=compensated))
 
     if not is_fused(jax.tree.unflatten(structure, [x.aval for x in pairs]), term):
-        return place(term, operands)
-    same = tuple(x.value for x in pairs), structure, compensated
+        return place(pairs, term, operands)
+    same = tuple(_describe(x.value) for x in pairs), structure, compensated
     before = getattr(ctx.module_context, "lowering_cache", {}).setdefault(_PLACE, [])
     for other in reversed(before):
-        if other.pairs == same and (joined := _join(other, term, operands)) is not None:
+        if other.same == same and (joined := _join(other, term, operands)) is not None:
             with ir.InsertionPoint(other.results[0]):
-                found = place(*joined)
+                found = place(other.pairs, *joined)
             for operation, result in zip(other.results, found, strict=False):
                 operation.operands[0] = result
             results = [_pass_on(x) for x in found[len(other.results) :]]
             other.term, other.operands, other.results = *joined, other.results + results
             break
     else:
-        results = [_pass_on(x) for x in place(term, operands)]
-        before.append(_Lowered(same, term, operands, results))
+        results = [_pass_on(x) for x in place(pairs, term, operands)]
+        before.append(_Lowered(same, pairs, term, operands, results))
     return [operation.results[0] for operation in results]
 
 
 def _pass_on(value: Internal) -> Internal:
-    """Return an operation that changes nothing, whose operand can be exchanged."""
-    return ir.Operation.create("stablehlo.reshape", results=[value.type], operands=[value])
+    """Return an operation that changes nothing, whose operand can be exchanged: its axes stay as they are."""
+    axes = ir.DenseI64ArrayAttr.get(list(range(_rank(value))))
+    return ir.Operation.create("stablehlo.transpose", [value.type], [value], {"permutation": axes})
 
 
 def _operation_of(value: Internal) -> Internal:
     """Return the operation whose result a value is; None: it is an argument."""
     return getattr(value.owner, "operation", None)
+
+
+def _describe(value: Internal) -> Internal:
+    """Return what is equal for equal values: how they are computed, or the value itself. Each sum writes down its own constants."""
+    operation = _operation_of(value)
+    if operation is None or operation.name not in _MOVABLE:
+        return value
+    named = tuple((name, operation.attributes[name]) for name in operation.attributes)
+    return operation.name, named, value.type, value.result_number, tuple(map(_describe, operation.operands))
 
 
 # --- numbers that are the same in all rows ----------------------------------------------------------------------------
@@ -114,11 +130,21 @@ def _share_numbers(term: Term, operands: Groups) -> tuple[Term, Groups]:
 
 
 def _number_of(x: _Known) -> _Known | None:
-    """Return the number that is broadcast to a value, if that is what it is."""
-    operation = _operation_of(x.value)
-    if operation is None or operation.name != "stablehlo.broadcast_in_dim" or _rank(operation.operands[0]) > 0:
+    """Return the number that a value is in every place, if it was broadcast, or computed of such ones."""
+    number = _find_number(x.value)
+    return None if number is None else _Known(number, ShapedArray((), x.aval.dtype))
+
+
+def _find_number(value: Internal) -> Internal:
+    operation = _operation_of(value)
+    if _rank(value) == 0:
+        return value
+    if operation is None or operation.name not in _ARITHMETIC:
         return None
-    return _Known(operation.operands[0], ShapedArray((), x.aval.dtype))
+    numbers = [_find_number(x) for x in operation.operands]
+    if operation.name == "stablehlo.broadcast_in_dim" or any(x is None for x in numbers):
+        return numbers[0] if len(numbers) == 1 else None
+    return ir.Operation.create(operation.name, [numbers[0].type], numbers).results[0]
 
 
 def _rank(value: Internal) -> int:
@@ -163,12 +189,11 @@ def _join(first: _Lowered, term: Term, operands: Groups) -> tuple[Term, Groups] 
 
 
 def _is_known(value: Internal, at: Internal) -> bool:
-    """Say whether a value is known where an operation stands; a number that follows from constants alone is moved there."""
+    """Say whether a value is known where an operation stands; what can be computed there already is moved there."""
     operation = _operation_of(value)
     if operation is None or operation.block != at.block or operation.is_before_in_block(at):
         return True
-    movable = operation.name.removeprefix("stablehlo.") in _MOVABLE and _rank(value) == 0
-    if not movable or not all(_is_known(x, at) for x in operation.operands):
+    if operation.name not in _MOVABLE or not all(_is_known(x, at) for x in operation.operands):
         return False
     operation.move_before(at)
     return True
