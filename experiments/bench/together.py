@@ -78,20 +78,21 @@ def main(n: int, threads: int, calls: int) -> None:
     import jax
 
     searches = [_compile(jax, n, k) for k in range(threads)]
-    start, end = threading.Barrier(threads + 1), threading.Barrier(threads + 1)
+    start = threading.Barrier(threads + 1)
 
     def work(search: Callable[[], Any]) -> None:
         start.wait()
         for _ in range(calls):
             search()
-        end.wait()
 
-    for search in searches:
-        threading.Thread(target=work, args=(search,), daemon=True).start()
+    workers = [threading.Thread(target=work, args=(search,)) for search in searches]
+    for worker in workers:
+        worker.start()
     print("ready", flush=True)
     sys.stdin.readline()
     start.wait()
-    end.wait()
+    for worker in workers:
+        worker.join()
     print("done", flush=True)
 
 
