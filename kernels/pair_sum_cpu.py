@@ -58,7 +58,8 @@ class Step(NamedTuple):
 class TermText(NamedTuple):
     """A term as native text: `text` defines the `sums` from what it reads, of S, of what all pairs share, of i and of j.
 
-    A column of numbers stands for each value of the last three, and with `steps` one of turns behind those of i and of j.
+    A column of numbers stands for each value of the last three, and with `steps` one of turns behind those of i and of j. The
+    `first` ones of the sums of each i stand in an array of their own; 0: all stand in one.
     """
 
     text: str
@@ -67,6 +68,7 @@ class TermText(NamedTuple):
     own: tuple[Value, ...]
     others: tuple[Value, ...]
     sums: tuple[Sum, ...]
+    first: int = 0
 
     @property
     def columns(self) -> int:
@@ -123,6 +125,7 @@ def constants_of(term: TermText, compensated: bool, extremes: bool, turned: bool
     """
     totals = sum(part.total for part in term.sums)
     found = {"OTHERS": term.columns, "STEPS": len(term.steps), "TOTALS": totals, "ROW_SUMS": len(term.sums) - totals}
+    found["FIRST_SUMS"] = term.first or found["ROW_SUMS"]
     own = sum(value.axis is None for value in term.own) + (turned and bool(term.steps))
     return found | {"OWN": own, "COMPENSATED": compensated, "SUMS": 1 + extremes}
 

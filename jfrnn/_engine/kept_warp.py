@@ -12,7 +12,7 @@ from jax import Array, lax
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import lattice_numbers
 from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
-from jfrnn._engine.sum_results import SumsOf
+from jfrnn._engine.sum_results import FoundSums, SumsOf
 from jfrnn._geometry import EXCHANGED, LARGEST_TURN, Cutoff, Cutoffs, Lattice
 from jfrnn.kernels import kept
 from jfrnn.kernels.pair_sum_cpu import TermText
@@ -100,15 +100,15 @@ def kept_sums(
     compensated: bool,
     apart: bool = False,
     extremes: bool = False,
-) -> tuple[Array, Array, Array]:
+) -> FoundSums:
     """Sum a term over the pairs of a list, as `jfrnn._engine.warp_sums.pair_sums` does over those of a search.
 
     `apart`: a particle's pair with itself, without a shift, is left out. Of extremes, the place in the row stands for the code of
     an image.
     """
 
-    def on(cuda: bool) -> Callable[[KeptList, tuple[Array, Array, Array]], tuple[Array, Array, Array]]:
-        def call(given: KeptList, values: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def on(cuda: bool) -> Callable[[KeptList, tuple[Array, Array, Array]], FoundSums]:
+        def call(given: KeptList, values: tuple[Array, Array, Array]) -> FoundSums:
             shared, own, others = values
             rows = (given.sources if given.reversal is not None else given.rows).shape[0]
             lanes = kept.LANES if cuda else 0

@@ -262,7 +262,7 @@ def _opened() -> Desk:
     desk = open_desk(compiler().load_launcher(header), _address(_behind_desk), _MOST)
     for name, address in zip(_PLATFORMS, desk.handlers, strict=True):
         _doors[name].lead_to(address)
-    atexit.register(desk.close)
+    atexit.register(desk.close)  # who asks while the interpreter exits would wait for it, and it for them; no result is waited for
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=desk.begin_anew)
     return desk

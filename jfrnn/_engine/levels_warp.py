@@ -12,7 +12,7 @@ from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import lattice_numbers, particle_rows, periodic_kind, space_flags
 from jfrnn._engine.plans import Clear, Launch, Plan, share
 from jfrnn._engine.problem import Filter, Rows, Search
-from jfrnn._engine.sum_results import SumsOf, TermText
+from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText
 from jfrnn._geometry import GROUPS, HALVINGS, Levels
 from jfrnn.kernels import levels as level_kernels
 from jfrnn.kernels import pair_sum_levels
@@ -60,10 +60,10 @@ def level_sums(
     values: tuple[Array, Array, Array],
     compensated: bool,
     extremes: bool,
-) -> tuple[Array, Array, Array]:
+) -> FoundSums:
     """Sum a term as `jfrnn._engine.warp_sums.pair_sums` does, on the CPU, among sources that XLA has sorted."""
 
-    def sums_on_cpu(search: Search, levels: Levels, values: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def sums_on_cpu(search: Search, levels: Levels, values: tuple[Array, Array, Array]) -> FoundSums:
         (shared, own, others), (_, m) = values, search.sizes
         results = SumsOf(term, m, pair_sum_levels.slots(m), compensated, extremes)
         call = _sum_callable(_variant_of(search, keep, False, False), results, key)

@@ -9,6 +9,8 @@ from jfrnn._engine.operands import as_integer
 from jfrnn._geometry import compensated_sum, rounded_sum
 from jfrnn.kernels.pair_sum_cpu import TermText
 
+FoundSums = tuple[tuple[Array, ...], Array, Array]  # what `pair_sums` returns
+
 
 class SumsOf(NamedTuple):
     """The results of a kernel that sums a term: for each of `rows` queries, and over all pairs in `slots` partial sums."""
@@ -22,16 +24,18 @@ class SumsOf(NamedTuple):
     def dims(self) -> dict[str, Any]:
         """Return the shapes of the arrays that the kernel writes."""
         return {
-            "sums": (self.rows, max(self._width, 1)),
+            "sums": (self.rows, max(self.term.first or self._width, 1)),
             "totals": max(2 * self.slots * self._totals, 1),
+            "more": (self.rows, self._width - self.term.first) if self.term.first else (1, 1),
             "errors": max(self.rows * self._width * (2 * self.extremes + self.compensated), 1),
         }
 
-    def unpack(self, sums: Array, parts: Array, rest: Array) -> tuple[Array, Array, Array]:
+    def unpack(self, sums: Array, parts: Array, rest: Array, more: Array | None = None) -> FoundSums:
         """Return the results of `pair_sums`; partial sums over all pairs are added together with their rounding errors."""
         width, totals = self._width, self._totals
         which = as_integer(rest).reshape(self.rows, width, 2) if self.extremes else jnp.zeros((self.rows, width, 0), jnp.int32)
-        return sums, _add_parts(parts[: 2 * self.slots * totals].reshape(self.slots, 2, totals)), which
+        found = (sums,) if more is None or not self.term.first else (sums, more)
+        return found, _add_parts(parts[: 2 * self.slots * totals].reshape(self.slots, 2, totals)), which
 
     @property
     def _totals(self) -> int:

@@ -14,12 +14,13 @@ from jfrnn._engine.levels_warp import level_sums
 from jfrnn._engine.operands import pack_particles, periodic_kind, space_flags
 from jfrnn._engine.plans import Launch, Plan, share
 from jfrnn._engine.problem import Filter, Search
-from jfrnn._engine.sum_results import SumsOf, TermText
+from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText
 from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, place_launches, size_numbers, sort_on_cpu
 from jfrnn._geometry import Cutoffs
 from jfrnn.kernels import cells_cpu, cells_cuda, few_cuda, pair_sum_cpu, pair_sum_cuda
 
 _GIVEN = ("positions", "queries", "cutoff", "shared_values", "own_values", "others")  # what a call is given
+_RESULTS = ("sums", "totals", "errors", "more")  # what kernels write
 _SORTED = {False: "columns", True: "values"}  # what is known of sources, in the order of cells, on the CPU and on CUDA
 
 
@@ -49,18 +50,19 @@ def pair_sums(
     values: tuple[Array, Array, Array],
     compensated: bool,
     extremes: bool = False,
-) -> tuple[Array, Array, Array]:
+) -> FoundSums:
     """Sum a term (`jfrnn.kernels.pair_sum_cpu.TermText`, named by its key) with the columns that it reads.
 
     Returns:
-        The sums of each query [m, width]; the sums over all pairs [totals]; and for `extremes`, where sums are the largest
-        summands, their sources and the codes of their images, int32 [m, width, 2].
+        The sums of each query [m, width], or the first of them and the others in two arrays; the sums over all pairs [totals]; and
+        for `extremes`, where sums are the largest summands, their sources and the codes of their images, int32 [m, width, 2].
     """
     if isinstance(search.cutoff, Cutoffs):
-        return level_sums(search, levels_of(search), keep, term, key, values, compensated, extremes)
+        return level_sums(search, levels_of(search), keep, term._replace(first=0), key, values, compensated, extremes)
+    term = term._replace(first=0) if extremes else term
 
-    def on(cuda: bool) -> Callable[[Search, tuple[Array, Array, Array]], tuple[Array, Array, Array]]:
-        def call(search: Search, values: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def on(cuda: bool) -> Callable[[Search, tuple[Array, Array, Array]], FoundSums]:
+        def call(search: Search, values: tuple[Array, Array, Array]) -> FoundSums:
             sources, queries, cutoff, batch, torus, _ = search
             flags = (queries is None, cutoff.closed, keep.drop_self, periodic_kind(torus), batch is not None)
             double, kind = sources.dtype == jnp.float64, (compensated, extremes, key, cuda, cuda and are_few(search))
@@ -77,7 +79,7 @@ def _call_sums(
     term: TermText,
     particles: tuple[Array, Array, Array],
     values: tuple[Array, Array, Array],
-) -> tuple[Array, Array, Array]:
+) -> FoundSums:
     """Let XLA call the kernels."""
     n, m = len(particles[0]), len(particles[1])
     if variant.few:
@@ -93,14 +95,13 @@ def _call_sums(
         values = (*values, *_sorting_callable(_sorting(variant))(*particles, output_dims=of_search))
     else:
         dims |= of_search
-    sums, parts, rest, *_ = _sum_callable(variant, term)(*particles, *values, output_dims=dims)
-    return results.unpack(sums, parts, rest)
+    return results.unpack(*_sum_callable(variant, term)(*particles, *values, output_dims=dims)[: len(_RESULTS)])
 
 
 @kernel
 def _sum_callable(variant: _SumVariant, term: TermText) -> Call:
     scalar, words = np.float64 if variant.double else np.float32, {"info": np.int32, "scratch": np.int32}
-    results, of_search = dict.fromkeys(("sums", "totals", "errors", _SORTED[variant.cuda]), scalar), tuple(words)
+    results, of_search = dict.fromkeys((*_RESULTS, _SORTED[variant.cuda]), scalar), tuple(words)
     name = _name_of_sum(f"pair_sum_{'cuda' if variant.cuda else 'cpu'}", variant)
     if variant.cuda:  # particles are sorted
         return Call(name, (*_GIVEN, *of_search), results, functools.partial(_plan_on_cuda, variant, term))
@@ -110,7 +111,7 @@ def _sum_callable(variant: _SumVariant, term: TermText) -> Call:
 @kernel
 def _few_callable(variant: _SumVariant, term: TermText) -> Call:
     scalar, plan = np.float64 if variant.double else np.float32, functools.partial(_plan_few, variant, term)
-    return Call(_name_of_sum("pair_sum_few_cuda", variant), _GIVEN, dict.fromkeys(("sums", "totals", "errors"), scalar), plan)
+    return Call(_name_of_sum("pair_sum_few_cuda", variant), _GIVEN, dict.fromkeys(_RESULTS, scalar), plan)
 
 
 def _plan_few(variant: _SumVariant, term: TermText, shapes: Shapes, _: int) -> Plan:

@@ -18,6 +18,7 @@ from jax import Array
 from jfrnn._engine import (
     MOST_IN_BOX,
     PLATFORMS,
+    FoundSums,
     Inputs,
     KeptList,
     Options,
@@ -165,11 +166,17 @@ def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: 
         for k, (spec, total, mark) in enumerate(zip(translated.outputs, term.totals, term.marks, strict=True))
         for e in range(math.prod(spec.shape))
     )
-    text = TermText(translated.text, steps, values[0], values[1], values[2], sums)
+    text = TermText(translated.text, steps, values[0], values[1], values[2], sums, 0 if listed else _first_of(term))
     turns = [
         ((len(group), 0),) if steps and not listed else () for group in term.operands
     ]  # the columns of turns follow those of the operands
     return Plan(text, columns[0], columns[1] + turns[1], columns[2] + turns[2], hash_of(tuple(text), dtype.name)[:20])
+
+
+def _first_of(term: Term) -> int:
+    """Return how many of several sums of each i stand apart, so that nothing has to be cut out: those of the first summand."""
+    sizes = [math.prod(like.shape) for like, total in zip(term.summands, term.totals, strict=True) if not total]
+    return sizes[0] if 0 < sum(sizes[:1]) < sum(sizes) else 0
 
 
 def sums(inputs: Inputs, options: Options, term: Term, operands: Groups, compensated: bool) -> list[Array]:
@@ -190,7 +197,7 @@ def extremes_of_list(given: KeptList, term: Term, operands: Groups, largest: boo
     """Find the largest summands over the pairs of a list, as `extremes` does over those of a search."""
     plan = make_plan(term, *_kind_of_list(given), not largest, listed=True)
     values = _values_of_list(given, plan, operands)
-    found, _, which = kept_sums(given, plan.text, plan.key, values, False, extremes=True)
+    (found,), _, which = kept_sums(given, plan.text, plan.key, values, False, extremes=True)
     source, place, shifts = which[..., 0], which[..., 1], None
     if given.lattice is not None:
         codes = None if given.codes is None else jnp.take_along_axis(given.codes, place, axis=1)
@@ -217,7 +224,7 @@ def extremes(
             any.
     """
     search = prepare_search(inputs, options)
-    values, _, which = _launch(search, options, make_plan(term, *_kind(inputs), not largest), operands, False, extremes=True)
+    (values,), _, which = _launch(search, options, make_plan(term, *_kind(inputs), not largest), operands, False, extremes=True)
     source, shifts = which[..., 0], None
     if search.torus is not None:
         lattice, wrapped = search.torus
@@ -234,9 +241,7 @@ def _split_extremes(term: Term, values: Array, source: Array, shifts: Array | No
     return list(zip(*parts[:3], strict=True))
 
 
-def _launch(
-    search: Search, options: Options, plan: Plan, operands: Groups, compensated: bool, extremes: bool = False
-) -> tuple[Array, Array, Array]:
+def _launch(search: Search, options: Options, plan: Plan, operands: Groups, compensated: bool, extremes: bool = False) -> FoundSums:
     """Run the kernel for a prepared search with the operands that a plan needs."""
     sources, torus = search.sources, search.torus
     if torus is not None:
@@ -258,15 +263,19 @@ def _pack(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) ->
     return jnp.concatenate([flat[k][..., e : e + 1] for k, e in columns], axis=-1)
 
 
-def _unpack(term: Term, sums: Array, totals: Array) -> list[Array]:
-    """Return the sums of each summand from the columns of all summands."""
+def _unpack(term: Term, sums: tuple[Array, ...], totals: Array) -> list[Array]:
+    """Return the sums of each summand from the columns of all summands, which may stand in several arrays."""
     found, row, total = [], 0, 0
+    arrays = iter(sums)
+    rows = next(arrays)
     for like, is_total in zip(term.summands, term.totals, strict=True):
         size = math.prod(like.shape)
         if is_total:
             found.append(totals[total : total + size].reshape(like.shape))
             total += size
         else:
-            found.append(sums[:, row : row + size].reshape(-1, *like.shape))
+            if row == rows.shape[1] and size > 0:
+                rows, row = next(arrays), 0
+            found.append(rows[:, row : row + size].reshape(-1, *like.shape))
             row += size
     return found

@@ -293,10 +293,26 @@ def _summable(x: Given, dtype: np.dtype) -> Array:
     return array.astype(dtype if is_loose else array.dtype)
 
 
-@compile_program
 def _mark(leaves: list[Array], good: Array) -> list[Array]:
-    """Replace invalid rows by NaN (integers: the smallest one); their derivatives become NaN too."""
-    return [mark_rows(x, good) for x in leaves]
+    """Replace invalid rows by NaN (integers: the smallest one); their derivatives become NaN too.
+
+    Factors are made apart from the sums. So they are known before, and derivatives may be summed together with those.
+    """
+    dtypes = {np.dtype(x.dtype) for x in leaves if jnp.issubdtype(x.dtype, jnp.floating)}
+    return _multiply(leaves, good, {dtype.name: _factors(good, dtype) for dtype in dtypes})
+
+
+@functools.partial(compile_program, static_argnames=("dtype",))
+def _factors(good: Array, dtype: np.dtype) -> Array:
+    return one_or_nan(good, jax.ShapeDtypeStruct(good.shape, dtype))
+
+
+@compile_program
+def _multiply(leaves: list[Array], good: Array, factors: dict[str, Array]) -> list[Array]:
+    def spread(x: Array) -> Array:
+        return factors[np.dtype(x.dtype).name].reshape(-1, *[1] * (x.ndim - 1))
+
+    return [x * spread(x) if jnp.issubdtype(x.dtype, jnp.floating) else mark_rows(x, good) for x in leaves]
 
 
 @functools.partial(compile_program, static_argnames=("good_rows", "static"))

@@ -17,6 +17,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jfrnn._sums.fused import can_sum_list, check
+from jfrnn._sums.joint import lower_sum
 from jfrnn._sums.relations import Kept, Relation, Searched, sum_pairs
 from jfrnn._sums.terms import Derived, Groups, Term, choose, is_moving, join, tangent, transpose
 from jfrnn._tracing import (
@@ -135,7 +136,7 @@ def _batch(args: tuple, dims: tuple, **params: Internal) -> tuple[list[Array], l
 
 def _lower(ctx: Internal, *args: Internal, **params: Internal) -> Internal:
     """Trace the sums as on a single device; see `jfrnn._tracing.manual`."""
-    return lower_late(_sums)(ctx.replace(avals_in=unvarying_types(ctx.avals_in)), *args, **params)
+    return lower_sum(lower_late(_sums), ctx.replace(avals_in=unvarying_types(ctx.avals_in)), *args, **params)
 
 
 _compiled = functools.partial(compile_program, static_argnames=("term", "structure", "compensated"))(_pair_sum_p.bind)
@@ -144,4 +145,4 @@ _pair_sum_p.def_abstract_eval(_result_shapes)
 ad.primitive_jvps[_pair_sum_p] = _jvp
 ad.primitive_transposes[_pair_sum_p] = _transpose
 batching.primitive_batchers[_pair_sum_p] = _batch
-mlir.register_lowering(_pair_sum_p, _lower)
+mlir.register_lowering(_pair_sum_p, _lower, cacheable=False)  # a sum looks at those before it

@@ -23,6 +23,7 @@ constexpr int SUMS = 0;                // 1: summands are added up, 2: the large
 constexpr bool ONE_BY_ONE = false;     // candidates are met one by one
 // Of a term that is summed: columns of numbers of j and of lattice steps, numbers of i, sums over all pairs and of each i.
 constexpr int OTHERS = 1, STEPS = 0, OWN = 0, TOTALS = 1, ROW_SUMS = 1;
+constexpr int FIRST_SUMS = 1;       // of those of each i, that stand in an array of their own
 constexpr bool COMPENSATED = true;  // sums are carried in twice the precision
 constexpr bool PACKED = false;   // what is near comes together first, so that the term is evaluated for hardly more than the pairs
 constexpr bool SKIPPED = false;  // the term is not evaluated for vectors without a pair

@@ -5,7 +5,7 @@
 
 struct FewSumsArguments {
     const real *positions, *queries, *cutoff, *shared_values, *own_values, *others;
-    real *sums, *totals, *errors;
+    real *sums, *totals, *errors, *more;
     int n, m, closed, drop_self;
 };
 
@@ -35,7 +35,7 @@ struct FewSums : FewSumsArguments {
                 code = of_image;
             });
         });
-        const Results results{sums, errors, n, totals};
+        const Results results(sums, errors, n, totals, more);
         store_totals(pairs, results, reduction);
         exchange(pairs, reduction, near);
         store_row(pairs, results, reduction);

@@ -36,7 +36,7 @@ struct Sums : Walk<Sums> {
           shared_values(a.shared_values),
           own_values(a.own_values),
           values(a.values),
-          results{a.sums, a.errors, a.n, a.totals},
+          results(a.sums, a.errors, a.n, a.totals, a.more),
           code_at_home(NAMED ? (count_codes() - 1) / 2 : 0) {}
 
     JFRNN_MEMBER void open(int block) {

@@ -5,7 +5,7 @@
 
 struct SumArguments {
     const real *positions, *queries, *cutoff, *shared_values, *own_values, *columns;
-    real *sums, *totals, *errors;
+    real *sums, *totals, *errors, *more;
     int* scratch;
     int n, m, own, table, closed, drop_self;
 };
@@ -27,7 +27,7 @@ struct Sums : Walk<Sums> {
           own_values(a.own_values),
           columns(a.columns),
           term(a.shared_values),
-          results(a.sums, a.totals, a.errors, a.n) {
+          results(a.sums, a.totals, a.errors, a.n, a.more) {
         memset(column, 0, sizeof column);
         memset(candidate, 0, sizeof candidate);
         memset(doubtful, 0, sizeof doubtful);

@@ -7,6 +7,8 @@
 struct Results : SumRows {
     real* totals;
 
+    JFRNN_MEMBER Results(real* sums, real* errors, int n, real* totals, real* more = nullptr)
+        : SumRows{sums, errors, n, more}, totals(totals) {}
     // Adds numbers of all lanes, always in the same order, to the part of a block.
     JFRNN_MEMBER void add_total(int t, real sum, real error, int block, int lane) const {
         for (int step = 16; step > 0; step /= 2) {
@@ -67,14 +69,15 @@ struct Added {
 #pragma unroll
             for (int k = 0; k < SUMMANDS; ++k)
                 if (!IS_TOTAL[k])
-                    store_row(results, (long long)of.id * ROW_SUMS + PLACE[k], sum[k], error[k], of);
+                    store_row(results, PLACE[k], sum[k], error[k], of);
 #pragma unroll
         for (int k = 0; k < SUMMANDS; ++k)
             if (IS_TOTAL[k] && of.block != NO_BLOCK)
                 results.add_total(PLACE[k], sum[k], error[k], of.block, of.lane);
     }
-    JFRNN_FUNCTION void store_row(const Results& results, long long at, real sum, real error, const Destination& of) {
-        real all = of.fresh ? real(0) : results.sums[at];
+    JFRNN_FUNCTION void store_row(const Results& results, int place, real sum, real error, const Destination& of) {
+        const long long at = (long long)of.id * ROW_SUMS + place;
+        real all = of.fresh ? real(0) : results.at(of.id, place);
         real carried = of.fresh || !COMPENSATED ? real(0) : results.errors[at];
         add_number(all, carried, true, sum);
         carried += error;
@@ -82,7 +85,7 @@ struct Added {
             all += carried;
         if (COMPENSATED && !of.finished)
             results.errors[at] = carried;
-        results.sums[at] = all;
+        results.at(of.id, place) = all;
     }
 };
 

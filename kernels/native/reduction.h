@@ -5,11 +5,16 @@
 
 constexpr int SUMMANDS = TOTALS + ROW_SUMS;
 
-// Where sums of queries go, a row each. `errors` is what rounding took, in sums that are carried in twice the precision; of extremes
+// Where sums of queries go, a row each: the first ones to `sums`, those that are left to `more`. `errors` is what rounding took, in sums that are carried in twice the precision; of extremes
 // it has the source and the code of the image of each, as integers among floats.
 struct SumRows {
     real *sums, *errors;
     int n;  // sources: that number of one is none
+    real* more;
+
+    JFRNN_MEMBER real& at(long long id, int place) const {
+        return place < FIRST_SUMS ? sums[id * FIRST_SUMS + place] : more[id * (ROW_SUMS - FIRST_SUMS) + place - FIRST_SUMS];
+    }
 
     JFRNN_MEMBER void put_integer(long long at, int x) const {
         if constexpr (DOUBLE)
@@ -21,7 +26,7 @@ struct SumRows {
     // Fills the row of a query whose position is not finite, from the sum `first` on every one of `stride`.
     JFRNN_MEMBER void clear(int id, int first = 0, int stride = 1) const {
         for (int r = first; r < ROW_SUMS; r += stride)
-            sums[(long long)id * ROW_SUMS + r] = MARKED[r] ? Bits::no_number() : real(0);
+            at(id, r) = MARKED[r] ? Bits::no_number() : real(0);
         for (int r = first; SUMS == 2 && r < 2 * ROW_SUMS; r += stride)
             put_integer(2ll * ROW_SUMS * id + r, r % 2 ? 0 : n);
     }

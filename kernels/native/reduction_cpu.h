@@ -13,7 +13,7 @@ struct Results : SumRows {
     real* totals;
     real total[TOTALS + 1], total_carried[TOTALS + 1];  // of this chunk
 
-    Results(real* sums, real* totals, real* errors, int n) : SumRows{sums, errors, n}, totals(totals) {
+    Results(real* sums, real* totals, real* errors, int n, real* more = nullptr) : SumRows{sums, errors, n, more}, totals(totals) {
         for (int t = 0; t <= TOTALS; ++t)
             total[t] = total_carried[t] = 0;
     }
@@ -79,14 +79,14 @@ struct Added {
                 continue;
             }
             const long long at = (long long)id * ROW_SUMS + place;
-            real all = fresh ? real(0) : results.sums[at];
+            real all = fresh ? real(0) : results.at(id, place);
             real carried = fresh || !COMPENSATED ? real(0) : results.errors[at];
             add_lanes(sum[k], error[k], all, carried);
             if (COMPENSATED && finished && Bits::finite(all))
                 all += carried;
             if (COMPENSATED && !finished)
                 results.errors[at] = carried;
-            results.sums[at] = all;
+            results.at(id, place) = all;
         }
     }
 };

@@ -4,7 +4,7 @@
 
 struct SumsArguments {
     const real *positions, *queries, *cutoff, *shared_values, *own_values, *others;
-    real *sums, *totals, *errors, *values;
+    real *sums, *totals, *errors, *more, *values;
     int *info, *scratch;
     int n, m, own, table, closed, drop_self;
 

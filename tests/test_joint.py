@@ -1,0 +1,109 @@
+"""Sums over the same pairs, which become one sum while a program is lowered; the engine "brute" takes them one by one."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jfrnn
+
+N, CUTOFF = 60, 0.35
+X = np.random.default_rng(0).random((N, 3))
+M = np.random.default_rng(1).random(N)
+
+
+def energy(r, i, j):
+    return i["m"] * j["m"] * jnp.maximum(1 - (r @ r) / CUTOFF**2, 0) ** 3
+
+
+def density(x, m, backend="warp", **options):
+    return jfrnn.pair_sum(energy, x, CUTOFF, {"m": m}, backend=backend, **options)
+
+
+def count_calls(function, *args):
+    return jax.jit(function).lower(*args).compile().as_text().count('custom_call_target="jfrnn"')
+
+
+def assert_near(found, expected):
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=2e-5), found, expected)
+
+
+def density_and_force(x, m, backend="warp", **options):
+    rho, back = jax.vjp(lambda x: density(x, m, backend, **options), x)
+    return rho, back(jnp.ones_like(rho))[0]
+
+
+def energies(x, m, backend="warp", **options):
+    """Return the energy, half the sum, with its derivatives."""
+    return jax.value_and_grad(lambda x, m: 0.5 * density(x, m, backend, **options).mean(), (0, 1))(x, m)
+
+
+def pressure(x, m, backend="warp", **options):
+    """Return what needs the densities of i and j before it can be summed."""
+    return jax.value_and_grad(lambda x: (density(x, m, backend, **options) ** 2).sum())(x)
+
+
+def several(x, m, backend="warp", **options):
+    """Return three sums over the same pairs, one of which takes a number that the program computes before."""
+    scale = jnp.exp(m.sum())
+    one = jfrnn.pair_sum(lambda r, i, j: r @ r, x, CUTOFF, backend=backend, **options)
+    two = jfrnn.pair_sum(
+        lambda r, i, j: (j, scale * r), x, CUTOFF, jnp.arange(float(N)).astype(x.dtype), backend=backend, **options
+    )
+    return one, two, density(x, m, backend, **options)
+
+
+@pytest.mark.parametrize(
+    ("function", "calls"), [(energies, 1), (pressure, 2), (several, 1)], ids=["energies", "pressure", "several"]
+)
+@pytest.mark.parametrize("kind", ["open", "box", "compensated"])
+def test_sums_are_joined_and_right(function, calls, kind):
+    x, m = jnp.asarray(X, jnp.float32), jnp.asarray(M, jnp.float32)
+    options = {"open": {}, "box": {"box": jfrnn.Box([1.0] * 3)}, "compensated": {"compensated": True}}[kind]
+    found = jax.jit(functools.partial(function, **options))(x, m)
+    assert_near(found, jax.jit(functools.partial(function, backend="brute", **options))(x, m))
+    assert count_calls(functools.partial(function, **options), x, m) == calls
+
+
+def test_a_step_of_a_scan_finds_pairs_once():
+    def step(x, _):
+        rho, force = density_and_force(x, jnp.asarray(M, x.dtype))
+        return x + 1e-3 * force, rho
+
+    x = jnp.asarray(X, jnp.float32)
+    assert count_calls(lambda x: jax.lax.scan(step, x, None, length=3), x) == 1
+    moved, rhos = jax.jit(lambda x: jax.lax.scan(step, x, None, length=3))(x)
+    with jax.disable_jit():
+        expected = jax.lax.scan(step, x, None, length=3)
+    assert_near((moved, rhos), expected)
+
+
+def test_derivatives_of_joined_sums():
+    x, m = jnp.asarray(X, jnp.float32), jnp.asarray(M, jnp.float32)
+    along = jnp.asarray(np.random.default_rng(2).normal(size=(N, 3)), jnp.float32)
+
+    def curvature(backend):
+        return lambda x: jax.jvp(lambda x: energies(x, m, backend), (x,), (along,))
+
+    assert_near(jax.jit(curvature("warp"))(x), jax.jit(curvature("brute"))(x))
+    assert_near(jax.jit(jax.hessian(lambda x: energies(x, m)[0]))(x), jax.jit(jax.hessian(lambda x: energies(x, m, "brute")[0]))(x))
+
+
+def test_invalid_rows_stay_marked():
+    x, m = jnp.asarray(X, jnp.float32).at[7, 1].set(jnp.nan), jnp.asarray(M, jnp.float32)
+    found, expected = jax.jit(density_and_force)(x, m), density_and_force(x, m, "brute")
+    assert np.isnan(found[0][7]) and np.isnan(found[1][7]).all()
+    assert_near(found, expected)
+
+
+def test_more_numbers_than_are_summed_together_stay_apart():
+    x = jnp.asarray(X, jnp.float32)
+
+    def both(x):
+        return [jfrnn.pair_sum(lambda r, i, j, k=k: jnp.tile(r * k, 3), x, CUTOFF, backend="warp") for k in (1.0, 2.0)]
+
+    assert count_calls(both, x) == 2
+    one, two = jax.jit(both)(x)
+    assert_near(two, 2 * one)
