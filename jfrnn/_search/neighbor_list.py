@@ -315,8 +315,8 @@ class NeighborList(ListExports):
         Args:
             positions: As in `vectors`.
             total: Number of edges, a static int up to 2³¹ - 1. If there are more pairs, this raises outside jit. Inside jit, all
-                displacements are NaN then, and `status` and `pair_count` say so; `require(total)` makes the list keep such a bit, of all
-                pairs that it holds, those of the skin included.
+                displacements are NaN then, and `status` and `pair_count` say so; `require(total)` makes the list keep such a bit,
+                of all pairs that it holds, those of the skin included.
             queries: As in `vectors`.
             box: As in `vectors`.
 
