@@ -10,31 +10,37 @@ import jfrnn
 
 
 def dense(nbrs, vectors, mask, shifts):
-    """Return senders, receivers, displacements, shifts and mask of all used slots, row by row."""
-    idx = np.asarray(nbrs.idx)
-    i, k = np.nonzero(idx < nbrs.source_count)
-    return idx[i, k], i, np.asarray(vectors)[i, k], np.asarray(shifts)[i, k], np.asarray(mask)[i, k]
+    """Return senders, receivers, displacements and shifts of all pairs closer than the cutoff, row by row."""
+    i, k = np.nonzero(mask)
+    return np.asarray(nbrs.idx)[i, k], i, np.asarray(vectors)[i, k], np.asarray(shifts)[i, k]
 
 
 @pytest.mark.parametrize("kind", lists.KINDS)
 @pytest.mark.parametrize("box", lists.BOXES)
 def test_edges_are_the_pairs(kind, box):
     nbrs, x, q = lists.make(kind, "warp", box, skin=0.05)
-    held, (m, n) = int((np.asarray(nbrs.idx) < len(x)).sum()), (nbrs.idx.shape[0], len(x))
+    (m, n), total = (nbrs.idx.shape[0], len(x)), int(nbrs.count.sum()) + 9
+    x = x + 0.01 * jnp.sin(50 * x)  # with pairs of the skin in the midst of rows
 
     @jax.jit
     def all_of(nbrs, x, q):
-        return nbrs.edges(x, held + 9, queries=q), (*nbrs.vectors(x, queries=q), nbrs.shifts(x, queries=q))
+        geometry = *nbrs.vectors(x, queries=q), nbrs.shifts(x, queries=q)
+        return nbrs.edges(x, total, queries=q), geometry, nbrs.pairs(total, positions=x, queries=q)
 
-    edges, geometry = all_of(nbrs, x, q)
+    edges, geometry, pairs = all_of(nbrs, x, q)
     expected = dense(nbrs, *geometry)
+    held = len(expected[0])
+    assert 0 < held < total - 9
+    np.testing.assert_array_equal(pairs, (edges.receivers, edges.senders))
+    np.testing.assert_array_equal(nbrs.pairs(positions=x, queries=q), expected[1::-1])
     for found, right in zip(edges, expected, strict=False):
         np.testing.assert_allclose(found[:held], right, atol=1e-15)
     assert (edges.senders[held:] == n).all()
     assert (edges.receivers[held:] == m).all()
-    assert not np.asarray(edges.mask)[held:].any()
-    assert not np.asarray(edges.displacement)[held:].any()
-    assert int(edges.status) == 0
+    assert (np.flatnonzero(edges.mask) == np.arange(held)).all()
+    assert not any(np.asarray(part)[held:].any() for part in (edges.displacement, edges.distance, edges.shift))
+    np.testing.assert_allclose(edges.distance, np.linalg.norm(edges.displacement, axis=1), atol=1e-15)
+    assert (int(edges.status), int(edges.pair_count)) == (0, held)
     assert (np.diff(edges.receivers) >= 0).all()
 
 
@@ -83,7 +89,9 @@ def test_too_many_pairs_are_never_silent():
     for total in (held - 1, 0):
         edges = jax.jit(lambda nbrs, x, total=total: nbrs.edges(x, total))(nbrs, x)
         assert int(edges.status) == jfrnn.Status.TOTAL_OVERFLOW
+        assert int(edges.pair_count) == held
         assert np.isnan(edges.displacement).all()
+        assert np.isnan(edges.distance).all()
 
 
 def test_sums_by_receiver():
@@ -97,6 +105,38 @@ def test_sums_by_receiver():
         return jax.ops.segment_sum(messages, edges.receivers, len(x), indices_are_sorted=True)
 
     np.testing.assert_allclose(sums(nbrs, x), jfrnn.pair_sum(lambda r, i, j: jnp.sum(r**2), x, None, neighbors=nbrs), rtol=1e-12)
+
+
+@pytest.mark.parametrize("box", ["open", "images"])
+def test_a_graph_has_two_graphs(box):
+    nbrs, x, _ = lists.make("full", "warp", box, skin=0.05)
+    edges, graph = nbrs.edges(x, 2000), jax.jit(lambda nbrs, x: nbrs.to_jraph(x, 2000))(nbrs, x)
+    assert graph._fields == ("nodes", "edges", "receivers", "senders", "globals", "n_node", "n_edge")
+    assert graph.n_node.tolist() == [len(x), 1]
+    assert graph.n_edge.tolist() == [int(edges.pair_count), 2000 - int(edges.pair_count)]
+    np.testing.assert_array_equal(graph.nodes["positions"], np.concatenate([x, np.zeros((1, 3))]))
+    found = graph.senders, graph.receivers, *(graph.edges[name] for name in ("displacement", "shift", "distance"))
+    right = edges.senders, edges.receivers, edges.displacement, edges.shift, edges.distance
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-15), found, right)
+    for asked, message in (({"queries": x}, "this list has queries"), ({}, "total must be a static int")):
+        with pytest.raises((ValueError, TypeError), match=message):
+            jfrnn.search(x, 0.2, **asked).to_jraph(x, None)
+
+
+def test_a_graph_is_one_of_jraph():
+    jraph = pytest.importorskip("jraph")
+    nbrs, x, _ = lists.make("full", "warp")
+    graph = nbrs.to_jraph(x, 2000)
+    assert graph._fields == jraph.GraphsTuple._fields
+    net = jraph.InteractionNetwork(
+        lambda edges, senders, receivers: edges["distance"] ** 2,
+        lambda nodes, messages: messages,
+        include_sent_messages_in_node_update=False,
+    )
+    sums = jfrnn.pair_sum(lambda r, i, j: jnp.sum(r**2), x, None, neighbors=nbrs)
+    np.testing.assert_allclose(net(graph).nodes[: len(x)], sums, rtol=1e-12)
+    whole = jraph.unpad_with_graphs(graph)
+    assert (len(whole.senders), whole.n_node.tolist()) == (int(nbrs.count.sum()), [len(x)])
 
 
 def test_vmap():

@@ -22,7 +22,21 @@ ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
 TOP = ("run", "report", "merge", "list", "show", "export", "gpu", "bench", "sph")
 BENCH = (
-    *("crossover", "distributed", "domain", "house", "arrays", "latency", "lj", "options", "peers", "skin", "start", "sums"),
+    *(
+        "crossover",
+        "distributed",
+        "domain",
+        "house",
+        "arrays",
+        "latency",
+        "lj",
+        "options",
+        "peers",
+        "skin",
+        "start",
+        "structures",
+        "sums",
+    ),
     *("ties", "triangles", "use"),
 )
 SPH = ("run", "validate", "speed", "gradients")
@@ -63,7 +77,7 @@ def test_the_list_of_commands_fits_a_screen(group, names):
 def test_help_keeps_what_stands_in_brackets(command):
     units = {"show": ["[m]"], "export": ["[m]"], "run": ["[s]"], "bench skin": ["[m]"], "bench domain": ["[cutoffs]"]}
     units |= {"bench triangles": ["[modules]"], "bench peers": ["[s]", "'.[peers]'"]}
-    units |= {"bench latency": ["[µs]"], "bench start": ["[s]"]}
+    units |= {"bench latency": ["[µs]"], "bench start": ["[s]"], "bench structures": ["angstrom"]}
     text = told(*command.split(), "--help")
     assert text.startswith(f"Usage: python -m experiments {command} ")
     assert [unit for unit in units.get(command, []) if unit not in text] == []

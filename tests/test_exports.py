@@ -27,9 +27,6 @@ def test_exports_of_static_length(total):
     found_offsets, found_indices = jax.jit(lambda nbrs: nbrs.csr(total))(nbrs)
     np.testing.assert_array_equal(found_offsets, offsets)
     np.testing.assert_array_equal(found_indices, np.concatenate([indices[:kept], np.full(total - kept, 50)]))
-    senders, receivers = jax.jit(lambda nbrs: nbrs.to_jraph(total))(nbrs)
-    np.testing.assert_array_equal(senders, sources)
-    np.testing.assert_array_equal(receivers, rows)
     assert {rows.dtype, sources.dtype, found_offsets.dtype, found_indices.dtype} == {np.dtype(np.int32)}
 
 
@@ -84,10 +81,10 @@ def test_all_that_leaves_a_list_says_the_same_pairs(kind):
     np.testing.assert_allclose(vectors[used], np.where(mask[used][:, None], apart, 0), atol=1e-6)
     if "skin" in KINDS.get(kind, {}):
         assert (used & ~mask).any()  # the skin holds pairs, which `pairs` lists and whose shifts are known
-    if nbrs.images is None:
-        senders, receivers = nbrs.to_jraph(total)
-        np.testing.assert_array_equal(senders, sources)
-        np.testing.assert_array_equal(receivers, rows)
+    near = i[mask[used]], j[mask[used]]
+    np.testing.assert_array_equal(nbrs.pairs(positions=X, **given), near)
+    np.testing.assert_array_equal(nbrs.csr(positions=X, **given)[1], near[1])
+    np.testing.assert_array_equal(np.stack(nbrs.pairs(total, positions=X, **given))[:, : len(near[0])], near)
 
 
 def test_a_pair_in_the_skin_has_its_shift():
@@ -99,28 +96,18 @@ def test_a_pair_in_the_skin_has_its_shift():
     assert not nbrs.distances(x)[1].any()
 
 
-def test_edges_of_images_are_refused_and_the_message_says_how_to_get_them():
+def test_edges_of_images_have_their_shifts():
     x = jnp.asarray([[0.5, 0.5, 0.5], [0.9, 0.5, 0.5]], jnp.float32)
-    box = jfrnn.Box([1.0, 1.0, 1.0])
-    nbrs, total = jfrnn.search(x, 1.1, box=box), 64
-    with pytest.raises(
-        ValueError, match=r"without lattice shifts.*jnp.nonzero\(nbrs.idx < nbrs.source_count, size=total"
-    ) as refused:
-        nbrs.to_jraph(total)
-    assert "nbrs.shifts(positions).at[i, k]" in str(refused.value)
+    graph = jfrnn.search(x, 1.1, box=jfrnn.Box([1.0, 1.0, 1.0])).to_jraph(x, 64)
+    count = int(graph.n_edge[0])
+    found = zip(*(part[:count].tolist() for part in (graph.receivers, graph.senders)), map(tuple, graph.edges["shift"].tolist()))
+    expected = reference.reference_images(np.asarray(x), 1.1, matrix=np.eye(3), periodic=(True,) * 3)
+    assert (set(found), count) == (expected, len(expected))
 
-    @jax.jit
-    def edges(nbrs, positions):
-        i, k = jnp.nonzero(nbrs.idx < nbrs.source_count, size=total, fill_value=len(nbrs.idx))
-        senders = nbrs.idx.at[i, k].get(mode="fill", fill_value=nbrs.source_count)
-        return senders, i, nbrs.shifts(positions).at[i, k].get(mode="fill", fill_value=0)
 
-    senders, receivers, shifts = (np.asarray(part) for part in edges(nbrs, x))
-    real = receivers < 2
-    assert (senders[~real] == 2).all()
-    found = set(zip(receivers[real].tolist(), senders[real].tolist(), map(tuple, shifts[real].tolist()), strict=True))
-    assert found == reference.reference_images(np.asarray(x), 1.1, matrix=np.eye(3), periodic=(True,) * 3)
-    assert len(found) == real.sum()
+def test_where_pairs_are_needs_positions():
+    with pytest.raises(TypeError, match=r"queries tell where pairs are now.*pass positions="):
+        jfrnn.search(X, 0.3).pairs(queries=X)
 
 
 def test_rows_that_overflowed_export_what_they_hold_and_carry_the_status():
@@ -136,7 +123,7 @@ def test_rows_that_overflowed_export_what_they_hold_and_carry_the_status():
 
 
 @pytest.mark.parametrize(
-    "leave", [lambda n: n.pairs(900), lambda n: n.csr(900), lambda n: n.to_jraph(900), lambda n: n.to_jax_md()]
+    "leave", [lambda n: n.pairs(900), lambda n: n.csr(900), lambda n: n.to_jraph(X, 900), lambda n: n.to_jax_md()]
 )
 def test_a_list_that_is_not_whole_does_not_leave(leave):
     nbrs = jfrnn.search(X, 0.3, capacity=4)
@@ -148,7 +135,7 @@ def test_a_list_that_is_not_whole_does_not_leave(leave):
     leave(nbrs.grow(X))
 
 
-EXPORTS = {"pairs": lambda n, t: n.pairs(t), "csr": lambda n, t: n.csr(t), "to_jraph": lambda n, t: n.to_jraph(t)}
+EXPORTS = {"pairs": lambda n, t: n.pairs(t), "csr": lambda n, t: n.csr(t), "to_jraph": lambda n, t: n.to_jraph(X, t).receivers}
 
 
 @pytest.mark.parametrize("export", EXPORTS)
@@ -157,7 +144,8 @@ def test_a_total_that_is_too_small_raises_outside_jit(export):
     held = len(nbrs.pairs()[0])
     with pytest.raises(ValueError, match=rf"total=100 is too small: the list holds {held} pairs. Pass total={held} or more"):
         EXPORTS[export](nbrs, 100)
-    assert len(EXPORTS[export](nbrs, held)[1]) == held
+    out = EXPORTS[export](nbrs, held)
+    assert len(out[1] if isinstance(out, tuple) else out) == held
 
 
 def test_a_total_that_is_too_small_sets_a_bit_that_stays():
@@ -235,7 +223,7 @@ def test_vmap_equals_a_loop():
 
 def test_a_sum_over_edges_is_the_sum_over_slots():
     nbrs = jfrnn.search(X, 0.3)
-    senders, receivers = nbrs.to_jraph(1000)
+    receivers, senders = nbrs.pairs(1000)
     degree = jax.ops.segment_sum(jnp.ones(1000), receivers, num_segments=51)
     np.testing.assert_array_equal(degree[:50], nbrs.count)
     assert int((senders == 50).sum()) == 1000 - int(nbrs.count.sum())

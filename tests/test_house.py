@@ -20,7 +20,7 @@ FLOORS = (  # from the lowest: a package or module of the library imports only f
     {"_search"},
     {"_sums", "_triangles"},
     {"_shards", "_memory"},
-    {"distributed", ""},  # "": the public names
+    {"distributed", "ase", "jax_md", ""},  # "": the public names
 )
 ALLOWED = {  # first-party and third-party modules that each folder may import
     "kernels": {"warp"},

@@ -73,7 +73,8 @@ def listed(names="", backend="warp", cutoff=CUTOFF, rule="gather", x="x"):
     now = places | {key: options[key] for key in ("active",) if key in options}
     total = 256
     asked = [nbrs.overflow, nbrs.pairs(), nbrs.csr(), nbrs.pairs(total), nbrs.csr(total), nbrs.require(total).status]
-    asked += [nbrs.to_jraph(total)] if nbrs.images is None else []
+    asked += [nbrs.edges(x, total, **places), nbrs.pairs(total, positions=x, **places)]
+    asked += [] if places or "active" in options else [nbrs.to_jraph(x, total)]  # hidden positions are not finite
     asked += [nbrs.vectors(x, **places), nbrs.distances(x, **places), nbrs.shifts(x, **places)]
     asked += [nbrs.rebuild_count] if "skin" in options else []
     return nbrs, nbrs.update(x, **now), nbrs.grow(x, **now), asked

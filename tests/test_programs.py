@@ -89,7 +89,7 @@ def test_what_is_asked_of_a_list_of_a_new_size_compiles_one_program_each():
     assert compiled_by(nbrs.check) == compiled_by(nbrs.pairs) == compiled_by(nbrs.csr) == compiled_by(nbrs.grow, x) == 0
     total = len(nbrs.pairs()[0])
     assert compiled_by(nbrs.pairs, total) == 2
-    assert compiled_by(nbrs.csr, total) == compiled_by(nbrs.to_jraph, total) == 0
+    assert compiled_by(nbrs.csr, total) == 0
     assert compiled_by(nbrs.shifts, x) == 1
     assert compiled_by(nbrs.vectors, x) == 1
     assert compiled_by(nbrs.distances, x) == 1  # and the program of vectors

@@ -56,7 +56,7 @@ FUNCTIONS = {
     "overflow": lambda x: jfrnn.search(x, CUTOFF, capacity=2, backend="warp").overflow,
     "pairs": lambda x: LISTS["half"](x).pairs(200),
     "csr": lambda x: LISTS["open"](x).csr(300),
-    "to_jraph": lambda x: LISTS["open"](x).to_jraph(300),
+    "to_jraph": lambda x: LISTS["open"](x).to_jraph(x, 300),
     "edges": lambda x: LISTS["open"](x).edges(x, 300),
     "require": lambda x: LISTS["open"](x).require(200),
     "to_jax_md": lambda x: LISTS["open"](x).to_jax_md(),

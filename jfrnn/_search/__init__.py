@@ -1,6 +1,7 @@
 """Searches and counts, the neighbor list, its geometry and its exports."""
 
 from jfrnn._search.chunks import run_chunk
+from jfrnn._search.edges import flatten
 from jfrnn._search.exports import MOST_PAIRS, saturating_add
 from jfrnn._search.geometry import is_native, kept_list, kept_shifts, norms
 from jfrnn._search.making import round_capacity

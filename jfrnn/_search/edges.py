@@ -8,7 +8,8 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry import Box, Images, Status, given_shifts, make_lattice, translation
-from jfrnn._search.exports import flat_pairs, pair_total
+from jfrnn._search.exports import flat_pairs, row_offsets
+from jfrnn._search.geometry import norms
 from jfrnn._search.reverse import Reverse
 from jfrnn._search.topology import Topology
 from jfrnn._tracing import compile_program
@@ -22,9 +23,11 @@ class Edges(NamedTuple):
         receivers: Particles (or queries) i in ascending order, shape [total], int32.
         displacement: x_j - x_i [length], in a box plus the lattice translation of the image, shape [total, d]; 0 where `mask` is
             not set, and NaN everywhere if pairs are missing because there are more of them than `total`.
-        shift: Lattice shifts S, shape [total, d], int32.
-        mask: Whether an edge is a pair that is closer than the cutoff, exactly, shape [total], bool.
+        shift: Lattice shifts S, shape [total, d], int32; 0 where `mask` is not set.
+        mask: Whether an edge is a pair, shape [total], bool: the first `pair_count` edges are, all others are padding.
         status: Bits of `Status` of the list, with `Status.TOTAL_OVERFLOW` if pairs are missing, shape [], int32.
+        distance: Length of the displacement, shape [total]; 0 where `mask` is not set, and NaN where the displacement is.
+        pair_count: The true number of pairs, shape [], int32; it may exceed `total`.
     """
 
     senders: Array
@@ -33,12 +36,84 @@ class Edges(NamedTuple):
     shift: Array
     mask: Array
     status: Array
+    distance: Array
+    pair_count: Array
+
+
+class Graph(NamedTuple):
+    """A graph in the form of jraph's `GraphsTuple`: the same fields in the same order, which its models read and replace.
+
+    It holds two graphs, as after `jraph.pad_with_graphs`: that of the particles, and one of a single node with all padding edges.
+
+    Attributes:
+        nodes: {"positions": [n + 1, d]}, 0 in the last row, the node of the padding.
+        edges: {"displacement": [total, d], "distance": [total], "shift": [total, d] int32}; 0 in padding edges.
+        receivers: Particles i in ascending order, shape [total], int32; n in padding edges.
+        senders: Neighbors j, shape [total], int32; likewise.
+        globals: None.
+        n_node: [n, 1], int32.
+        n_edge: The number of pairs and of padding edges, shape [2], int32.
+    """
+
+    nodes: dict[str, Array]
+    edges: dict[str, Array]
+    receivers: Array
+    senders: Array
+    globals: None
+    n_node: Array
+    n_edge: Array
+
+
+@compile_program
+def make_graph(edges: Edges, positions: Array) -> Graph:
+    """Return the graph of the edges among n particles at these positions [n, d]."""
+    total, held = len(edges.senders), jnp.minimum(edges.pair_count, len(edges.senders))
+    nodes = {"positions": jnp.pad(positions, ((0, 1), (0, 0)))}
+    of_edges = {"displacement": edges.displacement, "distance": edges.distance, "shift": edges.shift}
+    sizes = jnp.array([len(positions), 1], jnp.int32), jnp.stack([held, total - held])
+    return Graph(nodes, of_edges, edges.receivers, edges.senders, None, *sizes)
+
+
+class Flat(NamedTuple):
+    """The set slots of rows [m, capacity], one after another.
+
+    Attributes:
+        rows: The row of each, shape [total], int32; m in the padding.
+        slots: Row * capacity + its place in the row, shape [total], int32; 0 in the padding.
+        offsets: The start of each row and the end of the last, shape [m + 1], int32.
+        edges: Which of these each slot is, shape [m * capacity], int32; `total` for slots that are not set, or beyond.
+    """
+
+    rows: Array
+    slots: Array
+    offsets: Array
+    edges: Array
+
+
+def flatten(mask: Array, total: int) -> Flat:
+    """Put the set slots of a mask [m, capacity] one after another, in arrays of a static length."""
+    m, capacity = mask.shape
+    ranks = jnp.cumsum(mask, axis=1, dtype=jnp.int32)
+    offsets = row_offsets(ranks[:, -1], capacity)
+    edges = jnp.where(mask, jnp.minimum(offsets[:-1, None] + ranks - 1, total), total).reshape(-1)
+    slots = jnp.zeros(total, jnp.int32).at[edges].set(lax.iota(jnp.int32, mask.size), mode="drop")
+    rows = jnp.where(lax.iota(jnp.int32, total) < offsets[-1], slots // capacity, m)
+    return Flat(rows, slots, offsets, edges)
+
+
+@functools.partial(compile_program, static_argnames=("sources", "total"))
+def flat_pairs_of(idx: Array, mask: Array, sources: int, total: int) -> tuple[Array, Array, Array, Array]:
+    """Return what `flat_pairs` does, of the slots that are set in a mask [m, capacity], and their number."""
+    if 0 in (*idx.shape, total):
+        rows, indices, offsets = flat_pairs(idx, mask.sum(1, dtype=jnp.int32), sources, total)
+        return rows, indices, offsets, offsets[-1]
+    flat = flatten(mask, total)
+    return flat.rows, jnp.where(flat.rows < len(idx), idx.reshape(-1)[flat.slots], sources), flat.offsets, flat.offsets[-1]
 
 
 @functools.partial(compile_program, static_argnames=("kind", "total"))
 def flat_edges(
     topology: Topology,
-    count: Array,
     status: Array,
     mask: Array,
     shifts: Array | None,
@@ -52,49 +127,43 @@ def flat_edges(
     from jfrnn._search.gathers import gather
 
     (m, capacity), dim = topology.idx.shape, sources.shape[1]
-    receivers, senders, offsets = flat_pairs(topology.idx, count, topology.sources, total)
-    slot = receivers * capacity + lax.iota(jnp.int32, total) - offsets.at[receivers].get(mode="clip")
-    there = receivers < m
-    of_edge = functools.partial(_take, slot=jnp.where(there, slot, 0))
-    real = there & of_edge(mask)
-    ends = _by_sender(topology, offsets, total), _by_row(offsets, capacity, total)
+    flat = flatten(mask, total)
+    real = flat.rows < m
+    senders = jnp.where(real, topology.idx.reshape(-1)[flat.slots], topology.sources)
+    ends = _by_sender(topology, flat.edges, total), _by_row(flat.offsets, capacity, total)
     sides = [
         gather(points, Topology(named[:, None], None, end, len(points), 1, end.starts is None, topology.native))[:, 0]
-        for points, named, end in zip((sources, rows), (senders, receivers), ends, strict=True)
+        for points, named, end in zip((sources, rows), (senders, flat.rows), ends, strict=True)
     ]
     displacement, shift = sides[0] - sides[1], jnp.zeros((total, dim), jnp.int32)
     if shifts is not None and box is not None and kind is not None:
-        whole = jnp.where(there[:, None], of_edge(shifts), 0)
+        whole = jnp.where(real[:, None], shifts.reshape(-1, dim)[flat.slots], 0)
         displacement = displacement + translation(whole, make_lattice(box, kind, np.dtype(sources.dtype)))
         shift = given_shifts(whole, kind)
-    missing = offsets[-1] > total
-    displacement = jnp.where(missing, jnp.nan, jnp.where(real[:, None], displacement, 0))
+    missing = flat.offsets[-1] > total
+    displacement = jnp.where(real[:, None], displacement, 0).astype(sources.dtype)
+    distance, displacement = (jnp.where(missing, jnp.nan, x) for x in (norms(displacement), displacement))
     status = status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
-    return Edges(senders, receivers, displacement.astype(sources.dtype), shift, real, status)
+    return Edges(senders, flat.rows, displacement, shift, real, status, distance, flat.offsets[-1])
 
 
-def no_edges(m: int, sources: int, points: Array, status: Array, count: Array, capacity: int, total: int) -> Edges:
+def no_edges(mask: Array, sources: int, points: Array, status: Array, total: int) -> Edges:
     """Return the edges of a list that holds none, or of which none is asked for."""
-    missing = pair_total(count, capacity) > total
-    status = status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
+    count = jnp.sum(mask, dtype=jnp.int32)
+    status = status | jnp.where(count > total, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
     displacement = jnp.zeros((total, points.shape[1]), points.dtype)
-    ends = jnp.full(total, sources, jnp.int32), jnp.full(total, m, jnp.int32)
-    return Edges(*ends, displacement, displacement.astype(jnp.int32), jnp.zeros(total, bool), status)
+    ends = jnp.full(total, sources, jnp.int32), jnp.full(total, len(mask), jnp.int32)
+    shift, none = displacement.astype(jnp.int32), jnp.zeros(total, bool)
+    return Edges(*ends, displacement, shift, none, status, displacement[:, 0], count)
 
 
-def _take(x: Array, slot: Array) -> Array:
-    return x.reshape(-1, *x.shape[2:]).at[slot].get(mode="clip")
-
-
-def _by_sender(topology: Topology, offsets: Array, total: int) -> Reverse:
+def _by_sender(topology: Topology, edges: Array, total: int) -> Reverse:
     """Return the edges of each source, from its slots."""
-    reverse, (m, capacity) = topology.with_reverse(), topology.idx.shape
-    row = jnp.minimum(reverse.slots // capacity, m - 1)
-    edge = jnp.where(reverse.slots < m * capacity, offsets[row] + reverse.slots - row * capacity, total)
-    return reverse._replace(slots=jnp.minimum(edge, total))
+    reverse = topology.with_reverse()
+    return reverse._replace(slots=edges.at[reverse.slots].get(mode="fill", fill_value=total))
 
 
 def _by_row(offsets: Array, capacity: int, total: int) -> Reverse:
     """Return the edges of each row, which follow each other."""
-    edge = offsets[:-1, None] + lax.iota(jnp.int32, capacity)
+    edge = offsets[:-1, None] + lax.iota(jnp.int32, capacity)[None]
     return Reverse(jnp.where(edge < offsets[1:, None], jnp.minimum(edge, total), total))

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.core import Tracer
 
 from jfrnn._geometry import Status
 from jfrnn._tracing import compile_program
@@ -47,6 +48,15 @@ def check_total(total: object) -> int:
             "search with queries=, or outside jax.jit without total, where offsets are int64."
         )
     return int(total)
+
+
+def check_held(held: Array, total: int) -> None:
+    """Raise outside jit if more pairs are held than arrays of this length have room for."""
+    if isinstance(held, Tracer):
+        return
+    known = int(np.max(jax.device_get(held)))
+    if known > total:
+        raise ValueError(f"total={total} is too small: the list holds {known} pairs. Pass total={known} or more.")
 
 
 def saturating_add(a: Array, b: Array) -> Array:

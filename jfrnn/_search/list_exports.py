@@ -1,17 +1,26 @@
 """The exports of a neighbor list: methods of `NeighborList` that return its pairs in other forms."""
 
-from typing import overload
+from typing import TypedDict, Unpack, overload
 
 import jax
 import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._geometry import NeighborOverflowError, Status, known_status
-from jfrnn._search.exports import DenseNeighbors, check_total, flat_pairs, pair_total
+from jfrnn._geometry import Box, NeighborOverflowError, Status, known_status
+from jfrnn._search.edges import flat_pairs_of
+from jfrnn._search.exports import DenseNeighbors, check_held, check_total, flat_pairs, pair_total
 from jfrnn._search.geometry import ImageCodes
 from jfrnn._search.kept_options import KeptOptions
 from jfrnn._tracing import at_once, own_transfers
+
+
+class Present(TypedDict, total=False):
+    """Where particles are now; without positions, exports hold all pairs of a list."""
+
+    positions: Array
+    queries: Array | None
+    box: Box | None
 
 
 class ListExports(KeptOptions):
@@ -28,47 +37,56 @@ class ListExports(KeptOptions):
         """Slots per row."""
         return self.idx.shape[-1]
 
-    @overload
-    def pairs(self, total: None = None) -> tuple[np.ndarray, np.ndarray]: ...
+    def _near(self, positions: Array, queries: Array | None, box: Box | None) -> Array:
+        """Return which slots hold a pair that is closer than the cutoff at these positions, [m, capacity] bool."""
+        raise NotImplementedError
 
     @overload
-    def pairs(self, total: int) -> tuple[Array, Array]: ...
+    def pairs(self, total: None = None, **at: Unpack[Present]) -> tuple[np.ndarray, np.ndarray]: ...
 
-    def pairs(self, total: int | None = None) -> tuple[Array | np.ndarray, Array | np.ndarray]:
+    @overload
+    def pairs(self, total: int, **at: Unpack[Present]) -> tuple[Array, Array]: ...
+
+    def pairs(self, total: int | None = None, **at: Unpack[Present]) -> tuple[Array | np.ndarray, Array | np.ndarray]:
         """Export the pairs (i, j), row by row: to the host, or inside jit into arrays of a static length.
+
+        Without positions these are all pairs of the list: with a skin, those within cutoff + skin when it was last rebuilt. With
+        `positions` they are those within the cutoff there, exactly, in the order of `nbrs.shifts(x)[nbrs.distances(x)[1]]`.
 
         Args:
             total: Length of the arrays, a static int up to 2³¹ - 1; None: the number of pairs, which is known only outside jit. If
                 there are more pairs than `total`, this raises outside jit. Inside jit the last pairs are missing then;
                 `require(total)` sets a bit that `check` reports.
+            **at: `positions` [length], shape [n, d], where the sources are now, with `queries` and `box` as in `vectors`.
 
         Returns:
             Query indices i and source indices j, shape [pairs] or [total], int32 each; the padding holds m and n.
 
         Raises:
             NeighborOverflowError, ValueError: as `check`, outside jit; ValueError: more pairs than `total`, outside jit.
-            ValueError, TypeError: total is invalid, or missing inside jit.
+            ValueError, TypeError: total is invalid, or missing inside jit; or positions do not fit the list.
 
         Differentiable: no (integers). Jit: yes, with total. vmap: yes, with total.
         """
         if total is None:
-            count, idx = self._check_rows("pairs")
+            count, idx = self._check_rows("pairs", at)
             return np.repeat(np.arange(count.size, dtype=np.int32), count), idx
-        rows, indices, _ = self._flat(total)
+        rows, indices, _ = self._flat(total, at)
         return rows, indices
 
     @overload
-    def csr(self, total: None = None) -> tuple[np.ndarray, np.ndarray]: ...
+    def csr(self, total: None = None, **at: Unpack[Present]) -> tuple[np.ndarray, np.ndarray]: ...
 
     @overload
-    def csr(self, total: int) -> tuple[Array, Array]: ...
+    def csr(self, total: int, **at: Unpack[Present]) -> tuple[Array, Array]: ...
 
-    def csr(self, total: int | None = None) -> tuple[Array | np.ndarray, Array | np.ndarray]:
+    def csr(self, total: int | None = None, **at: Unpack[Present]) -> tuple[Array | np.ndarray, Array | np.ndarray]:
         """Export compressed rows: the neighbors of row i are indices[offsets[i]:offsets[i + 1]].
 
         Args:
             total: As in `pairs`; offsets[-1] is then the number of pairs in the rows, at most 2³¹ - 1, which inside jit may exceed
                 `total`.
+            **at: As in `pairs`.
 
         Returns:
             Offsets, shape [m + 1], int64 on the host, int32 with `total`; and indices, shape [pairs] or [total], int32, padded with
@@ -80,40 +98,10 @@ class ListExports(KeptOptions):
         Differentiable: no (integers). Jit: yes, with total. vmap: yes, with total.
         """
         if total is None:
-            count, idx = self._check_rows("csr")
+            count, idx = self._check_rows("csr", at)
             return np.concatenate([[0], np.cumsum(count, dtype=np.int64)]), idx
-        _, indices, offsets = self._flat(total)
+        _, indices, offsets = self._flat(total, at)
         return offsets, indices
-
-    def to_jraph(self, total: int) -> tuple[Array, Array]:
-        """Return senders and receivers of a graph: an edge from each neighbor j to its particle i.
-
-        In a periodic box the edge is to the minimum image of j. A list with several images per pair is refused, since edges cannot
-        tell them apart; for such a list, `shifts` returns the image of each slot of `idx`.
-
-        Args:
-            total: Number of edges, a static int: as in `pairs`.
-
-        Returns:
-            Senders j and receivers i, shape [total], int32 each; padding edges lead from n to m, the node that
-            `jraph.pad_with_graphs` adds first. Stacked, they are an edge index as other graph libraries use it.
-
-        Raises:
-            ValueError: the list has several images per pair.
-            ValueError, TypeError: as in `pairs`.
-
-        Differentiable: no (integers). Jit: yes. vmap: yes.
-        """
-        if self.images is not None:
-            raise ValueError(
-                "to_jraph() returns edges without lattice shifts, which a list with several images of a pair needs: take "
-                "i, k = jnp.nonzero(nbrs.idx < nbrs.source_count, size=total, fill_value=len(nbrs.idx)), senders "
-                "nbrs.idx.at[i, k].get(mode='fill', fill_value=nbrs.source_count), receivers i and shifts "
-                "nbrs.shifts(positions).at[i, k].get(mode='fill', fill_value=0); or search in a box that is at least 2.05 "
-                "(cutoff + skin) wide."
-            )
-        rows, indices, _ = self._flat(total)
-        return indices, rows
 
     def to_jax_md(self) -> DenseNeighbors:
         """Return this list in the form that jax-md's energies take: `idx` as in its format `Dense`.
@@ -132,33 +120,48 @@ class ListExports(KeptOptions):
         self._check_known()
         return DenseNeighbors(self.idx, self.status)
 
-    def _flat(self, total: int) -> tuple[Array, Array, Array]:
+    def _flat(self, total: int, at: Present) -> tuple[Array, Array, Array]:
         """Return rows and sources of the pairs, padded to a static length, and the row offsets."""
-        self._check_known()
-        return flat_pairs(self.idx, self.count, self.source_count, self._check_total(total))
-
-    def _check_total(self, total: int) -> int:
-        """Return a static number of pairs that holds all of them, as far as that is known."""
-        total = check_total(total)
+        total, near = check_total(total), self._near_now(at)
         self._check_single()
+        if near is None:
+            self._check_known()
+            self._check_total(total)
+            return flat_pairs(self.idx, self.count, self.source_count, total)
+        with own_transfers():
+            *made, held = flat_pairs_of(self.idx, near, self.source_count, total)
+        check_held(held, total)
+        return made[0], made[1], made[2]
+
+    def _check_total(self, total: int) -> None:
+        """Raise if the list holds more pairs, as far as that is known."""
         if not isinstance(self.count, Tracer):
             with at_once():
-                held = int(jax.device_get(pair_total(self.count, self.capacity)))
-            if held > total:
-                raise ValueError(f"total={total} is too small: the list holds {held} pairs. Pass total={held} or more.")
-        return total
+                check_held(pair_total(self.count, self.capacity), total)
 
-    def _check_rows(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        if isinstance(self.status, Tracer):
+    def _near_now(self, at: Present) -> Array | None:
+        if "positions" in at:
+            return self._near(at["positions"], at.get("queries"), at.get("box"))
+        if at:
+            raise TypeError(
+                f"{', '.join(at)} tell where pairs are now, with positions: pass positions=, or leave {next(iter(at))} out."
+            )
+        return None
+
+    def _check_rows(self, name: str, at: Present) -> tuple[np.ndarray, np.ndarray]:
+        if any(isinstance(x, Tracer) for x in (self.status, *at.values())):
             raise TypeError(
                 f"{name}() returns as many pairs as there are and cannot run inside jax.jit: write {name}(total), total being the "
                 "static length of its arrays."
             )
-        self._check_known()
+        near = self._near_now(at)
+        if near is None:
+            self._check_known()
         self._check_single()
         with own_transfers():
             idx, count = np.asarray(self.idx), np.asarray(self.count)
-        return count, idx[np.arange(self.capacity) < count[:, None]]
+            used = np.arange(self.capacity) < count[:, None] if near is None else np.asarray(near)
+        return used.sum(1), idx[used]
 
     def _check_single(self) -> None:
         if self.idx.ndim != 2:

@@ -32,8 +32,8 @@ from jfrnn._geometry import (
     round_box,
     shape_of,
 )
-from jfrnn._search.edges import Edges, flat_edges, no_edges
-from jfrnn._search.exports import check_total, pair_total
+from jfrnn._search.edges import Edges, Graph, flat_edges, make_graph, no_edges
+from jfrnn._search.exports import check_held, check_total, pair_total
 from jfrnn._search.geometry import ImageCodes, ImagesMade, lattice_shifts, norms, open_vectors, periodic_vectors
 from jfrnn._search.list_exports import ListExports
 from jfrnn._search.making import count_capacity, find_fields, round_capacity
@@ -204,7 +204,7 @@ class NeighborList(ListExports):
     def require(self, total: int) -> "NeighborList":
         """Return this list with the bit `Status.TOTAL_OVERFLOW` set if it holds more than `total` pairs.
 
-        Inside `jax.jit`, `pairs(total)`, `csr(total)` and `to_jraph(total)` cannot raise. Updates keep this bit, so `check` can
+        Inside `jax.jit`, `pairs(total)` and `csr(total)` cannot raise. Updates keep this bit, so `check` can
         report it afterwards.
 
         Args:
@@ -249,9 +249,9 @@ class NeighborList(ListExports):
     def shifts(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> Array:
         """Compute the lattice shift S of every neighbor: its displacement is x_j - x_i + S·(lattice vectors).
 
-        Every used slot has a shift, even if its pair lies in the skin, beyond the cutoff; `vectors` and `distances` mask such
-        pairs, `shifts` and `pairs` do not. `nbrs.shifts(x)[nbrs.idx < nbrs.source_count]` has one row per pair, in the order of
-        `pairs`.
+        Every used slot has a shift, even if its pair lies in the skin, beyond the cutoff: `nbrs.shifts(x)[nbrs.idx <
+        nbrs.source_count]` has one row per pair, in the order of `pairs()`. Of pairs closer than the cutoff,
+        `nbrs.shifts(x)[nbrs.distances(x)[1]]` has one row each, in the order of `pairs(positions=x)`.
 
         Args:
             positions: Sources [length], shape [n, d], where they are now.
@@ -309,38 +309,71 @@ class NeighborList(ListExports):
         """Return the pairs as edges of a graph, with their geometry, for graph networks inside jit.
 
         Edges lead from neighbors j to particles i and are sorted by i, so `jax.ops.segment_sum(messages, edges.receivers, m,
-        indices_are_sorted=True)` sorts nothing; `messages` of edges outside the mask should be 0. With a skin, pairs beyond the
-        cutoff have edges too, which are not in the mask. In a periodic box each image of a neighbor has an edge of its own.
+        indices_are_sorted=True)` sorts nothing; `messages` of edges outside the mask should be 0. Pairs of the skin, beyond the
+        cutoff at these positions, have no edges. In a periodic box each image of a neighbor has an edge of its own.
 
         Args:
             positions: As in `vectors`.
-            total: Number of edges, a static int: as in `pairs`. If the list holds more pairs, this raises outside jit. Inside jit,
-                all displacements are NaN then, and `status` says so; `require(total)` makes the list keep that bit.
+            total: Number of edges, a static int up to 2³¹ - 1. If there are more pairs, this raises outside jit. Inside jit, all
+                displacements are NaN then, and `status` and `pair_count` say so; `require(total)` makes the list keep such a bit,
+                of all pairs that it holds, those of the skin included.
             queries: As in `vectors`.
             box: As in `vectors`.
 
         Returns:
-            An `Edges`: senders [total], receivers [total], displacement [total, d], shift [total, d], mask [total], status [].
+            An `Edges`: senders [total], receivers [total], displacement [total, d], shift [total, d], mask [total], status [],
+            distance [total], pair_count [].
 
         Raises:
             ValueError, TypeError: as in `vectors` and `pairs`; or the list has more than 2³¹ - 1 slots.
             NeighborOverflowError, ValueError: as `vectors`.
 
-        Differentiable: displacements, to any order in positions, queries and box; derivatives gather, as those of `vectors`. Jit:
-        yes. vmap: yes.
+        Differentiable: displacements and distances, to any order in positions, queries and box; derivatives gather, as those of
+        `vectors`. Jit: yes. vmap: yes.
         """
         if self.idx.size > MOST_SLOTS:
             raise ValueError(
                 f"edges() numbers slots by int32, and this list has {self.idx.size}: take `vectors`, or fewer queries."
             )
+        total = check_total(total)
+        self._check_single()
         _, mask, shifts = self._geometry(*lax.stop_gradient((positions, queries, box)))
         sources, rows = self._geometry_inputs(positions, queries)
-        total, box = self._check_total(total), self._box_now(box, sources)
-        if 0 in (sources.shape[0], *self.idx.shape, total):
-            return no_edges(self.idx.shape[0], self.source_count, sources, self.status, self.count, self.capacity, total)
+        box = self._box_now(box, sources)
         with own_transfers():
-            given = self._topology(), self.count, self.status, mask, shifts, sources, rows, box
-            return flat_edges(*given, self.box_kind if box is not None else None, total)
+            if 0 in (sources.shape[0], *self.idx.shape, total):
+                made = no_edges(mask, self.source_count, sources, self.status, total)
+            else:
+                given = self._topology(), self.status, mask, shifts, sources, rows, box
+                made = flat_edges(*given, self.box_kind if box is not None else None, total)
+        check_held(made.pair_count, total)
+        return made
+
+    def to_jraph(self, positions: Array, total: int, *, box: Box | None = None) -> Graph:
+        """Return the edges as a graph of jraph, with displacements, distances and lattice shifts; jraph need not be installed.
+
+        Args:
+            positions: Particles [length], shape [n, d], where they are now.
+            total: Number of edges, a static int, as in `edges`.
+            box: As in `vectors`.
+
+        Returns:
+            A `Graph`, a pytree with the fields of `jraph.GraphsTuple`, padded by a second graph of one node and the unused edges:
+            nodes {"positions": [n + 1, d]}, edges {"displacement": [total, d], "distance": [total], "shift": [total, d]}, receivers
+            and senders [total] int32, n_node [2], n_edge [2].
+
+        Raises:
+            ValueError: the list has queries, which are no nodes.
+            NeighborOverflowError, ValueError, TypeError: as `edges`.
+
+        Differentiable: as `edges`, also the positions of nodes. Jit: yes. vmap: yes.
+        """
+        if self.own_queries:
+            raise ValueError("to_jraph() makes particles the nodes of a graph, and this list has queries: take `edges`.")
+        return make_graph(self.edges(positions, total, box=box), self._geometry_inputs(positions, None)[0])
+
+    def _near(self, positions: Array, queries: Array | None, box: Box | None) -> Array:
+        return self._geometry(positions, queries, box)[1]
 
     def _check_active(self, active: Array | None, sources: Array) -> Array | None:
         if self.masked != (active is not None):

@@ -1,0 +1,110 @@
+"""One structure of atoms after another, on the CPU: NumPy in, NumPy out, in float64, without a program for each number of atoms."""
+
+import ctypes
+import functools
+import struct
+import threading
+from collections.abc import Callable, Collection
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jfrnn._engine.start import compiler, warn_of_folders
+from jfrnn.kernels.structure import INTS_PER_ATOM, MORE_INTS, REALS_PER_ATOM, RULES, WRONG, structure_kernel
+
+_FIRST_ROOM = 1 << 14  # pairs
+_MOST_PAIRS = 2**31 - 1
+_MOST_KEPT = 1 << 18  # pairs whose room is kept for later calls
+_COLUMNS = {"first": ("i", (), np.int32), "second": ("j", (), np.int32), "shifts": ("S", (3,), np.int32)}
+_COLUMNS |= {"vectors": ("D", (3,), np.float64), "distances": ("d", (), np.float64)}
+_kept = threading.local()
+
+
+class Structure(NamedTuple):
+    """Atoms in a cell, checked.
+
+    Attributes:
+        positions: [n, 3] float64, contiguous, like all arrays here.
+        cell: [3, 3] float64 lattice vectors, one per row.
+        periodic: [3] int32.
+        cutoffs: [1], or [n] radii, or [kinds, kinds], float64.
+        rule: Which of these ("one", "radii", "table").
+        species: [n] int32 with a table, or None.
+    """
+
+    positions: np.ndarray
+    cell: np.ndarray
+    periodic: np.ndarray
+    cutoffs: np.ndarray
+    rule: str
+    species: np.ndarray | None = None
+
+
+def find_structure_pairs(given: Structure, with_self: bool, wanted: Collection[str]) -> dict[str, np.ndarray]:
+    """Find all pairs of a structure closer than their cutoff, exactly, in ascending order of i.
+
+    Args:
+        given: The structure.
+        with_self: Whether each atom is its own neighbor.
+        wanted: Some of "i", "j", "S", "D", "d".
+
+    Returns:
+        The arrays that are wanted, by name: i, j and S [pairs, 3] int64, D [pairs, 3] and d float64.
+
+    Raises:
+        ValueError: Positions or cell cannot be searched.
+    """
+    n, room = len(given.positions), getattr(_kept, "room", _FIRST_ROOM)
+    scratch = np.empty(REALS_PER_ATOM * n), np.empty(INTS_PER_ATOM * n + MORE_INTS, np.int32)
+    info = np.zeros(2, np.int64)
+    while True:
+        columns = _make_room(wanted, room)
+        arrays = (given.positions, given.cell, given.cutoffs, given.periodic, given.species, *columns, *scratch, info)
+        addresses = (0 if x is None else x.ctypes.data for x in arrays)
+        kinds = given.cutoffs.shape[-1] if given.rule == "table" else 0
+        function, layout, _ = _function()
+        function(layout.pack(*addresses, n, room, RULES[given.rule], kinds, with_self))
+        found, wrong = info.tolist()
+        if wrong:
+            raise ValueError(_SAYS[WRONG[wrong]])
+        if found > _MOST_PAIRS:
+            raise ValueError(f"the structure has {found} pairs, and at most {_MOST_PAIRS} can be listed: take a smaller cutoff.")
+        if found <= room:
+            break
+        room = found
+    names = zip(_COLUMNS.values(), columns, strict=True)
+    return {name: x[:found].astype(np.int64 if dtype is np.int32 else dtype) for (name, _, dtype), x in names if x is not None}
+
+
+def _make_room(wanted: Collection[str], room: int) -> list[np.ndarray | None]:
+    """Return arrays for pairs, of which small ones are kept by each thread."""
+    if getattr(_kept, "room", -1) != room:
+        _kept.columns, _kept.room = {}, min(room, _MOST_KEPT)
+    made: list[np.ndarray | None] = []
+    for name, shape, dtype in _COLUMNS.values():
+        column = _kept.columns.get(name) if room == _kept.room else None
+        if column is None and name in wanted:
+            column = np.empty((room, *shape), dtype)
+            if room == _kept.room:
+                _kept.columns[name] = column
+        made.append(column if name in wanted else None)
+    return made
+
+
+_SAYS = {
+    "not finite": "positions must be finite: remove what is NaN or infinite.",
+    "too far": "positions and cutoffs must span at most 1 048 576 cells, whole numbers of lattice vectors between atoms below "
+    "2³⁰, and coordinates at most 1e140: wrap positions into the cell, give shorter vectors, or take a smaller cutoff.",
+    "degenerate": "lattice vectors of periodic axes must be finite and linearly independent: pass others, or pbc=False.",
+}
+
+
+@functools.cache
+def _function() -> tuple[Callable[[bytes], Any], struct.Struct, Any]:
+    """Return what runs the kernel, given the bytes of its arguments, how these are packed, and what has to live as long."""
+    kernel = structure_kernel()
+    library = compiler().load(kernel.program)
+    warn_of_folders()
+    pointers = sum(field.is_array for field in kernel.fields)
+    layout = struct.Struct(f"={pointers}q{len(kernel.fields) - pointers}i")
+    return ctypes.CFUNCTYPE(None, ctypes.c_char_p)(library.address_of(kernel.name)), layout, library

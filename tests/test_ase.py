@@ -1,0 +1,197 @@
+"""`jfrnn.ase`: one structure after another on the host, against the oracle, and against its peers where they are installed."""
+
+import itertools
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import reference
+
+from jfrnn.ase import neighbor_list, primitive_neighbor_list
+from jfrnn.cases.periodic import PERIODIC_CASES
+
+
+def as_set(i, j, s):
+    found = set(zip(i.tolist(), j.tolist(), map(tuple, s.tolist())))
+    assert len(found) == len(i)
+    assert (np.diff(i) >= 0).all()
+    return found
+
+
+def in_3d(points, matrix, periodic):
+    more = 3 - points.shape[1]
+    rows = matrix if matrix.ndim == 2 else np.diag(matrix)
+    return np.pad(points, ((0, 0), (0, more))), np.pad(rows, ((0, more), (0, more))), (*periodic, *[False] * more)
+
+
+@pytest.mark.parametrize(("dtype", "dim"), [(np.float32, 2), (np.float64, 3)])
+def test_hard_cases(dtype, dim):
+    """In float64, whatever the dtype of what is given."""
+    for name, case in PERIODIC_CASES.items():
+        given = case.build(dtype, dim)
+        points, rows, periodic = in_3d(given.positions.astype(np.float64), given.matrix.astype(np.float64), given.periodic)
+        cutoff = float(dtype(given.cutoff))
+        if not np.isfinite(points).all():
+            with pytest.raises(ValueError, match="positions must be finite"):
+                primitive_neighbor_list("i", periodic, rows, points, cutoff)
+            points = points[np.isfinite(points).all(axis=1)]
+        i, j, s, vectors, d = primitive_neighbor_list("ijSDd", periodic, rows, points, cutoff)
+        assert as_set(i, j, s) == reference.reference_images(points, cutoff, matrix=rows, periodic=periodic), name
+        size = np.abs(points).max(initial=0) + np.abs(s).max(initial=0) * np.abs(rows).max()
+        np.testing.assert_allclose(vectors, points[j] - points[i] + s @ rows, atol=1e-14 * size)
+        np.testing.assert_allclose(d, np.linalg.norm(vectors, axis=1), rtol=1e-14)
+
+
+CELLS = {
+    "tiny": (np.eye(3) * 0.7, (True, True, True)),
+    "left-handed": (np.array([[0, 2.0, 0], [1.5, 0, 0], [0.25, 0.5, 1.25]]), (True, True, True)),
+    "unreduced": (np.array([[1.0, 0, 0], [17.0, 1.0, 0], [-23.0, 41.0, 1.5]]), (True, True, True)),
+    "very skewed": (np.array([[1.0, 0, 0], [1e3, 1.0, 0], [3.0, -2e4, 2.0]]), (True, True, True)),
+    "slab": (np.array([[1.25, 0.25, 0], [0.5, 1.0, 0], [0, 0, 0]]), (True, True, False)),
+    "wire": (np.array([[0, 0, 0], [0.75, 0.5, 1.0], [0, 0, np.nan]]), (False, True, False)),
+    "skewed slab": (np.array([[1.0, 0.5, 0.25], [0, 0, 0], [900.5, 451.0, 227.5]]), (True, False, True)),
+    "open": (np.zeros((3, 3)), (False, False, False)),
+}
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_cells(name):
+    """On a lattice of quarters, so that distances at the cutoff are many, and far from the cell."""
+    cell, pbc = CELLS[name]
+    rng = np.random.default_rng(5)
+    x = np.round(4 * rng.uniform(-1, 1, (12, 3)) * np.array([1, 3, 2])) / 4
+    x = x + np.where(rng.random((12, 1)) < 0.3, np.where(np.array(pbc), rng.integers(-9, 9, (12, 3)), 0) @ np.nan_to_num(cell), 0)
+    for cutoff in (0.25, 1.0, 1.75):
+        expected = reference.reference_images(x, cutoff, matrix=np.nan_to_num(cell), periodic=pbc)
+        assert as_set(*primitive_neighbor_list("ijS", pbc, cell, x, cutoff)) == expected
+        own = as_set(*primitive_neighbor_list("ijS", pbc, cell, x, cutoff, self_interaction=True))
+        assert own == expected | {(i, i, (0, 0, 0)) for i in range(12)}
+
+
+def pairs_within(x, cell, pbc, cutoff_of):
+    """Return the pairs closer than a cutoff of each, [n, n]."""
+    found = set()
+    for cutoff in np.unique(cutoff_of[cutoff_of > 0]):
+        near = reference.reference_images(x, float(cutoff), matrix=cell, periodic=pbc)
+        found |= {(i, j, s) for i, j, s in near if cutoff_of[i, j] == cutoff}
+    return found
+
+
+@pytest.mark.parametrize("name", ["left-handed", "slab", "open"])
+def test_radii_and_tables(name):
+    cell, pbc = CELLS[name]
+    rng = np.random.default_rng(6)
+    x, numbers = np.round(8 * rng.random((24, 3))) / 4, rng.choice([1, 6, 8], 24)
+    radii = rng.choice([0.0, 0.25, 0.5, 0.75], 24)
+    found = as_set(*primitive_neighbor_list("ijS", pbc, cell, x, radii))
+    assert found == pairs_within(x, cell, pbc, radii[:, None] + radii)
+    table = {("H", "C"): 1.0, (8, 8): 1.5, (6, 1): 0.75, ("O", "H"): 0.0, ("Fe", "Fe"): 3.0}
+    cutoff_of = np.zeros((9, 9))
+    cutoff_of[1, 6] = cutoff_of[6, 1] = 1.0
+    cutoff_of[8, 8] = 1.5
+    expected = pairs_within(x, cell, pbc, cutoff_of[numbers][:, numbers])
+    assert as_set(*primitive_neighbor_list("ijS", pbc, cell, x, table, numbers)) == expected
+    atoms = SimpleNamespace(positions=x, cell=cell, pbc=np.array(pbc), numbers=numbers)
+    assert as_set(*neighbor_list("ijS", atoms, table)) == expected
+    assert len(expected) > 10
+
+
+def test_fifty_angstrom_in_a_cell_of_two_atoms():
+    x, cell = np.array([[0.0, 0, 0], [1.1, 0.9, 1.3]]), np.array([[0, 1.7, 1.7], [1.7, 0, 1.7], [1.7, 1.7, 0]]) * 1.04
+    i, j, s, d = primitive_neighbor_list("ijSd", True, cell, x, 50.0)
+    vectors = x[j] - x[i] + s @ cell
+    np.testing.assert_allclose(d, np.linalg.norm(vectors, axis=1), rtol=1e-12)
+    assert (d < 50).all()
+    assert len(as_set(i, j, s)) == len(i)
+    grid = np.array(list(itertools.product(range(-35, 36), repeat=3)))
+    lengths = np.linalg.norm(grid @ cell + (x[1] - x[0]), axis=1)
+    assert (i == 0)[j == 1].sum() == (lengths < 50).sum()
+    assert np.bincount(i).min() > 80_000
+
+
+def test_two_of_one_name_and_what_is_empty():
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    assert primitive_neighbor_list("i", False, np.zeros(3), x, 2.0).tolist() == [0, 1]
+    i, again = primitive_neighbor_list("ii", False, np.zeros(3), x, 2.0)
+    assert i.tolist() == again.tolist() == [0, 1]
+    for points in (np.zeros((0, 3)), x * 10):
+        found = primitive_neighbor_list("ijSDd", False, np.zeros((3, 3)), points, 2.0)
+        assert [(part.shape, part.dtype) for part in found] == [
+            ((0,), int),
+            ((0,), int),
+            ((0, 3), int),
+            ((0, 3), float),
+            ((0,), float),
+        ]
+    scaled = primitive_neighbor_list("d", True, np.eye(3) * 4, x / 4, 1.5, use_scaled_positions=True)
+    assert scaled.tolist() == [1.0, 1.0]
+
+
+BAD = {
+    "quantities must be letters of 'ijdDS'": {"quantities": "ijx"},
+    "positions must be real numbers": {"positions": [["a", "b", "c"]]},
+    r"positions must have shape \[n, 3\] and cell": {"positions": np.zeros((4, 2))},
+    "cell must be real numbers": {"cell": "cubic"},
+    "pbc must be one bool or three": {"pbc": (True, False)},
+    r"cutoff must be a number, a dictionary, or radii of shape \[2\]": {"cutoff": np.ones(3)},
+    "cutoff must be finite and at least 0": {"cutoff": -1.0},
+    "cutoff must be finite and at least 0, got inf for": {"cutoff": {(1, 1): np.inf}, "numbers": [1, 1]},
+    "keys of cutoff must be pairs of symbols or numbers": {"cutoff": {("H", "Q"): 1.0}, "numbers": [1, 1]},
+    "a dictionary of cutoffs needs numbers": {"cutoff": {(1, 1): 1.0}},
+    "linearly independent": {"cell": np.array([[1.0, 0, 0], [2.0, 0, 0], [0, 0, 1.0]])},
+    "at most 1 048 576 cells": {"positions": np.array([[0, 0, 0], [1e9, 0, 0]])},
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_bad_input_says_what_is_wrong(message):
+    given = {"quantities": "ij", "pbc": True, "cell": np.eye(3), "positions": np.zeros((2, 3)), "cutoff": 0.5} | BAD[message]
+    with pytest.raises((ValueError, TypeError), match=message):
+        primitive_neighbor_list(**given)
+
+
+def test_what_is_no_structure_is_refused():
+    with pytest.raises(TypeError, match=r"a must be ase.Atoms.*ndarray lacks positions, cell, pbc, numbers"):
+        neighbor_list("ij", np.zeros((2, 3)), 1.0)
+
+
+def test_it_takes_no_device_of_jax():
+    code = "import jax, numpy as np; from jfrnn.ase import primitive_neighbor_list as find; find('i', True, np.eye(3), "
+    code += "np.zeros((1, 3)), 2.0); assert not jax._src.xla_bridge.backends_are_initialized()"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("peer", ["ase", "matscipy", "vesin"])
+def test_peers(peer):
+    """Where no distance lies at a cutoff, all libraries tell the same."""
+    ase = pytest.importorskip("ase")
+    build = pytest.importorskip("ase.build")
+    if peer == "ase":
+        theirs = pytest.importorskip("ase.neighborlist").neighbor_list
+    elif peer == "matscipy":
+        theirs = pytest.importorskip("matscipy.neighbours").neighbour_list
+    else:
+        theirs = pytest.importorskip("vesin").ase_neighbor_list
+    structures = [
+        build.bulk("NaCl", "rocksalt", a=5.6),
+        build.bulk("Ti"),
+        build.bulk("Si", cubic=True) * (2, 1, 3),
+        build.molecule("C6H6"),
+    ]
+    structures += [build.fcc111("Pt", (2, 2, 3), vacuum=8.0), ase.Atoms("H2", [[0, 0, 0], [30.0, 2, 1]], cell=[3, 4, 5], pbc=True)]
+    rng = np.random.default_rng(0)
+    for atoms in structures:
+        atoms.positions += rng.normal(scale=0.05, size=atoms.positions.shape)
+        cutoffs = [3.1, 6.7]
+        if peer != "vesin":
+            cutoffs += [{(s, t): 1.5 + 0.5 * len(s + t) for s in set(atoms.symbols) for t in set(atoms.symbols)}]
+            cutoffs += [rng.uniform(0.5, 2.0, len(atoms))]
+        if peer == "matscipy" and not atoms.cell.volume:
+            continue  # it takes no vectors of 0
+        for cutoff in cutoffs:
+            ours, others = (f("ijSDd", atoms, cutoff) for f in (neighbor_list, theirs))
+            order, other_order = (np.lexsort((*x[2].T, x[1], x[0])) for x in (ours, others))
+            for a, b in zip(ours, others):
+                np.testing.assert_allclose(a[order], b[other_order], atol=1e-12)
