@@ -20,6 +20,7 @@ myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"  # notebooks are kept with their outputs; tests/test_notebooks.py runs them
 nb_merge_streams = True
+smartquotes = False  # strings in docstrings are those of Python
 html_theme = "furo"
 html_title = f"jfrnn {release}"
 html_show_copyright = False

@@ -29,7 +29,7 @@ for page in map(Path, sys.argv[1:]):
     print(page.name, sum(map(bool, lines)))
 """
 GROUPS = {
-    "readme": ["docs/index.md", "docs/start.md"],
+    "readme": ["README.md", "docs/index.md", "docs/start.md"],
     "guides": sorted(f"docs/guides/{path.name}" for path in (ROOT / "docs/guides").glob("*.md")),
     "coming_from": sorted(f"docs/coming-from/{path.name}" for path in (ROOT / "docs/coming-from").glob("*.md")),
     "rest": ["docs/sph.md", *sorted(f"docs/developers/{path.name}" for path in (ROOT / "docs/developers").glob("*.md"))],
