@@ -15,14 +15,14 @@ PIP    := PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore PYTHONWARN
 # Where nothing may keep what Python compiles, each of the many processes that tests start compiles JAX anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: sweep sweeps peers notebooks test test-slow lint clean
+.PHONY: sweep sweeps peers notebooks docs test test-slow lint clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(f"jfrnn needs Python >= 3.11, found {v[0]}.{v[1]}: set PYTHON=/path/to/python3") if v < (3, 11) else None'
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) --upgrade pip
-	$(PIP) --no-compile --editable '.[test]'
+	$(PIP) --no-compile --editable . --group test
 	touch $@
 
 sweep: $(STAMP)
@@ -39,12 +39,17 @@ sweeps: $(STAMP)
 	  $(PY) -m experiments report experiments/results/sweep_$$each || exit 1; done
 
 peers: $(STAMP)
-	$(PIP) --editable '.[peers]'
+	$(PIP) --group peers
 
 # The notebooks that read rows of sweeps, with their outputs.
 notebooks: $(STAMP)
 	cd notebooks && for each in thesis_reproduced open_questions gpu_layouts speed_against_error; do \
 	  ../$(VENV)/bin/jupyter execute --inplace $$each.ipynb || exit 1; done
+
+# The pages of docs/, in out/docs; what is wrong in them is an error.
+docs: $(STAMP)
+	$(PY) -m sphinx -W --keep-going --quiet docs out/docs
+	@echo out/docs/index.html
 
 test: lint
 	$(PY) -m pytest

@@ -1,6 +1,6 @@
 """A Lennard-Jones liquid of jax-md with the neighbor list of jfrnn: same energy, same forces, same trajectory.
 
-python examples/jax_md_energy.py    (pip install -e '.[warp,peers]')
+python examples/jax_md_energy.py    (pip install -e '.[warp]' --group peers)
 """
 
 import jax

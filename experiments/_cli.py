@@ -108,6 +108,15 @@ def report(folder: Annotated[Path, typer.Argument(help="Folder with rows.jsonl."
         _reports.report(folder)
 
 
+@app.command(short_help="Make the tables of README.md and docs/ anew.")
+def tables() -> None:
+    """Make the tables of README.md and docs/ anew from the rows under experiments/results, and print the pages that changed."""
+    with usage_errors():
+        from experiments import pages
+
+        typer.echo("\n".join(str(path.relative_to(pages.ROOT)) for path in pages.write()) or "nothing changed")
+
+
 @app.command(short_help="Put rows of shards, or of machines, together.")
 def merge(
     out: Annotated[Path, typer.Argument(help="Folder that takes the rows.")],

@@ -25,6 +25,8 @@ from jfrnn._search import NeighborList, count, run_chunk, search
 from jfrnn._sums import pair_sum
 from jfrnn._triangles import TriangleList, search_triangles
 
+__version__ = "0.2.0"
+
 __all__ = [
     "Box",
     "MemoryPlan",

@@ -20,7 +20,7 @@ from jfrnn.cases import fluids
 
 ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
-TOP = ("run", "report", "merge", "list", "show", "export", "gpu", "bench", "sph")
+TOP = ("run", "report", "tables", "merge", "list", "show", "export", "gpu", "bench", "sph")
 BENCH = (
     *(
         "crossover",
@@ -40,7 +40,7 @@ BENCH = (
     *("ties", "triangles", "use"),
 )
 SPH = ("run", "validate", "speed", "gradients")
-COMMANDS = (*TOP[:7], *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))
+COMMANDS = (*TOP[:8], *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))
 
 
 def refused(*arguments):
@@ -76,7 +76,7 @@ def test_the_list_of_commands_fits_a_screen(group, names):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_keeps_what_stands_in_brackets(command):
     units = {"show": ["[m]"], "export": ["[m]"], "run": ["[s]"], "bench skin": ["[m]"], "bench domain": ["[cutoffs]"]}
-    units |= {"bench triangles": ["[modules]"], "bench peers": ["[s]", "'.[peers]'"]}
+    units |= {"bench triangles": ["[modules]"], "bench peers": ["[s]", "--group peers"]}
     units |= {"bench latency": ["[µs]"], "bench start": ["[s]"], "bench structures": ["angstrom"]}
     text = told(*command.split(), "--help")
     assert text.startswith(f"Usage: python -m experiments {command} ")

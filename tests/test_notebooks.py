@@ -33,6 +33,8 @@ SAYS = {  # pictures, and what each prints
     ),
     "speed_against_error": (3, ("exact on every scene", "methods with a list give")),
     "thesis_reproduced": (7, ("have a counterpart here", "verdict of the thesis, CLL before")),
+    "molecular_dynamics": (2, ("the list was rebuilt", "total energy per particle varies by", "first peak", "pressure")),
+    "quickstart": (3, ("sites closer than 3 spacings: 24", "and those at exactly 3:       28", "rebuilt", "unevenness")),
     "pair_sums": (2, ("sums per rebuild on", "one pair sum with backend='warp'")),
     "sph_gradients": (6, ("at the best ε", "m²/s was the first guess", "first guess [1. 0.]", "forces:")),
     "sph_jet": (2, ("particles of oil", "operations in a step", "kinetic energy", "neighbors on average")),

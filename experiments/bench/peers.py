@@ -192,7 +192,7 @@ def command(
     out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "peers",
     limit: Annotated[float, typer.Option(min=1, max=1e6, callback=finite, help="Time for one answer [s].")] = 60.0,
 ) -> str:
-    """Ask other libraries for the hard cases, and print a table of their answers (pip install -e '.[peers]').
+    """Ask other libraries for the hard cases, and print a table of their answers (pip install --group peers).
 
     The time for an answer includes compilation; beyond, the process is ended and the next case asked.
     """

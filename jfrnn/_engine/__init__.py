@@ -28,8 +28,8 @@ from jfrnn._engine.problem import (
 from jfrnn._engine.reverse_warp import collect_slots, reverse_slots, slots_by_source
 from jfrnn._engine.rows import count_rows, fold_pairs, list_rows
 from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit
-from jfrnn._engine.start import level_of_caller
-from jfrnn._engine.sum_results import FoundSums
+from jfrnn._engine.start import compiler, level_of_caller
 from jfrnn._engine.structure import Structure, find_structure_pairs
+from jfrnn._engine.sum_results import FoundSums
 from jfrnn._engine.warp import PLATFORMS
 from jfrnn._engine.warp_sums import pair_sums

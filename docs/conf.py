@@ -1,0 +1,47 @@
+"""How Sphinx builds these pages: `make docs`, or `python -m sphinx -W docs out/docs`."""
+
+import re
+import shutil
+from pathlib import Path
+
+import jfrnn
+
+project = "jfrnn"
+author = "jfrnn developers"
+release = version = jfrnn.__version__
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+default_role = "py:obj"  # a name in single quotation marks of a docstring becomes a link where it is documented
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+napoleon_use_rtype = False
+python_maximum_signature_line_length = 88
+myst_enable_extensions = ["colon_fence", "deflist"]
+myst_heading_anchors = 3
+nb_execution_mode = "off"  # notebooks are kept with their outputs; tests/test_notebooks.py runs them
+nb_merge_streams = True
+smartquotes = False  # strings in docstrings are those of Python
+html_theme = "furo"
+html_title = f"jfrnn {release}"
+html_show_copyright = False
+html_show_sphinx = False
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]
+
+HERE = Path(__file__).parent
+STUDIES = HERE.parent / "notebooks"
+
+
+def setup(app):
+    """Copy the notebooks that stand beside the pages, and keep Sphinx from reading formulas of docstrings as its own marks."""
+    (HERE / "notebooks").mkdir(exist_ok=True)
+    for notebook in STUDIES.glob("*.ipynb"):
+        shutil.copyfile(notebook, HERE / "notebooks" / notebook.name)
+    app.connect("autodoc-process-docstring", _escape, priority=100)  # before Napoleon
+
+
+def _escape(app, what, name, obj, options, lines):
+    """Escape what stands for itself: |x| is a distance and *rows are arguments."""
+    for k, line in enumerate(lines):
+        if not line.lstrip().startswith((">>>", "...")):
+            lines[k] = re.sub(r"(?<=[\[(])\*(?=\w)|(?<=, )\*(?=\w)", r"\\*", line.replace("|", "\\|"))

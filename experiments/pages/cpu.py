@@ -1,0 +1,199 @@
+"""Tables of what was measured on CPUs."""
+
+from experiments.pages.rows import TIMES, Row, markdown, number, one, read, whole
+
+_OURS = {
+    "warp": "jfrnn, list",
+    "warp-counts": "jfrnn, counts",
+    "pair-sum": "jfrnn, density by `pair_sum`",
+    "jax": "jfrnn, engine `jax`, list",
+    "hashgrid": "jfrnn, engine `hashgrid`, list",
+}
+_KNOWN = {  # methods that people know, and how they are called
+    "vesin": "vesin",
+    "matscipy": "matscipy",
+    "matscipy-neighbours": "matscipy-neighbours",
+    "nvalchemi": "nvalchemi-toolkit-ops",
+    "scipy-kdtree": "SciPy's cKDTree",
+    "freud": "freud",
+    "nanoflann-cpp": "nanoflann, C++",
+    "ann-kd": "ANN, kd-tree",
+    "cll": "first/next cell lists (the thesis)",
+    "hashgrid-plain": "Warp's HashGrid, plain",
+}
+
+
+def _name(method: str) -> str:
+    return (_OURS | _KNOWN).get(method, method)
+
+
+def _wrong(row: Row, kind: str) -> str:
+    return ("~" if row["compared"] == "counts" else "") + whole(row[kind])
+
+
+def search_known() -> str:
+    """Return the full lattice of the thesis, by the methods that people know."""
+    rows = read("thesis_cpu/table.csv")
+    found = [row for name in [*_OURS, *_KNOWN] if (row := one(rows, scene="full 100 %", method=name, status="ok"))]
+    lines = []
+    for row in sorted(found, key=lambda row: float(row["median_s"])):
+        wrong = [_wrong(row, kind) for kind in ("missing", "extra")]
+        lines.append([_name(row["method"]), number(row["median_s"], 1e3), number(row["search_mb"]), *wrong])
+    return markdown(("method", ">ms", ">MB", ">missing", ">extra"), lines)
+
+
+def search_scenes() -> str:
+    """Return seconds of all methods by scene."""
+    rows = read("thesis_cpu/table.csv")
+    scenes = {"corners 2 %": "corners", "clusters4 11 %": "4 clusters", "clusters20 51 %": "20 clusters", "full 100 %": "full"}
+    full = {row["method"]: float(row["median_s"] or "inf") for row in rows if row["scene"] == "full 100 %"}
+    methods = sorted(dict.fromkeys(row["method"] for row in rows), key=lambda method: full.get(method, float("inf")))
+    points = {scene: whole(next(row["points"] for row in rows if row["scene"] == scene)) for scene in scenes}
+    lines = []
+    for method in methods:
+        of_scene = [one(rows, scene=scene, method=method) for scene in scenes]
+        cells = [number(row["median_s"], 1e3) if row and row["status"] == "ok" else "" for row in of_scene]
+        if not any(cells):
+            continue
+        last = of_scene[-1]
+        known = last if last and last["status"] == "ok" else None
+        lines.append([_name(method), *cells, *([_wrong(known, "missing"), _wrong(known, "extra")] if known else ["", ""])])
+    heads = [f">{title}, {points[scene]}" for scene, title in scenes.items()]
+    return markdown(("method", *heads, ">missing, full", ">extra, full"), lines)
+
+
+def latency() -> str:
+    """Return microseconds of calls and of steps for few particles."""
+    ours = {"list": "list", "counts": "counts", "density": "density", "density, gradient": "and its gradient"}
+    heads = ["", ">n", ">`x + 1`", *(f">{title}" for title in ours.values()), ">jax-md list", ">nvalchemi list"]
+    heads += [f">step: {title}" for title in ours.values()]
+    lines = []
+    for file, machine in (("cpu", "2 cores"), ("gpu", "H100")):
+        rows = read(f"latency/{file}.csv")
+        for n in (64, 256, 1000, 4096, 32768):
+            of_n = [row for row in rows if row["n"] == str(n) and row["status"] == "ok"]
+            if not of_n:
+                continue
+            floor, mine = one(of_n, what="x + 1"), [one(of_n, who="jfrnn", what=what) for what in ours]
+            peers = [[row for row in of_n if row["who"].startswith(who)] for who in ("jax-md", "nvalchemi")]
+            fastest = [min((float(row["waited_us"]) for row in peer), default=None) for peer in peers]
+            line = [machine, whole(n), _us(floor), *(_us(row) for row in mine)]
+            line += ["" if us is None else f"{us:.0f}" for us in fastest]
+            lines.append([*line, *("" if row is None else f"{float(row['step_us']):.0f}" for row in mine)])
+    return markdown(heads, lines)
+
+
+def _us(row: Row | None) -> str:
+    return "" if row is None else f"{float(row['waited_us']):.0f}"
+
+
+def sums() -> str:
+    """Return a density, and its gradient, in many ways."""
+    rows = [row for row in read("sums/table.csv") if row["layout"] == "full" and row["points"] == "250000"]
+    ways = {
+        ("pair_sum warp", False): "`pair_sum`, `warp`",
+        ("pair_sum warp", True): "the same, compensated",
+        ("list, sum", False): "padded list, then a sum in plain JAX",
+        ("list, pair_sum", False): "list, `pair_sum(neighbors=)`, before a kernel read the list",
+        ("pair_sum jax", False): "`pair_sum`, `jax`",
+        ("nvalchemi list, sum", False): "nvalchemi's list, then the sum",
+        ("scipy pairs alone", False): "SciPy's pairs alone, no sum",
+    }
+    lines = []
+    for (way, compensated), title in ways.items():
+        of_way = [one(rows, way=way, compensated=compensated, sums=what) for what in ("density", "density, gradient")]
+        cells = [(number(r["seconds"], 1e3), number(r["B per particle"])) if r else ("", "") for r in of_way]
+        lines.append([title, *(cell for pair in cells for cell in pair)])
+    return markdown(("way", ">density [ms]", ">B per particle", ">and gradient [ms]", ">B per particle"), lines)
+
+
+def ties() -> str:
+    """Return what ties cost, as multiples of the time for sites moved at random."""
+    lines = []
+    for scene in ("spacing 1", "spacing 1/64", "spacing 1e-4", "spacing 1, one particle off"):
+        cells = []
+        for file in ("cpu", "gpu"):
+            for dtype in ("float32", "float64"):
+                row = one(read(f"ties/cube/{file}_warp.csv"), sites=scene, dtype=dtype)
+                cells.append("" if row is None else ", ".join(row[f"{what}_ratio"] for what in ("count", "list", "density")))
+        lines.append([scene, *cells])
+    return markdown(("sites of a cube", "2 cores, float32: counts, list, density", "float64", "H100, float32", "float64"), lines)
+
+
+def empty_space() -> str:
+    """Return seconds of a search while clusters are drawn apart."""
+    rows = [row for row in read("sweep_domain/table.csv") if row["status"] == "ok"]
+    growths = list(dict.fromkeys(row["growth"] for row in rows))
+    lines = []
+    for method in dict.fromkeys(row["method"] for row in rows):
+        cells = [one(rows, method=method, growth=growth) for growth in growths]
+        lines.append([_name(method), *(number(row["median_s"], 1e3) if row else "" for row in cells)])
+    return markdown(("method", *(f">{float(growth):g} {TIMES}" for growth in growths)), lines)
+
+
+def triangles() -> str:
+    """Return milliseconds of triangles near points, by engine."""
+    rows = read("triangles/cpu_warp.csv")
+    ways = {
+        "jfrnn bvh update": "`bvh`, wall stays",
+        "jfrnn bvh rebuild": "wall anew",
+        "jfrnn warp update": "`warp`, wall stays",
+        "jfrnn warp rebuild": "wall anew",
+        "libigl": "libigl, nearest",
+        "wp.Mesh nearest": "Warp's tree, nearest",
+    }
+    lines = []
+    for faces, cutoff in dict.fromkeys((row["faces"], row["cutoff"]) for row in rows):
+        found = [one(rows, faces=faces, cutoff=cutoff, method=way) for way in ways]
+        pairs = found[0]["pairs"] if found[0] else ""
+        lines.append([whole(faces), cutoff, whole(pairs), *(number(row["median_s"], 1e3) if row else "" for row in found)])
+    return markdown((">faces", ">cutoff [modules]", ">pairs", *(f">{title}" for title in ways.values())), lines)
+
+
+def answers() -> str:
+    """Return what libraries answer to the hard cases."""
+    from experiments.bench import peers
+
+    return peers.markdown(read("peers/answers.csv"))
+
+
+def liquid() -> str:
+    """Return steps per second of a Lennard-Jones liquid."""
+    ways = {
+        "pair_sum": "`pair_sum`, searches in each step",
+        "pair_sum, list": "`pair_sum(neighbors=)`, list with a skin",
+        "distances, grad": "`distances` and `jax.grad`, list with a skin",
+    }
+    both = {machine: read(f"lj/{file}.csv") for file, machine in (("cpu", "2 cores"), ("gpu", "H100"))}
+    columns = [(machine, n) for machine, rows in both.items() for n in dict.fromkeys(row["n"] for row in rows)]
+    lines = []
+    for who, title in ways.items():
+        lines.append([title, *(number((one(both[m], n=n, who=who) or {}).get("steps_per_s")) for m, n in columns)])
+    theirs = {(m, n): [row for row in both[m] if row["n"] == n and row["who"].startswith("jax-md")] for m, n in columns}
+    fastest = [max(float(row["steps_per_s"] or 0) for row in rows) for rows in theirs.values()]
+    lines.append(["jax-md 0.2.29, the faster of its ways", *map(number, fastest)])
+    return markdown(("way", *(f">{machine}, {whole(n)}" for machine, n in columns)), lines)
+
+
+def options() -> str:
+    """Return what each option costs, as a multiple of a plain search."""
+    rows = {name: read(f"options/{name}.csv") for name in ("cpu_warp", "gpu_warp")}
+    lines = []
+    for row in rows["cpu_warp"]:
+        other = one(rows["gpu_warp"], option=row["option"]) or {}
+        lines.append([row["option"], *(source.get(f"{what}_ratio", "") for source in (row, other) for what in ("list", "count"))])
+    return markdown(("option", ">list, 2 cores", ">counts", ">list, H200", ">counts"), lines)
+
+
+TABLES = {
+    "cpu-known": search_known,
+    "cpu-scenes": search_scenes,
+    "latency": latency,
+    "cpu-sums": sums,
+    "ties": ties,
+    "empty-space": empty_space,
+    "cpu-triangles": triangles,
+    "answers": answers,
+    "liquid": liquid,
+    "options": options,
+}

@@ -1,0 +1,63 @@
+"""Tables of the fluid solver."""
+
+from experiments.pages.rows import markdown, number, one, read, whole
+
+
+def validation() -> str:
+    """Return what was measured of scenes with known answers."""
+    rows = read("sph/table.csv")
+    heads = ("case", "what is measured", ">measured", "target", "met", ">particles", ">steps", ">seconds")
+    names = ("case", "quantity", "measured", "target", "met", "particles", "steps", "seconds")
+    return markdown(heads, ([row[name] for name in names] for row in rows))
+
+
+def inverse() -> str:
+    """Return what problems solved by gradients found."""
+    lines = []
+    for problem in ("viscosity", "jet", "droplet"):
+        for row in read(f"sph_gradients/{problem}.csv"):
+            values = [number(row[name]) for name in ("guess", "found", "known", "first loss", "loss")]
+            lines.append([problem, row["unknown"], *values, row["runs"], whole(row["steps"]), row["particles"]])
+    heads = ("problem", "sought", ">first guess", ">found", ">known", ">loss, first", ">best", ">runs", ">steps", ">particles")
+    return markdown(heads, lines)
+
+
+def reverse_memory() -> str:
+    """Return the scratch memory of reverse mode, by steps and segments."""
+    rows = read("sph_gradients/memory.csv")
+    lines = [[whole(row["steps"]), row["segments"], number(row["scratch [B]"], 1e-6)] for row in rows]
+    return markdown((">steps", ">segments", ">scratch [MB]"), lines)
+
+
+def ways() -> str:
+    """Return steps per second by ways to find and sum pairs on 2 cores."""
+    titles = {
+        "pair_sum": "`pair_sum`, each of three sums searches",
+        "edges of jfrnn": "edges of a list with a skin of 0.3 spacings, `jax.ops.segment_sum`",
+        "jax-sph": "jax-sph's way: edges of jax-md, made anew in every step",
+        "jax-sph, skin": "the same with that skin",
+    }
+    rows = read("sph/speed_cpu/step.csv")
+    found = [(title, row) for way, title in titles.items() if (row := one(rows, way=way))]
+    lines = [[title, number(row["steps/s"]), number(row["faster"]), number(row["MB"])] for title, row in found]
+    return markdown(("way", ">steps/s", ">`pair_sum` is faster", ">MB"), lines)
+
+
+def kept() -> str:
+    """Return steps per second of sums that search, and of those over a list with a skin."""
+    lines = []
+    for folder, machine in (("speed_kept", "2 cores"), ("speed_kept_h100", "H100")):
+        rows = read(f"sph/{folder}/step.csv")
+        for particles in dict.fromkeys(row["particles"] for row in rows):
+            pair = [one(rows, particles=particles, way=way) or {} for way in ("pair_sum", "list")]
+            lines.append([machine, whole(particles), *(number(row.get("steps/s")) for row in pair)])
+    return markdown(("", ">particles with walls", ">`pair_sum`", ">over a list with a skin of 0.3 spacings"), lines)
+
+
+TABLES = {
+    "sph-validation": validation,
+    "sph-inverse": inverse,
+    "sph-memory": reverse_memory,
+    "sph-ways": ways,
+    "sph-kept": kept,
+}

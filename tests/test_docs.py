@@ -1,0 +1,90 @@
+"""The pages: they build without a warning, their code runs as it stands, their figures are those of the rows."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import jfrnn
+from experiments import pages
+from experiments._errors import UsageError
+from jfrnn import distributed
+
+ROOT = Path(__file__).parent.parent
+RUN = """
+import re, sys
+from pathlib import Path
+
+for page in map(Path, sys.argv[1:]):
+    lines, running = [], False
+    for line in page.read_text(encoding="utf-8").splitlines():
+        fence = line.startswith("```")
+        running = line == "```python" if fence else running
+        lines.append(line if running and not fence else "")
+    if any(lines):
+        exec(compile("\\n".join(lines), str(page), "exec"), {"__name__": page.stem})
+    print(page.name, sum(map(bool, lines)))
+"""
+GROUPS = {
+    "readme": ["README.md", "docs/index.md", "docs/start.md"],
+    "guides": sorted(f"docs/guides/{path.name}" for path in (ROOT / "docs/guides").glob("*.md")),
+    "coming_from": sorted(f"docs/coming-from/{path.name}" for path in (ROOT / "docs/coming-from").glob("*.md")),
+    "rest": ["docs/sph.md", *sorted(f"docs/developers/{path.name}" for path in (ROOT / "docs/developers").glob("*.md"))],
+}
+
+
+def run(*arguments, **environment):
+    told = os.environ | {"PYTHONPATH": str(ROOT)} | environment
+    done = subprocess.run([sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, check=False, env=told)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_code_of_pages(group):
+    """Blocks of a page run in order, in one namespace, as a user finds the library: no 64-bit mode, here four virtual devices."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
+    said = run("-W", "error::RuntimeWarning", "-c", RUN, *GROUPS[group], XLA_FLAGS=flags)
+    assert any(int(line.split()[-1]) for line in said.splitlines() if line.endswith(tuple("0123456789")))
+
+
+def test_pages_build(tmp_path):
+    """With warnings as errors: links, anchors and cross-references are there, docstrings can be read, no page is left out."""
+    run(
+        "-m",
+        "sphinx",
+        "-W",
+        "--keep-going",
+        "--quiet",
+        "--builder",
+        "html",
+        str(ROOT / "docs"),
+        str(tmp_path),
+        PYTHONPATH=str(ROOT),
+    )
+    html = {path.stem: path.read_text(encoding="utf-8") for path in (tmp_path / "api").glob("*.html")}
+    missing = [name for name in jfrnn.__all__ if f'id="jfrnn.{name}"' not in html["jfrnn"]]
+    missing += [name for name in distributed.__all__ if f'id="jfrnn.distributed.{name}"' not in html["distributed"]]
+    assert missing == []
+
+
+@pytest.mark.parametrize("page", [path for path in pages.pages() if pages.tables_of(path)], ids=lambda path: path.stem)
+def test_figures_are_those_of_the_rows(page):
+    text = page.read_text(encoding="utf-8")
+    assert pages.fill_in(text) == text, "python -m experiments tables"
+
+
+def test_every_table_stands_in_a_page():
+    assert {name for page in pages.pages() for name in pages.tables_of(page)} == set(pages.TABLES)
+
+
+def test_a_figure_that_is_none_of_the_rows_is_found():
+    text = "<!-- table ties -->\n\n<!-- end -->\n"
+    filled = pages.fill_in(text)
+    spoiled = re.sub(r"\d\.\d\d", "0.10", filled, count=1)
+    assert spoiled != filled == pages.fill_in(spoiled)
+    with pytest.raises(UsageError, match="there is no such table"):
+        pages.fill_in(text.replace("ties", "knots"))
