@@ -16,7 +16,7 @@ from jfrnn._engine.problem import Filter, Rows, Search, largest_radius
 from jfrnn._geometry import Lattice, Status, Wrapped, sort_into_boxes
 from jfrnn.kernels import boxes
 
-_GIVEN = ("positions", "queries", "boxes", "axes", "asked", "ids", "visits", "cells", "start")
+_GIVEN = ("positions", "queries", "boxes", "axes", "asked", "ids", "order", "visits", "cells", "start")
 
 
 class _Variant(NamedTuple):
@@ -62,14 +62,13 @@ def _operands(search: Search) -> list[Array]:
     rows = particle_rows(sources, wrapped.turns, None)
     asking = rows if queries is None else particle_rows(queries, wrapped.query_turns, None)
     gap = ((0, 0), (0, 3 - lattice.dim))
-    visits = [batch.of_queries[:, None], jnp.pad(cells.from_cell, gap), jnp.pad(cells.visited, gap)]
-    visits = jnp.concatenate([x.astype(jnp.int32)[order] for x in visits] + [order[:, None]], axis=1)
-    axes = [lattice.spread(jnp.asarray(lattice.periodic), 2).astype(jnp.int32) << np.arange(lattice.dim, dtype=np.int32)[None]]
-    turning = jnp.broadcast_to(jnp.sum(axes[0], axis=1, dtype=jnp.int32), cells.first.shape)
-    of_system = [jnp.pad(cells.counts, gap), cells.first[:, None], turning[:, None], jnp.zeros((len(turning), 3), jnp.int32)]
-    numbers = _numbers(search, lattice, wrapped)
+    visits = jnp.concatenate([batch.of_queries[:, None], jnp.pad(cells.from_cell, gap), jnp.pad(cells.visited, gap)], axis=1)
+    bits = lattice.spread(jnp.asarray(lattice.periodic), 2).astype(jnp.int32) << np.arange(lattice.dim, dtype=np.int32)[None]
+    turning = jnp.broadcast_to(jnp.sum(bits, axis=1, dtype=jnp.int32), cells.first.shape)
+    of_system = jnp.concatenate([jnp.pad(cells.counts, gap), cells.first[:, None], turning[:, None]], axis=1)
     axes = jnp.stack([x[padded] for x in wrapped.sources.T])
-    return [rows, asking, numbers, axes, wrapped.queries[order], padded, visits, jnp.concatenate(of_system, axis=1), cells.start]
+    numbers = _numbers(search, lattice, wrapped)
+    return [rows, asking, numbers, axes, wrapped.queries, padded, order, visits, of_system, cells.start]
 
 
 def _numbers(search: Search, lattice: Lattice, wrapped: Wrapped) -> Array:

@@ -19,6 +19,7 @@ from jfrnn._geometry.lattice import Lattice, fractions_of
 from jfrnn._geometry.wrapping import Wrapped, unpack_turns
 
 _FILL = 4  # particles of a cell, at least, where cells are many
+_COUNTERS = 32  # of a system
 _FARTHEST = 2.0**22  # cells along an open axis, beyond which all are one: whole floats up to there are exact
 
 
@@ -52,7 +53,7 @@ def sort_into_boxes(
     n, (systems, dim) = len(sources), lattice.origin.shape
     packed = wrapped.turns if queries is None else wrapped.query_turns
     there, of_source = wrapped.turns >= 0, batch.sources
-    members = jnp.zeros(systems, jnp.int32).at[of_source].add(there.astype(jnp.int32))
+    members = _count_members(of_source, there, systems)
     periodic = jnp.broadcast_to(lattice.spread(jnp.asarray(lattice.periodic), 2), (systems, dim))
     counts = _count_cells(wrapped.reach, members, periodic) if divided else jnp.ones((systems, dim), jnp.int32)
     totals = jnp.prod(counts, axis=1, dtype=jnp.int32)
@@ -77,6 +78,13 @@ def sort_into_boxes(
     visited = jnp.maximum(high - low + 1, 0)
     visited = jnp.where(turning, visited, jnp.minimum(visited, many))
     return BoxCells(order, jnp.cumsum(held, dtype=jnp.int32), counts, first, low, jnp.where((packed >= 0)[:, None], visited, 0))
+
+
+def _count_members(systems: Array, there: Array, size: int) -> Array:
+    """Count the particles of each system, [size] int32: in several counters each, since those of one would wait for each other."""
+    counter = lax.iota(jnp.int32, len(systems)) % _COUNTERS
+    counted = jnp.zeros(_COUNTERS * size, jnp.int32).at[counter * size + systems].add(there.astype(jnp.int32))
+    return jnp.sum(counted.reshape(_COUNTERS, size), axis=0, dtype=jnp.int32)
 
 
 def _count_cells(reach: Array, members: Array, periodic: Array) -> Array:

@@ -1,17 +1,16 @@
 // Pairs in systems of which each has a box of its own (jfrnn/_geometry/box_cells.py): what a query visits, on the CPU and on CUDA.
 //
-// Sources stand by system and by cell. `visits` has eight integers of each query, in the order in which they are served: its system,
-// the lowest cell along each axis, how many there are from that on, and the query's number. Cells are numbered on beyond the ends of a
-// box, where the next image begins. `cells` has eight of each system: cells along each axis, the first cell, a bit per periodic axis.
-// `boxes` has the numbers of each lattice (lattice.h), behind the radius. `axes` are the coordinates of sources, in their box and
-// sorted, `stride` numbers of each axis, and `ids` their numbers; `asked` those of queries, as they are served. Rows of `positions` and
-// `queries` are as they were given, with packed turns.
+// Sources stand by system and by cell. `visits` has seven integers of each query: its system, the lowest cell along each axis, and how
+// many there are from that on. Cells are numbered on beyond the ends of a box, where the next image begins. `cells` has five of each
+// system: cells along each axis, the first cell, a bit per periodic axis. `boxes` has the numbers of each lattice (lattice.h), behind
+// the radius. `axes` are the coordinates of sources, in their box and sorted, `stride` numbers of each axis, and `ids` their numbers;
+// `asked` are those of queries, which are served in `order`. Rows of `positions` and `queries` are as they were given, with packed turns.
 #pragma once
 #include "exact.h"
 
 struct BoxArguments {
     const real *positions, *queries, *boxes, *axes, *asked;
-    const int *ids, *visits, *cells, *start;
+    const int *ids, *order, *visits, *cells, *start;
     int *idx, *count, *info;
     int n, m, stride, own, capacity, closed, drop_self, later_only;
 };
@@ -19,7 +18,7 @@ struct BoxArguments {
 // The sources of a row of cells, in one image.
 struct BoxRun {
     int from, size, code;
-    real moved[3];
+    real away[3];  // from the query to where the origin of the image is
 };
 
 struct BoxPairs : BoxArguments, Space {
@@ -41,25 +40,25 @@ struct BoxPairs : BoxArguments, Space {
     }
     // Goes to the query that is served as number `turn`.
     JFRNN_MEMBER void go_to(int turn) {
-        const int* const mine = visits + 8ll * turn;
+        query = order[turn];
+        place = own ? turn : -1;
+        const int* const mine = visits + 7ll * query;
         if (mine[0] != system)
             enter(mine[0]);
         int rows = 1;
         for (int k = 0; k < 3; ++k) {
             low[k] = k < DIM ? mine[1 + k] : 0;
             visited[k] = k < DIM ? mine[4 + k] : 1;
-            q[k] = k < DIM ? asked[(long long)DIM * turn + k] : real(0);
+            q[k] = k < DIM ? asked[(long long)DIM * query + k] : real(0);
             rows *= k > 0 ? visited[k] : 1;
         }
-        query = mine[7];
-        place = own ? turn : -1;
         const int pieces = floor_of(low[0] + visited[0] - 1, counts[0]) - floor_of(low[0], counts[0]) + 1;
         runs = visited[0] > 0 ? rows * pieces : 0;
     }
     JFRNN_MEMBER void enter(int other) {
         system = other;
         lattice = Lattice(boxes + (long long)LATTICE_END * system);
-        const int* const mine = cells + 8ll * system;
+        const int* const mine = cells + 5ll * system;
         for (int k = 0; k < 3; ++k)
             counts[k] = k < DIM ? mine[k] : 1;
         first = mine[3];
@@ -96,7 +95,7 @@ struct BoxPairs : BoxArguments, Space {
             run.code = run.code * (2 * lattice.images(k) + 1) + shift[k] + lattice.images(k);
         }
         for (int k = 0; k < 3; ++k)
-            run.moved[k] = k < DIM ? lattice.translation(shift[0], shift[1], shift[2], k) : real(0);
+            run.away[k] = k < DIM ? lattice.translation(shift[0], shift[1], shift[2], k) - q[k] : real(0);
         return run;
     }
     // The smallest source that a query asks for in an image: of its own images, half lists have those ahead.
