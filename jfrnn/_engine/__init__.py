@@ -24,6 +24,7 @@ from jfrnn._engine.problem import (
     hide_inactive,
     is_decidable,
     prepare_search,
+    take_present,
 )
 from jfrnn._engine.reverse_warp import collect_slots, reverse_slots, slots_by_source
 from jfrnn._engine.rows import count_rows, fold_pairs, list_rows

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._engine.boxes import find_in_boxes
 from jfrnn._engine.candidates import Candidates, Points, Span, Torus
 from jfrnn._engine.problem import Kind, Options, Rows, Search, largest_radius
 from jfrnn._engine.runs import count_neighbors, list_neighbors
@@ -108,7 +109,7 @@ def refuse_many(search: Search) -> None:
 
 def is_few(search: Search, tuning: Tuning) -> bool:
     """Say whether testing all pairs takes less time than sorting."""
-    images = 1 if search.torus is None else search.torus[0].images.total
+    images = 1 if search.torus is None or search.per_system else search.torus[0].images.total
     return math.prod(search.sizes) * images <= tuning.few_pairs
 
 
@@ -123,6 +124,8 @@ def complete_rows(search: Search, idx: Array | None, count: Array, capacity: int
 
 def find_candidates(search: Search, by_cells: bool, tuning: Tuning) -> Candidates:
     """Return the candidates of each query: all sources (brute force), by cells, or by cells of many sizes."""
+    if search.per_system:
+        return find_in_boxes(search, by_cells)
     sources, queries, cutoff, batch, given, _ = search
     torus = None if given is None else _torus(sources, queries, *given)
     clouds = (sources, queries) if given is None else (given[1].sources, None if queries is None else given[1].queries)

@@ -55,11 +55,11 @@ class Torus(NamedTuple):
 
     Attributes:
         images: The images that the search considers. Static.
-        translations: [images, d] lattice translation of each image, up to rounding.
-        matrix: [d, d] lattice vectors as given.
+        translations: [images, d] lattice translation of each image, up to rounding; with a box per system the shift itself.
+        matrix: [d, d] lattice vectors as given; with a box per system [d, d, m], those of each query in the order of visits.
         raw: [n, d] sources and [m, d] queries as given.
         turns: [n, d] and [m, d] whole floats, the lattice vectors that wrapping subtracted.
-        slack: [] bound on the error of a component of a displacement of wrapped coordinates.
+        slack: [] bound on the error of a component of a displacement of wrapped coordinates; [m] with a box per system.
     """
 
     images: Images
@@ -81,7 +81,7 @@ class Candidates(NamedTuple):
         size: Number of sources. Static.
         most_words: How many words of candidates a query has at most, if known. Static.
         words: From slots per query (None: unknown) to the words of candidates that are tested at a time. Static.
-        passes: [] int32, number of passes over the sources; None for one.
+        passes: Number of passes over the sources, [] int32, of all queries or from some of them; None for one.
         again: [] int32, after how many positions the sources start again; None if each has one position.
         in_order: Whether queries are visited by their indices. Static.
     """
@@ -92,7 +92,7 @@ class Candidates(NamedTuple):
     torus: Torus | None
     size: int
     words: Callable[[int | None], int]
-    passes: Array | None = None
+    passes: Array | Callable[[Span], Array] | None = None
     again: Array | None = None
     in_order: bool = False
     most_words: int | None = None

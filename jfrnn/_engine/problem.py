@@ -3,6 +3,7 @@
 import functools
 from typing import NamedTuple, Protocol
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -18,6 +19,7 @@ from jfrnn._geometry import (
     Radii,
     Status,
     Wrapped,
+    has_box,
     is_radius,
     is_valid,
     make_cutoffs,
@@ -63,6 +65,11 @@ class Search(NamedTuple):
         if not isinstance(self.cutoff, Cutoffs):
             raise TypeError("this search has one cutoff for all particles.")
         return self.cutoff
+
+    @property
+    def per_system(self) -> bool:
+        """Whether each system of the batch has a box of its own."""
+        return self.torus is not None and self.torus[0].images.per_system
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -154,10 +161,27 @@ def hide_inactive(positions: Array, active: Array | None) -> Array:
     return positions if active is None else jnp.where(active[:, None], positions, jnp.inf)
 
 
+def take_present(inputs: Inputs) -> Inputs:
+    """Return the operands without the particles that have no box, where each system has one: they are not active.
+
+    Queries have no mask; those that have no box are moved to infinity.
+    """
+    if inputs.box is None or not inputs.box.per_system or inputs.batch is None:
+        return inputs
+    active, queries, batch = inputs.active, inputs.queries, inputs.batch
+    there = has_box(batch.sources, len(inputs.box.vectors))
+    if queries is not None:
+        queries = jnp.where(has_box(batch.of_queries, len(inputs.box.vectors))[:, None], queries, jnp.inf)
+    return inputs._replace(active=there if active is None else active & there, queries=queries)
+
+
 def prepare_search(inputs: Inputs, options: Options) -> Search:
     """Prepare the operands for engines. No gradient flows through."""
-    given, queries, active, box, cutoff, batch = lax.stop_gradient(inputs)
+    asked = lax.stop_gradient(inputs)
+    given, queries, active, box, cutoff, batch = take_present(asked)
     sources, images = hide_inactive(given, active), options.images
+    if box is not None and box.per_system and batch is not None:
+        return _prepare_boxes(asked, Search(sources, queries, make_one(cutoff), batch, None, {}), options)
     batch = None if batch is None else rank_systems(batch)
     checks: dict[Status, Array] = {}
     if isinstance(cutoff, Radii):
@@ -170,6 +194,36 @@ def prepare_search(inputs: Inputs, options: Options) -> Search:
     checks[Status.BOX_TOO_SMALL] = wrapped.enough & is_valid(lattice)
     checks[Status.OUT_OF_RANGE] = (wrapped.met & TOO_FAR) == 0
     return Search(sources, queries, cutoff, batch, (lattice, wrapped), checks)
+
+
+def make_one(cutoff: Cutoff | Radii) -> Cutoff:
+    """Return the one cutoff of all particles."""
+    if isinstance(cutoff, Radii):
+        raise TypeError("a search with a box per system has one cutoff.")
+    return cutoff
+
+
+def _prepare_boxes(asked: Inputs, search: Search, options: Options) -> Search:
+    """Prepare the operands of a search with a box per system; system numbers become those of the nearest box that there is."""
+    box, batch, images = asked.box, search.batch, options.images
+    if box is None or batch is None or images is None:
+        raise TypeError("a search with a box per system needs boxes and a batch.")
+    boxes = len(box.vectors)
+    named = [(batch.sources >= -1) & (batch.sources < boxes)]
+    named = [x if asked.active is None else x | ~asked.active for x in named]
+    if batch.queries is not None:
+        named.append((batch.queries >= -1) & (batch.queries < boxes))
+    nearest = jax.tree.map(lambda x: jnp.clip(x, 0, boxes - 1), batch)
+    lattice = make_lattice(box, images, np.dtype(search.sources.dtype))
+    wrapped = wrap(search.sources, search.queries, lattice, largest_radius(search.cutoff), nearest)
+    right = (wrapped.enough & is_valid(lattice))[nearest.sources]
+    there = has_box(batch.sources, boxes) if asked.active is None else has_box(batch.sources, boxes) & asked.active
+    checks = {
+        Status.SYSTEM_WITHOUT_BOX: functools.reduce(jnp.logical_and, (x.all() for x in named)),
+        Status.BOX_TOO_SMALL: (right | ~there).all(),
+        Status.OUT_OF_RANGE: (wrapped.met & TOO_FAR) == 0,
+    }
+    return search._replace(batch=nearest, torus=(lattice, wrapped), checks=checks)
 
 
 @functools.partial(compile_program, static_argnames="options")

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jfrnn._engine.arrays import complete_rows, find_candidates, is_few, refuse_many
-from jfrnn._engine.problem import Inputs, Options, Rows, Search, prepare_search
+from jfrnn._engine.problem import Inputs, Options, Rows, Search, prepare_search, take_present
 from jfrnn._engine.runs import State, Visit, fold_neighbors
 from jfrnn._engine.tuning import Tuning, by_platform
-from jfrnn._geometry import NOT_FINITE, Cutoff, Status
+from jfrnn._geometry import NOT_FINITE, Cutoff, Status, has_box
 from jfrnn._tracing import compile_program
 
 
@@ -42,12 +42,16 @@ def count_rows(inputs: Inputs, options: Options) -> tuple[Array, Array]:
 
 def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
     """List the neighbors of every query, or only count them (capacity=None). Integers: no gradient flows through."""
-    given, given_queries, active = lax.stop_gradient(inputs[:3])
+    present = take_present(inputs)
+    given, given_queries, active = lax.stop_gradient(present[:3])
     search = prepare_search(inputs, options)
     sources, queries, cutoff, _, torus, checks = search
     rows = _empty_rows(search, options, capacity) if 0 in search.sizes else options.engine.rows(search, options, capacity)
     if torus is not None and active is None and isinstance(cutoff, Cutoff):  # else positions may be infinite for other reasons
         checks = checks | {Status.NONFINITE: (torus[1].met & NOT_FINITE) == 0}
+    if given_queries is not None and inputs.batch is not None and inputs.box is not None and search.per_system:
+        there = has_box(inputs.batch.of_queries, len(inputs.box.vectors))  # others are at infinity
+        given_queries = jnp.where(there[:, None], given_queries, 0)
     rows = _with_status(rows, given, given_queries, active, checks)
     images = options.images
     if rows.idx is None or torus is None or images is None or images.nearest:

@@ -222,7 +222,8 @@ class _Engine(NamedTuple):
     def block_count(self) -> int:
         """Number of blocks, whose words and slots fit into the scratch memory."""
         torus = self.candidates.torus
-        runs = 1 if torus is None or torus.images.nearest else torus.images.total  # every query has at least so many
+        several = torus is not None and not (torus.images.nearest or torus.images.per_system)
+        runs = torus.images.total if torus is not None and several else 1  # every query has at least so many
         words = max(self.words, runs)
         most = min(self.tuning.words // words, self.tuning.scratch // (words * WORD_BYTES + self.slots * SLOT_BYTES))
         return -(-self.queries.ids.size // max(most, 1))
@@ -278,6 +279,7 @@ class _Engine(NamedTuple):
             return lax.while_loop(lambda now: now[0], add_next, (jnp.asarray(table.longest > 0), jnp.int32(0), state))[2]
 
         passes = self.candidates.passes
+        passes = passes(span) if callable(passes) else passes
         return add_pass(jnp.int32(0), state) if passes is None else lax.fori_loop(0, passes, add_pass, state)
 
     def word_table(self, span: Span, which: Array) -> _WordTable:
@@ -295,7 +297,7 @@ class _Engine(NamedTuple):
         first, stop, image = self._locate_words(table, chunk)
         query = [x[:, None] for x in own]
         if image is not None and self.candidates.torus is not None:  # translate the query instead of the image
-            query = [q - t[image] for q, t in zip(query, self.candidates.torus.translations.T, strict=True)]
+            query = [q - t for q, t in zip(query, self._translations(self.candidates.torus, image, span), strict=True)]
         allowed = self._allowed_lanes(first, stop, image, span)
         packed = self._test(first, image, query, span) & (allowed | allowed << np.uint32(LANES))
         first, image, packed = lax.optimization_barrier((first, image, packed))
@@ -323,13 +325,22 @@ class _Engine(NamedTuple):
                     image = jnp.where(reached, table.image[:, r, None], image)
         return jnp.minimum(first, self.sources.ids.size - LANES), stop, image
 
+    def _translations(self, torus: Torus, image: Array, span: Span) -> list[Array]:
+        """Return the lattice translation of the images of queries, per axis."""
+        if not torus.images.per_system:
+            return [t[image] for t in torus.translations.T]
+        own, shifts = span.of(torus.matrix)[..., None], [x[image] for x in torus.translations.T]
+        if torus.images.orthogonal:
+            return [shift * own[k, k] for k, shift in enumerate(shifts)]
+        return [functools.reduce(jnp.add, (x * own[row, k] for row, x in enumerate(shifts))) for k in range(len(shifts))]
+
     def _test(self, first: Array, image: Array | None, query: list[Array], span: Span) -> Array:
         """Compare 16 candidates per word with the cutoff in working precision: low half hits, high half doubtful ones."""
         difference = [windows(x, first) - q[..., None] for x, q in zip(self.sources.axes, query, strict=True)]
         square = squared_distance(difference, self.cutoff)
         own, others = self.queries.radii, self.sources.radii
         own = None if own is None else span.of(own)[:, None, None]
-        inside, outside = self._bounds(own, None if others is None else windows(others, first))
+        inside, outside = self._bounds(own, None if others is None else windows(others, first), span)
         doubtful = jnp.where(square <= outside, np.uint32(1 << LANES), np.uint32(0))
         value = jnp.where(square < inside, np.uint32(1), doubtful) << lax.iota(jnp.uint32, LANES)
         if self.keep.later_only:
@@ -339,9 +350,11 @@ class _Engine(NamedTuple):
             value = jnp.where(windows(self.sources.systems, first) == system, value, np.uint32(0))
         return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,))
 
-    def _bounds(self, own: Array | None, others: Array | None) -> tuple[np.floating | Array, np.floating | Array]:
+    def _bounds(self, own: Array | None, others: Array | None, span: Span) -> tuple[np.floating | Array, np.floating | Array]:
         torus = self.candidates.torus
         slack = None if torus is None else torus.slack
+        if torus is not None and torus.images.per_system:
+            slack = span.of(torus.slack)[:, None, None]
         radii = self.cutoff.of_pairs(own, others) if isinstance(self.cutoff, Cutoffs) else None
         return step_one_bounds(self.cutoff, radii, slack)
 
@@ -432,7 +445,8 @@ class _Engine(NamedTuple):
         (sources, queries), shifts = torus.raw, _shifts_of(torus, i, j, image)
         shift = list(jnp.moveaxis(shifts, -1, 0))
         raw = [_at(x, i) for x in queries.T], [_at(x, j) for x in sources.T]
-        return Pair(*raw, radii, *shift_in_given(shift, torus.images.basis, torus.matrix), torus.images.orthogonal)
+        matrix = torus.matrix.at[..., place].get(mode="promise_in_bounds") if torus.images.per_system else torus.matrix
+        return Pair(*raw, radii, *shift_in_given(shift, torus.images.basis, matrix), torus.images.orthogonal)
 
 
 def _at(x: Array, places: Array) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 
 from jfrnn._engine.arrays import levels_of
+from jfrnn._engine.boxes_warp import box_neighbors
 from jfrnn._engine.launch import Call, Shapes, kernel, open_native
 from jfrnn._engine.levels_warp import level_neighbors
 from jfrnn._engine.operands import MOST_IN_BOX, pack_particles, periodic_kind, space_flags
@@ -50,6 +51,8 @@ class WarpEngine:
 
     def rows(self, search: Search, options: Options, capacity: int | None) -> Rows:
         """Search among cells, or where cutoffs differ from particle to particle, among cells of many sizes."""
+        if search.per_system:
+            return box_neighbors(search._replace(checks={}), options.filter, capacity)
         if isinstance(search.cutoff, Cutoffs):
             return level_neighbors(search, levels_of(search), options.filter, capacity)
 

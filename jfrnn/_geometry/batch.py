@@ -29,6 +29,11 @@ class Batch(NamedTuple):
         return self.sources if self.queries is None else jnp.concatenate([self.sources, self.queries])
 
 
+def has_box(systems: Array, boxes: int) -> Array:
+    """Say which particles belong to one of so many systems, each of which has a box of its own; [n] bool."""
+    return (systems >= 0) & (systems < boxes)
+
+
 def rank_systems(batch: Batch) -> Batch:
     """Replace system numbers by their differences to the smallest one, as uint32, which holds every difference of two int32."""
     sources = _in_order(batch.sources)

@@ -20,74 +20,96 @@ class Box:
     """A periodic box: space repeats along its lattice vectors. A pytree; lengths, vectors and origin may be traced.
 
     Attributes:
-        vectors: Edge lengths [length], shape [d], or lattice vectors, one per row, shape [d, d].
-        origin: A corner of the cell [length], shape [d].
-        periodic: Whether each axis is periodic. Static.
+        vectors: Edge lengths [length], shape [d], or lattice vectors, one per row, shape [d, d]. With `per_system`, one such array
+            per system of a batch, shape [systems, d] or [systems, d, d].
+        origin: A corner of the cell [length], shape [d]; with `per_system` [systems, d].
+        flags: Whether each axis of each system is periodic, shape [systems, d], bool; None: `periodic` says it for all.
+        periodic: Whether each axis is periodic; all True if `flags` tell. Static.
         images: How many cells away a periodic image may lie and still be a neighbor, per axis; None: see `Box`. Static.
+        per_system: Whether each system of a batch has a box of its own. Static.
     """
 
     vectors: Numbers
     origin: Numbers
+    flags: Numbers | None
     periodic: tuple[bool, ...]
     images: tuple[int, ...] | None
+    per_system: bool
 
     def __init__(
         self,
         lengths_or_matrix: Given,
-        periodic: bool | Sequence[bool] = True,
+        periodic: bool | Sequence[bool] | Given = True,
         origin: Given = 0.0,
         *,
         images: int | Sequence[int] | None = None,
+        per_system: bool | None = None,
     ) -> None:
-        """Make a box from its edge lengths or from its lattice vectors.
+        """Make a box from its edge lengths or from its lattice vectors, or one box for each system of a batch.
 
         Args:
             lengths_or_matrix: Edge lengths [length], shape [2] or [3], all > 0; or lattice vectors [length], one per row, shape [2,
                 2] or [3, 3], of any handedness and skew. If skewed vectors are known while tracing, the search works in short
                 vectors of the same lattice; shifts still count the given vectors. Rows of axes that are not periodic only need to
-                be finite. Values are rounded once to the dtype of the positions.
-            periodic: One bool for all axes, or one per axis (per row of the matrix).
-            origin: A corner of the cell [length], a number or shape [d]. It changes no pair; a search is fastest if particles lie
-                between origin and origin + vectors.
+                be finite. Values are rounded once to the dtype of the positions. For a box per system: lengths of shape [systems,
+                d] with `per_system=True`, or vectors of shape [systems, d, d]; such vectors are used as they are given.
+            periodic: One bool for all axes, or one per axis (per row of the matrix); for a box per system also an array of bool,
+                shape [systems, d], which may be traced.
+            origin: A corner of the cell [length], a number or shape [d], or with a box per system [systems, d]. It changes no pair;
+                a search is fastest if particles lie between origin and origin + vectors.
             images: How many cells away a periodic image may lie and still be a neighbor: a static int, or one per axis. Default: as
                 many as the cutoff needs if the box is known while tracing. For a traced box the default is the minimum image alone,
-                which needs a box at least 2.05 (cutoff + skin) wide along every periodic axis; a smaller box sets a status bit.
+                which needs a box at least 2.05 (cutoff + skin) wide along every periodic axis; a smaller box sets a status bit. For
+                a box per system: as many as any system needs; a system is searched for its own alone.
+            per_system: Whether the first axis counts the systems of a batch, so that each has a box of its own. Default: whether
+                there are three axes. Lengths [systems, d] need True, as they would else be lattice vectors.
 
         Raises:
             TypeError, ValueError: an argument is of the wrong kind, shape or range.
         """
         vectors = _real("lengths_or_matrix", lengths_or_matrix)
-        if vectors.shape not in ((2,), (3,), (2, 2), (3, 3)):
+        many = vectors.ndim == 3 if per_system is None else per_system
+        if not isinstance(many, bool | np.bool_):
+            raise TypeError(f"per_system must be True, False or None, known while tracing, got {per_system!r}.")
+        shape = vectors.shape[bool(many) :]
+        if shape not in ((2,), (3,), (2, 2), (3, 3)) or vectors.ndim != len(shape) + bool(many) or 0 in vectors.shape:
             raise ValueError(
-                f"lengths_or_matrix must have shape [d] (lengths) or [d, d] (lattice vectors) with d = 2 or 3, got shape "
-                f"{list(vectors.shape)}."
+                f"lengths_or_matrix must have shape [d] (lengths) or [d, d] (lattice vectors) with d = 2 or 3, or [systems, d, d], "
+                f"or with per_system=True [systems, d], got shape {list(vectors.shape)}."
             )
-        dim = vectors.shape[0]
+        dim, systems = shape[0], vectors.shape[: bool(many)]
         corner = _real("origin", origin)
-        if corner.shape not in ((), (dim,)):
-            raise ValueError(f"origin must be a number or have shape [{dim}], got shape {list(corner.shape)}.")
-        flags = _per_axis("periodic", periodic, dim, (bool, np.bool_), "bool")
+        if corner.shape not in ((), (dim,), (*systems, dim)):
+            wanted = f"[{dim}]{f' or {[*systems, dim]}' if many else ''}"
+            raise ValueError(f"origin must be a number or have shape {wanted}, got shape {list(corner.shape)}.")
+        flags = _flags_of_systems(periodic, (*systems, dim)) if many and np.ndim(periodic) == 2 else None
+        axes = (True,) * dim if flags is not None else _per_axis("periodic", periodic, dim, (bool, np.bool_), "bool")
         reach = None if images is None else _per_axis("images", images, dim, (int, np.integer), "int >= 0", least=0)
+        full = corner if corner.shape == (*systems, dim) else corner + np.zeros((*systems, dim), corner.dtype)
+        self._set((vectors, full, flags), (axes, reach, bool(many)))
         with own_transfers():
-            check_box_values(vectors, corner, flags)
-        self._set(vectors, corner if corner.shape else corner + np.zeros(dim, corner.dtype), flags, reach)
+            check_box_values(self)
 
-    def _set(self, vectors: Numbers, origin: Numbers, periodic: tuple[bool, ...], images: tuple[int, ...] | None) -> None:
-        for name, value in (("vectors", vectors), ("origin", origin), ("periodic", periodic), ("images", images)):
-            object.__setattr__(self, name, value)
+    def _set(self, arrays: Iterable[Numbers], static: tuple[Any, ...]) -> None:
+        for field, value in zip(dataclasses.fields(self), (*arrays, *static), strict=True):
+            object.__setattr__(self, field.name, value)
 
     def tree_flatten_with_keys(self) -> tuple[Any, Any]:
         """Return the arrays with their names, and the static fields."""
-        keys = (jax.tree_util.GetAttrKey("vectors"), jax.tree_util.GetAttrKey("origin"))
-        return tuple(zip(keys, (self.vectors, self.origin), strict=True)), (self.periodic, self.images)
+        arrays = {"vectors": self.vectors, "origin": self.origin, "flags": self.flags}
+        return tuple((jax.tree_util.GetAttrKey(name), x) for name, x in arrays.items()), self.kind
 
     @classmethod
-    def tree_unflatten(cls, static: tuple[tuple[bool, ...], tuple[int, ...] | None], arrays: Iterable[Numbers]) -> "Box":
+    def tree_unflatten(cls, static: tuple[Any, ...], arrays: Iterable[Numbers]) -> "Box":
         """Make a box from its parts without checking them again."""
         box = object.__new__(cls)
-        vectors, origin = arrays
-        box._set(vectors, origin, *static)
+        box._set(arrays, static)
         return box
+
+    @property
+    def kind(self) -> tuple[tuple[bool, ...], tuple[int, ...] | None, bool]:
+        """The static fields."""
+        return self.periodic, self.images, self.per_system
 
     @property
     def dim(self) -> int:
@@ -97,7 +119,18 @@ class Box:
     @property
     def orthogonal(self) -> bool:
         """Whether the box was given by lengths."""
-        return np.ndim(self.vectors) == 1
+        return np.ndim(self.vectors) == 1 + self.per_system
+
+
+def _flags_of_systems(periodic: Given, shape: tuple[int, ...]) -> Numbers:
+    """Return which axes of each system are periodic: a traced array unchanged, everything else as a new NumPy array."""
+    flags = periodic if isinstance(periodic, Tracer) else np.array(periodic)
+    if flags.dtype != np.bool_ or flags.shape != shape:
+        raise ValueError(
+            f"periodic must be one bool, one per axis, or an array of bool of shape {list(shape)}, got {flags.dtype} of shape "
+            f"{list(flags.shape)}."
+        )
+    return flags
 
 
 def _real(name: str, value: Given) -> Numbers:
@@ -122,22 +155,45 @@ def _per_axis(name: str, value: Given, dim: int, kinds: tuple[type, ...], what: 
     return tuple(v.item() if isinstance(v, np.generic) else v for v in values)
 
 
-def check_box_values(vectors: Numbers, origin: Numbers, periodic: tuple[bool, ...]) -> None:
+def check_box_values(box: Box) -> None:
+    """Raise if known values are not those of a box, or of one per system."""
+    vectors, origin, flags = (
+        _known(x) for x in (box.vectors, box.origin, np.array(box.periodic) if box.flags is None else box.flags)
+    )
     for name, value in (("lengths_or_matrix", vectors), ("origin", origin)):
         if not isinstance(value, Tracer) and not np.isfinite(value).all():
-            raise ValueError(f"{name} must be finite, got {value.tolist()}.")
-    if isinstance(vectors, Tracer):
+            raise ValueError(f"{name} must be finite, got {_tell_bad(value, ~np.isfinite(value), box)}.")
+    if isinstance(vectors, Tracer) or isinstance(flags, Tracer):
         return
-    if vectors.ndim == 1 and not (vectors[list(periodic)] > 0).all():
-        raise ValueError(f"lengths of periodic axes must be positive, got {vectors.tolist()}; give a matrix for other handedness.")
-    if vectors.ndim == 2 and any(periodic):
-        rows = vectors[list(periodic)].astype(np.float64)
-        size = np.abs(rows).max(axis=1, keepdims=True)
-        if not size.all() or np.linalg.matrix_rank(rows / size) < len(rows):
-            raise ValueError(f"periodic lattice vectors must be linearly independent, got the rows {vectors.tolist()}.")
+    if box.orthogonal:
+        if (bad := (vectors <= 0) & flags).any():
+            told = _tell_bad(vectors, bad, box)
+            raise ValueError(f"lengths of periodic axes must be positive, got {told}; give a matrix for other handedness.")
+        return
+    rows = np.where(flags[..., None], vectors.astype(np.float64), 0)
+    size = np.abs(rows).max(axis=-1, keepdims=True)
+    bad = np.linalg.matrix_rank(rows / np.where(size > 0, size, 1)) < flags.sum(axis=-1)
+    if bad.any():
+        raise ValueError(f"periodic lattice vectors must be linearly independent, got the rows {_tell_bad(vectors, bad, box)}.")
+
+
+def _known(x: Numbers) -> Numbers:
+    return x if isinstance(x, Tracer) else np.asarray(x)
+
+
+def _tell_bad(values: np.ndarray, bad: np.ndarray, box: Box) -> str:
+    """Return values as text; with a box per system those of the first bad one."""
+    if not box.per_system:
+        return str(values.tolist())
+    first = int(np.argmax(bad.reshape(len(bad), -1).any(axis=1)))
+    return f"{values[first].tolist()} in system {first}"
 
 
 def round_box(box: Box, dtype: np.dtype) -> Box:
     """Return a box with its arrays rounded to a dtype; it keeps which axes are periodic, but not `images`."""
     with own_transfers():
-        return Box.tree_unflatten((box.periodic, None), tuple(jnp.asarray(x).astype(dtype) for x in (box.vectors, box.origin)))
+        arrays = (
+            *(jnp.asarray(x).astype(dtype) for x in (box.vectors, box.origin)),
+            None if box.flags is None else jnp.asarray(box.flags),
+        )
+        return Box.tree_unflatten((box.periodic, None, box.per_system), arrays)

@@ -54,7 +54,7 @@ class Pair(NamedTuple):
     b: list[Array]
     radii: list[Array] | None = None
     shift: list[Array] | None = None  # whole floats
-    matrix: Array | None = None  # [d, d], one lattice vector per row, 0 for open axes
+    matrix: Array | None = None  # [d, d], one lattice vector per row, 0 for open axes; or [d, d, ...] of each pair
     orthogonal: bool = True
 
     def lattice_terms(self, axis: int) -> list[tuple[Array, tuple[int, int]]]:
@@ -94,7 +94,10 @@ def squared_distance(difference: list[Array], cutoff: "Cutoff | Cutoffs") -> Arr
 
 
 class Shifted(NamedTuple):
-    """The lattice part of pairs [m, k]: displacements and shifts [m, k, d], a bound on the error of displacements, the lattice."""
+    """The lattice part of pairs [m, k]: displacements and shifts [m, k, d], a bound on the error of displacements, the lattice.
+
+    That is `matrix`, [d, d], or [m, d, d] of each row.
+    """
 
     vectors: Array
     shifts: Array
@@ -138,7 +141,11 @@ class _Slots(NamedTuple):
         if shifted is None:
             return pair
         shifts = shifted.shifts if at is None else shifted.shifts.reshape(-1, len(axes)).at[at].get(mode="clip")
-        shift, matrix = shift_in_given(list(jnp.moveaxis(shifts, -1, 0)), shifted.basis, shifted.matrix)
+        given = shifted.matrix
+        if given.ndim == 3:  # of each row
+            given = jnp.moveaxis(given if at is None else given.at[at // self.neighbor.shape[1]].get(mode="clip"), 0, -1)
+            given = given[..., None] if at is None else given
+        shift, matrix = shift_in_given(list(jnp.moveaxis(shifts, -1, 0)), shifted.basis, given)
         return pair._replace(shift=shift, matrix=matrix, orthogonal=shifted.orthogonal)
 
     def _spread(self, column: Array, at: Array | None) -> Array:  # without an index array of all slots, a large constant for XLA
@@ -239,7 +246,7 @@ def _fixed_sign(pair: Pair, threshold: _Threshold) -> Array:
         return number
 
     matrix = jnp.zeros((0, 0), dtype) if pair.matrix is None else pair.matrix
-    lattice = _fixed_point(matrix.reshape(*matrix.shape, *[1] * up.ndim), up)
+    lattice = _fixed_point(matrix.reshape(*matrix.shape, *[1] * up.ndim) if matrix.ndim == 2 else matrix, up)
     for axis, (ak, bk) in enumerate(zip(pair.a, pair.b, strict=True)):
         displacement, estimate = _add(fixed(bk), fixed(ak), -1), bk - ak
         error = jnp.zeros((), dtype)
@@ -334,11 +341,15 @@ def _integer_sign(pair: Pair, threshold: _Threshold) -> Array:
 
 
 def _translation_limbs(shift: Array, vectors: Array, count: int, orthogonal: bool) -> Array:
-    """Return the sum of shifts [k, t] times lattice vectors [t, d] as limbs [k, d + 1, ...]; the last axis entry is 0."""
-    dim = vectors.shape[1]
-    limbs, shift = limbs_of(jnp.pad(vectors, ((0, 0), (0, 1))), count), shift[..., None]  # [t, d + 1, ...]
+    """Return the sum of shifts [k, t] times lattice vectors [t, d] as limbs [k, d + 1, ...]; the last axis entry is 0.
+
+    Where each pair has a lattice of its own, vectors are [t, d, k].
+    """
+    dim, shift = vectors.shape[1], shift[..., None]
+    vectors = vectors[None] if vectors.ndim == 2 else jnp.moveaxis(vectors, -1, 0)
+    limbs = limbs_of(jnp.pad(vectors, ((0, 0), (0, 0), (0, 1))), count)  # [1 or k, t, d + 1, ...]
     if orthogonal:
         vectors_of = np.eye(dim, dim + 1, dtype=limbs.dtype)
-        limbs = jnp.sum(vectors_of[..., None] * limbs[:dim], axis=0, dtype=limbs.dtype)
-        return jnp.pad(shift[:, :dim], ((0, 0), (0, 1), (0, 0))) * limbs[None]
-    return functools.reduce(jnp.add, (shift[:, k, None] * limbs[None, k] for k in range(len(limbs))))
+        limbs = jnp.sum(vectors_of[None, ..., None] * limbs[:, :dim], axis=1, dtype=limbs.dtype)
+        return jnp.pad(shift[:, :dim], ((0, 0), (0, 1), (0, 0))) * limbs
+    return functools.reduce(jnp.add, (shift[:, k, None] * limbs[:, k] for k in range(limbs.shape[1])))

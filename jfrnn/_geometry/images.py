@@ -32,6 +32,7 @@ class Images(NamedTuple):
         reach: How many cells away an image may lie and still be a neighbor, per axis; 0 along axes that are not periodic.
         nearest: Whether the minimum image of a pair is its only one within the cutoff, so that lists store no images.
         basis: The vectors that shifts count, as whole-number combinations of the given ones; None: the given ones.
+        per_system: Whether each system of a batch has a box of its own; `reach` is then the largest of any.
     """
 
     periodic: tuple[bool, ...]
@@ -39,6 +40,7 @@ class Images(NamedTuple):
     reach: tuple[int, ...]
     nearest: bool
     basis: Basis | None = None
+    per_system: bool = False
 
     @property
     def shifts(self) -> np.ndarray:
@@ -73,11 +75,11 @@ def images_of(box: Box, radius: float | None, dtype: np.dtype, sources: int) -> 
     Raises:
         ValueError: the cutoff spans more images than the codes can number.
     """
-    if box.images is None and radius is not None and not isinstance(box.vectors, Tracer):
+    if box.images is None and radius is not None and not isinstance(box.vectors, Tracer) and not isinstance(box.flags, Tracer):
         with own_transfers():
             vectors = np.asarray(box.vectors, dtype).astype(np.float64)
-        images = _needed_images(vectors, box, radius, dtype, None)
-        if not box.orthogonal and _too_many(images, sources, _MANY_IMAGES):
+            images = _needed_images(vectors, box, radius, dtype, None)
+        if not (box.orthogonal or box.per_system) and _too_many(images, sources, _MANY_IMAGES):
             basis, short = reduced_basis(vectors, box.periodic)
             reduced = _needed_images(short, box, radius, dtype, basis)
             images = reduced if reduced.total < images.total and _are_exact(reduced) else images
@@ -85,7 +87,7 @@ def images_of(box: Box, radius: float | None, dtype: np.dtype, sources: int) -> 
     wanted = (0,) * box.dim if box.images is None else box.images
     nearest = not any(k for k, p in zip(wanted, box.periodic, strict=True) if p)
     reach = tuple(max(k, 1) if p else 0 for k, p in zip(wanted, box.periodic, strict=True))
-    return check_images(Images(box.periodic, box.orthogonal, reach, nearest), sources)
+    return check_images(Images(box.periodic, box.orthogonal, reach, nearest, None, box.per_system), sources)
 
 
 def _needed_images(vectors: np.ndarray, box: Box, radius: float, dtype: np.dtype, basis: Basis | None) -> Images:
@@ -94,13 +96,16 @@ def _needed_images(vectors: np.ndarray, box: Box, radius: float, dtype: np.dtype
     `_ROUNDING` is far more than the rounding of coordinates, unless vectors are long beside the distances between their faces: then
     the residual of the transform, times the cells that an image lies away, is more (`jfrnn._geometry.wrapping.wrap`).
     """
-    span = (np.diag(vectors) if vectors.ndim == 1 else vectors)[list(box.periodic)]
-    inverse, share, residual = np.linalg.pinv(span), np.zeros(box.dim), np.zeros(box.dim)
-    share[list(box.periodic)] = radius * np.linalg.norm(inverse, axis=0)  # of the distances between opposite faces
-    residual[list(box.periodic)] = (np.abs(span) @ np.abs(inverse)).sum(axis=0)
-    margin = np.maximum(_ROUNDING, 48 * float(np.finfo(dtype).eps) * (share.max() + 3) * residual)
-    reach = tuple(math.ceil(s) if p else 0 for s, p in zip((share + margin).tolist(), box.periodic, strict=True))
-    return Images(box.periodic, box.orthogonal, reach, bool((share + margin <= _NEAREST).all()), basis)
+    flags = np.array(box.periodic) if box.flags is None else np.asarray(box.flags)
+    rows = vectors[..., None] * np.eye(box.dim) if box.orthogonal else vectors
+    rows = np.where(flags[..., None], rows, 0)
+    inverse = np.linalg.pinv(rows)
+    share = np.where(flags, radius * np.linalg.norm(inverse, axis=-2), 0)  # of the distances between opposite faces
+    residual = np.where(flags, (np.abs(rows) @ np.abs(inverse)).sum(axis=-2), 0)
+    margin = 48 * float(np.finfo(dtype).eps) * (share.max(axis=-1, keepdims=True) + 3) * residual
+    needed = (share + np.where(flags, np.maximum(_ROUNDING, margin), 0)).reshape(-1, box.dim).max(axis=0)  # of any system
+    reach = tuple(math.ceil(x) for x in needed.tolist())
+    return Images(box.periodic, box.orthogonal, reach, bool((needed <= _NEAREST).all()), basis, box.per_system)
 
 
 def _too_many(images: Images, sources: int, most: int) -> bool:
@@ -140,7 +145,7 @@ def grow_images(kind: Images, boxes: Sequence[Box], radius: float | None, dtype:
         ValueError: a box is degenerate, or too small for this cutoff.
     """
     for box in boxes:
-        check_box_values(np.asarray(box.vectors), np.asarray(box.origin), box.periodic)
+        check_box_values(box)
     kinds = [kind, *(images_of(box, radius, dtype, sources) for box in boxes)]
     if len({k.basis for k in kinds}) > 1:  # reaches are comparable in one basis only: that of the last box
         kinds = [_in_basis(box, radius, dtype, kinds[-1]) for box in boxes]

@@ -215,10 +215,16 @@ def check_box(box: object, positions: Array, like: Box | None = None) -> Box | N
         raise ValueError(
             f"box has {box.dim} axes, but positions have {positions.shape[1]} columns: give as many lengths or lattice vectors."
         )
-    if like is not None and (box.periodic, box.orthogonal) != (like.periodic, like.orthogonal):
-        was, came = (f"periodic={b.periodic}, {'lengths' if b.orthogonal else 'matrix'}" for b in (like, box))
+    if like is not None and _kind_of(box) != _kind_of(like):
+        was, came = (_kind_of(b) for b in (like, box))
         raise ValueError(f"box must be of the kind with which the list was made ({was}), got {came}.")
     return box if any(box.periodic) else None
+
+
+def _kind_of(box: Box) -> str:
+    known = f"periodic={box.periodic}" if box.flags is None else "periodic per system"
+    many = f", for each of {box.vectors.shape[0]} systems" if box.per_system else ""
+    return f"{known}, {'lengths' if box.orthogonal else 'matrix'}{many}"
 
 
 def check_flag(name: str, value: object) -> bool:

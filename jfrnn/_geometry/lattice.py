@@ -6,6 +6,7 @@ lattice; `given_shifts` converts such shifts to the given vectors.
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +18,14 @@ from jfrnn._geometry.exact import Shifted
 from jfrnn._geometry.floats import WHOLE_BITS, distill, half_mantissa
 from jfrnn._geometry.images import Images
 from jfrnn._geometry.reduced import Basis
-from jfrnn._tracing import leading_axes
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Lattice:
-    """A periodic box in the dtype of the positions, ready to wrap them.
+    """A periodic box in the dtype of the positions, ready to wrap them; or many, of which arrays have a first axis more.
+
+    These are the boxes of systems or, after `of_rows`, those to which the rows of other arrays belong.
 
     Attributes:
         matrix: [d, d] lattice vectors that shifts count, one per row; rows of open axes are 0. Short, rounded vectors if `images`
@@ -31,6 +33,7 @@ class Lattice:
         given: [d, d] lattice vectors that the user gave; exact decisions use these.
         transform: [d, d]; (x - origin) @ transform are fractional coordinates along periodic axes, lengths along open ones.
         origin: [d] a corner of the cell.
+        flags: [d] which axes are periodic, if that differs among many boxes; else None, and `images` tells.
         images: The images that the search considers. Static.
     """
 
@@ -38,6 +41,7 @@ class Lattice:
     given: Array
     transform: Array
     origin: Array
+    flags: Array | None
     images: Images = dataclasses.field(metadata={"static": True})
 
     @property
@@ -45,19 +49,51 @@ class Lattice:
         """Number of axes."""
         return len(self.images.periodic)
 
+    @property
+    def periodic(self) -> Array | np.ndarray:
+        """Which axes are periodic, [d] bool or as `flags`."""
+        return np.array(self.images.periodic) if self.flags is None else self.flags
+
+    @property
+    def residual(self) -> Array:
+        """The magnitude of matrix @ transform - 1 (0 instead of 1 along open axes): the rounding error of the transform."""
+        unit = np.eye(self.dim, dtype=bool).reshape(*(1,) * (self.matrix.ndim - 2), self.dim, self.dim)
+        exact = unit & self.spread(self.periodic, self.matrix.ndim)
+        return jnp.abs(product(self.matrix, self.transform) - jnp.asarray(exact, self.matrix.dtype))
+
+    def of_rows(self, systems: Array) -> "Lattice":
+        """Return the box of each row of an array, given the system of each, [rows]; the nearest of those that there are."""
+        return jax.tree.map(lambda x: x.at[systems].get(mode="clip"), self)
+
+    def spread(self, x: Array | np.ndarray, ndim: int) -> Array | np.ndarray:
+        """Return x [d], or one for each row [rows, d], so that it meets arrays [rows, ..., d] of so many axes."""
+        return x.reshape(*x.shape[:-1], *(1,) * (ndim - x.ndim), x.shape[-1])
+
 
 def make_lattice(box: Box, images: Images, dtype: np.dtype) -> Lattice:
-    """Round a box to a dtype once and compute its transform."""
+    """Round a box, or one per system, to a dtype once and compute its transform."""
     vectors, origin = jnp.asarray(box.vectors).astype(dtype), jnp.asarray(box.origin).astype(dtype)
+    if not box.per_system:
+        return Lattice(*_make(vectors, None, box, images), origin, None, images)
+    arrays = jax.vmap(lambda vectors, flags: _make(vectors, flags, box, images))(vectors, box.flags)
+    return Lattice(*arrays, origin, None if box.flags is None else jnp.asarray(box.flags), images)
+
+
+def _make(vectors: Array, flags: Array | None, box: Box, images: Images) -> tuple[Array, Array, Array]:
+    """Return the vectors that shifts count, the given ones and the transform of one box."""
+    periodic = np.array(box.periodic) if flags is None else flags
     rows = jnp.diag(vectors) if box.orthogonal else vectors
-    flags = np.array(box.periodic)
-    given = matrix = jnp.where(flags[:, None], rows, 0)
+    given = matrix = jnp.where(periodic[:, None], rows, 0)
     if box.orthogonal:
-        lengths = jnp.where(flags, vectors, 1)
-        return Lattice(matrix, given, jnp.diag(1 / lengths), origin, images)
+        return matrix, given, jnp.diag(1 / jnp.where(periodic, vectors, 1))
     if images.basis is not None:
         matrix = combine(images.basis, given)
-    return Lattice(matrix, given, _inverse(_complete(matrix, box.periodic)), origin, images)
+    if flags is None:
+        return matrix, given, _inverse(_complete(matrix, box.periodic))
+    whole = matrix = lax.stop_gradient(matrix)
+    for axes in itertools.product((False, True), repeat=len(periodic)):
+        whole = jnp.where((flags == np.array(axes)).all(), _complete(matrix, axes), whole)
+    return given, given, _inverse(whole)
 
 
 def combine(basis: Basis, matrix: Array) -> Array:
@@ -112,34 +148,39 @@ def _inverse(matrix: Array) -> Array:
 
 
 def _diagonal(matrix: Array) -> Array:
-    return jnp.stack([matrix[k, k] for k in range(len(matrix))])  # without a gather, which would be a separate kernel
+    return jnp.stack(
+        [matrix[..., k, k] for k in range(matrix.shape[-1])], axis=-1
+    )  # without a gather, which would be a separate kernel
 
 
 def product(a: Array, b: Array) -> Array:
-    return jnp.sum(a[:, :, None] * b[None, :, :], axis=1)  # without a matmul, which GPUs may compute in fewer bits
+    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)  # without a matmul, which GPUs may compute in fewer bits
 
 
 def is_valid(lattice: Lattice) -> Array:
-    """Say whether a lattice is finite, its vectors independent and its lengths positive; [] bool."""
-    right = jnp.isfinite(lattice.matrix).all() & jnp.isfinite(lattice.transform).all() & jnp.isfinite(lattice.origin).all()
+    """Say whether a lattice is finite, its vectors independent and its lengths positive; [] bool, or of many [boxes]."""
+    arrays = (lattice.matrix, (-2, -1)), (lattice.transform, (-2, -1)), (lattice.origin, (-1,))
+    right = functools.reduce(jnp.logical_and, (jnp.isfinite(x).all(axis=axes) for x, axes in arrays))
     if lattice.images.orthogonal:
-        right = right & (_diagonal(lattice.matrix) >= 0).all()
+        right = right & (_diagonal(lattice.matrix) >= 0).all(axis=-1)
     return right
 
 
 def fractions_of(points: Array, lattice: Lattice) -> Array:
     """Return the fractional coordinates of points [n, d] (lengths along open axes)."""
-    from_origin = points - lattice.origin[None]
+    from_origin = points - lattice.spread(lattice.origin, 2)
     if lattice.images.orthogonal:
-        return from_origin * _diagonal(lattice.transform)[None]
+        return from_origin * lattice.spread(_diagonal(lattice.transform), 2)
+    if lattice.transform.ndim == 3:
+        return jnp.sum(from_origin[:, :, None] * lattice.transform, axis=1)
     return product(from_origin, lattice.transform) if len(points) else from_origin
 
 
 def translation(shifts: Array, lattice: Lattice) -> Array:
     """Return the lattice translations shifts @ matrix, [..., d], of whole floats; differentiable in the lattice."""
     if lattice.images.orthogonal:
-        return shifts * leading_axes(_diagonal(lattice.matrix), shifts.ndim)
-    rows = [leading_axes(lattice.matrix[k], shifts.ndim) for k in range(lattice.dim)]
+        return shifts * lattice.spread(_diagonal(lattice.matrix), shifts.ndim)
+    rows = [lattice.spread(lattice.matrix[..., k, :], shifts.ndim) for k in range(lattice.dim)]
     return sum((shifts[..., k, None] * rows[k] for k, p in enumerate(lattice.images.periodic) if p), jnp.zeros_like(shifts))
 
 
@@ -151,10 +192,11 @@ def shift_pairs(difference: Array, shifts: Array, lattice: Lattice) -> Shifted:
     vectors, fixed = difference + translation(shifts, lattice), lax.stop_gradient(lattice)
     sizes = lax.stop_gradient(jnp.where(jnp.isfinite(difference), jnp.abs(difference), 0))
     spans = functools.reduce(jnp.maximum, (jnp.abs(shifts[..., k]) for k in range(lattice.dim))) + 1
-    rows = [jnp.abs(fixed.matrix[k]) for k in range(lattice.dim)]
-    moved = functools.reduce(jnp.add, rows)  # 0 for components to which no lattice vector contributes
+    rows = [jnp.abs(fixed.matrix[..., k, :]) for k in range(lattice.dim)]
+    every = lattice.spread(functools.reduce(jnp.add, rows), difference.ndim)
+    moved = [every[..., k] for k in range(lattice.dim)]  # 0 for components to which no lattice vector contributes
     parts = [jnp.where(moved[k] > 0, sizes[..., k] + spans * moved[k], 0) for k in range(lattice.dim)]
-    slack = 8 * jnp.finfo(moved.dtype).eps * functools.reduce(jnp.maximum, parts)
+    slack = 8 * jnp.finfo(every.dtype).eps * functools.reduce(jnp.maximum, parts)
     return Shifted(vectors, shifts, slack, fixed.given, lattice.images.orthogonal, lattice.images.basis)
 
 
@@ -178,12 +220,12 @@ def forward_shifts(shifts: Array, images: Images) -> Array:
 def nearest_shifts(difference: Array, lattice: Lattice) -> Array:
     """Return the lattice shifts [..., d], whole floats, of the minimum images of differences x_j - x_i [..., d]."""
     units = units_of(lax.stop_gradient(difference), lattice)
-    return lax.stop_gradient(jnp.where(np.array(lattice.images.periodic), -jnp.round(units), 0))
+    return lax.stop_gradient(jnp.where(lattice.spread(lattice.periodic, units.ndim), -jnp.round(units), 0))
 
 
 def units_of(difference: Array, lattice: Lattice) -> Array:
     """Return differences [..., d] in fractional coordinates (lengths along open axes)."""
     if lattice.images.orthogonal:
-        return difference * leading_axes(_diagonal(lattice.transform), difference.ndim)
-    rows = [leading_axes(lattice.transform[m], difference.ndim) for m in range(lattice.dim)]
+        return difference * lattice.spread(_diagonal(lattice.transform), difference.ndim)
+    rows = [lattice.spread(lattice.transform[..., m, :], difference.ndim) for m in range(lattice.dim)]
     return functools.reduce(jnp.add, (difference[..., m, None] * row for m, row in enumerate(rows)))

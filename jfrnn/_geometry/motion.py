@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._geometry.lattice import Lattice, nearest_shifts, product, translation, units_of
+from jfrnn._geometry.lattice import Lattice, nearest_shifts, translation, units_of
 from jfrnn._geometry.wrapping import pack_turns, unpack_turns
 
 
@@ -29,17 +29,17 @@ class Motion(NamedTuple):
 
 def motion_of(before: Array, now: Array, lattice: Lattice) -> Motion:
     """Measure the motion of points [n, d] modulo the lattice."""
-    eps, periodic = jnp.finfo(now.dtype).eps, np.array(lattice.images.periodic)
+    eps = jnp.finfo(now.dtype).eps
     difference, matrix, transform = now - before, jnp.abs(lattice.matrix), jnp.abs(lattice.transform)
     units, turns = units_of(difference, lattice), turns_between(before, now, lattice)
     size, taken = jnp.abs(difference), jnp.abs(turns)
     rounding = 4 * eps * (size + translation(taken, dataclasses.replace(lattice, matrix=matrix)))
     was_turned = (turns != 0).any(axis=1)
     left = jnp.abs(difference - translation(turns, lattice)) + jnp.where(was_turned[:, None], rounding, 0)
-    residual = jnp.abs(product(lattice.matrix, lattice.transform) - jnp.diag(jnp.asarray(periodic, now.dtype)))
+    residual = lattice.spread(lattice.residual.sum(axis=-2), 2)
     most = jnp.max(taken, axis=1, keepdims=True, initial=0) + 1
-    unsure = 8 * eps * units_of(size, dataclasses.replace(lattice, transform=transform)) + 2 * most * residual.sum(axis=0)[None]
-    sure = jnp.where(periodic[None], jnp.abs(units - turns) + unsure < 0.5, True).all(axis=1)
+    unsure = 8 * eps * units_of(size, dataclasses.replace(lattice, transform=transform)) + 2 * most * residual
+    sure = jnp.where(lattice.spread(lattice.periodic, 2), jnp.abs(units - turns) + unsure < 0.5, True).all(axis=1)
     packed = pack_turns(now, lattice)
     home = unpack_turns(packed, lattice.dim) - jnp.clip(turns, -(2.0**20), 2.0**20).astype(jnp.int32)
     return Motion(list(left.T), sure & ((packed >= 0) | ~was_turned), home)
@@ -52,7 +52,7 @@ def turns_between(before: Array, now: Array, lattice: Lattice) -> Array:
 
 
 def box_change(before: Lattice, now: Lattice, home: Sequence[Array]) -> Array:
-    """Bound the change in displacement that a changed box causes for any pair within reach.
+    """Bound the change in displacement that a changed box, or the one of any row, causes for any pair within reach.
 
     `home`, arrays [n, d] int32, tells how many lattice vectors the points lie from the box (`Motion`).
     """
@@ -62,7 +62,8 @@ def box_change(before: Lattice, now: Lattice, home: Sequence[Array]) -> Array:
     highest = functools.reduce(jnp.maximum, (jnp.max(x, axis=0) for x in places))
     lowest = functools.reduce(jnp.minimum, (jnp.min(x, axis=0) for x in places))
     eps = jnp.finfo(dtype).eps
-    moved = jnp.sqrt(jnp.sum((now.matrix - before.matrix) ** 2, axis=1)) * (1 + 16 * eps)
+    moved = jnp.sqrt(jnp.sum((now.matrix - before.matrix) ** 2, axis=-1)) * (1 + 16 * eps)
     if now.images.basis is not None:  # short vectors carry a rounding error
         moved = jnp.where(moved > 0, moved + 4 * eps * jnp.sum(jnp.abs(now.matrix), axis=1), moved)
-    return jnp.sum(((highest - lowest).astype(dtype) + np.array(now.images.reach, dtype)) * moved)
+    cells = (highest - lowest).astype(dtype) + np.array(now.images.reach, dtype)
+    return jnp.max(jnp.sum(now.spread(cells, moved.ndim) * moved, axis=-1))

@@ -27,6 +27,7 @@ class Status(enum.IntFlag):
     HALO_OVERFLOW = 256
     HALO_TOO_FAR = 512
     TOTAL_OVERFLOW = 1024
+    SYSTEM_WITHOUT_BOX = 2048
 
     @property
     def message(self) -> str:
@@ -64,6 +65,10 @@ _MESSAGES = {
     Status.SHARD_OVERFLOW: "A shard would have got more particles than it has room for: none of them changed their shard.",
     Status.HALO_OVERFLOW: "A message to a neighboring shard holds fewer particles than it should: pairs may be missing.",
     Status.HALO_TOO_FAR: "Pairs reach to shards farther away than messages go: pairs may be missing.",
+    Status.SYSTEM_WITHOUT_BOX: (
+        "`batch` names systems for which `box` holds no box: those particles have no neighbors in this list. Number systems from 0 "
+        "to the length of `box.vectors` - 1, and particles that are not there -1."
+    ),
     Status.TOTAL_OVERFLOW: "The list held more pairs than the `total` that `require` was told: exports of that length lack pairs.",
 }
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._geometry.batch import Batch
 from jfrnn._geometry.images import LARGEST_TURN
 from jfrnn._geometry.lattice import Lattice, fractions_of, product, translation
 
@@ -20,7 +21,7 @@ NOT_FINITE, TOO_FAR = 1 << _TURN_BITS, 2 << _TURN_BITS
 
 
 class Wrapped(NamedTuple):
-    """Wrapped coordinates of particles, with bounds on their rounding errors.
+    """Wrapped coordinates of particles, with bounds on their rounding errors; with a box per system, the bounds have an axis more.
 
     Attributes:
         sources: [n, d] wrapped coordinates, x - turns @ matrix up to rounding; NaN for particles out of range.
@@ -50,8 +51,8 @@ def pack_turns(points: Array, lattice: Lattice) -> Array:
 
     The result is -1 for points that are not finite, and -2 for those farther away than `LARGEST_TURN`.
     """
-    fractions, periodic = fractions_of(points, lattice), lattice.images.periodic
-    turns = [jnp.floor(fractions[:, k]) if p else jnp.zeros_like(fractions[:, k]) for k, p in enumerate(periodic)]
+    fractions = jnp.where(lattice.spread(lattice.periodic, 2), fractions_of(points, lattice), 0)
+    turns = [jnp.floor(fractions[:, k]) for k in range(lattice.dim)]
     finite = functools.reduce(jnp.logical_and, (jnp.isfinite(points[:, k]) for k in range(lattice.dim)))
     near = functools.reduce(jnp.logical_and, (jnp.abs(x) <= LARGEST_TURN for x in turns), finite)
     parts = [(x.astype(jnp.int32) + (LARGEST_TURN + 1)) << (k * _TURN_BITS) for k, x in enumerate(turns)]
@@ -76,7 +77,9 @@ def unpack_turns(packed: Array, dim: int) -> Array:
     return jnp.where(packed[..., None] < 0, 0, (parts & ((1 << _TURN_BITS) - 1)) - (LARGEST_TURN + 1))
 
 
-def wrap(sources: Array, queries: Array | None, lattice: Lattice, radius: np.floating | Array) -> Wrapped:
+def wrap(
+    sources: Array, queries: Array | None, lattice: Lattice, radius: np.floating | Array, batch: Batch | None = None
+) -> Wrapped:
     """Translate particles into one cell of the lattice and bound the rounding errors.
 
     Let u be the computed fractional coordinates, R = matrix @ transform - 1 the residual of the transform (periodic columns). Then
@@ -84,49 +87,63 @@ def wrap(sources: Array, queries: Array | None, lattice: Lattice, radius: np.flo
     transform| <= |d|·|column of the transform|. `reach` is the sum of these terms, each rounded up generously.
     """
     dtype, images, dim = np.dtype(sources.dtype), lattice.images, lattice.dim
-    eps, periodic = jnp.finfo(dtype).eps, np.array(images.periodic)
+    eps, periodic = jnp.finfo(dtype).eps, lattice.spread(lattice.periodic, lattice.origin.ndim)
     clouds = [sources] if queries is None else [sources, queries]
-    packed, wrapped = [pack_turns(points, lattice) for points in clouds], []
-    for points, turns in zip(clouds, packed, strict=True):
+    lattices = [lattice] * len(clouds) if batch is None else [lattice.of_rows(x) for x in (batch.sources, batch.of_queries)]
+    packed, wrapped = [pack_turns(points, each) for points, each in zip(clouds, lattices, strict=False)], []
+    for points, turns, each in zip(clouds, packed, lattices, strict=False):
         off = unpack_turns(turns, dim).astype(dtype)
-        moved = jnp.where((off == 0).all(axis=1, keepdims=True), points, points - translation(off, lattice))
+        moved = jnp.where((off == 0).all(axis=1, keepdims=True), points, points - translation(off, each))
         wrapped.append(jnp.where(turns[:, None] >= 0, moved, jnp.nan))
     met = functools.reduce(jnp.bitwise_or, (_met(turns, dim) for turns in packed))
     most = (met & LARGEST_TURN).astype(dtype)  # at least the largest number of turns, and less than twice that
 
     matrix, transform = jnp.abs(lattice.matrix), jnp.abs(lattice.transform)
-    spans = matrix.sum(axis=0)
+    spans = matrix.sum(axis=-2)
     size = jnp.abs(lattice.origin) + (most + 1) * spans  # largest coordinate so many lattice vectors away
-    if not (images.orthogonal or periodic.all()):
-        finite = [jnp.max(jnp.abs(x), axis=0, initial=0, where=jnp.isfinite(x)) for x in wrapped]
-        size = size + functools.reduce(jnp.maximum, finite)
-    residual = jnp.abs(product(lattice.matrix, lattice.transform) - jnp.diag(jnp.asarray(periodic, dtype)))
-    residual = residual + 8 * eps * product(matrix, transform)
-    shifts = most + max(images.reach) + 1
-    rounding = 8 * eps * product(size[None], transform)[0] + 2 * shifts * residual.sum(axis=0)
+    if not (images.orthogonal or (lattice.flags is None and np.all(periodic))):
+        size = size + functools.reduce(jnp.maximum, _largest_finite(wrapped, batch, len(spans)))
+    residual = lattice.residual + 8 * eps * product(matrix, transform)
+    length = jnp.sqrt(jnp.sum((transform * radius) ** 2, axis=-2)) * (1 + 16 * eps)
+    most_shifts = jnp.asarray(max(images.reach), dtype)
+    if batch is not None:  # those of each system alone
+        most_shifts = jnp.minimum(most_shifts, jnp.ceil(jnp.max(length, axis=-1, keepdims=True)) + 1)
+    shifts = most + most_shifts + 1
+    rounding = 8 * eps * product(size[..., None, :], transform)[..., 0, :] + 2 * shifts * residual.sum(axis=-2)
     if images.orthogonal:
         rounding = jnp.where(periodic, rounding, 0)  # cells along open axes use the given coordinates
-    length = jnp.sqrt(jnp.sum((transform * radius) ** 2, axis=0)) * (1 + 16 * eps)
     margin = 2 * rounding + jnp.where(periodic, 8 * eps, 0)
     reach = length + margin
-    limit = jnp.where(periodic, 0.5 if images.nearest else jnp.asarray(images.reach, dtype), jnp.inf)
-    enough = (reach < limit).all() if images.nearest else (reach <= limit).all()
-    slack = _wrapping_error(most, lattice)
+    most_images = lattice.spread(jnp.asarray(images.reach, dtype), periodic.ndim)
+    limit = jnp.where(periodic, 0.5 if images.nearest else most_images, jnp.inf)
+    enough = (reach < limit).all(axis=-1) if images.nearest else (reach <= limit).all(axis=-1)
+    slack = _wrapping_error(most, most_shifts, lattice)
     return Wrapped(wrapped[0], wrapped[-1], packed[0], packed[-1], slack, reach, margin, enough, met)
 
 
-def _wrapping_error(most: Array, lattice: Lattice) -> Array:
+def _wrapping_error(most: Array, reach: Array, lattice: Lattice) -> Array:
     """Bound the error of a component of x_j - x_i from wrapping both by at most `most` turns and moving one to an image.
+
+    Images lie up to `reach` cells away, [] or [systems, 1].
 
     With u = eps/2: a product t·A with a whole number t has an error of u|t·A|, or none for t = 0, 1, 2; with d such products, d
     times that. Adding a coordinate of the cell costs another u of it. Points that are not wrapped have no error.
     """
     dim, images = lattice.dim, lattice.images
     u = 0.525 * jnp.finfo(lattice.matrix.dtype).eps  # 5 % more than eps/2 covers second-order terms and the rounding of this sum
-    spans = jnp.abs(lattice.matrix).sum(axis=0)  # 0 for components to which no lattice vector contributes
+    spans = jnp.abs(lattice.matrix).sum(axis=-2)  # 0 for components to which no lattice vector contributes
     cell = jnp.where(spans > 0, jnp.abs(lattice.origin) + spans, 0)
     products = 1 if images.orthogonal else 2 * dim
     wrapping = jnp.where(most > 0, products * most * spans + cell, 0)
-    reach = max(images.reach)
-    moving = (0 if images.orthogonal and reach <= 2 else products * reach) * spans + cell + reach * spans
-    return u * jnp.max(2 * wrapping + moving, initial=0)
+    exact = images.orthogonal & (reach <= 2)
+    moving = jnp.where(exact, 0, products * reach) * spans + cell + reach * spans
+    return u * jnp.max(2 * wrapping + moving, axis=-1, initial=0)
+
+
+def _largest_finite(clouds: list[Array], batch: Batch | None, systems: int) -> list[Array]:
+    """Return the largest coordinates [d], or [systems, d], of each array of points."""
+    sizes = [jnp.where(jnp.isfinite(x), jnp.abs(x), 0) for x in clouds]
+    if batch is None:
+        return [jnp.max(x, axis=0, initial=0) for x in sizes]
+    both = zip(sizes, (batch.sources, batch.of_queries), strict=False)
+    return [jnp.zeros((systems, x.shape[1]), x.dtype).at[of].max(x, mode="clip") for x, of in both]

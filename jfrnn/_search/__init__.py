@@ -3,7 +3,7 @@
 from jfrnn._search.chunks import run_chunk
 from jfrnn._search.edges import flatten
 from jfrnn._search.exports import MOST_PAIRS, saturating_add
-from jfrnn._search.geometry import is_native, kept_list, kept_shifts, norms
+from jfrnn._search.geometry import is_native, kept_list, kept_shifts, lattice_of_rows, norms
 from jfrnn._search.making import round_capacity
 from jfrnn._search.neighbor_list import ROWS_ARE_WHOLE, NeighborList
 from jfrnn._search.problem import check_problem

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._geometry import Box, Images, Status, given_shifts, make_lattice, translation
+from jfrnn._geometry import Batch, Box, Images, Status, given_shifts, translation
 from jfrnn._search.exports import flat_pairs, row_offsets
-from jfrnn._search.geometry import norms
+from jfrnn._search.geometry import lattice_of_rows, norms
 from jfrnn._search.reverse import Reverse
 from jfrnn._search.topology import Topology
 from jfrnn._tracing import compile_program
@@ -120,6 +120,7 @@ def flat_edges(
     sources: Array,
     rows: Array,
     box: Box | None,
+    batch: Batch | None,
     kind: Images | None,
     total: int,
 ) -> Edges:
@@ -138,7 +139,9 @@ def flat_edges(
     displacement, shift = sides[0] - sides[1], jnp.zeros((total, dim), jnp.int32)
     if shifts is not None and box is not None and kind is not None:
         whole = jnp.where(real[:, None], shifts.reshape(-1, dim)[flat.slots], 0)
-        displacement = displacement + translation(whole, make_lattice(box, kind, np.dtype(sources.dtype)))
+        systems = None if batch is None else batch.of_queries.at[flat.rows].get(mode="clip")
+        lattice = lattice_of_rows(box, kind, np.dtype(sources.dtype), systems, topology.native)
+        displacement = displacement + translation(whole, lattice)
         shift = given_shifts(whole, kind)
     missing = flat.offsets[-1] > total
     displacement = jnp.where(real[:, None], displacement, 0).astype(sources.dtype)

@@ -1,5 +1,6 @@
 """The geometry of a list: displacements, lattice shifts, and which pairs are within the cutoff at present."""
 
+import dataclasses
 import functools
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ from jax import Array, lax
 from jfrnn._engine import KeptList, kept_mask
 from jfrnn._geometry import (
     LARGEST_TURN,
+    Batch,
     Box,
     Cutoff,
     Cutoffs,
@@ -44,6 +46,22 @@ class ImageCodes(NamedTuple):
     codes: Array
     turns: Array
     query_turns: Array | None
+
+
+def lattice_of_rows(box: Box, kind: Images, dtype: np.dtype, systems: Array | None, native: bool) -> Lattice:
+    """Return the lattice of a box or, where each system has one, that of each row; differentiable by gathers.
+
+    `systems` [rows] are those of the rows, of which some may have no box: these get any.
+    """
+    from jfrnn._search.gathers import gather
+
+    lattice = make_lattice(box, kind, dtype)
+    if not kind.per_system or systems is None:
+        return lattice
+    boxes, nearest = len(lattice.origin), jnp.clip(systems, 0, len(lattice.origin) - 1)
+    topology = Topology(nearest[:, None], None, None, boxes, 1, False, native)
+    matrix = gather(lattice.matrix.reshape(boxes, -1), topology).reshape(-1, lattice.dim, lattice.dim)
+    return dataclasses.replace(lax.stop_gradient(lattice).of_rows(nearest), matrix=matrix)
 
 
 ImagesMade = tuple[ImageCodes | None, tuple[Array, Array | None] | None]  # and the positions at which a list with a skin was made
@@ -85,7 +103,14 @@ class _Slots(NamedTuple):
 
 
 def _find_slots(
-    topology: Topology, count: Array, images: ImagesMade, sources: Array, rows: Array, lattice: Lattice, half: bool
+    topology: Topology,
+    count: Array,
+    images: ImagesMade,
+    sources: Array,
+    rows: Array,
+    lattice: Lattice,
+    half: bool,
+    of_sources: Lattice | None = None,
 ) -> _Slots:
     from jfrnn._search.gathers import gather
 
@@ -97,7 +122,7 @@ def _find_slots(
     if codes is None:
         shifts = nearest_shifts(difference, lattice)
     else:
-        turns, query_turns = _turns_now(codes, made, sources, rows, lattice)
+        turns, query_turns = _turns_now(codes, made, sources, rows, lattice, of_sources)
         image = jnp.where(used, codes.codes.astype(jnp.int32), lattice.images.home)
         shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)[image] + query_turns[:, None] - turns[neighbor]
     kind = lattice.images
@@ -111,10 +136,26 @@ def _find_slots(
 
 @functools.partial(compile_program, static_argnames=("kind", "half"))
 def lattice_shifts(
-    topology: Topology, count: Array, images: ImagesMade, sources: Array, rows: Array, box: Box, kind: Images, half: bool
+    topology: Topology,
+    count: Array,
+    images: ImagesMade,
+    sources: Array,
+    rows: Array,
+    box: Box,
+    batch: Batch | None,
+    kind: Images,
+    half: bool,
 ) -> Array:
-    lattice = make_lattice(box, kind, np.dtype(sources.dtype))
-    return given_shifts(lax.stop_gradient(_find_slots(topology, count, images, sources, rows, lattice, half).shifts), kind)
+    lattice, of_sources = _lattices(box, kind, np.dtype(sources.dtype), batch, topology.native)
+    slots = _find_slots(topology, count, images, sources, rows, lattice, half, of_sources)
+    return given_shifts(lax.stop_gradient(slots.shifts), kind)
+
+
+def _lattices(box: Box, kind: Images, dtype: np.dtype, batch: Batch | None, native: bool) -> tuple[Lattice, Lattice]:
+    """Return the lattices of rows and of sources."""
+    of_rows, of_sources = (None, None) if batch is None else (batch.of_queries, batch.sources)
+    lattice = lattice_of_rows(box, kind, dtype, of_rows, native)
+    return lattice, lattice if of_rows is of_sources else lattice_of_rows(box, kind, dtype, of_sources, native)
 
 
 @functools.partial(compile_program, static_argnames=("kind", "closed", "half"))
@@ -125,14 +166,15 @@ def periodic_vectors(
     sources: Array,
     rows: Array,
     box: Box,
+    batch: Batch | None,
     kind: Images,
     given: Cutoff | Radii | None,
     closed: bool,
     half: bool,
 ) -> tuple[Array, Array, Array]:
     cutoff = _pair_cutoff(given, closed)
-    lattice = make_lattice(box, kind, np.dtype(sources.dtype))
-    used, neighbor, difference, shifts = _find_slots(topology, count, images, sources, rows, lattice, half)
+    lattice, of_sources = _lattices(box, kind, np.dtype(sources.dtype), batch, topology.native)
+    used, neighbor, difference, shifts = _find_slots(topology, count, images, sources, rows, lattice, half, of_sources)
     fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
     pairs = shift_pairs(difference, shifts, lattice)
     if is_native(topology, kind, half):
@@ -145,8 +187,11 @@ def periodic_vectors(
 
 
 def is_native(topology: Topology, kind: Images | None, half: bool) -> bool:
-    """Say whether Warp's kernels decide which slots hold a pair: not in half lists of short vectors, whose images JAX chooses."""
-    return topology.native and not (half and kind is not None and kind.basis is not None)
+    """Say whether Warp's kernels decide which slots hold a pair.
+
+    They do not in half lists of short vectors, whose images JAX chooses, nor where each system has a box of its own.
+    """
+    return topology.native and not (kind is not None and ((half and kind.basis is not None) or kind.per_system))
 
 
 def kept_list(
@@ -184,7 +229,12 @@ def kept_shifts(given: KeptList) -> Array:
 
 
 def _turns_now(
-    images: ImageCodes, made: tuple[Array, Array | None] | None, sources: Array, rows: Array, lattice: Lattice
+    images: ImageCodes,
+    made: tuple[Array, Array | None] | None,
+    sources: Array,
+    rows: Array,
+    lattice: Lattice,
+    of_sources: Lattice | None = None,
 ) -> tuple[Array, Array]:
     """Return the lattice vectors between the cell and the sources [n, d] and rows [m, d], in whole floats.
 
@@ -194,8 +244,8 @@ def _turns_now(
     both = [images.turns] if images.query_turns is None else [images.turns, images.query_turns]
     turns = [unpack_turns(x, lattice.dim).astype(sources.dtype) for x in both]
     if made is not None:
-        since = zip(turns, made, (sources, rows), strict=False)
-        turns = [x if before is None else x + turns_between(before, now, lattice) for x, before, now in since]
+        since = zip(turns, made, (sources, rows), (of_sources or lattice, lattice), strict=False)
+        turns = [x if before is None else x + turns_between(before, now, each) for x, before, now, each in since]
     return turns[0], turns[-1]
 
 

@@ -70,7 +70,7 @@ def _by_vectors(how: tuple[Images | None, bool], sources: Array, box: Box | None
     if box is None or kind is None:
         vectors, mask = open_vectors(topology, counts, sources, sources, cutoff, closed)
     else:
-        vectors, mask, _ = periodic_vectors(topology, counts, images, sources, sources, box, kind, cutoff, closed, False)
+        vectors, mask, _ = periodic_vectors(topology, counts, images, sources, sources, box, None, kind, cutoff, closed, False)
     return norms(vectors), mask
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from jax import lax
 
-from jfrnn._engine import Inputs, Options, count_rows, hide_inactive, list_rows
+from jfrnn._engine import Inputs, Options, count_rows, hide_inactive, list_rows, take_present
 from jfrnn._geometry import Radii
 from jfrnn._search.geometry import ImageCodes
 from jfrnn._search.topology import make_topology
@@ -38,7 +38,7 @@ def find_fields(inputs: Inputs, options: Options, capacity: int, moving: bool, r
     As results of one program, they share no memory with the caller's arrays or each other, so either may be donated.
     """
     found = list_rows(inputs, options, capacity)
-    rows, sources = found.rows, hide_inactive(inputs.sources, inputs.active)
+    rows, sources = found.rows, hide_inactive(inputs.sources, take_present(inputs).active)
     codes = None if found.images is None or found.turns is None else ImageCodes(found.images, *found.turns)
     radii = lax.stop_gradient(inputs.cutoff) if isinstance(inputs.cutoff, Radii) else None
     verlet = first_verlet(sources, inputs.queries, inputs.box, radii) if moving else None

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._engine import Inputs, hide_inactive
+from jfrnn._engine import Inputs, hide_inactive, take_present
 from jfrnn._geometry import (
     Batch,
     Box,
@@ -274,7 +274,8 @@ class NeighborList(ListExports):
         with own_transfers():
             if box is None or self.box_kind is None or 0 in (sources.shape[0], *self.idx.shape):
                 return jnp.zeros((*self.idx.shape, sources.shape[1]), jnp.int32)
-            return lattice_shifts(self._topology(), self.count, self._images_made(), sources, rows, box, self.box_kind, self.half)
+            where = sources, rows, box, self.batch
+            return lattice_shifts(self._topology(), self.count, self._images_made(), *where, self.box_kind, self.half)
 
     def distances(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> tuple[Array, Array]:
         """Compute the distance to every neighbor.
@@ -294,7 +295,7 @@ class NeighborList(ListExports):
         Differentiable: to any order; the gradient of a distance of 0 is 0. Jit: yes. vmap: yes.
         """
         topology = self._topology()
-        if 0 in self.idx.shape or not topology.measured:
+        if 0 in self.idx.shape or not topology.measured or (self.box_kind is not None and self.box_kind.per_system):
             vectors, mask = self.vectors(positions, queries=queries, box=box)
             return norms(vectors), mask
         sources, _ = self._geometry_inputs(positions, queries)
@@ -344,7 +345,7 @@ class NeighborList(ListExports):
             if 0 in (sources.shape[0], *self.idx.shape, total):
                 made = no_edges(mask, self.source_count, sources, self.status, total)
             else:
-                given = self._topology(), self.status, mask, shifts, sources, rows, box
+                given = self._topology(), self.status, mask, shifts, sources, rows, box, self.batch
                 made = flat_edges(*given, self.box_kind if box is not None else None, total)
         check_held(made.pair_count, total)
         return made
@@ -418,7 +419,7 @@ class NeighborList(ListExports):
             if box is None or self.box_kind is None:
                 return *open_vectors(self._topology(), self.count, sources, rows, cutoff, self.closed), None
             given = (self.box_kind, cutoff, self.closed, self.half)
-            return periodic_vectors(self._topology(), self.count, self._images_made(), sources, rows, box, *given)
+            return periodic_vectors(self._topology(), self.count, self._images_made(), sources, rows, box, self.batch, *given)
 
     def _cutoff_of_pairs(self) -> Cutoff | Radii | None:
         return self.radii if self.cutoff is None else make_cutoff(self.cutoff, self.dtype, self.closed)
@@ -460,8 +461,8 @@ def _update(
 
     if nbrs.verlet is None:
         return remake(nbrs)
-    now = hide_inactive(sources, active)
-    moved = has_moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin)
+    now = hide_inactive(sources, take_present(inputs).active)
+    moved = has_moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin, nbrs.batch)
     fixed = {"box": box, "radii": radii, "batch": nbrs.batch}
     nobody = dict.fromkeys(fixed)  # what stays is no state of the loop, so that XLA derives from it once what steps of a scan need
     state = moved, dataclasses.replace(nbrs, **nobody)

@@ -111,6 +111,8 @@ def check_problem(
     skin = check_skin(skin, largest or 0.0, dtype)
     reach = None if largest is None else list_radius(largest, skin, dtype)
     box = None if box is None else check_box(box, sources)
+    if box is not None and box.per_system:
+        _check_boxes(batch, radii)
     images = None if box is None else images_of(box, reach, dtype, sources.shape[0])
     kind = Kind(periodic=box is not None, radii=radii is not None, batch=batch is not None)
     engine = choose_engine(parse_backend(backend, ENGINES), sources, queries, kind)
@@ -120,3 +122,11 @@ def check_problem(
     problem = Problem(options, radius, skin, **shape, dim=sources.shape[1], dtype=dtype)
     box = None if box is None else round_box(box, dtype)
     return problem, problem.inputs(sources, queries, active, box, radii, systems)
+
+
+def _check_boxes(batch: Given, radii: Radii | None) -> None:
+    """Raise if a search with a box per system is asked for what such a search does not support."""
+    if batch is None:
+        raise ValueError("box holds a box per system: pass batch=, the system of each particle (from 0 on; -1: in none of them).")
+    if radii is not None:
+        raise ValueError("cutoff must be one number where box holds a box per system, got one per particle: pass the largest one.")

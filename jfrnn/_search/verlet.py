@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry import (
+    Batch,
     Box,
     Cutoff,
     Images,
@@ -66,6 +67,7 @@ def has_moved_too_far(
     box_kind: Images | None,
     radii: Radii | None,
     skin: float,
+    batch: Batch | None = None,
 ) -> Array:
     """Say whether any point is, or may be by rounding, skin/2 or more from where the list was made, [] bool.
 
@@ -82,8 +84,11 @@ def has_moved_too_far(
     motions: list[Motion | None] = [None] * len(clouds)
     if box is not None and verlet.box is not None and box_kind is not None:
         old, new = (make_lattice(x, box_kind, np.dtype(positions.dtype)) for x in (verlet.box, box))
-        motions = [motion_of(before, now, new) for before, now in clouds]
-        used = box_change(old, new, [motion.home for motion in motions if motion is not None])
+        news = [new] * len(clouds)
+        if box.per_system and batch is not None:
+            news, old = [new.of_rows(x) for x in (batch.sources, batch.of_queries)], old.of_rows(batch.sources)
+        motions = [motion_of(before, now, each) for (before, now), each in zip(clouds, news, strict=False)]
+        used = box_change(old, news[0], [motion.home for motion in motions if motion is not None])
     if radii is not None and verlet.radii is not None:
         for before, now in ((verlet.radii.sources, radii.sources), (verlet.radii.queries, radii.queries)):
             if before is not None and now is not None:

@@ -11,9 +11,10 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._engine import Inputs, Options, hide_inactive, is_decidable
+from jfrnn._engine import Inputs, Options, hide_inactive, is_decidable, take_present
 from jfrnn._geometry import (
     EXCHANGED,
+    Batch,
     Box,
     Images,
     Lattice,
@@ -22,10 +23,9 @@ from jfrnn._geometry import (
     check_cutoff,
     make_cutoff,
     make_cutoffs,
-    make_lattice,
     translation,
 )
-from jfrnn._search import MOST_SLOTS, ROWS_ARE_WHOLE, NeighborList, is_native, kept_list
+from jfrnn._search import MOST_SLOTS, ROWS_ARE_WHOLE, NeighborList, is_native, kept_list, lattice_of_rows
 from jfrnn._sums.extremes import bind_extremes
 from jfrnn._sums.pair_function import call_with_pair
 from jfrnn._sums.relations import Kept, Listed, Relation, Searched, are_finite, mark_rows, one_or_nan
@@ -53,11 +53,11 @@ class Pairs(NamedTuple):
 
 def pairs_of_search(inputs: Inputs, options: Options, summed: bool) -> Pairs:
     """Return the pairs that a search finds; `summed` says that they are summed, rather than reduced to an extreme."""
-    sources, queries, active, box, cutoff, _ = inputs
+    sources, queries, active, box, cutoff, batch = inputs
     fixed = lax.stop_gradient(inputs._replace(sources=hide_inactive(sources, active), active=None))
     relation, several = Searched(fixed, options), isinstance(cutoff, Radii)
     largest = make_cutoffs(cutoff, options.closed).largest if isinstance(cutoff, Radii) else cutoff.radius
-    lattice = _lattice(box, options.images, sources)
+    lattice = _lattice(box, options.images, sources, batch)
     doubtful = several or box is not None
     if summed and active is None and not doubtful:
         return Pairs(relation, False, sources, sources if queries is None else queries, lattice, largest, relation.symmetric, None)
@@ -84,9 +84,10 @@ def pairs_of_list(
     fixed_rows = lax.stop_gradient(rows)
     directionless = not own and (nbrs.radii is None or nbrs.radii.rule not in EXCHANGED)
     relation = _relation_of_list(nbrs, *lax.stop_gradient((sources, rows, box)), symmetric=directionless and not nbrs.half)
-    lattice = _lattice(nbrs._box_now(box, sources), nbrs.box_kind, sources)
+    lattice = _lattice(nbrs._box_now(box, sources), nbrs.box_kind, sources, nbrs.batch)
     largest = nbrs.cutoff if nbrs.radii is None else make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest
-    data = nbrs.status, nbrs.count if nbrs.masked and not own else None, fixed_rows
+    masked = nbrs.masked or (nbrs.box is not None and nbrs.box.per_system)
+    data = nbrs.status, nbrs.count if masked and not own else None, fixed_rows
     sources, rows, mark = _prepare_marks(sources, rows if own else None, _good_rows_of_list, data)
     return Pairs(relation, nbrs.half, sources, rows, lattice, largest, directionless, mark)
 
@@ -99,7 +100,7 @@ def _relation_of_list(nbrs: NeighborList, sources: Array, rows: Array, box: Box 
         return Listed(nbrs.idx, mask, shifts, nbrs.source_count, symmetric)
     nbrs._check_known(spared=ROWS_ARE_WHOLE)
     cutoff = nbrs.radii if nbrs.cutoff is None else make_cutoff(nbrs.cutoff, nbrs.dtype, nbrs.closed)
-    lattice = _lattice(nbrs._box_now(box, sources), nbrs.box_kind, sources)
+    lattice = _lattice(nbrs._box_now(box, sources), nbrs.box_kind, sources, nbrs.batch)
     given = call_apart(
         lambda nbrs, sources, rows, cutoff, lattice: kept_list(
             nbrs._topology(), nbrs.count, nbrs._images_made(), sources, rows, cutoff, nbrs.closed, lattice
@@ -121,6 +122,7 @@ def _good_rows(points: Array, active: Array | None, whole: Array | None) -> Arra
 @functools.partial(compile_program, static_argnames=("options", "doubtful"))
 def _good_rows_of_search(inputs: Inputs, options: Options, doubtful: bool) -> Array:
     """Say which rows [m] of a search are valid; `doubtful` says that the data decide whether pairs may be missing."""
+    inputs = take_present(inputs)
     whole = is_decidable(inputs, options) if doubtful else None
     return _good_rows(inputs.sources, inputs.active, whole) if inputs.queries is None else _good_rows(inputs.queries, None, whole)
 
@@ -160,8 +162,12 @@ def _mark_derivatives_jvp(primals: tuple[Array, Array], tangents: tuple[Array, A
     return points, tangents[0] * one_or_nan(good, tangents[0])
 
 
-def _lattice(box: Box | None, images: Images | None, like: Array) -> Lattice | None:
-    return None if box is None or images is None else make_lattice(box, images, np.dtype(like.dtype))
+def _lattice(box: Box | None, images: Images | None, like: Array, batch: Batch | None) -> Lattice | None:
+    """Return the lattice of all pairs or, where each system has a box of its own, of each row."""
+    if box is None or images is None:
+        return None
+    systems = None if batch is None else batch.of_queries
+    return call_apart(lambda box, systems: lattice_of_rows(box, images, np.dtype(like.dtype), systems, False), box, systems)
 
 
 def reduce_pairs(
@@ -226,14 +232,17 @@ def _summand(
     sources, rows, lattice = pairs.sources, pairs.rows, pairs.lattice
     dtype = sources.dtype
     harmless = _along_first_axis(pairs.largest, sources.shape[1], dtype)
-    turning = [] if lattice is None else [lattice.matrix]
+    turning, each = ([], []) if lattice is None else ([], [lattice.matrix]) if lattice.images.per_system else ([lattice.matrix], [])
+    same = rows is sources and mine is theirs
     numbers = [jax.ShapeDtypeStruct((len(x),), np.int32) for x in (rows, sources)]  # become arrays only if the term needs them
     (own, own_tree), (others, other_tree) = jax.tree.flatten(mine), jax.tree.flatten(theirs)
-    operands = Groups((harmless, *turning), (rows, numbers[0], *own), (sources, numbers[1], *others))
+    theirs_too = each if same else []
+    operands = Groups((harmless, *turning), (rows, numbers[0], *each, *own), (sources, numbers[1], *theirs_too, *others))
     structure: list = []
 
     def summand(real: Array, shift: Array, operands: Groups) -> list[Array]:
         (harmless, *matrix), (x_i, number_i, *own), (x_j, number_j, *others) = operands
+        matrix, own, others = [*matrix, *own[: len(each)]], own[len(each) :], others[len(theirs_too) :]
         r = x_j - x_i
         if lattice is not None:
             r = r + translation(shift, dataclasses.replace(lattice, matrix=matrix[0]))

@@ -15,11 +15,6 @@ from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 
-def leading_axes(x: Array, ndim: int) -> Array:
-    """Return x with leading axes of length 1, so that it has `ndim` axes."""
-    return x.reshape((1,) * (ndim - x.ndim) + x.shape)
-
-
 def gather(x: Array) -> Array:
     """Return x replicated on every device, if its type says that it is sharded over explicit mesh axes.
 

@@ -1,0 +1,109 @@
+// Pairs in systems of which each has a box of its own (jfrnn/_geometry/box_cells.py): what a query visits, on the CPU and on CUDA.
+//
+// Sources stand by system and by cell. `visits` has seven integers of each query: its system, the lowest cell along each axis, and how
+// many there are from that on. Cells are numbered on beyond the ends of a box, where the next image begins. `cells` has five of each
+// system: cells along each axis, the first cell, a bit per periodic axis. `boxes` has the numbers of each lattice (lattice.h), behind
+// the radius. `axes` are the coordinates of sources, in their box and sorted, `stride` numbers of each axis, and `ids` their numbers;
+// `asked` are those of queries, which are served in `order`. Rows of `positions` and `queries` are as they were given, with packed turns.
+#pragma once
+#include "exact.h"
+
+struct BoxArguments {
+    const real *positions, *queries, *boxes, *axes, *asked;
+    const int *ids, *order, *visits, *cells, *start;
+    int *idx, *count, *info;
+    int n, m, stride, own, capacity, closed, drop_self, later_only;
+};
+
+// The sources of a row of cells, in one image.
+struct BoxRun {
+    int from, size, code;
+    real away[3];  // from the query to where the origin of the image is
+};
+
+struct BoxPairs : BoxArguments, Space {
+    real inside, outside;  // squares of distances below are surely those of pairs, squares beyond surely not
+    int system;            // whose lattice `lattice` is
+    int low[3], visited[3], counts[3], first, axes_turning;
+    int runs;            // of the query
+    int query;           // its number
+    int place;           // where it stands among the sources, or -1
+    int at_home, codes;  // the code of no shift, and how many there are
+    real q[3];
+
+    JFRNN_MEMBER explicit BoxPairs(const BoxArguments& given)
+        : BoxArguments(given), Space(given.boxes), system(-1), at_home(0), codes(1) {
+        for (int k = 0; k < DIM; ++k) {
+            at_home = at_home * (2 * lattice.images(k) + 1) + lattice.images(k);
+            codes *= 2 * lattice.images(k) + 1;
+        }
+    }
+    // Goes to the query that is served as number `turn`.
+    JFRNN_MEMBER void go_to(int turn) {
+        query = order[turn];
+        place = own ? turn : -1;
+        const int* const mine = visits + 7ll * query;
+        if (mine[0] != system)
+            enter(mine[0]);
+        int rows = 1;
+        for (int k = 0; k < 3; ++k) {
+            low[k] = k < DIM ? mine[1 + k] : 0;
+            visited[k] = k < DIM ? mine[4 + k] : 1;
+            q[k] = k < DIM ? asked[(long long)DIM * query + k] : real(0);
+            rows *= k > 0 ? visited[k] : 1;
+        }
+        const int pieces = floor_of(low[0] + visited[0] - 1, counts[0]) - floor_of(low[0], counts[0]) + 1;
+        runs = visited[0] > 0 ? rows * pieces : 0;
+    }
+    JFRNN_MEMBER void enter(int other) {
+        system = other;
+        lattice = Lattice(boxes + (long long)LATTICE_END * system);
+        const int* const mine = cells + 5ll * system;
+        for (int k = 0; k < 3; ++k)
+            counts[k] = k < DIM ? mine[k] : 1;
+        first = mine[3];
+        axes_turning = mine[4];
+        const real off = 2 * lattice.slack() * step_scale;  // by which distances of images may be wrong
+        const real inner = step_radius > off ? step_radius - off : real(0), outer = step_radius + off;
+        const real band = 8 * (1 + PERIODIC) * step_eps;
+        inside = inner * inner * (1 - band);
+        outside = outer * outer * (1 + band);
+    }
+    JFRNN_FUNCTION int floor_of(int x, int of) { return x >= 0 ? x / of : -1 - (-1 - x) / of; }
+    JFRNN_MEMBER int fill_value() const { return PERIODIC == 2 ? n * codes : n; }
+    JFRNN_MEMBER int name_of(int source, int code) const { return PERIODIC == 2 ? source + n * code : source; }
+
+    JFRNN_MEMBER BoxRun run_at(int number) const {
+        int shift[3] = {0, 0, 0}, row = 0, at[3] = {0, 0, 0};
+        for (int k = 1; k < DIM; ++k) {
+            const int cell = low[k] + number % visited[k];
+            number /= visited[k];
+            shift[k] = floor_of(cell, counts[k]);
+            at[k] = cell - shift[k] * counts[k];
+        }
+        shift[0] = floor_of(low[0], counts[0]) + number;
+        const int begins = low[0] - shift[0] * counts[0], ends = begins + visited[0];
+        for (int k = DIM - 1; k > 0; --k)
+            row = (row + at[k]) * counts[k - 1];
+        row += first;
+        BoxRun run;
+        run.from = start[row + (begins > 0 ? begins : 0)];
+        run.size = start[row + (ends < counts[0] ? ends : counts[0])] - run.from;
+        run.code = 0;
+        for (int k = 0; k < DIM; ++k) {
+            shift[k] = axes_turning >> k & 1 ? shift[k] : 0;
+            run.code = run.code * (2 * lattice.images(k) + 1) + shift[k] + lattice.images(k);
+        }
+        for (int k = 0; k < 3; ++k)
+            run.away[k] = k < DIM ? lattice.translation(shift[0], shift[1], shift[2], k) - q[k] : real(0);
+        return run;
+    }
+    // The smallest source that a query asks for in an image: of its own images, half lists have those ahead.
+    JFRNN_MEMBER int first_asked(int code) const {
+        return !later_only ? 0 : code == at_home ? query + drop_self : code < at_home ? query + 1 : query;
+    }
+    // Decides exactly.
+    JFRNN_MEMBER bool is_pair(int source, int code) const {
+        return exact_image(lattice, queries + (long long)ROW * query, positions + (long long)ROW * source, code, radius, 0, closed);
+    }
+};
