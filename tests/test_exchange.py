@@ -44,17 +44,17 @@ def weighted(fn, x, data, **options):
     return sum(jnp.sum(jnp.sin(jnp.arange(s.size, dtype=s.dtype)).reshape(s.shape) * s) for s in sums)
 
 
+@pytest.mark.parametrize("boxed", [False, True])
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_signs(name, scene, monkeypatch):
+def test_signs(name, boxed, scene, monkeypatch):
     """What is transposed is the tangent of fn, in which positions and features move."""
     fn, expected = FUNCTIONS[name]
     seen = []
     monkeypatch.setattr(summation, "signs_of", lambda term: seen.append(term) or exchange.signs_of(term))
     x, data, _ = scene
-    for box in (None, jfrnn.Box(np.full(3, SIDE))):
-        seen.clear()
-        jax.make_jaxpr(jax.grad(lambda x, data: weighted(fn, x, data, box=box), (0, 1)))(x, data)
-        assert exchange.signs_of(seen[0]) == expected
+    box = jfrnn.Box(np.full(3, SIDE)) if boxed else None
+    jax.make_jaxpr(jax.grad(lambda x, data: weighted(fn, x, data, box=box), (0, 1)))(x, data)
+    assert exchange.signs_of(seen[0]) == expected
 
 
 @pytest.mark.parametrize("name", ["several", pytest.param("differences", marks=pytest.mark.slow)])
