@@ -29,5 +29,5 @@ from jfrnn._engine.reverse_warp import collect_slots, reverse_slots, slots_by_so
 from jfrnn._engine.rows import count_rows, fold_pairs, list_rows
 from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit
 from jfrnn._engine.start import level_of_caller
-from jfrnn._engine.warp import PLATFORMS
+from jfrnn._engine.warp import PLATFORMS, has_order
 from jfrnn._engine.warp_sums import pair_sums

@@ -59,7 +59,7 @@ def flat_edges(
     real = there & of_edge(mask)
     ends = _by_sender(topology, offsets, total), _by_row(offsets, capacity, total)
     sides = [
-        gather(points, Topology(named[:, None], None, end, len(points), 1, end.starts is None, topology.native))[:, 0]
+        gather(points, Topology(named[:, None], None, end, None, len(points), 1, end.starts is None, topology.native))[:, 0]
         for points, named, end in zip((sources, rows), (senders, receivers), ends, strict=True)
     ]
     displacement, shift = sides[0] - sides[1], jnp.zeros((total, dim), jnp.int32)

@@ -164,7 +164,7 @@ def kept_list(
     of_pairs = _pair_cutoff(cutoff, closed)
     turns = None if codes is None or lattice is None else _turns_now(codes, made, sources, rows, lattice)
     fixed = lax.stop_gradient((sources, rows, turns, of_pairs, lattice))
-    return KeptList(topology.idx, count, topology.codes, *fixed, None)
+    return KeptList(topology.idx, count, topology.codes, *fixed, topology.order, None)
 
 
 def kept_shifts(given: KeptList) -> Array:

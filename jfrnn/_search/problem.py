@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from jax import Array
 
-from jfrnn._engine import Filter, Inputs, Kind, Options, check_backend, choose_engine
+from jfrnn._engine import Filter, Inputs, Kind, Options, check_backend, choose_engine, has_order, platform_of
 from jfrnn._geometry import (
     EXCHANGED,
     Batch,
@@ -115,7 +115,9 @@ def check_problem(
     kind = Kind(periodic=box is not None, radii=radii is not None, batch=batch is not None)
     engine = choose_engine(check_backend(backend), sources, queries, kind)
     systems = None if batch is None else check_batch(batch, sources, queries)
-    options = Options(keep, engine, closed, 0.0 if radii is None else skin, images, reach if engine.static_radius else None)
+    ordered = has_order(engine, platform_of(sources), sources.shape[0], queries is None and radii is None)
+    static_reach = reach if engine.static_radius else None
+    options = Options(keep, engine, closed, 0.0 if radii is None else skin, images, static_reach, ordered)
     shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}
     problem = Problem(options, radius, skin, **shape, dim=sources.shape[1], dtype=dtype)
     box = None if box is None else round_box(box, dtype)
