@@ -19,7 +19,7 @@ from jfrnn._engine.launch import Call, Shapes, kernel, open_native
 from jfrnn._engine.levels_warp import level_neighbors
 from jfrnn._engine.operands import MOST_IN_BOX, pack_particles, periodic_kind, space_flags
 from jfrnn._engine.plans import HugePages, Launch, Plan, ask_for_huge_pages, share
-from jfrnn._engine.problem import Engine, Filter, Kind, Options, Rows, Search
+from jfrnn._engine.problem import Engine, Filter, Kind, Options, Rows, Search, largest_radius
 from jfrnn._engine.start import check_warp
 from jfrnn._geometry import Cutoffs
 from jfrnn.kernels import _driver, cells_cpu, cells_cuda, few_cuda
@@ -55,7 +55,7 @@ class WarpEngine:
 
         def on(module: ModuleType, make: Callable[[Variant], Any]) -> Callable[[Search], Rows]:
             blocks = few_cuda.blocks(search.sizes[1]) if module is few_cuda else None
-            order = functools.partial(_order_in, module, search.sources) if options.ordered and capacity is not None else None
+            order = functools.partial(_order_in, module, search) if options.ordered and capacity is not None else None
             return functools.partial(
                 call_kernels, module.scratch_words, make, keep=options.filter, capacity=capacity, blocks=blocks, order=order
             )
@@ -81,13 +81,19 @@ def has_order(engine: Engine, platform: str, n: int, plain: bool) -> bool:
     return isinstance(engine, WarpEngine) and PLATFORMS.get(platform) == "cuda" and n > few_cuda.MOST and plain
 
 
-def _order_in(module: ModuleType, sources: Array, scratch: Array) -> Array:
-    """Return the order of the sources from the scratch of a search; that of the CPU tells none, and nobody asks for it."""
-    n = sources.shape[0]
+def _order_in(module: ModuleType, search: Search, scratch: Array) -> Array:
+    """Return the order of the sources from the scratch of a search, or their own where most are near the one before them.
+
+    Rows of such sources share more than those of a cell do. The scratch of a CPU tells no order, and nobody asks for it.
+    """
+    sources, n = search.sources, search.sizes[0]
     if module is not cells_cuda:
         return lax.iota(jnp.int32, n)
     first, words, word = cells_cuda.place_words(2 if sources.dtype == jnp.float64 else 1)
-    return scratch[first : first + words * n].reshape(n, words)[:, word]
+    found = scratch[first : first + words * n].reshape(n, words)[:, word]
+    steps = jnp.abs(sources[1:] - sources[:-1]) <= largest_radius(search.cutoff)
+    near = jnp.sum(functools.reduce(jnp.logical_and, steps.T), dtype=jnp.int32)
+    return jnp.where(near > n // 2, lax.iota(jnp.int32, n), found)
 
 
 def are_few(search: Search) -> bool:

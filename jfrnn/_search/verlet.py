@@ -117,7 +117,8 @@ def _find_extremes(before: Array, now: Array, lattice: Lattice | None, half_skin
     if motion is not None:
         home = motion.home.astype(square.dtype)
         rows += [*-home.T, *home.T]
-    return jnp.max(jnp.stack(rows), axis=1, initial=-jnp.inf)
+    least = [np.array(-np.inf, square.dtype)] * len(rows)
+    return jnp.stack(lax.reduce(rows, least, lambda a, b: [lax.max(x, y) for x, y in zip(a, b, strict=True)], (0,)))
 
 
 def first_verlet(positions: Array, queries: Array | None, box: Box | None, radii: Radii | None) -> Verlet:
