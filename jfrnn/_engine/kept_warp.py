@@ -33,7 +33,7 @@ class KeptList(NamedTuple):
         turns: Lattice vectors between the cell and the sources and the rows, in whole floats [n, d] and [m, d], with codes.
         cutoff: One for all, or one per particle.
         lattice: The box, or None.
-        order: In which order CUDA takes rows that belong to the sources [n], or None.
+        order: In which order CUDA takes rows that belong to the sources [n] (-1: as they come), or None.
         reversal: Slots by source, where they begin, and how many: the sums are then those of the sources, over the rows that list
             them. Or None.
     """

@@ -39,7 +39,7 @@ class Rows(NamedTuple):
     """Neighbors of m queries: [m, capacity] int32 source indices, unused slots n (None if only counted), and [m] int32 true counts.
 
     `required` [] int32 is the length of the longest row, `status` [] int32 the bits of `Status`. `order` [n] int32 are the sources
-    as they follow each other in space, if that is asked for.
+    as they follow each other in space, if that is asked for; -1 where their numbers do so already.
     """
 
     idx: Array | None

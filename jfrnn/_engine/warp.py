@@ -82,18 +82,18 @@ def has_order(engine: Engine, platform: str, n: int, plain: bool) -> bool:
 
 
 def _order_in(module: ModuleType, search: Search, scratch: Array) -> Array:
-    """Return the order of the sources from the scratch of a search, or their own where most are near the one before them.
+    """Return the order of the sources from the scratch of a search, or -1 where most are near the one before them.
 
-    Rows of such sources share more than those of a cell do. The scratch of a CPU tells no order, and nobody asks for it.
+    Rows of such sources share more than those of a cell do, and take no order. That of a CPU is not asked for.
     """
     sources, n = search.sources, search.sizes[0]
     if module is not cells_cuda:
-        return lax.iota(jnp.int32, n)
+        return jnp.full(n, -1, jnp.int32)
     first, words, word = cells_cuda.place_words(2 if sources.dtype == jnp.float64 else 1)
     found = scratch[first : first + words * n].reshape(n, words)[:, word]
     steps = jnp.abs(sources[1:] - sources[:-1]) <= largest_radius(search.cutoff)
     near = jnp.sum(functools.reduce(jnp.logical_and, steps.T), dtype=jnp.int32)
-    return jnp.where(near > n // 2, lax.iota(jnp.int32, n), found)
+    return jnp.where(near > n // 2, -1, found)
 
 
 def are_few(search: Search) -> bool:

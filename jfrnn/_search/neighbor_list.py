@@ -65,7 +65,8 @@ class NeighborList(ListExports):
         reverse: Where pairs stand the other way round (`Reverse`), if the list was made with `reverse=True`; updates find it anew
             whenever they rebuild the list.
         order: The particles as they followed each other in space when the list was last rebuilt, shape [n], int32, by which sums
-            over a list on a GPU go; None elsewhere, for up to 4096 particles, queries and cutoffs per particle.
+            over a list on a GPU go; -1 where their numbers did so. None elsewhere, and for up to 4096 particles, queries, and
+            cutoffs per particle.
         problem: The options of the search (`Problem`). Static.
     """
 

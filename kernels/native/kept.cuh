@@ -15,7 +15,8 @@ struct KeptLane : Kept {
           lane((int)(thread_index() % LANES_PER_ROW)),
           is_row(thread_index() / LANES_PER_ROW < given.m),
           row(row_at((int)(thread_index() / LANES_PER_ROW))) {}
-    JFRNN_MEMBER int row_at(int place) const { return ORDERED && is_row ? order[place] : place; }
+    // Where the first number is negative, rows are taken as they come: all threads read that one, and none waits for its own.
+    JFRNN_MEMBER int row_at(int place) const { return ORDERED && is_row && order[0] >= 0 ? order[place] : place; }
 
     struct Entries {
         int ids[AT_A_TIME], codes[AT_A_TIME];

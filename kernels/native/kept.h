@@ -4,7 +4,7 @@
 // (RADII). Sources have LENGTH: coordinates, OTHERS numbers that a term reads, turns and the cutoff of j. `cutoff` holds the largest
 // cutoff, the lattice, and the largest number of a shift. `steps` are the shifts of image codes. REVERSED: rows are those of the sources
 // of the list, whose slots are `lengths` many in `slots` from `starts` on, and j is who has such a slot. ORDERED: threads take rows as
-// `order` has them, so that rows that are taken together read the same sources.
+// `order` has them, so that rows that are taken together read the same sources, or as they come where it holds -1.
 #pragma once
 #include "codes.h"
 #include "exact.h"
