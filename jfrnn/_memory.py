@@ -21,6 +21,7 @@ from jfrnn._engine import (
     count_rows,
     default_platform,
     fastest_engine,
+    has_order,
     list_rows,
     parse_backend,
 )
@@ -39,7 +40,8 @@ class MemoryPlan:
 
     Attributes:
         list_bytes: The result of a search [B]: 4 per slot, 4 per row for its count, 8 for `status` and `required`; with a skin,
-            also copies of positions and queries, and 4; with `reverse`, another 4 per slot, and for queries 8 per source.
+            also copies of positions and queries, and 4; with `reverse`, another 4 per slot, and for queries 8 per source; on a GPU
+            by "warp", from 4097 particles on and without queries, 4 per particle for their order.
         scratch_bytes: Memory needed in addition while it runs [B].
         backend: The engine, never "auto".
         sums_bytes: The results of a pair sum, and of its gradient if planned [B].
@@ -133,9 +135,9 @@ def memory_plan(
     >>> import jfrnn
     >>> print(jfrnn.memory_plan(1_000_000, 0.1, 64, backend="warp", platform="gpu"))
     one search with backend='warp', beside the positions:
-      list        260.00 MB
+      list        264.00 MB
       scratch      44.03 MB
-      total       304.03 MB
+      total       308.03 MB
     """
     n, queries = check_size("n", n), None if queries is None else check_size("queries", queries)
     dim, dtype = check_kind(dim, dtype)
@@ -160,6 +162,7 @@ def memory_plan(
     kept = (n + (queries or 0)) * dim * dtype.itemsize + 4 if check_skin(skin, float(radius.radius), dtype) else 0
     if check_flag("reverse", reverse):
         kept += 4 * rows * capacity + (0 if queries is None else 8 * n)
+    kept += 4 * n if has_order(chosen, where, n, queries is None) else 0
     return MemoryPlan(4 * rows * (capacity + 1) + 8 + kept, scratch, chosen.name)
 
 

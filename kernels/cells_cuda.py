@@ -44,9 +44,22 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -
     table = table_cells(sources)
     tiles = 2 * ((table + 1) // _TILE + 1)
     longest = max(sources, queries)
-    parts = [_HEADER_WORDS, _PART * _PARTS * width, 4 * width * sources, table + 2, tiles, longest, longest, sources]
+    parts = [*_before_places(width), 4 * width * sources, table + 2, tiles, longest, longest, sources]
     if not own:
         parts += [table + 2, tiles, queries]
+    return _place_parts(parts)
+
+
+def place_words(width: int) -> tuple[int, int, int]:
+    """Return where sources in the order of cells begin in the scratch, how many words each has, and which one is its number."""
+    return _place_parts(_before_places(width)), 4 * width, 3 * width
+
+
+def _before_places(width: int) -> list[int]:
+    return [_HEADER_WORDS, _PART * _PARTS * width]
+
+
+def _place_parts(parts: list[int]) -> int:
     return sum((words + 15) // 16 * 16 for words in parts)
 
 

@@ -3,7 +3,8 @@
 On the CPU, LANES slots of a row are taken at a time. Numbers of their sources are read four at a time, where these stand, and rows
 and columns of what was read are exchanged in registers. On CUDA, eight lanes serve a row. A lane
 takes four slots at a time: it reads their ids at once, then the numbers of their sources. Nothing is sorted: these numbers may
-stand anywhere, and rows that follow each other share them if particles that follow each other are close.
+stand anywhere, and rows that are taken together share them if they are close in space: rows follow each other, or come in an order
+that the search has left.
 """
 
 import functools
@@ -34,6 +35,7 @@ class ListKind(NamedTuple):
         rule: Whose cutoff is that of a pair, one of `RADII`; "" if all have one.
         reversed: Whether rows are those of the sources of the list.
         aligned: Whether rows of ids begin at multiples of 16 bytes.
+        ordered: Whether an order is given in which rows are taken (CUDA).
         lanes: How many lanes of CUDA serve a row; 0 on the CPU.
     """
 
@@ -45,6 +47,7 @@ class ListKind(NamedTuple):
     rule: str
     reversed: bool
     aligned: bool
+    ordered: bool
     lanes: int
 
     @property
@@ -55,7 +58,8 @@ class ListKind(NamedTuple):
     @property
     def name(self) -> str:
         """Tells kernels of such lists from others."""
-        flags = {"scaled": self.scaled, "reversed": self.reversed, "aligned": self.aligned, self.rule: bool(self.rule)}
+        flags = {"scaled": self.scaled, "reversed": self.reversed, "aligned": self.aligned, "ordered": self.ordered}
+        flags |= {self.rule: bool(self.rule)}
         parts = [f"{self.dim}d", "f64" if self.double else "f32", *(flag for flag, on in flags.items() if on)]
         return "_".join(parts) + f"{SPACES[self.periodic]}_{self.code_bytes}{f'_cuda{self.lanes}' if self.cuda else '_cpu'}"
 
@@ -73,7 +77,7 @@ class ListKind(NamedTuple):
     def constants(self, columns: int) -> dict[str, int]:
         """Return the named integers of a program."""
         found = {"PERIODIC": self.periodic, "SCALED": self.scaled, "CODE_BYTES": self.code_bytes, "REVERSED": self.reversed}
-        found |= {"RADII": RADII.get(self.rule, 0), "SUM": self.rule == "mean", "ALIGNED": self.aligned}
+        found |= {"RADII": RADII.get(self.rule, 0), "SUM": self.rule == "mean", "ALIGNED": self.aligned, "ORDERED": self.ordered}
         found |= {"DECIDED": 1, "MEASURED": 0}
         return found | {"LENGTH": self.length(columns), "LANES_PER_ROW": max(self.lanes, 1), "QUERY_CHUNK": ROWS_AT_ONCE, **GRID}
 

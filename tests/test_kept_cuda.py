@@ -8,12 +8,12 @@ from jfrnn.kernels.pair_sum_cpu import Step, Sum, TermText, Value
 
 TEXT = "const auto v0 = x * y;\nconst auto o = v0 + s;\n"
 KINDS = [
-    kept.ListKind(3, False, False, 0, 0, "", False, True, 1),
-    kept.ListKind(3, False, False, 1, 0, "", False, True, 8),
-    kept.ListKind(2, False, True, 1, 0, "mean", False, False, 8),
-    kept.ListKind(3, False, False, 2, 1, "", True, True, 8),
-    kept.ListKind(3, True, True, 4, 2, "either", False, True, 1),
-    kept.ListKind(2, True, False, 3, 0, "", False, True, 8),
+    kept.ListKind(3, False, False, 0, 0, "", False, True, False, 1),
+    kept.ListKind(3, False, False, 1, 0, "", False, True, True, 8),
+    kept.ListKind(2, False, True, 1, 0, "mean", False, False, False, 8),
+    kept.ListKind(3, False, False, 2, 1, "", True, True, True, 8),
+    kept.ListKind(3, True, True, 4, 2, "either", False, True, False, 1),
+    kept.ListKind(2, True, False, 3, 0, "", False, True, False, 8),
 ]
 
 

@@ -32,5 +32,5 @@ from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit
 from jfrnn._engine.start import compiler, level_of_caller
 from jfrnn._engine.structure import Structure, find_structure_pairs
 from jfrnn._engine.sum_results import FoundSums
-from jfrnn._engine.warp import PLATFORMS
+from jfrnn._engine.warp import PLATFORMS, has_order
 from jfrnn._engine.warp_sums import pair_sums

@@ -17,7 +17,8 @@ from jfrnn._geometry import EXCHANGED, LARGEST_TURN, Cutoff, Cutoffs, Lattice
 from jfrnn.kernels import kept
 from jfrnn.kernels.pair_sum_cpu import TermText
 
-_LIST = ("rows", "points", "cutoff", "steps", "idx", "count", "codes", "slots", "starts", "lengths")  # what a call is given
+# what a call is given
+_LIST = ("rows", "points", "cutoff", "steps", "idx", "count", "codes", "slots", "starts", "lengths", "order")
 
 
 class KeptList(NamedTuple):
@@ -32,6 +33,7 @@ class KeptList(NamedTuple):
         turns: Lattice vectors between the cell and the sources and the rows, in whole floats [n, d] and [m, d], with codes.
         cutoff: One for all, or one per particle.
         lattice: The box, or None.
+        order: In which order CUDA takes rows that belong to the sources [n] (-1: as they come), or None.
         reversal: Slots by source, where they begin, and how many: the sums are then those of the sources, over the rows that list
             them. Or None.
     """
@@ -44,6 +46,7 @@ class KeptList(NamedTuple):
     turns: tuple[Array, Array] | None
     cutoff: Cutoff | Cutoffs
     lattice: Lattice | None
+    order: Array | None
     reversal: tuple[Array, Array, Array] | None
 
 
@@ -137,7 +140,8 @@ def _kind_of(given: KeptList, lanes: int) -> _Extra:
     rule = cutoff.rule if isinstance(cutoff, Cutoffs) else ""
     rule = EXCHANGED.get(rule, rule) if is_reversed else rule
     dim, double, aligned = given.sources.shape[1], given.sources.dtype == jnp.float64, given.idx.shape[1] % 4 == 0
-    kind = kept.ListKind(dim, double, cutoff.scaled, periodic, width, rule, is_reversed, aligned, lanes)
+    ordered = given.order is not None and lanes > 0
+    kind = kept.ListKind(dim, double, cutoff.scaled, periodic, width, rule, is_reversed, aligned, ordered, lanes)
     return _Extra(cutoff.closed, 1 if lattice is None else lattice.images.total, kind)
 
 
@@ -163,7 +167,8 @@ def _operands(given: KeptList, extra: _Extra, columns: int, others: Array | None
     nothing = jnp.zeros(1, jnp.int32)
     codes = nothing if given.codes is None else given.codes
     reversal = given.reversal or [nothing if slots is None else slots, nothing, nothing]
-    return [own, points, jnp.concatenate(numbers), steps, given.idx, given.counts, codes, *reversal]
+    order = nothing if given.order is None or not kind.ordered else given.order
+    return [own, points, jnp.concatenate(numbers), steps, given.idx, given.counts, codes, *reversal, order]
 
 
 def _radii_of(given: KeptList, kind: kept.ListKind) -> tuple[Array | None, Array | None]:

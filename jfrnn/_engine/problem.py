@@ -40,13 +40,15 @@ class Filter(NamedTuple):
 class Rows(NamedTuple):
     """Neighbors of m queries: [m, capacity] int32 source indices, unused slots n (None if only counted), and [m] int32 true counts.
 
-    `required` [] int32 is the length of the longest row, `status` [] int32 the bits of `Status`.
+    `required` [] int32 is the length of the longest row, `status` [] int32 the bits of `Status`. `order` [n] int32 are the sources
+    as they follow each other in space, if that is asked for; -1 where their numbers do so already.
     """
 
     idx: Array | None
     counts: Array
     required: Array
     status: Array
+    order: Array | None = None
 
 
 class Search(NamedTuple):
@@ -138,6 +140,7 @@ class Options(NamedTuple):
     skin: float = 0.0  # to be added to cutoffs per particle; a single cutoff includes it already
     images: Images | None = None  # the images that a search in a box considers
     radius: float | None = None  # the cutoff, for an engine that has to know it while tracing
+    ordered: bool = False  # whether rows are told in which order sources follow each other in space
     may_change: bool = False  # whether the array engine may sum a term that this engine cannot translate
 
 

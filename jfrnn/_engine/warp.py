@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import Array, lax
 
 from jfrnn._engine.arrays import levels_of
 from jfrnn._engine.boxes_warp import box_neighbors
@@ -20,7 +20,7 @@ from jfrnn._engine.launch import Call, Shapes, kernel, open_native
 from jfrnn._engine.levels_warp import level_neighbors
 from jfrnn._engine.operands import MOST_IN_BOX, pack_particles, periodic_kind, space_flags
 from jfrnn._engine.plans import HugePages, Launch, Plan, ask_for_huge_pages, share
-from jfrnn._engine.problem import Filter, Kind, Options, Rows, Search
+from jfrnn._engine.problem import Engine, Filter, Kind, Options, Rows, Search, largest_radius
 from jfrnn._engine.start import check_warp
 from jfrnn._geometry import Cutoffs
 from jfrnn.kernels import _driver, cells_cpu, cells_cuda, few_cuda
@@ -58,8 +58,9 @@ class WarpEngine:
 
         def on(module: ModuleType, make: Callable[[Variant], Any]) -> Callable[[Search], Rows]:
             blocks = few_cuda.blocks(search.sizes[1]) if module is few_cuda else None
+            order = functools.partial(_order_in, module, search) if options.ordered and capacity is not None else None
             return functools.partial(
-                call_kernels, module.scratch_words, make, keep=options.filter, capacity=capacity, blocks=blocks
+                call_kernels, module.scratch_words, make, keep=options.filter, capacity=capacity, blocks=blocks, order=order
             )
 
         few = are_few(search)
@@ -73,6 +74,29 @@ class WarpEngine:
         if 0 in (n, m) or (cells is cells_cuda and _all_meet((n, m), scaled)):
             return 0
         return 4 * cells.scratch_words(n, m, dim, 2 if double else 1, own)
+
+
+def has_order(engine: Engine, platform: str, n: int, plain: bool) -> bool:
+    """Say whether lists keep the order in which n sources follow each other in space, by which kernels of CUDA take rows.
+
+    `plain`: without queries, and with one cutoff.
+    """
+    return isinstance(engine, WarpEngine) and PLATFORMS.get(platform) == "cuda" and n > few_cuda.MOST and plain
+
+
+def _order_in(module: ModuleType, search: Search, scratch: Array) -> Array:
+    """Return the order of the sources from the scratch of a search, or -1 where most are near the one before them.
+
+    Rows of such sources share more than those of a cell do, and take no order. That of a CPU is not asked for.
+    """
+    sources, n = search.sources, search.sizes[0]
+    if module is not cells_cuda:
+        return jnp.full(n, -1, jnp.int32)
+    first, words, word = cells_cuda.place_words(2 if sources.dtype == jnp.float64 else 1)
+    found = scratch[first : first + words * n].reshape(n, words)[:, word]
+    steps = jnp.abs(sources[1:] - sources[:-1]) <= largest_radius(search.cutoff)
+    near = jnp.sum(functools.reduce(jnp.logical_and, steps.T), dtype=jnp.int32)
+    return jnp.where(near > n // 2, -1, found)
 
 
 def are_few(search: Search) -> bool:
@@ -128,10 +152,12 @@ def call_kernels(
     keep: Filter,
     capacity: int | None,
     blocks: int | None = None,
+    order: Callable[[Array], Array] | None = None,
 ) -> Rows:
     """Let XLA call what `make` returns, with the scratch that its kernels ask for.
 
-    With `blocks`, so many tell of their own queries how long rows are, and their status; otherwise one tells of all.
+    With `blocks`, so many tell of their own queries how long rows are, and their status; otherwise one tells of all. `order` finds
+    the order of the sources in that scratch.
     """
     sources, queries, cutoff, batch, torus, _ = search
     own, lists = queries is None, capacity is not None
@@ -145,11 +171,11 @@ def call_kernels(
         )
     words = scratch_words(n, m, dim, 2 if double else 1, own)
     dims = {"idx": (m, capacity), "count": m, "info": 2 if blocks is None else (blocks, 2), "scratch": max(words, 1)}
-    *idx, count, info, _ = make(variant)(*pack_particles(search), output_dims=dims)
+    *idx, count, info, scratch = make(variant)(*pack_particles(search), output_dims=dims)
     longest, status = (
         (info[0], info[1]) if blocks is None else (info[:, 0].max(), lax.reduce(info[:, 1], np.int32(0), lax.bitwise_or, (0,)))
     )
-    return Rows(idx[0] if lists else None, count, longest, status)
+    return Rows(idx[0] if lists else None, count, longest, status, None if order is None else order(scratch))
 
 
 @kernel

@@ -1,8 +1,6 @@
 """Motion: how far particles have moved since a list was made, and how far a change of the box moved periodic images."""
 
 import dataclasses
-import functools
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -10,7 +8,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry.lattice import Lattice, nearest_shifts, translation, units_of
-from jfrnn._geometry.wrapping import pack_turns, unpack_turns
+from jfrnn._geometry.wrapping import count_turns, unpack_turns
 
 
 class Motion(NamedTuple):
@@ -40,7 +38,7 @@ def motion_of(before: Array, now: Array, lattice: Lattice) -> Motion:
     most = jnp.max(taken, axis=1, keepdims=True, initial=0) + 1
     unsure = 8 * eps * units_of(size, dataclasses.replace(lattice, transform=transform)) + 2 * most * residual
     sure = jnp.where(lattice.spread(lattice.periodic, 2), jnp.abs(units - turns) + unsure < 0.5, True).all(axis=1)
-    packed = pack_turns(now, lattice)
+    packed = count_turns(now, lattice)
     home = unpack_turns(packed, lattice.dim) - jnp.clip(turns, -(2.0**20), 2.0**20).astype(jnp.int32)
     return Motion(list(left.T), sure & ((packed >= 0) | ~was_turned), home)
 
@@ -51,19 +49,15 @@ def turns_between(before: Array, now: Array, lattice: Lattice) -> Array:
     return -nearest_shifts(jnp.where(jnp.isfinite(now - before).all(axis=1, keepdims=True), now - before, 0), lattice)
 
 
-def box_change(before: Lattice, now: Lattice, home: Sequence[Array]) -> Array:
+def box_change(before: Lattice, now: Lattice, spans: Array) -> Array:
     """Bound the change in displacement that a changed box, or the one of any row, causes for any pair within reach.
 
-    `home`, arrays [n, d] int32, tells how many lattice vectors the points lie from the box (`Motion`).
+    `spans` [d] tells how many lattice vectors lie between the cells of two points at most (`Motion.home`).
     """
-    dtype, places = now.matrix.dtype, [x for x in home if len(x)]
-    if not places:
-        return jnp.zeros((), dtype)
-    highest = functools.reduce(jnp.maximum, (jnp.max(x, axis=0) for x in places))
-    lowest = functools.reduce(jnp.minimum, (jnp.min(x, axis=0) for x in places))
+    dtype = now.matrix.dtype
     eps = jnp.finfo(dtype).eps
     moved = jnp.sqrt(jnp.sum((now.matrix - before.matrix) ** 2, axis=-1)) * (1 + 16 * eps)
     if now.images.basis is not None:  # short vectors carry a rounding error
         moved = jnp.where(moved > 0, moved + 4 * eps * jnp.sum(jnp.abs(now.matrix), axis=1), moved)
-    cells = (highest - lowest).astype(dtype) + np.array(now.images.reach, dtype)
+    cells = spans + np.array(now.images.reach, dtype)
     return jnp.max(jnp.sum(now.spread(cells, moved.ndim) * moved, axis=-1))

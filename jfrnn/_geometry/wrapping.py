@@ -47,6 +47,11 @@ class Wrapped(NamedTuple):
 
 
 def pack_turns(points: Array, lattice: Lattice) -> Array:
+    """Return `count_turns`, computed once, so that all users see the same value."""
+    return lax.optimization_barrier(count_turns(points, lattice))
+
+
+def count_turns(points: Array, lattice: Lattice) -> Array:
     """Count the lattice vectors between the cell and each point (0 along open axes): [n] int32, 10 bits per axis.
 
     The result is -1 for points that are not finite, and -2 for those farther away than `LARGEST_TURN`.
@@ -56,8 +61,7 @@ def pack_turns(points: Array, lattice: Lattice) -> Array:
     finite = functools.reduce(jnp.logical_and, (jnp.isfinite(points[:, k]) for k in range(lattice.dim)))
     near = functools.reduce(jnp.logical_and, (jnp.abs(x) <= LARGEST_TURN for x in turns), finite)
     parts = [(x.astype(jnp.int32) + (LARGEST_TURN + 1)) << (k * _TURN_BITS) for k, x in enumerate(turns)]
-    packed = jnp.where(near, functools.reduce(jnp.bitwise_or, parts), jnp.where(finite, -2, -1))
-    return lax.optimization_barrier(packed)  # computed once, so that all users see the same value
+    return jnp.where(near, functools.reduce(jnp.bitwise_or, parts), jnp.where(finite, -2, -1))
 
 
 def _met(packed: Array, dim: int) -> Array:

@@ -133,7 +133,7 @@ def flat_edges(
     senders = jnp.where(real, topology.idx.reshape(-1)[flat.slots], topology.sources)
     ends = _by_sender(topology, flat.edges, total), _by_row(flat.offsets, capacity, total)
     sides = [
-        gather(points, Topology(named[:, None], None, end, len(points), 1, end.starts is None, topology.native))[:, 0]
+        gather(points, Topology(named[:, None], None, end, None, len(points), 1, end.starts is None, topology.native))[:, 0]
         for points, named, end in zip((sources, rows), (senders, flat.rows), ends, strict=True)
     ]
     displacement, shift = sides[0] - sides[1], jnp.zeros((total, dim), jnp.int32)

@@ -59,7 +59,7 @@ def lattice_of_rows(box: Box, kind: Images, dtype: np.dtype, systems: Array | No
     if not kind.per_system or systems is None:
         return lattice
     boxes, nearest = len(lattice.origin), jnp.clip(systems, 0, len(lattice.origin) - 1)
-    topology = Topology(nearest[:, None], None, None, boxes, 1, False, native)
+    topology = Topology(nearest[:, None], None, None, None, boxes, 1, False, native)
     matrix = gather(lattice.matrix.reshape(boxes, -1), topology).reshape(-1, lattice.dim, lattice.dim)
     return dataclasses.replace(lax.stop_gradient(lattice).of_rows(nearest), matrix=matrix)
 
@@ -209,7 +209,7 @@ def kept_list(
     of_pairs = _pair_cutoff(cutoff, closed)
     turns = None if codes is None or lattice is None else _turns_now(codes, made, sources, rows, lattice)
     fixed = lax.stop_gradient((sources, rows, turns, of_pairs, lattice))
-    return KeptList(topology.idx, count, topology.codes, *fixed, None)
+    return KeptList(topology.idx, count, topology.codes, *fixed, topology.order, None)
 
 
 def kept_shifts(given: KeptList) -> Array:

@@ -43,9 +43,10 @@ def find_fields(inputs: Inputs, options: Options, capacity: int, moving: bool, r
     radii = lax.stop_gradient(inputs.cutoff) if isinstance(inputs.cutoff, Radii) else None
     verlet = first_verlet(sources, inputs.queries, inputs.box, radii) if moving else None
     fields: dict[str, Any] = {"idx": rows.idx, "count": rows.counts, "status": rows.status, "required": rows.required}
+    fields["order"] = rows.order
     images = None if codes is None else codes.codes
     fields["reverse"] = None
     if reversing and rows.idx is not None:
-        topology = make_topology(options, sources.shape[0], inputs.queries is not None, radii, rows.idx, images, None)
+        topology = make_topology(options, sources.shape[0], inputs.queries is not None, radii, rows.idx, images, None, rows.order)
         fields["reverse"] = topology.with_reverse()
     return fields | {"verlet": verlet, "box": lax.stop_gradient(inputs.box), "images": codes, "radii": radii, "batch": inputs.batch}

@@ -64,6 +64,9 @@ class NeighborList(ListExports):
         batch: System numbers (`Batch`: sources [n], queries [m] or None), or None; updates keep them.
         reverse: Where pairs stand the other way round (`Reverse`), if the list was made with `reverse=True`; updates find it anew
             whenever they rebuild the list.
+        order: The particles as they followed each other in space when the list was last rebuilt, shape [n], int32, by which sums
+            over a list on a GPU go; -1 where their numbers did so. None elsewhere, and for up to 4096 particles, queries, and
+            cutoffs per particle.
         problem: The options of the search (`Problem`). Static.
     """
 
@@ -77,6 +80,7 @@ class NeighborList(ListExports):
     radii: Radii | None
     batch: Batch | None
     reverse: Reverse | None
+    order: Array | None
     problem: Problem = dataclasses.field(metadata={"static": True})
 
     def __repr__(self) -> str:
@@ -427,7 +431,7 @@ class NeighborList(ListExports):
     def _topology(self) -> Topology:
         problem, codes = self.problem, None if self.images is None else self.images.codes
         kind = problem.options, problem.source_count, problem.own_queries, self.radii
-        return make_topology(*kind, self.idx, codes, self.reverse)
+        return make_topology(*kind, self.idx, codes, self.reverse, self.order)
 
     def _images_made(self) -> ImagesMade:
         made = None if self.images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from jax import Array
 
-from jfrnn._engine import ENGINES, Filter, Inputs, Kind, Options, choose_engine, parse_backend
+from jfrnn._engine import ENGINES, Filter, Inputs, Kind, Options, choose_engine, has_order, parse_backend, platform_of
 from jfrnn._geometry import (
     EXCHANGED,
     Batch,
@@ -117,7 +117,9 @@ def check_problem(
     kind = Kind(periodic=box is not None, radii=radii is not None, batch=batch is not None)
     engine = choose_engine(parse_backend(backend, ENGINES), sources, queries, kind)
     systems = None if batch is None else check_batch(batch, sources, queries)
-    options = Options(keep, engine, closed, 0.0 if radii is None else skin, images, reach if engine.static_radius else None)
+    ordered = has_order(engine, platform_of(sources), sources.shape[0], queries is None and radii is None)
+    static_reach = reach if engine.static_radius else None
+    options = Options(keep, engine, closed, 0.0 if radii is None else skin, images, static_reach, ordered)
     shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}
     problem = Problem(options, radius, skin, **shape, dim=sources.shape[1], dtype=dtype)
     box = None if box is None else round_box(box, dtype)

@@ -20,6 +20,7 @@ class Topology:
         idx: [m, capacity] int32 source indices; unused slots hold the number of sources.
         codes: Image codes of the slots, or None if a pair has one image.
         reverse: The slots of each source, or None: they are found when they are needed.
+        order: The sources as they follow each other in space [n] int32, or None.
         sources: Number of sources. Static.
         images: Number of image codes. Static.
         mutual: Whether the list is its own mirror image. Static.
@@ -29,6 +30,7 @@ class Topology:
     idx: Array
     codes: Array | None
     reverse: Reverse | None
+    order: Array | None
     sources: int = dataclasses.field(metadata={"static": True})
     images: int = dataclasses.field(metadata={"static": True})
     mutual: bool = dataclasses.field(metadata={"static": True})
@@ -61,7 +63,7 @@ class Topology:
             starts = None if starts is None else number(starts, m * capacity)
             lengths = None if reverse.lengths is None else reverse.lengths.reshape(-1)
             reverse = Reverse(number(reverse.slots, m * capacity), starts, lengths)
-        return dataclasses.replace(self, idx=idx, codes=codes, reverse=reverse, sources=size * n)
+        return dataclasses.replace(self, idx=idx, codes=codes, reverse=reverse, order=None, sources=size * n)
 
 
 def is_mutual(options: Options, own_queries: bool, radii: Radii | None) -> bool:
@@ -70,9 +72,16 @@ def is_mutual(options: Options, own_queries: bool, radii: Radii | None) -> bool:
 
 
 def make_topology(
-    options: Options, sources: int, own_queries: bool, radii: Radii | None, idx: Array, codes: Array | None, reverse: Reverse | None
+    options: Options,
+    sources: int,
+    own_queries: bool,
+    radii: Radii | None,
+    idx: Array,
+    codes: Array | None,
+    reverse: Reverse | None,
+    order: Array | None,
 ) -> Topology:
     """Return which sources the slots of a list of a search with these options hold."""
     images = 1 if options.images is None else options.images.total
     mutual = is_mutual(options, own_queries, radii)
-    return Topology(idx, codes, reverse, sources, images, mutual, options.engine.translates)
+    return Topology(idx, codes, reverse, order, sources, images, mutual, options.engine.translates)

@@ -5,6 +5,7 @@ cutoff + skin (triangle inequality), so it is listed (Verlet 1967, doi:10.1103/P
 """
 
 import dataclasses
+import functools
 import math
 from fractions import Fraction
 
@@ -18,7 +19,7 @@ from jfrnn._geometry import (
     Box,
     Cutoff,
     Images,
-    Motion,
+    Lattice,
     Radii,
     box_change,
     is_radius,
@@ -81,14 +82,17 @@ def has_moved_too_far(
     clouds = [(verlet.positions, positions)]
     if queries is not None and verlet.queries is not None:
         clouds.append((verlet.queries, queries))
-    motions: list[Motion | None] = [None] * len(clouds)
+    old, news = None, [None] * len(clouds)
     if box is not None and verlet.box is not None and box_kind is not None:
         old, new = (make_lattice(x, box_kind, np.dtype(positions.dtype)) for x in (verlet.box, box))
         news = [new] * len(clouds)
         if box.per_system and batch is not None:
             news, old = [new.of_rows(x) for x in (batch.sources, batch.of_queries)], old.of_rows(batch.sources)
-        motions = [motion_of(before, now, each) for (before, now), each in zip(clouds, news, strict=False)]
-        used = box_change(old, news[0], [motion.home for motion in motions if motion is not None])
+    found = (_find_extremes(*cloud, lattice, half) for cloud, lattice in zip(clouds, news, strict=False))
+    extremes = functools.reduce(jnp.maximum, found)
+    if old is not None and news[0] is not None:
+        below, above = jnp.split(extremes[1:], 2)
+        used = box_change(old, news[0], jnp.where(below + above >= 0, below + above, 0))
     if radii is not None and verlet.radii is not None:
         for before, now in ((verlet.radii.sources, radii.sources), (verlet.radii.queries, radii.queries)):
             if before is not None and now is not None:
@@ -96,9 +100,7 @@ def has_moved_too_far(
                 grown = jnp.maximum(grown, _growth(before, now))
     if box is not None or radii is not None:
         half = widen(half, (used + grown) / 4)
-    for cloud, motion in zip(clouds, motions, strict=True):
-        moved = moved | _any_beyond(*cloud, motion, half)
-    return moved
+    return moved | ~(extremes[0] < half.inside)  # `inside` has a margin of 8 eps, so what is below is surely closer
 
 
 def _growth(before: Array, now: Array) -> Array:
@@ -107,12 +109,22 @@ def _growth(before: Array, now: Array) -> Array:
     return jnp.max(grown, initial=0) * (1 + 4 * jnp.finfo(grown.dtype).eps)
 
 
-def _any_beyond(before: Array, now: Array, motion: Motion | None, half_skin: Cutoff) -> Array:
-    axes = list((now - before).T) if motion is None else motion.axes
-    near = squared_distance(axes, half_skin) < half_skin.inside  # `inside` has a margin of 8 eps, so these are surely closer
-    near = near if motion is None else near & motion.sure
+def _find_extremes(before: Array, now: Array, lattice: Lattice | None, half_skin: Cutoff) -> Array:
+    """Return the largest scaled square of a motion, infinite where rounding leaves it open, in one reduction.
+
+    In a box, behind it come for each axis the largest numbers of lattice vectors that a point lies from the box, backward and
+    forward (`Motion.home`).
+    """
+    motion = None if lattice is None else motion_of(before, now, lattice)
+    square = squared_distance(list((now - before).T) if motion is None else motion.axes, half_skin)
+    square = square if motion is None else jnp.where(motion.sure, square, jnp.inf)
     there = jnp.isfinite(before).all(axis=1) | jnp.isfinite(now).all(axis=1)
-    return jnp.any(there & ~near)
+    rows = [jnp.where(there, square, 0)]
+    if motion is not None:
+        home = motion.home.astype(square.dtype)
+        rows += [*-home.T, *home.T]
+    least = [np.array(-np.inf, square.dtype)] * len(rows)
+    return jnp.stack(lax.reduce(rows, least, lambda a, b: [lax.max(x, y) for x, y in zip(a, b, strict=True)], (0,)))
 
 
 def first_verlet(positions: Array, queries: Array | None, box: Box | None, radii: Radii | None) -> Verlet:

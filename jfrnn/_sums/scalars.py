@@ -12,7 +12,8 @@ import numpy as np
 TYPES = {"float32": "f32", "float64": "f64", "int32": "i32", "int64": "i64", "bool": "flag"}  # dtypes, and their names in `Math`
 MOST_SCALARS = 20_000  # most nodes of a graph, to bound the native compiler's work
 
-_INFIX = {"add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}"}  # for floats
+_INFIX = {"add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "neg": "-{0}"}  # for floats
+_WRITTEN = {form: name for name, form in _INFIX.items()}
 _SUFFIX = {"float32": "f", "float64": "", "int32": "", "int64": "ll"}
 _BITS = {"float32": (np.uint32, "u"), "float64": (np.uint64, "ull")}
 _FOLDED = {  # operations on constant integers and bools, such as indices, which are computed here
@@ -38,6 +39,11 @@ class Node(NamedTuple):
     operands: tuple[int, ...]
     dtype: str
     value: Number = None
+
+    @property
+    def operation(self) -> str:
+        """The operation of `Math` by which it follows from its operands."""
+        return _WRITTEN.get(self.form) or self.form.removeprefix("Math::").partition("(")[0]
 
 
 def literal(scalar: Number) -> str:
@@ -84,12 +90,16 @@ class Scalars:
             return known
         if operation in ("add", "mul"):
             operands = sorted(operands)
+        if operation == "div" and dtype.startswith("float") and self._is(operands[0], 1):
+            operation, operands = "reciprocal", operands[1:]
         if operation == "mul" and operands[0] == operands[1]:
             operands = [self._known_up_to_sign(operands[0])] * 2
-        arguments = ", ".join(f"{{{k}}}" for k in range(len(operands)))
-        infix = dtype.startswith("float") and operation in _INFIX
-        form = _INFIX[operation] if infix else f"Math::{operation}({arguments})"
+        form = _form(operation, len(operands), dtype)
         return self._number((form, *operands), Node(form, tuple(operands), dtype))
+
+    def find(self, operation: str, operands: Sequence[int], dtype: str) -> int | None:
+        """Return the result of an operation if it is a node already."""
+        return self._numbers.get((_form(operation, len(operands), dtype), *operands))
 
     def value(self, number: int) -> Number:
         """Return the value of a constant, None for other nodes."""
@@ -159,7 +169,7 @@ class Scalars:
         if operation == "neg" and self.nodes[first].form == "-{0}":
             return self.nodes[first].operands[0]
         if operation == "div" and self._is(first, 1) and (root := self._root(last)) is not None:
-            known = self._numbers.get((_INFIX["div"], first, root))  # 1 / a² for a known 1 / a, as derivatives of 1 / a have it
+            known = self.find("reciprocal", (root,), dtype)  # 1 / a² for a known 1 / a, as derivatives of 1 / a have it
             if known is not None:
                 return self.apply("mul", (known, known), dtype)
         reciprocal = self._reciprocal(last) if operation == "div" else None
@@ -191,6 +201,11 @@ class Scalars:
         if real or operation not in _FOLDED:
             return None
         return self.constant(_quietly(_FOLDED[operation], *values), dtype)
+
+
+def _form(operation: str, count: int, dtype: str) -> str:
+    infix = dtype.startswith("float") and operation in _INFIX
+    return _INFIX[operation] if infix else f"Math::{operation}({', '.join(f'{{{k}}}' for k in range(count))})"
 
 
 def _quietly(function: Callable[..., Number], *arguments: Number) -> Number:

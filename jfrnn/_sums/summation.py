@@ -16,6 +16,7 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from jfrnn._sums.exchange import signs_of
 from jfrnn._sums.fused import can_sum_list, check
 from jfrnn._sums.joint import lower_sum
 from jfrnn._sums.relations import Kept, Relation, Searched, sum_pairs
@@ -100,7 +101,8 @@ def _transpose(cotangents: list, *args: Internal, term: Term, structure: Structu
         for kind in (True, False)
     }
     given = join(still, Groups(of_kind[True], of_kind[False], ()))
-    rules = transpose(term, linear, there, relation.symmetric)
+    signs = signs_of(term) if relation.symmetric else (None,) * len(there)
+    rules = transpose(term, linear, there, relation.symmetric, signs)
     results: list[Array] = []
     if rules.along is not None:
         if rules.sides:

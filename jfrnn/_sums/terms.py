@@ -79,10 +79,11 @@ class Term:
 
     def split(self, operands: Sequence) -> Groups:
         """Split a flat list of operands into the three groups."""
-        return _split(operands, self.operands)
+        return split_operands(operands, self.operands)
 
 
-def _split(operands: Sequence, like: Groups) -> Groups:
+def split_operands(operands: Sequence, like: Groups) -> Groups:
+    """Split a flat list of operands into the three groups."""
     shared, own, _ = (len(group) for group in like)
     return Groups(tuple(operands[:shared]), tuple(operands[shared : shared + own]), tuple(operands[shared + own :]))
 
@@ -171,7 +172,7 @@ def make_term(
     closed = _jaxpr_of(summand, operands, shift)
     always = [True, True] + [False] * sum(map(len, operands))
     jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), always)
-    needed = _split(used[2:], operands)
+    needed = split_operands(used[2:], operands)
     mine, theirs = labels
     labels = tuple(compress(mine, needed.own)), tuple(compress(theirs, needed.others))
     totals, marks = (tuple(flags or [False] * len(jaxpr.outvars)) for flags in (totals, marks))
@@ -189,7 +190,7 @@ def _one_pair(operands: Groups, shift: jax.ShapeDtypeStruct) -> list[jax.ShapeDt
 
 
 def _flat(summand: Summand, operands: Groups) -> Callable[..., list[Array]]:
-    return lambda real, shift, *flat: [jnp.asarray(x) for x in summand(real, shift, _split(flat, operands))]
+    return lambda real, shift, *flat: [jnp.asarray(x) for x in summand(real, shift, split_operands(flat, operands))]
 
 
 def choose(operands: Groups, flags: Groups) -> Groups:
@@ -266,12 +267,15 @@ def _pull_back(
 
 
 @functools.lru_cache(maxsize=256)
-def transpose(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetric: bool) -> Transposed:
+def transpose(
+    term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetric: bool, signs: tuple[int | None, ...]
+) -> Transposed:
     """Transpose a term in its linear operands; `cotangents` says for which sums there are any.
 
     `symmetric` means that j is a neighbor of i whenever i is one of j, and that both sides have the same kinds of operands. Then
     one term suffices: the sums for the linear operands of j are the last ones of `along`, whose operands on either side are all
-    those of i and of j. If an operand of j is the same array as one of i, its sums are added to those of i.
+    those of i and of j. If an operand of j is the same array as one of i, its sums are added to those of i. `signs` are those of
+    `jfrnn._sums.exchange`: where all are known, cotangents of i and of j are added, and both sums are one.
     """
     still = choose(term.operands, Groups(*(tuple(not flag for flag in group) for group in linear)))
     of_totals, of_sums = (
@@ -292,6 +296,8 @@ def transpose(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetri
     place = [sides.index(each.index(label)) for label in each]
     moving_i, moving_j = (tuple(compress(labels, which)) for labels, which in zip(term.labels, linear[1:], strict=True))
     joint = tuple(label in moving_i for label in moving_j)
+    of_given = [(sign, total) for sign, total, there in zip(signs, term.totals, cotangents, strict=True) if there]
+    folds = moving_i == moving_j and not any(linear.shared) and all(sign is not None for sign, _ in of_given)
     pull = functools.partial(_pull_back, term, linear, cotangents, still)
 
     def along(real: Array, shift: Array, operands: Groups) -> list[Array]:
@@ -304,6 +310,12 @@ def transpose(term: Term, linear: Groups, cotangents: tuple[bool, ...], symmetri
     def both(real: Array, shift: Array, operands: Groups) -> list[Array]:
         of_i, of_j = (tuple(side[k] for k in place) for side in (operands.own, operands.others))
         count = len(given.own)
+        if folds:
+            cut, rest = len(still.shared), count - len(of_sums)
+            of_total, of_sum = ([sign or 0 for sign, total in of_given if total == kind] for kind in (True, False))
+            totals = [x + sign * x for x, sign in zip(operands.shared[cut:], of_total, strict=True)]
+            sums = [x + sign * y for x, y, sign in zip(of_i[rest:count], of_j[rest:count], of_sum, strict=True)]
+            return list(pull(real, shift, Groups((*operands.shared[:cut], *totals), (*of_i[:rest], *sums), of_j[count:])).own)
         forward, backward = (Groups(operands.shared, a[:count], b[count:]) for a, b in ((of_i, of_j), (of_j, of_i)))
         result, others = pull(real, shift, forward), list(pull(real, -shift, backward).others)
         own = list(result.own)

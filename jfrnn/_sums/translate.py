@@ -66,20 +66,28 @@ def translate(closed: ClosedJaxpr) -> Translated:
         NoTranslationError: a primitive or dtype without translation, an index that depends on data, an array of more than
             MOST_ELEMENTS elements, or more than `jfrnn._sums.scalars.MOST_SCALARS` operations.
     """
-    scalars = Scalars()
+    scalars, arguments, results = translate_scalars(closed)
     inputs = tuple(_spec(v.aval, "an input") for v in closed.jaxpr.invars)
-    places: dict[int, tuple[int, int]] = {}
-    arguments = []
-    for k, (shape, dtype) in enumerate(inputs):
-        numbers = {scalars.declare(input_name(k, e), dtype): (k, e) for e in range(math.prod(shape))}
-        places |= numbers
-        arguments.append(np.array(list(numbers), int).reshape(shape))
-    results = _run(scalars, closed, arguments)
+    places = {number: (k, e) for k, numbers in enumerate(arguments) for e, number in enumerate(numbers.reshape(-1).tolist())}
     outputs = tuple(_spec(v.aval, "an output") for v in closed.jaxpr.outvars)
     defined = {output_name(k, e): x for k, result in enumerate(results) for e, x in enumerate(result.reshape(-1).tolist())}
     text = scalars.text(defined)
     reads = tuple(places[number] for number in sorted(scalars.dependencies(defined.values()) & places.keys()))
     return Translated(text, inputs, outputs, reads, hash_of(text, inputs, outputs))
+
+
+def translate_scalars(closed: ClosedJaxpr) -> tuple[Scalars, list[Values], list[Values]]:
+    """Return the scalars of a closed jaxpr, and which of them are the elements of its inputs and of its results.
+
+    Raises:
+        NoTranslationError: as `translate`.
+    """
+    scalars, arguments = Scalars(), []
+    for k, v in enumerate(closed.jaxpr.invars):
+        shape, dtype = _spec(v.aval, "an input")
+        numbers = [scalars.declare(input_name(k, e), dtype) for e in range(math.prod(shape))]
+        arguments.append(np.array(numbers, int).reshape(shape))
+    return scalars, arguments, _run(scalars, closed, arguments)
 
 
 def _spec(aval: Aval, what: str) -> Spec:

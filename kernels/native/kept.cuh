@@ -6,14 +6,17 @@
 constexpr int AT_A_TIME = LENGTH * sizeof(real) > 16 ? 2 : 4;  // entries of a lane
 
 struct KeptLane : Kept {
-    const int lane, row;  // of a row
+    const int lane;  // of a row
     const bool is_row;
+    const int row;
 
     JFRNN_MEMBER explicit KeptLane(const KeptArguments& given)
         : Kept(given),
           lane((int)(thread_index() % LANES_PER_ROW)),
-          row((int)(thread_index() / LANES_PER_ROW)),
-          is_row(row < given.m) {}
+          is_row(thread_index() / LANES_PER_ROW < given.m),
+          row(row_at((int)(thread_index() / LANES_PER_ROW))) {}
+    // Where the first number is negative, rows are taken as they come: all threads read that one, and none waits for its own.
+    JFRNN_MEMBER int row_at(int place) const { return ORDERED && is_row && order[0] >= 0 ? order[place] : place; }
 
     struct Entries {
         int ids[AT_A_TIME], codes[AT_A_TIME];

@@ -3,7 +3,8 @@
 // Rows of the list have OWN_LENGTH numbers: coordinates as they are, then turns along each axis (PERIODIC == 2), then the cutoff of i
 // (RADII). Sources have LENGTH: coordinates, OTHERS numbers that a term reads, turns and the cutoff of j. `cutoff` holds the largest
 // cutoff, the lattice, and the largest number of a shift. `steps` are the shifts of image codes. REVERSED: rows are those of the sources
-// of the list, whose slots are `lengths` many in `slots` from `starts` on, and j is who has such a slot.
+// of the list, whose slots are `lengths` many in `slots` from `starts` on, and j is who has such a slot. ORDERED: threads take rows as
+// `order` has them, so that rows that are taken together read the same sources, or as they come where it holds -1.
 #pragma once
 #include "codes.h"
 #include "exact.h"
@@ -11,7 +12,7 @@
 
 struct KeptArguments {
     const real *rows, *points, *cutoff, *steps;
-    const int *idx, *count, *codes, *slots, *starts, *lengths;
+    const int *idx, *count, *codes, *slots, *starts, *lengths, *order;
     int m, n, capacity, images, closed, apart;
 };
 

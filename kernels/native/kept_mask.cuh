@@ -4,13 +4,14 @@
 
 struct MaskArguments {
     const real *rows, *points, *cutoff, *steps;
-    const int *idx, *count, *codes, *slots, *starts, *lengths;
+    const int *idx, *count, *codes, *slots, *starts, *lengths, *order;
     int* mask;
     real* distances;
     int m, n, capacity, images, closed, apart;
 
     JFRNN_MEMBER KeptArguments of_list() const {
-        return {rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, m, n, capacity, images, closed, apart};
+        return {
+            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, m, n, capacity, images, closed, apart};
     }
 };
 struct KeptMask : KeptLane {

@@ -2,19 +2,32 @@
 //
 // It defines the same overloads of the types f32, f64, i32, i64 and flag for one number at a time, on CUDA, and for LANES, on the CPU,
 // so that one text compiles for each. Denormals are kept, if the processor's flush modes are cleared (`FloatControl`); XLA on the CPU
-// flushes them. Nothing uses CUDA's fast approximations.
+// flushes them. Of CUDA's approximations, divisions of float32 alone are taken, as XLA takes them: of full range, and off by at most
+// two units in the last place, they need no branch.
 #pragma once
 #include "series.h"
 
 #if JFRNN_SCALAR
 #if defined(__CUDACC__)
 struct Math : Arithmetic {
+    JFRNN_MATH f32 div(f32 x, f32 y) {
+        f32 z;
+        asm("div.full.f32 %0, %1, %2;" : "=f"(z) : "f"(x), "f"(y));
+        return z;
+    }
+    JFRNN_MATH f32 reciprocal(f32 x) {
+        f32 y;
+        asm("rcp.approx.f32 %0, %1;" : "=f"(y) : "f"(x));
+        return y;
+    }
     JFRNN_MATH f32 expm1(f32 x) { return ::expm1f(x); }
     JFRNN_MATH f64 expm1(f64 x) { return ::expm1(x); }
     JFRNN_MATH f32 log1p(f32 x) { return ::log1pf(x); }
     JFRNN_MATH f64 log1p(f64 x) { return ::log1p(x); }
 #else
 struct Math : Series {
+    JFRNN_MATH f32 div(f32 x, f32 y) { return x / y; }
+    JFRNN_MATH f32 reciprocal(f32 x) { return of(1.0f) / x; }
     JFRNN_GENERIC T log1p(T x) {
         const T u = number<T>(1) + x;
         return corrected_log(x, u, log(u));
@@ -51,6 +64,8 @@ struct Math : Series {
     JFRNN_MATH f64 pow(f64 x, f64 y) { return ::pow(x, y); }
     JFRNN_MATH f32 rem(f32 x, f32 y) { return ::fmodf(x, y); }
     JFRNN_MATH f64 rem(f64 x, f64 y) { return ::fmod(x, y); }
+    JFRNN_MATH f64 div(f64 x, f64 y) { return x / y; }
+    JFRNN_MATH f64 reciprocal(f64 x) { return of(1.0) / x; }
     JFRNN_GENERIC T rem(T x, T y) { return remainder(x, y); }
     JFRNN_GENERIC T div(T x, T y) { return quotient(x, y); }
 #else
@@ -98,6 +113,10 @@ struct Math : VectorSeries {
     JFRNN_GENERIC T rem(T x, T y) {
         return each(x, y, [](Number<T> a, Number<T> b) { return remainder(a, b); });
     }
+    JFRNN_MATH f32 div(f32 x, f32 y) { return x / y; }
+    JFRNN_MATH f64 div(f64 x, f64 y) { return x / y; }
+    JFRNN_MATH f32 reciprocal(f32 x) { return of(1.0f) / x; }
+    JFRNN_MATH f64 reciprocal(f64 x) { return of(1.0) / x; }
     JFRNN_GENERIC T div(T x, T y) {
         return each(x, y, [](Number<T> a, Number<T> b) { return quotient(a, b); });
     }

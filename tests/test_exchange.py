@@ -1,0 +1,73 @@
+"""Which summands stay the same when i and j are exchanged, and that derivatives are those that they would be without that."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jfrnn
+from jfrnn._sums import exchange, summation
+
+N, SIDE, CUTOFF = 30, 3.0, 1.0
+
+
+def smooth(r):
+    return (1 - r @ r) ** 2
+
+
+FUNCTIONS = {
+    "even": (lambda r, i, j: smooth(r), (1,)),
+    "product": (lambda r, i, j: i["q"] * j["q"] / jnp.sqrt(r @ r) * jnp.where(r @ r < 0.25, 1, smooth(r)), (1,)),
+    "mean": (lambda r, i, j: (i["q"] + j["q"]) / 2 * smooth(r), (1,)),
+    "odd": (lambda r, i, j: r * smooth(r), (-1,)),
+    "difference": (lambda r, i, j: (j["q"] - i["q"]) * smooth(r), (-1,)),
+    "differences": (lambda r, i, j: (j["v"] - i["v"]) * (r * (i["q"] + j["q"])), (1,)),
+    "functions": (lambda r, i, j: jnp.cos(r[0]) * jnp.sin(r[1]) * r[2], (1,)),
+    "several": (lambda r, i, j: (smooth(r), r * smooth(r)), (1, -1)),
+    "mass": (lambda r, i, j: j["q"] * smooth(r), (None,)),
+    "exponential": (lambda r, i, j: jnp.exp(r[0]), (None,)),
+    "mixed": (lambda r, i, j: smooth(r) * (1 + r[0]), (None,)),
+    "both": (lambda r, i, j: jnp.stack([smooth(r), r[0]]), (None,)),
+    "part": (lambda r, i, j: jnp.maximum(r[0], 0), (None,)),
+}
+
+
+@pytest.fixture(name="scene")
+def make_scene():
+    rng = np.random.default_rng(3)
+    x = rng.uniform(0, SIDE, (N, 3))
+    return x, {"q": rng.uniform(0.5, 2, N), "v": rng.normal(size=(N, 3))}, rng.normal(size=(N, 3))
+
+
+def weighted(fn, x, data, **options):
+    sums = jax.tree.leaves(jfrnn.pair_sum(fn, x, CUTOFF, data, **options))
+    return sum(jnp.sum(jnp.sin(jnp.arange(s.size, dtype=s.dtype)).reshape(s.shape) * s) for s in sums)
+
+
+@pytest.mark.parametrize("boxed", [False, True])
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_signs(name, boxed, scene, monkeypatch):
+    """What is transposed is the tangent of fn, in which positions and features move."""
+    fn, expected = FUNCTIONS[name]
+    seen = []
+    monkeypatch.setattr(summation, "signs_of", lambda term: seen.append(term) or exchange.signs_of(term))
+    x, data, _ = scene
+    box = jfrnn.Box(np.full(3, SIDE)) if boxed else None
+    jax.make_jaxpr(jax.grad(lambda x, data: weighted(fn, x, data, box=box), (0, 1)))(x, data)
+    assert exchange.signs_of(seen[0]) == expected
+
+
+@pytest.mark.parametrize("name", ["several", pytest.param("differences", marks=pytest.mark.slow)])
+def test_derivatives_are_the_same(name, scene, monkeypatch):
+    x, data, moved = scene
+    fn, box = FUNCTIONS[name][0], jfrnn.Box(np.full(3, SIDE))
+    first = jax.grad(lambda x, data: weighted(fn, x, data, box=box, backend="brute"), (0, 1))
+
+    def everything(x, data):
+        return first(x, data), jax.jvp(lambda x: first(x, data), (x,), (moved,))[1]
+
+    with jax.enable_x64(True):
+        found = everything(x, data)
+        monkeypatch.setattr(summation, "signs_of", lambda term: (None,) * len(term.summands))
+        plain = everything(x, data)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), found, plain)
