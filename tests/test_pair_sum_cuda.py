@@ -194,7 +194,7 @@ def test_programs_for_cuda_call_it_and_plans_have_the_arguments_of_their_kernels
     words = {"info", "scratch"}
     for found, arrays in (
         (sorting, {*warp_sums._GIVEN[:3], *words}),
-        (summing, {*given, *words, "sums", "totals", "errors", "values"}),
+        (summing, {*given, *words, *warp_sums._RESULTS, "values"}),
     ):
         for step in found.steps:
             numbers = {**found.numbers, **step.numbers}
@@ -210,7 +210,7 @@ def test_few_particles_take_one_launch():
     (launch,) = found.steps
     assert launch.threads // launch.kernel.block == few_cuda.blocks(40) == 5
     assert [few_cuda.warps(m) for m in (0, 1, 1024, 1025, 2048, 2049, few_cuda.MOST)] == [8, 8, 8, 16, 16, 32, 32]
-    arrays = {*warp_sums._GIVEN, "sums", "totals", "errors"}
+    arrays = {*warp_sums._GIVEN, *warp_sums._RESULTS}
     assert {field.name for field in launch.kernel.fields} <= arrays | set(found.numbers)
     for size, few in ((few_cuda.MOST, True), (few_cuda.MOST + 1, False)):
         program = jax.jit(lambda x: jfrnn.count(x, CUTOFF, backend="warp")).trace(jnp.zeros((size, 3), np.float32))

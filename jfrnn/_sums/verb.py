@@ -107,9 +107,10 @@ def pair_sum(
     `memory_plan`.
     Differentiable: to every order, forward and backward, in positions, queries, values, query_values, the lattice vectors of the
     box and whatever fn closes over; which particles are neighbors is constant. A derivative is a sum over the same pairs, gathered
-    by each particle. For a list that is not its own mirror image, the slots of each j are found by a sort, unless the list keeps
-    them (`reverse` of `search`); array programming scatters there. "max" and "min" have the derivative of the extreme pair, of
-    several the one with the smallest j.
+    by each particle. In a compiled function "warp" finds pairs once for several sums over them, such as a total and its gradient,
+    unless one needs the results of another. For a list that is not its own mirror image, the slots of each j are found by a sort,
+    unless the list keeps them (`reverse` of `search`); array programming scatters there. "max" and "min" have the derivative of the
+    extreme pair, of several the one with the smallest j.
     Jit: yes; outside of it, define fn once, since each new definition is compiled anew. vmap: yes, one after the other. Source:
     sums over neighbors as in SPH (Gingold & Monaghan 1977, doi:10.1093/mnras/181.3.375); derivatives by transposition (Radul et al.
     2023, doi:10.1145/3571236).
