@@ -1,8 +1,8 @@
 """Run jax-md's own tests with `jfrnn.jax_md` in the place of its neighbor lists, and beside that with its own.
 
-`python -m experiments.jax_md_tests CHECKOUT [FILE ...]`, CHECKOUT being a clone of https://github.com/jax-md/jax-md, whose
-package is used, and FILE tests in it (default: partition, energy, smap and simulate). It prints how many tests pass, and which do
-so with one list alone. As a plugin of pytest (`-p experiments.jax_md_tests`), this file puts our functions in place.
+`python -m experiments.jax_md_tests CHECKOUT [FILE ...]`: CHECKOUT is a clone of https://github.com/jax-md/jax-md, whose package is
+used, and FILE are tests in it (default: partition, energy, smap and simulate). It prints how many tests pass, and which do so with
+one list alone. As a plugin of pytest (`-p experiments.jax_md_tests`), this file puts our functions in place.
 """
 
 import os
@@ -54,8 +54,8 @@ def main(words: list[str]) -> None:
     for file in files:
         theirs, ours = (run(checkout, [file], which, options) for which in (False, True))
         passed = [{name for name, outcome in found.items() if outcome == "PASSED"} for found in (theirs, ours)]
-        both = len(theirs.keys() | ours.keys())
-        print(f"{file}: of {both} tests pass {len(passed[1])} with jfrnn, {len(passed[0])} with its own list")
+        count = len(theirs.keys() | ours.keys())
+        print(f"{file}: of {count} tests pass {len(passed[1])} with jfrnn, {len(passed[0])} with its own list", flush=True)
         for who, only in (("its own list", passed[0] - passed[1]), ("jfrnn", passed[1] - passed[0])):
             for name in sorted(only):
                 print(f"  only with {who}: {name}")

@@ -360,7 +360,11 @@ def neighbor_list_multi_image(
         return matrix, made if like is None else Box(matrix.T, like.periodic)
 
     def finish(kept: Kept, real: Array, made: Box, room: int) -> tuple[Any, Array, Array]:
-        n, shifts = len(real), kept.shifts(real, box=made if any(made.periodic) else None)
+        n, whole = (
+            len(real),
+            dataclasses.replace(kept, status=jnp.zeros_like(kept.status)),
+        )  # else it raises what the caller is told
+        shifts = whole.shifts(real, box=made if any(made.periodic) else None)
         used = kept.idx < n
         if own is OrderedSparse:
             i = jnp.arange(n, dtype=jnp.int32)[:, None]

@@ -1,6 +1,7 @@
 """Cutoffs that differ from particle to particle: every rule against the oracle, then what lists make of them."""
 
 import functools
+from fractions import Fraction
 from itertools import product
 
 import checked
@@ -184,6 +185,52 @@ def test_a_mean_with_0_reaches_half_as_far(backend):
     twice, none = np.repeat(x, 2, axis=0), np.zeros(4, np.float32)
     assert jfrnn.count(twice, none, radius_rule="mean", backend=backend).tolist() == [0] * 4
     assert jfrnn.count(twice, none, radius_rule="mean", closed=True, backend=backend).tolist() == [1] * 4
+
+
+def touching(x, h, q=None, g=None, *, closed=False):
+    """Return the pairs of spheres closer than the sum of their radii, by fractions."""
+    q, g = (x, h) if q is None else (q, g)
+    found = set()
+    for i, j in product(range(len(q)), range(len(x))):
+        square = sum((Fraction(float(a)) - Fraction(float(b))) ** 2 for a, b in zip(q[i], x[j]))
+        reach = (Fraction(float(g[i])) + Fraction(float(h[j]))) ** 2
+        if (i != j or q is not x) and (square < reach or (closed and square == reach)):
+            found.add((i, j))
+    return found
+
+
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", pytest.param("brute", marks=SLOW), pytest.param("jax", marks=SLOW)])
+def test_spheres_touch_at_the_sum_of_their_radii(backend, dtype):
+    rng = np.random.default_rng(4)
+    x, h = (rng.integers(0, 8, (60, 2)) / 8).astype(dtype), (rng.integers(0, 3, 60) / 16).astype(dtype)  # full of ties
+    h[::7] = rng.uniform(0, 0.2, len(h[::7])).astype(dtype)
+    given = {"radius_rule": "sum", "backend": backend}
+    for closed in (False, True):
+        nbrs = jfrnn.search(x, h, closed=closed, **given)
+        assert set(zip(*(part.tolist() for part in nbrs.pairs()))) == touching(x, h, closed=closed)
+    summed = jfrnn.pair_sum(lambda r, i, j: jnp.ones((), dtype), x, h, **given)
+    np.testing.assert_array_equal(np.asarray(summed), np.asarray(jfrnn.count(x, h, **given)))
+    assert summed.sum() > 60
+    nbrs = jfrnn.search(x, (h, h[:9]), queries=x[:9] + dtype(0.125), **given)
+    assert set(zip(*(part.tolist() for part in nbrs.pairs()))) == touching(x, h, x[:9] + dtype(0.125), h[:9])
+
+
+def test_spheres_that_grow():
+    rng = np.random.default_rng(5)
+    x, h = rng.random((40, 3)).astype(np.float32), rng.uniform(0, 0.1, 40).astype(np.float32)
+    nbrs = jfrnn.search(x, h, radius_rule="sum", skin=0.04, half=True)
+    chunk = jax.jit(lambda state, nbrs: (state, nbrs.update(state[0], cutoff=state[1])))
+    for factor in (1.0, 1.1, 2.0, 4.0):
+        _, nbrs = jfrnn.run_chunk(chunk, (x, factor * h), nbrs, lambda state: state[0], cutoff=lambda state: state[1])
+        found = set(zip(*(part.tolist() for part in nbrs.pairs(positions=jnp.asarray(x)))))
+        assert found == {(i, j) for i, j in touching(x, factor * h) if i < j}
+    nbrs = jfrnn.search(x, h, radius_rule="sum", capacity=1)
+    assert jfrnn.run_chunk(jax.jit(lambda x, n: (x, n.update(x))), jnp.asarray(x), nbrs, lambda x: x)[1].radii.asked == "sum"
+    with pytest.raises(ValueError, match=r"radius_rule='sum' adds radii of particles: pass an array of them, got float 0.5"):
+        jfrnn.search(x, 0.5, radius_rule="sum")
+    h[3] = 2e38
+    assert jfrnn.Status(int(jfrnn.search(x, h, radius_rule="sum", capacity=8).status)) == jfrnn.Status.INVALID_CUTOFF
 
 
 def test_motion_and_growth_share_the_skin():

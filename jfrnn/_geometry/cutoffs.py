@@ -14,6 +14,7 @@ from jfrnn._geometry.integers import limb_bits, limb_type
 
 Flags = Any  # bool array of NumPy or JAX, like the argument
 RULES = ("gather", "scatter", "either", "both", "mean")  # cutoff of a pair: i's, j's, larger, smaller, mean
+SUM = "sum"  # a rule of users: the mean of doubled radii, exactly
 EXCHANGED = {"gather": "scatter", "scatter": "gather"}  # rules that become another one where i and j are exchanged
 
 
@@ -52,11 +53,18 @@ class Radii:
         sources: [n] cutoffs of the sources, or None if the rule does not use them.
         queries: [m] cutoffs of the queries, likewise.
         rule: How the cutoff of a pair follows from both (`RULES`). Static.
+        summed: Whether they are twice the radii that the user gave, whose sum is then their mean. Static.
     """
 
     sources: Array | None
     queries: Array | None
     rule: str = dataclasses.field(metadata={"static": True})
+    summed: bool = dataclasses.field(default=False, metadata={"static": True})
+
+    @property
+    def asked(self) -> str:
+        """The rule that the user named."""
+        return SUM if self.summed else self.rule
 
 
 @jax.tree_util.register_dataclass

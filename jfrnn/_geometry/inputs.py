@@ -12,7 +12,7 @@ from jax.core import Tracer
 
 from jfrnn._geometry.batch import Batch
 from jfrnn._geometry.box import Box
-from jfrnn._geometry.cutoffs import RULES, Cutoff, Radii, largest_cutoff, make_cutoff, smallest_cutoff
+from jfrnn._geometry.cutoffs import RULES, SUM, Cutoff, Radii, largest_cutoff, make_cutoff, smallest_cutoff
 from jfrnn._tracing import Given, gather, make_on_host, on_device
 
 _MOST_POINTS = 2**31 - 32
@@ -110,33 +110,44 @@ def check_cutoff(cutoff: Given, dtype: np.dtype) -> Cutoff:
 
 def check_radii(cutoff: Given, rule: object, sources: Array, queries: Array | None) -> Radii | None:
     """Return cutoffs per particle in the dtype of the positions, or None if the cutoff is one number."""
-    if rule not in RULES:
-        raise ValueError(f"radius_rule must be one of {', '.join(map(repr, RULES))}, got {rule!r}.")
+    if rule not in (*RULES, SUM):
+        raise ValueError(f"radius_rule must be one of {', '.join(map(repr, (*RULES, SUM)))}, got {rule!r}.")
+    summed, rule = rule == SUM, "mean" if rule == SUM else str(rule)
     if not isinstance(cutoff, tuple | list) and np.ndim(cutoff) == 0:
+        if summed:
+            raise ValueError(f"radius_rule='sum' adds radii of particles: pass an array of them, got {_describe(cutoff)}.")
         return None
     n, m = sources.shape[0], None if queries is None else queries.shape[0]
     if m is None:
-        radii = _check_radii_of("cutoff", cutoff, n, "particle", sources)
-        return Radii(None if rule == "gather" else radii, None if rule == "scatter" else radii, rule)
+        radii = _check_radii_of("cutoff", cutoff, n, "particle", sources, summed)
+        return Radii(None if rule == "gather" else radii, None if rule == "scatter" else radii, rule, summed)
     if rule == "gather":
         return Radii(None, _check_radii_of("cutoff", cutoff, m, "query (radius_rule='gather')", sources), rule)
     if rule == "scatter":
         return Radii(_check_radii_of("cutoff", cutoff, n, "position (radius_rule='scatter')", sources), None, rule)
     if not isinstance(cutoff, tuple) or len(cutoff) != 2:
         raise ValueError(
-            f"cutoff must be a pair of arrays, of the positions [{n}] and of the queries [{m}], where radius_rule={rule!r} asks "
-            f"for both, got {_describe_array(cutoff)}."
+            f"cutoff must be a pair of arrays, of the positions [{n}] and of the queries [{m}], where radius_rule="
+            f"{SUM if summed else rule!r} asks for both, got {_describe_array(cutoff)}."
         )
-    of_sources = _check_radii_of("cutoff[0]", cutoff[0], n, "position", sources)
-    return Radii(of_sources, _check_radii_of("cutoff[1]", cutoff[1], m, "query", sources), rule)
+    of_sources = _check_radii_of("cutoff[0]", cutoff[0], n, "position", sources, summed)
+    return Radii(of_sources, _check_radii_of("cutoff[1]", cutoff[1], m, "query", sources, summed), rule, summed)
 
 
-def _check_radii_of(name: str, radii: Given, size: int, what: str, like: Array) -> Array:
+def _check_radii_of(name: str, radii: Given, size: int, what: str, like: Array, doubled: bool = False) -> Array:
     if not hasattr(radii, "dtype") or not np.issubdtype(radii.dtype, np.floating):
         raise TypeError(f"{name} must be a number, or an array of floats with one per {what}, got {_describe_array(radii)}.")
     if tuple(radii.shape) != (size,):
         raise ValueError(f"{name} must be a number, or have shape [{size}], one per {what}, got shape {list(radii.shape)}.")
-    return _as_dtype(radii, like.dtype)
+    if doubled and not isinstance(radii, Tracer):
+        return make_on_host(radii, lambda known: _double(known.astype(like.dtype)))
+    radii = _as_dtype(radii, like.dtype)
+    return 2 * radii if doubled else radii
+
+
+def _double(radii: np.ndarray) -> np.ndarray:
+    with np.errstate(over="ignore"):  # a status bit tells of cutoffs that are not finite
+        return radii + radii
 
 
 def _as_dtype(x: Given, dtype: np.dtype) -> Array:

@@ -60,7 +60,8 @@ class NeighborList(ListExports):
         verlet: With a skin, where the list was last rebuilt and how often (`Verlet`); None without.
         box: The periodic box, rounded to the dtype of the positions; None in open space.
         images: The periodic image of each slot (`ImageCodes`), 1 B per slot; None if the minimum image suffices.
-        radii: Cutoffs per particle (`Radii`: sources [n], queries [m], the rule), or None with one cutoff.
+        radii: Cutoffs per particle (`Radii`: sources [n], queries [m], the rule; of the rule "sum", twice the radii and their
+            mean), or None with one cutoff.
         batch: System numbers (`Batch`: sources [n], queries [m] or None), or None; updates keep them.
         reverse: Where pairs stand the other way round (`Reverse`), if the list was made with `reverse=True`; updates find it anew
             whenever they rebuild the list.
@@ -391,7 +392,7 @@ class NeighborList(ListExports):
             return self.radii
         if self.radii is None:
             raise ValueError("this list was made with one cutoff for all particles: leave cutoff out.")
-        radii = check_radii(cutoff, self.radii.rule, sources, queries)
+        radii = check_radii(cutoff, self.radii.asked, sources, queries)
         if radii is None:
             raise ValueError("this list was made with a cutoff for each particle: pass such an array, or leave cutoff out.")
         return radii

@@ -52,8 +52,8 @@ def search(
             and [m]. Only particles of one system are neighbors. Many systems cost what their particles cost, even if they overlap
             in space; all have the same box (for separate boxes, use `jax.vmap` over `search`).
         radius_rule: How the cutoff of a pair follows from cutoffs per particle: "gather" is that of i, the row; "scatter" that of
-            j; "either" the larger, "both" the smaller, "mean" the exact mean. Large cutoffs do not slow down particles with small
-            ones: up to a ratio of 128, each particle searches cells of its own size.
+            j; "either" the larger, "both" the smaller, "mean" the exact mean, "sum" the exact sum, for contacts of spheres. Large
+            cutoffs do not slow down particles with small ones: up to a ratio of 128, each particle searches cells of its own size.
         half: List each unordered pair once, in the row of its smaller index; of the images of a particle that are its own
             neighbors, those whose shift S has a positive number first. Not with the rules "gather" and "scatter".
         include_self: Make each particle its own neighbor.

@@ -1,0 +1,199 @@
+"""`jfrnn.jax_md`: jax-md's neighbor lists, against the oracle; jax-md's own functions where it is installed."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+
+from jfrnn import jax_md
+
+CUTOFF, SKIN, N = 0.7, 0.1, 40
+LENGTHS, MATRIX = np.array([2.0, 2.5, 2.25]), np.array([[2.0, 0.25, 0.5], [0.0, 2.5, 0.25], [0.0, 0.0, 2.25]])
+FORMATS = [jax_md.Dense, jax_md.Sparse, jax_md.OrderedSparse]
+
+
+def free(a, b, **_):
+    return a - b
+
+
+def nearest(a, b, box=None, **_):
+    away = a - b
+    return away - box * jnp.round(away / box)
+
+
+def general(a, b, box, **_):
+    away = a - b
+    return jnp.sum(box * (away - jnp.round(away)), axis=1)
+
+
+def metric(a, b, **_):
+    return jnp.abs(a - b).max()  # which is not Euclidean
+
+
+SPACES = {
+    "free": (free, LENGTHS, False),
+    "periodic": (functools.partial(nearest, box=jnp.asarray(LENGTHS)), LENGTHS, False),
+    "fractional": (functools.partial(general, box=jnp.asarray(MATRIX)), MATRIX, True),
+}
+
+
+def points(fractional, n=N):
+    x = np.random.default_rng(2).random((n, 3))
+    return jnp.asarray(x if fractional else x * LENGTHS)
+
+
+def pairs_of(idx, n, form):
+    if form.name == "Dense":
+        i, k = np.nonzero(np.asarray(idx) < n)
+        found = list(zip(i.tolist(), np.asarray(idx)[i, k].tolist()))
+    else:
+        found = [(i, j) for j, i in np.asarray(idx).T.tolist() if j < n]
+    assert len(found) == len(set(found))
+    return set(found)
+
+
+def expected(x, space, form):
+    real = np.asarray(x) @ MATRIX.T if space == "fractional" else np.asarray(x)
+    rows = MATRIX.T if space == "fractional" else np.diag(LENGTHS)
+    within = reference.reference_images(real, CUTOFF + SKIN, matrix=rows, periodic=(space != "free",) * 3)
+    return {(i, j) for i, j, _ in within if form.name != "OrderedSparse" or j < i}
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("form", FORMATS)
+def test_pairs_in_a_loop(space, form):
+    displacement, box, fractional = SPACES[space]
+    fns = jax_md.neighbor_list(displacement, box, CUTOFF, SKIN, fractional_coordinates=fractional, format=form)
+    x = points(fractional)
+    nbrs = fns.allocate(x)
+    assert nbrs.kept is not None
+    assert pairs_of(nbrs.idx, N, form) == expected(x, space, form)
+    y = x.at[3].add(0.02).at[5].add(0.2)
+
+    @jax.jit
+    def loop(x, nbrs):
+        return jax.lax.fori_loop(0, 3, lambda k, nbrs: nbrs.update(x - 0.0001 * k), nbrs)
+
+    moved = loop(y, nbrs)
+    assert pairs_of(moved.idx, N, form) == expected(y, space, form)
+    np.testing.assert_array_equal(moved.reference_position, y)
+    assert (int(moved.error.code), moved.idx.shape) == (0, nbrs.idx.shape)
+    still = fns.update(x + 0.001, nbrs)
+    np.testing.assert_array_equal(still.idx, nbrs.idx)
+    np.testing.assert_array_equal(still.reference_position, x)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_what_is_no_space_of_ours_is_measured(form):
+    small = functools.partial(nearest, box=jnp.asarray(1.0))
+    for displacement, box in ((metric, 2.0), (small, 1.0)):
+        x = points(True)
+        nbrs = jax_md.neighbor_list(displacement, box, CUTOFF, SKIN, format=form).allocate(x)
+        assert nbrs.kept is None
+        away = np.array([[np.linalg.norm(np.atleast_1d(displacement(a, b))) for b in x] for a in x])
+        near = {(i, j) for i, j in zip(*np.nonzero(away < CUTOFF + SKIN)) if i != j and (j < i or form.name != "OrderedSparse")}
+        assert pairs_of(nbrs.idx, N, form) == near
+        assert pairs_of(nbrs.update(x + 0.3).idx, N, form) == near
+
+
+def test_room():
+    displacement, box, _ = SPACES["periodic"]
+    x = points(False)
+    for form in FORMATS:
+        fns = jax_md.neighbor_list(displacement, box, CUTOFF, format=form, capacity_multiplier=1.0)
+        nbrs = fns.allocate(x)
+        crowd = nbrs.update(0.2 * x)
+        assert not nbrs.did_buffer_overflow
+        assert crowd.did_buffer_overflow
+        assert crowd.update(x).did_buffer_overflow  # it stays
+        wider = fns.allocate(x, extra_capacity=3)
+        assert wider.max_occupancy == nbrs.max_occupancy + (3 if form is jax_md.Dense else 3 * N)
+        assert wider.idx.shape[-1] == wider.max_occupancy
+        allocate, update = fns
+        assert update(x, allocate(x)).max_occupancy == nbrs.max_occupancy
+        own = jax_md.neighbor_list(displacement, box, CUTOFF, format=form, mask_self=False).allocate(x)
+        assert ((0, 0) in pairs_of(own.idx, N, form)) == (form is not jax_md.OrderedSparse)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_masks_come_before_room(form):
+    displacement, box, _ = SPACES["periodic"]
+    molecule = jnp.arange(N + 1) // 4
+
+    def mask(idx):
+        return jnp.where(molecule[idx] == molecule[:N, None], N, idx)
+
+    x = points(False)
+    made = {}
+    for name, function in (("all", None), ("others", mask)):
+        fns = jax_md.neighbor_list(displacement, box, CUTOFF, SKIN, 1.0, custom_mask_function=function, format=form)
+        made[name] = jax.jit(fns.update)(x + 0.2, fns.allocate(x))
+    pairs = {name: pairs_of(nbrs.idx, N, form) for name, nbrs in made.items()}
+    assert pairs["others"] == {(i, j) for i, j in pairs["all"] if i // 4 != j // 4}
+    assert len(pairs["others"]) < len(pairs["all"])
+    assert made["others"].max_occupancy < made["all"].max_occupancy or form is jax_md.Dense
+
+
+def test_boxes_that_change():
+    displacement, box, _ = SPACES["fractional"]
+    x = points(True)
+    nbrs = jax_md.neighbor_list(displacement, box, CUTOFF, fractional_coordinates=True, capacity_multiplier=9.0).allocate(x)
+    wide = jax.jit(lambda x, nbrs, box: nbrs.update(x, box=box))(x, nbrs, jnp.asarray(1.2 * MATRIX))
+    real = np.asarray(jnp.sum(x[:, None, :] * jnp.asarray(1.2 * MATRIX)[None], axis=-1))
+    near = reference.reference_images(real, CUTOFF, matrix=(1.2 * MATRIX).T, periodic=(True,) * 3)
+    assert pairs_of(wide.idx, N, jax_md.Dense) == {(i, j) for i, j, _ in near}
+    assert not wide.cell_size_too_small
+    assert nbrs.update(x, box=jnp.asarray(0.5 * MATRIX)).cell_size_too_small
+    with pytest.raises(ValueError, match="box= only with fractional_coordinates=True"):
+        jax_md.neighbor_list(SPACES["periodic"][0], LENGTHS, CUTOFF).allocate(points(False)).update(points(False), box=LENGTHS)
+    with pytest.raises(TypeError, match=r"knows the keyword box alone, got t"):
+        nbrs.update(x, t=1.0)
+    with pytest.raises(TypeError, match=r"cannot run inside jax.jit"):
+        jax.jit(lambda x: jax_md.neighbor_list(free, 1.0, CUTOFF).allocate(x).idx)(x)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("fractional", [True, False])
+def test_several_images(form, fractional):
+    matrix, x = MATRIX / 2, points(True, 6)
+    given = x if fractional else x @ matrix.T
+    fns = jax_md.neighbor_list_multi_image(None, matrix, CUTOFF, SKIN, fractional_coordinates=fractional, format=form)
+    nbrs = fns.allocate(given)
+    for moved in (given, given + 0.3 + jnp.sin(given) * 0.2):
+        nbrs = jax.jit(fns.update)(moved, nbrs)
+        real = np.asarray(jnp.sum(moved[:, None, :] * jnp.asarray(matrix)[None], axis=-1) if fractional else moved)
+        within = reference.reference_images(real, CUTOFF + SKIN, matrix=matrix.T, periodic=(True,) * 3)
+        if form is jax_md.OrderedSparse:
+            within = {(i, j, s) for i, j, s in within if s > (0, 0, 0) or (s == (0, 0, 0) and i < j)}
+        if form is jax_md.Dense:
+            i, k = np.nonzero(np.asarray(nbrs.idx) < 6)
+            j, s = np.asarray(nbrs.idx)[i, k], np.asarray(nbrs.shifts)[i, k]
+        else:
+            used = np.asarray(nbrs.receivers) < 6
+            i, j, s = (np.asarray(part)[used] for part in (nbrs.receivers, nbrs.senders, nbrs.shifts))
+        found = list(zip(i.tolist(), j.tolist(), map(tuple, s.astype(int).tolist())))
+        assert set(found) == within
+        assert len(found) == len(within) == nbrs.n_edges
+        assert not nbrs.did_buffer_overflow
+    assert fns.update(given, nbrs, box=0.2 * jnp.asarray(matrix)).did_buffer_overflow
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("form", ["Dense", "Sparse", "OrderedSparse"])
+def test_an_energy_of_jax_md(form):
+    """The same energy and forces, with the list of either."""
+    pytest.importorskip("flax")  # which jax-md imports
+    with jax.numpy_dtype_promotion("standard"):
+        theirs = pytest.importorskip("jax_md")
+        displacement, _ = theirs.space.periodic(LENGTHS[0])
+        x, energies = points(True) * LENGTHS[0], []
+        for module in (theirs.partition, jax_md):
+            form_of = theirs.partition.NeighborListFormat[form]
+            nbrs = module.neighbor_list(displacement, LENGTHS[0], CUTOFF, SKIN, format=form_of).allocate(x)
+            shape = theirs.space.metric(displacement)
+            energy = theirs.smap.pair_neighbor_list(lambda dr, **_: jnp.where(dr < CUTOFF, (CUTOFF - dr) ** 2, 0.0), shape)
+            energies.append((energy(x, neighbor=nbrs), jax.grad(energy)(x, neighbor=nbrs)))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12), *energies)
