@@ -13,6 +13,8 @@ from experiments import pages
 from experiments._errors import UsageError
 from jfrnn import distributed
 from jfrnn._engine import ENGINES, Kind
+from jfrnn._shards.calls import BACKENDS
+from jfrnn._triangles.engines import TRIANGLE_ENGINES
 
 ROOT = Path(__file__).parent.parent
 RUN = """
@@ -90,6 +92,9 @@ def test_engines_can_what_the_readme_says():
     for title, kind in asked.items():
         for name, engine in ENGINES.items():
             assert (said[title][name] == "no") == (engine.refuse(kind) is not None), (title, name)
+    tables = {"many devices": BACKENDS, next(title for title in said if title.startswith("triangles")): TRIANGLE_ENGINES}
+    for title, table in tables.items():
+        assert [name for name in names if said[title][name] == "yes"] == [name for name in names if name in table]
 
 
 def test_every_table_stands_in_a_page():
