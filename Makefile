@@ -64,4 +64,4 @@ lint: $(STAMP)
 	$(VENV)/bin/clang-format --dry-run -Werror kernels/native/*
 
 clean:
-	rm -rf $(VENV) out build *.egg-info
+	rm -rf $(VENV) out build docs/notebooks docs/pictures *.egg-info

@@ -2,9 +2,13 @@
 
 import re
 import shutil
+import sys
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
 import jfrnn
+from experiments.pages import pictures
 
 project = "jfrnn"
 author = "jfrnn developers"
@@ -15,12 +19,15 @@ autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 napoleon_use_rtype = False
+napoleon_use_ivar = True
+napoleon_attr_annotations = False
+add_module_names = False
 python_maximum_signature_line_length = 88
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"  # notebooks are kept with their outputs; tests/test_notebooks.py runs them
 nb_merge_streams = True
-smartquotes = False  # strings in docstrings are those of Python
+smartquotes_action = "D"  # dashes alone: strings in docstrings are those of Python
 html_theme = "furo"
 html_title = f"jfrnn {release}"
 html_show_copyright = False
@@ -33,7 +40,8 @@ STUDIES = HERE.parent / "notebooks"
 
 
 def setup(app):
-    """Copy the notebooks that stand beside the pages, and keep Sphinx from reading formulas of docstrings as its own marks."""
+    """Draw pictures, copy the notebooks, and keep Sphinx from reading formulas of docstrings as its own marks."""
+    pictures.draw(HERE / "pictures")
     (HERE / "notebooks").mkdir(exist_ok=True)
     for notebook in STUDIES.glob("*.ipynb"):
         shutil.copyfile(notebook, HERE / "notebooks" / notebook.name)

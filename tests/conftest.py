@@ -24,9 +24,20 @@ XLA_FLAGS = os.environ.get("XLA_FLAGS", "")
 UNFUSED = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 warp.config.log_level = warp.LOG_WARNING  # else it prints what it compiles, into doctests too
 LONGEST = (  # files, those first that take longest: what is left at the end is short, and no worker waits for another's long file
-    *("hard_cases", "pair_sum", "experiments_sweep", "notebooks", "radii", "box", "triangles_closest", "search", "triangles"),
+    *(
+        "hard_cases",
+        "pair_sum",
+        "experiments_sweep",
+        "notebooks",
+        "docs",
+        "radii",
+        "box",
+        "triangles_closest",
+        "search",
+        "triangles",
+    ),
     *("memory", "modes", "order", "verlet", "distributed", "batch", "reference", "cases_periodic", "transforms", "exports"),
-    *("experiments_sums", "experiments_distributed", "spread", "start", "travel", "house", "interrupts"),
+    *("experiments_sums", "experiments_distributed", "spread", "start", "travel", "gallery", "package", "house", "interrupts"),
 )
 
 

@@ -12,6 +12,9 @@ import jfrnn
 from experiments import pages
 from experiments._errors import UsageError
 from jfrnn import distributed
+from jfrnn._engine import ENGINES, Kind
+from jfrnn._shards.calls import BACKENDS
+from jfrnn._triangles.engines import TRIANGLE_ENGINES
 
 ROOT = Path(__file__).parent.parent
 RUN = """
@@ -75,6 +78,23 @@ def test_pages_build(tmp_path):
 def test_figures_are_those_of_the_rows(page):
     text = page.read_text(encoding="utf-8")
     assert pages.fill_in(text) == text, "python -m experiments tables"
+
+
+def test_engines_can_what_the_readme_says():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.split("## What each engine can")[1].splitlines()]
+    lines = [line for line in lines if len(line) == 5]
+    names = [cell.strip("`") for cell in lines[0][1:]]
+    said = {line[0]: dict(zip(names, line[1:])) for line in lines}
+    assert set(names) == set(ENGINES)
+    asked = {"periodic boxes, batches": Kind(periodic=True, batch=True), "a cutoff per particle": Kind(radii=True)}
+    asked["`pair_sum`"] = Kind(summed=True)
+    for title, kind in asked.items():
+        for name, engine in ENGINES.items():
+            assert (said[title][name] == "no") == (engine.refuse(kind) is not None), (title, name)
+    tables = {"many devices": BACKENDS, next(title for title in said if title.startswith("triangles")): TRIANGLE_ENGINES}
+    for title, table in tables.items():
+        assert [name for name in names if said[title][name] == "yes"] == [name for name in names if name in table]
 
 
 def test_every_table_stands_in_a_page():

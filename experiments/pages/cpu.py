@@ -2,7 +2,7 @@
 
 from experiments.pages.rows import TIMES, Row, markdown, number, one, read, whole
 
-_OURS = {
+OURS = {
     "warp": "jfrnn, list",
     "warp-counts": "jfrnn, counts",
     "pair-sum": "jfrnn, density by `pair_sum`",
@@ -23,8 +23,9 @@ _KNOWN = {  # methods that people know, and how they are called
 }
 
 
-def _name(method: str) -> str:
-    return (_OURS | _KNOWN).get(method, method)
+def name_of(method: str) -> str:
+    """Return what a method is called in pages."""
+    return (OURS | _KNOWN).get(method, method)
 
 
 def _wrong(row: Row, kind: str) -> str:
@@ -34,11 +35,11 @@ def _wrong(row: Row, kind: str) -> str:
 def search_known() -> str:
     """Return the full lattice of the thesis, by the methods that people know."""
     rows = read("thesis_cpu/table.csv")
-    found = [row for name in [*_OURS, *_KNOWN] if (row := one(rows, scene="full 100 %", method=name, status="ok"))]
+    found = [row for name in [*OURS, *_KNOWN] if (row := one(rows, scene="full 100 %", method=name, status="ok"))]
     lines = []
     for row in sorted(found, key=lambda row: float(row["median_s"])):
         wrong = [_wrong(row, kind) for kind in ("missing", "extra")]
-        lines.append([_name(row["method"]), number(row["median_s"], 1e3), number(row["search_mb"]), *wrong])
+        lines.append([name_of(row["method"]), number(row["median_s"], 1e3), number(row["search_mb"]), *wrong])
     return markdown(("method", ">ms", ">MB", ">missing", ">extra"), lines)
 
 
@@ -57,7 +58,7 @@ def search_scenes() -> str:
             continue
         last = of_scene[-1]
         known = last if last and last["status"] == "ok" else None
-        lines.append([_name(method), *cells, *([_wrong(known, "missing"), _wrong(known, "extra")] if known else ["", ""])])
+        lines.append([name_of(method), *cells, *([_wrong(known, "missing"), _wrong(known, "extra")] if known else ["", ""])])
     heads = [f">{title}, {points[scene]}" for scene, title in scenes.items()]
     return markdown(("method", *heads, ">missing, full", ">extra, full"), lines)
 
@@ -127,7 +128,7 @@ def empty_space() -> str:
     lines = []
     for method in dict.fromkeys(row["method"] for row in rows):
         cells = [one(rows, method=method, growth=growth) for growth in growths]
-        lines.append([_name(method), *(number(row["median_s"], 1e3) if row else "" for row in cells)])
+        lines.append([name_of(method), *(number(row["median_s"], 1e3) if row else "" for row in cells)])
     return markdown(("method", *(f">{float(growth):g} {TIMES}" for growth in growths)), lines)
 
 

@@ -1,0 +1,122 @@
+"""The pictures that lead the pages of benchmarks, the library in color, others in grey with their names; and two sketches.
+
+They are drawn from rows whenever the pages are built, so that no picture is older than its rows.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+
+from experiments.pages import cpu
+from experiments.pages.rows import number, one, read, whole
+
+OURS, OTHERS = "#0072b2", "0.45"
+_CPU = ("pair-sum", "warp", "cll", "vesin", "matscipy-neighbours", "scipy-kdtree", "nanoflann-cpp", "nvalchemi")
+_GPU = {
+    "jfrnn warp": "jfrnn, list",
+    "warp HashGrid": "wp.HashGrid, without JAX",
+    "nvalchemi 0.5.0 cell_list": "nvalchemi, cell_list",
+}
+
+
+def draw(folder: Path) -> None:
+    """Draw all pictures into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, make in {"cpu": _cpu, "gpu": _gpu, "liquid": _liquid, "cells": _cells, "halo": _halo}.items():
+        figure = Figure(figsize=(7.2, 4.2), layout="constrained")
+        make(figure.add_subplot())
+        figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+
+
+def _cpu(axes: Axes) -> None:
+    """Draw milliseconds of a search; what is wrong is hollow, and says how wrong."""
+    rows = [row for method in _CPU if (row := one(read("thesis_cpu/table.csv"), scene="full 100 %", method=method))]
+    rows.sort(key=lambda row: -float(row["median_s"]))
+    for place, row in enumerate(rows):
+        ms, color = 1e3 * float(row["median_s"]), OURS if row["method"] in cpu.OURS else OTHERS
+        wrong = [f"{whole(row[kind])} {kind}" for kind in ("missing", "extra") if row[kind] not in ("0", "")]
+        axes.plot(ms, place, "o", ms=9, color=color, mfc="white" if wrong else color)
+        said = f"{number(ms)} ms" + (f": {', '.join(wrong)}" if wrong else "")
+        axes.annotate(said, (ms, place), (10, 0), textcoords="offset points", va="center", color=color)
+    axes.set_yticks(range(len(rows)), [cpu.name_of(row["method"]).replace("`", "") for row in rows])
+    axes.set(xscale="log", xlim=(20, 60_000), xlabel="milliseconds of a search, 250 000 particles, 2 cores")
+    axes.set_title("Filled: exactly the right pairs. Hollow: pairs missing or extra.", loc="left", fontsize=11)
+    _clear(axes)
+
+
+def _gpu(axes: Axes) -> None:
+    """Draw milliseconds of a list over particles, names at the ends of lines."""
+    rows = [row for row in read("h200/rows.jsonl") if row["kind"] == "call" and row.get("median_s")]
+    for method, title in _GPU.items():
+        found = sorted((row["points"], 1e3 * row["median_s"]) for row in rows if row["method"] == method)
+        color, marker = (OURS, "o") if title.startswith("jfrnn") else (OTHERS, "s" if "Hash" in title else "^")
+        axes.plot(*zip(*found, strict=True), color=color, marker=marker)
+        axes.annotate(title, found[-1], (8, 0), textcoords="offset points", va="center", color=color)
+    axes.set(xscale="log", yscale="log", xlim=(2e4, 1.2e8), xlabel="particles", ylabel="milliseconds")
+    axes.set_title("Neighbor lists on one H200, 108 neighbors on average", loc="left", fontsize=11)
+    _clear(axes)
+
+
+def _liquid(axes: Axes) -> None:
+    """Draw steps per second of a Lennard-Jones liquid over particles, on a CPU and a GPU."""
+    for file, machine, style in (("cpu", "2 cores", "--"), ("gpu", "H100", "-")):
+        rows = [row for row in read(f"lj/{file}.csv") if row["steps_per_s"]]
+        for who, title, color in (("pair_sum, list", "jfrnn", OURS), ("jax-md", "jax-md", OTHERS)):
+            best: dict[int, float] = {}
+            for row in rows:
+                if row["who"].startswith(who):
+                    best[int(row["n"])] = max(best.get(int(row["n"]), 0.0), float(row["steps_per_s"]))
+            axes.plot(*zip(*sorted(best.items()), strict=True), style, color=color, marker="o" if color == OURS else "s")
+            last = max(best)
+            axes.annotate(f"{title}, {machine}", (last, best[last]), (8, 0), textcoords="offset points", va="center", color=color)
+    axes.set(xscale="log", yscale="log", xlim=(3e3, 1.5e7), xlabel="particles", ylabel="steps per second")
+    axes.set_title("A Lennard-Jones liquid in one compiled loop, lists with a skin", loc="left", fontsize=11)
+    _clear(axes)
+
+
+def _cells(axes: Axes) -> None:
+    """Draw a query, its circle, and the runs of cells that hold its candidates."""
+    x = np.random.default_rng(3).uniform((0, 0), (8, 5), (150, 2))
+    query = np.array([4.3, 2.6])
+    row = np.floor(query[1])
+    near = np.hypot(*(x - query).T) < 1
+    candidate = (np.abs(np.floor(4 * x[:, 0]) - np.floor(4 * query[0])) <= 4) & (np.abs(np.floor(x[:, 1]) - row) <= 1)
+    for k in (-1, 0, 1):
+        first, last = (np.floor(4 * query[0]) - 4) / 4, (np.floor(4 * query[0]) + 5) / 4
+        axes.add_patch(Rectangle((first, row + k), last - first, 1, color="#56b4e9", alpha=0.35, lw=0))
+        axes.annotate(f"run {int(k) + 2}", (last, row + k + 0.5), (6, 0), textcoords="offset points", va="center", color=OURS)
+    axes.plot(*x[~candidate].T, ".", color="0.7")
+    axes.plot(*x[candidate & ~near].T, ".", color=OURS)
+    axes.plot(*x[near].T, "o", color="#d55e00", ms=5)
+    axes.plot(*query, "k+", ms=10, mew=2)
+    axes.add_patch(Circle((query[0], query[1]), 1, fill=False, color="k"))
+    axes.set(xticks=range(9), yticks=range(6), xlim=(0, 8), ylim=(0, 5), aspect="equal")
+    axes.tick_params(labelbottom=False, labelleft=False, length=0)
+    axes.grid(alpha=0.5)
+    axes.set_title("Cells as wide as the cutoff; three runs of candidates (blue), neighbors in orange", loc="left", fontsize=10)
+
+
+def _halo(axes: Axes) -> None:
+    """Draw particles of four devices, and the halo of one of them."""
+    x = np.random.default_rng(4).normal((4, 2.5), (1.6, 0.9), (600, 2))
+    bounds = np.quantile(x[:, 0], (0.25, 0.5, 0.75))
+    owner = np.searchsorted(bounds, x[:, 0])
+    mine = x[owner == 1]
+    low, high = mine[:, 0].min() - 0.4, mine[:, 0].max() + 0.4
+    halo = (owner != 1) & (x[:, 0] > low) & (x[:, 0] < high)
+    axes.plot(*x[(owner != 1) & ~halo].T, ".", color="0.75")
+    axes.plot(*x[halo].T, ".", color="#d55e00")
+    axes.plot(*mine.T, ".", color=OURS)
+    for bound in bounds:
+        axes.axvline(bound, color="0.3", lw=1)
+    axes.axvspan(low, high, color="#56b4e9", alpha=0.15, lw=0)
+    axes.set(aspect="equal", xticks=[], yticks=[])
+    axes.set_title("Four devices, equally many particles each; one of them (blue) and its halo (orange)", loc="left", fontsize=10)
+
+
+def _clear(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis="x", alpha=0.3)
