@@ -169,7 +169,7 @@ def test_one_program_serves_other_boxes_and_flags():
             found.check()
             assert listed_images(found, x) == oracle(boxes, np.asarray(x), batch, 0.5, periodic)
     assert len(traces) == 1
-    assert jfrnn.Status(int(search(x, jnp.full((4, 2), 0.1), jnp.asarray(PERIODIC)).status)) == jfrnn.Status.BOX_TOO_SMALL
+    assert jfrnn.Status.BOX_TOO_SMALL in jfrnn.Status(int(search(x, jnp.full((4, 2), 0.1), jnp.asarray(PERIODIC)).status))
     empty = jnp.asarray(boxes).at[3].set(0.0)  # of a system without particles, whatever its box is
     there = jnp.where(np.asarray(batch)[:, None] == 3, jnp.nan, x)
     nbrs = jfrnn.search(there, 0.5, box=jfrnn.Box(boxes, per_system=True), batch=np.where(batch == 3, -1, batch), capacity=64)

@@ -18,7 +18,6 @@ from jfrnn._geometry.images import LARGEST_TURN
 from jfrnn._geometry.lattice import Lattice, fractions_of
 from jfrnn._geometry.wrapping import Wrapped, unpack_turns
 
-NARROW = True
 _FILL = 4  # particles of a cell, at least, where cells are many
 _COUNTERS = 32  # of a system
 _FARTHEST = 2.0**22  # cells along an open axis, beyond which all are one: whole floats up to there are exact
@@ -63,8 +62,8 @@ def sort_into_boxes(
     at = _cells_along(sources, wrapped.turns, of_source, lattice, wrapped.reach, counts, periodic)
     at = jnp.where(periodic[of_source], jnp.clip(at, 0, counts[of_source] - 1), at % counts[of_source])
     number = first[of_source] + _row_major(at, counts[of_source])
-    narrow = size < 2**16 - 1 and NARROW  # keys of half as many bits take half as many passes
-    key = jnp.where(there, number, size).astype(jnp.uint16 if narrow else jnp.uint32)
+    key = jnp.where(there, number, size)
+    key = key.astype(jnp.uint16 if size < 2**16 - 1 else jnp.uint32)  # half as many bits are sorted in half as many passes
     _, order = lax.sort((key, lax.iota(jnp.int32, n)), num_keys=1, is_stable=True)
     held = jnp.zeros(size + 1, jnp.int32).at[key.astype(jnp.int32) + 1].add(1, mode="drop")
     points, of_query = (sources, of_source) if queries is None else (queries, batch.of_queries)
