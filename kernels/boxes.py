@@ -7,7 +7,9 @@ from jfrnn.kernels._program import Entry, Kernel, declare
 
 QUERIES_AT_ONCE = 64  # that a thread of the CPU takes
 PADDING = 16  # sources behind the last one that may be read
+LANES = 16  # of CUDA that serve a query
 _BLOCK = 128
+BLOCKS = 8  # that share a multiprocessor: what decides exactly may spill registers, it is rare
 
 
 @functools.lru_cache(64)
@@ -18,11 +20,11 @@ def rows_kernel(dim: int, double: bool, scaled: bool, lists: bool, periodic: int
     """
     where = "cuda" if cuda else "cpu"
     name = f"box_rows_{where}_{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}{SPACES[periodic]}"
-    constants = {"PERIODIC": periodic, "SCALED": scaled, "LIST": lists, "QUERY_CHUNK": QUERIES_AT_ONCE}
+    constants = {"PERIODIC": periodic, "SCALED": scaled, "LIST": lists, "QUERY_CHUNK": QUERIES_AT_ONCE, "LANES_PER_ROW": LANES}
     text = program(double, dim, "box_rows.cuh" if cuda else "box_rows_cpu.h", **constants)
-    return declare(name, text, Entry("BoxRows.run", _BLOCK if cuda else 1), cuda=cuda, fused=cuda)[0]
+    return declare(name, text, Entry("BoxRows.run", _BLOCK if cuda else 1, BLOCKS), cuda=cuda, fused=cuda)[0]
 
 
 def threads(queries: int) -> int:
     """Return the threads of a launch on CUDA."""
-    return 32 * queries
+    return 32 * -(-queries * LANES // 32)

@@ -3,6 +3,7 @@
 import functools
 from itertools import product
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -86,3 +87,155 @@ def test_closed_and_half(backend):
     assert_case("ties", np.float64, 2, backend, closed=True)
     assert_case("ties", np.float64, 2, backend, half=True)
     assert_case("mixed", np.float64, 2, backend, half=True)
+
+
+# --- what boxes per system add to lists ----------------------------------------------------------------------------------
+
+PERIODIC = np.array([[True, True], [True, False], [False, False], [True, True]])
+
+
+def crystals(dtype=np.float64, dim=2):
+    given = CRYSTAL_CASES["mixed"].build(dtype, dim)
+    return jnp.asarray(given.positions), given.batch, jnp.asarray(given.boxes)
+
+
+@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
+def test_skin_in_moving_boxes(backend):
+    """Particles drift, boxes breathe and positions are wrapped: every step holds exactly the pairs of that step."""
+    rng, (x, batch, boxes) = np.random.default_rng(0), crystals(np.float32)
+    batch = np.where(np.arange(len(batch)) % 7 == 0, -1, batch)
+    nbrs = jfrnn.search(x, 0.5, box=jfrnn.Box(boxes), batch=batch, skin=0.08, capacity=64, backend=backend)
+    update = jax.jit(lambda nbrs, x, boxes: nbrs.update(x, box=jfrnn.Box(boxes)))
+    for step in range(8):
+        x = x + jnp.asarray(rng.normal(scale=0.004, size=x.shape), x.dtype)
+        boxes = boxes * np.float32(1 + 0.001 * np.sin(step))
+        if step == 3:
+            own = np.asarray(boxes, np.float64)[np.maximum(batch, 0)]
+            turns = np.floor(np.einsum("nd,ndk->nk", np.asarray(x, np.float64), np.linalg.inv(own)))
+            x = x - jnp.asarray(np.einsum("nd,ndk->nk", turns, own), x.dtype)
+        nbrs = update(nbrs, x, boxes)
+        assert masked_images(nbrs, x) == oracle(boxes, np.asarray(x), batch, 0.5)
+    assert 0 < int(nbrs.rebuild_count) < 8
+    nbrs.check()
+
+
+@pytest.mark.parametrize("way", ["distances", "edges", "list", pytest.param("sum", marks=SLOW)])
+def test_derivatives_in_positions_and_boxes(way):
+    """First derivatives against differences, and that of the first in one direction."""
+    x, batch, boxes = crystals()
+    nbrs = jfrnn.search(x, 0.6, box=jfrnn.Box(boxes), batch=batch, backend="warp")
+    total = int(nbrs.count.sum())
+
+    def energy(x, boxes):
+        def of_pair(r, i, j):
+            del i, j
+            return (0.6 - jnp.sqrt(r @ r)) ** 3
+
+        box = jfrnn.Box(boxes, images=nbrs.box_kind.reach)
+        if way == "sum":
+            return jfrnn.pair_sum(of_pair, x, 0.6, box=box, batch=batch).sum()
+        if way == "list":
+            return jfrnn.pair_sum(of_pair, x, None, neighbors=nbrs, box=box).sum()
+        if way == "edges":
+            edges = nbrs.edges(x, total + 3, box=box)
+            r = jnp.sqrt(jnp.where(edges.mask, (edges.displacement**2).sum(axis=1), 1))
+            return jnp.where(edges.mask, (0.6 - r) ** 3, 0).sum()
+        r, mask = nbrs.distances(x, box=box)
+        return jnp.where(mask, (0.6 - r) ** 3, 0).sum()
+
+    rng, h = np.random.default_rng(1), 1e-6
+    dx, db = jnp.asarray(rng.normal(size=x.shape)), jnp.asarray(rng.normal(size=boxes.shape))
+    value, gradient = jax.jit(jax.value_and_grad(energy, argnums=(0, 1)))(x, boxes)
+    ahead, behind = (jax.jit(energy)(x + s * h * dx, boxes + s * h * db) for s in (1, -1))
+    np.testing.assert_allclose(jnp.vdot(gradient[0], dx) + jnp.vdot(gradient[1], db), (ahead - behind) / (2 * h), rtol=1e-6)
+    r = np.sqrt(np.sum(np.asarray(nbrs.vectors(x)[0]) ** 2, axis=-1))[np.asarray(nbrs.vectors(x)[1])]
+    np.testing.assert_allclose(value, ((0.6 - r) ** 3).sum(), rtol=1e-12)
+    assert not np.asarray(gradient[1])[1].any()  # no particle is in that system
+
+
+def test_one_program_serves_other_boxes_and_flags():
+    x, batch, traces = jnp.asarray(np.random.default_rng(2).uniform(-2, 2, (30, 2))), np.arange(30, dtype=np.int32) % 4, []
+
+    @jax.jit
+    def search(x, boxes, periodic):
+        traces.append(None)
+        box = jfrnn.Box(boxes, periodic, per_system=True, images=2)
+        return jfrnn.search(x, 0.5, box=box, batch=batch, capacity=64, backend="warp")
+
+    for lengths in ([[1.0, 2.0], [0.5, 1.5], [1.0, 1.0], [3.0, 0.4]], [[0.6, 0.7], [2.0, 1.5], [1.0, 1.0], [3.0, 3.0]]):
+        for periodic in (PERIODIC, ~PERIODIC):
+            boxes = np.array(lengths)
+            found = search(x, jnp.asarray(boxes), jnp.asarray(periodic))
+            found.check()
+            assert listed_images(found, x) == oracle(boxes, np.asarray(x), batch, 0.5, periodic)
+    assert len(traces) == 1
+    assert jfrnn.Status.BOX_TOO_SMALL in jfrnn.Status(int(search(x, jnp.full((4, 2), 0.1), jnp.asarray(PERIODIC)).status))
+    empty = jnp.asarray(boxes).at[3].set(0.0)  # of a system without particles, whatever its box is
+    there = jnp.where(np.asarray(batch)[:, None] == 3, jnp.nan, x)
+    nbrs = jfrnn.search(there, 0.5, box=jfrnn.Box(boxes, per_system=True), batch=np.where(batch == 3, -1, batch), capacity=64)
+    jax.jit(lambda n, x, b: n.update(x, box=jfrnn.Box(b, per_system=True)))(nbrs, there, empty).check()
+
+
+def test_grow_in_boxes_that_shrink():
+    x, batch = jnp.asarray(np.random.default_rng(3).uniform(-2, 2, (20, 2))), np.arange(20, dtype=np.int32) % 2
+    nbrs = jfrnn.search(x, 0.5, box=jfrnn.Box(np.array([[2.0, 3.0], [4.0, 2.0], [9.0, 9.0]]), per_system=True), batch=batch)
+    assert nbrs.images is None
+    boxes = np.array([[0.4, 0.9], [1.5, 0.7], [9.0, 9.0]])
+    small = jfrnn.Box(boxes, per_system=True)
+    assert bool(nbrs.update(x, box=small).overflow)
+    assert listed_images(nbrs.grow(x, box=small), x) == oracle(boxes, np.asarray(x), batch, 0.5)
+
+
+def test_numbers_without_a_box_are_told():
+    x = jnp.zeros((3, 2))
+    nbrs = jfrnn.search(x, 0.5, box=jfrnn.Box(np.ones((2, 2, 2)) + np.eye(2)), batch=np.array([0, 2, -1]), capacity=8)
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.SYSTEM_WITHOUT_BOX
+    with pytest.raises(ValueError, match="names systems for which `box` holds no box"):
+        nbrs.check()
+
+
+X, SYSTEMS, CELLS = np.zeros((4, 3)), np.zeros(4, np.int32), np.stack([np.eye(3)] * 2)
+
+
+@pytest.mark.parametrize(
+    ("error", "match", "call"),
+    [
+        (ValueError, r"got shape \[5, 3\]", lambda: jfrnn.Box(np.ones((5, 3)))),
+        (ValueError, r"with per_system=True \[systems, d\], got shape \[3\]", lambda: jfrnn.Box(np.ones(3), per_system=True)),
+        (TypeError, "per_system must be True, False or None", lambda: jfrnn.Box(CELLS, per_system=1)),
+        (ValueError, r"got shape \[2, 3, 3\]", lambda: jfrnn.Box(CELLS, per_system=False)),
+        (ValueError, r"of shape \[2, 3\], got bool of shape \[3, 3\]", lambda: jfrnn.Box(CELLS, np.ones((3, 3), bool))),
+        (ValueError, r"origin must be a number or have shape \[3\] or \[2, 3\]", lambda: jfrnn.Box(CELLS, origin=np.zeros((3, 3)))),
+        (ValueError, r"independent, got the rows .* in system 1", lambda: jfrnn.Box(CELLS * [[[1.0]], [[0.0]]])),
+        (ValueError, r"must be finite, got .* in system 0", lambda: jfrnn.Box(CELLS * [[[np.nan]], [[1.0]]])),
+        (
+            ValueError,
+            r"must be positive, got \[-1.0, 1.0\] in system 1",
+            lambda: jfrnn.Box([[1.0, 1.0], [-1.0, 1.0]], per_system=True),
+        ),
+        (ValueError, "a box per system: pass batch=", lambda: jfrnn.search(X, 1.0, box=jfrnn.Box(CELLS))),
+        (
+            ValueError,
+            "cutoff must be one number where box holds a box per system",
+            lambda: jfrnn.search(X, np.ones(4), box=jfrnn.Box(CELLS), batch=SYSTEMS),
+        ),
+        (
+            ValueError,
+            r"kind with which the list was made \(.*for each of 2 systems\), got .*for each of 1 systems",
+            lambda: jfrnn.search(X, 0.1, box=jfrnn.Box(CELLS), batch=SYSTEMS).update(X, box=jfrnn.Box(CELLS[:1])),
+        ),
+        (
+            ValueError,
+            "where box holds a box per system",
+            lambda: jfrnn.pair_sum(lambda r, i, j: r @ r, X, 1.0, box=jfrnn.Box(CELLS), batch=SYSTEMS, backend="warp"),
+        ),
+        (
+            ValueError,
+            "hashgrid. knows one system at a time",
+            lambda: jfrnn.count(X, 1.0, box=jfrnn.Box(CELLS), batch=SYSTEMS, backend="hashgrid"),
+        ),
+    ],
+)
+def test_errors(error, match, call):
+    with pytest.raises(error, match=match):
+        call()

@@ -62,7 +62,8 @@ def sort_into_boxes(
     at = _cells_along(sources, wrapped.turns, of_source, lattice, wrapped.reach, counts, periodic)
     at = jnp.where(periodic[of_source], jnp.clip(at, 0, counts[of_source] - 1), at % counts[of_source])
     number = first[of_source] + _row_major(at, counts[of_source])
-    key = jnp.where(there, number, size).astype(jnp.uint32)
+    key = jnp.where(there, number, size)
+    key = key.astype(jnp.uint16 if size < 2**16 - 1 else jnp.uint32)  # half as many bits are sorted in half as many passes
     _, order = lax.sort((key, lax.iota(jnp.int32, n)), num_keys=1, is_stable=True)
     held = jnp.zeros(size + 1, jnp.int32).at[key.astype(jnp.int32) + 1].add(1, mode="drop")
     points, of_query = (sources, of_source) if queries is None else (queries, batch.of_queries)

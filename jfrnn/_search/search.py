@@ -47,10 +47,11 @@ def search(
         box: Periodic box (`Box`): (i, j) is then listed once for each periodic image of j within the cutoff, with displacement x_j
             - x_i + S·(lattice vectors) for whole numbers S, which `NeighborList.shifts` returns. Particles may be up to 511 lattice
             vectors away from the box (short vectors, if a skewed box is searched in those); along axes that are not periodic it has
-            no effect.
+            no effect. A box per system of a `batch` is one search, in which each system pays for its own images; it has one cutoff.
         batch: System number of each particle, shape [n], integers that fit into int32, in any order; with queries a tuple of [n]
             and [m]. Only particles of one system are neighbors. Many systems cost what their particles cost, even if they overlap
-            in space; all have the same box (for separate boxes, use `jax.vmap` over `search`).
+            in space. If `box` holds a box per system, numbers count its boxes from 0 on, and particles of the number -1 are not
+            there: they have no neighbors, and their positions may be anything.
         radius_rule: How the cutoff of a pair follows from cutoffs per particle: "gather" is that of i, the row; "scatter" that of
             j; "either" the larger, "both" the smaller, "mean" the exact mean, "sum" the exact sum, for contacts of spheres. Large
             cutoffs do not slow down particles with small ones: up to a ratio of 128, each particle searches cells of its own size.

@@ -161,8 +161,13 @@ def _check_box(box: object, x: np.ndarray, reach: float, mesh: Mesh) -> Box | No
     checked = check_box(box, cast(Any, x))
     if checked is None:
         return None
+    if checked.per_system:
+        raise ValueError(
+            "box must be one for all particles: systems with boxes of their own cannot be spread; search on one device."
+        )
     if not checked.orthogonal:
         raise ValueError("box must be given by lengths: particles in a skewed lattice cannot be spread yet; run it on one device.")
     kind = images_of(checked, reach, x.dtype, len(x))
     arrays = (replicate(mesh, np.asarray(a).astype(x.dtype)) for a in (checked.vectors, checked.origin))
-    return Box.tree_unflatten((checked.periodic, (0,) * checked.dim if kind.nearest else kind.reach), tuple(arrays))
+    images = (0,) * checked.dim if kind.nearest else kind.reach
+    return Box.tree_unflatten((checked.periodic, images, False), (*arrays, None))
