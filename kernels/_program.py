@@ -68,16 +68,20 @@ class Kernel(NamedTuple):
 
 
 class Entry(NamedTuple):
-    """A method that is launched, as in `"Sort.build"`; on CUDA, threads of a block, and blocks that share a multiprocessor."""
+    """A method that is launched, as in `"Sort.build"`; on CUDA, threads of a block, and blocks that share a multiprocessor.
+
+    `called` is the name in profiles of one of two programs that launch the same method.
+    """
 
     method: str
     block: int = 1
     blocks: int = 1
+    called: str = ""
 
     @property
     def name(self) -> str:
         """The name of the function by which it is called."""
-        return self.method.replace(".", "_")
+        return self.called or self.method.replace(".", "_")
 
 
 def declare(name: str, text: str, *entries: Entry | str, cuda: bool = False, fused: bool = False) -> list[Kernel]:

@@ -163,7 +163,8 @@ def cell_kernels(
     def query_kernel(name: str, crossing: bool = False) -> Kernel:
         kind = {"CROSSING": crossing, "SHIFTED": periodic if crossing else 0}
         text = program(double, dim, "rows.cuh", **query | kind)
-        return declare(f"{name}_cuda_{variant}", text, Entry("Rows.run", QUERY_BLOCK, blocks), cuda=True, fused=True)[0]
+        entry = Entry("Rows.run", QUERY_BLOCK, blocks, "Rows_cross" * crossing)
+        return declare(f"{name}_cuda_{variant}", text, entry, cuda=True, fused=True)[0]
 
     methods = ("find_bounds", "lay_out_grid", "count_cells", "scan_counts", "scatter_ids", "gather_places")
     stages = [Entry(f"Search.{method}", BLOCK) for method in methods]

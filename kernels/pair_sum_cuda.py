@@ -92,13 +92,13 @@ def sum_kernels(
     constants |= {"LIST": 0, "LATER": 0, "TAKEN": taken, "FROM_PLACES": _reads_positions(term) and not term.source_columns}
     constants |= {"ROW_LENGTH": max(row_length(term, dim, double), 1), "PLACED": _placed_columns(term, dim)}
 
-    def declare_one(name: str, text: str, method: str, blocks: int) -> Kernel:
-        return declare(f"{name}_{module}", text, Entry(method, QUERY_BLOCK, blocks), cuda=True, fused=True)[0]
+    def declare_one(name: str, text: str, method: str, blocks: int, called: str = "") -> Kernel:
+        return declare(f"{name}_{module}", text, Entry(method, QUERY_BLOCK, blocks, called), cuda=True, fused=True)[0]
 
     def query_kernel(name: str, crossing: bool = False) -> Kernel:
         where = {"CROSSING": crossing, "SHIFTED": periodic if crossing else 0}
         text = program(double, dim, "pair_sum.cuh", given=term_header(term, double), **constants | where)
-        return declare_one(name, text, "Sums.run", blocks)
+        return declare_one(name, text, "Sums.run", blocks, "Sums_cross" * crossing)
 
     sorting = program(double, dim, "sort_values.cuh", given={}, **constants)
     return Kernels(

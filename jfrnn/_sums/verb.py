@@ -75,8 +75,8 @@ def pair_sum(
             `NeighborList.vectors`. A half list gives whole sums too. Leave out the options with which it was made. If the list may
             lack pairs (see `NeighborList.check`), this raises outside jit. Over lists that "warp" made, on the CPU and on CUDA, a
             kernel reads the rows and evaluates the translated fn, with cutoffs per particle too; over others, and with a warning
-            if fn has no translation, array programming does. On a GPU it reads fastest if particles that follow each other are
-            close (`sort_order`).
+            if fn has no translation, array programming does. On a GPU rows are taken in the order of space that the list keeps,
+            and read fastest if particles that follow each other are close (`sort_order`).
 
     Returns:
         A pytree as fn returns it, leaves [m, ...]. Rows of inactive particles, and rows without neighbors, are 0 ("max": -inf,
