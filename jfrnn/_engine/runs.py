@@ -17,18 +17,18 @@ from jax import Array, lax
 from jfrnn._engine.candidates import Candidates, Points, Span, Torus
 from jfrnn._engine.problem import Filter
 from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
-from jfrnn._engine.words import LANES, BitRows, bit_counts, take, windows
+from jfrnn._engine.words import LANES, BitRows, bit_counts, windows
 from jfrnn._geometry import (
     Cutoff,
     Cutoffs,
     Pair,
-    decide_pairs,
+    decide_some,
     flat_take,
     shift_in_given,
     squared_distance,
     step_one_bounds,
 )
-from jfrnn._tracing import largest_of
+from jfrnn._tracing import largest_along, largest_of
 
 _FEW_RUNS = 32
 _SLOTS = 32  # doubtful candidates of a row that are decided at a time
@@ -70,16 +70,16 @@ def list_neighbors(
     def list_block(span: Span) -> list[Array]:
         def add(words: _HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
             (rows, count), (hits, first, image) = found, words
-            bits = BitRows.of(hits, tuning.in_groups)
+            bits = BitRows.of(hits, tuning.by_bisection)
             total = bits.total
 
             def add_group(g: Array, rows: Array) -> Array:
                 start = jnp.minimum(g * group, capacity - group)
                 ordinal = (start + slots)[None] - count[:, None]
                 word, bit = bits.nth(ordinal)
-                neighbor = engine.sources.ids.at[take(first, word) + bit].get(mode="promise_in_bounds")
+                neighbor = flat_take(engine.sources.ids, flat_take(first, word) + bit)
                 if image is not None and images > 1:
-                    neighbor = neighbor + n * take(image, word)
+                    neighbor = neighbor + n * flat_take(image, word)
                 old = rows if group == capacity else lax.dynamic_slice_in_dim(rows, start, group, axis=1)
                 new = jnp.where((ordinal >= 0) & (ordinal < total[:, None]), neighbor, old)
                 return new if group == capacity else lax.dynamic_update_slice_in_dim(rows, new, start, axis=1)
@@ -87,8 +87,8 @@ def list_neighbors(
             if group == capacity:
                 rows = add_group(jnp.int32(0), rows)
             else:
-                until = (jnp.minimum(jnp.max(count + total), capacity) + group - 1) // group
-                rows = lax.fori_loop(jnp.min(count) // group, until, add_group, rows)
+                ends = largest_of(jnp.minimum(count + total, capacity), capacity - jnp.minimum(count, capacity))
+                rows = lax.fori_loop((capacity - ends[1]) // group, (ends[0] + (group - 1)) // group, add_group, rows)
             return rows, count + total
 
         rows = jnp.full((span.size, capacity), n * images, jnp.int32)
@@ -147,17 +147,17 @@ def fold_neighbors(
         def fold(add: Callable[[Slots, Carry], Carry], state: Carry) -> Carry:
             def add_words(words: _HitWords, state: Carry) -> Carry:
                 hits, first, image = words
-                bits = BitRows.of(hits, tuning.in_groups)
+                bits = BitRows.of(hits, tuning.by_bisection)
                 total = jnp.where(fresh, bits.total, 0)
 
                 def add_group(state: tuple[Array, Any]) -> tuple[Array, Any]:
                     done, state = state
                     ordinal = jnp.broadcast_to(done + slots, (span.size, slots.size))
                     word, bit = bits.nth(ordinal)
-                    source = engine.sources.ids.at[take(first, word) + bit].get(mode="promise_in_bounds")
+                    source = flat_take(engine.sources.ids, flat_take(first, word) + bit)
                     shift = None
                     if torus is not None and image is not None:
-                        shift = _shifts_of(torus, ids[:, None], source, take(image, word))
+                        shift = _shifts_of(torus, ids[:, None], source, flat_take(image, word))
                     return done + FOLD_GROUP, add(Slots(source, shift, ordinal < total[:, None]), state)
 
                 most = jnp.max(total)
@@ -183,7 +183,7 @@ class _WordTable(NamedTuple):
     stop: Array  # [b, r] its end
     image: Array | None  # [b, r] its image code
     before: Array  # [b, r] number of words in the query's earlier runs
-    longest: Array | int  # [] largest number of words of a query
+    total: Array  # [b] number of words
 
 
 class _HitWords(NamedTuple):
@@ -214,7 +214,7 @@ class _Engine(NamedTuple):
     def words(self) -> int:
         """Words per query that are processed at a time."""
         words = self.candidates.words(self.capacity)
-        if self.tuning.in_groups:
+        if self.tuning.by_bisection:
             return min(words, _MOST_WORDS)
         return min(-(-words // 8) * 8, _MOST_WORDS // 4)
 
@@ -249,7 +249,7 @@ class _Engine(NamedTuple):
             if self.candidates.in_order:
                 return rows
             place = jnp.zeros_like(ids).at[ids].set(lax.iota(jnp.int32, ids.size), unique_indices=True)
-            return [_at(x, place) for x in rows]
+            return [x.at[place].get(mode="promise_in_bounds") for x in rows]
 
         def put(b: Array, out: list[Array]) -> list[Array]:
             span = self.block(b)
@@ -259,23 +259,25 @@ class _Engine(NamedTuple):
         return lax.fori_loop(0, self.block_count, put, [jnp.zeros((ids.size, *shape), jnp.int32) for shape in columns])
 
     def fold_words(self, span: Span, add: Callable[["_HitWords", State], State], state: State) -> State:
-        """Return the state after state = add(words, state) for each chunk of candidates of the queries at these positions."""
+        """Return the state after state = add(words, state) for the candidates of the queries at these positions, turn by turn.
+
+        A turn tests the next words of every query and decides what is doubtful among them, as far as there is room. It adds the
+        words before the first one that is still open; the others are tested again in the next turn. Most often there is one turn,
+        and the end of this loop is all that the host waits for on an accelerator.
+        """
+        query = [span.of(x) for x in self.queries.axes]
 
         def add_pass(which: Array, state: State) -> State:
             table = self.word_table(span, which)
 
-            query = [span.of(x) for x in self.queries.axes]
+            def add_turn(now: tuple[Array, Array, State]) -> tuple[Array, Array, State]:
+                _, begin, state = now
+                words, added = self.hit_words(span, query, table, begin)
+                begin = begin + added
+                return largest_of(jnp.maximum(table.total - begin, 0)) > 0, begin, add(words, state)
 
-            def add_chunk(chunk: Array, state: State) -> State:
-                return add(self.hit_words(span, query, table, chunk), state)
-
-            def add_next(now: tuple[Array, Array, State]) -> tuple[Array, Array, State]:
-                _, chunk, state = now
-                return (chunk + 1) * self.words < table.longest, chunk + 1, add_chunk(chunk, state)
-
-            if isinstance(table.longest, int) and table.longest <= self.words:
-                return add_chunk(jnp.int32(0), state)
-            return lax.while_loop(lambda now: now[0], add_next, (jnp.asarray(table.longest > 0), jnp.int32(0), state))[2]
+            begin = jnp.zeros(span.size, jnp.int32)
+            return lax.while_loop(lambda now: now[0], add_turn, (jnp.ones((), bool), begin, state))[2]
 
         passes = self.candidates.passes
         return add_pass(jnp.int32(0), state) if passes is None else lax.fori_loop(0, passes, add_pass, state)
@@ -287,30 +289,37 @@ class _Engine(NamedTuple):
             before = jnp.cumsum(count, axis=1, dtype=jnp.int32) - count
         else:
             before = jnp.sum(count[:, None] * np.tril(np.ones((runs, runs), np.int32), -1), axis=2, dtype=jnp.int32)
-        return _WordTable(start, stop, image, before, self.candidates.most_words or largest_of(before[:, -1] + count[:, -1]))
+        return _WordTable(start, stop, image, before, before[:, -1] + count[:, -1])
 
-    def hit_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> _HitWords:
-        """Test one chunk of words per query; `own` are the d coordinates [b] of the queries."""
-        own, table, chunk = lax.optimization_barrier((own, table, chunk))  # as XLA would take small parts out of the loop
-        first, stop, image = self._locate_words(table, chunk)
+    def hit_words(self, span: Span, own: list[Array], table: _WordTable, begin: Array) -> tuple[_HitWords, Array]:
+        """Test the words of each query from `begin` [b] on; return those before its first open one, and how many these are [b].
+
+        `own` are the d coordinates [b] of the queries.
+        """
+        own, table, begin = lax.optimization_barrier((own, table, begin))  # as XLA would take small parts out of the loop
+        first, stop, image = self._locate_words(table, begin)
         query = [x[:, None] for x in own]
         if image is not None and self.candidates.torus is not None:  # translate the query instead of the image
             query = [q - t[image] for q, t in zip(query, self.candidates.torus.translations.T, strict=True)]
         allowed = self._allowed_lanes(first, stop, image, span)
         packed = self._test(first, image, query, span) & (allowed | allowed << np.uint32(LANES))
         first, image, packed = lax.optimization_barrier((first, image, packed))
-        return _HitWords(self._decide_doubtful(packed, first, image, span), first, image)
+        packed = self._decide_doubtful(packed, first, image, span)
+        column = lax.broadcasted_iota(jnp.int32, packed.shape, 1)
+        added = self.words - largest_along(jnp.where(packed > _HITS, self.words - column, 0))[0]
+        return _HitWords(jnp.where(column < added[:, None], packed, np.uint32(0)), first, image), added
 
-    def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
-        word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (table.start.shape[0], self.words))
+    def _locate_words(self, table: _WordTable, begin: Array) -> tuple[Array, Array, Array | None]:
+        word = begin[:, None] + lax.iota(jnp.int32, self.words)[None]
         runs = table.start.shape[1]
         if runs > _FEW_RUNS:  # many images
             if runs > _MANY_RUNS:
                 run = jax.vmap(functools.partial(jnp.searchsorted, side="right"))(table.before, word).astype(jnp.int32) - 1
             else:
                 run = jnp.sum(word[..., None] >= table.before[:, None], axis=2, dtype=jnp.int32) - 1
-            first = take(table.start, run) + LANES * (word - take(table.before, run))
-            stop, image = take(table.stop, run), None if table.image is None else take(table.image, run)
+            run = run + runs * lax.broadcasted_iota(jnp.int32, run.shape, 0)
+            first = flat_take(table.start, run) + LANES * (word - flat_take(table.before, run))
+            stop, image = flat_take(table.stop, run), None if table.image is None else flat_take(table.image, run)
         else:  # a chain of selections takes half the time of a lookup
             first, stop = jnp.zeros_like(word), jnp.zeros_like(word)
             image = None if table.image is None else jnp.zeros_like(word)
@@ -370,30 +379,21 @@ class _Engine(NamedTuple):
         return windows(self.sources.ids, first) >= later[..., None]
 
     def _decide_doubtful(self, packed: Array, first: Array, image: Array | None, span: Span) -> Array:
-        """Add the doubtful candidates that are pairs to the hits: [b, words] uint32, of which the lower half is set then.
+        """Decide doubtful candidates of words [b, words]: each row's first 32, in a part of the block at a time if it is large.
 
-        A round decides the first 32 doubtful candidates of each row that has some, a part of the block at a time.
+        Those that are decided are doubtful no longer, and hits if they are pairs.
         """
         rows, width = packed.shape
         many = min(max(-(-rows // self.tuning.doubtful_share), self.tuning.doubtful_rows), rows)
-        whole, queue, waiting = many == rows, lax.iota(jnp.int32, rows), jnp.int32(0)
-        if not whole:
-            open_rows = jnp.max(packed, axis=1) > _HITS
-            until = jnp.cumsum(open_rows.astype(jnp.int32), dtype=jnp.int32)
-            waiting, queue = until[-1], jnp.full(rows + many, rows, jnp.int32)
-            queue = queue.at[jnp.where(open_rows, until - 1, rows + many)].set(lax.iota(jnp.int32, rows), mode="drop")
 
-        def decide_round(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            # The barrier keeps what follows in the loop: it is not worth computing where no round is needed.
-            _, at, packed, row = lax.optimization_barrier((*state, queue))
-            row = row if whole else lax.dynamic_slice_in_dim(row, at, many)
-            here = jnp.minimum(row, rows - 1)
-            both = packed if whole else jnp.where((row < rows)[:, None], packed[here], np.uint32(0))
-            asked = both >> np.uint32(LANES)
-            bits = BitRows.of(asked, self.tuning.in_groups)
-            slot = lax.broadcasted_iota(jnp.int32, (many, _SLOTS), 1)
-            column, bit = bits.nth(slot)
-            word = here[:, None] * width + column
+        def decide(packed: Array, row: Array | None) -> Array:
+            here = lax.iota(jnp.int32, rows) if row is None else jnp.minimum(row, rows - 1)
+            asked = packed if row is None else jnp.where((row < rows)[:, None], packed[here], np.uint32(0))
+            bits = BitRows.of(asked >> np.uint32(LANES), self.tuning.by_bisection)
+            slot = lax.broadcasted_iota(jnp.int32, (here.size, _SLOTS), 1)
+            word, bit = bits.nth(slot)
+            if row is not None:
+                word = word + width * (here - lax.iota(jnp.int32, many))[:, None]
             candidate = flat_take(first, word) + bit
 
             def points(at: Array | None) -> Pair:
@@ -402,21 +402,31 @@ class _Engine(NamedTuple):
                     of_row, source, of_word = here[at // _SLOTS], flat_take(source, at), flat_take(of_word, at)
                 return self._pair(span.first + of_row, source, None if image is None else flat_take(image, of_word))
 
-            there = slot < bits.total[:, None]
-            pair = decide_pairs(there, points, self.cutoff)
+            pair, known = decide_some(slot < bits.total[:, None], points, self.cutoff, self.tuning.waits)
             one = np.uint32(1) << bit.astype(jnp.uint32)
-            decided = jnp.where(there, one << np.uint32(LANES), np.uint32(0)) | jnp.where(pair, one, np.uint32(0))
-            of_column = lax.broadcasted_iota(jnp.int32, (many, width, _SLOTS), 1) == column[:, None]
-            change = lax.reduce(jnp.where(of_column, decided[:, None], np.uint32(0)), np.uint32(0), lax.bitwise_or, (2,))
-            both = both ^ change  # the bit of a doubtful candidate becomes 0, that of a pair 1
-            more = largest_of(both) > _HITS
-            if whole:
-                return more, at, both
-            at = jnp.where(more, at, at + many)
-            return at < waiting, at, packed.at[row].set(both, mode="drop", unique_indices=True)
+            change = jnp.where(pair, one, np.uint32(0)) - (one << np.uint32(LANES))
+            word = jnp.where(known, word, packed.size)
+            return packed.reshape(-1).at[word].add(change, mode="drop").reshape(packed.shape)
 
-        more = largest_of(packed) > _HITS if whole else waiting > 0
-        return lax.while_loop(lambda state: state[0], decide_round, (more, jnp.int32(0), packed))[2]
+        if many < rows:
+            return self._decide_parts(packed, many, decide)
+        if self.tuning.waits:
+            return decide(packed, None)
+        return lax.cond(largest_of(packed) > _HITS, lambda packed: decide(packed, None), lambda packed: packed, packed)
+
+    def _decide_parts(self, packed: Array, many: int, decide: Callable[[Array, Array], Array]) -> Array:
+        """Decide the doubtful candidates of so many rows that have some, then of as many others, until all rows had their turn."""
+        rows = len(packed)
+        open_rows = jnp.max(packed, axis=1) > _HITS
+        until = jnp.cumsum(open_rows.astype(jnp.int32), dtype=jnp.int32)
+        queue = jnp.full(rows + many, rows, jnp.int32)
+        queue = queue.at[jnp.where(open_rows, until - 1, rows + many)].set(lax.iota(jnp.int32, rows), mode="drop")
+
+        def decide_part(now: tuple[Array, Array]) -> tuple[Array, Array]:
+            at, packed, row = lax.optimization_barrier((*now, queue))
+            return at + many, decide(packed, lax.dynamic_slice_in_dim(row, at, many))
+
+        return lax.while_loop(lambda now: now[0] < until[-1], decide_part, (jnp.int32(0), packed))[1]
 
     def _pair(self, place: Array, candidate: Array, image: Array | None) -> Pair:
         """Return the given (not wrapped) points of queries and candidates at these positions."""
@@ -424,17 +434,14 @@ class _Engine(NamedTuple):
         if isinstance(self.cutoff, Cutoffs):
             own, others = self.queries.radii, self.sources.radii
             radii = self.cutoff.of_pairs(
-                None if own is None else _at(own, place), None if others is None else _at(others, candidate)
+                None if own is None else flat_take(own, place), None if others is None else flat_take(others, candidate)
             )
         if torus is None or image is None:
-            return Pair([_at(x, place) for x in self.queries.axes], [_at(x, candidate) for x in self.sources.axes], radii)
-        i, j = _at(self.queries.ids, place), _at(self.sources.ids, candidate)
+            return Pair(
+                [flat_take(x, place) for x in self.queries.axes], [flat_take(x, candidate) for x in self.sources.axes], radii
+            )
+        i, j = flat_take(self.queries.ids, place), flat_take(self.sources.ids, candidate)
         (sources, queries), shifts = torus.raw, _shifts_of(torus, i, j, image)
         shift = list(jnp.moveaxis(shifts, -1, 0))
-        raw = [_at(x, i) for x in queries.T], [_at(x, j) for x in sources.T]
+        raw = [flat_take(x, i) for x in queries.T], [flat_take(x, j) for x in sources.T]
         return Pair(*raw, radii, *shift_in_given(shift, torus.images.basis, torus.matrix), torus.images.orthogonal)
-
-
-def _at(x: Array, places: Array) -> Array:
-    """Return x[places]; all places are valid."""
-    return x.at[places].get(mode="promise_in_bounds")

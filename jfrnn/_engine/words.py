@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._geometry import flat_take
+
 LANES = 16  # candidates per word: in a uint32 hits take the lower half, doubtful candidates the upper half
 _GROUP = 8  # words whose counts are added up together
 
@@ -21,15 +23,9 @@ def bit_counts(words: Array) -> Array:
     return lax.population_count(words).astype(jnp.int32)
 
 
-def take(rows: Array, column: Array) -> Array:
-    """Return rows[i, column[i, k]] for rows [b, w] and columns [b, k]."""
-    flat = lax.broadcasted_iota(jnp.int32, column.shape, 0) * rows.shape[1] + column
-    return rows.reshape(-1).at[flat].get(mode="promise_in_bounds")
-
-
-def sums_along(counts: Array, in_groups: bool) -> Array:
-    """Return the cumulative sums of rows [b, w], w being a multiple of 8. `in_groups` as in `BitRows`."""
-    if in_groups:
+def sums_along(counts: Array, at_once: bool) -> Array:
+    """Return the cumulative sums of rows [b, w], w being a multiple of 8 unless `at_once`."""
+    if at_once:
         return jnp.cumsum(counts, axis=1, dtype=jnp.int32)
     rows, width = counts.shape  # within groups of 8, then over the groups: XLA's CPU compiler makes chains of cumulative sums
     groups = counts.reshape(rows, width // _GROUP, _GROUP)
@@ -45,22 +41,22 @@ class BitRows(NamedTuple):
     Attributes:
         until: [b, w] int32, the number of set bits in the words of a row up to each word.
         before: [b, w] int32, the number of those before it, and in its lower half the word itself: one gather reads both.
-        in_groups: Whether groups of words are looked at before words, in one kernel, which takes less time where gathers are cheap;
-            otherwise every word of the row, in a kernel of its own. Static.
+        by_bisection: Whether the word of a bit is found by bisection, which takes less time where gathers are cheap and is less to
+            compile; otherwise by looking at every word of the row, in a kernel of its own. Static.
     """
 
     until: Array
     before: Array
-    in_groups: bool
+    by_bisection: bool
 
     @classmethod
-    def of(cls, words: Array, in_groups: bool) -> "BitRows":
+    def of(cls, words: Array, by_bisection: bool) -> "BitRows":
         """Prepare words, of which only the lower half is used."""
         hits = words & np.uint32((1 << LANES) - 1)
         count = bit_counts(hits)
-        until = lax.optimization_barrier(sums_along(count, in_groups))
+        until = lax.optimization_barrier(sums_along(count, by_bisection))
         before = lax.optimization_barrier(((until - count) << LANES) | hits.astype(jnp.int32))
-        return cls(until, before, in_groups)
+        return cls(until, before, by_bisection)
 
     @property
     def total(self) -> Array:
@@ -68,26 +64,29 @@ class BitRows(NamedTuple):
         return self.until[:, -1]
 
     def nth(self, ordinal: Array) -> tuple[Array, Array]:
-        """Find the ordinal-th set bit in each row: its word and bit [b, k].
+        """Find the ordinal-th set bit in each row: its bit [b, k] and its word, as a position in the words of all rows.
 
         Ordinals outside [0, total) give any valid word and bit, which callers mask.
         """
-        last = self.until.shape[1] - 1
-        if self.in_groups:
-            heads = self.until[:, _GROUP - 1 :: _GROUP][:, : last // _GROUP]
-            word = _count_not_above(heads, ordinal) * _GROUP
-            inside = [(take(self.until, jnp.minimum(word + k, last)) <= ordinal).astype(jnp.int32) for k in range(_GROUP - 1)]
-            word = jnp.minimum(functools.reduce(jnp.add, inside, word), last)
-            found = take(self.before, word)
+        width = self.until.shape[1]
+        begin = width * lax.broadcasted_iota(jnp.int32, ordinal.shape, 0)
+        if self.by_bisection:
+            word, last = begin, begin + (width - 1)
+            for step in (1 << k for k in reversed(range((width - 1).bit_length()))):
+                above = flat_take(self.until, lax.min(word + np.int32(step - 1), last)) > ordinal
+                word = lax.select(above, word, word + np.int32(step))
+            word = lax.min(word, last)
+            found = flat_take(self.before, word)
         else:
-            word = lax.optimization_barrier(_count_not_above(self.until[:, :last], ordinal))
-            found = lax.optimization_barrier(take(self.before, word))
+            word = lax.optimization_barrier(begin + _count_not_above(self.until[:, :-1], ordinal))
+            found = lax.optimization_barrier(flat_take(self.before, word))
         return word, _nth_bit(found.astype(jnp.uint32) & np.uint32((1 << LANES) - 1), ordinal - (found >> LANES))
 
 
 def _count_not_above(ascending: Array, value: Array) -> Array:
     """Count the entries of each row [b, w] that are <= value [b, k]."""
-    reached = ((ascending[:, i : i + 1] <= value).astype(jnp.int32) for i in range(ascending.shape[1]))
+    columns = (lax.slice_in_dim(ascending, i, i + 1, axis=1) for i in range(ascending.shape[1]))
+    reached = ((column <= value).astype(jnp.int32) for column in columns)
     return functools.reduce(jnp.add, reached, jnp.zeros_like(value))
 
 

@@ -18,7 +18,6 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -57,12 +56,13 @@ class Pair(NamedTuple):
     matrix: Array | None = None  # [d, d], one lattice vector per row, 0 for open axes
     orthogonal: bool = True
 
-    def lattice_terms(self, axis: int) -> list[tuple[Array, tuple[int, int]]]:
-        """Return shifts, and the places in `matrix` of what they multiply, which sum to the translation along an axis."""
-        if self.shift is None or self.matrix is None:
+    def lattice_terms(self) -> list[tuple[Array, Callable[[Array], Array]]]:
+        """Return shifts, one or [d, ...], and how to take of arrays like `matrix` what they multiply, to be summed: [d, ...]."""
+        if self.shift is None:
             return []
-        rows = [axis] if self.orthogonal else range(len(self.shift))  # twice the axes if `shift_in_given` split the shifts
-        return [(self.shift[k], (k, axis)) for k in rows]
+        if self.orthogonal:
+            return [(jnp.stack(self.shift), lambda x: jnp.stack([x[k, k] for k in range(len(x))]))]
+        return [(shift[None], lambda x, k=k: x[k]) for k, shift in enumerate(self.shift)]
 
 
 PointsAt = Callable[[Array | None], Pair]
@@ -161,36 +161,42 @@ def is_pair_of(
     no, yes, open_pair = np.arange(3, dtype=np.int8)
     step_one = jnp.where(asked & (square <= outside), jnp.where(square < inside, yes, open_pair), no)  # one int8 array, one kernel
 
-    def refine_open(step_one: Array) -> Array:
-        return (step_one == yes) | decide_pairs(step_one == open_pair, slots.points, cutoff)
+    def refine(step_one: Array) -> Array:
+        pair, known = decide_some(step_one == open_pair, slots.points, cutoff, waits=False)
+        return jnp.where(known, jnp.where(pair, yes, no), step_one)
 
-    return lax.cond(jnp.max(step_one, initial=no) == open_pair, refine_open, lambda step_one: step_one == yes, step_one)
+    return lax.while_loop(lambda step_one: largest_of(step_one) == open_pair, refine, step_one) == yes
 
 
 def flat_take(x: Array, at: Array) -> Array:
-    """Return the elements of x at flat indices."""
-    return x.reshape(-1).at[at].get(mode="promise_in_bounds")
+    """Return the elements of x at flat indices, all of which are valid."""
+    dimensions = lax.GatherDimensionNumbers(offset_dims=(), collapsed_slice_dims=(0,), start_index_map=(0,))
+    return lax.gather(x.reshape(-1), at[..., None], dimensions, (1,), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
 
 
-def decide_pairs(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
-    """Decide the pairs that step 1 left open by steps 2 and 3; False elsewhere.
+def decide_some(asked: Array, points: PointsAt, cutoff: Cutoff | Cutoffs, waits: bool) -> tuple[Array, Array]:
+    """Decide pairs that step 1 left open: all by step 2, then by step 3 some of those that are left, but at least one.
 
-    `points(None)` returns both points of every pair in the shape of `doubtful`, and `points(at)` those at the flat indices `at`.
+    `points(None)` returns both points of every pair in the shape of `asked`, and `points(at)` those at the flat indices `at`.
+    Returns which of the pairs are within the cutoff, and which are decided. With `waits`, step 3 is made even if there is nothing
+    left for it, which takes less time than that the host waits to learn so.
     """
     pairs = points(None)
-    signs = jnp.where(doubtful, _fixed_sign(pairs, _threshold(pairs, cutoff)), 1).astype(jnp.int8)
+    signs = jnp.where(asked, _fixed_sign(pairs, _threshold(pairs, cutoff)), 1).astype(jnp.int8)
     chunk = min(_INTEGER_CHUNK, signs.size)
 
-    def decide_chunk(signs: Array) -> Array:
-        flat = signs.reshape(-1)
+    def decide_chunk(flat: Array) -> Array:
         first = jnp.minimum(lax.argmax(flat, 0, jnp.int32), flat.size - chunk)  # that of an unknown sign, the largest value
         here = points(first + lax.iota(jnp.int32, chunk))
         known = lax.dynamic_slice_in_dim(flat, first, chunk)
         known = jnp.where(known == _UNKNOWN, _integer_sign(here, _threshold(here, cutoff)).astype(jnp.int8), known)
-        return lax.dynamic_update_slice_in_dim(flat, known, first, axis=0).reshape(signs.shape)
+        return lax.dynamic_update_slice_in_dim(flat, known, first, axis=0)
 
-    signs = lax.while_loop(lambda signs: largest_of(signs) == _UNKNOWN, decide_chunk, signs)
-    return signs <= 0 if cutoff.closed else signs < 0
+    flat = lax.optimization_barrier(signs.reshape(-1))  # else each of its readers would compute it
+    flat = decide_chunk(flat) if waits else lax.cond(largest_of(flat) == _UNKNOWN, decide_chunk, lambda flat: flat, flat)
+    signs = flat.reshape(signs.shape)
+    known = asked & (signs != _UNKNOWN)
+    return known & (signs <= 0 if cutoff.closed else signs < 0), known
 
 
 class _Threshold(NamedTuple):
@@ -224,37 +230,34 @@ def _fixed_sign(pair: Pair, threshold: _Threshold) -> Array:
 
     A cutoff is below 4 in scaled lengths, and so is each component of a displacement that step 1 leaves open, up to its band.
     """
-    dtype = np.dtype(pair.a[0].dtype)
+    dim, dtype = len(pair.b), np.dtype(pair.b[0].dtype)
     fraction = fraction_bits(dtype, threshold.times)
     eps, bits = jnp.finfo(dtype).eps, limb_bits(dtype)
-    known, total = jnp.ones(pair.b[0].shape, bool), None
     unsigned, finfo = np.dtype(f"uint{8 * dtype.itemsize}").type, jnp.finfo(dtype)
     exponent = (lax.bitcast_convert_type(threshold.scale, unsigned) >> unsigned(finfo.nmant)).astype(jnp.int32)
     up = exponent + (fraction + bits + int(finfo.minexp) - finfo.nmant - (finfo.maxexp - 1))
-
-    def fixed(x: Array) -> _Fixed:
-        nonlocal known
-        number, whole = _fixed_point(x, up)
-        known = known & whole
-        return number
-
-    matrix = jnp.zeros((0, 0), dtype) if pair.matrix is None else pair.matrix
-    lattice = _fixed_point(matrix.reshape(*matrix.shape, *[1] * up.ndim), up)
-    for axis, (ak, bk) in enumerate(zip(pair.a, pair.b, strict=True)):
-        displacement, estimate = _add(fixed(bk), fixed(ak), -1), bk - ak
-        error = jnp.zeros((), dtype)
-        for shift, at in pair.lattice_terms(axis):
-            component, (number, whole) = matrix[at], jax.tree.map(lambda x, at=at: x[at], lattice)
-            known = known & whole
-            displacement = _add(displacement, number, shift.astype(limb_type(dtype)))
-            estimate = estimate + shift * component
-            error = error + 16 * eps * (jnp.abs(ak) + jnp.abs(bk) + jnp.abs(shift * component))
+    ends = jnp.stack([*pair.b, *(jnp.broadcast_to(x, pair.b[0].shape) for x in pair.a)])  # [2 d, ...], in few kernels
+    numbers, known = _fixed_point(ends, up)
+    (b, *others), (a, *own) = ([x[half] for x in (ends, *numbers, known)] for half in (slice(dim), slice(dim, None)))
+    displacement, known = _add(_Fixed(*others[:2]), _Fixed(*own[:2]), -1), others[2] & own[2]
+    estimate, size = b - a, jnp.zeros((), dtype)
+    if pair.matrix is not None:
+        matrix = pair.matrix.reshape(*pair.matrix.shape, *[1] * (b.ndim - 1))
+        lattice, whole = _fixed_point(matrix, up)
+        known, size = known & whole.all(axis=(0, 1)), jnp.abs(a) + jnp.abs(b)
+        for shift, term in pair.lattice_terms():
+            displacement = _add(displacement, _Fixed(*map(term, lattice)), shift.astype(limb_type(dtype)))
+            along = shift * term(matrix)
+            estimate, size = estimate + along, size + jnp.abs(along)
             known = known & (jnp.abs(shift) <= 2**WHOLE_BITS)
-        known = known & ((jnp.abs(estimate) + error) * threshold.scale < 4.5)
-        square = _square_limbs(displacement, threshold.times, bits)
-        total = square if total is None else [x + y for x, y in zip(total, square, strict=True)]
-    less = threshold.less or [-x for x in _square_limbs(functools.reduce(_add, map(fixed, threshold.radii)), 1, bits)]
-    return jnp.where(known, _sign_of_limbs([x + y for x, y in zip(total or [], less, strict=True)], bits), _UNKNOWN)
+    known = known & ((jnp.abs(estimate) + 16 * eps * size) * threshold.scale < 4.5)
+    limbs = [_of_axes(x, lax.add) for x in _square_limbs(displacement, threshold.times, bits)]
+    less, known = threshold.less, _of_axes(known, lax.bitwise_and)
+    if less is None:
+        radii = [_fixed_point(x, up) for x in threshold.radii]
+        known = functools.reduce(jnp.logical_and, (whole for _, whole in radii), known)
+        less = [-x for x in _square_limbs(functools.reduce(_add, (number for number, _ in radii)), 1, bits)]
+    return jnp.where(known, _sign_of_limbs([x + y for x, y in zip(limbs, less, strict=True)], bits), _UNKNOWN)
 
 
 class _Fixed(NamedTuple):
@@ -290,6 +293,11 @@ def _fixed_point(x: Array, up: Array) -> tuple[_Fixed, Array]:
     return _Fixed(upper.astype(whole) * signs, lower.astype(whole) * signs), finer == 0
 
 
+def _of_axes(x: Array, how: Callable[[Array, Array], Array]) -> Array:
+    """Combine the axes of [d, ...]. Other than a reduction, this is fused with what needs it."""
+    return functools.reduce(how, lax.split(x, [1] * len(x))).reshape(x.shape[1:])
+
+
 def _square_limbs(x: _Fixed, times: int, bits: int) -> list[Array]:
     """Return (times·x)² in seven limbs, the lowest first, not carried; the highest keeps the rest."""
     lower, mask = x.lower * times, (1 << bits) - 1
@@ -298,8 +306,9 @@ def _square_limbs(x: _Fixed, times: int, bits: int) -> list[Array]:
     upper = jnp.where(negative, jnp.where(lower == 0, -upper, ~upper), upper)
     lower = jnp.where(negative, -lower & mask, lower)
     limbs = [lower, upper & mask, (upper >> bits) & mask, upper >> (2 * bits)]
-    pairs = [[(i, k - i) for i in range(4) if 0 <= k - i < 4] for k in range(7)]
-    return [functools.reduce(jnp.add, (limbs[i] * limbs[j] for i, j in of_limb)) for of_limb in pairs]
+    pairs = [[(i, k - i) for i in range(4) if 0 <= k - i <= i] for k in range(7)]
+    twice = [2 * limb for limb in limbs]
+    return [functools.reduce(lax.add, ((limbs if i == j else twice)[i] * limbs[j] for i, j in of_limb)) for of_limb in pairs]
 
 
 def _sign_of_limbs(limbs: list[Array], bits: int) -> Array:
