@@ -321,15 +321,16 @@ class _Engine(NamedTuple):
             first = flat_take(table.start, run) + LANES * (word - flat_take(table.before, run))
             stop, image = flat_take(table.stop, run), None if table.image is None else flat_take(table.image, run)
         else:  # a chain of selections takes half the time of a lookup
-            first, stop = jnp.zeros_like(word), jnp.zeros_like(word)
-            image = None if table.image is None else jnp.zeros_like(word)
-            for r in range(runs):
-                before = table.before[:, r, None]
-                reached = word >= before
-                first = jnp.where(reached, table.start[:, r, None] + LANES * (word - before), first)
-                stop = jnp.where(reached, table.stop[:, r, None], stop)
-                if image is not None and table.image is not None:
-                    image = jnp.where(reached, table.image[:, r, None], image)
+            columns = [table.before, table.start - LANES * table.before, table.stop]
+            columns += [] if table.image is None else [table.image]
+            runs_of = zip(*(lax.split(x, [1] * runs, axis=1) for x in columns), strict=True)
+            begin, *found = next(runs_of)  # which begins at word 0
+            found = [jnp.broadcast_to(x, word.shape) for x in found]
+            for begin, *of_run in runs_of:
+                reached = word >= begin
+                found = [lax.select(reached, jnp.broadcast_to(x, word.shape), y) for x, y in zip(of_run, found, strict=True)]
+            first, stop, *of_image = found
+            first, image = first + LANES * word, of_image[0] if of_image else None
         return jnp.minimum(first, self.sources.ids.size - LANES), stop, image
 
     def _test(self, first: Array, image: Array | None, query: list[Array], span: Span) -> Array:

@@ -80,7 +80,7 @@ class BitRows(NamedTuple):
         else:
             word = lax.optimization_barrier(begin + _count_not_above(self.until[:, :-1], ordinal))
             found = lax.optimization_barrier(flat_take(self.before, word))
-        return word, _nth_bit(found.astype(jnp.uint32) & np.uint32((1 << LANES) - 1), ordinal - (found >> LANES))
+        return word, _nth_bit(found & np.int32((1 << LANES) - 1), ordinal - (found >> LANES))
 
 
 def _count_not_above(ascending: Array, value: Array) -> Array:
@@ -91,11 +91,10 @@ def _count_not_above(ascending: Array, value: Array) -> Array:
 
 
 def _nth_bit(word: Array, ordinal: Array) -> Array:
-    """Return the position of the ordinal-th set bit of 16, by bisection."""
-    position = jnp.zeros_like(ordinal)
+    """Return the position of the ordinal-th set bit of 16, by bisection; both int32."""
+    position, one = jnp.zeros_like(ordinal), np.int32(1)
     for width in (8, 4, 2, 1):
-        below = bit_counts((word >> position.astype(jnp.uint32)) & np.uint32((1 << width) - 1))
-        skip = ordinal >= below
-        ordinal = jnp.where(skip, ordinal - below, ordinal)
-        position = jnp.where(skip, position + width, position)
+        beyond = position + np.int32(width)
+        below = lax.population_count(word & ((one << beyond) - one))
+        position = lax.select(below > ordinal, position, beyond)
     return position
