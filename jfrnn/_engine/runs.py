@@ -213,10 +213,7 @@ class _Engine(NamedTuple):
     @property
     def words(self) -> int:
         """Words per query that are processed at a time."""
-        words = self.candidates.words(self.capacity)
-        if self.tuning.by_bisection:
-            return min(words, _MOST_WORDS)
-        return min(-(-words // 8) * 8, _MOST_WORDS // 4)
+        return min(-(-self.candidates.words(self.capacity) // 8) * 8, _MOST_WORDS // (1 if self.tuning.by_bisection else 4))
 
     @property
     def block_count(self) -> int:

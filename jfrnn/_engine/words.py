@@ -23,16 +23,22 @@ def bit_counts(words: Array) -> Array:
     return lax.population_count(words).astype(jnp.int32)
 
 
-def sums_along(counts: Array, at_once: bool) -> Array:
-    """Return the cumulative sums of rows [b, w], w being a multiple of 8 unless `at_once`."""
-    if at_once:
-        return jnp.cumsum(counts, axis=1, dtype=jnp.int32)
-    rows, width = counts.shape  # within groups of 8, then over the groups: XLA's CPU compiler makes chains of cumulative sums
-    groups = counts.reshape(rows, width // _GROUP, _GROUP)
-    within = jnp.sum(groups[:, :, None, :] * np.tril(np.ones((_GROUP, _GROUP), np.int32)), axis=3, dtype=jnp.int32)
-    earlier = np.tril(np.ones((width // _GROUP, width // _GROUP), np.int32), -1)
-    before = jnp.sum(within[:, None, :, -1] * earlier, axis=2, dtype=jnp.int32)
-    return (within + before[:, :, None]).reshape(rows, width)
+def sums_along(counts: Array, cumulate: bool) -> Array:
+    """Return the cumulative sums of rows [b, w], w being a multiple of 8: within groups of 8, then over the groups.
+
+    With `cumulate`, by cumulative sums, which XLA's CPU compiler makes chains of kernels; otherwise by sums of products. A barrier
+    keeps XLA's GPU compiler from adding up all words anew for each word.
+    """
+
+    def sums(x: Array) -> Array:
+        if cumulate:
+            return lax.cumsum(x, axis=x.ndim - 1)
+        return jnp.sum(x[..., None, :] * np.tril(np.ones((x.shape[-1], x.shape[-1]), np.int32)), axis=-1, dtype=jnp.int32)
+
+    rows, width = counts.shape
+    within = lax.optimization_barrier(sums(counts.reshape(rows, width // _GROUP, _GROUP)))
+    until = lax.optimization_barrier(sums(within[:, :, -1]))
+    return (within + (until - within[:, :, -1])[:, :, None]).reshape(rows, width)
 
 
 class BitRows(NamedTuple):

@@ -107,7 +107,7 @@ def sort_along_line(
         lengths.append(jnp.max(systems[:sources], initial=0).astype(points.dtype) + 1)
     strides = _strides(lengths, size)
     number = jnp.where(there, _number(along, strides) & np.uint32(size - 1), np.uint32(size))
-    ascending, order = _sort(number[:sources], least_sorted)
+    ascending, order = _sort(number[:sources], size, least_sorted)
     if sources <= searched:
         numbers = lax.iota(jnp.uint32, size + 1)
         begin = jnp.searchsorted(ascending, numbers, side="left", method="scan_unrolled").astype(jnp.int32)
@@ -122,15 +122,18 @@ def sort_along_line(
 
 def sort_queries(cells: Cells, sources: int, least_sorted: int) -> tuple[Array, Array]:
     """Return the numbers of the cells of queries, which follow those of the `sources`, and the queries in this order: [m] each."""
-    return _sort(cells.number[sources:], least_sorted)
+    return _sort(cells.number[sources:], table_size(sources), least_sorted)
 
 
-def _sort(key: Array, least: int) -> tuple[Array, Array]:
-    """Sort keys [n] uint32; return them and their indices. Fewer than `least` are sorted together with others that stay behind."""
-    more = max(least - key.size, 0)
-    padded = jnp.pad(key, (0, more), constant_values=np.uint32(2**32 - 1))
+def _sort(key: Array, size: int, least: int) -> tuple[Array, Array]:
+    """Sort keys [n] uint32 up to a size; return them and their indices.
+
+    Fewer than `least` are sorted together with others that stay behind. Half as many digits take a radix sort half the time.
+    """
+    short = np.uint16 if size < 2**16 else np.uint32
+    padded = jnp.pad(key.astype(short), (0, max(least - key.size, 0)), constant_values=short(np.iinfo(short).max))
     ascending, order = lax.sort((padded, lax.iota(jnp.int32, padded.size)), num_keys=1, is_stable=True)
-    return ascending[: key.size], order[: key.size]
+    return ascending[: key.size].astype(jnp.uint32), order[: key.size]
 
 
 def table_size(sources: int) -> int:
