@@ -22,13 +22,13 @@ from jfrnn._geometry import (
     Cutoff,
     Cutoffs,
     Pair,
-    decide_some,
+    decide_pairs,
     flat_take,
     shift_in_given,
     squared_distance,
     step_one_bounds,
 )
-from jfrnn._tracing import largest_along, largest_of
+from jfrnn._tracing import largest_of
 
 _FEW_RUNS = 32
 _SLOTS = 32  # doubtful candidates of a row that are decided at a time
@@ -70,7 +70,7 @@ def list_neighbors(
     def list_block(span: Span) -> list[Array]:
         def add(words: _HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
             (rows, count), (hits, first, image) = found, words
-            bits = BitRows.of(hits, tuning.by_bisection)
+            bits = BitRows.of(hits, tuning.in_groups)
             total = bits.total
 
             def add_group(g: Array, rows: Array) -> Array:
@@ -87,8 +87,8 @@ def list_neighbors(
             if group == capacity:
                 rows = add_group(jnp.int32(0), rows)
             else:
-                ends = largest_of(jnp.minimum(count + total, capacity), capacity - jnp.minimum(count, capacity))
-                rows = lax.fori_loop((capacity - ends[1]) // group, (ends[0] + (group - 1)) // group, add_group, rows)
+                until = (jnp.minimum(jnp.max(count + total), capacity) + group - 1) // group
+                rows = lax.fori_loop(jnp.min(count) // group, until, add_group, rows)
             return rows, count + total
 
         rows = jnp.full((span.size, capacity), n * images, jnp.int32)
@@ -147,7 +147,7 @@ def fold_neighbors(
         def fold(add: Callable[[Slots, Carry], Carry], state: Carry) -> Carry:
             def add_words(words: _HitWords, state: Carry) -> Carry:
                 hits, first, image = words
-                bits = BitRows.of(hits, tuning.by_bisection)
+                bits = BitRows.of(hits, tuning.in_groups)
                 total = jnp.where(fresh, bits.total, 0)
 
                 def add_group(state: tuple[Array, Any]) -> tuple[Array, Any]:
@@ -183,7 +183,7 @@ class _WordTable(NamedTuple):
     stop: Array  # [b, r] its end
     image: Array | None  # [b, r] its image code
     before: Array  # [b, r] number of words in the query's earlier runs
-    total: Array  # [b] number of words
+    longest: Array | int  # [] largest number of words of a query
 
 
 class _HitWords(NamedTuple):
@@ -213,7 +213,10 @@ class _Engine(NamedTuple):
     @property
     def words(self) -> int:
         """Words per query that are processed at a time."""
-        return min(-(-self.candidates.words(self.capacity) // 8) * 8, _MOST_WORDS // (1 if self.tuning.by_bisection else 4))
+        words = self.candidates.words(self.capacity)
+        if self.tuning.in_groups:
+            return min(words, _MOST_WORDS)
+        return min(-(-words // 8) * 8, _MOST_WORDS // 4)
 
     @property
     def block_count(self) -> int:
@@ -256,25 +259,23 @@ class _Engine(NamedTuple):
         return lax.fori_loop(0, self.block_count, put, [jnp.zeros((ids.size, *shape), jnp.int32) for shape in columns])
 
     def fold_words(self, span: Span, add: Callable[["_HitWords", State], State], state: State) -> State:
-        """Return the state after state = add(words, state) for the candidates of the queries at these positions, turn by turn.
-
-        A turn tests the next words of every query and decides what is doubtful among them, as far as there is room. It adds the
-        words before the first one that is still open; the others are tested again in the next turn. Most often there is one turn,
-        and the end of this loop is all that the host waits for on an accelerator.
-        """
-        query = [span.of(x) for x in self.queries.axes]
+        """Return the state after state = add(words, state) for each chunk of candidates of the queries at these positions."""
 
         def add_pass(which: Array, state: State) -> State:
             table = self.word_table(span, which)
 
-            def add_turn(now: tuple[Array, Array, State]) -> tuple[Array, Array, State]:
-                _, begin, state = now
-                words, added = self.hit_words(span, query, table, begin)
-                begin = begin + added
-                return largest_of(jnp.maximum(table.total - begin, 0)) > 0, begin, add(words, state)
+            query = [span.of(x) for x in self.queries.axes]
 
-            begin = jnp.zeros(span.size, jnp.int32)
-            return lax.while_loop(lambda now: now[0], add_turn, (jnp.ones((), bool), begin, state))[2]
+            def add_chunk(chunk: Array, state: State) -> State:
+                return add(self.hit_words(span, query, table, chunk), state)
+
+            def add_next(now: tuple[Array, Array, State]) -> tuple[Array, Array, State]:
+                _, chunk, state = now
+                return (chunk + 1) * self.words < table.longest, chunk + 1, add_chunk(chunk, state)
+
+            if isinstance(table.longest, int) and table.longest <= self.words:
+                return add_chunk(jnp.int32(0), state)
+            return lax.while_loop(lambda now: now[0], add_next, (jnp.asarray(table.longest > 0), jnp.int32(0), state))[2]
 
         passes = self.candidates.passes
         return add_pass(jnp.int32(0), state) if passes is None else lax.fori_loop(0, passes, add_pass, state)
@@ -286,28 +287,22 @@ class _Engine(NamedTuple):
             before = jnp.cumsum(count, axis=1, dtype=jnp.int32) - count
         else:
             before = jnp.sum(count[:, None] * np.tril(np.ones((runs, runs), np.int32), -1), axis=2, dtype=jnp.int32)
-        return _WordTable(start, stop, image, before, before[:, -1] + count[:, -1])
+        return _WordTable(start, stop, image, before, self.candidates.most_words or largest_of(before[:, -1] + count[:, -1]))
 
-    def hit_words(self, span: Span, own: list[Array], table: _WordTable, begin: Array) -> tuple[_HitWords, Array]:
-        """Test the words of each query from `begin` [b] on; return those before its first open one, and how many these are [b].
-
-        `own` are the d coordinates [b] of the queries.
-        """
-        own, table, begin = lax.optimization_barrier((own, table, begin))  # as XLA would take small parts out of the loop
-        first, stop, image = self._locate_words(table, begin)
+    def hit_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> _HitWords:
+        """Test one chunk of words per query; `own` are the d coordinates [b] of the queries."""
+        own, table, chunk = lax.optimization_barrier((own, table, chunk))  # as XLA would take small parts out of the loop
+        first, stop, image = self._locate_words(table, chunk)
         query = [x[:, None] for x in own]
         if image is not None and self.candidates.torus is not None:  # translate the query instead of the image
             query = [q - t[image] for q, t in zip(query, self.candidates.torus.translations.T, strict=True)]
         allowed = self._allowed_lanes(first, stop, image, span)
         packed = self._test(first, image, query, span) & (allowed | allowed << np.uint32(LANES))
         first, image, packed = lax.optimization_barrier((first, image, packed))
-        packed = self._decide_doubtful(packed, first, image, span)
-        column = lax.broadcasted_iota(jnp.int32, packed.shape, 1)
-        added = self.words - largest_along(jnp.where(packed > _HITS, self.words - column, 0))[0]
-        return _HitWords(jnp.where(column < added[:, None], packed, np.uint32(0)), first, image), added
+        return _HitWords(self._decide_doubtful(packed, first, image, span), first, image)
 
-    def _locate_words(self, table: _WordTable, begin: Array) -> tuple[Array, Array, Array | None]:
-        word = begin[:, None] + lax.iota(jnp.int32, self.words)[None]
+    def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
+        word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (table.start.shape[0], self.words))
         runs = table.start.shape[1]
         if runs > _FEW_RUNS:  # many images
             if runs > _MANY_RUNS:
@@ -318,16 +313,13 @@ class _Engine(NamedTuple):
             first = flat_take(table.start, run) + LANES * (word - flat_take(table.before, run))
             stop, image = flat_take(table.stop, run), None if table.image is None else flat_take(table.image, run)
         else:  # a chain of selections takes half the time of a lookup
-            columns = [table.before, table.start - LANES * table.before, table.stop]
-            columns += [] if table.image is None else [table.image]
-            runs_of = zip(*(lax.split(x, [1] * runs, axis=1) for x in columns), strict=True)
-            begin, *found = next(runs_of)  # which begins at word 0
-            found = [jnp.broadcast_to(x, word.shape) for x in found]
-            for begin, *of_run in runs_of:
-                reached = word >= begin
+            columns = [table.before, table.start, table.stop, *([] if table.image is None else [table.image])]
+            found = [jnp.zeros_like(word) for _ in columns[1:]]
+            for begin, start, *others in zip(*(lax.split(x, [1] * runs, axis=1) for x in columns), strict=True):
+                begin = jnp.broadcast_to(begin, word.shape)
+                of_run, reached = [start + LANES * (word - begin), *others], word >= begin
                 found = [lax.select(reached, jnp.broadcast_to(x, word.shape), y) for x, y in zip(of_run, found, strict=True)]
-            first, stop, *of_image = found
-            first, image = first + LANES * word, of_image[0] if of_image else None
+            first, stop, image = found if table.image is not None else (*found, None)
         return jnp.minimum(first, self.sources.ids.size - LANES), stop, image
 
     def _test(self, first: Array, image: Array | None, query: list[Array], span: Span) -> Array:
@@ -377,21 +369,30 @@ class _Engine(NamedTuple):
         return windows(self.sources.ids, first) >= later[..., None]
 
     def _decide_doubtful(self, packed: Array, first: Array, image: Array | None, span: Span) -> Array:
-        """Decide doubtful candidates of words [b, words]: each row's first 32, in a part of the block at a time if it is large.
+        """Add the doubtful candidates that are pairs to the hits: [b, words] uint32, of which the lower half is set then.
 
-        Those that are decided are doubtful no longer, and hits if they are pairs.
+        A round decides the first 32 doubtful candidates of each row that has some, a part of the block at a time.
         """
         rows, width = packed.shape
         many = min(max(-(-rows // self.tuning.doubtful_share), self.tuning.doubtful_rows), rows)
+        whole, queue, waiting = many == rows, lax.iota(jnp.int32, rows), jnp.int32(0)
+        if not whole:
+            open_rows = jnp.max(packed, axis=1) > _HITS
+            until = jnp.cumsum(open_rows.astype(jnp.int32), dtype=jnp.int32)
+            waiting, queue = until[-1], jnp.full(rows + many, rows, jnp.int32)
+            queue = queue.at[jnp.where(open_rows, until - 1, rows + many)].set(lax.iota(jnp.int32, rows), mode="drop")
 
-        def decide(packed: Array, row: Array | None) -> Array:
-            here = lax.iota(jnp.int32, rows) if row is None else jnp.minimum(row, rows - 1)
-            asked = packed if row is None else jnp.where((row < rows)[:, None], packed[here], np.uint32(0))
-            bits = BitRows.of(asked >> np.uint32(LANES), self.tuning.by_bisection)
-            slot = lax.broadcasted_iota(jnp.int32, (here.size, _SLOTS), 1)
+        def decide_round(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            # The barrier keeps what follows in the loop: it is not worth computing where no round is needed.
+            _, at, packed, row = lax.optimization_barrier((*state, queue))
+            row = row if whole else lax.dynamic_slice_in_dim(row, at, many)
+            here = jnp.minimum(row, rows - 1)
+            both = packed if whole else jnp.where((row < rows)[:, None], packed[here], np.uint32(0))
+            asked = both >> np.uint32(LANES)
+            bits = BitRows.of(asked, self.tuning.in_groups)
+            slot = lax.broadcasted_iota(jnp.int32, (many, _SLOTS), 1)
             word, bit = bits.nth(slot)
-            if row is not None:
-                word = word + width * (here - lax.iota(jnp.int32, many))[:, None]
+            word = word if whole else word + width * (here - lax.iota(jnp.int32, many))[:, None]
             candidate = flat_take(first, word) + bit
 
             def points(at: Array | None) -> Pair:
@@ -400,31 +401,18 @@ class _Engine(NamedTuple):
                     of_row, source, of_word = here[at // _SLOTS], flat_take(source, at), flat_take(of_word, at)
                 return self._pair(span.first + of_row, source, None if image is None else flat_take(image, of_word))
 
-            pair, known = decide_some(slot < bits.total[:, None], points, self.cutoff, self.tuning.waits)
+            there = slot < bits.total[:, None]
+            pair = decide_pairs(there, points, self.cutoff)
             one = np.uint32(1) << bit.astype(jnp.uint32)
-            change = jnp.where(pair, one, np.uint32(0)) - (one << np.uint32(LANES))
-            word = jnp.where(known, word, packed.size)
-            return packed.reshape(-1).at[word].add(change, mode="drop").reshape(packed.shape)
+            change = jnp.where(pair, one, np.uint32(0)) - (one << np.uint32(LANES))  # doubtful no longer, and a hit if it is a pair
+            word = jnp.where(there, word, packed.size)
+            packed = packed.reshape(-1).at[word].add(change, mode="drop").reshape(packed.shape)
+            more = largest_of(bits.total) > _SLOTS
+            at = at if whole else jnp.where(more, at, at + many)
+            return more if whole else at < waiting, at, packed
 
-        if many < rows:
-            return self._decide_parts(packed, many, decide)
-        if self.tuning.waits:
-            return decide(packed, None)
-        return lax.cond(largest_of(packed) > _HITS, lambda packed: decide(packed, None), lambda packed: packed, packed)
-
-    def _decide_parts(self, packed: Array, many: int, decide: Callable[[Array, Array], Array]) -> Array:
-        """Decide the doubtful candidates of so many rows that have some, then of as many others, until all rows had their turn."""
-        rows = len(packed)
-        open_rows = jnp.max(packed, axis=1) > _HITS
-        until = jnp.cumsum(open_rows.astype(jnp.int32), dtype=jnp.int32)
-        queue = jnp.full(rows + many, rows, jnp.int32)
-        queue = queue.at[jnp.where(open_rows, until - 1, rows + many)].set(lax.iota(jnp.int32, rows), mode="drop")
-
-        def decide_part(now: tuple[Array, Array]) -> tuple[Array, Array]:
-            at, packed, row = lax.optimization_barrier((*now, queue))
-            return at + many, decide(packed, lax.dynamic_slice_in_dim(row, at, many))
-
-        return lax.while_loop(lambda now: now[0] < until[-1], decide_part, (jnp.int32(0), packed))[1]
+        more = largest_of(packed) > _HITS if whole else waiting > 0
+        return lax.while_loop(lambda state: state[0], decide_round, (more, jnp.int32(0), packed))[2]
 
     def _pair(self, place: Array, candidate: Array, image: Array | None) -> Pair:
         """Return the given (not wrapped) points of queries and candidates at these positions."""

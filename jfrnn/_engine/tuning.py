@@ -27,9 +27,7 @@ class Tuning(NamedTuple):
         searched: Up to so many sources, the table of cells is made by binary searches instead of by counting.
         doubtful_share: Rows with pairs that are decided exactly are processed in parts of a block, one of so many,
         doubtful_rows: but at least so many rows at a time.
-        waits: Whether the host waits for the device before each turn of a loop, and each condition, that the data decide; then it
-            takes less time to do what is hardly ever needed than to ask whether it is.
-        by_bisection: Whether the word of a slot is found by bisection instead of by looking at every word of its row.
+        in_groups: Whether the word of a slot is found in a group of words instead of by looking at every word of its row.
         group: Slots of a row that are filled at a time.
     """
 
@@ -40,8 +38,7 @@ class Tuning(NamedTuple):
     searched: int
     doubtful_share: int
     doubtful_rows: int
-    waits: bool
-    by_bisection: bool
+    in_groups: bool
     group: int
 
 
@@ -53,8 +50,7 @@ CPU = Tuning(  # a block fits into the caches, and loops cost little
     searched=0,
     doubtful_share=1,
     doubtful_rows=64,
-    waits=False,
-    by_bisection=False,
+    in_groups=False,
     group=128,
 )
 ACCELERATOR = Tuning(  # few large kernels, in at most 1 GB
@@ -64,9 +60,8 @@ ACCELERATOR = Tuning(  # few large kernels, in at most 1 GB
     least_sorted=33 << 10,
     searched=1 << 18,
     doubtful_share=16,
-    doubtful_rows=1 << 15,
-    waits=True,
-    by_bisection=True,
+    doubtful_rows=4096,
+    in_groups=True,
     group=256,
 )
 

@@ -23,22 +23,16 @@ def bit_counts(words: Array) -> Array:
     return lax.population_count(words).astype(jnp.int32)
 
 
-def sums_along(counts: Array, cumulate: bool) -> Array:
-    """Return the cumulative sums of rows [b, w], w being a multiple of 8: within groups of 8, then over the groups.
-
-    With `cumulate`, by cumulative sums, which XLA's CPU compiler makes chains of kernels; otherwise by sums of products. A barrier
-    keeps XLA's GPU compiler from adding up all words anew for each word.
-    """
-
-    def sums(x: Array) -> Array:
-        if cumulate:
-            return lax.cumsum(x, axis=x.ndim - 1)
-        return jnp.sum(x[..., None, :] * np.tril(np.ones((x.shape[-1], x.shape[-1]), np.int32)), axis=-1, dtype=jnp.int32)
-
-    rows, width = counts.shape
-    within = lax.optimization_barrier(sums(counts.reshape(rows, width // _GROUP, _GROUP)))
-    until = lax.optimization_barrier(sums(within[:, :, -1]))
-    return (within + (until - within[:, :, -1])[:, :, None]).reshape(rows, width)
+def sums_along(counts: Array, in_groups: bool) -> Array:
+    """Return the cumulative sums of rows [b, w], w being a multiple of 8. `in_groups` as in `BitRows`."""
+    if in_groups:
+        return jnp.cumsum(counts, axis=1, dtype=jnp.int32)
+    rows, width = counts.shape  # within groups of 8, then over the groups: XLA's CPU compiler makes chains of cumulative sums
+    groups = counts.reshape(rows, width // _GROUP, _GROUP)
+    within = jnp.sum(groups[:, :, None, :] * np.tril(np.ones((_GROUP, _GROUP), np.int32)), axis=3, dtype=jnp.int32)
+    earlier = np.tril(np.ones((width // _GROUP, width // _GROUP), np.int32), -1)
+    before = jnp.sum(within[:, None, :, -1] * earlier, axis=2, dtype=jnp.int32)
+    return (within + before[:, :, None]).reshape(rows, width)
 
 
 class BitRows(NamedTuple):
@@ -47,22 +41,22 @@ class BitRows(NamedTuple):
     Attributes:
         until: [b, w] int32, the number of set bits in the words of a row up to each word.
         before: [b, w] int32, the number of those before it, and in its lower half the word itself: one gather reads both.
-        by_bisection: Whether the word of a bit is found by bisection, which takes less time where gathers are cheap and is less to
-            compile; otherwise by looking at every word of the row, in a kernel of its own. Static.
+        in_groups: Whether groups of words are looked at before words, in one kernel, which takes less time where gathers are cheap;
+            otherwise every word of the row, in a kernel of its own. Static.
     """
 
     until: Array
     before: Array
-    by_bisection: bool
+    in_groups: bool
 
     @classmethod
-    def of(cls, words: Array, by_bisection: bool) -> "BitRows":
+    def of(cls, words: Array, in_groups: bool) -> "BitRows":
         """Prepare words, of which only the lower half is used."""
         hits = words & np.uint32((1 << LANES) - 1)
         count = bit_counts(hits)
-        until = lax.optimization_barrier(sums_along(count, by_bisection))
+        until = lax.optimization_barrier(sums_along(count, in_groups))
         before = lax.optimization_barrier(((until - count) << LANES) | hits.astype(jnp.int32))
-        return cls(until, before, by_bisection)
+        return cls(until, before, in_groups)
 
     @property
     def total(self) -> Array:
@@ -70,22 +64,21 @@ class BitRows(NamedTuple):
         return self.until[:, -1]
 
     def nth(self, ordinal: Array) -> tuple[Array, Array]:
-        """Find the ordinal-th set bit in each row: its bit [b, k] and its word, as a position in the words of all rows.
+        """Find the ordinal-th set bit in each row: its word, as a position in the words of all rows, and its bit [b, k].
 
         Ordinals outside [0, total) give any valid word and bit, which callers mask.
         """
         width = self.until.shape[1]
-        begin = width * lax.broadcasted_iota(jnp.int32, ordinal.shape, 0)
-        if self.by_bisection:
-            word, last = begin, begin + (width - 1)
-            for step in (1 << k for k in reversed(range((width - 1).bit_length()))):
-                above = flat_take(self.until, lax.min(word + np.int32(step - 1), last)) > ordinal
-                word = lax.select(above, word, word + np.int32(step))
-            word = lax.min(word, last)
+        begin = lax.broadcasted_iota(jnp.int32, ordinal.shape, 0) * width
+        if self.in_groups:
+            heads = self.until[:, _GROUP - 1 :: _GROUP][:, : (width - 1) // _GROUP]
+            word, last = begin + _count_not_above(heads, ordinal) * _GROUP, begin + (width - 1)
+            inside = [flat_take(self.until, jnp.minimum(word + k, last)) <= ordinal for k in range(_GROUP - 1)]
+            word = jnp.minimum(functools.reduce(jnp.add, inside, word), last)
             found = flat_take(self.before, word)
         else:
-            word = lax.optimization_barrier(begin + _count_not_above(self.until[:, :-1], ordinal))
-            found = lax.optimization_barrier(flat_take(self.before, word))
+            word = lax.optimization_barrier(begin + _count_not_above(self.until[:, : width - 1], ordinal))
+            found = lax.optimization_barrier(self.before.reshape(-1).at[word].get(mode="promise_in_bounds"))
         return word, _nth_bit(found & np.int32((1 << LANES) - 1), ordinal - (found >> LANES))
 
 
@@ -98,9 +91,10 @@ def _count_not_above(ascending: Array, value: Array) -> Array:
 
 def _nth_bit(word: Array, ordinal: Array) -> Array:
     """Return the position of the ordinal-th set bit of 16, by bisection; both int32."""
-    position, one = jnp.zeros_like(ordinal), np.int32(1)
+    position = jnp.zeros_like(ordinal)
     for width in (8, 4, 2, 1):
-        beyond = position + np.int32(width)
-        below = lax.population_count(word & ((one << beyond) - one))
-        position = lax.select(below > ordinal, position, beyond)
+        below = lax.population_count((word >> position) & np.int32((1 << width) - 1))
+        skip = ordinal >= below
+        ordinal = lax.select(skip, ordinal - below, ordinal)
+        position = lax.select(skip, position + np.int32(width), position)
     return position

@@ -18,6 +18,7 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -27,7 +28,6 @@ from jfrnn._geometry.floats import WHOLE_BITS, unit_scale
 from jfrnn._geometry.integers import (
     beside,
     carry_limbs,
-    fields_of,
     full_count,
     limb_bits,
     limb_product,
@@ -56,13 +56,12 @@ class Pair(NamedTuple):
     matrix: Array | None = None  # [d, d], one lattice vector per row, 0 for open axes
     orthogonal: bool = True
 
-    def lattice_terms(self) -> list[tuple[Array, Callable[[Array], Array]]]:
-        """Return shifts, one or [d, ...], and how to take of arrays like `matrix` what they multiply, to be summed: [d, ...]."""
-        if self.shift is None:
+    def lattice_terms(self, axis: int) -> list[tuple[Array, tuple[int, int]]]:
+        """Return shifts, and the places in `matrix` of what they multiply, which sum to the translation along an axis."""
+        if self.shift is None or self.matrix is None:
             return []
-        if self.orthogonal:
-            return [(jnp.stack(self.shift), lambda x: jnp.stack([x[k, k] for k in range(len(x))]))]
-        return [(shift[None], lambda x, k=k: x[k]) for k, shift in enumerate(self.shift)]
+        rows = [axis] if self.orthogonal else range(len(self.shift))  # twice the axes if `shift_in_given` split the shifts
+        return [(self.shift[k], (k, axis)) for k in rows]
 
 
 PointsAt = Callable[[Array | None], Pair]
@@ -161,11 +160,10 @@ def is_pair_of(
     no, yes, open_pair = np.arange(3, dtype=np.int8)
     step_one = jnp.where(asked & (square <= outside), jnp.where(square < inside, yes, open_pair), no)  # one int8 array, one kernel
 
-    def refine(step_one: Array) -> Array:
-        pair, known = decide_some(step_one == open_pair, slots.points, cutoff, waits=False)
-        return jnp.where(known, jnp.where(pair, yes, no), step_one)
+    def refine_open(step_one: Array) -> Array:
+        return (step_one == yes) | decide_pairs(step_one == open_pair, slots.points, cutoff)
 
-    return lax.while_loop(lambda step_one: largest_of(step_one) == open_pair, refine, step_one) == yes
+    return lax.cond(jnp.max(step_one, initial=no) == open_pair, refine_open, lambda step_one: step_one == yes, step_one)
 
 
 def flat_take(x: Array, at: Array) -> Array:
@@ -174,29 +172,25 @@ def flat_take(x: Array, at: Array) -> Array:
     return lax.gather(x.reshape(-1), at[..., None], dimensions, (1,), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
 
 
-def decide_some(asked: Array, points: PointsAt, cutoff: Cutoff | Cutoffs, waits: bool) -> tuple[Array, Array]:
-    """Decide pairs that step 1 left open: all by step 2, then by step 3 some of those that are left, but at least one.
+def decide_pairs(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
+    """Decide the pairs that step 1 left open by steps 2 and 3; False elsewhere.
 
-    `points(None)` returns both points of every pair in the shape of `asked`, and `points(at)` those at the flat indices `at`.
-    Returns which of the pairs are within the cutoff, and which are decided. With `waits`, step 3 is made even if there is nothing
-    left for it, which takes less time than that the host waits to learn so.
+    `points(None)` returns both points of every pair in the shape of `doubtful`, and `points(at)` those at the flat indices `at`.
     """
     pairs = points(None)
-    signs = jnp.where(asked, _fixed_sign(pairs, _threshold(pairs, cutoff)), 1).astype(jnp.int8)
+    signs = jnp.where(doubtful, _fixed_sign(pairs, _threshold(pairs, cutoff)), 1).astype(jnp.int8)
     chunk = min(_INTEGER_CHUNK, signs.size)
 
-    def decide_chunk(flat: Array) -> Array:
+    def decide_chunk(signs: Array) -> Array:
+        flat = signs.reshape(-1)
         first = jnp.minimum(lax.argmax(flat, 0, jnp.int32), flat.size - chunk)  # that of an unknown sign, the largest value
         here = points(first + lax.iota(jnp.int32, chunk))
         known = lax.dynamic_slice_in_dim(flat, first, chunk)
         known = jnp.where(known == _UNKNOWN, _integer_sign(here, _threshold(here, cutoff)).astype(jnp.int8), known)
-        return lax.dynamic_update_slice_in_dim(flat, known, first, axis=0)
+        return lax.dynamic_update_slice_in_dim(flat, known, first, axis=0).reshape(signs.shape)
 
-    flat = lax.optimization_barrier(signs.reshape(-1))  # else each of its readers would compute it
-    flat = decide_chunk(flat) if waits else lax.cond(largest_of(flat) == _UNKNOWN, decide_chunk, lambda flat: flat, flat)
-    signs = flat.reshape(signs.shape)
-    known = asked & (signs != _UNKNOWN)
-    return known & (signs <= 0 if cutoff.closed else signs < 0), known
+    signs = lax.while_loop(lambda signs: largest_of(signs) == _UNKNOWN, decide_chunk, signs)
+    return signs <= 0 if cutoff.closed else signs < 0
 
 
 class _Threshold(NamedTuple):
@@ -230,34 +224,37 @@ def _fixed_sign(pair: Pair, threshold: _Threshold) -> Array:
 
     A cutoff is below 4 in scaled lengths, and so is each component of a displacement that step 1 leaves open, up to its band.
     """
-    dim, dtype = len(pair.b), np.dtype(pair.b[0].dtype)
+    dtype = np.dtype(pair.a[0].dtype)
     fraction = fraction_bits(dtype, threshold.times)
     eps, bits = jnp.finfo(dtype).eps, limb_bits(dtype)
+    known, total = jnp.ones(pair.b[0].shape, bool), None
     unsigned, finfo = np.dtype(f"uint{8 * dtype.itemsize}").type, jnp.finfo(dtype)
     exponent = (lax.bitcast_convert_type(threshold.scale, unsigned) >> unsigned(finfo.nmant)).astype(jnp.int32)
     up = exponent + (fraction + bits + int(finfo.minexp) - finfo.nmant - (finfo.maxexp - 1))
-    ends = jnp.stack([*pair.b, *(jnp.broadcast_to(x, pair.b[0].shape) for x in pair.a)])  # [2 d, ...], in few kernels
-    numbers, known = _fixed_point(ends, up)
-    (b, *others), (a, *own) = ([x[half] for x in (ends, *numbers, known)] for half in (slice(dim), slice(dim, None)))
-    displacement, known = _add(_Fixed(*others[:2]), _Fixed(*own[:2]), -1), others[2] & own[2]
-    estimate, size = b - a, jnp.zeros((), dtype)
-    if pair.matrix is not None:
-        matrix = pair.matrix.reshape(*pair.matrix.shape, *[1] * (b.ndim - 1))
-        lattice, whole = _fixed_point(matrix, up)
-        known, size = known & whole.all(axis=(0, 1)), jnp.abs(a) + jnp.abs(b)
-        for shift, term in pair.lattice_terms():
-            displacement = _add(displacement, _Fixed(*map(term, lattice)), shift.astype(limb_type(dtype)))
-            along = shift * term(matrix)
-            estimate, size = estimate + along, size + jnp.abs(along)
+
+    def fixed(x: Array) -> _Fixed:
+        nonlocal known
+        number, whole = _fixed_point(x, up)
+        known = known & whole
+        return number
+
+    matrix = jnp.zeros((0, 0), dtype) if pair.matrix is None else pair.matrix
+    lattice = _fixed_point(matrix.reshape(*matrix.shape, *[1] * up.ndim), up)
+    for axis, (ak, bk) in enumerate(zip(pair.a, pair.b, strict=True)):
+        displacement, estimate = _add(fixed(bk), fixed(ak), -1), bk - ak
+        error = jnp.zeros((), dtype)
+        for shift, at in pair.lattice_terms(axis):
+            component, (number, whole) = matrix[at], jax.tree.map(lambda x, at=at: x[at], lattice)
+            known = known & whole
+            displacement = _add(displacement, number, shift.astype(limb_type(dtype)))
+            estimate = estimate + shift * component
+            error = error + 16 * eps * (jnp.abs(ak) + jnp.abs(bk) + jnp.abs(shift * component))
             known = known & (jnp.abs(shift) <= 2**WHOLE_BITS)
-    known = known & ((jnp.abs(estimate) + 16 * eps * size) * threshold.scale < 4.5)
-    limbs = [_of_axes(x, lax.add) for x in _square_limbs(displacement, threshold.times, bits)]
-    less, known = threshold.less, _of_axes(known, lax.bitwise_and)
-    if less is None:
-        radii = [_fixed_point(x, up) for x in threshold.radii]
-        known = functools.reduce(jnp.logical_and, (whole for _, whole in radii), known)
-        less = [-x for x in _square_limbs(functools.reduce(_add, (number for number, _ in radii)), 1, bits)]
-    return jnp.where(known, _sign_of_limbs([x + y for x, y in zip(limbs, less, strict=True)], bits), _UNKNOWN)
+        known = known & ((jnp.abs(estimate) + error) * threshold.scale < 4.5)
+        square = _square_limbs(displacement, threshold.times, bits)
+        total = square if total is None else [x + y for x, y in zip(total, square, strict=True)]
+    less = threshold.less or [-x for x in _square_limbs(functools.reduce(_add, map(fixed, threshold.radii)), 1, bits)]
+    return jnp.where(known, _sign_of_limbs([x + y for x, y in zip(total or [], less, strict=True)], bits), _UNKNOWN)
 
 
 class _Fixed(NamedTuple):
@@ -273,29 +270,21 @@ def _add(x: _Fixed, y: _Fixed, times: Array | int = 1) -> _Fixed:
 
 def _fixed_point(x: Array, up: Array) -> tuple[_Fixed, Array]:
     """Return x in the units of step 2, and whether it has no finer digits; `up` is where the lowest bit of denormals is there."""
-    dtype = np.dtype(x.dtype)
+    dtype, finfo = np.dtype(x.dtype), jnp.finfo(x.dtype)
     bits, width, whole = limb_bits(dtype), 8 * dtype.itemsize, limb_type(dtype)
-    unsigned = np.dtype(f"uint{width}").type
-    negative, place, mantissa = fields_of(x)
-    place = place + up  # of the lowest digit, in digits of `lower`
 
     def by(amount: Array) -> Array:  # the result of longer shifts would depend on the hardware
-        return jnp.clip(amount, 0, width - 1).astype(unsigned)
+        return lax.clamp(whole.type(0), amount, whole.type(width - 1))
 
-    finer = mantissa & ((unsigned(1) << by(-place)) - unsigned(1))
-    digits = mantissa >> by(-place)
-    left = jnp.maximum(place, 0)
-    upper = jnp.where(
-        left < bits, digits >> by(bits - left), jnp.where(left - bits < width, digits << by(left - bits), unsigned(0))
-    )
-    lower = jnp.where(left < bits, (digits << by(left)) & unsigned((1 << bits) - 1), unsigned(0))
-    signs = jnp.where(negative, -1, 1).astype(whole)
-    return _Fixed(upper.astype(whole) * signs, lower.astype(whole) * signs), finer == 0
-
-
-def _of_axes(x: Array, how: Callable[[Array, Array], Array]) -> Array:
-    """Combine the axes of [d, ...]. Other than a reduction, this is fused with what needs it."""
-    return functools.reduce(how, lax.split(x, [1] * len(x))).reshape(x.shape[1:])
+    word = lax.bitcast_convert_type(x, whole)
+    exponent = (word >> finfo.nmant) & ((1 << finfo.nexp) - 1)
+    mantissa = (word & ((1 << finfo.nmant) - 1)) | (jnp.minimum(exponent, 1) << finfo.nmant)
+    place = jnp.maximum(exponent, 1) + (up.astype(whole) - 1)  # of the lowest digit, in digits of `lower`
+    finer, left = by(-place), jnp.maximum(place, 0)
+    digits, sign = mantissa >> finer, (word >> (width - 1)) | 1
+    upper = jnp.where(left < bits + width, (digits >> by(bits - left)) << by(left - bits), 0)
+    lower = (digits << by(left)) & ((1 << bits) - 1)
+    return _Fixed(upper * sign, lower * sign), digits << finer == mantissa
 
 
 def _square_limbs(x: _Fixed, times: int, bits: int) -> list[Array]:
@@ -306,8 +295,7 @@ def _square_limbs(x: _Fixed, times: int, bits: int) -> list[Array]:
     upper = jnp.where(negative, jnp.where(lower == 0, -upper, ~upper), upper)
     lower = jnp.where(negative, -lower & mask, lower)
     limbs = [lower, upper & mask, (upper >> bits) & mask, upper >> (2 * bits)]
-    pairs = [[(i, k - i) for i in range(4) if 0 <= k - i <= i] for k in range(7)]
-    twice = [2 * limb for limb in limbs]
+    pairs, twice = [[(i, k - i) for i in range(4) if 0 <= k - i <= i] for k in range(7)], [2 * limb for limb in limbs]
     return [functools.reduce(lax.add, ((limbs if i == j else twice)[i] * limbs[j] for i, j in of_limb)) for of_limb in pairs]
 
 

@@ -41,22 +41,15 @@ def set_places(flags: Array, most: int) -> Array:
     return jnp.where(found < words, place, n)
 
 
-def largest_of(*arrays: Array) -> Array:
-    """Return the largest of integers >= 0: [] for one array of any shape, [k] for k arrays of one shape.
+def largest_of(x: Array) -> Array:
+    """Return the largest of integers >= 0, of any shape: [].
 
-    At least two are looked for at once, because XLA's CPU compiler splits a reduction of one array of integers into a chain of
-    kernels, which dominate the time to compile.
+    It is found twice at once, because XLA's CPU compiler splits a reduction of one array of integers into a chain of kernels, which
+    dominate the time to compile.
     """
-    found = largest_along(*(x.reshape(1, -1) for x in arrays))
-    return jnp.concatenate(found) if len(arrays) > 1 else found[0][0]
-
-
-def largest_along(*rows: Array) -> list[Array]:
-    """Return the largest integers >= 0 along the rows of each array [b, k], in one kernel: [b] each. See `largest_of`."""
-    given = rows if len(rows) > 1 else rows * 2
-    start = tuple(np.zeros((), x.dtype) for x in given)
-    found = lax.reduce(given, start, lambda a, b: tuple(map(lax.max, a, b)), (1,))
-    return list(found) if len(rows) > 1 else [lax.max(*found)]
+    x, zero = x.reshape(-1), np.zeros((), x.dtype)
+    twice = lax.reduce((x, x), (zero, zero), lambda a, b: (lax.max(a[0], b[0]), lax.max(a[1], b[1])), (0,))
+    return lax.max(*twice)
 
 
 def first_set(flags: Array, after: Array) -> Array:
