@@ -73,12 +73,13 @@ class BitRows(NamedTuple):
         if self.in_groups:
             heads = self.until[:, _GROUP - 1 :: _GROUP][:, : (width - 1) // _GROUP]
             word, last = begin + _count_not_above(heads, ordinal) * _GROUP, begin + (width - 1)
-            inside = [flat_take(self.until, jnp.minimum(word + k, last)) <= ordinal for k in range(_GROUP - 1)]
-            word = jnp.minimum(functools.reduce(jnp.add, inside, word), last)
+            until = (flat_take(self.until, lax.min(word + k, last)) for k in range(_GROUP - 1))
+            inside = ((x <= ordinal).astype(jnp.int32) for x in until)
+            word = lax.min(functools.reduce(jnp.add, inside, word), last)
             found = flat_take(self.before, word)
         else:
             word = lax.optimization_barrier(begin + _count_not_above(self.until[:, : width - 1], ordinal))
-            found = lax.optimization_barrier(self.before.reshape(-1).at[word].get(mode="promise_in_bounds"))
+            found = lax.optimization_barrier(flat_take(self.before, word))
         return word, _nth_bit(found & np.int32((1 << LANES) - 1), ordinal - (found >> LANES))
 
 
