@@ -17,7 +17,7 @@ from jax import Array, lax
 from jfrnn._engine.candidates import Candidates, Points, Span, Torus
 from jfrnn._engine.problem import Filter
 from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
-from jfrnn._engine.words import LANES, BitRows, bit_counts, take, windows
+from jfrnn._engine.words import LANES, BitRows, bit_counts, windows
 from jfrnn._geometry import (
     Cutoff,
     Cutoffs,
@@ -77,9 +77,9 @@ def list_neighbors(
                 start = jnp.minimum(g * group, capacity - group)
                 ordinal = (start + slots)[None] - count[:, None]
                 word, bit = bits.nth(ordinal)
-                neighbor = engine.sources.ids.at[take(first, word) + bit].get(mode="promise_in_bounds")
+                neighbor = flat_take(engine.sources.ids, flat_take(first, word) + bit)
                 if image is not None and images > 1:
-                    neighbor = neighbor + n * take(image, word)
+                    neighbor = neighbor + n * flat_take(image, word)
                 old = rows if group == capacity else lax.dynamic_slice_in_dim(rows, start, group, axis=1)
                 new = jnp.where((ordinal >= 0) & (ordinal < total[:, None]), neighbor, old)
                 return new if group == capacity else lax.dynamic_update_slice_in_dim(rows, new, start, axis=1)
@@ -154,10 +154,10 @@ def fold_neighbors(
                     done, state = state
                     ordinal = jnp.broadcast_to(done + slots, (span.size, slots.size))
                     word, bit = bits.nth(ordinal)
-                    source = engine.sources.ids.at[take(first, word) + bit].get(mode="promise_in_bounds")
+                    source = flat_take(engine.sources.ids, flat_take(first, word) + bit)
                     shift = None
                     if torus is not None and image is not None:
-                        shift = _shifts_of(torus, ids[:, None], source, take(image, word))
+                        shift = _shifts_of(torus, ids[:, None], source, flat_take(image, word))
                     return done + FOLD_GROUP, add(Slots(source, shift, ordinal < total[:, None]), state)
 
                 most = jnp.max(total)
@@ -250,7 +250,7 @@ class _Engine(NamedTuple):
             if self.candidates.in_order:
                 return rows
             place = jnp.zeros_like(ids).at[ids].set(lax.iota(jnp.int32, ids.size), unique_indices=True)
-            return [_at(x, place) for x in rows]
+            return [x.at[place].get(mode="promise_in_bounds") for x in rows]
 
         def put(b: Array, out: list[Array]) -> list[Array]:
             span = self.block(b)
@@ -311,18 +311,17 @@ class _Engine(NamedTuple):
                 run = jax.vmap(functools.partial(jnp.searchsorted, side="right"))(table.before, word).astype(jnp.int32) - 1
             else:
                 run = jnp.sum(word[..., None] >= table.before[:, None], axis=2, dtype=jnp.int32) - 1
-            first = take(table.start, run) + LANES * (word - take(table.before, run))
-            stop, image = take(table.stop, run), None if table.image is None else take(table.image, run)
+            run = run + runs * lax.broadcasted_iota(jnp.int32, run.shape, 0)
+            first = flat_take(table.start, run) + LANES * (word - flat_take(table.before, run))
+            stop, image = flat_take(table.stop, run), None if table.image is None else flat_take(table.image, run)
         else:  # a chain of selections takes half the time of a lookup
-            first, stop = jnp.zeros_like(word), jnp.zeros_like(word)
-            image = None if table.image is None else jnp.zeros_like(word)
-            for r in range(runs):
-                before = table.before[:, r, None]
-                reached = word >= before
-                first = jnp.where(reached, table.start[:, r, None] + LANES * (word - before), first)
-                stop = jnp.where(reached, table.stop[:, r, None], stop)
-                if image is not None and table.image is not None:
-                    image = jnp.where(reached, table.image[:, r, None], image)
+            columns = [table.before, table.start, table.stop, *([] if table.image is None else [table.image])]
+            found = [jnp.zeros_like(word) for _ in columns[1:]]
+            for begin, start, *others in zip(*(lax.split(x, [1] * runs, axis=1) for x in columns), strict=True):
+                begin = jnp.broadcast_to(begin, word.shape)
+                of_run, reached = [start + LANES * (word - begin), *others], word >= begin
+                found = [lax.select(reached, jnp.broadcast_to(x, word.shape), y) for x, y in zip(of_run, found, strict=True)]
+            first, stop, image = found if table.image is not None else (*found, None)
         return jnp.minimum(first, self.sources.ids.size - LANES), stop, image
 
     def _translations(self, torus: Torus, image: Array, span: Span) -> list[Array]:
@@ -405,8 +404,8 @@ class _Engine(NamedTuple):
             asked = both >> np.uint32(LANES)
             bits = BitRows.of(asked, self.tuning.in_groups)
             slot = lax.broadcasted_iota(jnp.int32, (many, _SLOTS), 1)
-            column, bit = bits.nth(slot)
-            word = here[:, None] * width + column
+            word, bit = bits.nth(slot)
+            word = word if whole else word + width * (here - lax.iota(jnp.int32, many))[:, None]
             candidate = flat_take(first, word) + bit
 
             def points(at: Array | None) -> Pair:
@@ -418,15 +417,12 @@ class _Engine(NamedTuple):
             there = slot < bits.total[:, None]
             pair = decide_pairs(there, points, self.cutoff)
             one = np.uint32(1) << bit.astype(jnp.uint32)
-            decided = jnp.where(there, one << np.uint32(LANES), np.uint32(0)) | jnp.where(pair, one, np.uint32(0))
-            of_column = lax.broadcasted_iota(jnp.int32, (many, width, _SLOTS), 1) == column[:, None]
-            change = lax.reduce(jnp.where(of_column, decided[:, None], np.uint32(0)), np.uint32(0), lax.bitwise_or, (2,))
-            both = both ^ change  # the bit of a doubtful candidate becomes 0, that of a pair 1
-            more = largest_of(both) > _HITS
-            if whole:
-                return more, at, both
-            at = jnp.where(more, at, at + many)
-            return at < waiting, at, packed.at[row].set(both, mode="drop", unique_indices=True)
+            change = jnp.where(pair, one, np.uint32(0)) - (one << np.uint32(LANES))  # doubtful no longer, and a hit if it is a pair
+            word = jnp.where(there, word, packed.size)
+            packed = packed.reshape(-1).at[word].add(change, mode="drop").reshape(packed.shape)
+            more = largest_of(bits.total) > _SLOTS
+            at = at if whole else jnp.where(more, at, at + many)
+            return more if whole else at < waiting, at, packed
 
         more = largest_of(packed) > _HITS if whole else waiting > 0
         return lax.while_loop(lambda state: state[0], decide_round, (more, jnp.int32(0), packed))[2]
@@ -437,18 +433,15 @@ class _Engine(NamedTuple):
         if isinstance(self.cutoff, Cutoffs):
             own, others = self.queries.radii, self.sources.radii
             radii = self.cutoff.of_pairs(
-                None if own is None else _at(own, place), None if others is None else _at(others, candidate)
+                None if own is None else flat_take(own, place), None if others is None else flat_take(others, candidate)
             )
         if torus is None or image is None:
-            return Pair([_at(x, place) for x in self.queries.axes], [_at(x, candidate) for x in self.sources.axes], radii)
-        i, j = _at(self.queries.ids, place), _at(self.sources.ids, candidate)
+            return Pair(
+                [flat_take(x, place) for x in self.queries.axes], [flat_take(x, candidate) for x in self.sources.axes], radii
+            )
+        i, j = flat_take(self.queries.ids, place), flat_take(self.sources.ids, candidate)
         (sources, queries), shifts = torus.raw, _shifts_of(torus, i, j, image)
         shift = list(jnp.moveaxis(shifts, -1, 0))
-        raw = [_at(x, i) for x in queries.T], [_at(x, j) for x in sources.T]
+        raw = [flat_take(x, i) for x in queries.T], [flat_take(x, j) for x in sources.T]
         matrix = torus.matrix.at[..., place].get(mode="promise_in_bounds") if torus.images.per_system else torus.matrix
         return Pair(*raw, radii, *shift_in_given(shift, torus.images.basis, matrix), torus.images.orthogonal)
-
-
-def _at(x: Array, places: Array) -> Array:
-    """Return x[places]; all places are valid."""
-    return x.at[places].get(mode="promise_in_bounds")

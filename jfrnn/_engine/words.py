@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._geometry import flat_take
+
 LANES = 16  # candidates per word: in a uint32 hits take the lower half, doubtful candidates the upper half
 _GROUP = 8  # words whose counts are added up together
 
@@ -19,12 +21,6 @@ def windows(x: Array, first: Array) -> Array:
 
 def bit_counts(words: Array) -> Array:
     return lax.population_count(words).astype(jnp.int32)
-
-
-def take(rows: Array, column: Array) -> Array:
-    """Return rows[i, column[i, k]] for rows [b, w] and columns [b, k]."""
-    flat = lax.broadcasted_iota(jnp.int32, column.shape, 0) * rows.shape[1] + column
-    return rows.reshape(-1).at[flat].get(mode="promise_in_bounds")
 
 
 def sums_along(counts: Array, in_groups: bool) -> Array:
@@ -68,35 +64,38 @@ class BitRows(NamedTuple):
         return self.until[:, -1]
 
     def nth(self, ordinal: Array) -> tuple[Array, Array]:
-        """Find the ordinal-th set bit in each row: its word and bit [b, k].
+        """Find the ordinal-th set bit in each row: its word, as a position in the words of all rows, and its bit [b, k].
 
         Ordinals outside [0, total) give any valid word and bit, which callers mask.
         """
-        last = self.until.shape[1] - 1
+        width = self.until.shape[1]
+        begin = lax.broadcasted_iota(jnp.int32, ordinal.shape, 0) * width
         if self.in_groups:
-            heads = self.until[:, _GROUP - 1 :: _GROUP][:, : last // _GROUP]
-            word = _count_not_above(heads, ordinal) * _GROUP
-            inside = [(take(self.until, jnp.minimum(word + k, last)) <= ordinal).astype(jnp.int32) for k in range(_GROUP - 1)]
-            word = jnp.minimum(functools.reduce(jnp.add, inside, word), last)
-            found = take(self.before, word)
+            heads = self.until[:, _GROUP - 1 :: _GROUP][:, : (width - 1) // _GROUP]
+            word, last = begin + _count_not_above(heads, ordinal) * _GROUP, begin + (width - 1)
+            until = (flat_take(self.until, lax.min(word + k, last)) for k in range(_GROUP - 1))
+            inside = ((x <= ordinal).astype(jnp.int32) for x in until)
+            word = lax.min(functools.reduce(jnp.add, inside, word), last)
+            found = flat_take(self.before, word)
         else:
-            word = lax.optimization_barrier(_count_not_above(self.until[:, :last], ordinal))
-            found = lax.optimization_barrier(take(self.before, word))
-        return word, _nth_bit(found.astype(jnp.uint32) & np.uint32((1 << LANES) - 1), ordinal - (found >> LANES))
+            word = lax.optimization_barrier(begin + _count_not_above(self.until[:, : width - 1], ordinal))
+            found = lax.optimization_barrier(flat_take(self.before, word))
+        return word, _nth_bit(found & np.int32((1 << LANES) - 1), ordinal - (found >> LANES))
 
 
 def _count_not_above(ascending: Array, value: Array) -> Array:
     """Count the entries of each row [b, w] that are <= value [b, k]."""
-    reached = ((ascending[:, i : i + 1] <= value).astype(jnp.int32) for i in range(ascending.shape[1]))
+    columns = (lax.slice_in_dim(ascending, i, i + 1, axis=1) for i in range(ascending.shape[1]))
+    reached = ((column <= value).astype(jnp.int32) for column in columns)
     return functools.reduce(jnp.add, reached, jnp.zeros_like(value))
 
 
 def _nth_bit(word: Array, ordinal: Array) -> Array:
-    """Return the position of the ordinal-th set bit of 16, by bisection."""
+    """Return the position of the ordinal-th set bit of 16, by bisection; both int32."""
     position = jnp.zeros_like(ordinal)
     for width in (8, 4, 2, 1):
-        below = bit_counts((word >> position.astype(jnp.uint32)) & np.uint32((1 << width) - 1))
+        below = lax.population_count((word >> position) & np.int32((1 << width) - 1))
         skip = ordinal >= below
-        ordinal = jnp.where(skip, ordinal - below, ordinal)
-        position = jnp.where(skip, position + width, position)
+        ordinal = lax.select(skip, ordinal - below, ordinal)
+        position = lax.select(skip, position + np.int32(width), position)
     return position

@@ -58,9 +58,8 @@ def cell_coordinate(x: Array, edge: Array) -> Array:
     return jnp.where(x < 0, -1 - quotient, quotient)
 
 
-def cell_remainder(x: Array, edge: Array) -> Array:
+def cell_remainder(x: Array, cell: Array, edge: Array) -> Array:
     """Return the distance of |x| from the start of its cell, exactly; in [0, edge) unless cells are too far away to resolve."""
-    cell = cell_coordinate(x, edge)
     return _remainder(jnp.abs(x), jnp.where(x < 0, -1 - cell, cell), edge)
 
 

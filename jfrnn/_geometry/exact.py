@@ -28,7 +28,6 @@ from jfrnn._geometry.floats import WHOLE_BITS, unit_scale
 from jfrnn._geometry.integers import (
     beside,
     carry_limbs,
-    fields_of,
     full_count,
     limb_bits,
     limb_product,
@@ -175,8 +174,9 @@ def is_pair_of(
 
 
 def flat_take(x: Array, at: Array) -> Array:
-    """Return the elements of x at flat indices."""
-    return x.reshape(-1).at[at].get(mode="promise_in_bounds")
+    """Return the elements of x at flat indices, all of which are valid."""
+    dimensions = lax.GatherDimensionNumbers(offset_dims=(), collapsed_slice_dims=(0,), start_index_map=(0,))
+    return lax.gather(x.reshape(-1), at[..., None], dimensions, (1,), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
 
 
 def decide_pairs(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
@@ -277,24 +277,21 @@ def _add(x: _Fixed, y: _Fixed, times: Array | int = 1) -> _Fixed:
 
 def _fixed_point(x: Array, up: Array) -> tuple[_Fixed, Array]:
     """Return x in the units of step 2, and whether it has no finer digits; `up` is where the lowest bit of denormals is there."""
-    dtype = np.dtype(x.dtype)
+    dtype, finfo = np.dtype(x.dtype), jnp.finfo(x.dtype)
     bits, width, whole = limb_bits(dtype), 8 * dtype.itemsize, limb_type(dtype)
-    unsigned = np.dtype(f"uint{width}").type
-    negative, place, mantissa = fields_of(x)
-    place = place + up  # of the lowest digit, in digits of `lower`
 
     def by(amount: Array) -> Array:  # the result of longer shifts would depend on the hardware
-        return jnp.clip(amount, 0, width - 1).astype(unsigned)
+        return lax.clamp(whole.type(0), amount, whole.type(width - 1))
 
-    finer = mantissa & ((unsigned(1) << by(-place)) - unsigned(1))
-    digits = mantissa >> by(-place)
-    left = jnp.maximum(place, 0)
-    upper = jnp.where(
-        left < bits, digits >> by(bits - left), jnp.where(left - bits < width, digits << by(left - bits), unsigned(0))
-    )
-    lower = jnp.where(left < bits, (digits << by(left)) & unsigned((1 << bits) - 1), unsigned(0))
-    signs = jnp.where(negative, -1, 1).astype(whole)
-    return _Fixed(upper.astype(whole) * signs, lower.astype(whole) * signs), finer == 0
+    word = lax.bitcast_convert_type(x, whole)
+    exponent = (word >> finfo.nmant) & ((1 << finfo.nexp) - 1)
+    mantissa = (word & ((1 << finfo.nmant) - 1)) | (jnp.minimum(exponent, 1) << finfo.nmant)
+    place = jnp.maximum(exponent, 1) + (up.astype(whole) - 1)  # of the lowest digit, in digits of `lower`
+    finer, left = by(-place), jnp.maximum(place, 0)
+    digits, sign = mantissa >> finer, (word >> (width - 1)) | 1
+    upper = jnp.where(left < bits + width, (digits >> by(bits - left)) << by(left - bits), 0)
+    lower = (digits << by(left)) & ((1 << bits) - 1)
+    return _Fixed(upper * sign, lower * sign), digits << finer == mantissa
 
 
 def _square_limbs(x: _Fixed, times: int, bits: int) -> list[Array]:
@@ -305,8 +302,8 @@ def _square_limbs(x: _Fixed, times: int, bits: int) -> list[Array]:
     upper = jnp.where(negative, jnp.where(lower == 0, -upper, ~upper), upper)
     lower = jnp.where(negative, -lower & mask, lower)
     limbs = [lower, upper & mask, (upper >> bits) & mask, upper >> (2 * bits)]
-    pairs = [[(i, k - i) for i in range(4) if 0 <= k - i < 4] for k in range(7)]
-    return [functools.reduce(jnp.add, (limbs[i] * limbs[j] for i, j in of_limb)) for of_limb in pairs]
+    pairs, twice = [[(i, k - i) for i in range(4) if 0 <= k - i <= i] for k in range(7)], [2 * limb for limb in limbs]
+    return [functools.reduce(lax.add, ((limbs if i == j else twice)[i] * limbs[j] for i, j in of_limb)) for of_limb in pairs]
 
 
 def _sign_of_limbs(limbs: list[Array], bits: int) -> Array:
