@@ -150,7 +150,7 @@ def neighbor_list(
     dr_threshold) wide, is served by measuring all n² pairs with it, as jax-md does in small boxes.
 
     Args:
-        displacement_or_metric: f(Ra, Rb, **kwargs), a vector or a distance [length].
+        displacement_or_metric: `f(Ra, Rb, **kwargs)`, a vector or a distance [length].
         box: Edge length, edge lengths [d], or a matrix [d, d] whose columns are the lattice vectors [length].
         r_cutoff: Distance within which pairs interact [length].
         dr_threshold: Skin [length]: the list holds pairs within r_cutoff + dr_threshold, and is rebuilt after half of that motion.
@@ -163,8 +163,8 @@ def neighbor_list(
         **static_kwargs: Not used, as in jax-md.
 
     Returns:
-        A `NeighborListFns`: allocate(position, extra_capacity=0, **kwargs), not inside jit, and update(position, neighbors,
-        **kwargs). Its lists are `NeighborList`.
+        A `NeighborListFns`: `allocate(position, extra_capacity=0, **kwargs)`, not inside jit, and
+        `update(position, neighbors, **kwargs)`. Its lists are `NeighborList`.
 
     Raises:
         ValueError, TypeError: an argument is of the wrong kind, shape or range.
