@@ -68,4 +68,5 @@ def test_notebooks_take_no_private_names():
     for path in NOTEBOOKS.glob("*.ipynb"):
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
         code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-        assert re.findall(r"\b(?:jfrnn|experiments)\.[\w.]*\b_\w+|import .*\b_\w+|\w\._(?!replace\b)[a-z]\w*", code) == [], path.name
+        private = r"\b(?:jfrnn|experiments)\.[\w.]*\b_\w+|import .*\b_\w+|\w\._(?!replace\b)[a-z]\w*"
+        assert re.findall(private, code) == [], path.name
