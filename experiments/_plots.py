@@ -61,9 +61,9 @@ def draw_all(rows: Sequence[SearchRow], folder: Path, origin: str) -> list[Path]
         ("memory_by_layout", memory, partial(_by_layout, good, memory, thesis_memory, MEGABYTES)),
         ("runtime_by_fill", seconds, partial(_by_fill, good, seconds, thesis_seconds, speed)),
         ("memory_by_fill", memory, partial(_by_fill, good, memory, thesis_memory, MEGABYTES)),
-        ("speed_against_error", seconds, partial(_against_error, good, seconds, speed, "Speed")),
-        ("memory_against_error", memory, partial(_against_error, good, memory, MEGABYTES, "Memory")),
-        ("speed_against_sum_error", density, partial(_against_sum_error, good)),
+        ("speed_against_error", seconds, partial(against_error, good, seconds, speed, "Speed")),
+        ("memory_against_error", memory, partial(against_error, good, memory, MEGABYTES, "Memory")),
+        ("speed_against_sum_error", density, partial(against_sum_error, good)),
     )
     pictures = {name: draw() for name, value, draw in wanted if any(value(row) is not None for row in good)}
     paths = []
@@ -214,7 +214,7 @@ def _draw_over_fill(axes: Axes, values: list[tuple[SearchRow, float]], shift: fl
     axes.plot(x, y, markersize=6, linewidth=1.2, **style)  # pyright: ignore[reportArgumentType]
 
 
-def _against_error(rows: list[SearchRow], value: Value, label: str, title: str) -> Figure:
+def against_error(rows: list[SearchRow], value: Value, label: str, title: str) -> Figure:
     """Draw a value over missing and extra pairs: exact methods stand on the left edge, good ones low."""
     methods = _methods(rows)
     figure, axes = _figure(
@@ -232,7 +232,7 @@ def _against_error(rows: list[SearchRow], value: Value, label: str, title: str) 
     return figure
 
 
-def _against_sum_error(rows: list[SearchRow]) -> Figure:
+def against_sum_error(rows: list[SearchRow]) -> Figure:
     """Draw time over the largest error of a sum over neighbors: what wrong pairs do, and rounding to sums without a list."""
     methods = _methods(rows)
     figure, axes = _figure(10.5, max(6.0, 2 + 0.2 * len(methods)), "Speed against the error of a sum over neighbors")

@@ -1,6 +1,8 @@
 """Notebooks run from the first cell to the last, in a short version."""
 
+import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -60,3 +62,11 @@ def test_notebook(name):
         said += (two.format("nanoflann-dynamic", "nanoflann-rebuild"),)
     assert f"pictures: {pictures}" in done.stdout
     assert [words for words in said if words not in done.stdout] == []
+
+
+def test_notebooks_take_no_private_names():
+    for path in NOTEBOOKS.glob("*.ipynb"):
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+        private = r"\b(?:jfrnn|experiments)\.[\w.]*\b_\w+|import .*\b_\w+|\w\._(?!replace\b)[a-z]\w*"
+        assert re.findall(private, code) == [], path.name
