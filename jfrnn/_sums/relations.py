@@ -271,7 +271,7 @@ def mark_rows(x: Array, good: Array) -> Array:
     return jnp.where(good.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.iinfo(x.dtype).min)
 
 
-def one_or_nan(good: Array, like: Array) -> Array:
+def one_or_nan(good: Array, like: Array | jax.ShapeDtypeStruct) -> Array:
     """Return 1 for good rows and NaN for others, in a shape that multiplies `like` [rows, ...]."""
     return jnp.where(good, 1, jnp.nan).astype(like.dtype).reshape(-1, *[1] * (like.ndim - 1))
 
