@@ -57,7 +57,7 @@ def _run(n: int, processes: int, threads: int, calls: int) -> float:
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
     with ExitStack() as stack:
         pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": environment}
-        made = [stack.enter_context(subprocess.Popen(words, **pipes)) for _ in range(processes)]
+        made: list[Any] = [stack.enter_context(subprocess.Popen(words, **pipes)) for _ in range(processes)]
         _hear(made)
         begin = perf_counter()
         for each in made:
