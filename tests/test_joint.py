@@ -107,3 +107,14 @@ def test_more_numbers_than_are_summed_together_stay_apart():
     assert count_calls(both, x) == 2
     one, two = jax.jit(both)(x)
     assert_near(two, 2 * one)
+
+
+def test_many_operations_before_a_sum_take_no_time():
+    """Each is an operand of the next one twice: who followed all ways through them would not come to an end."""
+
+    def after_many(x):
+        for _ in range(60):
+            x = x * x - x * (x - 1)
+        return density_and_force(x, jnp.asarray(M, x.dtype) * jnp.ones(N).at[0].set(1))
+
+    assert count_calls(after_many, jnp.asarray(X, jnp.float32)) == 1
