@@ -64,7 +64,10 @@ def _run(n: int, processes: int, threads: int, calls: int) -> float:
             each.stdin.write("\n")
             each.stdin.flush()
         _hear(made)
-        return perf_counter() - begin
+        seconds = perf_counter() - begin
+        if any(each.wait() for each in made):
+            raise RuntimeError("a process failed, or found a wrong answer")
+        return seconds
 
 
 def _hear(made: list[Any]) -> None:
@@ -74,18 +77,22 @@ def _hear(made: list[Any]) -> None:
 
 
 def main(n: int, threads: int, calls: int) -> None:
-    """Compile a search for each thread, and when a line comes, let each make its calls, waiting for every one."""
+    """Compile a search for each thread, and when a line comes, let each make its calls, waiting for every one.
+
+    The first and the last answer of each must be the same, and their counts those of another program.
+    """
     import jax
 
-    searches = [_compile(jax, n, k) for k in range(threads)]
+    searches, found = [_compile(jax, n, k) for k in range(threads)], dict[int, Any]()
+    expected = [search() for search in searches]
     start = threading.Barrier(threads + 1)
 
-    def work(search: Callable[[], Any]) -> None:
+    def work(k: int) -> None:
         start.wait()
         for _ in range(calls):
-            search()
+            found[k] = searches[k]()
 
-    workers = [threading.Thread(target=work, args=(search,)) for search in searches]
+    workers = [threading.Thread(target=work, args=(k,)) for k in range(threads)]
     for worker in workers:
         worker.start()
     print("ready", flush=True)
@@ -94,6 +101,9 @@ def main(n: int, threads: int, calls: int) -> None:
     for worker in workers:
         worker.join()
     print("done", flush=True)
+    for k in range(threads):
+        if not all(np.array_equal(*pair) for pair in zip(found[k], expected[k], strict=True)):
+            raise RuntimeError(f"the answer of thread {k} changed")
 
 
 def _compile(jax: Any, n: int, k: int) -> Callable[[], Any]:  # noqa: ANN401
@@ -101,17 +111,18 @@ def _compile(jax: Any, n: int, k: int) -> Callable[[], Any]:  # noqa: ANN401
 
     x = jax.numpy.asarray(np.random.default_rng(k).random((n, 3)), jax.numpy.float32)
     cutoff = (3 * NEIGHBORS / (4 * math.pi * n)) ** (1 / 3)
-    capacity = jfrnn.search(x, cutoff).idx.shape[1]
+    known = jfrnn.search(x, cutoff)
 
     @jax.jit
     def search(x: Any) -> Any:  # noqa: ANN401
-        nbrs = jfrnn.search(x, cutoff, capacity=capacity)
+        nbrs = jfrnn.search(x, cutoff, capacity=known.capacity)
         return nbrs.idx, nbrs.count
 
     def call() -> Any:  # noqa: ANN401
         return jax.block_until_ready(search(x))
 
-    call()
+    if not np.array_equal(call()[1], known.count):
+        raise RuntimeError("counts differ from those of an eager search")
     return call
 
 

@@ -24,6 +24,7 @@ from jfrnn._sums.terms import Derived, Groups, Term, choose, join, make_term
 from jfrnn._tracing import Aval, Internal
 
 _MOST = 16  # numbers that are summed together for each particle: registers have to hold them
+_DEPTH = 6  # operations behind a value that are looked at: an operand may be used twice by each
 _PLACE = "jfrnn sums"  # where the sums of a module are, among what JAX keeps of it while it is lowered
 # Operations that may stand wherever their operands are known: they do nothing but compute.
 _PURE = (
@@ -105,13 +106,13 @@ def _operation_of(value: Internal) -> Internal:
     return getattr(value.owner, "operation", None)
 
 
-def _describe(value: Internal) -> Internal:
+def _describe(value: Internal, depth: int = _DEPTH) -> Internal:
     """Return what is equal for equal values: how they are computed, or the value itself. Each sum writes down its own constants."""
     operation = _operation_of(value)
-    if operation is None or operation.name not in _MOVABLE:
+    if depth == 0 or operation is None or operation.name not in _MOVABLE:
         return value
     named = tuple((name, operation.attributes[name]) for name in operation.attributes)
-    return operation.name, named, value.type, value.result_number, tuple(map(_describe, operation.operands))
+    return operation.name, named, value.type, value.result_number, tuple(_describe(x, depth - 1) for x in operation.operands)
 
 
 # --- numbers that are the same in all rows ----------------------------------------------------------------------------
@@ -135,15 +136,17 @@ def _number_of(x: _Known) -> _Known | None:
     return None if number is None else _Known(number, ShapedArray((), x.aval.dtype))
 
 
-def _find_number(value: Internal) -> Internal:
+def _find_number(value: Internal, depth: int = _DEPTH) -> Internal:
     operation = _operation_of(value)
     if _rank(value) == 0:
         return value
-    if operation is None or operation.name not in _ARITHMETIC:
+    if depth == 0 or operation is None or operation.name not in _ARITHMETIC:
         return None
-    numbers = [_find_number(x) for x in operation.operands]
-    if operation.name == "stablehlo.broadcast_in_dim" or any(x is None for x in numbers):
-        return numbers[0] if len(numbers) == 1 else None
+    numbers = [_find_number(x, depth - 1) for x in operation.operands]
+    if any(x is None for x in numbers):
+        return None
+    if operation.name == "stablehlo.broadcast_in_dim":
+        return numbers[0]
     return ir.Operation.create(operation.name, [numbers[0].type], numbers).results[0]
 
 
@@ -188,12 +191,13 @@ def _join(first: _Lowered, term: Term, operands: Groups) -> tuple[Term, Groups] 
     return derived.term, choose(both, derived.needed)
 
 
-def _is_known(value: Internal, at: Internal) -> bool:
+def _is_known(value: Internal, at: Internal, depth: int = _DEPTH) -> bool:
     """Say whether a value is known where an operation stands; what can be computed there already is moved there."""
     operation = _operation_of(value)
     if operation is None or operation.block != at.block or operation.is_before_in_block(at):
         return True
-    if operation.name not in _MOVABLE or not all(_is_known(x, at) for x in operation.operands):
+    movable = depth > 0 and operation.name in _MOVABLE
+    if not movable or not all(_is_known(x, at, depth - 1) for x in operation.operands):
         return False
     operation.move_before(at)
     return True
