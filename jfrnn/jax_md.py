@@ -293,12 +293,17 @@ class NeighborListMultiImage:
     @property
     def receivers(self) -> Array:
         """Particles i, of sparse formats."""
-        return self.idx[0]
+        return self._pairs("receivers")[0]
 
     @property
     def senders(self) -> Array:
         """Neighbors j, of sparse formats."""
-        return self.idx[1]
+        return self._pairs("senders")[1]
+
+    def _pairs(self, name: str) -> tuple[Array, Array]:
+        if isinstance(self.idx, tuple):
+            return self.idx
+        raise ValueError(f"{name} property not available for Dense format: read idx.")
 
     @property
     def n_node(self) -> int:
@@ -313,6 +318,8 @@ class NeighborListMultiImage:
     @property
     def max_neighbors(self) -> int:
         """Places of each particle, of the dense format."""
+        if isinstance(self.idx, tuple):
+            raise ValueError("max_neighbors property only available for Dense format: read max_occupancy.")
         return self.max_occupancy
 
 
