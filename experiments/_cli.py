@@ -32,6 +32,7 @@ class Bench(_commands.Commands):
         name.removesuffix("_report"): (f"experiments.bench.{name}", "command", text)
         for name, text in {
             "crossover": "Time the backends over sizes.",
+            "crystals": "Time batches of crystals in cells of their own.",
             "distributed": "Time lists, sums and fluids on 1 to k devices.",
             "domain": "Time what empty space costs.",
             "house": "Count files, lines and floors.",

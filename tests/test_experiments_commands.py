@@ -22,22 +22,8 @@ ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
 TOP = ("run", "report", "tables", "merge", "list", "show", "export", "gpu", "bench", "sph")
 BENCH = (
-    *(
-        "crossover",
-        "distributed",
-        "domain",
-        "house",
-        "arrays",
-        "latency",
-        "lj",
-        "options",
-        "peers",
-        "skin",
-        "start",
-        "structures",
-        "sums",
-    ),
-    *("ties", "triangles", "use"),
+    *("crossover", "crystals", "distributed", "domain", "house", "arrays", "latency", "lj", "options", "peers", "skin", "start"),
+    *("structures", "sums", "ties", "triangles", "use"),
 )
 SPH = ("run", "validate", "speed", "gradients")
 COMMANDS = (*TOP[:8], *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))

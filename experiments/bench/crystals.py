@@ -1,0 +1,174 @@
+"""What batches of crystals cost, each in a cell of its own, beside nvalchemi's batches and vesin, which is called for each."""
+
+import functools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import typer
+from jax import Array
+
+import jfrnn
+from experiments import _machine, _measure, methods
+from experiments._library import round_capacity
+from experiments.bench import table
+
+SIZES = ("1x32", "16x64", "64x100", "256x100", "64x1000")
+CUTOFF, DENSITY = 5.0, 0.1  # Å, atoms/Å³
+ROUNDED = 1e-3  # share of the particles whose counts of a peer may differ: its distances are rounded
+COLUMNS = (
+    *("platform", "systems", "atoms", "who", "what", "pairs", "images", "waited_ms", "repeats", "wrong", "status", "reason"),
+    *("others_cores", "device", "jax", "warp", "peer", "commit", "dirty"),
+)
+SHOWN = ("systems", "atoms", "who", "what", "pairs", "images", "waited_ms", "wrong", "reason")
+
+
+class _Scene(NamedTuple):
+    """Systems of so many atoms at random in skewed cells of their own, and the neighbors that each atom has."""
+
+    x: np.ndarray
+    batch: np.ndarray
+    cells: np.ndarray
+    counts: np.ndarray
+    images: int | tuple[int, ...] | None
+
+    @property
+    def capacity(self) -> int:
+        """Slots of a row."""
+        return round_capacity(int(self.counts.max()))
+
+
+class _Way(NamedTuple):
+    """Who does what: `make` returns a call, and what reads the counts of its result."""
+
+    who: str
+    what: str
+    make: Callable[[_Scene], tuple[Callable[[], Any], Callable[[Any], np.ndarray]]]
+    method: str | None = None
+    package: str = "jfrnn"
+
+
+def command(
+    out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform.")] = Path("out") / "crystals",
+    sizes: Annotated[list[str] | None, typer.Option(help="Systems x atoms of each, as 256x100; may be said several times.")] = None,
+    repeats: Annotated[int, typer.Option(min=2, max=100_000, help="Waited calls of each.")] = 100,
+) -> str:
+    """Time batches of crystals in cells of their own: jfrnn, nvalchemi and (on the CPU) vesin, where they are installed.
+
+    Atoms are random, float32, 0.1 of them per cubic unit, in cells skewed by up to a tenth, within a cutoff of 5. Calls are
+    compiled, with positions and cells as arguments, and waited for; vesin is called once for each system. Answers are compared with
+    those of k-d trees in float64; of ways whose answers are wrong, no time is taken.
+    """
+    asked = [_read_size(size) for size in sizes or SIZES]
+    parts = [(f"{systems} x {atoms}", functools.partial(_rows, systems, atoms, repeats)) for systems, atoms in asked]
+    there = sorted({way.method for way in _ways() if way.method is not None and methods.lacks(way.method) is None})
+    return table.text(table.measure(out, jax.default_backend(), parts, [repeats, there], COLUMNS), SHOWN)
+
+
+def _read_size(size: str) -> tuple[int, int]:
+    systems, _, atoms = size.partition("x")
+    if not (systems.isdecimal() and atoms.isdecimal() and 0 < int(systems) * int(atoms) < 10**8):
+        raise typer.BadParameter(f"{size}: say systems x atoms of each, as 256x100", param_hint="--sizes")
+    return int(systems), int(atoms)
+
+
+def _rows(systems: int, atoms: int, repeats: int) -> Iterator[table.Line]:
+    """Yield a row for each way; those whose answers are right are timed in turns."""
+    scene, calls, rows = _make_scene(systems, atoms), dict[str, Callable[[], Any]](), dict[str, table.Line]()
+    for way in _ways():
+        name = f"{way.who} {way.what}"
+        row: table.Line = {"systems": systems, "atoms": atoms, "who": way.who, "what": way.what, "pairs": int(scene.counts.sum())}
+        rows[name] = row | {"images": str(scene.images or "nearest")}
+        if way.method is not None and (missing := methods.lacks(way.method)) is not None:
+            rows[name] |= {"status": "missing", "reason": missing}
+            continue
+        try:
+            call, read = way.make(scene)
+            wrong = int((read(call()) != scene.counts).sum())
+        except Exception as error:  # what a peer raises is its answer
+            rows[name] |= {"status": "failed", "reason": " ".join(f"{type(error).__name__}: {error}".split())[:200]}
+            continue
+        rows[name] |= {"wrong": wrong, "status": "ok", "peer": _machine.versions([way.package]).get(way.package)}
+        if wrong > (0 if way.method is None else ROUNDED * len(scene.x)):
+            rows[name] |= {"status": "failed", "reason": f"the answer is wrong for {wrong} particles"}
+        else:
+            calls[name] = call
+    seconds, others = _measure.time_in_turns(calls, repeats)
+    for name, each in seconds.items():
+        rows[name] |= {"waited_ms": 1e3 * float(np.median(each)), "repeats": repeats, "others_cores": others}
+    yield from rows.values()
+
+
+def _make_scene(systems: int, atoms: int) -> _Scene:
+    random = np.random.default_rng(atoms)
+    edge = (atoms / DENSITY) ** (1 / 3)
+    cells = (edge * (np.eye(3) + 0.1 * random.uniform(-1, 1, (systems, 3, 3)))).astype(np.float32)
+    x = np.einsum("snd,sdk->snk", random.random((systems, atoms, 3)), cells).astype(np.float32)
+    counts = np.concatenate([_count(*each) for each in zip(x.astype(float), cells.astype(float), strict=True)])
+    kind = jfrnn.search(x[0], CUTOFF, box=jfrnn.Box(cells), batch=np.zeros(atoms, np.int32), capacity=1, backend="jax").box_kind
+    images = None if kind is None or kind.nearest else kind.reach
+    return _Scene(x.reshape(-1, 3), np.repeat(np.arange(systems, dtype=np.int32), atoms), cells, counts, images)
+
+
+def _count(x: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """Count the neighbors of the atoms of a system by k-d trees of all images within reach."""
+    from scipy.spatial import KDTree
+
+    reach = np.ceil(CUTOFF * np.linalg.norm(np.linalg.inv(cell), axis=0) + 1).astype(int)
+    shifts = np.stack(np.meshgrid(*(np.arange(-k, k + 1) for k in reach), indexing="ij"), -1).reshape(-1, 3) @ cell
+    everywhere = KDTree((x[None] + shifts[:, None]).reshape(-1, 3))
+    return np.asarray(everywhere.query_ball_point(x, CUTOFF, return_length=True)) - 1
+
+
+# --- who does what ------------------------------------------------------------------------------------------------------------
+
+
+def _ways() -> Iterator[_Way]:
+    yield _Way("jfrnn", "counts", functools.partial(_ours, lists=False))
+    yield _Way("jfrnn", "list", functools.partial(_ours, lists=True))
+    yield _Way("nvalchemi", "list", _nvalchemi, "nvalchemi", "nvalchemi-toolkit-ops")
+    if jax.default_backend() == "cpu":
+        yield _Way("vesin", "list", _vesin, "vesin", "vesin")
+
+
+def _ours(scene: _Scene, lists: bool) -> tuple[Callable[[], Any], Callable[[Any], np.ndarray]]:
+    def find(x: Array, batch: Array, cells: Array) -> list[Array]:
+        box = jfrnn.Box(cells, images=scene.images)
+        if not lists:
+            return [jfrnn.count(x, CUTOFF, box=box, batch=batch)]
+        nbrs = jfrnn.search(x, CUTOFF, box=box, batch=batch, capacity=scene.capacity)
+        return [nbrs.count, nbrs.idx, *([] if nbrs.images is None else [nbrs.images.codes])]
+
+    compiled, given = jax.jit(find), [jnp.asarray(part) for part in (scene.x, scene.batch, scene.cells)]
+    return lambda: jax.block_until_ready(compiled(*given)), lambda found: np.asarray(found[0])
+
+
+def _nvalchemi(scene: _Scene) -> tuple[Callable[[], Any], Callable[[Any], np.ndarray]]:
+    from nvalchemiops.jax.neighbors.batch_naive import batch_naive_neighbor_list  # pyright: ignore
+    from nvalchemiops.jax.neighbors.neighbor_utils import compute_naive_num_shifts  # pyright: ignore
+
+    systems, atoms = len(scene.cells), len(scene.x) // len(scene.cells)
+    periodic, starts = jnp.ones((systems, 3), bool), jnp.arange(systems + 1, dtype=jnp.int32) * atoms
+    ranges, shifts, most = compute_naive_num_shifts(jnp.asarray(scene.cells), CUTOFF, periodic)
+    known = {"shift_range_per_dimension": ranges, "num_shifts_per_system": shifts, "max_shifts_per_system": int(most)}
+    known |= {"max_atoms_per_system": atoms, "max_neighbors": scene.capacity, "batch_ptr": starts, "pbc": periodic}
+    compiled = jax.jit(lambda x, batch, cells: batch_naive_neighbor_list(x, CUTOFF, batch_idx=batch, cell=cells, **known)[:3])
+    given = [jnp.asarray(part) for part in (scene.x, scene.batch, scene.cells)]
+    return lambda: jax.block_until_ready(compiled(*given)), lambda found: np.asarray(found[1])
+
+
+def _vesin(scene: _Scene) -> tuple[Callable[[], Any], Callable[[Any], np.ndarray]]:
+    from vesin import NeighborList  # pyright: ignore
+
+    find, systems = NeighborList(cutoff=CUTOFF, full_list=True), len(scene.cells)
+    each = list(zip(scene.x.astype(float).reshape(systems, -1, 3), scene.cells.astype(float), strict=True))
+
+    def call() -> list[tuple[np.ndarray, ...]]:
+        return [find.compute(points=x, box=cell, periodic=True, quantities="ijS") for x, cell in each]
+
+    return call, lambda found: np.concatenate(
+        [np.bincount(i, minlength=len(x)) for (i, *_), (x, _) in zip(found, each, strict=True)]
+    )
