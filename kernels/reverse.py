@@ -6,7 +6,7 @@ from jfrnn.kernels._native import program
 from jfrnn.kernels._program import Entry, Kernel, declare
 
 ROWS_AT_ONCE = 64  # that a thread of the CPU takes
-LANES = 8  # of CUDA that serve a row, or a source
+LANES_PER_SLOT = 8  # on CUDA
 
 
 @functools.cache

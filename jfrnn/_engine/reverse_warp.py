@@ -45,7 +45,7 @@ def _plan_collect(by_source: bool, double: bool, cuda: bool, shapes: Shapes, _: 
     (n, width), slots = shapes["sums"], shapes["slots"]
     found = reverse.collect_kernel(width, double, by_source, cuda)
     numbers = {"n": n, "capacity": slots[-1], "all": shapes["values"][0]}
-    launch = Launch(found, reverse.LANES * n) if cuda else share(found, n, reverse.ROWS_AT_ONCE)
+    launch = Launch(found, reverse.LANES_PER_SLOT * n) if cuda else share(found, n, reverse.ROWS_AT_ONCE)
     return Plan([launch] if cuda else [Clear("info", 8), launch], numbers)
 
 
@@ -59,7 +59,7 @@ def _reverse_callable(code_bytes: int, images: int, cuda: bool) -> Call:
 def _plan_reverse(code_bytes: int, images: int, cuda: bool, shapes: Shapes, _: int) -> Plan:
     n, capacity = shapes["idx"]
     clear, find = reverse.reverse_kernels(code_bytes, cuda)
-    launch = Launch(find, reverse.LANES * n) if cuda else share(find, n, reverse.ROWS_AT_ONCE)
+    launch = Launch(find, reverse.LANES_PER_SLOT * n * capacity) if cuda else share(find, n, reverse.ROWS_AT_ONCE)
     first = Launch(clear, n * capacity if cuda else 1)
     return Plan([Clear("info", 8), first, launch], {"n": n, "capacity": capacity, "images": images})
 

@@ -1,47 +1,41 @@
-// Reverse slots on CUDA: eight lanes take the row of i, and for each pair (i, j) in it read the row of j until i is found. Pairs whose
-// j comes before i are found from the other side.
+// Reverse slots on CUDA: for the pair (i, j) in a row of i, eight lanes read the row of j together until i is found. Pairs whose j
+// comes before i are found from the other side.
 #pragma once
 #include "reverse.h"
 
 struct Reverse : ListOfRows {
-    static constexpr unsigned int ALL_LANES = 0xffffffffu;
-    const int lane, group;  // of the lanes of a row, and of the rows of a warp
-    const int i;
-    JFRNN_MEMBER explicit Reverse(const ReverseArguments& given)
-        : ListOfRows(given), lane(threadIdx.x & 7), group(threadIdx.x >> 3 & 3), i((int)(thread_index() >> 3)) {}
+    JFRNN_MEMBER explicit Reverse(const ReverseArguments& given) : ListOfRows(given) {}
 
+    // A lane reads four ids of 32 at a time: at once, where rows begin at multiples of 16 bytes.
     JFRNN_MEMBER void run() const {
-        for (int first = 0; __any_sync(ALL_LANES, first < capacity); first += 8) {
-            const int place = first + lane;
-            const int mine = i < n && place < capacity ? idx[i * capacity + place] : n;
-            if (!__any_sync(ALL_LANES, mine < n))  // unused slots come last
-                break;
-            unsigned int left = of_row(mine < n && mine >= i);
-            while (__any_sync(ALL_LANES, left != 0)) {
-                const int which = left ? __ffs(left) - 1 : 0;
-                find(first + which, __shfl_sync(ALL_LANES, mine, which, 8), left != 0);
-                left &= left - 1;
-            }
-        }
-    }
-    // What the lanes of this row say.
-    JFRNN_MEMBER unsigned int of_row(bool said) const { return __ballot_sync(ALL_LANES, said) >> 8 * group & 0xff; }
-    // Finds i in the row of j, its neighbor at a place. The lanes read 32 ids at a time, eight that follow each other at once.
-    JFRNN_MEMBER void find(int place, int j, bool searching) const {
-        const int slot = i * capacity + place, row = j * capacity, code = searching ? opposite(code_at(slot)) : 0;
+        constexpr unsigned int ALL_LANES = 0xffffffffu;
+        const long long thread = thread_index();
+        const int slot = (int)(thread >> 3), lane = (int)(thread & 7);
+        const bool there = thread >> 3 < (long long)none();
+        const int i = there ? slot / capacity : 0, j = there ? idx[slot] : n;
+        const int code = j < n ? opposite(code_at(slot)) : 0, row = j < n ? j * capacity : 0;
+        int found = capacity;
+        bool searching = j < n && j >= i;
         for (int b = 0; __any_sync(ALL_LANES, searching); b += 32) {
-            bool found = false;
+            const int from = b + 4 * lane;
             if (searching)
 #pragma unroll
-                for (int k = 0; k < 4; ++k) {
-                    const int there = b + 8 * k + lane, at = row + there;
-                    if (there < capacity && idx[at] == i && (CODE_BYTES == 0 || code_at(at) == code)) {
-                        slots[slot] = at;
-                        slots[at] = slot;
-                        found = true;
-                    }
+                for (int k = 3; k >= 0; --k) {
+                    const int place = from + k;
+                    const bool same = place < capacity && idx[row + place] == i;
+                    if (same && (CODE_BYTES == 0 || code_at(row + place) == code))
+                        found = place;
                 }
-            searching = of_row(found) == 0 && searching && b + 32 < capacity;
+#pragma unroll
+            for (int step = 4; step > 0; step /= 2) {
+                const int other = __shfl_xor_sync(ALL_LANES, found, step);
+                found = other < found ? other : found;
+            }
+            searching = searching && found == capacity && b + 32 < capacity;
+        }
+        if (found < capacity && lane == 0) {
+            slots[slot] = row + found;
+            slots[row + found] = slot;
         }
     }
     // Before that, no slot has any.
