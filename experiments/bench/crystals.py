@@ -108,7 +108,8 @@ def _make_scene(systems: int, atoms: int) -> _Scene:
     cells = (edge * (np.eye(3) + 0.1 * random.uniform(-1, 1, (systems, 3, 3)))).astype(np.float32)
     x = np.einsum("snd,sdk->snk", random.random((systems, atoms, 3)), cells).astype(np.float32)
     counts = np.concatenate([_count(*each) for each in zip(x.astype(float), cells.astype(float), strict=True)])
-    kind = jfrnn.search(x[0], CUTOFF, box=jfrnn.Box(cells), batch=jnp.zeros(atoms, jnp.int32), capacity=1, backend="jax").box_kind
+    some, of_first = jnp.asarray(x[0]), jnp.zeros(atoms, jnp.int32)
+    kind = jfrnn.search(some, CUTOFF, box=jfrnn.Box(cells), batch=of_first, capacity=1).box_kind
     images = None if kind is None or kind.nearest else kind.reach
     return _Scene(x.reshape(-1, 3), np.repeat(np.arange(systems, dtype=np.int32), atoms), cells, counts, images)
 
