@@ -1,5 +1,7 @@
 """The pair decision alone: any finite floats, by brute force over few points, against the oracle."""
 
+import itertools
+
 import checked
 import hypothesis
 import jax.numpy as jnp
@@ -92,8 +94,14 @@ def test_every_step_agrees_with_fractions(dtype, offset):
     np.testing.assert_array_equal(np.where(sign == _UNKNOWN, exact, sign), exact)
 
 
-@pytest.mark.parametrize("orthogonal", [True, False])
-@pytest.mark.parametrize("size", [1.0, 2.0**-22, 2.0**39])
+LATTICES = list(itertools.product((1.0, 2.0**-22, 2.0**39), (True, False), (np.float32, np.float64)))
+OFTEN = [each for each in LATTICES if each[2] is np.float32 or each[:2] == (1.0, False)]  # wide integers take long to compile
+
+
+@pytest.mark.parametrize(
+    ("size", "orthogonal", "dtype"),
+    [pytest.param(*each, marks=[pytest.mark.slow] * (each not in OFTEN)) for each in LATTICES],
+)
 def test_steps_agree_in_lattices(size, orthogonal, dtype):
     """Ties and near ties on a coarse lattice of points, far from the origin too, with images a few to a thousand cells away."""
     rng = np.random.default_rng(11)

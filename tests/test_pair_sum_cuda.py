@@ -160,12 +160,12 @@ def test_auto_takes_the_kernel_on_cuda_and_jax_elsewhere(monkeypatch):
     problem, inputs = check_problem(x, 1.0, None, None, None, "gather", False, False, False, "auto", 0.0, None)
     monkeypatch.setattr("jfrnn._sums.verb.platform_of", lambda *_: "gpu")
     for backend in ("auto", "warp"):
-        options = _with_engine(problem.options, inputs, backend)
+        options = _with_engine(problem.options, inputs, backend == "auto")
         assert (options.engine.name, options.may_change) == ("warp", backend == "auto")
     monkeypatch.setattr("jfrnn._sums.verb.platform_of", lambda *_: "rocm")
-    assert _with_engine(problem.options, inputs, "auto").engine.name == "jax"
+    assert _with_engine(problem.options, inputs, True).engine.name == "jax"
     with pytest.raises(ValueError, match="on the platform 'rocm', only on the CPU and on CUDA"):
-        _with_engine(problem.options, inputs, "warp")
+        _with_engine(problem.options, inputs, False)
 
 
 def test_a_box_holds_as_many_particles_as_their_numbers_leave_room_for(monkeypatch):

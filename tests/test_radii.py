@@ -277,7 +277,7 @@ X, H = np.zeros((4, 3), np.float32), np.ones(4, np.float32)
 @pytest.mark.parametrize(
     ("error", "match", "make"),
     [
-        (ValueError, r"radius_rule must be one of 'gather'.*got 'sum'", lambda: jfrnn.search(X, H, radius_rule="sum")),
+        (ValueError, r"radius_rule must be one of 'gather'.*got 'total'", lambda: jfrnn.search(X, H, radius_rule="total")),
         (
             ValueError,
             r"cutoff must be a number, or have shape \[4\], one per particle, got shape \[3\]",
