@@ -57,7 +57,8 @@ def test_signs(name, boxed, scene, monkeypatch):
     assert exchange.signs_of(seen[0]) == expected
 
 
-@pytest.mark.parametrize("name", ["several", pytest.param("differences", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["several", "differences"])
+@pytest.mark.slow
 def test_derivatives_are_the_same(name, scene, monkeypatch):
     x, data, moved = scene
     fn, box = FUNCTIONS[name][0], jfrnn.Box(np.full(3, SIDE))

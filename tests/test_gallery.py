@@ -19,7 +19,7 @@ CHECKS = {
     "gear": "x, vertices, faces = main(n=40, chunks=2, faces=200); assert np.isfinite(x).all() and x[:, 1].max() < 20",
     "devices": "x, device = main(n=300, chunks=1); assert (np.bincount(device) > 60).all() and len(np.bincount(device)) == 4",
 }
-SLOW = ("gear", "devices")
+SLOW = ("dam_break", "learned", "gear", "devices")
 RUN = """
 import importlib, json, sys
 import matplotlib

@@ -183,7 +183,10 @@ def test_too_many_slots_are_refused():
 MEASURED = [(box, dim, scale) for box in BOXES for dim in (2, 3) for scale in (1.0,)] + [("open", 3, 1e-24), ("nearest", 3, 1e15)]
 
 
-@pytest.mark.parametrize(("box", "dim", "scale"), MEASURED)
+@pytest.mark.parametrize(
+    ("box", "dim", "scale"),
+    [pytest.param(*each, marks=[pytest.mark.slow] * (each[:2] != ("open", 2) and each[1] == 2)) for each in MEASURED],
+)
 @pytest.mark.parametrize("skin", [0.0, 0.05])
 def test_distances_are_the_lengths_of_vectors(box, dim, scale, skin, dtype):
     """Of points of which two coincide and two nearly do, in rows whose length is no multiple of four; derivatives, too."""

@@ -111,8 +111,9 @@ def rates(model, s):
 
 @pytest.mark.parametrize(
     ("name", "settings"),
-    [("jet", {"layers": 3, "duration": 5e-4}), pytest.param("dam-break-2d", {"nx": 4}, marks=pytest.mark.slow)],
+    [("jet", {"layers": 3, "duration": 5e-4}), ("dam-break-2d", {"nx": 4})],
 )
+@pytest.mark.slow
 def test_rows_that_nobody_reads_may_be_left_out(name, settings):
     scene = fluids.fluid(name, **settings)
     near = scene.positions.copy()
@@ -131,6 +132,7 @@ def test_walls_among_the_fluid_leave_no_rows_out():
     assert make_model(fluids.fluid("cavity", nx=8)).fluid_count is None
 
 
+@pytest.mark.slow
 def test_edges_of_a_list_are_pairs_of_it():
     scene = speed.set_in_motion(fluids.fluid("drop", nx=6), 50.0)
     model, s = make_model(scene), make_state(scene)
