@@ -121,3 +121,19 @@ def test_many_operations_before_a_sum_take_no_time():
         return density_and_force(x, m)
 
     assert count_calls(after_many, jnp.asarray(X, jnp.float32), jnp.asarray(M, jnp.float32)) == 1
+
+
+@pytest.mark.parametrize("backend", ["warp", "auto"])
+def test_terms_that_no_kernel_holds_together_stay_apart(backend, monkeypatch):
+    """Each has fewer operations than a kernel may have, both together have more."""
+    monkeypatch.setattr("jfrnn._sums.scalars.MOST_SCALARS", 80)
+    x = jnp.asarray(X, jnp.float32)
+
+    def sines(k):
+        return lambda r, i, j: functools.reduce(lambda y, n: jnp.sin(y / 2 + (k + n)), range(10), r @ r)
+
+    def both(x, backend=backend):
+        return [jfrnn.pair_sum(sines(k), x, CUTOFF, backend=backend) for k in (1.1, 2.3)]
+
+    assert count_calls(both, x) == 2
+    assert_near(jax.jit(both)(x), both(x, "brute"))

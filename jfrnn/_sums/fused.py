@@ -69,7 +69,12 @@ def is_fused(inputs: Inputs, options: Options, term: Term) -> bool:
     """Say whether this engine computes a sum: it was chosen by name, or by "auto" and supports the term."""
     if not options.engine.translates:
         return False
-    return not options.may_change or _why_not(term, *_kind(inputs)) is None
+    return not options.may_change or can_sum(inputs, term)
+
+
+def can_sum(inputs: Inputs, term: Term) -> bool:
+    """Say whether this engine supports a term."""
+    return _why_not(term, *_kind(inputs)) is None
 
 
 def check(inputs: Inputs, options: Options, term: Term) -> None:

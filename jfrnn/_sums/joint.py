@@ -19,6 +19,7 @@ from jax import Array
 from jax.core import ShapedArray
 from jax.interpreters import mlir
 
+from jfrnn._sums.fused import can_sum
 from jfrnn._sums.relations import is_fused
 from jfrnn._sums.terms import Derived, Groups, Term, choose, join, make_term
 from jfrnn._tracing import Aval, Internal
@@ -76,12 +77,14 @@ def lower_sum(
         inside = ctx.replace(avals_in=[x.aval for x in given])
         return list(lower(inside, *(x.value for x in given), term=term, structure=structure, compensated=compensated))
 
-    if not is_fused(jax.tree.unflatten(structure, [x.aval for x in pairs]), term):
+    relation = jax.tree.unflatten(structure, [x.aval for x in pairs])
+    if not is_fused(relation, term):
         return place(pairs, term, operands)
     same = tuple(_describe(x.value) for x in pairs), structure, compensated
     before = getattr(ctx.module_context, "lowering_cache", {}).setdefault(_PLACE, [])
     for other in reversed(before):
-        if other.same == same and (joined := _join(other, term, operands)) is not None:
+        joined = _join(other, term, operands) if other.same == same else None
+        if joined is not None and can_sum(relation.inputs, joined[0]):
             with ir.InsertionPoint(other.results[0]):
                 found = place(other.pairs, *joined)
             for operation, result in zip(other.results, found, strict=False):
