@@ -121,7 +121,6 @@ def two_devices() -> str:
     rows = [*read("distributed/h200_x2.jsonl"), *read("distributed/h200_x2_64m.jsonl")]
     lines = []
     for alone in (row for row in rows if row["devices"] == 1):
-        pair = one((row for row in rows if row["devices"] == 2), work=alone["work"], scaling=alone["scaling"])
         both = [r for r in rows if r["devices"] == 2 and (r["work"], r["scaling"]) == (alone["work"], alone["scaling"])]
         ratio = 1.0 if alone["scaling"] == "strong" else 1.5
         pair = next(r for r in both if ratio <= r["particles"] / alone["particles"] <= 2)

@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,42 +9,27 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.launch import Call, Shapes, kernel
-from jfrnn._engine.operands import lattice_numbers, particle_rows, periodic_kind, space_flags
+from jfrnn._engine.operands import lattice_numbers, particle_rows, periodic_kind
 from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.problem import Filter, Rows, Search, largest_radius
+from jfrnn._engine.variants import Variant, absent, describe_call, plan_numbers
 from jfrnn._geometry import Lattice, Status, Wrapped, sort_into_boxes
 from jfrnn.kernels import boxes
 
 _GIVEN = ("positions", "queries", "boxes", "axes", "asked", "ids", "order", "visits", "cells", "start")
 
 
-class _Variant(NamedTuple):
-    """All that is static about a search, apart from shapes."""
-
-    dim: int
-    double: bool
-    scaled: bool
-    lists: bool
-    own: bool
-    closed: bool
-    keep: Filter
-    periodic: int
-    cuda: bool
-
-
 def box_neighbors(search: Search, keep: Filter, capacity: int | None) -> Rows:
     """List the neighbors of every query, or only count them (capacity=None), where each system has a box of its own."""
-    dims = {"count": search.sizes[1], "info": 2}
-    dims |= {} if capacity is None else {"idx": (search.sizes[1], capacity)}
-    double, dim = search.sources.dtype == jnp.float64, search.sources.shape[1]
-    own, kind = search.queries is None, periodic_kind(search.torus)
+    m, dim, double = search.sizes[1], search.sources.shape[1], search.sources.dtype == jnp.float64
+    dims = {"idx": (m, capacity), "count": m, "info": 2}
+    kind = (search.queries is None, search.cutoff.closed, keep, periodic_kind(search.torus), True)
+    variant = Variant(dim, double, search.cutoff.scaled, capacity is not None, *kind)
 
     def on(cuda: bool) -> Callable[..., list[Array]]:
-        lists, closed, scaled = capacity is not None, search.cutoff.closed, search.cutoff.scaled
-        call = _callable(_Variant(dim, double, scaled, lists, own, closed, keep, kind, cuda))
-        return lambda *given: call(*given, output_dims=dims)
+        return functools.partial(_callable(variant, cuda), output_dims=dims)
 
-    count, info, *idx = lax.platform_dependent(*_operands(search), cpu=on(False), cuda=on(True))
+    *idx, count, info = lax.platform_dependent(*_operands(search), cpu=on(False), cuda=on(True))
     overflow = jnp.where(capacity is not None and info[0] > (capacity or 0), Status.ROW_OVERFLOW.value, 0)
     return Rows(idx[0] if idx else None, count, info[0], overflow.astype(jnp.int32))
 
@@ -82,21 +66,15 @@ def _numbers(search: Search, lattice: Lattice, wrapped: Wrapped) -> Array:
 
 
 @kernel
-def _callable(variant: _Variant) -> Call:
-    flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
-    flags |= {**space_flags(variant.periodic), "own": variant.own, "closed": variant.closed}
-    flags |= {"dropself": variant.keep.drop_self, "later": variant.keep.later_only}
-    name = f"jfrnn_box_rows_{'cuda' if variant.cuda else 'cpu'}_{variant.dim}d"
-    results = dict.fromkeys(["count", "info", *["idx"] * variant.lists], np.int32)
-    return Call("_".join([name, *(flag for flag, on in flags.items() if on)]), _GIVEN, results, functools.partial(_plan, variant))
+def _callable(variant: Variant, cuda: bool) -> Call:
+    plan = functools.partial(_plan, variant, cuda)
+    return describe_call("box_rows_cuda" if cuda else "box_rows_cpu", variant, plan, _GIVEN, more=())
 
 
-def _plan(variant: _Variant, shapes: Shapes, _: int) -> Plan:
-    n, m = shapes["positions"][0], shapes["queries"][0]
-    found = boxes.rows_kernel(variant.dim, variant.double, variant.scaled, variant.lists, variant.periodic, variant.cuda)
-    numbers = {"n": n, "m": m, "stride": shapes["axes"][1], "own": variant.own, "closed": variant.closed}
-    numbers |= {"drop_self": variant.keep.drop_self, "later_only": variant.keep.later_only}
-    numbers |= {"capacity": shapes["idx"][1] if variant.lists else 0}
-    launch = Launch(found, boxes.threads(m)) if variant.cuda else share(found, m, boxes.QUERIES_AT_ONCE)
-    pages = [] if variant.cuda or not variant.lists else ask_for_huge_pages("idx", 4 * m * numbers["capacity"])
-    return Plan([Clear("info", 8), *pages, launch], numbers, [] if variant.lists else ["idx"])
+def _plan(variant: Variant, cuda: bool, shapes: Shapes, _: int) -> Plan:
+    kind = (variant.dim, variant.double, variant.scaled, variant.lists, variant.periodic)
+    found, numbers = boxes.rows_kernel(*kind, cuda), plan_numbers(variant, shapes) | {"stride": shapes["axes"][1]}
+    m = numbers["m"]
+    launch = Launch(found, boxes.threads(m)) if cuda else share(found, m, boxes.QUERIES_AT_ONCE)
+    pages = [] if cuda or not variant.lists else ask_for_huge_pages("idx", 4 * m * numbers["capacity"])
+    return Plan([Clear("info", 8), *pages, launch], numbers, absent(variant))

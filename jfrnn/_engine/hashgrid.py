@@ -13,7 +13,8 @@ from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.plans import Clear, Kept, Launch, Plan, ask_for_huge_pages
 from jfrnn._engine.problem import Kind, Options, Rows, Search
 from jfrnn._engine.start import INSTALL, load_warp
-from jfrnn._engine.warp import Variant, call_kernels, check_platform, describe_call, missing, plan_numbers
+from jfrnn._engine.variants import Variant, describe_call, plan_numbers
+from jfrnn._engine.warp import call_kernels, check_platform, missing
 from jfrnn.kernels import _clang, hashgrid
 
 HashGrid = Any  # the type of Warp, which cannot be named before it is imported

@@ -184,7 +184,7 @@ def prepare_search(inputs: Inputs, options: Options) -> Search:
     given, queries, active, box, cutoff, batch = take_present(asked)
     sources, images = hide_inactive(given, active), options.images
     if box is not None and box.per_system and batch is not None:
-        return _prepare_boxes(asked, Search(sources, queries, make_one(cutoff), batch, None, {}), options)
+        return _prepare_boxes(asked, active, Search(sources, queries, _one_cutoff(cutoff), batch, None, {}), options)
     batch = None if batch is None else rank_systems(batch)
     checks: dict[Status, Array] = {}
     if isinstance(cutoff, Radii):
@@ -199,17 +199,20 @@ def prepare_search(inputs: Inputs, options: Options) -> Search:
     return Search(sources, queries, cutoff, batch, (lattice, wrapped), checks)
 
 
-def make_one(cutoff: Cutoff | Radii) -> Cutoff:
+def _one_cutoff(cutoff: Cutoff | Radii) -> Cutoff:
     """Return the one cutoff of all particles."""
     if isinstance(cutoff, Radii):
         raise TypeError("a search with a box per system has one cutoff.")
     return cutoff
 
 
-def _prepare_boxes(asked: Inputs, search: Search, options: Options) -> Search:
-    """Prepare the operands of a search with a box per system; system numbers become those of the nearest box that there is."""
+def _prepare_boxes(asked: Inputs, present: Array | None, search: Search, options: Options) -> Search:
+    """Prepare the operands of a search with a box per system; system numbers become those of the nearest box that there is.
+
+    `present` [n] are the particles that take part, which have a box (`take_present`).
+    """
     box, batch, images = asked.box, search.batch, options.images
-    if box is None or batch is None or images is None:
+    if box is None or batch is None or images is None or present is None:
         raise TypeError("a search with a box per system needs boxes and a batch.")
     boxes = len(box.vectors)
     named = [(batch.sources >= -1) & (batch.sources < boxes)]
@@ -220,10 +223,9 @@ def _prepare_boxes(asked: Inputs, search: Search, options: Options) -> Search:
     lattice = make_lattice(box, images, np.dtype(search.sources.dtype))
     wrapped = wrap(search.sources, search.queries, lattice, largest_radius(search.cutoff), nearest)
     right = (wrapped.enough & is_valid(lattice))[nearest.sources]
-    there = has_box(batch.sources, boxes) if asked.active is None else has_box(batch.sources, boxes) & asked.active
     checks = {
         Status.SYSTEM_WITHOUT_BOX: functools.reduce(jnp.logical_and, (x.all() for x in named)),
-        Status.BOX_TOO_SMALL: (right | ~there).all(),
+        Status.BOX_TOO_SMALL: (right | ~present).all(),
         Status.OUT_OF_RANGE: (wrapped.met & TOO_FAR) == 0,
     }
     return search._replace(batch=nearest, torus=(lattice, wrapped), checks=checks)

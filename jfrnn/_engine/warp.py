@@ -8,7 +8,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,18 +18,17 @@ from jfrnn._engine.arrays import levels_of
 from jfrnn._engine.boxes_warp import box_neighbors
 from jfrnn._engine.launch import Call, Shapes, kernel, open_native
 from jfrnn._engine.levels_warp import level_neighbors
-from jfrnn._engine.operands import MOST_IN_BOX, pack_particles, periodic_kind, space_flags
+from jfrnn._engine.operands import MOST_IN_BOX, pack_particles, periodic_kind
 from jfrnn._engine.plans import HugePages, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.problem import Engine, Filter, Kind, Options, Rows, Search, largest_radius
 from jfrnn._engine.start import check_warp
+from jfrnn._engine.variants import Variant, absent, describe_call, plan_numbers
 from jfrnn._geometry import Cutoffs
 from jfrnn.kernels import _driver, cells_cpu, cells_cuda, few_cuda
-from jfrnn.kernels._native import table_cells
 
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
 _CELLS = {"cpu": cells_cpu, "cuda": cells_cuda}
 QUERIES_PER_THREAD = 1024  # on the CPU, at least: among 1000, to wake a second thread takes as long as it saves
-_PARTICLES = ("positions", "queries", "cutoff")  # what kernels of cells are given
 
 
 @dataclasses.dataclass(frozen=True)  # all are one
@@ -108,20 +107,6 @@ def _all_meet(sizes: tuple[int, int], scaled: bool) -> bool:
     return not scaled and max(sizes) <= few_cuda.MOST
 
 
-class Variant(NamedTuple):
-    """All that is static about an engine call, apart from shapes."""
-
-    dim: int
-    double: bool
-    scaled: bool
-    lists: bool
-    own: bool
-    closed: bool
-    keep: Filter
-    periodic: int = 0  # 1: nearest images, 2: images are told apart; two more where the lattice is skewed
-    batched: bool = False
-
-
 def missing(platform: str) -> str | None:
     """Say what keeps Warp from running on a JAX platform; None: nothing does."""
     try:
@@ -193,34 +178,13 @@ def _few_callable(variant: Variant) -> Call:
     return describe_call("few_cuda", variant, functools.partial(_plan_few, variant))
 
 
-def describe_call(name: str, variant: Variant, plan: Callable[[Shapes, int], Plan]) -> Call:
-    """Return what XLA calls for rows or counts: its name tells the kernels, and all that is static."""
-    flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
-    flags |= {**space_flags(variant.periodic), "batched": variant.batched}
-    flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
-    whole = "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
-    results = [*["idx"] * variant.lists, "count", "info", "scratch"]
-    return Call(whole, _PARTICLES, dict.fromkeys(results, np.int32), plan)
-
-
-def plan_numbers(variant: Variant, shapes: Shapes) -> dict[str, int]:
-    """Return the numbers that kernels of cells take, by name; without rows the capacity is 0."""
-    flags = {"closed": variant.closed, "drop_self": variant.keep.drop_self, "later_only": variant.keep.later_only}
-    capacity = shapes["idx"][1] if variant.lists else 0
-    return size_numbers(shapes, variant.own) | {"capacity": capacity, **flags}
-
-
-def _absent(variant: Variant) -> list[str]:
-    return [] if variant.lists else ["idx"]
-
-
 def _plan_on_cuda(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan:
     kind = {"periodic": variant.periodic, "batched": variant.batched}
     dim, later = variant.dim, variant.keep.later_only
     kernels = cells_cuda.cell_kernels(dim, variant.double, variant.scaled, variant.lists, later, **kind)
     numbers = plan_numbers(variant, shapes)
     return Plan(
-        place_launches(kernels.launches(numbers["n"], numbers["m"], variant.own, multiprocessors)), numbers, _absent(variant)
+        place_launches(kernels.launches(numbers["n"], numbers["m"], variant.own, multiprocessors)), numbers, absent(variant)
     )
 
 
@@ -230,7 +194,7 @@ def _plan_few(variant: Variant, shapes: Shapes, _: int) -> Plan:
     query = few_cuda.rows_kernel(
         few_cuda.warps(numbers["m"]), variant.dim, variant.double, variant.lists, variant.batched, variant.periodic == 1
     )
-    return Plan([Launch(query, few_cuda.threads(numbers["m"]))], numbers, _absent(variant))
+    return Plan([Launch(query, few_cuda.threads(numbers["m"]))], numbers, absent(variant))
 
 
 def place_launches(launches: Sequence[cells_cuda.Launch]) -> list[Launch]:
@@ -244,15 +208,9 @@ def _plan_on_cpu(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan
     numbers = plan_numbers(variant, shapes)
     rows = ask_for_huge_pages("idx", 4 * numbers["m"] * numbers["capacity"]) if variant.lists else []
     steps = [*sort_on_cpu(kernels, numbers["n"]), *rows, share(kernels.query, numbers["m"], QUERIES_PER_THREAD)]
-    return Plan(steps, numbers, _absent(variant))
+    return Plan(steps, numbers, absent(variant))
 
 
 def sort_on_cpu(kernels: cells_cpu.Kernels, n: int) -> list[Launch | HugePages]:
     """Return what sorts sources and queries by cell; several threads put the coordinates of many sources in order."""
     return [Launch(kernels.build), *([share(kernels.gather, n)] if n >= cells_cpu.MANY else [])]
-
-
-def size_numbers(shapes: Shapes, own: bool) -> dict[str, int]:
-    """Return n, m, own and the cells of the table, as all kernels of cells take them."""
-    n, m = shapes["positions"][0], shapes["queries"][0]
-    return {"n": n, "m": m, "own": int(own), "table": table_cells(n)}

@@ -15,7 +15,8 @@ from jfrnn._engine.operands import pack_particles, periodic_kind, space_flags
 from jfrnn._engine.plans import Launch, Plan, share
 from jfrnn._engine.problem import Filter, Search
 from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText
-from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, place_launches, size_numbers, sort_on_cpu
+from jfrnn._engine.variants import size_numbers
+from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, place_launches, sort_on_cpu
 from jfrnn._geometry import Cutoffs
 from jfrnn.kernels import cells_cpu, cells_cuda, few_cuda, pair_sum_cpu, pair_sum_cuda
 

@@ -5,8 +5,8 @@
 
 constexpr int SUMMANDS = TOTALS + ROW_SUMS;
 
-// Where sums of queries go, a row each: the first ones to `sums`, those that are left to `more`. `errors` is what rounding took, in sums that are carried in twice the precision; of extremes
-// it has the source and the code of the image of each, as integers among floats.
+// Where sums of queries go, a row each: the first ones to `sums`, those that are left to `more`. `errors` is what rounding took, in sums
+// that are carried in twice the precision; of extremes it has the source and the code of the image of each, as integers among floats.
 struct SumRows {
     real *sums, *errors;
     int n;  // sources: that number of one is none

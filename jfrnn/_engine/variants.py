@@ -1,0 +1,65 @@
+"""What is static about a call of kernels that list or count neighbors, and what follows from that: its name, and its numbers."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jfrnn._engine.launch import Call, Shapes
+from jfrnn._engine.operands import space_flags
+from jfrnn._engine.plans import Plan
+from jfrnn._engine.problem import Filter
+from jfrnn.kernels._native import table_cells
+
+_PARTICLES = ("positions", "queries", "cutoff")  # what kernels of cells are given
+
+
+class Variant(NamedTuple):
+    """All that is static about an engine call, apart from shapes."""
+
+    dim: int
+    double: bool
+    scaled: bool
+    lists: bool
+    own: bool
+    closed: bool
+    keep: Filter
+    periodic: int = 0  # 1: nearest images, 2: images are told apart; two more where the lattice is skewed
+    batched: bool = False
+
+
+def describe_call(
+    name: str,
+    variant: Variant,
+    plan: Callable[[Shapes, int], Plan],
+    given: Sequence[str] = _PARTICLES,
+    more: Sequence[str] = ("scratch",),
+) -> Call:
+    """Return what XLA calls for rows or counts: its name tells the kernels, and all that is static.
+
+    It is `given` arrays of these names, and writes rows, counts, `info` and `more`.
+    """
+    flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
+    flags |= {**space_flags(variant.periodic), "batched": variant.batched}
+    flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
+    whole = "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
+    results = [*["idx"] * variant.lists, "count", "info", *more]
+    return Call(whole, tuple(given), dict.fromkeys(results, np.int32), plan)
+
+
+def plan_numbers(variant: Variant, shapes: Shapes) -> dict[str, int]:
+    """Return the numbers that kernels of cells take, by name; without rows the capacity is 0."""
+    flags = {"closed": variant.closed, "drop_self": variant.keep.drop_self, "later_only": variant.keep.later_only}
+    capacity = shapes["idx"][1] if variant.lists else 0
+    return size_numbers(shapes, variant.own) | {"capacity": capacity, **flags}
+
+
+def absent(variant: Variant) -> list[str]:
+    """Return the names of arrays that are not written."""
+    return [] if variant.lists else ["idx"]
+
+
+def size_numbers(shapes: Shapes, own: bool) -> dict[str, int]:
+    """Return n, m, own and the cells of the table, as all kernels of cells take them."""
+    n, m = shapes["positions"][0], shapes["queries"][0]
+    return {"n": n, "m": m, "own": int(own), "table": table_cells(n)}
