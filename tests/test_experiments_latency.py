@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 from experiments import methods
 from experiments._cli import app
-from experiments.bench import latency, together
+from experiments.bench import latency, table, together
 
 OURS = ["x + 1", "list", "counts", "density", "density, gradient"]
 N = 16
@@ -26,15 +26,15 @@ def test_every_way_gets_a_row_and_none_twice(tmp_path, foreign):
     rows = (tmp_path / "rows.jsonl").read_bytes()
     assert CliRunner().invoke(app, words).stdout == result.stdout
     assert (tmp_path / "rows.jsonl").read_bytes() == rows
-    table = pd.read_csv(tmp_path / "cpu.csv")
-    assert (table["n"] == N).all()
-    ours = table[table["who"].isin(["jax", "jfrnn"])]
+    rows = pd.read_csv(tmp_path / "cpu.csv")
+    assert (rows["n"] == N).all()
+    ours = rows[rows["who"].isin(["jax", "jfrnn"])]
     assert list(ours["what"]) == OURS
     assert (ours["status"] == "ok").all()
     assert (ours["wrong"] == 0).all()
     assert (ours[["waited_us", "step_us", "waited_ratio", "step_ratio"]] > 0).all(axis=None)
     assert tuple(ours.loc[ours["what"] == "x + 1", ["waited_ratio", "step_ratio"]].iloc[0]) == (1, 1)
-    theirs = table[~table["who"].isin(["jax", "jfrnn"])]
+    theirs = rows[~rows["who"].isin(["jax", "jfrnn"])]
     assert list(theirs["what"]) == ["dense list", "sparse list", "cells", "all pairs"]
     for _, row in theirs.iterrows():
         missing = methods.lacks(row["who"])
@@ -46,7 +46,9 @@ def test_of_a_wrong_answer_no_time_is_taken(scene):
     nearer = scene._replace(cutoff=0.8 * scene.cutoff)
     for way in latency._ways():
         if way.who == "jfrnn":
-            row = latency._prepare(way._replace(make=lambda scene, way=way: way.make(nearer)), scene)
+            made = latency._prepare(way._replace(make=lambda scene, way=way: way.make(nearer)), scene)
+            row = {}
+            assert not table.judge(row, made.wrong, 0)
             assert (row["status"], row["wrong"] > 0) == ("failed", True), way.what
             assert row["reason"] == f"the answer is wrong for {row['wrong']} particles"
 
@@ -55,7 +57,8 @@ def test_an_error_is_a_row(scene):
     def make(scene):
         raise RuntimeError("no such thing")
 
-    row = latency._prepare(next(latency._ways())._replace(make=make), scene)
+    row = {}
+    assert table.ask(row, None, lambda: latency._prepare(next(latency._ways())._replace(make=make), scene)) is None
     assert row == {"status": "failed", "reason": "RuntimeError: no such thing"}
 
 

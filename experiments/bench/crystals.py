@@ -12,7 +12,7 @@ import typer
 from jax import Array
 
 import jfrnn
-from experiments import _machine, _measure, methods
+from experiments import _machine, _measure
 from experiments._library import round_capacity
 from experiments.bench import table
 
@@ -64,8 +64,7 @@ def command(
     """
     asked = [_read_size(size) for size in sizes or SIZES]
     parts = [(f"{systems} x {atoms}", functools.partial(_rows, systems, atoms, repeats)) for systems, atoms in asked]
-    there = sorted({way.method for way in _ways() if way.method is not None and methods.lacks(way.method) is None})
-    return table.text(table.measure(out, jax.default_backend(), parts, [repeats, there], COLUMNS), SHOWN)
+    return table.text(table.measure(out, jax.default_backend(), parts, [repeats, table.installed(_ways())], COLUMNS), SHOWN)
 
 
 def _read_size(size: str) -> tuple[int, int]:
@@ -82,24 +81,23 @@ def _rows(systems: int, atoms: int, repeats: int) -> Iterator[table.Line]:
         name = f"{way.who} {way.what}"
         row: table.Line = {"systems": systems, "atoms": atoms, "who": way.who, "what": way.what, "pairs": int(scene.counts.sum())}
         rows[name] = row | {"images": str(scene.images or "nearest")}
-        if way.method is not None and (missing := methods.lacks(way.method)) is not None:
-            rows[name] |= {"status": "missing", "reason": missing}
+        answer = table.ask(rows[name], way.method, functools.partial(_answer, way, scene))
+        if answer is None:
             continue
-        try:
-            call, read = way.make(scene)
-            wrong = int((read(call()) != scene.counts).sum())
-        except Exception as error:  # what a peer raises is its answer
-            rows[name] |= {"status": "failed", "reason": " ".join(f"{type(error).__name__}: {error}".split())[:200]}
-            continue
-        rows[name] |= {"wrong": wrong, "status": "ok", "peer": _machine.versions([way.package]).get(way.package)}
-        if wrong > (0 if way.method is None else ROUNDED * len(scene.x)):
-            rows[name] |= {"status": "failed", "reason": f"the answer is wrong for {wrong} particles"}
-        else:
+        call, wrong = answer
+        rows[name]["peer"] = _machine.versions([way.package]).get(way.package)
+        if table.judge(rows[name], wrong, 0 if way.method is None else ROUNDED * len(scene.x)):
             calls[name] = call
     seconds, others = _measure.time_in_turns(calls, repeats)
     for name, each in seconds.items():
         rows[name] |= {"waited_ms": 1e3 * float(np.median(each)), "repeats": repeats, "others_cores": others}
     yield from rows.values()
+
+
+def _answer(way: _Way, scene: _Scene) -> tuple[Callable[[], Any], int]:
+    """Return a call, and for how many atoms its answer is wrong."""
+    call, read = way.make(scene)
+    return call, int((read(call()) != scene.counts).sum())
 
 
 def _make_scene(systems: int, atoms: int) -> _Scene:

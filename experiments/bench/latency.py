@@ -13,7 +13,7 @@ import typer
 from jax import Array
 
 import jfrnn
-from experiments import _machine, _measure, methods
+from experiments import _machine, _measure
 from experiments._commands import MOST_POINTS
 from experiments._library import round_capacity
 from experiments.bench import table, together
@@ -103,8 +103,7 @@ def command(
         return table.text(table.measure(out, f"{platform}_at_once", parts, None, together.COLUMNS), together.SHOWN)
     asked = sizes or [n for n in SIZES if platform != "cpu" or n <= MOST_ON_CPU]
     parts = [(f"{n} particles", functools.partial(_rows, n, repeats)) for n in asked]
-    there = sorted({way.method for way in _ways() if way.method is not None and methods.lacks(way.method) is None})
-    frame = table.measure(out, platform, parts, [repeats, there], COLUMNS)
+    frame = table.measure(out, platform, parts, [repeats, table.installed(_ways())], COLUMNS)
     return table.text(frame, SHOWN)
 
 
@@ -114,13 +113,10 @@ def _rows(n: int, repeats: int) -> Iterator[table.Line]:
     for way in _ways():
         name = f"{way.who} {way.what}"
         rows[name] = {"n": n, "who": way.who, "what": way.what, "neighbors": round(float(scene.counts.mean()), 1)}
-        made = _prepare(way, scene)
-        if isinstance(made, _Timed):
+        made = table.ask(rows[name], way.method, functools.partial(_prepare, way, scene))
+        if made is not None and table.judge(rows[name], made.wrong, 0 if way.method is None else ROUNDED * n):
             timed[name] = made
-            rows[name] |= {"status": "ok", "wrong": made.wrong}
             rows[name] |= _tell_version(way, scene)
-        else:
-            rows[name] |= made
     for name, times in _time(scene, timed, repeats).items():
         rows[name] |= times
     floor = rows[next(iter(rows))]
@@ -155,18 +151,11 @@ def _tell_version(way: _Way, scene: _Scene) -> table.Line:
     return {"backend": jax.eval_shape(lambda x: jfrnn.search(x, scene.cutoff, capacity=scene.capacity), scene.x).backend}
 
 
-def _prepare(way: _Way, scene: _Scene) -> _Timed | table.Line:
-    """Compile a way and look at its answer; return what a row says where it cannot be timed."""
-    if way.method is not None and (missing := methods.lacks(way.method)) is not None:
-        return {"status": "missing", "reason": missing}
-    try:
-        function = None if way.make is None else way.make(scene)
-        compiled = jax.jit(function or (lambda x: x + 1))
-        wrong = way.wrong(scene, compiled(scene.x))
-    except Exception as error:  # what a peer raises is its answer
-        return {"status": "failed", "reason": " ".join(f"{type(error).__name__}: {error}".split())[:200]}
-    if wrong > (0 if way.method is None else ROUNDED * len(scene.x)):
-        return {"status": "failed", "wrong": wrong, "reason": f"the answer is wrong for {wrong} particles"}
+def _prepare(way: _Way, scene: _Scene) -> _Timed:
+    """Compile a way and look at its answer."""
+    function = None if way.make is None else way.make(scene)
+    compiled = jax.jit(function or (lambda x: x + 1))
+    wrong = way.wrong(scene, compiled(scene.x))
     return _Timed(way, function, lambda: compiled(scene.x), wrong)
 
 

@@ -241,13 +241,9 @@ def _temperature(v: Array) -> float:
 
 
 def _row_of_jax_md(name: str, liquid: _Liquid, skin: float, steps: int, repeats: int) -> table.Line:
-    if (missing := methods.lacks("jax-md")) is not None:
-        return {"who": name, "status": "missing", "reason": missing}
-    try:
-        row = _run_jax_md(JAX_MD[name], liquid, skin, steps, repeats)
-    except Exception as error:  # what a peer raises is its answer
-        return {"who": name, "status": "failed", "reason": " ".join(f"{type(error).__name__}: {error}".split())[:200], "skin": skin}
-    return {"who": name, "status": "ok", "skin": skin, "peer": _machine.versions(["jax-md"])["jax-md"]} | row
+    row: table.Line = {"who": name, "skin": skin}
+    found = table.ask(row, "jax-md", lambda: _run_jax_md(JAX_MD[name], liquid, skin, steps, repeats))
+    return row if found is None else row | {"status": "ok", "peer": _machine.versions(["jax-md"])["jax-md"]} | found
 
 
 def _run_jax_md(form: str, liquid: _Liquid, skin: float, steps: int, repeats: int) -> table.Line:
