@@ -22,7 +22,8 @@ from jfrnn.kernels._clang import warp_root
 from jfrnn.kernels._native import program
 from jfrnn.kernels._program import Entry, Kernel, declare
 
-BLOCK = 256
+BLOCK = 128
+_RESIDENT = 6  # blocks of queries in float32 on a multiprocessor: 79 registers a thread, not 88
 _CELLS_PER_PARTICLE = 2  # at least, and less than twice that; 8 B each
 _SMALLEST_BITS = 4  # per axis: 16 cells
 _LARGEST_BITS = 24  # in all: 256^3 or 4096^2 cells
@@ -60,7 +61,7 @@ def search_kernels(dim: int, double: bool, scaled: bool, lists: bool, cuda: bool
     """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts alone."""
     variant = f"{'cuda' if cuda else 'cpu'}_{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}"
     text = program(double, dim, "hashgrid.h", given={"warp_hashgrid.h": warp_header()}, SCALED=scaled, LIST=lists)
-    entries = Entry("HashGridSearch.pack", BLOCK), Entry("HashGridSearch.query", BLOCK)
+    entries = Entry("HashGridSearch.pack", BLOCK), Entry("HashGridSearch.query", BLOCK, 1 if double else _RESIDENT)
     return Kernels(*declare(f"hashgrid_{variant}", text, *entries, cuda=cuda, fused=cuda))
 
 
