@@ -15,7 +15,7 @@ PIP    := PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore PYTHONWARN
 # Where nothing may keep what Python compiles, each of the many processes that tests start compiles JAX anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: sweep sweeps peers notebooks docs test test-slow lint clean
+.PHONY: sweep sweeps peers notebooks docs test test-slow lint style clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml
@@ -51,16 +51,19 @@ docs: $(STAMP)
 	$(PY) -m sphinx -W --keep-going --quiet docs out/docs
 	@echo out/docs/index.html
 
-test: lint
+# Types are checked by a test, beside the others: pyright takes a minute on one core.
+test: style
 	$(PY) -m pytest
 
 test-slow: $(STAMP)
 	$(PY) -m pytest -m slow
 
-lint: $(STAMP)
+lint: style
+	$(VENV)/bin/pyright
+
+style: $(STAMP)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
-	$(VENV)/bin/pyright
 	$(VENV)/bin/clang-format --dry-run -Werror kernels/native/*
 
 clean:

@@ -25,6 +25,7 @@ UNFUSED = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split
 warp.config.log_level = warp.LOG_WARNING  # else it prints what it compiles, into doctests too
 LONGEST = (  # files, those first that take longest: what is left at the end is short, and no worker waits for another's long file
     *(
+        "types",
         "hard_cases",
         "pair_sum",
         "experiments_sweep",
