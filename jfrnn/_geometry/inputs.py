@@ -165,11 +165,11 @@ def check_species(cutoff: Given, species: Given, rule: object, sources: Array, q
         raise ValueError(
             f"species must be a pair of arrays, of the positions [{n}] and of the queries [{m}], got {_describe_array(species)}."
         )
-    radii = Radii(of_sources, of_queries, TABLE, table=check_table(cutoff, sources))
+    table = check_table(cutoff, sources)
     if not masked:
         for name, given in (("species", of_sources), ("species[1]", of_queries)):
-            _check_kinds(name, given, radii.table.shape[0])
-    return radii
+            _check_kinds(name, given, len(table))
+    return Radii(of_sources, of_queries, TABLE, table=table)
 
 
 def check_table(cutoff: Given, like: Array, kinds: int | None = None) -> Array:
