@@ -61,7 +61,7 @@ def pairs_found(nbrs, x, **queries):
 
 def each_case():
     often = {("exclude", "images", "warp", 3, np.float32), ("table, exclude", "images", "warp", 3, np.float32)}
-    often |= {("exclude", "open", "warp", 2, np.float32), ("table, exclude", "open", "brute", 2, np.float32)}
+    often |= {("exclude", "open", "warp", 2, np.float32), ("exclude", "open", "brute", 2, np.float32)}
     for who, box, backend in product(("exclude", "table", "table, exclude"), BOXES, ("warp", "jax", "brute")):
         for dim, dtype in product((2, 3), (np.float32, np.float64)):
             kind = f"{who}-{box}-{backend}-{dim}d-f{8 * dtype().itemsize}"
@@ -138,7 +138,8 @@ def heavy(r, i, j):
     return r @ r + zero
 
 
-SUMMED = [("exclude", "warp", "open", square), ("table, exclude", "warp", "open", square)]
+SUMMED = [("exclude", "warp", "open", square)]
+SUMMED += [pytest.param("table, exclude", "warp", box, square, marks=SLOW) for box in ("open", "images")]
 SUMMED += [
     pytest.param("exclude", "warp", "images", square, marks=SLOW),
     pytest.param("exclude", "warp", "open", heavy, marks=SLOW),
@@ -223,8 +224,20 @@ def test_kept_lists(backend, box):
         assert set(zip(rows.tolist(), sources.tolist(), map(tuple, shifts[rows, slots].tolist()), strict=True)) == expected
         summed = jfrnn.pair_sum(lambda r, i, j: jnp.ones((), r.dtype), moved, None, neighbors=nbrs)
         np.testing.assert_array_equal(summed, np.bincount(rows, minlength=N))
-    grown = jfrnn.search(x, table, capacity=1, **given).grow(x, cutoff=on)
-    assert grown.exclude is not None and bool((grown.radii.table == on).all())
+
+
+@SLOW
+def test_grow_and_chunks():
+    x, species, pairs = scene(np.float32, 3)
+    nbrs = jfrnn.search(x, TABLE.astype(np.float32), species=species, exclude=pairs, skin=0.05, capacity=1)
+    on = TABLE.astype(np.float32)
+    on[1, 1] = 0.3
+    chunk = jax.jit(lambda state, nbrs: (state, nbrs.update(state[0], cutoff=state[1])))
+    _, grown = jfrnn.run_chunk(chunk, (x, on), nbrs, lambda state: state[0], cutoff=lambda state: state[1])
+    near = reference.reference_species(x, on, species, matrix=np.ones(3), periodic=(False,) * 3)
+    expected = {pair[:2] for pair in reference.without_excluded(near, pairs)}
+    assert set(zip(*(part.tolist() for part in grown.pairs(positions=jnp.asarray(x))), strict=True)) == expected
+    jfrnn.run_chunk(jax.jit(lambda x, n: (x, n.update(x))), jnp.asarray(x), nbrs, lambda x: x)[1].check()
 
 
 def test_what_is_traced_sets_bits():
@@ -268,7 +281,7 @@ UNEVEN = np.array([[1.0, 0.5], [0.25, 1.0]], np.float32)
         (
             ValueError,
             r"below 4, or -1 in padding, got \[0, 4\] in row 1",
-            lambda: jfrnn.search(X, 1.0, exclude=S[:2] * 4 + [[0], [0]]),
+            lambda: jfrnn.search(X, 1.0, exclude=np.array([[0, 1], [0, 4]])),
         ),
         (ValueError, r"got \[-2, 0\] in row 0", lambda: jfrnn.count(X, 1.0, exclude=np.array([[-2, 0]]))),
         (ValueError, "numbers of queries below 1, then", lambda: jfrnn.count(X, 1.0, queries=X[:1], exclude=np.array([[1, 0]]))),
@@ -291,8 +304,8 @@ def test_errors(error, match, make):
 
 
 def test_nobody_is_excluded_by_no_pairs():
-    assert jfrnn.search(X, 1.0, exclude=np.zeros((0, 2), int), capacity=4, backend="brute").exclude is None
-    np.testing.assert_array_equal(jfrnn.count(X, 1.0, exclude=np.array([[-1, 2]]), backend="brute"), [3] * 4)
+    assert jfrnn.search(X, 1.0, exclude=np.zeros((0, 2), int), capacity=4).exclude is None
+    np.testing.assert_array_equal(jfrnn.count(X, 1.0, exclude=np.array([[-1, 2]])), [3] * 4)
 
 
 def test_rows_of_partners_are_pairs():
