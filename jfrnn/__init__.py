@@ -18,6 +18,7 @@ from jfrnn._geometry import (
     merge_vertices,
     morton_decode,
     morton_encode,
+    pairs_of_rows,
     sort_order,
 )
 from jfrnn._memory import MemoryPlan, memory_plan
@@ -42,6 +43,7 @@ __all__ = [
     "morton_decode",
     "morton_encode",
     "pair_sum",
+    "pairs_of_rows",
     "run_chunk",
     "search",
     "search_triangles",

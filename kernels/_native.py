@@ -18,8 +18,12 @@ from jfrnn.kernels._text import resolve
 CELLS_PER_PARTICLE = 4  # size of the cell table; 16 B per particle
 SMALLEST_TABLE = 4096
 SKEWED = 2
+EXCLUDED = (
+    "excluded_starts",
+    "excluded",
+)  # arrays that are given where kernels are EXCLUDING (native/excluded.h), and else left out
 SPACES = ("", "_nearest", "_images", "_nearest_skewed", "_images_skewed")  # in names of variants
-_DEFAULTS = {"PERIODIC": 0, "BATCHED": 0, "SUM": 0, "SCALED": 0, "ONE_BY_ONE": 0}
+_DEFAULTS = {"PERIODIC": 0, "BATCHED": 0, "SUM": 0, "SCALED": 0, "ONE_BY_ONE": 0, "EXCLUDING": 0}
 
 
 def table_cells(sources: int) -> int:
@@ -36,6 +40,7 @@ def program(double: bool, dim: int, *headers: str, given: Mapping[str, str] = Ma
     BATCHED is 1 where a row ends with the number of its system (see `jfrnn._geometry.batch`). SUM is 1 where the cutoff of a pair
     is the sum of two numbers. SHIFTED is 0 where all pairs that are decided are those of points as they are, though space is
     periodic. SCALED is 1 where cutoffs are so small, or so large, that their squares need a unit.
+    EXCLUDING is 1 where queries exclude sources.
 
     Args:
         double: Whether positions are float64.

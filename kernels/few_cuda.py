@@ -43,10 +43,13 @@ def slots(queries: int) -> int:
 
 
 @functools.lru_cache(64)
-def rows_kernel(warps: int, dim: int, double: bool, lists: bool, batched: bool, boxed: bool = False) -> Kernel:
+def rows_kernel(
+    warps: int, dim: int, double: bool, lists: bool, batched: bool, boxed: bool = False, excluding: bool = False
+) -> Kernel:
     """Return the kernel for warps of a block, a dimension and a dtype, for lists or counts alone."""
     variant = f"{warps}w_{dim}d_{'f64' if double else 'f32'}{'_list' * lists}{'_nearest' * boxed}{'_batched' * batched}"
-    text = program(double, dim, "few_rows.cuh", SUMS=0, **_constants(warps, lists, batched, boxed))
+    variant += "_excluding" * excluding
+    text = program(double, dim, "few_rows.cuh", SUMS=0, EXCLUDING=excluding, **_constants(warps, lists, batched, boxed))
     return declare(f"few_cuda_{variant}", text, Entry("FewRows.run", 32 * warps), cuda=True, fused=True)[0]
 
 
@@ -61,14 +64,17 @@ def sum_kernel(
     batched: bool = False,
     extremes: bool = False,
     boxed: bool = False,
+    excluding: bool = False,
 ) -> Kernel:
     """Return the kernel that sums a term.
 
     But for the warps of a block, the arguments are those of `jfrnn.kernels.pair_sum_cuda.sum_kernels`.
     """
     variant = f"{warps}w_{dim}d_{'f64' if double else 'f32'}{'_compensated' * compensated}{'_nearest' * boxed}"
-    variant += f"{'_batched' * batched}{'_extremes' * extremes}"
-    constants = GRID | _constants(warps, False, batched, boxed) | constants_of(term, compensated, extremes)
+    variant += f"{'_batched' * batched}{'_extremes' * extremes}{'_excluding' * excluding}"
+    constants = (
+        GRID | {"EXCLUDING": excluding} | _constants(warps, False, batched, boxed) | constants_of(term, compensated, extremes)
+    )
     text = program(double, dim, "few_sums.cuh", given=term_header(term, double), **constants)
     return declare(f"few_sums_cuda_{variant}_{key}", text, Entry("FewSums.run", 32 * warps), cuda=True, fused=True)[0]
 

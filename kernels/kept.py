@@ -20,7 +20,7 @@ LANES = 8  # of CUDA that serve a row
 _BLOCK = 128
 # that share a multiprocessor; in a box, its numbers stay in registers (forces of a million shuffled particles: 1.3 times faster)
 _BLOCKS, _BLOCKS_IN_BOX = 8, 5
-RADII = {"gather": 1, "scatter": 2, "either": 3, "both": 4, "mean": 5}
+RADII = {"gather": 1, "scatter": 2, "either": 3, "both": 4, "mean": 5, "table": 6}
 
 
 class ListKind(NamedTuple):

@@ -207,7 +207,7 @@ def _candidates(term: TermText, dim: int, double: bool) -> int:
 @functools.lru_cache(512)
 def query_kernel(
     term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: bool = False,
-    extremes: bool = False, packed: bool | None = None,
+    extremes: bool = False, packed: bool | None = None, excluding: bool = False,
 ) -> Kernel:  # fmt: skip
     """Return the kernel that sums a term; `key` tells it from all others in the names of programs.
 
@@ -217,11 +217,12 @@ def query_kernel(
     """
     packed = work(term.text) > LITTLE_WORK if packed is None else packed
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
-    variant += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}_{key}"
+    variant += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}{'_excluding' * excluding}_{key}"
     constants = {"SCALED": scaled, "LIST": 0, **GRID, **constants_of(term, compensated, extremes)}
     constants |= {
         "PERIODIC": periodic,
         "BATCHED": batched,
+        "EXCLUDING": excluding,
         "CHUNK": CHUNK,
         "QUERY_CHUNK": QUERY_CHUNK,
         "CANDIDATES": _candidates(term, dim, double),

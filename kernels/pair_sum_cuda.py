@@ -73,7 +73,7 @@ def _placed_columns(term: TermText, dim: int) -> int:
 @functools.lru_cache(512)
 def sum_kernels(
     term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: bool = False,
-    extremes: bool = False,
+    extremes: bool = False, excluding: bool = False,
 ) -> Kernels:  # fmt: skip
     """Return the kernels that sum a term; `key` tells it from all others in the names of programs.
 
@@ -86,10 +86,16 @@ def sum_kernels(
     taken = 4 if cheap else 2
     blocks = 16 if double or not cheap else 20
     kind = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
-    kind += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}"
+    kind += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}{'_excluding' * excluding}"
     module = f"{kind}_b{blocks}_t{taken}_{key}"
     constants = {**GRID, "PERIODIC": periodic, "BATCHED": batched, "SCALED": scaled, **constants_of(term, compensated, extremes)}
-    constants |= {"LIST": 0, "LATER": 0, "TAKEN": taken, "FROM_PLACES": _reads_positions(term) and not term.source_columns}
+    constants |= {
+        "LIST": 0,
+        "LATER": 0,
+        "EXCLUDING": excluding,
+        "TAKEN": taken,
+        "FROM_PLACES": _reads_positions(term) and not term.source_columns,
+    }
     constants |= {"ROW_LENGTH": max(row_length(term, dim, double), 1), "PLACED": _placed_columns(term, dim)}
 
     def declare_one(name: str, text: str, method: str, blocks: int, called: str = "") -> Kernel:

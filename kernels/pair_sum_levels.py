@@ -22,15 +22,21 @@ def slots(queries: int) -> int:
 @functools.lru_cache(512)
 def query_kernel(
     term: TermText, key: str, dim: int, double: bool, rule: str, groups: int, halvings: int, compensated: bool, periodic: int = 0,
-    batched: bool = False, extremes: bool = False,
+    batched: bool = False, extremes: bool = False, excluding: bool = False,
 ) -> Kernel:  # fmt: skip
     """Return the kernel that sums a term, the work of which threads share; `info` is zeros at first.
 
     `key` and `extremes` are those of `jfrnn.kernels.pair_sum_cpu.query_kernel`, the rest those of `jfrnn.kernels.levels`.
     """
     variant = f"{dim}d_{'f64' if double else 'f32'}_{rule}{'_compensated' * compensated}"
-    variant += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}_{key}"
-    constants = {"PERIODIC": periodic, "BATCHED": batched, "CANDIDATES": ROOM, **constants_of(term, compensated, extremes)}
+    variant += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}{'_excluding' * excluding}_{key}"
+    constants = {
+        "PERIODIC": periodic,
+        "BATCHED": batched,
+        "CANDIDATES": ROOM,
+        "EXCLUDING": excluding,
+        **constants_of(term, compensated, extremes),
+    }
     given = term_header(term, double)
     text = level_program(dim, double, rule, groups, halvings, "level_sums.h", given, **constants)
     return declare(f"pair_sum_levels_{variant}", text, "LevelSumsKernel.run")[0]

@@ -164,6 +164,28 @@ def reference_radii(
     return found
 
 
+def reference_species(positions: Any, table: Any, species: Any, *, query_species: Any = None, **options: Any) -> set[Image]:
+    """Return every (query i, source j, shift S) closer than the cutoff of their species, exactly.
+
+    `table` [s, s] are cutoffs of the dtype of positions, 0 where species are no neighbors, `species` [n] and `query_species` [m]
+    whole numbers. `options` are those of `reference_images`, which each different cutoff is asked for.
+    """
+    edges = [[float(x) for x in row] for row in np.asarray(table).tolist()]
+    of_end = [int(s) for s in np.asarray(species).tolist()]
+    of_start = of_end if query_species is None else [int(s) for s in np.asarray(query_species).tolist()]
+    found = set()
+    for cutoff in {x for row in edges for x in row if x > 0}:
+        near = reference_images(positions, cutoff, **options)
+        found |= {(i, j, shift) for i, j, shift in near if edges[of_start[i]][of_end[j]] == cutoff}
+    return found
+
+
+def without_excluded(found: Iterable[Image], exclude: Iterable[Sequence[int]], *, directed: bool = False) -> set[Image]:
+    """Return what is left without excluded pairs, in all images; those between queries and sources have a direction."""
+    apart = {(int(i), int(j)) for i, j in exclude}
+    return {(i, j, s) for i, j, s in found if (i, j) not in apart and (directed or (j, i) not in apart)}
+
+
 def triangle_pairs(positions: Any, vertices: Any, faces: Any, cutoff: float) -> set[Pair]:
     """Return every (particle i, face t) whose closed triangle (in 2D: segment) is closer than the cutoff, exactly.
 

@@ -87,8 +87,8 @@ def test_engines_can_what_the_readme_says():
     names = [cell.strip("`") for cell in lines[0][1:]]
     said = {line[0]: dict(zip(names, line[1:])) for line in lines}
     assert set(names) == set(ENGINES)
-    asked = {"periodic boxes, batches": Kind(periodic=True, batch=True), "a cutoff per particle": Kind(radii=True)}
-    asked["`pair_sum`"] = Kind(summed=True)
+    asked = {"periodic boxes, batches": Kind(periodic=True, batch=True), "`pair_sum`": Kind(summed=True)}
+    asked |= {"a cutoff per particle or per pair of species": Kind(radii=True), "excluded pairs": Kind(excluding=True)}
     for title, kind in asked.items():
         for name, engine in ENGINES.items():
             assert (said[title][name] == "no") == (engine.refuse(kind) is not None), (title, name)

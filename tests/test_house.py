@@ -30,7 +30,7 @@ ALLOWED = {  # first-party and third-party modules that each folder may import
 }
 PUBLIC = {"Box", "MemoryPlan", "NeighborList", "NeighborOverflowError", "Status", "TriangleList"}
 PUBLIC |= {"count", "memory_plan", "merge_vertices", "pair_sum", "run_chunk", "search", "search_triangles", "sort_order"}
-PUBLIC |= {"hilbert_decode", "hilbert_encode", "morton_decode", "morton_encode"}
+PUBLIC |= {"hilbert_decode", "hilbert_encode", "morton_decode", "morton_encode", "pairs_of_rows"}
 
 
 def imported_modules(path):

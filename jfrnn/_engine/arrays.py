@@ -20,7 +20,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.boxes import find_in_boxes
-from jfrnn._engine.candidates import Candidates, Points, Span, Torus
+from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
 from jfrnn._engine.problem import Kind, Options, Rows, Search, largest_radius
 from jfrnn._engine.runs import count_neighbors, list_neighbors
 from jfrnn._engine.tuning import Tuning, by_platform
@@ -33,6 +33,7 @@ from jfrnn._geometry import (
     Cells,
     Cutoff,
     Cutoffs,
+    Exclusions,
     Lattice,
     Levels,
     Status,
@@ -124,9 +125,24 @@ def complete_rows(search: Search, idx: Array | None, count: Array, capacity: int
 
 def find_candidates(search: Search, by_cells: bool, tuning: Tuning) -> Candidates:
     """Return the candidates of each query: all sources (brute force), by cells, or by cells of many sizes."""
+    candidates = _find_candidates(search, by_cells, tuning)
+    return candidates if search.exclude is None else candidates._replace(excluded=_place_excluded(candidates, search.exclude))
+
+
+def _place_excluded(candidates: Candidates, exclude: Exclusions) -> Excluded:
+    """Return where excluded sources stand among the candidates; those that stand nowhere are placed before all others."""
+    n, place = candidates.size, lax.iota(jnp.int32, candidates.size)
+    ids = candidates.sources.ids[:n]
+    if candidates.again is not None:
+        ids = jnp.where(place < candidates.again, ids, n)
+    places = jnp.full(n, -(1 << 30), jnp.int32).at[ids].set(place, mode="drop")
+    return Excluded(exclude.starts, places[exclude.others])
+
+
+def _find_candidates(search: Search, by_cells: bool, tuning: Tuning) -> Candidates:
     if search.per_system:
         return find_in_boxes(search, by_cells)
-    sources, queries, cutoff, batch, given, _ = search
+    sources, queries, cutoff, batch, given = search[:5]
     torus = None if given is None else _torus(sources, queries, *given)
     clouds = (sources, queries) if given is None else (given[1].sources, None if queries is None else given[1].queries)
     if not by_cells:
@@ -135,9 +151,10 @@ def find_candidates(search: Search, by_cells: bool, tuning: Tuning) -> Candidate
         along, axes = _cells_along(sources, queries, cutoff, given)
         return _cell_stencil(*clouds, along, axes.cells, batch, torus, tuning)
     images, levels = None if torus is None else torus.images, levels_of(search)
-    points = _in_order(clouds[0], jnp.pad(levels.order, (0, LANES)), cutoff.sources)
-    rows = _in_order(clouds[0] if clouds[1] is None else clouds[1], levels.query_order, cutoff.queries)
-    words, runs = {2: 16, 3: 64}[sources.shape[1]], level_runs(levels, cutoff, images)
+    of_sources, of_queries = cutoff.of_points
+    points = _in_order(clouds[0], jnp.pad(levels.order, (0, LANES)), of_sources)
+    rows = _in_order(clouds[0] if clouds[1] is None else clouds[1], levels.query_order, of_queries)
+    words, runs = {2: 16, 3: 64}[sources.shape[1]], level_runs(levels, cutoff.of_cells, images)
 
     def runs_of(span: Span, which: Array) -> tuple[Array, Array, Array | None]:
         return runs(span.places, which)
@@ -191,7 +208,7 @@ def _all_sources(
         codes = None if torus is None else jnp.zeros_like(start) + lax.iota(jnp.int32, images)[None]
         return start, jnp.broadcast_to(stop, start.shape), codes
 
-    of_sources, of_queries = (cutoff.sources, cutoff.queries) if isinstance(cutoff, Cutoffs) else (None, None)
+    of_sources, of_queries = cutoff.of_points if isinstance(cutoff, Cutoffs) else (None, None)
     padded = jnp.pad(lax.iota(jnp.int32, len(sources)) if order is None else order, (0, LANES))
     rows = _in_order(sources if queries is None else queries, query_order, of_queries)
     words, unordered = images * -(-len(sources) // LANES), query_order is None

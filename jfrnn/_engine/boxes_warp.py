@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.launch import Call, Shapes, kernel
-from jfrnn._engine.operands import lattice_numbers, particle_rows, periodic_kind
+from jfrnn._engine.operands import excluded_rows, lattice_numbers, particle_rows, periodic_kind
 from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.problem import Filter, Rows, Search, largest_radius
 from jfrnn._engine.variants import Variant, absent, describe_call, plan_numbers
@@ -23,7 +23,7 @@ def box_neighbors(search: Search, keep: Filter, capacity: int | None) -> Rows:
     """List the neighbors of every query, or only count them (capacity=None), where each system has a box of its own."""
     m, dim, double = search.sizes[1], search.sources.shape[1], search.sources.dtype == jnp.float64
     dims = {"idx": (m, capacity), "count": m, "info": 2}
-    kind = (search.queries is None, search.cutoff.closed, keep, periodic_kind(search.torus), True)
+    kind = (search.queries is None, search.cutoff.closed, keep, periodic_kind(search.torus), True, search.exclude is not None)
     variant = Variant(dim, double, search.cutoff.scaled, capacity is not None, *kind)
 
     def on(cuda: bool) -> Callable[..., list[Array]]:
@@ -52,7 +52,7 @@ def _operands(search: Search) -> list[Array]:
     of_system = jnp.concatenate([jnp.pad(cells.counts, gap), cells.first[:, None], turning[:, None]], axis=1)
     axes = jnp.stack([x[padded] for x in wrapped.sources.T])
     numbers = _numbers(search, lattice, wrapped)
-    return [rows, asking, numbers, axes, wrapped.queries, padded, order, visits, of_system, cells.start]
+    return [rows, asking, numbers, axes, wrapped.queries, padded, order, visits, of_system, cells.start, *excluded_rows(search)]
 
 
 def _numbers(search: Search, lattice: Lattice, wrapped: Wrapped) -> Array:
@@ -72,7 +72,7 @@ def _callable(variant: Variant, cuda: bool) -> Call:
 
 
 def _plan(variant: Variant, cuda: bool, shapes: Shapes, _: int) -> Plan:
-    kind = (variant.dim, variant.double, variant.scaled, variant.lists, variant.periodic)
+    kind = (variant.dim, variant.double, variant.scaled, variant.lists, variant.periodic, variant.excluding)
     found, numbers = boxes.rows_kernel(*kind, cuda), plan_numbers(variant, shapes) | {"stride": shapes["axes"][1]}
     m = numbers["m"]
     launch = Launch(found, boxes.threads(m)) if cuda else share(found, m, boxes.QUERIES_AT_ONCE)

@@ -40,7 +40,7 @@ class Points(NamedTuple):
     Attributes:
         axes: d coordinate arrays [n].
         ids: [n] int32, their indices.
-        radii: [n] cutoffs per particle, or None with one cutoff or if the rule does not use them.
+        radii: [n] cutoffs per particle, or species with a table of cutoffs; None with one cutoff or if the rule does not use them.
         systems: [n] systems of a batch, or None if runs meet no other system than that of their query.
     """
 
@@ -70,6 +70,18 @@ class Torus(NamedTuple):
     slack: Array
 
 
+class Excluded(NamedTuple):
+    """Where the sources that queries exclude stand in the order of visits.
+
+    Attributes:
+        starts: [m + 1] int32, where the row of each query begins, by the queries' ids, and where the last one ends.
+        places: [k] int32, positions of excluded sources, row after row; negative for those that have none.
+    """
+
+    starts: Array
+    places: Array
+
+
 class Candidates(NamedTuple):
     """Sources and queries in the order in which they are visited, and a function that finds the candidates of queries.
 
@@ -83,6 +95,7 @@ class Candidates(NamedTuple):
         words: From slots per query (None: unknown) to the words of candidates that are tested at a time. Static.
         passes: Number of passes over the sources, [] int32, of all queries or from some of them; None for one.
         again: [] int32, after how many positions the sources start again; None if each has one position.
+        excluded: The sources that queries exclude, or None.
         in_order: Whether queries are visited by their indices. Static.
     """
 
@@ -94,5 +107,6 @@ class Candidates(NamedTuple):
     words: Callable[[int | None], int]
     passes: Array | Callable[[Span], Array] | None = None
     again: Array | None = None
+    excluded: Excluded | None = None
     in_order: bool = False
     most_words: int | None = None

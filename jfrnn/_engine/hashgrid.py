@@ -33,6 +33,8 @@ class HashGridEngine:
         """Refuse what `wp.HashGrid` has no way to say."""
         if kind.summed:
             return "cannot sum over pairs: pass 'warp', 'jax', 'brute' or 'auto'."
+        if kind.excluding:
+            return "cannot exclude pairs: pass backend='warp', 'jax' or 'brute'."
         if kind.radii:
             return "takes one cutoff for all particles: pass backend='warp', 'jax' or 'brute'."
         if kind.batch:

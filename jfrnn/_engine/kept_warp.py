@@ -165,6 +165,9 @@ def _operands(given: KeptList, extra: _Extra, columns: int, others: Array | None
         numbers += [jnp.full(1, 2 * LARGEST_TURN + max(images.reach), dtype)]
         steps = jnp.asarray(images.shifts).astype(dtype).reshape(-1) if given.codes is not None else steps
     nothing = jnp.zeros(1, jnp.int32)
+    if isinstance(given.cutoff, Cutoffs) and given.cutoff.kinds is not None:
+        table = given.cutoff.kinds[0]
+        numbers += [jnp.full(1, table.size, dtype), table.reshape(-1)]
     codes = nothing if given.codes is None else given.codes
     reversal = given.reversal or [nothing if slots is None else slots, nothing, nothing]
     order = nothing if given.order is None or not kind.ordered else given.order
@@ -172,9 +175,17 @@ def _operands(given: KeptList, extra: _Extra, columns: int, others: Array | None
 
 
 def _radii_of(given: KeptList, kind: kept.ListKind) -> tuple[Array | None, Array | None]:
-    """Return the cutoffs beside sources and rows: halves if that of a pair is their mean, 0 if they are not read."""
+    """Return the cutoffs beside sources and rows: halves if that of a pair is their mean, 0 if they are not read.
+
+    With a table these are the species of sources, and where the row of a species begins in the table.
+    """
     if not isinstance(given.cutoff, Cutoffs):
         return None, None
+    if given.cutoff.kinds is not None:
+        table, *both = given.cutoff.kinds
+        beside, own = both[::-1] if kind.reversed else both
+        dtype = given.sources.dtype
+        return beside.astype(dtype), (own * np.int32(len(table))).astype(dtype)
     half = given.sources.dtype.type(0.5 if kind.rule == "mean" else 1)
     both = zip((given.cutoff.sources, given.cutoff.queries), (given.sources, given.rows), strict=True)
     found = [jnp.zeros(len(points), points.dtype) if x is None else x * half for x, points in both]

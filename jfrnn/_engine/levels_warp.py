@@ -9,13 +9,14 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.launch import Call, Shapes, kernel
-from jfrnn._engine.operands import lattice_numbers, particle_rows, periodic_kind, space_flags
+from jfrnn._engine.operands import excluded_rows, lattice_numbers, particle_rows, periodic_kind, space_flags
 from jfrnn._engine.plans import Clear, Launch, Plan, share
 from jfrnn._engine.problem import Filter, Rows, Search
 from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText
-from jfrnn._geometry import GROUPS, HALVINGS, Levels
+from jfrnn._geometry import GROUPS, HALVINGS, Cutoffs, Levels
 from jfrnn.kernels import levels as level_kernels
 from jfrnn.kernels import pair_sum_levels
+from jfrnn.kernels._native import EXCLUDED
 
 
 class _LevelVariant(NamedTuple):
@@ -31,6 +32,7 @@ class _LevelVariant(NamedTuple):
     periodic: int
     batched: bool
     cuda: bool
+    excluding: bool
 
 
 def level_neighbors(search: Search, levels: Levels, keep: Filter, capacity: int | None) -> Rows:
@@ -77,6 +79,7 @@ def level_sums(
 def _variant_of(search: Search, keep: Filter, lists: bool, cuda: bool) -> _LevelVariant:
     sources, cutoffs = search.sources, search.cutoffs
     kind = (search.queries is None, cutoffs.closed, keep, cutoffs.rule, periodic_kind(search.torus), search.batch is not None, cuda)
+    kind = (*kind, search.exclude is not None)
     return _LevelVariant(sources.shape[1], sources.dtype == jnp.float64, lists, *kind)
 
 
@@ -115,17 +118,32 @@ def _operands(search: Search, levels: Levels) -> list[Array]:
         levels.query_order,
         levels.query_top.reshape(-1),
         levels.query_place.reshape(-1),
+        *excluded_rows(search),
+        *_operands_of_kinds(cutoffs, levels),
     ]
+
+
+def _operands_of_kinds(cutoffs: Cutoffs, levels: Levels) -> list[Array]:
+    """Return a table of cutoffs, and whose species is which in the order of visits, in the order of `TABLE`."""
+    if cutoffs.kinds is None:
+        return []
+    table, of_sources, of_queries = cutoffs.kinds
+    sorted_kinds = jnp.pad(of_sources[levels.order], (0, level_kernels.PADDING))
+    return [table, sorted_kinds, of_queries[levels.query_order]]
 
 
 _GIVEN = ("positions", "queries", "axes", "radii", "ids", "keys", "top", "table", "header", "cutoff")
 _GIVEN += ("query_axes", "query_radii", "query_ids", "query_top", "places")
 
 
+def _given(variant: _LevelVariant) -> tuple[str, ...]:
+    return (*_GIVEN, *EXCLUDED * variant.excluding, *level_kernels.TABLE * (variant.rule == level_kernels.RULES[-1]))
+
+
 def _name(name: str, variant: _LevelVariant, **more: bool) -> str:
     flags = {"f64": variant.double, "f32": not variant.double, "list": variant.lists, "own": variant.own}
     flags |= {"closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only, variant.rule: True}
-    flags |= {**space_flags(variant.periodic), "batched": variant.batched}
+    flags |= {**space_flags(variant.periodic), "batched": variant.batched, "excluding": variant.excluding}
     return "_".join([f"jfrnn_{name}_{variant.dim}d", *(flag for flag, on in {**flags, **more}.items() if on)])
 
 
@@ -133,7 +151,7 @@ def _name(name: str, variant: _LevelVariant, **more: bool) -> str:
 def _level_callable(variant: _LevelVariant) -> Call:
     results = dict.fromkeys([*["idx"] * variant.lists, "count", "info"], np.int32)
     name = _name(f"levels_{'cuda' if variant.cuda else 'cpu'}", variant)
-    return Call(name, _GIVEN, results, functools.partial(_plan_rows, variant))
+    return Call(name, _given(variant), results, functools.partial(_plan_rows, variant))
 
 
 @kernel
@@ -142,12 +160,12 @@ def _sum_callable(variant: _LevelVariant, results: SumsOf, key: str) -> Call:
     name = _name("pair_sum_levels_cpu", variant, **kind, **{key: True})
     dtypes = dict.fromkeys(("sums", "totals", "errors"), np.float64 if variant.double else np.float32) | {"info": np.int32}
     plan = functools.partial(_plan_sums, variant, results, key)
-    return Call(name, (*_GIVEN, "shared_values", "own_values", "columns"), dtypes, plan)
+    return Call(name, (*_given(variant), "shared_values", "own_values", "columns"), dtypes, plan)
 
 
 def _plan_sums(variant: _LevelVariant, results: SumsOf, key: str, shapes: Shapes, multiprocessors: int) -> Plan:
-    of_search = variant.dim, variant.double, variant.rule, GROUPS, HALVINGS, results.compensated, variant.periodic
-    query = pair_sum_levels.query_kernel(results.term, key, *of_search, variant.batched, results.extremes)
+    of_search = variant.dim, variant.double, variant.rule, GROUPS, HALVINGS, results.compensated, variant.periodic, variant.batched
+    query = pair_sum_levels.query_kernel(results.term, key, *of_search, results.extremes, variant.excluding)
     numbers = _numbers(variant, shapes)
     return Plan([Clear("info", 8), share(query, numbers["m"])], numbers)
 
@@ -155,12 +173,13 @@ def _plan_sums(variant: _LevelVariant, results: SumsOf, key: str, shapes: Shapes
 def _numbers(variant: _LevelVariant, shapes: Shapes) -> dict[str, int]:
     flags = {"own_queries": variant.own, "closed": variant.closed}
     flags |= {"drop_self": variant.keep.drop_self, "later_only": variant.keep.later_only}
-    return {"n": shapes["ids"][0], "m": shapes["query_ids"][0], **flags}
+    kinds = shapes[level_kernels.TABLE[0]][0] if level_kernels.TABLE[0] in shapes else 0
+    return {"n": shapes["ids"][0], "m": shapes["query_ids"][0], "kinds": kinds, **flags}
 
 
 def _plan_rows(variant: _LevelVariant, shapes: Shapes, multiprocessors: int) -> Plan:
     kind = (variant.dim, variant.double, variant.lists, variant.rule, GROUPS, HALVINGS, variant.periodic, variant.batched)
-    query = level_kernels.query_kernel(*kind, variant.cuda)
+    query = level_kernels.query_kernel(*kind, variant.cuda, variant.excluding)
     numbers = _numbers(variant, shapes) | {"capacity": shapes["idx"][1] if variant.lists else 0}
     launch = Launch(query, numbers["m"]) if variant.cuda else share(query, numbers["m"])
     return Plan([Clear("info", 8), launch], numbers, [] if variant.lists else ["idx"])

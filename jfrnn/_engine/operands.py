@@ -56,9 +56,14 @@ def lattice_numbers(lattice: Lattice, reach: Array, slack: Array) -> Array:
     return jnp.concatenate([part.reshape(-1) for part in parts])
 
 
+def excluded_rows(search: Search) -> list[Array]:
+    """Return the rows of sources that queries exclude, as kernels read them (see `kernels/native/excluded.h`), if there are any."""
+    return [] if search.exclude is None else [search.exclude.starts, search.exclude.others]
+
+
 def pack_particles(search: Search) -> tuple[Array, Array, Array]:
     """Return rows of sources and of queries, and the shared numbers, as the cell kernels read them."""
-    sources, queries, cutoff, batch, torus, _ = search
+    sources, queries, cutoff, batch, torus = search[:5]
     numbers = [jnp.reshape(jnp.asarray(largest_radius(cutoff)), 1)]
     turns = query_turns = None
     if torus is not None:

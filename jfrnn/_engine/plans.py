@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jfrnn._engine.start import compiler, load_warp, warn_of_folders
 from jfrnn.kernels import Kernel, _driver
+from jfrnn.kernels._native import EXCLUDED
+from jfrnn.kernels.levels import TABLE
 
 if TYPE_CHECKING:
     from jfrnn.kernels._compile import Library
@@ -19,6 +21,7 @@ PLACES_PER_THREAD = 512  # below, a second thread costs more than it saves
 _HUGE = 1 << 22  # bytes from which an array is worth a request for huge pages
 _MOST_BYTES, _MOST_ARRAYS, MOST_WORDS = 1024, 48, 1024  # those of the native code
 _ONCE, _SHARED, _CUDA, _CUDA_BESIDE, _CLEAR, _HUGE_PAGES = range(6)
+_MAY_LACK = (*EXCLUDED, *TABLE)  # arguments that kernels name, and some of them do not read
 _STREAM = "stream"  # the name of an argument that gets the stream of the call, as if that were an array
 
 
@@ -189,7 +192,8 @@ def _lay_step(plan: Plan, places: dict[str, int], device: int, held: list[Any], 
     kernel, numbers = step.kernel, {**plan.numbers, **step.numbers}
     if kernel.size > _MOST_BYTES:
         raise ValueError(f"{kernel.name} takes {kernel.size} bytes of arguments, more than {_MOST_BYTES}")
-    arrays = [field for field in kernel.fields if field.is_array and field.name not in plan.absent]
+    left_out = {*plan.absent, *(name for name in _MAY_LACK if name not in places)}
+    arrays = [field for field in kernel.fields if field.is_array and field.name not in left_out]
     pairs = [number for field in arrays for number in (field.place, places[field.name])]
     given = kernel.pack(numbers)
     on_cuda = device >= 0 and kernel.program.cuda

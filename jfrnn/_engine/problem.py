@@ -14,13 +14,14 @@ from jfrnn._geometry import (
     Box,
     Cutoff,
     Cutoffs,
+    Exclusions,
     Images,
     Lattice,
     Radii,
     Status,
     Wrapped,
+    are_valid,
     has_box,
-    is_radius,
     is_valid,
     make_cutoffs,
     make_lattice,
@@ -60,6 +61,7 @@ class Search(NamedTuple):
     batch: Batch | None
     torus: tuple[Lattice, Wrapped] | None
     checks: dict[Status, Array]
+    exclude: Exclusions | None = None
 
     @property
     def cutoffs(self) -> Cutoffs:
@@ -86,6 +88,7 @@ class Kind(NamedTuple):
     batch: bool = False
     radii: bool = False
     summed: bool = False
+    excluding: bool = False
 
 
 ANYTHING = Kind()  # a search that every engine supports
@@ -153,6 +156,7 @@ class Inputs(NamedTuple):
     box: Box | None
     cutoff: Cutoff | Radii  # cutoff of the list: a single one that includes the skin, or per-particle ones that do not
     batch: Batch | None = None
+    exclude: Exclusions | None = None
 
 
 def hide_inactive(positions: Array, active: Array | None) -> Array:
@@ -181,22 +185,26 @@ def take_present(inputs: Inputs) -> Inputs:
 def prepare_search(inputs: Inputs, options: Options) -> Search:
     """Prepare the operands for engines. No gradient flows through."""
     asked = lax.stop_gradient(inputs)
-    given, queries, active, box, cutoff, batch = take_present(asked)
+    given, queries, active, box, cutoff, batch, exclude = take_present(asked)
     sources, images = hide_inactive(given, active), options.images
     if box is not None and box.per_system and batch is not None:
-        return _prepare_boxes(asked, active, Search(sources, queries, _one_cutoff(cutoff), batch, None, {}), options)
+        return _prepare_boxes(asked, active, Search(sources, queries, _one_cutoff(cutoff), batch, None, {}, exclude), options)
     batch = None if batch is None else rank_systems(batch)
-    checks: dict[Status, Array] = {}
+    checks = _check_exclusions(exclude)
     if isinstance(cutoff, Radii):
-        sources, queries, checks = _with_valid_radii(sources, queries, active, cutoff)
+        sources, queries, checks[Status.INVALID_CUTOFF] = _with_valid_radii(sources, queries, active, cutoff)
         cutoff = make_cutoffs(cutoff, options.closed, options.skin)
     if box is None or images is None:
-        return Search(sources, queries, cutoff, batch, None, checks)
+        return Search(sources, queries, cutoff, batch, None, checks, exclude)
     lattice = make_lattice(box, images, np.dtype(sources.dtype))
     wrapped = wrap(sources, queries, lattice, largest_radius(cutoff))
     checks[Status.BOX_TOO_SMALL] = wrapped.enough & is_valid(lattice)
     checks[Status.OUT_OF_RANGE] = (wrapped.met & TOO_FAR) == 0
-    return Search(sources, queries, cutoff, batch, (lattice, wrapped), checks)
+    return Search(sources, queries, cutoff, batch, (lattice, wrapped), checks, exclude)
+
+
+def _check_exclusions(exclude: Exclusions | None) -> dict[Status, Array]:
+    return {} if exclude is None or exclude.valid is None else {Status.EXCLUDED_OUT_OF_RANGE: exclude.valid}
 
 
 def _one_cutoff(cutoff: Cutoff | Radii) -> Cutoff:
@@ -227,7 +235,7 @@ def _prepare_boxes(asked: Inputs, present: Array | None, search: Search, options
         Status.SYSTEM_WITHOUT_BOX: functools.reduce(jnp.logical_and, (x.all() for x in named)),
         Status.BOX_TOO_SMALL: (right | ~present).all(),
         Status.OUT_OF_RANGE: (wrapped.met & TOO_FAR) == 0,
-    }
+    } | _check_exclusions(search.exclude)
     return search._replace(batch=nearest, torus=(lattice, wrapped), checks=checks)
 
 
@@ -239,20 +247,20 @@ def is_decidable(inputs: Inputs, options: Options) -> Array:
 
 def _with_valid_radii(
     sources: Array, queries: Array | None, active: Array | None, radii: Radii
-) -> tuple[Array, Array | None, dict[Status, Array]]:
+) -> tuple[Array, Array | None, Array]:
     """Return positions and queries, moved to infinity if their cutoff is invalid, and whether all active ones have valid ones."""
-    of_sources, of_queries = (None if x is None else is_radius(x) for x in (radii.sources, radii.queries))
+    of_sources, of_queries = are_valid(radii)
     right = [jnp.ones((), bool)]
     if queries is None:
         valid = next(x for x in (of_sources, of_queries) if x is not None)
-        return _where_rows(valid, sources), None, {Status.INVALID_CUTOFF: (valid if active is None else valid | ~active).all()}
+        return _where_rows(valid, sources), None, (valid if active is None else valid | ~active).all()
     if of_sources is not None:
         right.append((of_sources if active is None else of_sources | ~active).all())
         sources = _where_rows(of_sources, sources)
     if of_queries is not None:
         right.append(of_queries.all())
         queries = _where_rows(of_queries, queries)
-    return sources, queries, {Status.INVALID_CUTOFF: functools.reduce(jnp.logical_and, right)}
+    return sources, queries, functools.reduce(jnp.logical_and, right)
 
 
 def _where_rows(valid: Array, points: Array) -> Array:

@@ -45,7 +45,7 @@ def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
     present = take_present(inputs)
     given, given_queries, active = lax.stop_gradient(present[:3])
     search = prepare_search(inputs, options)
-    sources, queries, cutoff, _, torus, checks = search
+    sources, queries, cutoff, _, torus, checks = search[:6]
     rows = _empty_rows(search, options, capacity) if 0 in search.sizes else options.engine.rows(search, options, capacity)
     if torus is not None and active is None and isinstance(cutoff, Cutoff):  # else positions may be infinite for other reasons
         checks = checks | {Status.NONFINITE: (torus[1].met & NOT_FINITE) == 0}

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._engine.candidates import Candidates, Points, Span, Torus
+from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
 from jfrnn._engine.problem import Filter
 from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
 from jfrnn._engine.words import LANES, BitRows, bit_counts, windows
@@ -299,6 +299,8 @@ class _Engine(NamedTuple):
         if image is not None and self.candidates.torus is not None:  # translate the query instead of the image
             query = [q - t for q, t in zip(query, self._translations(self.candidates.torus, image, span), strict=True)]
         allowed = self._allowed_lanes(first, stop, image, span)
+        if self.candidates.excluded is not None:
+            allowed = allowed & ~self._excluded_lanes(self.candidates.excluded, first, span)
         packed = self._test(first, image, query, span) & (allowed | allowed << np.uint32(LANES))
         first, image, packed = lax.optimization_barrier((first, image, packed))
         return _HitWords(self._decide_doubtful(packed, first, image, span), first, image)
@@ -363,14 +365,31 @@ class _Engine(NamedTuple):
         lanes = (one << jnp.clip(stop - first, 0, LANES).astype(jnp.uint32)) - one
         if not self.keep.drop_self or self.keep.later_only:
             return lanes
-        again, own = self.candidates.again, jnp.zeros_like(lanes)
-        for where in (span.places,) if again is None else (span.places, span.places + again):
-            lane = where[:, None] - first
-            here = (lane >= 0) & (lane < LANES)
-            own = own | jnp.where(here, one << jnp.clip(lane, 0, LANES).astype(jnp.uint32), np.uint32(0))
+        own = self._lanes_at(span.places, first)
         if image is not None and self.candidates.torus is not None:
             own = jnp.where(image == self.candidates.torus.images.home, own, np.uint32(0))
         return lanes & ~own
+
+    def _lanes_at(self, place: Array, first: Array) -> Array:
+        """Return the candidates at a position [b] of each query: bits, [b, words] uint32."""
+        again, lanes = self.candidates.again, jnp.zeros(first.shape, jnp.uint32)
+        for where in (place,) if again is None else (place, place + again):
+            lane = where[:, None] - first
+            here = (lane >= 0) & (lane < LANES)
+            bit = np.uint32(1) << jnp.clip(lane, 0, LANES).astype(jnp.uint32)
+            lanes = lanes | jnp.where(here, bit, np.uint32(0))
+        return lanes
+
+    def _excluded_lanes(self, excluded: Excluded, first: Array, span: Span) -> Array:
+        """Return which candidates queries exclude: bits, [b, words] uint32. One pass for each place in the longest row."""
+        own = span.of(self.queries.ids)
+        begin, end = flat_take(excluded.starts, own), flat_take(excluded.starts, own + 1)
+
+        def add(k: Array, lanes: Array) -> Array:
+            place = flat_take(excluded.places, jnp.minimum(begin + k, excluded.places.size - 1))
+            return lanes | self._lanes_at(jnp.where(begin + k < end, place, -(1 << 30)), first)
+
+        return lax.fori_loop(0, largest_of(end - begin), add, jnp.zeros(first.shape, jnp.uint32))
 
     def _is_later(self, first: Array, image: Array | None, span: Span) -> Array:
         """Say which candidates [b, words, 16] are the later ones of their pairs: of a query's own images, the forward half."""

@@ -9,7 +9,7 @@ from jfrnn._engine.launch import Call, Shapes
 from jfrnn._engine.operands import space_flags
 from jfrnn._engine.plans import Plan
 from jfrnn._engine.problem import Filter
-from jfrnn.kernels._native import table_cells
+from jfrnn.kernels._native import EXCLUDED, table_cells
 
 _PARTICLES = ("positions", "queries", "cutoff")  # what kernels of cells are given
 
@@ -26,6 +26,7 @@ class Variant(NamedTuple):
     keep: Filter
     periodic: int = 0  # 1: nearest images, 2: images are told apart; two more where the lattice is skewed
     batched: bool = False
+    excluding: bool = False
 
 
 def describe_call(
@@ -37,14 +38,15 @@ def describe_call(
 ) -> Call:
     """Return what XLA calls for rows or counts: its name tells the kernels, and all that is static.
 
-    It is `given` arrays of these names, and writes rows, counts, `info` and `more`.
+    It is `given` arrays of these names, then those of exclusions, and writes rows, counts, `info` and `more`.
     """
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
     flags |= {**space_flags(variant.periodic), "batched": variant.batched}
     flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
+    flags |= {"excluding": variant.excluding}
     whole = "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
     results = [*["idx"] * variant.lists, "count", "info", *more]
-    return Call(whole, tuple(given), dict.fromkeys(results, np.int32), plan)
+    return Call(whole, (*given, *EXCLUDED * variant.excluding), dict.fromkeys(results, np.int32), plan)
 
 
 def plan_numbers(variant: Variant, shapes: Shapes) -> dict[str, int]:

@@ -18,7 +18,7 @@ from jfrnn._engine.arrays import levels_of
 from jfrnn._engine.boxes_warp import box_neighbors
 from jfrnn._engine.launch import Call, Shapes, kernel, open_native
 from jfrnn._engine.levels_warp import level_neighbors
-from jfrnn._engine.operands import MOST_IN_BOX, pack_particles, periodic_kind
+from jfrnn._engine.operands import MOST_IN_BOX, excluded_rows, pack_particles, periodic_kind
 from jfrnn._engine.plans import HugePages, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.problem import Engine, Filter, Kind, Options, Rows, Search, largest_radius
 from jfrnn._engine.start import check_warp
@@ -144,19 +144,20 @@ def call_kernels(
     With `blocks`, so many tell of their own queries how long rows are, and their status; otherwise one tells of all. `order` finds
     the order of the sources in that scratch.
     """
-    sources, queries, cutoff, batch, torus, _ = search
+    sources, queries, cutoff, batch, torus = search[:5]
     own, lists = queries is None, capacity is not None
     (n, m), dim = search.sizes, sources.shape[1]
     double = sources.dtype == jnp.float64
     periodic = periodic_kind(torus)
-    variant = Variant(dim, double, cutoff.scaled, lists, own, cutoff.closed, keep, periodic, batch is not None)
+    kind = (periodic, batch is not None, search.exclude is not None)
+    variant = Variant(dim, double, cutoff.scaled, lists, own, cutoff.closed, keep, *kind)
     if periodic in (1, 3) and n >= MOST_IN_BOX:
         raise ValueError(
             f"backend='warp' numbers at most {MOST_IN_BOX - 1} positions in a periodic box, got {n}: pass backend='jax'."
         )
     words = scratch_words(n, m, dim, 2 if double else 1, own)
     dims = {"idx": (m, capacity), "count": m, "info": 2 if blocks is None else (blocks, 2), "scratch": max(words, 1)}
-    *idx, count, info, scratch = make(variant)(*pack_particles(search), output_dims=dims)
+    *idx, count, info, scratch = make(variant)(*pack_particles(search), *excluded_rows(search), output_dims=dims)
     longest, status = (
         (info[0], info[1]) if blocks is None else (info[:, 0].max(), lax.reduce(info[:, 1], np.int32(0), lax.bitwise_or, (0,)))
     )
@@ -179,7 +180,7 @@ def _few_callable(variant: Variant) -> Call:
 
 
 def _plan_on_cuda(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan:
-    kind = {"periodic": variant.periodic, "batched": variant.batched}
+    kind = {"periodic": variant.periodic, "batched": variant.batched, "excluding": variant.excluding}
     dim, later = variant.dim, variant.keep.later_only
     kernels = cells_cuda.cell_kernels(dim, variant.double, variant.scaled, variant.lists, later, **kind)
     numbers = plan_numbers(variant, shapes)
@@ -192,7 +193,13 @@ def _plan_few(variant: Variant, shapes: Shapes, _: int) -> Plan:
     numbers = plan_numbers(variant, shapes)
     numbers["drop_self"] &= variant.own
     query = few_cuda.rows_kernel(
-        few_cuda.warps(numbers["m"]), variant.dim, variant.double, variant.lists, variant.batched, variant.periodic == 1
+        few_cuda.warps(numbers["m"]),
+        variant.dim,
+        variant.double,
+        variant.lists,
+        variant.batched,
+        variant.periodic == 1,
+        variant.excluding,
     )
     return Plan([Launch(query, few_cuda.threads(numbers["m"]))], numbers, absent(variant))
 
@@ -203,7 +210,7 @@ def place_launches(launches: Sequence[cells_cuda.Launch]) -> list[Launch]:
 
 
 def _plan_on_cpu(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan:
-    kind = {"periodic": variant.periodic, "batched": variant.batched}
+    kind = {"periodic": variant.periodic, "batched": variant.batched, "excluding": variant.excluding}
     kernels = cells_cpu.cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, **kind)
     numbers = plan_numbers(variant, shapes)
     rows = ask_for_huge_pages("idx", 4 * numbers["m"] * numbers["capacity"]) if variant.lists else []

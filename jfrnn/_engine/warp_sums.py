@@ -11,7 +11,7 @@ from jax import Array, lax
 from jfrnn._engine.arrays import levels_of
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.levels_warp import level_sums
-from jfrnn._engine.operands import pack_particles, periodic_kind, space_flags
+from jfrnn._engine.operands import excluded_rows, pack_particles, periodic_kind, space_flags
 from jfrnn._engine.plans import Launch, Plan, share
 from jfrnn._engine.problem import Filter, Search
 from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText
@@ -19,6 +19,7 @@ from jfrnn._engine.variants import size_numbers
 from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, place_launches, sort_on_cpu
 from jfrnn._geometry import Cutoffs
 from jfrnn.kernels import cells_cpu, cells_cuda, few_cuda, pair_sum_cpu, pair_sum_cuda
+from jfrnn.kernels._native import EXCLUDED
 
 _GIVEN = ("positions", "queries", "cutoff", "shared_values", "own_values", "others")  # what a call is given
 _RESULTS = ("sums", "totals", "errors", "more")  # what kernels write
@@ -41,6 +42,7 @@ class _SumVariant(NamedTuple):
     key: str
     cuda: bool
     few: bool  # all of them meet
+    excluding: bool
 
 
 def pair_sums(
@@ -64,11 +66,14 @@ def pair_sums(
 
     def on(cuda: bool) -> Callable[[Search, tuple[Array, Array, Array]], FoundSums]:
         def call(search: Search, values: tuple[Array, Array, Array]) -> FoundSums:
-            sources, queries, cutoff, batch, torus, _ = search
+            sources, queries, cutoff, batch, torus = search[:5]
             flags = (queries is None, cutoff.closed, keep.drop_self, periodic_kind(torus), batch is not None)
-            double, kind = sources.dtype == jnp.float64, (compensated, extremes, key, cuda, cuda and are_few(search))
+            double, kind = (
+                sources.dtype == jnp.float64,
+                (compensated, extremes, key, cuda, cuda and are_few(search), search.exclude is not None),
+            )
             variant = _SumVariant(sources.shape[1], double, cutoff.scaled, *flags, *kind)
-            return _call_sums(variant, term, pack_particles(search), values)
+            return _call_sums(variant, term, pack_particles(search), values, excluded_rows(search))
 
         return call
 
@@ -80,12 +85,13 @@ def _call_sums(
     term: TermText,
     particles: tuple[Array, Array, Array],
     values: tuple[Array, Array, Array],
+    excluded: list[Array],
 ) -> FoundSums:
     """Let XLA call the kernels."""
     n, m = len(particles[0]), len(particles[1])
     if variant.few:
         results = SumsOf(term, m, few_cuda.slots(m), variant.compensated, variant.extremes)
-        return results.unpack(*_few_callable(variant, term)(*particles, *values, output_dims=results.dims()))
+        return results.unpack(*_few_callable(variant, term)(*particles, *values, *excluded, output_dims=results.dims()))
     engine = pair_sum_cuda if variant.cuda else pair_sum_cpu
     results = SumsOf(term, m, engine.slots(m), variant.compensated, variant.extremes)
     dims = results.dims()
@@ -96,27 +102,30 @@ def _call_sums(
         values = (*values, *_sorting_callable(_sorting(variant))(*particles, output_dims=of_search))
     else:
         dims |= of_search
-    return results.unpack(*_sum_callable(variant, term)(*particles, *values, output_dims=dims)[: len(_RESULTS)])
+    return results.unpack(*_sum_callable(variant, term)(*particles, *values, *excluded, output_dims=dims)[: len(_RESULTS)])
 
 
 @kernel
 def _sum_callable(variant: _SumVariant, term: TermText) -> Call:
     scalar, words = np.float64 if variant.double else np.float32, {"info": np.int32, "scratch": np.int32}
     results, of_search = dict.fromkeys((*_RESULTS, _SORTED[variant.cuda]), scalar), tuple(words)
+    excluded = EXCLUDED * variant.excluding
     name = _name_of_sum(f"pair_sum_{'cuda' if variant.cuda else 'cpu'}", variant)
     if variant.cuda:  # particles are sorted
-        return Call(name, (*_GIVEN, *of_search), results, functools.partial(_plan_on_cuda, variant, term))
-    return Call(name, _GIVEN, results | words, functools.partial(_plan_on_cpu, variant, term))
+        return Call(name, (*_GIVEN, *of_search, *excluded), results, functools.partial(_plan_on_cuda, variant, term))
+    return Call(name, (*_GIVEN, *excluded), results | words, functools.partial(_plan_on_cpu, variant, term))
 
 
 @kernel
 def _few_callable(variant: _SumVariant, term: TermText) -> Call:
     scalar, plan = np.float64 if variant.double else np.float32, functools.partial(_plan_few, variant, term)
-    return Call(_name_of_sum("pair_sum_few_cuda", variant), _GIVEN, dict.fromkeys(_RESULTS, scalar), plan)
+    return Call(
+        _name_of_sum("pair_sum_few_cuda", variant), (*_GIVEN, *EXCLUDED * variant.excluding), dict.fromkeys(_RESULTS, scalar), plan
+    )
 
 
 def _plan_few(variant: _SumVariant, term: TermText, shapes: Shapes, _: int) -> Plan:
-    kind = variant.compensated, variant.batched, variant.extremes, variant.periodic == 1
+    kind = variant.compensated, variant.batched, variant.extremes, variant.periodic == 1, variant.excluding
     numbers = _numbers(variant, term, shapes)
     query = few_cuda.sum_kernel(few_cuda.warps(numbers["m"]), term, variant.key, variant.dim, variant.double, *kind)
     numbers["drop_self"] &= variant.own
@@ -127,13 +136,14 @@ def _name_of_sum(name: str, variant: _SumVariant) -> str:
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "own": variant.own}
     flags |= {"closed": variant.closed, "dropself": variant.drop_self, "batched": variant.batched}
     flags |= space_flags(variant.periodic)
-    flags |= {"compensated": variant.compensated, "extremes": variant.extremes, variant.key: bool(variant.key)}
+    flags |= {"compensated": variant.compensated, "extremes": variant.extremes, "excluding": variant.excluding}
+    flags |= {variant.key: bool(variant.key)}
     return "_".join([f"jfrnn_{name}_{variant.dim}d", *(flag for flag, on in flags.items() if on)])
 
 
 def _sorting(variant: _SumVariant) -> _SumVariant:
     """Return on what of a variant it depends how particles are sorted."""
-    return variant._replace(closed=False, drop_self=False, compensated=False, extremes=False, key="")
+    return variant._replace(closed=False, drop_self=False, compensated=False, extremes=False, key="", excluding=False)
 
 
 @kernel
@@ -164,7 +174,7 @@ def _numbers(variant: _SumVariant, term: TermText, shapes: Shapes) -> dict[str, 
 def _plan_on_cpu(variant: _SumVariant, term: TermText, shapes: Shapes, multiprocessors: int) -> Plan:
     dim, double, scaled = variant[:3]
     cells = cells_cpu.cell_kernels(dim, double, scaled, False, **_space(variant))
-    more = _space(variant) | {"extremes": variant.extremes}
+    more = _space(variant) | {"extremes": variant.extremes, "excluding": variant.excluding}
     query = pair_sum_cpu.query_kernel(term, variant.key, dim, double, scaled, variant.compensated, **more)
     numbers = _numbers(variant, term, shapes)
     values = [share(pair_sum_cpu.sort_kernel(dim, double), numbers["n"])] if term.source_columns else []
@@ -173,7 +183,7 @@ def _plan_on_cpu(variant: _SumVariant, term: TermText, shapes: Shapes, multiproc
 
 def _plan_on_cuda(variant: _SumVariant, term: TermText, shapes: Shapes, multiprocessors: int) -> Plan:
     dim, double, scaled = variant[:3]
-    more = _space(variant) | {"extremes": variant.extremes}
+    more = _space(variant) | {"extremes": variant.extremes, "excluding": variant.excluding}
     kernels = pair_sum_cuda.sum_kernels(term, variant.key, dim, double, scaled, variant.compensated, **more)
     numbers = _numbers(variant, term, shapes)
     launches = kernels.launches(numbers["n"], numbers["m"], multiprocessors)

@@ -15,6 +15,7 @@ from jfrnn._geometry.integers import limb_bits, limb_type
 Flags = Any  # bool array of NumPy or JAX, like the argument
 RULES = ("gather", "scatter", "either", "both", "mean")  # cutoff of a pair: i's, j's, larger, smaller, mean
 SUM = "sum"  # a rule of users: the mean of doubled radii, exactly
+TABLE = "table"  # a rule of pairs of species
 EXCHANGED = {"gather": "scatter", "scatter": "gather"}  # rules that become another one where i and j are exchanged
 
 
@@ -47,24 +48,31 @@ class Cutoff:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Radii:
-    """Cutoffs per particle as the user gave them; arrays, so they may be traced.
+    """Cutoffs per particle, or per pair of species, as the user gave them; arrays, so they may be traced.
 
     Attributes:
-        sources: [n] cutoffs of the sources, or None if the rule does not use them.
-        queries: [m] cutoffs of the queries, likewise.
-        rule: How the cutoff of a pair follows from both (`RULES`). Static.
+        sources: [n] cutoffs of the sources, or None if the rule does not use them; with a table species, int32.
+        queries: [m] cutoffs or species of the queries, likewise.
+        rule: How the cutoff of a pair follows from both (`RULES` and `TABLE`). Static.
         summed: Whether they are twice the radii that the user gave, whose sum is then their mean. Static.
+        table: [s, s] cutoffs of pairs of species, 0 for those that are no neighbors; None with cutoffs per particle.
     """
 
     sources: Array | None
     queries: Array | None
     rule: str = dataclasses.field(metadata={"static": True})
     summed: bool = dataclasses.field(default=False, metadata={"static": True})
+    table: Array | None = None
 
     @property
     def asked(self) -> str:
         """The rule that the user named."""
-        return SUM if self.summed else self.rule
+        return SUM if self.summed else RULES[0] if self.rule == TABLE else self.rule
+
+    def reverse(self) -> "Radii":
+        """Return the cutoffs of the same pairs with queries and sources exchanged."""
+        rule = EXCHANGED.get(self.rule, self.rule)
+        return dataclasses.replace(self, sources=self.queries, queries=self.sources, rule=rule)
 
 
 @jax.tree_util.register_dataclass
@@ -77,8 +85,10 @@ class Cutoffs:
         queries: [m] cutoffs of the queries, likewise.
         largest: [] the largest of all.
         unit_scale: [] power of two, a normal float, that scales the largest into [1, 4).
-        rule: How the cutoff of a pair follows from both (`RULES`). Static.
+        rule: How the cutoff of a pair follows from both (`RULES` and `TABLE`). Static.
         closed: Whether pairs at exactly the cutoff count. Static.
+        kinds: With a table, the cutoffs of pairs of species, [s, s], -1 for those that are no neighbors, and the species of the
+            sources and of the queries. The cutoff of a particle is then the largest one of its species. Otherwise None.
     """
 
     sources: Array | None
@@ -87,10 +97,28 @@ class Cutoffs:
     unit_scale: Array
     rule: str = dataclasses.field(metadata={"static": True})
     closed: bool = dataclasses.field(metadata={"static": True})
+    kinds: tuple[Array, Array, Array] | None = None
     scaled = True
 
+    @property
+    def of_points(self) -> tuple[Array | None, Array | None]:
+        """What `of_pairs` takes of the sources [n] and of the queries [m]: their cutoffs, or their species."""
+        return (self.sources, self.queries) if self.kinds is None else self.kinds[1:]
+
+    @property
+    def of_cells(self) -> "Cutoffs":
+        """These cutoffs for those who look for candidates: no pair of species reaches farther than either does at all."""
+        return self if self.kinds is None else dataclasses.replace(self, rule="both", kinds=None)
+
     def of_pairs(self, queries: Array | None, sources: Array | None) -> list[Array]:
-        """Return the cutoff of each pair in a list of one array, or of two arrays if the rule is their mean."""
+        """Return the cutoff of each pair in a list of one array, or of two arrays if the rule is their mean.
+
+        It takes what `of_points` holds of them.
+        """
+        if self.kinds is not None and queries is not None and sources is not None:
+            table = self.kinds[0]
+            at = queries * np.int32(len(table)) + sources
+            return [table.reshape(-1).at[at].get(mode="promise_in_bounds")]
         if sources is None or queries is None:
             return [x for x in (queries, sources) if x is not None]
         if self.rule == "mean":
@@ -143,12 +171,37 @@ def fraction_bits(dtype: np.dtype, times: int) -> int:
 
 def make_cutoffs(radii: Radii, closed: bool, skin: float = 0.0) -> Cutoffs:
     """Derive the constants of the pair test from cutoffs per particle; a skin is added to each, rounded up."""
+    if radii.table is not None:
+        return _make_cutoffs_of_kinds(radii, radii.table, closed, skin)
     parts = [
         None if x is None else jnp.where(is_radius(x), _sum_rounded_up(jnp.abs(x), skin), 0) for x in (radii.sources, radii.queries)
     ]
     largest = functools.reduce(jnp.maximum, (jnp.max(x, initial=0) for x in parts if x is not None))
     largest = jnp.where(largest > 0, largest, 1)
     return Cutoffs(parts[0], parts[1], largest, unit_scale(largest), radii.rule, closed)
+
+
+def _make_cutoffs_of_kinds(radii: Radii, given: Array, closed: bool, skin: float) -> Cutoffs:
+    if radii.sources is None or radii.queries is None:
+        raise TypeError("a table of cutoffs needs the species of sources and queries.")
+    table = jnp.where(is_radius(given) & (given > 0), _sum_rounded_up(given, skin), -1)
+    farthest = jnp.maximum(jnp.max(table, axis=1, initial=0), 0)
+    kinds = [jnp.clip(x, 0, len(table) - 1) for x in (radii.sources, radii.queries)]
+    largest = jnp.max(farthest, initial=0)
+    largest = jnp.where(largest > 0, largest, 1)
+    return Cutoffs(farthest[kinds[0]], farthest[kinds[1]], largest, unit_scale(largest), TABLE, closed, (table, kinds[0], kinds[1]))
+
+
+def are_valid(radii: Radii) -> tuple[Array | None, Array | None]:
+    """Say which sources [n] and queries [m] have a valid cutoff, or a species with valid ones; None for those that need none."""
+    if radii.table is None:
+        of_sources, of_queries = (None if x is None else is_radius(x) for x in (radii.sources, radii.queries))
+        return of_sources, of_queries
+    right, kinds = (is_radius(radii.table) & (radii.table == radii.table.T)).all(axis=1), len(radii.table)
+    of_sources, of_queries = (
+        None if x is None else (x >= 0) & (x < kinds) & right[jnp.clip(x, 0, kinds - 1)] for x in (radii.sources, radii.queries)
+    )
+    return of_sources, of_queries
 
 
 def _sum_rounded_up(x: Array, skin: float) -> Array:
@@ -192,6 +245,8 @@ def _bounds_of_pairs(cutoffs: Cutoffs, radii: list[Array], slack: Array | None =
     sure = radius > jnp.maximum(off, least)
     inside = jnp.where(sure, (radius - off) ** 2 * (1 - 32 * finfo.eps), -1)
     outside = (jnp.maximum(radius, least) + off) ** 2 * (1 + 32 * finfo.eps)
+    if cutoffs.kinds is not None:
+        outside = jnp.where(radius > 0, outside, -1)
     return inside, outside
 
 

@@ -125,7 +125,7 @@ class _Slots(NamedTuple):
         """Return the cutoffs of a `Pair` at flat indices, or of all pairs, with these sources."""
         if isinstance(self.cutoff, Cutoff):
             return None
-        own, other = self.cutoff.queries, self.cutoff.sources
+        other, own = self.cutoff.of_points
         return self.cutoff.of_pairs(None if own is None else self._spread(own, at), None if other is None else other[source])
 
     def points(self, at: Array | None) -> Pair:

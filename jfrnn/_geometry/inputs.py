@@ -12,10 +12,11 @@ from jax.core import Tracer
 
 from jfrnn._geometry.batch import Batch
 from jfrnn._geometry.box import Box
-from jfrnn._geometry.cutoffs import RULES, SUM, Cutoff, Radii, largest_cutoff, make_cutoff, smallest_cutoff
+from jfrnn._geometry.cutoffs import RULES, SUM, TABLE, Cutoff, Radii, is_radius, largest_cutoff, make_cutoff, smallest_cutoff
 from jfrnn._tracing import Given, gather, make_on_host, on_device
 
 _MOST_POINTS = 2**31 - 32
+_MOST_KINDS = 2**12  # places in a table of their cutoffs are whole floats, too
 
 
 def check_positions(name: str, positions: Given, like: Array | None = None) -> Array:
@@ -113,6 +114,11 @@ def check_radii(cutoff: Given, rule: object, sources: Array, queries: Array | No
     if rule not in (*RULES, SUM):
         raise ValueError(f"radius_rule must be one of {', '.join(map(repr, (*RULES, SUM)))}, got {rule!r}.")
     summed, rule = rule == SUM, "mean" if rule == SUM else str(rule)
+    if not isinstance(cutoff, tuple | list) and np.ndim(cutoff) == 2:
+        raise ValueError(
+            f"cutoff has shape {list(np.shape(cutoff))}, that of a table of cutoffs of pairs of species: pass species=, that of "
+            "each particle, with it."
+        )
     if not isinstance(cutoff, tuple | list) and np.ndim(cutoff) == 0:
         if summed:
             raise ValueError(f"radius_rule='sum' adds radii of particles: pass an array of them, got {_describe(cutoff)}.")
@@ -145,6 +151,65 @@ def _check_radii_of(name: str, radii: Given, size: int, what: str, like: Array, 
     return 2 * radii if doubled else radii
 
 
+def check_species(cutoff: Given, species: Given, rule: object, sources: Array, queries: Array | None, masked: bool) -> Radii:
+    """Return cutoffs of pairs of species, [s, s]; `masked` says that some particles may be inactive, and have any species."""
+    if rule != RULES[0]:
+        raise ValueError(f"radius_rule is about cutoffs per particle, not of pairs of species: leave it out, got {rule!r}.")
+    n, m = sources.shape[0], None if queries is None else queries.shape[0]
+    if m is None:
+        of_sources = of_queries = _check_numbers("species", "species", species, n, "particle")
+    elif isinstance(species, tuple) and len(species) == 2:
+        of_sources = _check_numbers("species[0]", "species", species[0], n, "position")
+        of_queries = _check_numbers("species[1]", "species", species[1], m, "query")
+    else:
+        raise ValueError(
+            f"species must be a pair of arrays, of the positions [{n}] and of the queries [{m}], got {_describe_array(species)}."
+        )
+    table = check_table(cutoff, sources)
+    if not masked:
+        for name, given in (("species", of_sources), ("species[1]", of_queries)):
+            _check_kinds(name, given, len(table))
+    return Radii(of_sources, of_queries, TABLE, table=table)
+
+
+def check_table(cutoff: Given, like: Array, kinds: int | None = None) -> Array:
+    """Return cutoffs of pairs of species, [s, s], in the dtype of the positions; `kinds` is s, where it is known."""
+    if not hasattr(cutoff, "dtype") or not np.issubdtype(cutoff.dtype, np.floating) or len(cutoff.shape) != 2:
+        raise TypeError(
+            "cutoff must be an array of floats of shape [s, s], the cutoffs of pairs of s species, where species is given, got "
+            f"{_describe_array(cutoff)}."
+        )
+    if cutoff.shape[0] != cutoff.shape[1] or cutoff.shape[0] == 0 or cutoff.shape[0] != (kinds or cutoff.shape[0]):
+        size = kinds or "s"
+        raise ValueError(
+            f"cutoff must have shape [{size}, {size}], a row and a column for each species, got shape {list(cutoff.shape)}."
+        )
+    if cutoff.shape[0] > _MOST_KINDS:
+        raise ValueError(f"cutoff holds cutoffs of {cutoff.shape[0]} species: at most {_MOST_KINDS}.")
+    table = _as_dtype(cutoff, like.dtype)
+    if isinstance(table, Tracer):
+        return table
+    known: Any = np.asarray(jax.device_get(table))
+    wrong = np.argwhere(~is_radius(known) | (known != known.T))
+    if len(wrong):
+        a, b = wrong[0].tolist()
+        raise ValueError(
+            "cutoff must be symmetric, and hold cutoffs that are positive and finite, or 0 for species that are no neighbors, "
+            f"got {known[a, b]} for species {a} and {b}, and {known[b, a]} for {b} and {a}."
+        )
+    return table
+
+
+def _check_kinds(name: str, species: Array, kinds: int) -> None:
+    """Raise if a species is not in the table; of traced ones a status bit tells."""
+    if isinstance(species, Tracer):
+        return
+    known: Any = np.asarray(jax.device_get(species))
+    wrong = known[(known < 0) | (known >= kinds)]
+    if wrong.size:
+        raise ValueError(f"{name} must be numbers of species from 0 to {kinds - 1}, the rows of cutoff, got {wrong[0]}.")
+
+
 def _double(radii: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore"):  # a status bit tells of cutoffs that are not finite
         return radii + radii
@@ -159,7 +224,7 @@ def _as_dtype(x: Given, dtype: np.dtype) -> Array:
 
 def largest_known(radii: Radii) -> float | None:
     """Return the largest valid cutoff, or 1 if none is valid; None if cutoffs are traced."""
-    given = [x for x in (radii.sources, radii.queries) if x is not None]
+    given = [x for x in (radii.sources, radii.queries) if x is not None] if radii.table is None else [radii.table.reshape(-1)]
     if any(isinstance(x, Tracer) for x in given):
         return None
     values: Any = np.concatenate(jax.device_get(given))
@@ -193,28 +258,29 @@ def check_active(active: Given, positions: Array) -> Array:
 def check_batch(batch: Given, sources: Array, queries: Array | None) -> Batch:
     """Return the system numbers of the particles, and of separate queries, as int32."""
     if queries is None:
-        return Batch(_check_systems("batch", batch, sources.shape[0], "particle"), None)
+        return Batch(_check_numbers("batch", "system", batch, sources.shape[0], "particle"), None)
     if not isinstance(batch, tuple) or len(batch) != 2:
         raise ValueError(
             f"batch must be a pair of arrays, of the positions [{sources.shape[0]}] and of the queries [{queries.shape[0]}], got "
             f"{_describe_array(batch)}."
         )
-    of_sources = _check_systems("batch[0]", batch[0], sources.shape[0], "position")
-    return Batch(of_sources, _check_systems("batch[1]", batch[1], queries.shape[0], "query"))
+    of_sources = _check_numbers("batch[0]", "system", batch[0], sources.shape[0], "position")
+    return Batch(of_sources, _check_numbers("batch[1]", "system", batch[1], queries.shape[0], "query"))
 
 
-def _check_systems(name: str, systems: Given, size: int, what: str) -> Array:
+def _check_numbers(name: str, of: str, systems: Given, size: int, what: str) -> Array:
+    """Return the number of the system, or of the species, of each particle as int32."""
     if not hasattr(systems, "dtype") or not np.issubdtype(systems.dtype, np.integer):
-        raise TypeError(f"{name} must be an array of integers, the system of each {what}, got {_describe_array(systems)}.")
+        raise TypeError(f"{name} must be an array of integers, the {of} of each {what}, got {_describe_array(systems)}.")
     if tuple(systems.shape) != (size,):
-        raise ValueError(f"{name} must have shape [{size}], the system of each {what}, got shape {list(systems.shape)}.")
+        raise ValueError(f"{name} must have shape [{size}], the {of} of each {what}, got shape {list(systems.shape)}.")
     if np.can_cast(systems.dtype, np.int32):
         return _as_dtype(systems, jnp.int32)
     if isinstance(systems, Tracer):
         raise TypeError(f"{name} is {systems.dtype}, of which not all numbers fit into int32: convert it with .astype(jnp.int32).")
     values: Any = np.asarray(jax.device_get(systems))
     if values.size and not -(2**31) <= int(values.min()) <= int(values.max()) < 2**31:
-        raise ValueError(f"{name} holds numbers from {values.min()} to {values.max()}, but systems are numbered in int32.")
+        raise ValueError(f"{name} holds numbers from {values.min()} to {values.max()}, but they are numbered in int32.")
     return make_on_host(systems, lambda known: known.astype(np.int32))
 
 

@@ -28,6 +28,7 @@ class Status(enum.IntFlag):
     HALO_TOO_FAR = 512
     TOTAL_OVERFLOW = 1024
     SYSTEM_WITHOUT_BOX = 2048
+    EXCLUDED_OUT_OF_RANGE = 4096
 
     @property
     def message(self) -> str:
@@ -52,7 +53,8 @@ _MESSAGES = {
     ),
     Status.INVALID_CUTOFF: (
         "`cutoff` holds values that are negative or not finite, or, where not 0, too small or large for their dtype: those "
-        "particles have no neighbors in this list. Find them with ~(jnp.isfinite(cutoff) & (cutoff >= 0))."
+        "particles have no neighbors in this list. Find them with ~(jnp.isfinite(cutoff) & (cutoff >= 0)). A table must be "
+        "symmetric as well, and hold all `species`."
     ),
     Status.NONFINITE_VERTEX: (
         "`vertices` that faces name hold non-finite coordinates (NaN or infinite): those faces are nobody's neighbors. "
@@ -68,6 +70,10 @@ _MESSAGES = {
     Status.SYSTEM_WITHOUT_BOX: (
         "`batch` names systems for which `box` holds no box: those particles have no neighbors in this list. Number systems from 0 "
         "to the length of `box.vectors` - 1, and particles that are not there -1."
+    ),
+    Status.EXCLUDED_OUT_OF_RANGE: (
+        "`exclude` names particles that do not exist: those pairs exclude nothing in this list. Number particles from 0 on, and "
+        "write -1 in rows that are padding."
     ),
     Status.TOTAL_OVERFLOW: "The list held more pairs than the `total` that `require` was told: exports of that length lack pairs.",
 }

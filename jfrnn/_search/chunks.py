@@ -86,5 +86,7 @@ def _cutoffs_of(nbrs: NeighborList) -> Array | tuple[Array, Array] | None:
     """Return the cutoffs per particle of a list, in the form that `NeighborList.grow` takes."""
     if nbrs.radii is None:
         return None
+    if nbrs.radii.table is not None:
+        return nbrs.radii.table
     known = [x / 2 if nbrs.radii.summed else x for x in (nbrs.radii.sources, nbrs.radii.queries) if x is not None]
     return (known[0], known[1]) if nbrs.own_queries and len(known) == 2 else known[0]

@@ -49,4 +49,11 @@ def find_fields(inputs: Inputs, options: Options, capacity: int, moving: bool, r
     if reversing and rows.idx is not None:
         topology = make_topology(options, sources.shape[0], inputs.queries is not None, radii, rows.idx, images, None, rows.order)
         fields["reverse"] = topology.with_reverse()
-    return fields | {"verlet": verlet, "box": lax.stop_gradient(inputs.box), "images": codes, "radii": radii, "batch": inputs.batch}
+    return fields | {
+        "verlet": verlet,
+        "box": lax.stop_gradient(inputs.box),
+        "images": codes,
+        "radii": radii,
+        "batch": inputs.batch,
+        "exclude": inputs.exclude,
+    }

@@ -17,6 +17,7 @@ from jfrnn._geometry import (
     Batch,
     Box,
     Cutoff,
+    Exclusions,
     Images,
     Radii,
     Status,
@@ -26,6 +27,7 @@ from jfrnn._geometry import (
     check_devices,
     check_radii,
     check_slack,
+    check_table,
     grow_images,
     make_cutoff,
     pairs_and_status,
@@ -63,6 +65,7 @@ class NeighborList(ListExports):
         radii: Cutoffs per particle (`Radii`: sources [n], queries [m], the rule; of the rule "sum", twice the radii and their
             mean), or None with one cutoff.
         batch: System numbers (`Batch`: sources [n], queries [m] or None), or None; updates keep them.
+        exclude: Pairs that are excluded, as rows (`Exclusions`), or None; updates keep them.
         reverse: Where pairs stand the other way round (`Reverse`), if the list was made with `reverse=True`; updates find it anew
             whenever they rebuild the list.
         order: The particles as they followed each other in space when the list was last rebuilt, shape [n], int32, by which sums
@@ -80,6 +83,7 @@ class NeighborList(ListExports):
     images: ImageCodes | None
     radii: Radii | None
     batch: Batch | None
+    exclude: Exclusions | None
     reverse: Reverse | None
     order: Array | None
     problem: Problem = dataclasses.field(metadata={"static": True})
@@ -89,7 +93,8 @@ class NeighborList(ListExports):
         *batch, m, capacity = shape_of(self.idx)
         rows = f"{m} queries of {self.source_count} particles" if self.own_queries else f"{self.source_count} particles"
         rows = f"batch of {batch}, {rows}" if batch else rows
-        reach = "per particle" if self.cutoff is None else f"{self.cutoff:.6g}"
+        kinds = self.radii is not None and self.radii.table is not None
+        reach = f"per {'pair of species' if kinds else 'particle'}" if self.cutoff is None else f"{self.cutoff:.6g}"
         skin = f", skin {self.skin:.6g}" if self.skin else ""
         rest = pairs_and_status(self.count, self.status)
         return f"NeighborList({rows}, capacity {capacity}, cutoff {reach}{skin}, engine {self.backend!r}, {rest})"
@@ -118,8 +123,8 @@ class NeighborList(ListExports):
 
         Args:
             positions: Sources [length], shape [n, d], where they are now.
-            cutoff: Present cutoffs per particle, as `search` takes them, if the list was made with such; default: those of the
-                list. The list keeps them. The growth of the largest one is subtracted from the skin.
+            cutoff: Present cutoffs per particle or per pair of species, as `search` takes them, if the list was made with such;
+                default: those of the list. The list keeps them. The growth of the largest one is subtracted from the skin.
             queries: Queries [length], shape [m, d], exactly if the list was made with queries.
             active: Which particles take part now, shape [n], bool, exactly if the list was made with `active`; a change causes a
                 rebuild.
@@ -179,7 +184,7 @@ class NeighborList(ListExports):
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, radii, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
         wider = dataclasses.replace(self, problem=self.problem.with_images(self._grow_images(box, radii)))
-        inputs, options = self.problem.inputs(sources, queries, active, box, radii, self.batch), wider.problem.options
+        inputs, options = self.problem.inputs(sources, queries, active, box, radii, self.batch, self.exclude), wider.problem.options
         with own_transfers():
             met = round_capacity(math.ceil(slack * int(np.max(np.asarray(self.required)))))
             made = _remake(wider, inputs, max(self.capacity, met, count_capacity(inputs, options, slack)))
@@ -392,6 +397,8 @@ class NeighborList(ListExports):
             return self.radii
         if self.radii is None:
             raise ValueError("this list was made with one cutoff for all particles: leave cutoff out.")
+        if self.radii.table is not None:
+            return dataclasses.replace(self.radii, table=check_table(cutoff, sources, self.radii.table.shape[0]))
         radii = check_radii(cutoff, self.radii.asked, sources, queries)
         if radii is None:
             raise ValueError("this list was made with a cutoff for each particle: pass such an array, or leave cutoff out.")
@@ -456,7 +463,7 @@ def _update(
     nbrs: NeighborList, sources: Array, queries: Array | None, active: Array | None, box: Box | None, radii: Radii | None
 ) -> NeighborList:
     sources, queries, box, radii = lax.stop_gradient((sources, queries, box, radii))
-    inputs = nbrs.problem.inputs(sources, queries, active, box, radii, nbrs.batch)
+    inputs = nbrs.problem.inputs(sources, queries, active, box, radii, nbrs.batch, nbrs.exclude)
 
     def remake(nbrs: NeighborList) -> NeighborList:
         made, verlet = _remake(nbrs, inputs, nbrs.capacity), nbrs.verlet
@@ -468,7 +475,7 @@ def _update(
         return remake(nbrs)
     now = hide_inactive(sources, take_present(inputs).active)
     moved = has_moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin, nbrs.batch)
-    fixed = {"box": box, "radii": radii, "batch": nbrs.batch}
+    fixed = {"box": box, "radii": radii, "batch": nbrs.batch, "exclude": nbrs.exclude}
     nobody = dict.fromkeys(fixed)  # what stays is no state of the loop, so that XLA derives from it once what steps of a scan need
     state = moved, dataclasses.replace(nbrs, **nobody)
 

@@ -10,16 +10,19 @@ from jfrnn._geometry import (
     EXCHANGED,
     Batch,
     Box,
+    Exclusions,
     Images,
     Radii,
     check_active,
     check_batch,
     check_box,
     check_cutoff,
+    check_exclusions,
     check_flag,
     check_positions,
     check_radii,
     check_skin,
+    check_species,
     images_of,
     largest_known,
     make_cutoff,
@@ -64,15 +67,22 @@ class Problem:
         return None if largest is None else list_radius(largest, self.skin, self.dtype)
 
     def inputs(
-        self, sources: Array, queries: Array | None, active: Array | None, box: Box | None, radii: Radii | None, batch: Batch | None
+        self,
+        sources: Array,
+        queries: Array | None,
+        active: Array | None,
+        box: Box | None,
+        radii: Radii | None,
+        batch: Batch | None,
+        exclude: Exclusions | None,
     ) -> Inputs:
         """Return the operands of this search for these particles."""
         if radii is not None:
-            return Inputs(sources, queries, active, box, radii, batch)
+            return Inputs(sources, queries, active, box, radii, batch, exclude)
         if self.cutoff is None:
             raise TypeError("a search needs a cutoff or radii.")
         reach = list_radius(self.cutoff, self.skin, self.dtype)
-        return Inputs(sources, queries, active, box, make_cutoff(reach, self.dtype, self.options.closed), batch)
+        return Inputs(sources, queries, active, box, make_cutoff(reach, self.dtype, self.options.closed), batch, exclude)
 
     def with_images(self, images: Images | None) -> "Problem":
         """Return the same problem with other images."""
@@ -86,6 +96,8 @@ def check_problem(
     box: Given,
     batch: Given,
     radius_rule: Given,
+    species: Given,
+    exclude: Given,
     half: bool,
     include_self: bool,
     closed: bool,
@@ -103,7 +115,12 @@ def check_problem(
     active = None if active is None else check_active(active, sources)
     keep = Filter(drop_self=queries is None and not check_flag("include_self", include_self), later_only=check_flag("half", half))
     dtype = np.dtype(sources.dtype)
-    radii, closed = check_radii(cutoff, radius_rule, sources, queries), check_flag("closed", closed)
+    closed = check_flag("closed", closed)
+    if species is None:
+        radii = check_radii(cutoff, radius_rule, sources, queries)
+    else:
+        radii = check_species(cutoff, species, radius_rule, sources, queries, active is not None)
+    excluded = None if exclude is None else check_exclusions(exclude, sources, queries)
     if keep.later_only and radii is not None and radii.rule in EXCHANGED:
         raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
     radius = float(check_cutoff(cutoff, dtype).radius) if radii is None else None
@@ -114,7 +131,7 @@ def check_problem(
     if box is not None and box.per_system:
         _check_boxes(batch, radii)
     images = None if box is None else images_of(box, reach, dtype, sources.shape[0])
-    kind = Kind(periodic=box is not None, radii=radii is not None, batch=batch is not None)
+    kind = Kind(periodic=box is not None, radii=radii is not None, batch=batch is not None, excluding=exclude is not None)
     engine = choose_engine(parse_backend(backend, ENGINES), sources, queries, kind)
     systems = None if batch is None else check_batch(batch, sources, queries)
     ordered = has_order(engine, platform_of(sources), sources.shape[0], queries is None and radii is None)
@@ -123,7 +140,7 @@ def check_problem(
     shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}
     problem = Problem(options, radius, skin, **shape, dim=sources.shape[1], dtype=dtype)
     box = None if box is None else round_box(box, dtype)
-    return problem, problem.inputs(sources, queries, active, box, radii, systems)
+    return problem, problem.inputs(sources, queries, active, box, radii, systems, excluded)
 
 
 def _check_boxes(batch: Given, radii: Radii | None) -> None:
@@ -131,4 +148,6 @@ def _check_boxes(batch: Given, radii: Radii | None) -> None:
     if batch is None:
         raise ValueError("box holds a box per system: pass batch=, the system of each particle (from 0 on; -1: in none of them).")
     if radii is not None:
-        raise ValueError("cutoff must be one number where box holds a box per system, got one per particle: pass the largest one.")
+        raise ValueError(
+            "cutoff must be one number where box holds a box per system, got one per particle or species: pass the largest one."
+        )

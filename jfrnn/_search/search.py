@@ -21,6 +21,8 @@ def search(
     box: Box | None = None,
     batch: Array | tuple[Array, Array] | None = None,
     radius_rule: str = "gather",
+    species: Array | tuple[Array, Array] | None = None,
+    exclude: Array | None = None,
     half: bool = False,
     include_self: bool = False,
     closed: bool = False,
@@ -41,7 +43,8 @@ def search(
         positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64. n = 0 is allowed.
         cutoff: Interaction radius [length]: a static number > 0; or one per particle, an array of floats of shape [n], which may be
             traced and hold 0, and to which `radius_rule` applies. With separate queries "gather" needs [m], "scatter" [n], and the
-            other rules a tuple of both, that of the positions first.
+            other rules a tuple of both, that of the positions first. Or, with `species`, one per pair of species, a symmetric array
+            of floats of shape [s, s], which may be traced; species whose entry is 0 are no neighbors, wherever they are.
         queries: Points [length] whose neighbors among `positions` are wanted, shape [m, d], same dtype; default: the positions
             themselves, each particle being excluded from its own row by index.
         box: Periodic box (`Box`): (i, j) is then listed once for each periodic image of j within the cutoff, with displacement x_j
@@ -55,6 +58,14 @@ def search(
         radius_rule: How the cutoff of a pair follows from cutoffs per particle: "gather" is that of i, the row; "scatter" that of
             j; "either" the larger, "both" the smaller, "mean" the exact mean, "sum" the exact sum, for contacts of spheres. Large
             cutoffs do not slow down particles with small ones: up to a ratio of 128, each particle searches cells of its own size.
+        species: Row of the table `cutoff` [s, s] that belongs to each particle, shape [n], integers from 0 to s - 1; with queries a
+            tuple of [n] and [m]. Particles of other species have no neighbors: outside jit, and without `active`, this raises, and
+            inside a status bit says so.
+        exclude: Pairs that are no neighbors, such as bonded atoms, whatever their distance: shape [e, 2], integers, numbers of two
+            particles in each row, in any order; with queries those of a query and of a particle. All periodic images of a pair are
+            excluded, those of particle i with itself by (i, i). Rows that hold a -1 are padding; partners of each particle are
+            written as pairs by `pairs_of_rows`. `count`, `capacity` and sums know nothing of excluded pairs, and updates keep them.
+            Only the number of rows is static. Traced numbers of particles that do not exist set a status bit.
         half: List each unordered pair once, in the row of its smaller index; of the images of a particle that are its own
             neighbors, those whose shift S has a positive number first. Not with the rules "gather" and "scatter".
         include_self: Make each particle its own neighbor.
@@ -74,7 +85,8 @@ def search(
         backend: "warp" (cells, compiled kernels, on CPU and NVIDIA GPUs), "hashgrid" (Warp's own `wp.HashGrid`, likewise), "jax"
             (cells, any device), "brute" (all n·m candidates), or "auto", the fastest measured on the platform: "warp" on the CPU
             and on NVIDIA GPUs (if Warp is missing "jax", with a warning), elsewhere "jax". The platform is that of the positions,
-            or of `jax.default_device` if they are traced. "hashgrid" supports neither boxes nor batches nor cutoffs per particle.
+            or of `jax.default_device` if they are traced. "hashgrid" supports neither boxes nor batches, nor exclusions, nor
+            cutoffs per particle or pair of species.
 
     Returns:
         A `NeighborList`; `idx` has shape [m, capacity], unused slots hold n. The order within rows is unspecified, but the same
@@ -116,7 +128,7 @@ def search(
     Array([1, 1, 0], dtype=int32)
     """
     problem, inputs = check_problem(
-        positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, skin, active
+        positions, cutoff, queries, box, batch, radius_rule, species, exclude, half, include_self, closed, backend, skin, active
     )
     slack = check_slack(slack)
     if capacity is None:
@@ -138,6 +150,8 @@ def count(
     box: Box | None = None,
     batch: Array | tuple[Array, Array] | None = None,
     radius_rule: str = "gather",
+    species: Array | tuple[Array, Array] | None = None,
+    exclude: Array | None = None,
     half: bool = False,
     include_self: bool = False,
     closed: bool = False,
@@ -155,7 +169,7 @@ def count(
     Memory: as in `search`, without the list. Differentiable: no (integers). Jit: yes. vmap: yes.
     """
     problem, inputs = check_problem(
-        positions, cutoff, queries, box, batch, radius_rule, half, include_self, closed, backend, 0.0, active
+        positions, cutoff, queries, box, batch, radius_rule, species, exclude, half, include_self, closed, backend, 0.0, active
     )
     with own_transfers():
         return call_apart(lambda inputs: count_rows(inputs, problem.options)[0], inputs)

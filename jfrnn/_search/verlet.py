@@ -94,7 +94,11 @@ def has_moved_too_far(
         below, above = jnp.split(extremes[1:], 2)
         used = box_change(old, news[0], jnp.where(below + above >= 0, below + above, 0))
     if radii is not None and verlet.radii is not None:
-        for before, now in ((verlet.radii.sources, radii.sources), (verlet.radii.queries, radii.queries)):
+        given = [(verlet.radii.sources, radii.sources), (verlet.radii.queries, radii.queries)]
+        if verlet.radii.table is not None and radii.table is not None:  # species stay what they are
+            given = [(verlet.radii.table, radii.table)]
+            moved = moved | ((verlet.radii.table > 0) != (radii.table > 0)).any()
+        for before, now in given:
             if before is not None and now is not None:
                 moved = moved | (is_radius(before) != is_radius(now)).any()
                 grown = jnp.maximum(grown, _growth(before, now))

@@ -53,12 +53,12 @@ class Pairs(NamedTuple):
 
 def pairs_of_search(inputs: Inputs, options: Options, summed: bool) -> Pairs:
     """Return the pairs that a search finds; `summed` says that they are summed, rather than reduced to an extreme."""
-    sources, queries, active, box, cutoff, batch = inputs
+    sources, queries, active, box, cutoff, batch, exclude = inputs
     fixed = lax.stop_gradient(inputs._replace(sources=hide_inactive(sources, active), active=None))
     relation, several = Searched(fixed, options), isinstance(cutoff, Radii)
     largest = make_cutoffs(cutoff, options.closed).largest if isinstance(cutoff, Radii) else cutoff.radius
     lattice = _lattice(box, options.images, sources, batch)
-    doubtful = several or box is not None
+    doubtful = several or box is not None or (exclude is not None and exclude.valid is not None)
     if summed and active is None and not doubtful:
         return Pairs(relation, False, sources, sources if queries is None else queries, lattice, largest, relation.symmetric, None)
     sources, rows, mark = _prepare_marks(sources, queries, _good_rows_of_search, (inputs,), (options, doubtful))

@@ -29,6 +29,8 @@ def pair_sum(
     box: Box | None = None,
     batch: Array | tuple[Array, Array] | None = None,
     radius_rule: str = "gather",
+    species: Array | tuple[Array, Array] | None = None,
+    exclude: Array | None = None,
     include_self: bool = False,
     closed: bool = False,
     active: Array | None = None,
@@ -61,6 +63,8 @@ def pair_sum(
         box: As in `search`; with `neighbors` as in `NeighborList.vectors`.
         batch: As in `search`.
         radius_rule: As in `search`.
+        species: As in `search`.
+        exclude: As in `search`.
         include_self: As in `search`; r is 0 then.
         closed: As in `search`.
         active: As in `search`.
@@ -131,12 +135,13 @@ def pair_sum(
         if named is not None and (reason := named.refuse(Kind(summed=True))):
             raise ValueError(f"backend={backend!r} {reason}")
         problem, inputs = check_problem(
-            positions, cutoff, queries, box, batch, radius_rule, False, include_self, closed, backend, 0.0, active
+            positions, cutoff, queries, box, batch, radius_rule, species, exclude, False, include_self, closed, backend, 0.0, active
         )
         with own_transfers():
             pairs = pairs_of_search(inputs, _with_engine(problem.options, inputs, named is None), reduce == "sum")
     else:
         given = {"batch": batch is not None, "radius_rule": radius_rule != "gather", "include_self": include_self}
+        given |= {"species": species is not None, "exclude": exclude is not None}
         given |= {"closed": closed, "active": active is not None, "backend": named is not None}
         with own_transfers():
             pairs = pairs_of_list(neighbors, positions, cutoff, queries, box, given, reduce != "sum" or compensated)

@@ -7,10 +7,11 @@
 // `asked` are those of queries, which are served in `order`. Rows of `positions` and `queries` are as they were given, with packed turns.
 #pragma once
 #include "exact.h"
+#include "excluded.h"
 
 struct BoxArguments {
     const real *positions, *queries, *boxes, *axes, *asked;
-    const int *ids, *order, *visits, *cells, *start;
+    const int *ids, *order, *visits, *cells, *start, *excluded_starts, *excluded;
     int *idx, *count, *info;
     int n, m, stride, own, capacity, closed, drop_self, later_only;
 };

@@ -81,12 +81,14 @@ struct BoxRows : BoxPairs {
             const bool asked = !(drop_self && run.code == at_home && at == place);
             hit = asked && square < inside;
             const bool open = asked && !hit && square <= outside;
-            if (later_only || open || (LIST && hit))
+            if (later_only || open || ((LIST || EXCLUDING) && hit))
                 source = ids[at];
             if (open)
                 hit = is_pair(source, run.code);
             if (later_only)
                 hit = hit && source >= first_asked(run.code);
+            if constexpr (EXCLUDING)
+                hit = hit && !Excluded(excluded_starts, excluded, query).has(source);
         }
         if constexpr (!LIST) {
             found += hit;

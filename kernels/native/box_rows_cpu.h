@@ -51,7 +51,7 @@ struct BoxRows : BoxPairs {
             asked &= ~(1u << (place - at));
         unsigned int pairs = mask_of(square, inside, Below{}) & asked;
         unsigned int open = mask_of(square, outside, BelowOrAt{}) & asked & ~pairs;
-        if (!LIST && !open && !later_only)
+        if (!LIST && !open && !later_only && !EXCLUDING)
             return __builtin_popcount(pairs);
         const ints sources = lanes_from(ids + at);
         for (; open; open &= open - 1) {
@@ -60,6 +60,10 @@ struct BoxRows : BoxPairs {
         }
         if (later_only)
             pairs &= bits_of_flags(__builtin_convertvector(sources >= first_asked(run.code), flags));
+        const Excluded mine(excluded_starts, excluded, query);
+        for (unsigned int rest = EXCLUDING ? pairs : 0; rest; rest &= rest - 1)
+            if (mine.has(sources[__builtin_ctz(rest)]))
+                pairs &= ~(rest & -rest);
         if (LIST && pairs)
             pack_within(sources + name_of(0, run.code), row + found, pairs, capacity - found);
         return __builtin_popcount(pairs);

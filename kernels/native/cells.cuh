@@ -1,10 +1,12 @@
 // How particles are sorted by cell on CUDA: seven or eight launches, in which every thread knows the same of the search.
 #pragma once
 #include "cells.h"
+#include "excluded.h"
 #include "shares.h"
 
 struct SearchArguments {
     const real *positions, *queries, *cutoff;
+    const int *excluded_starts, *excluded;
     int *idx, *count, *info, *scratch;
     int n, m, own, table, capacity, closed, drop_self, of_queries;
 };

@@ -20,6 +20,7 @@ constexpr int MANY = 1 << 15;          // sources from which several threads gat
 constexpr int CANDIDATES = 1024;       // that are held at a time, a multiple of 64
 constexpr bool LIST = true;            // ids of neighbors are written, they are not only counted
 constexpr int SUMS = 0;                // 1: summands are added up, 2: the largest ones are found
+constexpr bool EXCLUDING = false;      // queries exclude sources
 constexpr bool ONE_BY_ONE = false;     // candidates are met one by one
 // Of a term that is summed: columns of numbers of j and of lattice steps, numbers of i, sums over all pairs and of each i.
 constexpr int OTHERS = 1, STEPS = 0, OWN = 0, TOTALS = 1, ROW_SUMS = 1;

@@ -7,6 +7,7 @@
 // several images may be neighbors, have other kernels.
 #pragma once
 #include "exact.h"
+#include "excluded.h"
 
 constexpr unsigned int EVERY = 0xffffffffu;
 constexpr int SHARES = 32, OF_WARP = SHARES / FEW_WARPS;  // of sources, and those of a warp
@@ -20,6 +21,7 @@ struct FewPairs : Space {
     };
     typedef unsigned int Bits32[FEW_THREADS];
     const real *positions, *queries;
+    const int *excluded_starts, *excluded;
     const int n, m, closed, lane, warp;
     const int slot, query;  // of the query, in its block and in all
     const int words;        // of a share
@@ -37,6 +39,8 @@ struct FewPairs : Space {
         : Space(a.cutoff),
           positions(a.positions),
           queries(a.queries),
+          excluded_starts(a.excluded_starts),
+          excluded(a.excluded),
           n(a.n),
           m(a.m),
           closed(a.closed),
@@ -176,6 +180,7 @@ struct FewPairs : Space {
     // In `near` no others stay.
     template <class Meet>
     JFRNN_MEMBER void meet_all(Bits32* near, Meet meet) const {
+        const Excluded mine(excluded_starts, excluded, is_query ? query : 0);
         unsigned int rest = 0;
         for (int k = 0;;) {
             while (rest == 0 && k < words)
@@ -187,7 +192,7 @@ struct FewPairs : Space {
             real p[3];
             point_of(positions + (long long)ROW * j, p);
             int code = PERIODIC && SUMS ? code_of(p) : 0;
-            if (excess(q, p, sure_square) < 0 || is_exact_pair(p, j, code))
+            if ((excess(q, p, sure_square) < 0 || is_exact_pair(p, j, code)) && !(EXCLUDING && mine.has(j)))
                 meet(j, p, code);
             else
                 near[k - 1][threadIdx.x] &= ~(1u << bit);

@@ -5,6 +5,7 @@
 
 struct FewRowsArguments {
     const real *positions, *queries, *cutoff;
+    const int *excluded_starts, *excluded;
     int *idx, *count, *info;
     int n, m, capacity, closed, drop_self, later_only;
 };

@@ -5,6 +5,7 @@
 
 struct FewSumsArguments {
     const real *positions, *queries, *cutoff, *shared_values, *own_values, *others;
+    const int *excluded_starts, *excluded;
     real *sums, *totals, *errors, *more;
     int n, m, closed, drop_self;
 };

@@ -2,7 +2,8 @@
 //
 // Rows of the list have OWN_LENGTH numbers: coordinates as they are, then turns along each axis (PERIODIC == 2), then the cutoff of i
 // (RADII). Sources have LENGTH: coordinates, OTHERS numbers that a term reads, turns and the cutoff of j. `cutoff` holds the largest
-// cutoff, the lattice, and the largest number of a shift. `steps` are the shifts of image codes. REVERSED: rows are those of the sources
+// cutoff, the lattice, the largest number of a shift, and the cutoffs of pairs of species behind how many there are, -1 for those that
+// are no neighbors; in place of cutoffs then stand the first place of the row of i, and the species of j. `steps` are the shifts of image codes. REVERSED: rows are those of the sources
 // of the list, whose slots are `lengths` many in `slots` from `starts` on, and j is who has such a slot. ORDERED: threads take rows as
 // `order` has them, so that rows that are taken together read the same sources, or as they come where it holds -1.
 #pragma once
@@ -29,8 +30,9 @@ typedef NumberOfSlots<DOUBLE>::type Number;  // one, or LANES of them
 constexpr bool CODED = PERIODIC == 2;
 constexpr int TURNS = DIM + OTHERS, RADIUS = TURNS + (CODED ? DIM : 0);  // where they stand among the numbers of a source
 constexpr int OWN_TURNS = DIM, OWN_RADIUS = OWN_TURNS + (CODED ? DIM : 0), OWN_LENGTH = OWN_RADIUS + (RADII > 0);
-constexpr int OF_ROW = 1, OF_SOURCE = 2, LARGER = 3, SMALLER = 4,
-              MEAN = 5;  // RADII: the cutoff of a pair; of MEAN halves are given
+constexpr int OF_ROW = 1, OF_SOURCE = 2, LARGER = 3, SMALLER = 4, MEAN = 5,
+              OF_KINDS = 6;                         // RADII: the cutoff of a pair; of MEAN halves are given
+constexpr int KINDS = LATTICE_END + (SHIFTED > 0);  // where they stand in `cutoff`
 
 // Derivatives by positions (KeptSlopes): each slot has the slope of a function by its distance, and in `slots` the slot of the pair the
 // other way round: what both give to the row is along x_j - x_i. Distances below this, whose reciprocal is no float, give nothing.
@@ -146,6 +148,8 @@ struct Kept : KeptArguments, Space {
             inner = near * near * (1 - 16 * step_eps);
             outer = far * far * (1 + 16 * step_eps);
         }
+        if constexpr (RADII == OF_KINDS)
+            used = Math::both(used, Math::gt(cutoff_of(own, numbers), Number{}));
         found.sure = Math::both(used, Math::lt(square, inner));
         found.open = Math::both(Math::both(used, Math::le(square, outer)), Math::inverse(found.sure));
         return found;
@@ -181,6 +185,17 @@ struct Kept : KeptArguments, Space {
     }
     JFRNN_INLINE Number cutoff_of(const OwnPoint& own, const Number* numbers) const {
         const Number mine = Math::of(own.radius);
+        if constexpr (RADII == OF_KINDS) {
+            const Number place = mine + numbers[RADIUS];
+            Number found{};
+#if JFRNN_SCALAR
+            found = cutoff_at(place);
+#else
+            for (int l = 0; l < LANES; ++l)
+                found[l] = cutoff_at(place[l]);
+#endif
+            return found;
+        }
         if constexpr (RADII == OF_ROW)
             return mine;
         const Number theirs = numbers[RADII > OF_ROW ? RADIUS : 0];
@@ -189,12 +204,16 @@ struct Kept : KeptArguments, Space {
                : RADII == SMALLER ? Math::min(mine, theirs)
                                   : mine + theirs;
     }
+    // The cutoff of two species, given its place in the table; of slots that are not used, that may be anything.
+    JFRNN_MEMBER real cutoff_at(real place) const {
+        return place >= 0 && place < cutoff[KINDS] ? cutoff[KINDS + 1 + (int)place] : real(-1);
+    }
     // Decides exactly about a source at `p`, whose cutoff is `theirs`.
     JFRNN_MEMBER bool is_exact_pair(const OwnPoint& own, const real* p, real theirs, const int* shift) const {
         real r = radius, more = 0;
         if constexpr (RADII > 0) {
             const bool first = RADII == OF_ROW || RADII == MEAN || (own.radius > theirs) == (RADII == LARGER);
-            r = RADII != OF_SOURCE && first ? own.radius : theirs;
+            r = RADII == OF_KINDS ? cutoff_at(own.radius + theirs) : RADII != OF_SOURCE && first ? own.radius : theirs;
             more = RADII == MEAN ? theirs : real(0);
         }
         if constexpr (!SHIFTED)

@@ -6,9 +6,11 @@ struct LevelRowArguments {
     const real *positions, *queries, *axes, *radii;
     const int *ids, *keys, *top, *table, *header;
     const real *cutoff, *query_axes, *query_radii;
-    const int *query_ids, *query_top, *places;
+    const int *query_ids, *query_top, *places, *excluded_starts, *excluded;
+    const real* table_of_kinds;
+    const int *kinds_of_sources, *kinds_of_queries;
     int *idx, *count, *info;
-    int n, m, capacity, own_queries, closed, drop_self, later_only;
+    int n, m, capacity, own_queries, closed, drop_self, later_only, kinds;
 };
 struct LevelRows : Levels<LevelRows> {
     int *idx, *counts;
@@ -20,8 +22,9 @@ struct LevelRows : Levels<LevelRows> {
 
     JFRNN_INLINE explicit LevelRows(const LevelRowArguments& a)
         : Levels({a.positions, a.queries, a.axes, a.radii, a.ids, a.keys, a.top, a.table, a.header, a.cutoff, a.query_axes,
-              a.query_radii, a.query_ids, a.query_top, a.places, a.info, a.n, a.m, a.own_queries, a.closed, a.drop_self,
-              a.later_only}),
+              a.query_radii, a.query_ids, a.query_top, a.places, a.excluded_starts, a.excluded, a.table_of_kinds,
+              a.kinds_of_sources, a.kinds_of_queries, a.info, a.n, a.m, a.own_queries, a.closed, a.drop_self, a.later_only,
+              a.kinds}),
           idx(a.idx),
           counts(a.count),
           capacity(a.capacity) {}

@@ -10,11 +10,13 @@ struct LevelSumArguments {
     const real *positions, *queries, *axes, *radii;
     const int *ids, *keys, *top, *table, *header;
     const real *cutoff, *query_axes, *query_radii;
-    const int *query_ids, *query_top, *places;
+    const int *query_ids, *query_top, *places, *excluded_starts, *excluded;
+    const real* table_of_kinds;
+    const int *kinds_of_sources, *kinds_of_queries;
     const real *shared_values, *own_values, *columns;
     real *sums, *totals, *errors;
     int* info;
-    int n, m, own_queries, closed, drop_self, later_only;
+    int n, m, own_queries, closed, drop_self, later_only, kinds;
 };
 // Pairs that are held until the term is evaluated for them. They are no part of `LevelSums`, whose members stay in registers, since
 // nothing that is called has their address.
@@ -74,8 +76,9 @@ struct LevelSums : Levels<LevelSums> {
 
     JFRNN_INLINE LevelSums(const LevelSumArguments& a, HeldPairs& held)
         : Levels({a.positions, a.queries, a.axes, a.radii, a.ids, a.keys, a.top, a.table, a.header, a.cutoff, a.query_axes,
-              a.query_radii, a.query_ids, a.query_top, a.places, a.info, a.n, a.m, a.own_queries, a.closed, a.drop_self,
-              a.later_only}),
+              a.query_radii, a.query_ids, a.query_top, a.places, a.excluded_starts, a.excluded, a.table_of_kinds,
+              a.kinds_of_sources, a.kinds_of_queries, a.info, a.n, a.m, a.own_queries, a.closed, a.drop_self, a.later_only,
+              a.kinds}),
           held(held),
           columns(a.columns) {}
 

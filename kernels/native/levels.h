@@ -12,10 +12,11 @@
 //   end_query(state, one), chunk_done(chunk)  come after the last pair of a query, and (on the CPU) after the last query of a chunk
 #pragma once
 #include "exact.h"
+#include "excluded.h"
 #include "lane_count.h"
 
-constexpr int GATHER = 0, SCATTER = 1, EITHER = 2, BOTH = 3;
-constexpr int TOP = DIM + BATCHED;  // axes of top cells
+constexpr int GATHER = 0, SCATTER = 1, EITHER = 2, BOTH = 3, MEAN = 4, TABLE = 5;  // RULE
+constexpr int TOP = DIM + BATCHED;                                                 // axes of top cells
 constexpr real EPS = DOUBLE ? real(2.220446049250313e-16) : real(1.1920929e-07f);
 constexpr real LEAST = DOUBLE ? real(0x1p-459) : real(0x1p-40f);  // below, squares might underflow
 
@@ -23,9 +24,12 @@ struct LevelArguments {
     const real *positions, *queries, *axes, *radii;
     const int *ids, *keys, *top, *table, *header;
     const real *cutoff, *query_axes, *query_radii;
-    const int *query_ids, *query_top, *places;
+    const int *query_ids, *query_top, *places, *excluded_starts, *excluded;
+    // Of a table: the cutoffs of `kinds` species with each other, row by row, -1 where they are no neighbors, and whose species is which.
+    const real* table_of_kinds;
+    const int *kinds_of_sources, *kinds_of_queries;
     int* info;
-    int n, m, own_queries, closed, drop_self, later_only;
+    int n, m, own_queries, closed, drop_self, later_only, kinds;
 };
 
 // LANES numbers side by side, and the bits of what is true of them.
@@ -36,6 +40,7 @@ struct Side {
     JFRNN_FUNCTION unsigned int bits(bool is_so) { return is_so; }
     JFRNN_FUNCTION real choose(bool is_so, real yes, real no) { return is_so ? yes : no; }
     JFRNN_FUNCTION int lowest(unsigned int) { return 0; }
+    JFRNN_FUNCTION void put(lanes& x, int, real value) { x = value; }
 };
 #else
 typedef real lanes __attribute__((vector_size(LANES * sizeof(real))));
@@ -58,6 +63,7 @@ struct Side {
         return is_so ? yes : no;
     }
     static int lowest(unsigned int bits) { return __builtin_ctz(bits); }
+    static void put(lanes& x, int lane, real value) { x[lane] = value; }
 };
 #endif
 
@@ -79,6 +85,7 @@ struct One {
     int at, id;
     real q[3], own;
     int shift[3];
+    const real* of_kinds;  // of a table: the row of its species
 };
 
 template <class Query>
@@ -117,7 +124,7 @@ struct Levels : LevelArguments, Space {
     }
     JFRNN_INLINE Query& query() { return *(Query*)this; }
 
-    // The cutoff of a pair; a mean is rounded.
+    // The cutoff of a pair; a mean is rounded. Of a table, what no pair is beyond.
     JFRNN_FUNCTION real of_pair(real own, real other) {
         if constexpr (RULE == GATHER)
             return own;
@@ -125,18 +132,20 @@ struct Levels : LevelArguments, Space {
             return other;
         if constexpr (RULE == EITHER)
             return own > other ? own : other;
-        if constexpr (RULE == BOTH)
+        if constexpr (RULE == BOTH || RULE == TABLE)
             return own < other ? own : other;
         return own / 2 + other / 2;
     }
-    // Is a source a pair of a query, given both points as they are, their numbers, and the image of the source?
-    JFRNN_INLINE bool exactly(int query, int source, const real* q, const real* p, int image, real own, real other) const {
-        const real first = SUM ? own / 2 : of_pair(own, other), more = SUM ? other / 2 : real(0);
+    // Is a source a pair of a query, given its number, where it is, its image, and its place?
+    JFRNN_INLINE bool exactly(const One& one, int source, const real* p, int image, int place) const {
+        const real own = one.own, other = RULE == GATHER || RULE == TABLE ? real(0) : radii[place];
+        const real first = RULE == TABLE ? one.of_kinds[kinds_of_sources[place]] : SUM ? own / 2 : of_pair(own, other);
+        const real more = SUM ? other / 2 : real(0);
         if constexpr (PERIODIC) {
-            const real *a = queries + (long long)ROW * query, *b = positions + (long long)ROW * source;
+            const real *a = queries + (long long)ROW * one.id, *b = positions + (long long)ROW * source;
             return exact_image(lattice, a, b, image, first, more, closed);
         }
-        return exact_pair(q, p, first, more, closed);
+        return exact_pair(one.q, p, first, more, closed);
     }
     // The number of a top cell in the table.
     JFRNN_INLINE int row_major(const int* cell) const {
@@ -267,15 +276,18 @@ struct Levels : LevelArguments, Space {
     }
 
     // Which of LANES sources from `first` on are not surely too far from a query, a bit each, and which of those are surely pairs.
-    JFRNN_INLINE unsigned int test(const real* q, real own, int first, unsigned int& sure) const {
+    JFRNN_INLINE unsigned int test(const real* q, const One& one, int first, unsigned int& sure) const {
         const real unit = this->unit, slack = PERIODIC ? this->slack : real(0);
         lanes square = lanes{};
         for (int k = 0; k < DIM; ++k) {
             const lanes d = (Side::load(axes + k * stride + first) - q[k]) * unit;
             square += d * d;
         }
-        lanes r = lanes{} + own;
-        if constexpr (RULE != GATHER) {
+        lanes r = lanes{} + one.own;
+        if constexpr (RULE == TABLE) {
+            for (int e = 0; e < LANES; ++e)
+                Side::put(r, e, one.of_kinds[kinds_of_sources[first + e]]);
+        } else if constexpr (RULE != GATHER) {
             const lanes other = Side::load(radii + first);
             if constexpr (RULE == SCATTER)
                 r = other;
@@ -289,14 +301,16 @@ struct Levels : LevelArguments, Space {
         r *= unit;
         const lanes least = lanes{} + LEAST, inner = r - slack, outer = Side::choose(r > least, r, least) + slack;
         sure = Side::bits(square < inner * inner * (1 - 32 * EPS)) & Side::bits(r > least) & Side::bits(inner > lanes{});
-        return Side::bits(square <= outer * outer * (1 + 32 * EPS));
+        const unsigned int near = Side::bits(square <= outer * outer * (1 + 32 * EPS));
+        return RULE == TABLE ? near & Side::bits(r > lanes{}) : near;
     }
 
     // Lets a query meet the sources of a run, of an image, from where it meets them at home.
     template <class State>
     JFRNN_INLINE void meet(State& state, const One& one, int from, int to, int image, const real* from_where) {
+        const Excluded mine(excluded_starts, excluded, one.id);
         for (int first = from; first < to; first += LANES) {
-            unsigned int sure, near = test(from_where, one.own, first, sure);
+            unsigned int sure, near = test(from_where, one, first, sure);
             if (to - first < LANES)
                 near &= (1u << (to - first)) - 1;
             for (; near; near &= near - 1) {
@@ -310,9 +324,9 @@ struct Levels : LevelArguments, Space {
                     real p[3];
                     for (int k = 0; k < DIM; ++k)
                         p[k] = axes[k * stride + c];
-                    pair = exactly(one.id, other, one.q, p, image, one.own, RULE == GATHER ? real(0) : radii[c]);
+                    pair = exactly(one, other, p, image, c);
                 }
-                if (!pair)
+                if (!pair || (EXCLUDING && mine.has(other)))
                     continue;
                 query().pair(state, one, other, c, image);
             }
@@ -321,7 +335,9 @@ struct Levels : LevelArguments, Space {
 
     // Lets the query at a place meet all its candidates, group by group.
     JFRNN_INLINE void serve(int at) {
-        One one{at, query_ids[at], {0, 0, 0}, RULE == SCATTER ? real(0) : query_radii[at], {0, 0, 0}};
+        One one{at, query_ids[at], {0, 0, 0}, RULE == SCATTER ? real(0) : query_radii[at], {0, 0, 0}, nullptr};
+        if constexpr (RULE == TABLE)
+            one.of_kinds = table_of_kinds + (long long)kinds * kinds_of_queries[at];
         for (int k = 0; k < DIM; ++k)
             one.q[k] = query_axes[(long long)k * m + at];
         typename Query::State state = query().begin_query(one);

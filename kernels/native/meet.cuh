@@ -93,6 +93,14 @@ JFRNN_FUNCTION void meet_block(
         }
         aside.take_back(candidates, matrix);
     }
+    if constexpr (EXCLUDING) {
+        const Excluded mine(search.excluded_starts, search.excluded, group.my_id);
+        for (unsigned int rest = mine.begin < mine.end ? hits : 0; rest; rest &= rest - 1) {
+            const int j = __ffs(rest) - 1;
+            const int id = HELD ? warp.ids[pairs.tested + j] : warp.candidate_ids[first_candidate + j];
+            hits &= mine.has(search.source_named(id)) ? ~(1u << j) : ALL;
+        }
+    }
     pairs.found += __popc(hits);
     if constexpr (HELD) {
         warp.hits[pairs.tested / 32][search.lane] = hits;

@@ -5,6 +5,7 @@
 
 struct SumArguments {
     const real *positions, *queries, *cutoff, *shared_values, *own_values, *columns;
+    const int *excluded_starts, *excluded;
     real *sums, *totals, *errors, *more;
     int* scratch;
     int n, m, own, table, closed, drop_self;
@@ -23,7 +24,8 @@ struct Sums : Walk<Sums> {
     Results results;
 
     explicit Sums(const SumArguments& a)
-        : Walk({a.positions, a.queries, a.cutoff, a.scratch, a.n, a.m, a.own, a.table, a.closed, a.drop_self}),
+        : Walk({a.positions, a.queries, a.cutoff, a.excluded_starts, a.excluded, a.scratch, a.n, a.m, a.own, a.table, a.closed,
+              a.drop_self}),
           own_values(a.own_values),
           columns(a.columns),
           term(a.shared_values),
@@ -63,11 +65,15 @@ struct Sums : Walk<Sums> {
     void meet_in_place(const real* q, int id, const Term::Own& own_part, Reduction& reduction) {
         const real inside = this->inside, outside = this->outside;
         const int filled = this->filled;
+        const Excluded mine(excluded_starts, excluded, id);
         unsigned int any_unsure = 0;
         for (int b = 0, v = 0; b < filled; b += LANES, ++v) {
             const Points points = candidates_at(b);
             const vec square = square_of(q, points.p);
-            const unsigned int allowed = others_mask(b), hit = mask_of(square, inside, Below{}) & allowed;
+            unsigned int allowed = others_mask(b);
+            if constexpr (EXCLUDING)
+                allowed = wanted(mine, b, allowed & mask_of(square, outside, BelowOrAt{}));
+            const unsigned int hit = mask_of(square, inside, Below{}) & allowed;
             unsure[v] = hit ^ (mask_of(square, outside, BelowOrAt{}) & allowed);
             any_unsure |= unsure[v];
             if (SKIPPED && hit == 0)
@@ -100,10 +106,13 @@ struct Sums : Walk<Sums> {
         const real inside = this->inside, outside = this->outside;
         const int filled = this->filled;
         const ints numbers = first_numbers();
+        const Excluded mine(excluded_starts, excluded, id);
         int held = 0;
         for (int b = 0; b < filled; b += LANES) {
             const Points points = candidates_at(b);
-            const unsigned int near = mask_of(square_of(q, points.p), outside, BelowOrAt{}) & others_mask(b);
+            unsigned int near = mask_of(square_of(q, points.p), outside, BelowOrAt{}) & others_mask(b);
+            if constexpr (EXCLUDING)
+                near = wanted(mine, b, near);
             for (int k = 0; k < DIM; ++k)
                 pack(points.p[k], near_points[k] + held, near);
             for (int c = 0; c < OTHERS + STEPS; ++c)

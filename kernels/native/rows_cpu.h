@@ -6,6 +6,7 @@ typedef int eight_ints __attribute__((vector_size(32)));
 
 struct RowArguments {
     const real *positions, *queries, *cutoff;
+    const int *excluded_starts, *excluded;
     int *idx, *count, *info, *scratch;
     int n, m, own, table, capacity, closed, drop_self, later_only;
 };
@@ -19,7 +20,8 @@ struct Rows : Walk<Rows> {
     bool past_caches;  // rows are so many that they will not be read from the caches
 
     explicit Rows(const RowArguments& a)
-        : Walk({a.positions, a.queries, a.cutoff, a.scratch, a.n, a.m, a.own, a.table, a.closed, a.drop_self}),
+        : Walk({a.positions, a.queries, a.cutoff, a.excluded_starts, a.excluded, a.scratch, a.n, a.m, a.own, a.table, a.closed,
+              a.drop_self}),
           idx(a.idx),
           counts(a.count),
           info(a.info),

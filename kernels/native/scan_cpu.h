@@ -1,10 +1,12 @@
 // Candidates of the queries of a cell, copied side by side into the first-level cache, and which of them are pairs of a query.
 #pragma once
 #include "cells_cpu.h"
+#include "excluded.h"
 #include "wide.h"
 
 struct SearchArguments {
     const real *positions, *queries, *cutoff;
+    const int *excluded_starts, *excluded;
     int* scratch;
     int n, m, own, table, closed, drop_self;
 };
@@ -53,6 +55,16 @@ struct Scan : SearchArguments, Cells, Scratch {
         const int first = PERIODIC == 2 ? 3 * own_id + 1 + drop_self : own_id + drop_self;
         return bits_of_flags(__builtin_convertvector(ids >= first, flags));
     }
+    // The source that a candidate is, or an image of.
+    int source_at(int number) const { return PERIODIC == 2 && !SUMS ? candidate_ids[number] % n : candidate_ids[number]; }
+    // Those of the candidates from number b on, of which some are `near`, that a query does not exclude.
+    unsigned int wanted(const Excluded& excluded, int b, unsigned int near) const {
+        for (unsigned int rest = excluded.begin < excluded.end ? near : 0; rest; rest &= rest - 1) {
+            const int lane = __builtin_ctz(rest);
+            near &= excluded.has(source_at(b + lane)) ? ~(1u << lane) : ~0u;
+        }
+        return near;
+    }
     Points candidates_at(int b) const {
         Points points;
         for (int k = 0; k < DIM; ++k)
@@ -87,8 +99,7 @@ struct Scan : SearchArguments, Cells, Scratch {
     // Is a candidate a pair, given where it is and its number?
     bool exactly_decided(const real* q, int own_id, const real* p, int number) const {
         if constexpr (PERIODIC) {
-            const int source = PERIODIC == 2 && !SUMS ? candidate_ids[number] % n : candidate_ids[number];
-            const real* there = positions + (long long)ROW * source;
+            const real* there = positions + (long long)ROW * source_at(number);
             const int code = several ? candidate_images[number] : image;
             return exact_image(lattice, queries + (long long)ROW * own_id, there, code, radius, 0, closed);
         }
@@ -136,11 +147,14 @@ struct Scan : SearchArguments, Cells, Scratch {
     template <bool ONLY_LATER, bool BOUNDED>
     int scan(const real* q, int own_id, int count, int* to, int room) {
         const real inside = this->inside, outside = this->outside;  // stays in registers, whatever is stored
+        const Excluded mine(excluded_starts, excluded, own_id);
         unsigned int any_unsure = 0;
         int hits = 0;
         for (int b = 0, v = 0; b < count; b += LANES, ++v) {
             const vec square = square_of(q, candidates_at(b).p);
-            const unsigned int allowed = others_mask(b) & (ONLY_LATER ? later_mask(b, own_id) : ~0u);
+            unsigned int allowed = others_mask(b) & (ONLY_LATER ? later_mask(b, own_id) : ~0u);
+            if constexpr (EXCLUDING)
+                allowed = wanted(mine, b, allowed & mask_of(square, outside, BelowOrAt{}));
             const unsigned int hit = mask_of(square, inside, Below{}) & allowed;
             unsure[v] = hit ^ (mask_of(square, outside, BelowOrAt{}) & allowed);
             any_unsure |= unsure[v];

@@ -4,13 +4,15 @@
 
 struct SumsArguments {
     const real *positions, *queries, *cutoff, *shared_values, *own_values, *others;
+    const int *excluded_starts, *excluded;
     real *sums, *totals, *errors, *more, *values;
     int *info, *scratch;
     int n, m, own, table, closed, drop_self;
 
     // Of a search nothing is written but scratch.
     JFRNN_MEMBER SearchArguments of_search() const {
-        return {positions, queries, cutoff, nullptr, nullptr, info, scratch, n, m, own, table, 0, closed, drop_self, 0};
+        return {positions, queries, cutoff, excluded_starts, excluded, nullptr, nullptr, info, scratch, n, m, own, table, 0, closed,
+            drop_self, 0};
     }
 };
 

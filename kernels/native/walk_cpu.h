@@ -95,7 +95,7 @@ struct Walk : Scan {
     }
     // Packs what tells the candidates apart: their sources, and which images they are.
     void pack_names(ints numbers, unsigned int near) {
-        if constexpr (SUMS != 1 || PERIODIC)
+        if constexpr (SUMS != 1 || PERIODIC || EXCLUDING)
             pack(numbers + (PERIODIC == 2 && !SUMS ? n * image : 0), candidate_ids + filled, near);
         if constexpr (PERIODIC) {
             const ints codes = ints{} + image;

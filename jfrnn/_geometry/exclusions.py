@@ -1,0 +1,122 @@
+"""Pairs that are no neighbors, whatever their distance: as users give them, and as a search looks them up."""
+
+import contextlib
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+
+from jfrnn._tracing import Given, gather, on_device, own_transfers
+
+_ArrayModule = Any  # numpy or jax.numpy
+
+
+class Exclusions(NamedTuple):
+    """The sources that each row of a search excludes, in all of their periodic images. A pytree.
+
+    Attributes:
+        starts: [m + 1] int32, where the row of a query begins in `others`, and at the end where the last one ends.
+        others: [k] int32, excluded sources, ascending in each row; behind the last row stands what excludes nothing.
+        turned: The same with queries and sources exchanged; None if the sources are the queries: pairs then have no direction.
+        valid: Whether all pairs name particles that there are, [] bool; None if they are known to.
+    """
+
+    starts: Array
+    others: Array
+    turned: tuple[Array, Array] | None
+    valid: Array | None
+
+    def reverse(self) -> "Exclusions":
+        """Return the same pairs with queries and sources exchanged."""
+        if self.turned is None:
+            return self
+        return self._replace(starts=self.turned[0], others=self.turned[1], turned=(self.starts, self.others))
+
+
+def check_exclusions(exclude: Given, positions: Array, asking: Array | None) -> Exclusions | None:
+    """Return pairs [e, 2] as rows, or None if there are none; those that hold a -1 count as padding."""
+    sources, queries = positions.shape[0], None if asking is None else asking.shape[0]
+    if not hasattr(exclude, "dtype") or not np.issubdtype(exclude.dtype, np.integer):
+        told = np.dtype(exclude.dtype) if hasattr(exclude, "dtype") else type(exclude).__name__
+        raise TypeError(f"exclude must be an array of integers, the numbers of two particles in each row, got {told}.")
+    if len(exclude.shape) != 2 or exclude.shape[1] != 2:
+        raise ValueError(
+            f"exclude must have shape [e, 2], a pair in each row, got shape {list(exclude.shape)}: write rows of partners, one for "
+            "each particle, as pairs with jfrnn.pairs_of_rows."
+        )
+    if exclude.shape[0] > 2**30 - 1:
+        raise ValueError(f"exclude holds {exclude.shape[0]} pairs, but rows are numbered in int32: at most {2**30 - 1}.")
+    if 0 in (exclude.shape[0], sources, queries):
+        return None
+    if isinstance(exclude, Tracer):
+        return _make_rows(jnp, gather(exclude), sources, queries)
+    with own_transfers() if isinstance(exclude, Array) else contextlib.nullcontext():
+        known = np.asarray(jax.device_get(exclude) if isinstance(exclude, Array) else exclude)
+        made = _make_rows(np, known, sources, queries)
+        if not made.valid:
+            rows = sources if queries is None else queries
+            wrong = int(np.argmax(~_exist(known, rows, sources) & ~_pad(known)))
+            first = "numbers of particles" if queries is None else f"numbers of queries below {rows}, then of particles"
+            raise ValueError(
+                f"exclude must hold {first} below {sources}, or -1 in padding, got {known[wrong].tolist()} in row {wrong}."
+            )
+        return jax.tree.map(on_device, made._replace(valid=None))
+
+
+def _exist(pairs: Given, rows: int, sources: int) -> Given:
+    """Say which pairs [e, 2] name particles that there are."""
+    return (pairs[:, 0] >= 0) & (pairs[:, 0] < rows) & (pairs[:, 1] >= 0) & (pairs[:, 1] < sources)
+
+
+def _pad(pairs: Given) -> Given:
+    """Say which pairs [e, 2] are padding."""
+    unsigned = np.issubdtype(pairs.dtype, np.unsignedinteger)
+    return pairs[:, 0] < 0 if unsigned else (pairs[:, 0] == -1) | (pairs[:, 1] == -1)
+
+
+def _make_rows(xp: _ArrayModule, pairs: Given, sources: int, queries: int | None) -> Exclusions:
+    rows = sources if queries is None else queries
+    used = _exist(pairs, rows, sources)
+    valid = (used | _pad(pairs)).all()
+    first, second = (xp.where(used, x, 0).astype(np.int32) for x in (pairs[:, 0], pairs[:, 1]))
+    if queries is None:
+        used, first, second = (xp.concatenate(x) for x in ((used, used), (first, second), (second, first)))
+        return Exclusions(*_sort_rows(xp, used, first, second, rows), None, valid)
+    turned = _sort_rows(xp, used, second, first, sources)
+    return Exclusions(*_sort_rows(xp, used, first, second, rows), turned, valid)
+
+
+def _sort_rows(xp: _ArrayModule, used: Given, rows: Given, others: Given, count: int) -> tuple[Any, Any]:
+    """Return where rows begin, and what stands in them."""
+    key = xp.where(used, rows, np.int32(count))
+    order = xp.lexsort((others, key))
+    return xp.searchsorted(key[order], xp.arange(count + 1, dtype=np.int32)).astype(np.int32), others[order]
+
+
+def pairs_of_rows(rows: Array) -> Array:
+    """Write rows of partners, one for each particle, as pairs, as `exclude` of `jfrnn.search` takes them.
+
+    Args:
+        rows: Numbers of particles, shape [n, k], integers; unused places hold -1. A pair may stand in the rows of both or of one.
+
+    Returns:
+        Pairs (i, rows[i, ...]), shape [n·k, 2], of the dtype of the rows. Those of unused places hold a -1, and exclude nothing.
+
+    Raises:
+        TypeError, ValueError: rows are no integers, or have another shape.
+
+    Differentiable: no (integers). Jit: yes. vmap: yes.
+
+    >>> import numpy as np, jfrnn
+    >>> jfrnn.pairs_of_rows(np.array([[1, 2], [-1, -1], [-1, -1]])).tolist()
+    [[0, 1], [0, 2], [1, -1], [1, -1], [2, -1], [2, -1]]
+    """
+    if not hasattr(rows, "dtype") or not np.issubdtype(rows.dtype, np.signedinteger) or len(rows.shape) != 2:
+        told = f"{rows.dtype} of shape {list(rows.shape)}" if hasattr(rows, "dtype") else type(rows).__name__
+        raise TypeError(f"rows must be signed integers of shape [n, k], got {told}.")
+    xp = jnp if isinstance(rows, Array) else np
+    own = xp.broadcast_to(xp.arange(rows.shape[0], dtype=rows.dtype)[:, None], rows.shape)
+    return xp.stack([own, rows], axis=-1).reshape(-1, 2)

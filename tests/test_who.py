@@ -1,0 +1,317 @@
+"""Who pairs with whom: excluded pairs, and cutoffs of pairs of species: against the oracle, then what lists and sums make of it."""
+
+import functools
+from itertools import product
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from test_box import image_pairs
+
+import jfrnn
+
+SLOW = pytest.mark.slow
+N, CAPACITY = 48, 64
+TABLE = np.array(
+    [[3 / 8, 0, 0.21], [0, 0, 5 / 8], [0.21, 5 / 8, 1 / 8]]
+)  # sites are multiples of 1/8: many pairs are at the cutoff
+BOXES = {"open": None, "nearest": [1.5, 1.5, 1.5], "images": [1.0, 1.0, 1.0], "skewed": [[1.0, 0, 0], [0.25, 1, 0], [0, 0.5, 1]]}
+
+
+@functools.cache
+def scene(dtype, dim):
+    """Points on a coarse grid, some of them on top of each other, some turned away from it; species; pairs, some of them twice."""
+    random = np.random.default_rng(3)
+    x = random.integers(0, 8, (N, dim)) / 8
+    x[::5] += random.uniform(-0.02, 0.02, x[::5].shape)
+    pairs = np.concatenate([random.integers(0, N, (60, 2)), [[4, 4], [7, -1], [-1, -1]]])
+    return x.astype(dtype), random.integers(0, len(TABLE), N, np.int32), np.concatenate([pairs, pairs[:5, ::-1]])
+
+
+def box_of(name, dim):
+    return None if BOXES[name] is None else np.array(BOXES[name])[..., :dim][:dim]
+
+
+def expected_pairs(who, x, species, pairs, box, **options):
+    """Return the oracle's pairs: with one cutoff, or those of species, without the excluded ones."""
+    matrix, directed = np.ones(x.shape[1]) if box is None else box, "queries" in options
+    options |= {"matrix": matrix, "periodic": (box is not None,) * x.shape[1]}
+    if who == "exclude":
+        found = reference.reference_images(x, 3 / 8, **options)
+    else:
+        own = {} if not directed else {"query_species": species[: len(options["queries"])]}
+        found = reference.reference_species(x, TABLE.astype(x.dtype), species, **own, **options)
+    return reference.without_excluded(found, pairs, directed=directed) if "exclude" in who else found
+
+
+def asked(who, x, species, pairs):
+    """Return the cutoff, and the arguments that say who pairs with whom."""
+    exclude = {"exclude": pairs} if "exclude" in who else {}
+    return (TABLE.astype(x.dtype), {"species": species} | exclude) if "table" in who else (3 / 8, exclude)
+
+
+def pairs_found(nbrs, x, **queries):
+    if nbrs.box is not None:
+        return image_pairs(nbrs, x, **queries)
+    found = reference.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), len(x))
+    return {(*pair, (0,) * x.shape[1]) for pair in found}
+
+
+def each_case():
+    often = {("exclude", "images", "warp", 3, np.float32), ("table, exclude", "images", "warp", 3, np.float32)}
+    often |= {("exclude", "open", "warp", 2, np.float32), ("exclude", "open", "brute", 2, np.float32)}
+    for who, box, backend in product(("exclude", "table", "table, exclude"), BOXES, ("warp", "jax", "brute")):
+        for dim, dtype in product((2, 3), (np.float32, np.float64)):
+            kind = f"{who}-{box}-{backend}-{dim}d-f{8 * dtype().itemsize}"
+            marks = [] if (who, box, backend, dim, dtype) in often else [SLOW]
+            yield pytest.param(who, box, backend, dim, dtype, id=kind, marks=marks)
+
+
+@pytest.mark.parametrize(("who", "box", "backend", "dim", "dtype"), list(each_case()))
+def test_case(who, box, backend, dim, dtype):
+    x, species, pairs = scene(dtype, dim)
+    cutoff, given = asked(who, x, species, pairs)
+    lattice = box_of(box, dim)
+    given |= {"backend": backend} | ({} if lattice is None else {"box": jfrnn.Box(lattice)})
+    nbrs = jfrnn.search(x, cutoff, capacity=CAPACITY, **given)
+    nbrs.check()
+    expected = expected_pairs(who, x, species, pairs, lattice)
+    assert pairs_found(nbrs, x) == expected
+    np.testing.assert_array_equal(jfrnn.count(x, cutoff, **given), np.bincount([i for i, *_ in expected], minlength=N))
+
+
+@SLOW
+@pytest.mark.parametrize("backend", ["warp", "jax", "brute"])
+@pytest.mark.parametrize("who", ["exclude", "table", "table, exclude"])
+def test_options(who, backend):
+    """Half lists, closed ones, particles that are their own neighbors, and queries."""
+    x, species, pairs = scene(np.float32, 3)
+    cutoff, given = asked(who, x, species, pairs)
+    box = np.ones(3)
+    for options in ({"half": True}, {"closed": True}, {"include_self": True}, {"half": True, "include_self": True}):
+        nbrs = jfrnn.search(x, cutoff, backend=backend, box=jfrnn.Box(box), **options, **given)
+        assert pairs_found(nbrs, x) == expected_pairs(who, x, species, pairs, box, **options)
+    batch = np.arange(N) % 2
+    nbrs = jfrnn.search(x, cutoff, backend=backend, batch=batch, **given)
+    assert pairs_found(nbrs, x) == {(i, j, s) for i, j, s in expected_pairs(who, x, species, pairs, None) if i % 2 == j % 2}
+    queries = x[:20] + np.float32(1 / 8)
+    given |= {"species": (species, species[:20])} if "table" in who else {}
+    given |= {"exclude": pairs[pairs[:, 0] < 20]} if "exclude" in who else {}
+    nbrs = jfrnn.search(x, cutoff, queries=queries, backend=backend, **given)
+    assert pairs_found(nbrs, x, queries=queries) == expected_pairs(who, x, species, pairs, None, queries=queries)
+
+
+@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
+def test_a_box_per_system(backend):
+    x, _, pairs = scene(np.float32, 3)
+    box, batch = np.stack([np.ones(3), np.full(3, 1.25)]), np.arange(N) % 2
+    given = {"box": jfrnn.Box(box, per_system=True), "batch": batch, "exclude": pairs, "backend": backend}
+    counts = jfrnn.count(x, 3 / 8, **given)
+    expected = [(i, j) for k in (0, 1) for i, j, _ in expected_pairs("exclude", x, None, pairs, box[k]) if i % 2 == j % 2 == k]
+    np.testing.assert_array_equal(counts, np.bincount([i for i, _ in expected], minlength=N))
+    if backend == "jax":
+        np.testing.assert_array_equal(jfrnn.search(x, 3 / 8, **given).count, counts)
+
+
+def slopes_of(pairs, x, q=None, box=None):
+    """Return the sums of |r|^2 and the gradients of their total, by positions and by queries, in float64."""
+    x = np.asarray(x, np.float64)
+    q = x if q is None else np.asarray(q, np.float64)
+    sums, of_sources, of_rows = np.zeros(len(q)), np.zeros_like(x), np.zeros_like(q)
+    for i, j, shift in pairs:
+        r = x[j] - q[i] + np.array(shift) * (0 if box is None else box)
+        sums[i] += r @ r
+        of_sources[j] += 2 * r
+        of_rows[i] -= 2 * r
+    return sums, of_sources, of_rows
+
+
+def square(r, i, j):
+    return r @ r
+
+
+def heavy(r, i, j):
+    """The same by so many operations that kernels of the CPU look for what is near first."""
+    zero = sum(jnp.sin(k * r[0]) ** 2 + jnp.cos(k * r[0]) ** 2 - 1 for k in range(1, 4))
+    return r @ r + zero
+
+
+SUMMED = [("exclude", "warp", "open", square)]
+SUMMED += [pytest.param("table, exclude", "warp", box, square, marks=SLOW) for box in ("open", "images")]
+SUMMED += [
+    pytest.param("exclude", "warp", "images", square, marks=SLOW),
+    pytest.param("exclude", "warp", "open", heavy, marks=SLOW),
+]
+SUMMED += [
+    pytest.param(*given, square, marks=SLOW)
+    for given in product(("exclude", "table, exclude"), ("jax", "brute"), ("open", "images"))
+]
+
+
+@pytest.mark.parametrize(("who", "backend", "box", "fn"), SUMMED)
+def test_sums_and_their_gradients(who, backend, box, fn):
+    x, species, pairs = scene(np.float32, 3)
+    cutoff, given = asked(who, x, species, pairs)
+    lattice = box_of(box, 3)
+    given |= {"backend": backend} | ({} if lattice is None else {"box": jfrnn.Box(lattice)})
+
+    def total(x):
+        sums = jfrnn.pair_sum(fn, x, cutoff, **given)
+        return sums.sum(), sums
+
+    slopes, sums = jax.grad(total, has_aux=True)(jnp.asarray(x))
+    expected = slopes_of(expected_pairs(who, x, species, pairs, lattice), x, box=lattice)
+    np.testing.assert_allclose(sums, expected[0], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(slopes, expected[1] + expected[2], atol=1e-4)
+
+
+@pytest.mark.parametrize("backend", ["warp", pytest.param("brute", marks=SLOW)])
+def test_sums_for_queries(backend):
+    """A derivative by the positions sums over the rows of the particles, which exclude the queries that exclude them."""
+    x, _, pairs = scene(np.float32, 2)
+    queries, pairs = x[:20] + np.float32(1 / 8), pairs[pairs[:, 0] < 20]
+
+    def total(x, q):
+        return jfrnn.pair_sum(square, x, 3 / 8, queries=q, exclude=pairs, backend=backend).sum()
+
+    of_sources, of_queries = jax.grad(total, (0, 1))(jnp.asarray(x), jnp.asarray(queries))
+    _, *expected = slopes_of(expected_pairs("exclude", x, None, pairs, None, queries=queries), x, queries)
+    np.testing.assert_allclose(of_sources, expected[0], atol=1e-4)
+    np.testing.assert_allclose(of_queries, expected[1], atol=1e-4)
+
+
+@SLOW
+@pytest.mark.parametrize("backend", ["warp", "brute"])
+@pytest.mark.parametrize("who", ["exclude", "table, exclude"])
+def test_largest_summands(who, backend):
+    x, species, pairs = scene(np.float32, 3)
+    cutoff, given = asked(who, x, species, pairs)
+    largest = jfrnn.pair_sum(square, x, cutoff, reduce="max", backend=backend, **given)
+    expected = np.full(N, -np.inf)
+    for i, j, _ in expected_pairs(who, x, species, pairs, None):
+        expected[i] = max(expected[i], np.sum((np.float64(x[j]) - x[i]) ** 2))
+    np.testing.assert_allclose(largest, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("backend", "box"),
+    [("warp", "open"), *(pytest.param(*given, marks=SLOW) for given in (("warp", "images"), ("warp", "skewed"), ("jax", "open")))],
+)
+def test_kept_lists(backend, box):
+    """A list keeps who pairs with whom over updates, and its geometry and sums decide by species; cutoffs may change."""
+    x, species, pairs = scene(np.float32, 3)
+    table, lattice = TABLE.astype(np.float32), box_of(box, 3)
+    given = {"species": species, "exclude": pairs, "skin": 0.05, "backend": backend}
+    given |= {} if lattice is None else {"box": jfrnn.Box(lattice)}
+    nbrs = jfrnn.search(x, table, slack=2.0, **given)
+    update = jax.jit(lambda nbrs, x, table: nbrs.update(x, cutoff=table))
+    on = table.copy()
+    on[0, 1] = on[1, 0] = 0.3
+    random = np.random.default_rng(0)
+    for k, now in enumerate((table, 1.02 * table, on, table)):
+        moved = (x + random.uniform(-0.01, 0.01, x.shape)).astype(np.float32)
+        nbrs = update(nbrs, moved, now)
+        nbrs.check()
+        assert int(nbrs.rebuild_count) == [0, 0, 1, 2][k]
+        matrix = np.ones(3) if lattice is None else lattice
+        near = reference.reference_species(moved, now, species, matrix=matrix, periodic=(lattice is not None,) * 3)
+        expected = reference.without_excluded(near, pairs)
+        mask, shifts = np.asarray(nbrs.distances(moved)[1]), np.asarray(nbrs.shifts(moved))
+        rows, slots = np.nonzero(mask)
+        sources = np.asarray(nbrs.idx)[rows, slots]
+        assert set(zip(rows.tolist(), sources.tolist(), map(tuple, shifts[rows, slots].tolist()), strict=True)) == expected
+        summed = jfrnn.pair_sum(lambda r, i, j: jnp.ones((), r.dtype), moved, None, neighbors=nbrs)
+        np.testing.assert_array_equal(summed, np.bincount(rows, minlength=N))
+
+
+@SLOW
+def test_grow_and_chunks():
+    x, species, pairs = scene(np.float32, 3)
+    nbrs = jfrnn.search(x, TABLE.astype(np.float32), species=species, exclude=pairs, skin=0.05, capacity=1)
+    on = TABLE.astype(np.float32)
+    on[1, 1] = 0.3
+    chunk = jax.jit(lambda state, nbrs: (state, nbrs.update(state[0], cutoff=state[1])))
+    _, grown = jfrnn.run_chunk(chunk, (x, on), nbrs, lambda state: state[0], cutoff=lambda state: state[1])
+    near = reference.reference_species(x, on, species, matrix=np.ones(3), periodic=(False,) * 3)
+    expected = {pair[:2] for pair in reference.without_excluded(near, pairs)}
+    assert set(zip(*(part.tolist() for part in grown.pairs(positions=jnp.asarray(x))), strict=True)) == expected
+    jfrnn.run_chunk(jax.jit(lambda x, n: (x, n.update(x))), jnp.asarray(x), nbrs, lambda x: x)[1].check()
+
+
+def test_what_is_traced_sets_bits():
+    x, species, pairs = scene(np.float32, 2)
+    traces = []
+
+    @jax.jit
+    def search(x, table, species, pairs):
+        traces.append(None)
+        return jfrnn.search(x, table, species=species, exclude=pairs, capacity=CAPACITY)
+
+    table = TABLE.astype(np.float32)
+    nbrs = search(x, table, species, pairs)
+    nbrs.check()
+    assert pairs_found(nbrs, x) == expected_pairs("table, exclude", x, species, pairs, None)
+    wrong = pairs.copy()
+    wrong[3] = N, 0
+    nbrs = search(x, table, species, wrong)
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.EXCLUDED_OUT_OF_RANGE
+    with pytest.raises(ValueError, match="`exclude` names particles that do not exist"):
+        nbrs.check()
+    lost, uneven = species.copy(), table.copy()
+    lost[7], uneven[2, 1] = 3, 0.5
+    nbrs = search(x, table, lost, pairs)
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.INVALID_CUTOFF and nbrs.count[7] == 0
+    nbrs = search(x, uneven, species, pairs)
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.INVALID_CUTOFF
+    assert not np.asarray(nbrs.count)[species > 0].any() and nbrs.count.any()
+    assert len(traces) == 1
+
+
+X, S, T = np.zeros((4, 3), np.float32), np.array([0, 1, 1, 0]), np.ones((2, 2), np.float32)
+UNEVEN = np.array([[1.0, 0.5], [0.25, 1.0]], np.float32)
+
+
+@pytest.mark.parametrize(
+    ("error", "match", "make"),
+    [
+        (TypeError, "exclude must be an array of integers.*got float32", lambda: jfrnn.search(X, 1.0, exclude=T)),
+        (ValueError, r"exclude must have shape \[e, 2\].*pairs_of_rows", lambda: jfrnn.search(X, 1.0, exclude=S)),
+        (
+            ValueError,
+            r"below 4, or -1 in padding, got \[0, 4\] in row 1",
+            lambda: jfrnn.search(X, 1.0, exclude=np.array([[0, 1], [0, 4]])),
+        ),
+        (ValueError, r"got \[-2, 0\] in row 0", lambda: jfrnn.count(X, 1.0, exclude=np.array([[-2, 0]]))),
+        (ValueError, "numbers of queries below 1, then", lambda: jfrnn.count(X, 1.0, queries=X[:1], exclude=np.array([[1, 0]]))),
+        (ValueError, "'hashgrid' cannot exclude pairs: pass", lambda: jfrnn.count(X, 1.0, exclude=S[None, :2], backend="hashgrid")),
+        (ValueError, "'hashgrid' takes one cutoff", lambda: jfrnn.search(X, T, species=S, backend="hashgrid")),
+        (ValueError, "table of cutoffs of pairs of species: pass species=", lambda: jfrnn.search(X, T)),
+        (TypeError, "cutoff must be an array of floats of shape", lambda: jfrnn.search(X, 1.0, species=S)),
+        (ValueError, "cutoff must be symmetric.*got 0.5 for species 0 and 1, and 0.25", lambda: jfrnn.search(X, UNEVEN, species=S)),
+        (ValueError, r"shape \[s, s\], a row and a column", lambda: jfrnn.search(X, T[:1], species=S)),
+        (ValueError, "species must be numbers of species from 0 to 1.*got 2", lambda: jfrnn.search(X, T, species=S + 1)),
+        (TypeError, "species must be an array of integers", lambda: jfrnn.search(X, T, species=X[:, 0])),
+        (ValueError, "species must be a pair of arrays", lambda: jfrnn.search(X, T, species=S, queries=X)),
+        (ValueError, "radius_rule is about cutoffs per particle", lambda: jfrnn.search(X, T, species=S, radius_rule="mean")),
+        (TypeError, "rows must be signed integers", lambda: jfrnn.pairs_of_rows(S)),
+    ],
+)
+def test_errors(error, match, make):
+    with pytest.raises(error, match=match):
+        make()
+
+
+def test_nobody_is_excluded_by_no_pairs():
+    assert jfrnn.search(X, 1.0, exclude=np.zeros((0, 2), int), capacity=4).exclude is None
+    np.testing.assert_array_equal(jfrnn.count(X, 1.0, exclude=np.array([[-1, 2]])), [3] * 4)
+
+
+def test_rows_of_partners_are_pairs():
+    x = scene(np.float32, 2)[0][:20]
+    rows = np.array([[i + 1, i + 2] if i < 18 else [-1, i - 3] for i in range(20)])
+    bonded = [(i, j) for i in range(20) for j in rows[i] if j >= 0]
+    assert pairs_found(jfrnn.search(x, 3 / 8, exclude=jfrnn.pairs_of_rows(rows)), x) == expected_pairs(
+        "exclude", x, None, bonded, None
+    )
