@@ -21,7 +21,7 @@ from jfrnn._geometry import (
     sort_order,
 )
 from jfrnn._memory import MemoryPlan, memory_plan
-from jfrnn._search import NeighborList, count, run_chunk, search
+from jfrnn._search import EdgeList, NeighborList, count, run_chunk, search, search_edges
 from jfrnn._sums import pair_sum
 from jfrnn._triangles import TriangleList, search_triangles
 
@@ -29,6 +29,7 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Box",
+    "EdgeList",
     "MemoryPlan",
     "NeighborList",
     "NeighborOverflowError",
@@ -44,6 +45,7 @@ __all__ = [
     "pair_sum",
     "run_chunk",
     "search",
+    "search_edges",
     "search_triangles",
     "sort_order",
 ]

@@ -19,7 +19,7 @@ CELLS_PER_PARTICLE = 4  # size of the cell table; 16 B per particle
 SMALLEST_TABLE = 4096
 SKEWED = 2
 SPACES = ("", "_nearest", "_images", "_nearest_skewed", "_images_skewed")  # in names of variants
-_DEFAULTS = {"PERIODIC": 0, "BATCHED": 0, "SUM": 0, "SCALED": 0, "ONE_BY_ONE": 0}
+_DEFAULTS = {"PERIODIC": 0, "BATCHED": 0, "SUM": 0, "SCALED": 0, "ONE_BY_ONE": 0, "FLAT": 0}
 
 
 def table_cells(sources: int) -> int:

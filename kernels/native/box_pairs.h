@@ -10,7 +10,7 @@
 
 struct BoxArguments {
     const real *positions, *queries, *boxes, *axes, *asked;
-    const int *ids, *order, *visits, *cells, *start;
+    const int *ids, *order, *visits, *cells, *start, *starts;
     int *idx, *count, *info;
     int n, m, stride, own, capacity, closed, drop_self, later_only;
 };

@@ -1,40 +1,45 @@
 // Rows of neighbors, or their counts, where cutoffs differ from particle to particle.
 #pragma once
 #include "levels.h"
+#include "row_places.h"
 
 struct LevelRowArguments {
     const real *positions, *queries, *axes, *radii;
     const int *ids, *keys, *top, *table, *header;
     const real *cutoff, *query_axes, *query_radii;
-    const int *query_ids, *query_top, *places;
+    const int *query_ids, *query_top, *places, *starts;
     int *idx, *count, *info;
     int n, m, capacity, own_queries, closed, drop_self, later_only;
 };
 struct LevelRows : Levels<LevelRows> {
+    const int* starts;
     int *idx, *counts;
     int capacity;
     struct State {
         int* row;
-        int found;  // neighbors
+        int room, found;  // neighbors
     };
 
     JFRNN_INLINE explicit LevelRows(const LevelRowArguments& a)
         : Levels({a.positions, a.queries, a.axes, a.radii, a.ids, a.keys, a.top, a.table, a.header, a.cutoff, a.query_axes,
               a.query_radii, a.query_ids, a.query_top, a.places, a.info, a.n, a.m, a.own_queries, a.closed, a.drop_self,
               a.later_only}),
+          starts(a.starts),
           idx(a.idx),
           counts(a.count),
           capacity(a.capacity) {}
 
-    JFRNN_INLINE State begin_query(const One& one) { return State{idx + (long long)one.id * capacity, 0}; }
-    JFRNN_INLINE void pair(State& state, const One&, int other, int, int image) {
-        if (LIST && state.found < capacity)
-            state.row[state.found] = PERIODIC == 2 ? other + n * image : other;
+    JFRNN_INLINE State begin_query(const One& one) {
+        return State{row_begin(idx, starts, one.id, capacity), row_room(starts, one.id, capacity), 0};
+    }
+    JFRNN_INLINE void pair(State& state, const One& one, int other, int, int image) {
+        if (LIST && state.found < state.room)
+            write_slot(state.row + state.found, PERIODIC == 2 ? other + n * image : other, one.id, capacity);
         ++state.found;
     }
     JFRNN_INLINE void end_query(const State& state, const One& one) {
         if constexpr (LIST)
-            for (int s = state.found; s < capacity; ++s)
+            for (int s = state.found; s < state.room; ++s)
                 state.row[s] = fill_value;
         counts[one.id] = state.found;
         longest = state.found > longest ? state.found : longest;
