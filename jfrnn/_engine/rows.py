@@ -52,7 +52,7 @@ def list_flat(inputs: Inputs, options: Options, total: int) -> FoundFlat:
     found = _find(inputs, options, Room(jnp.minimum(offsets, total), total))
     m, n = len(counted.counts), len(inputs.sources)
     there = lax.iota(jnp.int32, total) < offsets[-1]
-    idx, receivers = (jnp.where(there, x, most) for x, most in ((found.rows.idx, n), (found.rows.receivers, m)))
+    idx, receivers = (jnp.where(there, jnp.asarray(x), most) for x, most in ((found.rows.idx, n), (found.rows.receivers, m)))
     status = counted.status | jnp.where(offsets[-1] > total, Status.TOTAL_OVERFLOW.value, 0).astype(jnp.int32)
     rows = Rows(idx, counted.counts, offsets[-1], status, None, receivers)
     images = None if found.images is None else jnp.where(there, found.images, 0)

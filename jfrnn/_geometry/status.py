@@ -135,6 +135,6 @@ class NeighborOverflowError(RuntimeError):
             f"`{name}`, {verb} counts first and cannot overflow."
         )
 
-    def __reduce__(self) -> tuple[type, tuple[int, int]]:
+    def __reduce__(self) -> tuple[type, tuple[int, int, str]]:
         """Return how to unpickle the error; by default only the message is pickled, which makes process pools hang."""
         return type(self), (self.required, self.capacity, self.name)
