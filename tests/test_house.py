@@ -29,7 +29,8 @@ ALLOWED = {  # first-party and third-party modules that each folder may import
     "jfrnn": {"jax", "numpy", "jfrnn"},
 }
 PUBLIC = {"Box", "EdgeList", "MemoryPlan", "NeighborList", "NeighborOverflowError", "Status", "TriangleList"}
-PUBLIC |= {"count", "memory_plan", "merge_vertices", "pair_sum", "run_chunk", "search", "search_edges", "search_triangles", "sort_order"}
+PUBLIC |= {"count", "memory_plan", "merge_vertices", "pair_sum", "run_chunk", "search", "search_edges", "search_triangles"}
+PUBLIC |= {"sort_order"}
 PUBLIC |= {"hilbert_decode", "hilbert_encode", "morton_decode", "morton_encode"}
 
 

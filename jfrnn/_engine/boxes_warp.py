@@ -23,7 +23,7 @@ _GIVEN = ("positions", "queries", "boxes", "axes", "asked", "ids", "order", "vis
 def box_neighbors(search: Search, keep: Filter, capacity: int | Room | None) -> Rows:
     """List the neighbors of every query, or only count them (capacity=None), where each system has a box of its own."""
     m, dim, double = search.sizes[1], search.sources.shape[1], search.sources.dtype == jnp.float64
-    dims = {"idx": row_dims(m, capacity), "count": m, "info": 2}
+    dims = {**row_dims(m, capacity), "count": m, "info": 2}
     kind = (search.queries is None, search.cutoff.closed, keep, periodic_kind(search.torus), True)
     starts = [capacity.starts] if isinstance(capacity, Room) else []
     variant = Variant(dim, double, search.cutoff.scaled, capacity is not None, *kind, bool(starts))
@@ -31,10 +31,10 @@ def box_neighbors(search: Search, keep: Filter, capacity: int | Room | None) -> 
     def on(cuda: bool) -> Callable[..., list[Array]]:
         return functools.partial(_callable(variant, cuda), output_dims=dims)
 
-    *idx, count, info = lax.platform_dependent(*_operands(search), *starts, cpu=on(False), cuda=on(True))
+    *written, count, info = lax.platform_dependent(*_operands(search), *starts, cpu=on(False), cuda=on(True))
     overflow = isinstance(capacity, int) and info[0] > capacity
     status = jnp.where(overflow, Status.ROW_OVERFLOW.value, 0).astype(jnp.int32)
-    return Rows(**split_rows(idx, bool(starts)), counts=count, required=info[0], status=status)
+    return Rows(**split_rows(written), counts=count, required=info[0], status=status)
 
 
 def _operands(search: Search) -> list[Array]:

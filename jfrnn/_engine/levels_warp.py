@@ -48,11 +48,11 @@ def _call_levels(cuda: bool, keep: Filter, capacity: int | Room | None, search: 
     lists, (_, m) = capacity is not None, search.sizes
     starts = [capacity.starts] if isinstance(capacity, Room) else []
     variant = _variant_of(search, keep, lists, cuda)._replace(flat=bool(starts))
-    dims = {"idx": row_dims(m, capacity), "count": m, "info": 2}
-    *idx, count, info = _level_callable(variant)(*_operands(search, levels), *starts, output_dims=dims)
+    dims = {**row_dims(m, capacity), "count": m, "info": 2}
+    *written, count, info = _level_callable(variant)(*_operands(search, levels), *starts, output_dims=dims)
     overflow = info[0] > capacity if isinstance(capacity, int) else jnp.zeros((), bool)
     status = overflow.astype(jnp.int32)  # Status.ROW_OVERFLOW
-    return Rows(**split_rows(idx, bool(starts)), counts=count, required=info[0], status=status)
+    return Rows(**split_rows(written), counts=count, required=info[0], status=status)
 
 
 def level_sums(
@@ -135,7 +135,7 @@ def _name(name: str, variant: _LevelVariant, **more: bool) -> str:
 
 @kernel
 def _level_callable(variant: _LevelVariant) -> Call:
-    results = dict.fromkeys([*["idx"] * variant.lists, "count", "info"], np.int32)
+    results = dict.fromkeys([*["idx"] * variant.lists, *["receivers"] * variant.flat, "count", "info"], np.int32)
     name = _name(f"levels_{'cuda' if variant.cuda else 'cpu'}", variant)
     return Call(name, (*_GIVEN, *["starts"] * variant.flat), results, functools.partial(_plan_rows, variant))
 
@@ -165,6 +165,6 @@ def _numbers(variant: _LevelVariant, shapes: Shapes) -> dict[str, int]:
 def _plan_rows(variant: _LevelVariant, shapes: Shapes, multiprocessors: int) -> Plan:
     kind = (variant.dim, variant.double, variant.lists, variant.rule, GROUPS, HALVINGS, variant.periodic, variant.batched)
     query = level_kernels.query_kernel(*kind, variant.cuda, variant.flat)
-    numbers = _numbers(variant, shapes) | {"capacity": shapes["idx"][1] if variant.lists else 0}
+    numbers = _numbers(variant, shapes) | {"capacity": shapes["idx"][1] if variant.lists and not variant.flat else 0}
     launch = Launch(query, numbers["m"]) if variant.cuda else share(query, numbers["m"])
     return Plan([Clear("info", 8), launch], numbers, absent(variant.lists, variant.flat))

@@ -45,32 +45,32 @@ def describe_call(
     flags |= {"flat": variant.flat, **space_flags(variant.periodic), "batched": variant.batched}
     flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
     whole = "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
-    results = [*["idx"] * variant.lists, "count", "info", *more]
+    results = [*["idx"] * variant.lists, *["receivers"] * variant.flat, "count", "info", *more]
     return Call(whole, (*given, *["starts"] * variant.flat), dict.fromkeys(results, np.int32), plan)
 
 
 def plan_numbers(variant: Variant, shapes: Shapes) -> dict[str, int]:
-    """Return the numbers that kernels of cells take, by name; without rows the capacity is 0, of a flat list the slots of all."""
+    """Return the numbers that kernels of cells take, by name; of rows without a common length the capacity is 0."""
     flags = {"closed": variant.closed, "drop_self": variant.keep.drop_self, "later_only": variant.keep.later_only}
-    capacity = shapes["idx"][1] if variant.lists else 0
+    capacity = shapes["idx"][1] if variant.lists and not variant.flat else 0
     return size_numbers(shapes, variant.own) | {"capacity": capacity, **flags}
 
 
 def absent(lists: bool, flat: bool) -> list[str]:
     """Return the names of arrays that kernels do not touch."""
-    return [*["idx"] * (not lists), *["starts"] * (not flat)]
+    return [*["idx"] * (not lists), *["starts", "receivers"] * (not flat)]
 
 
-def split_rows(idx: Sequence[Array], flat: bool) -> dict[str, Array | None]:
-    """Return the fields of `Rows` that a kernel has written: nothing, rows, or those of a flat list."""
-    if not flat:
-        return {"idx": idx[0] if idx else None}
-    return {"idx": idx[0][0], "receivers": idx[0][1]}
+def row_dims(m: int, capacity: int | Room | None) -> dict[str, int | tuple[int, int | None]]:
+    """Return the shape of what is written of rows, by name; without rows there is none."""
+    if isinstance(capacity, Room):
+        return {"idx": capacity.total, "receivers": capacity.total}
+    return {"idx": (m, capacity)}
 
 
-def row_dims(m: int, capacity: int | Room | None) -> tuple[int, int | None]:
-    """Return the shape of rows, or of the sources and rows of a flat list."""
-    return (2, capacity.total) if isinstance(capacity, Room) else (m, capacity)
+def split_rows(written: Sequence[Array]) -> dict[str, Array | None]:
+    """Return the fields of `Rows` that a kernel has written: none, rows, or those of a flat list."""
+    return {"idx": None} | dict(zip(("idx", "receivers"), written, strict=False))
 
 
 def size_numbers(shapes: Shapes, own: bool) -> dict[str, int]:

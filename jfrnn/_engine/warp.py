@@ -156,14 +156,14 @@ def call_kernels(
             f"backend='warp' numbers at most {MOST_IN_BOX - 1} positions in a periodic box, got {n}: pass backend='jax'."
         )
     words = scratch_words(n, m, dim, 2 if double else 1, own)
-    dims = {"idx": row_dims(m, capacity), "count": m, "info": 2 if blocks is None else (blocks, 2), "scratch": max(words, 1)}
+    dims = {**row_dims(m, capacity), "count": m, "info": 2 if blocks is None else (blocks, 2), "scratch": max(words, 1)}
     given = [*pack_particles(search), *[capacity.starts] * flat] if isinstance(capacity, Room) else pack_particles(search)
-    *idx, count, info, scratch = make(variant)(*given, output_dims=dims)
+    *written, count, info, scratch = make(variant)(*given, output_dims=dims)
     longest, status = (
         (info[0], info[1]) if blocks is None else (info[:, 0].max(), lax.reduce(info[:, 1], np.int32(0), lax.bitwise_or, (0,)))
     )
     order_found = None if order is None else order(scratch)
-    return Rows(**split_rows(idx, flat), counts=count, required=longest, status=status, order=order_found)
+    return Rows(**split_rows(written), counts=count, required=longest, status=status, order=order_found)
 
 
 @kernel

@@ -11,7 +11,7 @@
 struct BoxArguments {
     const real *positions, *queries, *boxes, *axes, *asked;
     const int *ids, *order, *visits, *cells, *start, *starts;
-    int *idx, *count, *info;
+    int *idx, *receivers, *count, *info;
     int n, m, stride, own, capacity, closed, drop_self, later_only;
 };
 

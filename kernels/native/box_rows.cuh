@@ -36,7 +36,7 @@ struct BoxRows : BoxPairs {
         if (!is_query)
             return;
         for (int s = all + lane; LIST && s < room; s += LANES_PER_ROW)
-            row_begin(idx, starts, query, capacity)[s] = fill_value();
+            idx[row_begin(starts, query, capacity) + s] = fill_value();
         if (lane > 0)
             return;
         count[query] = all;
@@ -98,7 +98,7 @@ struct BoxRows : BoxPairs {
         const unsigned int hits = of_query(__ballot_sync(EVERY, hit));
         const int slot = found + __popc(hits & ((1u << lane) - 1));
         if (hit && slot < room)
-            write_slot(row_begin(idx, starts, query, capacity) + slot, name_of(source, run.code), query, capacity);
+            write_slot(idx, receivers, row_begin(starts, query, capacity) + slot, name_of(source, run.code), query);
         found += __popc(hits);
     }
 };

@@ -26,18 +26,18 @@ struct BoxRows : BoxPairs {
             known < longest && !__atomic_compare_exchange_n(&info[0], &known, longest, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
     }
     int serve() const {
-        int* const row = row_begin(idx, starts, query, capacity);
+        const long long begin = LIST ? row_begin(starts, query, capacity) : 0;
         const int room = row_room(starts, query, capacity);
         int found = 0;
         for (int r = 0; r < runs; ++r) {
             const BoxRun run = run_at(r);
             for (int b = 0; b < run.size; b += LANES)
-                found += meet(run, b, row + found, room - found);
+                found += meet(run, b, idx + begin + found, room - found);
         }
         for (int s = found; LIST && !FLAT && s < room; ++s)
-            row[s] = fill_value();
+            idx[begin + s] = fill_value();
         for (int s = 0; FLAT && s < room; ++s)
-            write_slot(row + s, row[s], query, capacity);
+            receivers[begin + s] = query;
         return found;
     }
     // Meets the sources of a run from number b on; those that are neighbors go to `to`, where there is `room`.

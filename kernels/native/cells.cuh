@@ -6,7 +6,7 @@
 struct SearchArguments {
     const real *positions, *queries, *cutoff;
     const int* starts;
-    int *idx, *count, *info, *scratch;
+    int *idx, *receivers, *count, *info, *scratch;
     int n, m, own, table, capacity, closed, drop_self, of_queries;
 };
 struct Shared {

@@ -7,7 +7,7 @@
 struct FewRowsArguments {
     const real *positions, *queries, *cutoff;
     const int* starts;
-    int *idx, *count, *info;
+    int *idx, *receivers, *count, *info;
     int n, m, capacity, closed, drop_self, later_only;
 };
 
@@ -48,11 +48,11 @@ struct FewRows : FewRowsArguments {
         return number;
     }
     JFRNN_MEMBER void write(const FewPairs& pairs, const FewPairs::Bits32* near, int slot) const {
-        int* const row = row_begin(idx, starts, pairs.query, capacity);
+        const long long begin = row_begin(starts, pairs.query, capacity);
         const int room = row_room(starts, pairs.query, capacity);
         for (int k = 0; k < pairs.words; ++k)
             for (unsigned int rest = near[k][threadIdx.x]; rest && slot < room; rest &= rest - 1)
-                write_slot(row + slot++, pairs.first_of(k) + __ffs(rest) - 1, pairs.query, capacity);
+                write_slot(idx, receivers, begin + slot++, pairs.first_of(k) + __ffs(rest) - 1, pairs.query);
     }
     // Writes the row of `info` of this block.
     JFRNN_MEMBER void tell(int lane, int longest, bool not_finite) const {

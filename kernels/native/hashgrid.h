@@ -10,7 +10,7 @@
 struct HashGridArguments {
     const real *positions, *queries, *cutoff;
     const int* starts;
-    int *idx, *count, *info;
+    int *idx, *receivers, *count, *info;
     real* scratch;    // the points of which the grid is built, three numbers each
     const int* grid;  // what Warp calls its id
     int n, m, capacity, own, closed, drop_self, later_only;
@@ -46,7 +46,7 @@ struct HashGridSearch : HashGridArguments, Space {
             const bool finite = finite_point(q);
             const int found = finite ? meet_candidates(i, q) : 0;
             for (int slot = found; LIST && slot < row_room(starts, i, capacity); ++slot)
-                row_begin(idx, starts, i, capacity)[slot] = n;
+                idx[row_begin(starts, i, capacity) + slot] = n;
             count[i] = found;
             tell(found, (finite ? 0 : 2) | (LIST && !FLAT && found > capacity ? 1 : 0));
         });
@@ -60,7 +60,7 @@ struct HashGridSearch : HashGridArguments, Space {
             if ((drop_self && j == i) || (later_only && j < i) || !is_pair(q, positions + (long long)DIM * j))
                 continue;
             if (LIST && found < row_room(starts, i, capacity))
-                write_slot(row_begin(idx, starts, i, capacity) + found, j, i, capacity);
+                write_slot(idx, receivers, row_begin(starts, i, capacity) + found, j, i);
             ++found;
         }
         return found;

@@ -8,15 +8,15 @@ struct LevelRowArguments {
     const int *ids, *keys, *top, *table, *header;
     const real *cutoff, *query_axes, *query_radii;
     const int *query_ids, *query_top, *places, *starts;
-    int *idx, *count, *info;
+    int *idx, *receivers, *count, *info;
     int n, m, capacity, own_queries, closed, drop_self, later_only;
 };
 struct LevelRows : Levels<LevelRows> {
     const int* starts;
-    int *idx, *counts;
+    int *idx, *receivers, *counts;
     int capacity;
     struct State {
-        int* row;
+        long long begin;
         int room, found;  // neighbors
     };
 
@@ -26,21 +26,22 @@ struct LevelRows : Levels<LevelRows> {
               a.later_only}),
           starts(a.starts),
           idx(a.idx),
+          receivers(a.receivers),
           counts(a.count),
           capacity(a.capacity) {}
 
     JFRNN_INLINE State begin_query(const One& one) {
-        return State{row_begin(idx, starts, one.id, capacity), row_room(starts, one.id, capacity), 0};
+        return State{row_begin(starts, one.id, capacity), row_room(starts, one.id, capacity), 0};
     }
     JFRNN_INLINE void pair(State& state, const One& one, int other, int, int image) {
         if (LIST && state.found < state.room)
-            write_slot(state.row + state.found, PERIODIC == 2 ? other + n * image : other, one.id, capacity);
+            write_slot(idx, receivers, state.begin + state.found, PERIODIC == 2 ? other + n * image : other, one.id);
         ++state.found;
     }
     JFRNN_INLINE void end_query(const State& state, const One& one) {
         if constexpr (LIST)
             for (int s = state.found; s < state.room; ++s)
-                state.row[s] = fill_value;
+                idx[state.begin + s] = fill_value;
         counts[one.id] = state.found;
         longest = state.found > longest ? state.found : longest;
     }

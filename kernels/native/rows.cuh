@@ -130,16 +130,16 @@ struct Rows : Walk<Rows> {
 #pragma unroll 1
             for (int k = 0; k < 32; k += 4) {
                 RowPlace left;
-                int* const out = slots_of(k + lane / 8, before, mine, left);
+                const long long out = slots_of(k + lane / 8, before, mine, left) - idx;
                 const int4 four = load_four(k + lane / 8);
                 if (left.room > 0)
-                    write_slot(out, four.x, left.id, capacity);
+                    write_slot(idx, receivers, out, four.x, left.id);
                 if (left.room > STEP)
-                    write_slot(out + STEP, four.y, left.id, capacity);
+                    write_slot(idx, receivers, out + STEP, four.y, left.id);
                 if (left.room > 2 * STEP)
-                    write_slot(out + 2 * STEP, four.z, left.id, capacity);
+                    write_slot(idx, receivers, out + 2 * STEP, four.z, left.id);
                 if (left.room > 3 * STEP)
-                    write_slot(out + 3 * STEP, four.w, left.id, capacity);
+                    write_slot(idx, receivers, out + 3 * STEP, four.w, left.id);
             }
         }
     }

@@ -8,14 +8,14 @@ typedef int eight_ints __attribute__((vector_size(32)));
 struct RowArguments {
     const real *positions, *queries, *cutoff;
     const int* starts;
-    int *idx, *count, *info, *scratch;
+    int *idx, *receivers, *count, *info, *scratch;
     int n, m, own, table, capacity, closed, drop_self, later_only;
 };
 
 struct Rows : Walk<Rows> {
     static constexpr bool FLUSHED = false;
     const int* starts;
-    int *idx, *counts, *info;
+    int *idx, *receivers, *counts, *info;
     int capacity, later_only;
     int longest;
     int fill_value;
@@ -25,6 +25,7 @@ struct Rows : Walk<Rows> {
         : Walk({a.positions, a.queries, a.cutoff, a.scratch, a.n, a.m, a.own, a.table, a.closed, a.drop_self}),
           starts(a.starts),
           idx(a.idx),
+          receivers(a.receivers),
           counts(a.count),
           info(a.info),
           capacity(a.capacity),
@@ -84,14 +85,15 @@ struct Rows : Walk<Rows> {
 
     // Writes `hits` ids from `row` into the slots of a row from `from` on, and behind the last ones the fill value.
     void write_row(int id, int from, int hits, bool last) {
-        int* const out = row_begin(idx, starts, id, capacity);
+        const long long begin = row_begin(starts, id, capacity);
+        int* const out = idx + begin;
         const int room = row_room(starts, id, capacity), stop = from + hits < room ? from + hits : room;
         if (!FLAT && from == 0 && last && (capacity & 7) == 0 && ((unsigned long long)idx & 31) == 0) {
             past_caches ? write_whole_row<true>(out, stop) : write_whole_row<false>(out, stop);
             return;
         }
         for (int s = from; s < stop; ++s)
-            write_slot(out + s, row[s - from], id, capacity);
+            write_slot(idx, receivers, begin + s, row[s - from], id);
         if (!FLAT && last)
             for (int s = stop; s < capacity; ++s)
                 out[s] = fill_value;

@@ -10,7 +10,8 @@ struct SumsArguments {
 
     // Of a search nothing is written but scratch.
     JFRNN_MEMBER SearchArguments of_search() const {
-        return {positions, queries, cutoff, nullptr, nullptr, nullptr, info, scratch, n, m, own, table, 0, closed, drop_self, 0};
+        return {positions, queries, cutoff, nullptr, nullptr, nullptr, nullptr, info, scratch, n, m, own, table, 0, closed,
+            drop_self, 0};
     }
 };
 
