@@ -26,7 +26,7 @@ from jfrnn._engine.problem import (
     prepare_search,
     take_present,
 )
-from jfrnn._engine.reverse_warp import collect_slots, reverse_slots, slots_by_source
+from jfrnn._engine.reverse_warp import collect_slots, flatten_slots, reverse_slots, slots_by_source
 from jfrnn._engine.rows import Found, add_up, count_rows, fold_pairs, list_flat, list_rows
 from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit
 from jfrnn._engine.start import compiler, level_of_caller

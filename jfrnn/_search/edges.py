@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._engine import flatten_slots
 from jfrnn._geometry import (
     Batch,
     Box,
@@ -104,9 +105,17 @@ class Flat(NamedTuple):
     edges: Array
 
 
-def flatten(mask: Array, total: int) -> Flat:
-    """Put the set slots of a mask [m, capacity] one after another, in arrays of a static length."""
+def flatten(mask: Array, total: int, native: bool = False) -> Flat:
+    """Put the set slots of a mask [m, capacity] one after another, in arrays of a static length, by Warp's kernels if `native`."""
     m, capacity = mask.shape
+    if native:
+        offsets = row_offsets(jnp.sum(mask, axis=1, dtype=jnp.int32), capacity)
+        on_cpu, on_cuda = (functools.partial(flatten_slots, total=total, cuda=cuda) for cuda in (False, True))
+        rows, slots = lax.platform_dependent(mask, offsets[:-1], cpu=on_cpu, cuda=on_cuda)
+        real, edge = lax.iota(jnp.int32, total) < offsets[-1], lax.iota(jnp.int32, total)
+        at = jnp.where(real, slots, mask.size)
+        edges = jnp.full(mask.size, total, jnp.int32).at[at].set(edge, mode="drop", unique_indices=True)
+        return Flat(jnp.where(real, rows, m), jnp.where(real, slots, 0), offsets, edges)
     ranks = jnp.cumsum(mask, axis=1, dtype=jnp.int32)
     offsets = row_offsets(ranks[:, -1], capacity)
     edges = jnp.where(mask, jnp.minimum(offsets[:-1, None] + ranks - 1, total), total).reshape(-1)
@@ -115,13 +124,13 @@ def flatten(mask: Array, total: int) -> Flat:
     return Flat(rows, slots, offsets, edges)
 
 
-@functools.partial(compile_program, static_argnames=("sources", "total"))
-def flat_pairs_of(idx: Array, mask: Array, sources: int, total: int) -> tuple[Array, Array, Array, Array]:
+@functools.partial(compile_program, static_argnames=("sources", "total", "native"))
+def flat_pairs_of(idx: Array, mask: Array, sources: int, total: int, native: bool) -> tuple[Array, Array, Array, Array]:
     """Return what `flat_pairs` does, of the slots that are set in a mask [m, capacity], and their number."""
     if 0 in (*idx.shape, total):
         rows, indices, offsets = flat_pairs(idx, mask.sum(1, dtype=jnp.int32), sources, total)
         return rows, indices, offsets, offsets[-1]
-    flat = flatten(mask, total)
+    flat = flatten(mask, total, native)
     return flat.rows, jnp.where(flat.rows < len(idx), idx.reshape(-1)[flat.slots], sources), flat.offsets, flat.offsets[-1]
 
 
@@ -142,7 +151,7 @@ def flat_edges(
     from jfrnn._search.gathers import gather
 
     (m, capacity), dim = topology.idx.shape, sources.shape[1]
-    flat = flatten(mask, total)
+    flat = flatten(mask, total, topology.native)
     real = flat.rows < m
     senders = jnp.where(real, topology.idx.reshape(-1)[flat.slots], topology.sources)
     ends = _by_sender(topology, flat.edges, total), _by_row(flat.offsets, capacity, total)
