@@ -22,7 +22,7 @@ from jfrnn._geometry import (
     sort_order,
 )
 from jfrnn._memory import MemoryPlan, memory_plan
-from jfrnn._search import NeighborList, count, run_chunk, search
+from jfrnn._search import EdgeList, NeighborList, count, run_chunk, search, search_edges
 from jfrnn._sums import pair_sum
 from jfrnn._triangles import TriangleList, search_triangles
 
@@ -30,6 +30,7 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Box",
+    "EdgeList",
     "MemoryPlan",
     "NeighborList",
     "NeighborOverflowError",
@@ -46,6 +47,7 @@ __all__ = [
     "pairs_of_rows",
     "run_chunk",
     "search",
+    "search_edges",
     "search_triangles",
     "sort_order",
 ]

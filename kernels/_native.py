@@ -23,7 +23,7 @@ EXCLUDED = (
     "excluded",
 )  # arrays that are given where kernels are EXCLUDING (native/excluded.h), and else left out
 SPACES = ("", "_nearest", "_images", "_nearest_skewed", "_images_skewed")  # in names of variants
-_DEFAULTS = {"PERIODIC": 0, "BATCHED": 0, "SUM": 0, "SCALED": 0, "ONE_BY_ONE": 0, "EXCLUDING": 0}
+_DEFAULTS = {"PERIODIC": 0, "BATCHED": 0, "SUM": 0, "SCALED": 0, "ONE_BY_ONE": 0, "EXCLUDING": 0, "FLAT": 0}
 
 
 def table_cells(sources: int) -> int:

@@ -13,16 +13,18 @@ BLOCKS = 8  # that share a multiprocessor: what decides exactly may spill regist
 
 
 @functools.lru_cache(64)
-def rows_kernel(dim: int, double: bool, scaled: bool, lists: bool, periodic: int, excluding: bool, cuda: bool) -> Kernel:
+def rows_kernel(
+    dim: int, double: bool, scaled: bool, lists: bool, periodic: int, excluding: bool, cuda: bool, flat: bool = False
+) -> Kernel:
     """Return the kernel for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts alone.
 
-    `periodic` and `excluding` are those of `jfrnn.kernels._native.program`.
+    `periodic`, `excluding` and `flat` are those of `jfrnn.kernels._native.program`.
     """
     where = "cuda" if cuda else "cpu"
     name = f"box_rows_{where}_{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}"
-    name += f"{SPACES[periodic]}{'_excluding' * excluding}"
+    name += f"{'_flat' * flat}{SPACES[periodic]}{'_excluding' * excluding}"
     constants = {"PERIODIC": periodic, "SCALED": scaled, "LIST": lists, "QUERY_CHUNK": QUERIES_AT_ONCE, "LANES_PER_ROW": LANES}
-    constants["EXCLUDING"] = excluding
+    constants |= {"EXCLUDING": excluding, "FLAT": flat}
     text = program(double, dim, "box_rows.cuh" if cuda else "box_rows_cpu.h", **constants)
     return declare(name, text, Entry("BoxRows.run", _BLOCK if cuda else 1, BLOCKS), cuda=cuda, fused=cuda)[0]
 

@@ -43,15 +43,22 @@ class Kernels(NamedTuple):
 
 @functools.lru_cache(512)
 def cell_kernels(
-    dim: int, double: bool, scaled: bool, lists: bool, periodic: int = 0, batched: bool = False, excluding: bool = False
+    dim: int,
+    double: bool,
+    scaled: bool,
+    lists: bool,
+    periodic: int = 0,
+    batched: bool = False,
+    excluding: bool = False,
+    flat: bool = False,
 ) -> Kernels:
     """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts alone.
 
-    `periodic`, `batched` and `excluding` are those of `jfrnn.kernels._native.program`.
+    `periodic`, `batched`, `excluding` and `flat` are those of `jfrnn.kernels._native.program`.
     """
-    variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}"
+    variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}{'_flat' * flat}"
     variant += f"{SPACES[periodic]}{'_batched' * batched}{'_excluding' * excluding}"
-    options = {"SCALED": scaled, "LIST": lists, **GRID, "PERIODIC": periodic}
+    options = {"SCALED": scaled, "LIST": lists, "FLAT": flat, **GRID, "PERIODIC": periodic}
     options |= {"BATCHED": batched, "EXCLUDING": excluding, "SUMS": 0, "CHUNK": CHUNK, "QUERY_CHUNK": QUERY_CHUNK, "MANY": MANY}
     options |= {"TOGETHER": TOGETHER, "CANDIDATES": 1024 if double else 1536}  # what fits into a first-level cache beside a row
     text = program(double, dim, "rows_cpu.h", **options)

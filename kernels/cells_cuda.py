@@ -147,18 +147,19 @@ def cell_kernels(
     periodic: int = 0,
     batched: bool = False,
     excluding: bool = False,
+    flat: bool = False,
 ) -> Kernels:
     """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts, half lists or whole.
 
-    `periodic`, `batched` and `excluding` are those of `jfrnn.kernels._native.program`. `reach` is the number of cell edges in a
-    cutoff along y and z, `reach_x` along x; other numbers than these are slower, and only measurements ask for them.
+    `periodic`, `batched`, `excluding` and `flat` are those of `jfrnn.kernels._native.program`. `reach` is the number of cell edges
+    in a cutoff along y and z, `reach_x` along x; other numbers than these are slower, and only measurements ask for them.
     """
     blocks = 24 if not lists else 16 if double else 20  # registers against occupancy, measured on an H200
     kind = f"{dim}d_{'f64' if double else 'f32'}_r{reach}x{reach_x}"
     kind += SPACES[periodic] + "_batched" * batched
-    variant = f"{kind}{'_scaled' * scaled}{'_list' * lists}{'_later' * later}{'_excluding' * excluding}"
+    variant = f"{kind}{'_scaled' * scaled}{'_list' * lists}{'_flat' * flat}{'_later' * later}{'_excluding' * excluding}"
     grid = {**GRID, "REACH": reach, "REACH_X": reach_x, "PERIODIC": periodic, "BATCHED": batched}
-    query = {"SCALED": scaled, "LIST": lists, "SUMS": 0, "LATER": later, "EXCLUDING": excluding}
+    query = {"SCALED": scaled, "LIST": lists, "FLAT": flat, "SUMS": 0, "LATER": later, "EXCLUDING": excluding}
     query |= grid
 
     def query_kernel(name: str, crossing: bool = False) -> Kernel:

@@ -44,12 +44,20 @@ def slots(queries: int) -> int:
 
 @functools.lru_cache(64)
 def rows_kernel(
-    warps: int, dim: int, double: bool, lists: bool, batched: bool, boxed: bool = False, excluding: bool = False
+    warps: int,
+    dim: int,
+    double: bool,
+    lists: bool,
+    batched: bool,
+    boxed: bool = False,
+    excluding: bool = False,
+    flat: bool = False,
 ) -> Kernel:
     """Return the kernel for warps of a block, a dimension and a dtype, for lists or counts alone."""
     variant = f"{warps}w_{dim}d_{'f64' if double else 'f32'}{'_list' * lists}{'_nearest' * boxed}{'_batched' * batched}"
-    variant += "_excluding" * excluding
-    text = program(double, dim, "few_rows.cuh", SUMS=0, EXCLUDING=excluding, **_constants(warps, lists, batched, boxed))
+    variant += "_excluding" * excluding + "_flat" * flat
+    options = {"EXCLUDING": excluding, "FLAT": flat, **_constants(warps, lists, batched, boxed)}
+    text = program(double, dim, "few_rows.cuh", SUMS=0, **options)
     return declare(f"few_cuda_{variant}", text, Entry("FewRows.run", 32 * warps), cuda=True, fused=True)[0]
 
 

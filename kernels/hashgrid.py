@@ -57,10 +57,11 @@ def split_width(width: float) -> dict[str, int]:
 
 
 @functools.cache
-def search_kernels(dim: int, double: bool, scaled: bool, lists: bool, cuda: bool) -> Kernels:
+def search_kernels(dim: int, double: bool, scaled: bool, lists: bool, cuda: bool, flat: bool = False) -> Kernels:
     """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts alone."""
     variant = f"{'cuda' if cuda else 'cpu'}_{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}"
-    text = program(double, dim, "hashgrid.h", given={"warp_hashgrid.h": warp_header()}, SCALED=scaled, LIST=lists)
+    variant += "_flat" * flat
+    text = program(double, dim, "hashgrid.h", given={"warp_hashgrid.h": warp_header()}, SCALED=scaled, LIST=lists, FLAT=flat)
     entries = Entry("HashGridSearch.pack", BLOCK), Entry("HashGridSearch.query", BLOCK, 1 if double else _RESIDENT)
     return Kernels(*declare(f"hashgrid_{variant}", text, *entries, cuda=cuda, fused=cuda))
 

@@ -42,16 +42,16 @@ def level_program(
 @functools.lru_cache(512)
 def query_kernel(
     dim: int, double: bool, lists: bool, rule: str, groups: int, halvings: int, periodic: int = 0, batched: bool = False,
-    cuda: bool = False, excluding: bool = False,
+    cuda: bool = False, excluding: bool = False, flat: bool = False,
 ) -> Kernel:  # fmt: skip
     """Return the kernel for a dimension, a dtype and a rule, for lists or counts alone.
 
     On the CPU threads share the work, on CUDA there is one per query. `info`, zeros at first, gets the longest row.
-    `periodic`, `batched` and `excluding` are those of `jfrnn.kernels._native.program`.
+    `periodic`, `batched`, `excluding` and `flat` are those of `jfrnn.kernels._native.program`.
     """
-    variant = f"{dim}d_{'f64' if double else 'f32'}_{rule}{'_list' * lists}"
+    variant = f"{dim}d_{'f64' if double else 'f32'}_{rule}{'_list' * lists}{'_flat' * flat}"
     variant += f"{SPACES[periodic]}{'_batched' * batched}{'_excluding' * excluding}"
-    constants = {"LIST": lists, "PERIODIC": periodic, "BATCHED": batched, "EXCLUDING": excluding}
+    constants = {"LIST": lists, "FLAT": flat, "PERIODIC": periodic, "BATCHED": batched, "EXCLUDING": excluding}
     text = level_program(dim, double, rule, groups, halvings, "level_rows.h", **constants)
     entry = Entry("LevelRows.run", BLOCK)
     return declare(f"levels_{'cuda' if cuda else 'cpu'}_{variant}", text, entry, cuda=cuda)[0]

@@ -7,6 +7,7 @@ from jfrnn.kernels._program import Entry, Kernel, declare
 
 ROWS_AT_ONCE = 64  # that a thread of the CPU takes
 LANES_PER_SLOT = 8  # on CUDA
+LANES_PER_ROW = 32  # likewise, where rows become flat
 
 
 @functools.cache
@@ -28,6 +29,13 @@ def collect_kernel(width: int, double: bool, by_source: bool, cuda: bool) -> Ker
     name = f"collect_{'cuda' if cuda else 'cpu'}_{width}_{'f64' if double else 'f32'}{'_sorted' * by_source}"
     text = program(double, 3, "collect.h", WIDTH=width, REVERSED=by_source, QUERY_CHUNK=ROWS_AT_ONCE)
     return declare(name, text, Entry("Collect.run", 128 if cuda else 1, 8), cuda=cuda)[0]
+
+
+@functools.cache
+def flatten_kernel(cuda: bool) -> Kernel:
+    """Return the kernel that finds the slots of a list that hold a pair, one after another."""
+    text = program(False, 3, "flatten.h", QUERY_CHUNK=ROWS_AT_ONCE)
+    return declare(f"flatten_{'cuda' if cuda else 'cpu'}", text, Entry("Flatten.run", 128 if cuda else 1, 8), cuda=cuda)[0]
 
 
 @functools.cache

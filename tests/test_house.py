@@ -28,9 +28,9 @@ ALLOWED = {  # first-party and third-party modules that each folder may import
     "cases": {"numpy"},
     "jfrnn": {"jax", "numpy", "jfrnn"},
 }
-PUBLIC = {"Box", "MemoryPlan", "NeighborList", "NeighborOverflowError", "Status", "TriangleList"}
-PUBLIC |= {"count", "memory_plan", "merge_vertices", "pair_sum", "run_chunk", "search", "search_triangles", "sort_order"}
-PUBLIC |= {"hilbert_decode", "hilbert_encode", "morton_decode", "morton_encode", "pairs_of_rows"}
+PUBLIC = {"Box", "EdgeList", "MemoryPlan", "NeighborList", "NeighborOverflowError", "Status", "TriangleList"}
+PUBLIC |= {"count", "memory_plan", "merge_vertices", "pair_sum", "run_chunk", "search", "search_edges", "search_triangles"}
+PUBLIC |= {"hilbert_decode", "hilbert_encode", "morton_decode", "morton_encode", "pairs_of_rows", "sort_order"}
 
 
 def imported_modules(path):

@@ -21,8 +21,8 @@ from jax import Array, lax
 
 from jfrnn._engine.boxes import find_in_boxes
 from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
-from jfrnn._engine.problem import Kind, Options, Rows, Search, largest_radius
-from jfrnn._engine.runs import count_neighbors, list_neighbors
+from jfrnn._engine.problem import Kind, Options, Room, Rows, Search, largest_radius
+from jfrnn._engine.runs import count_neighbors, fill_neighbors, list_neighbors
 from jfrnn._engine.tuning import Tuning, by_platform
 from jfrnn._engine.words import LANES
 from jfrnn._geometry import (
@@ -76,10 +76,12 @@ class ArrayEngine:
         """Return None: it runs on every platform."""
         return None
 
-    def rows(self, search: Search, options: Options, capacity: int | None) -> Rows:
+    def rows(self, search: Search, options: Options, capacity: int | Room | None) -> Rows:
         """Find the candidates of every query, and keep those that are neighbors."""
         refuse_many(search)
         m = search.sizes[1]
+        if isinstance(capacity, Room):
+            return self._flat_rows(search._replace(checks={}), options, capacity)
 
         def on(tuning: Tuning) -> Callable[[Search], Rows]:
             return functools.partial(self._rows, options, capacity, tuning)
@@ -93,6 +95,21 @@ class ArrayEngine:
         if capacity is None:
             return complete_rows(search, None, count_neighbors(candidates, search.cutoff, options.filter, tuning), None)
         return complete_rows(search, *list_neighbors(candidates, search.cutoff, options.filter, capacity, tuning), capacity)
+
+    def _flat_rows(self, search: Search, options: Options, room: Room) -> Rows:
+        def on(tuning: Tuning) -> Callable[[tuple[Search, Array]], Array]:
+            def fill(operands: tuple[Search, Array]) -> Array:
+                search, starts = operands
+                candidates = find_candidates(search, self.by_cells and not is_few(search, tuning), tuning)
+                return fill_neighbors(candidates, search.cutoff, options.filter, Room(starts, room.total), tuning)
+
+            return fill
+
+        like = jax.ShapeDtypeStruct((room.total,), np.int32)
+        idx = call_late(lambda *operands: by_platform(on, operands), (search, room.starts), like)
+        begun = jnp.zeros(room.total, jnp.int32).at[room.starts[1:-1]].add(1, mode="drop", indices_are_sorted=True)
+        receivers = jnp.cumsum(begun, dtype=jnp.int32)
+        return complete_rows(search, idx, jnp.diff(room.starts), None)._replace(receivers=receivers)
 
     def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool, scaled: bool) -> int | None:
         """Return None: only the compiler knows."""

@@ -1,6 +1,7 @@
 """Searches with a box per system by Warp's kernels: cells are sorted by XLA, a kernel meets them."""
 
 import functools
+import math
 from collections.abc import Callable
 
 import jax
@@ -11,27 +12,29 @@ from jax import Array, lax
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import excluded_rows, lattice_numbers, particle_rows, periodic_kind
 from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
-from jfrnn._engine.problem import Filter, Rows, Search, largest_radius
-from jfrnn._engine.variants import Variant, absent, describe_call, plan_numbers
+from jfrnn._engine.problem import Filter, Room, Rows, Search, largest_radius
+from jfrnn._engine.variants import Variant, absent, describe_call, plan_numbers, row_dims, split_rows
 from jfrnn._geometry import Lattice, Status, Wrapped, sort_into_boxes
 from jfrnn.kernels import boxes
 
 _GIVEN = ("positions", "queries", "boxes", "axes", "asked", "ids", "order", "visits", "cells", "start")
 
 
-def box_neighbors(search: Search, keep: Filter, capacity: int | None) -> Rows:
+def box_neighbors(search: Search, keep: Filter, capacity: int | Room | None) -> Rows:
     """List the neighbors of every query, or only count them (capacity=None), where each system has a box of its own."""
     m, dim, double = search.sizes[1], search.sources.shape[1], search.sources.dtype == jnp.float64
-    dims = {"idx": (m, capacity), "count": m, "info": 2}
+    dims = {**row_dims(m, capacity), "count": m, "info": 2}
     kind = (search.queries is None, search.cutoff.closed, keep, periodic_kind(search.torus), True, search.exclude is not None)
-    variant = Variant(dim, double, search.cutoff.scaled, capacity is not None, *kind)
+    starts = [capacity.starts] if isinstance(capacity, Room) else []
+    variant = Variant(dim, double, search.cutoff.scaled, capacity is not None, *kind, bool(starts))
 
     def on(cuda: bool) -> Callable[..., list[Array]]:
         return functools.partial(_callable(variant, cuda), output_dims=dims)
 
-    *idx, count, info = lax.platform_dependent(*_operands(search), cpu=on(False), cuda=on(True))
-    overflow = jnp.where(capacity is not None and info[0] > (capacity or 0), Status.ROW_OVERFLOW.value, 0)
-    return Rows(idx[0] if idx else None, count, info[0], overflow.astype(jnp.int32))
+    *written, count, info = lax.platform_dependent(*_operands(search), *starts, cpu=on(False), cuda=on(True))
+    overflow = isinstance(capacity, int) and info[0] > capacity
+    status = jnp.where(overflow, Status.ROW_OVERFLOW.value, 0).astype(jnp.int32)
+    return Rows(**split_rows(written), counts=count, required=info[0], status=status)
 
 
 def _operands(search: Search) -> list[Array]:
@@ -73,8 +76,8 @@ def _callable(variant: Variant, cuda: bool) -> Call:
 
 def _plan(variant: Variant, cuda: bool, shapes: Shapes, _: int) -> Plan:
     kind = (variant.dim, variant.double, variant.scaled, variant.lists, variant.periodic, variant.excluding)
-    found, numbers = boxes.rows_kernel(*kind, cuda), plan_numbers(variant, shapes) | {"stride": shapes["axes"][1]}
+    found, numbers = boxes.rows_kernel(*kind, cuda, variant.flat), plan_numbers(variant, shapes) | {"stride": shapes["axes"][1]}
     m = numbers["m"]
     launch = Launch(found, boxes.threads(m)) if cuda else share(found, m, boxes.QUERIES_AT_ONCE)
-    pages = [] if cuda or not variant.lists else ask_for_huge_pages("idx", 4 * m * numbers["capacity"])
-    return Plan([Clear("info", 8), *pages, launch], numbers, absent(variant))
+    pages = [] if cuda or not variant.lists else ask_for_huge_pages("idx", 4 * math.prod(shapes["idx"]))
+    return Plan([Clear("info", 8), *pages, launch], numbers, absent(variant.lists, variant.flat))

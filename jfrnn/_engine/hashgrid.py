@@ -11,9 +11,9 @@ from jax import lax
 
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.plans import Clear, Kept, Launch, Plan, ask_for_huge_pages
-from jfrnn._engine.problem import Kind, Options, Rows, Search
+from jfrnn._engine.problem import Kind, Options, Room, Rows, Search
 from jfrnn._engine.start import INSTALL, load_warp
-from jfrnn._engine.variants import Variant, describe_call, plan_numbers
+from jfrnn._engine.variants import Variant, absent, describe_call, plan_numbers
 from jfrnn._engine.warp import call_kernels, check_platform, missing
 from jfrnn.kernels import _clang, hashgrid
 
@@ -45,7 +45,7 @@ class HashGridEngine:
         """Say what keeps Warp from running on a JAX platform."""
         return missing(platform)
 
-    def rows(self, search: Search, options: Options, capacity: int | None) -> Rows:
+    def rows(self, search: Search, options: Options, capacity: int | Room | None) -> Rows:
         """Search with a hash grid of the cutoff."""
         version = _clang.warp_version()
         if tuple(map(int, version.split(".")[:2])) < (1, 19):
@@ -88,12 +88,12 @@ def _plan(variant: Variant, radius: float, cuda: bool, shapes: Shapes, _: int) -
     n, m = numbers["n"], numbers["m"]
     grid = hashgrid.grid_shape(n, variant.dim)
     numbers["cells_x"], numbers["cells_y"], _ = grid
-    kernels = hashgrid.search_kernels(variant.dim, variant.double, variant.scaled, variant.lists, cuda)
-    rows = [] if cuda or not variant.lists else ask_for_huge_pages("idx", 4 * m * numbers["capacity"])
+    kernels = hashgrid.search_kernels(variant.dim, variant.double, variant.scaled, variant.lists, cuda, variant.flat)
+    rows = [] if cuda or not variant.lists else ask_for_huge_pages("idx", 4 * math.prod(shapes["idx"]))
     pack, query = Launch(kernels.pack, n if cuda else 1), Launch(kernels.query, m if cuda else 1)
     steps = [Clear("info", 8), pack, Launch(hashgrid.build_kernel(variant.double)), *rows, query]
     keep = functools.partial(_keep_grid, grid, variant.double, n)
-    return Plan(steps, numbers, [] if variant.lists else ["idx"], keep)
+    return Plan(steps, numbers, absent(variant.lists, variant.flat), keep)
 
 
 def _keep_grid(shape: tuple[int, int, int], double: bool, points: int, device: int) -> Kept:

@@ -11,8 +11,9 @@ from jax import Array, lax
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import excluded_rows, lattice_numbers, particle_rows, periodic_kind, space_flags
 from jfrnn._engine.plans import Clear, Launch, Plan, share
-from jfrnn._engine.problem import Filter, Rows, Search
+from jfrnn._engine.problem import Filter, Room, Rows, Search
 from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText
+from jfrnn._engine.variants import absent, row_dims, split_rows
 from jfrnn._geometry import GROUPS, HALVINGS, Cutoffs, Levels
 from jfrnn.kernels import levels as level_kernels
 from jfrnn.kernels import pair_sum_levels
@@ -33,9 +34,10 @@ class _LevelVariant(NamedTuple):
     batched: bool
     cuda: bool
     excluding: bool
+    flat: bool = False
 
 
-def level_neighbors(search: Search, levels: Levels, keep: Filter, capacity: int | None) -> Rows:
+def level_neighbors(search: Search, levels: Levels, keep: Filter, capacity: int | Room | None) -> Rows:
     """Search with a cutoff per particle, among sources that XLA has sorted; capacity=None only counts."""
 
     def on(cuda: bool) -> Callable[[Search, Levels], Rows]:
@@ -44,13 +46,15 @@ def level_neighbors(search: Search, levels: Levels, keep: Filter, capacity: int 
     return lax.platform_dependent(search._replace(checks={}), levels, cpu=on(False), cuda=on(True))
 
 
-def _call_levels(cuda: bool, keep: Filter, capacity: int | None, search: Search, levels: Levels) -> Rows:
+def _call_levels(cuda: bool, keep: Filter, capacity: int | Room | None, search: Search, levels: Levels) -> Rows:
     lists, (_, m) = capacity is not None, search.sizes
-    variant = _variant_of(search, keep, lists, cuda)
-    dims = {"idx": (m, capacity), "count": m, "info": 2}
-    *idx, count, info = _level_callable(variant)(*_operands(search, levels), output_dims=dims)
-    overflow = info[0] > capacity if lists else jnp.zeros((), bool)
-    return Rows(idx[0] if lists else None, count, info[0], overflow.astype(jnp.int32))  # Status.ROW_OVERFLOW
+    starts = [capacity.starts] if isinstance(capacity, Room) else []
+    variant = _variant_of(search, keep, lists, cuda)._replace(flat=bool(starts))
+    dims = {**row_dims(m, capacity), "count": m, "info": 2}
+    *written, count, info = _level_callable(variant)(*_operands(search, levels), *starts, output_dims=dims)
+    overflow = info[0] > capacity if isinstance(capacity, int) else jnp.zeros((), bool)
+    status = overflow.astype(jnp.int32)  # Status.ROW_OVERFLOW
+    return Rows(**split_rows(written), counts=count, required=info[0], status=status)
 
 
 def level_sums(
@@ -141,7 +145,7 @@ def _given(variant: _LevelVariant) -> tuple[str, ...]:
 
 
 def _name(name: str, variant: _LevelVariant, **more: bool) -> str:
-    flags = {"f64": variant.double, "f32": not variant.double, "list": variant.lists, "own": variant.own}
+    flags = {"f64": variant.double, "f32": not variant.double, "list": variant.lists, "flat": variant.flat, "own": variant.own}
     flags |= {"closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only, variant.rule: True}
     flags |= {**space_flags(variant.periodic), "batched": variant.batched, "excluding": variant.excluding}
     return "_".join([f"jfrnn_{name}_{variant.dim}d", *(flag for flag, on in {**flags, **more}.items() if on)])
@@ -149,9 +153,10 @@ def _name(name: str, variant: _LevelVariant, **more: bool) -> str:
 
 @kernel
 def _level_callable(variant: _LevelVariant) -> Call:
-    results = dict.fromkeys([*["idx"] * variant.lists, "count", "info"], np.int32)
+    results = dict.fromkeys([*["idx"] * variant.lists, *["receivers"] * variant.flat, "count", "info"], np.int32)
     name = _name(f"levels_{'cuda' if variant.cuda else 'cpu'}", variant)
-    return Call(name, _given(variant), results, functools.partial(_plan_rows, variant))
+    given = (*_given(variant), *["starts"] * variant.flat)
+    return Call(name, given, results, functools.partial(_plan_rows, variant))
 
 
 @kernel
@@ -179,7 +184,7 @@ def _numbers(variant: _LevelVariant, shapes: Shapes) -> dict[str, int]:
 
 def _plan_rows(variant: _LevelVariant, shapes: Shapes, multiprocessors: int) -> Plan:
     kind = (variant.dim, variant.double, variant.lists, variant.rule, GROUPS, HALVINGS, variant.periodic, variant.batched)
-    query = level_kernels.query_kernel(*kind, variant.cuda, variant.excluding)
-    numbers = _numbers(variant, shapes) | {"capacity": shapes["idx"][1] if variant.lists else 0}
+    query = level_kernels.query_kernel(*kind, variant.cuda, variant.excluding, variant.flat)
+    numbers = _numbers(variant, shapes) | {"capacity": shapes["idx"][1] if variant.lists and not variant.flat else 0}
     launch = Launch(query, numbers["m"]) if variant.cuda else share(query, numbers["m"])
-    return Plan([Clear("info", 8), launch], numbers, [] if variant.lists else ["idx"])
+    return Plan([Clear("info", 8), launch], numbers, absent(variant.lists, variant.flat))

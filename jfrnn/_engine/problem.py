@@ -38,9 +38,22 @@ class Filter(NamedTuple):
     later_only: bool
 
 
+class Room(NamedTuple):
+    """Where the rows of a flat list begin, which follow each other without gaps.
+
+    Attributes:
+        starts: Where each begins and the last one ends, shape [m + 1], int32, at most `total`.
+        total: The slots of all. Static.
+    """
+
+    starts: Array
+    total: int
+
+
 class Rows(NamedTuple):
     """Neighbors of m queries: [m, capacity] int32 source indices, unused slots n (None if only counted), and [m] int32 true counts.
 
+    Of a flat list, `idx` [total] are the sources, and `receivers` [total] the rows; what stands behind the last pair is undefined.
     `required` [] int32 is the length of the longest row, `status` [] int32 the bits of `Status`. `order` [n] int32 are the sources
     as they follow each other in space, if that is asked for; -1 where their numbers do so already.
     """
@@ -50,6 +63,7 @@ class Rows(NamedTuple):
     required: Array
     status: Array
     order: Array | None = None
+    receivers: Array | None = None
 
 
 class Search(NamedTuple):
@@ -121,8 +135,11 @@ class Engine(Protocol):
         """Return what it lacks on a JAX platform, or None if it can run there."""
         ...
 
-    def rows(self, search: Search, options: "Options", capacity: int | None) -> Rows:
-        """List the neighbors of every query, or only count them (capacity=None). There is at least one source and one query."""
+    def rows(self, search: Search, options: "Options", capacity: int | Room | None) -> Rows:
+        """List the neighbors of every query, or only count them (capacity=None). There is at least one source and one query.
+
+        With `Room`, rows are those of a flat list.
+        """
         ...
 
     def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool, scaled: bool) -> int | None:

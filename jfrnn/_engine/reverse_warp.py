@@ -34,6 +34,30 @@ def collect_slots(values: Array, slots: Array, starts: Array | None, lengths: Ar
     return call(*given, output_dims={"sums": (sources, values.shape[1]), "info": 2})[0]
 
 
+def flatten_slots(mask: Array, starts: Array, total: int, cuda: bool) -> tuple[Array, Array]:
+    """Return the rows of the slots that are set in a mask [m, capacity], and the slots, [total] int32 each.
+
+    `starts` [m] are how many come before each row. What stands behind the last slot is undefined.
+    """
+    receivers, slots, _ = _flatten_callable(cuda)(mask, starts, output_dims={"receivers": total, "slots": total, "info": 2})
+    return receivers, slots
+
+
+@kernel
+def _flatten_callable(cuda: bool) -> Call:
+    results = dict.fromkeys(("receivers", "slots", "info"), np.int32)
+    plan = functools.partial(_plan_flatten, cuda)
+    return Call(f"jfrnn_flatten_{'cuda' if cuda else 'cpu'}", ("mask", "starts"), results, plan)
+
+
+def _plan_flatten(cuda: bool, shapes: Shapes, _: int) -> Plan:
+    m, capacity = shapes["mask"]
+    found = reverse.flatten_kernel(cuda)
+    launch = Launch(found, reverse.LANES_PER_ROW * m) if cuda else share(found, m, reverse.ROWS_AT_ONCE)
+    numbers = {"m": m, "capacity": capacity, "total": shapes["slots"][0]}
+    return Plan([launch] if cuda else [Clear("info", 8), launch], numbers)
+
+
 @kernel
 def _collect_callable(width: int, double: bool, by_source: bool, cuda: bool) -> Call:
     name = f"jfrnn_collect_{'cuda' if cuda else 'cpu'}_{width}_{'f64' if double else 'f32'}{'_sorted' * by_source}"

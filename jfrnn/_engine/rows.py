@@ -5,10 +5,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.arrays import complete_rows, find_candidates, is_few, refuse_many
-from jfrnn._engine.problem import Inputs, Options, Rows, Search, prepare_search, take_present
+from jfrnn._engine.problem import Inputs, Options, Room, Rows, Search, prepare_search, take_present
 from jfrnn._engine.runs import State, Visit, fold_neighbors
 from jfrnn._engine.tuning import Tuning, by_platform
 from jfrnn._geometry import NOT_FINITE, Cutoff, Status, has_box
@@ -18,8 +19,8 @@ from jfrnn._tracing import compile_program
 class Found(NamedTuple):
     """The result of a search: rows of neighbors and the periodic images to which they belong.
 
-    `images` [m, capacity] holds image codes, and `turns` [n] and [m] int32 (or None) are packed; both are None unless images must
-    be told apart.
+    `images`, in the shape of `rows.idx`, holds codes, `turns` [n] and [m] int32 (or None) are packed; both are None unless images
+    must be told apart.
     """
 
     rows: Rows
@@ -33,6 +34,40 @@ def list_rows(inputs: Inputs, options: Options, capacity: int) -> Found:
     return _find(inputs, options, capacity)
 
 
+class FoundFlat(NamedTuple):
+    """A flat list: where its rows begin, and the last one ends, [m + 1] int32, saturating; and what is found of it.
+
+    `found.rows.idx` and `receivers` are [total], padded by n and m. Counts are true ones, `required` is the number of all pairs.
+    """
+
+    offsets: Array
+    found: Found
+
+
+@functools.partial(compile_program, static_argnames=("options", "total"))
+def list_flat(inputs: Inputs, options: Options, total: int) -> FoundFlat:
+    """List the neighbors of every query in rows without gaps: count them, add up, and fill."""
+    counted = _find(inputs, options, None).rows
+    offsets = add_up(counted.counts)
+    found = _find(inputs, options, Room(jnp.minimum(offsets, total), total))
+    m, n = len(counted.counts), len(inputs.sources)
+    there = lax.iota(jnp.int32, total) < offsets[-1]
+    idx, receivers = (jnp.where(there, jnp.asarray(x), most) for x, most in ((found.rows.idx, n), (found.rows.receivers, m)))
+    status = counted.status | jnp.where(offsets[-1] > total, Status.TOTAL_OVERFLOW.value, 0).astype(jnp.int32)
+    rows = Rows(idx, counted.counts, offsets[-1], status, None, receivers)
+    images = None if found.images is None else jnp.where(there, found.images, 0)
+    return FoundFlat(offsets, Found(rows, images, found.turns))
+
+
+def add_up(counts: Array) -> Array:
+    """Return 0 and the sums of the first counts, [m + 1] int32, saturating at the largest int32."""
+    ends = jnp.cumsum(counts, dtype=jnp.int32)
+    m = counts.shape[0]
+    whole = jnp.min(jnp.where(ends < 0, lax.iota(jnp.int32, m), m), initial=m)  # the first sum beyond int32 is negative
+    ends = jnp.where(lax.iota(jnp.int32, m) < whole, ends, np.iinfo(np.int32).max)
+    return jnp.concatenate([jnp.zeros(1, jnp.int32), ends])
+
+
 @functools.partial(compile_program, static_argnames="options")
 def count_rows(inputs: Inputs, options: Options) -> tuple[Array, Array]:
     """Count the neighbors of every query, [m] int32, and return their maximum too: the compiled program of `count`."""
@@ -40,7 +75,7 @@ def count_rows(inputs: Inputs, options: Options) -> tuple[Array, Array]:
     return rows.counts, rows.required
 
 
-def _find(inputs: Inputs, options: Options, capacity: int | None) -> Found:
+def _find(inputs: Inputs, options: Options, capacity: int | Room | None) -> Found:
     """List the neighbors of every query, or only count them (capacity=None). Integers: no gradient flows through."""
     present = take_present(inputs)
     given, given_queries, active = lax.stop_gradient(present[:3])
@@ -94,9 +129,12 @@ def _with_status(rows: Rows, sources: Array, queries: Array | None, active: Arra
     return rows._replace(status=status)
 
 
-def _empty_rows(search: Search, options: Options, capacity: int | None) -> Rows:
+def _empty_rows(search: Search, options: Options, capacity: int | Room | None) -> Rows:
     """Return rows without neighbors, for searches without queries or sources."""
     n, m = search.sizes
     fill = n if options.images is None or options.images.nearest else max(n, 1) * options.images.total
+    if isinstance(capacity, Room):
+        idx = jnp.full(capacity.total, fill, jnp.int32)
+        return complete_rows(search, idx, jnp.zeros(m, jnp.int32), None)._replace(receivers=jnp.full(capacity.total, m, jnp.int32))
     idx = None if capacity is None else jnp.full((m, capacity), fill, jnp.int32)
     return complete_rows(search, idx, jnp.zeros(m, jnp.int32), capacity)

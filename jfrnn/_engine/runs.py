@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
-from jfrnn._engine.problem import Filter
+from jfrnn._engine.problem import Filter, Room
 from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
 from jfrnn._engine.words import LANES, BitRows, bit_counts, windows
 from jfrnn._geometry import (
@@ -96,6 +96,42 @@ def list_neighbors(
 
     rows, count = engine.map_blocks(list_block, [(capacity,), ()])
     return rows, count
+
+
+def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, room: Room, tuning: Tuning) -> Array:
+    """List the neighbors of every query in rows without gaps: [total] int32, as `list_neighbors` has them, 0 behind the last."""
+    torus = candidates.torus
+    engine = _Engine(candidates, cutoff, keep, tuning, slots=FOLD_GROUP, capacity=None)
+    n, images = candidates.size, 1 if torus is None or torus.images.nearest else torus.images.total
+    slots = lax.iota(jnp.int32, FOLD_GROUP)
+
+    def fill_block(b: Array, out: Array) -> Array:
+        span = engine.block(b)
+        ids = span.of(engine.queries.ids)
+        begin, end = room.starts[ids], room.starts[ids + 1]
+
+        def add(words: _HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
+            (out, at), (hits, first, image) = found, words
+            bits = BitRows.of(hits, tuning.in_groups)
+            total = bits.total
+
+            def add_group(state: tuple[Array, Array]) -> tuple[Array, Array]:
+                done, out = state
+                ordinal = jnp.broadcast_to(done + slots, (span.size, slots.size))
+                word, bit = bits.nth(ordinal)
+                neighbor = flat_take(engine.sources.ids, flat_take(first, word) + bit)
+                if image is not None and images > 1:
+                    neighbor = neighbor + n * flat_take(image, word)
+                place = at[:, None] + ordinal
+                there = (ordinal < total[:, None]) & (place < end[:, None])
+                return done + FOLD_GROUP, out.at[jnp.where(there, place, room.total)].set(neighbor, mode="drop")
+
+            most = jnp.max(total)
+            return lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), out))[1], at + total
+
+        return engine.fold_words(span, add, (out, begin))[0]
+
+    return lax.fori_loop(0, engine.block_count, fill_block, jnp.zeros(room.total, jnp.int32))
 
 
 class Slots(NamedTuple):

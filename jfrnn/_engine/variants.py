@@ -4,11 +4,12 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jax import Array
 
 from jfrnn._engine.launch import Call, Shapes
 from jfrnn._engine.operands import space_flags
 from jfrnn._engine.plans import Plan
-from jfrnn._engine.problem import Filter
+from jfrnn._engine.problem import Filter, Room
 from jfrnn.kernels._native import EXCLUDED, table_cells
 
 _PARTICLES = ("positions", "queries", "cutoff")  # what kernels of cells are given
@@ -27,6 +28,7 @@ class Variant(NamedTuple):
     periodic: int = 0  # 1: nearest images, 2: images are told apart; two more where the lattice is skewed
     batched: bool = False
     excluding: bool = False
+    flat: bool = False  # a list whose rows follow each other without gaps
 
 
 def describe_call(
@@ -41,24 +43,37 @@ def describe_call(
     It is `given` arrays of these names, then those of exclusions, and writes rows, counts, `info` and `more`.
     """
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
-    flags |= {**space_flags(variant.periodic), "batched": variant.batched}
+    flags |= {"flat": variant.flat, **space_flags(variant.periodic), "batched": variant.batched}
     flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
     flags |= {"excluding": variant.excluding}
     whole = "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
-    results = [*["idx"] * variant.lists, "count", "info", *more]
-    return Call(whole, (*given, *EXCLUDED * variant.excluding), dict.fromkeys(results, np.int32), plan)
+    results = [*["idx"] * variant.lists, *["receivers"] * variant.flat, "count", "info", *more]
+    given = (*given, *EXCLUDED * variant.excluding, *["starts"] * variant.flat)
+    return Call(whole, given, dict.fromkeys(results, np.int32), plan)
 
 
 def plan_numbers(variant: Variant, shapes: Shapes) -> dict[str, int]:
-    """Return the numbers that kernels of cells take, by name; without rows the capacity is 0."""
+    """Return the numbers that kernels of cells take, by name; of rows without a common length the capacity is 0."""
     flags = {"closed": variant.closed, "drop_self": variant.keep.drop_self, "later_only": variant.keep.later_only}
-    capacity = shapes["idx"][1] if variant.lists else 0
+    capacity = shapes["idx"][1] if variant.lists and not variant.flat else 0
     return size_numbers(shapes, variant.own) | {"capacity": capacity, **flags}
 
 
-def absent(variant: Variant) -> list[str]:
-    """Return the names of arrays that are not written."""
-    return [] if variant.lists else ["idx"]
+def absent(lists: bool, flat: bool) -> list[str]:
+    """Return the names of arrays that kernels do not touch."""
+    return [*["idx"] * (not lists), *["starts", "receivers"] * (not flat)]
+
+
+def row_dims(m: int, capacity: int | Room | None) -> dict[str, int | tuple[int, int | None]]:
+    """Return the shape of what is written of rows, by name; without rows there is none."""
+    if isinstance(capacity, Room):
+        return {"idx": capacity.total, "receivers": capacity.total}
+    return {"idx": (m, capacity)}
+
+
+def split_rows(written: Sequence[Array]) -> dict[str, Array | None]:
+    """Return the fields of `Rows` that a kernel has written: none, rows, or those of a flat list."""
+    return {"idx": None} | dict(zip(("idx", "receivers"), written, strict=False))
 
 
 def size_numbers(shapes: Shapes, own: bool) -> dict[str, int]:

@@ -6,6 +6,7 @@ depends on (JAX's persistent compilation cache sees no more than that).
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
@@ -20,9 +21,9 @@ from jfrnn._engine.launch import Call, Shapes, kernel, open_native
 from jfrnn._engine.levels_warp import level_neighbors
 from jfrnn._engine.operands import MOST_IN_BOX, excluded_rows, pack_particles, periodic_kind
 from jfrnn._engine.plans import HugePages, Launch, Plan, ask_for_huge_pages, share
-from jfrnn._engine.problem import Engine, Filter, Kind, Options, Rows, Search, largest_radius
+from jfrnn._engine.problem import Engine, Filter, Kind, Options, Room, Rows, Search, largest_radius
 from jfrnn._engine.start import check_warp
-from jfrnn._engine.variants import Variant, absent, describe_call, plan_numbers
+from jfrnn._engine.variants import Variant, absent, describe_call, plan_numbers, row_dims, split_rows
 from jfrnn._geometry import Cutoffs
 from jfrnn.kernels import _driver, cells_cpu, cells_cuda, few_cuda
 
@@ -48,7 +49,7 @@ class WarpEngine:
         """Say what keeps Warp from running on a JAX platform."""
         return missing(platform)
 
-    def rows(self, search: Search, options: Options, capacity: int | None) -> Rows:
+    def rows(self, search: Search, options: Options, capacity: int | Room | None) -> Rows:
         """Search among cells, or where cutoffs differ from particle to particle, among cells of many sizes."""
         if search.per_system:
             return box_neighbors(search._replace(checks={}), options.filter, capacity)
@@ -57,7 +58,7 @@ class WarpEngine:
 
         def on(module: ModuleType, make: Callable[[Variant], Any]) -> Callable[[Search], Rows]:
             blocks = few_cuda.blocks(search.sizes[1]) if module is few_cuda else None
-            order = functools.partial(_order_in, module, search) if options.ordered and capacity is not None else None
+            order = functools.partial(_order_in, module, search) if options.ordered and isinstance(capacity, int) else None
             return functools.partial(
                 call_kernels, module.scratch_words, make, keep=options.filter, capacity=capacity, blocks=blocks, order=order
             )
@@ -135,7 +136,7 @@ def call_kernels(
     search: Search,
     *,
     keep: Filter,
-    capacity: int | None,
+    capacity: int | Room | None,
     blocks: int | None = None,
     order: Callable[[Array], Array] | None = None,
 ) -> Rows:
@@ -145,23 +146,27 @@ def call_kernels(
     the order of the sources in that scratch.
     """
     sources, queries, cutoff, batch, torus = search[:5]
-    own, lists = queries is None, capacity is not None
+    own, lists, flat = queries is None, capacity is not None, isinstance(capacity, Room)
     (n, m), dim = search.sizes, sources.shape[1]
     double = sources.dtype == jnp.float64
     periodic = periodic_kind(torus)
-    kind = (periodic, batch is not None, search.exclude is not None)
+    kind = (periodic, batch is not None, search.exclude is not None, flat)
     variant = Variant(dim, double, cutoff.scaled, lists, own, cutoff.closed, keep, *kind)
     if periodic in (1, 3) and n >= MOST_IN_BOX:
         raise ValueError(
             f"backend='warp' numbers at most {MOST_IN_BOX - 1} positions in a periodic box, got {n}: pass backend='jax'."
         )
     words = scratch_words(n, m, dim, 2 if double else 1, own)
-    dims = {"idx": (m, capacity), "count": m, "info": 2 if blocks is None else (blocks, 2), "scratch": max(words, 1)}
-    *idx, count, info, scratch = make(variant)(*pack_particles(search), *excluded_rows(search), output_dims=dims)
+    dims = {**row_dims(m, capacity), "count": m, "info": 2 if blocks is None else (blocks, 2), "scratch": max(words, 1)}
+    given = [*pack_particles(search), *excluded_rows(search)]
+    if isinstance(capacity, Room):
+        given.append(capacity.starts)
+    *written, count, info, scratch = make(variant)(*given, output_dims=dims)
     longest, status = (
         (info[0], info[1]) if blocks is None else (info[:, 0].max(), lax.reduce(info[:, 1], np.int32(0), lax.bitwise_or, (0,)))
     )
-    return Rows(idx[0] if lists else None, count, longest, status, None if order is None else order(scratch))
+    order_found = None if order is None else order(scratch)
+    return Rows(**split_rows(written), counts=count, required=longest, status=status, order=order_found)
 
 
 @kernel
@@ -180,12 +185,14 @@ def _few_callable(variant: Variant) -> Call:
 
 
 def _plan_on_cuda(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan:
-    kind = {"periodic": variant.periodic, "batched": variant.batched, "excluding": variant.excluding}
+    kind = {"periodic": variant.periodic, "batched": variant.batched, "excluding": variant.excluding, "flat": variant.flat}
     dim, later = variant.dim, variant.keep.later_only
     kernels = cells_cuda.cell_kernels(dim, variant.double, variant.scaled, variant.lists, later, **kind)
     numbers = plan_numbers(variant, shapes)
     return Plan(
-        place_launches(kernels.launches(numbers["n"], numbers["m"], variant.own, multiprocessors)), numbers, absent(variant)
+        place_launches(kernels.launches(numbers["n"], numbers["m"], variant.own, multiprocessors)),
+        numbers,
+        absent(variant.lists, variant.flat),
     )
 
 
@@ -200,8 +207,9 @@ def _plan_few(variant: Variant, shapes: Shapes, _: int) -> Plan:
         variant.batched,
         variant.periodic == 1,
         variant.excluding,
+        variant.flat,
     )
-    return Plan([Launch(query, few_cuda.threads(numbers["m"]))], numbers, absent(variant))
+    return Plan([Launch(query, few_cuda.threads(numbers["m"]))], numbers, absent(variant.lists, variant.flat))
 
 
 def place_launches(launches: Sequence[cells_cuda.Launch]) -> list[Launch]:
@@ -210,12 +218,12 @@ def place_launches(launches: Sequence[cells_cuda.Launch]) -> list[Launch]:
 
 
 def _plan_on_cpu(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan:
-    kind = {"periodic": variant.periodic, "batched": variant.batched, "excluding": variant.excluding}
+    kind = {"periodic": variant.periodic, "batched": variant.batched, "excluding": variant.excluding, "flat": variant.flat}
     kernels = cells_cpu.cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, **kind)
     numbers = plan_numbers(variant, shapes)
-    rows = ask_for_huge_pages("idx", 4 * numbers["m"] * numbers["capacity"]) if variant.lists else []
+    rows = ask_for_huge_pages("idx", 4 * math.prod(shapes["idx"])) if variant.lists else []
     steps = [*sort_on_cpu(kernels, numbers["n"]), *rows, share(kernels.query, numbers["m"], QUERIES_PER_THREAD)]
-    return Plan(steps, numbers, absent(variant))
+    return Plan(steps, numbers, absent(variant.lists, variant.flat))
 
 
 def sort_on_cpu(kernels: cells_cpu.Kernels, n: int) -> list[Launch | HugePages]:

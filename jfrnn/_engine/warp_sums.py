@@ -163,7 +163,7 @@ def _plan_sorting(variant: _SumVariant, shapes: Shapes, multiprocessors: int) ->
     # what sorts particles takes the arguments of a search that only counts
     more = dict.fromkeys(("capacity", "closed", "drop_self"), 0)
     stages = place_launches(kernels.stages(numbers["n"], numbers["m"], variant.own, multiprocessors))
-    return Plan(stages, numbers | more, ["idx", "count"])
+    return Plan(stages, numbers | more, ["idx", "count", "starts", "receivers"])
 
 
 def _numbers(variant: _SumVariant, term: TermText, shapes: Shapes) -> dict[str, int]:

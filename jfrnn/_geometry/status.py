@@ -122,21 +122,25 @@ def pairs_and_status(count: Given, status: Given) -> str:
 
 
 class NeighborOverflowError(RuntimeError):
-    """A neighbor list was too small; `required` is the capacity that holds every row.
+    """A neighbor list was too small; `required` is the capacity that holds every row, or of a flat list the total of all pairs.
 
     Attributes:
-        required: The largest number of neighbors of one row.
-        capacity: The slots per row that the list had.
+        required: The largest number of neighbors of one row, or the number of pairs.
+        capacity: The slots per row, or of all pairs, that the list had.
+        name: The argument that was too small, "capacity" or "total".
     """
 
-    def __init__(self, required: int, capacity: int) -> None:
+    def __init__(self, required: int, capacity: int, name: str = "capacity") -> None:
         self.required = required
         self.capacity = capacity
+        self.name = name
+        held, verb = ("there are", "search_edges") if name == "total" else ("one row has", "search")
+        held = f"{held} {required} {'pairs' if name == 'total' else 'neighbors'}"
         super().__init__(
-            f"capacity={capacity} is too small: one row has {required} neighbors. Search again with "
-            f"capacity={required} or more; called outside jax.jit without `capacity`, search counts first and cannot overflow."
+            f"{name}={capacity} is too small: {held}. Search again with {name}={required} or more; called outside jax.jit without "
+            f"`{name}`, {verb} counts first and cannot overflow."
         )
 
-    def __reduce__(self) -> tuple[type, tuple[int, int]]:
+    def __reduce__(self) -> tuple[type, tuple[int, int, str]]:
         """Return how to unpickle the error; by default only the message is pickled, which makes process pools hang."""
-        return type(self), (self.required, self.capacity)
+        return type(self), (self.required, self.capacity, self.name)

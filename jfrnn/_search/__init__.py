@@ -1,12 +1,14 @@
 """Searches and counts, the neighbor list, its geometry and its exports."""
 
 from jfrnn._search.chunks import run_chunk
+from jfrnn._search.edge_list import EdgeList
 from jfrnn._search.edges import flatten
 from jfrnn._search.exports import MOST_PAIRS, saturating_add
 from jfrnn._search.geometry import is_native, kept_list, kept_shifts, lattice_of_rows, norms
+from jfrnn._search.kept_search import ROWS_ARE_WHOLE
 from jfrnn._search.making import round_capacity
-from jfrnn._search.neighbor_list import ROWS_ARE_WHOLE, NeighborList
+from jfrnn._search.neighbor_list import NeighborList
 from jfrnn._search.problem import check_problem
 from jfrnn._search.reverse import MOST_SLOTS, Reverse, find_reverse
-from jfrnn._search.search import count, search
+from jfrnn._search.search import count, search, search_edges
 from jfrnn._search.verlet import has_moved_too_far, list_radius

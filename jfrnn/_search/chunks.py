@@ -9,16 +9,16 @@ from jax import Array
 from jax.core import Tracer
 
 from jfrnn._geometry import Box
-from jfrnn._search.neighbor_list import NeighborList
+from jfrnn._search.kept_search import Kept, KeptSearch
 from jfrnn._tracing import own_transfers
 
 State = TypeVar("State")
 
 
 def run_chunk(
-    chunk: Callable[[State, NeighborList], tuple[State, NeighborList]],
+    chunk: Callable[[State, Kept], tuple[State, Kept]],
     state: State,
-    nbrs: NeighborList,
+    nbrs: Kept,
     positions: Callable[[State], Array],
     *,
     queries: Callable[[State], Array] | None = None,
@@ -26,12 +26,12 @@ def run_chunk(
     box: Callable[[State], Box] | None = None,
     cutoff: Callable[[State], Array] | None = None,
     slack: float = 1.25,
-) -> tuple[State, NeighborList]:
+) -> tuple[State, Kept]:
     """Run a jitted chunk of steps; if its list overflowed, grow the list and replay the chunk from the same state.
 
-    A chunk whose list overflowed has missed pairs, so its results are discarded; it only reports how many slots were needed, and
-    whether a box needed more images. Each replay has at least that many slots, and more images, so the loop ends, or raises if no
-    capacity helps. Each run synchronizes with the host once.
+    A chunk whose list overflowed has missed pairs, so its results are discarded; it only reports how many slots, or edges of a flat
+    list, were needed, and whether a box needed more images. Each replay has at least that much room, and more images, so the loop
+    ends, or raises if no room helps. Each run synchronizes with the host once.
 
     Args:
         chunk: (state, nbrs) -> (state, nbrs), usually under `jax.jit`; it calls `nbrs.update` in every step, and must not donate
@@ -82,7 +82,7 @@ def run_chunk(
         nbrs = seen.grow(positions(state), slack=slack, **given)
 
 
-def _cutoffs_of(nbrs: NeighborList) -> Array | tuple[Array, Array] | None:
+def _cutoffs_of(nbrs: KeptSearch) -> Array | tuple[Array, Array] | None:
     """Return the cutoffs per particle of a list, in the form that `NeighborList.grow` takes."""
     if nbrs.radii is None:
         return None

@@ -1,5 +1,6 @@
 """The pairs of a list as the edges of a graph, sorted by receiver, with displacements that are differentiated by gathers."""
 
+import dataclasses
 import functools
 from typing import NamedTuple
 
@@ -7,12 +8,26 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._geometry import Batch, Box, Images, Status, given_shifts, translation
+from jfrnn._engine import flatten_slots
+from jfrnn._geometry import (
+    Batch,
+    Box,
+    Cutoff,
+    Images,
+    Radii,
+    Shifted,
+    Status,
+    forward_shifts,
+    given_shifts,
+    is_pair_of,
+    shift_pairs,
+    translation,
+)
 from jfrnn._search.exports import flat_pairs, row_offsets
-from jfrnn._search.geometry import lattice_of_rows, norms
+from jfrnn._search.geometry import ImagesMade, edge_shifts, lattice_of_rows, norms, pair_cutoff
 from jfrnn._search.reverse import Reverse
 from jfrnn._search.topology import Topology
-from jfrnn._tracing import compile_program
+from jfrnn._tracing import call_apart, compile_program
 
 
 class Edges(NamedTuple):
@@ -90,9 +105,17 @@ class Flat(NamedTuple):
     edges: Array
 
 
-def flatten(mask: Array, total: int) -> Flat:
-    """Put the set slots of a mask [m, capacity] one after another, in arrays of a static length."""
+def flatten(mask: Array, total: int, native: bool = False) -> Flat:
+    """Put the set slots of a mask [m, capacity] one after another, in arrays of a static length, by Warp's kernels if `native`."""
     m, capacity = mask.shape
+    if native:
+        offsets = row_offsets(jnp.sum(mask, axis=1, dtype=jnp.int32), capacity)
+        on_cpu, on_cuda = (functools.partial(flatten_slots, total=total, cuda=cuda) for cuda in (False, True))
+        rows, slots = lax.platform_dependent(mask, offsets[:-1], cpu=on_cpu, cuda=on_cuda)
+        real, edge = lax.iota(jnp.int32, total) < offsets[-1], lax.iota(jnp.int32, total)
+        at = jnp.where(real, slots, mask.size)
+        edges = jnp.full(mask.size, total, jnp.int32).at[at].set(edge, mode="drop", unique_indices=True)
+        return Flat(jnp.where(real, rows, m), jnp.where(real, slots, 0), offsets, edges)
     ranks = jnp.cumsum(mask, axis=1, dtype=jnp.int32)
     offsets = row_offsets(ranks[:, -1], capacity)
     edges = jnp.where(mask, jnp.minimum(offsets[:-1, None] + ranks - 1, total), total).reshape(-1)
@@ -101,13 +124,13 @@ def flatten(mask: Array, total: int) -> Flat:
     return Flat(rows, slots, offsets, edges)
 
 
-@functools.partial(compile_program, static_argnames=("sources", "total"))
-def flat_pairs_of(idx: Array, mask: Array, sources: int, total: int) -> tuple[Array, Array, Array, Array]:
+@functools.partial(compile_program, static_argnames=("sources", "total", "native"))
+def flat_pairs_of(idx: Array, mask: Array, sources: int, total: int, native: bool) -> tuple[Array, Array, Array, Array]:
     """Return what `flat_pairs` does, of the slots that are set in a mask [m, capacity], and their number."""
     if 0 in (*idx.shape, total):
         rows, indices, offsets = flat_pairs(idx, mask.sum(1, dtype=jnp.int32), sources, total)
         return rows, indices, offsets, offsets[-1]
-    flat = flatten(mask, total)
+    flat = flatten(mask, total, native)
     return flat.rows, jnp.where(flat.rows < len(idx), idx.reshape(-1)[flat.slots], sources), flat.offsets, flat.offsets[-1]
 
 
@@ -128,7 +151,7 @@ def flat_edges(
     from jfrnn._search.gathers import gather
 
     (m, capacity), dim = topology.idx.shape, sources.shape[1]
-    flat = flatten(mask, total)
+    flat = flatten(mask, total, topology.native)
     real = flat.rows < m
     senders = jnp.where(real, topology.idx.reshape(-1)[flat.slots], topology.sources)
     ends = _by_sender(topology, flat.edges, total), _by_row(flat.offsets, capacity, total)
@@ -148,6 +171,69 @@ def flat_edges(
     distance, displacement = (jnp.where(missing, jnp.nan, x) for x in (norms(displacement), displacement))
     status = status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
     return Edges(senders, flat.rows, displacement, shift, real, status, distance, flat.offsets[-1])
+
+
+@functools.partial(compile_program, static_argnames=("kind", "closed", "half"))
+def edges_of(
+    ends: tuple[Topology, Topology, Array],
+    status: Array,
+    images: ImagesMade,
+    sources: Array,
+    rows: Array,
+    box: Box | None,
+    batch: Batch | None,
+    cutoff: Cutoff | Radii | None,
+    kind: Images | None,
+    closed: bool,
+    half: bool,
+) -> Edges:
+    """Return the edges of a flat list: `ends` are its senders, its receivers and the number of pairs, true or missing some.
+
+    Without a cutoff, all of its pairs are edges.
+    """
+    from jfrnn._search.gathers import gather
+
+    by_sender, by_receiver, pair_count = ends
+    total, senders, receivers = len(by_sender.idx), by_sender.idx[:, 0], by_receiver.idx[:, 0]
+    missing, mask = pair_count > total, lax.iota(jnp.int32, total) < pair_count
+    at_senders, at_receivers = gather(sources, by_sender), gather(rows, by_receiver)
+    vectors, pairs, shift = at_senders - at_receivers, None, jnp.zeros((total, sources.shape[1]), jnp.int32)
+    if box is not None and kind is not None:
+        systems = None if batch is None else batch.of_queries.at[receivers].get(mode="clip")
+        lattice = lattice_of_rows(box, kind, np.dtype(sources.dtype), systems, by_sender.native)
+        shifts = edge_shifts(vectors, mask, (by_sender, by_receiver), images, (sources, rows), (box, batch), lattice)
+        if half and kind.basis is not None:  # as in padded lists
+            shifts = jnp.where((senders == receivers)[:, None, None], forward_shifts(shifts, kind), shifts)
+        shifts = jnp.where(mask[:, None, None], shifts, 0)
+        pairs = shift_pairs(vectors, shifts, lattice)
+        vectors, shift = pairs.vectors, given_shifts(shifts[:, 0], kind)
+    if cutoff is not None:
+        mask = mask & _are_close(by_sender, by_receiver, mask, sources, at_receivers, cutoff, closed, pairs)
+        shift = jnp.where(mask[:, None], shift, 0)
+    displacement = jnp.where(mask[:, None], vectors[:, 0], 0).astype(sources.dtype)
+    distance, displacement = (jnp.where(missing, jnp.nan, x) for x in (norms(displacement), displacement))
+    status = status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
+    held = pair_count if cutoff is None else jnp.where(missing, pair_count, jnp.sum(mask, dtype=jnp.int32))
+    return Edges(senders, receivers, displacement, shift, mask, status, distance, held)
+
+
+def _are_close(
+    by_sender: Topology,
+    by_receiver: Topology,
+    real: Array,
+    sources: Array,
+    at_receivers: Array,
+    given: Cutoff | Radii,
+    closed: bool,
+    pairs: Shifted | None,
+) -> Array:
+    """Say which edges are those of pairs that are closer than the cutoff, exactly, [total] bool."""
+    if isinstance(given, Radii) and given.queries is not None:
+        given = dataclasses.replace(given, queries=given.queries.at[by_receiver.idx[:, 0]].get(mode="clip"))
+    senders = jnp.where(real[:, None], by_sender.idx, 0)
+    fixed = lax.stop_gradient((at_receivers[:, 0], sources))
+    pairs = None if pairs is None else pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
+    return call_apart(is_pair_of, *fixed, senders, real[:, None], pair_cutoff(given, closed), pairs)[:, 0]
 
 
 def no_edges(mask: Array, sources: int, points: Array, status: Array, total: int) -> Edges:

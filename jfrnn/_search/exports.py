@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
+from jfrnn._engine import add_up
 from jfrnn._geometry import Status
 from jfrnn._tracing import compile_program
 
@@ -75,10 +76,7 @@ def pair_total(count: Array, capacity: int) -> Array:
 
 def row_offsets(count: Array, capacity: int) -> Array:
     """Return the start of each row and the end of the last, [m + 1] int32, saturating at the largest int32."""
-    used = jnp.minimum(count, capacity)
-    fits = count.shape[0] * capacity <= MOST_PAIRS
-    ends = jnp.cumsum(used, dtype=jnp.int32) if fits else lax.associative_scan(saturating_add, used)
-    return jnp.concatenate([jnp.zeros(1, jnp.int32), ends])
+    return add_up(jnp.minimum(count, capacity))
 
 
 @functools.partial(compile_program, static_argnames=("sources", "total"))

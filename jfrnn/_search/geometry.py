@@ -67,7 +67,8 @@ def lattice_of_rows(box: Box, kind: Images, dtype: np.dtype, systems: Array | No
 ImagesMade = tuple[ImageCodes | None, tuple[Array, Array | None] | None]  # and the positions at which a list with a skin was made
 
 
-def _pair_cutoff(cutoff: Cutoff | Radii | None, closed: bool) -> Cutoff | Cutoffs:
+def pair_cutoff(cutoff: Cutoff | Radii | None, closed: bool) -> Cutoff | Cutoffs:
+    """Return the cutoff of pairs, with the constants of its test."""
     if isinstance(cutoff, Cutoff):
         return cutoff
     if cutoff is None:
@@ -81,7 +82,7 @@ def open_vectors(
 ) -> tuple[Array, Array]:
     from jfrnn._search.gathers import gather
 
-    cutoff, idx = _pair_cutoff(given, closed), topology.idx
+    cutoff, idx = pair_cutoff(given, closed), topology.idx
     used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
     neighbor = jnp.where(used, idx, 0)
     fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
@@ -134,6 +135,27 @@ def _find_slots(
     return _Slots(used, neighbor, difference, jnp.where(used[..., None], shifts, 0))
 
 
+def edge_shifts(
+    difference: Array,
+    real: Array,
+    ends: tuple[Topology, Topology],
+    images: ImagesMade,
+    points: tuple[Array, Array],
+    where: tuple[Box, Batch | None],
+    lattice: Lattice,
+) -> Array:
+    """Return the lattice shifts [total, 1, d], whole floats, of edges between sources and rows, whose `lattice` is that of each."""
+    (codes, made), (sources, rows), (box, batch), kind = images, points, where, lattice.images
+    if codes is None:
+        return nearest_shifts(difference, lattice)
+    of_rows, of_sources = _lattices(box, kind, np.dtype(sources.dtype), batch, ends[0].native)
+    turns, query_turns = _turns_now(codes, made, sources, rows, of_rows, of_sources)
+    image = jnp.where(real, codes.codes.astype(jnp.int32), kind.home)
+    senders, receivers = (jnp.where(real, end.idx[:, 0], 0) for end in ends)
+    table = jnp.asarray(kind.shifts).astype(sources.dtype)
+    return (table[image] + query_turns[receivers] - turns[senders])[:, None]
+
+
 @functools.partial(compile_program, static_argnames=("kind", "half"))
 def lattice_shifts(
     topology: Topology,
@@ -172,7 +194,7 @@ def periodic_vectors(
     closed: bool,
     half: bool,
 ) -> tuple[Array, Array, Array]:
-    cutoff = _pair_cutoff(given, closed)
+    cutoff = pair_cutoff(given, closed)
     lattice, of_sources = _lattices(box, kind, np.dtype(sources.dtype), batch, topology.native)
     used, neighbor, difference, shifts = _find_slots(topology, count, images, sources, rows, lattice, half, of_sources)
     fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
@@ -206,7 +228,7 @@ def kept_list(
 ) -> KeptList:
     """Return a list at these positions as Warp's kernels take it."""
     codes, made = images
-    of_pairs = _pair_cutoff(cutoff, closed)
+    of_pairs = pair_cutoff(cutoff, closed)
     turns = None if codes is None or lattice is None else _turns_now(codes, made, sources, rows, lattice)
     fixed = lax.stop_gradient((sources, rows, turns, of_pairs, lattice))
     return KeptList(topology.idx, count, topology.codes, *fixed, topology.order, None)

@@ -7,11 +7,10 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._geometry import Box, NeighborOverflowError, Status, known_status
+from jfrnn._geometry import Box, NeighborOverflowError, Status
 from jfrnn._search.edges import flat_pairs_of
 from jfrnn._search.exports import DenseNeighbors, check_held, check_total, flat_pairs, pair_total
-from jfrnn._search.geometry import ImageCodes
-from jfrnn._search.kept_options import KeptOptions
+from jfrnn._search.kept_search import KeptSearch
 from jfrnn._tracing import at_once, own_transfers
 
 
@@ -23,14 +22,11 @@ class Present(TypedDict, total=False):
     box: Box | None
 
 
-class ListExports(KeptOptions):
+class ListExports(KeptSearch):
     """The rows of a neighbor list as pairs, compressed rows, graphs and lists of other libraries."""
 
     idx: Array
     count: Array
-    status: Array
-    required: Array
-    images: ImageCodes | None
 
     @property
     def capacity(self) -> int:
@@ -129,7 +125,7 @@ class ListExports(KeptOptions):
             self._check_total(total)
             return flat_pairs(self.idx, self.count, self.source_count, total)
         with own_transfers():
-            *made, held = flat_pairs_of(self.idx, near, self.source_count, total)
+            *made, held = flat_pairs_of(self.idx, near, self.source_count, total, self.problem.options.engine.translates)
         check_held(held, total)
         return made[0], made[1], made[2]
 
@@ -168,8 +164,7 @@ class ListExports(KeptOptions):
             raise ValueError(f"exports take one list at a time, got idx of shape {list(self.idx.shape)}: index the batch first.")
 
     def _check_known(self, spared: Status = Status.OK) -> None:
-        """Raise what status bits report, except the spared ones; a traced list is not checked."""
-        status = (known_status(self.status) or Status.OK) & ~spared
+        status = self._bits(spared)
         if Status.ROW_OVERFLOW in status:
             raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self.capacity)
         if Status.TOTAL_OVERFLOW in status:

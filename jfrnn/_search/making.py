@@ -6,9 +6,10 @@ from typing import Any
 
 from jax import lax
 
-from jfrnn._engine import Inputs, Options, count_rows, hide_inactive, list_rows, take_present
+from jfrnn._engine import Found, Inputs, Options, count_rows, hide_inactive, list_flat, list_rows, take_present
 from jfrnn._geometry import Radii
 from jfrnn._search.geometry import ImageCodes
+from jfrnn._search.reverse import find_reverse
 from jfrnn._search.topology import make_topology
 from jfrnn._search.verlet import first_verlet
 from jfrnn._tracing import at_once, compile_program, own_transfers
@@ -38,22 +39,30 @@ def find_fields(inputs: Inputs, options: Options, capacity: int, moving: bool, r
     As results of one program, they share no memory with the caller's arrays or each other, so either may be donated.
     """
     found = list_rows(inputs, options, capacity)
+    rows, fields = found.rows, _common_fields(inputs, found, moving)
+    fields |= {"idx": rows.idx, "count": rows.counts, "order": rows.order, "reverse": None}
+    if reversing and rows.idx is not None:
+        codes = None if fields["images"] is None else fields["images"].codes
+        own = len(inputs.sources), inputs.queries is not None, fields["radii"]
+        fields["reverse"] = make_topology(options, *own, rows.idx, codes, None, rows.order).with_reverse()
+    return fields
+
+
+@functools.partial(compile_program, static_argnames=("options", "total", "moving", "reversing"))
+def find_flat_fields(inputs: Inputs, options: Options, total: int, moving: bool, reversing: bool) -> dict[str, Any]:
+    """Do what `find_fields` does, for a flat list: the compiled program of `search_edges`."""
+    offsets, found = list_flat(inputs, options, total)
+    rows, fields = found.rows, _common_fields(inputs, found, moving)
+    fields |= {"senders": rows.idx, "receivers": rows.receivers, "offsets": offsets, "reverse": None}
+    if reversing and rows.idx is not None:
+        fields["reverse"] = find_reverse(rows.idx[:, None], None, 1, len(inputs.sources), False, options.engine.translates)
+    return fields
+
+
+def _common_fields(inputs: Inputs, found: Found, moving: bool) -> dict[str, Any]:
     rows, sources = found.rows, hide_inactive(inputs.sources, take_present(inputs).active)
     codes = None if found.images is None or found.turns is None else ImageCodes(found.images, *found.turns)
     radii = lax.stop_gradient(inputs.cutoff) if isinstance(inputs.cutoff, Radii) else None
     verlet = first_verlet(sources, inputs.queries, inputs.box, radii) if moving else None
-    fields: dict[str, Any] = {"idx": rows.idx, "count": rows.counts, "status": rows.status, "required": rows.required}
-    fields["order"] = rows.order
-    images = None if codes is None else codes.codes
-    fields["reverse"] = None
-    if reversing and rows.idx is not None:
-        topology = make_topology(options, sources.shape[0], inputs.queries is not None, radii, rows.idx, images, None, rows.order)
-        fields["reverse"] = topology.with_reverse()
-    return fields | {
-        "verlet": verlet,
-        "box": lax.stop_gradient(inputs.box),
-        "images": codes,
-        "radii": radii,
-        "batch": inputs.batch,
-        "exclude": inputs.exclude,
-    }
+    fields = {"status": rows.status, "required": rows.required, "verlet": verlet, "box": lax.stop_gradient(inputs.box)}
+    return fields | {"images": codes, "radii": radii, "batch": inputs.batch, "exclude": inputs.exclude}

@@ -1,12 +1,16 @@
-"""The public functions `search` and `count`."""
+"""The public functions `search`, `search_edges` and `count`."""
+
+import dataclasses
 
 import jax
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._engine import Inputs, Options, count_rows
+from jfrnn._engine import Inputs, count_rows
 from jfrnn._geometry import Box, check_capacity, check_flag, check_slack
-from jfrnn._search.making import count_capacity, find_fields
+from jfrnn._search.edge_list import EdgeList, count_total
+from jfrnn._search.exports import check_total
+from jfrnn._search.making import count_capacity, find_fields, find_flat_fields
 from jfrnn._search.neighbor_list import NeighborList
 from jfrnn._search.problem import check_problem
 from jfrnn._search.reverse import MOST_SLOTS
@@ -132,7 +136,8 @@ def search(
     )
     slack = check_slack(slack)
     if capacity is None:
-        capacity = _count_capacity(inputs, problem.options, slack)
+        _refuse_traced(inputs, "capacity", "capacity=int(jfrnn.count(positions, cutoff + skin).max())")
+        capacity = count_capacity(inputs, problem.options, slack)
     capacity, reverse = check_capacity(capacity), check_flag("reverse", reverse)
     rows = inputs.sources.shape[0] if inputs.queries is None else inputs.queries.shape[0]
     if reverse and rows * capacity > MOST_SLOTS:
@@ -140,6 +145,85 @@ def search(
     with own_transfers():
         fields = call_apart(lambda inputs: find_fields(inputs, problem.options, capacity, problem.skin > 0, reverse), inputs)
     return NeighborList(**fields, problem=problem)
+
+
+def search_edges(
+    positions: Array,
+    cutoff: float | Array | tuple[Array, Array],
+    *,
+    total: int | None = None,
+    queries: Array | None = None,
+    box: Box | None = None,
+    batch: Array | tuple[Array, Array] | None = None,
+    radius_rule: str = "gather",
+    species: Array | tuple[Array, Array] | None = None,
+    exclude: Array | None = None,
+    half: bool = False,
+    include_self: bool = False,
+    closed: bool = False,
+    skin: float = 0.0,
+    active: Array | None = None,
+    slack: float = 1.0,
+    reverse: bool = False,
+    backend: str = "auto",
+) -> EdgeList:
+    """Find every pair of particles closer than a cutoff, as edges one after another, sorted by receiver.
+
+    These are the pairs of `search`, in memory that follows their number: a particle with 5000 neighbors among others with 30 makes
+    no row longer. Neighbors are counted, the counts added up, and each pair is written to its place, in one program.
+
+    Args:
+        positions: As in `search`.
+        cutoff: As in `search`.
+        total: Number of edges that there is room for, a static int up to 2³¹ - 1. Required if positions are traced. Default:
+            `slack` times as many as there are pairs, rounded up by 6 % at most.
+        queries: As in `search`; the receivers are then queries.
+        box: As in `search`. Each image of a neighbor has an edge of its own.
+        batch: As in `search`.
+        radius_rule: As in `search`.
+        species: As in `search`.
+        exclude: As in `search`; `total` knows nothing of excluded pairs.
+        half: As in `search`.
+        include_self: As in `search`.
+        closed: As in `search`.
+        skin: As in `search`: the list holds pairs within cutoff + skin, of which `EdgeList.edges` masks those beyond the cutoff.
+        active: As in `search`.
+        slack: Factor >= 1 on the counted total, room for later motion.
+        reverse: Keep the edges in the order of their senders, 4 B each and 8 B per particle, so that derivatives need not sort them
+            in each call. `update` keeps it up to date.
+        backend: As in `search`.
+
+    Returns:
+        An `EdgeList`.
+
+    Raises:
+        TypeError, ValueError, ImportError, RuntimeError: as in `search`; ValueError: there are more than 2³¹ - 1 pairs.
+        Overflow of a given total and non-finite coordinates are known only from data: see `status`, `overflow` and `check`.
+
+    Memory: 8 B per edge and 4 B per receiver, with a batch, a skin or cutoffs per particle what `search` keeps for them, and the
+    scratch of a search. See `memory_plan`.
+    Differentiable: the list is topology, without gradient; see `EdgeList.edges`. Jit: yes, with total. vmap: yes, with total.
+
+    >>> import jax.numpy as jnp, jfrnn
+    >>> x = jnp.array([[0.0, 0.0], [0.3, 0.4], [2.0, 0.0]])
+    >>> nbrs = jfrnn.search_edges(x, 1.0, total=4)
+    >>> nbrs.receivers.tolist(), nbrs.senders.tolist()
+    ([0, 1, 3, 3], [1, 0, 3, 3])
+    >>> nbrs.edges(x).distance.tolist()
+    [0.5, 0.5, 0.0, 0.0]
+    """
+    problem, inputs = check_problem(
+        positions, cutoff, queries, box, batch, radius_rule, species, exclude, half, include_self, closed, backend, skin, active
+    )
+    problem = dataclasses.replace(problem, options=problem.options._replace(ordered=False))
+    slack, reverse = check_slack(slack), check_flag("reverse", reverse)
+    if total is None:
+        _refuse_traced(inputs, "total", "total=int(jfrnn.count(positions, cutoff + skin).sum())")
+        total = count_total(inputs, problem.options, slack)
+    total = check_total(total)
+    with own_transfers():
+        fields = call_apart(lambda inputs: find_flat_fields(inputs, problem.options, total, problem.skin > 0, reverse), inputs)
+    return EdgeList(**fields, problem=problem)
 
 
 def count(
@@ -175,11 +259,9 @@ def count(
         return call_apart(lambda inputs: count_rows(inputs, problem.options)[0], inputs)
 
 
-def _count_capacity(inputs: Inputs, options: Options, slack: float) -> int:
+def _refuse_traced(inputs: Inputs, name: str, how: str) -> None:
     if any(isinstance(x, Tracer) for x in jax.tree.leaves(inputs)):
         raise ValueError(
-            "capacity must be given where positions are traced (jax.jit, vmap, grad, scan), because it is a shape: pass "
-            "capacity=int(jfrnn.count(positions, cutoff + skin).max()) of concrete positions, with room to move, or the capacity "
-            "of an earlier search, and check nbrs.overflow."
+            f"{name} must be given where positions are traced (jax.jit, vmap, grad, scan), because it is a shape: pass {how} of "
+            f"concrete positions, with room to move, or the {name} of an earlier search, and check nbrs.overflow."
         )
-    return count_capacity(inputs, options, slack)

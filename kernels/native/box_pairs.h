@@ -11,8 +11,8 @@
 
 struct BoxArguments {
     const real *positions, *queries, *boxes, *axes, *asked;
-    const int *ids, *order, *visits, *cells, *start, *excluded_starts, *excluded;
-    int *idx, *count, *info;
+    const int *ids, *order, *visits, *cells, *start, *excluded_starts, *excluded, *starts;
+    int *idx, *receivers, *count, *info;
     int n, m, stride, own, capacity, closed, drop_self, later_only;
 };
 

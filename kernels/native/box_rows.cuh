@@ -4,20 +4,23 @@
 // particles and many images, each lane those of its own. Queries of a warp walk together, as long as any of them has something left.
 #pragma once
 #include "box_pairs.h"
+#include "row_places.h"
 
 struct BoxRows : BoxPairs {
     static constexpr unsigned int EVERY = 0xffffffffu, OF_QUERY = EVERY >> (32 - LANES_PER_ROW);
     const int lane, first_lane;  // among those of its query, and the first of them in the warp
     int found;                   // of the query if they are listed, by this lane if they are counted
+    int room;                    // of its row
 
     JFRNN_MEMBER explicit BoxRows(const BoxArguments& given)
-        : BoxPairs(given), lane(threadIdx.x % LANES_PER_ROW), first_lane((threadIdx.x & 31) - lane), found(0) {}
+        : BoxPairs(given), lane(threadIdx.x % LANES_PER_ROW), first_lane((threadIdx.x & 31) - lane), found(0), room(0) {}
 
     JFRNN_MEMBER void run() {
         const long long turn = thread_index() / LANES_PER_ROW;
         const bool is_query = turn < m;
         go_to(is_query ? (int)turn : 0);
         runs = is_query ? runs : 0;
+        room = row_room(starts, query, capacity);
         for (int r = 0; __any_sync(EVERY, r < runs); r += LANES_PER_ROW) {
             BoxRun mine{0, 0, 0, {0, 0, 0}};
             if (r + lane < runs)
@@ -32,8 +35,8 @@ struct BoxRows : BoxPairs {
         const int all = LIST ? found : sum_of(found);
         if (!is_query)
             return;
-        for (int s = all + lane; LIST && s < capacity; s += LANES_PER_ROW)
-            idx[(long long)query * capacity + s] = fill_value();
+        for (int s = all + lane; LIST && s < room; s += LANES_PER_ROW)
+            idx[row_begin(starts, query, capacity) + s] = fill_value();
         if (lane > 0)
             return;
         count[query] = all;
@@ -96,8 +99,8 @@ struct BoxRows : BoxPairs {
         }
         const unsigned int hits = of_query(__ballot_sync(EVERY, hit));
         const int slot = found + __popc(hits & ((1u << lane) - 1));
-        if (hit && slot < capacity)
-            idx[(long long)query * capacity + slot] = name_of(source, run.code);
+        if (hit && slot < room)
+            write_slot(idx, receivers, row_begin(starts, query, capacity) + slot, name_of(source, run.code), query);
         found += __popc(hits);
     }
 };

@@ -2,6 +2,7 @@
 #pragma once
 #include "box_pairs.h"
 #include "lanes.h"
+#include "row_places.h"
 
 struct BoxRows : BoxPairs {
     explicit BoxRows(const BoxArguments& given) : BoxPairs(given) {}
@@ -25,19 +26,22 @@ struct BoxRows : BoxPairs {
             known < longest && !__atomic_compare_exchange_n(&info[0], &known, longest, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
     }
     int serve() const {
-        int* const row = idx + (LIST ? (long long)query * capacity : 0);
+        const long long begin = LIST ? row_begin(starts, query, capacity) : 0;
+        const int room = row_room(starts, query, capacity);
         int found = 0;
         for (int r = 0; r < runs; ++r) {
             const BoxRun run = run_at(r);
             for (int b = 0; b < run.size; b += LANES)
-                found += meet(run, b, row, found);
+                found += meet(run, b, idx + begin + found, room - found);
         }
-        for (int s = found; LIST && s < capacity; ++s)
-            row[s] = fill_value();
+        for (int s = found; LIST && !FLAT && s < room; ++s)
+            idx[begin + s] = fill_value();
+        for (int s = 0; FLAT && s < room; ++s)
+            receivers[begin + s] = query;
         return found;
     }
-    // Meets the sources of a run from number b on; those that are neighbors go into the row behind `found` others.
-    int meet(const BoxRun& run, int b, int* row, int found) const {
+    // Meets the sources of a run from number b on; those that are neighbors go to `to`, where there is `room`.
+    int meet(const BoxRun& run, int b, int* to, int room) const {
         const int at = run.from + b;
         vec square{};
         for (int k = 0; k < DIM; ++k) {
@@ -65,7 +69,7 @@ struct BoxRows : BoxPairs {
             if (mine.has(sources[__builtin_ctz(rest)]))
                 pairs &= ~(rest & -rest);
         if (LIST && pairs)
-            pack_within(sources + name_of(0, run.code), row + found, pairs, capacity - found);
+            pack_within(sources + name_of(0, run.code), to, pairs, room);
         return __builtin_popcount(pairs);
     }
 };

@@ -6,8 +6,8 @@
 
 struct SearchArguments {
     const real *positions, *queries, *cutoff;
-    const int *excluded_starts, *excluded;
-    int *idx, *count, *info, *scratch;
+    const int *excluded_starts, *excluded, *starts;
+    int *idx, *receivers, *count, *info, *scratch;
     int n, m, own, table, capacity, closed, drop_self, of_queries;
 };
 struct Shared {

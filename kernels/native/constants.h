@@ -19,6 +19,7 @@ constexpr int FEW = 384;               // sources up to which all are candidates
 constexpr int MANY = 1 << 15;          // sources from which several threads gather their coordinates
 constexpr int CANDIDATES = 1024;       // that are held at a time, a multiple of 64
 constexpr bool LIST = true;            // ids of neighbors are written, they are not only counted
+constexpr bool FLAT = false;           // rows of a list are as long as they need to be (row_places.h)
 constexpr int SUMS = 0;                // 1: summands are added up, 2: the largest ones are found
 constexpr bool EXCLUDING = false;      // queries exclude sources
 constexpr bool ONE_BY_ONE = false;     // candidates are met one by one

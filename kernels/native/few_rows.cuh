@@ -2,11 +2,12 @@
 // queries, and the bits of their status. Nothing has to be cleared before.
 #pragma once
 #include "few.cuh"
+#include "row_places.h"
 
 struct FewRowsArguments {
     const real *positions, *queries, *cutoff;
-    const int *excluded_starts, *excluded;
-    int *idx, *count, *info;
+    const int *excluded_starts, *excluded, *starts;
+    int *idx, *receivers, *count, *info;
     int n, m, capacity, closed, drop_self, later_only;
 };
 
@@ -30,11 +31,11 @@ struct FewRows : FewRowsArguments {
         const int id = blockIdx.x * FEW_WARPS + pairs.warp;
         if (pairs.lane == 0 && id < m)
             count[id] = all;
-        for (int slot = all + pairs.lane; LIST && id < m && slot < capacity; slot += 32)
+        for (int slot = all + pairs.lane; LIST && !FLAT && id < m && slot < capacity; slot += 32)
             idx[(long long)id * capacity + slot] = n;
         __syncthreads();
         if (LIST && found > 0)
-            write(pairs, near, idx + (long long)pairs.query * capacity, counted[pairs.slot][pairs.share]);
+            write(pairs, near, counted[pairs.slot][pairs.share]);
         if (pairs.warp == 0)
             tell(pairs.lane, pairs.lane < FEW_WARPS ? counted[pairs.lane % FEW_WARPS][SHARES] : 0, not_finite);
     }
@@ -46,10 +47,12 @@ struct FewRows : FewRowsArguments {
         }
         return number;
     }
-    JFRNN_MEMBER void write(const FewPairs& pairs, const FewPairs::Bits32* near, int* row, int slot) const {
+    JFRNN_MEMBER void write(const FewPairs& pairs, const FewPairs::Bits32* near, int slot) const {
+        const long long begin = row_begin(starts, pairs.query, capacity);
+        const int room = row_room(starts, pairs.query, capacity);
         for (int k = 0; k < pairs.words; ++k)
-            for (unsigned int rest = near[k][threadIdx.x]; rest && slot < capacity; rest &= rest - 1)
-                row[slot++] = pairs.first_of(k) + __ffs(rest) - 1;
+            for (unsigned int rest = near[k][threadIdx.x]; rest && slot < room; rest &= rest - 1)
+                write_slot(idx, receivers, begin + slot++, pairs.first_of(k) + __ffs(rest) - 1, pairs.query);
     }
     // Writes the row of `info` of this block.
     JFRNN_MEMBER void tell(int lane, int longest, bool not_finite) const {
@@ -60,6 +63,6 @@ struct FewRows : FewRowsArguments {
         if (lane > 0)
             return;
         info[2 * blockIdx.x] = longest;
-        info[2 * blockIdx.x + 1] = (not_finite ? 2 : 0) | (LIST && longest > capacity ? 1 : 0);
+        info[2 * blockIdx.x + 1] = (not_finite ? 2 : 0) | (LIST && !FLAT && longest > capacity ? 1 : 0);
     }
 };

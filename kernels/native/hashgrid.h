@@ -3,12 +3,14 @@
 // On CUDA a thread serves a query, on the CPU they are served one after the other. `info` is zeros at first.
 #pragma once
 #include "exact.h"
+#include "row_places.h"
 #include "warp_types.h"
 #include "warp_hashgrid.h"
 
 struct HashGridArguments {
     const real *positions, *queries, *cutoff;
-    int *idx, *count, *info;
+    const int* starts;
+    int *idx, *receivers, *count, *info;
     real* scratch;    // the points of which the grid is built, three numbers each
     const int* grid;  // what Warp calls its id
     int n, m, capacity, own, closed, drop_self, later_only;
@@ -43,10 +45,10 @@ struct HashGridSearch : HashGridArguments, Space {
             const real* q = queries + (long long)DIM * i;
             const bool finite = finite_point(q);
             const int found = finite ? meet_candidates(i, q) : 0;
-            for (int slot = found; LIST && slot < capacity; ++slot)
-                idx[(long long)capacity * i + slot] = n;
+            for (int slot = found; LIST && slot < row_room(starts, i, capacity); ++slot)
+                idx[row_begin(starts, i, capacity) + slot] = n;
             count[i] = found;
-            tell(found, (finite ? 0 : 2) | (LIST && found > capacity ? 1 : 0));
+            tell(found, (finite ? 0 : 2) | (LIST && !FLAT && found > capacity ? 1 : 0));
         });
     }
     // Writes down the neighbors of a query as far as its row goes, and returns how many there are.
@@ -57,8 +59,8 @@ struct HashGridSearch : HashGridArguments, Space {
         for (int j = 0; wp::hash_grid_query_next(candidates, j);) {
             if ((drop_self && j == i) || (later_only && j < i) || !is_pair(q, positions + (long long)DIM * j))
                 continue;
-            if (LIST && found < capacity)
-                idx[(long long)capacity * i + found] = j;
+            if (LIST && found < row_room(starts, i, capacity))
+                write_slot(idx, receivers, row_begin(starts, i, capacity) + found, j, i);
             ++found;
         }
         return found;

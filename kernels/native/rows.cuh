@@ -1,6 +1,7 @@
 // Rows of neighbors, or their counts, on CUDA.
 #pragma once
 #include "held.cuh"
+#include "row_places.h"
 #include "walk.cuh"
 
 // The neighbors of a query on their way into its row: their ids are numbered by their addresses, up to LISTED at a time.
@@ -56,11 +57,17 @@ struct RowList {
     }
 };
 
+// Where the row of a query begins, if rows are those of a flat list, and how many slots it has.
+struct RowPlace {
+    int id, begin, room;
+};
+
 struct Rows : Walk<Rows> {
+    static constexpr int STEP = FLAT ? 8 : 1;  // between slots that a lane writes: those of a flat list one by one
     JFRNN_MEMBER explicit Rows(const SearchArguments& given) : Walk(given) {}
     JFRNN_MEMBER void open(int) {}
     JFRNN_MEMBER void none(int id) {
-        if (LIST)
+        if (LIST && !FLAT)
             for (int s = lane; s < capacity; s += 32)
                 idx[(long long)id * capacity + s] = fill_value();
         if (lane == 0)
@@ -72,7 +79,7 @@ struct Rows : Walk<Rows> {
         const int longest_row = __reduce_max_sync(ALL, lane < group.size ? found : 0);
         if (lane == 0 && longest_row > shared_known().longest_before) {
             atomicMax(&info[0], longest_row);
-            if (LIST && longest_row > capacity)
+            if (LIST && !FLAT && longest_row > capacity)
                 atomicOr(&info[1], 1);
         }
     }
@@ -84,6 +91,9 @@ struct Rows : Walk<Rows> {
         if (finished)
             warp.ids[pairs.tested + lane] = fill_value();
         RowList row(lane);
+        const bool is_query = lane < group.size;
+        const RowPlace place{group.my_id, FLAT && is_query ? starts[group.my_id] : 0,
+            FLAT && !is_query ? 0 : row_room(starts, group.my_id, capacity)};
         __syncwarp();
         HeldPairs held(pairs, lane);
         const unsigned int last_ids = finished ? 1 : held.words + held.to_ids + 4 * pairs.tested;
@@ -91,26 +101,26 @@ struct Rows : Walk<Rows> {
         for (bool more = true; more;) {
             row.number(held, last_ids);
             const unsigned int ready = row.waiting >= LISTED ? LISTED : held.ids == last_ids ? row.waiting & ~3u : 0;
-            const int before = lane < group.size && ready > 0 ? row.written : capacity;
+            const int before = is_query && ready > 0 ? row.written : place.room;
             __syncwarp();
-            write(before, group.my_id);
+            write(before, place);
             __syncwarp();
             row.advance(ready);
-            more = __any_sync(ALL, finished ? lane < group.size && row.written < capacity : held.ids != last_ids);
+            more = __any_sync(ALL, finished ? is_query && row.written < place.room : held.ids != last_ids);
         }
         if (!finished)
             row.leave(lane);
     }
     // Writes what waits for the rows behind the first `before` slots of each: eight lanes write one row, and maybe more than waits,
     // that will be written again.
-    JFRNN_MEMBER void write(int before, int my_id) {
-        if ((capacity & 3) == 0) {  // only then rows begin where 16 bytes may be stored at once
+    JFRNN_MEMBER void write(int before, const RowPlace& mine) {
+        if (!FLAT && (capacity & 3) == 0) {  // only then rows begin where 16 bytes may be stored at once
 #pragma unroll
             for (int k = 0; k < 32; k += 4) {
-                int room;
-                int* const out = slots_of(k + lane / 8, before, my_id, room);
+                RowPlace left;
+                int* const out = slots_of(k + lane / 8, before, mine, left);
                 const int4 four = load_four(k + lane / 8);
-                if (room > 0)
+                if (left.room > 0)
                     asm volatile("st.global.v4.s32 [%0], {%1, %2, %3, %4};"
                         :
                         : "l"(out), "r"(four.x), "r"(four.y), "r"(four.z), "r"(four.w)
@@ -119,35 +129,39 @@ struct Rows : Walk<Rows> {
         } else {
 #pragma unroll 1
             for (int k = 0; k < 32; k += 4) {
-                int room;
-                int* const out = slots_of(k + lane / 8, before, my_id, room);
+                RowPlace left;
+                const long long out = slots_of(k + lane / 8, before, mine, left) - idx;
                 const int4 four = load_four(k + lane / 8);
-                if (room > 0)
-                    out[0] = four.x;
-                if (room > 1)
-                    out[1] = four.y;
-                if (room > 2)
-                    out[2] = four.z;
-                if (room > 3)
-                    out[3] = four.w;
+                if (left.room > 0)
+                    write_slot(idx, receivers, out, four.x, left.id);
+                if (left.room > STEP)
+                    write_slot(idx, receivers, out + STEP, four.y, left.id);
+                if (left.room > 2 * STEP)
+                    write_slot(idx, receivers, out + 2 * STEP, four.z, left.id);
+                if (left.room > 3 * STEP)
+                    write_slot(idx, receivers, out + 3 * STEP, four.w, left.id);
             }
         }
     }
     // Loads the four ids of a row that this lane writes.
     JFRNN_MEMBER int4 load_four(int row) const {
-        const unsigned short* const from = (const unsigned short*)shared_warp().lists[row] + lane % 8 * 4;
-        const int4 four = make_int4(load_id(from[0]), load_id(from[1]), load_id(from[2]), load_id(from[3]));
+        const unsigned short* const from = (const unsigned short*)shared_warp().lists[row] + first_of_lane();
+        const int4 four = make_int4(load_id(from[0]), load_id(from[STEP]), load_id(from[2 * STEP]), load_id(from[3 * STEP]));
         if constexpr (IDS == 1)
             return make_int4(source_of(four.x), source_of(four.y), source_of(four.z), source_of(four.w));
         else
             return four;
     }
-    // Returns where this lane writes to in a row, of which `before` slots are written, and how much room there is.
-    JFRNN_MEMBER int* slots_of(int row, int before, int my_id, int& room) const {
-        const unsigned int row_before = __shfl_sync(ALL, before, row), row_id = __shfl_sync(ALL, my_id, row);
-        room = capacity - lane % 8 * 4 - (int)row_before;
+    JFRNN_MEMBER int first_of_lane() const { return FLAT ? lane % 8 : lane % 8 * 4; }
+    // Returns where this lane writes to in a row, of which `before` slots are written; `left` becomes that row with the room there is.
+    JFRNN_MEMBER int* slots_of(int row, int before, const RowPlace& mine, RowPlace& left) const {
+        const unsigned int row_before = __shfl_sync(ALL, before, row), row_id = __shfl_sync(ALL, mine.id, row);
+        left.id = (int)row_id;
+        left.room = (FLAT ? __shfl_sync(ALL, mine.room, row) : capacity) - first_of_lane() - (int)row_before;
+        int* const column = idx + first_of_lane();
+        if constexpr (FLAT)
+            return column + (long long)__shfl_sync(ALL, mine.begin, row) + row_before;
         const unsigned int row_bytes = 4u * (unsigned int)capacity;
-        char* const column = (char*)(idx + lane % 8 * 4);
-        return (int*)(column + (unsigned long long)row_id * row_bytes + (unsigned long long)row_before * 4);
+        return (int*)((char*)column + (unsigned long long)row_id * row_bytes + (unsigned long long)row_before * 4);
     }
 };

@@ -1,19 +1,21 @@
 // Rows of neighbors, or their counts, on the CPU.
 #pragma once
+#include "row_places.h"
 #include "walk_cpu.h"
 
 typedef int eight_ints __attribute__((vector_size(32)));
 
 struct RowArguments {
     const real *positions, *queries, *cutoff;
-    const int *excluded_starts, *excluded;
-    int *idx, *count, *info, *scratch;
+    const int *excluded_starts, *excluded, *starts;
+    int *idx, *receivers, *count, *info, *scratch;
     int n, m, own, table, capacity, closed, drop_self, later_only;
 };
 
 struct Rows : Walk<Rows> {
     static constexpr bool FLUSHED = false;
-    int *idx, *counts, *info;
+    const int* starts;
+    int *idx, *receivers, *counts, *info;
     int capacity, later_only;
     int longest;
     int fill_value;
@@ -22,7 +24,9 @@ struct Rows : Walk<Rows> {
     explicit Rows(const RowArguments& a)
         : Walk({a.positions, a.queries, a.cutoff, a.excluded_starts, a.excluded, a.scratch, a.n, a.m, a.own, a.table, a.closed,
               a.drop_self}),
+          starts(a.starts),
           idx(a.idx),
+          receivers(a.receivers),
           counts(a.count),
           info(a.info),
           capacity(a.capacity),
@@ -38,7 +42,7 @@ struct Rows : Walk<Rows> {
     void meet(const real* q, int id, bool fresh, bool finished) {
         const int before = fresh ? 0 : counts[id];
         int hits;
-        if (LIST && !past_caches) {
+        if (LIST && !FLAT && !past_caches) {
             int* const out = idx + (long long)id * capacity;
             if (fresh)
                 fill(out);
@@ -62,7 +66,7 @@ struct Rows : Walk<Rows> {
         int known = __atomic_load_n(&info[0], __ATOMIC_RELAXED);
         while (
             known < longest && !__atomic_compare_exchange_n(&info[0], &known, longest, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
-        if (LIST && longest > capacity)
+        if (LIST && !FLAT && longest > capacity)
             __atomic_fetch_or(&info[1], 1, __ATOMIC_RELAXED);
     }
 
@@ -82,15 +86,16 @@ struct Rows : Walk<Rows> {
 
     // Writes `hits` ids from `row` into the slots of a row from `from` on, and behind the last ones the fill value.
     void write_row(int id, int from, int hits, bool last) {
-        int* out = idx + (long long)id * capacity;
-        const int stop = from + hits < capacity ? from + hits : capacity;
-        if (from == 0 && last && (capacity & 7) == 0 && ((unsigned long long)idx & 31) == 0) {
+        const long long begin = row_begin(starts, id, capacity);
+        int* const out = idx + begin;
+        const int room = row_room(starts, id, capacity), stop = from + hits < room ? from + hits : room;
+        if (!FLAT && from == 0 && last && (capacity & 7) == 0 && ((unsigned long long)idx & 31) == 0) {
             past_caches ? write_whole_row<true>(out, stop) : write_whole_row<false>(out, stop);
             return;
         }
         for (int s = from; s < stop; ++s)
-            out[s] = row[s - from];
-        if (last)
+            write_slot(idx, receivers, begin + s, row[s - from], id);
+        if (!FLAT && last)
             for (int s = stop; s < capacity; ++s)
                 out[s] = fill_value;
     }

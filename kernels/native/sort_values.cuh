@@ -11,8 +11,8 @@ struct SumsArguments {
 
     // Of a search nothing is written but scratch.
     JFRNN_MEMBER SearchArguments of_search() const {
-        return {positions, queries, cutoff, excluded_starts, excluded, nullptr, nullptr, info, scratch, n, m, own, table, 0, closed,
-            drop_self, 0};
+        return {positions, queries, cutoff, excluded_starts, excluded, nullptr, nullptr, nullptr, nullptr, info, scratch, n, m, own,
+            table, 0, closed, drop_self, 0};
     }
 };
 

@@ -1,0 +1,212 @@
+"""A flat list: the pairs of a search one after another, sorted by receiver, as long as all of them together."""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jfrnn._engine import Inputs, Options, count_rows
+from jfrnn._geometry import Batch, Box, Exclusions, NeighborOverflowError, Radii, Status, pairs_and_status
+from jfrnn._search.edges import Edges, Graph, edges_of, make_graph, no_edges
+from jfrnn._search.exports import MOST_PAIRS
+from jfrnn._search.geometry import ImageCodes
+from jfrnn._search.kept_search import KeptSearch
+from jfrnn._search.making import find_flat_fields
+from jfrnn._search.problem import Problem
+from jfrnn._search.reverse import Reverse
+from jfrnn._search.topology import Topology
+from jfrnn._search.verlet import Verlet
+from jfrnn._tracing import at_once, own_transfers
+
+_TOTAL_STEP = 16  # steps between powers of two, in which totals are rounded up
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class EdgeList(KeptSearch):
+    """The pairs (i, j) of m queries and n sources as edges from j to i, sorted by i; `search_edges` makes it. A pytree.
+
+    Memory follows the number of pairs: 8 B each, and 4 B per query, however many neighbors the fullest one has.
+
+    Attributes:
+        senders: Neighbors j, shape [total], int32; n beyond the last pair.
+        receivers: Particles (or queries) i in ascending order, shape [total], int32; m beyond the last pair.
+        offsets: Where the edges of each receiver begin, and those of the last one end, shape [m + 1], int32, if all pairs had
+            room. With a skin, edges include pairs within cutoff + skin when the list was last rebuilt.
+        status: Bits of `Status`, shape [], int32.
+        required: The `total` that holds all pairs, shape [], int32; like the status, over all updates.
+        verlet: As in `NeighborList`, and so are box, radii, batch and problem.
+        box: The periodic box, rounded to the dtype of the positions; None in open space.
+        images: The periodic image of each edge (`ImageCodes`), 1 B each; None if the minimum image suffices.
+        radii: Cutoffs per particle, or None with one cutoff.
+        batch: System numbers, or None.
+        exclude: Pairs that are excluded, as rows (`Exclusions`), or None; updates keep them.
+        reverse: The edges of each sender (`Reverse`), if the list was made with `reverse=True`.
+        problem: The options of the search (`Problem`). Static.
+    """
+
+    senders: Array
+    receivers: Array
+    offsets: Array
+    status: Array
+    required: Array
+    verlet: Verlet | None
+    box: Box | None
+    images: ImageCodes | None
+    radii: Radii | None
+    batch: Batch | None
+    exclude: Exclusions | None
+    reverse: Reverse | None
+    problem: Problem = dataclasses.field(metadata={"static": True})
+    _full = Status.TOTAL_OVERFLOW
+
+    def __repr__(self) -> str:
+        """Summarize the list in a line; waits for the device."""
+        *batch, total = (None,) if not hasattr(self.senders, "shape") else self.senders.shape
+        rows = f"{self.source_count} particles" if not batch else f"batch of {batch}, {self.source_count} particles"
+        kinds = self.radii is not None and self.radii.table is not None
+        reach = f"per {'pair of species' if kinds else 'particle'}" if self.cutoff is None else f"{self.cutoff:.6g}"
+        skin = f", skin {self.skin:.6g}" if self.skin else ""
+        rest = pairs_and_status(self.offsets[..., -1], self.status)
+        return f"EdgeList({rows}, total {total}, cutoff {reach}{skin}, engine {self.backend!r}, {rest})"
+
+    @property
+    def total(self) -> int:
+        """Edges that there is room for."""
+        return self.senders.shape[-1]
+
+    @property
+    def pair_count(self) -> Array:
+        """The true number of pairs, shape [], int32, at most 2³¹ - 1; it may exceed `total`."""
+        with own_transfers():
+            return self.offsets[..., -1]
+
+    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Export the pairs (i, j) to the host, without padding: receivers and senders, int32, shape [pairs] each.
+
+        Raises:
+            NeighborOverflowError, ValueError, TypeError: as `check`.
+        """
+        self.check()
+        self._check_single()
+        with own_transfers():
+            held = int(self.offsets[-1])
+            return np.asarray(self.receivers)[:held], np.asarray(self.senders)[:held]
+
+    def edges(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> Edges:
+        """Return the edges with their geometry at these positions.
+
+        `jax.ops.segment_sum(messages, edges.receivers, m, indices_are_sorted=True)` sums messages for the receivers; `messages` of
+        edges outside the mask should be 0. Without a skin, edges are the pairs of the list, whose positions these should be. With
+        one, those whose pair is not closer than the cutoff at these positions, exactly, are masked where they stand.
+
+        Args:
+            positions: Sources [length], shape [n, d], where they are now.
+            queries: Queries [length], shape [m, d], exactly if the list was made with queries.
+            box: The present box; default: that of the list, as a constant in derivatives.
+
+        Returns:
+            An `Edges`. Inside jit, all displacements are NaN if pairs are missing, and `status` and `pair_count` say so.
+
+        Raises:
+            ValueError, TypeError: an argument does not fit the list.
+            NeighborOverflowError, ValueError: outside jit, pairs may be missing (`check`); inside, read `status`. Particles that
+                are not finite have no pairs, which is no error here.
+
+        Differentiable: displacements and distances, to any order in positions, queries and box; derivatives gather and do not
+        scatter, in the order of senders, which is found in each call unless the list was made with `reverse=True`. Jit: yes. vmap:
+        yes.
+        """
+        self._check_single()
+        sources, rows = self._geometry_inputs(positions, queries)
+        self._check_known(spared=Status.NONFINITE)
+        box = self._box_now(box, sources)
+        with own_transfers():
+            if 0 in (sources.shape[0], len(rows), self.total):
+                return no_edges(jnp.zeros((len(rows), 1), bool), self.source_count, sources, self.status, self.total)
+            codes = None if self.images is None else self.images.codes
+            by_sender = self._side(self.senders, codes, self.reverse, self.source_count)
+            held = jnp.minimum(self.offsets, self.total)
+            reverse = Reverse(lax.iota(jnp.int32, self.total), held[:-1], jnp.diff(held))
+            by_receiver = self._side(self.receivers, None, reverse, len(rows))
+            where = sources, rows, box, self.batch
+            kind = self.box_kind if box is not None else None
+            cutoff = self._cutoff_of_pairs() if self.skin else None
+            ends = by_sender, by_receiver, self.offsets[-1]
+            return edges_of(ends, self.status, self._images_made(), *where, cutoff, kind, self.closed, self.half)
+
+    def to_jraph(self, positions: Array, *, box: Box | None = None) -> Graph:
+        """Return the edges as a graph of jraph, as `NeighborList.to_jraph` does; jraph need not be installed.
+
+        Raises:
+            ValueError: the list has queries, which are no nodes, or a skin, whose pairs are no edges.
+            NeighborOverflowError, ValueError, TypeError: as `edges`.
+
+        Differentiable: as `edges`, also the positions of nodes. Jit: yes. vmap: yes.
+        """
+        if self.own_queries:
+            raise ValueError("to_jraph() makes particles the nodes of a graph, and this list has queries: take `edges`.")
+        if self.skin:
+            raise ValueError("to_jraph() cannot leave pairs of a skin out of the midst: take `edges`, whose mask does, or no skin.")
+        return make_graph(self.edges(positions, box=box), self._geometry_inputs(positions, None)[0])
+
+    @property
+    def _room(self) -> int:
+        return self.total
+
+    @property
+    def _row_count(self) -> int:
+        return self.offsets.shape[-1] - 1
+
+    def _room_for(self, needed: int) -> int:
+        return round_total(needed)
+
+    def _count_room(self, inputs: Inputs, options: Options, slack: float) -> int:
+        return count_total(inputs, options, slack)
+
+    def _find(self, inputs: Inputs, room: int) -> dict[str, Any]:
+        return find_flat_fields(inputs, self.problem.options, room, self.skin > 0, self.reverse is not None)
+
+    def _side(self, named: Array, codes: Array | None, reverse: Reverse | None, points: int) -> Topology:
+        """Return the particles at one end of the edges, as a list of one slot per edge."""
+        kind = self.problem.options
+        images = 1 if codes is None or kind.images is None else kind.images.total
+        codes = None if codes is None else codes[:, None]
+        return Topology(named[:, None], codes, reverse, None, points, images, False, kind.engine.translates)
+
+    def _check_single(self) -> None:
+        if self.senders.ndim != 1:
+            raise ValueError(f"take one list at a time, got senders of shape {list(self.senders.shape)}: index the batch first.")
+
+    def _check_known(self, spared: Status = Status.OK) -> None:
+        status = self._bits(spared)
+        if Status.TOTAL_OVERFLOW in status:
+            raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self.total, "total")
+        if status:
+            raise ValueError(status.message)
+
+
+def round_total(pairs: int) -> int:
+    """Round a total up, by 6 % at most, so that similar scenes share one compiled program."""
+    step = max(1 << max(pairs - 1, 1).bit_length() - 1, _TOTAL_STEP) // _TOTAL_STEP
+    return min(-(-max(pairs, 1) // step) * step, MOST_PAIRS)
+
+
+def count_total(inputs: Inputs, options: Options, slack: float) -> int:
+    """Count the pairs at concrete positions; return a total of `slack` times as many.
+
+    Raises:
+        ValueError: they are more than int32 can number.
+    """
+    with at_once(), own_transfers():
+        pairs = int(np.sum(np.asarray(count_rows(inputs, options)[0]), dtype=np.int64))
+    if pairs > MOST_PAIRS:
+        raise ValueError(
+            f"total must be at most {MOST_PAIRS}, as many pairs as int32 can number, and there are {pairs}: search in parts, with "
+            "queries=, or sum with pair_sum, which stores no pairs."
+        )
+    return round_total(math.ceil(pairs * slack))

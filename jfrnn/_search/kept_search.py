@@ -1,0 +1,287 @@
+"""What padded and flat lists share: checks of what they are given later, updates in a loop, and growth after an overflow."""
+
+import dataclasses
+import math
+from typing import Any, Self, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.core import Tracer
+
+from jfrnn._engine import Inputs, Options, hide_inactive, take_present
+from jfrnn._geometry import (
+    Batch,
+    Box,
+    Cutoff,
+    Exclusions,
+    Images,
+    Radii,
+    Status,
+    check_active,
+    check_again,
+    check_box,
+    check_devices,
+    check_radii,
+    check_slack,
+    check_table,
+    grow_images,
+    known_status,
+    make_cutoff,
+    round_box,
+)
+from jfrnn._search.geometry import ImageCodes, ImagesMade
+from jfrnn._search.kept_options import KeptOptions
+from jfrnn._search.reverse import Reverse
+from jfrnn._search.verlet import Verlet, has_moved_too_far
+from jfrnn._tracing import Given, call_apart, compile_program, own_transfers
+
+ROWS_ARE_WHOLE = Status.NONFINITE | Status.TOTAL_OVERFLOW  # bits that do not mean missing neighbors in rows
+
+
+Kept = TypeVar("Kept", bound="KeptSearch")
+
+
+class KeptSearch(KeptOptions):
+    """A frozen dataclass that keeps what a search has found, so that it can be updated in a loop."""
+
+    status: Array
+    required: Array
+    verlet: Verlet | None
+    box: Box | None
+    images: ImageCodes | None
+    radii: Radii | None
+    batch: Batch | None
+    exclude: Exclusions | None
+    reverse: Reverse | None
+    _full = Status.ROW_OVERFLOW  # the bit that says that there is too little room
+
+    @property
+    def _room(self) -> int:
+        """How much room there is for pairs; static."""
+        raise NotImplementedError
+
+    @property
+    def _row_count(self) -> int:
+        raise NotImplementedError
+
+    def _find(self, inputs: Inputs, room: int) -> dict[str, Any]:
+        """Search, and return the fields that come from data."""
+        raise NotImplementedError
+
+    def _room_for(self, needed: int) -> int:
+        """Round the room that is needed up, so that similar scenes share a program."""
+        raise NotImplementedError
+
+    def _count_room(self, inputs: Inputs, options: Options, slack: float) -> int:
+        """Return the room that a search at concrete positions takes, `slack` times."""
+        raise NotImplementedError
+
+    def _check_known(self, spared: Status = Status.OK) -> None:
+        """Raise what status bits report, except the spared ones; a traced list is not checked."""
+        raise NotImplementedError
+
+    @property
+    def overflow(self) -> Array:
+        """Whether pairs may be missing for lack of room, or because a box needs more images, [] bool; `grow` fixes both."""
+        with own_transfers():
+            return (self.status & (self._full | Status.BOX_TOO_SMALL).value) != 0
+
+    @property
+    def rebuild_count(self) -> Array:
+        """How often updates rebuilt the list, shape [], int32; only for a list with a skin."""
+        if self.verlet is None:
+            raise ValueError("this list was made without a skin: every update makes it anew, and nothing counts them.")
+        return self.verlet.rebuild_count
+
+    def check(self) -> None:
+        """Raise what the status bits report; wait for the device. Not inside jit: there, read `status` and `overflow`.
+
+        Raises:
+            NeighborOverflowError: a row holds more neighbors than `capacity`, or a flat list more pairs than `total`; `.required`
+                is what is needed.
+            ValueError: positions or queries hold NaN or infinity, or do not fit the box; or there were more pairs than `require`
+                allows.
+            TypeError: called on a list that is being traced.
+        """
+        if isinstance(self.status, Tracer):
+            raise TypeError("check() reads values and cannot run inside jax.jit: call it on the list that jit returns.")
+        self._check_known()
+
+    def update(
+        self,
+        positions: Array,
+        *,
+        cutoff: Array | tuple[Array, Array] | None = None,
+        queries: Array | None = None,
+        active: Array | None = None,
+        box: Box | None = None,
+    ) -> Self:
+        """Rebuild the list if anything has moved skin/2 since the last time, or may have by rounding; without a skin, always.
+
+        The returned list holds every pair within the cutoff at these positions, in the same shapes, so it can be a simulation step
+        inside `jax.jit`, `lax.scan` or `lax.fori_loop`. Lattice translations do not count as motion: positions may be wrapped in
+        every step. Status bits and `required` are kept over all updates; read `overflow` after a chunk of steps, then `grow` and
+        run the chunk again (`run_chunk` does that).
+
+        Args:
+            positions: Sources [length], shape [n, d], where they are now.
+            cutoff: Present cutoffs per particle or per pair of species, as `search` takes them, if the list was made with such;
+                default: those of the list. The list keeps them. The growth of the largest one is subtracted from the skin.
+            queries: Queries [length], shape [m, d], exactly if the list was made with queries.
+            active: Which particles take part now, shape [n], bool, exactly if the list was made with `active`; a change causes a
+                rebuild.
+            box: The present box, of the same kind; default: that of the list. The list keeps it. A change that may bring a new pair
+                within the cutoff causes a rebuild.
+
+        Returns:
+            A list of the same type, shapes and options.
+
+        Raises:
+            ValueError, TypeError: an argument does not fit the list.
+
+        Cost: one pass over the positions, or a search. Differentiable: no gradient flows through. Jit: yes. vmap: yes; if any list
+        of the batch is stale, all are rebuilt.
+        """
+        sources, rows = self._geometry_inputs(positions, queries)
+        rows = rows if self.own_queries else None
+        radii = self._radii_now(cutoff, sources, rows)
+        active, box = self._check_active(active, sources), self._box_now(box, sources)
+        with own_transfers():
+            return call_apart(_update, self, sources, rows, active, box, radii)
+
+    def grow(
+        self,
+        positions: Array,
+        *,
+        cutoff: Array | tuple[Array, Array] | None = None,
+        queries: Array | None = None,
+        active: Array | None = None,
+        box: Box | None = None,
+        slack: float = 1.25,
+    ) -> Self:
+        """Make a list with more room at these positions, where it overflowed. Not inside jit: the room is a shape.
+
+        What grows is `capacity`, or `total` of a flat list, and in a periodic box the number of images: to those that the cutoff
+        needs in this box and in that of the list, or twice as many if updates met a smaller box in between.
+
+        Args:
+            positions: Sources [length], shape [n, d].
+            cutoff: As in `update`.
+            queries: As in `update`.
+            active: As in `update`.
+            box: The box at these positions; default: that of the list, which after a chunk is the last one.
+            slack: Factor >= 1 on what was needed so far, including updates of this list.
+
+        Returns:
+            A list of the same type and options, with no less room than before, status bits cleared, and nothing to `check`.
+
+        Raises:
+            TypeError: positions or the list are traced.
+            ValueError, TypeError: an argument does not fit the list, or the new list reports invalid data (`check`), which no
+                room can fix: non-finite positions, or a degenerate box.
+        """
+        sources, rows = self._geometry_inputs(positions, queries)
+        queries, active, slack = rows if self.own_queries else None, self._check_active(active, sources), check_slack(slack)
+        box, radii = self._box_now(box, sources), self._radii_now(cutoff, sources, queries)
+        if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, radii, self.required))):
+            raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
+        wider = _replace(self, problem=self.problem.with_images(self._grow_images(box, radii)))
+        inputs, options = self.problem.inputs(sources, queries, active, box, radii, self.batch, self.exclude), wider.problem.options
+        with own_transfers():
+            met = self._room_for(math.ceil(slack * int(np.max(np.asarray(self.required)))))
+            made = _remake(wider, inputs, max(self._room, met, self._count_room(inputs, options, slack)))
+        made.check()
+        return made
+
+    def _check_active(self, active: Array | None, sources: Array) -> Array | None:
+        if self.masked != (active is not None):
+            state = "with active: pass active=" if self.masked else "without active: leave active out"
+            raise ValueError(f"this list was made {state}.")
+        return None if active is None else check_active(active, sources)
+
+    def _radii_now(self, cutoff: Given, sources: Array, queries: Array | None) -> Radii | None:
+        if cutoff is None:
+            return self.radii
+        if self.radii is None:
+            raise ValueError("this list was made with one cutoff for all particles: leave cutoff out.")
+        if self.radii.table is not None:
+            return dataclasses.replace(self.radii, table=check_table(cutoff, sources, self.radii.table.shape[0]))
+        radii = check_radii(cutoff, self.radii.asked, sources, queries)
+        if radii is None:
+            raise ValueError("this list was made with a cutoff for each particle: pass such an array, or leave cutoff out.")
+        return radii
+
+    def _box_now(self, box: Box | None, sources: Array) -> Box | None:
+        if box is None:
+            return self.box
+        if self.box is None:
+            raise ValueError("this list was made without a periodic box: leave box out.")
+        checked = check_box(box, sources, like=self.box)
+        return None if checked is None else round_box(checked, np.dtype(sources.dtype))
+
+    def _grow_images(self, box: Box | None, radii: Radii | None) -> Images | None:
+        if self.box_kind is None or self.box is None or box is None:
+            return self.box_kind
+        short = bool(np.any(np.asarray(jax.device_get(self.status)) & Status.BOX_TOO_SMALL.value))
+        reach = self.problem.reach(radii)
+        return grow_images(self.box_kind, (box, self.box), reach, self.dtype, self.source_count, short)
+
+    def _cutoff_of_pairs(self) -> Cutoff | Radii | None:
+        return self.radii if self.cutoff is None else make_cutoff(self.cutoff, self.dtype, self.closed)
+
+    def _images_made(self) -> ImagesMade:
+        made = None if self.images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
+        return self.images, made
+
+    def _geometry_inputs(self, positions: Array, queries: Array | None) -> tuple[Array, Array]:
+        sources = check_again("positions", positions, self.dtype, self.dim, self.source_count)
+        check_devices("positions", sources, self.status)
+        if self.own_queries != (queries is not None):
+            state = "with queries: pass queries=" if self.own_queries else "without queries: leave queries out"
+            raise ValueError(f"this list was made {state}.")
+        if queries is None:
+            return sources, sources
+        rows = check_again("queries", queries, self.dtype, self.dim, self._row_count)
+        check_devices("queries", rows, self.status)
+        return sources, rows
+
+    def _bits(self, spared: Status) -> Status:
+        """Return the bits that are set, without the spared ones; none while traced."""
+        return (known_status(self.status) or Status.OK) & ~spared
+
+
+def _replace(nbrs: Kept, **fields: object) -> Kept:
+    return dataclasses.replace(nbrs, **fields)  # pyright: ignore[reportArgumentType, reportCallIssue, reportUnknownVariableType]
+
+
+@compile_program
+def _update(nbrs: Kept, sources: Array, queries: Array | None, active: Array | None, box: Box | None, radii: Radii | None) -> Kept:
+    sources, queries, box, radii = lax.stop_gradient((sources, queries, box, radii))
+    inputs = nbrs.problem.inputs(sources, queries, active, box, radii, nbrs.batch, nbrs.exclude)
+
+    def remake(nbrs: Kept) -> Kept:
+        made, verlet = _remake(nbrs, inputs, nbrs._room), nbrs.verlet
+        if made.verlet is not None and verlet is not None:
+            made = _replace(made, verlet=dataclasses.replace(made.verlet, rebuild_count=verlet.rebuild_count + 1))
+        return _replace(made, status=made.status | nbrs.status, required=jnp.maximum(made.required, nbrs.required))
+
+    if nbrs.verlet is None:
+        return remake(nbrs)
+    now = hide_inactive(sources, take_present(inputs).active)
+    moved = has_moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin, nbrs.batch)
+    fixed = {"box": box, "radii": radii, "batch": nbrs.batch, "exclude": nbrs.exclude}
+    nobody = dict.fromkeys(fixed)  # what stays is no state of the loop, so that XLA derives from it once what steps of a scan need
+    state = moved, _replace(nbrs, **nobody)
+
+    def body(state: tuple[Array, Kept]) -> tuple[Array, Kept]:
+        return jnp.zeros_like(state[0]), _replace(remake(state[1]), **nobody)
+
+    # a loop of at most one iteration: XLA updates a loop's carry in place, but copies the results of a branch
+    return _replace(lax.while_loop(lambda state: state[0], body, state)[1], **fixed)
+
+
+def _remake(nbrs: Kept, inputs: Inputs, room: int) -> Kept:
+    """Make a new list with the options of this one."""
+    return _replace(nbrs, **nbrs._find(inputs, room))

@@ -1,0 +1,248 @@
+"""`search_edges`: flat lists of edges against the oracle, what too small a total says, and their geometry against padded lists."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+
+import jfrnn
+
+LENGTHS = {"open": None, "nearest": [1.0, 1.0, 1.0], "images": [0.5, 0.3, 1.0]}
+N, CUTOFF = 60, 0.3
+SLOW = pytest.mark.slow
+
+
+def points(n=N, box="open", seed=0, dtype=np.float32):
+    """Return points of which a third are a dense clump, so that rows differ in length."""
+    x = np.random.default_rng(seed).random((n, 3)) * np.array(LENGTHS[box] or [1, 1, 1])
+    x[: n // 3] = 0.2 + 0.05 * x[: n // 3]
+    return x.astype(dtype)
+
+
+def box_of(name, dtype=np.float32):
+    return None if LENGTHS[name] is None else jfrnn.Box(np.array(LENGTHS[name], dtype))
+
+
+def oracle(x, box, **options):
+    cell = LENGTHS[box]
+    matrix = np.ones(3) if cell is None else np.array(cell, x.dtype)
+    return reference.reference_images(x, CUTOFF, matrix=matrix, periodic=(cell is not None,) * 3, **options)
+
+
+def edges_as_set(edges):
+    """Return (i, j, S) of the edges, after checking that each is there once, and sorted by receiver."""
+    real = np.asarray(edges.mask)
+    columns = (np.asarray(x)[real].tolist() for x in (edges.receivers, edges.senders, edges.shift))
+    triples = [(i, j, tuple(shift)) for i, j, shift in zip(*columns, strict=True)]
+    found = set(triples)
+    assert len(found) == len(triples) == int(edges.pair_count)
+    assert (np.diff(edges.receivers) >= 0).all()
+    return found
+
+
+def assert_right(nbrs, x, expected, queries=None):
+    edges = nbrs.edges(x, queries=queries)
+    assert edges_as_set(edges) == expected
+    m, held = len(x if queries is None else queries), int(nbrs.pair_count)
+    assert held == len(expected) == int(nbrs.required)
+    assert (np.asarray(nbrs.senders)[held:] == len(x)).all()
+    assert (np.asarray(nbrs.receivers)[held:] == m).all()
+    np.testing.assert_array_equal(np.diff(nbrs.offsets), np.bincount(np.asarray(nbrs.receivers)[:held], minlength=m))
+    i, j = nbrs.pairs()
+    assert set(zip(i.tolist(), j.tolist(), strict=True)) == {pair[:2] for pair in expected}
+    nbrs.check()
+
+
+@pytest.mark.parametrize(
+    ("backend", "box"),
+    [
+        ("warp", "images"),
+        ("brute", "open"),
+        *(pytest.param(*case, marks=SLOW) for case in (("warp", "open"), ("warp", "nearest"), ("brute", "images"))),
+        *(pytest.param("jax", box, marks=SLOW) for box in LENGTHS),
+    ],
+)
+def test_edges_are_those_of_the_oracle(backend, box):
+    x = points(box=box)
+    assert_right(jfrnn.search_edges(x, CUTOFF, box=box_of(box), backend=backend), x, oracle(x, box))
+
+
+@SLOW
+@pytest.mark.parametrize("backend", ["warp", "jax", "brute", "hashgrid"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("options", [{"half": True}, {"include_self": True}, {"closed": True}, {"queries": True}], ids=str)
+def test_options(backend, dtype, options):
+    for box in ("open", "images") if backend != "hashgrid" else ("open",):
+        x = points(200, box, dtype=dtype)
+        given = options | ({"queries": points(70, box, 1, dtype)} if "queries" in options else {})
+        nbrs = jfrnn.search_edges(x, CUTOFF, box=box_of(box, dtype), backend=backend, **given)
+        assert_right(nbrs, x, oracle(x, box, **given), given.get("queries"))
+
+
+@SLOW
+@pytest.mark.parametrize("backend", ["warp", "jax", "brute"])
+def test_cutoffs_per_particle_and_inactive_ones(backend):
+    x, radii = points(), np.random.default_rng(2).uniform(0.05, 0.3, N).astype(np.float32)
+    active = np.arange(N) % 5 > 0
+    nbrs = jfrnn.search_edges(x, radii, radius_rule="either", active=active, backend=backend)
+    expected = reference.reference_radii(x, radii, "either")
+    assert_right(nbrs, x, {pair for pair in expected if active[pair[0]] and active[pair[1]]})
+
+
+@SLOW
+@pytest.mark.parametrize("backend", ["warp", "jax", "brute"])
+def test_systems(backend):
+    x, systems = points(120, "images"), np.arange(120) % 3
+    nbrs = jfrnn.search_edges(x, CUTOFF, batch=systems, box=box_of("images"), backend=backend)
+    assert_right(nbrs, x, {p for p in oracle(x, "images") if systems[p[0]] == systems[p[1]]})
+    cells = np.array([[0.5, 0.3, 1.0], [1.0, 1.0, 1.0], [0.4, 0.6, 0.8]], np.float32)
+    nbrs = jfrnn.search_edges(x, CUTOFF, batch=systems, box=jfrnn.Box(cells), backend=backend)
+    expected = set()
+    for system, cell in enumerate(cells):
+        members = np.flatnonzero(systems == system)
+        found = reference.reference_images(x[members], CUTOFF, matrix=cell, periodic=(True,) * 3)
+        expected |= {(members[i], members[j], shift) for i, j, shift in found}
+    assert_right(nbrs, x, expected)
+
+
+@pytest.mark.parametrize("backend", ["warp", pytest.param("brute", marks=SLOW)])
+def test_too_small_a_total_is_never_silent(backend):
+    x = points()
+    whole = jfrnn.search_edges(x, CUTOFF, backend=backend)
+    pairs = int(whole.pair_count)
+    for total in (pairs - 1, 0):
+
+        @jax.jit
+        def step(x, total=total):
+            nbrs = jfrnn.search_edges(x, CUTOFF, total=total, backend=backend)
+            apart = nbrs.update(jnp.arange(N, dtype=x.dtype)[:, None] * jnp.ones(3, x.dtype))  # nobody is near anybody
+            return nbrs, apart, nbrs.edges(x)
+
+        nbrs, apart, edges = step(x)
+        assert (int(nbrs.pair_count), int(apart.pair_count)) == (pairs, 0)
+        np.testing.assert_array_equal(nbrs.senders, whole.senders[:total])
+        assert np.isnan(edges.displacement).all()
+        assert int(edges.status) == jfrnn.Status.TOTAL_OVERFLOW
+        for kept in (nbrs, apart):  # sticky
+            assert bool(kept.overflow)
+            assert int(kept.required) == pairs
+            with pytest.raises(jfrnn.NeighborOverflowError, match=f"total={total} is too small: there are {pairs} pairs") as raised:
+                kept.check()
+            assert (raised.value.required, raised.value.capacity) == (pairs, total)
+        assert apart.grow(x).total >= pairs
+
+
+def test_a_chunk_is_replayed_with_a_larger_total():
+    @jax.jit
+    def chunk(x, nbrs):
+        def step(_, state):
+            x, nbrs = state
+            return 0.8 * x, nbrs.update(0.8 * x)
+
+        return jax.lax.fori_loop(0, 3, step, (x, nbrs))
+
+    x = jnp.asarray(points())
+    nbrs = jfrnn.search_edges(x, CUTOFF, skin=0.02, backend="warp")
+    y, grown = jfrnn.run_chunk(chunk, x, nbrs, lambda x: x)
+    assert grown.total > nbrs.total
+    assert edges_as_set(grown.edges(y)) == oracle(np.asarray(y), "open")
+
+
+@SLOW
+@pytest.mark.parametrize(("half", "box"), [(False, "open"), *((half, "images") for half in (False, True))])
+@pytest.mark.parametrize("reverse", [True, False])
+def test_geometry_and_derivatives_are_those_of_padded_lists(half, box, reverse):
+    x = jnp.asarray(points(30, box, dtype=np.float64))
+    options = {"box": box_of(box, np.float64), "half": half, "skin": 0.02, "reverse": reverse, "backend": "warp"}
+    flat, padded = (find(x, CUTOFF, **options) for find in (jfrnn.search_edges, jfrnn.search))
+    moved = x + 0.005 * jnp.sin(40 * x)
+    flat, padded = flat.update(moved), padded.update(moved)
+    assert int(flat.rebuild_count) == 0
+
+    def energy(edges_of):
+        def f(x, a):
+            edges = edges_of(x, None if flat.box is None else jfrnn.Box(a))
+            return jnp.sum(jnp.where(edges.mask, jnp.sin(3 * edges.distance) * edges.displacement[:, 0], 0))
+
+        def all_of(x, a):
+            slope = jax.grad(f)
+            return f(x, a), jax.grad(f, (0, 1))(x, a), jax.jvp(lambda x: slope(x, a), (x,), (x,))[1]
+
+        return jax.jit(all_of)(moved, jnp.asarray(LENGTHS[box] or [1.0] * 3))
+
+    total = flat.total
+    of_flat, of_padded = energy(lambda x, b: flat.edges(x, box=b)), energy(lambda x, b: padded.edges(x, total, box=b))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-10), of_flat, of_padded)
+    assert edges_as_set(flat.edges(moved)) == edges_as_set(padded.edges(moved, total))
+
+
+def test_derivatives_do_not_scatter():
+    x = jnp.asarray(points(dtype=np.float64))
+    nbrs = jfrnn.search_edges(x, CUTOFF, reverse=True, backend="brute")
+    text = jax.jit(jax.grad(lambda x: jnp.sum(nbrs.edges(x).displacement ** 4))).lower(x).as_text()
+    assert [line for line in text.splitlines() if "stablehlo.scatter" in line and "f64" in line] == []
+
+
+def test_graphs():
+    x = points()
+    nbrs = jfrnn.search_edges(x, CUTOFF, backend="warp", total=3000)
+    graph, padded = nbrs.to_jraph(x), jfrnn.search(x, CUTOFF, backend="warp").to_jraph(x, 3000)
+    assert graph.n_edge.tolist() == padded.n_edge.tolist()
+    np.testing.assert_array_equal(np.bincount(graph.senders), np.bincount(padded.senders))
+    with pytest.raises(ValueError, match="cannot leave pairs of a skin out"):
+        jfrnn.search_edges(x, CUTOFF, skin=0.1, backend="warp").to_jraph(x)
+    with pytest.raises(ValueError, match="this list has queries"):
+        jfrnn.search_edges(x, CUTOFF, queries=x[:3], backend="warp").to_jraph(x)
+
+
+def test_vmap():
+    x = jnp.stack([points(seed=seed) for seed in (0, 1)])
+
+    def count_near(x):
+        nbrs = jfrnn.search_edges(x, CUTOFF, total=2000, backend="warp")
+        return nbrs.pair_count, jnp.sum(nbrs.edges(x).distance)
+
+    counts, sums = jax.jit(jax.vmap(count_near))(x)
+    for k in range(2):
+        np.testing.assert_allclose(count_near(x[k])[1], sums[k], rtol=1e-5)
+        assert int(counts[k]) == len(oracle(np.asarray(x[k]), "open"))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"total": 2**31}, r"total must be at most 2147483647"),
+        ({"total": -1}, "total must be at least 0"),
+        ({"total": 3.5}, "total must be a static int"),
+        ({}, "total must be given where positions are traced"),
+    ],
+)
+def test_totals_are_refused_while_tracing(options, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        jax.eval_shape(lambda x: jfrnn.search_edges(x, CUTOFF, **options), jnp.zeros((4, 3)))
+
+
+def test_more_pairs_than_int32_are_refused(monkeypatch):
+    monkeypatch.setattr("jfrnn._search.edge_list.MOST_PAIRS", 10)
+    with pytest.raises(ValueError, match="total must be at most 10, as many pairs as int32 can number, and there are"):
+        jfrnn.search_edges(points(), CUTOFF, backend="warp")
+
+
+def test_nobody():
+    for n, total in ((0, 3), (5, 0)):
+        x = np.zeros((n, 3), np.float32)
+        nbrs = jfrnn.search_edges(x, 1.0, total=total, backend="warp")
+        assert nbrs.senders.shape == nbrs.edges(x).senders.shape == (total,) if n == 0 else (0,)
+        assert int(nbrs.pair_count) == n * (n - 1) if n else True
+        assert bool(nbrs.overflow) == (n > 0)
+
+
+def test_positions_that_are_not_finite_are_told():
+    x = points()
+    x[3] = np.nan
+    nbrs = jfrnn.search_edges(x, CUTOFF, backend="warp")
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
+    with pytest.raises(ValueError, match="non-finite"):
+        nbrs.check()
+    assert 3 not in np.asarray(nbrs.edges(jnp.asarray(x)).senders)
