@@ -4,6 +4,8 @@ import functools
 
 from jfrnn.kernels._native import SPACES, program
 from jfrnn.kernels._program import Entry, Kernel, declare
+from jfrnn.kernels.cells_cuda import GRID
+from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
 QUERIES_AT_ONCE = 64  # that a thread of the CPU takes
 PADDING = 16  # sources behind the last one that may be read
@@ -20,11 +22,35 @@ def rows_kernel(dim: int, double: bool, scaled: bool, lists: bool, periodic: int
     """
     where = "cuda" if cuda else "cpu"
     name = f"box_rows_{where}_{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}{SPACES[periodic]}"
-    constants = {"PERIODIC": periodic, "SCALED": scaled, "LIST": lists, "QUERY_CHUNK": QUERIES_AT_ONCE, "LANES_PER_ROW": LANES}
-    text = program(double, dim, "box_rows.cuh" if cuda else "box_rows_cpu.h", **constants)
+    text = program(double, dim, "box_rows.cuh" if cuda else "box_rows_cpu.h", **_constants(periodic, scaled, lists), SUMS=0)
     return declare(name, text, Entry("BoxRows.run", _BLOCK if cuda else 1, BLOCKS), cuda=cuda, fused=cuda)[0]
+
+
+def _constants(periodic: int, scaled: bool, lists: bool) -> dict[str, int]:
+    return {"PERIODIC": periodic, "SCALED": scaled, "LIST": lists, "QUERY_CHUNK": QUERIES_AT_ONCE, "LANES_PER_ROW": LANES}
+
+
+@functools.lru_cache(512)
+def sum_kernel(
+    term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, extremes: bool, periodic: int, cuda: bool
+) -> Kernel:
+    """Return the kernel that sums a term; `key` tells it from all others in the names of programs.
+
+    `extremes`: it finds the largest summands instead, as `jfrnn.kernels.pair_sum_cpu.query_kernel` does.
+    """
+    name = f"box_sums_{'cuda' if cuda else 'cpu'}_{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}"
+    name += f"{'_compensated' * compensated}{SPACES[periodic]}{'_extremes' * extremes}_{key}"
+    constants = {**GRID, **_constants(periodic, scaled, False), **constants_of(term, compensated, extremes)}
+    header = "box_sums.cuh" if cuda else "box_sums_cpu.h"
+    text = program(double, dim, header, given=term_header(term, double), **constants)
+    return declare(name, text, Entry("BoxSums.run", _BLOCK if cuda else 1, BLOCKS), cuda=cuda, fused=cuda)[0]
+
+
+def slots(queries: int, cuda: bool) -> int:
+    """Return the number of partial sums that make up a sum over all pairs."""
+    return -(-queries // (32 // LANES if cuda else QUERIES_AT_ONCE))
 
 
 def threads(queries: int) -> int:
     """Return the threads of a launch on CUDA."""
-    return 32 * -(-queries * LANES // 32)
+    return 32 * slots(queries, cuda=True)

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +13,11 @@ from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import lattice_numbers, particle_rows, periodic_kind
 from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.problem import Filter, Rows, Search, largest_radius
+from jfrnn._engine.sum_results import FoundSums, SumsOf
 from jfrnn._engine.variants import Variant, absent, describe_call, plan_numbers
-from jfrnn._geometry import Lattice, Status, Wrapped, sort_into_boxes
+from jfrnn._geometry import Lattice, Status, Wrapped, sort_into_boxes, unpack_turns
 from jfrnn.kernels import boxes
+from jfrnn.kernels.pair_sum_cpu import TermText
 
 _GIVEN = ("positions", "queries", "boxes", "axes", "asked", "ids", "order", "visits", "cells", "start")
 
@@ -78,3 +81,82 @@ def _plan(variant: Variant, cuda: bool, shapes: Shapes, _: int) -> Plan:
     launch = Launch(found, boxes.threads(m)) if cuda else share(found, m, boxes.QUERIES_AT_ONCE)
     pages = [] if cuda or not variant.lists else ask_for_huge_pages("idx", 4 * m * numbers["capacity"])
     return Plan([Clear("info", 8), *pages, launch], numbers, absent(variant))
+
+
+# --- sums ----------------------------------------------------------------------------------------------------------------
+
+
+class _SumVariant(NamedTuple):
+    """All that is static about a pair sum, apart from shapes; `key` names the text."""
+
+    dim: int
+    double: bool
+    scaled: bool
+    own: bool
+    closed: bool
+    drop_self: bool
+    periodic: int
+    compensated: bool
+    extremes: bool
+    key: str
+    cuda: bool
+
+
+def box_sums(
+    search: Search,
+    keep: Filter,
+    term: TermText,
+    key: str,
+    values: tuple[Array, Array, Array],
+    compensated: bool,
+    extremes: bool,
+) -> FoundSums:
+    """Sum a term over the pairs of a search in which each system has a box of its own, as `jfrnn._engine.warp_sums.pair_sums`."""
+    (_, m), dim, double = search.sizes, search.sources.shape[1], search.sources.dtype == jnp.float64
+    cutoff, shared, own, others = search.cutoff, *values
+
+    def on(cuda: bool) -> Callable[..., FoundSums]:
+        flags = search.queries is None, cutoff.closed, keep.drop_self, periodic_kind(search.torus), compensated, extremes
+        call_sums = _sum_callable(_SumVariant(dim, double, cutoff.scaled, *flags, key, cuda), term)
+        results = SumsOf(term, m, boxes.slots(m, cuda), compensated, extremes)
+
+        def call(*given: Array) -> FoundSums:
+            return results.unpack(*call_sums(*given, output_dims=results.dims() | {"info": 2})[: len(_SUMS)])
+
+        return call
+
+    given = _operands(search)
+    columns = _sorted_columns(search, term, others, given[_GIVEN.index("ids")])
+    return lax.platform_dependent(*given, shared, own, columns, cpu=on(False), cuda=on(True))
+
+
+def _sorted_columns(search: Search, term: TermText, others: Array, ids: Array) -> Array:
+    """Return what a term reads of the sources, a row for each number, sorted; turns, which `others` has packed, axis by axis."""
+    columns = [others[:, k] for k in range(term.columns)]
+    if search.torus is not None and term.steps:
+        lattice, wrapped = search.torus
+        turns = unpack_turns(wrapped.turns, lattice.dim).astype(others.dtype)
+        columns += [turns[:, step.axis] for step in term.steps]
+    return jnp.stack([x[ids] for x in columns]) if columns else jnp.zeros((1, 1), others.dtype)
+
+
+_SUMS = ("sums", "totals", "errors", "more")  # what a kernel writes
+
+
+@kernel
+def _sum_callable(variant: _SumVariant, term: TermText) -> Call:
+    scalar, flags = np.float64 if variant.double else np.float32, variant._asdict()
+    on = [flag for flag, on in flags.items() if on is True]
+    where = f"{variant.dim}d_{'f64' if variant.double else 'f32'}_{variant.periodic}"
+    results = dict.fromkeys(_SUMS, scalar) | {"info": np.int32}
+    given = (*_GIVEN, "shared_values", "own_values", "columns")
+    return Call("_".join(["jfrnn_box_sums", where, *on, variant.key]), given, results, functools.partial(_plan_sums, variant, term))
+
+
+def _plan_sums(variant: _SumVariant, term: TermText, shapes: Shapes, _: int) -> Plan:
+    kind = variant.dim, variant.double, variant.scaled, variant.compensated, variant.extremes, variant.periodic
+    found, cuda = boxes.sum_kernel(term, variant.key, *kind, variant.cuda), variant.cuda
+    n, m, stride = shapes["positions"][0], shapes["queries"][0], shapes["axes"][1]
+    flags = {"own": int(variant.own), "closed": int(variant.closed), "drop_self": int(variant.drop_self)}
+    launch = Launch(found, boxes.threads(m)) if cuda else share(found, m, boxes.QUERIES_AT_ONCE)
+    return Plan([launch] if cuda else [Clear("info", 8), launch], {"n": n, "m": m, "stride": stride, **flags})

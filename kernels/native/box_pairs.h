@@ -18,6 +18,7 @@ struct BoxArguments {
 // The sources of a row of cells, in one image.
 struct BoxRun {
     int from, size, code;
+    int shift[3];  // of the image
     real away[3];  // from the query to where the origin of the image is
 };
 
@@ -91,7 +92,7 @@ struct BoxPairs : BoxArguments, Space {
         run.size = start[row + (ends < counts[0] ? ends : counts[0])] - run.from;
         run.code = 0;
         for (int k = 0; k < DIM; ++k) {
-            shift[k] = axes_turning >> k & 1 ? shift[k] : 0;
+            run.shift[k] = shift[k] = axes_turning >> k & 1 ? shift[k] : 0;
             run.code = run.code * (2 * lattice.images(k) + 1) + shift[k] + lattice.images(k);
         }
         for (int k = 0; k < 3; ++k)

@@ -1,10 +1,9 @@
-// Rows of neighbors, or their counts, in systems with boxes of their own on the CPU: a query meets LANES sources of a run at a time.
+// Rows of neighbors, or their counts, in systems with boxes of their own on the CPU.
 #pragma once
-#include "box_pairs.h"
-#include "lanes.h"
+#include "box_pairs_cpu.h"
 
-struct BoxRows : BoxPairs {
-    explicit BoxRows(const BoxArguments& given) : BoxPairs(given) {}
+struct BoxRows : BoxLanes {
+    explicit BoxRows(const BoxArguments& given) : BoxLanes(given) {}
 
     // Threads hand themselves chunks of queries; `info` holds the length of the longest row, and the next chunk.
     void run() {
@@ -38,30 +37,15 @@ struct BoxRows : BoxPairs {
     }
     // Meets the sources of a run from number b on; those that are neighbors go into the row behind `found` others.
     int meet(const BoxRun& run, int b, int* row, int found) const {
-        const int at = run.from + b;
-        vec square{};
-        for (int k = 0; k < DIM; ++k) {
-            vec d = lanes_from(axes + (long long)k * stride + at) + run.away[k];
-            if constexpr (SCALED)
-                d *= step_scale;
-            square += d * d;
-        }
-        unsigned int asked = lanes_before(run.size - b);
-        if (drop_self && run.code == at_home && place >= at && place < at + LANES)
-            asked &= ~(1u << (place - at));
-        unsigned int pairs = mask_of(square, inside, Below{}) & asked;
-        unsigned int open = mask_of(square, outside, BelowOrAt{}) & asked & ~pairs;
-        if (!LIST && !open && !later_only)
-            return __builtin_popcount(pairs);
-        const ints sources = lanes_from(ids + at);
-        for (; open; open &= open - 1) {
-            const int lane = __builtin_ctz(open);
-            pairs |= is_pair(sources[lane], run.code) ? 1u << lane : 0;
-        }
+        Tested some = test(run, b);
+        decide(run, b, some);
+        if (!LIST && !later_only)
+            return __builtin_popcount(some.pairs);
+        const ints sources = lanes_from(ids + run.from + b);
         if (later_only)
-            pairs &= bits_of_flags(__builtin_convertvector(sources >= first_asked(run.code), flags));
-        if (LIST && pairs)
-            pack_within(sources + name_of(0, run.code), row + found, pairs, capacity - found);
-        return __builtin_popcount(pairs);
+            some.pairs &= bits_of_flags(__builtin_convertvector(sources >= first_asked(run.code), flags));
+        if (LIST && some.pairs)
+            pack_within(sources + name_of(0, run.code), row + found, some.pairs, capacity - found);
+        return __builtin_popcount(some.pairs);
     }
 };

@@ -1,0 +1,45 @@
+"""Fused pair sums with a box per system, searched and over kept lists: the pairs of the oracle, and derivatives."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_boxes import CAPACITY, box_of, expected_images
+from test_pair_sum_warp_boxes import assert_marks, marks
+
+import jfrnn
+from jfrnn.cases.crystals import CRYSTAL_CASES
+
+SLOW = pytest.mark.slow
+fused = functools.partial(jfrnn.pair_sum, backend="warp")
+
+
+def assert_case(name, dtype, dim, listed):
+    given = CRYSTAL_CASES[name].build(dtype, dim)
+    x, q = jnp.asarray(given.positions), None if given.queries is None else jnp.asarray(given.queries)
+    queries = {} if q is None else {"queries": q}
+    systems = given.batch if q is None else given.query_batch
+    options = {"box": box_of(given), "batch": given.batch if q is None else (given.batch, given.query_batch)}
+    values = {"query_values": jnp.arange(len(systems), dtype=dtype)} if queries else {}
+    ids = jnp.arange(len(x), dtype=dtype)
+    if listed:
+        nbrs = jfrnn.search(x, given.cutoff, capacity=CAPACITY[dim], backend="warp", **queries, **options)
+        nbrs.check()
+        found = jfrnn.pair_sum(marks, x, None, ids, neighbors=nbrs, **queries, **values)
+    else:
+        found = fused(marks, x, given.cutoff, ids, **queries, **values, **options)
+    boxes = given.boxes if given.boxes.ndim == 3 else np.einsum("sd,dk->sdk", given.boxes, np.eye(dim))
+    there = (systems >= 0) & (systems < len(boxes))
+    points = np.where(there[:, None], given.positions if q is None else given.queries, 0)
+    pairs = expected_images(name, dtype, dim)
+    keep = there & np.isfinite(points).all(axis=1)
+    found = jax.tree.map(lambda s: np.where(keep.reshape(-1, *[1] * (s.ndim - 1)), s, 0), found)
+    assert_marks(found, pairs, given.positions, points, boxes[np.clip(systems, 0, len(boxes) - 1)])
+
+
+@pytest.mark.parametrize("listed", [False, True], ids=["search", "list"])
+@pytest.mark.parametrize("name", ["mixed", "far", "slabs", *(pytest.param(x, marks=SLOW) for x in CRYSTAL_CASES)])
+def test_case(name, listed):
+    assert_case(name, np.float32, 3, listed)
