@@ -4,7 +4,8 @@
 // (RADII). Sources have LENGTH: coordinates, OTHERS numbers that a term reads, turns and the cutoff of j. `cutoff` holds the largest
 // cutoff, the lattice, and the largest number of a shift. `steps` are the shifts of image codes. REVERSED: rows are those of the sources
 // of the list, whose slots are `lengths` many in `slots` from `starts` on, and j is who has such a slot. ORDERED: threads take rows as
-// `order` has them, so that rows that are taken together read the same sources, or as they come where it holds -1.
+// `order` has them, so that rows that are taken together read the same sources, or as they come where it holds -1. BOXES: `cutoff` has
+// such numbers for each of several systems, of which `systems` says to which a row belongs.
 #pragma once
 #include "codes.h"
 #include "exact.h"
@@ -12,7 +13,7 @@
 
 struct KeptArguments {
     const real *rows, *points, *cutoff, *steps;
-    const int *idx, *count, *codes, *slots, *starts, *lengths, *order;
+    const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
     int m, n, capacity, images, closed, apart;
 };
 
@@ -44,9 +45,30 @@ struct Kept : KeptArguments, Space {
     // Where lattice vectors lie along the axes: their lengths, and the reciprocals; 0 where space is open. No store can change them.
     real sides[3], units[3];
 
-    JFRNN_MEMBER explicit Kept(const KeptArguments& given) : KeptArguments(given), Space(given.cutoff), moved(0), most(0) {
+    int system;            // whose lattice it is
+
+    // `row` is the first one that is looked at.
+    JFRNN_MEMBER explicit Kept(const KeptArguments& given, int row = 0)
+        : KeptArguments(given), Space(numbers_of(given, row)), moved(0), most(0), system(BOXES ? given.systems[row] : 0) {
         inside = step_radius * step_radius * (1 - 8 * step_eps);
         outside = step_radius * step_radius * (1 + 8 * step_eps);
+        measure_lattice();
+        if constexpr (SHIFTED)
+            most = cutoff[LATTICE_END];
+    }
+    JFRNN_FUNCTION const real* numbers_of(const KeptArguments& given, int row) {
+        return given.cutoff + (BOXES ? (LATTICE_END + 1ll) * given.systems[row] : 0);
+    }
+    // Goes to the lattice of a row.
+    JFRNN_MEMBER void enter(int row) {
+        if (!BOXES || systems[row] == system)
+            return;
+        system = systems[row];
+        lattice = Lattice(numbers_of(*this, row));
+        measure_lattice();
+    }
+    JFRNN_MEMBER void measure_lattice() {
+        moved = 0;
         for (int k = 0; SHIFTED && k < DIM; ++k) {
             real sum = 0;
             for (int l = 0; l < DIM; ++l)
@@ -58,8 +80,6 @@ struct Kept : KeptArguments, Space {
             sides[k] = turns ? lattice.vector(k, k) : real(0);
             units[k] = turns ? lattice.transform(k, k) : real(0);
         }
-        if constexpr (SHIFTED)
-            most = cutoff[LATTICE_END];
     }
     JFRNN_INLINE static Number larger(Number x, Number y) { return Math::select(Math::gt(x, y), x, y); }
     JFRNN_FUNCTION real size_of(real x) { return x < 0 ? -x : x; }

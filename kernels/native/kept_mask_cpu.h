@@ -4,7 +4,7 @@
 
 struct MaskArguments {
     const real *rows, *points, *cutoff, *steps;
-    const int *idx, *count, *codes, *slots, *starts, *lengths, *order;
+    const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
     int* mask;
     real* distances;
     int* info;
@@ -12,7 +12,7 @@ struct MaskArguments {
 
     KeptArguments of_list() const {
         return {
-            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, m, n, capacity, images, closed, apart};
+            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed, apart};
     }
 };
 struct KeptMask : KeptRows<KeptMask> {

@@ -5,7 +5,7 @@
 
 struct KeptSumsArguments {
     const real *rows, *points, *cutoff, *steps;
-    const int *idx, *count, *codes, *slots, *starts, *lengths, *order;
+    const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
     const real *shared_values, *own_values;
     real *sums, *totals, *errors;
     int* info;
@@ -13,7 +13,7 @@ struct KeptSumsArguments {
 
     KeptArguments of_list() const {
         return {
-            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, m, n, capacity, images, closed, apart};
+            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed, apart};
     }
 };
 struct KeptSums : KeptRows<KeptSums> {
