@@ -1,6 +1,7 @@
-"""Systems with boxes of their own: which cells a query visits is known before (`jfrnn._geometry.box_cells`), one launch does it."""
+"""Systems with boxes of their own: sources are sorted by system and cell, on CUDA by six launches; then one serves all queries."""
 
 import functools
+from typing import NamedTuple
 
 from jfrnn.kernels._native import SPACES, program
 from jfrnn.kernels._program import Entry, Kernel, declare
@@ -12,6 +13,47 @@ PADDING = 16  # sources behind the last one that may be read
 LANES = 16  # of CUDA that serve a query
 _BLOCK = 128
 BLOCKS = 8  # that share a multiprocessor: what decides exactly may spill registers, it is rare
+
+
+_LAID_AT_ONCE = 1024  # systems whose cells are laid out at once
+_HEADER = 16  # words
+
+
+def scratch_words(sources: int, systems: int, cells: int) -> tuple[int, int]:
+    """Return the int32 words of scratch in which sources are sorted on CUDA, and how many of them are 0 before."""
+    zeros = _HEADER + 2 * (cells // GRID["TILE"] + 1) + systems
+    return zeros + 3 * sources, zeros
+
+
+class Sorting(NamedTuple):
+    """The kernels that sort sources on CUDA, all with the same arguments."""
+
+    count_members: Kernel
+    lay_out: Kernel
+    count_cells: Kernel
+    scan: Kernel
+    scatter: Kernel
+    rank: Kernel
+
+    def launches(self, sources: int, cells: int, multiprocessors: int) -> list[tuple[Kernel, int]]:
+        """Return what is launched, in order, and the threads of each."""
+        block = GRID["BLOCK"]
+        tiles = min(cells // GRID["TILE"] + 1, multiprocessors)
+        each = dict.fromkeys(self, -(-(sources + PADDING) // block) * block)
+        each |= {self.lay_out: _LAID_AT_ONCE, self.scan: tiles * block}
+        return list(each.items())
+
+
+@functools.lru_cache(16)
+def sorting_kernels(dim: int, double: bool, periodic: int) -> Sorting:
+    """Return the kernels that sort sources on CUDA; `periodic` is that of `jfrnn.kernels._native.program`."""
+    entries = [Entry(f"BoxSort.{name}", _LAID_AT_ONCE if name == "lay_out" else GRID["BLOCK"]) for name in _STAGES]
+    text = program(double, dim, "box_sort.cuh", PERIODIC=periodic, **GRID)
+    name = f"box_sort_{dim}d_{'f64' if double else 'f32'}{SPACES[periodic]}"
+    return Sorting(*declare(name, text, *entries, cuda=True, fused=True))
+
+
+_STAGES = ("count_members", "lay_out", "count_cells", "scan_counts", "scatter", "rank")
 
 
 @functools.lru_cache(64)

@@ -1,4 +1,4 @@
-"""Searches with a box per system by Warp's kernels: cells are sorted by XLA, a kernel meets them."""
+"""Searches with a box per system by Warp's kernels: sources are sorted by cell, on the CPU by XLA, and a kernel meets them."""
 
 import functools
 from collections.abc import Callable
@@ -15,11 +15,11 @@ from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.problem import Filter, Rows, Search, largest_radius
 from jfrnn._engine.sum_results import FoundSums, SumsOf
 from jfrnn._engine.variants import Variant, absent, describe_call, plan_numbers
-from jfrnn._geometry import Lattice, Status, Wrapped, sort_into_boxes, unpack_turns
+from jfrnn._geometry import Lattice, Status, Wrapped, most_cells, sort_into_boxes, unpack_turns
 from jfrnn.kernels import boxes
 from jfrnn.kernels.pair_sum_cpu import TermText
 
-_GIVEN = ("positions", "queries", "boxes", "axes", "asked", "ids", "order", "visits", "cells", "start")
+_GIVEN = ("positions", "queries", "boxes", "axes", "systems", "ids", "cells", "start")
 
 
 def box_neighbors(search: Search, keep: Filter, capacity: int | None) -> Rows:
@@ -29,33 +29,55 @@ def box_neighbors(search: Search, keep: Filter, capacity: int | None) -> Rows:
     kind = (search.queries is None, search.cutoff.closed, keep, periodic_kind(search.torus), True)
     variant = Variant(dim, double, search.cutoff.scaled, capacity is not None, *kind)
 
-    def on(cuda: bool) -> Callable[..., list[Array]]:
-        return functools.partial(_callable(variant, cuda), output_dims=dims)
+    def on(cuda: bool) -> Callable[[Search], list[Array]]:
+        return lambda search: _callable(variant, cuda)(*_operands(search, cuda), output_dims=dims)
 
-    *idx, count, info = lax.platform_dependent(*_operands(search), cpu=on(False), cuda=on(True))
+    *idx, count, info = lax.platform_dependent(search, cpu=on(False), cuda=on(True))
     overflow = jnp.where(capacity is not None and info[0] > (capacity or 0), Status.ROW_OVERFLOW.value, 0)
     return Rows(idx[0] if idx else None, count, info[0], overflow.astype(jnp.int32))
 
 
-def _operands(search: Search) -> list[Array]:
-    """Return what the kernel is given, in the order of `_GIVEN` (see `kernels/native/box_pairs.h`)."""
+def _operands(search: Search, cuda: bool) -> list[Array]:
+    """Return what a kernel is given, in the order of `_GIVEN` (see `kernels/native/box_pairs.h`)."""
     sources, queries, batch, torus = search.sources, search.queries, search.batch, search.torus
     if batch is None or torus is None:
         raise TypeError("a search with a box per system has a batch and a lattice.")
     lattice, wrapped = torus
-    cells = sort_into_boxes(sources, queries, lattice, wrapped, batch)
-    padded = jnp.pad(cells.order, (0, boxes.PADDING))
-    order = cells.order if queries is None else lax.iota(jnp.int32, len(queries))
     rows = particle_rows(sources, wrapped.turns, None)
     asking = rows if queries is None else particle_rows(queries, wrapped.query_turns, None)
-    gap = ((0, 0), (0, 3 - lattice.dim))
-    visits = jnp.concatenate([batch.of_queries[:, None], jnp.pad(cells.from_cell, gap), jnp.pad(cells.visited, gap)], axis=1)
     bits = lattice.spread(jnp.asarray(lattice.periodic), 2).astype(jnp.int32) << np.arange(lattice.dim, dtype=np.int32)[None]
-    turning = jnp.broadcast_to(jnp.sum(bits, axis=1, dtype=jnp.int32), cells.first.shape)
-    of_system = jnp.concatenate([jnp.pad(cells.counts, gap), cells.first[:, None], turning[:, None]], axis=1)
-    axes = jnp.stack([x[padded] for x in wrapped.sources.T])
+    turning = jnp.broadcast_to(functools.reduce(jnp.bitwise_or, bits.T), len(lattice.origin))
     numbers = _numbers(search, lattice, wrapped)
-    return [rows, asking, numbers, axes, wrapped.queries, padded, order, visits, of_system, cells.start]
+    if cuda:
+        n, systems = len(sources), len(lattice.origin)
+        cells, stride = most_cells(n, systems), n + boxes.PADDING
+        dims = {"axes": (lattice.dim, stride), "ids": stride, "cells": (systems, 5), "start": cells + 1}
+        dims |= {"scratch": boxes.scratch_words(n, systems, cells)[0]}
+        sort = _sorting_callable(lattice.dim, sources.dtype == jnp.float64, periodic_kind(torus))
+        axes, ids, of_system, start, _ = sort(rows, numbers, batch.sources, turning, output_dims=dims)
+        return [rows, asking, numbers, axes, batch.of_queries, ids, of_system, start]
+    found = sort_into_boxes(sources, queries, lattice, wrapped, batch)
+    ids, gap = jnp.pad(found.order, (0, boxes.PADDING)), ((0, 0), (0, 3 - lattice.dim))
+    of_system = jnp.concatenate([jnp.pad(found.counts, gap), found.first[:, None], turning[:, None]], axis=1)
+    axes = jnp.stack([x[ids] for x in wrapped.sources.T])
+    return [rows, asking, numbers, axes, batch.of_queries, ids, of_system, found.start]
+
+
+@kernel
+def _sorting_callable(dim: int, double: bool, periodic: int) -> Call:
+    """Make a function that XLA calls to sort sources on CUDA, once for a sum and its derivative."""
+    scalar, words = np.float64 if double else np.float32, dict.fromkeys(("ids", "cells", "start", "scratch"), np.int32)
+    name = f"jfrnn_box_sort_{dim}d_{'f64' if double else 'f32'}_{periodic}"
+    given = ("positions", "boxes", "systems", "turning")
+    return Call(name, given, {"axes": scalar} | words, functools.partial(_plan_sorting, dim, double, periodic))
+
+
+def _plan_sorting(dim: int, double: bool, periodic: int, shapes: Shapes, multiprocessors: int) -> Plan:
+    n, systems, cells = shapes["positions"][0], shapes["turning"][0], shapes["start"][0] - 1
+    launches = boxes.sorting_kernels(dim, double, periodic).launches(n, cells, multiprocessors)
+    clear = [Clear("scratch", 4 * boxes.scratch_words(n, systems, cells)[1]), Clear("start", 4 * (cells + 1))]
+    numbers = {"n": n, "boxed": systems, "stride": shapes["axes"][1], "size": cells}
+    return Plan([*clear, *(Launch(kernel, threads) for kernel, threads in launches)], numbers)
 
 
 def _numbers(search: Search, lattice: Lattice, wrapped: Wrapped) -> Array:
@@ -120,14 +142,14 @@ def box_sums(
         call_sums = _sum_callable(_SumVariant(dim, double, cutoff.scaled, *flags, key, cuda), term)
         results = SumsOf(term, m, boxes.slots(m, cuda), compensated, extremes)
 
-        def call(*given: Array) -> FoundSums:
-            return results.unpack(*call_sums(*given, output_dims=results.dims() | {"info": 2})[: len(_SUMS)])
+        def call(search: Search, shared: Array, own: Array, others: Array) -> FoundSums:
+            given = _operands(search, cuda)
+            columns = _sorted_columns(search, term, others, given[_GIVEN.index("ids")])
+            return results.unpack(*call_sums(*given, shared, own, columns, output_dims=results.dims() | {"info": 2})[: len(_SUMS)])
 
         return call
 
-    given = _operands(search)
-    columns = _sorted_columns(search, term, others, given[_GIVEN.index("ids")])
-    return lax.platform_dependent(*given, shared, own, columns, cpu=on(False), cuda=on(True))
+    return lax.platform_dependent(search._replace(checks={}), shared, own, others, cpu=on(False), cuda=on(True))
 
 
 def _sorted_columns(search: Search, term: TermText, others: Array, ids: Array) -> Array:

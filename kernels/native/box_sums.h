@@ -6,15 +6,14 @@
 #include "box_pairs.h"
 
 struct BoxSumArguments {
-    const real *positions, *queries, *boxes, *axes, *asked, *shared_values, *own_values, *columns;
-    const int *ids, *order, *visits, *cells, *start;
+    const real *positions, *queries, *boxes, *axes, *shared_values, *own_values, *columns;
+    const int *systems, *ids, *cells, *start;
     real *sums, *totals, *errors, *more;
     int* info;
     int n, m, stride, own, closed, drop_self;
 
     JFRNN_MEMBER BoxArguments of_search() const {
-        return {positions, queries, boxes, axes,    asked,   ids,    order, visits, cells, start,
-                nullptr,   nullptr, info,  n,       m,       stride, own,   0,      closed, drop_self,
-                0};
+        return {positions, queries, boxes, axes, systems, ids, cells, start, nullptr, nullptr, info, n, m, stride, own, 0, closed,
+            drop_self, 0};
     }
 };

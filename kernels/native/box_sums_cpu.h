@@ -57,7 +57,8 @@ struct BoxSums : BoxLanes {
         if constexpr (FLUSHED)
             floats.keep();
     }
-    void add(const BoxRun& run, int at, unsigned int pairs, const Term& term, const Term::Own& own_part, Reduction& reduction) const {
+    void add(
+        const BoxRun& run, int at, unsigned int pairs, const Term& term, const Term::Own& own_part, Reduction& reduction) const {
         number points[3] = {number{}, number{}, number{}}, summand[SUMMANDS];
         for (int k = 0; k < DIM; ++k)
             points[k] = lanes_from(axes + (long long)k * stride + at);

@@ -45,7 +45,7 @@ struct Kept : KeptArguments, Space {
     // Where lattice vectors lie along the axes: their lengths, and the reciprocals; 0 where space is open. No store can change them.
     real sides[3], units[3];
 
-    int system;            // whose lattice it is
+    int system;  // whose lattice it is
 
     // `row` is the first one that is looked at.
     JFRNN_MEMBER explicit Kept(const KeptArguments& given, int row = 0)

@@ -11,8 +11,8 @@ struct MaskArguments {
     int m, n, capacity, images, closed, apart;
 
     KeptArguments of_list() const {
-        return {
-            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed, apart};
+        return {rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images,
+            closed, apart};
     }
 };
 struct KeptMask : KeptRows<KeptMask> {

@@ -10,8 +10,8 @@ struct KeptSlopesArguments {
     int m, n, capacity, images, closed, apart;
 
     JFRNN_MEMBER KeptArguments of_list() const {
-        return {
-            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed, apart};
+        return {rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images,
+            closed, apart};
     }
 };
 struct KeptSlopes : KeptLane {

@@ -11,8 +11,8 @@ struct KeptSumsArguments {
     int m, n, capacity, images, closed, apart;
 
     JFRNN_MEMBER KeptArguments of_list() const {
-        return {
-            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed, apart};
+        return {rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images,
+            closed, apart};
     }
 };
 struct KeptSums : KeptLane {

@@ -12,8 +12,8 @@ struct KeptSumsArguments {
     int m, n, capacity, images, closed, apart;
 
     KeptArguments of_list() const {
-        return {
-            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed, apart};
+        return {rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images,
+            closed, apart};
     }
 };
 struct KeptSums : KeptRows<KeptSums> {
