@@ -136,14 +136,14 @@ def _complete(matrix: Array, periodic: tuple[bool, ...]) -> Array:
 
 def _inverse(matrix: Array) -> Array:
     """Invert a [d, d] matrix by cofactors of its scaled rows, followed by one Newton step."""
-    size = jnp.max(jnp.abs(matrix), axis=1, keepdims=True)
+    size = largest_of(jnp.abs(matrix))[:, None]
     rows = matrix / size
     if len(matrix) == 2:
         adjugate = jnp.stack([jnp.stack([rows[1, 1], -rows[0, 1]]), jnp.stack([-rows[1, 0], rows[0, 0]])])
     else:
         adjugate = jnp.stack([jnp.cross(rows[k - 2], rows[k - 1]) for k in range(3)], axis=1)
-    inverse = adjugate / jnp.sum(rows[0] * adjugate[:, 0])
-    inverse = inverse @ (2 * jnp.eye(len(rows), dtype=rows.dtype) - product(rows, inverse))
+    inverse = adjugate / add_rows((rows[0] * adjugate[:, 0])[:, None])[0]
+    inverse = product(inverse, 2 * jnp.eye(len(rows), dtype=rows.dtype) - product(rows, inverse))
     return inverse / size.T
 
 
@@ -154,7 +154,18 @@ def _diagonal(matrix: Array) -> Array:
 
 
 def product(a: Array, b: Array) -> Array:
-    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)  # without a matmul, which GPUs may compute in fewer bits
+    """Return the matrix product, without a matmul, which GPUs may compute in fewer bits."""
+    return functools.reduce(jnp.add, (a[..., :, k, None] * b[..., None, k, :] for k in range(b.shape[-2])))
+
+
+def add_rows(matrix: Array) -> Array:
+    """Return the sum of the rows of [..., d, d], without a reduction, which XLA might not fuse."""
+    return functools.reduce(jnp.add, (matrix[..., k, :] for k in range(matrix.shape[-2])))
+
+
+def largest_of(x: Array) -> Array:
+    """Return the largest number of [..., d], likewise."""
+    return functools.reduce(jnp.maximum, (x[..., k] for k in range(x.shape[-1])))
 
 
 def is_valid(lattice: Lattice) -> Array:
@@ -172,7 +183,7 @@ def fractions_of(points: Array, lattice: Lattice) -> Array:
     if lattice.images.orthogonal:
         return from_origin * lattice.spread(_diagonal(lattice.transform), 2)
     if lattice.transform.ndim == 3:
-        return jnp.sum(from_origin[:, :, None] * lattice.transform, axis=1)
+        return add_rows(from_origin[:, :, None] * lattice.transform)
     return product(from_origin, lattice.transform) if len(points) else from_origin
 
 
