@@ -153,6 +153,26 @@ def test_derivatives_in_positions_and_boxes(way):
     assert not np.asarray(gradient[1])[1].any()  # no particle is in that system
 
 
+@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW), pytest.param("brute", marks=SLOW)])
+def test_known_numbers_of_neighbors_at_long_cutoffs(backend):
+    """Diamond, 2 atoms in its primitive cell, at 95 bohr; and single particles in cubic cells, whose neighbors integers count."""
+    edge, cutoff = 3.567, 95 * 0.529177210903
+    diamond = edge / 2 * np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 0.0]])
+    boxes = np.stack([diamond, 3.0 * np.eye(3), diamond, 60.0 * np.eye(3)])
+    atoms = (
+        edge / 4 * np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.5, 0.5, 0.5], [0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
+    )
+    away = np.arange(-17, 18) ** 2
+    cubic = int((9 * (away[:, None, None] + away[:, None] + away) < cutoff**2).sum()) - 1
+    given = {"box": jfrnn.Box(boxes), "batch": np.array([0, 0, 1, 2, 2, 3]), "backend": backend}
+    assert jfrnn.count(atoms, cutoff, **given).tolist() == [94004, 94004, cubic, 94004, 94004, 0]
+    if backend == "warp":
+        nbrs = jfrnn.search(atoms, cutoff, **given)
+        np.testing.assert_array_equal(nbrs.distances(atoms)[1].sum(axis=1), [94004, 94004, cubic, 94004, 94004, 0])
+        listed = nbrs.shifts(atoms)[2][: int(nbrs.count[2])]
+        assert len(np.unique(listed, axis=0)) == cubic
+
+
 def test_one_program_serves_other_boxes_and_flags():
     x, batch, traces = jnp.asarray(np.random.default_rng(2).uniform(-2, 2, (30, 2))), np.arange(30, dtype=np.int32) % 4, []
 
