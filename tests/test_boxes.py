@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from test_box import masked_images
+from test_box import LONG, masked_images
+from test_box import oracle as lattice_oracle
 
 import jfrnn
 from jfrnn.cases.crystals import CRYSTAL_CASES
@@ -171,6 +172,46 @@ def test_known_numbers_of_neighbors_at_long_cutoffs(backend):
         np.testing.assert_array_equal(nbrs.distances(atoms)[1].sum(axis=1), [94004, 94004, cubic, 94004, 94004, 0])
         listed = nbrs.shifts(atoms)[2][: int(nbrs.count[2])]
         assert len(np.unique(listed, axis=0)) == cubic
+
+
+@pytest.mark.parametrize(
+    ("backend", "options"),
+    [
+        pytest.param("warp", {}, marks=SLOW),
+        pytest.param("warp", {"half": True}, marks=SLOW),
+        pytest.param("jax", {}, marks=SLOW),
+        pytest.param("jax", {"half": True}, marks=SLOW),
+        pytest.param("brute", {}, marks=SLOW),
+    ],
+    ids=str,
+)
+def test_lattices_far_from_reduced(backend, options):
+    """Short vectors are found for each system that needs them, and are data: other boxes take the same program."""
+    rng, dtype, traces = np.random.default_rng(0), np.float32, []
+    batch = np.array([0] * 8 + [1] * 6 + [2] * 7)[rng.permutation(21)].astype(np.int32)
+    plain = np.array([[1.1, 0.0, 0.0], [0.2, 1.3, 0.0], [-0.1, 0.3, 1.2]])
+    slanted = np.array([[1.0, 0.0, 0.0], [0.1, 1.1, 0.0], [40.2, -27.1, 0.9]])
+
+    @jax.jit
+    def search(x, box):
+        traces.append(None)
+        return jfrnn.search(x, 0.6, box=box, batch=batch, capacity=64, backend=backend, **options)
+
+    for boxes in ([LONG, plain, slanted], [plain, LONG, LONG]):
+        boxes = np.stack(boxes).astype(dtype)
+        whole = rng.integers(-2, 3, (21, 3))
+        x = jnp.asarray(np.einsum("nd,ndk->nk", rng.uniform(0, 1, (21, 3)) + whole, boxes[batch]), dtype)
+        nbrs = search(x, jfrnn.Box(boxes, images=2))
+        nbrs.check()
+        expected = set()
+        for system, matrix in enumerate(boxes):
+            ends = np.flatnonzero(batch == system)
+            pairs = lattice_oracle(x[ends], 0.6, matrix, **options)
+            expected |= {(int(ends[i]), int(ends[j]), shift) for i, j, shift in pairs}
+        assert masked_images(nbrs, x) == expected
+        assert int(nbrs.count.sum()) == len(expected) > 30
+    assert len(traces) == 1
+    assert jfrnn.Box([plain, plain]).numbers is None
 
 
 def test_one_program_serves_other_boxes_and_flags():

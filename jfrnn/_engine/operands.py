@@ -56,7 +56,9 @@ def lattice_numbers(lattice: Lattice, reach: Array, slack: Array, flags: Array |
     parts = [jnp.pad(lattice.matrix, square), jnp.pad(lattice.transform, square), jnp.pad(lattice.origin, line)]
     parts += [jnp.pad(reach, line, constant_values=1), jnp.pad(images, line), slack]
     if not lattice.images.orthogonal:
-        parts += [jnp.pad(lattice.given, square), jnp.pad(lattice.images.numbers.astype(images.dtype), square)]
+        dim = lattice.dim
+        numbers = lattice.given[dim:] if lattice.images.short else lattice.images.numbers.astype(images.dtype)
+        parts += [jnp.pad(lattice.given[:dim], square), jnp.pad(numbers, square)]
     return jnp.concatenate([part.reshape(-1) for part in parts])
 
 

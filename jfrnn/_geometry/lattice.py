@@ -17,7 +17,6 @@ from jfrnn._geometry.box import Box
 from jfrnn._geometry.exact import Shifted
 from jfrnn._geometry.floats import WHOLE_BITS, distill, half_mantissa
 from jfrnn._geometry.images import Images
-from jfrnn._geometry.reduced import Basis
 
 
 @jax.tree_util.register_dataclass
@@ -29,8 +28,9 @@ class Lattice:
 
     Attributes:
         matrix: [d, d] lattice vectors that shifts count, one per row; rows of open axes are 0. Short, rounded vectors if `images`
-            has a basis.
-        given: [d, d] lattice vectors that the user gave; exact decisions use these.
+            has a basis, or each system.
+        given: [d, d] lattice vectors that the user gave; exact decisions use these. If `images.short`, [2 d, d]: behind them stands
+            how many of each make up a vector of `matrix`, whole floats.
         transform: [d, d]; (x - origin) @ transform are fractional coordinates along periodic axes, lengths along open ones.
         origin: [d] a corner of the cell.
         flags: [d] which axes are periodic, if that differs among many boxes; else None, and `images` tells.
@@ -74,12 +74,13 @@ def make_lattice(box: Box, images: Images, dtype: np.dtype) -> Lattice:
     """Round a box, or one per system, to a dtype once and compute its transform."""
     vectors, origin = jnp.asarray(box.vectors).astype(dtype), jnp.asarray(box.origin).astype(dtype)
     if not box.per_system:
-        return Lattice(*_make(vectors, None, box, images), origin, None, images)
-    arrays = jax.vmap(lambda vectors, flags: _make(vectors, flags, box, images))(vectors, box.flags)
+        return Lattice(*_make(vectors, None, None, box, images), origin, None, images)
+    numbers = None if box.numbers is None or not images.short else lax.stop_gradient(jnp.asarray(box.numbers).astype(dtype))
+    arrays = jax.vmap(lambda *of_system: _make(*of_system, box, images))(vectors, box.flags, numbers)
     return Lattice(*arrays, origin, None if box.flags is None else jnp.asarray(box.flags), images)
 
 
-def _make(vectors: Array, flags: Array | None, box: Box, images: Images) -> tuple[Array, Array, Array]:
+def _make(vectors: Array, flags: Array | None, numbers: Array | None, box: Box, images: Images) -> tuple[Array, Array, Array]:
     """Return the vectors that shifts count, the given ones and the transform of one box."""
     periodic = np.array(box.periodic) if flags is None else flags
     rows = jnp.diag(vectors) if box.orthogonal else vectors
@@ -87,23 +88,24 @@ def _make(vectors: Array, flags: Array | None, box: Box, images: Images) -> tupl
     if box.orthogonal:
         return matrix, given, jnp.diag(1 / jnp.where(periodic, vectors, 1))
     if images.basis is not None:
-        matrix = combine(images.basis, given)
+        matrix = combine(np.array(images.basis), given)
+    if numbers is not None:
+        matrix, given = combine(numbers.astype(jnp.int32), given), jnp.concatenate([given, numbers])
     if flags is None:
         return matrix, given, _inverse(_complete(matrix, box.periodic))
-    whole = matrix = lax.stop_gradient(matrix)
+    whole = fixed = lax.stop_gradient(matrix)
     for axes in itertools.product((False, True), repeat=len(periodic)):
-        whole = jnp.where((flags == np.array(axes)).all(), _complete(matrix, axes), whole)
-    return given, given, _inverse(whole)
+        whole = jnp.where((flags == np.array(axes)).all(), _complete(fixed, axes), whole)
+    return matrix, given, _inverse(whole)
 
 
-def combine(basis: Basis, matrix: Array) -> Array:
-    """Return basis @ matrix, the short vectors, with about one rounding per component; differentiable."""
-    whole = np.array(basis)
+def combine(whole: np.ndarray | Array, matrix: Array) -> Array:
+    """Return whole @ matrix, the short vectors of a basis, with about one rounding per component; differentiable."""
     high = (whole + (1 << (WHOLE_BITS - 1))) >> WHOLE_BITS
     half = half_mantissa(lax.stop_gradient(matrix))
     terms = []
     for numbers, size in ((whole - (high << WHOLE_BITS), 1), (high, 2**WHOLE_BITS)):
-        if numbers.any():
+        if isinstance(numbers, Array) or numbers.any():
             times = numbers.astype(matrix.dtype)
             terms += [times[:, k, None] * (part[k] * size)[None] for k in range(len(whole)) for part in (matrix - half, half)]
     for _ in range(3):
@@ -211,18 +213,21 @@ def shift_pairs(difference: Array, shifts: Array, lattice: Lattice) -> Shifted:
     return Shifted(vectors, shifts, slack, fixed.given, lattice.images.orthogonal, lattice.images.basis)
 
 
-def given_shifts(shifts: Array, images: Images) -> Array:
+def given_shifts(shifts: Array, lattice: Lattice) -> Array:
     """Return shifts [..., d] of whole numbers in terms of the given lattice vectors, int32."""
-    counts = shifts.astype(jnp.int32)
-    if images.basis is None:
+    counts, images, dim = shifts.astype(jnp.int32), lattice.images, lattice.dim
+    if images.basis is None and not images.short:
         return counts
-    rows = [np.array(row, np.int32).reshape((1,) * (counts.ndim - 1) + (-1,)) for row in images.basis]
+    if images.basis is not None:
+        rows = [np.array(row, np.int32).reshape((1,) * (counts.ndim - 1) + (-1,)) for row in images.basis]
+    else:
+        rows = [lattice.spread(lattice.given[..., dim + k, :], counts.ndim).astype(jnp.int32) for k in range(dim)]
     return functools.reduce(jnp.add, (counts[..., k, None] * row for k, row in enumerate(rows)))
 
 
-def forward_shifts(shifts: Array, images: Images) -> Array:
+def forward_shifts(shifts: Array, lattice: Lattice) -> Array:
     """Return shifts [..., d], negated if needed so that the first nonzero number in the given vectors is positive."""
-    given, backward = given_shifts(shifts, images), jnp.zeros(shifts.shape[:-1], bool)
+    given, backward = given_shifts(shifts, lattice), jnp.zeros(shifts.shape[:-1], bool)
     for k in reversed(range(shifts.shape[-1])):
         backward = (given[..., k] < 0) | ((given[..., k] == 0) & backward)
     return jnp.where(backward[..., None], -shifts, shifts)

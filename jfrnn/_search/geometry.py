@@ -38,7 +38,7 @@ class ImageCodes(NamedTuple):
 
     Attributes:
         codes: Index among the shifts within reach, for wrapped positions, shape [m, capacity]: uint8 for up to 256 images, int16
-            for up to 32 768, else int32. Shifts and turns count the vectors of `Images.basis`.
+            for up to 32 768, else int32. Shifts and turns count the vectors of `Images.basis`, or of `Box.numbers`.
         turns: How many lattice vectors each source was from the box when the list was made, packed, shape [n], int32.
         query_turns: Likewise for queries, shape [m], int32; None if the sources are the queries.
     """
@@ -126,9 +126,11 @@ def _find_slots(
         image = jnp.where(used, codes.codes.astype(jnp.int32), lattice.images.home)
         shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)[image] + query_turns[:, None] - turns[neighbor]
     kind = lattice.images
-    if half and kind.basis is not None:  # of a particle's two opposite images, keep the forward one in the given vectors
+    if half and (
+        kind.basis is not None or kind.short
+    ):  # of a particle's two opposite images, keep the forward one in the given vectors
         own = neighbor == lax.broadcasted_iota(jnp.int32, idx.shape, 0)
-        shifts = jnp.where(own[..., None], forward_shifts(shifts, kind), shifts)
+        shifts = jnp.where(own[..., None], forward_shifts(shifts, lattice), shifts)
     most = 2 * LARGEST_TURN + max(kind.reach)  # at larger distances no pair is decided exactly
     used = used & (jnp.abs(shifts) <= most).all(axis=-1)
     return _Slots(used, neighbor, difference, jnp.where(used[..., None], shifts, 0))
@@ -148,7 +150,7 @@ def lattice_shifts(
 ) -> Array:
     lattice, of_sources = _lattices(box, kind, np.dtype(sources.dtype), batch, topology.native)
     slots = _find_slots(topology, count, images, sources, rows, lattice, half, of_sources)
-    return given_shifts(lax.stop_gradient(slots.shifts), kind)
+    return given_shifts(lax.stop_gradient(slots.shifts), lattice)
 
 
 def _lattices(box: Box, kind: Images, dtype: np.dtype, batch: Batch | None, native: bool) -> tuple[Lattice, Lattice]:
@@ -192,7 +194,7 @@ def is_native(topology: Topology, kind: Images | None, half: bool) -> bool:
 
     They do not in half lists of short vectors, whose images JAX chooses.
     """
-    return topology.native and not (kind is not None and half and kind.basis is not None)
+    return topology.native and not (kind is not None and half and (kind.basis is not None or kind.short))
 
 
 def kept_list(
