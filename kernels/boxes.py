@@ -10,12 +10,11 @@ from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
 QUERIES_AT_ONCE = 64  # that a thread of the CPU takes
 PADDING = 16  # sources behind the last one that may be read
-LANES = 16  # of CUDA that serve a query
-_BLOCK = 128
-BLOCKS = 8  # that share a multiprocessor: what decides exactly may spill registers, it is rare
+_BLOCK = 32  # one warp: others need not wait for it to end
+BLOCKS = 20  # that share a multiprocessor: what decides exactly may spill registers, it is rare
 
 
-FILL, FINE = 4, 1  # sources of a cell on CUDA, at least, and cells per cutoff along periodic axes
+FILL, FINE = 8, 2  # sources of a cell on CUDA, at least, and cells per cutoff along periodic axes
 _LAID_AT_ONCE = 1024  # systems whose cells are laid out at once
 _HEADER = 16  # words
 
@@ -70,7 +69,7 @@ def rows_kernel(dim: int, double: bool, scaled: bool, lists: bool, periodic: int
 
 
 def _constants(periodic: int, scaled: bool, lists: bool) -> dict[str, int]:
-    return {"PERIODIC": periodic, "SCALED": scaled, "LIST": lists, "QUERY_CHUNK": QUERIES_AT_ONCE, "LANES_PER_ROW": LANES}
+    return {"PERIODIC": periodic, "SCALED": scaled, "LIST": lists, "QUERY_CHUNK": QUERIES_AT_ONCE}
 
 
 @functools.lru_cache(512)
@@ -91,9 +90,9 @@ def sum_kernel(
 
 def slots(queries: int, cuda: bool) -> int:
     """Return the number of partial sums that make up a sum over all pairs."""
-    return -(-queries // (32 // LANES if cuda else QUERIES_AT_ONCE))
+    return -(-queries // (_BLOCK if cuda else QUERIES_AT_ONCE))
 
 
 def threads(queries: int) -> int:
     """Return the threads of a launch on CUDA."""
-    return 32 * slots(queries, cuda=True)
+    return _BLOCK * slots(queries, cuda=True)

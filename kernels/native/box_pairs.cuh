@@ -1,87 +1,109 @@
-// Pairs in systems with boxes of their own on CUDA: LANES_PER_ROW lanes of a warp have a query.
+// Pairs in systems with boxes of their own on CUDA: a warp serves 32 queries that follow each other, and so are close.
 //
-// Each lane finds a run. Then all of them meet the sources of one run after the other or, where runs are short, since systems have few
-// particles and many images, each lane those of its own. Queries of a warp walk together, as long as any of them has something left.
-// `Visitor`, the struct that derives from this one, has a member `meet(run, number)`, which all lanes call together: each with the
-// source of a number in a run, if there is one.
+// Those of one system visit what any of them has within reach. Each lane finds a run; then all of them meet the sources of one run
+// after the other, 32 at a time, each lane as its own query. What becomes of the pairs is said by `Visitor`, the struct that derives
+// from this one: all lanes together call its member `take(run, at, size, hits)`, with a bit for each of `size` sources from the place
+// `at` on.
 #pragma once
 #include "box_pairs.h"
 
 template <class Visitor>
-struct BoxLanes : BoxPairs {
-    static constexpr unsigned int EVERY = 0xffffffffu, OF_QUERY = EVERY >> (32 - LANES_PER_ROW);
-    const int lane, first_lane;  // among those of its query, and the first of them in the warp
+struct BoxWarp : BoxPairs {
+    static constexpr unsigned int EVERY = 0xffffffffu;
+    static constexpr int UNROLLED = 8;  // sources whose coordinates are loaded at once; so many may be read behind the last one
+    const int lane;
     const bool is_query;
+    bool is_asking;  // it has a system, and something to visit
 
-    JFRNN_MEMBER explicit BoxLanes(const BoxArguments& given)
-        : BoxPairs(given),
-          lane(threadIdx.x % LANES_PER_ROW),
-          first_lane((threadIdx.x & 31) - lane),
-          is_query(thread_index() / LANES_PER_ROW < given.m) {}
+    JFRNN_MEMBER explicit BoxWarp(const BoxArguments& given)
+        : BoxPairs(given), lane(threadIdx.x & 31), is_query(thread_index() < given.m), is_asking(false) {}
 
-    JFRNN_MEMBER void walk() {
-        for (int r = 0; __any_sync(EVERY, r < runs); r += LANES_PER_ROW) {
-            BoxRun mine{0, 0, 0, {0, 0, 0}, {0, 0, 0}};
-            if (r + lane < runs)
-                mine = run_at(r + lane);
-            const int longest = __reduce_max_sync(EVERY, mine.size);
-            if (longest < __reduce_max_sync(EVERY, sum_of((mine.size + LANES_PER_ROW - 1) / LANES_PER_ROW)))
-                for (int b = 0; b < longest; ++b)
-                    ((Visitor*)this)->meet(mine, b);
-            else
-                meet_in_turn(mine);
-        }
-    }
     JFRNN_MEMBER void go_to_own() {
-        go_to(is_query ? (int)(thread_index() / LANES_PER_ROW) : 0);
-        runs = is_query ? runs : 0;
+        go_to(is_query ? (int)thread_index() : 0);
+        is_asking = is_query && runs > 0;
     }
-    // The sum over the lanes of a query.
-    JFRNN_FUNCTION int sum_of(int number) {
-        for (int step = LANES_PER_ROW / 2; step > 0; step /= 2)
-            number += __shfl_xor_sync(EVERY, number, step);
-        return number;
-    }
-    JFRNN_MEMBER unsigned int of_query(unsigned int bits) const { return bits >> first_lane & OF_QUERY; }
-    // Lets all lanes meet the run of one lane after the other.
-    JFRNN_MEMBER void meet_in_turn(const BoxRun& mine) {
-        unsigned int left = of_query(__ballot_sync(EVERY, mine.size > 0));
-        for (; __any_sync(EVERY, left); left &= left - 1) {
-            const int other = first_lane + (left ? __ffs(left) - 1 : 0);
-            BoxRun run;
-            run.from = __shfl_sync(EVERY, mine.from, other);
-            run.size = __shfl_sync(EVERY, mine.size, other);
-            run.code = __shfl_sync(EVERY, mine.code, other);
-            for (int k = 0; k < 3; ++k) {
-                run.away[k] = k < DIM ? __shfl_sync(EVERY, mine.away[k], other) : real(0);
-                run.shift[k] = SUMS > 0 && k < DIM ? __shfl_sync(EVERY, mine.shift[k], other) : 0;
+    // Serves all queries, system by system.
+    JFRNN_MEMBER void walk() {
+        int from[3], to[3];
+        for (int k = 0; k < 3; ++k) {
+            from[k] = low[k];
+            to[k] = low[k] + visited[k];
+        }
+        const int own_system = system;
+        unsigned int left = __ballot_sync(EVERY, is_asking);
+        while (left) {
+            const int chosen = __shfl_sync(EVERY, own_system, __ffs(left) - 1);
+            const bool among = is_asking && own_system == chosen;
+            left &= ~__ballot_sync(EVERY, among);
+            if (system != chosen)
+                enter(chosen);
+            for (int k = 0; k < DIM; ++k) {
+                low[k] = __reduce_min_sync(EVERY, among ? from[k] : 0x7fffffff);
+                visited[k] = __reduce_max_sync(EVERY, among ? to[k] : -0x7fffffff) - low[k];
+                if (!is_turning(k))
+                    visited[k] = visited[k] < counts[k] ? visited[k] : counts[k];
             }
-            run.size = left ? run.size : 0;
-            const int longest = LANES_PER_ROW == 32 ? run.size : __reduce_max_sync(EVERY, run.size);
-            for (int b = 0; b < longest; b += LANES_PER_ROW)
-                ((Visitor*)this)->meet(run, b + lane);
+            walk_runs(among);
         }
     }
-    // Says whether the source of a number in a run is a pair, and which one it is, if that is needed.
-    JFRNN_MEMBER bool is_met(const BoxRun& run, int number, bool named, int& source) const {
-        if (number >= run.size)
-            return false;
-        const int at = run.from + number;
-        real square = 0;
-#pragma unroll
-        for (int k = 0; k < DIM; ++k) {
-            real d = axes[(long long)k * stride + at] + run.away[k];
-            if constexpr (SCALED)
-                d *= step_scale;
-            square += d * d;
+    JFRNN_MEMBER void walk_runs(bool among) {
+        const int all = count_runs();
+        for (int r = 0; r < all; r += 32) {
+            BoxRun some{0, 0, 0, {0, 0, 0}, {0, 0, 0}};
+            if (r + lane < all)
+                some = run_at(r + lane);
+            for (unsigned int there = __ballot_sync(EVERY, some.size > 0); there; there &= there - 1) {
+                const BoxRun run = run_of(some, __ffs(there) - 1);
+                for (int b = 0; b < run.size; b += 32)
+                    meet(run, b, among);
+            }
         }
-        const bool asked = !(drop_self && run.code == at_home && at == place);
-        bool hit = asked && square < inside;
-        const bool open = asked && !hit && square <= outside;
-        if (later_only || open || (named && hit))
-            source = ids[at];
-        if (open)
-            hit = is_pair(source, run.code);
-        return hit && !(later_only && source < first_asked(run.code));
+    }
+    // What another lane has found.
+    JFRNN_FUNCTION BoxRun run_of(const BoxRun& some, int other) {
+        BoxRun run;
+        run.from = __shfl_sync(EVERY, some.from, other);
+        run.size = __shfl_sync(EVERY, some.size, other);
+        run.code = __shfl_sync(EVERY, some.code, other);
+        for (int k = 0; k < 3; ++k) {
+            run.moved[k] = k < DIM ? __shfl_sync(EVERY, some.moved[k], other) : real(0);
+            run.shift[k] = SUMS > 0 && k < DIM ? __shfl_sync(EVERY, some.shift[k], other) : 0;
+        }
+        return run;
+    }
+    // Lets each query meet the sources of a run from number b on, up to 32.
+    JFRNN_MEMBER void meet(const BoxRun& run, int b, bool among) {
+        const int at = run.from + b, size = run.size - b < 32 ? run.size - b : 32;
+        const real* const first = axes + at;
+        unsigned int hits = 0, open = 0;
+        for (int c = 0; c < size; c += UNROLLED)
+#pragma unroll
+            for (int e = 0; e < UNROLLED; ++e) {
+                real square = 0;
+#pragma unroll
+                for (int k = 0; k < DIM; ++k) {
+                    real d = first[(long long)k * stride + c + e] + (run.moved[k] - q[k]);
+                    if constexpr (SCALED)
+                        d *= step_scale;
+                    square += d * d;
+                }
+                const unsigned int bit = 1u << (c + e);
+                hits |= square < inside ? bit : 0;
+                open |= square <= outside ? bit : 0;
+            }
+        unsigned int asked = among ? EVERY >> (32 - size) : 0;
+        if (drop_self && run.code == at_home && place >= at && place < at + size)
+            asked &= ~(1u << (place - at));
+        hits &= asked;
+        for (open &= asked & ~hits; open; open &= open - 1) {
+            const int c = __ffs(open) - 1;
+            hits |= is_pair(ids[at + c], run.code) ? 1u << c : 0;
+        }
+        for (unsigned int some = later_only ? hits : 0; some; some &= some - 1) {
+            const int c = __ffs(some) - 1;
+            hits &= ids[at + c] >= first_asked(run.code) ? EVERY : ~(1u << c);
+        }
+        __syncwarp();
+        ((Visitor*)this)->take(run, at, size, hits);
     }
 };

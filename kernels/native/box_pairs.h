@@ -17,8 +17,8 @@ struct BoxArguments {
 // The sources of a row of cells, in one image.
 struct BoxRun {
     int from, size, code;
-    int shift[3];  // of the image
-    real away[3];  // from the query to where the origin of the image is
+    int shift[3];   // of the image
+    real moved[3];  // by which sources are moved into it
 };
 
 struct BoxPairs : BoxArguments, BoxSpace {
@@ -44,16 +44,17 @@ struct BoxPairs : BoxArguments, BoxSpace {
         if (systems[query] != system)
             enter(systems[query]);
         point_of(queries + (long long)ROW * query, q);
-        int rows = 1;
         for (int k = 0; k < 3; ++k) {
             low[k] = 0;
             visited[k] = 1;
             if (k < DIM)
                 visit(k);
-            rows *= k > 0 ? visited[k] : 1;
         }
+        runs = finite_point(q) ? count_runs() : 0;
+    }
+    JFRNN_MEMBER int count_runs() const {
         const int pieces = floor_of(low[0] + visited[0] - 1, counts[0]) - floor_of(low[0], counts[0]) + 1;
-        runs = visited[0] > 0 && finite_point(q) ? rows * pieces : 0;
+        return visited[0] > 0 ? pieces * visited[1] * visited[2] : 0;
     }
     JFRNN_MEMBER void visit(int k) {
         constexpr int LARGEST_TURN = 511;  // as in jfrnn/_geometry/images.py
@@ -107,7 +108,7 @@ struct BoxPairs : BoxArguments, BoxSpace {
             run.code = run.code * (2 * lattice.images(k) + 1) + shift[k] + lattice.images(k);
         }
         for (int k = 0; k < 3; ++k)
-            run.away[k] = k < DIM ? lattice.translation(shift[0], shift[1], shift[2], k) - q[k] : real(0);
+            run.moved[k] = k < DIM ? lattice.translation(shift[0], shift[1], shift[2], k) : real(0);
         return run;
     }
     // The smallest source that a query asks for in an image: of its own images, half lists have those ahead.

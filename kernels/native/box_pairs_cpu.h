@@ -15,7 +15,7 @@ struct BoxLanes : BoxPairs {
         const int at = run.from + b;
         vec square{};
         for (int k = 0; k < DIM; ++k) {
-            vec d = lanes_from(axes + (long long)k * stride + at) + run.away[k];
+            vec d = lanes_from(axes + (long long)k * stride + at) + (run.moved[k] - q[k]);
             if constexpr (SCALED)
                 d *= step_scale;
             square += d * d;

@@ -1,10 +1,10 @@
-// Sums over pairs in systems with boxes of their own on CUDA: a lane evaluates the term for the pairs that it finds.
+// Sums over pairs in systems with boxes of their own on CUDA: the lane of a query evaluates the term for its pairs.
 #pragma once
 #include "box_pairs.cuh"
 #include "box_sums.h"
 #include "reduction.cuh"
 
-struct BoxSums : BoxLanes<BoxSums> {
+struct BoxSums : BoxWarp<BoxSums> {
     const real *own_values, *columns;
     const Term term;
     const Results results;
@@ -12,7 +12,7 @@ struct BoxSums : BoxLanes<BoxSums> {
     Term::Own own_part;
 
     JFRNN_MEMBER explicit BoxSums(const BoxSumArguments& a)
-        : BoxLanes(a.of_search()),
+        : BoxWarp(a.of_search()),
           own_values(a.own_values),
           columns(a.columns),
           term(a.shared_values),
@@ -20,25 +20,23 @@ struct BoxSums : BoxLanes<BoxSums> {
           reduction(a.n) {}
 
     JFRNN_MEMBER void run() {
-        const int lane_of_warp = threadIdx.x & 31;
         const long long warp = thread_index() >> 5;
-        if (warp * (32 / LANES_PER_ROW) >= m)
+        if (32 * warp >= m)
             return;
-        for (int t = lane_of_warp; t < 2 * TOTALS; t += 32)
+        for (int t = lane; t < 2 * TOTALS; t += 32)
             results.totals[2ll * TOTALS * warp + t] = 0;
         __syncwarp();
         go_to_own();
         own_part = term.own(own_values + (long long)query * OWN, q);
         walk();
         __syncwarp();
-        reduction.reduce_over_warp<LANES_PER_ROW>();
-        reduction.store(results, {lane_of_warp, query, (int)warp, is_query && lane == 0, true, true});
+        reduction.store(results, {lane, query, (int)warp, is_query, true, true});
     }
-    JFRNN_MEMBER void meet(const BoxRun& run, int number_in_run) {
-        int source = 0;
-        if (!is_met(run, number_in_run, SUMS == 2, source))
-            return;
-        const int at = run.from + number_in_run;
+    JFRNN_MEMBER void take(const BoxRun& run, int at, int, unsigned int hits) {
+        for (; hits; hits &= hits - 1)
+            add(run, at + __ffs(hits) - 1);
+    }
+    JFRNN_MEMBER void add(const BoxRun& run, int at) {
         number points[3] = {0, 0, 0}, summand[SUMMANDS];
         for (int k = 0; k < DIM; ++k)
             points[k] = axes[(long long)k * stride + at];
@@ -48,8 +46,8 @@ struct BoxSums : BoxLanes<BoxSums> {
             return c < OTHERS ? x : real(axis == 0 ? run.shift[0] : axis == 1 ? run.shift[1] : run.shift[2]) - x;
         };
         term.evaluate(own_part, points, column, summand);
-        reduction.add(summand, true, [&](int& id, int& code) {
-            id = source;
+        reduction.add(summand, true, [&](int& source, int& code) {
+            source = ids[at];
             code = run.code;
         });
     }
