@@ -10,11 +10,12 @@ from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
 QUERIES_AT_ONCE = 64  # that a thread of the CPU takes
 PADDING = 16  # sources behind the last one that may be read
-_BLOCK = 32  # one warp: others need not wait for it to end
-BLOCKS = 20  # that share a multiprocessor: what decides exactly may spill registers, it is rare
+LANES = 16  # of CUDA that serve a query
+_BLOCK = 128
+BLOCKS = 8  # that share a multiprocessor: what decides exactly may spill registers, it is rare
 
 
-FILL, FINE = 8, 2  # sources of a cell on CUDA, at least, and cells per cutoff along periodic axes
+FILL, FINE = 4, 1  # sources of a cell on CUDA, at least, and cells per cutoff along periodic axes
 _LAID_AT_ONCE = 1024  # systems whose cells are laid out at once
 _HEADER = 16  # words
 
@@ -57,19 +58,21 @@ _STAGES = ("count_members", "lay_out", "count_cells", "scan_counts", "scatter", 
 
 
 @functools.lru_cache(64)
-def rows_kernel(dim: int, double: bool, scaled: bool, lists: bool, periodic: int, cuda: bool) -> Kernel:
-    """Return the kernel for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts alone.
+def rows_kernel(dim: int, double: bool, scaled: bool, lists: bool, later: bool, periodic: int, cuda: bool) -> Kernel:
+    """Return the kernel for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts, half lists or whole.
 
     `periodic` is that of `jfrnn.kernels._native.program`.
     """
     where = "cuda" if cuda else "cpu"
-    name = f"box_rows_{where}_{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}{SPACES[periodic]}"
-    text = program(double, dim, "box_rows.cuh" if cuda else "box_rows_cpu.h", **_constants(periodic, scaled, lists), SUMS=0)
+    kind = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}{'_later' * later}"
+    name = f"box_rows_{where}_{kind}{SPACES[periodic]}"
+    text = program(double, dim, "box_rows.cuh" if cuda else "box_rows_cpu.h", **_constants(periodic, scaled, lists, later), SUMS=0)
     return declare(name, text, Entry("BoxRows.run", _BLOCK if cuda else 1, BLOCKS), cuda=cuda, fused=cuda)[0]
 
 
-def _constants(periodic: int, scaled: bool, lists: bool) -> dict[str, int]:
-    return {"PERIODIC": periodic, "SCALED": scaled, "LIST": lists, "QUERY_CHUNK": QUERIES_AT_ONCE}
+def _constants(periodic: int, scaled: bool, lists: bool, later: bool) -> dict[str, int]:
+    found = {"PERIODIC": periodic, "SCALED": scaled, "LIST": lists, "LATER": later}
+    return found | {"QUERY_CHUNK": QUERIES_AT_ONCE, "LANES_PER_ROW": LANES}
 
 
 @functools.lru_cache(512)
@@ -82,7 +85,7 @@ def sum_kernel(
     """
     name = f"box_sums_{'cuda' if cuda else 'cpu'}_{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}"
     name += f"{'_compensated' * compensated}{SPACES[periodic]}{'_extremes' * extremes}_{key}"
-    constants = {**GRID, **_constants(periodic, scaled, False), **constants_of(term, compensated, extremes)}
+    constants = {**GRID, **_constants(periodic, scaled, False, False), **constants_of(term, compensated, extremes)}
     header = "box_sums.cuh" if cuda else "box_sums_cpu.h"
     text = program(double, dim, header, given=term_header(term, double), **constants)
     return declare(name, text, Entry("BoxSums.run", _BLOCK if cuda else 1, BLOCKS), cuda=cuda, fused=cuda)[0]
@@ -90,9 +93,9 @@ def sum_kernel(
 
 def slots(queries: int, cuda: bool) -> int:
     """Return the number of partial sums that make up a sum over all pairs."""
-    return -(-queries // (_BLOCK if cuda else QUERIES_AT_ONCE))
+    return -(-queries // (32 // LANES if cuda else QUERIES_AT_ONCE))
 
 
 def threads(queries: int) -> int:
     """Return the threads of a launch on CUDA."""
-    return _BLOCK * slots(queries, cuda=True)
+    return 32 * slots(queries, cuda=True)

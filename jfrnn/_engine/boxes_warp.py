@@ -97,7 +97,7 @@ def _callable(variant: Variant, cuda: bool) -> Call:
 
 
 def _plan(variant: Variant, cuda: bool, shapes: Shapes, _: int) -> Plan:
-    kind = (variant.dim, variant.double, variant.scaled, variant.lists, variant.periodic)
+    kind = (variant.dim, variant.double, variant.scaled, variant.lists, variant.keep.later_only, variant.periodic)
     found, numbers = boxes.rows_kernel(*kind, cuda), plan_numbers(variant, shapes) | {"stride": shapes["axes"][1]}
     m = numbers["m"]
     launch = Launch(found, boxes.threads(m)) if cuda else share(found, m, boxes.QUERIES_AT_ONCE)

@@ -1,109 +1,102 @@
-// Pairs in systems with boxes of their own on CUDA: a warp serves 32 queries that follow each other, and so are close.
+// Pairs in systems with boxes of their own on CUDA: LANES_PER_ROW lanes of a warp have a query.
 //
-// Those of one system visit what any of them has within reach. Each lane finds a run; then all of them meet the sources of one run
-// after the other, 32 at a time, each lane as its own query. What becomes of the pairs is said by `Visitor`, the struct that derives
-// from this one: all lanes together call its member `take(run, at, size, hits)`, with a bit for each of `size` sources from the place
-// `at` on.
+// Each lane finds a run. Then all of them meet the sources of one run after the other or, where runs are short, since systems have few
+// particles and many images, each lane those of its own. Queries of a warp walk together, as long as any of them has something left.
+// Pairs in doubt are rare: if there are any, all queries of the warp walk once more and decide about these, so that the registers
+// which that takes are not missed before. `Visitor`, the struct that derives from this one, has a member `take(hit, at, run)`, which
+// all lanes call together: each with the place of a source, and whether it is a pair.
 #pragma once
 #include "box_pairs.h"
 
 template <class Visitor>
-struct BoxWarp : BoxPairs {
-    static constexpr unsigned int EVERY = 0xffffffffu;
-    static constexpr int UNROLLED = 8;  // sources whose coordinates are loaded at once; so many may be read behind the last one
-    const int lane;
+struct BoxLanes : BoxPairs {
+    static constexpr unsigned int EVERY = 0xffffffffu, OF_QUERY = EVERY >> (32 - LANES_PER_ROW);
+    const int lane, first_lane;  // among those of its query, and the first of them in the warp
     const bool is_query;
-    bool is_asking;  // it has a system, and something to visit
+    bool in_doubt;  // about a source that this lane has met
 
-    JFRNN_MEMBER explicit BoxWarp(const BoxArguments& given)
-        : BoxPairs(given), lane(threadIdx.x & 31), is_query(thread_index() < given.m), is_asking(false) {}
+    JFRNN_MEMBER explicit BoxLanes(const BoxArguments& given)
+        : BoxPairs(given),
+          lane(threadIdx.x % LANES_PER_ROW),
+          first_lane((threadIdx.x & 31) - lane),
+          is_query(thread_index() / LANES_PER_ROW < given.m),
+          in_doubt(false) {}
 
-    JFRNN_MEMBER void go_to_own() {
-        go_to(is_query ? (int)thread_index() : 0);
-        is_asking = is_query && runs > 0;
-    }
-    // Serves all queries, system by system.
     JFRNN_MEMBER void walk() {
-        int from[3], to[3];
-        for (int k = 0; k < 3; ++k) {
-            from[k] = low[k];
-            to[k] = low[k] + visited[k];
+        ((Visitor*)this)->go_to(is_query ? (int)(thread_index() / LANES_PER_ROW) : 0);
+        runs = is_query ? runs : 0;
+        walk_runs<false>();
+        if (__any_sync(EVERY, in_doubt))
+            walk_runs<true>();
+    }
+    template <bool DECIDES>
+    JFRNN_MEMBER void walk_runs() {
+        for (int r = 0; __any_sync(EVERY, r < runs); r += LANES_PER_ROW) {
+            BoxRun mine{0, 0, 0, {0, 0, 0}, {0, 0, 0}};
+            if (r + lane < runs)
+                mine = run_at(r + lane);
+            const int longest = __reduce_max_sync(EVERY, mine.size);
+            if (longest < __reduce_max_sync(EVERY, sum_of((mine.size + LANES_PER_ROW - 1) / LANES_PER_ROW)))
+                meet<DECIDES>(mine, 0, 1, longest);
+            else
+                meet_in_turn<DECIDES>(mine);
         }
-        const int own_system = system;
-        unsigned int left = __ballot_sync(EVERY, is_asking);
-        while (left) {
-            const int chosen = __shfl_sync(EVERY, own_system, __ffs(left) - 1);
-            const bool among = is_asking && own_system == chosen;
-            left &= ~__ballot_sync(EVERY, among);
-            if (system != chosen)
-                enter(chosen);
+    }
+    // The sum over the lanes of a query.
+    JFRNN_FUNCTION int sum_of(int number) {
+        for (int step = LANES_PER_ROW / 2; step > 0; step /= 2)
+            number += __shfl_xor_sync(EVERY, number, step);
+        return number;
+    }
+    JFRNN_MEMBER unsigned int of_query(unsigned int bits) const { return bits >> first_lane & OF_QUERY; }
+    // Lets all lanes meet the run of one lane after the other.
+    template <bool DECIDES>
+    JFRNN_MEMBER void meet_in_turn(const BoxRun& mine) {
+        unsigned int left = of_query(__ballot_sync(EVERY, mine.size > 0));
+        for (; __any_sync(EVERY, left); left &= left - 1) {
+            const int other = first_lane + (left ? __ffs(left) - 1 : 0);
+            BoxRun run;
+            run.from = __shfl_sync(EVERY, mine.from, other);
+            run.size = __shfl_sync(EVERY, mine.size, other);
+            run.code = __shfl_sync(EVERY, mine.code, other);
+            for (int k = 0; k < 3; ++k) {
+                run.moved[k] = k < DIM ? __shfl_sync(EVERY, mine.moved[k], other) : real(0);
+                run.shift[k] = SUMS > 0 && k < DIM ? __shfl_sync(EVERY, mine.shift[k], other) : 0;
+            }
+            run.size = left ? run.size : 0;
+            meet<DECIDES>(run, lane, LANES_PER_ROW, LANES_PER_ROW == 32 ? run.size : __reduce_max_sync(EVERY, run.size));
+        }
+    }
+    // Lets each lane meet the sources of a run from number `first` on, every one of `step`; for the longest run of all lanes these are
+    // below `longest`.
+    template <bool DECIDES>
+    JFRNN_MEMBER void meet(const BoxRun& run, int first, int step, int longest) {
+        const int itself = drop_self && run.code == at_home ? place - run.from : -1;
+        const real away[3] = {run.moved[0] - q[0], run.moved[1] - q[1], run.moved[2] - q[2]};
+        const real* source = axes + run.from + first;
+        constexpr int TOGETHER = DECIDES ? 1 : 4;  // steps whose sources are loaded at once
+#pragma unroll TOGETHER
+        for (int b = 0; b < longest; b += step) {
+            const int number = first + b;
+            const bool asked = number < run.size & number != itself;
+            const real* const source = axes + run.from + (number < run.size ? number : 0);
+            real square = 0;
+#pragma unroll
             for (int k = 0; k < DIM; ++k) {
-                low[k] = __reduce_min_sync(EVERY, among ? from[k] : 0x7fffffff);
-                visited[k] = __reduce_max_sync(EVERY, among ? to[k] : -0x7fffffff) - low[k];
-                if (!is_turning(k))
-                    visited[k] = visited[k] < counts[k] ? visited[k] : counts[k];
+                real d = source[(long long)k * stride] + away[k];
+                if constexpr (SCALED)
+                    d *= step_scale;
+                square += d * d;
             }
-            walk_runs(among);
+            const bool sure = asked & square < inside, open = asked & square <= outside & !sure;
+            bool hit = DECIDES ? open : sure;
+            if constexpr (DECIDES)
+                hit = hit && is_pair(ids[run.from + number], run.code);
+            else
+                in_doubt |= open;
+            if constexpr (LATER)
+                hit = hit && ids[run.from + number] >= first_asked(run.code);
+            ((Visitor*)this)->take(hit, run.from + number, run);
         }
-    }
-    JFRNN_MEMBER void walk_runs(bool among) {
-        const int all = count_runs();
-        for (int r = 0; r < all; r += 32) {
-            BoxRun some{0, 0, 0, {0, 0, 0}, {0, 0, 0}};
-            if (r + lane < all)
-                some = run_at(r + lane);
-            for (unsigned int there = __ballot_sync(EVERY, some.size > 0); there; there &= there - 1) {
-                const BoxRun run = run_of(some, __ffs(there) - 1);
-                for (int b = 0; b < run.size; b += 32)
-                    meet(run, b, among);
-            }
-        }
-    }
-    // What another lane has found.
-    JFRNN_FUNCTION BoxRun run_of(const BoxRun& some, int other) {
-        BoxRun run;
-        run.from = __shfl_sync(EVERY, some.from, other);
-        run.size = __shfl_sync(EVERY, some.size, other);
-        run.code = __shfl_sync(EVERY, some.code, other);
-        for (int k = 0; k < 3; ++k) {
-            run.moved[k] = k < DIM ? __shfl_sync(EVERY, some.moved[k], other) : real(0);
-            run.shift[k] = SUMS > 0 && k < DIM ? __shfl_sync(EVERY, some.shift[k], other) : 0;
-        }
-        return run;
-    }
-    // Lets each query meet the sources of a run from number b on, up to 32.
-    JFRNN_MEMBER void meet(const BoxRun& run, int b, bool among) {
-        const int at = run.from + b, size = run.size - b < 32 ? run.size - b : 32;
-        const real* const first = axes + at;
-        unsigned int hits = 0, open = 0;
-        for (int c = 0; c < size; c += UNROLLED)
-#pragma unroll
-            for (int e = 0; e < UNROLLED; ++e) {
-                real square = 0;
-#pragma unroll
-                for (int k = 0; k < DIM; ++k) {
-                    real d = first[(long long)k * stride + c + e] + (run.moved[k] - q[k]);
-                    if constexpr (SCALED)
-                        d *= step_scale;
-                    square += d * d;
-                }
-                const unsigned int bit = 1u << (c + e);
-                hits |= square < inside ? bit : 0;
-                open |= square <= outside ? bit : 0;
-            }
-        unsigned int asked = among ? EVERY >> (32 - size) : 0;
-        if (drop_self && run.code == at_home && place >= at && place < at + size)
-            asked &= ~(1u << (place - at));
-        hits &= asked;
-        for (open &= asked & ~hits; open; open &= open - 1) {
-            const int c = __ffs(open) - 1;
-            hits |= is_pair(ids[at + c], run.code) ? 1u << c : 0;
-        }
-        for (unsigned int some = later_only ? hits : 0; some; some &= some - 1) {
-            const int c = __ffs(some) - 1;
-            hits &= ids[at + c] >= first_asked(run.code) ? EVERY : ~(1u << c);
-        }
-        __syncwarp();
-        ((Visitor*)this)->take(run, at, size, hits);
     }
 };

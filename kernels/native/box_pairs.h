@@ -11,7 +11,7 @@ struct BoxArguments {
     const real *positions, *queries, *boxes, *axes;
     const int *systems, *ids, *cells, *start;
     int *idx, *count, *info;
-    int n, m, stride, own, capacity, closed, drop_self, later_only;
+    int n, m, stride, own, capacity, closed, drop_self;
 };
 
 // The sources of a row of cells, in one image.
@@ -113,7 +113,7 @@ struct BoxPairs : BoxArguments, BoxSpace {
     }
     // The smallest source that a query asks for in an image: of its own images, half lists have those ahead.
     JFRNN_MEMBER int first_asked(int code) const {
-        return !later_only ? 0 : code == at_home ? query + drop_self : code < at_home ? query + 1 : query;
+        return !LATER ? 0 : code == at_home ? query + drop_self : code < at_home ? query + 1 : query;
     }
     // Decides exactly.
     JFRNN_MEMBER bool is_pair(int source, int code) const {

@@ -2,38 +2,34 @@
 #pragma once
 #include "box_pairs.cuh"
 
-struct BoxRows : BoxWarp<BoxRows> {
-    int found;  // by the query of this lane
+struct BoxRows : BoxLanes<BoxRows> {
+    int found;  // of the query if they are listed, by this lane if they are counted
 
-    JFRNN_MEMBER explicit BoxRows(const BoxArguments& given) : BoxWarp(given), found(0) {}
+    JFRNN_MEMBER explicit BoxRows(const BoxArguments& given) : BoxLanes(given), found(0) {}
 
     JFRNN_MEMBER void run() {
-        go_to_own();
         walk();
-        const int longest = __reduce_max_sync(EVERY, is_query ? found : 0);
-        if (lane == 0 && longest > *(volatile int*)&info[0])
-            atomicMax(&info[0], longest);
-        if (is_query)
-            count[query] = found;
-        if constexpr (LIST)
-            for (unsigned int there = __ballot_sync(EVERY, is_query && found < capacity); there; there &= there - 1) {
-                const int other = __ffs(there) - 1, row = __shfl_sync(EVERY, query, other);
-                for (int s = __shfl_sync(EVERY, found, other) + lane; s < capacity; s += 32)
-                    idx[(long long)row * capacity + s] = fill_value();
-            }
+        const int all = LIST ? found : sum_of(found);
+        if (!is_query)
+            return;
+        for (int s = all + lane; LIST && s < capacity; s += LANES_PER_ROW)
+            idx[(long long)query * capacity + s] = fill_value();
+        if (lane > 0)
+            return;
+        count[query] = all;
+        if (all > *(volatile int*)&info[0])
+            atomicMax(&info[0], all);
     }
-    // Writes the neighbors of one query after the other, each lane a source.
-    JFRNN_MEMBER void take(const BoxRun& run, int at, int size, unsigned int hits) {
-        if constexpr (LIST) {
-            const int name = lane < size ? name_of(ids[at + lane], run.code) : 0;
-            for (unsigned int there = __ballot_sync(EVERY, hits != 0); there; there &= there - 1) {
-                const int other = __ffs(there) - 1, row = __shfl_sync(EVERY, query, other);
-                const unsigned int bits = __shfl_sync(EVERY, hits, other);
-                const int slot = __shfl_sync(EVERY, found, other) + __popc(bits & ((1u << lane) - 1));
-                if (bits >> lane & 1 && slot < capacity)
-                    idx[(long long)row * capacity + slot] = name;
-            }
+    // Those that are neighbors go into the row, by their lanes.
+    JFRNN_MEMBER void take(bool hit, int at, const BoxRun& run) {
+        if constexpr (!LIST) {
+            found += hit;
+            return;
         }
+        const unsigned int hits = of_query(__ballot_sync(EVERY, hit));
+        const int slot = found + __popc(hits & ((1u << lane) - 1));
+        if (hit && slot < capacity)
+            idx[(long long)query * capacity + slot] = name_of(ids[at], run.code);
         found += __popc(hits);
     }
 };

@@ -39,10 +39,10 @@ struct BoxRows : BoxLanes {
     int meet(const BoxRun& run, int b, int* row, int found) const {
         Tested some = test(run, b);
         decide(run, b, some);
-        if (!LIST && !later_only)
+        if (!LIST && !LATER)
             return __builtin_popcount(some.pairs);
         const ints sources = lanes_from(ids + run.from + b);
-        if (later_only)
+        if constexpr (LATER)
             some.pairs &= bits_of_flags(__builtin_convertvector(sources >= first_asked(run.code), flags));
         if (LIST && some.pairs)
             pack_within(sources + name_of(0, run.code), row + found, some.pairs, capacity - found);

@@ -1,10 +1,10 @@
-// Sums over pairs in systems with boxes of their own on CUDA: the lane of a query evaluates the term for its pairs.
+// Sums over pairs in systems with boxes of their own on CUDA: a lane evaluates the term for the pairs that it finds.
 #pragma once
 #include "box_pairs.cuh"
 #include "box_sums.h"
 #include "reduction.cuh"
 
-struct BoxSums : BoxWarp<BoxSums> {
+struct BoxSums : BoxLanes<BoxSums> {
     const real *own_values, *columns;
     const Term term;
     const Results results;
@@ -12,7 +12,7 @@ struct BoxSums : BoxWarp<BoxSums> {
     Term::Own own_part;
 
     JFRNN_MEMBER explicit BoxSums(const BoxSumArguments& a)
-        : BoxWarp(a.of_search()),
+        : BoxLanes(a.of_search()),
           own_values(a.own_values),
           columns(a.columns),
           term(a.shared_values),
@@ -20,23 +20,25 @@ struct BoxSums : BoxWarp<BoxSums> {
           reduction(a.n) {}
 
     JFRNN_MEMBER void run() {
+        const int lane_of_warp = threadIdx.x & 31;
         const long long warp = thread_index() >> 5;
-        if (32 * warp >= m)
+        if (warp * (32 / LANES_PER_ROW) >= m)
             return;
-        for (int t = lane; t < 2 * TOTALS; t += 32)
+        for (int t = lane_of_warp; t < 2 * TOTALS; t += 32)
             results.totals[2ll * TOTALS * warp + t] = 0;
         __syncwarp();
-        go_to_own();
-        own_part = term.own(own_values + (long long)query * OWN, q);
         walk();
         __syncwarp();
-        reduction.store(results, {lane, query, (int)warp, is_query, true, true});
+        reduction.reduce_over_warp<LANES_PER_ROW>();
+        reduction.store(results, {lane_of_warp, query, (int)warp, is_query && lane == 0, true, true});
     }
-    JFRNN_MEMBER void take(const BoxRun& run, int at, int, unsigned int hits) {
-        for (; hits; hits &= hits - 1)
-            add(run, at + __ffs(hits) - 1);
+    JFRNN_MEMBER void go_to(int turn) {
+        BoxPairs::go_to(turn);
+        own_part = term.own(own_values + (long long)query * OWN, q);
     }
-    JFRNN_MEMBER void add(const BoxRun& run, int at) {
+    JFRNN_MEMBER void take(bool hit, int at, const BoxRun& run) {
+        if (!hit)
+            return;
         number points[3] = {0, 0, 0}, summand[SUMMANDS];
         for (int k = 0; k < DIM; ++k)
             points[k] = axes[(long long)k * stride + at];

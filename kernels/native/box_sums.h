@@ -14,6 +14,6 @@ struct BoxSumArguments {
 
     JFRNN_MEMBER BoxArguments of_search() const {
         return {positions, queries, boxes, axes, systems, ids, cells, start, nullptr, nullptr, info, n, m, stride, own, 0, closed,
-            drop_self, 0};
+            drop_self};
     }
 };
