@@ -49,7 +49,7 @@ class Sorting(NamedTuple):
 def sorting_kernels(dim: int, double: bool, periodic: int) -> Sorting:
     """Return the kernels that sort sources on CUDA; `periodic` is that of `jfrnn.kernels._native.program`."""
     entries = [Entry(f"BoxSort.{name}", _LAID_AT_ONCE if name == "lay_out" else GRID["BLOCK"]) for name in _STAGES]
-    text = program(double, dim, "box_sort.cuh", PERIODIC=periodic, FILL=FILL, FINE=FINE, **GRID)
+    text = program(double, dim, "box_sort.cuh", given={}, PERIODIC=periodic, FILL=FILL, FINE=FINE, **GRID)
     name = f"box_sort_{dim}d_{'f64' if double else 'f32'}{SPACES[periodic]}"
     return Sorting(*declare(name, text, *entries, cuda=True, fused=True))
 
@@ -66,7 +66,8 @@ def rows_kernel(dim: int, double: bool, scaled: bool, lists: bool, later: bool, 
     where = "cuda" if cuda else "cpu"
     kind = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}{'_later' * later}"
     name = f"box_rows_{where}_{kind}{SPACES[periodic]}"
-    text = program(double, dim, "box_rows.cuh" if cuda else "box_rows_cpu.h", **_constants(periodic, scaled, lists, later), SUMS=0)
+    header = "box_rows.cuh" if cuda else "box_rows_cpu.h"
+    text = program(double, dim, header, given={}, SUMS=0, **_constants(periodic, scaled, lists, later))
     return declare(name, text, Entry("BoxRows.run", _BLOCK if cuda else 1, BLOCKS), cuda=cuda, fused=cuda)[0]
 
 

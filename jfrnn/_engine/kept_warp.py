@@ -172,7 +172,7 @@ def _operands(given: KeptList, extra: _Extra, columns: int, others: Array | None
     return [own, points, _numbers_of(given, cutoff), steps, given.idx, given.counts, codes, *reversal, order, systems]
 
 
-def _numbers_of(given: KeptList, cutoff: Array) -> Array:
+def _numbers_of(given: KeptList, cutoff: np.floating | Array) -> Array:
     """Return the cutoff, the numbers of the lattice, and the largest number of a shift; of many lattices, such a row of each."""
     dtype, lattice = given.sources.dtype, given.lattice
     radius = jnp.reshape(jnp.asarray(cutoff, dtype), 1)

@@ -74,10 +74,15 @@ def make_lattice(box: Box, images: Images, dtype: np.dtype) -> Lattice:
     """Round a box, or one per system, to a dtype once and compute its transform."""
     vectors, origin = jnp.asarray(box.vectors).astype(dtype), jnp.asarray(box.origin).astype(dtype)
     if not box.per_system:
-        return Lattice(*_make(vectors, None, None, box, images), origin, None, images)
+        matrix, given, transform = _make(vectors, None, None, box, images)
+        return Lattice(matrix, given, transform, origin, None, images)
     numbers = None if box.numbers is None or not images.short else lax.stop_gradient(jnp.asarray(box.numbers).astype(dtype))
-    arrays = jax.vmap(lambda *of_system: _make(*of_system, box, images))(vectors, box.flags, numbers)
-    return Lattice(*arrays, origin, None if box.flags is None else jnp.asarray(box.flags), images)
+
+    def of_system(vectors: Array, flags: Array | None, numbers: Array | None) -> tuple[Array, Array, Array]:
+        return _make(vectors, flags, numbers, box, images)
+
+    matrix, given, transform = jax.vmap(of_system)(vectors, box.flags, numbers)
+    return Lattice(matrix, given, transform, origin, None if box.flags is None else jnp.asarray(box.flags), images)
 
 
 def _make(vectors: Array, flags: Array | None, numbers: Array | None, box: Box, images: Images) -> tuple[Array, Array, Array]:
