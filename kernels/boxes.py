@@ -15,7 +15,6 @@ _BLOCK = 128
 BLOCKS = 8  # that share a multiprocessor: what decides exactly may spill registers, it is rare
 
 
-FILL, FINE = 4, 1  # sources of a cell on CUDA, at least, and cells per cutoff along periodic axes
 _LAID_AT_ONCE = 1024  # systems whose cells are laid out at once
 _HEADER = 16  # words
 
@@ -49,7 +48,7 @@ class Sorting(NamedTuple):
 def sorting_kernels(dim: int, double: bool, periodic: int) -> Sorting:
     """Return the kernels that sort sources on CUDA; `periodic` is that of `jfrnn.kernels._native.program`."""
     entries = [Entry(f"BoxSort.{name}", _LAID_AT_ONCE if name == "lay_out" else GRID["BLOCK"]) for name in _STAGES]
-    text = program(double, dim, "box_sort.cuh", given={}, PERIODIC=periodic, FILL=FILL, FINE=FINE, **GRID)
+    text = program(double, dim, "box_sort.cuh", given={}, PERIODIC=periodic, **GRID)
     name = f"box_sort_{dim}d_{'f64' if double else 'f32'}{SPACES[periodic]}"
     return Sorting(*declare(name, text, *entries, cuda=True, fused=True))
 

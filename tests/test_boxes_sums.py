@@ -7,10 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_boxes import CAPACITY, box_of, expected_images
+from test_kept_cuda import compiles, term_of
 from test_pair_sum_warp_boxes import assert_marks, marks
 
 import jfrnn
 from jfrnn.cases.crystals import CRYSTAL_CASES
+from jfrnn.kernels import boxes, kept
 
 SLOW = pytest.mark.slow
 fused = functools.partial(jfrnn.pair_sum, backend="warp")
@@ -30,13 +32,13 @@ def assert_case(name, dtype, dim, listed):
         found = jfrnn.pair_sum(marks, x, None, ids, neighbors=nbrs, **queries, **values)
     else:
         found = fused(marks, x, given.cutoff, ids, **queries, **values, **options)
-    boxes = given.boxes if given.boxes.ndim == 3 else np.einsum("sd,dk->sdk", given.boxes, np.eye(dim))
-    there = (systems >= 0) & (systems < len(boxes))
+    cells = given.boxes if given.boxes.ndim == 3 else np.einsum("sd,dk->sdk", given.boxes, np.eye(dim))
+    there = (systems >= 0) & (systems < len(cells))
     points = np.where(there[:, None], given.positions if q is None else given.queries, 0)
     pairs = expected_images(name, dtype, dim)
     keep = there & np.isfinite(points).all(axis=1)
     found = jax.tree.map(lambda s: np.where(keep.reshape(-1, *[1] * (s.ndim - 1)), s, 0), found)
-    assert_marks(found, pairs, given.positions, points, boxes[np.clip(systems, 0, len(boxes) - 1)])
+    assert_marks(found, pairs, given.positions, points, cells[np.clip(systems, 0, len(cells) - 1)])
 
 
 @pytest.mark.parametrize(
@@ -49,3 +51,17 @@ def assert_case(name, dtype, dim, listed):
 )
 def test_case(name, listed):
     assert_case(name, np.float32, 3, listed)
+
+
+@SLOW
+@pytest.mark.parametrize(("dim", "double", "periodic"), [(3, False, 4), (2, True, 1)])
+def test_kernels_compile_for_cuda(dim, double, periodic):
+    for kernel in boxes.sorting_kernels(dim, double, periodic):
+        assert compiles(kernel)
+    for lists, later in ((False, False), (True, False), (True, True)):
+        assert compiles(boxes.rows_kernel(dim, double, False, lists, later, periodic, True))
+    kind = kept.ListKind(dim, double, False, periodic, 0, "", False, True, False, 8)
+    for extremes in (False, True):
+        term = term_of(kind)
+        term = term._replace(sums=term.sums[:1]) if extremes else term
+        assert compiles(boxes.sum_kernel(term, f"test_{extremes}", dim, double, False, not extremes, extremes, periodic, True))

@@ -72,12 +72,13 @@ struct BoxSort : BoxSortArguments, BoxSpace {
     }
     // Finds how many cells a system has along each axis, at most as many as its cutoff asks for and its sources fill, and in all.
     JFRNN_MEMBER int divide(int s) {
+        constexpr int FILL = 4;  // as in jfrnn/_geometry/box_cells.py
         enter(boxes, s, turning[s]);
         const int room = members[s] / FILL > 1 ? members[s] / FILL : 1;
         const double most = room * (1 - 1e-6);
         double along[3] = {1, 1, 1}, all = 1;
         for (int k = 0; k < DIM; ++k) {
-            const double wanted = is_turning(k) ? floor(FINE / (double)lattice.reach(k)) : most;
+            const double wanted = is_turning(k) ? floor(1 / (double)lattice.reach(k)) : most;
             along[k] = wanted > 1 ? fmin(floor(wanted), (double)room) : 1.0;  // what is no number is 1
             all *= along[k];
         }
