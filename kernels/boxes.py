@@ -1,9 +1,12 @@
-"""Systems with boxes of their own: which cells a query visits is known before (`jfrnn._geometry.box_cells`), one launch does it."""
+"""Systems with boxes of their own: sources are sorted by system and cell, on CUDA by six launches; then one serves all queries."""
 
 import functools
+from typing import NamedTuple
 
 from jfrnn.kernels._native import SPACES, program
 from jfrnn.kernels._program import Entry, Kernel, declare
+from jfrnn.kernels.cells_cuda import GRID
+from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
 QUERIES_AT_ONCE = 64  # that a thread of the CPU takes
 PADDING = 16  # sources behind the last one that may be read
@@ -12,23 +15,107 @@ _BLOCK = 128
 BLOCKS = 8  # that share a multiprocessor: what decides exactly may spill registers, it is rare
 
 
+_LAID_AT_ONCE = 1024  # systems whose cells are laid out at once
+_HEADER = 16  # words
+
+
+def scratch_words(sources: int, systems: int, cells: int) -> tuple[int, int]:
+    """Return the int32 words of scratch in which sources are sorted on CUDA, and how many of them are 0 before."""
+    zeros = _HEADER + 2 * (cells // GRID["TILE"] + 1) + systems
+    return zeros + 3 * sources, zeros
+
+
+class Sorting(NamedTuple):
+    """The kernels that sort sources on CUDA, all with the same arguments."""
+
+    count_members: Kernel
+    lay_out: Kernel
+    count_cells: Kernel
+    scan: Kernel
+    scatter: Kernel
+    rank: Kernel
+
+    def launches(self, sources: int, cells: int, multiprocessors: int) -> list[tuple[Kernel, int]]:
+        """Return what is launched, in order, and the threads of each."""
+        block = GRID["BLOCK"]
+        tiles = min(cells // GRID["TILE"] + 1, multiprocessors)
+        each = dict.fromkeys(self, -(-(sources + PADDING) // block) * block)
+        each |= {self.lay_out: _LAID_AT_ONCE, self.scan: tiles * block}
+        return list(each.items())
+
+
+@functools.lru_cache(16)
+def sorting_kernels(dim: int, double: bool, periodic: int) -> Sorting:
+    """Return the kernels that sort sources on CUDA; `periodic` is that of `jfrnn.kernels._native.program`."""
+    entries = [Entry(f"BoxSort.{name}", _LAID_AT_ONCE if name == "lay_out" else GRID["BLOCK"]) for name in _STAGES]
+    text = program(double, dim, "box_sort.cuh", given={}, PERIODIC=periodic, **GRID)
+    name = f"box_sort_{dim}d_{'f64' if double else 'f32'}{SPACES[periodic]}"
+    return Sorting(*declare(name, text, *entries, cuda=True, fused=True))
+
+
+_STAGES = ("count_members", "lay_out", "count_cells", "scan_counts", "scatter", "rank")
+
+
 @functools.lru_cache(64)
 def rows_kernel(
-    dim: int, double: bool, scaled: bool, lists: bool, periodic: int, excluding: bool, cuda: bool, flat: bool = False
+    dim: int,
+    double: bool,
+    scaled: bool,
+    lists: bool,
+    later: bool,
+    periodic: int,
+    cuda: bool,
+    excluding: bool = False,
+    flat: bool = False,
 ) -> Kernel:
-    """Return the kernel for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts alone.
+    """Return the kernel for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts, half lists or whole.
 
     `periodic`, `excluding` and `flat` are those of `jfrnn.kernels._native.program`.
     """
     where = "cuda" if cuda else "cpu"
-    name = f"box_rows_{where}_{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}"
-    name += f"{'_flat' * flat}{SPACES[periodic]}{'_excluding' * excluding}"
-    constants = {"PERIODIC": periodic, "SCALED": scaled, "LIST": lists, "QUERY_CHUNK": QUERIES_AT_ONCE, "LANES_PER_ROW": LANES}
-    constants |= {"EXCLUDING": excluding, "FLAT": flat}
-    text = program(double, dim, "box_rows.cuh" if cuda else "box_rows_cpu.h", **constants)
+    kind = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}{'_flat' * flat}{'_later' * later}"
+    name = f"box_rows_{where}_{kind}{SPACES[periodic]}{'_excluding' * excluding}"
+    constants = _constants(periodic, scaled, lists, later) | {"EXCLUDING": excluding, "FLAT": flat}
+    text = program(double, dim, "box_rows.cuh" if cuda else "box_rows_cpu.h", given={}, SUMS=0, **constants)
     return declare(name, text, Entry("BoxRows.run", _BLOCK if cuda else 1, BLOCKS), cuda=cuda, fused=cuda)[0]
+
+
+def _constants(periodic: int, scaled: bool, lists: bool, later: bool) -> dict[str, int]:
+    found = {"PERIODIC": periodic, "SCALED": scaled, "LIST": lists, "LATER": later}
+    return found | {"QUERY_CHUNK": QUERIES_AT_ONCE, "LANES_PER_ROW": LANES}
+
+
+@functools.lru_cache(512)
+def sum_kernel(
+    term: TermText,
+    key: str,
+    dim: int,
+    double: bool,
+    scaled: bool,
+    compensated: bool,
+    extremes: bool,
+    periodic: int,
+    cuda: bool,
+    excluding: bool = False,
+) -> Kernel:
+    """Return the kernel that sums a term; `key` tells it from all others in the names of programs.
+
+    `extremes`: it finds the largest summands instead, as `jfrnn.kernels.pair_sum_cpu.query_kernel` does.
+    """
+    name = f"box_sums_{'cuda' if cuda else 'cpu'}_{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}"
+    name += f"{'_compensated' * compensated}{SPACES[periodic]}{'_extremes' * extremes}{'_excluding' * excluding}_{key}"
+    constants = {**GRID, **_constants(periodic, scaled, False, False), **constants_of(term, compensated, extremes)}
+    constants["EXCLUDING"] = excluding
+    header = "box_sums.cuh" if cuda else "box_sums_cpu.h"
+    text = program(double, dim, header, given=term_header(term, double), **constants)
+    return declare(name, text, Entry("BoxSums.run", _BLOCK if cuda else 1, BLOCKS), cuda=cuda, fused=cuda)[0]
+
+
+def slots(queries: int, cuda: bool) -> int:
+    """Return the number of partial sums that make up a sum over all pairs."""
+    return -(-queries // (32 // LANES if cuda else QUERIES_AT_ONCE))
 
 
 def threads(queries: int) -> int:
     """Return the threads of a launch on CUDA."""
-    return 32 * -(-queries * LANES // 32)
+    return 32 * slots(queries, cuda=True)

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from test_box import masked_images
+from test_box import LONG, masked_images
+from test_box import oracle as lattice_oracle
 
 import jfrnn
 from jfrnn.cases.crystals import CRYSTAL_CASES
@@ -153,6 +154,66 @@ def test_derivatives_in_positions_and_boxes(way):
     assert not np.asarray(gradient[1])[1].any()  # no particle is in that system
 
 
+@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW), pytest.param("brute", marks=SLOW)])
+def test_known_numbers_of_neighbors_at_long_cutoffs(backend):
+    """Diamond, 2 atoms in its primitive cell, at 95 bohr; and single particles in cubic cells, whose neighbors integers count."""
+    edge, cutoff = 3.567, 95 * 0.529177210903
+    diamond = edge / 2 * np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 0.0]])
+    boxes = np.stack([diamond, 3.0 * np.eye(3), diamond, 60.0 * np.eye(3)])
+    atoms = (
+        edge / 4 * np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.5, 0.5, 0.5], [0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
+    )
+    away = np.arange(-17, 18) ** 2
+    cubic = int((9 * (away[:, None, None] + away[:, None] + away) < cutoff**2).sum()) - 1
+    given = {"box": jfrnn.Box(boxes), "batch": np.array([0, 0, 1, 2, 2, 3]), "backend": backend}
+    assert jfrnn.count(atoms, cutoff, **given).tolist() == [94004, 94004, cubic, 94004, 94004, 0]
+    if backend == "warp":
+        nbrs = jfrnn.search(atoms, cutoff, **given)
+        np.testing.assert_array_equal(nbrs.distances(atoms)[1].sum(axis=1), [94004, 94004, cubic, 94004, 94004, 0])
+        listed = nbrs.shifts(atoms)[2][: int(nbrs.count[2])]
+        assert len(np.unique(listed, axis=0)) == cubic
+
+
+@pytest.mark.parametrize(
+    ("backend", "options"),
+    [
+        pytest.param("warp", {}, marks=SLOW),
+        pytest.param("warp", {"half": True}, marks=SLOW),
+        pytest.param("jax", {}, marks=SLOW),
+        pytest.param("jax", {"half": True}, marks=SLOW),
+        pytest.param("brute", {}, marks=SLOW),
+    ],
+    ids=str,
+)
+def test_lattices_far_from_reduced(backend, options):
+    """Short vectors are found for each system that needs them, and are data: other boxes take the same program."""
+    rng, dtype, traces = np.random.default_rng(0), np.float32, []
+    batch = np.array([0] * 8 + [1] * 6 + [2] * 7)[rng.permutation(21)].astype(np.int32)
+    plain = np.array([[1.1, 0.0, 0.0], [0.2, 1.3, 0.0], [-0.1, 0.3, 1.2]])
+    slanted = np.array([[1.0, 0.0, 0.0], [0.1, 1.1, 0.0], [40.2, -27.1, 0.9]])
+
+    @jax.jit
+    def search(x, box):
+        traces.append(None)
+        return jfrnn.search(x, 0.6, box=box, batch=batch, capacity=64, backend=backend, **options)
+
+    for boxes in ([LONG, plain, slanted], [plain, LONG, LONG]):
+        boxes = np.stack(boxes).astype(dtype)
+        whole = rng.integers(-2, 3, (21, 3))
+        x = jnp.asarray(np.einsum("nd,ndk->nk", rng.uniform(0, 1, (21, 3)) + whole, boxes[batch]), dtype)
+        nbrs = search(x, jfrnn.Box(boxes, images=2))
+        nbrs.check()
+        expected = set()
+        for system, matrix in enumerate(boxes):
+            ends = np.flatnonzero(batch == system)
+            pairs = lattice_oracle(x[ends], 0.6, matrix, **options)
+            expected |= {(int(ends[i]), int(ends[j]), shift) for i, j, shift in pairs}
+        assert masked_images(nbrs, x) == expected
+        assert int(nbrs.count.sum()) == len(expected) > 30
+    assert len(traces) == 1
+    assert jfrnn.Box([plain, plain]).numbers is None
+
+
 def test_one_program_serves_other_boxes_and_flags():
     x, batch, traces = jnp.asarray(np.random.default_rng(2).uniform(-2, 2, (30, 2))), np.arange(30, dtype=np.int32) % 4, []
 
@@ -184,6 +245,33 @@ def test_grow_in_boxes_that_shrink():
     small = jfrnn.Box(boxes, per_system=True)
     assert bool(nbrs.update(x, box=small).overflow)
     assert listed_images(nbrs.grow(x, box=small), x) == oracle(boxes, np.asarray(x), batch, 0.5)
+
+
+@SLOW
+@pytest.mark.parametrize("backend", ["warp", "jax"])
+def test_run_chunk_in_boxes_that_shrink(backend):
+    """One system shrinks until its cutoff needs more images, while the other stays as it is."""
+    u, batch = jnp.asarray(np.random.default_rng(4).uniform(-1, 2, (18, 2))), np.arange(18, dtype=np.int32) % 2
+    first = jnp.array([[[2.0, 0.1], [0.3, 2.1]], [[3.0, 0.2], [0.0, 2.6]]])
+    ratio = jnp.array([0.9, 1.0])[:, None, None]
+
+    def positions_of(boxes):
+        return jnp.einsum("nd,ndk->nk", u, boxes[batch])
+
+    @jax.jit
+    def chunk(boxes, nbrs):
+        def step(_, carry):
+            boxes = carry[0] * ratio
+            return boxes, carry[1].update(positions_of(boxes), box=jfrnn.Box(boxes))
+
+        return jax.lax.fori_loop(0, 8, step, (boxes, nbrs))
+
+    nbrs = jfrnn.search(positions_of(first), 0.5, skin=0.1, box=jfrnn.Box(first), batch=batch, backend=backend)
+    assert nbrs.images is None
+    boxes, nbrs = jfrnn.run_chunk(chunk, first, nbrs, positions_of, box=jfrnn.Box)
+    nbrs.check()
+    assert nbrs.images is not None
+    assert masked_images(nbrs, positions_of(boxes)) == oracle(np.asarray(boxes), np.asarray(positions_of(boxes)), batch, 0.5)
 
 
 def test_numbers_without_a_box_are_told():
@@ -223,11 +311,6 @@ X, SYSTEMS, CELLS = np.zeros((4, 3)), np.zeros(4, np.int32), np.stack([np.eye(3)
             ValueError,
             r"kind with which the list was made \(.*for each of 2 systems\), got .*for each of 1 systems",
             lambda: jfrnn.search(X, 0.1, box=jfrnn.Box(CELLS), batch=SYSTEMS).update(X, box=jfrnn.Box(CELLS[:1])),
-        ),
-        (
-            ValueError,
-            "where box holds a box per system",
-            lambda: jfrnn.pair_sum(lambda r, i, j: r @ r, X, 1.0, box=jfrnn.Box(CELLS), batch=SYSTEMS, backend="warp"),
         ),
         (
             ValueError,

@@ -11,7 +11,7 @@ KINDS = [
     kept.ListKind(3, False, False, 0, 0, "", False, True, False, 1),
     kept.ListKind(3, False, False, 1, 0, "", False, True, True, 8),
     kept.ListKind(2, False, True, 1, 0, "mean", False, False, False, 8),
-    kept.ListKind(3, False, False, 2, 1, "", True, True, True, 8),
+    kept.ListKind(3, False, False, 2, 1, "", True, True, True, 8, boxes=True),
     kept.ListKind(3, True, True, 4, 2, "either", False, True, False, 1),
     kept.ListKind(2, True, False, 3, 0, "", False, True, False, 8),
 ]

@@ -24,17 +24,22 @@ def marks(r, i, j):
 
 
 def assert_marks(found, pairs, x, q, matrix):
-    """Compare sums with those over the oracle's pairs; of displacements but for the rounding of their terms and of the sum."""
+    """Compare sums with those over the oracle's pairs; of displacements but for the rounding of their terms and of the sum.
+
+    `matrix` is that of all pairs or, [m, d, d], of each row.
+    """
     (m, d), eps, found = q.shape, np.finfo(x.dtype).eps, checked.with_sums(found, q)
     i, j, shifts = arrays_of(pairs, d)
-    matrix = (matrix if matrix.ndim == 2 else np.diag(matrix)).astype(np.float64)
+    matrix = (np.diag(matrix) if matrix.ndim == 1 else matrix).astype(np.float64)
+    matrix = matrix[i] if matrix.ndim == 3 else np.broadcast_to(matrix, (len(i), d, d))
     x, q, counts = x.astype(np.float64), q.astype(np.float64), np.bincount(i, minlength=m)
     np.testing.assert_array_equal(found["count"], counts)
     np.testing.assert_array_equal(found["ids"], np.bincount(i, j, m))
     np.testing.assert_array_equal(found["rests"], np.bincount(i, j * j % 61, m))
     np.testing.assert_array_equal(found["rows"], counts * np.arange(m))
-    r = x[j] - q[i] + shifts @ matrix
-    wrong = 2 * eps * (np.abs(x[j]) + np.abs(q[i]) + np.abs(shifts) @ np.abs(matrix))  # rounding of each component
+    r = x[j] - q[i] + np.einsum("pk,pkd->pd", shifts, matrix)
+    spans = np.einsum("pk,pkd->pd", np.abs(shifts), np.abs(matrix))
+    wrong = 2 * eps * (np.abs(x[j]) + np.abs(q[i]) + spans)  # rounding of each component
     terms = {"square": ((r**2).sum(axis=1), (2 * np.abs(r) * wrong + wrong**2).sum(axis=1))}
     terms |= {k: (r[:, k], wrong[:, k]) for k in range(d)}
     for key, (term, each) in terms.items():

@@ -1,8 +1,9 @@
-"""Searches with a box per system by Warp's kernels: cells are sorted by XLA, a kernel meets them."""
+"""Searches with a box per system by Warp's kernels: sources are sorted by cell, on the CPU by XLA, and a kernel meets them."""
 
 import functools
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +14,14 @@ from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import excluded_rows, lattice_numbers, particle_rows, periodic_kind
 from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.problem import Filter, Room, Rows, Search, largest_radius
+from jfrnn._engine.sum_results import FoundSums, SumsOf
 from jfrnn._engine.variants import Variant, absent, describe_call, plan_numbers, row_dims, split_rows
-from jfrnn._geometry import Lattice, Status, Wrapped, sort_into_boxes
+from jfrnn._geometry import Lattice, Status, Wrapped, most_cells, sort_into_boxes, unpack_turns
 from jfrnn.kernels import boxes
+from jfrnn.kernels._native import EXCLUDED
+from jfrnn.kernels.pair_sum_cpu import TermText
 
-_GIVEN = ("positions", "queries", "boxes", "axes", "asked", "ids", "order", "visits", "cells", "start")
+_GIVEN = ("positions", "queries", "boxes", "axes", "systems", "ids", "cells", "start")
 
 
 def box_neighbors(search: Search, keep: Filter, capacity: int | Room | None) -> Rows:
@@ -29,33 +33,58 @@ def box_neighbors(search: Search, keep: Filter, capacity: int | Room | None) -> 
     variant = Variant(dim, double, search.cutoff.scaled, capacity is not None, *kind, bool(starts))
 
     def on(cuda: bool) -> Callable[..., list[Array]]:
-        return functools.partial(_callable(variant, cuda), output_dims=dims)
+        def call(search: Search, *starts: Array) -> list[Array]:
+            return _callable(variant, cuda)(*_operands(search, cuda), *excluded_rows(search), *starts, output_dims=dims)
 
-    *written, count, info = lax.platform_dependent(*_operands(search), *starts, cpu=on(False), cuda=on(True))
+        return call
+
+    *written, count, info = lax.platform_dependent(search, *starts, cpu=on(False), cuda=on(True))
     overflow = isinstance(capacity, int) and info[0] > capacity
     status = jnp.where(overflow, Status.ROW_OVERFLOW.value, 0).astype(jnp.int32)
     return Rows(**split_rows(written), counts=count, required=info[0], status=status)
 
 
-def _operands(search: Search) -> list[Array]:
-    """Return what the kernel is given, in the order of `_GIVEN` (see `kernels/native/box_pairs.h`)."""
+def _operands(search: Search, cuda: bool) -> list[Array]:
+    """Return what a kernel is given, in the order of `_GIVEN` (see `kernels/native/box_pairs.h`)."""
     sources, queries, batch, torus = search.sources, search.queries, search.batch, search.torus
     if batch is None or torus is None:
         raise TypeError("a search with a box per system has a batch and a lattice.")
     lattice, wrapped = torus
-    cells = sort_into_boxes(sources, queries, lattice, wrapped, batch)
-    padded = jnp.pad(cells.order, (0, boxes.PADDING))
-    order = cells.order if queries is None else lax.iota(jnp.int32, len(queries))
     rows = particle_rows(sources, wrapped.turns, None)
     asking = rows if queries is None else particle_rows(queries, wrapped.query_turns, None)
-    gap = ((0, 0), (0, 3 - lattice.dim))
-    visits = jnp.concatenate([batch.of_queries[:, None], jnp.pad(cells.from_cell, gap), jnp.pad(cells.visited, gap)], axis=1)
     bits = lattice.spread(jnp.asarray(lattice.periodic), 2).astype(jnp.int32) << np.arange(lattice.dim, dtype=np.int32)[None]
-    turning = jnp.broadcast_to(jnp.sum(bits, axis=1, dtype=jnp.int32), cells.first.shape)
-    of_system = jnp.concatenate([jnp.pad(cells.counts, gap), cells.first[:, None], turning[:, None]], axis=1)
-    axes = jnp.stack([x[padded] for x in wrapped.sources.T])
+    turning = jnp.broadcast_to(functools.reduce(jnp.bitwise_or, bits.T), len(lattice.origin))
     numbers = _numbers(search, lattice, wrapped)
-    return [rows, asking, numbers, axes, wrapped.queries, padded, order, visits, of_system, cells.start, *excluded_rows(search)]
+    if cuda:
+        n, systems = len(sources), len(lattice.origin)
+        cells, stride = most_cells(n, systems), n + boxes.PADDING
+        dims = {"axes": (lattice.dim, stride), "ids": stride, "cells": (systems, 5), "start": cells + 1}
+        dims |= {"scratch": boxes.scratch_words(n, systems, cells)[0]}
+        sort = _sorting_callable(lattice.dim, sources.dtype == jnp.float64, periodic_kind(torus))
+        axes, ids, of_system, start, _ = sort(rows, numbers, batch.sources, turning, output_dims=dims)
+        return [rows, asking, numbers, axes, batch.of_queries, ids, of_system, start]
+    found = sort_into_boxes(sources, queries, lattice, wrapped, batch)
+    ids, gap = jnp.pad(found.order, (0, boxes.PADDING)), ((0, 0), (0, 3 - lattice.dim))
+    of_system = jnp.concatenate([jnp.pad(found.counts, gap), found.first[:, None], turning[:, None]], axis=1)
+    axes = jnp.stack([x[ids] for x in wrapped.sources.T])
+    return [rows, asking, numbers, axes, batch.of_queries, ids, of_system, found.start]
+
+
+@kernel
+def _sorting_callable(dim: int, double: bool, periodic: int) -> Call:
+    """Make a function that XLA calls to sort sources on CUDA, once for a sum and its derivative."""
+    scalar, words = np.float64 if double else np.float32, dict.fromkeys(("ids", "cells", "start", "scratch"), np.int32)
+    name = f"jfrnn_box_sort_{dim}d_{'f64' if double else 'f32'}_{periodic}"
+    given = ("positions", "boxes", "systems", "turning")
+    return Call(name, given, {"axes": scalar} | words, functools.partial(_plan_sorting, dim, double, periodic))
+
+
+def _plan_sorting(dim: int, double: bool, periodic: int, shapes: Shapes, multiprocessors: int) -> Plan:
+    n, systems, cells = shapes["positions"][0], shapes["turning"][0], shapes["start"][0] - 1
+    launches = boxes.sorting_kernels(dim, double, periodic).launches(n, cells, multiprocessors)
+    clear = [Clear("scratch", 4 * boxes.scratch_words(n, systems, cells)[1]), Clear("start", 4 * (cells + 1))]
+    numbers = {"n": n, "boxed": systems, "stride": shapes["axes"][1], "size": cells}
+    return Plan([*clear, *(Launch(kernel, threads) for kernel, threads in launches)], numbers)
 
 
 def _numbers(search: Search, lattice: Lattice, wrapped: Wrapped) -> Array:
@@ -75,9 +104,91 @@ def _callable(variant: Variant, cuda: bool) -> Call:
 
 
 def _plan(variant: Variant, cuda: bool, shapes: Shapes, _: int) -> Plan:
-    kind = (variant.dim, variant.double, variant.scaled, variant.lists, variant.periodic, variant.excluding)
-    found, numbers = boxes.rows_kernel(*kind, cuda, variant.flat), plan_numbers(variant, shapes) | {"stride": shapes["axes"][1]}
-    m = numbers["m"]
+    kind = (variant.dim, variant.double, variant.scaled, variant.lists, variant.keep.later_only, variant.periodic)
+    found = boxes.rows_kernel(*kind, cuda, variant.excluding, variant.flat)
+    numbers, m = plan_numbers(variant, shapes) | {"stride": shapes["axes"][1]}, shapes["queries"][0]
     launch = Launch(found, boxes.threads(m)) if cuda else share(found, m, boxes.QUERIES_AT_ONCE)
     pages = [] if cuda or not variant.lists else ask_for_huge_pages("idx", 4 * math.prod(shapes["idx"]))
     return Plan([Clear("info", 8), *pages, launch], numbers, absent(variant.lists, variant.flat))
+
+
+# --- sums ----------------------------------------------------------------------------------------------------------------
+
+
+class _SumVariant(NamedTuple):
+    """All that is static about a pair sum, apart from shapes; `key` names the text."""
+
+    dim: int
+    double: bool
+    scaled: bool
+    own: bool
+    closed: bool
+    drop_self: bool
+    periodic: int
+    compensated: bool
+    extremes: bool
+    excluding: bool
+    key: str
+    cuda: bool
+
+
+def box_sums(
+    search: Search,
+    keep: Filter,
+    term: TermText,
+    key: str,
+    values: tuple[Array, Array, Array],
+    compensated: bool,
+    extremes: bool,
+) -> FoundSums:
+    """Sum a term over the pairs of a search in which each system has a box of its own, as `jfrnn._engine.warp_sums.pair_sums`."""
+    (_, m), dim, double = search.sizes, search.sources.shape[1], search.sources.dtype == jnp.float64
+    cutoff, shared, own, others = search.cutoff, *values
+
+    def on(cuda: bool) -> Callable[..., FoundSums]:
+        flags = search.queries is None, cutoff.closed, keep.drop_self, periodic_kind(search.torus), compensated, extremes
+        flags += (search.exclude is not None,)
+        call_sums = _sum_callable(_SumVariant(dim, double, cutoff.scaled, *flags, key, cuda), term)
+        results = SumsOf(term, m, boxes.slots(m, cuda), compensated, extremes)
+
+        def call(search: Search, shared: Array, own: Array, others: Array) -> FoundSums:
+            given = _operands(search, cuda)
+            columns = _sorted_columns(search, term, others, given[_GIVEN.index("ids")])
+            given += [shared, own, columns, *excluded_rows(search)]
+            return results.unpack(*call_sums(*given, output_dims=results.dims() | {"info": 2})[: len(_SUMS)])
+
+        return call
+
+    return lax.platform_dependent(search._replace(checks={}), shared, own, others, cpu=on(False), cuda=on(True))
+
+
+def _sorted_columns(search: Search, term: TermText, others: Array, ids: Array) -> Array:
+    """Return what a term reads of the sources, a row for each number, sorted; turns, which `others` has packed, axis by axis."""
+    columns = [others[:, k] for k in range(term.columns)]
+    if search.torus is not None and term.steps:
+        lattice, wrapped = search.torus
+        turns = unpack_turns(wrapped.turns, lattice.dim).astype(others.dtype)
+        columns += [turns[:, step.axis] for step in term.steps]
+    return jnp.stack([x[ids] for x in columns]) if columns else jnp.zeros((1, 1), others.dtype)
+
+
+_SUMS = ("sums", "totals", "errors", "more")  # what a kernel writes
+
+
+@kernel
+def _sum_callable(variant: _SumVariant, term: TermText) -> Call:
+    scalar, flags = np.float64 if variant.double else np.float32, variant._asdict()
+    on = [flag for flag, on in flags.items() if on is True]
+    where = f"{variant.dim}d_{'f64' if variant.double else 'f32'}_{variant.periodic}"
+    results = dict.fromkeys(_SUMS, scalar) | {"info": np.int32}
+    given = (*_GIVEN, "shared_values", "own_values", "columns", *EXCLUDED * variant.excluding)
+    return Call("_".join(["jfrnn_box_sums", where, *on, variant.key]), given, results, functools.partial(_plan_sums, variant, term))
+
+
+def _plan_sums(variant: _SumVariant, term: TermText, shapes: Shapes, _: int) -> Plan:
+    kind = variant.dim, variant.double, variant.scaled, variant.compensated, variant.extremes, variant.periodic
+    found, cuda = boxes.sum_kernel(term, variant.key, *kind, variant.cuda, variant.excluding), variant.cuda
+    n, m, stride = shapes["positions"][0], shapes["queries"][0], shapes["axes"][1]
+    flags = {"own": int(variant.own), "closed": int(variant.closed), "drop_self": int(variant.drop_self)}
+    launch = Launch(found, boxes.threads(m)) if cuda else share(found, m, boxes.QUERIES_AT_ONCE)
+    return Plan([launch] if cuda else [Clear("info", 8), launch], {"n": n, "m": m, "stride": stride, **flags})

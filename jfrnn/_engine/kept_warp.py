@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -18,7 +19,7 @@ from jfrnn.kernels import kept
 from jfrnn.kernels.pair_sum_cpu import TermText
 
 # what a call is given
-_LIST = ("rows", "points", "cutoff", "steps", "idx", "count", "codes", "slots", "starts", "lengths", "order")
+_LIST = ("rows", "points", "cutoff", "steps", "idx", "count", "codes", "slots", "starts", "lengths", "order", "systems")
 
 
 class KeptList(NamedTuple):
@@ -32,10 +33,11 @@ class KeptList(NamedTuple):
         rows: Positions of the rows [m, d].
         turns: Lattice vectors between the cell and the sources and the rows, in whole floats [n, d] and [m, d], with codes.
         cutoff: One for all, or one per particle.
-        lattice: The box, or None.
+        lattice: The box, or one per system, or None.
         order: In which order CUDA takes rows that belong to the sources [n] (-1: as they come), or None.
         reversal: Slots by source, where they begin, and how many: the sums are then those of the sources, over the rows that list
             them. Or None.
+        systems: With a box per system, whose boxes those of the sources [n] and of the rows [m] are, or None.
     """
 
     idx: Array
@@ -48,6 +50,7 @@ class KeptList(NamedTuple):
     lattice: Lattice | None
     order: Array | None
     reversal: tuple[Array, Array, Array] | None
+    systems: tuple[Array, Array] | None = None
 
 
 def kept_mask(given: KeptList) -> Array:
@@ -141,7 +144,8 @@ def _kind_of(given: KeptList, lanes: int) -> _Extra:
     rule = EXCHANGED.get(rule, rule) if is_reversed else rule
     dim, double, aligned = given.sources.shape[1], given.sources.dtype == jnp.float64, given.idx.shape[1] % 4 == 0
     ordered = given.order is not None and lanes > 0
-    kind = kept.ListKind(dim, double, cutoff.scaled, periodic, width, rule, is_reversed, aligned, ordered, lanes)
+    boxes = given.systems is not None
+    kind = kept.ListKind(dim, double, cutoff.scaled, periodic, width, rule, is_reversed, aligned, ordered, lanes, boxes)
     return _Extra(cutoff.closed, 1 if lattice is None else lattice.images.total, kind)
 
 
@@ -158,20 +162,32 @@ def _operands(given: KeptList, extra: _Extra, columns: int, others: Array | None
     points = _beside(kind.length(columns), sources, others if columns else None, turns[0], of_sources)
     own = _beside(kind.own_length, rows, turns[1], of_rows)
     cutoff = given.cutoff.largest if isinstance(given.cutoff, Cutoffs) else given.cutoff.radius
-    numbers, steps = [jnp.reshape(jnp.asarray(cutoff, dtype), 1)], jnp.zeros(1, dtype)
-    if given.lattice is not None:
-        images, dim = given.lattice.images, kind.dim
-        numbers += [lattice_numbers(given.lattice, jnp.ones(dim, dtype), jnp.zeros((), dtype))]
-        numbers += [jnp.full(1, 2 * LARGEST_TURN + max(images.reach), dtype)]
-        steps = jnp.asarray(images.shifts).astype(dtype).reshape(-1) if given.codes is not None else steps
-    nothing = jnp.zeros(1, jnp.int32)
-    if isinstance(given.cutoff, Cutoffs) and given.cutoff.kinds is not None:
-        table = given.cutoff.kinds[0]
-        numbers += [jnp.full(1, table.size, dtype), table.reshape(-1)]
+    nothing, steps = jnp.zeros(1, jnp.int32), jnp.zeros(1, dtype)
+    if given.lattice is not None and given.codes is not None:
+        steps = jnp.asarray(given.lattice.images.shifts).astype(dtype).reshape(-1)
     codes = nothing if given.codes is None else given.codes
     reversal = given.reversal or [nothing if slots is None else slots, nothing, nothing]
     order = nothing if given.order is None or not kind.ordered else given.order
-    return [own, points, jnp.concatenate(numbers), steps, given.idx, given.counts, codes, *reversal, order]
+    systems = nothing if given.systems is None else given.systems[0 if kind.reversed else 1]
+    return [own, points, _numbers_of(given, cutoff), steps, given.idx, given.counts, codes, *reversal, order, systems]
+
+
+def _numbers_of(given: KeptList, cutoff: np.floating | Array) -> Array:
+    """Return the cutoff, the numbers of the lattice, the largest number of a shift, and a table; such a row of each lattice."""
+    dtype, lattice = given.sources.dtype, given.lattice
+    radius, kinds = jnp.reshape(jnp.asarray(cutoff, dtype), 1), []
+    if isinstance(given.cutoff, Cutoffs) and given.cutoff.kinds is not None:
+        table = given.cutoff.kinds[0]
+        kinds = [jnp.full(1, table.size, dtype), table.reshape(-1)]
+    if lattice is None:
+        return jnp.concatenate([radius, *kinds])
+    none, slack = jnp.ones(lattice.dim, dtype), jnp.zeros((), dtype)
+    most = jnp.full(1, 2 * LARGEST_TURN + max(lattice.images.reach), dtype)
+
+    def row(lattice: Lattice) -> Array:
+        return jnp.concatenate([radius, lattice_numbers(lattice, none, slack, lattice.flags), most, *kinds])
+
+    return row(lattice) if given.systems is None else jax.vmap(row)(lattice)
 
 
 def _radii_of(given: KeptList, kind: kept.ListKind) -> tuple[Array | None, Array | None]:

@@ -44,15 +44,21 @@ def as_integer(x: Array) -> Array:
     return lax.bitcast_convert_type(x, jnp.int32) if x.dtype == jnp.float32 else x.astype(jnp.int32)
 
 
-def lattice_numbers(lattice: Lattice, reach: Array, slack: Array) -> Array:
-    """Return the numbers of a lattice that kernels read, in the order that `jfrnn.kernels._native` specifies."""
+def lattice_numbers(lattice: Lattice, reach: Array, slack: Array, flags: Array | None = None) -> Array:
+    """Return the numbers of a lattice that kernels read, in the order that `jfrnn.kernels._native` specifies.
+
+    There are no images along axes that are not periodic by `flags`.
+    """
     more = 3 - lattice.dim
     square, line = ((0, more), (0, more)), (0, more)
     images = jnp.asarray(lattice.images.reach).astype(lattice.matrix.dtype)
+    images = images if flags is None else jnp.where(flags, images, 0)
     parts = [jnp.pad(lattice.matrix, square), jnp.pad(lattice.transform, square), jnp.pad(lattice.origin, line)]
     parts += [jnp.pad(reach, line, constant_values=1), jnp.pad(images, line), slack]
     if not lattice.images.orthogonal:
-        parts += [jnp.pad(lattice.given, square), jnp.pad(lattice.images.numbers.astype(images.dtype), square)]
+        dim = lattice.dim
+        numbers = lattice.given[dim:] if lattice.images.short else lattice.images.numbers.astype(images.dtype)
+        parts += [jnp.pad(lattice.given[:dim], square), jnp.pad(numbers, square)]
     return jnp.concatenate([part.reshape(-1) for part in parts])
 
 

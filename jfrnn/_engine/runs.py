@@ -499,4 +499,5 @@ class _Engine(NamedTuple):
         shift = list(jnp.moveaxis(shifts, -1, 0))
         raw = [flat_take(x, i) for x in queries.T], [flat_take(x, j) for x in sources.T]
         matrix = torus.matrix.at[..., place].get(mode="promise_in_bounds") if torus.images.per_system else torus.matrix
+        matrix = matrix[len(shift) :] if torus.images.short else matrix
         return Pair(*raw, radii, *shift_in_given(shift, torus.images.basis, matrix), torus.images.orthogonal)

@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.arrays import levels_of
+from jfrnn._engine.boxes_warp import box_sums
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.levels_warp import level_sums
 from jfrnn._engine.operands import excluded_rows, pack_particles, periodic_kind, space_flags
@@ -63,6 +64,8 @@ def pair_sums(
     if isinstance(search.cutoff, Cutoffs):
         return level_sums(search, levels_of(search), keep, term._replace(first=0), key, values, compensated, extremes)
     term = term._replace(first=0) if extremes else term
+    if search.per_system:
+        return box_sums(search, keep, term, key, values, compensated, extremes)
 
     def on(cuda: bool) -> Callable[[Search, tuple[Array, Array, Array]], FoundSums]:
         def call(search: Search, values: tuple[Array, Array, Array]) -> FoundSums:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from jfrnn._geometry.reduced import short_vectors
 from jfrnn._tracing import Given, own_transfers
 
 _SINGULAR = 1e-9  # determinants below may be those of dependent rows
@@ -25,6 +26,8 @@ class Box:
             per system of a batch, shape [systems, d] or [systems, d, d].
         origin: A corner of the cell [length], shape [d]; with `per_system` [systems, d].
         flags: Whether each axis of each system is periodic, shape [systems, d], bool; None: `periodic` says it for all.
+        numbers: Of systems with vectors far longer than need be: how many of each vector make up the short ones in which the search
+            works, whole floats, shape [systems, d, d]; None: the vectors are used as they are given.
         periodic: Whether each axis is periodic; all True if `flags` tell. Static.
         images: How many cells away a periodic image may lie and still be a neighbor, per axis; None: see `Box`. Static.
         per_system: Whether each system of a batch has a box of its own. Static.
@@ -33,6 +36,7 @@ class Box:
     vectors: Numbers
     origin: Numbers
     flags: Numbers | None
+    numbers: Numbers | None
     periodic: tuple[bool, ...]
     images: tuple[int, ...] | None
     per_system: bool
@@ -53,7 +57,9 @@ class Box:
                 2] or [3, 3], of any handedness and skew. If skewed vectors are known while tracing, the search works in short
                 vectors of the same lattice; shifts still count the given vectors. Rows of axes that are not periodic only need to
                 be finite. Values are rounded once to the dtype of the positions. For a box per system: lengths of shape [systems,
-                d] with `per_system=True`, or vectors of shape [systems, d, d]; such vectors are used as they are given.
+                d] with `per_system=True`, or vectors of shape [systems, d, d]. If these are known when the box is made, those of
+                systems that are skewed strongly are replaced by short ones, too; the box holds them as data, so that it may be an
+                argument of a compiled function. Vectors that are traced are used as they are given.
             periodic: One bool for all axes, or one per axis (per row of the matrix); for a box per system also an array of bool,
                 shape [systems, d], which may be traced.
             origin: A corner of the cell [length], a number or shape [d], or with a box per system [systems, d]. It changes no pair;
@@ -87,9 +93,12 @@ class Box:
         axes = (True,) * dim if flags is not None else _per_axis("periodic", periodic, dim, (bool, np.bool_), "bool")
         reach = None if images is None else _per_axis("images", images, dim, (int, np.integer), "int >= 0", least=0)
         full = corner if corner.shape == (*systems, dim) else corner + np.zeros((*systems, dim), corner.dtype)
-        self._set((vectors, full, flags), (axes, reach, bool(many)))
+        self._set((vectors, full, flags, None), (axes, reach, bool(many)))
         with own_transfers():
             check_box_values(self)
+            if many and not self.orthogonal and not any(isinstance(x, Tracer) for x in (vectors, flags)):
+                known = np.broadcast_to(np.array(axes) if flags is None else np.asarray(flags), (*systems, dim))
+                object.__setattr__(self, "numbers", short_vectors(np.asarray(vectors, np.float64), known))
 
     def _set(self, arrays: Iterable[Numbers], static: tuple[Any, ...]) -> None:
         for field, value in zip(dataclasses.fields(self), (*arrays, *static), strict=True):
@@ -97,7 +106,7 @@ class Box:
 
     def tree_flatten_with_keys(self) -> tuple[Any, Any]:
         """Return the arrays with their names, and the static fields."""
-        arrays = {"vectors": self.vectors, "origin": self.origin, "flags": self.flags}
+        arrays = {"vectors": self.vectors, "origin": self.origin, "flags": self.flags, "numbers": self.numbers}
         return tuple((jax.tree_util.GetAttrKey(name), x) for name, x in arrays.items()), self.kind
 
     @classmethod
@@ -105,6 +114,12 @@ class Box:
         """Make a box from its parts without checking them again."""
         box = object.__new__(cls)
         box._set(arrays, static)
+        return box
+
+    def counted_as(self, other: "Box") -> "Box":
+        """Return this box with the short vectors of another one, which shifts of a list count."""
+        box = object.__new__(Box)
+        box._set((self.vectors, self.origin, self.flags, other.numbers), self.kind)
         return box
 
     @property
@@ -199,5 +214,6 @@ def round_box(box: Box, dtype: np.dtype) -> Box:
         arrays = (
             *(jnp.asarray(x).astype(dtype) for x in (box.vectors, box.origin)),
             None if box.flags is None else jnp.asarray(box.flags),
+            None if box.numbers is None else jnp.asarray(box.numbers).astype(dtype),
         )
         return Box.tree_unflatten((box.periodic, None, box.per_system), arrays)

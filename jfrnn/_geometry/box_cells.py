@@ -58,7 +58,7 @@ def sort_into_boxes(
     counts = _count_cells(wrapped.reach, members, periodic) if divided else jnp.ones((systems, dim), jnp.int32)
     totals = jnp.prod(counts, axis=1, dtype=jnp.int32)
     ends = jnp.cumsum(totals, dtype=jnp.int32)
-    first, size = ends - totals, n // _FILL + systems
+    first, size = ends - totals, most_cells(n, systems)
     at = _cells_along(sources, wrapped.turns, of_source, lattice, wrapped.reach, counts, periodic)
     at = jnp.where(periodic[of_source], jnp.clip(at, 0, counts[of_source] - 1), at % counts[of_source])
     number = first[of_source] + _row_major(at, counts[of_source])
@@ -79,6 +79,11 @@ def sort_into_boxes(
     visited = jnp.maximum(high - low + 1, 0)
     visited = jnp.where(turning, visited, jnp.minimum(visited, many))
     return BoxCells(order, jnp.cumsum(held, dtype=jnp.int32), counts, first, low, jnp.where((packed >= 0)[:, None], visited, 0))
+
+
+def most_cells(sources: int, systems: int) -> int:
+    """Return how many cells so many systems have at most."""
+    return sources // _FILL + systems
 
 
 def _count_members(systems: Array, there: Array, size: int) -> Array:

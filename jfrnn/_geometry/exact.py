@@ -70,13 +70,15 @@ PointsAt = Callable[[Array | None], Pair]
 def shift_in_given(shift: list[Array], basis: Basis | None, matrix: Array) -> tuple[list[Array], Array]:
     """Return shifts and lattice vectors that express a translation exactly in the given vectors [d, d].
 
-    `shift` holds whole floats that count vectors of the basis. Counts of the given vectors may be too large for one product to be
-    exact, so each is split into two.
+    `shift` holds whole floats that count vectors of the basis, which may stand behind the given ones, whole floats. Counts of the
+    given vectors may be too large for one product to be exact, so each is split into two.
     """
-    if basis is None:
+    matrix, behind = matrix[: len(shift)], matrix[len(shift) :]
+    if basis is None and len(behind) == 0:
         return shift, matrix
     counts = [x.astype(jnp.int32) for x in shift]
-    given = [functools.reduce(jnp.add, (x * row[k] for x, row in zip(counts, basis, strict=True))) for k in range(len(shift))]
+    numbers = behind.astype(jnp.int32) if basis is None else basis
+    given = [functools.reduce(jnp.add, (x * row[k] for x, row in zip(counts, numbers, strict=True))) for k in range(len(shift))]
     high = [(x + (1 << (WHOLE_BITS - 1))) >> WHOLE_BITS for x in given]
     low = [x - (h << WHOLE_BITS) for x, h in zip(given, high, strict=True)]
     return [x.astype(matrix.dtype) for x in (*low, *high)], jnp.concatenate([matrix, matrix * 2**WHOLE_BITS])
@@ -95,7 +97,7 @@ def squared_distance(difference: list[Array], cutoff: "Cutoff | Cutoffs") -> Arr
 class Shifted(NamedTuple):
     """The lattice part of pairs [m, k]: displacements and shifts [m, k, d], a bound on the error of displacements, the lattice.
 
-    That is `matrix`, [d, d], or [m, d, d] of each row.
+    That is `matrix`, [d, d], or [m, d, d] of each row, or [m, 2 d, d] as `Lattice.given` may be.
     """
 
     vectors: Array

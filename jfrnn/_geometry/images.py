@@ -33,6 +33,7 @@ class Images(NamedTuple):
         nearest: Whether the minimum image of a pair is its only one within the cutoff, so that lists store no images.
         basis: The vectors that shifts count, as whole-number combinations of the given ones; None: the given ones.
         per_system: Whether each system of a batch has a box of its own; `reach` is then the largest of any.
+        short: Whether shifts count vectors that each system has by itself (`Box.numbers`).
     """
 
     periodic: tuple[bool, ...]
@@ -41,6 +42,7 @@ class Images(NamedTuple):
     nearest: bool
     basis: Basis | None = None
     per_system: bool = False
+    short: bool = False
 
     @property
     def shifts(self) -> np.ndarray:
@@ -77,17 +79,23 @@ def images_of(box: Box, radius: float | None, dtype: np.dtype, sources: int) -> 
     """
     if box.images is None and radius is not None and not isinstance(box.vectors, Tracer) and not isinstance(box.flags, Tracer):
         with own_transfers():
-            vectors = np.asarray(box.vectors, dtype).astype(np.float64)
-            images = _needed_images(vectors, box, radius, dtype, None)
+            images = _needed_images(_vectors_of(box, dtype), box, radius, dtype, None)
         if not (box.orthogonal or box.per_system) and _too_many(images, sources, _MANY_IMAGES):
-            basis, short = reduced_basis(vectors, box.periodic)
+            basis, short = reduced_basis(_vectors_of(box, dtype), box.periodic)
             reduced = _needed_images(short, box, radius, dtype, basis)
             images = reduced if reduced.total < images.total and _are_exact(reduced) else images
         return check_images(images, sources)
     wanted = (0,) * box.dim if box.images is None else box.images
     nearest = not any(k for k, p in zip(wanted, box.periodic, strict=True) if p)
     reach = tuple(max(k, 1) if p else 0 for k, p in zip(wanted, box.periodic, strict=True))
-    return check_images(Images(box.periodic, box.orthogonal, reach, nearest, None, box.per_system), sources)
+    kind = Images(box.periodic, box.orthogonal, reach, nearest, None, box.per_system, box.numbers is not None)
+    return check_images(kind, sources)
+
+
+def _vectors_of(box: Box, dtype: np.dtype) -> np.ndarray:
+    """Return the vectors of a box as rounded to a dtype or, with a basis of each system, the short ones, in float64."""
+    vectors = np.asarray(box.vectors, dtype).astype(np.float64)
+    return vectors if box.numbers is None else np.asarray(box.numbers, np.float64) @ vectors
 
 
 def _needed_images(vectors: np.ndarray, box: Box, radius: float, dtype: np.dtype, basis: Basis | None) -> Images:
@@ -106,7 +114,8 @@ def _needed_images(vectors: np.ndarray, box: Box, radius: float, dtype: np.dtype
     margin = 48 * float(np.finfo(dtype).eps) * (share.max(axis=-1, keepdims=True) + 3) * residual
     needed = (share + np.where(flags, np.maximum(_ROUNDING, margin), 0)).reshape(-1, box.dim).max(axis=0)  # of any system
     reach = tuple(math.ceil(x) for x in needed.tolist())
-    return Images(box.periodic, box.orthogonal, reach, bool((needed <= _NEAREST).all()), basis, box.per_system)
+    nearest, short = bool((needed <= _NEAREST).all()), box.numbers is not None
+    return Images(box.periodic, box.orthogonal, reach, nearest, basis, box.per_system, short)
 
 
 def _too_many(images: Images, sources: int, most: int) -> bool:

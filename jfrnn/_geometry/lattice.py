@@ -17,7 +17,6 @@ from jfrnn._geometry.box import Box
 from jfrnn._geometry.exact import Shifted
 from jfrnn._geometry.floats import WHOLE_BITS, distill, half_mantissa
 from jfrnn._geometry.images import Images
-from jfrnn._geometry.reduced import Basis
 
 
 @jax.tree_util.register_dataclass
@@ -29,8 +28,9 @@ class Lattice:
 
     Attributes:
         matrix: [d, d] lattice vectors that shifts count, one per row; rows of open axes are 0. Short, rounded vectors if `images`
-            has a basis.
-        given: [d, d] lattice vectors that the user gave; exact decisions use these.
+            has a basis, or each system.
+        given: [d, d] lattice vectors that the user gave; exact decisions use these. If `images.short`, [2 d, d]: behind them stands
+            how many of each make up a vector of `matrix`, whole floats.
         transform: [d, d]; (x - origin) @ transform are fractional coordinates along periodic axes, lengths along open ones.
         origin: [d] a corner of the cell.
         flags: [d] which axes are periodic, if that differs among many boxes; else None, and `images` tells.
@@ -74,12 +74,18 @@ def make_lattice(box: Box, images: Images, dtype: np.dtype) -> Lattice:
     """Round a box, or one per system, to a dtype once and compute its transform."""
     vectors, origin = jnp.asarray(box.vectors).astype(dtype), jnp.asarray(box.origin).astype(dtype)
     if not box.per_system:
-        return Lattice(*_make(vectors, None, box, images), origin, None, images)
-    arrays = jax.vmap(lambda vectors, flags: _make(vectors, flags, box, images))(vectors, box.flags)
-    return Lattice(*arrays, origin, None if box.flags is None else jnp.asarray(box.flags), images)
+        matrix, given, transform = _make(vectors, None, None, box, images)
+        return Lattice(matrix, given, transform, origin, None, images)
+    numbers = None if box.numbers is None or not images.short else lax.stop_gradient(jnp.asarray(box.numbers).astype(dtype))
+
+    def of_system(vectors: Array, flags: Array | None, numbers: Array | None) -> tuple[Array, Array, Array]:
+        return _make(vectors, flags, numbers, box, images)
+
+    matrix, given, transform = jax.vmap(of_system)(vectors, box.flags, numbers)
+    return Lattice(matrix, given, transform, origin, None if box.flags is None else jnp.asarray(box.flags), images)
 
 
-def _make(vectors: Array, flags: Array | None, box: Box, images: Images) -> tuple[Array, Array, Array]:
+def _make(vectors: Array, flags: Array | None, numbers: Array | None, box: Box, images: Images) -> tuple[Array, Array, Array]:
     """Return the vectors that shifts count, the given ones and the transform of one box."""
     periodic = np.array(box.periodic) if flags is None else flags
     rows = jnp.diag(vectors) if box.orthogonal else vectors
@@ -87,23 +93,24 @@ def _make(vectors: Array, flags: Array | None, box: Box, images: Images) -> tupl
     if box.orthogonal:
         return matrix, given, jnp.diag(1 / jnp.where(periodic, vectors, 1))
     if images.basis is not None:
-        matrix = combine(images.basis, given)
+        matrix = combine(np.array(images.basis), given)
+    if numbers is not None:
+        matrix, given = combine(numbers.astype(jnp.int32), given), jnp.concatenate([given, numbers])
     if flags is None:
         return matrix, given, _inverse(_complete(matrix, box.periodic))
-    whole = matrix = lax.stop_gradient(matrix)
+    whole = fixed = lax.stop_gradient(matrix)
     for axes in itertools.product((False, True), repeat=len(periodic)):
-        whole = jnp.where((flags == np.array(axes)).all(), _complete(matrix, axes), whole)
-    return given, given, _inverse(whole)
+        whole = jnp.where((flags == np.array(axes)).all(), _complete(fixed, axes), whole)
+    return matrix, given, _inverse(whole)
 
 
-def combine(basis: Basis, matrix: Array) -> Array:
-    """Return basis @ matrix, the short vectors, with about one rounding per component; differentiable."""
-    whole = np.array(basis)
+def combine(whole: np.ndarray | Array, matrix: Array) -> Array:
+    """Return whole @ matrix, the short vectors of a basis, with about one rounding per component; differentiable."""
     high = (whole + (1 << (WHOLE_BITS - 1))) >> WHOLE_BITS
     half = half_mantissa(lax.stop_gradient(matrix))
     terms = []
     for numbers, size in ((whole - (high << WHOLE_BITS), 1), (high, 2**WHOLE_BITS)):
-        if numbers.any():
+        if isinstance(numbers, Array) or numbers.any():
             times = numbers.astype(matrix.dtype)
             terms += [times[:, k, None] * (part[k] * size)[None] for k in range(len(whole)) for part in (matrix - half, half)]
     for _ in range(3):
@@ -136,14 +143,14 @@ def _complete(matrix: Array, periodic: tuple[bool, ...]) -> Array:
 
 def _inverse(matrix: Array) -> Array:
     """Invert a [d, d] matrix by cofactors of its scaled rows, followed by one Newton step."""
-    size = jnp.max(jnp.abs(matrix), axis=1, keepdims=True)
+    size = largest_of(jnp.abs(matrix))[:, None]
     rows = matrix / size
     if len(matrix) == 2:
         adjugate = jnp.stack([jnp.stack([rows[1, 1], -rows[0, 1]]), jnp.stack([-rows[1, 0], rows[0, 0]])])
     else:
         adjugate = jnp.stack([jnp.cross(rows[k - 2], rows[k - 1]) for k in range(3)], axis=1)
-    inverse = adjugate / jnp.sum(rows[0] * adjugate[:, 0])
-    inverse = inverse @ (2 * jnp.eye(len(rows), dtype=rows.dtype) - product(rows, inverse))
+    inverse = adjugate / add_rows((rows[0] * adjugate[:, 0])[:, None])[0]
+    inverse = product(inverse, 2 * jnp.eye(len(rows), dtype=rows.dtype) - product(rows, inverse))
     return inverse / size.T
 
 
@@ -154,7 +161,18 @@ def _diagonal(matrix: Array) -> Array:
 
 
 def product(a: Array, b: Array) -> Array:
-    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)  # without a matmul, which GPUs may compute in fewer bits
+    """Return the matrix product, without a matmul, which GPUs may compute in fewer bits."""
+    return functools.reduce(jnp.add, (a[..., :, k, None] * b[..., None, k, :] for k in range(b.shape[-2])))
+
+
+def add_rows(matrix: Array) -> Array:
+    """Return the sum of the rows of [..., d, d], without a reduction, which XLA might not fuse."""
+    return functools.reduce(jnp.add, (matrix[..., k, :] for k in range(matrix.shape[-2])))
+
+
+def largest_of(x: Array) -> Array:
+    """Return the largest number of [..., d], likewise."""
+    return functools.reduce(jnp.maximum, (x[..., k] for k in range(x.shape[-1])))
 
 
 def is_valid(lattice: Lattice) -> Array:
@@ -172,7 +190,7 @@ def fractions_of(points: Array, lattice: Lattice) -> Array:
     if lattice.images.orthogonal:
         return from_origin * lattice.spread(_diagonal(lattice.transform), 2)
     if lattice.transform.ndim == 3:
-        return jnp.sum(from_origin[:, :, None] * lattice.transform, axis=1)
+        return add_rows(from_origin[:, :, None] * lattice.transform)
     return product(from_origin, lattice.transform) if len(points) else from_origin
 
 
@@ -200,18 +218,21 @@ def shift_pairs(difference: Array, shifts: Array, lattice: Lattice) -> Shifted:
     return Shifted(vectors, shifts, slack, fixed.given, lattice.images.orthogonal, lattice.images.basis)
 
 
-def given_shifts(shifts: Array, images: Images) -> Array:
+def given_shifts(shifts: Array, lattice: Lattice) -> Array:
     """Return shifts [..., d] of whole numbers in terms of the given lattice vectors, int32."""
-    counts = shifts.astype(jnp.int32)
-    if images.basis is None:
+    counts, images, dim = shifts.astype(jnp.int32), lattice.images, lattice.dim
+    if images.basis is None and not images.short:
         return counts
-    rows = [np.array(row, np.int32).reshape((1,) * (counts.ndim - 1) + (-1,)) for row in images.basis]
+    if images.basis is not None:
+        rows = [np.array(row, np.int32).reshape((1,) * (counts.ndim - 1) + (-1,)) for row in images.basis]
+    else:
+        rows = [lattice.spread(lattice.given[..., dim + k, :], counts.ndim).astype(jnp.int32) for k in range(dim)]
     return functools.reduce(jnp.add, (counts[..., k, None] * row for k, row in enumerate(rows)))
 
 
-def forward_shifts(shifts: Array, images: Images) -> Array:
+def forward_shifts(shifts: Array, lattice: Lattice) -> Array:
     """Return shifts [..., d], negated if needed so that the first nonzero number in the given vectors is positive."""
-    given, backward = given_shifts(shifts, images), jnp.zeros(shifts.shape[:-1], bool)
+    given, backward = given_shifts(shifts, lattice), jnp.zeros(shifts.shape[:-1], bool)
     for k in reversed(range(shifts.shape[-1])):
         backward = (given[..., k] < 0) | ((given[..., k] == 0) & backward)
     return jnp.where(backward[..., None], -shifts, shifts)

@@ -46,3 +46,60 @@ def _less(rows: list[list[Fraction]], k: int, others: list[int], times: tuple[in
 
 def _dot(a: list[Fraction], b: list[Fraction]) -> Fraction:
     return sum((x * y for x, y in zip(a, b, strict=True)), Fraction(0))
+
+
+# --- many lattices at a time ---------------------------------------------------------------------------------------------
+
+_GAIN = 4.0  # so many times fewer images, at least, make short vectors worth while
+_MOST_NUMBERS = 4096  # largest sum of the numbers of one given vector in all short ones: so shifts stay exact in float32
+_ROUNDS = 64
+
+
+def short_vectors(vectors: np.ndarray, periodic: np.ndarray) -> np.ndarray | None:
+    """Return U [systems, d, d], whole floats, for lattices [systems, d, d] in float64; None if no system has far shorter vectors.
+
+    Systems to which short vectors bring little keep theirs: their U is 1. `periodic` [systems, d] says which vectors count.
+    """
+    dim, unit = vectors.shape[-1], np.broadcast_to(np.eye(vectors.shape[-1]), vectors.shape)
+    rows = np.where(periodic[..., None], vectors, 0)
+    numbers, changing = unit.copy(), np.flatnonzero(_images_per_volume(rows, periodic) > _GAIN)
+    for _ in range(_ROUNDS):
+        before = numbers[changing]
+        for k in range(dim):
+            _shorten_many(rows, numbers, periodic, changing, k)
+        changing = changing[(numbers[changing] != before).any(axis=(1, 2))]
+        if not len(changing):
+            break
+    short = numbers @ rows
+    gain = _images_per_volume(rows, periodic) / _images_per_volume(short, periodic)
+    useful = (gain >= _GAIN) & (np.abs(numbers).sum(axis=1).max(axis=1) <= _MOST_NUMBERS)
+    return np.where(useful[:, None, None], numbers, unit) if useful.any() else None
+
+
+def _images_per_volume(rows: np.ndarray, periodic: np.ndarray) -> np.ndarray:
+    """Return the product of the ratios of the lengths of vectors to the distances between faces, at least 1."""
+    inverse = np.linalg.pinv(rows)
+    lengths = np.linalg.norm(rows, axis=2) * np.linalg.norm(inverse, axis=1)
+    return np.where(periodic, lengths, 1).prod(axis=1)
+
+
+def _shorten_many(rows: np.ndarray, numbers: np.ndarray, periodic: np.ndarray, which: np.ndarray, k: int) -> None:
+    """Subtract whole multiples of the other vectors from row k of the short vectors wherever that makes it shorter."""
+    dim = rows.shape[-1]
+    others = [j for j in range(dim) if j != k]
+    given = rows[which]
+    for times in [None, *product((-1.0, 0.0, 1.0), repeat=len(others))]:
+        some = numbers[which]
+        short = some @ given
+        squares = (short**2).sum(axis=2)
+        if times is None:  # one after the other, rounded
+            for j in others:
+                along = (short[:, k] * short[:, j]).sum(axis=1) / np.where(squares[:, j] > 0, squares[:, j], 1)
+                some[:, k] -= np.round(along)[:, None] * some[:, j]
+                short[:, k] = np.einsum("sd,sdk->sk", some[:, k], given)
+        else:
+            for j, many in zip(others, times, strict=True):
+                some[:, k] += many * np.where(periodic[which, j], 1, 0)[:, None] * some[:, j]
+            short[:, k] = np.einsum("sd,sdk->sk", some[:, k], given)
+        shorter = periodic[which, k] & ((short[:, k] ** 2).sum(axis=1) < squares[:, k] * (1 - 1e-9))
+        numbers[which[shorter], k] = some[shorter, k]

@@ -14,7 +14,7 @@ from jax import Array, lax
 
 from jfrnn._geometry.batch import Batch
 from jfrnn._geometry.images import LARGEST_TURN
-from jfrnn._geometry.lattice import Lattice, fractions_of, product, translation
+from jfrnn._geometry.lattice import Lattice, add_rows, fractions_of, largest_of, product, translation
 
 _TURN_BITS = 10
 NOT_FINITE, TOO_FAR = 1 << _TURN_BITS, 2 << _TURN_BITS
@@ -103,17 +103,17 @@ def wrap(
     most = (met & LARGEST_TURN).astype(dtype)  # at least the largest number of turns, and less than twice that
 
     matrix, transform = jnp.abs(lattice.matrix), jnp.abs(lattice.transform)
-    spans = matrix.sum(axis=-2)
+    spans = add_rows(matrix)
     size = jnp.abs(lattice.origin) + (most + 1) * spans  # largest coordinate so many lattice vectors away
     if not (images.orthogonal or (lattice.flags is None and np.all(periodic))):
         size = size + functools.reduce(jnp.maximum, _largest_finite(wrapped, batch, len(spans)))
     residual = lattice.residual + 8 * eps * product(matrix, transform)
-    length = jnp.sqrt(jnp.sum((transform * radius) ** 2, axis=-2)) * (1 + 16 * eps)
+    length = jnp.sqrt(add_rows((transform * radius) ** 2)) * (1 + 16 * eps)
     most_shifts = jnp.asarray(max(images.reach), dtype)
     if batch is not None:  # those of each system alone
-        most_shifts = jnp.minimum(most_shifts, jnp.ceil(jnp.max(length, axis=-1, keepdims=True)) + 1)
+        most_shifts = jnp.minimum(most_shifts, jnp.ceil(largest_of(length)[..., None]) + 1)
     shifts = most + most_shifts + 1
-    rounding = 8 * eps * product(size[..., None, :], transform)[..., 0, :] + 2 * shifts * residual.sum(axis=-2)
+    rounding = 8 * eps * product(size[..., None, :], transform)[..., 0, :] + 2 * shifts * add_rows(residual)
     if images.orthogonal:
         rounding = jnp.where(periodic, rounding, 0)  # cells along open axes use the given coordinates
     margin = 2 * rounding + jnp.where(periodic, 8 * eps, 0)
@@ -135,13 +135,13 @@ def _wrapping_error(most: Array, reach: Array, lattice: Lattice) -> Array:
     """
     dim, images = lattice.dim, lattice.images
     u = 0.525 * jnp.finfo(lattice.matrix.dtype).eps  # 5 % more than eps/2 covers second-order terms and the rounding of this sum
-    spans = jnp.abs(lattice.matrix).sum(axis=-2)  # 0 for components to which no lattice vector contributes
+    spans = add_rows(jnp.abs(lattice.matrix))  # 0 for components to which no lattice vector contributes
     cell = jnp.where(spans > 0, jnp.abs(lattice.origin) + spans, 0)
     products = 1 if images.orthogonal else 2 * dim
     wrapping = jnp.where(most > 0, products * most * spans + cell, 0)
     exact = images.orthogonal & (reach <= 2)
     moving = jnp.where(exact, 0, products * reach) * spans + cell + reach * spans
-    return u * jnp.max(2 * wrapping + moving, axis=-1, initial=0)
+    return u * largest_of(2 * wrapping + moving)
 
 
 def _largest_finite(clouds: list[Array], batch: Batch | None, systems: int) -> list[Array]:

@@ -165,7 +165,7 @@ def flat_edges(
         systems = None if batch is None else batch.of_queries.at[flat.rows].get(mode="clip")
         lattice = lattice_of_rows(box, kind, np.dtype(sources.dtype), systems, topology.native)
         displacement = displacement + translation(whole, lattice)
-        shift = given_shifts(whole, kind)
+        shift = given_shifts(whole, lattice)
     missing = flat.offsets[-1] > total
     displacement = jnp.where(real[:, None], displacement, 0).astype(sources.dtype)
     distance, displacement = (jnp.where(missing, jnp.nan, x) for x in (norms(displacement), displacement))

@@ -38,7 +38,7 @@ class ImageCodes(NamedTuple):
 
     Attributes:
         codes: Index among the shifts within reach, for wrapped positions, shape [m, capacity]: uint8 for up to 256 images, int16
-            for up to 32 768, else int32. Shifts and turns count the vectors of `Images.basis`.
+            for up to 32 768, else int32. Shifts and turns count the vectors of `Images.basis`, or of `Box.numbers`.
         turns: How many lattice vectors each source was from the box when the list was made, packed, shape [n], int32.
         query_turns: Likewise for queries, shape [m], int32; None if the sources are the queries.
     """
@@ -127,9 +127,11 @@ def _find_slots(
         image = jnp.where(used, codes.codes.astype(jnp.int32), lattice.images.home)
         shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)[image] + query_turns[:, None] - turns[neighbor]
     kind = lattice.images
-    if half and kind.basis is not None:  # of a particle's two opposite images, keep the forward one in the given vectors
+    if half and (
+        kind.basis is not None or kind.short
+    ):  # of a particle's two opposite images, keep the forward one in the given vectors
         own = neighbor == lax.broadcasted_iota(jnp.int32, idx.shape, 0)
-        shifts = jnp.where(own[..., None], forward_shifts(shifts, kind), shifts)
+        shifts = jnp.where(own[..., None], forward_shifts(shifts, lattice), shifts)
     most = 2 * LARGEST_TURN + max(kind.reach)  # at larger distances no pair is decided exactly
     used = used & (jnp.abs(shifts) <= most).all(axis=-1)
     return _Slots(used, neighbor, difference, jnp.where(used[..., None], shifts, 0))
@@ -170,7 +172,7 @@ def lattice_shifts(
 ) -> Array:
     lattice, of_sources = _lattices(box, kind, np.dtype(sources.dtype), batch, topology.native)
     slots = _find_slots(topology, count, images, sources, rows, lattice, half, of_sources)
-    return given_shifts(lax.stop_gradient(slots.shifts), kind)
+    return given_shifts(lax.stop_gradient(slots.shifts), lattice)
 
 
 def _lattices(box: Box, kind: Images, dtype: np.dtype, batch: Batch | None, native: bool) -> tuple[Lattice, Lattice]:
@@ -200,7 +202,8 @@ def periodic_vectors(
     fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
     pairs = shift_pairs(difference, shifts, lattice)
     if is_native(topology, kind, half):
-        given_list = kept_list(topology, count, images, fixed_sources, fixed_rows, given, closed, lattice)
+        one_each = lax.stop_gradient(make_lattice(box, kind, np.dtype(sources.dtype)))
+        given_list = kept_list(topology, count, images, fixed_sources, fixed_rows, given, closed, one_each, batch)
         mask = call_apart(kept_mask, given_list)
     else:
         fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
@@ -211,9 +214,9 @@ def periodic_vectors(
 def is_native(topology: Topology, kind: Images | None, half: bool) -> bool:
     """Say whether Warp's kernels decide which slots hold a pair.
 
-    They do not in half lists of short vectors, whose images JAX chooses, nor where each system has a box of its own.
+    They do not in half lists of short vectors, whose images JAX chooses.
     """
-    return topology.native and not (kind is not None and ((half and kind.basis is not None) or kind.per_system))
+    return topology.native and not (kind is not None and half and (kind.basis is not None or kind.short))
 
 
 def kept_list(
@@ -225,20 +228,26 @@ def kept_list(
     cutoff: Cutoff | Radii | None,
     closed: bool,
     lattice: Lattice | None,
+    batch: Batch | None = None,
 ) -> KeptList:
-    """Return a list at these positions as Warp's kernels take it."""
+    """Return a list at these positions as Warp's kernels take it; `lattice` is that of all systems or, of a batch, one of each."""
     codes, made = images
-    of_pairs = pair_cutoff(cutoff, closed)
-    turns = None if codes is None or lattice is None else _turns_now(codes, made, sources, rows, lattice)
+    of_pairs, systems, turns = pair_cutoff(cutoff, closed), None, None
+    if lattice is not None and batch is not None and lattice.images.per_system:
+        most = len(lattice.origin) - 1  # rows without a box get any
+        systems = jnp.clip(batch.sources, 0, most), jnp.clip(batch.of_queries, 0, most)
+    if codes is not None and lattice is not None:
+        of_sources, of_rows = (lattice, lattice) if systems is None else map(lattice.of_rows, systems)
+        turns = _turns_now(codes, made, sources, rows, of_rows, of_sources)
     fixed = lax.stop_gradient((sources, rows, turns, of_pairs, lattice))
-    return KeptList(topology.idx, count, topology.codes, *fixed, topology.order, None)
+    return KeptList(topology.idx, count, topology.codes, *fixed, topology.order, None, systems)
 
 
 def kept_shifts(given: KeptList) -> Array:
     """Return the lattice shifts of the slots of a list in a box, [m, capacity, d] whole floats, 0 in unused slots."""
     if given.lattice is None:
         raise TypeError("a list in open space has no shifts.")
-    lattice = given.lattice
+    lattice = given.lattice if given.systems is None else given.lattice.of_rows(given.systems[1])
     used = given.idx < given.sources.shape[0]
     neighbor = jnp.where(used, given.idx, 0)
     if given.codes is None or given.turns is None:

@@ -219,7 +219,7 @@ class KeptSearch(KeptOptions):
         if self.box is None:
             raise ValueError("this list was made without a periodic box: leave box out.")
         checked = check_box(box, sources, like=self.box)
-        return None if checked is None else round_box(checked, np.dtype(sources.dtype))
+        return None if checked is None else round_box(checked.counted_as(self.box), np.dtype(sources.dtype))
 
     def _grow_images(self, box: Box | None, radii: Radii | None) -> Images | None:
         if self.box_kind is None or self.box is None or box is None:

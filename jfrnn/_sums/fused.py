@@ -56,8 +56,6 @@ def refusal(inputs: Inputs, platform: str) -> str | None:
     """Return why this engine cannot run on such a search, or None if it can."""
     if platform not in PLATFORMS:
         return f"on the platform {platform!r}, only on the CPU and on CUDA"
-    if inputs.box is not None and inputs.box.per_system:
-        return "where box holds a box per system: list them (neighbors=jfrnn.search(...))"
     if platform != "cpu" and isinstance(inputs.cutoff, Radii):
         return f"with a cutoff per particle on the platform {platform!r}, only on the CPU"
     if platform != "cpu" and inputs.box is not None and inputs.sources.shape[0] >= MOST_IN_BOX:

@@ -11,11 +11,12 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._engine import Inputs, Options, hide_inactive, is_decidable, take_present
+from jfrnn._engine import Inputs, KeptList, Options, hide_inactive, is_decidable, take_present
 from jfrnn._geometry import (
     EXCHANGED,
     Batch,
     Box,
+    Cutoff,
     Images,
     Lattice,
     Radii,
@@ -23,6 +24,7 @@ from jfrnn._geometry import (
     check_cutoff,
     make_cutoff,
     make_cutoffs,
+    make_lattice,
     translation,
 )
 from jfrnn._search import MOST_SLOTS, ROWS_ARE_WHOLE, NeighborList, is_native, kept_list, lattice_of_rows
@@ -100,13 +102,14 @@ def _relation_of_list(nbrs: NeighborList, sources: Array, rows: Array, box: Box 
         return Listed(nbrs.idx, mask, shifts, nbrs.source_count, symmetric)
     nbrs._check_known(spared=ROWS_ARE_WHOLE)
     cutoff = nbrs.radii if nbrs.cutoff is None else make_cutoff(nbrs.cutoff, nbrs.dtype, nbrs.closed)
-    lattice = _lattice(nbrs._box_now(box, sources), nbrs.box_kind, sources, nbrs.batch)
-    given = call_apart(
-        lambda nbrs, sources, rows, cutoff, lattice: kept_list(
-            nbrs._topology(), nbrs.count, nbrs._images_made(), sources, rows, cutoff, nbrs.closed, lattice
-        ),
-        *(nbrs, sources, rows, cutoff, lattice),
-    )
+    box, kind = nbrs._box_now(box, sources), nbrs.box_kind
+
+    def make(nbrs: NeighborList, sources: Array, rows: Array, cutoff: Cutoff | Radii, box: Box | None) -> KeptList:
+        lattice = None if box is None or kind is None else make_lattice(box, kind, np.dtype(sources.dtype))
+        images = nbrs._images_made()
+        return kept_list(nbrs._topology(), nbrs.count, images, sources, rows, cutoff, nbrs.closed, lattice, nbrs.batch)
+
+    given = call_apart(make, nbrs, sources, rows, cutoff, box)
     known = nbrs.reverse if nbrs.reverse is not None and nbrs.reverse.starts is not None else None
     return Kept(given, known, symmetric)
 

@@ -60,7 +60,7 @@ def pair_sum(
             other direction gets the same value, or its negative, bit for bit. So forces balance up to the rounding of the sums.
             Every row gets its whole sum in any case. Not with queries, nor with the rules "gather" and "scatter".
         queries: As in `search`; the result has one row per query.
-        box: As in `search`; with `neighbors` as in `NeighborList.vectors`.
+        box: As in `search`, one for all or one per system; with `neighbors` as in `NeighborList.vectors`.
         batch: As in `search`.
         radius_rule: As in `search`.
         species: As in `search`.
@@ -73,8 +73,8 @@ def pair_sum(
         backend: "jax" (cells, any device), "brute" (all n·m candidates), "warp" (cells, on the CPU and on CUDA: fn is translated
             into the kernel that finds the pairs), or "auto": on the CPU "warp" if it supports the sum, else "jax". "warp" sums
             floats of the dtype of the positions; values and closed-over arrays have that dtype, or are smaller floats, bool, int32
-            or (float64) int64; cutoffs per particle work on the CPU only, and a box per system not yet. If fn or its derivative
-            has no translation, "auto" warns.
+            or (float64) int64; cutoffs per particle work on the CPU only. A box per system is taken on both. If fn or its
+            derivative has no translation, "auto" warns.
         neighbors: A list to use instead of a search: its pairs that are closer than its cutoff at these positions, as in
             `NeighborList.vectors`. A half list gives whole sums too. Leave out the options with which it was made. If the list may
             lack pairs (see `NeighborList.check`), this raises outside jit. Over lists that "warp" made, on the CPU and on CUDA, a

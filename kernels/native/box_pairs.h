@@ -1,76 +1,89 @@
-// Pairs in systems of which each has a box of its own (jfrnn/_geometry/box_cells.py): what a query visits, on the CPU and on CUDA.
+// Pairs in systems of which each has a box of its own: what a query visits, on the CPU and on CUDA.
 //
-// Sources stand by system and by cell. `visits` has seven integers of each query: its system, the lowest cell along each axis, and how
-// many there are from that on. Cells are numbered on beyond the ends of a box, where the next image begins. `cells` has five of each
-// system: cells along each axis, the first cell, a bit per periodic axis. `boxes` has the numbers of each lattice (lattice.h), behind
-// the radius. `axes` are the coordinates of sources, in their box and sorted, `stride` numbers of each axis, and `ids` their numbers;
-// `asked` are those of queries, which are served in `order`. Rows of `positions` and `queries` are as they were given, with packed turns.
+// Sources stand by system and by cell (box_space.h). `axes` are their coordinates, in their box and sorted, `stride` numbers of each
+// axis, and `ids` their numbers. Rows of `positions` and `queries` are as they were given, with packed turns. Queries that are the
+// sources are served in the order of `ids`, others as they come; `systems` are theirs.
 #pragma once
+#include "box_space.h"
 #include "exact.h"
 #include "excluded.h"
 
 struct BoxArguments {
-    const real *positions, *queries, *boxes, *axes, *asked;
-    const int *ids, *order, *visits, *cells, *start, *excluded_starts, *excluded, *starts;
+    const real *positions, *queries, *boxes, *axes;
+    const int *systems, *ids, *cells, *start, *excluded_starts, *excluded, *starts;
     int *idx, *receivers, *count, *info;
-    int n, m, stride, own, capacity, closed, drop_self, later_only;
+    int n, m, stride, own, capacity, closed, drop_self;
 };
 
 // The sources of a row of cells, in one image.
 struct BoxRun {
     int from, size, code;
-    real away[3];  // from the query to where the origin of the image is
+    int shift[3];   // of the image
+    real moved[3];  // by which sources are moved into it
 };
 
-struct BoxPairs : BoxArguments, Space {
+struct BoxPairs : BoxArguments, BoxSpace {
     real inside, outside;  // squares of distances below are surely those of pairs, squares beyond surely not
-    int system;            // whose lattice `lattice` is
-    int low[3], visited[3], counts[3], first, axes_turning;
+    int low[3], visited[3];
     int runs;            // of the query
     int query;           // its number
     int place;           // where it stands among the sources, or -1
     int at_home, codes;  // the code of no shift, and how many there are
-    real q[3];
+    real q[3];           // where it is, in its box
 
-    JFRNN_MEMBER explicit BoxPairs(const BoxArguments& given)
-        : BoxArguments(given), Space(given.boxes), system(-1), at_home(0), codes(1) {
+    JFRNN_MEMBER explicit BoxPairs(const BoxArguments& given) : BoxArguments(given), BoxSpace(given.boxes), at_home(0), codes(1) {
         for (int k = 0; k < DIM; ++k) {
             at_home = at_home * (2 * lattice.images(k) + 1) + lattice.images(k);
             codes *= 2 * lattice.images(k) + 1;
         }
     }
-    // Goes to the query that is served as number `turn`.
+    // Goes to the query that is served as number `turn`: it visits the cells within reach of it, numbered on beyond the ends of its box,
+    // where the next image begins.
     JFRNN_MEMBER void go_to(int turn) {
-        query = order[turn];
+        query = own ? ids[turn] : turn;
         place = own ? turn : -1;
-        const int* const mine = visits + 7ll * query;
-        if (mine[0] != system)
-            enter(mine[0]);
-        int rows = 1;
+        if (systems[query] != system)
+            enter(systems[query]);
+        point_of(queries + (long long)ROW * query, q);
         for (int k = 0; k < 3; ++k) {
-            low[k] = k < DIM ? mine[1 + k] : 0;
-            visited[k] = k < DIM ? mine[4 + k] : 1;
-            q[k] = k < DIM ? asked[(long long)DIM * query + k] : real(0);
-            rows *= k > 0 ? visited[k] : 1;
+            low[k] = 0;
+            visited[k] = 1;
+            if (k < DIM)
+                visit(k);
         }
+        runs = finite_point(q) ? count_runs() : 0;
+    }
+    JFRNN_MEMBER int count_runs() const {
         const int pieces = floor_of(low[0] + visited[0] - 1, counts[0]) - floor_of(low[0], counts[0]) + 1;
-        runs = visited[0] > 0 ? rows * pieces : 0;
+        return visited[0] > 0 ? pieces * visited[1] * visited[2] : 0;
+    }
+    JFRNN_MEMBER void visit(int k) {
+        constexpr int LARGEST_TURN = 511;  // as in jfrnn/_geometry/images.py
+        const real reach = lattice.reach(k);
+        int high = cell_along(k, q, reach);
+        low[k] = cell_along(k, q, -reach);
+        if (is_turning(k)) {
+            const int whole_reach = reach < LARGEST_TURN ? (int)reach + (reach > (int)reach) : LARGEST_TURN;
+            const int most = whole_reach < lattice.images(k) ? whole_reach : lattice.images(k);
+            low[k] = low[k] < -most * counts[k] ? -most * counts[k] : low[k];
+            high = high < (most + 1) * counts[k] ? high : (most + 1) * counts[k] - 1;
+        }
+        visited[k] = high < low[k] ? 0 : high - low[k] + 1;
+        if (!is_turning(k))
+            visited[k] = visited[k] < counts[k] ? visited[k] : counts[k];
     }
     JFRNN_MEMBER void enter(int other) {
-        system = other;
-        lattice = Lattice(boxes + (long long)LATTICE_END * system);
-        const int* const mine = cells + 5ll * system;
+        const int* const mine = cells + 5ll * other;
+        BoxSpace::enter(boxes, other, mine[4]);
         for (int k = 0; k < 3; ++k)
             counts[k] = k < DIM ? mine[k] : 1;
         first = mine[3];
-        axes_turning = mine[4];
         const real off = 2 * lattice.slack() * step_scale;  // by which distances of images may be wrong
         const real inner = step_radius > off ? step_radius - off : real(0), outer = step_radius + off;
         const real band = 8 * (1 + PERIODIC) * step_eps;
         inside = inner * inner * (1 - band);
         outside = outer * outer * (1 + band);
     }
-    JFRNN_FUNCTION int floor_of(int x, int of) { return x >= 0 ? x / of : -1 - (-1 - x) / of; }
     JFRNN_MEMBER int fill_value() const { return PERIODIC == 2 ? n * codes : n; }
     JFRNN_MEMBER int name_of(int source, int code) const { return PERIODIC == 2 ? source + n * code : source; }
 
@@ -92,17 +105,18 @@ struct BoxPairs : BoxArguments, Space {
         run.size = start[row + (ends < counts[0] ? ends : counts[0])] - run.from;
         run.code = 0;
         for (int k = 0; k < DIM; ++k) {
-            shift[k] = axes_turning >> k & 1 ? shift[k] : 0;
+            run.shift[k] = shift[k] = is_turning(k) ? shift[k] : 0;
             run.code = run.code * (2 * lattice.images(k) + 1) + shift[k] + lattice.images(k);
         }
         for (int k = 0; k < 3; ++k)
-            run.away[k] = k < DIM ? lattice.translation(shift[0], shift[1], shift[2], k) - q[k] : real(0);
+            run.moved[k] = k < DIM ? lattice.translation(shift[0], shift[1], shift[2], k) : real(0);
         return run;
     }
     // The smallest source that a query asks for in an image: of its own images, half lists have those ahead.
     JFRNN_MEMBER int first_asked(int code) const {
-        return !later_only ? 0 : code == at_home ? query + drop_self : code < at_home ? query + 1 : query;
+        return !LATER ? 0 : code == at_home ? query + drop_self : code < at_home ? query + 1 : query;
     }
+    JFRNN_MEMBER bool is_excluded(int source) const { return Excluded(excluded_starts, excluded, query).has(source); }
     // Decides exactly.
     JFRNN_MEMBER bool is_pair(int source, int code) const {
         return exact_image(lattice, queries + (long long)ROW * query, positions + (long long)ROW * source, code, radius, 0, closed);

@@ -1,11 +1,10 @@
-// Rows of neighbors, or their counts, in systems with boxes of their own on the CPU: a query meets LANES sources of a run at a time.
+// Rows of neighbors, or their counts, in systems with boxes of their own on the CPU.
 #pragma once
-#include "box_pairs.h"
-#include "lanes.h"
+#include "box_pairs_cpu.h"
 #include "row_places.h"
 
-struct BoxRows : BoxPairs {
-    explicit BoxRows(const BoxArguments& given) : BoxPairs(given) {}
+struct BoxRows : BoxLanes {
+    explicit BoxRows(const BoxArguments& given) : BoxLanes(given) {}
 
     // Threads hand themselves chunks of queries; `info` holds the length of the longest row, and the next chunk.
     void run() {
@@ -42,34 +41,15 @@ struct BoxRows : BoxPairs {
     }
     // Meets the sources of a run from number b on; those that are neighbors go to `to`, where there is `room`.
     int meet(const BoxRun& run, int b, int* to, int room) const {
-        const int at = run.from + b;
-        vec square{};
-        for (int k = 0; k < DIM; ++k) {
-            vec d = lanes_from(axes + (long long)k * stride + at) + run.away[k];
-            if constexpr (SCALED)
-                d *= step_scale;
-            square += d * d;
-        }
-        unsigned int asked = lanes_before(run.size - b);
-        if (drop_self && run.code == at_home && place >= at && place < at + LANES)
-            asked &= ~(1u << (place - at));
-        unsigned int pairs = mask_of(square, inside, Below{}) & asked;
-        unsigned int open = mask_of(square, outside, BelowOrAt{}) & asked & ~pairs;
-        if (!LIST && !open && !later_only && !EXCLUDING)
-            return __builtin_popcount(pairs);
-        const ints sources = lanes_from(ids + at);
-        for (; open; open &= open - 1) {
-            const int lane = __builtin_ctz(open);
-            pairs |= is_pair(sources[lane], run.code) ? 1u << lane : 0;
-        }
-        if (later_only)
-            pairs &= bits_of_flags(__builtin_convertvector(sources >= first_asked(run.code), flags));
-        const Excluded mine(excluded_starts, excluded, query);
-        for (unsigned int rest = EXCLUDING ? pairs : 0; rest; rest &= rest - 1)
-            if (mine.has(sources[__builtin_ctz(rest)]))
-                pairs &= ~(rest & -rest);
-        if (LIST && pairs)
-            pack_within(sources + name_of(0, run.code), to, pairs, room);
-        return __builtin_popcount(pairs);
+        Tested some = test(run, b);
+        decide(run, b, some);
+        if (!LIST && !LATER)
+            return __builtin_popcount(some.pairs);
+        const ints sources = lanes_from(ids + run.from + b);
+        if constexpr (LATER)
+            some.pairs &= bits_of_flags(__builtin_convertvector(sources >= first_asked(run.code), flags));
+        if (LIST && some.pairs)
+            pack_within(sources + name_of(0, run.code), to, some.pairs, room);
+        return __builtin_popcount(some.pairs);
     }
 };

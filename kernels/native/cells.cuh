@@ -2,6 +2,7 @@
 #pragma once
 #include "cells.h"
 #include "excluded.h"
+#include "scan.cuh"
 #include "shares.h"
 
 struct SearchArguments {
@@ -251,71 +252,10 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
         }
     }
 
-    // Turns counts into first places, in one pass (Merrill & Garland 2016, decoupled look-back).
+    // Turns counts into first places; one more entry is the end of the last cell.
     JFRNN_MEMBER void scan_counts() {
-        __shared__ int sums[8];
-        __shared__ int tile_shared, before_shared;
-        unsigned long long volatile* state = of_queries ? query_tile_state : tile_state;
-        int* counts = of_queries ? query_start : start;
-        const int cells = shared.grid.cells + 1;  // one more entry: the end of the last cell
-        for (;;) {
-            if (threadIdx.x == 0)
-                tile_shared = atomicAdd(&shared.tiles[of_queries], 1);
-            __syncthreads();
-            const int tile = tile_shared;
-            if ((long long)tile * TILE >= cells)
-                break;
-            constexpr int EACH = TILE / BLOCK;
-            const long long first = (long long)tile * TILE + threadIdx.x * EACH;
-            int value[EACH], total = 0;
-            for (int e = 0; e < EACH; ++e) {
-                value[e] = total;
-                total += first + e < cells ? counts[first + e] : 0;
-            }
-            int inclusive = total;
-            for (int step = 1; step < 32; step *= 2) {
-                const int other = __shfl_up_sync(ALL, inclusive, step);
-                inclusive += lane >= step ? other : 0;
-            }
-            if (lane == 31)
-                sums[warp_in_block] = inclusive;
-            __syncthreads();
-            int before = inclusive - total, tile_total = 0;
-            for (int w = 0; w < 8; ++w) {
-                before += w < warp_in_block ? sums[w] : 0;
-                tile_total += sums[w];
-            }
-            if (threadIdx.x == 0)  // 1: the sum of this tile, 2: of all tiles up to it; one word, so that both arrive together
-                state[tile] = ((tile == 0 ? 2ull : 1ull) << 32) | (unsigned int)tile_total;
-            if (warp_in_block == 0) {
-                int earlier = 0;
-                for (int back = tile - 1; back >= 0; back -= 32) {
-                    const int seen = back - lane;
-                    unsigned long long word = seen >= 0 ? 0 : 2ull << 32;
-                    while (__any_sync(ALL, (word >> 32) == 0))
-                        word = (word >> 32) == 0 ? state[seen] : word;
-                    const unsigned int full = __ballot_sync(ALL, (word >> 32) == 2);
-                    const int until = full ? __ffs(full) - 1 : 31;
-                    int part = lane <= until ? (int)(word & 0xffffffffull) : 0;
-                    for (int step = 16; step > 0; step /= 2)
-                        part += __shfl_down_sync(ALL, part, step);
-                    earlier += __shfl_sync(ALL, part, 0);
-                    if (full)
-                        break;
-                }
-                if (lane == 0) {
-                    before_shared = earlier;
-                    if (tile > 0)
-                        state[tile] = (2ull << 32) | (unsigned int)(earlier + tile_total);
-                }
-            }
-            __syncthreads();
-            before += before_shared;
-            for (int e = 0; e < EACH; ++e)
-                if (first + e < cells)
-                    counts[first + e] = before + value[e];
-            __syncthreads();
-        }
+        scan_in_place(of_queries ? query_start : start, shared.grid.cells + 1, of_queries ? query_tile_state : tile_state,
+            &shared.tiles[of_queries]);
     }
 
     // Puts particles into their cells, in the order in which they came.

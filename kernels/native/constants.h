@@ -52,6 +52,7 @@ constexpr bool ORDERED = true;    // an order of rows is given
 constexpr int LANES_PER_ROW = 8;  // of CUDA
 constexpr bool DECIDED = true;    // which of its slots hold a pair
 constexpr bool MEASURED = false;  // distances are written, too
+constexpr bool BOXES = false;     // each system has a lattice of its own
 // Of triangles (see jfrnn/kernels/_triangles.py, triangles_cpu.py and triangles_cuda.py).
 constexpr int LIMBS = 14, ROOM = 1202, STRIDE = 1;
 constexpr int MOST_CELLS = 8, MOST_ALONG = 64, MOST_ALONG_LOG2 = 6;

@@ -11,12 +11,16 @@ struct KeptLane : Kept {
     const int row;
 
     JFRNN_MEMBER explicit KeptLane(const KeptArguments& given)
-        : Kept(given),
+        : Kept(given, BOXES && is_place(given) ? row_at(given) : 0),
           lane((int)(thread_index() % LANES_PER_ROW)),
-          is_row(thread_index() / LANES_PER_ROW < given.m),
-          row(row_at((int)(thread_index() / LANES_PER_ROW))) {}
+          is_row(is_place(given)),
+          row(row_at(given)) {}
+    JFRNN_FUNCTION bool is_place(const KeptArguments& given) { return thread_index() / LANES_PER_ROW < given.m; }
     // Where the first number is negative, rows are taken as they come: all threads read that one, and none waits for its own.
-    JFRNN_MEMBER int row_at(int place) const { return ORDERED && is_row && order[0] >= 0 ? order[place] : place; }
+    JFRNN_FUNCTION int row_at(const KeptArguments& given) {
+        const int place = (int)(thread_index() / LANES_PER_ROW);
+        return ORDERED && is_place(given) && given.order[0] >= 0 ? given.order[place] : place;
+    }
 
     struct Entries {
         int ids[AT_A_TIME], codes[AT_A_TIME];

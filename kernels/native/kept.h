@@ -3,9 +3,11 @@
 // Rows of the list have OWN_LENGTH numbers: coordinates as they are, then turns along each axis (PERIODIC == 2), then the cutoff of i
 // (RADII). Sources have LENGTH: coordinates, OTHERS numbers that a term reads, turns and the cutoff of j. `cutoff` holds the largest
 // cutoff, the lattice, the largest number of a shift, and the cutoffs of pairs of species behind how many there are, -1 for those that
-// are no neighbors; in place of cutoffs then stand the first place of the row of i, and the species of j. `steps` are the shifts of image codes. REVERSED: rows are those of the sources
-// of the list, whose slots are `lengths` many in `slots` from `starts` on, and j is who has such a slot. ORDERED: threads take rows as
-// `order` has them, so that rows that are taken together read the same sources, or as they come where it holds -1.
+// are no neighbors; in place of cutoffs then stand the first place of the row of i, and the species of j. BOXES: `cutoff` has such
+// numbers for each of several systems, of which `systems` says to which a row belongs. `steps` are the shifts of image codes. REVERSED:
+// rows are those of the sources of the list, whose slots are `lengths` many in `slots` from `starts` on, and j is who has such a slot.
+// ORDERED: threads take rows as `order` has them, so that rows that are taken together read the same sources, or as they come where it
+// holds -1.
 #pragma once
 #include "codes.h"
 #include "exact.h"
@@ -13,7 +15,7 @@
 
 struct KeptArguments {
     const real *rows, *points, *cutoff, *steps;
-    const int *idx, *count, *codes, *slots, *starts, *lengths, *order;
+    const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
     int m, n, capacity, images, closed, apart;
 };
 
@@ -46,9 +48,31 @@ struct Kept : KeptArguments, Space {
     // Where lattice vectors lie along the axes: their lengths, and the reciprocals; 0 where space is open. No store can change them.
     real sides[3], units[3];
 
-    JFRNN_MEMBER explicit Kept(const KeptArguments& given) : KeptArguments(given), Space(given.cutoff), moved(0), most(0) {
+    int system;  // whose lattice it is
+
+    // `row` is the first one that is looked at.
+    JFRNN_MEMBER explicit Kept(const KeptArguments& given, int row = 0)
+        : KeptArguments(given), Space(numbers_of(given, row)), moved(0), most(0), system(BOXES ? given.systems[row] : 0) {
         inside = step_radius * step_radius * (1 - 8 * step_eps);
         outside = step_radius * step_radius * (1 + 8 * step_eps);
+        measure_lattice();
+        if constexpr (SHIFTED)
+            most = cutoff[LATTICE_END];
+    }
+    JFRNN_FUNCTION const real* numbers_of(const KeptArguments& given, int row) {
+        const long long length = RADII == OF_KINDS ? KINDS + 1 + (long long)given.cutoff[KINDS] : LATTICE_END + 1;
+        return given.cutoff + (BOXES ? length * given.systems[row] : 0);
+    }
+    // Goes to the lattice of a row.
+    JFRNN_MEMBER void enter(int row) {
+        if (!BOXES || systems[row] == system)
+            return;
+        system = systems[row];
+        lattice = Lattice(numbers_of(*this, row));
+        measure_lattice();
+    }
+    JFRNN_MEMBER void measure_lattice() {
+        moved = 0;
         for (int k = 0; SHIFTED && k < DIM; ++k) {
             real sum = 0;
             for (int l = 0; l < DIM; ++l)
@@ -60,8 +84,6 @@ struct Kept : KeptArguments, Space {
             sides[k] = turns ? lattice.vector(k, k) : real(0);
             units[k] = turns ? lattice.transform(k, k) : real(0);
         }
-        if constexpr (SHIFTED)
-            most = cutoff[LATTICE_END];
     }
     JFRNN_INLINE static Number larger(Number x, Number y) { return Math::select(Math::gt(x, y), x, y); }
     JFRNN_FUNCTION real size_of(real x) { return x < 0 ? -x : x; }

@@ -142,8 +142,10 @@ struct KeptRows : Kept {
             if ((long long)chunk * QUERY_CHUNK >= m)
                 break;
             const int begin = chunk * QUERY_CHUNK, end = m - begin < QUERY_CHUNK ? m : begin + QUERY_CHUNK;
-            for (int row = begin; row < end; ++row)
+            for (int row = begin; row < end; ++row) {
+                enter(row);
                 visitor().serve(row, own_point(row));
+            }
             visitor().finish_chunk(chunk);
         }
     }

@@ -4,15 +4,15 @@
 
 struct MaskArguments {
     const real *rows, *points, *cutoff, *steps;
-    const int *idx, *count, *codes, *slots, *starts, *lengths, *order;
+    const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
     int* mask;
     real* distances;
     int* info;
     int m, n, capacity, images, closed, apart;
 
     KeptArguments of_list() const {
-        return {
-            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, m, n, capacity, images, closed, apart};
+        return {rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images,
+            closed, apart};
     }
 };
 struct KeptMask : KeptRows<KeptMask> {

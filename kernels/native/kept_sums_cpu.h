@@ -5,15 +5,15 @@
 
 struct KeptSumsArguments {
     const real *rows, *points, *cutoff, *steps;
-    const int *idx, *count, *codes, *slots, *starts, *lengths, *order;
+    const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
     const real *shared_values, *own_values;
     real *sums, *totals, *errors;
     int* info;
     int m, n, capacity, images, closed, apart;
 
     KeptArguments of_list() const {
-        return {
-            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, m, n, capacity, images, closed, apart};
+        return {rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images,
+            closed, apart};
     }
 };
 struct KeptSums : KeptRows<KeptSums> {

@@ -1,0 +1,39 @@
+// Pairs in systems with boxes of their own on the CPU: a query meets LANES sources of a run at a time.
+#pragma once
+#include "box_pairs.h"
+#include "lanes.h"
+
+struct BoxLanes : BoxPairs {
+    explicit BoxLanes(const BoxArguments& given) : BoxPairs(given) {}
+
+    // One bit per lane: those that are pairs, and those that have to be decided.
+    struct Tested {
+        unsigned int pairs, open;
+    };
+    // Tests the sources of a run from number b on.
+    Tested test(const BoxRun& run, int b) const {
+        const int at = run.from + b;
+        vec square{};
+        for (int k = 0; k < DIM; ++k) {
+            vec d = lanes_from(axes + (long long)k * stride + at) + (run.moved[k] - q[k]);
+            if constexpr (SCALED)
+                d *= step_scale;
+            square += d * d;
+        }
+        unsigned int asked = lanes_before(run.size - b);
+        if (drop_self && run.code == at_home && place >= at && place < at + LANES)
+            asked &= ~(1u << (place - at));
+        const unsigned int pairs = mask_of(square, inside, Below{}) & asked;
+        return {pairs, mask_of(square, outside, BelowOrAt{}) & asked & ~pairs};
+    }
+    // Decides about those in doubt, and leaves out those that are excluded.
+    void decide(const BoxRun& run, int b, Tested& some) const {
+        for (; some.open; some.open &= some.open - 1) {
+            const int lane = __builtin_ctz(some.open);
+            some.pairs |= is_pair(ids[run.from + b + lane], run.code) ? 1u << lane : 0;
+        }
+        for (unsigned int rest = EXCLUDING ? some.pairs : 0; rest; rest &= rest - 1)
+            if (is_excluded(ids[run.from + b + __builtin_ctz(rest)]))
+                some.pairs &= ~(rest & -rest);
+    }
+};

@@ -1,0 +1,67 @@
+"""Fused pair sums with a box per system, searched and over kept lists: the pairs of the oracle, and derivatives."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_boxes import CAPACITY, box_of, expected_images
+from test_kept_cuda import compiles, term_of
+from test_pair_sum_warp_boxes import assert_marks, marks
+
+import jfrnn
+from jfrnn.cases.crystals import CRYSTAL_CASES
+from jfrnn.kernels import boxes, kept
+
+SLOW = pytest.mark.slow
+fused = functools.partial(jfrnn.pair_sum, backend="warp")
+
+
+def assert_case(name, dtype, dim, listed):
+    given = CRYSTAL_CASES[name].build(dtype, dim)
+    x, q = jnp.asarray(given.positions), None if given.queries is None else jnp.asarray(given.queries)
+    queries = {} if q is None else {"queries": q}
+    systems = given.batch if q is None else given.query_batch
+    options = {"box": box_of(given), "batch": given.batch if q is None else (given.batch, given.query_batch)}
+    values = {"query_values": jnp.arange(len(systems), dtype=dtype)} if queries else {}
+    ids = jnp.arange(len(x), dtype=dtype)
+    if listed:
+        nbrs = jfrnn.search(x, given.cutoff, capacity=CAPACITY[dim], backend="warp", **queries, **options)
+        nbrs.check()
+        found = jfrnn.pair_sum(marks, x, None, ids, neighbors=nbrs, **queries, **values)
+    else:
+        found = fused(marks, x, given.cutoff, ids, **queries, **values, **options)
+    cells = given.boxes if given.boxes.ndim == 3 else np.einsum("sd,dk->sdk", given.boxes, np.eye(dim))
+    there = (systems >= 0) & (systems < len(cells))
+    points = np.where(there[:, None], given.positions if q is None else given.queries, 0)
+    pairs = expected_images(name, dtype, dim)
+    keep = there & np.isfinite(points).all(axis=1)
+    found = jax.tree.map(lambda s: np.where(keep.reshape(-1, *[1] * (s.ndim - 1)), s, 0), found)
+    assert_marks(found, pairs, given.positions, points, cells[np.clip(systems, 0, len(cells) - 1)])
+
+
+@pytest.mark.parametrize(
+    ("name", "listed"),
+    [
+        (name, listed) if (name, listed) in (("mixed", False), ("far", True)) else pytest.param(name, listed, marks=SLOW)
+        for name in CRYSTAL_CASES
+        for listed in (False, True)
+    ],
+)
+def test_case(name, listed):
+    assert_case(name, np.float32, 3, listed)
+
+
+@SLOW
+@pytest.mark.parametrize(("dim", "double", "periodic"), [(3, False, 4), (2, True, 1)])
+def test_kernels_compile_for_cuda(dim, double, periodic):
+    for kernel in boxes.sorting_kernels(dim, double, periodic):
+        assert compiles(kernel)
+    for lists, later in ((False, False), (True, False), (True, True)):
+        assert compiles(boxes.rows_kernel(dim, double, False, lists, later, periodic, True))
+    kind = kept.ListKind(dim, double, False, periodic, 0, "", False, True, False, 8)
+    for extremes in (False, True):
+        term = term_of(kind)
+        term = term._replace(sums=term.sums[:1]) if extremes else term
+        assert compiles(boxes.sum_kernel(term, f"test_{extremes}", dim, double, False, not extremes, extremes, periodic, True))
