@@ -3,12 +3,24 @@
 #include "constants.h"
 #include "device.h"
 
-// A row of `ids`, those of the query from `starts[query]` on, in ascending order; without EXCLUDING there are no rows.
+// A row of `ids`, those of the query from `starts[query]` on, in ascending order; without EXCLUDING there are no rows. Of short rows a
+// filter has a bit for each number modulo 64 that stands there: it tells most other sources apart without a look at the row.
 struct Excluded {
+    static constexpr int SHORT = 64;
     const int *begin, *end;
+    unsigned long long filter;
     JFRNN_INLINE Excluded(const int* starts, const int* ids, int query)
-        : begin(EXCLUDING ? ids + starts[query] : nullptr), end(EXCLUDING ? ids + starts[query + 1] : nullptr) {}
+        : begin(EXCLUDING ? ids + starts[query] : nullptr), end(EXCLUDING ? ids + starts[query + 1] : nullptr), filter(0) {
+        for (const int* id = begin; EXCLUDING && end - begin <= SHORT && id < end; ++id)
+            filter |= 1ull << (*id & 63);
+        if (end - begin > SHORT)
+            filter = ~0ull;
+    }
+    // May it have a source?
+    JFRNN_INLINE bool may_have(int source) const { return filter >> (source & 63) & 1; }
     JFRNN_INLINE bool has(int source) const {
+        if (!may_have(source))
+            return false;
         const int *low = begin, *high = end;
         while (low < high) {
             const int* const middle = low + (high - low) / 2;

@@ -95,10 +95,15 @@ JFRNN_FUNCTION void meet_block(
     }
     if constexpr (EXCLUDING) {
         const Excluded mine(search.excluded_starts, search.excluded, group.my_id);
+        const int* const ids = HELD ? warp.ids + pairs.tested : warp.candidate_ids + first_candidate;
+        unsigned int doubtful = 0;
         for (unsigned int rest = mine.begin < mine.end ? hits : 0; rest; rest &= rest - 1) {
             const int j = __ffs(rest) - 1;
-            const int id = HELD ? warp.ids[pairs.tested + j] : warp.candidate_ids[first_candidate + j];
-            hits &= mine.has(search.source_named(id)) ? ~(1u << j) : ALL;
+            doubtful |= mine.may_have(search.source_named(ids[j])) ? 1u << j : 0;
+        }
+        for (; doubtful; doubtful &= doubtful - 1) {
+            const int j = __ffs(doubtful) - 1;
+            hits &= mine.has(search.source_named(ids[j])) ? ~(1u << j) : ALL;
         }
     }
     pairs.found += __popc(hits);
