@@ -9,17 +9,18 @@ struct Excluded {
     static constexpr int SHORT = 64;
     const int *begin, *end;
     unsigned long long filter;
-    JFRNN_INLINE Excluded(const int* starts, const int* ids, int query)
-        : begin(EXCLUDING ? ids + starts[query] : nullptr), end(EXCLUDING ? ids + starts[query + 1] : nullptr), filter(0) {
-        for (const int* id = begin; EXCLUDING && end - begin <= SHORT && id < end; ++id)
+    JFRNN_INLINE Excluded(const int* starts, const int* ids, int query, unsigned long long filter)
+        : begin(EXCLUDING ? ids + starts[query] : nullptr), end(EXCLUDING ? ids + starts[query + 1] : nullptr), filter(filter) {}
+    JFRNN_INLINE Excluded(const int* starts, const int* ids, int query) : Excluded(starts, ids, query, 0) {
+        const bool is_short = end - begin <= SHORT;
+        for (const int* id = begin; is_short && id < end; ++id)
             filter |= 1ull << (*id & 63);
-        if (end - begin > SHORT)
-            filter = ~0ull;
+        filter = is_short ? filter : ~0ull;
     }
-    // May it have a source?
-    JFRNN_INLINE bool may_have(int source) const { return filter >> (source & 63) & 1; }
+    // May a source stand in a row with a filter?
+    JFRNN_FUNCTION bool may_stand(unsigned long long filter, int source) { return filter >> (source & 63) & 1; }
     JFRNN_INLINE bool has(int source) const {
-        if (!may_have(source))
+        if (!may_stand(filter, source))
             return false;
         const int *low = begin, *high = end;
         while (low < high) {

@@ -337,8 +337,8 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
 
     // Lets a query meet the sources of a run, of an image, from where it meets them at home.
     template <class State>
-    JFRNN_INLINE void meet(State& state, const One& one, int from, int to, int image, const real* from_where) {
-        const Excluded mine = this->excluded_from(one.id);
+    JFRNN_INLINE void meet(
+        State& state, const One& one, const Excluded& mine, int from, int to, int image, const real* from_where) {
         const real* const of_kinds = this->row_of(one.at);
         for (int first = from; first < to; first += LANES) {
             unsigned int sure, near = test(from_where, one.own, of_kinds, first, sure);
@@ -369,6 +369,7 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
         One one{at, query_ids[at], {0, 0, 0}, RULE == SCATTER ? real(0) : query_radii[at], {0, 0, 0}};
         for (int k = 0; k < DIM; ++k)
             one.q[k] = query_axes[(long long)k * m + at];
+        const Excluded mine = this->excluded_from(one.id);
         typename Query::State state = query().begin_query(one);
         for (int g = 0; finite_point(one.q) && g < groups; ++g) {
             if (RULE != GATHER && largest[g] < 0)
@@ -391,14 +392,14 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
                         moved[k] = image == home
                                        ? one.q[k]
                                        : Lattice::add(one.q[k], -lattice.translation(one.shift[0], one.shift[1], one.shift[2], k));
-                    meet(state, one, from, to, image, moved);
+                    meet(state, one, mine, from, to, image, moved);
                 });
                 continue;
             }
             Runs& runs = kept[LANES > 1 ? g : 0];
             find_runs(runs, g, at, level);
             for (int r = 0; r < runs.count; ++r)
-                meet(state, one, runs.begin[r], runs.end[r], home, one.q);
+                meet(state, one, mine, runs.begin[r], runs.end[r], home, one.q);
         }
         query().end_query(state, one);
     }
