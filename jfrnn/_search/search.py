@@ -103,13 +103,14 @@ def search(
         Overflow of a given capacity and non-finite coordinates are known only from data: see `status`, `overflow` and `check`.
 
     Memory: 4 B per slot for the list (8 B with `reverse`), which keeps copies of what updates need: with a skin positions and
-    queries, with a batch 4 B and with cutoffs per particle one float each (with a skin two). On a GPU, from 4097 particles on, a
-    list by "warp" without queries and with one cutoff also keeps their order in space, 4 B per particle. It shares no memory with
-    the given arrays, so they, or the list, may be donated (`jax.jit(..., donate_argnums=)`). While searching, however large space
-    is, "warp" takes at most 64 B and "hashgrid" 84 B per particle, "jax" and "brute" 100 B per particle (float64: 125 B) and, for
-    the block being processed, at most 64 MB on a CPU, elsewhere 1 GB or an eighth of the device's memory, whichever is less. With a
-    box or a batch "warp" also copies the positions, at most 20 B per particle (float64: 40 B); with cutoffs per particle it takes
-    140 B in all (float64: 180 B). See `memory_plan`.
+    queries, with a batch 4 B and with cutoffs per particle one float each (with a skin two), with species 4 B each, with exclusions
+    8 B per pair and 4 B per row (with queries, also 4 B per particle). On a GPU, from 4097 particles on, a list by "warp" without
+    queries and with one cutoff also keeps their order in space, 4 B per particle. It shares no memory with the given arrays, so
+    they, or the list, may be donated (`jax.jit(..., donate_argnums=)`). While searching, however large space is, "warp" takes at
+    most 64 B and "hashgrid" 84 B per particle, "jax" and "brute" 100 B per particle (float64: 125 B) and, for the block being
+    processed, at most 64 MB on a CPU, elsewhere 1 GB or an eighth of the device's memory, whichever is less. With a box or a batch
+    "warp" also copies the positions, at most 20 B per particle (float64: 40 B); with cutoffs per particle it takes 140 B in all
+    (float64: 180 B). See `memory_plan`.
     Differentiable: the list is topology, without gradient; see `NeighborList.vectors`. Jit: yes, with capacity. vmap: yes, with
     capacity. Arrays that are sharded over a mesh are gathered on each device, and each does the whole work; `jfrnn.distributed`
     divides the work. `jax.export`: yes, with `disabled_checks=[jax.export.DisabledSafetyCheck.custom_call("jfrnn")]`; a process

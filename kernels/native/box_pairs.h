@@ -116,7 +116,7 @@ struct BoxPairs : BoxArguments, BoxSpace {
     JFRNN_MEMBER int first_asked(int code) const {
         return !LATER ? 0 : code == at_home ? query + drop_self : code < at_home ? query + 1 : query;
     }
-    JFRNN_MEMBER bool is_excluded(int source) const { return Excluded(excluded_starts, excluded, query).has(source); }
+    JFRNN_MEMBER bool is_excluded(int source) const { return Excluded(excluded_starts, excluded, query, ~0ull).has(source); }
     // Decides exactly.
     JFRNN_MEMBER bool is_pair(int source, int code) const {
         return exact_image(lattice, queries + (long long)ROW * query, positions + (long long)ROW * source, code, radius, 0, closed);

@@ -3,12 +3,25 @@
 #include "constants.h"
 #include "device.h"
 
-// A row of `ids`, those of the query from `starts[query]` on, in ascending order; without EXCLUDING there are no rows.
+// A row of `ids`, those of the query from `starts[query]` on, in ascending order; without EXCLUDING there are no rows. Of short rows a
+// filter has a bit for each number modulo 64 that stands there: it tells most other sources apart without a look at the row.
 struct Excluded {
+    static constexpr int SHORT = 64;
     const int *begin, *end;
-    JFRNN_INLINE Excluded(const int* starts, const int* ids, int query)
-        : begin(EXCLUDING ? ids + starts[query] : nullptr), end(EXCLUDING ? ids + starts[query + 1] : nullptr) {}
+    unsigned long long filter;
+    JFRNN_INLINE Excluded(const int* starts, const int* ids, int query, unsigned long long filter)
+        : begin(EXCLUDING ? ids + starts[query] : nullptr), end(EXCLUDING ? ids + starts[query + 1] : nullptr), filter(filter) {}
+    JFRNN_INLINE Excluded(const int* starts, const int* ids, int query) : Excluded(starts, ids, query, 0) {
+        const bool is_short = end - begin <= SHORT;
+        for (const int* id = begin; is_short && id < end; ++id)
+            filter |= 1ull << (*id & 63);
+        filter = is_short ? filter : ~0ull;
+    }
+    // May a source stand in a row with a filter?
+    JFRNN_FUNCTION bool may_stand(unsigned long long filter, int source) { return filter >> (source & 63) & 1; }
     JFRNN_INLINE bool has(int source) const {
+        if (!may_stand(filter, source))
+            return false;
         const int *low = begin, *high = end;
         while (low < high) {
             const int* const middle = low + (high - low) / 2;

@@ -73,7 +73,7 @@ struct ImageSearch : Search {
         for (int k = 0; k < DIM; ++k)
             moved[k] = lattice.translation(shift[0], shift[1], shift[2], k);
     }
-    JFRNN_MEMBER int source_named(int id) const { return SUMS ? id_of(load(sorted + source_of(id)).id) : source_of(id); }
+    JFRNN_MEMBER int source_named(int id) const { return SUMS ? id_of(__ldg(&sorted[source_of(id)].id)) : source_of(id); }
     // Loads where a candidate is. It is moved by the same operations wherever it is loaded, so that it is always in the same place.
     JFRNN_MEMBER void load_image(int id, real* p) const {
         if constexpr (SUMS) {

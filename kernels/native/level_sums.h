@@ -76,9 +76,9 @@ struct LevelSums : Levels<LevelSums> {
 
     JFRNN_INLINE LevelSums(const LevelSumArguments& a, HeldPairs& held)
         : Levels({a.positions, a.queries, a.axes, a.radii, a.ids, a.keys, a.top, a.table, a.header, a.cutoff, a.query_axes,
-              a.query_radii, a.query_ids, a.query_top, a.places, a.excluded_starts, a.excluded, a.table_of_kinds,
-              a.kinds_of_sources, a.kinds_of_queries, a.info, a.n, a.m, a.own_queries, a.closed, a.drop_self, a.later_only,
-              a.kinds}),
+                     a.query_radii, a.query_ids, a.query_top, a.places, a.info, a.n, a.m, a.own_queries, a.closed, a.drop_self,
+                     a.later_only},
+              a),
           held(held),
           columns(a.columns) {}
 

@@ -24,12 +24,41 @@ struct LevelArguments {
     const real *positions, *queries, *axes, *radii;
     const int *ids, *keys, *top, *table, *header;
     const real *cutoff, *query_axes, *query_radii;
-    const int *query_ids, *query_top, *places, *excluded_starts, *excluded;
-    // Of a table: the cutoffs of `kinds` species with each other, row by row, -1 where they are no neighbors, and whose species is which.
+    const int *query_ids, *query_top, *places;
+    int* info;
+    int n, m, own_queries, closed, drop_self, later_only;
+};
+
+// What says who pairs with whom: exclusions (excluded.h), and of a table the cutoffs of `kinds` species with each other, row by row,
+// -1 where they are no neighbors, and whose species is which. Where nobody asks for that, a thread holds none of it.
+template <bool USED>
+struct Pairing {
+    const int *excluded_starts, *excluded;
     const real* table_of_kinds;
     const int *kinds_of_sources, *kinds_of_queries;
-    int* info;
-    int n, m, own_queries, closed, drop_self, later_only, kinds;
+    int kinds;
+    template <class Arguments>
+    JFRNN_INLINE explicit Pairing(const Arguments& a)
+        : excluded_starts(a.excluded_starts),
+          excluded(a.excluded),
+          table_of_kinds(a.table_of_kinds),
+          kinds_of_sources(a.kinds_of_sources),
+          kinds_of_queries(a.kinds_of_queries),
+          kinds(a.kinds) {}
+    JFRNN_INLINE Excluded excluded_from(int query) const { return Excluded(excluded_starts, excluded, query); }
+    // The cutoffs of the species of the query at a place.
+    JFRNN_INLINE const real* row_of(int at) const {
+        return RULE == TABLE ? table_of_kinds + (long long)kinds * kinds_of_queries[at] : nullptr;
+    }
+    JFRNN_INLINE real cutoff_in(const real* row, int place) const { return row[kinds_of_sources[place]]; }
+};
+template <>
+struct Pairing<false> {
+    template <class Arguments>
+    JFRNN_INLINE explicit Pairing(const Arguments&) {}
+    JFRNN_INLINE Excluded excluded_from(int query) const { return Excluded(nullptr, nullptr, query); }
+    JFRNN_INLINE const real* row_of(int) const { return nullptr; }
+    JFRNN_INLINE real cutoff_in(const real*, int) const { return 0; }
 };
 
 // LANES numbers side by side, and the bits of what is true of them.
@@ -85,11 +114,10 @@ struct One {
     int at, id;
     real q[3], own;
     int shift[3];
-    const real* of_kinds;  // of a table: the row of its species
 };
 
 template <class Query>
-struct Levels : LevelArguments, Space {
+struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
     const int* extent;
     bool dense;
     int groups;
@@ -100,8 +128,10 @@ struct Levels : LevelArguments, Space {
     int longest;
     Runs kept[KEPT];
 
-    JFRNN_INLINE explicit Levels(const LevelArguments& given)
+    template <class Arguments>
+    JFRNN_INLINE Levels(const LevelArguments& given, const Arguments& all)
         : LevelArguments(given),
+          Pairing<EXCLUDING || RULE == TABLE>(all),
           Space(given.cutoff),
           extent(header),
           dense(header[4] != 0),
@@ -137,9 +167,9 @@ struct Levels : LevelArguments, Space {
         return own / 2 + other / 2;
     }
     // Is a source a pair of a query, given its number, where it is, its image, and its place?
-    JFRNN_INLINE bool exactly(const One& one, int source, const real* p, int image, int place) const {
+    JFRNN_INLINE bool exactly(const One& one, const real* of_kinds, int source, const real* p, int image, int place) const {
         const real own = one.own, other = RULE == GATHER || RULE == TABLE ? real(0) : radii[place];
-        const real first = RULE == TABLE ? one.of_kinds[kinds_of_sources[place]] : SUM ? own / 2 : of_pair(own, other);
+        const real first = RULE == TABLE ? this->cutoff_in(of_kinds, place) : SUM ? own / 2 : of_pair(own, other);
         const real more = SUM ? other / 2 : real(0);
         if constexpr (PERIODIC) {
             const real *a = queries + (long long)ROW * one.id, *b = positions + (long long)ROW * source;
@@ -276,17 +306,17 @@ struct Levels : LevelArguments, Space {
     }
 
     // Which of LANES sources from `first` on are not surely too far from a query, a bit each, and which of those are surely pairs.
-    JFRNN_INLINE unsigned int test(const real* q, const One& one, int first, unsigned int& sure) const {
+    JFRNN_INLINE unsigned int test(const real* q, real own, const real* of_kinds, int first, unsigned int& sure) const {
         const real unit = this->unit, slack = PERIODIC ? this->slack : real(0);
         lanes square = lanes{};
         for (int k = 0; k < DIM; ++k) {
             const lanes d = (Side::load(axes + k * stride + first) - q[k]) * unit;
             square += d * d;
         }
-        lanes r = lanes{} + one.own;
+        lanes r = lanes{} + own;
         if constexpr (RULE == TABLE) {
             for (int e = 0; e < LANES; ++e)
-                Side::put(r, e, one.of_kinds[kinds_of_sources[first + e]]);
+                Side::put(r, e, this->cutoff_in(of_kinds, first + e));
         } else if constexpr (RULE != GATHER) {
             const lanes other = Side::load(radii + first);
             if constexpr (RULE == SCATTER)
@@ -307,10 +337,11 @@ struct Levels : LevelArguments, Space {
 
     // Lets a query meet the sources of a run, of an image, from where it meets them at home.
     template <class State>
-    JFRNN_INLINE void meet(State& state, const One& one, int from, int to, int image, const real* from_where) {
-        const Excluded mine(excluded_starts, excluded, one.id);
+    JFRNN_INLINE void meet(
+        State& state, const One& one, const Excluded& mine, int from, int to, int image, const real* from_where) {
+        const real* const of_kinds = this->row_of(one.at);
         for (int first = from; first < to; first += LANES) {
-            unsigned int sure, near = test(from_where, one, first, sure);
+            unsigned int sure, near = test(from_where, one.own, of_kinds, first, sure);
             if (to - first < LANES)
                 near &= (1u << (to - first)) - 1;
             for (; near; near &= near - 1) {
@@ -324,7 +355,7 @@ struct Levels : LevelArguments, Space {
                     real p[3];
                     for (int k = 0; k < DIM; ++k)
                         p[k] = axes[k * stride + c];
-                    pair = exactly(one, other, p, image, c);
+                    pair = exactly(one, of_kinds, other, p, image, c);
                 }
                 if (!pair || (EXCLUDING && mine.has(other)))
                     continue;
@@ -335,11 +366,10 @@ struct Levels : LevelArguments, Space {
 
     // Lets the query at a place meet all its candidates, group by group.
     JFRNN_INLINE void serve(int at) {
-        One one{at, query_ids[at], {0, 0, 0}, RULE == SCATTER ? real(0) : query_radii[at], {0, 0, 0}, nullptr};
-        if constexpr (RULE == TABLE)
-            one.of_kinds = table_of_kinds + (long long)kinds * kinds_of_queries[at];
+        One one{at, query_ids[at], {0, 0, 0}, RULE == SCATTER ? real(0) : query_radii[at], {0, 0, 0}};
         for (int k = 0; k < DIM; ++k)
             one.q[k] = query_axes[(long long)k * m + at];
+        const Excluded mine = this->excluded_from(one.id);
         typename Query::State state = query().begin_query(one);
         for (int g = 0; finite_point(one.q) && g < groups; ++g) {
             if (RULE != GATHER && largest[g] < 0)
@@ -362,14 +392,14 @@ struct Levels : LevelArguments, Space {
                         moved[k] = image == home
                                        ? one.q[k]
                                        : Lattice::add(one.q[k], -lattice.translation(one.shift[0], one.shift[1], one.shift[2], k));
-                    meet(state, one, from, to, image, moved);
+                    meet(state, one, mine, from, to, image, moved);
                 });
                 continue;
             }
             Runs& runs = kept[LANES > 1 ? g : 0];
             find_runs(runs, g, at, level);
             for (int r = 0; r < runs.count; ++r)
-                meet(state, one, runs.begin[r], runs.end[r], home, one.q);
+                meet(state, one, mine, runs.begin[r], runs.end[r], home, one.q);
         }
         query().end_query(state, one);
     }

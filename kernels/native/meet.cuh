@@ -70,6 +70,23 @@ JFRNN_FUNCTION unsigned int find_met(const PairSearch& search, const Group& grou
     }
     return met;
 }
+// Returns which of the neighbors in a block of candidates a query does not exclude.
+JFRNN_FUNCTION unsigned int drop_excluded(const PairSearch& search, const Group& group, const int* ids, unsigned int hits) {
+    const unsigned long long filter = shared_warp().filters[search.lane];
+    unsigned int doubtful = 0;
+    for (unsigned int rest = filter ? hits : 0; rest; rest &= rest - 1) {
+        const int j = __ffs(rest) - 1;
+        doubtful |= Excluded::may_stand(filter, search.source_named(ids[j])) ? 1u << j : 0;
+    }
+    if (doubtful == 0)
+        return hits;
+    const Excluded mine(search.excluded_starts, search.excluded, group.my_id, filter);
+    for (; doubtful; doubtful &= doubtful - 1) {
+        const int j = __ffs(doubtful) - 1;
+        hits &= mine.has(search.source_named(ids[j])) ? ~(1u << j) : ALL;
+    }
+    return hits;
+}
 // Lets the queries meet the next block of candidates.
 JFRNN_FUNCTION void meet_block(
     const PairSearch& search, const Group& group, Matrix& matrix, Candidates& candidates, Aside& aside, Pairs& pairs) {
@@ -93,14 +110,8 @@ JFRNN_FUNCTION void meet_block(
         }
         aside.take_back(candidates, matrix);
     }
-    if constexpr (EXCLUDING) {
-        const Excluded mine(search.excluded_starts, search.excluded, group.my_id);
-        for (unsigned int rest = mine.begin < mine.end ? hits : 0; rest; rest &= rest - 1) {
-            const int j = __ffs(rest) - 1;
-            const int id = HELD ? warp.ids[pairs.tested + j] : warp.candidate_ids[first_candidate + j];
-            hits &= mine.has(search.source_named(id)) ? ~(1u << j) : ALL;
-        }
-    }
+    if constexpr (EXCLUDING)
+        hits = drop_excluded(search, group, HELD ? warp.ids + pairs.tested : warp.candidate_ids + first_candidate, hits);
     pairs.found += __popc(hits);
     if constexpr (HELD) {
         warp.hits[pairs.tested / 32][search.lane] = hits;

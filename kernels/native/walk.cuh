@@ -46,6 +46,8 @@ struct Walk : PairSearch {
     JFRNN_MEMBER void walk(Group& group) {
         group.enclose(*this);
         const Runs runs(*this, group);
+        if constexpr (EXCLUDING)
+            shared_warp().filters[lane] = Excluded(excluded_starts, excluded, lane < group.size ? group.my_id : 0).filter;
         Pairs pairs{0, 0, 0, 0, own && drop_self, true};
         if constexpr (LIST)
             shared_warp().written[lane] = 0;
