@@ -1,7 +1,6 @@
 """Searches with a box per system by Warp's kernels: cells are sorted by XLA, a kernel meets them."""
 
 import functools
-import math
 from collections.abc import Callable
 
 import jax
@@ -11,9 +10,9 @@ from jax import Array, lax
 
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import lattice_numbers, particle_rows, periodic_kind
-from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
+from jfrnn._engine.plans import Clear, Launch, Plan, share
 from jfrnn._engine.problem import Filter, Room, Rows, Search, largest_radius
-from jfrnn._engine.variants import Variant, absent, describe_call, plan_numbers, row_dims, split_rows
+from jfrnn._engine.variants import Variant, absent, describe_call, huge_pages, plan_numbers, row_dims, split_rows
 from jfrnn._geometry import Lattice, Status, Wrapped, sort_into_boxes
 from jfrnn.kernels import boxes
 
@@ -79,5 +78,5 @@ def _plan(variant: Variant, cuda: bool, shapes: Shapes, _: int) -> Plan:
     found, numbers = boxes.rows_kernel(*kind, cuda, variant.flat), plan_numbers(variant, shapes) | {"stride": shapes["axes"][1]}
     m = numbers["m"]
     launch = Launch(found, boxes.threads(m)) if cuda else share(found, m, boxes.QUERIES_AT_ONCE)
-    pages = [] if cuda or not variant.lists else ask_for_huge_pages("idx", 4 * math.prod(shapes["idx"]))
+    pages = [] if cuda else huge_pages(variant, shapes)
     return Plan([Clear("info", 8), *pages, launch], numbers, absent(variant.lists, variant.flat))
