@@ -22,10 +22,12 @@ from jfrnn._engine import (
     default_platform,
     fastest_engine,
     has_order,
+    list_flat,
     list_rows,
     parse_backend,
 )
 from jfrnn._geometry import Cutoff, check_capacity, check_cutoff, check_flag, check_kind, check_size, check_skin
+from jfrnn._search import check_total
 from jfrnn._sums import pair_sum
 from jfrnn._tracing import Tree
 from jfrnn._triangles import TRIANGLE_ENGINES, TriangleEngine, fastest_of, find_triangles
@@ -39,7 +41,8 @@ class MemoryPlan:
     """The bytes that one search, count or pair sum takes in addition to its given positions and values.
 
     Attributes:
-        list_bytes: The result of a search [B]: 4 per slot, 4 per row for its count, 8 for `status` and `required`; with a skin,
+        list_bytes: The result of a search [B]: 4 per slot, 4 per row for its count, 8 for `status` and `required` (of
+            `search_edges` 8 per edge, 4 per row and 12); with a skin,
             also copies of positions and queries, and 4; with `reverse`, another 4 per slot, and for queries 8 per source; on a GPU
             by "warp", from 4097 particles on and without queries, 4 per particle for their order.
         scratch_bytes: Memory needed in addition while it runs [B].
@@ -79,6 +82,7 @@ def memory_plan(
     cutoff: float,
     capacity: int | None = None,
     *,
+    total: int | None = None,
     dim: int = 3,
     dtype: np.dtype | type | str = np.float32,
     queries: int | None = None,
@@ -91,7 +95,7 @@ def memory_plan(
     backend: str = "auto",
     platform: str | None = None,
 ) -> MemoryPlan:
-    """Predict the memory of a `search`, `count`, `pair_sum` (fn) or `search_triangles` (faces) of these shapes.
+    """Predict the memory of a `search`, `search_edges` (total), `count`, `pair_sum` (fn) or `search_triangles` (faces).
 
     Nothing depends on where the particles are. For "warp" and "hashgrid" the plan adds the sizes of the arrays that they allocate,
     and works for platforms that this machine lacks. For "jax" and "brute" it is XLA's analysis of the program, compiled for these
@@ -110,6 +114,7 @@ def memory_plan(
         n: Number of particles, from 0 to 2^31 - 32.
         cutoff: Interaction radius [length], checked as in `search`; it does not change the bytes.
         capacity: Slots per row; None: no list is made, and the plan is that of `count` or of a pair sum.
+        total: Edges of a flat list, which `search_edges` makes; without capacity.
         dim: 2 or 3.
         dtype: Dtype of the positions, float32 or float64.
         queries: Number of separate queries; None: the particles themselves are the queries.
@@ -145,6 +150,8 @@ def memory_plan(
     rows = n if queries is None else queries
     where = default_platform() if platform is None else platform
     _check_parts(faces, queries, fn, capacity, gradient or values is not None)
+    if total is not None and not (faces is None and fn is None and capacity is None):
+        raise ValueError("total is that of a flat list, which has no capacity, no faces and no fn: leave them out.")
     if faces is not None:
         sizes = (n, check_size("faces", faces), dim, check_capacity(capacity))
         return _plan_of_triangles(sizes, dtype, radius, parse_backend(backend, TRIANGLE_ENGINES, " with faces"), _device_of(where))
@@ -152,18 +159,24 @@ def memory_plan(
     if fn is not None:
         points = _shapes_of(n, queries, dim, dtype)
         return _plan_of_sum(fn, points, cutoff, values, gradient, named, _device_of(where))
-    capacity = None if capacity is None else check_capacity(capacity)
+    capacity, total = None if capacity is None else check_capacity(capacity), None if total is None else check_total(total)
     chosen = named or fastest_engine(_device_of(where).platform, n)
     scratch = chosen.scratch_bytes(where, n, rows, dim, dtype == np.float64, queries is None, radius.scaled)
     if scratch is None:
-        scratch = _compiled_scratch(_shapes_of(n, queries, dim, dtype, _device_of(where)), radius, chosen, capacity)
-    if capacity is None:
+        scratch = _compiled_scratch(_shapes_of(n, queries, dim, dtype, _device_of(where)), radius, chosen, capacity, total)
+    elif total is not None:
+        scratch += 8 * rows + 4  # counts, and where rows begin
+    if capacity is None and total is None:
         return MemoryPlan(0, scratch, chosen.name, counts_bytes=4 * rows)
     kept = (n + (queries or 0)) * dim * dtype.itemsize + 4 if check_skin(skin, float(radius.radius), dtype) else 0
-    if check_flag("reverse", reverse):
-        kept += 4 * rows * capacity + (0 if queries is None else 8 * n)
+    reverse = check_flag("reverse", reverse)
+    if total is not None:
+        kept += 4 * total + 8 * n if reverse else 0
+        return MemoryPlan(8 * total + 4 * (rows + 1) + 8 + kept, scratch, chosen.name)
+    slots = rows * (capacity or 0)
+    kept += 4 * slots + (0 if queries is None else 8 * n) if reverse else 0
     kept += 4 * n if has_order(chosen, where, n, queries is None) else 0
-    return MemoryPlan(4 * rows * (capacity + 1) + 8 + kept, scratch, chosen.name)
+    return MemoryPlan(4 * (slots + rows) + 8 + kept, scratch, chosen.name)
 
 
 def _check_parts(
@@ -193,11 +206,16 @@ def _device_of(platform: str) -> Device:
         ) from error
 
 
-def _compiled_scratch(points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff, engine: Engine, capacity: int | None) -> int:
+def _compiled_scratch(
+    points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff, engine: Engine, capacity: int | None, total: int | None
+) -> int:
     """Compile the search, or the count, for these shapes, and return XLA's size of its temporary arrays [B]."""
     options = Options(Filter(drop_self=points[1] is None, later_only=False), engine, closed=False)
     inputs: Any = Inputs(points[0], points[1], None, None, cutoff)  # pyright: ignore[reportArgumentType] (shapes of arrays)
-    lowered = count_rows.lower(inputs, options) if capacity is None else list_rows.lower(inputs, options, capacity)
+    if total is not None:
+        lowered = list_flat.lower(inputs, options, total)
+    else:
+        lowered = count_rows.lower(inputs, options) if capacity is None else list_rows.lower(inputs, options, capacity)
     return int(_analysis(lowered).temp_size_in_bytes)
 
 

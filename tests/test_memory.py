@@ -48,6 +48,21 @@ def test_warp_takes_what_was_planned(n, capacity, queries, dim, dtype):
     assert_close(plan, compiled_bytes(n, capacity, dim, dtype, "warp", queries))
 
 
+@pytest.mark.parametrize("options", [{}, {"queries": 500}, {"skin": 0.01, "reverse": True}], ids=str)
+def test_a_flat_list_takes_what_was_planned(options):
+    n, total = 30_000, 90_000
+    given = options | {"queries": jax.ShapeDtypeStruct((500, 3), np.float32)} if "queries" in options else options
+    plan = jfrnn.memory_plan(n, 0.1, total=total, backend="warp", **options)
+    find = jax.jit(
+        lambda x, q: jfrnn.search_edges(
+            x, 0.1, total=total, backend="warp", **{**given, **({"queries": q} if q is not None else {})}
+        )
+    )
+    memory = find.lower(jax.ShapeDtypeStruct((n, 3), np.float32), given.get("queries")).compile().memory_analysis()
+    assert plan.list_bytes == pytest.approx(memory.output_size_in_bytes, rel=0.01)
+    assert plan.scratch_bytes == pytest.approx(memory.temp_size_in_bytes, rel=0.1)
+
+
 @pytest.mark.parametrize("queries", [None, 500])
 def test_what_a_list_with_a_skin_keeps_is_planned(queries, dtype):
     plan = jfrnn.memory_plan(1000, 0.1, 8, dtype=dtype, queries=queries, skin=0.01, backend="warp")

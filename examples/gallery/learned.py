@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 
 import jfrnn
 
-N, CUTOFF, EDGES, CAPACITY = 200, 0.12, 2600, 32
+N, CUTOFF, EDGES = 200, 0.12, 2600
 
 
 def true_forces(x):
@@ -27,7 +27,7 @@ def layer(key, wide, high):
 
 def network(weights, x, nbrs):
     """Each edge makes a message of its length; a particle sums messages along its edges' directions."""
-    edges = nbrs.edges(x, EDGES)
+    edges = nbrs.edges(x)
     length = jnp.sqrt((edges.displacement**2).sum(-1, keepdims=True) + 1e-12)
     h = jnp.concatenate([length / CUTOFF, (length / CUTOFF) ** 2], axis=1)
     for w, b in weights[:-1]:
@@ -41,12 +41,12 @@ def network(weights, x, nbrs):
 def train(weights, means, squares, key):
     """One step of RMSprop with momentum on a scene that was not there before."""
     x = jax.random.uniform(key, (N, 2))
-    nbrs = jfrnn.search(x, CUTOFF, capacity=CAPACITY)
+    nbrs = jfrnn.search_edges(x, CUTOFF, total=EDGES)
     loss, slope = jax.value_and_grad(lambda w: jnp.mean((network(w, x, nbrs) - true_forces(x)) ** 2))(weights)
     means = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, means, slope)
     squares = jax.tree.map(lambda s, g: 0.99 * s + 0.01 * g**2, squares, slope)
     weights = jax.tree.map(lambda w, m, s: w - 2e-3 * m / (jnp.sqrt(s) + 1e-8), weights, means, squares)
-    return weights, means, squares, loss, nbrs.require(EDGES).status
+    return weights, means, squares, loss, nbrs.status
 
 
 def main(steps=600):
@@ -59,7 +59,7 @@ def main(steps=600):
     for key in jax.random.split(jax.random.key(2), steps):
         weights, means, squares, loss, status = train(weights, means, squares, key)
         if status != 0:
-            raise RuntimeError(f"{jfrnn.Status(int(status))}: more slots or edges are needed")
+            raise RuntimeError(f"{jfrnn.Status(int(status))}: more edges are needed")
         losses.append(float(loss / size))
     print(f"squared error of the forces: {losses[0]:.2f} of their square before, {losses[-1]:.1e} after {steps} steps")
     return losses

@@ -1,7 +1,6 @@
 """Searches with a box per system by Warp's kernels: sources are sorted by cell, on the CPU by XLA, and a kernel meets them."""
 
 import functools
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -12,10 +11,10 @@ from jax import Array, lax
 
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import excluded_rows, lattice_numbers, particle_rows, periodic_kind
-from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
+from jfrnn._engine.plans import Clear, Launch, Plan, share
 from jfrnn._engine.problem import Filter, Room, Rows, Search, largest_radius
 from jfrnn._engine.sum_results import FoundSums, SumsOf
-from jfrnn._engine.variants import Variant, absent, describe_call, plan_numbers, row_dims, split_rows
+from jfrnn._engine.variants import Variant, absent, describe_call, huge_pages, plan_numbers, row_dims, split_rows
 from jfrnn._geometry import Lattice, Status, Wrapped, most_cells, sort_into_boxes, unpack_turns
 from jfrnn.kernels import boxes
 from jfrnn.kernels._native import EXCLUDED
@@ -108,7 +107,7 @@ def _plan(variant: Variant, cuda: bool, shapes: Shapes, _: int) -> Plan:
     found = boxes.rows_kernel(*kind, cuda, variant.excluding, variant.flat)
     numbers, m = plan_numbers(variant, shapes) | {"stride": shapes["axes"][1]}, shapes["queries"][0]
     launch = Launch(found, boxes.threads(m)) if cuda else share(found, m, boxes.QUERIES_AT_ONCE)
-    pages = [] if cuda or not variant.lists else ask_for_huge_pages("idx", 4 * math.prod(shapes["idx"]))
+    pages = [] if cuda else huge_pages(variant, shapes)
     return Plan([Clear("info", 8), *pages, launch], numbers, absent(variant.lists, variant.flat))
 
 

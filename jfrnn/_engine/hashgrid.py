@@ -10,10 +10,10 @@ from typing import Any
 from jax import lax
 
 from jfrnn._engine.launch import Call, Shapes, kernel
-from jfrnn._engine.plans import Clear, Kept, Launch, Plan, ask_for_huge_pages
+from jfrnn._engine.plans import Clear, Kept, Launch, Plan
 from jfrnn._engine.problem import Kind, Options, Room, Rows, Search
 from jfrnn._engine.start import INSTALL, load_warp
-from jfrnn._engine.variants import Variant, absent, describe_call, plan_numbers
+from jfrnn._engine.variants import Variant, absent, describe_call, huge_pages, plan_numbers
 from jfrnn._engine.warp import call_kernels, check_platform, missing
 from jfrnn.kernels import _clang, hashgrid
 
@@ -89,7 +89,7 @@ def _plan(variant: Variant, radius: float, cuda: bool, shapes: Shapes, _: int) -
     grid = hashgrid.grid_shape(n, variant.dim)
     numbers["cells_x"], numbers["cells_y"], _ = grid
     kernels = hashgrid.search_kernels(variant.dim, variant.double, variant.scaled, variant.lists, cuda, variant.flat)
-    rows = [] if cuda or not variant.lists else ask_for_huge_pages("idx", 4 * math.prod(shapes["idx"]))
+    rows = [] if cuda else huge_pages(variant, shapes)
     pack, query = Launch(kernels.pack, n if cuda else 1), Launch(kernels.query, m if cuda else 1)
     steps = [Clear("info", 8), pack, Launch(hashgrid.build_kernel(variant.double)), *rows, query]
     keep = functools.partial(_keep_grid, grid, variant.double, n)

@@ -1,5 +1,6 @@
 """What is static about a call of kernels that list or count neighbors, and what follows from that: its name, and its numbers."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -8,7 +9,7 @@ from jax import Array
 
 from jfrnn._engine.launch import Call, Shapes
 from jfrnn._engine.operands import space_flags
-from jfrnn._engine.plans import Plan
+from jfrnn._engine.plans import HugePages, Plan, ask_for_huge_pages
 from jfrnn._engine.problem import Filter, Room
 from jfrnn.kernels._native import EXCLUDED, table_cells
 
@@ -74,6 +75,12 @@ def row_dims(m: int, capacity: int | Room | None) -> dict[str, int | tuple[int, 
 def split_rows(written: Sequence[Array]) -> dict[str, Array | None]:
     """Return the fields of `Rows` that a kernel has written: none, rows, or those of a flat list."""
     return {"idx": None} | dict(zip(("idx", "receivers"), written, strict=False))
+
+
+def huge_pages(variant: Variant, shapes: Shapes) -> list[HugePages]:
+    """Return the requests for what is written of rows, on the CPU."""
+    names = [*["idx"] * variant.lists, *["receivers"] * variant.flat]
+    return [step for name in names for step in ask_for_huge_pages(name, 4 * math.prod(shapes[name]))]
 
 
 def size_numbers(shapes: Shapes, own: bool) -> dict[str, int]:

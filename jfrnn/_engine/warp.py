@@ -6,7 +6,6 @@ depends on (JAX's persistent compilation cache sees no more than that).
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
@@ -20,10 +19,10 @@ from jfrnn._engine.boxes_warp import box_neighbors
 from jfrnn._engine.launch import Call, Shapes, kernel, open_native
 from jfrnn._engine.levels_warp import level_neighbors
 from jfrnn._engine.operands import MOST_IN_BOX, excluded_rows, pack_particles, periodic_kind
-from jfrnn._engine.plans import HugePages, Launch, Plan, ask_for_huge_pages, share
+from jfrnn._engine.plans import HugePages, Launch, Plan, share
 from jfrnn._engine.problem import Engine, Filter, Kind, Options, Room, Rows, Search, largest_radius
 from jfrnn._engine.start import check_warp
-from jfrnn._engine.variants import Variant, absent, describe_call, plan_numbers, row_dims, split_rows
+from jfrnn._engine.variants import Variant, absent, describe_call, huge_pages, plan_numbers, row_dims, split_rows
 from jfrnn._geometry import Cutoffs
 from jfrnn.kernels import _driver, cells_cpu, cells_cuda, few_cuda
 
@@ -221,8 +220,11 @@ def _plan_on_cpu(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan
     kind = {"periodic": variant.periodic, "batched": variant.batched, "excluding": variant.excluding, "flat": variant.flat}
     kernels = cells_cpu.cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, **kind)
     numbers = plan_numbers(variant, shapes)
-    rows = ask_for_huge_pages("idx", 4 * math.prod(shapes["idx"])) if variant.lists else []
-    steps = [*sort_on_cpu(kernels, numbers["n"]), *rows, share(kernels.query, numbers["m"], QUERIES_PER_THREAD)]
+    steps = [
+        *sort_on_cpu(kernels, numbers["n"]),
+        *huge_pages(variant, shapes),
+        share(kernels.query, numbers["m"], QUERIES_PER_THREAD),
+    ]
     return Plan(steps, numbers, absent(variant.lists, variant.flat))
 
 

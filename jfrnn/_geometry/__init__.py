@@ -58,5 +58,5 @@ from jfrnn._geometry.levels import GROUPS, HALVINGS, Axes, Levels, level_runs, s
 from jfrnn._geometry.meshes import merge_vertices
 from jfrnn._geometry.motion import box_change, motion_of, turns_between
 from jfrnn._geometry.order import hilbert_order, sort_order
-from jfrnn._geometry.status import NeighborOverflowError, Status, known_status, names_of_bits, pairs_and_status, shape_of
+from jfrnn._geometry.status import NeighborOverflowError, Status, known_status, names_of_bits, pairs_and_status, shape_of, tell
 from jfrnn._geometry.wrapping import NOT_FINITE, TOO_FAR, Wrapped, unpack_turns, wrap

@@ -3,7 +3,7 @@
 from jfrnn._search.chunks import run_chunk
 from jfrnn._search.edge_list import EdgeList
 from jfrnn._search.edges import flatten
-from jfrnn._search.exports import MOST_PAIRS, saturating_add
+from jfrnn._search.exports import MOST_PAIRS, check_total, saturating_add
 from jfrnn._search.geometry import is_native, kept_list, kept_shifts, lattice_of_rows, norms
 from jfrnn._search.kept_search import ROWS_ARE_WHOLE
 from jfrnn._search.making import round_capacity

@@ -7,11 +7,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 
 from jfrnn._engine import Inputs, Options, count_rows
-from jfrnn._geometry import Batch, Box, Exclusions, NeighborOverflowError, Radii, Status, pairs_and_status
-from jfrnn._search.edges import Edges, Graph, edges_of, make_graph, no_edges
+from jfrnn._geometry import Batch, Box, Exclusions, NeighborOverflowError, Radii, Status, names_of_bits, tell
+from jfrnn._search.edges import Edges, Graph, edges_of, edges_of_rows, make_graph, no_edges
 from jfrnn._search.exports import MOST_PAIRS
 from jfrnn._search.geometry import ImageCodes
 from jfrnn._search.kept_search import KeptSearch
@@ -66,13 +66,13 @@ class EdgeList(KeptSearch):
 
     def __repr__(self) -> str:
         """Summarize the list in a line; waits for the device."""
-        *batch, total = (None,) if not hasattr(self.senders, "shape") else self.senders.shape
+        *batch, total = getattr(self.senders, "shape", (None,))
         rows = f"{self.source_count} particles" if not batch else f"batch of {batch}, {self.source_count} particles"
         kinds = self.radii is not None and self.radii.table is not None
         reach = f"per {'pair of species' if kinds else 'particle'}" if self.cutoff is None else f"{self.cutoff:.6g}"
         skin = f", skin {self.skin:.6g}" if self.skin else ""
-        rest = pairs_and_status(self.offsets[..., -1], self.status)
-        return f"EdgeList({rows}, total {total}, cutoff {reach}{skin}, engine {self.backend!r}, {rest})"
+        pairs, bits = tell(self.offsets, lambda offsets: offsets[..., -1].sum(dtype=np.int64)), names_of_bits(self.status)
+        return f"EdgeList({rows}, total {total}, cutoff {reach}{skin}, engine {self.backend!r}, {pairs} pairs, status {bits})"
 
     @property
     def total(self) -> int:
@@ -130,9 +130,7 @@ class EdgeList(KeptSearch):
                 return no_edges(jnp.zeros((len(rows), 1), bool), self.source_count, sources, self.status, self.total)
             codes = None if self.images is None else self.images.codes
             by_sender = self._side(self.senders, codes, self.reverse, self.source_count)
-            held = jnp.minimum(self.offsets, self.total)
-            reverse = Reverse(lax.iota(jnp.int32, self.total), held[:-1], jnp.diff(held))
-            by_receiver = self._side(self.receivers, None, reverse, len(rows))
+            by_receiver = self._side(self.receivers, None, edges_of_rows(self.offsets, self.total), len(rows))
             where = sources, rows, box, self.batch
             kind = self.box_kind if box is not None else None
             cutoff = self._cutoff_of_pairs() if self.skin else None

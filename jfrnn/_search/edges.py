@@ -154,7 +154,7 @@ def flat_edges(
     flat = flatten(mask, total, topology.native)
     real = flat.rows < m
     senders = jnp.where(real, topology.idx.reshape(-1)[flat.slots], topology.sources)
-    ends = _by_sender(topology, flat.edges, total), _by_row(flat.offsets, capacity, total)
+    ends = _by_sender(topology, flat.edges, total), _by_row(flat.offsets, capacity, total, topology.native)
     sides = [
         gather(points, Topology(named[:, None], None, end, None, len(points), 1, end.starts is None, topology.native))[:, 0]
         for points, named, end in zip((sources, rows), (senders, flat.rows), ends, strict=True)
@@ -246,13 +246,21 @@ def no_edges(mask: Array, sources: int, points: Array, status: Array, total: int
     return Edges(*ends, displacement, shift, none, status, displacement[:, 0], count)
 
 
+def edges_of_rows(offsets: Array, total: int) -> Reverse:
+    """Return the edges of each receiver of a flat list."""
+    held = jnp.minimum(offsets, total)
+    return Reverse(lax.iota(jnp.int32, total), held[:-1], jnp.diff(held))
+
+
 def _by_sender(topology: Topology, edges: Array, total: int) -> Reverse:
     """Return the edges of each source, from its slots."""
     reverse = topology.with_reverse()
     return reverse._replace(slots=edges.at[reverse.slots].get(mode="fill", fill_value=total))
 
 
-def _by_row(offsets: Array, capacity: int, total: int) -> Reverse:
+def _by_row(offsets: Array, capacity: int, total: int, native: bool) -> Reverse:
     """Return the edges of each row, which follow each other."""
+    if native:  # array programming adds rows of one length sooner
+        return edges_of_rows(offsets, total)
     edge = offsets[:-1, None] + lax.iota(jnp.int32, capacity)[None]
     return Reverse(jnp.where(edge < offsets[1:, None], jnp.minimum(edge, total), total))

@@ -94,7 +94,9 @@ struct Rows : Walk<Rows> {
             return;
         }
         for (int s = from; s < stop; ++s)
-            write_slot(idx, receivers, begin + s, row[s - from], id);
+            out[s] = row[s - from];
+        for (int s = from; FLAT && s < stop; ++s)
+            receivers[begin + s] = id;
         if (!FLAT && last)
             for (int s = stop; s < capacity; ++s)
                 out[s] = fill_value;
