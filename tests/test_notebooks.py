@@ -33,7 +33,7 @@ SAYS = {  # pictures, and what each prints
         2,
         ("times as long as cll", "turned2 tumbled / straight", "no rows of warp-update and warp-rebuild", "growth: time"),
     ),
-    "speed_against_error": (3, ("exact on every scene", "methods with a list give")),
+    "speed_against_error": (4, ("exact on every scene", "methods with a list give")),
     "thesis_reproduced": (7, ("have a counterpart here", "verdict of the thesis, CLL before")),
     "molecular_dynamics": (2, ("the list was rebuilt", "total energy per particle varies by", "first peak", "pressure")),
     "quickstart": (3, ("sites closer than 3 spacings: 24", "and those at exactly 3:       28", "rebuilt", "unevenness")),
