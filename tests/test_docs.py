@@ -74,7 +74,7 @@ def test_pages_build(tmp_path):
     assert missing == []
 
 
-@pytest.mark.parametrize("page", [path for path in pages.pages() if pages.tables_of(path)], ids=lambda path: path.stem)
+@pytest.mark.parametrize("page", [path for path in pages.pages() if pages.names_in(path)], ids=lambda path: path.stem)
 def test_figures_are_those_of_the_rows(page):
     text = page.read_text(encoding="utf-8")
     assert pages.fill_in(text) == text, "python -m experiments tables"
@@ -97,8 +97,34 @@ def test_engines_can_what_the_readme_says():
         assert [name for name in names if said[title][name] == "yes"] == [name for name in names if name in table]
 
 
-def test_every_table_stands_in_a_page():
-    assert {name for page in pages.pages() for name in pages.tables_of(page)} == set(pages.TABLES)
+NOTES = ("docs/benchmarks/tried.md", "docs/benchmarks/paper.md")  # of the laboratory, and arithmetic
+NO_MEASUREMENTS = {  # bounds, defaults and definitions
+    "docs/benchmarks/cpu.md": ["60 s", "16 GiB"],
+    "docs/benchmarks/gpu.md": ["11 %"],
+    "docs/benchmarks/many-devices.md": ["20 B"],
+    "docs/explanation/array-engine.md": ["3 ×", "64 MB", "1 GB", "100 B", "125 B"],
+    "docs/guides/kept-lists.md": ["4 B"],
+    "docs/guides/many-devices.md": ["20 s"],
+    "docs/guides/memory.md": ["64 MB", "1 GB"],
+    "docs/start.md": ["4 B", "4 B"],
+    "docs/thesis.md": ["95 %", "0.1 to 100 %", "10 %"],
+}
+
+
+def test_no_figure_is_written_by_hand():
+    loose = {str(page.relative_to(ROOT)): pages.loose_figures(page.read_text(encoding="utf-8")) for page in pages.pages()}
+    assert {name: found for name, found in loose.items() if found and name not in NOTES} == NO_MEASUREMENTS
+
+
+def test_a_figure_written_by_hand_is_found():
+    text = (
+        "It takes 3.2 ms, 4 to 5 times as long, `5 ms` <!-- value jet-steps -->7 s<!-- end -->, 1 024 particles.\n```\n8 s\n```\n"
+    )
+    assert pages.loose_figures(text) == ["3.2 ms", "4 to 5 times"]
+
+
+def test_every_table_and_figure_stands_in_a_page():
+    assert {name for page in pages.pages() for name in pages.names_in(page)} == {*pages.TABLES, *pages.VALUES}
 
 
 def test_a_figure_that_is_none_of_the_rows_is_found():
@@ -108,3 +134,7 @@ def test_a_figure_that_is_none_of_the_rows_is_found():
     assert spoiled != filled == pages.fill_in(spoiled)
     with pytest.raises(UsageError, match="there is no such table"):
         pages.fill_in(text.replace("ties", "knots"))
+    text = "<!-- value jet-steps -->1 000<!-- end -->"
+    assert pages.fill_in(text) == text.replace("1 000", pages.VALUES["jet-steps"]()) != text
+    with pytest.raises(UsageError, match="there is no such value"):
+        pages.fill_in(text.replace("jet", "oil"))
