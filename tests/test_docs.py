@@ -11,6 +11,7 @@ import pytest
 import jfrnn
 from experiments import pages
 from experiments._errors import UsageError
+from experiments.pages.rows import TIMES
 from jfrnn import distributed
 from jfrnn._engine import ENGINES, Kind
 from jfrnn._shards.calls import BACKENDS
@@ -102,7 +103,7 @@ NO_MEASUREMENTS = {  # bounds, defaults and definitions
     "docs/benchmarks/cpu.md": ["60 s", "16 GiB"],
     "docs/benchmarks/gpu.md": ["11 %"],
     "docs/benchmarks/many-devices.md": ["20 B"],
-    "docs/explanation/array-engine.md": ["3 ×", "64 MB", "1 GB", "100 B", "125 B"],
+    "docs/explanation/array-engine.md": [f"3 {TIMES}", "64 MB", "1 GB", "100 B", "125 B"],
     "docs/guides/kept-lists.md": ["4 B"],
     "docs/guides/many-devices.md": ["20 s"],
     "docs/guides/memory.md": ["64 MB", "1 GB"],
