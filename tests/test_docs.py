@@ -19,8 +19,10 @@ from jfrnn._triangles.engines import TRIANGLE_ENGINES
 
 ROOT = Path(__file__).parent.parent
 RUN = """
-import re, sys
+import sys, traceback
 from pathlib import Path
+
+import jax
 
 for page in map(Path, sys.argv[1:]):
     lines, running = [], False
@@ -28,9 +30,13 @@ for page in map(Path, sys.argv[1:]):
         fence = line.startswith("```")
         running = line == "```python" if fence else running
         lines.append(line if running and not fence else "")
-    if any(lines):
+    jax.config.update("jax_enable_x64", False)
+    try:
         exec(compile("\\n".join(lines), str(page), "exec"), {"__name__": page.stem})
-    print(page.name, sum(map(bool, lines)))
+    except Exception:
+        traceback.print_exc()
+    else:
+        print("\\0ran", page, sum(map(bool, lines)))
 """
 GROUPS = {
     "readme": ["README.md", "docs/index.md", "docs/start.md"],
@@ -47,12 +53,25 @@ def run(*arguments, **environment):
     return done.stdout
 
 
-@pytest.mark.parametrize("group", GROUPS)
-def test_code_of_pages(group):
-    """Blocks of a page run in order, in one namespace, as a user finds the library: no 64-bit mode, here four virtual devices."""
+@pytest.fixture(scope="module")
+def ran():
+    """Run the blocks of all pages in one process, those of a page in order and in a namespace of its own.
+
+    As a user finds the library: no 64-bit mode, here four virtual devices. Returns lines of code by page, and errors.
+    """
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
-    said = run("-W", "error::RuntimeWarning", "-c", RUN, *GROUPS[group], XLA_FLAGS=flags)
-    assert any(int(line.split()[-1]) for line in said.splitlines() if line.endswith(tuple("0123456789")))
+    told = os.environ | {"PYTHONPATH": str(ROOT), "XLA_FLAGS": flags}
+    command = [sys.executable, "-W", "error::RuntimeWarning", "-c", RUN, *(page for pages in GROUPS.values() for page in pages)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=told)
+    counted = [line.split() for line in done.stdout.splitlines() if line.startswith("\0ran")]
+    return {page: int(lines) for _, page, lines in counted}, done.stderr
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_code_of_pages(group, ran):
+    lines, errors = ran
+    assert [page for page in GROUPS[group] if page not in lines] == [], errors
+    assert sum(lines[page] for page in GROUPS[group]) > 0
 
 
 def test_pages_build(tmp_path):

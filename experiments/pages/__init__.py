@@ -18,7 +18,7 @@ TABLES: dict[str, Callable[[], str]] = cpu.TABLES | gpu.TABLES | fluids.TABLES |
 _PLACE = re.compile(r"(<!-- table ([\w-]+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 _UNIT = r"(?:[mnµu]?s|%|[GMk]?B|[GM]iB|times|\N{MULTIPLICATION SIGN}|fold|steps/s|per second|seconds?|minutes?|hours?)"
 _FIGURE = re.compile(rf"(?<![\w.`=-])\d[\d .,]*(?:\s(?:to|and|or)\s\d[\d .,]*)?\s?{_UNIT}(?![\w/])")
-_VALUE = re.compile(r"(<!-- value ([\w-]+) -->)(.*?)(<!-- end -->)")
+_VALUE = re.compile(r"(<!-- value ([a-z0-9-]+) -->)(.*?)(<!-- end -->)")
 
 
 def pages() -> list[Path]:
