@@ -25,9 +25,11 @@ _GPU = {
 def draw(folder: Path) -> None:
     """Draw all pictures into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
+    figures = {"steps": _steps()}
     for name, make in {"cpu": _cpu, "gpu": _gpu, "liquid": _liquid, "cells": _cells, "halo": _halo}.items():
-        figure = Figure(figsize=(7.0, 4.2), layout="constrained")
-        make(figure.add_subplot())
+        figures[name] = Figure(figsize=(7.0, 4.2), layout="constrained")
+        make(figures[name].add_subplot())
+    for name, figure in figures.items():
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
 
 
@@ -123,6 +125,54 @@ def _cells(axes: Axes) -> None:
     axes.tick_params(labelbottom=False, labelleft=False, length=0)
     axes.grid(alpha=0.5)
     _entitle(axes, "Cells as wide as the cutoff; three runs of candidates (blue), neighbors in orange")
+
+
+def _steps() -> Figure:
+    """Draw the four steps of the array engine, for forty particles and one query, with cells undivided along x."""
+    across, down = 6, 4
+    x = np.random.default_rng(7).uniform((0.15, 0.15), (across - 0.15, down - 0.15), (40, 2))
+    cells = np.floor(x[:, 0]).astype(int) + across * np.floor(x[:, 1]).astype(int)
+    order = np.argsort(cells, kind="stable")
+    x, cells = x[order], cells[order]  # as the engine has them: a particle's index is its place in the order
+    query = int(np.argmin(np.hypot(*(x - (3.4, 1.6)).T)))
+    first = cells[query] - 1 + across * np.array([-1, 0, 1])
+    runs = [np.flatnonzero((cells >= cell) & (cells <= cell + 2)) for cell in first]
+    figure = Figure(figsize=(7.0, 5.0), layout="constrained")
+    sort, stencil, gather, compact = figure.subplots(2, 2, height_ratios=(3, 2)).ravel()
+    for axes in (sort, stencil):
+        axes.set(xticks=range(across + 1), yticks=range(down + 1), xlim=(0, across), ylim=(0, down), aspect="equal")
+        axes.tick_params(labelbottom=False, labelleft=False, length=0)
+        axes.grid(alpha=0.6)
+    for cell in range(across * down):
+        sort.text(cell % across + 0.04, cell // across + 0.04, str(cell), fontsize=6, color="0.5")
+    for k, at in enumerate(x):
+        sort.text(*at, str(k), fontsize=7, color=OURS, ha="center", va="center", clip_on=True)
+    for k, (cell, run) in enumerate(zip(first, runs, strict=True), start=1):
+        left, low = cell % across, cell // across
+        stencil.add_patch(Rectangle((left, low), 3, 1, color="#56b4e9", alpha=0.35, lw=0))
+        stencil.text(left - 0.1, low + 0.5, f"run {k}:\n{run[0]} to {run[-1]}", fontsize=8, va="center", ha="right", color=OURS)
+    stencil.plot(*x.T, ".", color="0.5", ms=4)
+    stencil.plot(*x[query], "k+", ms=10, mew=2)
+    stencil.add_patch(Circle((x[query, 0], x[query, 1]), 1, fill=False))
+    _draw_rows(gather, compact, [[int(k) for k in run] for run in runs], np.hypot(*(x - x[query]).T) < 1, query)
+    titles = ("1. Sort particles by the number of their cell", "2. Three runs around a query", "3. A bit for each candidate")
+    for axes, title in zip((sort, stencil, gather, compact), (*titles, "4. Set bits become a padded row"), strict=True):
+        axes.set_title(title, loc="left", fontsize=9, fontweight="bold")
+    return figure
+
+
+def _draw_rows(gather: Axes, compact: Axes, runs: list[list[int]], near: np.ndarray, query: int) -> None:
+    """Draw a box for each candidate of each run, filled where it is a neighbor, and the row of neighbors."""
+    found = [k for run in runs for k in run if near[k] and k != query]
+    padded = [*found, len(near), len(near)]
+    for axes, rows in ((gather, runs), (compact, [padded])):
+        for row, indices in enumerate(rows):
+            for place, k in enumerate(indices):
+                face, ink = (OURS, "white") if k in found else ("white", "0.4")
+                axes.add_patch(Rectangle((place, -row), 0.9, 0.9, facecolor=face, edgecolor="0.5"))
+                axes.text(place + 0.45, 0.45 - row, str(k), ha="center", va="center", fontsize=8, color=ink)
+        axes.set(xlim=(-0.2, max(map(len, rows)) + 0.2), ylim=(-len(rows) + 0.8, 1.2), aspect="equal")
+        axes.set_axis_off()
 
 
 def _halo(axes: Axes) -> None:
