@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Iterable
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from experiments import _plots, _thesis
+from experiments import _look, _thesis
 
 Frame = Any  # a pd.DataFrame; what its columns hold, its annotations do not know
 SHOWN = {"CLL": ("cll",), "ANN-NL": ("ann-kd-nolist", "scipy-kdtree-nolist"), "ANN": ("ann-kd-naive", "ann-kd", "scipy-kdtree")}
 """Methods of the thesis, and which of ours stands beside each: the first that has rows."""
-COLORS = {"CLL": _plots.COLORS["cll"], "ANN-NL": _plots.COLORS["scipy-kdtree-nolist"], "ANN": _plots.COLORS["scipy-kdtree"]}
+COLORS: dict[str, str] = dict(zip(("CLL", "ANN-NL", "ANN"), _look.COLORS, strict=False))
+HATCHES = {"CLL": "", "ANN-NL": "///", "ANN": "..."}
 
 
 def compare_entries(table: Frame) -> Frame:
@@ -51,71 +53,94 @@ def bars(lines: Frame, ours: str, theirs: str, label: str, methods: Iterable[str
         theirs: Column of the thesis's.
         label: Of the values.
         methods: Of the thesis.
-        title: Of the figure.
+        title: Of the figure; which method is first, here and in the thesis, is added.
     """
+    title = f"{title}. First is {_first(lines, ours, methods)} here, {_first(lines, theirs, methods)} in the thesis"
     methods = [name for name in methods if (lines.method == name).any()]
     scenes = list(dict.fromkeys(lines.scene))
-    figure, axes = _axes(title, label, max(6.0, 1.3 * len(scenes)))
+    figure, axes = _axes(title, label, _look.WIDTH)
     width = 0.8 / (2 * len(methods))
     for number, method in enumerate(methods):
         mine = lines[lines.method == method].set_index("scene").reindex(scenes)
         left = np.arange(len(scenes)) + (2 * number - len(methods)) * width
-        axes.bar(left, mine[ours], width, align="edge", color=COLORS[method], label=f"{method}: ours")
-        axes.bar(left + width, mine[theirs], width, align="edge", fill=False, edgecolor=COLORS[method], label=f"{method}: thesis")
+        style: Any = {"align": "edge", "edgecolor": COLORS[method]}
+        axes.bar(left, mine[ours], width, **style, facecolor=COLORS[method], label=f"{method}: ours")
+        axes.bar(left + width, mine[theirs], width, **style, fill=False, hatch=HATCHES[method], label=f"{method}: thesis")
     axes.set_xticks(range(len(scenes)), scenes, rotation=30, ha="right")
     axes.set_ylim(top=8 * axes.get_ylim()[1])  # room for the legend
-    axes.yaxis.set_major_formatter(_plots.PLAIN)
+    axes.yaxis.set_major_formatter(_look.PLAIN)
     axes.legend(fontsize=8, ncols=len(methods), loc="upper left", frameon=False)
     return figure
+
+
+def _first(lines: Frame, column: str, methods: Iterable[str]) -> str:
+    """Say which method takes least, and on how many of the scenes that have figures of all."""
+    table = lines[lines.method.isin([*methods])].pivot(index="scene", columns="method", values=column)
+    table = table.dropna(axis="columns", how="all").dropna()
+    if table.empty:
+        return "none"
+    first = table.idxmin(axis="columns").value_counts()
+    return f"{first.index[0]} on {first.iloc[0]} of {len(table)} scenes"
 
 
 def split(lines: Frame, title: str) -> Figure:
     """Draw how the time of ANN with a list divides into counting, fetching and making the list, ours and the thesis's."""
     parts = {"t_ksearch": "#56B4E9", "t_frsearch": "#0072B2", "t_processing": "#E69F00"}
     mine = lines[lines.method == "ANN"].set_index("scene")
-    figure, axes = _axes(title, "time [s]", max(6.0, 1.3 * len(mine)))
+    figure, axes = _axes(title, "time [s]", _look.WIDTH)
     for side, (prefix, hatch) in enumerate((("", None), ("thesis_", "//"))):
         for number, (part, color) in enumerate(parts.items()):
             place = np.arange(len(mine)) + 0.4 * side - 0.4 + 0.13 * number
             label = f"{part}: {'thesis' if prefix else 'ours'}"
             axes.bar(place, mine[prefix + part], 0.12, align="edge", color=color, hatch=hatch, edgecolor="white", label=label)
     axes.set_xticks(range(len(mine)), mine.index, rotation=30, ha="right")
-    axes.legend(fontsize=8, ncols=2, frameon=False)
+    axes.set_ylim(top=30 * axes.get_ylim()[1])  # room for the legend
+    axes.yaxis.set_major_formatter(_look.PLAIN)
+    axes.legend(fontsize=8, ncols=2, loc="upper left", frameon=False)
     return figure
 
 
 def over_fill(lines: Frame, ours: str, theirs: str, label: str, methods: Iterable[str], title: str) -> Figure:
     """Draw the mean over layouts for each fill, ours as a line and the thesis's dashed."""
-    figure, axes = _axes(title, label, 7.0)
+    figure, axes = _axes(title, label, _look.WIDTH)
     for method in methods:
         means = lines[lines.method == method].groupby("fill")[[ours, theirs]].mean()
         axes.plot(means.index, means[ours], "o-", color=COLORS[method], label=f"{method}: ours")
         axes.plot(means.index, means[theirs], "o--", color=COLORS[method], markerfacecolor="white", label=f"{method}: thesis")
     axes.set(xscale="log", xlabel="fill [%]")
-    axes.xaxis.set_major_formatter(_plots.PLAIN)
-    axes.yaxis.set_major_formatter(_plots.PLAIN)
+    axes.xaxis.set_major_formatter(_look.PLAIN)
+    axes.yaxis.set_major_formatter(_look.PLAIN)
     axes.legend(fontsize=8, frameon=False)
     return figure
 
 
 def effect_bars(axes: Axes, made: Frame, factor: str, title: str) -> None:
-    """Draw ratios with their intervals, a mark for each line of `_study.effects`; 1 is no effect."""
+    """Draw ratios with their intervals, a mark for each line of `_study.effects`; the title says what is beyond noise of 1."""
+    found = ", ".join(dict.fromkeys(made.method[made.verdict == "beyond noise"])) or "nothing"
+    title = fill(f"{title}; beyond noise: {found}", 80)
     methods = list(dict.fromkeys(made.method))
     values = list(dict.fromkeys(made[factor]))
     for number, value in enumerate(values):
         part = made[made[factor] == value]
         y = [methods.index(method) + 0.7 * ((number + 0.5) / len(values) - 0.5) for method in part.method]
-        color = _plots.OTHER_COLORS[(number + 4) % len(_plots.OTHER_COLORS)]
+        color = _look.COLORS[number % len(_look.COLORS)]
         axes.hlines(y, part.low, part.high, color=color, linewidth=1.5)
+        marker = _look.MARKERS[number % len(_look.MARKERS)]
         axes.plot(
-            part.ratio, y, "o", color=color, markersize=5, label=f"{factor} {value:g}" if isinstance(value, float) else str(value)
+            part.ratio,
+            y,
+            marker,
+            color=color,
+            markersize=5,
+            label=f"{factor} {value:g}" if isinstance(value, float) else str(value),
         )
     axes.axvline(1, color="0.5", linewidth=0.8)
     axes.set_yticks(range(len(methods)), methods)
-    axes.set(title=title, xlabel="ratio of times")
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.set(xlabel="ratio of times")
     if made.ratio.max() > 3 * made.ratio.min() or made.high.max() > 5:
         axes.set_xscale("log")
-        _plots.label_logarithmic(axes.xaxis)
+        _look.label_logarithmic(axes.xaxis)
         axes.xaxis.set_minor_locator(NullLocator())
     axes.legend(fontsize=8, frameon=False)
 
@@ -132,7 +157,7 @@ def show(figure: Figure) -> None:
 def _axes(title: str, label: str, width: float) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(width, 4.5), layout="constrained")
     axes = figure.add_subplot()
-    axes.set_title(title, loc="left", fontsize=11)
+    axes.set_title(fill(title, int(11 * width)), loc="left", fontsize=10)
     axes.set(yscale="log", ylabel=label)
     axes.spines[["top", "right"]].set_visible(False)
     return figure, axes

@@ -1,42 +1,45 @@
-"""The pictures of a report, drawn from rows alone: filled marks are ours, hollow ones the thesis's."""
+"""The pictures of a report, drawn from rows alone: eight methods at most in those that lead, all of them in small panels."""
 
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from statistics import geometric_mean
+from textwrap import fill
+from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 
-from experiments import _table, _thesis
+from experiments import _look, _table, _thesis
 from experiments._rows import SearchRow
 
-# Colors of M. Okabe and K. Ito, distinct to color-blind eyes too; other methods take those that are left.
-COLORS = {
-    **{"warp": "#CC79A7", "hashgrid": "#E69F00", "jax": "#0072B2", "cll": "#D55E00"},
-    **{"scipy-kdtree": "#009E73", "scipy-kdtree-nolist": "#56B4E9", "brute": "#999999"},
-}
-OTHER_COLORS = (
-    *("#000000", "#F0E442", "#7F3C8D", "#6B4423", "#1F77B4", "#8C564B", "#17BECF", "#BCBD22", "#2CA02C", "#AF4B91"),
-    *("#98DF8A", "#FF9896", "#9467BD", "#C49C94", "#393B79", "#637939", "#E377C2", "#843C39"),
-)
-OTHER_MARKERS = ("P", "p", "h", "<", ">", "d", "8")
-MARKERS = {
-    **{"warp": "*", "hashgrid": "X", "jax": "o", "cll": "s"},
-    **{"scipy-kdtree": "^", "scipy-kdtree-nolist": "v", "brute": "D"},
-}
-PLAIN = FuncFormatter(lambda number, _: _table.count(int(number)) if number >= 1000 else f"{number:g}")
 Value = Callable[[SearchRow], float | None]
-ThesisValue = Callable[[_thesis.Figures], float]
+Lines = dict[str, dict[int, float]]  # by method: values by place
+MOST_SCENES = 14  # side by side; where there are more, each layout has one place
 
-SECONDS = "time of a search [s], median; bars: its interval"
-MEGABYTES = "peak memory of a search over its start [MB]"
+
+@dataclass(frozen=True)
+class Quantity:
+    """What is drawn of rows: its value and label, what the thesis says of it, and which headline it gets (`fast` or `lean`)."""
+
+    value: Value
+    label: str
+    thesis: Callable[[_thesis.Figures], float]
+    what: str
+
+
+def _memory(row: SearchRow) -> float | None:
+    return _table.megabytes(row.search_bytes or row.peak_bytes)
+
+
+TIME = Quantity(attrgetter("median_s"), "time of a search [s]", attrgetter("seconds"), "fast")
+MEMORY = Quantity(_memory, "peak memory of a search [MB]", attrgetter("megabytes"), "lean")
 
 
 def draw_all(rows: Sequence[SearchRow], folder: Path, origin: str) -> list[Path]:
@@ -48,217 +51,250 @@ def draw_all(rows: Sequence[SearchRow], folder: Path, origin: str) -> list[Path]
         origin: Machine, versions and date, written below each picture.
     """
     good = _table.in_order([row for row in rows if row.status == "ok"])
-    if not good:
-        return []
-
-    def memory(row: SearchRow) -> float | None:
-        return _table.megabytes(row.search_bytes or row.peak_bytes)
-
-    seconds, density, thesis_seconds, thesis_memory = map(attrgetter, ("median_s", "density_error", "seconds", "megabytes"))
-    speed = SECONDS.split(";")[0]
     wanted: tuple[tuple[str, Value, Callable[[], Figure]], ...] = (
-        ("runtime_by_layout", seconds, partial(_by_layout, good, seconds, thesis_seconds, SECONDS)),
-        ("memory_by_layout", memory, partial(_by_layout, good, memory, thesis_memory, MEGABYTES)),
-        ("runtime_by_fill", seconds, partial(_by_fill, good, seconds, thesis_seconds, speed)),
-        ("memory_by_fill", memory, partial(_by_fill, good, memory, thesis_memory, MEGABYTES)),
-        ("speed_against_error", seconds, partial(against_error, good, seconds, speed, "Speed")),
-        ("memory_against_error", memory, partial(against_error, good, memory, MEGABYTES, "Memory")),
-        ("speed_against_sum_error", density, partial(against_sum_error, good)),
+        ("runtime_by_layout", TIME.value, partial(by_layout, good, TIME)),
+        ("memory_by_layout", MEMORY.value, partial(by_layout, good, MEMORY)),
+        ("runtime_by_fill", TIME.value, partial(by_fill, good, TIME)),
+        ("memory_by_fill", MEMORY.value, partial(by_fill, good, MEMORY)),
+        ("speed_against_error", TIME.value, partial(against_error, good, TIME)),
+        ("memory_against_error", MEMORY.value, partial(against_error, good, MEMORY)),
+        ("speed_against_sum_error", _sum_error, partial(against_sum_error, good)),
+        ("runtime_of_all", TIME.value, partial(of_all, good, TIME)),
+        ("memory_of_all", MEMORY.value, partial(of_all, good, MEMORY)),
     )
-    pictures = {name: draw() for name, value, draw in wanted if any(value(row) is not None for row in good)}
     paths = []
-    for name, figure in pictures.items():
-        figure.text(0.01, 0.008, origin, fontsize=7, color="0.45", wrap=True)
-        paths.append(folder / f"{name}.png")
-        figure.savefig(paths[-1], dpi=150)
+    for name, value, draw in wanted:
+        if any(value(row) is not None for row in good):
+            figure = draw()
+            below = f"{figure.get_supxlabel()}\n{fill(origin, 130)}".strip()
+            figure.supxlabel(below, x=0.015, ha="left", fontsize=6.5, color="0.35")
+            paths.append(folder / f"{name}.png")
+            figure.savefig(paths[-1], dpi=160)
     return paths
 
 
-def _methods(rows: Iterable[SearchRow]) -> list[str]:
-    """Return the methods of the rows, known ones first."""
-    present = {row.method for row in rows}
-    return [*(name for name in COLORS if name in present), *sorted(present - set(COLORS))]
-
-
-def _color(method: str, methods: list[str]) -> str:
-    others = [name for name in methods if name not in COLORS]
-    return COLORS.get(method) or OTHER_COLORS[others.index(method) % len(OTHER_COLORS) if method in others else 0]
-
-
-def _marker(method: str) -> str:
-    return MARKERS.get(method) or OTHER_MARKERS[sum(method.encode()) % len(OTHER_MARKERS)]
-
-
-def _title(label: str) -> str:
-    """Return the label of an axis without what stands behind its unit, as a title."""
-    return f"{label[0].upper()}{label[1:].split(' [')[0]}"
-
-
-def _figure(width: float, height: float, title: str) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    figure.get_layout_engine().set(rect=(0, 0.035, 1, 0.965))  # type: ignore[union-attr]
-    axes = figure.add_subplot()
-    axes.set_title(title, loc="left", fontsize=12, fontweight="bold")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(True, which="major", color="0.9", linewidth=0.8)
-    axes.set_axisbelow(True)
-    return figure, axes
-
-
-def label_logarithmic(axis: Axis, short: float = 1000) -> None:
-    """Write plain numbers at the powers of ten, and at 2 and 5 times these where an axis ends below `short` times its begin."""
-    low, high = axis.get_view_interval()
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < short * low else (1,)))
-    axis.set_major_formatter(PLAIN)
-
-
-def dress(axes: Axes, xlabel: str, ylabel: str) -> None:
-    """Make both axes logarithmic and name them."""
-    axes.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
-    for axis, short in ((axes.xaxis, 100), (axes.yaxis, 1000)):  # numbers side by side take more room
-        label_logarithmic(axis, short)
-        axis.set_minor_formatter(NullFormatter())
-    axes.grid(True, which="major", color="0.9", linewidth=0.8)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def _legend(axes: Axes, methods: list[str], thesis: Iterable[tuple[str, str]], *, lines: bool = False) -> None:
-    """Name our methods and the thesis's beside the axes; `thesis` holds pairs of our method and its counterpart."""
-    solid, dashed = ("-", "--") if lines else ("none", "none")
-    handles = [Line2D([], [], color=_color(name, methods), marker=_marker(name), linestyle=solid, label=name) for name in methods]
-    for ours, theirs in thesis:
-        handle = Line2D([], [], color=_color(ours, methods), marker=_marker(ours), linestyle=dashed, label=f"thesis: {theirs}")
-        handle.set_markerfacecolor("none")
-        handles.append(handle)
-    axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9)
-
-
-def _theirs(rows: list[SearchRow], value: ThesisValue) -> dict[tuple[str, str], list[tuple[SearchRow, float]]]:
-    """Return the thesis's values on the scenes of these rows, by our method and its counterpart."""
-    scenes = {row.scene_key: row for row in rows}
-    found = defaultdict(list)
-    for ours, theirs in _thesis.counterparts(row.method for row in rows).items():
-        for row in scenes.values():
-            if (figures := _thesis.figures(row, theirs)) is not None:
-                found[ours, theirs].append((row, value(figures)))
-    return dict(found)
-
-
-def _by_layout(rows: list[SearchRow], value: Value, thesis_value: ThesisValue, label: str) -> Figure:
-    """Draw a mark per row: scenes downwards, values to the right on a log axis."""
-    names, methods = _table.name_scenes(rows), _methods(rows)
-    theirs = _theirs(rows, thesis_value)
-    places = {key: number for number, key in enumerate(dict.fromkeys(row.scene_key for row in rows))}
-    points = {row.scene_key: row.points or 0 for row in rows}
-    height = max(1.8 + max(0.52, 0.06 * len(methods)) * len(places), 2 + 0.2 * len(methods))
-    figure, axes = _figure(10.5, height, f"{_title(label)}, by layout")
-    for number in range(0, len(places), 2):
-        axes.axhspan(number - 0.5, number + 0.5, color="0.97", zorder=0)
-    offsets = {name: 0.62 * ((number + 0.5) / len(methods) - 0.5) for number, name in enumerate(methods)}
-    for row in rows:
-        if not (middle := value(row)):
-            continue
-        y, color = places[row.scene_key] + offsets[row.method], _color(row.method, methods)
-        low, high = getattr(row, "low_s", None) or row.p10_s, getattr(row, "high_s", None) or row.p90_s
-        if value(row) == row.median_s and low and high:
-            axes.plot([low, high], [y, y], color=color, linewidth=1.5)
-        axes.plot(middle, y, color=color, marker=_marker(row.method), markersize=6, linestyle="none")
-    for (ours, _), values in theirs.items():
-        y = [places[row.scene_key] + offsets.get(ours, 0.0) + 0.31 / len(methods) for row, _ in values]  # beside ours, not upon it
-        x = [number for _, number in values]
-        style = {"color": _color(ours, methods), "marker": _marker(ours), "markerfacecolor": "none", "linestyle": "none"}
-        axes.plot(x, y, markersize=6, **style)  # pyright: ignore[reportArgumentType]
-    labels = [f"{names[key]}\n{_table.count(points[key])} points" for key in places]
-    axes.set_yticks(list(places.values()), labels, fontsize=9)
-    axes.set(xscale="log", ylim=(len(places) - 0.5, -0.5), xlabel=label)
-    label_logarithmic(axes.xaxis)
-    axes.yaxis.grid(False)
-    _legend(axes, methods, theirs)
+def by_layout(rows: Sequence[SearchRow], quantity: Quantity) -> Figure:
+    """Draw a line per method over scenes, or over layouts where scenes are many."""
+    whole, lines, found = _by_place(rows, quantity.value)
+    names, shared = _shorten(whole)
+    chosen = [name for name in _look.choose(_methods(rows)) if lines.get(name)]
+    scenes = "layouts" if len({row.scene_key for row in rows}) > MOST_SCENES else "scenes"
+    figure, axes = _look.make_axes(_look.headline(found, quantity.what, scenes), 4.8)
+    _draw_lines(axes, lines, chosen)
+    axes.set_xticks(range(len(names)), names, rotation=40, ha="right", fontsize=8, rotation_mode="anchor")
+    axes.set(yscale="log", xlim=(-0.3, len(names) - 0.7), xlabel=shared, ylabel=quantity.label)
+    _look.label_logarithmic(axes.yaxis)
+    _name_lines(axes, lines, chosen)
     return figure
 
 
-def _by_fill(rows: list[SearchRow], value: Value, thesis_value: ThesisValue, label: str) -> Figure:
-    """Draw the geometric mean of the layouts that are asked to fill the same, and a bar from the least to the most of them."""
-    methods, theirs = _methods(rows), _theirs(rows, thesis_value)
-    figure, axes = _figure(10.5, 6.0, f"{_title(label)}, by fill (mean and range of the layouts)")
-    shifts = {name: 1.018 ** (number - (len(methods) - 1) / 2) for number, name in enumerate(methods)}
-    for method in methods:
-        mine = [(row, number) for row in rows if row.method == method and (number := value(row))]
-        _draw_over_fill(axes, mine, shifts[method], color=_color(method, methods), marker=_marker(method), linestyle="-")
-    for (ours, _), values in theirs.items():
-        style = {"color": _color(ours, methods), "marker": _marker(ours), "markerfacecolor": "white", "linestyle": "--"}
-        _draw_over_fill(axes, values, shifts.get(ours, 1.0), **style)
+def by_fill(rows: Sequence[SearchRow], quantity: Quantity) -> Figure:
+    """Draw over fill the geometric mean of the layouts that are asked to fill the same, with a bar from the least to the most."""
+    filled = [row for row in rows if row.fill]
+    found: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    fills: dict[str, list[float]] = defaultdict(list)
+    for row in filled:
+        if value := quantity.value(row):
+            found[f"{row.fill_asked}"][row.method].append(value)
+            fills[f"{row.fill_asked}"].append(100 * (row.fill or 1))
+    means = {asked: {name: geometric_mean(values) for name, values in of.items()} for asked, of in found.items()}
+    places = {asked: geometric_mean(values) for asked, values in fills.items()}
+    chosen = _look.choose(name for name in _methods(filled) if any(name in of for of in means.values()))
+    figure, axes = _look.make_axes(f"{_look.headline(means, quantity.what, 'fills')} (means of layouts)", 4.4)
+    ends = []
+    for name in chosen:
+        line = sorted((places[asked], of[name], found[asked][name]) for asked, of in means.items() if name in of)
+        x, y, values = zip(*line, strict=True)
+        axes.vlines(x, [min(of) for of in values], [max(of) for of in values], color=_look.color_of(name), linewidth=1)
+        axes.plot(x, y, **_style(name, chosen))
+        ends.append((_look.name_of(name), x[-1], y[-1], _look.color_of(name)))
     ticks = [number * 10.0**power for power in range(-6, 3) for number in (1, 2, 5) if number * 10**power <= 100]
-    axes.set(xscale="log", yscale="log", xlabel="fill: points / points of the full domain [%]", ylabel=label)
+    if places:
+        axes.set_xlim(min(places.values()) / 1.25, max(places.values()) * 1.25)
+    axes.set(xscale="log", yscale="log", xlabel="fill: points / points of the full domain [%]", ylabel=quantity.label)
     axes.xaxis.set_major_locator(FixedLocator(ticks))
     axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(PLAIN)
-    label_logarithmic(axes.yaxis)
-    fills = [100 * row.fill for row in rows if row.fill]
-    axes.set_xlim(min(fills) / 1.25, max(fills) * 1.25)
-    _legend(axes, methods, theirs, lines=True)
+    axes.xaxis.set_major_formatter(_look.PLAIN)
+    _look.label_logarithmic(axes.yaxis)
+    _look.write_names(axes, ends)
     return figure
 
 
-def _draw_over_fill(axes: Axes, values: list[tuple[SearchRow, float]], shift: float, **style: str) -> None:
-    """Draw the values of one method; the shift keeps marks of methods apart."""
-    groups = defaultdict(list)
-    for row, number in values:
-        if row.fill:
-            groups[row.fill_asked].append((100 * row.fill, number))
-    means = sorted((geometric_mean(fills), numbers) for fills, numbers in (zip(*group, strict=True) for group in groups.values()))
-    x, y = [shift * fill for fill, _ in means], [geometric_mean(numbers) for _, numbers in means]
-    axes.vlines(
-        x, [min(numbers) for _, numbers in means], [max(numbers) for _, numbers in means], color=style["color"], linewidth=1.5
-    )
-    axes.plot(x, y, markersize=6, linewidth=1.2, **style)  # pyright: ignore[reportArgumentType]
+def against_error(rows: Sequence[SearchRow], quantity: Quantity) -> Figure:
+    """Draw a value of the scene that most methods searched over wrong pairs: what is exact in lines of its own, in order."""
+    scene = _fullest_scene(row for row in rows if quantity.value(row) and row.errors is not None)
+    lists = {row.method: row for row in scene if row.method not in _look.WITHOUT_LIST} or {row.method: row for row in scene}
+    exact = [row for row in lists.values() if not row.errors]
+    wrong = [row for row in lists.values() if row.errors]
+    title = f"{len(exact)} of {len(lists)} lists are exact" if len(lists) > 1 else f"{quantity.label.split(' [')[0]}".capitalize()
+    if exact and wrong:
+        shown = [row for row in exact if row.method in _look.choose(lists)] or exact
+        best, other = (min(of, key=lambda row: quantity.value(row) or 0) for of in (shown, wrong))
+        ratio = _look.factor((quantity.value(other) or 0) / (quantity.value(best) or 1))
+        least, times = {"fast": ("fastest", "times as long as"), "lean": ("leanest", "times the memory of")}[quantity.what]
+        title += f"; the {least} of the others, {_look.spoken(other.method)}, takes {ratio} {times} {_look.spoken(best.method)}"
+    label = f"{quantity.label}; {scene[0].scene_name}, {_look.plain(scene[0].points or 0)} points" if scene else quantity.label
+    return _strip(scene, quantity.value, lambda row: row.errors, title, label, "missing and extra pairs")
 
 
-def against_error(rows: list[SearchRow], value: Value, label: str, title: str) -> Figure:
-    """Draw a value over missing and extra pairs: exact methods stand on the left edge, good ones low."""
-    methods = _methods(rows)
-    figure, axes = _figure(
-        10.5, max(6.0, 2 + 0.2 * len(methods)), f"{title} against error: a mark per scene, larger for more points"
-    )
-    _scatter(axes, rows, lambda row: row.errors, value)
-    axes.set_xscale("symlog", linthresh=1)
-    most = max((row.errors or 0 for row in rows), default=0)
-    axes.set(yscale="log", xlim=(-0.5, max(2.0 * most, 10)), xlabel="missing + extra pairs, against the exact answer")
-    axes.set_ylabel(label)
-    axes.axvline(0, color="0.6", linewidth=0.8, zorder=0.5)
-    axes.xaxis.set_major_formatter(PLAIN)
-    label_logarithmic(axes.yaxis)
-    _legend(axes, methods, [])
-    return figure
-
-
-def against_sum_error(rows: list[SearchRow]) -> Figure:
+def against_sum_error(rows: Sequence[SearchRow]) -> Figure:
     """Draw time over the largest error of a sum over neighbors: what wrong pairs do, and rounding to sums without a list."""
-    methods = _methods(rows)
-    figure, axes = _figure(10.5, max(6.0, 2 + 0.2 * len(methods)), "Speed against the error of a sum over neighbors")
+    scene = _fullest_scene(row for row in rows if row.median_s and _sum_error(row) is not None)
+    worst = max((row.jump_error or 0.0 for row in scene), default=0.0)
+    title = f"Wrong pairs change a sum that jumps at the cutoff by up to {100 * worst:.2g} % of its mean"
+    title = title if worst else "No wrong pair, and so no error of a sum that jumps at the cutoff"
+    rounding = max((row.density_error or 0.0 for row in scene if row.method == "pair-sum"), default=0.0)
+    title += f"; rounding changes the density of pair_sum by {rounding:.0e}" if rounding else ""
+    label = f"{TIME.label}; {scene[0].scene_name}, {_look.plain(scene[0].points or 0)} points"
+    return _strip(scene, TIME.value, _sum_error, title, label, "error of a sum, over its mean")
 
-    def error(row: SearchRow) -> float | None:
-        known = [value for value in (row.density_error, row.jump_error) if value is not None]
-        return max(known) if known else None
 
-    _scatter(axes, rows, error, lambda row: row.median_s)
-    axes.set_xscale("symlog", linthresh=1e-8)
-    axes.set(yscale="log", xlim=(-5e-9, 1), ylabel=SECONDS.split(";")[0])
-    axes.set_xlabel(
-        "largest error of a particle, over the mean: of unit vectors, which jump at the cutoff; of pair-sum, its density"
-    )
-    axes.axvline(0, color="0.6", linewidth=0.8, zorder=0.5)
-    label_logarithmic(axes.yaxis)
-    _legend(axes, methods, [])
+def of_all(rows: Sequence[SearchRow], quantity: Quantity) -> Figure:
+    """Draw a panel for each method over all scenes, others in grey: hollow marks have wrong pairs, dashes are the thesis's."""
+    names, lines, _ = _by_place(rows, quantity.value)
+    wrong = {(row.method, place) for row, place in _places(rows) if row.errors}
+    methods = sorted((name for name in lines if lines[name]), key=lambda name: (not _look.is_ours(name), _last(lines[name])))
+    across = min(4, len(methods))
+    down = math.ceil(len(methods) / across)
+    figure = Figure(figsize=(_look.WIDTH, 1.6 + 1.3 * down), layout="constrained")
+    panels = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False).ravel()
+    theirs = _theirs(rows, quantity)
+    faint = [sorted(line.items()) for line in lines.values()]
+    for axes, method in zip(panels, methods, strict=False):
+        _look.clear(axes)
+        axes.add_collection(LineCollection(faint, colors=_look.FAINT, linewidths=0.7))
+        if method in theirs:
+            axes.plot(*zip(*sorted(theirs[method].items()), strict=True), color=_look.COLORS[1], linestyle="--", linewidth=1)
+        color = _look.OURS if _look.is_ours(method) else "k"
+        x, y = zip(*sorted(lines[method].items()), strict=True)
+        axes.plot(x, y, color=color, linewidth=1.3)
+        for place, value in zip(x, y, strict=True):
+            axes.plot(place, value, "o", ms=3.5, color=color, mfc="white" if (method, place) in wrong else color)
+        axes.set_title(_look.name_of(method), loc="left", fontsize=8, color=color, pad=2)
+        axes.set(yscale="log", xticks=range(len(names)))
+        axes.tick_params(labelsize=7)
+        axes.set_xticklabels([str(k + 1) for k in range(len(names))], fontsize=5.5)
+        axes.set_xlim(-0.5, len(names) - 0.5)
+    for axes in panels[len(methods) :]:
+        axes.remove()
+    _look.label_logarithmic(panels[0].yaxis, 100)
+    shown = f"All {len(methods)} methods: {quantity.label}. Hollow: pairs missing or extra"
+    _look.head(figure, shown + ("; dashed: what the thesis reports, on its machine" if theirs else ""))
+    figure.supxlabel(fill(" · ".join(f"{k}: {name}" for k, name in enumerate(names, start=1)), 130))
     return figure
 
 
-def _scatter(axes: Axes, rows: list[SearchRow], x: Value, y: Value) -> None:
-    """Draw a mark per row, larger for more points; rows that lack a value are left out."""
-    methods = _methods(rows)
+def _methods(rows: Iterable[SearchRow]) -> list[str]:
+    return list(dict.fromkeys(row.method for row in rows))
+
+
+def _sum_error(row: SearchRow) -> float | None:
+    known = [value for value in (row.density_error, row.jump_error) if value is not None]
+    return max(known) if known else None
+
+
+def _fullest_scene(rows: Iterable[SearchRow]) -> list[SearchRow]:
+    """Return the rows of the scene that most of the methods that lead searched; of several, that with most points."""
+    scenes: dict[Any, list[SearchRow]] = defaultdict(list)
     for row in rows:
-        place, height = x(row), y(row)
-        if place is None or not height or not row.points:
-            continue
-        style = {"color": _color(row.method, methods), "marker": _marker(row.method), "alpha": 0.8, "linewidths": 0.5}
-        axes.scatter(place, height, s=15 + 9 * math.log2(max(row.points / 1000, 1)), edgecolor="white", **style)
+        scenes[row.scene_key].append(row)
+    leading = _look.choose(row.method for of in scenes.values() for row in of)
+    return max(scenes.values(), key=lambda of: (sum(row.method in leading for row in of), of[0].points or 0), default=[])
+
+
+def _places(rows: Sequence[SearchRow]) -> list[tuple[SearchRow, int]]:
+    """Return each row and where it stands from left to right: by scene, or by layout where scenes are many."""
+    keys = [row.scene_key for row in rows]
+    keys = [row.layout for row in rows] if len(set(keys)) > MOST_SCENES else keys
+    places = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+    return [(row, places[key]) for row, key in zip(rows, keys, strict=True)]
+
+
+def _by_place(rows: Sequence[SearchRow], value: Value) -> tuple[list[str], Lines, dict[str, dict[str, float]]]:
+    """Return names of places, the values of each method by place (means where a place holds several), and the same by place."""
+    scenes, of_layouts = _table.name_scenes(rows), len({row.scene_key for row in rows}) > MOST_SCENES
+    names: dict[int, str] = {}
+    values: dict[tuple[str, int], list[float]] = defaultdict(list)
+    for row, place in _places(rows):
+        points = f"{_look.plain(row.points or 0)} points"
+        names.setdefault(place, row.layout if of_layouts else f"{scenes[row.scene_key]}, {points}")
+        if number := value(row):
+            values[row.method, place].append(number)
+    lines: Lines = {method: {} for method in _methods(rows)}
+    found: dict[str, dict[str, float]] = {f"{place}": {} for place in names}
+    for (method, place), numbers in values.items():
+        lines[method][place] = found[f"{place}"][method] = geometric_mean(numbers)
+    return list(names.values()), lines, {place: of for place, of in found.items() if of}
+
+
+def _shorten(names: Sequence[str]) -> tuple[list[str], str]:
+    """Return what tells scenes apart, a line for each part, and what they share."""
+    parts = [name.split(", ") for name in names]
+    shared = [part for part in parts[0] if all(part in of for of in parts)] if len(parts) > 1 else []
+    return ["\n".join(part for part in of if part not in shared) for of in parts], ", ".join(shared)
+
+
+def _theirs(rows: Sequence[SearchRow], quantity: Quantity) -> Lines:
+    """Return the thesis's values by our method that is like its own."""
+    found: Lines = defaultdict(dict)
+    for ours, theirs in _thesis.counterparts(row.method for row in rows).items():
+        for row, place in _places(rows):
+            if (figures := _thesis.figures(row, theirs)) is not None:
+                found[ours][place] = quantity.thesis(figures)
+    return found
+
+
+def _last(line: dict[int, float]) -> float:
+    return line[max(line)] / (1 + max(line))
+
+
+def _style(method: str, chosen: Sequence[str], size: float = 6.5) -> Any:  # noqa: ANN401
+    width = 2.0 if _look.is_ours(method) else 1.1
+    style = {"color": _look.color_of(method), "marker": _look.marker_of(method, chosen), "markersize": size, "linewidth": width}
+    return style | {"markeredgecolor": "white", "markeredgewidth": 0.6}
+
+
+def _draw_lines(axes: Axes, lines: Lines, chosen: Sequence[str]) -> None:
+    for name in reversed(chosen):  # ours on top
+        axes.plot(*zip(*sorted(lines[name].items()), strict=True), **_style(name, chosen))
+
+
+def _name_lines(axes: Axes, lines: Lines, chosen: Sequence[str]) -> None:
+    ends = [(_look.name_of(name), max(lines[name]), lines[name][max(lines[name])], _look.color_of(name)) for name in chosen]
+    _look.write_names(axes, ends)
+
+
+def _strip(scene: list[SearchRow], value: Value, error: Value, title: str, label: str, errors: str) -> Figure:
+    """Draw values to the right: above, a line for each method without error, in order; below, errors downwards, names beside."""
+    chosen = _look.choose(row.method for row in scene)
+    marks = {row.method: (value(row) or 0.0, error(row) or 0.0) for row in scene if row.method in chosen}
+    exact = sorted((name for name, (_, off) in marks.items() if not off), key=lambda name: marks[name])
+    wrong = [name for name, (_, off) in marks.items() if off]
+    heights = [0.27 * len(exact) + 0.1] * bool(exact) + [2.2] * bool(wrong) or [1.0]
+    figure = Figure(figsize=(_look.WIDTH, 1.8 + sum(heights)), layout="constrained")
+    _look.head(figure, title)
+    panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
+    for axes in panels:
+        _look.clear(axes)
+        axes.set(xscale="log")
+    for place, name in enumerate(exact):
+        panels[0].plot([marks[name][0]], [place], **_style(name, chosen, 8) | {"linestyle": "none"})
+    if exact:
+        panels[0].set(ylim=(len(exact) - 0.4, -0.6), facecolor="0.97", ylabel="exact" if len(exact) > 1 else "")
+        panels[0].set_yticks(range(len(exact)), [_look.name_of(name) for name in exact])
+        for text, name in zip(panels[0].get_yticklabels(), exact, strict=True):
+            text.set(color=_look.color_of(name), fontweight="bold" if _look.is_ours(name) else "normal")
+    for name in wrong:
+        panels[-1].plot(*([number] for number in marks[name]), **_style(name, chosen, 8) | {"linestyle": "none"})
+    if marks:
+        panels[-1].set_xlim(min(at for at, _ in marks.values()) / 1.6, max(at for at, _ in marks.values()) * 1.6)
+    panels[-1].set_xlabel(label)
+    _look.label_logarithmic(panels[-1].xaxis, 200)
+    if wrong:
+        found = [marks[name][1] for name in wrong]
+        panels[-1].set(yscale="log", ylabel=errors, ylim=(max(found) * 2, min(found) / 2))
+        if min(found) >= 1:
+            _look.label_logarithmic(panels[-1].yaxis)
+        panels[-1].yaxis.set_minor_formatter(NullFormatter())
+        _look.write_names(panels[-1], [(_look.name_of(name), *marks[name], _look.color_of(name)) for name in wrong])
+    return figure

@@ -5,6 +5,7 @@ import io
 import tempfile
 from collections.abc import Sequence
 from contextlib import redirect_stderr
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,17 +36,23 @@ def rows(sweep: str, small: bool, results: str | None = None) -> list[SearchRow]
         return read_latest(folder)
     config = shrink(_config.load(ROOT / "configs" / f"{sweep}.toml"))
     if small:
-        gc.freeze()  # a row collects garbage before it measures memory: what is imported is none, and slow to look through
-        try:
-            with tempfile.TemporaryDirectory() as out:
-                return [_sweep.measure(spec, Path(out), _worker.measure(spec, Path(out))) for spec in config.specs()]
-        finally:
-            gc.unfreeze()
+        return list(_measure(config))
     with redirect_stderr(io.StringIO()):  # its progress is no result
         made = _sweep.run(config, f"{sweep}, small", ROOT.parent / "out" / "small" / sweep)
     command = f"python -m experiments run experiments/configs/{sweep}.toml --out {folder.relative_to(ROOT.parent)}"
     print(f"no rows of {sweep} are here: what follows is a small version, measured now. `{command}` measures the whole one.")
     return made
+
+
+@cache
+def _measure(config: Config) -> tuple[SearchRow, ...]:
+    """Return rows of a small sweep, measured in this process, once however many ask for them."""
+    gc.freeze()  # a row collects garbage before it measures memory: what is imported is none, and slow to look through
+    try:
+        with tempfile.TemporaryDirectory() as out:
+            return tuple(_sweep.measure(spec, Path(out), _worker.measure(spec, Path(out))) for spec in config.specs())
+    finally:
+        gc.unfreeze()
 
 
 def shrink(config: Config) -> Config:

@@ -11,6 +11,7 @@ import pytest
 import jfrnn
 from experiments import pages
 from experiments._errors import UsageError
+from experiments.pages.rows import TIMES
 from jfrnn import distributed
 from jfrnn._engine import ENGINES, Kind
 from jfrnn._shards.calls import BACKENDS
@@ -18,8 +19,10 @@ from jfrnn._triangles.engines import TRIANGLE_ENGINES
 
 ROOT = Path(__file__).parent.parent
 RUN = """
-import re, sys
+import sys, traceback
 from pathlib import Path
+
+import jax
 
 for page in map(Path, sys.argv[1:]):
     lines, running = [], False
@@ -27,9 +30,13 @@ for page in map(Path, sys.argv[1:]):
         fence = line.startswith("```")
         running = line == "```python" if fence else running
         lines.append(line if running and not fence else "")
-    if any(lines):
+    jax.config.update("jax_enable_x64", False)
+    try:
         exec(compile("\\n".join(lines), str(page), "exec"), {"__name__": page.stem})
-    print(page.name, sum(map(bool, lines)))
+    except Exception:
+        traceback.print_exc()
+    else:
+        print("\\0ran", page, sum(map(bool, lines)))
 """
 GROUPS = {
     "readme": ["README.md", "docs/index.md", "docs/start.md"],
@@ -46,12 +53,25 @@ def run(*arguments, **environment):
     return done.stdout
 
 
-@pytest.mark.parametrize("group", GROUPS)
-def test_code_of_pages(group):
-    """Blocks of a page run in order, in one namespace, as a user finds the library: no 64-bit mode, here four virtual devices."""
+@pytest.fixture(scope="module")
+def ran():
+    """Run the blocks of all pages in one process, those of a page in order and in a namespace of its own.
+
+    As a user finds the library: no 64-bit mode, here four virtual devices. Returns lines of code by page, and errors.
+    """
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
-    said = run("-W", "error::RuntimeWarning", "-c", RUN, *GROUPS[group], XLA_FLAGS=flags)
-    assert any(int(line.split()[-1]) for line in said.splitlines() if line.endswith(tuple("0123456789")))
+    told = os.environ | {"PYTHONPATH": str(ROOT), "XLA_FLAGS": flags}
+    command = [sys.executable, "-W", "error::RuntimeWarning", "-c", RUN, *(page for pages in GROUPS.values() for page in pages)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=told)
+    counted = [line.split() for line in done.stdout.splitlines() if line.startswith("\0ran")]
+    return {page: int(lines) for _, page, lines in counted}, done.stderr
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_code_of_pages(group, ran):
+    lines, errors = ran
+    assert [page for page in GROUPS[group] if page not in lines] == [], errors
+    assert sum(lines[page] for page in GROUPS[group]) > 0
 
 
 def test_pages_build(tmp_path):
@@ -74,7 +94,7 @@ def test_pages_build(tmp_path):
     assert missing == []
 
 
-@pytest.mark.parametrize("page", [path for path in pages.pages() if pages.tables_of(path)], ids=lambda path: path.stem)
+@pytest.mark.parametrize("page", [path for path in pages.pages() if pages.names_in(path)], ids=lambda path: path.stem)
 def test_figures_are_those_of_the_rows(page):
     text = page.read_text(encoding="utf-8")
     assert pages.fill_in(text) == text, "python -m experiments tables"
@@ -97,8 +117,34 @@ def test_engines_can_what_the_readme_says():
         assert [name for name in names if said[title][name] == "yes"] == [name for name in names if name in table]
 
 
-def test_every_table_stands_in_a_page():
-    assert {name for page in pages.pages() for name in pages.tables_of(page)} == set(pages.TABLES)
+NOTES = ("docs/benchmarks/tried.md", "docs/benchmarks/paper.md")  # of the laboratory, and arithmetic
+NO_MEASUREMENTS = {  # bounds, defaults and definitions
+    "docs/benchmarks/cpu.md": ["60 s", "16 GiB"],
+    "docs/benchmarks/gpu.md": ["11 %"],
+    "docs/benchmarks/many-devices.md": ["20 B"],
+    "docs/explanation/array-engine.md": [f"3 {TIMES}", "64 MB", "1 GB", "100 B", "125 B"],
+    "docs/guides/kept-lists.md": ["4 B"],
+    "docs/guides/many-devices.md": ["20 s"],
+    "docs/guides/memory.md": ["64 MB", "1 GB"],
+    "docs/start.md": ["4 B", "4 B"],
+    "docs/thesis.md": ["95 %", "0.1 to 100 %", "10 %"],
+}
+
+
+def test_no_figure_is_written_by_hand():
+    loose = {str(page.relative_to(ROOT)): pages.loose_figures(page.read_text(encoding="utf-8")) for page in pages.pages()}
+    assert {name: found for name, found in loose.items() if found and name not in NOTES} == NO_MEASUREMENTS
+
+
+def test_a_figure_written_by_hand_is_found():
+    text = (
+        "It takes 3.2 ms, 4 to 5 times as long, `5 ms` <!-- value jet-steps -->7 s<!-- end -->, 1 024 particles.\n```\n8 s\n```\n"
+    )
+    assert pages.loose_figures(text) == ["3.2 ms", "4 to 5 times"]
+
+
+def test_every_table_and_figure_stands_in_a_page():
+    assert {name for page in pages.pages() for name in pages.names_in(page)} == {*pages.TABLES, *pages.VALUES}
 
 
 def test_a_figure_that_is_none_of_the_rows_is_found():
@@ -108,3 +154,7 @@ def test_a_figure_that_is_none_of_the_rows_is_found():
     assert spoiled != filled == pages.fill_in(spoiled)
     with pytest.raises(UsageError, match="there is no such table"):
         pages.fill_in(text.replace("ties", "knots"))
+    text = "<!-- value jet-steps -->1 000<!-- end -->"
+    assert pages.fill_in(text) == text.replace("1 000", pages.VALUES["jet-steps"]()) != text
+    with pytest.raises(UsageError, match="there is no such value"):
+        pages.fill_in(text.replace("jet", "oil"))

@@ -3,16 +3,17 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from matplotlib.image import imread
 from typer.testing import CliRunner
 
-from experiments import _plots, _report, _reports, _table, _thesis
+from experiments import _look, _plots, _report, _reports, _table, _thesis
 from experiments._cli import app
 from experiments._rows import RowFile, SearchRow, values_of
 
 PICTURES = ("runtime_by_layout", "memory_by_layout", "runtime_by_fill", "memory_by_fill", "speed_against_error")
-PICTURES += ("memory_against_error", "speed_against_sum_error")
+PICTURES += ("memory_against_error", "speed_against_sum_error", "runtime_of_all", "memory_of_all")
 MACHINE = {"cpu": "Some CPU", "cores": 2, "memory_bytes": 8 * 2**30, "system": "Linux 6"}
 VERSIONS = {"jax": "0.10.2", "scipy": "1.17.1", "warp-lang": None}
 SCENES = (
@@ -128,8 +129,8 @@ def test_scenes_stand_by_size_and_are_told_apart():
 def test_printed_table_and_paths(reported):
     folder, printed = reported
     lines = printed.splitlines()
-    assert lines[-9:-7] == [str(folder / "report.html"), str(folder / "table.csv")]
-    assert lines[-7:] == [str(folder / f"{name}.png") for name in PICTURES]
+    assert lines[-11:-9] == [str(folder / "report.html"), str(folder / "table.csv")]
+    assert lines[-9:] == [str(folder / f"{name}.png") for name in PICTURES]
     assert ["s", "MB", "missing", "extra"] in [line.split() for line in lines]
     full = lines.index(next(line for line in lines if line.strip() == "full 100 %, 250 000 points"))
     shown = [line.split() for line in lines[full + 1 : full + 5]]
@@ -138,7 +139,8 @@ def test_printed_table_and_paths(reported):
     assert "Some CPU, 2 cores, 8 GiB · jax 0.10.2, scipy 1.17.1 · commit 0123456789 · 2031-02-03" in lines
 
 
-def test_printed_table_fits_80_columns_and_names_what_is_not_installed_in_one_line(tmp_path):
+def test_printed_table_fits_80_columns_and_names_what_is_not_installed_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(_plots, "draw_all", lambda rows, folder, origin: [])
     names = ("scipy-kdtree-nolist", "freud", "jax-md")
     for number, method in enumerate(names):
         scene = ("corners", 0.11, 28158, 0.112632)
@@ -169,17 +171,83 @@ def test_markdown_holds_the_table_the_source_the_reasons_and_the_pictures(report
     assert start + "| ANN | 1340.39 | 16755 | 51.0 | 2.65 |" in table
     assert "J. Peifle" in text
     assert "- full 100 %, brute: skipped: too many" in text
-    assert [f"![{name.replace('_', ' ')}]({name}.png)" in text for name in PICTURES] == [True] * 7
+    assert [f"![{name.replace('_', ' ')}]({name}.png)" in text for name in PICTURES] == [True] * 9
     assert "Some CPU" in text
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_pictures_show_every_method_in_its_color(reported, name):
+def test_pictures_show_the_library_in_color_and_nothing_else(reported, name):
     picture = (255 * imread(reported[0] / f"{name}.png")[..., :3]).round().astype(int)
-    assert min(picture.shape[:2]) >= 400
-    for method in ("jax", "scipy-kdtree", "cll"):
-        wanted = [int(_plots.COLORS[method][place : place + 2], 16) for place in (1, 3, 5)]
-        assert (picture == wanted).all(axis=2).sum() > 60, method
+    assert picture.shape[1] >= 700
+    ours = [int(_look.OURS[place : place + 2], 16) for place in (1, 3, 5)]
+    assert (abs(picture - ours) < 3).all(axis=2).sum() > 60
+    assert (abs(picture - round(255 * float(_look.PEER))) < 3).all(axis=2).sum() > 60 or name.endswith("of_all")
+    assert (np.ptp(picture[picture[..., 2] < picture[..., 0]], axis=1) < 8).all() or name.endswith("of_all"), "dashed: the thesis"
+
+
+def texts_of(figure):
+    return [text.get_text() for axes in figure.axes for text in (*axes.texts, *axes.get_yticklabels(), axes.title)]
+
+
+MANY = ("warp", "pair-sum", "jax", "hashgrid", "cll", "vesin", "scipy-kdtree", "nvalchemi", "freud", "matscipy", "another")
+DRAWN = {
+    "runtime_by_layout": lambda rows: _plots.by_layout(rows, _plots.TIME),
+    "memory_by_fill": lambda rows: _plots.by_fill(rows, _plots.MEMORY),
+    "speed_against_error": lambda rows: _plots.against_error(rows, _plots.TIME),
+    "speed_against_sum_error": _plots.against_sum_error,
+}
+
+
+@pytest.fixture(scope="module")
+def many():
+    """Rows of eleven methods on four scenes: the n-th takes n times as long, and n times the memory; each third is wrong."""
+    made = []
+    for scene in SCENES:
+        for n, method in enumerate(MANY, start=1):
+            made.append(make_row(scene, method, 0.1 * n, 5.0 * n, missing=n * (n % 3 == 2), jump_error=0.01 * (n % 3 == 2)))
+    return made
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_pictures_that_lead_have_eight_methods_each_with_its_name_and_marker(many, name):
+    figure = DRAWN[name](many)
+    named = [method for method in MANY if _look.name_of(method) in texts_of(figure)]
+    assert named == ["warp", "pair-sum", "jax", "cll", "vesin", "scipy-kdtree", "nvalchemi", "freud"]
+    lines = [line for axes in figure.axes for line in axes.lines if line.get_marker() not in ("None", "")]
+    assert len({line.get_marker() for line in lines}) == len(lines) == 8
+    assert {line.get_color() for line in lines} == {_look.OURS, _look.PEER}
+    assert all(axes.get_legend() is None for axes in figure.axes)
+
+
+def test_all_methods_are_in_a_second_picture(many):
+    assert {_look.name_of(method) for method in MANY} <= {
+        axes.get_title(loc="left") for axes in _plots.of_all(many, _plots.TIME).axes
+    }
+
+
+def test_titles_say_what_the_rows_say(many):
+    said = {name: draw(many).get_suptitle().replace("\n", " ") for name, draw in DRAWN.items()}
+    assert said["runtime_by_layout"] == "jfrnn's list is 5 times as fast as the next, cell lists (thesis), on all 4 scenes"
+    lean = "jfrnn's list takes 0.2 times the memory of the leanest other, cell lists (thesis) (means of layouts)"
+    assert said["memory_by_fill"] == lean
+    assert said["speed_against_error"].startswith(
+        "7 of 10 lists are exact; the fastest of the others, cell lists (thesis), takes 5 times"
+    )
+    assert said["speed_against_sum_error"].startswith("Wrong pairs change a sum that jumps at the cutoff by up to 1 %")
+    slow = [replace(row, median_s=0.05) if row.method == "vesin" and row.layout == "full" else row for row in many]
+    title = _plots.by_layout(slow, _plots.TIME).get_suptitle().replace("\n", " ")
+    assert title.startswith(
+        "jfrnn's list is first on 3 of 4 scenes, up to 5 times as fast as the next; elsewhere up to 2 times as slow as"
+    )
+
+
+def test_what_is_exact_stands_in_order_each_in_a_line_of_its_own(many):
+    exact, wrong = _plots.against_error(many, _plots.TIME).axes
+    places = sorted((line.get_ydata()[0], line.get_xdata()[0]) for line in exact.lines)
+    assert [place for place, _ in places] == list(range(len(exact.lines)))
+    assert [seconds for _, seconds in places] == sorted(seconds for _, seconds in places)
+    assert [label.get_text() for label in exact.get_yticklabels()][:2] == ["jfrnn, list", "jfrnn, engine jax"]
+    assert all(line.get_ydata()[0] > 0 for line in wrong.lines)
 
 
 def test_times_beside_busy_processes_are_marked():
@@ -221,13 +289,14 @@ def test_a_folder_without_rows(tmp_path):
     assert result.stderr.startswith(f"error: {tmp_path}: no rows; fill it with `python -m experiments run CONFIG.toml --out")
 
 
-def test_without_memory_there_are_no_pictures_of_it(tmp_path):
+def test_without_memory_there_are_no_pictures_of_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(_plots.Figure, "savefig", lambda figure, path, dpi: path.touch())
     file = RowFile(tmp_path)
     for row in make_rows():
         file.append(replace(row, search_bytes=None, peak_bytes=None, scratch_bytes=None))
     _report.report(tmp_path)
     drawn = {path.stem for path in tmp_path.glob("*.png")}
-    assert drawn == {"runtime_by_layout", "runtime_by_fill", "speed_against_error", "speed_against_sum_error"}
+    assert drawn == {"runtime_by_layout", "runtime_by_fill", "speed_against_error", "speed_against_sum_error", "runtime_of_all"}
 
 
 def test_short_times_keep_three_figures():

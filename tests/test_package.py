@@ -1,10 +1,13 @@
 """The package: what a wheel holds works elsewhere, and says what runs there."""
 
 import os
+import re
 import subprocess
 import sys
 import tomllib
 import zipfile
+from email import message_from_bytes
+from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
@@ -19,14 +22,14 @@ assert jfrnn.__file__.startswith({folder!r}), jfrnn.__file__
 assert doctest.testmod(jfrnn).failed == 0
 x = np.random.default_rng(0).uniform(size=(300, 3)).astype(np.float32)
 nbrs = jfrnn.search(x, 0.1)
-assert nbrs.backend == "warp"
+assert nbrs.backend == {engine!r}
 print(len(nbrs.pairs()[0]))
 """
 
 
-def run(*arguments, cwd, **environment):
+def run(*arguments, cwd, python=sys.executable, **environment):
     told = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | environment
-    done = subprocess.run([sys.executable, *arguments], cwd=cwd, capture_output=True, text=True, check=False, env=told)
+    done = subprocess.run([python, *arguments], cwd=cwd, capture_output=True, text=True, check=False, env=told)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -35,7 +38,7 @@ def run(*arguments, cwd, **environment):
 def wheel(tmp_path_factory):
     """Build a wheel of a copy of the tree, without what an earlier build left, and without the internet."""
     folder = tmp_path_factory.mktemp("wheel")
-    for name in ("jfrnn", "kernels", "cases", "pyproject.toml", "README.md", "LICENSE"):
+    for name in ("jfrnn", "kernels", "cases", "pyproject.toml", "setup.py", "README.md", "LICENSE"):
         (folder / "tree").mkdir(exist_ok=True)
         (folder / "tree" / name).symlink_to(ROOT / name)
     build = ("-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", str(folder), str(folder / "tree"))
@@ -48,7 +51,7 @@ def test_wheel_works_elsewhere(wheel, tmp_path):
     run(
         "-m", "pip", "install", "--quiet", "--no-deps", "--no-compile", "--target", str(tmp_path / "site"), str(wheel), cwd=tmp_path
     )
-    said = run("-c", SEARCH.format(folder=str(tmp_path)), cwd=tmp_path, PYTHONPATH=str(tmp_path / "site"))
+    said = run("-c", SEARCH.format(folder=str(tmp_path), engine="warp"), cwd=tmp_path, PYTHONPATH=str(tmp_path / "site"))
     assert int(said.split()[-1]) > 0
 
 
@@ -67,6 +70,62 @@ def test_extras_name_what_the_wheel_holds():
     assert {"experiments", "peers", "notebooks", "docs", "test"} <= set(project["dependency-groups"])
     assert f"version: {jfrnn.__version__}\n" in (ROOT / "CITATION.cff").read_text()
     assert f"\n## {jfrnn.__version__}" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_extras_are_there_for_a_resolver(wheel, tmp_path):
+    """Offline: pip resolves the extra whose packages are installed here; the other is one that JAX has."""
+    run("-m", "pip", "install", "--dry-run", "--no-index", f"{wheel}[warp]", cwd=tmp_path)
+    (metadata,) = (name for name in zipfile.ZipFile(wheel).namelist() if name.endswith("/METADATA"))
+    told = message_from_bytes(zipfile.ZipFile(wheel).read(metadata))
+    assert set(told.get_all("Provides-Extra")) == {"warp", "cuda13"}
+    needed = next(line for line in told.get_all("Requires-Dist") if 'extra == "cuda13"' in line)
+    assert needed.startswith("jax[cuda13]") and "cuda13" in distribution("jax").metadata.get_all("Provides-Extra")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("extras", "engine"), [("", "jax"), ("[warp]", "warp"), ("[cuda13]", "jax"), ("[warp,cuda13]", "warp")])
+def test_wheel_works_in_a_fresh_environment_with_each_extra(wheel, tmp_path, extras, engine):
+    """Everything is fetched: those of CUDA take gigabytes."""
+    run("-m", "venv", str(tmp_path / "venv"), cwd=tmp_path)
+    python = str(tmp_path / "venv" / "bin" / "python")
+    run("-m", "pip", "install", "--quiet", "--no-compile", "--no-cache-dir", f"{wheel}{extras}", cwd=tmp_path, python=python)
+    search = SEARCH.format(folder=str(tmp_path), engine=engine)
+    if engine == "jax":
+        search = search.replace("assert doctest.testmod(jfrnn).failed == 0\n", "")  # they name engines of Warp
+    assert int(run("-c", search, cwd=tmp_path, python=python, JAX_PLATFORMS="cpu").split()[-1]) > 0
+    said = run("-m", "jfrnn", cwd=tmp_path, python=python, JAX_PLATFORMS="cpu")
+    assert f"  {engine:9} right" in said
+
+
+def describe(tree, repository):
+    """Return the metadata of a package whose pyproject.toml names a repository."""
+    for name in ("jfrnn", "kernels", "cases", "setup.py", "README.md", "LICENSE"):
+        (tree / name).symlink_to(ROOT / name)
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assert 'repository = ""' in text
+    (tree / "pyproject.toml").write_text(text.replace('repository = ""', f'repository = "{repository}"'), encoding="utf-8")
+    made = run("-c", "from setuptools import build_meta as b; print(b.prepare_metadata_for_build_wheel('.'))", cwd=tree).split()[-1]
+    return message_from_bytes((tree / made / "METADATA").read_bytes())
+
+
+@pytest.mark.parametrize("repository", ["", "https://example.org/owner/jfrnn/"])
+def test_links_and_pictures_of_a_package_page_lead_somewhere(tmp_path, repository):
+    """One line of pyproject.toml makes them all; without it there are none that lead nowhere."""
+    told = describe(tmp_path, repository)
+    text = told.get_payload()
+    links = re.findall(r"(!?)\[[^\]]*\]\(([^)]+)\)", text)
+    assert all(link.startswith(("https://", "#")) for _, link in links)
+    assert told["Author"] == "jfrnn developers"
+    if not repository:
+        assert "![" not in text and told.get_all("Project-URL") is None and "A jet of oil onto a turning gear" in text
+        return
+    home = repository.rstrip("/")
+    assert [link for picture, link in links if picture] == [f"{home}/raw/main/docs/_static/jet.gif"]
+    assert ("", f"{home}/blob/main/docs/start.md") in links
+    named = dict(line.split(", ") for line in told.get_all("Project-URL"))
+    assert named["Homepage"] == home and set(named) == {"Homepage", "Documentation", "Changelog"}
+    paths = {link.removeprefix(f"{home}/").partition("/main/")[2] for _, link in links if link.startswith(home)}
+    assert paths and all((ROOT / path).exists() for path in paths)
 
 
 def test_command_says_which_engines_run():

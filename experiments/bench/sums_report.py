@@ -1,4 +1,4 @@
-"""What rows of sums say: a table, a picture of time, memory and error over particles, and one of where a list pays off."""
+"""What rows of sums say: a table, a picture of time and memory over particles, and one of where a list pays off."""
 
 import math
 from collections.abc import Iterable
@@ -12,19 +12,18 @@ from matplotlib.figure import Figure
 
 from experiments._commands import RetryFailed, RowsFolder, take_folder
 from experiments._config import load
-from experiments._plots import COLORS, OTHER_COLORS, dress
+from experiments._look import MARKERS, OURS, PEER, WIDTH, dress, factor, head, plain, write_names
 from experiments.bench.sums import ERROR_UNIT, Config, SumRow, run
 from experiments.bench.ways import WAYS
 
 FUSED = "pair_sum warp"
 PANELS = {
-    "seconds": "time of list and sums [s], median",
+    "seconds": "list and sums [s]",
     "B per particle": "peak memory [B per particle]",
-    "error": "largest error [eps·sqrt(neighbors)]",
 }
 SHARED = (1, 2, 5, 10, 20, 50, 100, 200)  # sums per rebuild of a list
-_COLORS = (*COLORS.values(), OTHER_COLORS[0])
-_STYLES = {way: (color, marker) for way, color, marker in zip(WAYS, _COLORS, "*XosP^vD", strict=True)}
+_OTHERS = ("jax-md", "nvalchemi", "scipy")
+_STYLES = {way: (PEER if way.startswith(_OTHERS) else OURS, marker) for way, marker in zip(WAYS, MARKERS, strict=True)}
 _Line = dict[str, Any]
 
 
@@ -43,8 +42,8 @@ def report(rows: list[SumRow], folder: Path) -> str:
     lines = table(rows)
     frame = pd.DataFrame(lines)
     frame.to_csv(folder / "table.csv", index=False)
-    draw(lines).savefig(folder / "sums.png", dpi=130)
-    draw_payoff(lines).savefig(folder / "payoff.png", dpi=130)
+    draw(lines).savefig(folder / "sums.png", dpi=160)
+    draw_payoff(lines).savefig(folder / "payoff.png", dpi=160)
     shown = frame.rename(columns={"error": f"error [{ERROR_UNIT}]"})
     return shown.to_string(index=False, na_rep="", float_format="%.3g")
 
@@ -97,50 +96,54 @@ def _group(lines: Iterable[_Line], *names: str) -> dict[tuple, list[_Line]]:
 
 
 def draw(lines: list[_Line]) -> Figure:
-    """Draw time, memory and error over the number of particles, a row of panels for each layout and sum."""
-    kinds = _group((line for line in lines if line["status"] == "ok"), "layout", "sums")
-    figure, panels = _figure(max(len(kinds), 1), len(PANELS))
-    for panel, ((layout, what), scenes) in zip(panels, kinds.items(), strict=False):
-        for axes, (column, label) in zip(panel, PANELS.items(), strict=True):
-            there = [line for line in scenes if line[column]]
-            for (way, compensated), of_way in _group(there, "way", "compensated").items():
-                _plot(axes, [x["points"] for x in of_way], [x[column] for x in of_way], way, compensated)
-            dress(axes, "particles", label)
-            if column == "error":
-                axes.set(yscale="linear", ylim=(0, None))
-        panel[0].set_title(f"{layout}: {what}", loc="left", fontsize=11, fontweight="bold")
-    _name_ways(figure, panels[0])
+    """Draw time and memory over the number of particles, a column for each layout and sum; what is compensated is in the table."""
+    kinds = _group((line for line in lines if line["status"] == "ok" and not line["compensated"]), "layout", "sums")
+    figure = Figure(figsize=(WIDTH, 1.2 + 3.2 * len(PANELS)), layout="constrained")
+    panels = figure.subplots(len(PANELS), max(len(kinds), 1), squeeze=False, sharex=True, sharey="row")
+    last_ways = {line["way"] for line in [*kinds.values()][-1]} if kinds else set()
+    for column, ((layout, what), scenes) in zip(panels.T, kinds.items(), strict=False):
+        for axes, (name, label) in zip(column, PANELS.items(), strict=True):
+            ways = _group((line for line in scenes if line[name]), "way")
+            for (way,), of_way in ways.items():
+                _plot(axes, [x["points"] for x in of_way], [x[name] for x in of_way], way)
+            dress(axes, "particles" if axes is column[-1] else "", label if axes in panels[:, 0] else "")
+            ends = [(way, of[-1]["points"], of[-1][name], _STYLES[way][0]) for (way,), of in ways.items()]
+            if axes in panels[:, -1]:
+                write_names(axes, ends)
+            for way, x, y, color in (end for end in ends if end[0] not in last_ways):
+                axes.annotate(way, (x, y), (-4, 6), textcoords="offset points", ha="right", fontsize=8, color=color)
+        column[0].set_title(f"{layout}: {what}", loc="left", fontsize=10)
+    head(figure, _headline(lines))
     return figure
+
+
+def _headline(lines: list[_Line]) -> str:
+    ratios = [line["ratio"] for line in _good(lines) if line["ratio"] and line["build_ms"] is not None and not line["compensated"]]
+    span = f" takes {factor(min(ratios))} to {factor(max(ratios))} times as long as {FUSED}" if ratios else ""
+    return f"A list and a sum over it{span}" if span else "Sums over neighbors"
 
 
 def draw_payoff(lines: list[_Line]) -> Figure:
     """Draw the time of one sum over the number of sums that share a list, of the largest scene of each layout and sum."""
     kinds = _group((line for line in _good(lines) if not line["compensated"]), "layout", "sums")
-    figure, panels = _figure(1, max(len(kinds), 1))
-    for axes, ((layout, what), scenes) in zip(panels[0], kinds.items(), strict=False):
-        largest = max(line["points"] for line in scenes)
+    figure = Figure(figsize=(WIDTH, 3.9 * max(len(kinds), 1)), layout="constrained")
+    for axes, ((layout, what), scenes) in zip(
+        figure.subplots(max(len(kinds), 1), squeeze=False)[:, 0], kinds.items(), strict=False
+    ):
+        largest, ends = max(line["points"] for line in scenes), []
         for line in (line for line in scenes if line["points"] == largest):
-            _plot(axes, SHARED, [(line["build_ms"] or 0) / k + line["sum_ms"] for k in SHARED], line["way"], False)
+            times = [(line["build_ms"] or 0) / k + line["sum_ms"] for k in SHARED]
+            _plot(axes, SHARED, times, line["way"])
+            ends.append((line["way"], SHARED[-1], times[-1], _STYLES[line["way"]][0]))
         dress(axes, "sums per rebuild of the list", "time of a sum and its share of the list [ms]")
-        axes.set_title(f"{layout}, {largest} particles: {what}", loc="left", fontsize=11, fontweight="bold")
-    _name_ways(figure, panels[0])
+        write_names(axes, ends)
+        axes.set_title(f"{layout}, {plain(largest)} particles: {what}", loc="left", fontsize=10)
+    pays = [line["pays_from"] for line in _good(lines) if line["pays_from"]]
+    least = min(pays, default=math.inf)
+    head(figure, "No list pays off, however many sums it serves" if least == math.inf else f"A list pays off from {least} sums on")
     return figure
 
 
-def _figure(rows: int, columns: int) -> tuple[Figure, Any]:
-    figure = Figure(figsize=(4.4 * columns, 0.9 + 3.9 * rows), layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False)
-
-
-def _plot(axes: Axes, x: Iterable[float], y: Iterable[float], way: str, compensated: bool) -> None:
-    (color, marker), label = _STYLES[way], f"{way}{', compensated' * compensated}"
-    (line,) = axes.plot([*x], [*y], color=color, marker=marker, markersize=6, label=label)
-    if compensated:
-        line.set(linestyle="--", markerfacecolor="white")
-
-
-def _name_ways(figure: Figure, panels: Iterable[Axes]) -> None:
-    """Name every way once, below the panels."""
-    named = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    if named:
-        figure.legend([*named.values()], [*named], loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+def _plot(axes: Axes, x: Iterable[float], y: Iterable[float], way: str) -> None:
+    color, marker = _STYLES[way]
+    axes.plot([*x], [*y], color=color, marker=marker, markeredgecolor="white", linewidth=1.8 if color == OURS else 1.1)

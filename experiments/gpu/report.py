@@ -7,8 +7,7 @@ that a copy reached in the same run.
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-
+from experiments import _look
 from experiments._errors import UsageError
 from experiments._rows import RowFile
 from experiments._table import count, markdown
@@ -131,16 +130,21 @@ def _triangles(rows: list[dict[str, Any]]) -> str:
 def _draw(rows: list[dict[str, Any]], path: Path) -> None:
     copy = bandwidth(rows)
     calls = [row for row in _of(rows, "call") if row.get("median_s")]
-    figure = Figure(figsize=(7, 6), layout="constrained")
-    axes = figure.subplots()
-    for method in dict.fromkeys(row["method"] for row in calls):
-        of_method = sorted((row["points"], row["median_s"]) for row in calls if row["method"] == method)
-        axes.plot(*zip(*((n, 1e9 * s / n) for n, s in of_method), strict=True), marker="o", label=method)
     lists = sorted({(row["points"], floor_seconds(row, copy)) for row in calls if row["method"] == OURS})
     if not lists:
         return
-    axes.plot(*zip(*((n, 1e9 * s / n) for n, s in lists), strict=True), "k--", label="floor: bytes of the list / bandwidth")
-    axes.set(xscale="log", yscale="log", xlabel="particles", ylabel="ns per particle")
-    axes.grid(alpha=0.3, which="both")
-    figure.legend(loc="outside lower center", ncols=2)
-    figure.savefig(path, dpi=150)
+    best, floor = min((row["median_s"] / floor_seconds(row, copy), row["points"]) for row in calls if row["method"] == OURS)
+    title = f"Our list takes {_look.factor(best)} times the time in which its bytes can be moved, at {count(floor)} particles"
+    figure, axes = _look.make_axes(title, 4.6)
+    ends = []
+    for number, method in enumerate(dict.fromkeys(row["method"] for row in calls)):
+        of_method = sorted((row["points"], row["median_s"]) for row in calls if row["method"] == method)
+        color = _look.OURS if method.startswith("jfrnn") else _look.PEER
+        x, y = zip(*((n, 1e9 * s / n) for n, s in of_method), strict=True)
+        axes.plot(x, y, color=color, marker=_look.MARKERS[number % len(_look.MARKERS)])
+        ends.append((method, x[-1], y[-1], color))
+    x, y = zip(*((n, 1e9 * s / n) for n, s in lists), strict=True)
+    axes.plot(x, y, "--", color="k")
+    _look.dress(axes, "particles", "ns per particle")
+    _look.write_names(axes, [*ends, ("floor: bytes of the list / bandwidth", x[-1], y[-1], "k")])
+    figure.savefig(path, dpi=200)

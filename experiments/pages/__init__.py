@@ -1,7 +1,8 @@
 """The tables of README.md and docs/ that hold measured figures: each is made from rows under experiments/results.
 
-In a page, a table stands between two comments, `<!-- table NAME -->` and `<!-- end -->`; `python -m experiments tables` writes what
-is between them. A test compares what stands in the pages with the rows.
+In a page, a table stands between two comments, `<!-- table NAME -->` and `<!-- end -->`, and a figure in running text between
+`<!-- value NAME -->` and `<!-- end -->`; `python -m experiments tables` writes what is between them. A test compares what stands in
+the pages with the rows, and finds figures that stand outside of such comments.
 """
 
 import re
@@ -9,11 +10,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 from experiments._errors import UsageError
-from experiments.pages import cpu, fluids, gpu
+from experiments.pages import answers, cpu, fluids, gpu
+from experiments.pages.values import VALUES
 
 ROOT = Path(__file__).parent.parent.parent
-TABLES: dict[str, Callable[[], str]] = cpu.TABLES | gpu.TABLES | fluids.TABLES
+TABLES: dict[str, Callable[[], str]] = cpu.TABLES | gpu.TABLES | fluids.TABLES | answers.TABLES
 _PLACE = re.compile(r"(<!-- table ([\w-]+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+_UNIT = r"(?:[mnµu]?s|%|[GMk]?B|[GM]iB|times|\N{MULTIPLICATION SIGN}|fold|steps/s|per second|seconds?|minutes?|hours?)"
+_FIGURE = re.compile(rf"(?<![\w.`=-])\d[\d .,]*(?:\s(?:to|and|or)\s\d[\d .,]*)?\s?{_UNIT}(?![\w/])")
+_VALUE = re.compile(r"(<!-- value ([a-z0-9-]+) -->)(.*?)(<!-- end -->)")
 
 
 def pages() -> list[Path]:
@@ -22,15 +27,28 @@ def pages() -> list[Path]:
 
 
 def fill_in(text: str) -> str:
-    """Return a page with all of its tables made anew."""
+    """Return a page with all of its tables and figures made anew."""
 
     def make(place: re.Match[str]) -> str:
-        name = place[2]
-        if name not in TABLES:
-            raise UsageError(f"table {name}: there is no such table; there are {', '.join(TABLES)}")
-        return f"{place[1]}\n{TABLES[name]()}\n\n{place[4]}"
+        return f"{place[1]}\n{_known('table', TABLES, place[2])()}\n\n{place[4]}"
 
-    return _PLACE.sub(make, text)
+    def tell(place: re.Match[str]) -> str:
+        return f"{place[1]}{_known('value', VALUES, place[2])()}{place[4]}"
+
+    return _VALUE.sub(tell, _PLACE.sub(make, text))
+
+
+def _known(kind: str, known: dict[str, Callable[[], str]], name: str) -> Callable[[], str]:
+    if name not in known:
+        raise UsageError(f"{kind} {name}: there is no such {kind}; there are {', '.join(known)}")
+    return known[name]
+
+
+def loose_figures(text: str) -> list[str]:
+    """Return the figures with a unit, or a factor, of a page that are neither made from rows nor in code."""
+    for made in (_PLACE, _VALUE, re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)):
+        text = made.sub("", text)
+    return [found[0] for found in _FIGURE.finditer(text)]
 
 
 def write() -> list[Path]:
@@ -45,6 +63,7 @@ def write() -> list[Path]:
     return changed
 
 
-def tables_of(path: Path) -> list[str]:
-    """Return the names of the tables of a page."""
-    return [place[2] for place in _PLACE.finditer(path.read_text(encoding="utf-8"))]
+def names_in(path: Path) -> list[str]:
+    """Return the names of the tables and figures of a page."""
+    text = path.read_text(encoding="utf-8")
+    return [place[2] for found in (_PLACE, _VALUE) for place in found.finditer(text)]

@@ -1,5 +1,8 @@
 """Tables of what was measured on CPUs."""
 
+from functools import partial
+from statistics import median
+
 from experiments.pages.rows import TIMES, Row, markdown, number, one, read, whole
 
 OURS = {
@@ -186,7 +189,63 @@ def options() -> str:
     return markdown(("option", ">list, 2 cores", ">counts", ">list, H200", ">counts"), lines)
 
 
+def structures() -> str:
+    """Return seconds of many small structures, one after another, and microseconds of a call."""
+    rows = read("structures/cpu.csv")
+    lines = []
+    for who, cache, title in (("jfrnn", "warm", "`jfrnn.ase`"), ("jfrnn", "cold", "the same, kernels compiled first")):
+        lines.append((who, title, one(rows, who=who, cache=cache)))
+    lines += [(who, who, next(row for row in rows if row["who"] == who and row["structures"])) for who in ("matscipy", "vesin")]
+    table = []
+    for who, title, row in lines:
+        call = None if row is None or row["cache"] == "cold" else next(r for r in rows if r["who"] == who and r["atoms"])
+        assert row is not None, title
+        cells = [title, number(row["total_s"]), number(row["first_s"]), number(call and call["median_us"]), whole(row["pairs"])]
+        table.append(cells)
+    many = next(whole(row["structures"]) for row in rows if row["structures"])
+    heads = (
+        f">{many} structures [s]",
+        ">of it the first call, import included [s]",
+        ">a warm call, 32 atoms [µs]",
+        ">pairs of all",
+    )
+    return markdown(("library", *heads), table)
+
+
+def crystals(file: str) -> str:
+    """Return milliseconds of batches of crystals, each in a skewed cell of its own."""
+    rows = [row for row in read(f"crystals/{file}.csv") if row["status"] == "ok"]
+    ways = {("jfrnn", "list"): "jfrnn list", ("jfrnn", "counts"): "counts", ("nvalchemi", "list"): "nvalchemi list"}
+    ways |= {("vesin", "list"): "vesin, one by one"} if any(row["who"] == "vesin" for row in rows) else {}
+    lines = []
+    for systems, atoms in dict.fromkeys((row["systems"], row["atoms"]) for row in rows):
+        found = [one(rows, systems=systems, atoms=atoms, who=who, what=what) for who, what in ways]
+        cells = [f"{number(row['waited_ms'])}{_particles(row['wrong'])}" if row else "" for row in found]
+        lines.append([whole(systems), whole(atoms), whole(found[0]["pairs"]) if found[0] else "", *cells])
+    heads = (">crystals", ">atoms each", ">pairs", *(f">{title}" for title in ways.values()))
+    return markdown(heads, lines)
+
+
+def _particles(wrong: str) -> str:
+    return "" if wrong in ("", "0") else f" ({whole(wrong)} wrong)"
+
+
+def first_call() -> str:
+    """Return seconds of a fresh process from `import jfrnn` to its first result, with kernels and without."""
+    rows = [row for row in read("latency/start_cpu.csv") if row["status"] == "ok" and row["who"] == "after"]
+    lines = []
+    for what, title in (("search", "a list"), ("gradient", "the gradient of a density")):
+        cells = []
+        for cache in ("cold", "warm"):
+            cells.append(number(median(float(row["wait_s"]) for row in rows if (row["what"], row["cache"]) == (what, cache))))
+        lines.append([title, *cells])
+    return markdown(("", ">kernels compiled first [s]", ">kernels in the cache [s]"), lines)
+
+
 TABLES = {
+    "structures": structures,
+    "crystals": partial(crystals, "cpu"),
+    "first-call": first_call,
     "cpu-known": search_known,
     "cpu-scenes": search_scenes,
     "latency": latency,

@@ -1,5 +1,8 @@
 """Tables of what was measured on GPUs, one or several."""
 
+from functools import partial
+
+from experiments.pages.cpu import crystals
 from experiments.pages.rows import TIMES, Row, markdown, number, one, read, whole
 
 
@@ -133,6 +136,7 @@ def two_devices() -> str:
 
 
 TABLES = {
+    "gpu-crystals": partial(crystals, "gpu"),
     "gpu-known": search_known,
     "gpu-steps": steps,
     "gpu-sums": sums,

@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
+from experiments._look import OURS, PEER, factor, head, plain, write_names
 from experiments.pages import cpu
 from experiments.pages.rows import number, one, read, whole
 
-OURS, OTHERS = "#0072b2", "0.45"
 _CPU = ("pair-sum", "warp", "cll", "vesin", "matscipy-neighbours", "scipy-kdtree", "nanoflann-cpp", "nvalchemi")
 _GPU = {
     "jfrnn warp": "jfrnn, list",
@@ -25,9 +25,11 @@ _GPU = {
 def draw(folder: Path) -> None:
     """Draw all pictures into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
+    figures = {"steps": _steps()}
     for name, make in {"cpu": _cpu, "gpu": _gpu, "liquid": _liquid, "cells": _cells, "halo": _halo}.items():
-        figure = Figure(figsize=(7.2, 4.2), layout="constrained")
-        make(figure.add_subplot())
+        figures[name] = Figure(figsize=(7.0, 4.2), layout="constrained")
+        make(figures[name].add_subplot())
+    for name, figure in figures.items():
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
 
 
@@ -36,44 +38,70 @@ def _cpu(axes: Axes) -> None:
     rows = [row for method in _CPU if (row := one(read("thesis_cpu/table.csv"), scene="full 100 %", method=method))]
     rows.sort(key=lambda row: -float(row["median_s"]))
     for place, row in enumerate(rows):
-        ms, color = 1e3 * float(row["median_s"]), OURS if row["method"] in cpu.OURS else OTHERS
+        ms, color = 1e3 * float(row["median_s"]), OURS if row["method"] in cpu.OURS else PEER
         wrong = [f"{whole(row[kind])} {kind}" for kind in ("missing", "extra") if row[kind] not in ("0", "")]
         axes.plot(ms, place, "o", ms=9, color=color, mfc="white" if wrong else color)
         said = f"{number(ms)} ms" + (f": {', '.join(wrong)}" if wrong else "")
-        axes.annotate(said, (ms, place), (10, 0), textcoords="offset points", va="center", color=color)
+        axes.annotate(said, (ms, place), (10, 0), textcoords="offset points", va="center", color=color, fontsize=9)
     axes.set_yticks(range(len(rows)), [cpu.name_of(row["method"]).replace("`", "") for row in rows])
     axes.set(xscale="log", xlim=(20, 60_000), xlabel="milliseconds of a search, 250 000 particles, 2 cores")
-    axes.set_title("Filled: exactly the right pairs. Hollow: pairs missing or extra.", loc="left", fontsize=11)
+    axes.xaxis.set_major_formatter(lambda ms, _: plain(ms))
+    others = {row["method"]: float(row["median_s"]) for row in rows if row["method"] not in cpu.OURS}
+    first, ours = min(others, key=lambda name: others[name]), one(rows, method="warp") or {}
+    said = f"jfrnn's list is exact and {factor(others[first] / float(ours['median_s']))} times as fast as {_brief(first)}"
+    _entitle(axes, f"{said}, the next. Hollow: pairs missing or extra")
     _clear(axes)
+
+
+def _brief(method: str) -> str:
+    return cpu.name_of(method).partition(" (")[0]
 
 
 def _gpu(axes: Axes) -> None:
     """Draw milliseconds of a list over particles, names at the ends of lines."""
     rows = [row for row in read("h200/rows.jsonl") if row["kind"] == "call" and row.get("median_s")]
+    ends, found = [], {}
     for method, title in _GPU.items():
-        found = sorted((row["points"], 1e3 * row["median_s"]) for row in rows if row["method"] == method)
-        color, marker = (OURS, "o") if title.startswith("jfrnn") else (OTHERS, "s" if "Hash" in title else "^")
-        axes.plot(*zip(*found, strict=True), color=color, marker=marker)
-        axes.annotate(title, found[-1], (8, 0), textcoords="offset points", va="center", color=color)
-    axes.set(xscale="log", yscale="log", xlim=(2e4, 1.2e8), xlabel="particles", ylabel="milliseconds")
-    axes.set_title("Neighbor lists on one H200, 108 neighbors on average", loc="left", fontsize=11)
+        found[method] = {row["points"]: 1e3 * row["median_s"] for row in rows if row["method"] == method}
+        x, y = zip(*sorted(found[method].items()), strict=True)
+        color, marker = (OURS, "o") if title.startswith("jfrnn") else (PEER, "s" if "Hash" in title else "^")
+        axes.plot(x, y, color=color, marker=marker)
+        ends.append((title, x[-1], y[-1], color))
+    axes.set(xscale="log", yscale="log", xlabel="particles, 108 neighbors on average, one H200", ylabel="milliseconds of a list")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(lambda value, _: plain(value))
+    ours, *others = found.values()
+    spans = [sorted(of[n] / ours[n] for n in of if n in ours) for of in others]
+    said = [
+        f"{factor(span[0])} to {factor(span[-1])} times as fast as {title}"
+        for span, title in zip(spans, ("wp.HashGrid", "nvalchemi"), strict=True)
+    ]
+    _entitle(axes, f"jfrnn's list is {', '.join(said)}")
+    write_names(axes, ends)
     _clear(axes)
 
 
 def _liquid(axes: Axes) -> None:
     """Draw steps per second of a Lennard-Jones liquid over particles, on a CPU and a GPU."""
+    ends, spans = [], []
     for file, machine, style in (("cpu", "2 cores", "--"), ("gpu", "H100", "-")):
         rows = [row for row in read(f"lj/{file}.csv") if row["steps_per_s"]]
-        for who, title, color in (("pair_sum, list", "jfrnn", OURS), ("jax-md", "jax-md", OTHERS)):
+        found = {}
+        for who, title, color in (("pair_sum, list", "jfrnn", OURS), ("jax-md", "jax-md", PEER)):
             best: dict[int, float] = {}
             for row in rows:
                 if row["who"].startswith(who):
                     best[int(row["n"])] = max(best.get(int(row["n"]), 0.0), float(row["steps_per_s"]))
+            found[title] = best
             axes.plot(*zip(*sorted(best.items()), strict=True), style, color=color, marker="o" if color == OURS else "s")
-            last = max(best)
-            axes.annotate(f"{title}, {machine}", (last, best[last]), (8, 0), textcoords="offset points", va="center", color=color)
-    axes.set(xscale="log", yscale="log", xlim=(3e3, 1.5e7), xlabel="particles", ylabel="steps per second")
-    axes.set_title("A Lennard-Jones liquid in one compiled loop, lists with a skin", loc="left", fontsize=11)
+            ends.append((f"{title}, {machine}", max(best), best[max(best)], color))
+        ratios = sorted(found["jfrnn"][n] / found["jax-md"][n] for n in found["jfrnn"] if n in found["jax-md"])
+        spans.append(f"{factor(ratios[0])} to {factor(ratios[-1])} times on {'an ' if machine == 'H100' else ''}{machine}")
+    axes.set(xscale="log", yscale="log", xlabel="particles of a Lennard-Jones liquid, lists with a skin", ylabel="steps per second")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(lambda value, _: plain(value))
+    _entitle(axes, f"Steps per second over jax-md's: {' and '.join(spans)}")
+    write_names(axes, ends)
     _clear(axes)
 
 
@@ -96,7 +124,55 @@ def _cells(axes: Axes) -> None:
     axes.set(xticks=range(9), yticks=range(6), xlim=(0, 8), ylim=(0, 5), aspect="equal")
     axes.tick_params(labelbottom=False, labelleft=False, length=0)
     axes.grid(alpha=0.5)
-    axes.set_title("Cells as wide as the cutoff; three runs of candidates (blue), neighbors in orange", loc="left", fontsize=10)
+    _entitle(axes, "Cells as wide as the cutoff; three runs of candidates (blue), neighbors in orange")
+
+
+def _steps() -> Figure:
+    """Draw the four steps of the array engine, for forty particles and one query, with cells undivided along x."""
+    across, down = 6, 4
+    x = np.random.default_rng(7).uniform((0.15, 0.15), (across - 0.15, down - 0.15), (40, 2))
+    cells = np.floor(x[:, 0]).astype(int) + across * np.floor(x[:, 1]).astype(int)
+    order = np.argsort(cells, kind="stable")
+    x, cells = x[order], cells[order]  # as the engine has them: a particle's index is its place in the order
+    query = int(np.argmin(np.hypot(*(x - (3.4, 1.6)).T)))
+    first = cells[query] - 1 + across * np.array([-1, 0, 1])
+    runs = [np.flatnonzero((cells >= cell) & (cells <= cell + 2)) for cell in first]
+    figure = Figure(figsize=(7.0, 5.0), layout="constrained")
+    sort, stencil, gather, compact = figure.subplots(2, 2, height_ratios=(3, 2)).ravel()
+    for axes in (sort, stencil):
+        axes.set(xticks=range(across + 1), yticks=range(down + 1), xlim=(0, across), ylim=(0, down), aspect="equal")
+        axes.tick_params(labelbottom=False, labelleft=False, length=0)
+        axes.grid(alpha=0.6)
+    for cell in range(across * down):
+        sort.text(cell % across + 0.04, cell // across + 0.04, str(cell), fontsize=6, color="0.5")
+    for k, at in enumerate(x):
+        sort.text(*at, str(k), fontsize=7, color=OURS, ha="center", va="center", clip_on=True)
+    for k, (cell, run) in enumerate(zip(first, runs, strict=True), start=1):
+        left, low = cell % across, cell // across
+        stencil.add_patch(Rectangle((left, low), 3, 1, color="#56b4e9", alpha=0.35, lw=0))
+        stencil.text(left - 0.1, low + 0.5, f"run {k}:\n{run[0]} to {run[-1]}", fontsize=8, va="center", ha="right", color=OURS)
+    stencil.plot(*x.T, ".", color="0.5", ms=4)
+    stencil.plot(*x[query], "k+", ms=10, mew=2)
+    stencil.add_patch(Circle((x[query, 0], x[query, 1]), 1, fill=False))
+    _draw_rows(gather, compact, [[int(k) for k in run] for run in runs], np.hypot(*(x - x[query]).T) < 1, query)
+    titles = ("1. Sort particles by the number of their cell", "2. Three runs around a query", "3. A bit for each candidate")
+    for axes, title in zip((sort, stencil, gather, compact), (*titles, "4. Set bits become a padded row"), strict=True):
+        axes.set_title(title, loc="left", fontsize=9, fontweight="bold")
+    return figure
+
+
+def _draw_rows(gather: Axes, compact: Axes, runs: list[list[int]], near: np.ndarray, query: int) -> None:
+    """Draw a box for each candidate of each run, filled where it is a neighbor, and the row of neighbors."""
+    found = [k for run in runs for k in run if near[k] and k != query]
+    padded = [*found, len(near), len(near)]
+    for axes, rows in ((gather, runs), (compact, [padded])):
+        for row, indices in enumerate(rows):
+            for place, k in enumerate(indices):
+                face, ink = (OURS, "white") if k in found else ("white", "0.4")
+                axes.add_patch(Rectangle((place, -row), 0.9, 0.9, facecolor=face, edgecolor="0.5"))
+                axes.text(place + 0.45, 0.45 - row, str(k), ha="center", va="center", fontsize=8, color=ink)
+        axes.set(xlim=(-0.2, max(map(len, rows)) + 0.2), ylim=(-len(rows) + 0.8, 1.2), aspect="equal")
+        axes.set_axis_off()
 
 
 def _halo(axes: Axes) -> None:
@@ -108,13 +184,18 @@ def _halo(axes: Axes) -> None:
     low, high = mine[:, 0].min() - 0.4, mine[:, 0].max() + 0.4
     halo = (owner != 1) & (x[:, 0] > low) & (x[:, 0] < high)
     axes.plot(*x[(owner != 1) & ~halo].T, ".", color="0.75")
-    axes.plot(*x[halo].T, ".", color="#d55e00")
+    axes.plot(*x[halo].T, "x", color="#d55e00", ms=4)
     axes.plot(*mine.T, ".", color=OURS)
     for bound in bounds:
         axes.axvline(bound, color="0.3", lw=1)
     axes.axvspan(low, high, color="#56b4e9", alpha=0.15, lw=0)
     axes.set(aspect="equal", xticks=[], yticks=[])
-    axes.set_title("Four devices, equally many particles each; one of them (blue) and its halo (orange)", loc="left", fontsize=10)
+    _entitle(axes, "Four devices, equally many particles each; one of them (blue) and its halo (crosses)")
+
+
+def _entitle(axes: Axes, title: str) -> None:
+    assert isinstance(axes.figure, Figure)
+    head(axes.figure, title)
 
 
 def _clear(axes: Axes) -> None:

@@ -6,12 +6,11 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure
 
-from experiments._plots import COLORS, OTHER_COLORS, dress
+from experiments._look import COLORS, MARKERS, dress, factor, make_axes, write_names
 from experiments.sph.speed import StepRow
 from experiments.sph.stages import STAGES
 
-_PALETTE = (*COLORS.values(), *OTHER_COLORS)
-_MARKERS = "o^sDvX*P"
+_HATCHES = ("", "///", "...", "xxx", "")
 
 
 def report(rows: list[StepRow], folder: Path) -> str:
@@ -73,9 +72,9 @@ def draw_stages(rows: list[StepRow]) -> Figure:
     panels = figure.subplots(len(rows), squeeze=False)[:, 0]
     for axes, row in zip(panels, rows, strict=True):
         left, name = 0.0, f"{row.way}\n{row.particles:,}".replace(",", "\u2009")
-        for color, stage in zip(_PALETTE, STAGES, strict=False):
+        for color, hatch, stage in zip(COLORS[:5], _HATCHES, STAGES, strict=True):
             width = 1e9 * max(row.parts[stage], 0.0) / (row.particles or 1)
-            axes.barh([name], [width], left=left, color=color, label=stage)
+            axes.barh([name], [width], left=left, color=color, label=stage, hatch=hatch, edgecolor="white")
             left += width
         axes.set_xlim(0, left)
         axes.spines[["top", "right"]].set_visible(False)
@@ -88,20 +87,25 @@ def draw_stages(rows: list[StepRow]) -> Figure:
 
 def draw_tradeoff(rows: list[StepRow]) -> Figure:
     """Draw the error of velocities over the seconds of a run: a line per precision and skin, a mark per resolution."""
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
-    axes, lines = figure.add_subplot(), {}
+    lines: dict[tuple[str, float | None], list[StepRow]] = {}
     for row in rows:
         lines.setdefault((row.dtype, row.skin), []).append(row)
-    skins = sorted({skin for _, skin in lines})
+    last = {kind: of[-1] for kind, of in lines.items()}
+    errors = [row.error["l2 of velocity"] for row in last.values()]
+    seconds = [row.seconds or 0 for row in last.values()]
+    ratio = factor(max(seconds) / min(seconds)) if min(seconds) else "many"
+    title = f"At {rows[-1].nx}² particles all ways err by {min(errors):.2g} to {max(errors):.2g}, and differ {ratio} times in time"
+    figure, axes = make_axes(title, 4.4)
+    skins = sorted({skin for _, skin in lines}, key=lambda skin: skin or 0)
+    ends = []
     for (dtype, skin), of in lines.items():
-        seconds, error = [row.seconds for row in of], [row.error["l2 of velocity"] for row in of]
-        label = f"{dtype}, {f'list, skin {skin:g} spacings' if skin else 'pair_sum'}"
-        k = skins.index(skin)
-        axes.plot(seconds, error, "--" if dtype == "float64" else "-", marker=_MARKERS[k], color=_PALETTE[k], label=label)
+        x, y = [row.seconds or 0 for row in of], [row.error["l2 of velocity"] for row in of]
+        color, marker = COLORS[skins.index(skin)], MARKERS[skins.index(skin)]
+        axes.plot(x, y, "--" if dtype == "float64" else "-", marker=marker, color=color)
+        ends.append((f"{dtype}, {f'list, skin {skin:g}' if skin else 'pair_sum'}", x[-1], y[-1], color))
     for row in (row for row in rows if (row.dtype, row.skin) == (rows[0].dtype, rows[0].skin)):
         at = row.seconds or 0, row.error["l2 of velocity"]
         axes.annotate(f"{row.nx}²", at, xytext=(4, 4), textcoords="offset points", fontsize=8)
-    dress(axes, "run, compilation left out [s]", "velocity, relative L2 error")
-    axes.set_title(f"Taylor-Green vortices, Re = 100, {rows[0].device}", fontsize=10)
-    axes.legend(fontsize=8, frameon=False)
+    dress(axes, f"run, compilation left out [s]; Taylor-Green vortices, Re = 100, {rows[0].device}", "velocity, relative L2 error")
+    write_names(axes, ends)
     return figure

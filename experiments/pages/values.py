@@ -1,0 +1,91 @@
+"""Single figures in running text, made from rows: in a page `<!-- value NAME -->` stands before one, `<!-- end -->` behind it."""
+
+import json
+from collections.abc import Callable
+
+from experiments.pages.rows import RESULTS, number, one, read, whole
+
+
+def _bytes_per_particle(method: str) -> Callable[[], str]:
+    """Return the peak of the device's memory at a hundred million particles [B per particle]."""
+
+    def value() -> str:
+        rows = [row for row in read("h200_size/table.csv") if row["method"] == method and row["status"] == "ok"]
+        row = max(rows, key=lambda row: int(row["points"]))
+        return number(1e6 * float(row["device_mb"]) / int(row["points"]), digits=2)
+
+    return value
+
+
+def _decided() -> str:
+    """Return how many hard cases were decided on a GPU after later changes of kernels, if none was wrong."""
+    rows = [row for row in read("house/h200_exactness.jsonl") if row["kind"] == "exactness"]
+    wrong = sum(row["wrong"] for row in rows)
+    return f"{whole(sum(row['cases'] for row in rows))} decisions, {wrong or 'none'} wrong"
+
+
+def _ahead() -> str:
+    """Return in how many scenes of few particles on a GPU nvalchemi's list takes less than ours, by the median."""
+    rows = [row for row in read("h200_fill/table.csv") if row["status"] == "ok" and int(row["points"]) < 14_000]
+    scenes = dict.fromkeys(row["scene"] for row in rows)
+    pairs = [[one(rows, scene=scene, method=method) for method in ("nvalchemi", "warp")] for scene in scenes]
+    both = [(theirs, ours) for theirs, ours in pairs if theirs and ours]
+    ahead = [theirs for theirs, ours in both if float(theirs["median_s"]) < float(ours["median_s"])]
+    names = ", ".join(f"{whole(row['points'])} particles, `{row['layout']}`" for row in ahead)
+    return f"{len(ahead)} of {len(both)} of these scenes" + (f" ({names})" if names else "")
+
+
+def _jet(what: str) -> Callable[[], str]:
+    """Return particles, or the sum of a column, of the jet on an H200."""
+
+    def value() -> str:
+        if what == "particles":
+            return whole(json.loads((RESULTS / "jet_gear/h200_run.json").read_text(encoding="utf-8"))["particles"])
+        return whole(sum(float(row[what]) for row in read("jet_gear/h200_steps.csv")))
+
+    return value
+
+
+def _liquid() -> str:
+    """Return our steps per second over jax-md's for the smallest liquid on a GPU."""
+    rows = [row for row in read("lj/gpu.csv") if row["steps_per_s"]]
+    least = min(rows, key=lambda row: int(row["n"]))["n"]
+    of_least = [row for row in rows if row["n"] == least]
+    ours = float((one(of_least, who="pair_sum, list") or {})["steps_per_s"])
+    theirs = max(float(row["steps_per_s"]) for row in of_least if row["who"].startswith("jax-md"))
+    return f"{number(ours / theirs)} times jax-md's steps per second among {whole(least)}"
+
+
+def _density(what: str) -> Callable[[], str]:
+    """Return milliseconds, or nanoseconds per particle, of a density of 64 million particles on one GPU."""
+
+    def value() -> str:
+        row = one(read("distributed/h200_x2_64m.jsonl"), work="pair_sum", devices=1) or {}
+        return number(row["median_s"], 1e3) if what == "ms" else number(row["median_s"] / row["particles"], 1e9, digits=2)
+
+    return value
+
+
+def _tree_disagrees() -> str:
+    """Return on how many points Warp's tree says another thing about the cutoff, and libigl."""
+    rows = read("triangles/cpu_warp.csv")
+    said = []
+    for method, title in (("libigl", "libigl"), ("wp.Mesh nearest", "Warp's tree, in single precision,")):
+        of = [row for row in rows if row["method"] == method]
+        said.append(f"{title} on {sum(int(row['missing'] or 0) + int(row['extra'] or 0) for row in of) or 'none'}")
+    return ", ".join(said)
+
+
+VALUES: dict[str, Callable[[], str]] = {
+    "gpu-bytes-counts": _bytes_per_particle("warp-counts"),
+    "gpu-bytes-density": _bytes_per_particle("pair-sum"),
+    "gpu-decided-later": _decided,
+    "gpu-ahead": _ahead,
+    "jet-particles": _jet("particles"),
+    "jet-steps": _jet("steps"),
+    "jet-seconds": _jet("seconds"),
+    "gpu-liquid": _liquid,
+    "density-64m-ms": _density("ms"),
+    "density-64m-ns": _density("ns"),
+    "tree-disagrees": _tree_disagrees,
+}

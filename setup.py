@@ -1,0 +1,49 @@
+"""What a package page needs beyond pyproject.toml: addresses, and a README whose links work there.
+
+`[tool.jfrnn] repository` in pyproject.toml is the one place that says where the project lives, as https://github.com/owner/jfrnn:
+files are then looked for below `blob/main`, pictures below `raw/main`. While it is empty, links to files become their text, and
+pictures what they show.
+"""
+
+import re
+import tomllib
+from pathlib import Path
+
+from setuptools import setup
+
+ROOT = Path(__file__).parent
+LINK = re.compile(r"(!?)\[([^\]]*)\]\((?!https?://|#)([^)]+)\)")
+
+
+def read_repository() -> str:
+    """Return where the project lives, without a slash at its end; empty where nobody has said."""
+    with (ROOT / "pyproject.toml").open("rb") as stream:
+        return tomllib.load(stream)["tool"]["jfrnn"]["repository"].rstrip("/")
+
+
+def rewrite_links(text: str, repository: str) -> str:
+    """Return a README without links that lead nowhere outside of the repository."""
+
+    def replace(link: re.Match[str]) -> str:
+        picture, shown, path = link.groups()
+        if not repository:
+            return f"*{shown}*" if picture else shown
+        return f"{picture}[{shown}]({repository}/{'raw' if picture else 'blob'}/main/{path})"
+
+    return LINK.sub(replace, text)
+
+
+def list_addresses(repository: str) -> dict[str, str]:
+    """Return the addresses of the project by name."""
+    if not repository:
+        return {}
+    pages = {"Documentation": "docs/start.md", "Changelog": "CHANGELOG.md"}
+    return {"Homepage": repository} | {name: f"{repository}/blob/main/{path}" for name, path in pages.items()}
+
+
+home = read_repository()
+setup(
+    long_description=rewrite_links((ROOT / "README.md").read_text(encoding="utf-8"), home),
+    long_description_content_type="text/markdown",
+    project_urls=list_addresses(home),
+)
