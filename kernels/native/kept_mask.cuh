@@ -7,11 +7,10 @@ struct MaskArguments {
     const int *idx, *count, *codes, *slots, *starts, *lengths, *order;
     int* mask;
     real* distances;
-    int m, n, capacity, images, closed, apart;
+    int m, n, capacity, images, closed;
 
     JFRNN_MEMBER KeptArguments of_list() const {
-        return {
-            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, m, n, capacity, images, closed, apart};
+        return {rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, m, n, capacity, images, closed};
     }
 };
 struct KeptMask : KeptLane {
