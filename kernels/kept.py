@@ -18,8 +18,7 @@ from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 ROWS_AT_ONCE = 64  # that a thread of the CPU takes
 LANES = 8  # of CUDA that serve a row
 _BLOCK = 128
-# that share a multiprocessor; in a box, its numbers stay in registers (forces of a million shuffled particles: 1.3 times faster)
-_BLOCKS, _BLOCKS_IN_BOX = 8, 5
+_BLOCKS, _BLOCKS_IN_BOX = 7, 6  # that share a multiprocessor: more of them, and numbers of a loop leave their registers
 RADII = {"gather": 1, "scatter": 2, "either": 3, "both": 4, "mean": 5, "table": 6}
 
 
@@ -80,7 +79,7 @@ class ListKind(NamedTuple):
         """Return the named integers of a program."""
         found = {"PERIODIC": self.periodic, "SCALED": self.scaled, "CODE_BYTES": self.code_bytes, "REVERSED": self.reversed}
         found |= {"RADII": RADII.get(self.rule, 0), "SUM": self.rule == "mean", "ALIGNED": self.aligned, "ORDERED": self.ordered}
-        found |= {"DECIDED": 1, "MEASURED": 0, "BOXES": self.boxes}
+        found |= {"DECIDED": 1, "MEASURED": 0, "APART": 0, "BOXES": self.boxes}
         return found | {"LENGTH": self.length(columns), "LANES_PER_ROW": max(self.lanes, 1), "QUERY_CHUNK": ROWS_AT_ONCE, **GRID}
 
 
@@ -118,14 +117,19 @@ def _kernel(kind: ListKind, what: str, suffix: str, **constants: int) -> Kernel:
 
 
 @functools.lru_cache(512)
-def sum_kernel(kind: ListKind, term: TermText, key: str, compensated: bool, extremes: bool) -> Kernel:
+def sum_kernel(kind: ListKind, term: TermText, key: str, compensated: bool, extremes: bool, apart: bool) -> Kernel:
     """Return the kernel that sums a term; `key` tells it from all others in the names of programs.
 
-    `extremes`: it finds the largest summands instead; `errors` [m, width, 2] then gets their sources (n: there is none), and their
-    places in the row.
+    `apart`: a particle's pair with itself, without a shift, is left out. `extremes`: it finds the largest summands instead;
+    `errors` [m, width, 2] then gets their sources (n: there is none), and their places in the row.
     """
-    constants = {"LIST": 0, **kind.constants(term.columns), **constants_of(term, compensated, extremes, turned=False)}
+    constants = {
+        "LIST": 0,
+        **kind.constants(term.columns),
+        **constants_of(term, compensated, extremes, turned=False),
+        "APART": apart,
+    }
     header = "kept_sums.cuh" if kind.cuda else "kept_sums_cpu.h"
     text = program(kind.double, kind.dim, header, given=term_header(term, kind.double, turned=False), **constants)
-    name = f"kept_sums_{kind.name}{'_compensated' * compensated}{'_extremes' * extremes}_{key}"
+    name = f"kept_sums_{kind.name}{'_compensated' * compensated}{'_apart' * apart}{'_extremes' * extremes}_{key}"
     return declare(name, text, _entry(kind, "KeptSums.run"), cuda=kind.cuda, fused=kind.cuda)[0]

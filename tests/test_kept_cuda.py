@@ -35,9 +35,9 @@ def test_masks_and_sums_compile(kind):
     assert kind.reversed or all(compiles(kept.mask_kernel(kind, measured)) for measured in (False, True))
     assert kind.reversed or compiles(kept.slope_kernel(kind))
     for compensated, extremes in ((False, False), (True, False)):
-        assert compiles(kept.sum_kernel(kind, term_of(kind), f"test_{bool(kind.periodic)}", compensated, extremes))
+        assert compiles(kept.sum_kernel(kind, term_of(kind), f"test_{bool(kind.periodic)}", compensated, extremes, kind.reversed))
     largest = term_of(kind)._replace(sums=(Sum("o", False, False),))
-    assert compiles(kept.sum_kernel(kind, largest, f"largest_{bool(kind.periodic)}", False, True))
+    assert compiles(kept.sum_kernel(kind, largest, f"largest_{bool(kind.periodic)}", False, True, False))
 
 
 @pytest.mark.parametrize("code_bytes", [0, 1, 2, 4])

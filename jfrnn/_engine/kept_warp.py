@@ -159,7 +159,7 @@ def _operands(given: KeptList, extra: _Extra, columns: int, others: Array | None
     if kind.reversed:
         sources, rows, turns = rows, sources, turns[::-1]
     of_sources, of_rows = _radii_of(given, kind)
-    points = _beside(kind.length(columns), sources, others if columns else None, turns[0], of_sources)
+    points = _beside(kind.length(columns), sources, others if columns else None, turns[0], of_sources, rows=len(sources) + 1)
     own = _beside(kind.own_length, rows, turns[1], of_rows)
     cutoff = given.cutoff.largest if isinstance(given.cutoff, Cutoffs) else given.cutoff.radius
     nothing, steps = jnp.zeros(1, jnp.int32), jnp.zeros(1, dtype)
@@ -208,9 +208,11 @@ def _radii_of(given: KeptList, kind: kept.ListKind) -> tuple[Array | None, Array
     return (found[1], found[0]) if kind.reversed else (found[0], found[1])
 
 
-def _beside(length: int, *parts: Array | None) -> Array:
-    """Return arrays of points side by side, and zeros up to a length."""
+def _beside(length: int, *parts: Array | None, rows: int = 0) -> Array:
+    """Return arrays of points side by side, and NaN up to a length and a number of rows."""
     given = [x if x.ndim == 2 else x[:, None] for x in parts if x is not None]
+    more = max(rows - len(given[0]), 0)
+    given = [jnp.pad(x, ((0, more), (0, 0)), constant_values=jnp.nan) for x in given]
     rows, filled = jnp.pad(given[0], ((0, 0), (0, length - given[0].shape[1]))), given[0].shape[1]
     for column in (x[:, k] for x in given[1:] for k in range(x.shape[1])):  # on a GPU, XLA's concatenation takes twice as long
         rows, filled = jnp.where(np.arange(length) == filled, column[:, None], rows), filled + 1
@@ -248,24 +250,16 @@ def _name(extra: _Extra) -> str:
     return f"{extra.kind.name}{'_closed' * extra.closed}_{extra.images}"
 
 
-def _numbers(extra: _Extra, shapes: Shapes, apart: bool) -> dict[str, int]:
-    (m, capacity), n = shapes["idx"], shapes["points"][0]
+def _launch(extra: _Extra, found: kept.Kernel, shapes: Shapes) -> Plan:
+    (m, capacity), n = shapes["idx"], shapes["points"][0] - 1
     m = shapes["rows"][0] if extra.kind.reversed else m
-    sizes = {"m": m, "n": n, "capacity": capacity, "images": extra.images}
-    return sizes | {"closed": int(extra.closed), "apart": int(apart)}
-
-
-def _launch(extra: _Extra, found: kept.Kernel, numbers: dict[str, int]) -> Plan:
-    launch = (
-        Launch(found, kept.threads(numbers["m"], extra.kind.lanes))
-        if extra.kind.cuda
-        else share(found, numbers["m"], kept.ROWS_AT_ONCE)
-    )
+    numbers = {"m": m, "n": n, "capacity": capacity, "images": extra.images, "closed": int(extra.closed)}
+    launch = Launch(found, kept.threads(m, extra.kind.lanes)) if extra.kind.cuda else share(found, m, kept.ROWS_AT_ONCE)
     return Plan([launch] if extra.kind.cuda else [Clear("info", 8), launch], numbers)
 
 
 def _plan_mask(extra: _Extra, measured: bool, shapes: Shapes, _: int) -> Plan:
-    plan = _launch(extra, kept.mask_kernel(extra.kind, measured), _numbers(extra, shapes, False))
+    plan = _launch(extra, kept.mask_kernel(extra.kind, measured), shapes)
     if not measured:
         return plan._replace(absent=["distances"])
     size = np.dtype(_scalar(extra)).itemsize * math.prod(shapes["distances"])
@@ -273,11 +267,10 @@ def _plan_mask(extra: _Extra, measured: bool, shapes: Shapes, _: int) -> Plan:
 
 
 def _plan_slopes(extra: _Extra, shapes: Shapes, _: int) -> Plan:
-    return _launch(extra, kept.slope_kernel(extra.kind), _numbers(extra, shapes, False))
+    return _launch(extra, kept.slope_kernel(extra.kind), shapes)
 
 
 def _plan_sums(
     extra: _Extra, term: TermText, key: str, compensated: bool, extremes: bool, apart: bool, shapes: Shapes, _: int
 ) -> Plan:
-    found = kept.sum_kernel(extra.kind, term, key, compensated, extremes)
-    return _launch(extra, found, _numbers(extra, shapes, apart))
+    return _launch(extra, kept.sum_kernel(extra.kind, term, key, compensated, extremes, apart), shapes)

@@ -20,6 +20,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 
+from jfrnn._sums.factors import factor_out
 from jfrnn._sums.primitives import TABLE, Equation, Spec, Values
 from jfrnn._sums.scalars import TYPES, NoTranslationError, Scalars, hash_of
 from jfrnn._tracing import Aval, Given, Internal
@@ -71,6 +72,8 @@ def translate(closed: ClosedJaxpr) -> Translated:
     places = {number: (k, e) for k, numbers in enumerate(arguments) for e, number in enumerate(numbers.reshape(-1).tolist())}
     outputs = tuple(_spec(v.aval, "an output") for v in closed.jaxpr.outvars)
     defined = {output_name(k, e): x for k, result in enumerate(results) for e, x in enumerate(result.reshape(-1).tolist())}
+    better = factor_out(scalars, defined.values())
+    defined = {name: better[number] for name, number in defined.items()}
     text = scalars.text(defined)
     reads = tuple(places[number] for number in sorted(scalars.dependencies(defined.values()) & places.keys()))
     return Translated(text, inputs, outputs, reads, hash_of(text, inputs, outputs))

@@ -49,6 +49,7 @@ constexpr int LENGTH = 4;         // numbers of each source
 constexpr bool REVERSED = false;  // rows are those of the sources of a list
 constexpr bool ALIGNED = true;    // rows of ids begin at multiples of 16 bytes
 constexpr bool ORDERED = true;    // an order of rows is given
+constexpr bool APART = true;      // particles are no neighbors of their own
 constexpr int LANES_PER_ROW = 8;  // of CUDA
 constexpr bool DECIDED = true;    // which of its slots hold a pair
 constexpr bool MEASURED = false;  // distances are written, too

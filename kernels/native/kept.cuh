@@ -24,7 +24,6 @@ struct KeptLane : Kept {
 
     struct Entries {
         int ids[AT_A_TIME], codes[AT_A_TIME];
-        bool used[AT_A_TIME];
     };
     // Reads what belongs to the slots of a row from `place` on: at once, where rows begin at multiples of 16 bytes.
     template <class Element>
@@ -42,21 +41,16 @@ struct KeptLane : Kept {
     JFRNN_MEMBER void read(long long first, int place, int all, Entries& some) const {
 #pragma unroll
         for (int k = 0; k < AT_A_TIME; ++k) {
-            some.used[k] = place + k < all;
-            some.ids[k] = some.codes[k] = 0;
+            some.ids[k] = n;
+            some.codes[k] = 0;
         }
         if constexpr (ALIGNED && !REVERSED && !CODED) {
-            int ids[AT_A_TIME];
-            if (some.used[0]) {
-                read_slots(idx + first, place, ids);
-#pragma unroll
-                for (int k = 0; k < AT_A_TIME; ++k)
-                    some.ids[k] = some.used[k] ? ids[k] : 0;
-            }
+            if (place < all)
+                read_slots(idx + first, place, some.ids);
         } else
 #pragma unroll
             for (int k = 0; k < AT_A_TIME; ++k)
-                if (some.used[k])
+                if (place + k < all)
                     read_entry(first + place + k, some.ids[k], some.codes[k]);
     }
     // Calls `visit(place, id, numbers, verdict, pair)` for the entries of the row that this lane takes. Those in doubt come once more,
@@ -75,37 +69,41 @@ struct KeptLane : Kept {
                 load_numbers<LENGTH>(points + (long long)LENGTH * some.ids[k], numbers[k]);
             Entries next;
             read(first, place + AT_A_TIME * LANES_PER_ROW, all, next);
-            unsigned int open = 0, pairs = 0;
+            unsigned int pairs = 0;
+            bool open = false;
             real lengths[AT_A_TIME];
 #pragma unroll
             for (int k = 0; k < AT_A_TIME; ++k) {
-                const Verdict verdict = judged(own, numbers[k], some.ids[k], some.codes[k], some.used[k]);
+                const Verdict verdict = judged(own, numbers[k], some.ids[k], some.codes[k]);
                 lengths[k] = MEASURED ? length_of(verdict.vector) : real(0);
-                open |= verdict.open ? 1u << k : 0;
+                open |= verdict.open;
                 pairs |= verdict.sure ? 1u << k : 0;
                 visit(place + k, some.ids[k], numbers[k], verdict, verdict.sure);
             }
-            for (; open; open &= open - 1) {
-                const int k = __ffs(open) - 1;
-                int id, code;
-                read_entry(first + place + k, id, code);
-                real doubted[LENGTH];
-                load_numbers<LENGTH>(points + (long long)LENGTH * id, doubted);
-                const Verdict verdict = judged(own, doubted, id, code, true);
-                if (decide(own, doubted, verdict)) {
-                    pairs |= 1u << k;
-                    visit(place + k, id, doubted, verdict, true);
+            if (open) {  // what comes next is read again: it would leave its registers for calls that hardly ever happen
+#pragma unroll 1
+                for (int k = 0; k < AT_A_TIME && place + k < all; ++k) {
+                    int id, code;
+                    read_entry(first + place + k, id, code);
+                    real doubted[LENGTH];
+                    load_numbers<LENGTH>(points + (long long)LENGTH * id, doubted);
+                    const Verdict verdict = judged(own, doubted, id, code);
+                    if (verdict.open && decide(own, doubted, verdict)) {
+                        pairs |= 1u << k;
+                        visit(place + k, id, doubted, verdict, true);
+                    }
                 }
+                read(first, place + AT_A_TIME * LANES_PER_ROW, all, next);
             }
             settle(place, pairs, lengths);
             some = next;
         }
     }
-    JFRNN_MEMBER Verdict judged(const OwnPoint& own, const real* numbers, int id, int code, bool used) const {
+    JFRNN_MEMBER Verdict judged(const OwnPoint& own, const real* numbers, int id, int code) const {
         real step[3] = {0, 0, 0};
         for (int a = 0; CODED && a < DIM; ++a)
             step[a] = steps[DIM * code + a];
-        return judge(own, numbers, step, apart && id == row, used);
+        return judge(own, numbers, step, id != row);
     }
     JFRNN_MEMBER bool decide(const OwnPoint& own, const real* numbers, const Verdict& verdict) const {
         int shift[3] = {0, 0, 0};

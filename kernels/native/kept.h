@@ -7,7 +7,8 @@
 // numbers for each of several systems, of which `systems` says to which a row belongs. `steps` are the shifts of image codes. REVERSED:
 // rows are those of the sources of the list, whose slots are `lengths` many in `slots` from `starts` on, and j is who has such a slot.
 // ORDERED: threads take rows as `order` has them, so that rows that are taken together read the same sources, or as they come where it
-// holds -1.
+// holds -1. APART: a particle's pair with itself, without a shift, is left out.
+// Source n stands behind all others, and its numbers are NaN: it is what slots hold that are not used, so nobody asks which ones are.
 #pragma once
 #include "codes.h"
 #include "exact.h"
@@ -16,7 +17,7 @@
 struct KeptArguments {
     const real *rows, *points, *cutoff, *steps;
     const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
-    int m, n, capacity, images, closed, apart;
+    int m, n, capacity, images, closed;
 };
 
 template <bool WIDE>
@@ -120,10 +121,10 @@ struct Kept : KeptArguments, Space {
         Number shift[3], vector[3];
         Math::flag sure, open;
     };
-    // `step` (CODED): the shift of the image code of each slot; `same`: the source of a slot is its row. Where nothing is DECIDED, each
-    // slot that is used is sure.
-    JFRNN_INLINE Verdict judge(
-        const OwnPoint& own, const Number* numbers, const Number* step, Math::flag same, Math::flag used) const {
+    // `step` (CODED): the shift of the image code of each slot; `other` (APART): the source of a slot is not its row. Slots that are not
+    // used hold no numbers (NaN), so they are neither sure nor open, unless nothing is DECIDED.
+    JFRNN_INLINE Verdict judge(const OwnPoint& own, const Number* numbers, const Number* step, Math::flag other) const {
+        Math::flag used = Math::eq(Number{}, Number{});
         Number d[3], square{};
         Verdict found{};
         for (int k = 0; k < DIM; ++k)
@@ -141,13 +142,14 @@ struct Kept : KeptArguments, Space {
                 size = larger(Math::abs(d[k]), size);
             }
             used = Math::both(used, Math::le(spans, Math::of(most)));
-            used = Math::both(used, Math::inverse(Math::both(same, Math::eq(spans, Number{}))));
+            if constexpr (APART)
+                used = Math::both(used, Math::either(other, Math::gt(spans, Number{})));
             // twice the most that a component is off by (jfrnn/_geometry/lattice.py)
             off = (size + (spans + real(1)) * moved) * (16 * step_eps * step_scale);
             for (int k = 0; k < DIM; ++k)
                 d[k] = d[k] + translation(found.shift, k);
-        } else
-            used = Math::both(used, Math::inverse(same));
+        } else if constexpr (APART)
+            used = other;
         for (int k = 0; k < DIM; ++k)
             found.vector[k] = d[k];
         if constexpr (!DECIDED) {

@@ -88,17 +88,16 @@ struct KeptRows : Kept {
         const long long first = first_entry(row);
         const int all = entries(row);
         KeptSlots some;
-        int last[LANES];  // ids, where the row ends among them
+        int last[LANES];  // ids, where they do not stand side by side
         for (int b = 0; b < all; b += LANES) {
-            const unsigned int there = lanes_before(all - b);
             some.places = b;
             Number step[3] = {Number{}, Number{}, Number{}};
             some.ids = idx + first + b;
-            if (REVERSED || CODED || b + LANES > all) {
+            if (REVERSED || CODED || (capacity % LANES && b + LANES > all)) {
                 some.ids = last;
                 for (int l = 0; l < LANES; ++l) {
                     int code = 0;
-                    last[l] = 0;
+                    last[l] = n;
                     if (b + l < all)
                         read_entry(first + b + l, last[l], code);
                     for (int k = 0; CODED && k < DIM; ++k)
@@ -106,9 +105,7 @@ struct KeptRows : Kept {
                 }
             }
             read_points(some.ids, some.numbers);
-            const ints ids = lanes_from(some.ids);
-            const Math::flag same = apart ? __builtin_convertvector(ids == row, Math::flag) : Math::flag{};
-            some.verdict = judge(own, some.numbers, step, same, truths(there));
+            some.verdict = judge(own, some.numbers, step, __builtin_convertvector(lanes_from(some.ids) != row, Math::flag));
             some.pairs = bits_of_flags(some.verdict.sure);
             if (unsigned int open = bits_of_flags(some.verdict.open))
                 some.pairs |= decide(own, some, open);

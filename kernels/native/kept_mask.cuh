@@ -7,11 +7,11 @@ struct MaskArguments {
     const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
     int* mask;
     real* distances;
-    int m, n, capacity, images, closed, apart;
+    int m, n, capacity, images, closed;
 
     JFRNN_MEMBER KeptArguments of_list() const {
-        return {rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images,
-            closed, apart};
+        return {
+            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed};
     }
 };
 struct KeptMask : KeptLane {

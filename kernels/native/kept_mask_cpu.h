@@ -8,11 +8,11 @@ struct MaskArguments {
     int* mask;
     real* distances;
     int* info;
-    int m, n, capacity, images, closed, apart;
+    int m, n, capacity, images, closed;
 
     KeptArguments of_list() const {
-        return {rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images,
-            closed, apart};
+        return {
+            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed};
     }
 };
 struct KeptMask : KeptRows<KeptMask> {

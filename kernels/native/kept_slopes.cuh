@@ -7,11 +7,11 @@ struct KeptSlopesArguments {
     const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
     const real *distances, *slopes;
     real* sums;
-    int m, n, capacity, images, closed, apart;
+    int m, n, capacity, images, closed;
 
     JFRNN_MEMBER KeptArguments of_list() const {
-        return {rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images,
-            closed, apart};
+        return {
+            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed};
     }
 };
 struct KeptSlopes : KeptLane {
@@ -47,9 +47,8 @@ struct KeptSlopes : KeptLane {
         read_slots(slopes + first, place, slope);
 #pragma unroll
         for (int k = 0; k < AT_A_TIME; ++k) {
-            some.used[k] = some.used[k] && distance[k] >= LEAST_DISTANCE;
             other[k] = 0;
-            if (some.used[k]) {
+            if (distance[k] >= LEAST_DISTANCE) {
                 load_numbers<LENGTH>(points + (long long)LENGTH * some.ids[k], numbers[k]);
                 if ((unsigned int)back[k] < (unsigned int)(m * capacity))
                     load_numbers<1>(slopes + back[k], &other[k]);
@@ -57,8 +56,8 @@ struct KeptSlopes : KeptLane {
         }
 #pragma unroll
         for (int k = 0; k < AT_A_TIME; ++k)
-            if (some.used[k]) {
-                const Verdict verdict = judged(own, numbers[k], some.ids[k], some.codes[k], true);
+            if (distance[k] >= LEAST_DISTANCE) {
+                const Verdict verdict = judged(own, numbers[k], some.ids[k], some.codes[k]);
                 const real reciprocal = 1 / distance[k], along = slope[k] + other[k];
                 for (int a = 0; a < DIM; ++a)
                     sum[a] += along * (verdict.vector[a] * reciprocal);

@@ -8,11 +8,11 @@ struct KeptSumsArguments {
     const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
     const real *shared_values, *own_values;
     real *sums, *totals, *errors;
-    int m, n, capacity, images, closed, apart;
+    int m, n, capacity, images, closed;
 
     JFRNN_MEMBER KeptArguments of_list() const {
-        return {rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images,
-            closed, apart};
+        return {
+            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed};
     }
 };
 struct KeptSums : KeptLane {

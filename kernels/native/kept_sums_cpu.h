@@ -9,11 +9,11 @@ struct KeptSumsArguments {
     const real *shared_values, *own_values;
     real *sums, *totals, *errors;
     int* info;
-    int m, n, capacity, images, closed, apart;
+    int m, n, capacity, images, closed;
 
     KeptArguments of_list() const {
-        return {rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images,
-            closed, apart};
+        return {
+            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed};
     }
 };
 struct KeptSums : KeptRows<KeptSums> {

@@ -1,0 +1,68 @@
+"""Factors that stand before brackets: values stay as they are up to rounding, and fewer operations are left."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jfrnn._sums.factors import factor_out
+from jfrnn._sums.translate import translate_scalars
+
+
+def evaluate(scalars, known, number):
+    """Return the value of a scalar in float64."""
+    node = scalars.nodes[number]
+    if number not in known:
+        given = [evaluate(scalars, known, k) for k in node.operands]
+        known[number] = float(node.value) if node.value is not None else OPERATIONS[node.operation](*given)
+    return known[number]
+
+
+OPERATIONS = {
+    **{"add": lambda a, b: a + b, "sub": lambda a, b: a - b, "mul": lambda a, b: a * b, "neg": lambda a: -a},
+    **{"reciprocal": lambda a: 1 / a, "div": lambda a, b: a / b, "sqrt": np.sqrt},
+}
+
+
+def energy(x):
+    sixth = 1 / (x @ x) ** 3
+    return 4 * (sixth * sixth - sixth)
+
+
+# a function of three numbers, and how many operations it takes at most
+FUNCTIONS = {
+    "a force": (lambda x: -jax.grad(energy)(x) - jax.grad(energy)(x), 19),
+    "a force and its derivative": (lambda x: jax.jvp(jax.grad(energy), (x,), (x,)), 60),
+    "signs and twos": (lambda x: -(x * x[0] * 3 + x * x[0] * 3), 6),
+    "some of several": (lambda x: x[0] * x[1] + x[2] + x[0] * x[2] - jnp.sqrt(x[1]), 6),
+    "inner brackets": (lambda x: x[0] * x[1] * x[2] + x[0] * x[1] * x[1] + x[0] * x[2], 7),
+    "nothing in common": (lambda x: x[0] * x[1] + x[2] * x[2], 3),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_values_stay_and_operations_go(name):
+    function, most = FUNCTIONS[name]
+    scalars, (inputs,), results = translate_scalars(jax.make_jaxpr(function)(jnp.ones(3, jnp.float32)))
+    outputs = [k for result in results for k in result.reshape(-1).tolist()]
+    better = factor_out(scalars, outputs)
+    for x in np.random.default_rng(1).uniform(0.5, 2, (5, 3)):
+        known = dict(zip(inputs.tolist(), x.tolist(), strict=True))
+        values, same = ([evaluate(scalars, dict(known), k) for k in numbers] for numbers in (outputs, [better[k] for k in outputs]))
+        np.testing.assert_allclose(same, values, rtol=1e-9, atol=1e-9)
+    count = {True: 0, False: 0}
+    for is_better, numbers in ((False, outputs), (True, better.values())):
+        count[is_better] = sum(bool(scalars.nodes[k].operands) for k in scalars.dependencies(numbers))
+    assert count[True] <= min(count[False], most), count
+
+
+@pytest.mark.parametrize("factor", [1, 3])
+def test_what_rounding_takes_is_not_cancelled(factor):
+    def error(x):
+        a, b = (x[0], x[1]) if factor == 1 else (x[0] * x[2], x[1] * x[2])
+        total = a + b
+        return b - (total - a)
+
+    scalars, _, results = translate_scalars(jax.make_jaxpr(error)(jnp.ones(3, jnp.float32)))
+    outputs = [k for result in results for k in result.reshape(-1).tolist()]
+    assert factor_out(scalars, outputs) == {k: k for k in outputs}
