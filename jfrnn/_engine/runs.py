@@ -9,7 +9,6 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -17,7 +16,7 @@ from jax import Array, lax
 from jfrnn._engine.candidates import Candidates, Points, Span, Torus
 from jfrnn._engine.problem import Filter
 from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
-from jfrnn._engine.words import LANES, BitRows, bit_counts, windows
+from jfrnn._engine.words import LANES, BitRows, bit_counts, join_lanes, last_reached, windows
 from jfrnn._geometry import (
     Cutoff,
     Cutoffs,
@@ -27,13 +26,13 @@ from jfrnn._geometry import (
     shift_in_given,
     squared_distance,
     step_one_bounds,
+    take_points,
 )
 from jfrnn._tracing import largest_of
 
 _FEW_RUNS = 32
 _SLOTS = 32  # doubtful candidates of a row that are decided at a time
 _HITS = np.uint32((1 << LANES) - 1)
-_MANY_RUNS = 4096
 _MOST_WORDS = 256  # per query, that are tested at a time; (words << 16) has to be an int32
 FOLD_GROUP = 32  # neighbors per query that are folded at a time
 
@@ -70,7 +69,7 @@ def list_neighbors(
     def list_block(span: Span) -> list[Array]:
         def add(words: _HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
             (rows, count), (hits, first, image) = found, words
-            bits = BitRows.of(hits, tuning.in_groups)
+            bits = BitRows.of(hits, tuning.by_gathers)
             total = bits.total
 
             def add_group(g: Array, rows: Array) -> Array:
@@ -82,7 +81,9 @@ def list_neighbors(
                     neighbor = neighbor + n * flat_take(image, word)
                 old = rows if group == capacity else lax.dynamic_slice_in_dim(rows, start, group, axis=1)
                 new = jnp.where((ordinal >= 0) & (ordinal < total[:, None]), neighbor, old)
-                return new if group == capacity else lax.dynamic_update_slice_in_dim(rows, new, start, axis=1)
+                if group == capacity:
+                    return new
+                return lax.dynamic_update_slice_in_dim(rows, lax.optimization_barrier(new), start, axis=1)  # in parts of its own
 
             if group == capacity:
                 rows = add_group(jnp.int32(0), rows)
@@ -147,7 +148,7 @@ def fold_neighbors(
         def fold(add: Callable[[Slots, Carry], Carry], state: Carry) -> Carry:
             def add_words(words: _HitWords, state: Carry) -> Carry:
                 hits, first, image = words
-                bits = BitRows.of(hits, tuning.in_groups)
+                bits = BitRows.of(hits, tuning.by_gathers)
                 total = jnp.where(fresh, bits.total, 0)
 
                 def add_group(state: tuple[Array, Any]) -> tuple[Array, Any]:
@@ -214,7 +215,7 @@ class _Engine(NamedTuple):
     def words(self) -> int:
         """Words per query that are processed at a time."""
         words = self.candidates.words(self.capacity)
-        if self.tuning.in_groups:
+        if self.tuning.by_gathers:
             return min(words, _MOST_WORDS)
         return min(-(-words // 8) * 8, _MOST_WORDS // 4)
 
@@ -306,15 +307,11 @@ class _Engine(NamedTuple):
     def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
         word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (table.start.shape[0], self.words))
         runs = table.start.shape[1]
-        if runs > _FEW_RUNS:  # many images
-            if runs > _MANY_RUNS:
-                run = jax.vmap(functools.partial(jnp.searchsorted, side="right"))(table.before, word).astype(jnp.int32) - 1
-            else:
-                run = jnp.sum(word[..., None] >= table.before[:, None], axis=2, dtype=jnp.int32) - 1
-            run = run + runs * lax.broadcasted_iota(jnp.int32, run.shape, 0)
+        if self.tuning.by_gathers or runs > _FEW_RUNS:  # or many images
+            run = last_reached(table.before, word) + runs * lax.broadcasted_iota(jnp.int32, word.shape, 0)
             first = flat_take(table.start, run) + LANES * (word - flat_take(table.before, run))
             stop, image = flat_take(table.stop, run), None if table.image is None else flat_take(table.image, run)
-        else:  # a chain of selections takes half the time of a lookup
+        else:  # a chain of selections takes half the time of a lookup on a CPU
             columns = [table.before, table.start, table.stop, *([] if table.image is None else [table.image])]
             found = [jnp.zeros_like(word) for _ in columns[1:]]
             for begin, start, *others in zip(*(lax.split(x, [1] * runs, axis=1) for x in columns), strict=True):
@@ -347,7 +344,7 @@ class _Engine(NamedTuple):
         if self.queries.systems is not None and self.sources.systems is not None:
             system = span.of(self.queries.systems)[:, None, None]
             value = jnp.where(windows(self.sources.systems, first) == system, value, np.uint32(0))
-        return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,))
+        return join_lanes(value, self.tuning.lanes)
 
     def _bounds(self, own: Array | None, others: Array | None, span: Span) -> tuple[np.floating | Array, np.floating | Array]:
         torus = self.candidates.torus
@@ -402,7 +399,7 @@ class _Engine(NamedTuple):
             here = jnp.minimum(row, rows - 1)
             both = packed if whole else jnp.where((row < rows)[:, None], packed[here], np.uint32(0))
             asked = both >> np.uint32(LANES)
-            bits = BitRows.of(asked, self.tuning.in_groups)
+            bits = BitRows.of(asked, self.tuning.by_gathers)
             slot = lax.broadcasted_iota(jnp.int32, (many, _SLOTS), 1)
             word, bit = bits.nth(slot)
             word = word if whole else word + width * (here - lax.iota(jnp.int32, many))[:, None]
@@ -435,13 +432,12 @@ class _Engine(NamedTuple):
             radii = self.cutoff.of_pairs(
                 None if own is None else flat_take(own, place), None if others is None else flat_take(others, candidate)
             )
-        if torus is None or image is None:
-            return Pair(
-                [flat_take(x, place) for x in self.queries.axes], [flat_take(x, candidate) for x in self.sources.axes], radii
-            )
         i, j = flat_take(self.queries.ids, place), flat_take(self.sources.ids, candidate)
-        (sources, queries), shifts = torus.raw, _shifts_of(torus, i, j, image)
-        shift = list(jnp.moveaxis(shifts, -1, 0))
-        raw = [flat_take(x, i) for x in queries.T], [flat_take(x, j) for x in sources.T]
+        sources, queries = self.candidates.given
+        pair = Pair(take_points(queries, i), take_points(sources, j), radii)
+        if torus is None or image is None:
+            return pair
         matrix = torus.matrix.at[..., place].get(mode="promise_in_bounds") if torus.images.per_system else torus.matrix
-        return Pair(*raw, radii, *shift_in_given(shift, torus.images.basis, matrix), torus.images.orthogonal)
+        shift = jnp.moveaxis(_shifts_of(torus, i, j, image), -1, 0)
+        shift, matrix = shift_in_given(shift, torus.images.basis, matrix)
+        return pair._replace(shift=shift, matrix=matrix, orthogonal=torus.images.orthogonal)
