@@ -16,7 +16,7 @@ from jax import Array, lax
 from jfrnn._engine.candidates import Candidates, Points, Span, Torus
 from jfrnn._engine.problem import Filter
 from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
-from jfrnn._engine.words import LANES, BitRows, bit_counts, join_lanes, last_reached, windows
+from jfrnn._engine.words import LANES, BitRows, bit_counts, last_reached, windows
 from jfrnn._geometry import (
     Cutoff,
     Cutoffs,
@@ -344,7 +344,7 @@ class _Engine(NamedTuple):
         if self.queries.systems is not None and self.sources.systems is not None:
             system = span.of(self.queries.systems)[:, None, None]
             value = jnp.where(windows(self.sources.systems, first) == system, value, np.uint32(0))
-        return join_lanes(value, self.tuning.lanes)
+        return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,))
 
     def _bounds(self, own: Array | None, others: Array | None, span: Span) -> tuple[np.floating | Array, np.floating | Array]:
         torus = self.candidates.torus

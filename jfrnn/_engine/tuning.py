@@ -29,7 +29,6 @@ class Tuning(NamedTuple):
         doubtful_rows: but at least so many rows at a time.
         by_gathers: Whether what a slot needs to know of a group of words is gathered, instead of chosen by looking at every group.
         group: Slots of a row that are filled at a time.
-        lanes: Candidates of a word that one thread tests.
     """
 
     scratch: int
@@ -40,7 +39,6 @@ class Tuning(NamedTuple):
     doubtful_rows: int
     by_gathers: bool
     group: int
-    lanes: int
 
 
 CPU = Tuning(  # a block fits into the caches, and loops cost little
@@ -52,7 +50,6 @@ CPU = Tuning(  # a block fits into the caches, and loops cost little
     doubtful_rows=64,
     by_gathers=False,
     group=128,
-    lanes=1,
 )
 ACCELERATOR = Tuning(  # few large kernels, in at most 1 GB
     scratch=900_000_000,
@@ -63,7 +60,6 @@ ACCELERATOR = Tuning(  # few large kernels, in at most 1 GB
     doubtful_rows=4096,
     by_gathers=True,
     group=256,
-    lanes=4,
 )
 
 

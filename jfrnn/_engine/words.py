@@ -1,6 +1,5 @@
 """Words of 16 candidates, one bit per candidate: gather their sources and find their set bits."""
 
-import functools
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -19,14 +18,6 @@ def windows(x: Array, first: Array) -> Array:
     """Gather x[first : first + 16] for every word, as contiguous slices, which is several times faster than by element."""
     dimensions = lax.GatherDimensionNumbers(offset_dims=(2,), collapsed_slice_dims=(), start_index_map=(0,))
     return lax.gather(x, first[..., None], dimensions, (LANES,), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
-
-
-def join_lanes(bits: Array, together: int) -> Array:
-    """Return words [b, w] with the bits of their lanes [b, w, 16], of which one thread reads some `together`."""
-    if together > 1:
-        parts = bits.reshape(*bits.shape[:2], LANES // together, together)
-        bits = functools.reduce(lax.bitwise_or, (parts[..., k] for k in range(together)))
-    return bits[..., 0] if together == LANES else lax.reduce(bits, np.uint32(0), lax.bitwise_or, (2,))
 
 
 def bit_counts(words: Array) -> Array:
@@ -114,10 +105,14 @@ def _column(x: Array, k: int, shape: tuple[int, ...]) -> Array:
 
 
 def last_reached(ascending: Array, value: Array) -> Array:
-    """Return the last place in each ascending row [b, w] whose entry is <= value [b, k], or 0: binary searches by gathers."""
-    last = ascending.shape[1] - 1
-    row, place = lax.broadcasted_iota(jnp.int32, value.shape, 0) * (last + 1), jnp.zeros_like(value)
-    for bit in reversed(range(last.bit_length())):
+    """Return the last place in each ascending row [b, w] whose entry is <= value [b, k], or 0, by few comparisons or gathers."""
+    last, place = ascending.shape[1] - 1, jnp.zeros_like(value)
+    if last < _GROUP:
+        for k in range(1, last + 1):
+            place = place + (_column(ascending, k, value.shape) <= value).astype(jnp.int32)
+        return place
+    row = lax.broadcasted_iota(jnp.int32, value.shape, 0) * (last + 1)
+    for bit in reversed(range(last.bit_length())):  # binary searches
         further = lax.min(place + np.int32(1 << bit), np.int32(last))
         place = lax.select(flat_take(ascending, row + further) <= value, further, place)
     return place
