@@ -183,8 +183,12 @@ class _WordTable(NamedTuple):
     start: Array  # [b, r] start of each run
     stop: Array  # [b, r] its end
     image: Array | None  # [b, r] its image code
-    before: Array  # [b, r] number of words in the query's earlier runs
+    before: Array | None  # [b, r] number of words in the query's earlier runs, if these are looked up
     longest: Array | int  # [] largest number of words of a query
+
+
+def _words_of(start: Array, stop: Array) -> Array:
+    return (stop - start + (LANES - 1)) >> (LANES.bit_length() - 1)
 
 
 class _HitWords(NamedTuple):
@@ -285,12 +289,13 @@ class _Engine(NamedTuple):
 
     def word_table(self, span: Span, which: Array) -> _WordTable:
         start, stop, image = self.candidates.runs(span, which)
-        count, runs = (stop - start + (LANES - 1)) >> (LANES.bit_length() - 1), start.shape[1]
+        count, runs = _words_of(start, stop), start.shape[1]
+        total, before = jnp.sum(count, axis=1, dtype=jnp.int32), None
         if runs > _FEW_RUNS:
             before = jnp.cumsum(count, axis=1, dtype=jnp.int32) - count
-        else:
-            before = jnp.sum(count[:, None] * np.tril(np.ones((runs, runs), np.int32), -1), axis=2, dtype=jnp.int32)
-        return _WordTable(start, stop, image, before, self.candidates.most_words or largest_of(before[:, -1] + count[:, -1]))
+        elif self.tuning.by_gathers:
+            before = jnp.sum(count[:, None] * np.tril(np.ones((runs, runs), np.int32), -1)[None], axis=2, dtype=jnp.int32)
+        return _WordTable(start, stop, image, before, self.candidates.most_words or largest_of(total))
 
     def hit_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> _HitWords:
         """Test one chunk of words per query; `own` are the d coordinates [b] of the queries."""
@@ -307,17 +312,17 @@ class _Engine(NamedTuple):
     def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
         word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (table.start.shape[0], self.words))
         runs = table.start.shape[1]
-        if self.tuning.by_gathers or runs > _FEW_RUNS:  # or many images
+        if table.before is not None:
             run = last_reached(table.before, word) + runs * lax.broadcasted_iota(jnp.int32, word.shape, 0)
             first = flat_take(table.start, run) + LANES * (word - flat_take(table.before, run))
             stop, image = flat_take(table.stop, run), None if table.image is None else flat_take(table.image, run)
         else:  # a chain of selections takes half the time of a lookup on a CPU
-            columns = [table.before, table.start, table.stop, *([] if table.image is None else [table.image])]
-            found = [jnp.zeros_like(word) for _ in columns[1:]]
-            for begin, start, *others in zip(*(lax.split(x, [1] * runs, axis=1) for x in columns), strict=True):
-                begin = jnp.broadcast_to(begin, word.shape)
-                of_run, reached = [start + LANES * (word - begin), *others], word >= begin
+            columns = [table.start, table.stop, *([] if table.image is None else [table.image])]
+            found, before = [jnp.zeros_like(word) for _ in columns], jnp.zeros_like(table.start[:, :1])
+            for start, stop, *others in zip(*(lax.split(x, [1] * runs, axis=1) for x in columns), strict=True):
+                of_run, reached = [start + LANES * (word - before), stop, *others], word >= before
                 found = [lax.select(reached, jnp.broadcast_to(x, word.shape), y) for x, y in zip(of_run, found, strict=True)]
+                before = before + _words_of(start, stop)
             first, stop, image = found if table.image is not None else (*found, None)
         return jnp.minimum(first, self.sources.ids.size - LANES), stop, image
 

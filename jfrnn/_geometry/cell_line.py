@@ -259,8 +259,8 @@ def line_runs(line: CellLine, cells: Cells, images: Images | None) -> tuple[Arra
 
 def _ends(line: CellLine, begin: Array, length: Array) -> tuple[Array, Array]:
     """Return the positions at which runs begin and end that cover so many numbers from `begin` on."""
-    ends = line.table.at[jnp.stack([begin, begin + length])].get(mode="promise_in_bounds")
-    return ends[0], ends[1]
+    start, stop = (line.table.at[at].get(mode="promise_in_bounds") for at in (begin, begin + length))
+    return start, stop
 
 
 def _parts_of_rows(x: Array, turns: Array | None, reach: int, images: Images) -> tuple[Array, Array, Array]:
