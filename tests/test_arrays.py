@@ -15,8 +15,10 @@ from jfrnn._engine import rows as rows_module
 from jfrnn.cases.hard import HARD_CASES
 
 # blocks as small as these cases, so that each has several
-ELSEWHERE = tuning.ACCELERATOR._replace(words=1 << 12, few_pairs=1000, searched=300, doubtful_rows=16)
-TIES = ("lattice_1e-4_at_0", "ulps_far", "cell_edges_far", "queries_fewer")
+SORTING = tuning.ACCELERATOR.sorting._replace(searched=300)
+ELSEWHERE = tuning.ACCELERATOR._replace(words=1 << 12, few_pairs=1000, sorting=SORTING, doubtful_rows=16)
+AT_ONCE = ELSEWHERE._replace(words=1 << 20, few_pairs=1 << 20, doubtful_rows=1 << 20)  # all rows and their doubtful pairs
+TIES = ("lattice_1e-4_at_0", "ulp_far_axis", "cell_edges_far", "queries_fewer")
 
 
 @pytest.fixture
@@ -32,6 +34,16 @@ def elsewhere(monkeypatch):
 def test_numbers_of_accelerators_find_the_same_pairs(name, elsewhere):
     if name == "denormal_lattice":
         pytest.skip("its cutoff is refused")
+    given = HARD_CASES[name].build(np.float32, 3)
+    nbrs = checked.search_padded(given, max(704, len(given.positions)), 704, backend="jax")
+    checked.assert_pairs(nbrs, reference.reference_pairs(given.positions, given.cutoff, queries=given.queries))
+
+
+@pytest.mark.parametrize(
+    "name", [name if name == "lattice_1e-4_at_0" else pytest.param(name, marks=pytest.mark.slow) for name in TIES]
+)
+def test_all_rows_of_a_block_at_once(name, elsewhere, monkeypatch):
+    monkeypatch.setattr(tuning, "CPU", AT_ONCE)
     given = HARD_CASES[name].build(np.float32, 3)
     nbrs = checked.search_padded(given, max(704, len(given.positions)), 704, backend="jax")
     checked.assert_pairs(nbrs, reference.reference_pairs(given.positions, given.cutoff, queries=given.queries))

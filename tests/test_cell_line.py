@@ -108,3 +108,15 @@ def test_a_program_does_not_grow_with_the_images():
         return len(jax.make_jaxpr(runs)(jnp.zeros((60, 3), jnp.float32)).eqns)
 
     assert length(2) == length(351)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5000, 20_000])
+def test_key_and_index_are_sorted_as_one_word(n):
+    """Up to 16 384 particles in one pass, then in two; equal keys stay in order."""
+    size = cell_line.table_size(n)
+    key = np.random.default_rng(n).integers(0, size + 1, n).astype(np.uint32) // 3 * 3
+    key[-1] = size
+    keys, order = cell_line._sort(jnp.asarray(key), size, cell_line.Sorting(packed=True))
+    expected = np.argsort(key, kind="stable")
+    np.testing.assert_array_equal(order, expected)
+    np.testing.assert_array_equal(keys, key[expected])

@@ -82,7 +82,7 @@ def ulp_pairs(dtype, seed, count=256, scale=1.0, offset=0.0):
 def test_every_step_agrees_with_fractions(dtype, offset):
     a, b = ulp_pairs(dtype, seed=5, offset=offset)
     cutoff = make_cutoff(1.0, np.dtype(dtype), closed=False)
-    pair = Pair(*([jnp.asarray(x) for x in side.T] for side in (a, b)))
+    pair = Pair(jnp.asarray(a.T), jnp.asarray(b.T))
     exact = np.array(
         [0 if reference.is_pair(p, q, 1.0, closed=True) != reference.is_pair(p, q, 1.0) else 1 - 2 * reference.is_pair(p, q, 1.0)
          for p, q in zip(a, b, strict=True)]
@@ -112,8 +112,8 @@ def test_steps_agree_in_lattices(size, orthogonal, dtype):
     offset = rng.integers(-30, 31, (count, 3)) * step
     b = a + offset - (shift @ matrix.astype(np.float64))
     b[::3] += rng.integers(-2, 3, (len(b[::3]), 3)) * np.spacing(np.abs(b[::3]).astype(dtype))
-    columns = [jnp.asarray(x.astype(dtype)) for x in (*a.T, *b.T, *shift.T)]
-    pair = Pair(columns[:3], columns[3:6], None, columns[6:], jnp.asarray(matrix, dtype), orthogonal)
+    a, b, shift = (jnp.asarray(x.T.astype(dtype)) for x in (a, b, shift))
+    pair = Pair(a, b, None, shift, jnp.asarray(matrix, dtype), orthogonal)
     threshold = _threshold(pair, make_cutoff(float(21 * step), np.dtype(dtype), closed=False))  # 21² = 16² + 13² + 4²
     near = jnp.asarray(np.linalg.norm(offset, axis=1) < 42 * step)  # what step 1 leaves open is no farther
     sign, exact = _fixed_sign(pair, threshold), _integer_sign(pair, threshold)
@@ -126,7 +126,7 @@ def test_steps_agree_in_lattices(size, orthogonal, dtype):
 def test_exact_ties_are_known_without_integers(dtype):
     a = jnp.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]], dtype)
     b = a + jnp.array([1.0, 2.0, 2.0], dtype)
-    pair = Pair(list(a.T), list(b.T))
+    pair = Pair(a.T, b.T)
     sign = _fixed_sign(pair, _threshold(pair, make_cutoff(3.0, np.dtype(dtype), closed=False)))
     np.testing.assert_array_equal(sign, [0, 0])
 

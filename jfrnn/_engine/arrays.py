@@ -142,8 +142,10 @@ def complete_rows(search: Search, idx: Array | None, count: Array, capacity: int
 
 def find_candidates(search: Search, by_cells: bool, tuning: Tuning) -> Candidates:
     """Return the candidates of each query: all sources (brute force), by cells, or by cells of many sizes."""
-    candidates = _find_candidates(search, by_cells, tuning)
-    return candidates if search.exclude is None else candidates._replace(excluded=_place_excluded(candidates, search.exclude))
+    found = find_in_boxes(search, by_cells) if search.per_system else _find_candidates(search, by_cells, tuning)
+    if search.exclude is not None:
+        found = found._replace(excluded=_place_excluded(found, search.exclude))
+    return found._replace(given=(search.sources, search.sources if search.queries is None else search.queries))
 
 
 def _place_excluded(candidates: Candidates, exclude: Exclusions) -> Excluded:
@@ -157,10 +159,8 @@ def _place_excluded(candidates: Candidates, exclude: Exclusions) -> Excluded:
 
 
 def _find_candidates(search: Search, by_cells: bool, tuning: Tuning) -> Candidates:
-    if search.per_system:
-        return find_in_boxes(search, by_cells)
     sources, queries, cutoff, batch, given = search[:5]
-    torus = None if given is None else _torus(sources, queries, *given)
+    torus = None if given is None else _torus(*given, sources.dtype)
     clouds = (sources, queries) if given is None else (given[1].sources, None if queries is None else given[1].queries)
     if not by_cells:
         return _all_sources(*clouds, cutoff, batch, torus)
@@ -198,11 +198,10 @@ def _cells_along(
     return points.T, Axes(open_axes(cell_edge(largest_radius(cutoff)), points.shape[1]), one, 0 * one)
 
 
-def _torus(sources: Array, queries: Array | None, lattice: Lattice, wrapped: Wrapped) -> Torus:
-    raw = (sources, sources if queries is None else queries)
-    turns = tuple(unpack_turns(x, lattice.dim).astype(sources.dtype) for x in (wrapped.turns, wrapped.query_turns))
-    shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)
-    return Torus(lattice.images, translation(shifts, lattice), lattice.given, raw, (turns[0], turns[1]), wrapped.slack)
+def _torus(lattice: Lattice, wrapped: Wrapped, dtype: np.dtype) -> Torus:
+    turns = tuple(unpack_turns(x, lattice.dim).astype(dtype) for x in (wrapped.turns, wrapped.query_turns))
+    shifts = jnp.asarray(lattice.images.shifts).astype(dtype)
+    return Torus(lattice.images, translation(shifts, lattice), lattice.given, (turns[0], turns[1]), wrapped.slack)
 
 
 def _all_sources(
@@ -247,8 +246,8 @@ def _cell_stencil(
     `along` [d, n + m] are the coordinates of the sources, then of the queries, which `axes` divides into cells.
     """
     n, systems = len(sources), None if batch is None else batch.of_all
-    line, cells = sort_along_line(along, axes, n, systems, tuning.least_sorted, tuning.searched)
-    numbers, order = (line.numbers, line.order) if queries is None else sort_queries(cells, n, tuning.least_sorted)
+    line, cells = sort_along_line(along, axes, n, systems, tuning.sorting)
+    numbers, order = (line.numbers, line.order) if queries is None else sort_queries(cells, n, tuning.sorting)
     images = None if torus is None else torus.images
     ordered = None if images is None else cells.of(order if queries is None else order + n)
 

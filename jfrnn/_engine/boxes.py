@@ -31,10 +31,10 @@ def find_in_boxes(search: Search, by_cells: bool) -> Candidates:
         return passes_of(cells, systems, span.places, _WIDTH)
 
     own = lattice.of_rows(systems)
-    raw, shifts = (sources, sources if queries is None else queries), jnp.asarray(lattice.images.shifts)
+    shifts = jnp.asarray(lattice.images.shifts)
     turns = tuple(unpack_turns(x, lattice.dim).astype(sources.dtype) for x in (wrapped.turns, wrapped.query_turns))
     matrix = jnp.concatenate([own.matrix, own.given], axis=1) if lattice.images.short else own.matrix  # the short vectors first
     matrix = jnp.moveaxis(matrix, 0, -1)
-    images = Torus(lattice.images, shifts.astype(sources.dtype), matrix, raw, (turns[0], turns[1]), wrapped.slack[systems])
+    images = Torus(lattice.images, shifts.astype(sources.dtype), matrix, (turns[0], turns[1]), wrapped.slack[systems])
     points, rows = (Points([x[at] for x in of.T], at) for of, at in ((wrapped.sources, padded), (wrapped.queries, order)))
     return Candidates(points, rows, runs, images, len(sources), lambda _: _WORDS, passes)

@@ -57,7 +57,6 @@ class Torus(NamedTuple):
         images: The images that the search considers. Static.
         translations: [images, d] lattice translation of each image, up to rounding; with a box per system the shift itself.
         matrix: [d, d] lattice vectors as given; with a box per system [d, d, m], those of each query in the order of visits.
-        raw: [n, d] sources and [m, d] queries as given.
         turns: [n, d] and [m, d] whole floats, the lattice vectors that wrapping subtracted.
         slack: [] bound on the error of a component of a displacement of wrapped coordinates; [m] with a box per system.
     """
@@ -65,7 +64,6 @@ class Torus(NamedTuple):
     images: Images
     translations: Array
     matrix: Array
-    raw: tuple[Array, Array]
     turns: tuple[Array, Array]
     slack: Array
 
@@ -92,6 +90,7 @@ class Candidates(NamedTuple):
         torus: What a lattice adds.
         size: Number of sources. Static.
         most_words: How many words of candidates a query has at most, if known. Static.
+        given: [n, d] sources and [m, d] queries, by their indices and as they were given.
         words: From slots per query (None: unknown) to the words of candidates that are tested at a time. Static.
         passes: Number of passes over the sources, [] int32, of all queries or from some of them; None for one.
         again: [] int32, after how many positions the sources start again; None if each has one position.
@@ -110,3 +109,4 @@ class Candidates(NamedTuple):
     excluded: Excluded | None = None
     in_order: bool = False
     most_words: int | None = None
+    given: tuple[Array, ...] = ()

@@ -9,7 +9,6 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -17,7 +16,7 @@ from jax import Array, lax
 from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
 from jfrnn._engine.problem import Filter, Room
 from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
-from jfrnn._engine.words import LANES, BitRows, bit_counts, windows
+from jfrnn._engine.words import LANES, BitRows, bit_counts, last_reached, windows
 from jfrnn._geometry import (
     Cutoff,
     Cutoffs,
@@ -27,13 +26,13 @@ from jfrnn._geometry import (
     shift_in_given,
     squared_distance,
     step_one_bounds,
+    take_points,
 )
 from jfrnn._tracing import largest_of
 
 _FEW_RUNS = 32
 _SLOTS = 32  # doubtful candidates of a row that are decided at a time
 _HITS = np.uint32((1 << LANES) - 1)
-_MANY_RUNS = 4096
 _MOST_WORDS = 256  # per query, that are tested at a time; (words << 16) has to be an int32
 FOLD_GROUP = 32  # neighbors per query that are folded at a time
 
@@ -70,7 +69,7 @@ def list_neighbors(
     def list_block(span: Span) -> list[Array]:
         def add(words: _HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
             (rows, count), (hits, first, image) = found, words
-            bits = BitRows.of(hits, tuning.in_groups)
+            bits = BitRows.of(hits, tuning.by_gathers)
             total = bits.total
 
             def add_group(g: Array, rows: Array) -> Array:
@@ -82,7 +81,9 @@ def list_neighbors(
                     neighbor = neighbor + n * flat_take(image, word)
                 old = rows if group == capacity else lax.dynamic_slice_in_dim(rows, start, group, axis=1)
                 new = jnp.where((ordinal >= 0) & (ordinal < total[:, None]), neighbor, old)
-                return new if group == capacity else lax.dynamic_update_slice_in_dim(rows, new, start, axis=1)
+                if group == capacity:
+                    return new
+                return lax.dynamic_update_slice_in_dim(rows, lax.optimization_barrier(new), start, axis=1)  # in parts of its own
 
             if group == capacity:
                 rows = add_group(jnp.int32(0), rows)
@@ -183,7 +184,7 @@ def fold_neighbors(
         def fold(add: Callable[[Slots, Carry], Carry], state: Carry) -> Carry:
             def add_words(words: _HitWords, state: Carry) -> Carry:
                 hits, first, image = words
-                bits = BitRows.of(hits, tuning.in_groups)
+                bits = BitRows.of(hits, tuning.by_gathers)
                 total = jnp.where(fresh, bits.total, 0)
 
                 def add_group(state: tuple[Array, Any]) -> tuple[Array, Any]:
@@ -218,8 +219,12 @@ class _WordTable(NamedTuple):
     start: Array  # [b, r] start of each run
     stop: Array  # [b, r] its end
     image: Array | None  # [b, r] its image code
-    before: Array  # [b, r] number of words in the query's earlier runs
+    before: Array | None  # [b, r] number of words in the query's earlier runs, if these are looked up
     longest: Array | int  # [] largest number of words of a query
+
+
+def _words_of(start: Array, stop: Array) -> Array:
+    return (stop - start + (LANES - 1)) >> (LANES.bit_length() - 1)
 
 
 class _HitWords(NamedTuple):
@@ -250,7 +255,7 @@ class _Engine(NamedTuple):
     def words(self) -> int:
         """Words per query that are processed at a time."""
         words = self.candidates.words(self.capacity)
-        if self.tuning.in_groups:
+        if self.tuning.by_gathers:
             return min(words, _MOST_WORDS)
         return min(-(-words // 8) * 8, _MOST_WORDS // 4)
 
@@ -320,12 +325,13 @@ class _Engine(NamedTuple):
 
     def word_table(self, span: Span, which: Array) -> _WordTable:
         start, stop, image = self.candidates.runs(span, which)
-        count, runs = (stop - start + (LANES - 1)) >> (LANES.bit_length() - 1), start.shape[1]
+        count, runs = _words_of(start, stop), start.shape[1]
+        total, before = jnp.sum(count, axis=1, dtype=jnp.int32), None
         if runs > _FEW_RUNS:
             before = jnp.cumsum(count, axis=1, dtype=jnp.int32) - count
-        else:
-            before = jnp.sum(count[:, None] * np.tril(np.ones((runs, runs), np.int32), -1), axis=2, dtype=jnp.int32)
-        return _WordTable(start, stop, image, before, self.candidates.most_words or largest_of(before[:, -1] + count[:, -1]))
+        elif self.tuning.by_gathers:
+            before = jnp.sum(count[:, None] * np.tril(np.ones((runs, runs), np.int32), -1)[None], axis=2, dtype=jnp.int32)
+        return _WordTable(start, stop, image, before, self.candidates.most_words or largest_of(total))
 
     def hit_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> _HitWords:
         """Test one chunk of words per query; `own` are the d coordinates [b] of the queries."""
@@ -344,21 +350,17 @@ class _Engine(NamedTuple):
     def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
         word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (table.start.shape[0], self.words))
         runs = table.start.shape[1]
-        if runs > _FEW_RUNS:  # many images
-            if runs > _MANY_RUNS:
-                run = jax.vmap(functools.partial(jnp.searchsorted, side="right"))(table.before, word).astype(jnp.int32) - 1
-            else:
-                run = jnp.sum(word[..., None] >= table.before[:, None], axis=2, dtype=jnp.int32) - 1
-            run = run + runs * lax.broadcasted_iota(jnp.int32, run.shape, 0)
+        if table.before is not None:
+            run = last_reached(table.before, word) + runs * lax.broadcasted_iota(jnp.int32, word.shape, 0)
             first = flat_take(table.start, run) + LANES * (word - flat_take(table.before, run))
             stop, image = flat_take(table.stop, run), None if table.image is None else flat_take(table.image, run)
-        else:  # a chain of selections takes half the time of a lookup
-            columns = [table.before, table.start, table.stop, *([] if table.image is None else [table.image])]
-            found = [jnp.zeros_like(word) for _ in columns[1:]]
-            for begin, start, *others in zip(*(lax.split(x, [1] * runs, axis=1) for x in columns), strict=True):
-                begin = jnp.broadcast_to(begin, word.shape)
-                of_run, reached = [start + LANES * (word - begin), *others], word >= begin
+        else:  # a chain of selections takes half the time of a lookup on a CPU
+            columns = [table.start, table.stop, *([] if table.image is None else [table.image])]
+            found, before = [jnp.zeros_like(word) for _ in columns], jnp.zeros_like(table.start[:, :1])
+            for start, stop, *others in zip(*(lax.split(x, [1] * runs, axis=1) for x in columns), strict=True):
+                of_run, reached = [start + LANES * (word - before), stop, *others], word >= before
                 found = [lax.select(reached, jnp.broadcast_to(x, word.shape), y) for x, y in zip(of_run, found, strict=True)]
+                before = before + _words_of(start, stop)
             first, stop, image = found if table.image is not None else (*found, None)
         return jnp.minimum(first, self.sources.ids.size - LANES), stop, image
 
@@ -457,7 +459,7 @@ class _Engine(NamedTuple):
             here = jnp.minimum(row, rows - 1)
             both = packed if whole else jnp.where((row < rows)[:, None], packed[here], np.uint32(0))
             asked = both >> np.uint32(LANES)
-            bits = BitRows.of(asked, self.tuning.in_groups)
+            bits = BitRows.of(asked, self.tuning.by_gathers)
             slot = lax.broadcasted_iota(jnp.int32, (many, _SLOTS), 1)
             word, bit = bits.nth(slot)
             word = word if whole else word + width * (here - lax.iota(jnp.int32, many))[:, None]
@@ -490,14 +492,13 @@ class _Engine(NamedTuple):
             radii = self.cutoff.of_pairs(
                 None if own is None else flat_take(own, place), None if others is None else flat_take(others, candidate)
             )
-        if torus is None or image is None:
-            return Pair(
-                [flat_take(x, place) for x in self.queries.axes], [flat_take(x, candidate) for x in self.sources.axes], radii
-            )
         i, j = flat_take(self.queries.ids, place), flat_take(self.sources.ids, candidate)
-        (sources, queries), shifts = torus.raw, _shifts_of(torus, i, j, image)
-        shift = list(jnp.moveaxis(shifts, -1, 0))
-        raw = [flat_take(x, i) for x in queries.T], [flat_take(x, j) for x in sources.T]
+        sources, queries = self.candidates.given
+        pair = Pair(take_points(queries, i), take_points(sources, j), radii)
+        if torus is None or image is None:
+            return pair
         matrix = torus.matrix.at[..., place].get(mode="promise_in_bounds") if torus.images.per_system else torus.matrix
+        shift = jnp.moveaxis(_shifts_of(torus, i, j, image), -1, 0)
         matrix = matrix[len(shift) :] if torus.images.short else matrix
-        return Pair(*raw, radii, *shift_in_given(shift, torus.images.basis, matrix), torus.images.orthogonal)
+        shift, matrix = shift_in_given(shift, torus.images.basis, matrix)
+        return pair._replace(shift=shift, matrix=matrix, orthogonal=torus.images.orthogonal)

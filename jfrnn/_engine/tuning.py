@@ -6,6 +6,7 @@ from typing import NamedTuple, TypeVar
 import jax
 from jax import lax
 
+from jfrnn._geometry import Sorting
 from jfrnn._tracing import Internal, Tree, platform_of_lowering
 
 WORD_BYTES = 24  # what a word of 16 candidates takes while it is tested
@@ -22,23 +23,21 @@ class Tuning(NamedTuple):
         scratch: Memory of a block of queries [B], apart from the sorted particles.
         words: Most words of 16 candidates in a block.
         few_pairs: Up to so many pairs of a query and a source, all are tested, and nothing is sorted.
-        least_sorted: Fewer keys are sorted together with padding: XLA of jax 0.11.2 sorted 17 408 keys on an H200 by a chain of its
-            own kernels, and 33 792 by CUB, which takes less time.
-        searched: Up to so many sources, the table of cells is made by binary searches instead of by counting.
+        sorting: How particles are sorted. On a CPU, XLA sorts single words several times faster than pairs. XLA of jax 0.11.2
+            sorted 17 408 pairs of words on an H200 by a chain of its own kernels, and 33 792 by CUB, which takes less time.
         doubtful_share: Rows with pairs that are decided exactly are processed in parts of a block, one of so many,
         doubtful_rows: but at least so many rows at a time.
-        in_groups: Whether the word of a slot is found in a group of words instead of by looking at every word of its row.
+        by_gathers: Whether what a slot needs to know of a group of words is gathered, instead of chosen by looking at every group.
         group: Slots of a row that are filled at a time.
     """
 
     scratch: int
     words: int
     few_pairs: int
-    least_sorted: int
-    searched: int
+    sorting: Sorting
     doubtful_share: int
     doubtful_rows: int
-    in_groups: bool
+    by_gathers: bool
     group: int
 
 
@@ -46,22 +45,20 @@ CPU = Tuning(  # a block fits into the caches, and loops cost little
     scratch=48_000_000,
     words=1 << 16,
     few_pairs=1 << 14,
-    least_sorted=0,
-    searched=0,
+    sorting=Sorting(packed=True),
     doubtful_share=1,
     doubtful_rows=64,
-    in_groups=False,
+    by_gathers=False,
     group=128,
 )
 ACCELERATOR = Tuning(  # few large kernels, in at most 1 GB
     scratch=900_000_000,
     words=1 << 26,
     few_pairs=1 << 25,
-    least_sorted=33 << 10,
-    searched=1 << 18,
+    sorting=Sorting(least=33 << 10, searched=1 << 18),
     doubtful_share=16,
     doubtful_rows=4096,
-    in_groups=True,
+    by_gathers=True,
     group=256,
 )
 

@@ -1,6 +1,5 @@
 """Words of 16 candidates, one bit per candidate: gather their sources and find their set bits."""
 
-import functools
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -10,7 +9,9 @@ from jax import Array, lax
 from jfrnn._geometry import flat_take
 
 LANES = 16  # candidates per word: in a uint32 hits take the lower half, doubtful candidates the upper half
-_GROUP = 8  # words whose counts are added up together
+_GROUP = 8  # words whose counts are bytes of two integers
+_BYTES = np.uint32(0x01010101)
+_TOPS = np.uint32(0x80808080)
 
 
 def windows(x: Array, first: Array) -> Array:
@@ -23,79 +24,115 @@ def bit_counts(words: Array) -> Array:
     return lax.population_count(words).astype(jnp.int32)
 
 
-def sums_along(counts: Array, in_groups: bool) -> Array:
-    """Return the cumulative sums of rows [b, w], w being a multiple of 8. `in_groups` as in `BitRows`."""
-    if in_groups:
-        return jnp.cumsum(counts, axis=1, dtype=jnp.int32)
-    rows, width = counts.shape  # within groups of 8, then over the groups: XLA's CPU compiler makes chains of cumulative sums
-    groups = counts.reshape(rows, width // _GROUP, _GROUP)
-    within = jnp.sum(groups[:, :, None, :] * np.tril(np.ones((_GROUP, _GROUP), np.int32)), axis=3, dtype=jnp.int32)
-    earlier = np.tril(np.ones((width // _GROUP, width // _GROUP), np.int32), -1)
-    before = jnp.sum(within[:, None, :, -1] * earlier, axis=2, dtype=jnp.int32)
-    return (within + before[:, :, None]).reshape(rows, width)
-
-
 class BitRows(NamedTuple):
     """Rows of words [b, w], prepared so that their set bits can be found one by one.
 
+    Words form groups of eight. The number of set bits in a group up to each of its words is a byte, at most 128.
+
     Attributes:
-        until: [b, w] int32, the number of set bits in the words of a row up to each word.
-        before: [b, w] int32, the number of those before it, and in its lower half the word itself: one gather reads both.
-        in_groups: Whether groups of words are looked at before words, in one kernel, which takes less time where gathers are cheap;
-            otherwise every word of the row, in a kernel of its own. Static.
+        hits: [b, w] uint32, the words.
+        earlier: [b, g] int32, the number of set bits in earlier groups of the row.
+        low: [b, g] uint32, the bytes of a group's words 0 to 3.
+        high: [b, g] uint32, the bytes of its words 4 to 7.
+        by_gathers: Whether a group's numbers are gathered, or chosen by looking at every group of the row. Static.
     """
 
-    until: Array
-    before: Array
-    in_groups: bool
+    hits: Array
+    earlier: Array
+    low: Array
+    high: Array
+    by_gathers: bool
 
     @classmethod
-    def of(cls, words: Array, in_groups: bool) -> "BitRows":
+    def of(cls, words: Array, by_gathers: bool) -> "BitRows":
         """Prepare words, of which only the lower half is used."""
+        rows, width = words.shape
         hits = words & np.uint32((1 << LANES) - 1)
-        count = bit_counts(hits)
-        until = lax.optimization_barrier(sums_along(count, in_groups))
-        before = lax.optimization_barrier(((until - count) << LANES) | hits.astype(jnp.int32))
-        return cls(until, before, in_groups)
+        groups = -(-width // _GROUP)
+        counts = jnp.pad(lax.population_count(hits), ((0, 0), (0, groups * _GROUP - width))).reshape(rows, groups, 1, _GROUP)
+        until = lax.optimization_barrier(jnp.sum(counts * _until_bytes(), axis=3, dtype=jnp.uint32))
+        low, high = until[:, :, 0], until[:, :, 1]
+        in_group = (high >> np.uint32(24)).astype(jnp.int32)
+        before = np.tril(np.ones((groups, groups), np.int32), -1)
+        earlier = jnp.sum(in_group[:, None] * before[None], axis=2, dtype=jnp.int32)
+        return cls(hits, *lax.optimization_barrier((earlier, low, high)), by_gathers)
 
     @property
     def total(self) -> Array:
         """The number of set bits of each row, [b] int32."""
-        return self.until[:, -1]
+        return self.earlier[:, -1] + (self.high[:, -1] >> np.uint32(24)).astype(jnp.int32)
 
     def nth(self, ordinal: Array) -> tuple[Array, Array]:
         """Find the ordinal-th set bit in each row: its word, as a position in the words of all rows, and its bit [b, k].
 
         Ordinals outside [0, total) give any valid word and bit, which callers mask.
         """
-        width = self.until.shape[1]
-        begin = lax.broadcasted_iota(jnp.int32, ordinal.shape, 0) * width
-        if self.in_groups:
-            heads = self.until[:, _GROUP - 1 :: _GROUP][:, : (width - 1) // _GROUP]
-            word, last = begin + _count_not_above(heads, ordinal) * _GROUP, begin + (width - 1)
-            until = (flat_take(self.until, lax.min(word + k, last)) for k in range(_GROUP - 1))
-            inside = ((x <= ordinal).astype(jnp.int32) for x in until)
-            word = lax.min(functools.reduce(jnp.add, inside, word), last)
-            found = flat_take(self.before, word)
-        else:
-            word = lax.optimization_barrier(begin + _count_not_above(self.until[:, : width - 1], ordinal))
-            found = lax.optimization_barrier(flat_take(self.before, word))
-        return word, _nth_bit(found & np.int32((1 << LANES) - 1), ordinal - (found >> LANES))
+        group, earlier, low, high = self._group_of(ordinal)
+        within = (ordinal - earlier).astype(jnp.uint32) & np.uint32(0xFF)
+        asked = within * _BYTES | _TOPS  # no byte borrows from the next, as counts are at most 128
+        reached = ((asked - low) >> np.uint32(7) & _BYTES) + ((asked - high) >> np.uint32(7) & _BYTES)
+        word = lax.min(reached * _BYTES >> np.uint32(24), np.uint32(_GROUP - 1))
+        before = jnp.where(word < 4, low << np.uint32(8), high << np.uint32(8) | low >> np.uint32(24))
+        within = within - (before >> (word % 4 * 8) & np.uint32(0xFF))
+        width = self.hits.shape[1]
+        word = lax.min(group * _GROUP + word.astype(jnp.int32), np.int32(width - 1))
+        word = word + lax.broadcasted_iota(jnp.int32, ordinal.shape, 0) * width
+        if self.by_gathers:
+            return word, _nth_bit(flat_take(self.hits, word), within)
+        word, within = lax.optimization_barrier((word, within))  # kernels without gathers are vectorized
+        found = lax.optimization_barrier(flat_take(self.hits, word))
+        return word, lax.optimization_barrier(_nth_bit(found, within))
+
+    def _group_of(self, ordinal: Array) -> tuple[Array, Array, Array, Array]:
+        """Return the group in which a bit is, the number of bits in earlier ones, and the bytes of the group."""
+        columns = (self.earlier, self.low, self.high)
+        if self.by_gathers:
+            group = last_reached(self.earlier, ordinal)
+            at = group + lax.broadcasted_iota(jnp.int32, ordinal.shape, 0) * self.earlier.shape[1]
+            earlier, low, high = (flat_take(x, at) for x in columns)
+            return group, earlier, low, high
+        group, (earlier, low, high) = jnp.zeros_like(ordinal), (_column(x, 0, ordinal.shape) for x in columns)
+        for k in range(1, self.earlier.shape[1]):
+            new = [_column(x, k, ordinal.shape) for x in columns]
+            reached = new[0] <= ordinal
+            group = group + reached.astype(jnp.int32)
+            earlier, low, high = (lax.select(reached, x, y) for x, y in zip(new, (earlier, low, high), strict=True))
+        return group, earlier, low, high
 
 
-def _count_not_above(ascending: Array, value: Array) -> Array:
-    """Count the entries of each row [b, w] that are <= value [b, k]."""
-    columns = (lax.slice_in_dim(ascending, i, i + 1, axis=1) for i in range(ascending.shape[1]))
-    reached = ((column <= value).astype(jnp.int32) for column in columns)
-    return functools.reduce(jnp.add, reached, jnp.zeros_like(value))
+def _column(x: Array, k: int, shape: tuple[int, ...]) -> Array:
+    return jnp.broadcast_to(x[:, k : k + 1], shape)
+
+
+def last_reached(ascending: Array, value: Array) -> Array:
+    """Return the last place in each ascending row [b, w] whose entry is <= value [b, k], or 0, by few comparisons or gathers."""
+    last, place = ascending.shape[1] - 1, jnp.zeros_like(value)
+    if last < _GROUP:
+        for k in range(1, last + 1):
+            place = place + (_column(ascending, k, value.shape) <= value).astype(jnp.int32)
+        return place
+    row = lax.broadcasted_iota(jnp.int32, value.shape, 0) * (last + 1)
+    for bit in reversed(range(last.bit_length())):  # binary searches
+        further = lax.min(place + np.int32(1 << bit), np.int32(last))
+        place = lax.select(flat_take(ascending, row + further) <= value, further, place)
+    return place
+
+
+def _until_bytes() -> np.ndarray:
+    """Return factors [1, 1, 2, 8] that turn the counts of eight words into bytes of cumulative counts."""
+    place = np.arange(_GROUP)
+    reached = (place[:, None] >= place).astype(np.uint32) << (place[:, None] % 4 * 8).astype(np.uint32)
+    return reached.reshape(2, 4, _GROUP).sum(1, dtype=np.uint32)[None, None]
 
 
 def _nth_bit(word: Array, ordinal: Array) -> Array:
-    """Return the position of the ordinal-th set bit of 16, by bisection; both int32."""
-    position = jnp.zeros_like(ordinal)
-    for width in (8, 4, 2, 1):
-        below = lax.population_count((word >> position) & np.int32((1 << width) - 1))
+    """Return the position of the ordinal-th set bit of 16, by bisection of counts: int32; both are uint32."""
+    pairs = word - (word >> np.uint32(1) & np.uint32(0x5555))
+    fours = (pairs & np.uint32(0x3333)) + (pairs >> np.uint32(2) & np.uint32(0x3333))
+    position = jnp.zeros_like(word)
+    for counts, width in ((fours + (fours >> np.uint32(4)), 8), (fours, 4), (pairs, 2), (word, 1)):
+        below = counts >> position & np.uint32(2 * width - 1)
         skip = ordinal >= below
-        ordinal = lax.select(skip, ordinal - below, ordinal)
-        position = lax.select(skip, position + np.int32(width), position)
-    return position
+        ordinal = jnp.where(skip, ordinal - below, ordinal)
+        position = jnp.where(skip, position + np.uint32(width), position)
+    return position.astype(jnp.int32)

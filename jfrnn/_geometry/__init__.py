@@ -3,7 +3,7 @@
 from jfrnn._geometry.batch import Batch, has_box, rank_systems
 from jfrnn._geometry.box import Box, round_box
 from jfrnn._geometry.box_cells import box_runs, most_cells, passes_of, sort_into_boxes
-from jfrnn._geometry.cell_line import FINE, Cells, line_runs, sort_along_line, sort_queries
+from jfrnn._geometry.cell_line import FINE, Cells, Sorting, line_runs, sort_along_line, sort_queries
 from jfrnn._geometry.cells import CellAxes, cell_edge, open_axes, ordered_bits
 from jfrnn._geometry.curves import hilbert_decode, hilbert_encode, morton_decode, morton_encode
 from jfrnn._geometry.cutoffs import (
@@ -18,7 +18,7 @@ from jfrnn._geometry.cutoffs import (
     step_one_bounds,
     widen,
 )
-from jfrnn._geometry.exact import Pair, Shifted, decide_pairs, flat_take, is_pair_of, shift_in_given, squared_distance
+from jfrnn._geometry.exact import Pair, Shifted, decide_pairs, flat_take, is_pair_of, shift_in_given, squared_distance, take_points
 from jfrnn._geometry.exclusions import Exclusions, check_exclusions, pairs_of_rows
 from jfrnn._geometry.floats import compensated_sum, rounded_sum
 from jfrnn._geometry.images import LARGEST_TURN, Images, grow_images, images_of

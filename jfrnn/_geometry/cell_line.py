@@ -46,6 +46,23 @@ class Cells(NamedTuple):
         return Cells(self.along[:, points], self.number[points])
 
 
+class Sorting(NamedTuple):
+    """How particles are sorted and found; decides about time alone.
+
+    Attributes:
+        packed: Whether key and index are sorted as one word, in two passes where it is too short for both.
+        least: Fewer keys of 32 bits are sorted together with padding.
+        searched: The table of up to so many sources is searched for in the sorted keys instead of counted.
+    """
+
+    packed: bool = False
+    least: int = 0
+    searched: int = 0
+
+
+PLAIN = Sorting()
+
+
 class CellLine(NamedTuple):
     """Sources sorted by the number of their cell, and the table that finds them.
 
@@ -73,13 +90,12 @@ class CellLine(NamedTuple):
 
 
 def sort_along_line(
-    points: Array, axes: CellAxes, sources: int, systems: Array | None, least_sorted: int = 0, searched: int = 0
+    points: Array, axes: CellAxes, sources: int, systems: Array | None, by: Sorting = PLAIN
 ) -> tuple[CellLine, Cells]:
     """Sort the first of the points [d, n + m], the `sources`, by cell; return also the cells of all points.
 
     Open axes begin where the sources do, with a margin; periodic ones, whose coordinates are fractions from 0 to 1, begin at 0.
-    `systems` [n + m] uint32 are the systems of a batch. At least `least_sorted` keys are sorted, and the table of up to `searched`
-    sources is searched for in them instead of counted; both decide about time alone.
+    `systems` [n + m] uint32 are the systems of a batch.
     """
     there = jnp.isfinite(points).all(axis=0)
     size = table_size(sources)
@@ -107,8 +123,8 @@ def sort_along_line(
         lengths.append(jnp.max(systems[:sources], initial=0).astype(points.dtype) + 1)
     strides = _strides(lengths, size)
     number = jnp.where(there, _number(along, strides) & np.uint32(size - 1), np.uint32(size))
-    ascending, order = _sort(number[:sources], size, least_sorted)
-    if sources <= searched:
+    ascending, order = _sort(number[:sources], size, by)
+    if sources <= by.searched:
         numbers = lax.iota(jnp.uint32, size + 1)
         begin = jnp.searchsorted(ascending, numbers, side="left", method="scan_unrolled").astype(jnp.int32)
     else:
@@ -120,20 +136,27 @@ def sort_along_line(
     return CellLine(order, ascending, inside, table, strides, turns), Cells(jnp.stack(along), number)
 
 
-def sort_queries(cells: Cells, sources: int, least_sorted: int) -> tuple[Array, Array]:
+def sort_queries(cells: Cells, sources: int, by: Sorting) -> tuple[Array, Array]:
     """Return the numbers of the cells of queries, which follow those of the `sources`, and the queries in this order: [m] each."""
-    return _sort(cells.number[sources:], table_size(sources), least_sorted)
+    return _sort(cells.number[sources:], table_size(sources), by)
 
 
-def _sort(key: Array, size: int, least: int) -> tuple[Array, Array]:
-    """Sort keys [n] uint32 up to a size; return them and their indices.
-
-    Fewer than `least` are sorted together with others that stay behind. Half as many digits take a radix sort half the time.
-    """
+def _sort(key: Array, size: int, by: Sorting) -> tuple[Array, Array]:
+    """Sort keys [n] uint32 up to a size; return them and their indices. Half as many digits take a radix sort half the time."""
+    n, place = key.size, lax.iota(jnp.int32, key.size)
+    digits = 32 - max((n - 1).bit_length(), 1)  # that fit into a word beside an index
+    if by.packed and size.bit_length() <= 2 * digits:
+        order, mask = place.astype(jnp.uint32), np.uint32((1 << (32 - digits)) - 1)
+        for done in range(0, size.bit_length(), digits):
+            part = key.at[order].get(mode="promise_in_bounds") >> np.uint32(done) << np.uint32(32 - digits)
+            places = lax.sort(part | place.astype(jnp.uint32)) & mask
+            order = order.at[places].get(mode="promise_in_bounds")
+        return key.at[order].get(mode="promise_in_bounds"), order.astype(jnp.int32)
     short = np.uint16 if size < 2**16 else np.uint32
-    padded = jnp.pad(key.astype(short), (0, max(least - key.size, 0)), constant_values=short(np.iinfo(short).max))
+    more = 0 if short is np.uint16 else max(by.least - n, 0)
+    padded = jnp.pad(key.astype(short), (0, more), constant_values=short(np.iinfo(short).max))
     ascending, order = lax.sort((padded, lax.iota(jnp.int32, padded.size)), num_keys=1, is_stable=True)
-    return ascending[: key.size].astype(jnp.uint32), order[: key.size]
+    return ascending[:n].astype(jnp.uint32), order[:n]
 
 
 def table_size(sources: int) -> int:
@@ -236,8 +259,8 @@ def line_runs(line: CellLine, cells: Cells, images: Images | None) -> tuple[Arra
 
 def _ends(line: CellLine, begin: Array, length: Array) -> tuple[Array, Array]:
     """Return the positions at which runs begin and end that cover so many numbers from `begin` on."""
-    ends = line.table.at[jnp.stack([begin, begin + length])].get(mode="promise_in_bounds")
-    return ends[0], ends[1]
+    start, stop = (line.table.at[at].get(mode="promise_in_bounds") for at in (begin, begin + length))
+    return start, stop
 
 
 def _parts_of_rows(x: Array, turns: Array | None, reach: int, images: Images) -> tuple[Array, Array, Array]:

@@ -18,7 +18,6 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -26,7 +25,6 @@ from jax import Array, lax
 from jfrnn._geometry.cutoffs import Cutoff, Cutoffs, fraction_bits, step_one_bounds
 from jfrnn._geometry.floats import WHOLE_BITS, unit_scale
 from jfrnn._geometry.integers import (
-    beside,
     carry_limbs,
     full_count,
     limb_bits,
@@ -43,45 +41,50 @@ _INTEGER_CHUNK = 64  # pairs per iteration of the integer test
 
 
 class Pair(NamedTuple):
-    """Points a and b of pairs, per axis, and the lattice shift of b (None in open space): x_b + shift·matrix - x_a.
+    """Points a and b [d, ...] of pairs, and the lattice shift of b (None in open space): x_b + shift·matrix - x_a.
 
     Where pairs form rows, a may have one column for all pairs of a row.
     `radii` is used with cutoffs per particle: one array of pair cutoffs, or two arrays whose mean is the cutoff.
     """
 
-    a: list[Array]
-    b: list[Array]
+    a: Array
+    b: Array
     radii: list[Array] | None = None
-    shift: list[Array] | None = None  # whole floats
+    shift: Array | None = None  # [d, ...] whole floats; twice as many if `shift_in_given` split the shifts
     matrix: Array | None = None  # [d, d], one lattice vector per row, 0 for open axes; or [d, d, ...] of each pair
     orthogonal: bool = True
 
-    def lattice_terms(self, axis: int) -> list[tuple[Array, tuple[int, int]]]:
-        """Return shifts, and the places in `matrix` of what they multiply, which sum to the translation along an axis."""
+    def lattice_terms(self) -> list[tuple[Array, Array]]:
+        """Return shifts and vectors, [d, ...] or 1 where they are all alike, whose products sum to the translation."""
         if self.shift is None or self.matrix is None:
             return []
-        rows = [axis] if self.orthogonal else range(len(self.shift))  # twice the axes if `shift_in_given` split the shifts
-        return [(self.shift[k], (k, axis)) for k in rows]
+        dim, ones = len(self.b), (1,) * (self.b.ndim - 1)
+        matrix = self.matrix if self.matrix.ndim > 2 else self.matrix.reshape(*self.matrix.shape, *ones)
+        if self.orthogonal:
+            return [(self.shift[:dim], jnp.stack([matrix[k, k] for k in range(dim)]))]
+        return [(shift[None], vector) for shift, vector in zip(self.shift, matrix, strict=True)]
 
 
 PointsAt = Callable[[Array | None], Pair]
 
 
-def shift_in_given(shift: list[Array], basis: Basis | None, matrix: Array) -> tuple[list[Array], Array]:
-    """Return shifts and lattice vectors that express a translation exactly in the given vectors [d, d].
+def shift_in_given(shift: Array, basis: Basis | None, matrix: Array) -> tuple[Array, Array]:
+    """Return shifts [d or 2·d, ...] and lattice vectors that express a translation exactly in the given vectors [d, d].
 
-    `shift` holds whole floats that count vectors of the basis, which may stand behind the given ones, whole floats. Counts of the
-    given vectors may be too large for one product to be exact, so each is split into two.
+    `shift` [d, ...] holds whole floats that count vectors of the basis, which may stand behind the given ones, whole floats. Counts
+    of the given vectors may be too large for one product to be exact, so each is split into two.
     """
     matrix, behind = matrix[: len(shift)], matrix[len(shift) :]
     if basis is None and len(behind) == 0:
         return shift, matrix
-    counts = [x.astype(jnp.int32) for x in shift]
+    counts = shift.astype(jnp.int32)
     numbers = behind.astype(jnp.int32) if basis is None else basis
-    given = [functools.reduce(jnp.add, (x * row[k] for x, row in zip(counts, numbers, strict=True))) for k in range(len(shift))]
-    high = [(x + (1 << (WHOLE_BITS - 1))) >> WHOLE_BITS for x in given]
-    low = [x - (h << WHOLE_BITS) for x, h in zip(given, high, strict=True)]
-    return [x.astype(matrix.dtype) for x in (*low, *high)], jnp.concatenate([matrix, matrix * 2**WHOLE_BITS])
+    given = jnp.stack(
+        [functools.reduce(jnp.add, (x * row[k] for x, row in zip(counts, numbers, strict=True))) for k in range(len(shift))]
+    )
+    high = (given + (1 << (WHOLE_BITS - 1))) >> WHOLE_BITS
+    split = jnp.concatenate([given - (high << WHOLE_BITS), high])
+    return split.astype(matrix.dtype), jnp.concatenate([matrix, matrix * 2**WHOLE_BITS])
 
 
 def squared_distance(difference: list[Array], cutoff: "Cutoff | Cutoffs") -> Array:
@@ -132,21 +135,17 @@ class _Slots(NamedTuple):
 
     def points(self, at: Array | None) -> Pair:
         """Return the points at flat indices, or of all pairs."""
-        axes, source = range(self.sources.shape[1]), self.neighbor if at is None else flat_take(self.neighbor, at)
-        others = list(jnp.moveaxis(self.sources[source], -1, 0))
-        if at is None:
-            own = [self._spread(self.rows[:, axis], at) for axis in axes]
-        else:
-            own = list(self.rows.at[at // self.neighbor.shape[1]].get(mode="clip").T)
-        pair, shifted = Pair(own, others, self.radii(at, source)), self.shifted
+        source = self.neighbor if at is None else flat_take(self.neighbor, at)
+        own = self.rows.T[..., None] if at is None else self.rows.at[at // self.neighbor.shape[1]].get(mode="clip").T
+        pair, shifted = Pair(own, jnp.moveaxis(self.sources[source], -1, 0), self.radii(at, source)), self.shifted
         if shifted is None:
             return pair
-        shifts = shifted.shifts if at is None else shifted.shifts.reshape(-1, len(axes)).at[at].get(mode="clip")
+        shifts = shifted.shifts if at is None else shifted.shifts.reshape(-1, len(own)).at[at].get(mode="clip")
         given = shifted.matrix
         if given.ndim == 3:  # of each row
             given = jnp.moveaxis(given if at is None else given.at[at // self.neighbor.shape[1]].get(mode="clip"), 0, -1)
             given = given[..., None] if at is None else given
-        shift, matrix = shift_in_given(list(jnp.moveaxis(shifts, -1, 0)), shifted.basis, given)
+        shift, matrix = shift_in_given(jnp.moveaxis(shifts, -1, 0), shifted.basis, given)
         return pair._replace(shift=shift, matrix=matrix, orthogonal=shifted.orthogonal)
 
     def _spread(self, column: Array, at: Array | None) -> Array:  # without an index array of all slots, a large constant for XLA
@@ -179,6 +178,12 @@ def flat_take(x: Array, at: Array) -> Array:
     """Return the elements of x at flat indices, all of which are valid."""
     dimensions = lax.GatherDimensionNumbers(offset_dims=(), collapsed_slice_dims=(0,), start_index_map=(0,))
     return lax.gather(x.reshape(-1), at[..., None], dimensions, (1,), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
+
+
+def take_points(x: Array, at: Array) -> Array:
+    """Return the points [d, ...] at these indices of x [n, d], all of which are valid."""
+    dimensions = lax.GatherDimensionNumbers(offset_dims=(0,), collapsed_slice_dims=(0,), start_index_map=(0,))
+    return lax.gather(x, at[..., None], dimensions, (1, x.shape[1]), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
 
 
 def decide_pairs(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) -> Array:
@@ -232,38 +237,33 @@ def _fixed_sign(pair: Pair, threshold: _Threshold) -> Array:
     """Return the sign of |b - a|² - r² where units of step 2 express all its parts, ties included, else _UNKNOWN; int32.
 
     A cutoff is below 4 in scaled lengths, and so is each component of a displacement that step 1 leaves open, up to its band.
+    All axes are processed together, so that the program is short.
     """
-    dtype = np.dtype(pair.a[0].dtype)
+    dtype = np.dtype(pair.a.dtype)
     fraction = fraction_bits(dtype, threshold.times)
     eps, bits = jnp.finfo(dtype).eps, limb_bits(dtype)
-    known, total = jnp.ones(pair.b[0].shape, bool), None
     unsigned, finfo = np.dtype(f"uint{8 * dtype.itemsize}").type, jnp.finfo(dtype)
     exponent = (lax.bitcast_convert_type(threshold.scale, unsigned) >> unsigned(finfo.nmant)).astype(jnp.int32)
     up = exponent + (fraction + bits + int(finfo.minexp) - finfo.nmant - (finfo.maxexp - 1))
-
-    def fixed(x: Array) -> _Fixed:
-        nonlocal known
-        number, whole = _fixed_point(x, up)
-        known = known & whole
-        return number
-
-    matrix = jnp.zeros((0, 0), dtype) if pair.matrix is None else pair.matrix
-    lattice = _fixed_point(matrix.reshape(*matrix.shape, *[1] * up.ndim) if matrix.ndim == 2 else matrix, up)
-    for axis, (ak, bk) in enumerate(zip(pair.a, pair.b, strict=True)):
-        displacement, estimate = _add(fixed(bk), fixed(ak), -1), bk - ak
-        error = jnp.zeros((), dtype)
-        for shift, at in pair.lattice_terms(axis):
-            component, (number, whole) = matrix[at], jax.tree.map(lambda x, at=at: x[at], lattice)
-            known = known & whole
-            displacement = _add(displacement, number, shift.astype(limb_type(dtype)))
-            estimate = estimate + shift * component
-            error = error + 16 * eps * (jnp.abs(ak) + jnp.abs(bk) + jnp.abs(shift * component))
-            known = known & (jnp.abs(shift) <= 2**WHOLE_BITS)
-        known = known & ((jnp.abs(estimate) + error) * threshold.scale < 4.5)
-        square = _square_limbs(displacement, threshold.times, bits)
-        total = square if total is None else [x + y for x, y in zip(total, square, strict=True)]
-    less = threshold.less or [-x for x in _square_limbs(functools.reduce(_add, map(fixed, threshold.radii)), 1, bits)]
-    return jnp.where(known, _sign_of_limbs([x + y for x, y in zip(total or [], less, strict=True)], bits), _UNKNOWN)
+    up_of_axes, scale = (x[None] if x.ndim else x for x in (up, threshold.scale))
+    (a, whole_a), (b, whole_b) = (_fixed_point(x, up_of_axes) for x in (pair.a, pair.b))
+    displacement, estimate, known = _add(b, a, -1), pair.b - pair.a, whole_a & whole_b
+    error = jnp.zeros((), dtype)
+    for shift, vector in pair.lattice_terms():
+        number, whole = _fixed_point(vector, up_of_axes)
+        displacement = _add(displacement, number, shift.astype(limb_type(dtype)))
+        estimate = estimate + shift * vector
+        error = error + 16 * eps * (jnp.abs(pair.a) + jnp.abs(pair.b) + jnp.abs(shift * vector))
+        known = known & whole & (jnp.abs(shift) <= 2**WHOLE_BITS)
+    known = known & ((jnp.abs(estimate) + error) * scale < 4.5)
+    total = [functools.reduce(lax.add, limb) for limb in _square_limbs(displacement, threshold.times, bits)]
+    known = functools.reduce(lax.bitwise_and, known)
+    less = threshold.less
+    if less is None:
+        numbers, wholes = zip(*(_fixed_point(x, up) for x in threshold.radii), strict=True)
+        less = [-x for x in _square_limbs(functools.reduce(_add, numbers), 1, bits)]
+        known = functools.reduce(lax.bitwise_and, wholes, known)
+    return jnp.where(known, _sign_of_limbs([x + y for x, y in zip(total, less, strict=True)], bits), _UNKNOWN)
 
 
 class _Fixed(NamedTuple):
@@ -325,30 +325,16 @@ def _integer_sign(pair: Pair, threshold: _Threshold) -> Array:
     of two radii and twice the differences. A limb of the sum of squares adds 4·29 (4·84) products of limbs carried by
     `carry_limbs`, which stays below 2^30 (2^61).
     """
-    dim, radii, dtype = len(pair.a), threshold.radii, np.dtype(pair.a[0].dtype)
+    (dim, size), radii, dtype = pair.b.shape, threshold.radii, np.dtype(pair.a.dtype)
     count, whole = full_count(dtype) + 3, limb_type(dtype)  # room for carries and the sign
     ends = radii[0], -radii[1] if len(radii) == 2 else jnp.zeros((), dtype)
-    limbs = limbs_of(beside([*pair.b, ends[0], *pair.a, ends[1]]), count)  # [k, 2 (d + 1), ...]
-    times = np.array([threshold.times] * dim + [1], whole)[None, :, None]
-    squared = (limbs[:, : dim + 1] - limbs[:, dim + 1 :]) * times
-    if pair.shift is not None and pair.matrix is not None:
-        shift = beside(pair.shift).astype(whole)
-        squared = squared + _translation_limbs(shift, pair.matrix, count, pair.orthogonal) * times
+    ends = [jnp.broadcast_to(x.reshape(1, -1), (1, size)) for x in ends]
+    limbs = limbs_of(jnp.concatenate([pair.b, ends[0], pair.a, ends[1]]), count)  # [2 (d + 1), k, ...]
+    times = np.array([threshold.times] * dim + [1], whole)[:, None, None]
+    squared = (limbs[: dim + 1] - limbs[dim + 1 :]) * times
+    for shift, vector in pair.lattice_terms():
+        translation = shift.astype(whole)[..., None] * limbs_of(vector, count)
+        squared = squared + jnp.pad(translation, ((0, 1), (0, 0), (0, 0))) * times
     squared = carry_limbs(squared)
-    signs = np.array([1] * dim + [-1], whole)[None, :, None]
-    return limb_sign(jnp.sum(limb_product(squared * signs, squared), axis=1, dtype=whole))
-
-
-def _translation_limbs(shift: Array, vectors: Array, count: int, orthogonal: bool) -> Array:
-    """Return the sum of shifts [k, t] times lattice vectors [t, d] as limbs [k, d + 1, ...]; the last axis entry is 0.
-
-    Where each pair has a lattice of its own, vectors are [t, d, k].
-    """
-    dim, shift = vectors.shape[1], shift[..., None]
-    vectors = vectors[None] if vectors.ndim == 2 else jnp.moveaxis(vectors, -1, 0)
-    limbs = limbs_of(jnp.pad(vectors, ((0, 0), (0, 0), (0, 1))), count)  # [1 or k, t, d + 1, ...]
-    if orthogonal:
-        vectors_of = np.eye(dim, dim + 1, dtype=limbs.dtype)
-        limbs = jnp.sum(vectors_of[None, ..., None] * limbs[:, :dim], axis=1, dtype=limbs.dtype)
-        return jnp.pad(shift[:, :dim], ((0, 0), (0, 1), (0, 0))) * limbs
-    return functools.reduce(jnp.add, (shift[:, k, None] * limbs[:, k] for k in range(limbs.shape[1])))
+    signs = np.array([1] * dim + [-1], whole)[:, None, None]
+    return limb_sign(jnp.sum(limb_product(squared * signs, squared), axis=0, dtype=whole))

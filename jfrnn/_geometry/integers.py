@@ -49,13 +49,6 @@ def fields_of(x: Array) -> tuple[Array, Array, Array]:
     return bits != magnitude, jnp.maximum(exponent.astype(jnp.int32), 1) - 1, mantissa
 
 
-def beside(columns: list[Array]) -> Array:
-    """Stack columns, [k] or scalars, to [k, columns]. `jnp.stack` would become one loop per column on the CPU."""
-    place = np.arange(len(columns), dtype=np.int32)[None]
-    rows = [jnp.reshape(column, (-1, 1)) for column in columns]
-    return functools.reduce(lambda left, k: jnp.where(place == k, rows[k], left), range(1, len(rows)), rows[0])
-
-
 def limbs_of(x: Array, count: int, origin: Array | None = None) -> Array:
     """Return finite floats [...] as limbs [..., GUARDS + count] below 2^bits; the unit is the bit at position `origin` [...], or 0.
 
