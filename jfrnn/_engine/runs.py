@@ -113,7 +113,7 @@ def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filte
 
         def add(words: _HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
             (out, at), (hits, first, image) = found, words
-            bits = BitRows.of(hits, tuning.in_groups)
+            bits = BitRows.of(hits, tuning.by_gathers)
             total = bits.total
 
             def add_group(state: tuple[Array, Array]) -> tuple[Array, Array]:
