@@ -61,7 +61,7 @@ def pairs_found(nbrs, x, **queries):
 
 def each_case():
     often = {("exclude", "images", "warp", 3, np.float32), ("table, exclude", "images", "warp", 3, np.float32)}
-    often |= {("exclude", "open", "warp", 2, np.float32), ("exclude", "open", "brute", 2, np.float32)}
+    often |= {("exclude", "open", "warp", 3, np.float32), ("exclude", "open", "brute", 2, np.float32)}
     for who, box, backend in product(("exclude", "table", "table, exclude"), BOXES, ("warp", "jax", "brute")):
         for dim, dtype in product((2, 3), (np.float32, np.float64)):
             kind = f"{who}-{box}-{backend}-{dim}d-f{8 * dtype().itemsize}"
@@ -170,7 +170,7 @@ def test_sums_and_their_gradients(who, backend, box, fn):
 @pytest.mark.parametrize("backend", ["warp", pytest.param("brute", marks=SLOW)])
 def test_sums_for_queries(backend):
     """A derivative by the positions sums over the rows of the particles, which exclude the queries that exclude them."""
-    x, _, pairs = scene(np.float32, 2)
+    x, _, pairs = scene(np.float32, 3)
     queries, pairs = x[:20] + np.float32(1 / 8), pairs[pairs[:, 0] < 20]
 
     def total(x, q):
@@ -241,7 +241,7 @@ def test_grow_and_chunks():
 
 
 def test_what_is_traced_sets_bits():
-    x, species, pairs = scene(np.float32, 2)
+    x, species, pairs = scene(np.float32, 3)
     traces = []
 
     @jax.jit
@@ -309,7 +309,7 @@ def test_nobody_is_excluded_by_no_pairs():
 
 
 def test_rows_of_partners_are_pairs():
-    x = scene(np.float32, 2)[0][:20]
+    x = scene(np.float32, 3)[0][:20]
     rows = np.array([[i + 1, i + 2] if i < 18 else [-1, i - 3] for i in range(20)])
     bonded = [(i, j) for i in range(20) for j in rows[i] if j >= 0]
     assert pairs_found(jfrnn.search(x, 3 / 8, exclude=jfrnn.pairs_of_rows(rows)), x) == expected_pairs(

@@ -57,7 +57,7 @@ def refusal(inputs: Inputs, platform: str) -> str | None:
     if platform not in PLATFORMS:
         return f"on the platform {platform!r}, only on the CPU and on CUDA"
     if platform != "cpu" and isinstance(inputs.cutoff, Radii):
-        return f"with a cutoff per particle on the platform {platform!r}, only on the CPU"
+        return f"with a cutoff per particle or pair of species on the platform {platform!r}, only on the CPU"
     if platform != "cpu" and inputs.box is not None and inputs.sources.shape[0] >= MOST_IN_BOX:
         return f"of more than {MOST_IN_BOX - 1} positions in a periodic box on the platform {platform!r}"
     return None
