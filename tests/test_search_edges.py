@@ -97,7 +97,7 @@ def test_systems(backend):
     nbrs = jfrnn.search_edges(x, CUTOFF, batch=systems, box=box_of("images"), backend=backend)
     assert_right(nbrs, x, {p for p in oracle(x, "images") if systems[p[0]] == systems[p[1]]})
     cells = np.array([[0.5, 0.3, 1.0], [1.0, 1.0, 1.0], [0.4, 0.6, 0.8]], np.float32)
-    nbrs = jfrnn.search_edges(x, CUTOFF, batch=systems, box=jfrnn.Box(cells), backend=backend)
+    nbrs = jfrnn.search_edges(x, CUTOFF, batch=systems, box=jfrnn.Box(cells, per_system=True), backend=backend)
     expected = set()
     for system, cell in enumerate(cells):
         members = np.flatnonzero(systems == system)

@@ -45,9 +45,8 @@ def flatten_slots(mask: Array, starts: Array, total: int, cuda: bool) -> tuple[A
 
 @kernel
 def _flatten_callable(cuda: bool) -> Call:
-    results = dict.fromkeys(("receivers", "slots", "info"), np.int32)
-    plan = functools.partial(_plan_flatten, cuda)
-    return Call(f"jfrnn_flatten_{'cuda' if cuda else 'cpu'}", ("mask", "starts"), results, plan)
+    name, plan = f"jfrnn_flatten_{'cuda' if cuda else 'cpu'}", functools.partial(_plan_flatten, cuda)
+    return Call(name, ("mask", "starts"), dict.fromkeys(("receivers", "slots", "info"), np.int32), plan)
 
 
 def _plan_flatten(cuda: bool, shapes: Shapes, _: int) -> Plan:
