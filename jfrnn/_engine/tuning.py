@@ -49,7 +49,7 @@ CPU = Tuning(  # a block fits into the caches, and loops cost little
     doubtful_share=1,
     doubtful_rows=64,
     by_gathers=False,
-    group=128,
+    group=32,
 )
 ACCELERATOR = Tuning(  # few large kernels, in at most 1 GB
     scratch=900_000_000,
