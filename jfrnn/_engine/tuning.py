@@ -27,7 +27,8 @@ class Tuning(NamedTuple):
             sorted 17 408 pairs of words on an H200 by a chain of its own kernels, and 33 792 by CUB, which takes less time.
         doubtful_share: Rows with pairs that are decided exactly are processed in parts of a block, one of so many,
         doubtful_rows: but at least so many rows at a time.
-        by_gathers: Whether what a slot needs to know of a group of words is gathered, instead of chosen by looking at every group.
+        by_gathers: Whether what a slot needs to know of a group of words, and a word of its run, is gathered, instead of chosen by
+            looking at every group or run.
         group: Slots of a row that are filled at a time.
     """
 
@@ -49,7 +50,7 @@ CPU = Tuning(  # a block fits into the caches, and loops cost little
     doubtful_share=1,
     doubtful_rows=64,
     by_gathers=False,
-    group=128,
+    group=32,
 )
 ACCELERATOR = Tuning(  # few large kernels, in at most 1 GB
     scratch=900_000_000,

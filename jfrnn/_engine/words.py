@@ -55,7 +55,8 @@ class BitRows(NamedTuple):
         in_group = (high >> np.uint32(24)).astype(jnp.int32)
         before = np.tril(np.ones((groups, groups), np.int32), -1)
         earlier = jnp.sum(in_group[:, None] * before[None], axis=2, dtype=jnp.int32)
-        return cls(hits, *lax.optimization_barrier((earlier, low, high)), by_gathers)
+        earlier, low, high = lax.optimization_barrier((earlier, low, high))
+        return cls(hits, earlier, low, high, by_gathers)
 
     @property
     def total(self) -> Array:
