@@ -159,7 +159,7 @@ def _operands(given: KeptList, extra: _Extra, columns: int, others: Array | None
     if kind.reversed:
         sources, rows, turns = rows, sources, turns[::-1]
     of_sources, of_rows = _radii_of(given, kind)
-    points = _beside(kind.length(columns), sources, others if columns else None, turns[0], of_sources, rows=len(sources) + 1)
+    points = _beside(kind.length(columns), sources, others if columns else None, turns[0], of_sources, more=1)
     own = _beside(kind.own_length, rows, turns[1], of_rows)
     cutoff = given.cutoff.largest if isinstance(given.cutoff, Cutoffs) else given.cutoff.radius
     nothing, steps = jnp.zeros(1, jnp.int32), jnp.zeros(1, dtype)
@@ -208,10 +208,9 @@ def _radii_of(given: KeptList, kind: kept.ListKind) -> tuple[Array | None, Array
     return (found[1], found[0]) if kind.reversed else (found[0], found[1])
 
 
-def _beside(length: int, *parts: Array | None, rows: int = 0) -> Array:
-    """Return arrays of points side by side, and NaN up to a length and a number of rows."""
+def _beside(length: int, *parts: Array | None, more: int = 0) -> Array:
+    """Return arrays of points side by side, zeros up to a length, and `more` points whose numbers are NaN."""
     given = [x if x.ndim == 2 else x[:, None] for x in parts if x is not None]
-    more = max(rows - len(given[0]), 0)
     given = [jnp.pad(x, ((0, more), (0, 0)), constant_values=jnp.nan) for x in given]
     rows, filled = jnp.pad(given[0], ((0, 0), (0, length - given[0].shape[1]))), given[0].shape[1]
     for column in (x[:, k] for x in given[1:] for k in range(x.shape[1])):  # on a GPU, XLA's concatenation takes twice as long
