@@ -73,8 +73,8 @@ def pair_sum(
         backend: "jax" (cells, any device), "brute" (all n·m candidates), "warp" (cells, on the CPU and on CUDA: fn is translated
             into the kernel that finds the pairs), or "auto": on the CPU "warp" if it supports the sum, else "jax". "warp" sums
             floats of the dtype of the positions; values and closed-over arrays have that dtype, or are smaller floats, bool, int32
-            or (float64) int64; cutoffs per particle and per pair of species work on the CPU only. A box per system is taken on both.
-            If fn or its derivative has no translation, "auto" warns.
+            or (float64) int64; cutoffs per particle and per pair of species work on the CPU only. A box per system is taken on
+            both. If fn or its derivative has no translation, "auto" warns.
         neighbors: A list to use instead of a search: its pairs that are closer than its cutoff at these positions, as in
             `NeighborList.vectors`. A half list gives whole sums too. Leave out the options with which it was made. If the list may
             lack pairs (see `NeighborList.check`), this raises outside jit. Over lists that "warp" made, on the CPU and on CUDA, a
