@@ -257,6 +257,9 @@ def _style(method: str, chosen: Sequence[str], size: float = 6.5) -> Any:  # noq
 def _draw_lines(axes: Axes, lines: Lines, chosen: Sequence[str]) -> None:
     for name in reversed(chosen):  # ours on top
         axes.plot(*zip(*sorted(lines[name].items()), strict=True), **_style(name, chosen))
+    drawn = [value for name in chosen for value in lines[name].values()]
+    if drawn and max(drawn) < 1.01 * min(drawn):  # one and the same number, around which Matplotlib finds no decade
+        axes.set_ylim(min(drawn) / 2, max(drawn) * 2)
 
 
 def _name_lines(axes: Axes, lines: Lines, chosen: Sequence[str]) -> None:

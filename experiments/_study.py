@@ -34,9 +34,9 @@ def rows(sweep: str, small: bool, results: str | None = None) -> list[SearchRow]
     folder = ROOT / "results" / (results or sweep)
     if not small and (folder / "rows.jsonl").exists():
         return read_latest(folder)
-    config = shrink(_config.load(ROOT / "configs" / f"{sweep}.toml"))
     if small:
-        return list(_measure(config))
+        return list(_measure(sweep))
+    config = shrink(_config.load(ROOT / "configs" / f"{sweep}.toml"))
     with redirect_stderr(io.StringIO()):  # its progress is no result
         made = _sweep.run(config, f"{sweep}, small", ROOT.parent / "out" / "small" / sweep)
     command = f"python -m experiments run experiments/configs/{sweep}.toml --out {folder.relative_to(ROOT.parent)}"
@@ -45,8 +45,9 @@ def rows(sweep: str, small: bool, results: str | None = None) -> list[SearchRow]
 
 
 @cache
-def _measure(config: Config) -> tuple[SearchRow, ...]:
+def _measure(sweep: str) -> tuple[SearchRow, ...]:
     """Return rows of a small sweep, measured in this process, once however many ask for them."""
+    config = shrink(_config.load(ROOT / "configs" / f"{sweep}.toml"))
     gc.freeze()  # a row collects garbage before it measures memory: what is imported is none, and slow to look through
     try:
         with tempfile.TemporaryDirectory() as out:

@@ -37,6 +37,7 @@ def given():
     arrays |= {"active": jnp.asarray(active), "batch": jnp.asarray(np.arange(N) % 2), "query_batch": jnp.asarray(np.arange(M) % 2)}
     arrays["hidden"] = jnp.asarray(np.where(active[:, None], points["x"], np.nan), np.float32)
     arrays["faces"] = jnp.asarray([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    arrays["partners"] = jnp.asarray(np.arange(2 * N, dtype=np.int32).reshape(N, 2) % N)
     arrays["cells"] = jnp.asarray(rng.integers(0, 16, (N, 3)))
     return arrays
 
@@ -152,6 +153,13 @@ def encoded():
     return results
 
 
+def flat():
+    g = given()
+    options = options_of("box") | {"exclude": jfrnn.pairs_of_rows(g["partners"])}
+    found = jfrnn.search_edges(g["x"], CUTOFF, total=128, backend="warp", **options)
+    return found, found.edges(g["x"])
+
+
 def planned():
     plans = jfrnn.memory_plan(N, CUTOFF, 8, backend="warp"), jfrnn.memory_plan(N, CUTOFF, backend="jax")
     return [np.array(plan.total_bytes) for plan in plans]
@@ -166,6 +174,7 @@ def with_radii(verb, rule, names="", backend="warp"):
 CASES = {
     "search": listed,
     "search box skin active": lambda: listed("box skin active", x="hidden"),
+    "search_edges box exclude": flat,
     "count": counted,
     "pair_sum active": lambda: (summed("active", x="hidden"), differentiated("active")),
     "sort_order hilbert": lambda: ordered("hilbert"),
@@ -267,7 +276,14 @@ def test_same_bits_in_a_mode(mode, name):
 def test_every_public_name_is_in_a_mode():
     """What this file knows of: a function that is new is added to a table above."""
     asked = {name.split()[0] for name in CASES | SLOW_CASES}
-    asked |= {"search_triangles", "hilbert_encode", "hilbert_decode", "morton_encode", "morton_decode"}  # triangles, codes
+    asked |= {
+        "pairs_of_rows",
+        "search_triangles",
+        "hilbert_encode",
+        "hilbert_decode",
+        "morton_encode",
+        "morton_decode",
+    }  # triangles, codes
     functions = {name for name in jfrnn.__all__ if not isinstance(getattr(jfrnn, name), type)}
     assert sorted(functions - asked) == []
 

@@ -16,6 +16,7 @@ from jfrnn._search.problem import check_problem
 from jfrnn._sums import fused as _fused
 from jfrnn._sums.verb import _with_engine
 from jfrnn.kernels import _compile, few_cuda, pair_sum_cpu, pair_sum_cuda
+from jfrnn.kernels._native import EXCLUDED
 
 CUTOFF = 0.1
 
@@ -185,7 +186,7 @@ def test_programs_for_cuda_call_it_and_plans_have_the_arguments_of_their_kernels
     assert f'"jfrnn_pair_sum_cuda_3d_f32_own_dropself_{"nearest_" * periodic}' in program
     plan = plan_of(functools.partial(square_sum, box=box), *arguments(np.float32, 3)[:3])
     assert f'"jfrnn_sorting_cuda_3d_f32_own{"_nearest" * periodic}@' in program
-    variant = warp_sums._SumVariant(3, False, False, True, False, True, periodic, False, False, False, plan.key, True, False)
+    variant = warp_sums._SumVariant(3, False, False, True, False, True, periodic, False, False, False, plan.key, True, False, False)
     given = {name: (40, 3) for name in warp_sums._GIVEN}
     sorting = warp_sums._plan_sorting(warp_sums._sorting(variant), given, 132)
     summing = warp_sums._plan_on_cuda(variant, plan.text, given, 132)
@@ -198,20 +199,20 @@ def test_programs_for_cuda_call_it_and_plans_have_the_arguments_of_their_kernels
     ):
         for step in found.steps:
             numbers = {**found.numbers, **step.numbers}
-            assert {field.name for field in step.kernel.fields if field.is_array} <= arrays | set(found.absent)
+            assert {field.name for field in step.kernel.fields if field.is_array} <= arrays | {*found.absent, *EXCLUDED}
             assert all(0 <= numbers[field.name] < 2**31 for field in step.kernel.fields if not field.is_array)
 
 
 def test_few_particles_take_one_launch():
     x = jnp.zeros((40, 3), np.float32)
     plan = plan_of(lambda x: jfrnn.pair_sum(poly6, x, CUTOFF, x[:, 0], backend="warp"), x)
-    variant = warp_sums._SumVariant(3, False, False, True, False, True, 0, False, False, False, plan.key, True, True)
+    variant = warp_sums._SumVariant(3, False, False, True, False, True, 0, False, False, False, plan.key, True, True, False)
     found = warp_sums._plan_few(variant, plan.text, {name: (40, 3) for name in warp_sums._GIVEN}, 132)
     (launch,) = found.steps
     assert launch.threads // launch.kernel.block == few_cuda.blocks(40) == 5
     assert [few_cuda.warps(m) for m in (0, 1, 1024, 1025, 2048, 2049, few_cuda.MOST)] == [8, 8, 8, 16, 16, 32, 32]
     arrays = {*warp_sums._GIVEN, *warp_sums._RESULTS}
-    assert {field.name for field in launch.kernel.fields} <= arrays | set(found.numbers)
+    assert {field.name for field in launch.kernel.fields} <= arrays | {*found.numbers, *EXCLUDED}
     for size, few in ((few_cuda.MOST, True), (few_cuda.MOST + 1, False)):
         program = jax.jit(lambda x: jfrnn.count(x, CUTOFF, backend="warp")).trace(jnp.zeros((size, 3), np.float32))
         assert ("jfrnn_few_cuda_" in program.lower(lowering_platforms=("cuda",)).as_text()) == few

@@ -44,6 +44,7 @@ def examples():
         particles.required,
         spread,
         spread.halo,
+        jfrnn.search_edges(X, 0.3, total=200, skin=0.05, exclude=jnp.array([[0, 1]]), backend="warp"),
     ]
 
 

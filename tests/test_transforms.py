@@ -45,6 +45,7 @@ FUNCTIONS = {
     "count, batch": lambda x: jfrnn.count(x, CUTOFF, batch=(4 * x[:, 0]).astype(jnp.int32), backend="warp"),
     "count, hashgrid": lambda x: jfrnn.count(x, CUTOFF, backend="hashgrid"),
     "count, box per system": lambda x: jfrnn.count(x, CUTOFF, box=jfrnn.Box(1.0 + x[0]), backend="warp"),
+    "search_edges": lambda x: jfrnn.search_edges(x, CUTOFF, total=300, backend="warp"),
     "update": lambda x: LISTS["open"](x).update(x + 0.1),
     "update, skin": lambda x: LISTS["skin"](x).update(x + jnp.where(x[0, 0] > 0.5, 0.1, 0.0).astype(x.dtype)),
     "update, box": lambda x: LISTS["box"](x).update(x + 0.1),
