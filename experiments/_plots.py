@@ -111,6 +111,7 @@ def by_fill(rows: Sequence[SearchRow], quantity: Quantity) -> Figure:
     ticks = [number * 10.0**power for power in range(-6, 3) for number in (1, 2, 5) if number * 10**power <= 100]
     if places:
         axes.set_xlim(min(places.values()) / 1.25, max(places.values()) * 1.25)
+    _make_room(axes, [value for of in found.values() for values in of.values() for value in values])
     axes.set(xscale="log", yscale="log", xlabel="fill: points / points of the full domain [%]", ylabel=quantity.label)
     axes.xaxis.set_major_locator(FixedLocator(ticks))
     axes.xaxis.set_minor_locator(NullLocator())
@@ -257,8 +258,12 @@ def _style(method: str, chosen: Sequence[str], size: float = 6.5) -> Any:  # noq
 def _draw_lines(axes: Axes, lines: Lines, chosen: Sequence[str]) -> None:
     for name in reversed(chosen):  # ours on top
         axes.plot(*zip(*sorted(lines[name].items()), strict=True), **_style(name, chosen))
-    drawn = [value for name in chosen for value in lines[name].values()]
-    if drawn and max(drawn) < 1.01 * min(drawn):  # one and the same number, around which Matplotlib finds no decade
+    _make_room(axes, [value for name in chosen for value in lines[name].values()])
+
+
+def _make_room(axes: Axes, drawn: Sequence[float]) -> None:
+    """Show what is about one and the same number: around that, Matplotlib finds no decade."""
+    if drawn and max(drawn) < 1.01 * min(drawn):
         axes.set_ylim(min(drawn) / 2, max(drawn) * 2)
 
 
