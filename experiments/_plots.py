@@ -172,6 +172,7 @@ def of_all(rows: Sequence[SearchRow], quantity: Quantity) -> Figure:
         for place, value in zip(x, y, strict=True):
             axes.plot(place, value, "o", ms=3.5, color=color, mfc="white" if (method, place) in wrong else color)
         axes.set_title(_look.name_of(method), loc="left", fontsize=8, color=color, pad=2)
+        _make_room(axes, [value for line in lines.values() for value in line.values()])
         axes.set(yscale="log", xticks=range(len(names)))
         axes.tick_params(labelsize=7)
         axes.set_xticklabels([str(k + 1) for k in range(len(names))], fontsize=5.5)
