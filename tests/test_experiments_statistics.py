@@ -139,7 +139,7 @@ def test_the_page_needs_nothing_besides_and_pandas_reads_the_table(tmp_path):
     assert CliRunner().invoke(app, ["report", str(tmp_path)], catch_exceptions=False).exit_code == 0
     text = (tmp_path / "report.html").read_text()
     page = Page(text)
-    assert len(page.sources) == 7
+    assert len(page.sources) == 9
     assert all(source.startswith("data:image/png;base64,") for source in page.sources)
     assert page.links == []
     assert "jax&lt;b&gt;" in text
