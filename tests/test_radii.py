@@ -216,6 +216,7 @@ def test_spheres_touch_at_the_sum_of_their_radii(backend, dtype):
     assert set(zip(*(part.tolist() for part in nbrs.pairs()))) == touching(x, h, x[:9] + dtype(0.125), h[:9])
 
 
+@pytest.mark.slow
 def test_spheres_that_grow():
     rng = np.random.default_rng(5)
     x, h = rng.random((40, 3)).astype(np.float32), rng.uniform(0, 0.1, 40).astype(np.float32)

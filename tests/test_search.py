@@ -60,7 +60,7 @@ def test_queries(m, backend, dtype, dim):
     np.testing.assert_array_equal(jfrnn.count(points, 0.2, queries=queries, backend=backend), nbrs.count)
 
 
-@pytest.mark.parametrize("backend", ["jax", "warp"])
+@pytest.mark.parametrize("backend", [pytest.param("jax", marks=pytest.mark.slow), "warp"])
 def test_rows_longer_than_one_group_of_slots(backend):
     points = random_points(1500, 3, np.float32)
     nbrs = jfrnn.search(points, 0.6, capacity=1500, backend=backend)

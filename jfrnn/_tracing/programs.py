@@ -129,5 +129,9 @@ def _maps_are_scarce() -> bool:
         limit = int(Path("/proc/sys/vm/max_map_count").read_text())
         with Path("/proc/self/maps").open("rb") as maps:
             return sum(1 for _ in maps) > _SHARE * limit
-    except (OSError, ValueError):
+    except (
+        FileNotFoundError,
+        PermissionError,
+        ValueError,
+    ):  # not OSError: a handler of signals may raise TimeoutError, which is one
         return False
