@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from textwrap import fill
 
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -94,8 +95,6 @@ def make_axes(title: str, height: float) -> tuple[Figure, Axes]:
 
 def head(figure: Figure, title: str) -> None:
     """Write what is to be seen above a figure, in lines as wide as it."""
-    from textwrap import fill
-
     figure.suptitle(fill(title, 78), x=0.015, ha="left", fontsize=11, fontweight="bold")
 
 

@@ -12,6 +12,7 @@ import pytest
 
 import jfrnn
 from jfrnn._engine import warp_sums
+from jfrnn._engine.variants import SumVariant
 from jfrnn._search.problem import check_problem
 from jfrnn._sums import fused as _fused
 from jfrnn._sums.verb import _with_engine
@@ -186,7 +187,7 @@ def test_programs_for_cuda_call_it_and_plans_have_the_arguments_of_their_kernels
     assert f'"jfrnn_pair_sum_cuda_3d_f32_own_dropself_{"nearest_" * periodic}' in program
     plan = plan_of(functools.partial(square_sum, box=box), *arguments(np.float32, 3)[:3])
     assert f'"jfrnn_sorting_cuda_3d_f32_own{"_nearest" * periodic}@' in program
-    variant = warp_sums._SumVariant(3, False, False, True, False, True, periodic, False, False, False, plan.key, True, False, False)
+    variant = SumVariant(3, False, False, True, False, True, periodic, False, False, False, plan.key, True, False, False)
     given = {name: (40, 3) for name in warp_sums._GIVEN}
     sorting = warp_sums._plan_sorting(warp_sums._sorting(variant), given, 132)
     summing = warp_sums._plan_on_cuda(variant, plan.text, given, 132)
@@ -206,7 +207,7 @@ def test_programs_for_cuda_call_it_and_plans_have_the_arguments_of_their_kernels
 def test_few_particles_take_one_launch():
     x = jnp.zeros((40, 3), np.float32)
     plan = plan_of(lambda x: jfrnn.pair_sum(poly6, x, CUTOFF, x[:, 0], backend="warp"), x)
-    variant = warp_sums._SumVariant(3, False, False, True, False, True, 0, False, False, False, plan.key, True, True, False)
+    variant = SumVariant(3, False, False, True, False, True, 0, False, False, False, plan.key, True, True, False)
     found = warp_sums._plan_few(variant, plan.text, {name: (40, 3) for name in warp_sums._GIVEN}, 132)
     (launch,) = found.steps
     assert launch.threads // launch.kernel.block == few_cuda.blocks(40) == 5

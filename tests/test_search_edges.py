@@ -246,3 +246,12 @@ def test_positions_that_are_not_finite_are_told():
     with pytest.raises(ValueError, match="non-finite"):
         nbrs.check()
     assert 3 not in np.asarray(nbrs.edges(jnp.asarray(x)).senders)
+
+
+def test_a_line_says_what_the_list_is():
+    x = jnp.zeros((5, 3), np.float32)
+    one = jfrnn.search_edges(x, 1.0, total=30, queries=x[:2], backend="warp")
+    assert repr(one) == "EdgeList(2 queries of 5 particles, total 30, cutoff 1, engine 'warp', 10 pairs, status OK)"
+    many = jax.vmap(lambda x: jfrnn.search_edges(x, 1.0, total=8, backend="warp"))(x[None])
+    assert repr(many) == "EdgeList(batch of [1], 5 particles, total 8, cutoff 1, engine 'warp', 20 pairs, status TOTAL_OVERFLOW)"
+    assert "total None" in repr(jax.tree.map(lambda _: None, one))  # whatever stands where arrays stood

@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +13,8 @@ from jfrnn._engine.operands import excluded_rows, lattice_numbers, particle_rows
 from jfrnn._engine.plans import Clear, Launch, Plan, share
 from jfrnn._engine.problem import Filter, Room, Rows, Search, largest_radius
 from jfrnn._engine.sum_results import FoundSums, SumsOf
-from jfrnn._engine.variants import Variant, absent, describe_call, huge_pages, plan_numbers, row_dims, split_rows
-from jfrnn._geometry import Lattice, Status, Wrapped, most_cells, sort_into_boxes, unpack_turns
+from jfrnn._engine.variants import SumVariant, Variant, absent, describe_call, found_rows, huge_pages, plan_numbers, row_dims
+from jfrnn._geometry import Lattice, Wrapped, most_cells, sort_into_boxes, unpack_turns
 from jfrnn.kernels import boxes
 from jfrnn.kernels._native import EXCLUDED
 from jfrnn.kernels.pair_sum_cpu import TermText
@@ -38,9 +37,7 @@ def box_neighbors(search: Search, keep: Filter, capacity: int | Room | None) -> 
         return call
 
     *written, count, info = lax.platform_dependent(search, *starts, cpu=on(False), cuda=on(True))
-    overflow = isinstance(capacity, int) and info[0] > capacity
-    status = jnp.where(overflow, Status.ROW_OVERFLOW.value, 0).astype(jnp.int32)
-    return Rows(**split_rows(written), counts=count, required=info[0], status=status)
+    return found_rows(written, count, info[0], capacity)
 
 
 def _operands(search: Search, cuda: bool) -> list[Array]:
@@ -114,23 +111,6 @@ def _plan(variant: Variant, cuda: bool, shapes: Shapes, _: int) -> Plan:
 # --- sums ----------------------------------------------------------------------------------------------------------------
 
 
-class _SumVariant(NamedTuple):
-    """All that is static about a pair sum, apart from shapes; `key` names the text."""
-
-    dim: int
-    double: bool
-    scaled: bool
-    own: bool
-    closed: bool
-    drop_self: bool
-    periodic: int
-    compensated: bool
-    extremes: bool
-    excluding: bool
-    key: str
-    cuda: bool
-
-
 def box_sums(
     search: Search,
     keep: Filter,
@@ -145,9 +125,9 @@ def box_sums(
     cutoff, shared, own, others = search.cutoff, *values
 
     def on(cuda: bool) -> Callable[..., FoundSums]:
-        flags = search.queries is None, cutoff.closed, keep.drop_self, periodic_kind(search.torus), compensated, extremes
-        flags += (search.exclude is not None,)
-        call_sums = _sum_callable(_SumVariant(dim, double, cutoff.scaled, *flags, key, cuda), term)
+        flags = search.queries is None, cutoff.closed, keep.drop_self, periodic_kind(search.torus), True
+        kind = compensated, extremes, key, cuda, False, search.exclude is not None
+        call_sums = _sum_callable(SumVariant(dim, double, cutoff.scaled, *flags, *kind), term)
         results = SumsOf(term, m, boxes.slots(m, cuda), compensated, extremes)
 
         def call(search: Search, shared: Array, own: Array, others: Array) -> FoundSums:
@@ -175,16 +155,15 @@ _SUMS = ("sums", "totals", "errors", "more")  # what a kernel writes
 
 
 @kernel
-def _sum_callable(variant: _SumVariant, term: TermText) -> Call:
-    scalar, flags = np.float64 if variant.double else np.float32, variant._asdict()
-    on = [flag for flag, on in flags.items() if on is True]
-    where = f"{variant.dim}d_{'f64' if variant.double else 'f32'}_{variant.periodic}"
+def _sum_callable(variant: SumVariant, term: TermText) -> Call:
+    scalar = np.float64 if variant.double else np.float32
     results = dict.fromkeys(_SUMS, scalar) | {"info": np.int32}
     given = (*_GIVEN, "shared_values", "own_values", "columns", *EXCLUDED * variant.excluding)
-    return Call("_".join(["jfrnn_box_sums", where, *on, variant.key]), given, results, functools.partial(_plan_sums, variant, term))
+    name = variant.name(f"box_sums_{'cuda' if variant.cuda else 'cpu'}")
+    return Call(name, given, results, functools.partial(_plan_sums, variant, term))
 
 
-def _plan_sums(variant: _SumVariant, term: TermText, shapes: Shapes, _: int) -> Plan:
+def _plan_sums(variant: SumVariant, term: TermText, shapes: Shapes, _: int) -> Plan:
     kind = variant.dim, variant.double, variant.scaled, variant.compensated, variant.extremes, variant.periodic
     found, cuda = boxes.sum_kernel(term, variant.key, *kind, variant.cuda, variant.excluding), variant.cuda
     n, m, stride = shapes["positions"][0], shapes["queries"][0], shapes["axes"][1]

@@ -13,7 +13,7 @@ from jfrnn._engine.operands import excluded_rows, lattice_numbers, particle_rows
 from jfrnn._engine.plans import Clear, Launch, Plan, share
 from jfrnn._engine.problem import Filter, Room, Rows, Search
 from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText
-from jfrnn._engine.variants import absent, row_dims, split_rows
+from jfrnn._engine.variants import absent, found_rows, row_dims
 from jfrnn._geometry import GROUPS, HALVINGS, Cutoffs, Levels
 from jfrnn.kernels import levels as level_kernels
 from jfrnn.kernels import pair_sum_levels
@@ -52,9 +52,7 @@ def _call_levels(cuda: bool, keep: Filter, capacity: int | Room | None, search: 
     variant = _variant_of(search, keep, lists, cuda)._replace(flat=bool(starts))
     dims = {**row_dims(m, capacity), "count": m, "info": 2}
     *written, count, info = _level_callable(variant)(*_operands(search, levels), *starts, output_dims=dims)
-    overflow = info[0] > capacity if isinstance(capacity, int) else jnp.zeros((), bool)
-    status = overflow.astype(jnp.int32)  # Status.ROW_OVERFLOW
-    return Rows(**split_rows(written), counts=count, required=info[0], status=status)
+    return found_rows(written, count, info[0], capacity)
 
 
 def level_sums(

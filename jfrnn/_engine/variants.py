@@ -1,16 +1,18 @@
-"""What is static about a call of kernels that list or count neighbors, and what follows from that: its name, and its numbers."""
+"""What is static about a call of kernels that list, count or sum, and what follows from that: its name, and its numbers."""
 
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jfrnn._engine.launch import Call, Shapes
 from jfrnn._engine.operands import space_flags
 from jfrnn._engine.plans import HugePages, Plan, ask_for_huge_pages
-from jfrnn._engine.problem import Filter, Room
+from jfrnn._engine.problem import Filter, Room, Rows
+from jfrnn._geometry import Status
 from jfrnn.kernels._native import EXCLUDED, table_cells
 
 _PARTICLES = ("positions", "queries", "cutoff")  # what kernels of cells are given
@@ -30,6 +32,33 @@ class Variant(NamedTuple):
     batched: bool = False
     excluding: bool = False
     flat: bool = False  # a list whose rows follow each other without gaps
+
+
+class SumVariant(NamedTuple):
+    """All that is static about a pair sum, apart from shapes; `key` names the text."""
+
+    dim: int
+    double: bool
+    scaled: bool
+    own: bool
+    closed: bool
+    drop_self: bool
+    periodic: int
+    batched: bool
+    compensated: bool
+    extremes: bool
+    key: str
+    cuda: bool
+    few: bool  # all of them meet
+    excluding: bool
+
+    def name(self, of: str) -> str:
+        """Return the name of a call, which tells it from all others."""
+        flags = {"f64": self.double, "f32": not self.double, "scaled": self.scaled, "own": self.own}
+        flags |= {"closed": self.closed, "dropself": self.drop_self, "batched": self.batched, **space_flags(self.periodic)}
+        flags |= {"compensated": self.compensated, "extremes": self.extremes, "excluding": self.excluding}
+        flags |= {self.key: bool(self.key)}
+        return "_".join([f"jfrnn_{of}_{self.dim}d", *(flag for flag, on in flags.items() if on)])
 
 
 def describe_call(
@@ -75,6 +104,13 @@ def row_dims(m: int, capacity: int | Room | None) -> dict[str, int | tuple[int, 
 def split_rows(written: Sequence[Array]) -> dict[str, Array | None]:
     """Return the fields of `Rows` that a kernel has written: none, rows, or those of a flat list."""
     return {"idx": None} | dict(zip(("idx", "receivers"), written, strict=False))
+
+
+def found_rows(written: Sequence[Array], count: Array, longest: Array, capacity: int | Room | None) -> Rows:
+    """Return what kernels have found whose status is that rows overflow, if anything."""
+    overflow = isinstance(capacity, int) and longest > capacity
+    status = jnp.where(overflow, Status.ROW_OVERFLOW.value, 0).astype(jnp.int32)
+    return Rows(**split_rows(written), counts=count, required=longest, status=status)
 
 
 def huge_pages(variant: Variant, shapes: Shapes) -> list[HugePages]:

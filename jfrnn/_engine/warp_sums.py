@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,11 +11,11 @@ from jfrnn._engine.arrays import levels_of
 from jfrnn._engine.boxes_warp import box_sums
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.levels_warp import level_sums
-from jfrnn._engine.operands import excluded_rows, pack_particles, periodic_kind, space_flags
+from jfrnn._engine.operands import excluded_rows, pack_particles, periodic_kind
 from jfrnn._engine.plans import Launch, Plan, share
 from jfrnn._engine.problem import Filter, Search
 from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText
-from jfrnn._engine.variants import size_numbers
+from jfrnn._engine.variants import SumVariant, size_numbers
 from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, place_launches, sort_on_cpu
 from jfrnn._geometry import Cutoffs
 from jfrnn.kernels import cells_cpu, cells_cuda, few_cuda, pair_sum_cpu, pair_sum_cuda
@@ -25,25 +24,6 @@ from jfrnn.kernels._native import EXCLUDED
 _GIVEN = ("positions", "queries", "cutoff", "shared_values", "own_values", "others")  # what a call is given
 _RESULTS = ("sums", "totals", "errors", "more")  # what kernels write
 _SORTED = {False: "columns", True: "values"}  # what is known of sources, in the order of cells, on the CPU and on CUDA
-
-
-class _SumVariant(NamedTuple):
-    """All that is static about a pair sum, apart from shapes; `key` names the text."""
-
-    dim: int
-    double: bool
-    scaled: bool
-    own: bool
-    closed: bool
-    drop_self: bool
-    periodic: int
-    batched: bool
-    compensated: bool
-    extremes: bool
-    key: str
-    cuda: bool
-    few: bool  # all of them meet
-    excluding: bool
 
 
 def pair_sums(
@@ -71,11 +51,8 @@ def pair_sums(
         def call(search: Search, values: tuple[Array, Array, Array]) -> FoundSums:
             sources, queries, cutoff, batch, torus = search[:5]
             flags = (queries is None, cutoff.closed, keep.drop_self, periodic_kind(torus), batch is not None)
-            double, kind = (
-                sources.dtype == jnp.float64,
-                (compensated, extremes, key, cuda, cuda and are_few(search), search.exclude is not None),
-            )
-            variant = _SumVariant(sources.shape[1], double, cutoff.scaled, *flags, *kind)
+            kind = (compensated, extremes, key, cuda, cuda and are_few(search), search.exclude is not None)
+            variant = SumVariant(sources.shape[1], sources.dtype == jnp.float64, cutoff.scaled, *flags, *kind)
             return _call_sums(variant, term, pack_particles(search), values, excluded_rows(search))
 
         return call
@@ -84,7 +61,7 @@ def pair_sums(
 
 
 def _call_sums(
-    variant: _SumVariant,
+    variant: SumVariant,
     term: TermText,
     particles: tuple[Array, Array, Array],
     values: tuple[Array, Array, Array],
@@ -109,25 +86,23 @@ def _call_sums(
 
 
 @kernel
-def _sum_callable(variant: _SumVariant, term: TermText) -> Call:
+def _sum_callable(variant: SumVariant, term: TermText) -> Call:
     scalar, words = np.float64 if variant.double else np.float32, {"info": np.int32, "scratch": np.int32}
     results, of_search = dict.fromkeys((*_RESULTS, _SORTED[variant.cuda]), scalar), tuple(words)
     excluded = EXCLUDED * variant.excluding
-    name = _name_of_sum(f"pair_sum_{'cuda' if variant.cuda else 'cpu'}", variant)
+    name = variant.name(f"pair_sum_{'cuda' if variant.cuda else 'cpu'}")
     if variant.cuda:  # particles are sorted
         return Call(name, (*_GIVEN, *of_search, *excluded), results, functools.partial(_plan_on_cuda, variant, term))
     return Call(name, (*_GIVEN, *excluded), results | words, functools.partial(_plan_on_cpu, variant, term))
 
 
 @kernel
-def _few_callable(variant: _SumVariant, term: TermText) -> Call:
+def _few_callable(variant: SumVariant, term: TermText) -> Call:
     scalar, plan = np.float64 if variant.double else np.float32, functools.partial(_plan_few, variant, term)
-    return Call(
-        _name_of_sum("pair_sum_few_cuda", variant), (*_GIVEN, *EXCLUDED * variant.excluding), dict.fromkeys(_RESULTS, scalar), plan
-    )
+    return Call(variant.name("pair_sum_few_cuda"), (*_GIVEN, *EXCLUDED * variant.excluding), dict.fromkeys(_RESULTS, scalar), plan)
 
 
-def _plan_few(variant: _SumVariant, term: TermText, shapes: Shapes, _: int) -> Plan:
+def _plan_few(variant: SumVariant, term: TermText, shapes: Shapes, _: int) -> Plan:
     kind = variant.compensated, variant.batched, variant.extremes, variant.periodic == 1, variant.excluding
     numbers = _numbers(variant, term, shapes)
     query = few_cuda.sum_kernel(few_cuda.warps(numbers["m"]), term, variant.key, variant.dim, variant.double, *kind)
@@ -135,32 +110,23 @@ def _plan_few(variant: _SumVariant, term: TermText, shapes: Shapes, _: int) -> P
     return Plan([Launch(query, few_cuda.threads(numbers["m"]))], numbers)
 
 
-def _name_of_sum(name: str, variant: _SumVariant) -> str:
-    flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "own": variant.own}
-    flags |= {"closed": variant.closed, "dropself": variant.drop_self, "batched": variant.batched}
-    flags |= space_flags(variant.periodic)
-    flags |= {"compensated": variant.compensated, "extremes": variant.extremes, "excluding": variant.excluding}
-    flags |= {variant.key: bool(variant.key)}
-    return "_".join([f"jfrnn_{name}_{variant.dim}d", *(flag for flag, on in flags.items() if on)])
-
-
-def _sorting(variant: _SumVariant) -> _SumVariant:
+def _sorting(variant: SumVariant) -> SumVariant:
     """Return on what of a variant it depends how particles are sorted."""
     return variant._replace(closed=False, drop_self=False, compensated=False, extremes=False, key="", excluding=False)
 
 
 @kernel
-def _sorting_callable(variant: _SumVariant) -> Call:
+def _sorting_callable(variant: SumVariant) -> Call:
     """Make a function that XLA calls to sort particles on CUDA."""
     words = {"info": np.int32, "scratch": np.int32}
-    return Call(_name_of_sum("sorting_cuda", variant), _GIVEN[:3], words, functools.partial(_plan_sorting, variant))
+    return Call(variant.name("sorting_cuda"), _GIVEN[:3], words, functools.partial(_plan_sorting, variant))
 
 
-def _space(variant: _SumVariant) -> dict[str, int]:
+def _space(variant: SumVariant) -> dict[str, int]:
     return {"periodic": variant.periodic, "batched": variant.batched}
 
 
-def _plan_sorting(variant: _SumVariant, shapes: Shapes, multiprocessors: int) -> Plan:
+def _plan_sorting(variant: SumVariant, shapes: Shapes, multiprocessors: int) -> Plan:
     kernels = cells_cuda.cell_kernels(variant.dim, variant.double, variant.scaled, False, **_space(variant))
     numbers = size_numbers(shapes, variant.own)
     # what sorts particles takes the arguments of a search that only counts
@@ -169,12 +135,12 @@ def _plan_sorting(variant: _SumVariant, shapes: Shapes, multiprocessors: int) ->
     return Plan(stages, numbers | more, ["idx", "count", "starts", "receivers"])
 
 
-def _numbers(variant: _SumVariant, term: TermText, shapes: Shapes) -> dict[str, int]:
+def _numbers(variant: SumVariant, term: TermText, shapes: Shapes) -> dict[str, int]:
     flags = {"closed": variant.closed, "drop_self": variant.drop_self, "width": term.source_columns}
     return size_numbers(shapes, variant.own) | flags
 
 
-def _plan_on_cpu(variant: _SumVariant, term: TermText, shapes: Shapes, multiprocessors: int) -> Plan:
+def _plan_on_cpu(variant: SumVariant, term: TermText, shapes: Shapes, multiprocessors: int) -> Plan:
     dim, double, scaled = variant[:3]
     cells = cells_cpu.cell_kernels(dim, double, scaled, False, **_space(variant))
     more = _space(variant) | {"extremes": variant.extremes, "excluding": variant.excluding}
@@ -184,7 +150,7 @@ def _plan_on_cpu(variant: _SumVariant, term: TermText, shapes: Shapes, multiproc
     return Plan([*sort_on_cpu(cells, numbers["n"]), *values, share(query, numbers["m"], QUERIES_PER_THREAD)], numbers)
 
 
-def _plan_on_cuda(variant: _SumVariant, term: TermText, shapes: Shapes, multiprocessors: int) -> Plan:
+def _plan_on_cuda(variant: SumVariant, term: TermText, shapes: Shapes, multiprocessors: int) -> Plan:
     dim, double, scaled = variant[:3]
     more = _space(variant) | {"extremes": variant.extremes, "excluding": variant.excluding}
     kernels = pair_sum_cuda.sum_kernels(term, variant.key, dim, double, scaled, variant.compensated, **more)

@@ -56,6 +56,11 @@ class Images(NamedTuple):
         return np.eye(len(self.reach), dtype=np.int64) if self.basis is None else np.array(self.basis)
 
     @property
+    def counts_short(self) -> bool:
+        """Whether shifts count short vectors instead of the given ones."""
+        return self.basis is not None or self.short
+
+    @property
     def total(self) -> int:
         """Number of shifts within reach."""
         return math.prod(2 * k + 1 for k in self.reach)

@@ -143,7 +143,7 @@ def _complete(matrix: Array, periodic: tuple[bool, ...]) -> Array:
 
 def _inverse(matrix: Array) -> Array:
     """Invert a [d, d] matrix by cofactors of its scaled rows, followed by one Newton step."""
-    size = largest_of(jnp.abs(matrix))[:, None]
+    size = largest_component(jnp.abs(matrix))[:, None]
     rows = matrix / size
     if len(matrix) == 2:
         adjugate = jnp.stack([jnp.stack([rows[1, 1], -rows[0, 1]]), jnp.stack([-rows[1, 0], rows[0, 0]])])
@@ -170,7 +170,7 @@ def add_rows(matrix: Array) -> Array:
     return functools.reduce(jnp.add, (matrix[..., k, :] for k in range(matrix.shape[-2])))
 
 
-def largest_of(x: Array) -> Array:
+def largest_component(x: Array) -> Array:
     """Return the largest number of [..., d], likewise."""
     return functools.reduce(jnp.maximum, (x[..., k] for k in range(x.shape[-1])))
 
@@ -221,7 +221,7 @@ def shift_pairs(difference: Array, shifts: Array, lattice: Lattice) -> Shifted:
 def given_shifts(shifts: Array, lattice: Lattice) -> Array:
     """Return shifts [..., d] of whole numbers in terms of the given lattice vectors, int32."""
     counts, images, dim = shifts.astype(jnp.int32), lattice.images, lattice.dim
-    if images.basis is None and not images.short:
+    if not images.counts_short:
         return counts
     if images.basis is not None:
         rows = [np.array(row, np.int32).reshape((1,) * (counts.ndim - 1) + (-1,)) for row in images.basis]

@@ -57,7 +57,7 @@ def box_change(before: Lattice, now: Lattice, spans: Array) -> Array:
     dtype = now.matrix.dtype
     eps = jnp.finfo(dtype).eps
     moved = jnp.sqrt(jnp.sum((now.matrix - before.matrix) ** 2, axis=-1)) * (1 + 16 * eps)
-    if now.images.basis is not None or now.images.short:  # short vectors carry a rounding error
+    if now.images.counts_short:  # short vectors carry a rounding error
         moved = jnp.where(moved > 0, moved + 4 * eps * jnp.sum(jnp.abs(now.matrix), axis=-1), moved)
     cells = spans + np.array(now.images.reach, dtype)
     return jnp.max(jnp.sum(now.spread(cells, moved.ndim) * moved, axis=-1))

@@ -87,10 +87,10 @@ def known_status(status: Array) -> Status | None:
     return Status(int(np.bitwise_or.reduce(bits, axis=None)))
 
 
-def shape_of(rows: Given) -> tuple[Any, ...]:
-    """Return the shape of an array of rows, or (None, None) for anything else."""
+def shape_of(rows: Given, axes: int = 2) -> tuple[Any, ...]:
+    """Return the shape of an array of rows, or of so many axes at least; for anything else as many times None."""
     shape = tuple(getattr(rows, "shape", ()))
-    return shape if len(shape) > 1 else (None, None)
+    return shape if len(shape) >= axes else (None,) * axes
 
 
 def tell(x: Given, how: Callable[[np.ndarray], object]) -> str:
@@ -134,8 +134,8 @@ class NeighborOverflowError(RuntimeError):
         self.required = required
         self.capacity = capacity
         self.name = name
-        held, verb = ("there are", "search_edges") if name == "total" else ("one row has", "search")
-        held = f"{held} {required} {'pairs' if name == 'total' else 'neighbors'}"
+        flat = name == "total"
+        held, verb = (f"there are {required} pairs", "search_edges") if flat else (f"one row has {required} neighbors", "search")
         super().__init__(
             f"{name}={capacity} is too small: {held}. Search again with {name}={required} or more; called outside jax.jit without "
             f"`{name}`, {verb} counts first and cannot overflow."

@@ -14,7 +14,7 @@ from jax import Array, lax
 
 from jfrnn._geometry.batch import Batch
 from jfrnn._geometry.images import LARGEST_TURN
-from jfrnn._geometry.lattice import Lattice, add_rows, fractions_of, largest_of, product, translation
+from jfrnn._geometry.lattice import Lattice, add_rows, fractions_of, largest_component, product, translation
 
 _TURN_BITS = 10
 NOT_FINITE, TOO_FAR = 1 << _TURN_BITS, 2 << _TURN_BITS
@@ -111,7 +111,7 @@ def wrap(
     length = jnp.sqrt(add_rows((transform * radius) ** 2)) * (1 + 16 * eps)
     most_shifts = jnp.asarray(max(images.reach), dtype)
     if batch is not None:  # those of each system alone
-        most_shifts = jnp.minimum(most_shifts, jnp.ceil(largest_of(length)[..., None]) + 1)
+        most_shifts = jnp.minimum(most_shifts, jnp.ceil(largest_component(length)[..., None]) + 1)
     shifts = most + most_shifts + 1
     rounding = 8 * eps * product(size[..., None, :], transform)[..., 0, :] + 2 * shifts * add_rows(residual)
     if images.orthogonal:
@@ -141,7 +141,7 @@ def _wrapping_error(most: Array, reach: Array, lattice: Lattice) -> Array:
     wrapping = jnp.where(most > 0, products * most * spans + cell, 0)
     exact = images.orthogonal & (reach <= 2)
     moving = jnp.where(exact, 0, products * reach) * spans + cell + reach * spans
-    return u * largest_of(2 * wrapping + moving)
+    return u * largest_component(2 * wrapping + moving)
 
 
 def _largest_finite(clouds: list[Array], batch: Batch | None, systems: int) -> list[Array]:

@@ -10,16 +10,13 @@ import numpy as np
 from jax import Array
 
 from jfrnn._engine import Inputs, Options, count_rows
-from jfrnn._geometry import Batch, Box, Exclusions, NeighborOverflowError, Radii, Status, names_of_bits, tell
+from jfrnn._geometry import Box, NeighborOverflowError, Status, names_of_bits, shape_of, tell
 from jfrnn._search.edges import Edges, Graph, edges_of, edges_of_rows, make_graph, no_edges
 from jfrnn._search.exports import MOST_PAIRS
-from jfrnn._search.geometry import ImageCodes
 from jfrnn._search.kept_search import KeptSearch
 from jfrnn._search.making import find_flat_fields
-from jfrnn._search.problem import Problem
 from jfrnn._search.reverse import Reverse
 from jfrnn._search.topology import Topology
-from jfrnn._search.verlet import Verlet
 from jfrnn._tracing import at_once, own_transfers
 
 _TOTAL_STEP = 16  # steps between powers of two, in which totals are rounded up
@@ -52,27 +49,14 @@ class EdgeList(KeptSearch):
     senders: Array
     receivers: Array
     offsets: Array
-    status: Array
-    required: Array
-    verlet: Verlet | None
-    box: Box | None
-    images: ImageCodes | None
-    radii: Radii | None
-    batch: Batch | None
-    exclude: Exclusions | None
-    reverse: Reverse | None
-    problem: Problem = dataclasses.field(metadata={"static": True})
     _full = Status.TOTAL_OVERFLOW
 
     def __repr__(self) -> str:
         """Summarize the list in a line; waits for the device."""
-        *batch, total = getattr(self.senders, "shape", (None,))
-        rows = f"{self.source_count} particles" if not batch else f"batch of {batch}, {self.source_count} particles"
-        kinds = self.radii is not None and self.radii.table is not None
-        reach = f"per {'pair of species' if kinds else 'particle'}" if self.cutoff is None else f"{self.cutoff:.6g}"
-        skin = f", skin {self.skin:.6g}" if self.skin else ""
+        *batch, total = shape_of(self.senders, axes=1)
+        ends = shape_of(self.offsets, axes=1)[-1]
         pairs, bits = tell(self.offsets, lambda offsets: offsets[..., -1].sum(dtype=np.int64)), names_of_bits(self.status)
-        return f"EdgeList({rows}, total {total}, cutoff {reach}{skin}, engine {self.backend!r}, {pairs} pairs, status {bits})"
+        return self._describe(batch, ends and ends - 1, f"total {total}", f"{pairs} pairs, status {bits}")
 
     @property
     def total(self) -> int:

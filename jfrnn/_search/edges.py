@@ -202,7 +202,7 @@ def edges_of(
         systems = None if batch is None else batch.of_queries.at[receivers].get(mode="clip")
         lattice = lattice_of_rows(box, kind, np.dtype(sources.dtype), systems, by_sender.native)
         shifts = edge_shifts(vectors, mask, (by_sender, by_receiver), images, (sources, rows), (box, batch), lattice)
-        if half and (kind.basis is not None or kind.short):  # as in padded lists
+        if half and kind.counts_short:  # as in padded lists
             shifts = jnp.where((senders == receivers)[:, None, None], forward_shifts(shifts, lattice), shifts)
         shifts = jnp.where(mask[:, None, None], shifts, 0)
         pairs = shift_pairs(vectors, shifts, lattice)

@@ -127,9 +127,7 @@ def _find_slots(
         image = jnp.where(used, codes.codes.astype(jnp.int32), lattice.images.home)
         shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)[image] + query_turns[:, None] - turns[neighbor]
     kind = lattice.images
-    if half and (
-        kind.basis is not None or kind.short
-    ):  # of a particle's two opposite images, keep the forward one in the given vectors
+    if half and kind.counts_short:  # of a particle's two opposite images, keep the forward one in the given vectors
         own = neighbor == lax.broadcasted_iota(jnp.int32, idx.shape, 0)
         shifts = jnp.where(own[..., None], forward_shifts(shifts, lattice), shifts)
     most = 2 * LARGEST_TURN + max(kind.reach)  # at larger distances no pair is decided exactly
@@ -216,7 +214,7 @@ def is_native(topology: Topology, kind: Images | None, half: bool) -> bool:
 
     They do not in half lists of short vectors, whose images JAX chooses.
     """
-    return topology.native and not (kind is not None and half and (kind.basis is not None or kind.short))
+    return topology.native and not (kind is not None and half and kind.counts_short)
 
 
 def kept_list(

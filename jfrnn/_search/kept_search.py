@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any, Self, TypeVar
 
 import jax
@@ -33,6 +34,7 @@ from jfrnn._geometry import (
 )
 from jfrnn._search.geometry import ImageCodes, ImagesMade
 from jfrnn._search.kept_options import KeptOptions
+from jfrnn._search.problem import Problem
 from jfrnn._search.reverse import Reverse
 from jfrnn._search.verlet import Verlet, has_moved_too_far
 from jfrnn._tracing import Given, call_apart, compile_program, own_transfers
@@ -43,8 +45,9 @@ ROWS_ARE_WHOLE = Status.NONFINITE | Status.TOTAL_OVERFLOW  # bits that do not me
 Kept = TypeVar("Kept", bound="KeptSearch")
 
 
+@dataclasses.dataclass(frozen=True, repr=False)
 class KeptSearch(KeptOptions):
-    """A frozen dataclass that keeps what a search has found, so that it can be updated in a loop."""
+    """What a search has found, kept so that it can be updated in a loop: what padded and flat lists have in common."""
 
     status: Array
     required: Array
@@ -55,6 +58,7 @@ class KeptSearch(KeptOptions):
     batch: Batch | None
     exclude: Exclusions | None
     reverse: Reverse | None
+    problem: Problem = dataclasses.field(metadata={"static": True})
     _full = Status.ROW_OVERFLOW  # the bit that says that there is too little room
 
     @property
@@ -81,6 +85,15 @@ class KeptSearch(KeptOptions):
     def _check_known(self, spared: Status = Status.OK) -> None:
         """Raise what status bits report, except the spared ones; a traced list is not checked."""
         raise NotImplementedError
+
+    def _describe(self, batch: Sequence[int], rows: int | None, room: str, found: str) -> str:
+        """Summarize the list in a line: of how many rows, with how much room, and what it has found."""
+        points = f"{rows} queries of {self.source_count} particles" if self.own_queries else f"{self.source_count} particles"
+        points = f"batch of {[*batch]}, {points}" if batch else points
+        kinds = self.radii is not None and self.radii.table is not None
+        reach = f"per {'pair of species' if kinds else 'particle'}" if self.cutoff is None else f"{self.cutoff:.6g}"
+        skin = f", skin {self.skin:.6g}" if self.skin else ""
+        return f"{type(self).__name__}({points}, {room}, cutoff {reach}{skin}, engine {self.backend!r}, {found})"
 
     @property
     def overflow(self) -> Array:

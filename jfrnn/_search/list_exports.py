@@ -1,5 +1,6 @@
 """The exports of a neighbor list: methods of `NeighborList` that return its pairs in other forms."""
 
+import dataclasses
 from typing import TypedDict, Unpack, overload
 
 import jax
@@ -22,6 +23,7 @@ class Present(TypedDict, total=False):
     box: Box | None
 
 
+@dataclasses.dataclass(frozen=True, repr=False)
 class ListExports(KeptSearch):
     """The rows of a neighbor list as pairs, compressed rows, graphs and lists of other libraries."""
 

@@ -12,24 +12,19 @@ from jax import Array, lax
 
 from jfrnn._engine import Inputs, Options
 from jfrnn._geometry import (
-    Batch,
     Box,
-    Exclusions,
-    Radii,
     Status,
     pairs_and_status,
     shape_of,
 )
 from jfrnn._search.edges import Edges, Graph, flat_edges, make_graph, no_edges
 from jfrnn._search.exports import check_held, check_total, pair_total
-from jfrnn._search.geometry import ImageCodes, lattice_shifts, norms, open_vectors, periodic_vectors
+from jfrnn._search.geometry import lattice_shifts, norms, open_vectors, periodic_vectors
 from jfrnn._search.kept_search import ROWS_ARE_WHOLE
 from jfrnn._search.list_exports import ListExports
 from jfrnn._search.making import count_capacity, find_fields, round_capacity
-from jfrnn._search.problem import Problem
-from jfrnn._search.reverse import MOST_SLOTS, Reverse
+from jfrnn._search.reverse import MOST_SLOTS
 from jfrnn._search.topology import Topology, make_topology
-from jfrnn._search.verlet import Verlet
 from jfrnn._tracing import own_transfers
 
 
@@ -59,30 +54,12 @@ class NeighborList(ListExports):
         problem: The options of the search (`Problem`). Static.
     """
 
-    idx: Array
-    count: Array
-    status: Array
-    required: Array
-    verlet: Verlet | None
-    box: Box | None
-    images: ImageCodes | None
-    radii: Radii | None
-    batch: Batch | None
-    exclude: Exclusions | None
-    reverse: Reverse | None
     order: Array | None
-    problem: Problem = dataclasses.field(metadata={"static": True})
 
     def __repr__(self) -> str:
         """Summarize the list in a line; waits for the device."""
         *batch, m, capacity = shape_of(self.idx)
-        rows = f"{m} queries of {self.source_count} particles" if self.own_queries else f"{self.source_count} particles"
-        rows = f"batch of {batch}, {rows}" if batch else rows
-        kinds = self.radii is not None and self.radii.table is not None
-        reach = f"per {'pair of species' if kinds else 'particle'}" if self.cutoff is None else f"{self.cutoff:.6g}"
-        skin = f", skin {self.skin:.6g}" if self.skin else ""
-        rest = pairs_and_status(self.count, self.status)
-        return f"NeighborList({rows}, capacity {capacity}, cutoff {reach}{skin}, engine {self.backend!r}, {rest})"
+        return self._describe(batch, m, f"capacity {capacity}", pairs_and_status(self.count, self.status))
 
     def require(self, total: int) -> "NeighborList":
         """Return this list with the bit `Status.TOTAL_OVERFLOW` set if it holds more than `total` pairs.

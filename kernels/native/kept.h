@@ -61,8 +61,7 @@ struct Kept : KeptArguments, Space {
             most = cutoff[LATTICE_END];
     }
     JFRNN_FUNCTION const real* numbers_of(const KeptArguments& given, int row) {
-        const long long length = RADII == OF_KINDS ? KINDS + 1 + (long long)given.cutoff[KINDS] : LATTICE_END + 1;
-        return given.cutoff + (BOXES ? length * given.systems[row] : 0);
+        return given.cutoff + (BOXES ? (LATTICE_END + 1ll) * given.systems[row] : 0);
     }
     // Goes to the lattice of a row.
     JFRNN_MEMBER void enter(int row) {
