@@ -54,8 +54,9 @@ struct Kept : KeptArguments, Space {
     // `row` is the first one that is looked at.
     JFRNN_MEMBER explicit Kept(const KeptArguments& given, int row = 0)
         : KeptArguments(given), Space(numbers_of(given, row)), moved(0), most(0), system(BOXES ? given.systems[row] : 0) {
-        inside = step_radius * step_radius * (1 - 8 * step_eps);
-        outside = step_radius * step_radius * (1 + 8 * step_eps);
+        // 7 roundings of eps/2, 5 in a square and 2 in a bound (jfrnn/_geometry/exact.py)
+        inside = step_radius * step_radius * (1 - 4 * step_eps);
+        outside = step_radius * step_radius * (1 + 4 * step_eps);
         measure_lattice();
         if constexpr (SHIFTED)
             most = cutoff[LATTICE_END];

@@ -1,7 +1,7 @@
 // Lists that are kept, on the CPU: LANES slots of a row at a time, whose pairs are told, or what a term makes of them.
 #pragma once
 #include "kept.h"
-#include "lanes.h"
+#include "wide.h"
 
 static Math::flag truths(unsigned int bits) {
     Math::flag lanes;
@@ -21,9 +21,11 @@ struct KeptSlots {
 template <class Visitor>
 struct KeptRows : Kept {
     static constexpr bool FLUSHED = !SCALED && RADII == 0;  // else what decides may be so small as to be flushed to zero
-    int* const next;                                        // chunk of rows, which threads hand themselves
+    static constexpr bool PLAIN = !SHIFTED && RADII == 0;   // one cutoff in open space
+    const Wide wide;
+    int* const next;  // chunk of rows, which threads hand themselves
 
-    KeptRows(const KeptArguments& given, int* next) : Kept(given), next(next) {}
+    KeptRows(const KeptArguments& given, int* next) : Kept(given), wide(radius, given.closed), next(next) {}
     Visitor& visitor() { return *(Visitor*)this; }
 
     // Reads LENGTH numbers of each source: four at a time, and then exchanges rows and columns in registers.
@@ -107,15 +109,19 @@ struct KeptRows : Kept {
             read_points(some.ids, some.numbers);
             some.verdict = judge(own, some.numbers, step, __builtin_convertvector(lanes_from(some.ids) != row, Math::flag));
             some.pairs = bits_of_flags(some.verdict.sure);
-            if (unsigned int open = bits_of_flags(some.verdict.open))
-                some.pairs |= decide(own, some, open);
+            if (unsigned int open = bits_of_flags(some.verdict.open)) {
+                if constexpr (PLAIN && !SCALED)
+                    some.pairs |= wide.sure(own.q, (const vec*)some.numbers, open);
+                if (open)
+                    some.pairs |= decide(own, some, open);
+            }
             visit(some);
         }
     }
     __attribute__((noinline)) unsigned int decide(const OwnPoint& own, const KeptSlots& some, unsigned int open) const {
-        unsigned int pairs = 0;
         if constexpr (FLUSHED)
             floats.keep();
+        unsigned int pairs = !PLAIN ? 0 : wide.decided(own.q, (const vec*)some.numbers, open);
         for (; open; open &= open - 1) {
             const int l = __builtin_ctz(open);
             real p[3] = {0, 0, 0};

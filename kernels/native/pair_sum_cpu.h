@@ -61,6 +61,17 @@ struct Sums : Walk<Sums> {
             meet_in_place(q, id, own_part, reduction);
         reduction.store(results, id, fresh, finished);
     }
+    // Decides while denormals are kept, if anything is `open`.
+    unsigned int decided_apart(const real* q, int id, const Points& points, const int* numbers, unsigned int open) const {
+        if (open == 0)
+            return 0;
+        if constexpr (FLUSHED)
+            floats.keep();
+        const unsigned int pairs = decided(q, id, points, numbers, open);
+        if constexpr (FLUSHED)
+            floats.flush();
+        return pairs;
+    }
     // Evaluates the term for vectors of candidates as they are, under a mask; those in doubt follow.
     void meet_in_place(const real* q, int id, const Term::Own& own_part, Reduction& reduction) {
         const real inside = this->inside, outside = this->outside;
@@ -88,11 +99,9 @@ struct Sums : Walk<Sums> {
         const int doubts = any_unsure ? collect_doubtful(filled) : 0;
         for (int b = 0; b < doubts; b += LANES) {
             const Points points = doubtful_at(b);
-            if constexpr (FLUSHED)
-                floats.keep();
-            const unsigned int hit = decided(q, id, points, doubtful + b, lanes_before(doubts - b));
-            if constexpr (FLUSHED)
-                floats.flush();
+            unsigned int open = lanes_before(doubts - b);
+            const unsigned int sure_ones = sure(q, points, open),
+                               hit = sure_ones | decided_apart(q, id, points, doubtful + b, open);
             number summand[SUMMANDS];
             term.evaluate(own_part, points.p, [&](int c) { return gathered(column[c], doubtful + b); }, summand);
             reduction.add(summand, flags_of(hit), [&](Math::i32& source, Math::i32& code) {
@@ -127,12 +136,9 @@ struct Sums : Walk<Sums> {
                 points.p[k] = *(const vec*)(near_points[k] + b);
             const unsigned int there = lanes_before(held - b);
             unsigned int hit = mask_of(square_of(q, points.p), inside, Below{}) & there;
-            if (const unsigned int open = there & ~hit) {
-                if constexpr (FLUSHED)
-                    floats.keep();
-                hit |= decided(q, id, points, doubtful + b, open);
-                if constexpr (FLUSHED)
-                    floats.flush();
+            if (unsigned int open = there & ~hit) {
+                hit |= sure(q, points, open);
+                hit |= decided_apart(q, id, points, doubtful + b, open);
             }
             number summand[SUMMANDS];
             term.evaluate(own_part, points.p, [&](int c) { return *(const number*)(near_column[c] + b); }, summand);

@@ -26,6 +26,37 @@ struct Results : SumRows {
     }
 };
 
+typedef real four __attribute__((vector_size(4 * sizeof(real))));
+
+// Adds the upper half of the lanes to the lower one, until four are left.
+template <int SIZE>
+JFRNN_INLINE static four folded(const real* lanes) {
+    typedef real half __attribute__((vector_size(SIZE / 2 * sizeof(real))));
+    if constexpr (SIZE == 4) {
+        four last;
+        memcpy(&last, lanes, sizeof last);
+        return last;
+    } else {
+        half low, high;
+        memcpy(&low, lanes, sizeof low);
+        memcpy(&high, lanes + SIZE / 2, sizeof high);
+        const half both = low + high;
+        return folded<SIZE / 2>((const real*)&both);
+    }
+}
+// The sums of all lanes of four vectors at once, each in the order of `Added::add_lanes`.
+JFRNN_INLINE static four lane_sums(const number* sum, int count) {
+    four part[4];
+#pragma unroll
+    for (int k = 0; k < 4; ++k)
+        part[k] = k < count ? folded<LANES>((const real*)&sum[k]) : four{};
+    const four first =
+        __builtin_shufflevector(part[0], part[1], 0, 4, 1, 5) + __builtin_shufflevector(part[0], part[1], 2, 6, 3, 7);
+    const four second =
+        __builtin_shufflevector(part[2], part[3], 0, 4, 1, 5) + __builtin_shufflevector(part[2], part[3], 2, 6, 3, 7);
+    return __builtin_shufflevector(first, second, 0, 1, 4, 5) + __builtin_shufflevector(first, second, 2, 3, 6, 7);
+}
+
 struct Added {
     number sum[SUMMANDS], error[SUMMANDS];
 
@@ -46,7 +77,7 @@ struct Added {
                 sum[k] += x;
         }
     }
-    // Adds a number of each lane to a total, always in the same order.
+    // Adds a number of each lane to a total in twice the precision, always in the same order.
     JFRNN_INLINE static void add_lanes(number sum, number error, real& total, real& carried) {
         real s[LANES], e[LANES];
         memcpy(s, &sum, sizeof s);
@@ -54,26 +85,28 @@ struct Added {
 #pragma unroll
         for (int size = LANES / 2; size > 0; size /= 2)
 #pragma unroll
-            for (int l = 0; l < size; ++l)
-                if constexpr (COMPENSATED) {
-                    two_sum(s[l], e[l], s[l + size]);
-                    e[l] += e[l + size];
-                } else
-                    s[l] += s[l + size];
-        if constexpr (COMPENSATED) {
-            two_sum(total, carried, s[0]);
-            carried += e[0];
-        } else
-            total += s[0];
+            for (int l = 0; l < size; ++l) {
+                two_sum(s[l], e[l], s[l + size]);
+                e[l] += e[l + size];
+            }
+        two_sum(total, carried, s[0]);
+        carried += e[0];
     }
     // Adds to what the query has already, and to the totals of the chunk; `fresh`: the query has nothing yet.
     JFRNN_INLINE void store(Results& results, int id, bool fresh, bool finished) {
+        four plain[(SUMMANDS + 3) / 4];
+#pragma unroll
+        for (int k = 0; !COMPENSATED && k < SUMMANDS; k += 4)
+            plain[k / 4] = lane_sums(sum + k, SUMMANDS - k);
 #pragma unroll
         for (int k = 0; k < SUMMANDS; ++k) {
             const int place = PLACE[k];
             if (IS_TOTAL[k]) {
                 real all = 0, carried = 0;
-                add_lanes(sum[k], error[k], all, carried);
+                if constexpr (COMPENSATED)
+                    add_lanes(sum[k], error[k], all, carried);
+                else
+                    all = plain[k / 4][k % 4];
                 two_sum(results.total[place], results.total_carried[place], all);
                 results.total_carried[place] += carried;
                 continue;
@@ -81,7 +114,10 @@ struct Added {
             const long long at = (long long)id * ROW_SUMS + place;
             real all = fresh ? real(0) : results.at(id, place);
             real carried = fresh || !COMPENSATED ? real(0) : results.errors[at];
-            add_lanes(sum[k], error[k], all, carried);
+            if constexpr (COMPENSATED)
+                add_lanes(sum[k], error[k], all, carried);
+            else
+                all += plain[k / 4][k % 4];
             if (COMPENSATED && finished && Bits::finite(all))
                 all += carried;
             if (COMPENSATED && !finished)

@@ -32,7 +32,7 @@ struct Rows : Walk<Rows> {
           capacity(a.capacity),
           later_only(a.later_only),
           longest(0),
-          past_caches((long long)m * capacity >= 1 << 18) {
+          past_caches((long long)m * capacity >= 1 << 20) {
         int codes = 1;  // of images
         for (int k = 0; PERIODIC == 2 && k < DIM; ++k)
             codes *= 2 * lattice.images(k) + 1;

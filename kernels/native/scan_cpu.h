@@ -105,6 +105,10 @@ struct Scan : SearchArguments, Cells, Scratch {
         }
         return exact_pair(q, p, radius, 0, closed);
     }
+    // Which of the points in lanes are surely pairs, also while denormals are flushed; others stay `open` or are none.
+    unsigned int sure(const real* q, const Points& points, unsigned int& open) const {
+        return SCALED || PERIODIC > 0 ? 0 : wide.sure(q, points.p, open);
+    }
     // Which of the points in lanes, of which some are `open`, are pairs; `numbers` are theirs among the candidates.
     unsigned int decided(const real* q, int own_id, const Points& points, const int* numbers, unsigned int open) const {
         unsigned int pairs = PERIODIC ? 0 : wide.decided(q, points.p, open);

@@ -105,32 +105,48 @@ struct Wide {
         return term[TERMS - 1];
     }
 
+    // The points in lanes from WIDE * h on.
+    static void points_at(const vec* p, int h, doubles* points) {
+        for (int k = 0; k < DIM; ++k) {
+            typedef real reals __attribute__((vector_size(WIDE * sizeof(real))));
+            reals part;
+            __builtin_memcpy(&part, (const real*)&p[k] + WIDE * h, sizeof part);
+            points[k] = __builtin_convertvector(part, doubles);
+        }
+    }
+    // Which of the points in lanes are surely pairs, by squares in float64; others stay `open` or are none. This may be computed while
+    // denormals are flushed, unless cutoffs are SCALED: what that takes of coordinates, 2^-126 at most, is far below what the bounds allow.
+    JFRNN_INLINE unsigned int sure(const real* q, const vec* p, unsigned int& open) const {
+        if constexpr (DOUBLE)
+            return 0;
+        unsigned int pairs = 0, left = 0;
+        for (int h = 0; h < LANES / WIDE; ++h) {
+            const unsigned int here = open >> WIDE * h & ((1u << WIDE) - 1);
+            doubles points[3], square = doubles{};
+            points_at(p, h, points);
+            for (int k = 0; k < DIM; ++k)
+                square += (points[k] - (double)q[k]) * (points[k] - (double)q[k]);
+            const unsigned int found = bits_of(square < doubly_inside) & here;
+            pairs |= found << WIDE * h;
+            left |= (here & ~found & bits_of(square <= doubly_outside)) << WIDE * h;
+        }
+        open = left;
+        return pairs;
+    }
+
     // Which of the points in lanes are pairs; a few stay `open`, others are none. This is a call of its own: nothing of it may be
     // computed while denormals are flushed.
     __attribute__((noinline)) unsigned int decided(const real* q, const vec* p, unsigned int& open) const {
-        unsigned int pairs = 0, left = 0;
+        unsigned int pairs = sure(q, p, open), left = 0;
         double origin[3];
         for (int k = 0; k < DIM; ++k)
             origin[k] = (double)q[k];
         for (int h = 0; h < LANES / WIDE; ++h) {
-            unsigned int here = open >> WIDE * h & ((1u << WIDE) - 1), found = 0;
+            unsigned int here = open >> WIDE * h & ((1u << WIDE) - 1);
             doubles points[3];
-            for (int k = 0; k < DIM; ++k) {
-                typedef real reals __attribute__((vector_size(WIDE * sizeof(real))));
-                reals part;
-                __builtin_memcpy(&part, (const real*)&p[k] + WIDE * h, sizeof part);
-                points[k] = __builtin_convertvector(part, doubles);
-            }
-            if constexpr (!DOUBLE) {
-                doubles square = doubles{};
-                for (int k = 0; k < DIM; ++k)
-                    square += (points[k] - origin[k]) * (points[k] - origin[k]);
-                found = bits_of(square < doubly_inside) & here;
-                here &= ~found & bits_of(square <= doubly_outside);
-            }
+            points_at(p, h, points);
             if (here)
-                found |= signs_decided(origin, points, here);
-            pairs |= found << WIDE * h;
+                pairs |= signs_decided(origin, points, here) << WIDE * h;
             left |= here << WIDE * h;
         }
         open = left;
