@@ -117,19 +117,22 @@ def _kernel(kind: ListKind, what: str, suffix: str, **constants: int) -> Kernel:
 
 
 @functools.lru_cache(512)
-def sum_kernel(kind: ListKind, term: TermText, key: str, compensated: bool, extremes: bool, apart: bool) -> Kernel:
+def sum_kernel(kind: ListKind, term: TermText, key: str, compensated: bool, extremes: bool, apart: bool, mirrored: bool) -> Kernel:
     """Return the kernel that sums a term; `key` tells it from all others in the names of programs.
 
     `apart`: a particle's pair with itself, without a shift, is left out. `extremes`: it finds the largest summands instead;
-    `errors` [m, width, 2] then gets their sources (n: there is none), and their places in the row.
+    `errors` [m, width, 2] then gets their sources (n: there is none), and their places in the row. `mirrored`: the term
+    reads of i what stands beside the points, of the same number.
     """
     constants = {
         "LIST": 0,
         **kind.constants(term.columns),
         **constants_of(term, compensated, extremes, turned=False),
         "APART": apart,
+        "MIRRORED": mirrored,
     }
     header = "kept_sums.cuh" if kind.cuda else "kept_sums_cpu.h"
     text = program(kind.double, kind.dim, header, given=term_header(term, kind.double, turned=False), **constants)
-    name = f"kept_sums_{kind.name}{'_compensated' * compensated}{'_apart' * apart}{'_extremes' * extremes}_{key}"
+    name = f"kept_sums_{kind.name}{'_compensated' * compensated}{'_apart' * apart}{'_extremes' * extremes}"
+    name += f"{'_mirrored' * mirrored}_{key}"
     return declare(name, text, _entry(kind, "KeptSums.run"), cuda=kind.cuda, fused=kind.cuda)[0]

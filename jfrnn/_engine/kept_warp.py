@@ -102,24 +102,27 @@ def kept_sums(
     given: KeptList,
     term: TermText,
     key: str,
-    values: tuple[Array, Array, Array],
+    values: tuple[Array, Array | None, Array],
     compensated: bool,
     apart: bool = False,
     extremes: bool = False,
 ) -> FoundSums:
     """Sum a term over the pairs of a list, as `jfrnn._engine.warp_sums.pair_sums` does over those of a search.
 
-    `apart`: a particle's pair with itself, without a shift, is left out. Of extremes, the place in the row stands for the code of
-    an image.
+    `values` are what all pairs share, what is read of i, or None where that is of the same arrays as what is read of j, and what is
+    read of j. `apart`: a particle's pair with itself, without a shift, is left out. Of extremes, the place in the row stands for
+    the code of an image.
     """
+    mirrored = values[1] is None
 
-    def on(cuda: bool) -> Callable[[KeptList, tuple[Array, Array, Array]], FoundSums]:
-        def call(given: KeptList, values: tuple[Array, Array, Array]) -> FoundSums:
+    def on(cuda: bool) -> Callable[[KeptList, tuple[Array, Array | None, Array]], FoundSums]:
+        def call(given: KeptList, values: tuple[Array, Array | None, Array]) -> FoundSums:
             shared, own, others = values
+            own = jnp.zeros((1, 1), given.sources.dtype) if own is None else own
             rows = (given.sources if given.reversal is not None else given.rows).shape[0]
             lanes = kept.LANES if cuda else 0
             kind, results = _kind_of(given, lanes), SumsOf(term, rows, kept.slots(rows, lanes), compensated, extremes)
-            call_sums = _sum_callable(kind, term, key, compensated, extremes, apart)
+            call_sums = _sum_callable(kind, term, key, compensated, extremes, apart, mirrored)
             operands = _operands(given, kind, term.columns, others)
             return results.unpack(*call_sums(*operands, shared, own, output_dims=results.dims() | {"info": 2})[:3])
 
@@ -233,11 +236,11 @@ def _slope_callable(extra: _Extra) -> Call:
 
 
 @kernel
-def _sum_callable(extra: _Extra, term: TermText, key: str, compensated: bool, extremes: bool, apart: bool) -> Call:
-    scalar, flags = _scalar(extra), {"compensated": compensated, "extremes": extremes, "apart": apart}
+def _sum_callable(extra: _Extra, term: TermText, key: str, compensated: bool, extremes: bool, apart: bool, mirrored: bool) -> Call:
+    scalar, flags = _scalar(extra), {"compensated": compensated, "extremes": extremes, "apart": apart, "mirrored": mirrored}
     name = "_".join(["jfrnn_kept_sums", _name(extra), *(flag for flag, on in flags.items() if on), key])
     results = dict.fromkeys(("sums", "totals", "errors"), scalar) | {"info": np.int32}
-    plan = functools.partial(_plan_sums, extra, term, key, compensated, extremes, apart)
+    plan = functools.partial(_plan_sums, extra, (term, key, compensated, extremes, apart, mirrored))
     return Call(name, (*_LIST, "shared_values", "own_values"), results, plan)
 
 
@@ -269,7 +272,5 @@ def _plan_slopes(extra: _Extra, shapes: Shapes, _: int) -> Plan:
     return _launch(extra, kept.slope_kernel(extra.kind), shapes)
 
 
-def _plan_sums(
-    extra: _Extra, term: TermText, key: str, compensated: bool, extremes: bool, apart: bool, shapes: Shapes, _: int
-) -> Plan:
-    return _launch(extra, kept.sum_kernel(extra.kind, term, key, compensated, extremes, apart), shapes)
+def _plan_sums(extra: _Extra, kind: tuple, shapes: Shapes, _: int) -> Plan:
+    return _launch(extra, kept.sum_kernel(extra.kind, *kind), shapes)

@@ -194,14 +194,14 @@ def sums(inputs: Inputs, options: Options, term: Term, operands: Groups, compens
 def sums_of_list(given: KeptList, term: Term, operands: Groups, compensated: bool, apart: bool) -> list[Array]:
     """Sum a term over the pairs of a list; with `given.reversal` over those of its sources."""
     plan = make_plan(term, *_kind_of_list(given), listed=True)
-    found, totals, _ = kept_sums(given, plan.text, plan.key, _values_of_list(given, plan, operands), compensated, apart)
+    found, totals, _ = kept_sums(given, plan.text, plan.key, _values_of_list(given, plan, term, operands), compensated, apart)
     return _unpack(term, found, totals)
 
 
 def extremes_of_list(given: KeptList, term: Term, operands: Groups, largest: bool) -> list[tuple[Array, Array, Array | None]]:
     """Find the largest summands over the pairs of a list, as `extremes` does over those of a search."""
     plan = make_plan(term, *_kind_of_list(given), not largest, listed=True)
-    values = _values_of_list(given, plan, operands)
+    values = _values_of_list(given, plan, term, operands)
     (found,), _, which = kept_sums(given, plan.text, plan.key, values, False, extremes=True)
     source, place, shifts = which[..., 0], which[..., 1], None
     if given.lattice is not None:
@@ -210,12 +210,17 @@ def extremes_of_list(given: KeptList, term: Term, operands: Groups, largest: boo
     return _split_extremes(term, found, source, shifts)
 
 
-def _values_of_list(given: KeptList, plan: Plan, operands: Groups) -> tuple[Array, Array, Array]:
+def _values_of_list(given: KeptList, plan: Plan, term: Term, operands: Groups) -> tuple[Array, Array | None, Array]:
+    """Return the columns of what all pairs share, of i, and of j; None for i where those are of the same arrays."""
     n, m = given.sources.shape[0], given.rows.shape[0]
     sizes = (None, m, n) if given.reversal is None else (None, n, m)
     groups = zip(operands, (plan.shared, plan.own, plan.others), sizes, strict=True)
     shared, own, others = (_pack(*group, given.sources.dtype) for group in groups)
-    return shared, own, others
+    of_i, of_j = (
+        [(labels[k], e) for k, e in columns] for labels, columns in zip(term.labels, (plan.own, plan.others), strict=True)
+    )
+    mirrored = of_i == of_j != []  # equal labels: the same arrays
+    return shared, None if mirrored else own, others
 
 
 def extremes(

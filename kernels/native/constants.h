@@ -52,6 +52,7 @@ constexpr bool ORDERED = true;    // an order of rows is given
 constexpr bool APART = true;      // particles are no neighbors of their own
 constexpr int LANES_PER_ROW = 8;  // of CUDA
 constexpr bool DECIDED = true;    // which of its slots hold a pair
+constexpr bool MIRRORED = false;  // a term reads of i what it reads of j
 constexpr bool MEASURED = false;  // distances are written, too
 constexpr bool BOXES = false;     // each system has a lattice of its own
 // Of triangles (see jfrnn/kernels/_triangles.py, triangles_cpu.py and triangles_cuda.py).

@@ -99,6 +99,10 @@ struct Kept : KeptArguments, Space {
     JFRNN_MEMBER long long first_entry(int row) const { return REVERSED ? starts[row] : (long long)row * capacity; }
     JFRNN_MEMBER int entries(int row) const { return REVERSED ? lengths[row] : count[row] < capacity ? count[row] : capacity; }
 
+    // What a term reads of a row: its own numbers, or (MIRRORED) those of the source of that number.
+    JFRNN_MEMBER const real* own_numbers(const real* own_values, int row) const {
+        return MIRRORED ? points + (long long)LENGTH * row + DIM : own_values + (long long)OWN * row;
+    }
     // What is known of a row.
     struct OwnPoint {
         real q[3], turn[3], radius;

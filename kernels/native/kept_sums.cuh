@@ -36,7 +36,7 @@ struct KeptSums : KeptLane {
         __syncwarp();
         const OwnPoint own = own_point(is_row ? row : 0);
         const Term term(shared_values);
-        const Term::Own own_part = term.own(own_values + (long long)(is_row ? row : 0) * OWN, own.q);
+        const Term::Own own_part = term.own(own_numbers(own_values, is_row ? row : 0), own.q);
         Reduction reduction(n);
         auto visit = [&](int place, int id, const real* numbers, const Verdict& verdict, bool pair) {
             number summand[SUMMANDS];

@@ -29,7 +29,7 @@ struct KeptSums : KeptRows<KeptSums> {
 
     // Of extremes, the place in the row stands for the code of an image.
     void serve(int row, const OwnPoint& own) {
-        const Term::Own own_part = term.own(own_values + (long long)row * OWN, own.q);
+        const Term::Own own_part = term.own(own_numbers(own_values, row), own.q);
         const Term term = this->term;  // a variable, which stays in registers
         Reduction reduction(n);
         walk(row, own, [&](const KeptSlots& some) {
