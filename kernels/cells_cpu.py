@@ -6,7 +6,6 @@ themselves chunks of places from an atomic counter (see `native/walk_cpu.h`).
 """
 
 import functools
-from typing import NamedTuple
 
 from jfrnn.kernels._native import SPACES, program, table_cells
 from jfrnn.kernels._program import Kernel, declare
@@ -33,33 +32,37 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -
     return sum((words + 15) // 16 * 16 for words in parts)
 
 
-class Kernels(NamedTuple):
-    """The kernels of a variant, `gather` (of `MANY` sources and more) and `query` share their work among threads."""
+@functools.lru_cache(128)
+def sort_kernels(dim: int, double: bool, scaled: bool, periodic: int = 0, batched: bool = False) -> tuple[Kernel, Kernel]:
+    """Return what sorts: `build`, and `gather`, which is for `MANY` sources and more, and whose work threads share.
 
-    build: Kernel
-    gather: Kernel
-    query: Kernel
+    They are a program of their own: sums take no others, and to compile rows takes long.
+    """
+    text = program(double, dim, "cells_cpu.h", **_options(scaled, periodic, batched))
+    build, gather = declare(f"sort_cpu_{_variant(dim, double, scaled, periodic, batched)}", text, "Sort.build", "Gather.gather")
+    return build, gather
 
 
 @functools.lru_cache(512)
-def cell_kernels(
-    dim: int,
-    double: bool,
-    scaled: bool,
-    lists: bool,
-    periodic: int = 0,
-    batched: bool = False,
-    excluding: bool = False,
+def query_kernel(
+    dim: int, double: bool, scaled: bool, lists: bool, periodic: int = 0, batched: bool = False, excluding: bool = False,
     flat: bool = False,
-) -> Kernels:
-    """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts alone.
+) -> Kernel:  # fmt: skip
+    """Return what lists or counts, whose work threads share.
 
-    `periodic`, `batched`, `excluding` and `flat` are those of `jfrnn.kernels._native.program`.
+    It is for a dimension and dtype, and for cutoffs that need scaling or not; the other options are those of
+    `jfrnn.kernels._native.program`.
     """
-    variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}{'_flat' * flat}"
-    variant += f"{SPACES[periodic]}{'_batched' * batched}{'_excluding' * excluding}"
-    options = {"SCALED": scaled, "LIST": lists, "FLAT": flat, **GRID, "PERIODIC": periodic}
-    options |= {"BATCHED": batched, "EXCLUDING": excluding, "SUMS": 0, "CHUNK": CHUNK, "QUERY_CHUNK": QUERY_CHUNK, "MANY": MANY}
+    options = {**_options(scaled, periodic, batched), "LIST": lists, "FLAT": flat, "EXCLUDING": excluding}
     options |= {"TOGETHER": TOGETHER, "CANDIDATES": 1024 if double else 1536}  # what fits into a first-level cache beside a row
-    text = program(double, dim, "rows_cpu.h", **options)
-    return Kernels(*declare(f"cells_cpu_{variant}", text, "Sort.build", "Gather.gather", "Rows.run"))
+    variant = f"{_variant(dim, double, scaled, periodic, batched)}{'_list' * lists}{'_flat' * flat}{'_excluding' * excluding}"
+    return declare(f"cells_cpu_{variant}", program(double, dim, "rows_cpu.h", **options), "Rows.run")[0]
+
+
+def _variant(dim: int, double: bool, scaled: bool, periodic: int, batched: bool) -> str:
+    return f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{SPACES[periodic]}{'_batched' * batched}"
+
+
+def _options(scaled: bool, periodic: int, batched: bool) -> dict[str, int]:
+    options = {"SCALED": scaled, **GRID, "PERIODIC": periodic, "BATCHED": batched, "SUMS": 0, "LIST": 0}
+    return options | {"CHUNK": CHUNK, "QUERY_CHUNK": QUERY_CHUNK, "MANY": MANY}

@@ -24,7 +24,7 @@ from jfrnn._engine.problem import Engine, Filter, Kind, Options, Room, Rows, Sea
 from jfrnn._engine.start import check_warp
 from jfrnn._engine.variants import Variant, absent, describe_call, huge_pages, plan_numbers, row_dims, split_rows
 from jfrnn._geometry import Cutoffs
-from jfrnn.kernels import _driver, cells_cpu, cells_cuda, few_cuda
+from jfrnn.kernels import Kernel, _driver, cells_cpu, cells_cuda, few_cuda
 
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
 _CELLS = {"cpu": cells_cpu, "cuda": cells_cuda}
@@ -216,18 +216,20 @@ def place_launches(launches: Sequence[cells_cuda.Launch]) -> list[Launch]:
     return [Launch(x.kernel, x.threads, {"of_queries": int(x.of_queries)}, x.beside) for x in launches]
 
 
-def _plan_on_cpu(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan:
-    kind = {"periodic": variant.periodic, "batched": variant.batched, "excluding": variant.excluding, "flat": variant.flat}
-    kernels = cells_cpu.cell_kernels(variant.dim, variant.double, variant.scaled, variant.lists, **kind)
+def _plan_on_cpu(variant: Variant, shapes: Shapes, _: int) -> Plan:
+    kind = variant.dim, variant.double, variant.scaled
+    space = {"periodic": variant.periodic, "batched": variant.batched}
+    query = cells_cpu.query_kernel(*kind, variant.lists, **space, excluding=variant.excluding, flat=variant.flat)
     numbers = plan_numbers(variant, shapes)
     steps = [
-        *sort_on_cpu(kernels, numbers["n"]),
+        *sort_on_cpu(cells_cpu.sort_kernels(*kind, **space), numbers["n"]),
         *huge_pages(variant, shapes),
-        share(kernels.query, numbers["m"], QUERIES_PER_THREAD),
+        share(query, numbers["m"], QUERIES_PER_THREAD),
     ]
     return Plan(steps, numbers, absent(variant.lists, variant.flat))
 
 
-def sort_on_cpu(kernels: cells_cpu.Kernels, n: int) -> list[Launch | HugePages]:
+def sort_on_cpu(sort: tuple[Kernel, Kernel], n: int) -> list[Launch | HugePages]:
     """Return what sorts sources and queries by cell; several threads put the coordinates of many sources in order."""
-    return [Launch(kernels.build), *([share(kernels.gather, n)] if n >= cells_cpu.MANY else [])]
+    build, gather = sort
+    return [Launch(build), *([share(gather, n)] if n >= cells_cpu.MANY else [])]

@@ -142,12 +142,12 @@ def _numbers(variant: SumVariant, term: TermText, shapes: Shapes) -> dict[str, i
 
 def _plan_on_cpu(variant: SumVariant, term: TermText, shapes: Shapes, multiprocessors: int) -> Plan:
     dim, double, scaled = variant[:3]
-    cells = cells_cpu.cell_kernels(dim, double, scaled, False, **_space(variant))
+    sort = cells_cpu.sort_kernels(dim, double, scaled, **_space(variant))
     more = _space(variant) | {"extremes": variant.extremes, "excluding": variant.excluding}
     query = pair_sum_cpu.query_kernel(term, variant.key, dim, double, scaled, variant.compensated, **more)
     numbers = _numbers(variant, term, shapes)
     values = [share(pair_sum_cpu.sort_kernel(dim, double), numbers["n"])] if term.source_columns else []
-    return Plan([*sort_on_cpu(cells, numbers["n"]), *values, share(query, numbers["m"], QUERIES_PER_THREAD)], numbers)
+    return Plan([*sort_on_cpu(sort, numbers["n"]), *values, share(query, numbers["m"], QUERIES_PER_THREAD)], numbers)
 
 
 def _plan_on_cuda(variant: SumVariant, term: TermText, shapes: Shapes, multiprocessors: int) -> Plan:
