@@ -79,7 +79,7 @@ class ListKind(NamedTuple):
         """Return the named integers of a program."""
         found = {"PERIODIC": self.periodic, "SCALED": self.scaled, "CODE_BYTES": self.code_bytes, "REVERSED": self.reversed}
         found |= {"RADII": RADII.get(self.rule, 0), "SUM": self.rule == "mean", "ALIGNED": self.aligned, "ORDERED": self.ordered}
-        found |= {"DECIDED": 1, "MEASURED": 0, "APART": 0, "BOXES": self.boxes}
+        found |= {"DECIDED": 1, "MEASURED": 0, "APART": 0, "MIRRORED": 0, "OWN": 0, "BOXES": self.boxes}
         return found | {"LENGTH": self.length(columns), "LANES_PER_ROW": max(self.lanes, 1), "QUERY_CHUNK": ROWS_AT_ONCE, **GRID}
 
 

@@ -34,10 +34,11 @@ def term_of(kind):
 def test_masks_and_sums_compile(kind):
     assert kind.reversed or all(compiles(kept.mask_kernel(kind, measured)) for measured in (False, True))
     assert kind.reversed or compiles(kept.slope_kernel(kind))
-    for compensated, extremes in ((False, False), (True, False)):
-        assert compiles(kept.sum_kernel(kind, term_of(kind), f"test_{bool(kind.periodic)}", compensated, extremes, kind.reversed))
+    for compensated in (False, True):  # and what a term reads of i stands beside the points, or does not
+        key = f"test_{bool(kind.periodic)}"
+        assert compiles(kept.sum_kernel(kind, term_of(kind), key, compensated, False, kind.reversed, compensated))
     largest = term_of(kind)._replace(sums=(Sum("o", False, False),))
-    assert compiles(kept.sum_kernel(kind, largest, f"largest_{bool(kind.periodic)}", False, True, False))
+    assert compiles(kept.sum_kernel(kind, largest, f"largest_{bool(kind.periodic)}", False, True, False, False))
 
 
 @pytest.mark.parametrize("code_bytes", [0, 1, 2, 4])
