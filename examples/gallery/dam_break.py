@@ -62,9 +62,7 @@ def main(nx=16, steps=1600, differentiated=100):
     x = jnp.asarray((sites + 0.5) * DX, jnp.float32)
     start = x, jnp.zeros_like(x), jnp.full(len(x), RHO, x.dtype)
     reached, change = jax.value_and_grad(front)(jnp.float32(GRAVITY), differentiated, start)
-    print(
-        f"{len(x)} particles; after {differentiated} steps the front is at {reached:.3f} m; its slope over gravity is {change:.1e} s²"
-    )
+    print(f"{len(x)} particles; front after {differentiated} steps: {reached:.3f} m, its slope over gravity {change:.1e} s²")
     assert change > 0, "more gravity drives the front forward"
     return run(jnp.float32(GRAVITY), steps, start), steps * DT
 
