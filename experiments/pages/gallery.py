@@ -18,14 +18,13 @@ _PICTURE = re.compile(r"\(pictures/gallery/((\w+)\.(?:png|gif))\)")
 _RUN = """
 import contextlib, pathlib, runpy, sys
 
-import matplotlib.pyplot as plt
-
 given = sys.argv[1:]
 for program, picture in zip(given[::2], given[1::2], strict=True):
     sys.argv = [program, picture]
     with pathlib.Path(picture).with_suffix(".txt").open("w", encoding="utf-8") as said, contextlib.redirect_stdout(said):
         runpy.run_path(program, run_name="__main__")
-    plt.close("all")
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
 """
 
 
