@@ -69,9 +69,9 @@ def main(nx=16, steps=1600, differentiated=100):
 
 if __name__ == "__main__":
     (x, v, _), time = main()
-    figure, axes = plt.subplots(figsize=(7, 3.6), layout="constrained")
+    figure, axes = plt.subplots(figsize=(7, 3.6))
     marks = axes.scatter(*x.T, c=jnp.linalg.norm(v, axis=1), s=6)
-    figure.colorbar(marks, label="speed [m/s]", shrink=0.7)
+    figure.colorbar(marks, label="speed [m/s]", shrink=0.6)
     axes.set(aspect="equal", xlim=(0, TANK), ylim=(0, 1.6), xlabel="x [m]", ylabel="y [m]")
     axes.set_title(f"A column of water, {time:.2f} s after it was let go")
-    figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "dam_break.png", dpi=100)
+    figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "dam_break.png", dpi=100, bbox_inches="tight")
