@@ -18,13 +18,13 @@ STIFF, DAMPED, DT, WIDE = 2e4, 20.0, 5e-4, 1.0
 
 
 def contact(r, i, j):
-    """Force on i from a grain that touches it: a damped spring along the line of centers, over the mass of i."""
+    """Acceleration of i by a grain that touches it, a damped spring along the line of centers; and 1, which counts contacts."""
     distance = jnp.sqrt(r @ r + 1e-12)
     away = -r / distance
     overlap = i["radius"] + j["radius"] - distance
     closing = (i["v"] - j["v"]) @ away
     reduced = 1 / (1 / i["m"] + 1 / j["m"])
-    return away * reduced * (STIFF * overlap - DAMPED * closing) / i["m"]
+    return away * reduced * (STIFF * overlap - DAMPED * closing) / i["m"], 1.0
 
 
 @jax.jit
@@ -33,14 +33,14 @@ def frame(x, v, radius):
     m = radius**2
 
     def step(_, state):
-        x, v = state
-        a = jfrnn.pair_sum(contact, x, radius, {"v": v, "radius": radius, "m": m}, radius_rule="sum")
+        x, v, _ = state
+        a, touching = jfrnn.pair_sum(contact, x, radius, {"v": v, "radius": radius, "m": m}, radius_rule="sum")
         low, high = jnp.maximum(radius[:, None] - x, 0), jnp.maximum(x + radius[:, None] - jnp.array([WIDE, 1e3]), 0)
         a = a + STIFF * (low - high) - DAMPED * v * ((low > 0) | (high > 0)) + jnp.array([0.0, -9.81])
         v = v + DT * a
-        return x + DT * v, v
+        return x + DT * v, v, touching
 
-    return jax.lax.fori_loop(0, 40, step, (x, v))
+    return jax.lax.fori_loop(0, 40, step, (x, v, 0 * radius))
 
 
 def main(across=12, up=12, frames=60):
@@ -53,10 +53,10 @@ def main(across=12, up=12, frames=60):
     v, seen = jnp.zeros_like(x), []
     for _ in range(frames):
         seen.append(np.asarray(x))
-        x, v = frame(x, v, radius)
-    contacts = jfrnn.count(x, radius, radius_rule="sum").sum() // 2
-    print(f"{len(x)} grains, {contacts} contacts at the end, speed up to {float(jnp.abs(v).max()):.2f} m/s")
-    assert (x[:, 1] < seen[0][:, 1]).mean() > 0.5, "grains fall"
+        x, v, touching = frame(x, v, radius)
+    contacts, speed = int(np.sum(touching)) // 2, float(np.abs(v).max())
+    print(f"{len(x)} grains, {contacts} contacts at the end, speed up to {speed:.2f} m/s")
+    assert np.mean(np.asarray(x)[:, 1] < seen[0][:, 1]) > 0.5, "grains fall"
     return np.asarray(radius), seen
 
 
@@ -68,9 +68,9 @@ if __name__ == "__main__":
     grains = EllipseCollection(*shape, units="xy", offsets=seen[0], offset_transform=axes.transData, array=radius)
     axes.add_collection(grains)
     pictures = []
-    for x in seen[::3]:
+    for x in seen[::4]:
         grains.set_offsets(x)
         figure.canvas.draw()
         pictures.append(Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB").quantize(32))
     name = sys.argv[1] if len(sys.argv) > 1 else "grains.gif"
-    pictures[0].save(name, save_all=True, append_images=pictures[1:], duration=80, loop=0)
+    pictures[0].save(name, save_all=True, append_images=pictures[1:], duration=100, loop=0)

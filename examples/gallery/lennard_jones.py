@@ -47,7 +47,7 @@ def main(side=8, chunks=20):
     length = (n / DENSITY) ** (1 / 3)
     sites = np.stack(np.meshgrid(*[np.arange(side)] * 3), axis=-1).reshape(-1, 3)
     x = jnp.asarray((sites + 0.5) * length / side, jnp.float32)
-    v = TEMPERATURE**0.5 * jax.random.normal(jax.random.key(0), x.shape)
+    v = np.random.default_rng(0).normal(0, TEMPERATURE**0.5, x.shape).astype(np.float32)
     nbrs = jfrnn.search(x, CUTOFF, skin=SKIN, box=jfrnn.Box([length] * 3), slack=1.25)
     state, energies = (x, v - v.mean(axis=0), -jax.grad(potential)(x, nbrs)), []
     for _ in range(chunks):
