@@ -114,17 +114,17 @@ def _scratch(model: Model, s: State, steps: int, segments: int) -> int:
 
 def draw_memory(frame: pd.DataFrame) -> Figure:
     """Draw scratch over steps, with √steps segments and with one."""
-    last = frame[frame["steps"] == frame["steps"].max()].set_index("segments")["scratch [B]"]
-    ratio = factor(last.max() / last.min())
+    steps, segments, scratch = (np.asarray(frame[name], float) for name in ("steps", "segments", "scratch [B]"))
+    last = scratch[steps == steps.max()]
+    ratio = factor(float(last.max() / last.min()))
     figure, axes = make_axes(
-        f"After {plain(frame['steps'].max())} steps, √steps segments take {ratio} times less memory than one", 3.8
+        f"After {plain(float(steps.max()))} steps, √steps segments take {ratio} times less memory than one", 3.8
     )
     ends = []
-    parts = (("√steps segments", OURS, frame["segments"] > 1), ("one segment", PEER, frame["segments"] == 1))
-    for name, color, which in parts:
-        x, y = frame[which]["steps"].to_numpy(), frame[which]["scratch [B]"].to_numpy() / 1e6
+    for name, color, which in (("√steps segments", OURS, segments > 1), ("one segment", PEER, segments == 1)):
+        x, y = steps[which], scratch[which] / 1e6
         axes.plot(x, y, "o-", color=color, markersize=5)
-        ends.append((name, x[-1], y[-1], color))
+        ends.append((name, float(x[-1]), float(y[-1]), color))
     dress(axes, "steps", "memory of reverse mode [MB]")
     write_names(axes, ends)
     return figure

@@ -106,8 +106,9 @@ def draw(row: CaseRow) -> Picture:
         what, _, kind = name.rpartition(", ")
         color = OURS if kind == "measured" else PEER
         dots = (kind == "known") if broken else (kind == "measured")
-        style = {"linestyle": "none", "marker": shapes[name] if broken else "o"} if dots else {"linestyle": "-" if kind else "--"}
-        axes.plot(x, y, color=color, markersize=5 if broken else 3.5, zorder=3 if dots else 2, **style)
+        marker, line = (shapes[name] if broken else "o", "none") if dots else ("none", "-")
+        size, above = 5 if broken else 3.5, 3 if dots else 2
+        axes.plot(x, y, color=color, marker=marker, linestyle=line, markersize=size, zorder=above)
         if broken or not what:
             ends.append(("particles" if kind == "measured" else what or kind, x[-1], y[-1], color))
     write_names(axes, ends)
