@@ -1,8 +1,8 @@
 """What a package page needs beyond pyproject.toml: addresses, and a README whose links work there.
 
 `[tool.jfrnn] repository` in pyproject.toml is the one place that says where the project lives, as https://github.com/owner/jfrnn:
-files are then looked for below `blob/main`, pictures below `raw/main`. While it is empty, links to files become their text, and
-pictures what they show.
+files are then looked for below `blob/main`, pictures below `raw/main`. While it is empty, links to files become their text and the
+path of the file in a checkout, and pictures what they show.
 """
 
 import re
@@ -27,7 +27,8 @@ def rewrite_links(text: str, repository: str) -> str:
     def replace(link: re.Match[str]) -> str:
         picture, shown, path = link.groups()
         if not repository:
-            return f"*{shown}*" if picture else shown
+            place = "" if path in shown else f" (`{path}`)"
+            return f"*{shown}*" if picture else f"{shown}{place}"
         return f"{picture}[{shown}]({repository}/{'raw' if picture else 'blob'}/main/{path})"
 
     return LINK.sub(replace, text)

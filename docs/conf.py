@@ -8,7 +8,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 import jfrnn
-from experiments.pages import pictures
+from experiments.pages import gallery, pictures
 
 project = "jfrnn"
 author = "jfrnn developers"
@@ -40,8 +40,9 @@ STUDIES = HERE.parent / "notebooks"
 
 
 def setup(app):
-    """Draw pictures, copy the notebooks, and keep Sphinx from reading formulas of docstrings as its own marks."""
+    """Draw pictures, run the gallery, copy the notebooks, and keep Sphinx from reading formulas of docstrings as its own marks."""
     pictures.draw(HERE / "pictures")
+    gallery.run(HERE / "gallery.md", HERE / "pictures" / "gallery")
     (HERE / "notebooks").mkdir(exist_ok=True)
     for notebook in STUDIES.glob("*.ipynb"):
         shutil.copyfile(notebook, HERE / "notebooks" / notebook.name)

@@ -130,6 +130,7 @@ def write_names(axes: Axes, ends: Sequence[tuple[str, float, float, str]]) -> No
     """
     if not ends:
         return
+    axes.get_xbound()  # Matplotlib chooses limits of both axes when they are asked for, and transforms do not ask
     to_share = axes.transData + axes.transAxes.inverted()
     places = sorted((float(to_share.transform((x, y))[1]), name, x, y, color) for name, x, y, color in ends)
     tall = axes.get_window_extent().height / axes.figure.dpi  # before the layout makes room for titles and labels

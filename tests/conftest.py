@@ -38,7 +38,7 @@ LONGEST = (  # files, those first that take longest: what is left at the end is 
         "triangles",
     ),
     *("memory", "modes", "order", "verlet", "distributed", "batch", "reference", "cases_periodic", "transforms", "exports"),
-    *("experiments_sums", "experiments_distributed", "spread", "start", "travel", "gallery", "package", "house", "interrupts"),
+    *("experiments_sums", "experiments_distributed", "spread", "start", "travel", "package", "house", "interrupts"),
 )
 
 

@@ -333,6 +333,7 @@ X = np.zeros((4, 3), np.float32)
     ("error", "match", "make"),
     [
         (ValueError, r"lengths_or_matrix must have shape \[d\].*got shape \[4\]", lambda: jfrnn.Box([1.0] * 4)),
+        (ValueError, r"got shape \[\]: a cube is Box\(\[length\] \* 3\)", lambda: jfrnn.Box(1.0)),
         (TypeError, r"lengths_or_matrix must be real numbers, got str", lambda: jfrnn.Box("1")),
         (ValueError, r"lengths of periodic axes must be positive, got \[1.0, 0.0\]", lambda: jfrnn.Box([1.0, 0.0])),
         (ValueError, r"lengths_or_matrix must be finite, got \[1.0, nan\]", lambda: jfrnn.Box([1.0, np.nan])),

@@ -86,6 +86,9 @@ def test_too_many_pairs_are_never_silent():
     held = int(nbrs.count.sum())
     with pytest.raises(ValueError, match=f"Pass total={held} or more"):
         nbrs.edges(x, held - 1)
+    assert nbrs.edges(x).mask.sum() == len(nbrs.edges(x).mask) == held
+    with pytest.raises(TypeError, match=r"write edges\(positions, total\)"):
+        jax.jit(lambda nbrs, x: nbrs.edges(x))(nbrs, x)
     for total in (held - 1, 0):
         edges = jax.jit(lambda nbrs, x, total=total: nbrs.edges(x, total))(nbrs, x)
         assert int(edges.status) == jfrnn.Status.TOTAL_OVERFLOW
@@ -120,7 +123,7 @@ def test_a_graph_has_two_graphs(box):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-15), found, right)
     for asked, message in (({"queries": x}, "this list has queries"), ({}, "total must be a static int")):
         with pytest.raises((ValueError, TypeError), match=message):
-            jfrnn.search(x, 0.2, **asked).to_jraph(x, None)
+            jfrnn.search(x, 0.2, **asked).to_jraph(x, 2.0)
 
 
 def test_a_graph_is_one_of_jraph():

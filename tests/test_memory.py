@@ -326,6 +326,7 @@ def test_example_in_the_docstring():
     ("error", "match", "arguments"),
     [
         (TypeError, r"n must be an int, the number of points, got float 1000\.0", {"n": 1e3}),
+        (TypeError, r"n must be an int, the number of points, got float64 of shape \[9, 3\]", {"n": np.zeros((9, 3))}),
         (ValueError, r"n must be a number of points from 0 to 2147483616, got -1", {"n": -1}),
         (ValueError, r"queries must be a number of points from 0 to 2147483616, got 2147483648", {"queries": 2**31}),
         (TypeError, r"queries must be an int, the number of points, got bool True", {"queries": True}),

@@ -75,8 +75,7 @@ def test_extras_name_what_the_wheel_holds():
 def test_extras_are_there_for_a_resolver(wheel, tmp_path):
     """Offline: pip resolves the extra whose packages are installed here; the other is one that JAX has."""
     run("-m", "pip", "install", "--dry-run", "--no-index", f"{wheel}[warp]", cwd=tmp_path)
-    (metadata,) = (name for name in zipfile.ZipFile(wheel).namelist() if name.endswith("/METADATA"))
-    told = message_from_bytes(zipfile.ZipFile(wheel).read(metadata))
+    told = metadata(wheel)
     assert set(told.get_all("Provides-Extra")) == {"warp", "cuda13"}
     needed = next(line for line in told.get_all("Requires-Dist") if 'extra == "cuda13"' in line)
     assert needed.startswith("jax[cuda13]") and "cuda13" in distribution("jax").metadata.get_all("Provides-Extra")
@@ -97,6 +96,11 @@ def test_wheel_works_in_a_fresh_environment_with_each_extra(wheel, tmp_path, ext
     assert f"  {engine:9} right" in said
 
 
+def metadata(wheel):
+    with zipfile.ZipFile(wheel) as held:
+        return message_from_bytes(held.read(next(name for name in held.namelist() if name.endswith("/METADATA"))))
+
+
 def describe(tree, repository):
     """Return the metadata of a package whose pyproject.toml names a repository."""
     for name in ("jfrnn", "kernels", "cases", "setup.py", "README.md", "LICENSE"):
@@ -109,15 +113,16 @@ def describe(tree, repository):
 
 
 @pytest.mark.parametrize("repository", ["", "https://example.org/owner/jfrnn/"])
-def test_links_and_pictures_of_a_package_page_lead_somewhere(tmp_path, repository):
+def test_links_and_pictures_of_a_package_page_lead_somewhere(wheel, tmp_path, repository):
     """One line of pyproject.toml makes them all; without it there are none that lead nowhere."""
-    told = describe(tmp_path, repository)
+    told = describe(tmp_path, repository) if repository else metadata(wheel)
     text = told.get_payload()
     links = re.findall(r"(!?)\[[^\]]*\]\(([^)]+)\)", text)
     assert all(link.startswith(("https://", "#")) for _, link in links)
     assert told["Author"] == "jfrnn developers"
     if not repository:
         assert "![" not in text and told.get_all("Project-URL") is None and "A jet of oil onto a turning gear" in text
+        assert "quickstart (`notebooks/quickstart.ipynb`)" in text
         return
     home = repository.rstrip("/")
     assert [link for picture, link in links if picture] == [f"{home}/raw/main/docs/_static/jet.gif"]

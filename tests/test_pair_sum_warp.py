@@ -350,6 +350,9 @@ def test_auto_takes_the_kernel_where_it_can():
     assert engine(lambda r, i, j: r, reduce="max")
     with pytest.warns(RuntimeWarning, match="takes the slower engine 'jax' for a pair sum: the primitive 'sort'"):
         assert not engine(sorted_norm)
+    with pytest.warns(RuntimeWarning) as seen:
+        jax.eval_shape(jax.grad(lambda x: jfrnn.pair_sum(sorted_norm, x, CUTOFF).sum()), x)
+    assert {warning.filename for warning in seen} == {__file__}  # not a line of JAX, from which a derivative is taken
 
 
 def derivative_without_translation(x):

@@ -287,6 +287,7 @@ X = np.zeros((4, 3), np.float32)
         (TypeError, r"positions must be float32 or float64, got float16", {"positions": np.zeros((4, 3), np.float16)}),
         (ValueError, r"positions must have shape \[n, 2\] or \[n, 3\].*got shape \[3\]", {"positions": X[0]}),
         (ValueError, r"got shape \[4, 1\]", {"positions": X[:, :1]}),
+        (ValueError, r"got shape \[3, 4\]: pass positions.T", {"positions": X.T}),
         (ValueError, r"got shape \[1, 4, 3\]", {"positions": X[None]}),
         (ValueError, r"cutoff must be positive and finite, got 0", {"cutoff": 0.0}),
         (ValueError, r"cutoff must be positive and finite, got -1", {"cutoff": -1}),

@@ -1,6 +1,4 @@
-"""Crystals of different sizes, one compiled program: energies and forces per atom, in boxes smaller than the cutoff too.
-
-With ASE, take `atoms.positions`, `atoms.cell[:]` and `atoms.pbc` instead of `fcc`.
+"""Crystals of different sizes from ASE, one compiled program: energies and forces, in cells smaller than the cutoff too.
 
 python examples/gallery/crystals.py [PICTURE]
 """
@@ -11,19 +9,12 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from ase.build import bulk
 
 import jfrnn
 
 CUTOFF, ATOMS, SLOTS = 6.0, 64, 64
 DEPTH, RANGE = 0.0103, 3.40  # a Lennard-Jones argon: eV, Å
-
-
-def fcc(a, cells, noise, seed=0):
-    """Return positions and lattice vectors [Å] of a face-centered cubic crystal whose atoms are off their sites."""
-    basis = np.array([[0, 0, 0], [0, 0.5, 0.5], [0.5, 0, 0.5], [0.5, 0.5, 0]])
-    corners = np.stack(np.meshgrid(*map(np.arange, cells), indexing="ij"), axis=-1).reshape(-1, 1, 3)
-    positions = a * (corners + basis).reshape(-1, 3)
-    return positions + np.random.default_rng(seed).normal(0, noise, positions.shape), a * np.diag(cells).astype(float)
 
 
 def pair_energy(r, i, j):
@@ -41,24 +32,31 @@ def energy_and_forces(positions, active, vectors):
 
 
 def main():
-    """Return for each structure its atoms, its energy per atom [eV] and its largest force [eV/Å]."""
+    """Return for each structure its formula, its energy per atom [eV] and the forces on its atoms [eV/Å]."""
     found = []
     for cells, noise in (((1, 1, 1), 0.0), ((2, 1, 1), 0.05), ((2, 2, 2), 0.1), ((4, 2, 2), 0.1)):
-        positions, vectors = fcc(5.26, cells, noise)
-        padded, active = np.zeros((ATOMS, 3), np.float32), np.arange(ATOMS) < len(positions)
-        padded[active] = positions
-        energy, forces, status, count = energy_and_forces(padded, active, jnp.asarray(vectors, jnp.float32))
+        atoms = bulk("Ar", "fcc", a=5.26, cubic=True) * cells
+        atoms.rattle(noise, seed=0)
+        padded, active = np.zeros((ATOMS, 3), np.float32), np.arange(ATOMS) < len(atoms)
+        padded[active] = atoms.positions
+        energy, forces, status, count = energy_and_forces(padded, active, jnp.asarray(atoms.cell[:], jnp.float32))
         if status != 0:
             raise RuntimeError(f"pairs are missing: {jfrnn.Status(int(status))}, longest row {int(count.max())}")
-        per_atom, largest = float(energy) / len(positions), float(jnp.abs(forces).max())
-        print(f"{len(positions):3} atoms, {int(count[0])} neighbors: {per_atom:.4f} eV per atom, forces up to {largest:.4f} eV/Å")
-        found.append((len(positions), per_atom, largest))
+        forces = np.asarray(forces)[active]
+        name, per_atom = atoms.get_chemical_formula(), float(energy) / len(atoms)
+        assert np.abs(forces.sum(axis=0)).max() < 1e-4, "forces of a crystal add up to zero"
+        print(f"{name:>4}: {int(count[0])} neighbors, {per_atom:.4f} eV per atom, forces up to {np.abs(forces).max():.4f} eV/Å")
+        found.append((name, per_atom, forces))
     return found
 
 
 if __name__ == "__main__":
     found = main()
     figure, axes = plt.subplots(figsize=(7, 3.5), layout="constrained")
-    axes.bar([f"{atoms} atoms" for atoms, _, _ in found], [1e3 * energy for _, energy, _ in found])
-    axes.set(ylabel="meV per atom", title="Argon crystals, their atoms off their sites but in the first")
+    for place, (_, _, forces) in enumerate(found):
+        strength = 1e3 * np.linalg.norm(forces, axis=1)
+        axes.plot(place + np.linspace(-0.3, 0.3, len(strength)), strength, "o", color="tab:blue", markersize=4)
+    axes.set_xticks(range(len(found)), [f"{name}\n{1e3 * energy:.1f} meV per atom" for name, energy, _ in found])
+    axes.set(ylabel="force on each atom [meV/Å]", title="Four argon crystals, further from their sites towards the right")
+    axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "crystals.png", dpi=100)

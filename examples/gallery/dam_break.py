@@ -56,22 +56,22 @@ def front(gravity, steps, state):
     return DX * jax.nn.logsumexp(x[:, 0] / DX)
 
 
-def main(nx=20, steps=2000, differentiated=300):
-    """Print how far the front is and how that changes with gravity; return the state at the end."""
+def main(nx=16, steps=1600, differentiated=100):
+    """Print how far the front is and how that changes with gravity; return the state at the end, and its time [s]."""
     sites = np.stack(np.meshgrid(np.arange(nx), np.arange(2 * nx), indexing="ij"), axis=-1).reshape(-1, 2)
     x = jnp.asarray((sites + 0.5) * DX, jnp.float32)
     start = x, jnp.zeros_like(x), jnp.full(len(x), RHO, x.dtype)
     reached, change = jax.value_and_grad(front)(jnp.float32(GRAVITY), differentiated, start)
-    print(
-        f"{len(x)} particles; front at {reached:.2f} m after {differentiated} steps, {change:.4f} m more for each m/s² of gravity"
-    )
-    return run(jnp.float32(GRAVITY), steps, start), float(change)
+    print(f"{len(x)} particles; front after {differentiated} steps: {reached:.3f} m, its slope over gravity {change:.1e} s²")
+    assert change > 0, "more gravity drives the front forward"
+    return run(jnp.float32(GRAVITY), steps, start), steps * DT
 
 
 if __name__ == "__main__":
-    (x, v, _), _ = main()
-    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
+    (x, v, _), time = main()
+    figure, axes = plt.subplots(figsize=(7, 3.6))
     marks = axes.scatter(*x.T, c=jnp.linalg.norm(v, axis=1), s=6)
-    figure.colorbar(marks, label="speed [m/s]")
-    axes.set(aspect="equal", xlim=(0, TANK), ylim=(0, 2.2), xlabel="x [m]", ylabel="y [m]", title="A column of water, let go")
-    figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "dam_break.png", dpi=100)
+    figure.colorbar(marks, label="speed [m/s]", shrink=0.6)
+    axes.set(aspect="equal", xlim=(0, TANK), ylim=(0, 1.6), xlabel="x [m]", ylabel="y [m]")
+    axes.set_title(f"A column of water, {time:.2f} s after it was let go")
+    figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "dam_break.png", dpi=100, bbox_inches="tight")

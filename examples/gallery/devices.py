@@ -34,7 +34,7 @@ def chunk(particles, nbrs):
     return jax.lax.fori_loop(0, 20, step, (particles, nbrs))
 
 
-def main(n=2000, chunks=5):
+def main(n=1000, chunks=2):
     """Return positions, and the device that each particle is on at the end."""
     x = np.random.default_rng(0).uniform(0, 1, (n, 2)).astype(np.float32)
     mesh = jax.make_mesh((jax.device_count(),), ("x",))
@@ -48,12 +48,13 @@ def main(n=2000, chunks=5):
             particles = particles.grow(after, seen)
             nbrs = seen.grow(particles)
         particles, nbrs = after, seen
-    particles.check()
     ids = np.asarray(particles.ids).reshape(jax.device_count(), -1)
     device = np.empty(n, int)
     for k, row in enumerate(ids):
         device[row[row >= 0]] = k
     print(f"{n} particles on {jax.device_count()} devices: {np.bincount(device).tolist()}, {len(nbrs.pairs()[0])} pairs")
+    particles.check()
+    nbrs.check()
     return distributed.collect(particles)[0], device
 
 
@@ -61,5 +62,5 @@ if __name__ == "__main__":
     x, device = main()
     figure, axes = plt.subplots(figsize=(5, 5), layout="constrained")
     axes.scatter(*x.T, c=device, cmap="viridis", s=6)
-    axes.set(aspect="equal", title="Each color is a device", xticks=[], yticks=[])
+    axes.set(aspect="equal", title=f"{len(x)} particles, each in the color of its device", xticks=[], yticks=[])
     figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "devices.png", dpi=100)

@@ -4,6 +4,19 @@ import json
 from collections.abc import Callable
 
 from experiments.pages.rows import RESULTS, number, one, read, whole
+from jfrnn.cases.batches import BATCH_CASES
+from jfrnn.cases.hard import HARD_CASES
+from jfrnn.cases.periodic import PERIODIC_CASES
+from jfrnn.cases.radii import RADII_CASES
+from jfrnn.cases.triangles import TRIANGLE_CASES
+
+_CASES = {
+    "hard": HARD_CASES,
+    "periodic": PERIODIC_CASES,
+    "radii": RADII_CASES,
+    "batches": BATCH_CASES,
+    "triangles": TRIANGLE_CASES,
+}
 
 
 def _bytes_per_particle(method: str) -> Callable[[], str]:
@@ -88,4 +101,4 @@ VALUES: dict[str, Callable[[], str]] = {
     "density-64m-ms": _density("ms"),
     "density-64m-ns": _density("ns"),
     "tree-disagrees": _tree_disagrees,
-}
+} | {f"cases-{kind}": (lambda cases=cases: str(len(cases))) for kind, cases in _CASES.items()}

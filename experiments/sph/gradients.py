@@ -11,6 +11,7 @@ from jax import Array
 from matplotlib.figure import Figure
 
 from experiments._commands import check_names
+from experiments._look import OURS, PEER, WIDTH, clear, dress, factor, head, make_axes, plain, write_names
 from experiments.sph import solver
 from experiments.sph.inverse import PROBLEMS, Found, Problem, solve
 from experiments.sph.model import Model, State, make_model, make_state
@@ -58,15 +59,24 @@ def table(problem: Problem, found: Found, seconds: float) -> pd.DataFrame:
 
 def draw(problem: Problem, found: Found) -> Figure:
     """Draw losses over runs, and the parameters that were tried; dashes are what is known."""
-    figure = Figure(figsize=(7.0, 2.8), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
     left, right = figure.subplots(1, 2)
-    left.semilogy(np.maximum(found.losses, 1e-16), "o-", markersize=3)
-    left.set(xlabel="run", ylabel="loss", title=problem.name)
-    for k in range(found.tried.shape[1]):
-        right.plot(found.tried[:, k], "o-", color=f"C{k}", markersize=3)
+    for axes in (left, right):
+        clear(axes)
+    left.semilogy(np.maximum(found.losses, 1e-16), "o-", color=OURS, markersize=3)
+    left.set(xlabel="run", ylabel="loss")
+    ends = []
+    for k, values in enumerate(found.tried.T):
+        right.plot(values, "o-", color=OURS, markersize=3, linewidth=1)
+        ends.append((f"{values[-1]:.3g}", len(values) - 1, values[-1], OURS))
         if problem.known is not None:
-            right.axhline(problem.known[k], color=f"C{k}", linestyle="--", linewidth=1)
+            right.axhline(problem.known[k], color=PEER, linestyle="--", linewidth=1)
     right.set(xlabel="run", ylabel=problem.unknown)
+    write_names(right, ends)
+    many = f"{len(found.best)} numbers are" if len(found.best) > 1 else "one number is"
+    dashes = "; dashes: known" if problem.known is not None else ""
+    fall = f"a loss of {found.losses[0]:.2g} falls to {found.loss:.2g}"
+    head(figure, f"{problem.name}: {many} found in {len(found.losses)} runs, {fall}{dashes}")
     return figure
 
 
@@ -104,10 +114,17 @@ def _scratch(model: Model, s: State, steps: int, segments: int) -> int:
 
 def draw_memory(frame: pd.DataFrame) -> Figure:
     """Draw scratch over steps, with √steps segments and with one."""
-    figure = Figure(figsize=(4.6, 3.2), layout="constrained")
-    axes = figure.add_subplot()
-    for label, part in (("√steps segments", frame[frame["segments"] > 1]), ("one segment", frame[frame["segments"] == 1])):
-        axes.loglog(part["steps"], part["scratch [B]"] / 1e6, "o-", label=label, markersize=4)
-    axes.set(xlabel="steps", ylabel="memory of reverse mode [MB]")
-    axes.legend()
+    steps, segments, scratch = (np.asarray(frame[name], float) for name in ("steps", "segments", "scratch [B]"))
+    last = scratch[steps == steps.max()]
+    ratio = factor(float(last.max() / last.min()))
+    figure, axes = make_axes(
+        f"After {plain(float(steps.max()))} steps, √steps segments take {ratio} times less memory than one", 3.8
+    )
+    ends = []
+    for name, color, which in (("√steps segments", OURS, segments > 1), ("one segment", PEER, segments == 1)):
+        x, y = steps[which], scratch[which] / 1e6
+        axes.plot(x, y, "o-", color=color, markersize=5)
+        ends.append((name, float(x[-1]), float(y[-1]), color))
+    dress(axes, "steps", "memory of reverse mode [MB]")
+    write_names(axes, ends)
     return figure

@@ -7,11 +7,14 @@ from time import perf_counter
 from typing import Any
 
 import jax
+import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Picture
 
 from experiments import _machine
 from experiments._commands import check_names
+from experiments._look import MARKERS, OURS, PEER, make_axes, write_names
 from experiments._loop import Task, fill
 from experiments._rows import Row, RowFile
 from experiments.sph import health, solver
@@ -94,24 +97,45 @@ def table(rows: list[CaseRow]) -> pd.DataFrame:
 
 
 def draw(row: CaseRow) -> Picture:
-    """Draw what was measured as dots or dashes, what is known as lines."""
-    figure = Picture(figsize=(5.2, 3.6), layout="constrained")
-    axes = figure.add_subplot()
-    colors: dict[str, str] = {}
+    """Draw what the particles do in color, as dots, and what is known in grey, as lines; of a dam break the other way round."""
+    broken = row.key.startswith("dam-break")
+    said = "; ".join(f"{x['quantity']}: {_number(x)} ({_target(x)})" for x in row.figures[: 1 if broken else 2])
+    figure, axes = make_axes(f"{row.key}. {said}" if said else row.key, 4.2)
+    shapes, ends = dict(zip(row.curves, MARKERS, strict=False)), []
     for name, (x, y) in row.curves.items():
         what, _, kind = name.rpartition(", ")
-        known = kind == "known"
-        color = colors.setdefault(what, f"C{len(colors)}")
-        if row.key.startswith("dam-break"):
-            axes.plot(x, y, {"known": "o", "computed": "--"}.get(kind, "-"), color=color, label=name, markersize=4)
-        else:
-            axes.plot(x, y, "-" if known else "o", color=color, label=name if len(row.curves) <= 4 else None, markersize=3, lw=1)
-    if row.figures:
-        axes.set_title("\n".join(f"{x['quantity']}: {_number(x)} ({_target(x)})" for x in row.figures), fontsize=7)
-    axes.set(xlabel=row.axes[0], ylabel=row.axes[1])
-    if axes.get_legend_handles_labels()[1]:
-        axes.legend(fontsize=7)
+        color = OURS if kind == "measured" else PEER
+        dots = (kind == "known") if broken else (kind == "measured")
+        marker, line = (shapes[name] if broken else "o", "none") if dots else ("none", "-")
+        size, above = 5 if broken else 3.5, 3 if dots else 2
+        axes.plot(x, y, color=color, marker=marker, linestyle=line, markersize=size, zorder=above)
+        if broken or not what:
+            ends.append(("particles" if kind == "measured" else what or kind, x[-1], y[-1], color))
+    write_names(axes, ends)
+    _name_pairs(axes, row.curves if not ends else {})
+    key = "" if broken else "; dots: particles, lines: known"
+    axes.set(xlabel=f"{row.axes[0]}{key}", ylabel=row.axes[1])
     return figure
+
+
+def _name_pairs(axes: Axes, curves: Curves) -> None:
+    """Write what the lines of known answers are where they are furthest apart; those that are one there share a name."""
+    low, high = axes.get_ylim()
+    lines = {
+        name.rpartition(", ")[0]: np.array(sorted(zip(*xy, strict=True))).T for name, xy in curves.items() if name.endswith("known")
+    }
+    if not lines:
+        return
+    places = np.quantile(next(iter(lines.values()))[0], np.linspace(0.05, 0.95, 19))
+    values = {what: np.interp(places, *line) for what, line in lines.items()}
+    best = int(np.argmax(np.ptp(np.stack([*values.values()]), axis=0)))
+    placed: list[tuple[float, str]] = []
+    for y, what in sorted((of[best], what) for what, of in values.items()):
+        near = bool(placed) and y - placed[-1][0] < 0.06 * (high - low)
+        placed[-1 if near else len(placed) :] = [(y, f"{placed[-1][1]}, {what.removeprefix('t = ')}" if near else what)]
+    for y, what in placed:
+        box = {"boxstyle": "square,pad=0.1", "color": "white", "alpha": 0.8}
+        axes.annotate(what, (places[best], y), (0, 6), textcoords="offset points", ha="center", fontsize=9, bbox=box)
 
 
 def _number(figure: dict[str, Any]) -> str:

@@ -154,8 +154,8 @@ if hasattr(os, "register_at_fork"):
 
 
 def level_of_caller() -> int:
-    """Return the stacklevel that makes a warning name the caller of the library."""
+    """Return the stacklevel that makes a warning name the caller of the library, also where JAX stands between them."""
     frame, level = inspect.currentframe(), 0
-    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] == "jfrnn":
+    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] in ("jfrnn", "jax"):
         frame, level = frame.f_back, level + 1
     return level

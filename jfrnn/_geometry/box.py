@@ -82,7 +82,8 @@ class Box:
         if shape not in ((2,), (3,), (2, 2), (3, 3)) or vectors.ndim != len(shape) + bool(many) or 0 in vectors.shape:
             raise ValueError(
                 f"lengths_or_matrix must have shape [d] (lengths) or [d, d] (lattice vectors) with d = 2 or 3, or [systems, d, d], "
-                f"or with per_system=True [systems, d], got shape {list(vectors.shape)}."
+                f"or with per_system=True [systems, d], got shape {list(vectors.shape)}"
+                f"{': a cube is Box([length] * 3)' if vectors.ndim == 0 else ''}."
             )
         dim, systems = shape[0], vectors.shape[: bool(many)]
         corner = _real("origin", origin)

@@ -35,7 +35,8 @@ def check_positions(name: str, positions: Given, like: Array | None = None) -> A
             f'jax.config.update("jax_enable_x64", True) at start-up, or pass {name}.astype(np.float32).'
         )
     if len(shape) != 2 or shape[1] not in (2, 3):
-        raise ValueError(f"{name} must have shape [n, 2] or [n, 3], one row per particle, got shape {list(shape)}.")
+        turned = f": pass {name}.T" if len(shape) == 2 and shape[0] in (2, 3) else ""
+        raise ValueError(f"{name} must have shape [n, 2] or [n, 3], one row per particle, got shape {list(shape)}{turned}.")
     check_is_known(name, shape)
     if shape[0] > _MOST_POINTS:
         raise ValueError(f"{name} hold {shape[0]} particles, but indices are int32: at most {_MOST_POINTS}.")
@@ -356,7 +357,12 @@ def check_kind(dim: object, dtype: Given) -> tuple[int, np.dtype]:
 
 
 def _describe(value: object) -> str:
-    return f"a traced value {value}" if isinstance(value, Tracer) else f"{type(value).__name__} {value!r}"
+    if isinstance(value, Tracer):
+        return f"a traced value {value}"
+    if getattr(value, "ndim", 0) > 0:
+        return _describe_array(value)
+    text = f"{value!r}"
+    return f"{type(value).__name__} {text if len(text) <= 100 else f'{text[:97]}...'}"
 
 
 def _describe_array(value: Given) -> str:

@@ -137,6 +137,19 @@ class ListExports(KeptSearch):
             with at_once():
                 check_held(pair_total(self.count, self.capacity), total)
 
+    def _count_pairs(self, name: str) -> int:
+        """Return how many pairs the list holds, those of the skin included.
+
+        Raises:
+            TypeError: The list is traced.
+        """
+        if isinstance(self.count, Tracer):
+            raise TypeError(
+                f"{name}() makes arrays of a static length inside jax.jit: write {name}(positions, total), total being it."
+            )
+        self._check_known()
+        return int(np.asarray(self.count).sum(dtype=np.int64))
+
     def _near_now(self, at: Present) -> Array | None:
         if "positions" in at:
             return self._near(at["positions"], at.get("queries"), at.get("box"))

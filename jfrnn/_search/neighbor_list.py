@@ -166,7 +166,7 @@ class NeighborList(ListExports):
         with own_transfers():
             return lengths(topology, self.count, self._images_made(), sources, box, self.box_kind, cutoff, self.closed)
 
-    def edges(self, positions: Array, total: int, *, queries: Array | None = None, box: Box | None = None) -> Edges:
+    def edges(self, positions: Array, total: int | None = None, *, queries: Array | None = None, box: Box | None = None) -> Edges:
         """Return the pairs as edges of a graph, with their geometry, for graph networks inside jit.
 
         Edges lead from neighbors j to particles i and are sorted by i, so `jax.ops.segment_sum(messages, edges.receivers, m,
@@ -175,9 +175,9 @@ class NeighborList(ListExports):
 
         Args:
             positions: As in `vectors`.
-            total: Number of edges, a static int up to 2³¹ - 1. If there are more pairs, this raises outside jit. Inside jit, all
-                displacements are NaN then, and `status` and `pair_count` say so; `require(total)` makes the list keep such a bit,
-                of all pairs that it holds, those of the skin included.
+            total: Number of edges, a static int up to 2³¹ - 1; outside jit as many as the list holds pairs by default. If there are
+                more pairs, this raises outside jit. Inside jit, all displacements are NaN then, and `status` and `pair_count` say
+                so; `require(total)` makes the list keep such a bit, of all pairs that it holds, those of the skin included.
             queries: As in `vectors`.
             box: As in `vectors`.
 
@@ -196,7 +196,7 @@ class NeighborList(ListExports):
             raise ValueError(
                 f"edges() numbers slots by int32, and this list has {self.idx.size}: take `vectors`, or fewer queries."
             )
-        total = check_total(total)
+        total = self._count_pairs("edges") if total is None else check_total(total)
         self._check_single()
         _, mask, shifts = self._geometry(*lax.stop_gradient((positions, queries, box)))
         sources, rows = self._geometry_inputs(positions, queries)
@@ -210,12 +210,12 @@ class NeighborList(ListExports):
         check_held(made.pair_count, total)
         return made
 
-    def to_jraph(self, positions: Array, total: int, *, box: Box | None = None) -> Graph:
+    def to_jraph(self, positions: Array, total: int | None = None, *, box: Box | None = None) -> Graph:
         """Return the edges as a graph of jraph, with displacements, distances and lattice shifts; jraph need not be installed.
 
         Args:
             positions: Particles [length], shape [n, d], where they are now.
-            total: Number of edges, a static int, as in `edges`.
+            total: Number of edges, a static int, as in `edges`; by default as there.
             box: As in `vectors`.
 
         Returns:
