@@ -9,6 +9,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -21,6 +22,7 @@ from jfrnn._geometry import (
     Cutoff,
     Cutoffs,
     Pair,
+    decide_in_units,
     decide_pairs,
     flat_take,
     shift_in_given,
@@ -45,8 +47,9 @@ def count_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filt
     engine = _Engine(candidates, cutoff, keep, tuning, slots=1, capacity=None)
 
     def count_block(span: Span) -> list[Array]:
-        def add(words: _HitWords, count: Array) -> Array:
-            return count + bit_counts(words.hits).sum(1, dtype=jnp.int32)
+        def add(words: _HitWords, count: Array, once: bool) -> tuple[Array, None]:
+            del once
+            return count + bit_counts(words.hits).sum(1, dtype=jnp.int32), None
 
         return [engine.fold_words(span, add, jnp.zeros(span.size, jnp.int32))]
 
@@ -60,14 +63,16 @@ def list_neighbors(
 
     If images must be told apart, n times the image code is added to the source index; unused slots are n·images.
     """
-    torus = candidates.torus
     engine = _Engine(candidates, cutoff, keep, tuning, slots=capacity, capacity=capacity)
-    n, images = candidates.size, 1 if torus is None or torus.images.nearest else torus.images.total
+    if tuning.scattered:
+        return _scatter_neighbors(engine, capacity)
+    n, images = candidates.size, engine.images
     group = min(tuning.group, capacity)
     slots = lax.iota(jnp.int32, group)
 
     def list_block(span: Span) -> list[Array]:
-        def add(words: _HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
+        def add(words: _HitWords, found: tuple[Array, Array], once: bool) -> tuple[tuple[Array, Array], None]:
+            del once
             (rows, count), (hits, first, image) = found, words
             bits = BitRows.of(hits, tuning.by_gathers)
             total = bits.total
@@ -90,7 +95,7 @@ def list_neighbors(
             else:
                 until = (jnp.minimum(jnp.max(count + total), capacity) + group - 1) // group
                 rows = lax.fori_loop(jnp.min(count) // group, until, add_group, rows)
-            return rows, count + total
+            return (rows, count + total), None
 
         rows = jnp.full((span.size, capacity), n * images, jnp.int32)
         return [*engine.fold_words(span, add, (rows, jnp.zeros(span.size, jnp.int32)))]
@@ -99,11 +104,43 @@ def list_neighbors(
     return rows, count
 
 
+def _scatter_neighbors(engine: "_Engine", capacity: int) -> tuple[Array, Array]:
+    """List the neighbors of every query as `list_neighbors` does; each one is written to its slot."""
+    ids, fill = engine.queries.ids, engine.candidates.size * engine.images
+
+    def list_block(b: Array | int, out: tuple[Array, Array]) -> tuple[Array, Array]:
+        span = engine.block(b)
+        own = span.of(ids)
+
+        def add(words: _HitWords, found: tuple[Array, Array], once: bool) -> tuple[tuple[Array, Array], None]:
+            del once
+            rows, count = found
+            bits = BitRows.of(words.hits, engine.tuning.by_gathers)
+            there, ordinal = bits.ordinals()
+            slot = jnp.where(there, ordinal + count[:, None, None], capacity)
+            row = jnp.broadcast_to(own[:, None, None], slot.shape)
+            rows = _write(rows, (row, slot), engine.neighbors_of(words))
+            return (rows, count + bits.total), None
+
+        rows, count = engine.fold_words(span, add, (out[0], jnp.zeros(span.size, jnp.int32)))
+        return rows, out[1].at[own].set(count, unique_indices=True, mode="promise_in_bounds")
+
+    out = jnp.full((ids.size, capacity), fill, jnp.int32), jnp.zeros(ids.size, jnp.int32)
+    return list_block(0, out) if engine.block_count == 1 else lax.fori_loop(0, engine.block_count, list_block, out)
+
+
+def _write(x: Array, at: tuple[Array, ...], values: Array) -> Array:
+    """Write values to different places of an array; what is to be written beyond its end is dropped."""
+    axes = tuple(range(x.ndim))
+    dimensions = lax.ScatterDimensionNumbers(update_window_dims=(), inserted_window_dims=axes, scatter_dims_to_operand_dims=axes)
+    mode = lax.GatherScatterMode.FILL_OR_DROP
+    return lax.scatter(x, jnp.stack(at, axis=-1), values, dimensions, unique_indices=True, mode=mode)
+
+
 def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, room: Room, tuning: Tuning) -> Array:
     """List the neighbors of every query in rows without gaps: [total] int32, as `list_neighbors` has them, 0 behind the last."""
-    torus = candidates.torus
     engine = _Engine(candidates, cutoff, keep, tuning, slots=FOLD_GROUP, capacity=None)
-    n, images = candidates.size, 1 if torus is None or torus.images.nearest else torus.images.total
+    n, images = candidates.size, engine.images
     slots = lax.iota(jnp.int32, FOLD_GROUP)
 
     def fill_block(b: Array, out: Array) -> Array:
@@ -111,10 +148,16 @@ def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filte
         ids = span.of(engine.queries.ids)
         begin, end = room.starts[ids], room.starts[ids + 1]
 
-        def add(words: _HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
+        def add(words: _HitWords, found: tuple[Array, Array], once: bool) -> tuple[tuple[Array, Array], None]:
+            del once
             (out, at), (hits, first, image) = found, words
             bits = BitRows.of(hits, tuning.by_gathers)
             total = bits.total
+            if tuning.scattered:
+                there, ordinal = bits.ordinals()
+                place = at[:, None, None] + ordinal
+                place = jnp.where(there & (place < end[:, None, None]), place, room.total)
+                return (_write(out, (place,), engine.neighbors_of(words)), at + total), None
 
             def add_group(state: tuple[Array, Array]) -> tuple[Array, Array]:
                 done, out = state
@@ -128,7 +171,7 @@ def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filte
                 return done + FOLD_GROUP, out.at[jnp.where(there, place, room.total)].set(neighbor, mode="drop")
 
             most = jnp.max(total)
-            return lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), out))[1], at + total
+            return (lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), out))[1], at + total), None
 
         return engine.fold_words(span, add, (out, begin))[0]
 
@@ -173,8 +216,9 @@ def fold_neighbors(
 
     `elements` is the number of scalars per pair that a visitor needs; they count as slots of a block.
     """
-    engine = _Engine(candidates, cutoff, keep, tuning, slots=FOLD_GROUP * elements, capacity=None)
-    slots, torus = lax.iota(jnp.int32, FOLD_GROUP), candidates.torus
+    size = tuning.fold_group if candidates.queries.ids.size <= tuning.at_once else FOLD_GROUP
+    engine = _Engine(candidates, cutoff, keep, tuning, slots=size * elements, capacity=None)
+    slots, torus = lax.iota(jnp.int32, size), candidates.torus
 
     def fold_block(b: Array, out: State) -> State:
         span = engine.block(b)
@@ -182,7 +226,7 @@ def fold_neighbors(
         fresh = span.places >= b * engine.block_size
 
         def fold(add: Callable[[Slots, Carry], Carry], state: Carry) -> Carry:
-            def add_words(words: _HitWords, state: Carry) -> Carry:
+            def add_words(words: _HitWords, state: Carry, once: bool) -> tuple[Carry, Array | None]:
                 hits, first, image = words
                 bits = BitRows.of(hits, tuning.by_gathers)
                 total = jnp.where(fresh, bits.total, 0)
@@ -195,10 +239,12 @@ def fold_neighbors(
                     shift = None
                     if torus is not None and image is not None:
                         shift = _shifts_of(torus, ids[:, None], source, flat_take(image, word))
-                    return done + FOLD_GROUP, add(Slots(source, shift, ordinal < total[:, None]), state)
+                    return done + size, add(Slots(source, shift, ordinal < total[:, None]), state)
 
+                if once:
+                    return add_group((jnp.int32(0), state))[1], total > size
                 most = jnp.max(total)
-                return lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), state))[1]
+                return lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), state))[1], None
 
             return engine.fold_words(span, add_words, state)
 
@@ -220,7 +266,13 @@ class _WordTable(NamedTuple):
     stop: Array  # [b, r] its end
     image: Array | None  # [b, r] its image code
     before: Array | None  # [b, r] number of words in the query's earlier runs, if these are looked up
-    longest: Array | int  # [] largest number of words of a query
+    total: Array  # [b] number of words of each query
+    most: int | None  # that no query exceeds, if it is known
+
+    @property
+    def longest(self) -> Array | int:
+        """The largest number of words of a query, []."""
+        return self.most or largest_of(self.total)
 
 
 def _words_of(start: Array, stop: Array) -> Array:
@@ -233,6 +285,10 @@ class _HitWords(NamedTuple):
     hits: Array  # in the lower half
     first: Array  # position of each word's first candidate
     image: Array | None  # image code
+
+
+# (words, state, whether only the first slots of a row are to be filled) -> state, and which rows [b] have more than those
+_Add = Callable[[_HitWords, Carry, bool], tuple[Carry, Array | None]]
 
 
 class _Engine(NamedTuple):
@@ -250,6 +306,19 @@ class _Engine(NamedTuple):
     @property
     def queries(self) -> Points:
         return self.candidates.queries
+
+    @property
+    def images(self) -> int:
+        """The number of images that rows tell apart."""
+        torus = self.candidates.torus
+        return 1 if torus is None or torus.images.nearest else torus.images.total
+
+    def neighbors_of(self, words: "_HitWords") -> Array:
+        """Return what a list says of each candidate [b, w, 16]: its index, and n for each image before its own."""
+        neighbor = windows(self.sources.ids, words.first)
+        if words.image is None or self.images == 1:
+            return neighbor
+        return neighbor + np.int32(self.candidates.size) * words.image[..., None]
 
     @property
     def words(self) -> int:
@@ -300,28 +369,39 @@ class _Engine(NamedTuple):
 
         return lax.fori_loop(0, self.block_count, put, [jnp.zeros((ids.size, *shape), jnp.int32) for shape in columns])
 
-    def fold_words(self, span: Span, add: Callable[["_HitWords", State], State], state: State) -> State:
-        """Return the state after state = add(words, state) for each chunk of candidates of the queries at these positions."""
-
-        def add_pass(which: Array, state: State) -> State:
-            table = self.word_table(span, which)
-
-            query = [span.of(x) for x in self.queries.axes]
-
-            def add_chunk(chunk: Array, state: State) -> State:
-                return add(self.hit_words(span, query, table, chunk), state)
-
-            def add_next(now: tuple[Array, Array, State]) -> tuple[Array, Array, State]:
-                _, chunk, state = now
-                return (chunk + 1) * self.words < table.longest, chunk + 1, add_chunk(chunk, state)
-
-            if isinstance(table.longest, int) and table.longest <= self.words:
-                return add_chunk(jnp.int32(0), state)
-            return lax.while_loop(lambda now: now[0], add_next, (jnp.asarray(table.longest > 0), jnp.int32(0), state))[2]
-
+    def fold_words(self, span: Span, add: "_Add", state: Carry) -> Carry:
+        """Return the state after `add` was called for each chunk of candidates of the queries at these positions."""
         passes = self.candidates.passes
         passes = passes(span) if callable(passes) else passes
-        return add_pass(jnp.int32(0), state) if passes is None else lax.fori_loop(0, passes, add_pass, state)
+        if passes is None:
+            return self._fold_pass(span, add, jnp.int32(0), state)
+        return lax.fori_loop(0, passes, lambda which, state: self._fold_pass(span, add, which, state), state)
+
+    def _fold_pass(self, span: Span, add: "_Add", which: Array, state: Carry) -> Carry:
+        table, query = self.word_table(span, which), [span.of(x) for x in self.queries.axes]
+        at_once = span.size <= self.tuning.at_once and self.candidates.passes is None
+        begin, rare = state, None
+        if at_once:
+            words, rest = self.hit_words(span, query, table, jnp.int32(0), once=True)
+            state, more = add(words, state, True)
+            rest = rest if more is None else rest | more
+            rare = jnp.any(rest if table.most is not None and table.most <= self.words else rest | (table.total > self.words))
+
+        def add_chunk(chunk: Array, state: Carry) -> Carry:
+            return add(self.hit_words(span, query, table, chunk)[0], state, False)[0]
+
+        def add_next(now: tuple[Array, Array, Carry]) -> tuple[Array, Array, Carry]:
+            _, chunk, state = now
+            table_now = table
+            if at_once:  # the barrier keeps the largest number in the loop: it is not worth computing where nothing is rare
+                state = jax.tree.map(lambda old, new: jnp.where(chunk == 0, old, new), begin, state)
+                table_now = table._replace(total=lax.optimization_barrier((table.total, chunk))[0])
+            return (chunk + 1) * self.words < table_now.longest, chunk + 1, add_chunk(chunk, state)
+
+        if not at_once and table.most is not None and table.most <= self.words:
+            return add_chunk(jnp.int32(0), state)
+        go = rare if rare is not None else jnp.asarray(table.longest > 0)
+        return lax.while_loop(lambda now: now[0], add_next, (go, jnp.int32(0), state))[2]
 
     def word_table(self, span: Span, which: Array) -> _WordTable:
         start, stop, image = self.candidates.runs(span, which)
@@ -331,10 +411,15 @@ class _Engine(NamedTuple):
             before = jnp.cumsum(count, axis=1, dtype=jnp.int32) - count
         elif self.tuning.by_gathers:
             before = jnp.sum(count[:, None] * np.tril(np.ones((runs, runs), np.int32), -1)[None], axis=2, dtype=jnp.int32)
-        return _WordTable(start, stop, image, before, self.candidates.most_words or largest_of(total))
+        return _WordTable(start, stop, image, before, total, self.candidates.most_words)
 
-    def hit_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> _HitWords:
-        """Test one chunk of words per query; `own` are the d coordinates [b] of the queries."""
+    def hit_words(
+        self, span: Span, own: list[Array], table: _WordTable, chunk: Array, once: bool = False
+    ) -> tuple["_HitWords", Array]:
+        """Test one chunk of words per query; `own` are the d coordinates [b] of the queries.
+
+        Returns the hits and, with `once`, which queries [b] have doubtful candidates that were left undecided.
+        """
         own, table, chunk = lax.optimization_barrier((own, table, chunk))  # as XLA would take small parts out of the loop
         first, stop, image = self._locate_words(table, chunk)
         query = [x[:, None] for x in own]
@@ -345,7 +430,12 @@ class _Engine(NamedTuple):
             allowed = allowed & ~self._excluded_lanes(self.candidates.excluded, first, span)
         packed = self._test(first, image, query, span) & (allowed | allowed << np.uint32(LANES))
         first, image, packed = lax.optimization_barrier((first, image, packed))
-        return _HitWords(self._decide_doubtful(packed, first, image, span), first, image)
+        packed, rest = (
+            self._decide_first(packed, first, image, span)
+            if once
+            else (self._decide_doubtful(packed, first, image, span), first[:, 0] < 0)
+        )
+        return _HitWords(packed, first, image), rest
 
     def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
         word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (table.start.shape[0], self.words))
@@ -437,6 +527,30 @@ class _Engine(NamedTuple):
             home = self.candidates.torus.images.home
             later = jnp.where(image > home, own, jnp.where(image < home, own + 1, later))
         return windows(self.sources.ids, first) >= later[..., None]
+
+    def _decide_first(self, packed: Array, first: Array, image: Array | None, span: Span) -> tuple[Array, Array]:
+        """Decide the first doubtful candidate of each query, where that takes no wide integers, without any loop.
+
+        Returns the words, of which the lower half is right where the upper half is empty, and which rows have others [b].
+        """
+        one, (rows, width) = np.uint32(1), packed.shape
+        word = jnp.where(packed > _HITS, lax.broadcasted_iota(jnp.int32, packed.shape, 1), width)
+        start = np.int32(width), np.int32(0)
+        word, many = lax.reduce(
+            (word, bit_counts(packed >> np.uint32(LANES))), start, lambda a, b: (lax.min(a[0], b[0]), a[1] + b[1]), (1,)
+        )
+        at = lax.min(word, np.int32(width - 1)) + width * lax.iota(jnp.int32, rows)
+        asked = flat_take(packed, at) >> np.uint32(LANES)
+        bit = bit_counts((asked & (~asked + one)) - one) % LANES
+        known, near = decide_in_units(
+            self._pair(span.places, flat_take(first, at) + bit, None if image is None else flat_take(image, at)), self.cutoff
+        )
+        known = known & (many > 0)
+        bit = one << bit.astype(jnp.uint32)
+        change = jnp.where(known, jnp.where(near, bit, np.uint32(0)) - (bit << np.uint32(LANES)), np.uint32(0))
+        word, change, many = lax.optimization_barrier((word, change, many - known.astype(jnp.int32)))
+        here = lax.broadcasted_iota(jnp.int32, packed.shape, 1) == word[:, None]
+        return packed + jnp.where(here, change[:, None], np.uint32(0)), many > 0
 
     def _decide_doubtful(self, packed: Array, first: Array, image: Array | None, span: Span) -> Array:
         """Add the doubtful candidates that are pairs to the hits: [b, words] uint32, of which the lower half is set then.

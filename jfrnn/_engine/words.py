@@ -32,15 +32,13 @@ class BitRows(NamedTuple):
     Attributes:
         hits: [b, w] uint32, the words.
         earlier: [b, g] int32, the number of set bits in earlier groups of the row.
-        low: [b, g] uint32, the bytes of a group's words 0 to 3.
-        high: [b, g] uint32, the bytes of its words 4 to 7.
+        until: The bytes of a group's words 0 to 3, and of its words 4 to 7, uint32: [b, g, 2], or two arrays [b, g].
         by_gathers: Whether a group's numbers are gathered, or chosen by looking at every group of the row. Static.
     """
 
     hits: Array
     earlier: Array
-    low: Array
-    high: Array
+    until: Array | tuple[Array, Array]
     by_gathers: bool
 
     @classmethod
@@ -55,13 +53,16 @@ class BitRows(NamedTuple):
         in_group = (high >> np.uint32(24)).astype(jnp.int32)
         before = np.tril(np.ones((groups, groups), np.int32), -1)
         earlier = jnp.sum(in_group[:, None] * before[None], axis=2, dtype=jnp.int32)
+        if by_gathers:
+            return cls(hits, lax.optimization_barrier(earlier), until, by_gathers)
         earlier, low, high = lax.optimization_barrier((earlier, low, high))
-        return cls(hits, earlier, low, high, by_gathers)
+        return cls(hits, earlier, (low, high), by_gathers)
 
     @property
     def total(self) -> Array:
         """The number of set bits of each row, [b] int32."""
-        return self.earlier[:, -1] + (self.high[:, -1] >> np.uint32(24)).astype(jnp.int32)
+        last = self.until[1][:, -1] if isinstance(self.until, tuple) else self.until[:, -1, 1]
+        return self.earlier[:, -1] + (last >> np.uint32(24)).astype(jnp.int32)
 
     def nth(self, ordinal: Array) -> tuple[Array, Array]:
         """Find the ordinal-th set bit in each row: its word, as a position in the words of all rows, and its bit [b, k].
@@ -84,14 +85,26 @@ class BitRows(NamedTuple):
         found = lax.optimization_barrier(flat_take(self.hits, word))
         return word, lax.optimization_barrier(_nth_bit(found, within))
 
+    def ordinals(self) -> tuple[Array, Array]:
+        """Return which candidates are set bits, [b, w, 16] bool, and how many bits of their row are set before each, int32."""
+        (rows, width), groups = self.hits.shape, self.earlier.shape[1]
+        low, high = self.until if isinstance(self.until, tuple) else (self.until[:, :, 0], self.until[:, :, 1])
+        place = lax.broadcasted_iota(jnp.uint32, (1, 1, _GROUP), 2)
+        low, high = low[..., None], high[..., None]
+        before = jnp.where(place < 4, low << np.uint32(8), high << np.uint32(8) | low >> np.uint32(24))
+        before = self.earlier[..., None] + (before >> (place % 4 * 8) & np.uint32(0xFF)).astype(jnp.int32)
+        before = before.reshape(rows, groups * _GROUP)[:, :width, None]
+        lane = lax.broadcasted_iota(jnp.uint32, (1, 1, LANES), 2)
+        one, hits = np.uint32(1), self.hits[..., None]
+        return hits >> lane & one != 0, before + bit_counts(hits & ((one << lane) - one))
+
     def _group_of(self, ordinal: Array) -> tuple[Array, Array, Array, Array]:
         """Return the group in which a bit is, the number of bits in earlier ones, and the bytes of the group."""
-        columns = (self.earlier, self.low, self.high)
-        if self.by_gathers:
+        if not isinstance(self.until, tuple):
             group = last_reached(self.earlier, ordinal)
             at = group + lax.broadcasted_iota(jnp.int32, ordinal.shape, 0) * self.earlier.shape[1]
-            earlier, low, high = (flat_take(x, at) for x in columns)
-            return group, earlier, low, high
+            return group, flat_take(self.earlier, at), flat_take(self.until, 2 * at), flat_take(self.until, 2 * at + 1)
+        columns = (self.earlier, *self.until)
         group, (earlier, low, high) = jnp.zeros_like(ordinal), (_column(x, 0, ordinal.shape) for x in columns)
         for k in range(1, self.earlier.shape[1]):
             new = [_column(x, k, ordinal.shape) for x in columns]
