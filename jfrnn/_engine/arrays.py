@@ -225,10 +225,17 @@ def _all_sources(
         return start, jnp.broadcast_to(stop, start.shape), codes
 
     of_sources, of_queries = cutoff.of_points if isinstance(cutoff, Cutoffs) else (None, None)
-    padded = jnp.pad(lax.iota(jnp.int32, len(sources)) if order is None else order, (0, LANES))
+    words, ids = images * -(-len(sources) // LANES), lax.iota(jnp.int32, len(sources)) if order is None else order
+    ids = jnp.pad(ids, (0, LANES))
+    if order is None:
+        radii = None if of_sources is None else jnp.pad(of_sources, (0, LANES))
+        points = Points(list(jnp.pad(sources.T, ((0, 0), (0, LANES)))), ids, radii)
+    else:
+        points = _in_order(sources, ids, of_sources)
     rows = _in_order(sources if queries is None else queries, query_order, of_queries)
-    words, unordered = images * -(-len(sources) // LANES), query_order is None
-    points = _in_order(sources, padded, of_sources)
+    if queries is None:  # their positions come first among those of the sources
+        rows = rows._replace(axes=points.axes)
+    unordered = query_order is None
     return Candidates(points, rows, runs, torus, len(sources), lambda _: words, in_order=unordered, most_words=words)
 
 

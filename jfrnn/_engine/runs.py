@@ -123,6 +123,8 @@ def _scatter_neighbors(engine: "_Engine", capacity: int) -> tuple[Array, Array]:
             return (rows, count + bits.total), None
 
         rows, count = engine.fold_words(span, add, (out[0], jnp.zeros(span.size, jnp.int32)))
+        if engine.block_count == 1 and engine.candidates.in_order:
+            return rows, count
         return rows, out[1].at[own].set(count, unique_indices=True, mode="promise_in_bounds")
 
     out = jnp.full((ids.size, capacity), fill, jnp.int32), jnp.zeros(ids.size, jnp.int32)
@@ -388,7 +390,8 @@ class _Engine(NamedTuple):
             rare = jnp.any(rest if table.most is not None and table.most <= self.words else rest | (table.total > self.words))
 
         def add_chunk(chunk: Array, state: Carry) -> Carry:
-            return add(self.hit_words(span, query, table, chunk)[0], state, False)[0]
+            own = [span.of(x) for x in self.queries.axes] if at_once else query  # or they would be written down before the loop
+            return add(self.hit_words(span, own, table, chunk)[0], state, False)[0]
 
         def add_next(now: tuple[Array, Array, Carry]) -> tuple[Array, Array, Carry]:
             _, chunk, state = now
@@ -420,15 +423,16 @@ class _Engine(NamedTuple):
 
         Returns the hits and, with `once`, which queries [b] have doubtful candidates that were left undecided.
         """
-        own, table, chunk = lax.optimization_barrier((own, table, chunk))  # as XLA would take small parts out of the loop
+        if not once:  # XLA would take small parts out of the loop
+            own, table, chunk = lax.optimization_barrier((own, table, chunk))
         first, stop, image = self._locate_words(table, chunk)
         query = [x[:, None] for x in own]
         if image is not None and self.candidates.torus is not None:  # translate the query instead of the image
             query = [q - t for q, t in zip(query, self._translations(self.candidates.torus, image, span), strict=True)]
-        allowed = self._allowed_lanes(first, stop, image, span)
+        packed = self._test(first, stop, image, query, span)
         if self.candidates.excluded is not None:
-            allowed = allowed & ~self._excluded_lanes(self.candidates.excluded, first, span)
-        packed = self._test(first, image, query, span) & (allowed | allowed << np.uint32(LANES))
+            allowed = ~self._excluded_lanes(self.candidates.excluded, first, span) & _HITS
+            packed = packed & (allowed | allowed << np.uint32(LANES))
         first, image, packed = lax.optimization_barrier((first, image, packed))
         packed, rest = (
             self._decide_first(packed, first, image, span)
@@ -463,7 +467,7 @@ class _Engine(NamedTuple):
             return [shift * own[k, k] for k, shift in enumerate(shifts)]
         return [functools.reduce(jnp.add, (x * own[row, k] for row, x in enumerate(shifts))) for k in range(len(shifts))]
 
-    def _test(self, first: Array, image: Array | None, query: list[Array], span: Span) -> Array:
+    def _test(self, first: Array, stop: Array, image: Array | None, query: list[Array], span: Span) -> Array:
         """Compare 16 candidates per word with the cutoff in working precision: low half hits, high half doubtful ones."""
         difference = [windows(x, first) - q[..., None] for x, q in zip(self.sources.axes, query, strict=True)]
         square = squared_distance(difference, self.cutoff)
@@ -477,7 +481,11 @@ class _Engine(NamedTuple):
         if self.queries.systems is not None and self.sources.systems is not None:
             system = span.of(self.queries.systems)[:, None, None]
             value = jnp.where(windows(self.sources.systems, first) == system, value, np.uint32(0))
-        return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,))
+        if self.tuning.by_gathers:  # in the same kernel
+            value = jnp.where(self._is_allowed(first, stop, image, span), value, np.uint32(0))
+            return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,))
+        allowed = self._allowed_lanes(first, stop, image, span)
+        return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,)) & (allowed | allowed << np.uint32(LANES))
 
     def _bounds(self, own: Array | None, others: Array | None, span: Span) -> tuple[np.floating | Array, np.floating | Array]:
         torus = self.candidates.torus
@@ -486,6 +494,18 @@ class _Engine(NamedTuple):
             slack = span.of(torus.slack)[:, None, None]
         radii = self.cutoff.of_pairs(own, others) if isinstance(self.cutoff, Cutoffs) else None
         return step_one_bounds(self.cutoff, radii, slack)
+
+    def _is_allowed(self, first: Array, stop: Array, image: Array | None, span: Span) -> Array:
+        """Say which candidates [b, words, 16] belong to their run and are not the query itself."""
+        place = first[..., None] + np.arange(LANES, dtype=np.int32)[None, None]
+        allowed = place < stop[..., None]
+        if not self.keep.drop_self or self.keep.later_only:
+            return allowed
+        own, again = span.places[:, None, None], self.candidates.again
+        other = place != own if again is None else (place != own) & (place != own + again)
+        if image is not None and self.candidates.torus is not None:
+            other = other | (image != self.candidates.torus.images.home)[..., None]
+        return allowed & other
 
     def _allowed_lanes(self, first: Array, stop: Array, image: Array | None, span: Span) -> Array:
         """Return which of a word's 16 candidates belong to its run and are not the query itself: bits, [b, words] uint32."""

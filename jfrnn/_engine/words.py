@@ -10,6 +10,7 @@ from jfrnn._geometry import flat_take
 
 LANES = 16  # candidates per word: in a uint32 hits take the lower half, doubtful candidates the upper half
 _GROUP = 8  # words whose counts are bytes of two integers
+_FEW = 16  # entries that are compared one by one
 _BYTES = np.uint32(0x01010101)
 _TOPS = np.uint32(0x80808080)
 
@@ -89,12 +90,12 @@ class BitRows(NamedTuple):
         """Return which candidates are set bits, [b, w, 16] bool, and how many bits of their row are set before each, int32."""
         (rows, width), groups = self.hits.shape, self.earlier.shape[1]
         low, high = self.until if isinstance(self.until, tuple) else (self.until[:, :, 0], self.until[:, :, 1])
-        place = lax.broadcasted_iota(jnp.uint32, (1, 1, _GROUP), 2)
+        place = np.arange(_GROUP, dtype=np.uint32)[None, None]
         low, high = low[..., None], high[..., None]
         before = jnp.where(place < 4, low << np.uint32(8), high << np.uint32(8) | low >> np.uint32(24))
         before = self.earlier[..., None] + (before >> (place % 4 * 8) & np.uint32(0xFF)).astype(jnp.int32)
         before = before.reshape(rows, groups * _GROUP)[:, :width, None]
-        lane = lax.broadcasted_iota(jnp.uint32, (1, 1, LANES), 2)
+        lane = np.arange(LANES, dtype=np.uint32)[None, None]
         one, hits = np.uint32(1), self.hits[..., None]
         return hits >> lane & one != 0, before + bit_counts(hits & ((one << lane) - one))
 
@@ -121,7 +122,7 @@ def _column(x: Array, k: int, shape: tuple[int, ...]) -> Array:
 def last_reached(ascending: Array, value: Array) -> Array:
     """Return the last place in each ascending row [b, w] whose entry is <= value [b, k], or 0, by few comparisons or gathers."""
     last, place = ascending.shape[1] - 1, jnp.zeros_like(value)
-    if last < _GROUP:
+    if last < _FEW:
         for k in range(1, last + 1):
             place = place + (_column(ascending, k, value.shape) <= value).astype(jnp.int32)
         return place
