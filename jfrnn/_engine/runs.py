@@ -93,8 +93,12 @@ def list_neighbors(
             if group == capacity:
                 rows = add_group(jnp.int32(0), rows)
             else:
-                until = (jnp.minimum(jnp.max(count + total), capacity) + group - 1) // group
-                rows = lax.fori_loop(jnp.min(count) // group, until, add_group, rows)
+                start = np.int32(np.iinfo(np.int32).max), np.int32(0)
+                begin, end = lax.reduce(
+                    (count, count + total), start, lambda a, b: (lax.min(a[0], b[0]), lax.max(a[1], b[1])), (0,)
+                )
+                until = lax.div(lax.min(end, np.int32(capacity)) + np.int32(group - 1), np.int32(group))
+                rows = lax.fori_loop(lax.div(begin, np.int32(group)), until, add_group, rows)
             return (rows, count + total), None
 
         rows = jnp.full((span.size, capacity), n * images, jnp.int32)

@@ -33,13 +33,13 @@ class BitRows(NamedTuple):
     Attributes:
         hits: [b, w] uint32, the words.
         earlier: [b, g] int32, the number of set bits in earlier groups of the row.
-        until: The bytes of a group's words 0 to 3, and of its words 4 to 7, uint32: [b, g, 2], or two arrays [b, g].
+        until: [b, g, 2] uint32, the bytes of a group's words 0 to 3, and of its words 4 to 7.
         by_gathers: Whether a group's numbers are gathered, or chosen by looking at every group of the row. Static.
     """
 
     hits: Array
     earlier: Array
-    until: Array | tuple[Array, Array]
+    until: Array
     by_gathers: bool
 
     @classmethod
@@ -50,20 +50,15 @@ class BitRows(NamedTuple):
         groups = -(-width // _GROUP)
         counts = jnp.pad(lax.population_count(hits), ((0, 0), (0, groups * _GROUP - width))).reshape(rows, groups, 1, _GROUP)
         until = lax.optimization_barrier(jnp.sum(counts * _until_bytes(), axis=3, dtype=jnp.uint32))
-        low, high = until[:, :, 0], until[:, :, 1]
-        in_group = (high >> np.uint32(24)).astype(jnp.int32)
+        in_group = (until[:, :, 1] >> np.uint32(24)).astype(jnp.int32)
         before = np.tril(np.ones((groups, groups), np.int32), -1)
         earlier = jnp.sum(in_group[:, None] * before[None], axis=2, dtype=jnp.int32)
-        if by_gathers:
-            return cls(hits, lax.optimization_barrier(earlier), until, by_gathers)
-        earlier, low, high = lax.optimization_barrier((earlier, low, high))
-        return cls(hits, earlier, (low, high), by_gathers)
+        return cls(hits, lax.optimization_barrier(earlier), until, by_gathers)
 
     @property
     def total(self) -> Array:
         """The number of set bits of each row, [b] int32."""
-        last = self.until[1][:, -1] if isinstance(self.until, tuple) else self.until[:, -1, 1]
-        return self.earlier[:, -1] + (last >> np.uint32(24)).astype(jnp.int32)
+        return self.earlier[:, -1] + (self.until[:, -1, 1] >> np.uint32(24)).astype(jnp.int32)
 
     def nth(self, ordinal: Array) -> tuple[Array, Array]:
         """Find the ordinal-th set bit in each row: its word, as a position in the words of all rows, and its bit [b, k].
@@ -89,9 +84,8 @@ class BitRows(NamedTuple):
     def ordinals(self) -> tuple[Array, Array]:
         """Return which candidates are set bits, [b, w, 16] bool, and how many bits of their row are set before each, int32."""
         (rows, width), groups = self.hits.shape, self.earlier.shape[1]
-        low, high = self.until if isinstance(self.until, tuple) else (self.until[:, :, 0], self.until[:, :, 1])
         place = np.arange(_GROUP, dtype=np.uint32)[None, None]
-        low, high = low[..., None], high[..., None]
+        low, high = self.until[:, :, :1], self.until[:, :, 1:]
         before = jnp.where(place < 4, low << np.uint32(8), high << np.uint32(8) | low >> np.uint32(24))
         before = self.earlier[..., None] + (before >> (place % 4 * 8) & np.uint32(0xFF)).astype(jnp.int32)
         before = before.reshape(rows, groups * _GROUP)[:, :width, None]
@@ -101,11 +95,11 @@ class BitRows(NamedTuple):
 
     def _group_of(self, ordinal: Array) -> tuple[Array, Array, Array, Array]:
         """Return the group in which a bit is, the number of bits in earlier ones, and the bytes of the group."""
-        if not isinstance(self.until, tuple):
+        if self.by_gathers:
             group = last_reached(self.earlier, ordinal)
             at = group + lax.broadcasted_iota(jnp.int32, ordinal.shape, 0) * self.earlier.shape[1]
             return group, flat_take(self.earlier, at), flat_take(self.until, 2 * at), flat_take(self.until, 2 * at + 1)
-        columns = (self.earlier, *self.until)
+        columns = self.earlier, self.until[:, :, 0], self.until[:, :, 1]
         group, (earlier, low, high) = jnp.zeros_like(ordinal), (_column(x, 0, ordinal.shape) for x in columns)
         for k in range(1, self.earlier.shape[1]):
             new = [_column(x, k, ordinal.shape) for x in columns]
