@@ -9,7 +9,6 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -47,9 +46,8 @@ def count_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filt
     engine = _Engine(candidates, cutoff, keep, tuning, slots=1, capacity=None)
 
     def count_block(span: Span) -> list[Array]:
-        def add(words: _HitWords, count: Array, once: bool) -> tuple[Array, None]:
-            del once
-            return count + bit_counts(words.hits).sum(1, dtype=jnp.int32), None
+        def add(words: _HitWords, count: Array) -> Array:
+            return count + bit_counts(words.hits).sum(1, dtype=jnp.int32)
 
         return [engine.fold_words(span, add, jnp.zeros(span.size, jnp.int32))]
 
@@ -64,15 +62,12 @@ def list_neighbors(
     If images must be told apart, n times the image code is added to the source index; unused slots are n·images.
     """
     engine = _Engine(candidates, cutoff, keep, tuning, slots=capacity, capacity=capacity)
-    if tuning.scattered:
-        return _scatter_neighbors(engine, capacity)
     n, images = candidates.size, engine.images
     group = min(tuning.group, capacity)
     slots = lax.iota(jnp.int32, group)
 
     def list_block(span: Span) -> list[Array]:
-        def add(words: _HitWords, found: tuple[Array, Array], once: bool) -> tuple[tuple[Array, Array], None]:
-            del once
+        def add(words: _HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
             (rows, count), (hits, first, image) = found, words
             bits = BitRows.of(hits, tuning.by_gathers)
             total = bits.total
@@ -99,48 +94,13 @@ def list_neighbors(
                 )
                 until = lax.div(lax.min(end, np.int32(capacity)) + np.int32(group - 1), np.int32(group))
                 rows = lax.fori_loop(lax.div(begin, np.int32(group)), until, add_group, rows)
-            return (rows, count + total), None
+            return rows, count + total
 
         rows = jnp.full((span.size, capacity), n * images, jnp.int32)
         return [*engine.fold_words(span, add, (rows, jnp.zeros(span.size, jnp.int32)))]
 
     rows, count = engine.map_blocks(list_block, [(capacity,), ()])
     return rows, count
-
-
-def _scatter_neighbors(engine: "_Engine", capacity: int) -> tuple[Array, Array]:
-    """List the neighbors of every query as `list_neighbors` does; each one is written to its slot."""
-    ids, fill = engine.queries.ids, engine.candidates.size * engine.images
-
-    def list_block(b: Array | int, out: tuple[Array, Array]) -> tuple[Array, Array]:
-        span = engine.block(b)
-        own = span.of(ids)
-
-        def add(words: _HitWords, found: tuple[Array, Array], once: bool) -> tuple[tuple[Array, Array], None]:
-            del once
-            rows, count = found
-            bits = BitRows.of(words.hits, engine.tuning.by_gathers)
-            there, ordinal = bits.ordinals()
-            slot = jnp.where(there, ordinal + count[:, None, None], capacity)
-            row = jnp.broadcast_to(own[:, None, None], slot.shape)
-            rows = _write(rows, (row, slot), engine.neighbors_of(words))
-            return (rows, count + bits.total), None
-
-        rows, count = engine.fold_words(span, add, (out[0], jnp.zeros(span.size, jnp.int32)))
-        if engine.block_count == 1 and engine.candidates.in_order:
-            return rows, count
-        return rows, out[1].at[own].set(count, unique_indices=True, mode="promise_in_bounds")
-
-    out = jnp.full((ids.size, capacity), fill, jnp.int32), jnp.zeros(ids.size, jnp.int32)
-    return list_block(0, out) if engine.block_count == 1 else lax.fori_loop(0, engine.block_count, list_block, out)
-
-
-def _write(x: Array, at: tuple[Array, ...], values: Array) -> Array:
-    """Write values to different places of an array; what is to be written beyond its end is dropped."""
-    axes = tuple(range(x.ndim))
-    dimensions = lax.ScatterDimensionNumbers(update_window_dims=(), inserted_window_dims=axes, scatter_dims_to_operand_dims=axes)
-    mode = lax.GatherScatterMode.FILL_OR_DROP
-    return lax.scatter(x, jnp.stack(at, axis=-1), values, dimensions, unique_indices=True, mode=mode)
 
 
 def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, room: Room, tuning: Tuning) -> Array:
@@ -154,16 +114,10 @@ def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filte
         ids = span.of(engine.queries.ids)
         begin, end = room.starts[ids], room.starts[ids + 1]
 
-        def add(words: _HitWords, found: tuple[Array, Array], once: bool) -> tuple[tuple[Array, Array], None]:
-            del once
+        def add(words: _HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
             (out, at), (hits, first, image) = found, words
             bits = BitRows.of(hits, tuning.by_gathers)
             total = bits.total
-            if tuning.scattered:
-                there, ordinal = bits.ordinals()
-                place = at[:, None, None] + ordinal
-                place = jnp.where(there & (place < end[:, None, None]), place, room.total)
-                return (_write(out, (place,), engine.neighbors_of(words)), at + total), None
 
             def add_group(state: tuple[Array, Array]) -> tuple[Array, Array]:
                 done, out = state
@@ -177,7 +131,7 @@ def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filte
                 return done + FOLD_GROUP, out.at[jnp.where(there, place, room.total)].set(neighbor, mode="drop")
 
             most = jnp.max(total)
-            return (lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), out))[1], at + total), None
+            return lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), out))[1], at + total
 
         return engine.fold_words(span, add, (out, begin))[0]
 
@@ -222,7 +176,7 @@ def fold_neighbors(
 
     `elements` is the number of scalars per pair that a visitor needs; they count as slots of a block.
     """
-    size = tuning.fold_group if candidates.queries.ids.size <= tuning.at_once else FOLD_GROUP
+    size = tuning.fold_group if _is_at_once(candidates, tuning) else FOLD_GROUP
     engine = _Engine(candidates, cutoff, keep, tuning, slots=size * elements, capacity=None)
     slots, torus = lax.iota(jnp.int32, size), candidates.torus
 
@@ -232,7 +186,7 @@ def fold_neighbors(
         fresh = span.places >= b * engine.block_size
 
         def fold(add: Callable[[Slots, Carry], Carry], state: Carry) -> Carry:
-            def add_words(words: _HitWords, state: Carry, once: bool) -> tuple[Carry, Array | None]:
+            def add_words(words: _HitWords, state: Carry, at_once: bool) -> Carry:
                 hits, first, image = words
                 bits = BitRows.of(hits, tuning.by_gathers)
                 total = jnp.where(fresh, bits.total, 0)
@@ -247,12 +201,13 @@ def fold_neighbors(
                         shift = _shifts_of(torus, ids[:, None], source, flat_take(image, word))
                     return done + size, add(Slots(source, shift, ordinal < total[:, None]), state)
 
-                if once:
-                    return add_group((jnp.int32(0), state))[1], total > size
+                if at_once:
+                    return add_group((jnp.int32(0), state))[1]
                 most = jnp.max(total)
-                return lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), state))[1], None
+                return lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), state))[1]
 
-            return engine.fold_words(span, add_words, state)
+            few = functools.partial(add_words, at_once=True)
+            return engine.fold_words(span, functools.partial(add_words, at_once=False), state, (few, size))
 
         return visit(Block(ids, fresh, fold), out)
 
@@ -293,8 +248,12 @@ class _HitWords(NamedTuple):
     image: Array | None  # image code
 
 
-# (words, state, whether only the first slots of a row are to be filled) -> state, and which rows [b] have more than those
-_Add = Callable[[_HitWords, Carry, bool], tuple[Carry, Array | None]]
+_Add = Callable[[_HitWords, State], State]
+
+
+def _is_at_once(candidates: Candidates, tuning: Tuning) -> bool:
+    """Say whether blocks are processed without loops where that is enough: doubts are rare in open space alone."""
+    return candidates.queries.ids.size <= tuning.at_once and candidates.torus is None and candidates.passes is None
 
 
 class _Engine(NamedTuple):
@@ -318,13 +277,6 @@ class _Engine(NamedTuple):
         """The number of images that rows tell apart."""
         torus = self.candidates.torus
         return 1 if torus is None or torus.images.nearest else torus.images.total
-
-    def neighbors_of(self, words: "_HitWords") -> Array:
-        """Return what a list says of each candidate [b, w, 16]: its index, and n for each image before its own."""
-        neighbor = windows(self.sources.ids, words.first)
-        if words.image is None or self.images == 1:
-            return neighbor
-        return neighbor + np.int32(self.candidates.size) * words.image[..., None]
 
     @property
     def words(self) -> int:
@@ -375,40 +327,53 @@ class _Engine(NamedTuple):
 
         return lax.fori_loop(0, self.block_count, put, [jnp.zeros((ids.size, *shape), jnp.int32) for shape in columns])
 
-    def fold_words(self, span: Span, add: "_Add", state: Carry) -> Carry:
-        """Return the state after `add` was called for each chunk of candidates of the queries at these positions."""
+    def fold_words(self, span: Span, add: "_Add[State]", state: State, few: tuple["_Add[State]", int] | None = None) -> State:
+        """Return the state after state = add(words, state) for each chunk of candidates of the queries at these positions.
+
+        `few` holds a function that does the same for so many neighbors of each query at most.
+        """
+        if _is_at_once(self.candidates, self.tuning):
+            return self._fold_at_once(span, add, state, few)
+
+        def add_pass(which: Array, state: State) -> State:
+            return self._fold_table(span, add, self.word_table(span, which), state)
+
         passes = self.candidates.passes
         passes = passes(span) if callable(passes) else passes
-        if passes is None:
-            return self._fold_pass(span, add, jnp.int32(0), state)
-        return lax.fori_loop(0, passes, lambda which, state: self._fold_pass(span, add, which, state), state)
+        return add_pass(jnp.int32(0), state) if passes is None else lax.fori_loop(0, passes, add_pass, state)
 
-    def _fold_pass(self, span: Span, add: "_Add", which: Array, state: Carry) -> Carry:
-        table, query = self.word_table(span, which), [span.of(x) for x in self.queries.axes]
-        at_once = span.size <= self.tuning.at_once and self.candidates.passes is None
-        begin, rare = state, None
-        if at_once:
-            words, rest = self.hit_words(span, query, table, jnp.int32(0), once=True)
-            state, more = add(words, state, True)
-            rest = rest if more is None else rest | more
-            rare = jnp.any(rest if table.most is not None and table.most <= self.words else rest | (table.total > self.words))
+    def _fold_at_once(self, span: Span, add: "_Add[State]", state: State, few: tuple["_Add[State]", int] | None) -> State:
+        """Fold the first chunk of candidates without a loop; where that is not all, or leaves doubts, start again with loops."""
+        table = self.word_table(span, jnp.int32(0))
+        packed, first, image = self._test_words(span, [span.of(x) for x in self.queries.axes], table, jnp.int32(0))
+        packed, rest = self._decide_first(packed, first, image, span)
+        if table.most is None or table.most > self.words:
+            rest = rest | (table.total > self.words)
+        add_few = add
+        if few is not None:
+            add_few, room = few
+            rest = rest | (bit_counts(packed & _HITS).sum(axis=1, dtype=jnp.int32) > room)
+        return lax.cond(
+            jnp.any(rest),
+            lambda state: self._fold_table(span, add, table, state),
+            lambda state: add_few(_HitWords(packed, first, image), state),
+            state,
+        )
 
-        def add_chunk(chunk: Array, state: Carry) -> Carry:
-            own = [span.of(x) for x in self.queries.axes] if at_once else query  # or they would be written down before the loop
-            return add(self.hit_words(span, own, table, chunk)[0], state, False)[0]
+    def _fold_table(self, span: Span, add: "_Add[State]", table: _WordTable, state: State) -> State:
+        query = [span.of(x) for x in self.queries.axes]
 
-        def add_next(now: tuple[Array, Array, Carry]) -> tuple[Array, Array, Carry]:
+        def add_chunk(chunk: Array, state: State) -> State:
+            return add(self.hit_words(span, query, table, chunk), state)
+
+        def add_next(now: tuple[Array, Array, State]) -> tuple[Array, Array, State]:
             _, chunk, state = now
-            table_now = table
-            if at_once:  # the barrier keeps the largest number in the loop: it is not worth computing where nothing is rare
-                state = jax.tree.map(lambda old, new: jnp.where(chunk == 0, old, new), begin, state)
-                table_now = table._replace(total=lax.optimization_barrier((table.total, chunk))[0])
-            return (chunk + 1) * self.words < table_now.longest, chunk + 1, add_chunk(chunk, state)
+            return (chunk + 1) * self.words < longest, chunk + 1, add_chunk(chunk, state)
 
-        if not at_once and table.most is not None and table.most <= self.words:
+        if table.most is not None and table.most <= self.words:
             return add_chunk(jnp.int32(0), state)
-        go = rare if rare is not None else jnp.asarray(table.longest > 0)
-        return lax.while_loop(lambda now: now[0], add_next, (go, jnp.int32(0), state))[2]
+        longest = table.longest
+        return lax.while_loop(lambda now: now[0], add_next, (jnp.asarray(longest > 0), jnp.int32(0), state))[2]
 
     def word_table(self, span: Span, which: Array) -> _WordTable:
         start, stop, image = self.candidates.runs(span, which)
@@ -420,15 +385,14 @@ class _Engine(NamedTuple):
             before = jnp.sum(count[:, None] * np.tril(np.ones((runs, runs), np.int32), -1)[None], axis=2, dtype=jnp.int32)
         return _WordTable(start, stop, image, before, total, self.candidates.most_words)
 
-    def hit_words(
-        self, span: Span, own: list[Array], table: _WordTable, chunk: Array, once: bool = False
-    ) -> tuple["_HitWords", Array]:
-        """Test one chunk of words per query; `own` are the d coordinates [b] of the queries.
+    def hit_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> _HitWords:
+        """Test one chunk of words per query; `own` are the d coordinates [b] of the queries."""
+        own, table, chunk = lax.optimization_barrier((own, table, chunk))  # as XLA would take small parts out of the loop
+        packed, first, image = self._test_words(span, own, table, chunk)
+        return _HitWords(self._decide_doubtful(packed, first, image, span), first, image)
 
-        Returns the hits and, with `once`, which queries [b] have doubtful candidates that were left undecided.
-        """
-        if not once:  # XLA would take small parts out of the loop
-            own, table, chunk = lax.optimization_barrier((own, table, chunk))
+    def _test_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
+        """Return a chunk of words with hits and doubtful candidates, the positions of their first candidates, and their images."""
         first, stop, image = self._locate_words(table, chunk)
         query = [x[:, None] for x in own]
         if image is not None and self.candidates.torus is not None:  # translate the query instead of the image
@@ -437,13 +401,7 @@ class _Engine(NamedTuple):
         if self.candidates.excluded is not None:
             allowed = ~self._excluded_lanes(self.candidates.excluded, first, span) & _HITS
             packed = packed & (allowed | allowed << np.uint32(LANES))
-        first, image, packed = lax.optimization_barrier((first, image, packed))
-        packed, rest = (
-            self._decide_first(packed, first, image, span)
-            if once
-            else (self._decide_doubtful(packed, first, image, span), first[:, 0] < 0)
-        )
-        return _HitWords(packed, first, image), rest
+        return lax.optimization_barrier((packed, first, image))
 
     def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
         word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (table.start.shape[0], self.words))

@@ -30,11 +30,10 @@ class Tuning(NamedTuple):
         by_gathers: Whether what a slot needs to know of a group of words, and a word of its run, is gathered, instead of chosen by
             looking at every group or run.
         group: Slots of a row that are filled at a time.
-        scattered: Whether each neighbor is written to its slot, instead of each slot looking for its neighbor.
-        at_once: A block of up to so many queries is first processed without any loop, on the assumption that no query has more
-            words of candidates than are usual, or more than one doubtful candidate. Where that is wrong, all is done again by
-            loops. A loop of which the data decide how often it runs makes the host of an accelerator wait for each decision.
-        fold_group: Slots of a row that are summed at a time.
+        at_once: A block of up to so many queries, in open space, is processed without any loop unless a query has more words of
+            candidates than are usual, more doubtful ones than one, or more neighbors than `fold_group`. A loop whose length the
+            data decide makes the host of an accelerator wait before each turn, but such a program takes longer to compile.
+        fold_group: Slots of a row that are summed at a time, where `at_once` allows it.
     """
 
     scratch: int
@@ -45,7 +44,6 @@ class Tuning(NamedTuple):
     doubtful_rows: int
     by_gathers: bool
     group: int
-    scattered: bool = False
     at_once: int = 0
     fold_group: int = 32
 
@@ -69,7 +67,6 @@ ACCELERATOR = Tuning(  # few large kernels, in at most 1 GB
     doubtful_rows=4096,
     by_gathers=True,
     group=256,
-    scattered=True,
     at_once=1 << 16,
     fold_group=128,
 )

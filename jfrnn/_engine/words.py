@@ -81,18 +81,6 @@ class BitRows(NamedTuple):
         found = lax.optimization_barrier(flat_take(self.hits, word))
         return word, lax.optimization_barrier(_nth_bit(found, within))
 
-    def ordinals(self) -> tuple[Array, Array]:
-        """Return which candidates are set bits, [b, w, 16] bool, and how many bits of their row are set before each, int32."""
-        (rows, width), groups = self.hits.shape, self.earlier.shape[1]
-        place = np.arange(_GROUP, dtype=np.uint32)[None, None]
-        low, high = self.until[:, :, :1], self.until[:, :, 1:]
-        before = jnp.where(place < 4, low << np.uint32(8), high << np.uint32(8) | low >> np.uint32(24))
-        before = self.earlier[..., None] + (before >> (place % 4 * 8) & np.uint32(0xFF)).astype(jnp.int32)
-        before = before.reshape(rows, groups * _GROUP)[:, :width, None]
-        lane = np.arange(LANES, dtype=np.uint32)[None, None]
-        one, hits = np.uint32(1), self.hits[..., None]
-        return hits >> lane & one != 0, before + bit_counts(hits & ((one << lane) - one))
-
     def _group_of(self, ordinal: Array) -> tuple[Array, Array, Array, Array]:
         """Return the group in which a bit is, the number of bits in earlier ones, and the bytes of the group."""
         if self.by_gathers:

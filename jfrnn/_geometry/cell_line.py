@@ -103,9 +103,9 @@ def sort_along_line(
     alike = all(edge is axes.edges[0] for edge in axes.edges)
     edges = axes.edges[0] if alike else jnp.stack(axes.edges)[:, None]
     whole = jnp.where(np.array(is_open)[:, None], cell_coordinate(points, edges), points) if any(is_open) else points
-    among = [jnp.where(there[:sources], whole[:, :sources], most) for most in (jnp.inf, -jnp.inf)]
-    start = [np.array(most, whole.dtype) for most in (np.inf, -np.inf)]
-    lowest, highest = lax.reduce(among, start, lambda x, y: [lax.min(x[0], y[0]), lax.max(x[1], y[1])], (1,))  # at once
+    among = jnp.where(there[:sources], whole[:, :sources], jnp.inf)
+    ends = jnp.min(jnp.concatenate([among, jnp.where(there[:sources], -among, jnp.inf)]), axis=1, initial=jnp.inf)  # at once
+    lowest, highest = ends[: len(whole)], -ends[len(whole) :]
     lowest = jnp.where(lowest <= highest, lowest, 0)
     opened = _whole_number(whole) - _whole_number(lowest)[:, None] + np.uint32(1) if any(is_open) else whole
     spans = jnp.maximum(highest - lowest, 0) + 1
