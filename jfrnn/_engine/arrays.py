@@ -2,8 +2,8 @@
 
 1. Sort: particles are sorted by the number of their cell, and a table tells where each number begins (`jfrnn._geometry.cell_line`).
 2. Stencil: the rows of cells around a query are runs of sorted particles, its candidates (`line_runs`; `find_candidates` below).
-3. Gather: runs are read as words of 16 particles and compared with the cutoff, a bit each (`jfrnn._engine.runs`, `_test`). What
-   rounding leaves open is decided exactly, in one place (`_decide_doubtful`).
+3. Gather: runs are read as words of 16 particles and compared with the cutoff, a bit each (`jfrnn._engine.blocks`, `_test`). What
+   rounding leaves open is decided exactly (`_decide_first` where no loop is wanted, `_decide_doubtful`).
 4. Compaction: the k-th neighbor of a query is its k-th set bit (`jfrnn._engine.words.BitRows`).
 
 "brute" has no sorting: all particles are one run. What is chosen by platform stands in `jfrnn._engine.tuning`.

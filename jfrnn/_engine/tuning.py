@@ -61,7 +61,7 @@ CPU = Tuning(  # a block fits into the caches, and loops cost little
 ACCELERATOR = Tuning(  # few large kernels, in at most 1 GB
     scratch=900_000_000,
     words=1 << 26,
-    few_pairs=1 << 25,
+    few_pairs=1 << 24,
     sorting=Sorting(least=33 << 10, searched=1 << 18),
     doubtful_share=16,
     doubtful_rows=4096,
