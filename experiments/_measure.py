@@ -134,10 +134,16 @@ def repeat(
         del result
 
 
-def compile_scan(function: Callable[[Any], Any] | None, x: Any, steps: int) -> Callable[[], Any]:  # noqa: ANN401
+def compile_scan(
+    function: Callable[[Any], Any] | None,
+    x: Any,  # noqa: ANN401
+    steps: int,
+    made: Any = None,  # noqa: ANN401
+) -> Callable[[], Any]:
     """Return a compiled scan whose steps move x and call a function of it, or only move x; it keeps what the last step makes.
 
-    Nothing of a step can be left out, as all that it makes is carried along, and no step knows that nobody moves.
+    Nothing of a step can be left out, as all that it makes is carried along, and no step knows that nobody moves. `made` is what
+    the function makes of x, if that is known: then it is compiled in the scan alone.
     """
     import jax
     import jax.numpy as jnp
@@ -149,7 +155,9 @@ def compile_scan(function: Callable[[Any], Any] | None, x: Any, steps: int) -> C
     def run(x: Any, velocity: Any, made: Any) -> Any:  # noqa: ANN401
         return jax.lax.scan(functools.partial(step, velocity=velocity), (x, made), None, length=steps)[0]
 
-    compiled, made = jax.jit(run), None if function is None else jax.jit(function)(x)
+    compiled = jax.jit(run)
+    if made is None and function is not None:
+        made = jax.jit(function)(x)
     rest = jnp.zeros((), x.dtype)
     jax.block_until_ready(compiled(x, rest, made))
     return lambda: compiled(x, rest, made)

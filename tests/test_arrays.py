@@ -18,6 +18,7 @@ from jfrnn.cases.hard import HARD_CASES
 SORTING = tuning.ACCELERATOR.sorting._replace(searched=300)
 ELSEWHERE = tuning.ACCELERATOR._replace(words=1 << 12, few_pairs=1000, sorting=SORTING, doubtful_rows=16)
 AT_ONCE = ELSEWHERE._replace(words=1 << 20, few_pairs=1 << 20, doubtful_rows=1 << 20)  # all rows and their doubtful pairs
+LOOPS = ELSEWHERE._replace(at_once=0)  # as blocks of many queries are processed
 TIES = ("lattice_1e-4_at_0", "ulp_far_axis", "cell_edges_far", "queries_fewer")
 
 
@@ -40,10 +41,17 @@ def test_numbers_of_accelerators_find_the_same_pairs(name, elsewhere):
 
 
 @pytest.mark.parametrize(
-    "name", [name if name == "lattice_1e-4_at_0" else pytest.param(name, marks=pytest.mark.slow) for name in TIES]
+    ("name", "numbers"),
+    [
+        (name, numbers)
+        if (name, numbers) == ("lattice_1e-4_at_0", "AT_ONCE")
+        else pytest.param(name, numbers, marks=pytest.mark.slow)
+        for name in TIES
+        for numbers in ("AT_ONCE", "LOOPS")
+    ],
 )
-def test_all_rows_of_a_block_at_once(name, elsewhere, monkeypatch):
-    monkeypatch.setattr(tuning, "CPU", AT_ONCE)
+def test_all_rows_of_a_block_at_once_and_blocks_in_loops(name, numbers, elsewhere, monkeypatch):
+    monkeypatch.setattr(tuning, "CPU", {"AT_ONCE": AT_ONCE, "LOOPS": LOOPS}[numbers])
     given = HARD_CASES[name].build(np.float32, 3)
     nbrs = checked.search_padded(given, max(704, len(given.positions)), 704, backend="jax")
     checked.assert_pairs(nbrs, reference.reference_pairs(given.positions, given.cutoff, queries=given.queries))
@@ -84,6 +92,23 @@ def pairs_of(nbrs):
 
 def spring(r, i, j):
     return jnp.maximum(0.2 - jnp.sqrt(jnp.sum(r * r) + 1e-6), 0) ** 2
+
+
+@pytest.mark.usefixtures("elsewhere")
+@pytest.mark.parametrize(
+    "kind", ["few", pytest.param("many", marks=pytest.mark.slow), pytest.param("ties", marks=pytest.mark.slow)]
+)
+def test_sums_with_the_numbers_of_accelerators(kind):
+    """At once, with more neighbors than that allows, and with more doubtful candidates."""
+    rng = np.random.default_rng(2)
+    x = rng.random((600, 3)) if kind == "few" else rng.random((600, 3)) / 3
+    x = jnp.asarray(np.round(x * 10) / 10 if kind == "ties" else x, jnp.float32)
+
+    def sums(x, backend):
+        return jax.value_and_grad(lambda x: jfrnn.pair_sum(spring, x, 0.2, backend=backend).sum())(x)
+
+    found, right = jax.jit(lambda x: sums(x, "jax"))(x), jax.jit(lambda x: sums(x, "warp"))(x)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), found, right)
 
 
 def everything(x):

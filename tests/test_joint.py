@@ -1,4 +1,4 @@
-"""Sums over the same pairs, which become one sum while a program is lowered; the engine "brute" takes them one by one."""
+"""Sums over the same pairs, which become one sum while a program is lowered."""
 
 import functools
 
@@ -68,6 +68,17 @@ def test_sums_are_joined_and_right(function, kind):
     found = jax.jit(functools.partial(function, **options))(x, m)
     assert_near(found, jax.jit(functools.partial(function, backend="brute", **options))(x, m))
     assert count_calls(functools.partial(function, **options), x, m) == (2 if function is pressure else 1)
+
+
+@pytest.mark.slow
+def test_array_programs_find_pairs_once():
+    """A program sorts particles once for a density and its gradient, and what it finds is what two programs find."""
+    x = jnp.asarray(np.random.default_rng(3).random((200, 3)), jnp.float32)
+    m = jnp.asarray(np.random.default_rng(4).random(200), jnp.float32)
+    compiled = jax.jit(functools.partial(density_and_force, backend="jax")).lower(x, m).compile()
+    assert compiled.as_text().count(" sort(") == 1
+    apart = density(x, m, "jax"), jax.grad(lambda x: density(x, m, "warp").sum())(x)
+    assert_near(compiled(x, m), apart)
 
 
 def test_a_step_of_a_scan_finds_pairs_once():

@@ -25,6 +25,7 @@ JITTER = 0.3  # spacings
 STEPS = 10  # of a scan, fewer where calls are slow
 SLOW_S = 0.05  # calls that take longer are repeated a fifth as often, and scans of them have 2 steps
 ROUNDED = 1e-3  # share of the particles whose rows of a peer may differ: its distances are rounded
+ROWS_SEEN = 50_000  # of a list, in which distances are looked at
 MOST_ON_GPU = 300_000  # particles that jax-md is asked for; it took 19 GB for 250 000
 COLUMNS = (
     *("platform", "n", "layout", "who", "what", "neighbors", "lower_s", "compile_s", "waited_ms", "step_ms", "scratch_mb", "wrong"),
@@ -57,6 +58,7 @@ class _Way(NamedTuple):
     wrong: Callable[[_Scene, Any], int]
     method: str | None = None
     package: str = "jfrnn"
+    tied: bool = False  # whether a lattice full of ties is asked for, too
 
 
 def command(
@@ -70,7 +72,7 @@ def command(
     along each axis, "ties" none, so that 30 pairs of each are exactly at the cutoff (lists and counts alone). Programs are lowered
     and compiled without JAX's cache [s], calls waited for one by one, and steps of a compiled scan move the particles [ms];
     `scratch_mb` is what XLA says. `ratio` is to jax-md's time at the same size, and `x + 1` is the shortest call. Answers
-    are compared with distances in float64; of a wrong one no time is taken.
+    are compared with distances in float64; of a wrong one no time is taken. Each row is kept before the next way but one begins.
     """
     platform = jax.default_backend()
     asked = sides or [side for side in SIDES if platform != "cpu" or side**3 <= MOST_ON_CPU]
@@ -81,38 +83,35 @@ def command(
 
 
 def _rows(side: int, layout: str, repeats: int) -> Iterator[table.Line]:
-    scene = _make_scene(side, layout)
-    rows, calls, functions = dict[str, table.Line](), dict[str, Callable[[], Any]](), dict[str, Function]()
-    for way in list(_ways())[: 2 if layout == "ties" else None]:
-        name = f"{way.who} {way.what}"
-        rows[name] = {"n": len(scene.x), "layout": layout, "who": way.who, "what": way.what}
-        rows[name]["neighbors"] = round(float(scene.counts.mean()), 1)
-        most = table.ask(rows[name], way.method, _most_of_jax_md) if way.who == "jax-md" else MOST_POINTS
+    """Measure one way after the other, so that a row is known before the next program is compiled."""
+    scene, peer = _make_scene(side, layout), None
+    for way in (way for way in _ways() if layout != "ties" or way.tied):
+        row: table.Line = {"n": len(scene.x), "layout": layout, "who": way.who, "what": way.what}
+        row["neighbors"] = round(float(scene.counts.mean()), 1)
+        most = table.ask(row, way.method, _most_of_jax_md) if way.who == "jax-md" else MOST_POINTS
         if most is not None and len(scene.x) > most:
-            rows[name] |= {"status": "skipped", "reason": f"is not asked for more than {most} particles"}
-        if "status" in rows[name]:
-            continue
-        answer = table.ask(rows[name], way.method, functools.partial(_prepare, way, scene))
-        if answer is None:
-            continue
-        found, call, function = answer
-        rows[name] |= found
-        if table.judge(rows[name], found["wrong"], 0 if way.method is None else ROUNDED * len(scene.x)):
-            calls[name], functions[name] = call, function
-    first, _ = _measure.time_in_turns(calls, 1)
-    slow = {name for name, (seconds,) in first.items() if seconds > SLOW_S}
-    for names, rounds, steps in ((calls.keys() - slow, repeats, STEPS), (slow, max(repeats // 5, 3), 2)):
-        waited, others = _measure.time_in_turns({name: call for name, call in calls.items() if name in names}, rounds)
-        scans = {name: _measure.compile_scan(functions[name], scene.x, steps) for name in calls if name in names}
-        stepped, _ = _measure.time_in_turns(scans, 3)
-        for name in scans:
-            times = {"waited_ms": 1e3 * float(np.median(waited[name])), "step_ms": 1e3 * float(np.median(stepped[name])) / steps}
-            rows[name] |= times | {"repeats": rounds, "others_cores": others}
-    peer = rows.get("jax-md list", {}).get("waited_ms")
-    for row in rows.values():
+            row |= {"status": "skipped", "reason": f"is not asked for more than {most} particles"}
+        answer = None if "status" in row else table.ask(row, way.method, functools.partial(_prepare, way, scene))
+        if answer is not None:
+            found, compiled, function, made = answer
+            row |= found
+            if table.judge(row, found["wrong"], 0 if way.method is None else ROUNDED * len(scene.x)):
+                row |= _time(lambda compiled=compiled: compiled(scene.x), function, scene.x, made, repeats)
+        if way.who == "jax-md":
+            peer = row.get("waited_ms")
         if peer is not None and "waited_ms" in row:
             row["ratio"] = row["waited_ms"] / peer
         yield row
+
+
+def _time(call: Callable[[], Any], function: Function, x: Array, made: Any, repeats: int) -> table.Line:  # noqa: ANN401
+    """Time calls that are waited for, and steps of a scan."""
+    (first,) = _measure.time_in_turns({"call": call}, 1)[0]["call"]
+    rounds, steps = (repeats, STEPS) if first <= SLOW_S else (max(repeats // 5, 3), 2)
+    waited, others = _measure.time_in_turns({"call": call}, rounds)
+    stepped, _ = _measure.time_in_turns({"scan": _measure.compile_scan(function, x, steps, made)}, 3)
+    times = {"waited_ms": 1e3 * float(np.median(waited["call"])), "step_ms": 1e3 * float(np.median(stepped["scan"])) / steps}
+    return times | {"repeats": rounds, "others_cores": others}
 
 
 def _make_scene(side: int, layout: str) -> _Scene:
@@ -127,8 +126,8 @@ def _make_scene(side: int, layout: str) -> _Scene:
     return _Scene(jnp.asarray(x, jnp.float32), counts)
 
 
-def _prepare(way: _Way, scene: _Scene) -> tuple[table.Line, Callable[[], Any], Function]:
-    """Compile a way and look at its answer; return the first columns of its row, a call, and the function that is called."""
+def _prepare(way: _Way, scene: _Scene) -> tuple[table.Line, Function, Function, Any]:
+    """Compile a way and look at its answer; return the first columns of its row, the program, its function and its answer."""
     function = way.make(scene)
     cache = jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
     jax.config.update("jax_enable_compilation_cache", False)
@@ -139,13 +138,14 @@ def _prepare(way: _Way, scene: _Scene) -> tuple[table.Line, Callable[[], Any], F
     compiled = lowered.compile()
     end = perf_counter()
     jax.config.update("jax_enable_compilation_cache", cache)
-    wrong = way.wrong(scene, compiled(scene.x))
+    made = compiled(scene.x)
+    wrong = way.wrong(scene, made)
     analysis = compiled.memory_analysis()
     scratch = None if analysis is None else analysis.temp_size_in_bytes / 1e6
     row: table.Line = {"wrong": wrong, "lower_s": between - begin, "compile_s": end - between, "scratch_mb": scratch}
     if way.method is not None:
         row["peer"] = _machine.versions([way.package])[way.package]
-    return row, lambda: compiled(scene.x), function
+    return row, compiled, function, made
 
 
 # --- who does what ----------------------------------------------------------------------------------------------------
@@ -194,16 +194,16 @@ def _nvalchemi(scene: _Scene) -> Function:
 
 
 def _ways() -> Iterator[_Way]:
-    """Yield the ways in the order of a table. The first two are those that a lattice full of ties is asked for."""
-    yield _Way("jfrnn", "list", _list, _wrong_rows)
-    yield _Way("jfrnn", "counts", lambda scene: lambda x: jfrnn.count(x, CUTOFF, backend="jax"), _wrong_counts)
+    """Yield the ways in the order of a table: first the one whose time others are divided by."""
+    yield _Way("jax-md", "list", _jax_md, lambda scene, idx: _wrong_rows(scene, (idx, None)), "jax-md", "jax-md")
+    yield _Way("jfrnn", "list", _list, _wrong_rows, tied=True)
+    yield _Way("jfrnn", "counts", lambda scene: lambda x: jfrnn.count(x, CUTOFF, backend="jax"), _wrong_counts, tied=True)
     yield _Way("jfrnn", "density", lambda scene: _density, _wrong_density)
     yield _Way(
         "jfrnn", "density, gradient", lambda scene: _density_and_gradient, lambda scene, found: _wrong_density(scene, found[0])
     )
     yield _Way("jfrnn", "list in a box", _periodic, _wrong_rows)
     yield _Way("XLA", "x + 1", lambda scene: lambda x: x + 1, lambda scene, found: int((found != scene.x + 1).any(axis=1).sum()))
-    yield _Way("jax-md", "list", _jax_md, lambda scene, idx: _wrong_rows(scene, (idx, None)), "jax-md", "jax-md")
     yield _Way("nvalchemi", "list", _nvalchemi, _wrong_rows, "nvalchemi", "nvalchemi-toolkit-ops")
 
 
@@ -211,17 +211,18 @@ def _ways() -> Iterator[_Way]:
 
 
 def _wrong_rows(scene: _Scene, found: tuple[Array, Array | None]) -> int:
-    """Count the particles whose rows are not the right number of different neighbors within the cutoff, by float64."""
-    n, x = len(scene.x), np.asarray(scene.x, np.float64)
-    idx = np.sort(np.asarray(found[0]), axis=1)
-    right = (idx < n).sum(axis=1) == scene.counts
-    right &= ((idx[:, 1:] > idx[:, :-1]) | (idx[:, 1:] >= n)).all(axis=1)
-    for first in range(0, n, 50_000):
-        rows = slice(first, first + 50_000)
-        used = idx[rows] < n
-        apart = np.square(x[np.where(used, idx[rows], 0)] - x[rows, None]).sum(axis=2)
-        own = idx[rows] == np.arange(n)[rows, None]
-        right[rows] &= (~used | ((apart < CUTOFF**2) & ~own)).all(axis=1)
+    """Count the particles whose rows are not the right number of different neighbors within the cutoff, by float64.
+
+    All rows have to have the right number; if there are many, distances are looked at in evenly chosen ones.
+    """
+    n, x, rows = len(scene.x), np.asarray(scene.x, np.float64), np.asarray(found[0])
+    right = (rows < n).sum(axis=1) == scene.counts
+    chosen = np.linspace(0, n - 1, min(n, ROWS_SEEN)).astype(int)
+    for some in np.array_split(chosen, -(-len(chosen) // 20_000)):
+        idx = np.sort(rows[some], axis=1)
+        good, used = ((idx[:, 1:] > idx[:, :-1]) | (idx[:, 1:] >= n)).all(axis=1), idx < n
+        apart = np.square(x[np.where(used, idx, 0)] - x[some, None]).sum(axis=2)
+        right[some] &= good & (~used | ((apart < CUTOFF**2) & (idx != some[:, None]))).all(axis=1)
     return int((~right).sum()) + (0 if found[1] is None else _wrong_counts(scene, found[1]))
 
 

@@ -2,8 +2,8 @@
 
 1. Sort: particles are sorted by the number of their cell, and a table tells where each number begins (`jfrnn._geometry.cell_line`).
 2. Stencil: the rows of cells around a query are runs of sorted particles, its candidates (`line_runs`; `find_candidates` below).
-3. Gather: runs are read as words of 16 particles and compared with the cutoff, a bit each (`jfrnn._engine.runs`, `_test`). What
-   rounding leaves open is decided exactly, in one place (`_decide_doubtful`).
+3. Gather: runs are read as words of 16 particles and compared with the cutoff, a bit each (`jfrnn._engine.blocks`, `_test`). What
+   rounding leaves open is decided exactly (`_decide_first` where no loop is wanted, `_decide_doubtful`).
 4. Compaction: the k-th neighbor of a query is its k-th set bit (`jfrnn._engine.words.BitRows`).
 
 "brute" has no sorting: all particles are one run. What is chosen by platform stands in `jfrnn._engine.tuning`.
@@ -225,10 +225,17 @@ def _all_sources(
         return start, jnp.broadcast_to(stop, start.shape), codes
 
     of_sources, of_queries = cutoff.of_points if isinstance(cutoff, Cutoffs) else (None, None)
-    padded = jnp.pad(lax.iota(jnp.int32, len(sources)) if order is None else order, (0, LANES))
+    words, ids = images * -(-len(sources) // LANES), lax.iota(jnp.int32, len(sources)) if order is None else order
+    ids = jnp.pad(ids, (0, LANES))
+    if order is None:
+        radii = None if of_sources is None else jnp.pad(of_sources, (0, LANES))
+        points = Points(list(jnp.pad(sources.T, ((0, 0), (0, LANES)))), ids, radii)
+    else:
+        points = _in_order(sources, ids, of_sources)
     rows = _in_order(sources if queries is None else queries, query_order, of_queries)
-    words, unordered = images * -(-len(sources) // LANES), query_order is None
-    points = _in_order(sources, padded, of_sources)
+    if queries is None:  # their positions come first among those of the sources
+        rows = rows._replace(axes=points.axes)
+    unordered = query_order is None
     return Candidates(points, rows, runs, torus, len(sources), lambda _: words, in_order=unordered, most_words=words)
 
 

@@ -1,51 +1,31 @@
-"""From runs of candidates to rows of neighbors, by array programming in blocks of queries, with bounded scratch memory.
-
-A run is a contiguous range of sorted sources. Runs are divided into words of 16 candidates, with one bit per candidate that says
-whether it is a neighbor. A block has a bounded number of words and slots (`jfrnn._engine.tuning`), so its scratch memory is bounded
-for any n, and nothing is stored per candidate.
-"""
+"""From runs of candidates to rows of neighbors, by array programming in blocks of queries (`jfrnn._engine.blocks`)."""
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
+from jfrnn._engine.blocks import BlockSearch, HitWords, State, is_at_once, shifts_of
+from jfrnn._engine.candidates import Candidates, Span
 from jfrnn._engine.problem import Filter, Room
-from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
-from jfrnn._engine.words import LANES, BitRows, bit_counts, last_reached, windows
-from jfrnn._geometry import (
-    Cutoff,
-    Cutoffs,
-    Pair,
-    decide_pairs,
-    flat_take,
-    shift_in_given,
-    squared_distance,
-    step_one_bounds,
-    take_points,
-)
-from jfrnn._tracing import largest_of
+from jfrnn._engine.tuning import Tuning
+from jfrnn._engine.words import BitRows, bit_counts
+from jfrnn._geometry import Cutoff, Cutoffs, flat_take
 
-_FEW_RUNS = 32
-_SLOTS = 32  # doubtful candidates of a row that are decided at a time
-_HITS = np.uint32((1 << LANES) - 1)
-_MOST_WORDS = 256  # per query, that are tested at a time; (words << 16) has to be an int32
 FOLD_GROUP = 32  # neighbors per query that are folded at a time
 
-State = TypeVar("State")
 Carry = Any  # the state of a loop over pairs
 
 
 def count_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, tuning: Tuning) -> Array:
     """Count the neighbors of every query: [m] int32, in the order of the queries' ids."""
-    engine = _Engine(candidates, cutoff, keep, tuning, slots=1, capacity=None)
+    engine = BlockSearch(candidates, cutoff, keep, tuning, slots=1, capacity=None)
 
     def count_block(span: Span) -> list[Array]:
-        def add(words: _HitWords, count: Array) -> Array:
+        def add(words: HitWords, count: Array) -> Array:
             return count + bit_counts(words.hits).sum(1, dtype=jnp.int32)
 
         return [engine.fold_words(span, add, jnp.zeros(span.size, jnp.int32))]
@@ -60,14 +40,13 @@ def list_neighbors(
 
     If images must be told apart, n times the image code is added to the source index; unused slots are n·images.
     """
-    torus = candidates.torus
-    engine = _Engine(candidates, cutoff, keep, tuning, slots=capacity, capacity=capacity)
-    n, images = candidates.size, 1 if torus is None or torus.images.nearest else torus.images.total
+    engine = BlockSearch(candidates, cutoff, keep, tuning, slots=capacity, capacity=capacity)
+    n, images = candidates.size, engine.images
     group = min(tuning.group, capacity)
     slots = lax.iota(jnp.int32, group)
 
     def list_block(span: Span) -> list[Array]:
-        def add(words: _HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
+        def add(words: HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
             (rows, count), (hits, first, image) = found, words
             bits = BitRows.of(hits, tuning.by_gathers)
             total = bits.total
@@ -88,8 +67,12 @@ def list_neighbors(
             if group == capacity:
                 rows = add_group(jnp.int32(0), rows)
             else:
-                until = (jnp.minimum(jnp.max(count + total), capacity) + group - 1) // group
-                rows = lax.fori_loop(jnp.min(count) // group, until, add_group, rows)
+                start = np.int32(np.iinfo(np.int32).max), np.int32(0)
+                begin, end = lax.reduce(
+                    (count, count + total), start, lambda a, b: (lax.min(a[0], b[0]), lax.max(a[1], b[1])), (0,)
+                )
+                until = lax.div(lax.min(end, np.int32(capacity)) + np.int32(group - 1), np.int32(group))
+                rows = lax.fori_loop(lax.div(begin, np.int32(group)), until, add_group, rows)
             return rows, count + total
 
         rows = jnp.full((span.size, capacity), n * images, jnp.int32)
@@ -101,9 +84,8 @@ def list_neighbors(
 
 def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, room: Room, tuning: Tuning) -> Array:
     """List the neighbors of every query in rows without gaps: [total] int32, as `list_neighbors` has them, 0 behind the last."""
-    torus = candidates.torus
-    engine = _Engine(candidates, cutoff, keep, tuning, slots=FOLD_GROUP, capacity=None)
-    n, images = candidates.size, 1 if torus is None or torus.images.nearest else torus.images.total
+    engine = BlockSearch(candidates, cutoff, keep, tuning, slots=FOLD_GROUP, capacity=None)
+    n, images = candidates.size, engine.images
     slots = lax.iota(jnp.int32, FOLD_GROUP)
 
     def fill_block(b: Array, out: Array) -> Array:
@@ -111,7 +93,7 @@ def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filte
         ids = span.of(engine.queries.ids)
         begin, end = room.starts[ids], room.starts[ids + 1]
 
-        def add(words: _HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
+        def add(words: HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
             (out, at), (hits, first, image) = found, words
             bits = BitRows.of(hits, tuning.by_gathers)
             total = bits.total
@@ -173,8 +155,9 @@ def fold_neighbors(
 
     `elements` is the number of scalars per pair that a visitor needs; they count as slots of a block.
     """
-    engine = _Engine(candidates, cutoff, keep, tuning, slots=FOLD_GROUP * elements, capacity=None)
-    slots, torus = lax.iota(jnp.int32, FOLD_GROUP), candidates.torus
+    size = tuning.fold_group if is_at_once(candidates, tuning) else FOLD_GROUP
+    engine = BlockSearch(candidates, cutoff, keep, tuning, slots=size * elements, capacity=None)
+    slots, torus = lax.iota(jnp.int32, size), candidates.torus
 
     def fold_block(b: Array, out: State) -> State:
         span = engine.block(b)
@@ -182,7 +165,7 @@ def fold_neighbors(
         fresh = span.places >= b * engine.block_size
 
         def fold(add: Callable[[Slots, Carry], Carry], state: Carry) -> Carry:
-            def add_words(words: _HitWords, state: Carry) -> Carry:
+            def add_words(words: HitWords, state: Carry, at_once: bool) -> Carry:
                 hits, first, image = words
                 bits = BitRows.of(hits, tuning.by_gathers)
                 total = jnp.where(fresh, bits.total, 0)
@@ -194,311 +177,17 @@ def fold_neighbors(
                     source = flat_take(engine.sources.ids, flat_take(first, word) + bit)
                     shift = None
                     if torus is not None and image is not None:
-                        shift = _shifts_of(torus, ids[:, None], source, flat_take(image, word))
-                    return done + FOLD_GROUP, add(Slots(source, shift, ordinal < total[:, None]), state)
+                        shift = shifts_of(torus, ids[:, None], source, flat_take(image, word))
+                    return done + size, add(Slots(source, shift, ordinal < total[:, None]), state)
 
+                if at_once:
+                    return add_group((jnp.int32(0), state))[1]
                 most = jnp.max(total)
                 return lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), state))[1]
 
-            return engine.fold_words(span, add_words, state)
+            few = functools.partial(add_words, at_once=True)
+            return engine.fold_words(span, functools.partial(add_words, at_once=False), state, (few, size))
 
         return visit(Block(ids, fresh, fold), out)
 
     return fold_block(jnp.int32(0), out) if engine.block_count == 1 else lax.fori_loop(0, engine.block_count, fold_block, out)
-
-
-def _shifts_of(torus: Torus, query: Array, source: Array, image: Array) -> Array:
-    """Return the lattice shifts [..., d], whole floats, of pairs of queries and images of sources."""
-    turns, query_turns = torus.turns
-    return jnp.asarray(torus.images.shifts).astype(turns.dtype)[image] + query_turns[query] - turns[source]
-
-
-class _WordTable(NamedTuple):
-    """How the runs of a block's queries are divided into words."""
-
-    start: Array  # [b, r] start of each run
-    stop: Array  # [b, r] its end
-    image: Array | None  # [b, r] its image code
-    before: Array | None  # [b, r] number of words in the query's earlier runs, if these are looked up
-    longest: Array | int  # [] largest number of words of a query
-
-
-def _words_of(start: Array, stop: Array) -> Array:
-    return (stop - start + (LANES - 1)) >> (LANES.bit_length() - 1)
-
-
-class _HitWords(NamedTuple):
-    """The neighbors in a chunk of candidates: one bit per candidate, [b, words] each."""
-
-    hits: Array  # in the lower half
-    first: Array  # position of each word's first candidate
-    image: Array | None  # image code
-
-
-class _Engine(NamedTuple):
-    candidates: Candidates
-    cutoff: Cutoff | Cutoffs
-    keep: Filter
-    tuning: Tuning
-    slots: int  # scalars per query that a block holds
-    capacity: int | None  # expected number of neighbors per query
-
-    @property
-    def sources(self) -> Points:
-        return self.candidates.sources
-
-    @property
-    def queries(self) -> Points:
-        return self.candidates.queries
-
-    @property
-    def words(self) -> int:
-        """Words per query that are processed at a time."""
-        words = self.candidates.words(self.capacity)
-        if self.tuning.by_gathers:
-            return min(words, _MOST_WORDS)
-        return min(-(-words // 8) * 8, _MOST_WORDS // 4)
-
-    @property
-    def block_count(self) -> int:
-        """Number of blocks, whose words and slots fit into the scratch memory."""
-        torus = self.candidates.torus
-        several = torus is not None and not (torus.images.nearest or torus.images.per_system)
-        runs = torus.images.total if torus is not None and several else 1  # every query has at least so many
-        words = max(self.words, runs)
-        most = min(self.tuning.words // words, self.tuning.scratch // (words * WORD_BYTES + self.slots * SLOT_BYTES))
-        return -(-self.queries.ids.size // max(most, 1))
-
-    @property
-    def block_size(self) -> int:
-        """Number of queries in a block."""
-        return -(-self.queries.ids.size // self.block_count)
-
-    def block(self, b: Array | int) -> Span:
-        """Return the positions of block b's queries; the last block overlaps, so that all have one length."""
-        if self.block_count == 1:
-            return Span(0, self.block_size)
-        return Span(jnp.minimum(b * self.block_size, self.queries.ids.size - self.block_size), self.block_size)
-
-    def map_blocks(self, of_block: Callable[[Span], list[Array]], columns: list[tuple[int, ...]]) -> list[Array]:
-        """Return of_block(span), int32 arrays with a row per query, for all queries in the order of their indices.
-
-        `columns` are the shapes of a row of each array.
-        """
-        ids = self.queries.ids
-        if self.block_count == 1:
-            rows = of_block(self.block(0))
-            if self.candidates.in_order:
-                return rows
-            place = jnp.zeros_like(ids).at[ids].set(lax.iota(jnp.int32, ids.size), unique_indices=True)
-            return [x.at[place].get(mode="promise_in_bounds") for x in rows]
-
-        def put(b: Array, out: list[Array]) -> list[Array]:
-            span = self.block(b)
-            here = span.of(ids)
-            return [x.at[here].set(rows, unique_indices=True) for x, rows in zip(out, of_block(span), strict=True)]
-
-        return lax.fori_loop(0, self.block_count, put, [jnp.zeros((ids.size, *shape), jnp.int32) for shape in columns])
-
-    def fold_words(self, span: Span, add: Callable[["_HitWords", State], State], state: State) -> State:
-        """Return the state after state = add(words, state) for each chunk of candidates of the queries at these positions."""
-
-        def add_pass(which: Array, state: State) -> State:
-            table = self.word_table(span, which)
-
-            query = [span.of(x) for x in self.queries.axes]
-
-            def add_chunk(chunk: Array, state: State) -> State:
-                return add(self.hit_words(span, query, table, chunk), state)
-
-            def add_next(now: tuple[Array, Array, State]) -> tuple[Array, Array, State]:
-                _, chunk, state = now
-                return (chunk + 1) * self.words < table.longest, chunk + 1, add_chunk(chunk, state)
-
-            if isinstance(table.longest, int) and table.longest <= self.words:
-                return add_chunk(jnp.int32(0), state)
-            return lax.while_loop(lambda now: now[0], add_next, (jnp.asarray(table.longest > 0), jnp.int32(0), state))[2]
-
-        passes = self.candidates.passes
-        passes = passes(span) if callable(passes) else passes
-        return add_pass(jnp.int32(0), state) if passes is None else lax.fori_loop(0, passes, add_pass, state)
-
-    def word_table(self, span: Span, which: Array) -> _WordTable:
-        start, stop, image = self.candidates.runs(span, which)
-        count, runs = _words_of(start, stop), start.shape[1]
-        total, before = jnp.sum(count, axis=1, dtype=jnp.int32), None
-        if runs > _FEW_RUNS:
-            before = jnp.cumsum(count, axis=1, dtype=jnp.int32) - count
-        elif self.tuning.by_gathers:
-            before = jnp.sum(count[:, None] * np.tril(np.ones((runs, runs), np.int32), -1)[None], axis=2, dtype=jnp.int32)
-        return _WordTable(start, stop, image, before, self.candidates.most_words or largest_of(total))
-
-    def hit_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> _HitWords:
-        """Test one chunk of words per query; `own` are the d coordinates [b] of the queries."""
-        own, table, chunk = lax.optimization_barrier((own, table, chunk))  # as XLA would take small parts out of the loop
-        first, stop, image = self._locate_words(table, chunk)
-        query = [x[:, None] for x in own]
-        if image is not None and self.candidates.torus is not None:  # translate the query instead of the image
-            query = [q - t for q, t in zip(query, self._translations(self.candidates.torus, image, span), strict=True)]
-        allowed = self._allowed_lanes(first, stop, image, span)
-        if self.candidates.excluded is not None:
-            allowed = allowed & ~self._excluded_lanes(self.candidates.excluded, first, span)
-        packed = self._test(first, image, query, span) & (allowed | allowed << np.uint32(LANES))
-        first, image, packed = lax.optimization_barrier((first, image, packed))
-        return _HitWords(self._decide_doubtful(packed, first, image, span), first, image)
-
-    def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
-        word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (table.start.shape[0], self.words))
-        runs = table.start.shape[1]
-        if table.before is not None:
-            run = last_reached(table.before, word) + runs * lax.broadcasted_iota(jnp.int32, word.shape, 0)
-            first = flat_take(table.start, run) + LANES * (word - flat_take(table.before, run))
-            stop, image = flat_take(table.stop, run), None if table.image is None else flat_take(table.image, run)
-        else:  # a chain of selections takes half the time of a lookup on a CPU
-            columns = [table.start, table.stop, *([] if table.image is None else [table.image])]
-            found, before = [jnp.zeros_like(word) for _ in columns], jnp.zeros_like(table.start[:, :1])
-            for start, stop, *others in zip(*(lax.split(x, [1] * runs, axis=1) for x in columns), strict=True):
-                of_run, reached = [start + LANES * (word - before), stop, *others], word >= before
-                found = [lax.select(reached, jnp.broadcast_to(x, word.shape), y) for x, y in zip(of_run, found, strict=True)]
-                before = before + _words_of(start, stop)
-            first, stop, image = found if table.image is not None else (*found, None)
-        return jnp.minimum(first, self.sources.ids.size - LANES), stop, image
-
-    def _translations(self, torus: Torus, image: Array, span: Span) -> list[Array]:
-        """Return the lattice translation of the images of queries, per axis."""
-        if not torus.images.per_system:
-            return [t[image] for t in torus.translations.T]
-        own, shifts = span.of(torus.matrix)[..., None], [x[image] for x in torus.translations.T]
-        if torus.images.orthogonal:
-            return [shift * own[k, k] for k, shift in enumerate(shifts)]
-        return [functools.reduce(jnp.add, (x * own[row, k] for row, x in enumerate(shifts))) for k in range(len(shifts))]
-
-    def _test(self, first: Array, image: Array | None, query: list[Array], span: Span) -> Array:
-        """Compare 16 candidates per word with the cutoff in working precision: low half hits, high half doubtful ones."""
-        difference = [windows(x, first) - q[..., None] for x, q in zip(self.sources.axes, query, strict=True)]
-        square = squared_distance(difference, self.cutoff)
-        own, others = self.queries.radii, self.sources.radii
-        own = None if own is None else span.of(own)[:, None, None]
-        inside, outside = self._bounds(own, None if others is None else windows(others, first), span)
-        doubtful = jnp.where(square <= outside, np.uint32(1 << LANES), np.uint32(0))
-        value = jnp.where(square < inside, np.uint32(1), doubtful) << lax.iota(jnp.uint32, LANES)
-        if self.keep.later_only:
-            value = jnp.where(self._is_later(first, image, span), value, np.uint32(0))
-        if self.queries.systems is not None and self.sources.systems is not None:
-            system = span.of(self.queries.systems)[:, None, None]
-            value = jnp.where(windows(self.sources.systems, first) == system, value, np.uint32(0))
-        return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,))
-
-    def _bounds(self, own: Array | None, others: Array | None, span: Span) -> tuple[np.floating | Array, np.floating | Array]:
-        torus = self.candidates.torus
-        slack = None if torus is None else torus.slack
-        if torus is not None and torus.images.per_system:
-            slack = span.of(torus.slack)[:, None, None]
-        radii = self.cutoff.of_pairs(own, others) if isinstance(self.cutoff, Cutoffs) else None
-        return step_one_bounds(self.cutoff, radii, slack)
-
-    def _allowed_lanes(self, first: Array, stop: Array, image: Array | None, span: Span) -> Array:
-        """Return which of a word's 16 candidates belong to its run and are not the query itself: bits, [b, words] uint32."""
-        one = np.uint32(1)
-        lanes = (one << jnp.clip(stop - first, 0, LANES).astype(jnp.uint32)) - one
-        if not self.keep.drop_self or self.keep.later_only:
-            return lanes
-        own = self._lanes_at(span.places, first)
-        if image is not None and self.candidates.torus is not None:
-            own = jnp.where(image == self.candidates.torus.images.home, own, np.uint32(0))
-        return lanes & ~own
-
-    def _lanes_at(self, place: Array, first: Array) -> Array:
-        """Return the candidates at a position [b] of each query: bits, [b, words] uint32."""
-        again, lanes = self.candidates.again, jnp.zeros(first.shape, jnp.uint32)
-        for where in (place,) if again is None else (place, place + again):
-            lane = where[:, None] - first
-            here = (lane >= 0) & (lane < LANES)
-            bit = np.uint32(1) << jnp.clip(lane, 0, LANES).astype(jnp.uint32)
-            lanes = lanes | jnp.where(here, bit, np.uint32(0))
-        return lanes
-
-    def _excluded_lanes(self, excluded: Excluded, first: Array, span: Span) -> Array:
-        """Return which candidates queries exclude: bits, [b, words] uint32. One pass for each place in the longest row."""
-        own = span.of(self.queries.ids)
-        begin, end = flat_take(excluded.starts, own), flat_take(excluded.starts, own + 1)
-
-        def add(k: Array, lanes: Array) -> Array:
-            place = flat_take(excluded.places, jnp.minimum(begin + k, excluded.places.size - 1))
-            return lanes | self._lanes_at(jnp.where(begin + k < end, place, -(1 << 30)), first)
-
-        return lax.fori_loop(0, largest_of(end - begin), add, jnp.zeros(first.shape, jnp.uint32))
-
-    def _is_later(self, first: Array, image: Array | None, span: Span) -> Array:
-        """Say which candidates [b, words, 16] are the later ones of their pairs: of a query's own images, the forward half."""
-        own = span.of(self.queries.ids)[:, None]
-        later = own + int(self.keep.drop_self)
-        if image is not None and self.candidates.torus is not None:
-            home = self.candidates.torus.images.home
-            later = jnp.where(image > home, own, jnp.where(image < home, own + 1, later))
-        return windows(self.sources.ids, first) >= later[..., None]
-
-    def _decide_doubtful(self, packed: Array, first: Array, image: Array | None, span: Span) -> Array:
-        """Add the doubtful candidates that are pairs to the hits: [b, words] uint32, of which the lower half is set then.
-
-        A round decides the first 32 doubtful candidates of each row that has some, a part of the block at a time.
-        """
-        rows, width = packed.shape
-        many = min(max(-(-rows // self.tuning.doubtful_share), self.tuning.doubtful_rows), rows)
-        whole, queue, waiting = many == rows, lax.iota(jnp.int32, rows), jnp.int32(0)
-        if not whole:
-            open_rows = jnp.max(packed, axis=1) > _HITS
-            until = jnp.cumsum(open_rows.astype(jnp.int32), dtype=jnp.int32)
-            waiting, queue = until[-1], jnp.full(rows + many, rows, jnp.int32)
-            queue = queue.at[jnp.where(open_rows, until - 1, rows + many)].set(lax.iota(jnp.int32, rows), mode="drop")
-
-        def decide_round(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            # The barrier keeps what follows in the loop: it is not worth computing where no round is needed.
-            _, at, packed, row = lax.optimization_barrier((*state, queue))
-            row = row if whole else lax.dynamic_slice_in_dim(row, at, many)
-            here = jnp.minimum(row, rows - 1)
-            both = packed if whole else jnp.where((row < rows)[:, None], packed[here], np.uint32(0))
-            asked = both >> np.uint32(LANES)
-            bits = BitRows.of(asked, self.tuning.by_gathers)
-            slot = lax.broadcasted_iota(jnp.int32, (many, _SLOTS), 1)
-            word, bit = bits.nth(slot)
-            word = word if whole else word + width * (here - lax.iota(jnp.int32, many))[:, None]
-            candidate = flat_take(first, word) + bit
-
-            def points(at: Array | None) -> Pair:
-                of_row, source, of_word = here[:, None], candidate, word
-                if at is not None:
-                    of_row, source, of_word = here[at // _SLOTS], flat_take(source, at), flat_take(of_word, at)
-                return self._pair(span.first + of_row, source, None if image is None else flat_take(image, of_word))
-
-            there = slot < bits.total[:, None]
-            pair = decide_pairs(there, points, self.cutoff)
-            one = np.uint32(1) << bit.astype(jnp.uint32)
-            change = jnp.where(pair, one, np.uint32(0)) - (one << np.uint32(LANES))  # doubtful no longer, and a hit if it is a pair
-            word = jnp.where(there, word, packed.size)
-            packed = packed.reshape(-1).at[word].add(change, mode="drop").reshape(packed.shape)
-            more = largest_of(bits.total) > _SLOTS
-            at = at if whole else jnp.where(more, at, at + many)
-            return more if whole else at < waiting, at, packed
-
-        more = largest_of(packed) > _HITS if whole else waiting > 0
-        return lax.while_loop(lambda state: state[0], decide_round, (more, jnp.int32(0), packed))[2]
-
-    def _pair(self, place: Array, candidate: Array, image: Array | None) -> Pair:
-        """Return the given (not wrapped) points of queries and candidates at these positions."""
-        torus, radii = self.candidates.torus, None
-        if isinstance(self.cutoff, Cutoffs):
-            own, others = self.queries.radii, self.sources.radii
-            radii = self.cutoff.of_pairs(
-                None if own is None else flat_take(own, place), None if others is None else flat_take(others, candidate)
-            )
-        i, j = flat_take(self.queries.ids, place), flat_take(self.sources.ids, candidate)
-        sources, queries = self.candidates.given
-        pair = Pair(take_points(queries, i), take_points(sources, j), radii)
-        if torus is None or image is None:
-            return pair
-        matrix = torus.matrix.at[..., place].get(mode="promise_in_bounds") if torus.images.per_system else torus.matrix
-        shift = jnp.moveaxis(_shifts_of(torus, i, j, image), -1, 0)
-        matrix = matrix[len(shift) :] if torus.images.short else matrix
-        shift, matrix = shift_in_given(shift, torus.images.basis, matrix)
-        return pair._replace(shift=shift, matrix=matrix, orthogonal=torus.images.orthogonal)

@@ -30,6 +30,10 @@ class Tuning(NamedTuple):
         by_gathers: Whether what a slot needs to know of a group of words, and a word of its run, is gathered, instead of chosen by
             looking at every group or run.
         group: Slots of a row that are filled at a time.
+        at_once: A block of up to so many queries, in open space, is processed without any loop unless a query has more words of
+            candidates than are usual, more doubtful ones than one, or more neighbors than `fold_group`. A loop whose length the
+            data decide makes the host of an accelerator wait before each turn, but such a program takes longer to compile.
+        fold_group: Slots of a row that are summed at a time, where `at_once` allows it.
     """
 
     scratch: int
@@ -40,6 +44,8 @@ class Tuning(NamedTuple):
     doubtful_rows: int
     by_gathers: bool
     group: int
+    at_once: int = 0
+    fold_group: int = 32
 
 
 CPU = Tuning(  # a block fits into the caches, and loops cost little
@@ -55,12 +61,14 @@ CPU = Tuning(  # a block fits into the caches, and loops cost little
 ACCELERATOR = Tuning(  # few large kernels, in at most 1 GB
     scratch=900_000_000,
     words=1 << 26,
-    few_pairs=1 << 25,
+    few_pairs=1 << 24,
     sorting=Sorting(least=33 << 10, searched=1 << 18),
     doubtful_share=16,
     doubtful_rows=4096,
     by_gathers=True,
     group=256,
+    at_once=1 << 16,
+    fold_group=128,
 )
 
 

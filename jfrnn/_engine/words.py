@@ -10,6 +10,7 @@ from jfrnn._geometry import flat_take
 
 LANES = 16  # candidates per word: in a uint32 hits take the lower half, doubtful candidates the upper half
 _GROUP = 8  # words whose counts are bytes of two integers
+_FEW = 16  # entries that are compared one by one
 _BYTES = np.uint32(0x01010101)
 _TOPS = np.uint32(0x80808080)
 
@@ -32,15 +33,13 @@ class BitRows(NamedTuple):
     Attributes:
         hits: [b, w] uint32, the words.
         earlier: [b, g] int32, the number of set bits in earlier groups of the row.
-        low: [b, g] uint32, the bytes of a group's words 0 to 3.
-        high: [b, g] uint32, the bytes of its words 4 to 7.
+        until: [b, g, 2] uint32, the bytes of a group's words 0 to 3, and of its words 4 to 7.
         by_gathers: Whether a group's numbers are gathered, or chosen by looking at every group of the row. Static.
     """
 
     hits: Array
     earlier: Array
-    low: Array
-    high: Array
+    until: Array
     by_gathers: bool
 
     @classmethod
@@ -51,17 +50,15 @@ class BitRows(NamedTuple):
         groups = -(-width // _GROUP)
         counts = jnp.pad(lax.population_count(hits), ((0, 0), (0, groups * _GROUP - width))).reshape(rows, groups, 1, _GROUP)
         until = lax.optimization_barrier(jnp.sum(counts * _until_bytes(), axis=3, dtype=jnp.uint32))
-        low, high = until[:, :, 0], until[:, :, 1]
-        in_group = (high >> np.uint32(24)).astype(jnp.int32)
+        in_group = (until[:, :, 1] >> np.uint32(24)).astype(jnp.int32)
         before = np.tril(np.ones((groups, groups), np.int32), -1)
         earlier = jnp.sum(in_group[:, None] * before[None], axis=2, dtype=jnp.int32)
-        earlier, low, high = lax.optimization_barrier((earlier, low, high))
-        return cls(hits, earlier, low, high, by_gathers)
+        return cls(hits, lax.optimization_barrier(earlier), until, by_gathers)
 
     @property
     def total(self) -> Array:
         """The number of set bits of each row, [b] int32."""
-        return self.earlier[:, -1] + (self.high[:, -1] >> np.uint32(24)).astype(jnp.int32)
+        return self.earlier[:, -1] + (self.until[:, -1, 1] >> np.uint32(24)).astype(jnp.int32)
 
     def nth(self, ordinal: Array) -> tuple[Array, Array]:
         """Find the ordinal-th set bit in each row: its word, as a position in the words of all rows, and its bit [b, k].
@@ -86,12 +83,11 @@ class BitRows(NamedTuple):
 
     def _group_of(self, ordinal: Array) -> tuple[Array, Array, Array, Array]:
         """Return the group in which a bit is, the number of bits in earlier ones, and the bytes of the group."""
-        columns = (self.earlier, self.low, self.high)
         if self.by_gathers:
             group = last_reached(self.earlier, ordinal)
             at = group + lax.broadcasted_iota(jnp.int32, ordinal.shape, 0) * self.earlier.shape[1]
-            earlier, low, high = (flat_take(x, at) for x in columns)
-            return group, earlier, low, high
+            return group, flat_take(self.earlier, at), flat_take(self.until, 2 * at), flat_take(self.until, 2 * at + 1)
+        columns = self.earlier, self.until[:, :, 0], self.until[:, :, 1]
         group, (earlier, low, high) = jnp.zeros_like(ordinal), (_column(x, 0, ordinal.shape) for x in columns)
         for k in range(1, self.earlier.shape[1]):
             new = [_column(x, k, ordinal.shape) for x in columns]
@@ -108,7 +104,7 @@ def _column(x: Array, k: int, shape: tuple[int, ...]) -> Array:
 def last_reached(ascending: Array, value: Array) -> Array:
     """Return the last place in each ascending row [b, w] whose entry is <= value [b, k], or 0, by few comparisons or gathers."""
     last, place = ascending.shape[1] - 1, jnp.zeros_like(value)
-    if last < _GROUP:
+    if last < _FEW:
         for k in range(1, last + 1):
             place = place + (_column(ascending, k, value.shape) <= value).astype(jnp.int32)
         return place

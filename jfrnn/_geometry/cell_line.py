@@ -97,10 +97,11 @@ def sort_along_line(
     Open axes begin where the sources do, with a margin; periodic ones, whose coordinates are fractions from 0 to 1, begin at 0.
     `systems` [n + m] uint32 are the systems of a batch.
     """
-    there = jnp.isfinite(points).all(axis=0)
+    there = functools.reduce(jnp.logical_and, (jnp.isfinite(x) for x in points))
     size = table_size(sources)
     is_open = [turn is None for turn in axes.turns]
-    edges = jnp.stack(axes.edges)[:, None]
+    alike = all(edge is axes.edges[0] for edge in axes.edges)
+    edges = axes.edges[0] if alike else jnp.stack(axes.edges)[:, None]
     whole = jnp.where(np.array(is_open)[:, None], cell_coordinate(points, edges), points) if any(is_open) else points
     among = jnp.where(there[:sources], whole[:, :sources], jnp.inf)
     ends = jnp.min(jnp.concatenate([among, jnp.where(there[:sources], -among, jnp.inf)]), axis=1, initial=jnp.inf)  # at once
@@ -146,11 +147,13 @@ def _sort(key: Array, size: int, by: Sorting) -> tuple[Array, Array]:
     n, place = key.size, lax.iota(jnp.int32, key.size)
     digits = 32 - max((n - 1).bit_length(), 1)  # that fit into a word beside an index
     if by.packed and size.bit_length() <= 2 * digits:
-        order, mask = place.astype(jnp.uint32), np.uint32((1 << (32 - digits)) - 1)
-        for done in range(0, size.bit_length(), digits):
-            part = key.at[order].get(mode="promise_in_bounds") >> np.uint32(done) << np.uint32(32 - digits)
-            places = lax.sort(part | place.astype(jnp.uint32)) & mask
-            order = order.at[places].get(mode="promise_in_bounds")
+        mask, left = np.uint32((1 << (32 - digits)) - 1), np.uint32(32 - digits)
+        places = lax.sort(key << left | place.astype(jnp.uint32))
+        if size.bit_length() <= digits:
+            return places >> left, (places & mask).astype(jnp.int32)
+        first = places & mask
+        part = key.at[first].get(mode="promise_in_bounds") >> np.uint32(digits) << left
+        order = first.at[lax.sort(part | place.astype(jnp.uint32)) & mask].get(mode="promise_in_bounds")
         return key.at[order].get(mode="promise_in_bounds"), order.astype(jnp.int32)
     short = np.uint16 if size < 2**16 else np.uint32
     more = 0 if short is np.uint16 else max(by.least - n, 0)

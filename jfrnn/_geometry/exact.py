@@ -207,6 +207,12 @@ def decide_pairs(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) ->
     return signs <= 0 if cutoff.closed else signs < 0
 
 
+def decide_in_units(pair: Pair, cutoff: Cutoff | Cutoffs) -> tuple[Array, Array]:
+    """Decide pairs by step 2 alone; return which of them it can decide, and which of these are within the cutoff."""
+    sign = _fixed_sign(pair, _threshold(pair, cutoff))
+    return sign != _UNKNOWN, sign <= 0 if cutoff.closed else sign < 0
+
+
 class _Threshold(NamedTuple):
     """The cutoff as steps 2 and 3 use it: scalars, or one value per pair.
 

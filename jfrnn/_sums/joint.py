@@ -20,7 +20,7 @@ from jax.core import ShapedArray
 from jax.interpreters import mlir
 
 from jfrnn._sums.fused import can_sum
-from jfrnn._sums.relations import is_fused
+from jfrnn._sums.relations import Searched, is_fused
 from jfrnn._sums.terms import Derived, Groups, Term, choose, join, make_term
 from jfrnn._tracing import Aval, Internal
 
@@ -78,13 +78,14 @@ def lower_sum(
         return list(lower(inside, *(x.value for x in given), term=term, structure=structure, compensated=compensated))
 
     relation = jax.tree.unflatten(structure, [x.aval for x in pairs])
-    if not is_fused(relation, term):
+    if not isinstance(relation, Searched) or 0 in relation.sizes:
         return place(pairs, term, operands)
-    same = tuple(_describe(x.value) for x in pairs), structure, compensated
+    fused = is_fused(relation, term)
+    same = tuple(_describe(x.value) for x in pairs), structure, compensated, fused
     before = getattr(ctx.module_context, "lowering_cache", {}).setdefault(_PLACE, [])
     for other in reversed(before):
         joined = _join(other, term, operands) if other.same == same else None
-        if joined is not None and can_sum(relation.inputs, joined[0]):
+        if joined is not None and (not fused or can_sum(relation.inputs, joined[0])):
             with ir.InsertionPoint(other.results[0]):
                 found = place(other.pairs, *joined)
             for operation, result in zip(other.results, found, strict=False):

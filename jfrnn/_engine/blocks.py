@@ -1,0 +1,428 @@
+"""The test of candidates in blocks of queries: words of 16 candidates, of which each has a bit that says whether it is a neighbor.
+
+Runs, the contiguous ranges of sorted sources around a query, are divided into such words. A block has a bounded number of words and
+slots (`jfrnn._engine.tuning`), so its scratch memory is bounded for any n, and nothing is stored per candidate.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
+from jfrnn._engine.problem import Filter
+from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
+from jfrnn._engine.words import LANES, BitRows, bit_counts, last_reached, windows
+from jfrnn._geometry import (
+    Cutoff,
+    Cutoffs,
+    Pair,
+    decide_in_units,
+    decide_pairs,
+    flat_take,
+    shift_in_given,
+    squared_distance,
+    step_one_bounds,
+    take_points,
+)
+from jfrnn._tracing import largest_of
+
+_FEW_RUNS = 32
+_SLOTS = 32  # doubtful candidates of a row that are decided at a time
+_HITS = np.uint32((1 << LANES) - 1)
+_MOST_WORDS = 256  # per query, that are tested at a time; (words << 16) has to be an int32
+
+State = TypeVar("State")
+
+
+def shifts_of(torus: Torus, query: Array, source: Array, image: Array) -> Array:
+    """Return the lattice shifts [..., d], whole floats, of pairs of queries and images of sources."""
+    turns, query_turns = torus.turns
+    return jnp.asarray(torus.images.shifts).astype(turns.dtype)[image] + query_turns[query] - turns[source]
+
+
+class _WordTable(NamedTuple):
+    """How the runs of a block's queries are divided into words."""
+
+    start: Array  # [b, r] start of each run
+    stop: Array  # [b, r] its end
+    image: Array | None  # [b, r] its image code
+    before: Array | None  # [b, r] number of words in the query's earlier runs, if these are looked up
+    total: Array  # [b] number of words of each query
+    most: int | None  # that no query exceeds, if it is known
+
+    @property
+    def longest(self) -> Array | int:
+        """The largest number of words of a query, []."""
+        return self.most or largest_of(self.total)
+
+
+def _words_of(start: Array, stop: Array) -> Array:
+    return (stop - start + (LANES - 1)) >> (LANES.bit_length() - 1)
+
+
+class HitWords(NamedTuple):
+    """The neighbors in a chunk of candidates: one bit per candidate, [b, words] each."""
+
+    hits: Array  # in the lower half
+    first: Array  # position of each word's first candidate
+    image: Array | None  # image code
+
+
+Add = Callable[[HitWords, State], State]
+
+
+def is_at_once(candidates: Candidates, tuning: Tuning) -> bool:
+    """Say whether blocks are processed without loops where that is enough: doubts are rare in open space alone."""
+    return candidates.queries.ids.size <= tuning.at_once and candidates.torus is None and candidates.passes is None
+
+
+class BlockSearch(NamedTuple):
+    """Tests the candidates of queries, block by block."""
+
+    candidates: Candidates
+    cutoff: Cutoff | Cutoffs
+    keep: Filter
+    tuning: Tuning
+    slots: int  # scalars per query that a block holds
+    capacity: int | None  # expected number of neighbors per query
+
+    @property
+    def sources(self) -> Points:
+        return self.candidates.sources
+
+    @property
+    def queries(self) -> Points:
+        return self.candidates.queries
+
+    @property
+    def images(self) -> int:
+        """The number of images that rows tell apart."""
+        torus = self.candidates.torus
+        return 1 if torus is None or torus.images.nearest else torus.images.total
+
+    @property
+    def words(self) -> int:
+        """Words per query that are processed at a time."""
+        words = self.candidates.words(self.capacity)
+        if self.tuning.by_gathers:
+            return min(words, _MOST_WORDS)
+        return min(-(-words // 8) * 8, _MOST_WORDS // 4)
+
+    @property
+    def block_count(self) -> int:
+        """Number of blocks, whose words and slots fit into the scratch memory."""
+        torus = self.candidates.torus
+        several = torus is not None and not (torus.images.nearest or torus.images.per_system)
+        runs = torus.images.total if torus is not None and several else 1  # every query has at least so many
+        words = max(self.words, runs)
+        most = min(self.tuning.words // words, self.tuning.scratch // (words * WORD_BYTES + self.slots * SLOT_BYTES))
+        return -(-self.queries.ids.size // max(most, 1))
+
+    @property
+    def block_size(self) -> int:
+        """Number of queries in a block."""
+        return -(-self.queries.ids.size // self.block_count)
+
+    def block(self, b: Array | int) -> Span:
+        """Return the positions of block b's queries; the last block overlaps, so that all have one length."""
+        if self.block_count == 1:
+            return Span(0, self.block_size)
+        return Span(jnp.minimum(b * self.block_size, self.queries.ids.size - self.block_size), self.block_size)
+
+    def map_blocks(self, of_block: Callable[[Span], list[Array]], columns: list[tuple[int, ...]]) -> list[Array]:
+        """Return of_block(span), int32 arrays with a row per query, for all queries in the order of their indices.
+
+        `columns` are the shapes of a row of each array.
+        """
+        ids = self.queries.ids
+        if self.block_count == 1:
+            rows = of_block(self.block(0))
+            if self.candidates.in_order:
+                return rows
+            place = jnp.zeros_like(ids).at[ids].set(lax.iota(jnp.int32, ids.size), unique_indices=True)
+            return [x.at[place].get(mode="promise_in_bounds") for x in rows]
+
+        def put(b: Array, out: list[Array]) -> list[Array]:
+            span = self.block(b)
+            here = span.of(ids)
+            return [x.at[here].set(rows, unique_indices=True) for x, rows in zip(out, of_block(span), strict=True)]
+
+        return lax.fori_loop(0, self.block_count, put, [jnp.zeros((ids.size, *shape), jnp.int32) for shape in columns])
+
+    def fold_words(self, span: Span, add: "Add[State]", state: State, few: tuple["Add[State]", int] | None = None) -> State:
+        """Return the state after state = add(words, state) for each chunk of candidates of the queries at these positions.
+
+        `few` holds a function that does the same for so many neighbors of each query at most. Where all sources are candidates,
+        lists and counts have one loop, that of doubtful candidates; without a second way, their programs compile in less time.
+        """
+        most = self.candidates.most_words
+        if is_at_once(self.candidates, self.tuning) and (most is None or (few is not None and most <= self.words)):
+            return self._fold_at_once(span, add, state, few)
+
+        def add_pass(which: Array, state: State) -> State:
+            return self._fold_table(span, add, self.word_table(span, which), state)
+
+        passes = self.candidates.passes
+        passes = passes(span) if callable(passes) else passes
+        return add_pass(jnp.int32(0), state) if passes is None else lax.fori_loop(0, passes, add_pass, state)
+
+    def _fold_at_once(self, span: Span, add: "Add[State]", state: State, few: tuple["Add[State]", int] | None) -> State:
+        """Fold the first chunk of candidates without a loop; where that is not all, or leaves doubts, start again with loops."""
+        table = self.word_table(span, jnp.int32(0))
+        packed, first, image = self._test_words(span, [span.of(x) for x in self.queries.axes], table, jnp.int32(0))
+        packed, rest = self._decide_first(packed, first, image, span)
+        if table.most is None:
+            rest = rest | (table.total > self.words)
+        add_few = add
+        if few is not None:
+            add_few, room = few
+            rest = rest | (bit_counts(packed & _HITS).sum(axis=1, dtype=jnp.int32) > room)
+        return lax.cond(
+            jnp.any(rest),
+            lambda state: self._fold_table(span, add, table, state),
+            lambda state: add_few(HitWords(packed, first, image), state),
+            state,
+        )
+
+    def _fold_table(self, span: Span, add: "Add[State]", table: _WordTable, state: State) -> State:
+        query = [span.of(x) for x in self.queries.axes]
+
+        def add_chunk(chunk: Array, state: State) -> State:
+            return add(self.hit_words(span, query, table, chunk), state)
+
+        def add_next(now: tuple[Array, Array, State]) -> tuple[Array, Array, State]:
+            _, chunk, state = now
+            return (chunk + 1) * self.words < longest, chunk + 1, add_chunk(chunk, state)
+
+        if table.most is not None and table.most <= self.words:
+            return add_chunk(jnp.int32(0), state)
+        longest = table.longest
+        return lax.while_loop(lambda now: now[0], add_next, (jnp.asarray(longest > 0), jnp.int32(0), state))[2]
+
+    def word_table(self, span: Span, which: Array) -> _WordTable:
+        start, stop, image = self.candidates.runs(span, which)
+        count, runs = _words_of(start, stop), start.shape[1]
+        total, before = jnp.sum(count, axis=1, dtype=jnp.int32), None
+        if runs > _FEW_RUNS:
+            before = jnp.cumsum(count, axis=1, dtype=jnp.int32) - count
+        elif self.tuning.by_gathers:
+            before = jnp.sum(count[:, None] * np.tril(np.ones((runs, runs), np.int32), -1)[None], axis=2, dtype=jnp.int32)
+        return _WordTable(start, stop, image, before, total, self.candidates.most_words)
+
+    def hit_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> HitWords:
+        """Test one chunk of words per query; `own` are the d coordinates [b] of the queries."""
+        own, table, chunk = lax.optimization_barrier((own, table, chunk))  # as XLA would take small parts out of the loop
+        packed, first, image = self._test_words(span, own, table, chunk)
+        return HitWords(self._decide_doubtful(packed, first, image, span), first, image)
+
+    def _test_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
+        """Return a chunk of words with hits and doubtful candidates, the positions of their first candidates, and their images."""
+        first, stop, image = self._locate_words(table, chunk)
+        query = [x[:, None] for x in own]
+        if image is not None and self.candidates.torus is not None:  # translate the query instead of the image
+            query = [q - t for q, t in zip(query, self._translations(self.candidates.torus, image, span), strict=True)]
+        packed = self._test(first, stop, image, query, span)
+        if self.candidates.excluded is not None:
+            allowed = ~self._excluded_lanes(self.candidates.excluded, first, span) & _HITS
+            packed = packed & (allowed | allowed << np.uint32(LANES))
+        return lax.optimization_barrier((packed, first, image))
+
+    def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
+        word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (table.start.shape[0], self.words))
+        runs = table.start.shape[1]
+        if table.before is not None:
+            run = last_reached(table.before, word) + runs * lax.broadcasted_iota(jnp.int32, word.shape, 0)
+            first = flat_take(table.start, run) + LANES * (word - flat_take(table.before, run))
+            stop, image = flat_take(table.stop, run), None if table.image is None else flat_take(table.image, run)
+        else:  # a chain of selections takes half the time of a lookup on a CPU
+            columns = [table.start, table.stop, *([] if table.image is None else [table.image])]
+            found, before = [jnp.zeros_like(word) for _ in columns], jnp.zeros_like(table.start[:, :1])
+            for start, stop, *others in zip(*(lax.split(x, [1] * runs, axis=1) for x in columns), strict=True):
+                of_run, reached = [start + LANES * (word - before), stop, *others], word >= before
+                found = [lax.select(reached, jnp.broadcast_to(x, word.shape), y) for x, y in zip(of_run, found, strict=True)]
+                before = before + _words_of(start, stop)
+            first, stop, image = found if table.image is not None else (*found, None)
+        return jnp.minimum(first, self.sources.ids.size - LANES), stop, image
+
+    def _translations(self, torus: Torus, image: Array, span: Span) -> list[Array]:
+        """Return the lattice translation of the images of queries, per axis."""
+        if not torus.images.per_system:
+            return [t[image] for t in torus.translations.T]
+        own, shifts = span.of(torus.matrix)[..., None], [x[image] for x in torus.translations.T]
+        if torus.images.orthogonal:
+            return [shift * own[k, k] for k, shift in enumerate(shifts)]
+        return [functools.reduce(jnp.add, (x * own[row, k] for row, x in enumerate(shifts))) for k in range(len(shifts))]
+
+    def _test(self, first: Array, stop: Array, image: Array | None, query: list[Array], span: Span) -> Array:
+        """Compare 16 candidates per word with the cutoff in working precision: low half hits, high half doubtful ones."""
+        difference = [windows(x, first) - q[..., None] for x, q in zip(self.sources.axes, query, strict=True)]
+        square = squared_distance(difference, self.cutoff)
+        own, others = self.queries.radii, self.sources.radii
+        own = None if own is None else span.of(own)[:, None, None]
+        inside, outside = self._bounds(own, None if others is None else windows(others, first), span)
+        doubtful = jnp.where(square <= outside, np.uint32(1 << LANES), np.uint32(0))
+        value = jnp.where(square < inside, np.uint32(1), doubtful) << lax.iota(jnp.uint32, LANES)
+        if self.keep.later_only:
+            value = jnp.where(self._is_later(first, image, span), value, np.uint32(0))
+        if self.queries.systems is not None and self.sources.systems is not None:
+            system = span.of(self.queries.systems)[:, None, None]
+            value = jnp.where(windows(self.sources.systems, first) == system, value, np.uint32(0))
+        if self.tuning.by_gathers:  # in the same kernel
+            value = jnp.where(self._is_allowed(first, stop, image, span), value, np.uint32(0))
+            return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,))
+        allowed = self._allowed_lanes(first, stop, image, span)
+        return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,)) & (allowed | allowed << np.uint32(LANES))
+
+    def _bounds(self, own: Array | None, others: Array | None, span: Span) -> tuple[np.floating | Array, np.floating | Array]:
+        torus = self.candidates.torus
+        slack = None if torus is None else torus.slack
+        if torus is not None and torus.images.per_system:
+            slack = span.of(torus.slack)[:, None, None]
+        radii = self.cutoff.of_pairs(own, others) if isinstance(self.cutoff, Cutoffs) else None
+        return step_one_bounds(self.cutoff, radii, slack)
+
+    def _is_allowed(self, first: Array, stop: Array, image: Array | None, span: Span) -> Array:
+        """Say which candidates [b, words, 16] belong to their run and are not the query itself."""
+        place = first[..., None] + np.arange(LANES, dtype=np.int32)[None, None]
+        allowed = place < stop[..., None]
+        if not self.keep.drop_self or self.keep.later_only:
+            return allowed
+        own, again = span.places[:, None, None], self.candidates.again
+        other = place != own if again is None else (place != own) & (place != own + again)
+        if image is not None and self.candidates.torus is not None:
+            other = other | (image != self.candidates.torus.images.home)[..., None]
+        return allowed & other
+
+    def _allowed_lanes(self, first: Array, stop: Array, image: Array | None, span: Span) -> Array:
+        """Return which of a word's 16 candidates belong to its run and are not the query itself: bits, [b, words] uint32."""
+        one = np.uint32(1)
+        lanes = (one << jnp.clip(stop - first, 0, LANES).astype(jnp.uint32)) - one
+        if not self.keep.drop_self or self.keep.later_only:
+            return lanes
+        own = self._lanes_at(span.places, first)
+        if image is not None and self.candidates.torus is not None:
+            own = jnp.where(image == self.candidates.torus.images.home, own, np.uint32(0))
+        return lanes & ~own
+
+    def _lanes_at(self, place: Array, first: Array) -> Array:
+        """Return the candidates at a position [b] of each query: bits, [b, words] uint32."""
+        again, lanes = self.candidates.again, jnp.zeros(first.shape, jnp.uint32)
+        for where in (place,) if again is None else (place, place + again):
+            lane = where[:, None] - first
+            here = (lane >= 0) & (lane < LANES)
+            bit = np.uint32(1) << jnp.clip(lane, 0, LANES).astype(jnp.uint32)
+            lanes = lanes | jnp.where(here, bit, np.uint32(0))
+        return lanes
+
+    def _excluded_lanes(self, excluded: Excluded, first: Array, span: Span) -> Array:
+        """Return which candidates queries exclude: bits, [b, words] uint32. One pass for each place in the longest row."""
+        own = span.of(self.queries.ids)
+        begin, end = flat_take(excluded.starts, own), flat_take(excluded.starts, own + 1)
+
+        def add(k: Array, lanes: Array) -> Array:
+            place = flat_take(excluded.places, jnp.minimum(begin + k, excluded.places.size - 1))
+            return lanes | self._lanes_at(jnp.where(begin + k < end, place, -(1 << 30)), first)
+
+        return lax.fori_loop(0, largest_of(end - begin), add, jnp.zeros(first.shape, jnp.uint32))
+
+    def _is_later(self, first: Array, image: Array | None, span: Span) -> Array:
+        """Say which candidates [b, words, 16] are the later ones of their pairs: of a query's own images, the forward half."""
+        own = span.of(self.queries.ids)[:, None]
+        later = own + int(self.keep.drop_self)
+        if image is not None and self.candidates.torus is not None:
+            home = self.candidates.torus.images.home
+            later = jnp.where(image > home, own, jnp.where(image < home, own + 1, later))
+        return windows(self.sources.ids, first) >= later[..., None]
+
+    def _decide_first(self, packed: Array, first: Array, image: Array | None, span: Span) -> tuple[Array, Array]:
+        """Decide the first doubtful candidate of each query, where that takes no wide integers, without any loop.
+
+        Returns the words, of which the lower half is right where the upper half is empty, and which rows have others [b].
+        """
+        one, (rows, width) = np.uint32(1), packed.shape
+        word = jnp.where(packed > _HITS, lax.broadcasted_iota(jnp.int32, packed.shape, 1), width)
+        start = np.int32(width), np.int32(0)
+        word, many = lax.reduce(
+            (word, bit_counts(packed >> np.uint32(LANES))), start, lambda a, b: (lax.min(a[0], b[0]), a[1] + b[1]), (1,)
+        )
+        at = lax.min(word, np.int32(width - 1)) + width * lax.iota(jnp.int32, rows)
+        asked = flat_take(packed, at) >> np.uint32(LANES)
+        bit = bit_counts((asked & (~asked + one)) - one) % LANES
+        known, near = decide_in_units(
+            self._pair(span.places, flat_take(first, at) + bit, None if image is None else flat_take(image, at)), self.cutoff
+        )
+        known = known & (many > 0)
+        bit = one << bit.astype(jnp.uint32)
+        change = jnp.where(known, jnp.where(near, bit, np.uint32(0)) - (bit << np.uint32(LANES)), np.uint32(0))
+        word, change, many = lax.optimization_barrier((word, change, many - known.astype(jnp.int32)))
+        here = lax.broadcasted_iota(jnp.int32, packed.shape, 1) == word[:, None]
+        return packed + jnp.where(here, change[:, None], np.uint32(0)), many > 0
+
+    def _decide_doubtful(self, packed: Array, first: Array, image: Array | None, span: Span) -> Array:
+        """Add the doubtful candidates that are pairs to the hits: [b, words] uint32, of which the lower half is set then.
+
+        A round decides the first 32 doubtful candidates of each row that has some, a part of the block at a time.
+        """
+        rows, width = packed.shape
+        many = min(max(-(-rows // self.tuning.doubtful_share), self.tuning.doubtful_rows), rows)
+        whole, queue, waiting = many == rows, lax.iota(jnp.int32, rows), jnp.int32(0)
+        if not whole:
+            open_rows = jnp.max(packed, axis=1) > _HITS
+            until = jnp.cumsum(open_rows.astype(jnp.int32), dtype=jnp.int32)
+            waiting, queue = until[-1], jnp.full(rows + many, rows, jnp.int32)
+            queue = queue.at[jnp.where(open_rows, until - 1, rows + many)].set(lax.iota(jnp.int32, rows), mode="drop")
+
+        def decide_round(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            # The barrier keeps what follows in the loop: it is not worth computing where no round is needed.
+            _, at, packed, row = lax.optimization_barrier((*state, queue))
+            row = row if whole else lax.dynamic_slice_in_dim(row, at, many)
+            here = jnp.minimum(row, rows - 1)
+            both = packed if whole else jnp.where((row < rows)[:, None], packed[here], np.uint32(0))
+            asked = both >> np.uint32(LANES)
+            bits = BitRows.of(asked, self.tuning.by_gathers)
+            slot = lax.broadcasted_iota(jnp.int32, (many, _SLOTS), 1)
+            word, bit = bits.nth(slot)
+            word = word if whole else word + width * (here - lax.iota(jnp.int32, many))[:, None]
+            candidate = flat_take(first, word) + bit
+
+            def points(at: Array | None) -> Pair:
+                of_row, source, of_word = here[:, None], candidate, word
+                if at is not None:
+                    of_row, source, of_word = here[at // _SLOTS], flat_take(source, at), flat_take(of_word, at)
+                return self._pair(span.first + of_row, source, None if image is None else flat_take(image, of_word))
+
+            there = slot < bits.total[:, None]
+            pair = decide_pairs(there, points, self.cutoff)
+            one = np.uint32(1) << bit.astype(jnp.uint32)
+            change = jnp.where(pair, one, np.uint32(0)) - (one << np.uint32(LANES))  # doubtful no longer, and a hit if it is a pair
+            word = jnp.where(there, word, packed.size)
+            packed = packed.reshape(-1).at[word].add(change, mode="drop").reshape(packed.shape)
+            more = largest_of(bits.total) > _SLOTS
+            at = at if whole else jnp.where(more, at, at + many)
+            return more if whole else at < waiting, at, packed
+
+        more = largest_of(packed) > _HITS if whole else waiting > 0
+        return lax.while_loop(lambda state: state[0], decide_round, (more, jnp.int32(0), packed))[2]
+
+    def _pair(self, place: Array, candidate: Array, image: Array | None) -> Pair:
+        """Return the given (not wrapped) points of queries and candidates at these positions."""
+        torus, radii = self.candidates.torus, None
+        if isinstance(self.cutoff, Cutoffs):
+            own, others = self.queries.radii, self.sources.radii
+            radii = self.cutoff.of_pairs(
+                None if own is None else flat_take(own, place), None if others is None else flat_take(others, candidate)
+            )
+        i, j = flat_take(self.queries.ids, place), flat_take(self.sources.ids, candidate)
+        sources, queries = self.candidates.given
+        pair = Pair(take_points(queries, i), take_points(sources, j), radii)
+        if torus is None or image is None:
+            return pair
+        matrix = torus.matrix.at[..., place].get(mode="promise_in_bounds") if torus.images.per_system else torus.matrix
+        shift = jnp.moveaxis(shifts_of(torus, i, j, image), -1, 0)
+        matrix = matrix[len(shift) :] if torus.images.short else matrix
+        shift, matrix = shift_in_given(shift, torus.images.basis, matrix)
+        return pair._replace(shift=shift, matrix=matrix, orthogonal=torus.images.orthogonal)
