@@ -7,7 +7,7 @@ from jax import Array
 
 from jfrnn._geometry import Batch, Box, rounded_product, rounded_scaled
 from jfrnn._search.topology import Topology
-from jfrnn._tracing import compile_program
+from jfrnn._tracing import compile_program, own_transfers
 
 
 def real_points(
@@ -21,7 +21,8 @@ def real_points(
     """
     if box is None or not box.fractional:
         return sources, queries
-    return _multiply(sources, queries, box.vectors, batch, box.orthogonal, box.per_system, native)
+    with own_transfers():
+        return _multiply(sources, queries, box.vectors, batch, box.orthogonal, box.per_system, native)
 
 
 @functools.partial(compile_program, static_argnames=("orthogonal", "per_system", "native"))

@@ -252,9 +252,8 @@ class KeptSearch(KeptOptions):
         """Return the present positions of sources and rows, as lengths, and the present box, after checking that they fit."""
         sources, rows = self._check_points(positions, queries)
         box = self._box_now(box, sources)
-        with own_transfers():
-            asking = rows if self.own_queries else None
-            real, asking = real_points(sources, asking, box, self.batch, self.problem.options.engine.translates)
+        asking = rows if self.own_queries else None
+        real, asking = real_points(sources, asking, box, self.batch, self.problem.options.engine.translates)
         return real, real if asking is None else asking, box
 
     def _check_points(self, positions: Array, queries: Array | None) -> tuple[Array, Array]:

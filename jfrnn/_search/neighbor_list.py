@@ -219,7 +219,7 @@ class NeighborList(ListExports):
         Returns:
             A `Graph`, a pytree with the fields of `jraph.GraphsTuple`, padded by a second graph of one node and the unused edges:
             nodes {"positions": [n + 1, d]}, edges {"displacement": [total, d], "distance": [total], "shift": [total, d]}, receivers
-            and senders [total] int32, n_node [2], n_edge [2].
+            and senders [total] int32, n_node [2], n_edge [2]. Positions of nodes are lengths, of fractional coordinates too.
 
         Raises:
             ValueError: the list has queries, which are no nodes.

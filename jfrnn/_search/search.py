@@ -62,8 +62,8 @@ def search(
             there: they have no neighbors, and their positions may be anything.
         radius_rule: How the cutoff of a pair follows from cutoffs per particle: "gather" is that of i, the row; "scatter" that of
             j; "either" the larger, "both" the smaller, "mean" the exact mean, "sum" the exact sum, for contacts of spheres. Large
-            cutoffs do not slow down particles with small ones: up to a ratio of 128, each particle searches cells of its own size. With
-            a box per system, cells are as wide as the largest cutoff in their system.
+            cutoffs do not slow down particles with small ones: up to a ratio of 128, each particle searches cells of its own size.
+            With a box per system, cells are as wide as the largest cutoff in their system.
         species: Row of the table `cutoff` [s, s] that belongs to each particle, shape [n], integers from 0 to s - 1; with queries a
             tuple of [n] and [m]. Particles of other species have no neighbors: outside jit, and without `active`, this raises, and
             inside a status bit says so.

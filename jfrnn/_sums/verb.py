@@ -49,8 +49,8 @@ def pair_sum(
             Python numbers that it closes over are compiled in: each new value costs about a second of compilation, so close over
             `jnp.asarray(number, x.dtype)` if a number changes. If particles may coincide or are their own neighbors, fn must be
             safe at r = 0 (the derivative of sqrt is not).
-        positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64, or fractional coordinates as in `search`.
-            n = 0 is allowed.
+        positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64, or fractional coordinates, as in
+            `search`. n = 0 is allowed.
         cutoff: As in `search`; with `neighbors` that of the list, or None.
         values: A pytree of arrays of shape [n, ...]; fn gets leaves [...], of j and, without queries, of i. Default: None.
         query_values: Values of the queries, leaves [m, ...], which fn gets for i. Only with queries.
