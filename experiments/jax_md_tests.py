@@ -60,7 +60,9 @@ def pytest_runtest_logreport(report: Any) -> None:  # noqa: ANN401
     reason = str(report.longrepr[-1] if isinstance(report.longrepr, tuple) else report.longrepr or "").strip().splitlines()[-1:]
     row = (report.nodeid.partition("::")[0].rpartition("/")[2], _name(report.nodeid), _who(), report.outcome)
     with Path(os.environ[_ROWS]).open("a", newline="") as file:
-        csv.writer(file).writerow((*row, f"{report.duration:.1f}", *[x[:200] for x in reason or [""]], theirs, jax.__version__, ours))
+        csv.writer(file).writerow(
+            (*row, f"{report.duration:.1f}", *[x[:200] for x in reason or [""]], theirs, jax.__version__, ours)
+        )
 
 
 def _who() -> str:
