@@ -202,14 +202,11 @@ def neighbor_list(
             )
         current, n = kwargs.get("box", box), len(position)
         kind = None if disable_cell_list else _kind_of(metric, current, fractional_coordinates, position, kwargs)
-        kept, real, given = None, _real(position, current, fractional_coordinates), {}
+        kept, given = None, {"skin": skin, "include_self": not mask_self}
+        if kind == "periodic" or (kind == "free" and fractional_coordinates):
+            given["box"] = _box_of(current, position.shape[1], kind == "periodic", fractional_coordinates)
         if kind is not None:
-            given = {
-                "box": None if kind == "free" else _box_of(current, position.shape[1]),
-                "skin": skin,
-                "include_self": not mask_self,
-            }
-            kept = search(real, cutoff, slack=max(float(capacity_multiplier), 1.0), **given)
+            kept = search(position, cutoff, slack=max(float(capacity_multiplier), 1.0), **given)
             kept = kept if kept.images is None else None  # a list of jax-md holds the nearest image alone
         rows = all_pairs(position, kwargs) if kept is None else kept.idx
         occupancy = int(finish(rows, 0 if own is not Dense else rows.shape[1])[1])
@@ -217,7 +214,7 @@ def neighbor_list(
         extra = extra_capacity if own is Dense else n * extra_capacity
         room = max(min(int(occupancy * capacity_multiplier + extra), most), 0)
         if kept is not None and own is Dense and room > kept.capacity:
-            kept = search(real, cutoff, capacity=room, **given)
+            kept = search(position, cutoff, capacity=room, **given)
             rows = kept.idx
         idx, held = finish(rows, room)
         error = PartitionError(jnp.where(held > room, 1, 0).astype(jnp.uint8))
@@ -238,9 +235,7 @@ def neighbor_list(
                 raise TypeError(
                     f"update() knows the keyword box alone, got {', '.join(unknown)}: make the list with disable_cell_list=True."
                 )
-            current = kwargs.get("box", box)
-            real = _real(position, current, fractional_coordinates)
-            new = kept.update(real, box=_box_like(kept.box, current) if "box" in kwargs else None)
+            new = kept.update(position, box=_box_like(kept.box, kwargs["box"]) if "box" in kwargs else None)
             moved = jnp.asarray(True) if skin == 0 else new.rebuild_count != kept.rebuild_count
             fresh = dataclasses.replace(neighbors, kept=new)
             rows = lambda: new.idx  # noqa: E731
@@ -361,17 +356,16 @@ def neighbor_list_multi_image(
     def box_of(box: Given, dim: int, like: Box | None = None) -> tuple[Array, Box]:
         matrix = jnp.asarray(box)
         matrix = jnp.eye(dim) * matrix if matrix.ndim < 2 else matrix
-        made = Box(
-            matrix.T if isinstance(matrix, Tracer) else np.asarray(matrix).T, True if pbc is None else np.asarray(pbc).tolist()
-        )
-        return matrix, made if like is None else Box(matrix.T, like.periodic)
+        vectors = matrix.T if isinstance(matrix, Tracer) or like is not None else np.asarray(matrix).T
+        axes = like.periodic if like is not None else True if pbc is None else np.asarray(pbc).tolist()
+        return matrix, Box(vectors, axes, fractional=fractional_coordinates)
 
-    def finish(kept: Kept, real: Array, made: Box, room: int) -> tuple[Any, Array, Array]:
+    def finish(kept: Kept, position: Array, made: Box, room: int) -> tuple[Any, Array, Array]:
         n, whole = (
-            len(real),
+            len(position),
             dataclasses.replace(kept, status=jnp.zeros_like(kept.status)),
         )  # else it raises what the caller is told
-        shifts = whole.shifts(real, box=made if any(made.periodic) else None)
+        shifts = whole.shifts(position, box=made if kept.box is not None else None)
         used = kept.idx < n
         if own is OrderedSparse:
             i = jnp.arange(n, dtype=jnp.int32)[:, None]
@@ -383,35 +377,33 @@ def neighbor_list_multi_image(
         if own is Dense:
             more = ((0, 0), (0, max(room - kept.capacity, 0)))
             idx, shifts = jnp.pad(kept.idx, more, constant_values=n)[:, :room], jnp.pad(shifts, (*more, (0, 0)))[:, :room]
-            return idx, shifts.astype(real.dtype), jnp.max(kept.count, initial=0)
+            return idx, shifts.astype(position.dtype), jnp.max(kept.count, initial=0)
         if 0 in used.shape:
             none = jnp.full(room, n, jnp.int32)
-            return (none, none), jnp.zeros((room, shifts.shape[-1]), real.dtype), jnp.int32(0)
+            return (none, none), jnp.zeros((room, shifts.shape[-1]), position.dtype), jnp.int32(0)
         flat = flatten(used, room)
         real_pair = flat.rows < n
         senders = jnp.where(real_pair, kept.idx.reshape(-1)[flat.slots], n)
         shifts = jnp.where(real_pair[:, None], shifts.reshape(used.size, -1)[flat.slots], 0)
-        return (flat.rows, senders), shifts.astype(real.dtype), flat.offsets[-1]
+        return (flat.rows, senders), shifts.astype(position.dtype), flat.offsets[-1]
 
     def allocate(position: Array, extra_capacity: int = 0, **given: Given) -> NeighborListMultiImage:
         position = jnp.asarray(position)
         n, dim = position.shape
         matrix, made = box_of(given.get("box", box), dim)
-        real = _real(position, matrix, fractional_coordinates)
-        kept = search(real, cutoff, box=made, skin=skin, slack=max(float(capacity_multiplier), 1.0))
-        occupancy = int(finish(kept, real, made, 1)[2])
+        kept = search(position, cutoff, box=made, skin=skin, slack=max(float(capacity_multiplier), 1.0))
+        occupancy = int(finish(kept, position, made, 1)[2])
         room = max(int(occupancy * capacity_multiplier) + extra_capacity * (1 if own is Dense else n), 1)
         if room > kept.capacity and own is Dense:
-            kept = search(real, cutoff, box=made, skin=skin, capacity=room)
-        idx, shifts, held = finish(kept, real, made, room)
+            kept = search(position, cutoff, box=made, skin=skin, capacity=room)
+        idx, shifts, held = finish(kept, position, made, room)
         return NeighborListMultiImage(idx, shifts, position, matrix, matrix, held > room, kept, room, _theirs(own, format), update)
 
     def update(position: Array, neighbors: NeighborListMultiImage, **given: Given) -> NeighborListMultiImage:
         position, room = jnp.asarray(position), neighbors.max_occupancy
         matrix, made = box_of(given.get("box", neighbors.box), position.shape[1], neighbors.kept.box)
-        real = _real(position, matrix, fractional_coordinates)
-        kept = neighbors.kept.update(real, box=made if neighbors.kept.box is not None else None)
-        idx, shifts, held = finish(kept, real, made, room)
+        kept = neighbors.kept.update(position, box=made if neighbors.kept.box is not None else None)
+        idx, shifts, held = finish(kept, position, made, room)
         moved = jnp.asarray(True) if skin == 0 else kept.rebuild_count != neighbors.kept.rebuild_count
         reference = jnp.where(moved, position, neighbors.reference_position)
         reference_box = jnp.where(moved, matrix, neighbors.reference_box)
@@ -465,24 +457,18 @@ def _kind_of(metric: Distance, box: Given, fractional: bool, position: Array, kw
     return None
 
 
-def _real(position: Array, box: Given, fractional: bool) -> Array:
-    if not fractional:
-        return position
-    box = jnp.asarray(box, position.dtype)
-    return position * box if box.ndim < 2 else jnp.sum(position[:, None, :] * box[None], axis=-1)
-
-
-def _box_of(box: Given, dim: int) -> Box:
+def _box_of(box: Given, dim: int, periodic: bool, fractional: bool) -> Box:
     box = np.asarray(box)
-    return Box(np.full(dim, box) if box.ndim == 0 else box if box.ndim == 1 else box.T)
+    return Box(np.full(dim, box) if box.ndim == 0 else box if box.ndim == 1 else box.T, periodic, fractional=fractional)
 
 
 def _box_like(made: Box | None, box: Given) -> Box | None:
-    """Return the box of the moment in the form in which the list has it; in free space there is none."""
+    """Return the box of the moment in the form in which the list has it; in free space there is none, but for fractions."""
     if made is None:
         return None
     box, dim = jnp.asarray(box, made.vectors.dtype), made.dim
     if made.orthogonal and box.ndim == 2:
         raise ValueError(f"box must be a length or {dim} lengths, as when the list was allocated, got a matrix: allocate with one.")
     box = jnp.full(dim, box) if box.ndim == 0 else box
-    return Box(box if made.orthogonal else jnp.diag(box) if box.ndim == 1 else box.T)
+    vectors = box if made.orthogonal else jnp.diag(box) if box.ndim == 1 else box.T
+    return Box(vectors, made.periodic, fractional=made.fractional)

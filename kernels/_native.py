@@ -22,8 +22,10 @@ EXCLUDED = (
     "excluded_starts",
     "excluded",
 )  # arrays that are given where kernels are EXCLUDING (native/excluded.h), and else left out
+RULES = ("gather", "scatter", "either", "both", "mean", "table")  # by which the cutoff of a pair follows from both, in native order
+TABLE = ("table_of_kinds", "kinds_of_sources", "kinds_of_queries")  # arrays that the last of these rules asks for
 SPACES = ("", "_nearest", "_images", "_nearest_skewed", "_images_skewed")  # in names of variants
-_DEFAULTS = {"PERIODIC": 0, "BATCHED": 0, "SUM": 0, "SCALED": 0, "ONE_BY_ONE": 0, "EXCLUDING": 0, "FLAT": 0}
+_DEFAULTS = {"PERIODIC": 0, "BATCHED": 0, "SUM": 0, "SCALED": 0, "ONE_BY_ONE": 0, "EXCLUDING": 0, "FLAT": 0, "RULE": -1}
 
 
 def table_cells(sources: int) -> int:
@@ -40,7 +42,7 @@ def program(double: bool, dim: int, *headers: str, given: Mapping[str, str] = Ma
     BATCHED is 1 where a row ends with the number of its system (see `jfrnn._geometry.batch`). SUM is 1 where the cutoff of a pair
     is the sum of two numbers. SHIFTED is 0 where all pairs that are decided are those of points as they are, though space is
     periodic. SCALED is 1 where cutoffs are so small, or so large, that their squares need a unit.
-    EXCLUDING is 1 where queries exclude sources.
+    EXCLUDING is 1 where queries exclude sources. RULE is the number of one of `RULES`, -1 where all pairs have one cutoff.
 
     Args:
         double: Whether positions are float64.

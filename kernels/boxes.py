@@ -3,7 +3,7 @@
 import functools
 from typing import NamedTuple
 
-from jfrnn.kernels._native import SPACES, program
+from jfrnn.kernels._native import RULES, SPACES, program
 from jfrnn.kernels._program import Entry, Kernel, declare
 from jfrnn.kernels.cells_cuda import GRID
 from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
@@ -67,21 +67,24 @@ def rows_kernel(
     cuda: bool,
     excluding: bool = False,
     flat: bool = False,
+    rule: str = "",
 ) -> Kernel:
     """Return the kernel for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts, half lists or whole.
 
-    `periodic`, `excluding` and `flat` are those of `jfrnn.kernels._native.program`.
+    `periodic`, `excluding` and `flat` are those of `jfrnn.kernels._native.program`; `rule` is one of its `RULES`, "" with one
+    cutoff.
     """
     where = "cuda" if cuda else "cpu"
     kind = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}{'_flat' * flat}{'_later' * later}"
-    name = f"box_rows_{where}_{kind}{SPACES[periodic]}{'_excluding' * excluding}"
-    constants = _constants(periodic, scaled, lists, later) | {"EXCLUDING": excluding, "FLAT": flat}
+    name = f"box_rows_{where}_{kind}{SPACES[periodic]}{'_excluding' * excluding}{f'_{rule}' * bool(rule)}"
+    constants = _constants(periodic, scaled, lists, later, rule) | {"EXCLUDING": excluding, "FLAT": flat}
     text = program(double, dim, "box_rows.cuh" if cuda else "box_rows_cpu.h", given={}, SUMS=0, **constants)
     return declare(name, text, Entry("BoxRows.run", _BLOCK if cuda else 1, BLOCKS), cuda=cuda, fused=cuda)[0]
 
 
-def _constants(periodic: int, scaled: bool, lists: bool, later: bool) -> dict[str, int]:
-    found = {"PERIODIC": periodic, "SCALED": scaled, "LIST": lists, "LATER": later}
+def _constants(periodic: int, scaled: bool, lists: bool, later: bool, rule: str) -> dict[str, int]:
+    found = {"PERIODIC": periodic, "SCALED": scaled, "LIST": lists, "LATER": later, "SUM": rule == "mean"}
+    found |= {"RULE": RULES.index(rule)} if rule else {}
     return found | {"QUERY_CHUNK": QUERIES_AT_ONCE, "LANES_PER_ROW": LANES}
 
 
@@ -97,14 +100,16 @@ def sum_kernel(
     periodic: int,
     cuda: bool,
     excluding: bool = False,
+    rule: str = "",
 ) -> Kernel:
     """Return the kernel that sums a term; `key` tells it from all others in the names of programs.
 
     `extremes`: it finds the largest summands instead, as `jfrnn.kernels.pair_sum_cpu.query_kernel` does.
     """
     name = f"box_sums_{'cuda' if cuda else 'cpu'}_{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}"
-    name += f"{'_compensated' * compensated}{SPACES[periodic]}{'_extremes' * extremes}{'_excluding' * excluding}_{key}"
-    constants = {**GRID, **_constants(periodic, scaled, False, False), **constants_of(term, compensated, extremes)}
+    name += f"{'_compensated' * compensated}{SPACES[periodic]}{'_extremes' * extremes}{'_excluding' * excluding}"
+    name += f"{f'_{rule}' * bool(rule)}_{key}"
+    constants = {**GRID, **_constants(periodic, scaled, False, False, rule), **constants_of(term, compensated, extremes)}
     constants["EXCLUDING"] = excluding
     header = "box_sums.cuh" if cuda else "box_sums_cpu.h"
     text = program(double, dim, header, given=term_header(term, double), **constants)

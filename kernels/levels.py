@@ -8,14 +8,12 @@ import functools
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from jfrnn.kernels._native import SPACES, program
+from jfrnn.kernels._native import RULES, SPACES, program
 from jfrnn.kernels._program import Entry, Kernel, declare
 
 PADDING = 16  # sources behind the last one, which nobody meets: the CPU tests so many at a time
 CHUNK = 256  # queries that a thread of the CPU takes at a time
 BLOCK = 128  # threads of CUDA
-RULES = ("gather", "scatter", "either", "both", "mean", "table")
-TABLE = ("table_of_kinds", "kinds_of_sources", "kinds_of_queries")  # arrays that the last of these rules asks for
 
 
 def level_program(

@@ -133,32 +133,39 @@ def reference_radii(
     queries: Any = None,
     query_radii: Any = None,
     lengths: Any = None,
+    matrix: Any = None,
+    periodic: Sequence[bool] | None = None,
+    half: bool = False,
     closed: bool = False,
 ) -> set[Image]:
     """Return every (query i, source j, shift S) closer than the cutoff of that pair, which a rule takes of two, exactly.
 
     `radii` [n] are the cutoffs of the positions, `query_radii` [m] those of the queries, all of the dtype of positions. The
     rule names what a pair's cutoff is: gather that of i, scatter that of j, either the larger, both the smaller, mean the mean.
-    S is 0 without `lengths` [d], those of a periodic box. Without `queries`, (i, i, 0) is left out.
+    S is 0 without `lengths` [d], those of a periodic box, or `matrix` and `periodic`, which with `half` are as in
+    `reference_images`. Without `queries`, (i, i, 0) is left out.
 
-    Found among the images within the largest cutoff of all; then 4 |x_j - x_i + S·L|^2 is compared with (2 r)^2 in fractions.
+    Found among the images within the largest cutoff of all; then 4 |x_j - x_i + S·A|^2 is compared with (2 r)^2 in fractions.
     """
     points = _points(positions)
     largest = float(np.max([*np.asarray(radii), *([] if query_radii is None else np.asarray(query_radii))]))
-    cell, dim = lengths, points.shape[1]
-    options = {"matrix": np.ones(dim) if cell is None else cell, "periodic": (cell is not None,) * dim}
-    nearby = reference_images(points, largest, queries=queries, closed=True, **options)
+    cell, dim = lengths if matrix is None else matrix, points.shape[1]
+    flags = (cell is not None,) * dim if periodic is None else periodic
+    options = {"matrix": np.ones(dim) if cell is None else cell, "periodic": flags}
+    nearby = reference_images(points, largest, queries=queries, half=half, closed=True, **options)
     ends = [[Fraction(x) for x in point] for point in points.tolist()]
     starts = ends if queries is None else [[Fraction(x) for x in point] for point in _points(queries).tolist()]
     of_end = [Fraction(r) for r in np.asarray(radii).tolist()]
     of_start = of_end if query_radii is None else [Fraction(r) for r in np.asarray(query_radii).tolist()]
-    edges = [Fraction(0)] * dim if cell is None else [Fraction(x) for x in np.asarray(cell, points.dtype).tolist()]
+    rows = np.asarray(np.zeros(dim) if cell is None else cell, points.dtype)
+    rows = [[Fraction(x) for x in row] for row in (np.diag(rows) if rows.ndim == 1 else rows).tolist()]
     found = set()
     for i, j, shift in nearby:
         own, other = of_start[i], of_end[j]
         double = {"gather": 2 * own, "scatter": 2 * other, "either": 2 * max(own, other), "both": 2 * min(own, other)}
         limit = (own + other if rule == "mean" else double[rule]) ** 2
-        square = 4 * sum((y - x + s * e) ** 2 for x, y, s, e in zip(starts[i], ends[j], shift, edges, strict=True))
+        moved = [sum(s * row[k] for s, row in zip(shift, rows, strict=True)) for k in range(dim)]
+        square = 4 * sum((y - x + v) ** 2 for x, y, v in zip(starts[i], ends[j], moved, strict=True))
         if square < limit or (closed and square == limit):
             found.add((i, j, shift))
     return found

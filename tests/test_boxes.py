@@ -304,11 +304,6 @@ X, SYSTEMS, CELLS = np.zeros((4, 3)), np.zeros(4, np.int32), np.stack([np.eye(3)
         (ValueError, "a box per system: pass batch=", lambda: jfrnn.search(X, 1.0, box=jfrnn.Box(CELLS))),
         (
             ValueError,
-            "cutoff must be one number where box holds a box per system",
-            lambda: jfrnn.search(X, np.ones(4), box=jfrnn.Box(CELLS), batch=SYSTEMS),
-        ),
-        (
-            ValueError,
             r"kind with which the list was made \(.*for each of 2 systems\), got .*for each of 1 systems",
             lambda: jfrnn.search(X, 0.1, box=jfrnn.Box(CELLS), batch=SYSTEMS).update(X, box=jfrnn.Box(CELLS[:1])),
         ),

@@ -21,18 +21,17 @@ WHOLE = sorted(path.name for path in NATIVE.iterdir())
 
 def is_cpu_only(header):
     """Tell headers with Clang's vectors, or with calls of the CPU alone; where cutoffs differ, one text has both."""
-    if header in ("levels.h", "level_rows.h", "winding.h"):
+    if header in ("levels.h", "level_rows.h", "level_sums.h", "winding.h"):
         return False
     text = resolve(header, given={"numbers.h": "", "xla_ffi.h": "", "warp_hashgrid.h": ""})
     if header in ("c_library.h", "hashgrid_build.h", *LAUNCHING):
         return True
-    words = ("vector_size", "__builtin_prefetch", "__atomic_fetch_add", "_cpu.h", "level_sums", "__builtin_sqrt")
+    words = ("vector_size", "__builtin_prefetch", "__atomic_fetch_add", "_cpu.h", "__builtin_sqrt")
     return any(word in text or word in header for word in words) and not header.endswith(".cuh")
 
 
 def headers(cuda):
-    found = [name for name in WHOLE if (name.endswith(".h") or cuda) and not (cuda and is_cpu_only(name))]
-    return [name for name in found if not (cuda and name == "level_sums.h")]
+    return [name for name in WHOLE if (name.endswith(".h") or cuda) and not (cuda and is_cpu_only(name))]
 
 
 def text_of(header):

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 import jfrnn
-from jfrnn._engine import warp_sums
-from jfrnn._engine.variants import SumVariant
+from jfrnn._engine import Filter, boxes_warp, levels_warp, warp_sums
+from jfrnn._engine.sum_results import SumsOf
+from jfrnn._engine.variants import SumVariant, names_of_cutoffs
 from jfrnn._search.problem import check_problem
 from jfrnn._sums import fused as _fused
 from jfrnn._sums.verb import _with_engine
 from jfrnn.kernels import _compile, few_cuda, pair_sum_cpu, pair_sum_cuda
-from jfrnn.kernels._native import EXCLUDED
+from jfrnn.kernels._native import EXCLUDED, TABLE
 
 CUTOFF = 0.1
 
@@ -202,6 +203,39 @@ def test_programs_for_cuda_call_it_and_plans_have_the_arguments_of_their_kernels
             numbers = {**found.numbers, **step.numbers}
             assert {field.name for field in step.kernel.fields if field.is_array} <= arrays | {*found.absent, *EXCLUDED}
             assert all(0 <= numbers[field.name] < 2**31 for field in step.kernel.fields if not field.is_array)
+
+
+@pytest.mark.parametrize(
+    ("rule", "boxes"),
+    [("table", True), *(pytest.param(*x, marks=pytest.mark.slow) for x in (("mean", True), ("mean", False), ("table", False)))],
+)
+def test_cutoffs_that_differ_compile_and_plans_have_the_arguments_of_their_kernels(rule, boxes):
+    x, n, species = np.zeros((40, 3), np.float32), 40, np.zeros(40, np.int32)
+    cutoff, given = (np.ones((2, 2), np.float32), {"species": species}) if rule == "table" else (np.ones(n, np.float32), {})
+    given |= {"box": jfrnn.Box(np.stack([np.eye(3)] * 2), images=1), "batch": species} if boxes else {}
+    given |= {"radius_rule": rule} if rule == "mean" else {}
+    density = lambda x: jfrnn.pair_sum(poly6, x, cutoff, x[:, 0], backend="warp", **given)  # noqa: E731
+    program = jax.jit(lambda x: (density(x), jfrnn.search(x, cutoff, capacity=8, backend="warp", **given).idx))
+    text = program.trace(x).lower(lowering_platforms=("cuda",)).as_text()
+    plan = plan_of(density, x)
+    keep = Filter(drop_self=True, later_only=False)
+    if boxes:
+        assert f'"jfrnn_box_sums_cuda_3d_f32_scaled_own_dropself_batched_images_skewed_{rule}_' in text
+        assert f'"jfrnn_box_rows_cuda_3d_f32_scaled_list_images_skewed_batched_own_dropself_{rule}@' in text
+        variant = SumVariant(3, False, True, True, False, True, 4, True, False, False, plan.key, True, False, False, rule)
+        names = (*boxes_warp._GIVEN, "shared_values", "own_values", "columns", *names_of_cutoffs(rule), *boxes_warp._SUMS, "info")
+        found = boxes_warp._plan_sums(variant, plan.text, {name: (n, 4) for name in names}, 132)
+    else:
+        assert f'"jfrnn_pair_sum_levels_cuda_3d_f32_own_dropself_{rule}_' in text
+        variant = levels_warp._LevelVariant(3, False, False, True, False, keep, rule, 0, False, True, False)
+        names = (*levels_warp._given(variant), "shared_values", "own_values", "columns", "sums", "totals", "errors", "info")
+        results = SumsOf(plan.text, n, 2, False, False)
+        found = levels_warp._plan_sums(variant, results, plan.key, {name: (n, 4) for name in names}, 132)
+    (launch,) = found.steps
+    assert f".entry {launch.kernel.name}(" in _compile.find_binary(launch.kernel.program, arch=90).read_text()
+    spared = {*EXCLUDED, *TABLE, "radii", "query_radii", "more"}
+    assert {field.name for field in launch.kernel.fields if field.is_array} <= {*names, *spared}
+    assert all(0 <= found.numbers[field.name] < 2**31 for field in launch.kernel.fields if not field.is_array)
 
 
 def test_few_particles_take_one_launch():

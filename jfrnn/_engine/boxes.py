@@ -6,7 +6,7 @@ from jax import Array, lax
 from jfrnn._engine.candidates import Candidates, Points, Span, Torus
 from jfrnn._engine.problem import Search
 from jfrnn._engine.words import LANES
-from jfrnn._geometry import box_runs, passes_of, sort_into_boxes, unpack_turns
+from jfrnn._geometry import Cutoffs, box_runs, passes_of, sort_into_boxes, unpack_turns
 
 _WIDTH = 27  # runs of a pass
 _WORDS = 64  # of candidates that a query tests at a time
@@ -36,5 +36,9 @@ def find_in_boxes(search: Search, by_cells: bool) -> Candidates:
     matrix = jnp.concatenate([own.matrix, own.given], axis=1) if lattice.images.short else own.matrix  # the short vectors first
     matrix = jnp.moveaxis(matrix, 0, -1)
     images = Torus(lattice.images, shifts.astype(sources.dtype), matrix, (turns[0], turns[1]), wrapped.slack[systems])
-    points, rows = (Points([x[at] for x in of.T], at) for of, at in ((wrapped.sources, padded), (wrapped.queries, order)))
+    radii = search.cutoff.of_points if isinstance(search.cutoff, Cutoffs) else (None, None)
+    points, rows = (
+        Points([x[at] for x in of.T], at, None if each is None else each[at])
+        for of, at, each in ((wrapped.sources, padded, radii[0]), (wrapped.queries, order, radii[1]))
+    )
     return Candidates(points, rows, runs, images, len(sources), lambda _: _WORDS, passes)

@@ -13,10 +13,20 @@ from jfrnn._engine.operands import excluded_rows, lattice_numbers, particle_rows
 from jfrnn._engine.plans import Clear, Launch, Plan, share
 from jfrnn._engine.problem import Filter, Room, Rows, Search, largest_radius
 from jfrnn._engine.sum_results import FoundSums, SumsOf
-from jfrnn._engine.variants import SumVariant, Variant, absent, describe_call, found_rows, huge_pages, plan_numbers, row_dims
-from jfrnn._geometry import Lattice, Wrapped, most_cells, sort_into_boxes, unpack_turns
+from jfrnn._engine.variants import (
+    SumVariant,
+    Variant,
+    absent,
+    describe_call,
+    found_rows,
+    huge_pages,
+    names_of_cutoffs,
+    plan_numbers,
+    row_dims,
+)
+from jfrnn._geometry import Cutoffs, Lattice, Wrapped, most_cells, sort_into_boxes, unpack_turns
 from jfrnn.kernels import boxes
-from jfrnn.kernels._native import EXCLUDED
+from jfrnn.kernels._native import EXCLUDED, TABLE
 from jfrnn.kernels.pair_sum_cpu import TermText
 
 _GIVEN = ("positions", "queries", "boxes", "axes", "systems", "ids", "cells", "start")
@@ -25,14 +35,17 @@ _GIVEN = ("positions", "queries", "boxes", "axes", "systems", "ids", "cells", "s
 def box_neighbors(search: Search, keep: Filter, capacity: int | Room | None) -> Rows:
     """List the neighbors of every query, or only count them (capacity=None), where each system has a box of its own."""
     m, dim, double = search.sizes[1], search.sources.shape[1], search.sources.dtype == jnp.float64
+    rule = _rule_of(search)
     dims = {**row_dims(m, capacity), "count": m, "info": 2}
     kind = (search.queries is None, search.cutoff.closed, keep, periodic_kind(search.torus), True, search.exclude is not None)
     starts = [capacity.starts] if isinstance(capacity, Room) else []
-    variant = Variant(dim, double, search.cutoff.scaled, capacity is not None, *kind, bool(starts))
+    variant = Variant(dim, double, search.cutoff.scaled, capacity is not None, *kind, bool(starts), rule)
 
     def on(cuda: bool) -> Callable[..., list[Array]]:
         def call(search: Search, *starts: Array) -> list[Array]:
-            return _callable(variant, cuda)(*_operands(search, cuda), *excluded_rows(search), *starts, output_dims=dims)
+            given = _operands(search, cuda)
+            given += [*excluded_rows(search), *_cutoffs_of_pairs(search, given[_GIVEN.index("ids")])]
+            return _callable(variant, cuda)(*given, *starts, output_dims=dims)
 
         return call
 
@@ -64,6 +77,22 @@ def _operands(search: Search, cuda: bool) -> list[Array]:
     of_system = jnp.concatenate([jnp.pad(found.counts, gap), found.first[:, None], turning[:, None]], axis=1)
     axes = jnp.stack([x[ids] for x in wrapped.sources.T])
     return [rows, asking, numbers, axes, batch.of_queries, ids, of_system, found.start]
+
+
+def _rule_of(search: Search) -> str:
+    return search.cutoff.rule if isinstance(search.cutoff, Cutoffs) else ""
+
+
+def _cutoffs_of_pairs(search: Search, ids: Array) -> list[Array]:
+    """Return what kernels read of cutoffs that differ: those of the sources, sorted, and of the queries; or a table and species."""
+    cutoff = search.cutoff
+    if not isinstance(cutoff, Cutoffs):
+        return []
+    if cutoff.kinds is not None:
+        table, of_sources, of_queries = cutoff.kinds
+        return [table, of_sources[ids], of_queries]
+    given = (None if cutoff.sources is None else cutoff.sources[ids], cutoff.queries)
+    return [jnp.zeros(1, search.sources.dtype) if x is None else x for x in given]
 
 
 @kernel
@@ -99,10 +128,15 @@ def _callable(variant: Variant, cuda: bool) -> Call:
     return describe_call("box_rows_cuda" if cuda else "box_rows_cpu", variant, plan, _GIVEN, more=())
 
 
+def _kinds(shapes: Shapes) -> int:
+    """Return the species of a table."""
+    return shapes[TABLE[0]][0] if TABLE[0] in shapes else 0
+
+
 def _plan(variant: Variant, cuda: bool, shapes: Shapes, _: int) -> Plan:
     kind = (variant.dim, variant.double, variant.scaled, variant.lists, variant.keep.later_only, variant.periodic)
-    found = boxes.rows_kernel(*kind, cuda, variant.excluding, variant.flat)
-    numbers, m = plan_numbers(variant, shapes) | {"stride": shapes["axes"][1]}, shapes["queries"][0]
+    found = boxes.rows_kernel(*kind, cuda, variant.excluding, variant.flat, variant.rule)
+    numbers, m = plan_numbers(variant, shapes) | {"stride": shapes["axes"][1], "kinds": _kinds(shapes)}, shapes["queries"][0]
     launch = Launch(found, boxes.threads(m)) if cuda else share(found, m, boxes.QUERIES_AT_ONCE)
     pages = [] if cuda else huge_pages(variant, shapes)
     return Plan([Clear("info", 8), *pages, launch], numbers, absent(variant.lists, variant.flat))
@@ -126,14 +160,15 @@ def box_sums(
 
     def on(cuda: bool) -> Callable[..., FoundSums]:
         flags = search.queries is None, cutoff.closed, keep.drop_self, periodic_kind(search.torus), True
-        kind = compensated, extremes, key, cuda, False, search.exclude is not None
+        kind = compensated, extremes, key, cuda, False, search.exclude is not None, _rule_of(search)
         call_sums = _sum_callable(SumVariant(dim, double, cutoff.scaled, *flags, *kind), term)
         results = SumsOf(term, m, boxes.slots(m, cuda), compensated, extremes)
 
         def call(search: Search, shared: Array, own: Array, others: Array) -> FoundSums:
             given = _operands(search, cuda)
-            columns = _sorted_columns(search, term, others, given[_GIVEN.index("ids")])
-            given += [shared, own, columns, *excluded_rows(search)]
+            ids = given[_GIVEN.index("ids")]
+            given += [shared, own, _sorted_columns(search, term, others, ids)]
+            given += [*excluded_rows(search), *_cutoffs_of_pairs(search, ids)]
             return results.unpack(*call_sums(*given, output_dims=results.dims() | {"info": 2})[: len(_SUMS)])
 
         return call
@@ -158,15 +193,17 @@ _SUMS = ("sums", "totals", "errors", "more")  # what a kernel writes
 def _sum_callable(variant: SumVariant, term: TermText) -> Call:
     scalar = np.float64 if variant.double else np.float32
     results = dict.fromkeys(_SUMS, scalar) | {"info": np.int32}
-    given = (*_GIVEN, "shared_values", "own_values", "columns", *EXCLUDED * variant.excluding)
+    given = (*_GIVEN, "shared_values", "own_values", "columns", *EXCLUDED * variant.excluding, *names_of_cutoffs(variant.rule))
     name = variant.name(f"box_sums_{'cuda' if variant.cuda else 'cpu'}")
     return Call(name, given, results, functools.partial(_plan_sums, variant, term))
 
 
 def _plan_sums(variant: SumVariant, term: TermText, shapes: Shapes, _: int) -> Plan:
     kind = variant.dim, variant.double, variant.scaled, variant.compensated, variant.extremes, variant.periodic
-    found, cuda = boxes.sum_kernel(term, variant.key, *kind, variant.cuda, variant.excluding), variant.cuda
+    found, cuda = boxes.sum_kernel(term, variant.key, *kind, variant.cuda, variant.excluding, variant.rule), variant.cuda
     n, m, stride = shapes["positions"][0], shapes["queries"][0], shapes["axes"][1]
     flags = {"own": int(variant.own), "closed": int(variant.closed), "drop_self": int(variant.drop_self)}
     launch = Launch(found, boxes.threads(m)) if cuda else share(found, m, boxes.QUERIES_AT_ONCE)
-    return Plan([launch] if cuda else [Clear("info", 8), launch], {"n": n, "m": m, "stride": stride, **flags})
+    return Plan(
+        [launch] if cuda else [Clear("info", 8), launch], {"n": n, "m": m, "stride": stride, "kinds": _kinds(shapes), **flags}
+    )

@@ -168,6 +168,9 @@ def _operands(given: KeptList, extra: _Extra, columns: int, others: Array | None
     nothing, steps = jnp.zeros(1, jnp.int32), jnp.zeros(1, dtype)
     if given.lattice is not None and given.codes is not None:
         steps = jnp.asarray(given.lattice.images.shifts).astype(dtype).reshape(-1)
+    if isinstance(given.cutoff, Cutoffs) and given.cutoff.kinds is not None:
+        table = given.cutoff.kinds[0]
+        steps = jnp.concatenate([steps, jnp.full(1, table.size, dtype), table.reshape(-1)])
     codes = nothing if given.codes is None else given.codes
     reversal = given.reversal or [nothing if slots is None else slots, nothing, nothing]
     order = nothing if given.order is None or not kind.ordered else given.order
@@ -176,19 +179,16 @@ def _operands(given: KeptList, extra: _Extra, columns: int, others: Array | None
 
 
 def _numbers_of(given: KeptList, cutoff: np.floating | Array) -> Array:
-    """Return the cutoff, the numbers of the lattice, the largest number of a shift, and a table; such a row of each lattice."""
+    """Return the cutoff, the numbers of the lattice and the largest number of a shift; such a row of each lattice."""
     dtype, lattice = given.sources.dtype, given.lattice
-    radius, kinds = jnp.reshape(jnp.asarray(cutoff, dtype), 1), []
-    if isinstance(given.cutoff, Cutoffs) and given.cutoff.kinds is not None:
-        table = given.cutoff.kinds[0]
-        kinds = [jnp.full(1, table.size, dtype), table.reshape(-1)]
+    radius = jnp.reshape(jnp.asarray(cutoff, dtype), 1)
     if lattice is None:
-        return jnp.concatenate([radius, *kinds])
+        return radius
     none, slack = jnp.ones(lattice.dim, dtype), jnp.zeros((), dtype)
     most = jnp.full(1, 2 * LARGEST_TURN + max(lattice.images.reach), dtype)
 
     def row(lattice: Lattice) -> Array:
-        return jnp.concatenate([radius, lattice_numbers(lattice, none, slack, lattice.flags), most, *kinds])
+        return jnp.concatenate([radius, lattice_numbers(lattice, none, slack, lattice.flags), most])
 
     return row(lattice) if given.systems is None else jax.vmap(row)(lattice)
 

@@ -17,7 +17,7 @@ from jfrnn._engine.variants import absent, found_rows, row_dims
 from jfrnn._geometry import GROUPS, HALVINGS, Cutoffs, Levels
 from jfrnn.kernels import levels as level_kernels
 from jfrnn.kernels import pair_sum_levels
-from jfrnn.kernels._native import EXCLUDED
+from jfrnn.kernels._native import EXCLUDED, RULES, TABLE
 
 
 class _LevelVariant(NamedTuple):
@@ -65,17 +65,20 @@ def level_sums(
     compensated: bool,
     extremes: bool,
 ) -> FoundSums:
-    """Sum a term as `jfrnn._engine.warp_sums.pair_sums` does, on the CPU, among sources that XLA has sorted."""
+    """Sum a term as `jfrnn._engine.warp_sums.pair_sums` does, among sources that XLA has sorted."""
 
-    def sums_on_cpu(search: Search, levels: Levels, values: tuple[Array, Array, Array]) -> FoundSums:
-        (shared, own, others), (_, m) = values, search.sizes
-        results = SumsOf(term, m, pair_sum_levels.slots(m), compensated, extremes)
-        call = _sum_callable(_variant_of(search, keep, False, False), results, key)
-        columns = jnp.zeros(1, others.dtype) if term.source_columns == 0 else others[levels.order].T.reshape(-1)
-        operands = _operands(search, levels)
-        return results.unpack(*call(*operands, shared, own, columns, output_dims=results.dims() | {"info": 2})[:3])
+    def on(cuda: bool) -> Callable[[Search, Levels, tuple[Array, Array, Array]], FoundSums]:
+        def call(search: Search, levels: Levels, values: tuple[Array, Array, Array]) -> FoundSums:
+            (shared, own, others), (_, m) = values, search.sizes
+            results = SumsOf(term, m, pair_sum_levels.slots(m, cuda), compensated, extremes)
+            call_sums = _sum_callable(_variant_of(search, keep, False, cuda), results, key)
+            columns = jnp.zeros(1, others.dtype) if term.source_columns == 0 else others[levels.order].T.reshape(-1)
+            operands = _operands(search, levels)
+            return results.unpack(*call_sums(*operands, shared, own, columns, output_dims=results.dims() | {"info": 2})[:3])
 
-    return lax.platform_dependent(search._replace(checks={}), levels, values, cpu=sums_on_cpu)
+        return call
+
+    return lax.platform_dependent(search._replace(checks={}), levels, values, cpu=on(False), cuda=on(True))
 
 
 def _variant_of(search: Search, keep: Filter, lists: bool, cuda: bool) -> _LevelVariant:
@@ -139,7 +142,7 @@ _GIVEN += ("query_axes", "query_radii", "query_ids", "query_top", "places")
 
 
 def _given(variant: _LevelVariant) -> tuple[str, ...]:
-    return (*_GIVEN, *EXCLUDED * variant.excluding, *level_kernels.TABLE * (variant.rule == level_kernels.RULES[-1]))
+    return (*_GIVEN, *EXCLUDED * variant.excluding, *TABLE * (variant.rule == RULES[-1]))
 
 
 def _name(name: str, variant: _LevelVariant, **more: bool) -> str:
@@ -160,7 +163,7 @@ def _level_callable(variant: _LevelVariant) -> Call:
 @kernel
 def _sum_callable(variant: _LevelVariant, results: SumsOf, key: str) -> Call:
     kind = {"compensated": results.compensated, "extremes": results.extremes}
-    name = _name("pair_sum_levels_cpu", variant, **kind, **{key: True})
+    name = _name(f"pair_sum_levels_{'cuda' if variant.cuda else 'cpu'}", variant, **kind, **{key: True})
     dtypes = dict.fromkeys(("sums", "totals", "errors"), np.float64 if variant.double else np.float32) | {"info": np.int32}
     plan = functools.partial(_plan_sums, variant, results, key)
     return Call(name, (*_given(variant), "shared_values", "own_values", "columns"), dtypes, plan)
@@ -168,15 +171,17 @@ def _sum_callable(variant: _LevelVariant, results: SumsOf, key: str) -> Call:
 
 def _plan_sums(variant: _LevelVariant, results: SumsOf, key: str, shapes: Shapes, multiprocessors: int) -> Plan:
     of_search = variant.dim, variant.double, variant.rule, GROUPS, HALVINGS, results.compensated, variant.periodic, variant.batched
-    query = pair_sum_levels.query_kernel(results.term, key, *of_search, results.extremes, variant.excluding)
+    query = pair_sum_levels.query_kernel(results.term, key, *of_search, results.extremes, variant.excluding, variant.cuda)
     numbers = _numbers(variant, shapes)
+    if variant.cuda:
+        return Plan([Launch(query, numbers["m"])], numbers)
     return Plan([Clear("info", 8), share(query, numbers["m"])], numbers)
 
 
 def _numbers(variant: _LevelVariant, shapes: Shapes) -> dict[str, int]:
     flags = {"own_queries": variant.own, "closed": variant.closed}
     flags |= {"drop_self": variant.keep.drop_self, "later_only": variant.keep.later_only}
-    kinds = shapes[level_kernels.TABLE[0]][0] if level_kernels.TABLE[0] in shapes else 0
+    kinds = shapes[TABLE[0]][0] if TABLE[0] in shapes else 0
     return {"n": shapes["ids"][0], "m": shapes["query_ids"][0], "kinds": kinds, **flags}
 
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jfrnn._engine.start import compiler, load_warp, warn_of_folders
 from jfrnn.kernels import Kernel, _driver
-from jfrnn.kernels._native import EXCLUDED
-from jfrnn.kernels.levels import TABLE
+from jfrnn.kernels._native import EXCLUDED, TABLE
 
 if TYPE_CHECKING:
     from jfrnn.kernels._compile import Library
@@ -21,7 +20,7 @@ PLACES_PER_THREAD = 512  # below, a second thread costs more than it saves
 _HUGE = 1 << 22  # bytes from which an array is worth a request for huge pages
 _MOST_BYTES, _MOST_ARRAYS, MOST_WORDS = 1024, 48, 1024  # those of the native code
 _ONCE, _SHARED, _CUDA, _CUDA_BESIDE, _CLEAR, _HUGE_PAGES = range(6)
-_MAY_LACK = (*EXCLUDED, *TABLE)  # arguments that kernels name, and some of them do not read
+_MAY_LACK = (*EXCLUDED, *TABLE, "radii", "query_radii")  # arguments that kernels name, and some of them do not read
 _STREAM = "stream"  # the name of an argument that gets the stream of the call, as if that were an array
 
 

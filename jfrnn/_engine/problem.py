@@ -204,13 +204,15 @@ def prepare_search(inputs: Inputs, options: Options) -> Search:
     asked = lax.stop_gradient(inputs)
     given, queries, active, box, cutoff, batch, exclude = take_present(asked)
     sources, images = hide_inactive(given, active), options.images
-    if box is not None and box.per_system and batch is not None:
-        return _prepare_boxes(asked, active, Search(sources, queries, _one_cutoff(cutoff), batch, None, {}, exclude), options)
-    batch = None if batch is None else rank_systems(batch)
+    per_system = box is not None and box.per_system and batch is not None
+    batch = None if batch is None or per_system else rank_systems(batch)
     checks = _check_exclusions(exclude)
     if isinstance(cutoff, Radii):
-        sources, queries, checks[Status.INVALID_CUTOFF] = _with_valid_radii(sources, queries, active, cutoff)
+        asking = None if asked.queries is None or not per_system else _there(asked)
+        sources, queries, checks[Status.INVALID_CUTOFF] = _with_valid_radii(sources, queries, active, asking, cutoff)
         cutoff = make_cutoffs(cutoff, options.closed, options.skin)
+    if per_system:
+        return _prepare_boxes(asked, active, Search(sources, queries, cutoff, asked.batch, None, checks, exclude), options)
     if box is None or images is None:
         return Search(sources, queries, cutoff, batch, None, checks, exclude)
     lattice = make_lattice(box, images, np.dtype(sources.dtype))
@@ -224,11 +226,9 @@ def _check_exclusions(exclude: Exclusions | None) -> dict[Status, Array]:
     return {} if exclude is None or exclude.valid is None else {Status.EXCLUDED_OUT_OF_RANGE: exclude.valid}
 
 
-def _one_cutoff(cutoff: Cutoff | Radii) -> Cutoff:
-    """Return the one cutoff of all particles."""
-    if isinstance(cutoff, Radii):
-        raise TypeError("a search with a box per system has one cutoff.")
-    return cutoff
+def _there(asked: Inputs) -> Array | None:
+    """Say which queries have a box, where each system has one."""
+    return None if asked.batch is None or asked.box is None else has_box(asked.batch.of_queries, len(asked.box.vectors))
 
 
 def _prepare_boxes(asked: Inputs, present: Array | None, search: Search, options: Options) -> Search:
@@ -246,14 +246,30 @@ def _prepare_boxes(asked: Inputs, present: Array | None, search: Search, options
         named.append((batch.queries >= -1) & (batch.queries < boxes))
     nearest = jax.tree.map(lambda x: jnp.clip(x, 0, boxes - 1), batch)
     lattice = make_lattice(box, images, np.dtype(search.sources.dtype))
-    wrapped = wrap(search.sources, search.queries, lattice, largest_radius(search.cutoff), nearest)
+    wrapped = wrap(search.sources, search.queries, lattice, _radius_of_systems(search, nearest, boxes), nearest)
     right = (wrapped.enough & is_valid(lattice))[nearest.sources]
     checks = {
         Status.SYSTEM_WITHOUT_BOX: functools.reduce(jnp.logical_and, (x.all() for x in named)),
         Status.BOX_TOO_SMALL: (right | ~present).all(),
         Status.OUT_OF_RANGE: (wrapped.met & TOO_FAR) == 0,
-    } | _check_exclusions(search.exclude)
+    } | search.checks
     return search._replace(batch=nearest, torus=(lattice, wrapped), checks=checks)
+
+
+def _radius_of_systems(search: Search, batch: Batch, boxes: int) -> np.floating | Array:
+    """Return an upper bound on the cutoff of any pair, or on that of each system [systems, 1, 1], where cutoffs differ."""
+    if isinstance(search.cutoff, Cutoff):
+        return search.cutoff.radius
+    rule, found = search.cutoff.rule, []
+    for of_points, systems, points in (
+        (search.cutoff.sources, batch.sources, search.sources),
+        (search.cutoff.queries, batch.of_queries, search.sources if search.queries is None else search.queries),
+    ):
+        if of_points is not None:
+            known = jnp.where(jnp.isfinite(points[:, 0]), of_points, 0)
+            found.append(jnp.zeros(boxes, known.dtype).at[systems].max(known))
+    largest = functools.reduce(jnp.minimum if rule in ("both", "table") else jnp.maximum, found)
+    return jnp.where(largest > 0, largest, search.cutoff.largest)[:, None, None]
 
 
 @functools.partial(compile_program, static_argnames="options")
@@ -263,9 +279,12 @@ def is_decidable(inputs: Inputs, options: Options) -> Array:
 
 
 def _with_valid_radii(
-    sources: Array, queries: Array | None, active: Array | None, radii: Radii
+    sources: Array, queries: Array | None, active: Array | None, asking: Array | None, radii: Radii
 ) -> tuple[Array, Array | None, Array]:
-    """Return positions and queries, moved to infinity if their cutoff is invalid, and whether all active ones have valid ones."""
+    """Return positions and queries, moved to infinity if their cutoff is invalid, and whether all active ones have valid ones.
+
+    `asking` says which queries take part; None: all.
+    """
     of_sources, of_queries = are_valid(radii)
     right = [jnp.ones((), bool)]
     if queries is None:
@@ -275,7 +294,7 @@ def _with_valid_radii(
         right.append((of_sources if active is None else of_sources | ~active).all())
         sources = _where_rows(of_sources, sources)
     if of_queries is not None:
-        right.append(of_queries.all())
+        right.append((of_queries if asking is None else of_queries | ~asking).all())
         queries = _where_rows(of_queries, queries)
     return sources, queries, functools.reduce(jnp.logical_and, right)
 

@@ -13,7 +13,7 @@ from jfrnn._engine.operands import space_flags
 from jfrnn._engine.plans import HugePages, Plan, ask_for_huge_pages
 from jfrnn._engine.problem import Filter, Room, Rows
 from jfrnn._geometry import Status
-from jfrnn.kernels._native import EXCLUDED, table_cells
+from jfrnn.kernels._native import EXCLUDED, RULES, TABLE, table_cells
 
 _PARTICLES = ("positions", "queries", "cutoff")  # what kernels of cells are given
 
@@ -32,6 +32,7 @@ class Variant(NamedTuple):
     batched: bool = False
     excluding: bool = False
     flat: bool = False  # a list whose rows follow each other without gaps
+    rule: str = ""  # by which the cutoff of a pair follows from both, if they differ
 
 
 class SumVariant(NamedTuple):
@@ -51,13 +52,14 @@ class SumVariant(NamedTuple):
     cuda: bool
     few: bool  # all of them meet
     excluding: bool
+    rule: str = ""
 
     def name(self, of: str) -> str:
         """Return the name of a call, which tells it from all others."""
         flags = {"f64": self.double, "f32": not self.double, "scaled": self.scaled, "own": self.own}
         flags |= {"closed": self.closed, "dropself": self.drop_self, "batched": self.batched, **space_flags(self.periodic)}
         flags |= {"compensated": self.compensated, "extremes": self.extremes, "excluding": self.excluding}
-        flags |= {self.key: bool(self.key)}
+        flags |= {self.rule: bool(self.rule), self.key: bool(self.key)}
         return "_".join([f"jfrnn_{of}_{self.dim}d", *(flag for flag, on in flags.items() if on)])
 
 
@@ -75,11 +77,16 @@ def describe_call(
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
     flags |= {"flat": variant.flat, **space_flags(variant.periodic), "batched": variant.batched}
     flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
-    flags |= {"excluding": variant.excluding}
+    flags |= {"excluding": variant.excluding, variant.rule: bool(variant.rule)}
     whole = "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
     results = [*["idx"] * variant.lists, *["receivers"] * variant.flat, "count", "info", *more]
-    given = (*given, *EXCLUDED * variant.excluding, *["starts"] * variant.flat)
+    given = (*given, *EXCLUDED * variant.excluding, *names_of_cutoffs(variant.rule), *["starts"] * variant.flat)
     return Call(whole, given, dict.fromkeys(results, np.int32), plan)
+
+
+def names_of_cutoffs(rule: str) -> tuple[str, ...]:
+    """Return the names of the arrays that kernels are given by `cutoffs_of_pairs`."""
+    return () if not rule else TABLE if rule == RULES[-1] else ("radii", "query_radii")
 
 
 def plan_numbers(variant: Variant, shapes: Shapes) -> dict[str, int]:

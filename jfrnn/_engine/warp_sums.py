@@ -41,11 +41,11 @@ def pair_sums(
         The sums of each query [m, width], or the first of them and the others in two arrays; the sums over all pairs [totals]; and
         for `extremes`, where sums are the largest summands, their sources and the codes of their images, int32 [m, width, 2].
     """
-    if isinstance(search.cutoff, Cutoffs):
-        return level_sums(search, levels_of(search), keep, term._replace(first=0), key, values, compensated, extremes)
     term = term._replace(first=0) if extremes else term
     if search.per_system:
         return box_sums(search, keep, term, key, values, compensated, extremes)
+    if isinstance(search.cutoff, Cutoffs):
+        return level_sums(search, levels_of(search), keep, term._replace(first=0), key, values, compensated, extremes)
 
     def on(cuda: bool) -> Callable[[Search, tuple[Array, Array, Array]], FoundSums]:
         def call(search: Search, values: tuple[Array, Array, Array]) -> FoundSums:

@@ -30,7 +30,7 @@ from jfrnn._geometry.exact import (
     take_points,
 )
 from jfrnn._geometry.exclusions import Exclusions, check_exclusions, pairs_of_rows
-from jfrnn._geometry.floats import compensated_sum, rounded_sum
+from jfrnn._geometry.floats import compensated_sum, rounded_product, rounded_scaled, rounded_sum
 from jfrnn._geometry.images import LARGEST_TURN, Images, grow_images, images_of
 from jfrnn._geometry.inputs import (
     check_active,

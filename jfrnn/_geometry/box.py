@@ -31,6 +31,7 @@ class Box:
         periodic: Whether each axis is periodic; all True if `flags` tell. Static.
         images: How many cells away a periodic image may lie and still be a neighbor, per axis; None: see `Box`. Static.
         per_system: Whether each system of a batch has a box of its own. Static.
+        fractional: Whether positions count the lattice vectors. Static.
     """
 
     vectors: Numbers
@@ -40,6 +41,7 @@ class Box:
     periodic: tuple[bool, ...]
     images: tuple[int, ...] | None
     per_system: bool
+    fractional: bool
 
     def __init__(
         self,
@@ -49,6 +51,7 @@ class Box:
         *,
         images: int | Sequence[int] | None = None,
         per_system: bool | None = None,
+        fractional: bool = False,
     ) -> None:
         """Make a box from its edge lengths or from its lattice vectors, or one box for each system of a batch.
 
@@ -70,6 +73,12 @@ class Box:
                 a box per system: as many as any system needs; a system is searched for its own alone.
             per_system: Whether the first axis counts the systems of a batch, so that each has a box of its own. Default: whether
                 there are three axes. Lengths [systems, d] need True, as they would else be lattice vectors.
+            fractional: Whether positions, and queries, count the lattice vectors, along axes that are not periodic too: they lie at
+                positions @ vectors, where `origin` adds nothing. Each component of this product is computed in twice the precision
+                and rounded once to the dtype of the positions, the same on every device, and what a pair is is decided exactly on
+                the result. All else is as it would be for such positions: cutoffs, skins, displacements and distances are lengths,
+                shifts whole numbers that count from the positions as given. Derivatives in positions and vectors go through the
+                product, whose own vectors are those of the box that a call is given.
 
         Raises:
             TypeError, ValueError: an argument is of the wrong kind, shape or range.
@@ -94,7 +103,9 @@ class Box:
         axes = (True,) * dim if flags is not None else _per_axis("periodic", periodic, dim, (bool, np.bool_), "bool")
         reach = None if images is None else _per_axis("images", images, dim, (int, np.integer), "int >= 0", least=0)
         full = corner if corner.shape == (*systems, dim) else corner + np.zeros((*systems, dim), corner.dtype)
-        self._set((vectors, full, flags, None), (axes, reach, bool(many)))
+        if not isinstance(fractional, bool | np.bool_):
+            raise TypeError(f"fractional must be True or False, known while tracing, got {fractional!r}.")
+        self._set((vectors, full, flags, None), (axes, reach, bool(many), bool(fractional)))
         with own_transfers():
             check_box_values(self)
             if many and not self.orthogonal and not any(isinstance(x, Tracer) for x in (vectors, flags)):
@@ -124,9 +135,9 @@ class Box:
         return box
 
     @property
-    def kind(self) -> tuple[tuple[bool, ...], tuple[int, ...] | None, bool]:
+    def kind(self) -> tuple[tuple[bool, ...], tuple[int, ...] | None, bool, bool]:
         """The static fields."""
-        return self.periodic, self.images, self.per_system
+        return self.periodic, self.images, self.per_system, self.fractional
 
     @property
     def dim(self) -> int:
@@ -217,4 +228,4 @@ def round_box(box: Box, dtype: np.dtype) -> Box:
             None if box.flags is None else jnp.asarray(box.flags),
             None if box.numbers is None else jnp.asarray(box.numbers).astype(dtype),
         )
-        return Box.tree_unflatten((box.periodic, None, box.per_system), arrays)
+        return Box.tree_unflatten((box.periodic, None, box.per_system, box.fractional), arrays)

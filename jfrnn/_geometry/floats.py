@@ -3,6 +3,9 @@
 Sources: Dekker (1971); Ogita, Rump & Oishi (2005), doi:10.1137/030601818.
 """
 
+import functools
+
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -51,3 +54,42 @@ def unit_scale(x: Array) -> Array:
     unsigned, nmant, bias = (jnp.uint32, 23, 127) if x.dtype == jnp.float32 else (jnp.uint64, 52, 1023)
     exponent = lax.bitcast_convert_type(x, unsigned) >> unsigned(nmant)  # biased; 2·bias - e is the exponent of the inverse
     return lax.bitcast_convert_type(jnp.maximum(unsigned(2 * bias) - exponent, unsigned(1)) << unsigned(nmant), x.dtype)
+
+
+@jax.custom_jvp
+def rounded_scaled(points: Array, sizes: Array) -> Array:
+    """Return points * sizes, [n, d], with one rounding, which all that use it see: no product is contracted with a sum."""
+    return lax.optimization_barrier(points * sizes)
+
+
+@jax.custom_jvp
+def rounded_product(points: Array, matrix: Array) -> Array:
+    """Return points @ matrix of [n, d] and one matrix, or one per point, in twice the precision and rounded once.
+
+    Products of half mantissas are exact, so that no device can contract them with sums to another result.
+    """
+    parts = [(x, y) for k in range(points.shape[1]) for x in _halves(points[:, k, None]) for y in _halves(matrix[..., k, :])]
+    *errors, total = distill([x * y for x, y in parts])
+    return lax.optimization_barrier(rounded_sum(total, functools.reduce(jnp.add, errors)))
+
+
+def _halves(x: Array) -> tuple[Array, Array]:
+    high = half_mantissa(x)
+    return high, x - high
+
+
+@rounded_scaled.defjvp
+def _rounded_scaled_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    (points, sizes), (of_points, of_sizes) = primals, tangents
+    return rounded_scaled(points, sizes), of_points * sizes + points * of_sizes
+
+
+@rounded_product.defjvp
+def _rounded_product_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    (points, matrix), (of_points, of_matrix) = primals, tangents
+    return rounded_product(points, matrix), _plain_product(of_points, matrix) + _plain_product(points, of_matrix)
+
+
+def _plain_product(points: Array, matrix: Array) -> Array:
+    """Return points @ matrix, without a matmul, which GPUs may compute in fewer bits."""
+    return functools.reduce(jnp.add, (points[:, k, None] * matrix[..., k, :] for k in range(points.shape[1])))

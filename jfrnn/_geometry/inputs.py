@@ -286,7 +286,7 @@ def _check_numbers(name: str, of: str, systems: Given, size: int, what: str) -> 
 
 
 def check_box(box: object, positions: Array, like: Box | None = None) -> Box | None:
-    """Return a box, with `like` of the same kind, or None if no axis is periodic."""
+    """Return a box, with `like` of the same kind, or None if no axis is periodic and positions are lengths."""
     if not isinstance(box, Box):
         raise TypeError(f"box must be a jfrnn.Box, got {_describe(box)}: write e.g. jfrnn.Box([1.0, 1.0, 1.0]).")
     if box.dim != positions.shape[1]:
@@ -296,13 +296,13 @@ def check_box(box: object, positions: Array, like: Box | None = None) -> Box | N
     if like is not None and _kind_of(box) != _kind_of(like):
         was, came = (_kind_of(b) for b in (like, box))
         raise ValueError(f"box must be of the kind with which the list was made ({was}), got {came}.")
-    return box if any(box.periodic) else None
+    return box if any(box.periodic) or box.fractional else None
 
 
 def _kind_of(box: Box) -> str:
     known = f"periodic={box.periodic}" if box.flags is None else "periodic per system"
     many = f", for each of {box.vectors.shape[0]} systems" if box.per_system else ""
-    return f"{known}, {'lengths' if box.orthogonal else 'matrix'}{many}"
+    return f"{known}, {'lengths' if box.orthogonal else 'matrix'}{', fractional' * box.fractional}{many}"
 
 
 def check_flag(name: str, value: object) -> bool:

@@ -106,9 +106,8 @@ class EdgeList(KeptSearch):
         yes.
         """
         self._check_single()
-        sources, rows = self._geometry_inputs(positions, queries)
+        sources, rows, box = self._geometry_inputs(positions, queries, box)
         self._check_known(spared=Status.NONFINITE)
-        box = self._box_now(box, sources)
         with own_transfers():
             if 0 in (sources.shape[0], len(rows), self.total):
                 return no_edges(jnp.zeros((len(rows), 1), bool), self.source_count, sources, self.status, self.total)
@@ -134,7 +133,7 @@ class EdgeList(KeptSearch):
             raise ValueError("to_jraph() makes particles the nodes of a graph, and this list has queries: take `edges`.")
         if self.skin:
             raise ValueError("to_jraph() cannot leave pairs of a skin out of the midst: take `edges`, whose mask does, or no skin.")
-        return make_graph(self.edges(positions, box=box), self._geometry_inputs(positions, None)[0])
+        return make_graph(self.edges(positions, box=box), self._geometry_inputs(positions, None, box)[0])
 
     @property
     def _room(self) -> int:

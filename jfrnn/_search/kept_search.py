@@ -32,6 +32,7 @@ from jfrnn._geometry import (
     make_cutoff,
     round_box,
 )
+from jfrnn._search.fractional import real_points
 from jfrnn._search.geometry import ImageCodes, ImagesMade
 from jfrnn._search.kept_options import KeptOptions
 from jfrnn._search.problem import Problem
@@ -157,10 +158,9 @@ class KeptSearch(KeptOptions):
         Cost: one pass over the positions, or a search. Differentiable: no gradient flows through. Jit: yes. vmap: yes; if any list
         of the batch is stale, all are rebuilt.
         """
-        sources, rows = self._geometry_inputs(positions, queries)
+        sources, rows, box = self._geometry_inputs(positions, queries, box)
         rows = rows if self.own_queries else None
-        radii = self._radii_now(cutoff, sources, rows)
-        active, box = self._check_active(active, sources), self._box_now(box, sources)
+        radii, active = self._radii_now(cutoff, sources, rows), self._check_active(active, sources)
         with own_transfers():
             return call_apart(_update, self, sources, rows, active, box, radii)
 
@@ -195,9 +195,9 @@ class KeptSearch(KeptOptions):
             ValueError, TypeError: an argument does not fit the list, or the new list reports invalid data (`check`), which no
                 room can fix: non-finite positions, or a degenerate box.
         """
-        sources, rows = self._geometry_inputs(positions, queries)
+        sources, rows, box = self._geometry_inputs(positions, queries, box)
         queries, active, slack = rows if self.own_queries else None, self._check_active(active, sources), check_slack(slack)
-        box, radii = self._box_now(box, sources), self._radii_now(cutoff, sources, queries)
+        radii = self._radii_now(cutoff, sources, queries)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, radii, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
         wider = _replace(self, problem=self.problem.with_images(self._grow_images(box, radii)))
@@ -248,7 +248,15 @@ class KeptSearch(KeptOptions):
         made = None if self.images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
         return self.images, made
 
-    def _geometry_inputs(self, positions: Array, queries: Array | None) -> tuple[Array, Array]:
+    def _geometry_inputs(self, positions: Array, queries: Array | None, box: Box | None) -> tuple[Array, Array, Box | None]:
+        """Return the present positions of sources and rows, as lengths, and the present box, after checking that they fit."""
+        sources, rows = self._check_points(positions, queries)
+        box = self._box_now(box, sources)
+        asking = rows if self.own_queries else None
+        real, asking = real_points(sources, asking, box, self.batch, self.problem.options.engine.translates)
+        return real, real if asking is None else asking, box
+
+    def _check_points(self, positions: Array, queries: Array | None) -> tuple[Array, Array]:
         sources = check_again("positions", positions, self.dtype, self.dim, self.source_count)
         check_devices("positions", sources, self.status)
         if self.own_queries != (queries is not None):

@@ -128,9 +128,8 @@ class NeighborList(ListExports):
 
         Differentiable: no (integers). Jit: yes. vmap: yes.
         """
-        sources, rows = self._geometry_inputs(positions, queries)
+        sources, rows, box = self._geometry_inputs(positions, queries, box)
         self._check_known(spared=ROWS_ARE_WHOLE)
-        box = self._box_now(box, sources)
         with own_transfers():
             if box is None or self.box_kind is None or 0 in (sources.shape[0], *self.idx.shape):
                 return jnp.zeros((*self.idx.shape, sources.shape[1]), jnp.int32)
@@ -158,9 +157,9 @@ class NeighborList(ListExports):
         if 0 in self.idx.shape or not topology.measured or (self.box_kind is not None and self.box_kind.per_system):
             vectors, mask = self.vectors(positions, queries=queries, box=box)
             return norms(vectors), mask
-        sources, _ = self._geometry_inputs(positions, queries)
+        sources, _, box = self._geometry_inputs(positions, queries, box)
         self._check_known(spared=ROWS_ARE_WHOLE)
-        box, cutoff = self._box_now(box, sources), self._cutoff_of_pairs()
+        cutoff = self._cutoff_of_pairs()
         from jfrnn._search.lengths import lengths
 
         with own_transfers():
@@ -198,9 +197,8 @@ class NeighborList(ListExports):
             )
         total = self._count_pairs("edges") if total is None else check_total(total)
         self._check_single()
-        _, mask, shifts = self._geometry(*lax.stop_gradient((positions, queries, box)))
-        sources, rows = self._geometry_inputs(positions, queries)
-        box = self._box_now(box, sources)
+        sources, rows, box = self._geometry_inputs(positions, queries, box)
+        _, mask, shifts = self._geometry_of(*lax.stop_gradient((sources, rows, box)))
         with own_transfers():
             if 0 in (sources.shape[0], *self.idx.shape, total):
                 made = no_edges(mask, self.source_count, sources, self.status, total)
@@ -221,7 +219,7 @@ class NeighborList(ListExports):
         Returns:
             A `Graph`, a pytree with the fields of `jraph.GraphsTuple`, padded by a second graph of one node and the unused edges:
             nodes {"positions": [n + 1, d]}, edges {"displacement": [total, d], "distance": [total], "shift": [total, d]}, receivers
-            and senders [total] int32, n_node [2], n_edge [2].
+            and senders [total] int32, n_node [2], n_edge [2]. Positions of nodes are lengths, of fractional coordinates too.
 
         Raises:
             ValueError: the list has queries, which are no nodes.
@@ -231,7 +229,7 @@ class NeighborList(ListExports):
         """
         if self.own_queries:
             raise ValueError("to_jraph() makes particles the nodes of a graph, and this list has queries: take `edges`.")
-        return make_graph(self.edges(positions, total, box=box), self._geometry_inputs(positions, None)[0])
+        return make_graph(self.edges(positions, total, box=box), self._geometry_inputs(positions, None, box)[0])
 
     def _near(self, positions: Array, queries: Array | None, box: Box | None) -> Array:
         return self._geometry(positions, queries, box)[1]
@@ -254,9 +252,11 @@ class NeighborList(ListExports):
         return find_fields(inputs, self.problem.options, room, self.skin > 0, self.reverse is not None)
 
     def _geometry(self, positions: Array, queries: Array | None, box: Box | None) -> tuple[Array, Array, Array | None]:
-        sources, rows = self._geometry_inputs(positions, queries)
+        return self._geometry_of(*self._geometry_inputs(positions, queries, box))
+
+    def _geometry_of(self, sources: Array, rows: Array, box: Box | None) -> tuple[Array, Array, Array | None]:
+        """Return displacements, mask and shifts of sources and rows that are lengths, in the present box."""
         self._check_known(spared=ROWS_ARE_WHOLE)
-        box = self._box_now(box, sources)
         if 0 in (sources.shape[0], *self.idx.shape):
             with own_transfers():
                 return jnp.zeros((*self.idx.shape, sources.shape[1]), sources.dtype), jnp.zeros(self.idx.shape, bool), None

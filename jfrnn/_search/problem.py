@@ -28,6 +28,7 @@ from jfrnn._geometry import (
     make_cutoff,
     round_box,
 )
+from jfrnn._search.fractional import real_points
 from jfrnn._search.verlet import list_radius
 from jfrnn._tracing import Given
 
@@ -119,7 +120,8 @@ def check_problem(
     if species is None:
         radii = check_radii(cutoff, radius_rule, sources, queries)
     else:
-        radii = check_species(cutoff, species, radius_rule, sources, queries, active is not None)
+        masked = active is not None or (isinstance(box, Box) and box.per_system)
+        radii = check_species(cutoff, species, radius_rule, sources, queries, masked)
     excluded = None if exclude is None else check_exclusions(exclude, sources, queries)
     if keep.later_only and radii is not None and radii.rule in EXCHANGED:
         raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
@@ -129,13 +131,14 @@ def check_problem(
     reach = None if largest is None else list_radius(largest, skin, dtype)
     box = None if box is None else check_box(box, sources)
     if box is not None and box.per_system:
-        _check_boxes(batch, radii)
+        _check_boxes(batch)
     images = None if box is None else images_of(box, reach, dtype, sources.shape[0])
     kind = Kind(periodic=box is not None, radii=radii is not None, batch=batch is not None, excluding=exclude is not None)
     engine = choose_engine(parse_backend(backend, ENGINES), sources, queries, kind)
     systems = None if batch is None else check_batch(batch, sources, queries)
     ordered = has_order(engine, platform_of(sources), sources.shape[0], queries is None and radii is None)
     static_reach = reach if engine.static_radius else None
+    sources, queries = real_points(sources, queries, box, systems, engine.translates)
     options = Options(keep, engine, closed, 0.0 if radii is None else skin, images, static_reach, ordered)
     shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}
     problem = Problem(options, radius, skin, **shape, dim=sources.shape[1], dtype=dtype)
@@ -143,11 +146,7 @@ def check_problem(
     return problem, problem.inputs(sources, queries, active, box, radii, systems, excluded)
 
 
-def _check_boxes(batch: Given, radii: Radii | None) -> None:
-    """Raise if a search with a box per system is asked for what such a search does not support."""
+def _check_boxes(batch: Given) -> None:
+    """Raise if it is not said to which of the systems, of which each has a box, particles belong."""
     if batch is None:
         raise ValueError("box holds a box per system: pass batch=, the system of each particle (from 0 on; -1: in none of them).")
-    if radii is not None:
-        raise ValueError(
-            "cutoff must be one number where box holds a box per system, got one per particle or species: pass the largest one."
-        )

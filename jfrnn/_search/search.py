@@ -44,7 +44,8 @@ def search(
     candidates being the particles in the 3^d cells around it; empty space costs nothing, however large.
 
     Args:
-        positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64. n = 0 is allowed.
+        positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64. n = 0 is allowed. With a box made with
+            `fractional=True`, these and `queries` count its lattice vectors, here and wherever the list is given positions.
         cutoff: Interaction radius [length]: a static number > 0; or one per particle, an array of floats of shape [n], which may be
             traced and hold 0, and to which `radius_rule` applies. With separate queries "gather" needs [m], "scatter" [n], and the
             other rules a tuple of both, that of the positions first. Or, with `species`, one per pair of species, a symmetric array
@@ -54,7 +55,7 @@ def search(
         box: Periodic box (`Box`): (i, j) is then listed once for each periodic image of j within the cutoff, with displacement x_j
             - x_i + S·(lattice vectors) for whole numbers S, which `NeighborList.shifts` returns. Particles may be up to 511 lattice
             vectors away from the box (short vectors, if a skewed box is searched in those); along axes that are not periodic it has
-            no effect. A box per system of a `batch` is one search, in which each system pays for its own images; it has one cutoff.
+            no effect. A box per system of a `batch` is one search, in which each system pays for its own images.
         batch: System number of each particle, shape [n], integers that fit into int32, in any order; with queries a tuple of [n]
             and [m]. Only particles of one system are neighbors. Many systems cost what their particles cost, even if they overlap
             in space. If `box` holds a box per system, numbers count its boxes from 0 on, and particles of the number -1 are not
@@ -62,6 +63,7 @@ def search(
         radius_rule: How the cutoff of a pair follows from cutoffs per particle: "gather" is that of i, the row; "scatter" that of
             j; "either" the larger, "both" the smaller, "mean" the exact mean, "sum" the exact sum, for contacts of spheres. Large
             cutoffs do not slow down particles with small ones: up to a ratio of 128, each particle searches cells of its own size.
+            With a box per system, cells are as wide as the largest cutoff in their system.
         species: Row of the table `cutoff` [s, s] that belongs to each particle, shape [n], integers from 0 to s - 1; with queries a
             tuple of [n] and [m]. Particles of other species have no neighbors: outside jit, and without `active`, this raises, and
             inside a status bit says so.

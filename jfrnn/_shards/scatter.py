@@ -165,9 +165,11 @@ def _check_box(box: object, x: np.ndarray, reach: float, mesh: Mesh) -> Box | No
         raise ValueError(
             "box must be one for all particles: systems with boxes of their own cannot be spread; search on one device."
         )
+    if checked.fractional:
+        raise ValueError("box must be one of positions that are lengths: spread positions @ vectors, not fractional coordinates.")
     if not checked.orthogonal:
         raise ValueError("box must be given by lengths: particles in a skewed lattice cannot be spread yet; run it on one device.")
     kind = images_of(checked, reach, x.dtype, len(x))
     arrays = (replicate(mesh, np.asarray(a).astype(x.dtype)) for a in (checked.vectors, checked.origin))
     images = (0,) * checked.dim if kind.nearest else kind.reach
-    return Box.tree_unflatten((checked.periodic, images, False), (*arrays, None, None))
+    return Box.tree_unflatten((checked.periodic, images, False, False), (*arrays, None, None))

@@ -29,7 +29,7 @@ from jfrnn._engine import (
     pair_sums,
     prepare_search,
 )
-from jfrnn._geometry import Radii, unpack_turns
+from jfrnn._geometry import unpack_turns
 from jfrnn._search import kept_shifts
 from jfrnn._sums.scalars import NoTranslationError, hash_of
 from jfrnn._sums.terms import POSITIONS, Groups, Term, join
@@ -56,8 +56,6 @@ def refusal(inputs: Inputs, platform: str) -> str | None:
     """Return why this engine cannot run on such a search, or None if it can."""
     if platform not in PLATFORMS:
         return f"on the platform {platform!r}, only on the CPU and on CUDA"
-    if platform != "cpu" and isinstance(inputs.cutoff, Radii):
-        return f"with a cutoff per particle or pair of species on the platform {platform!r}, only on the CPU"
     if platform != "cpu" and inputs.box is not None and inputs.sources.shape[0] >= MOST_IN_BOX:
         return f"of more than {MOST_IN_BOX - 1} positions in a periodic box on the platform {platform!r}"
     return None

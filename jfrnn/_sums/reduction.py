@@ -77,7 +77,7 @@ def pairs_of_list(
         raise ValueError(f"{name} was said when the list was made: leave it out where neighbors is given.")
     if full and nbrs.half:
         raise ValueError("neighbors must be a full list for reduce='max', 'min' and compensated=True: search without half=True.")
-    sources, rows = nbrs._geometry_inputs(positions, queries)
+    sources, rows, box = nbrs._geometry_inputs(positions, queries, box)
     dtype = np.dtype(sources.dtype)
     if cutoff is not None and (nbrs.cutoff is None or float(check_cutoff(cutoff, dtype).radius) != nbrs.cutoff):
         has = "a cutoff per particle" if nbrs.cutoff is None else f"cutoff={nbrs.cutoff}"
@@ -86,7 +86,7 @@ def pairs_of_list(
     fixed_rows = lax.stop_gradient(rows)
     directionless = not own and (nbrs.radii is None or nbrs.radii.rule not in EXCHANGED)
     relation = _relation_of_list(nbrs, *lax.stop_gradient((sources, rows, box)), symmetric=directionless and not nbrs.half)
-    lattice = _lattice(nbrs._box_now(box, sources), nbrs.box_kind, sources, nbrs.batch)
+    lattice = _lattice(box, nbrs.box_kind, sources, nbrs.batch)
     largest = nbrs.cutoff if nbrs.radii is None else make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest
     masked = nbrs.masked or (nbrs.box is not None and nbrs.box.per_system)
     data = nbrs.status, nbrs.count if masked and not own else None, fixed_rows
@@ -98,11 +98,11 @@ def _relation_of_list(nbrs: NeighborList, sources: Array, rows: Array, box: Box 
     """Return the pairs of a list: Warp's kernels decide about them while they sum, or all is decided at once."""
     topology, nobody = nbrs._topology(), 0 in (*nbrs.idx.shape, nbrs.source_count)
     if nobody or not is_native(topology, nbrs.box_kind, nbrs.half) or nbrs.idx.size > MOST_SLOTS:
-        _, mask, shifts = nbrs._geometry(sources, rows if nbrs.own_queries else None, box)
+        _, mask, shifts = nbrs._geometry_of(sources, rows, box)
         return Listed(nbrs.idx, mask, shifts, nbrs.source_count, symmetric)
     nbrs._check_known(spared=ROWS_ARE_WHOLE)
     cutoff = nbrs.radii if nbrs.cutoff is None else make_cutoff(nbrs.cutoff, nbrs.dtype, nbrs.closed)
-    box, kind = nbrs._box_now(box, sources), nbrs.box_kind
+    kind = nbrs.box_kind
 
     def make(nbrs: NeighborList, sources: Array, rows: Array, cutoff: Cutoff | Radii, box: Box | None) -> KeptList:
         lattice = None if box is None or kind is None else make_lattice(box, kind, np.dtype(sources.dtype))

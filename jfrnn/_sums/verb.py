@@ -49,7 +49,8 @@ def pair_sum(
             Python numbers that it closes over are compiled in: each new value costs about a second of compilation, so close over
             `jnp.asarray(number, x.dtype)` if a number changes. If particles may coincide or are their own neighbors, fn must be
             safe at r = 0 (the derivative of sqrt is not).
-        positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64. n = 0 is allowed.
+        positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64, or fractional coordinates, as in
+            `search`. n = 0 is allowed.
         cutoff: As in `search`; with `neighbors` that of the list, or None.
         values: A pytree of arrays of shape [n, ...]; fn gets leaves [...], of j and, without queries, of i. Default: None.
         query_values: Values of the queries, leaves [m, ...], which fn gets for i. Only with queries.
@@ -73,8 +74,7 @@ def pair_sum(
         backend: "jax" (cells, any device), "brute" (all n·m candidates), "warp" (cells, on the CPU and on CUDA: fn is translated
             into the kernel that finds the pairs), or "auto": on the CPU "warp" if it supports the sum, else "jax". "warp" sums
             floats of the dtype of the positions; values and closed-over arrays have that dtype, or are smaller floats, bool, int32
-            or (float64) int64; cutoffs per particle and per pair of species work on the CPU only. A box per system is taken on
-            both. If fn or its derivative has no translation, "auto" warns.
+            or (float64) int64. If fn or its derivative has no translation, "auto" warns.
         neighbors: A list to use instead of a search: its pairs that are closer than its cutoff at these positions, as in
             `NeighborList.vectors`. A half list gives whole sums too. Leave out the options with which it was made. If the list may
             lack pairs (see `NeighborList.check`), this raises outside jit. Over lists that "warp" made, on the CPU and on CUDA, a

@@ -88,10 +88,13 @@ struct BoxLanes : BoxPairs {
                     d *= step_scale;
                 square += d * d;
             }
-            const bool sure = asked & square < inside, open = asked & square <= outside & !sure;
+            PairCutoffs::Bounds<real> bounds{inside, outside};
+            if constexpr (RULE != ONE_CUTOFF)
+                bounds = PairCutoffs::bounds_of(cutoff_at(run.from + (number < run.size ? number : 0)) * step_scale, slack);
+            const bool sure = asked & square < bounds.inside, open = asked & square <= bounds.outside & !sure;
             bool hit = DECIDES ? open : sure;
             if constexpr (DECIDES)
-                hit = hit && is_pair(ids[run.from + number], run.code);
+                hit = hit && is_pair(run.from + number, run.code);
             else
                 in_doubt |= open;
             if constexpr (LATER)

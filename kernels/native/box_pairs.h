@@ -3,16 +3,21 @@
 // Sources stand by system and by cell (box_space.h). `axes` are their coordinates, in their box and sorted, `stride` numbers of each
 // axis, and `ids` their numbers. Rows of `positions` and `queries` are as they were given, with packed turns. Queries that are the
 // sources are served in the order of `ids`, others as they come; `systems` are theirs.
+// Where cutoffs differ (RULE, see pair_cutoffs.h), `radii` are those of the sources, sorted, `query_radii` those of the queries, as they
+// come. Of a table the cutoffs of `kinds` species with each other follow row by row, -1 where they are no neighbors; whose species is
+// which say `kinds_of_sources`, sorted, and `kinds_of_queries`. The radius is then the largest of all, which nobody's cutoff exceeds.
 #pragma once
 #include "box_space.h"
-#include "exact.h"
 #include "excluded.h"
+#include "pair_cutoffs.h"
 
 struct BoxArguments {
     const real *positions, *queries, *boxes, *axes;
-    const int *systems, *ids, *cells, *start, *excluded_starts, *excluded, *starts;
+    const int *systems, *ids, *cells, *start, *excluded_starts, *excluded;
+    const real *radii, *query_radii, *table_of_kinds;
+    const int *kinds_of_sources, *kinds_of_queries, *starts;
     int *idx, *receivers, *count, *info;
-    int n, m, stride, own, capacity, closed, drop_self;
+    int n, m, stride, own, capacity, closed, drop_self, kinds;
 };
 
 // The sources of a row of cells, in one image.
@@ -25,13 +30,17 @@ struct BoxRun {
 struct BoxPairs : BoxArguments, BoxSpace {
     real inside, outside;  // squares of distances below are surely those of pairs, squares beyond surely not
     int low[3], visited[3];
-    int runs;            // of the query
-    int query;           // its number
-    int place;           // where it stands among the sources, or -1
-    int at_home, codes;  // the code of no shift, and how many there are
-    real q[3];           // where it is, in its box
+    int runs;              // of the query
+    int query;             // its number
+    int place;             // where it stands among the sources, or -1
+    int at_home, codes;    // the code of no shift, and how many there are
+    real q[3];             // where it is, in its box
+    real own_radius;       // its cutoff, where a rule asks for it
+    const real* of_kinds;  // of a table, the row of its species
+    real slack;            // by which distances of images may be wrong, in the unit of step 1
 
-    JFRNN_MEMBER explicit BoxPairs(const BoxArguments& given) : BoxArguments(given), BoxSpace(given.boxes), at_home(0), codes(1) {
+    JFRNN_MEMBER explicit BoxPairs(const BoxArguments& given)
+        : BoxArguments(given), BoxSpace(given.boxes), at_home(0), codes(1), own_radius(0), of_kinds(nullptr), slack(0) {
         for (int k = 0; k < DIM; ++k) {
             at_home = at_home * (2 * lattice.images(k) + 1) + lattice.images(k);
             codes *= 2 * lattice.images(k) + 1;
@@ -45,6 +54,10 @@ struct BoxPairs : BoxArguments, BoxSpace {
         if (systems[query] != system)
             enter(systems[query]);
         point_of(queries + (long long)ROW * query, q);
+        if constexpr (RULE == TABLE)
+            of_kinds = table_of_kinds + (long long)kinds * kinds_of_queries[query];
+        else if constexpr (RULE != ONE_CUTOFF && RULE != SCATTER)
+            own_radius = query_radii[query];
         for (int k = 0; k < 3; ++k) {
             low[k] = 0;
             visited[k] = 1;
@@ -78,8 +91,8 @@ struct BoxPairs : BoxArguments, BoxSpace {
         for (int k = 0; k < 3; ++k)
             counts[k] = k < DIM ? mine[k] : 1;
         first = mine[3];
-        const real off = 2 * lattice.slack() * step_scale;  // by which distances of images may be wrong
-        const real inner = step_radius > off ? step_radius - off : real(0), outer = step_radius + off;
+        slack = 2 * lattice.slack() * step_scale;
+        const real inner = step_radius > slack ? step_radius - slack : real(0), outer = step_radius + slack;
         const real band = 8 * (1 + PERIODIC) * step_eps;
         inside = inner * inner * (1 - band);
         outside = outer * outer * (1 + band);
@@ -117,8 +130,16 @@ struct BoxPairs : BoxArguments, BoxSpace {
         return !LATER ? 0 : code == at_home ? query + drop_self : code < at_home ? query + 1 : query;
     }
     JFRNN_MEMBER bool is_excluded(int source) const { return Excluded(excluded_starts, excluded, query, ~0ull).has(source); }
-    // Decides exactly.
-    JFRNN_MEMBER bool is_pair(int source, int code) const {
-        return exact_image(lattice, queries + (long long)ROW * query, positions + (long long)ROW * source, code, radius, 0, closed);
+    // The cutoff of the query and the source at a place, in a search where cutoffs differ; a mean is rounded.
+    JFRNN_MEMBER real cutoff_at(int at) const {
+        if constexpr (RULE == TABLE)
+            return of_kinds[kinds_of_sources[at]];
+        return PairCutoffs::of_pair(own_radius, RULE == GATHER ? real(0) : radii[at]);
+    }
+    // Decides exactly about the source at a place.
+    JFRNN_MEMBER bool is_pair(int at, int code) const {
+        const real* const source = positions + (long long)ROW * ids[at];
+        const real first = RULE == ONE_CUTOFF ? radius : SUM ? own_radius / 2 : cutoff_at(at), more = SUM ? radii[at] / 2 : real(0);
+        return exact_image(lattice, queries + (long long)ROW * query, source, code, first, more, closed);
     }
 };

@@ -23,14 +23,29 @@ struct BoxLanes : BoxPairs {
         unsigned int asked = lanes_before(run.size - b);
         if (drop_self && run.code == at_home && place >= at && place < at + LANES)
             asked &= ~(1u << (place - at));
-        const unsigned int pairs = mask_of(square, inside, Below{}) & asked;
-        return {pairs, mask_of(square, outside, BelowOrAt{}) & asked & ~pairs};
+        if constexpr (RULE == ONE_CUTOFF) {
+            const unsigned int pairs = mask_of(square, inside, Below{}) & asked;
+            return {pairs, mask_of(square, outside, BelowOrAt{}) & asked & ~pairs};
+        }
+        const auto bounds = PairCutoffs::bounds_of(vec(cutoffs_from(at) * step_scale), slack);
+        const unsigned int pairs = bits_of_flags(__builtin_convertvector(square < bounds.inside, flags)) & asked;
+        return {pairs, bits_of_flags(__builtin_convertvector(square <= bounds.outside, flags)) & asked & ~pairs};
+    }
+    // The cutoffs of the query and the sources from a place on.
+    vec cutoffs_from(int at) const {
+        vec own = vec{} + own_radius;
+        if constexpr (RULE == TABLE)
+            for (int l = 0; l < LANES; ++l)
+                own[l] = of_kinds[kinds_of_sources[at + l]];
+        if constexpr (RULE == TABLE || RULE == GATHER)
+            return own;
+        return PairCutoffs::of_pair(own, lanes_from(radii + at));
     }
     // Decides about those in doubt, and leaves out those that are excluded.
     void decide(const BoxRun& run, int b, Tested& some) const {
         for (; some.open; some.open &= some.open - 1) {
             const int lane = __builtin_ctz(some.open);
-            some.pairs |= is_pair(ids[run.from + b + lane], run.code) ? 1u << lane : 0;
+            some.pairs |= is_pair(run.from + b + lane, run.code) ? 1u << lane : 0;
         }
         for (unsigned int rest = EXCLUDING ? some.pairs : 0; rest; rest &= rest - 1)
             if (is_excluded(ids[run.from + b + __builtin_ctz(rest)]))

@@ -8,12 +8,15 @@
 struct BoxSumArguments {
     const real *positions, *queries, *boxes, *axes, *shared_values, *own_values, *columns;
     const int *systems, *ids, *cells, *start, *excluded_starts, *excluded;
+    const real *radii, *query_radii, *table_of_kinds;
+    const int *kinds_of_sources, *kinds_of_queries;
     real *sums, *totals, *errors, *more;
     int* info;
-    int n, m, stride, own, closed, drop_self;
+    int n, m, stride, own, closed, drop_self, kinds;
 
     JFRNN_MEMBER BoxArguments of_search() const {
-        return {positions, queries, boxes, axes, systems, ids, cells, start, excluded_starts, excluded, nullptr, nullptr, nullptr,
-            nullptr, info, n, m, stride, own, 0, closed, drop_self};
+        return {positions, queries, boxes, axes, systems, ids, cells, start, excluded_starts, excluded, radii, query_radii,
+            table_of_kinds, kinds_of_sources, kinds_of_queries, nullptr, nullptr, nullptr, nullptr, info, n, m, stride, own, 0,
+            closed, drop_self, kinds};
     }
 };

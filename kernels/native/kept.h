@@ -2,9 +2,10 @@
 //
 // Rows of the list have OWN_LENGTH numbers: coordinates as they are, then turns along each axis (PERIODIC == 2), then the cutoff of i
 // (RADII). Sources have LENGTH: coordinates, OTHERS numbers that a term reads, turns and the cutoff of j. `cutoff` holds the largest
-// cutoff, the lattice, the largest number of a shift, and the cutoffs of pairs of species behind how many there are, -1 for those that
-// are no neighbors; in place of cutoffs then stand the first place of the row of i, and the species of j. BOXES: `cutoff` has such
-// numbers for each of several systems, of which `systems` says to which a row belongs. `steps` are the shifts of image codes. REVERSED:
+// cutoff, the lattice, and the largest number of a shift. BOXES: it has such numbers for each of several systems, of which `systems` says
+// to which a row belongs. `steps` are the shifts of image codes, or a 0 where there are none, and behind them the cutoffs of pairs of
+// species behind how many there are, -1 for those that are no neighbors; in place of cutoffs then stand the first place of the row of i,
+// and the species of j. REVERSED:
 // rows are those of the sources of the list, whose slots are `lengths` many in `slots` from `starts` on, and j is who has such a slot.
 // ORDERED: threads take rows as `order` has them, so that rows that are taken together read the same sources, or as they come where it
 // holds -1. APART: a particle's pair with itself, without a shift, is left out.
@@ -34,8 +35,7 @@ constexpr bool CODED = PERIODIC == 2;
 constexpr int TURNS = DIM + OTHERS, RADIUS = TURNS + (CODED ? DIM : 0);  // where they stand among the numbers of a source
 constexpr int OWN_TURNS = DIM, OWN_RADIUS = OWN_TURNS + (CODED ? DIM : 0), OWN_LENGTH = OWN_RADIUS + (RADII > 0);
 constexpr int OF_ROW = 1, OF_SOURCE = 2, LARGER = 3, SMALLER = 4, MEAN = 5,
-              OF_KINDS = 6;                         // RADII: the cutoff of a pair; of MEAN halves are given
-constexpr int KINDS = LATTICE_END + (SHIFTED > 0);  // where they stand in `cutoff`
+              OF_KINDS = 6;  // RADII: the cutoff of a pair; of MEAN halves are given
 
 // Derivatives by positions (KeptSlopes): each slot has the slope of a function by its distance, and in `slots` the slot of the pair the
 // other way round: what both give to the row is along x_j - x_i. Distances below this, whose reciprocal is no float, give nothing.
@@ -234,7 +234,8 @@ struct Kept : KeptArguments, Space {
     }
     // The cutoff of two species, given its place in the table; of slots that are not used, that may be anything.
     JFRNN_MEMBER real cutoff_at(real place) const {
-        return place >= 0 && place < cutoff[KINDS] ? cutoff[KINDS + 1 + (int)place] : real(-1);
+        const real* const kinds = steps + (CODED ? DIM * images : 1);
+        return place >= 0 && place < kinds[0] ? kinds[1 + (int)place] : real(-1);
     }
     // Decides exactly about a source at `p`, whose cutoff is `theirs`.
     JFRNN_MEMBER bool is_exact_pair(const OwnPoint& own, const real* p, real theirs, const int* shift) const {

@@ -9,16 +9,14 @@
 //   State                  what is known of a query, a variable of its own, which stays in registers
 //   begin_query(one)       a query begins: returns its state
 //   pair(state, one, other, place, image)  the source `other` at `place` is a pair, in an image
-//   end_query(state, one), chunk_done(chunk)  come after the last pair of a query, and (on the CPU) after the last query of a chunk
+//   end_query(state, one)  comes after its last pair
+//   chunk_done(chunk)      on the CPU, comes after the last query of a chunk
 #pragma once
-#include "exact.h"
 #include "excluded.h"
 #include "lane_count.h"
+#include "pair_cutoffs.h"
 
-constexpr int GATHER = 0, SCATTER = 1, EITHER = 2, BOTH = 3, MEAN = 4, TABLE = 5;  // RULE
-constexpr int TOP = DIM + BATCHED;                                                 // axes of top cells
-constexpr real EPS = DOUBLE ? real(2.220446049250313e-16) : real(1.1920929e-07f);
-constexpr real LEAST = DOUBLE ? real(0x1p-459) : real(0x1p-40f);  // below, squares might underflow
+constexpr int TOP = DIM + BATCHED;  // axes of top cells
 
 struct LevelArguments {
     const real *positions, *queries, *axes, *radii;
@@ -67,7 +65,6 @@ typedef real lanes;
 struct Side {
     JFRNN_FUNCTION lanes load(const real* from) { return *from; }
     JFRNN_FUNCTION unsigned int bits(bool is_so) { return is_so; }
-    JFRNN_FUNCTION real choose(bool is_so, real yes, real no) { return is_so ? yes : no; }
     JFRNN_FUNCTION int lowest(unsigned int) { return 0; }
     JFRNN_FUNCTION void put(lanes& x, int, real value) { x = value; }
 };
@@ -86,10 +83,6 @@ struct Side {
         unsigned short b;
         __builtin_memcpy(&b, &f, 2);
         return b;
-    }
-    template <class Truth>
-    static lanes choose(Truth is_so, lanes yes, lanes no) {
-        return is_so ? yes : no;
     }
     static int lowest(unsigned int bits) { return __builtin_ctz(bits); }
     static void put(lanes& x, int lane, real value) { x[lane] = value; }
@@ -154,22 +147,10 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
     }
     JFRNN_INLINE Query& query() { return *(Query*)this; }
 
-    // The cutoff of a pair; a mean is rounded. Of a table, what no pair is beyond.
-    JFRNN_FUNCTION real of_pair(real own, real other) {
-        if constexpr (RULE == GATHER)
-            return own;
-        if constexpr (RULE == SCATTER)
-            return other;
-        if constexpr (RULE == EITHER)
-            return own > other ? own : other;
-        if constexpr (RULE == BOTH || RULE == TABLE)
-            return own < other ? own : other;
-        return own / 2 + other / 2;
-    }
     // Is a source a pair of a query, given its number, where it is, its image, and its place?
     JFRNN_INLINE bool exactly(const One& one, const real* of_kinds, int source, const real* p, int image, int place) const {
         const real own = one.own, other = RULE == GATHER || RULE == TABLE ? real(0) : radii[place];
-        const real first = RULE == TABLE ? this->cutoff_in(of_kinds, place) : SUM ? own / 2 : of_pair(own, other);
+        const real first = RULE == TABLE ? this->cutoff_in(of_kinds, place) : SUM ? own / 2 : PairCutoffs::of_pair(own, other);
         const real more = SUM ? other / 2 : real(0);
         if constexpr (PERIODIC) {
             const real *a = queries + (long long)ROW * one.id, *b = positions + (long long)ROW * source;
@@ -317,22 +298,11 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
         if constexpr (RULE == TABLE) {
             for (int e = 0; e < LANES; ++e)
                 Side::put(r, e, this->cutoff_in(of_kinds, first + e));
-        } else if constexpr (RULE != GATHER) {
-            const lanes other = Side::load(radii + first);
-            if constexpr (RULE == SCATTER)
-                r = other;
-            else if constexpr (RULE == EITHER)
-                r = Side::choose(other > r, other, r);
-            else if constexpr (RULE == BOTH)
-                r = Side::choose(other < r, other, r);
-            else
-                r = r / 2 + other / 2;
-        }
-        r *= unit;
-        const lanes least = lanes{} + LEAST, inner = r - slack, outer = Side::choose(r > least, r, least) + slack;
-        sure = Side::bits(square < inner * inner * (1 - 32 * EPS)) & Side::bits(r > least) & Side::bits(inner > lanes{});
-        const unsigned int near = Side::bits(square <= outer * outer * (1 + 32 * EPS));
-        return RULE == TABLE ? near & Side::bits(r > lanes{}) : near;
+        } else if constexpr (RULE != GATHER)
+            r = PairCutoffs::of_pair(r, Side::load(radii + first));
+        const auto bounds = PairCutoffs::bounds_of(lanes(r * unit), slack);
+        sure = Side::bits(square < bounds.inside);
+        return Side::bits(square <= bounds.outside);
     }
 
     // Lets a query meet the sources of a run, of an image, from where it meets them at home.
@@ -364,8 +334,8 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
         }
     }
 
-    // Lets the query at a place meet all its candidates, group by group.
-    JFRNN_INLINE void serve(int at) {
+    // Lets the query at a place meet all its candidates, group by group; returns what is known of it then.
+    JFRNN_INLINE auto serve(int at) {
         One one{at, query_ids[at], {0, 0, 0}, RULE == SCATTER ? real(0) : query_radii[at], {0, 0, 0}};
         for (int k = 0; k < DIM; ++k)
             one.q[k] = query_axes[(long long)k * m + at];
@@ -374,7 +344,7 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
         for (int g = 0; finite_point(one.q) && g < groups; ++g) {
             if (RULE != GATHER && largest[g] < 0)
                 continue;
-            const real reach = of_pair(one.own, largest[g]) * (1 + 8 * EPS);
+            const real reach = PairCutoffs::of_pair(one.own, largest[g]) * (1 + 8 * EPS);
             int level = 0;  // the finest one whose cells are wider than the reach
             for (bool fits = true; fits && level < HALVINGS; level += fits)
                 for (int k = 0; k < DIM; ++k)
@@ -402,6 +372,7 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
                 meet(state, one, mine, runs.begin[r], runs.end[r], home, one.q);
         }
         query().end_query(state, one);
+        return state;
     }
 
 #if defined(__CUDACC__)

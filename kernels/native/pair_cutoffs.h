@@ -1,0 +1,40 @@
+// The cutoff of a pair where cutoffs differ from particle to particle, or from species to species: RULE says how it follows from both.
+//
+// A thread of CUDA looks at one source at a time, the CPU at LANES of them: so `Numbers` are one number, or a vector of them.
+#pragma once
+#include "exact.h"
+
+constexpr int ONE_CUTOFF = -1, GATHER = 0, SCATTER = 1, EITHER = 2, BOTH = 3, MEAN = 4, TABLE = 5;  // RULE
+constexpr real EPS = DOUBLE ? real(2.220446049250313e-16) : real(1.1920929e-07f);
+constexpr real LEAST = DOUBLE ? real(0x1p-459) : real(0x1p-40f);  // below, squares might underflow
+
+struct PairCutoffs {
+    // The cutoff of a pair, of those of both particles; a mean is rounded. Of a table, what no pair is beyond.
+    template <class Numbers>
+    JFRNN_MATH Numbers of_pair(Numbers own, Numbers other) {
+        if constexpr (RULE == GATHER)
+            return own;
+        if constexpr (RULE == SCATTER)
+            return other;
+        if constexpr (RULE == EITHER)
+            return own > other ? own : other;
+        if constexpr (RULE == BOTH || RULE == TABLE)
+            return own < other ? own : other;
+        return own / 2 + other / 2;
+    }
+    // Squares below are surely those of pairs, squares beyond surely not; the latter is negative where species are no neighbors.
+    template <class Numbers>
+    struct Bounds {
+        Numbers inside, outside;
+    };
+    // The bounds of a cutoff in a unit; `slack` is by which distances of images may be wrong.
+    template <class Numbers>
+    JFRNN_MATH Bounds<Numbers> bounds_of(Numbers r, real slack) {
+        const Numbers none = Numbers{} - 1, least = Numbers{} + LEAST, inner = r - slack;
+        const Numbers outer = (r > least ? r : least) + slack, nearest = least + slack;
+        const Numbers inside = r > nearest ? inner * inner * (1 - 32 * EPS) : none, outside = outer * outer * (1 + 32 * EPS);
+        if constexpr (RULE == TABLE)
+            return {inside, r > Numbers{} ? outside : none};
+        return {inside, outside};
+    }
+};

@@ -1,0 +1,233 @@
+"""Cutoffs that differ, per particle or per pair of species, in systems with boxes of their own: the pairs of the oracle."""
+
+import functools
+from itertools import product
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from test_box import masked_images
+from test_boxes import box_of, listed_images
+
+import jfrnn
+from jfrnn._geometry.cutoffs import RULES
+from jfrnn.cases.crystals import CRYSTAL_CASES
+
+SLOW = pytest.mark.slow
+CAPACITY = {2: 96, 3: 256}
+TABLE = np.array([[0.75, 0, 0.5], [0, 0, 0.875], [0.5, 0.875, 0.375]])  # the second species has no neighbors of its own
+
+
+def oracle(who, boxes, x, batch, given, periodic=None, queries=None, query_batch=None, **options):
+    """Return (i, j, S) of all pairs, system by system; `given` are the radii or species of sources and of queries."""
+    found, (of_sources, of_queries) = set(), given
+    for system, box in enumerate(np.asarray(boxes, x.dtype)):
+        flags = np.ones(x.shape[1], bool) if periodic is None else np.broadcast_to(np.asarray(periodic), boxes.shape[:2])[system]
+        matrix, ends = np.diag(box) if box.ndim == 1 else box, np.flatnonzero(batch == system)
+        starts = ends if queries is None else np.flatnonzero(query_batch == system)
+        if not (len(ends) and len(starts)):
+            continue
+        more = {
+            "matrix": matrix,
+            "periodic": flags.tolist(),
+            **options,
+            **({} if queries is None else {"queries": queries[starts]}),
+        }
+        if who == "table":
+            more |= {} if queries is None else {"query_species": of_queries[starts]}
+            pairs = reference.reference_species(x[ends], TABLE.astype(x.dtype), of_sources[ends], **more)
+        else:
+            more |= {} if queries is None else {"query_radii": of_queries[starts]}
+            pairs = reference.reference_radii(x[ends], of_sources[ends], who, **more)
+        found |= {(int(starts[i]), int(ends[j]), shift) for i, j, shift in pairs}
+    return found
+
+
+class Scene:
+    """A case of `jfrnn.cases.crystals`, with radii or species; half of the radii are such that pairs are at exactly the cutoff."""
+
+    def __init__(self, name, dtype, dim, who):
+        self.given, self.who, random = CRYSTAL_CASES[name].build(dtype, dim), who, np.random.default_rng(1)
+        sizes = [len(self.given.positions), 0 if self.given.queries is None else len(self.given.queries)]
+        if who == "table":
+            self.of_points = [random.integers(0, len(TABLE), n).astype(np.int32) for n in sizes]
+        else:
+            self.of_points = [np.where(np.arange(n) % 2, 0.75, random.uniform(0, 0.9, n)).astype(dtype) for n in sizes]
+        self.x = self.given.positions
+        self.queries = {} if self.given.queries is None else {"queries": jnp.asarray(self.given.queries)}
+        self.batch = self.given.batch if self.given.queries is None else (self.given.batch, self.given.query_batch)
+        self.own = self.given.queries is None
+
+    @property
+    def cutoff(self):
+        if self.who == "table":
+            return TABLE.astype(self.x.dtype)
+        if self.own:
+            return self.of_points[0]
+        return {"gather": self.of_points[1], "scatter": self.of_points[0]}.get(self.who, tuple(self.of_points))
+
+    @property
+    def options(self):
+        if self.who == "table":
+            return {"species": self.of_points[0] if self.own else tuple(self.of_points)}
+        return {"radius_rule": self.who}
+
+    def pairs(self, **options):
+        given = self.given
+        of_queries = {"queries": given.queries, "query_batch": given.query_batch}
+        return oracle(self.who, given.boxes, self.x, given.batch, self.of_points, given.periodic, **of_queries, **options)
+
+    def search(self, backend, search=jfrnn.search, **options):
+        given = self.queries | self.options | {"box": box_of(self.given), "batch": self.batch, "backend": backend} | options
+        return search(jnp.asarray(self.x), self.cutoff, **given)
+
+
+@functools.lru_cache(maxsize=32)
+def scene(name, dtype, dim, who):
+    return Scene(name, dtype, dim, who)
+
+
+def each_case():
+    """Yield every case, rule, kind and engine; by default two on Warp, since others take long to compile."""
+    often = {("queries", "mean", np.float32, 3, "warp"), ("absent", "table", np.float32, 2, "warp")}
+    kinds = product(CRYSTAL_CASES, (*RULES, "table"), (np.float32, np.float64), (2, 3), ("warp", "jax", "brute"))
+    for name, who, dtype, dim, backend in kinds:
+        kind = f"{name}-{who}-f{8 * dtype().itemsize}-{dim}d-{backend}"
+        marks = [] if (name, who, dtype, dim, backend) in often else [SLOW]
+        yield pytest.param(name, who, dtype, dim, backend, id=kind, marks=marks)
+
+
+@pytest.mark.parametrize(("name", "who", "dtype", "dim", "backend"), list(each_case()))
+def test_case(name, who, dtype, dim, backend):
+    given = scene(name, dtype, dim, who)
+    nbrs = given.search(backend, capacity=CAPACITY[dim])
+    nbrs.check()
+    expected = given.pairs()
+    assert listed_images(nbrs, jnp.asarray(given.x), **given.queries) == expected
+    assert masked_images(nbrs, jnp.asarray(given.x), **given.queries) == expected
+    np.testing.assert_array_equal(given.search(backend, jfrnn.count), nbrs.count)
+    assert len(expected) > 0 and nbrs.backend == backend
+
+
+@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW), pytest.param("brute", marks=SLOW)])
+@pytest.mark.parametrize("who", ["table", pytest.param("either", marks=SLOW)])
+def test_options_and_flat_lists(who, backend):
+    given = scene("mixed", np.float32, 2, who)
+    exclude = np.random.default_rng(2).integers(0, len(given.x), (40, 2))
+    expected = reference.without_excluded(given.pairs(half=True), exclude)
+    flat = given.search(backend, jfrnn.search_edges, half=True, exclude=exclude)
+    flat.check()
+    edges = flat.edges(jnp.asarray(given.x))
+    receivers, senders, shifts = (
+        np.asarray(part)[np.asarray(edges.mask)] for part in (edges.receivers, edges.senders, edges.shift)
+    )
+    assert int(edges.pair_count) == len(expected) == len(senders)
+    assert set(zip(receivers.tolist(), senders.tolist(), map(tuple, shifts.tolist()), strict=True)) == expected
+    if backend == "warp":
+        nbrs = given.search(backend, half=True, exclude=exclude)
+        assert masked_images(nbrs, jnp.asarray(given.x)) == expected
+        closed = given.search(backend, closed=True)
+        assert masked_images(closed, jnp.asarray(given.x)) == given.pairs(closed=True)
+
+
+@pytest.mark.parametrize(
+    ("who", "backend"), [("table", "warp"), *(pytest.param(*x, marks=SLOW) for x in (("mean", "warp"), ("table", "jax")))]
+)
+def test_skin_while_cutoffs_and_boxes_change(who, backend):
+    """Particles drift, boxes breathe and cutoffs grow: every step holds exactly the pairs of that step; then room is made."""
+    given, random = scene("mixed", np.float32, 2, who), np.random.default_rng(0)
+    x, boxes, cutoff, batch = jnp.asarray(given.x), jnp.asarray(given.given.boxes), given.cutoff, given.given.batch
+    options = given.options | {"box": jfrnn.Box(boxes), "batch": batch, "skin": 0.08, "backend": backend}
+    nbrs = jfrnn.search(x, cutoff, slack=1.5, **options)
+    update = jax.jit(lambda nbrs, x, boxes, cutoff: nbrs.update(x, box=jfrnn.Box(boxes), cutoff=cutoff))
+
+    def expected(scale):
+        of_points = given.of_points if who == "table" else [given.of_points[0] * scale, None]
+        rows = np.asarray(boxes)
+        if who != "table":
+            return oracle(who, rows, np.asarray(x), batch, of_points)
+        found = set()
+        for system, matrix in enumerate(rows):
+            at = np.flatnonzero(batch == system)
+            if len(at):
+                near = reference.reference_species(
+                    np.asarray(x)[at], TABLE.astype(np.float32) * scale, of_points[0][at], matrix=matrix, periodic=(True, True)
+                )
+                found |= {(int(at[i]), int(at[j]), s) for i, j, s in near}
+        return found
+
+    for step in range(6):
+        scale = np.float32(1 + 0.002 * step)
+        x = x + jnp.asarray(random.normal(scale=0.004, size=x.shape), x.dtype)
+        boxes = boxes * np.float32(1 + 0.001 * np.sin(step))
+        nbrs = update(nbrs, x, boxes, cutoff * scale)
+        assert masked_images(nbrs, x) == expected(scale)
+    assert 0 < int(nbrs.rebuild_count) < 6
+    nbrs.check()
+    small = jfrnn.search(x, cutoff, capacity=1, **options)
+    assert small.overflow
+    grown = small.grow(x, box=jfrnn.Box(boxes), cutoff=cutoff * scale)
+    assert masked_images(grown, x) == expected(scale)
+
+
+def weight(r, i, j):
+    return (1 + i["m"]) * j["m"] * (1 - r @ r) ** 2 + r[0]
+
+
+WAYS = [("mean", "warp", "search")]
+MORE = [(who, backend, way) for who in (*RULES, "table") for backend in ("warp", "jax", "brute") for way in ("search", "list")]
+
+
+@pytest.mark.parametrize(("who", "backend", "way"), [*WAYS, *(pytest.param(*x, marks=SLOW) for x in MORE if x not in WAYS)])
+def test_sums_and_derivatives_in_positions_and_boxes(who, backend, way):
+    """Sums over the oracle's pairs, their gradient, and with a table that of its norm."""
+    given = scene("mixed", np.float64, 2, who)
+    x, boxes, m = (
+        jnp.asarray(given.x),
+        jnp.asarray(given.given.boxes),
+        jnp.asarray(np.random.default_rng(4).uniform(0, 1, len(given.x))),
+    )
+    i, j, shifts = (np.array(part) for part in zip(*sorted(given.pairs()), strict=True))
+    nbrs = given.search(backend)
+    reach = nbrs.box_kind.reach
+
+    def of_pairs(x, boxes):
+        r = x[j] - x[i] + jnp.einsum("ps,psd->pd", jnp.asarray(shifts, x.dtype), boxes[given.given.batch[i]])
+        terms = jax.vmap(weight)(r, {"m": m[i]}, {"m": m[j]})
+        return jnp.zeros(len(x)).at[i].add(terms)
+
+    def of_library(x, boxes):
+        box = jfrnn.Box(boxes, images=reach)
+        if way == "list":
+            return jfrnn.pair_sum(weight, x, None, {"m": m}, neighbors=nbrs, box=box)
+        options = given.options | {"box": box, "batch": given.batch, "backend": backend}
+        return jfrnn.pair_sum(weight, x, given.cutoff, {"m": m}, **options)
+
+    weights = jnp.arange(1.0, len(given.x) + 1)
+
+    def everything(sums):
+        total = lambda x, boxes: sums(x, boxes) @ weights  # noqa: E731
+        slopes = jax.grad(total, (0, 1))
+        size = lambda x, boxes: sum((part**2).sum() for part in slopes(x, boxes))  # noqa: E731
+        second = jax.grad(size, (0, 1))(x, boxes) if who == "table" else ()
+        return sums(x, boxes), slopes(x, boxes), second
+
+    for found, right in zip(*(jax.tree.leaves(everything(sums)) for sums in (of_library, of_pairs)), strict=True):
+        np.testing.assert_allclose(found, right, rtol=1e-9, atol=1e-9 * float(jnp.abs(right).max()))
+
+
+@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
+def test_what_is_wrong_sets_bits_and_absent_particles_may_have_any_cutoff(backend):
+    given = scene("absent", np.float32, 2, "either")
+    gone, radii = given.given.batch < 0, given.cutoff.copy()
+    assert gone.any()
+    radii[gone] = -1
+    box = jfrnn.Box(given.given.boxes, given.given.periodic, images=6)
+    count = jax.jit(lambda radii: jfrnn.search(given.x, radii, capacity=96, box=box, batch=given.batch, **given.options))
+    nbrs = count(radii)
+    nbrs.check()
+    assert masked_images(nbrs, jnp.asarray(given.x)) == given.pairs()
+    radii[np.flatnonzero(~gone)[0]] = np.nan
+    assert jfrnn.Status(int(count(radii).status)) == jfrnn.Status.INVALID_CUTOFF
