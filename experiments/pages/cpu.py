@@ -3,7 +3,7 @@
 from functools import partial
 from statistics import median
 
-from experiments.pages.rows import TIMES, Row, markdown, number, one, read, whole
+from experiments.pages.rows import TIMES, Row, machine, markdown, number, one, read, whole
 
 OURS = {
     "warp": "jfrnn, list",
@@ -72,8 +72,7 @@ def latency() -> str:
     heads = ["", ">n", ">`x + 1`", *(f">{title}" for title in ours.values()), ">jax-md list", ">nvalchemi list"]
     heads += [f">step: {title}" for title in ours.values()]
     lines = []
-    for file, machine in (("cpu", "2 cores"), ("gpu", "H100")):
-        rows = read(f"latency/{file}.csv")
+    for rows in (read("latency/cpu.csv"), read("latency/gpu.csv")):
         for n in (64, 256, 1000, 4096, 32768):
             of_n = [row for row in rows if row["n"] == str(n) and row["status"] == "ok"]
             if not of_n:
@@ -81,7 +80,7 @@ def latency() -> str:
             floor, mine = one(of_n, what="x + 1"), [one(of_n, who="jfrnn", what=what) for what in ours]
             peers = [[row for row in of_n if row["who"].startswith(who)] for who in ("jax-md", "nvalchemi")]
             fastest = [min((float(row["waited_us"]) for row in peer), default=None) for peer in peers]
-            line = [machine, whole(n), _us(floor), *(_us(row) for row in mine)]
+            line = [machine(rows), whole(n), _us(floor), *(_us(row) for row in mine)]
             line += ["" if us is None else f"{us:.0f}" for us in fastest]
             lines.append([*line, *("" if row is None else f"{float(row['step_us']):.0f}" for row in mine)])
     return markdown(heads, lines)
@@ -168,15 +167,15 @@ def liquid() -> str:
         "pair_sum, list": "`pair_sum(neighbors=)`, list with a skin",
         "distances, grad": "`distances` and `jax.grad`, list with a skin",
     }
-    both = {machine: read(f"lj/{file}.csv") for file, machine in (("cpu", "2 cores"), ("gpu", "H100"))}
-    columns = [(machine, n) for machine, rows in both.items() for n in dict.fromkeys(row["n"] for row in rows)]
+    both = {machine(rows): rows for rows in (read("lj/cpu.csv"), read("lj/gpu.csv"))}
+    columns = [(where, n) for where, rows in both.items() for n in dict.fromkeys(row["n"] for row in rows)]
     lines = []
     for who, title in ways.items():
         lines.append([title, *(number((one(both[m], n=n, who=who) or {}).get("steps_per_s")) for m, n in columns)])
     theirs = {(m, n): [row for row in both[m] if row["n"] == n and row["who"].startswith("jax-md")] for m, n in columns}
     fastest = [max(float(row["steps_per_s"] or 0) for row in rows) for rows in theirs.values()]
     lines.append(["jax-md 0.2.29, the faster of its ways", *map(number, fastest)])
-    return markdown(("way", *(f">{machine}, {whole(n)}" for machine, n in columns)), lines)
+    return markdown(("way", *(f">{where}, {whole(n)}" for where, n in columns)), lines)
 
 
 def options() -> str:

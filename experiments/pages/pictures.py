@@ -12,7 +12,7 @@ from matplotlib.patches import Circle, Rectangle
 
 from experiments._look import OURS, PEER, factor, head, plain, write_names
 from experiments.pages import cpu
-from experiments.pages.rows import number, one, read, whole
+from experiments.pages.rows import machine, number, one, read, whole
 
 _CPU = ("pair-sum", "warp", "cll", "vesin", "matscipy-neighbours", "scipy-kdtree", "nanoflann-cpp", "nvalchemi")
 _GPU = {
@@ -84,8 +84,9 @@ def _gpu(axes: Axes) -> None:
 def _liquid(axes: Axes) -> None:
     """Draw steps per second of a Lennard-Jones liquid over particles, on a CPU and a GPU."""
     ends, spans = [], []
-    for file, machine, style in (("cpu", "2 cores", "--"), ("gpu", "H100", "-")):
+    for file, style in (("cpu", "--"), ("gpu", "-")):
         rows = [row for row in read(f"lj/{file}.csv") if row["steps_per_s"]]
+        where = machine(rows)
         found = {}
         for who, title, color in (("pair_sum, list", "jfrnn", OURS), ("jax-md", "jax-md", PEER)):
             best: dict[int, float] = {}
@@ -94,9 +95,9 @@ def _liquid(axes: Axes) -> None:
                     best[int(row["n"])] = max(best.get(int(row["n"]), 0.0), float(row["steps_per_s"]))
             found[title] = best
             axes.plot(*zip(*sorted(best.items()), strict=True), style, color=color, marker="o" if color == OURS else "s")
-            ends.append((f"{title}, {machine}", max(best), best[max(best)], color))
+            ends.append((f"{title}, {where}", max(best), best[max(best)], color))
         ratios = sorted(found["jfrnn"][n] / found["jax-md"][n] for n in found["jfrnn"] if n in found["jax-md"])
-        spans.append(f"{factor(ratios[0])} to {factor(ratios[-1])} times on {'an ' if machine == 'H100' else ''}{machine}")
+        spans.append(f"{factor(ratios[0])} to {factor(ratios[-1])} times on {'an ' if where.startswith('H') else ''}{where}")
     axes.set(xscale="log", yscale="log", xlabel="particles of a Lennard-Jones liquid, lists with a skin", ylabel="steps per second")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(lambda value, _: plain(value))

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,12 @@ def read(name: str) -> list[Row]:
 def one(rows: Iterable[Row], **wanted: object) -> Row | None:
     """Return the first row with these values, compared as text; None if there is none."""
     return next((row for row in rows if all(str(row.get(name)) == str(value) for name, value in wanted.items())), None)
+
+
+def machine(rows: Iterable[Row]) -> str:
+    """Return what rows were measured on, in a word or two: two cores, or a card, as in "H200"."""
+    found = re.search(r"[A-Z]+\d+", next(row["device"] for row in rows if row.get("device")))
+    return "2 cores" if found is None else found[0]
 
 
 def number(value: object, scale: float = 1.0, digits: int = 3) -> str:
