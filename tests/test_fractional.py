@@ -77,7 +77,8 @@ def test_lists_flat_lists_and_counts(name, dtype, backend):
 CELLS = np.stack([SKEWED, 0.4 * SKEWED, 2.5 * SKEWED[::-1]])
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW), pytest.param("brute", marks=SLOW)])
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["warp", "jax", "brute"])
 def test_systems_with_skins_in_boxes_that_change(backend):
     """Every step holds the pairs of that step; coordinates stay, while boxes breathe; then room is made."""
     random, dtype = np.random.default_rng(2), np.float32
