@@ -165,7 +165,7 @@ def _vesin(scene: _Scene) -> tuple[Callable[[], Any], Callable[[Any], np.ndarray
     find, systems = NeighborList(cutoff=CUTOFF, full_list=True), len(scene.cells)
     each = list(zip(scene.x.astype(float).reshape(systems, -1, 3), scene.cells.astype(float), strict=True))
 
-    def call() -> list[tuple[np.ndarray, ...]]:
+    def call() -> list[Any]:
         return [find.compute(points=x, box=cell, periodic=True, quantities="ijS") for x, cell in each]
 
     return call, lambda found: np.concatenate(

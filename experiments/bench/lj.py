@@ -1,6 +1,7 @@
 """A Lennard-Jones liquid at constant energy, a benchmark that people know: steps per second, all of them in a compiled scan."""
 
 import functools
+import importlib
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -248,12 +249,14 @@ def _row_of_jax_md(name: str, liquid: _Liquid, skin: float, steps: int, repeats:
 
 def _run_jax_md(form: str, liquid: _Liquid, skin: float, steps: int, repeats: int) -> table.Line:
     """Return the columns of jax-md's own simulation, with its potential, its list and its integrator."""
-    from jax_md import energy, partition, simulate, space  # pyright: ignore[reportMissingImports]
-
+    energy, partition, simulate, space = (
+        importlib.import_module(f"jax_md.{name}") for name in ("energy", "partition", "simulate", "space")
+    )
     displacement, shift = space.periodic(liquid.length)
     options = {"r_onset": ONSET, "r_cutoff": CUTOFF, "dr_threshold": skin, "capacity_multiplier": 1.25}
-    formats: Any = partition.NeighborListFormat
-    neighbors, potential = energy.lennard_jones_neighbor_list(displacement, liquid.length, format=formats[form], **options)
+    neighbors, potential = energy.lennard_jones_neighbor_list(
+        displacement, liquid.length, format=partition.NeighborListFormat[form], **options
+    )
     wrapped = jnp.mod(liquid.x, liquid.length)
     nbrs = neighbors.allocate(wrapped)
     begin, apply = simulate.nve(potential, shift, STEP)

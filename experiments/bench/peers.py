@@ -92,14 +92,14 @@ def _matscipy(given: Problem) -> Pairs:
 
 def _jax_md(given: Problem) -> Pairs:
     import jax.numpy as jnp
-    from jax_md import partition, space  # pyright: ignore[reportMissingImports]
 
+    partition, space = (importlib.import_module(f"jax_md.{name}") for name in ("partition", "space"))
     points = jnp.asarray(given.positions)
     if given.matrix is None:
         displacement, _ = space.free()
         low, extent = _bounds(given.positions)
         points, size = points - low, extent + given.cutoff  # its cells begin at 0
-        make: Any = partition.neighbor_list(displacement, size, given.cutoff, format=partition.NeighborListFormat.Sparse)
+        make = partition.neighbor_list(displacement, size, given.cutoff, format=partition.NeighborListFormat.Sparse)
     elif not all(given.periodic):
         raise Cannot("boxes with open axes")
     else:
