@@ -210,15 +210,13 @@ def extremes_of_list(given: KeptList, term: Term, operands: Groups, largest: boo
 
 def _values_of_list(given: KeptList, plan: Plan, term: Term, operands: Groups) -> tuple[Array, Array | None, Array]:
     """Return the columns of what all pairs share, of i, and of j; None for i where those are of the same arrays."""
-    n, m = given.sources.shape[0], given.rows.shape[0]
-    sizes = (None, m, n) if given.reversal is None else (None, n, m)
-    groups = zip(operands, (plan.shared, plan.own, plan.others), sizes, strict=True)
-    shared, own, others = (_pack(*group, given.sources.dtype) for group in groups)
+    n, m = (len(x) for x in (given.sources, given.rows)[:: 1 if given.reversal is None else -1])
     of_i, of_j = (
         [(labels[k], e) for k, e in columns] for labels, columns in zip(term.labels, (plan.own, plan.others), strict=True)
     )
-    mirrored = of_i == of_j != []  # equal labels: the same arrays
-    return shared, None if mirrored else own, others
+    mirrored, dtype = of_i == of_j != [], given.sources.dtype  # equal labels: the same arrays
+    own = None if mirrored else _pack(operands.own, plan.own, m, dtype)
+    return _pack(operands.shared, plan.shared, None, dtype), own, _pack(operands.others, plan.others, n, dtype)
 
 
 def extremes(

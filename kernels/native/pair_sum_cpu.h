@@ -61,15 +61,16 @@ struct Sums : Walk<Sums> {
             meet_in_place(q, id, own_part, reduction);
         reduction.store(results, id, fresh, finished);
     }
-    // Decides while denormals are kept, if anything is `open`.
-    unsigned int decided_apart(const real* q, int id, const Points& points, const int* numbers, unsigned int open) const {
-        if (open == 0)
-            return 0;
-        if constexpr (FLUSHED)
-            floats.keep();
-        const unsigned int pairs = decided(q, id, points, numbers, open);
-        if constexpr (FLUSHED)
-            floats.flush();
+    // `decided` while a term is evaluated: denormals are kept for what float64 leaves open alone.
+    unsigned int decided_between(const real* q, int id, const Points& points, const int* numbers, unsigned int open) const {
+        unsigned int pairs = sure(q, points, open);
+        if (open) {
+            if constexpr (FLUSHED)
+                floats.keep();
+            pairs |= decided(q, id, points, numbers, open);
+            if constexpr (FLUSHED)
+                floats.flush();
+        }
         return pairs;
     }
     // Evaluates the term for vectors of candidates as they are, under a mask; those in doubt follow.
@@ -99,9 +100,7 @@ struct Sums : Walk<Sums> {
         const int doubts = any_unsure ? collect_doubtful(filled) : 0;
         for (int b = 0; b < doubts; b += LANES) {
             const Points points = doubtful_at(b);
-            unsigned int open = lanes_before(doubts - b);
-            const unsigned int sure_ones = sure(q, points, open),
-                               hit = sure_ones | decided_apart(q, id, points, doubtful + b, open);
+            const unsigned int hit = decided_between(q, id, points, doubtful + b, lanes_before(doubts - b));
             number summand[SUMMANDS];
             term.evaluate(own_part, points.p, [&](int c) { return gathered(column[c], doubtful + b); }, summand);
             reduction.add(summand, flags_of(hit), [&](Math::i32& source, Math::i32& code) {
@@ -136,10 +135,8 @@ struct Sums : Walk<Sums> {
                 points.p[k] = *(const vec*)(near_points[k] + b);
             const unsigned int there = lanes_before(held - b);
             unsigned int hit = mask_of(square_of(q, points.p), inside, Below{}) & there;
-            if (unsigned int open = there & ~hit) {
-                hit |= sure(q, points, open);
-                hit |= decided_apart(q, id, points, doubtful + b, open);
-            }
+            if (const unsigned int open = there & ~hit)
+                hit |= decided_between(q, id, points, doubtful + b, open);
             number summand[SUMMANDS];
             term.evaluate(own_part, points.p, [&](int c) { return *(const number*)(near_column[c] + b); }, summand);
             reduction.add(summand, flags_of(hit), [&](Math::i32& source, Math::i32& code) {
