@@ -8,6 +8,7 @@ seconds to lower and to compile, without JAX's cache; microseconds of a waited c
 import sys
 import time
 from collections.abc import Callable
+from statistics import median
 from typing import Any
 
 import jax
@@ -16,6 +17,7 @@ import numpy as np
 from jax import Array
 
 import jfrnn
+from experiments import _measure
 
 CUTOFF, CAPACITY = 3.0, 128  # of a cubic lattice with a spacing of 1
 Function = Callable[[Array], Any]
@@ -52,29 +54,6 @@ def make_way(who: str, way: str, x: Array) -> Function:
     return known.get(way, rows)
 
 
-def median(call: Callable[[], Any], repeats: int) -> float:
-    """Return the median of calls that are waited for [s]."""
-    took = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        jax.block_until_ready(call())
-        took.append(time.perf_counter() - begin)
-    return float(np.median(took))
-
-
-def compile_scan(function: Function, x: Array, steps: int) -> Callable[[], Any]:
-    """Return a compiled scan whose steps move all particles by nothing, which XLA does not know, and keep what was found last."""
-
-    def step(kept: tuple, _: None) -> tuple[tuple, None]:
-        moved = kept[0] + kept[2]
-        return (moved, function(moved), kept[2]), None
-
-    run = jax.jit(lambda x, move, made: jax.lax.scan(step, (x, made, move), None, length=steps)[0])
-    move, made = jnp.zeros((), x.dtype), jax.jit(function)(x)
-    jax.block_until_ready(run(x, move, made))
-    return lambda: run(x, move, made)
-
-
 def main(who: str, sizes: str, ways: str) -> None:
     """Print a line for each size and way."""
     jax.config.update("jax_enable_compilation_cache", False)
@@ -89,9 +68,13 @@ def main(who: str, sizes: str, ways: str) -> None:
             between = time.perf_counter()
             compiled = lowered.compile()
             end = time.perf_counter()
-            waited = median(lambda compiled=compiled, x=x: compiled(x), 40 if n < 100_000 else 10)
-            steps = 50 if n < 100_000 else 5
-            step = median(compile_scan(function, x, steps), 5) / steps
+            repeats, steps = (40, 50) if n < 100_000 else (10, 5)
+            calls = {"waited": lambda compiled=compiled, x=x: compiled(x), "scan": _measure.compile_scan(function, x, steps)}
+            waited, scan = (
+                median(_measure.time_in_turns({name: call}, k)[0][name])
+                for (name, call), k in zip(calls.items(), (repeats, 5), strict=True)
+            )
+            step = scan / steps
             scratch = compiled.memory_analysis()
             times = (
                 f"lower {between - begin:5.2f} compile {end - between:5.2f} waited {1e6 * waited:8.0f} us step {1e6 * step:8.0f} us"
