@@ -95,7 +95,7 @@ def make_axes(title: str, height: float) -> tuple[Figure, Axes]:
 
 def head(figure: Figure, title: str) -> None:
     """Write what is to be seen above a figure, in lines as wide as it."""
-    figure.suptitle(fill(title, 78), x=0.015, ha="left", fontsize=11, fontweight="bold")
+    figure.suptitle(fill(title, 74), x=0.015, ha="left", fontsize=11, fontweight="bold")
 
 
 def clear(axes: Axes) -> None:
