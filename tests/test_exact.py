@@ -90,6 +90,7 @@ def test_every_step_agrees_with_fractions(dtype, offset):
     assert {-1, 1} <= set(exact)
     np.testing.assert_array_equal(_integer_sign(pair, _threshold(pair, cutoff)), exact)
     sign = _fixed_sign(pair, _threshold(pair, cutoff))
+    np.testing.assert_array_equal(_fixed_sign(pair, _threshold(pair, cutoff), by_axis=True), sign)
     assert np.mean(sign != _UNKNOWN) > 0.99
     np.testing.assert_array_equal(np.where(sign == _UNKNOWN, exact, sign), exact)
 
@@ -117,6 +118,7 @@ def test_steps_agree_in_lattices(size, orthogonal, dtype):
     threshold = _threshold(pair, make_cutoff(float(21 * step), np.dtype(dtype), closed=False))  # 21² = 16² + 13² + 4²
     near = jnp.asarray(np.linalg.norm(offset, axis=1) < 42 * step)  # what step 1 leaves open is no farther
     sign, exact = _fixed_sign(pair, threshold), _integer_sign(pair, threshold)
+    np.testing.assert_array_equal(_fixed_sign(pair, threshold, by_axis=True), sign)
     known = (sign != _UNKNOWN) & near
     assert np.mean(known) > 0.5
     assert int((exact == 0).sum()) > 0

@@ -276,7 +276,7 @@ def _stencil_words(dim: int, slots: int | None) -> int:
     share = (2 + 1 / FINE) * runs / {2: np.pi, 3: 4 * np.pi / 3}[dim]  # candidates per neighbor
     slots = {2: 32, 3: 128}[dim] if slots is None else slots
     most = {2: 32, 3: 64}[dim]
-    return min(max(4 * round((0.9 * share * slots / LANES + runs) / 4), 8), most)
+    return min(max(math.ceil(share * slots / LANES + runs), 8), most)
 
 
 def _cells_of_lattice(

@@ -15,11 +15,12 @@ from jax import Array, lax
 from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
 from jfrnn._engine.problem import Filter
 from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
-from jfrnn._engine.words import LANES, BitRows, bit_counts, last_reached, windows
+from jfrnn._engine.words import LANES, BitRows, Lanes, bit_counts, last_reached, nth_bit
 from jfrnn._geometry import (
     Cutoff,
     Cutoffs,
     Pair,
+    decide_in_integers,
     decide_in_units,
     decide_pairs,
     flat_take,
@@ -31,6 +32,7 @@ from jfrnn._geometry import (
 from jfrnn._tracing import largest_of
 
 _FEW_RUNS = 32
+_AT_A_TIME = 1 << 10  # words of which one candidate each is decided by wide integers
 _SLOTS = 32  # doubtful candidates of a row that are decided at a time
 _HITS = np.uint32((1 << LANES) - 1)
 _MOST_WORDS = 256  # per query, that are tested at a time; (words << 16) has to be an int32
@@ -78,6 +80,12 @@ Add = Callable[[HitWords, State], State]
 def is_at_once(candidates: Candidates, tuning: Tuning) -> bool:
     """Say whether blocks are processed without loops where that is enough: doubts are rare in open space alone."""
     return candidates.queries.ids.size <= tuning.at_once and candidates.torus is None and candidates.passes is None
+
+
+def _decided(bit: Array, pair: Array) -> Array:
+    """Return what is added to a word so that this bit is doubtful no longer, and a hit if it is a pair."""
+    one = np.uint32(1) << bit.astype(jnp.uint32)
+    return jnp.where(pair, one, np.uint32(0)) - (one << np.uint32(LANES))
 
 
 class BlockSearch(NamedTuple):
@@ -174,32 +182,34 @@ class BlockSearch(NamedTuple):
         """Fold the first chunk of candidates without a loop; where that is not all, or leaves doubts, start again with loops."""
         table = self.word_table(span, jnp.int32(0))
         packed, first, image = self._test_words(span, [span.of(x) for x in self.queries.axes], table, jnp.int32(0))
-        packed, rest = self._decide_first(packed, first, image, span)
+        packed = self._decide_first(packed, first, image, span)
+        rest = largest_of(packed) > _HITS
         if table.most is None:
-            rest = rest | (table.total > self.words)
+            rest = rest | (table.longest > self.words)
         add_few = add
         if few is not None:
             add_few, room = few
-            rest = rest | (bit_counts(packed & _HITS).sum(axis=1, dtype=jnp.int32) > room)
+            rest = rest | (largest_of(bit_counts(packed & _HITS).sum(axis=1, dtype=jnp.int32)) > room)
         return lax.cond(
-            jnp.any(rest),
-            lambda state: self._fold_table(span, add, table, state),
+            rest,
+            lambda state: self._fold_table(span, add, table, state, again=True),
             lambda state: add_few(HitWords(packed, first, image), state),
             state,
         )
 
-    def _fold_table(self, span: Span, add: "Add[State]", table: _WordTable, state: State) -> State:
+    def _fold_table(self, span: Span, add: "Add[State]", table: _WordTable, state: State, again: bool = False) -> State:
         query = [span.of(x) for x in self.queries.axes]
 
         def add_chunk(chunk: Array, state: State) -> State:
-            return add(self.hit_words(span, query, table, chunk), state)
+            own, runs, chunk = lax.optimization_barrier((query, table, chunk))  # XLA would take small parts out of the loop
+            return add(self.hit_words(span, own, runs, chunk, again), state)
 
         def add_next(now: tuple[Array, Array, State]) -> tuple[Array, Array, State]:
             _, chunk, state = now
             return (chunk + 1) * self.words < longest, chunk + 1, add_chunk(chunk, state)
 
         if table.most is not None and table.most <= self.words:
-            return add_chunk(jnp.int32(0), state)
+            return add(self.hit_words(span, query, table, jnp.int32(0), again), state)
         longest = table.longest
         return lax.while_loop(lambda now: now[0], add_next, (jnp.asarray(longest > 0), jnp.int32(0), state))[2]
 
@@ -209,31 +219,39 @@ class BlockSearch(NamedTuple):
         total, before = jnp.sum(count, axis=1, dtype=jnp.int32), None
         if runs > _FEW_RUNS:
             before = jnp.cumsum(count, axis=1, dtype=jnp.int32) - count
-        elif self.tuning.by_gathers:
-            before = jnp.sum(count[:, None] * np.tril(np.ones((runs, runs), np.int32), -1)[None], axis=2, dtype=jnp.int32)
+        elif self.tuning.by_gathers:  # of a short row, sums of gathered numbers take less time than a reduction
+            row, run = (lax.broadcasted_iota(jnp.int32, count.shape, k) for k in (0, 1))
+            gathered = [flat_take(count, row * runs + k) for k in range(runs)]
+            before = sum((jnp.where(run > k, x, 0) for k, x in enumerate(gathered[:-1])), jnp.zeros_like(count))
+            total = before[:, -1] + count[:, -1]
         return _WordTable(start, stop, image, before, total, self.candidates.most_words)
 
-    def hit_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> HitWords:
-        """Test one chunk of words per query; `own` are the d coordinates [b] of the queries."""
-        own, table, chunk = lax.optimization_barrier((own, table, chunk))  # as XLA would take small parts out of the loop
+    def hit_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array, again: bool) -> HitWords:
+        """Test one chunk of words per query, `again` if that was tried without loops; `own` are the d coordinates [b] of the queries."""
         packed, first, image = self._test_words(span, own, table, chunk)
-        return HitWords(self._decide_doubtful(packed, first, image, span), first, image)
+        decide = self._decide_doubtful
+        if len(packed) <= self.tuning.at_once:
+            decide = self._decide_at_once
+            packed = packed if again else self._decide_first(packed, first, image, span)
+        return HitWords(decide(packed, first, image, span), first, image)
 
     def _test_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
         """Return a chunk of words with hits and doubtful candidates, the positions of their first candidates, and their images."""
         first, stop, image = self._locate_words(table, chunk)
-        query = [x[:, None] for x in own]
-        if image is not None and self.candidates.torus is not None:  # translate the query instead of the image
-            query = [q - t for q, t in zip(query, self._translations(self.candidates.torus, image, span), strict=True)]
-        packed = self._test(first, stop, image, query, span)
+        last = self.tuning.by_gathers
+        lanes = Lanes(*(x.T if last and x is not None else x for x in (first, stop, image)), queries_last=last)
+        packed = self._test(lanes, own, span)
         if self.candidates.excluded is not None:
             allowed = ~self._excluded_lanes(self.candidates.excluded, first, span) & _HITS
             packed = packed & (allowed | allowed << np.uint32(LANES))
-        return lax.optimization_barrier((packed, first, image))
+        if self.candidates.most_words is None:  # else the words are known before
+            packed, first, image = lax.optimization_barrier((packed, first, image))
+        return packed, first, image
 
     def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
-        word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (table.start.shape[0], self.words))
-        runs = table.start.shape[1]
+        """Return where words begin, where their runs end, and their images, [b, w] each."""
+        rows, runs = table.start.shape
+        word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (rows, self.words))
         if table.before is not None:
             run = last_reached(table.before, word) + runs * lax.broadcasted_iota(jnp.int32, word.shape, 0)
             first = flat_take(table.start, run) + LANES * (word - flat_take(table.before, run))
@@ -248,65 +266,72 @@ class BlockSearch(NamedTuple):
             first, stop, image = found if table.image is not None else (*found, None)
         return jnp.minimum(first, self.sources.ids.size - LANES), stop, image
 
-    def _translations(self, torus: Torus, image: Array, span: Span) -> list[Array]:
-        """Return the lattice translation of the images of queries, per axis."""
+    def _translations(self, torus: Torus, lanes: Lanes, span: Span) -> list[Array]:
+        """Return the lattice translation of the images of queries, per axis, for each word."""
+        if lanes.image is None:
+            raise TypeError("the runs of a search in a lattice have images.")
         if not torus.images.per_system:
-            return [t[image] for t in torus.translations.T]
-        own, shifts = span.of(torus.matrix)[..., None], [x[image] for x in torus.translations.T]
+            return [t[lanes.image] for t in torus.translations.T]
+        own, shifts = (
+            jnp.expand_dims(span.of(torus.matrix), 2 if lanes.queries_last else 3),
+            [x[lanes.image] for x in torus.translations.T],
+        )
         if torus.images.orthogonal:
             return [shift * own[k, k] for k, shift in enumerate(shifts)]
         return [functools.reduce(jnp.add, (x * own[row, k] for row, x in enumerate(shifts))) for k in range(len(shifts))]
 
-    def _test(self, first: Array, stop: Array, image: Array | None, query: list[Array], span: Span) -> Array:
+    def _test(self, lanes: Lanes, own: list[Array], span: Span) -> Array:
         """Compare 16 candidates per word with the cutoff in working precision: low half hits, high half doubtful ones."""
-        difference = [windows(x, first) - q[..., None] for x, q in zip(self.sources.axes, query, strict=True)]
-        square = squared_distance(difference, self.cutoff)
-        own, others = self.queries.radii, self.sources.radii
-        own = None if own is None else span.of(own)[:, None, None]
-        inside, outside = self._bounds(own, None if others is None else windows(others, first), span)
+        query, torus = [lanes.of_queries(x) for x in own], self.candidates.torus
+        if torus is not None:  # translate the query instead of the image
+            query = [q - lanes.of_words(t) for q, t in zip(query, self._translations(torus, lanes, span), strict=True)]
+        square = squared_distance([lanes.read(x) - q for x, q in zip(self.sources.axes, query, strict=True)], self.cutoff)
+        inside, outside = self._bounds(lanes, span)
         doubtful = jnp.where(square <= outside, np.uint32(1 << LANES), np.uint32(0))
-        value = jnp.where(square < inside, np.uint32(1), doubtful) << lax.iota(jnp.uint32, LANES)
+        value = jnp.where(square < inside, np.uint32(1), doubtful)
         if self.keep.later_only:
-            value = jnp.where(self._is_later(first, image, span), value, np.uint32(0))
+            value = jnp.where(self._is_later(lanes, span), value, np.uint32(0))
         if self.queries.systems is not None and self.sources.systems is not None:
-            system = span.of(self.queries.systems)[:, None, None]
-            value = jnp.where(windows(self.sources.systems, first) == system, value, np.uint32(0))
+            same = lanes.read(self.sources.systems) == lanes.of_queries(span.of(self.queries.systems))
+            value = jnp.where(same, value, np.uint32(0))
         if self.tuning.by_gathers:  # in the same kernel
-            value = jnp.where(self._is_allowed(first, stop, image, span), value, np.uint32(0))
-            return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,))
-        allowed = self._allowed_lanes(first, stop, image, span)
-        return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,)) & (allowed | allowed << np.uint32(LANES))
+            return lanes.joined(jnp.where(self._is_allowed(lanes, span), value, np.uint32(0)))
+        allowed = self._allowed_lanes(lanes, span)
+        return lanes.joined(value) & (allowed | allowed << np.uint32(LANES))
 
-    def _bounds(self, own: Array | None, others: Array | None, span: Span) -> tuple[np.floating | Array, np.floating | Array]:
-        torus = self.candidates.torus
+    def _bounds(self, lanes: Lanes, span: Span) -> tuple[np.floating | Array, np.floating | Array]:
+        torus, radii = self.candidates.torus, None
         slack = None if torus is None else torus.slack
         if torus is not None and torus.images.per_system:
-            slack = span.of(torus.slack)[:, None, None]
-        radii = self.cutoff.of_pairs(own, others) if isinstance(self.cutoff, Cutoffs) else None
+            slack = lanes.of_queries(span.of(torus.slack))
+        if isinstance(self.cutoff, Cutoffs):
+            own, others = self.queries.radii, self.sources.radii
+            radii = self.cutoff.of_pairs(
+                None if own is None else lanes.of_queries(span.of(own)), None if others is None else lanes.read(others)
+            )
         return step_one_bounds(self.cutoff, radii, slack)
 
-    def _is_allowed(self, first: Array, stop: Array, image: Array | None, span: Span) -> Array:
-        """Say which candidates [b, words, 16] belong to their run and are not the query itself."""
-        place = first[..., None] + np.arange(LANES, dtype=np.int32)[None, None]
-        allowed = place < stop[..., None]
+    def _is_allowed(self, lanes: Lanes, span: Span) -> Array:
+        """Say which candidates belong to their run and are not the query itself."""
+        allowed = lanes.places < lanes.of_words(lanes.stop)
         if not self.keep.drop_self or self.keep.later_only:
             return allowed
-        own, again = span.places[:, None, None], self.candidates.again
-        other = place != own if again is None else (place != own) & (place != own + again)
-        if image is not None and self.candidates.torus is not None:
-            other = other | (image != self.candidates.torus.images.home)[..., None]
+        own, again, torus = lanes.of_queries(span.places), self.candidates.again, self.candidates.torus
+        other = lanes.places != own if again is None else (lanes.places != own) & (lanes.places != own + again)
+        if lanes.image is not None and torus is not None:
+            other = other | lanes.of_words(lanes.image != torus.images.home)
         return allowed & other
 
-    def _allowed_lanes(self, first: Array, stop: Array, image: Array | None, span: Span) -> Array:
+    def _allowed_lanes(self, lanes: Lanes, span: Span) -> Array:
         """Return which of a word's 16 candidates belong to its run and are not the query itself: bits, [b, words] uint32."""
-        one = np.uint32(1)
-        lanes = (one << jnp.clip(stop - first, 0, LANES).astype(jnp.uint32)) - one
+        one, torus = np.uint32(1), self.candidates.torus
+        allowed = (one << jnp.clip(lanes.stop - lanes.first, 0, LANES).astype(jnp.uint32)) - one
         if not self.keep.drop_self or self.keep.later_only:
-            return lanes
-        own = self._lanes_at(span.places, first)
-        if image is not None and self.candidates.torus is not None:
-            own = jnp.where(image == self.candidates.torus.images.home, own, np.uint32(0))
-        return lanes & ~own
+            return allowed
+        own = self._lanes_at(span.places, lanes.first)
+        if lanes.image is not None and torus is not None:
+            own = jnp.where(lanes.image == torus.images.home, own, np.uint32(0))
+        return allowed & ~own
 
     def _lanes_at(self, place: Array, first: Array) -> Array:
         """Return the candidates at a position [b] of each query: bits, [b, words] uint32."""
@@ -329,38 +354,58 @@ class BlockSearch(NamedTuple):
 
         return lax.fori_loop(0, largest_of(end - begin), add, jnp.zeros(first.shape, jnp.uint32))
 
-    def _is_later(self, first: Array, image: Array | None, span: Span) -> Array:
-        """Say which candidates [b, words, 16] are the later ones of their pairs: of a query's own images, the forward half."""
-        own = span.of(self.queries.ids)[:, None]
+    def _is_later(self, lanes: Lanes, span: Span) -> Array:
+        """Say which candidates are the later ones of their pairs: of a query's own images, the forward half."""
+        own, torus = lanes.of_queries(span.of(self.queries.ids)), self.candidates.torus
         later = own + int(self.keep.drop_self)
-        if image is not None and self.candidates.torus is not None:
-            home = self.candidates.torus.images.home
-            later = jnp.where(image > home, own, jnp.where(image < home, own + 1, later))
-        return windows(self.sources.ids, first) >= later[..., None]
+        if lanes.image is not None and torus is not None:
+            image = lanes.of_words(lanes.image)
+            later = jnp.where(image > torus.images.home, own, jnp.where(image < torus.images.home, own + 1, later))
+        return lanes.read(self.sources.ids) >= later
 
-    def _decide_first(self, packed: Array, first: Array, image: Array | None, span: Span) -> tuple[Array, Array]:
-        """Decide the first doubtful candidate of each query, where that takes no wide integers, without any loop.
+    def _decide_first(self, packed: Array, first: Array, image: Array | None, span: Span) -> Array:
+        """Decide the first doubtful candidate of each row, where that takes no wide integers, without any loop.
 
-        Returns the words, of which the lower half is right where the upper half is empty, and which rows have others [b].
+        Returns the words, of which the lower half is right where the upper half is empty.
         """
         one, (rows, width) = np.uint32(1), packed.shape
         word = jnp.where(packed > _HITS, lax.broadcasted_iota(jnp.int32, packed.shape, 1), width)
-        start = np.int32(width), np.int32(0)
-        word, many = lax.reduce(
-            (word, bit_counts(packed >> np.uint32(LANES))), start, lambda a, b: (lax.min(a[0], b[0]), a[1] + b[1]), (1,)
-        )
+        word = jnp.min(word, axis=1)
         at = lax.min(word, np.int32(width - 1)) + width * lax.iota(jnp.int32, rows)
         asked = flat_take(packed, at) >> np.uint32(LANES)
         bit = bit_counts((asked & (~asked + one)) - one) % LANES
-        known, near = decide_in_units(
-            self._pair(span.places, flat_take(first, at) + bit, None if image is None else flat_take(image, at)), self.cutoff
-        )
-        known = known & (many > 0)
-        bit = one << bit.astype(jnp.uint32)
-        change = jnp.where(known, jnp.where(near, bit, np.uint32(0)) - (bit << np.uint32(LANES)), np.uint32(0))
-        word, change, many = lax.optimization_barrier((word, change, many - known.astype(jnp.int32)))
+        of_row = None if image is None else flat_take(image, at)
+        known, near = decide_in_units(self._pair(span.places, flat_take(first, at) + bit, of_row), self.cutoff)
+        change = jnp.where(known & (asked > 0), _decided(bit, near), np.uint32(0))
+        word, change = lax.optimization_barrier((word, change))
         here = lax.broadcasted_iota(jnp.int32, packed.shape, 1) == word[:, None]
-        return packed + jnp.where(here, change[:, None], np.uint32(0)), many > 0
+        return packed + jnp.where(here, change[:, None], np.uint32(0))
+
+    def _decide_at_once(self, packed: Array, first: Array, image: Array | None, span: Span) -> Array:
+        """Do what `_decide_doubtful` does for all rows at once, in a loop that rarely turns twice."""
+        (rows, width), many = packed.shape, min(_AT_A_TIME, packed.size)
+
+        def of(word: Array) -> Array | None:
+            return None if image is None else flat_take(image, word)
+
+        def decide_next(flat: Array) -> Array:
+            (flat,) = lax.optimization_barrier((flat,))
+            bits = BitRows.of(flat.reshape(rows, width) >> np.uint32(LANES), self.tuning.by_gathers)
+            row, slot = (lax.broadcasted_iota(jnp.int32, (rows, _SLOTS), k) for k in (0, 1))
+            word, bit = bits.nth(slot)
+            pair = self._pair(span.first + row, flat_take(first, word) + bit, of(word))
+            known, near = decide_in_units(pair, self.cutoff)
+            known = known & (slot < bits.total[:, None])
+            flat = flat.at[jnp.where(known, word, flat.size)].add(_decided(bit, near), mode="drop")
+            start = jnp.minimum(lax.argmax(flat > _HITS, 0, jnp.int32), flat.size - many)  # the first that is left
+            here, word = lax.dynamic_slice_in_dim(flat, start, many), start + lax.iota(jnp.int32, many)
+            asked = here >> np.uint32(LANES)
+            bit = nth_bit(asked, jnp.zeros_like(asked))
+            pair = self._pair(span.first + lax.div(word, np.int32(width)), flat_take(first, word) + bit, of(word))
+            here = here + jnp.where(asked > 0, _decided(bit, decide_in_integers(pair, self.cutoff)), np.uint32(0))
+            return lax.dynamic_update_slice_in_dim(flat, here, start, axis=0)
+
+        return lax.while_loop(lambda flat: largest_of(flat) > _HITS, decide_next, packed.reshape(-1)).reshape(packed.shape)
 
     def _decide_doubtful(self, packed: Array, first: Array, image: Array | None, span: Span) -> Array:
         """Add the doubtful candidates that are pairs to the hits: [b, words] uint32, of which the lower half is set then.
@@ -397,8 +442,7 @@ class BlockSearch(NamedTuple):
 
             there = slot < bits.total[:, None]
             pair = decide_pairs(there, points, self.cutoff)
-            one = np.uint32(1) << bit.astype(jnp.uint32)
-            change = jnp.where(pair, one, np.uint32(0)) - (one << np.uint32(LANES))  # doubtful no longer, and a hit if it is a pair
+            change = _decided(bit, pair)
             word = jnp.where(there, word, packed.size)
             packed = packed.reshape(-1).at[word].add(change, mode="drop").reshape(packed.shape)
             more = largest_of(bits.total) > _SLOTS
@@ -416,10 +460,13 @@ class BlockSearch(NamedTuple):
             radii = self.cutoff.of_pairs(
                 None if own is None else flat_take(own, place), None if others is None else flat_take(others, candidate)
             )
+        if torus is None:  # these are the given points
+            a, b = (jnp.stack([flat_take(x, k) for x in of.axes]) for of, k in ((self.queries, place), (self.sources, candidate)))
+            return Pair(a, b, radii)
         i, j = flat_take(self.queries.ids, place), flat_take(self.sources.ids, candidate)
         sources, queries = self.candidates.given
         pair = Pair(take_points(queries, i), take_points(sources, j), radii)
-        if torus is None or image is None:
+        if image is None:
             return pair
         matrix = torus.matrix.at[..., place].get(mode="promise_in_bounds") if torus.images.per_system else torus.matrix
         shift = jnp.moveaxis(shifts_of(torus, i, j, image), -1, 0)

@@ -30,10 +30,9 @@ class Tuning(NamedTuple):
         by_gathers: Whether what a slot needs to know of a group of words, and a word of its run, is gathered, instead of chosen by
             looking at every group or run.
         group: Slots of a row that are filled at a time.
-        at_once: A block of up to so many queries, in open space, is processed without any loop unless a query has more words of
-            candidates than are usual, more doubtful ones than one, or more neighbors than `fold_group`. A loop whose length the
-            data decide makes the host of an accelerator wait before each turn, but such a program takes longer to compile.
-        fold_group: Slots of a row that are summed at a time, where `at_once` allows it.
+        at_once: In blocks of up to so many queries, doubtful candidates of all are decided at once, instead of collecting those that
+            have some: an accelerator's host would have to wait for their number.
+        fold_group: Slots of a row that are summed at a time. Where it is large, fewer turns of a loop are waited for.
     """
 
     scratch: int

@@ -10,15 +10,60 @@ from jfrnn._geometry import flat_take
 
 LANES = 16  # candidates per word: in a uint32 hits take the lower half, doubtful candidates the upper half
 _GROUP = 8  # words whose counts are bytes of two integers
-_FEW = 16  # entries that are compared one by one
+_FEW = 12  # entries that are compared one by one
 _BYTES = np.uint32(0x01010101)
 _TOPS = np.uint32(0x80808080)
 
 
-def windows(x: Array, first: Array) -> Array:
-    """Gather x[first : first + 16] for every word, as contiguous slices, which is several times faster than by element."""
-    dimensions = lax.GatherDimensionNumbers(offset_dims=(2,), collapsed_slice_dims=(), start_index_map=(0,))
-    return lax.gather(x, first[..., None], dimensions, (LANES,), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
+class Lanes(NamedTuple):
+    """The 16 candidates of each word, as an axis of arrays that are compared with the cutoff.
+
+    On a CPU words are [b, w] and lanes their last axis: a word is read as one contiguous slice, several times faster than by element.
+    Elsewhere words are [w, b] and lanes the axis between: each thread tests all 16, and threads next to it test much the same
+    candidates for other queries of a cell.
+
+    Attributes:
+        first: [b, w] or [w, b] int32, the position of each word's first candidate.
+        stop: Where its run ends.
+        image: The image code of its run, or None.
+        queries_last: Whether words are [w, b]. Static.
+    """
+
+    first: Array
+    stop: Array
+    image: Array | None
+    queries_last: bool
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The numbers of the lanes, int32, along their axis."""
+        return np.arange(LANES, dtype=np.int32).reshape((1, -1, 1) if self.queries_last else (1, 1, -1))
+
+    @property
+    def places(self) -> Array:
+        """The position of each candidate."""
+        return self.of_words(self.first) + self.numbers
+
+    def of_words(self, x: Array) -> Array:
+        """Return values of words for all their lanes."""
+        return x[:, None] if self.queries_last else x[..., None]
+
+    def of_queries(self, x: Array) -> Array:
+        """Return values [b] of queries for all their candidates."""
+        return x[None, None] if self.queries_last else x[:, None, None]
+
+    def read(self, x: Array) -> Array:
+        """Gather the values of the candidates."""
+        if self.queries_last:
+            return flat_take(x, self.places)
+        dimensions = lax.GatherDimensionNumbers(offset_dims=(2,), collapsed_slice_dims=(), start_index_map=(0,))
+        return lax.gather(x, self.first[..., None], dimensions, (LANES,), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
+
+    def joined(self, value: Array) -> Array:
+        """Join uint32 values of all lanes by `or`, each shifted by the number of its lane: [b, w]."""
+        value = value << self.numbers.astype(np.uint32)
+        words = lax.reduce(value, np.uint32(0), lax.bitwise_or, (1 if self.queries_last else 2,))
+        return lax.optimization_barrier(words).T if self.queries_last else words  # a kernel of its own compiles in less time
 
 
 def bit_counts(words: Array) -> Array:
@@ -76,10 +121,10 @@ class BitRows(NamedTuple):
         word = lax.min(group * _GROUP + word.astype(jnp.int32), np.int32(width - 1))
         word = word + lax.broadcasted_iota(jnp.int32, ordinal.shape, 0) * width
         if self.by_gathers:
-            return word, _nth_bit(flat_take(self.hits, word), within)
+            return word, nth_bit(flat_take(self.hits, word), within)
         word, within = lax.optimization_barrier((word, within))  # kernels without gathers are vectorized
         found = lax.optimization_barrier(flat_take(self.hits, word))
-        return word, lax.optimization_barrier(_nth_bit(found, within))
+        return word, lax.optimization_barrier(nth_bit(found, within))
 
     def _group_of(self, ordinal: Array) -> tuple[Array, Array, Array, Array]:
         """Return the group in which a bit is, the number of bits in earlier ones, and the bytes of the group."""
@@ -102,13 +147,14 @@ def _column(x: Array, k: int, shape: tuple[int, ...]) -> Array:
 
 
 def last_reached(ascending: Array, value: Array) -> Array:
-    """Return the last place in each ascending row [b, w] whose entry is <= value [b, k], or 0, by few comparisons or gathers."""
-    last, place = ascending.shape[1] - 1, jnp.zeros_like(value)
+    """Return the last place in each ascending row [b, w] whose entry is <= value [b, k], or 0, by few comparisons or a search.
+
+    Entries are gathered: a reduction over a row would take XLA's autotuner for GPUs seconds to compile, and slices kernels of their own.
+    """
+    last = ascending.shape[1] - 1
+    row, place = lax.broadcasted_iota(jnp.int32, value.shape, 0) * (last + 1), jnp.zeros_like(value)
     if last < _FEW:
-        for k in range(1, last + 1):
-            place = place + (_column(ascending, k, value.shape) <= value).astype(jnp.int32)
-        return place
-    row = lax.broadcasted_iota(jnp.int32, value.shape, 0) * (last + 1)
+        return sum(((flat_take(ascending, row + k) <= value).astype(jnp.int32) for k in range(1, last + 1)), place)
     for bit in reversed(range(last.bit_length())):  # binary searches
         further = lax.min(place + np.int32(1 << bit), np.int32(last))
         place = lax.select(flat_take(ascending, row + further) <= value, further, place)
@@ -122,7 +168,7 @@ def _until_bytes() -> np.ndarray:
     return reached.reshape(2, 4, _GROUP).sum(1, dtype=np.uint32)[None, None]
 
 
-def _nth_bit(word: Array, ordinal: Array) -> Array:
+def nth_bit(word: Array, ordinal: Array) -> Array:
     """Return the position of the ordinal-th set bit of 16, by bisection of counts: int32; both are uint32."""
     pairs = word - (word >> np.uint32(1) & np.uint32(0x5555))
     fours = (pairs & np.uint32(0x3333)) + (pairs >> np.uint32(2) & np.uint32(0x3333))

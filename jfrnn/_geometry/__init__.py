@@ -21,6 +21,7 @@ from jfrnn._geometry.cutoffs import (
 from jfrnn._geometry.exact import (
     Pair,
     Shifted,
+    decide_in_integers,
     decide_in_units,
     decide_pairs,
     flat_take,

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,13 +10,28 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry.floats import two_sum, unit_scale
-from jfrnn._geometry.integers import limb_bits, limb_type
+from jfrnn._geometry.integers import limb_type
 
 Flags = Any  # bool array of NumPy or JAX, like the argument
 RULES = ("gather", "scatter", "either", "both", "mean")  # cutoff of a pair: i's, j's, larger, smaller, mean
 SUM = "sum"  # a rule of users: the mean of doubled radii, exactly
 TABLE = "table"  # a rule of pairs of species
 EXCHANGED = {"gather": "scatter", "scatter": "gather"}  # rules that become another one where i and j are exchanged
+
+
+class Units(NamedTuple):
+    """How step 2 of the pair test counts scaled lengths: 2^-upper units, each of 2^(2 limb) smaller ones.
+
+    Attributes:
+        upper: Binary digits of the upper integer. Scaled lengths are below 2^(31 - upper) (float64: 2^(63 - upper)).
+        limb: Binary digits of a limb of a square; the lower integer has twice as many.
+    """
+
+    upper: int
+    limb: int
+
+
+UNITS = {4: Units(15, 12), 8: Units(34, 26)}  # by the size of a float [B]: 2^-39 and 2^-86 of a scaled length
 
 
 @jax.tree_util.register_dataclass
@@ -158,15 +173,11 @@ def make_cutoff(value: float, dtype: np.dtype, closed: bool) -> Cutoff:
 
 
 def _limbs_of_square(radius: np.floating, scale: np.floating) -> np.ndarray:
-    """Return (r·scale)² in units of step 2, which express it: [7] limbs, the lowest first, of which the highest keeps the rest."""
-    bits, whole = limb_bits(radius.dtype), limb_type(radius.dtype)
-    number = int(float(radius) * float(scale) * 2.0 ** (fraction_bits(radius.dtype, 1) + bits)) ** 2
-    return np.array([number >> (bits * k) & ((1 << bits) - 1) if k < 6 else number >> (bits * k) for k in range(7)], whole)
-
-
-def fraction_bits(dtype: np.dtype, times: int) -> int:
-    """Return the binary digits of the upper integers of step 2: `times` displacements are below half their range."""
-    return 8 * dtype.itemsize - 3 - times
+    """Return the limbs of r² in the units of step 2, the lowest first."""
+    units = UNITS[radius.dtype.itemsize]
+    number = int(float(radius) * float(scale) * 2.0 ** (units.upper + 2 * units.limb)) ** 2
+    limbs = [number >> (units.limb * k) & ((1 << units.limb) - 1) for k in range(6)] + [number >> (units.limb * 6)]
+    return np.array(limbs, limb_type(radius.dtype))
 
 
 def make_cutoffs(radii: Radii, closed: bool, skin: float = 0.0) -> Cutoffs:

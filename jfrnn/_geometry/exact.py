@@ -7,9 +7,10 @@ There are three steps. Each is exact where it decides, and only evaluated for wh
    denormals add at most 3·2^-126 to a difference, less than 2^-28 of any cutoff that `check_cutoff` accepts. A band of 8 eps on
    either side is therefore safe however the compiler fuses multiply-adds; the CPU kernels, which flush nothing that matters here,
    use 4 eps.
-2. `_fixed_sign` counts distances in units of about 2^-39 cutoffs (float64: 2^-86), in two machine integers per axis. The upper one
-   wraps around, so coordinates and lattice translations of any size may be added; only the displacement has to fit. It decides all
-   pairs whose coordinates are whole numbers of units, as all floats are that exceed 2^-14 cutoffs (float64: 2^-32).
+2. `_fixed_sign` counts distances in units of 2^-39 scaled lengths (float64: 2^-86), in two machine integers per axis. A difference of
+   two floats is exactly the sum of two others (Knuth 1969), which are converted to these units. It decides all pairs whose
+   coordinates are whole numbers of units, as all floats are that exceed 2^-14 cutoffs (float64: 2^-32), unless coordinates differ
+   by more than 2^14 cutoffs (2^27), as those of images of particles that were not wrapped may.
 3. `_integer_sign` uses fixed-point integers as wide as the float format (`jfrnn._geometry.integers`), which never round. It decides
    the pairs that are left.
 """
@@ -22,12 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._geometry.cutoffs import Cutoff, Cutoffs, fraction_bits, step_one_bounds
-from jfrnn._geometry.floats import WHOLE_BITS, unit_scale
+from jfrnn._geometry.cutoffs import UNITS, Cutoff, Cutoffs, step_one_bounds
+from jfrnn._geometry.floats import WHOLE_BITS, two_sum, unit_scale
 from jfrnn._geometry.integers import (
     carry_limbs,
     full_count,
-    limb_bits,
     limb_product,
     limb_sign,
     limb_type,
@@ -63,6 +63,21 @@ class Pair(NamedTuple):
         if self.orthogonal:
             return [(self.shift[:dim], jnp.stack([matrix[k, k] for k in range(dim)]))]
         return [(shift[None], vector) for shift, vector in zip(self.shift, matrix, strict=True)]
+
+    def along(self, k: int) -> "_Component":
+        """Return the components along one axis."""
+        if self.shift is None or self.matrix is None:
+            return _Component(self.a[k], self.b[k], [])
+        terms = [(self.shift[k], self.matrix[k, k])] if self.orthogonal else list(zip(self.shift, self.matrix[:, k], strict=True))
+        return _Component(self.a[k], self.b[k], terms)
+
+
+class _Component(NamedTuple):
+    """Components of points a and b and of the lattice vectors between them, with their shifts: along one axis, or along all [d, ...]."""
+
+    a: Array
+    b: Array
+    terms: list[tuple[Array, Array]]
 
 
 PointsAt = Callable[[Array | None], Pair]
@@ -208,9 +223,15 @@ def decide_pairs(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) ->
 
 
 def decide_in_units(pair: Pair, cutoff: Cutoff | Cutoffs) -> tuple[Array, Array]:
-    """Decide pairs by step 2 alone; return which of them it can decide, and which of these are within the cutoff."""
-    sign = _fixed_sign(pair, _threshold(pair, cutoff))
+    """Decide pairs by step 2 alone, in one kernel; return which it can decide, and which of these are within the cutoff."""
+    sign = _fixed_sign(pair, _threshold(pair, cutoff), by_axis=True)
     return sign != _UNKNOWN, sign <= 0 if cutoff.closed else sign < 0
+
+
+def decide_in_integers(pair: Pair, cutoff: Cutoff | Cutoffs) -> Array:
+    """Decide [k] pairs by step 3; return which are within the cutoff."""
+    sign = _integer_sign(pair, _threshold(pair, cutoff))
+    return sign <= 0 if cutoff.closed else sign < 0
 
 
 class _Threshold(NamedTuple):
@@ -239,83 +260,89 @@ def _threshold(pair: Pair, cutoff: Cutoff | Cutoffs) -> _Threshold:
     return _Threshold(radii, unit_scale(functools.reduce(jnp.maximum, radii)))
 
 
-def _fixed_sign(pair: Pair, threshold: _Threshold) -> Array:
+def _fixed_sign(pair: Pair, threshold: _Threshold, by_axis: bool = False) -> Array:
     """Return the sign of |b - a|² - r² where units of step 2 express all its parts, ties included, else _UNKNOWN; int32.
 
-    A cutoff is below 4 in scaled lengths, and so is each component of a displacement that step 1 leaves open, up to its band.
-    All axes are processed together, so that the program is short.
+    All axes are processed together, so that the program is short, or one after the other, so that all is one kernel.
     """
-    dtype = np.dtype(pair.a.dtype)
-    fraction = fraction_bits(dtype, threshold.times)
-    eps, bits = jnp.finfo(dtype).eps, limb_bits(dtype)
-    unsigned, finfo = np.dtype(f"uint{8 * dtype.itemsize}").type, jnp.finfo(dtype)
-    exponent = (lax.bitcast_convert_type(threshold.scale, unsigned) >> unsigned(finfo.nmant)).astype(jnp.int32)
-    up = exponent + (fraction + bits + int(finfo.minexp) - finfo.nmant - (finfo.maxexp - 1))
-    up_of_axes, scale = (x[None] if x.ndim else x for x in (up, threshold.scale))
-    (a, whole_a), (b, whole_b) = (_fixed_point(x, up_of_axes) for x in (pair.a, pair.b))
-    displacement, estimate, known = _add(b, a, -1), pair.b - pair.a, whole_a & whole_b
-    error = jnp.zeros((), dtype)
-    for shift, vector in pair.lattice_terms():
-        number, whole = _fixed_point(vector, up_of_axes)
-        displacement = _add(displacement, number, shift.astype(limb_type(dtype)))
-        estimate = estimate + shift * vector
-        error = error + 16 * eps * (jnp.abs(pair.a) + jnp.abs(pair.b) + jnp.abs(shift * vector))
-        known = known & whole & (jnp.abs(shift) <= 2**WHOLE_BITS)
-    known = known & ((jnp.abs(estimate) + error) * scale < 4.5)
-    total = [functools.reduce(lax.add, limb) for limb in _square_limbs(displacement, threshold.times, bits)]
-    known = functools.reduce(lax.bitwise_and, known)
-    less = threshold.less
+    if by_axis:
+        axes = [_square_in_units(pair.along(k), threshold.scale) for k in range(len(pair.b))]
+        limbs, known = zip(*(x for x, _ in axes), strict=True), [x for _, x in axes]
+    else:
+        scale = threshold.scale[None] if threshold.scale.ndim else threshold.scale
+        limbs, known = _square_in_units(_Component(pair.a, pair.b, pair.lattice_terms()), scale)
+    total, known = [functools.reduce(lax.add, limb) for limb in limbs], functools.reduce(lax.bitwise_and, known)
+    less, times = threshold.less, threshold.times**2
     if less is None:
-        numbers, wholes = zip(*(_fixed_point(x, up) for x in threshold.radii), strict=True)
-        less = [-x for x in _square_limbs(functools.reduce(_add, numbers), 1, bits)]
+        numbers, wholes = zip(*(_in_units(x, threshold.scale) for x in threshold.radii), strict=True)
+        less = [-x for x in _square_limbs(*map(functools.partial(functools.reduce, lax.add), zip(*numbers, strict=True)))]
         known = functools.reduce(lax.bitwise_and, wholes, known)
-    return jnp.where(known, _sign_of_limbs([x + y for x, y in zip(total, less, strict=True)], bits), _UNKNOWN)
+    return jnp.where(known, _sign_of_limbs([x * times + y for x, y in zip(total, less, strict=True)]), _UNKNOWN)
 
 
-class _Fixed(NamedTuple):
-    """A number upper + lower / 2^bits in the units of step 2, `bits` being those of a limb. `upper` wraps around."""
+def _square_in_units(component: _Component, scale: Array) -> tuple[list[Array], Array]:
+    """Return the limbs of (b - a)² in the units of step 2, and whether these express b - a.
 
-    upper: Array
-    lower: Array
-
-
-def _add(x: _Fixed, y: _Fixed, times: Array | int = 1) -> _Fixed:
-    return _Fixed(x.upper + y.upper * times, x.lower + y.lower * times)
-
-
-def _fixed_point(x: Array, up: Array) -> tuple[_Fixed, Array]:
-    """Return x in the units of step 2, and whether it has no finer digits; `up` is where the lowest bit of denormals is there."""
-    dtype, finfo = np.dtype(x.dtype), jnp.finfo(x.dtype)
-    bits, width, whole = limb_bits(dtype), 8 * dtype.itemsize, limb_type(dtype)
-
-    def by(amount: Array) -> Array:  # the result of longer shifts would depend on the hardware
-        return lax.clamp(whole.type(0), amount, whole.type(width - 1))
-
-    word = lax.bitcast_convert_type(x, whole)
-    exponent = (word >> finfo.nmant) & ((1 << finfo.nexp) - 1)
-    mantissa = (word & ((1 << finfo.nmant) - 1)) | (jnp.minimum(exponent, 1) << finfo.nmant)
-    place = jnp.maximum(exponent, 1) + (up.astype(whole) - 1)  # of the lowest digit, in digits of `lower`
-    finer, left = by(-place), jnp.maximum(place, 0)
-    digits, sign = mantissa >> finer, (word >> (width - 1)) | 1
-    upper = jnp.where(left < bits + width, (digits >> by(bits - left)) << by(left - bits), 0)
-    lower = (digits << by(left)) & ((1 << bits) - 1)
-    return _Fixed(upper * sign, lower * sign), digits << finer == mantissa
+    A cutoff is below 4 in scaled lengths, and so is each component of a displacement that step 1 leaves open, up to its band.
+    The difference of two floats is exactly the sum of two others, where no digit lies below the smallest normal float.
+    """
+    dtype = np.dtype(component.a.dtype)
+    eps, limb = jnp.finfo(dtype).eps, UNITS[dtype.itemsize].limb
+    difference, finer = two_sum(component.b, -component.a)
+    numbers, knowns = zip(*(_in_units(x, scale) for x in (difference, finer)), strict=True)
+    upper, lower = (x + y for x, y in zip(*numbers, strict=True))
+    known = _has_normal_digits(component.a) & _has_normal_digits(component.b) & knowns[0] & knowns[1]
+    if not component.terms:
+        return _square_limbs(upper, lower), known & (jnp.abs(difference) * scale < 4.5)
+    lowest, lower = lower & ((1 << limb) - 1), lower >> limb
+    estimate, error = difference, 16 * eps * (jnp.abs(component.a) + jnp.abs(component.b))
+    for shift, vector in component.terms:
+        (upper_part, lower_part), whole = _in_units(vector, scale)
+        times = shift.astype(limb_type(dtype))
+        upper, lower = upper + upper_part * times, lower + (lower_part >> limb) * times
+        lowest = lowest + (lower_part & ((1 << limb) - 1)) * times
+        estimate, error = estimate + shift * vector, error + 16 * eps * jnp.abs(shift * vector)
+        known = known & whole & _has_normal_digits(vector) & (jnp.abs(shift) <= 2**WHOLE_BITS)
+    lower = lower + (lowest >> limb)
+    upper, lower = upper + (lower >> limb), (lower & ((1 << limb) - 1)) << limb | (lowest & ((1 << limb) - 1))
+    return _square_limbs(upper, lower), known & ((jnp.abs(estimate) + error) * scale < 4.5)
 
 
-def _square_limbs(x: _Fixed, times: int, bits: int) -> list[Array]:
-    """Return (times·x)² in seven limbs, the lowest first, not carried; the highest keeps the rest."""
-    lower, mask = x.lower * times, (1 << bits) - 1
-    upper, lower = x.upper * times + (lower >> bits), lower & mask
-    negative = upper < 0
-    upper = jnp.where(negative, jnp.where(lower == 0, -upper, ~upper), upper)
-    lower = jnp.where(negative, -lower & mask, lower)
-    limbs = [lower, upper & mask, (upper >> bits) & mask, upper >> (2 * bits)]
+def _has_normal_digits(x: Array) -> Array:
+    """Say which floats are 0 or so large that all their digits are at least the smallest normal float, which no device flushes."""
+    finfo = jnp.finfo(x.dtype)
+    unsigned = np.dtype(f"uint{finfo.bits}").type
+    least = unsigned(finfo.nmant + 1) << unsigned(finfo.nmant + 1)
+    return (lax.bitcast_convert_type(x, unsigned) << unsigned(1)) - unsigned(1) >= least - unsigned(1)
+
+
+def _in_units(x: Array, scale: Array) -> tuple[tuple[Array, Array], Array]:
+    """Return x in the upper and the lower units of step 2, integers of the same sign, and whether these express it."""
+    dtype, whole = np.dtype(x.dtype), limb_type(np.dtype(x.dtype))
+    units = UNITS[dtype.itemsize]
+    scaled = x * (scale * dtype.type(2.0**units.upper))
+    upper = scaled.astype(whole)
+    rest = (scaled - upper.astype(dtype)) * dtype.type(2.0 ** (2 * units.limb))
+    lower = rest.astype(whole)
+    fits = jnp.abs(scaled) < dtype.type(2.0 ** (8 * dtype.itemsize - 1))
+    return (upper, lower), fits & (lower.astype(dtype) == rest) & ((scaled != 0) | (x == 0))
+
+
+def _square_limbs(upper: Array, lower: Array) -> list[Array]:
+    """Return the square of a number in upper and lower units: seven limbs, the lowest first, not carried; the highest keeps the rest.
+
+    `lower` is below 2^25 (float64: 2^53). Three of these squares, four times, fit into the integers.
+    """
+    bits = UNITS[np.dtype(upper.dtype).itemsize].limb
+    mask = (1 << bits) - 1
+    limbs = [lower & mask, lower >> bits, upper & mask, upper >> bits]
     pairs, twice = [[(i, k - i) for i in range(4) if 0 <= k - i <= i] for k in range(7)], [2 * limb for limb in limbs]
     return [functools.reduce(lax.add, ((limbs if i == j else twice)[i] * limbs[j] for i, j in of_limb)) for of_limb in pairs]
 
 
-def _sign_of_limbs(limbs: list[Array], bits: int) -> Array:
+def _sign_of_limbs(limbs: list[Array]) -> Array:
     """Return the sign of a sum of squares of `_square_limbs`, int32."""
+    bits = UNITS[np.dtype(limbs[0].dtype).itemsize].limb
     carry, rest = jnp.zeros_like(limbs[0]), jnp.zeros_like(limbs[0])
     for limb in limbs[:-1]:
         total = limb + carry
