@@ -51,28 +51,40 @@ def list_neighbors(
             bits = BitRows.of(hits, tuning.by_gathers)
             total = bits.total
 
-            def add_group(g: Array, rows: Array) -> Array:
-                start = jnp.minimum(g * group, capacity - group)
+            def find_group(start: Array | int) -> Array:
+                """Return the neighbors for slots [start, start + group), and -1 for slots that this chunk does not fill."""
                 ordinal = (start + slots)[None] - count[:, None]
                 word, bit = bits.nth(ordinal)
                 neighbor = flat_take(engine.sources.ids, flat_take(first, word) + bit)
                 if image is not None and images > 1:
                     neighbor = neighbor + n * flat_take(image, word)
-                old = rows if group == capacity else lax.dynamic_slice_in_dim(rows, start, group, axis=1)
-                new = jnp.where((ordinal >= 0) & (ordinal < total[:, None]), neighbor, old)
-                if group == capacity:
-                    return new
-                return lax.dynamic_update_slice_in_dim(rows, lax.optimization_barrier(new), start, axis=1)  # in parts of its own
+                return jnp.where((ordinal >= 0) & (ordinal < total[:, None]), neighbor, -1)
 
-            if group == capacity:
-                rows = add_group(jnp.int32(0), rows)
+            def first_slot(g: Array) -> Array:
+                return jnp.minimum(g * group, capacity - group)
+
+            def keep_filled(rows: Array, found: Array) -> Array:
+                return jnp.where(found < 0, rows, found)
+
+            def put_group(rows: Array, start: Array, found: Array) -> Array:
+                old = lax.dynamic_slice_in_dim(rows, start, group, axis=1)
+                return lax.dynamic_update_slice_in_dim(rows, keep_filled(old, found), start, axis=1)
+
+            def next_group(g: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+                # XLA divides no kernel among cores that writes into a part of an array: so one writes what the turn before found.
+                return put_group(*state), first_slot(g), find_group(first_slot(g))
+
+            if group == capacity and tuning.by_gathers:
+                return keep_filled(rows, find_group(0)), count + total
+            start = np.int32(np.iinfo(np.int32).max), np.int32(0)
+            begin, end = lax.reduce((count, count + total), start, lambda a, b: (lax.min(a[0], b[0]), lax.max(a[1], b[1])), (0,))
+            begin = lax.div(begin, np.int32(group))
+            until = lax.div(lax.min(end, np.int32(capacity)) + np.int32(group - 1), np.int32(group))
+            if group == capacity:  # one turn of a loop, into which XLA does not fuse what has made the words
+                rows = lax.fori_loop(begin, until, lambda g, rows: keep_filled(rows, find_group(first_slot(g))), rows)
             else:
-                start = np.int32(np.iinfo(np.int32).max), np.int32(0)
-                begin, end = lax.reduce(
-                    (count, count + total), start, lambda a, b: (lax.min(a[0], b[0]), lax.max(a[1], b[1])), (0,)
-                )
-                until = lax.div(lax.min(end, np.int32(capacity)) + np.int32(group - 1), np.int32(group))
-                rows = lax.fori_loop(lax.div(begin, np.int32(group)), until, add_group, rows)
+                none = rows, jnp.int32(0), jnp.full((span.size, group), -1, jnp.int32)
+                rows = put_group(*lax.fori_loop(begin, until, next_group, none))
             return rows, count + total
 
         rows = jnp.full((span.size, capacity), n * images, jnp.int32)

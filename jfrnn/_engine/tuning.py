@@ -56,7 +56,7 @@ CPU = Tuning(  # a block fits into the caches, and loops cost little
     doubtful_share=1,
     doubtful_rows=64,
     by_gathers=False,
-    group=32,
+    group=160,
 )
 ACCELERATOR = Tuning(  # few large kernels, in at most 1 GB
     scratch=900_000_000,
