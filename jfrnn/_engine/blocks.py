@@ -15,7 +15,7 @@ from jax import Array, lax
 from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
 from jfrnn._engine.problem import Filter
 from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
-from jfrnn._engine.words import LANES, BitRows, bit_counts, last_reached, windows
+from jfrnn._engine.words import CHUNK, LANES, BitRows, bit_counts, last_reached, windows
 from jfrnn._geometry import (
     Cutoff,
     Cutoffs,
@@ -68,8 +68,14 @@ class HitWords(NamedTuple):
     """The neighbors in a chunk of candidates: one bit per candidate, [b, words] each."""
 
     hits: Array  # in the lower half
-    first: Array  # position of each word's first candidate
+    first: Array | None  # position of each word's first candidate; None if the words of each row hold all sources in their order
     image: Array | None  # image code
+
+    def places(self, word: Array, bit: Array) -> Array:
+        """Return the positions of candidates [b, k], by the positions of their words among those of all rows and their bits."""
+        if self.first is not None:
+            return flat_take(self.first, word) + bit
+        return LANES * lax.rem(word.astype(jnp.uint32), np.uint32(self.hits.shape[1])).astype(jnp.int32) + bit
 
 
 Add = Callable[[HitWords, State], State]
@@ -110,7 +116,12 @@ class BlockSearch(NamedTuple):
         words = self.candidates.words(self.capacity)
         if self.tuning.by_gathers:
             return min(words, _MOST_WORDS)
-        return min(-(-words // 8) * 8, _MOST_WORDS // 4)
+        return min(-(-words // 8) * 8, CHUNK // LANES)
+
+    @property
+    def reads_all(self) -> bool:
+        """Whether a chunk holds all sources in their order: no runs, words or places have to be looked up."""
+        return self.candidates.whole and self.candidates.size <= CHUNK and not self.tuning.by_gathers
 
     @property
     def block_count(self) -> int:
@@ -204,6 +215,9 @@ class BlockSearch(NamedTuple):
         return lax.while_loop(lambda now: now[0], add_next, (jnp.asarray(longest > 0), jnp.int32(0), state))[2]
 
     def word_table(self, span: Span, which: Array) -> _WordTable:
+        if self.reads_all:  # there is nothing to look up
+            none = jnp.zeros((span.size, 0), jnp.int32)
+            return _WordTable(none, none, None, None, jnp.zeros(span.size, jnp.int32), self.candidates.most_words)
         start, stop, image = self.candidates.runs(span, which)
         count, runs = _words_of(start, stop), start.shape[1]
         total, before = jnp.sum(count, axis=1, dtype=jnp.int32), None
@@ -219,17 +233,28 @@ class BlockSearch(NamedTuple):
         packed, first, image = self._test_words(span, own, table, chunk)
         return HitWords(self._decide_doubtful(packed, first, image, span), first, image)
 
-    def _test_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
+    def ids_of(self, words: HitWords, word: Array, bit: Array) -> Array:
+        """Return the sources that bits stand for; those of unset bits are any."""
+        place = words.places(word, bit)
+        return lax.min(place, np.int32(self.candidates.size - 1)) if words.first is None else flat_take(self.sources.ids, place)
+
+    def _test_words(
+        self, span: Span, own: list[Array], table: _WordTable, chunk: Array
+    ) -> tuple[Array, Array | None, Array | None]:
         """Return a chunk of words with hits and doubtful candidates, the positions of their first candidates, and their images."""
-        first, stop, image = self._locate_words(table, chunk)
-        query = [x[:, None] for x in own]
-        if image is not None and self.candidates.torus is not None:  # translate the query instead of the image
-            query = [q - t for q, t in zip(query, self._translations(self.candidates.torus, image, span), strict=True)]
-        packed = self._test(first, stop, image, query, span)
+        if self.reads_all:
+            first, image = jnp.broadcast_to(LANES * lax.iota(jnp.int32, self.words), (span.size, self.words)), None
+            packed = self._test_all(first, own, span)
+        else:
+            first, stop, image = self._locate_words(table, chunk)
+            query = [x[:, None] for x in own]
+            if image is not None and self.candidates.torus is not None:  # translate the query instead of the image
+                query = [q - t for q, t in zip(query, self._translations(self.candidates.torus, image, span), strict=True)]
+            packed = self._test(first, stop, image, query, span)
         if self.candidates.excluded is not None:
             allowed = ~self._excluded_lanes(self.candidates.excluded, first, span) & _HITS
             packed = packed & (allowed | allowed << np.uint32(LANES))
-        return lax.optimization_barrier((packed, first, image))
+        return lax.optimization_barrier((packed, None if self.reads_all else first, image))
 
     def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
         word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (table.start.shape[0], self.words))
@@ -276,6 +301,28 @@ class BlockSearch(NamedTuple):
             return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,))
         allowed = self._allowed_lanes(first, stop, image, span)
         return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,)) & (allowed | allowed << np.uint32(LANES))
+
+    def _test_all(self, first: Array, own: list[Array], span: Span) -> Array:
+        """Do what `_test` does for words of all sources; what stands behind the last one is no neighbor."""
+        none = np.uint32(0)
+
+        def read(x: Array) -> Array:
+            return x[: self.words * LANES].reshape(1, self.words, LANES)
+
+        square = squared_distance([read(x) - q[:, None, None] for x, q in zip(self.sources.axes, own, strict=True)], self.cutoff)
+        radii, others = self.queries.radii, self.sources.radii
+        radii = None if radii is None else span.of(radii)[:, None, None]
+        inside, outside = self._bounds(radii, None if others is None else read(others), span)
+        near, doubtful = (x.astype(jnp.uint32) for x in (square < inside, square <= outside))
+        value = (near | (near ^ doubtful) << np.uint32(LANES)) << lax.iota(jnp.uint32, LANES)
+        lane, bits = span.places[:, None] - first, lax.reduce(value, none, lax.bitwise_or, (2,))
+        if self.keep.later_only:
+            refused = (np.uint32(1) << jnp.clip(lane + int(self.keep.drop_self), 0, LANES).astype(jnp.uint32)) - np.uint32(1)
+        elif self.keep.drop_self:
+            refused = jnp.where(lane.astype(jnp.uint32) < LANES, np.uint32(1) << lane.astype(jnp.uint32), none)
+        else:
+            refused = none
+        return bits & ~(refused | refused << np.uint32(LANES))
 
     def _bounds(self, own: Array | None, others: Array | None, span: Span) -> tuple[np.floating | Array, np.floating | Array]:
         torus = self.candidates.torus
@@ -362,7 +409,7 @@ class BlockSearch(NamedTuple):
         here = lax.broadcasted_iota(jnp.int32, packed.shape, 1) == word[:, None]
         return packed + jnp.where(here, change[:, None], np.uint32(0)), many > 0
 
-    def _decide_doubtful(self, packed: Array, first: Array, image: Array | None, span: Span) -> Array:
+    def _decide_doubtful(self, packed: Array, first: Array | None, image: Array | None, span: Span) -> Array:
         """Add the doubtful candidates that are pairs to the hits: [b, words] uint32, of which the lower half is set then.
 
         A round decides the first 32 doubtful candidates of each row that has some, a part of the block at a time.
@@ -387,7 +434,7 @@ class BlockSearch(NamedTuple):
             slot = lax.broadcasted_iota(jnp.int32, (many, _SLOTS), 1)
             word, bit = bits.nth(slot)
             word = word if whole else word + width * (here - lax.iota(jnp.int32, many))[:, None]
-            candidate = flat_take(first, word) + bit
+            candidate = HitWords(asked, first, image).places(word, bit)
 
             def points(at: Array | None) -> Pair:
                 of_row, source, of_word = here[:, None], candidate, word

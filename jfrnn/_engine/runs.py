@@ -47,7 +47,7 @@ def list_neighbors(
 
     def list_block(span: Span) -> list[Array]:
         def add(words: HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
-            (rows, count), (hits, first, image) = found, words
+            (rows, count), (hits, _, image) = found, words
             bits = BitRows.of(hits, tuning.by_gathers)
             total = bits.total
 
@@ -55,7 +55,7 @@ def list_neighbors(
                 """Return the neighbors for slots [start, start + group), and -1 for slots that this chunk does not fill."""
                 ordinal = (start + slots)[None] - count[:, None]
                 word, bit = bits.nth(ordinal)
-                neighbor = flat_take(engine.sources.ids, flat_take(first, word) + bit)
+                neighbor = engine.ids_of(words, word, bit)
                 if image is not None and images > 1:
                     neighbor = neighbor + n * flat_take(image, word)
                 return jnp.where((ordinal >= 0) & (ordinal < total[:, None]), neighbor, -1)
@@ -74,7 +74,7 @@ def list_neighbors(
                 # XLA divides no kernel among cores that writes into a part of an array: so one writes what the turn before found.
                 return put_group(*state), first_slot(g), find_group(first_slot(g))
 
-            if group == capacity and tuning.by_gathers:
+            if group == capacity and (tuning.by_gathers or words.first is None):
                 return keep_filled(rows, find_group(0)), count + total
             start = np.int32(np.iinfo(np.int32).max), np.int32(0)
             begin, end = lax.reduce((count, count + total), start, lambda a, b: (lax.min(a[0], b[0]), lax.max(a[1], b[1])), (0,))
@@ -106,7 +106,7 @@ def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filte
         begin, end = room.starts[ids], room.starts[ids + 1]
 
         def add(words: HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
-            (out, at), (hits, first, image) = found, words
+            (out, at), (hits, _, image) = found, words
             bits = BitRows.of(hits, tuning.by_gathers)
             total = bits.total
 
@@ -114,7 +114,7 @@ def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filte
                 done, out = state
                 ordinal = jnp.broadcast_to(done + slots, (span.size, slots.size))
                 word, bit = bits.nth(ordinal)
-                neighbor = flat_take(engine.sources.ids, flat_take(first, word) + bit)
+                neighbor = engine.ids_of(words, word, bit)
                 if image is not None and images > 1:
                     neighbor = neighbor + n * flat_take(image, word)
                 place = at[:, None] + ordinal
@@ -178,7 +178,7 @@ def fold_neighbors(
 
         def fold(add: Callable[[Slots, Carry], Carry], state: Carry) -> Carry:
             def add_words(words: HitWords, state: Carry, at_once: bool) -> Carry:
-                hits, first, image = words
+                hits, _, image = words
                 bits = BitRows.of(hits, tuning.by_gathers)
                 total = jnp.where(fresh, bits.total, 0)
 
@@ -186,7 +186,7 @@ def fold_neighbors(
                     done, state = state
                     ordinal = jnp.broadcast_to(done + slots, (span.size, slots.size))
                     word, bit = bits.nth(ordinal)
-                    source = flat_take(engine.sources.ids, flat_take(first, word) + bit)
+                    source = engine.ids_of(words, word, bit)
                     shift = None
                     if torus is not None and image is not None:
                         shift = shifts_of(torus, ids[:, None], source, flat_take(image, word))

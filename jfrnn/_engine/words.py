@@ -9,6 +9,7 @@ from jax import Array, lax
 from jfrnn._geometry import flat_take
 
 LANES = 16  # candidates per word: in a uint32 hits take the lower half, doubtful candidates the upper half
+CHUNK = 64 * LANES  # most candidates per query that are tested at a time on a CPU
 _GROUP = 8  # words whose counts are bytes of two integers
 _FEW = 16  # entries that are compared one by one
 _BYTES = np.uint32(0x01010101)
@@ -44,9 +45,9 @@ class BitRows(NamedTuple):
 
     @classmethod
     def of(cls, words: Array, by_gathers: bool) -> "BitRows":
-        """Prepare words, of which only the lower half is used."""
+        """Prepare words, of which only the lower half is used; on a CPU, the upper half has to be empty."""
         rows, width = words.shape
-        hits = words & np.uint32((1 << LANES) - 1)
+        hits = words & np.uint32((1 << LANES) - 1) if by_gathers else words
         groups = -(-width // _GROUP)
         counts = jnp.pad(lax.population_count(hits), ((0, 0), (0, groups * _GROUP - width))).reshape(rows, groups, 1, _GROUP)
         until = lax.optimization_barrier(jnp.sum(counts * _until_bytes(), axis=3, dtype=jnp.uint32))
