@@ -6,7 +6,8 @@
    rounding leaves open is decided exactly (`_decide_first` where no loop is wanted, `_decide_doubtful`).
 4. Compaction: the k-th neighbor of a query is its k-th set bit (`jfrnn._engine.words.BitRows`).
 
-"brute" has no sorting: all particles are one run; on a CPU few of them are read without gathers (`_test_all`). What is chosen by platform stands in `jfrnn._engine.tuning`.
+"brute" has no sorting: all particles are one run; on a CPU few of them are read without gathers (`_test_all`). What is chosen by
+platform stands in `jfrnn._engine.tuning`.
 """
 
 import dataclasses

@@ -246,7 +246,9 @@ class BlockSearch(NamedTuple):
             first, image = jnp.broadcast_to(LANES * lax.iota(jnp.int32, self.words), (span.size, self.words)), None
             packed = self._test_all(first, own, span)
         else:
-            first, stop, image = self._locate_words(table, chunk)
+            first, stop, image = (
+                self._locate_words(table, chunk) if self.tuning.by_gathers else self._locate_apart(span, table, chunk)
+            )
             query = [x[:, None] for x in own]
             if image is not None and self.candidates.torus is not None:  # translate the query instead of the image
                 query = [q - t for q, t in zip(query, self._translations(self.candidates.torus, image, span), strict=True)]
@@ -255,6 +257,21 @@ class BlockSearch(NamedTuple):
             allowed = ~self._excluded_lanes(self.candidates.excluded, first, span) & _HITS
             packed = packed & (allowed | allowed << np.uint32(LANES))
         return lax.optimization_barrier((packed, None if self.reads_all else first, image))
+
+    def _locate_apart(self, span: Span, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
+        """Return the first candidates of words, which of their candidates are allowed, and their images, by a kernel of its own.
+
+        XLA would else find them again for every word that it tests, one after the other. It fuses nothing into a branch.
+        """
+
+        def locate() -> tuple[Array, Array, Array | None]:
+            first, stop, image = self._locate_words(table, chunk)
+            return first, self._allowed_lanes(first, stop, image, span), image
+
+        shape = table.start.shape[0], self.words
+        none, image = jnp.zeros(shape, jnp.int32), table.image
+        always = table.total[0] + chunk >= 0  # which XLA does not know
+        return lax.cond(always, locate, lambda: (none, none.astype(jnp.uint32), None if image is None else none))
 
     def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
         word = jnp.broadcast_to(chunk * self.words + lax.iota(jnp.int32, self.words), (table.start.shape[0], self.words))
@@ -283,7 +300,10 @@ class BlockSearch(NamedTuple):
         return [functools.reduce(jnp.add, (x * own[row, k] for row, x in enumerate(shifts))) for k in range(len(shifts))]
 
     def _test(self, first: Array, stop: Array, image: Array | None, query: list[Array], span: Span) -> Array:
-        """Compare 16 candidates per word with the cutoff in working precision: low half hits, high half doubtful ones."""
+        """Compare 16 candidates per word with the cutoff in working precision: low half hits, high half doubtful ones.
+
+        Where nothing is looked up by gathers, `stop` holds the bits of the candidates that are allowed.
+        """
         difference = [windows(x, first) - q[..., None] for x, q in zip(self.sources.axes, query, strict=True)]
         square = squared_distance(difference, self.cutoff)
         own, others = self.queries.radii, self.sources.radii
@@ -299,8 +319,7 @@ class BlockSearch(NamedTuple):
         if self.tuning.by_gathers:  # in the same kernel
             value = jnp.where(self._is_allowed(first, stop, image, span), value, np.uint32(0))
             return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,))
-        allowed = self._allowed_lanes(first, stop, image, span)
-        return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,)) & (allowed | allowed << np.uint32(LANES))
+        return lax.reduce(value, np.uint32(0), lax.bitwise_or, (2,)) & (stop | stop << np.uint32(LANES))
 
     def _test_all(self, first: Array, own: list[Array], span: Span) -> Array:
         """Do what `_test` does for words of all sources; what stands behind the last one is no neighbor."""
@@ -425,14 +444,14 @@ class BlockSearch(NamedTuple):
 
         def decide_round(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             # The barrier keeps what follows in the loop: it is not worth computing where no round is needed.
-            _, at, packed, row = lax.optimization_barrier((*state, queue))
+            open_pairs, at, packed, row = lax.optimization_barrier((*state, queue))
             row = row if whole else lax.dynamic_slice_in_dim(row, at, many)
             here = jnp.minimum(row, rows - 1)
             both = packed if whole else jnp.where((row < rows)[:, None], packed[here], np.uint32(0))
             asked = both >> np.uint32(LANES)
             bits = BitRows.of(asked, self.tuning.by_gathers)
             slot = lax.broadcasted_iota(jnp.int32, (many, _SLOTS), 1)
-            word, bit = bits.nth(slot)
+            word, bit = bits.nth(slot) if self.tuning.by_gathers else bits.nth_apart(slot, open_pairs)
             word = word if whole else word + width * (here - lax.iota(jnp.int32, many))[:, None]
             candidate = HitWords(asked, first, image).places(word, bit)
 

@@ -82,6 +82,11 @@ class BitRows(NamedTuple):
         found = lax.optimization_barrier(flat_take(self.hits, word))
         return word, lax.optimization_barrier(_nth_bit(found, within))
 
+    def nth_apart(self, ordinal: Array, needed: Array) -> tuple[Array, Array]:
+        """Return `nth` if it is needed, [] bool. XLA fuses nothing into a branch: several kernels read what one has found."""
+        none = jnp.zeros_like(ordinal)
+        return lax.cond(needed, lambda: self.nth(ordinal), lambda: (none, none))
+
     def _group_of(self, ordinal: Array) -> tuple[Array, Array, Array, Array]:
         """Return the group in which a bit is, the number of bits in earlier ones, and the bytes of the group."""
         if self.by_gathers:
