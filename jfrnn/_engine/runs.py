@@ -185,11 +185,18 @@ def fold_neighbors(
                 def add_group(state: tuple[Array, Any]) -> tuple[Array, Any]:
                     done, state = state
                     ordinal = jnp.broadcast_to(done + slots, (span.size, slots.size))
-                    word, bit = bits.nth(ordinal)
-                    source = engine.ids_of(words, word, bit)
-                    shift = None
-                    if torus is not None and image is not None:
-                        shift = shifts_of(torus, ids[:, None], source, flat_take(image, word))
+                    with_image = torus is not None and image is not None
+
+                    def find() -> tuple[Array, Array | None]:
+                        word, bit = bits.nth(ordinal)
+                        return engine.ids_of(words, word, bit), flat_take(image, word) if with_image else None
+
+                    if tuning.by_gathers:
+                        source, code = find()
+                    else:  # XLA fuses nothing into a branch, and does not know that it always takes it: so this is found once
+                        none = jnp.zeros_like(ordinal)
+                        source, code = lax.cond(done >= 0, find, lambda: (none, none if with_image else None))
+                    shift = shifts_of(torus, ids[:, None], source, code) if with_image else None
                     return done + size, add(Slots(source, shift, ordinal < total[:, None]), state)
 
                 if at_once:
