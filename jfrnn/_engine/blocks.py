@@ -231,16 +231,15 @@ class BlockSearch(NamedTuple):
         """Test one chunk of words per query; `own` are the d coordinates [b] of the queries."""
         own, table, chunk = lax.optimization_barrier((own, table, chunk))  # as XLA would take small parts out of the loop
         packed, first, image = self._test_words(span, own, table, chunk)
-        return HitWords(self._decide_doubtful(packed, first, image, span), first, image)
+        looked_up = None if self.reads_all else first
+        return HitWords(self._decide_doubtful(packed, looked_up, image, span), looked_up, image)
 
     def ids_of(self, words: HitWords, word: Array, bit: Array) -> Array:
         """Return the sources that bits stand for; those of unset bits are any."""
         place = words.places(word, bit)
         return lax.min(place, np.int32(self.candidates.size - 1)) if words.first is None else flat_take(self.sources.ids, place)
 
-    def _test_words(
-        self, span: Span, own: list[Array], table: _WordTable, chunk: Array
-    ) -> tuple[Array, Array | None, Array | None]:
+    def _test_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
         """Return a chunk of words with hits and doubtful candidates, the positions of their first candidates, and their images."""
         if self.reads_all:
             first, image = jnp.broadcast_to(LANES * lax.iota(jnp.int32, self.words), (span.size, self.words)), None
@@ -256,7 +255,7 @@ class BlockSearch(NamedTuple):
         if self.candidates.excluded is not None:
             allowed = ~self._excluded_lanes(self.candidates.excluded, first, span) & _HITS
             packed = packed & (allowed | allowed << np.uint32(LANES))
-        return lax.optimization_barrier((packed, None if self.reads_all else first, image))
+        return lax.optimization_barrier((packed, first, image))
 
     def _locate_apart(self, span: Span, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
         """Return the first candidates of words, which of their candidates are allowed, and their images, by a kernel of its own.

@@ -185,18 +185,18 @@ def fold_neighbors(
                 def add_group(state: tuple[Array, Any]) -> tuple[Array, Any]:
                     done, state = state
                     ordinal = jnp.broadcast_to(done + slots, (span.size, slots.size))
-                    with_image = torus is not None and image is not None
+                    images = None if torus is None else image
 
                     def find() -> tuple[Array, Array | None]:
                         word, bit = bits.nth(ordinal)
-                        return engine.ids_of(words, word, bit), flat_take(image, word) if with_image else None
+                        return engine.ids_of(words, word, bit), None if images is None else flat_take(images, word)
 
                     if tuning.by_gathers:
                         source, code = find()
                     else:  # XLA fuses nothing into a branch, and does not know that it always takes it: so this is found once
                         none = jnp.zeros_like(ordinal)
-                        source, code = lax.cond(done >= 0, find, lambda: (none, none if with_image else None))
-                    shift = shifts_of(torus, ids[:, None], source, code) if with_image else None
+                        source, code = lax.cond(done >= 0, find, lambda: (none, None if images is None else none))
+                    shift = None if torus is None or code is None else shifts_of(torus, ids[:, None], source, code)
                     return done + size, add(Slots(source, shift, ordinal < total[:, None]), state)
 
                 if at_once:
