@@ -11,6 +11,8 @@ import pytest
 import warp
 from jax._src import compiler
 
+from jfrnn._engine import tuning
+
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_traceback_in_locations_limit", 0)
@@ -20,6 +22,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # to compile the sources of JAX
 gc.freeze()  # imported modules are no garbage; tracing makes many objects that stay: to look through them takes a tenth of the time
 gc.set_threshold(50_000, 20, 20)
 TESTS = count(1)
+tuning.CPU = tuning.CPU._replace(plain_pairs=tuning.CPU.few_pairs)  # "jax" sorts most scenes of tests; "brute" tests all pairs
 XLA_FLAGS = os.environ.get("XLA_FLAGS", "")
 UNFUSED = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 warp.config.log_level = warp.LOG_WARNING  # else it prints what it compiles, into doctests too

@@ -16,8 +16,10 @@ from jfrnn.cases.hard import HARD_CASES
 
 # blocks as small as these cases, so that each has several
 SORTING = tuning.ACCELERATOR.sorting._replace(searched=300)
-ELSEWHERE = tuning.ACCELERATOR._replace(words=1 << 12, few_pairs=1000, sorting=SORTING, doubtful_rows=16)
-AT_ONCE = ELSEWHERE._replace(words=1 << 20, few_pairs=1 << 20, doubtful_rows=1 << 20)  # all rows and their doubtful pairs
+ELSEWHERE = tuning.ACCELERATOR._replace(words=1 << 12, few_pairs=1000, plain_pairs=1000, sorting=SORTING, doubtful_rows=16)
+AT_ONCE = ELSEWHERE._replace(
+    words=1 << 20, few_pairs=1 << 20, plain_pairs=1 << 20, doubtful_rows=1 << 20
+)  # all rows and their doubtful pairs
 LOOPS = ELSEWHERE._replace(at_once=0)  # as blocks of many queries are processed
 TIES = ("lattice_1e-4_at_0", "ulp_far_axis", "cell_edges_far", "queries_fewer")
 
@@ -81,6 +83,15 @@ def test_options_with_the_numbers_of_accelerators(kind):
     found, right = (jfrnn.search(x, cutoff, backend=backend, **options) for backend in ("jax", "warp"))
     assert pairs_of(found) == pairs_of(right)
     np.testing.assert_array_equal(found.count, right.count)
+
+
+def test_few_particles_are_not_sorted(monkeypatch):
+    monkeypatch.setattr(tuning, "CPU", tuning.CPU._replace(plain_pairs=1 << 20))
+    x = np.round(np.random.default_rng(3).random((600, 3)).astype(np.float32) * 16) / 16  # with ties
+    nbrs = jax.jit(lambda x: jfrnn.search(x, 0.25, capacity=100, backend="jax", half=True))(x)
+    idx = np.asarray(nbrs.idx)
+    assert ((idx[:, 1:] > idx[:, :-1]) | (idx[:, 1:] == 600)).all()  # all pairs are tested in the order of indices
+    checked.assert_pairs(nbrs, reference.reference_pairs(x, 0.25, half=True))
 
 
 def pairs_of(nbrs):

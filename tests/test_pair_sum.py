@@ -337,7 +337,7 @@ def test_derivatives_in_a_box(backend, second):
 @pytest.mark.parametrize("backend", ["jax", "list", pytest.param("brute", marks=SLOW)])
 def test_many_blocks(backend, monkeypatch):
     """Blocks of which the last reaches back, in sums over rows and over all pairs."""
-    monkeypatch.setattr(_tuning, "CPU", _tuning.CPU._replace(words=64 * 25, few_pairs=0))
+    monkeypatch.setattr(_tuning, "CPU", _tuning.CPU._replace(words=64 * 25, few_pairs=0, plain_pairs=0))
     monkeypatch.setattr(_relations, "_LIST_SLOTS", 25 * 32 * 4)
     (x, m), weights = scene(0), jnp.arange(2.0)
     given = {"neighbors": jfrnn.search(x, CUTOFF, capacity=47, backend="warp")} if backend == "list" else {"backend": backend}

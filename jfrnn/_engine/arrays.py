@@ -6,7 +6,8 @@
    rounding leaves open is decided exactly (`_decide_first` where no loop is wanted, `_decide_doubtful`).
 4. Compaction: the k-th neighbor of a query is its k-th set bit (`jfrnn._engine.words.BitRows`).
 
-"brute" has no sorting: all particles are one run. What is chosen by platform stands in `jfrnn._engine.tuning`.
+"brute" has no sorting: all particles are one run; on a CPU few of them are read without gathers (`_test_all`). What is chosen by
+platform stands in `jfrnn._engine.tuning`.
 """
 
 import dataclasses
@@ -24,7 +25,7 @@ from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
 from jfrnn._engine.problem import Kind, Options, Room, Rows, Search, largest_radius
 from jfrnn._engine.runs import count_neighbors, fill_neighbors, list_neighbors
 from jfrnn._engine.tuning import Tuning, by_platform
-from jfrnn._engine.words import LANES
+from jfrnn._engine.words import CHUNK, LANES
 from jfrnn._geometry import (
     FINE,
     Axes,
@@ -128,7 +129,9 @@ def refuse_many(search: Search) -> None:
 def is_few(search: Search, tuning: Tuning) -> bool:
     """Say whether testing all pairs takes less time than sorting."""
     images = 1 if search.torus is None or search.per_system else search.torus[0].images.total
-    return math.prod(search.sizes) * images <= tuning.few_pairs
+    plain = search.torus is None and search.batch is None and not search.per_system
+    most = tuning.plain_pairs if plain and search.sizes[0] <= CHUNK else tuning.few_pairs
+    return math.prod(search.sizes) * images <= most
 
 
 def complete_rows(search: Search, idx: Array | None, count: Array, capacity: int | None) -> Rows:
@@ -226,17 +229,20 @@ def _all_sources(
 
     of_sources, of_queries = cutoff.of_points if isinstance(cutoff, Cutoffs) else (None, None)
     words, ids = images * -(-len(sources) // LANES), lax.iota(jnp.int32, len(sources)) if order is None else order
-    ids = jnp.pad(ids, (0, LANES))
+    whole = batch is None and torus is None
+    gap = (0, max(LANES, CHUNK - len(sources)) if whole else LANES)
+    ids = jnp.pad(ids, gap)
     if order is None:
-        radii = None if of_sources is None else jnp.pad(of_sources, (0, LANES))
-        points = Points(list(jnp.pad(sources.T, ((0, 0), (0, LANES)))), ids, radii)
+        radii = None if of_sources is None else jnp.pad(of_sources, gap)
+        points = Points(list(jnp.pad(sources.T, ((0, 0), gap), constant_values=jnp.inf)), ids, radii)  # no neighbors
     else:
         points = _in_order(sources, ids, of_sources)
     rows = _in_order(sources if queries is None else queries, query_order, of_queries)
     if queries is None:  # their positions come first among those of the sources
         rows = rows._replace(axes=points.axes)
     unordered = query_order is None
-    return Candidates(points, rows, runs, torus, len(sources), lambda _: words, in_order=unordered, most_words=words)
+    most, n = words, len(sources)
+    return Candidates(points, rows, runs, torus, n, lambda _: words, in_order=unordered, most_words=most, whole=whole)
 
 
 def _cell_stencil(

@@ -15,7 +15,7 @@ from jax import Array, lax
 from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
 from jfrnn._engine.problem import Filter
 from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
-from jfrnn._engine.words import LANES, BitRows, Lanes, bit_counts, last_reached, nth_bit
+from jfrnn._engine.words import CHUNK, LANES, BitRows, Lanes, bit_counts, last_reached, nth_bit
 from jfrnn._geometry import (
     Cutoff,
     Cutoffs,
@@ -70,8 +70,14 @@ class HitWords(NamedTuple):
     """The neighbors in a chunk of candidates: one bit per candidate, [b, words] each."""
 
     hits: Array  # in the lower half
-    first: Array  # position of each word's first candidate
+    first: Array | None  # position of each word's first candidate; None if the words of each row hold all sources in their order
     image: Array | None  # image code
+
+    def places(self, word: Array, bit: Array) -> Array:
+        """Return the positions of candidates [b, k], by the positions of their words among those of all rows and their bits."""
+        if self.first is not None:
+            return flat_take(self.first, word) + bit
+        return LANES * lax.rem(word.astype(jnp.uint32), np.uint32(self.hits.shape[1])).astype(jnp.int32) + bit
 
 
 Add = Callable[[HitWords, State], State]
@@ -118,7 +124,12 @@ class BlockSearch(NamedTuple):
         words = self.candidates.words(self.capacity)
         if self.tuning.by_gathers:
             return min(words, _MOST_WORDS)
-        return min(-(-words // 8) * 8, _MOST_WORDS // 4)
+        return min(-(-words // 8) * 8, CHUNK // LANES)
+
+    @property
+    def reads_all(self) -> bool:
+        """Whether a chunk holds all sources in their order: no runs, words or places have to be looked up."""
+        return self.candidates.whole and self.candidates.size <= CHUNK and not self.tuning.by_gathers
 
     @property
     def block_count(self) -> int:
@@ -214,6 +225,9 @@ class BlockSearch(NamedTuple):
         return lax.while_loop(lambda now: now[0], add_next, (jnp.asarray(longest > 0), jnp.int32(0), state))[2]
 
     def word_table(self, span: Span, which: Array) -> _WordTable:
+        if self.reads_all:  # there is nothing to look up
+            none = jnp.zeros((span.size, 0), jnp.int32)
+            return _WordTable(none, none, None, None, jnp.zeros(span.size, jnp.int32), self.candidates.most_words)
         start, stop, image = self.candidates.runs(span, which)
         count, runs = _words_of(start, stop), start.shape[1]
         total, before = jnp.sum(count, axis=1, dtype=jnp.int32), None
@@ -229,24 +243,50 @@ class BlockSearch(NamedTuple):
     def hit_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array, again: bool) -> HitWords:
         """Test one chunk of words per query, `again` if that was tried without loops; `own` are the d coordinates [b] of the queries."""
         packed, first, image = self._test_words(span, own, table, chunk)
-        decide = self._decide_doubtful
         if len(packed) <= self.tuning.at_once:
-            decide = self._decide_at_once
             packed = packed if again else self._decide_first(packed, first, image, span)
-        return HitWords(decide(packed, first, image, span), first, image)
+            return HitWords(self._decide_at_once(packed, first, image, span), first, image)
+        looked_up = None if self.reads_all else first
+        return HitWords(self._decide_doubtful(packed, looked_up, image, span), looked_up, image)
+
+    def ids_of(self, words: HitWords, word: Array, bit: Array) -> Array:
+        """Return the sources that bits stand for; those of unset bits are any."""
+        place = words.places(word, bit)
+        return lax.min(place, np.int32(self.candidates.size - 1)) if words.first is None else flat_take(self.sources.ids, place)
 
     def _test_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
         """Return a chunk of words with hits and doubtful candidates, the positions of their first candidates, and their images."""
-        first, stop, image = self._locate_words(table, chunk)
-        last = self.tuning.by_gathers
-        lanes = Lanes(*(x.T if last and x is not None else x for x in (first, stop, image)), queries_last=last)
-        packed = self._test(lanes, own, span)
+        if self.reads_all:
+            first, image = jnp.broadcast_to(LANES * lax.iota(jnp.int32, self.words), (span.size, self.words)), None
+            packed = self._test_all(first, own, span)
+        elif self.tuning.by_gathers:
+            first, stop, image = self._locate_words(table, chunk)
+            lanes = Lanes(first.T, None if image is None else image.T, queries_last=True)
+            packed = self._test(lanes, own, span, stop.T)
+        else:
+            first, allowed, image = self._locate_apart(span, table, chunk)
+            packed = self._test(Lanes(first, image, queries_last=False), own, span) & (allowed | allowed << np.uint32(LANES))
         if self.candidates.excluded is not None:
             allowed = ~self._excluded_lanes(self.candidates.excluded, first, span) & _HITS
             packed = packed & (allowed | allowed << np.uint32(LANES))
         if self.candidates.most_words is None:  # else the words are known before
             packed, first, image = lax.optimization_barrier((packed, first, image))
         return packed, first, image
+
+    def _locate_apart(self, span: Span, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
+        """Return the first candidates of words, which of their candidates are allowed, and their images, by a kernel of its own.
+
+        XLA would else find them again for every word that it tests, one after the other. It fuses nothing into a branch.
+        """
+
+        def locate() -> tuple[Array, Array, Array | None]:
+            first, stop, image = self._locate_words(table, chunk)
+            return first, self._allowed_lanes(Lanes(first, image, queries_last=False), stop, span), image
+
+        shape = table.start.shape[0], self.words
+        none, image = jnp.zeros(shape, jnp.int32), table.image
+        always = table.total[0] + chunk >= 0  # which XLA does not know
+        return lax.cond(always, locate, lambda: (none, none.astype(jnp.uint32), None if image is None else none))
 
     def _locate_words(self, table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
         """Return where words begin, where their runs end, and their images, [b, w] each."""
@@ -280,13 +320,21 @@ class BlockSearch(NamedTuple):
             return [shift * own[k, k] for k, shift in enumerate(shifts)]
         return [functools.reduce(jnp.add, (x * own[row, k] for row, x in enumerate(shifts))) for k in range(len(shifts))]
 
-    def _test(self, lanes: Lanes, own: list[Array], span: Span) -> Array:
-        """Compare 16 candidates per word with the cutoff in working precision: low half hits, high half doubtful ones."""
+    def _test(self, lanes: Lanes, own: list[Array], span: Span, stop: Array | None = None) -> Array:
+        """Compare 16 candidates per word with the cutoff in working precision: low half hits, high half doubtful ones.
+
+        If it is said where the runs of words stop, only candidates count that belong to them and are not the query itself.
+        """
         query, torus = [lanes.of_queries(x) for x in own], self.candidates.torus
         if torus is not None:  # translate the query instead of the image
             query = [q - lanes.of_words(t) for q, t in zip(query, self._translations(torus, lanes, span), strict=True)]
         square = squared_distance([lanes.read(x) - q for x, q in zip(self.sources.axes, query, strict=True)], self.cutoff)
-        inside, outside = self._bounds(lanes, span)
+        own_radii, radii = self.queries.radii, self.sources.radii
+        own_radii = None if own_radii is None else lanes.of_queries(span.of(own_radii))
+        slack = None if torus is None else torus.slack
+        if torus is not None and torus.images.per_system:
+            slack = lanes.of_queries(span.of(torus.slack))
+        inside, outside = self._bounds(own_radii, None if radii is None else lanes.read(radii), slack)
         doubtful = jnp.where(square <= outside, np.uint32(1 << LANES), np.uint32(0))
         value = jnp.where(square < inside, np.uint32(1), doubtful)
         if self.keep.later_only:
@@ -294,26 +342,41 @@ class BlockSearch(NamedTuple):
         if self.queries.systems is not None and self.sources.systems is not None:
             same = lanes.read(self.sources.systems) == lanes.of_queries(span.of(self.queries.systems))
             value = jnp.where(same, value, np.uint32(0))
-        if self.tuning.by_gathers:  # in the same kernel
-            return lanes.joined(jnp.where(self._is_allowed(lanes, span), value, np.uint32(0)))
-        allowed = self._allowed_lanes(lanes, span)
-        return lanes.joined(value) & (allowed | allowed << np.uint32(LANES))
+        if stop is not None:  # in the same kernel
+            value = jnp.where(self._is_allowed(lanes, stop, span), value, np.uint32(0))
+        return lanes.joined(value)
 
-    def _bounds(self, lanes: Lanes, span: Span) -> tuple[np.floating | Array, np.floating | Array]:
-        torus, radii = self.candidates.torus, None
-        slack = None if torus is None else torus.slack
-        if torus is not None and torus.images.per_system:
-            slack = lanes.of_queries(span.of(torus.slack))
-        if isinstance(self.cutoff, Cutoffs):
-            own, others = self.queries.radii, self.sources.radii
-            radii = self.cutoff.of_pairs(
-                None if own is None else lanes.of_queries(span.of(own)), None if others is None else lanes.read(others)
-            )
+    def _test_all(self, first: Array, own: list[Array], span: Span) -> Array:
+        """Do what `_test` does for words of all sources; what stands behind the last one is no neighbor."""
+        none = np.uint32(0)
+
+        def read(x: Array) -> Array:
+            return x[: self.words * LANES].reshape(1, self.words, LANES)
+
+        square = squared_distance([read(x) - q[:, None, None] for x, q in zip(self.sources.axes, own, strict=True)], self.cutoff)
+        radii, others = self.queries.radii, self.sources.radii
+        radii = None if radii is None else span.of(radii)[:, None, None]
+        inside, outside = self._bounds(radii, None if others is None else read(others), None)
+        near, doubtful = (x.astype(jnp.uint32) for x in (square < inside, square <= outside))
+        value = (near | (near ^ doubtful) << np.uint32(LANES)) << lax.iota(jnp.uint32, LANES)
+        lane, bits = span.places[:, None] - first, lax.reduce(value, none, lax.bitwise_or, (2,))
+        if self.keep.later_only:
+            refused = (np.uint32(1) << jnp.clip(lane + int(self.keep.drop_self), 0, LANES).astype(jnp.uint32)) - np.uint32(1)
+        elif self.keep.drop_self:
+            refused = jnp.where(lane.astype(jnp.uint32) < LANES, np.uint32(1) << lane.astype(jnp.uint32), none)
+        else:
+            refused = none
+        return bits & ~(refused | refused << np.uint32(LANES))
+
+    def _bounds(
+        self, own: Array | None, others: Array | None, slack: Array | None
+    ) -> tuple[np.floating | Array, np.floating | Array]:
+        radii = self.cutoff.of_pairs(own, others) if isinstance(self.cutoff, Cutoffs) else None
         return step_one_bounds(self.cutoff, radii, slack)
 
-    def _is_allowed(self, lanes: Lanes, span: Span) -> Array:
+    def _is_allowed(self, lanes: Lanes, stop: Array, span: Span) -> Array:
         """Say which candidates belong to their run and are not the query itself."""
-        allowed = lanes.places < lanes.of_words(lanes.stop)
+        allowed = lanes.places < lanes.of_words(stop)
         if not self.keep.drop_self or self.keep.later_only:
             return allowed
         own, again, torus = lanes.of_queries(span.places), self.candidates.again, self.candidates.torus
@@ -322,10 +385,10 @@ class BlockSearch(NamedTuple):
             other = other | lanes.of_words(lanes.image != torus.images.home)
         return allowed & other
 
-    def _allowed_lanes(self, lanes: Lanes, span: Span) -> Array:
+    def _allowed_lanes(self, lanes: Lanes, stop: Array, span: Span) -> Array:
         """Return which of a word's 16 candidates belong to its run and are not the query itself: bits, [b, words] uint32."""
         one, torus = np.uint32(1), self.candidates.torus
-        allowed = (one << jnp.clip(lanes.stop - lanes.first, 0, LANES).astype(jnp.uint32)) - one
+        allowed = (one << jnp.clip(stop - lanes.first, 0, LANES).astype(jnp.uint32)) - one
         if not self.keep.drop_self or self.keep.later_only:
             return allowed
         own = self._lanes_at(span.places, lanes.first)
@@ -407,7 +470,7 @@ class BlockSearch(NamedTuple):
 
         return lax.while_loop(lambda flat: largest_of(flat) > _HITS, decide_next, packed.reshape(-1)).reshape(packed.shape)
 
-    def _decide_doubtful(self, packed: Array, first: Array, image: Array | None, span: Span) -> Array:
+    def _decide_doubtful(self, packed: Array, first: Array | None, image: Array | None, span: Span) -> Array:
         """Add the doubtful candidates that are pairs to the hits: [b, words] uint32, of which the lower half is set then.
 
         A round decides the first 32 doubtful candidates of each row that has some, a part of the block at a time.
@@ -423,16 +486,16 @@ class BlockSearch(NamedTuple):
 
         def decide_round(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             # The barrier keeps what follows in the loop: it is not worth computing where no round is needed.
-            _, at, packed, row = lax.optimization_barrier((*state, queue))
+            open_pairs, at, packed, row = lax.optimization_barrier((*state, queue))
             row = row if whole else lax.dynamic_slice_in_dim(row, at, many)
             here = jnp.minimum(row, rows - 1)
             both = packed if whole else jnp.where((row < rows)[:, None], packed[here], np.uint32(0))
             asked = both >> np.uint32(LANES)
             bits = BitRows.of(asked, self.tuning.by_gathers)
             slot = lax.broadcasted_iota(jnp.int32, (many, _SLOTS), 1)
-            word, bit = bits.nth(slot)
+            word, bit = bits.nth(slot) if self.tuning.by_gathers else bits.nth_apart(slot, open_pairs)
             word = word if whole else word + width * (here - lax.iota(jnp.int32, many))[:, None]
-            candidate = flat_take(first, word) + bit
+            candidate = HitWords(asked, first, image).places(word, bit)
 
             def points(at: Array | None) -> Pair:
                 of_row, source, of_word = here[:, None], candidate, word

@@ -90,6 +90,7 @@ class Candidates(NamedTuple):
         torus: What a lattice adds.
         size: Number of sources. Static.
         most_words: How many words of candidates a query has at most, if known. Static.
+        whole: Whether the candidates of each query are all sources, in the order of their indices, once. Static.
         given: [n, d] sources and [m, d] queries, by their indices and as they were given.
         words: From slots per query (None: unknown) to the words of candidates that are tested at a time. Static.
         passes: Number of passes over the sources, [] int32, of all queries or from some of them; None for one.
@@ -109,4 +110,5 @@ class Candidates(NamedTuple):
     excluded: Excluded | None = None
     in_order: bool = False
     most_words: int | None = None
+    whole: bool = False
     given: tuple[Array, ...] = ()

@@ -47,32 +47,44 @@ def list_neighbors(
 
     def list_block(span: Span) -> list[Array]:
         def add(words: HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
-            (rows, count), (hits, first, image) = found, words
+            (rows, count), (hits, _, image) = found, words
             bits = BitRows.of(hits, tuning.by_gathers)
             total = bits.total
 
-            def add_group(g: Array, rows: Array) -> Array:
-                start = jnp.minimum(g * group, capacity - group)
+            def find_group(start: Array | int) -> Array:
+                """Return the neighbors for slots [start, start + group), and -1 for slots that this chunk does not fill."""
                 ordinal = (start + slots)[None] - count[:, None]
                 word, bit = bits.nth(ordinal)
-                neighbor = flat_take(engine.sources.ids, flat_take(first, word) + bit)
+                neighbor = engine.ids_of(words, word, bit)
                 if image is not None and images > 1:
                     neighbor = neighbor + n * flat_take(image, word)
-                old = rows if group == capacity else lax.dynamic_slice_in_dim(rows, start, group, axis=1)
-                new = jnp.where((ordinal >= 0) & (ordinal < total[:, None]), neighbor, old)
-                if group == capacity:
-                    return new
-                return lax.dynamic_update_slice_in_dim(rows, lax.optimization_barrier(new), start, axis=1)  # in parts of its own
+                return jnp.where((ordinal >= 0) & (ordinal < total[:, None]), neighbor, -1)
 
-            if group == capacity:
-                rows = add_group(jnp.int32(0), rows)
+            def first_slot(g: Array) -> Array:
+                return jnp.minimum(g * group, capacity - group)
+
+            def keep_filled(rows: Array, found: Array) -> Array:
+                return jnp.where(found < 0, rows, found)
+
+            def put_group(rows: Array, start: Array, found: Array) -> Array:
+                old = lax.dynamic_slice_in_dim(rows, start, group, axis=1)
+                return lax.dynamic_update_slice_in_dim(rows, keep_filled(old, found), start, axis=1)
+
+            def next_group(g: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+                # XLA divides no kernel among cores that writes into a part of an array: so one writes what the turn before found.
+                return put_group(*state), first_slot(g), find_group(first_slot(g))
+
+            if group == capacity and (tuning.by_gathers or words.first is None):
+                return keep_filled(rows, find_group(0)), count + total
+            start = np.int32(np.iinfo(np.int32).max), np.int32(0)
+            begin, end = lax.reduce((count, count + total), start, lambda a, b: (lax.min(a[0], b[0]), lax.max(a[1], b[1])), (0,))
+            begin = lax.div(begin, np.int32(group))
+            until = lax.div(lax.min(end, np.int32(capacity)) + np.int32(group - 1), np.int32(group))
+            if group == capacity:  # one turn of a loop, into which XLA does not fuse what has made the words
+                rows = lax.fori_loop(begin, until, lambda g, rows: keep_filled(rows, find_group(first_slot(g))), rows)
             else:
-                start = np.int32(np.iinfo(np.int32).max), np.int32(0)
-                begin, end = lax.reduce(
-                    (count, count + total), start, lambda a, b: (lax.min(a[0], b[0]), lax.max(a[1], b[1])), (0,)
-                )
-                until = lax.div(lax.min(end, np.int32(capacity)) + np.int32(group - 1), np.int32(group))
-                rows = lax.fori_loop(lax.div(begin, np.int32(group)), until, add_group, rows)
+                none = rows, jnp.int32(0), jnp.full((span.size, group), -1, jnp.int32)
+                rows = put_group(*lax.fori_loop(begin, until, next_group, none))
             return rows, count + total
 
         rows = jnp.full((span.size, capacity), n * images, jnp.int32)
@@ -94,7 +106,7 @@ def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filte
         begin, end = room.starts[ids], room.starts[ids + 1]
 
         def add(words: HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
-            (out, at), (hits, first, image) = found, words
+            (out, at), (hits, _, image) = found, words
             bits = BitRows.of(hits, tuning.by_gathers)
             total = bits.total
 
@@ -102,7 +114,7 @@ def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filte
                 done, out = state
                 ordinal = jnp.broadcast_to(done + slots, (span.size, slots.size))
                 word, bit = bits.nth(ordinal)
-                neighbor = flat_take(engine.sources.ids, flat_take(first, word) + bit)
+                neighbor = engine.ids_of(words, word, bit)
                 if image is not None and images > 1:
                     neighbor = neighbor + n * flat_take(image, word)
                 place = at[:, None] + ordinal
@@ -166,18 +178,25 @@ def fold_neighbors(
 
         def fold(add: Callable[[Slots, Carry], Carry], state: Carry) -> Carry:
             def add_words(words: HitWords, state: Carry, at_once: bool) -> Carry:
-                hits, first, image = words
+                hits, _, image = words
                 bits = BitRows.of(hits, tuning.by_gathers)
                 total = jnp.where(fresh, bits.total, 0)
 
                 def add_group(state: tuple[Array, Any]) -> tuple[Array, Any]:
                     done, state = state
                     ordinal = jnp.broadcast_to(done + slots, (span.size, slots.size))
-                    word, bit = bits.nth(ordinal)
-                    source = flat_take(engine.sources.ids, flat_take(first, word) + bit)
-                    shift = None
-                    if torus is not None and image is not None:
-                        shift = shifts_of(torus, ids[:, None], source, flat_take(image, word))
+                    images = None if torus is None else image
+
+                    def find() -> tuple[Array, Array | None]:
+                        word, bit = bits.nth(ordinal)
+                        return engine.ids_of(words, word, bit), None if images is None else flat_take(images, word)
+
+                    if tuning.by_gathers:
+                        source, code = find()
+                    else:  # XLA fuses nothing into a branch, and does not know that it always takes it: so this is found once
+                        none = jnp.zeros_like(ordinal)
+                        source, code = lax.cond(done >= 0, find, lambda: (none, None if images is None else none))
+                    shift = None if torus is None or code is None else shifts_of(torus, ids[:, None], source, code)
                     return done + size, add(Slots(source, shift, ordinal < total[:, None]), state)
 
                 if at_once:

@@ -22,7 +22,8 @@ class Tuning(NamedTuple):
     Attributes:
         scratch: Memory of a block of queries [B], apart from the sorted particles.
         words: Most words of 16 candidates in a block.
-        few_pairs: Up to so many pairs of a query and a source, all are tested, and nothing is sorted.
+        few_pairs: Up to so many pairs of a query and an image of a source, all are tested, and nothing is sorted;
+        plain_pairs: the same in open space without systems, if the sources are one chunk of words on a CPU.
         sorting: How particles are sorted. On a CPU, XLA sorts single words several times faster than pairs. XLA of jax 0.11.2
             sorted 17 408 pairs of words on an H200 by a chain of its own kernels, and 33 792 by CUB, which takes less time.
         doubtful_share: Rows with pairs that are decided exactly are processed in parts of a block, one of so many,
@@ -38,6 +39,7 @@ class Tuning(NamedTuple):
     scratch: int
     words: int
     few_pairs: int
+    plain_pairs: int
     sorting: Sorting
     doubtful_share: int
     doubtful_rows: int
@@ -51,16 +53,18 @@ CPU = Tuning(  # a block fits into the caches, and loops cost little
     scratch=48_000_000,
     words=1 << 16,
     few_pairs=1 << 14,
+    plain_pairs=1 << 20,
     sorting=Sorting(packed=True),
     doubtful_share=1,
     doubtful_rows=64,
     by_gathers=False,
-    group=32,
+    group=160,
 )
 ACCELERATOR = Tuning(  # few large kernels, in at most 1 GB
     scratch=900_000_000,
     words=1 << 26,
     few_pairs=1 << 24,
+    plain_pairs=1 << 24,
     sorting=Sorting(least=33 << 10, searched=1 << 18),
     doubtful_share=16,
     doubtful_rows=4096,

@@ -9,6 +9,7 @@ from jax import Array, lax
 from jfrnn._geometry import flat_take
 
 LANES = 16  # candidates per word: in a uint32 hits take the lower half, doubtful candidates the upper half
+CHUNK = 64 * LANES  # most candidates per query that are tested at a time on a CPU
 _GROUP = 8  # words whose counts are bytes of two integers
 _FEW = 12  # entries that are compared one by one
 _BYTES = np.uint32(0x01010101)
@@ -24,13 +25,11 @@ class Lanes(NamedTuple):
 
     Attributes:
         first: [b, w] or [w, b] int32, the position of each word's first candidate.
-        stop: Where its run ends.
         image: The image code of its run, or None.
         queries_last: Whether words are [w, b]. Static.
     """
 
     first: Array
-    stop: Array
     image: Array | None
     queries_last: bool
 
@@ -89,9 +88,9 @@ class BitRows(NamedTuple):
 
     @classmethod
     def of(cls, words: Array, by_gathers: bool) -> "BitRows":
-        """Prepare words, of which only the lower half is used."""
+        """Prepare words, of which only the lower half is used; on a CPU, the upper half has to be empty."""
         rows, width = words.shape
-        hits = words & np.uint32((1 << LANES) - 1)
+        hits = words & np.uint32((1 << LANES) - 1) if by_gathers else words
         groups = -(-width // _GROUP)
         counts = jnp.pad(lax.population_count(hits), ((0, 0), (0, groups * _GROUP - width))).reshape(rows, groups, 1, _GROUP)
         until = lax.optimization_barrier(jnp.sum(counts * _until_bytes(), axis=3, dtype=jnp.uint32))
@@ -125,6 +124,11 @@ class BitRows(NamedTuple):
         word, within = lax.optimization_barrier((word, within))  # kernels without gathers are vectorized
         found = lax.optimization_barrier(flat_take(self.hits, word))
         return word, lax.optimization_barrier(nth_bit(found, within))
+
+    def nth_apart(self, ordinal: Array, needed: Array) -> tuple[Array, Array]:
+        """Return `nth` if it is needed, [] bool. XLA fuses nothing into a branch: several kernels read what one has found."""
+        none = jnp.zeros_like(ordinal)
+        return lax.cond(needed, lambda: self.nth(ordinal), lambda: (none, none))
 
     def _group_of(self, ordinal: Array) -> tuple[Array, Array, Array, Array]:
         """Return the group in which a bit is, the number of bits in earlier ones, and the bytes of the group."""
