@@ -241,7 +241,7 @@ class BlockSearch(NamedTuple):
         return _WordTable(start, stop, image, before, total, self.candidates.most_words)
 
     def hit_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array, again: bool) -> HitWords:
-        """Test one chunk of words per query, `again` if that was tried without loops; `own` are the d coordinates [b] of the queries."""
+        """Test one chunk of words per query; `own` are the d coordinates [b] of the queries; `again`: after a try without loops."""
         packed, first, image = self._test_words(span, own, table, chunk)
         if len(packed) <= self.tuning.at_once:
             packed = packed if again else self._decide_first(packed, first, image, span)

@@ -31,9 +31,10 @@ class Tuning(NamedTuple):
         by_gathers: Whether what a slot needs to know of a group of words, and a word of its run, is gathered, instead of chosen by
             looking at every group or run.
         group: Slots of a row that are filled at a time.
-        at_once: In blocks of up to so many queries, doubtful candidates of all are decided at once, instead of collecting those that
-            have some: an accelerator's host would have to wait for their number.
-        fold_group: Slots of a row that are summed at a time. Where it is large, fewer turns of a loop are waited for.
+        at_once: A block of up to so many queries, in open space, is processed without any loop unless a query has more words of
+            candidates than are usual, more doubtful ones than one, or more neighbors than `fold_group`: the host of an accelerator
+            waits before each turn of a loop whose length the data decide. Doubts are then decided for all rows at once.
+        fold_group: Slots of a row that are summed at a time, where `at_once` allows it.
     """
 
     scratch: int

@@ -19,7 +19,7 @@ _TOPS = np.uint32(0x80808080)
 class Lanes(NamedTuple):
     """The 16 candidates of each word, as an axis of arrays that are compared with the cutoff.
 
-    On a CPU words are [b, w] and lanes their last axis: a word is read as one contiguous slice, several times faster than by element.
+    On a CPU words are [b, w] and lanes their last axis: a word is read as one contiguous slice, faster than one by one.
     Elsewhere words are [w, b] and lanes the axis between: each thread tests all 16, and threads next to it test much the same
     candidates for other queries of a cell.
 
@@ -153,7 +153,7 @@ def _column(x: Array, k: int, shape: tuple[int, ...]) -> Array:
 def last_reached(ascending: Array, value: Array) -> Array:
     """Return the last place in each ascending row [b, w] whose entry is <= value [b, k], or 0, by few comparisons or a search.
 
-    Entries are gathered: a reduction over a row would take XLA's autotuner for GPUs seconds to compile, and slices kernels of their own.
+    Entries are gathered: a reduction over a row would take XLA's autotuner for GPUs seconds, and slices kernels of their own.
     """
     last = ascending.shape[1] - 1
     row, place = lax.broadcasted_iota(jnp.int32, value.shape, 0) * (last + 1), jnp.zeros_like(value)

@@ -7,8 +7,8 @@ There are three steps. Each is exact where it decides, and only evaluated for wh
    denormals add at most 3·2^-126 to a difference, less than 2^-28 of any cutoff that `check_cutoff` accepts. A band of 8 eps on
    either side is therefore safe however the compiler fuses multiply-adds; the CPU kernels, which flush nothing that matters here,
    use 4 eps.
-2. `_fixed_sign` counts distances in units of 2^-39 scaled lengths (float64: 2^-86), in two machine integers per axis. A difference of
-   two floats is exactly the sum of two others (Knuth 1969), which are converted to these units. It decides all pairs whose
+2. `_fixed_sign` counts distances in units of 2^-39 scaled lengths (float64: 2^-86), in two machine integers per axis. A difference
+   of two floats is exactly the sum of two others (Knuth 1969), which are converted to these units. It decides all pairs whose
    coordinates are whole numbers of units, as all floats are that exceed 2^-14 cutoffs (float64: 2^-32), unless coordinates differ
    by more than 2^14 cutoffs (2^27), as those of images of particles that were not wrapped may.
 3. `_integer_sign` uses fixed-point integers as wide as the float format (`jfrnn._geometry.integers`), which never round. It decides
@@ -73,7 +73,7 @@ class Pair(NamedTuple):
 
 
 class _Component(NamedTuple):
-    """Components of points a and b and of the lattice vectors between them, with their shifts: along one axis, or along all [d, ...]."""
+    """Components of points a and b, and shifts and lattice vectors between them, along one axis, or along all [d, ...]."""
 
     a: Array
     b: Array
@@ -329,7 +329,7 @@ def _in_units(x: Array, scale: Array) -> tuple[tuple[Array, Array], Array]:
 
 
 def _square_limbs(upper: Array, lower: Array) -> list[Array]:
-    """Return the square of a number in upper and lower units: seven limbs, the lowest first, not carried; the highest keeps the rest.
+    """Return the square of a number in upper and lower units: seven limbs, the lowest first, not carried; the last keeps the rest.
 
     `lower` is below 2^25 (float64: 2^53). Three of these squares, four times, fit into the integers.
     """
