@@ -102,6 +102,7 @@ def test_a_sweep_says_how_long_it_will_take_and_how_much_is_left(tmp_path, capfd
     assert re.search(r"corners 2 %: 1 of 2 rows measured, left: about \d+ (s|min)\n", said)
 
 
+@pytest.mark.usefixtures("foreign")
 def test_methods_that_cannot_be_imported_are_those_that_lack_something():
     found = []
     for name in methods.names():
