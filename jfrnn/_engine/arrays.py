@@ -3,7 +3,7 @@
 1. Sort: particles are sorted by the number of their cell, and a table tells where each number begins (`jfrnn._geometry.cell_line`).
 2. Stencil: the rows of cells around a query are runs of sorted particles, its candidates (`line_runs`; `find_candidates` below).
 3. Gather: runs are read as words of 16 particles and compared with the cutoff, a bit each (`jfrnn._engine.blocks`, `_test`). What
-   rounding leaves open is decided exactly (`_decide_first` where no loop is wanted, `_decide_doubtful`).
+   rounding leaves open is decided exactly (`_decide_first` where no loop is wanted, `_decide_at_once`, `_decide_doubtful`).
 4. Compaction: the k-th neighbor of a query is its k-th set bit (`jfrnn._engine.words.BitRows`).
 
 "brute" has no sorting: all particles are one run; on a CPU few of them are read without gathers (`_test_all`). What is chosen by
@@ -241,8 +241,8 @@ def _all_sources(
     if queries is None:  # their positions come first among those of the sources
         rows = rows._replace(axes=points.axes)
     unordered = query_order is None
-    most, n = words, len(sources)
-    return Candidates(points, rows, runs, torus, n, lambda _: words, in_order=unordered, most_words=most, whole=whole)
+    n, of_capacity = len(sources), lambda _: words
+    return Candidates(points, rows, runs, torus, n, of_capacity, in_order=unordered, most_words=words, whole=whole)
 
 
 def _cell_stencil(
