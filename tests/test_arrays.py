@@ -16,10 +16,8 @@ from jfrnn.cases.hard import HARD_CASES
 
 # blocks as small as these cases, so that each has several
 SORTING = tuning.ACCELERATOR.sorting._replace(searched=300)
-ELSEWHERE = tuning.ACCELERATOR._replace(words=1 << 12, few_pairs=1000, plain_pairs=1000, sorting=SORTING, doubtful_rows=16)
-AT_ONCE = ELSEWHERE._replace(
-    words=1 << 20, few_pairs=1 << 20, plain_pairs=1 << 20, doubtful_rows=1 << 20
-)  # all rows and their doubtful pairs
+ELSEWHERE = tuning.ACCELERATOR._replace(words=1 << 12, few_pairs=1000, plain_pairs=1000, sorting=SORTING)
+AT_ONCE = ELSEWHERE._replace(words=1 << 20, few_pairs=1 << 20, plain_pairs=1 << 20)  # all rows and their doubtful pairs
 LOOPS = ELSEWHERE._replace(at_once=0)  # as blocks of many queries are processed
 TIES = ("lattice_1e-4_at_0", "ulp_far_axis", "cell_edges_far", "queries_fewer")
 

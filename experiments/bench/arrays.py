@@ -22,8 +22,9 @@ SIDES = (10, 16, 25, 40, 64, 100)  # sites along an edge of the lattice
 MOST_ON_CPU = 63**3  # particles, unless sizes are asked for
 CUTOFF = 3.0  # spacings
 JITTER = 0.3  # spacings
-STEPS = 10  # of a scan, fewer where calls are slow
-SLOW_S = 0.05  # calls that take longer are repeated a fifth as often, and scans of them have 2 steps
+STEPS = 100  # of a scan at most, so that what a call of it takes is a small part
+SCAN_S = 0.05  # that a scan is to take: fewer steps where calls are slow
+SLOW_S = 0.05  # calls that take longer are repeated a fifth as often
 ROUNDED = 1e-3  # share of the particles whose rows of a peer may differ: its distances are rounded
 ROWS_SEEN = 50_000  # of a list, in which distances are looked at
 MOST_ON_GPU = 300_000  # particles that jax-md is asked for; it took 19 GB for 250 000
@@ -107,7 +108,7 @@ def _rows(side: int, layout: str, repeats: int) -> Iterator[table.Line]:
 def _time(call: Callable[[], Any], function: Function, x: Array, made: Any, repeats: int) -> table.Line:  # noqa: ANN401
     """Time calls that are waited for, and steps of a scan."""
     (first,) = _measure.time_in_turns({"call": call}, 1)[0]["call"]
-    rounds, steps = (repeats, STEPS) if first <= SLOW_S else (max(repeats // 5, 3), 2)
+    rounds, steps = repeats if first <= SLOW_S else max(repeats // 5, 3), int(np.clip(SCAN_S / first, 2, STEPS))
     waited, others = _measure.time_in_turns({"call": call}, rounds)
     stepped, _ = _measure.time_in_turns({"scan": _measure.compile_scan(function, x, steps, made)}, 3)
     times = {"waited_ms": 1e3 * float(np.median(waited["call"])), "step_ms": 1e3 * float(np.median(stepped["scan"])) / steps}

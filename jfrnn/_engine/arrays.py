@@ -3,10 +3,11 @@
 1. Sort: particles are sorted by the number of their cell, and a table tells where each number begins (`jfrnn._geometry.cell_line`).
 2. Stencil: the rows of cells around a query are runs of sorted particles, its candidates (`line_runs`; `find_candidates` below).
 3. Gather: runs are read as words of 16 particles and compared with the cutoff, a bit each (`jfrnn._engine.blocks`, `_test`). What
-   rounding leaves open is decided exactly (`_decide_first` where no loop is wanted, `_decide_at_once`, `_decide_doubtful`).
+   rounding leaves open is decided exactly (`_decide_by_rounds` on a CPU; elsewhere `_decide_first` and `_decide_in_rows`, which do
+   without a loop, and `_decide_rest`).
 4. Compaction: the k-th neighbor of a query is its k-th set bit (`jfrnn._engine.words.BitRows`).
 
-"brute" has no sorting: all particles are one run; on a CPU few of them are read without gathers (`_test_all`). What is chosen by
+"brute" has no sorting: all particles are one run; few of them are read without gathers (`_test_all`). What is chosen by
 platform stands in `jfrnn._engine.tuning`.
 """
 
@@ -50,7 +51,7 @@ from jfrnn._geometry import (
     translation,
     unpack_turns,
 )
-from jfrnn._tracing import call_late
+from jfrnn._tracing import call_late, largest_of
 
 _MOST_SOURCES = 2**30 - LANES  # whose places are int32, as runs read the sources twice in a row
 
@@ -136,7 +137,7 @@ def is_few(search: Search, tuning: Tuning) -> bool:
 
 def complete_rows(search: Search, idx: Array | None, count: Array, capacity: int | None) -> Rows:
     """Return rows with the length of the longest, and status bits for overflow and non-finite positions."""
-    required = jnp.max(count, initial=0)
+    required = largest_of(count)
     finite = jnp.isfinite(search.sources).all() & (True if search.queries is None else jnp.isfinite(search.queries).all())
     overflow = False if capacity is None else required > capacity
     status = jnp.where(overflow, Status.ROW_OVERFLOW.value, 0) | jnp.where(finite, 0, Status.NONFINITE.value)
@@ -277,12 +278,15 @@ def _cell_stencil(
 
 
 def _stencil_words(dim: int, slots: int | None) -> int:
-    """Return the words around a query that has as many neighbors as slots, in a uniform density."""
-    runs = 3 ** (dim - 1)
+    """Return the words around a query that has as many neighbors as slots, in a uniform density: a multiple of 8 or 16.
+
+    Cells whose walls stand where a lattice has its sites hold up to a fifth more than the average; that fits, too.
+    """
+    runs, many = 3 ** (dim - 1), {2: 8, 3: 16}[dim]
     share = (2 + 1 / FINE) * runs / {2: np.pi, 3: 4 * np.pi / 3}[dim]  # candidates per neighbor
     slots = {2: 32, 3: 128}[dim] if slots is None else slots
-    most = {2: 32, 3: 64}[dim]
-    return min(max(math.ceil(share * slots / LANES + runs), 8), most)
+    words = math.ceil(share * slots / LANES + runs)
+    return min(-(-words // many) * many, {2: 32, 3: 64}[dim])
 
 
 def _cells_of_lattice(

@@ -15,7 +15,7 @@ from jax import Array, lax
 from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
 from jfrnn._engine.problem import Filter
 from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
-from jfrnn._engine.words import CHUNK, LANES, BitRows, Lanes, bit_counts, last_reached, nth_bit
+from jfrnn._engine.words import CHUNK, LANES, BitRows, Lanes, bit_counts, join_lanes, last_reached, nth_bit
 from jfrnn._geometry import (
     Cutoff,
     Cutoffs,
@@ -32,7 +32,6 @@ from jfrnn._geometry import (
 from jfrnn._tracing import largest_of
 
 _FEW_RUNS = 32
-_AT_A_TIME = 1 << 10  # words of which one candidate each is decided by wide integers
 _SLOTS = 32  # doubtful candidates of a row that are decided at a time
 _HITS = np.uint32((1 << LANES) - 1)
 _MOST_WORDS = 256  # per query, that are tested at a time; (words << 16) has to be an int32
@@ -129,7 +128,7 @@ class BlockSearch(NamedTuple):
     @property
     def reads_all(self) -> bool:
         """Whether a chunk holds all sources in their order: no runs, words or places have to be looked up."""
-        return self.candidates.whole and self.candidates.size <= CHUNK and not self.tuning.by_gathers
+        return self.candidates.whole and self.candidates.size <= LANES * self.words
 
     @property
     def block_count(self) -> int:
@@ -243,22 +242,25 @@ class BlockSearch(NamedTuple):
     def hit_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array, again: bool) -> HitWords:
         """Test one chunk of words per query; `own` are the d coordinates [b] of the queries; `again`: after a try without loops."""
         packed, first, image = self._test_words(span, own, table, chunk)
-        if len(packed) <= self.tuning.at_once:
-            packed = packed if again else self._decide_first(packed, first, image, span)
-            return HitWords(self._decide_at_once(packed, first, image, span), first, image)
-        looked_up = None if self.reads_all else first
-        return HitWords(self._decide_doubtful(packed, looked_up, image, span), looked_up, image)
+        if not self.tuning.by_gathers:
+            return HitWords(self._decide_by_rounds(packed, first, image, span), first, image)
+        if self.reads_all:  # of few sources, all ties are decided without a loop
+            packed = self._decide_in_rows(packed, first, image, span)
+        elif not again:
+            packed = self._decide_first(packed, first, image, span)
+        return HitWords(self._decide_rest(packed, first, image, span, not self.reads_all), first, image)
 
     def ids_of(self, words: HitWords, word: Array, bit: Array) -> Array:
         """Return the sources that bits stand for; those of unset bits are any."""
         place = words.places(word, bit)
         return lax.min(place, np.int32(self.candidates.size - 1)) if words.first is None else flat_take(self.sources.ids, place)
 
-    def _test_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> tuple[Array, Array, Array | None]:
+    def _test_words(
+        self, span: Span, own: list[Array], table: _WordTable, chunk: Array
+    ) -> tuple[Array, Array | None, Array | None]:
         """Return a chunk of words with hits and doubtful candidates, the positions of their first candidates, and their images."""
         if self.reads_all:
-            first, image = jnp.broadcast_to(LANES * lax.iota(jnp.int32, self.words), (span.size, self.words)), None
-            packed = self._test_all(first, own, span)
+            packed, first, image = self._test_all(own, span), None, None
         elif self.tuning.by_gathers:
             first, stop, image = self._locate_words(table, chunk)
             lanes = Lanes(first.T, None if image is None else image.T, queries_last=True)
@@ -267,7 +269,8 @@ class BlockSearch(NamedTuple):
             first, allowed, image = self._locate_apart(span, table, chunk)
             packed = self._test(Lanes(first, image, queries_last=False), own, span) & (allowed | allowed << np.uint32(LANES))
         if self.candidates.excluded is not None:
-            allowed = ~self._excluded_lanes(self.candidates.excluded, first, span) & _HITS
+            begin = self._first_of_all(span) if first is None else first
+            allowed = ~self._excluded_lanes(self.candidates.excluded, begin, span) & _HITS
             packed = packed & (allowed | allowed << np.uint32(LANES))
         if self.candidates.most_words is None:  # else the words are known before
             packed, first, image = lax.optimization_barrier((packed, first, image))
@@ -344,22 +347,25 @@ class BlockSearch(NamedTuple):
             value = jnp.where(same, value, np.uint32(0))
         if stop is not None:  # in the same kernel
             value = jnp.where(self._is_allowed(lanes, stop, span), value, np.uint32(0))
-        return lanes.joined(value)
+        return join_lanes(value, lanes.queries_last)
 
-    def _test_all(self, first: Array, own: list[Array], span: Span) -> Array:
+    def _test_all(self, own: list[Array], span: Span) -> Array:
         """Do what `_test` does for words of all sources; what stands behind the last one is no neighbor."""
-        none = np.uint32(0)
+        none, queries_last = np.uint32(0), self.tuning.by_gathers
+        shape = (self.words, LANES, 1) if queries_last else (1, self.words, LANES)
+        of_queries = (None, None) if queries_last else (slice(None), None, None)
 
         def read(x: Array) -> Array:
-            return x[: self.words * LANES].reshape(1, self.words, LANES)
+            return x[: self.words * LANES].reshape(shape)
 
-        square = squared_distance([read(x) - q[:, None, None] for x, q in zip(self.sources.axes, own, strict=True)], self.cutoff)
+        square = squared_distance([read(x) - q[of_queries] for x, q in zip(self.sources.axes, own, strict=True)], self.cutoff)
         radii, others = self.queries.radii, self.sources.radii
-        radii = None if radii is None else span.of(radii)[:, None, None]
+        radii = None if radii is None else span.of(radii)[of_queries]
         inside, outside = self._bounds(radii, None if others is None else read(others), None)
         near, doubtful = (x.astype(jnp.uint32) for x in (square < inside, square <= outside))
-        value = (near | (near ^ doubtful) << np.uint32(LANES)) << lax.iota(jnp.uint32, LANES)
-        lane, bits = span.places[:, None] - first, lax.reduce(value, none, lax.bitwise_or, (2,))
+        value = near | (near ^ doubtful) << np.uint32(LANES)
+        bits = join_lanes(value, queries_last)
+        lane = span.places[:, None] - self._first_of_all(span)
         if self.keep.later_only:
             refused = (np.uint32(1) << jnp.clip(lane + int(self.keep.drop_self), 0, LANES).astype(jnp.uint32)) - np.uint32(1)
         elif self.keep.drop_self:
@@ -367,6 +373,10 @@ class BlockSearch(NamedTuple):
         else:
             refused = none
         return bits & ~(refused | refused << np.uint32(LANES))
+
+    def _first_of_all(self, span: Span) -> Array:
+        """Return the first candidates of words of all sources."""
+        return jnp.broadcast_to(LANES * lax.iota(jnp.int32, self.words), (span.size, self.words))
 
     def _bounds(
         self, own: Array | None, others: Array | None, slack: Array | None
@@ -426,94 +436,82 @@ class BlockSearch(NamedTuple):
             later = jnp.where(image > torus.images.home, own, jnp.where(image < torus.images.home, own + 1, later))
         return lanes.read(self.sources.ids) >= later
 
-    def _decide_first(self, packed: Array, first: Array, image: Array | None, span: Span) -> Array:
+    def _decide_first(self, packed: Array, first: Array | None, image: Array | None, span: Span) -> Array:
         """Decide the first doubtful candidate of each row, where that takes no wide integers, without any loop.
 
         Returns the words, of which the lower half is right where the upper half is empty.
         """
         one, (rows, width) = np.uint32(1), packed.shape
-        word = jnp.where(packed > _HITS, lax.broadcasted_iota(jnp.int32, packed.shape, 1), width)
-        word = jnp.min(word, axis=1)
-        at = lax.min(word, np.int32(width - 1)) + width * lax.iota(jnp.int32, rows)
+        word = lax.argmax(packed > _HITS, 1, jnp.int32)  # of a single minimum, XLA's autotuner for GPUs compiles several variants
+        at = word + width * lax.iota(jnp.int32, rows)
         asked = flat_take(packed, at) >> np.uint32(LANES)
         bit = bit_counts((asked & (~asked + one)) - one) % LANES
-        of_row = None if image is None else flat_take(image, at)
-        known, near = decide_in_units(self._pair(span.places, flat_take(first, at) + bit, of_row), self.cutoff)
+        known, near = decide_in_units(self._pair_at(span.places, HitWords(packed, first, image), at, bit), self.cutoff)
         change = jnp.where(known & (asked > 0), _decided(bit, near), np.uint32(0))
         word, change = lax.optimization_barrier((word, change))
         here = lax.broadcasted_iota(jnp.int32, packed.shape, 1) == word[:, None]
         return packed + jnp.where(here, change[:, None], np.uint32(0))
 
-    def _decide_at_once(self, packed: Array, first: Array, image: Array | None, span: Span) -> Array:
-        """Do what `_decide_doubtful` does for all rows at once, in a loop that rarely turns twice."""
-        (rows, width), many = packed.shape, min(_AT_A_TIME, packed.size)
+    def _decide_in_rows(self, packed: Array, first: Array | None, image: Array | None, span: Span) -> Array:
+        """Decide by step 2 the first 32 doubtful candidates of each row, a thread each.
 
-        def of(word: Array) -> Array | None:
-            return None if image is None else flat_take(image, word)
+        A thread without one ends where its index turns out to lie beyond the words, before it computes a decision.
+        """
+        shape, doubtful = (len(packed), _SLOTS), packed >> np.uint32(LANES)
+        bits = BitRows.of(doubtful, self.tuning.by_gathers)
+        row, slot = (lax.broadcasted_iota(jnp.int32, shape, k) for k in (0, 1))
+        word, bit = bits.nth(slot)
+        known, near = decide_in_units(self._pair_at(span.first + row, HitWords(packed, first, image), word, bit), self.cutoff)
+        change = jnp.where(known, _decided(bit, near), np.uint32(0))
+        place = jnp.where(slot < bits.total[:, None], word, packed.size)
+        return packed.reshape(-1).at[place].add(change, mode="drop").reshape(packed.shape)
 
-        def decide_next(flat: Array) -> Array:
-            (flat,) = lax.optimization_barrier((flat,))
-            bits = BitRows.of(flat.reshape(rows, width) >> np.uint32(LANES), self.tuning.by_gathers)
-            row, slot = (lax.broadcasted_iota(jnp.int32, (rows, _SLOTS), k) for k in (0, 1))
-            word, bit = bits.nth(slot)
-            pair = self._pair(span.first + row, flat_take(first, word) + bit, of(word))
-            known, near = decide_in_units(pair, self.cutoff)
-            known = known & (slot < bits.total[:, None])
-            flat = flat.at[jnp.where(known, word, flat.size)].add(_decided(bit, near), mode="drop")
+    def _decide_rest(self, packed: Array, first: Array | None, image: Array | None, span: Span, in_rows: bool) -> Array:
+        """Decide what is still doubtful, in a loop that rarely turns: by step 2 in rows, then one candidate per word by step 3."""
+        (width,), many = packed.shape[1:], min(self.tuning.wide, packed.size)
+
+        def decide_next(packed: Array) -> Array:
+            (packed,) = lax.optimization_barrier((packed,))
+            flat = (self._decide_in_rows(packed, first, image, span) if in_rows else packed).reshape(-1)
             start = jnp.minimum(lax.argmax(flat > _HITS, 0, jnp.int32), flat.size - many)  # the first that is left
             here, word = lax.dynamic_slice_in_dim(flat, start, many), start + lax.iota(jnp.int32, many)
-            asked = here >> np.uint32(LANES)
-            bit = nth_bit(asked, jnp.zeros_like(asked))
-            pair = self._pair(span.first + lax.div(word, np.int32(width)), flat_take(first, word) + bit, of(word))
-            here = here + jnp.where(asked > 0, _decided(bit, decide_in_integers(pair, self.cutoff)), np.uint32(0))
-            return lax.dynamic_update_slice_in_dim(flat, here, start, axis=0)
+            doubtful = here >> np.uint32(LANES)
+            bit, row = nth_bit(doubtful, jnp.zeros_like(doubtful)), lax.div(word, np.int32(width))
+            pair = self._pair_at(span.first + row, HitWords(packed, first, image), word, bit)
+            here = here + jnp.where(doubtful > 0, _decided(bit, decide_in_integers(pair, self.cutoff)), np.uint32(0))
+            return lax.dynamic_update_slice_in_dim(flat, here, start, axis=0).reshape(packed.shape)
 
-        return lax.while_loop(lambda flat: largest_of(flat) > _HITS, decide_next, packed.reshape(-1)).reshape(packed.shape)
+        return lax.while_loop(lambda packed: largest_of(packed) > _HITS, decide_next, packed)
 
-    def _decide_doubtful(self, packed: Array, first: Array | None, image: Array | None, span: Span) -> Array:
-        """Add the doubtful candidates that are pairs to the hits: [b, words] uint32, of which the lower half is set then.
+    def _decide_by_rounds(self, packed: Array, first: Array | None, image: Array | None, span: Span) -> Array:
+        """Decide doubtful candidates on a CPU: the first 32 of each row at a time."""
+        rows = len(packed)
 
-        A round decides the first 32 doubtful candidates of each row that has some, a part of the block at a time.
-        """
-        rows, width = packed.shape
-        many = min(max(-(-rows // self.tuning.doubtful_share), self.tuning.doubtful_rows), rows)
-        whole, queue, waiting = many == rows, lax.iota(jnp.int32, rows), jnp.int32(0)
-        if not whole:
-            open_rows = jnp.max(packed, axis=1) > _HITS
-            until = jnp.cumsum(open_rows.astype(jnp.int32), dtype=jnp.int32)
-            waiting, queue = until[-1], jnp.full(rows + many, rows, jnp.int32)
-            queue = queue.at[jnp.where(open_rows, until - 1, rows + many)].set(lax.iota(jnp.int32, rows), mode="drop")
-
-        def decide_round(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        def decide_round(state: tuple[Array, Array]) -> tuple[Array, Array]:
             # The barrier keeps what follows in the loop: it is not worth computing where no round is needed.
-            open_pairs, at, packed, row = lax.optimization_barrier((*state, queue))
-            row = row if whole else lax.dynamic_slice_in_dim(row, at, many)
-            here = jnp.minimum(row, rows - 1)
-            both = packed if whole else jnp.where((row < rows)[:, None], packed[here], np.uint32(0))
-            asked = both >> np.uint32(LANES)
-            bits = BitRows.of(asked, self.tuning.by_gathers)
-            slot = lax.broadcasted_iota(jnp.int32, (many, _SLOTS), 1)
-            word, bit = bits.nth(slot) if self.tuning.by_gathers else bits.nth_apart(slot, open_pairs)
-            word = word if whole else word + width * (here - lax.iota(jnp.int32, many))[:, None]
-            candidate = HitWords(asked, first, image).places(word, bit)
+            more, packed = lax.optimization_barrier(state)
+            bits = BitRows.of(packed >> np.uint32(LANES), self.tuning.by_gathers)
+            slot = lax.broadcasted_iota(jnp.int32, (rows, _SLOTS), 1)
+            word, bit = bits.nth_apart(slot, more)
+            candidate = HitWords(packed, first, image).places(word, bit)
 
             def points(at: Array | None) -> Pair:
-                of_row, source, of_word = here[:, None], candidate, word
+                row, source, of_word = lax.iota(jnp.int32, rows)[:, None], candidate, word
                 if at is not None:
-                    of_row, source, of_word = here[at // _SLOTS], flat_take(source, at), flat_take(of_word, at)
-                return self._pair(span.first + of_row, source, None if image is None else flat_take(image, of_word))
+                    row, source, of_word = at // _SLOTS, flat_take(source, at), flat_take(of_word, at)
+                return self._pair(span.first + row, source, None if image is None else flat_take(image, of_word))
 
             there = slot < bits.total[:, None]
             pair = decide_pairs(there, points, self.cutoff)
-            change = _decided(bit, pair)
-            word = jnp.where(there, word, packed.size)
-            packed = packed.reshape(-1).at[word].add(change, mode="drop").reshape(packed.shape)
-            more = largest_of(bits.total) > _SLOTS
-            at = at if whole else jnp.where(more, at, at + many)
-            return more if whole else at < waiting, at, packed
+            place = jnp.where(there, word, packed.size)
+            packed = packed.reshape(-1).at[place].add(_decided(bit, pair), mode="drop").reshape(packed.shape)
+            return largest_of(bits.total) > _SLOTS, packed
 
-        more = largest_of(packed) > _HITS if whole else waiting > 0
-        return lax.while_loop(lambda state: state[0], decide_round, (more, jnp.int32(0), packed))[2]
+        return lax.while_loop(lambda state: state[0], decide_round, (largest_of(packed) > _HITS, packed))[1]
+
+    def _pair_at(self, place: Array, words: HitWords, word: Array, bit: Array) -> Pair:
+        """Return the points of queries at these positions and of the candidates that bits stand for."""
+        return self._pair(place, words.places(word, bit), None if words.image is None else flat_take(words.image, word))
 
     def _pair(self, place: Array, candidate: Array, image: Array | None) -> Pair:
         """Return the given (not wrapped) points of queries and candidates at these positions."""

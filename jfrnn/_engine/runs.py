@@ -14,6 +14,7 @@ from jfrnn._engine.problem import Filter, Room
 from jfrnn._engine.tuning import Tuning
 from jfrnn._engine.words import BitRows, bit_counts
 from jfrnn._geometry import Cutoff, Cutoffs, flat_take
+from jfrnn._tracing import largest_of
 
 FOLD_GROUP = 32  # neighbors per query that are folded at a time
 
@@ -121,7 +122,7 @@ def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filte
                 there = (ordinal < total[:, None]) & (place < end[:, None])
                 return done + FOLD_GROUP, out.at[jnp.where(there, place, room.total)].set(neighbor, mode="drop")
 
-            most = jnp.max(total)
+            most = largest_of(total)
             return lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), out))[1], at + total
 
         return engine.fold_words(span, add, (out, begin))[0]
@@ -201,7 +202,7 @@ def fold_neighbors(
 
                 if at_once:
                     return add_group((jnp.int32(0), state))[1]
-                most = jnp.max(total)
+                most = largest_of(total)
                 return lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), state))[1]
 
             few = functools.partial(add_words, at_once=True)

@@ -26,14 +26,13 @@ class Tuning(NamedTuple):
         plain_pairs: the same in open space without systems, if the sources are one chunk of words on a CPU.
         sorting: How particles are sorted. On a CPU, XLA sorts single words several times faster than pairs. XLA of jax 0.11.2
             sorted 17 408 pairs of words on an H200 by a chain of its own kernels, and 33 792 by CUB, which takes less time.
-        doubtful_share: Rows with pairs that are decided exactly are processed in parts of a block, one of so many,
-        doubtful_rows: but at least so many rows at a time.
         by_gathers: Whether what a slot needs to know of a group of words, and a word of its run, is gathered, instead of chosen by
             looking at every group or run.
         group: Slots of a row that are filled at a time.
         at_once: A block of up to so many queries, in open space, is processed without any loop unless a query has more words of
             candidates than are usual, more doubtful ones than one, or more neighbors than `fold_group`: the host of an accelerator
             waits before each turn of a loop whose length the data decide. Doubts are then decided for all rows at once.
+        wide: Words at a time of which step 3 of the exact decision, in wide integers, decides one candidate each.
         fold_group: Slots of a row that are summed at a time, where `at_once` allows it.
     """
 
@@ -42,11 +41,10 @@ class Tuning(NamedTuple):
     few_pairs: int
     plain_pairs: int
     sorting: Sorting
-    doubtful_share: int
-    doubtful_rows: int
     by_gathers: bool
     group: int
     at_once: int = 0
+    wide: int = 1 << 10
     fold_group: int = 32
 
 
@@ -56,8 +54,6 @@ CPU = Tuning(  # a block fits into the caches, and loops cost little
     few_pairs=1 << 14,
     plain_pairs=1 << 20,
     sorting=Sorting(packed=True),
-    doubtful_share=1,
-    doubtful_rows=64,
     by_gathers=False,
     group=160,
 )
@@ -67,8 +63,6 @@ ACCELERATOR = Tuning(  # few large kernels, in at most 1 GB
     few_pairs=1 << 24,
     plain_pairs=1 << 24,
     sorting=Sorting(least=33 << 10, searched=1 << 18),
-    doubtful_share=16,
-    doubtful_rows=4096,
     by_gathers=True,
     group=256,
     at_once=1 << 16,

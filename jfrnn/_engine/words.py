@@ -58,11 +58,12 @@ class Lanes(NamedTuple):
         dimensions = lax.GatherDimensionNumbers(offset_dims=(2,), collapsed_slice_dims=(), start_index_map=(0,))
         return lax.gather(x, self.first[..., None], dimensions, (LANES,), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
 
-    def joined(self, value: Array) -> Array:
-        """Join uint32 values of all lanes by `or`, each shifted by the number of its lane: [b, w]."""
-        value = value << self.numbers.astype(np.uint32)
-        words = lax.reduce(value, np.uint32(0), lax.bitwise_or, (1 if self.queries_last else 2,))
-        return lax.optimization_barrier(words).T if self.queries_last else words  # a kernel of its own compiles in less time
+
+def join_lanes(value: Array, queries_last: bool) -> Array:
+    """Join uint32 values of all lanes ([b, w, 16] or [w, 16, b]) by `or`, each shifted by the number of its lane: [b, w]."""
+    shift = np.arange(LANES, dtype=np.uint32).reshape((1, -1, 1) if queries_last else (1, 1, -1))
+    words = lax.reduce(value << shift, np.uint32(0), lax.bitwise_or, (1 if queries_last else 2,))
+    return lax.optimization_barrier(words).T if queries_last else words  # a kernel of its own compiles in less time
 
 
 def bit_counts(words: Array) -> Array:
@@ -96,7 +97,10 @@ class BitRows(NamedTuple):
         until = lax.optimization_barrier(jnp.sum(counts * _until_bytes(), axis=3, dtype=jnp.uint32))
         in_group = (until[:, :, 1] >> np.uint32(24)).astype(jnp.int32)
         before = np.tril(np.ones((groups, groups), np.int32), -1)
-        earlier = jnp.sum(in_group[:, None] * before[None], axis=2, dtype=jnp.int32)
+        if by_gathers:  # over the middle axis: each thread adds up a number of its own
+            earlier = jnp.sum(in_group[:, :, None] * before.T[None], axis=1, dtype=jnp.int32)
+        else:
+            earlier = jnp.sum(in_group[:, None] * before[None], axis=2, dtype=jnp.int32)
         return cls(hits, lax.optimization_barrier(earlier), until, by_gathers)
 
     @property
