@@ -189,37 +189,57 @@ class BlockSearch(NamedTuple):
         return add_pass(jnp.int32(0), state) if passes is None else lax.fori_loop(0, passes, add_pass, state)
 
     def _fold_at_once(self, span: Span, add: "Add[State]", state: State, few: tuple["Add[State]", int] | None) -> State:
-        """Fold the first chunk of candidates without a loop; where that is not all, or leaves doubts, start again with loops."""
+        """Fold the first chunk of candidates without a loop; where that is not all, or leaves doubts, go on with loops."""
         table = self.word_table(span, jnp.int32(0))
         packed, first, image = self._test_words(span, [span.of(x) for x in self.queries.axes], table, jnp.int32(0))
-        packed = self._decide_first(packed, first, image, span)
-        rest = largest_of(packed) > _HITS
+        packed, rest, most = self._decide_first(packed, first, image, span)
         if table.most is None:
-            rest = rest | (table.longest > self.words)
+            rest = rest | (table.total > self.words)
         add_few = add
         if few is not None:
             add_few, room = few
-            rest = rest | (largest_of(bit_counts(packed & _HITS).sum(axis=1, dtype=jnp.int32)) > room)
+            rest = rest | (most > room)
+        words = HitWords(packed, first, image)
         return lax.cond(
-            rest,
-            lambda state: self._fold_table(span, add, table, state, again=True),
-            lambda state: add_few(HitWords(packed, first, image), state),
+            largest_of(rest.astype(jnp.int32)) > 0,
+            lambda state: self._fold_rest(span, add, table, words, state),
+            lambda state: add_few(words, state),
             state,
         )
 
-    def _fold_table(self, span: Span, add: "Add[State]", table: _WordTable, state: State, again: bool = False) -> State:
+    def _fold_rest(self, span: Span, add: "Add[State]", table: _WordTable, words: HitWords, state: State) -> State:
+        """Fold the first chunk of candidates, which is tested, but has doubts, and all others."""
+        query = [span.of(x) for x in self.queries.axes]
+
+        def add_tested(words: HitWords, state: State) -> State:
+            packed, first, image = words
+            return add(HitWords(self._decide_rest(*words, span, largest_of(packed) > _HITS), first, image), state)
+
+        if table.most is not None and table.most <= self.words:
+            return add_tested(words, state)
+        longest = table.longest
+
+        def add_next(now: tuple[Array, Array, HitWords, State]) -> tuple[Array, Array, HitWords, State]:
+            _, chunk, words, state = now
+            state, chunk = add_tested(words, state), chunk + 1
+            more = chunk * self.words < longest
+            return more, chunk, lax.cond(more, lambda: HitWords(*self._test_words(span, query, table, chunk)), lambda: words), state
+
+        return lax.while_loop(lambda now: now[0], add_next, (jnp.asarray(longest > 0), jnp.int32(0), words, state))[3]
+
+    def _fold_table(self, span: Span, add: "Add[State]", table: _WordTable, state: State) -> State:
         query = [span.of(x) for x in self.queries.axes]
 
         def add_chunk(chunk: Array, state: State) -> State:
             own, runs, chunk = lax.optimization_barrier((query, table, chunk))  # XLA would take small parts out of the loop
-            return add(self.hit_words(span, own, runs, chunk, again), state)
+            return add(self.hit_words(span, own, runs, chunk), state)
 
         def add_next(now: tuple[Array, Array, State]) -> tuple[Array, Array, State]:
             _, chunk, state = now
             return (chunk + 1) * self.words < longest, chunk + 1, add_chunk(chunk, state)
 
         if table.most is not None and table.most <= self.words:
-            return add(self.hit_words(span, query, table, jnp.int32(0), again), state)
+            return add(self.hit_words(span, query, table, jnp.int32(0)), state)
         longest = table.longest
         return lax.while_loop(lambda now: now[0], add_next, (jnp.asarray(longest > 0), jnp.int32(0), state))[2]
 
@@ -239,16 +259,18 @@ class BlockSearch(NamedTuple):
             total = before[:, -1] + count[:, -1]
         return _WordTable(start, stop, image, before, total, self.candidates.most_words)
 
-    def hit_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array, again: bool) -> HitWords:
-        """Test one chunk of words per query; `own` are the d coordinates [b] of the queries; `again`: after a try without loops."""
+    def hit_words(self, span: Span, own: list[Array], table: _WordTable, chunk: Array) -> HitWords:
+        """Test one chunk of words per query; `own` are the d coordinates [b] of the queries."""
         packed, first, image = self._test_words(span, own, table, chunk)
         if not self.tuning.by_gathers:
             return HitWords(self._decide_by_rounds(packed, first, image, span), first, image)
         if self.reads_all:  # of few sources, all ties are decided without a loop
             packed = self._decide_in_rows(packed, first, image, span)
-        elif not again:
-            packed = self._decide_first(packed, first, image, span)
-        return HitWords(self._decide_rest(packed, first, image, span, not self.reads_all), first, image)
+            more = largest_of(packed) > _HITS
+        else:
+            packed, left, _ = self._decide_first(packed, first, image, span)
+            more = largest_of(left.astype(jnp.int32)) > 0
+        return HitWords(self._decide_rest(packed, first, image, span, more, in_rows=not self.reads_all), first, image)
 
     def ids_of(self, words: HitWords, word: Array, bit: Array) -> Array:
         """Return the sources that bits stand for; those of unset bits are any."""
@@ -436,21 +458,27 @@ class BlockSearch(NamedTuple):
             later = jnp.where(image > torus.images.home, own, jnp.where(image < torus.images.home, own + 1, later))
         return lanes.read(self.sources.ids) >= later
 
-    def _decide_first(self, packed: Array, first: Array | None, image: Array | None, span: Span) -> Array:
+    def _decide_first(self, packed: Array, first: Array | None, image: Array | None, span: Span) -> tuple[Array, Array, Array]:
         """Decide the first doubtful candidate of each row, where that takes no wide integers, without any loop.
 
-        Returns the words, of which the lower half is right where the upper half is empty.
+        Returns the words, which rows [b] have doubtful candidates left, and how many neighbors each has at most. All are found by
+        one reduction: of a single minimum, XLA's autotuner for GPUs compiles several variants.
         """
         one, (rows, width) = np.uint32(1), packed.shape
-        word = lax.argmax(packed > _HITS, 1, jnp.int32)  # of a single minimum, XLA's autotuner for GPUs compiles several variants
-        at = word + width * lax.iota(jnp.int32, rows)
+        place = jnp.where(packed > _HITS, lax.broadcasted_iota(jnp.int32, packed.shape, 1), width)
+        columns = place, bit_counts(packed >> np.uint32(LANES)), bit_counts(packed)
+        start = np.int32(width), np.int32(0), np.int32(0)
+        word, doubts, most = lax.reduce(columns, start, lambda a, b: (lax.min(a[0], b[0]), a[1] + b[1], a[2] + b[2]), (1,))
+        at = lax.min(word, np.int32(width - 1)) + width * lax.iota(jnp.int32, rows)
         asked = flat_take(packed, at) >> np.uint32(LANES)
         bit = bit_counts((asked & (~asked + one)) - one) % LANES
         known, near = decide_in_units(self._pair_at(span.places, HitWords(packed, first, image), at, bit), self.cutoff)
-        change = jnp.where(known & (asked > 0), _decided(bit, near), np.uint32(0))
-        word, change = lax.optimization_barrier((word, change))
-        here = lax.broadcasted_iota(jnp.int32, packed.shape, 1) == word[:, None]
-        return packed + jnp.where(here, change[:, None], np.uint32(0))
+        known = known & (asked > 0)
+        at, change, left = lax.optimization_barrier(
+            (at, jnp.where(known, _decided(bit, near), np.uint32(0)), doubts > known.astype(jnp.int32))
+        )
+        flat = packed.reshape(-1).at[at].add(change, indices_are_sorted=True, unique_indices=True, mode="promise_in_bounds")
+        return flat.reshape(packed.shape), left, most
 
     def _decide_in_rows(self, packed: Array, first: Array | None, image: Array | None, span: Span) -> Array:
         """Decide by step 2 the first 32 doubtful candidates of each row, a thread each.
@@ -466,12 +494,14 @@ class BlockSearch(NamedTuple):
         place = jnp.where(slot < bits.total[:, None], word, packed.size)
         return packed.reshape(-1).at[place].add(change, mode="drop").reshape(packed.shape)
 
-    def _decide_rest(self, packed: Array, first: Array | None, image: Array | None, span: Span, in_rows: bool) -> Array:
-        """Decide what is still doubtful, in a loop that rarely turns: by step 2 in rows, then one candidate per word by step 3."""
+    def _decide_rest(
+        self, packed: Array, first: Array | None, image: Array | None, span: Span, more: Array, in_rows: bool = True
+    ) -> Array:
+        """Decide what is still doubtful, if more is, in a loop that rarely turns: by step 2 in rows, then by step 3 in words."""
         (width,), many = packed.shape[1:], min(self.tuning.wide, packed.size)
 
-        def decide_next(packed: Array) -> Array:
-            (packed,) = lax.optimization_barrier((packed,))
+        def decide_next(state: tuple[Array, Array]) -> tuple[Array, Array]:
+            _, packed = lax.optimization_barrier(state)
             flat = (self._decide_in_rows(packed, first, image, span) if in_rows else packed).reshape(-1)
             start = jnp.minimum(lax.argmax(flat > _HITS, 0, jnp.int32), flat.size - many)  # the first that is left
             here, word = lax.dynamic_slice_in_dim(flat, start, many), start + lax.iota(jnp.int32, many)
@@ -479,9 +509,10 @@ class BlockSearch(NamedTuple):
             bit, row = nth_bit(doubtful, jnp.zeros_like(doubtful)), lax.div(word, np.int32(width))
             pair = self._pair_at(span.first + row, HitWords(packed, first, image), word, bit)
             here = here + jnp.where(doubtful > 0, _decided(bit, decide_in_integers(pair, self.cutoff)), np.uint32(0))
-            return lax.dynamic_update_slice_in_dim(flat, here, start, axis=0).reshape(packed.shape)
+            flat = lax.dynamic_update_slice_in_dim(flat, here, start, axis=0)
+            return largest_of(flat) > _HITS, flat.reshape(packed.shape)
 
-        return lax.while_loop(lambda packed: largest_of(packed) > _HITS, decide_next, packed)
+        return lax.while_loop(lambda state: state[0], decide_next, (more, packed))[1]
 
     def _decide_by_rounds(self, packed: Array, first: Array | None, image: Array | None, span: Span) -> Array:
         """Decide doubtful candidates on a CPU: the first 32 of each row at a time."""

@@ -12,6 +12,7 @@ LANES = 16  # candidates per word: in a uint32 hits take the lower half, doubtfu
 CHUNK = 64 * LANES  # most candidates per query that are tested at a time on a CPU
 _GROUP = 8  # words whose counts are bytes of two integers
 _FEW = 12  # entries that are compared one by one
+_LOWER = np.uint32((1 << LANES) - 1)
 _BYTES = np.uint32(0x01010101)
 _TOPS = np.uint32(0x80808080)
 
@@ -76,7 +77,7 @@ class BitRows(NamedTuple):
     Words form groups of eight. The number of set bits in a group up to each of its words is a byte, at most 128.
 
     Attributes:
-        hits: [b, w] uint32, the words.
+        hits: [b, w] uint32, the words; where numbers are gathered, the upper half is any.
         earlier: [b, g] int32, the number of set bits in earlier groups of the row.
         until: [b, g, 2] uint32, the bytes of a group's words 0 to 3, and of its words 4 to 7.
         by_gathers: Whether a group's numbers are gathered, or chosen by looking at every group of the row. Static.
@@ -91,7 +92,7 @@ class BitRows(NamedTuple):
     def of(cls, words: Array, by_gathers: bool) -> "BitRows":
         """Prepare words, of which only the lower half is used; on a CPU, the upper half has to be empty."""
         rows, width = words.shape
-        hits = words & np.uint32((1 << LANES) - 1) if by_gathers else words
+        hits = words & _LOWER if by_gathers else words
         groups = -(-width // _GROUP)
         counts = jnp.pad(lax.population_count(hits), ((0, 0), (0, groups * _GROUP - width))).reshape(rows, groups, 1, _GROUP)
         until = lax.optimization_barrier(jnp.sum(counts * _until_bytes(), axis=3, dtype=jnp.uint32))
@@ -101,7 +102,7 @@ class BitRows(NamedTuple):
             earlier = jnp.sum(in_group[:, :, None] * before.T[None], axis=1, dtype=jnp.int32)
         else:
             earlier = jnp.sum(in_group[:, None] * before[None], axis=2, dtype=jnp.int32)
-        return cls(hits, lax.optimization_barrier(earlier), until, by_gathers)
+        return cls(words, lax.optimization_barrier(earlier), until, by_gathers)
 
     @property
     def total(self) -> Array:
@@ -124,7 +125,7 @@ class BitRows(NamedTuple):
         word = lax.min(group * _GROUP + word.astype(jnp.int32), np.int32(width - 1))
         word = word + lax.broadcasted_iota(jnp.int32, ordinal.shape, 0) * width
         if self.by_gathers:
-            return word, nth_bit(flat_take(self.hits, word), within)
+            return word, nth_bit(flat_take(self.hits, word) & _LOWER, within)
         word, within = lax.optimization_barrier((word, within))  # kernels without gathers are vectorized
         found = lax.optimization_barrier(flat_take(self.hits, word))
         return word, lax.optimization_barrier(nth_bit(found, within))
