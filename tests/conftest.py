@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import soon
 import warp
 from jax._src import compiler
 
@@ -26,7 +27,6 @@ TESTS = count(1)
 tuning.CPU = tuning.CPU._replace(plain_pairs=tuning.CPU.few_pairs)  # "jax" sorts most scenes of tests; "brute" tests all pairs
 XLA_FLAGS = os.environ.get("XLA_FLAGS", "")
 UNFUSED = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
-AS_USERS_DO, SOON = _clang.OPTIONS, ("-march=native", "-O0")  # what kernels for the CPU are compiled with: see `_compile_kernels`
 warp.config.log_level = warp.LOG_WARNING  # else it prints what it compiles, into doctests too
 LONGEST = (  # files, those first that take longest: what is left at the end is short, and no worker waits for another's long file
     *(
@@ -90,11 +90,7 @@ def _quick_options():
 
 
 def _compile_kernels(options):
-    """Compile kernels for the CPU with these options from now on; those that were compiled with others are let go.
-
-    Clang without optimizations takes a sixth of the time, and a kernel of it three to five times as long. What floats come out
-    is the same: none of the options allows a compiler to calculate otherwise than it is told.
-    """
+    """Compile kernels with these options (`soon.py`) from now on; those that were compiled with others are let go."""
     if options == _clang.OPTIONS:
         return
     _clang.OPTIONS = options
@@ -108,7 +104,7 @@ def _compiled_soon(request, monkeypatch, _quick_options):
     fully, kernels = (
         any(request.node.get_closest_marker(name) for name in ("slow", "fully_compiled", *also)) for also in ((), ("kernels",))
     )
-    _compile_kernels(AS_USERS_DO if kernels else SOON)
+    _compile_kernels(soon.AS_USERS_DO if kernels else soon.SOON)
     if fully:
         monkeypatch.delenv("JAX_DISABLE_MOST_OPTIMIZATIONS")
         monkeypatch.setenv("XLA_FLAGS", XLA_FLAGS)
