@@ -24,6 +24,7 @@ UNCROSSED = EMPTY | {"periodic_none", "skewed_open", "blob_at_origin", "blobs_on
 ONLY_TIES = {"alone_at_the_cutoff"}
 
 
+@functools.lru_cache(maxsize=256)
 def built(name, dtype, dim):
     return PERIODIC_CASES[name].build(dtype, dim)
 
