@@ -36,10 +36,6 @@ def expected_pairs(name, dtype, dim, closed):
     return reference.reference_pairs(given.positions, given.cutoff, queries=given.queries, closed=closed)
 
 
-# Of most pairs whole numbers decide, which takes the array engines seconds: these are padded to fewer rows.
-DOUBTFUL = ("residues", "residues_balanced", "residues_denormal", "mixed_exponents")
-
-
 def each_case():
     """Yield every dtype, dimension, comparison, case and backend, in an order in which the oracle answers each case once.
 
@@ -57,8 +53,7 @@ def each_case():
 def test_hard_case(name, dtype, dim, closed, backend):
     given = HARD_CASES[name].build(dtype, dim)
     rows = max(len(given.positions), 0 if given.queries is None else len(given.queries))
-    short = backend in ("brute", "jax") and name in DOUBTFUL
-    length = 304 if short else 704 if rows <= 704 else 2048
+    length = 704 if rows <= 704 else 2048
     nbrs = checked.search_padded(given, length, CAPACITY, backend=backend, closed=closed)
     checked.assert_pairs(nbrs, expected_pairs(name, dtype, dim, closed))  # the padding is NaN and in no pair
 
