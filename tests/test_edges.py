@@ -13,7 +13,7 @@ import jfrnn
 
 def dense(nbrs, vectors, mask, shifts):
     """Return senders, receivers, displacements and shifts of all pairs closer than the cutoff, row by row."""
-    i, k = np.nonzero(mask)
+    i, k = np.nonzero(np.asarray(mask))
     return np.asarray(nbrs.idx)[i, k], i, np.asarray(vectors)[i, k], np.asarray(shifts)[i, k]
 
 

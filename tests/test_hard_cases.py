@@ -49,6 +49,7 @@ def each_case():
         yield pytest.param(name, dtype, dim, closed, backend, id=f"{kind}-{name}-{backend}", marks=[pytest.mark.slow] * rarely)
 
 
+@pytest.mark.kernels
 @pytest.mark.parametrize(("name", "dtype", "dim", "closed", "backend"), list(each_case()))
 def test_hard_case(name, dtype, dim, closed, backend):
     given = HARD_CASES[name].build(dtype, dim)

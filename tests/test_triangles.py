@@ -49,6 +49,7 @@ def each_case():
         yield pytest.param(name, dtype, dim, backend, id=kind, marks=[pytest.mark.slow] * rarely)
 
 
+@pytest.mark.kernels
 @pytest.mark.parametrize(("name", "dtype", "dim", "backend"), list(each_case()))
 def test_hard_case(name, dtype, dim, backend):
     tri = search_padded(name, dtype, dim, backend)
