@@ -19,7 +19,7 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_traceback_in_locations_limit", 0)
 os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"  # programs tell no line of the sources they were traced from: it takes long
-os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"  # in processes that tests start, as `_compiled_soon` in this one
+os.environ[soon.ASKED] = "1"  # in processes that tests start, as `_compiled_soon` in this one
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # to compile the sources of JAX takes each of them a second and a half
 gc.freeze()  # imported modules are no garbage; tracing makes many objects that stay: to look through them takes a tenth of the time
 gc.set_threshold(50_000, 20, 20)
@@ -101,12 +101,11 @@ def _compile_kernels(options):
 @pytest.fixture(autouse=True)
 def _compiled_soon(request, monkeypatch, _quick_options):
     """Leave out what takes long to compile, but in slow tests, and where memory or the last digits of floats are tested."""
-    fully, kernels = (
-        any(request.node.get_closest_marker(name) for name in ("slow", "fully_compiled", *also)) for also in ((), ("kernels",))
-    )
-    _compile_kernels(soon.AS_USERS_DO if kernels else soon.SOON)
+    asked = {mark.name for mark in request.node.iter_markers()}
+    fully = not asked.isdisjoint(("slow", "fully_compiled"))
+    _compile_kernels(soon.AS_USERS_DO if fully or "kernels" in asked else soon.SOON)
     if fully:
-        monkeypatch.delenv("JAX_DISABLE_MOST_OPTIMIZATIONS")
+        monkeypatch.delenv(soon.ASKED)
         monkeypatch.setenv("XLA_FLAGS", XLA_FLAGS)
     elif _quick_options:
         monkeypatch.setattr(compiler, "get_compile_options", _quick_options)

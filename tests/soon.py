@@ -1,7 +1,8 @@
 """What kernels for the CPU are compiled with in tests.
 
-Clang without optimizations takes a sixth of the time, and what it makes three to five times as long. The floats that come out are
-the same: none of the options lets a compiler calculate otherwise than it is told.
+To optimize takes Clang most of its time, which on a machine that keeps no kernels is most of the time of the tests; kernels that
+are not optimized are slower, but the scenes are small. The floats that come out are the same: none of the options lets a compiler
+calculate otherwise than it is told. Hard cases run optimized kernels all the same, by the mark `kernels`.
 """
 
 import os
