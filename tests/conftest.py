@@ -8,16 +8,18 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import soon
 import warp
 from jax._src import compiler
 
-from jfrnn._engine import tuning
+from jfrnn._engine import launch, tuning
+from jfrnn.kernels import _clang
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_traceback_in_locations_limit", 0)
 os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"  # programs tell no line of the sources they were traced from: it takes long
-os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"  # in processes that tests start, as `_compiled_soon` in this one
+os.environ[soon.ASKED] = "1"  # in processes that tests start, as `_compiled_soon` in this one
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # to compile the sources of JAX takes each of them a second and a half
 gc.freeze()  # imported modules are no garbage; tracing makes many objects that stay: to look through them takes a tenth of the time
 gc.set_threshold(50_000, 20, 20)
@@ -26,23 +28,18 @@ tuning.CPU = tuning.CPU._replace(plain_pairs=tuning.CPU.few_pairs)  # "jax" sort
 XLA_FLAGS = os.environ.get("XLA_FLAGS", "")
 UNFUSED = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 warp.config.log_level = warp.LOG_WARNING  # else it prints what it compiles, into doctests too
-LONGEST = (  # files, those first that take longest: what is left at the end is short, and no worker waits for another's long file
-    *(
-        "types",
-        "hard_cases",
-        "pair_sum",
-        "experiments_sweep",
-        "notebooks",
-        "docs",
-        "radii",
-        "box",
-        "triangles_closest",
-        "search",
-        "triangles",
-    ),
-    *("memory", "modes", "order", "verlet", "distributed", "batch", "reference", "cases_periodic", "transforms", "exports"),
-    *("experiments_sums", "experiments_distributed", "spread", "start", "travel", "package", "house", "interrupts"),
-)
+# Files, those first that take longest: what is left at the end is short, and no worker waits for another's long file.
+LONGEST = (
+    "types", "docs", "kept", "hard_cases", "box", "triangles", "pair_sum", "experiments_sweep", "triangles_closest",
+    "cases_periodic", "boxes", "exact", "reverse", "radii", "search", "memory", "pair_sum_warp", "reference", "arrays",
+    "triangles_cuda", "order", "experiments_peers", "experiments_gpu", "notebooks", "jax_md", "boxes_radii", "distributed",
+    "verlet", "joint", "pair_sum_cuda", "sph_solids", "verlet_boxes", "edges", "fractional", "transforms", "batch", "modes",
+    "spread", "translate", "cell_line", "start", "pair_sum_warp_boxes", "experiments_latency", "experiments_lj", "who",
+    "neighbors", "native", "experiments_sums", "triangles_contacts", "cells", "sph_speed", "sph_parts", "search_edges",
+    "experiments_methods", "sph_run", "triangles_moving", "ase", "exports", "travel", "pair_sum_warp_radii", "buffers",
+    "package", "experiments_distributed", "experiments_start", "experiments_report", "experiments_commands", "house",
+    "interrupts",
+)  # fmt: skip
 
 
 def pytest_collection_modifyitems(items):
@@ -87,12 +84,23 @@ def _quick_options():
     return whole and quick
 
 
+def _compile_kernels(options):
+    """Compile kernels with these options (`soon.py`) from now on; those that were compiled with others are let go."""
+    if options == _clang.OPTIONS:
+        return
+    _clang.OPTIONS = options
+    for key in list(launch._plans):  # programs that call them ask for them again
+        launch._open().drop(launch._plans.pop(key))
+
+
 @pytest.fixture(autouse=True)
 def _compiled_soon(request, monkeypatch, _quick_options):
     """Leave out what takes long to compile, but in slow tests, and where memory or the last digits of floats are tested."""
-    fully = any(request.node.get_closest_marker(name) for name in ("slow", "fully_compiled"))
+    asked = {mark.name for mark in request.node.iter_markers()}
+    fully = not asked.isdisjoint(("slow", "fully_compiled"))
+    _compile_kernels(soon.AS_USERS_DO if fully or "kernels" in asked else soon.SOON)
     if fully:
-        monkeypatch.delenv("JAX_DISABLE_MOST_OPTIMIZATIONS")
+        monkeypatch.delenv(soon.ASKED)
         monkeypatch.setenv("XLA_FLAGS", XLA_FLAGS)
     elif _quick_options:
         monkeypatch.setattr(compiler, "get_compile_options", _quick_options)

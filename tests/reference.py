@@ -153,12 +153,11 @@ def reference_radii(
     flags = (cell is not None,) * dim if periodic is None else periodic
     options = {"matrix": np.ones(dim) if cell is None else cell, "periodic": flags}
     nearby = reference_images(points, largest, queries=queries, half=half, closed=True, **options)
-    ends = [[Fraction(x) for x in point] for point in points.tolist()]
-    starts = ends if queries is None else [[Fraction(x) for x in point] for point in _points(queries).tolist()]
-    of_end = [Fraction(r) for r in np.asarray(radii).tolist()]
-    of_start = of_end if query_radii is None else [Fraction(r) for r in np.asarray(query_radii).tolist()]
     rows = np.asarray(np.zeros(dim) if cell is None else cell, points.dtype)
-    rows = [[Fraction(x) for x in row] for row in (np.diag(rows) if rows.ndim == 1 else rows).tolist()]
+    rows = np.diag(rows) if rows.ndim == 1 else rows
+    given = [points, points if queries is None else _points(queries), rows, np.asarray(radii)[None]]
+    given.append(given[-1] if query_radii is None else np.asarray(query_radii)[None])
+    ends, starts, rows, (of_end,), (of_start,) = _whole(*given)
     found = set()
     for i, j, shift in nearby:
         own, other = of_start[i], of_end[j]
@@ -400,6 +399,13 @@ def _integers(cutoff: float, *clouds: np.ndarray) -> tuple[int, list[dict[int, l
     return top * (scale // bottom), scaled
 
 
+def _whole(*tables: np.ndarray) -> list[list[list[int]]]:
+    """Return tables of floats in a unit of which all are multiples, so that comparing them takes whole numbers alone."""
+    ratios = [[[x.as_integer_ratio() for x in row] for row in table.tolist()] for table in tables]
+    unit = max((below for table in ratios for row in table for _, below in row), default=1)  # denominators are powers of two
+    return [[[above * (unit // below) for above, below in row] for row in table] for table in ratios]
+
+
 def _within(cutoff: float, queries: np.ndarray, sources: np.ndarray, closed: bool, once: bool = False) -> Iterator[Pair]:
     """Yield every (query i, source j) within the cutoff: by integer cells of that edge, then by squared distance.
 
@@ -448,9 +454,13 @@ def _shifts(v: Vector, levels: list[Level], limit: int) -> Iterator[tuple[int, .
         if _dot(v, v) <= limit:
             yield ()
         return
-    row, normal, height, reach = levels[-1]
+    *rest, (row, normal, height, reach) = levels
     here = _dot(v, normal)
     for s in range(-((reach + here) // height), (reach - here) // height + 1):
         moved = [x + s * step for x, step in zip(v, row, strict=True)] if s else v
-        for others in _shifts(moved, levels[:-1], limit):
+        if not rest:
+            if _dot(moved, moved) <= limit:
+                yield (s,)
+            continue
+        for others in _shifts(moved, rest, limit):
             yield (*others, s)

@@ -13,11 +13,13 @@ os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_p
 import jax
 import jax.numpy as jnp
 import numpy as np
+import soon
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 import jfrnn
 
 jax.config.update("jax_enable_x64", True)
+soon.compile_soon()
 jax.config.update("jax_disable_most_optimizations", True)
 
 CHECKS = {}

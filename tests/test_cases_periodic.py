@@ -24,6 +24,7 @@ UNCROSSED = EMPTY | {"periodic_none", "skewed_open", "blob_at_origin", "blobs_on
 ONLY_TIES = {"alone_at_the_cutoff"}
 
 
+@functools.lru_cache(maxsize=256)
 def built(name, dtype, dim):
     return PERIODIC_CASES[name].build(dtype, dim)
 
@@ -106,9 +107,10 @@ def test_cases_refuse_other_dtypes_and_dimensions():
             PERIODIC_CASES["random"].build(dtype, dim)
 
 
+@pytest.mark.parametrize("builds", [BUILDS[1:3], pytest.param(BUILDS[::3], marks=pytest.mark.slow)], ids=["often", "rarely"])
 @pytest.mark.parametrize("name", PERIODIC_CASES)
-def test_case_has_the_pairs_it_is_about(name):
-    for dtype, dim in BUILDS:
+def test_case_has_the_pairs_it_is_about(name, builds):
+    for dtype, dim in builds:
         found = images_of(name, dtype, dim, closed=True)
         given = built(name, dtype, dim)
         radius = Fraction(dtype(given.cutoff).item())

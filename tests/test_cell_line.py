@@ -1,5 +1,7 @@
 """Cells numbered along a line: every candidate once, in domains that fit into the table and in others."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,15 +14,25 @@ from jfrnn._geometry.images import Images
 CUTOFF = 0.1
 
 
-def line_of(x, sources, systems=None):
+def line_of(x, sources):
     axes = open_axes(cell_edge(jnp.asarray(CUTOFF, x.dtype)), x.shape[1])
-    return cell_line.sort_along_line(jnp.asarray(x.T), axes, sources, systems)
+    return cell_line.sort_along_line(jnp.asarray(x.T), axes, sources, None)
 
 
-def candidates_of(line, cells, queries, images=None):
+def runs_of(line, cells, queries, images=None):
+    """Return the sources along the line, twice, and the runs of queries."""
+    return line.twice(), *cell_line.line_runs(line, cells.of(jnp.asarray(queries)), images)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def runs_along_line(x, sources, queries):
+    """Sort and look up in one program, which scenes of the same shape share."""
+    return runs_of(*line_of(x, sources), queries)
+
+
+def candidates(twice, start, stop, code):
     """Return the sources and image codes of each query's runs, one list per query."""
-    start, stop, code = cell_line.line_runs(line, cells.of(jnp.asarray(queries)), images)
-    twice = np.asarray(line.twice())
+    twice, start, stop = map(np.asarray, (twice, start, stop))
     code = np.zeros_like(start) if code is None else np.asarray(code)
     rows = [list(zip(*row, strict=True)) for row in zip(start.tolist(), stop.tolist(), code.tolist(), strict=True)]
     return [[(int(twice[p]), c) for a, b, c in row for p in range(a, b)] for row in rows]
@@ -35,10 +47,9 @@ def test_every_pair_is_met_once(spread, queries, dtype, dim):
     x = np.concatenate([blobs.reshape(-1, dim), rng.uniform(-spread, spread, (60, dim)), np.full((5, dim), np.inf)]).astype(dtype)
     x = rng.permutation(x)
     asked = x[rng.integers(0, len(x), queries)] + dtype(0.01)
-    line, cells = line_of(np.concatenate([x, asked]), len(x))
     places = np.arange(len(x)) if queries == 0 else len(x) + np.arange(queries)
     points = np.concatenate([x, asked]).astype(np.float64)
-    for q, found in zip(places, candidates_of(line, cells, places), strict=True):
+    for q, found in zip(places, candidates(*runs_along_line(np.concatenate([x, asked]), len(x), places)), strict=True):
         met = [j for j, _ in found]
         assert len(met) == len(set(met))
         with np.errstate(invalid="ignore"):
@@ -83,7 +94,7 @@ def test_runs_of_a_torus_meet_every_image_once(images, crowded, monkeypatch):
     fine = np.stack([np.asarray(c).astype(np.int64) for c in cells.along], axis=1)
     period = np.array([4 * turns[0], turns[1], turns[2]]) * images.periodic
     width = np.array([4, 1, 1]) * np.maximum(images.reach, 1)
-    for q, found in zip(places, candidates_of(line, cells, places, images), strict=True):
+    for q, found in zip(places, candidates(*runs_of(line, cells, places, images)), strict=True):
         expected = [
             (j, code)
             for code, shift in enumerate(images.shifts)

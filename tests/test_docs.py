@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import soon
 
 import jfrnn
 from experiments import pages
@@ -18,7 +19,9 @@ from jfrnn._shards.calls import BACKENDS
 from jfrnn._triangles.engines import TRIANGLE_ENGINES
 
 ROOT = Path(__file__).parent.parent
-RUN = """
+RUN = (
+    soon.PROGRAM
+    + """
 import sys, traceback
 from pathlib import Path
 
@@ -37,6 +40,16 @@ for page in map(Path, sys.argv[1:]):
         traceback.print_exc()
     else:
         print("\\0ran", page, sum(map(bool, lines)))
+"""
+)
+BUILD = f"""
+import sys
+
+from experiments.pages import gallery
+from sphinx.cmd.build import main
+
+gallery._RUN = {soon.PROGRAM!r} + gallery._RUN
+sys.exit(main(sys.argv[1:]))
 """
 GROUPS = {
     "readme": ["README.md", "docs/index.md", "docs/start.md"],
@@ -76,18 +89,7 @@ def test_code_of_pages(group, ran):
 
 def test_pages_build(tmp_path):
     """With warnings as errors: links, anchors and cross-references are there, docstrings can be read, no page is left out."""
-    run(
-        "-m",
-        "sphinx",
-        "-W",
-        "--keep-going",
-        "--quiet",
-        "--builder",
-        "html",
-        str(ROOT / "docs"),
-        str(tmp_path),
-        PYTHONPATH=str(ROOT),
-    )
+    run("-c", BUILD, "-W", "--keep-going", "--quiet", "--builder", "html", str(ROOT / "docs"), str(tmp_path))
     html = {path.stem: path.read_text(encoding="utf-8") for path in (tmp_path / "api").glob("*.html")}
     missing = [name for name in jfrnn.__all__ if f'id="jfrnn.{name}"' not in html["jfrnn"]]
     missing += [name for name in distributed.__all__ if f'id="jfrnn.distributed.{name}"' not in html["distributed"]]

@@ -33,6 +33,7 @@ def cutoffs(dtype):
     return st.one_of(st.floats(low, high, width=width), st.integers(1, 100).map(float))
 
 
+@pytest.mark.kernels
 @hypothesis.settings(max_examples=150, deadline=None)
 @hypothesis.given(st.data())
 @pytest.mark.parametrize(

@@ -39,16 +39,23 @@ def expected_pairs(name, dtype, dim, closed):
 def each_case():
     """Yield every dtype, dimension, comparison, case and backend, in an order in which the oracle answers each case once.
 
-    The array engines decide alike and compile slowly: of them, and of "hashgrid", some kinds run by hand alone.
+    By default "warp" takes each dtype in each dimension, and either comparison with each of them; of the array engines, which
+    decide alike and compile slowly, and of "hashgrid" more kinds run by hand alone.
     """
     for dtype, dim, closed, name, backend in product((np.float32, np.float64), (2, 3), (False, True), NAMES, BACKENDS):
         often = (dtype, dim) in ((np.float32, 3), (np.float64, 2))
         first = (dtype, dim) == (np.float32, 3)
-        rarely = {"brute": closed or not first, "jax": closed or not often, "hashgrid": not often}.get(backend, False)
+        rarely = {
+            "brute": closed or not first,
+            "jax": closed or not often,
+            "hashgrid": not often or closed is not first,
+            "warp": closed is often,
+        }[backend]
         kind = f"f{8 * dtype().itemsize}-{dim}d-{'closed' if closed else 'open'}"
         yield pytest.param(name, dtype, dim, closed, backend, id=f"{kind}-{name}-{backend}", marks=[pytest.mark.slow] * rarely)
 
 
+@pytest.mark.kernels
 @pytest.mark.parametrize(("name", "dtype", "dim", "closed", "backend"), list(each_case()))
 def test_hard_case(name, dtype, dim, closed, backend):
     given = HARD_CASES[name].build(dtype, dim)

@@ -1,6 +1,7 @@
 """`jfrnn.jax_md`: jax-md's neighbor lists, against the oracle; jax-md's own functions where it is installed."""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -62,8 +63,13 @@ def expected(x, space, form):
     return {(i, j) for i, j, _ in within if form.name != "OrderedSparse" or j < i}
 
 
-@pytest.mark.parametrize("space", SPACES)
-@pytest.mark.parametrize("form", FORMATS)
+OFTEN = [("free", jax_md.Dense), ("periodic", jax_md.Sparse), ("periodic", jax_md.OrderedSparse), ("fractional", jax_md.Dense)]
+
+
+@pytest.mark.parametrize(
+    ("space", "form"),
+    [pytest.param(*each, marks=[pytest.mark.slow] * (each not in OFTEN)) for each in itertools.product(SPACES, FORMATS)],
+)
 def test_pairs_in_a_loop(space, form):
     displacement, box, fractional = SPACES[space]
     fns = jax_md.neighbor_list(displacement, box, CUTOFF, SKIN, fractional_coordinates=fractional, format=form)
@@ -155,8 +161,13 @@ def test_boxes_that_change():
         jax.jit(lambda x: jax_md.neighbor_list(free, 1.0, CUTOFF).allocate(x).idx)(x)
 
 
-@pytest.mark.parametrize("form", FORMATS)
-@pytest.mark.parametrize("fractional", [True, False])
+@pytest.mark.parametrize(
+    ("form", "fractional"),
+    [
+        pytest.param(form, fractional, marks=[pytest.mark.slow] * (fractional is not (form is not jax_md.Sparse)))
+        for form, fractional in itertools.product(FORMATS, (True, False))
+    ],
+)
 def test_several_images(form, fractional):
     matrix, x = MATRIX / 2, points(True, 6)
     given = x if fractional else x @ matrix.T

@@ -22,8 +22,14 @@ def density(x, m, backend="warp", **options):
     return jfrnn.pair_sum(energy, x, CUTOFF, {"m": m}, backend=backend, **options)
 
 
+def compiled(function, *args):
+    """Return a program, and how many sums it calls."""
+    program = jax.jit(function).lower(*args).compile()
+    return program, program.as_text().count('custom_call_target="jfrnn"')
+
+
 def count_calls(function, *args):
-    return jax.jit(function).lower(*args).compile().as_text().count('custom_call_target="jfrnn"')
+    return compiled(function, *args)[1]
 
 
 def assert_near(found, expected):
@@ -65,9 +71,9 @@ SLOW = [pytest.param(function, kind, marks=pytest.mark.slow) for function in (pr
 def test_sums_are_joined_and_right(function, kind):
     x, m = jnp.asarray(X, jnp.float32), jnp.asarray(M, jnp.float32)
     options = {"open": {}, "box": {"box": jfrnn.Box([1.0] * 3)}, "compensated": {"compensated": True}}[kind]
-    found = jax.jit(functools.partial(function, **options))(x, m)
-    assert_near(found, jax.jit(functools.partial(function, backend="brute", **options))(x, m))
-    assert count_calls(functools.partial(function, **options), x, m) == (2 if function is pressure else 1)
+    program, calls = compiled(functools.partial(function, **options), x, m)
+    assert_near(program(x, m), jax.jit(functools.partial(function, backend="brute", **options))(x, m))
+    assert calls == (2 if function is pressure else 1)
 
 
 @pytest.mark.slow
@@ -75,10 +81,10 @@ def test_array_programs_find_pairs_once():
     """A program sorts particles once for a density and its gradient, and what it finds is what two programs find."""
     x = jnp.asarray(np.random.default_rng(3).random((200, 3)), jnp.float32)
     m = jnp.asarray(np.random.default_rng(4).random(200), jnp.float32)
-    compiled = jax.jit(functools.partial(density_and_force, backend="jax")).lower(x, m).compile()
-    assert compiled.as_text().count(" sort(") == 1
+    program, _ = compiled(functools.partial(density_and_force, backend="jax"), x, m)
+    assert program.as_text().count(" sort(") == 1
     apart = density(x, m, "jax"), jax.grad(lambda x: density(x, m, "warp").sum())(x)
-    assert_near(compiled(x, m), apart)
+    assert_near(program(x, m), apart)
 
 
 def test_a_step_of_a_scan_finds_pairs_once():
@@ -87,8 +93,9 @@ def test_a_step_of_a_scan_finds_pairs_once():
         return x + 1e-3 * force, rho
 
     x = jnp.asarray(X, jnp.float32)
-    assert count_calls(lambda x: jax.lax.scan(step, x, None, length=3), x) == 1
-    moved, rhos = jax.jit(lambda x: jax.lax.scan(step, x, None, length=3))(x)
+    program, calls = compiled(lambda x: jax.lax.scan(step, x, None, length=3), x)
+    assert calls == 1
+    moved, rhos = program(x)
     with jax.disable_jit():
         expected = jax.lax.scan(step, x, None, length=3)
     assert_near((moved, rhos), expected)

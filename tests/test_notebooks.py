@@ -9,11 +9,14 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+import soon
 
 from experiments import methods
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
-RUN = """
+RUN = (
+    soon.PROGRAM
+    + """
 import json, sys, traceback
 from pathlib import Path
 from IPython.core.interactiveshell import InteractiveShell
@@ -42,6 +45,7 @@ for path in map(Path, sys.argv[1:]):
             break
     print("\\0" + json.dumps([path.stem, pictures, said, failed]), flush=True)
 """
+)
 
 
 SAYS = {  # pictures, and what each prints

@@ -83,6 +83,7 @@ def marked(x, cutoff, queries=None, **options):
     return fused(marks, jnp.asarray(checked.padded(x, LENGTH)), cutoff, ids, **options)
 
 
+@pytest.mark.kernels
 @pytest.mark.parametrize(
     ("dtype", "dim"),
     [(np.float32, 3), (np.float64, 2), *(pytest.param(*kind, marks=SLOW) for kind in ((np.float32, 2), (np.float64, 3)))],

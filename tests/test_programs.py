@@ -21,6 +21,13 @@ BOX = jfrnn.Box([4.0, 4.0, 4.0])
 SIZES = iter(range(40, 400))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _begin_anew():
+    """Drop what other files compiled: past a number of programs or memory maps the library drops all, and would amid a test."""
+    jax.clear_caches()
+    gc.collect()
+
+
 def compiled_by(call, *args, **kwargs):
     before = len(COMPILED)
     jax.block_until_ready(call(*args, **kwargs))

@@ -27,7 +27,7 @@ def masked_pairs(nbrs, x, **options):
     """Return the pairs of a list within the true cutoff at these positions."""
     assert not nbrs.overflow
     _, mask = distances(nbrs, x, **options)
-    i, k = np.nonzero(mask)
+    i, k = np.nonzero(np.asarray(mask))
     pairs = list(zip(i.tolist(), np.asarray(nbrs.idx)[i, k].tolist(), strict=True))
     assert len(pairs) == len(set(pairs))
     return set(pairs)

@@ -79,7 +79,8 @@ def test_images_of_a_kept_list_are_those_of_the_moved_particles(dtype, kind, ask
     points = None if asked != "queries" else jnp.asarray(rng.uniform(0, 1, (9, 3)) @ rows + whole(9, 2), dtype)
     options = {"half": asked == "half"}
     given = {} if points is None else {"queries": points}
-    nbrs = jfrnn.search(before, cutoff, skin=skin, box=box, **options, **given)
+    nbrs = jfrnn.search(before, cutoff, skin=skin, box=box, capacity=256, **options, **given)
+    nbrs.check()
     assert (nbrs.images is None) == (kind == "nearest")
 
     def moved(x):

@@ -45,6 +45,7 @@ def stop(*_):
 
 def interrupted(given):
     """Return what a compiled program gives that was interrupted when it was loaded, while native code was compiled or loaded."""
+    jax.devices()  # JAX makes its client once: where a signal interrupts that, it says that there is none
     gc.disable()  # Python drops what is raised while it collects garbage
     signal.signal(signal.SIGALRM, stop)
     try:
