@@ -15,7 +15,7 @@ from jax import Array, lax
 from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
 from jfrnn._engine.problem import Filter
 from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
-from jfrnn._engine.words import CHUNK, LANES, BitRows, Lanes, bit_counts, join_lanes, last_reached, nth_bit
+from jfrnn._engine.words import CHUNK, HITS, LANES, BitRows, Lanes, bit_counts, join_lanes, last_reached, nth_bit
 from jfrnn._geometry import (
     Cutoff,
     Cutoffs,
@@ -32,8 +32,8 @@ from jfrnn._geometry import (
 from jfrnn._tracing import largest_of
 
 _FEW_RUNS = 32
+_AT_A_TIME = 1 << 10  # words of which one candidate each is decided by wide integers
 _SLOTS = 32  # doubtful candidates of a row that are decided at a time
-_HITS = np.uint32((1 << LANES) - 1)
 _MOST_WORDS = 256  # per query, that are tested at a time; (words << 16) has to be an int32
 
 State = TypeVar("State")
@@ -213,7 +213,7 @@ class BlockSearch(NamedTuple):
 
         def add_tested(words: HitWords, state: State) -> State:
             packed, first, image = words
-            return add(HitWords(self._decide_rest(*words, span, largest_of(packed) > _HITS), first, image), state)
+            return add(HitWords(self._decide_rest(*words, span, largest_of(packed) > HITS), first, image), state)
 
         if table.most is not None and table.most <= self.words:
             return add_tested(words, state)
@@ -266,7 +266,7 @@ class BlockSearch(NamedTuple):
             return HitWords(self._decide_by_rounds(packed, first, image, span), first, image)
         if self.reads_all:  # of few sources, all ties are decided without a loop
             packed = self._decide_in_rows(packed, first, image, span)
-            more = largest_of(packed) > _HITS
+            more = largest_of(packed) > HITS
         else:
             packed, left, _ = self._decide_first(packed, first, image, span)
             more = largest_of(left.astype(jnp.int32)) > 0
@@ -292,7 +292,7 @@ class BlockSearch(NamedTuple):
             packed = self._test(Lanes(first, image, queries_last=False), own, span) & (allowed | allowed << np.uint32(LANES))
         if self.candidates.excluded is not None:
             begin = self._first_of_all(span) if first is None else first
-            allowed = ~self._excluded_lanes(self.candidates.excluded, begin, span) & _HITS
+            allowed = ~self._excluded_lanes(self.candidates.excluded, begin, span) & HITS
             packed = packed & (allowed | allowed << np.uint32(LANES))
         if self.candidates.most_words is None:  # else the words are known before
             packed, first, image = lax.optimization_barrier((packed, first, image))
@@ -465,7 +465,7 @@ class BlockSearch(NamedTuple):
         one reduction: of a single minimum, XLA's autotuner for GPUs compiles several variants.
         """
         one, (rows, width) = np.uint32(1), packed.shape
-        place = jnp.where(packed > _HITS, lax.broadcasted_iota(jnp.int32, packed.shape, 1), width)
+        place = jnp.where(packed > HITS, lax.broadcasted_iota(jnp.int32, packed.shape, 1), width)
         columns = place, bit_counts(packed >> np.uint32(LANES)), bit_counts(packed)
         start = np.int32(width), np.int32(0), np.int32(0)
         word, doubts, most = lax.reduce(columns, start, lambda a, b: (lax.min(a[0], b[0]), a[1] + b[1], a[2] + b[2]), (1,))
@@ -498,19 +498,19 @@ class BlockSearch(NamedTuple):
         self, packed: Array, first: Array | None, image: Array | None, span: Span, more: Array, in_rows: bool = True
     ) -> Array:
         """Decide what is still doubtful, if more is, in a loop that rarely turns: by step 2 in rows, then by step 3 in words."""
-        (width,), many = packed.shape[1:], min(self.tuning.wide, packed.size)
+        (width,), many = packed.shape[1:], min(_AT_A_TIME, packed.size)
 
         def decide_next(state: tuple[Array, Array]) -> tuple[Array, Array]:
             _, packed = lax.optimization_barrier(state)
             flat = (self._decide_in_rows(packed, first, image, span) if in_rows else packed).reshape(-1)
-            start = jnp.minimum(lax.argmax(flat > _HITS, 0, jnp.int32), flat.size - many)  # the first that is left
+            start = jnp.minimum(lax.argmax(flat > HITS, 0, jnp.int32), flat.size - many)  # the first that is left
             here, word = lax.dynamic_slice_in_dim(flat, start, many), start + lax.iota(jnp.int32, many)
             doubtful = here >> np.uint32(LANES)
             bit, row = nth_bit(doubtful, jnp.zeros_like(doubtful)), lax.div(word, np.int32(width))
             pair = self._pair_at(span.first + row, HitWords(packed, first, image), word, bit)
             here = here + jnp.where(doubtful > 0, _decided(bit, decide_in_integers(pair, self.cutoff)), np.uint32(0))
             flat = lax.dynamic_update_slice_in_dim(flat, here, start, axis=0)
-            return largest_of(flat) > _HITS, flat.reshape(packed.shape)
+            return largest_of(flat) > HITS, flat.reshape(packed.shape)
 
         return lax.while_loop(lambda state: state[0], decide_next, (more, packed))[1]
 
@@ -538,7 +538,7 @@ class BlockSearch(NamedTuple):
             packed = packed.reshape(-1).at[place].add(_decided(bit, pair), mode="drop").reshape(packed.shape)
             return largest_of(bits.total) > _SLOTS, packed
 
-        return lax.while_loop(lambda state: state[0], decide_round, (largest_of(packed) > _HITS, packed))[1]
+        return lax.while_loop(lambda state: state[0], decide_round, (largest_of(packed) > HITS, packed))[1]
 
     def _pair_at(self, place: Array, words: HitWords, word: Array, bit: Array) -> Pair:
         """Return the points of queries at these positions and of the candidates that bits stand for."""

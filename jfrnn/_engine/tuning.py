@@ -32,7 +32,6 @@ class Tuning(NamedTuple):
         at_once: A block of up to so many queries, in open space, is processed without any loop unless a query has more words of
             candidates than are usual, more doubtful ones than one, or more neighbors than `fold_group`: the host of an accelerator
             waits before each turn of a loop whose length the data decide. Doubts are then decided for all rows at once.
-        wide: Words at a time of which step 3 of the exact decision, in wide integers, decides one candidate each.
         fold_group: Slots of a row that are summed at a time, where `at_once` allows it.
     """
 
@@ -44,7 +43,6 @@ class Tuning(NamedTuple):
     by_gathers: bool
     group: int
     at_once: int = 0
-    wide: int = 1 << 10
     fold_group: int = 32
 
 

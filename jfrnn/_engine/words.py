@@ -9,10 +9,10 @@ from jax import Array, lax
 from jfrnn._geometry import flat_take
 
 LANES = 16  # candidates per word: in a uint32 hits take the lower half, doubtful candidates the upper half
+HITS = np.uint32((1 << LANES) - 1)  # the lower half
 CHUNK = 64 * LANES  # most candidates per query that are tested at a time on a CPU
 _GROUP = 8  # words whose counts are bytes of two integers
 _FEW = 12  # entries that are compared one by one
-_LOWER = np.uint32((1 << LANES) - 1)
 _BYTES = np.uint32(0x01010101)
 _TOPS = np.uint32(0x80808080)
 
@@ -92,7 +92,7 @@ class BitRows(NamedTuple):
     def of(cls, words: Array, by_gathers: bool) -> "BitRows":
         """Prepare words, of which only the lower half is used; on a CPU, the upper half has to be empty."""
         rows, width = words.shape
-        hits = words & _LOWER if by_gathers else words
+        hits = words & HITS if by_gathers else words
         groups = -(-width // _GROUP)
         counts = jnp.pad(lax.population_count(hits), ((0, 0), (0, groups * _GROUP - width))).reshape(rows, groups, 1, _GROUP)
         until = lax.optimization_barrier(jnp.sum(counts * _until_bytes(), axis=3, dtype=jnp.uint32))
@@ -125,7 +125,7 @@ class BitRows(NamedTuple):
         word = lax.min(group * _GROUP + word.astype(jnp.int32), np.int32(width - 1))
         word = word + lax.broadcasted_iota(jnp.int32, ordinal.shape, 0) * width
         if self.by_gathers:
-            return word, nth_bit(flat_take(self.hits, word) & _LOWER, within)
+            return word, nth_bit(flat_take(self.hits, word) & HITS, within)
         word, within = lax.optimization_barrier((word, within))  # kernels without gathers are vectorized
         found = lax.optimization_barrier(flat_take(self.hits, word))
         return word, lax.optimization_barrier(nth_bit(found, within))
