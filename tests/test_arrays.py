@@ -10,7 +10,7 @@ import pytest
 import reference
 
 import jfrnn
-from jfrnn._engine import arrays, tuning
+from jfrnn._engine import arrays, blocks, tuning
 from jfrnn._engine import rows as rows_module
 from jfrnn.cases.hard import HARD_CASES
 
@@ -90,6 +90,47 @@ def test_few_particles_are_not_sorted(monkeypatch):
     idx = np.asarray(nbrs.idx)
     assert ((idx[:, 1:] > idx[:, :-1]) | (idx[:, 1:] == 600)).all()  # all pairs are tested in the order of indices
     checked.assert_pairs(nbrs, reference.reference_pairs(x, 0.25, half=True))
+
+
+def lattice_of(side, dim):
+    """Return the sites of a square or cubic lattice with spacing 1, shuffled, [side^dim, dim] float32."""
+    sites = np.stack(np.meshgrid(*[np.arange(side)] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+    return np.random.default_rng(side).permutation(sites.astype(np.float32))
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_a_lattice_full_of_ties_has_no_more_words_than_are_tested_at_a_time(monkeypatch):
+    """Its sites stand on walls of cells, so that there are more candidates per neighbor than elsewhere."""
+    seen, word_table = [], blocks.BlockSearch.word_table
+
+    def table(self, span, which):
+        found = word_table(self, span, which)
+        jax.debug.callback(lambda total: seen.append((int(total.max()), self.words)), found.total)
+        return found
+
+    monkeypatch.setattr(blocks.BlockSearch, "word_table", table)
+    monkeypatch.setattr(tuning, "CPU", ELSEWHERE._replace(words=1 << 20))
+    nbrs = jfrnn.search(lattice_of(12, 3), 3.0, capacity=96, backend="jax")
+    assert not nbrs.overflow
+    jax.effects_barrier()
+    assert max(longest for longest, _ in seen) > 40
+    assert all(longest <= words for longest, words in seen)
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_queries_with_more_words_than_are_tested_at_a_time_and_ties_among_all(monkeypatch):
+    monkeypatch.setattr(tuning, "CPU", ELSEWHERE._replace(words=1 << 20))
+    x = lattice_of(25, 2)
+    square = (x * x).sum(1)[:, None] + (x * x).sum(1)[None] - 2 * x @ x.T  # whole numbers, far below 2^24
+    near = (square < 100) & ~np.eye(len(x), dtype=bool)
+    assert (square == 100).sum() > 4 * len(x)
+    nbrs = jfrnn.search(x, 10.0, capacity=int(near.sum(1).max()), backend="jax")
+    idx = np.asarray(nbrs.idx)
+    found = np.zeros((len(x), len(x) + 1), bool)
+    found[np.arange(len(x))[:, None], idx] = True
+    np.testing.assert_array_equal(found[:, :-1], near)
+    np.testing.assert_array_equal(nbrs.count, near.sum(1))
+    np.testing.assert_array_equal((idx < len(x)).sum(1), near.sum(1))  # each once
 
 
 def pairs_of(nbrs):
