@@ -398,6 +398,8 @@ _TABLE = (
     # outside the cell
     _case("outside", "each particle up to 5 boxes outside, both signs", _filled(_WIDE, turns=(-5, 5))),
     _case("outside_100", "each particle up to 100 boxes outside, both signs", _filled(_WIDE, turns=(-100, 100))),
+    _case("outside_700", "nobody has wrapped them: up to 700 boxes outside, both signs", _filled(_WIDE, turns=(-700, 700))),
+    _case("outside_400000", "farther than a float tells where in a box", _filled(_WIDE, turns=(-400_000, 400_000))),
     _case("outside_negative", "all coordinates negative: truncation is not floor", _filled(_WIDE, turns=(-3, -1))),
     _case("outside_all_by_100", "all particles in one cell 100 boxes away", _filled(_WIDE, turns=(100, 100))),
     _case(
@@ -455,6 +457,7 @@ _TABLE = (
     _case("ties_across", "exact ties through faces, and one float to either side", _ties_across((4.0, 5.5, 4.5))),
     _case("ties_across_far", "the same, partners up to 3 boxes away", _ties_across((4.0, 5.5, 4.5), turns=3)),
     _case("ties_across_100", "the same, partners up to 100 boxes away", _ties_across((4.0, 5.5, 4.5), turns=100)),
+    _case("ties_across_700", "the same, partners up to 700 boxes away", _ties_across((4.0, 5.5, 4.5), turns=700)),
     _case("ties_across_skewed", "exact ties through faces of a skewed cell", _ties_across(_DYADIC)),
     _case("ties_across_skewed_far", "the same, up to 3 lattice vectors away, left-handed", _ties_across(_DYADIC_LEFT, turns=3)),
     _case("ulp_across", "distances within 3 ulp of the cutoff through faces", _ulp_images(_ODD, 0.7, 1)),

@@ -108,7 +108,7 @@ def memory_plan(
 
     It excludes what lists of some scenes keep in addition: for a batch 4 B per particle and query, for cutoffs per particle a
     float each (with a skin two), for a box whose images must be told apart 1 B per slot (2 B from 257 images on) and 4 B per
-    particle and query, for species 4 B each, for exclusions 8 B per pair and 4 B per row.
+    particle and query, for species 4 B each, for exclusions 8 B per pair (of one image, 4·d B more) and 4 B per row.
 
     Args:
         n: Number of particles, from 0 to 2^31 - 32.

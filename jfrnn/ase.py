@@ -31,8 +31,22 @@ _SYMBOLS = (
 _NUMBERS = {symbol: number for number, symbol in enumerate(_SYMBOLS.split())}
 
 
-def neighbor_list(quantities: str, a: Given, cutoff: Given, self_interaction: bool = False, max_nbins: Given = None) -> Arrays:
-    """Find all pairs of a structure closer than a cutoff, as `ase.neighborlist.neighbor_list` does.
+def neighbor_list(
+    quantities: str,
+    a: Given = None,
+    cutoff: Given = None,
+    self_interaction: bool = False,
+    max_nbins: Given = None,
+    *,
+    atoms: Given = None,
+    positions: Given = None,
+    cell: Given = None,
+    pbc: Given = None,
+    numbers: Given = None,
+) -> Arrays:
+    """Find all pairs of a structure closer than a cutoff, as `ase.neighborlist.neighbor_list` and matscipy's `neighbour_list` do.
+
+    A structure is given as atoms, or as positions with a cell.
 
     Args:
         quantities: Letters of what is returned, in this order: "i" and "j" the atoms of a pair, [pairs] int64; "S" by how many
@@ -44,6 +58,11 @@ def neighbor_list(quantities: str, a: Given, cutoff: Given, self_interaction: bo
             pairs have none; or radii of all atoms, an array [n]: pairs are then closer than the sum of their radii.
         self_interaction: List each atom as its own neighbor, with S = 0.
         max_nbins: Not used; it stands here as ASE has it.
+        atoms: The name that matscipy has for a.
+        positions: In place of atoms: positions [length], shape [n, 3].
+        cell: With positions: lattice vectors [length], one per row, shape [3, 3]; or edge lengths, shape [3]; None: open space.
+        pbc: With positions: whether axes are periodic, a bool or three; default: none is.
+        numbers: With positions: species of the atoms, shape [n], integers; for a dictionary of cutoffs.
 
     Returns:
         A tuple of arrays, or one array for one letter. Pairs stand both ways, (i, j) and (j, i), in ascending order of i.
@@ -55,6 +74,20 @@ def neighbor_list(quantities: str, a: Given, cutoff: Given, self_interaction: bo
     Memory: what is returned, the same once more, and 100 B per atom. Source: cell lists (Hockney & Eastwood 1981, ch. 8); short
     lattice vectors (Semaev 2001, doi:10.1007/3-540-44670-2_13).
     """
+    arrays = {"positions": positions, "cell": cell, "pbc": pbc, "numbers": numbers}
+    given = [name for name, x in {"a": a, "atoms": atoms, **arrays}.items() if x is not None]
+    if cutoff is None:
+        raise TypeError("cutoff must be given: a number, a dictionary, or radii of all atoms.")
+    if a is None and atoms is None and positions is not None:
+        periodic = False if pbc is None else pbc
+        if cell is None and np.any(np.asarray(periodic)):
+            raise ValueError(f"pbc={pbc!r} needs cell, the lattice vectors of the periodic axes.")
+        vectors = np.eye(3) if cell is None else cell
+        return primitive_neighbor_list(quantities, periodic, vectors, positions, cutoff, numbers, self_interaction)
+    if len(given) != 1 or positions is not None:
+        told = ", ".join(given) or "nothing"
+        raise TypeError(f"pass atoms, or positions= with cell=, pbc= and numbers= of the same structure, got {told}.")
+    a = atoms if a is None else a
     missing = [name for name in ("positions", "cell", "pbc", "numbers") if not hasattr(a, name)]
     if missing:
         raise TypeError(

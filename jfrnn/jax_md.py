@@ -74,7 +74,8 @@ class NeighborList:
         idx: Dense: neighbors, shape [n, max_occupancy], int32; else pairs, shape [2, max_occupancy], first the neighbors. Unused
             places hold n. Pairs are those within r_cutoff + dr_threshold when the list was last rebuilt.
         reference_position: Positions at that time, shape [n, d].
-        error: A `PartitionError`.
+        error: A `PartitionError`. Every bit of `Status` that the list sets has a code here: a box that shrank has that of cells,
+            all others that of an overflow.
         kept: The list of jfrnn from which idx comes, or None where all pairs are measured by the displacement function.
         occupancy: How much room idx takes, shape [], int32; over all updates, it may exceed `max_occupancy`.
         max_occupancy, format, update_fn: As in jax-md. Static.
@@ -167,7 +168,8 @@ def neighbor_list(
         `update(position, neighbors, **kwargs)`. Its lists are `NeighborList`.
 
     Raises:
-        ValueError, TypeError: an argument is of the wrong kind, shape or range.
+        ValueError, TypeError: an argument is of the wrong kind, shape or range. `allocate` also raises what `NeighborList.check`
+            of jfrnn would, as for positions that are not finite.
     """
     own, cutoff, skin = NeighborListFormat[format.name], float(r_cutoff), float(dr_threshold)
     metric = _as_metric(displacement_or_metric)
@@ -207,6 +209,7 @@ def neighbor_list(
             given["box"] = _box_of(current, position.shape[1], kind == "periodic", fractional_coordinates)
         if kind is not None:
             kept = search(position, cutoff, slack=max(float(capacity_multiplier), 1.0), **given)
+            kept.check()
             kept = kept if kept.images is None else None  # a list of jax-md holds the nearest image alone
         rows = all_pairs(position, kwargs) if kept is None else kept.idx
         occupancy = int(finish(rows, 0 if own is not Dense else rows.shape[1])[1])
@@ -244,8 +247,7 @@ def neighbor_list(
         idx, held, reference = make() if skin == 0 else lax.cond(moved, make, keep)
         code = neighbors.error.code | jnp.where(held > room, 1, 0).astype(jnp.uint8)
         if fresh.kept is not None:
-            code = code | jnp.where((fresh.kept.status & Status.ROW_OVERFLOW.value) != 0, 1, 0).astype(jnp.uint8)
-            code = code | jnp.where((fresh.kept.status & Status.BOX_TOO_SMALL.value) != 0, 4, 0).astype(jnp.uint8)
+            code = code | _code_of(fresh.kept.status)
         held = jnp.maximum(held, neighbors.occupancy)
         return dataclasses.replace(fresh, idx=idx, reference_position=reference, error=PartitionError(code), occupancy=held)
 
@@ -265,7 +267,8 @@ class NeighborListMultiImage:
         reference_position: Positions when the list was last rebuilt, shape [n, d].
         reference_box: The box at that time, shape [d, d].
         box: The present box, shape [d, d].
-        did_buffer_overflow: Whether pairs are missing, for lack of room or because the box shrank: allocate again. [] bool.
+        did_buffer_overflow: Whether pairs are missing, for lack of room, because the box shrank, or because positions are not
+            finite or too far away: allocate again, which raises what room cannot help. [] bool.
         kept: The list of jfrnn from which idx and shifts come.
         max_occupancy, format, update_fn: As in jax-md. Static.
     """
@@ -392,6 +395,7 @@ def neighbor_list_multi_image(
         n, dim = position.shape
         matrix, made = box_of(given.get("box", box), dim)
         kept = search(position, cutoff, box=made, skin=skin, slack=max(float(capacity_multiplier), 1.0))
+        kept.check()
         occupancy = int(finish(kept, position, made, 1)[2])
         room = max(int(occupancy * capacity_multiplier) + extra_capacity * (1 if own is Dense else n), 1)
         if room > kept.capacity and own is Dense:
@@ -407,10 +411,21 @@ def neighbor_list_multi_image(
         moved = jnp.asarray(True) if skin == 0 else kept.rebuild_count != neighbors.kept.rebuild_count
         reference = jnp.where(moved, position, neighbors.reference_position)
         reference_box = jnp.where(moved, matrix, neighbors.reference_box)
-        overflow = neighbors.did_buffer_overflow | (held > room) | kept.overflow
+        overflow = neighbors.did_buffer_overflow | (held > room) | (kept.status != 0)
         return NeighborListMultiImage(idx, shifts, reference, reference_box, matrix, overflow, kept, room, neighbors.format, update)
 
     return NeighborListFns(allocate, update)
+
+
+def _code_of(status: Array) -> Array:
+    """Return the code of an error, uint8: every bit of a list sets one, and says that `allocate` is to be called.
+
+    Where more room does not help, as with positions that are not finite, `allocate` raises what is wrong.
+    """
+    shrunk = (status & Status.BOX_TOO_SMALL.value) != 0
+    others = (status & ~Status.BOX_TOO_SMALL.value) != 0
+    codes = PartitionErrorCode.CELL_SIZE_TOO_SMALL, PartitionErrorCode.NEIGHBOR_LIST_OVERFLOW
+    return jnp.where(shrunk, codes[0].value, 0).astype(jnp.uint8) | jnp.where(others, codes[1].value, 0).astype(jnp.uint8)
 
 
 def _theirs(own: NeighborListFormat, given: Format) -> Format:

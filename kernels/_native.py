@@ -42,7 +42,8 @@ def program(double: bool, dim: int, *headers: str, given: Mapping[str, str] = Ma
     BATCHED is 1 where a row ends with the number of its system (see `jfrnn._geometry.batch`). SUM is 1 where the cutoff of a pair
     is the sum of two numbers. SHIFTED is 0 where all pairs that are decided are those of points as they are, though space is
     periodic. SCALED is 1 where cutoffs are so small, or so large, that their squares need a unit.
-    EXCLUDING is 1 where queries exclude sources. RULE is the number of one of `RULES`, -1 where all pairs have one cutoff.
+    EXCLUDING is 1 where queries exclude sources, 2 where they exclude images of sources. RULE is the number of one of `RULES`, -1
+    where all pairs have one cutoff.
 
     Args:
         double: Whether positions are float64.

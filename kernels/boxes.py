@@ -65,7 +65,7 @@ def rows_kernel(
     later: bool,
     periodic: int,
     cuda: bool,
-    excluding: bool = False,
+    excluding: int = 0,
     flat: bool = False,
     rule: str = "",
 ) -> Kernel:
@@ -99,7 +99,7 @@ def sum_kernel(
     extremes: bool,
     periodic: int,
     cuda: bool,
-    excluding: bool = False,
+    excluding: int = 0,
     rule: str = "",
 ) -> Kernel:
     """Return the kernel that sums a term; `key` tells it from all others in the names of programs.

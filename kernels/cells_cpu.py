@@ -45,7 +45,7 @@ def sort_kernels(dim: int, double: bool, scaled: bool, periodic: int = 0, batche
 
 @functools.lru_cache(512)
 def query_kernel(
-    dim: int, double: bool, scaled: bool, lists: bool, periodic: int = 0, batched: bool = False, excluding: bool = False,
+    dim: int, double: bool, scaled: bool, lists: bool, periodic: int = 0, batched: bool = False, excluding: int = 0,
     flat: bool = False,
 ) -> Kernel:  # fmt: skip
     """Return what lists or counts, whose work threads share.

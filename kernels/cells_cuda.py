@@ -146,7 +146,7 @@ def cell_kernels(
     reach_x: int = GRID["REACH_X"],
     periodic: int = 0,
     batched: bool = False,
-    excluding: bool = False,
+    excluding: int = 0,
     flat: bool = False,
 ) -> Kernels:
     """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts, half lists or whole.

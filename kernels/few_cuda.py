@@ -50,7 +50,7 @@ def rows_kernel(
     lists: bool,
     batched: bool,
     boxed: bool = False,
-    excluding: bool = False,
+    excluding: int = 0,
     flat: bool = False,
 ) -> Kernel:
     """Return the kernel for warps of a block, a dimension and a dtype, for lists or counts alone."""
@@ -72,7 +72,7 @@ def sum_kernel(
     batched: bool = False,
     extremes: bool = False,
     boxed: bool = False,
-    excluding: bool = False,
+    excluding: int = 0,
 ) -> Kernel:
     """Return the kernel that sums a term.
 

@@ -37,6 +37,7 @@ class ListKind(NamedTuple):
         ordered: Whether an order is given in which rows are taken (CUDA).
         lanes: How many lanes of CUDA serve a row; 0 on the CPU.
         boxes: Whether each system has a lattice of its own.
+        itself: Whether a particle is its own neighbor, whatever its cutoff.
     """
 
     dim: int
@@ -50,6 +51,7 @@ class ListKind(NamedTuple):
     ordered: bool
     lanes: int
     boxes: bool = False
+    itself: bool = False
 
     @property
     def cuda(self) -> bool:
@@ -60,7 +62,7 @@ class ListKind(NamedTuple):
     def name(self) -> str:
         """Tells kernels of such lists from others."""
         flags = {"scaled": self.scaled, "reversed": self.reversed, "aligned": self.aligned, "ordered": self.ordered}
-        flags |= {self.rule: bool(self.rule), "boxes": self.boxes}
+        flags |= {self.rule: bool(self.rule), "boxes": self.boxes, "itself": self.itself}
         parts = [f"{self.dim}d", "f64" if self.double else "f32", *(flag for flag, on in flags.items() if on)]
         return "_".join(parts) + f"{SPACES[self.periodic]}_{self.code_bytes}{f'_cuda{self.lanes}' if self.cuda else '_cpu'}"
 
@@ -79,7 +81,7 @@ class ListKind(NamedTuple):
         """Return the named integers of a program."""
         found = {"PERIODIC": self.periodic, "SCALED": self.scaled, "CODE_BYTES": self.code_bytes, "REVERSED": self.reversed}
         found |= {"RADII": RADII.get(self.rule, 0), "SUM": self.rule == "mean", "ALIGNED": self.aligned, "ORDERED": self.ordered}
-        found |= {"DECIDED": 1, "MEASURED": 0, "APART": 0, "MIRRORED": 0, "OWN": 0, "BOXES": self.boxes}
+        found |= {"DECIDED": 1, "MEASURED": 0, "APART": 0, "MIRRORED": 0, "OWN": 0, "BOXES": self.boxes, "ITSELF": self.itself}
         return found | {"LENGTH": self.length(columns), "LANES_PER_ROW": max(self.lanes, 1), "QUERY_CHUNK": ROWS_AT_ONCE, **GRID}
 
 

@@ -40,7 +40,7 @@ def level_program(
 @functools.lru_cache(512)
 def query_kernel(
     dim: int, double: bool, lists: bool, rule: str, groups: int, halvings: int, periodic: int = 0, batched: bool = False,
-    cuda: bool = False, excluding: bool = False, flat: bool = False,
+    cuda: bool = False, excluding: int = 0, flat: bool = False,
 ) -> Kernel:  # fmt: skip
     """Return the kernel for a dimension, a dtype and a rule, for lists or counts alone.
 

@@ -207,7 +207,7 @@ def _candidates(term: TermText, dim: int, double: bool) -> int:
 @functools.lru_cache(512)
 def query_kernel(
     term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: bool = False,
-    extremes: bool = False, packed: bool | None = None, excluding: bool = False,
+    extremes: bool = False, packed: bool | None = None, excluding: int = 0,
 ) -> Kernel:  # fmt: skip
     """Return the kernel that sums a term; `key` tells it from all others in the names of programs.
 

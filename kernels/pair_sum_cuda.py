@@ -73,7 +73,7 @@ def _placed_columns(term: TermText, dim: int) -> int:
 @functools.lru_cache(512)
 def sum_kernels(
     term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: bool = False,
-    extremes: bool = False, excluding: bool = False,
+    extremes: bool = False, excluding: int = 0,
 ) -> Kernels:  # fmt: skip
     """Return the kernels that sum a term; `key` tells it from all others in the names of programs.
 

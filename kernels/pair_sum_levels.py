@@ -25,7 +25,7 @@ def slots(queries: int, cuda: bool) -> int:
 @functools.lru_cache(512)
 def query_kernel(
     term: TermText, key: str, dim: int, double: bool, rule: str, groups: int, halvings: int, compensated: bool, periodic: int = 0,
-    batched: bool = False, extremes: bool = False, excluding: bool = False, cuda: bool = False,
+    batched: bool = False, extremes: bool = False, excluding: int = 0, cuda: bool = False,
 ) -> Kernel:  # fmt: skip
     """Return the kernel that sums a term. On the CPU threads share the work, and `info` is zeros at first.
 

@@ -13,6 +13,7 @@ import warp
 from jax._src import compiler
 
 from jfrnn._engine import launch, tuning
+from jfrnn._tracing import programs
 from jfrnn.kernels import _clang
 
 jax.config.update("jax_enable_x64", True)
@@ -24,6 +25,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # to compile the sources of JAX
 gc.freeze()  # imported modules are no garbage; tracing makes many objects that stay: to look through them takes a tenth of the time
 gc.set_threshold(50_000, 20, 20)
 TESTS = count(1)
+programs._MOST_BYTES = 1 << 40  # tests share programs that come once or twice each
 tuning.CPU = tuning.CPU._replace(plain_pairs=tuning.CPU.few_pairs)  # "jax" sorts most scenes of tests; "brute" tests all pairs
 XLA_FLAGS = os.environ.get("XLA_FLAGS", "")
 UNFUSED = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}

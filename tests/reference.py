@@ -183,6 +183,9 @@ def reference_species(positions: Any, table: Any, species: Any, *, query_species
     for cutoff in {x for row in edges for x in row if x > 0}:
         near = reference_images(positions, cutoff, **options)
         found |= {(i, j, shift) for i, j, shift in near if edges[of_start[i]][of_end[j]] == cutoff}
+    if options.get("include_self"):  # everyone is its own neighbor, whatever the cutoff of its species
+        points = np.asarray(positions)
+        found |= {(i, i, (0,) * points.shape[1]) for i in np.flatnonzero(np.isfinite(points).all(axis=1)).tolist()}
     return found
 
 

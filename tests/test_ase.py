@@ -195,3 +195,27 @@ def test_peers(peer):
             order, other_order = (np.lexsort((*x[2].T, x[1], x[0])) for x in (ours, others))
             for a, b in zip(ours, others):
                 np.testing.assert_allclose(a[order], b[other_order], atol=1e-12)
+
+
+def test_names_of_ase_and_matscipy():
+    """`atoms=`, and arrays by name instead of atoms; what is missing or doubled is refused."""
+    build = pytest.importorskip("ase.build")
+    atoms = build.bulk("Cu", cubic=True)
+    expected = neighbor_list("ijS", atoms, 4.0)
+    arrays = {"positions": atoms.positions, "cell": atoms.cell[:], "pbc": True}
+    for found in (neighbor_list("ijS", atoms=atoms, cutoff=4.0), neighbor_list("ijS", cutoff=4.0, **arrays)):
+        for one, other in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(one, other)
+    alone = neighbor_list("i", positions=atoms.positions, cutoff=3.0)
+    assert len(alone) == 12  # of the four atoms of the cell, without images
+    kinds = neighbor_list("i", cutoff={("Cu", "Cu"): 4.0}, numbers=atoms.numbers, **arrays)
+    assert len(kinds) == len(expected[0])
+    for error, match, given in (
+        (TypeError, "cutoff must be given", {"atoms": atoms}),
+        (TypeError, "got nothing", {"cutoff": 3.0}),
+        (TypeError, "got a, atoms", {"a": atoms, "atoms": atoms, "cutoff": 3.0}),
+        (TypeError, "got a, positions", {"a": atoms, "positions": atoms.positions, "cutoff": 3.0}),
+        (ValueError, "needs cell", {"positions": atoms.positions, "pbc": True, "cutoff": 3.0}),
+    ):
+        with pytest.raises(error, match=match):
+            neighbor_list("i", **given)

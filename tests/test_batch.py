@@ -152,3 +152,29 @@ def test_errors(error, match, options):
     for function in (jfrnn.search, jfrnn.count):
         with pytest.raises(error, match=match):
             function(X, 1.0, **options)
+
+
+@pytest.mark.parametrize("wide", [np.int64, np.uint32, np.uint64])
+def test_wide_numbers_of_systems_and_species_are_taken_inside_jit(wide):
+    """As outside; a number that int32 does not hold sets the bit, and its particle has no neighbors."""
+    x = np.random.default_rng(0).random((30, 3)).astype(np.float32)
+    batch, table = (np.arange(30) % 3).astype(wide), np.full((3, 3), 0.4, np.float32)
+    found = jax.jit(lambda batch: (jfrnn.count(x, 0.4, batch=batch), jfrnn.count(x, table, species=batch)))(batch)
+    np.testing.assert_array_equal(found[0], jfrnn.count(x, 0.4, batch=batch.astype(np.int32)))
+    np.testing.assert_array_equal(found[1], jfrnn.count(x, 0.4))
+    far = batch.copy()
+    far[4] = 2**32 - 2
+    search = jax.jit(lambda far: jfrnn.search(x, 0.4, batch=far, capacity=32))
+    nbrs = search(far)
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.SYSTEM_WITHOUT_BOX
+    apart = np.where(np.arange(30) == 4, 99, batch).astype(np.int32)
+    np.testing.assert_array_equal(nbrs.count, jfrnn.count(x, 0.4, batch=apart))
+    counts = jax.jit(lambda far: jfrnn.count(x, 0.4, batch=far))(far)
+    assert (np.asarray(counts) == np.iinfo(np.int32).min).all()
+    sums = jax.jit(lambda far: jfrnn.pair_sum(lambda r, i, j: 1.0, x, 0.4, batch=far))(far)
+    assert np.isnan(sums).all()
+    queries = jax.jit(lambda far: jfrnn.count(x, 0.4, queries=x[:5], batch=(batch, far)))
+    assert int(queries(batch[:5])[0]) >= 1
+    assert (np.asarray(queries(far[:5])) == np.iinfo(np.int32).min).all()
+    kinds = jax.jit(lambda far: jfrnn.search(x, table, species=far, capacity=32))(far)
+    assert jfrnn.Status(int(kinds.status)) == jfrnn.Status.INVALID_CUTOFF

@@ -198,12 +198,12 @@ def test_a_traced_box_with_images():
 
 @pytest.mark.parametrize("backend", [pytest.param("jax", marks=pytest.mark.slow), "warp"])
 def test_out_of_range_positions_set_a_bit_and_spare_the_others(backend):
-    x = points(30, np.float32).at[7, 1].set(1e4)
+    x = points(30, np.float32).at[7, 1].set(1e7)
     nbrs = jfrnn.search(x, 0.3, box=jfrnn.Box(LENGTHS), backend=backend)
     assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.OUT_OF_RANGE
     expected = {pair for pair in oracle(x, 0.3, LENGTHS) if 7 not in pair[:2]}
     assert image_pairs(nbrs, x) == expected
-    with pytest.raises(ValueError, match="more than 511 lattice vectors"):
+    with pytest.raises(ValueError, match=r"too far away"):
         nbrs.check()
 
 
@@ -372,3 +372,76 @@ X = np.zeros((4, 3), np.float32)
 def test_bad_boxes_say_what_is_wrong(error, match, make):
     with pytest.raises(error, match=match):
         make()
+
+
+# --- how many images -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("vectors", "cutoff"), [(LENGTHS, 0.3), (LENGTHS, 0.5), (SMALL, 0.3), (SKEWED, 0.6), (LENGTHS, 3.1)])
+def test_images_can_be_asked_for(vectors, cutoff, dtype):
+    """A traced box with so many images finds all pairs, and nothing says it is too small; with one less it says so."""
+    x, images = points(12, dtype, scale=1.0), jfrnn.Box(vectors).images_for(cutoff)
+    assert all(isinstance(k, int) for k in images)
+    expected = jfrnn.count(x, cutoff, box=jfrnn.Box(vectors))
+
+    def count(images):
+        return jax.jit(lambda v: jfrnn.count(x, cutoff, box=jfrnn.Box(v, images=images)))(jnp.asarray(vectors, dtype))
+
+    np.testing.assert_array_equal(count(images), expected)
+    if any(images):
+        fewer = tuple(k - (k == max(images)) for k in images)
+        assert (np.asarray(count(fewer)) == np.iinfo(np.int32).min).all()
+
+
+def test_images_of_nothing_known():
+    with pytest.raises(TypeError, match="traced"):
+        jax.jit(lambda v: jfrnn.Box(v).images_for(0.3))(LENGTHS)
+    for wrong in (0.0, -1.0, np.inf):
+        with pytest.raises(ValueError, match="positive and finite"):
+            jfrnn.Box(LENGTHS).images_for(wrong)
+    with pytest.raises(TypeError, match="must be a number, got str"):
+        jfrnn.Box(LENGTHS).images_for("far")
+
+
+def test_sums_in_the_box_of_a_list_have_its_images_and_chunks_raise_both():
+    """A cell shrinks in a chunk until pairs have several images: `run_chunk` takes more, for the list and for sums in its box."""
+    u = points(20, scale=1.0) + 0.5
+
+    @jax.jit
+    def chunk(state, nbrs):
+        def step(_, carry):
+            (size, _), nbrs = carry
+            size = size * 0.95
+            nbrs = nbrs.update(u * size, box=jfrnn.Box(size * jnp.ones(3)))
+            return (size, jfrnn.pair_sum(lambda r, i, j: jnp.ones((), r.dtype), u * size, 0.4, box=nbrs.box)), nbrs
+
+        return jax.lax.fori_loop(0, 20, step, (state, nbrs))
+
+    state = jnp.asarray(1.0), jnp.zeros(20)
+    nbrs = jfrnn.search(u, 0.4, skin=0.02, box=jfrnn.Box([1.0] * 3))
+    assert nbrs.box.images_of_list == (0, 0, 0)
+    (size, sums), nbrs = jfrnn.run_chunk(chunk, state, nbrs, lambda s: u * s[0], box=lambda s: jfrnn.Box(s[0] * jnp.ones(3)))
+    assert nbrs.box.images_of_list == (2, 2, 2)
+    np.testing.assert_array_equal(sums, jfrnn.count(u * size, 0.4, box=jfrnn.Box([float(size)] * 3)))
+    assert int(jfrnn.count(u * size, 0.9, box=nbrs.box)[0]) > int(sums[0])  # a box that is known has as many as a cutoff needs
+
+
+def test_cells_from_lengths_and_angles():
+    """As ASE makes them; right angles are exact, in 2D, too, and traced ones alike."""
+    from ase.cell import Cell
+
+    for parameters in ([3.0, 4.0, 5.0, 80.0, 70.0, 110.0], [1.0, 2.0, 3.0, 90.0, 90.0, 90.0], [1.0, 1.0, 1.0, 60.0, 60.0, 60.0]):
+        box = jfrnn.Box.from_parameters(parameters[:3], parameters[3:], periodic=(True, True, False), images=1)
+        np.testing.assert_allclose(box.vectors, Cell.fromcellpar(parameters)[:], atol=1e-12)
+        assert box.periodic == (True, True, False)
+        traced = jax.jit(lambda a, b: jfrnn.Box.from_parameters(a, b).vectors)(*np.split(np.array(parameters), 2))
+        np.testing.assert_allclose(traced, box.vectors, atol=1e-12)
+    np.testing.assert_array_equal(jfrnn.Box.from_parameters([1.0, 2.0], 90.0).vectors, np.diag([1.0, 2.0]))
+    for error, match, make in (
+        (ValueError, "Box.from_parameters", lambda: jfrnn.Box([1.0, 2.0, 3.0, 90.0, 90.0, 90.0])),
+        (ValueError, "less than the sum of the others", lambda: jfrnn.Box.from_parameters([1.0, 2.0, 3.0], [10.0, 20.0, 150.0])),
+        (ValueError, "between 0 and 180", lambda: jfrnn.Box.from_parameters([1.0, 2.0, 3.0], [10.0, 20.0, 180.0])),
+        (ValueError, r"lengths and angles must have shape \[3\] each", lambda: jfrnn.Box.from_parameters([1.0, 2.0, 3.0], 90.0)),
+    ):
+        with pytest.raises(error, match=match):
+            make()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import reference
 
+import jfrnn
 from jfrnn import jax_md
 
 CUTOFF, SKIN, N = 0.7, 0.1, 40
@@ -208,3 +209,26 @@ def test_an_energy_of_jax_md(form):
             energy = theirs.smap.pair_neighbor_list(lambda dr, **_: jnp.where(dr < CUTOFF, (CUTOFF - dr) ** 2, 0.0), shape)
             energies.append((energy(x, neighbor=nbrs), jax.grad(energy)(x, neighbor=nbrs)))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12), *energies)
+
+
+def test_particles_that_nobody_wrapped_are_found():
+    """Up to 700 boxes away: by `allocate`, and by `update` of a list that was made at home; images have their shifts."""
+    rng, edge = np.random.default_rng(0), 6.0
+    x = (rng.random((60, 3)) * edge).astype(np.float32)
+    far = (x + edge * rng.integers(-700, 701, x.shape)).astype(np.float32)
+
+    def nearest(a, b, **_):
+        away = a - b
+        return away - edge * jnp.round(away / edge)
+
+    expected = int(jfrnn.count(far, 1.0, box=jfrnn.Box([edge] * 3)).sum())
+    made = jax_md.neighbor_list(nearest, edge, 1.0).allocate(far)
+    assert (int((made.idx < 60).sum()), int(made.error.code)) == (expected, 0)
+    moved = jax_md.neighbor_list(nearest, edge, 1.0, capacity_multiplier=2.0).allocate(x).update(far)
+    assert (int((moved.idx < 60).sum()), int(moved.error.code)) == (expected, 0)
+    many = jax_md.neighbor_list_multi_image(None, edge * np.eye(3), 1.0, fractional_coordinates=False).allocate(far)
+    used = np.asarray(many.senders) < 60
+    i, j = np.asarray(many.receivers)[used], np.asarray(many.senders)[used]
+    away = far[j] + np.asarray(many.shifts)[used] * np.float64(edge) - far[i]
+    assert used.sum() == expected
+    assert (np.linalg.norm(away, axis=1) < 1.001).all()

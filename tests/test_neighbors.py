@@ -204,3 +204,26 @@ def test_a_list_is_printed_in_a_line():
     jax.eval_shape(lambda nbrs: seen.append(repr(nbrs)), nbrs)
     assert seen == [line.format("traced", "traced")]
     assert "shape" not in repr(jax.tree.map(lambda _: 0, nbrs))  # whatever stands where arrays stood
+
+
+def test_boxes_and_totals_are_taken_by_place_and_by_name():
+    """On every method alike; errors name the class that the user has."""
+    x, box = np.random.default_rng(0).random((20, 3)).astype(np.float32), jfrnn.Box([1.0, 1.0, 1.0])
+    nbrs, flat = jfrnn.search(x, 0.3, box=box), jfrnn.search_edges(x, 0.3, box=box)
+    for call in (nbrs.vectors, nbrs.distances, flat.edges):
+        jax.tree.map(np.testing.assert_array_equal, call(x, box), call(x, box=box))
+    np.testing.assert_array_equal(nbrs.shifts(x, box), nbrs.shifts(x, box=box))
+    for call in (nbrs.edges, nbrs.to_jraph):
+        jax.tree.map(np.testing.assert_array_equal, call(x, 500, box), call(x, total=500, box=box))
+    for made in (nbrs, flat):
+        assert int(made.update(x, box).status) == int(made.update(x, box=box).status) == 0
+        assert int(made.grow(x, box, slack=1.5).status) == 0
+        name = type(made).__name__
+        for method in ("update", "grow", "edges"):
+            with pytest.raises(TypeError, match=rf"^{name}\.{method}\(\) got an unexpected keyword argument 'boxes'"):
+                getattr(made, method)(x, boxes=box)
+        assert type(made).update.__doc__.startswith("Rebuild the list")
+    with pytest.raises(TypeError, match=r"^NeighborList\.pairs\(\) got an unexpected keyword argument 'position'"):
+        nbrs.pairs(position=x)
+    with pytest.raises(TypeError, match=r"box must be a jfrnn\.Box, got float32 of shape \[20, 3\]"):
+        nbrs.distances(x, x)

@@ -29,7 +29,7 @@ def test_counts_are_those_of_a_search(name):
     x = jnp.asarray(checked.padded(given.positions, length))
     queries = None if given.queries is None else jnp.asarray(checked.padded(given.queries, length))
     counts = fused(one, x, given.cutoff, queries=queries)
-    expected = jfrnn.count(x, given.cutoff, queries=queries, backend="warp")
+    expected = jfrnn.search(x, given.cutoff, queries=queries, backend="warp", capacity=1).count
     np.testing.assert_array_equal(checked.with_sums(counts, x if queries is None else queries), expected)
     assert counts.dtype == np.float32
 
@@ -393,3 +393,18 @@ def test_errors(error, match, call):
 
 def second(r, i, j):
     return j.astype(np.float32)
+
+
+def test_a_table_that_is_read_by_species_is_told_a_way_out():
+    """The warning names it; rows of the table as values of particles are translated, and give the same."""
+    x, kind = jax.random.uniform(jax.random.key(0), (100, 3), jnp.float32), jnp.asarray(np.arange(100) % 2, jnp.int32)
+    table = jnp.array([[1.0, 2.0], [2.0, 3.0]], jnp.float32)
+    with pytest.warns(
+        RuntimeWarning, match=r"as in table\[i\[\"kind\"\], j\[\"kind\"\]\]. Give each particle its row of the table"
+    ):
+        slow = jfrnn.pair_sum(lambda r, i, j: table[i["kind"], j["kind"]] * (r @ r), x, 0.3, {"kind": kind})
+
+    def of_pair(r, i, j):
+        return jnp.where(jnp.arange(2, dtype=jnp.int32) == j["kind"], i["row"], 0).sum() * (r @ r)
+
+    np.testing.assert_allclose(fused(of_pair, x, 0.3, {"row": table[kind], "kind": kind}), slow, rtol=1e-5)

@@ -169,5 +169,5 @@ def test_where_a_search_cannot_answer_nothing_looks_like_an_answer():
 
     lengths = jnp.array([2.0, 1.0, 1.0])
     assert np.isfinite(sums(x, lengths)).all()
-    for wrong in ((x, 0.1 * lengths), (x.at[0, 0].set(1e5), lengths)):
+    for wrong in ((x, 0.1 * lengths), (x.at[0, 0].set(1e12), lengths)):
         assert np.isnan(sums(*wrong)).all()

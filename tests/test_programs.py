@@ -1,6 +1,7 @@
 """How many programs an eager call compiles for a new number of particles, and how many the library keeps."""
 
 import gc
+import itertools
 import subprocess
 import sys
 
@@ -62,14 +63,37 @@ def warm(kind):
 
 @pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.slow] * (k in ("box", "active", "batch"))) for k in SEARCHES])
 def test_a_search_of_a_new_size_compiles_a_count_and_a_list(kind):
+    """But the count of few particles takes no program, until their number comes often."""
     warm(kind)
     x = scene(next(SIZES))
     options = SEARCHES[kind](x)
     x = np.asarray(x) if kind == "NumPy" else x
-    assert compiled_by(jfrnn.search, x, 0.6, **options) == 2
+    few = kind in ("open", "NumPy", "skin", "box")
+    assert compiled_by(jfrnn.search, x, 0.6, **options) == 2 - few
     assert compiled_by(jfrnn.search, x, 0.6, **options) == 0
     counted = {name: value for name, value in options.items() if name != "skin"}
-    assert compiled_by(jfrnn.count, x, 0.6, **counted) == 0  # the search counted first
+    assert compiled_by(jfrnn.count, x, 0.6, **counted) == few  # else the search counted first
+    if few:
+        known = jfrnn.search(x, 0.6, **options).capacity
+        assert sum(compiled_by(jfrnn.search, x, 0.6, **options) for _ in range(10)) == 0  # the count has compiled one
+        assert jfrnn.search(x, 0.6, **options).capacity == known
+
+
+def test_a_data_set_of_crystals_compiles_two_programs_for_each_number_of_atoms():
+    """A list, and one program for displacements and shifts."""
+    rng = np.random.default_rng(0)
+
+    def look(atoms):
+        edge = (atoms / 0.05) ** (1 / 3)
+        x = (rng.random((atoms, 3)) * edge).astype(np.float32)
+        nbrs = jfrnn.search(x, 5.0, box=jfrnn.Box([edge] * 3))
+        displacement, mask = nbrs.vectors(x)
+        moved = x[np.minimum(nbrs.idx, atoms - 1)] - x[:, None] + np.asarray(nbrs.shifts(x)) * np.float32(edge)
+        np.testing.assert_allclose(np.asarray(displacement)[mask], moved[mask], atol=1e-4)
+
+    look(17)
+    for atoms in (20, 27, 34, 41, 48, 55):
+        assert compiled_by(look, atoms) <= 2
 
 
 def test_a_search_with_a_capacity_compiles_one_program():
@@ -287,3 +311,47 @@ def test_kernels_of_many_sums_are_let_go(monkeypatch):
     assert len(launch._plans) == 3
     gc.collect()
     assert len(_compile._loaded) == loaded
+
+
+def test_programs_of_a_data_set_are_dropped_and_those_of_a_loop_stay(monkeypatch):
+    """Memory grows by about 2 MB for each: those of numbers of particles that come once go first."""
+    _programs.clear_programs()
+    monkeypatch.setattr(_programs, "_MOST_BYTES", -1)
+    x, held = scene(next(SIZES)), []
+    for _ in range(30):
+        for _ in range(3):
+            jfrnn.count(x, 0.6)
+        jfrnn.search(scene(next(SIZES)), 0.6, capacity=8)
+        held.append(_programs.program_count())
+    assert max(held) <= _programs._FEWEST + _programs._LOOK_EVERY
+    assert sum(new < old for old, new in itertools.pairwise(held)) >= 1
+    assert compiled_by(jfrnn.count, x, 0.6) == 0
+
+
+def test_clearing_the_caches_of_jax_clears_programs_of_the_library():
+    jfrnn.search(scene(next(SIZES)), 0.6, capacity=8)
+    assert _programs.program_count() > 0
+    jax.clear_caches()
+    assert _programs.program_count() == 0
+
+
+@pytest.mark.slow
+def test_memory_of_a_thousand_numbers_of_particles_is_bounded():
+    """Below 200 MB, and most of it is given back."""
+    script = """
+import ctypes, gc, jax, numpy as np, jfrnn
+def resident(): return int(open("/proc/self/statm").read().split()[1]) * 4096 / 1e6
+rng, most = np.random.default_rng(0), 0.0
+for k in range(1000):
+    jfrnn.search(rng.random((100 + k, 3)).astype(np.float32), 0.3)
+    first = resident() if k == 0 else first
+    most = max(most, resident() - first)
+jax.clear_caches()
+gc.collect()
+print(most, resident() - first)
+"""
+    most, left = map(
+        float, subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
+    )
+    assert most < 200
+    assert left < 0.75 * most

@@ -365,3 +365,11 @@ def test_a_program_may_end_before_its_results(backend):
         "found = search(x + 1e-3)\n"  # the program is compiled: this returns at once, and the interpreter exits
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=300, capture_output=True)
+
+
+def test_atoms_are_told_where_their_positions_are():
+    class Atoms:
+        positions = np.zeros((2, 3))
+
+    with pytest.raises(TypeError, match=r"got Atoms, which has one: pass atoms\.positions, with a cell box=jfrnn\.Box"):
+        jfrnn.search(Atoms(), 1.0)

@@ -315,3 +315,129 @@ def test_rows_of_partners_are_pairs():
     assert pairs_found(jfrnn.search(x, 3 / 8, exclude=jfrnn.pairs_of_rows(rows)), x) == expected_pairs(
         "exclude", x, None, bonded, None
     )
+
+
+# --- excluded images -------------------------------------------------------------------------------------------------------
+
+LATTICES = {
+    "open": None,
+    "nearest": np.diag([2.0, 2.5, 3.0]),
+    "images": np.diag([0.8, 1.1, 0.9]),
+    "skewed": np.array([[1.0, 0, 0], [0.3, 1.1, 0], [-0.2, 0.25, 0.95]]),
+    "short": np.array([[1.0, 0, 0], [30.3, 1.1, 0], [-17.2, 21.1, 0.9]]),
+    "slab": np.diag([0.8, 1.1, 0.9]),
+}
+IMAGES_OFTEN = {("nearest", "plain", "warp"), ("images", "radii", "warp"), ("short", "half", "warp"), ("slab", "queries", "warp")}
+IMAGES_OFTEN |= {("images", "plain", "jax"), ("open", "plain", "warp")}
+
+
+def each_image_case():
+    for lattice, kind, backend in product(
+        LATTICES, ("plain", "radii", "species", "batch", "half", "queries"), ("warp", "jax", "brute")
+    ):
+        for dtype in (np.float32, np.float64):
+            often = (lattice, kind, backend) in IMAGES_OFTEN and dtype == np.float32
+            yield pytest.param(lattice, kind, backend, dtype, marks=[] if often else [SLOW])
+
+
+@pytest.mark.parametrize(("lattice", "kind", "backend", "dtype"), list(each_image_case()))
+def test_excluded_images(lattice, kind, backend, dtype):
+    """Pairs (i, j, S) are no neighbors, other images of them are, wherever particles lie; sums know nothing of them, either."""
+    rng, given, cutoff = np.random.default_rng(6), LATTICES[lattice], 0.6
+    matrix = (np.eye(3) if given is None else given).astype(dtype)
+    axes = (True, True, False) if lattice == "slab" else (given is not None,) * 3
+    x = rng.random((40, 3)) * (1 if given is None else 2) - 0.5
+    if lattice in ("nearest", "images"):  # far away, too
+        x += rng.integers(-600, 601, (40, 3)) @ matrix
+    x = x.astype(dtype)
+    options = {"matrix": matrix, "periodic": axes}
+    all_pairs = sorted(reference.reference_images(x, cutoff, **options))
+    picked = [all_pairs[k] for k in rng.choice(len(all_pairs), 60)] + [pair for pair in all_pairs if pair[0] == pair[1]][:1]
+    picked += [(3, 4, (50, 0, 0)), (5, 6, (0, 0, 0))]
+    exclude = np.array([[i, j, *shift] for i, j, shift in picked] + [[-1, 2, 0, 0, 0]])
+    more = (
+        {} if given is None else {"box": jfrnn.Box(np.diag(matrix) if (matrix == np.diag(np.diag(matrix))).all() else matrix, axes)}
+    )
+    more |= {"backend": backend}
+    radii, own, queries = cutoff, (lambda pair: True), {}
+    if kind == "radii":
+        radii = np.full(40, cutoff, dtype)
+    elif kind == "species":
+        radii, more["species"] = np.full((2, 2), cutoff, dtype), rng.integers(0, 2, 40)
+    elif kind == "batch":
+        systems = more["batch"] = rng.integers(0, 2, 40)
+        own = lambda pair: systems[pair[0]] == systems[pair[1]]  # noqa: E731
+    elif kind == "half":
+        more["half"] = True
+        own = lambda pair: pair[0] < pair[1] or (pair[0] == pair[1] and pair[2] > (0, 0, 0))  # noqa: E731
+    gone = set(picked) | {(j, i, tuple(-s for s in shift)) for i, j, shift in picked}
+    if kind == "queries":
+        queries = {"queries": x[:10]}
+        all_pairs, gone, exclude = (
+            reference.reference_images(x, cutoff, queries=x[:10], **options),
+            set(picked),
+            exclude[exclude[:, 0] < 10],
+        )
+    expected = {pair for pair in set(all_pairs) - gone if own(pair)}
+    assert len(expected) < sum(map(own, all_pairs))
+    nbrs = jfrnn.search(x, radii, exclude=exclude, **more, **queries)
+    nbrs.check()
+    rows, mask = np.broadcast_to(np.arange(len(nbrs.idx))[:, None], nbrs.idx.shape), np.asarray(nbrs.idx) < 40
+    shifts, idx = np.asarray(nbrs.shifts(x, **queries)), np.asarray(nbrs.idx)
+    found = list(zip(rows[mask].tolist(), idx[mask].tolist(), map(tuple, shifts[mask].tolist()), strict=True))
+    assert len(set(found)) == len(found)
+    assert set(found) == expected
+    if kind == "half":
+        return
+    del more["backend"]
+    sums = jfrnn.pair_sum(lambda r, i, j: jnp.ones((), dtype), x, radii, exclude=exclude, backend=backend, **more, **queries)
+    np.testing.assert_array_equal(sums, np.bincount([i for i, *_ in expected], minlength=len(nbrs.idx)))
+
+
+def test_derivatives_leave_excluded_images_out():
+    """A square of sums, whose derivative runs over the pairs the other way round, too; of queries, these are other rows."""
+    rng, matrix = np.random.default_rng(7), np.diag([0.8, 1.1, 0.9])
+    x = jnp.asarray(rng.random((20, 3)))
+    for queries in ({}, {"queries": x[:7]}):
+        pairs = sorted(reference.reference_images(x, 0.5, matrix=matrix, periodic=(True,) * 3, **queries))
+        exclude = np.array([[i, j, *shift] for i, j, shift in pairs[::3]])
+        gone = set(pairs[::3]) | (set() if queries else {(j, i, tuple(-s for s in shift)) for i, j, shift in pairs[::3]})
+        left = [pair for pair in pairs if pair not in gone]
+        i, j, shift = (np.array(part) for part in zip(*left, strict=True))
+
+        def fused(x, queries=queries, exclude=exclude):
+            given = {"queries": x[:7]} if queries else {}
+            box = jfrnn.Box(np.diag(matrix))
+            return (jfrnn.pair_sum(lambda r, i, j: r @ r, x, 0.5, exclude=exclude, box=box, **given) ** 2).sum()
+
+        def plain(x, i=i, j=j, shift=shift, queries=queries):
+            r = x[j] - x[i] + shift @ matrix
+            return (jnp.zeros(7 if queries else 20).at[i].add((r * r).sum(1)) ** 2).sum()
+
+        np.testing.assert_allclose(jax.jit(jax.grad(fused))(x), jax.grad(plain)(x), rtol=1e-9)
+
+
+def test_excluded_images_traced_and_in_systems_of_their_own():
+    rng, cells = np.random.default_rng(8), np.array([[0.8, 1.1, 0.9], [2.0, 2.5, 3.0]])
+    x, batch = rng.random((40, 3)), np.repeat([0, 1], 20)
+    found = set()
+    for k, cell in enumerate(cells):
+        pairs = reference.reference_images(x[batch == k], 0.6, matrix=np.diag(cell), periodic=(True,) * 3)
+        found |= {(i + 20 * k, j + 20 * k, shift) for i, j, shift in pairs}
+    picked = sorted(found)[::4]
+    gone = set(picked) | {(j, i, tuple(-s for s in shift)) for i, j, shift in picked}
+    box = jfrnn.Box(cells, per_system=True, images=1)
+
+    @jax.jit
+    def search(exclude):
+        return jfrnn.search(x, 0.6, box=box, batch=batch, exclude=exclude, capacity=96)
+
+    exclude = np.array([[i, j, *shift] for i, j, shift in picked])
+    nbrs = search(exclude)
+    nbrs.check()
+    assert int(np.sum(nbrs.count)) == len(found - gone)
+    with pytest.raises(ValueError, match="exclude"):
+        search(exclude + 100).check()
+    with pytest.raises(ValueError, match=r"shape \[e, 2\], a pair in each row, or \[e, 5\] with the lattice shift"):
+        jfrnn.search(x, 0.6, exclude=exclude[:, :4])
+    assert jax.make_jaxpr(lambda: jfrnn.count(x, 0.6, exclude=exclude[:, :2]))  # as before

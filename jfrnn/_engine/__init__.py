@@ -10,6 +10,7 @@ from jfrnn._engine.auto import (
     parse_backend,
     platform_of,
 )
+from jfrnn._engine.few_counts import count_few
 from jfrnn._engine.kept_warp import KeptList, kept_distances, kept_mask, kept_slopes, kept_sums
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import MOST_IN_BOX, as_float
@@ -21,13 +22,14 @@ from jfrnn._engine.problem import (
     Kind,
     Options,
     Search,
+    find_bits,
     hide_inactive,
-    is_decidable,
     prepare_search,
+    rows_asked,
     take_present,
 )
 from jfrnn._engine.reverse_warp import collect_slots, flatten_slots, reverse_slots, slots_by_source
-from jfrnn._engine.rows import Found, add_up, count_rows, fold_pairs, list_flat, list_rows
+from jfrnn._engine.rows import Found, add_up, count_rows, fold_pairs, list_flat, list_rows, mark_counts
 from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit
 from jfrnn._engine.start import compiler, level_of_caller
 from jfrnn._engine.structure import Structure, find_structure_pairs

@@ -35,7 +35,7 @@ from jfrnn._geometry import (
     Cells,
     Cutoff,
     Cutoffs,
-    Exclusions,
+    ExcludedCodes,
     Lattice,
     Levels,
     Status,
@@ -152,14 +152,17 @@ def find_candidates(search: Search, by_cells: bool, tuning: Tuning) -> Candidate
     return found._replace(given=(search.sources, search.sources if search.queries is None else search.queries))
 
 
-def _place_excluded(candidates: Candidates, exclude: Exclusions) -> Excluded:
+def _place_excluded(candidates: Candidates, exclude: ExcludedCodes) -> Excluded:
     """Return where excluded sources stand among the candidates; those that stand nowhere are placed before all others."""
     n, place = candidates.size, lax.iota(jnp.int32, candidates.size)
     ids = candidates.sources.ids[:n]
     if candidates.again is not None:
         ids = jnp.where(place < candidates.again, ids, n)
     places = jnp.full(n, -(1 << 30), jnp.int32).at[ids].set(place, mode="drop")
-    return Excluded(exclude.starts, places[exclude.others])
+    found = places[exclude.others]
+    if exclude.codes is None or candidates.torus is not None:
+        return Excluded(exclude.starts, found, exclude.codes)
+    return Excluded(exclude.starts, jnp.where(exclude.codes < 0, -(1 << 30), found))
 
 
 def _find_candidates(search: Search, by_cells: bool, tuning: Tuning) -> Candidates:

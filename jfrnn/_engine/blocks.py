@@ -93,6 +93,12 @@ def _decided(bit: Array, pair: Array) -> Array:
     return jnp.where(pair, one, np.uint32(0)) - (one << np.uint32(LANES))
 
 
+def _lanes_before(end: Array) -> Array:
+    """Return the bits of the candidates of a word before a number, which may lie before or behind all of them; uint32."""
+    one = np.uint32(1)
+    return (one << jnp.clip(end, 0, LANES).astype(jnp.uint32)) - one
+
+
 class BlockSearch(NamedTuple):
     """Tests the candidates of queries, block by block."""
 
@@ -281,18 +287,22 @@ class BlockSearch(NamedTuple):
         self, span: Span, own: list[Array], table: _WordTable, chunk: Array
     ) -> tuple[Array, Array | None, Array | None]:
         """Return a chunk of words with hits and doubtful candidates, the positions of their first candidates, and their images."""
+        allowed = HITS
         if self.reads_all:
             packed, first, image = self._test_all(own, span), None, None
         elif self.tuning.by_gathers:
             first, stop, image = self._locate_words(table, chunk)
             lanes = Lanes(first.T, None if image is None else image.T, queries_last=True)
-            packed = self._test(lanes, own, span, stop.T)
+            packed, allowed = self._test(lanes, own, span, stop.T), _lanes_before(stop - first)
         else:
             first, allowed, image = self._locate_apart(span, table, chunk)
             packed = self._test(Lanes(first, image, queries_last=False), own, span) & (allowed | allowed << np.uint32(LANES))
+        if isinstance(self.cutoff, Cutoffs) and self.cutoff.itself:
+            itself = self._own_lanes(self._first_of_all(span) if first is None else first, image, span) & allowed
+            packed = packed & ~(itself << np.uint32(LANES)) | itself  # whatever its cutoff
         if self.candidates.excluded is not None:
             begin = self._first_of_all(span) if first is None else first
-            allowed = ~self._excluded_lanes(self.candidates.excluded, begin, span) & HITS
+            allowed = ~self._excluded_lanes(self.candidates.excluded, begin, image, span) & HITS
             packed = packed & (allowed | allowed << np.uint32(LANES))
         if self.candidates.most_words is None:  # else the words are known before
             packed, first, image = lax.optimization_barrier((packed, first, image))
@@ -419,14 +429,21 @@ class BlockSearch(NamedTuple):
 
     def _allowed_lanes(self, lanes: Lanes, stop: Array, span: Span) -> Array:
         """Return which of a word's 16 candidates belong to its run and are not the query itself: bits, [b, words] uint32."""
-        one, torus = np.uint32(1), self.candidates.torus
-        allowed = (one << jnp.clip(stop - lanes.first, 0, LANES).astype(jnp.uint32)) - one
+        torus, allowed = self.candidates.torus, _lanes_before(stop - lanes.first)
         if not self.keep.drop_self or self.keep.later_only:
             return allowed
         own = self._lanes_at(span.places, lanes.first)
         if lanes.image is not None and torus is not None:
             own = jnp.where(lanes.image == torus.images.home, own, np.uint32(0))
         return allowed & ~own
+
+    def _own_lanes(self, first: Array, image: Array | None, span: Span) -> Array:
+        """Return which of a word's 16 candidates is the query itself, if that is finite: bits, [b, words] uint32."""
+        finite = functools.reduce(jnp.logical_and, (jnp.isfinite(span.of(x)) for x in self.queries.axes))
+        itself, torus = jnp.where(finite[:, None], self._lanes_at(span.places, first), np.uint32(0)), self.candidates.torus
+        if image is None or torus is None:
+            return itself
+        return jnp.where(image == torus.images.home, itself, np.uint32(0))
 
     def _lanes_at(self, place: Array, first: Array) -> Array:
         """Return the candidates at a position [b] of each query: bits, [b, words] uint32."""
@@ -438,14 +455,17 @@ class BlockSearch(NamedTuple):
             lanes = lanes | jnp.where(here, bit, np.uint32(0))
         return lanes
 
-    def _excluded_lanes(self, excluded: Excluded, first: Array, span: Span) -> Array:
+    def _excluded_lanes(self, excluded: Excluded, first: Array, image: Array | None, span: Span) -> Array:
         """Return which candidates queries exclude: bits, [b, words] uint32. One pass for each place in the longest row."""
         own = span.of(self.queries.ids)
         begin, end = flat_take(excluded.starts, own), flat_take(excluded.starts, own + 1)
 
         def add(k: Array, lanes: Array) -> Array:
-            place = flat_take(excluded.places, jnp.minimum(begin + k, excluded.places.size - 1))
-            return lanes | self._lanes_at(jnp.where(begin + k < end, place, -(1 << 30)), first)
+            at = jnp.minimum(begin + k, excluded.places.size - 1)
+            found = self._lanes_at(jnp.where(begin + k < end, flat_take(excluded.places, at), -(1 << 30)), first)
+            if excluded.codes is not None and image is not None:
+                found = jnp.where(image == flat_take(excluded.codes, at)[:, None], found, np.uint32(0))
+            return lanes | found
 
         return lax.fori_loop(0, largest_of(end - begin), add, jnp.zeros(first.shape, jnp.uint32))
 

@@ -37,7 +37,7 @@ def box_neighbors(search: Search, keep: Filter, capacity: int | Room | None) -> 
     m, dim, double = search.sizes[1], search.sources.shape[1], search.sources.dtype == jnp.float64
     rule = _rule_of(search)
     dims = {**row_dims(m, capacity), "count": m, "info": 2}
-    kind = (search.queries is None, search.cutoff.closed, keep, periodic_kind(search.torus), True, search.exclude is not None)
+    kind = (search.queries is None, search.cutoff.closed, keep, periodic_kind(search.torus), True, search.excluding)
     starts = [capacity.starts] if isinstance(capacity, Room) else []
     variant = Variant(dim, double, search.cutoff.scaled, capacity is not None, *kind, bool(starts), rule)
 
@@ -160,7 +160,7 @@ def box_sums(
 
     def on(cuda: bool) -> Callable[..., FoundSums]:
         flags = search.queries is None, cutoff.closed, keep.drop_self, periodic_kind(search.torus), True
-        kind = compensated, extremes, key, cuda, False, search.exclude is not None, _rule_of(search)
+        kind = compensated, extremes, key, cuda, False, search.excluding, _rule_of(search)
         call_sums = _sum_callable(SumVariant(dim, double, cutoff.scaled, *flags, *kind), term)
         results = SumsOf(term, m, boxes.slots(m, cuda), compensated, extremes)
 
@@ -193,7 +193,14 @@ _SUMS = ("sums", "totals", "errors", "more")  # what a kernel writes
 def _sum_callable(variant: SumVariant, term: TermText) -> Call:
     scalar = np.float64 if variant.double else np.float32
     results = dict.fromkeys(_SUMS, scalar) | {"info": np.int32}
-    given = (*_GIVEN, "shared_values", "own_values", "columns", *EXCLUDED * variant.excluding, *names_of_cutoffs(variant.rule))
+    given = (
+        *_GIVEN,
+        "shared_values",
+        "own_values",
+        "columns",
+        *EXCLUDED * bool(variant.excluding),
+        *names_of_cutoffs(variant.rule),
+    )
     name = variant.name(f"box_sums_{'cuda' if variant.cuda else 'cpu'}")
     return Call(name, given, results, functools.partial(_plan_sums, variant, term))
 

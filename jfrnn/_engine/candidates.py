@@ -74,10 +74,12 @@ class Excluded(NamedTuple):
     Attributes:
         starts: [m + 1] int32, where the row of each query begins, by the queries' ids, and where the last one ends.
         places: [k] int32, positions of excluded sources, row after row; negative for those that have none.
+        codes: [k] int32, the images that are excluded; None: all are.
     """
 
     starts: Array
     places: Array
+    codes: Array | None = None
 
 
 class Candidates(NamedTuple):

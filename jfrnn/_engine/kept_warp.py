@@ -148,7 +148,8 @@ def _kind_of(given: KeptList, lanes: int) -> _Extra:
     dim, double, aligned = given.sources.shape[1], given.sources.dtype == jnp.float64, given.idx.shape[1] % 4 == 0
     ordered = given.order is not None and lanes > 0
     boxes = given.systems is not None
-    kind = kept.ListKind(dim, double, cutoff.scaled, periodic, width, rule, is_reversed, aligned, ordered, lanes, boxes)
+    itself = isinstance(cutoff, Cutoffs) and cutoff.itself
+    kind = kept.ListKind(dim, double, cutoff.scaled, periodic, width, rule, is_reversed, aligned, ordered, lanes, boxes, itself)
     return _Extra(cutoff.closed, 1 if lattice is None else lattice.images.total, kind)
 
 

@@ -13,7 +13,7 @@ from jfrnn._engine.operands import excluded_rows, lattice_numbers, particle_rows
 from jfrnn._engine.plans import Clear, Launch, Plan, share
 from jfrnn._engine.problem import Filter, Room, Rows, Search
 from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText
-from jfrnn._engine.variants import absent, found_rows, row_dims
+from jfrnn._engine.variants import absent, excluding_flags, found_rows, row_dims
 from jfrnn._geometry import GROUPS, HALVINGS, Cutoffs, Levels
 from jfrnn.kernels import levels as level_kernels
 from jfrnn.kernels import pair_sum_levels
@@ -33,7 +33,7 @@ class _LevelVariant(NamedTuple):
     periodic: int
     batched: bool
     cuda: bool
-    excluding: bool
+    excluding: int
     flat: bool = False
 
 
@@ -84,7 +84,7 @@ def level_sums(
 def _variant_of(search: Search, keep: Filter, lists: bool, cuda: bool) -> _LevelVariant:
     sources, cutoffs = search.sources, search.cutoffs
     kind = (search.queries is None, cutoffs.closed, keep, cutoffs.rule, periodic_kind(search.torus), search.batch is not None, cuda)
-    kind = (*kind, search.exclude is not None)
+    kind = (*kind, search.excluding)
     return _LevelVariant(sources.shape[1], sources.dtype == jnp.float64, lists, *kind)
 
 
@@ -142,13 +142,13 @@ _GIVEN += ("query_axes", "query_radii", "query_ids", "query_top", "places")
 
 
 def _given(variant: _LevelVariant) -> tuple[str, ...]:
-    return (*_GIVEN, *EXCLUDED * variant.excluding, *TABLE * (variant.rule == RULES[-1]))
+    return (*_GIVEN, *EXCLUDED * bool(variant.excluding), *TABLE * (variant.rule == RULES[-1]))
 
 
 def _name(name: str, variant: _LevelVariant, **more: bool) -> str:
     flags = {"f64": variant.double, "f32": not variant.double, "list": variant.lists, "flat": variant.flat, "own": variant.own}
     flags |= {"closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only, variant.rule: True}
-    flags |= {**space_flags(variant.periodic), "batched": variant.batched, "excluding": variant.excluding}
+    flags |= {**space_flags(variant.periodic), "batched": variant.batched, **excluding_flags(variant.excluding)}
     return "_".join([f"jfrnn_{name}_{variant.dim}d", *(flag for flag, on in {**flags, **more}.items() if on)])
 
 

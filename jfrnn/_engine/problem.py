@@ -14,6 +14,7 @@ from jfrnn._geometry import (
     Box,
     Cutoff,
     Cutoffs,
+    ExcludedCodes,
     Exclusions,
     Images,
     Lattice,
@@ -21,6 +22,9 @@ from jfrnn._geometry import (
     Status,
     Wrapped,
     are_valid,
+    bring_near,
+    exclude_in_lattice,
+    exclude_in_space,
     has_box,
     is_valid,
     make_cutoffs,
@@ -75,7 +79,7 @@ class Search(NamedTuple):
     batch: Batch | None
     torus: tuple[Lattice, Wrapped] | None
     checks: dict[Status, Array]
-    exclude: Exclusions | None = None
+    exclude: ExcludedCodes | None = None
 
     @property
     def cutoffs(self) -> Cutoffs:
@@ -83,6 +87,11 @@ class Search(NamedTuple):
         if not isinstance(self.cutoff, Cutoffs):
             raise TypeError("this search has one cutoff for all particles.")
         return self.cutoff
+
+    @property
+    def excluding(self) -> int:
+        """What queries exclude: 0 nothing, 1 sources, 2 images of sources."""
+        return 0 if self.exclude is None else 1 if self.exclude.codes is None else 2
 
     @property
     def per_system(self) -> bool:
@@ -186,17 +195,38 @@ def hide_inactive(positions: Array, active: Array | None) -> Array:
 
 
 def take_present(inputs: Inputs) -> Inputs:
-    """Return the operands without the particles that have no box, where each system has one: they are not active.
+    """Return the operands without the particles that have no system, or no box where each system has one: they are not active.
 
-    Queries have no mask; those that have no box are moved to infinity.
+    Queries have no mask; those that have none are moved to infinity.
     """
-    if inputs.box is None or not inputs.box.per_system or inputs.batch is None:
+    there, asking = _have_system(inputs)
+    if there is None:
         return inputs
-    active, queries, batch = inputs.active, inputs.queries, inputs.batch
-    there = has_box(batch.sources, len(inputs.box.vectors))
-    if queries is not None:
-        queries = jnp.where(has_box(batch.of_queries, len(inputs.box.vectors))[:, None], queries, jnp.inf)
+    active, queries = inputs.active, inputs.queries
+    if queries is not None and asking is not None:
+        queries = jnp.where(asking[:, None], queries, jnp.inf)
     return inputs._replace(active=there if active is None else active & there, queries=queries)
+
+
+def _have_system(inputs: Inputs) -> tuple[Array | None, Array | None]:
+    """Say which sources and which queries belong to a system, [n] and [m] bool; None where all do, and without queries."""
+    batch, box = inputs.batch, inputs.box
+    if batch is None:
+        return None, None
+    if box is not None and box.per_system:
+        there, asking = (has_box(x, len(box.vectors)) for x in (batch.sources, batch.of_queries))
+    elif batch.fit is not None:
+        there, asking = batch.fit
+    else:
+        return None, None
+    return there, None if inputs.queries is None else asking
+
+
+def rows_asked(inputs: Inputs) -> tuple[Array, Array | None]:
+    """Return the points of the rows of a search, and which of these take part (None: all): queries have no mask but their boxes."""
+    if inputs.queries is not None:
+        return inputs.queries, _have_system(inputs)[1]
+    return inputs.sources, take_present(inputs).active
 
 
 def prepare_search(inputs: Inputs, options: Options) -> Search:
@@ -206,29 +236,44 @@ def prepare_search(inputs: Inputs, options: Options) -> Search:
     sources, images = hide_inactive(given, active), options.images
     per_system = box is not None and box.per_system and batch is not None
     batch = None if batch is None or per_system else rank_systems(batch)
-    checks = _check_exclusions(exclude)
+    checks = _check_exclusions(exclude) | _check_systems(asked)
     if isinstance(cutoff, Radii):
-        asking = None if asked.queries is None or not per_system else _there(asked)
+        asking = None if asked.queries is None else _have_system(asked)[1]
         sources, queries, checks[Status.INVALID_CUTOFF] = _with_valid_radii(sources, queries, active, asking, cutoff)
         cutoff = make_cutoffs(cutoff, options.closed, options.skin)
     if per_system:
-        return _prepare_boxes(asked, active, Search(sources, queries, cutoff, asked.batch, None, checks, exclude), options)
+        return _prepare_boxes(asked, active, Search(sources, queries, cutoff, asked.batch, None, checks), options)
     if box is None or images is None:
-        return Search(sources, queries, cutoff, batch, None, checks, exclude)
+        excluded = None if exclude is None else exclude_in_space(exclude.rows)
+        return Search(sources, queries, cutoff, batch, None, checks, excluded)
     lattice = make_lattice(box, images, np.dtype(sources.dtype))
-    wrapped = wrap(sources, queries, lattice, largest_radius(cutoff))
+    near = [bring_near(x, lattice) for x in (sources, queries) if x is not None]
+    sources, queries = near[0].points, None if queries is None else near[1].points
+    wrapped, moved = wrap(sources, queries, lattice, largest_radius(cutoff)), (near[0].turns, near[-1].turns)
+    excluded = None if exclude is None else exclude_in_lattice(exclude.rows, lattice, wrapped, moved, None)
     checks[Status.BOX_TOO_SMALL] = wrapped.enough & is_valid(lattice)
     checks[Status.OUT_OF_RANGE] = (wrapped.met & TOO_FAR) == 0
-    return Search(sources, queries, cutoff, batch, (lattice, wrapped), checks, exclude)
+    return Search(sources, queries, cutoff, batch, (lattice, wrapped), checks, excluded)
 
 
 def _check_exclusions(exclude: Exclusions | None) -> dict[Status, Array]:
     return {} if exclude is None or exclude.valid is None else {Status.EXCLUDED_OUT_OF_RANGE: exclude.valid}
 
 
-def _there(asked: Inputs) -> Array | None:
-    """Say which queries have a box, where each system has one."""
-    return None if asked.batch is None or asked.box is None else has_box(asked.batch.of_queries, len(asked.box.vectors))
+def _check_systems(asked: Inputs) -> dict[Status, Array]:
+    """Check that all particles that take part have a number of a system, where each system has a box of one there is, or -1."""
+    batch, box = asked.batch, asked.box
+    if batch is None:
+        return {}
+    if box is not None and box.per_system:
+        boxes = len(box.vectors)
+        named = [(x >= -1) & (x < boxes) for x in (batch.sources, batch.queries) if x is not None]
+    elif batch.fit is not None:
+        named = [x for x in batch.fit if x is not None]
+    else:
+        return {}
+    named[0] = named[0] if asked.active is None else named[0] | ~asked.active
+    return {Status.SYSTEM_WITHOUT_BOX: functools.reduce(jnp.logical_and, (x.all() for x in named))}
 
 
 def _prepare_boxes(asked: Inputs, present: Array | None, search: Search, options: Options) -> Search:
@@ -240,20 +285,22 @@ def _prepare_boxes(asked: Inputs, present: Array | None, search: Search, options
     if box is None or batch is None or images is None or present is None:
         raise TypeError("a search with a box per system needs boxes and a batch.")
     boxes = len(box.vectors)
-    named = [(batch.sources >= -1) & (batch.sources < boxes)]
-    named = [x if asked.active is None else x | ~asked.active for x in named]
-    if batch.queries is not None:
-        named.append((batch.queries >= -1) & (batch.queries < boxes))
-    nearest = jax.tree.map(lambda x: jnp.clip(x, 0, boxes - 1), batch)
+    nearest = jax.tree.map(lambda x: jnp.clip(x, 0, boxes - 1), batch._replace(fit=None))
     lattice = make_lattice(box, images, np.dtype(search.sources.dtype))
-    wrapped = wrap(search.sources, search.queries, lattice, _radius_of_systems(search, nearest, boxes), nearest)
+    clouds = zip((search.sources, search.queries), (nearest.sources, nearest.of_queries), strict=True)
+    near = [bring_near(x, lattice.of_rows(systems)) for x, systems in clouds if x is not None]
+    sources, queries, moved = near[0].points, None if search.queries is None else near[1].points, (near[0].turns, near[-1].turns)
+    wrapped = wrap(sources, queries, lattice, _radius_of_systems(search, nearest, boxes), nearest)
     right = (wrapped.enough & is_valid(lattice))[nearest.sources]
     checks = {
-        Status.SYSTEM_WITHOUT_BOX: functools.reduce(jnp.logical_and, (x.all() for x in named)),
         Status.BOX_TOO_SMALL: (right | ~present).all(),
         Status.OUT_OF_RANGE: (wrapped.met & TOO_FAR) == 0,
     } | search.checks
-    return search._replace(batch=nearest, torus=(lattice, wrapped), checks=checks)
+    excluded = None
+    if asked.exclude is not None:
+        excluded = exclude_in_lattice(asked.exclude.rows, lattice, wrapped, moved, nearest.of_queries)
+    found = {"sources": sources, "queries": queries, "batch": nearest, "torus": (lattice, wrapped), "checks": checks}
+    return search._replace(**found, exclude=excluded)
 
 
 def _radius_of_systems(search: Search, batch: Batch, boxes: int) -> np.floating | Array:
@@ -273,9 +320,15 @@ def _radius_of_systems(search: Search, batch: Batch, boxes: int) -> np.floating 
 
 
 @functools.partial(compile_program, static_argnames="options")
-def is_decidable(inputs: Inputs, options: Options) -> Array:
-    """Say whether cutoffs, box and positions of all particles that take part are in range; [] bool."""
-    return functools.reduce(jnp.logical_and, prepare_search(inputs, options).checks.values(), jnp.ones((), bool))
+def find_bits(inputs: Inputs, options: Options) -> Array:
+    """Find the bits of `Status` that particles, cutoffs and box set, except that for positions that are not finite; [] int32."""
+    return bits_of(prepare_search(inputs, options).checks)
+
+
+def bits_of(checks: dict[Status, Array]) -> Array:
+    """Return the bits of what is not right, [] int32."""
+    bits = (jnp.where(right, 0, bit.value).astype(jnp.int32) for bit, right in checks.items())
+    return functools.reduce(jnp.bitwise_or, bits, jnp.int32(0))
 
 
 def _with_valid_radii(

@@ -9,10 +9,10 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.arrays import complete_rows, find_candidates, is_few, refuse_many
-from jfrnn._engine.problem import Inputs, Options, Room, Rows, Search, prepare_search, take_present
+from jfrnn._engine.problem import Inputs, Options, Room, Rows, Search, bits_of, prepare_search, rows_asked, take_present
 from jfrnn._engine.runs import State, Visit, fold_neighbors
 from jfrnn._engine.tuning import Tuning, by_platform
-from jfrnn._geometry import NOT_FINITE, Cutoff, Status, has_box
+from jfrnn._geometry import NOT_FINITE, Cutoff, Status, are_whole, good_rows, mark_rows
 from jfrnn._tracing import compile_program
 
 
@@ -69,10 +69,16 @@ def add_up(counts: Array) -> Array:
 
 
 @functools.partial(compile_program, static_argnames="options")
-def count_rows(inputs: Inputs, options: Options) -> tuple[Array, Array]:
-    """Count the neighbors of every query, [m] int32, and return their maximum too: the compiled program of `count`."""
+def count_rows(inputs: Inputs, options: Options) -> tuple[Array, Array, Array]:
+    """Count the neighbors of every query, [m] int32; return their maximum and the bits of `Status`, too: the program of `count`."""
     rows = _find(inputs, options, None).rows
-    return rows.counts, rows.required
+    return rows.counts, rows.required, rows.status
+
+
+@compile_program
+def mark_counts(inputs: Inputs, counts: Array, status: Array) -> Array:
+    """Replace counts that may be wrong by the smallest integer: those of particles that are not finite, or all."""
+    return mark_rows(counts, good_rows(*rows_asked(inputs), are_whole(status)))
 
 
 def _find(inputs: Inputs, options: Options, capacity: int | Room | None) -> Found:
@@ -84,8 +90,8 @@ def _find(inputs: Inputs, options: Options, capacity: int | Room | None) -> Foun
     rows = _empty_rows(search, options, capacity) if 0 in search.sizes else options.engine.rows(search, options, capacity)
     if torus is not None and active is None and isinstance(cutoff, Cutoff):  # else positions may be infinite for other reasons
         checks = checks | {Status.NONFINITE: (torus[1].met & NOT_FINITE) == 0}
-    if given_queries is not None and inputs.batch is not None and inputs.box is not None and search.per_system:
-        there = has_box(inputs.batch.of_queries, len(inputs.box.vectors))  # others are at infinity
+    there = rows_asked(inputs)[1]
+    if given_queries is not None and there is not None:  # others are at infinity
         given_queries = jnp.where(there[:, None], given_queries, 0)
     rows = _with_status(rows, given, given_queries, active, checks)
     images = options.images
@@ -123,10 +129,7 @@ def _with_status(rows: Rows, sources: Array, queries: Array | None, active: Arra
     if Status.NONFINITE not in checks:
         finite = (jnp.isfinite(sources).all(axis=1) | (False if active is None else ~active)).all()
         checks = checks | {Status.NONFINITE: finite & (True if queries is None else jnp.isfinite(queries).all())}
-    status = rows.status & ~Status.NONFINITE.value
-    for bit, right in checks.items():
-        status = status | jnp.where(right, 0, bit.value).astype(jnp.int32)
-    return rows._replace(status=status)
+    return rows._replace(status=rows.status & ~Status.NONFINITE.value | bits_of(checks))
 
 
 def _empty_rows(search: Search, options: Options, capacity: int | Room | None) -> Rows:

@@ -30,9 +30,14 @@ class Variant(NamedTuple):
     keep: Filter
     periodic: int = 0  # 1: nearest images, 2: images are told apart; two more where the lattice is skewed
     batched: bool = False
-    excluding: bool = False
+    excluding: int = 0  # as `Search.excluding`
     flat: bool = False  # a list whose rows follow each other without gaps
     rule: str = ""  # by which the cutoff of a pair follows from both, if they differ
+
+
+def excluding_flags(excluding: int) -> dict[str, bool]:
+    """Return the words of a name that tell what queries exclude."""
+    return {"excluding": excluding == 1, "excludingimages": excluding == 2}
 
 
 class SumVariant(NamedTuple):
@@ -51,14 +56,14 @@ class SumVariant(NamedTuple):
     key: str
     cuda: bool
     few: bool  # all of them meet
-    excluding: bool
+    excluding: int
     rule: str = ""
 
     def name(self, of: str) -> str:
         """Return the name of a call, which tells it from all others."""
         flags = {"f64": self.double, "f32": not self.double, "scaled": self.scaled, "own": self.own}
         flags |= {"closed": self.closed, "dropself": self.drop_self, "batched": self.batched, **space_flags(self.periodic)}
-        flags |= {"compensated": self.compensated, "extremes": self.extremes, "excluding": self.excluding}
+        flags |= {"compensated": self.compensated, "extremes": self.extremes, **excluding_flags(self.excluding)}
         flags |= {self.rule: bool(self.rule), self.key: bool(self.key)}
         return "_".join([f"jfrnn_{of}_{self.dim}d", *(flag for flag, on in flags.items() if on)])
 
@@ -77,10 +82,10 @@ def describe_call(
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
     flags |= {"flat": variant.flat, **space_flags(variant.periodic), "batched": variant.batched}
     flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
-    flags |= {"excluding": variant.excluding, variant.rule: bool(variant.rule)}
+    flags |= {**excluding_flags(variant.excluding), variant.rule: bool(variant.rule)}
     whole = "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
     results = [*["idx"] * variant.lists, *["receivers"] * variant.flat, "count", "info", *more]
-    given = (*given, *EXCLUDED * variant.excluding, *names_of_cutoffs(variant.rule), *["starts"] * variant.flat)
+    given = (*given, *EXCLUDED * bool(variant.excluding), *names_of_cutoffs(variant.rule), *["starts"] * variant.flat)
     return Call(whole, given, dict.fromkeys(results, np.int32), plan)
 
 

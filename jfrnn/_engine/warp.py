@@ -149,7 +149,7 @@ def call_kernels(
     (n, m), dim = search.sizes, sources.shape[1]
     double = sources.dtype == jnp.float64
     periodic = periodic_kind(torus)
-    kind = (periodic, batch is not None, search.exclude is not None, flat)
+    kind = (periodic, batch is not None, search.excluding, flat)
     variant = Variant(dim, double, cutoff.scaled, lists, own, cutoff.closed, keep, *kind)
     if periodic in (1, 3) and n >= MOST_IN_BOX:
         raise ValueError(

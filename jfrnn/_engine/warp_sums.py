@@ -51,7 +51,7 @@ def pair_sums(
         def call(search: Search, values: tuple[Array, Array, Array]) -> FoundSums:
             sources, queries, cutoff, batch, torus = search[:5]
             flags = (queries is None, cutoff.closed, keep.drop_self, periodic_kind(torus), batch is not None)
-            kind = (compensated, extremes, key, cuda, cuda and are_few(search), search.exclude is not None)
+            kind = (compensated, extremes, key, cuda, cuda and are_few(search), search.excluding)
             variant = SumVariant(sources.shape[1], sources.dtype == jnp.float64, cutoff.scaled, *flags, *kind)
             return _call_sums(variant, term, pack_particles(search), values, excluded_rows(search))
 
@@ -89,7 +89,7 @@ def _call_sums(
 def _sum_callable(variant: SumVariant, term: TermText) -> Call:
     scalar, words = np.float64 if variant.double else np.float32, {"info": np.int32, "scratch": np.int32}
     results, of_search = dict.fromkeys((*_RESULTS, _SORTED[variant.cuda]), scalar), tuple(words)
-    excluded = EXCLUDED * variant.excluding
+    excluded = EXCLUDED * bool(variant.excluding)
     name = variant.name(f"pair_sum_{'cuda' if variant.cuda else 'cpu'}")
     if variant.cuda:  # particles are sorted
         return Call(name, (*_GIVEN, *of_search, *excluded), results, functools.partial(_plan_on_cuda, variant, term))
@@ -99,7 +99,9 @@ def _sum_callable(variant: SumVariant, term: TermText) -> Call:
 @kernel
 def _few_callable(variant: SumVariant, term: TermText) -> Call:
     scalar, plan = np.float64 if variant.double else np.float32, functools.partial(_plan_few, variant, term)
-    return Call(variant.name("pair_sum_few_cuda"), (*_GIVEN, *EXCLUDED * variant.excluding), dict.fromkeys(_RESULTS, scalar), plan)
+    return Call(
+        variant.name("pair_sum_few_cuda"), (*_GIVEN, *EXCLUDED * bool(variant.excluding)), dict.fromkeys(_RESULTS, scalar), plan
+    )
 
 
 def _plan_few(variant: SumVariant, term: TermText, shapes: Shapes, _: int) -> Plan:
@@ -112,7 +114,7 @@ def _plan_few(variant: SumVariant, term: TermText, shapes: Shapes, _: int) -> Pl
 
 def _sorting(variant: SumVariant) -> SumVariant:
     """Return on what of a variant it depends how particles are sorted."""
-    return variant._replace(closed=False, drop_self=False, compensated=False, extremes=False, key="", excluding=False)
+    return variant._replace(closed=False, drop_self=False, compensated=False, extremes=False, key="", excluding=0)
 
 
 @kernel

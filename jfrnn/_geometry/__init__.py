@@ -30,9 +30,10 @@ from jfrnn._geometry.exact import (
     squared_distance,
     take_points,
 )
+from jfrnn._geometry.excluded_images import ExcludedCodes, exclude_in_lattice, exclude_in_space
 from jfrnn._geometry.exclusions import Exclusions, check_exclusions, pairs_of_rows
 from jfrnn._geometry.floats import compensated_sum, rounded_product, rounded_scaled, rounded_sum
-from jfrnn._geometry.images import LARGEST_TURN, Images, grow_images, images_of
+from jfrnn._geometry.images import LARGEST_TURN, Images, box_of_list, grow_images, images_of, refuse_status
 from jfrnn._geometry.inputs import (
     check_active,
     check_again,
@@ -56,6 +57,8 @@ from jfrnn._geometry.inputs import (
 from jfrnn._geometry.integers import GUARDS, carry_limbs, fields_of, full_count, limb_bits, limb_sign, limbs_of
 from jfrnn._geometry.lattice import (
     Lattice,
+    Near,
+    bring_near,
     forward_shifts,
     fractions_of,
     given_shifts,
@@ -66,8 +69,17 @@ from jfrnn._geometry.lattice import (
     translation,
 )
 from jfrnn._geometry.levels import GROUPS, HALVINGS, Axes, Levels, level_runs, sort_by_levels
+from jfrnn._geometry.marks import ROWS_ARE_WHOLE, are_finite, are_whole, good_rows, mark_rows, one_or_nan
 from jfrnn._geometry.meshes import merge_vertices
 from jfrnn._geometry.motion import box_change, motion_of, turns_between
 from jfrnn._geometry.order import hilbert_order, sort_order
-from jfrnn._geometry.status import NeighborOverflowError, Status, known_status, names_of_bits, pairs_and_status, shape_of, tell
+from jfrnn._geometry.status import (
+    NeighborOverflowError,
+    Status,
+    known_status,
+    names_of_bits,
+    pairs_and_status,
+    shape_of,
+    tell,
+)
 from jfrnn._geometry.wrapping import NOT_FINITE, TOO_FAR, Wrapped, unpack_turns, wrap

@@ -13,10 +13,13 @@ class Batch(NamedTuple):
     Attributes:
         sources: [n] system of each source: int32 as the user numbers systems, or uint32 after `rank_systems`.
         queries: [m] system of each query; None if the sources are the queries.
+        fit: Which sources and which queries have a number that int32 holds, [n] and [m] bool; None if all are known to. Others take
+            no part.
     """
 
     sources: Array
     queries: Array | None
+    fit: tuple[Array, Array | None] | None = None
 
     @property
     def of_queries(self) -> Array:
@@ -27,6 +30,11 @@ class Batch(NamedTuple):
     def of_all(self) -> Array:
         """System numbers of the sources, followed by those of the queries if these are separate."""
         return self.sources if self.queries is None else jnp.concatenate([self.sources, self.queries])
+
+    def reverse(self) -> "Batch":
+        """Return the same numbers with queries and sources exchanged."""
+        turned = None if self.fit is None else (self.fit[0] if self.fit[1] is None else self.fit[1], self.fit[0])
+        return Batch(self.of_queries, self.sources, turned)
 
 
 def has_box(systems: Array, boxes: int) -> Array:

@@ -1,6 +1,7 @@
 """The public class `Box`: the periodic cell, given by edge lengths or by lattice vectors."""
 
 import dataclasses
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -9,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from jfrnn._geometry.reach import count_cells
 from jfrnn._geometry.reduced import short_vectors
-from jfrnn._tracing import Given, own_transfers
+from jfrnn._tracing import Given, make_on_host, on_device, own_transfers
 
 _SINGULAR = 1e-9  # determinants below may be those of dependent rows
 Numbers = Any  # an array of NumPy or JAX, concrete or traced
@@ -32,6 +34,7 @@ class Box:
         images: How many cells away a periodic image may lie and still be a neighbor, per axis; None: see `Box`. Static.
         per_system: Whether each system of a batch has a box of its own. Static.
         fractional: Whether positions count the lattice vectors. Static.
+        images_of_list: Of the box of a list (`nbrs.box`): the images of the list, which count where the vectors are traced. Static.
     """
 
     vectors: Numbers
@@ -42,6 +45,7 @@ class Box:
     images: tuple[int, ...] | None
     per_system: bool
     fractional: bool
+    images_of_list: tuple[int, ...] | None
 
     def __init__(
         self,
@@ -67,10 +71,11 @@ class Box:
                 shape [systems, d], which may be traced.
             origin: A corner of the cell [length], a number or shape [d], or with a box per system [systems, d]. It changes no pair;
                 a search is fastest if particles lie between origin and origin + vectors.
-            images: How many cells away a periodic image may lie and still be a neighbor: a static int, or one per axis. Default: as
-                many as the cutoff needs if the box is known while tracing. For a traced box the default is the minimum image alone,
-                which needs a box at least 2.05 (cutoff + skin) wide along every periodic axis; a smaller box sets a status bit. For
-                a box per system: as many as any system needs; a system is searched for its own alone.
+            images: How many cells away a periodic image may lie and still be a neighbor: a static int, or one per axis, as
+                `images_for` counts them. Default: as many as the cutoff needs if the box is known while tracing. For a traced box
+                the default is the minimum image alone (0), which needs a box at least 2.05 (cutoff + skin) wide along every
+                periodic axis; a smaller box sets a status bit. For a box per system: as many as any system needs; a system is
+                searched for its own alone. Where the box of a list (`nbrs.box`) is traced, it has the images of the list.
             per_system: Whether the first axis counts the systems of a batch, so that each has a box of its own. Default: whether
                 there are three axes. Lengths [systems, d] need True, as they would else be lattice vectors.
             fractional: Whether positions, and queries, count the lattice vectors, along axes that are not periodic too: they lie at
@@ -92,7 +97,8 @@ class Box:
             raise ValueError(
                 f"lengths_or_matrix must have shape [d] (lengths) or [d, d] (lattice vectors) with d = 2 or 3, or [systems, d, d], "
                 f"or with per_system=True [systems, d], got shape {list(vectors.shape)}"
-                f"{': a cube is Box([length] * 3)' if vectors.ndim == 0 else ''}."
+                f"{': a cube is Box([length] * 3)' if vectors.ndim == 0 else ''}"
+                f"{': lengths and angles are Box.from_parameters(lengths, angles)' if vectors.shape == (6,) else ''}."
             )
         dim, systems = shape[0], vectors.shape[: bool(many)]
         corner = _real("origin", origin)
@@ -105,12 +111,47 @@ class Box:
         full = corner if corner.shape == (*systems, dim) else corner + np.zeros((*systems, dim), corner.dtype)
         if not isinstance(fractional, bool | np.bool_):
             raise TypeError(f"fractional must be True or False, known while tracing, got {fractional!r}.")
-        self._set((vectors, full, flags, None), (axes, reach, bool(many), bool(fractional)))
+        self._set((vectors, full, flags, None), (axes, reach, bool(many), bool(fractional), None))
         with own_transfers():
             check_box_values(self)
             if many and not self.orthogonal and not any(isinstance(x, Tracer) for x in (vectors, flags)):
                 known = np.broadcast_to(np.array(axes) if flags is None else np.asarray(flags), (*systems, dim))
                 object.__setattr__(self, "numbers", short_vectors(np.asarray(vectors, np.float64), known))
+
+    @classmethod
+    def from_parameters(
+        cls,
+        lengths: Given,
+        angles: Given,
+        periodic: bool | Sequence[bool] | Given = True,
+        origin: Given = 0.0,
+        *,
+        images: int | Sequence[int] | None = None,
+        fractional: bool = False,
+    ) -> "Box":
+        """Make a box from the lengths of its lattice vectors and the angles between them.
+
+        The first vector lies along x, the second in the plane of x and y with y > 0, the third, if there is one, has z > 0.
+
+        Args:
+            lengths: Of the vectors a, b and c [length], shape [3]; in 2D a and b, shape [2].
+            angles: Between b and c, a and c, a and b [degree], shape [3]; in 2D between a and b, a number. 90 makes an exact 0.
+            periodic: As in `Box`, and so are origin, images and fractional.
+            origin: As in `Box`.
+            images: As in `Box`.
+            fractional: As in `Box`.
+
+        Returns:
+            A `Box` with lattice vectors [d, d], lower triangular.
+
+        Raises:
+            TypeError, ValueError: an argument is of the wrong kind, shape or range, or no cell has such angles.
+
+        >>> import jfrnn
+        >>> jfrnn.Box.from_parameters([2.0, 3.0, 4.0], [90.0, 90.0, 90.0]).vectors.tolist()
+        [[2.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 4.0]]
+        """
+        return cls(_cell_of(lengths, angles), periodic, origin, images=images, fractional=fractional)
 
     def _set(self, arrays: Iterable[Numbers], static: tuple[Any, ...]) -> None:
         for field, value in zip(dataclasses.fields(self), (*arrays, *static), strict=True):
@@ -128,16 +169,53 @@ class Box:
         box._set(arrays, static)
         return box
 
+    def images_for(self, cutoff: float) -> tuple[int, ...]:
+        """Return how many cells away a neighbor may lie along each axis, as `images` takes it; 0: the minimum image suffices.
+
+        Args:
+            cutoff: Interaction radius [length]; of a list with a skin, cutoff + skin; the largest one where cutoffs differ.
+
+        Raises:
+            TypeError: the box is traced, or cutoff is not a number.
+            ValueError: cutoff is not positive and finite, or the box is degenerate.
+
+        >>> import jfrnn
+        >>> jfrnn.Box([10.0, 10.0, 3.0]).images_for(4.0), jfrnn.Box([10.0, 10.0, 10.0]).images_for(4.0)
+        ((1, 1, 2), (0, 0, 0))
+        """
+        if isinstance(self.vectors, Tracer) or isinstance(self.flags, Tracer):
+            raise TypeError("images_for() reads the vectors of a box, and these are traced: ask outside of jax.jit.")
+        if isinstance(cutoff, Tracer | bool) or not isinstance(cutoff, int | float | np.number):
+            raise TypeError(f"cutoff must be a number, got {type(cutoff).__name__}.")
+        if not 0 < cutoff < math.inf:
+            raise ValueError(f"cutoff must be positive and finite, got {cutoff}.")
+        single = np.dtype(np.float32)  # which needs as many as float64, or more
+        with own_transfers():
+            check_box_values(self)
+            flags = np.array(self.periodic) if self.flags is None else np.asarray(self.flags)
+            radius = float(np.nextafter(np.float32(cutoff), np.float32(np.inf)))
+            reach, nearest = count_cells(searched_vectors(self, single), flags, self.orthogonal, radius, single)
+        return (0,) * self.dim if nearest else reach
+
+    def of_list(self, images: tuple[int, ...] | None) -> "Box":
+        """Return this box as that of a list with so many images."""
+        return self._replace(images=None, images_of_list=images)
+
     def counted_as(self, other: "Box") -> "Box":
         """Return this box with the short vectors of another one, which shifts of a list count."""
+        return self._replace(numbers=other.numbers)
+
+    def _replace(self, **changed: Any) -> "Box":  # noqa: ANN401
         box = object.__new__(Box)
-        box._set((self.vectors, self.origin, self.flags, other.numbers), self.kind)
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)} | changed
+        for name, value in fields.items():
+            object.__setattr__(box, name, value)
         return box
 
     @property
-    def kind(self) -> tuple[tuple[bool, ...], tuple[int, ...] | None, bool, bool]:
+    def kind(self) -> tuple[tuple[bool, ...], tuple[int, ...] | None, bool, bool, tuple[int, ...] | None]:
         """The static fields."""
-        return self.periodic, self.images, self.per_system, self.fractional
+        return self.periodic, self.images, self.per_system, self.fractional, self.images_of_list
 
     @property
     def dim(self) -> int:
@@ -148,6 +226,32 @@ class Box:
     def orthogonal(self) -> bool:
         """Whether the box was given by lengths."""
         return np.ndim(self.vectors) == 1 + self.per_system
+
+
+def _cell_of(lengths: Given, angles: Given) -> Numbers:
+    """Return the lattice vectors of a cell with these lengths and angles [degree], one per row; traced if one of both is."""
+    sizes, between = _real("lengths", lengths), _real("angles", angles)
+    if sizes.shape not in ((2,), (3,)) or between.shape not in {(2,): ((), (1,)), (3,): ((3,),)}[sizes.shape]:
+        raise ValueError(
+            f"lengths and angles must have shape [3] each, or lengths [2] and angles [] in 2D, got {list(sizes.shape)} and "
+            f"{list(between.shape)}."
+        )
+    xp = jnp if isinstance(sizes, Tracer) or isinstance(between, Tracer) else np
+    if xp is np and not (np.isfinite(sizes).all() and (sizes > 0).all() and (between > 0).all() and (between < 180).all()):
+        raise ValueError(f"lengths must be positive, and angles lie between 0 and 180 degrees, got {lengths} and {angles}.")
+    between = between.reshape(-1)
+    cosines = xp.where(between == 90, 0, xp.cos(xp.deg2rad(between))).astype(between.dtype)
+    gamma, nothing = cosines[-1], xp.zeros((), between.dtype)
+    height = xp.sqrt(1 - gamma**2)
+    if sizes.shape == (2,):
+        rows = [[1 + nothing, nothing], [gamma, height]]
+    else:
+        along = (cosines[0] - cosines[1] * gamma) / height
+        square = 1 - cosines[1] ** 2 - along**2
+        if xp is np and not square > 0:
+            raise ValueError(f"angles must be those of a cell, each less than the sum of the others, got {angles}.")
+        rows = [[1 + nothing, nothing, nothing], [gamma, height, nothing], [cosines[1], along, xp.sqrt(square)]]
+    return xp.stack([xp.stack(row) for row in rows]).astype(sizes.dtype) * sizes[:, None]
 
 
 def _flags_of_systems(periodic: Given, shape: tuple[int, ...]) -> Numbers:
@@ -220,12 +324,23 @@ def _tell_bad(values: np.ndarray, bad: np.ndarray, box: Box) -> str:
     return f"{values[first].tolist()} in system {first}"
 
 
+def _rounded(x: Numbers, dtype: np.dtype) -> Numbers:
+    """Return an array of a dtype on the device; of concrete numbers it is made without a program for their shape."""
+    if isinstance(x, Tracer):
+        return x.astype(dtype)
+    return on_device(x) if x.dtype == dtype else make_on_host(x, lambda known: known.astype(dtype))
+
+
+def searched_vectors(box: Box, dtype: np.dtype) -> np.ndarray:
+    """Return the vectors of a box as rounded to a dtype or, with short ones of each system, those, in float64."""
+    vectors = np.asarray(box.vectors, dtype).astype(np.float64)
+    return vectors if box.numbers is None else np.asarray(box.numbers, np.float64) @ vectors
+
+
 def round_box(box: Box, dtype: np.dtype) -> Box:
-    """Return a box with its arrays rounded to a dtype; it keeps which axes are periodic, but not `images`."""
+    """Return a box with its arrays rounded to a dtype."""
     with own_transfers():
-        arrays = (
-            *(jnp.asarray(x).astype(dtype) for x in (box.vectors, box.origin)),
-            None if box.flags is None else jnp.asarray(box.flags),
-            None if box.numbers is None else jnp.asarray(box.numbers).astype(dtype),
-        )
-        return Box.tree_unflatten((box.periodic, None, box.per_system, box.fractional), arrays)
+        floats = (_rounded(x, dtype) for x in (box.vectors, box.origin))
+        flags = None if box.flags is None else _rounded(box.flags, np.dtype(bool))
+        arrays = (*floats, flags, None if box.numbers is None else _rounded(box.numbers, dtype))
+        return Box.tree_unflatten(box.kind, arrays)

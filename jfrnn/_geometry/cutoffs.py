@@ -71,6 +71,7 @@ class Radii:
         rule: How the cutoff of a pair follows from both (`RULES` and `TABLE`). Static.
         summed: Whether they are twice the radii that the user gave, whose sum is then their mean. Static.
         table: [s, s] cutoffs of pairs of species, 0 for those that are no neighbors; None with cutoffs per particle.
+        itself: Whether each particle is its own neighbor, whatever its cutoff. Static.
     """
 
     sources: Array | None
@@ -78,6 +79,7 @@ class Radii:
     rule: str = dataclasses.field(metadata={"static": True})
     summed: bool = dataclasses.field(default=False, metadata={"static": True})
     table: Array | None = None
+    itself: bool = dataclasses.field(default=False, metadata={"static": True})
 
     @property
     def asked(self) -> str:
@@ -104,6 +106,7 @@ class Cutoffs:
         closed: Whether pairs at exactly the cutoff count. Static.
         kinds: With a table, the cutoffs of pairs of species, [s, s], -1 for those that are no neighbors, and the species of the
             sources and of the queries. The cutoff of a particle is then the largest one of its species. Otherwise None.
+        itself: Whether each particle is its own neighbor, whatever its cutoff. Static.
     """
 
     sources: Array | None
@@ -113,6 +116,7 @@ class Cutoffs:
     rule: str = dataclasses.field(metadata={"static": True})
     closed: bool = dataclasses.field(metadata={"static": True})
     kinds: tuple[Array, Array, Array] | None = None
+    itself: bool = dataclasses.field(default=False, metadata={"static": True})
     scaled = True
 
     @property
@@ -189,7 +193,7 @@ def make_cutoffs(radii: Radii, closed: bool, skin: float = 0.0) -> Cutoffs:
     ]
     largest = functools.reduce(jnp.maximum, (jnp.max(x, initial=0) for x in parts if x is not None))
     largest = jnp.where(largest > 0, largest, 1)
-    return Cutoffs(parts[0], parts[1], largest, unit_scale(largest), radii.rule, closed)
+    return Cutoffs(parts[0], parts[1], largest, unit_scale(largest), radii.rule, closed, itself=radii.itself)
 
 
 def _make_cutoffs_of_kinds(radii: Radii, given: Array, closed: bool, skin: float) -> Cutoffs:
@@ -200,7 +204,8 @@ def _make_cutoffs_of_kinds(radii: Radii, given: Array, closed: bool, skin: float
     kinds = [jnp.clip(x, 0, len(table) - 1) for x in (radii.sources, radii.queries)]
     largest = jnp.max(farthest, initial=0)
     largest = jnp.where(largest > 0, largest, 1)
-    return Cutoffs(farthest[kinds[0]], farthest[kinds[1]], largest, unit_scale(largest), TABLE, closed, (table, kinds[0], kinds[1]))
+    named, scale = (table, kinds[0], kinds[1]), unit_scale(largest)
+    return Cutoffs(farthest[kinds[0]], farthest[kinds[1]], largest, scale, TABLE, closed, named, radii.itself)
 
 
 def are_valid(radii: Radii) -> tuple[Array | None, Array | None]:

@@ -182,6 +182,10 @@ def is_pair_of(
     square = squared_distance(difference, cutoff)
     no, yes, open_pair = np.arange(3, dtype=np.int8)
     step_one = jnp.where(asked & (square <= outside), jnp.where(square < inside, yes, open_pair), no)  # one int8 array, one kernel
+    if isinstance(cutoff, Cutoffs) and cutoff.itself:
+        itself = asked & (neighbor == lax.broadcasted_iota(jnp.int32, neighbor.shape, 0)) & (square == square)
+        itself = itself if shifted is None else itself & (shifted.shifts == 0).all(axis=-1)
+        step_one = jnp.where(itself, yes, step_one)
 
     def refine_open(step_one: Array) -> Array:
         return (step_one == yes) | decide_pairs(step_one == open_pair, slots.points, cutoff)

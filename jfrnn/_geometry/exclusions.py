@@ -15,37 +15,55 @@ _ArrayModule = Any  # numpy or jax.numpy
 
 
 class Exclusions(NamedTuple):
-    """The sources that each row of a search excludes, in all of their periodic images. A pytree.
+    """The sources that each row of a search excludes, in all of their periodic images or in one. A pytree.
 
     Attributes:
-        starts: [m + 1] int32, where the row of a query begins in `others`, and at the end where the last one ends.
-        others: [k] int32, excluded sources, ascending in each row; behind the last row stands what excludes nothing.
-        turned: The same with queries and sources exchanged; None if the sources are the queries: pairs then have no direction.
+        rows: The excluded sources of each query.
+        turned: The same with queries and sources exchanged; None if the sources are the queries: rows are then their own mirror
+            image.
         valid: Whether all pairs name particles that there are, [] bool; None if they are known to.
     """
 
-    starts: Array
-    others: Array
-    turned: tuple[Array, Array] | None
+    rows: "ExcludedRows"
+    turned: "ExcludedRows | None"
     valid: Array | None
 
     def reverse(self) -> "Exclusions":
         """Return the same pairs with queries and sources exchanged."""
-        if self.turned is None:
-            return self
-        return self._replace(starts=self.turned[0], others=self.turned[1], turned=(self.starts, self.others))
+        return self if self.turned is None else self._replace(rows=self.turned, turned=self.rows)
+
+
+class ExcludedRows(NamedTuple):
+    """Rows of excluded sources, one for each query. A pytree.
+
+    Attributes:
+        starts: [m + 1] int32, where the row of a query begins in `others`, and at the end where the last one ends.
+        others: [k] int32, excluded sources, ascending in each row; behind the last row stands what excludes nothing.
+        shifts: [k, d] int32, the lattice shift of the image that is excluded; None: all images are.
+    """
+
+    starts: Array
+    others: Array
+    shifts: Array | None = None
+
+    @property
+    def row_of_each(self) -> Array:
+        """Of which row each of `others` is, [k] int32; behind the last row their number."""
+        place = jnp.arange(self.others.shape[0], dtype=jnp.int32)
+        return jnp.searchsorted(self.starts, place, side="right").astype(jnp.int32) - 1
 
 
 def check_exclusions(exclude: Given, positions: Array, asking: Array | None) -> Exclusions | None:
-    """Return pairs [e, 2] as rows, or None if there are none; those that hold a -1 count as padding."""
+    """Return pairs [e, 2], or images [e, 2 + d], as rows, or None if there are none; those that hold a -1 count as padding."""
     sources, queries = positions.shape[0], None if asking is None else asking.shape[0]
+    dim = positions.shape[1]
     if not hasattr(exclude, "dtype") or not np.issubdtype(exclude.dtype, np.integer):
         told = np.dtype(exclude.dtype) if hasattr(exclude, "dtype") else type(exclude).__name__
         raise TypeError(f"exclude must be an array of integers, the numbers of two particles in each row, got {told}.")
-    if len(exclude.shape) != 2 or exclude.shape[1] != 2:
+    if len(exclude.shape) != 2 or exclude.shape[1] not in (2, 2 + dim):
         raise ValueError(
-            f"exclude must have shape [e, 2], a pair in each row, got shape {list(exclude.shape)}: write rows of partners, one for "
-            "each particle, as pairs with jfrnn.pairs_of_rows."
+            f"exclude must have shape [e, 2], a pair in each row, or [e, {2 + dim}] with the lattice shift of an image behind it, "
+            f"got shape {list(exclude.shape)}: write rows of partners, one for each particle, as pairs with jfrnn.pairs_of_rows."
         )
     if exclude.shape[0] > 2**30 - 1:
         raise ValueError(f"exclude holds {exclude.shape[0]} pairs, but rows are numbered in int32: at most {2**30 - 1}.")
@@ -82,18 +100,30 @@ def _make_rows(xp: _ArrayModule, pairs: Given, sources: int, queries: int | None
     used = _exist(pairs, rows, sources)
     valid = (used | _pad(pairs)).all()
     first, second = (xp.where(used, x, 0).astype(np.int32) for x in (pairs[:, 0], pairs[:, 1]))
+    shifts = None if pairs.shape[1] == 2 else _narrow(xp, pairs[:, 2:])
     if queries is None:
         used, first, second = (xp.concatenate(x) for x in ((used, used), (first, second), (second, first)))
-        return Exclusions(*_sort_rows(xp, used, first, second, rows), None, valid)
-    turned = _sort_rows(xp, used, second, first, sources)
-    return Exclusions(*_sort_rows(xp, used, first, second, rows), turned, valid)
+        both = None if shifts is None else xp.concatenate([shifts, -shifts])
+        return Exclusions(_sort_rows(xp, used, first, second, both, rows), None, valid)
+    turned = _sort_rows(xp, used, second, first, None if shifts is None else -shifts, sources)
+    return Exclusions(_sort_rows(xp, used, first, second, shifts, rows), turned, valid)
 
 
-def _sort_rows(xp: _ArrayModule, used: Given, rows: Given, others: Given, count: int) -> tuple[Any, Any]:
-    """Return where rows begin, and what stands in them."""
+def _narrow(xp: _ArrayModule, shifts: Given) -> Given:
+    """Return shifts as int32; one that does not fit is of an image that is nobody's neighbor, as are all so far away."""
+    most = np.iinfo(np.int32).max // 4
+    return xp.clip(
+        shifts,
+        0 if np.issubdtype(shifts.dtype, np.unsignedinteger) else -min(most, np.iinfo(shifts.dtype).max),
+        min(most, np.iinfo(shifts.dtype).max),
+    ).astype(np.int32)
+
+
+def _sort_rows(xp: _ArrayModule, used: Given, rows: Given, others: Given, shifts: Given, count: int) -> ExcludedRows:
     key = xp.where(used, rows, np.int32(count))
     order = xp.lexsort((others, key))
-    return xp.searchsorted(key[order], xp.arange(count + 1, dtype=np.int32)).astype(np.int32), others[order]
+    starts = xp.searchsorted(key[order], xp.arange(count + 1, dtype=np.int32)).astype(np.int32)
+    return ExcludedRows(starts, others[order], None if shifts is None else shifts[order])
 
 
 def pairs_of_rows(rows: Array) -> Array:

@@ -4,6 +4,7 @@ An image pair (i, j, S) is a pair iff |x_j - x_i + S·A| < cutoff. The rows of A
 that is 0 along axes that are not periodic.
 """
 
+import contextlib
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from jax.core import Tracer
 
-from jfrnn._geometry.box import Box, check_box_values
+from jfrnn._geometry.box import Box, check_box_values, searched_vectors
+from jfrnn._geometry.reach import count_cells
 from jfrnn._geometry.reduced import Basis, reduced_basis
+from jfrnn._geometry.status import Status
 from jfrnn._tracing import own_transfers
 
 LARGEST_TURN = 511  # most cells between a particle and the box: three such numbers fit into an int32, and S·A is exact
-_ROUNDING = 0.01  # of a cell: the margin for rounding where vectors are about as long as their lattice is wide
-_NEAREST = 0.5  # largest cutoff / width, with the margin for rounding, for which the minimum image suffices
 _MANY_IMAGES = 2**15 - 1  # with more images, shorter lattice vectors are looked for
 _MOST_IMAGES = 2**22  # their tables take 100 MB
 _MOST_VECTORS = 2**23  # largest sum of given vectors in a shift: float32 holds whole numbers up to 2^24 exactly
@@ -84,43 +85,52 @@ def images_of(box: Box, radius: float | None, dtype: np.dtype, sources: int) -> 
     """
     if box.images is None and radius is not None and not isinstance(box.vectors, Tracer) and not isinstance(box.flags, Tracer):
         with own_transfers():
-            images = _needed_images(_vectors_of(box, dtype), box, radius, dtype, None)
+            images = _needed_images(searched_vectors(box, dtype), box, radius, dtype, None)
         if not (box.orthogonal or box.per_system) and _too_many(images, sources, _MANY_IMAGES):
-            basis, short = reduced_basis(_vectors_of(box, dtype), box.periodic)
+            basis, short = reduced_basis(searched_vectors(box, dtype), box.periodic)
             reduced = _needed_images(short, box, radius, dtype, basis)
             images = reduced if reduced.total < images.total and _are_exact(reduced) else images
         return check_images(images, sources)
-    wanted = (0,) * box.dim if box.images is None else box.images
+    wanted = box.images or box.images_of_list or (0,) * box.dim
     nearest = not any(k for k, p in zip(wanted, box.periodic, strict=True) if p)
     reach = tuple(max(k, 1) if p else 0 for k, p in zip(wanted, box.periodic, strict=True))
     kind = Images(box.periodic, box.orthogonal, reach, nearest, None, box.per_system, box.numbers is not None)
     return check_images(kind, sources)
 
 
-def _vectors_of(box: Box, dtype: np.dtype) -> np.ndarray:
-    """Return the vectors of a box as rounded to a dtype or, with a basis of each system, the short ones, in float64."""
-    vectors = np.asarray(box.vectors, dtype).astype(np.float64)
-    return vectors if box.numbers is None else np.asarray(box.numbers, np.float64) @ vectors
+def refuse_status(status: Status, box: Box | None, images: Images | None, radius: float | None, more: str = "") -> None:
+    """Raise what bits report, and `more`, if any is set; of a box with too few images, say how many its cutoff needs.
+
+    Raises:
+        ValueError: a bit is set.
+    """
+    if not status:
+        return
+    text = status.message + more
+    known = box is not None and not isinstance(box.vectors, Tracer) and not isinstance(box.flags, Tracer)
+    if Status.BOX_TOO_SMALL in status and known and box is not None and images is not None and radius is not None:
+        had = "" if images.counts_short else f", and here images={(0,) * box.dim if images.nearest else images.reach}"
+        with contextlib.suppress(ValueError):  # a degenerate box has no number of images
+            text += f" A radius of {radius:.6g} needs images={box.images_for(radius)} in this box as it is now{had}."
+    raise ValueError(text)
+
+
+def box_of_list(box: Box, kind: Images, radius: float | None) -> Box:
+    """Return the box that a list keeps: with as many images as the list has, so that searches and sums in it have no fewer.
+
+    A list may count short vectors; the box then has the images that the given ones need, if that is known.
+    """
+    if not kind.counts_short:
+        return box.of_list((0,) * box.dim if kind.nearest else kind.reach)
+    known = radius is not None and not isinstance(box.vectors, Tracer) and not isinstance(box.flags, Tracer)
+    return box.of_list(box.images_for(radius) if known and radius is not None else box.images or box.images_of_list)
 
 
 def _needed_images(vectors: np.ndarray, box: Box, radius: float, dtype: np.dtype, basis: Basis | None) -> Images:
-    """Return the images that a cutoff needs in a lattice of these vectors.
-
-    `_ROUNDING` is far more than the rounding of coordinates, unless vectors are long beside the distances between their faces: then
-    the residual of the transform, times the cells that an image lies away, is more (`jfrnn._geometry.wrapping.wrap`).
-    """
+    """Return the images that a cutoff needs in a lattice of these vectors."""
     flags = np.array(box.periodic) if box.flags is None else np.asarray(box.flags)
-    rows = vectors[..., None] * np.eye(box.dim) if box.orthogonal else vectors
-    rows = np.where(flags[..., None], rows, 0)
-    regular = flags.all() and bool((np.linalg.det(rows) != 0).all())
-    inverse = np.linalg.inv(rows) if regular else np.linalg.pinv(rows)  # which takes ten times as long
-    share = np.where(flags, radius * np.linalg.norm(inverse, axis=-2), 0)  # of the distances between opposite faces
-    residual = np.where(flags, (np.abs(rows) @ np.abs(inverse)).sum(axis=-2), 0)
-    margin = 48 * float(np.finfo(dtype).eps) * (share.max(axis=-1, keepdims=True) + 3) * residual
-    needed = (share + np.where(flags, np.maximum(_ROUNDING, margin), 0)).reshape(-1, box.dim).max(axis=0)  # of any system
-    reach = tuple(math.ceil(x) for x in needed.tolist())
-    nearest, short = bool((needed <= _NEAREST).all()), box.numbers is not None
-    return Images(box.periodic, box.orthogonal, reach, nearest, basis, box.per_system, short)
+    reach, nearest = count_cells(vectors, flags, box.orthogonal, radius, dtype)
+    return Images(box.periodic, box.orthogonal, reach, nearest, basis, box.per_system, box.numbers is not None)
 
 
 def _too_many(images: Images, sources: int, most: int) -> bool:

@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jfrnn._geometry.batch import Batch
 from jfrnn._geometry.box import Box
 from jfrnn._geometry.cutoffs import RULES, SUM, TABLE, Cutoff, Radii, is_radius, largest_cutoff, make_cutoff, smallest_cutoff
-from jfrnn._tracing import Given, gather, make_on_host, on_device
+from jfrnn._tracing import Given, gather, make_on_host, on_device, refuse_forks
 
 _MOST_POINTS = 2**31 - 32
 _MOST_KINDS = 2**12  # places in a table of their cutoffs are whole floats, too
@@ -21,6 +21,12 @@ _MOST_KINDS = 2**12  # places in a table of their cutoffs are whole floats, too
 
 def check_positions(name: str, positions: Given, like: Array | None = None) -> Array:
     """Return positions as a float32 or float64 array [n, 2] or [n, 3]; with `like`, of the same dtype and dimension."""
+    refuse_forks()
+    if hasattr(positions, "positions"):
+        raise TypeError(
+            f"{name} must be a JAX or NumPy array of shape [n, 2] or [n, 3], got {type(positions).__name__}, which has one: pass "
+            f"atoms.positions, with a cell box=jfrnn.Box(atoms.cell[:], periodic=atoms.pbc), or call jfrnn.ase.neighbor_list."
+        )
     if not hasattr(positions, "dtype") or not hasattr(positions, "shape"):
         raise TypeError(
             f"{name} must be a JAX or NumPy array of shape [n, 2] or [n, 3], got {type(positions).__name__}: "
@@ -158,10 +164,10 @@ def check_species(cutoff: Given, species: Given, rule: object, sources: Array, q
         raise ValueError(f"radius_rule is about cutoffs per particle, not of pairs of species: leave it out, got {rule!r}.")
     n, m = sources.shape[0], None if queries is None else queries.shape[0]
     if m is None:
-        of_sources = of_queries = _check_numbers("species", "species", species, n, "particle")
+        of_sources = of_queries = _check_numbers("species", "species", species, n, "particle")[0]
     elif isinstance(species, tuple) and len(species) == 2:
-        of_sources = _check_numbers("species[0]", "species", species[0], n, "position")
-        of_queries = _check_numbers("species[1]", "species", species[1], m, "query")
+        of_sources = _check_numbers("species[0]", "species", species[0], n, "position")[0]
+        of_queries = _check_numbers("species[1]", "species", species[1], m, "query")[0]
     else:
         raise ValueError(
             f"species must be a pair of arrays, of the positions [{n}] and of the queries [{m}], got {_describe_array(species)}."
@@ -259,30 +265,42 @@ def check_active(active: Given, positions: Array) -> Array:
 def check_batch(batch: Given, sources: Array, queries: Array | None) -> Batch:
     """Return the system numbers of the particles, and of separate queries, as int32."""
     if queries is None:
-        return Batch(_check_numbers("batch", "system", batch, sources.shape[0], "particle"), None)
+        of_sources, fit = _check_numbers("batch", "system", batch, sources.shape[0], "particle")
+        return Batch(of_sources, None, None if fit is None else (fit, None))
     if not isinstance(batch, tuple) or len(batch) != 2:
         raise ValueError(
             f"batch must be a pair of arrays, of the positions [{sources.shape[0]}] and of the queries [{queries.shape[0]}], got "
             f"{_describe_array(batch)}."
         )
-    of_sources = _check_numbers("batch[0]", "system", batch[0], sources.shape[0], "position")
-    return Batch(of_sources, _check_numbers("batch[1]", "system", batch[1], queries.shape[0], "query"))
+    of_sources, fit = _check_numbers("batch[0]", "system", batch[0], sources.shape[0], "position")
+    of_queries, also = _check_numbers("batch[1]", "system", batch[1], queries.shape[0], "query")
+    if fit is None and also is None:
+        return Batch(of_sources, of_queries)
+    known = (jnp.ones(x.shape, bool) if each is None else each for x, each in ((of_sources, fit), (of_queries, also)))
+    return Batch(of_sources, of_queries, (next(known), next(known)))
 
 
-def _check_numbers(name: str, of: str, systems: Given, size: int, what: str) -> Array:
-    """Return the number of the system, or of the species, of each particle as int32."""
+def _check_numbers(name: str, of: str, systems: Given, size: int, what: str) -> tuple[Array, Array | None]:
+    """Return the number of the system, or of the species, of each particle as int32, and which of them fit; None: all do.
+
+    Traced integers that are wider are taken; the largest int32 stands for those that do not fit.
+    """
     if not hasattr(systems, "dtype") or not np.issubdtype(systems.dtype, np.integer):
         raise TypeError(f"{name} must be an array of integers, the {of} of each {what}, got {_describe_array(systems)}.")
     if tuple(systems.shape) != (size,):
         raise ValueError(f"{name} must have shape [{size}], the {of} of each {what}, got shape {list(systems.shape)}.")
     if np.can_cast(systems.dtype, np.int32):
-        return _as_dtype(systems, jnp.int32)
+        return _as_dtype(systems, jnp.int32), None
+    most = np.iinfo(np.int32).max
     if isinstance(systems, Tracer):
-        raise TypeError(f"{name} is {systems.dtype}, of which not all numbers fit into int32: convert it with .astype(jnp.int32).")
+        systems = gather(systems)
+        fit = systems <= most
+        fit = fit if np.issubdtype(systems.dtype, np.unsignedinteger) else fit & (systems >= -most - 1)
+        return jnp.where(fit, systems, most).astype(np.int32), fit
     values: Any = np.asarray(jax.device_get(systems))
     if values.size and not -(2**31) <= int(values.min()) <= int(values.max()) < 2**31:
         raise ValueError(f"{name} holds numbers from {values.min()} to {values.max()}, but they are numbered in int32.")
-    return make_on_host(systems, lambda known: known.astype(np.int32))
+    return make_on_host(systems, lambda known: known.astype(np.int32)), None
 
 
 def check_box(box: object, positions: Array, like: Box | None = None) -> Box | None:

@@ -7,6 +7,7 @@ lattice; `given_shifts` converts such shifts to the given vectors.
 import dataclasses
 import functools
 import itertools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from jax import Array, lax
 
 from jfrnn._geometry.box import Box
 from jfrnn._geometry.exact import Shifted
+from jfrnn._geometry.far import subtract_turns, whole_steps
 from jfrnn._geometry.floats import WHOLE_BITS, distill, half_mantissa
 from jfrnn._geometry.images import Images
 
@@ -32,7 +34,7 @@ class Lattice:
         given: [d, d] lattice vectors that the user gave; exact decisions use these. If `images.short`, [2 d, d]: behind them stands
             how many of each make up a vector of `matrix`, whole floats.
         transform: [d, d]; (x - origin) @ transform are fractional coordinates along periodic axes, lengths along open ones.
-        origin: [d] a corner of the cell.
+        origin: [d] a corner of the cell; one that is far away is moved as particles there are (`bring_near`).
         flags: [d] which axes are periodic, if that differs among many boxes; else None, and `images` tells.
         images: The images that the search considers. Static.
     """
@@ -75,14 +77,16 @@ def make_lattice(box: Box, images: Images, dtype: np.dtype) -> Lattice:
     vectors, origin = jnp.asarray(box.vectors).astype(dtype), jnp.asarray(box.origin).astype(dtype)
     if not box.per_system:
         matrix, given, transform = _make(vectors, None, None, box, images)
-        return Lattice(matrix, given, transform, origin, None, images)
+        made = Lattice(matrix, given, transform, origin, None, images)
+        return dataclasses.replace(made, origin=bring_near(origin[None], made).points[0])
     numbers = None if box.numbers is None or not images.short else lax.stop_gradient(jnp.asarray(box.numbers).astype(dtype))
 
     def of_system(vectors: Array, flags: Array | None, numbers: Array | None) -> tuple[Array, Array, Array]:
         return _make(vectors, flags, numbers, box, images)
 
     matrix, given, transform = jax.vmap(of_system)(vectors, box.flags, numbers)
-    return Lattice(matrix, given, transform, origin, None if box.flags is None else jnp.asarray(box.flags), images)
+    made = Lattice(matrix, given, transform, origin, None if box.flags is None else jnp.asarray(box.flags), images)
+    return dataclasses.replace(made, origin=bring_near(origin, made).points)
 
 
 def _make(vectors: Array, flags: Array | None, numbers: Array | None, box: Box, images: Images) -> tuple[Array, Array, Array]:
@@ -242,6 +246,30 @@ def nearest_shifts(difference: Array, lattice: Lattice) -> Array:
     """Return the lattice shifts [..., d], whole floats, of the minimum images of differences x_j - x_i [..., d]."""
     units = units_of(lax.stop_gradient(difference), lattice)
     return lax.stop_gradient(jnp.where(lattice.spread(lattice.periodic, units.ndim), -jnp.round(units), 0))
+
+
+class Near(NamedTuple):
+    """Points near the box.
+
+    Attributes:
+        points: [n, d] points - turns @ (given vectors), exactly; those that are too far away for that are unchanged.
+        turns: [n, d] whole floats.
+    """
+
+    points: Array
+    turns: Array
+
+
+def bring_near(points: Array, lattice: Lattice) -> Near:
+    """Move far points [n, d] near the box of a lattice, or each near that of its row (`jfrnn._geometry.far`).
+
+    Differentiable in points and vectors. In lattices that are searched in short vectors, no points are moved.
+    """
+    if lattice.images.counts_short:
+        return Near(points, jnp.zeros_like(points))
+    (fixed, vectors), orthogonal = lax.stop_gradient((points, lattice)), lattice.images.orthogonal
+    turns = whole_steps(fixed, units_of(fixed, vectors), vectors.matrix, vectors.spread(vectors.periodic, 2), orthogonal)
+    return Near(subtract_turns(points, turns, lattice.matrix, orthogonal), turns)
 
 
 def units_of(difference: Array, lattice: Lattice) -> Array:

@@ -39,21 +39,24 @@ class Status(enum.IntFlag):
 _MESSAGES = {
     Status.ROW_OVERFLOW: "At least one row of the neighbor list holds more neighbors than `capacity`.",
     Status.NONFINITE: (
-        "`positions` (or `queries`) hold non-finite coordinates (NaN or infinite): those particles have no neighbors "
-        "in this list. Find them with jnp.isfinite(positions).all(axis=1)."
+        "`positions` (or `queries`) hold non-finite coordinates (NaN or infinite): those particles have no neighbors. "
+        "Find them with jnp.isfinite(positions).all(axis=1)."
     ),
     Status.BOX_TOO_SMALL: (
         "`box` is degenerate, or too small for the images that were looked at, so that pairs may be missing: a traced box must be "
         "at least 2.05 (cutoff + skin) wide along every periodic axis, unless jfrnn.Box(..., images=k) says over how many cells "
-        "to either side a pair may reach. Outside jit, search() and NeighborList.grow() see how many images a box needs."
+        "to either side a pair may reach, as box.images_for(cutoff + skin) tells. Outside jit, search() and grow() of a list see "
+        "how many images a box needs."
     ),
     Status.OUT_OF_RANGE: (
-        "`positions` (or `queries`) lie more than 511 lattice vectors away from a periodic box: those particles have no "
-        "neighbors in this list. Wrap them into the box (one whose vectors are far longer than need be into that of short ones)."
+        "`positions` (or `queries`) lie too far away from a periodic box: those particles have no neighbors. Up to 2^19 lengths of "
+        "a box (float64: 2^30), and at least 511 vectors of a skewed one, are no trouble; farther away, a run has exploded, or "
+        "positions have another unit than the box. Find them with jnp.abs(positions / lengths).max(axis=1) > 511, or with "
+        "positions @ jnp.linalg.inv(vectors) in place of the quotient."
     ),
     Status.INVALID_CUTOFF: (
         "`cutoff` holds values that are negative or not finite, or, where not 0, too small or large for their dtype: those "
-        "particles have no neighbors in this list. Find them with ~(jnp.isfinite(cutoff) & (cutoff >= 0)). A table must be "
+        "particles have no neighbors. Find them with ~(jnp.isfinite(cutoff) & (cutoff >= 0)). A table must be "
         "symmetric as well, and hold all `species`."
     ),
     Status.NONFINITE_VERTEX: (
@@ -61,18 +64,18 @@ _MESSAGES = {
         "Find them with ~jnp.isfinite(vertices[faces]).all(axis=(1, 2))."
     ),
     Status.FACE_OUT_OF_RANGE: (
-        "`faces` name vertices that do not exist: those faces are nobody's neighbors in this list. Find them with "
+        "`faces` name vertices that do not exist: those faces are nobody's neighbors. Find them with "
         "((faces < 0) | (faces >= len(vertices))).any(axis=1)."
     ),
     Status.SHARD_OVERFLOW: "A shard would have got more particles than it has room for: none of them changed their shard.",
     Status.HALO_OVERFLOW: "A message to a neighboring shard holds fewer particles than it should: pairs may be missing.",
     Status.HALO_TOO_FAR: "Pairs reach to shards farther away than messages go: pairs may be missing.",
     Status.SYSTEM_WITHOUT_BOX: (
-        "`batch` names systems for which `box` holds no box: those particles have no neighbors in this list. Number systems from 0 "
-        "to the length of `box.vectors` - 1, and particles that are not there -1."
+        "`batch` names systems for which `box` holds no box, or that int32 cannot number: those particles have no neighbors. "
+        "Number systems from 0 to the length of `box.vectors` - 1, and particles that are not there -1."
     ),
     Status.EXCLUDED_OUT_OF_RANGE: (
-        "`exclude` names particles that do not exist: those pairs exclude nothing in this list. Number particles from 0 on, and "
+        "`exclude` names particles that do not exist: those pairs exclude nothing. Number particles from 0 on, and "
         "write -1 in rows that are padding."
     ),
     Status.TOTAL_OVERFLOW: "The list held more pairs than the `total` that `require` was told: exports of that length lack pairs.",

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jfrnn._engine import Inputs, Options, count_rows
+from jfrnn._engine import Inputs, Options, count_few, count_rows
 from jfrnn._geometry import Box, NeighborOverflowError, Status, names_of_bits, shape_of, tell
 from jfrnn._search.edges import Edges, Graph, edges_of, edges_of_rows, make_graph, no_edges
 from jfrnn._search.exports import MOST_PAIRS
@@ -50,6 +50,7 @@ class EdgeList(KeptSearch):
     receivers: Array
     offsets: Array
     _full = Status.TOTAL_OVERFLOW
+    _harmless = Status.NONFINITE
 
     def __repr__(self) -> str:
         """Summarize the list in a line; waits for the device."""
@@ -81,7 +82,7 @@ class EdgeList(KeptSearch):
             held = int(self.offsets[-1])
             return np.asarray(self.receivers)[:held], np.asarray(self.senders)[:held]
 
-    def edges(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> Edges:
+    def edges(self, positions: Array, box: Box | None = None, *, queries: Array | None = None) -> Edges:
         """Return the edges with their geometry at these positions.
 
         `jax.ops.segment_sum(messages, edges.receivers, m, indices_are_sorted=True)` sums messages for the receivers; `messages` of
@@ -90,8 +91,8 @@ class EdgeList(KeptSearch):
 
         Args:
             positions: Sources [length], shape [n, d], where they are now.
-            queries: Queries [length], shape [m, d], exactly if the list was made with queries.
             box: The present box; default: that of the list, as a constant in derivatives.
+            queries: Queries [length], shape [m, d], exactly if the list was made with queries.
 
         Returns:
             An `Edges`. Inside jit, all displacements are NaN if pairs are missing, and `status` and `pair_count` say so.
@@ -107,7 +108,7 @@ class EdgeList(KeptSearch):
         """
         self._check_single()
         sources, rows, box = self._geometry_inputs(positions, queries, box)
-        self._check_known(spared=Status.NONFINITE)
+        self._check_known(spared=self._harmless)
         with own_transfers():
             if 0 in (sources.shape[0], len(rows), self.total):
                 return no_edges(jnp.zeros((len(rows), 1), bool), self.source_count, sources, self.status, self.total)
@@ -120,7 +121,7 @@ class EdgeList(KeptSearch):
             ends = by_sender, by_receiver, self.offsets[-1]
             return edges_of(ends, self.status, self._images_made(), *where, cutoff, kind, self.closed, self.half)
 
-    def to_jraph(self, positions: Array, *, box: Box | None = None) -> Graph:
+    def to_jraph(self, positions: Array, box: Box | None = None) -> Graph:
         """Return the edges as a graph of jraph, as `NeighborList.to_jraph` does; jraph need not be installed.
 
         Raises:
@@ -167,8 +168,7 @@ class EdgeList(KeptSearch):
         status = self._bits(spared)
         if Status.TOTAL_OVERFLOW in status:
             raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self.total, "total")
-        if status:
-            raise ValueError(status.message)
+        self._refuse(status)
 
 
 def round_total(pairs: int) -> int:
@@ -184,7 +184,8 @@ def count_total(inputs: Inputs, options: Options, slack: float) -> int:
         ValueError: they are more than int32 can number.
     """
     with at_once(), own_transfers():
-        pairs = int(np.sum(np.asarray(count_rows(inputs, options)[0]), dtype=np.int64))
+        known = count_few(inputs, options)
+        pairs = int(np.sum(np.asarray(count_rows(inputs, options)[0]) if known is None else known, dtype=np.int64))
     if pairs > MOST_PAIRS:
         raise ValueError(
             f"total must be at most {MOST_PAIRS}, as many pairs as int32 can number, and there are {pairs}: search in parts, with "

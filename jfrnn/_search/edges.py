@@ -17,14 +17,16 @@ from jfrnn._geometry import (
     Radii,
     Shifted,
     Status,
+    are_finite,
+    are_whole,
     forward_shifts,
-    given_shifts,
     is_pair_of,
+    mark_rows,
     shift_pairs,
     translation,
 )
 from jfrnn._search.exports import flat_pairs, row_offsets
-from jfrnn._search.geometry import ImagesMade, edge_shifts, lattice_of_rows, norms, pair_cutoff
+from jfrnn._search.geometry import ImagesMade, edge_shifts, find_ends, lattice_of_rows, norms, pair_cutoff
 from jfrnn._search.reverse import Reverse
 from jfrnn._search.topology import Topology
 from jfrnn._tracing import call_apart, compile_program
@@ -37,8 +39,8 @@ class Edges(NamedTuple):
         senders: Neighbors j, shape [total], int32.
         receivers: Particles (or queries) i in ascending order, shape [total], int32.
         displacement: x_j - x_i [length], in a box plus the lattice translation of the image, shape [total, d]; 0 where `mask` is
-            not set, and NaN everywhere if pairs are missing because there are more of them than `total`.
-        shift: Lattice shifts S, shape [total, d], int32; 0 where `mask` is not set.
+            not set, and NaN everywhere if pairs may be missing: there are more of them than `total`, or the list lacks some.
+        shift: Lattice shifts S, shape [total, d], int32; 0 where `mask` is not set, the smallest int32 where pairs may be missing.
         mask: Whether an edge is a pair, shape [total], bool: the first `pair_count` edges are, all others are padding.
         status: Bits of `Status` of the list, with `Status.TOTAL_OVERFLOW` if pairs are missing, shape [], int32.
         distance: Length of the displacement, shape [total]; 0 where `mask` is not set, and NaN where the displacement is.
@@ -152,7 +154,10 @@ def flat_edges(
 
     (m, capacity), dim = topology.idx.shape, sources.shape[1]
     flat = flatten(mask, total, topology.native)
-    real = flat.rows < m
+    real, near = flat.rows < m, None
+    if shifts is not None and box is not None and kind is not None:
+        near = find_ends(sources, rows, box, kind, batch, topology.native)
+        sources, rows = near.sources.points, near.rows.points
     senders = jnp.where(real, topology.idx.reshape(-1)[flat.slots], topology.sources)
     ends = _by_sender(topology, flat.edges, total), _by_row(flat.offsets, capacity, total, topology.native)
     sides = [
@@ -160,15 +165,16 @@ def flat_edges(
         for points, named, end in zip((sources, rows), (senders, flat.rows), ends, strict=True)
     ]
     displacement, shift = sides[0] - sides[1], jnp.zeros((total, dim), jnp.int32)
-    if shifts is not None and box is not None and kind is not None:
+    if near is not None and shifts is not None and box is not None and kind is not None:
         whole = jnp.where(real[:, None], shifts.reshape(-1, dim)[flat.slots], 0)
         systems = None if batch is None else batch.of_queries.at[flat.rows].get(mode="clip")
         lattice = lattice_of_rows(box, kind, np.dtype(sources.dtype), systems, topology.native)
         displacement = displacement + translation(whole, lattice)
-        shift = given_shifts(whole, lattice)
-    missing = flat.offsets[-1] > total
+        shift = near._replace(of_rows=lattice).shifts_of_given(whole, senders, flat.rows)
+        shift = jnp.where(real[:, None], shift, 0)
     displacement = jnp.where(real[:, None], displacement, 0).astype(sources.dtype)
-    distance, displacement = (jnp.where(missing, jnp.nan, x) for x in (norms(displacement), displacement))
+    missing, known = flat.offsets[-1] > total, are_whole(status)
+    displacement, shift, distance = (mark_rows(x, known & ~missing) for x in (displacement, shift, norms(displacement)))
     status = status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
     return Edges(senders, flat.rows, displacement, shift, real, status, distance, flat.offsets[-1])
 
@@ -195,23 +201,28 @@ def edges_of(
 
     by_sender, by_receiver, pair_count = ends
     total, senders, receivers = len(by_sender.idx), by_sender.idx[:, 0], by_receiver.idx[:, 0]
-    missing, mask = pair_count > total, lax.iota(jnp.int32, total) < pair_count
+    missing, mask, near = pair_count > total, lax.iota(jnp.int32, total) < pair_count, None
+    if box is not None and kind is not None:
+        near = find_ends(sources, rows, box, kind, batch, by_sender.native)
+        sources, rows = near.sources.points, near.rows.points
     at_senders, at_receivers = gather(sources, by_sender), gather(rows, by_receiver)
     vectors, pairs, shift = at_senders - at_receivers, None, jnp.zeros((total, sources.shape[1]), jnp.int32)
-    if box is not None and kind is not None:
+    if near is not None and box is not None and kind is not None:
         systems = None if batch is None else batch.of_queries.at[receivers].get(mode="clip")
         lattice = lattice_of_rows(box, kind, np.dtype(sources.dtype), systems, by_sender.native)
-        shifts = edge_shifts(vectors, mask, (by_sender, by_receiver), images, (sources, rows), (box, batch), lattice)
+        shifts = edge_shifts(vectors, mask, (by_sender, by_receiver), images, near, lattice)
         if half and kind.counts_short:  # as in padded lists
             shifts = jnp.where((senders == receivers)[:, None, None], forward_shifts(shifts, lattice), shifts)
         shifts = jnp.where(mask[:, None, None], shifts, 0)
         pairs = shift_pairs(vectors, shifts, lattice)
-        vectors, shift = pairs.vectors, given_shifts(shifts[:, 0], lattice)
+        vectors, shift = pairs.vectors, near._replace(of_rows=lattice).shifts_of_given(shifts[:, 0], senders, receivers)
+        shift = jnp.where(mask[:, None], shift, 0)
     if cutoff is not None:
         mask = mask & _are_close(by_sender, by_receiver, mask, sources, at_receivers, cutoff, closed, pairs)
         shift = jnp.where(mask[:, None], shift, 0)
     displacement = jnp.where(mask[:, None], vectors[:, 0], 0).astype(sources.dtype)
-    distance, displacement = (jnp.where(missing, jnp.nan, x) for x in (norms(displacement), displacement))
+    known = are_whole(status, Status.NONFINITE) & ~missing
+    displacement, shift, distance = (mark_rows(x, known) for x in (displacement, shift, norms(displacement)))
     status = status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
     held = pair_count if cutoff is None else jnp.where(missing, pair_count, jnp.sum(mask, dtype=jnp.int32))
     return Edges(senders, receivers, displacement, shift, mask, status, distance, held)
@@ -230,10 +241,15 @@ def _are_close(
     """Say which edges are those of pairs that are closer than the cutoff, exactly, [total] bool."""
     if isinstance(given, Radii) and given.queries is not None:
         given = dataclasses.replace(given, queries=given.queries.at[by_receiver.idx[:, 0]].get(mode="clip"))
-    senders = jnp.where(real[:, None], by_sender.idx, 0)
+    senders, itself = jnp.where(real[:, None], by_sender.idx, 0), None
     fixed = lax.stop_gradient((at_receivers[:, 0], sources))
     pairs = None if pairs is None else pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
-    return call_apart(is_pair_of, *fixed, senders, real[:, None], pair_cutoff(given, closed), pairs)[:, 0]
+    if isinstance(given, Radii) and given.itself:  # rows are edges here
+        there = real & (by_sender.idx == by_receiver.idx)[:, 0] & are_finite(fixed[0])
+        itself = there if pairs is None else there & (pairs.shifts == 0).all(axis=(1, 2))
+        given = dataclasses.replace(given, itself=False)
+    close = call_apart(is_pair_of, *fixed, senders, real[:, None], pair_cutoff(given, closed), pairs)[:, 0]
+    return close if itself is None else close | itself
 
 
 def no_edges(mask: Array, sources: int, points: Array, status: Array, total: int) -> Edges:

@@ -18,7 +18,9 @@ from jfrnn._geometry import (
     Cutoffs,
     Images,
     Lattice,
+    Near,
     Radii,
+    bring_near,
     forward_shifts,
     given_shifts,
     is_pair_of,
@@ -67,6 +69,33 @@ def lattice_of_rows(box: Box, kind: Images, dtype: np.dtype, systems: Array | No
 ImagesMade = tuple[ImageCodes | None, tuple[Array, Array | None] | None]  # and the positions at which a list with a skin was made
 
 
+class Ends(NamedTuple):
+    """Sources and rows near the box, and the lattice of each; or of all of them."""
+
+    sources: Near
+    rows: Near
+    of_sources: Lattice
+    of_rows: Lattice
+
+    def shifts_of_given(self, whole: Array, senders: Array, receivers: Array) -> Array:
+        """Return shifts [..., d], whole floats between near points, as whole numbers between points as they are given, int32.
+
+        `senders` and `receivers` [...] say whose they are; the lattice of a receiver has an axis more where each has one.
+        """
+        turns = (x.turns.astype(jnp.int32) for x in (self.rows, self.sources))
+        of_rows, of_sources = (x.at[named].get(mode="clip") for x, named in zip(turns, (receivers, senders), strict=True))
+        return given_shifts(whole, self.of_rows) + of_rows - of_sources
+
+
+def find_ends(sources: Array, rows: Array, box: Box, kind: Images, batch: Batch | None, native: bool) -> Ends:
+    """Return sources and rows near the box, or each near the box of its system; differentiable in points and box."""
+    of_rows, of_sources = (None, None) if batch is None else (batch.of_queries, batch.sources)
+    lattice = lattice_of_rows(box, kind, np.dtype(sources.dtype), of_rows, native)
+    also = lattice if of_rows is of_sources else lattice_of_rows(box, kind, np.dtype(sources.dtype), of_sources, native)
+    near = bring_near(sources, also)
+    return Ends(near, near if rows is sources else bring_near(rows, lattice), also, lattice)
+
+
 def pair_cutoff(cutoff: Cutoff | Radii | None, closed: bool) -> Cutoff | Cutoffs:
     """Return the cutoff of pairs, with the constants of its test."""
     if isinstance(cutoff, Cutoff):
@@ -87,7 +116,7 @@ def open_vectors(
     neighbor = jnp.where(used, idx, 0)
     fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
     if topology.native:
-        given_list = kept_list(topology, count, (None, None), fixed_sources, fixed_rows, given, closed, None)
+        given_list = kept_list(topology, count, (None, None), fixed_sources, fixed_rows, given, closed, None, None)
         mask = call_apart(kept_mask, given_list)
     else:
         mask = call_apart(is_pair_of, fixed_rows, fixed_sources, neighbor, used, cutoff)
@@ -103,19 +132,10 @@ class _Slots(NamedTuple):
     shifts: Array
 
 
-def _find_slots(
-    topology: Topology,
-    count: Array,
-    images: ImagesMade,
-    sources: Array,
-    rows: Array,
-    lattice: Lattice,
-    half: bool,
-    of_sources: Lattice | None = None,
-) -> _Slots:
+def _find_slots(topology: Topology, count: Array, images: ImagesMade, ends: Ends, half: bool) -> _Slots:
     from jfrnn._search.gathers import gather
 
-    idx = topology.idx
+    idx, sources, rows, lattice = topology.idx, ends.sources.points, ends.rows.points, ends.of_rows
     used = lax.broadcasted_iota(jnp.int32, idx.shape, 1) < count[:, None]
     neighbor = jnp.where(used, idx, 0)
     difference = gather(sources, topology) - rows[:, None, :]
@@ -123,7 +143,7 @@ def _find_slots(
     if codes is None:
         shifts = nearest_shifts(difference, lattice)
     else:
-        turns, query_turns = _turns_now(codes, made, sources, rows, lattice, of_sources)
+        turns, query_turns = _turns_now(codes, made, ends)
         image = jnp.where(used, codes.codes.astype(jnp.int32), lattice.images.home)
         shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)[image] + query_turns[:, None] - turns[neighbor]
     kind = lattice.images
@@ -136,23 +156,17 @@ def _find_slots(
 
 
 def edge_shifts(
-    difference: Array,
-    real: Array,
-    ends: tuple[Topology, Topology],
-    images: ImagesMade,
-    points: tuple[Array, Array],
-    where: tuple[Box, Batch | None],
-    lattice: Lattice,
+    difference: Array, real: Array, sides: tuple[Topology, Topology], images: ImagesMade, ends: Ends, lattice: Lattice
 ) -> Array:
-    """Return the lattice shifts [total, 1, d], whole floats, of edges between sources and rows, whose `lattice` is that of each."""
-    (codes, made), (sources, rows), (box, batch), kind = images, points, where, lattice.images
+    """Return the lattice shifts [total, 1, d], whole floats, of edges between near points; `lattice` is that of all, or of each."""
+    codes, made = images
+    senders, receivers = (jnp.where(real, side.idx[:, 0], 0) for side in sides)
     if codes is None:
         return nearest_shifts(difference, lattice)
-    of_rows, of_sources = _lattices(box, kind, np.dtype(sources.dtype), batch, ends[0].native)
-    turns, query_turns = _turns_now(codes, made, sources, rows, of_rows, of_sources)
+    turns, query_turns = _turns_now(codes, made, ends)
+    kind = ends.of_rows.images
     image = jnp.where(real, codes.codes.astype(jnp.int32), kind.home)
-    senders, receivers = (jnp.where(real, end.idx[:, 0], 0) for end in ends)
-    table = jnp.asarray(kind.shifts).astype(sources.dtype)
+    table = jnp.asarray(kind.shifts).astype(difference.dtype)
     return (table[image] + query_turns[receivers] - turns[senders])[:, None]
 
 
@@ -168,19 +182,18 @@ def lattice_shifts(
     kind: Images,
     half: bool,
 ) -> Array:
-    lattice, of_sources = _lattices(box, kind, np.dtype(sources.dtype), batch, topology.native)
-    slots = _find_slots(topology, count, images, sources, rows, lattice, half, of_sources)
-    return given_shifts(lax.stop_gradient(slots.shifts), lattice)
+    """Return the lattice shift of each slot between points as they are given, [m, capacity, d] int32; 0 in unused slots."""
+    ends = find_ends(sources, rows, box, kind, batch, topology.native)
+    return _given_shifts(_find_slots(topology, count, images, ends, half), ends)
 
 
-def _lattices(box: Box, kind: Images, dtype: np.dtype, batch: Batch | None, native: bool) -> tuple[Lattice, Lattice]:
-    """Return the lattices of rows and of sources."""
-    of_rows, of_sources = (None, None) if batch is None else (batch.of_queries, batch.sources)
-    lattice = lattice_of_rows(box, kind, dtype, of_rows, native)
-    return lattice, lattice if of_rows is of_sources else lattice_of_rows(box, kind, dtype, of_sources, native)
+def _given_shifts(slots: _Slots, ends: Ends) -> Array:
+    row = lax.broadcasted_iota(jnp.int32, slots.neighbor.shape, 0)
+    shifts = ends.shifts_of_given(lax.stop_gradient(slots.shifts), slots.neighbor, row)
+    return jnp.where(slots.used[..., None], shifts, 0)
 
 
-@functools.partial(compile_program, static_argnames=("kind", "closed", "half"))
+@functools.partial(compile_program, static_argnames=("kind", "closed", "half", "as_given"))
 def periodic_vectors(
     topology: Topology,
     count: Array,
@@ -193,19 +206,21 @@ def periodic_vectors(
     given: Cutoff | Radii | None,
     closed: bool,
     half: bool,
+    as_given: bool = False,
 ) -> tuple[Array, Array, Array]:
+    """Return displacements, the mask, and the shifts of slots: whole floats between near points, or as `lattice_shifts` does."""
     cutoff = pair_cutoff(given, closed)
-    lattice, of_sources = _lattices(box, kind, np.dtype(sources.dtype), batch, topology.native)
-    used, neighbor, difference, shifts = _find_slots(topology, count, images, sources, rows, lattice, half, of_sources)
-    fixed_rows, fixed_sources = lax.stop_gradient((rows, sources))
-    pairs = shift_pairs(difference, shifts, lattice)
+    ends = find_ends(sources, rows, box, kind, batch, topology.native)
+    slots = _find_slots(topology, count, images, ends, half)
+    fixed_rows, fixed_sources = lax.stop_gradient((ends.rows.points, ends.sources.points))
+    pairs = shift_pairs(slots.difference, slots.shifts, ends.of_rows)
     if is_native(topology, kind, half):
-        one_each = lax.stop_gradient(make_lattice(box, kind, np.dtype(sources.dtype)))
-        given_list = kept_list(topology, count, images, fixed_sources, fixed_rows, given, closed, one_each, batch)
+        given_list = kept_list(topology, count, images, *lax.stop_gradient((sources, rows)), given, closed, box, kind, batch)
         mask = call_apart(kept_mask, given_list)
     else:
         fixed_pairs = pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
-        mask = call_apart(is_pair_of, fixed_rows, fixed_sources, neighbor, used, cutoff, fixed_pairs)
+        mask = call_apart(is_pair_of, fixed_rows, fixed_sources, slots.neighbor, slots.used, cutoff, fixed_pairs)
+    shifts = _given_shifts(slots, ends) if as_given else slots.shifts
     return jnp.where(mask[..., None], pairs.vectors, 0), mask, shifts
 
 
@@ -225,18 +240,21 @@ def kept_list(
     rows: Array,
     cutoff: Cutoff | Radii | None,
     closed: bool,
-    lattice: Lattice | None,
+    box: Box | None,
+    kind: Images | None,
     batch: Batch | None = None,
 ) -> KeptList:
-    """Return a list at these positions as Warp's kernels take it; `lattice` is that of all systems or, of a batch, one of each."""
-    codes, made = images
-    of_pairs, systems, turns = pair_cutoff(cutoff, closed), None, None
-    if lattice is not None and batch is not None and lattice.images.per_system:
-        most = len(lattice.origin) - 1  # rows without a box get any
-        systems = jnp.clip(batch.sources, 0, most), jnp.clip(batch.of_queries, 0, most)
-    if codes is not None and lattice is not None:
-        of_sources, of_rows = (lattice, lattice) if systems is None else map(lattice.of_rows, systems)
-        turns = _turns_now(codes, made, sources, rows, of_rows, of_sources)
+    """Return a list at these positions as Warp's kernels take it: points near the box, and one lattice, or one per system."""
+    (codes, made), of_pairs, systems, turns, lattice = images, pair_cutoff(cutoff, closed), None, None, None
+    if box is not None and kind is not None:
+        lattice = of_sources = of_rows = make_lattice(box, kind, np.dtype(sources.dtype))
+        if batch is not None and kind.per_system:
+            most = len(lattice.origin) - 1  # rows without a box get any
+            systems = jnp.clip(batch.sources, 0, most), jnp.clip(batch.of_queries, 0, most)
+            of_sources, of_rows = map(lattice.of_rows, systems)
+        ends = Ends(bring_near(sources, of_sources), bring_near(rows, of_rows), of_sources, of_rows)
+        sources, rows = ends.sources.points, ends.rows.points
+        turns = None if codes is None else _turns_now(codes, made, ends)
     fixed = lax.stop_gradient((sources, rows, turns, of_pairs, lattice))
     return KeptList(topology.idx, count, topology.codes, *fixed, topology.order, None, systems)
 
@@ -257,23 +275,17 @@ def kept_shifts(given: KeptList) -> Array:
     return jnp.where(used[..., None], shifts, 0)
 
 
-def _turns_now(
-    images: ImageCodes,
-    made: tuple[Array, Array | None] | None,
-    sources: Array,
-    rows: Array,
-    lattice: Lattice,
-    of_sources: Lattice | None = None,
-) -> tuple[Array, Array]:
-    """Return the lattice vectors between the cell and the sources [n, d] and rows [m, d], in whole floats.
+def _turns_now(images: ImageCodes, made: tuple[Array, Array | None] | None, ends: Ends) -> tuple[Array, Array]:
+    """Return the lattice vectors between the cell and near sources [n, d] and rows [m, d], in whole floats.
 
     They are those of the time when the list was made, plus the translations since then (`made` holds the positions of that time).
     So an image code denotes the same image after positions have been wrapped.
     """
+    sources, rows, lattice = ends.sources.points, ends.rows.points, ends.of_rows
     both = [images.turns] if images.query_turns is None else [images.turns, images.query_turns]
     turns = [unpack_turns(x, lattice.dim).astype(sources.dtype) for x in both]
     if made is not None:
-        since = zip(turns, made, (sources, rows), (of_sources or lattice, lattice), strict=False)
+        since = zip(turns, made, (sources, rows), (ends.of_sources, lattice), strict=False)
         turns = [x if before is None else x + turns_between(before, now, each) for x, before, now, each in since]
     return turns[0], turns[-1]
 
@@ -284,7 +296,7 @@ def norms(vectors: Array) -> Array:
     """Return the lengths of vectors [..., d]; the derivative of a length of 0 is 0."""
     columns = [vectors[..., k] for k in range(vectors.shape[-1])]  # reductions over so short an axis are slow
     largest = functools.reduce(jnp.maximum, map(jnp.abs, columns))
-    apart = largest > 0
+    apart = largest != 0  # also of what is no number
     unit = jnp.where(apart, largest, 1)  # unscaled squares of tiny or huge lengths would leave the float range
     square = functools.reduce(jnp.add, ((x / unit) ** 2 for x in columns))
     return jnp.where(apart, unit * jnp.sqrt(jnp.where(apart, square, 1)), 0)
@@ -294,6 +306,6 @@ def norms(vectors: Array) -> Array:
 def _norms_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     (vectors,), (moved,) = primals, tangents
     lengths = norms(vectors)
-    apart = jnp.where(lengths > 0, lengths, 1)
+    apart = jnp.where(lengths != 0, lengths, 1)
     along = (vectors[..., k] / apart * moved[..., k] for k in range(vectors.shape[-1]))
     return lengths, functools.reduce(jnp.add, along)

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Sequence
+from types import FunctionType
 from typing import Any, Self, TypeVar
 
 import jax
@@ -13,6 +14,7 @@ from jax.core import Tracer
 
 from jfrnn._engine import Inputs, Options, hide_inactive, take_present
 from jfrnn._geometry import (
+    ROWS_ARE_WHOLE,
     Batch,
     Box,
     Cutoff,
@@ -20,6 +22,8 @@ from jfrnn._geometry import (
     Images,
     Radii,
     Status,
+    are_whole,
+    box_of_list,
     check_active,
     check_again,
     check_box,
@@ -30,8 +34,11 @@ from jfrnn._geometry import (
     grow_images,
     known_status,
     make_cutoff,
+    mark_rows,
+    refuse_status,
     round_box,
 )
+from jfrnn._search.culprits import name_culprits
 from jfrnn._search.fractional import real_points
 from jfrnn._search.geometry import ImageCodes, ImagesMade
 from jfrnn._search.kept_options import KeptOptions
@@ -39,9 +46,6 @@ from jfrnn._search.problem import Problem
 from jfrnn._search.reverse import Reverse
 from jfrnn._search.verlet import Verlet, has_moved_too_far
 from jfrnn._tracing import Given, call_apart, compile_program, own_transfers
-
-ROWS_ARE_WHOLE = Status.NONFINITE | Status.TOTAL_OVERFLOW  # bits that do not mean missing neighbors in rows
-
 
 Kept = TypeVar("Kept", bound="KeptSearch")
 
@@ -61,6 +65,18 @@ class KeptSearch(KeptOptions):
     reverse: Reverse | None
     problem: Problem = dataclasses.field(metadata={"static": True})
     _full = Status.ROW_OVERFLOW  # the bit that says that there is too little room
+    _harmless = ROWS_ARE_WHOLE  # bits that do not mean missing pairs
+
+    def __init_subclass__(cls, **options: object) -> None:
+        """Give a class its inherited methods under its own name, which errors of Python tell: users know no other."""
+        super().__init_subclass__(**options)
+        inherited = {name: x for base in reversed(cls.__mro__[1:]) for name, x in vars(base).items() if not name.startswith("_")}
+        for name, method in inherited.items():
+            if isinstance(method, FunctionType) and name not in vars(cls):
+                own = FunctionType(method.__code__, method.__globals__, name, method.__defaults__, method.__closure__)
+                own.__kwdefaults__, own.__annotations__ = method.__kwdefaults__, method.__annotations__
+                own.__doc__, own.__module__, own.__qualname__ = method.__doc__, cls.__module__, f"{cls.__name__}.{name}"
+                setattr(cls, name, own)
 
     @property
     def _room(self) -> int:
@@ -86,6 +102,22 @@ class KeptSearch(KeptOptions):
     def _check_known(self, spared: Status = Status.OK) -> None:
         """Raise what status bits report, except the spared ones; a traced list is not checked."""
         raise NotImplementedError
+
+    def _refuse(self, status: Status) -> None:
+        """Raise what these bits report, if any is set; a list with a skin names particles, where it was rebuilt."""
+        if status:
+            verlet, problem, more = self.verlet, self.problem, ""
+            if verlet is not None and verlet.positions.ndim == 2:
+                kept = (verlet.positions, verlet.queries, None, verlet.box, verlet.radii or self.radii, self.batch, self.exclude)
+                more = name_culprits(status & ~(Status.NONFINITE if self.masked else Status.OK), problem.inputs(*kept))
+            refuse_status(status, self.box, self.box_kind, problem.reach(self.radii), more)
+
+    def _mark(self, x: Array) -> Array:
+        """Return what was computed of the pairs; where the list is traced, NaN or the smallest integer if pairs may be missing.
+
+        Outside jit, `_check_known` has raised then.
+        """
+        return mark_rows(x, are_whole(self.status, self._harmless)) if isinstance(self.status, Tracer) else x
 
     def _describe(self, batch: Sequence[int], rows: int | None, room: str, found: str) -> str:
         """Summarize the list in a line: of how many rows, with how much room, and what it has found."""
@@ -126,11 +158,11 @@ class KeptSearch(KeptOptions):
     def update(
         self,
         positions: Array,
+        box: Box | None = None,
         *,
         cutoff: Array | tuple[Array, Array] | None = None,
         queries: Array | None = None,
         active: Array | None = None,
-        box: Box | None = None,
     ) -> Self:
         """Rebuild the list if anything has moved skin/2 since the last time, or may have by rounding; without a skin, always.
 
@@ -141,13 +173,13 @@ class KeptSearch(KeptOptions):
 
         Args:
             positions: Sources [length], shape [n, d], where they are now.
+            box: The present box, of the same kind; default: that of the list. The list keeps it. A change that may bring a new pair
+                within the cutoff causes a rebuild.
             cutoff: Present cutoffs per particle or per pair of species, as `search` takes them, if the list was made with such;
                 default: those of the list. The list keeps them. The growth of the largest one is subtracted from the skin.
             queries: Queries [length], shape [m, d], exactly if the list was made with queries.
             active: Which particles take part now, shape [n], bool, exactly if the list was made with `active`; a change causes a
                 rebuild.
-            box: The present box, of the same kind; default: that of the list. The list keeps it. A change that may bring a new pair
-                within the cutoff causes a rebuild.
 
         Returns:
             A list of the same type, shapes and options.
@@ -167,11 +199,11 @@ class KeptSearch(KeptOptions):
     def grow(
         self,
         positions: Array,
+        box: Box | None = None,
         *,
         cutoff: Array | tuple[Array, Array] | None = None,
         queries: Array | None = None,
         active: Array | None = None,
-        box: Box | None = None,
         slack: float = 1.25,
     ) -> Self:
         """Make a list with more room at these positions, where it overflowed. Not inside jit: the room is a shape.
@@ -181,10 +213,10 @@ class KeptSearch(KeptOptions):
 
         Args:
             positions: Sources [length], shape [n, d].
+            box: The box at these positions; default: that of the list, which after a chunk is the last one.
             cutoff: As in `update`.
             queries: As in `update`.
             active: As in `update`.
-            box: The box at these positions; default: that of the list, which after a chunk is the last one.
             slack: Factor >= 1 on what was needed so far, including updates of this list.
 
         Returns:
@@ -200,7 +232,10 @@ class KeptSearch(KeptOptions):
         radii = self._radii_now(cutoff, sources, queries)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, radii, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
-        wider = _replace(self, problem=self.problem.with_images(self._grow_images(box, radii)))
+        images = self._grow_images(box, radii)
+        wider = _replace(self, problem=self.problem.with_images(images))
+        if box is not None and images is not None:
+            box = box_of_list(box, images, self.problem.reach(radii))
         inputs, options = self.problem.inputs(sources, queries, active, box, radii, self.batch, self.exclude), wider.problem.options
         with own_transfers():
             met = self._room_for(math.ceil(slack * int(np.max(np.asarray(self.required)))))
@@ -224,7 +259,7 @@ class KeptSearch(KeptOptions):
         radii = check_radii(cutoff, self.radii.asked, sources, queries)
         if radii is None:
             raise ValueError("this list was made with a cutoff for each particle: pass such an array, or leave cutoff out.")
-        return radii
+        return dataclasses.replace(radii, itself=self.radii.itself)
 
     def _box_now(self, box: Box | None, sources: Array) -> Box | None:
         if box is None:
@@ -232,7 +267,9 @@ class KeptSearch(KeptOptions):
         if self.box is None:
             raise ValueError("this list was made without a periodic box: leave box out.")
         checked = check_box(box, sources, like=self.box)
-        return None if checked is None else round_box(checked.counted_as(self.box), np.dtype(sources.dtype))
+        if checked is None:
+            return None
+        return round_box(checked.counted_as(self.box).of_list(self.box.images_of_list), np.dtype(sources.dtype))
 
     def _grow_images(self, box: Box | None, radii: Radii | None) -> Images | None:
         if self.box_kind is None or self.box is None or box is None:

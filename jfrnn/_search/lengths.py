@@ -14,7 +14,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 
 from jfrnn._engine import KeptList, kept_distances, kept_slopes
-from jfrnn._geometry import Box, Cutoff, Images, Radii, make_lattice, translation
+from jfrnn._geometry import Box, Cutoff, Images, Radii, bring_near, translation
 from jfrnn._search.gathers import bind, collect, define, gather
 from jfrnn._search.geometry import ImagesMade, kept_list, kept_shifts, norms, open_vectors, periodic_vectors
 from jfrnn._search.topology import Topology
@@ -61,8 +61,7 @@ def _lengths(how: tuple[Images | None, bool], sources: Array, box: Box | None, g
 def _at(how: tuple[Images | None, bool], sources: Array, box: Box | None, given: _Given) -> KeptList:
     kind, closed = how
     topology, counts, images, cutoff = given
-    lattice = None if box is None or kind is None else make_lattice(box, kind, jnp.dtype(sources.dtype))
-    return kept_list(topology, counts, images, sources, sources, cutoff, closed, lattice)
+    return kept_list(topology, counts, images, sources, sources, cutoff, closed, box, kind)
 
 
 def _by_vectors(how: tuple[Images | None, bool], sources: Array, box: Box | None, given: _Given) -> tuple[Array, Array]:
@@ -88,7 +87,8 @@ def _lengths_jvp(how: tuple[Images | None, bool], primals: tuple, tangents: tupl
     if isinstance(moved, SymbolicZero):
         return (distances, mask), (SymbolicZero(jax.typeof(distances)), none)
     fixed = _at(how, lax.stop_gradient(sources), lax.stop_gradient(box), given)
-    lines = _Lines(fixed._replace(sources=sources, rows=sources), given.topology, distances)
+    near = sources if fixed.lattice is None else bring_near(sources, fixed.lattice).points
+    lines = _Lines(fixed._replace(sources=near, rows=near), given.topology, distances)
     return (distances, mask), (bind(_along_p, moved, lines), none)
 
 

@@ -69,7 +69,7 @@ class ListExports(KeptSearch):
         if total is None:
             count, idx = self._check_rows("pairs", at)
             return np.repeat(np.arange(count.size, dtype=np.int32), count), idx
-        rows, indices, _ = self._flat(total, at)
+        rows, indices, _ = self._flat("pairs", total, at)
         return rows, indices
 
     @overload
@@ -98,7 +98,7 @@ class ListExports(KeptSearch):
         if total is None:
             count, idx = self._check_rows("csr", at)
             return np.concatenate([[0], np.cumsum(count, dtype=np.int64)]), idx
-        _, indices, offsets = self._flat(total, at)
+        _, indices, offsets = self._flat("csr", total, at)
         return offsets, indices
 
     def to_jax_md(self) -> DenseNeighbors:
@@ -118,9 +118,9 @@ class ListExports(KeptSearch):
         self._check_known()
         return DenseNeighbors(self.idx, self.status)
 
-    def _flat(self, total: int, at: Present) -> tuple[Array, Array, Array]:
+    def _flat(self, name: str, total: int, at: Present) -> tuple[Array, Array, Array]:
         """Return rows and sources of the pairs, padded to a static length, and the row offsets."""
-        total, near = check_total(total), self._near_now(at)
+        total, near = check_total(total), self._near_now(name, at)
         self._check_single()
         if near is None:
             self._check_known()
@@ -150,7 +150,9 @@ class ListExports(KeptSearch):
         self._check_known()
         return int(np.asarray(self.count).sum(dtype=np.int64))
 
-    def _near_now(self, at: Present) -> Array | None:
+    def _near_now(self, name: str, at: Present) -> Array | None:
+        for unknown in set(at) - set(Present.__annotations__):
+            raise TypeError(f"NeighborList.{name}() got an unexpected keyword argument {unknown!r}")
         if "positions" in at:
             return self._near(at["positions"], at.get("queries"), at.get("box"))
         if at:
@@ -165,7 +167,7 @@ class ListExports(KeptSearch):
                 f"{name}() returns as many pairs as there are and cannot run inside jax.jit: write {name}(total), total being the "
                 "static length of its arrays."
             )
-        near = self._near_now(at)
+        near = self._near_now(name, at)
         if near is None:
             self._check_known()
         self._check_single()
@@ -185,5 +187,4 @@ class ListExports(KeptSearch):
         if Status.TOTAL_OVERFLOW in status:
             now = int(np.sum(jax.device_get(self.count), dtype=np.int64))
             raise ValueError(f"{status.message} At present it holds {now}.")
-        if status:
-            raise ValueError(status.message)
+        self._refuse(status)

@@ -20,12 +20,13 @@ from jfrnn._geometry import (
 from jfrnn._search.edges import Edges, Graph, flat_edges, make_graph, no_edges
 from jfrnn._search.exports import check_held, check_total, pair_total
 from jfrnn._search.geometry import lattice_shifts, norms, open_vectors, periodic_vectors
-from jfrnn._search.kept_search import ROWS_ARE_WHOLE
 from jfrnn._search.list_exports import ListExports
 from jfrnn._search.making import count_capacity, find_fields, round_capacity
 from jfrnn._search.reverse import MOST_SLOTS
 from jfrnn._search.topology import Topology, make_topology
 from jfrnn._tracing import own_transfers
+
+_FEW_SLOTS = 1 << 18  # up to which a program takes longer to compile than its displacements to compute
 
 
 @jax.tree_util.register_dataclass
@@ -84,29 +85,31 @@ class NeighborList(ListExports):
             status = self.status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
         return dataclasses.replace(self, status=status)
 
-    def vectors(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> tuple[Array, Array]:
+    def vectors(self, positions: Array, box: Box | None = None, *, queries: Array | None = None) -> tuple[Array, Array]:
         """Compute the displacements x_j - x_i to all neighbors, in a periodic box plus the lattice translation of the image.
 
         Args:
             positions: Sources [length], shape [n, d], where they are now.
-            queries: Queries [length], shape [m, d], exactly if the list was made with queries.
             box: The present box; default: that of the list, as a constant in derivatives.
+            queries: Queries [length], shape [m, d], exactly if the list was made with queries.
 
         Returns:
             Displacements [length], shape [m, capacity, d], 0 in masked slots; and the mask, shape [m, capacity], bool: the slot is
-            used and its pair is closer than the cutoff at these positions, exactly.
+            used and its pair is closer than the cutoff at these positions, exactly. Inside jit, displacements are NaN in all slots
+            if pairs may be missing.
 
         Raises:
             ValueError, TypeError: positions or queries do not fit the list.
-            NeighborOverflowError, ValueError: outside jit, pairs may be missing: rows overflowed, or data were invalid; inside,
-                read `status`. Particles that are not finite have no pairs, which is no error here.
+            NeighborOverflowError, ValueError: outside jit, pairs may be missing: rows overflowed, or data were invalid.
+                Particles that are not finite have no pairs, which is no error here.
 
         Differentiable: to any order in positions, queries and box; the mask is a constant. Jit: yes. vmap: yes.
         """
         vectors, mask, _ = self._geometry(positions, queries, box)
-        return vectors, mask
+        with own_transfers():
+            return self._mark(vectors), mask
 
-    def shifts(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> Array:
+    def shifts(self, positions: Array, box: Box | None = None, *, queries: Array | None = None) -> Array:
         """Compute the lattice shift S of every neighbor: its displacement is x_j - x_i + S·(lattice vectors).
 
         Every used slot has a shift, even if its pair lies in the skin, beyond the cutoff: `nbrs.shifts(x)[nbrs.idx <
@@ -115,12 +118,12 @@ class NeighborList(ListExports):
 
         Args:
             positions: Sources [length], shape [n, d], where they are now.
-            queries: As in `vectors`.
             box: As in `vectors`.
+            queries: As in `vectors`.
 
         Returns:
             Whole numbers, shape [m, capacity, d], int32; 0 in unused slots, along axes that are not periodic, and between positions
-            that are now more than 1022 lattice vectors apart.
+            that are now more than 1022 lattice vectors apart. Inside jit, the smallest int32 if pairs may be missing.
 
         Raises:
             ValueError, TypeError: an argument does not fit the list.
@@ -129,20 +132,22 @@ class NeighborList(ListExports):
         Differentiable: no (integers). Jit: yes. vmap: yes.
         """
         sources, rows, box = self._geometry_inputs(positions, queries, box)
-        self._check_known(spared=ROWS_ARE_WHOLE)
+        self._check_known(spared=self._harmless)
         with own_transfers():
             if box is None or self.box_kind is None or 0 in (sources.shape[0], *self.idx.shape):
-                return jnp.zeros((*self.idx.shape, sources.shape[1]), jnp.int32)
-            where = sources, rows, box, self.batch
-            return lattice_shifts(self._topology(), self.count, self._images_made(), *where, self.box_kind, self.half)
+                return self._mark(jnp.zeros((*self.idx.shape, sources.shape[1]), jnp.int32))
+            given = self._topology(), self.count, self._images_made(), sources, rows, box, self.batch, self.box_kind
+            if self.idx.size <= _FEW_SLOTS:  # the program of `vectors`, so that they share one
+                return self._mark(periodic_vectors(*given, self._cutoff_of_pairs(), self.closed, self.half, True)[2])
+            return self._mark(lattice_shifts(*given, self.half))
 
-    def distances(self, positions: Array, *, queries: Array | None = None, box: Box | None = None) -> tuple[Array, Array]:
+    def distances(self, positions: Array, box: Box | None = None, *, queries: Array | None = None) -> tuple[Array, Array]:
         """Compute the distance to every neighbor.
 
         Args:
             positions: Sources [length], shape [n, d], where they are now.
-            queries: As in `vectors`.
             box: As in `vectors`.
+            queries: As in `vectors`.
 
         Returns:
             Distances [length], shape [m, capacity], 0 in masked slots; and the mask as `vectors` gives it.
@@ -158,14 +163,15 @@ class NeighborList(ListExports):
             vectors, mask = self.vectors(positions, queries=queries, box=box)
             return norms(vectors), mask
         sources, _, box = self._geometry_inputs(positions, queries, box)
-        self._check_known(spared=ROWS_ARE_WHOLE)
+        self._check_known(spared=self._harmless)
         cutoff = self._cutoff_of_pairs()
         from jfrnn._search.lengths import lengths
 
         with own_transfers():
-            return lengths(topology, self.count, self._images_made(), sources, box, self.box_kind, cutoff, self.closed)
+            made, mask = lengths(topology, self.count, self._images_made(), sources, box, self.box_kind, cutoff, self.closed)
+            return self._mark(made), mask
 
-    def edges(self, positions: Array, total: int | None = None, *, queries: Array | None = None, box: Box | None = None) -> Edges:
+    def edges(self, positions: Array, total: int | None = None, box: Box | None = None, *, queries: Array | None = None) -> Edges:
         """Return the pairs as edges of a graph, with their geometry, for graph networks inside jit.
 
         Edges lead from neighbors j to particles i and are sorted by i, so `jax.ops.segment_sum(messages, edges.receivers, m,
@@ -177,8 +183,8 @@ class NeighborList(ListExports):
             total: Number of edges, a static int up to 2³¹ - 1; outside jit as many as the list holds pairs by default. If there are
                 more pairs, this raises outside jit. Inside jit, all displacements are NaN then, and `status` and `pair_count` say
                 so; `require(total)` makes the list keep such a bit, of all pairs that it holds, those of the skin included.
-            queries: As in `vectors`.
             box: As in `vectors`.
+            queries: As in `vectors`.
 
         Returns:
             An `Edges`: senders [total], receivers [total], displacement [total, d], shift [total, d], mask [total], status [],
@@ -208,7 +214,7 @@ class NeighborList(ListExports):
         check_held(made.pair_count, total)
         return made
 
-    def to_jraph(self, positions: Array, total: int | None = None, *, box: Box | None = None) -> Graph:
+    def to_jraph(self, positions: Array, total: int | None = None, box: Box | None = None) -> Graph:
         """Return the edges as a graph of jraph, with displacements, distances and lattice shifts; jraph need not be installed.
 
         Args:
@@ -252,11 +258,16 @@ class NeighborList(ListExports):
         return find_fields(inputs, self.problem.options, room, self.skin > 0, self.reverse is not None)
 
     def _geometry(self, positions: Array, queries: Array | None, box: Box | None) -> tuple[Array, Array, Array | None]:
-        return self._geometry_of(*self._geometry_inputs(positions, queries, box))
+        return self._geometry_of(*self._geometry_inputs(positions, queries, box), as_given=True)
 
-    def _geometry_of(self, sources: Array, rows: Array, box: Box | None) -> tuple[Array, Array, Array | None]:
-        """Return displacements, mask and shifts of sources and rows that are lengths, in the present box."""
-        self._check_known(spared=ROWS_ARE_WHOLE)
+    def _geometry_of(
+        self, sources: Array, rows: Array, box: Box | None, as_given: bool = False
+    ) -> tuple[Array, Array, Array | None]:
+        """Return displacements, mask and shifts of sources and rows that are lengths, in the present box.
+
+        Shifts are those of `periodic_vectors`: between near points, or as they are given.
+        """
+        self._check_known(spared=self._harmless)
         if 0 in (sources.shape[0], *self.idx.shape):
             with own_transfers():
                 return jnp.zeros((*self.idx.shape, sources.shape[1]), sources.dtype), jnp.zeros(self.idx.shape, bool), None
@@ -264,7 +275,7 @@ class NeighborList(ListExports):
         with own_transfers():
             if box is None or self.box_kind is None:
                 return *open_vectors(self._topology(), self.count, sources, rows, cutoff, self.closed), None
-            given = (self.box_kind, cutoff, self.closed, self.half)
+            given = (self.box_kind, cutoff, self.closed, self.half, as_given)
             return periodic_vectors(self._topology(), self.count, self._images_made(), sources, rows, box, self.batch, *given)
 
     def _topology(self) -> Topology:

@@ -2,8 +2,10 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 
 from jfrnn._engine import ENGINES, Filter, Inputs, Kind, Options, choose_engine, has_order, parse_backend, platform_of
 from jfrnn._geometry import (
@@ -13,6 +15,8 @@ from jfrnn._geometry import (
     Exclusions,
     Images,
     Radii,
+    Status,
+    box_of_list,
     check_active,
     check_batch,
     check_box,
@@ -26,8 +30,10 @@ from jfrnn._geometry import (
     images_of,
     largest_known,
     make_cutoff,
+    refuse_status,
     round_box,
 )
+from jfrnn._search.culprits import name_culprits
 from jfrnn._search.fractional import real_points
 from jfrnn._search.verlet import list_radius
 from jfrnn._tracing import Given
@@ -85,6 +91,17 @@ class Problem:
         reach = list_radius(self.cutoff, self.skin, self.dtype)
         return Inputs(sources, queries, active, box, make_cutoff(reach, self.dtype, self.options.closed), batch, exclude)
 
+    def refuse(self, status: Status | None, inputs: Inputs) -> None:
+        """Raise what bits report of a search of concrete particles, if any is set; None: they are not known.
+
+        Raises:
+            ValueError: a bit is set.
+        """
+        if status:
+            reach = self.reach(inputs.cutoff if isinstance(inputs.cutoff, Radii) else None)
+            known = not any(isinstance(x, Tracer) for x in jax.tree.leaves(inputs))
+            refuse_status(status, inputs.box, self.options.images, reach, name_culprits(status, inputs) if known else "")
+
     def with_images(self, images: Images | None) -> "Problem":
         """Return the same problem with other images."""
         return dataclasses.replace(self, options=self.options._replace(images=images))
@@ -122,6 +139,8 @@ def check_problem(
     else:
         masked = active is not None or (isinstance(box, Box) and box.per_system)
         radii = check_species(cutoff, species, radius_rule, sources, queries, masked)
+    if radii is not None and queries is None and not keep.drop_self:
+        radii = dataclasses.replace(radii, itself=True)
     excluded = None if exclude is None else check_exclusions(exclude, sources, queries)
     if keep.later_only and radii is not None and radii.rule in EXCHANGED:
         raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
@@ -142,7 +161,7 @@ def check_problem(
     options = Options(keep, engine, closed, 0.0 if radii is None else skin, images, static_reach, ordered)
     shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}
     problem = Problem(options, radius, skin, **shape, dim=sources.shape[1], dtype=dtype)
-    box = None if box is None else round_box(box, dtype)
+    box = None if box is None or images is None else box_of_list(round_box(box, dtype), images, reach)
     return problem, problem.inputs(sources, queries, active, box, radii, systems, excluded)
 
 

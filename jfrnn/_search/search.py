@@ -6,8 +6,8 @@ import jax
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._engine import Inputs, count_rows
-from jfrnn._geometry import Box, check_capacity, check_flag, check_slack
+from jfrnn._engine import Inputs, count_rows, mark_counts
+from jfrnn._geometry import Box, check_capacity, check_flag, check_slack, known_status
 from jfrnn._search.edge_list import EdgeList, count_total
 from jfrnn._search.exports import check_total
 from jfrnn._search.making import count_capacity, find_fields, find_flat_fields
@@ -53,10 +53,11 @@ def search(
         queries: Points [length] whose neighbors among `positions` are wanted, shape [m, d], same dtype; default: the positions
             themselves, each particle being excluded from its own row by index.
         box: Periodic box (`Box`): (i, j) is then listed once for each periodic image of j within the cutoff, with displacement x_j
-            - x_i + S·(lattice vectors) for whole numbers S, which `NeighborList.shifts` returns. Particles may be up to 511 lattice
-            vectors away from the box (short vectors, if a skewed box is searched in those); along axes that are not periodic it has
-            no effect. A box per system of a `batch` is one search, in which each system pays for its own images.
-        batch: System number of each particle, shape [n], integers that fit into int32, in any order; with queries a tuple of [n]
+            - x_i + S·(lattice vectors) for whole numbers S, which `NeighborList.shifts` returns. Particles may be 2^19 lengths
+            (float64: 2^30) away from the box, or 511 vectors of a skewed one, and more where nothing is rounded; along axes that
+            are not periodic it has no effect. A box per system of a `batch` is one search, in which each system pays for its own
+            images.
+        batch: System number of each particle, shape [n], integers, in any order; with queries a tuple of [n]
             and [m]. Only particles of one system are neighbors. Many systems cost what their particles cost, even if they overlap
             in space. If `box` holds a box per system, numbers count its boxes from 0 on, and particles of the number -1 are not
             there: they have no neighbors, and their positions may be anything.
@@ -69,12 +70,13 @@ def search(
             inside a status bit says so.
         exclude: Pairs that are no neighbors, such as bonded atoms, whatever their distance: shape [e, 2], integers, numbers of two
             particles in each row, in any order; with queries those of a query and of a particle. All periodic images of a pair are
-            excluded, those of particle i with itself by (i, i). Rows that hold a -1 are padding; partners of each particle are
+            excluded, those of particle i with itself by (i, i). With a box also shape [e, 2 + d]: rows (i, j, S) exclude one image,
+            that of j at the shift S of `NeighborList.shifts`. Rows in which i or j is -1 are padding; partners of each particle are
             written as pairs by `pairs_of_rows`. `count`, `capacity` and sums know nothing of excluded pairs, and updates keep them.
             Only the number of rows is static. Traced numbers of particles that do not exist set a status bit.
         half: List each unordered pair once, in the row of its smaller index; of the images of a particle that are its own
             neighbors, those whose shift S has a positive number first. Not with the rules "gather" and "scatter".
-        include_self: Make each particle its own neighbor.
+        include_self: Make each particle its own neighbor, whatever its cutoff, 0 included.
         closed: Count pairs at exactly the cutoff (<= instead of <).
         skin: Verlet skin [length], a static number >= 0: the list holds all pairs within cutoff + skin, so that
             `NeighborList.update` need not rebuild it before something has moved skin/2. `vectors` and `distances` mask to the
@@ -105,14 +107,14 @@ def search(
         Overflow of a given capacity and non-finite coordinates are known only from data: see `status`, `overflow` and `check`.
 
     Memory: 4 B per slot for the list (8 B with `reverse`), which keeps copies of what updates need: with a skin positions and
-    queries, with a batch 4 B and with cutoffs per particle one float each (with a skin two), with species 4 B each, with exclusions
-    8 B per pair and 4 B per row (with queries, also 4 B per particle). On a GPU, from 4097 particles on, a list by "warp" without
-    queries and with one cutoff also keeps their order in space, 4 B per particle. It shares no memory with the given arrays, so
-    they, or the list, may be donated (`jax.jit(..., donate_argnums=)`). While searching, however large space is, "warp" takes at
-    most 64 B and "hashgrid" 84 B per particle, "jax" and "brute" 100 B per particle (float64: 125 B) and, for the block being
-    processed, at most 64 MB on a CPU, elsewhere 1 GB or an eighth of the device's memory, whichever is less. With a box or a batch
-    "warp" also copies the positions, at most 20 B per particle (float64: 40 B); with cutoffs per particle it takes 140 B in all
-    (float64: 180 B). See `memory_plan`.
+    queries, with a batch 4 B and with cutoffs per particle one float each (with a skin two), with species 4 B each, with
+    exclusions 8 B per pair (of one image, 4·d B more) and 4 B per row (with queries, also 4 B per particle). On a GPU, from
+    4097 particles on, a list by "warp" without queries and with one cutoff also keeps their order in space, 4 B per particle.
+    It shares no memory with the given arrays, so they, or the list, may be donated (`jax.jit(..., donate_argnums=)`). While
+    searching, however large space is, "warp" takes at most 64 B and "hashgrid" 84 B per particle, "jax" and "brute" 100 B per
+    particle (float64: 125 B) and, for the block being processed, at most 64 MB on a CPU, elsewhere 1 GB or an eighth of the
+    device's memory, whichever is less. With a box or a batch "warp" also copies the positions, at most 20 B per particle
+    (float64: 40 B); with cutoffs per particle it takes 140 B in all (float64: 180 B). See `memory_plan`.
     Differentiable: the list is topology, without gradient; see `NeighborList.vectors`. Jit: yes, with capacity. vmap: yes, with
     capacity. Arrays that are sharded over a mesh are gathered on each device, and each does the whole work; `jfrnn.distributed`
     divides the work. `jax.export`: yes, with `disabled_checks=[jax.export.DisabledSafetyCheck.custom_call("jfrnn")]`; a process
@@ -248,10 +250,14 @@ def count(
     """Count the neighbors that `search` would list, without listing them. All arguments are those of `search`.
 
     Returns:
-        Neighbors per row, shape [m], int32. Particles with a non-finite coordinate have none, and are never counted as neighbors.
+        Neighbors per row, shape [m], int32. Inside jit, what cannot be known is the smallest int32: the rows of particles with a
+        non-finite coordinate, which are never counted as neighbors; and all rows if the data show that pairs may be missing (a box
+        that is too small, a particle too far outside of it, a cutoff per particle that is negative or not finite, an unknown
+        species or system).
 
     Raises:
-        TypeError, ValueError, ImportError, RuntimeError: as in `search`.
+        TypeError, ValueError, ImportError, RuntimeError: as in `search`; ValueError: outside jit, what the `status` of a search
+            would report.
 
     Memory: as in `search`, without the list. Differentiable: no (integers). Jit: yes. vmap: yes.
     """
@@ -259,7 +265,12 @@ def count(
         positions, cutoff, queries, box, batch, radius_rule, species, exclude, half, include_self, closed, backend, 0.0, active
     )
     with own_transfers():
-        return call_apart(lambda inputs: count_rows(inputs, problem.options)[0], inputs)
+        counts, _, status = call_apart(lambda inputs: count_rows(inputs, problem.options), inputs)
+        known = known_status(status)
+        if known is None:
+            return call_apart(mark_counts, inputs, counts, status)
+    problem.refuse(known, inputs)
+    return counts
 
 
 def _refuse_traced(inputs: Inputs, name: str, how: str) -> None:

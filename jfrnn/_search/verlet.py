@@ -22,6 +22,7 @@ from jfrnn._geometry import (
     Lattice,
     Radii,
     box_change,
+    bring_near,
     is_radius,
     make_cutoff,
     make_lattice,
@@ -37,8 +38,9 @@ class Verlet:
     """What a list with a skin keeps of the time when it was last rebuilt.
 
     Attributes:
-        positions: Sources at that time [length], shape [n, d]; inactive ones are infinite.
-        queries: Queries at that time [length], shape [m, d], or None.
+        positions: Sources at that time [length], shape [n, d]; inactive ones are infinite, and those that were far away from a
+            periodic box have been moved near it (`bring_near`).
+        queries: Queries at that time [length], shape [m, d], likewise, or None.
         box: The periodic box at that time, or None.
         radii: Cutoffs per particle at that time, or None with one cutoff.
         rebuild_count: How often `update` rebuilt the list, shape [], int32.
@@ -88,6 +90,7 @@ def has_moved_too_far(
         news = [new] * len(clouds)
         if box.per_system and batch is not None:
             news, old = [new.of_rows(x) for x in (batch.sources, batch.of_queries)], old.of_rows(batch.sources)
+        clouds = [(before, bring_near(now, each).points) for (before, now), each in zip(clouds, news, strict=False)]
     found = (_find_extremes(*cloud, lattice, half) for cloud, lattice in zip(clouds, news, strict=False))
     extremes = functools.reduce(jnp.maximum, found)
     if old is not None and news[0] is not None:
@@ -131,6 +134,16 @@ def _find_extremes(before: Array, now: Array, lattice: Lattice | None, half_skin
     return jnp.stack(lax.reduce(rows, least, lambda a, b: [lax.max(x, y) for x, y in zip(a, b, strict=True)], (0,)))
 
 
-def first_verlet(positions: Array, queries: Array | None, box: Box | None, radii: Radii | None) -> Verlet:
+def first_verlet(
+    positions: Array, queries: Array | None, box: Box | None, kind: Images | None, radii: Radii | None, batch: Batch | None
+) -> Verlet:
     """Return the state of a list that was just made."""
-    return Verlet(*lax.stop_gradient((positions, queries, box, radii)), jnp.int32(0))
+    positions, queries, box, radii = lax.stop_gradient((positions, queries, box, radii))
+    if box is not None and kind is not None:
+        lattice = make_lattice(box, kind, np.dtype(positions.dtype))
+        of_sources, of_queries = lattice, lattice
+        if box.per_system and batch is not None:
+            of_sources, of_queries = lattice.of_rows(batch.sources), lattice.of_rows(batch.of_queries)
+        positions = bring_near(positions, of_sources).points
+        queries = None if queries is None else bring_near(queries, of_queries).points
+    return Verlet(positions, queries, box, radii, jnp.int32(0))

@@ -12,7 +12,7 @@ from jax import Array, lax
 from jax.sharding import PartitionSpec
 
 from jfrnn._engine import ENGINES, Kind, parse_backend
-from jfrnn._geometry import check_cutoff, check_flag, check_skin
+from jfrnn._geometry import check_cutoff, check_flag, check_skin, mark_rows
 from jfrnn._search import count, list_radius, round_capacity
 from jfrnn._shards.halo import Halo, exchange, halo_in_shard, halo_spec, rows_seen
 from jfrnn._shards.particles import OVERFLOWS, Particles, of_shards, spec_of
@@ -129,13 +129,6 @@ def is_good(particles: Particles, halo: Halo) -> Array:
     return ~lax.pmax(other, particles.mesh.axis_names) & ((halo.status & OVERFLOWS.value) == 0)
 
 
-def mark(x: Array, good: Array) -> Array:
-    """Replace values by NaN (integers: the smallest one) if pairs may be missing; their derivatives become NaN too."""
-    if jnp.issubdtype(x.dtype, jnp.floating):
-        return x * jnp.where(good, 1, jnp.nan).astype(x.dtype)
-    return jnp.where(good, x, jnp.iinfo(x.dtype).min)
-
-
 @functools.partial(jax.jit, static_argnames="asked")
 def counts(particles: Particles, halo: Halo | None, asked: Asked) -> Array:
     def count_shard(particles: Particles, halo: Halo | None) -> Array:
@@ -145,7 +138,7 @@ def counts(particles: Particles, halo: Halo | None, asked: Asked) -> Array:
         counts = count(
             x, radius, box=particles.box, include_self=asked.include_self, closed=asked.closed, active=active, backend=asked.backend
         )
-        return mark(counts[: particles.sizes.particles], is_good(particles, halo))
+        return mark_rows(counts[: particles.sizes.particles], is_good(particles, halo))
 
     return over_shards(count_shard, particles, of_shards(particles.mesh), lax.stop_gradient(particles), halo)
 

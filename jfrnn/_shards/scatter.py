@@ -172,4 +172,4 @@ def _check_box(box: object, x: np.ndarray, reach: float, mesh: Mesh) -> Box | No
     kind = images_of(checked, reach, x.dtype, len(x))
     arrays = (replicate(mesh, np.asarray(a).astype(x.dtype)) for a in (checked.vectors, checked.origin))
     images = (0,) * checked.dim if kind.nearest else kind.reach
-    return Box.tree_unflatten((checked.periodic, images, False, False), (*arrays, None, None))
+    return Box.tree_unflatten((checked.periodic, images, False, False, None), (*arrays, None, None))

@@ -10,8 +10,8 @@ from jax import Array
 from jax.core import Tracer
 
 from jfrnn._engine import parse_backend
-from jfrnn._geometry import Status, check_capacity, check_flag, check_slack, known_status
-from jfrnn._search import ROWS_ARE_WHOLE, NeighborList
+from jfrnn._geometry import ROWS_ARE_WHOLE, Status, check_capacity, check_flag, check_slack, known_status, mark_rows
+from jfrnn._search import NeighborList
 from jfrnn._shards.calls import (
     BACKENDS,
     Asked,
@@ -21,7 +21,6 @@ from jfrnn._shards.calls import (
     counts,
     gather_seen,
     is_good,
-    mark,
     over_shards,
 )
 from jfrnn._shards.halo import Halo, exchange, halo_in_shard
@@ -196,6 +195,6 @@ def _sums(
         else:
             sums = pair_sum_on_one(fn, x, None, theirs, neighbors=jax.tree.map(lambda leaf: leaf[0], local), **options)
         good = is_good(particles, halo)
-        return jax.tree.map(lambda leaf: mark(leaf[: particles.sizes.particles], good), sums)
+        return jax.tree.map(lambda leaf: mark_rows(leaf[: particles.sizes.particles], good), sums)
 
     return over_shards(sum_shard, particles, of_shards(particles.mesh), particles, halo, local, values)

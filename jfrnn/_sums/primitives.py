@@ -51,8 +51,10 @@ class Equation(NamedTuple):
         values = [self.scalars.value(k) for k in numbers.reshape(-1).tolist()]
         if any(value is None for value in values):
             raise NoTranslationError(
-                f"the primitive {self.primitive.name!r} has no translation into a kernel where its indices depend on data: index "
-                'with constants, select with jnp.where, or pass backend="jax".'
+                f"the primitive {self.primitive.name!r} has no translation into a kernel where its indices depend on data, as in "
+                'table[i["kind"], j["kind"]]. Give each particle its row of the table, values={"row": table[kind], "kind": kind}, '
+                'and take jnp.where(jnp.arange(len(table)) == j["kind"], i["row"], 0).sum(); or index with constants, select with '
+                'jnp.where, or pass backend="jax".'
             )
         return np.array(values, values[0].dtype if values else np.int32).reshape(numbers.shape)
 

@@ -11,9 +11,10 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._engine import Inputs, KeptList, Options, hide_inactive, is_decidable, take_present
+from jfrnn._engine import Inputs, KeptList, Options, find_bits, hide_inactive, rows_asked
 from jfrnn._geometry import (
     EXCHANGED,
+    ROWS_ARE_WHOLE,
     Batch,
     Box,
     Cutoff,
@@ -21,16 +22,20 @@ from jfrnn._geometry import (
     Lattice,
     Radii,
     Status,
+    are_whole,
     check_cutoff,
+    good_rows,
+    known_status,
     make_cutoff,
     make_cutoffs,
-    make_lattice,
+    mark_rows,
+    one_or_nan,
     translation,
 )
-from jfrnn._search import MOST_SLOTS, ROWS_ARE_WHOLE, NeighborList, is_native, kept_list, lattice_of_rows
+from jfrnn._search import MOST_SLOTS, NeighborList, Problem, find_ends, is_native, kept_list, lattice_of_rows
 from jfrnn._sums.extremes import bind_extremes
 from jfrnn._sums.pair_function import call_with_pair
-from jfrnn._sums.relations import Kept, Listed, Relation, Searched, are_finite, mark_rows, one_or_nan
+from jfrnn._sums.relations import Kept, Listed, Relation, Searched
 from jfrnn._sums.summation import bind_sum
 from jfrnn._sums.terms import OF_QUERIES, OF_SOURCES, Groups, Labels, Summand, Term, choose, fresh_labels, trace
 from jfrnn._tracing import Given, Tree, call_apart, compile_program, on_device
@@ -53,15 +58,26 @@ class Pairs(NamedTuple):
     mark: Callable[[list[Array]], list[Array]] | None
 
 
-def pairs_of_search(inputs: Inputs, options: Options, summed: bool) -> Pairs:
-    """Return the pairs that a search finds; `summed` says that they are summed, rather than reduced to an extreme."""
+def pairs_of_search(problem: Problem, inputs: Inputs, summed: bool) -> Pairs:
+    """Return the pairs that a search finds; `summed` says that they are summed, rather than reduced to an extreme.
+
+    Raises:
+        ValueError: outside jit, the data show that pairs may be missing.
+    """
+    options = problem.options
     sources, queries, active, box, cutoff, batch, exclude = inputs
     fixed = lax.stop_gradient(inputs._replace(sources=hide_inactive(sources, active), active=None))
     relation, several = Searched(fixed, options), isinstance(cutoff, Radii)
     largest = make_cutoffs(cutoff, options.closed).largest if isinstance(cutoff, Radii) else cutoff.radius
     lattice = _lattice(box, options.images, sources, batch)
-    doubtful = several or box is not None or (exclude is not None and exclude.valid is not None)
-    if summed and active is None and not doubtful:
+    sources, queries = _bring_near(sources, queries, box, options.images, batch)
+    unsure = (exclude is not None and exclude.valid is not None) or (batch is not None and batch.fit is not None)
+    doubtful = by_data = several or box is not None or unsure
+    if doubtful:
+        known = known_status(call_apart(lambda inputs: find_bits(inputs, options), inputs))
+        problem.refuse(known, inputs)
+        doubtful = known is None
+    if summed and active is None and not by_data:
         return Pairs(relation, False, sources, sources if queries is None else queries, lattice, largest, relation.symmetric, None)
     sources, rows, mark = _prepare_marks(sources, queries, _good_rows_of_search, (inputs,), (options, doubtful))
     return Pairs(relation, False, sources, rows, lattice, largest, relation.symmetric, mark)
@@ -87,6 +103,8 @@ def pairs_of_list(
     directionless = not own and (nbrs.radii is None or nbrs.radii.rule not in EXCHANGED)
     relation = _relation_of_list(nbrs, *lax.stop_gradient((sources, rows, box)), symmetric=directionless and not nbrs.half)
     lattice = _lattice(box, nbrs.box_kind, sources, nbrs.batch)
+    sources, asking = _bring_near(sources, rows if own else None, box, nbrs.box_kind, nbrs.batch)
+    rows = sources if asking is None else asking
     largest = nbrs.cutoff if nbrs.radii is None else make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest
     masked = nbrs.masked or (nbrs.box is not None and nbrs.box.per_system)
     data = nbrs.status, nbrs.count if masked and not own else None, fixed_rows
@@ -105,37 +123,25 @@ def _relation_of_list(nbrs: NeighborList, sources: Array, rows: Array, box: Box 
     kind = nbrs.box_kind
 
     def make(nbrs: NeighborList, sources: Array, rows: Array, cutoff: Cutoff | Radii, box: Box | None) -> KeptList:
-        lattice = None if box is None or kind is None else make_lattice(box, kind, np.dtype(sources.dtype))
         images = nbrs._images_made()
-        return kept_list(nbrs._topology(), nbrs.count, images, sources, rows, cutoff, nbrs.closed, lattice, nbrs.batch)
+        return kept_list(nbrs._topology(), nbrs.count, images, sources, rows, cutoff, nbrs.closed, box, kind, nbrs.batch)
 
     given = call_apart(make, nbrs, sources, rows, cutoff, box)
     known = nbrs.reverse if nbrs.reverse is not None and nbrs.reverse.starts is not None else None
     return Kept(given, known, symmetric)
 
 
-@compile_program
-def _good_rows(points: Array, active: Array | None, whole: Array | None) -> Array:
-    """Say which rows [m] are valid: those of finite points and of inactive particles, provided that no pairs are missing."""
-    finite = are_finite(lax.stop_gradient(points))
-    good = finite if active is None else finite | ~active
-    return good if whole is None else good & whole
-
-
 @functools.partial(compile_program, static_argnames=("options", "doubtful"))
 def _good_rows_of_search(inputs: Inputs, options: Options, doubtful: bool) -> Array:
     """Say which rows [m] of a search are valid; `doubtful` says that the data decide whether pairs may be missing."""
-    inputs = take_present(inputs)
-    whole = is_decidable(inputs, options) if doubtful else None
-    return _good_rows(inputs.sources, inputs.active, whole) if inputs.queries is None else _good_rows(inputs.queries, None, whole)
+    return good_rows(*rows_asked(inputs), are_whole(find_bits(inputs, options)) if doubtful else None)
 
 
 @compile_program
 def _good_rows_of_list(status: Array, count: Array | None, points: Array) -> Array:
     """Say which rows [m] of a list are valid. If particles may be inactive, `count` is given: those with neighbors are active."""
-    whole = (status & ~ROWS_ARE_WHOLE.value) == 0
     active = None if count is None else (count > 0) | ((status & Status.NONFINITE.value) != 0)
-    return _good_rows(points, active, whole)
+    return good_rows(points, active, are_whole(status))
 
 
 def _prepare_marks(
@@ -171,6 +177,23 @@ def _lattice(box: Box | None, images: Images | None, like: Array, batch: Batch |
         return None
     systems = None if batch is None else batch.of_queries
     return call_apart(lambda box, systems: lattice_of_rows(box, images, np.dtype(like.dtype), systems, False), box, systems)
+
+
+def _bring_near(
+    sources: Array, queries: Array | None, box: Box | None, images: Images | None, batch: Batch | None
+) -> tuple[Array, Array | None]:
+    """Return sources and queries near the box, as engines see them; differentiable in positions and box."""
+    if box is None or images is None or images.counts_short:
+        return sources, queries
+    return _near_points(sources, queries, box, batch, images)
+
+
+@functools.partial(compile_program, static_argnames="images")
+def _near_points(
+    sources: Array, queries: Array | None, box: Box, batch: Batch | None, images: Images
+) -> tuple[Array, Array | None]:
+    ends = find_ends(sources, sources if queries is None else queries, box, images, batch, False)
+    return ends.sources.points, None if queries is None else ends.rows.points
 
 
 def reduce_pairs(

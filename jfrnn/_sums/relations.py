@@ -1,7 +1,6 @@
 """Relations: the pairs of a sum, from a search or from a list, and the loops that sum over them."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import TypeGuard
 
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jfrnn._engine import FOLD_GROUP, Block, Inputs, KeptList, Options, Slots, Visit, fold_pairs, kept_mask
-from jfrnn._geometry import EXCHANGED, Batch, Radii, compensated_sum, rounded_sum
+from jfrnn._geometry import EXCHANGED, Radii, are_finite, compensated_sum, mark_rows, rounded_sum
 from jfrnn._search import Reverse, find_reverse, kept_shifts
 from jfrnn._sums.fused import is_fused as is_fusible
 from jfrnn._sums.fused import sums as fused_sums
@@ -65,7 +64,7 @@ class Searched:
         exclude = None if exclude is None else exclude.reverse()
         if queries is not None:
             sources, queries = queries, sources
-            batch = batch if batch is None else Batch(batch.of_queries, batch.sources)
+            batch = batch if batch is None else batch.reverse()
         return Searched(Inputs(sources, queries, active, box, cutoff, batch, exclude), self.options)
 
     def fold(self, elements: int, visit: Visit, out: Tree) -> Tree:
@@ -262,23 +261,6 @@ def sum_pairs(relation: Relation, term: Term, operands: Groups, compensated: boo
         return results
     good = relation.finite_rows
     return [mark_rows(x, good) if mark else x for x, mark in zip(results, term.marks, strict=True)]
-
-
-def mark_rows(x: Array, good: Array) -> Array:
-    """Replace rows that are not good by NaN (integers: the smallest one); their derivatives become NaN too."""
-    if jnp.issubdtype(x.dtype, jnp.floating):
-        return x * one_or_nan(good, x)
-    return jnp.where(good.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.iinfo(x.dtype).min)
-
-
-def one_or_nan(good: Array, like: Array | jax.ShapeDtypeStruct) -> Array:
-    """Return 1 for good rows and NaN for others, in a shape that multiplies `like` [rows, ...]."""
-    return jnp.where(good, 1, jnp.nan).astype(like.dtype).reshape(-1, *[1] * (like.ndim - 1))
-
-
-def are_finite(points: Array) -> Array:
-    """Say which points have finite coordinates: [rows] bool. It takes no reduction, which XLA would not fuse."""
-    return functools.reduce(jnp.logical_and, (jnp.isfinite(points[:, k]) for k in range(points.shape[1])))
 
 
 def evaluate(relation: Searched | Listed, term: Term, operands: Groups, block: Block, slots: Slots) -> list[Array]:

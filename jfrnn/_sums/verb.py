@@ -1,5 +1,6 @@
 """The public function `pair_sum`: sums over neighbors without a neighbor list."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -85,12 +86,12 @@ def pair_sum(
     Returns:
         A pytree as fn returns it, leaves [m, ...]. Rows of inactive particles, and rows without neighbors, are 0 ("max": -inf,
         "min": inf). Invalid rows are NaN, as are their derivatives in the positions, and integers are the smallest of their dtype.
-        Invalid are rows of particles with NaN or infinite coordinates; and all rows if the data show that pairs may be missing (a
-        box that is too small, a particle too far outside of it, a cutoff per particle that is negative or not finite, a list that
-        overflowed). The `status` of a `search`, or of the list, tells the reason.
+        Invalid are rows of particles with NaN or infinite coordinates; and, inside jit, all rows if the data show that pairs may be
+        missing (a box that is too small, a particle too far outside of it, a cutoff per particle that is negative or not finite, a
+        list that overflowed). The `status` of a `search`, or of the list, tells the reason.
 
     Raises:
-        NeighborOverflowError, ValueError: outside jit, `neighbors` may lack pairs.
+        NeighborOverflowError, ValueError: outside jit, pairs may be missing, as above.
         TypeError, ValueError: an argument is of the wrong kind, shape or range; fn does not take (r, i, j), needs a concrete value
             (as `if` does), or returns what cannot be summed; or "warp" was chosen by name and does not support the sum. Other
             errors of fn are raised unchanged, with a note that describes its arguments.
@@ -138,7 +139,8 @@ def pair_sum(
             positions, cutoff, queries, box, batch, radius_rule, species, exclude, False, include_self, closed, backend, 0.0, active
         )
         with own_transfers():
-            pairs = pairs_of_search(inputs, _with_engine(problem.options, inputs, named is None), reduce == "sum")
+            engine = _with_engine(problem.options, inputs, named is None)
+            pairs = pairs_of_search(dataclasses.replace(problem, options=engine), inputs, reduce == "sum")
     else:
         given = {"batch": batch is not None, "radius_rule": radius_rule != "gather", "include_self": include_self}
         given |= {"species": species is not None, "exclude": exclude is not None}

@@ -1,6 +1,7 @@
 """What the library needs from JAX's tracing: its modes, `shard_map`, and a bound on the number of compiled programs."""
 
 from jfrnn._tracing.flags import first_set, largest_of, set_places
+from jfrnn._tracing.forks import refuse_forks
 from jfrnn._tracing.kinds import Aval, Given, Internal, Tree
 from jfrnn._tracing.late import call_late, lower_late, platform_of_lowering
 from jfrnn._tracing.manual import call_apart, result_aval, unvarying_types, vary, varying_axes

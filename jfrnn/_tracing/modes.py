@@ -14,6 +14,8 @@ from jax import Array
 from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jfrnn._tracing.forks import refuse_forks
+
 
 def gather(x: Array) -> Array:
     """Return x replicated on every device, if its type says that it is sharded over explicit mesh axes.
@@ -35,8 +37,9 @@ def own_transfers() -> AbstractContextManager[object]:
     """Allow the library's own transfers between host and device, like explicit `device_put` and `device_get`.
 
     `jax.transfer_guard("disallow_explicit")` forbids these too. Arrays of users must be on the device before: transferring their
-    NumPy arrays is left to them.
+    NumPy arrays is left to them. Whatever enters here works with arrays, so forked processes are refused.
     """
+    refuse_forks()
     guards = (
         (_guard_of_moves(), jax.transfer_guard_host_to_device),
         (jax.config.jax_transfer_guard_device_to_host, jax.transfer_guard_device_to_host),  # pyright: ignore[reportAttributeAccessIssue]

@@ -15,11 +15,13 @@ from jfrnn._geometry import (
     Cutoff,
     NeighborOverflowError,
     Status,
+    are_whole,
     check_again,
     check_devices,
     check_slack,
     known_status,
     make_cutoff,
+    mark_rows,
     pairs_and_status,
     shape_of,
 )
@@ -106,7 +108,7 @@ class TriangleList:
         with own_transfers():
             return (self.status & Status.ROW_OVERFLOW.value) != 0
 
-    def update(self, positions: Array, *, vertices: Array | None = None) -> "TriangleList":
+    def update(self, positions: Array, vertices: Array | None = None) -> "TriangleList":
         """Rebuild the list at these positions, in the same shapes: a simulation step inside `jax.jit` or `lax.scan`.
 
         Status bits and `required` are kept over all updates; read `overflow` after a chunk of steps, `grow` and run it again.
@@ -130,7 +132,7 @@ class TriangleList:
         found |= {"status": found["status"] | self.status, "required": jnp.maximum(found["required"], self.required)}
         return dataclasses.replace(self, **found, closed=self._copy_closed())
 
-    def grow(self, positions: Array, *, vertices: Array | None = None, slack: float = 1.25) -> "TriangleList":
+    def grow(self, positions: Array, vertices: Array | None = None, *, slack: float = 1.25) -> "TriangleList":
         """Make a list with a capacity that suffices at these positions. Not inside jit: the capacity is a shape.
 
         Args:
@@ -179,7 +181,13 @@ class TriangleList:
         if Status.ROW_OVERFLOW in (known_status(self.status) or Status.OK):
             raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self.capacity)
 
-    def closest(self, positions: Array, *, vertices: Array | None = None) -> tuple[Array, Array, Array]:
+    def _mark(self, x: Array) -> Array:
+        """Return what was computed of the rows; where the list is traced, NaN if triangles may be missing."""
+        if not isinstance(self.status, Tracer):
+            return x  # `_check_rows` has raised
+        return mark_rows(x, are_whole(self.status, ~Status.ROW_OVERFLOW))
+
+    def closest(self, positions: Array, vertices: Array | None = None) -> tuple[Array, Array, Array]:
         """Compute the nearest point of every triangle in a row.
 
         Distances, also to slivers, are accurate to 4 eps of the dtype times the largest coordinate of a corner relative to the
@@ -196,7 +204,7 @@ class TriangleList:
 
         Raises:
             ValueError, TypeError: an argument does not fit the list.
-            NeighborOverflowError: outside jit, a row lacks triangles; inside, read `overflow`.
+            NeighborOverflowError: outside jit, a row lacks triangles; inside, points and distances are NaN then.
 
         Differentiable: to any order in positions and vertices, where the nearest point does not jump; the gradient of a distance of
         0 is 0. Jit: yes. vmap: yes. Source: Ericson (2005), sect. 5.1.
@@ -207,9 +215,10 @@ class TriangleList:
             none = jnp.zeros(self.idx.shape, points.dtype)
             return jnp.broadcast_to(points[:, None], (*self.idx.shape, points.shape[1])), none, none > 0
         vectors, _, mask = _nearest_in_rows(self, points, corners)
+        vectors = self._mark(vectors)
         return points[:, None] + vectors, norms(vectors), mask
 
-    def contacts(self, positions: Array, *, vertices: Array | None = None) -> tuple[Array, Array, Array]:
+    def contacts(self, positions: Array, vertices: Array | None = None) -> tuple[Array, Array, Array]:
         """Compute the contacts of spheres with walls: the nearest points of `closest`, one per wall instead of one per triangle.
 
         A triangle yields to another one of its row that has the corner or side on which its nearest point lies and that is nearer,
@@ -250,9 +259,10 @@ class TriangleList:
         self._check_rows()
         vectors, feature, mask = _nearest_in_rows(self, points, corners)
         vectors, mask = _contacts_in_rows(self, points, corners, vectors, feature, mask)
+        vectors = self._mark(vectors)
         return points[:, None] + vectors, norms(vectors), mask
 
-    def signed_distance(self, positions: Array, *, vertices: Array | None = None) -> SignedDistance:
+    def signed_distance(self, positions: Array, vertices: Array | None = None) -> SignedDistance:
         """Compute the distance to the nearest triangle of each row, negative inside the solid that the triangles enclose.
 
         A point is inside if the winding number of the triangles is 1 or more, so closed parts that overlap, touch, nest or are
@@ -285,7 +295,8 @@ class TriangleList:
             none = jnp.zeros(points.shape[0], points.dtype)
             return SignedDistance(none, none > 0, jnp.zeros_like(points), jnp.asarray(self.faces.shape[0] == 0))
         tri = self if vertices is None else dataclasses.replace(self, cells=None)
-        return _signed_distance(tri, points, corners)
+        found = _signed_distance(tri, points, corners)
+        return found._replace(distance=self._mark(found.distance), normal=self._mark(found.normal))
 
     def _check_points(self, positions: Array, vertices: Array | None) -> tuple[Array, Array]:
         dtype, (count, dim) = np.dtype(self.vertices.dtype), self.vertices.shape

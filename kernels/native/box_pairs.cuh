@@ -71,14 +71,15 @@ struct BoxLanes : BoxPairs {
     // below `longest`.
     template <bool DECIDES>
     JFRNN_MEMBER void meet(const BoxRun& run, int first, int step, int longest) {
-        const int itself = drop_self && run.code == at_home ? place - run.from : -1;
+        const int itself =
+            run.code == at_home ? place - run.from : -1;  // it is its own neighbor whatever its cutoff, or not at all
         const real away[3] = {run.moved[0] - q[0], run.moved[1] - q[1], run.moved[2] - q[2]};
         const real* source = axes + run.from + first;
         constexpr int TOGETHER = DECIDES ? 1 : 4;  // steps whose sources are loaded at once
 #pragma unroll TOGETHER
         for (int b = 0; b < longest; b += step) {
             const int number = first + b;
-            const bool asked = number < run.size & number != itself;
+            const bool asked = number < run.size & (number != itself | !drop_self);
             const real* const source = axes + run.from + (number < run.size ? number : 0);
             real square = 0;
 #pragma unroll
@@ -91,7 +92,8 @@ struct BoxLanes : BoxPairs {
             PairCutoffs::Bounds<real> bounds{inside, outside};
             if constexpr (RULE != ONE_CUTOFF)
                 bounds = PairCutoffs::bounds_of(cutoff_at(run.from + (number < run.size ? number : 0)) * step_scale, slack);
-            const bool sure = asked & square < bounds.inside, open = asked & square <= bounds.outside & !sure;
+            const bool sure = asked & (square < bounds.inside | (RULE != ONE_CUTOFF & number == itself));
+            const bool open = asked & square <= bounds.outside & !sure;
             bool hit = DECIDES ? open : sure;
             if constexpr (DECIDES)
                 hit = hit && is_pair(run.from + number, run.code);
@@ -100,7 +102,7 @@ struct BoxLanes : BoxPairs {
             if constexpr (LATER)
                 hit = hit && ids[run.from + number] >= first_asked(run.code);
             if constexpr (EXCLUDING)
-                hit = hit && !is_excluded(ids[run.from + number]);
+                hit = hit && !is_excluded(ids[run.from + number], run.code);
             ((Visitor*)this)->take(hit, run.from + number, run);
         }
     }

@@ -129,7 +129,9 @@ struct BoxPairs : BoxArguments, BoxSpace {
     JFRNN_MEMBER int first_asked(int code) const {
         return !LATER ? 0 : code == at_home ? query + drop_self : code < at_home ? query + 1 : query;
     }
-    JFRNN_MEMBER bool is_excluded(int source) const { return Excluded(excluded_starts, excluded, query, ~0ull).has(source); }
+    JFRNN_MEMBER bool is_excluded(int source, int code) const {
+        return Excluded(excluded_starts, excluded, query, ~0ull).has(Excluded::id_of(source, code, n));
+    }
     // The cutoff of the query and the source at a place, in a search where cutoffs differ; a mean is rounded.
     JFRNN_MEMBER real cutoff_at(int at) const {
         if constexpr (RULE == TABLE)

@@ -20,15 +20,18 @@ struct BoxLanes : BoxPairs {
                 d *= step_scale;
             square += d * d;
         }
-        unsigned int asked = lanes_before(run.size - b);
-        if (drop_self && run.code == at_home && place >= at && place < at + LANES)
-            asked &= ~(1u << (place - at));
+        unsigned int asked = lanes_before(run.size - b), itself = 0;
+        if (run.code == at_home && place >= at && place < at + LANES)
+            itself = asked & 1u << (place - at);
+        if (drop_self)
+            asked &= ~itself;
         if constexpr (RULE == ONE_CUTOFF) {
             const unsigned int pairs = mask_of(square, inside, Below{}) & asked;
             return {pairs, mask_of(square, outside, BelowOrAt{}) & asked & ~pairs};
         }
         const auto bounds = PairCutoffs::bounds_of(vec(cutoffs_from(at) * step_scale), slack);
-        const unsigned int pairs = bits_of_flags(__builtin_convertvector(square < bounds.inside, flags)) & asked;
+        unsigned int pairs = bits_of_flags(__builtin_convertvector(square < bounds.inside, flags)) & asked;
+        pairs |= drop_self ? 0 : itself;  // whatever its cutoff
         return {pairs, bits_of_flags(__builtin_convertvector(square <= bounds.outside, flags)) & asked & ~pairs};
     }
     // The cutoffs of the query and the sources from a place on.
@@ -48,7 +51,7 @@ struct BoxLanes : BoxPairs {
             some.pairs |= is_pair(run.from + b + lane, run.code) ? 1u << lane : 0;
         }
         for (unsigned int rest = EXCLUDING ? some.pairs : 0; rest; rest &= rest - 1)
-            if (is_excluded(ids[run.from + b + __builtin_ctz(rest)]))
+            if (is_excluded(ids[run.from + b + __builtin_ctz(rest)], run.code))
                 some.pairs &= ~(rest & -rest);
     }
 };

@@ -21,7 +21,7 @@ constexpr int CANDIDATES = 1024;       // that are held at a time, a multiple of
 constexpr bool LIST = true;            // ids of neighbors are written, they are not only counted
 constexpr bool FLAT = false;           // rows of a list are as long as they need to be (row_places.h)
 constexpr int SUMS = 0;                // 1: summands are added up, 2: the largest ones are found
-constexpr bool EXCLUDING = false;      // queries exclude sources
+constexpr int EXCLUDING = 0;           // 1: queries exclude sources, 2: images of sources
 constexpr bool ONE_BY_ONE = false;     // candidates are met one by one
 // Of a term that is summed: columns of numbers of j and of lattice steps, numbers of i, sums over all pairs and of each i.
 constexpr int OTHERS = 1, STEPS = 0, OWN = 0, TOTALS = 1, ROW_SUMS = 1;
@@ -44,6 +44,7 @@ constexpr int RULE = 0, GROUPS = 8, HALVINGS = 5, PADDING = 16;
 // Of lists that are kept (see jfrnn/kernels/reverse.py and kept.py).
 constexpr int CODE_BYTES = 1;     // of the code of an image, 0: pairs have one image
 constexpr int RADII = 0;          // whose cutoff is that of a pair (kept.h), 0: all have one
+constexpr bool ITSELF = false;    // a particle is its own neighbor, whatever its cutoff
 constexpr int WIDTH = 3;          // numbers of each slot
 constexpr int LENGTH = 4;         // numbers of each source
 constexpr bool REVERSED = false;  // rows are those of the sources of a list

@@ -3,10 +3,13 @@
 #include "constants.h"
 #include "device.h"
 
-// A row of `ids`, those of the query from `starts[query]` on, in ascending order; without EXCLUDING there are no rows. Of short rows a
-// filter has a bit for each number modulo 64 that stands there: it tells most other sources apart without a look at the row.
+// A row of `ids`, those of the query from `starts[query]` on, in ascending order; without EXCLUDING there are no rows. Where EXCLUDING is
+// 2, an id names an image of a source: source + n * code. Of short rows a filter has a bit for each number modulo 64 that stands there:
+// it tells most other sources apart without a look at the row.
 struct Excluded {
     static constexpr int SHORT = 64;
+    // The id of a source, of which there are n, in an image.
+    JFRNN_FUNCTION int id_of(int source, int code, int n) { return EXCLUDING == 2 ? source + n * code : source; }
     const int *begin, *end;
     unsigned long long filter;
     JFRNN_INLINE Excluded(const int* starts, const int* ids, int query, unsigned long long filter)

@@ -191,8 +191,9 @@ struct FewPairs : Space {
             rest &= rest - 1;
             real p[3];
             point_of(positions + (long long)ROW * j, p);
-            int code = PERIODIC && SUMS ? code_of(p) : 0;
-            if ((excess(q, p, sure_square) < 0 || is_exact_pair(p, j, code)) && !(EXCLUDING && mine.has(j)))
+            int code = PERIODIC && (SUMS || EXCLUDING == 2) ? code_of(p) : 0;
+            const bool near_enough = excess(q, p, sure_square) < 0 || is_exact_pair(p, j, code);
+            if (near_enough && !(EXCLUDING && mine.has(Excluded::id_of(j, code, n))))
                 meet(j, p, code);
             else
                 near[k - 1][threadIdx.x] &= ~(1u << bit);

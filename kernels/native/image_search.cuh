@@ -74,6 +74,12 @@ struct ImageSearch : Search {
             moved[k] = lattice.translation(shift[0], shift[1], shift[2], k);
     }
     JFRNN_MEMBER int source_named(int id) const { return SUMS ? id_of(__ldg(&sorted[source_of(id)].id)) : source_of(id); }
+    // How rows of what queries exclude name a candidate (excluded.h).
+    JFRNN_MEMBER int excluded_id(int id) const {
+        if constexpr (EXCLUDING == 2)
+            return Excluded::id_of(source_named(id), IDS ? image_of(id) : (count_codes() - 1) / 2, n);
+        return source_named(id);
+    }
     // Loads where a candidate is. It is moved by the same operations wherever it is loaded, so that it is always in the same place.
     JFRNN_MEMBER void load_image(int id, real* p) const {
         if constexpr (SUMS) {

@@ -8,7 +8,7 @@
 // and the species of j. REVERSED:
 // rows are those of the sources of the list, whose slots are `lengths` many in `slots` from `starts` on, and j is who has such a slot.
 // ORDERED: threads take rows as `order` has them, so that rows that are taken together read the same sources, or as they come where it
-// holds -1. APART: a particle's pair with itself, without a shift, is left out.
+// holds -1. APART: a particle's pair with itself, without a shift, is left out. ITSELF: it is a pair, whatever the cutoff.
 // Source n stands behind all others, and its numbers are NaN: it is what slots hold that are not used, so nobody asks which ones are.
 #pragma once
 #include "codes.h"
@@ -125,17 +125,17 @@ struct Kept : KeptArguments, Space {
         Number shift[3], vector[3];
         Math::flag sure, open;
     };
-    // `step` (CODED): the shift of the image code of each slot; `other` (APART): the source of a slot is not its row. Slots that are not
-    // used hold no numbers (NaN), so they are neither sure nor open, unless nothing is DECIDED.
+    // `step` (CODED): the shift of the image code of each slot; `other` (APART, ITSELF): the source of a slot is not its row. Slots that
+    // are not used hold no numbers (NaN), so they are neither sure nor open, unless nothing is DECIDED.
     JFRNN_INLINE Verdict judge(const OwnPoint& own, const Number* numbers, const Number* step, Math::flag other) const {
         Math::flag used = Math::eq(Number{}, Number{});
         Number d[3], square{};
         Verdict found{};
         for (int k = 0; k < DIM; ++k)
             d[k] = numbers[k] - own.q[k];
-        Number off{};
+        Number off{}, spans{};
         if constexpr (SHIFTED) {
-            Number spans{}, size{};
+            Number size{};
             for (int k = 0; k < DIM; ++k) {
                 if constexpr (CODED || SKEWED)
                     found.shift[k] =
@@ -176,9 +176,15 @@ struct Kept : KeptArguments, Space {
             inner = near * near * (1 - 16 * step_eps);
             outer = far * far * (1 + 16 * step_eps);
         }
+        Math::flag itself = Math::both(used, Math::both(Math::inverse(other), Math::eq(square, square)));
         if constexpr (RADII == OF_KINDS)
             used = Math::both(used, Math::gt(cutoff_of(own, numbers), Number{}));
         found.sure = Math::both(used, Math::lt(square, inner));
+        if constexpr (ITSELF) {
+            if constexpr (SHIFTED)
+                itself = Math::both(itself, Math::le(spans, Number{}));
+            found.sure = Math::either(found.sure, itself);
+        }
         found.open = Math::both(Math::both(used, Math::le(square, outer)), Math::inverse(found.sure));
         return found;
     }

@@ -314,20 +314,22 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
             unsigned int sure, near = test(from_where, one.own, of_kinds, first, sure);
             if (to - first < LANES)
                 near &= (1u << (to - first)) - 1;
+            if (!drop_self && own_queries && image == home && one.at >= first && one.at < first + LANES && one.at < to)
+                near |= 1u << (one.at - first);  // a particle is its own neighbor, whatever its cutoff
             for (; near; near &= near - 1) {
                 const int e = LANES > 1 ? Side::lowest(near) : 0, c = first + e, other = ids[c];
                 const bool itself = own_queries && c == one.at && image == home;
                 const bool earlier = other < one.id || (PERIODIC == 2 && other == one.id && image < home);
                 if ((drop_self && itself) || (later_only && earlier))
                     continue;
-                bool pair = sure >> e & 1;
+                bool pair = itself || (sure >> e & 1);
                 if (!pair) {
                     real p[3];
                     for (int k = 0; k < DIM; ++k)
                         p[k] = axes[k * stride + c];
                     pair = exactly(one, of_kinds, other, p, image, c);
                 }
-                if (!pair || (EXCLUDING && mine.has(other)))
+                if (!pair || (EXCLUDING && mine.has(Excluded::id_of(other, image, n))))
                     continue;
                 query().pair(state, one, other, c, image);
             }

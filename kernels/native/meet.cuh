@@ -76,14 +76,14 @@ JFRNN_FUNCTION unsigned int drop_excluded(const PairSearch& search, const Group&
     unsigned int doubtful = 0;
     for (unsigned int rest = filter ? hits : 0; rest; rest &= rest - 1) {
         const int j = __ffs(rest) - 1;
-        doubtful |= Excluded::may_stand(filter, search.source_named(ids[j])) ? 1u << j : 0;
+        doubtful |= Excluded::may_stand(filter, search.excluded_id(ids[j])) ? 1u << j : 0;
     }
     if (doubtful == 0)
         return hits;
     const Excluded mine(search.excluded_starts, search.excluded, group.my_id, filter);
     for (; doubtful; doubtful &= doubtful - 1) {
         const int j = __ffs(doubtful) - 1;
-        hits &= mine.has(search.source_named(ids[j])) ? ~(1u << j) : ALL;
+        hits &= mine.has(search.excluded_id(ids[j])) ? ~(1u << j) : ALL;
     }
     return hits;
 }

@@ -61,7 +61,8 @@ struct Scan : SearchArguments, Cells, Scratch {
     unsigned int wanted(const Excluded& excluded, int b, unsigned int near) const {
         for (unsigned int rest = excluded.begin < excluded.end ? near : 0; rest; rest &= rest - 1) {
             const int lane = __builtin_ctz(rest);
-            near &= excluded.has(source_at(b + lane)) ? ~(1u << lane) : ~0u;
+            const int source = source_at(b + lane), code = PERIODIC && several ? candidate_images[b + lane] : image;
+            near &= excluded.has(Excluded::id_of(source, code, n)) ? ~(1u << lane) : ~0u;
         }
         return near;
     }

@@ -1,0 +1,79 @@
+"""Particles far from a periodic box: moved near it by whole numbers of lattice vectors, without rounding.
+
+Coordinates that nobody wraps, as those of a long molecular run, lie any number of boxes away. Kernels number the lattice vectors
+between a particle and its box by few bits, and the errors of wrapped coordinates grow with that number. So a particle that is at
+least `_FAR` vectors away is first moved by a multiple of `_STEP` of them, to coordinates that are floats again.
+
+Why nothing is rounded where vectors lie along the axes: let A be a length in [1, 2), p the exponent of x, and s·256·A what is
+subtracted, with s = round(x / 256 A). A is the sum of two halves of its mantissa, so that both products are exact. In float32,
+the first product is a multiple of 2^-3, and x is one of 2^(p - 23). Their difference is below 2^8 + 2^(p - 11), which is less
+than 2^24 such units for 192 <= x < 2^20, so it is a float. If x is 384 A or more, the second product and the difference are
+multiples of 2^-15, and the result is below 2^9, as it is at most 128 A plus the rounding of s. For smaller x, s is 1, and the
+result is a multiple of 2^-16 and at most 128 A < 2^8. In both cases it is a float, too. In float64, halves have 26 bits, and s up
+to 22.
+
+Where several vectors contribute to a component, sums are checked: points that rounding would change are not moved.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jfrnn._geometry.floats import half_mantissa, two_sum
+
+_STEP, _FAR = 256, 192
+_BITS = {4: 11, 8: 22}  # of how many steps a particle is moved, by the size of a float [B]
+
+
+def whole_steps(points: Array, units: Array, matrix: Array, periodic: Array | np.ndarray, orthogonal: bool) -> Array:
+    """Return by how many lattice vectors far points [n, d] are moved, [n, d] whole floats: multiples of 256, 0 along open axes.
+
+    `units` [n, d] are their coordinates along the vectors, `matrix` [d, d] the vectors of all or [n, d, d] those of each. Points
+    that lie too far away, or that would be rounded, are not moved.
+    """
+    steps = jnp.round(units / _STEP)
+    far = (jnp.abs(units) >= _FAR) & (jnp.abs(steps) <= 2.0 ** _BITS[points.dtype.itemsize]) & periodic
+    turns = jnp.where(far, steps * _STEP, 0)
+    if orthogonal:
+        return turns
+    _, exact = _subtract_checked(points, turns, matrix)
+    return jnp.where(exact[:, None], turns, 0)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
+def subtract_turns(points: Array, turns: Array, matrix: Array, orthogonal: bool) -> Array:
+    """Return x - turns @ matrix, [n, d], of one matrix or one per row, for turns of `whole_steps`: exactly.
+
+    Differentiable in points and matrix.
+    """
+    if not orthogonal:
+        return jnp.where((turns != 0).any(axis=1, keepdims=True), _subtract_checked(points, turns, matrix)[0], points)
+    lengths = jnp.stack([matrix[..., k, k] for k in range(points.shape[1])], axis=-1)
+    high = half_mantissa(lengths)
+    high, low = (x if x.ndim == 2 else x[None] for x in (high, lengths - high))
+    return jnp.where(turns == 0, points, (points - turns * high) - turns * low)
+
+
+@subtract_turns.defjvp
+def _subtract_jvp(
+    orthogonal: bool, primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]
+) -> tuple[Array, Array]:
+    (points, turns, matrix), (moved, _, stretched) = primals, tangents
+    rows = (turns[:, k, None] * stretched[..., k, :] for k in range(points.shape[1]))
+    return subtract_turns(points, turns, matrix, orthogonal), moved - functools.reduce(jnp.add, rows)
+
+
+def _subtract_checked(points: Array, turns: Array, matrix: Array) -> tuple[Array, Array]:
+    """Return x - turns @ matrix, [n, d], and for which rows nothing was rounded."""
+    high, dim = half_mantissa(matrix), points.shape[1]
+    total, rest, lost = points, jnp.zeros_like(points), jnp.zeros_like(points)
+    for part in (high, matrix - high):
+        for k in range(dim):
+            total, error = two_sum(total, -turns[:, k, None] * part[..., k, :])
+            rest, more = two_sum(rest, error)
+            lost = lost + jnp.abs(more)
+    total, error = two_sum(total, rest)
+    return total, ((lost == 0) & (error == 0)).all(axis=1)

@@ -1,0 +1,203 @@
+"""Particles that nobody wrapped, any number of boxes away: against the oracle, on all that a list and a sum tell."""
+
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+
+import jfrnn
+from jfrnn._geometry.far import subtract_turns, whole_steps
+
+SLOW = pytest.mark.slow
+N, CUTOFF = 24, 1.0
+CELLS = {
+    "lengths": [10.0, 9.0, 7.0],
+    "short": [1.1, 1.7, 0.9],
+    "flat": [1.3, 2.1],
+    "straight": [[3.0, 0, 0], [0, 2.7, 0], [0, 0, 3.3]],
+    "fcc": [[0, 1.8, 1.8], [1.8, 0, 1.8], [1.8, 1.8, 0]],
+}
+OFTEN = {("lengths", "warp", 700, np.float32), ("short", "warp", 5000, np.float64), ("fcc", "warp", 500, np.float32)}
+OFTEN |= {("flat", "jax", 700, np.float32)}
+
+
+def each_case():
+    for cell in CELLS:
+        for backend in ("warp", "jax", "brute"):
+            for far in (200, 500) if cell == "fcc" else (200, 700, 5000, 400_000):
+                for dtype in (np.float32, np.float64):
+                    kind = cell, backend, far, dtype
+                    yield pytest.param(*kind, marks=[] if kind in OFTEN else [SLOW])
+
+
+def scene(cell, far, dtype, seed=0):
+    matrix = np.asarray(CELLS[cell], dtype)
+    matrix = np.diag(matrix) if matrix.ndim == 1 else matrix
+    rng, dim = np.random.default_rng(seed), len(matrix)
+    places = rng.random((N, dim)) + rng.integers(-far, far + 1, (N, dim))
+    x = (places @ matrix.astype(float)).astype(dtype)
+    x[1] = x[0] + np.eye(dim)[0].astype(dtype)  # a tie, up to rounding of the coordinates
+    return x, matrix
+
+
+def triples(first, second, shifts, mask):
+    where = np.nonzero(np.asarray(mask))
+    named = (np.asarray(first)[where].tolist(), np.asarray(second)[where].tolist(), map(tuple, np.asarray(shifts)[where].tolist()))
+    found = list(zip(*named, strict=True))
+    assert len(set(found)) == len(found)
+    return set(found)
+
+
+def ends_of(edges):
+    return triples(edges.receivers, edges.senders, edges.shift, edges.mask)
+
+
+@pytest.mark.parametrize(("cell", "backend", "far", "dtype"), list(each_case()))
+def test_pairs_shifts_and_sums(cell, backend, far, dtype):
+    x, matrix = scene(cell, far, dtype)
+    expected = reference.reference_images(x, CUTOFF, matrix=matrix, periodic=(True,) * len(matrix))
+    options = {"box": jfrnn.Box(np.asarray(CELLS[cell], dtype)), "backend": backend}
+    nbrs = jfrnn.search(x, CUTOFF, **options)
+    nbrs.check()
+    vectors, mask = nbrs.vectors(x)
+    shifts, rows = nbrs.shifts(x), np.broadcast_to(np.arange(N)[:, None], nbrs.idx.shape)
+    assert triples(rows, nbrs.idx, shifts, mask) == expected
+    assert ends_of(nbrs.edges(x)) == expected
+    assert ends_of(jfrnn.search_edges(x, CUTOFF, **options).edges(x)) == expected
+    count = np.bincount([i for i, *_ in expected], minlength=N)
+    np.testing.assert_array_equal(jfrnn.count(x, CUTOFF, **options), count)
+    one = lambda r, i, j: jnp.ones((), dtype)  # noqa: E731
+    np.testing.assert_array_equal(jfrnn.pair_sum(one, x, CUTOFF, **options), count)
+    np.testing.assert_array_equal(jfrnn.pair_sum(one, x, None, neighbors=nbrs), count)
+    exact = [Fraction(v) for v in matrix.astype(float).reshape(-1).tolist()]
+    dim, eps = len(matrix), float(np.finfo(dtype).eps)
+    for (i, k), shift in zip(np.argwhere(mask)[:40].tolist(), np.asarray(shifts)[np.asarray(mask)][:40].tolist(), strict=True):
+        j = int(nbrs.idx[i, k])
+        for c in range(dim):
+            moved = sum(s * exact[dim * row + c] for row, s in enumerate(shift))
+            known = Fraction(float(x[j, c])) - Fraction(float(x[i, c])) + moved
+            size = 1000 * np.abs(matrix).max()  # of coordinates, and so of the rounding, wherever the particle is
+            assert abs(float(known) - float(vectors[i, k, c])) <= size * eps
+
+
+def test_a_list_with_a_skin_follows_them_and_wrapping_is_no_motion():
+    x, matrix = scene("lengths", 700, np.float64)
+    box = jfrnn.Box(CELLS["lengths"])
+    nbrs = jfrnn.search(x, CUTOFF, box=box, skin=0.3, slack=2.0)
+    rng = np.random.default_rng(1)
+    for step, moved in enumerate((x, x + 0.02 * rng.normal(size=x.shape), x % np.diag(matrix), x + 300 * np.diag(matrix))):
+        nbrs = nbrs.update(moved)
+        expected = reference.reference_images(moved, CUTOFF, matrix=matrix, periodic=(True,) * 3)
+        rows = np.broadcast_to(np.arange(N)[:, None], nbrs.idx.shape)
+        assert triples(rows, nbrs.idx, nbrs.shifts(moved), nbrs.distances(moved)[1]) == expected, step
+    assert int(nbrs.rebuild_count) <= 1
+
+
+def test_a_box_far_from_its_particles_and_particles_far_from_their_box():
+    rng = np.random.default_rng(2)
+    x = (rng.random((N, 3)) * [1.1, 1.7, 0.9]).astype(np.float32)
+    expected = jfrnn.count(x, 0.5, box=jfrnn.Box([1.1, 1.7, 0.9]))
+    for origin in (-1000.0, 300.0, [700.0, -250.0, 1e5]):
+        np.testing.assert_array_equal(jfrnn.count(x, 0.5, box=jfrnn.Box([1.1, 1.7, 0.9], origin=origin)), expected)
+
+
+def test_boxes_of_systems():
+    (x, first), (y, second) = scene("lengths", 700, np.float32), scene("short", 3000, np.float32, seed=1)
+    both, batch = np.concatenate([x, y]), np.repeat(np.int32([0, 1]), N)
+    boxes = jfrnn.Box(np.stack([np.diag(first), np.diag(second)]), per_system=True)
+    nbrs = jfrnn.search(both, CUTOFF, box=boxes, batch=batch)
+    nbrs.check()
+    rows = np.broadcast_to(np.arange(2 * N)[:, None], nbrs.idx.shape)
+    expected = set()
+    for k, (points, matrix) in enumerate(((x, first), (y, second))):
+        found = reference.reference_images(points, CUTOFF, matrix=matrix, periodic=(True,) * 3)
+        expected |= {(i + k * N, j + k * N, shift) for i, j, shift in found}
+    assert triples(rows, nbrs.idx, nbrs.shifts(both), nbrs.distances(both)[1]) == expected
+
+
+def test_derivatives_in_positions_and_box():
+    """Of a list and of a sum, against differences, where all particles are far away."""
+    x, matrix = scene("lengths", 700, np.float64)
+    lengths = jnp.asarray(np.diag(matrix))
+    nbrs = jfrnn.search(x, 3.0, box=jfrnn.Box(np.diag(matrix)))
+    scaled = jnp.asarray(x) / lengths
+
+    def by_list(s, lengths):
+        r, mask = nbrs.distances(s * lengths, jfrnn.Box(lengths))
+        return jnp.where(mask, (3.0 - r) ** 3, 0).sum()
+
+    def by_sum(s, lengths):
+        box = jfrnn.Box(lengths, images=1)
+        return jfrnn.pair_sum(lambda r, i, j: (3.0 - jnp.sqrt(r @ r)) ** 3, s * lengths, 3.0, box=box).sum()
+
+    for energy in (by_list, by_sum):
+        value, (of_s, of_lengths) = jax.value_and_grad(energy, (0, 1))(scaled, lengths)
+        assert value > 0
+        step = 1e-6
+        for k in range(3):
+            ahead, behind = (energy(scaled, lengths.at[k].add(sign * step)) for sign in (1, -1))
+            np.testing.assert_allclose(of_lengths[k], (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-5)
+        direction = jnp.asarray(np.random.default_rng(3).normal(size=x.shape)) * 1e-3
+        ahead, behind = (energy(scaled + sign * step * direction, lengths) for sign in (1, -1))
+        np.testing.assert_allclose(jnp.vdot(of_s, direction), (ahead - behind) / (2 * step), rtol=1e-3)
+
+
+def test_graphs_have_the_positions_that_were_given():
+    x, matrix = scene("lengths", 700, np.float64)
+    graph = jfrnn.search(x, CUTOFF, box=jfrnn.Box(np.diag(matrix))).to_jraph(x)
+    np.testing.assert_array_equal(graph.nodes["positions"][:N], x)
+    i, j = np.asarray(graph.receivers), np.asarray(graph.senders)
+    moved = x[j] - x[i] + np.asarray(graph.edges["shift"]) @ matrix
+    np.testing.assert_allclose(graph.edges["displacement"], moved, atol=1e-8)
+
+
+def test_what_lies_beyond_sets_a_bit():
+    x, _ = scene("lengths", 0, np.float32)
+    assert jfrnn.Status(int(jfrnn.search(x, CUTOFF, box=jfrnn.Box([10.0] * 3)).status)) == jfrnn.Status.OK
+    for far in (1e7, -1e20, 3e38):
+        nbrs = jfrnn.search(jnp.asarray(x).at[3, 1].set(far), CUTOFF, box=jfrnn.Box([10.0] * 3))
+        assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.OUT_OF_RANGE
+    skewed = jfrnn.Box([[3.0, 0, 0], [0.7, 2.7, 0], [-0.3, 0.2, 3.3]])
+    near = jfrnn.search(jnp.asarray(x).at[3, 1].set(2.7 * 400), CUTOFF, box=skewed)
+    assert jfrnn.Status(int(near.status)) == jfrnn.Status.OK
+
+
+@pytest.mark.parametrize("backend", ["warp", "jax", "brute"])
+def test_in_skewed_cells_those_that_rounding_would_move_are_named(backend):
+    """Beyond 511 vectors, points are taken whose move is exact; the others have no neighbors, and the error names one."""
+    x, matrix = scene("fcc", 700, np.float32)
+    nbrs = jfrnn.search(x, 2.0, box=jfrnn.Box(matrix), backend=backend)
+    units, alone = np.abs(x @ np.linalg.inv(matrix)).max(axis=1), np.asarray(nbrs.count) == 0
+    assert 0 < alone.sum() < (units > 511).sum() < N
+    assert (units[alone] > 511).all()
+    with pytest.raises(ValueError, match=rf"positions\[{int(units.argmax())}\] lies \d+"):
+        jfrnn.count(x, 2.0, box=jfrnn.Box(matrix), backend=backend)
+    with pytest.raises(ValueError, match="farther away, a run has exploded"):
+        nbrs.check()
+    expected = reference.reference_images(x, 2.0, matrix=matrix, periodic=(True,) * 3)
+    found = [(i, j) for i, row in enumerate(np.asarray(nbrs.idx).tolist()) for j in row if j < N]
+    assert sorted(found) == sorted((i, j) for i, j, _ in expected if not (alone[i] or alone[j]))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_nothing_is_rounded(dtype):
+    """Lengths of all mantissas, and particles wherever they may be, at the edges where a step more is taken, too."""
+    rng, most = np.random.default_rng(4), 2.0 ** (18 if dtype == np.float32 else 29)
+    lengths = np.concatenate([rng.uniform(1, 2, 200), [1, np.nextafter(dtype(2), dtype(1)), 1.5]]).astype(dtype)
+    turns = np.concatenate(
+        [rng.uniform(-1, 1, 400) * most ** rng.random(400), 192 * np.array([1, 1.0000001, 2, 4 / 3, -1, 3]), [most]]
+    )
+    x = np.multiply.outer(turns, lengths).astype(dtype).reshape(-1, 1)
+    matrix = np.broadcast_to(lengths, (len(turns), len(lengths))).reshape(-1, 1, 1).astype(dtype)
+    units = jnp.asarray(x / matrix[:, 0])
+    steps = whole_steps(jnp.asarray(x), units, jnp.asarray(matrix), np.array([True]), True)
+    near = subtract_turns(jnp.asarray(x), steps, jnp.asarray(matrix), True)
+    steps, near = np.asarray(steps), np.asarray(near)
+    assert (np.abs(near) < 193 * matrix[:, 0]).all()
+    assert (steps != 0).mean() > 0.3
+    for k in rng.choice(len(x), 4000, replace=False):
+        exact = Fraction(float(x[k, 0])) - int(steps[k, 0]) * Fraction(float(matrix[k, 0, 0]))
+        assert Fraction(float(near[k, 0])) == exact

@@ -1,0 +1,117 @@
+"""`include_self`: every particle that is there is its own neighbor, also where its own cutoff, or that of its species, is 0."""
+
+from itertools import product
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+
+import jfrnn
+
+SLOW = pytest.mark.slow
+N, CAPACITY = 48, 64
+BOXES = {
+    "open": None,
+    "nearest": jfrnn.Box([2.0, 2.5, 3.0]),
+    "images": jfrnn.Box([0.7, 1.1, 0.8]),
+    "skewed": jfrnn.Box([[2.0, 0.0, 0.0], [0.5, 2.0, 0.0], [-0.3, 0.4, 2.2]]),
+    "systems": jfrnn.Box([[2.0, 2.5, 3.0], [0.7, 1.1, 0.8]], per_system=True),
+}
+WHO = ("gather", "scatter", "either", "both", "species")
+
+
+def scene(who, dtype):
+    """Return positions with one that is not finite, and cutoffs: a third of them 0, or a species that has no neighbors."""
+    rng = np.random.default_rng(5)
+    x = rng.random((N, 3)).astype(dtype)
+    x[1] = x[0]
+    x[7] = np.nan
+    if who == "species":
+        table = np.array([[0.0, 0.0, 0.0], [0.0, 0.25, 0.3], [0.0, 0.3, 0.0]], dtype)
+        return x, table, {"species": rng.integers(0, 3, N).astype(np.int32)}
+    return x, np.where(rng.random(N) < 0.4, 0, rng.uniform(0.1, 0.3, N)).astype(dtype), {"radius_rule": who}
+
+
+def each_pair(who, x, cutoff, more, kind, batch, closed):
+    """Return the pairs of the oracle, and every finite particle with itself."""
+    box, found = BOXES[kind], {(i, i, (0, 0, 0)) for i in range(N) if np.isfinite(x[i]).all()}
+    for system in range(2 if kind == "systems" else 1):
+        members = np.flatnonzero(batch == system) if kind == "systems" else np.arange(N)
+        vectors = None if box is None else np.asarray(box.vectors)
+        vectors = vectors[system] if kind == "systems" else vectors
+        matrix = np.diag([9.0] * 3) if box is None else vectors if vectors.ndim == 2 else np.diag(vectors)
+        options = {"matrix": matrix.astype(x.dtype), "periodic": (box is not None,) * 3}
+        of = more["species"][members] if who == "species" else None
+        for reach in np.unique(cutoff[cutoff > 0]):  # pairs with each cutoff, by the oracle of one
+            near = reference.reference_images(x[members], float(reach), closed=closed, **options)
+            for i, j, shift in near:
+                own, other = (of[i], of[j]) if who == "species" else (cutoff[members[i]], cutoff[members[j]])
+                rules = {"gather": own, "scatter": other, "either": max(own, other), "both": min(own, other)}
+                mine = cutoff[own, other] if who == "species" else rules[who]
+                if mine == reach:
+                    found.add((int(members[i]), int(members[j]), shift))
+    return found
+
+
+def pairs_and_shifts(idx, shifts, mask):
+    i, k = np.nonzero(np.asarray(mask))
+    return set(zip(i.tolist(), np.asarray(idx)[i, k].tolist(), map(tuple, np.asarray(shifts)[i, k].tolist()), strict=True))
+
+
+OFTEN = {("gather", "open"), ("scatter", "nearest"), ("either", "systems"), ("both", "skewed"), ("species", "images")}
+
+
+def each_kind():
+    for who, kind, backend, dtype in product(WHO, BOXES, ("warp", "jax", "brute"), (np.float32, np.float64)):
+        often = (who, kind) in OFTEN and backend == "warp" and dtype == np.float32
+        often = often or (who, kind, backend, dtype) == ("species", "open", "jax", np.float32)
+        yield pytest.param(who, kind, backend, dtype, marks=[] if often else [SLOW])
+
+
+@pytest.mark.parametrize(("who", "kind", "backend", "dtype"), list(each_kind()))
+def test_everyone_is_its_own_neighbor(who, kind, backend, dtype):
+    x, cutoff, more = scene(who, dtype)
+    box, batch = BOXES[kind], np.arange(N, dtype=np.int32) % 2
+    options = {"box": box, "include_self": True, "backend": backend, **more, **({"batch": batch} if kind == "systems" else {})}
+    expected = each_pair(who, x, cutoff, more, kind, batch, False)
+    nbrs = jfrnn.search(x, cutoff, capacity=CAPACITY, **options)
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
+    shifts, mask = nbrs.shifts(x), nbrs.vectors(x)[1]
+    assert pairs_and_shifts(nbrs.idx, shifts, mask) == expected
+    assert pairs_and_shifts(nbrs.idx, shifts, nbrs.idx < N) == expected
+    expected_counts = np.bincount([i for i, *_ in expected], minlength=N)
+    np.testing.assert_array_equal(nbrs.count, expected_counts)
+    there = np.isfinite(x).all(axis=1)
+    sums = jfrnn.pair_sum(lambda r, i, j: jnp.ones((), r.dtype), x, cutoff, **options)
+    np.testing.assert_array_equal(np.asarray(sums)[there], expected_counts[there])
+    sums = jfrnn.pair_sum(lambda r, i, j: jnp.ones((), r.dtype), x, None, neighbors=nbrs)
+    np.testing.assert_array_equal(np.asarray(sums)[there], expected_counts[there])
+    edges = jfrnn.search_edges(x, cutoff, total=len(expected) + 5, **options).edges(x)
+    assert int(edges.pair_count) == len(expected)
+    if who not in ("gather", "scatter"):
+        half = jfrnn.search(x, cutoff, capacity=CAPACITY, half=True, **options)
+        mirrored = {(i, j, s) for i, j, s in expected if i < j or (i == j and s >= (0, 0, 0))}
+        assert pairs_and_shifts(half.idx, half.shifts(x), half.vectors(x)[1]) == mirrored
+
+
+@pytest.mark.parametrize("who", ["gather", "species"])
+def test_a_list_with_a_skin_keeps_them(who):
+    x, cutoff, more = scene(who, np.float32)
+    nbrs = jfrnn.search(x, cutoff, include_self=True, skin=0.05, **more)
+    edges = jfrnn.search_edges(x, cutoff, include_self=True, skin=0.05, **more)
+    for moved in (x, x + np.float32(0.001) * np.random.default_rng(1).normal(size=x.shape).astype(np.float32)):
+        expected = each_pair(who, moved, cutoff, more, "open", None, False)
+        after = nbrs.update(moved)
+        assert pairs_and_shifts(after.idx, np.zeros((*after.idx.shape, 3), int), after.vectors(moved)[1]) == expected
+        found = edges.update(moved).edges(moved)
+        mask = np.asarray(found.mask)
+        ends = zip(np.asarray(found.receivers)[mask].tolist(), np.asarray(found.senders)[mask].tolist(), strict=True)
+        assert {(i, j, (0, 0, 0)) for i, j in ends} == expected
+
+
+def test_separate_queries_have_no_self():
+    x, cutoff, _ = scene("gather", np.float32)
+    with pytest.raises(ValueError, match="include_self=True"):
+        jfrnn.search(x, cutoff, queries=x, include_self=True)
+    assert jfrnn.count(x[:1], np.zeros(1, np.float32), queries=x[2:3])[0] == 0
