@@ -1,4 +1,4 @@
-# Two commands: `make sweep` runs the thesis sweep on CPU, `make test` runs every test. Both set up .venv first.
+# Two commands: `make sweep` runs the thesis sweep on CPU, `make test` tests the library. Both set up .venv first.
 # Methods of others come with `make peers`. Those in C++ without a Python package, ANN and nanoflann's dynamic index, are compiled when
 # they first run, from Debian's headers: apt-get install g++ libann-dev libnanoflann-dev. Rows say what is missing; nothing else fails.
 PYTHON ?= python3
@@ -15,7 +15,7 @@ PIP    := PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore PYTHONWARN
 # Where nothing may keep what Python compiles, each of the many processes that tests start compiles JAX anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: sweep sweeps peers notebooks docs test test-slow lint style clean
+.PHONY: sweep sweeps peers notebooks docs test check test-slow mutants lint style clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml
@@ -51,12 +51,20 @@ docs: $(STAMP)
 	$(PY) -m sphinx -W --keep-going --quiet docs out/docs
 	@echo out/docs/index.html
 
-# Types are checked by a test, beside the others: pyright takes a minute on one core.
-test: style
-	$(PY) -m pytest
+# The library, whole: every engine, dtype, option and hard case against the oracle. What XLA compiled is kept in .cache for the next run.
+test: $(STAMP)
+	$(PY) -m pytest --ignore tests/release
+
+# What a release needs besides. Types are checked by a test, beside the others: pyright takes a minute on one core.
+check: style
+	$(PY) -m pytest tests/release
 
 test-slow: $(STAMP)
 	$(PY) -m pytest -m slow
+
+# Faults of one line, each put into a copy: which of them do the tests of `make test` not notice?
+mutants: $(STAMP)
+	$(PY) tests/mutate.py $(ROOMS)
 
 lint: style
 	$(VENV)/bin/pyright
@@ -67,4 +75,4 @@ style: $(STAMP)
 	$(VENV)/bin/clang-format --dry-run -Werror kernels/native/*
 
 clean:
-	rm -rf $(VENV) out build docs/notebooks docs/pictures *.egg-info
+	rm -rf $(VENV) .cache out build docs/notebooks docs/pictures *.egg-info

@@ -22,6 +22,15 @@ jax.config.update("jax_traceback_in_locations_limit", 0)
 os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"  # programs tell no line of the sources they were traced from: it takes long
 os.environ[soon.ASKED] = "1"  # in processes that tests start, as `_compiled_soon` in this one
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # to compile the sources of JAX takes each of them a second and a half
+# What XLA compiled is kept for the next run, here and in processes that tests start: half of the time of the tests.
+KEPT = {
+    "jax_compilation_cache_dir": os.environ.get("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".cache" / "xla")),
+    "jax_persistent_cache_min_compile_time_secs": 0,
+    "jax_persistent_cache_min_entry_size_bytes": -1,
+}
+for name, value in KEPT.items():
+    jax.config.update(name, value)
+    os.environ[name.upper()] = str(value)
 gc.freeze()  # imported modules are no garbage; tracing makes many objects that stay: to look through them takes a tenth of the time
 gc.set_threshold(50_000, 20, 20)
 TESTS = count(1)
@@ -32,7 +41,7 @@ UNFUSED = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split
 warp.config.log_level = warp.LOG_WARNING  # else it prints what it compiles, into doctests too
 # Files, those first that take longest: what is left at the end is short, and no worker waits for another's long file.
 LONGEST = (
-    "types", "docs", "kept", "hard_cases", "box", "triangles", "pair_sum", "experiments_sweep", "triangles_closest",
+    "types", "docs", "status", "kept", "hard_cases", "box", "triangles", "pair_sum", "experiments_sweep", "triangles_closest",
     "cases_periodic", "boxes", "exact", "reverse", "radii", "search", "memory", "pair_sum_warp", "reference", "arrays",
     "triangles_cuda", "order", "experiments_peers", "experiments_gpu", "notebooks", "jax_md", "boxes_radii", "distributed",
     "verlet", "joint", "pair_sum_cuda", "sph_solids", "verlet_boxes", "edges", "fractional", "transforms", "batch", "modes",

@@ -4,6 +4,7 @@ Prints a line of JSON for each: its name, and what was wrong, or null. The oracl
 compare with rational arithmetic.
 """
 
+import dataclasses
 import functools
 import json
 import os
@@ -188,6 +189,73 @@ def room_that_is_missing_is_told_and_made():
     settled = distributed.migrate(together.grow(settled))
     assert int(settled.status) == 0
     assert sorted(per_shard(settled)) == [0, 0, 0, 160]
+
+
+@check
+def what_is_missing_anywhere_is_told():
+    """By a bit that one shard alone sets, across a periodic face, and until buffers have grown."""
+    k = np.arange(16)
+    x = np.stack([0.25 + 0.5 * k, 2.0 * (k % 4)], axis=1)
+    x[12:] = [[7.0, 1.0], [7.1, 1.0], [7.2, 1.0], [7.9, 0.0]]  # three near each other, and one near the first
+    box = jfrnn.Box([8.0, 8.0])
+    particles = distributed.scatter(x, 0.5, mesh=mesh_of(4), box=box, along=(0,), skin=0.1)
+    raises(ValueError, "reach", distributed.search, particles, 0.5, skin=0.2)
+    full = distributed.search(particles, 0.5, skin=0.1, capacity=1, backend="warp")
+    np.testing.assert_array_equal(by_id(full.count, particles), [1] + [0] * 11 + [2] * 3 + [1])
+    assert jfrnn.Status(int(full.status)) == jfrnn.Status.ROW_OVERFLOW  # on the last shard
+    ids = np.maximum(np.asarray(particles.ids), 0)
+    apart = particles.replace(positions=jnp.asarray(np.where(k[:, None] > 11, [[5.0, 5.0]] + 0.7 * k[:, None] % 3, x))[ids])
+    settled, kept = full.update(apart)
+    assert int(kept.rebuild_count[0]) == 1
+    assert jfrnn.Status(int(kept.status)) == jfrnn.Status.ROW_OVERFLOW
+    assert int(kept.required.row) == 2
+    again = kept.update(settled)[1]
+    assert int(again.rebuild_count[0]) == 1
+    swapped = np.asarray(settled.ids).copy()
+    swapped[[0, 1]] = swapped[[1, 0]]
+    others = dataclasses.replace(settled, ids=jax.device_put(swapped, settled.ids.sharding))
+    assert int(kept.update(others)[1].rebuild_count[0]) == 2  # rows of others
+    crowded = distributed.migrate(particles.replace(positions=particles.positions * 0))
+    assert jfrnn.Status.SHARD_OVERFLOW in jfrnn.Status(int(crowded.status))
+    back = distributed.migrate(crowded.replace(positions=particles.positions))
+    assert jfrnn.Status.SHARD_OVERFLOW in jfrnn.Status(int(back.status))
+    assert int(back.required.particles) == 16
+    x[1] = [5.0, 3.0]  # from the region of the first shard into that of the third
+    far = particles.replace(positions=jnp.asarray(x)[ids])
+    halo = distributed.halo(far)
+    assert jfrnn.Status(int(halo.status)) == jfrnn.Status.HALO_TOO_FAR
+    assert halo.required.hops.tolist() == [2]
+    assert int(distributed.count(far, 0.5, halo=halo, backend="warp").max()) == np.iinfo(np.int32).min
+
+
+@check
+def counts_beside_cuts_that_differ_and_of_strays():
+    """Two slabs whose cuts lie far apart, so that ghosts go round a corner, and particles on shards far from where they are."""
+    rng, k = np.random.default_rng(13), np.arange(8)
+    left = np.stack([np.full(8, 3.8), np.where(k < 4, 4 + 0.4 * k, 4.5 + 0.4 * k)], axis=1)
+    right = np.stack([np.full(8, 4.2), np.where(k < 4, 0.3 * k, 2.4 + 0.4 * k)], axis=1)
+    corner, box = np.concatenate([left, right]), jfrnn.Box([8.0, 8.0])
+    strays = [
+        np.where([True, False], rng.uniform(0, 8, (16, 2)), rng.uniform(0, 0.4, (16, 2)))[:, turn] for turn in ([0, 1], [1, 0]) * 2
+    ]
+    counted = jax.jit(lambda particles: distributed.count(particles, 0.5, backend="warp"))
+    for first in (corner, 8 - corner):
+        particles = roomy(distributed.scatter(first, 0.5, mesh=mesh_of(2, 2), box=box, along=(0, 1)))
+        for x in (first, *strays):
+            moved = particles.replace(positions=jnp.asarray(x)[np.maximum(np.asarray(particles.ids), 0)])
+            expected = jfrnn.count(jnp.asarray(x), 0.5, box=box, backend="warp")
+            np.testing.assert_array_equal(by_id(counted(moved), particles), expected)
+            assert int(expected.sum()) > 10
+
+
+@check
+def particles_that_do_not_fill_a_round_of_migration():
+    """Three go to the other shard, by twos."""
+    x = np.linspace(0, 8, 150)[:, None] * np.array([1.0, 0.25])
+    x[[0, 1, 2, 147, 148, 149]] = x[[147, 148, 149, 0, 1, 2]]
+    particles = distributed.scatter(x, 0.1, mesh=mesh_of(2))
+    whole(particles, x)
+    assert list(per_shard(particles)) == [75, 75]
 
 
 def raises(kind, words, fn, *args, **kwargs):

@@ -127,6 +127,9 @@ def test_two_of_one_name_and_what_is_empty():
         ]
     scaled = primitive_neighbor_list("d", True, np.eye(3) * 4, x / 4, 1.5, use_scaled_positions=True)
     assert scaled.tolist() == [1.0, 1.0]
+    cell, u = CELLS["left-handed"][0], np.random.default_rng(7).integers(0, 8, (12, 3)) / 8  # so that products are exact
+    lengths, fractions = as_set(*primitive_neighbor_list("ijS", True, cell, u @ cell, 1.0)), {"use_scaled_positions": True}
+    assert as_set(*primitive_neighbor_list("ijS", True, cell, u, 1.0, **fractions)) == lengths != set()
 
 
 BAD = {

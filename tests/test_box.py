@@ -10,6 +10,7 @@ import pytest
 import reference
 
 import jfrnn
+from jfrnn._geometry.images import images_of
 from jfrnn._geometry.wrapping import unpack_turns
 from jfrnn.cases.periodic import PERIODIC_CASES
 
@@ -148,6 +149,13 @@ def test_options(options, vectors, dtype):
     nbrs = jfrnn.search(x, 0.3, box=jfrnn.Box(vectors), backend="warp", **options)
     assert image_pairs(nbrs, x) == oracle(x, 0.3, vectors, **options)
     np.testing.assert_array_equal(jfrnn.count(x, 0.3, box=jfrnn.Box(vectors), backend="warp", **options), nbrs.count)
+
+
+def test_half_lists_have_one_of_two_opposite_images_of_a_particle_itself():
+    x = points(40, np.float32)
+    for options in ({"half": True}, {"half": True, "include_self": True}):
+        nbrs = jfrnn.search(x, 0.6, box=jfrnn.Box(SMALL), backend="warp", **options)
+        assert image_pairs(nbrs, x) == oracle(x, 0.6, SMALL, **options)
 
 
 def test_an_open_box_is_none():
@@ -391,6 +399,15 @@ def test_images_can_be_asked_for(vectors, cutoff, dtype):
     if any(images):
         fewer = tuple(k - (k == max(images)) for k in images)
         assert (np.asarray(count(fewer)) == np.iinfo(np.int32).min).all()
+
+
+def test_images_are_as_many_as_int32_numbers():
+    box, most = jfrnn.Box([1.0, 1.0, 1.0]), (2**31 - 1) // 27
+    assert images_of(box, 0.6, np.dtype(np.float32), most).total == 27
+    for sources in (most + 1, 2**27):
+        with pytest.raises(ValueError, match=f"{sources} of them with 27 images each are more than int32 can number"):
+            images_of(box, 0.6, np.dtype(np.float32), sources)
+    assert images_of(box, 0.4, np.dtype(np.float32), 2**27).nearest  # such lists number no images
 
 
 def test_images_of_nothing_known():

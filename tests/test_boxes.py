@@ -317,3 +317,21 @@ X, SYSTEMS, CELLS = np.zeros((4, 3)), np.zeros(4, np.int32), np.stack([np.eye(3)
 def test_errors(error, match, call):
     with pytest.raises(error, match=match):
         call()
+
+
+def test_near_ties_of_particles_a_hundred_cells_away():
+    """Where boxes differ, too, no pair is decided by wrapped coordinates, which lost to rounding what tells these pairs apart."""
+    rng, boxes = np.random.default_rng(5), np.array([[3.1, 2.7, 3.3], [2.9, 3.7, 2.3]], np.float32)
+    batch = np.repeat([0, 1], 60)
+    lengths = boxes[batch].astype(float)
+    start = (rng.random((120, 3)) + rng.integers(-100, 101, (120, 3))) * lengths
+    way = rng.normal(size=(60, 3))
+    way *= 0.5 / np.linalg.norm(way, axis=1, keepdims=True)
+    x = start.astype(np.float32)
+    x[1::2] = (x[::2].astype(float) + way + rng.integers(-50, 51, (60, 3)) * lengths[::2]).astype(np.float32)
+    expected = oracle(boxes, x, batch, 0.5)
+    nbrs = jfrnn.search(jnp.asarray(x), 0.5, box=jfrnn.Box(boxes, per_system=True), batch=batch, capacity=16, backend="warp")
+    nbrs.check()
+    assert listed_images(nbrs, jnp.asarray(x)) == expected
+    near = {pair[:2] for pair in expected}
+    assert 10 < sum((k, k + 1) in near for k in range(0, 120, 2)) < 50

@@ -233,3 +233,17 @@ def test_what_is_wrong_sets_bits_and_absent_particles_may_have_any_cutoff(backen
     assert masked_images(nbrs, jnp.asarray(given.x)) == given.pairs()
     radii[np.flatnonzero(~gone)[0]] = np.nan
     assert jfrnn.Status(int(count(radii).status)) == jfrnn.Status.INVALID_CUTOFF
+
+
+def test_far_reaching_queries_among_sources_with_small_cutoffs():
+    """The larger cutoff of a pair decides, so cells of a system are as wide as the largest of either."""
+    rng, boxes = np.random.default_rng(3), np.array([[2.0, 2.2, 1.9], [1.7, 2.4, 2.1]], np.float32)
+    x, q, batch, asking = rng.random((60, 3)), rng.random((20, 3)), np.repeat([0, 1], 30), np.repeat([0, 1], 10)
+    x, q = (x * boxes[batch]).astype(np.float32), (q * boxes[asking]).astype(np.float32)
+    radii = np.full(60, 0.1, np.float32), np.full(20, 0.7, np.float32)
+    given = {"box": jfrnn.Box(boxes, per_system=True), "batch": (batch, asking), "queries": jnp.asarray(q)}
+    nbrs = jfrnn.search(jnp.asarray(x), radii, radius_rule="either", capacity=32, backend="warp", **given)
+    nbrs.check()
+    expected = oracle("either", boxes, x, batch, radii, queries=q, query_batch=asking)
+    assert listed_images(nbrs, jnp.asarray(x), queries=jnp.asarray(q)) == expected
+    assert len(expected) > 60

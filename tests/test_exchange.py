@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
 
 import jfrnn
 from jfrnn._sums import exchange, summation
@@ -29,6 +30,7 @@ FUNCTIONS = {
     "mixed": (lambda r, i, j: smooth(r) * (1 + r[0]), (None,)),
     "both": (lambda r, i, j: jnp.stack([smooth(r), r[0]]), (None,)),
     "part": (lambda r, i, j: jnp.maximum(r[0], 0), (None,)),
+    "choice": (lambda r, i, j: jnp.where(r @ r < 0.25, r[0], smooth(r)), (None,)),
 }
 
 
@@ -55,6 +57,25 @@ def test_signs(name, boxed, scene, monkeypatch):
     box = jfrnn.Box(np.full(3, SIDE)) if boxed else None
     jax.make_jaxpr(jax.grad(lambda x, data: weighted(fn, x, data, box=box), (0, 1)))(x, data)
     assert exchange.signs_of(seen[0]) == expected
+
+
+@pytest.mark.parametrize("name", ["even", "odd"])
+def test_forces_of_weighted_sums(name, scene):
+    """Cotangents of i and j, which differ, are added, or subtracted where the summand changes sign; against all pairs at once."""
+    x, (fn, _), near = scene[0], FUNCTIONS[name], np.zeros((N, N), bool)
+    near[tuple(zip(*reference.reference_pairs(x, CUTOFF), strict=True))] = True
+
+    def plain(x):
+        terms = jax.vmap(jax.vmap(lambda r: fn(r, None, None)))(x[None] - x[:, None])
+        return jnp.sum(jnp.where(near.reshape(N, N, *[1] * (terms.ndim - 2)), terms, 0), axis=1)
+
+    def force(sums):
+        weights = jnp.sin(jnp.arange(1.0, 1 + N))
+        return jax.jit(jax.grad(lambda x: jnp.sum(weights @ sums(x))))(x)
+
+    found, expected = force(lambda x: jfrnn.pair_sum(fn, x, CUTOFF, backend="brute")), force(plain)
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
+    assert np.abs(expected).max() > 0.1
 
 
 @pytest.mark.parametrize("name", ["several", "differences"])

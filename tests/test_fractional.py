@@ -77,6 +77,17 @@ def test_lists_flat_lists_and_counts(name, dtype, backend):
 CELLS = np.stack([SKEWED, 0.4 * SKEWED, 2.5 * SKEWED[::-1]])
 
 
+def test_queries_count_the_vectors_of_their_own_system():
+    """As many queries as particles, of other systems: whoever takes the systems of the others has shapes that fit."""
+    dtype, u, q, of_u, of_q = np.float32, points(np.float32), points(np.float32, 1), np.arange(N) % 3, np.arange(N) // 8
+    cells = CELLS.astype(dtype)
+    box = jfrnn.Box(cells, fractional=True)
+    x, y = (np.concatenate([exact(p[None], cells[k], dtype) for p, k in zip(*each)]) for each in ((u, of_u), (q, of_q)))
+    expected = oracle_of_systems(cells, x, of_u, 0.5, queries=y, query_batch=of_q)
+    counts = jfrnn.count(u, 0.5, queries=q, box=box, batch=(of_u, of_q))
+    np.testing.assert_array_equal(counts, np.bincount([i for i, _, _ in expected], minlength=N))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", ["warp", "jax", "brute"])
 def test_systems_with_skins_in_boxes_that_change(backend):

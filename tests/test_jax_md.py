@@ -191,6 +191,7 @@ def test_several_images(form, fractional):
         assert len(found) == len(within) == nbrs.n_edges
         assert not nbrs.did_buffer_overflow
     assert fns.update(given, nbrs, box=0.2 * jnp.asarray(matrix)).did_buffer_overflow
+    assert fns.update(given.at[2, 0].set(jnp.nan), nbrs).did_buffer_overflow  # though there is room for all that are found
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -130,6 +130,17 @@ def test_more_numbers_than_are_summed_together_stay_apart():
     assert_near(two, 2 * one)
 
 
+def test_a_compensated_sum_stays_apart_from_others():
+    x, m = jnp.asarray(X, jnp.float32), jnp.asarray(M, jnp.float32)
+
+    def both(x, m):
+        return [density(x, m, compensated=each) for each in (False, True)]
+
+    assert count_calls(both, x, m) == 2
+    for found, alone in zip(jax.jit(both)(x, m), both(x, m), strict=True):
+        np.testing.assert_array_equal(found, alone)
+
+
 def test_many_operations_before_a_sum_take_no_time():
     """Each is an operand of the next one twice: who followed all ways through them would not come to an end."""
 

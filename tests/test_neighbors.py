@@ -48,9 +48,10 @@ def test_mask_is_the_exact_test_at_the_new_positions(dtype, dim):
 
 def test_distances_do_not_underflow(dtype):
     tiny = np.array([[0, 0], [3e-25, 4e-25]], dtype)
-    d, mask = jfrnn.search(tiny, 1e-24).distances(tiny)
-    assert mask[0, 0]
-    np.testing.assert_allclose(d[0, 0], 5e-25, rtol=1e-6)
+    for half in (False, True):  # by a kernel, and by `norms`
+        d, mask = jfrnn.search(tiny, 1e-24, half=half).distances(tiny)
+        assert mask[0, 0]
+        np.testing.assert_allclose(d[0, 0], 5e-25, rtol=1e-6)
 
 
 def test_queries(points):

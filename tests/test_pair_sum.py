@@ -340,7 +340,7 @@ def test_many_blocks(backend, monkeypatch):
     monkeypatch.setattr(_tuning, "CPU", _tuning.CPU._replace(words=64 * 25, few_pairs=0, plain_pairs=0))
     monkeypatch.setattr(_relations, "_LIST_SLOTS", 25 * 32 * 4)
     (x, m), weights = scene(0), jnp.arange(2.0)
-    given = {"neighbors": jfrnn.search(x, CUTOFF, capacity=47, backend="warp")} if backend == "list" else {"backend": backend}
+    given = {"neighbors": jfrnn.search(x, CUTOFF, capacity=47, backend="brute")} if backend == "list" else {"backend": backend}
 
     def fn(weights, r, i, j):
         return j * jnp.tanh(weights @ r)
@@ -509,6 +509,21 @@ def test_of_equal_extremes_the_smallest_index_counts():
     np.testing.assert_array_equal(rows[48:], [47, -np.inf])
 
 
+def test_of_equal_extremes_array_programs_choose_likewise():
+    x, m = jnp.zeros((9, 2)).at[8].set(9.0), jnp.asarray([1.0, 3.0, 2.0, 3.0, 3.0, 0.0, 1.0, 2.0, 4.0])
+
+    @jax.jit
+    def largest(m):
+        rows = jfrnn.pair_sum(lambda r, i, j: j, x, 1.0, m, reduce="max", backend="brute")
+        return jnp.sum(rows[:8]), rows
+
+    gradient, rows = jax.grad(largest, has_aux=True)(m)
+    np.testing.assert_array_equal(gradient, [0, 7, 0, 1, 0, 0, 0, 0, 0])  # 3 is what 1 itself has
+    np.testing.assert_array_equal(rows, [3.0] * 8 + [-np.inf])
+    _, rows = largest(m.at[5].set(jnp.nan))
+    assert np.flatnonzero(np.isnan(rows)).tolist() == [0, 1, 2, 3, 4, 6, 7]  # NaN is not hidden
+
+
 @pytest.mark.parametrize("backend", ["list", pytest.param("jax", marks=SLOW), pytest.param("brute", marks=SLOW)])
 def test_rounding(backend):
     """Sums of many terms against exact ones: the bound of the docstring, and with compensation a far smaller one."""
@@ -530,6 +545,42 @@ def test_rounding(backend):
     bound = 2 * eps * abs(exact) + 4 * eps**2 * n * total
     assert np.abs(compensated - exact).max() <= bound
     assert np.abs(plain - exact).max() > 10 * bound  # else this would prove nothing
+
+
+def test_derivatives_of_compensated_sums_are_compensated():
+    """Those by the factors of i are the sums of the others, in which almost all cancels."""
+    n, eps, random = 500, np.finfo(np.float32).eps, np.random.default_rng(0)
+    values = (random.standard_normal(n) * 10 ** random.uniform(-3, 5, n)).astype(np.float32)
+    values[n // 2 :] = -values[: n // 2] * np.float32(1 + 1e-5)
+    x, ones = jnp.zeros((n, 2), jnp.float32), jnp.ones(3, jnp.float32)
+
+    def slopes(compensated):
+        given = {"queries": x[:3], "compensated": compensated, "backend": "warp"}
+        total = lambda w: jfrnn.pair_sum(lambda r, i, j: i * j, x, 1.0, values, query_values=w, **given).sum()  # noqa: E731
+        return np.asarray(jax.grad(total)(ones), np.float64)
+
+    exact, total = math.fsum(values.tolist()), math.fsum(np.abs(values).tolist())
+    bound = 2 * eps * abs(exact) + 4 * eps**2 * n * total
+    assert np.abs(slopes(True) - exact).max() <= bound
+    assert np.abs(slopes(False) - exact).max() > 10 * bound  # else this would prove nothing
+
+
+def test_derivatives_by_what_all_pairs_share_are_compensated():
+    """They are one sum over all pairs, which kernels add in parts: what these lost to rounding is not lost again."""
+    n, eps, random = 500, np.finfo(np.float32).eps, np.random.default_rng(0)
+    values = (random.standard_normal(n) * 10 ** random.uniform(-3, 5, n)).astype(np.float32)
+    values[n // 2 :] = -values[: n // 2] * np.float32(1 + 1e-5)
+    x = jnp.zeros((n, 2), jnp.float32)
+
+    def slope(compensated):
+        given = {"include_self": True, "compensated": compensated, "backend": "warp"}
+        total = lambda c: jfrnn.pair_sum(lambda r, i, j: c * j, x, 1.0, values, **given).sum()  # noqa: E731
+        return float(jax.grad(total)(jnp.float32(1)))
+
+    exact, size = n * math.fsum(values.tolist()), n * math.fsum(np.abs(values).tolist())
+    bound = 2 * eps * abs(exact) + 4 * eps**2 * n * size  # n is the root of the number of pairs
+    assert abs(slope(True) - exact) <= bound
+    assert abs(slope(False) - exact) > 10 * bound  # else this would prove nothing
 
 
 # --- transformations, memory, errors -----------------------------------------------------------------------------------------

@@ -245,6 +245,7 @@ def test_few_particles_take_one_launch():
     found = warp_sums._plan_few(variant, plan.text, {name: (40, 3) for name in warp_sums._GIVEN}, 132)
     (launch,) = found.steps
     assert launch.threads // launch.kernel.block == few_cuda.blocks(40) == 5
+    assert [few_cuda.blocks(m) * few_cuda.warps(m) for m in (1, 41, 1025, 4095)] == [8, 48, 1040, 4096]  # everyone is served
     assert [few_cuda.warps(m) for m in (0, 1, 1024, 1025, 2048, 2049, few_cuda.MOST)] == [8, 8, 8, 16, 16, 32, 32]
     arrays = {*warp_sums._GIVEN, *warp_sums._RESULTS}
     assert {field.name for field in launch.kernel.fields} <= arrays | {*found.numbers, *EXCLUDED}

@@ -143,7 +143,7 @@ def heavy(r, i, j):
     return jnp.sin(j * jnp.linspace(0.01, 0.03, 8, dtype=j.dtype)).sum()
 
 
-@pytest.mark.parametrize("fn", [light, heavy])
+@pytest.mark.parametrize("fn", [light, pytest.param(heavy, marks=pytest.mark.slow)])
 def test_extremes_among_more_candidates_than_fit(fn):
     """Of equal ones that of the smallest index; NaN is not hidden; rows without neighbors."""
     n = 3000

@@ -13,7 +13,7 @@ import reference
 from test_box import image_pairs, masked_images
 
 import jfrnn
-from jfrnn._geometry.cutoffs import RULES, is_radius, smallest_cutoff
+from jfrnn._geometry.cutoffs import RULES, Radii, is_radius, make_cutoffs, smallest_cutoff
 from jfrnn.cases.radii import RADII_CASES
 
 SLOW = pytest.mark.slow
@@ -216,6 +216,16 @@ def test_spheres_touch_at_the_sum_of_their_radii(backend, dtype):
     assert set(zip(*(part.tolist() for part in nbrs.pairs()))) == touching(x, h, x[:9] + dtype(0.125), h[:9])
 
 
+def test_lists_of_spheres_grow_with_the_radii_they_have():
+    """A chunk that does not say cutoffs grows its list with those of the list: the radii, not the sums for which it keeps them."""
+    rng = np.random.default_rng(6)
+    x, h = rng.random((60, 2)).astype(np.float32), rng.uniform(0, 0.2, 60).astype(np.float32)
+    nbrs = jfrnn.search(x, h, radius_rule="sum", capacity=1)
+    _, grown = jfrnn.run_chunk(jax.jit(lambda x, n: (x, n.update(x))), jnp.asarray(x), nbrs, lambda x: x)
+    assert set(zip(*(part.tolist() for part in grown.pairs()))) == touching(x, h)
+    np.testing.assert_array_equal(grown.radii.sources, nbrs.radii.sources)
+
+
 @pytest.mark.slow
 def test_spheres_that_grow():
     rng = np.random.default_rng(5)
@@ -324,3 +334,27 @@ def test_valid_cutoffs_are_told_alike_on_the_host():
         assert isinstance(valid, np.ndarray)
         np.testing.assert_array_equal(valid, is_radius(jnp.asarray(radii)))
         assert valid[:4].tolist() == [True, True, True, False]
+
+
+@pytest.mark.parametrize("backend", ["warp", "jax"])
+def test_cutoffs_between_two_powers_of_two_reach_as_far_as_the_largest_of_them(backend):
+    """Cells half as wide as the largest cutoff are wider than some cutoffs of a group, the last ones, but not than all of them."""
+    n, radii = 160, np.repeat([1.9, 0.99, 0.6], [2, 118, 40])  # more than are tested without cells
+    x = 3 * np.random.default_rng(14).random((n, 3))
+    x[2:120:2, 0], x[3:120:2, 0] = 0.94, 1.91  # on either side of such a cell
+    x[3:120:2, 1:] = x[2:120:2, 1:]
+    nbrs = jfrnn.search(jnp.asarray(x), radii, radius_rule="mean", capacity=CAPACITY, backend=backend)
+    found = reference.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), n)
+    assert set(found) == {pair[:2] for pair in reference.reference_radii(x, radii, "mean")}
+
+
+def test_a_skin_is_added_to_cutoffs_and_rounded_up(dtype):
+    """The smallest float from which on a list holds all pairs that its skin promises."""
+    radii, skin = np.random.default_rng(15).uniform(0.1, 9, 100).astype(dtype), dtype(0.3)
+    cutoffs = make_cutoffs(Radii(jnp.asarray(radii), None, "scatter"), False, float(skin))
+    below = np.nextafter(np.asarray(cutoffs.sources), dtype(0))
+    nearest = 0
+    for radius, whole, less in zip(radii.tolist(), np.asarray(cutoffs.sources).tolist(), below.tolist(), strict=True):
+        assert Fraction(less) < Fraction(radius) + Fraction(float(skin)) <= Fraction(whole)
+        nearest += float(dtype(radius) + skin) == whole
+    assert 10 < nearest < 90  # else all, or none, were rounded up

@@ -92,7 +92,9 @@ DERIVED = [("full", "open", True), ("full", "images", False), ("half", "nearest"
 DERIVED += [("queries", "images", True), ("gather", "open", False)]
 
 
-@pytest.mark.parametrize(("kind", "box", "reverse"), DERIVED)
+@pytest.mark.parametrize(
+    ("kind", "box", "reverse"), [pytest.param(*each, marks=[pytest.mark.slow] * (k % 3 == 2)) for k, each in enumerate(DERIVED)]
+)
 def test_derivatives_are_those_of_scattering(kind, box, reverse):
     """Against plain indexing, whose derivatives JAX scatters: first and second order, in positions, queries and the box."""
     nbrs, x, q = make(kind, "warp", box, reverse=reverse)
@@ -119,6 +121,15 @@ def test_derivatives_are_those_of_scattering(kind, box, reverse):
         return jax.jit(lambda: (jax.grad(f, which)(x, q, a), slope(x), jax.jvp(of_x, (x,), (x,))[1]))()
 
     jax.tree.map(lambda p, r: np.testing.assert_allclose(p, r, atol=1e-11), derivatives(ours), derivatives(scattering))
+
+
+@pytest.mark.parametrize("kind", ["half", "queries"])
+def test_array_programs_derive_the_same(kind):
+    """They add the slots of each source by groups, of which the last one is not full."""
+    nbrs, x, q = make(kind, "warp", "nearest")
+    slopes = [jax.jit(jax.grad(lambda x, k=k: jnp.sum(k.vectors(x, queries=q)[0] ** 3)))(x) for k in (nbrs, by_arrays(nbrs))]
+    np.testing.assert_allclose(*slopes, atol=1e-12)
+    assert np.abs(slopes[0]).max() > 0.1
 
 
 @pytest.mark.parametrize("kind", ["full", "half"])

@@ -137,6 +137,16 @@ def test_overflow_sets_the_bit_and_keeps_true_counts(capacity, backend):
     assert all(k <= t and len(k) == min(len(t), capacity) for k, t in zip(kept, true, strict=True))
 
 
+@pytest.mark.parametrize("backend", ["warp", "hashgrid"])
+def test_one_neighbor_too_many_sets_the_bit(backend):
+    points = random_points(300, 2, np.float32)
+    required = int(jfrnn.count(points, 0.3).max())
+    for capacity in (required - 1, required):
+        nbrs = jax.jit(lambda x, capacity=capacity: jfrnn.search(x, 0.3, capacity=capacity, backend=backend))(points)
+        assert jfrnn.Status(int(nbrs.status)) == (jfrnn.Status.ROW_OVERFLOW if capacity < required else jfrnn.Status(0))
+        assert int(nbrs.required) == required
+
+
 # --- data that no shape can reveal ----------------------------------------------------------------------------------------
 
 
@@ -161,11 +171,21 @@ def test_non_finite_positions_set_a_bit_and_spare_the_others(value, backend, dty
         nbrs.check()
 
 
-def test_non_finite_queries_set_the_bit():
+@pytest.mark.parametrize("backend", ["warp", "jax"])
+def test_non_finite_queries_set_the_bit(backend):
     queries = np.array([[0.5, np.nan]], np.float32)
-    nbrs = jfrnn.search(random_points(10, 2, np.float32), 0.3, queries=queries)
+    nbrs = jfrnn.search(random_points(10, 2, np.float32), 0.3, queries=queries, capacity=16, backend=backend)
+    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
     with pytest.raises(ValueError, match="queries"):
         nbrs.check()
+
+
+def test_counts_that_are_not_known_raise_or_are_no_numbers():
+    points = random_points(100, 3, np.float32)
+    points[17, 2] = np.nan
+    with pytest.raises(ValueError, match=r"positions\[17\] is"):
+        jfrnn.count(points, 0.3)
+    assert np.flatnonzero(np.asarray(jax.jit(lambda x: jfrnn.count(x, 0.3))(points)) < 0).tolist() == [17]
 
 
 def test_all_positions_non_finite(dim):

@@ -7,6 +7,7 @@ import pytest
 import reference
 
 import jfrnn
+from jfrnn._engine.rows import add_up
 
 LENGTHS = {"open": None, "nearest": [1.0, 1.0, 1.0], "images": [0.5, 0.3, 1.0]}
 N, CUTOFF = 60, 0.3
@@ -255,3 +256,29 @@ def test_a_line_says_what_the_list_is():
     many = jax.vmap(lambda x: jfrnn.search_edges(x, 1.0, total=8, backend="warp"))(x[None])
     assert repr(many) == "EdgeList(batch of [1], 5 particles, total 8, cutoff 1, engine 'warp', 20 pairs, status TOTAL_OVERFLOW)"
     assert "total None" in repr(jax.tree.map(lambda _: None, one))  # whatever stands where arrays stood
+
+
+def test_where_rows_begin_never_wraps():
+    """Counts whose sums leave int32 once, and come back to where they look right."""
+    counts = np.array([5, 2**30, 0, 2**30, 2**31 - 1, 2**31 - 1, 7], np.int32)
+    exact = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+    wrapped = np.cumsum(counts, dtype=np.int32)
+    assert (wrapped[exact[1:] >= 2**31] >= 0).any()
+    np.testing.assert_array_equal(jax.jit(add_up)(jnp.asarray(counts)), np.minimum(exact, 2**31 - 1))
+    np.testing.assert_array_equal(jax.jit(add_up)(jnp.asarray(counts[:3])), exact[:4])
+
+
+@pytest.mark.parametrize(("backend", "include_self"), [("warp", False), ("warp", True), ("jax", False)])
+def test_own_images_in_half_lists(backend, include_self):
+    """They are listed once, and so counted, with and without a program, where both ends of a pair are one particle."""
+    x, lengths = points(5), np.array([0.25, 0.25, 0.25])
+    given = {"half": True, "include_self": include_self}
+    expected = reference.reference_images(x, CUTOFF, matrix=np.diag(lengths), periodic=(True,) * 3, **given)
+    assert sum(i == j for i, j, _ in expected) == 5 * (3 + include_self)
+    nbrs = jfrnn.search_edges(x, CUTOFF, box=jfrnn.Box(lengths), backend=backend, **given)
+    nbrs.check()
+    assert nbrs.total == -(-len(expected) // 8) * 8
+    assert edges_as_set(nbrs.edges(x)) == expected
+    rows = jfrnn.search(x, CUTOFF, box=jfrnn.Box(lengths), backend=backend, **given)
+    rows.check()
+    np.testing.assert_array_equal(rows.count, np.bincount([i for i, *_ in expected], minlength=5))

@@ -59,13 +59,13 @@ def pairs_and_shifts(idx, shifts, mask):
     return set(zip(i.tolist(), np.asarray(idx)[i, k].tolist(), map(tuple, np.asarray(shifts)[i, k].tolist()), strict=True))
 
 
-OFTEN = {("gather", "open"), ("scatter", "nearest"), ("either", "systems"), ("both", "skewed"), ("species", "images")}
+OFTEN = {("scatter", "nearest"), ("either", "systems"), ("species", "images")}
 
 
 def each_kind():
     for who, kind, backend, dtype in product(WHO, BOXES, ("warp", "jax", "brute"), (np.float32, np.float64)):
         often = (who, kind) in OFTEN and backend == "warp" and dtype == np.float32
-        often = often or (who, kind, backend, dtype) == ("species", "open", "jax", np.float32)
+        often = often or (who, kind, backend, dtype) == ("both", "open", "jax", np.float64)
         yield pytest.param(who, kind, backend, dtype, marks=[] if often else [SLOW])
 
 

@@ -192,6 +192,7 @@ def test_what_is_the_same_bit_by_bit_is_written_once():
     lines = translated(lambda x, y: (x - y) * x + (x - y) ** 2 + (y - x) ** 2 * (y - x), x, y).text.splitlines()
     assert sum("v0 * v0" in line for line in lines) == 1
     assert len(lines) == 8
+    assert "v1 * v1" in translated(lambda x, y: y / x + (x / y) ** 2, x[0], y[0]).text  # of a quotient, not of its reciprocal
     assert "in0_0 * Math::of(0x1.0000000000000p-3f)" in translated(lambda x: x / 8, x).text
     assert "in0_0 * Math::of(0x1.5555560000000p-2f)" in translated(lambda x: x / 3, x).text
     assert "Math::div" not in translated(jax.grad(lambda x: jnp.maximum(x, 0)), np.float32(1)).text

@@ -14,7 +14,7 @@ from jfrnn._geometry.cutoffs import make_cutoff
 from jfrnn._triangles import cells as _triangles_cells
 from jfrnn._triangles import tree as _triangles_tree
 from jfrnn._triangles import warp as _triangles_warp
-from jfrnn.cases.triangles import TRIANGLE_CASES, padded
+from jfrnn.cases.triangles import TRIANGLE_CASES, TriangleInput, padded
 
 BACKENDS = ("jax", "warp", "bvh")
 IN_CELLS = ("jax", "warp")
@@ -68,6 +68,37 @@ def test_every_case_as_it_is(name, dtype, dim):
     given = TRIANGLE_CASES[name].build(dtype, dim)
     tri = jfrnn.search_triangles(given.positions, given.vertices, given.faces, given.cutoff)
     assert_exact(tri, expected_pairs(name, dtype, dim))
+
+
+@pytest.mark.parametrize(("backend", "dtype"), [("jax", np.float32), ("warp", np.float64)])  # of which some take integers
+def test_particles_at_the_cutoff_beside_each_side(backend, dtype):
+    """They lie beyond one side alone, in its plane or at any angle to it: near the plane, but the side decides."""
+    random, cutoff, eps = np.random.default_rng(11), 0.3, float(np.finfo(dtype).eps)
+    corners = random.uniform(-3, 3, (16, 1, 3)) + random.uniform(-1, 1, (16, 3, 3))
+    along = np.roll(corners, -1, axis=1) - corners
+    normal = np.cross(along[:, 0], along[:, 1])[:, None]
+    across, up = (v / np.linalg.norm(v, axis=2, keepdims=True) for v in (np.cross(along, normal), normal))
+    angle = random.uniform(-1.2, 1.2, (16, 3, 1)) * random.integers(0, 2, (16, 3, 1))
+    away = cutoff * (1 + eps * random.integers(-2, 3, (16, 3, 1))) * (np.cos(angle) * across + np.sin(angle) * up)
+    x = (corners + along * random.uniform(0.2, 0.8, (16, 3, 1)) + away).reshape(48, 3).astype(dtype)
+    vertices, faces = corners.reshape(48, 3).astype(dtype), np.arange(48, dtype=np.int32).reshape(16, 3)
+    wide = padded(TriangleInput(x, vertices, faces, cutoff))
+    tri = jfrnn.search_triangles(wide.positions, wide.vertices, wide.faces, cutoff, capacity=CAPACITY, backend=backend)
+    assert_exact(tri, reference.triangle_pairs(x, vertices, faces, cutoff))
+    near = np.any(np.asarray(tri.idx) == np.repeat(np.arange(16), 3)[:, None], axis=1)
+    assert 10 < near.sum() < 38
+
+
+@pytest.mark.parametrize("backend", ["warp", "bvh"])
+def test_where_floats_are_farther_apart_than_the_cutoff(backend):
+    """A box, widened by the cutoff, is as large as before: the particles on its border are in it."""
+    random = np.random.default_rng(12)
+    vertices = (2.0**27 + 16 * random.integers(-3, 4, (48, 3))).astype(np.float32)
+    x, faces = vertices[random.permutation(48)], np.arange(48, dtype=np.int32).reshape(16, 3)
+    wide = padded(TriangleInput(x, vertices, faces, 1.0))
+    tri = jfrnn.search_triangles(wide.positions, wide.vertices, wide.faces, 1.0, capacity=CAPACITY, backend=backend)
+    assert_exact(tri, reference.triangle_pairs(x, vertices, faces, 1.0))
+    assert int(tri.count.sum()) >= 48
 
 
 def wall(dtype=np.float32, origin=0.0):
@@ -172,6 +203,10 @@ def test_a_loop_with_a_wall_that_moves():
     after, seen = fall(x, tri)
     assert seen.overflow
     assert int(seen.required) == 2
+    _, past = fall(after, seen)
+    assert not np.any(past.count)
+    assert past.overflow
+    assert int(past.required) == 2
     grown = seen.grow(after)
     grown.check()
     assert grown.capacity == 8

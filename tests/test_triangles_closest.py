@@ -100,6 +100,21 @@ def test_signed_distance_to_a_cube():
     expected = distance_to_cube(x)
     assert np.array_equal(signed.mask, np.abs(expected) < 1)
     assert np.allclose(np.where(signed.mask, expected, 0), signed.distance, atol=1e-14)
+    clear, steps = np.asarray(signed.mask)[8:] & (np.abs(expected[8:]) > 1e-3), 1e-6 * np.eye(3)
+    slopes = np.stack([distance_to_cube(x[8:] + step) - distance_to_cube(x[8:] - step) for step in steps], axis=1) / 2e-6
+    assert np.allclose(np.asarray(signed.normal)[8:][clear], slopes[clear], atol=1e-5)
+    assert min(np.sum(expected[8:][clear] < 0), np.sum(expected[8:][clear] > 0)) > 30
+
+
+def test_signed_distance_to_a_wall_that_has_moved():
+    """Rows know the wall where it was, sides and distances are those of where it is."""
+    x, by = np.random.default_rng(2).uniform(-1.6, 1.6, (200, 3)), np.array([0.3, -0.2, 0.1])
+    tri = cube_list(x, np.float64)
+    signed, expected = tri.signed_distance(x, vertices=tri.vertices + by), distance_to_cube(x - by)
+    known = np.abs(expected) < 0.6  # nearer than what moves in from beyond the cutoff
+    assert signed.watertight
+    assert np.allclose(np.asarray(signed.distance)[known], expected[known], atol=1e-14)
+    assert min(np.sum(expected[known] < 0), np.sum(expected[known] > 0)) > 30
 
 
 def test_the_nearest_of_each_row_is_found_in_blocks_and_chunks(monkeypatch):
@@ -192,6 +207,46 @@ def around(dim, dtype):
     return np.concatenate([random_points, level]).astype(dtype)
 
 
+def test_sides_of_a_wall_that_is_open():
+    """A spike without a bottom, one of whose three sides is a triangle and the others fans of many: angles are the weights."""
+    corners = np.array([[np.cos(a), np.sin(a), 0] for a in (0, 2 * np.pi / 3, 4 * np.pi / 3)]) * 0.3
+    share = np.arange(1, 6)[:, None] / 6
+    ring = [corners[:2], *((1 - share) * a + share * b for a, b in zip(corners[1:], corners[[2, 0]], strict=True))]
+    ring = np.concatenate([*ring[:2], corners[2:], ring[2]])
+    named = np.arange(1, len(ring) + 1)
+    wall = np.concatenate([[[0, 0, 1.0]], ring]), np.stack([np.zeros_like(named), named, np.roll(named, -1)], axis=1)
+    outward = np.cross(corners - [0, 0, 1], np.roll(corners, -1, axis=0) - [0, 0, 1])
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    random = np.random.default_rng(4)
+    beyond = random.dirichlet(np.full(3, 0.3), 120) @ outward * random.uniform(0.01, 0.5, (120, 1))
+    within = random.dirichlet(np.ones(3), 80) @ corners * 0.9
+    height = random.uniform(0.5, 0.9, (80, 1))
+    tip = np.array([0, 0, 1.0])
+    x = np.concatenate([tip + beyond, within * (1 - height) + tip * height])
+    vertices, faces = joined(wall)
+    tri = jfrnn.search_triangles(x, vertices, faces, 1.0, capacity=48, backend="bvh")
+    signed = tri.signed_distance(x)
+    assert not signed.watertight
+    assert np.all(signed.mask)
+    assert np.allclose(signed.distance[:120], np.linalg.norm(beyond, axis=1), atol=1e-14)
+    assert np.all(np.asarray(signed.distance[120:]) < 0)
+
+
+def test_a_wall_with_a_lost_corner_is_not_watertight():
+    """It has a hole there, through which rays go; the sides of the other faces are those of the cube."""
+    vertices, faces = meshes.cube(2.0, 2)
+    x = np.random.default_rng(5).uniform(-1.6, 1.6, (200, 3))
+    at = int(np.argmax(vertices.sum(axis=1)))  # a corner of the cube
+    vertices[at] = np.nan
+    tri = jfrnn.search_triangles(x, vertices, faces, 1.0, capacity=48, backend="bvh")
+    signed, expected = tri.signed_distance(x), distance_to_cube(x)
+    assert tri.closed
+    assert not signed.watertight
+    clear = np.asarray(signed.mask) & (x.max(axis=1) < 0)
+    assert np.allclose(np.asarray(signed.distance)[clear], expected[clear], atol=1e-14)
+    assert clear.sum() > 10
+
+
 WALLS = [(dim, name) for dim in (2, 3) for name in walls(dim)]
 
 
@@ -234,22 +289,40 @@ def test_signs_are_those_of_the_union(dim, name, dtype, backend):
     assert np.allclose(np.abs(distance[mask]), nearest[mask], rtol=1e-6)
 
 
+@jax.jit
+def cast_both_ways(vertices, faces, x):
+    """Return what rays of arrays tell, and those of kernels: which points are inside, and which are left open."""
+    corners, good, dtype = vertices[faces], jnp.ones(len(faces), bool), np.dtype(x.dtype)
+    cutoff = make_cutoff(0.25, dtype, closed=False)
+    tree, rays = grow_tree(corners, good, cutoff), ray_ways(x.shape[1], dtype)
+    given = tree, corners, x, rays, jnp.ones(len(x), bool), least_winding(corners, good), cutoff
+    return cast_rays(*given), _triangles_warp.cast_rays(*given)
+
+
+def test_rays_from_within_rounding_of_a_face(dtype):
+    """They tell the right side, or none; those of kernels tell it wherever positions are float32."""
+    random = np.random.default_rng(6)
+    turn = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
+    vertices, faces = joined((walls(2)["one"][0][0] @ turn.T, walls(2)["one"][0][1]))
+    vertices, share = vertices.astype(dtype), random.uniform(0.1, 0.9, (200, 1))
+    start, end = (vertices[faces[np.arange(200) % 4, k]].astype(float) for k in range(2))
+    x = ((1 - share) * start + share * end).astype(dtype)
+    expected, on_face = expected_side(x, vertices, faces)
+    for k, (inside, unknown) in enumerate(cast_both_ways(vertices, faces, x)):
+        sure = ~np.asarray(unknown) & ~on_face
+        assert np.array_equal(np.asarray(inside)[sure], expected[sure])
+        assert (sure | on_face).all() == (k == 1 and dtype == np.float32)
+    assert 50 < expected.sum() < 150
+
+
 @pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])  # in 3D the next test does, with one wall
 @pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
 def test_rays_without_warp(dim, dtype):
-    """Rays of arrays tell the sides that those of kernels do, also of points as near as rounding, or leave them open."""
-
-    @jax.jit
-    def both(vertices, faces, x):
-        corners, good, cutoff = vertices[faces], jnp.ones(len(faces), bool), make_cutoff(0.25, np.dtype(dtype), closed=False)
-        tree, rays = grow_tree(corners, good, cutoff), ray_ways(dim, np.dtype(dtype))
-        given = tree, corners, x, rays, jnp.ones(len(x), bool), least_winding(corners, good), cutoff
-        return cast_rays(*given), _triangles_warp.cast_rays(*given)
-
+    """Rays of arrays tell the sides that those of kernels do, or leave them open."""
     for name, parts in walls(dim).items():
         vertices, faces = joined(*parts)
         vertices, x = vertices.astype(dtype), around(dim, dtype)
-        (inside, unknown), (surely, still) = both(vertices, faces, x)
+        (inside, unknown), (surely, still) = cast_both_ways(vertices, faces, x)
         expected, on_face = expected_side(x, vertices, faces, name)
         for told, sure in ((inside, ~np.asarray(unknown)), (surely, ~np.asarray(still))):
             assert (sure | on_face)[:-60].all()

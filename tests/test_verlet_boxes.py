@@ -51,6 +51,7 @@ def test_positions_that_are_wrapped_in_every_step_cost_no_lists(backend, dtype):
 LONG = np.array([[1.0, 0.0, 0.0], [30.3, 1.1, 0.0], [-17.2, 21.1, 0.9]]) @ np.linalg.qr(SKEWED + 1)[0]
 KINDS = {
     "long": (jfrnn.Box(LONG), 0.8),
+    "long, own images": (jfrnn.Box(LONG), 1.15),
     "orthogonal": (jfrnn.Box([0.7, 1.6, 1.1], origin=[-0.2, 0.1, 0.0]), 0.9),
     "skewed": (jfrnn.Box(SKEWED), 0.8),
     "slab": (jfrnn.Box(SKEWED, periodic=(True, False, True)), 0.8),
@@ -64,6 +65,7 @@ EACH = [
     (np.float32, "orthogonal", "half"),
     (np.float64, "nearest", "own"),
     (np.float64, "long", "half"),
+    (np.float64, "long, own images", "half"),
 ]
 ALL = [(dtype, kind, asked) for dtype in (np.float32, np.float64) for kind in KINDS for asked in ("own", "half", "queries")]
 

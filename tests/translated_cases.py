@@ -190,6 +190,7 @@ SHAPES = {
     "extremes": shaped(
         lambda a: (a.max(), a.min(0), (a > 0).any(), (a > -1).all(1), (a > 0).sum(), jnp.bitwise_xor.reduce(a > 0, axis=0)), (2, 3)
     ),
+    "extremes of nothing": shaped(lambda a: (a[:0].min(0, initial=9), a[:0].max(0, initial=-9)), (2, 3)),
     "running": shaped(
         lambda a: (jnp.cumsum(a, 1), jnp.cumprod(a, 0), lax.cummax(a, 1), lax.cummin(a, 1, reverse=True)), (2, 3), ulp=2, scale=4
     ),

@@ -40,7 +40,10 @@ struct Scan : SearchArguments, Cells, Scratch {
           self_lanes(0) {
         const real off = PERIODIC ? 2 * lattice.slack() * step_scale : real(0);  // by which distances of images may be wrong
         const real inner = step_radius > off ? step_radius - off : real(0), outer = step_radius + off;
-        // 7 roundings of eps/2, 5 in a square and 2 in a bound (jfrnn/_geometry/exact.py); images are farther off
+        // 7 roundings of eps/2, 5 in a square and 2 in a bound (jfrnn/_geometry/exact.py). Of images, that of `inner` counts twice:
+        // 4.5 eps. Their band is wider than it need be, since `off` is more than what images may be wrong by, too: no more than 1.74
+        // times the slack, the length of three errors, which would have to be the worst along each axis. Who is in a wider band is
+        // decided exactly.
         const real band = (PERIODIC ? 8 * (1 + PERIODIC) : 4) * step_eps, unit = shared.unit;
         const real between = !SCALED && unit > 0 ? real(square_between(radius, unit, closed)) * unit * unit : real(0);
         inside = between > 0 ? between : inner * inner * (1 - band);

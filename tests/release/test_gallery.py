@@ -7,7 +7,7 @@ import pytest
 
 from experiments.pages import gallery
 
-PAGE = Path(__file__).parent.parent / "docs" / "gallery.md"
+PAGE = Path(__file__).parents[2] / "docs" / "gallery.md"
 
 
 def test_every_program_is_shown():

@@ -20,7 +20,7 @@ def choose(backend):
     for warning in caught:
         print(warning.category.__name__, warning.filename, warning.message)
 """
-DAMAGED, BEGUN = (Path(__file__).with_name(name) for name in ("damaged.py", "begun.py"))
+DAMAGED, BEGUN = (Path(__file__).parents[1] / name for name in ("damaged.py", "begun.py"))
 
 
 def run(*command, cache, limits=""):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 def test_pyright_finds_no_error():
     """A worker that waits for pyright leaves the others all cores but one."""
-    root = Path(__file__).parent.parent
+    root = Path(__file__).parents[2]
     found = subprocess.run(
         [sys.executable, "-m", "pyright", "--pythonpath", sys.executable], cwd=root, capture_output=True, text=True, check=False
     )

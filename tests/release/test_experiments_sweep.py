@@ -18,7 +18,7 @@ from experiments import _config, _machine, _measure, _rows, _sweep, _worker
 from experiments._cli import app
 from experiments._errors import UsageError
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 METHODS = ["jax", "warp", "cll", "scipy-kdtree", "scipy-kdtree-nolist"]  # each a process or two; test_experiments_methods has all
 KDTREES = 'methods = ["scipy-kdtree", "scipy-kdtree-nolist"]\n'
 QUICK = "spacing = 5e-4\nrepeats = 5\nmin_seconds = 0.0\n"

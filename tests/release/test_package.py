@@ -2,8 +2,10 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from email import message_from_bytes
@@ -14,7 +16,7 @@ import pytest
 
 import jfrnn
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 SEARCH = """
 import doctest, jfrnn, numpy as np
 import jfrnn.cases.hard, jfrnn.distributed
@@ -61,6 +63,36 @@ def test_wheel_holds_the_library_alone(wheel):
     assert {Path(name).suffix for name in names if not name.startswith("jfrnn-")} == {".py", ".typed", ".h", ".cuh"}
     held = {Path(name).name for name in names if "/native/" in name}
     assert held == {path.name for path in (ROOT / "kernels" / "native").iterdir() if path.suffix in (".py", ".h", ".cuh")}
+
+
+def test_a_wheel_made_from_the_sdist_holds_the_same(wheel, tmp_path):
+    """The source distribution is whole: nothing of the checkout is needed beside it."""
+    build = f"from setuptools import build_meta; print(build_meta.build_sdist({str(tmp_path)!r}))"
+    tree = tmp_path / "tree"
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    for name in subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.splitlines():
+        if name.split("/")[0] not in ("docs", "notebooks", "experiments", "tests") and (ROOT / name).exists():
+            (tree / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, tree / name, follow_symlinks=False)
+    made = tmp_path / run("-c", build, cwd=tree).split()[-1]
+    assert made.name == f"jfrnn-{jfrnn.__version__}.tar.gz"
+    with tarfile.open(made) as held:
+        held.extractall(tmp_path / "from", filter="data")
+    (source,) = (tmp_path / "from").iterdir()
+    run(
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--no-build-isolation",
+        "--wheel-dir",
+        str(tmp_path),
+        str(source),
+        cwd=tmp_path,
+    )
+    (again,) = tmp_path.glob("*.whl")
+    assert sorted(zipfile.ZipFile(again).namelist()) == sorted(zipfile.ZipFile(wheel).namelist())
 
 
 def test_extras_name_what_the_wheel_holds():

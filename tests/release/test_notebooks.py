@@ -13,7 +13,7 @@ import soon
 
 from experiments import methods
 
-NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
+NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 RUN = (
     soon.PROGRAM
     + """

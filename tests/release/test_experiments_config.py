@@ -9,7 +9,7 @@ import pytest
 from experiments import _config, _layouts, _rows, _sweep, _thesis, _worker, methods
 from experiments._errors import UsageError
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = ROOT / "experiments" / "configs"
 
 GOOD = """

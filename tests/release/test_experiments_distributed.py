@@ -11,7 +11,7 @@ import pytest
 from experiments._config import load
 from experiments.bench import distributed
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 CONFIG = """
 devices = [1, 2, 4]
 scaling = ["strong"]

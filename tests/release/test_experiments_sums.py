@@ -16,7 +16,7 @@ from experiments._errors import UsageError
 from experiments.bench import sums, sums_report, ways
 from experiments.sph import speed
 
-CONFIGS = Path(__file__).parent.parent / "experiments" / "configs"
+CONFIGS = Path(__file__).parents[2] / "experiments" / "configs"
 TINY = """
 ways = ["pair_sum warp", "list, sum", "scipy pairs alone", "nvalchemi list, sum", "brute force"]
 layouts = ["full"]

@@ -10,12 +10,15 @@ from pathlib import Path
 
 import pytest
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1]
 CHECKS, SPH, PROCESS = HERE / "distributed_checks.py", HERE / "distributed_sph.py", HERE / "distributed_process.py"
 QUICK = {  # the others compile longer
+    "counts_beside_cuts_that_differ_and_of_strays",
     "pairs_on_1_and_8_devices",
     "particles_move_across_several_shards",
+    "particles_that_do_not_fill_a_round_of_migration",
     "sums_and_their_gradients",
+    "what_is_missing_anywhere_is_told",
     "wrong_arguments_are_named",
 }
 

@@ -14,7 +14,7 @@ import jfrnn.distributed
 from jfrnn import Status, jax_md
 from jfrnn.ase import primitive_neighbor_list
 
-PAGE = Path(__file__).parent.parent / "docs" / "guides" / "status.md"
+PAGE = Path(__file__).parents[2] / "docs" / "guides" / "status.md"
 N, CUTOFF = 24, 0.4
 LENGTHS = np.array([1.0, 1.2, 0.9], np.float32)
 X = (np.random.default_rng(0).random((N, 3)) * LENGTHS).astype(np.float32)
@@ -53,22 +53,32 @@ def options(bit, traced):
     return x, given.get("cutoff", CUTOFF), {name: value for name, value in given.items() if name != "cutoff"}
 
 
-def call(make, traced):
-    """Run a call, outside or inside jit, and say in the words of the table what came back."""
-    said = []
+def calls(makes, traced):
+    """Run calls, each by itself outside of jit, or all in one program inside; say in the words of the table what came back."""
+    said = {}
 
-    def run(zero):
+    def attempt(name, finish):
+        try:
+            found = makes[name]()
+            said[name] = found if isinstance(found, str) else finish(found)
+        except jfrnn.NeighborOverflowError:
+            said[name] = "raises `NeighborOverflowError`"
+        except (ValueError, RuntimeError) as error:
+            said[name] = f"raises `{type(error).__name__}`"
+
+    def program(zero):
         ZERO[:] = [zero]
-        found = make()
-        return said.append(found) if isinstance(found, str) else found
+        for name in makes:
+            attempt(name, lambda found: found)
+        return {name: said.pop(name) for name in makes if not isinstance(said[name], str)}
 
-    try:
-        found = jax.jit(run)(0) if traced else run(0)
-        return said[0] if said else tell(found)
-    except jfrnn.NeighborOverflowError:
-        return "raises `NeighborOverflowError`"
-    except (ValueError, RuntimeError) as error:
-        return f"raises `{type(error).__name__}`"
+    if traced:
+        said |= {name: tell(found) for name, found in jax.jit(program)(0).items()}
+    else:
+        ZERO[:] = [0]
+        for name in makes:
+            attempt(name, tell)
+    return {name: said[name] for name in makes}
 
 
 def tell(found):
@@ -176,31 +186,27 @@ OUTSIDE = dict(  # calls that are not for jit
 
 def observed():
     """Run every call for every bit; return the table: the name of a call -> what it does in the four columns."""
-    table = {}
-    for name, verb in (VERBS | OUTSIDE).items():
-        cells = []
-        for bits in KINDS.values():
-            for traced in (False, True):
-                if traced and name in OUTSIDE:
-                    cells.append("")
-                    continue
-                words = {
-                    bit: call(functools.partial(verb, bit, traced), traced)
-                    for bit in bits
-                    if traced or bit != Status.EXCLUDED_OUT_OF_RANGE  # outside jit, the search itself raises
-                }
-                if "grow" in name and Status.BOX_TOO_SMALL in words:
-                    assert words.pop(Status.BOX_TOO_SMALL) == "more room"  # images
-                assert len(set(words.values())) == 1, (name, traced, words)
-                cells.append(next(iter(words.values())))
-        table[name] = cells
+    table = {name: [] for name in VERBS | OUTSIDE}
+    for bits in KINDS.values():
+        for traced in (False, True):
+            words = {}
+            for bit in bits:
+                if traced or bit != Status.EXCLUDED_OUT_OF_RANGE:  # outside jit, the search itself raises
+                    verbs = VERBS if traced else VERBS | OUTSIDE
+                    words[bit] = calls({name: functools.partial(verb, bit, traced) for name, verb in verbs.items()}, traced)
+            for name, cells in table.items():
+                found = {bit: said[name] for bit, said in words.items() if name in said}
+                if "grow" in name and Status.BOX_TOO_SMALL in found:
+                    assert found.pop(Status.BOX_TOO_SMALL) == "more room"  # images
+                assert len(set(found.values())) == (0 if traced and name in OUTSIDE else 1), (name, traced, found)
+                cells.append(next(iter(found.values()), ""))
     return table
 
 
 def full_lists(traced):
     """Return a row of the table for each call on lists, and sums over them, whose rows, or whose total, overflowed."""
     padded, flat = (lambda: jfrnn.search(X, CUTOFF, capacity=2)), (lambda: jfrnn.search_edges(X, CUTOFF, total=3))
-    calls = {
+    makes = {
         "search": padded,
         "search_edges": flat,
         "pair_sum(neighbors=), of floats": lambda: jfrnn.pair_sum(one, X, None, neighbors=padded()),
@@ -221,7 +227,7 @@ def full_lists(traced):
         "EdgeList.pairs()": lambda: flat().pairs()[0],
         "NeighborList.grow, EdgeList.grow, run_chunk": lambda: grown(padded(), X),
     }
-    return {name: "" if traced and name in OUTSIDE else call(make, traced) for name, make in calls.items()}
+    return calls({name: make for name, make in makes.items() if not (traced and name in OUTSIDE)}, traced)
 
 
 def others():
@@ -244,8 +250,8 @@ def others():
                 "contacts": lambda tri=tri: tri().contacts(x)[1],
                 "signed_distance": lambda tri=tri: tri().signed_distance(x).distance,
             }
-            for name, make in made.items():
-                table.setdefault(name, []).append(call(make, traced))
+            for name, said in calls(made, traced).items():
+                table.setdefault(name, []).append(said)
     return table
 
 

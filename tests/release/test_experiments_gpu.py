@@ -16,7 +16,7 @@ from experiments.bench.triangles import gear
 from experiments.gpu import exactness, report, run, sums, timings, triangles
 from experiments.gpu.config import Config
 
-CONFIG = Path(__file__).parent.parent / "experiments" / "configs" / "h200.toml"
+CONFIG = Path(__file__).parents[2] / "experiments" / "configs" / "h200.toml"
 
 
 def load(path):

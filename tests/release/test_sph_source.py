@@ -10,7 +10,7 @@ from experiments.sph import budget, solver
 from experiments.sph.model import make_model, make_state
 from jfrnn.cases import fluids
 
-REFERENCE = Path(__file__).parent.parent / "experiments" / "reference"
+REFERENCE = Path(__file__).parents[2] / "experiments" / "reference"
 
 
 def make(name, backend="brute"):

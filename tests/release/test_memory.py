@@ -20,7 +20,7 @@ from experiments import _measure
 from jfrnn._engine import hashgrid, launch
 from jfrnn.kernels import few_cuda
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 SIZES = [(1000, 40), (30_000, 256), (300_000, 40)]
 
 
@@ -243,7 +243,7 @@ print(memory.source, memory.peak() - memory.start)
 @pytest.mark.parametrize("gradient", [False, True])
 def test_sums_take_what_was_planned(gradient):
     """In a process of its own, as a search above."""
-    n, tests = 300_000, str(ROOT / "tests")
+    n, tests = 300_000, str(ROOT / "tests" / "release")
     command = [sys.executable, "-c", SUMS, str(n), str(gradient)]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), tests])}
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=environment)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from test_distributed import names_in, outcomes
 
-CHECKS = Path(__file__).parent / "spread_checks.py"
+CHECKS = Path(__file__).parents[1] / "spread_checks.py"
 SLOW = {"more_on_automatic_axes", "more_on_explicit_axes", "more_in_shard_map"}
 QUICK = [name for name in names_in(CHECKS) if name not in SLOW]
 

@@ -14,7 +14,7 @@ from jfrnn.kernels._text import resolve
 from jfrnn.kernels.hashgrid import warp_header
 from jfrnn.kernels.launch import write_launcher
 
-NATIVE = Path(__file__).parents[1] / "kernels" / "native"
+NATIVE = Path(__file__).parents[2] / "kernels" / "native"
 LAUNCHING = ("calls.h", "desk.h", "launch.h")  # which need XLA's header
 WHOLE = sorted(path.name for path in NATIVE.iterdir())
 

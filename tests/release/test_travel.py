@@ -22,7 +22,7 @@ SAFE = [jax.export.DisabledSafetyCheck.custom_call("jfrnn")]
 def run_elsewhere(way, folder, right):
     """Run the program of a folder in a fresh process, and compare what it gives; return what it writes."""
     environment = os.environ | {"JAX_ENABLE_X64": "1", "JAX_NUMPY_DTYPE_PROMOTION": "strict"}
-    command = [sys.executable, Path(__file__).with_name("travelled.py"), way, folder]
+    command = [sys.executable, Path(__file__).parents[1] / "travelled.py", way, folder]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 0, done.stderr
     with np.load(folder / "answers.npz") as found:

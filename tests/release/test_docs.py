@@ -18,7 +18,7 @@ from jfrnn._engine import ENGINES, Kind
 from jfrnn._shards.calls import BACKENDS
 from jfrnn._triangles.engines import TRIANGLE_ENGINES
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 RUN = (
     soon.PROGRAM
     + """

@@ -15,7 +15,7 @@ import pytest
 import jfrnn
 from jfrnn._engine import launch
 
-PROGRAM = Path(__file__).parent / "interrupted.py"
+PROGRAM = Path(__file__).parents[1] / "interrupted.py"
 
 
 def run(tries, *more):
