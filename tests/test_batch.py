@@ -15,7 +15,7 @@ import jfrnn
 from jfrnn.cases.batches import BATCH_CASES
 
 SLOW = pytest.mark.slow
-LENGTH, CAPACITY = 128, 256
+LENGTH, CAPACITY = 136, 256
 
 
 @functools.lru_cache(maxsize=64)

@@ -56,7 +56,7 @@ def make(name, dtype=np.float64, dim=3, n=90, skin=0.05, reverse=False):
 
 
 OFTEN = ("images", "either")  # in single precision too; the others by hand
-PRECISIONS = [pytest.param(name, np.float64, marks=[pytest.mark.slow] * (k % 2)) for k, name in enumerate(LISTS)]
+PRECISIONS = [pytest.param(name, np.float64, marks=[pytest.mark.slow] * (k % 3 > 0)) for k, name in enumerate(LISTS)]
 PRECISIONS += [pytest.param(name, np.float32, marks=[pytest.mark.slow] * (name not in OFTEN)) for name in LISTS]
 
 
@@ -75,7 +75,7 @@ EVERY = [
 ]
 
 
-@pytest.mark.parametrize("scale", [1.0, 1e-4, 3e-17, 1e15])
+@pytest.mark.parametrize("scale", [1.0, pytest.param(1e-4, marks=pytest.mark.slow), 3e-17, 1e15])
 @pytest.mark.parametrize(("dtype", "dim", "closed"), EVERY)
 def test_ties_are_decided_exactly(scale, dtype, dim, closed):
     """All points on a lattice, in a list of all of them: rows full of pairs at exactly the cutoff, or as near as floats allow."""

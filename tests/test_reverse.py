@@ -202,9 +202,8 @@ def test_too_many_slots_are_refused():
 
 
 MEASURED = [(box, dim, 1.0) for box in BOXES for dim in (2, 3)] + [("open", 3, 1e-24), ("nearest", 3, 1e15)]
-PAIRWISE = [("open", 2, 1.0, True, np.float32), ("open", 2, 1.0, False, np.float64), ("open", 3, 1.0, False, np.float32)]
-PAIRWISE += [("open", 3, 1.0, True, np.float64), ("nearest", 3, 1.0, True, np.float32), ("images", 3, 1.0, False, np.float32)]
-PAIRWISE += [("images", 3, 1.0, True, np.float64), ("open", 3, 1e-24, False, np.float32), ("nearest", 3, 1e15, False, np.float64)]
+PAIRWISE = [("open", 2, 1.0, False, np.float64), ("open", 3, 1.0, True, np.float64), ("nearest", 3, 1.0, True, np.float32)]
+PAIRWISE += [("images", 3, 1.0, False, np.float32), ("open", 3, 1e-24, False, np.float32)]
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,7 @@ def test_everyone_is_its_own_neighbor(who, kind, backend, dtype):
         assert pairs_and_shifts(half.idx, half.shifts(x), half.vectors(x)[1]) == mirrored
 
 
-@pytest.mark.parametrize("who", ["gather", "species"])
+@pytest.mark.parametrize("who", ["gather", pytest.param("species", marks=SLOW)])
 def test_a_list_with_a_skin_keeps_them(who):
     x, cutoff, more = scene(who, np.float32)
     nbrs = jfrnn.search(x, cutoff, include_self=True, skin=0.05, **more)

@@ -63,7 +63,6 @@ EACH = [
     (np.float32, "skewed", "own"),
     (np.float64, "slab", "queries"),
     (np.float32, "orthogonal", "half"),
-    (np.float64, "nearest", "own"),
     (np.float64, "long", "half"),
     (np.float64, "long, own images", "half"),
 ]
