@@ -59,7 +59,7 @@ def pairs_and_shifts(idx, shifts, mask):
     return set(zip(i.tolist(), np.asarray(idx)[i, k].tolist(), map(tuple, np.asarray(shifts)[i, k].tolist()), strict=True))
 
 
-OFTEN = {("scatter", "nearest"), ("either", "systems"), ("species", "images")}
+OFTEN = {("either", "systems"), ("species", "images")}
 
 
 def each_kind():
