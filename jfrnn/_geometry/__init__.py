@@ -73,13 +73,5 @@ from jfrnn._geometry.marks import ROWS_ARE_WHOLE, are_finite, are_whole, good_ro
 from jfrnn._geometry.meshes import merge_vertices
 from jfrnn._geometry.motion import box_change, motion_of, turns_between
 from jfrnn._geometry.order import hilbert_order, sort_order
-from jfrnn._geometry.status import (
-    NeighborOverflowError,
-    Status,
-    known_status,
-    names_of_bits,
-    pairs_and_status,
-    shape_of,
-    tell,
-)
+from jfrnn._geometry.status import NeighborOverflowError, Status, known_status, names_of_bits, pairs_and_status, shape_of, tell
 from jfrnn._geometry.wrapping import NOT_FINITE, TOO_FAR, Wrapped, unpack_turns, wrap

@@ -30,6 +30,7 @@ from jfrnn._geometry import (
     squared_distance,
     widen,
 )
+from jfrnn._search.geometry import find_ends
 
 
 @jax.tree_util.register_dataclass
@@ -140,10 +141,6 @@ def first_verlet(
     """Return the state of a list that was just made."""
     positions, queries, box, radii = lax.stop_gradient((positions, queries, box, radii))
     if box is not None and kind is not None:
-        lattice = make_lattice(box, kind, np.dtype(positions.dtype))
-        of_sources, of_queries = lattice, lattice
-        if box.per_system and batch is not None:
-            of_sources, of_queries = lattice.of_rows(batch.sources), lattice.of_rows(batch.of_queries)
-        positions = bring_near(positions, of_sources).points
-        queries = None if queries is None else bring_near(queries, of_queries).points
+        ends = find_ends(positions, positions if queries is None else queries, box, kind, batch, False)
+        positions, queries = ends.sources.points, None if queries is None else ends.rows.points
     return Verlet(positions, queries, box, radii, jnp.int32(0))

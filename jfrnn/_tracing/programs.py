@@ -173,7 +173,7 @@ def make_on_host(x: Given, how: Callable[[np.ndarray], np.ndarray]) -> Array:
 
 
 def _keep_bounded() -> None:
-    """Drop all programs if there are too many of them, looking only where there are new ones."""
+    """Drop programs if there are too many, or if they have taken much memory; look only where there are new ones."""
     global _seen, _before
     count = program_count()
     if count < _seen:  # caches have been cleared
