@@ -393,3 +393,17 @@ def test_atoms_are_told_where_their_positions_are():
 
     with pytest.raises(TypeError, match=r"got Atoms, which has one: pass atoms\.positions, with a cell box=jfrnn\.Box"):
         jfrnn.search(Atoms(), 1.0)
+
+
+def test_near_ties_among_more_particles_than_meet_at_once():
+    """A GPU multiplies coordinates of so many in halves, and decides what the rounding of these leaves open."""
+    rng, half = np.random.default_rng(0), 4000
+    direction = rng.normal(size=(half, 3))
+    first = rng.uniform(0, 8, (half, 3))
+    second = first + 0.3 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    x = np.concatenate([first, second]).astype(np.float32)
+    nbrs = jfrnn.search(x, 0.3, backend="warp", capacity=32)
+    expected = reference.reference_pairs(x, 0.3)
+    apart = [(i, i + half) in expected for i in range(half)]
+    assert 0.3 < np.mean(apart) < 0.7
+    checked.assert_pairs(nbrs, expected)
