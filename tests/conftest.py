@@ -16,6 +16,7 @@ from jfrnn._engine import launch, tuning
 from jfrnn._tracing import programs
 from jfrnn.kernels import _clang
 
+pytest_plugins = ["progress"]
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_traceback_in_locations_limit", 0)

@@ -43,6 +43,7 @@ SCENES = {
     Status.EXCLUDED_OUT_OF_RANGE: (X, {}, {"exclude": np.array([[0, 99]])}),
 }
 ZERO = [0]  # a number that is traced inside jit, so that what it is added to is
+LISTS = {}  # that calls of one program share
 KINDS = {"not finite": [Status.NONFINITE], "invalid": [bit for bit in SCENES if bit != Status.NONFINITE]}
 
 
@@ -68,6 +69,7 @@ def calls(makes, traced):
 
     def program(zero):
         ZERO[:] = [zero]
+        LISTS.clear()
         for name in makes:
             attempt(name, lambda found: found)
         return {name: said.pop(name) for name in makes if not isinstance(said[name], str)}
@@ -76,8 +78,10 @@ def calls(makes, traced):
         said |= {name: tell(found) for name, found in jax.jit(program)(0).items()}
     else:
         ZERO[:] = [0]
+        LISTS.clear()
         for name in makes:
             attempt(name, tell)
+    LISTS.clear()
     return {name: said[name] for name in makes}
 
 
@@ -111,11 +115,24 @@ def whole(r, i, j):
     return jnp.int32(1)
 
 
-def made(bit, traced, **more):
+def shared(make):
+    """Make a list once for all calls of a program."""
+
+    def of(*key):
+        if (make, key) not in LISTS:
+            LISTS[make, key] = make(*key)
+        return LISTS[make, key]
+
+    return of
+
+
+@shared
+def made(bit, traced):
     x, cutoff, given = options(bit, traced)
-    return x, jfrnn.search(x, cutoff, capacity=256, **given, **more)
+    return x, jfrnn.search(x, cutoff, capacity=256, **given)
 
 
+@shared
 def edges_made(bit, traced):
     x, cutoff, given = options(bit, traced)
     return x, jfrnn.search_edges(x, cutoff, total=6000, **given)
@@ -205,7 +222,7 @@ def observed():
 
 def full_lists(traced):
     """Return a row of the table for each call on lists, and sums over them, whose rows, or whose total, overflowed."""
-    padded, flat = (lambda: jfrnn.search(X, CUTOFF, capacity=2)), (lambda: jfrnn.search_edges(X, CUTOFF, total=3))
+    padded, flat = shared(lambda: jfrnn.search(X, CUTOFF, capacity=2)), shared(lambda: jfrnn.search_edges(X, CUTOFF, total=3))
     makes = {
         "search": padded,
         "search_edges": flat,
@@ -244,7 +261,7 @@ def others():
     table = {}
     for vertices, named, capacity in walls.values():
         for traced in (False, True):
-            tri = functools.partial(jfrnn.search_triangles, x, vertices, named, 1.0, capacity=capacity)
+            tri = shared(functools.partial(jfrnn.search_triangles, x, vertices, named, 1.0, capacity=capacity))
             made = {"search_triangles": tri, "closest": lambda tri=tri: tri().closest(x)[1]}
             made |= {
                 "contacts": lambda tri=tri: tri().contacts(x)[1],
