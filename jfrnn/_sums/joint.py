@@ -4,21 +4,29 @@ Each sum looks for one that stands before it in the same block of operations, ov
 operands are known, too. One sum with the summands of both then stands there, and what used the results of the first uses those of
 it. What the first left behind has no use, and XLA drops it. Operands that are one number in all rows, such as the ones that the
 gradient of a total multiplies by, become shared, so that nobody writes them down for every particle.
+
+No other file reads operations of XLA, whose Python interface is private to JAX and differs between its releases. What is read is
+tried out on a small program before the first sum is lowered. Where anything is not as expected, every sum is lowered alone, which
+is as right and takes longer, and a warning says so once.
 """
 
+import contextlib
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from itertools import compress
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.core import ShapedArray
 from jax.interpreters import mlir
 
+from jfrnn._engine import level_of_caller
 from jfrnn._sums.fused import can_sum
 from jfrnn._sums.relations import Searched, is_fused
 from jfrnn._sums.terms import Derived, Groups, Term, choose, join, make_term
@@ -34,7 +42,7 @@ _PURE = (
 _ARITHMETIC = frozenset(f"stablehlo.{name}" for name in ("broadcast_in_dim", "multiply", "divide", "negate"))
 _MOVABLE = frozenset(("func.call", *(f"stablehlo.{name}" for name in _PURE.split())))
 
-ir: Internal = mlir.ir  # pyright: ignore[reportAttributeAccessIssue]
+ir: Internal = getattr(mlir, "ir", None)
 
 
 class _Known(NamedTuple):
@@ -68,6 +76,10 @@ def lower_sum(
         structure: That of the relation.
         compensated: As in `sum_pairs`.
     """
+    fault = find_fault() or (None if hasattr(ctx.module_context, "lowering_cache") else "a module keeps no lowering_cache")
+    if fault is not None:
+        _warn(fault)
+        return list(lower(ctx, *args, term=term, structure=structure, compensated=compensated))
     known = [_Known(*each) for each in zip(args, ctx.avals_in, strict=True)]
     pairs, rest = known[: structure.num_leaves], known[structure.num_leaves :]
     term, operands = _share_numbers(term, term.split(rest))
@@ -82,11 +94,11 @@ def lower_sum(
         return place(pairs, term, operands)
     fused = is_fused(relation, term)
     same = tuple(_describe(x.value) for x in pairs), structure, compensated, fused
-    before = getattr(ctx.module_context, "lowering_cache", {}).setdefault(_PLACE, [])
+    before = ctx.module_context.lowering_cache.setdefault(_PLACE, [])
     for other in reversed(before):
         joined = _join(other, term, operands) if other.same == same else None
         if joined is not None and (not fused or can_sum(relation.inputs, joined[0])):
-            with ir.InsertionPoint(other.results[0]):
+            with _before(other.results[0]):
                 found = place(other.pairs, *joined)
             for operation, result in zip(other.results, found, strict=False):
                 operation.operands[0] = result
@@ -97,6 +109,71 @@ def lower_sum(
         results = [_pass_on(x) for x in place(pairs, term, operands)]
         before.append(_Lowered(same, pairs, term, operands, results))
     return [operation.results[0] for operation in results]
+
+
+# --- operations, as this JAX shows them -------------------------------------------------------------------------------
+
+
+@functools.cache
+def find_fault() -> str | None:
+    """Return what of a small program cannot be read as it is in this file; None: all of it can."""
+    try:
+        with mlir.make_ir_context(), ir.Location.unknown():
+            module = ir.Module.create()
+            with ir.InsertionPoint(module.body):
+                return ", ".join(name for name, is_right in _try_out().items() if not is_right) or None
+    except Exception as error:  # of whatever kind: nobody promises anything of this interface
+        return f"{type(error).__name__}: {error}"
+
+
+def _try_out() -> dict[str, bool]:
+    """Read and change a small program as sums are joined; return by name what came out as it has to."""
+    zero = ir.DenseElementsAttr.get(np.zeros((), np.float32))
+    rows = ir.RankedTensorType.get((3,), ir.F32Type.get())
+    number = ir.Operation.create("stablehlo.constant", [zero.type], [], {"value": zero}).results[0]
+
+    def fill() -> Internal:
+        axes = ir.DenseI64ArrayAttr.get([])
+        return ir.Operation.create("stablehlo.broadcast_in_dim", [rows], [number], {"broadcast_dimensions": axes}).results[0]
+
+    first, second = fill(), fill()
+    end = _pass_on(first)
+    end.operands[0] = second
+    negative = ir.Operation.create("stablehlo.negate", [rows], [fill()]).results[0]
+    with _before(end):
+        earlier = fill()
+    return {
+        "a value and its type": _rank(first) == 1 and first != second and first.type == second.type,
+        "what an operation computes": _describe(first) == _describe(second) and _describe(first) != _describe(negative),
+        "an operand that was exchanged": end.operands[0] == second,
+        "a number that was broadcast": _rank(_find_number(negative)) == 0,
+        "the block of an operation": end.block == ir.InsertionPoint.current.block,
+        "operations before another": _is_before(_operation_of(first), end) and not _is_before(_operation_of(negative), end),
+        "an operation that is made before another": _is_before(_operation_of(earlier), end),
+        "an operation that is moved": _is_known(negative, end) and _is_before(_operation_of(negative), end),
+        "an operation that stays": not _is_before(end, end) and not _is_known(end.results[0], end),
+    }
+
+
+@functools.cache
+def _warn(fault: str) -> None:
+    """Say once that sums are not joined."""
+    warnings.warn(
+        f"jfrnn/_sums/joint.py cannot read the operations of XLA as jax {jax.__version__} shows them ({fault}): sums are right, "
+        "but those over the same pairs are not joined, and take longer. With another version of jax, or of jfrnn, they are joined.",
+        RuntimeWarning,
+        stacklevel=level_of_caller(),
+    )
+
+
+@contextlib.contextmanager
+def _before(at: Internal) -> Iterator[None]:
+    """Have operations made before another one: some releases put what they inline at the end of a block, wherever they are."""
+    apart = ir.Module.create()
+    with ir.InsertionPoint(apart.body):
+        yield
+    for operation in list(apart.body.operations):
+        operation.move_before(at)
 
 
 def _pass_on(value: Internal) -> Internal:
@@ -115,8 +192,10 @@ def _describe(value: Internal, depth: int = _DEPTH) -> Internal:
     operation = _operation_of(value)
     if depth == 0 or operation is None or operation.name not in _MOVABLE:
         return value
-    named = tuple((name, operation.attributes[name]) for name in operation.attributes)
-    return operation.name, named, value.type, value.result_number, tuple(_describe(x, depth - 1) for x in operation.operands)
+    attributes = [operation.attributes[k] for k in range(len(operation.attributes))]
+    named = tuple((x.name, x.attr) for x in attributes)
+    number = ir.OpResult(value).result_number
+    return operation.name, named, value.type, number, tuple(_describe(x, depth - 1) for x in operation.operands)
 
 
 # --- numbers that are the same in all rows ----------------------------------------------------------------------------
@@ -198,13 +277,20 @@ def _join(first: _Lowered, term: Term, operands: Groups) -> tuple[Term, Groups] 
 def _is_known(value: Internal, at: Internal, depth: int = _DEPTH) -> bool:
     """Say whether a value is known where an operation stands; what can be computed there already is moved there."""
     operation = _operation_of(value)
-    if operation is None or operation.block != at.block or operation.is_before_in_block(at):
+    if operation is None or operation.block != at.block or _is_before(operation, at):
         return True
     movable = depth > 0 and operation.name in _MOVABLE
     if not movable or not all(_is_known(x, at, depth - 1) for x in operation.operands):
         return False
     operation.move_before(at)
     return True
+
+
+def _is_before(operation: Internal, at: Internal) -> bool:
+    """Say whether an operation stands before another one of its block; jax 0.7 has to look through the block."""
+    if hasattr(operation, "is_before_in_block"):
+        return operation.is_before_in_block(at)
+    return next(x for x in at.block.operations if x in (operation, at)) != at
 
 
 @functools.lru_cache(maxsize=256)
