@@ -42,16 +42,15 @@ class HashGridEngine:
         return "knows no periodic box: pass backend='warp', 'jax' or 'brute'." if kind.periodic else None
 
     def missing(self, platform: str) -> str | None:
-        """Say what keeps Warp from running on a JAX platform."""
-        return missing(platform)
+        """Say what keeps Warp from running on a JAX platform, or its hash grid from being right."""
+        if reason := missing(platform):
+            return reason
+        version = _clang.warp_version()
+        outdated = tuple(map(int, version.split(".")[:2])) < (1, 19)
+        return f"the HashGrid of warp-lang {version} can list a pair twice: {INSTALL}" if outdated else None
 
     def rows(self, search: Search, options: Options, capacity: int | Room | None) -> Rows:
         """Search with a hash grid of the cutoff."""
-        version = _clang.warp_version()
-        if tuple(map(int, version.split(".")[:2])) < (1, 19):
-            raise ImportError(
-                f"the backend 'hashgrid' needs warp-lang 1.19: the HashGrid of {version} can list a pair twice. {INSTALL}"
-            )
         radius = options.radius
         if radius is None:
             raise TypeError("the backend 'hashgrid' needs a cutoff that is known while tracing.")
