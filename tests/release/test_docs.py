@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pasted
 import pytest
 import soon
 
@@ -19,29 +20,6 @@ from jfrnn._shards.calls import BACKENDS
 from jfrnn._triangles.engines import TRIANGLE_ENGINES
 
 ROOT = Path(__file__).parents[2]
-RUN = (
-    soon.PROGRAM
-    + """
-import sys, traceback
-from pathlib import Path
-
-import jax
-
-for page in map(Path, sys.argv[1:]):
-    lines, running = [], False
-    for line in page.read_text(encoding="utf-8").splitlines():
-        fence = line.startswith("```")
-        running = line == "```python" if fence else running
-        lines.append(line if running and not fence else "")
-    jax.config.update("jax_enable_x64", False)
-    try:
-        exec(compile("\\n".join(lines), str(page), "exec"), {"__name__": page.stem})
-    except Exception:
-        traceback.print_exc()
-    else:
-        print("\\0ran", page, sum(map(bool, lines)))
-"""
-)
 BUILD = f"""
 import sys
 
@@ -74,10 +52,10 @@ def ran():
     """
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
     told = os.environ | {"PYTHONPATH": str(ROOT), "XLA_FLAGS": flags}
-    command = [sys.executable, "-W", "error::RuntimeWarning", "-c", RUN, *(page for pages in GROUPS.values() for page in pages)]
+    given = [page for pages in GROUPS.values() for page in pages]
+    command = [sys.executable, "-W", "error::RuntimeWarning", "-c", pasted.PROGRAM, *given]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=told)
-    counted = [line.split() for line in done.stdout.splitlines() if line.startswith("\0ran")]
-    return {page: int(lines) for _, page, lines in counted}, done.stderr
+    return pasted.lines_run(done.stdout), done.stderr
 
 
 @pytest.mark.parametrize("group", GROUPS)
