@@ -42,15 +42,14 @@ UNFUSED = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split
 warp.config.log_level = warp.LOG_WARNING  # else it prints what it compiles, into doctests too
 # Files, those first that take longest: what is left at the end is short, and no worker waits for another's long file.
 LONGEST = (
-    "types", "docs", "status", "kept", "hard_cases", "box", "triangles", "pair_sum", "experiments_sweep", "triangles_closest",
-    "cases_periodic", "boxes", "exact", "reverse", "radii", "search", "memory", "pair_sum_warp", "reference", "arrays",
-    "triangles_cuda", "order", "experiments_peers", "experiments_gpu", "notebooks", "jax_md", "boxes_radii", "distributed",
-    "verlet", "joint", "pair_sum_cuda", "sph_solids", "verlet_boxes", "edges", "fractional", "transforms", "batch", "modes",
-    "spread", "translate", "cell_line", "start", "pair_sum_warp_boxes", "experiments_latency", "experiments_lj", "who",
+    "types", "docs", "lowest", "status", "kept", "hard_cases", "box", "triangles", "pair_sum", "experiments_sweep",
+    "triangles_closest", "cases_periodic", "boxes", "exact", "reverse", "radii", "search", "memory", "pair_sum_warp", "reference",
+    "arrays", "triangles_cuda", "order", "experiments_peers", "experiments_gpu", "notebooks", "jax_md", "boxes_radii",
+    "distributed", "verlet", "joint", "pair_sum_cuda", "sph_solids", "verlet_boxes", "edges", "fractional", "transforms", "batch",
+    "modes", "spread", "translate", "cell_line", "start", "pair_sum_warp_boxes", "experiments_latency", "experiments_lj", "who",
     "neighbors", "native", "experiments_sums", "triangles_contacts", "cells", "sph_speed", "sph_parts", "search_edges",
-    "experiments_methods", "sph_run", "triangles_moving", "ase", "exports", "travel", "pair_sum_warp_radii", "buffers",
-    "package", "experiments_distributed", "experiments_start", "experiments_report", "experiments_commands", "house",
-    "interrupts",
+    "experiments_methods", "sph_run", "triangles_moving", "ase", "exports", "travel", "pair_sum_warp_radii", "buffers", "package",
+    "experiments_distributed", "experiments_start", "experiments_report", "experiments_commands", "house", "interrupts",
 )  # fmt: skip
 
 

@@ -36,10 +36,8 @@ def run(*arguments, cwd, python=sys.executable, **environment):
     return done.stdout
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
+def build_wheel(folder):
     """Build a wheel of a copy of the tree, without what an earlier build left, and without the internet."""
-    folder = tmp_path_factory.mktemp("wheel")
     for name in ("jfrnn", "kernels", "cases", "pyproject.toml", "setup.py", "README.md", "LICENSE"):
         (folder / "tree").mkdir(exist_ok=True)
         (folder / "tree" / name).symlink_to(ROOT / name)
@@ -47,6 +45,11 @@ def wheel(tmp_path_factory):
     run(*build, cwd=folder)
     (found,) = folder.glob("*.whl")
     return found
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    return build_wheel(tmp_path_factory.mktemp("wheel"))
 
 
 def test_wheel_works_elsewhere(wheel, tmp_path):
