@@ -94,7 +94,7 @@ def as_on_one_device(cases, kind):
     mesh = jax.make_mesh((4,), ("p",), axis_types=(kind,))
     for name, case in cases.items():
         expected = jax.tree.leaves(case(jnp.asarray(X), jnp.asarray(R)))
-        with jax.set_mesh(mesh):
+        with jax.set_mesh(mesh) if hasattr(jax, "set_mesh") else jax.sharding.use_mesh(mesh):
             x, r = (jax.device_put(a, NamedSharding(mesh, PartitionSpec("p"))) for a in (X, R))
             found = {"eager": case(x, r), "jit": jax.jit(case)(x, r)}
         for how, result in found.items():
