@@ -259,7 +259,7 @@ def test_vmap_is_a_loop(backend):
 
 @pytest.mark.parametrize("backend", IN_CELLS)
 def test_buckets_are_shared_without_harm(monkeypatch, backend):
-    """All cells hashed into two buckets: candidates are many, pairs the same, though squares of lengths leave the range of floats."""
+    """All cells hashed into two buckets: candidates are many, pairs the same, and squares of lengths are no floats."""
     for module in (_triangles_cells, _triangles_warp):
         monkeypatch.setattr(module, "bucket_count", lambda faces: 2)
     for name in EXTREME:
