@@ -7,24 +7,31 @@ import pytest
 
 from jfrnn._tracing.flags import largest_of, set_places
 
+MOST = (1, 40, 1100)
+
+
+@jax.jit
+def places_of(flags):
+    return [set_places(flags, most) for most in MOST]
+
 
 @pytest.mark.parametrize("n", [0, 1, 31, 32, 33, 1000])
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.5, 1.0])
 def test_places_are_those_of_numpy(n, share):
     flags = np.random.default_rng(n).random(n) < share
-    places = jax.jit(set_places, static_argnums=1)
-    for most in (1, 40, 1100):
+    for most, got in zip(MOST, places_of(flags), strict=True):
         expected = np.full(most, n)
         found = np.flatnonzero(flags)[:most]
         expected[: len(found)] = found
-        got = places(jnp.asarray(flags), most)
         assert got.dtype == jnp.int32
         np.testing.assert_array_equal(got, expected)
 
 
 def test_the_last_and_the_first_flag_of_each_word_are_found():
     for k in (0, 31, 32, 63, 64, 95):
-        assert set_places(jnp.arange(96) == k, 2).tolist() == [k, 96]
+        first, most, _ = places_of(np.arange(96) == k)
+        assert first.tolist() == [k]
+        assert most.tolist() == [k, *[96] * 39]
 
 
 @pytest.mark.parametrize("dtype", [np.int8, np.int32, np.uint32])
