@@ -19,6 +19,22 @@ VARIANTS += [
 ]
 
 
+# Rows of a table in which any two columns hold each pair of 0 and 1: variants of what two options may be.
+FEW = [(2, False, False, False, False), (3, True, False, False, False), (2, True, False, True, False)]
+FEW += [(3, False, True, True, False), (3, False, False, True, True)]
+PAIRWISE = ["11111", "10001", "11000", "01100", "00110", "00011"]
+
+
+def sparing(variants, often):
+    """Return parameters of a test: variants that do not stand in `often` are slow."""
+    return [pytest.param(*each, marks=[pytest.mark.slow] * (each not in often)) for each in variants]
+
+
+def pairwise(columns):
+    """Return variants of a dimension and options, fewer than all: any two of them are tried in all ways."""
+    return [(2 + int(row[0]), *(mark == "1" for mark in row[1:columns])) for row in PAIRWISE]
+
+
 def compiles(*kernels):
     """Compile programs for a GPU that need not be there; return how many there are."""
     programs = {kernel.program for kernel in kernels if kernel is not None}
@@ -28,12 +44,14 @@ def compiles(*kernels):
     return len(programs)
 
 
-@pytest.mark.parametrize(("dim", "double", "scaled", "lists", "later"), VARIANTS)
+@pytest.mark.parametrize(("dim", "double", "scaled", "lists", "later"), sparing(VARIANTS, FEW))
 def test_variants_compile(dim, double, scaled, lists, later):
     assert compiles(*cells_cuda.cell_kernels(dim, double, scaled, lists, later)) == 2
 
 
-@pytest.mark.parametrize(("dim", "double", "scaled", "lists"), [*itertools.product((2, 3), *3 * [(False, True)])])
+@pytest.mark.parametrize(
+    ("dim", "double", "scaled", "lists"), sparing(itertools.product((2, 3), *3 * [(False, True)]), pairwise(4))
+)
 def test_hashgrid_compiles(dim, double, scaled, lists):
     assert compiles(*hashgrid.search_kernels(dim, double, scaled, lists, cuda=True)) == 1
 
@@ -44,10 +62,11 @@ def test_boxes_batches_and_cutoffs_per_particle_compile():
         assert compiles(levels.query_kernel(3, False, True, rule, GROUPS, HALVINGS, periodic, batched=True, cuda=True)) == 1
 
 
-def test_kernels_of_few_particles_compile(dim):
-    for double, lists, batched in itertools.product((False, True), repeat=3):
-        assert compiles(few_cuda.rows_kernel(32 if lists else 16, dim, double, lists, batched)) == 1
-        assert compiles(few_cuda.rows_kernel(32 if lists else 16, dim, double, lists, batched, boxed=True)) == 1
+@pytest.mark.parametrize(
+    ("dim", "double", "lists", "batched", "boxed"), sparing(itertools.product((2, 3), *4 * [(False, True)]), pairwise(5))
+)
+def test_kernels_of_few_particles_compile(dim, double, lists, batched, boxed):
+    assert compiles(few_cuda.rows_kernel(32 if lists else 16, dim, double, lists, batched, boxed=boxed)) == 1
 
 
 @pytest.mark.parametrize("module", [cells_cpu, cells_cuda], ids=["cpu", "cuda"])

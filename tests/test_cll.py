@@ -9,9 +9,15 @@ from jfrnn import cases
 
 @pytest.fixture(scope="module", autouse=True)
 def _warm_kernels():
-    """Compile the kernels once for both precisions."""
-    for dtype in (np.float32, np.float64):
-        adapter.prepare(np.zeros((1, 3), dtype), 1.0)
+    """Compile the kernels once, for both precisions together, without what takes Clang long."""
+    kernels = adapter._cll_kernels
+    wp.set_module_options({"optimization_level": 0}, module=kernels)
+    for real, vector in ((wp.float32, wp.vec3f), (wp.float64, wp.vec3d)):
+        kinds = {"positions": wp.array(dtype=vector), "origin": vector, "inverse_edge": real}
+        wp.overload(kernels.link_particles_kernel, kinds)
+        wp.overload(kernels.append_pairs_kernel, {**kinds, "cutoff_squared": real})
+    yield
+    wp.set_module_options({"optimization_level": None}, module=kernels)
 
 
 def search(positions, cutoff):

@@ -74,11 +74,11 @@ def compiles_for(plan, dim, double, **variant):
 @pytest.mark.parametrize(
     ("dim", "dtype", "variant"),
     [
-        (3, np.float32, {}),
+        pytest.param(3, np.float32, {}, marks=pytest.mark.slow),  # derivatives are of this kind
         (2, np.float32, {"compensated": True}),
         (3, np.float32, {"batched": True, "scaled": True}),
         (2, np.float64, {}),
-        (3, np.float64, {"batched": True, "compensated": True}),
+        pytest.param(3, np.float64, {"batched": True, "compensated": True}, marks=pytest.mark.slow),
     ],
 )
 def test_densities_compile(dim, dtype, variant):
@@ -86,7 +86,7 @@ def test_densities_compile(dim, dtype, variant):
     assert compiles_for(plan_of(square_sum, masses, x, scale), dim, dtype == np.float64, **variant)
 
 
-@pytest.mark.parametrize("argnums", [0, 1, 2], ids=["values", "positions", "closed over"])
+@pytest.mark.parametrize("argnums", [0, pytest.param(1, marks=pytest.mark.slow), 2], ids=["values", "positions", "closed over"])
 def test_derivatives_compile(argnums):
     masses, x, scale, _ = arguments(np.float32, 3)
     plan = plan_of(jax.grad(square_sum, argnums), masses, x, scale)
@@ -94,7 +94,7 @@ def test_derivatives_compile(argnums):
     assert compiles_for(plan, 3, False)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [pytest.param(np.float32, marks=pytest.mark.slow), np.float64])
 def test_functions_and_values_of_all_kinds_compile(dtype):
     _, x, scale, values = arguments(dtype, 3)
     plan = plan_of(functools.partial(square_sum, fn=everything), values, x, scale)
@@ -102,7 +102,9 @@ def test_functions_and_values_of_all_kinds_compile(dtype):
     assert compiles_for(plan, 3, dtype == np.float64)
 
 
-@pytest.mark.parametrize(("dim", "dtype", "length"), [(3, np.float32, 2.0), (2, np.float64, 0.1)])
+@pytest.mark.parametrize(
+    ("dim", "dtype", "length"), [(3, np.float32, 2.0), pytest.param(2, np.float64, 0.1, marks=pytest.mark.slow)]
+)
 def test_terms_in_boxes_compile(dim, dtype, length):
     """Of the nearest images, and of several; the lattice shift has no column, its turns have one."""
     masses, x, scale, _ = arguments(dtype, dim)
@@ -112,7 +114,10 @@ def test_terms_in_boxes_compile(dim, dtype, length):
     assert compiles_for(plan, dim, dtype == np.float64, periodic=1 if length > CUTOFF else 2)
 
 
-@pytest.mark.parametrize(("dtype", "variant"), [(np.float32, {}), (np.float64, {"periodic": 2, "batched": True})])
+@pytest.mark.parametrize(
+    ("dtype", "variant"),
+    [pytest.param(np.float32, {}, marks=pytest.mark.slow), (np.float64, {"periodic": 2, "batched": True})],
+)
 def test_extremes_compile(dtype, variant):
     masses, x, _, _ = arguments(dtype, 3)
     plan = plan_of(lambda x: jfrnn.pair_sum(poly6, x, CUTOFF, masses, reduce="min", backend="warp"), x)
