@@ -36,26 +36,38 @@ def expected_pairs(name, dtype, dim, closed):
     return reference.reference_pairs(given.positions, given.cutoff, queries=given.queries, closed=closed)
 
 
-def each_case():
-    """Yield every dtype, dimension, comparison, case and backend, in an order in which the oracle answers each case once.
+EXACT = ("mixed_exponents", "residues", "residues_balanced")  # most pairs are decided in integers, which array programs do slowly
+SCALED = ("near_max", "clumps_near_max", "tiny_scale")  # lengths are scaled: other programs
+BRUTE = ("lattice_1_at_0", "ulp_away", "n_33")  # all pairs are tested as "jax" tests those of cells
 
-    By default "warp" takes each dtype in each dimension, and either comparison with each of them; of the array engines, which
-    decide alike and compile slowly, and of "hashgrid" more kinds run by hand alone.
+
+def is_default(name, dtype, dim, closed, backend):
+    """Say whether a combination runs by default: each case in as few programs as meet each dtype, dimension and comparison.
+
+    "warp" answers each case in both dtypes, and every other one also in the other dimension of each, where pairs at the cutoff
+    count. "jax" and "hashgrid", whose programs take long to compile, answer each case in one of two kinds, "brute" a few.
     """
+    kind, odd, queried = (dtype, dim, closed), NAMES.index(name) % 2 == 1, name.startswith("queries")
+    first, second = (np.float32, 3, False), (np.float64, 2, False)
+    if backend == "warp":
+        return kind in (first, second, (np.float32, 2, True) if odd else (np.float64, 3, True))
+    if backend == "hashgrid":
+        return kind == ((np.float32, 3, True) if not queried and (odd or name in SCALED) else second)
+    if backend == "jax":
+        return kind == (first if name not in EXACT and not queried and (odd or name in SCALED) else second)
+    return kind == first and (queried or name in BRUTE)
+
+
+def each_case():
+    """Yield every dtype, dimension, comparison, case and backend, in an order in which the oracle answers each case once."""
     for dtype, dim, closed, name, backend in product((np.float32, np.float64), (2, 3), (False, True), NAMES, BACKENDS):
-        often = (dtype, dim) in ((np.float32, 3), (np.float64, 2))
-        first = (dtype, dim) == (np.float32, 3)
-        rarely = {
-            "brute": closed or not first,
-            "jax": closed or not often,
-            "hashgrid": not often or closed is not first,
-            "warp": closed is often,
-        }[backend]
         kind = f"f{8 * dtype().itemsize}-{dim}d-{'closed' if closed else 'open'}"
-        yield pytest.param(name, dtype, dim, closed, backend, id=f"{kind}-{name}-{backend}", marks=[pytest.mark.slow] * rarely)
+        marks = [] if is_default(name, dtype, dim, closed, backend) else [pytest.mark.slow]
+        if (dtype, dim, closed, backend) == (np.float32, 3, False, "warp"):
+            marks.append(pytest.mark.kernels)
+        yield pytest.param(name, dtype, dim, closed, backend, id=f"{kind}-{name}-{backend}", marks=marks)
 
 
-@pytest.mark.kernels
 @pytest.mark.parametrize(("name", "dtype", "dim", "closed", "backend"), list(each_case()))
 def test_hard_case(name, dtype, dim, closed, backend):
     given = HARD_CASES[name].build(dtype, dim)
@@ -66,12 +78,14 @@ def test_hard_case(name, dtype, dim, closed, backend):
 
 
 def each_size():
-    """Yield sizes, unpadded, each a program of its own: of the array engines, which compile slowly, one of one kind."""
+    """Yield sizes, unpadded, each a program of its own: by default of two kinds, and of the array engines but one."""
     empty, others = ("n_0", "no_queries", "no_sources"), ("n_1", "n_2", "n_33", "n_65", "queries_fewer")
     for name, dtype, dim, backend in product(empty + others, (np.float32, np.float64), (2, 3), BACKENDS):
-        slowly = name in others and (backend == "brute" or (backend == "jax" and (name, dtype, dim) != ("n_33", np.float64, 2)))
+        first, second = (dtype, dim) == (np.float32, 3), (dtype, dim) == (np.float64, 2)
+        often = (first or second) if name in empty or backend == "warp" else first and backend == "hashgrid"
+        often |= second and (name, backend) == ("n_33", "jax")
         kind = f"{name}-f{8 * dtype().itemsize}-{dim}d-{backend}"
-        yield pytest.param(name, dtype, dim, backend, id=kind, marks=[pytest.mark.slow] * slowly)
+        yield pytest.param(name, dtype, dim, backend, id=kind, marks=[] if often else [pytest.mark.slow])
 
 
 @pytest.mark.parametrize(("name", "dtype", "dim", "backend"), list(each_size()))
