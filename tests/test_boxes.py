@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from test_box import LONG, masked_images
+from checked import padded
+from test_box import LONG, arrays_of, energy_and_slopes, masked_images
 from test_box import oracle as lattice_oracle
 
 import jfrnn
+from jfrnn._geometry.wrapping import unpack_turns
 from jfrnn.cases.crystals import CRYSTAL_CASES
 
 SLOW = pytest.mark.slow
@@ -41,9 +43,23 @@ def expected_images(name, dtype, dim, closed=False, half=False):
 
 
 def listed_images(nbrs, x, **queries):
-    """Return (i, j, S) of all slots of a list without a skin."""
-    shifts, (i, j) = np.asarray(nbrs.shifts(x, **queries)), nbrs.pairs()
-    shifts = shifts[np.asarray(nbrs.idx) < nbrs.source_count]
+    """Return (i, j, S) of all slots of a list without a skin; S is found without the library's vectors."""
+    assert not nbrs.overflow
+    idx, kind, batch = np.asarray(nbrs.idx), nbrs.box_kind, nbrs.batch
+    i, k = np.nonzero(np.arange(nbrs.capacity) < np.asarray(nbrs.count)[:, None])
+    assert (idx != nbrs.source_count).sum() == len(i)
+    j, system = idx[i, k], np.asarray(batch.queries if queries else batch.sources)[i]
+    if nbrs.images is None:
+        x = np.asarray(x, np.float64)
+        q = np.asarray(queries["queries"], np.float64) if queries else x
+        boxes = np.asarray(nbrs.box.vectors, np.float64)[system]
+        boxes = boxes[:, None] * np.eye(x.shape[1]) if boxes.ndim == 2 else boxes
+        shifts = -np.rint(np.einsum("pd,pdk->pk", x[j] - q[i], np.linalg.inv(boxes))).astype(int)
+    else:
+        turns, of_rows = (None if t is None else np.asarray(unpack_turns(t, x.shape[1])) for t in nbrs.images[1:])
+        shifts = kind.shifts[np.asarray(nbrs.images.codes)[i, k]] + (turns if of_rows is None else of_rows)[i] - turns[j]
+        if nbrs.box.numbers is not None:  # of given vectors, where the list counts short ones
+            shifts = np.einsum("ps,psd->pd", shifts, np.asarray(nbrs.box.numbers)[system]).astype(int)
     pairs = set(zip(i.tolist(), j.tolist(), map(tuple, shifts.tolist()), strict=True))
     assert len(pairs) == len(i)
     return pairs
@@ -53,25 +69,42 @@ def box_of(given):
     return jfrnn.Box(given.boxes, given.periodic, per_system=True)
 
 
-def assert_case(name, dtype, dim, backend, closed=False, half=False, geometry=False):
+N, MOST, REACH = 268, 6, {2: (6, 5), 3: (4, 4, 6)}  # of the largest cases
+
+
+def padded_box(given):
+    """Return the boxes of a case, and more without particles, so that most cases share a program."""
+    lengths, (systems, dim) = given.boxes.ndim == 2, given.boxes.shape[:2]
+    more = np.broadcast_to(1 if lengths else np.eye(dim), (MOST - systems, *given.boxes.shape[1:]))
+    boxes = np.concatenate([given.boxes, more.astype(given.boxes.dtype)])
+    flags = np.ones((MOST, dim), bool)
+    flags[:systems] = given.periodic
+    many = any(box_of(given).images_for(given.cutoff))
+    return jfrnn.Box(boxes, flags, per_system=True, images=REACH[dim] if many else 0)
+
+
+def assert_case(name, dtype, dim, backend, closed=False, half=False, geometry=False, pad=True):
     given = CRYSTAL_CASES[name].build(dtype, dim)
-    x, expected = jnp.asarray(given.positions), expected_images(name, dtype, dim, closed, half)
+    expected = expected_images(name, dtype, dim, closed, half)
     queries = {} if given.queries is None else {"queries": jnp.asarray(given.queries)}
-    batch = given.batch if given.queries is None else (given.batch, given.query_batch)
-    options = {"box": box_of(given), "batch": batch, "backend": backend, "closed": closed, "half": half}
-    nbrs = jfrnn.search(x, given.cutoff, capacity=CAPACITY[dim], **queries, **options)
+    x, batch, box = given.positions, given.batch, padded_box(given) if pad else box_of(given)
+    if pad:
+        x, batch = padded(x, N), np.concatenate([batch, np.full(N - len(batch), -1, np.int32)])
+    batch = batch if given.queries is None else (batch, given.query_batch)
+    options = {"box": box, "batch": batch, "backend": backend, "closed": closed, "half": half}
+    nbrs = jfrnn.search(jnp.asarray(x), given.cutoff, capacity=CAPACITY[dim], **queries, **options)
     nbrs.check()
     found = masked_images(nbrs, x, **queries) if geometry else listed_images(nbrs, x, **queries)
     missing, extra = expected - found, found - expected
     assert (len(missing), len(extra)) == (0, 0), f"missing {sorted(missing)[:5]}, extra {sorted(extra)[:5]} of {len(expected)}"
-    assert int(nbrs.count.sum()) == len(expected) > 0
+    assert int(np.asarray(nbrs.count).sum()) == len(expected) > 0
     assert nbrs.backend == backend
     assert (nbrs.images is None) == (name == "nearest")
 
 
 def each_case():
-    """Yield every case, kind and engine; by default two kinds on Warp, and a few cases on the engines that compile slowly."""
-    often = {("mixed", np.float32, 3, "jax"), ("slabs", np.float64, 2, "jax"), ("absent", np.float32, 2, "brute")}
+    """Yield every case, kind and engine; by default one kind on Warp, and a case on each engine that compiles slowly."""
+    often = {("slabs", np.float32, 3, "jax"), ("absent", np.float64, 2, "brute")}
     for name, dtype, dim, backend in product(CRYSTAL_CASES, (np.float32, np.float64), (2, 3), ("jax", "warp", "brute")):
         by_default = (name, dtype, dim, backend) in often or (backend == "warp" and (dtype, dim) == (np.float32, 3))
         kind = f"{name}-f{8 * dtype().itemsize}-{dim}d-{backend}"
@@ -80,7 +113,8 @@ def each_case():
 
 @pytest.mark.parametrize(("name", "dtype", "dim", "backend"), list(each_case()))
 def test_case(name, dtype, dim, backend):
-    assert_case(name, dtype, dim, backend, geometry=name in ("mixed", "nearest", "queries"))
+    geometry = backend == "warp" and name in ("mixed", "tiny", "unreduced")
+    assert_case(name, dtype, dim, backend, geometry=geometry, pad=backend == "warp" and name != "lengths")
 
 
 @pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW), pytest.param("brute", marks=SLOW)])
@@ -103,55 +137,58 @@ def crystals(dtype=np.float64, dim=2):
 @pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
 def test_skin_in_moving_boxes(backend):
     """Particles drift, boxes breathe and positions are wrapped: every step holds exactly the pairs of that step."""
-    rng, (x, batch, boxes) = np.random.default_rng(0), crystals(np.float32)
+    rng, (x, batch, boxes) = np.random.default_rng(0), [np.asarray(part) for part in crystals(np.float32)]
     batch = np.where(np.arange(len(batch)) % 7 == 0, -1, batch)
     nbrs = jfrnn.search(x, 0.5, box=jfrnn.Box(boxes), batch=batch, skin=0.08, capacity=64, backend=backend)
     update = jax.jit(lambda nbrs, x, boxes: nbrs.update(x, box=jfrnn.Box(boxes)))
     for step in range(8):
-        x = x + jnp.asarray(rng.normal(scale=0.004, size=x.shape), x.dtype)
+        x = x + rng.normal(scale=0.004, size=x.shape).astype(x.dtype)
         boxes = boxes * np.float32(1 + 0.001 * np.sin(step))
         if step == 3:
-            own = np.asarray(boxes, np.float64)[np.maximum(batch, 0)]
-            turns = np.floor(np.einsum("nd,ndk->nk", np.asarray(x, np.float64), np.linalg.inv(own)))
-            x = x - jnp.asarray(np.einsum("nd,ndk->nk", turns, own), x.dtype)
+            own = boxes.astype(np.float64)[np.maximum(batch, 0)]
+            turns = np.floor(np.einsum("nd,ndk->nk", x.astype(np.float64), np.linalg.inv(own)))
+            x = x - np.einsum("nd,ndk->nk", turns, own).astype(x.dtype)
         nbrs = update(nbrs, x, boxes)
-        assert masked_images(nbrs, x) == oracle(boxes, np.asarray(x), batch, 0.5)
+        assert masked_images(nbrs, x) == oracle(boxes, x, batch, 0.5)
     assert 0 < int(nbrs.rebuild_count) < 8
     nbrs.check()
 
 
-@pytest.mark.parametrize("way", ["distances", "edges", "list", pytest.param("sum", marks=SLOW)])
-def test_derivatives_in_positions_and_boxes(way):
-    """First derivatives against differences, and that of the first in one direction."""
+@pytest.mark.parametrize("ways", [("distances", "list"), pytest.param(("edges", "sum"), marks=SLOW)], ids="-".join)
+def test_derivatives_in_positions_and_boxes(ways):
+    """Sums over the pairs of the oracle, and their derivatives."""
     x, batch, boxes = crystals()
-    nbrs = jfrnn.search(x, 0.6, box=jfrnn.Box(boxes), batch=batch, backend="warp")
-    total = int(nbrs.count.sum())
+    pairs = arrays_of(expected_images("mixed", np.float64, 2))
+    total, capacity = len(pairs[0]), CAPACITY[2]
+    nbrs = jfrnn.search(x, 0.75, box=jfrnn.Box(boxes), batch=batch, backend="warp", capacity=capacity)
 
-    def energy(x, boxes):
+    def energy(way, x, boxes):
         def of_pair(r, i, j):
             del i, j
-            return (0.6 - jnp.sqrt(r @ r)) ** 3
+            return (0.75 - jnp.sqrt(r @ r)) ** 3
 
         box = jfrnn.Box(boxes, images=nbrs.box_kind.reach)
         if way == "sum":
-            return jfrnn.pair_sum(of_pair, x, 0.6, box=box, batch=batch).sum()
+            return jfrnn.pair_sum(of_pair, x, 0.75, box=box, batch=batch).sum()
         if way == "list":
             return jfrnn.pair_sum(of_pair, x, None, neighbors=nbrs, box=box).sum()
         if way == "edges":
             edges = nbrs.edges(x, total + 3, box=box)
             r = jnp.sqrt(jnp.where(edges.mask, (edges.displacement**2).sum(axis=1), 1))
-            return jnp.where(edges.mask, (0.6 - r) ** 3, 0).sum()
+            return jnp.where(edges.mask, (0.75 - r) ** 3, 0).sum()
         r, mask = nbrs.distances(x, box=box)
-        return jnp.where(mask, (0.6 - r) ** 3, 0).sum()
+        return jnp.where(mask, (0.75 - r) ** 3, 0).sum()
 
-    rng, h = np.random.default_rng(1), 1e-6
-    dx, db = jnp.asarray(rng.normal(size=x.shape)), jnp.asarray(rng.normal(size=boxes.shape))
-    value, gradient = jax.jit(jax.value_and_grad(energy, argnums=(0, 1)))(x, boxes)
-    ahead, behind = (jax.jit(energy)(x + s * h * dx, boxes + s * h * db) for s in (1, -1))
-    np.testing.assert_allclose(jnp.vdot(gradient[0], dx) + jnp.vdot(gradient[1], db), (ahead - behind) / (2 * h), rtol=1e-6)
-    r = np.sqrt(np.sum(np.asarray(nbrs.vectors(x)[0]) ** 2, axis=-1))[np.asarray(nbrs.vectors(x)[1])]
-    np.testing.assert_allclose(value, ((0.6 - r) ** 3).sum(), rtol=1e-12)
-    assert not np.asarray(gradient[1])[1].any()  # no particle is in that system
+    @jax.jit
+    def everything(x, boxes):
+        return [jax.value_and_grad(functools.partial(energy, way), argnums=(0, 1))(x, boxes) for way in ways]
+
+    right, of_x, of_boxes = energy_and_slopes(np.asarray(x), np.asarray(boxes), pairs, batch, 0.75)
+    for value, gradient in everything(x, boxes):
+        np.testing.assert_allclose(value, right, rtol=1e-12)
+        np.testing.assert_allclose(gradient[0], of_x, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(gradient[1], of_boxes, rtol=1e-10, atol=1e-12)
+    assert not of_boxes[1].any()  # no particle is in that system
 
 
 @pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW), pytest.param("brute", marks=SLOW)])
@@ -166,12 +203,16 @@ def test_known_numbers_of_neighbors_at_long_cutoffs(backend):
     away = np.arange(-17, 18) ** 2
     cubic = int((9 * (away[:, None, None] + away[:, None] + away) < cutoff**2).sum()) - 1
     given = {"box": jfrnn.Box(boxes), "batch": np.array([0, 0, 1, 2, 2, 3]), "backend": backend}
-    assert jfrnn.count(atoms, cutoff, **given).tolist() == [94004, 94004, cubic, 94004, 94004, 0]
-    if backend == "warp":
-        nbrs = jfrnn.search(atoms, cutoff, **given)
-        np.testing.assert_array_equal(nbrs.distances(atoms)[1].sum(axis=1), [94004, 94004, cubic, 94004, 94004, 0])
-        listed = nbrs.shifts(atoms)[2][: int(nbrs.count[2])]
-        assert len(np.unique(listed, axis=0)) == cubic
+    if backend != "warp":
+        assert jfrnn.count(atoms, cutoff, **given).tolist() == [94004, 94004, cubic, 94004, 94004, 0]
+        return
+    nbrs = jfrnn.search(atoms, cutoff, capacity=94008, **given)
+    nbrs.check()
+    counts, shifts = np.asarray(nbrs.count).tolist(), np.asarray(nbrs.shifts(atoms))
+    assert counts == [94004, 94004, cubic, 94004, 94004, 0]
+    for i, count in enumerate(counts):  # no particle has another one twice in the same image
+        listed = np.column_stack([np.asarray(nbrs.idx)[i], shifts[i]])[:count]
+        assert len(np.unique(listed @ 1000 ** np.arange(4))) == count
 
 
 @pytest.mark.parametrize(
@@ -200,7 +241,7 @@ def test_lattices_far_from_reduced(backend, options):
     for boxes in ([LONG, plain, slanted], [plain, LONG, LONG]):
         boxes = np.stack(boxes).astype(dtype)
         whole = rng.integers(-2, 3, (21, 3))
-        x = jnp.asarray(np.einsum("nd,ndk->nk", rng.uniform(0, 1, (21, 3)) + whole, boxes[batch]), dtype)
+        x = np.einsum("nd,ndk->nk", rng.uniform(0, 1, (21, 3)) + whole, boxes[batch]).astype(dtype)
         nbrs = search(x, jfrnn.Box(boxes, images=2))
         nbrs.check()
         expected = set()
@@ -215,10 +256,10 @@ def test_lattices_far_from_reduced(backend, options):
 
 
 def test_one_program_serves_other_boxes_and_flags():
-    x, batch, traces = jnp.asarray(np.random.default_rng(2).uniform(-2, 2, (30, 2))), np.arange(30, dtype=np.int32) % 4, []
+    x, batch, traces = np.random.default_rng(2).uniform(-2, 2, (30, 2)), np.arange(30, dtype=np.int32) % 4, []
 
     @jax.jit
-    def search(x, boxes, periodic):
+    def search(x, boxes, periodic, batch):
         traces.append(None)
         box = jfrnn.Box(boxes, periodic, per_system=True, images=2)
         return jfrnn.search(x, 0.5, box=box, batch=batch, capacity=64, backend="warp")
@@ -226,20 +267,19 @@ def test_one_program_serves_other_boxes_and_flags():
     for lengths in ([[1.0, 2.0], [0.5, 1.5], [1.0, 1.0], [3.0, 0.4]], [[0.6, 0.7], [2.0, 1.5], [1.0, 1.0], [3.0, 3.0]]):
         for periodic in (PERIODIC, ~PERIODIC):
             boxes = np.array(lengths)
-            found = search(x, jnp.asarray(boxes), jnp.asarray(periodic))
+            found = search(x, boxes, periodic, batch)
             found.check()
             assert listed_images(found, x) == oracle(boxes, np.asarray(x), batch, 0.5, periodic)
+    assert jfrnn.Status.BOX_TOO_SMALL in jfrnn.Status(int(search(x, np.full((4, 2), 0.1), PERIODIC, batch).status))
+    empty = boxes * [[1.0], [1.0], [1.0], [0.0]]  # of a system without particles, whatever its box is
+    search(np.where(batch[:, None] == 3, np.nan, x), empty, PERIODIC, np.where(batch == 3, -1, batch)).check()
     assert len(traces) == 1
-    assert jfrnn.Status.BOX_TOO_SMALL in jfrnn.Status(int(search(x, jnp.full((4, 2), 0.1), jnp.asarray(PERIODIC)).status))
-    empty = jnp.asarray(boxes).at[3].set(0.0)  # of a system without particles, whatever its box is
-    there = jnp.where(np.asarray(batch)[:, None] == 3, jnp.nan, x)
-    nbrs = jfrnn.search(there, 0.5, box=jfrnn.Box(boxes, per_system=True), batch=np.where(batch == 3, -1, batch), capacity=64)
-    jax.jit(lambda n, x, b: n.update(x, box=jfrnn.Box(b, per_system=True)))(nbrs, there, empty).check()
 
 
 def test_grow_in_boxes_that_shrink():
     x, batch = jnp.asarray(np.random.default_rng(3).uniform(-2, 2, (20, 2))), np.arange(20, dtype=np.int32) % 2
-    nbrs = jfrnn.search(x, 0.5, box=jfrnn.Box(np.array([[2.0, 3.0], [4.0, 2.0], [9.0, 9.0]]), per_system=True), batch=batch)
+    box = jfrnn.Box(np.array([[2.0, 3.0], [4.0, 2.0], [9.0, 9.0]]), per_system=True)
+    nbrs = jfrnn.search(x, 0.5, box=box, batch=batch, capacity=8)
     assert nbrs.images is None
     boxes = np.array([[0.4, 0.9], [1.5, 0.7], [9.0, 9.0]])
     small = jfrnn.Box(boxes, per_system=True)
@@ -305,7 +345,7 @@ X, SYSTEMS, CELLS = np.zeros((4, 3)), np.zeros(4, np.int32), np.stack([np.eye(3)
         (
             ValueError,
             r"kind with which the list was made \(.*for each of 2 systems\), got .*for each of 1 systems",
-            lambda: jfrnn.search(X, 0.1, box=jfrnn.Box(CELLS), batch=SYSTEMS).update(X, box=jfrnn.Box(CELLS[:1])),
+            lambda: jfrnn.search(X, 0.1, box=jfrnn.Box(CELLS), batch=SYSTEMS, capacity=8).update(X, box=jfrnn.Box(CELLS[:1])),
         ),
         (
             ValueError,
