@@ -18,6 +18,9 @@ CAPACITY = 400
 LENGTH = 304
 
 
+unpacked = jax.jit(unpack_turns, static_argnums=1)
+
+
 def image_pairs(nbrs, positions, queries=None):
     """Return (i, j, S) of every used slot, after checking padding and counts; S is found without the library's vectors."""
     assert not nbrs.overflow
@@ -34,7 +37,7 @@ def image_pairs(nbrs, positions, queries=None):
         shifts = np.zeros((len(i), x.shape[1]), int)
         shifts[:, periodic] = -np.rint((x[j] - q[i]) @ np.linalg.pinv(vectors))
     else:
-        turns, query_turns = (None if t is None else np.asarray(unpack_turns(t, nbrs.box.dim)) for t in nbrs.images[1:])
+        turns, query_turns = (None if t is None else np.asarray(unpacked(t, nbrs.box.dim)) for t in nbrs.images[1:])
         shifts = kind.shifts[np.asarray(nbrs.images.codes)[i, k]] + (turns if query_turns is None else query_turns)[i] - turns[j]
         shifts = shifts @ kind.numbers  # of given vectors, where the list counts short ones
     pairs = list(zip(i.tolist(), j.tolist(), map(tuple, shifts.tolist()), strict=True))

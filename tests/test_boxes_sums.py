@@ -3,7 +3,6 @@
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_boxes import CAPACITY, box_of, expected_images
@@ -20,24 +19,30 @@ fused = functools.partial(jfrnn.pair_sum, backend="warp")
 
 def assert_case(name, dtype, dim, listed):
     given = CRYSTAL_CASES[name].build(dtype, dim)
-    x, q = jnp.asarray(given.positions), None if given.queries is None else jnp.asarray(given.queries)
+    q, systems = given.queries, given.batch if given.queries is None else given.query_batch
     queries = {} if q is None else {"queries": q}
-    systems = given.batch if q is None else given.query_batch
-    options = {"box": box_of(given), "batch": given.batch if q is None else (given.batch, given.query_batch)}
-    values = {"query_values": jnp.arange(len(systems), dtype=dtype)} if queries else {}
-    ids = jnp.arange(len(x), dtype=dtype)
+    images = box_of(given).images_for(given.cutoff)
+    box = jfrnn.Box(given.boxes, given.periodic, per_system=True, images=images)
+    batch = given.batch if q is None else (given.batch, given.query_batch)
+    values = {"query_values": np.arange(len(systems), dtype=dtype)} if queries else {}
+    ids = np.arange(len(given.positions), dtype=dtype)
+
+    @jax.jit
+    def sums(x, box, queries):
+        if not listed:
+            return fused(marks, x, given.cutoff, ids, box=box, batch=batch, **queries, **values), None
+        nbrs = jfrnn.search(x, given.cutoff, box=box, batch=batch, capacity=CAPACITY[dim], backend="warp", **queries)
+        return jfrnn.pair_sum(marks, x, None, ids, neighbors=nbrs, **queries, **values), nbrs
+
+    found, nbrs = sums(given.positions, box, queries)
     if listed:
-        nbrs = jfrnn.search(x, given.cutoff, capacity=CAPACITY[dim], backend="warp", **queries, **options)
         nbrs.check()
-        found = jfrnn.pair_sum(marks, x, None, ids, neighbors=nbrs, **queries, **values)
-    else:
-        found = fused(marks, x, given.cutoff, ids, **queries, **values, **options)
     cells = given.boxes if given.boxes.ndim == 3 else np.einsum("sd,dk->sdk", given.boxes, np.eye(dim))
     there = (systems >= 0) & (systems < len(cells))
     points = np.where(there[:, None], given.positions if q is None else given.queries, 0)
     pairs = expected_images(name, dtype, dim)
     keep = there & np.isfinite(points).all(axis=1)
-    found = jax.tree.map(lambda s: np.where(keep.reshape(-1, *[1] * (s.ndim - 1)), s, 0), found)
+    found = jax.tree.map(lambda s: np.where(keep.reshape(-1, *[1] * (s.ndim - 1)), s, 0), jax.tree.map(np.asarray, found))
     assert_marks(found, pairs, given.positions, points, cells[np.clip(systems, 0, len(cells) - 1)])
 
 
