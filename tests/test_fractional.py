@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from test_box import masked_images
+from test_box import arrays_of, image_pairs, masked_images, pull_back
 from test_boxes import oracle as oracle_of_systems
 
 import jfrnn
@@ -62,16 +62,20 @@ def test_lists_flat_lists_and_counts(name, dtype, backend):
     nbrs.check()
     assert masked_images(nbrs, u) == expected
     np.testing.assert_array_equal(jfrnn.count(u, cutoff, **given), nbrs.count)
-    flat = jfrnn.search_edges(u, cutoff, half=True, **given)
-    edges = flat.edges(u)
-    i, j, s = (np.asarray(part)[np.asarray(edges.mask)] for part in (edges.receivers, edges.senders, edges.shift))
+    flat = jfrnn.search_edges(u, cutoff, half=True, total=2048, **given)
+    flat.check()
+    edges = jax.jit(lambda flat, u: flat.edges(u))(flat, u)
+    i, j, s, v = (np.asarray(x)[np.asarray(edges.mask)] for x in (edges.receivers, edges.senders, edges.shift, edges.displacement))
     half = reference.reference_images(real, cutoff, matrix=vectors, periodic=flags, half=True)
     assert set(zip(i.tolist(), j.tolist(), map(tuple, s.tolist()), strict=True)) == half
     rows = np.diag(vectors) if vectors.ndim == 1 else vectors
-    np.testing.assert_allclose(edges.displacement[: len(i)], real[j] - real[i] + s @ rows, atol=1e-5)
+    np.testing.assert_allclose(v, real[j] - real[i] + s @ rows, atol=1e-5)
     of_queries = jfrnn.search(u, cutoff, queries=q, capacity=CAPACITY, **given)
     asked = reference.reference_images(real, cutoff, matrix=vectors, periodic=flags, queries=asking)
-    assert masked_images(of_queries, u, queries=q) == asked
+    if of_queries.images is None:
+        assert masked_images(of_queries, u, queries=q) == asked
+    else:
+        assert image_pairs(of_queries, u, queries=q) == asked
 
 
 CELLS = np.stack([SKEWED, 0.4 * SKEWED, 2.5 * SKEWED[::-1]])
@@ -116,40 +120,50 @@ def smooth(r, i, j):
     return (0.7 - jnp.sqrt(r @ r + 0.01)) ** 3 * (1 + r[0])
 
 
+def smooth_in_numpy(r):
+    """Return `smooth` of each row of r, which may be complex, and its derivative."""
+    s, factor = np.sqrt((r**2).sum(axis=1) + 0.01), 1 + r[:, 0]
+    of_length = -3 * (0.7 - s) ** 2 * factor / s
+    return (0.7 - s) ** 3 * factor, of_length[:, None] * r + ((0.7 - s) ** 3)[:, None] * np.eye(3)[0]
+
+
 @pytest.mark.parametrize("per_system", [True, pytest.param(False, marks=SLOW)])
-@pytest.mark.parametrize("way", ["search", *(pytest.param(way, marks=SLOW) for way in ("list", "edges", "distances", "jax"))])
+@pytest.mark.parametrize("way", ["search", *(pytest.param(way, marks=SLOW) for way in ("list", "edges", "jax"))])
 def test_derivatives_in_coordinates_and_vectors_are_those_of_the_product(way, per_system):
-    u, batch = points(np.float64, 4), jnp.arange(N) % 3
-    cells = jnp.asarray(CELLS if per_system else SKEWED)
+    """First and second derivatives of sums over the oracle's pairs, the second in one direction, by a complex step."""
+    u, batch = np.asarray(points(np.float64, 4)), np.arange(N) % 3 if per_system else np.zeros(N, int)
+    cells = CELLS if per_system else SKEWED[None]
+    real = np.concatenate([exact(p[None], cells[k], np.float64) for p, k in zip(u, batch)])
+    i, j, shifts = arrays_of(oracle_of_systems(cells, real, batch, 0.6))
+    images, weights = jfrnn.Box(CELLS if per_system else SKEWED).images_for(0.6), np.cos(np.arange(N))
     more = {"batch": batch} if per_system else {}
-    nbrs = jfrnn.search(u, 0.6, box=jfrnn.Box(cells, fractional=True), **more)
-    total = int(nbrs.count.sum())
-    weights = jnp.cos(jnp.arange(N))
 
-    def energy(u, cells, fractional):
-        x = u if fractional else jnp.einsum("nd,ndk->nk", u, cells[batch]) if per_system else u @ cells
-        box, kept = jfrnn.Box(cells, images=nbrs.box_kind.reach, fractional=fractional), nbrs
-        if not fractional:
-            kept = jfrnn.search(jax.lax.stop_gradient(x), 0.6, box=box, capacity=nbrs.capacity, **more)
+    def energy(u, cells):
+        box = jfrnn.Box(cells if per_system else cells[0], images=images, fractional=True)
+        if way in ("search", "jax"):
+            return jfrnn.pair_sum(smooth, u, 0.6, box=box, backend="jax" if way == "jax" else "warp", **more) @ weights
+        nbrs = jfrnn.search(u, 0.6, box=box, capacity=CAPACITY, **more)
         if way == "list":
-            return jfrnn.pair_sum(smooth, x, None, neighbors=kept, box=box) @ weights
-        if way == "edges":
-            edges = kept.edges(x, total, box=box)
-            return (jnp.where(edges.mask, jax.vmap(lambda r: smooth(r, None, None))(edges.displacement), 0) * edges.receivers).sum()
-        if way == "distances":
-            r, mask = kept.distances(x, box=box)
-            return jnp.where(mask, (0.6 - r) ** 3, 0).sum(1) @ weights
-        return jfrnn.pair_sum(smooth, x, 0.6, box=box, backend="jax" if way == "jax" else "warp", **more) @ weights
+            return jfrnn.pair_sum(smooth, u, None, neighbors=nbrs, box=box) @ weights
+        edges = nbrs.edges(u, len(i), box=box)
+        terms = jax.vmap(lambda r: smooth(r, None, None))(edges.displacement)
+        return jnp.where(edges.mask, terms * jnp.asarray(weights)[jnp.minimum(edges.receivers, N - 1)], 0).sum()
 
-    def everything(u, cells, fractional):
-        slopes = jax.value_and_grad(energy, (0, 1))
-        second = jax.jvp(lambda u, c: slopes(u, c, fractional), (u, cells), (jnp.sin(u), jnp.cos(cells)))[1]
-        return slopes(u, cells, fractional), second
+    def in_numpy(u, cells):
+        whole, rows = u[j] - u[i] + shifts, cells[batch[i]]
+        terms, forces = smooth_in_numpy(np.einsum("pd,pdk->pk", whole, rows))
+        forces = weights[i, None] * forces
+        of_u, _ = pull_back(np.einsum("pk,pdk->pd", forces, rows), u, cells, (i, j, shifts), batch)
+        return terms @ weights[i], of_u, pull_back(forces, u, cells, (i, j, whole), batch)[1]
 
-    for found, right in zip(
-        *(jax.tree.leaves(jax.jit(everything, static_argnums=2)(u, cells, x)) for x in (True, False)), strict=True
-    ):
-        np.testing.assert_allclose(found, right, rtol=1e-8, atol=1e-9 * float(jnp.abs(right).max()))
+    slopes, ways, step = jax.value_and_grad(energy, (0, 1)), (np.sin(u), np.cos(cells)), 1e-30
+    found, turned = jax.jit(lambda *given: jax.jvp(slopes, given[:2], given[2:]))(u, cells, *ways)
+    ahead = in_numpy(*(given + 1j * step * way for given, way in zip((u, cells), ways, strict=True)))
+    for parts in zip(*map(jax.tree.leaves, (found, turned)), in_numpy(u, cells), ahead, strict=True):
+        first, second, right, right_ahead = map(np.asarray, parts)
+        np.testing.assert_allclose(first, right, rtol=1e-8, atol=1e-9 * np.abs(right).max())
+        right = right_ahead.imag / step
+        np.testing.assert_allclose(second, right, rtol=1e-8, atol=1e-9 * np.abs(right).max())
 
 
 def test_chunks_of_steps():
@@ -164,23 +178,24 @@ def test_chunks_of_steps():
 
         return jax.lax.fori_loop(0, 5, step, (size, nbrs))
 
-    nbrs = jfrnn.search(u, 0.7, skin=0.1, box=jfrnn.Box(3 * SKEWED, fractional=True))
+    nbrs = jfrnn.search(u, 0.7, skin=0.1, box=jfrnn.Box(3 * SKEWED, fractional=True), capacity=32)
     size, nbrs = jfrnn.run_chunk(chunk, jnp.asarray(1.0), nbrs, lambda size: u, box=box)
-    real = exact(u, size * 3 * SKEWED, np.float64)
-    assert masked_images(nbrs, u) == reference.reference_images(real, 0.7, matrix=np.asarray(nbrs.box.vectors), periodic=[True] * 3)
-    graph = nbrs.to_jraph(u, 4096)
-    np.testing.assert_allclose(graph.nodes["positions"][:N], real, rtol=1e-12)
+    real, vectors = exact(u, float(size) * 3 * SKEWED, np.float64), np.asarray(nbrs.box.vectors)
+    assert nbrs.images is not None
+    assert masked_images(nbrs, u) == reference.reference_images(real, 0.7, matrix=vectors, periodic=[True] * 3)
+    graph = jax.jit(lambda nbrs, u: nbrs.to_jraph(u, 1024).nodes)(nbrs, u)
+    np.testing.assert_allclose(graph["positions"][:N], real, rtol=1e-12)
 
 
 def test_errors():
     u, box = points(np.float32), jfrnn.Box(SKEWED, fractional=True)
     with pytest.raises(TypeError, match="fractional must be True or False, known while tracing, got 'yes'"):
         jfrnn.Box(SKEWED, fractional="yes")
-    nbrs = jfrnn.search(u, 0.3, box=box)
+    nbrs = jfrnn.search(u, 0.3, box=box, capacity=64)
     with pytest.raises(ValueError, match=r"of the kind with which the list was made \(.*matrix, fractional\), got .*matrix\."):
         nbrs.update(u, box=jfrnn.Box(SKEWED))
     with pytest.raises(ValueError, match="positions that are lengths: spread positions @ vectors"):
         mesh = jax.make_mesh((1,), ("x",))
         jfrnn.distributed.scatter(np.asarray(u), 0.3, mesh=mesh, box=jfrnn.Box([1.0, 1.0, 1.0], fractional=True))
-    lost = jfrnn.search(u.at[3].set(jnp.nan), 0.3, box=box, capacity=64)
-    assert jfrnn.Status(int(lost.status)) == jfrnn.Status.NONFINITE and lost.count[3] == 0
+    lost = jfrnn.search(np.where(np.arange(N)[:, None] == 3, np.nan, u).astype(u.dtype), 0.3, box=box, capacity=64)
+    assert jfrnn.Status(int(lost.status)) == jfrnn.Status.NONFINITE and np.asarray(lost.count)[3] == 0
