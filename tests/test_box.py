@@ -107,8 +107,8 @@ DIFFERENT = [
     pytest.param("far_from_reduced_crowded", np.float32, 2, True, marks=pytest.mark.slow),
     pytest.param("residues_across_100", np.float64, 2, True, marks=pytest.mark.slow),
 ]
-# other axes than those of periodic_x, periodic_z, periodic_xz and periodic_yz, a program each
-RARE = ("periodic_y", "periodic_xy")
+# other axes than those of periodic_x, periodic_z, periodic_xz and periodic_yz, or of skewed_slab and skewed_wire, a program each
+RARE = ("periodic_y", "periodic_xy", "skewed_slab_first")
 
 
 @pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x in RARE)) for x in PERIODIC_CASES])
@@ -294,13 +294,14 @@ def test_gradients_in_positions_and_box(vectors):
         assert np.abs(right).max() > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("backend", "vectors"),
     [
-        pytest.param("warp", LENGTHS, marks=pytest.mark.slow),
+        ("warp", LENGTHS),
         ("warp", SKEWED),
-        pytest.param("warp", SMALL, marks=pytest.mark.slow),
-        pytest.param("jax", LENGTHS, marks=pytest.mark.slow),
+        ("warp", SMALL),
+        ("jax", LENGTHS),
     ],
     ids=["warp-lengths", "warp-skewed", "warp-images", "jax-lengths"],
 )
@@ -390,10 +391,14 @@ def test_derivatives_in_a_lattice_far_from_reduced_are_those_in_the_given_vector
     np.testing.assert_allclose(found, 2 * np.einsum("nkl,nkd->ld", shifts, vectors), rtol=1e-9, atol=1e-9)
 
 
-def test_known_numbers_of_neighbors_at_long_cutoffs():
-    """One particle in a skewed cell; diamond, 2 atoms in its primitive cell, at 95 bohr."""
+def test_the_neighbors_of_one_particle_in_a_skewed_cell():
     alone = jfrnn.Box([[3.0, 0.0, 0.0], [900.0, 3.0, 0.0], [0.0, 0.0, 3.0]])
     assert jfrnn.count(np.zeros((1, 3)), 6.0, box=alone).tolist() == [26]
+
+
+@pytest.mark.slow
+def test_known_numbers_of_neighbors_at_long_cutoffs():
+    """Diamond, 2 atoms in its primitive cell, at 95 bohr."""
     edge, bohr = 3.567, 0.529177210903
     diamond = jfrnn.Box(edge / 2 * np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 0.0]]))
     atoms = edge / 4 * np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
@@ -448,7 +453,7 @@ def test_bad_boxes_say_what_is_wrong(error, match, make):
     ("vectors", "cutoff", "dtype"),
     [
         (LENGTHS, 0.3, np.float32),
-        (LENGTHS, 0.5, np.float64),
+        pytest.param(LENGTHS, 0.5, np.float64, marks=pytest.mark.slow),
         (SMALL, 0.3, np.float64),
         (SKEWED, 0.6, np.float32),
         (LENGTHS, 3.1, np.float32),

@@ -112,7 +112,7 @@ def each_case():
 
 @pytest.mark.parametrize(("name", "dtype", "dim", "backend"), list(each_case()))
 def test_case(name, dtype, dim, backend):
-    geometry = backend == "warp" and name in ("mixed", "unreduced")
+    geometry = backend == "warp" and name == "unreduced"  # where shifts of the list count other vectors than the given ones
     assert_case(name, dtype, dim, backend, geometry=geometry, pad=backend == "warp" and name != "lengths")
 
 
@@ -282,7 +282,6 @@ def test_grow_in_boxes_that_shrink():
     assert nbrs.images is None
     boxes = np.array([[0.4, 0.9], [1.5, 0.7], [9.0, 9.0]])
     small = jfrnn.Box(boxes, per_system=True)
-    assert bool(nbrs.update(x, box=small).overflow)
     assert listed_images(nbrs.grow(x, box=small), x) == oracle(boxes, np.asarray(x), batch, 0.5)
 
 

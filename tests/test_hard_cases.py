@@ -44,13 +44,14 @@ BRUTE = ("lattice_1_at_0", "ulp_away", "n_33")  # all pairs are tested as "jax" 
 def is_default(name, dtype, dim, closed, backend):
     """Say whether a combination runs by default: each case in as few programs as meet each dtype, dimension and comparison.
 
-    "warp" answers each case in both dtypes, and every other one also in the other dimension of each, where pairs at the cutoff
-    count. "jax" and "hashgrid", whose programs take long to compile, answer each case in one of two kinds, "brute" a few.
+    "warp" answers each case in both dtypes, and half of them in another dimension, too, where pairs at the cutoff count. "jax" and
+    "hashgrid", whose programs take long to compile, answer each case in one of two kinds, but for two on "jax"; "brute" a few.
     """
-    kind, odd, queried = (dtype, dim, closed), NAMES.index(name) % 2 == 1, name.startswith("queries")
+    kind, place, queried = (dtype, dim, closed), NAMES.index(name), "queries" in name or name == "no_sources"
+    odd = place % 2 == 1
     first, second = (np.float32, 3, False), (np.float64, 2, False)
     if backend == "warp":
-        return kind in (first, second, (np.float32, 2, True) if odd else (np.float64, 3, True))
+        return kind in (first, second, {0: (np.float64, 3, True), 1: (np.float32, 2, True)}.get(place % 4))
     if backend == "hashgrid":
         return kind == ((np.float32, 3, True) if not queried and (odd or name in SCALED) else second)
     if backend == "jax" and name in ("uniform", "mixed_exponents"):  # another program, and as much time as all others take

@@ -152,7 +152,6 @@ OFTEN = [  # each rule, part, space, engine and width; what takes long to compil
     ("gather", "open", "jax", F32, ("count",)),
     ("scatter", "open", "jax", F32, ("search",)),
     ("either", "open", "jax", F64, ("pair_sum",)),
-    ("sum", "open", "jax", F64, ("count",)),
 ]
 
 
