@@ -1,13 +1,17 @@
-"""Lists that are kept, by Warp's kernels: the pairs that they find and what they sum, against array programming."""
+"""Lists that are kept, by Warp's kernels and by array programming: the pairs that they find and what they sum, against NumPy."""
 
 import dataclasses
+import functools
+import math
 import warnings
 from itertools import product
 
+import by_numpy
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
 
 import jfrnn
 from jfrnn._engine import ARRAYS
@@ -33,6 +37,9 @@ LISTS = {
     "half mean": {"radius_rule": "mean", "half": True},
 }
 CAPACITY = {"half short vectors": 640}  # given: a program that counts would be compiled besides
+REVERSED = ("half", "queries")
+N, ASKING, CUTOFF = 90, 31, 0.3
+SLOW = pytest.mark.slow
 
 
 def by_arrays(nbrs):
@@ -41,67 +48,161 @@ def by_arrays(nbrs):
     return dataclasses.replace(nbrs, problem=dataclasses.replace(nbrs.problem, options=options))
 
 
-def make(name, dtype=np.float64, dim=3, n=90, skin=0.05, reverse=False):
-    rng, options = np.random.default_rng(5), dict(LISTS[name])
-    box, queries = options.pop("box", None), options.pop("queries", False)
-    box = None if box is None else np.array(box, dtype)[:dim] if np.ndim(box) == 1 else np.array(box, dtype)[:dim, :dim]
-    x = rng.random((n, dim)) * (box if box is not None and box.ndim == 1 else 1)
-    cutoff = jnp.asarray(rng.uniform(0.1, 0.35, n), dtype) if "radius_rule" in options else 0.3
-    q = jnp.asarray(rng.random((31, dim)), dtype) if queries else None
-    options |= {"box": None if box is None else jfrnn.Box(box), "queries": q, "skin": skin, "reverse": reverse}
-    x = jnp.asarray(x, dtype)
+def box_of(name, dtype, dim=3):
+    box = LISTS[name].get("box")
+    return None if box is None else np.array(box, dtype)[(slice(dim),) * np.ndim(box)]
+
+
+@functools.cache
+def made(name, dtype=np.float64, dim=3):
+    """Return a list with a skin, positions after a motion that it allows, and queries: several tests share a list and its program."""
+    rng, options, box = np.random.default_rng(5), dict(LISTS[name]), box_of(name, dtype, dim)
+    x = (rng.random((N, dim)) * (box if box is not None and box.ndim == 1 else 1)).astype(dtype)
+    cutoff = radii_of(dtype) if "radius_rule" in options else CUTOFF
+    q = np.random.default_rng(6).random((ASKING, dim)).astype(dtype) if options.pop("queries", False) else None
+    options |= {"box": None if box is None else jfrnn.Box(box), "queries": q, "skin": 0.05, "reverse": name in REVERSED}
     nbrs = jfrnn.search(x, cutoff, backend="warp", capacity=CAPACITY.get(name, 128), **options)
     nbrs.check()
-    return nbrs, x + jnp.asarray(0.02 * np.sin(9 * np.arange(x.size)), dtype).reshape(x.shape), q
+    moved = x + (0.012 * np.sin(9 * np.arange(x.size))).astype(dtype).reshape(x.shape)
+    return nbrs, jnp.asarray(moved), None if q is None else jnp.asarray(q)
 
 
-OFTEN = ("images", "either")  # in single precision too; the others by hand
-PRECISIONS = [pytest.param(name, np.float64, marks=[pytest.mark.slow] * (k % 3 > 0)) for k, name in enumerate(LISTS)]
-PRECISIONS += [pytest.param(name, np.float32, marks=[pytest.mark.slow] * (name not in OFTEN)) for name in LISTS]
+def radii_of(dtype):
+    return np.random.default_rng(7).uniform(0.1, 0.35, N).astype(dtype)
 
 
-@pytest.mark.parametrize(("name", "dtype"), PRECISIONS)
+def oracle(name, x, q=None):
+    """Return all pairs at these positions, (i, j, shift); of half lists, in both directions."""
+    x, q = np.asarray(x), None if q is None else np.asarray(q)
+    (dim, box), rule = (x.shape[1], box_of(name, x.dtype, x.shape[1])), LISTS[name].get("radius_rule")
+    cell = {"matrix": np.ones(dim) if box is None else box, "periodic": (box is not None,) * dim}
+    if rule is not None:
+        return reference.reference_radii(x, radii_of(x.dtype), rule, queries=q, **cell)
+    return reference.reference_images(x, CUTOFF, queries=q, include_self=LISTS[name].get("include_self", False), **cell)
+
+
+def assert_pairs(name, nbrs, found, x, q=None):
+    """Fail unless these slots of a list, by their displacements and a mask, are the oracle's pairs."""
+    expected = oracle(name, x, q)
+    expected = by_numpy.forward(expected) if LISTS[name].get("half") else expected
+    assert by_numpy.named_slots(nbrs.idx, *found, x, q, box_of(name, x.dtype, x.shape[1])) == expected
+
+
+# What is left out here, sums below ask for, or by hand.
+OFTEN = [("open", np.float64), ("nearest", np.float64), ("half images", np.float64)]
+OFTEN += [("skewed", np.float32), ("gather", np.float32), ("both", np.float32)]
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [pytest.param(*each, marks=[SLOW] * (each not in OFTEN)) for each in product(LISTS, (np.float32, np.float64))],
+)
 def test_pairs_at_new_positions(name, dtype):
-    nbrs, x, q = make(name, dtype)
-    ours, theirs = (np.asarray(each.vectors(x, queries=q)[1]) for each in (nbrs, by_arrays(nbrs)))
-    np.testing.assert_array_equal(ours, theirs)
-    assert 0 < ours.sum() < (np.asarray(nbrs.idx) < len(x)).sum()
+    nbrs, x, q = made(name, dtype)
+    found = nbrs.vectors(x, queries=q)
+    assert_pairs(name, nbrs, found, x, q)
+    assert 0 < np.asarray(found[1]).sum() < (np.asarray(nbrs.idx) < N).sum()
 
 
-PAIRWISE = [(np.float32, 2, False), (np.float32, 3, True), (np.float64, 2, True), (np.float64, 3, False)]
-EVERY = [
-    pytest.param(*given, marks=[pytest.mark.slow] * (given not in PAIRWISE))
-    for given in product((np.float32, np.float64), (2, 3), (False, True))
-]
+SCALES = (1.0, 1e-4, 3e-17, 1e15)  # in single precision, kernels of their own scale distances of 3e-17
+LATTICES = [(np.float32, 2, False, scale) for scale in (1.0, 1e15)] + [(np.float32, 3, True, scale) for scale in (3e-17, 1e15)]
+LATTICES += [(np.float64, *kind, scale) for kind in ((2, True), (3, False)) for scale in (1.0, 3e-17, 1e15)]
+EVERY = product((np.float32, np.float64), (2, 3), (False, True), SCALES)
 
 
-@pytest.mark.parametrize("scale", [1.0, pytest.param(1e-4, marks=pytest.mark.slow), 3e-17, 1e15])
-@pytest.mark.parametrize(("dtype", "dim", "closed"), EVERY)
+@pytest.mark.parametrize(
+    ("dtype", "dim", "closed", "scale"), [pytest.param(*given, marks=[SLOW] * (given not in LATTICES)) for given in EVERY]
+)
 def test_ties_are_decided_exactly(scale, dtype, dim, closed):
     """All points on a lattice, in a list of all of them: rows full of pairs at exactly the cutoff, or as near as floats allow."""
     grid = np.stack(np.meshgrid(*[np.arange(4)] * dim, indexing="ij"), -1).reshape(-1, dim)
-    lattice = jnp.asarray((grid * scale).astype(dtype))
-    nbrs = jfrnn.search(jnp.zeros_like(lattice), 2 * scale, closed=closed, backend="warp")
-    mask = np.asarray(nbrs.vectors(lattice)[1])
-    np.testing.assert_array_equal(mask, np.asarray(by_arrays(nbrs).vectors(lattice)[1]))
+    lattice = (grid * scale).astype(dtype)
+    nbrs = jfrnn.search(np.zeros_like(lattice), 2 * scale, closed=closed, capacity=len(lattice), backend="warp")
+    vectors, mask = nbrs.vectors(lattice)
+    expected = reference.reference_pairs(lattice, 2 * scale, closed=closed)
+    assert {pair[:2] for pair in by_numpy.named_slots(nbrs.idx, vectors, mask, lattice)} == expected
     count = jfrnn.pair_sum(lambda r, i, j: jnp.ones((), r.dtype), lattice, None, neighbors=nbrs)
-    np.testing.assert_array_equal(count, mask.sum(1))
+    np.testing.assert_array_equal(count, np.asarray(mask).sum(1))
 
 
-@pytest.mark.parametrize("length", [4.0, 5.0])
+@pytest.mark.parametrize(
+    ("dtype", "length"),
+    [(np.float32, 4.0), (np.float32, 5.0), (np.float64, 4.0), pytest.param(np.float64, 5.0, marks=SLOW)],
+    ids=["f32-4.0", "f32-5.0", "f64-4.0", "f64-5.0"],
+)
 def test_ties_of_images_are_decided_exactly(length, dtype):
     grid = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    box = jfrnn.Box(np.full(3, length * 0.1, dtype))
-    x = jnp.asarray((grid * 0.1).astype(dtype))
-    nbrs = jfrnn.search(x, 0.2, skin=0.05, box=box, backend="warp")
-    moved = x + jnp.asarray(length * 0.1 * np.random.default_rng(0).integers(-2, 3, x.shape), dtype)
+    lengths = np.full(3, length * 0.1, dtype)
+    x = (grid * 0.1).astype(dtype)
+    nbrs = jfrnn.search(x, 0.2, skin=0.05, box=jfrnn.Box(lengths), capacity=96, backend="warp")
+    moved = x + (length * 0.1 * np.random.default_rng(0).integers(-2, 3, x.shape)).astype(dtype)
     for each in (x, moved):
-        np.testing.assert_array_equal(nbrs.vectors(each)[1], by_arrays(nbrs).vectors(each)[1])
+        expected = reference.reference_images(each, 0.2, matrix=lengths, periodic=(True,) * 3)
+        assert by_numpy.named_slots(nbrs.idx, *nbrs.vectors(each), each, matrix=lengths) == expected
 
 
 def summand(r, i, j):
     square = jnp.sum(r * r)
     return {"a": i["m"] * j["m"] * jnp.exp(-square), "b": r * j["v"], "c": jnp.where(square > 0.01, j["k"], 0)}
+
+
+RNG = np.random.default_rng(1)
+VALUES = {"m": RNG.random(N), "v": RNG.random((N, 3)), "k": np.arange(N, dtype=np.int32)}
+
+
+def energy_of(sums, sin=jnp.sin):
+    return (sums["a"] ** 2).sum() + sin(sums["b"]).sum()
+
+
+def everything(nbrs, x, q, twice, compensated=False):
+    """Return displacements, the mask, and sums with their derivatives: of first order, and (`twice`) those along a motion, too."""
+    mine = None if q is None else {"m": VALUES["m"][:ASKING]}
+
+    def energy(x, m, scale, q):
+        sums = jfrnn.pair_sum(
+            lambda r, i, j: {key: scale * y if key != "c" else y.astype(r.dtype) for key, y in summand(r, i, j).items()},
+            x, None, {**VALUES, "m": m}, neighbors=nbrs, queries=q, query_values=mine, compensated=compensated,
+        )  # fmt: skip
+        return energy_of(sums), sums
+
+    @jax.jit
+    def all_of(x, m, scale, q):
+        def slopes(x):
+            (_, sums), slopes = jax.value_and_grad(energy, (0, 1, 2) if q is None else (0, 1, 2, 3), has_aux=True)(x, m, scale, q)
+            return sums, slopes
+
+        found = jax.jvp(slopes, (x,), (jnp.cos(x),)) if twice else slopes(x)
+        return nbrs.vectors(x, queries=q), found
+
+    return all_of(x, VALUES["m"], jnp.asarray(1.5), q)
+
+
+def expected_of(name, x, q, twice):
+    """Return what `everything` finds of sums, by NumPy; the derivatives along a motion by a step along the imaginary axis."""
+    pairs, matrix, scale = by_numpy.in_order(oracle(name, x, q), 3), box_of(name, np.float64), 1.5
+    x, q = np.asarray(x), None if q is None else np.asarray(q)
+    matrix = np.diag(matrix) if matrix is not None and matrix.ndim == 1 else matrix
+    i, j, rows, (m, v, k) = pairs.i, pairs.j, N if q is None else ASKING, VALUES.values()
+
+    def slopes(x):
+        r = by_numpy.vectors_of(pairs, x, x if q is None else q, matrix)
+        square = (r * r).sum(1)
+        near = np.exp(-square)
+        terms = {"a": scale * m[i] * m[j] * near, "b": scale * r * v[j], "c": np.where(square.real > 0.01, k[j], 0) + 0 * square}
+        sums = {key: by_numpy.add_up(term, i, rows) for key, term in terms.items()}
+        of_a, of_b = 2 * sums["a"][i], np.cos(sums["b"])[i]
+        of_r = (-2 * of_a * terms["a"])[:, None] * r + scale * of_b * v[j]
+        of_m = by_numpy.add_up(scale * of_a * m[i] * near, j, N)
+        of_m = of_m if q is not None else of_m + by_numpy.add_up(scale * of_a * m[j] * near, i, N)
+        of_x = by_numpy.pull(pairs, of_r, x, q)
+        of_scale = ((of_a * terms["a"]).sum() + (of_b * terms["b"]).sum()) / scale
+        return sums, (of_x, of_m, of_scale) if q is None else (of_x[0], of_m, of_scale, of_x[1])
+
+    return (slopes(x), by_numpy.along(slopes, x, np.cos(x))) if twice else slopes(x)
+
+
+def assert_close(found, expected):
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-11), found, expected)
 
 
 TWICE = ("images", "either")  # second derivatives of the others by hand
@@ -111,83 +212,100 @@ SUMMED += [(name, True, False) for name in ("scatter", "queries")]
 MORE = [(name, False, True) for name in LISTS if name not in TWICE] + [
     (name, True, True) for name in ("images", "scatter", "queries")
 ]
-SUMMED += [pytest.param(*more, marks=pytest.mark.slow) for more in MORE]
 
 
-@pytest.mark.parametrize(("name", "compensated", "twice"), SUMMED)
+@pytest.mark.parametrize(("name", "compensated", "twice"), [*SUMMED, *(pytest.param(*more, marks=SLOW) for more in MORE)])
 def test_sums_and_derivatives(name, compensated, twice):
     """Of first order, and where kinds of lists differ in how pairs are passed on (`twice`) of second order."""
-    nbrs, x, q = make(name, reverse=name in ("half", "queries"))
-    rng, n = np.random.default_rng(1), len(x)
-    values = {"m": jnp.asarray(rng.random(n)), "v": jnp.asarray(rng.random((n, 3))), "k": jnp.arange(n, dtype=jnp.int32)}
-    mine = None if q is None else {"m": values["m"][:31]}
+    nbrs, x, q = made(name)
+    found, sums = everything(nbrs, x, q, twice, compensated)
+    assert_pairs(name, nbrs, found, x, q)
+    assert_close(sums, expected_of(name, x, q, twice))
 
-    def total(nbrs, x, m, q, scale):
-        sums = jfrnn.pair_sum(
-            lambda r, i, j: {key: scale * y if key != "c" else y.astype(r.dtype) for key, y in summand(r, i, j).items()},
-            x, None, {**values, "m": m}, neighbors=nbrs, queries=q, query_values=mine, compensated=compensated,
-        )  # fmt: skip
-        return jnp.sum(sums["a"] ** 2) + jnp.sum(jnp.sin(sums["b"])), sums
 
-    which = (1, 2, 4) if q is None else (1, 2, 3, 4)
-
-    @jax.jit
-    def all_of(nbrs, x, m, q, scale):
-        first = jax.grad(lambda *given: total(*given)[0], which)
-
-        def slope(x):
-            return jax.grad(lambda x: total(nbrs, x, m, q, scale)[0])(x)
-
-        second = jax.jvp(slope, (x,), (jnp.cos(x),))[1] if twice else None
-        return total(nbrs, x, m, q, scale), first(nbrs, x, m, q, scale), second
-
-    given = (x, values["m"], q, jnp.asarray(1.5))
-    ours, theirs = all_of(nbrs, *given), all_of(by_arrays(nbrs), *given)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-11), ours, theirs)
+@pytest.mark.parametrize(
+    ("name", "twice"),
+    [
+        ("skewed images", True),
+        ("half mean", False),
+        *(pytest.param(name, True, marks=SLOW) for name in LISTS if name != "skewed images"),
+    ],
+)
+def test_array_programs_find_and_sum_the_same(name, twice):
+    nbrs, x, q = made(name)
+    found, sums = everything(by_arrays(nbrs), x, q, twice)
+    assert_pairs(name, nbrs, found, x, q)
+    assert_close(sums, expected_of(name, x, q, twice))
 
 
 @pytest.mark.parametrize(
     ("name", "reduce"),
     [
-        *(("open", "max"), ("images", "min"), ("queries", "max")),
-        *(pytest.param(*more, marks=pytest.mark.slow) for more in (("open", "min"), ("images", "max"), ("queries", "min"))),
+        *(("images", "min"), ("queries", "max")),
+        *(pytest.param(*more, marks=SLOW) for more in (("open", "max"), ("open", "min"), ("images", "max"), ("queries", "min"))),
     ],
 )
 def test_extremes(name, reduce):
-    nbrs, x, q = make(name)
+    nbrs, x, q = made(name)
 
-    def found(nbrs, x):
-        return jfrnn.pair_sum(lambda r, i, j: jnp.sin(9 * r), x, None, neighbors=nbrs, queries=q, reduce=reduce)
+    def energy(x):
+        found = jfrnn.pair_sum(lambda r, i, j: jnp.sin(9 * r), x, None, neighbors=nbrs, queries=q, reduce=reduce)
+        return jnp.sum(jnp.where(jnp.isfinite(found), found, 0) ** 2), found
 
-    def of_both(nbrs):
-        finite = lambda x: jnp.sum(jnp.where(jnp.isfinite(found(nbrs, x)), found(nbrs, x), 0) ** 2)  # noqa: E731
-        return jax.jit(lambda x: (found(nbrs, x), jax.grad(finite)(x)))(x)
+    slopes, found = jax.jit(jax.grad(energy, has_aux=True))(x)
+    x, q, matrix = np.asarray(x), None if q is None else np.asarray(q), box_of(name, np.float64)
+    pairs = by_numpy.in_order(oracle(name, x, q), 3)
+    r = by_numpy.vectors_of(pairs, x, x if q is None else q, None if matrix is None else np.diag(matrix))
+    choose, none = {"max": (np.maximum, -np.inf), "min": (np.minimum, np.inf)}[reduce]
+    expected = np.full((N if q is None else ASKING, 3), none)
+    choose.at(expected, pairs.i, np.sin(9 * r))
+    chosen = np.sin(9 * r) == expected[pairs.i]
+    assert (chosen.sum(0) == np.isfinite(expected).sum(0)).all()  # no pair is as good as another one
+    of_x = by_numpy.pull(pairs, np.where(chosen, 18 * np.sin(9 * r) * np.cos(9 * r), 0), x, q)
+    np.testing.assert_allclose(found, expected, rtol=1e-13)
+    np.testing.assert_allclose(slopes, of_x if q is None else of_x[0], rtol=1e-12, atol=1e-13)
 
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13), of_both(nbrs), of_both(by_arrays(nbrs)))
 
-
-@pytest.mark.parametrize("symmetry", ["symmetric", "antisymmetric"])
 @pytest.mark.parametrize("name", ["nearest", "half images"])
-def test_symmetry(name, symmetry):
-    nbrs, x, _ = make(name)
-    sums = [
-        jfrnn.pair_sum(lambda r, i, j: r * jnp.sum(r**4), x, None, neighbors=each, symmetry=symmetry)
-        for each in (nbrs, by_arrays(nbrs))
-    ]
-    np.testing.assert_allclose(*sums, atol=1e-15)
+def test_symmetry(name):
+    """A function of i < j, or of a forward image, whose value the other end gets, too, or its negative."""
+    nbrs, x, _ = made(name)
+
+    @jax.jit
+    def both(x):
+        return [
+            jfrnn.pair_sum(lambda r, i, j: r * jnp.sum(r**4), x, None, neighbors=nbrs, symmetry=symmetry)
+            for symmetry in ("symmetric", "antisymmetric")
+        ]
+
+    pairs = by_numpy.in_order(by_numpy.forward(oracle(name, x)), 3)
+    r = by_numpy.vectors_of(pairs, np.asarray(x), np.asarray(x), np.diag(box_of(name, np.float64)))
+    terms = r * (r**4).sum(1)[:, None]
+    of_i, of_j = (by_numpy.add_up(terms, where, N) for where in (pairs.i, pairs.j))
+    np.testing.assert_allclose(both(x), [of_i + of_j, of_i - of_j], atol=1e-15)
 
 
 def test_in_two_dimensions_and_single_precision():
-    nbrs, x, _ = make("nearest", np.float32, dim=2)
-    for fn in (lambda r, i, j: jnp.exp(-jnp.sum(r * r)), lambda r, i, j: r * j[:, None] + i[0]):
-        values = None if fn(x[0], jnp.zeros(5, x.dtype), jnp.zeros(5, x.dtype)).ndim == 0 else jnp.ones((len(x), 5), x.dtype)
-        sums = [jfrnn.pair_sum(fn, x, None, values, neighbors=each) for each in (nbrs, by_arrays(nbrs))]
-        np.testing.assert_allclose(*sums, rtol=2e-6)
+    nbrs, x, _ = made("nearest", np.float32, dim=2)
+
+    @jax.jit
+    def all_of(x):
+        near = jfrnn.pair_sum(lambda r, i, j: jnp.exp(-jnp.sum(r * r)), x, None, neighbors=nbrs)
+        of_values = jfrnn.pair_sum(lambda r, i, j: r * j[:, None] + i[0], x, None, jnp.ones((N, 5), x.dtype), neighbors=nbrs)
+        return nbrs.vectors(x), near, of_values
+
+    found, near, of_values = all_of(x)
+    assert_pairs("nearest", nbrs, found, x)
+    pairs = by_numpy.in_order(oracle("nearest", x), 2)
+    r = by_numpy.vectors_of(pairs, np.asarray(x, float), np.asarray(x, float), np.eye(2))
+    np.testing.assert_allclose(near, by_numpy.add_up(np.exp(-(r * r).sum(1)), pairs.i, N), rtol=2e-6)
+    expected = np.broadcast_to(by_numpy.add_up(r + 1, pairs.i, N)[:, None], (N, 5, 2))
+    np.testing.assert_allclose(of_values, expected, rtol=2e-6)
 
 
 def test_the_kernel_sums():
     """The program has a call of the library and no loop of array programming."""
-    nbrs, x, _ = make("nearest")
+    nbrs, x, _ = made("nearest")
     text = (
         jax.jit(jax.grad(lambda x: jnp.sum(jfrnn.pair_sum(lambda r, i, j: jnp.sum(r**4), x, None, neighbors=nbrs))))
         .lower(x)
@@ -198,7 +316,7 @@ def test_the_kernel_sums():
 
 
 def test_what_has_no_translation_warns_once():
-    nbrs, x, _ = make("open")
+    nbrs, x, _ = made("open")
 
     def fn(r, i, j):
         return jax.scipy.special.gammaln(1 + jnp.sum(r * r))
@@ -206,28 +324,34 @@ def test_what_has_no_translation_warns_once():
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         sums = jfrnn.pair_sum(fn, x, None, neighbors=nbrs)
-        jax.grad(lambda x: jnp.sum(jfrnn.pair_sum(fn, x, None, neighbors=nbrs)))(x)
+        jax.eval_shape(jax.grad(lambda x: jnp.sum(jfrnn.pair_sum(fn, x, None, neighbors=nbrs))), x)
     assert len([each for each in told if "has no translation" in str(each.message)]) == 2  # one for each sum, none for derivatives
     assert all(each.filename == __file__ for each in told)
-    np.testing.assert_allclose(sums, jfrnn.pair_sum(fn, x, 0.3, backend="jax"), rtol=1e-12)
+    pairs = by_numpy.in_order(oracle("open", x), 3)
+    square = (by_numpy.vectors_of(pairs, np.asarray(x), np.asarray(x)) ** 2).sum(1)
+    terms = np.array([math.lgamma(1 + x) for x in square.tolist()])
+    np.testing.assert_allclose(sums, by_numpy.add_up(terms, pairs.i, N), rtol=1e-12)
 
 
 def test_vmap():
-    nbrs, x, _ = make("half images")
+    nbrs, x, _ = made("half images")
 
-    def total(x):
+    def slopes(x):
         return jax.grad(lambda x: jnp.sum(jfrnn.pair_sum(lambda r, i, j: jnp.sum(r**4), x, None, neighbors=nbrs)))(x)
 
-    several = jnp.stack([x, x + 0.01])
-    np.testing.assert_allclose(jax.vmap(total)(several), jnp.stack([total(x), total(x + 0.01)]), rtol=1e-12)
+    several = np.stack([x, x + 0.002 * np.cos(np.arange(N))[:, None]])
+    for found, x in zip(jax.jit(jax.vmap(slopes))(several), several, strict=True):
+        pairs = by_numpy.in_order(oracle("half images", x), 3)
+        r = by_numpy.vectors_of(pairs, x, x, np.diag(box_of("half images", np.float64)))
+        np.testing.assert_allclose(found, by_numpy.pull(pairs, 4 * r**3, x), rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.parametrize("dtype", [pytest.param(np.float32, marks=SLOW), np.float64])
 def test_particles_that_are_not_finite(dtype):
-    nbrs, x, _ = make("nearest", dtype)
-    x = x.at[3, 0].set(jnp.nan).at[7, 1].set(jnp.inf)
-    for each in (nbrs, by_arrays(nbrs)):
-        mask = np.asarray(each.vectors(x)[1])
-        assert not mask[[3, 7]].any()
-        assert not np.isin(np.asarray(nbrs.idx)[mask], [3, 7]).any()
-    sums = np.asarray(jfrnn.pair_sum(lambda r, i, j: jnp.sum(r * r), x, None, neighbors=nbrs))
+    nbrs, x, _ = made("nearest", dtype)
+    x = np.array(x)
+    x[3, 0], x[7, 1] = np.nan, np.inf
+    sums = jax.jit(lambda x: jfrnn.pair_sum(lambda r, i, j: jnp.sum(r * r), x, None, neighbors=nbrs))(x)
     assert np.flatnonzero(np.isnan(sums)).tolist() == [3, 7]
+    for each in (nbrs, by_arrays(nbrs)):
+        assert_pairs("nearest", each, each.vectors(x), x)
