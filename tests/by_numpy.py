@@ -1,5 +1,6 @@
 """What NumPy makes of the oracle's pairs, in double precision: their displacements, sums over them, and derivatives of those."""
 
+import itertools
 from typing import NamedTuple
 
 import jax
@@ -52,10 +53,10 @@ def along(function, x, direction):
     return jax.tree.map(lambda leaf: np.imag(leaf) / STEP, function(x + STEP * 1j * direction))
 
 
-def named_slots(idx, vectors, mask, x, rows=None, matrix=None):
-    """Return the set of (i, j, shift) of the slots that a mask names; their displacements tell the shifts.
+def pairs_of_slots(idx, vectors, mask, x, rows=None, matrix=None):
+    """Return the pairs of the slots that a mask names, in their order; their displacements tell the shifts.
 
-    Fails where a displacement is none of the pair, where a slot that is not named has one, and where a pair is named twice.
+    Fails where a displacement is not that of its pair, where a slot that is not named has one, and where a pair is named twice.
     """
     idx, vectors, mask = map(np.asarray, (idx, vectors, mask))
     eps, x = float(np.finfo(vectors.dtype).eps), np.asarray(x, float)
@@ -71,6 +72,27 @@ def named_slots(idx, vectors, mask, x, rows=None, matrix=None):
         apart, size = apart + shifts @ matrix, size + np.abs(matrix).max() * np.abs(shifts).max(initial=0)
     np.testing.assert_allclose(found, apart, rtol=0, atol=4 * eps * size)
     assert not vectors[~mask].any()
-    named = list(zip(i.tolist(), j.tolist(), map(tuple, shifts.tolist()), strict=True))
-    assert len(set(named)) == len(named)
-    return set(named)
+    pairs = Pairs(i, j, shifts)
+    assert len(named(pairs)) == len(i)
+    return pairs
+
+
+def named(pairs):
+    """Return the set of (i, j, shift)."""
+    return set(zip(pairs.i.tolist(), pairs.j.tolist(), map(tuple, pairs.shifts.tolist()), strict=True))
+
+
+def image_counts(x, cutoff, lengths=None):
+    """Return how many images of j are closer to i than the cutoff, [n, n], without i itself; no length is shorter than that.
+
+    The cutoff is one for all, or one per row i. Fails where rounding to double precision could decide.
+    """
+    radius = np.asarray(cutoff, x.dtype).astype(float).reshape(-1, 1)
+    x, counts = x.astype(float), np.zeros((len(x), len(x)), int)
+    steps = (-1, 0, 1) if lengths is not None else (0,)
+    for step in itertools.product(steps, repeat=x.shape[1]):
+        moved = x if lengths is None else x + np.asarray(step) * lengths
+        square = ((moved - x[:, None]) ** 2).sum(-1)
+        assert (np.abs(square - radius**2) > 1e-13 * radius**2).all()
+        counts += (square < radius**2) & (any(step) | ~np.eye(len(x), dtype=bool))
+    return counts

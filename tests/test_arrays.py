@@ -2,6 +2,7 @@
 
 import re
 
+import by_numpy
 import checked
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,8 @@ SORTING = tuning.ACCELERATOR.sorting._replace(searched=300)
 ELSEWHERE = tuning.ACCELERATOR._replace(words=1 << 12, few_pairs=1000, plain_pairs=1000, sorting=SORTING)
 AT_ONCE = ELSEWHERE._replace(words=1 << 20, few_pairs=1 << 20, plain_pairs=1 << 20)  # all rows and their doubtful pairs
 LOOPS = ELSEWHERE._replace(at_once=0)  # as blocks of many queries are processed
-TIES = ("ulp_far_axis", "queries_fewer")
+OFTEN, TIES = ("queries_fewer",), ("ulp_far_axis", "queries_fewer")
+SLOW = pytest.mark.slow
 
 
 @pytest.fixture
@@ -31,7 +33,7 @@ def elsewhere(monkeypatch):
     jax.clear_caches()
 
 
-@pytest.mark.parametrize("name", [name if name in TIES else pytest.param(name, marks=pytest.mark.slow) for name in HARD_CASES])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[SLOW] * (name not in OFTEN)) for name in HARD_CASES])
 def test_numbers_of_accelerators_find_the_same_pairs(name, elsewhere):
     if name == "denormal_lattice":
         pytest.skip("its cutoff is refused")
@@ -43,9 +45,7 @@ def test_numbers_of_accelerators_find_the_same_pairs(name, elsewhere):
 @pytest.mark.parametrize(
     ("name", "numbers"),
     [
-        (name, numbers)
-        if (name, numbers) == ("lattice_1e-4_at_0", "AT_ONCE")
-        else pytest.param(name, numbers, marks=pytest.mark.slow)
+        (name, numbers) if (name, numbers) == ("lattice_1e-4_at_0", "AT_ONCE") else pytest.param(name, numbers, marks=SLOW)
         for name in TIES
         for numbers in ("AT_ONCE", "LOOPS")
     ],
@@ -57,30 +57,39 @@ def test_all_rows_of_a_block_at_once_and_blocks_in_loops(name, numbers, elsewher
     checked.assert_pairs(nbrs, reference.reference_pairs(given.positions, given.cutoff, queries=given.queries))
 
 
+SOME = np.random.default_rng(1).random((600, 3)).astype(np.float32)
+SYSTEMS = np.random.default_rng(2).integers(0, 5, 600)
+LENGTHS = {"images": [1.0, 0.3, 1.0], "nearest images": [1.0, 1.0, 1.0]}
+
+
 @pytest.mark.usefixtures("elsewhere")
 @pytest.mark.parametrize(
-    "kind",
-    [
-        "batch",
-        "images",
-        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("half", "nearest images", "a cutoff per particle")),
-    ],
+    "kind", ["images", *(pytest.param(kind, marks=SLOW) for kind in ("batch", "half", "nearest images", "a cutoff per particle"))]
 )
 def test_options_with_the_numbers_of_accelerators(kind):
-    rng = np.random.default_rng(1)
-    x, cutoff, options = rng.random((600, 3)).astype(np.float32), 0.2, {}
+    x, cutoff, lengths, options = SOME, 0.2, LENGTHS.get(kind), {}
     if kind == "a cutoff per particle":
-        cutoff = rng.uniform(0.02, 0.2, 600).astype(np.float32)
+        cutoff = np.random.default_rng(2).uniform(0.02, 0.2, len(x)).astype(np.float32)
+    elif kind == "batch":
+        options = {"batch": SYSTEMS}
+    elif kind == "half":
+        options = {"half": True}
     else:
-        options = {
-            "batch": {"batch": rng.integers(0, 5, 600)},
-            "half": {"half": True},
-            "images": {"box": jfrnn.Box([1.0, 0.3, 1.0])},
-            "nearest images": {"box": jfrnn.Box([1.0, 1.0, 1.0])},
-        }[kind]
-    found, right = (jfrnn.search(x, cutoff, backend=backend, **options) for backend in ("jax", "warp"))
-    assert pairs_of(found) == pairs_of(right)
-    np.testing.assert_array_equal(found.count, right.count)
+        options = {"box": jfrnn.Box(lengths)}
+    near = by_numpy.image_counts(x, cutoff, None if lengths is None else np.array(lengths, np.float32))
+    near = near * (SYSTEMS[:, None] == SYSTEMS) if kind == "batch" else np.triu(near) if kind == "half" else near
+    assert near.sum() > 1000
+    found = np.zeros_like(near)
+    nbrs = jfrnn.search(x, cutoff, capacity=int(near.sum(1).max()), backend="jax", **options)
+    np.add.at(found, nbrs.pairs(), 1)
+    np.testing.assert_array_equal(found, near)
+    np.testing.assert_array_equal(nbrs.count, near.sum(1))
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_counts_with_the_numbers_of_accelerators():
+    near = by_numpy.image_counts(SOME, 0.2) * (SYSTEMS[:, None] == SYSTEMS)
+    np.testing.assert_array_equal(jfrnn.count(SOME, 0.2, batch=SYSTEMS, backend="jax"), near.sum(1))
 
 
 def test_few_particles_are_not_sorted(monkeypatch):
@@ -133,40 +142,34 @@ def test_queries_with_more_words_than_are_tested_at_a_time_and_ties_among_all(mo
     np.testing.assert_array_equal((idx < len(x)).sum(1), near.sum(1))  # each once
 
 
-def pairs_of(nbrs):
-    i, j = nbrs.pairs()
-    pairs = sorted(zip(i.tolist(), j.tolist(), strict=True))
-    assert len(pairs) > 1000
-    return pairs
-
-
 def spring(r, i, j):
     return jnp.maximum(0.2 - jnp.sqrt(jnp.sum(r * r) + 1e-6), 0) ** 2
 
 
 @pytest.mark.usefixtures("elsewhere")
-@pytest.mark.parametrize(
-    "kind", ["few", pytest.param("many", marks=pytest.mark.slow), pytest.param("ties", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("kind", ["few", pytest.param("many", marks=SLOW), pytest.param("ties", marks=SLOW)])
 def test_sums_with_the_numbers_of_accelerators(kind):
     """At once, with more neighbors than that allows, and with more doubtful candidates."""
     rng = np.random.default_rng(2)
     n = 601  # so that the last two blocks overlap
     x = rng.random((n, 3)) if kind == "few" else rng.random((n, 3)) / 3
-    x = jnp.asarray(np.round(x * 10) / 10 if kind == "ties" else x, jnp.float32)
+    x = (np.round(x * 10) / 10 if kind == "ties" else x).astype(np.float32)
 
-    def sums(x, backend):
-        def energy(x, factor):  # whose derivative is one sum over all pairs
-            return jfrnn.pair_sum(lambda r, i, j: factor * spring(r, i, j), x, 0.2, backend=backend).sum()
+    def energy(x, factor):  # whose derivative is one sum over all pairs
+        return jfrnn.pair_sum(lambda r, i, j: factor * spring(r, i, j), x, 0.2, backend="jax").sum()
 
-        return jax.value_and_grad(energy, (0, 1))(x, jnp.float32(1))
-
-    found, right = jax.jit(lambda x: sums(x, "jax"))(x), jax.jit(lambda x: sums(x, "warp"))(x)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), found, right)
+    found = jax.jit(jax.value_and_grad(energy, (0, 1)))(x, np.float32(1))
+    pairs, x = by_numpy.in_order(reference.reference_pairs(x, 0.2), 3), x.astype(float)
+    r = by_numpy.vectors_of(pairs, x, x)
+    apart = np.sqrt((r * r).sum(1) + 1e-6)
+    over = np.maximum(0.2 - apart, 0)
+    expected = (over**2).sum(), (by_numpy.pull(pairs, (-2 * over / apart)[:, None] * r, x), (over**2).sum())
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), found, expected)
 
 
 def everything(x):
-    nbrs = jfrnn.search(x, 0.2, capacity=64, backend="jax")
+    """Return a list in a box, a count, and a sum with its gradient."""
+    nbrs = jfrnn.search(x, 0.2, capacity=64, box=jfrnn.Box([1.0] * 3), backend="jax")
     sums = jax.value_and_grad(lambda x: jfrnn.pair_sum(spring, x, 0.2, backend="jax").sum())(x)
     return nbrs.idx, nbrs.count, jfrnn.count(x, 0.2, backend="jax"), *sums
 
@@ -191,30 +194,30 @@ def test_scratch_is_a_share_of_the_device(told, scratch, monkeypatch):
     assert tuning._fit_memory(tuning.ACCELERATOR).scratch == scratch
 
 
-@pytest.mark.parametrize("box", [False, True])
-def test_programs_are_exported_for_every_platform(box):
+def test_programs_are_exported_for_every_platform():
     """One program for CPUs, GPUs of two makers and TPUs, with no custom call but what XLA itself means by one."""
-    fn = everything if not box else lambda x: jfrnn.search(x, 0.2, capacity=64, box=jfrnn.Box([1.0] * 3), backend="jax").idx
     x = jax.ShapeDtypeStruct((5000, 3), np.float32)
-    program = jax.export.export(jax.jit(fn), platforms=["cpu", "cuda", "rocm", "tpu"])(x)
+    program = jax.export.export(jax.jit(everything), platforms=["cpu", "cuda", "rocm", "tpu"])(x)
     assert program.platforms == ("cpu", "cuda", "rocm", "tpu")
     assert set(re.findall(r"custom_call @(\w+)", str(program.mlir_module()))) <= {"Sharding", "annotate_device_placement"}
 
 
-@pytest.mark.parametrize("platforms", [("cpu",), ("cuda",), ("cpu", "cuda")])
-def test_a_program_is_traced_for_its_platforms_alone(platforms, monkeypatch):
-    """A search, and the gradient of a sum."""
+def searched(x):
+    return jfrnn.search(x, 0.2, capacity=64, backend="jax").idx
+
+
+slopes = jax.grad(lambda x: jfrnn.pair_sum(spring, x, 0.2, backend="jax").sum())
+MADE_FOR = [(searched, "cpu"), (slopes, "cuda"), (searched, "cpu", "cuda")]
+
+
+@pytest.mark.parametrize(("function", "platforms"), [(f, names) for f, *names in MADE_FOR], ids=["cpu", "cuda", "both"])
+def test_a_program_is_traced_for_its_platforms_alone(function, platforms, monkeypatch):
+    """A search, or the gradient of a sum."""
     used, rows, fold = [], arrays.find_candidates, rows_module.find_candidates
     monkeypatch.setattr(
         arrays, "find_candidates", lambda search, by_cells, tuning: used.append(tuning) or rows(search, by_cells, tuning)
     )
     monkeypatch.setattr(rows_module, "find_candidates", lambda *given: used.append(given[2]) or fold(*given))
-
-    def both(x):
-        return jfrnn.search(x, 0.2, capacity=64, backend="jax").idx, jax.grad(
-            lambda x: jfrnn.pair_sum(spring, x, 0.2, backend="jax").sum()
-        )(x)
-
-    jax.export.export(jax.jit(both), platforms=platforms)(jax.ShapeDtypeStruct((601, 3), np.float32))
+    jax.export.export(jax.jit(function), platforms=platforms)(jax.ShapeDtypeStruct((601, 3), np.float32))
     numbers = {"cpu": tuning.CPU, "cuda": tuning.ACCELERATOR}
     assert set(used) == {numbers[name] for name in platforms}

@@ -2,114 +2,108 @@
 
 from itertools import product
 
+import by_numpy
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
 import test_reverse as lists
 
 import jfrnn
 
-
-def dense(nbrs, vectors, mask, shifts):
-    """Return senders, receivers, displacements and shifts of all pairs closer than the cutoff, row by row."""
-    i, k = np.nonzero(np.asarray(mask))
-    return np.asarray(nbrs.idx)[i, k], i, np.asarray(vectors)[i, k], np.asarray(shifts)[i, k]
+SLOW = pytest.mark.slow
+OFTEN = [("full", "open"), ("self", "images"), ("half", "images"), ("gather", "nearest"), ("queries", "open")]
+EACH = list(product(lists.KINDS, lists.BOXES))
 
 
-OFTEN = [
-    ("full", "open"),
-    ("self", "nearest"),
-    ("half", "images"),
-    ("gather", "nearest"),
-    ("either", "images"),
-    ("queries", "open"),
-]
+def oracle(kind, box, x, q=None):
+    """Return all pairs (i, j, shift) of a list of `test_reverse.py` at these positions."""
+    cutoff, options = lists.options_of(kind, box)
+    x, q = np.asarray(x), None if q is None else np.asarray(q)
+    cell = {"matrix": np.array(lists.BOXES[box] or [1.0] * 3), "periodic": (box != "open",) * 3}
+    if "radius_rule" in options:
+        return reference.reference_radii(x, cutoff, options["radius_rule"], queries=q, **cell)
+    given = {name: options[name] for name in ("half", "include_self") if name in options}
+    return reference.reference_images(x, cutoff, queries=q, **cell, **given)
 
 
-@pytest.mark.parametrize(
-    ("kind", "box"),
-    [
-        pytest.param(kind, box, marks=[pytest.mark.slow] * ((kind, box) not in OFTEN))
-        for kind, box in product(lists.KINDS, lists.BOXES)
-    ],
-)
+@pytest.mark.parametrize(("kind", "box"), [pytest.param(*each, marks=[SLOW] * (each not in OFTEN)) for each in EACH])
 def test_edges_are_the_pairs(kind, box):
-    nbrs, x, q = lists.make(kind, "warp", box, skin=0.05)
-    (m, n), total = (nbrs.idx.shape[0], len(x)), int(nbrs.count.sum()) + 9
-    x = x + 0.01 * jnp.sin(50 * x)  # with pairs of the skin in the midst of rows
-
-    @jax.jit
-    def all_of(nbrs, x, q):
-        geometry = *nbrs.vectors(x, queries=q), nbrs.shifts(x, queries=q)
-        return nbrs.edges(x, total, queries=q), geometry, nbrs.pairs(total, positions=x, queries=q)
-
-    edges, geometry, pairs = jax.device_get(all_of(nbrs, x, q))  # no program is compiled for what is compared
-    expected = dense(nbrs, *geometry)
-    held = len(expected[0])
+    nbrs, x, q = lists.make(kind, "warp", box)
+    (m, n), total = (nbrs.idx.shape[0], len(x)), int(np.asarray(nbrs.count).sum()) + 9
+    x = np.asarray(x) + 0.01 * np.sin(50 * np.asarray(x))  # with pairs of the skin in the midst of rows
+    edges, pairs = jax.jit(lambda nbrs, x, q: (nbrs.edges(x, total, queries=q), nbrs.pairs(total, positions=x, queries=q)))(
+        nbrs, x, q
+    )
+    edges, expected = jax.tree.map(np.asarray, edges), oracle(kind, box, x, q)
+    held = len(expected)
     assert 0 < held < total - 9
     np.testing.assert_array_equal(pairs, (edges.receivers, edges.senders))
-    np.testing.assert_array_equal(nbrs.pairs(positions=x, queries=q), expected[1::-1])
-    for found, right in zip(edges, expected, strict=False):
-        np.testing.assert_allclose(found[:held], right, atol=1e-15)
+    found = by_numpy.Pairs(edges.receivers[:held], edges.senders[:held], edges.shift[:held])
+    assert by_numpy.named(found) == expected
+    apart = by_numpy.vectors_of(found, x, x if q is None else np.asarray(q), np.diag(lists.BOXES[box] or [0.0] * 3))
+    np.testing.assert_allclose(edges.displacement[:held], apart, atol=1e-15)
     assert (edges.senders[held:] == n).all()
     assert (edges.receivers[held:] == m).all()
     assert (np.flatnonzero(edges.mask) == np.arange(held)).all()
-    assert not any(np.asarray(part)[held:].any() for part in (edges.displacement, edges.distance, edges.shift))
+    assert not any(part[held:].any() for part in (edges.displacement, edges.distance, edges.shift))
     np.testing.assert_allclose(edges.distance, np.linalg.norm(edges.displacement, axis=1), atol=1e-15)
     assert (int(edges.status), int(edges.pair_count)) == (0, held)
     assert (np.diff(edges.receivers) >= 0).all()
 
 
-@pytest.mark.parametrize(
-    ("kind", "box", "reverse"),
-    [
-        pytest.param(*each, reverse, marks=[pytest.mark.slow] * (reverse is not (each[0] == "half")))
-        for each in (("full", "images"), ("half", "open"), ("queries", "nearest"))
-        for reverse in (True, False)
-    ],
-)
+DERIVED = [("full", "images", True), ("half", "images", True), ("queries", "open", True)]
+DERIVED += [
+    pytest.param(*each, marks=SLOW) for each in (("full", "images", False), ("half", "open", False), ("queries", "open", False))
+]
+
+
+@pytest.mark.parametrize(("kind", "box", "reverse"), DERIVED)
 def test_derivatives_are_those_of_vectors(kind, box, reverse):
-    nbrs, x, q = lists.make(kind, "warp", box, reverse=reverse, skin=0.05)
-    a = jnp.asarray(lists.BOXES[box] or [1.0] * 3)
+    nbrs, x, q = lists.make(kind, "warp", box, reverse=reverse)
+    lengths, which = np.array(lists.BOXES[box] or [0.0] * 3), (0, 2) if q is None else (0, 1, 2)
 
-    def energy(vectors, mask):
-        return jnp.sum(jnp.where(mask[..., None], jnp.sin(3 * vectors) * vectors[..., ::-1], 0))
-
-    def by_edges(x, q, a):
+    def energy(x, q, a):
         edges = nbrs.edges(x, 4000, queries=q, box=None if nbrs.box is None else jfrnn.Box(a))
-        return energy(edges.displacement, edges.mask)
+        r = edges.displacement
+        return jnp.sum(jnp.where(edges.mask[:, None], jnp.sin(3 * r) * r[:, ::-1], 0))
 
-    def by_vectors(x, q, a):
-        return energy(*nbrs.vectors(x, queries=q, box=None if nbrs.box is None else jfrnn.Box(a)))
+    def slopes(x):
+        return jax.grad(energy, which)(x, q, lengths)
 
-    which = (0, 2) if q is None else (0, 1, 2)
+    first, second = jax.jit(lambda x: jax.jvp(slopes, (x,), (x,)))(x)
+    pairs, x, q = by_numpy.in_order(oracle(kind, box, x, q), 3), np.asarray(x), None if q is None else np.asarray(q)
 
-    def derivatives(f):
-        slope = jax.grad(lambda x: f(x, q, a))
-        return jax.jit(lambda: (jax.grad(f, which)(x, q, a), jax.jvp(slope, (x,), (x,))[1]))()
+    def expected(x):
+        r = by_numpy.vectors_of(pairs, x, x if q is None else q, np.diag(lengths))
+        of_r = 3 * np.cos(3 * r) * r[:, ::-1] + np.sin(3 * r)[:, ::-1]
+        of_x, of_a = by_numpy.pull(pairs, of_r, x, q), (of_r * pairs.shifts).sum(0)
+        return (of_x, of_a) if q is None else (*of_x, of_a)
 
-    jax.tree.map(lambda p, r: np.testing.assert_allclose(p, r, atol=1e-11), derivatives(by_edges), derivatives(by_vectors))
+    jax.tree.map(lambda p, r: np.testing.assert_allclose(p, r, atol=1e-11), first, expected(x))
+    jax.tree.map(lambda p, r: np.testing.assert_allclose(p, r, atol=1e-11), second, by_numpy.along(expected, x, x))
 
 
 @pytest.mark.parametrize("kind", ["full", "half"])
 def test_neither_edges_nor_sums_over_them_scatter_derivatives(kind):
-    nbrs, x, _ = lists.make(kind, "jax", "open")
+    nbrs, x, _ = lists.traced(kind)
 
-    def energy(x):
+    def energy(x, nbrs):
         edges = nbrs.edges(x, 2000)
         return jnp.sum(jnp.where(edges.mask, jnp.sum(edges.displacement**4, -1), 0))
 
-    text = jax.jit(jax.grad(energy)).lower(x).as_text()
+    text = jax.jit(jax.grad(energy)).lower(x, nbrs).as_text()
     assert [line for line in text.splitlines() if "stablehlo.scatter" in line and "f64" in line] == []
 
 
 def test_too_many_pairs_are_never_silent():
     nbrs, x, _ = lists.make("full", "warp")
-    held = int(nbrs.count.sum())
+    held = len(oracle("full", "open", x))
     with pytest.raises(ValueError, match=f"Pass total={held} or more"):
         nbrs.edges(x, held - 1)
-    assert nbrs.edges(x).mask.sum() == len(nbrs.edges(x).mask) == held
+    mask = np.asarray(nbrs.edges(x).mask)
+    assert (mask.sum(), len(mask)) == (held, np.asarray(nbrs.count).sum())  # room for those of the skin, too
     with pytest.raises(TypeError, match=r"write edges\(positions, total\)"):
         jax.jit(lambda nbrs, x: nbrs.edges(x))(nbrs, x)
     for total in (held - 1, 0):
@@ -122,7 +116,7 @@ def test_too_many_pairs_are_never_silent():
 
 def test_sums_by_receiver():
     nbrs, x, _ = lists.make("full", "warp", "images")
-    total = int(nbrs.count.sum()) + 5
+    total = int(np.asarray(nbrs.count).sum()) + 5
 
     @jax.jit
     def sums(nbrs, x):
@@ -130,13 +124,15 @@ def test_sums_by_receiver():
         messages = jnp.where(edges.mask, jnp.sum(edges.displacement**2, -1), 0)
         return jax.ops.segment_sum(messages, edges.receivers, len(x), indices_are_sorted=True)
 
-    np.testing.assert_allclose(sums(nbrs, x), jfrnn.pair_sum(lambda r, i, j: jnp.sum(r**2), x, None, neighbors=nbrs), rtol=1e-12)
+    found, pairs, x = sums(nbrs, x), by_numpy.in_order(oracle("full", "images", x), 3), np.asarray(x)
+    r = by_numpy.vectors_of(pairs, x, x, np.diag(lists.BOXES["images"]))
+    np.testing.assert_allclose(found, by_numpy.add_up((r**2).sum(1), pairs.i, len(x)), rtol=1e-12)
 
 
 @pytest.mark.parametrize("box", ["open", "images"])
 def test_a_graph_has_two_graphs(box):
-    nbrs, x, _ = lists.make("full", "warp", box, skin=0.05)
-    edges, graph = nbrs.edges(x, 2000), jax.jit(lambda nbrs, x: nbrs.to_jraph(x, 2000))(nbrs, x)
+    nbrs, x, _ = lists.make("full", "warp", box)
+    edges, graph = jax.jit(lambda nbrs, x: (nbrs.edges(x, 2000), nbrs.to_jraph(x, 2000)))(nbrs, x)
     assert graph._fields == ("nodes", "edges", "receivers", "senders", "globals", "n_node", "n_edge")
     assert graph.n_node.tolist() == [len(x), 1]
     assert graph.n_edge.tolist() == [int(edges.pair_count), 2000 - int(edges.pair_count)]
@@ -144,9 +140,10 @@ def test_a_graph_has_two_graphs(box):
     found = graph.senders, graph.receivers, *(graph.edges[name] for name in ("displacement", "shift", "distance"))
     right = edges.senders, edges.receivers, edges.displacement, edges.shift, edges.distance
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-15), found, right)
-    for asked, message in (({"queries": x}, "this list has queries"), ({}, "total must be a static int")):
-        with pytest.raises((ValueError, TypeError), match=message):
-            jfrnn.search(x, 0.2, **asked).to_jraph(x, 2.0)
+    with pytest.raises(TypeError, match="total must be a static int"):
+        nbrs.to_jraph(x, 2.0)
+    with pytest.raises(ValueError, match="this list has queries"):
+        lists.make("queries", "warp")[0].to_jraph(x, 2000)
 
 
 def test_a_graph_is_one_of_jraph():
@@ -159,20 +156,21 @@ def test_a_graph_is_one_of_jraph():
         lambda nodes, messages: messages,
         include_sent_messages_in_node_update=False,
     )
-    sums = jfrnn.pair_sum(lambda r, i, j: jnp.sum(r**2), x, None, neighbors=nbrs)
-    np.testing.assert_allclose(net(graph).nodes[: len(x)], sums, rtol=1e-12)
+    pairs = by_numpy.in_order(oracle("full", "open", x), 3)
+    r = by_numpy.vectors_of(pairs, np.asarray(x), np.asarray(x))
+    np.testing.assert_allclose(net(graph).nodes[: len(x)], by_numpy.add_up((r**2).sum(1), pairs.i, len(x)), rtol=1e-12)
     whole = jraph.unpad_with_graphs(graph)
-    assert (len(whole.senders), whole.n_node.tolist()) == (int(nbrs.count.sum()), [len(x)])
+    assert (len(whole.senders), whole.n_node.tolist()) == (len(pairs.i), [len(x)])
 
 
 def test_vmap():
     nbrs, x, _ = lists.make("full", "warp", "nearest")
-    several = jnp.stack([x, x + 0.01])
-
-    def f(x):
-        return jnp.sum(nbrs.edges(x, 1500).displacement ** 3)
-
-    np.testing.assert_allclose(jax.vmap(jax.grad(f))(several), jnp.stack([jax.grad(f)(y) for y in several]), atol=1e-12)
+    several = np.stack([x, x + 0.005 * np.sin(np.arange(x.size)).reshape(x.shape)])
+    found = jax.jit(jax.vmap(jax.grad(lambda x: jnp.sum(nbrs.edges(x, 1500).displacement ** 3))))(several)
+    for slopes, x in zip(found, several, strict=True):
+        pairs = by_numpy.in_order(oracle("full", "nearest", x), 3)
+        expected = by_numpy.pull(pairs, 3 * by_numpy.vectors_of(pairs, x, x, np.eye(3)) ** 2, x)
+        np.testing.assert_allclose(slopes, expected, atol=1e-12)
 
 
 def test_nobody():

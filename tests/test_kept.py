@@ -55,7 +55,7 @@ def box_of(name, dtype, dim=3):
 
 @functools.cache
 def made(name, dtype=np.float64, dim=3):
-    """Return a list with a skin, positions after a motion that it allows, and queries: several tests share a list and its program."""
+    """Return a list with a skin, positions after a motion that it allows, and queries; tests share lists and their programs."""
     rng, options, box = np.random.default_rng(5), dict(LISTS[name]), box_of(name, dtype, dim)
     x = (rng.random((N, dim)) * (box if box is not None and box.ndim == 1 else 1)).astype(dtype)
     cutoff = radii_of(dtype) if "radius_rule" in options else CUTOFF
@@ -85,7 +85,8 @@ def assert_pairs(name, nbrs, found, x, q=None):
     """Fail unless these slots of a list, by their displacements and a mask, are the oracle's pairs."""
     expected = oracle(name, x, q)
     expected = by_numpy.forward(expected) if LISTS[name].get("half") else expected
-    assert by_numpy.named_slots(nbrs.idx, *found, x, q, box_of(name, x.dtype, x.shape[1])) == expected
+    slots = by_numpy.pairs_of_slots(nbrs.idx, *found, x, q, box_of(name, x.dtype, x.shape[1]))
+    assert by_numpy.named(slots) == expected
 
 
 # What is left out here, sums below ask for, or by hand.
@@ -120,7 +121,8 @@ def test_ties_are_decided_exactly(scale, dtype, dim, closed):
     nbrs = jfrnn.search(np.zeros_like(lattice), 2 * scale, closed=closed, capacity=len(lattice), backend="warp")
     vectors, mask = nbrs.vectors(lattice)
     expected = reference.reference_pairs(lattice, 2 * scale, closed=closed)
-    assert {pair[:2] for pair in by_numpy.named_slots(nbrs.idx, vectors, mask, lattice)} == expected
+    found = by_numpy.named(by_numpy.pairs_of_slots(nbrs.idx, vectors, mask, lattice))
+    assert {pair[:2] for pair in found} == expected
     count = jfrnn.pair_sum(lambda r, i, j: jnp.ones((), r.dtype), lattice, None, neighbors=nbrs)
     np.testing.assert_array_equal(count, np.asarray(mask).sum(1))
 
@@ -138,7 +140,8 @@ def test_ties_of_images_are_decided_exactly(length, dtype):
     moved = x + (length * 0.1 * np.random.default_rng(0).integers(-2, 3, x.shape)).astype(dtype)
     for each in (x, moved):
         expected = reference.reference_images(each, 0.2, matrix=lengths, periodic=(True,) * 3)
-        assert by_numpy.named_slots(nbrs.idx, *nbrs.vectors(each), each, matrix=lengths) == expected
+        found = by_numpy.pairs_of_slots(nbrs.idx, *nbrs.vectors(each), each, matrix=lengths)
+        assert by_numpy.named(found) == expected
 
 
 def summand(r, i, j):

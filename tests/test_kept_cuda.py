@@ -30,15 +30,19 @@ def term_of(kind):
     return TermText(text, steps, (), (Value("y", dtype, 0),), others, (Sum("o", False, False), Sum("o", True, False)))
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=[kind.name for kind in KINDS])
-def test_masks_and_sums_compile(kind):
-    assert kind.reversed or all(compiles(kept.mask_kernel(kind, measured)) for measured in (False, True))
-    assert kind.reversed or compiles(kept.slope_kernel(kind))
-    for compensated in (False, True):  # and what a term reads of i stands beside the points, or does not
-        key = f"test_{bool(kind.periodic)}"
-        assert compiles(kept.sum_kernel(kind, term_of(kind), key, compensated, False, kind.reversed, compensated))
-    largest = term_of(kind)._replace(sums=(Sum("o", False, False),))
-    assert compiles(kept.sum_kernel(kind, largest, f"largest_{bool(kind.periodic)}", False, True, False, False))
+@pytest.mark.parametrize("other", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", range(len(KINDS)), ids=[kind.name for kind in KINDS])
+def test_masks_and_sums_compile(number, other):
+    """Kinds in turn with and without distances, and compensated sums; `other`: the other way round."""
+    kind, odd, periodic = KINDS[number], (number % 2 == 1) is not other, bool(KINDS[number].periodic)
+    # what a term reads of i stands beside the points, or does not
+    assert compiles(kept.sum_kernel(kind, term_of(kind), f"test_{periodic}", odd, False, kind.reversed, odd))
+    if not kind.reversed:
+        assert compiles(kept.mask_kernel(kind, odd))
+    if odd:
+        assert kind.reversed or compiles(kept.slope_kernel(kind))
+        largest = term_of(kind)._replace(sums=(Sum("o", False, False),))
+        assert compiles(kept.sum_kernel(kind, largest, f"largest_{periodic}", False, True, False, False))
 
 
 @pytest.mark.parametrize("code_bytes", [0, 1, 2, 4])
