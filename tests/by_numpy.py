@@ -89,10 +89,10 @@ def image_counts(x, cutoff, lengths=None):
     """
     radius = np.asarray(cutoff, x.dtype).astype(float).reshape(-1, 1)
     x, counts = x.astype(float), np.zeros((len(x), len(x)), int)
-    steps = (-1, 0, 1) if lengths is not None else (0,)
-    for step in itertools.product(steps, repeat=x.shape[1]):
-        moved = x if lengths is None else x + np.asarray(step) * lengths
-        square = ((moved - x[:, None]) ** 2).sum(-1)
+    apart, lengths = x - x[:, None], np.zeros(x.shape[1]) if lengths is None else np.asarray(lengths, float)
+    apart = apart - np.rint(apart / np.where(lengths > 0, lengths, np.inf)) * lengths
+    for step in itertools.product((-1, 0, 1) if lengths.any() else (0,), repeat=x.shape[1]):
+        square = ((apart + step * lengths) ** 2).sum(-1)
         assert (np.abs(square - radius**2) > 1e-13 * radius**2).all()
         counts += (square < radius**2) & (any(step) | ~np.eye(len(x), dtype=bool))
     return counts

@@ -133,7 +133,7 @@ def test_boxes_of_systems():
 
     @jax.jit
     def all_of(x):
-        nbrs = jfrnn.search(x, CUTOFF, capacity=64, box=boxes, batch=batch)
+        nbrs = jfrnn.search(x, CUTOFF, capacity=72, box=boxes, batch=batch)
         return nbrs, nbrs.shifts(x), nbrs.distances(x)[1]
 
     nbrs, shifts, mask = all_of(both)

@@ -63,7 +63,7 @@ def made(name, dtype=np.float64, dim=3):
     options |= {"box": None if box is None else jfrnn.Box(box), "queries": q, "skin": 0.05, "reverse": name in REVERSED}
     nbrs = jfrnn.search(x, cutoff, backend="warp", capacity=CAPACITY.get(name, 128), **options)
     nbrs.check()
-    moved = x + (0.012 * np.sin(9 * np.arange(x.size))).astype(dtype).reshape(x.shape)
+    moved = x + (0.008 * np.sin(9 * np.arange(x.size))).astype(dtype).reshape(x.shape)
     return nbrs, jnp.asarray(moved), None if q is None else jnp.asarray(q)
 
 

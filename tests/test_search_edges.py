@@ -179,9 +179,9 @@ def test_geometry_and_derivatives_are_those_of_padded_lists(half, box, reverse):
 
 
 def test_derivatives_do_not_scatter():
-    x = jnp.asarray(points(dtype=np.float64))
-    nbrs = jfrnn.search_edges(x, CUTOFF, reverse=True, backend="brute")
-    text = jax.jit(jax.grad(lambda x: jnp.sum(nbrs.edges(x).displacement ** 4))).lower(x).as_text()
+    x, options = points(dtype=np.float64), {"total": 2000, "reverse": True, "backend": "brute"}
+    nbrs = jax.eval_shape(lambda x: jfrnn.search_edges(x, CUTOFF, **options), x)  # for which no program is compiled
+    text = jax.jit(jax.grad(lambda x, nbrs: jnp.sum(nbrs.edges(x).displacement ** 4))).lower(x, nbrs).as_text()
     assert [line for line in text.splitlines() if "stablehlo.scatter" in line and "f64" in line] == []
 
 
@@ -198,7 +198,7 @@ def test_graphs():
 
 
 def test_vmap():
-    x = jnp.stack([points(seed=seed) for seed in (0, 1)])
+    x = np.stack([points(seed=seed) for seed in (0, 1)])
 
     def count_near(x):
         nbrs = jfrnn.search_edges(x, CUTOFF, total=2000, backend="warp")
@@ -206,8 +206,9 @@ def test_vmap():
 
     counts, sums = jax.jit(jax.vmap(count_near))(x)
     for k in range(2):
-        np.testing.assert_allclose(count_near(x[k])[1], sums[k], rtol=1e-5)
-        assert int(counts[k]) == len(oracle(np.asarray(x[k]), "open"))
+        i, j = np.array([pair[:2] for pair in oracle(x[k], "open")]).T
+        np.testing.assert_allclose(np.linalg.norm(x[k][j] - x[k][i], axis=1).sum(), sums[k], rtol=1e-5)
+        assert int(counts[k]) == len(i)
 
 
 @pytest.mark.parametrize(
@@ -275,10 +276,13 @@ def test_own_images_in_half_lists(backend, include_self):
     given = {"half": True, "include_self": include_self}
     expected = reference.reference_images(x, CUTOFF, matrix=np.diag(lengths), periodic=(True,) * 3, **given)
     assert sum(i == j for i, j, _ in expected) == 5 * (3 + include_self)
-    nbrs = jfrnn.search_edges(x, CUTOFF, box=jfrnn.Box(lengths), backend=backend, **given)
+    options = given | {"box": jfrnn.Box(lengths), "backend": backend}
+    room = {"total": len(expected)} if backend == "jax" else {}  # given where a program that counts compiles for seconds
+    nbrs = jfrnn.search_edges(x, CUTOFF, **options, **room)
     nbrs.check()
-    assert nbrs.total == -(-len(expected) // 8) * 8
+    assert nbrs.total == (len(expected) if room else -(-len(expected) // 8) * 8)
     assert edges_as_set(nbrs.edges(x)) == expected
-    rows = jfrnn.search(x, CUTOFF, box=jfrnn.Box(lengths), backend=backend, **given)
-    rows.check()
-    np.testing.assert_array_equal(rows.count, np.bincount([i for i, *_ in expected], minlength=5))
+    if not room:
+        rows = jfrnn.search(x, CUTOFF, **options)
+        rows.check()
+        np.testing.assert_array_equal(rows.count, np.bincount([i for i, *_ in expected], minlength=5))
