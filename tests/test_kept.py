@@ -89,9 +89,9 @@ def assert_pairs(name, nbrs, found, x, q=None):
     assert by_numpy.named(slots) == expected
 
 
-# What is left out here, sums below ask for, or by hand.
+# What is left out here, sums below and `test_box.py` ask for, or by hand.
 OFTEN = [("open", np.float64), ("nearest", np.float64), ("half images", np.float64)]
-OFTEN += [("skewed", np.float32), ("gather", np.float32), ("both", np.float32)]
+OFTEN += [("gather", np.float32), ("both", np.float32)]
 
 
 @pytest.mark.parametrize(
@@ -123,8 +123,9 @@ def test_ties_are_decided_exactly(scale, dtype, dim, closed):
     expected = reference.reference_pairs(lattice, 2 * scale, closed=closed)
     found = by_numpy.named(by_numpy.pairs_of_slots(nbrs.idx, vectors, mask, lattice))
     assert {pair[:2] for pair in found} == expected
-    count = jfrnn.pair_sum(lambda r, i, j: jnp.ones((), r.dtype), lattice, None, neighbors=nbrs)
-    np.testing.assert_array_equal(count, np.asarray(mask).sum(1))
+    if dim == 3:  # in sums, another kernel decides
+        count = jfrnn.pair_sum(lambda r, i, j: jnp.ones((), r.dtype), lattice, None, neighbors=nbrs)
+        np.testing.assert_array_equal(count, np.asarray(mask).sum(1))
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ def test_mask_is_the_exact_test_at_the_new_positions(dtype, dim):
 def test_distances_do_not_underflow(dtype):
     tiny = np.array([[0, 0], [3e-25, 4e-25]], dtype)
     for half in (False, True):  # by a kernel, and by `norms`
-        d, mask = jfrnn.search(tiny, 1e-24, half=half).distances(tiny)
+        d, mask = map(np.asarray, jfrnn.search(tiny, 1e-24, half=half, capacity=2).distances(tiny))
         assert mask[0, 0]
         np.testing.assert_allclose(d[0, 0], 5e-25, rtol=1e-6)
 
@@ -223,11 +223,13 @@ def test_boxes_and_totals_are_taken_by_place_and_by_name():
         calls = [made.update, made.edges] if made is flat else [made.update, made.vectors, made.distances, made.shifts]
         for call in calls:
             assert same(call, lambda x, box, call=call: call(x, box=box))
-            assert not same(call, lambda x, box, call=call: call(x))
+    assert not same(nbrs.vectors, lambda x, box: nbrs.vectors(x))
     for call in (nbrs.edges, nbrs.to_jraph):
         assert same(lambda x, box, call=call: call(x, 500, box), lambda x, box, call=call: call(x, total=500, box=box))
+    assert int(nbrs.grow(x, box, slack=1.5).status) == 0
     for made in (nbrs, flat):
-        assert int(made.grow(x, box, slack=1.5).status) == 0
+        with pytest.raises(TypeError, match=r"box must be a jfrnn\.Box"):
+            made.grow(x, x, slack=1.5)
         name = type(made).__name__
         for method in ("update", "grow", "edges"):
             with pytest.raises(TypeError, match=rf"^{name}\.{method}\(\) got an unexpected keyword argument 'boxes'"):

@@ -66,7 +66,7 @@ def slots_of(nbrs):
 
 # In all kinds of boxes the lists of the most usual kind, the others in some; by hand all.
 SOME = [*(("full", box) for box in BOXES), ("self", "images"), ("half", "nearest"), ("half", "images")]
-SOME += [("gather", "nearest"), ("either", "images"), ("queries", "open")]
+SOME += [("gather", "nearest"), ("queries", "open")]
 
 
 def each_list(kinds):
@@ -205,7 +205,7 @@ def test_derivatives_of_distances(kind):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11), derivatives, expected)
 
 
-@pytest.mark.parametrize(("kind", "reverse"), [("full", False), ("half", True), ("queries", False)])
+@pytest.mark.parametrize(("kind", "reverse"), [("full", False), ("half", True), pytest.param("queries", False, marks=SLOW)])
 def test_derivatives_do_not_scatter(kind, reverse):
     def both(nbrs, x, q):
         f = jax.grad(lambda x: jnp.sum(by_arrays(nbrs).distances(x, queries=q)[0] ** 3))
