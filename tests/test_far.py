@@ -242,11 +242,17 @@ def test_nothing_is_rounded(dtype):
 def test_turns_that_do_not_fit_are_told():
     """Up to 511 on either side of the box are numbers; of those beyond, and of NaN, no axis has another's digits."""
     box, dtype = jfrnn.Box([1.0, 2.0, 4.0]), np.dtype(np.float32)
-    lattice = make_lattice(box, images_of(box, 0.1, dtype, 1), dtype)
+    kind = images_of(box, 0.1, dtype, 1)
     along = np.array([-LARGEST_TURN - 1, -LARGEST_TURN, -1, 0, LARGEST_TURN, LARGEST_TURN + 1])
     turns = np.stack(np.meshgrid(along, along, along), axis=-1).reshape(-1, 3)
     x = np.concatenate([(turns + 0.5) * [1, 2, 4], np.full((1, 3), np.nan)]).astype(dtype)
-    packed, unpacked = jax.jit(lambda x: (count_turns(x, lattice), unpack_turns(count_turns(x, lattice), 3)))(x)
+
+    @jax.jit
+    def both(x):
+        packed = count_turns(x, make_lattice(box, kind, dtype))
+        return packed, unpack_turns(packed, 3)
+
+    packed, unpacked = both(x)
     (*packed, nowhere), unpacked = np.asarray(packed), np.asarray(unpacked)[:-1]
     fit = (np.abs(turns) <= LARGEST_TURN).all(axis=1)
     assert 0 < fit.sum() < len(fit)

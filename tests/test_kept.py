@@ -212,10 +212,12 @@ def assert_close(found, expected):
 TWICE = ("images", "either")  # second derivatives of the others by hand
 ONCE = ("skewed images", "half mean")  # and of kinds that are like these, sums, too
 SUMMED = [(name, False, True) for name in TWICE] + [(name, False, False) for name in ONCE]
-SUMMED += [(name, True, False) for name in ("scatter", "queries")]
-MORE = [(name, False, True) for name in LISTS if name not in TWICE] + [
-    (name, True, True) for name in ("images", "scatter", "queries")
-]
+SUMMED += [("queries", True, False)]
+MORE = (
+    [("scatter", True, False)]
+    + [(name, False, True) for name in LISTS if name not in TWICE]
+    + [(name, True, True) for name in ("images", "scatter", "queries")]
+)
 
 
 @pytest.mark.parametrize(("name", "compensated", "twice"), [*SUMMED, *(pytest.param(*more, marks=SLOW) for more in MORE)])

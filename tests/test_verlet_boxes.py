@@ -112,7 +112,7 @@ def test_images_of_a_kept_list_are_those_of_the_moved_particles(dtype, kind, ask
     @jax.jit
     def all_of(nbrs, x, **given):
         kept = nbrs.update(x, **given) if kind in UPDATED or (dtype, kind, asked) not in EACH else nbrs
-        sums = None if asked != "own" else jfrnn.pair_sum(weight, x, None, neighbors=kept)
+        sums = None if (kind, asked) != ("skewed", "own") else jfrnn.pair_sum(weight, x, None, neighbors=kept)
         return kept, geometry(kept, x, **given), sums
 
     kept, found, sums = all_of(nbrs, after, **given)
