@@ -63,11 +63,12 @@ def assert_case(name, dtype, dim, backend, closed=False, **options):
 
 
 def each_case():
-    """Yield every case, kind and engine; by default two kinds, of the array engines, which compile slowly, one, of fewer cases."""
+    """Yield every case, kind and engine; by default two kinds of cases that share a program, one of others and of array engines."""
+    alone = {"queries": (np.float32, 3), "periodic": (np.float32, 3), "periodic_images": (np.float64, 2)}
     for name, dtype, dim, backend in product(BATCH_CASES, (np.float32, np.float64), (2, 3), ("jax", "warp", "brute")):
-        often = [(np.float32, 3), (np.float64, 2)] if backend == "warp" else [(np.float32, 3)]  # XLA compiles for both, in boxes
-        slowly = (backend == "brute" and name != "superposed") or (backend == "jax" and name == "periodic")
-        rarely = slowly or (dtype, dim) not in often
+        walked = [alone[name]] if name in alone else [(np.float32, 3), (np.float64, 2)]
+        often = {"warp": walked, "jax": [(np.float32, 2)], "brute": []}[backend]
+        rarely = (dtype, dim) not in often or (backend == "jax" and name in ("periodic", "queries"))
         kind = f"{name}-f{8 * dtype().itemsize}-{dim}d-{backend}"
         yield pytest.param(name, dtype, dim, backend, id=kind, marks=[SLOW] * rarely)
 
@@ -77,9 +78,13 @@ def test_case(name, dtype, dim, backend):
     assert_case(name, dtype, dim, backend)
 
 
-@pytest.mark.parametrize("name", BATCH_CASES)
-@pytest.mark.parametrize(("dtype", "dim"), [(np.float32, 3), pytest.param(np.float64, 2, marks=SLOW)])
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
+def each_case_with_radii():
+    for name, kind, backend in product(BATCH_CASES, ((np.float32, 3), (np.float64, 2)), ("warp", "jax")):
+        rarely = backend == "jax" or kind[1] != 3 or name in ("queries", "periodic")  # each of which is a program of its own
+        yield pytest.param(name, *kind, backend, id=f"{backend}-f{8 * kind[0]().itemsize}-{kind[1]}d-{name}", marks=[SLOW] * rarely)
+
+
+@pytest.mark.parametrize(("name", "dtype", "dim", "backend"), list(each_case_with_radii()))
 def test_case_with_a_cutoff_per_particle(name, dtype, dim, backend):
     rule = "gather" if name == "queries" else "mean"  # of all of them, the same cutoff
     assert_case(name, dtype, dim, backend, radii=True, radius_rule=rule)
@@ -91,14 +96,6 @@ def test_closed_and_half(backend):
     nbrs, *_ = search_case("ties", np.float32, 3, backend, half=True)
     expected = {(i, j) for i, j, _ in expected_images("ties", np.float32, 3) if i < j}
     assert set(reference.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), LENGTH)) == expected
-
-
-def test_a_batch_is_a_loop_over_its_systems():
-    given = BATCH_CASES["extreme_numbers"].build(np.float32, 3)
-    together = jfrnn.count(given.positions, given.cutoff, batch=given.batch)
-    for system in np.unique(given.batch):
-        members = given.batch == system
-        np.testing.assert_array_equal(together[members], jfrnn.count(given.positions[members], given.cutoff))
 
 
 def test_updates_keep_the_systems():
@@ -122,9 +119,10 @@ def test_traced_systems_share_one_program():
         traces.append(None)
         return jfrnn.count(x, 0.375, batch=batch)
 
-    count(given.positions, given.batch)
-    together = count(given.positions, 0 * given.batch)
-    np.testing.assert_array_equal(together, jfrnn.count(given.positions, 0.375))
+    pairs = reference.reference_pairs(given.positions, 0.375)
+    for batch in (given.batch, 0 * given.batch):
+        expected = np.bincount([i for i, j in pairs if batch[i] == batch[j]], minlength=len(batch))
+        np.testing.assert_array_equal(count(given.positions, batch), expected)
     assert len(traces) == 1
 
 
@@ -154,27 +152,40 @@ def test_errors(error, match, options):
             function(X, 1.0, **options)
 
 
-@pytest.mark.parametrize("wide", [np.int64, np.uint32, np.uint64])
+@pytest.mark.parametrize("wide", [np.int64, np.uint32, pytest.param(np.uint64, marks=SLOW)])
 def test_wide_numbers_of_systems_and_species_are_taken_inside_jit(wide):
     """As outside; a number that int32 does not hold sets the bit, and its particle has no neighbors."""
     x = np.random.default_rng(0).random((30, 3)).astype(np.float32)
     batch, table = (np.arange(30) % 3).astype(wide), np.full((3, 3), 0.4, np.float32)
-    found = jax.jit(lambda batch: (jfrnn.count(x, 0.4, batch=batch), jfrnn.count(x, table, species=batch)))(batch)
-    np.testing.assert_array_equal(found[0], jfrnn.count(x, 0.4, batch=batch.astype(np.int32)))
-    np.testing.assert_array_equal(found[1], jfrnn.count(x, 0.4))
     far = batch.copy()
     far[4] = 2**32 - 2
-    search = jax.jit(lambda far: jfrnn.search(x, 0.4, batch=far, capacity=32))
-    nbrs = search(far)
-    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.SYSTEM_WITHOUT_BOX
-    apart = np.where(np.arange(30) == 4, 99, batch).astype(np.int32)
-    np.testing.assert_array_equal(nbrs.count, jfrnn.count(x, 0.4, batch=apart))
-    counts = jax.jit(lambda far: jfrnn.count(x, 0.4, batch=far))(far)
-    assert (np.asarray(counts) == np.iinfo(np.int32).min).all()
-    sums = jax.jit(lambda far: jfrnn.pair_sum(lambda r, i, j: 1.0, x, 0.4, batch=far))(far)
-    assert np.isnan(sums).all()
-    queries = jax.jit(lambda far: jfrnn.count(x, 0.4, queries=x[:5], batch=(batch, far)))
-    assert int(queries(batch[:5])[0]) >= 1
-    assert (np.asarray(queries(far[:5])) == np.iinfo(np.int32).min).all()
-    kinds = jax.jit(lambda far: jfrnn.search(x, table, species=far, capacity=32))(far)
-    assert jfrnn.Status(int(kinds.status)) == jfrnn.Status.INVALID_CUTOFF
+
+    @jax.jit
+    def find(batch):
+        options = {"batch": batch, "capacity": 32}
+        return {
+            "list": jfrnn.search(x, 0.4, **options),
+            "counts": jfrnn.count(x, 0.4, batch=batch),
+            "sums": jfrnn.pair_sum(lambda r, i, j: 1.0, x, 0.4, batch=batch),
+            "queries": jfrnn.count(x, 0.4, queries=x[:5], batch=(batch, batch[:5])),
+            "kinds": jfrnn.search(x, table, species=batch, capacity=32),
+        }
+
+    near = {(i, j) for i, j in reference.reference_pairs(x, 0.4)}
+
+    def counts(of):
+        return np.bincount([i for i, j in near if of[i] == of[j]], minlength=30)
+
+    found = find(batch)
+    for name in ("counts", "sums"):
+        np.testing.assert_array_equal(found[name], counts(batch))
+    np.testing.assert_array_equal(found["list"].count, counts(batch))
+    np.testing.assert_array_equal(found["queries"], counts(batch)[:5] + 1)  # each of which meets the particle in its place
+    np.testing.assert_array_equal(found["kinds"].count, counts(0 * batch))
+    found = find(far)
+    assert jfrnn.Status(int(found["list"].status)) == jfrnn.Status.SYSTEM_WITHOUT_BOX
+    np.testing.assert_array_equal(found["list"].count, counts(far))
+    for name in ("counts", "queries"):
+        assert (np.asarray(found[name]) == np.iinfo(np.int32).min).all()
+    assert np.isnan(found["sums"]).all()
+    assert jfrnn.Status(int(found["kinds"].status)) == jfrnn.Status.INVALID_CUTOFF

@@ -66,7 +66,7 @@ def test_integers_travel_whose_bits_are_no_usual_floats(box):
     def same(r, i, j):
         return [(j == k).astype(r.dtype) for k in bits]
 
-    found = fused(same, x, 0.3, kinds, box=box)
+    found = jax.jit(lambda x, kinds: fused(same, x, 0.3, kinds, box=box))(x, kinds)
     pairs = reference.reference_images(x, 0.3, matrix=np.ones(3), periodic=(box is not None,) * 3)
     i, j, _ = arrays_of(pairs, 3)
     expected = [np.bincount(i[kinds[j] == k], minlength=300) for k in bits]

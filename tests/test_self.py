@@ -2,6 +2,7 @@
 
 from itertools import product
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -59,52 +60,91 @@ def pairs_and_shifts(idx, shifts, mask):
     return set(zip(i.tolist(), np.asarray(idx)[i, k].tolist(), map(tuple, np.asarray(shifts)[i, k].tolist()), strict=True))
 
 
-OFTEN = {("either", "systems"), ("species", "images")}
+ALL = {"half", "edges", "sums", "sums of a list"}
+OFTEN = {
+    ("either", "systems", "warp", np.float32): {"edges", "sums"},
+    ("species", "images", "warp", np.float32): {"half", "sums of a list"},
+    ("both", "open", "jax", np.float64): {"sums"},
+}
 
 
 def each_kind():
+    """Yield who, box, engine and dtype, and what is asked besides a list: by default each of it in one case, by hand in all."""
     for who, kind, backend, dtype in product(WHO, BOXES, ("warp", "jax", "brute"), (np.float32, np.float64)):
-        often = (who, kind) in OFTEN and backend == "warp" and dtype == np.float32
-        often = often or (who, kind, backend, dtype) == ("both", "open", "jax", np.float64)
-        yield pytest.param(who, kind, backend, dtype, marks=[] if often else [SLOW])
+        name = f"{who}-{kind}-{backend}-{dtype.__name__}"
+        if (who, kind, backend, dtype) in OFTEN:
+            yield pytest.param(who, kind, backend, dtype, OFTEN[who, kind, backend, dtype], id=name)
+        parts = ALL - {"half"} if who in ("gather", "scatter") else ALL
+        yield pytest.param(who, kind, backend, dtype, parts, id=f"{name}-all", marks=SLOW)
 
 
-@pytest.mark.parametrize(("who", "kind", "backend", "dtype"), list(each_kind()))
-def test_everyone_is_its_own_neighbor(who, kind, backend, dtype):
+def one(r, i, j):
+    return jnp.ones((), r.dtype)
+
+
+@pytest.mark.parametrize(("who", "kind", "backend", "dtype", "parts"), list(each_kind()))
+def test_everyone_is_its_own_neighbor(who, kind, backend, dtype, parts):
     x, cutoff, more = scene(who, dtype)
-    box, batch = BOXES[kind], np.arange(N, dtype=np.int32) % 2
-    options = {"box": box, "include_self": True, "backend": backend, **more, **({"batch": batch} if kind == "systems" else {})}
+    batch = np.arange(N, dtype=np.int32) % 2
+    given = {
+        "box": BOXES[kind],
+        "include_self": True,
+        "backend": backend,
+        **more,
+        **({"batch": batch} if kind == "systems" else {}),
+    }
     expected = each_pair(who, x, cutoff, more, kind, batch, False)
-    nbrs = jfrnn.search(x, cutoff, capacity=CAPACITY, **options)
+    counts, total = np.bincount([i for i, *_ in expected], minlength=N), len(expected)
+
+    def listed(x, cutoff, **options):
+        nbrs = jfrnn.search(x, cutoff, capacity=CAPACITY, **options, **given)
+        return nbrs, nbrs.shifts(x), nbrs.vectors(x)[1]
+
+    def edges(x, cutoff):
+        return jfrnn.search_edges(x, cutoff, total=total + 5, **given).edges(x).pair_count
+
+    @jax.jit
+    def find(x, cutoff):
+        full = listed(x, cutoff)
+        each = {
+            "half": lambda: listed(x, cutoff, half=True),
+            "edges": lambda: edges(x, cutoff),
+            "sums": lambda: jfrnn.pair_sum(one, x, cutoff, **given),
+            "sums of a list": lambda: jfrnn.pair_sum(one, x, None, neighbors=full[0]),
+        }
+        return full, {name: each[name]() for name in parts}
+
+    (nbrs, shifts, mask), found = find(x, cutoff)
     assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
-    shifts, mask = nbrs.shifts(x), nbrs.vectors(x)[1]
     assert pairs_and_shifts(nbrs.idx, shifts, mask) == expected
-    assert pairs_and_shifts(nbrs.idx, shifts, nbrs.idx < N) == expected
-    expected_counts = np.bincount([i for i, *_ in expected], minlength=N)
-    np.testing.assert_array_equal(nbrs.count, expected_counts)
+    assert pairs_and_shifts(nbrs.idx, shifts, np.asarray(nbrs.idx) < N) == expected
+    np.testing.assert_array_equal(nbrs.count, counts)
     there = np.isfinite(x).all(axis=1)
-    sums = jfrnn.pair_sum(lambda r, i, j: jnp.ones((), r.dtype), x, cutoff, **options)
-    np.testing.assert_array_equal(np.asarray(sums)[there], expected_counts[there])
-    sums = jfrnn.pair_sum(lambda r, i, j: jnp.ones((), r.dtype), x, None, neighbors=nbrs)
-    np.testing.assert_array_equal(np.asarray(sums)[there], expected_counts[there])
-    edges = jfrnn.search_edges(x, cutoff, total=len(expected) + 5, **options).edges(x)
-    assert int(edges.pair_count) == len(expected)
-    if who not in ("gather", "scatter"):
-        half = jfrnn.search(x, cutoff, capacity=CAPACITY, half=True, **options)
+    for name in parts & {"sums", "sums of a list"}:
+        np.testing.assert_array_equal(np.asarray(found[name])[there], counts[there])
+    if "edges" in parts:
+        assert found["edges"] == total
+    if "half" in parts:
+        half, *geometry = found["half"]
         mirrored = {(i, j, s) for i, j, s in expected if i < j or (i == j and s >= (0, 0, 0))}
-        assert pairs_and_shifts(half.idx, half.shifts(x), half.vectors(x)[1]) == mirrored
+        assert pairs_and_shifts(half.idx, *geometry) == mirrored
 
 
 @pytest.mark.parametrize("who", ["gather", pytest.param("species", marks=SLOW)])
 def test_a_list_with_a_skin_keeps_them(who):
     x, cutoff, more = scene(who, np.float32)
-    nbrs = jfrnn.search(x, cutoff, include_self=True, skin=0.05, **more)
-    edges = jfrnn.search_edges(x, cutoff, include_self=True, skin=0.05, **more)
+    nbrs = jfrnn.search(x, cutoff, include_self=True, skin=0.05, capacity=24, **more)
+    edges = jfrnn.search_edges(x, cutoff, include_self=True, skin=0.05, total=24 * N, **more)
+
+    @jax.jit
+    def updated(nbrs, edges, x):
+        nbrs = nbrs.update(x)
+        return nbrs.idx, nbrs.vectors(x)[1], edges.edges(x)
+
     for moved in (x, x + np.float32(0.001) * np.random.default_rng(1).normal(size=x.shape).astype(np.float32)):
         expected = each_pair(who, moved, cutoff, more, "open", None, False)
-        after = nbrs.update(moved)
-        assert pairs_and_shifts(after.idx, np.zeros((*after.idx.shape, 3), int), after.vectors(moved)[1]) == expected
-        found = edges.update(moved).edges(moved)
+        idx, mask, found = updated(nbrs, edges, moved)
+        assert pairs_and_shifts(idx, np.zeros((*idx.shape, 3), int), mask) == expected
         mask = np.asarray(found.mask)
         ends = zip(np.asarray(found.receivers)[mask].tolist(), np.asarray(found.senders)[mask].tolist(), strict=True)
         assert {(i, j, (0, 0, 0)) for i, j in ends} == expected
