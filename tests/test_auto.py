@@ -51,7 +51,9 @@ X = np.random.default_rng(0).random((50, 3)).astype(np.float32)
     return done.stdout
 
 
-def test_without_warp_auto_takes_jax_and_warns_once():
+@pytest.fixture(scope="module")
+def without_warp():
+    """Return the lines of a process that lets "auto" choose, then asks for engines by name, which warn of nothing."""
     text = run_without_warp("""
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
@@ -59,19 +61,6 @@ with warnings.catch_warnings(record=True) as caught:
     print(int(jfrnn.count(X, 0.3).sum()))
 print(len(caught), caught[0].category.__name__, caught[0].filename)
 print(caught[0].message)
-""")
-    engines, pairs, warned, message = text.splitlines()
-    assert engines == "jax jax jax"
-    assert int(pairs) == np.sum(jfrnn.count(X, 0.3))
-    assert warned == "1 RuntimeWarning <string>"
-    assert message == (
-        "backend='auto' takes the slower engine 'jax' on the platform 'cpu': the backends 'warp' and 'hashgrid' need the package "
-        "warp-lang (1.18 or 1.19): pip install 'warp-lang==1.19.*'. Pass backend='jax' to choose it without this warning."
-    )
-
-
-def test_without_warp_named_engines_say_what_to_install():
-    text = run_without_warp("""
 warnings.simplefilter("error")
 for backend in ("warp", "hashgrid"):
     for call in (jfrnn.search, jfrnn.count, lambda x, r, backend: jfrnn.memory_plan(50, r, 8, backend=backend)):
@@ -81,7 +70,22 @@ for backend in ("warp", "hashgrid"):
             print(error)
 print(*(jfrnn.search(X, 0.3, capacity=9, backend=backend).backend for backend in ("jax", "brute")))
 """)
-    *messages, engines = text.splitlines()
+    return text.splitlines()
+
+
+def test_without_warp_auto_takes_jax_and_warns_once(without_warp):
+    engines, pairs, warned, message = without_warp[:4]
+    assert engines == "jax jax jax"
+    assert int(pairs) == np.sum(jfrnn.count(X, 0.3))
+    assert warned == "1 RuntimeWarning <string>"
+    assert message == (
+        "backend='auto' takes the slower engine 'jax' on the platform 'cpu': the backends 'warp' and 'hashgrid' need the package "
+        "warp-lang (1.18 or 1.19): pip install 'warp-lang==1.19.*'. Pass backend='jax' to choose it without this warning."
+    )
+
+
+def test_without_warp_named_engines_say_what_to_install(without_warp):
+    *messages, engines = without_warp[4:]
     assert messages == 6 * [
         "the backends 'warp' and 'hashgrid' need the package warp-lang (1.18 or 1.19): pip install 'warp-lang==1.19.*'"
     ]

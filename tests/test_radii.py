@@ -86,7 +86,7 @@ def test_case(name, rule, dtype, dim, backend):
 
 
 @pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
-@pytest.mark.parametrize("rule", ["either", "mean", *(pytest.param(rule, marks=SLOW) for rule in ("gather", "scatter", "both"))])
+@pytest.mark.parametrize("rule", ["mean", *(pytest.param(rule, marks=SLOW) for rule in RULES if rule != "mean")])
 def test_ties_when_closed(rule, backend):
     for name in ("ties", "ties_far", "coincident", "mean_residues"):
         assert_case(name, *KINDS[rule], rule, backend, closed=True)

@@ -410,29 +410,30 @@ def test_excluded_images(lattice, kind, backend, dtype, summed):
     np.testing.assert_array_equal(sums, np.bincount([i for i, *_ in expected], minlength=len(nbrs.idx)))
 
 
-def test_derivatives_leave_excluded_images_out():
+@pytest.mark.parametrize("apart", [pytest.param(False, marks=SLOW), True])
+def test_derivatives_leave_excluded_images_out(apart):
     """A square of sums, whose derivative runs over the pairs the other way round, too; of queries, these are other rows."""
     rng, lengths = np.random.default_rng(7), np.array([0.8, 1.1, 0.9])
     x = rng.random((20, 3))
-    for queries in ({}, {"queries": x[:7]}):
-        pairs = sorted(reference.reference_images(x, 0.5, matrix=np.diag(lengths), periodic=(True,) * 3, **queries))
-        exclude = np.array([[i, j, *shift] for i, j, shift in pairs[::3]])
-        gone = set(pairs[::3]) | (set() if queries else {(j, i, tuple(-s for s in shift)) for i, j, shift in pairs[::3]})
-        left = [pair for pair in pairs if pair not in gone]
+    queries = {"queries": x[:7]} if apart else {}
+    pairs = sorted(reference.reference_images(x, 0.5, matrix=np.diag(lengths), periodic=(True,) * 3, **queries))
+    exclude = np.array([[i, j, *shift] for i, j, shift in pairs[::3]])
+    gone = set(pairs[::3]) | (set() if apart else {(j, i, tuple(-s for s in shift)) for i, j, shift in pairs[::3]})
+    left = [pair for pair in pairs if pair not in gone]
 
-        @jax.jit
-        @jax.grad
-        def slopes(x, queries=queries, exclude=exclude):
-            given = {"queries": x[:7]} if queries else {}
-            return (jfrnn.pair_sum(square, x, 0.5, exclude=exclude, box=jfrnn.Box(lengths), **given) ** 2).sum()
+    @jax.jit
+    @jax.grad
+    def slopes(x):
+        given = {"queries": x[:7]} if apart else {}
+        return (jfrnn.pair_sum(square, x, 0.5, exclude=exclude, box=jfrnn.Box(lengths), **given) ** 2).sum()
 
-        i, j, shift = (np.array(part) for part in zip(*left, strict=True))
-        r = x[j] - x[i] + shift * lengths
-        of_r = (4 * np.bincount(i, (r * r).sum(1))[i])[:, None] * r
-        expected = np.zeros_like(x)
-        np.add.at(expected, j, of_r)
-        np.add.at(expected, i, -of_r)
-        np.testing.assert_allclose(slopes(x), expected, rtol=1e-9, atol=1e-12)
+    i, j, shift = (np.array(part) for part in zip(*left, strict=True))
+    r = x[j] - x[i] + shift * lengths
+    of_r = (4 * np.bincount(i, (r * r).sum(1))[i])[:, None] * r
+    expected = np.zeros_like(x)
+    np.add.at(expected, j, of_r)
+    np.add.at(expected, i, -of_r)
+    np.testing.assert_allclose(slopes(x), expected, rtol=1e-9, atol=1e-12)
 
 
 def test_excluded_images_traced_and_in_systems_of_their_own():
