@@ -67,8 +67,8 @@ def each_case():
     alone = {"queries": (np.float32, 3), "periodic": (np.float32, 3), "periodic_images": (np.float64, 2)}
     for name, dtype, dim, backend in product(BATCH_CASES, (np.float32, np.float64), (2, 3), ("jax", "warp", "brute")):
         walked = [alone[name]] if name in alone else [(np.float32, 3), (np.float64, 2)]
-        often = {"warp": walked, "jax": [(np.float32, 2)], "brute": []}[backend]
-        rarely = (dtype, dim) not in often or (backend == "jax" and name in ("periodic", "queries"))
+        often = {"warp": walked, "jax": [] if name in alone else [(np.float32, 2)], "brute": []}[backend]
+        rarely = (dtype, dim) not in often
         kind = f"{name}-f{8 * dtype().itemsize}-{dim}d-{backend}"
         yield pytest.param(name, dtype, dim, backend, id=kind, marks=[SLOW] * rarely)
 
@@ -80,7 +80,7 @@ def test_case(name, dtype, dim, backend):
 
 def each_case_with_radii():
     for name, kind, backend in product(BATCH_CASES, ((np.float32, 3), (np.float64, 2)), ("warp", "jax")):
-        rarely = backend == "jax" or kind[1] != 3 or name in ("queries", "periodic")  # each of which is a program of its own
+        rarely = backend == "jax" or kind[1] != 3 or name in ("queries", "periodic", "periodic_images")  # programs of their own
         yield pytest.param(name, *kind, backend, id=f"{backend}-f{8 * kind[0]().itemsize}-{kind[1]}d-{name}", marks=[SLOW] * rarely)
 
 
@@ -152,7 +152,7 @@ def test_errors(error, match, options):
             function(X, 1.0, **options)
 
 
-@pytest.mark.parametrize("wide", [np.int64, np.uint32, pytest.param(np.uint64, marks=SLOW)])
+@pytest.mark.parametrize("wide", [np.int64, *(pytest.param(wide, marks=SLOW) for wide in (np.uint32, np.uint64))])
 def test_wide_numbers_of_systems_and_species_are_taken_inside_jit(wide):
     """As outside; a number that int32 does not hold sets the bit, and its particle has no neighbors."""
     x = np.random.default_rng(0).random((30, 3)).astype(np.float32)

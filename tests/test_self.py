@@ -62,14 +62,14 @@ def pairs_and_shifts(idx, shifts, mask):
 
 ALL = {"half", "edges", "sums", "sums of a list"}
 OFTEN = {
-    ("either", "systems", "warp", np.float32): {"edges", "sums"},
+    ("either", "systems", "warp", np.float32): {"sums"},
     ("species", "images", "warp", np.float32): {"half", "sums of a list"},
     ("both", "open", "jax", np.float64): {"sums"},
 }
 
 
 def each_kind():
-    """Yield who, box, engine and dtype, and what is asked besides a list: by default each of it in one case, by hand in all."""
+    """Yield who, box, engine and dtype, and what is asked besides a list: by default something in each case, by hand everything."""
     for who, kind, backend, dtype in product(WHO, BOXES, ("warp", "jax", "brute"), (np.float32, np.float64)):
         name = f"{who}-{kind}-{backend}-{dtype.__name__}"
         if (who, kind, backend, dtype) in OFTEN:

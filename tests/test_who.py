@@ -60,7 +60,7 @@ def pairs_found(nbrs, x, **queries):
 
 
 def each_case():
-    often = {("exclude", "images", "warp", 3, np.float32), ("table, exclude", "images", "warp", 3, np.float32)}
+    often = {("table, exclude", "images", "warp", 3, np.float32), ("table", "open", "warp", 2, np.float64)}
     often |= {("exclude", "open", "warp", 3, np.float32), ("exclude", "open", "brute", 2, np.float32)}
     for who, box, backend in product(("exclude", "table", "table, exclude"), BOXES, ("warp", "jax", "brute")):
         for dim, dtype in product((2, 3), (np.float32, np.float64)):
@@ -79,7 +79,7 @@ def test_case(who, box, backend, dim, dtype):
     nbrs.check()
     expected = expected_pairs(who, x, species, pairs, lattice)
     assert pairs_found(nbrs, x) == expected
-    if who != "exclude":
+    if who != "exclude" and box != "images":
         np.testing.assert_array_equal(jfrnn.count(x, cutoff, **given), np.bincount([i for i, *_ in expected], minlength=N))
 
 
