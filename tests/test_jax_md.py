@@ -180,7 +180,7 @@ def test_boxes_that_change():
         jax.jit(lambda x: jax_md.neighbor_list(free, 1.0, CUTOFF).allocate(x).idx)(x)
 
 
-IMAGES_OFTEN = [(jax_md.Dense, True), (jax_md.OrderedSparse, False)]  # Sparse: of particles that nobody wrapped
+IMAGES_OFTEN = [(jax_md.Dense, True), (jax_md.OrderedSparse, True)]  # Sparse, and no fractions: of particles that nobody wrapped
 
 
 @pytest.mark.parametrize(

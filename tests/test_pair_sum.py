@@ -504,7 +504,8 @@ def test_symmetry(backend, symmetry):
     pairs = reference.reference_images(x, CUTOFF, matrix=MATRIX, periodic=PERIODIC, include_self=True)
     options |= {"box": box, "backend": backend}
     if backend in ("list", "half"):
-        options = {"neighbors": jfrnn.search(x, CUTOFF, box=box, half=backend == "half", include_self=True, backend="warp")}
+        nbrs = jfrnn.search(x, CUTOFF, box=box, half=backend == "half", include_self=True, capacity=128, backend="warp")
+        options = {"neighbors": nbrs}
     args, along = (x, m), tangents_of((x, m))
     fn = stepped(imposed({"symmetric": 1, "antisymmetric": -1}[symmetry], pairs))
     found = everything(lambda x, m: jfrnn.pair_sum(one_sided, x, CUTOFF, m, symmetry=symmetry, **options), False)(args, along)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+import soon
 
 import jfrnn
 
@@ -381,10 +382,10 @@ def test_float32_works_without_x64(dim, backend):
 
 def test_a_program_may_end_before_its_results():
     """Native code computes them while the interpreter ends: it needs neither Python nor what Python gives back."""
-    program = (
+    program = soon.PROGRAM + (
         "import jax, jfrnn, numpy as np\n"
-        "x = np.random.default_rng(0).random((150_000, 3)).astype(np.float32)\n"
-        "def search(backend): return jax.jit(lambda x: jfrnn.search(x, 0.03, capacity=64, backend=backend).idx)\n"
+        "x = np.random.default_rng(0).random((50_000, 3)).astype(np.float32)\n"
+        "def search(backend): return jax.jit(lambda x: jfrnn.search(x, 0.045, capacity=64, backend=backend).idx)\n"
         "both = [search(backend).lower(x).compile() for backend in ('warp', 'hashgrid')]\n"
         "found = [each(x) for each in both]\n"  # what is compiled returns at once, and the interpreter exits
     )
