@@ -124,19 +124,26 @@ def test_hard_cases(backend, dtype, dim, names):
 
 @pytest.mark.parametrize("backend", ["brute", pytest.param("jax", marks=SLOW)])
 def test_options(backend):
-    """Queries and active; then several systems, closed with include_self; each where it decides something."""
+    """Several systems, of particles that are active or not, closed, with themselves; each where it decides something."""
+    given, options = BATCH_CASES["ties"].build(np.float32, 2), {"closed": True, "include_self": True}
+    batch, n = given.batch, len(given.positions)
+    active = np.arange(n) % 3 > 0
+    sums = marked_sums(given.positions, given.cutoff, length=n, batch=batch, active=active, backend=backend, **options)
+    pairs, found = (reference.reference_pairs(given.positions, given.cutoff, **kind) for kind in (options, {}))
+    pairs = {(i, j) for i, j in pairs if active[i] and active[j]}
+    together = {(i, j) for i, j in pairs if batch[i] == batch[j]}
+    assert len(pairs) > len(together) > len(together & found) + active.sum()
+    assert_marks(sums, together, given.positions)
+
+
+@SLOW
+@pytest.mark.parametrize("backend", ["brute", "jax"])
+def test_queries_of_active_particles(backend):
     given = HARD_CASES["queries_coincident"].build(np.float32, 3)
     active = np.arange(LENGTH) % 3 > 0
     sums = cut(marked_sums(given.positions, given.cutoff, given.queries, active=active, backend=backend), len(given.queries))
     pairs = reference.reference_pairs(given.positions, given.cutoff, queries=given.queries)
     assert_marks(sums, {(i, j) for i, j in pairs if active[j]}, given.positions, given.queries)
-    given, options = BATCH_CASES["ties"].build(np.float32, 2), {"closed": True, "include_self": True}
-    batch, n = given.batch, len(given.positions)
-    sums = marked_sums(given.positions, given.cutoff, length=n, batch=batch, backend=backend, **options)
-    closed, found = (reference.reference_pairs(given.positions, given.cutoff, **kind) for kind in (options, {}))
-    pairs = {(i, j) for i, j in closed if batch[i] == batch[j]}
-    assert len(closed) > len(pairs) > len({(i, j) for i, j in found if batch[i] == batch[j]}) + n
-    assert_marks(sums, pairs, given.positions)
 
 
 BOXES = {
@@ -446,7 +453,10 @@ def partly_active():
     return jnp.asarray(x), jnp.asarray(np.where(active, m, np.nan)), active
 
 
-@pytest.mark.parametrize(("backend", "second"), [ENGINES[0], *(pytest.param(b, False, marks=SLOW) for b in ("brute", "jax"))])
+@pytest.mark.parametrize(
+    ("backend", "second"),
+    [("list", False), *(pytest.param(*kind, marks=SLOW) for kind in (ENGINES[0], ("brute", False), ("jax", False)))],
+)
 def test_what_is_no_pair_poisons_nothing(backend, second):
     """fn is NaN or infinite where there is no pair, and so are values and positions of inactive particles."""
     x, m, active = partly_active()
@@ -865,7 +875,9 @@ def test_what_has_no_sum_has_no_derivative_in_its_position(backend, queries):
     assert all(np.isfinite(np.delete(a, which, axis=0)).all() for a, which in zip((rows, *pulled, *again), nowhere, strict=True))
 
 
-@pytest.mark.parametrize(("half", "reduce"), [(False, "sum"), pytest.param(True, "sum", marks=SLOW), (False, "max")])
+@pytest.mark.parametrize(
+    ("half", "reduce"), [(False, "sum"), *(pytest.param(*kind, marks=SLOW) for kind in ((True, "sum"), (False, "max")))]
+)
 def test_a_list_that_lacks_pairs_has_no_sums(half, reduce):
     """Outside jit, and where it is closed over, it raises; inside, no row looks like a sum, nor does a force."""
     x, m = scene(1)

@@ -130,24 +130,26 @@ def test_everyone_is_its_own_neighbor(who, kind, backend, dtype, parts):
         assert pairs_and_shifts(half.idx, *geometry) == mirrored
 
 
-@pytest.mark.parametrize("who", ["gather", pytest.param("species", marks=SLOW)])
-def test_a_list_with_a_skin_keeps_them(who):
+@pytest.mark.parametrize(("who", "flat"), [("gather", False), *(pytest.param(*k, marks=SLOW) for k in product(WHO, (False, True)))])
+def test_a_list_with_a_skin_keeps_them(who, flat):
     x, cutoff, more = scene(who, np.float32)
-    nbrs = jfrnn.search(x, cutoff, include_self=True, skin=0.05, capacity=24, **more)
-    edges = jfrnn.search_edges(x, cutoff, include_self=True, skin=0.05, total=24 * N, **more)
+    given = {"include_self": True, "skin": 0.05, **more}
+    nbrs = jfrnn.search_edges(x, cutoff, total=24 * N, **given) if flat else jfrnn.search(x, cutoff, capacity=24, **given)
 
     @jax.jit
-    def updated(nbrs, edges, x):
+    def updated(nbrs, x):
         nbrs = nbrs.update(x)
-        return nbrs.idx, nbrs.vectors(x)[1], edges.edges(x)
+        return nbrs, nbrs.edges(x) if flat else nbrs.vectors(x)[1]
 
     for moved in (x, x + np.float32(0.001) * np.random.default_rng(1).normal(size=x.shape).astype(np.float32)):
         expected = each_pair(who, moved, cutoff, more, "open", None, False)
-        idx, mask, found = updated(nbrs, edges, moved)
-        assert pairs_and_shifts(idx, np.zeros((*idx.shape, 3), int), mask) == expected
-        mask = np.asarray(found.mask)
-        ends = zip(np.asarray(found.receivers)[mask].tolist(), np.asarray(found.senders)[mask].tolist(), strict=True)
-        assert {(i, j, (0, 0, 0)) for i, j in ends} == expected
+        after, found = updated(nbrs, moved)
+        if flat:
+            mask = np.asarray(found.mask)
+            ends = zip(np.asarray(found.receivers)[mask].tolist(), np.asarray(found.senders)[mask].tolist(), strict=True)
+            assert {(i, j, (0, 0, 0)) for i, j in ends} == expected
+        else:
+            assert pairs_and_shifts(after.idx, np.zeros((*after.idx.shape, 3), int), found) == expected
 
 
 def test_separate_queries_have_no_self():
