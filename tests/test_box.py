@@ -1,6 +1,7 @@
 """Periodic boxes: every case of `jfrnn.cases.periodic` against the oracle, then what boxes add to lists."""
 
 import functools
+from itertools import product
 
 import checked
 import jax
@@ -153,15 +154,18 @@ def oracle(x, cutoff, vectors, periodic=(True,) * 3, **options):
     return reference.reference_images(np.asarray(x), cutoff, matrix=np.asarray(vectors, x.dtype), periodic=periodic, **options)
 
 
+HALF, SELF = {"half": True}, {"include_self": True}
+OFTEN = [
+    (np.float32, "nearest", HALF),
+    (np.float32, "nearest", HALF | SELF),
+    (np.float64, "images", HALF),
+    (np.float64, "images", SELF),
+]
+ALL = product((np.float32, np.float64), ("nearest", "images"), (HALF, SELF, HALF | SELF))
+
+
 @pytest.mark.parametrize(
-    ("vectors", "options", "dtype"),
-    [
-        ("nearest", {"half": True}, np.float32),
-        ("nearest", {"half": True, "include_self": True}, np.float32),
-        ("images", {"half": True}, np.float64),
-        ("images", {"include_self": True}, np.float64),
-    ],
-    ids=str,
+    ("dtype", "vectors", "options"), [pytest.param(*x, marks=[pytest.mark.slow] * (x not in OFTEN)) for x in ALL], ids=str
 )
 def test_options(options, vectors, dtype):
     x, vectors = points(40, dtype), SMALL if vectors == "images" else LENGTHS
@@ -367,7 +371,8 @@ LONG = np.array([[1.0, 0.0, 0.0], [30.3, 1.1, 0.0], [-17.2, 21.1, 0.9]]) @ np.li
 def test_lattices_far_from_reduced(backend, kind, options):
     rng, periodic = np.random.default_rng(0), options.get("periodic", (True,) * 3)
     whole = rng.integers(-3, 4, (12, 3)) * periodic
-    x = ((rng.uniform(0, 1, (12, 3)) + whole) @ LONG).astype(kind)
+    fractions = rng.uniform(0, 1, (12, 3)) * np.where(periodic, 1, 0.5)  # all of the open vector is 600 of the first one away
+    x = ((fractions + whole) @ LONG).astype(kind)
     given = {"half": True} if "half" in options else {"queries": x[:5] + 0.25} if "queries" in options else {}
     box = jfrnn.Box(LONG, periodic)
     nbrs = jfrnn.search(x, 0.9, box=box, backend=backend, capacity=64, **given)

@@ -73,9 +73,8 @@ N, MOST, REACH = 268, 6, {2: (6, 5), 3: (4, 4, 6)}  # of the largest cases
 
 def padded_box(given):
     """Return the boxes of a case, and more without particles, so that most cases share a program."""
-    lengths, (systems, dim) = given.boxes.ndim == 2, given.boxes.shape[:2]
-    more = np.broadcast_to(1 if lengths else np.eye(dim), (MOST - systems, *given.boxes.shape[1:]))
-    boxes = np.concatenate([given.boxes, more.astype(given.boxes.dtype)])
+    systems, dim = given.boxes.shape[:2]
+    boxes = np.concatenate([given.boxes, np.stack([np.eye(dim, dtype=given.boxes.dtype)] * MOST)])[:MOST]
     flags = np.ones((MOST, dim), bool)
     flags[:systems] = given.periodic
     many = any(box_of(given).images_for(given.cutoff))

@@ -125,19 +125,23 @@ def test_options_and_flat_lists(who, backend):
     )
     assert int(edges.pair_count) == len(expected) == len(senders)
     assert set(zip(receivers.tolist(), senders.tolist(), map(tuple, shifts.tolist()), strict=True)) == expected
+    if backend == "warp" and who == "either":
+        nbrs = given.search(backend, half=True, exclude=exclude)
+        assert masked_images(nbrs, given.x) == reference.without_excluded(given.pairs(half=True), exclude)
+        closed = given.search(backend, closed=True)
+        assert masked_images(closed, given.x) == given.pairs(closed=True)
 
 
 @SLOW
 @pytest.mark.parametrize(("who", "backend"), [("table", "warp"), ("mean", "warp"), ("table", "jax")])
 def test_skin_while_cutoffs_and_boxes_change(who, backend):
-    """Room is made for "mean", particles drift, boxes breathe and cutoffs grow: every step holds exactly the pairs of that step."""
+    """Room is made, particles drift, boxes breathe and cutoffs grow: every step holds exactly the pairs of that step."""
     given, random = scene("mixed", np.float32, 2, who), np.random.default_rng(0)
     x, boxes, cutoff, batch = given.x, given.given.boxes, given.cutoff, given.given.batch
     options = given.options | {"box": jfrnn.Box(boxes), "batch": batch, "skin": 0.08, "backend": backend}
-    nbrs = jfrnn.search(x, cutoff, capacity=1 if who == "mean" else 64, **options)
-    if who == "mean":
-        assert nbrs.overflow
-        nbrs = nbrs.grow(x, box=jfrnn.Box(boxes), cutoff=cutoff, slack=1.5)
+    small = jfrnn.search(x, cutoff, capacity=1, **options)
+    assert small.overflow
+    nbrs = small.grow(x, box=jfrnn.Box(boxes), cutoff=cutoff, slack=1.5)
     update = jax.jit(lambda nbrs, x, boxes, cutoff: nbrs.update(x, box=jfrnn.Box(boxes), cutoff=cutoff))
 
     def expected(scale):

@@ -47,12 +47,30 @@ def test_products_are_rounded_once(dtype):
             np.testing.assert_array_equal(found, exact(u, vectors, dtype))
 
 
+def test_second_derivatives_of_products():
+    """Those of a sum of cubes of the product in one direction, by a complex step."""
+    u, ways, step = np.asarray(points(np.float64)), (np.sin(points(np.float64)), np.cos(SKEWED)), 1e-30
+
+    def cubes(u, vectors):
+        return (real_points(u, None, jfrnn.Box(vectors, fractional=True), None, True)[0] ** 3).sum()
+
+    def in_numpy(u, vectors):
+        of_x = 3 * (u @ vectors) ** 2
+        return of_x @ vectors.T, u.T @ of_x
+
+    found, turned = jax.jit(lambda *given: jax.jvp(jax.grad(cubes, (0, 1)), given[:2], given[2:]))(u, SKEWED, *ways)
+    ahead = in_numpy(*(given + 1j * step * way for given, way in zip((u, SKEWED), ways, strict=True)))
+    for first, second, right, right_ahead in zip(found, turned, in_numpy(u, SKEWED), ahead, strict=True):
+        np.testing.assert_allclose(first, right, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(second, right_ahead.imag / step, rtol=1e-12, atol=1e-12)
+
+
 OFTEN = [("skewed", np.float32, "warp")]
 ALL = [(name, dtype, backend) for name in BOXES for dtype in (np.float32, np.float64) for backend in ("warp", "jax", "brute")]
 
 
 @pytest.mark.parametrize(("name", "dtype", "backend"), [*OFTEN, *(pytest.param(*x, marks=SLOW) for x in ALL if x not in OFTEN)])
-def test_lists_flat_lists_and_counts(name, dtype, backend):
+def test_lists_and_flat_lists(name, dtype, backend):
     (vectors, periodic, cutoff), u, q = BOXES[name], points(dtype), points(dtype, 1, 7)
     real, asking = exact(u, vectors, dtype), exact(q, vectors, dtype)
     flags = [periodic] * 3 if isinstance(periodic, bool) else periodic
@@ -60,8 +78,12 @@ def test_lists_flat_lists_and_counts(name, dtype, backend):
     expected = reference.reference_images(real, cutoff, matrix=vectors, periodic=flags)
     nbrs = jfrnn.search(u, cutoff, capacity=CAPACITY, **given)
     nbrs.check()
-    found = masked_images if nbrs.images is None else image_pairs
-    assert found(nbrs, u) == expected
+    if nbrs.images is not None:
+        assert image_pairs(nbrs, u) == expected
+    else:
+        assert masked_images(nbrs, u) == expected
+    nodes = jax.jit(lambda nbrs, u: nbrs.to_jraph(u, 2048).nodes)(nbrs, u)
+    np.testing.assert_array_equal(nodes["positions"][:N], real)
     flat = jfrnn.search_edges(u, cutoff, half=True, total=2048, **given)
     flat.check()
     edges = jax.jit(lambda flat, u: flat.edges(u))(flat, u)
@@ -72,7 +94,7 @@ def test_lists_flat_lists_and_counts(name, dtype, backend):
     np.testing.assert_allclose(v, real[j] - real[i] + s @ rows, atol=1e-5)
     of_queries = jfrnn.search(u, cutoff, queries=q, capacity=CAPACITY, **given)
     asked = reference.reference_images(real, cutoff, matrix=vectors, periodic=flags, queries=asking)
-    assert found(of_queries, u, queries=q) == asked
+    assert masked_images(of_queries, u, queries=q) == asked
 
 
 CELLS = np.stack([SKEWED, 0.4 * SKEWED, 2.5 * SKEWED[::-1]])
@@ -125,9 +147,11 @@ def smooth_in_numpy(r):
 
 
 @pytest.mark.parametrize("per_system", [True, pytest.param(False, marks=SLOW)])
-@pytest.mark.parametrize("way", ["first", *(pytest.param(way, marks=SLOW) for way in ("search", "list", "edges", "jax"))])
+@pytest.mark.parametrize(
+    "way", ["first", *(pytest.param(way, marks=SLOW) for way in ("search", "list", "edges", "vectors", "jax"))]
+)
 def test_derivatives_in_coordinates_and_vectors_are_those_of_the_product(way, per_system):
-    """Derivatives of sums over the oracle's pairs; but for the quick test also second ones in one direction, by a complex step."""
+    """Derivatives of sums over the oracle's pairs, after "first" also the second ones in one direction, by a complex step."""
     u, batch = np.asarray(points(np.float64, 4)), np.arange(N) % 3 if per_system else np.zeros(N, int)
     cells = CELLS if per_system else SKEWED[None]
     real = np.concatenate([exact(p[None], cells[k], np.float64) for p, k in zip(u, batch)])
@@ -142,6 +166,10 @@ def test_derivatives_in_coordinates_and_vectors_are_those_of_the_product(way, pe
         nbrs = jfrnn.search(u, 0.6, box=box, capacity=CAPACITY, **more)
         if way == "list":
             return jfrnn.pair_sum(smooth, u, None, neighbors=nbrs, box=box) @ weights
+        if way == "vectors":
+            vectors, mask = nbrs.vectors(u, box=box)
+            terms = jax.vmap(jax.vmap(lambda r: smooth(r, None, None)))(vectors)
+            return jnp.where(mask, terms, 0).sum(axis=1) @ weights
         edges = nbrs.edges(u, len(i), box=box)
         terms = jax.vmap(lambda r: smooth(r, None, None))(edges.displacement)
         return jnp.where(edges.mask, terms * jnp.asarray(weights)[jnp.minimum(edges.receivers, N - 1)], 0).sum()
