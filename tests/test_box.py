@@ -103,8 +103,8 @@ DIFFERENT = [
     pytest.param("crystal_0.1_outside", np.float32, 3, True, marks=pytest.mark.slow),
     pytest.param("ties_across_skewed_far", np.float32, 2, True, marks=pytest.mark.slow),
     pytest.param("cutoff_1.5_boxes", np.float32, 2, True, marks=pytest.mark.slow),
-    ("queries_many_images", np.float64, 2, False),
-    ("far_from_reduced_alone", np.float32, 2, False),
+    pytest.param("queries_many_images", np.float64, 2, True, marks=pytest.mark.slow),
+    ("far_from_reduced_alone", np.float64, 2, False),
     pytest.param("far_from_reduced_crowded", np.float32, 2, True, marks=pytest.mark.slow),
     pytest.param("residues_across_100", np.float64, 2, True, marks=pytest.mark.slow),
 ]
@@ -322,6 +322,7 @@ def test_skin_in_a_moving_box(backend, vectors):
     assert 0 < int(nbrs.rebuild_count) < 12
 
 
+@pytest.mark.slow
 def test_a_box_that_changes_enough_makes_the_list_anew():
     """Particles rest, the box shrinks: by less than the skin in all directions the list stays, by more it is made anew."""
     x = points(40, scale=1.0)
