@@ -1,0 +1,97 @@
+"""Headers of `kernels/native` compile by themselves, and structures that mirror XLA's C interface are those of its header."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import jax
+import pytest
+from places import ROOT
+
+from jfrnn._engine import ffi
+from jfrnn._engine.start import load_warp
+from jfrnn.kernels import Program, _compile
+from jfrnn.kernels._text import resolve
+from jfrnn.kernels.hashgrid import warp_header
+from jfrnn.kernels.launch import write_launcher
+
+NATIVE = ROOT / "kernels" / "native"
+LAUNCHING = ("calls.h", "desk.h", "launch.h")  # which need XLA's header
+WHOLE = sorted(path.name for path in NATIVE.iterdir())
+
+
+def is_cpu_only(header):
+    """Tell headers with Clang's vectors, or with calls of the CPU alone; where cutoffs differ, one text has both."""
+    if header in ("levels.h", "level_rows.h", "level_sums.h", "winding.h"):
+        return False
+    text = resolve(header, given={"numbers.h": "", "xla_ffi.h": "", "warp_hashgrid.h": ""})
+    if header in ("c_library.h", "hashgrid_build.h", *LAUNCHING):
+        return True
+    words = ("vector_size", "__builtin_prefetch", "__atomic_fetch_add", "_cpu.h", "__builtin_sqrt")
+    return any(word in text or word in header for word in words) and not header.endswith(".cuh")
+
+
+def headers(cuda):
+    return [name for name in WHOLE if (name.endswith(".h") or cuda) and not (cuda and is_cpu_only(name))]
+
+
+def text_of(header):
+    return write_launcher(HEADER, header) if header in LAUNCHING else resolve(header, given={"warp_hashgrid.h": warp_header()})
+
+
+@pytest.mark.parametrize("cuda", [False, True], ids=["cpu", "cuda"])
+def test_headers_compile_by_themselves(cuda):
+    assert len(headers(cuda)) >= 30
+    load_warp()
+    for name in headers(cuda):
+        assert _compile.find_binary(Program(f"header_{name}", text_of(name), cuda), arch=90).exists()
+
+
+def test_nvcc_compiles_headers(tmp_path):
+    nvcc = shutil.which("nvcc")
+    if nvcc is None:
+        pytest.skip("no nvcc")
+    pieces = [f"namespace space_{k} {{\n{text_of(name)}\n}}\n" for k, name in enumerate(headers(cuda=True))]
+    source = tmp_path / "headers.cu"
+    source.write_text("#include <cuda_fp16.h>\n" + "".join(pieces))
+    done = subprocess.run(
+        [nvcc, "-ptx", "-std=c++17", "-arch=sm_90", "-o", tmp_path / "x.ptx", source], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[:2000]
+
+
+HEADER = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text()
+EXTENSION = "XLA_FFI_InternalExtension" if "XLA_FFI_InternalExtension" in HEADER else "XLA_FFI_Extension_Base"  # by version
+MIRRORED = {
+    ffi.Version: ("XLA_FFI_Api_Version", {"major": "major_version", "minor": "minor_version", "extension": "extension_start"}),
+    ffi.Extension: (EXTENSION, {"metadata": None}),
+    ffi.CallFrame: ("XLA_FFI_CallFrame", {"extension": "extension_start"}),
+    ffi.Api: (
+        "XLA_FFI_Api",
+        {"extension": "extension_start", "version": "api_version", "internal": "internal_api", "fail": "XLA_FFI_Error_Create"},
+    ),
+}
+
+
+def test_structures_are_those_of_xla(tmp_path):
+    """Places and sizes of what is read, as a C compiler lays out the header that JAX ships."""
+    compiler = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
+    if compiler is None:
+        pytest.skip("no C compiler")
+    lines, expected = [], []
+    for structure, (name, renamed) in MIRRORED.items():
+        for field, *_ in structure._fields_:
+            there = renamed.get(field, field)
+            if there is not None:
+                lines.append(f'printf("%zu\\n", offsetof({name}, {there}));')
+                expected.append((name, field, getattr(structure, field).offset))
+    source = tmp_path / "offsets.c"
+    body = "\n".join(lines)
+    source.write_text(
+        f'#include <stddef.h>\n#include <stdio.h>\n#include "xla/ffi/api/c_api.h"\nint main() {{\n{body}\nreturn 0;\n}}\n'
+    )
+    command = [compiler, f"-I{jax.ffi.include_dir()}", "-o", tmp_path / "offsets", source]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    found = subprocess.run([tmp_path / "offsets"], check=True, capture_output=True, text=True).stdout.split()
+    assert [(name, field, int(at)) for (name, field, _), at in zip(expected, found)] == expected

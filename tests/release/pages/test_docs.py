@@ -1,0 +1,139 @@
+"""The pages: they build without a warning, their code runs as it stands, their figures are those of the rows."""
+
+import os
+import re
+import subprocess
+import sys
+
+import pasted
+import pytest
+import soon
+from places import ROOT
+
+import jfrnn
+from experiments import pages
+from experiments._errors import UsageError
+from experiments.pages.rows import TIMES
+from jfrnn import distributed
+from jfrnn._engine import ENGINES, Kind
+from jfrnn._shards.calls import BACKENDS
+from jfrnn._triangles.engines import TRIANGLE_ENGINES
+
+BUILD = f"""
+import sys
+
+from experiments.pages import gallery
+from sphinx.cmd.build import main
+
+gallery._RUN = {soon.PROGRAM!r} + gallery._RUN
+sys.exit(main(sys.argv[1:]))
+"""
+GROUPS = {
+    "readme": ["README.md", "docs/index.md", "docs/start.md"],
+    "guides": sorted(f"docs/guides/{path.name}" for path in (ROOT / "docs/guides").glob("*.md")),
+    "coming_from": sorted(f"docs/coming-from/{path.name}" for path in (ROOT / "docs/coming-from").glob("*.md")),
+    "rest": ["docs/sph.md", *sorted(f"docs/developers/{path.name}" for path in (ROOT / "docs/developers").glob("*.md"))],
+}
+
+
+def run(*arguments, **environment):
+    told = os.environ | {"PYTHONPATH": str(ROOT)} | environment
+    done = subprocess.run([sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, check=False, env=told)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def ran():
+    """Run the blocks of all pages in one process, those of a page in order and in a namespace of its own.
+
+    As a user finds the library: no 64-bit mode, here four virtual devices. Returns lines of code by page, and errors.
+    """
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
+    told = os.environ | {"PYTHONPATH": str(ROOT), "XLA_FLAGS": flags}
+    given = [page for pages in GROUPS.values() for page in pages]
+    command = [sys.executable, "-W", "error::RuntimeWarning", "-c", pasted.PROGRAM, *given]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=told)
+    return pasted.lines_run(done.stdout), done.stderr
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_code_of_pages(group, ran):
+    lines, errors = ran
+    assert [page for page in GROUPS[group] if page not in lines] == [], errors
+    assert sum(lines[page] for page in GROUPS[group]) > 0
+
+
+def test_pages_build(tmp_path):
+    """With warnings as errors: links, anchors and cross-references are there, docstrings can be read, no page is left out."""
+    run("-c", BUILD, "-W", "--keep-going", "--quiet", "--builder", "html", str(ROOT / "docs"), str(tmp_path))
+    html = {path.stem: path.read_text(encoding="utf-8") for path in (tmp_path / "api").glob("*.html")}
+    missing = [name for name in jfrnn.__all__ if f'id="jfrnn.{name}"' not in html["jfrnn"]]
+    missing += [name for name in distributed.__all__ if f'id="jfrnn.distributed.{name}"' not in html["distributed"]]
+    assert missing == []
+
+
+@pytest.mark.parametrize("page", [path for path in pages.pages() if pages.names_in(path)], ids=lambda path: path.stem)
+def test_figures_are_those_of_the_rows(page):
+    text = page.read_text(encoding="utf-8")
+    assert pages.fill_in(text) == text, "python -m experiments tables"
+
+
+def test_engines_can_what_the_readme_says():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.split("## What each engine can")[1].splitlines()]
+    lines = [line for line in lines if len(line) == 5]
+    names = [cell.strip("`") for cell in lines[0][1:]]
+    said = {line[0]: dict(zip(names, line[1:])) for line in lines}
+    assert set(names) == set(ENGINES)
+    asked = {"periodic boxes, batches": Kind(periodic=True, batch=True), "`pair_sum`": Kind(summed=True)}
+    asked |= {"a cutoff per particle or per pair of species": Kind(radii=True), "excluded pairs": Kind(excluding=True)}
+    for title, kind in asked.items():
+        for name, engine in ENGINES.items():
+            assert (said[title][name] == "no") == (engine.refuse(kind) is not None), (title, name)
+    tables = {"many devices": BACKENDS, next(title for title in said if title.startswith("triangles")): TRIANGLE_ENGINES}
+    for title, table in tables.items():
+        assert [name for name in names if said[title][name] == "yes"] == [name for name in names if name in table]
+
+
+NOTES = ("docs/benchmarks/tried.md", "docs/benchmarks/paper.md")  # of the laboratory, and arithmetic
+NO_MEASUREMENTS = {  # bounds, defaults and definitions
+    "docs/benchmarks/cpu.md": ["60 s", "16 GiB"],
+    "docs/benchmarks/gpu.md": ["11 %"],
+    "docs/benchmarks/many-devices.md": ["20 B"],
+    "docs/explanation/array-engine.md": [f"3 {TIMES}", "64 MB", "1 GB", "100 B", "125 B"],
+    "docs/guides/kept-lists.md": ["4 B"],
+    "docs/guides/many-devices.md": ["20 s"],
+    "docs/guides/memory.md": ["64 MB", "1 GB"],
+    "docs/start.md": ["4 B", "4 B", "8 B"],
+    "docs/thesis.md": ["95 %", "0.1 to 100 %", "10 %"],
+}
+
+
+def test_no_figure_is_written_by_hand():
+    loose = {str(page.relative_to(ROOT)): pages.loose_figures(page.read_text(encoding="utf-8")) for page in pages.pages()}
+    assert {name: found for name, found in loose.items() if found and name not in NOTES} == NO_MEASUREMENTS
+
+
+def test_a_figure_written_by_hand_is_found():
+    text = (
+        "It takes 3.2 ms, 4 to 5 times as long, `5 ms` <!-- value jet-steps -->7 s<!-- end -->, 1 024 particles.\n```\n8 s\n```\n"
+    )
+    assert pages.loose_figures(text) == ["3.2 ms", "4 to 5 times"]
+
+
+def test_every_table_and_figure_stands_in_a_page():
+    assert {name for page in pages.pages() for name in pages.names_in(page)} == {*pages.TABLES, *pages.VALUES}
+
+
+def test_a_figure_that_is_none_of_the_rows_is_found():
+    text = "<!-- table ties -->\n\n<!-- end -->\n"
+    filled = pages.fill_in(text)
+    spoiled = re.sub(r"\d\.\d\d", "0.10", filled, count=1)
+    assert spoiled != filled == pages.fill_in(spoiled)
+    with pytest.raises(UsageError, match="there is no such table"):
+        pages.fill_in(text.replace("ties", "knots"))
+    text = "<!-- value jet-steps -->1 000<!-- end -->"
+    assert pages.fill_in(text) == text.replace("1 000", pages.VALUES["jet-steps"]()) != text
+    with pytest.raises(UsageError, match="there is no such value"):
+        pages.fill_in(text.replace("jet", "oil"))

@@ -1,0 +1,88 @@
+"""Handlers of signals that raise while searches run: no wrong result, nothing lost, no memory written after it was given back."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import jax
+import numpy as np
+import pytest
+from places import TESTS
+
+import jfrnn
+from jfrnn._engine import launch
+
+PROGRAM = TESTS / "interrupted.py"
+
+
+def run(tries, *more):
+    """Raise so many times in each of 16 works; return how often a result was wrong, and an exception lost."""
+    environment = os.environ | {"JAX_ENABLE_X64": "0"}
+    done = subprocess.run(
+        [sys.executable, PROGRAM, str(tries), *more], capture_output=True, text=True, check=False, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    print(done.stderr)  # what was dropped, and where
+    words = done.stdout.split()
+    return {kind: int(times) for kind, times in zip(words[::2], words[1::2])}
+
+
+def assert_sound(found, tries):
+    assert (found["wrong"], found["lost"]) == (0, 0)
+    assert found["interrupted"] + found["finished"] == 16 * tries
+    assert min(found["interrupted"], found["finished"]) > tries  # it was raised within searches, and behind them
+
+
+def test_interrupted_searches_are_right_or_raise():
+    assert_sound(run(24), 24)
+
+
+def forget_plans():
+    for key in list(launch._plans):
+        launch._open().drop(launch._plans.pop(key))
+
+
+@pytest.mark.parametrize("backend", ["warp", "hashgrid"])
+def test_what_a_handler_raises_while_python_is_asked_is_raised_when_the_call_has_ended(backend, monkeypatch):
+    """A program whose plan is gone asks on the main thread."""
+    x = np.random.default_rng(0).random((40, 3), np.float32)
+    count = jax.jit(lambda x: jfrnn.search(x, 0.3, capacity=40, backend=backend).count)
+    right, threads, work = np.asarray(count(x)), [], launch._keep_plan
+
+    def interrupted(*given):
+        threads.append(threading.current_thread())
+        os.kill(os.getpid(), signal.SIGUSR1)
+        time.sleep(0.1)
+        return work(*given)
+
+    def handle(number, _):
+        raise error
+
+    error = KeyboardInterrupt("itself")
+    forget_plans()
+    monkeypatch.setattr(launch, "_keep_plan", interrupted)
+    before = signal.signal(signal.SIGUSR1, handle)
+    try:
+        with pytest.raises(KeyboardInterrupt, match="itself") as raised:
+            jax.block_until_ready(count(x))
+            time.sleep(1)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert raised.value is error
+    assert threads
+    assert threading.main_thread() not in threads
+    monkeypatch.undo()
+    np.testing.assert_array_equal(count(x), right)
+
+
+@pytest.mark.slow
+def test_without_memory_for_instructions_interrupted_searches_are_right_or_raise():
+    assert_sound(run(48, "unmapped"), 48)
+
+
+@pytest.mark.slow
+def test_searches_that_are_interrupted_thousands_of_times_are_right_or_raise():
+    assert_sound(run(300), 300)

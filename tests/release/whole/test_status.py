@@ -1,0 +1,393 @@
+"""What each public call does for each status bit: all of them are run, and compared with the table of docs/guides/status.md."""
+
+import functools
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from places import ROOT
+
+import jfrnn
+import jfrnn.distributed
+from jfrnn import Status, jax_md
+from jfrnn.ase import primitive_neighbor_list
+
+PAGE = ROOT / "docs" / "guides" / "status.md"
+N, CUTOFF = 24, 0.4
+LENGTHS = np.array([1.0, 1.2, 0.9], np.float32)
+X = (np.random.default_rng(0).random((N, 3)) * LENGTHS).astype(np.float32)
+BAD = 5  # the particle that is not finite, or too far away
+BOX = jfrnn.Box(LENGTHS, images=0)
+PLATE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], np.float32), np.array([[0, 1, 2], [1, 2, 3]], np.int32)
+
+
+def damaged(value):
+    x = X.copy()
+    x[BAD] = value
+    return x
+
+
+# For each bit: positions, and the arguments that set it. `traced` ones are known to be wrong only inside jit.
+SCENES = {
+    Status.NONFINITE: (damaged(np.nan), {}, {}),
+    Status.BOX_TOO_SMALL: (X, {"box": jfrnn.Box(0.5 * LENGTHS, images=0)}, {}),
+    Status.OUT_OF_RANGE: (damaged(1e12), {"box": BOX}, {}),
+    Status.INVALID_CUTOFF: (X, {"cutoff": np.where(np.arange(N) == BAD, -1, CUTOFF).astype(np.float32)}, {}),
+    Status.SYSTEM_WITHOUT_BOX: (
+        X,
+        {"box": jfrnn.Box([LENGTHS, LENGTHS], per_system=True, images=0), "batch": np.where(np.arange(N) == BAD, 7, 0)},
+        {},
+    ),
+    Status.EXCLUDED_OUT_OF_RANGE: (X, {}, {"exclude": np.array([[0, 99]])}),
+}
+ZERO = [0]  # a number that is traced inside jit, so that what it is added to is
+LISTS = {}  # that calls of one program share
+KINDS = {"not finite": [Status.NONFINITE], "invalid": [bit for bit in SCENES if bit != Status.NONFINITE]}
+
+
+def options(bit, traced):
+    """Return positions, cutoff and other arguments of a search that sets a bit; those that only jit takes are left out outside."""
+    x, given, inside = SCENES[bit]
+    given = given | ({name: value + ZERO[0] for name, value in inside.items()} if traced else {})
+    return x, given.get("cutoff", CUTOFF), {name: value for name, value in given.items() if name != "cutoff"}
+
+
+def calls(makes, traced):
+    """Run calls, each by itself outside of jit, or all in one program inside; say in the words of the table what came back."""
+    said = {}
+
+    def attempt(name, finish):
+        try:
+            found = makes[name]()
+            said[name] = found if isinstance(found, str) else finish(found)
+        except jfrnn.NeighborOverflowError:
+            said[name] = "raises `NeighborOverflowError`"
+        except (ValueError, RuntimeError) as error:
+            said[name] = f"raises `{type(error).__name__}`"
+
+    def program(zero):
+        ZERO[:] = [zero]
+        LISTS.clear()
+        for name in makes:
+            attempt(name, lambda found: found)
+        return {name: said.pop(name) for name in makes if not isinstance(said[name], str)}
+
+    if traced:
+        said |= {name: tell(found) for name, found in jax.jit(program)(0).items()}
+    else:
+        ZERO[:] = [0]
+        LISTS.clear()
+        for name in makes:
+            attempt(name, tell)
+    LISTS.clear()
+    return {name: said[name] for name in makes}
+
+
+def tell(found):
+    if hasattr(found, "status") and not isinstance(found, tuple):
+        return "the bit" if Status(int(found.status)) else "nothing"
+    words = {tell_array(x) for x in jax.tree.leaves(found)}
+    assert len(words) == 1, words
+    return words.pop()
+
+
+def tell_array(x):
+    x = np.asarray(x)
+    floats = np.issubdtype(x.dtype, np.floating)
+    unknown = np.isnan(x) if floats else x == np.iinfo(x.dtype).min
+    rows = unknown.reshape(len(x), -1) if x.ndim else unknown.reshape(1, 1)
+    name = "NaN" if floats else "the smallest integer"
+    if rows.all():
+        return name
+    if len(rows) == N and rows[BAD].all() and not np.delete(rows, BAD, axis=0).any():
+        return f"{name} in its row"
+    assert not unknown.any()
+    return "without it"
+
+
+def one(r, i, j):
+    return 1 + 0 * (r @ r)
+
+
+def whole(r, i, j):
+    return jnp.int32(1)
+
+
+def shared(make):
+    """Make a list once for all calls of a program."""
+
+    def of(*key):
+        if (make, key) not in LISTS:
+            LISTS[make, key] = make(*key)
+        return LISTS[make, key]
+
+    return of
+
+
+@shared
+def made(bit, traced):
+    x, cutoff, given = options(bit, traced)
+    return x, jfrnn.search(x, cutoff, capacity=256, **given)
+
+
+@shared
+def edges_made(bit, traced):
+    x, cutoff, given = options(bit, traced)
+    return x, jfrnn.search_edges(x, cutoff, total=6000, **given)
+
+
+def lists(name, method, make=made):
+    """Return a row of the table: a method of a list that holds the bit."""
+    return name, lambda bit, traced: method(*make(bit, traced))
+
+
+def search_verb(verb):
+    def run(bit, traced):
+        x, cutoff, given = options(bit, traced)
+        return verb(x, cutoff, **given)
+
+    return run
+
+
+def sum_over(fn):
+    def run(bit, traced):
+        x, nbrs = made(bit, traced)
+        return jfrnn.pair_sum(fn, x, None, neighbors=nbrs)
+
+    return run
+
+
+def grown(nbrs, x):
+    return "more room" if int(nbrs.grow(x).status) == 0 else "the bit"
+
+
+def kept_pairs(nbrs, total):
+    """Return that what is exported is what the list holds, whatever its status."""
+    i, _ = nbrs.pairs(total)
+    return "what is listed" if isinstance(i, jax.core.Tracer) else i
+
+
+VERBS = dict(
+    [
+        ("search", search_verb(functools.partial(jfrnn.search, capacity=256))),
+        ("search_edges", search_verb(functools.partial(jfrnn.search_edges, total=6000))),
+        ("count", search_verb(jfrnn.count)),
+        ("pair_sum, of floats", search_verb(functools.partial(jfrnn.pair_sum, one))),
+        ("pair_sum, of integers", search_verb(functools.partial(jfrnn.pair_sum, whole))),
+        ("pair_sum(neighbors=), of floats", sum_over(one)),
+        ("pair_sum(neighbors=), of integers", sum_over(whole)),
+        lists("NeighborList.vectors", lambda x, nbrs: nbrs.vectors(x)[0]),
+        lists("NeighborList.distances", lambda x, nbrs: nbrs.distances(x)[0]),
+        lists("NeighborList.shifts", lambda x, nbrs: nbrs.shifts(x)),
+        lists("NeighborList.edges", lambda x, nbrs: [(e := nbrs.edges(x, 6000)).displacement, e.distance]),
+        lists("NeighborList.to_jraph", lambda x, nbrs: [(e := nbrs.to_jraph(x, 6000).edges)["displacement"], e["distance"]]),
+        lists("EdgeList.edges", lambda x, nbrs: [(e := nbrs.edges(x)).displacement, e.distance], edges_made),
+        lists("EdgeList.to_jraph", lambda x, nbrs: [(e := nbrs.to_jraph(x).edges)["displacement"], e["distance"]], edges_made),
+        lists("NeighborList.update", lambda x, nbrs: nbrs.update(x)),
+        lists("EdgeList.update", lambda x, nbrs: nbrs.update(x), edges_made),
+        lists("NeighborList.pairs(total), csr(total)", lambda x, nbrs: kept_pairs(nbrs, 6000)),
+        lists("NeighborList.to_jax_md", lambda x, nbrs: "what is listed" if nbrs.to_jax_md().idx is nbrs.idx else "other"),
+    ]
+)
+OUTSIDE = dict(  # calls that are not for jit
+    [
+        lists("NeighborList.check, EdgeList.check", lambda x, nbrs: nbrs.check()),
+        lists("NeighborList.pairs(), csr()", lambda x, nbrs: nbrs.pairs()[0]),
+        lists("EdgeList.pairs()", lambda x, nbrs: nbrs.pairs()[0], edges_made),
+        lists("NeighborList.grow, EdgeList.grow, run_chunk", lambda x, nbrs: grown(nbrs, x)),
+    ]
+)
+
+
+def observed():
+    """Run every call for every bit; return the table: the name of a call -> what it does in the four columns."""
+    table = {name: [] for name in VERBS | OUTSIDE}
+    for bits in KINDS.values():
+        for traced in (False, True):
+            words = {}
+            for bit in bits:
+                if traced or bit != Status.EXCLUDED_OUT_OF_RANGE:  # outside jit, the search itself raises
+                    verbs = VERBS if traced else VERBS | OUTSIDE
+                    words[bit] = calls({name: functools.partial(verb, bit, traced) for name, verb in verbs.items()}, traced)
+            for name, cells in table.items():
+                found = {bit: said[name] for bit, said in words.items() if name in said}
+                if "grow" in name and Status.BOX_TOO_SMALL in found:
+                    assert found.pop(Status.BOX_TOO_SMALL) == "more room"  # images
+                assert len(set(found.values())) == (0 if traced and name in OUTSIDE else 1), (name, traced, found)
+                cells.append(next(iter(found.values()), ""))
+    return table
+
+
+def full_lists(traced):
+    """Return a row of the table for each call on lists, and sums over them, whose rows, or whose total, overflowed."""
+    padded, flat = shared(lambda: jfrnn.search(X, CUTOFF, capacity=2)), shared(lambda: jfrnn.search_edges(X, CUTOFF, total=3))
+    makes = {
+        "search": padded,
+        "search_edges": flat,
+        "pair_sum(neighbors=), of floats": lambda: jfrnn.pair_sum(one, X, None, neighbors=padded()),
+        "pair_sum(neighbors=), of integers": lambda: jfrnn.pair_sum(whole, X, None, neighbors=padded()),
+        "NeighborList.vectors": lambda: padded().vectors(X)[0],
+        "NeighborList.distances": lambda: padded().distances(X)[0],
+        "NeighborList.shifts": lambda: jfrnn.search(X, CUTOFF, capacity=2, box=BOX).shifts(X),
+        "NeighborList.edges": lambda: [(e := padded().edges(X, 6000)).displacement, e.distance],
+        "NeighborList.to_jraph": lambda: [(e := padded().to_jraph(X, 6000).edges)["displacement"], e["distance"]],
+        "EdgeList.edges": lambda: [(e := flat().edges(X)).displacement, e.distance],
+        "EdgeList.to_jraph": lambda: [(e := flat().to_jraph(X).edges)["displacement"], e["distance"]],
+        "NeighborList.update": lambda: padded().update(X),
+        "EdgeList.update": lambda: flat().update(X),
+        "NeighborList.pairs(total), csr(total)": lambda: kept_pairs(padded(), 6000),
+        "NeighborList.to_jax_md": lambda: "what is listed" if (n := padded()).to_jax_md().idx is n.idx else "other",
+        "NeighborList.check, EdgeList.check": lambda: padded().check(),
+        "NeighborList.pairs(), csr()": lambda: padded().pairs()[0],
+        "EdgeList.pairs()": lambda: flat().pairs()[0],
+        "NeighborList.grow, EdgeList.grow, run_chunk": lambda: grown(padded(), X),
+    }
+    return calls({name: make for name, make in makes.items() if not (traced and name in OUTSIDE)}, traced)
+
+
+def others():
+    """Run the calls that have bits, or errors, of their own: triangles, distributed particles and adapters."""
+    corners, faces = PLATE
+    lost, torn = corners.copy(), faces.copy()
+    lost[3], torn[1] = np.nan, [0, 1, 9]
+    walls = {
+        "few slots": (corners, faces, 1),
+        "a corner that is not finite": (lost, faces, 2),
+        "a face of no corners": (corners, torn, 2),
+    }
+    x = np.abs(X) * np.float32(0.1)
+    table = {}
+    for vertices, named, capacity in walls.values():
+        for traced in (False, True):
+            tri = shared(functools.partial(jfrnn.search_triangles, x, vertices, named, 1.0, capacity=capacity))
+            made = {"search_triangles": tri, "closest": lambda tri=tri: tri().closest(x)[1]}
+            made |= {
+                "contacts": lambda tri=tri: tri().contacts(x)[1],
+                "signed_distance": lambda tri=tri: tri().signed_distance(x).distance,
+            }
+            for name, said in calls(made, traced).items():
+                table.setdefault(name, []).append(said)
+    return table
+
+
+def rows_of_page(title):
+    """Return the table below a heading of the page: the first column -> the others."""
+    text = PAGE.read_text(encoding="utf-8").split(f"## {title}\n", 1)[1].split("\n## ", 1)[0]
+    rows = [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
+    return {row[0].replace("`", ""): row[1:] for row in rows[2:]}
+
+
+def as_rows(table):
+    return {name: [cell or "-" for cell in cells] for name, cells in table.items()}
+
+
+@functools.cache
+def everything():
+    outside, inside = full_lists(False), full_lists(True)
+    return {name: [*cells, outside.get(name, ""), inside.get(name, "")] for name, cells in observed().items()}
+
+
+def test_the_page_says_what_every_call_does():
+    assert rows_of_page("Searches, lists and sums") == as_rows(everything())
+
+
+def test_the_page_says_what_calls_about_walls_do():
+    assert rows_of_page("Walls of triangles") == as_rows(others())
+
+
+def test_every_bit_has_a_row_and_a_message():
+    told = rows_of_page("Bits")
+    assert list(told) == [bit.name for bit in Status if bit]
+    for bit in Status:
+        assert not bit or (bit.message and "in this list" not in bit.message)
+
+
+def test_no_call_answers_with_a_number_where_it_may_be_wrong():
+    """Not one cell of bits that mean missing pairs is a plain number."""
+    for name, (_, _, *cells) in everything().items():
+        assert all(cell != "without it" for cell in cells), name
+
+
+def test_adapters_raise_or_have_a_code():
+    def free(a, b, **_):
+        return a - b
+
+    def nearest(a, b, **_):
+        away = a - b
+        return away - 5 * jnp.round(away / 5)
+
+    x = np.random.default_rng(1).random((40, 3)).astype(np.float32) * 5
+    for displacement in (free, nearest):
+        fns = jax_md.neighbor_list(displacement, 5.0, 1.0, 0.2)
+        with pytest.raises(ValueError, match=r"not finite|non-finite"):
+            fns.allocate(jnp.asarray(x).at[3].set(jnp.nan))
+        nbrs = fns.allocate(x)
+        assert int(nbrs.update(jnp.asarray(x).at[3].set(jnp.nan)).did_buffer_overflow) != 0
+    assert int(nbrs.update(jnp.asarray(x).at[3].set(1e12)).error.code) != 0
+    fns = jax_md.neighbor_list_multi_image(None, 5.0 * np.eye(3), 1.0, 0.2, fractional_coordinates=False)
+    with pytest.raises(ValueError, match="non-finite"):
+        fns.allocate(jnp.asarray(x).at[3].set(jnp.nan))
+    assert bool(fns.allocate(x).update(jnp.asarray(x).at[3].set(jnp.nan)).did_buffer_overflow)
+    with pytest.raises(ValueError, match="finite"):
+        primitive_neighbor_list("ij", True, np.eye(3), np.full((2, 3), np.nan), 0.3)
+
+
+def test_distributed_calls():
+    mesh = jax.make_mesh((1,), ("x",))
+    particles = jfrnn.distributed.scatter(damaged(np.nan), CUTOFF, mesh=mesh)
+    nbrs = jfrnn.distributed.search(particles, CUTOFF)
+    with pytest.raises(ValueError, match="non-finite"):
+        nbrs.check()
+    ids = np.asarray(particles.ids)
+    counts, sums = jfrnn.distributed.count(particles, CUTOFF), jfrnn.distributed.pair_sum(one, particles, CUTOFF)
+    there = ids >= 0
+    np.testing.assert_array_equal(np.asarray(counts)[there] == np.iinfo(np.int32).min, ids[there] == BAD)
+    np.testing.assert_array_equal(np.isnan(sums)[there], ids[there] == BAD)
+    full = jfrnn.distributed.search(particles, CUTOFF, capacity=2)
+    with pytest.raises(RuntimeError, match="capacity"):
+        full.check()
+    with pytest.raises(RuntimeError):
+        jfrnn.distributed.pair_sum(one, particles, None, neighbors=full)
+
+
+def test_errors_name_the_particle():
+    with pytest.raises(ValueError, match=rf"positions\[{BAD}\] is \[nan, nan, nan\]"):
+        jfrnn.count(damaged(np.nan), CUTOFF)
+    with pytest.raises(ValueError, match=rf"positions\[{BAD}\] lies 1\.1\d*e\+12 lattice vectors away along axis 2"):
+        jfrnn.count(damaged(1e12), CUTOFF, box=BOX)
+    with pytest.raises(ValueError, match=rf"queries\[{BAD}\] is \[nan"):
+        jfrnn.count(X, CUTOFF, queries=damaged(np.nan))
+    x, radii, _ = options(Status.INVALID_CUTOFF, False)
+    with pytest.raises(ValueError, match=rf"cutoff\[{BAD}\] is -1"):
+        jfrnn.pair_sum(one, x, radii)
+    nbrs = jfrnn.search(X, CUTOFF, box=BOX, skin=0.02, capacity=40).update(damaged(1e12))
+    with pytest.raises(ValueError, match=rf"positions\[{BAD}\] lies"):
+        nbrs.check()
+
+
+def test_a_count_that_is_not_known_is_no_number():
+    """Copper's primitive cell, 78 neighbors within 6: too few images, or a traced cell, and 24 of them are found."""
+    cell, x = np.array([[0, 1.8, 1.8], [1.8, 0, 1.8], [1.8, 1.8, 0]], np.float32), np.zeros((1, 3), np.float32)
+    assert jfrnn.count(x, 6.0, box=jfrnn.Box(cell)).tolist() == [78]
+    unknown = np.iinfo(np.int32).min
+    assert jax.jit(lambda cell: jfrnn.count(x, 6.0, box=jfrnn.Box(cell)))(cell).tolist() == [unknown]
+    images = jfrnn.Box(cell).images_for(6.0)
+    assert jax.jit(lambda cell: jfrnn.count(x, 6.0, box=jfrnn.Box(cell, images=images)))(cell).tolist() == [78]
+    with pytest.raises(ValueError, match=r"needs images=\(3, 3, 3\) in this box as it is now, and here images=\(1, 1, 1\)"):
+        jfrnn.count(x, 6.0, box=jfrnn.Box(cell, images=1))
+    with pytest.raises(ValueError, match=r"needs images=\(3, 3, 3\)"):
+        jfrnn.pair_sum(one, x, 6.0, box=jfrnn.Box(cell, images=1))
+    with pytest.raises(ValueError, match=r"needs images=\(3, 3, 3\)"):
+        jfrnn.search(x, 6.0, box=jfrnn.Box(cell, images=1), capacity=80).check()
+    assert re.search("images_for", Status.BOX_TOO_SMALL.message)
+
+
+def test_inactive_particles_may_be_anything():
+    active = np.arange(N) != BAD
+    expected = jfrnn.count(np.delete(X, BAD, axis=0), CUTOFF)
+    for jit in (lambda f: f, jax.jit):
+        found = jit(lambda x: jfrnn.count(x, CUTOFF, active=active))(damaged(np.nan))
+        np.testing.assert_array_equal(np.delete(found, BAD), expected)
+        assert int(found[BAD]) == 0
