@@ -217,3 +217,21 @@ def test_readme_links_exist():
     links = re.findall(r"\]\(([^)#]+)\)", (ROOT / "README.md").read_text())
     assert len(links) > 3
     assert [link for link in links if "://" not in link and not (ROOT / link).exists()] == []
+
+
+def test_each_module_has_its_tests_in_the_table():
+    """`tests/README.md` names every module of the library once, and files that there are; no file of tests is missing."""
+    page = (ROOT / "tests" / "README.md").read_text(encoding="utf-8")
+    modules, named = [], set()
+    for line in re.findall(r"^\| (`.+`) \| (`.+`) \|$", page, re.MULTILINE):
+        folder = re.match(r"`(\w+/)?", line[0])[1] or ""
+        modules += [name if "/" in name else folder + name for name in re.findall(r"`([\w/]+)`", line[0])]
+        named |= {ROOT / "tests" / f"{file}.py" for file in re.findall(r"`([\w/]+)`", line[1])}
+    package = ROOT / "jfrnn"
+    there = [path.relative_to(package).with_suffix("").as_posix() for path in package.glob("_[a-z]*/*.py")]
+    there += [path.stem for path in package.glob("*.py")]
+    assert sorted(modules) == sorted(name for name in there if not name.endswith("__init__"))
+    assert [str(path) for path in named if not path.exists()] == []
+    elsewhere = {"house", "cases", "experiments", "sph", "pages", "package", "whole"}  # told by the name of the folder
+    listed = {path for path in (ROOT / "tests").rglob("test_*.py") if path.parent.name not in elsewhere}
+    assert sorted(map(str, listed - named)) == []
