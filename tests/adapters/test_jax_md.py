@@ -124,7 +124,7 @@ def test_room():
     displacement, box, _ = SPACES["periodic"]
     x = points(False)
     for form in (jax_md.Dense, jax_md.OrderedSparse):
-        fns = jax_md.neighbor_list(displacement, box, CUTOFF, format=form, capacity_multiplier=1.0)
+        fns = jax_md.neighbor_list(displacement, box, CUTOFF, SKIN, format=form, capacity_multiplier=1.0)
         assert tuple(fns) == (fns.allocate, fns.update)
         nbrs = fns.allocate(x)
         update = jax.jit(fns.update)
@@ -137,7 +137,7 @@ def test_room():
         wider = fns.allocate(x, extra_capacity=3)
         assert wider.max_occupancy == nbrs.max_occupancy + (3 if form is jax_md.Dense else 3 * N)
         assert wider.idx.shape[-1] == wider.max_occupancy
-        own = jax_md.neighbor_list(displacement, box, CUTOFF, format=form, mask_self=False).allocate(x)
+        own = jax_md.neighbor_list(displacement, box, CUTOFF, SKIN, format=form, mask_self=False).allocate(x)
         assert ((0, 0) in pairs_of(own.idx, N, form)) == (form is not jax_md.OrderedSparse)
 
 
@@ -180,7 +180,7 @@ def test_boxes_that_change():
         jax.jit(lambda x: jax_md.neighbor_list(free, 1.0, CUTOFF).allocate(x).idx)(x)
 
 
-IMAGES_OFTEN = [(jax_md.Dense, True), (jax_md.OrderedSparse, True)]  # Sparse, and no fractions: of particles that nobody wrapped
+IMAGES_OFTEN = [(jax_md.Dense, True)]  # pairs one after another, and no fractions: of particles that nobody wrapped
 
 
 @pytest.mark.parametrize(
@@ -247,13 +247,14 @@ def test_particles_that_nobody_wrapped_are_found():
         away = a - b
         return away - edge * jnp.round(away / edge)
 
-    expected = len(reference.reference_images(far, 1.0, matrix=edge * np.eye(3), periodic=(True,) * 3))
+    expected = reference.reference_images(far, 1.0, matrix=edge * np.eye(3), periodic=(True,) * 3)
     fns = jax_md.neighbor_list(nearest, edge, 1.0, capacity_multiplier=2.0)
     for made in (fns.allocate(far), jax.jit(fns.update)(far, fns.allocate(x))):
-        assert (np.count_nonzero(np.asarray(made.idx) < 60), int(made.error.code)) == (expected, 0)
-    many = jax_md.neighbor_list_multi_image(None, edge * np.eye(3), 1.0, fractional_coordinates=False).allocate(far)
+        assert (np.count_nonzero(np.asarray(made.idx) < 60), int(made.error.code)) == (len(expected), 0)
+    form = jax_md.OrderedSparse
+    many = jax_md.neighbor_list_multi_image(None, edge * np.eye(3), 1.0, fractional_coordinates=False, format=form).allocate(far)
     used = np.asarray(many.senders) < 60
-    i, j = np.asarray(many.receivers)[used], np.asarray(many.senders)[used]
-    away = far[j] + np.asarray(many.shifts)[used] * np.float64(edge) - far[i]
-    assert used.sum() == expected
-    assert (np.linalg.norm(away, axis=1) < 1.001).all()
+    i, j, shifts = (np.asarray(part)[used].astype(int).tolist() for part in (many.receivers, many.senders, many.shifts))
+    found = list(zip(i, j, map(tuple, shifts)))
+    assert len(found) == len(set(found))
+    assert set(found) == {(i, j, s) for i, j, s in expected if s > (0, 0, 0) or (s == (0, 0, 0) and i < j)}

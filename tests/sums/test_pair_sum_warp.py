@@ -103,10 +103,10 @@ def marked(x, cutoff, queries=None, **options):
     return fused(marks, jnp.asarray(checked.padded(x, LENGTH)), cutoff, ids, **options)
 
 
-KINDS = [(np.float32, 3), (np.float64, 2), *(pytest.param(*kind, marks=SLOW) for kind in ((np.float32, 2), (np.float64, 3)))]
-
-
-@pytest.mark.parametrize(("dtype", "dim"), [pytest.param(np.float32, 3, marks=pytest.mark.kernels), *KINDS[1:]])
+@pytest.mark.parametrize(
+    ("dtype", "dim"),
+    [(np.float32, 3), (np.float64, 2), *(pytest.param(*kind, marks=SLOW) for kind in ((np.float32, 2), (np.float64, 3)))],
+)
 def test_hard_cases(dtype, dim):
     for name in HARD:
         given = HARD_CASES[name].build(dtype, dim)
