@@ -1,4 +1,4 @@
-"""Search with a cutoff per particle: queries one by one, on the CPU in chunks on every core, on CUDA one per thread.
+"""Search with a cutoff per particle on CUDA: queries one by one, one per thread.
 
 What `jfrnn._levels` sorts, `query` walks: top cells as wide as the largest cutoff, within them groups of cutoffs, within those a
 Morton curve. A query finds the candidates of a group in the cells around it that are as wide as what the group reaches.
@@ -12,7 +12,6 @@ from jfrnn.kernels._native import RULES, SPACES, program
 from jfrnn.kernels._program import Entry, Kernel, declare
 
 PADDING = 16  # sources behind the last one, which nobody meets: the CPU tests so many at a time
-CHUNK = 256  # queries that a thread of the CPU takes at a time
 BLOCK = 128  # threads of CUDA
 
 
@@ -33,23 +32,23 @@ def level_program(
         constants: Further ones, such as PERIODIC and BATCHED of `jfrnn.kernels._native.program`.
     """
     constants |= {"RULE": RULES.index(rule), "SUM": rule == "mean", "GROUPS": groups, "HALVINGS": halvings}
-    constants |= {"SCALED": True, "PADDING": PADDING, "CHUNK": CHUNK, "ONE_BY_ONE": True}
+    constants |= {"SCALED": True, "PADDING": PADDING, "ONE_BY_ONE": True}
     return program(double, dim, header, given=given, **constants)
 
 
 @functools.lru_cache(512)
 def query_kernel(
     dim: int, double: bool, lists: bool, rule: str, groups: int, halvings: int, periodic: int = 0, batched: bool = False,
-    cuda: bool = False, excluding: int = 0, flat: bool = False,
+    excluding: int = 0, flat: bool = False,
 ) -> Kernel:  # fmt: skip
     """Return the kernel for a dimension, a dtype and a rule, for lists or counts alone.
 
-    On the CPU threads share the work, on CUDA there is one per query. `info`, zeros at first, gets the longest row.
+    There is a thread per query. `info`, zeros at first, gets the longest row.
     `periodic`, `batched`, `excluding` and `flat` are those of `jfrnn.kernels._native.program`.
     """
     variant = f"{dim}d_{'f64' if double else 'f32'}_{rule}{'_list' * lists}{'_flat' * flat}"
     variant += f"{SPACES[periodic]}{'_batched' * batched}{'_excluding' * excluding}"
     constants = {"LIST": lists, "FLAT": flat, "PERIODIC": periodic, "BATCHED": batched, "EXCLUDING": excluding}
-    text = level_program(dim, double, rule, groups, halvings, "level_rows.h", **constants)
+    text = level_program(dim, double, rule, groups, halvings, "level_rows.cuh", **constants)
     entry = Entry("LevelRows.run", BLOCK)
-    return declare(f"levels_{'cuda' if cuda else 'cpu'}_{variant}", text, entry, cuda=cuda)[0]
+    return declare(f"levels_cuda_{variant}", text, entry, cuda=True)[0]

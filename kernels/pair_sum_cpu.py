@@ -13,6 +13,7 @@ import itertools
 import re
 from typing import NamedTuple
 
+from jfrnn.kernels import tree_cpu
 from jfrnn.kernels._native import SPACES, program
 from jfrnn.kernels._program import Kernel, declare
 from jfrnn.kernels.cells_cpu import CHUNK, GRID, QUERY_CHUNK, TOGETHER
@@ -207,17 +208,20 @@ def _candidates(term: TermText, dim: int, double: bool) -> int:
 @functools.lru_cache(512)
 def query_kernel(
     term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: bool = False,
-    extremes: bool = False, packed: bool | None = None, excluding: int = 0,
+    extremes: bool = False, packed: bool | None = None, excluding: int = 0, rule: str = "",
 ) -> Kernel:  # fmt: skip
     """Return the kernel that sums a term; `key` tells it from all others in the names of programs.
 
     `extremes`: it finds the largest summands instead; `errors` [m, width, 2] then gets their sources (n: there is none), and the
     codes of their images, as integers travel among floats.
     `packed`: the term is evaluated for what is near alone, not for other candidates; None: as is faster.
+    `rule`: one of `RULES`, where cutoffs differ; then sources stand in a tree (`jfrnn.kernels.tree_cpu`).
     """
     packed = work(term.text) > LITTLE_WORK if packed is None else packed
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
-    variant += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}{'_excluding' * excluding}_{key}"
+    variant += (
+        f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}{'_excluding' * excluding}{'_' * bool(rule)}{rule}_{key}"
+    )
     constants = {"SCALED": scaled, "LIST": 0, **GRID, **constants_of(term, compensated, extremes)}
     constants |= {
         "PERIODIC": periodic,
@@ -229,5 +233,9 @@ def query_kernel(
     }
     works = work(term.text) > VERY_LITTLE_WORK
     constants |= {"MANY": 0, "PACKED": packed, "SKIPPED": works, "TOGETHER": TOGETHER_AT_WORK if works else TOGETHER}
-    text = program(double, dim, "pair_sum_cpu.h", given=term_header(term, double), **constants)
+    given = term_header(term, double)
+    if rule:
+        constants |= tree_cpu.constants_of(rule)
+        given |= tree_cpu.PROVIDER
+    text = program(double, dim, "pair_sum_cpu.h", given=given, **constants)
     return declare(f"pair_sum_cpu_{variant}", text, "Sums.run")[0]

@@ -1,16 +1,16 @@
-"""Warp inside JAX where cutoffs differ from particle to particle: lists, counts and sums over cells of many sizes."""
+"""CUDA inside JAX where cutoffs differ from particle to particle: lists, counts and sums over cells of many sizes."""
 
 import functools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._engine.arrays import levels_of
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import excluded_rows, lattice_numbers, particle_rows, periodic_kind, space_flags
-from jfrnn._engine.plans import Clear, Launch, Plan, share
+from jfrnn._engine.plans import Clear, Launch, Plan
 from jfrnn._engine.problem import Filter, Room, Rows, Search
 from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText
 from jfrnn._engine.variants import absent, excluding_flags, found_rows, row_dims
@@ -32,58 +32,36 @@ class _LevelVariant(NamedTuple):
     rule: str
     periodic: int
     batched: bool
-    cuda: bool
     excluding: int
     flat: bool = False
 
 
-def level_neighbors(search: Search, levels: Levels, keep: Filter, capacity: int | Room | None) -> Rows:
-    """Search with a cutoff per particle, among sources that XLA has sorted; capacity=None only counts."""
-
-    def on(cuda: bool) -> Callable[[Search, Levels], Rows]:
-        return functools.partial(_call_levels, cuda, keep, capacity)
-
-    return lax.platform_dependent(search._replace(checks={}), levels, cpu=on(False), cuda=on(True))
-
-
-def _call_levels(cuda: bool, keep: Filter, capacity: int | Room | None, search: Search, levels: Levels) -> Rows:
+def level_neighbors(search: Search, keep: Filter, capacity: int | Room | None) -> Rows:
+    """Search with a cutoff per particle on CUDA, among sources that XLA sorts; capacity=None only counts."""
+    levels = levels_of(search)
     lists, (_, m) = capacity is not None, search.sizes
     starts = [capacity.starts] if isinstance(capacity, Room) else []
-    variant = _variant_of(search, keep, lists, cuda)._replace(flat=bool(starts))
+    variant = _variant_of(search, keep, lists)._replace(flat=bool(starts))
     dims = {**row_dims(m, capacity), "count": m, "info": 2}
     *written, count, info = _level_callable(variant)(*_operands(search, levels), *starts, output_dims=dims)
     return found_rows(written, count, info[0], capacity)
 
 
 def level_sums(
-    search: Search,
-    levels: Levels,
-    keep: Filter,
-    term: TermText,
-    key: str,
-    values: tuple[Array, Array, Array],
-    compensated: bool,
-    extremes: bool,
+    search: Search, keep: Filter, term: TermText, key: str, values: tuple[Array, Array, Array], compensated: bool, extremes: bool
 ) -> FoundSums:
-    """Sum a term as `jfrnn._engine.warp_sums.pair_sums` does, among sources that XLA has sorted."""
-
-    def on(cuda: bool) -> Callable[[Search, Levels, tuple[Array, Array, Array]], FoundSums]:
-        def call(search: Search, levels: Levels, values: tuple[Array, Array, Array]) -> FoundSums:
-            (shared, own, others), (_, m) = values, search.sizes
-            results = SumsOf(term, m, pair_sum_levels.slots(m, cuda), compensated, extremes)
-            call_sums = _sum_callable(_variant_of(search, keep, False, cuda), results, key)
-            columns = jnp.zeros(1, others.dtype) if term.source_columns == 0 else others[levels.order].T.reshape(-1)
-            operands = _operands(search, levels)
-            return results.unpack(*call_sums(*operands, shared, own, columns, output_dims=results.dims() | {"info": 2})[:3])
-
-        return call
-
-    return lax.platform_dependent(search._replace(checks={}), levels, values, cpu=on(False), cuda=on(True))
+    """Sum a term as `jfrnn._engine.warp_sums.pair_sums` does, on CUDA, among sources that XLA sorts."""
+    (shared, own, others), (_, m), levels = values, search.sizes, levels_of(search)
+    results = SumsOf(term, m, pair_sum_levels.slots(m), compensated, extremes)
+    call_sums = _sum_callable(_variant_of(search, keep, False), results, key)
+    columns = jnp.zeros(1, others.dtype) if term.source_columns == 0 else others[levels.order].T.reshape(-1)
+    operands = _operands(search, levels)
+    return results.unpack(*call_sums(*operands, shared, own, columns, output_dims=results.dims() | {"info": 2})[:3])
 
 
-def _variant_of(search: Search, keep: Filter, lists: bool, cuda: bool) -> _LevelVariant:
+def _variant_of(search: Search, keep: Filter, lists: bool) -> _LevelVariant:
     sources, cutoffs = search.sources, search.cutoffs
-    kind = (search.queries is None, cutoffs.closed, keep, cutoffs.rule, periodic_kind(search.torus), search.batch is not None, cuda)
+    kind = (search.queries is None, cutoffs.closed, keep, cutoffs.rule, periodic_kind(search.torus), search.batch is not None)
     kind = (*kind, search.excluding)
     return _LevelVariant(sources.shape[1], sources.dtype == jnp.float64, lists, *kind)
 
@@ -155,7 +133,7 @@ def _name(name: str, variant: _LevelVariant, **more: bool) -> str:
 @kernel
 def _level_callable(variant: _LevelVariant) -> Call:
     results = dict.fromkeys([*["idx"] * variant.lists, *["receivers"] * variant.flat, "count", "info"], np.int32)
-    name = _name(f"levels_{'cuda' if variant.cuda else 'cpu'}", variant)
+    name = _name("levels_cuda", variant)
     given = (*_given(variant), *["starts"] * variant.flat)
     return Call(name, given, results, functools.partial(_plan_rows, variant))
 
@@ -163,7 +141,7 @@ def _level_callable(variant: _LevelVariant) -> Call:
 @kernel
 def _sum_callable(variant: _LevelVariant, results: SumsOf, key: str) -> Call:
     kind = {"compensated": results.compensated, "extremes": results.extremes}
-    name = _name(f"pair_sum_levels_{'cuda' if variant.cuda else 'cpu'}", variant, **kind, **{key: True})
+    name = _name("pair_sum_levels_cuda", variant, **kind, **{key: True})
     dtypes = dict.fromkeys(("sums", "totals", "errors"), np.float64 if variant.double else np.float32) | {"info": np.int32}
     plan = functools.partial(_plan_sums, variant, results, key)
     return Call(name, (*_given(variant), "shared_values", "own_values", "columns"), dtypes, plan)
@@ -171,11 +149,9 @@ def _sum_callable(variant: _LevelVariant, results: SumsOf, key: str) -> Call:
 
 def _plan_sums(variant: _LevelVariant, results: SumsOf, key: str, shapes: Shapes, multiprocessors: int) -> Plan:
     of_search = variant.dim, variant.double, variant.rule, GROUPS, HALVINGS, results.compensated, variant.periodic, variant.batched
-    query = pair_sum_levels.query_kernel(results.term, key, *of_search, results.extremes, variant.excluding, variant.cuda)
+    query = pair_sum_levels.query_kernel(results.term, key, *of_search, results.extremes, variant.excluding)
     numbers = _numbers(variant, shapes)
-    if variant.cuda:
-        return Plan([Launch(query, numbers["m"])], numbers)
-    return Plan([Clear("info", 8), share(query, numbers["m"])], numbers)
+    return Plan([Launch(query, numbers["m"])], numbers)
 
 
 def _numbers(variant: _LevelVariant, shapes: Shapes) -> dict[str, int]:
@@ -187,7 +163,6 @@ def _numbers(variant: _LevelVariant, shapes: Shapes) -> dict[str, int]:
 
 def _plan_rows(variant: _LevelVariant, shapes: Shapes, multiprocessors: int) -> Plan:
     kind = (variant.dim, variant.double, variant.lists, variant.rule, GROUPS, HALVINGS, variant.periodic, variant.batched)
-    query = level_kernels.query_kernel(*kind, variant.cuda, variant.excluding, variant.flat)
+    query = level_kernels.query_kernel(*kind, variant.excluding, variant.flat)
     numbers = _numbers(variant, shapes) | {"capacity": shapes["idx"][1] if variant.lists and not variant.flat else 0}
-    launch = Launch(query, numbers["m"]) if variant.cuda else share(query, numbers["m"])
-    return Plan([Clear("info", 8), launch], numbers, absent(variant.lists, variant.flat))
+    return Plan([Clear("info", 8), Launch(query, numbers["m"])], numbers, absent(variant.lists, variant.flat))

@@ -5,7 +5,8 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.problem import Search, largest_radius
-from jfrnn._geometry import Lattice, Wrapped
+from jfrnn._geometry import Cutoffs, Lattice, Wrapped
+from jfrnn.kernels._native import TABLE
 
 MOST_IN_BOX = 1 << 27  # most positions in a box, where ids share their bits with image codes
 
@@ -65,6 +66,13 @@ def lattice_numbers(lattice: Lattice, reach: Array, slack: Array, flags: Array |
 def excluded_rows(search: Search) -> list[Array]:
     """Return the rows of sources that queries exclude, as kernels read them (see `kernels/native/excluded.h`), if there are any."""
     return [] if search.exclude is None else [search.exclude.starts, search.exclude.names(search.sizes[0])]
+
+
+def cutoffs_of_particles(cutoffs: Cutoffs) -> dict[str, Array]:
+    """Return the cutoffs of sources and queries by the names that kernels on the CPU have for them; a table and species, too."""
+    names = dict(zip(("radii", "query_radii"), (cutoffs.sources, cutoffs.queries), strict=True))
+    named = {name: jnp.zeros(1, cutoffs.largest.dtype) if x is None else x for name, x in names.items()}
+    return named if cutoffs.kinds is None else named | dict(zip(TABLE, cutoffs.kinds, strict=True))
 
 
 def pack_particles(search: Search) -> tuple[Array, Array, Array]:

@@ -68,16 +68,28 @@ class SumVariant(NamedTuple):
         return "_".join([f"jfrnn_{of}_{self.dim}d", *(flag for flag, on in flags.items() if on)])
 
 
+def names_of_particles(rule: str) -> tuple[str, ...]:
+    """Return the names of what `cutoffs_of_particles` returns."""
+    return () if not rule else ("radii", "query_radii", *TABLE * (rule == RULES[-1]))
+
+
+def names_of_cutoffs(rule: str) -> tuple[str, ...]:
+    """Return the names of the arrays that kernels are given by `cutoffs_of_pairs`."""
+    return () if not rule else TABLE if rule == RULES[-1] else ("radii", "query_radii")
+
+
 def describe_call(
     name: str,
     variant: Variant,
     plan: Callable[[Shapes, int], Plan],
     given: Sequence[str] = _PARTICLES,
     more: Sequence[str] = ("scratch",),
+    cutoffs: Callable[[str], tuple[str, ...]] = names_of_cutoffs,
 ) -> Call:
     """Return what XLA calls for rows or counts: its name tells the kernels, and all that is static.
 
-    It is `given` arrays of these names, then those of exclusions, and writes rows, counts, `info` and `more`.
+    It is `given` arrays of these names, then those of exclusions and of cutoffs that differ, by a function of the rule; it writes
+    rows, counts, `info` and `more`.
     """
     flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
     flags |= {"flat": variant.flat, **space_flags(variant.periodic), "batched": variant.batched}
@@ -85,13 +97,8 @@ def describe_call(
     flags |= {**excluding_flags(variant.excluding), variant.rule: bool(variant.rule)}
     whole = "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
     results = [*["idx"] * variant.lists, *["receivers"] * variant.flat, "count", "info", *more]
-    given = (*given, *EXCLUDED * bool(variant.excluding), *names_of_cutoffs(variant.rule), *["starts"] * variant.flat)
+    given = (*given, *EXCLUDED * bool(variant.excluding), *cutoffs(variant.rule), *["starts"] * variant.flat)
     return Call(whole, given, dict.fromkeys(results, np.int32), plan)
-
-
-def names_of_cutoffs(rule: str) -> tuple[str, ...]:
-    """Return the names of the arrays that kernels are given by `cutoffs_of_pairs`."""
-    return () if not rule else TABLE if rule == RULES[-1] else ("radii", "query_radii")
 
 
 def plan_numbers(variant: Variant, shapes: Shapes) -> dict[str, int]:
@@ -134,4 +141,5 @@ def huge_pages(variant: Variant, shapes: Shapes) -> list[HugePages]:
 def size_numbers(shapes: Shapes, own: bool) -> dict[str, int]:
     """Return n, m, own and the cells of the table, as all kernels of cells take them."""
     n, m = shapes["positions"][0], shapes["queries"][0]
-    return {"n": n, "m": m, "own": int(own), "table": table_cells(n)}
+    kinds = shapes[TABLE[0]][0] if TABLE[0] in shapes else 0
+    return {"n": n, "m": m, "own": int(own), "table": table_cells(n), "kinds": kinds}

@@ -14,17 +14,25 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._engine.arrays import levels_of
 from jfrnn._engine.boxes_warp import box_neighbors
 from jfrnn._engine.launch import Call, Shapes, kernel, open_native
 from jfrnn._engine.levels_warp import level_neighbors
-from jfrnn._engine.operands import MOST_IN_BOX, excluded_rows, pack_particles, periodic_kind
+from jfrnn._engine.operands import MOST_IN_BOX, cutoffs_of_particles, excluded_rows, pack_particles, periodic_kind
 from jfrnn._engine.plans import HugePages, Launch, Plan, share
 from jfrnn._engine.problem import Engine, Filter, Kind, Options, Room, Rows, Search, largest_radius
 from jfrnn._engine.start import check_warp
-from jfrnn._engine.variants import Variant, absent, describe_call, huge_pages, plan_numbers, row_dims, split_rows
+from jfrnn._engine.variants import (
+    Variant,
+    absent,
+    describe_call,
+    huge_pages,
+    names_of_particles,
+    plan_numbers,
+    row_dims,
+    split_rows,
+)
 from jfrnn._geometry import Cutoffs
-from jfrnn.kernels import Kernel, _driver, cells_cpu, cells_cuda, few_cuda
+from jfrnn.kernels import Kernel, _driver, cells_cpu, cells_cuda, few_cuda, tree_cpu
 
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
 _CELLS = {"cpu": cells_cpu, "cuda": cells_cuda}
@@ -53,7 +61,9 @@ class WarpEngine:
         if search.per_system:
             return box_neighbors(search._replace(checks={}), options.filter, capacity)
         if isinstance(search.cutoff, Cutoffs):
-            return level_neighbors(search, levels_of(search), options.filter, capacity)
+            tree = functools.partial(call_kernels, tree_cpu.scratch_words, _tree_callable, keep=options.filter, capacity=capacity)
+            levels = functools.partial(level_neighbors, keep=options.filter, capacity=capacity)
+            return lax.platform_dependent(search._replace(checks={}), cpu=tree, cuda=levels)
 
         def on(module: ModuleType, make: Callable[[Variant], Any]) -> Callable[[Search], Rows]:
             blocks = few_cuda.blocks(search.sizes[1]) if module is few_cuda else None
@@ -149,15 +159,17 @@ def call_kernels(
     (n, m), dim = search.sizes, sources.shape[1]
     double = sources.dtype == jnp.float64
     periodic = periodic_kind(torus)
-    kind = (periodic, batch is not None, search.excluding, flat)
-    variant = Variant(dim, double, cutoff.scaled, lists, own, cutoff.closed, keep, *kind)
+    of_particles = cutoffs_of_particles(cutoff) if isinstance(cutoff, Cutoffs) else {}
+    rule, scaled = (cutoff.rule, True) if isinstance(cutoff, Cutoffs) else ("", cutoff.scaled)
+    kind = (periodic, batch is not None, search.excluding, flat, rule)
+    variant = Variant(dim, double, scaled, lists, own, cutoff.closed, keep, *kind)
     if periodic in (1, 3) and n >= MOST_IN_BOX:
         raise ValueError(
             f"backend='warp' numbers at most {MOST_IN_BOX - 1} positions in a periodic box, got {n}: pass backend='jax'."
         )
     words = scratch_words(n, m, dim, 2 if double else 1, own)
     dims = {**row_dims(m, capacity), "count": m, "info": 2 if blocks is None else (blocks, 2), "scratch": max(words, 1)}
-    given = [*pack_particles(search), *excluded_rows(search)]
+    given = [*pack_particles(search), *excluded_rows(search), *of_particles.values()]
     if isinstance(capacity, Room):
         given.append(capacity.starts)
     *written, count, info, scratch = make(variant)(*given, output_dims=dims)
@@ -171,6 +183,11 @@ def call_kernels(
 @kernel
 def _cpu_callable(variant: Variant) -> Call:
     return describe_call("cells_cpu", variant, functools.partial(_plan_on_cpu, variant))
+
+
+@kernel
+def _tree_callable(variant: Variant) -> Call:
+    return describe_call("tree_cpu", variant, functools.partial(_plan_tree, variant), cutoffs=names_of_particles)
 
 
 @kernel
@@ -223,6 +240,18 @@ def _plan_on_cpu(variant: Variant, shapes: Shapes, _: int) -> Plan:
     numbers = plan_numbers(variant, shapes)
     steps = [
         *sort_on_cpu(cells_cpu.sort_kernels(*kind, **space), numbers["n"]),
+        *huge_pages(variant, shapes),
+        share(query, numbers["m"], QUERIES_PER_THREAD),
+    ]
+    return Plan(steps, numbers, absent(variant.lists, variant.flat))
+
+
+def _plan_tree(variant: Variant, shapes: Shapes, _: int) -> Plan:
+    kind, space = (variant.dim, variant.double, variant.rule), {"periodic": variant.periodic, "batched": variant.batched}
+    query = tree_cpu.query_kernel(*kind, variant.lists, **space, excluding=variant.excluding, flat=variant.flat)
+    numbers = plan_numbers(variant, shapes)
+    steps = [
+        Launch(tree_cpu.sort_kernel(*kind, **space)),
         *huge_pages(variant, shapes),
         share(query, numbers["m"], QUERIES_PER_THREAD),
     ]

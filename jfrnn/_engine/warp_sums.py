@@ -7,18 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._engine.arrays import levels_of
 from jfrnn._engine.boxes_warp import box_sums
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.levels_warp import level_sums
-from jfrnn._engine.operands import excluded_rows, pack_particles, periodic_kind
+from jfrnn._engine.operands import cutoffs_of_particles, excluded_rows, pack_particles, periodic_kind
 from jfrnn._engine.plans import Launch, Plan, share
 from jfrnn._engine.problem import Filter, Search
 from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText
-from jfrnn._engine.variants import SumVariant, size_numbers
+from jfrnn._engine.variants import SumVariant, names_of_particles, size_numbers
 from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, place_launches, sort_on_cpu
 from jfrnn._geometry import Cutoffs
-from jfrnn.kernels import cells_cpu, cells_cuda, few_cuda, pair_sum_cpu, pair_sum_cuda
+from jfrnn.kernels import cells_cpu, cells_cuda, few_cuda, pair_sum_cpu, pair_sum_cuda, tree_cpu
 from jfrnn.kernels._native import EXCLUDED
 
 _GIVEN = ("positions", "queries", "cutoff", "shared_values", "own_values", "others")  # what a call is given
@@ -44,16 +43,19 @@ def pair_sums(
     term = term._replace(first=0) if extremes else term
     if search.per_system:
         return box_sums(search, keep, term, key, values, compensated, extremes)
-    if isinstance(search.cutoff, Cutoffs):
-        return level_sums(search, levels_of(search), keep, term._replace(first=0), key, values, compensated, extremes)
+    rule = search.cutoff.rule if isinstance(search.cutoff, Cutoffs) else ""
+    term = term._replace(first=0) if rule else term
 
     def on(cuda: bool) -> Callable[[Search, tuple[Array, Array, Array]], FoundSums]:
         def call(search: Search, values: tuple[Array, Array, Array]) -> FoundSums:
+            if cuda and rule:
+                return level_sums(search, keep, term, key, values, compensated, extremes)
             sources, queries, cutoff, batch, torus = search[:5]
             flags = (queries is None, cutoff.closed, keep.drop_self, periodic_kind(torus), batch is not None)
-            kind = (compensated, extremes, key, cuda, cuda and are_few(search), search.excluding)
+            kind = (compensated, extremes, key, cuda, cuda and are_few(search), search.excluding, rule)
             variant = SumVariant(sources.shape[1], sources.dtype == jnp.float64, cutoff.scaled, *flags, *kind)
-            return _call_sums(variant, term, pack_particles(search), values, excluded_rows(search))
+            more = [*excluded_rows(search), *(cutoffs_of_particles(cutoff).values() if isinstance(cutoff, Cutoffs) else ())]
+            return _call_sums(variant, term, pack_particles(search), values, more)
 
         return call
 
@@ -65,35 +67,35 @@ def _call_sums(
     term: TermText,
     particles: tuple[Array, Array, Array],
     values: tuple[Array, Array, Array],
-    excluded: list[Array],
+    more: list[Array],
 ) -> FoundSums:
-    """Let XLA call the kernels."""
+    """Let XLA call the kernels; `more` are rows of exclusions, and cutoffs that differ."""
     n, m = len(particles[0]), len(particles[1])
     if variant.few:
         results = SumsOf(term, m, few_cuda.slots(m), variant.compensated, variant.extremes)
-        return results.unpack(*_few_callable(variant, term)(*particles, *values, *excluded, output_dims=results.dims()))
+        return results.unpack(*_few_callable(variant, term)(*particles, *values, *more, output_dims=results.dims()))
     engine = pair_sum_cuda if variant.cuda else pair_sum_cpu
     results = SumsOf(term, m, engine.slots(m), variant.compensated, variant.extremes)
     dims = results.dims()
     dims |= {_SORTED[variant.cuda]: max(engine.sorted_numbers(term, n, variant.dim, variant.double), 1)}
-    cells = cells_cuda if variant.cuda else cells_cpu
+    cells = cells_cuda if variant.cuda else tree_cpu if variant.rule else cells_cpu
     of_search = {"info": 2, "scratch": cells.scratch_words(n, m, variant.dim, 2 if variant.double else 1, variant.own)}
     if variant.cuda:  # particles are sorted by a call of its own, which XLA makes once for a sum and its derivative
         values = (*values, *_sorting_callable(_sorting(variant))(*particles, output_dims=of_search))
     else:
         dims |= of_search
-    return results.unpack(*_sum_callable(variant, term)(*particles, *values, *excluded, output_dims=dims)[: len(_RESULTS)])
+    return results.unpack(*_sum_callable(variant, term)(*particles, *values, *more, output_dims=dims)[: len(_RESULTS)])
 
 
 @kernel
 def _sum_callable(variant: SumVariant, term: TermText) -> Call:
     scalar, words = np.float64 if variant.double else np.float32, {"info": np.int32, "scratch": np.int32}
     results, of_search = dict.fromkeys((*_RESULTS, _SORTED[variant.cuda]), scalar), tuple(words)
-    excluded = EXCLUDED * bool(variant.excluding)
+    more = (*EXCLUDED * bool(variant.excluding), *names_of_particles(variant.rule))
     name = variant.name(f"pair_sum_{'cuda' if variant.cuda else 'cpu'}")
     if variant.cuda:  # particles are sorted
-        return Call(name, (*_GIVEN, *of_search, *excluded), results, functools.partial(_plan_on_cuda, variant, term))
-    return Call(name, (*_GIVEN, *excluded), results | words, functools.partial(_plan_on_cpu, variant, term))
+        return Call(name, (*_GIVEN, *of_search, *more), results, functools.partial(_plan_on_cuda, variant, term))
+    return Call(name, (*_GIVEN, *more), results | words, functools.partial(_plan_on_cpu, variant, term))
 
 
 @kernel
@@ -144,12 +146,16 @@ def _numbers(variant: SumVariant, term: TermText, shapes: Shapes) -> dict[str, i
 
 def _plan_on_cpu(variant: SumVariant, term: TermText, shapes: Shapes, multiprocessors: int) -> Plan:
     dim, double, scaled = variant[:3]
-    sort = cells_cpu.sort_kernels(dim, double, scaled, **_space(variant))
-    more = _space(variant) | {"extremes": variant.extremes, "excluding": variant.excluding}
+    space = _space(variant)
+    more = space | {"extremes": variant.extremes, "excluding": variant.excluding, "rule": variant.rule}
     query = pair_sum_cpu.query_kernel(term, variant.key, dim, double, scaled, variant.compensated, **more)
     numbers = _numbers(variant, term, shapes)
     values = [share(pair_sum_cpu.sort_kernel(dim, double), numbers["n"])] if term.source_columns else []
-    return Plan([*sort_on_cpu(sort, numbers["n"]), *values, share(query, numbers["m"], QUERIES_PER_THREAD)], numbers)
+    if variant.rule:
+        sort = [Launch(tree_cpu.sort_kernel(dim, double, variant.rule, **space))]
+    else:
+        sort = sort_on_cpu(cells_cpu.sort_kernels(dim, double, scaled, **space), numbers["n"])
+    return Plan([*sort, *values, share(query, numbers["m"], QUERIES_PER_THREAD)], numbers)
 
 
 def _plan_on_cuda(variant: SumVariant, term: TermText, shapes: Shapes, multiprocessors: int) -> Plan:

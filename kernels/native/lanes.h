@@ -12,24 +12,27 @@ struct Below {
 struct BelowOrAt {
     enum { value = 18 };
 };
-// One bit per lane: is it below a bound, or at it?
+// One bit per lane: is it below its bound, or at it?
 template <class Comparison>
-static unsigned int mask_of(vec a, real bound, Comparison) {
+static unsigned int mask_of(vec a, vec bounds, Comparison) {
 #if defined(__AVX512F__) && defined(__AVX512VL__)
     typedef float floats __attribute__((vector_size(64)));
     typedef double doubles __attribute__((vector_size(64)));
-    const vec bounds = vec{} + bound;
     if constexpr (DOUBLE)
         return (unsigned char)__builtin_ia32_cmppd512_mask((doubles)a, (doubles)bounds, Comparison::value, -1, 4);
     else
         return (unsigned short)__builtin_ia32_cmpps512_mask((floats)a, (floats)bounds, Comparison::value, -1, 4);
 #else
-    const auto lanes = Comparison::value == 18 ? a <= bound : a < bound;
+    const auto lanes = Comparison::value == 18 ? a <= bounds : a < bounds;
     const flags f = __builtin_convertvector(lanes, flags);
     unsigned char bits;
     __builtin_memcpy(&bits, &f, 1);
     return LANES == 4 ? bits & 15 : bits;
 #endif
+}
+template <class Comparison>
+static unsigned int mask_of(vec a, real bound, Comparison c) {
+    return mask_of(a, vec{} + bound, c);
 }
 // One bit per lane of flags.
 static unsigned int bits_of_flags(flags f) {

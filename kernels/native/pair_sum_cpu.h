@@ -1,20 +1,22 @@
 // Sums over pairs on the CPU: terms are evaluated where their pairs are found, 8 or 16 at a time.
 #pragma once
-#include "walk_cpu.h"
+#include "query_walk_cpu.h"
 #include "reduction_cpu.h"
 
 struct SumArguments {
     const real *positions, *queries, *cutoff, *shared_values, *own_values, *columns;
     const int *excluded_starts, *excluded;
+    const real *query_radii, *table_of_kinds;
+    const int* kinds_of_queries;
     real *sums, *totals, *errors, *more;
     int* scratch;
-    int n, m, own, table, closed, drop_self;
+    int n, m, own, table, closed, drop_self, kinds;
 };
 
 // What the term reads of the sources stands in `columns`, in the order of cells; columns of the candidates lie beside their
 // coordinates. In a periodic box turns stand behind what is read of i and j, packed as in jfrnn/_geometry/box.py: with the image of a
 // candidate they make the lattice shift of the pair, a step along each axis.
-struct Sums : Walk<Sums> {
+struct Sums : QueryWalk<Sums> {
     static constexpr bool FLUSHED = !SCALED;  // where cutoffs are so small that they are scaled, so may be what decides
     alignas(64) real column[OTHERS + STEPS + 1][CANDIDATES + LANES];
     alignas(64) real near_points[PACKED ? 3 : 1][PACKED ? CANDIDATES + LANES : 1];
@@ -24,8 +26,8 @@ struct Sums : Walk<Sums> {
     Results results;
 
     explicit Sums(const SumArguments& a)
-        : Walk({a.positions, a.queries, a.cutoff, a.excluded_starts, a.excluded, a.scratch, a.n, a.m, a.own, a.table, a.closed,
-              a.drop_self}),
+        : QueryWalk<Sums>({a.positions, a.queries, a.cutoff, a.excluded_starts, a.excluded, a.query_radii, a.table_of_kinds,
+              a.kinds_of_queries, a.scratch, a.n, a.m, a.own, a.table, a.closed, a.drop_self, a.kinds}),
           own_values(a.own_values),
           columns(a.columns),
           term(a.shared_values),
@@ -75,18 +77,19 @@ struct Sums : Walk<Sums> {
     }
     // Evaluates the term for vectors of candidates as they are, under a mask; those in doubt follow.
     void meet_in_place(const real* q, int id, const Term::Own& own_part, Reduction& reduction) {
-        const real inside = this->inside, outside = this->outside;
+        const Band of_query{inside, outside};
         const int filled = this->filled;
         const Excluded mine(excluded_starts, excluded, id);
         unsigned int any_unsure = 0;
         for (int b = 0, v = 0; b < filled; b += LANES, ++v) {
             const Points points = candidates_at(b);
             const vec square = square_of(q, points.p);
+            const auto band = band_at(b, of_query);
             unsigned int allowed = others_mask(b);
             if constexpr (EXCLUDING)
-                allowed = wanted(mine, b, allowed & mask_of(square, outside, BelowOrAt{}));
-            const unsigned int hit = mask_of(square, inside, Below{}) & allowed;
-            unsure[v] = hit ^ (mask_of(square, outside, BelowOrAt{}) & allowed);
+                allowed = wanted(mine, b, allowed & (mask_of(square, band.outside, BelowOrAt{}) | sure_mask(b)));
+            const unsigned int hit = (mask_of(square, band.inside, Below{}) | sure_mask(b)) & allowed;
+            unsure[v] = ~hit & mask_of(square, band.outside, BelowOrAt{}) & allowed;
             any_unsure |= unsure[v];
             if (SKIPPED && hit == 0)
                 continue;
@@ -111,21 +114,22 @@ struct Sums : Walk<Sums> {
     }
     // Packs what is near first, so that the term is evaluated for hardly more than the pairs.
     void meet_packed(const real* q, int id, const Term::Own& own_part, Reduction& reduction) {
-        const real inside = this->inside, outside = this->outside;
+        const Band of_query{inside, outside};
         const int filled = this->filled;
         const ints numbers = first_numbers();
         const Excluded mine(excluded_starts, excluded, id);
         int held = 0;
         for (int b = 0; b < filled; b += LANES) {
             const Points points = candidates_at(b);
-            unsigned int near = mask_of(square_of(q, points.p), outside, BelowOrAt{}) & others_mask(b);
+            unsigned int near = mask_of(square_of(q, points.p), band_at(b, of_query).outside, BelowOrAt{}) | sure_mask(b);
+            near &= others_mask(b);
             if constexpr (EXCLUDING)
                 near = wanted(mine, b, near);
             for (int k = 0; k < DIM; ++k)
                 pack(points.p[k], near_points[k] + held, near);
             for (int c = 0; c < OTHERS + STEPS; ++c)
                 pack(*(const number*)(column[c] + b), near_column[c] + held, near);
-            if constexpr (PERIODIC || SUMS == 2)
+            if constexpr (PERIODIC || DIFFER || SUMS == 2)
                 pack(numbers + b, doubtful + held, near);
             held += __builtin_popcount(near);
         }
@@ -134,7 +138,8 @@ struct Sums : Walk<Sums> {
             for (int k = 0; k < DIM; ++k)
                 points.p[k] = *(const vec*)(near_points[k] + b);
             const unsigned int there = lanes_before(held - b);
-            unsigned int hit = mask_of(square_of(q, points.p), inside, Below{}) & there;
+            unsigned int hit = mask_of(square_of(q, points.p), band_of(doubtful + b, of_query).inside, Below{}) & there;
+            hit |= sure_among(doubtful + b, there);
             if (const unsigned int open = there & ~hit)
                 hit |= decided_between(q, id, points, doubtful + b, open);
             number summand[SUMMANDS];

@@ -1,18 +1,20 @@
 // Rows of neighbors, or their counts, on the CPU.
 #pragma once
+#include "query_walk_cpu.h"
 #include "row_places.h"
-#include "walk_cpu.h"
 
 typedef int eight_ints __attribute__((vector_size(32)));
 
 struct RowArguments {
     const real *positions, *queries, *cutoff;
     const int *excluded_starts, *excluded, *starts;
+    const real *query_radii, *table_of_kinds;
+    const int* kinds_of_queries;
     int *idx, *receivers, *count, *info, *scratch;
-    int n, m, own, table, capacity, closed, drop_self, later_only;
+    int n, m, own, table, capacity, closed, drop_self, later_only, kinds;
 };
 
-struct Rows : Walk<Rows> {
+struct Rows : QueryWalk<Rows> {
     static constexpr bool FLUSHED = false;
     const int* starts;
     int *idx, *receivers, *counts, *info;
@@ -22,8 +24,8 @@ struct Rows : Walk<Rows> {
     bool past_caches;  // rows are so many that they will not be read from the caches
 
     explicit Rows(const RowArguments& a)
-        : Walk({a.positions, a.queries, a.cutoff, a.excluded_starts, a.excluded, a.scratch, a.n, a.m, a.own, a.table, a.closed,
-              a.drop_self}),
+        : QueryWalk<Rows>({a.positions, a.queries, a.cutoff, a.excluded_starts, a.excluded, a.query_radii, a.table_of_kinds,
+              a.kinds_of_queries, a.scratch, a.n, a.m, a.own, a.table, a.closed, a.drop_self, a.kinds}),
           starts(a.starts),
           idx(a.idx),
           receivers(a.receivers),

@@ -1,45 +1,67 @@
 // Candidates of the queries of a cell, copied side by side into the first-level cache, and which of them are pairs of a query.
 #pragma once
-#include "cells_cpu.h"
 #include "excluded.h"
+#include "pair_cutoffs.h"
+#include "places_cpu.h"
 #include "wide.h"
 
 struct SearchArguments {
     const real *positions, *queries, *cutoff;
     const int *excluded_starts, *excluded;
+    const real *query_radii, *table_of_kinds;
+    const int* kinds_of_queries;
     int* scratch;
-    int n, m, own, table, closed, drop_self;
+    int n, m, own, table, closed, drop_self, kinds;
 };
 struct Points {
     vec p[3];
 };
 
-struct Scan : SearchArguments, Cells, Scratch {
+// Squares of distances below `inside` are surely those of pairs, squares beyond `outside` surely not.
+struct Band {
+    real inside, outside;
+};
+constexpr bool VARY = DIFFER && RULE != GATHER;  // the cutoffs of the pairs of a query
+
+struct Scan : SearchArguments, Cells, SourcePlaces {
     const Wide wide;
-    real inside, outside;       // squares of distances below are surely those of pairs, squares beyond surely not
+    real inside, outside;       // the band of the pairs of a query, unless these VARY
+    const real slack;           // by which scaled distances of images may be wrong
     int image;                  // that candidates are copied from, its code
     bool several;               // images among them: each says which one it is of
     int self_from, self_lanes;  // of the candidate that the query itself is: the first number of its vector (-1: none), and its bit
+    int self_id, home;          // where cutoffs DIFFER: the id of the query among the sources (-1: none), and the code of its image
+    real own_radius;            // of the query
+    const real* of_kinds;       // the cutoffs of its species
     alignas(64) real candidate[3][CANDIDATES + LANES];
     alignas(64) int candidate_ids[CANDIDATES + LANES];
-    alignas(64) int row[CANDIDATES + LANES];                                  // ids of pairs
-    alignas(64) unsigned short unsure[CANDIDATES / LANES + LANES];            // one bit per candidate that step 1 leaves open
-    alignas(64) int doubtful[CANDIDATES + LANES];                             // their numbers
-    alignas(64) int vectors_in_doubt[CANDIDATES / LANES + LANES];             // numbers of the vectors that have any
-    alignas(64) int candidate_images[PERIODIC ? CANDIDATES + LANES : 1];      // their codes
+    alignas(64) int row[CANDIDATES + LANES];                              // ids of pairs
+    alignas(64) unsigned short unsure[CANDIDATES / LANES + LANES];        // one bit per candidate that step 1 leaves open
+    alignas(64) int doubtful[CANDIDATES + LANES];                         // their numbers
+    alignas(64) int vectors_in_doubt[CANDIDATES / LANES + LANES];         // numbers of the vectors that have any
+    alignas(64) int candidate_images[PERIODIC ? CANDIDATES + LANES : 1];  // their codes
+    alignas(64) real candidate_radius[VARY && RULE != TABLE ? CANDIDATES + LANES : 1];
+    alignas(64) int candidate_kind[RULE == TABLE ? CANDIDATES + LANES : 1];
     alignas(64) int candidate_order[PERIODIC == 2 ? CANDIDATES + LANES : 1];  // by source, then by image: behind, at home, ahead
 
     explicit Scan(const SearchArguments& given)
         : SearchArguments(given),
           Cells(given.cutoff, given.n <= FEW),
-          Scratch(given.scratch, given.n, given.m, given.own, given.table),
+          SourcePlaces(given.scratch, given.n, given.m, given.own, given.table),
           wide(radius, given.closed),
+          slack(PERIODIC ? 2 * lattice.slack() * step_scale : real(0)),
           image(0),
           several(false),
           self_from(-1),
-          self_lanes(0) {
-        const real off = PERIODIC ? 2 * lattice.slack() * step_scale : real(0);  // by which distances of images may be wrong
-        const real inner = step_radius > off ? step_radius - off : real(0), outer = step_radius + off;
+          self_lanes(0),
+          self_id(-1),
+          home(0),
+          own_radius(0),
+          of_kinds(nullptr) {
+        for (int k = 0; PERIODIC && k < DIM; ++k)
+            home = home * (2 * lattice.images(k) + 1) + lattice.images(k);
+        memset(candidate_kind, 0, sizeof candidate_kind);  // those behind the last one are looked up, too
+        const real inner = step_radius > slack ? step_radius - slack : real(0), outer = step_radius + slack;
         // 7 roundings of eps/2, 5 in a square and 2 in a bound (jfrnn/_geometry/exact.py). Of images, that of `inner` counts twice:
         // 4.5 eps. Their band is wider than it need be, since `off` is more than what images may be wrong by, too: no more than 1.74
         // times the slack, the length of three errors, which would have to be the worst along each axis. Who is in a wider band is
@@ -50,16 +72,89 @@ struct Scan : SearchArguments, Cells, Scratch {
         outside = between > 0 ? between : outer * outer * (1 + band);
     }
 
+    // Begins with a query of an id, given the largest cutoffs of its own.
+    void begin_with(int id, bool among_sources) {
+        if constexpr (!DIFFER)
+            return;
+        self_id = among_sources ? id : -1;
+        own_radius = RULE == SCATTER ? real(0) : query_radii[id];
+        of_kinds = RULE == TABLE ? table_of_kinds + (long long)kinds * kinds_of_queries[id] : nullptr;
+        if constexpr (RULE == GATHER) {
+            const auto bounds = PairCutoffs::bounds_of(own_radius * step_scale, slack);
+            inside = bounds.inside;
+            outside = bounds.outside;
+        }
+    }
+    // The cutoffs of the query and the candidates in the vector that begins with the number b, or of those with such numbers.
+    vec radii_at(int b) const {
+        vec r;
+        if constexpr (RULE == TABLE)
+            for (int l = 0; l < LANES; ++l)
+                r[l] = of_kinds[candidate_kind[b + l]];
+        else
+            r = PairCutoffs::of_pair(vec{} + own_radius, *(const vec*)(candidate_radius + b));
+        return r;
+    }
+    real radius_of(int number) const {
+        if constexpr (RULE == TABLE)
+            return of_kinds[candidate_kind[number]];
+        return VARY ? PairCutoffs::of_pair(own_radius, candidate_radius[number]) : DIFFER ? own_radius : radius;
+    }
+    vec radii_of(const int* numbers) const {
+        vec r;
+        for (int l = 0; l < LANES; ++l)
+            r[l] = radius_of(numbers[l]);
+        return r;
+    }
+    // The bands of candidates: that of the query, which stays in registers, or one of each.
+    auto band_at(int b, const Band& of_query) const {
+        if constexpr (VARY)
+            return PairCutoffs::bounds_of(vec(radii_at(b) * step_scale), slack);
+        else
+            return of_query;
+    }
+    auto band_of(const int* numbers, const Band& of_query) const {
+        if constexpr (VARY)
+            return PairCutoffs::bounds_of(vec(radii_of(numbers) * step_scale), slack);
+        else
+            return of_query;
+    }
+
+    // Where cutoffs DIFFER: the query itself, at home, among the candidates from the number b on.
+    unsigned int itself_mask(int b) const {
+        const ints ids = *(const ints*)(candidate_ids + b);
+        unsigned int found = bits_of_flags(__builtin_convertvector(ids == (NAMED ? self_id + n * home : self_id), flags));
+        if constexpr (PERIODIC && !NAMED)
+            found &= bits_of_flags(__builtin_convertvector(*(const ints*)(candidate_images + b) == home, flags));
+        return self_id < 0 ? 0 : found;
+    }
+    bool is_itself(int number) const {
+        const bool there = candidate_ids[number] == (NAMED ? self_id + n * home : self_id);
+        return self_id >= 0 && there && (!PERIODIC || NAMED || candidate_images[number] == home);
+    }
     // Candidates but for the query itself, in the vector that begins with the number b.
-    unsigned int others_mask(int b) const { return b == self_from ? ~self_lanes : ~0u; }
+    unsigned int others_mask(int b) const {
+        if constexpr (DIFFER)
+            return drop_self ? ~itself_mask(b) : ~0u;
+        return b == self_from ? ~self_lanes : ~0u;
+    }
+    // Candidates that are pairs whatever their cutoffs, and which of those with such numbers are.
+    unsigned int sure_mask(int b) const { return DIFFER && !drop_self ? itself_mask(b) : 0; }
+    unsigned int sure_among(const int* numbers, unsigned int there) const {
+        for (unsigned int rest = DIFFER && !drop_self ? there : 0; rest; rest &= rest - 1)
+            if (is_itself(numbers[__builtin_ctz(rest)]))
+                return rest & -rest;
+        return 0;
+    }
     // Candidates whose id is above the query's, or its own id where a particle is its own neighbor.
     unsigned int later_mask(int b, int own_id) const {
         const ints ids = *(const ints*)((PERIODIC == 2 ? candidate_order : candidate_ids) + b);
         const int first = PERIODIC == 2 ? 3 * own_id + 1 + drop_self : own_id + drop_self;
         return bits_of_flags(__builtin_convertvector(ids >= first, flags));
     }
+    static constexpr bool NAMED = PERIODIC == 2 && !SUMS;  // ids name images, too
     // The source that a candidate is, or an image of.
-    int source_at(int number) const { return PERIODIC == 2 && !SUMS ? candidate_ids[number] % n : candidate_ids[number]; }
+    int source_at(int number) const { return NAMED ? candidate_ids[number] % n : candidate_ids[number]; }
     // Those of the candidates from number b on, of which some are `near`, that a query does not exclude.
     unsigned int wanted(const Excluded& excluded, int b, unsigned int near) const {
         for (unsigned int rest = excluded.begin < excluded.end ? near : 0; rest; rest &= rest - 1) {
@@ -100,22 +195,25 @@ struct Scan : SearchArguments, Cells, Scratch {
         return square;
     }
 
+    // Two numbers whose sum is the cutoff of the query and a candidate; a mean is not rounded.
+    real first_of(int number) const { return SUM ? own_radius / 2 : radius_of(number); }
+    real more_of(int number) const { return SUM ? candidate_radius[SUM ? number : 0] / 2 : real(0); }
     // Is a candidate a pair, given where it is and its number?
     bool exactly_decided(const real* q, int own_id, const real* p, int number) const {
         if constexpr (PERIODIC) {
             const real* there = positions + (long long)ROW * source_at(number);
             const int code = several ? candidate_images[number] : image;
-            return exact_image(lattice, queries + (long long)ROW * own_id, there, code, radius, 0, closed);
+            return exact_image(lattice, queries + (long long)ROW * own_id, there, code, first_of(number), more_of(number), closed);
         }
-        return exact_pair(q, p, radius, 0, closed);
+        return exact_pair(q, p, first_of(number), more_of(number), closed);
     }
     // Which of the points in lanes are surely pairs, also while denormals are flushed; others stay `open` or are none.
     unsigned int sure(const real* q, const Points& points, unsigned int& open) const {
-        return SCALED || PERIODIC > 0 ? 0 : wide.sure(q, points.p, open);
+        return SCALED || DIFFER || PERIODIC > 0 ? 0 : wide.sure(q, points.p, open);
     }
     // Which of the points in lanes, of which some are `open`, are pairs; `numbers` are theirs among the candidates.
     unsigned int decided(const real* q, int own_id, const Points& points, const int* numbers, unsigned int open) const {
-        unsigned int pairs = PERIODIC ? 0 : wide.decided(q, points.p, open);
+        unsigned int pairs = PERIODIC || DIFFER ? 0 : wide.decided(q, points.p, open);
         for (; open; open &= open - 1) {
             const int lane = __builtin_ctz(open);
             real p[3];
@@ -154,17 +252,18 @@ struct Scan : SearchArguments, Cells, Scratch {
     // product and a comparison per axis or candidate, LANES at a time.
     template <bool ONLY_LATER, bool BOUNDED>
     int scan(const real* q, int own_id, int count, int* to, int room) {
-        const real inside = this->inside, outside = this->outside;  // stays in registers, whatever is stored
+        const Band of_query{inside, outside};  // stays in registers, whatever is stored
         const Excluded mine(excluded_starts, excluded, own_id);
         unsigned int any_unsure = 0;
         int hits = 0;
         for (int b = 0, v = 0; b < count; b += LANES, ++v) {
             const vec square = square_of(q, candidates_at(b).p);
+            const auto band = band_at(b, of_query);
             unsigned int allowed = others_mask(b) & (ONLY_LATER ? later_mask(b, own_id) : ~0u);
             if constexpr (EXCLUDING)
-                allowed = wanted(mine, b, allowed & mask_of(square, outside, BelowOrAt{}));
-            const unsigned int hit = mask_of(square, inside, Below{}) & allowed;
-            unsure[v] = hit ^ (mask_of(square, outside, BelowOrAt{}) & allowed);
+                allowed = wanted(mine, b, allowed & (mask_of(square, band.outside, BelowOrAt{}) | sure_mask(b)));
+            const unsigned int hit = (mask_of(square, band.inside, Below{}) | sure_mask(b)) & allowed;
+            unsure[v] = ~hit & mask_of(square, band.outside, BelowOrAt{}) & allowed;
             any_unsure |= unsure[v];
             if constexpr (LIST && BOUNDED)
                 pack_within(*(const ints*)(candidate_ids + b), to + hits, hit, room - hits);

@@ -8,6 +8,11 @@
 //   copied(from, near)       packs more of those of the sources from the place `from` on that are `near`, of the image `shift`
 //   none(id)                 a query that is not finite has no candidates
 //   chunk_done(chunk), finish() come after the last query of a chunk, and of this thread
+// How queries come to their candidates is said by a struct between both (`query_walk_cpu.h`), by these members:
+//   serve_chunk(place, end)  the queries at these places meet their candidates
+//   farthest(from)           the squares beyond which sources from a place on are too far away for all queries that meet candidates
+//   strangers()              whether these may belong to other systems
+//   placed(from, to, near)   comes after sources at places [from, to) were packed
 #pragma once
 #include "scan_cpu.h"
 
@@ -17,8 +22,6 @@ struct Box {
 
 template <class Query>
 struct Walk : Scan {
-    static constexpr int ROWS = 64;  // of cells around a cell
-    const Grid grid;
     const int finite_places;
     int filled;                    // candidates
     int begin, end;                // places of the queries of the cell that is served
@@ -30,11 +33,11 @@ struct Walk : Scan {
     real moved[3];                 // by which its sources are moved
 
     explicit Walk(const SearchArguments& given)
-        : Scan(given), grid(shared.grid), finite_places(shared.finite_queries), shift{0, 0, 0}, moved{0, 0, 0} {}
+        : Scan(given), finite_places(shared.finite_queries), shift{0, 0, 0}, moved{0, 0, 0} {}
     Query& query() { return *(Query*)this; }
 
     void position_of(int place, real* q) const {
-        if (own)
+        if (!DIFFER && own)  // the places are those of the sources
             for (int k = 0; k < DIM; ++k)
                 q[k] = axis[k][place];
         else
@@ -47,12 +50,15 @@ struct Walk : Scan {
         for (int e = 0; e < LANES; ++e)
             for (int k = 0; k < DIM; ++k)
                 candidate[k][filled + e] = __builtin_nanf("");
+        for (int e = 0; DIFFER && e < LANES; ++e)
+            candidate_ids[filled + e] = -1;  // nobody: not the query itself either
         if constexpr (Query::FLUSHED)
             floats.flush();
         for (int place = begin; place < end; ++place) {
             real q[3];
             position_of(place, q);
-            const int self = drop_self && place >= own_from && place < own_to ? own_at + place - own_from : -1;
+            this->begin_with(query_ids[place], own);
+            const int self = !DIFFER && drop_self && place >= own_from && place < own_to ? own_at + place - own_from : -1;
             self_from = self < 0 ? -1 : self & -LANES;  // to change it among the candidates would delay all loads of them
             self_lanes = 1 << (self & (LANES - 1));
             query().meet(q, query_ids[place], fresh, finished);
@@ -80,22 +86,22 @@ struct Walk : Scan {
                 beside[k] = points.p[k] - (least < box.high[k] ? least : vec{} + box.high[k]);
             }
             unsigned int near = lanes_before(to - from);
-            near &= mask_of(square_of(origin, beside), outside, BelowOrAt{});
+            near &= mask_of(square_of(origin, beside), query().farthest(from), BelowOrAt{});
             const ints numbers = lanes_from(ids + from);
-            for (int l = 0; BATCHED && !grid.dense && l < LANES && from + l < to; ++l)
+            for (int l = 0; BATCHED && query().strangers() && l < LANES && from + l < to; ++l)
                 if (system_of(positions + (long long)ROW * numbers[l]) != system)
                     near &= ~(1u << l);
             for (int k = 0; k < DIM; ++k)
                 pack(points.p[k], candidate[k] + filled, near);
             pack_names(numbers, near);
             query().copied(from, near);
-            find_queries_among(from, from + LANES < to ? from + LANES : to, near);
+            query().placed(from, from + LANES < to ? from + LANES : to, near);
             filled += __builtin_popcount(near);
         }
     }
     // Packs what tells the candidates apart: their sources, and which images they are.
     void pack_names(ints numbers, unsigned int near) {
-        if constexpr (SUMS != 1 || PERIODIC || EXCLUDING)
+        if constexpr (SUMS != 1 || PERIODIC || EXCLUDING || DIFFER)
             pack(numbers + (PERIODIC == 2 && !SUMS ? n * image : 0), candidate_ids + filled, near);
         if constexpr (PERIODIC) {
             const ints codes = ints{} + image;
@@ -104,193 +110,13 @@ struct Walk : Scan {
         if constexpr (PERIODIC == 2)
             pack(3 * numbers + (1 + side), candidate_order + filled, near);
     }
-    // Notes which queries stand among the sources at places [from, to), all of which are near.
-    void find_queries_among(int from, int to, unsigned int near) {
-        const int low_place = from > begin ? from : begin, high_place = to < end ? to : end;
-        if (!own || (PERIODIC && side != 0) || low_place >= high_place)
-            return;
-        if (own_from == own_to) {
-            own_from = low_place;
-            own_at = filled + __builtin_popcount(near & ((1u << (low_place - from)) - 1));
-        }
-        own_to = high_place;
-    }
-
-    // Copies all rows of cells from `first` to `last`, of one image. Rows of a hashed table may share entries: these are copied once.
-    void copy_rows(const Box& box, const whole* first, const whole* last) {
-        const Grid grid = this->grid;  // stays in registers, whatever is stored; and so do those below
-        const int* const start = this->start;
-        const unsigned int system = this->system;
-        const int length = (int)(last[0] - first[0] + 1);
-        int seen[ROWS], rows = 0;
-        for (whole z = first[2]; z <= last[2] && length > 0; ++z)
-            for (whole y = first[1]; y <= last[1]; ++y) {
-                if (grid.dense) {
-                    const int row = row_start(grid, y, z, system);
-                    copy(box, start[row + first[0]], start[row + last[0] + 1]);
-                    continue;
-                }
-                const int begins = ring(row_start(grid, y, z, system) + ring(first[0], grid.cells), grid.cells);
-                int front = 0, back = 0;  // entries shared with rows that were copied before
-                for (int r = 0; r < rows; ++r) {
-                    const int behind = ring(begins - seen[r], grid.cells), ahead = grid.cells - behind;
-                    if (behind < length)
-                        front = length - behind > front ? length - behind : front;
-                    else if (ahead < length)
-                        back = length - ahead > back ? length - ahead : back;
-                }
-                seen[rows++] = begins;
-                const int size = length - front - back, from = ring(begins + front, grid.cells);
-                if (size <= 0)
-                    continue;
-                if (from + size <= grid.cells)
-                    copy(box, start[from], start[from + size]);
-                else {
-                    copy(box, start[from], start[grid.cells]);
-                    copy(box, start[0], start[from + size - grid.cells]);
-                }
-            }
-    }
-    // Copies the cells from `first` to `last` of a periodic box, image by image.
-    void copy_images(const Box& box, const whole* first, const whole* last) {
-        several = false;
-        for (int k = 0; k < DIM; ++k)
-            several = several || (is_periodic(k) && (first[k] < 0 || last[k] >= (whole)inverse_edge[k]));
-        int from[3] = {0, 0, 0}, to[3] = {0, 0, 0};
-        for (int k = 0; several && k < DIM; ++k)
-            if (is_periodic(k)) {
-                const int most = lattice.images(k);  // rounded up, a query may reach an image that nobody can
-                from[k] = period_of(k, first[k]) < -most ? -most : period_of(k, first[k]);
-                to[k] = period_of(k, last[k]) > most ? most : period_of(k, last[k]);
-            }
-        for (int x = from[0]; x <= to[0]; ++x)
-            for (int y = from[1]; y <= to[1]; ++y)
-                for (int z = from[2]; z <= to[2]; ++z) {
-                    const int lead = x ? x : y ? y : z;
-                    side = (lead > 0) - (lead < 0);
-                    shift[0] = x;
-                    shift[1] = y;
-                    shift[2] = z;
-                    copy_image(box, first, last);
-                }
-    }
-    void copy_image(const Box& box, const whole* first, const whole* last) {
-        whole begins[3] = {0, 0, 0}, ends[3] = {0, 0, 0};
-        image = 0;
-        for (int k = 0; k < DIM; ++k) {
-            const whole cells = (whole)inverse_edge[k], skipped = is_periodic(k) ? shift[k] * cells : 0;
-            begins[k] = first[k] - skipped;
-            ends[k] = last[k] - skipped;
-            if (is_periodic(k)) {
-                begins[k] = begins[k] < 0 ? 0 : begins[k];
-                ends[k] = ends[k] < cells ? ends[k] : cells - 1;
-            }
-            moved[k] = lattice.translation(shift[0], shift[1], shift[2], k);
-            image = image * (2 * lattice.images(k) + 1) + shift[k] + lattice.images(k);
-        }
-        copy_rows(box, begins, ends);
-    }
-
-    // Serves all queries of one cell: places [begin, end), whose coordinates along the axes are between low and high.
-    void serve(int from, int to, const real* low, const real* high) {
-        begin = from;
-        end = to;
-        whole first[3] = {0, 0, 0}, last[3] = {0, 0, 0};
-        for (int k = 0; k < DIM; ++k) {
-            if (is_periodic(k)) {
-                first[k] = (whole)cell_of(k, low[k] - reach_along(k));
-                last[k] = (whole)cell_of(k, high[k] + reach_along(k));
-                continue;
-            }
-            first[k] = axis_cell(grid, k, low[k] - reach_along(k));
-            last[k] = axis_cell(grid, k, high[k] + reach_along(k));
-            if (grid.dense) {
-                first[k] = first[k] < 0 ? 0 : first[k];
-                last[k] = last[k] >= grid.extent[k] ? grid.extent[k] - 1 : last[k];
-            }
-        }
-        Box box;  // of the queries: a variable of its own, which stays in registers
-        position_of(begin, box.low);
-        position_of(begin, box.high);
-        for (int place = begin + 1; place < end; ++place) {
-            real q[3];
-            position_of(place, q);
-            widen(box.low, box.high, q, q);
-        }
-        system = system_at(begin);
-        filled = own_from = own_to = own_at = side = 0;
-        fresh = true;
-        if constexpr (PERIODIC)
-            copy_images(box, first, last);
-        else
-            copy_rows(box, first, last);
-        flush(true);
-    }
-
-    // Where the query at a place is along the axes, and its cell.
-    void locate(int place, real* at, whole* cell) const {
-        real q[3];
-        position_of(place, q);
-        for (int k = 0; k < DIM; ++k) {
-            at[k] = coordinate(k, q);
-            cell[k] = axis_cell(grid, k, at[k]);
-        }
-        cell[DIM] = (whole)system_at(place);
-    }
-    static bool same_row(const whole* a, const whole* b) {
-        bool same = true;
-        for (int k = 1; k < DIM + BATCHED; ++k)
-            same = same && a[k] == b[k];
-        return same;
-    }
-    static bool same_cell(const whole* a, const whole* b) { return a[0] == b[0] && same_row(a, b); }
-    // Serves the cells that begin among the places [place, chunk_end): a cell belongs to the chunk that holds its first place, but
-    // where there is one cell alone, of which each chunk serves its own part. Cells of a row are served together until they hold
-    // `TOGETHER` queries, since to copy candidates takes longer than to meet some that are farther away.
-    void serve_chunk(int place, int chunk_end) {
-        whole cell[4], other[4];
-        real at[3];
-        if (!one_cell && place > 0 && place < finite_places) {
-            locate(place - 1, at, cell);
-            for (; place < finite_places; ++place) {
-                locate(place, at, other);
-                if (!same_cell(cell, other))
-                    break;
-            }
-        }
-        if (place < finite_places)
-            locate(place, at, other);
-        while (place < chunk_end) {
-            if (place >= finite_places) {
-                query().none(query_ids[place++]);
-                continue;
-            }
-            real low[3], high[3];  // `other` and `at` are those of the first place
-            for (int k = 0; k < DIM; ++k)
-                low[k] = high[k] = at[k];
-            for (int k = 0; k < DIM + BATCHED; ++k)
-                cell[k] = other[k];
-            int stop = place + 1;
-            for (const int end = one_cell && chunk_end < finite_places ? chunk_end : finite_places; stop < end; ++stop) {
-                locate(stop, at, other);
-                if (!same_cell(cell, other)) {
-                    if (!grid.dense || stop - place >= TOGETHER || stop >= chunk_end || !same_row(cell, other))
-                        break;
-                    cell[0] = other[0];
-                }
-                widen(low, high, at, at);
-            }
-            serve(place, stop, low, high);
-            place = stop;
-        }
-    }
     void run() {
         for (;;) {
             const int chunk = __atomic_fetch_add(&shared.next_chunk, 1, __ATOMIC_RELAXED);
             if ((long long)chunk * QUERY_CHUNK >= m)
                 break;
             const int place = chunk * QUERY_CHUNK;
-            serve_chunk(place, m - place < QUERY_CHUNK ? m : place + QUERY_CHUNK);
+            query().serve_chunk(place, m - place < QUERY_CHUNK ? m : place + QUERY_CHUNK);
             query().chunk_done(chunk);
         }
         query().finish();

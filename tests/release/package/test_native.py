@@ -21,8 +21,8 @@ WHOLE = sorted(path.name for path in NATIVE.iterdir())
 
 
 def is_cpu_only(header):
-    """Tell headers with Clang's vectors, or with calls of the CPU alone; where cutoffs differ, one text has both."""
-    if header in ("levels.h", "level_rows.h", "level_sums.h", "winding.h"):
+    """Tell headers with Clang's vectors, or with calls of the CPU alone; windings have one text for both."""
+    if header == "winding.h":
         return False
     text = resolve(header, given={"numbers.h": "", "xla_ffi.h": "", "warp_hashgrid.h": ""})
     if header in ("c_library.h", "hashgrid_build.h", *LAUNCHING):

@@ -1,4 +1,4 @@
-// Search with a cutoff per particle: queries one by one, on the CPU in chunks on every core, on CUDA one per thread.
+// Search with a cutoff per particle on CUDA: queries one by one, one per thread. (On the CPU, `tree_walk_cpu.h` does this.)
 //
 // `header` holds the cells of the table along each axis (4), whether there is a table, and how many groups are in use. `cutoff`
 // holds the largest cutoff and the lattice, then the largest of each group, and along each axis: the width of a top cell, how many
@@ -10,7 +10,6 @@
 //   begin_query(one)       a query begins: returns its state
 //   pair(state, one, other, place, image)  the source `other` at `place` is a pair, in an image
 //   end_query(state, one)  comes after its last pair
-//   chunk_done(chunk)      on the CPU, comes after the last query of a chunk
 #pragma once
 #include "excluded.h"
 #include "lane_count.h"
@@ -59,49 +58,6 @@ struct Pairing<false> {
     JFRNN_INLINE real cutoff_in(const real*, int) const { return 0; }
 };
 
-// LANES numbers side by side, and the bits of what is true of them.
-#if defined(__CUDACC__)
-typedef real lanes;
-struct Side {
-    JFRNN_FUNCTION lanes load(const real* from) { return *from; }
-    JFRNN_FUNCTION unsigned int bits(bool is_so) { return is_so; }
-    JFRNN_FUNCTION int lowest(unsigned int) { return 0; }
-    JFRNN_FUNCTION void put(lanes& x, int, real value) { x = value; }
-};
-#else
-typedef real lanes __attribute__((vector_size(LANES * sizeof(real))));
-struct Side {
-    static lanes load(const real* from) {
-        lanes x;
-        __builtin_memcpy(&x, from, sizeof(x));
-        return x;
-    }
-    template <class Truth>
-    static unsigned int bits(Truth is_so) {
-        typedef bool flags __attribute__((ext_vector_type(LANES)));
-        const flags f = __builtin_convertvector(is_so, flags);
-        unsigned short b;
-        __builtin_memcpy(&b, &f, 2);
-        return b;
-    }
-    static int lowest(unsigned int bits) { return __builtin_ctz(bits); }
-    static void put(lanes& x, int lane, real value) { x[lane] = value; }
-};
-#endif
-
-// Runs of candidates of one group, around a cell: sorted, those that touch joined. Queries that follow each other often share them,
-// so a thread of the CPU keeps them for each group, where there are no images.
-struct Runs {
-    int level;
-    long long cell[4];  // of the query, at that level, and its system
-    int count, begin[27], end[27];
-};
-#if defined(__CUDACC__)
-constexpr int KEPT = 1;
-#else
-constexpr int KEPT = GROUPS;
-#endif
-
 // A query: its place, its number, where it is, its cutoff, and the image that it meets, in lattice vectors.
 struct One {
     int at, id;
@@ -119,7 +75,6 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
     real unit, slack;             // slack: by which distances of images may be wrong
     int codes, home, fill_value;  // of images
     int longest;
-    Runs kept[KEPT];
 
     template <class Arguments>
     JFRNN_INLINE Levels(const LevelArguments& given, const Arguments& all)
@@ -142,8 +97,6 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
             codes *= 2 * lattice.images(k) + 1;
         home = (codes - 1) / 2;
         fill_value = PERIODIC == 2 ? n * codes : n;
-        for (Runs& runs : kept)
-            runs.level = -1;
     }
     JFRNN_INLINE Query& query() { return *(Query*)this; }
 
@@ -251,58 +204,20 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
                         use(from, to, image);
                 }
     }
-    // Finds the runs of a group around the cell of a query, if they are not those that are kept.
-    JFRNN_INLINE void find_runs(Runs& runs, int g, int at, int level) const {
-        const int shift = HALVINGS - level;
-        bool same = LANES > 1 && runs.level == level;
-        for (int k = 0; k < TOP; ++k) {
-            const long long first = query_top[(long long)k * m + at];
-            const long long cell = k == DIM ? first : (first << level) + (places[(long long)k * m + at] >> shift);
-            same = same && runs.cell[k] == cell;
-            runs.cell[k] = cell;
-        }
-        if (same)
-            return;
-        runs.level = level;
-        runs.count = 0;
-        each_run(g, at, level, [&](int from, int to, int) {
-            int place = runs.count++;
-            for (; place > 0 && runs.begin[place - 1] > from; --place) {
-                runs.begin[place] = runs.begin[place - 1];
-                runs.end[place] = runs.end[place - 1];
-            }
-            runs.begin[place] = from;
-            runs.end[place] = to;
-        });
-        int joined = 0;
-        for (int r = 1; r < runs.count; ++r)
-            if (runs.begin[r] == runs.end[joined])
-                runs.end[joined] = runs.end[r];
-            else {
-                ++joined;
-                runs.begin[joined] = runs.begin[r];
-                runs.end[joined] = runs.end[r];
-            }
-        runs.count = runs.count ? joined + 1 : 0;
-    }
-
-    // Which of LANES sources from `first` on are not surely too far from a query, a bit each, and which of those are surely pairs.
-    JFRNN_INLINE unsigned int test(const real* q, real own, const real* of_kinds, int first, unsigned int& sure) const {
-        const real unit = this->unit, slack = PERIODIC ? this->slack : real(0);
-        lanes square = lanes{};
+    // Is a source not surely too far from a query, and is it surely a pair?
+    JFRNN_INLINE bool test(const real* q, real own, const real* of_kinds, int at, bool& sure) const {
+        real square = 0, r = own;
         for (int k = 0; k < DIM; ++k) {
-            const lanes d = (Side::load(axes + k * stride + first) - q[k]) * unit;
+            const real d = (axes[k * stride + at] - q[k]) * unit;
             square += d * d;
         }
-        lanes r = lanes{} + own;
-        if constexpr (RULE == TABLE) {
-            for (int e = 0; e < LANES; ++e)
-                Side::put(r, e, this->cutoff_in(of_kinds, first + e));
-        } else if constexpr (RULE != GATHER)
-            r = PairCutoffs::of_pair(r, Side::load(radii + first));
-        const auto bounds = PairCutoffs::bounds_of(lanes(r * unit), slack);
-        sure = Side::bits(square < bounds.inside);
-        return Side::bits(square <= bounds.outside);
+        if constexpr (RULE == TABLE)
+            r = this->cutoff_in(of_kinds, at);
+        else if constexpr (RULE != GATHER)
+            r = PairCutoffs::of_pair(own, radii[at]);
+        const auto bounds = PairCutoffs::bounds_of(r * unit, PERIODIC ? slack : real(0));
+        sure = square < bounds.inside;
+        return square <= bounds.outside;
     }
 
     // Lets a query meet the sources of a run, of an image, from where it meets them at home.
@@ -310,29 +225,24 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
     JFRNN_INLINE void meet(
         State& state, const One& one, const Excluded& mine, int from, int to, int image, const real* from_where) {
         const real* const of_kinds = this->row_of(one.at);
-        for (int first = from; first < to; first += LANES) {
-            unsigned int sure, near = test(from_where, one.own, of_kinds, first, sure);
-            if (to - first < LANES)
-                near &= (1u << (to - first)) - 1;
-            if (!drop_self && own_queries && image == home && one.at >= first && one.at < first + LANES && one.at < to)
-                near |= 1u << (one.at - first);  // a particle is its own neighbor, whatever its cutoff
-            for (; near; near &= near - 1) {
-                const int e = LANES > 1 ? Side::lowest(near) : 0, c = first + e, other = ids[c];
-                const bool itself = own_queries && c == one.at && image == home;
-                const bool earlier = other < one.id || (PERIODIC == 2 && other == one.id && image < home);
-                if ((drop_self && itself) || (later_only && earlier))
-                    continue;
-                bool pair = itself || (sure >> e & 1);
-                if (!pair) {
-                    real p[3];
-                    for (int k = 0; k < DIM; ++k)
-                        p[k] = axes[k * stride + c];
-                    pair = exactly(one, of_kinds, other, p, image, c);
-                }
-                if (!pair || (EXCLUDING && mine.has(Excluded::id_of(other, image, n))))
-                    continue;
-                query().pair(state, one, other, c, image);
+        for (int c = from; c < to; ++c) {
+            const bool itself = own_queries && c == one.at && image == home;  // its own neighbor, whatever its cutoff
+            bool sure;
+            if (!test(from_where, one.own, of_kinds, c, sure) && !itself)
+                continue;
+            const int other = ids[c];
+            const bool earlier = other < one.id || (PERIODIC == 2 && other == one.id && image < home);
+            if ((drop_self && itself) || (later_only && earlier))
+                continue;
+            bool pair = itself || sure;
+            if (!pair) {
+                real p[3];
+                for (int k = 0; k < DIM; ++k)
+                    p[k] = axes[k * stride + c];
+                pair = exactly(one, of_kinds, other, p, image, c);
             }
+            if (pair && !(EXCLUDING && mine.has(Excluded::id_of(other, image, n))))
+                query().pair(state, one, other, c, image);
         }
     }
 
@@ -368,16 +278,12 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
                 });
                 continue;
             }
-            Runs& runs = kept[LANES > 1 ? g : 0];
-            find_runs(runs, g, at, level);
-            for (int r = 0; r < runs.count; ++r)
-                meet(state, one, mine, runs.begin[r], runs.end[r], home, one.q);
+            each_run(g, at, level, [&](int from, int to, int) { meet(state, one, mine, from, to, home, one.q); });
         }
         query().end_query(state, one);
         return state;
     }
 
-#if defined(__CUDACC__)
     JFRNN_INLINE void run() {
         const long long at = thread_index();
         if (at >= m)
@@ -386,19 +292,4 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
         if (longest > 0)
             atomicMax(&info[0], longest);
     }
-#else
-    void run() {
-        for (;;) {
-            const long long chunk = __atomic_fetch_add(&info[1], 1, __ATOMIC_RELAXED), begin = chunk * CHUNK;
-            if (begin >= m)
-                break;
-            for (long long at = begin; at < begin + CHUNK && at < m; ++at)
-                serve((int)at);
-            query().chunk_done((int)chunk);
-        }
-        int known = __atomic_load_n(&info[0], __ATOMIC_RELAXED);
-        while (
-            known < longest && !__atomic_compare_exchange_n(&info[0], &known, longest, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
-    }
-#endif
 };

@@ -1,6 +1,6 @@
 // Rows of neighbors, or their counts, where cutoffs differ from particle to particle.
 #pragma once
-#include "levels.h"
+#include "levels.cuh"
 #include "row_places.h"
 
 struct LevelRowArguments {
@@ -48,5 +48,4 @@ struct LevelRows : Levels<LevelRows> {
         counts[one.id] = state.found;
         longest = state.found > longest ? state.found : longest;
     }
-    JFRNN_INLINE void chunk_done(int) {}
 };

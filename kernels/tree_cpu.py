@@ -1,0 +1,72 @@
+"""Search on the CPU where cutoffs differ: sources sorted along a curve, a tree of boxes around them, queries in groups.
+
+`build` sorts sources and queries and makes the tree (`native/tree_cpu.h`). Then threads hand themselves chunks of queries: those
+that follow each other, and whose cutoffs are alike, find the leaves that are near all of them (`native/tree_walk_cpu.h`), and meet
+their sources as those of a cell are met (`native/walk_cpu.h`). So time follows pairs and particles, whatever the spread of cutoffs
+is, and whatever the density.
+"""
+
+import functools
+import itertools
+
+from jfrnn.kernels import cells_cpu
+from jfrnn.kernels._native import RULES, SPACES, program
+from jfrnn.kernels._program import Kernel, declare
+
+LEAF = 8  # sources of a leaf
+FANOUT = 16  # nodes of a node
+CLASS_BITS = 1  # of cutoffs that are alike, behind the leading one
+TOGETHER = 8  # queries of a group at least, where so many have the same class and chunk
+MOST_TOGETHER = 32
+_MOST_LANES = 16
+
+
+def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -> int:
+    """Return the int32 words of scratch that `build` and queries need; `width` is 1 for float32 and 2 for float64."""
+    del own  # queries have an order of their own, by their cutoffs
+    nodes, count = 0, -(-sources // LEAF)
+    for _ in itertools.repeat(None, 12):
+        nodes += -(-count // FANOUT) * FANOUT
+        if count <= FANOUT:
+            break
+        count = -(-count // FANOUT)
+    most = max(sources, queries)
+    parts = [64, *[width * sources] * dim, sources, 2, most, queries, 2]  # those of cells, without a table
+    parts += [width * (sources + _MOST_LANES), sources + _MOST_LANES, *[width * (nodes + _MOST_LANES)] * (2 * dim + 1), most, most]
+    return sum((words + 15) // 16 * 16 for words in parts)
+
+
+PROVIDER = {"places_cpu.h": '#include "tree_cpu.h"\n', "query_walk_cpu.h": '#include "tree_walk_cpu.h"\n'}  # in place of cells
+
+
+def constants_of(rule: str) -> dict[str, int]:
+    """Return the constants of programs that walk a tree."""
+    constants: dict[str, int] = {"RULE": RULES.index(rule), "SUM": rule == "mean", "SCALED": True, "LEAF": LEAF, "FANOUT": FANOUT}
+    return constants | {"CLASS_BITS": CLASS_BITS, "TOGETHER": TOGETHER, "MOST_TOGETHER": MOST_TOGETHER}
+
+
+def _constants(rule: str, periodic: int, batched: bool) -> dict[str, int]:
+    found = {**cells_cpu.GRID, "PERIODIC": periodic, "BATCHED": batched, "SUMS": 0, "LIST": 0, "MANY": 0, **constants_of(rule)}
+    return found | {"CHUNK": cells_cpu.CHUNK, "QUERY_CHUNK": cells_cpu.QUERY_CHUNK}
+
+
+def _variant(dim: int, double: bool, rule: str, periodic: int, batched: bool) -> str:
+    return f"{dim}d_{'f64' if double else 'f32'}_{rule}{SPACES[periodic]}{'_batched' * batched}"
+
+
+@functools.lru_cache(128)
+def sort_kernel(dim: int, double: bool, rule: str, periodic: int = 0, batched: bool = False) -> Kernel:
+    """Return `build`, for a rule of `RULES`."""
+    text = program(double, dim, "tree_cpu.h", **_constants(rule, periodic, batched))
+    return declare(f"sort_tree_cpu_{_variant(dim, double, rule, periodic, batched)}", text, "TreeSort.build")[0]
+
+
+@functools.lru_cache(512)
+def query_kernel(
+    dim: int, double: bool, rule: str, lists: bool, periodic: int = 0, batched: bool = False, excluding: int = 0, flat: bool = False
+) -> Kernel:
+    """Return what lists or counts, whose work threads share; options are those of `jfrnn.kernels._native.program`."""
+    constants = {**_constants(rule, periodic, batched), "LIST": lists, "FLAT": flat, "EXCLUDING": excluding}
+    constants["CANDIDATES"] = 1024 if double else 1536  # as many as among cells
+    variant = f"{_variant(dim, double, rule, periodic, batched)}{'_list' * lists}{'_flat' * flat}{'_excluding' * excluding}"
+    return declare(f"tree_cpu_{variant}", program(double, dim, "rows_cpu.h", given=PROVIDER, **constants), "Rows.run")[0]
