@@ -20,7 +20,7 @@ SORTING = tuning.ACCELERATOR.sorting._replace(searched=300)
 ELSEWHERE = tuning.ACCELERATOR._replace(words=1 << 12, few_pairs=1000, plain_pairs=1000, sorting=SORTING)
 AT_ONCE = ELSEWHERE._replace(words=1 << 20, few_pairs=1 << 20, plain_pairs=1 << 20)  # all rows and their doubtful pairs
 LOOPS = ELSEWHERE._replace(at_once=0)  # as blocks of many queries are processed
-OFTEN, TIES = ("queries_fewer",), ("ulp_far_axis", "queries_fewer")
+TIES = ("ulp_far_axis", "queries_fewer")
 SLOW = pytest.mark.slow
 
 
@@ -33,7 +33,8 @@ def elsewhere(monkeypatch):
     jax.clear_caches()
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[SLOW] * (name not in OFTEN)) for name in HARD_CASES])
+@SLOW
+@pytest.mark.parametrize("name", HARD_CASES)
 def test_numbers_of_accelerators_find_the_same_pairs(name, elsewhere):
     if name == "denormal_lattice":
         pytest.skip("its cutoff is refused")

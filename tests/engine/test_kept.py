@@ -233,7 +233,7 @@ def test_sums_and_derivatives(name, compensated, twice):
     ("name", "twice"),
     [
         ("skewed images", True),
-        ("half mean", False),
+        pytest.param("half mean", False, marks=SLOW),
         *(pytest.param(name, True, marks=SLOW) for name in LISTS if name != "skewed images"),
     ],
 )

@@ -112,7 +112,13 @@ DIFFERENT = [
 RARE = ("periodic_y", "periodic_xy", "skewed_slab_first")
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x in RARE)) for x in PERIODIC_CASES])
+OPTIMIZED = ("ties_across", "cutoff_1.5_boxes")  # nearest images, and several: kernels as users run them
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=[pytest.mark.slow] * (x in RARE) + [pytest.mark.kernels] * (x in OPTIMIZED)) for x in PERIODIC_CASES],
+)
 def test_case(name):
     assert_case(name, np.float32, 3, "warp", images=IMAGES.get(name))
 

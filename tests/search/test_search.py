@@ -46,7 +46,8 @@ def each_option():
 @pytest.mark.parametrize(("options", "backend", "dtype", "dim"), list(each_option()))
 def test_options(options, backend, dtype, dim):
     points = np.concatenate([random_points(150, dim, dtype), random_points(20, dim, dtype)])  # 20 coincident pairs
-    cutoff = 0.12 if dim == 2 else 0.25
+    points[50:100] = np.round(8 * points[50:100]) / 8  # and pairs at exactly the cutoff
+    cutoff = 0.125 if dim == 2 else 0.25
     nbrs = jfrnn.search(points, cutoff, backend=backend, capacity=40, **options)
     checked.assert_exact(nbrs, points, cutoff, **options)
     assert (nbrs.half, nbrs.include_self, nbrs.closed) == tuple(options.get(k, False) for k in ("half", "include_self", "closed"))

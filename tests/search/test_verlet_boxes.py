@@ -217,7 +217,7 @@ def by_grow(chunk, state, nbrs):
 @pytest.mark.parametrize(
     ("lengths", "cutoff", "skin", "ratio", "run"),
     [
-        ([25.75, 25.75, 25.75], 12.0, 0.5, 0.96, by_run_chunk),
+        pytest.param([25.75, 25.75, 25.75], 12.0, 0.5, 0.96, by_run_chunk, marks=pytest.mark.slow),
         ([25.75, 25.75, 25.75], 12.0, 0.5, 0.96, by_grow),
         pytest.param([10.0, 9.0, 11.0], 2.5, 0.0, 0.1, by_the_loop_of_the_readme, marks=pytest.mark.slow),
     ],

@@ -234,7 +234,7 @@ def test_cutoffs_that_differ_compile_and_plans_have_the_arguments_of_their_kerne
         found = boxes_warp._plan_sums(variant, plan.text, {name: (n, 4) for name in names}, 132)
     else:
         assert f'"jfrnn_pair_sum_levels_cuda_3d_f32_own_dropself_{rule}_' in text
-        variant = levels_warp._LevelVariant(3, False, False, True, False, keep, rule, 0, False, True, False)
+        variant = levels_warp._LevelVariant(3, False, False, True, False, keep, rule, 0, False, False)
         names = (*levels_warp._given(variant), "shared_values", "own_values", "columns", "sums", "totals", "errors", "info")
         results = SumsOf(plan.text, n, 2, False, False)
         found = levels_warp._plan_sums(variant, results, plan.key, {name: (n, 4) for name in names}, 132)

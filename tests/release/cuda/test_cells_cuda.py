@@ -59,7 +59,7 @@ def test_hashgrid_compiles(dim, double, scaled, lists):
 def test_boxes_batches_and_cutoffs_per_particle_compile():
     assert compiles(*cells_cuda.cell_kernels(3, False, False, True, periodic=2, batched=True)) == 3
     for rule, periodic in (("mean", 2), ("gather", 0)):
-        assert compiles(levels.query_kernel(3, False, True, rule, GROUPS, HALVINGS, periodic, batched=True, cuda=True)) == 1
+        assert compiles(levels.query_kernel(3, False, True, rule, GROUPS, HALVINGS, periodic, batched=True)) == 1
 
 
 @pytest.mark.parametrize(
