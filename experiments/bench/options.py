@@ -85,6 +85,11 @@ def _options(n: int, neighbors: int) -> Iterator[_Option]:
     batch = jnp.asarray(random.integers(0, systems, n), jnp.int32)
     yield _Option("batch of 100 systems, superposed", x, r * systems ** (1 / 3), {"batch": batch})
     yield _Option("a cutoff per particle, equal", x, jnp.full(n, r, jnp.float32), {})
+    within = jnp.asarray(r * random.uniform(2 / 3, 4 / 3, n), jnp.float32)
+    for rule in ("gather", "either"):
+        yield _Option(f"a cutoff per particle within a factor of 2, {rule}", x, within, {"radius_rule": rule})
+    cutoffs = jnp.asarray([[r, 0.75 * r], [0.75 * r, 0.5 * r]], jnp.float32)
+    yield _Option("a cutoff per pair of two species", x, cutoffs, {"species": jnp.asarray(random.integers(0, 2, n), jnp.int32)})
     away = random.normal(size=(n, 3))
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     distance = 10.0 ** random.uniform(-2, 0, n)

@@ -15,7 +15,7 @@ def test_every_option_gets_a_row(tmp_path):
     assert result.exit_code == 0, result.output
     table = pd.read_csv(tmp_path / "cpu_warp.csv")
     assert table["option"].is_unique
-    assert len(table) == 19
+    assert len(table) == 22
     assert (table[["list_s", "count_s", "list_ratio", "count_ratio"]] > 0).all(axis=None)
     entries = dict(zip(table["option"], table["entries"], strict=True))
     assert 2 * entries["half"] == entries["open, whole list"] == entries["a cutoff per particle, equal"]

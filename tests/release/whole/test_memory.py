@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 import warp as wp
-from places import ROOT
+from places import ROOT, TESTS
 
 import jfrnn
 import jfrnn._memory
@@ -242,9 +242,9 @@ print(memory.source, memory.peak() - memory.start)
 @pytest.mark.parametrize("gradient", [False, True])
 def test_sums_take_what_was_planned(gradient):
     """In a process of its own, as a search above."""
-    n, tests = 300_000, str(ROOT / "tests" / "release" / "whole")
+    n, tests = 300_000, [str(TESTS), str(TESTS / "release" / "whole")]
     command = [sys.executable, "-c", SUMS, str(n), str(gradient)]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), tests])}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *tests])}
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 0, done.stderr
     source, size = done.stdout.split()[-2:]
