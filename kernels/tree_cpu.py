@@ -13,11 +13,11 @@ from jfrnn.kernels import cells_cpu
 from jfrnn.kernels._native import RULES, SPACES, program
 from jfrnn.kernels._program import Kernel, declare
 
-LEAF = 8  # sources of a leaf
+LEAF = 16  # sources of a leaf
 FANOUT = 16  # nodes of a node
 CLASS_BITS = 1  # of cutoffs that are alike, behind the leading one
-TOGETHER = 8  # queries of a group at least, where so many have the same class and chunk
-MOST_TOGETHER = 32
+TOGETHER = 12  # queries of a group at least, where so many have the same class and chunk
+MOST_TOGETHER = 48
 _MOST_LANES = 16
 
 

@@ -17,6 +17,7 @@ from jfrnn.cases.periodic import PERIODIC_CASES
 DTYPES = (np.float32, np.float64)
 DIMS = (2, 3)
 BUILDS = list(product(DTYPES, DIMS))
+OFTEN = [*BUILDS[1:3], *(pytest.param(*each, marks=pytest.mark.slow) for each in BUILDS[::3])]  # either width, either dimension
 ULP_CASES = [name for name in PERIODIC_CASES if name.startswith("ulp_")]
 TIE_CASES = [name for name in PERIODIC_CASES if name.startswith("ties_")]
 EMPTY = {"alone_wide", "n_0", "n_1", "queries_none_in_reach", "queries_beside_slab", "no_queries", "no_sources"}
@@ -130,7 +131,7 @@ def test_the_example_in_the_docstring():
 # Where the points are
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 def test_open_axes_reach_beyond_the_box(dtype, dim):
     for letters in ("x", "y", "z", "xy", "xz", "yz", "none"):
         name = f"periodic_{letters}"
@@ -144,7 +145,7 @@ def test_open_axes_reach_beyond_the_box(dtype, dim):
             assert len(wrapped) > 1.05 * len(images_of(name, dtype, dim))
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 def test_points_lie_outside_as_far_as_said(dtype, dim):
     for name, low, high in (
         ("outside", -5, 6),
@@ -164,7 +165,7 @@ def test_points_lie_outside_as_far_as_said(dtype, dim):
         assert max(abs(s) for _, _, shift in images_of(name, dtype, dim) for s in shift) > 127  # beyond int8
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 def test_points_on_faces(dtype, dim):
     for name in ("faces", "faces_just_below_zero", "faces_denormal"):
         given = built(name, dtype, dim)
@@ -185,7 +186,7 @@ def test_points_on_faces(dtype, dim):
     assert len({(i, j) for i, j, _ in images(given, 1e-3)}) == 4**dim * (4**dim - 1)
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 def test_blobs_touch_through_the_boundary(dtype, dim):
     for name in ("blobs", "unequal_1e6"):
         assert len({image for image in crossing(images_of(name, dtype, dim)) if (image[0] < 60) != (image[1] < 60)}) > 100
@@ -199,7 +200,7 @@ def test_blobs_touch_through_the_boundary(dtype, dim):
     assert built("far_open_axis", dtype, dim).periodic == (False, True, True)[:dim]
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 def test_points_that_are_not_finite(dtype, dim):
     for name in ("nonfinite", "nonfinite_slab"):
         x = built(name, dtype, dim).positions
@@ -215,7 +216,7 @@ def test_points_that_are_not_finite(dtype, dim):
 # The box
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 def test_boxes_in_cutoffs(dtype, dim):
     for name, ratio, step in (
         ("1", 1, 0),
@@ -237,7 +238,7 @@ def test_boxes_in_cutoffs(dtype, dim):
     assert Fraction(given.matrix[0].item()) != 3 * Fraction(dtype(given.cutoff).item())
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 def test_several_images_of_a_pair(dtype, dim):
     for name, least_2d, least_3d in (
         ("outside_small_box", 2, 2),
@@ -276,7 +277,7 @@ def test_one_particle_among_its_images(dtype):
     assert {len(built(name, dtype, 3).positions) for name in PERIODIC_CASES if name.startswith("alone")} == {1}
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 def test_axes_differ(dtype, dim):
     for name in ("thin_slab", "thin_open"):
         given = built(name, dtype, dim)
@@ -286,7 +287,7 @@ def test_axes_differ(dtype, dim):
     assert [length < wire.cutoff for length in wire.matrix] == [True, False, True][:dim]
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 def test_cells_are_skewed_as_said(dtype, dim):
     def measured(name):
         given = built(name, dtype, dim)
@@ -344,7 +345,7 @@ def test_crystals_have_ties_through_faces(dtype, dim):
         assert all(shape in (7, 6, 5, 14, 12) for shape in np.rint(given.matrix / 0.1).tolist())
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 @pytest.mark.parametrize("name", TIE_CASES)
 def test_ties_through_faces_are_exact(name, dtype, dim):
     given = built(name, dtype, dim)
@@ -365,7 +366,7 @@ def partners(given):
     return dataclasses.replace(given, positions=given.positions[1::2], queries=given.positions[::2])
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 @pytest.mark.parametrize("name", ULP_CASES)
 def test_ulp_images_straddle_the_cutoff(name, dtype, dim):
     given = partners(built(name, dtype, dim))
@@ -399,7 +400,7 @@ def test_ulp_images_are_beyond_the_working_precision(dtype):
     assert wrong >= 100
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 @pytest.mark.parametrize("name", ["residues_across", "residues_across_100", "residues_across_balanced"])
 def test_residues_decide_through_images(name, dtype, dim):
     given = built(name, dtype, dim)
@@ -415,7 +416,7 @@ def test_residues_decide_through_images(name, dtype, dim):
     assert max(abs(s) for _, _, shift in found for s in shift) > (100 if name.endswith("100") else 1)
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 def test_pairs_half_a_box_apart(dtype, dim):
     given = built("half_box", dtype, dim)
     assert 2 * dtype(given.cutoff) == given.matrix[0]
@@ -436,7 +437,7 @@ def test_pairs_half_a_box_apart(dtype, dim):
     assert uneven > 25
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 def test_distances_of_zero_through_images(dtype, dim):
     given = built("coincident", dtype, dim)
     same = images(given, 1e-3)
@@ -457,7 +458,7 @@ def test_scales_leave_the_range(dim):
 # Queries
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 def test_queries_are_where_they_should_be(dtype, dim):
     for name, reach in (("queries", 1), ("queries_outside", 4), ("queries_outside_skewed", 4)):
         given = built(name, dtype, dim)
