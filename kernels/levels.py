@@ -32,7 +32,7 @@ def level_program(
         constants: Further ones, such as PERIODIC and BATCHED of `jfrnn.kernels._native.program`.
     """
     constants |= {"RULE": RULES.index(rule), "SUM": rule == "mean", "GROUPS": groups, "HALVINGS": halvings}
-    constants |= {"SCALED": True, "PADDING": PADDING, "ONE_BY_ONE": True}
+    constants |= {"SCALED": True, "PADDING": PADDING}
     return program(double, dim, header, given=given, **constants)
 
 

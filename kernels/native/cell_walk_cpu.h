@@ -5,12 +5,11 @@
 template <class Query>
 struct CellWalk : Walk<Query> {
     typedef Walk<Query> Base;
-    using Base::axis_cell, Base::begin, Base::cell_of, Base::coordinate, Base::copy, Base::end, Base::filled, Base::finite_places;
-    using Base::flush, Base::fresh, Base::own, Base::image, Base::inverse_edge, Base::is_periodic, Base::lattice, Base::moved,
-        Base::one_cell;
-    using Base::own_at, Base::own_from, Base::own_to, Base::period_of, Base::position_of, Base::query, Base::query_ids;
-    using Base::reach_along, Base::ring, Base::row_start, Base::several, Base::shared, Base::shift, Base::side, Base::system;
-    using Base::system_at;
+    using Base::axis_cell, Base::begin, Base::cell_of, Base::coordinate, Base::copy, Base::end, Base::filled;
+    using Base::finite_places, Base::flush, Base::fresh, Base::own, Base::image, Base::inverse_edge, Base::is_periodic;
+    using Base::lattice, Base::one_cell, Base::own_at, Base::own_from, Base::own_to, Base::period_of, Base::position_of;
+    using Base::query, Base::query_ids, Base::reach_along, Base::ring, Base::row_start, Base::several, Base::shared;
+    using Base::shift, Base::side, Base::system, Base::system_at;
     static constexpr int ROWS = 64;  // of cells around a cell
     const Grid grid;
 
@@ -76,20 +75,10 @@ struct CellWalk : Walk<Query> {
                 from[k] = period_of(k, first[k]) < -most ? -most : period_of(k, first[k]);
                 to[k] = period_of(k, last[k]) > most ? most : period_of(k, last[k]);
             }
-        for (int x = from[0]; x <= to[0]; ++x)
-            for (int y = from[1]; y <= to[1]; ++y)
-                for (int z = from[2]; z <= to[2]; ++z) {
-                    const int lead = x ? x : y ? y : z;
-                    side = (lead > 0) - (lead < 0);
-                    shift[0] = x;
-                    shift[1] = y;
-                    shift[2] = z;
-                    copy_image(box, first, last);
-                }
+        this->each_image(from, to, [&] { copy_image(box, first, last); });
     }
     void copy_image(const Box& box, const whole* first, const whole* last) {
         whole begins[3] = {0, 0, 0}, ends[3] = {0, 0, 0};
-        image = 0;
         for (int k = 0; k < DIM; ++k) {
             const whole cells = (whole)inverse_edge[k], skipped = is_periodic(k) ? shift[k] * cells : 0;
             begins[k] = first[k] - skipped;
@@ -98,8 +87,6 @@ struct CellWalk : Walk<Query> {
                 begins[k] = begins[k] < 0 ? 0 : begins[k];
                 ends[k] = ends[k] < cells ? ends[k] : cells - 1;
             }
-            moved[k] = lattice.translation(shift[0], shift[1], shift[2], k);
-            image = image * (2 * lattice.images(k) + 1) + shift[k] + lattice.images(k);
         }
         copy_rows(box, begins, ends);
     }

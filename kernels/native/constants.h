@@ -22,7 +22,6 @@ constexpr bool LIST = true;            // ids of neighbors are written, they are
 constexpr bool FLAT = false;           // rows of a list are as long as they need to be (row_places.h)
 constexpr int SUMS = 0;                // 1: summands are added up, 2: the largest ones are found
 constexpr int EXCLUDING = 0;           // 1: queries exclude sources, 2: images of sources
-constexpr bool ONE_BY_ONE = false;     // candidates are met one by one
 // Of a term that is summed: columns of numbers of j and of lattice steps, numbers of i, sums over all pairs and of each i.
 constexpr int OTHERS = 1, STEPS = 0, OWN = 0, TOTALS = 1, ROW_SUMS = 1;
 constexpr int FIRST_SUMS = 1;       // of those of each i, that stand in an array of their own

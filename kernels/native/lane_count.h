@@ -1,4 +1,4 @@
-// How many numbers stand side by side: as many as a register of the CPU holds, 16 where queries meet candidates one by one, 1 on CUDA.
+// How many numbers stand side by side: as many as a register of the CPU holds, 1 on CUDA.
 #pragma once
 #include "constants.h"
 #include "device.h"
@@ -9,8 +9,8 @@ constexpr int LANES = 1;
 #else
 #define JFRNN_SCALAR 0
 #if defined(__AVX512F__) && defined(__AVX512VL__)
-constexpr int LANES = ONE_BY_ONE || !DOUBLE ? 16 : 8;
+constexpr int LANES = DOUBLE ? 8 : 16;
 #else
-constexpr int LANES = ONE_BY_ONE ? 16 : DOUBLE ? 4 : 8;
+constexpr int LANES = DOUBLE ? 4 : 8;
 #endif
 #endif

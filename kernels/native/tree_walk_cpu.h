@@ -8,10 +8,10 @@
 template <class Query>
 struct TreeWalk : Walk<Query> {
     typedef Walk<Query> Base;
-    using Base::begin, Base::copy, Base::end, Base::filled, Base::finite_places, Base::flush, Base::fresh, Base::home, Base::image;
-    using Base::is_periodic, Base::lattice, Base::levels, Base::moved, Base::n, Base::node_high, Base::node_low, Base::node_radius;
-    using Base::nodes, Base::position_of, Base::query, Base::query_ids, Base::several, Base::shared, Base::shift, Base::side;
-    using Base::slack, Base::square_of, Base::step_scale, Base::system, Base::system_at;
+    using Base::begin, Base::copy, Base::end, Base::filled, Base::finite_places, Base::flush, Base::fresh, Base::image;
+    using Base::is_periodic, Base::lattice, Base::levels, Base::moved, Base::node_high, Base::node_low, Base::node_radius;
+    using Base::nodes, Base::position_of, Base::query, Base::query_ids, Base::several, Base::shared, Base::side, Base::slack;
+    using Base::square_of, Base::step_scale, Base::system, Base::system_at;
     real group_radius;           // the largest cutoff of the queries
     int system_from, system_to;  // places of the sources of their system
     int run_from, run_to;        // places of sources that are near and not yet copied
@@ -92,27 +92,15 @@ struct TreeWalk : Walk<Query> {
         copy_run(box);
     }
     __attribute__((noinline)) void copy_run(const Box& box) { copy(box, run_from, run_to); }
-    // Copies sources image by image; `several` once it is known that there is another one than that at home.
+    // Copies sources image by image, of all images that there are: nodes tell soon which ones are near.
     void copy_images(const Box& box) {
-        int most[3] = {0, 0, 0};
-        for (int k = 0; k < DIM; ++k)
-            most[k] = is_periodic(k) ? lattice.images(k) : 0;
+        int from[3] = {0, 0, 0}, to[3] = {0, 0, 0};
+        for (int k = 0; k < DIM; ++k) {
+            to[k] = is_periodic(k) ? lattice.images(k) : 0;
+            from[k] = -to[k];
+        }
         several = true;
-        for (int x = -most[0]; x <= most[0]; ++x)
-            for (int y = -most[1]; y <= most[1]; ++y)
-                for (int z = -most[2]; z <= most[2]; ++z) {
-                    const int lead = x ? x : y ? y : z;
-                    side = (lead > 0) - (lead < 0);
-                    shift[0] = x;
-                    shift[1] = y;
-                    shift[2] = z;
-                    image = 0;
-                    for (int k = 0; k < DIM; ++k) {
-                        moved[k] = lattice.translation(x, y, z, k);
-                        image = image * (2 * lattice.images(k) + 1) + shift[k] + lattice.images(k);
-                    }
-                    copy_sources(box);
-                }
+        this->each_image(from, to, [&] { copy_sources(box); });
     }
 
     // Finds the places of the sources of a system.

@@ -99,6 +99,25 @@ struct Walk : Scan {
             filled += __builtin_popcount(near);
         }
     }
+    // Goes from image to image, from the first to the last one along each axis, and calls `copy_it` there.
+    template <class Copy>
+    void each_image(const int* from, const int* to, Copy copy_it) {
+        for (int x = from[0]; x <= to[0]; ++x)
+            for (int y = from[1]; y <= to[1]; ++y)
+                for (int z = from[2]; z <= to[2]; ++z) {
+                    const int lead = x ? x : y ? y : z;
+                    side = (lead > 0) - (lead < 0);
+                    shift[0] = x;
+                    shift[1] = y;
+                    shift[2] = z;
+                    image = 0;
+                    for (int k = 0; k < DIM; ++k) {
+                        moved[k] = lattice.translation(x, y, z, k);
+                        image = image * (2 * lattice.images(k) + 1) + shift[k] + lattice.images(k);
+                    }
+                    copy_it();
+                }
+    }
     // Packs what tells the candidates apart: their sources, and which images they are.
     void pack_names(ints numbers, unsigned int near) {
         if constexpr (SUMS != 1 || PERIODIC || EXCLUDING || DIFFER)
