@@ -28,7 +28,6 @@ CELLS = {
 ASKED = {
     ("short", "warp", 5000, np.float64): ("count", "sums", "sums of the list"),
     ("fcc", "warp", 500, np.float32): ("edges",),
-    ("flat", "jax", 700, np.float32): ("sums",),
 }
 ALL = ("count", "sums", "sums of the list", "edges", "edges of the list")
 

@@ -78,7 +78,6 @@ KINDS = {
 
 
 EACH = [
-    (np.float32, "skewed", "own"),
     (np.float64, "slab", "queries"),
     (np.float32, "orthogonal", "half"),
     (np.float64, "long, own images", "half"),

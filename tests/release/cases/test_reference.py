@@ -13,6 +13,10 @@ from jfrnn.cases.hard import HARD_CASES
 DTYPES = (np.float32, np.float64)
 DIMS = (2, 3)
 BUILDS = list(product(DTYPES, DIMS))
+OFTEN = [*BUILDS[1:3], *(pytest.param(*each, marks=pytest.mark.slow) for each in BUILDS[::3])]  # either width, either dimension
+IN_PARTS = pytest.mark.parametrize(
+    "builds", [BUILDS[1:3], pytest.param(BUILDS[::3], marks=pytest.mark.slow)], ids=["often", "rarely"]
+)
 ULP_CASES = [name for name in HARD_CASES if name.startswith("ulp_")]
 
 
@@ -157,9 +161,10 @@ def test_equals_the_definition(points, cutoff, closed):
     assert {(i, j) for i, j in one_by_one if is_pair(x[i], x[j], cutoff, closed=closed)} == everything
 
 
+@IN_PARTS
 @pytest.mark.parametrize("name", HARD_CASES)
-def test_equals_the_definition_on_hard_cases(name):
-    for dtype, dim in BUILDS:
+def test_equals_the_definition_on_hard_cases(name, builds):
+    for dtype, dim in builds:
         hard = HARD_CASES[name].build(dtype, dim)
         sources = hard.positions[-20:]
         queries = sources if hard.queries is None else hard.queries[-20:]
@@ -543,7 +548,7 @@ def test_hard_cases_refuse_other_dtypes_and_dimensions():
             HARD_CASES["uniform"].build(dtype, dim)
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 @pytest.mark.parametrize("name", ULP_CASES)
 def test_ulp_pairs_straddle_the_cutoff(name, dtype, dim):
     hard = HARD_CASES[name].build(dtype, dim)
@@ -567,7 +572,7 @@ def test_ulp_pairs_are_beyond_the_working_precision(dtype):
     assert wrong >= 20  # of 960
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 @pytest.mark.parametrize("name", ["residues", "residues_denormal", "residues_balanced"])
 def test_residues_are_beyond_twice_the_precision(name, dtype, dim):
     hard = HARD_CASES[name].build(dtype, dim)
@@ -589,7 +594,7 @@ def test_residues_are_beyond_float64(dim):
     )
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 def test_balanced_residues_come_in_pairs_and_none(dtype, dim):
     hard = HARD_CASES["residues_balanced"].build(dtype, dim)
     for a, below, above in hard.positions.reshape(-1, 3, dim):
@@ -604,7 +609,7 @@ def naive_cells(x, cutoff):
     return np.floor((x - x0) / r), np.floor(x * inverse - x0 * inverse)
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 @pytest.mark.parametrize("name", ["split_by_cells", "split_by_cells_near"])
 def test_cells_of_the_cutoff_lose_pairs(name, dtype, dim):
     hard = HARD_CASES[name].build(dtype, dim)
@@ -615,7 +620,7 @@ def test_cells_of_the_cutoff_lose_pairs(name, dtype, dim):
         assert len(apart) >= 50 and set(apart) == {2}
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 @pytest.mark.parametrize("name", ["cell_edges", "cell_edges_far", "cell_edges_denormal"])
 def test_cell_edges_have_partners_on_both_sides(name, dtype, dim):
     hard = HARD_CASES[name].build(dtype, dim)
@@ -626,7 +631,7 @@ def test_cell_edges_have_partners_on_both_sides(name, dtype, dim):
     assert (np.abs(hard.positions - steps * hard.cutoff) <= 4 * coarse + 4 * np.finfo(dtype).eps * hard.cutoff).all()
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 def test_ties_are_exact(dtype, dim):
     def ties(name):
         hard = HARD_CASES[name].build(dtype, dim)
@@ -649,7 +654,7 @@ def test_rounded_cutoffs_change_sides():
         assert is_pair(a.astype(float), b.astype(float), hard.cutoff, closed=closed) is unrounded
 
 
-@pytest.mark.parametrize(("dtype", "dim"), BUILDS)
+@pytest.mark.parametrize(("dtype", "dim"), OFTEN)
 def test_extremes_leave_the_range(dtype, dim):
     with np.errstate(all="ignore"):
         for name in ("near_max", "clump_and_largest"):
@@ -663,11 +668,12 @@ def test_extremes_leave_the_range(dtype, dim):
             assert np.abs(far).max() / hard.cutoff > 2**31
 
 
+@IN_PARTS
 @pytest.mark.parametrize("name", HARD_CASES)
-def test_hard_case_has_the_pairs_it_is_about(name):
+def test_hard_case_has_the_pairs_it_is_about(name, builds):
     without = {"n_0", "n_1", "no_pairs", "queries_none_in_reach", "no_queries", "no_sources"}
     only_ties = {"cutoff_rounds_down", "cutoff_rounds_up"}
-    for dtype, dim in BUILDS:
+    for dtype, dim in builds:
         hard = HARD_CASES[name].build(dtype, dim)
         found = reference_pairs(hard.positions, hard.cutoff, queries=hard.queries, closed=name in only_ties)
         assert bool(found) == (name not in without)

@@ -152,7 +152,7 @@ print(memory.source, memory.peak() - memory.start, blobs.cutoff, int(found.requi
 """
 
 
-@pytest.mark.parametrize("backend", ["warp", "hashgrid"])
+@pytest.mark.parametrize("backend", ["warp", pytest.param("hashgrid", marks=pytest.mark.slow)])
 def test_two_blobs_cost_the_same_however_far_apart(backend):
     """Both take what was planned, whatever the box; the nearer ones leave some pages of it untouched.
 
