@@ -16,8 +16,9 @@ from jfrnn.kernels._program import Kernel, declare
 LEAF = 16  # sources of a leaf
 FANOUT = 16  # nodes of a node
 CLASS_BITS = 1  # of cutoffs that are alike, behind the leading one
-TOGETHER = 12  # queries of a group at least, where so many have the same class and chunk
-MOST_TOGETHER = 48
+TOGETHER = 6  # queries of a group: where fewer are in a cube as wide as their cutoff is, that is doubled along axis after axis
+MOST_TOGETHER = 32
+MOST_DOUBLED, MOST_HALVED = 6, 9  # axes
 _MOST_LANES = 16
 
 
@@ -32,7 +33,8 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -
         count = -(-count // FANOUT)
     most = max(sources, queries)
     parts = [64, *[width * sources] * dim, sources, 2, most, queries, 2]  # those of cells, without a table
-    parts += [width * (sources + _MOST_LANES), sources + _MOST_LANES, *[width * (nodes + _MOST_LANES)] * (2 * dim + 1), most, most]
+    parts += [width * (sources + _MOST_LANES), sources + _MOST_LANES, sources, width * queries]
+    parts += [*[width * (nodes + _MOST_LANES)] * (2 * dim + 1), most, most]
     return sum((words + 15) // 16 * 16 for words in parts)
 
 
@@ -42,12 +44,13 @@ PROVIDER = {"places_cpu.h": '#include "tree_cpu.h"\n', "query_walk_cpu.h": '#inc
 def constants_of(rule: str) -> dict[str, int]:
     """Return the constants of programs that walk a tree."""
     constants: dict[str, int] = {"RULE": RULES.index(rule), "SUM": rule == "mean", "SCALED": True, "LEAF": LEAF, "FANOUT": FANOUT}
-    return constants | {"CLASS_BITS": CLASS_BITS, "TOGETHER": TOGETHER, "MOST_TOGETHER": MOST_TOGETHER}
+    constants |= {"CLASS_BITS": CLASS_BITS, "TOGETHER": TOGETHER, "MOST_TOGETHER": MOST_TOGETHER}
+    return constants | {"MOST_DOUBLED": MOST_DOUBLED, "MOST_HALVED": MOST_HALVED}
 
 
 def _constants(rule: str, periodic: int, batched: bool) -> dict[str, int]:
-    found = {**cells_cpu.GRID, "PERIODIC": periodic, "BATCHED": batched, "SUMS": 0, "LIST": 0, "MANY": 0, **constants_of(rule)}
-    return found | {"CHUNK": cells_cpu.CHUNK, "QUERY_CHUNK": cells_cpu.QUERY_CHUNK}
+    found = {**cells_cpu.GRID, "PERIODIC": periodic, "BATCHED": batched, "SUMS": 0, "LIST": 0, **constants_of(rule)}
+    return found | {"CHUNK": cells_cpu.CHUNK, "QUERY_CHUNK": cells_cpu.QUERY_CHUNK, "MANY": cells_cpu.MANY}
 
 
 def _variant(dim: int, double: bool, rule: str, periodic: int, batched: bool) -> str:
@@ -55,10 +58,11 @@ def _variant(dim: int, double: bool, rule: str, periodic: int, batched: bool) ->
 
 
 @functools.lru_cache(128)
-def sort_kernel(dim: int, double: bool, rule: str, periodic: int = 0, batched: bool = False) -> Kernel:
-    """Return `build`, for a rule of `RULES`."""
+def sort_kernels(dim: int, double: bool, rule: str, periodic: int = 0, batched: bool = False) -> tuple[Kernel, Kernel]:
+    """Return `build` and `gather`, for a rule of `RULES`, as `jfrnn.kernels.cells_cpu.sort_kernels` does."""
     text = program(double, dim, "tree_cpu.h", **_constants(rule, periodic, batched))
-    return declare(f"sort_tree_cpu_{_variant(dim, double, rule, periodic, batched)}", text, "TreeSort.build")[0]
+    build, gather = declare(f"sort_tree_cpu_{_variant(dim, double, rule, periodic, batched)}", text, "TreeSort.build", "TreeGather.gather")
+    return build, gather
 
 
 @functools.lru_cache(512)

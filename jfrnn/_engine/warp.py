@@ -251,7 +251,7 @@ def _plan_tree(variant: Variant, shapes: Shapes, _: int) -> Plan:
     query = tree_cpu.query_kernel(*kind, variant.lists, **space, excluding=variant.excluding, flat=variant.flat)
     numbers = plan_numbers(variant, shapes)
     steps = [
-        Launch(tree_cpu.sort_kernel(*kind, **space)),
+        *sort_on_cpu(tree_cpu.sort_kernels(*kind, **space), numbers["n"]),
         *huge_pages(variant, shapes),
         share(query, numbers["m"], QUERIES_PER_THREAD),
     ]

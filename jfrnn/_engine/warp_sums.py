@@ -152,7 +152,7 @@ def _plan_on_cpu(variant: SumVariant, term: TermText, shapes: Shapes, multiproce
     numbers = _numbers(variant, term, shapes)
     values = [share(pair_sum_cpu.sort_kernel(dim, double), numbers["n"])] if term.source_columns else []
     if variant.rule:
-        sort = [Launch(tree_cpu.sort_kernel(dim, double, variant.rule, **space))]
+        sort = sort_on_cpu(tree_cpu.sort_kernels(dim, double, variant.rule, **space), numbers["n"])
     else:
         sort = sort_on_cpu(cells_cpu.sort_kernels(dim, double, scaled, **space), numbers["n"])
     return Plan([*sort, *values, share(query, numbers["m"], QUERIES_PER_THREAD)], numbers)

@@ -6,16 +6,19 @@ template <class Query>
 struct CellWalk : Walk<Query> {
     typedef Walk<Query> Base;
     using Base::axis_cell, Base::begin, Base::cell_of, Base::coordinate, Base::copy, Base::end, Base::filled;
+    using Base::drop_self, Base::lattice, Base::one_cell, Base::period_of, Base::position_of;
     using Base::finite_places, Base::flush, Base::fresh, Base::own, Base::image, Base::inverse_edge, Base::is_periodic;
-    using Base::lattice, Base::one_cell, Base::own_at, Base::own_from, Base::own_to, Base::period_of, Base::position_of;
     using Base::query, Base::query_ids, Base::reach_along, Base::ring, Base::row_start, Base::several, Base::shared;
     using Base::shift, Base::side, Base::system, Base::system_at;
     static constexpr int ROWS = 64;  // of cells around a cell
     const Grid grid;
+    int own_from, own_to, own_at;  // places of queries that are candidates, too, and the number of the first of them
 
-    explicit CellWalk(const SearchArguments& given) : Base(given), grid(shared.grid) {}
+    explicit CellWalk(const SearchArguments& given) : Base(given), grid(shared.grid), own_from(0), own_to(0), own_at(0) {}
     real farthest(int) const { return this->outside; }
     bool strangers() const { return !grid.dense; }
+    int number_of(int place) const { return drop_self && place >= own_from && place < own_to ? own_at + place - own_from : -1; }
+    void forget() { own_from = own_to = 0; }
     // Notes which queries stand among the sources at places [from, to), all of which are near.
     void placed(int from, int to, unsigned int near) {
         const int low_place = from > begin ? from : begin, high_place = to < end ? to : end;
@@ -118,7 +121,7 @@ struct CellWalk : Walk<Query> {
             widen(box.low, box.high, q, q);
         }
         system = system_at(begin);
-        filled = own_from = own_to = own_at = side = 0;
+        filled = own_from = own_to = side = 0;
         fresh = true;
         if constexpr (PERIODIC)
             copy_images(box, first, last);

@@ -7,6 +7,7 @@ struct Shared {
     int finite_queries;
     int next_chunk;
     int next_gathered, next_sorted;  // chunks of sources whose coordinates and values are put in order
+    int gathered;                    // sources that are
     real unit;                       // of the lattice on which all coordinates lie, or 0
 };
 

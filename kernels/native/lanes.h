@@ -85,6 +85,27 @@ static vec gathered(const real* from, const int* numbers) {
         lanes[l] = from[numbers[l]];
     return lanes;
 }
+// What a table of LANES entries holds at numbers below LANES.
+static vec looked_up(vec table, ints numbers) {
+#if defined(__AVX512F__) && defined(__AVX512VL__)
+    typedef float floats __attribute__((vector_size(64)));
+    typedef double doubles8 __attribute__((vector_size(64)));
+    typedef long long longs8 __attribute__((vector_size(64)));
+    int __attribute__((vector_size(32))) eight{};
+    int __attribute__((vector_size(64))) sixteen{};
+    __builtin_memcpy(&eight, &numbers, sizeof eight);
+    __builtin_memcpy(&sixteen, &numbers, sizeof numbers);
+    if constexpr (DOUBLE)
+        return (vec)__builtin_ia32_permvardf512((doubles8)table, __builtin_convertvector(eight, longs8));
+    else
+        return (vec)__builtin_ia32_permvarsf512((floats)table, sixteen);
+#else
+    vec lanes;
+    for (int l = 0; l < LANES; ++l)
+        lanes[l] = ((const real*)&table)[numbers[l]];
+    return lanes;
+#endif
+}
 // A vector of numbers from anywhere.
 template <class Element>
 static auto lanes_from(const Element* from) {

@@ -21,18 +21,18 @@ struct Points {
 struct Band {
     real inside, outside;
 };
-constexpr bool VARY = DIFFER && RULE != GATHER;  // the cutoffs of the pairs of a query
+constexpr bool VARY = DIFFER && RULE != GATHER;                             // the cutoffs of the pairs of a query
+constexpr bool BANDED = RULE == SCATTER || RULE == EITHER || RULE == BOTH;  // the bands of a pair are those of one of its particles
 
 struct Scan : SearchArguments, Cells, SourcePlaces {
     const Wide wide;
-    real inside, outside;       // the band of the pairs of a query, unless these VARY
-    const real slack;           // by which scaled distances of images may be wrong
-    int image;                  // that candidates are copied from, its code
-    bool several;               // images among them: each says which one it is of
-    int self_from, self_lanes;  // of the candidate that the query itself is: the first number of its vector (-1: none), and its bit
-    int self_id, home;          // where cutoffs DIFFER: the id of the query among the sources (-1: none), and the code of its image
-    real own_radius;            // of the query
-    const real* of_kinds;       // the cutoffs of its species
+    real inside, outside;             // the band of the pairs of a query, unless these VARY
+    const real slack;                 // by which scaled distances of images may be wrong
+    int image;                        // that candidates are copied from, its code
+    bool several;                     // images among them: each says which one it is of
+    int self, self_from, self_lanes;  // the number of the candidate that the query itself is (-1: none), of its vector, its bit
+    real own_radius;                  // of the query
+    const real* of_kinds;             // the cutoffs of its species
     alignas(64) real candidate[3][CANDIDATES + LANES];
     alignas(64) int candidate_ids[CANDIDATES + LANES];
     alignas(64) int row[CANDIDATES + LANES];                              // ids of pairs
@@ -41,7 +41,10 @@ struct Scan : SearchArguments, Cells, SourcePlaces {
     alignas(64) int vectors_in_doubt[CANDIDATES / LANES + LANES];         // numbers of the vectors that have any
     alignas(64) int candidate_images[PERIODIC ? CANDIDATES + LANES : 1];  // their codes
     alignas(64) real candidate_radius[VARY && RULE != TABLE ? CANDIDATES + LANES : 1];
+    alignas(64) real candidate_inside[BANDED ? CANDIDATES + LANES : 1], candidate_outside[BANDED ? CANDIDATES + LANES : 1];
     alignas(64) int candidate_kind[RULE == TABLE ? CANDIDATES + LANES : 1];
+    alignas(64) real kind_inside[RULE == TABLE ? LANES : 1][LANES], kind_outside[RULE == TABLE ? LANES : 1][LANES];
+    const vec *inside_of_kinds, *outside_of_kinds;                            // of few species: the bands of that of the query
     alignas(64) int candidate_order[PERIODIC == 2 ? CANDIDATES + LANES : 1];  // by source, then by image: behind, at home, ahead
 
     explicit Scan(const SearchArguments& given)
@@ -52,15 +55,22 @@ struct Scan : SearchArguments, Cells, SourcePlaces {
           slack(PERIODIC ? 2 * lattice.slack() * step_scale : real(0)),
           image(0),
           several(false),
+          self(-1),
           self_from(-1),
           self_lanes(0),
-          self_id(-1),
-          home(0),
           own_radius(0),
-          of_kinds(nullptr) {
-        for (int k = 0; PERIODIC && k < DIM; ++k)
-            home = home * (2 * lattice.images(k) + 1) + lattice.images(k);
+          of_kinds(nullptr),
+          inside_of_kinds(nullptr),
+          outside_of_kinds(nullptr) {
         memset(candidate_kind, 0, sizeof candidate_kind);  // those behind the last one are looked up, too
+        for (int k = 0; RULE == TABLE && k < kinds && kinds <= LANES; ++k) {
+            vec r{};
+            for (int l = 0; l < kinds; ++l)
+                r[l] = table_of_kinds[kinds * k + l];
+            const auto bounds = PairCutoffs::bounds_of(vec(r * step_scale), slack);
+            __builtin_memcpy(kind_inside[k], &bounds.inside, sizeof r);
+            __builtin_memcpy(kind_outside[k], &bounds.outside, sizeof r);
+        }
         const real inner = step_radius > slack ? step_radius - slack : real(0), outer = step_radius + slack;
         // 7 roundings of eps/2, 5 in a square and 2 in a bound (jfrnn/_geometry/exact.py). Of images, that of `inner` counts twice:
         // 4.5 eps. Their band is wider than it need be, since `off` is more than what images may be wrong by, too: no more than 1.74
@@ -72,14 +82,26 @@ struct Scan : SearchArguments, Cells, SourcePlaces {
         outside = between > 0 ? between : outer * outer * (1 + band);
     }
 
-    // Begins with a query of an id, given the largest cutoffs of its own.
-    void begin_with(int id, bool among_sources) {
+    // Finds the bands of so many candidates.
+    void find_bands(int count) {
+        for (int b = 0; BANDED && b < count; b += LANES) {
+            const auto bounds = PairCutoffs::bounds_of(vec(*(const vec*)(candidate_radius + b) * step_scale), slack);
+            *(vec*)(candidate_inside + b) = bounds.inside;
+            *(vec*)(candidate_outside + b) = bounds.outside;
+        }
+    }
+    // Begins with a query of an id.
+    void begin_with(int id) {
         if constexpr (!DIFFER)
             return;
-        self_id = among_sources ? id : -1;
         own_radius = RULE == SCATTER ? real(0) : query_radii[id];
-        of_kinds = RULE == TABLE ? table_of_kinds + (long long)kinds * kinds_of_queries[id] : nullptr;
-        if constexpr (RULE == GATHER) {
+        if constexpr (RULE == TABLE) {
+            const int kind = kinds_of_queries[id];
+            of_kinds = table_of_kinds + (long long)kinds * kind;
+            inside_of_kinds = (const vec*)kind_inside[kinds <= LANES ? kind : 0];
+            outside_of_kinds = (const vec*)kind_outside[kinds <= LANES ? kind : 0];
+        }
+        if constexpr (RULE == GATHER || RULE == EITHER || RULE == BOTH) {
             const auto bounds = PairCutoffs::bounds_of(own_radius * step_scale, slack);
             inside = bounds.inside;
             outside = bounds.outside;
@@ -106,9 +128,20 @@ struct Scan : SearchArguments, Cells, SourcePlaces {
             r[l] = radius_of(numbers[l]);
         return r;
     }
-    // The bands of candidates: that of the query, which stays in registers, or one of each.
+    // The bands of candidates: that of the query, which stays in registers, or one of each. A band is the wider, the longer a cutoff.
     auto band_at(int b, const Band& of_query) const {
-        if constexpr (VARY)
+        if constexpr (BANDED) {
+            const vec inside = *(const vec*)(candidate_inside + b), outside = *(const vec*)(candidate_outside + b);
+            if constexpr (RULE == SCATTER)
+                return PairCutoffs::Bounds<vec>{inside, outside};
+            return PairCutoffs::Bounds<vec>{
+                PairCutoffs::of_pair(vec{} + of_query.inside, inside), PairCutoffs::of_pair(vec{} + of_query.outside, outside)};
+        } else if constexpr (RULE == TABLE) {
+            if (kinds > LANES)
+                return PairCutoffs::bounds_of(vec(radii_at(b) * step_scale), slack);
+            const ints kind = *(const ints*)(candidate_kind + b);
+            return PairCutoffs::Bounds<vec>{looked_up(*inside_of_kinds, kind), looked_up(*outside_of_kinds, kind)};
+        } else if constexpr (VARY)
             return PairCutoffs::bounds_of(vec(radii_at(b) * step_scale), slack);
         else
             return of_query;
@@ -120,31 +153,15 @@ struct Scan : SearchArguments, Cells, SourcePlaces {
             return of_query;
     }
 
-    // Where cutoffs DIFFER: the query itself, at home, among the candidates from the number b on.
-    unsigned int itself_mask(int b) const {
-        const ints ids = *(const ints*)(candidate_ids + b);
-        unsigned int found = bits_of_flags(__builtin_convertvector(ids == (NAMED ? self_id + n * home : self_id), flags));
-        if constexpr (PERIODIC && !NAMED)
-            found &= bits_of_flags(__builtin_convertvector(*(const ints*)(candidate_images + b) == home, flags));
-        return self_id < 0 ? 0 : found;
-    }
-    bool is_itself(int number) const {
-        const bool there = candidate_ids[number] == (NAMED ? self_id + n * home : self_id);
-        return self_id >= 0 && there && (!PERIODIC || NAMED || candidate_images[number] == home);
-    }
     // Candidates but for the query itself, in the vector that begins with the number b.
-    unsigned int others_mask(int b) const {
-        if constexpr (DIFFER)
-            return drop_self ? ~itself_mask(b) : ~0u;
-        return b == self_from ? ~self_lanes : ~0u;
-    }
+    unsigned int others_mask(int b) const { return (!DIFFER || drop_self) && b == self_from ? ~self_lanes : ~0u; }
     // Candidates that are pairs whatever their cutoffs, and which of those with such numbers are.
-    unsigned int sure_mask(int b) const { return DIFFER && !drop_self ? itself_mask(b) : 0; }
+    unsigned int sure_mask(int b) const { return DIFFER && !drop_self && b == self_from ? self_lanes : 0; }
     unsigned int sure_among(const int* numbers, unsigned int there) const {
-        for (unsigned int rest = DIFFER && !drop_self ? there : 0; rest; rest &= rest - 1)
-            if (is_itself(numbers[__builtin_ctz(rest)]))
-                return rest & -rest;
-        return 0;
+        if constexpr (!DIFFER)
+            return 0;
+        const unsigned int found = bits_of_flags(__builtin_convertvector(lanes_from(numbers) == self, flags));
+        return drop_self ? 0 : found & there;
     }
     // Candidates whose id is above the query's, or its own id where a particle is its own neighbor.
     unsigned int later_mask(int b, int own_id) const {

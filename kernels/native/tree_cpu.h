@@ -2,20 +2,24 @@
 //
 // Sources that follow each other along a Morton curve are near each other. LEAF of them make a leaf, FANOUT leaves a node above, and
 // so on: a node is a box, and the largest cutoff in it. Where many sources share the finest cell of the curve, as those of a cluster
-// do whose domain is large, they are sorted along a curve of their own, again and again: no scene is too sparse, nor too dense.
+// do whose domain is large, they are sorted along a curve of their own, again and again: no scene is too sparse, nor too dense. Cells
+// are powers of two wide, and each curve has its cells in those of the one before: what lies in a cube of such a width stands together.
 #pragma once
 #include "cells_cpu.h"
-#include "lane_count.h"
+#include "lanes.h"
 #include "pair_cutoffs.h"
 
-constexpr int LEVELS = 12;                      // of nodes, at most
-constexpr int CURVE_BITS = DIM == 3 ? 10 : 16;  // of a coordinate along the curve
+constexpr int LEVELS = 12;                     // of nodes, at most
+constexpr int CURVE_BITS = DIM == 3 ? 7 : 11;  // of a coordinate along a curve
 constexpr int DIGIT = 11, DIGITS = 1 << DIGIT;
+constexpr int KEY_DIGITS = 2;
 
 // The scratch of a search: `jfrnn.kernels.tree_cpu.scratch_words` is the sum of its parts.
 struct TreeScratch : Scratch {
     real* radii_there;  // cutoffs of sources, in their order
     int* kinds_there;   // and species
+    int* place_of;      // where a source stands
+    real* reach_there;  // of queries, in their order: cutoffs, which say how wide a group may be
     real *node_low[3], *node_high[3], *node_radius;
     int *others, *order;                               // numbers, while they are sorted
     int levels, first[LEVELS + 1], nodes[LEVELS + 1];  // of each level: its first node, and how many there are
@@ -33,6 +37,8 @@ struct TreeScratch : Scratch {
         }
         radii_there = (real*)take(WIDTH * (long long)(n + LANES));
         kinds_there = take(n + LANES);
+        place_of = take(n);
+        reach_there = (real*)take(WIDTH * (long long)m);
         for (int k = 0; k < DIM; ++k) {
             node_low[k] = (real*)take(WIDTH * (long long)(total + LANES));
             node_high[k] = (real*)take(WIDTH * (long long)(total + LANES));
@@ -41,6 +47,8 @@ struct TreeScratch : Scratch {
         others = take(n > m ? n : m);
         order = take(n > m ? n : m);
     }
+    // The exponent of a cutoff, and the first bits behind the leading one.
+    static int class_of(real r) { return (int)(Bits::of(r) >> (Bits::MANTISSA - CLASS_BITS)); }
 };
 
 struct TreeSortArguments {
@@ -50,15 +58,103 @@ struct TreeSortArguments {
     int n, m, own;
 };
 
-// One thread, which reads every particle a few times.
-struct TreeSort : TreeSortArguments, Cells, TreeScratch {
-    int histogram[3][DIGITS];
-
-    explicit TreeSort(const TreeSortArguments& given)
+struct TreePlaces : TreeSortArguments, Cells, TreeScratch {
+    explicit TreePlaces(const TreeSortArguments& given)
         : TreeSortArguments(given), Cells(given.cutoff, false), TreeScratch(given.scratch, given.n, given.m, 0, 0) {}
 
+    // Puts the sources at places [from, to) in order, and makes leaves around them; `from` is the first place of one.
+    void put_in_order(int from, int to) {
+        for (int place = from; place < to; ++place) {
+            constexpr int AHEAD = 16;  // places
+            const int i = ids[place];
+            __builtin_prefetch(positions + (long long)ROW * ids[place + AHEAD < to ? place + AHEAD : place]);
+            real p[3];
+            point_of(positions + (long long)ROW * i, p);
+            for (int k = 0; k < DIM; ++k)
+                axis[k][place] = p[k];
+            place_of[i] = place;
+            if constexpr (RULE != GATHER)
+                radii_there[place] = radii[i];
+            if constexpr (RULE == TABLE)
+                kinds_there[place] = kinds_of_sources[i];
+        }
+        const int finite = shared.grid.finite;
+        for (int leaf = from / LEAF; leaf * LEAF < to; ++leaf) {
+            const int begins = leaf * LEAF, ends = begins + LEAF < finite ? begins + LEAF : finite;
+            begin_node(leaf);
+            for (int k = 0; k < DIM; ++k) {
+                vec low = vec{} + __builtin_inff(), high = -low;
+                for (int place = begins; place < ends; place += LANES) {  // those behind the last one are that, again
+                    vec x = lanes_from(axis[k] + (place + LANES <= ends ? place : ends - LANES > begins ? ends - LANES : begins));
+                    for (int l = ends - begins; l < LANES; ++l)
+                        x[l] = x[0];
+                    low = x < low ? x : low;
+                    high = x > high ? x : high;
+                }
+                node_low[k][leaf] = __builtin_reduce_min(low);
+                node_high[k][leaf] = __builtin_reduce_max(high);
+            }
+            for (int place = begins; RULE != GATHER && place < ends; ++place)
+                node_radius[leaf] = radii_there[place] > node_radius[leaf] ? radii_there[place] : node_radius[leaf];
+        }
+    }
+    // Makes the nodes above the leaves.
+    void make_nodes() {
+        end_level(0);
+        for (int level = 1; level < levels; ++level) {
+            for (int node = 0; node < nodes[level]; ++node) {
+                const int at = first[level] + node, from = first[level - 1] + node * FANOUT;
+                begin_node(at);
+                for (int child = from; child < from + FANOUT; ++child) {
+                    for (int k = 0; k < DIM; ++k) {
+                        node_low[k][at] = node_low[k][child] < node_low[k][at] ? node_low[k][child] : node_low[k][at];
+                        node_high[k][at] = node_high[k][child] > node_high[k][at] ? node_high[k][child] : node_high[k][at];
+                    }
+                    node_radius[at] = node_radius[child] > node_radius[at] ? node_radius[child] : node_radius[at];
+                }
+            }
+            end_level(level);
+        }
+    }
+    void begin_node(int at) {
+        for (int k = 0; k < DIM; ++k) {
+            node_low[k][at] = __builtin_inff();
+            node_high[k][at] = -__builtin_inff();
+        }
+        node_radius[at] = 0;
+    }
+    // Nodes without sources fill the last FANOUT of a level.
+    void end_level(int level) {
+        for (int node = nodes[level]; node % FANOUT; ++node)
+            begin_node(first[level] + node);
+    }
+};
+
+// Puts many sources in order. It is launched once per thread: threads hand themselves chunks of places, and the last one to end makes
+// the nodes above the leaves.
+struct TreeGather : TreePlaces {
+    explicit TreeGather(const TreeSortArguments& given) : TreePlaces(given) {}
+    void gather() {
+        for (;;) {
+            const int chunk = __atomic_fetch_add(&shared.next_gathered, 1, __ATOMIC_RELAXED);
+            if ((long long)chunk * CHUNK >= n)
+                break;
+            const int begin = chunk * CHUNK, end = n - begin < CHUNK ? n : begin + CHUNK;
+            put_in_order(begin, end);
+            if (__atomic_add_fetch(&shared.gathered, end - begin, __ATOMIC_ACQ_REL) == n)
+                make_nodes();
+        }
+    }
+};
+
+// One thread, which reads every particle a few times.
+struct TreeSort : TreePlaces {
+    int histogram[KEY_DIGITS][DIGITS];
+
+    explicit TreeSort(const TreeSortArguments& given) : TreePlaces(given) {}
+
     void build() {
-        shared.next_chunk = shared.next_gathered = shared.next_sorted = 0;
+        shared.next_chunk = shared.next_gathered = shared.next_sorted = shared.gathered = 0;
         shared.unit = 0;
         info[0] = 0;
         const int finite = sort(positions, n, ids);
@@ -69,13 +165,12 @@ struct TreeSort : TreeSortArguments, Cells, TreeScratch {
             shared.finite_queries = finite;
         } else
             shared.finite_queries = sort(queries, m, query_ids);
-        if constexpr (RULE != SCATTER)
-            sort_by_radius(shared.finite_queries);
+        sort_by_reach(shared.finite_queries);
         info[1] = finite < n || shared.finite_queries < m ? 2 : 0;
-        put_in_order();
-        make_leaves(finite);
-        for (int level = 1; level < levels; ++level)
-            make_nodes(level);
+        if (n < MANY) {
+            put_in_order(0, n);
+            make_nodes();
+        }
     }
 
     // Sorts points by system, then along a curve; those that are not finite come last. Returns how many are finite.
@@ -89,12 +184,25 @@ struct TreeSort : TreeSortArguments, Cells, TreeScratch {
             else
                 to[--behind] = i;
         }
-        arrange(points, to, 0, finite, 0);
+        double low[3], high[3];
+        const double widest = find_box(points, to, 0, finite, low, high);
+        for (int k = 0; k < DIM; ++k)
+            shared.grid.low[k] = finite ? real(2 * low[k]) : real(0);
+        const double scale = widest > 0 ? Bits::power_of_two(CURVE_BITS - 1 - exponent_of(widest)) : 0;
+        if (scale > 0 && scale < __builtin_inf())
+            arrange(points, to, 0, finite, low, scale, true);
+        else if (BATCHED)
+            sort_by_system(points, to, 0, finite);
         return finite;
     }
-    // Sorts the points [from, to) of `at` along a curve, which is as long as their box is wide.
-    void arrange(const real* points, int* at, int from, int to, int depth) {
-        double low[3], high[3], widest = 0;
+    static int exponent_of(double x) {
+        unsigned long long bits;
+        memcpy(&bits, &x, 8);
+        return (int)(bits >> 52 & 0x7ff) - 1023;
+    }
+    // The box around the points [from, to) of `at`, in halves of lengths: differences of floats may be infinite. Returns its width.
+    double find_box(const real* points, const int* at, int from, int to, double* low, double* high) const {
+        double widest = 0;
         for (int k = 0; k < DIM; ++k) {
             low[k] = __builtin_inf();
             high[k] = -__builtin_inf();
@@ -103,41 +211,58 @@ struct TreeSort : TreeSortArguments, Cells, TreeScratch {
             real p[3];
             point_of(points + (long long)ROW * at[i], p);
             for (int k = 0; k < DIM; ++k) {
-                low[k] = 0.5 * p[k] < low[k] ? 0.5 * p[k] : low[k];  // halved: differences of floats may be infinite
+                low[k] = 0.5 * p[k] < low[k] ? 0.5 * p[k] : low[k];
                 high[k] = 0.5 * p[k] > high[k] ? 0.5 * p[k] : high[k];
             }
         }
         for (int k = 0; k < DIM; ++k)
             widest = high[k] - low[k] > widest ? high[k] - low[k] : widest;
-        const double scale = (1 << CURVE_BITS) / widest;
-        if (!(widest > 0 && scale < __builtin_inf() && depth < 64)) {  // they are in one place
-            if constexpr (BATCHED)
-                if (depth == 0)
-                    sort_by_system(points, at, from, to);
-            return;
-        }
+        return widest;
+    }
+    // Sorts the points [from, to) of `at` along the curve through cells from a corner on, `scale` per length; then those in each cell.
+    void arrange(const real* points, int* at, int from, int to, const double* corner, double scale, bool first) {
+        const double most = (1 << CURVE_BITS) - 1;
         unsigned int* const keys = (unsigned int*)key;
         for (int i = from; i < to; ++i) {
             real p[3];
             point_of(points + (long long)ROW * at[i], p);
             unsigned int code = 0;
             for (int k = 0; k < DIM; ++k) {
-                const double cell = (0.5 * p[k] - low[k]) * scale;
-                const unsigned int most = (1u << CURVE_BITS) - 1, c = (unsigned int)cell;
-                code |= spread(c < most ? c : most) << k;
+                const double cell = (0.5 * p[k] - corner[k]) * scale;
+                code |= spread((unsigned int)(cell < most ? cell > 0 ? cell : 0 : most)) << k;
             }
             keys[i] = code;
         }
         sort_by_key(at, from, to);
-        if constexpr (BATCHED)
-            if (depth == 0)
-                sort_by_system(points, at, from, to);
+        if (BATCHED && first)
+            sort_by_system(points, at, from, to);
         for (int begin = from, end; begin < to; begin = end) {  // those that share a cell
             for (end = begin + 1; end < to && keys[end] == keys[begin] && same_system(points, at, begin, end);)
                 ++end;
             if (end - begin > 2 * LEAF)
-                arrange(points, at, begin, end, depth + 1);
+                arrange_cell(points, at, begin, end, corner, scale);
         }
+    }
+    // Sorts the points of a cell along a curve through smaller ones, the widest that are not all in one.
+    void arrange_cell(const real* points, int* at, int from, int to, const double* corner, double scale) {
+        double low[3], high[3], inside[3];
+        if (!(find_box(points, at, from, to, low, high) > 0))
+            return;  // they are in one place
+        for (int k = 0; k < DIM; ++k)
+            inside[k] = corner[k];
+        for (bool one = true; one;) {
+            double begins[3];
+            for (int k = 0; k < DIM; ++k) {
+                begins[k] = __builtin_floor((low[k] - inside[k]) * scale);
+                inside[k] += begins[k] / scale;
+            }
+            scale *= 1 << CURVE_BITS;
+            if (!(scale < 0x1p900))
+                return;
+            for (int k = 0; k < DIM; ++k)
+                one = one && __builtin_floor((low[k] - inside[k]) * scale) == __builtin_floor((high[k] - inside[k]) * scale);
+        }
+        arrange(points, at, from, to, inside, scale, false);
     }
     bool same_system(const real* points, const int* at, int a, int b) const {
         return !BATCHED || system_of(points + (long long)ROW * at[a]) == system_of(points + (long long)ROW * at[b]);
@@ -175,11 +300,11 @@ struct TreeSort : TreeSortArguments, Cells, TreeScratch {
         }
         memset(histogram, 0, sizeof histogram);
         for (int i = from; i < to; ++i)
-            for (int d = 0; d < 3; ++d)
+            for (int d = 0; d < KEY_DIGITS; ++d)
                 ++histogram[d][keys[i] >> (DIGIT * d) & (DIGITS - 1)];
         unsigned int *read = keys, *write = (unsigned int*)others;
         int *ids_read = at, *ids_written = order;
-        for (int d = 0; d < 3; ++d) {
+        for (int d = 0; d < KEY_DIGITS; ++d) {
             if (histogram[d][read[from] >> (DIGIT * d) & (DIGITS - 1)] == to - from)
                 continue;
             for (int c = 0, place = from; c < DIGITS; ++c) {
@@ -233,72 +358,19 @@ struct TreeSort : TreeSortArguments, Cells, TreeScratch {
             sort_by_number(
                 at, from, to, [&](int i) { return (int)(system_of(points + (long long)ROW * i) >> shift & (DIGITS - 1)); });
     }
+    // How wide a group around a query of an id may be: its cutoff, or what is known of it.
+    real reach_of(int id) const { return RULE != SCATTER ? query_radii[id] : own ? radii[id] : radius; }
     // Brings queries together whose cutoffs are alike: they meet the same sources.
-    void sort_by_radius(int finite) {
+    void sort_by_reach(int finite) {
         const int largest = class_of(radius);
         sort_by_number(query_ids, 0, finite, [&](int i) {
-            const int below = largest - class_of(query_radii[i]);
+            const int below = largest - class_of(reach_of(i));
             return below < 0 ? 0 : below < DIGITS ? below : DIGITS - 1;
         });
         if constexpr (BATCHED)
             sort_by_system(queries, query_ids, 0, finite);
-    }
-    // The exponent of a cutoff, and the first bits behind the leading one.
-    static int class_of(real r) { return (int)(Bits::of(r) >> (Bits::MANTISSA - CLASS_BITS)); }
-
-    void put_in_order() {
-        for (int place = 0; place < n; ++place) {
-            const int i = ids[place];
-            real p[3];
-            point_of(positions + (long long)ROW * i, p);
-            for (int k = 0; k < DIM; ++k)
-                axis[k][place] = p[k];
-            if constexpr (RULE != GATHER)
-                radii_there[place] = radii[i];
-            if constexpr (RULE == TABLE)
-                kinds_there[place] = kinds_of_sources[i];
-        }
-    }
-    void make_leaves(int finite) {
-        for (int leaf = 0; leaf < nodes[0]; ++leaf) {
-            const int from = leaf * LEAF, to = from + LEAF < finite ? from + LEAF : finite;
-            begin_node(leaf);
-            for (int place = from; place < to; ++place)
-                for (int k = 0; k < DIM; ++k) {
-                    const real x = axis[k][place];
-                    node_low[k][leaf] = x < node_low[k][leaf] ? x : node_low[k][leaf];
-                    node_high[k][leaf] = x > node_high[k][leaf] ? x : node_high[k][leaf];
-                }
-            for (int place = from; RULE != GATHER && place < to; ++place)
-                node_radius[leaf] = radii_there[place] > node_radius[leaf] ? radii_there[place] : node_radius[leaf];
-        }
-        end_level(0);
-    }
-    void make_nodes(int level) {
-        for (int node = 0; node < nodes[level]; ++node) {
-            const int at = first[level] + node, from = first[level - 1] + node * FANOUT;
-            begin_node(at);
-            for (int child = from; child < from + FANOUT; ++child) {
-                for (int k = 0; k < DIM; ++k) {
-                    node_low[k][at] = node_low[k][child] < node_low[k][at] ? node_low[k][child] : node_low[k][at];
-                    node_high[k][at] = node_high[k][child] > node_high[k][at] ? node_high[k][child] : node_high[k][at];
-                }
-                node_radius[at] = node_radius[child] > node_radius[at] ? node_radius[child] : node_radius[at];
-            }
-        }
-        end_level(level);
-    }
-    void begin_node(int at) {
-        for (int k = 0; k < DIM; ++k) {
-            node_low[k][at] = __builtin_inff();
-            node_high[k][at] = -__builtin_inff();
-        }
-        node_radius[at] = 0;
-    }
-    // Nodes without sources fill the last FANOUT of a level.
-    void end_level(int level) {
-        for (int node = nodes[level]; node % FANOUT; ++node)
-            begin_node(first[level] + node);
+        for (int place = 0; place < finite; ++place)
+            reach_there[place] = reach_of(query_ids[place]);
     }
 };
 typedef TreeScratch SourcePlaces;

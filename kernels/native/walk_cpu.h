@@ -13,6 +13,8 @@
 //   farthest(from)           the squares beyond which sources from a place on are too far away for all queries that meet candidates
 //   strangers()              whether these may belong to other systems
 //   placed(from, to, near)   comes after sources at places [from, to) were packed
+//   number_of(place)         which of the candidates the query at a place is itself, -1: none, or it does not matter
+//   forget()                 candidates are gone
 #pragma once
 #include "scan_cpu.h"
 
@@ -23,14 +25,13 @@ struct Box {
 template <class Query>
 struct Walk : Scan {
     const int finite_places;
-    int filled;                    // candidates
-    int begin, end;                // places of the queries of the cell that is served
-    int own_from, own_to, own_at;  // places of queries that are candidates, too, and the number of the first of them
-    bool fresh;                    // no candidates have been met
-    unsigned int system;           // theirs
-    int side;                      // whether the image lies behind (-1), at home, or ahead
-    int shift[3];                  // of the image, in lattice vectors
-    real moved[3];                 // by which its sources are moved
+    int filled;           // candidates
+    int begin, end;       // places of the queries that are served
+    bool fresh;           // no candidates have been met
+    unsigned int system;  // theirs
+    int side;             // whether the image lies behind (-1), at home, or ahead
+    int shift[3];         // of the image, in lattice vectors
+    real moved[3];        // by which its sources are moved
 
     explicit Walk(const SearchArguments& given)
         : Scan(given), finite_places(shared.finite_queries), shift{0, 0, 0}, moved{0, 0, 0} {}
@@ -50,15 +51,14 @@ struct Walk : Scan {
         for (int e = 0; e < LANES; ++e)
             for (int k = 0; k < DIM; ++k)
                 candidate[k][filled + e] = __builtin_nanf("");
-        for (int e = 0; DIFFER && e < LANES; ++e)
-            candidate_ids[filled + e] = -1;  // nobody: not the query itself either
+        this->find_bands(filled);
         if constexpr (Query::FLUSHED)
             floats.flush();
         for (int place = begin; place < end; ++place) {
             real q[3];
-            position_of(place, q);
-            this->begin_with(query_ids[place], own);
-            const int self = !DIFFER && drop_self && place >= own_from && place < own_to ? own_at + place - own_from : -1;
+            query().position_of(place, q);
+            this->begin_with(query_ids[place]);
+            self = query().number_of(place);
             self_from = self < 0 ? -1 : self & -LANES;  // to change it among the candidates would delay all loads of them
             self_lanes = 1 << (self & (LANES - 1));
             query().meet(q, query_ids[place], fresh, finished);
@@ -66,7 +66,8 @@ struct Walk : Scan {
         if constexpr (Query::FLUSHED)
             floats.keep();
         fresh = false;
-        filled = own_from = own_to = 0;
+        filled = 0;
+        query().forget();
     }
 
     // Copies those of the sources at places [from, to) that may be near one of the queries: others are too far from the box around
