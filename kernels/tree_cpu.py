@@ -10,13 +10,15 @@ import functools
 import itertools
 
 from jfrnn.kernels import cells_cpu
-from jfrnn.kernels._native import RULES, SPACES, program
+from jfrnn.kernels._native import RULES, SPACES, program, table_cells
 from jfrnn.kernels._program import Kernel, declare
 
 LEAF = 16  # sources of a leaf
 FANOUT = 16  # nodes of a node
 CLASS_BITS = 1  # of cutoffs that are alike, behind the leading one
-TOGETHER = 6  # queries of a group: where fewer are in a cube as wide as their cutoff is, that is doubled along axis after axis
+LEAST_TOGETHER = (
+    6  # queries of a group: where fewer are in a cube as wide as their cutoff is, that is doubled along axis after axis
+)
 MOST_TOGETHER = 32
 MOST_DOUBLED, MOST_HALVED = 6, 9  # axes
 _MOST_LANES = 16
@@ -32,19 +34,20 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -
             break
         count = -(-count // FANOUT)
     most = max(sources, queries)
-    parts = [64, *[width * sources] * dim, sources, 2, most, queries, 2]  # those of cells, without a table
+    table = table_cells(sources) + 2
+    parts = [64, *[width * sources] * dim, sources, table, most, queries, table]  # those of cells
     parts += [width * (sources + _MOST_LANES), sources + _MOST_LANES, sources, width * queries]
     parts += [*[width * (nodes + _MOST_LANES)] * (2 * dim + 1), most, most]
     return sum((words + 15) // 16 * 16 for words in parts)
 
 
-PROVIDER = {"places_cpu.h": '#include "tree_cpu.h"\n', "query_walk_cpu.h": '#include "tree_walk_cpu.h"\n'}  # in place of cells
+PROVIDER = {"places_cpu.h": '#include "cutoffs_cpu.h"\n', "query_walk_cpu.h": '#include "cutoff_walk_cpu.h"\n'}  # in place of cells
 
 
 def constants_of(rule: str) -> dict[str, int]:
     """Return the constants of programs that walk a tree."""
     constants: dict[str, int] = {"RULE": RULES.index(rule), "SUM": rule == "mean", "SCALED": True, "LEAF": LEAF, "FANOUT": FANOUT}
-    constants |= {"CLASS_BITS": CLASS_BITS, "TOGETHER": TOGETHER, "MOST_TOGETHER": MOST_TOGETHER}
+    constants |= {"CLASS_BITS": CLASS_BITS, "LEAST_TOGETHER": LEAST_TOGETHER, "MOST_TOGETHER": MOST_TOGETHER}
     return constants | {"MOST_DOUBLED": MOST_DOUBLED, "MOST_HALVED": MOST_HALVED}
 
 
@@ -60,8 +63,10 @@ def _variant(dim: int, double: bool, rule: str, periodic: int, batched: bool) ->
 @functools.lru_cache(128)
 def sort_kernels(dim: int, double: bool, rule: str, periodic: int = 0, batched: bool = False) -> tuple[Kernel, Kernel]:
     """Return `build` and `gather`, for a rule of `RULES`, as `jfrnn.kernels.cells_cpu.sort_kernels` does."""
-    text = program(double, dim, "tree_cpu.h", **_constants(rule, periodic, batched))
-    build, gather = declare(f"sort_tree_cpu_{_variant(dim, double, rule, periodic, batched)}", text, "TreeSort.build", "TreeGather.gather")
+    text = program(double, dim, "cutoffs_cpu.h", **_constants(rule, periodic, batched))
+    build, gather = declare(
+        f"sort_tree_cpu_{_variant(dim, double, rule, periodic, batched)}", text, "CutoffSort.build", "TreeGather.gather"
+    )
     return build, gather
 
 
@@ -70,7 +75,13 @@ def query_kernel(
     dim: int, double: bool, rule: str, lists: bool, periodic: int = 0, batched: bool = False, excluding: int = 0, flat: bool = False
 ) -> Kernel:
     """Return what lists or counts, whose work threads share; options are those of `jfrnn.kernels._native.program`."""
-    constants = {**_constants(rule, periodic, batched), "LIST": lists, "FLAT": flat, "EXCLUDING": excluding}
+    constants = {
+        **_constants(rule, periodic, batched),
+        "LIST": lists,
+        "FLAT": flat,
+        "EXCLUDING": excluding,
+        "TOGETHER": cells_cpu.TOGETHER,
+    }
     constants["CANDIDATES"] = 1024 if double else 1536  # as many as among cells
     variant = f"{_variant(dim, double, rule, periodic, batched)}{'_list' * lists}{'_flat' * flat}{'_excluding' * excluding}"
     return declare(f"tree_cpu_{variant}", program(double, dim, "rows_cpu.h", given=PROVIDER, **constants), "Rows.run")[0]

@@ -1,4 +1,4 @@
-// Queries of a cell meet the sources of the cells around it, on the CPU, where all pairs have one cutoff.
+// Queries of a cell meet the sources of the cells around it, on the CPU, where all pairs have one cutoff, or cutoffs are alike.
 #pragma once
 #include "walk_cpu.h"
 
@@ -14,13 +14,21 @@ struct CellWalk : Walk<Query> {
     const Grid grid;
     int own_from, own_to, own_at;  // places of queries that are candidates, too, and the number of the first of them
 
-    explicit CellWalk(const SearchArguments& given) : Base(given), grid(shared.grid), own_from(0), own_to(0), own_at(0) {}
-    real farthest(int) const { return this->outside; }
+    explicit CellWalk(const SearchArguments& given) : Base(given), grid(shared.grid), own_from(0), own_to(0), own_at(0) {
+        if constexpr (!DIFFER)
+            return;
+        this->set_cutoff_of_cells(shared.cells_for);
+        if (own)
+            query_ids = this->ids;
+    }
     bool strangers() const { return !grid.dense; }
-    int number_of(int place) const { return drop_self && place >= own_from && place < own_to ? own_at + place - own_from : -1; }
+    int number_of(int place) const {
+        return (DIFFER || drop_self) && place >= own_from && place < own_to ? own_at + place - own_from : -1;
+    }
     void forget() { own_from = own_to = 0; }
     // Notes which queries stand among the sources at places [from, to), all of which are near.
     void placed(int from, int to, unsigned int near) {
+        this->pack_cutoffs(from, near);
         const int low_place = from > begin ? from : begin, high_place = to < end ? to : end;
         if (!own || (PERIODIC && side != 0) || low_place >= high_place)
             return;
@@ -98,6 +106,7 @@ struct CellWalk : Walk<Query> {
     void serve(int from, int to, const real* low, const real* high) {
         begin = from;
         end = to;
+        this->find_group_cutoff();
         whole first[3] = {0, 0, 0}, last[3] = {0, 0, 0};
         for (int k = 0; k < DIM; ++k) {
             if (is_periodic(k)) {
@@ -105,11 +114,17 @@ struct CellWalk : Walk<Query> {
                 last[k] = (whole)cell_of(k, high[k] + reach_along(k));
                 continue;
             }
-            first[k] = axis_cell(grid, k, low[k] - reach_along(k));
-            last[k] = axis_cell(grid, k, high[k] + reach_along(k));
+            const real reach = DIFFER && BY_OWN && !PERIODIC ? this->group_radius : reach_along(k);
+            first[k] = axis_cell(grid, k, low[k] - reach);
+            last[k] = axis_cell(grid, k, high[k] + reach);
             if (grid.dense) {
+                const whole most = grid.extent[k] - 1;
                 first[k] = first[k] < 0 ? 0 : first[k];
-                last[k] = last[k] >= grid.extent[k] ? grid.extent[k] - 1 : last[k];
+                last[k] = last[k] > most ? most : last[k];
+                if constexpr (DIFFER) {  // sources beyond the grid are in the cells of its border
+                    first[k] = first[k] > most ? most : first[k];
+                    last[k] = last[k] < 0 ? 0 : last[k];
+                }
             }
         }
         Box box;  // of the queries: a variable of its own, which stays in registers

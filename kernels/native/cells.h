@@ -42,6 +42,11 @@ struct Cells : Space {
         for (int axis = 0; PERIODIC && axis < DIM; ++axis)
             periodic_axes |= lattice.periodic(axis) << axis;
     }
+    // Lets cells along axes that are open be as wide as if this were the cutoff.
+    JFRNN_MEMBER void set_cutoff_of_cells(real cutoff) {
+        for (int axis = 0; axis < DIM && !PERIODIC; ++axis)
+            inverse_edge[axis] = real(axis == 0 ? REACH_X : REACH) / cutoff;
+    }
     // Cells per length along an axis; along a periodic one they are a whole number per period.
     JFRNN_MEMBER real cells_per_length(int axis) const {
         const real cells = real(axis == 0 ? REACH_X : REACH);

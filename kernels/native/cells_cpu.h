@@ -9,6 +9,7 @@ struct Shared {
     int next_gathered, next_sorted;  // chunks of sources whose coordinates and values are put in order
     int gathered;                    // sources that are
     real unit;                       // of the lattice on which all coordinates lie, or 0
+    real cells_for;                  // where cutoffs differ: that for which cells are wide, or 0: sources stand in a tree
 };
 
 // The scratch of a search: `jfrnn.kernels.cells_cpu.scratch_words` is the sum of its parts.
@@ -119,35 +120,39 @@ struct Sort : SortArguments, Places {
     }
 
     // Sorts points by cell into `order`, with the first place of each cell in `first`; points that are not finite come last. Returns
-    // how many are finite. Coordinates of few sources are put in order at once, those of many by several threads (`gather`).
+    // how many are finite.
     int sort(const Grid& grid, const real* points, int count, int* first, int* order, bool with_axes) {
+        count_cells(grid, points, count, first);
+        return put_in_cells(grid, points, count, first, order, with_axes);
+    }
+    // Notes the cell of each point, and how many points each cell has two entries behind its own.
+    void count_cells(const Grid& grid, const real* points, int count, int* first) {
         int* const key = this->key;  // stays in a register, whatever is stored
-        const int cells = grid.cells;
-        for (int c = 0; c < cells + 2; ++c)
+        for (int c = 0; c < grid.cells + 2; ++c)
             first[c] = 0;
-        int outside = 0;
         for (int i = 0; i < count; ++i) {
             real p[3];
             point_of(points + (long long)ROW * i, p);
-            int cell = -1;
-            if (finite_point(p))
-                cell = cell_key(grid, p, system_of(points + (long long)ROW * i));
-            else
-                ++outside;
+            const int cell = finite_point(p) ? cell_key(grid, p, system_of(points + (long long)ROW * i)) : -1;
             key[i] = cell;
             if (cell >= 0)
                 ++first[cell + 2];
         }
+    }
+    // Coordinates of few sources are put in order at once, those of many by several threads (`gather`).
+    int put_in_cells(const Grid& grid, const real* points, int count, int* first, int* order, bool with_axes) {
+        const int* const key = this->key;
+        const int cells = grid.cells;
         for (int c = 2; c < cells + 2; ++c)
             first[c] += first[c - 1];
-        int behind = count - outside;
-        for (int i = 0; i < count; ++i) {
+        const int finite = first[cells + 1];
+        for (int i = 0, behind = finite; i < count; ++i) {
             const int place = key[i] >= 0 ? first[key[i] + 1]++ : behind++;
             order[place] = i;
             if (with_axes && n < MANY)
                 put_coordinates(points, i, place);
         }
-        return count - outside;
+        return finite;
     }
 };
 

@@ -16,7 +16,13 @@ struct SumArguments {
 // What the term reads of the sources stands in `columns`, in the order of cells; columns of the candidates lie beside their
 // coordinates. In a periodic box turns stand behind what is read of i and j, packed as in jfrnn/_geometry/box.py: with the image of a
 // candidate they make the lattice shift of the pair, a step along each axis.
-struct Sums : QueryWalk<Sums> {
+template <template <class> class Way>
+struct SumsBy : Way<SumsBy<Way>> {
+    typedef Way<SumsBy<Way>> Base;
+    using Base::band_at, Base::band_of, Base::candidate, Base::candidate_ids, Base::candidate_images, Base::candidates_at;
+    using Base::collect_doubtful, Base::decided, Base::doubtful, Base::doubtful_at, Base::excluded, Base::excluded_starts;
+    using Base::filled, Base::floats, Base::image, Base::inside, Base::n, Base::others_mask, Base::outside, Base::several;
+    using Base::shift, Base::square_of, Base::sure, Base::sure_among, Base::sure_mask, Base::unsure, Base::wanted;
     static constexpr bool FLUSHED = !SCALED;  // where cutoffs are so small that they are scaled, so may be what decides
     alignas(64) real column[OTHERS + STEPS + 1][CANDIDATES + LANES];
     alignas(64) real near_points[PACKED ? 3 : 1][PACKED ? CANDIDATES + LANES : 1];
@@ -25,8 +31,8 @@ struct Sums : QueryWalk<Sums> {
     const Term term;
     Results results;
 
-    explicit Sums(const SumArguments& a)
-        : QueryWalk<Sums>({a.positions, a.queries, a.cutoff, a.excluded_starts, a.excluded, a.query_radii, a.table_of_kinds,
+    explicit SumsBy(const SumArguments& a)
+        : Base({a.positions, a.queries, a.cutoff, a.excluded_starts, a.excluded, a.query_radii, a.table_of_kinds,
               a.kinds_of_queries, a.scratch, a.n, a.m, a.own, a.table, a.closed, a.drop_self, a.kinds}),
           own_values(a.own_values),
           columns(a.columns),
@@ -155,4 +161,9 @@ struct Sums : QueryWalk<Sums> {
         source[l] = candidate_ids[number_of_it];
         code[l] = PERIODIC && several ? candidate_images[number_of_it] : image;
     }
+};
+struct Sums {
+    const SumArguments& given;
+    explicit Sums(const SumArguments& given) : given(given) {}
+    void run() { walk<SumsBy>(given); }
 };

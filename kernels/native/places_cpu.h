@@ -1,4 +1,4 @@
-// Where the sources stand that queries meet: in the order of cells. Where cutoffs differ, `tree_cpu.h` takes the place of this file.
+// Where the sources stand that queries meet: in the order of cells. Where cutoffs differ, `cutoffs_cpu.h` takes the place of this file.
 #pragma once
 #include "cells_cpu.h"
 

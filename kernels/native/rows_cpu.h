@@ -14,7 +14,10 @@ struct RowArguments {
     int n, m, own, table, capacity, closed, drop_self, later_only, kinds;
 };
 
-struct Rows : QueryWalk<Rows> {
+template <template <class> class Way>
+struct RowsBy : Way<RowsBy<Way>> {
+    typedef Way<RowsBy<Way>> Base;
+    using Base::filled, Base::m, Base::n, Base::lattice, Base::row;
     static constexpr bool FLUSHED = false;
     const int* starts;
     int *idx, *receivers, *counts, *info;
@@ -23,8 +26,8 @@ struct Rows : QueryWalk<Rows> {
     int fill_value;
     bool past_caches;  // rows are so many that they will not be read from the caches
 
-    explicit Rows(const RowArguments& a)
-        : QueryWalk<Rows>({a.positions, a.queries, a.cutoff, a.excluded_starts, a.excluded, a.query_radii, a.table_of_kinds,
+    explicit RowsBy(const RowArguments& a)
+        : Base({a.positions, a.queries, a.cutoff, a.excluded_starts, a.excluded, a.query_radii, a.table_of_kinds,
               a.kinds_of_queries, a.scratch, a.n, a.m, a.own, a.table, a.closed, a.drop_self, a.kinds}),
           starts(a.starts),
           idx(a.idx),
@@ -50,7 +53,8 @@ struct Rows : QueryWalk<Rows> {
                 fill(out);
             hits = scan_within(q, id, out + before, capacity - before);
         } else {
-            hits = later_only ? scan<true, false>(q, id, filled, row, 0) : scan<false, false>(q, id, filled, row, 0);
+            hits = later_only ? this->template scan<true, false>(q, id, filled, row, 0)
+                              : this->template scan<false, false>(q, id, filled, row, 0);
             if constexpr (LIST)
                 write_row(id, before, hits, finished);
         }
@@ -74,7 +78,8 @@ struct Rows : QueryWalk<Rows> {
 
     // What is written to the caches alone is written in place: nothing waits for what was written before.
     int scan_within(const real* q, int id, int* to, int room) {
-        return later_only ? scan<true, true>(q, id, filled, to, room) : scan<false, true>(q, id, filled, to, room);
+        return later_only ? this->template scan<true, true>(q, id, filled, to, room)
+                          : this->template scan<false, true>(q, id, filled, to, room);
     }
     void fill(int* out) const {
         const ints filling = ints{} + fill_value;
@@ -127,4 +132,9 @@ struct Rows : QueryWalk<Rows> {
         for (; s < capacity; s += 8)
             store<PAST_CACHES>(filled_up, out + s);
     }
+};
+struct Rows {
+    const RowArguments& given;
+    explicit Rows(const RowArguments& given) : given(given) {}
+    void run() { walk<RowsBy>(given); }
 };

@@ -29,6 +29,7 @@ struct Scan : SearchArguments, Cells, SourcePlaces {
     real inside, outside;             // the band of the pairs of a query, unless these VARY
     const real slack;                 // by which scaled distances of images may be wrong
     int image;                        // that candidates are copied from, its code
+    bool scaled_at_once;              // distances from the query, coordinate by coordinate
     bool several;                     // images among them: each says which one it is of
     int self, self_from, self_lanes;  // the number of the candidate that the query itself is (-1: none), of its vector, its bit
     real own_radius;                  // of the query
@@ -54,6 +55,7 @@ struct Scan : SearchArguments, Cells, SourcePlaces {
           wide(radius, given.closed),
           slack(PERIODIC ? 2 * lattice.slack() * step_scale : real(0)),
           image(0),
+          scaled_at_once(true),
           several(false),
           self(-1),
           self_from(-1),
@@ -193,23 +195,32 @@ struct Scan : SearchArguments, Cells, SourcePlaces {
             points.p[k] = gathered(candidate[k], doubtful + b);
         return points;
     }
-    // Squares of the distances of points in lanes.
+    // Squares of the distances of points in lanes. By a power of two both coordinates are multiplied, and rounded once, where that of
+    // the query stays finite: so it takes no operation more.
     vec square_of(const real* q, const vec* p) const {
         vec square;
         for (int k = 0; k < DIM; ++k) {
             vec d = p[k] - q[k];
-            if constexpr (SCALED)
-                d *= step_scale;
 #if defined(__FMA__)
-            if constexpr (SUMS)  // as a term computes it, too
+            if constexpr (SCALED)
+                d = scaled_at_once ? __builtin_elementwise_fma(p[k], vec{} + step_scale, vec{} - q[k] * step_scale)
+                                   : d * step_scale;
+            if constexpr (SUMS && !SCALED)  // as a term computes it, too
                 square = k == 0 ? d * d : square + d * d;
             else
                 square = k == 0 ? d * d : __builtin_elementwise_fma(d, d, square);
 #else
+            if constexpr (SCALED)
+                d *= step_scale;
             square = k == 0 ? d * d : square + d * d;
 #endif
         }
         return square;
+    }
+    void scale_at_once(const real* q) {
+        scaled_at_once = true;
+        for (int k = 0; SCALED && k < DIM; ++k)
+            scaled_at_once = scaled_at_once && Bits::finite(q[k] * step_scale);
     }
 
     // Two numbers whose sum is the cutoff of the query and a candidate; a mean is not rounded.

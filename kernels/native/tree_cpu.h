@@ -14,7 +14,7 @@ constexpr int CURVE_BITS = DIM == 3 ? 7 : 11;  // of a coordinate along a curve
 constexpr int DIGIT = 11, DIGITS = 1 << DIGIT;
 constexpr int KEY_DIGITS = 2;
 
-// The scratch of a search: `jfrnn.kernels.tree_cpu.scratch_words` is the sum of its parts.
+// The scratch of a search, whether by cells or in a tree: `jfrnn.kernels.tree_cpu.scratch_words` is the sum of its parts.
 struct TreeScratch : Scratch {
     real* radii_there;  // cutoffs of sources, in their order
     int* kinds_there;   // and species
@@ -24,7 +24,7 @@ struct TreeScratch : Scratch {
     int *others, *order;                               // numbers, while they are sorted
     int levels, first[LEVELS + 1], nodes[LEVELS + 1];  // of each level: its first node, and how many there are
 
-    TreeScratch(int* scratch, int n, int m, int, int) : Scratch(scratch, n, m, 0, 0) {
+    TreeScratch(int* scratch, int n, int m, int, int table) : Scratch(scratch, n, m, 0, table) {
         constexpr int WIDTH = DOUBLE ? 2 : 1;
         int total = 0;
         levels = 0;
@@ -55,14 +55,16 @@ struct TreeSortArguments {
     const real *positions, *queries, *cutoff, *radii, *query_radii;
     const int* kinds_of_sources;
     int *info, *scratch;
-    int n, m, own;
+    int n, m, own, table;
 };
 
 struct TreePlaces : TreeSortArguments, Cells, TreeScratch {
     explicit TreePlaces(const TreeSortArguments& given)
-        : TreeSortArguments(given), Cells(given.cutoff, false), TreeScratch(given.scratch, given.n, given.m, 0, 0) {}
+        : TreeSortArguments(given),
+          Cells(given.cutoff, false),
+          TreeScratch(given.scratch, given.n, given.m, given.own, given.table) {}
 
-    // Puts the sources at places [from, to) in order, and makes leaves around them; `from` is the first place of one.
+    // Puts the sources at places [from, to) in order.
     void put_in_order(int from, int to) {
         for (int place = from; place < to; ++place) {
             constexpr int AHEAD = 16;  // places
@@ -72,12 +74,16 @@ struct TreePlaces : TreeSortArguments, Cells, TreeScratch {
             point_of(positions + (long long)ROW * i, p);
             for (int k = 0; k < DIM; ++k)
                 axis[k][place] = p[k];
-            place_of[i] = place;
+            if (!(shared.cells_for > 0))
+                place_of[i] = place;
             if constexpr (RULE != GATHER)
                 radii_there[place] = radii[i];
             if constexpr (RULE == TABLE)
                 kinds_there[place] = kinds_of_sources[i];
         }
+    }
+    // Makes leaves around the sources at places [from, to); `from` is the first place of one.
+    void make_leaves(int from, int to) {
         const int finite = shared.grid.finite;
         for (int leaf = from / LEAF; leaf * LEAF < to; ++leaf) {
             const int begins = leaf * LEAF, ends = begins + LEAF < finite ? begins + LEAF : finite;
@@ -141,6 +147,9 @@ struct TreeGather : TreePlaces {
                 break;
             const int begin = chunk * CHUNK, end = n - begin < CHUNK ? n : begin + CHUNK;
             put_in_order(begin, end);
+            if (shared.cells_for > 0)
+                continue;
+            make_leaves(begin, end);
             if (__atomic_add_fetch(&shared.gathered, end - begin, __ATOMIC_ACQ_REL) == n)
                 make_nodes();
         }
@@ -154,9 +163,6 @@ struct TreeSort : TreePlaces {
     explicit TreeSort(const TreeSortArguments& given) : TreePlaces(given) {}
 
     void build() {
-        shared.next_chunk = shared.next_gathered = shared.next_sorted = shared.gathered = 0;
-        shared.unit = 0;
-        info[0] = 0;
         const int finite = sort(positions, n, ids);
         shared.grid.finite = finite;
         if (own) {
@@ -169,6 +175,7 @@ struct TreeSort : TreePlaces {
         info[1] = finite < n || shared.finite_queries < m ? 2 : 0;
         if (n < MANY) {
             put_in_order(0, n);
+            make_leaves(0, n);
             make_nodes();
         }
     }
@@ -373,4 +380,3 @@ struct TreeSort : TreePlaces {
             reach_there[place] = reach_of(query_ids[place]);
     }
 };
-typedef TreeScratch SourcePlaces;

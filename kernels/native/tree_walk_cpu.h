@@ -13,9 +13,8 @@ struct TreeWalk : Walk<Query> {
     using Base::nodes, Base::own, Base::query, Base::query_ids, Base::several, Base::shared, Base::side, Base::slack;
     using Base::square_of, Base::step_scale, Base::system;
     static constexpr int NOWHERE = 0x7fffffff;
-    real group_radius, group_outside;  // the largest cutoff of the queries, and the square beyond which no pair is by that alone
-    int system_from, system_to;        // places of the sources of their system
-    int next_own;                      // the first of the queries that was not yet seen among the sources
+    int system_from, system_to;  // places of the sources of their system
+    int next_own;                // the first of the queries that was not yet seen among the sources
     int own_place[MOST_TOGETHER + 1], own_number[MOST_TOGETHER];  // where the queries are sources, and their numbers as candidates
     // The queries of a chunk, from the place `chunk` on: where they are, how wide a group of them may be, and their systems.
     int chunk;
@@ -23,8 +22,7 @@ struct TreeWalk : Walk<Query> {
     alignas(64) real query_reach[QUERY_CHUNK + LANES];
     unsigned int query_system[BATCHED ? QUERY_CHUNK : 1];
 
-    explicit TreeWalk(const SearchArguments& given)
-        : Base(given), group_radius(0), group_outside(0), system_from(0), system_to(0), next_own(0), chunk(0) {
+    explicit TreeWalk(const SearchArguments& given) : Base(given), system_from(0), system_to(0), next_own(0), chunk(0) {
         memset(query_at, 0, sizeof query_at);
         memset(query_reach, 0, sizeof query_reach);
     }
@@ -33,31 +31,10 @@ struct TreeWalk : Walk<Query> {
             q[k] = query_at[k][place - chunk];
     }
     unsigned int system_at(int place) const { return BATCHED ? query_system[BATCHED ? place - chunk : 0] : 0u; }
-    // The squares beyond which the sources from a place on, or in nodes from a number on, are too far away from the group.
-    auto farthest(int from) const {
-        if constexpr (RULE == GATHER)
-            return group_outside;
-        else
-            return farthest_by(this->radii_there + from);
-    }
-    auto farthest_by(const real* of_sources) const {
-        if constexpr (RULE == GATHER)
-            return group_outside;
-        else if constexpr (RULE == MEAN)
-            return PairCutoffs::outside_of(
-                vec(PairCutoffs::of_pair(vec{} + group_radius, lanes_from(of_sources)) * step_scale), slack);
-        else {
-            const vec outside = PairCutoffs::outside_of(vec(lanes_from(of_sources) * step_scale), slack);
-            return PairCutoffs::of_pair(vec{} + group_outside, outside);
-        }
-    }
     static constexpr bool strangers() { return false; }
     // Queries of a group, and sources, come in the same order: so those among them are found.
     void placed(int from, int to, unsigned int near) {
-        if constexpr (RULE == TABLE)
-            pack(lanes_from(this->kinds_there + from), this->candidate_kind + filled, near);
-        else if constexpr (VARY)
-            pack(lanes_from(this->radii_there + from), this->candidate_radius + filled, near);
+        this->pack_cutoffs(from, near);
         for (; side == 0 && own_place[next_own] < to; ++next_own)
             if (const int lane = own_place[next_own] - from; lane >= 0)
                 own_number[next_own] = filled + __builtin_popcount(near & ((1u << lane) - 1));
@@ -82,7 +59,7 @@ struct TreeWalk : Walk<Query> {
             apart[k] = above > below ? above : below;
             apart[k] = apart[k] > 0 ? apart[k] : vec{};
         }
-        return mask_of(square_of(origin, apart), farthest_by(node_radius + at), BelowOrAt{});
+        return mask_of(square_of(origin, apart), this->farthest_by(node_radius + at), BelowOrAt{});
     }
     // Copies the sources of those nodes [from, to) of a level that are near a box, and of the system. Leaves that follow each other
     // are copied together.
@@ -202,7 +179,7 @@ struct TreeWalk : Walk<Query> {
         const real cells = real(Bits::power_of_two(Bits::BIAS - Bits::exponent(query_reach[place - chunk])));
         Cube cube{{cells, cells, cells}, 0};
         int stop = cube_end(cube, place, most);
-        for (int k = 0; k < MOST_DOUBLED && stop - place < TOGETHER && stop < most; ++k) {
+        for (int k = 0; k < MOST_DOUBLED && stop - place < LEAST_TOGETHER && stop < most; ++k) {
             cube.grow();
             stop = cube_end(cube, place, most);
         }
@@ -243,18 +220,14 @@ struct TreeWalk : Walk<Query> {
         Box box;
         position_of(from, box.low);
         position_of(from, box.high);
-        group_radius = 0;
         for (int place = from; place < to; ++place) {
             real q[3];
             position_of(place, q);
             widen(box.low, box.high, q, q);
-            const int id = query_ids[place];
-            const real r = RULE == SCATTER ? real(0) : this->query_radii[id];
-            group_radius = r > group_radius ? r : group_radius;
-            own_place[place - from] = own ? this->place_of[id] : NOWHERE;
+            own_place[place - from] = own ? this->place_of[query_ids[place]] : NOWHERE;
         }
         own_place[to - from] = NOWHERE;
-        group_outside = PairCutoffs::outside_of(group_radius * step_scale, slack);
+        this->find_group_cutoff();
         next_own = filled = side = 0;
         fresh = true;
         forget();
@@ -267,5 +240,3 @@ struct TreeWalk : Walk<Query> {
         flush(true);
     }
 };
-template <class Query>
-using QueryWalk = TreeWalk<Query>;

@@ -8,9 +8,8 @@
 //   copied(from, near)       packs more of those of the sources from the place `from` on that are `near`, of the image `shift`
 //   none(id)                 a query that is not finite has no candidates
 //   chunk_done(chunk), finish() come after the last query of a chunk, and of this thread
-// How queries come to their candidates is said by a struct between both (`query_walk_cpu.h`), by these members:
+// How queries come to their candidates is said by a struct between both (`cell_walk_cpu.h`, `tree_walk_cpu.h`), by these members:
 //   serve_chunk(place, end)  the queries at these places meet their candidates
-//   farthest(from)           the squares beyond which sources from a place on are too far away for all queries that meet candidates
 //   strangers()              whether these may belong to other systems
 //   placed(from, to, near)   comes after sources at places [from, to) were packed
 //   number_of(place)         which of the candidates the query at a place is itself, -1: none, or it does not matter
@@ -29,16 +28,49 @@ struct Walk : Scan {
     int begin, end;       // places of the queries that are served
     bool fresh;           // no candidates have been met
     unsigned int system;  // theirs
-    int side;             // whether the image lies behind (-1), at home, or ahead
-    int shift[3];         // of the image, in lattice vectors
-    real moved[3];        // by which its sources are moved
+    real group_radius,
+        group_outside;  // where cutoffs differ: the largest of the queries, and the square beyond which no pair is by that
+    int side;           // whether the image lies behind (-1), at home, or ahead
+    int shift[3];       // of the image, in lattice vectors
+    real moved[3];      // by which its sources are moved
 
     explicit Walk(const SearchArguments& given)
-        : Scan(given), finite_places(shared.finite_queries), shift{0, 0, 0}, moved{0, 0, 0} {}
+        : Scan(given), finite_places(shared.finite_queries), group_radius(0), group_outside(0), shift{0, 0, 0}, moved{0, 0, 0} {}
     Query& query() { return *(Query*)this; }
 
+    // Finds the largest cutoff of the queries that are served.
+    void find_group_cutoff() {
+        group_radius = 0;
+        for (int place = begin; DIFFER && RULE != SCATTER && place < end; ++place) {
+            const real r = query_radii[query_ids[place]];
+            group_radius = r > group_radius ? r : group_radius;
+        }
+        if constexpr (DIFFER)
+            group_outside = PairCutoffs::outside_of(group_radius * step_scale, slack);
+    }
+    // The squares beyond which the sources from a place on, or in nodes from a number on, are too far away from the group.
+    auto farthest(int from) const {
+        if constexpr (!DIFFER)
+            return outside;
+        else if constexpr (RULE == GATHER)
+            return group_outside;
+        else
+            return farthest_by(((const Query*)this)->radii_there + from);
+    }
+    auto farthest_by(const real* of_sources) const {
+        if constexpr (RULE == GATHER)
+            return group_outside;
+        else if constexpr (RULE == MEAN)
+            return PairCutoffs::outside_of(
+                vec(PairCutoffs::of_pair(vec{} + group_radius, lanes_from(of_sources)) * step_scale), slack);
+        else {
+            const vec outside = PairCutoffs::outside_of(vec(lanes_from(of_sources) * step_scale), slack);
+            return PairCutoffs::of_pair(vec{} + group_outside, outside);
+        }
+    }
+
     void position_of(int place, real* q) const {
-        if (!DIFFER && own)  // the places are those of the sources
+        if (own)  // the places are those of the sources
             for (int k = 0; k < DIM; ++k)
                 q[k] = axis[k][place];
         else
@@ -58,6 +90,7 @@ struct Walk : Scan {
             real q[3];
             query().position_of(place, q);
             this->begin_with(query_ids[place]);
+            this->scale_at_once(q);
             self = query().number_of(place);
             self_from = self < 0 ? -1 : self & -LANES;  // to change it among the candidates would delay all loads of them
             self_lanes = 1 << (self & (LANES - 1));
@@ -87,7 +120,7 @@ struct Walk : Scan {
                 beside[k] = points.p[k] - (least < box.high[k] ? least : vec{} + box.high[k]);
             }
             unsigned int near = lanes_before(to - from);
-            near &= mask_of(square_of(origin, beside), query().farthest(from), BelowOrAt{});
+            near &= mask_of(square_of(origin, beside), farthest(from), BelowOrAt{});
             const ints numbers = lanes_from(ids + from);
             for (int l = 0; BATCHED && query().strangers() && l < LANES && from + l < to; ++l)
                 if (system_of(positions + (long long)ROW * numbers[l]) != system)
@@ -118,6 +151,13 @@ struct Walk : Scan {
                     }
                     copy_it();
                 }
+    }
+    // Packs what says their cutoffs.
+    void pack_cutoffs(int from, unsigned int near) {
+        if constexpr (RULE == TABLE)
+            pack(lanes_from(query().kinds_there + from), candidate_kind + filled, near);
+        else if constexpr (VARY)
+            pack(lanes_from(((const Query*)this)->radii_there + from), candidate_radius + filled, near);
     }
     // Packs what tells the candidates apart: their sources, and which images they are.
     void pack_names(ints numbers, unsigned int near) {

@@ -16,7 +16,7 @@ from test_search_edges import edges_as_set
 import jfrnn
 
 SLOW = pytest.mark.slow
-N, CAPACITY, TOTAL, SKIN, DRAWS = 128, 128, 8192, 0.03, 3
+N, CAPACITY, TOTAL, SKIN, DRAWS = 200, 208, 8192, 0.03, 3  # more than are all tested without cells
 RULES = ("gather", "scatter", "either", "both", "mean", "sum")
 SPACES = {
     "open": None,
@@ -39,9 +39,13 @@ def neighbors_of(x, matrix):
 
 @functools.lru_cache(maxsize=4)
 def near_ties(space, rule, dtype, seed):
-    """Return positions, some of them a few cells away, cutoffs, and one near tie (i, j, S) of every particle that has any."""
+    """Return positions, some of them a few cells away, cutoffs, and one near tie (i, j, S) of every particle that has any.
+
+    Of odd draws half of the points make up a clump, so that cutoffs are as various as the distances.
+    """
     random, matrix = np.random.default_rng(seed), SPACES[space]
     fractions = random.random((N, 3))
+    fractions[: N * (seed % 2) : 2] = 0.4 + 0.01 * fractions[: N * (seed % 2) : 2]
     x = (fractions if matrix is None else fractions @ matrix).astype(dtype)
     at, shifts = neighbors_of(x.astype(np.float64), matrix)
     chosen = random.integers(12, size=N)

@@ -1,5 +1,6 @@
 """Cutoffs that differ from particle to particle: every rule against the oracle, then what lists make of them."""
 
+import dataclasses
 import functools
 from fractions import Fraction
 from itertools import product
@@ -18,8 +19,23 @@ from jfrnn.cases.radii import RADII_CASES
 
 SLOW = pytest.mark.slow
 LENGTH, CAPACITY = 160, 256  # more pairs than are all tested by "jax"
+# How a case is lengthened: a few are all tested, more are sorted into cells or a tree, and beside a crowd it is always a tree.
+CROWD, LENGTHS = 400, {"few": LENGTH, "more": 192, "crowd": 640}
 KINDS = {"gather": (np.float64, 2), "scatter": (np.float32, 2), "either": (np.float32, 3), "both": (np.float32, 3)}
 KINDS["mean"] = (np.float64, 3)
+ALONE = ("periodic", "periodic_ties", "periodic_images", "queries")  # nothing lies beside a box; a crowd has no queries
+
+
+def built(name, dtype, dim, way):
+    """Build a case; "crowd" puts particles of tiny cutoffs into a small ball beside it, beyond the reach of all others."""
+    given = RADII_CASES[name].build(dtype, dim)
+    if way != "crowd":
+        return given
+    random, reach = np.random.default_rng(0), 4 * float(given.cutoffs.max())
+    x = random.uniform(-0.02, 0.02, (CROWD, dim)) * reach + (given.positions.max(axis=0) + reach).astype(float)
+    h = np.full(CROWD, 1e-3 * reach)
+    more = {"positions": np.r_[given.positions, x.astype(dtype)], "cutoffs": np.r_[given.cutoffs, h.astype(dtype)]}
+    return dataclasses.replace(given, **more)
 
 
 def radii_of(given, rule, length=None):
@@ -35,28 +51,34 @@ def radii_of(given, rule, length=None):
 
 
 @functools.lru_cache(maxsize=64)
-def expected_pairs(name, dtype, dim, rule, closed=False):
-    given = RADII_CASES[name].build(dtype, dim)
+def expected_pairs(name, dtype, dim, rule, closed=False, way="few"):
+    given = built(name, dtype, dim, way)
     options = {"queries": given.queries, "query_radii": given.query_cutoffs, "lengths": given.lengths}
-    return reference.reference_radii(given.positions, given.cutoffs, rule, closed=closed, **options)
+    if way != "crowd":
+        return reference.reference_radii(given.positions, given.cutoffs, rule, closed=closed, **options)
+    n = len(given.positions) - CROWD
+    beside = reference.reference_radii(given.positions[n:], given.cutoffs[n:], rule, closed=closed)
+    return expected_pairs(name, dtype, dim, rule, closed) | {(n + i, n + j, shift) for i, j, shift in beside}
 
 
-def search_case(name, dtype, dim, rule, backend, **options):
+def search_case(name, dtype, dim, rule, backend, way="few", **options):
     """Search a case padded to one length, so that cases share compiled programs; return the list, positions and queries."""
-    given = RADII_CASES[name].build(dtype, dim)
-    x = jnp.asarray(checked.padded(given.positions, LENGTH))
-    queries = {} if given.queries is None else {"queries": jnp.asarray(checked.padded(given.queries, LENGTH))}
+    given, length = built(name, dtype, dim, way), LENGTHS[way]
+    x = jnp.asarray(checked.padded(given.positions, length))
+    queries = {} if given.queries is None else {"queries": jnp.asarray(checked.padded(given.queries, length))}
     box = {} if given.lengths is None else {"box": jfrnn.Box(given.lengths)}
-    radii = radii_of(given, rule, LENGTH)
+    radii = radii_of(given, rule, length)
     return jfrnn.search(x, radii, radius_rule=rule, backend=backend, **queries, **box, **options), x, queries
 
 
-def assert_case(name, dtype, dim, rule, backend, closed=False, masked=True):
-    nbrs, x, queries = search_case(name, dtype, dim, rule, backend, closed=closed, capacity=CAPACITY)
+def assert_case(name, dtype, dim, rule, backend, closed=False, masked=True, way="few"):
+    nbrs, x, queries = search_case(
+        name, dtype, dim, rule, backend, way, closed=closed, capacity=CAPACITY if way != "crowd" else 512
+    )
     assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE  # the padding
-    expected = expected_pairs(name, dtype, dim, rule, closed)
+    expected = expected_pairs(name, dtype, dim, rule, closed, way)
     if nbrs.box is None:
-        found = {(*pair, (0,) * dim) for pair in reference.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), LENGTH)}
+        found = {(*pair, (0,) * dim) for pair in reference.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), len(x))}
     else:
         found = image_pairs(nbrs, x, **queries)
     missing, extra = expected - found, found - expected
@@ -75,14 +97,18 @@ def each_case():
     for name, rule, dtype, dim, backend in product(RADII_CASES, RULES, (np.float32, np.float64), (2, 3), ("jax", "warp", "brute")):
         common = walked.get(name, RULES)
         often = (dtype, dim) == KINDS[rule] and rule in (common if backend == "warp" else compiled.get(name, ("mean",)))
-        kind = f"{name}-{rule}-f{8 * dtype().itemsize}-{dim}d-{backend}"
-        yield pytest.param(name, rule, dtype, dim, backend, id=kind, marks=[SLOW] * (backend == "brute" or not often))
+        in_turn = (list(RADII_CASES).index(name) + RULES.index(rule)) % 3  # by default, each case in each way by some rule
+        for k, way in enumerate(LENGTHS):
+            rarely = backend == "brute" or not often or (k != in_turn if backend == "warp" else k > 0)
+            kind = f"{name}-{rule}-f{8 * dtype().itemsize}-{dim}d-{backend}-{way}"
+            if way != "crowd" or name not in ALONE:
+                yield pytest.param(name, rule, dtype, dim, backend, way, id=kind, marks=[SLOW] * rarely)
 
 
-@pytest.mark.parametrize(("name", "rule", "dtype", "dim", "backend"), list(each_case()))
-def test_case(name, rule, dtype, dim, backend):
-    often = rule in ("gather", "either", "mean") and name != "queries"  # the mask is a program of its own
-    assert_case(name, dtype, dim, rule, backend, masked=often)
+@pytest.mark.parametrize(("name", "rule", "dtype", "dim", "backend", "way"), list(each_case()))
+def test_case(name, rule, dtype, dim, backend, way):
+    often = way == "few" and rule in ("gather", "either", "mean") and name != "queries"  # the mask is a program of its own
+    assert_case(name, dtype, dim, rule, backend, masked=often, way=way)
 
 
 @pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
