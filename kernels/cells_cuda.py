@@ -15,7 +15,7 @@ crossing the same in a periodic box, for queries whose reach leaves it: images t
 import functools
 from typing import NamedTuple
 
-from jfrnn.kernels._native import SPACES, program, table_cells
+from jfrnn.kernels._native import RULES, SPACES, program, table_cells
 from jfrnn.kernels._program import Entry, Kernel, declare
 
 BLOCK = 256
@@ -135,6 +135,11 @@ def walks(query: Kernel, crossing: Kernel | None, m: int, multiprocessors: int) 
     return [first, Launch(query, threads, False, beside=True)]
 
 
+def constants_of(rule: str) -> dict[str, int]:
+    """Return the constants of kernels for cutoffs that differ by a rule of `RULES`."""
+    return {"RULE": RULES.index(rule), "SUM": rule == "mean", "SCALED": True}
+
+
 @functools.lru_cache(512)
 def cell_kernels(
     dim: int,
@@ -148,19 +153,22 @@ def cell_kernels(
     batched: bool = False,
     excluding: int = 0,
     flat: bool = False,
+    rule: str = "",
 ) -> Kernels:
     """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts, half lists or whole.
 
     `periodic`, `batched`, `excluding` and `flat` are those of `jfrnn.kernels._native.program`. `reach` is the number of cell edges
     in a cutoff along y and z, `reach_x` along x; other numbers than these are slower, and only measurements ask for them.
+    `rule`: one of `RULES`, where cutoffs differ.
     """
     blocks = 24 if not lists else 16 if double else 20  # registers against occupancy, measured on an H200
     kind = f"{dim}d_{'f64' if double else 'f32'}_r{reach}x{reach_x}"
     kind += SPACES[periodic] + "_batched" * batched
     variant = f"{kind}{'_scaled' * scaled}{'_list' * lists}{'_flat' * flat}{'_later' * later}{'_excluding' * excluding}"
+    variant += "_" * bool(rule) + rule
     grid = {**GRID, "REACH": reach, "REACH_X": reach_x, "PERIODIC": periodic, "BATCHED": batched}
     query = {"SCALED": scaled, "LIST": lists, "FLAT": flat, "SUMS": 0, "LATER": later, "EXCLUDING": excluding}
-    query |= grid
+    query |= grid | (constants_of(rule) if rule else {})
 
     def query_kernel(name: str, crossing: bool = False) -> Kernel:
         kind = {"CROSSING": crossing, "SHIFTED": periodic if crossing else 0}

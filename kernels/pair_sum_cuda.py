@@ -24,6 +24,7 @@ from typing import NamedTuple
 from jfrnn.kernels._native import SPACES, program
 from jfrnn.kernels._program import Entry, Kernel, declare
 from jfrnn.kernels.cells_cuda import GRID, QUERY_BLOCK, Launch, query_blocks, walks
+from jfrnn.kernels.cells_cuda import constants_of as constants_of_rule
 from jfrnn.kernels.pair_sum_cpu import LITTLE_WORK, TermText, constants_of, term_header, work
 
 
@@ -73,7 +74,7 @@ def _placed_columns(term: TermText, dim: int) -> int:
 @functools.lru_cache(512)
 def sum_kernels(
     term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: bool = False,
-    extremes: bool = False, excluding: int = 0,
+    extremes: bool = False, excluding: int = 0, rule: str = "",
 ) -> Kernels:  # fmt: skip
     """Return the kernels that sum a term; `key` tells it from all others in the names of programs.
 
@@ -86,7 +87,7 @@ def sum_kernels(
     taken = 4 if cheap else 2
     blocks = 16 if double or not cheap else 20
     kind = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
-    kind += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}{'_excluding' * excluding}"
+    kind += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}{'_excluding' * excluding}{'_' * bool(rule)}{rule}"
     module = f"{kind}_b{blocks}_t{taken}_{key}"
     constants = {**GRID, "PERIODIC": periodic, "BATCHED": batched, "SCALED": scaled, **constants_of(term, compensated, extremes)}
     constants |= {
@@ -96,6 +97,7 @@ def sum_kernels(
         "TAKEN": taken,
         "FROM_PLACES": _reads_positions(term) and not term.source_columns,
     }
+    constants |= constants_of_rule(rule) if rule else {}
     constants |= {"ROW_LENGTH": max(row_length(term, dim, double), 1), "PLACED": _placed_columns(term, dim)}
 
     def declare_one(name: str, text: str, method: str, blocks: int, called: str = "") -> Kernel:

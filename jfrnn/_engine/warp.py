@@ -8,7 +8,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -38,6 +38,11 @@ PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names
 _CELLS = {"cpu": cells_cpu, "cuda": cells_cuda}
 QUERIES_PER_THREAD = 1024  # on the CPU, at least: among 1000, to wake a second thread takes as long as it saves
 
+# Of cutoffs that differ, on CUDA: how many sources within the largest cutoff a query may meet among cells, and how many more for
+# each that is near, before a walk over many sizes is faster (measured on an H200); and how many queries and sources tell.
+MOST_MET, MOST_MORE, SAMPLED = 2000, 8, (1024, 4096)
+Found = TypeVar("Found")  # what a search or a sum returns
+
 
 @dataclasses.dataclass(frozen=True)  # all are one
 class WarpEngine:
@@ -61,9 +66,11 @@ class WarpEngine:
         if search.per_system:
             return box_neighbors(search._replace(checks={}), options.filter, capacity)
         if isinstance(search.cutoff, Cutoffs):
-            tree = functools.partial(call_kernels, tree_cpu.scratch_words, _tree_callable, keep=options.filter, capacity=capacity)
-            levels = functools.partial(level_neighbors, keep=options.filter, capacity=capacity)
-            return lax.platform_dependent(search._replace(checks={}), cpu=tree, cuda=levels)
+            asked = {"keep": options.filter, "capacity": capacity}
+            tree = functools.partial(call_kernels, tree_cpu.scratch_words, _tree_callable, **asked)
+            cells = functools.partial(call_kernels, cells_cuda.scratch_words, _cuda_callable, **asked)
+            cuda = functools.partial(by_cells_or_levels, cells, functools.partial(level_neighbors, **asked))
+            return lax.platform_dependent(search._replace(checks={}), cpu=tree, cuda=cuda)
 
         def on(module: ModuleType, make: Callable[[Variant], Any]) -> Callable[[Search], Rows]:
             blocks = few_cuda.blocks(search.sizes[1]) if module is few_cuda else None
@@ -91,6 +98,34 @@ def has_order(engine: Engine, platform: str, n: int, plain: bool) -> bool:
     `plain`: without queries, and with one cutoff.
     """
     return isinstance(engine, WarpEngine) and PLATFORMS.get(platform) == "cuda" and n > few_cuda.MOST and plain
+
+
+def by_cells_or_levels(
+    cells: Callable[..., Found], levels: Callable[..., Found], search: Search, *more: tuple[Array, ...]
+) -> Found:
+    """Search on CUDA by cells as wide as the largest cutoff if cutoffs are alike, else by cells of many sizes."""
+    return lax.cond(cutoffs_are_alike(search), cells, levels, search, *more)
+
+
+def cutoffs_are_alike(search: Search) -> Array:
+    """Say whether the largest cutoff is not much longer than the others are where most particles are, as far as a sample tells."""
+    cutoffs, (n, m), dim = search.cutoffs, search.sizes, search.sources.shape[1]
+    of_queries, of_sources = (slice(None, None, -(-size // most)) for size, most in zip((m, n), SAMPLED, strict=True))
+    sources = search.sources[of_sources]
+    queries = (search.sources if search.queries is None else search.queries)[of_queries]
+    if 0 in (len(sources), len(queries)):
+        return jnp.asarray(True)
+    met = jnp.sum(((queries[:, None] - sources) / cutoffs.largest) ** 2, axis=-1) <= 1
+    if search.batch is not None:
+        met &= search.batch.of_queries[of_queries][:, None] == search.batch.sources[of_sources]
+    if cutoffs.queries is None:
+        radii = None if cutoffs.sources is None else cutoffs.sources[of_sources]
+    else:
+        radii = cutoffs.queries[of_queries][:, None]
+    volumes = (cutoffs.largest if radii is None else radii) / cutoffs.largest
+    each = n / len(sources) / len(queries)
+    found = jnp.sum(jnp.where(met, 1 - MOST_MORE * volumes**dim, 0))
+    return (found * each <= MOST_MET) & (cutoffs.largest > 0)
 
 
 def _order_in(module: ModuleType, search: Search, scratch: Array) -> Array:
@@ -192,7 +227,7 @@ def _tree_callable(variant: Variant) -> Call:
 
 @kernel
 def _cuda_callable(variant: Variant) -> Call:
-    return describe_call("cells_cuda", variant, functools.partial(_plan_on_cuda, variant))
+    return describe_call("cells_cuda", variant, functools.partial(_plan_on_cuda, variant), cutoffs=names_of_particles)
 
 
 @kernel
@@ -202,6 +237,7 @@ def _few_callable(variant: Variant) -> Call:
 
 def _plan_on_cuda(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan:
     kind = {"periodic": variant.periodic, "batched": variant.batched, "excluding": variant.excluding, "flat": variant.flat}
+    kind["rule"] = variant.rule
     dim, later = variant.dim, variant.keep.later_only
     kernels = cells_cuda.cell_kernels(dim, variant.double, variant.scaled, variant.lists, later, **kind)
     numbers = plan_numbers(variant, shapes)

@@ -15,7 +15,7 @@ from jfrnn._engine.plans import Launch, Plan, share
 from jfrnn._engine.problem import Filter, Search
 from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText
 from jfrnn._engine.variants import SumVariant, names_of_particles, size_numbers
-from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, place_launches, sort_on_cpu
+from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, by_cells_or_levels, place_launches, sort_on_cpu
 from jfrnn._geometry import Cutoffs
 from jfrnn.kernels import cells_cpu, cells_cuda, few_cuda, pair_sum_cpu, pair_sum_cuda, tree_cpu
 from jfrnn.kernels._native import EXCLUDED
@@ -48,18 +48,20 @@ def pair_sums(
 
     def on(cuda: bool) -> Callable[[Search, tuple[Array, Array, Array]], FoundSums]:
         def call(search: Search, values: tuple[Array, Array, Array]) -> FoundSums:
-            if cuda and rule:
-                return level_sums(search, keep, term, key, values, compensated, extremes)
             sources, queries, cutoff, batch, torus = search[:5]
             flags = (queries is None, cutoff.closed, keep.drop_self, periodic_kind(torus), batch is not None)
-            kind = (compensated, extremes, key, cuda, cuda and are_few(search), search.excluding, rule)
+            kind = (compensated, extremes, key, cuda, cuda and not rule and are_few(search), search.excluding, rule)
             variant = SumVariant(sources.shape[1], sources.dtype == jnp.float64, cutoff.scaled, *flags, *kind)
             more = [*excluded_rows(search), *(cutoffs_of_particles(cutoff).values() if isinstance(cutoff, Cutoffs) else ())]
             return _call_sums(variant, term, pack_particles(search), values, more)
 
         return call
 
-    return lax.platform_dependent(search._replace(checks={}), values, cpu=on(False), cuda=on(True))
+    def by_levels(search: Search, values: tuple[Array, Array, Array]) -> FoundSums:
+        return level_sums(search, keep, term, key, values, compensated, extremes)
+
+    cuda = functools.partial(by_cells_or_levels, on(True), by_levels) if rule else on(True)
+    return lax.platform_dependent(search._replace(checks={}), values, cpu=on(False), cuda=cuda)
 
 
 def _call_sums(
@@ -116,7 +118,7 @@ def _plan_few(variant: SumVariant, term: TermText, shapes: Shapes, _: int) -> Pl
 
 def _sorting(variant: SumVariant) -> SumVariant:
     """Return on what of a variant it depends how particles are sorted."""
-    return variant._replace(closed=False, drop_self=False, compensated=False, extremes=False, key="", excluding=0)
+    return variant._replace(closed=False, drop_self=False, compensated=False, extremes=False, key="", excluding=0, rule="")
 
 
 @kernel
@@ -160,7 +162,7 @@ def _plan_on_cpu(variant: SumVariant, term: TermText, shapes: Shapes, multiproce
 
 def _plan_on_cuda(variant: SumVariant, term: TermText, shapes: Shapes, multiprocessors: int) -> Plan:
     dim, double, scaled = variant[:3]
-    more = _space(variant) | {"extremes": variant.extremes, "excluding": variant.excluding}
+    more = _space(variant) | {"extremes": variant.extremes, "excluding": variant.excluding, "rule": variant.rule}
     kernels = pair_sum_cuda.sum_kernels(term, variant.key, dim, double, scaled, variant.compensated, **more)
     numbers = _numbers(variant, term, shapes)
     launches = kernels.launches(numbers["n"], numbers["m"], multiprocessors)

@@ -13,13 +13,21 @@ struct Pairs {
 };
 
 // Keeps a candidate, the one of a number, if it is near; `x` is where it is from the center.
-JFRNN_FUNCTION void keep(bool is_near, const Place& candidate, const real* x, unsigned int number) {
+JFRNN_FUNCTION void keep(const PairSearch& search, bool is_near, const Place& candidate, const real* x, unsigned int number) {
     Warp& warp = shared_warp();
-    if constexpr (DOUBLE) {
-        if (is_near)
+    if constexpr (!MATRIX) {
+        if (is_near) {
 #pragma unroll
             for (int a = 0; a < DIM; ++a)
                 warp.candidates[a][number % RING] = candidate.p[a];
+            if constexpr (VARY) {
+                real known[2];
+                search.cutoffs_of(search.source_named(id_of(candidate.id)), known);
+#pragma unroll
+                for (int k = 0; k < OF_CUTOFFS; ++k)
+                    warp.candidates[DIM + k][number % RING] = known[k];
+            }
+        }
     } else {
         const unsigned int column = shared_address(warp.candidates[0]) + 4 * (number % RING);
         float square = 0;
@@ -30,6 +38,9 @@ JFRNN_FUNCTION void keep(bool is_near, const Place& candidate, const real* x, un
             store_if(is_near, column + (unsigned int)sizeof(warp.candidates[0]) * a, halves(along, 1));
         }
         store_if(is_near, column + (unsigned int)sizeof(warp.candidates[0]) * 3, halves(square, 1));
+        if constexpr (RULE == TABLE)
+            if (is_near)
+                search.cutoffs_of(search.source_named(id_of(candidate.id)), &warp.candidates[4][number % RING]);
     }
     if constexpr (LATER || !HELD)
         store_if(is_near, shared_address(warp.candidate_ids) + 4 * (number % RING), (unsigned int)id_of(candidate.id));
@@ -108,7 +119,7 @@ struct Candidates {
 #pragma unroll
         for (int k = 0; k < FETCHED; ++k) {
             const unsigned int all_near = __ballot_sync(ALL, near[k]);
-            keep(near[k], places[k], x[k], pairs.kept + __popc(all_near & ((1u << search.lane) - 1)));
+            keep(search, near[k], places[k], x[k], pairs.kept + __popc(all_near & ((1u << search.lane) - 1)));
             pairs.kept += __popc(all_near);
         }
         fetched += 32 * FETCHED;
@@ -149,14 +160,14 @@ JFRNN_FUNCTION void keep_untested(const PairSearch& search, const Group& group, 
 #pragma unroll
         for (int a = 0; a < DIM; ++a)
             x[a] = group.from_center(left[k].p[a], warp.box.center[a]);
-        keep(32 * k + search.lane < pairs.kept, left[k], x, 32 * k + search.lane);
+        keep(search, 32 * k + search.lane < pairs.kept, left[k], x, 32 * k + search.lane);
     }
 }
 
 // What is put aside while something else needs the registers: a callee, who cannot use those that hold something across the call, or
 // what is done with many pairs at once. Registers are few, so memory holds it.
 struct Aside {
-    volatile unsigned int words[4 * FETCHED + 8];
+    volatile unsigned int words[4 * FETCHED + 8 + (RULE == TABLE ? 4 : 0)];
     JFRNN_MEMBER void put(const Candidates& candidates, const Matrix& matrix) {
         if constexpr (!DOUBLE) {
 #pragma unroll
@@ -170,6 +181,8 @@ struct Aside {
             for (int k = 0; k < 4; ++k) {
                 words[4 * FETCHED + k] = matrix.high[k];
                 words[4 * FETCHED + 4 + k] = matrix.low[k];
+                if constexpr (RULE == TABLE)
+                    words[4 * FETCHED + 8 + k] = matrix.of_kinds[k];
             }
         }
     }
@@ -186,6 +199,8 @@ struct Aside {
             for (int k = 0; k < 4; ++k) {
                 matrix.high[k] = words[4 * FETCHED + k];
                 matrix.low[k] = words[4 * FETCHED + 4 + k];
+                if constexpr (RULE == TABLE)
+                    matrix.of_kinds[k] = words[4 * FETCHED + 8 + k];
             }
         }
     }

@@ -8,8 +8,10 @@
 struct SearchArguments {
     const real *positions, *queries, *cutoff;
     const int *excluded_starts, *excluded, *starts;
+    const real *radii, *query_radii, *table_of_kinds;
+    const int *kinds_of_sources, *kinds_of_queries;
     int *idx, *receivers, *count, *info, *scratch;
-    int n, m, own, table, capacity, closed, drop_self, of_queries;
+    int n, m, own, table, capacity, closed, drop_self, of_queries, kinds;
 };
 struct Shared {
     Grid grid;

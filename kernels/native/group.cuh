@@ -15,6 +15,7 @@ struct Group {
     real my_place[3];  // along the axes of cells
     unsigned int system;
     real bound;           // of lane 2a the group's lowest coordinate along axis a, of lane 2a + 1 the highest
+    real largest;         // where cutoffs differ: beyond, none of the queries has a neighbor
     real unit, scale;     // coordinates from the center are multiplied by both
     float coarse_square;  // that the sums of `Matrix` start from
     Box box;
@@ -57,6 +58,10 @@ struct Group {
             square += half * half;
         }
         const float diagonal = 1.0001f * square_root((float)square);
+        if constexpr (DIFFER) {
+            real lowest;
+            reduce(search, search.upper, lowest, largest);
+        }
         choose_unit(search, center, diagonal);
         set_limits(search, diagonal);
 #pragma unroll
@@ -125,9 +130,14 @@ struct Group {
         const real radius = search.radius, between = shared_known().between;
         const real group_radius = (SCALED ? radius * scale : radius) * unit;
         const real outer = CROSSING ? (radius + 2 * search.lattice.slack()) * (SCALED ? scale : real(1)) * unit : group_radius;
-        const real near_square = outer * outer * (1 + 8 * PairSearch::step_eps) + (DOUBLE ? real(0) : real(1e-30));
+        real near_square = outer * outer * (1 + 8 * PairSearch::step_eps) + (DOUBLE ? real(0) : real(1e-30));
+        if constexpr (DIFFER) {
+            const real off = CROSSING ? 2 * search.lattice.slack() * scale : real(0);
+            near_square = PairCutoffs::outside_of(largest * scale, off) * (1 + 16 * PairSearch::step_eps) * unit * unit;
+            near_square += DOUBLE ? real(0) : real(1e-30);
+        }
         const float reach = fminf(diagonal * (float)unit + (float)outer, 240);
-        float coarse_band = reach * reach * 2e-5f;
+        float coarse_band = reach * reach * (RULE == TABLE ? 3e-5f : 2e-5f);
         const float square_unit = (float)(shared_known().site * unit) * (float)(shared_known().site * unit);
         const bool on_lattice = !DOUBLE && between > 0 && reach < 239 && coarse_band < 0.25f * square_unit;
         if (on_lattice) {
@@ -136,7 +146,8 @@ struct Group {
         } else {
             if constexpr (CROSSING)
                 coarse_band += 1.001f * (float)((outer - group_radius) * (outer + group_radius));
-            coarse_square = (float)group_radius * (float)group_radius - coarse_band;
+            const float mine = (float)(DIFFER ? search.upper * scale * unit : group_radius) * (search.few_kinds() ? 0 : 1);
+            coarse_square = mine * mine - coarse_band;
         }
         box.center[3] = near_square;
         box.half[3] = 2 * coarse_band;

@@ -19,14 +19,20 @@ JFRNN_FUNCTION unsigned int halves(float x, float factor) {
 // it does not matter) less than 4e-6, splitting and scaling less than 2e-6: less than the band of 2e-5. Negative: surely closer than
 // the cutoff; beyond 2 coarse_band: surely not; between: decided one by one. On a lattice squares are whole numbers of squared units,
 // of which that band is less than a quarter, and the limit lies in the middle between two of them: all signs are sure.
+//
+// Of few species, r^2 is a product, too: of what a query's is with each species, and of which species the candidate is. These are three
+// sums more, of terms that add up to 7.5: less than 1.8e-5 is lost, and the band is 3e-5.
 struct Matrix {
-    unsigned int high[4], low[4];  // rows, the queries of a quad of lanes, whose lanes hold one column each
+    unsigned int high[4], low[4];                  // rows, the queries of a quad of lanes, whose lanes hold one column each
+    unsigned int of_kinds[RULE == TABLE ? 4 : 1];  // and of a species each
 
-    JFRNN_MEMBER Matrix() : high{0, 0, 0, 0}, low{0, 0, 0, 0} {}
+    JFRNN_MEMBER Matrix() : high{0, 0, 0, 0}, low{0, 0, 0, 0}, of_kinds{0} {}
     // Makes rows of the queries; `x` is this lane's, from the center.
-    JFRNN_MEMBER void make(const real* x, float coarse_square, int lane) {
+    JFRNN_MEMBER void make(const PairSearch& search, const real* x, const Group& group, int lane) {
+        constexpr int SETS = RULE == TABLE ? 3 : 2;
+        const float coarse_square = group.coarse_square;
         Warp& warp = shared_warp();
-        unsigned int words[2][4];
+        unsigned int words[SETS][4];
         float square = 0;
 #pragma unroll
         for (int a = 0; a < 3; ++a) {
@@ -37,15 +43,24 @@ struct Matrix {
         }
         words[0][3] = ONES;
         words[1][3] = halves(square - coarse_square, 1);
+#pragma unroll
+        for (int k = 0; k < 4 && RULE == TABLE; ++k) {
+            const real r = search.few_kinds() && k < search.kinds ? search.of_kinds[k] : real(0);
+            const float scaled = (float)(r * group.scale * group.unit);
+            constexpr float NONE = 57600;  // as far as anything near is
+            words[SETS - 1][k] = !search.few_kinds() ? 0 : halves(r > 0 ? -(scaled * scaled) : NONE, 1);
+        }
         unsigned int* const columns = (unsigned int*)warp.candidates;
 #pragma unroll
-        for (int k = 0; k < 8; ++k)
+        for (int k = 0; k < 4 * SETS; ++k)
             columns[33 * k + lane] = words[k / 4][k % 4];
         __syncwarp();
 #pragma unroll
         for (int i = 0; i < 4; ++i) {
             high[i] = columns[33 * (lane % 4) + (lane & 28) + i];
             low[i] = columns[33 * (lane % 4 + 4) + (lane & 28) + i];
+            if constexpr (RULE == TABLE)
+                of_kinds[i] = columns[33 * (lane % 4 + 8) + (lane & 28) + i];
         }
         __syncwarp();
     }
@@ -54,6 +69,10 @@ struct Matrix {
     JFRNN_MEMBER unsigned int meet(unsigned int first_candidate, unsigned int from, unsigned int& closest, int lane) const {
         const uint4 loaded = *(const uint4*)(shared_warp().candidates[DOUBLE ? 0 : lane % 4] + first_candidate + lane / 4 * 4);
         const unsigned int column[4] = {loaded.x, loaded.y, loaded.z, loaded.w};
+        uint4 kinds{0, 0, 0, 0};
+        if constexpr (RULE == TABLE)
+            kinds = *(const uint4*)(shared_warp().candidates[DOUBLE ? 0 : 4] + first_candidate + lane / 4 * 4);
+        const unsigned int kind[4] = {kinds.x, kinds.y, kinds.z, kinds.w};
         unsigned int nibbles[4][2] = {{0, 0}, {0, 0}, {0, 0}, {0, 0}};
 #pragma unroll
         for (int j = 3; j >= 0; --j) {
@@ -67,6 +86,11 @@ struct Matrix {
                     : "=f"(sum[0]), "=f"(sum[1]), "=f"(sum[2]), "=f"(sum[3])
                     : "r"(high[2 * half]), "r"(high[2 * half + 1]), "r"(low[2 * half]), "r"(low[2 * half + 1]), "r"(column[j]),
                     "r"(again), "f"(0.0f));
+                if constexpr (RULE == TABLE)
+                    asm volatile(
+                        "mma.sync.aligned.m16n8k8.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5}, {%6}, {%0, %1, %2, %3};"
+                        : "+f"(sum[0]), "+f"(sum[1]), "+f"(sum[2]), "+f"(sum[3])
+                        : "r"(of_kinds[2 * half]), "r"(of_kinds[2 * half + 1]), "r"(kind[j] == lane % 4 ? ONES : 0u));
 #pragma unroll
                 for (int k = 0; k < 4; ++k) {
                     unsigned int& nibble = nibbles[2 * half + k / 2][k % 2];

@@ -51,6 +51,37 @@ JFRNN_FUNCTION BlockBits meet_one_by_one(const PairSearch& search, const real* q
         }
     return {hits, open};
 }
+// Meets the block one by one, each candidate by the cutoffs of both.
+JFRNN_FUNCTION BlockBits meet_by_cutoffs(const PairSearch& search, const real* q, unsigned int first_candidate) {
+    const Warp& warp = shared_warp();
+    unsigned int hits = 0, beyond = 0;
+    constexpr int ALONG = 16 / sizeof(real);
+#pragma unroll
+    for (int j = 32 - ALONG; j >= 0; j -= ALONG) {
+        struct alignas(16) Loaded {
+            real x[ALONG];
+        } loaded[DIM + OF_CUTOFFS];
+#pragma unroll
+        for (int a = 0; a < DIM + OF_CUTOFFS; ++a)
+            loaded[a] = *(const Loaded*)(warp.candidates[a] + first_candidate + j);
+#pragma unroll
+        for (int e = ALONG - 1; e >= 0; --e) {
+            real known[2] = {0, 0}, square = 0;
+#pragma unroll
+            for (int k = 0; k < OF_CUTOFFS; ++k)
+                known[k] = loaded[DIM + k].x[e];
+#pragma unroll
+            for (int a = 0; a < DIM; ++a) {
+                const real d = (loaded[a].x[e] - q[a]) * search.step_scale;
+                square += d * d;
+            }
+            const auto bounds = search.bounds_with(known);
+            hits = __funnelshift_l(upper_word(square - bounds.inside), hits, 1);
+            beyond = __funnelshift_l(upper_word(bounds.outside - square), beyond, 1);
+        }
+    }
+    return {hits, ~(hits | beyond)};
+}
 // Returns the candidates of a block that a query may meet at all: those that there are, not itself, and of half lists later ones.
 JFRNN_FUNCTION unsigned int find_met(const PairSearch& search, const Group& group, Pairs& pairs, unsigned int first_candidate) {
     const unsigned int here = pairs.kept - pairs.tested < 32 ? pairs.kept - pairs.tested : 32;
@@ -94,14 +125,26 @@ JFRNN_FUNCTION void meet_block(
     const unsigned int first_candidate = pairs.tested % RING;
     const unsigned int met = find_met(search, group, pairs, first_candidate);
     BlockBits block;
-    if constexpr (DOUBLE)
+    if constexpr (VARY && !MATRIX)
+        block = meet_by_cutoffs(search, group.mine.p, first_candidate);
+    else if constexpr (DOUBLE)
         block = meet_one_by_one(search, group.mine.p, first_candidate);
     else
         block = meet_as_matrix(matrix, first_candidate, search.lane);
     unsigned int hits = block.hits & met, open = block.open & met;
+    if constexpr (DIFFER) {
+        const bool itself = search.own && !search.drop_self && pairs.fresh && pairs.tested == 0;
+        const unsigned int sure = itself && search.lane < group.size ? 1u << search.lane : 0;  // whatever its cutoff
+        if (RULE == TABLE && MATRIX && !search.few_kinds()) {
+            open |= hits;
+            hits = 0;
+        }
+        open &= ~sure;
+        hits |= sure;
+    }
     if (__any_sync(ALL, open)) {
         aside.put(candidates, matrix);
-        const bool has_it = DOUBLE || CROSSING;
+        const bool has_it = !MATRIX || CROSSING;
         const Place query = has_it ? group.mine : open ? search.load_query(group.place + search.lane) : Place{{0, 0, 0}, 0};
         for (; open; open &= open - 1) {
             const int j = __ffs(open) - 1;

@@ -6,7 +6,9 @@
 
 constexpr int ONE_CUTOFF = -1, GATHER = 0, SCATTER = 1, EITHER = 2, BOTH = 3, MEAN = 4, TABLE = 5;  // RULE
 constexpr bool DIFFER = RULE != ONE_CUTOFF;                                                         // cutoffs
-constexpr bool BY_OWN = RULE == GATHER || RULE == BOTH || RULE == TABLE;  // no pair of a query is beyond its own cutoff
+constexpr bool VARY = DIFFER && RULE != GATHER;                             // the cutoffs of the pairs of a query
+constexpr bool BANDED = RULE == SCATTER || RULE == EITHER || RULE == BOTH;  // the bands of a pair are those of one of its particles
+constexpr bool BY_OWN = RULE == GATHER || RULE == BOTH || RULE == TABLE;    // no pair of a query is beyond its own cutoff
 constexpr real EPS = DOUBLE ? real(2.220446049250313e-16) : real(1.1920929e-07f);
 constexpr real LEAST = DOUBLE ? real(0x1p-459) : real(0x1p-40f);  // below, squares might underflow
 

@@ -1,7 +1,10 @@
 // How a pair is decided: nearly always in working precision, in doubt exactly.
+//
+// Where cutoffs DIFFER, a lane knows those of its query: what is beyond `upper` is surely no neighbor of it. Where they VARY with the
+// candidate, too, what is known of that stands beside its coordinates.
 #pragma once
-#include "exact.h"
 #include "image_search.cuh"
+#include "pair_cutoffs.h"
 
 JFRNN_FUNCTION unsigned int upper_word(real x) { return DOUBLE ? __double2hiint(x) : __float_as_uint((float)x); }
 JFRNN_FUNCTION real magnitude(real x) { return DOUBLE ? (real)fabs(x) : (real)fabsf(x); }
@@ -16,8 +19,12 @@ struct PairSearch : ImageSearch {
     real outer_radius;  // what is farther away is surely no neighbor, scaled
     real sure_square;   // what is closer surely is one, squared
     real band;  // half of the difference between both, squared: pairs in between are decided exactly; negative: there are none
+    real own_radius, upper;  // where cutoffs DIFFER: that of this lane's query, and the longest that a pair of it may have
+    const real* of_kinds;    // the cutoffs of its species
+    PairCutoffs::Bounds<real> own_bounds;
 
-    JFRNN_MEMBER explicit PairSearch(const SearchArguments& given) : ImageSearch(given) {
+    JFRNN_MEMBER explicit PairSearch(const SearchArguments& given)
+        : ImageSearch(given), own_radius(0), upper(0), of_kinds(nullptr), own_bounds{0, 0} {
         Known& known = shared_known();
         if (lane == 0) {
             known.site = SCALED ? real(0) : shared.unit;
@@ -27,8 +34,7 @@ struct PairSearch : ImageSearch {
             known.longest_before = SUMS ? 0 : *(volatile int*)&info[0];
         }
         __syncwarp();
-        // differences of images may be off by more than rounding takes from a difference
-        const real off = CROSSING ? 2 * lattice.slack() * step_scale : real(0);
+        const real off = this->off();
         outer_radius = step_radius + off;
         const real inner_radius = step_radius > off ? step_radius - off : real(0), square_radius = step_radius * step_radius;
         // where coordinates lie on a lattice nothing is in doubt, and bands are negative
@@ -36,6 +42,40 @@ struct PairSearch : ImageSearch {
                                                   : inner_radius * inner_radius - 8 * (1 + SHIFTED) * step_eps * square_radius;
         const real beyond = outer_radius * outer_radius * (1 + 16 * step_eps) - sure_square;
         band = DOUBLE && known.between > 0 ? real(-1) : CROSSING ? real(0.5) * beyond : 8 * step_eps * square_radius;
+    }
+    // By which the distances of images may be off, beyond what rounding takes from a difference.
+    JFRNN_MEMBER real off() const { return CROSSING ? 2 * lattice.slack() * step_scale : real(0); }
+    // Where cutoffs DIFFER: takes those of the query of this lane, if it has one.
+    JFRNN_MEMBER void take_cutoffs(int id, bool has_query) {
+        own_radius = RULE != SCATTER && has_query ? query_radii[id] : real(0);
+        of_kinds = RULE == TABLE ? table_of_kinds + (long long)kinds * (has_query ? kinds_of_queries[id] : 0) : nullptr;
+        upper = BY_OWN ? own_radius : RULE == MEAN ? (own_radius / 2 + radius / 2) * (1 + 4 * step_eps) : radius;
+        own_bounds = PairCutoffs::bounds_of(own_radius * step_scale, off());
+        sure_square = own_bounds.inside;  // of GATHER
+        band = (own_bounds.outside - own_bounds.inside) / 2;
+    }
+    // Are species so few that tensor cores know the cutoffs of their pairs?
+    JFRNN_MEMBER bool few_kinds() const { return RULE == TABLE && kinds <= MOST_KINDS; }
+    // What is known of the cutoffs of a source.
+    JFRNN_MEMBER void cutoffs_of(int source, real* known) const {
+        if constexpr (RULE == TABLE)
+            known[0] = bits_as_real(kinds_of_sources[source]);
+        else if constexpr (RULE == MEAN)
+            known[0] = radii[source];
+        else if constexpr (VARY) {
+            const auto bounds = PairCutoffs::bounds_of(radii[source] * step_scale, off());
+            known[0] = bounds.inside;
+            known[1] = bounds.outside;
+        }
+    }
+    // The bounds of the query of this lane and a candidate of which that is known.
+    JFRNN_MEMBER PairCutoffs::Bounds<real> bounds_with(const real* known) const {
+        if constexpr (BANDED)
+            return {PairCutoffs::of_pair(own_bounds.inside, known[0]), PairCutoffs::of_pair(own_bounds.outside, known[1])};
+        int other = RULE == TABLE ? id_of(known[0]) : 0;
+        other = (unsigned int)other < (unsigned int)kinds ? other : 0;  // behind the last candidate stands anything
+        const real r = RULE == TABLE ? of_kinds[other] : PairCutoffs::of_pair(own_radius, known[0]);
+        return PairCutoffs::bounds_of(r * step_scale, off());
     }
     // |b - a|^2 - r^2 + band in working precision, fused or not: off by less than 5 eps r^2 where it is near [0, 2 band], see
     // jfrnn/_geometry/exact.py. Negative: surely closer than the cutoff. Its upper word has the sign and, if not negative, the order
@@ -55,6 +95,8 @@ struct PairSearch : ImageSearch {
     JFRNN_MEMBER bool is_neighbor(const real* q, int my_id, int id) const {
         real p[3];
         load_image(id, p);
+        if constexpr (DIFFER)
+            return is_neighbor_by_cutoffs(q, p, my_id, id);
         const real over = excess(q, p);
         bool hit = over < 0;
         if (over >= 0 && over <= 2 * band) {
@@ -66,5 +108,25 @@ struct PairSearch : ImageSearch {
             }
         }
         return hit;
+    }
+    // The same for a candidate at `p`, by the cutoffs of both.
+    JFRNN_MEMBER bool is_neighbor_by_cutoffs(const real* q, const real* p, int my_id, int id) const {
+        const int source = source_named(id);
+        const real other = RULE == GATHER || RULE == TABLE ? real(0) : radii[source];
+        const real r = RULE == TABLE ? of_kinds[kinds_of_sources[source]] : PairCutoffs::of_pair(own_radius, other);
+        const auto bounds = PairCutoffs::bounds_of(r * step_scale, off());
+        real square = 0;
+#pragma unroll
+        for (int k = 0; k < DIM; ++k) {
+            const real d = (p[k] - q[k]) * step_scale;
+            square += d * d;
+        }
+        if (square < bounds.inside || !(square <= bounds.outside))
+            return square < bounds.inside;
+        const real first = SUM ? own_radius / 2 : r, more = SUM ? other / 2 : real(0);
+        if constexpr (INSIDE)
+            return exact_pair(q, p, first, more, closed);
+        const real* there = positions + (long long)ROW * source;
+        return exact_image(lattice, queries + (long long)ROW * my_id, there, image_of(id), first, more, closed);
     }
 };

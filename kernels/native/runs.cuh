@@ -33,7 +33,7 @@ struct Runs {
     JFRNN_FUNCTION whole find_end(const PairSearch& search, const Group& group) {
         const Grid& grid = shared_known().grid;
         const int lane = search.lane, along = lane / 2 < DIM ? lane / 2 : 0;
-        const real reach = search.reach_along(along);
+        const real reach = DIFFER && !PERIODIC ? group.largest : search.reach_along(along);
         const real x = search.cell_of(along, search.in_range(lane % 2 ? group.bound + reach : group.bound - reach));
         whole reached;
         if (search.is_periodic(along))  // numbered on beyond the ends

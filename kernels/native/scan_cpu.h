@@ -21,9 +21,6 @@ struct Points {
 struct Band {
     real inside, outside;
 };
-constexpr bool VARY = DIFFER && RULE != GATHER;                             // the cutoffs of the pairs of a query
-constexpr bool BANDED = RULE == SCATTER || RULE == EITHER || RULE == BOTH;  // the bands of a pair are those of one of its particles
-
 struct Scan : SearchArguments, Cells, SourcePlaces {
     const Wide wide;
     real inside, outside;             // the band of the pairs of a query, unless these VARY

@@ -5,14 +5,17 @@
 struct SumsArguments {
     const real *positions, *queries, *cutoff, *shared_values, *own_values, *others;
     const int *excluded_starts, *excluded;
+    const real *radii, *query_radii, *table_of_kinds;
+    const int *kinds_of_sources, *kinds_of_queries;
     real *sums, *totals, *errors, *more, *values;
     int *info, *scratch;
-    int n, m, own, table, closed, drop_self;
+    int n, m, own, table, closed, drop_self, kinds;
 
     // Of a search nothing is written but scratch.
     JFRNN_MEMBER SearchArguments of_search() const {
-        return {positions, queries, cutoff, excluded_starts, excluded, nullptr, nullptr, nullptr, nullptr, info, scratch, n, m, own,
-            table, 0, closed, drop_self, 0};
+        return {positions, queries, cutoff, excluded_starts, excluded, nullptr, radii, query_radii, table_of_kinds,
+            kinds_of_sources, kinds_of_queries, nullptr, nullptr, nullptr, info, scratch, n, m, own, table, 0, closed, drop_self, 0,
+            kinds};
     }
 };
 

@@ -44,6 +44,8 @@ struct Walk : PairSearch {
         }
     }
     JFRNN_MEMBER void walk(Group& group) {
+        if constexpr (DIFFER)
+            this->take_cutoffs(group.my_id, lane < group.size);
         group.enclose(*this);
         const Runs runs(*this, group);
         if constexpr (EXCLUDING)
@@ -89,13 +91,13 @@ struct Walk : PairSearch {
 #pragma unroll
         for (int a = 0; a < DIM; ++a)
             x[a] = lane < group.size ? group.from_center(group.mine.p[a], group.box.center[a]) : 0;
-        if constexpr (!DOUBLE)
-            matrix.make(x, group.coarse_square, lane);
+        if constexpr (MATRIX)
+            matrix.make(*this, x, group, lane);
         if (own) {
             Place at_home = group.mine;
             if constexpr (PERIODIC == 2 || SUMS)
                 at_home.id = bits_as_real(id_of_image(SUMS ? group.place + lane : group.my_id, home));
-            keep(lane < group.size, at_home, x, lane);
+            keep(*this, lane < group.size, at_home, x, lane);
             pairs.kept = group.size;
         }
     }

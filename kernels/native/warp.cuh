@@ -1,12 +1,16 @@
 // What the lanes of a warp share while they serve a group of queries, and the instructions that read and write it.
 #pragma once
 #include "cells.cuh"
+#include "pair_cutoffs.h"
 
 constexpr bool HELD = LIST || SUMS;  // pairs are held as bits until many can be written, or evaluated, together
 constexpr int BLOCKS = 22;           // of 32 candidates, whose pairs are held
 constexpr int LISTED = 32;           // neighbors of a query that are written at once
 constexpr int FETCHED = 2;           // candidates that a lane fetches at a time
-constexpr int RING = 128;            // candidates that wait: fewer than a block, and what is fetched twice, rounded up
+constexpr bool MATRIX = !DOUBLE && (!VARY || RULE == TABLE);  // queries meet candidates on tensor cores, else one by one
+constexpr int OF_CUTOFFS = BANDED ? 2 : VARY ? 1 : 0;         // numbers that are known of a candidate where cutoffs VARY
+constexpr int MOST_KINDS = 4;                                 // species that meet each other on tensor cores
+constexpr int RING = 128;  // candidates that wait: fewer than a block, and what is fetched twice, rounded up
 
 // The box around a group. The last numbers are what is near, squared, and twice the coarse band.
 struct alignas(16) Box {
@@ -18,8 +22,8 @@ struct Run {
 };
 struct alignas(16) Warp {
     union {
-        // Of a ring of candidates near the box: coordinates (float64), or columns of a matrix, pairs of halves (float32).
-        real candidates[DOUBLE ? DIM : 4][RING + 8];
+        // Of a ring of candidates near the box: columns of a matrix, pairs of halves, or coordinates, and what says their cutoffs.
+        real candidates[(MATRIX ? 4 : DIM) + OF_CUTOFFS][RING + 8];
         // Per query, while rows are written: addresses of the ids that are next, two in a word; the stride is odd, for the banks.
         unsigned int lists[SUMS ? 1 : 32][LISTED / 2 + 3];
     };

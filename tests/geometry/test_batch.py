@@ -90,6 +90,23 @@ def test_case_with_a_cutoff_per_particle(name, dtype, dim, backend):
     assert_case(name, dtype, dim, backend, radii=True, radius_rule=rule)
 
 
+@pytest.mark.parametrize("rule", ["gather", pytest.param("either", marks=SLOW)])
+def test_systems_on_top_of_each_other_whose_cutoffs_differ_widely(rule):
+    """Most particles of each system stand in one place, with tiny cutoffs: sources are sorted into a tree."""
+    random, systems, n, crowd = np.random.default_rng(0), 3, 180, 120
+    one = random.random((n, 3)).astype(np.float32)
+    one[:crowd] = 0.5 + 1e-3 * one[:crowd]
+    order = random.permutation(systems * n)
+    x, batch = np.tile(one, (systems, 1))[order], np.repeat(np.arange(systems, dtype=np.int32), n)[order]
+    cutoffs = np.tile(np.where(np.arange(n) < crowd, np.float32(1e-4), np.float32(0.3)), systems)[order]
+    nbrs = jfrnn.search(x, cutoffs, batch=batch, radius_rule=rule, capacity=256, backend="warp")
+    expected = set()
+    for system in range(systems):
+        (ids,) = np.nonzero(batch == system)
+        expected |= {(ids[i], ids[j]) for i, j, _ in reference.reference_radii(x[ids], cutoffs[ids], rule)}
+    assert set(reference.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), len(x))) == expected
+
+
 @pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
 def test_closed_and_half(backend):
     assert_case("ties", np.float32, 3, backend, closed=True)

@@ -5,10 +5,13 @@ What they answer is decided on a GPU: python -m experiments gpu experiments/conf
 
 import itertools
 
+import jax
 import launched
 import numpy as np
 import pytest
 
+import jfrnn
+from jfrnn._engine import warp
 from jfrnn._geometry.levels import GROUPS, HALVINGS
 from jfrnn.kernels import _compile, cells_cpu, cells_cuda, declare, few_cuda, hashgrid, levels
 from jfrnn.kernels._native import program
@@ -60,6 +63,37 @@ def test_boxes_batches_and_cutoffs_per_particle_compile():
     assert compiles(*cells_cuda.cell_kernels(3, False, False, True, periodic=2, batched=True)) == 3
     for rule, periodic in (("mean", 2), ("gather", 0)):
         assert compiles(levels.query_kernel(3, False, True, rule, GROUPS, HALVINGS, periodic, batched=True)) == 1
+        assert compiles(*cells_cuda.cell_kernels(3, False, True, True, periodic=periodic, rule=rule)) == (3 if periodic else 2)
+    for rule, double in (("table", False), ("either", False), ("table", True)):
+        assert compiles(*cells_cuda.cell_kernels(2, double, True, False, rule=rule)) == 2
+
+
+def test_cells_serve_where_cutoffs_are_alike_near_most_particles(monkeypatch):
+    """A core of many whose cutoffs are tiny beside a few others is for cells of many sizes; what is spread evenly never is."""
+    random, n, found = np.random.default_rng(0), 20_000, []
+    x, r = random.random((n, 3)).astype(np.float32), np.float32((28 / 4.19 / n) ** (1 / 3))
+
+    def chosen(x, cutoff, **options):
+        def by(search, **more):
+            found.append(warp.cutoffs_are_alike(search))
+            return more["cpu"](search)
+
+        monkeypatch.setattr(warp.lax, "platform_dependent", by)
+        with jax.disable_jit():
+            jfrnn.count(x, cutoff, backend="warp", **options)
+        return bool(found.pop())
+
+    for rule in ("gather", "scatter", "either"):
+        assert chosen(x, np.full(n, r), radius_rule=rule)
+        assert chosen(x, (r * random.uniform(2 / 3, 4 / 3, n)).astype(np.float32), radius_rule=rule)
+        core, cutoffs = (
+            np.where(np.arange(n)[:, None] < 19_000, 0.5 + 0.005 * x, x),
+            np.where(np.arange(n) < 19_000, 0.005 * r, 5 * r),
+        )
+        assert not chosen(core, cutoffs, radius_rule=rule)
+    assert chosen(x, np.array([[r, r / 2], [r / 2, r]]), species=np.arange(n, dtype=np.int32) % 2)
+    assert chosen(x, np.full(n, 10 * r), batch=np.arange(n, dtype=np.int32) // 200)
+    assert chosen(x, np.full(n, 2 * r), queries=x[:5], radius_rule="scatter")
 
 
 @pytest.mark.parametrize(

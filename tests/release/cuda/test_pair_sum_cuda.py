@@ -188,6 +188,9 @@ def test_a_box_holds_as_many_particles_as_their_numbers_leave_room_for(monkeypat
     assert _fused.refusal(inputs, "gpu") == "of more than 3 positions in a periodic box on the platform 'gpu'"
 
 
+SPARED = {*EXCLUDED, *TABLE, "radii", "query_radii"}  # what kernels name, and these do not read
+
+
 @pytest.mark.parametrize("periodic", [0, 1])
 def test_programs_for_cuda_call_it_and_plans_have_the_arguments_of_their_kernels(periodic):
     x, box = np.zeros((few_cuda.MOST + 1, 3), np.float32), jfrnn.Box([2.0] * 3) if periodic else None
@@ -208,7 +211,7 @@ def test_programs_for_cuda_call_it_and_plans_have_the_arguments_of_their_kernels
     ):
         for step in found.steps:
             numbers = {**found.numbers, **step.numbers}
-            assert {field.name for field in step.kernel.fields if field.is_array} <= arrays | {*found.absent, *EXCLUDED}
+            assert {field.name for field in step.kernel.fields if field.is_array} <= arrays | {*found.absent, *SPARED}
             assert all(0 <= numbers[field.name] < 2**31 for field in step.kernel.fields if not field.is_array)
 
 
@@ -234,14 +237,14 @@ def test_cutoffs_that_differ_compile_and_plans_have_the_arguments_of_their_kerne
         found = boxes_warp._plan_sums(variant, plan.text, {name: (n, 4) for name in names}, 132)
     else:
         assert f'"jfrnn_pair_sum_levels_cuda_3d_f32_own_dropself_{rule}_' in text
+        assert f'"jfrnn_pair_sum_cuda_3d_f32_scaled_own_dropself_{rule}_' in text
         variant = levels_warp._LevelVariant(3, False, False, True, False, keep, rule, 0, False, False)
         names = (*levels_warp._given(variant), "shared_values", "own_values", "columns", "sums", "totals", "errors", "info")
         results = SumsOf(plan.text, n, 2, False, False)
         found = levels_warp._plan_sums(variant, results, plan.key, {name: (n, 4) for name in names}, 132)
     (launch,) = found.steps
     assert f".entry {launch.kernel.name}(" in _compile.find_binary(launch.kernel.program, arch=90).read_text()
-    spared = {*EXCLUDED, *TABLE, "radii", "query_radii", "more"}
-    assert {field.name for field in launch.kernel.fields if field.is_array} <= {*names, *spared}
+    assert {field.name for field in launch.kernel.fields if field.is_array} <= {*names, *SPARED, "more"}
     assert all(0 <= found.numbers[field.name] < 2**31 for field in launch.kernel.fields if not field.is_array)
 
 
