@@ -1,4 +1,4 @@
-"""Search with a cutoff per particle on CUDA: queries one by one, one per thread.
+"""Search with cutoffs that differ widely on CUDA: queries one by one, one per thread. Those that are alike ride `cells_cuda`.
 
 What `jfrnn._levels` sorts, `query` walks: top cells as wide as the largest cutoff, within them groups of cutoffs, within those a
 Morton curve. A query finds the candidates of a group in the cells around it that are as wide as what the group reaches.
