@@ -28,6 +28,11 @@ _STEP, _FAR = 256, 192
 _BITS = {4: 11, 8: 22}  # of how many steps a particle is moved, by the size of a float [B]
 
 
+def is_far(units: Array) -> Array:
+    """Say along which lattice vectors points are far, of their coordinates [n, d] along these."""
+    return jnp.abs(units) >= _FAR
+
+
 def whole_steps(points: Array, units: Array, matrix: Array, periodic: Array | np.ndarray, orthogonal: bool) -> Array:
     """Return by how many lattice vectors far points [n, d] are moved, [n, d] whole floats: multiples of 256, 0 along open axes.
 
@@ -35,7 +40,7 @@ def whole_steps(points: Array, units: Array, matrix: Array, periodic: Array | np
     that lie too far away, or that would be rounded, are not moved.
     """
     steps = jnp.round(units / _STEP)
-    far = (jnp.abs(units) >= _FAR) & (jnp.abs(steps) <= 2.0 ** _BITS[points.dtype.itemsize]) & periodic
+    far = is_far(units) & (jnp.abs(steps) <= 2.0 ** _BITS[points.dtype.itemsize]) & periodic
     turns = jnp.where(far, steps * _STEP, 0)
     if orthogonal:
         return turns

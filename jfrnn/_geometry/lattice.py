@@ -16,7 +16,7 @@ from jax import Array, lax
 
 from jfrnn._geometry.box import Box
 from jfrnn._geometry.exact import Shifted
-from jfrnn._geometry.far import subtract_turns, whole_steps
+from jfrnn._geometry.far import is_far, subtract_turns, whole_steps
 from jfrnn._geometry.floats import WHOLE_BITS, distill, half_mantissa
 from jfrnn._geometry.images import Images
 
@@ -267,9 +267,27 @@ def bring_near(points: Array, lattice: Lattice) -> Near:
     """
     if lattice.images.counts_short:
         return Near(points, jnp.zeros_like(points))
+    if lattice.images.orthogonal:
+        return _bring_each_near(points, lattice)
+    return lax.platform_dependent(points, lattice, cpu=_bring_near_if_any_is_far, default=_bring_each_near)
+
+
+def _bring_each_near(points: Array, lattice: Lattice) -> Near:
     (fixed, vectors), orthogonal = lax.stop_gradient((points, lattice)), lattice.images.orthogonal
     turns = whole_steps(fixed, units_of(fixed, vectors), vectors.matrix, vectors.spread(vectors.periodic, 2), orthogonal)
     return Near(subtract_turns(points, turns, lattice.matrix, orthogonal), turns)
+
+
+def _bring_near_if_any_is_far(points: Array, lattice: Lattice) -> Near:
+    """Look first: to compute moves that nothing takes is as long as a search on a CPU; on a GPU it takes longer to ask."""
+    units = units_of(*lax.stop_gradient((points, lattice)))
+
+    def stay(points: Array, lattice: Lattice) -> Near:
+        del lattice
+        none = jnp.where(jnp.abs(units) < 0, units, 0)  # is varied over devices as the moves are
+        return Near(jnp.where(none == 0, points, none), none)
+
+    return lax.cond(is_far(units).any(), _bring_each_near, stay, points, lattice)
 
 
 def units_of(difference: Array, lattice: Lattice) -> Array:
