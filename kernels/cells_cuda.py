@@ -28,8 +28,18 @@ _TILE = 2048  # cells that a block of `scan` takes
 # of programs, not of the device: one with more or fewer multiprocessors runs as many warps, and gets the same bits. It is about 32
 # per multiprocessor of large GPUs; half and twice as many took longer on one of 132.
 _WARPS = 4096
+MOST_KINDS = 4  # species whose cutoffs tensor cores know; among more, cells of many sizes are searched
 # what all kernels of a search must agree on
-GRID = {"REACH": 1, "REACH_X": 6, "PARTS": _PARTS, "PART": _PART, "TILE": _TILE, "BLOCK": BLOCK, "WARPS": _WARPS}
+GRID = {
+    "REACH": 1,
+    "REACH_X": 6,
+    "PARTS": _PARTS,
+    "PART": _PART,
+    "TILE": _TILE,
+    "BLOCK": BLOCK,
+    "WARPS": _WARPS,
+    "MOST_KINDS": MOST_KINDS,
+}
 _HEADER_WORDS = 64
 # Blocks of kernels that walk in strides, per multiprocessor: no result depends on how many there are.
 _SWEEP = 8  # over all particles

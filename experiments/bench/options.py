@@ -1,6 +1,5 @@
 """What each option of a search costs: the same scene with one option at a time, side by side in one run."""
 
-import itertools
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,10 +17,11 @@ from experiments._library import round_capacity
 from experiments.bench import table
 
 COLUMNS = (
-    *("platform", "backend", "n", "option", "entries", "capacity", "rounds", "list_s", "count_s", "list_ratio", "count_ratio"),
+    *("platform", "backend", "n", "option", "entries", "capacity", "rounds", "list_s", "count_s", "sum_s"),
+    *("list_ratio", "count_ratio", "sum_ratio"),
     *("others_cores", "device", "jax", "warp", "commit", "dirty"),
 )
-SHOWN = ("option", "entries", "capacity", "list_s", "list_ratio", "count_s", "count_ratio")
+SHOWN = ("option", "entries", "capacity", "list_s", "list_ratio", "count_s", "count_ratio", "sum_s", "sum_ratio")
 NEIGHBORS = 30  # about so many each, away from the faces of the unit cube
 
 
@@ -50,18 +50,18 @@ def _rows(n: int, rounds: int, backend: str) -> Iterator[table.Line]:
     """Time every option once per round; medians of rounds count."""
     options = list(_options(n, NEIGHBORS))
     calls = [_compile(option, backend) for option in options]
-    for search, count in calls:
-        jax.block_until_ready((search(), count()))
-    numbered = {str(place): call for place, call in enumerate(itertools.chain.from_iterable(calls))}
+    for each in calls:
+        jax.block_until_ready([call() for call in each.values()])
+    numbered = {f"{place} {what}": call for place, each in enumerate(calls) for what, call in each.items()}
     burst = 20 if jax.default_backend() == "gpu" else 1
     seconds, others = _measure.time_in_turns(numbered, rounds, burst)
-    medians = np.median(list(seconds.values()), axis=1).reshape(len(options), 2)
-    for option, (search, _), median in zip(options, calls, medians, strict=True):
-        idx, count = search()
-        list_ratio, count_ratio = (round(float(ratio), 2) for ratio in median / medians[0])
+    medians = {name: float(np.median(found)) for name, found in seconds.items()}
+    for place, (option, each) in enumerate(zip(options, calls, strict=True)):
+        idx, count = each["list"]()
         row = {"backend": backend, "n": n, "option": option.name, "entries": int(np.asarray(count).sum(dtype=np.int64))}
-        row |= {"capacity": idx.shape[1], "rounds": rounds, "list_s": float(median[0]), "count_s": float(median[1])}
-        yield row | {"list_ratio": list_ratio, "count_ratio": count_ratio, "others_cores": others}
+        row |= {"capacity": idx.shape[1], "rounds": rounds, "others_cores": others}
+        row |= {f"{what}_s": medians[f"{place} {what}"] for what in each}
+        yield row | {f"{what}_ratio": round(medians[f"{place} {what}"] / medians[f"0 {what}"], 2) for what in each}
 
 
 def _options(n: int, neighbors: int) -> Iterator[_Option]:
@@ -100,7 +100,8 @@ def _options(n: int, neighbors: int) -> Iterator[_Option]:
         yield _Option(name, graded, jnp.asarray(radii, jnp.float32), {"radius_rule": rule})
 
 
-def _compile(option: _Option, backend: str) -> tuple[Callable[[], Any], Callable[[], Any]]:
+def _compile(option: _Option, backend: str) -> dict[str, Callable[[], Any]]:
+    """Return what lists, what counts and what sums a density; half lists, and those with a skin, are no sums."""
     given = {name: value for name, value in option.more.items() if name != "skin"}
     skin = option.more.get("skin", 0.0)
     longest = int(jfrnn.count(option.x, option.cutoff + skin, backend=backend, **given).max())
@@ -108,11 +109,22 @@ def _compile(option: _Option, backend: str) -> tuple[Callable[[], Any], Callable
     given["cutoff"] = option.cutoff
     data: dict[str, Any] = {name: value for name, value in given.items() if hasattr(value, "shape")}  # operands, no constants
     more = {name: value for name, value in given.items() if name not in data}
+    masses = jnp.linspace(1, 2, len(option.x), dtype=option.x.dtype)
 
     def list_pairs(x: jax.Array, data: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
         nbrs = jfrnn.search(x, skin=skin, capacity=capacity, backend=backend, **more, **data)
         return nbrs.idx, nbrs.count
 
-    search = jax.jit(list_pairs)
+    def density(r: jax.Array, i: jax.Array, j: jax.Array) -> jax.Array:
+        return j * jnp.maximum(1 - r @ r, 0) ** 3
+
+    def sum_pairs(x: jax.Array, masses: jax.Array, data: dict[str, Any]) -> jax.Array:
+        of_queries = {"query_values": masses} if "queries" in data else {}
+        return jfrnn.pair_sum(density, x, values=masses, backend=backend, **of_queries, **more, **data)
+
+    search, summed = jax.jit(list_pairs), jax.jit(sum_pairs)
     count = jax.jit(lambda x, data: jfrnn.count(x, backend=backend, **more, **data))
-    return lambda: search(option.x, data), lambda: count(option.x, data)
+    calls = {"list": lambda: search(option.x, data), "count": lambda: count(option.x, data)}
+    if not {"half", "skin"} & set(option.more):
+        calls["sum"] = lambda: summed(option.x, masses, data)
+    return calls

@@ -181,11 +181,11 @@ def liquid() -> str:
 def options() -> str:
     """Return what each option costs, as a multiple of a plain search."""
     rows = {name: read(f"options/{name}.csv") for name in ("cpu_warp", "gpu_warp")}
-    lines = []
+    verbs, lines = ("list", "count", "sum"), []
     for row in rows["cpu_warp"]:
         other = one(rows["gpu_warp"], option=row["option"]) or {}
-        lines.append([row["option"], *(source.get(f"{what}_ratio", "") for source in (row, other) for what in ("list", "count"))])
-    return markdown(("option", ">list, 2 cores", ">counts", ">list, H200", ">counts"), lines)
+        lines.append([row["option"], *(source.get(f"{what}_ratio", "") for source in (row, other) for what in verbs)])
+    return markdown(("option", ">list, 2 cores", ">counts", ">sum", ">list, H200", ">counts", ">sum"), lines)
 
 
 def structures() -> str:

@@ -113,6 +113,8 @@ def cutoffs_are_alike(search: Search) -> Array:
     of_queries, of_sources = (slice(None, None, -(-size // most)) for size, most in zip((m, n), SAMPLED, strict=True))
     sources = search.sources[of_sources]
     queries = (search.sources if search.queries is None else search.queries)[of_queries]
+    if cutoffs.kinds is not None and len(cutoffs.kinds[0]) > cells_cuda.MOST_KINDS:
+        return jnp.asarray(False)
     if 0 in (len(sources), len(queries)):
         return jnp.asarray(True)
     met = jnp.sum(((queries[:, None] - sources) / cutoffs.largest) ** 2, axis=-1) <= 1

@@ -36,6 +36,7 @@ constexpr int TAKEN = 4;          // pairs that a lane evaluates at once
 constexpr int PLACED = 3;         // coordinates of j before its numbers, in a row of ROW_LENGTH
 constexpr int ROW_LENGTH = 4;
 constexpr bool FROM_PLACES = false;  // the term reads coordinates of j, and no numbers
+constexpr int MOST_KINDS = 4;        // species whose cutoffs tensor cores know
 // Of few particles on CUDA (see jfrnn/kernels/few_cuda.py).
 constexpr int FEW_MOST = 4096, FEW_WARPS = 32;
 // Of searches with a cutoff per particle (see jfrnn/kernels/tree_cpu.py and levels.py).

@@ -9,7 +9,6 @@ constexpr int LISTED = 32;           // neighbors of a query that are written at
 constexpr int FETCHED = 2;           // candidates that a lane fetches at a time
 constexpr bool MATRIX = !DOUBLE && (!VARY || RULE == TABLE);  // queries meet candidates on tensor cores, else one by one
 constexpr int OF_CUTOFFS = BANDED ? 2 : VARY ? 1 : 0;         // numbers that are known of a candidate where cutoffs VARY
-constexpr int MOST_KINDS = 4;                                 // species that meet each other on tensor cores
 constexpr int RING = 128;  // candidates that wait: fewer than a block, and what is fetched twice, rounded up
 
 // The box around a group. The last numbers are what is near, squared, and twice the coarse band.

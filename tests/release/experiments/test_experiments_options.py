@@ -17,6 +17,7 @@ def test_every_option_gets_a_row(tmp_path):
     assert table["option"].is_unique
     assert len(table) == 22
     assert (table[["list_s", "count_s", "list_ratio", "count_ratio"]] > 0).all(axis=None)
+    assert set(table["option"][table["sum_s"].isna()]) == {"half", "skin of a tenth"}
     entries = dict(zip(table["option"], table["entries"], strict=True))
     assert 2 * entries["half"] == entries["open, whole list"] == entries["a cutoff per particle, equal"]
     assert entries["include_self"] == entries["open, whole list"] + 500
