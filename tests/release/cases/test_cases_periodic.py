@@ -77,12 +77,13 @@ def exact_squared(given, image):
 # Every case
 
 
+@pytest.mark.parametrize("builds", [BUILDS[1:3], pytest.param(BUILDS[::3], marks=pytest.mark.slow)], ids=["often", "rarely"])
 @pytest.mark.parametrize("name", PERIODIC_CASES)
-def test_case_is_what_it_says(name):
+def test_case_is_what_it_says(name, builds):
     case = PERIODIC_CASES[name]
     assert case.name == name
     assert case.mechanism and "\n" not in case.mechanism
-    for dtype, dim in BUILDS:
+    for dtype, dim in builds:
         given, again = case.build(dtype, dim), case.build(np.dtype(dtype).name, dim)
         assert type(given.cutoff) is float and given.cutoff == again.cutoff
         assert 0 < dtype(given.cutoff) < np.inf
