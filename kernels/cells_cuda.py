@@ -9,6 +9,8 @@ gather   positions into cell order, ranked by index within a cell: the same orde
 query    a warp serves up to 32 neighboring queries, one per lane: candidates within reach of their box meet all of them, 32 in a
          block, float32 on tensor cores first; a neighbor is a bit, until the rows are written. Those that are far from each other
          it serves one after the other: where queries are few, they are shared among more warps
+         Where cutoffs differ, but are alike: a row of tensor cores has a cutoff of its own, and up to four species theirs with each
+         other; by other rules, candidates are met one by one, each with what is known of its cutoff beside its coordinates
 crossing the same in a periodic box, for queries whose reach leaves it: images take registers, which the others have no use for
 """
 

@@ -18,11 +18,9 @@ from jfrnn.kernels._program import Kernel, declare
 LEAF = 16  # sources of a leaf
 FANOUT = 16  # nodes of a node
 CLASS_BITS = 1  # of cutoffs that are alike, behind the leading one
-LEAST_TOGETHER = (
-    6  # queries of a group: where fewer are in a cube as wide as their cutoff is, that is doubled along axis after axis
-)
-MOST_TOGETHER = 32
-MOST_DOUBLED, MOST_HALVED = 6, 9  # axes
+# Queries of a group: a cube as wide as their cutoff is doubled along an axis where it holds fewer, halved where it holds more.
+LEAST_TOGETHER, MOST_TOGETHER = 6, 32
+MOST_DOUBLED, MOST_HALVED = 6, 9  # times
 _MOST_LANES = 16
 
 
@@ -47,7 +45,7 @@ PROVIDER = {"places_cpu.h": '#include "cutoffs_cpu.h"\n', "query_walk_cpu.h": '#
 
 
 def constants_of(rule: str) -> dict[str, int]:
-    """Return the constants of programs that walk a tree."""
+    """Return the constants of programs for cutoffs that differ by a rule."""
     constants: dict[str, int] = {"RULE": RULES.index(rule), "SUM": rule == "mean", "SCALED": True, "LEAF": LEAF, "FANOUT": FANOUT}
     constants |= {"CLASS_BITS": CLASS_BITS, "LEAST_TOGETHER": LEAST_TOGETHER, "MOST_TOGETHER": MOST_TOGETHER}
     return constants | {"MOST_DOUBLED": MOST_DOUBLED, "MOST_HALVED": MOST_HALVED}
@@ -55,7 +53,8 @@ def constants_of(rule: str) -> dict[str, int]:
 
 def _constants(rule: str, periodic: int, batched: bool) -> dict[str, int]:
     found = {**cells_cpu.GRID, "PERIODIC": periodic, "BATCHED": batched, "SUMS": 0, "LIST": 0, **constants_of(rule)}
-    return found | {"CHUNK": cells_cpu.CHUNK, "QUERY_CHUNK": cells_cpu.QUERY_CHUNK, "MANY": cells_cpu.MANY}
+    found |= {"CHUNK": cells_cpu.CHUNK, "QUERY_CHUNK": cells_cpu.QUERY_CHUNK}
+    return found | {"MANY": cells_cpu.MANY, "TOGETHER": cells_cpu.TOGETHER}
 
 
 def _variant(dim: int, double: bool, rule: str, periodic: int, batched: bool) -> str:
@@ -77,13 +76,7 @@ def query_kernel(
     dim: int, double: bool, rule: str, lists: bool, periodic: int = 0, batched: bool = False, excluding: int = 0, flat: bool = False
 ) -> Kernel:
     """Return what lists or counts, whose work threads share; options are those of `jfrnn.kernels._native.program`."""
-    constants = {
-        **_constants(rule, periodic, batched),
-        "LIST": lists,
-        "FLAT": flat,
-        "EXCLUDING": excluding,
-        "TOGETHER": cells_cpu.TOGETHER,
-    }
+    constants = {**_constants(rule, periodic, batched), "LIST": lists, "FLAT": flat, "EXCLUDING": excluding}
     constants["CANDIDATES"] = 1024 if double else 1536  # as many as among cells
     variant = f"{_variant(dim, double, rule, periodic, batched)}{'_list' * lists}{'_flat' * flat}{'_excluding' * excluding}"
     return declare(f"tree_cpu_{variant}", program(double, dim, "rows_cpu.h", given=PROVIDER, **constants), "Rows.run")[0]

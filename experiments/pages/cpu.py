@@ -181,11 +181,14 @@ def liquid() -> str:
 def options() -> str:
     """Return what each option costs, as a multiple of a plain search."""
     rows = {name: read(f"options/{name}.csv") for name in ("cpu_warp", "gpu_warp")}
-    verbs, lines = ("list", "count", "sum"), []
+    titles = {"list_ratio": "list", "count_ratio": "counts", "sum_ratio": "sum"}
+    columns = [(name, what) for name, found in rows.items() for what in titles if any(row.get(what) for row in found)]
+    lines = []
     for row in rows["cpu_warp"]:
-        other = one(rows["gpu_warp"], option=row["option"]) or {}
-        lines.append([row["option"], *(source.get(f"{what}_ratio", "") for source in (row, other) for what in verbs)])
-    return markdown(("option", ">list, 2 cores", ">counts", ">sum", ">list, H200", ">counts", ">sum"), lines)
+        both = {"cpu_warp": row, "gpu_warp": one(rows["gpu_warp"], option=row["option"]) or {}}
+        lines.append([row["option"], *(both[name].get(what, "") for name, what in columns)])
+    heads = [f">{titles[what]}" + f", {machine(rows[name])}" * (what == "list_ratio") for name, what in columns]
+    return markdown(("option", *heads), lines)
 
 
 def structures() -> str:

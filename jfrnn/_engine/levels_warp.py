@@ -1,4 +1,4 @@
-"""CUDA inside JAX where cutoffs differ from particle to particle: lists, counts and sums over cells of many sizes."""
+"""CUDA inside JAX where cutoffs differ widely from particle to particle: lists, counts and sums over cells of many sizes."""
 
 import functools
 from typing import NamedTuple

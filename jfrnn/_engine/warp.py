@@ -62,7 +62,7 @@ class WarpEngine:
         return missing(platform)
 
     def rows(self, search: Search, options: Options, capacity: int | Room | None) -> Rows:
-        """Search among cells, or where cutoffs differ from particle to particle, among cells of many sizes."""
+        """Search among cells; where cutoffs differ widely, in a tree (CPU) or among cells of many sizes (CUDA)."""
         if search.per_system:
             return box_neighbors(search._replace(checks={}), options.filter, capacity)
         if isinstance(search.cutoff, Cutoffs):
@@ -239,7 +239,7 @@ def _few_callable(variant: Variant) -> Call:
 
 def _plan_on_cuda(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan:
     kind = {"periodic": variant.periodic, "batched": variant.batched, "excluding": variant.excluding, "flat": variant.flat}
-    kind["rule"] = variant.rule
+    kind |= {"rule": variant.rule}
     dim, later = variant.dim, variant.keep.later_only
     kernels = cells_cuda.cell_kernels(dim, variant.double, variant.scaled, variant.lists, later, **kind)
     numbers = plan_numbers(variant, shapes)

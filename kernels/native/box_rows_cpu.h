@@ -1,6 +1,7 @@
 // Rows of neighbors, or their counts, in systems with boxes of their own on the CPU.
 #pragma once
 #include "box_pairs_cpu.h"
+#include "chunks.h"
 #include "row_places.h"
 
 struct BoxRows : BoxLanes {
@@ -9,17 +10,14 @@ struct BoxRows : BoxLanes {
     // Threads hand themselves chunks of queries; `info` holds the length of the longest row, and the next chunk.
     void run() {
         int longest = 0;
-        for (;;) {
-            const long long begin = (long long)QUERY_CHUNK * __atomic_fetch_add(&info[1], 1, __ATOMIC_RELAXED);
-            if (begin >= m)
-                break;
-            for (long long turn = begin; turn < m && turn < begin + QUERY_CHUNK; ++turn) {
-                go_to((int)turn);
+        each_chunk(info[1], m, QUERY_CHUNK, [&](int from, int to, int) {
+            for (int turn = from; turn < to; ++turn) {
+                go_to(turn);
                 const int found = serve();
                 count[query] = found;
                 longest = found > longest ? found : longest;
             }
-        }
+        });
         int known = __atomic_load_n(&info[0], __ATOMIC_RELAXED);
         while (
             known < longest && !__atomic_compare_exchange_n(&info[0], &known, longest, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}

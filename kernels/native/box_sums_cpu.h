@@ -2,6 +2,7 @@
 #pragma once
 #include "box_pairs_cpu.h"
 #include "box_sums.h"
+#include "chunks.h"
 #include "reduction_cpu.h"
 
 struct BoxSums : BoxLanes {
@@ -20,17 +21,13 @@ struct BoxSums : BoxLanes {
           next(a.info) {}
 
     void run() {
-        for (;;) {
-            const int chunk = __atomic_fetch_add(next, 1, __ATOMIC_RELAXED);
-            const long long begin = (long long)QUERY_CHUNK * chunk;
-            if (begin >= m)
-                break;
-            for (long long turn = begin; turn < m && turn < begin + QUERY_CHUNK; ++turn) {
-                go_to((int)turn);
+        each_chunk(*next, m, QUERY_CHUNK, [&](int from, int to, int chunk) {
+            for (int turn = from; turn < to; ++turn) {
+                go_to(turn);
                 serve();
             }
             results.store_totals(chunk);
-        }
+        });
     }
     void serve() {
         const Term::Own own_part = term.own(own_values + (long long)query * OWN, q);

@@ -1,6 +1,7 @@
 // How sources (and queries, if they are others) are sorted by cell on the CPU, and where things lie in the scratch meanwhile.
 #pragma once
 #include "cells.h"
+#include "chunks.h"
 
 struct Shared {
     Grid grid;
@@ -169,16 +170,12 @@ struct Gather : GatherArguments, Places {
         : GatherArguments(given), Places(given.cutoff, given.scratch, given.n, given.m, given.own, given.table) {}
 
     void gather() {
-        for (;;) {
-            const int chunk = __atomic_fetch_add(&shared.next_gathered, 1, __ATOMIC_RELAXED);
-            if ((long long)chunk * CHUNK >= n)
-                break;
-            const int begin = chunk * CHUNK, end = n - begin < CHUNK ? n : begin + CHUNK;
-            for (int place = begin; place < end; ++place) {
+        each_chunk(shared.next_gathered, n, CHUNK, [&](int from, int to, int) {
+            for (int place = from; place < to; ++place) {
                 constexpr int AHEAD = 16;  // places
                 __builtin_prefetch(positions + (long long)ROW * ids[place + AHEAD < n ? place + AHEAD : place]);
                 put_coordinates(positions, ids[place], place);
             }
-        }
+        });
     }
 };

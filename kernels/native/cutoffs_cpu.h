@@ -124,6 +124,5 @@ struct CutoffSort : TreeSortArguments {
         }
         return met <= MOST_MET * near;
     }
-    real reach_of(int id) const { return RULE != SCATTER ? query_radii[id] : own ? radii[id] : cells.radius; }
 };
 typedef TreeScratch SourcePlaces;

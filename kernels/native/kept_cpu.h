@@ -1,5 +1,6 @@
 // Lists that are kept, on the CPU: LANES slots of a row at a time, whose pairs are told, or what a term makes of them.
 #pragma once
+#include "chunks.h"
 #include "kept.h"
 #include "wide.h"
 
@@ -140,16 +141,12 @@ struct KeptRows : Kept {
     void run() {
         if constexpr (FLUSHED)
             floats.flush();
-        for (;;) {
-            const int chunk = __atomic_fetch_add(next, 1, __ATOMIC_RELAXED);
-            if ((long long)chunk * QUERY_CHUNK >= m)
-                break;
-            const int begin = chunk * QUERY_CHUNK, end = m - begin < QUERY_CHUNK ? m : begin + QUERY_CHUNK;
-            for (int row = begin; row < end; ++row) {
+        each_chunk(*next, m, QUERY_CHUNK, [&](int from, int to, int chunk) {
+            for (int row = from; row < to; ++row) {
                 enter(row);
                 visitor().serve(row, own_point(row));
             }
             visitor().finish_chunk(chunk);
-        }
+        });
     }
 };

@@ -1,5 +1,6 @@
 // Reverse slots on the CPU: for the pair (i, j) in a row of i, the row of j is read until i is found, LANES ids at a time.
 #pragma once
+#include "chunks.h"
 #include "lanes.h"
 #include "reverse.h"
 
@@ -40,13 +41,10 @@ struct Reverse : ListOfRows {
             slots[slot] = none();
     }
     void run() const {
-        for (;;) {
-            const int first = __atomic_fetch_add(info, 1, __ATOMIC_RELAXED) * QUERY_CHUNK;
-            if (first >= n)
-                return;
-            for (int i = first; i < n && i < first + QUERY_CHUNK; ++i)
+        each_chunk(*info, n, QUERY_CHUNK, [&](int from, int to, int) {
+            for (int i = from; i < to; ++i)
                 reverse_row(i);
-        }
+        });
     }
 };
 

@@ -21,6 +21,7 @@ struct Points {
 struct Band {
     real inside, outside;
 };
+
 struct Scan : SearchArguments, Cells, SourcePlaces {
     const Wide wide;
     real inside, outside;             // the band of the pairs of a query, unless these VARY

@@ -13,14 +13,10 @@ struct SortValues : SortValuesArguments {
 
     void run() {
         const Scratch in(scratch, n, m, own, table);
-        for (;;) {
-            const int chunk = __atomic_fetch_add(&in.shared.next_sorted, 1, __ATOMIC_RELAXED);
-            if ((long long)chunk * CHUNK >= n)
-                break;
-            const int begin = chunk * CHUNK, end = n - begin < CHUNK ? n : begin + CHUNK;
-            for (int place = begin; place < end; ++place)
+        each_chunk(in.shared.next_sorted, n, CHUNK, [&](int from, int to, int) {
+            for (int place = from; place < to; ++place)
                 for (int c = 0; c < width; ++c)
                     columns[(long long)c * n + place] = others[(long long)width * in.ids[place] + c];
-        }
+        });
     }
 };

@@ -56,6 +56,9 @@ struct TreeSortArguments {
     const int* kinds_of_sources;
     int *info, *scratch;
     int n, m, own, table;
+
+    // How wide a group around a query of an id may be: its cutoff, or what is known of it.
+    real reach_of(int id) const { return RULE != SCATTER ? query_radii[id] : own ? radii[id] : cutoff[0]; }
 };
 
 struct TreePlaces : TreeSortArguments, Cells, TreeScratch {
@@ -141,18 +144,14 @@ struct TreePlaces : TreeSortArguments, Cells, TreeScratch {
 struct TreeGather : TreePlaces {
     explicit TreeGather(const TreeSortArguments& given) : TreePlaces(given) {}
     void gather() {
-        for (;;) {
-            const int chunk = __atomic_fetch_add(&shared.next_gathered, 1, __ATOMIC_RELAXED);
-            if ((long long)chunk * CHUNK >= n)
-                break;
-            const int begin = chunk * CHUNK, end = n - begin < CHUNK ? n : begin + CHUNK;
-            put_in_order(begin, end);
+        each_chunk(shared.next_gathered, n, CHUNK, [&](int from, int to, int) {
+            put_in_order(from, to);
             if (shared.cells_for > 0)
-                continue;
-            make_leaves(begin, end);
-            if (__atomic_add_fetch(&shared.gathered, end - begin, __ATOMIC_ACQ_REL) == n)
+                return;
+            make_leaves(from, to);
+            if (__atomic_add_fetch(&shared.gathered, to - from, __ATOMIC_ACQ_REL) == n)
                 make_nodes();
-        }
+        });
     }
 };
 
@@ -365,8 +364,6 @@ struct TreeSort : TreePlaces {
             sort_by_number(
                 at, from, to, [&](int i) { return (int)(system_of(points + (long long)ROW * i) >> shift & (DIGITS - 1)); });
     }
-    // How wide a group around a query of an id may be: its cutoff, or what is known of it.
-    real reach_of(int id) const { return RULE != SCATTER ? query_radii[id] : own ? radii[id] : radius; }
     // Brings queries together whose cutoffs are alike: they meet the same sources.
     void sort_by_reach(int finite) {
         const int largest = class_of(radius);

@@ -1,7 +1,8 @@
 // Groups of queries meet the sources in the leaves of a tree that are near them, on the CPU, where cutoffs differ.
 //
-// A group are queries that follow each other along the curve, with similar cutoffs, in a cube about as wide as these. Which nodes are near its box is a matter of
-// distances between boxes: rounding is monotone, so that no source of a node is nearer to a query, by `square_of`, than both boxes are.
+// A group are queries that follow each other along the curve, with similar cutoffs, in a cube about as wide as these. Which nodes are
+// near its box is a matter of distances between boxes: rounding is monotone, so that no source of a node is nearer to a query, by
+// `square_of`, than both boxes are.
 #pragma once
 #include "walk_cpu.h"
 
@@ -69,8 +70,8 @@ struct TreeWalk : Walk<Query> {
         for (int node = from; node < to; node += LANES) {
             unsigned int near = near_nodes(box, first + node) & lanes_before(to - node);
             while (near) {
-                const int skipped = __builtin_ctz(near), run = level > 0 ? 1 : __builtin_ctz(~(near >> skipped)),
-                          found = node + skipped;
+                const int skipped = __builtin_ctz(near), found = node + skipped;
+                const int run = level > 0 ? 1 : __builtin_ctz(~(near >> skipped));
                 near &= ~(((1u << run) - 1) << skipped);
                 if (level > 0) {
                     const int low = system_from / size, high = (system_to - 1) / size + 1;
@@ -196,18 +197,14 @@ struct TreeWalk : Walk<Query> {
         for (int k = 0; k < DIM; ++k)
             cell[k] = __builtin_elementwise_floor((query_at[k][place - chunk] - shared.grid.low[k]) * cube.cells[k]);
         int stop = place;
-        for (unsigned int same = ~0u; stop < most && same;) {
+        for (int more = LANES; stop < most && more == LANES; stop += more) {
             const int at = stop - chunk;
             vec beside{};
             for (int k = 0; k < DIM; ++k) {
                 const vec there = __builtin_elementwise_floor((lanes_from(query_at[k] + at) - shared.grid.low[k]) * cube.cells[k]);
                 beside += there == cell[k] ? vec{} : vec{} + 1;
             }
-            same = mask_of(beside, real(0.5), Below{});
-            const int more = __builtin_ctz(~same);
-            stop += more;
-            if (more < LANES)
-                break;
+            more = __builtin_ctz(~mask_of(beside, real(0.5), Below{}));
         }
         for (int s = place + 1; s < stop && s < most; ++s)
             if (system_at(s) != system || this->class_of(query_reach[s - chunk]) != this->class_of(query_reach[place - chunk]))

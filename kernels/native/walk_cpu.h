@@ -28,15 +28,16 @@ struct Walk : Scan {
     int begin, end;       // places of the queries that are served
     bool fresh;           // no candidates have been met
     unsigned int system;  // theirs
-    real group_radius,
-        group_outside;  // where cutoffs differ: the largest of the queries, and the square beyond which no pair is by that
-    int side;           // whether the image lies behind (-1), at home, or ahead
-    int shift[3];       // of the image, in lattice vectors
-    real moved[3];      // by which its sources are moved
+    // Where cutoffs differ: the largest of the queries, and the square beyond which no pair is by that alone.
+    real group_radius, group_outside;
+    int side;       // whether the image lies behind (-1), at home, or ahead
+    int shift[3];   // of the image, in lattice vectors
+    real moved[3];  // by which its sources are moved
 
     explicit Walk(const SearchArguments& given)
         : Scan(given), finite_places(shared.finite_queries), group_radius(0), group_outside(0), shift{0, 0, 0}, moved{0, 0, 0} {}
     Query& query() { return *(Query*)this; }
+    const Query& query() const { return *(const Query*)this; }
 
     // Finds the largest cutoff of the queries that are served.
     void find_group_cutoff() {
@@ -55,7 +56,7 @@ struct Walk : Scan {
         else if constexpr (RULE == GATHER)
             return group_outside;
         else
-            return farthest_by(((const Query*)this)->radii_there + from);
+            return farthest_by(query().radii_there + from);
     }
     auto farthest_by(const real* of_sources) const {
         if constexpr (RULE == GATHER)
@@ -157,7 +158,7 @@ struct Walk : Scan {
         if constexpr (RULE == TABLE)
             pack(lanes_from(query().kinds_there + from), candidate_kind + filled, near);
         else if constexpr (VARY)
-            pack(lanes_from(((const Query*)this)->radii_there + from), candidate_radius + filled, near);
+            pack(lanes_from(query().radii_there + from), candidate_radius + filled, near);
     }
     // Packs what tells the candidates apart: their sources, and which images they are.
     void pack_names(ints numbers, unsigned int near) {
@@ -171,14 +172,10 @@ struct Walk : Scan {
             pack(3 * numbers + (1 + side), candidate_order + filled, near);
     }
     void run() {
-        for (;;) {
-            const int chunk = __atomic_fetch_add(&shared.next_chunk, 1, __ATOMIC_RELAXED);
-            if ((long long)chunk * QUERY_CHUNK >= m)
-                break;
-            const int place = chunk * QUERY_CHUNK;
-            query().serve_chunk(place, m - place < QUERY_CHUNK ? m : place + QUERY_CHUNK);
+        each_chunk(shared.next_chunk, m, QUERY_CHUNK, [&](int from, int to, int chunk) {
+            query().serve_chunk(from, to);
             query().chunk_done(chunk);
-        }
+        });
         query().finish();
     }
 };
