@@ -20,7 +20,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from jfrnn._geometry.floats import half_mantissa, two_sum
 
@@ -33,52 +33,57 @@ def is_far(units: Array) -> Array:
     return jnp.abs(units) >= _FAR
 
 
-def whole_steps(points: Array, units: Array, matrix: Array, periodic: Array | np.ndarray, orthogonal: bool) -> Array:
-    """Return by how many lattice vectors far points [n, d] are moved, [n, d] whole floats: multiples of 256, 0 along open axes.
+def move_near(
+    points: Array, units: Array, matrix: Array, periodic: Array | np.ndarray, orthogonal: bool, rarely: bool = False
+) -> tuple[Array, Array]:
+    """Return points - turns @ matrix, [n, d], exactly, and turns, [n, d] whole floats: multiples of 256, 0 along open axes.
 
-    `units` [n, d] are their coordinates along the vectors, `matrix` [d, d] the vectors of all or [n, d, d] those of each. Points
-    that lie too far away, or that would be rounded, are not moved.
+    `units` [n, d] are the coordinates of the points along the vectors, `matrix` [d, d] the vectors of all or [n, d, d] those of
+    each. Points that lie too far away, or that would be rounded, are not moved. Differentiable in points and matrix. What is done
+    `rarely` is a loop, which takes XLA a third of the time to compile.
     """
     steps = jnp.round(units / _STEP)
     far = is_far(units) & (jnp.abs(steps) <= 2.0 ** _BITS[points.dtype.itemsize]) & periodic
-    turns = jnp.where(far, steps * _STEP, 0)
-    if orthogonal:
-        return turns
-    _, exact = _subtract_checked(points, turns, matrix)
-    return jnp.where(exact[:, None], turns, 0)
+    return _subtract(points, jnp.where(far, steps * _STEP, 0), matrix, orthogonal, rarely)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
-def subtract_turns(points: Array, turns: Array, matrix: Array, orthogonal: bool) -> Array:
-    """Return x - turns @ matrix, [n, d], of one matrix or one per row, for turns of `whole_steps`: exactly.
-
-    Differentiable in points and matrix.
-    """
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
+def _subtract(points: Array, turns: Array, matrix: Array, orthogonal: bool, rarely: bool) -> tuple[Array, Array]:
+    """Return x - turns @ matrix, [n, d], of one matrix or one per row, and the turns; those of rows that would be rounded are 0."""
     if not orthogonal:
-        return jnp.where((turns != 0).any(axis=1, keepdims=True), _subtract_checked(points, turns, matrix)[0], points)
+        moved, exact = _subtract_checked(points, turns, matrix, rarely)
+        turns = jnp.where(exact[:, None], turns, 0)
+        return jnp.where((turns != 0).any(axis=1, keepdims=True), moved, points), turns
     lengths = jnp.stack([matrix[..., k, k] for k in range(points.shape[1])], axis=-1)
     high = half_mantissa(lengths)
     high, low = (x if x.ndim == 2 else x[None] for x in (high, lengths - high))
-    return jnp.where(turns == 0, points, (points - turns * high) - turns * low)
+    return jnp.where(turns == 0, points, (points - turns * high) - turns * low), turns
 
 
-@subtract_turns.defjvp
+@_subtract.defjvp
 def _subtract_jvp(
-    orthogonal: bool, primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]
-) -> tuple[Array, Array]:
+    orthogonal: bool, rarely: bool, primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     (points, turns, matrix), (moved, _, stretched) = primals, tangents
+    near, turns = _subtract(points, turns, matrix, orthogonal, rarely)
     rows = (turns[:, k, None] * stretched[..., k, :] for k in range(points.shape[1]))
-    return subtract_turns(points, turns, matrix, orthogonal), moved - functools.reduce(jnp.add, rows)
+    return (near, turns), (moved - functools.reduce(jnp.add, rows), jnp.zeros_like(turns))
 
 
-def _subtract_checked(points: Array, turns: Array, matrix: Array) -> tuple[Array, Array]:
+def _subtract_checked(points: Array, turns: Array, matrix: Array, rarely: bool) -> tuple[Array, Array]:
     """Return x - turns @ matrix, [n, d], and for which rows nothing was rounded."""
     high, dim = half_mantissa(matrix), points.shape[1]
-    total, rest, lost = points, jnp.zeros_like(points), jnp.zeros_like(points)
-    for part in (high, matrix - high):
-        for k in range(dim):
-            total, error = two_sum(total, -turns[:, k, None] * part[..., k, :])
-            rest, more = two_sum(rest, error)
-            lost = lost + jnp.abs(more)
+    factors = jnp.concatenate([turns, turns], axis=1)
+    rows = jnp.concatenate([high, matrix - high], axis=-2)
+
+    def subtract(k: int | Array, sums: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        total, rest, lost = sums
+        factor, row = factors[:, k, None], rows[..., k, :]
+        total, error = two_sum(total, -factor * row)
+        rest, more = two_sum(rest, error)
+        return total, rest, lost + jnp.abs(more)
+
+    sums = points, 0 * points, 0 * points
+    total, rest, lost = lax.fori_loop(0, 2 * dim, subtract, sums, unroll=not rarely)
     total, error = two_sum(total, rest)
     return total, ((lost == 0) & (error == 0)).all(axis=1)

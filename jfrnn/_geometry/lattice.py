@@ -16,7 +16,7 @@ from jax import Array, lax
 
 from jfrnn._geometry.box import Box
 from jfrnn._geometry.exact import Shifted
-from jfrnn._geometry.far import is_far, subtract_turns, whole_steps
+from jfrnn._geometry.far import is_far, move_near
 from jfrnn._geometry.floats import WHOLE_BITS, distill, half_mantissa
 from jfrnn._geometry.images import Images
 
@@ -272,10 +272,11 @@ def bring_near(points: Array, lattice: Lattice) -> Near:
     return lax.platform_dependent(points, lattice, cpu=_bring_near_if_any_is_far, default=_bring_each_near)
 
 
-def _bring_each_near(points: Array, lattice: Lattice) -> Near:
-    (fixed, vectors), orthogonal = lax.stop_gradient((points, lattice)), lattice.images.orthogonal
-    turns = whole_steps(fixed, units_of(fixed, vectors), vectors.matrix, vectors.spread(vectors.periodic, 2), orthogonal)
-    return Near(subtract_turns(points, turns, lattice.matrix, orthogonal), turns)
+def _bring_each_near(points: Array, lattice: Lattice, rarely: bool = False) -> Near:
+    fixed = lax.stop_gradient(lattice)
+    units = units_of(lax.stop_gradient(points), fixed)
+    periodic = fixed.spread(fixed.periodic, 2)
+    return Near(*move_near(points, units, lattice.matrix, periodic, lattice.images.orthogonal, rarely))
 
 
 def _bring_near_if_any_is_far(points: Array, lattice: Lattice) -> Near:
@@ -287,7 +288,8 @@ def _bring_near_if_any_is_far(points: Array, lattice: Lattice) -> Near:
         none = jnp.where(jnp.abs(units) < 0, units, 0)  # is varied over devices as the moves are
         return Near(jnp.where(none == 0, points, none), none)
 
-    return lax.cond(is_far(units).any(), _bring_each_near, stay, points, lattice)
+    move = functools.partial(_bring_each_near, rarely=True)
+    return lax.cond(is_far(units).any(), move, stay, points, lattice)
 
 
 def units_of(difference: Array, lattice: Lattice) -> Array:

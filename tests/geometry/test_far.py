@@ -10,7 +10,7 @@ import pytest
 import reference
 
 import jfrnn
-from jfrnn._geometry.far import subtract_turns, whole_steps
+from jfrnn._geometry.far import move_near
 from jfrnn._geometry.images import LARGEST_TURN, images_of
 from jfrnn._geometry.lattice import make_lattice
 from jfrnn._geometry.wrapping import count_turns, unpack_turns
@@ -225,12 +225,8 @@ def test_nothing_is_rounded(dtype):
     x = np.multiply.outer(turns, lengths).astype(dtype).reshape(-1, 1)
     matrix = np.broadcast_to(lengths, (len(turns), len(lengths))).reshape(-1, 1, 1).astype(dtype)
 
-    @jax.jit
-    def both(x, units, matrix):
-        steps = whole_steps(x, units, matrix, np.array([True]), True)
-        return steps, subtract_turns(x, steps, matrix, True)
-
-    steps, near = map(np.asarray, both(x, x / matrix[:, 0], matrix))
+    both = jax.jit(lambda x, units, matrix: move_near(x, units, matrix, np.array([True]), True))
+    near, steps = map(np.asarray, both(x, x / matrix[:, 0], matrix))
     assert (np.abs(near) < 193 * matrix[:, 0]).all()
     assert (steps != 0).mean() > 0.3
     for k in rng.choice(len(x), 4000, replace=False):
