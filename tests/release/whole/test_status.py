@@ -201,16 +201,20 @@ OUTSIDE = dict(  # calls that are not for jit
 )
 
 
-def observed():
-    """Run every call for every bit; return the table: the name of a call -> what it does in the four columns."""
+def observed(every=False):
+    """Run every call for every bit; return the table: the name of a call -> what it does in the four columns.
+
+    If not `every` call is run for each bit, the bits that mean missing pairs take turns, call by call.
+    """
     table = {name: [] for name in VERBS | OUTSIDE}
     for bits in KINDS.values():
         for traced in (False, True):
             words = {}
-            for bit in bits:
-                if traced or bit != Status.EXCLUDED_OUT_OF_RANGE:  # outside jit, the search itself raises
-                    verbs = VERBS if traced else VERBS | OUTSIDE
-                    words[bit] = calls({name: functools.partial(verb, bit, traced) for name, verb in verbs.items()}, traced)
+            asked = [bit for bit in bits if traced or bit != Status.EXCLUDED_OUT_OF_RANGE]  # outside jit, the search itself raises
+            for turn, bit in enumerate(asked):
+                verbs = list((VERBS if traced else VERBS | OUTSIDE).items())
+                verbs = dict(verbs if every else verbs[turn :: len(asked)])
+                words[bit] = calls({name: functools.partial(verb, bit, traced) for name, verb in verbs.items()}, traced)
             for name, cells in table.items():
                 found = {bit: said[name] for bit, said in words.items() if name in said}
                 if "grow" in name and Status.BOX_TOO_SMALL in found:
@@ -284,13 +288,14 @@ def as_rows(table):
 
 
 @functools.cache
-def everything():
+def everything(every):
     outside, inside = full_lists(False), full_lists(True)
-    return {name: [*cells, outside.get(name, ""), inside.get(name, "")] for name, cells in observed().items()}
+    return {name: [*cells, outside.get(name, ""), inside.get(name, "")] for name, cells in observed(every).items()}
 
 
-def test_the_page_says_what_every_call_does():
-    assert rows_of_page("Searches, lists and sums") == as_rows(everything())
+@pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["in_turns", "every"])
+def test_the_page_says_what_every_call_does(every):
+    assert rows_of_page("Searches, lists and sums") == as_rows(everything(every))
 
 
 def test_the_page_says_what_calls_about_walls_do():
@@ -306,7 +311,7 @@ def test_every_bit_has_a_row_and_a_message():
 
 def test_no_call_answers_with_a_number_where_it_may_be_wrong():
     """Not one cell of bits that mean missing pairs is a plain number."""
-    for name, (_, _, *cells) in everything().items():
+    for name, (_, _, *cells) in everything(False).items():
         assert all(cell != "without it" for cell in cells), name
 
 
