@@ -92,7 +92,8 @@ def _compile(asked: Asked, backend: str) -> tuple[Calls, table.Line]:
     """Return what lists, counts and sums a density, and entries and capacity; of half lists, and with a skin, there is no sum."""
     given = {name: value for name, value in asked.more.items() if name != "skin"} | {"cutoff": asked.cutoff}
     skin = asked.more.get("skin", 0.0)
-    data: dict[str, Any] = {name: value for name, value in given.items() if hasattr(value, "shape")}  # operands, no constants
+    # Arrays are operands, no constants, but for exclusions: those that are known are sorted once, and not in each call.
+    data: dict[str, Any] = {name: value for name, value in given.items() if hasattr(value, "shape") and name != "exclude"}
     more = {name: value for name, value in given.items() if name not in data}
     x, masses = asked.x, jnp.linspace(1, 2, len(asked.x), dtype=asked.x.dtype)
 
