@@ -12,7 +12,7 @@ import numpy as np
 import typer
 
 import jfrnn
-from experiments import _machine, _measure
+from experiments import _machine, _measure, methods
 from experiments._commands import Engine, Points, Rounds
 from experiments._library import round_capacity
 from experiments.bench import table
@@ -52,7 +52,7 @@ def command(
     """
     jax.config.update("jax_enable_x64", True)
     parts = [(option.name, functools.partial(_rows, option, points, rounds, backend)) for option in options()]
-    given = [points, rounds, [name for name in PEERS.values() if table.methods.lacks(name) is None]]
+    given = [points, rounds, [name for name in PEERS.values() if methods.lacks(name) is None]]
     return table.text(table.measure(out, f"{jax.default_backend()}_{backend}", parts, given, COLUMNS), SHOWN)
 
 
