@@ -227,11 +227,21 @@ def _lattice(spacing: float = 1.0, *, moved: bool = False) -> Callable[[int], As
 
 def _radius_of(asked: Asked, pairs: int) -> float:
     """Return the one cutoff with about so many pairs, from the neighbors of some of the particles."""
-    low, high = float(asked.cutoff.min()), float(asked.cutoff.max())
-    x = np.asarray(asked.x)
+    x, cutoffs = np.asarray(asked.x), np.asarray(asked.cutoff, np.float64)
+    if cutoffs.min() == cutoffs.max():
+        return float(cutoffs[0])
     everywhere, some = KDTree(x), KDTree(x[:: -(-len(x) // _SAMPLED)])
     wanted = (pairs / len(x) + 1) * some.n  # each is found itself, too
+
+    def few(cutoff: float) -> bool:
+        return int(some.count_neighbors(everywhere, cutoff)) < wanted
+
+    low = high = float(np.median(cutoffs))  # the largest ones may reach everything, which takes long to count
+    while few(high):
+        low, high = high, 2 * high
+    while not few(low):
+        low, high = low / 2, low
     while high > 1.001 * low:
         middle = math.sqrt(low * high)
-        low, high = (middle, high) if int(some.count_neighbors(everywhere, middle)) < wanted else (low, middle)
+        low, high = (middle, high) if few(middle) else (low, middle)
     return float(np.float32(high))
