@@ -1,9 +1,10 @@
-"""What each option of a search costs: the same scene with one option at a time, side by side in one run."""
+"""What each option of a search costs: in turns with what it is compared with, and with what SciPy and `wp.HashGrid` take."""
 
-import math
+import functools
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from time import perf_counter
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -11,27 +12,31 @@ import numpy as np
 import typer
 
 import jfrnn
-from experiments import _measure
+from experiments import _machine, _measure, methods
 from experiments._commands import Engine, Points, Rounds
 from experiments._library import round_capacity
 from experiments.bench import table
+from experiments.bench.options_scenes import FIRST, Asked, Option, beside, density, options
 
+Calls = dict[str, Callable[[], Any]]
+WHATS = ("list", "count", "sum")
+PEERS = {"scipy": "scipy-kdtree-nolist", "hashgrid": "hashgrid-plain"}
 COLUMNS = (
-    *("platform", "backend", "n", "option", "entries", "capacity", "rounds", "list_s", "count_s", "sum_s"),
-    *("list_ratio", "count_ratio", "sum_ratio"),
-    *("others_cores", "device", "jax", "warp", "commit", "dirty"),
+    *("platform", "backend", "n", "option", "beside", "spread", "entries", "beside_entries", "capacity", "rounds"),
+    *(f"{what}_s" for what in WHATS),
+    *(f"beside_{what}_s" for what in WHATS),
+    *(f"{what}_ratio" for what in WHATS),
+    *(f"{peer}_{what}" for peer in PEERS for what in ("s", "behind", "differs", "rounds")),
+    *("status", "reason", "others_cores", "cores", "device", "jax", "warp", "scipy", "commit", "dirty"),
 )
-SHOWN = ("option", "entries", "capacity", "list_s", "list_ratio", "count_s", "count_ratio", "sum_s", "sum_ratio")
-NEIGHBORS = 30  # about so many each, away from the faces of the unit cube
-
-
-class _Option(NamedTuple):
-    """One way to search: its name, positions, cutoff, and what else goes to `search` and `count`."""
-
-    name: str
-    x: Any
-    cutoff: Any
-    more: dict[str, Any]
+SHOWN = (
+    *("option", "beside", "entries", "beside_entries", "capacity"),
+    *(f"{what}_{kind}" for what in WHATS for kind in ("s", "ratio")),
+    *(f"{peer}_{what}" for peer in PEERS for what in ("s", "behind", "differs")),
+    "reason",
+)
+PEER_SECONDS = 3.0  # that a peer may take in one row, about; two rounds it gets at least
+MOST_CANDIDATES = {"cpu": 5e8, "gpu": 1e11}  # that `wp.HashGrid` is let look at in one call: about a second
 
 
 def command(
@@ -40,91 +45,123 @@ def command(
     rounds: Rounds = 15,
     backend: Engine = "warp",
 ) -> str:
-    """Time each option of a search beside a plain one."""
+    """Time each option of a search in turns with what it is compared with, which its row names.
+
+    Counts of SciPy (on a CPU, with all cores) and of Warp's HashGrid stand beside ours where they answer the same question; their
+    trees and grids are built in each call. Rows say for how many pairs their counts differ from ours.
+    """
     jax.config.update("jax_enable_x64", True)
-    parts = [("all options", lambda: _rows(points, rounds, backend))]
-    return table.text(table.measure(out, f"{jax.default_backend()}_{backend}", parts, [points, rounds], COLUMNS), SHOWN)
+    parts = [(option.name, functools.partial(_rows, option, points, rounds, backend)) for option in options()]
+    given = [points, rounds, [name for name in PEERS.values() if methods.lacks(name) is None]]
+    return table.text(table.measure(out, f"{jax.default_backend()}_{backend}", parts, given, COLUMNS), SHOWN)
 
 
-def _rows(n: int, rounds: int, backend: str) -> Iterator[table.Line]:
-    """Time every option once per round; medians of rounds count."""
-    options = list(_options(n, NEIGHBORS))
-    calls = [_compile(option, backend) for option in options]
-    for each in calls:
-        jax.block_until_ready([call() for call in each.values()])
-    numbered = {f"{place} {what}": call for place, each in enumerate(calls) for what, call in each.items()}
-    burst = 20 if jax.default_backend() == "gpu" else 1
-    seconds, others = _measure.time_in_turns(numbered, rounds, burst)
-    medians = {name: float(np.median(found)) for name, found in seconds.items()}
-    for place, (option, each) in enumerate(zip(options, calls, strict=True)):
-        idx, count = each["list"]()
-        row = {"backend": backend, "n": n, "option": option.name, "entries": int(np.asarray(count).sum(dtype=np.int64))}
-        row |= {"capacity": idx.shape[1], "rounds": rounds, "others_cores": others}
-        row |= {f"{what}_s": medians[f"{place} {what}"] for what in each}
-        yield row | {f"{what}_ratio": round(medians[f"{place} {what}"] / medians[f"0 {what}"], 2) for what in each}
+def _rows(option: Option, n: int, rounds: int, backend: str) -> Iterator[table.Line]:
+    """Yield the row of an option; medians of rounds count."""
+    row: table.Line = {"backend": backend, "n": n, "option": option.name, "beside": option.beside, "status": "ok"}
+    row |= {"cores": _machine.machine()["cores"], "scipy": _machine.versions()["scipy"]}
+    table.ask(row, None, lambda: _measure_option(row, option, n, rounds, backend))
+    yield row
 
 
-def _options(n: int, neighbors: int) -> Iterator[_Option]:
-    random = np.random.default_rng(0)
-    points = random.random((n, 3)).astype(np.float32)
-    x, r = jnp.asarray(points), (3 * neighbors / (4 * math.pi * n)) ** (1 / 3)
-    yield _Option("open, whole list", x, r, {})
-    yield _Option("half", x, r, {"half": True})
-    yield _Option("closed", x, r, {"closed": True})
-    yield _Option("include_self", x, r, {"include_self": True})
-    yield _Option("float64", jnp.asarray(points, jnp.float64), r, {})
-    yield _Option("as many queries", x, r, {"queries": jnp.asarray(random.random((n, 3)), jnp.float32)})
-    yield _Option("a tenth inactive", x, r, {"active": jnp.asarray(random.random(n) < 0.9)})
-    yield _Option("skin of a tenth", x, r, {"skin": 0.1 * r})
-    yield _Option("box, periodic", x, r, {"box": jfrnn.Box([1.0, 1.0, 1.0])})
-    yield _Option("box, periodic along x", x, r, {"box": jfrnn.Box([1.0, 1.0, 1.0], (True, False, False))})
-    skewed = np.eye(3) + np.diag([0.3, 0.3], 1)
-    yield _Option("box, skewed", x, r, {"box": jfrnn.Box(skewed)})
-    yield _Option("box, images told apart", x, r, {"box": jfrnn.Box([1.0, 1.0, 1.0], images=1)})
-    systems = 100
-    batch = jnp.asarray(random.integers(0, systems, n), jnp.int32)
-    yield _Option("batch of 100 systems, superposed", x, r * systems ** (1 / 3), {"batch": batch})
-    yield _Option("a cutoff per particle, equal", x, jnp.full(n, r, jnp.float32), {})
-    within = jnp.asarray(r * random.uniform(2 / 3, 4 / 3, n), jnp.float32)
-    for rule in ("gather", "either"):
-        yield _Option(f"a cutoff per particle within a factor of 2, {rule}", x, within, {"radius_rule": rule})
-    cutoffs = jnp.asarray([[r, 0.75 * r], [0.75 * r, 0.5 * r]], jnp.float32)
-    yield _Option("a cutoff per pair of two species", x, cutoffs, {"species": jnp.asarray(random.integers(0, 2, n), jnp.int32)})
-    away = random.normal(size=(n, 3))
-    away /= np.linalg.norm(away, axis=1, keepdims=True)
-    distance = 10.0 ** random.uniform(-2, 0, n)
-    graded = jnp.asarray(distance[:, None] * away, jnp.float32)
-    radii = (3 * neighbors * math.log(100) / n) ** (1 / 3) * distance  # of neighbors, where density goes with distance^-3
-    for rule in ("gather", "scatter", "either", "both", "mean"):
-        name = f"a cutoff per particle over a factor of 100, {rule}"
-        yield _Option(name, graded, jnp.asarray(radii, jnp.float32), {"radius_rule": rule})
+def _measure_option(row: table.Line, option: Option, n: int, rounds: int, backend: str) -> None:
+    asked = option.make(n)
+    calls, about = _compile(asked, backend)
+    row |= about | {"n": len(asked.x), "spread": asked.spread, "rounds": rounds}
+    others, its = _plain_calls(n, backend) if option.beside == FIRST else _compile(beside(option, asked, row["entries"]), backend)
+    row["beside_entries"] = its["entries"]
+    both = {f"{what}_s": calls[what] for what in calls} | {f"beside_{what}_s": others[what] for what in calls}
+    jax.block_until_ready([call() for call in both.values()])
+    seconds, row["others_cores"] = _measure.time_in_turns(both, rounds, _burst())
+    row |= {name: float(np.median(found)) for name, found in seconds.items()}
+    row |= {f"{what}_ratio": round(row[f"{what}_s"] / row[f"beside_{what}_s"], 2) for what in calls}
+    if asked.peers:
+        _ask_peers(row, asked, calls["count"], rounds)
 
 
-def _compile(option: _Option, backend: str) -> dict[str, Callable[[], Any]]:
-    """Return what lists, what counts and what sums a density; half lists, and those with a skin, are no sums."""
-    given = {name: value for name, value in option.more.items() if name != "skin"}
-    skin = option.more.get("skin", 0.0)
-    longest = int(jfrnn.count(option.x, option.cutoff + skin, backend=backend, **given).max())
-    capacity = round_capacity(longest)
-    given["cutoff"] = option.cutoff
-    data: dict[str, Any] = {name: value for name, value in given.items() if hasattr(value, "shape")}  # operands, no constants
+def _burst() -> int:
+    return 20 if jax.default_backend() == "gpu" else 1
+
+
+@functools.cache
+def _plain_calls(n: int, backend: str) -> tuple[Calls, table.Line]:
+    return _compile(options()[0].make(n), backend)
+
+
+def _compile(asked: Asked, backend: str) -> tuple[Calls, table.Line]:
+    """Return what lists, counts and sums a density, and entries and capacity; of half lists, and with a skin, there is no sum."""
+    given = {name: value for name, value in asked.more.items() if name != "skin"} | {"cutoff": asked.cutoff}
+    skin = asked.more.get("skin", 0.0)
+    # Arrays are operands, no constants, but for exclusions: those that are known are sorted once, and not in each call.
+    data: dict[str, Any] = {name: value for name, value in given.items() if hasattr(value, "shape") and name != "exclude"}
     more = {name: value for name, value in given.items() if name not in data}
-    masses = jnp.linspace(1, 2, len(option.x), dtype=option.x.dtype)
+    x, masses = asked.x, jnp.linspace(1, 2, len(asked.x), dtype=asked.x.dtype)
+
+    def sum_pairs(x: jax.Array, masses: jax.Array, data: dict[str, Any]) -> jax.Array:
+        if asked.alone is not None:
+            return asked.alone(x, masses, backend)
+        of_queries = {"query_values": masses} if "queries" in data else {}
+        return jfrnn.pair_sum(density, x, values=masses, backend=backend, **of_queries, **more, **data)
+
+    summed = jax.jit(sum_pairs)
+    count = jax.jit(lambda x, data: jfrnn.count(x, backend=backend, **more, **data))
+    found = np.asarray(count(x, data))
+    about: table.Line = {"entries": int(found.sum(dtype=np.int64))}
+    if asked.alone is not None:
+        return {"sum": lambda: summed(x, masses, data)}, about
+    longest = jfrnn.count(x, backend=backend, **given | {"cutoff": asked.cutoff + skin}) if skin else found
+    about["capacity"] = capacity = round_capacity(int(longest.max()))
 
     def list_pairs(x: jax.Array, data: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
         nbrs = jfrnn.search(x, skin=skin, capacity=capacity, backend=backend, **more, **data)
         return nbrs.idx, nbrs.count
 
-    def density(r: jax.Array, i: jax.Array, j: jax.Array) -> jax.Array:
-        return j * jnp.maximum(1 - r @ r, 0) ** 3
+    search = jax.jit(list_pairs)
+    calls: Calls = {"list": lambda: search(x, data), "count": lambda: count(x, data)}
+    if not {"half", "skin"} & set(asked.more):
+        calls["sum"] = lambda: summed(x, masses, data)
+    return calls, about
 
-    def sum_pairs(x: jax.Array, masses: jax.Array, data: dict[str, Any]) -> jax.Array:
-        of_queries = {"query_values": masses} if "queries" in data else {}
-        return jfrnn.pair_sum(density, x, values=masses, backend=backend, **of_queries, **more, **data)
 
-    search, summed = jax.jit(list_pairs), jax.jit(sum_pairs)
-    count = jax.jit(lambda x, data: jfrnn.count(x, backend=backend, **more, **data))
-    calls = {"list": lambda: search(option.x, data), "count": lambda: count(option.x, data)}
-    if not {"half", "skin"} & set(option.more):
-        calls["sum"] = lambda: summed(option.x, masses, data)
-    return calls
+# --- SciPy and wp.HashGrid ----------------------------------------------------------------------------------------------------
+
+
+def _ask_peers(row: table.Line, asked: Asked, ours: Callable[[], Any], rounds: int) -> None:
+    """Let a row say what each peer takes for counts, how many times ours that is, and for how many pairs it differs."""
+    x = np.asarray(asked.x)
+    cutoffs = np.broadcast_to(np.float32(asked.cutoff), len(x))
+    makers: dict[str, Callable[[np.ndarray, np.ndarray], tuple[Callable[[], Any], Callable[[Any], np.ndarray]]]]
+    makers = {"scipy": _scipy, "hashgrid": _hashgrid} if jax.default_backend() == "cpu" else {"hashgrid": _hashgrid}
+    for peer, make in makers.items():
+        told: table.Line = {}
+        made = table.ask(told, PEERS[peer], functools.partial(make, x, cutoffs))
+        if made is None:
+            row["reason"] = "; ".join(filter(None, [row.get("reason"), f"{peer}: {told['reason']}"]))
+            continue
+        theirs, read = made
+        found = read(theirs())  # compiles, too
+        row[f"{peer}_differs"] = int(np.abs(found.astype(np.int64) - np.asarray(ours())).sum())
+        begin = perf_counter()
+        jax.block_until_ready(theirs())
+        once = perf_counter() - begin
+        burst = _burst() if once < 0.02 else 1
+        turns = int(np.clip(PEER_SECONDS / (once * (burst + 1)), 2, rounds))
+        seconds = _measure.time_in_turns({"ours": ours, "theirs": theirs}, turns, burst)[0]
+        mine, its = (float(np.median(seconds[who])) for who in ("ours", "theirs"))
+        row |= {f"{peer}_s": its, f"{peer}_behind": round(its / mine, 2), f"{peer}_rounds": turns}
+
+
+def _scipy(x: np.ndarray, cutoffs: np.ndarray) -> tuple[Callable[[], Any], Callable[[Any], np.ndarray]]:
+    from experiments.methods import scipy_kdtree_nolist
+
+    strict = np.nextafter(cutoffs.astype(np.float64), 0)  # as it takes <=
+    return scipy_kdtree_nolist.prepare(x, strict, workers=_machine.machine()["cores"]), lambda found: found - 1
+
+
+def _hashgrid(x: np.ndarray, cutoffs: np.ndarray) -> tuple[Callable[[], Any], Callable[[Any], np.ndarray]]:
+    from experiments.methods import hashgrid_plain
+
+    looked_at = hashgrid_plain.candidates(x, float(cutoffs.max()))
+    if looked_at > MOST_CANDIDATES[jax.default_backend()]:
+        raise OverflowError(f"its queries look at up to {looked_at:.1e} particles, which takes too long to time")
+    return hashgrid_plain.prepare_counts(x, cutoffs), lambda found: found.array.numpy()

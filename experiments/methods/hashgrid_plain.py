@@ -1,6 +1,7 @@
 """`wp.HashGrid` as Warp's own examples use it: built anew, then one thread per particle; no JAX, float32, pairs as they round."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -42,3 +43,41 @@ def read(result: tuple[Any, Any]) -> Found:
     idx, count = (part.numpy() for part in result)
     device = result[0].device
     return found_in_rows(idx, count, device.name if device.is_cuda else "cpu")
+
+
+@dataclass
+class Counts:
+    """Neighbors of each particle [n], on their way: `jax.block_until_ready` waits for them as for an array of JAX."""
+
+    array: Any
+
+    def block_until_ready(self) -> "Counts":
+        """Wait for the device."""
+        wp.synchronize_device(self.array.device)
+        return self
+
+
+def prepare_counts(positions: np.ndarray, cutoffs: np.ndarray) -> Callable[[], Counts]:
+    """Compile a count within a cutoff per particle, in cells as wide as the largest, and return it; a call does not wait."""
+    device = wp.get_preferred_device()
+    points, radii = (wp.array(np.float32(a), dtype=kind, device=device) for a, kind in ((positions, wp.vec3), (cutoffs, float)))
+    grid, widest = wp.HashGrid(*CELLS, device=device), float(np.max(cutoffs))
+
+    def search() -> Counts:
+        count = wp.empty(len(points), dtype=wp.int32, device=device)
+        grid.build(points, widest)
+        kernel = _hashgrid_kernels.count_neighbors_kernel
+        wp.launch(kernel, dim=len(points), inputs=[grid.id, points, radii], outputs=[count], device=device)
+        return Counts(count)
+
+    return search
+
+
+def candidates(positions: np.ndarray, widest: float) -> float:
+    """Return how many particles the queries of a count look at, for cutoffs as wide as the cells: what it costs, beforehand."""
+    cells = np.floor(positions / widest).astype(np.int64) % CELLS
+    held = np.bincount(np.ravel_multi_index(tuple(cells.T), CELLS), minlength=np.prod(CELLS)).reshape(CELLS).astype(float)
+    near = held
+    for axis in range(3):
+        near = sum(np.roll(near, k, axis) for k in (-1, 0, 1))
+    return float((held * near).sum())

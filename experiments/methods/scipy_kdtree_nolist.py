@@ -1,4 +1,4 @@
-"""SciPy's kd-tree without a pair list: the number of neighbors of each particle, distance <= cutoff, one thread."""
+"""SciPy's kd-tree without a pair list: the number of neighbors of each particle, distance <= cutoff, one thread unless told."""
 
 from collections.abc import Callable
 
@@ -8,11 +8,11 @@ from scipy.spatial import KDTree
 from experiments.methods import Found
 
 
-def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], np.ndarray]:
-    """Return a search that builds the tree and counts the points in each ball."""
+def prepare(positions: np.ndarray, cutoff: float | np.ndarray, *, workers: int = 1) -> Callable[[], np.ndarray]:
+    """Return a search that builds the tree and counts the points in each ball, whose radii may differ, with so many threads."""
 
     def search() -> np.ndarray:
-        return KDTree(positions).query_ball_point(positions, cutoff, return_length=True, workers=1)
+        return KDTree(positions).query_ball_point(positions, cutoff, return_length=True, workers=workers)
 
     return search
 

@@ -178,19 +178,6 @@ def liquid() -> str:
     return markdown(("way", *(f">{where}, {whole(n)}" for where, n in columns)), lines)
 
 
-def options() -> str:
-    """Return what each option costs, as a multiple of a plain search."""
-    rows = {name: read(f"options/{name}.csv") for name in ("cpu_warp", "gpu_warp")}
-    titles = {"list_ratio": "list", "count_ratio": "counts", "sum_ratio": "sum"}
-    columns = [(name, what) for name, found in rows.items() for what in titles if any(row.get(what) for row in found)]
-    lines = []
-    for row in rows["cpu_warp"]:
-        both = {"cpu_warp": row, "gpu_warp": one(rows["gpu_warp"], option=row["option"]) or {}}
-        lines.append([row["option"], *(both[name].get(what, "") for name, what in columns)])
-    heads = [f">{titles[what]}" + f", {machine(rows[name])}" * (what == "list_ratio") for name, what in columns]
-    return markdown(("option", *heads), lines)
-
-
 def structures() -> str:
     """Return seconds of many small structures, one after another, and microseconds of a call."""
     rows = read("structures/cpu.csv")
@@ -257,5 +244,4 @@ TABLES = {
     "cpu-triangles": triangles,
     "answers": answers,
     "liquid": liquid,
-    "options": options,
 }

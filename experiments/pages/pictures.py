@@ -10,11 +10,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from experiments._look import OURS, PEER, factor, head, plain, write_names
-from experiments.pages import cpu
+from experiments._look import OURS, PEER, dress, factor, head, plain, write_names
+from experiments.pages import cpu, options
 from experiments.pages.rows import machine, number, one, read, whole
 
 _CPU = ("pair-sum", "warp", "cll", "vesin", "matscipy-neighbours", "scipy-kdtree", "nanoflann-cpp", "nvalchemi")
+_COUNTERS = {"scipy": "SciPy", "hashgrid": "wp.HashGrid"}
+_SPREAD = {  # columns of options, what they are called, and how their lines look
+    **{"list_s": ("jfrnn, list", "-o"), "count_s": ("jfrnn, counts", "-s"), "sum_s": ("jfrnn, sum", "-D")},
+    **{"beside_count_s": ("one cutoff", ":v"), "scipy_s": ("SciPy", "-^"), "hashgrid_s": ("wp.HashGrid", "-P")},
+}
 _GPU = {
     "jfrnn warp": "jfrnn, list",
     "warp HashGrid": "wp.HashGrid, without JAX",
@@ -25,7 +30,7 @@ _GPU = {
 def draw(folder: Path) -> None:
     """Draw all pictures into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    figures = {"steps": _steps()}
+    figures = {"steps": _steps(), "spread": _spread()}
     for name, make in {"cpu": _cpu, "gpu": _gpu, "liquid": _liquid, "cells": _cells, "halo": _halo}.items():
         figures[name] = Figure(figsize=(7.0, 4.2), layout="constrained")
         make(figures[name].add_subplot())
@@ -104,6 +109,30 @@ def _liquid(axes: Axes) -> None:
     _entitle(axes, f"Steps per second over jax-md's: {' and '.join(spans)}")
     write_names(axes, ends)
     _clear(axes)
+
+
+def _spread() -> Figure:
+    """Draw milliseconds over the largest cutoff over the least, a panel for each machine that was measured."""
+    found = [(where, rows) for where in options.machines() if (rows := options.spread_rows(where))]
+    figure = Figure(figsize=(7.0, 0.5 + 3.2 * len(found)), layout="constrained")
+    spans = []
+    for axes, (where, rows) in zip(np.ravel(figure.subplots(len(found), squeeze=False)), found, strict=True):
+        ends = []
+        for column, (title, style) in _SPREAD.items():
+            points = [(float(row["spread"]), 1e3 * float(row[column])) for row in rows if row.get(column)]
+            if points:
+                color = OURS if title.startswith("jfrnn") else PEER
+                axes.plot(*zip(*points, strict=True), style, color=color, ms=5)
+                ends.append((title, *points[-1], color))
+        dress(axes, "largest cutoff over the least", "milliseconds")
+        said = f"{whole(rows[0]['n'])} uniform points, about 30 neighbors each, {where.name}"
+        axes.set_title(said, loc="left", fontsize=9)
+        write_names(axes, ends)
+        behind = {peer: sorted(float(row[f"{peer}_behind"]) for row in rows if row.get(f"{peer}_behind")) for peer in _COUNTERS}
+        said = [f"{_COUNTERS[peer]} takes {factor(of[0])} to {factor(of[-1])} times" for peer, of in behind.items() if of]
+        spans.append(f"{' and '.join(said)} on {'an ' if where.name.startswith('H') else ''}{where.name}")
+    head(figure, f"To count within a cutoff per particle, {', '.join(spans)} what jfrnn takes")
+    return figure
 
 
 def _cells(axes: Axes) -> None:
