@@ -160,6 +160,19 @@ def doubled(x):
 
 doubled.defvjp(lambda x: (2 * x, None), lambda _, g: (3 * g,))
 
+
+def by_data(a):
+    """Read and write by indices that are data: negative ones, and some that are out of range."""
+    k, l = jnp.floor(2 * a[:, 0]).astype(jnp.int32)  # noqa: E741
+    both = jnp.stack([k, l])
+    each = jax.vmap(lambda row, k: row[k])
+    read = a[k, l], a[both], a.at[:, k].get(mode="fill"), a.at[k, l].get(mode="clip"), jnp.take(a, both, axis=1), each(a, both)
+    windows = lax.dynamic_slice(a, (k, l), (1, 2)), lax.dynamic_update_slice(a, a[:1, :2], (k, l)), lax.dynamic_index_in_dim(a, k)
+    written = a.at[k, 1].set(7), a.at[:, both].add(a[:, :2]), a.at[k].add(1, mode="clip"), jnp.zeros(3, a.dtype).at[k].set(a[0, 0])
+    slopes = jax.grad(lambda a: a[k, l] + (each(a, both) ** 2).sum() + a.at[l].get(mode="fill", fill_value=0).sum())(a)
+    return read, windows, written, slopes
+
+
 SHAPES = {
     "reshape": shaped(lambda a: (a.T, a.reshape(3, 2), a.reshape(-1), lax.reshape(a, (6,), (1, 0)), a[None, ..., None]), (2, 3)),
     "broadcast": shaped(lambda a, b: (a + b[:, None], jnp.broadcast_to(b, (3, 2)), a * b[0]), (2, 3), (2,), ulp=0.5),
@@ -186,6 +199,7 @@ SHAPES = {
     "dynamic_slice": shaped(
         lambda a: (lax.dynamic_slice(a, (1, 1), (1, 2)), lax.dynamic_update_slice(a, a[:1, :1], (1, 2))), (2, 3)
     ),
+    "by data": shaped(by_data, (2, 3), ulp=1, scale=4),
     "reduce": shaped(lambda a: (a.sum(), a.sum(0), a.prod(1), a.mean(), jnp.zeros((0, 3), a.dtype).sum(0)), (2, 3), ulp=4, scale=4),
     "extremes": shaped(
         lambda a: (a.max(), a.min(0), (a > 0).any(), (a > -1).all(1), (a > 0).sum(), jnp.bitwise_xor.reduce(a > 0, axis=0)), (2, 3)

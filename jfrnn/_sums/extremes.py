@@ -1,12 +1,14 @@
-"""Maxima and minima over pairs: find the extreme pair of each row without derivatives, then evaluate that pair with them."""
+"""Maxima and minima over pairs: the extreme pair of each row is found without derivatives, which are those of that pair."""
 
 import functools
+import itertools
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.custom_derivatives import SymbolicZero
 
 from jfrnn._engine import Block, Slots
 from jfrnn._sums.fused import can_sum_list, check, extremes, extremes_of_list
@@ -23,24 +25,51 @@ def bind_extremes(relation: Relation, term: Term, operands: Groups, largest: boo
 
     NaN is more extreme than any number. Of equal values, that of the smallest j is chosen, and so is its derivative.
     """
-    m, n = relation.sizes
     if isinstance(relation, Searched):
         check(relation.inputs, relation.options, term)
     elif isinstance(relation, Kept) and not can_sum_list(relation.given, term):
         relation = call_apart(Kept.listed, relation)
     find = functools.partial(_find, term=term, largest=largest)
     found = call_apart(lambda *given: find(given[0], operands=given[1]), lax.stop_gradient(relation), lax.stop_gradient(operands))
+    return _values(found, operands, term, largest, relation.sizes[1])
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4))
+def _values(found: list[_Best], operands: Groups, term: Term, largest: bool, n: int) -> list[Array]:
+    """Return the extremes that were found, which are differentiable in the operands: only then are they evaluated once more."""
+    del operands, n
+    values = [value if largest else -value for value, *_ in found]
+    return [value.reshape(-1, *like.shape) for value, like in zip(values, term.summands, strict=True)]
+
+
+@functools.partial(_values.defjvp, symbolic_zeros=True)
+def _move(term: Term, largest: bool, n: int, primals: tuple, tangents: tuple) -> tuple[list[Array], list[Array]]:
+    (found, operands), moves = primals, tangents[1]
+    flat, structure = jax.tree.flatten(operands)
+    moved = structure.flatten_up_to(moves)
+    moving = [not isinstance(move, SymbolicZero) for move in moved]
+
+    def evaluate(some: list[Array]) -> list[Array]:
+        left = iter(some)
+        chosen = [next(left) if flag else x for x, flag in zip(flat, moving, strict=True)]
+        return _evaluate(found, jax.tree.unflatten(structure, chosen), term, n)
+
+    some, theirs = (list(itertools.compress(each, moving)) for each in (flat, moved))
+    return _values(found, operands, term, largest, n), jax.jvp(evaluate, (some,), (theirs,))[1]
+
+
+def _evaluate(found: list[_Best], operands: Groups, term: Term, n: int) -> list[Array]:
+    """Return the summands of the extreme pairs, 0 for rows without pairs."""
     results = []
     for k, (like, (_, source, shift)) in enumerate(zip(term.summands, found, strict=True)):
-        has, elements = source < n, source.shape[1]
+        has, (m, elements) = source < n, source.shape
         shifts = None if shift is None else shift.reshape(-1, 1, shift.shape[-1])
         one_each = Listed(jnp.where(has, source, 0).reshape(-1, 1), has.reshape(-1, 1), shifts, n, symmetric=False)
         element, needed = _element(term, k)
         own = tuple(jnp.repeat(x, elements, axis=0) for x in operands.own)
         number = (jnp.tile(lax.iota(jnp.int32, elements), m),)
         (value,) = bind_sum(one_each, element, choose(join(operands._replace(own=own), Groups((), number, ())), needed), False)
-        none = jnp.asarray(-np.inf if largest else np.inf, like.dtype)
-        results.append(jnp.where(has, value.reshape(has.shape), none).reshape(m, *like.shape))
+        results.append(value.reshape(m, *like.shape))
     return results
 
 

@@ -6,64 +6,15 @@ that only moves elements needs no operations: its rule moves their numbers.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import numpy as np
-from jax import numpy as jnp
 
-from jfrnn._sums.scalars import TYPES, NoTranslationError, Number, Scalars
+from jfrnn._sums.equation import Equation, Rule, Values
+from jfrnn._sums.indexing import add_window, choose, dynamic_slice, dynamic_update_slice, gather, scatter, set_window
+from jfrnn._sums.scalars import NoTranslationError, Number
 
 MOST_REPEATED = 8  # largest constant exponent of `pow` that becomes repeated multiplication, within a few ulp
-
-Values = np.ndarray  # scalar numbers in the shape of the array that the scalars form
-
-
-class Spec(NamedTuple):
-    """The shape and dtype of an array."""
-
-    shape: tuple[int, ...]
-    dtype: str
-
-
-class Equation(NamedTuple):
-    """What a rule knows besides its inputs; `run` translates a nested jaxpr from the equation's parameters."""
-
-    scalars: Scalars
-    primitive: Any
-    params: dict[str, Any]
-    outputs: Sequence[Spec]
-    run: Callable[[Any, Sequence[Values]], list[Values]]
-
-    def each(self, operation: str, *arrays: Values, dtype: str | None = None) -> Values:
-        """Apply an operation to every element, broadcasting scalars."""
-        arrays = np.broadcast_arrays(*arrays)
-        rows = zip(*(a.reshape(-1).tolist() for a in arrays), strict=True)
-        dtype = dtype or self.outputs[0].dtype
-        return np.array([self.scalars.apply(operation, row, dtype) for row in rows], int).reshape(arrays[0].shape)
-
-    def full(self, value: Number, shape: tuple[int, ...] = (), dtype: str | None = None) -> Values:
-        """Return an array filled with one constant."""
-        return np.full(shape, self.scalars.constant(value, dtype or self.outputs[0].dtype))
-
-    def constants(self, numbers: Values) -> np.ndarray:
-        """Return the values of constants, such as the indices of a gather."""
-        values = [self.scalars.value(k) for k in numbers.reshape(-1).tolist()]
-        if any(value is None for value in values):
-            raise NoTranslationError(
-                f"the primitive {self.primitive.name!r} has no translation into a kernel where its indices depend on data, as in "
-                'table[i["kind"], j["kind"]]. Give each particle its row of the table, values={"row": table[kind], "kind": kind}, '
-                'and take jnp.where(jnp.arange(len(table)) == j["kind"], i["row"], 0).sum(); or index with constants, select with '
-                'jnp.where, or pass backend="jax".'
-            )
-        return np.array(values, values[0].dtype if values else np.int32).reshape(numbers.shape)
-
-    def cast(self, x: Values, dtype: str) -> Values:
-        """Convert values to another dtype."""
-        return self.each(f"to_{TYPES[dtype]}", x, dtype=dtype)
-
-
-Rule = Callable[[Equation, list[Values]], list[Values]]
 
 
 def _each(operation: str) -> Rule:
@@ -124,19 +75,7 @@ def _select(eqn: Equation, inputs: list[Values]) -> list[Values]:
     which, first, *others = inputs
     if not others:
         return [np.broadcast_to(first, eqn.outputs[0].shape)]
-    return [_choose(eqn, which, [first, *others], eqn.outputs[0].dtype)]
-
-
-def _choose(eqn: Equation, which: Values, cases: Sequence[Values], dtype: str) -> Values:
-    """Return the case that `which` selects, a bool or an integer; an integer out of range selects the nearest case."""
-    kind = eqn.scalars.nodes[int(which.flat[0])].dtype if which.size else "bool"
-    if kind == "bool":
-        return eqn.each("select", which, cases[1], cases[0], dtype=dtype)
-    result = cases[0]
-    for k, case in enumerate(cases[1:], 1):
-        beyond = eqn.each("ge", which, eqn.full(k, dtype=kind), dtype="bool")
-        result = eqn.each("select", beyond, case, result, dtype=dtype)
-    return result
+    return [choose(eqn, which, [first, *others], eqn.outputs[0].dtype)]
 
 
 # --- reductions -------------------------------------------------------------------------------------------------------
@@ -248,37 +187,6 @@ def _pad(eqn: Equation, inputs: list[Values]) -> list[Values]:
     return [x]
 
 
-def _by_index(*sources: int) -> Rule:
-    """Return a rule for moves by constant indices: JAX moves the scalar numbers; all inputs but the first are indices."""
-
-    def rule(eqn: Equation, inputs: list[Values]) -> list[Values]:
-        with jax.ensure_compile_time_eval():
-            arrays = [jnp.asarray(x.astype(np.int32) if k in sources else eqn.constants(x)) for k, x in enumerate(inputs)]
-            params = {**eqn.params, "fill_value": -1} if "fill_value" in eqn.params else eqn.params
-            moved = np.asarray(eqn.primitive.bind(*arrays, **params)).astype(int)
-        kind = np.dtype(eqn.outputs[0].dtype).kind
-        fill = eqn.params.get("fill_value")
-        fill = fill if fill is not None else np.nan if kind == "f" else _least(np.dtype(eqn.outputs[0].dtype))
-        return [np.where(moved < 0, eqn.full(fill), moved)]
-
-    return rule
-
-
-def _scatter_add(eqn: Equation, inputs: list[Values]) -> list[Values]:
-    """Add each update to the elements to which JAX scatters it."""
-    (operand, indices, updates), dtype = inputs, eqn.outputs[0].dtype
-    with jax.ensure_compile_time_eval():
-        where = jnp.asarray(eqn.constants(indices))
-        nothing = jnp.zeros(operand.shape, dtype)
-        ones = jnp.eye(updates.size, dtype=dtype).reshape(-1, *updates.shape)
-        places = [np.asarray(eqn.primitive.bind(nothing, where, one, **eqn.params)).reshape(-1) for one in ones]
-    result = operand.reshape(-1).copy()
-    for update, row in zip(updates.reshape(-1), places, strict=True):
-        for k in np.flatnonzero(row):
-            result[k] = eqn.each("add", result[k], update)
-    return [result.reshape(operand.shape)]
-
-
 # --- nested functions -------------------------------------------------------------------------------------------------
 
 
@@ -290,7 +198,7 @@ def _inline(eqn: Equation, inputs: list[Values]) -> list[Values]:
 def _cond(eqn: Equation, inputs: list[Values]) -> list[Values]:
     """Evaluate all branches, which have no side effects, and select one."""
     results = [eqn.run(branch, inputs[1:]) for branch in eqn.params["branches"]]
-    return [_choose(eqn, inputs[0], cases, spec.dtype) for spec, cases in zip(eqn.outputs, zip(*results, strict=True), strict=True)]
+    return [choose(eqn, inputs[0], cases, spec.dtype) for spec, cases in zip(eqn.outputs, zip(*results, strict=True), strict=True)]
 
 
 # --- all of it --------------------------------------------------------------------------------------------------------
@@ -348,11 +256,11 @@ TABLE: dict[str, Rule] = {name: _each(name) for name in _SAME_NAME} | {
     "unstack": _unstack,
     "iota": _iota,
     "pad": _pad,
-    "dynamic_slice": _by_index(0),
-    "dynamic_update_slice": _by_index(0, 1),
-    "gather": _by_index(0),
-    "scatter": _by_index(0, 2),
-    "scatter-add": _scatter_add,
+    "dynamic_slice": dynamic_slice,
+    "dynamic_update_slice": dynamic_update_slice,
+    "gather": gather,
+    "scatter": scatter(set_window),
+    "scatter-add": scatter(add_window),
     # nested functions
     "jit": _inline,
     "pjit": _inline,

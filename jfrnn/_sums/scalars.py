@@ -116,6 +116,11 @@ class Scalars:
                 left.extend(self.nodes[number].operands)
         return found
 
+    def latest_input(self, number: int) -> int:
+        """Return the last of the scalars defined elsewhere on which one depends; -1: it depends on none."""
+        inputs = (k for k in self.dependencies([number]) if not self.nodes[k].operands and self.nodes[k].value is None)
+        return max(inputs, default=-1)
+
     def text(self, outputs: dict[str, int]) -> str:
         """Return the statements that define the outputs by name, without unused ones."""
         names, lines = {}, []
@@ -158,7 +163,8 @@ class Scalars:
             known = self.value(first)
             return last if operands[1] == last else None if known is None else operands[1] if known else last
         if dtype == "bool":
-            return None
+            known, other = (first, last) if self.value(first) is not None else (last, first)
+            return other if operation == "both" and self.value(known) else None
         zero = -0.0 if dtype.startswith("float") else 0  # -0.0 + 0.0 is 0.0
         if operation == "mul" and (self._is(first, 1) or self._is(last, 1)):
             return last if self._is(first, 1) else first

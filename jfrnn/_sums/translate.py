@@ -20,8 +20,9 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 
+from jfrnn._sums.equation import Equation, Spec, Values
 from jfrnn._sums.factors import factor_out
-from jfrnn._sums.primitives import TABLE, Equation, Spec, Values
+from jfrnn._sums.primitives import TABLE
 from jfrnn._sums.scalars import TYPES, NoTranslationError, Scalars, hash_of
 from jfrnn._tracing import Aval, Given, Internal
 
@@ -64,8 +65,8 @@ def translate(closed: ClosedJaxpr) -> Translated:
         The text, its inputs and its outputs.
 
     Raises:
-        NoTranslationError: a primitive or dtype without translation, an index that depends on data, an array of more than
-            MOST_ELEMENTS elements, or more than `jfrnn._sums.scalars.MOST_SCALARS` operations.
+        NoTranslationError: a primitive or dtype without translation, an array of more than MOST_ELEMENTS elements, or more than
+            `jfrnn._sums.scalars.MOST_SCALARS` operations.
     """
     scalars, arguments, results = translate_scalars(closed)
     inputs = tuple(_spec(v.aval, "an input") for v in closed.jaxpr.invars)

@@ -89,38 +89,44 @@ struct Added {
     }
 };
 
-struct Largest : LargestSummands {
-    JFRNN_MEMBER explicit Largest(int n) : LargestSummands(n) {}
+struct Largest {
+    Extreme extreme[SUMMANDS];
+
+    JFRNN_MEMBER explicit Largest(int n) {
+#pragma unroll
+        for (int k = 0; k < SUMMANDS; ++k)
+            extreme[k] = Extreme(n);
+    }
+    // Takes the summands of a pair that are larger; `names` tells its source and image.
+    template <class Names>
+    JFRNN_MEMBER void add(const number* summand, bool is_pair, Names names) {
+        int source, code;
+        names(source, code);
+#pragma unroll
+        for (int k = 0; k < SUMMANDS; ++k)
+            extreme[k].take(summand[k], source, code, is_pair);
+    }
     // Finds the largest of WIDTH lanes for the first one.
     template <int WIDTH = 32>
     JFRNN_MEMBER void reduce_over_warp() {
 #pragma unroll
         for (int k = 0; k < SUMMANDS; ++k)
             for (int step = WIDTH / 2; step > 0; step /= 2) {
-                const real other = __shfl_down_sync(ALL, best[k], step);
-                const int source = __shfl_down_sync(ALL, source_of[k], step), code = __shfl_down_sync(ALL, code_of[k], step);
-                take(k, other, source, code, true);
+                const real other = __shfl_down_sync(ALL, extreme[k].best, step);
+                const int source = __shfl_down_sync(ALL, extreme[k].source, step);
+                extreme[k].take(other, source, __shfl_down_sync(ALL, extreme[k].code, step), true);
             }
     }
     // Keeps what is larger than what the query has already.
     JFRNN_MEMBER void store(const Results& results, const Destination& of) const {
         if (!of.is_query)
             return;
-        LargestSummands kept(results.n);
-        const long long at = (long long)of.id * SUMMANDS;
-        if (!of.fresh)
-#pragma unroll
-            for (int k = 0; k < SUMMANDS; ++k) {
-                kept.best[k] = results.sums[at + k];
-                kept.source_of[k] = results.integer_at(2 * (at + k));
-                kept.code_of[k] = results.integer_at(2 * (at + k) + 1);
-            }
 #pragma unroll
         for (int k = 0; k < SUMMANDS; ++k) {
-            kept.take(k, best[k], source_of[k], code_of[k], true);
-            results.sums[at + k] = kept.best[k];
-            results.put_integer(2 * (at + k), kept.source_of[k]);
-            results.put_integer(2 * (at + k) + 1, kept.code_of[k]);
+            const long long at = (long long)of.id * SUMMANDS + k;
+            Extreme kept = of.fresh ? Extreme(results.n) : Extreme(results, at);
+            kept.take(extreme[k].best, extreme[k].source, extreme[k].code, true);
+            kept.put(results, at);
         }
     }
 };

@@ -48,39 +48,30 @@ JFRNN_INLINE static void two_sum(Number& sum, Number& error, Number x) {
     sum = s;
 }
 
-// Of each summand the largest, its source and the code of its image. NaN is larger than all; of equal ones comes first the smallest
-// source, then the smallest image.
-struct LargestSummands {
-    number best[SUMMANDS];
-    Math::i32 source_of[SUMMANDS], code_of[SUMMANDS];
+// Of a summand the largest, its source and the code of its image. NaN is larger than all; of equal ones comes first the smallest source,
+// then the smallest image.
+struct Extreme {
+    real best;
+    int source, code;
 
-    JFRNN_INLINE explicit LargestSummands(int n) {
-#pragma unroll
-        for (int k = 0; k < SUMMANDS; ++k) {
-            best[k] = Math::of(-Bits::not_finite());
-            source_of[k] = Math::i32{} + n;
-            code_of[k] = Math::i32{};
-        }
+    JFRNN_MEMBER Extreme() {}
+    JFRNN_MEMBER explicit Extreme(int n) : best(-Bits::not_finite()), source(n), code(0) {}
+    // What a row has already.
+    JFRNN_MEMBER Extreme(const SumRows& rows, long long at)
+        : best(rows.sums[at]), source(rows.integer_at(2 * at)), code(rows.integer_at(2 * at + 1)) {}
+    JFRNN_MEMBER void take(real x, int of_source, int of_code, bool among) {
+        const bool same = x == best || (x != x && best != best);
+        const bool first = of_source < source || (of_source == source && of_code < code);
+        if (!among || !(x > best || (x != x && best == best) || (same && first)))
+            return;
+        best = x;
+        source = of_source;
+        code = of_code;
     }
-    // Takes the summands of pairs that are larger; `names` tells their sources and images.
-    template <class Names>
-    JFRNN_INLINE void add(const number* summand, Math::flag pairs, Names names) {
-        Math::i32 source, code;
-        names(source, code);
-#pragma unroll
-        for (int k = 0; k < SUMMANDS; ++k)
-            take(k, summand[k], source, code, pairs);
-    }
-    JFRNN_INLINE void take(int k, number x, Math::i32 source, Math::i32 code, Math::flag among) {
-        const Math::flag is_nan = Math::ne(x, x), was_nan = Math::ne(best[k], best[k]);
-        const Math::flag larger = Math::either(Math::gt(x, best[k]), Math::both(is_nan, Math::inverse(was_nan)));
-        const Math::flag same = Math::either(Math::eq(x, best[k]), Math::both(is_nan, was_nan));
-        const Math::flag same_source = Math::both(Math::eq(source, source_of[k]), Math::lt(code, code_of[k]));
-        const Math::flag first = Math::either(Math::lt(source, source_of[k]), same_source);
-        const Math::flag taken = Math::both(among, Math::either(larger, Math::both(same, first)));
-        best[k] = Math::select(taken, x, best[k]);
-        source_of[k] = Math::select(taken, source, source_of[k]);
-        code_of[k] = Math::select(taken, code, code_of[k]);
+    JFRNN_MEMBER void put(const SumRows& rows, long long at) const {
+        rows.sums[at] = best;
+        rows.put_integer(2 * at, source);
+        rows.put_integer(2 * at + 1, code);
     }
 };
 

@@ -127,27 +127,83 @@ struct Added {
     }
 };
 
-struct Largest : LargestSummands {
-    explicit Largest(int n) : LargestSummands(n) {}
+// The largest of all lanes, none of which is NaN.
+template <class Lanes>
+JFRNN_INLINE static real largest_of(Lanes lanes) {
+    if constexpr (sizeof lanes == sizeof(real)) {
+        return lanes[0];
+    } else {
+        typedef real half __attribute__((vector_size(sizeof lanes / 2)));
+        half low, high;
+        memcpy(&low, &lanes, sizeof low);
+        memcpy(&high, (const char*)&lanes + sizeof low, sizeof high);
+        return largest_of(half(low > high ? low : high));
+    }
+}
+
+// Holds some vectors of summands. Only when there are no more, or no room, it is looked up which are the largest, and whose.
+struct Largest {
+    enum { HELD = SUMMANDS > 16 ? 8 : 32 };  // vectors: no more than an integer has bits
+    number summand_of[HELD][SUMMANDS];
+    Math::i32 source_of[HELD], code_of[HELD];
+    unsigned int pairs_of[HELD];  // a bit for each lane
+    int held;
+    Extreme extreme[SUMMANDS];
+
+    JFRNN_INLINE explicit Largest(int n) : held(0) {
+#pragma unroll
+        for (int k = 0; k < SUMMANDS; ++k)
+            extreme[k] = Extreme(n);
+    }
+    // Takes the summands of pairs; `names` tells their sources and images.
+    template <class Names>
+    JFRNN_INLINE void add(const number* summand, Math::flag pairs, Names names) {
+        if (held == HELD)
+            settle();
+        names(source_of[held], code_of[held]);
+        pairs_of[held] = bits_of_flags(pairs);
+#pragma unroll
+        for (int k = 0; k < SUMMANDS; ++k)
+            summand_of[held][k] = Math::select(pairs, summand[k], Math::of(-Bits::not_finite()));
+        ++held;
+    }
+    __attribute__((noinline)) void settle() {
+        for (int k = 0; k < SUMMANDS; ++k) {
+            number largest = summand_of[0][k];
+            unsigned int strange = 0;  // lanes where there is NaN
+            for (int v = 0; v < held; ++v) {
+                const number x = summand_of[v][k];
+                largest = x > largest ? x : largest;
+                strange |= bits_of_flags(Math::ne(x, x));
+            }
+            const real most = strange ? Bits::no_number() : largest_of(largest);
+            auto theirs = [&](int v) {  // the lanes that hold it
+                const number x = summand_of[v][k];
+                return bits_of_flags(strange ? Math::ne(x, x) : Math::eq(x, Math::of(most))) & pairs_of[v];
+            };
+            unsigned int vectors = 0;  // that have any: mostly one, wherever it is
+            for (int v = 0; v < held; ++v)
+                vectors |= (unsigned int)(theirs(v) != 0) << v;
+            for (; vectors; vectors &= vectors - 1) {
+                const int v = __builtin_ctz(vectors);
+                for (unsigned int rest = theirs(v); rest; rest &= rest - 1) {
+                    const int lane = __builtin_ctz(rest);
+                    extreme[k].take(most, source_of[v][lane], code_of[v][lane], true);
+                }
+            }
+        }
+        held = 0;
+    }
     JFRNN_INLINE void store(Results& results, int id, bool fresh, bool) {
+        settle();
 #pragma unroll
         for (int k = 0; k < SUMMANDS; ++k) {
             const long long at = (long long)id * SUMMANDS + k;
-            real x = fresh ? -Bits::not_finite() : results.sums[at];
-            int source = fresh ? results.n : results.integer_at(2 * at), code = fresh ? 0 : results.integer_at(2 * at + 1);
-            for (int l = 0; l < LANES; ++l) {
-                const real y = best[k][l];
-                const bool same = x == y || (x != x && y != y);
-                const bool first = source_of[k][l] < source || (source_of[k][l] == source && code_of[k][l] < code);
-                if (!(y > x || (y != y && x == x) || (same && first)))
-                    continue;
-                x = y;
-                source = source_of[k][l];
-                code = code_of[k][l];
+            if (!fresh) {
+                const Extreme before(results, at);
+                extreme[k].take(before.best, before.source, before.code, true);
             }
-            results.sums[at] = x;
-            results.put_integer(2 * at, source);
-            results.put_integer(2 * at + 1, code);
+            extreme[k].put(results, at);
         }
     }
 };

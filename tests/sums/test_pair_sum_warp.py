@@ -418,22 +418,21 @@ def second(r, i, j):
     return j.astype(np.float32)
 
 
-def test_a_table_that_is_read_by_species_is_told_a_way_out():
-    """The warning names it; rows of the table as values of particles are translated, and give the same."""
-    x, kind = np.random.default_rng(0).random((100, 3)).astype(np.float32), (np.arange(100) % 2).astype(np.int32)
-    table = np.array([[1.0, 2.0], [2.0, 3.0]], np.float32)
+def test_tables_are_read_by_species():
+    """A sum over pairs that reads a table by both species, and its derivatives by positions and by the table."""
+    x, kind = np.random.default_rng(0).random((100, 3)).astype(np.float32), (np.arange(100) % 3 - 1).astype(np.int32)
+    table = np.array([[1.0, 2.0, 4.0], [3.0, 5.0, -1.0], [0.5, 7.0, 6.0]], np.float32)  # not symmetric: a derivative reads it twice
 
-    def of_table(r, i, j):
-        return jnp.asarray(table)[i["kind"], j["kind"]] * (r @ r)
+    def energy(x, table):
+        sums = jfrnn.pair_sum(lambda r, i, j: table[i["kind"], j["kind"]] * (r @ r), x, 0.3, {"kind": kind}, backend="warp")
+        return sums.sum(), sums
 
-    with pytest.warns(
-        RuntimeWarning, match=r"as in table\[i\[\"kind\"\], j\[\"kind\"\]\]. Give each particle its row of the table"
-    ):
-        jax.eval_shape(lambda x: jfrnn.pair_sum(of_table, x, 0.3, {"kind": kind}), x)
-
-    def of_pair(r, i, j):
-        return jnp.where(jnp.arange(2, dtype=jnp.int32) == j["kind"], i["row"], 0).sum() * (r @ r)
-
+    found = jax.jit(jax.grad(energy, (0, 1), has_aux=True))(x, table)
     i, j, _ = arrays_of(reference.reference_pairs(x, 0.3), 3)
-    expected = np.bincount(i, table[kind[i], kind[j]] * ((x[j] - x[i]) ** 2).sum(1), 100)
-    np.testing.assert_allclose(fused(of_pair, x, 0.3, {"row": table[kind], "kind": kind}), expected, rtol=1e-5)
+    r, factor = x[j] - x[i], (table[kind[i], kind[j]] + table[kind[j], kind[i]])[:, None]
+    by_table = np.bincount(3 * (kind[i] % 3) + kind[j] % 3, (r**2).sum(1), 9).reshape(3, 3)
+    by_place = np.zeros_like(x)
+    np.add.at(by_place, i, -2 * factor * r)
+    expected = (by_place, by_table), np.bincount(i, table[kind[i], kind[j]] * (r**2).sum(1), 100)
+    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected)):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5)
