@@ -91,7 +91,7 @@ def _operands(search: Search, levels: Levels) -> list[Array]:
         jnp.pad(points[levels.order].T, ((0, 0), (0, padding))).reshape(-1),
         put_in_order(cutoffs.sources, levels.order, padding),
         levels.order,
-        lax.bitcast_convert_type(levels.keys, jnp.int32),
+        lax.bitcast_convert_type(jnp.stack(levels.keys[::-1], axis=1), jnp.int32).reshape(-1),  # words of 64 bits
         levels.grid.coords.reshape(-1),
         levels.grid.table,
         jnp.concatenate(header),

@@ -1,7 +1,7 @@
 """Cells of many sizes, for cutoffs per particle: a few large cutoffs must not slow down all other particles.
 
 Sources are sorted into top cells as wide as the largest cutoff (`jfrnn._geometry.cells`). Within a top cell they are sorted by
-group, a range of cutoffs between two powers of two, and then along a Morton curve that halves the cell up to 7 times. So at each
+group, a range of cutoffs between two powers of two, and then along a Morton curve that halves the cell up to 17 times. So at each
 level, the sources of a group in a cell form one contiguous run. For each group, a query visits the 3^d cells around it at the
 finest level whose cells are wider than the cutoff of such pairs. The number of candidates is thereby proportional to the number of
 particles within that cutoff, whatever the cutoffs of other particles; no factor (largest / smallest)^d arises.
@@ -26,11 +26,11 @@ from jfrnn._geometry.cells import (
     grid_coordinates,
     places_between,
 )
-from jfrnn._geometry.curves import spread
+from jfrnn._geometry.curves import Words, morton_words
 from jfrnn._geometry.cutoffs import Cutoffs
 from jfrnn._geometry.images import Images
 
-HALVINGS = 7  # levels below a top cell, each halving its edges
+HALVINGS = 17  # levels below a top cell, each halving its edges: cutoffs may differ by a factor of 100 000
 GROUPS = 8  # ranges of cutoffs, by powers of two below the largest; the last one holds all smaller ones
 
 
@@ -49,7 +49,7 @@ class Levels(NamedTuple):
         order: [n] int32, the source at each position of the order.
         query_order: [m] int32, likewise for queries; the same array if the sources are the queries.
         grid: The top cells of the sources.
-        keys: [n] uint32 in that order: the group, then the Morton key within the top cell.
+        keys: In that order the group, then the Morton key within the top cell, in two words, the higher first: [n] uint32 each.
         query_top: [d, m] int32, the top cell of each query; [d + 1, m] with a batch.
         query_place: [d, m] int32, the finest cell of each query within its top cell, counted from 0 along each axis.
         largest: [GROUPS] largest cutoff of each group, -1 if empty; None if the rule does not use cutoffs of sources, which then
@@ -62,7 +62,7 @@ class Levels(NamedTuple):
     order: Array
     query_order: Array
     grid: Grid
-    keys: Array
+    keys: Words
     query_top: Array
     query_place: Array
     largest: Array | None
@@ -76,7 +76,7 @@ def sort_by_levels(along: Array, axes: Axes, cutoffs: Cutoffs, n: int, own: bool
 
     `batch` [n + m] uint32 holds their system numbers.
     """
-    dim, total = along.shape
+    total = along.shape[1]
     finite = jnp.isfinite(along).all(axis=0)
     top, extent = grid_coordinates(along, axes.cells, finite, batch)
     place = jnp.stack([_place_in_cell(*axis) for axis in zip(along, axes.cells.edges, axes.cells.turns, strict=True)])
@@ -84,11 +84,12 @@ def sort_by_levels(along: Array, axes: Axes, cutoffs: Cutoffs, n: int, own: bool
     widths = jnp.stack([edge if turn is None else 1 / turn for edge, turn in zip(axes.cells.edges, axes.cells.turns, strict=True)])
 
     group = jnp.zeros(n, jnp.uint32) if cutoffs.sources is None else _groups(cutoffs.sources, cutoffs.largest)
-    key = (group << np.uint32(HALVINGS * dim)) | _morton(list(place[:, :n].astype(jnp.uint32)))
-    _, by_key = lax.sort((key, lax.iota(jnp.int32, n)), num_keys=1, is_stable=True)
+    high, low = _key_of(group, list(place[:, :n].astype(jnp.uint32)))
+    _, by_low = lax.sort((low, lax.iota(jnp.int32, n)), num_keys=1, is_stable=True)
+    _, by_key = lax.sort((high[by_low], by_low), num_keys=1, is_stable=True)
     grid = build_grid(top[:, :n][:, by_key], finite[:n][by_key], extent, total)
     order = by_key[grid.order]
-    keys = key[order]
+    keys = high[order], low[order]
     query_order = order if own else cell_order(top[:, n:], finite[n:], extent, grid.dense)
     at = query_order if own else n + query_order
     largest, passes = None, None
@@ -113,12 +114,11 @@ def level_runs(
         radii = cutoffs.of_pairs(of_query, of_group)
         reach = functools.reduce(jnp.add, radii) / len(radii) * (1 + 4 * jnp.finfo(radii[0].dtype).eps)
         level = _finest_level(reach, levels.widths, levels.axes)
-        first = which.astype(jnp.uint32) << np.uint32(HALVINGS * dim)
-        around = _cells_around(levels.query_top[:, places], levels.query_place[:, places], level, levels.grid.extent, images)
+        query_top, query_place = levels.query_top[:, places], levels.query_place[:, places]
+        around = _cells_around(which, query_top, query_place, level, levels.grid.extent, images)
         start, stop = places_between(levels.grid, [around.top[0], *around.top])
-        size = (np.uint32(1) << (dim * (HALVINGS - level)).astype(jnp.uint32))[:, None]
-        lowest = first | around.key
-        bounds = _lower_bound(keys, jnp.stack([lowest, lowest + size]), start, stop)
+        ends = _add_power(around.key, dim * (HALVINGS - level)[:, None])
+        bounds = _lower_bound(keys, tuple(map(jnp.stack, zip(around.key, ends, strict=True))), start, stop)
         return bounds[0], jnp.where(around.there, bounds[1], bounds[0]), around.image
 
     return runs
@@ -131,7 +131,7 @@ def _place_in_cell(x: Array, edge: Array, turns: Array | None) -> Array:
         scaled = x * turns
         part = (scaled - jnp.clip(jnp.floor(scaled), 0, turns - 1)) * finest
     else:
-        part = cell_coordinate(cell_remainder(x, cell_coordinate(x, edge), edge), edge / finest)
+        part = cell_coordinate(cell_remainder(x, cell_coordinate(x, edge), edge) * 2**10, edge / (finest >> 10))
         part = jnp.where(x < 0, finest - 1 - part, part)  # below 0, cells are mirrored
     return jnp.clip(jnp.floor(part), 0, finest - 1).astype(jnp.int32)
 
@@ -146,8 +146,18 @@ def _groups(radii: Array, largest: Array) -> Array:
     return jnp.clip(exponent(largest) - exponent(radii), 0, GROUPS - 1).astype(jnp.uint32)
 
 
-def _morton(axes: list[Array]) -> Array:
-    return functools.reduce(jnp.bitwise_or, (spread(c, len(axes)) << np.uint32(k) for k, c in enumerate(axes)))
+def _key_of(group: Array, axes: list[Array]) -> Words:
+    """Return the key of finest cells, given their number along each axis, for a group: both words."""
+    high, low = morton_words(axes, HALVINGS)
+    return high | group.astype(jnp.uint32) << np.uint32(HALVINGS * len(axes) - 32), low
+
+
+def _add_power(key: Words, bit: Array) -> Words:
+    """Return key + 2^bit, for any bit of both words."""
+    (high, low), one = key, np.uint32(1)
+    more = jnp.where(bit < 32, one << jnp.minimum(bit, 31).astype(jnp.uint32), 0)
+    above = jnp.where(bit < 32, 0, one << jnp.maximum(bit - 32, 0).astype(jnp.uint32))
+    return high + above + (low + more < low).astype(jnp.uint32), low + more
 
 
 def _finest_level(reach: Array, widths: Array, axes: Axes) -> Array:
@@ -161,13 +171,13 @@ class _Around(NamedTuple):
     """Cells around queries, [b, r] each: their top cells (one array per axis), first keys and image codes, and which ones exist."""
 
     top: list[Array]
-    key: Array
+    key: Words
     image: Array | None
     there: Array
 
 
-def _cells_around(top: Array, place: Array, level: Array, extent: Array, images: Images | None) -> _Around:
-    """Return the cells around queries [d, b] at their level [b]; in small boxes these span several periodic images."""
+def _cells_around(group: Array, top: Array, place: Array, level: Array, extent: Array, images: Images | None) -> _Around:
+    """Return the cells of a group around queries [d, b] at their level [b]; in small boxes these span several periodic images."""
     reach = (0,) * len(place) if images is None else images.reach
     steps = [np.arange(-max(k, 1), max(k, 1) + 1, dtype=np.int32) for k in reach]
     which = np.array(list(product(*(range(len(axis)) for axis in steps)))).T  # [d, r]
@@ -178,22 +188,24 @@ def _cells_around(top: Array, place: Array, level: Array, extent: Array, images:
         turn = jnp.zeros_like(cell) if reach[k] == 0 else cell // extent[k]
         far = (np.abs(step) > 1)[None] & (level[:, None] > 0)
         cells.append((cell - turn * extent[k])[:, which[k]])
-        within.append((fine & ((1 << level[:, None]) - 1)).astype(jnp.uint32)[:, which[k]])
+        finest = (fine & ((1 << level[:, None]) - 1)) << (HALVINGS - level)[:, None]
+        within.append(finest.astype(jnp.uint32)[:, which[k]])
         code = code * (2 * reach[k] + 1) + (turn + reach[k])[:, which[k]]
         there = there & ~far[:, which[k]] & (jnp.abs(turn) <= max(reach[k], 1))[:, which[k]]
     cells += [jnp.broadcast_to(system[:, None], code.shape) for system in top[len(place) :]]
-    key = _morton(within) << (len(place) * (HALVINGS - level)).astype(jnp.uint32)[:, None]
-    return _Around(cells, key, None if images is None else code, there)
+    return _Around(cells, _key_of(group, within), None if images is None else code, there)
 
 
-def _lower_bound(keys: Array, target: Array, low: Array, high: Array) -> Array:
-    """Return the first index in [low, high) whose key is not below the target, for indices [b, r] and targets [2, b, r]."""
+def _lower_bound(keys: Words, target: Words, low: Array, high: Array) -> Array:
+    """Return the first index in [low, high) whose key is not below the target, of indices [b, r] and targets [2, b, r] of words."""
 
     def halve(bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bounds
         middle = low + (high - low) // 2
-        right = (keys.at[middle].get(mode="clip") < target) & (low < high)
+        upper, lower = (word.at[middle].get(mode="clip") for word in keys)
+        right = ((upper < target[0]) | ((upper == target[0]) & (lower < target[1]))) & (low < high)
         return jnp.where(right, middle + 1, low), jnp.where(right, high, middle)
 
-    bounds = jnp.broadcast_to(low, target.shape), jnp.broadcast_to(jnp.maximum(low, high), target.shape)
+    shape = target[0].shape
+    bounds = jnp.broadcast_to(low, shape), jnp.broadcast_to(jnp.maximum(low, high), shape)
     return lax.while_loop(lambda bounds: jnp.any(bounds[0] < bounds[1]), halve, bounds)[0]

@@ -16,6 +16,7 @@
 #include "pair_cutoffs.h"
 
 constexpr int TOP = DIM + BATCHED;  // axes of top cells
+using Key = unsigned long long;     // a group, then the Morton key within a top cell; `keys` holds its words, the lower one first
 
 struct LevelArguments {
     const real *positions, *queries, *axes, *radii;
@@ -136,10 +137,10 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
         return low;
     }
     // The first source in [low, high) whose key is not below this one.
-    JFRNN_INLINE int first_key_from(unsigned int key, int low, int high) const {
+    JFRNN_INLINE int first_key_from(Key key, int low, int high) const {
         while (low < high) {
             const int middle = low + (high - low) / 2;
-            if ((unsigned int)keys[middle] < key)
+            if (((const Key*)keys)[middle] < key)
                 low = middle + 1;
             else
                 high = middle;
@@ -147,11 +148,19 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
         return low;
     }
     // Spreads bits: bit b goes to place DIM * b.
-    JFRNN_FUNCTION unsigned int spread(unsigned int c) {
-        unsigned int result = 0;
-        for (int b = 0; b < HALVINGS; ++b)
-            result |= (c >> b & 1) << (DIM * b);
-        return result;
+    JFRNN_FUNCTION Key spread(Key c) {
+        if constexpr (DIM == 2) {
+            c = (c | c << 16) & 0x0000ffff0000ffffull;
+            c = (c | c << 8) & 0x00ff00ff00ff00ffull;
+            c = (c | c << 4) & 0x0f0f0f0f0f0f0f0full;
+            c = (c | c << 2) & 0x3333333333333333ull;
+            return (c | c << 1) & 0x5555555555555555ull;
+        }
+        c = (c | c << 32) & 0x001f00000000ffffull;
+        c = (c | c << 16) & 0x001f0000ff0000ffull;
+        c = (c | c << 8) & 0x100f00f00f00f00full;
+        c = (c | c << 4) & 0x10c30c30c30c30c3ull;
+        return (c | c << 2) & 0x1249249249249249ull;
     }
 
     // How far the cells around a query reach: where images lie close, over many of the largest cells.
@@ -168,12 +177,12 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
                 for (int x = -reach[0]; x <= reach[0]; ++x) {
                     const int steps[3] = {x, y, z};
                     int around[4] = {0, 0, 0, 0}, image = 0;
-                    unsigned int key = 0;
+                    Key key = 0;
                     bool there = true;
                     for (int k = 0; k < DIM; ++k) {
                         const int fine = (places[(long long)k * m + at] >> shift) + steps[k];
                         around[k] = query_top[(long long)k * m + at] + (fine >> level);
-                        key |= spread((unsigned int)(fine & mask)) << k;
+                        key |= spread((Key)(fine & mask)) << k;
                         if constexpr (PERIODIC) {
                             const int most = lattice.images(k), e = extent[k];
                             const int turn = most == 0 ? 0 : around[k] >= 0 ? around[k] / e : -1 - (-1 - around[k]) / e;
@@ -197,9 +206,9 @@ struct Levels : LevelArguments, Pairing<EXCLUDING || RULE == TABLE>, Space {
                     }
                     if (from == to)
                         continue;
-                    key = ((unsigned int)g << (DIM * HALVINGS)) | (key << (DIM * shift));
+                    key = ((Key)g << (DIM * HALVINGS)) | (key << (DIM * shift));
                     from = first_key_from(key, from, to);
-                    to = first_key_from(key + (1u << (DIM * shift)), from, to);
+                    to = first_key_from(key + ((Key)1 << (DIM * shift)), from, to);
                     if (from < to)
                         use(from, to, image);
                 }
