@@ -252,8 +252,8 @@ def sedov(scene: GasScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
         Figure("radius of the front, largest relative error", max(fronts), None, 0.02),
         Figure(f"density, relative L1, t = {seen[-1].time:.2g}", errors[-1], None, 0.15),
         Figure(f"largest density over exact, t = {seen[-1].time:.2g}", peaks[-1], 0.75, 1.1),
-        Figure("total energy, largest relative drift", drift, None, 1e-3),
-        Figure(f"largest smoothing length over smallest, t = {seen[-1].time:.2g}", seen[-1].resolution, 8.0, 1000.0),
+        Figure("total energy, largest relative drift", drift, None, 1e-4),
+        Figure(f"largest smoothing length over the smallest, t = {seen[-1].time:.2g}", seen[-1].resolution, 8.0, 1000.0),
     ]
     return figures, curves
 

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from experiments._cli import app
-from experiments.sph import answers, budget, gas, solver
+from experiments.sph import answers, budget, gas, health, snapshots, solver
 from experiments.sph.model import make_model, make_state
 from experiments.sph.validation import CASES, Seen
 from jfrnn.cases import fluids
@@ -50,7 +50,7 @@ def densities(x, masses):
 @pytest.fixture(scope="module")
 def begun():
     begin = jax.jit(solver.begin)
-    return tuple(begin(make_model(scene), make_state(scene)) for scene in (LOSSLESS, VISCOUS))
+    return tuple(begin(make_model(scene, backend="brute"), make_state(scene)) for scene in (LOSSLESS, VISCOUS))
 
 
 def test_lengths_follow_the_density(begun):
@@ -167,6 +167,22 @@ def invoke(*arguments):
     return result.stderr
 
 
+def test_a_snapshot_holds_a_gas_and_a_line_its_energies(begun, tmp_path):
+    model, s = make_model(VISCOUS), begun[1]
+    snapshots.save(s, VISCOUS, *map(np.asarray, gas.density_and_pressure(model, s)), tmp_path, 3)
+    again, step = snapshots.latest(tmp_path, VISCOUS)
+    assert step == 3
+    jax.tree.map(np.testing.assert_array_equal, again, s)
+    line = snapshots.energies(model, s, VISCOUS)
+    kinetic, heat = VISCOUS.masses @ (VISCOUS.velocities**2).sum(axis=1) / 2, VISCOUS.masses @ VISCOUS.energies
+    assert (line["kinetic"], line["thermal"], line["total"]) == pytest.approx((kinetic, heat, kinetic + heat))
+    assert line["resolution"] == float(s.gas.h.max() / s.gas.h.min())
+    assert health.complaint(VISCOUS, s) is None
+    ill = s._replace(gas=s.gas._replace(u=s.gas.u.at[5].set(jnp.nan)))
+    assert health.complaint(VISCOUS, ill) == "particle 5 has thermal energy nan"
+
+
+@pytest.mark.slow
 def test_a_run_tells_its_energies_and_goes_on(tmp_path):
     short = ("--set", "nx=8", "--frames", 2, "--no-pictures", "--out", tmp_path)
     invoke("--set", "duration=0.04", *short)
