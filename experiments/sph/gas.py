@@ -60,7 +60,7 @@ def make_state(scene: GasScene, dtype: type = np.float64) -> State:
 def begin(model: GasModel, s: State) -> State:
     """Return the state with smoothing lengths, accelerations and rates of its positions, velocities and thermal energies."""
     u, first, *_ = thermal(s)
-    h = jax.lax.fori_loop(0, FIRST_PASSES, lambda _, h: _improve(model, h, sum_density(model, s.x, h)), first)
+    h = jax.lax.fori_loop(0, FIRST_PASSES, lambda _, h: improve(model, h, sum_density(model, s.x, h)), first)
     return _evaluate(model, s, u, h)
 
 
@@ -89,7 +89,7 @@ def step(model: GasModel, s: State, dt: Array) -> State:
     middle, u = s.v + dt / 2 * s.a, u + dt / 2 * heating
     x, h = s.x + dt * middle, h * jnp.exp(dt * growth)
     for _ in range(PASSES):
-        h = _improve(model, h, sum_density(model, x, h))
+        h = improve(model, h, sum_density(model, x, h))
     s = _evaluate(model, s._replace(x=x, v=middle + dt / 2 * s.a), u + dt / 2 * heating, h)
     now = thermal(s)
     return s._replace(v=middle + dt / 2 * s.a, gas=now._replace(u=u + dt / 2 * now.heating))
@@ -131,7 +131,7 @@ def sum_density(model: GasModel, x: Array, h: Array) -> Density:
     return Density(rho, jnp.maximum(sums["steep"] / (dim * rho), _LEAST_OMEGA))
 
 
-def _improve(model: GasModel, h: Array, found: Density) -> Array:
+def improve(model: GasModel, h: Array, found: Density) -> Array:
     """Return lengths after a pass of Newton's method for ln(ρ h^d/(m η^d)) = 0, whose derivative in ln h is dΩ."""
     dim = model.dim
     off = jnp.log(found.rho / model.m) + dim * jnp.log(h / model.physics.smoothing_ratio)
