@@ -14,6 +14,8 @@ def sedov(
     heat_ratio: float = 1.4,
     duration: float = 0.15,
     hot: float = 4.0,
+    jitter: float = 0.1,
+    seed: int = 0,
     step: float | None = None,
 ) -> GasScene:
     """Return a cold gas of density 1 at rest, in whose middle energy is set free: Sedov's blast, in 2D or 3D.
@@ -26,13 +28,16 @@ def sedov(
         heat_ratio: Ratio of specific heats γ.
         duration: Time that is simulated [s].
         hot: Radius within which the energy is spread, in particle spacings.
+        jitter: Largest displacement of a particle from its site, in spacings: along the rows of an exact lattice, jets run ahead.
+        seed: Of the displacements.
         step: Time step [s]; None: it follows from the Courant condition.
 
     Source: Sedov (1959), Similarity and Dimensional Methods in Mechanics, ch. 4.
     """
     spacing = radius / nx
     grid = lattice((-radius,) * dim, (2 * nx,) * dim, spacing)
-    x = grid[(grid**2).sum(axis=1) <= radius**2]
+    sites = grid[(grid**2).sum(axis=1) <= radius**2]
+    x = sites + jitter * spacing * np.random.default_rng(seed).uniform(-1, 1, sites.shape)
     masses = np.full(len(x), spacing**dim)
     share = np.maximum(1 - (x**2).sum(axis=1) / (hot * spacing) ** 2, 0)
     return GasScene(

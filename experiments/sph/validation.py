@@ -237,8 +237,8 @@ def sedov(scene: GasScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
         assert at.rho is not None, "of a gas"
         counts, radii, sums = (np.histogram(r, edges, weights=weights)[0] for weights in (None, r, at.rho))
         radii, shells = (each[counts > 0] / counts[counts > 0] for each in (radii, sums))
-        last = np.flatnonzero(shells > (1 + shells.max()) / 2)[-1]
-        front = np.interp(-(1 + shells.max()) / 2, -shells[last : last + 2], radii[last : last + 2])
+        edge = np.flatnonzero(shells > (1 + shells.max()) / 2)[-1]
+        front = np.interp(-(1 + shells.max()) / 2, -shells[edge : edge + 2], radii[edge : edge + 2])
         fronts.append(abs(front / exact.front - 1))
         peaks.append(shells.max() / exact.rho[-1])
         known = np.interp(r, exact.r, exact.rho, right=1.0)
@@ -247,13 +247,17 @@ def sedov(scene: GasScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
         curves[f"t = {at.time:.2g} s, measured"] = curve(radii, shells)
         after = [np.append(each, more) for each, more in ((exact.r[::20], [exact.front, edges[-1]]), (exact.rho[::20], [1.0, 1.0]))]
         curves[f"t = {at.time:.2g} s, known"] = curve(*after)
+    last = seen[-1]
+    outwards = np.sum(last.v * last.x, axis=1) ** 2 / np.sum(last.x**2, axis=1)
+    sideways = 1 - scene.masses @ outwards / (2 * last.kinetic)
     drift = max(abs((at.kinetic + at.thermal) / energy - 1) for at in seen)
     figures = [
         Figure("radius of the front, largest relative error", max(fronts), None, 0.02),
-        Figure(f"density, relative L1, t = {seen[-1].time:.2g}", errors[-1], None, 0.15),
-        Figure(f"largest density over exact, t = {seen[-1].time:.2g}", peaks[-1], 0.75, 1.1),
+        Figure(f"density, relative L1, t = {last.time:.2g}", errors[-1], None, 0.12),
+        Figure(f"largest density over exact, t = {last.time:.2g}", peaks[-1], 0.75, 1.1),
+        Figure(f"share of kinetic energy that is not outwards, t = {last.time:.2g}", sideways, None, 0.003),
         Figure("total energy, largest relative drift", drift, None, 1e-4),
-        Figure(f"largest smoothing length over the smallest, t = {seen[-1].time:.2g}", seen[-1].resolution, 8.0, 1000.0),
+        Figure(f"largest smoothing length over the smallest, t = {last.time:.2g}", last.resolution, 8.0, 1000.0),
     ]
     return figures, curves
 

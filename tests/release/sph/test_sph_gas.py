@@ -124,10 +124,12 @@ def test_the_exact_blast_meets_its_targets_and_another_misses_them():
         seen = []
         for time in case.times:
             blast = answers.sedov(factor * time)
-            rho = np.interp(r, blast.r, blast.rho, right=1.0)
-            seen.append(Seen(time, scene.positions, 0 * r, 0 * r, 0.3 * factor, 0.0, rho, 0.7 * factor, 30.0))
-        front, density, _, energy, resolution = case.judge(scene, seen)[0]
-        assert [front.met, density.met, energy.met, resolution.met] == [met, met, met, True]
+            rho, speed = np.interp(r, blast.r, blast.rho, right=1.0), np.interp(r, blast.r, blast.v, right=0.0)
+            v = (scene.positions / r[:, None] + (factor - 1) * RANDOM.normal(size=scene.positions.shape)) * speed[:, None]
+            kinetic = scene.masses @ (v**2).sum(axis=1) / 2
+            seen.append(Seen(time, scene.positions, v, 0 * r, kinetic, 0.0, rho, factor - kinetic, 30.0))
+        front, density, _, sideways, energy, resolution = case.judge(scene, seen)[0]
+        assert [figure.met for figure in (front, density, sideways, energy, resolution)] == [met] * 4 + [True]
 
 
 def speed_up(scene, steps, segments):
