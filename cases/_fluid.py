@@ -1,9 +1,9 @@
-"""A fluid scene: particles, and what acts on them, as plain data. What is None is not there, and will not be computed."""
+"""Scenes of fluids and gases: particles, and what acts on them, as plain data. What is None is not there, and is not computed."""
 
 from __future__ import annotations  # `get_type_hints` can then be told what Number and Vector stand for
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, Literal, TypeVar
 
 import numpy as np
@@ -83,9 +83,26 @@ WORDS = (
 """Fields of `Physics` that choose what is computed; the others are numbers that may be traced."""
 
 
+@dataclass(frozen=True)
+class Gas(Generic[Number]):
+    """State what acts in an ideal gas whose smoothing lengths follow its density: numbers are constants, None leaves a part out.
+
+    Args:
+        heat_ratio: Ratio of specific heats γ: p = (γ-1)ρu.
+        smoothing_ratio: Smoothing length over the distance of particles, η: h = η (m/ρ)^(1/d).
+        kernel: Smoothing kernel.
+        artificial: Monaghan's α of artificial viscosity, without which there are no shocks.
+    """
+
+    heat_ratio: Number
+    smoothing_ratio: Number
+    kernel: Kernel = "wendland2"
+    artificial: Number | None = None
+
+
 @dataclass(frozen=True, eq=False)
-class FluidScene:
-    """Hold particles and what acts on them.
+class Scene:
+    """Hold particles and what is around them.
 
     Args:
         name: Name of the scene.
@@ -95,7 +112,6 @@ class FluidScene:
         spacing: Particle distance [m].
         duration: Time that is simulated [s].
         step: Time step [s]; None: it follows from the Courant condition, anew in every step.
-        physics: What acts.
         wall: Which particles are dummies of a wall, bool, shape [n]; None: there are none.
         periodic: Lower corner and lengths of a box that repeats itself [m], and along which axes; None: space is open.
         tank: Lower and upper corner of a box that particles bounce off [m], for `physics.restitution`; None: there is none.
@@ -116,7 +132,6 @@ class FluidScene:
     spacing: float
     duration: float
     step: float | None
-    physics: Physics[float, Floats]
     wall: NDArray[np.bool_] | None = None
     periodic: Periodic | None = None
     tank: Tank | None = None
@@ -137,6 +152,30 @@ class FluidScene:
     def dim(self) -> int:
         """Number of axes."""
         return self.positions.shape[1]
+
+
+@dataclass(frozen=True, eq=False)
+class FluidScene(Scene):
+    """Hold a weakly compressible fluid.
+
+    Args:
+        physics: What acts.
+    """
+
+    physics: Physics[float, Floats] = field(kw_only=True)
+
+
+@dataclass(frozen=True, eq=False)
+class GasScene(Scene):
+    """Hold an ideal gas in open space.
+
+    Args:
+        physics: What acts.
+        energies: Specific thermal energies at first [J/kg], shape [n].
+    """
+
+    physics: Gas[float] = field(kw_only=True)
+    energies: NDArray[np.float64] = field(kw_only=True)
 
 
 @dataclass(frozen=True)

@@ -1,23 +1,29 @@
-"""Fluid scenes by name: positions, velocities, masses, and what acts on them.
+"""Scenes of fluids and gases by name: positions, velocities, masses, and what acts on them.
 
 >>> fluid("four").positions.tolist()
 [[0.505, 0.5], [0.515, 0.5], [0.51, 0.45], [0.5, 0.45]]
 """
 
-from ._fluid import WORDS, FluidScene, Periodic, Physics, Solid, Tank, Turning
+from ._fluid import WORDS, FluidScene, Gas, GasScene, Periodic, Physics, Scene, Solid, Tank, Turning
 from ._fluid_flows import SCENES as _FLOWS
 from ._fluid_free import SCENES as _FREE
+from ._fluid_gas import SCENES as _GASES
 from ._fluid_gear import SCENES as _GEAR
 from ._fluid_source import SCENES as _SOURCE
 
-__all__ = ["FLUIDS", "WORDS", "FluidScene", "Periodic", "Physics", "Solid", "Tank", "Turning", "fluid"]
+__all__ = [
+    "FLUIDS", "GASES", "WORDS", "FluidScene", "Gas", "GasScene", "Periodic", "Physics", "Scene", "Solid", "Tank", "Turning",
+    "fluid", "gas",
+]  # fmt: skip
 
 FLUIDS = {**_SOURCE, **_FLOWS, **_FREE, **_GEAR}
-"""Functions that make scenes, by name."""
+"""Functions that make scenes of fluids, by name."""
+GASES = {**_GASES}
+"""Functions that make scenes of gases, by name."""
 
 
 def fluid(name: str, **settings: float) -> FluidScene:
-    """Return a scene by its name.
+    """Return a scene of a fluid by its name.
 
     Args:
         name: One of `FLUIDS`.
@@ -29,3 +35,18 @@ def fluid(name: str, **settings: float) -> FluidScene:
     if name not in FLUIDS:
         raise ValueError(f"name must be a known fluid scene, got {name!r}: take one of {', '.join(FLUIDS)}.")
     return FLUIDS[name](**settings)
+
+
+def gas(name: str, **settings: float) -> GasScene:
+    """Return a scene of a gas by its name.
+
+    Args:
+        name: One of `GASES`.
+        **settings: Of that scene: its function says which.
+
+    Raises:
+        ValueError: There is no such scene.
+    """
+    if name not in GASES:
+        raise ValueError(f"name must be a known scene of a gas, got {name!r}: take one of {', '.join(GASES)}.")
+    return GASES[name](**settings)

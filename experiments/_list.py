@@ -18,7 +18,7 @@ WIDTH = 80
 
 def names() -> str:
     """Return all names: of scenes with a line each, of the others in a row."""
-    scenes = [f"  {name:<14}{_title(fluids.FLUIDS[name], WIDTH - 16)}" for name in fluids.FLUIDS]
+    scenes = [f"  {name:<14}{_title(settings.SCENES[name], WIDTH - 16)}" for name in settings.SCENES]
     absent = [name for name in methods.names() if methods.lacks(name)]
     parts = {
         "Layouts (show, export, configs; N is any number of tiles)": _layouts.names(),
@@ -36,20 +36,21 @@ def scene(name: str) -> str:
     Raises:
         UsageError: There is no such scene.
     """
-    if name not in fluids.FLUIDS:
-        raise UsageError(f"list {name}: no such scene; there are {', '.join(fluids.FLUIDS)}")
-    make, physics = fluids.FLUIDS[name], fluids.fluid(name).physics
+    if name not in settings.SCENES:
+        raise UsageError(f"list {name}: no such scene; there are {', '.join(settings.SCENES)}")
+    make = settings.SCENES[name]
+    physics = make().physics  # pyright: ignore[reportAttributeAccessIssue]
     of_scene = {key: inspect.signature(make).parameters[key].default for key in settings.parameters(name)}
-    of_physics = {key: getattr(physics, key) for key in settings.PHYSICS if key not in of_scene}
+    of_physics = {key: getattr(physics, key) for key in settings.physics_of(name) if key not in of_scene}
     lines = [f"{name}: {_title(make)}", "", "--set of the scene:", *_settings(name, of_scene, _meanings(make))]
-    return "\n".join([*lines, "", "--set of its physics:", *_settings(name, of_physics, _meanings(fluids.Physics))])
+    return "\n".join([*lines, "", "--set of its physics:", *_settings(name, of_physics, _meanings(type(physics)))])
 
 
 def _settings(scene: str, defaults: dict[str, Any], meanings: dict[str, str]) -> list[str]:
     """Return a line or more for each setting; what its function does not tell, another scene's does."""
     lines, others = [], {}
-    alike = sorted(fluids.FLUIDS, key=lambda name: name[:4] != scene[:4])
-    for make in (*(fluids.FLUIDS[name] for name in alike), fluids.FluidScene):
+    alike = sorted(settings.SCENES, key=lambda name: name[:4] != scene[:4])
+    for make in (*(settings.SCENES[name] for name in alike), fluids.Scene):
         others = _meanings(make) | others
     for key, default in defaults.items():
         bounds = ranges.of(scene, key)

@@ -191,10 +191,10 @@ def _search(spec: Spec, row: DeviceRow) -> None:
 def _sph(spec: Spec, row: DeviceRow) -> None:
     from experiments.sph import spread
     from experiments.sph.model import make_model, make_state
-    from experiments.sph.settings import make_scene
+    from jfrnn.cases import fluids
 
     depth = 0.5 * (spec.devices if spec.scaling == "weak" else 1)
-    scene = make_scene("dam-break-3d", [f"nx={spec.nx}", f"depth={depth}"])
+    scene = fluids.fluid("dam-break-3d", nx=spec.nx, depth=depth)
     kind = np.dtype(spec.dtype).type
 
     def begin(mesh: Mesh) -> spread.Flow:

@@ -3,11 +3,20 @@
 import jax.numpy as jnp
 from jax import Array
 
-from experiments.sph import states
+from experiments.sph import gas, states
 from experiments.sph.model import Model, State
+from experiments.sph.particles import Flow, GasModel
 
 
-def kinetic_energy(model: Model, s: State) -> Array:
+def energies(model: Flow, s: State) -> dict[str, Array]:
+    """Return the energies [J; in 2D J/m], shape [] each, by name: kinetic, and potential or, of a gas, thermal, Σ m u."""
+    kinetic = {"kinetic": kinetic_energy(model, s)}
+    if isinstance(model, GasModel):
+        return kinetic | {"thermal": jnp.sum(model.m * gas.thermal(s).u)}
+    return kinetic | {"potential": potential_energy(model, s)}
+
+
+def kinetic_energy(model: Flow, s: State) -> Array:
     """Return ½ Σ m v² of the fluid [J; in 2D J/m], shape []."""
     return jnp.sum(_masses(model) * jnp.sum(s.v * s.v, axis=1)) / 2
 
@@ -38,10 +47,10 @@ def internal_energy(model: Model, s: State) -> Array:
     return jnp.sum(_masses(model) * each)
 
 
-def momentum(model: Model, s: State) -> Array:
+def momentum(model: Flow, s: State) -> Array:
     """Return Σ m v of the fluid [kg m/s], shape [d]."""
     return jnp.sum(_masses(model)[:, None] * s.v, axis=0)
 
 
-def _masses(model: Model) -> Array:
-    return model.m if model.wall is None else jnp.where(model.wall, 0, model.m)
+def _masses(model: Flow) -> Array:
+    return model.m if isinstance(model, GasModel) or model.wall is None else jnp.where(model.wall, 0, model.m)

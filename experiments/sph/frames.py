@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from experiments.sph import view
-from jfrnn.cases.fluids import FluidScene
+from jfrnn.cases.fluids import Scene
 
 WALL = "0.75"
 
 
-def draw(scene: FluidScene, x: np.ndarray, v: np.ndarray, time: float, top_speed: float, path: Path) -> None:
+def draw(scene: Scene, x: np.ndarray, v: np.ndarray, time: float, top_speed: float, path: Path) -> None:
     """Draw particles from the side, colored by speed: the first axis to the right, the last one upwards; a solid in 3D aslant.
 
     Args:
@@ -54,7 +54,7 @@ def draw(scene: FluidScene, x: np.ndarray, v: np.ndarray, time: float, top_speed
     figure.savefig(path, dpi=100)
 
 
-def _draw_in_space(scene: FluidScene, x: np.ndarray, v: np.ndarray, time: float, top_speed: float, path: Path) -> None:
+def _draw_in_space(scene: Scene, x: np.ndarray, v: np.ndarray, time: float, top_speed: float, path: Path) -> None:
     """Draw particles that have come, and the solid, aslant from above."""
     there = np.ones(scene.n, bool) if scene.enters is None else scene.enters <= time
     scale = ScalarMappable(Normalize(0, top_speed or 1.0), "viridis")
@@ -69,14 +69,14 @@ def _draw_in_space(scene: FluidScene, x: np.ndarray, v: np.ndarray, time: float,
     figure.savefig(path, dpi=100)
 
 
-def picture_bounds(scene: FluidScene) -> tuple[np.ndarray, np.ndarray]:
+def picture_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower and upper corner of what is shown."""
     if scene.bounds is None:
         return scene.positions.min(axis=0), scene.positions.max(axis=0)
     return np.array(scene.bounds.lower), np.array(scene.bounds.upper)
 
 
-def wrap_positions(scene: FluidScene, x: np.ndarray) -> np.ndarray:
+def wrap_positions(scene: Scene, x: np.ndarray) -> np.ndarray:
     """Return positions inside the periodic box, where there is one."""
     if scene.periodic is None:
         return x

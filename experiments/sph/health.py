@@ -5,22 +5,21 @@ import numpy as np
 from experiments._errors import UsageError
 from experiments.sph import solids, solver
 from experiments.sph.forces import Neighbors
-from experiments.sph.model import Model, State
-from jfrnn.cases.fluids import FluidScene
+from experiments.sph.particles import Flow, State
+from jfrnn.cases.fluids import FluidScene, Scene
 
 
 class DivergedError(UsageError):
     """A run went wrong; the message says in which step, and which particle."""
 
 
-def complaint(scene: FluidScene, s: State) -> str | None:
+def complaint(scene: Scene, s: State) -> str | None:
     """Say which particle is not finite or went through a wall by more than half a spacing; None: all is well."""
-    for name in ("x", "v", "rho", "p"):
-        value = getattr(s, name)
-        if value is not None and not np.isfinite(value := np.asarray(value)).all():
+    for name, value in (s._asdict() | ({} if s.gas is None else s.gas._asdict())).items():
+        if name in _WORDS and value is not None and not np.isfinite(value := np.asarray(value)).all():
             particle = int(np.argwhere(~np.isfinite(value))[0][0])
             return f"particle {particle} has {_WORDS[name]} {value[particle]}"
-    distances = solids.clearance(scene, s)
+    distances = solids.clearance(scene, s) if isinstance(scene, FluidScene) else None
     if distances is not None and distances.min(initial=np.inf) <= 0:
         return f"particle {distances.argmin()} went through the wall of triangles, {-distances.min()} m deep"
     if scene.sealed is None:
@@ -35,7 +34,7 @@ def complaint(scene: FluidScene, s: State) -> str | None:
     return f"particle {particle} went through a wall, to {x[particle]} at {np.asarray(s.v)[particle]} m/s"
 
 
-def check(scene: FluidScene, model: Model, before: State, nbrs: Neighbors, after: State, steps: int, first: int) -> None:
+def check(scene: Scene, model: Flow, before: State, nbrs: Neighbors, after: State, steps: int, first: int) -> None:
     """Raise where a chunk of steps ended badly; its steps are run again to find the one in which it began.
 
     Args:
@@ -65,4 +64,4 @@ def check(scene: FluidScene, model: Model, before: State, nbrs: Neighbors, after
     )
 
 
-_WORDS = {"x": "position", "v": "velocity", "rho": "density", "p": "pressure"}
+_WORDS = {"x": "position", "v": "velocity", "rho": "density", "p": "pressure", "u": "thermal energy", "h": "smoothing length"}

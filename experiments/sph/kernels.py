@@ -31,15 +31,15 @@ class Kernel(NamedTuple):
     source: str
     over_q: Callable[[Array], Array] | None = None
 
-    def value(self, r: Array, h: float, dim: int) -> Array:
+    def value(self, r: Array, h: float | Array, dim: int) -> Array:
         """Return W(r, h) [1/length^dim] at distances r [length], any shape."""
         return self.norm[dim - 2] / h**dim * self.shape(r / h)
 
-    def slope(self, r: Array, h: float, dim: int) -> Array:
+    def slope(self, r: Array, h: float | Array, dim: int) -> Array:
         """Return dW/dr [1/length^(dim+1)] at distances r [length], any shape."""
         return self.norm[dim - 2] / h ** (dim + 1) * self.derivative(r / h)
 
-    def pull(self, r: Array, h: float, dim: int) -> Array:
+    def pull(self, r: Array, h: float | Array, dim: int) -> Array:
         """Return dW/dr / r [1/length^(dim+2)] at distances r [length], any shape; where that has no limit at r = 0, 0 there."""
         if self.over_q is not None:
             return self.norm[dim - 2] / h ** (dim + 2) * self.over_q(r / h)

@@ -1,7 +1,7 @@
 """The first model and state of a scene: what acts in it, and its particles, put into JAX."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, overload
 
 import jax
 import jax.numpy as jnp
@@ -9,21 +9,32 @@ import numpy as np
 from jax import Array
 
 import jfrnn
-from experiments.sph import solids
+from experiments.sph import gas, solids
 from experiments.sph.kernels import KERNELS
 from experiments.sph.pairs import reach
-from experiments.sph.particles import Model, State
-from jfrnn.cases.fluids import FluidScene, Physics
+from experiments.sph.particles import Flow, Model, State
+from jfrnn.cases.fluids import FluidScene, GasScene, Physics, Scene
 
 __all__ = ["Model", "State", "make_model", "make_state"]
 
 
-def make_model(scene: FluidScene, dtype: type = np.float64, backend: str = "auto") -> Model:
+@overload
+def make_model(scene: FluidScene, dtype: type = ..., backend: str = ...) -> Model: ...
+
+
+@overload
+def make_model(scene: Scene, dtype: type = ..., backend: str = ...) -> Flow: ...
+
+
+def make_model(scene: Scene, dtype: type = np.float64, backend: str = "auto") -> Flow:
     """Put what acts in a scene into JAX, numbers of one dtype.
 
     Raises:
-        ValueError: A periodic box is too small for the kernel, or parts of the physics do not go together.
+        ValueError: A periodic box is too small for the kernel, or parts of the physics do not go together; or as `gas.make_model`.
     """
+    if isinstance(scene, GasScene):
+        return gas.make_model(scene, dtype, backend)
+    assert isinstance(scene, FluidScene), "a scene is of one of two kinds"
 
     def array(value: Any) -> Array:  # noqa: ANN401
         return jnp.asarray(value, dtype)
@@ -95,12 +106,15 @@ def _check_solid(physics: Physics[float, tuple[float, ...]]) -> None:
         raise ValueError("corrected must be False beside a solid: what it corrects is what the wall lacks in particles.")
 
 
-def make_state(scene: FluidScene, dtype: type = np.float64) -> State:
+def make_state(scene: Scene, dtype: type = np.float64) -> State:
     """Put the particles of a scene into JAX, where they are at first; `solver.begin` does the rest.
 
     Raises:
         ValueError: The solid is not closed, or holds a particle.
     """
+    if isinstance(scene, GasScene):
+        return gas.make_state(scene, dtype)
+    assert isinstance(scene, FluidScene), "a scene is of one of two kinds"
     physics = scene.physics
     x, v = jnp.asarray(scene.positions, dtype), jnp.asarray(scene.velocities, dtype)
     zero = jnp.zeros((), dtype)

@@ -2,8 +2,9 @@
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -13,6 +14,8 @@ from experiments.sph.kernels import Kernel
 Values = dict[str, Array]
 """What is known of each particle: m [kg], rho [kg/m³], volume m/rho, specific 1/rho, p [Pa], v, u, w [m/s], wall, inverse."""
 Term = Callable[["Pair", Values, Values], Any]
+OwnTerm = Callable[["Pair", "Pair", Values, Values], Any]
+Length = TypeVar("Length", float, Array)
 _BEYOND = 1 + 2**-12  # a lattice has many pairs at exactly the support, which take long to decide (10 times the sum) and add 0
 
 
@@ -46,7 +49,7 @@ class Pair:
         h: Smoothing length.
     """
 
-    def __init__(self, r: Array, kernel: Kernel, h: float) -> None:
+    def __init__(self, r: Array, kernel: Kernel, h: float | Array) -> None:
         """Hold the displacement of a pair, and the kernel."""
         self.r, self.kernel, self.h = r, kernel, h
 
@@ -72,9 +75,9 @@ class Pair:
         return self.kernel.pull(self.distance, self.h, self.r.shape[0])
 
 
-def reach(kernel: Kernel, h: float) -> float:
+def reach(kernel: Kernel, h: Length) -> Length:
     """Return the cutoff [length] of pairs: a little more than the kernel's support, where all terms are 0."""
-    return kernel.support * h * _BEYOND
+    return kernel.support * _BEYOND * h
 
 
 def total(
@@ -109,3 +112,34 @@ def total(
     if nbrs is not None:
         return nbrs.sum(fn, x, values)
     return jfrnn.pair_sum(fn, x, reach(kernel, h), values, **options)
+
+
+def total_of_own(
+    term: OwnTerm,
+    x: Array,
+    values: Values,
+    kernel: Kernel,
+    h: Array,
+    rule: str,
+    backend: str = "auto",
+) -> Any:  # noqa: ANN401
+    """Sum a term over the neighbors of each particle, where each particle has its own smoothing length.
+
+    Args:
+        term: (the pair as i weighs it, with h_i, and as j does, with h_j; values of i, values of j) -> a pytree of arrays.
+        x: Positions [length], shape [n, d].
+        values: Arrays of shape [n, ...], that the term reads.
+        kernel: Gives the pairs their weights and, by its support, the cutoffs.
+        h: Smoothing lengths [length], shape [n].
+        rule: "gather": j is a neighbor of i within the support of i; "either": within that of i or of j.
+        backend: Of `jfrnn.pair_sum`.
+
+    Returns:
+        What the term returns, leaves [n, ...]; differentiable in x, values and h.
+    """
+
+    def fn(r: Array, i: Values, j: Values) -> Any:  # noqa: ANN401
+        return term(Pair(r, kernel, i["h"]), Pair(r, kernel, j["h"]), i, j)
+
+    cutoffs = reach(kernel, jax.lax.stop_gradient(h))
+    return jfrnn.pair_sum(fn, x, cutoffs, values | {"h": h}, radius_rule=rule, backend=backend)

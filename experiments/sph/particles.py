@@ -10,13 +10,14 @@ import jfrnn
 from experiments.sph.kernels import KERNELS, Kernel
 from experiments.sph.pairs import reach
 from jfrnn.cases import fluids
-from jfrnn.cases.fluids import Physics, Turning
+from jfrnn.cases.fluids import Gas, Physics, Turning
 
 jax.tree_util.register_dataclass(
     fluids.Physics,
     data_fields=[item.name for item in fields(fluids.Physics) if item.name not in fluids.WORDS],
     meta_fields=list(fluids.WORDS),
 )
+jax.tree_util.register_dataclass(fluids.Gas, data_fields=["heat_ratio", "smoothing_ratio", "artificial"], meta_fields=["kernel"])
 jax.tree_util.register_dataclass(fluids.Turning, data_fields=["center", "axis", "rate"], meta_fields=[])
 
 
@@ -64,6 +65,31 @@ class Model:
         return reach(self.kernel, self.physics.smoothing)
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class GasModel:
+    """What acts on the particles of a gas.
+
+    Attributes:
+        physics: `cases.fluids.Gas`; its kernel is static, its numbers may be traced.
+        m: Masses [kg], shape [n].
+        step: Time step [s]; None: the Courant condition gives it.
+        dim: Number of axes. Static.
+        backend: Of `jfrnn.pair_sum`. Static.
+    """
+
+    physics: Gas[Array]
+    m: Array
+    step: Array | None
+    dim: int = field(metadata={"static": True})
+    backend: str = field(default="auto", metadata={"static": True})
+
+    @property
+    def kernel(self) -> Kernel:
+        """The smoothing kernel."""
+        return KERNELS[self.physics.kernel]
+
+
 class Beside(NamedTuple):
     """The wall as particles see it, where they are.
 
@@ -82,6 +108,22 @@ class Beside(NamedTuple):
     normal: Array
 
 
+class Thermal(NamedTuple):
+    """What particles of a gas have besides velocities.
+
+    Attributes:
+        u: Specific thermal energies [J/kg], shape [n].
+        h: Smoothing lengths [m], shape [n].
+        heating: Rates of u of the last evaluation [W/kg], shape [n].
+        growth: Rates of ln h by the divergence of the flow then [1/s], shape [n].
+    """
+
+    u: Array
+    h: Array
+    heating: Array
+    growth: Array
+
+
 class State(NamedTuple):
     """What moves. Fields that the scene has no use for are None.
 
@@ -95,6 +137,7 @@ class State(NamedTuple):
         p: Carried pressures [Pa], shape [n].
         w: Velocities with which particles move besides v [m/s], shape [n, d].
         solid: The wall of triangles as particles see it.
+        gas: What else moves in a gas.
     """
 
     x: Array
@@ -106,3 +149,7 @@ class State(NamedTuple):
     p: Array | None = None
     w: Array | None = None
     solid: Beside | None = None
+    gas: Thermal | None = None
+
+
+Flow = Model | GasModel

@@ -1,4 +1,4 @@
-"""Which values the settings of a fluid scene may have: of its function, and of `Physics`."""
+"""Which values the settings of a scene may have: of its function, and of its physics."""
 
 import types
 from typing import Annotated, Any, Union, get_args, get_origin
@@ -11,7 +11,7 @@ _ABOVE_0: Bounds = {"gt": 0}
 _FROM_0: Bounds = {"ge": 0}
 _POSITIVE = (
     *("duration", "step", "reynolds", "radius", "side", "width", "height", "depth", "diameter", "plate", "module", "speed"),
-    *("top_speed", "density", "sound_speed", "smoothing", "exponent"),
+    *("top_speed", "density", "sound_speed", "smoothing", "exponent", "energy"),
 )
 _NOT_NEGATIVE = (
     *("viscosity", "artificial", "density_diffusion", "pressure_diffusion", "transport", "shifting", "tension"),
@@ -22,6 +22,9 @@ RANGES: dict[str, Bounds] = {
     **{key: _FROM_0 for key in _NOT_NEGATIVE},
     **{key: {"ge": 1, "le": 10_000} for key in ("nx", "layers")},
     "ny": {"ge": 2, "le": 10_000},
+    "heat_ratio": {"gt": 1, "lt": 2},
+    "smoothing_ratio": {"ge": 1, "le": 4},
+    "hot": {"ge": 1, "le": 100},
     "dim": {"ge": 2, "le": 3},
     "seed": {"ge": 0, "lt": 2**31},
     "teeth": {"ge": 5, "le": 1000},

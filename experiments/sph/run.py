@@ -14,8 +14,9 @@ from experiments import _loop
 from experiments._errors import UsageError
 from experiments.sph import forces, frames, health, settings, snapshots, solids, solver
 from experiments.sph.forces import Neighbors
-from experiments.sph.model import Model, State, make_model, make_state
-from jfrnn.cases.fluids import FluidScene
+from experiments.sph.model import make_model, make_state
+from experiments.sph.particles import Flow, GasModel, Model, State
+from jfrnn.cases.fluids import GasScene, Scene
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ def faster_way(platform: str, particles: int) -> str:
     return "list" if platform != "cpu" and particles <= MOST_FOR_LISTS else "pair_sum"
 
 
-def run(scene: FluidScene, folder: Path, how: How) -> State:
+def run(scene: Scene, folder: Path, how: How) -> State:
     """Run a scene from its beginning, or from the last snapshot of the folder, to its end.
 
     Args:
@@ -73,16 +74,15 @@ def run(scene: FluidScene, folder: Path, how: How) -> State:
         s, step = saved or (first or make_state(scene, np.dtype(how.dtype).type), 0)
     except ValueError as error:
         raise UsageError(f"scene {scene.name!r}: {error}") from error
-    way = faster_way(jax.default_backend(), scene.n) if how.neighbors == "auto" else how.neighbors
-    nbrs = solver.list_neighbors(model, s, how.skin * scene.spacing) if way == "list" else None
+    nbrs = _first_neighbors(scene, model, s, how)
     if saved is None:
         s = jax.jit(solver.begin)(model, s, nbrs)
         _keep(scene, model, s, nbrs, folder, step, how)
     with _loop.show(how.frames, round(how.frames * float(s.time) / scene.duration)) as shown:
         shown.label(scene.name)
-        while (steps := _steps_to_next(scene, model, s, how.frames)) > 0:
+        while (goal := _next_moment(scene, model, s, how.frames)) is not None:
             start, before, nbrs_before = perf_counter(), s, nbrs
-            s, nbrs = _chunk(model, s, nbrs, steps)
+            s, nbrs, steps = _chunk(model, s, nbrs, goal)
             jax.block_until_ready(s.x)
             seconds = perf_counter() - start
             health.check(scene, model, before, nbrs_before, s, steps, step)
@@ -98,18 +98,41 @@ def run(scene: FluidScene, folder: Path, how: How) -> State:
     return s
 
 
-def _digest(scene: FluidScene) -> str:
+def _first_neighbors(scene: Scene, model: Flow, s: State, how: How) -> Neighbors:
+    """Return a list where sums over one are asked for or faster; the smoothing lengths of a gas change in every step.
+
+    Raises:
+        UsageError: A list is asked for, of a gas.
+    """
+    if isinstance(model, GasModel):
+        if how.neighbors == "list":
+            raise UsageError(f"--neighbors list: the cutoffs of scene {scene.name!r} change in every step; take pair_sum or auto")
+        return None
+    way = faster_way(jax.default_backend(), scene.n) if how.neighbors == "auto" else how.neighbors
+    return solver.list_neighbors(model, s, how.skin * scene.spacing) if way == "list" else None
+
+
+def _digest(scene: Scene) -> str:
     """Return 12 hex digits that stand for the particles and the solid of a scene."""
-    arrays = (scene.positions, scene.velocities, scene.masses, *((scene.solid.vertices, scene.solid.faces) if scene.solid else ()))
+    arrays = [scene.positions, scene.velocities, scene.masses]
+    arrays += [scene.energies] if isinstance(scene, GasScene) else []
+    arrays += [scene.solid.vertices, scene.solid.faces] if scene.solid else []
     return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()[:12]
 
 
-def _chunk(model: Model, s: State, nbrs: Neighbors, steps: int) -> tuple[State, Neighbors]:
-    """Run steps; where a row of a list overflowed, with a larger list again."""
+def _chunk(model: Flow, s: State, nbrs: Neighbors, goal: float) -> tuple[State, Neighbors, int]:
+    """Run steps to about a time [s], and return their number; where a row of a list overflowed, with a larger list again.
+
+    The steps of a fluid grow slowly: their number is told by the first. Those of a gas grow fast after a blast, and are counted.
+    """
+    if isinstance(model, GasModel):
+        after, taken = solver.advance_until(model, s, goal)
+        return after, None, int(taken)
+    steps = max(1, round((goal - float(s.time)) / _step_now(model, s)))
     while True:
         after, seen = _chunk_of_particles(model, s, nbrs, steps)
         if s.solid is None or after.solid is None or not after.solid.tri.overflow:
-            return after, seen
+            return after, seen, steps
         larger = after.solid.tri.grow(solids.into_frame(s.x, model.turning, s.solid.angle))
         s = s._replace(solid=s.solid._replace(tri=larger))
 
@@ -124,21 +147,24 @@ def _chunk_of_particles(model: Model, s: State, nbrs: Neighbors, steps: int) -> 
         return solver.advance(model, s, nbrs, steps)
 
 
-def _steps_to_next(scene: FluidScene, model: Model, s: State, count: int) -> int:
-    """Return how many steps it is to the next snapshot; 0 at the end."""
-    time, step = float(s.time), float(solver.courant(model, s)) if scene.step is None else scene.step
+def _next_moment(scene: Scene, model: Flow, s: State, count: int) -> float | None:
+    """Return the time of the next snapshot [s]; None at the end."""
+    time, step = float(s.time), _step_now(model, s)
     if time > scene.duration - step / 2:
-        return 0
+        return None
     interval = scene.duration / count
-    goal = interval * (math.floor((time + step / 2) / interval) + 1)
-    return max(1, round((goal - time) / step))
+    return interval * (math.floor((time + step / 2) / interval) + 1)
 
 
-def _keep(scene: FluidScene, model: Model, s: State, nbrs: Neighbors, folder: Path, step: int, how: How) -> dict[str, float]:
+def _step_now(model: Flow, s: State) -> float:
+    return float(solver.courant(model, s) if model.step is None else model.step)
+
+
+def _keep(scene: Scene, model: Flow, s: State, nbrs: Neighbors, folder: Path, step: int, how: How) -> dict[str, float]:
     """Write what belongs to a moment; return its energies."""
     line = snapshots.energies(model, s, scene)
     snapshots.add_line(line, folder / "energies.csv", step)
-    rho, p = jax.jit(forces.density_and_pressure)(model, s, nbrs)
+    rho, p = jax.jit(solver.density_and_pressure)(model, s, nbrs)
     if how.pictures:
         x, v = np.asarray(s.x), np.asarray(s.v)
         top = max(np.linalg.norm(scene.velocities, axis=1).max(initial=0), line["top_speed"])

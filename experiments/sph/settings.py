@@ -3,6 +3,7 @@
 import inspect
 import json
 import math
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -13,34 +14,36 @@ import numpy as np
 from experiments._errors import UsageError
 from experiments.sph import ranges
 from jfrnn.cases import fluids
-from jfrnn.cases.fluids import FluidScene
+from jfrnn.cases.fluids import FluidScene, GasScene, Scene
 
-PHYSICS = get_type_hints(fluids.Physics, localns={"Number": float, "Vector": tuple[float, ...]})
+SCENES: dict[str, Callable[..., Scene]] = {**fluids.FLUIDS, **fluids.GASES}
+_HINTS = {"Number": float, "Vector": tuple[float, ...]}
+PHYSICS, PHYSICS_OF_GASES = (get_type_hints(kind, localns=_HINTS) for kind in (fluids.Physics, fluids.Gas))
 LEAST_SMOOTHING, MOST_SMOOTHING = 0.1, 50.0  # in particle spacings
 MOST_STEPS = 1e9
 _LARGEST_SOLID = 100  # times what the scene shows: files in millimeters are 1000 times as large as they say
 
 
-def make_scene(name: str, settings: list[str]) -> FluidScene:
-    """Return a scene with settings "key=value": of the scene's function, or of `Physics`.
+def make_scene(name: str, settings: list[str]) -> Scene:
+    """Return a scene with settings "key=value": of the scene's function, or of its physics.
 
     Raises:
         UsageError: There is no such scene or key, the value is out of its range, or values do not go together.
     """
-    of_scene = parameters(name)
+    of_scene, of_physics = parameters(name), physics_of(name)
     chosen: dict[str, dict[str, Any]] = {"scene": {}, "physics": {}}
     for setting in settings:
         key, sign, text = setting.partition("=")
         if not sign:
             raise UsageError(f"--set {setting}: expected key=value")
-        if key not in of_scene and key not in PHYSICS:
-            raise UsageError(f"--set {key}: unknown; of {name}: {', '.join(of_scene)}; physics: {', '.join(PHYSICS)}")
+        if key not in of_scene and key not in of_physics:
+            raise UsageError(f"--set {key}: unknown; of {name}: {', '.join(of_scene)}; physics: {', '.join(of_physics)}")
         kind = "scene" if key in of_scene else "physics"
-        chosen[kind][key] = _value(name, key, text, of_scene.get(key, PHYSICS.get(key)))
+        chosen[kind][key] = _value(name, key, text, of_scene.get(key, of_physics.get(key)))
     said = "".join(f" --set {setting}" for setting in settings)
     try:
         with np.errstate(all="ignore"):  # what is not finite is refused below
-            scene = fluids.FLUIDS[name](**chosen["scene"])
+            scene: Any = SCENES[name](**chosen["scene"])
     except (ValueError, ZeroDivisionError, OverflowError, MemoryError) as error:
         raise UsageError(f"scene {name!r}{said}: cannot be made ({error})") from error
     scene = replace(scene, physics=replace(scene.physics, **chosen["physics"]))
@@ -55,29 +58,40 @@ def parameters(name: str) -> dict[str, Any]:
     Raises:
         UsageError: There is no such scene.
     """
-    if name not in fluids.FLUIDS:
-        raise UsageError(f"unknown fluid scene {name!r}; allowed: {', '.join(fluids.FLUIDS)}")
-    return {key: item.annotation for key, item in inspect.signature(fluids.FLUIDS[name]).parameters.items() if key != "name"}
+    if name not in SCENES:
+        raise UsageError(f"unknown fluid scene {name!r}; allowed: {', '.join(SCENES)}")
+    return {key: item.annotation for key, item in inspect.signature(SCENES[name]).parameters.items() if key != "name"}
 
 
-def _complaint(scene: FluidScene) -> str | None:
+def physics_of(name: str) -> dict[str, Any]:
+    """Return the settings of the physics of a scene, by its name, with their annotations."""
+    return PHYSICS_OF_GASES if name in fluids.GASES else PHYSICS
+
+
+def _complaint(scene: Scene) -> str | None:
     """Say which settings do not go together, None where they do."""
-    gravity, smoothing = scene.physics.gravity, scene.physics.smoothing / scene.spacing
     fluid = scene.n if scene.wall is None else int((~scene.wall).sum())
     if fluid == 0:
         return "has no particle of fluid: make it larger, or its particles smaller"
-    for name in ("positions", "velocities", "masses"):
-        if not np.isfinite(getattr(scene, name)).all():
+    for name in ("positions", "velocities", "masses", "energies"):
+        if not np.isfinite(getattr(scene, name, 0)).all():
             return f"its {name} are not finite"
+    if isinstance(scene, FluidScene) and (wrong := _complaint_of_physics(scene)) is not None:
+        return wrong
+    if scene.step is not None and not scene.duration / MOST_STEPS <= scene.step < math.inf:
+        return f"takes steps of {scene.step:.3g} s for {scene.duration:.3g} s, expected up to {MOST_STEPS:.0e} steps"
+    if scene.step == 0:
+        return f"takes steps of 0 s for {scene.duration:.3g} s"
+    return None
+
+
+def _complaint_of_physics(scene: FluidScene) -> str | None:
+    gravity, smoothing = scene.physics.gravity, scene.physics.smoothing / scene.spacing
     if gravity is not None and len(gravity) != scene.dim:
         return f"gravity has {len(gravity)} components, expected {scene.dim} in {scene.dim}D"
     if not LEAST_SMOOTHING <= smoothing <= MOST_SMOOTHING:
         spacing = f"{LEAST_SMOOTHING:g} to {MOST_SMOOTHING:g} particle spacings of {scene.spacing:.4g} m"
         return f"smoothing is {scene.physics.smoothing:.4g} m, expected {spacing}"
-    if scene.step is not None and not scene.duration / MOST_STEPS <= scene.step < math.inf:
-        return f"takes steps of {scene.step:.3g} s for {scene.duration:.3g} s, expected up to {MOST_STEPS:.0e} steps"
-    if scene.step == 0:
-        return f"takes steps of 0 s for {scene.duration:.3g} s"
     return None
 
 
@@ -92,7 +106,7 @@ def _value(scene: str, key: str, text: str, kind: Any) -> Any:  # noqa: ANN401
         raise UsageError(f"--set {key}: got {text!r}; {error}") from error
 
 
-def with_particles(scene: FluidScene, path: Path) -> FluidScene:
+def with_particles(scene: Scene, path: Path) -> Scene:
     """Return the scene with the fluid of a file; its walls stay.
 
     Args:
@@ -101,8 +115,10 @@ def with_particles(scene: FluidScene, path: Path) -> FluidScene:
             then vx, vy, vz and m, if wanted. Velocities are 0 without, masses those of the scene's first particle.
 
     Raises:
-        UsageError: The file cannot be used.
+        UsageError: The file cannot be used, or the scene is a gas.
     """
+    if isinstance(scene, GasScene):
+        raise UsageError(f"--initial {path}: says nothing of thermal energies, which scene {scene.name!r} needs; leave it out")
     try:
         given = {name: np.asarray(array, np.float64) for name, array in _read(path, scene.dim).items()}
     except (TypeError, ValueError) as error:
@@ -122,7 +138,7 @@ def with_particles(scene: FluidScene, path: Path) -> FluidScene:
     return _replace_particles(scene, positions, velocities, masses)
 
 
-def with_solid(scene: FluidScene, path: Path, scale: float) -> FluidScene:
+def with_solid(scene: Scene, path: Path, scale: float) -> Scene:
     """Return the scene with the triangles of a file as its solid, which stands.
 
     Args:
@@ -170,7 +186,7 @@ def _place(corner: np.ndarray) -> str:
     return "(" + ", ".join(f"{x:.3g}" for x in corner) + ")"
 
 
-def _replace_particles(scene: FluidScene, positions: np.ndarray, velocities: np.ndarray, masses: np.ndarray) -> FluidScene:
+def _replace_particles(scene: Scene, positions: np.ndarray, velocities: np.ndarray, masses: np.ndarray) -> Scene:
     """Return the scene with these particles, all of them there from the beginning, before its walls."""
     walls = np.zeros(scene.n, bool) if scene.wall is None else scene.wall
     return replace(
@@ -210,7 +226,8 @@ def _columns(table: np.ndarray, axes: str) -> dict[str, np.ndarray]:
     return given | ({"masses": table["m"]} if "m" in names else {})
 
 
-def describe(scene: FluidScene) -> dict[str, Any]:
+def describe(scene: Scene) -> dict[str, Any]:
     """Return what a scene says, but its particles: what a run must have in common with one that it goes on with."""
+    assert isinstance(scene, FluidScene | GasScene), "a scene is of one of two kinds"
     physics = {item.name: getattr(scene.physics, item.name) for item in fields(scene.physics)}
     return {"name": scene.name, "particles": scene.n, "duration": scene.duration, "step": scene.step, "physics": physics}

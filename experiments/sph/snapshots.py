@@ -11,14 +11,15 @@ import numpy as np
 from experiments._commands import take_folder
 from experiments._errors import UsageError
 from experiments.sph import budget, solids
-from experiments.sph.model import Model, State
-from jfrnn.cases.fluids import FluidScene
+from experiments.sph.particles import Flow, State, Thermal
+from jfrnn.cases.fluids import FluidScene, Scene
 
 
-def save(state: State, scene: FluidScene, rho: np.ndarray, p: np.ndarray, folder: Path, step: int) -> None:
+def save(state: State, scene: Scene, rho: np.ndarray, p: np.ndarray, folder: Path, step: int) -> None:
     """Write a state as STEP.npz, complete or not at all, and its particles that have entered as STEP.vtp."""
     folder.mkdir(parents=True, exist_ok=True)
-    arrays = {name: np.asarray(value) for name, value in state._asdict().items() if value is not None and name != "solid"}
+    parts = state._asdict() | ({} if state.gas is None else state.gas._asdict())
+    arrays = {name: np.asarray(value) for name, value in parts.items() if value is not None and name not in ("solid", "gas")}
     if state.solid is not None and state.solid.angle is not None:
         arrays["angle"] = np.asarray(state.solid.angle)
     whole, part = folder / f"{step:09d}.npz", folder / "part.npz"
@@ -27,7 +28,7 @@ def save(state: State, scene: FluidScene, rho: np.ndarray, p: np.ndarray, folder
     part.replace(whole)
 
 
-def latest(folder: Path, scene: FluidScene) -> tuple[State, int] | None:
+def latest(folder: Path, scene: Scene) -> tuple[State, int] | None:
     """Return the last state that was saved of a scene, and its step; None where there is none."""
     paths = sorted(path for path in folder.glob("*.npz") if path.stem.isdigit())
     if not paths:
@@ -35,10 +36,12 @@ def latest(folder: Path, scene: FluidScene) -> tuple[State, int] | None:
     try:
         with paths[-1].open("rb") as stream, np.load(stream) as file:
             arrays = {name: jnp.asarray(file[name]) for name in file}
-        angle, s = arrays.pop("angle", None), State(**arrays)  # pyright: ignore[reportArgumentType]
+        angle, gas = arrays.pop("angle", None), [arrays.pop(name) for name in Thermal._fields if name in arrays]
+        s = State(**arrays, gas=Thermal(*gas) if gas else None)  # pyright: ignore[reportArgumentType]
     except (ValueError, TypeError, EOFError, BadZipFile) as error:
         raise UsageError(f"{paths[-1]}: is no snapshot ({error}); remove it, and the run goes on from the one before") from error
-    return s._replace(solid=solids.begin(scene, s.x, angle)), int(paths[-1].stem)
+    solid = solids.begin(scene, s.x, angle) if isinstance(scene, FluidScene) else None
+    return s._replace(solid=solid), int(paths[-1].stem)
 
 
 def check_same(about: dict[str, Any], folder: Path) -> None:
@@ -60,22 +63,24 @@ def check_same(about: dict[str, Any], folder: Path) -> None:
         raise UsageError(f"{folder}: holds a run with another {', '.join(different)}; take another folder, or remove it")
 
 
-def energies(model: Model, state: State, scene: FluidScene) -> dict[str, float]:
-    """Return a line of the energies: time [s], kinetic and potential energy [J], momentum [kg m/s], largest speed [m/s].
+def energies(model: Flow, state: State, scene: Scene) -> dict[str, float]:
+    """Return a line of the energies: time [s], `budget.energies` [J] and their total, momentum [kg m/s], largest speed [m/s].
 
-    Where there is a solid, also the least signed distance to it [m], infinite where nothing is within its reach.
+    Of a gas, also the largest smoothing length over the smallest. Where there is a solid, also the least signed distance to it [m],
+    infinite where nothing is within its reach.
     """
     moved = budget.momentum(model, state)
     fluid = np.ones(scene.n, bool) if scene.wall is None else ~scene.wall
     line = {
         "time": float(state.time),
-        "kinetic": float(budget.kinetic_energy(model, state)),
-        "potential": float(budget.potential_energy(model, state)),
+        **(held := {name: float(value) for name, value in budget.energies(model, state).items()}),
         **{f"momentum_{axis}": float(moved[k]) for k, axis in enumerate("xyz"[: scene.dim])},
         "top_speed": float(np.linalg.norm(np.asarray(state.v)[fluid], axis=1).max(initial=0)),
     }
-    line |= {"total": line["kinetic"] + line["potential"]}
-    distances = solids.clearance(scene, state)
+    line |= {"total": sum(held.values())}
+    if state.gas is not None:
+        line |= {"resolution": float(state.gas.h.max() / state.gas.h.min())}
+    distances = solids.clearance(scene, state) if isinstance(scene, FluidScene) else None
     return line if distances is None else line | {"clearance": float(distances.min(initial=np.inf))}
 
 
@@ -89,7 +94,7 @@ def add_line(line: dict[str, float], path: Path, step: int) -> None:
     part.replace(path)
 
 
-def _write_vtk(arrays: dict[str, np.ndarray], scene: FluidScene, values: dict[str, np.ndarray], path: Path) -> None:
+def _write_vtk(arrays: dict[str, np.ndarray], scene: Scene, values: dict[str, np.ndarray], path: Path) -> None:
     import pyvista
 
     there = np.ones(scene.n, bool) if scene.enters is None else scene.enters <= arrays["time"]

@@ -5,22 +5,27 @@ import jax.numpy as jnp
 from jax import Array
 
 import jfrnn
-from experiments.sph import forces, solids, walls
+from experiments.sph import forces, gas, solids, walls
 from experiments.sph.forces import Neighbors
 from experiments.sph.model import Model, State
+from experiments.sph.particles import Flow, GasModel
 
 
-def begin(model: Model, s: State, nbrs: Neighbors = None) -> State:
+def begin(model: Flow, s: State, nbrs: Neighbors = None) -> State:
     """Return the state with what its integrator carries from step to step, at the positions and velocities that it has."""
+    if isinstance(model, GasModel):
+        return gas.begin(model, s)
     return _evaluate(model, s, nbrs) if model.physics.integrator == "symplectic" else s
 
 
-def courant(model: Model, s: State) -> Array:
-    """Return the time step [s], shape [], that sound, viscosity and acceleration allow.
+def courant(model: Flow, s: State) -> Array:
+    """Return the time step [s], shape [], that sound, viscosity and acceleration allow; in a gas as `gas.courant` says.
 
     The least of 0.25 h/(c + |v|), 0.25 √(h/|a|) and, with viscosity, 0.125 h²/ν.
     Source: Monaghan (1992), doi:10.1146/annurev.aa.30.090192.002551; Morris, Fox & Zhu (1997), doi:10.1006/jcph.1997.5776.
     """
+    if isinstance(model, GasModel):
+        return gas.courant(model, s)
     physics, h = model.physics, model.physics.smoothing
     speed = _greatest(s.v) if s.solid is None else _greatest(s.v) + solids.rim_speed(model, s.solid)
     limits = [0.25 * h / (physics.sound_speed + speed)]
@@ -37,29 +42,44 @@ def _greatest(vectors: Array) -> Array:
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 
-def step(model: Model, s: State, nbrs: Neighbors = None) -> tuple[State, Neighbors]:
+def step(model: Flow, s: State, nbrs: Neighbors = None) -> tuple[State, Neighbors]:
     """Advance by one time step: the scene's own, or what `courant` allows.
 
     Args:
         model: What acts.
         s: The state, as `begin` or this function returns it.
-        nbrs: A neighbor list, which is updated; None: neighbors are found by each sum anew.
+        nbrs: A neighbor list, which is updated; None: neighbors are found by each sum anew, as always in a gas.
 
     Returns:
         The state after the step, and the list.
     """
     dt = courant(model, s) if model.step is None else model.step
-    s, nbrs = _INTEGRATORS[model.physics.integrator](model, s, dt, nbrs)
+    if isinstance(model, GasModel):
+        s = gas.step(model, s, dt)
+    else:
+        s, nbrs = _INTEGRATORS[model.physics.integrator](model, s, dt, nbrs)
     return s._replace(time=s.time + dt, last=dt), nbrs
 
 
 @jax.jit
-def advance(model: Model, s: State, nbrs: Neighbors, steps: Array | int) -> tuple[State, Neighbors]:
+def advance(model: Flow, s: State, nbrs: Neighbors, steps: Array | int) -> tuple[State, Neighbors]:
     """Run a number of steps, data: one compiled loop serves all numbers."""
     return jax.lax.fori_loop(0, steps, lambda _, carry: step(model, *carry), (s, nbrs))
 
 
-def rollout(model: Model, s: State, steps: int, nbrs: Neighbors = None, segments: int = 1) -> tuple[State, Neighbors]:
+def density_and_pressure(model: Flow, s: State, nbrs: Neighbors = None) -> tuple[Array, Array]:
+    """Return densities [kg/m³] and pressures [Pa] of a state, shape [n] each."""
+    return gas.density_and_pressure(model, s) if isinstance(model, GasModel) else forces.density_and_pressure(model, s, nbrs)
+
+
+@jax.jit
+def advance_until(model: Flow, s: State, time: Array | float) -> tuple[State, Array]:
+    """Run steps that search until one ends at a time [s] or later; return the state, and how many steps it took."""
+    first = (s, jnp.zeros((), jnp.int32))
+    return jax.lax.while_loop(lambda carry: carry[0].time < time, lambda carry: (step(model, carry[0])[0], carry[1] + 1), first)
+
+
+def rollout(model: Flow, s: State, steps: int, nbrs: Neighbors = None, segments: int = 1) -> tuple[State, Neighbors]:
     """Run steps such that they can be differentiated in reverse, in the model's numbers and in the state.
 
     Derivatives are those of the program: a list changes none of them, and where a flow has a kink (a bounce off a tank; artificial

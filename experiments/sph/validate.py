@@ -19,8 +19,8 @@ from experiments._loop import Task, fill
 from experiments._rows import Row, RowFile
 from experiments.sph import health, solver
 from experiments.sph.model import make_model, make_state
+from experiments.sph.settings import SCENES
 from experiments.sph.validation import CASES, Case, Curves, Seen, look
-from jfrnn.cases import fluids
 
 
 @dataclass(kw_only=True)
@@ -48,15 +48,17 @@ def run(names: list[str], folder: Path) -> list[CaseRow]:
 
 def measure(name: str, case: Case, say: Any = print) -> CaseRow:  # noqa: ANN401
     """Run a case and judge it; a run that diverges makes a row that says so."""
-    scene = fluids.fluid(case.scene, **case.settings)
-    assert scene.step is not None, "cases are looked at after whole steps"
+    scene = SCENES[case.scene](**case.settings)
     model, start, step, seen = make_model(scene, backend=case.backend), perf_counter(), 0, []
     s = jax.jit(solver.begin)(model, make_state(scene))
     reason = None
     for time in case.times:
-        steps = round(time / scene.step) - step
-        s, _ = solver.advance(model, s, None, steps)
-        step += steps
+        if scene.step is None:
+            s, steps = solver.advance_until(model, s, time)
+        else:
+            steps = round(time / scene.step) - step
+            s, _ = solver.advance(model, s, None, steps)
+        step += int(steps)
         if (reason := health.complaint(scene, s)) is not None:
             reason = f"diverged until t = {float(s.time):.6g} s: {reason}"
             break

@@ -8,17 +8,21 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax import Array
 
 from experiments._library import taylor_green_velocity
-from experiments.sph import answers, budget, forces, potential
-from experiments.sph.model import Model, State
-from jfrnn.cases.fluids import FluidScene
+from experiments.sph import answers, budget, potential, solver
+from experiments.sph.particles import Flow, State
+from jfrnn.cases.fluids import FluidScene, GasScene, Scene
 
 Curves = dict[str, list[list[float]]]
 
 
 class Seen(NamedTuple):
-    """The fluid at a moment: time [s], positions, velocities, pressures, kinetic and potential energy [J]; no walls."""
+    """The fluid at a moment: time [s], positions, velocities, pressures, kinetic and potential energy [J]; no walls.
+
+    Of a gas also densities, its thermal energy [J], and its largest smoothing length over the smallest.
+    """
 
     time: float
     x: np.ndarray
@@ -26,6 +30,9 @@ class Seen(NamedTuple):
     p: np.ndarray
     kinetic: float
     potential: float
+    rho: np.ndarray | None = None
+    thermal: float = 0.0
+    resolution: float = 1.0
 
 
 class Figure(NamedTuple):
@@ -47,7 +54,7 @@ class Case:
     """A scene, when it is looked at, and what is said about what was seen.
 
     Attributes:
-        scene: Name of a fluid scene.
+        scene: Name of a scene.
         times: When it is looked at [s].
         judge: (scene, what was seen) -> figures, and curves by name, each [x, y], for the picture.
         settings: Of the scene.
@@ -57,24 +64,24 @@ class Case:
 
     scene: str
     times: tuple[float, ...]
-    judge: Callable[[FluidScene, list[Seen]], tuple[list[Figure], Curves]]
+    judge: Callable[[Any, list[Seen]], tuple[list[Figure], Curves]]
     settings: dict[str, Any] = field(default_factory=dict)
     backend: str = "auto"
     axes: tuple[str, str] = ("time [s]", "energy [J]")
 
 
 @jax.jit
-def _measures(model: Model, s: State) -> tuple[jax.Array, ...]:
-    return forces.density_and_pressure(model, s)[1], budget.kinetic_energy(model, s), budget.potential_energy(model, s)
+def _measures(model: Flow, s: State) -> tuple[Array, Array, dict[str, Array]]:
+    return *solver.density_and_pressure(model, s), budget.energies(model, s)
 
 
-def look(scene: FluidScene, model: Model, s: State) -> Seen:
+def look(scene: Scene, model: Flow, s: State) -> Seen:
     """Return what is to be seen of a state."""
     fluid = np.ones(scene.n, bool) if scene.wall is None else ~scene.wall
-    p, kinetic, potential = _measures(model, s)
-    return Seen(
-        float(s.time), np.asarray(s.x)[fluid], np.asarray(s.v)[fluid], np.asarray(p)[fluid], float(kinetic), float(potential)
-    )
+    rho, p, energies = _measures(model, s)
+    held = {name: float(energies.get(name, 0)) for name in ("kinetic", "potential", "thermal")}
+    x, v, p, rho = (np.asarray(each)[fluid] for each in (s.x, s.v, p, rho))
+    return Seen(float(s.time), x, v, p, rho=rho, resolution=1.0 if s.gas is None else float(s.gas.h.max() / s.gas.h.min()), **held)
 
 
 def relative(found: np.ndarray, exact: np.ndarray) -> float:
@@ -218,6 +225,43 @@ def dam_break(scene: FluidScene, seen: list[Seen], perfect: bool = True) -> tupl
     return figures, curves
 
 
+def sedov(scene: GasScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
+    """The front and the densities of a blast, in shells of a particle spacing, against Sedov's; its energies, its resolution.
+
+    The front is where densities, from outside, come up to half of what is between those before it and the largest.
+    """
+    energy, gamma = float(scene.masses @ scene.energies), scene.physics.heat_ratio
+    edges, curves, fronts, errors, peaks = np.arange(scene.positions.max(), step=scene.spacing), {}, [], [], []
+    for at in seen:
+        r, exact = np.linalg.norm(at.x, axis=1), answers.sedov(at.time, energy, gamma, scene.dim)
+        assert at.rho is not None, "of a gas"
+        counts, radii, sums = (np.histogram(r, edges, weights=weights)[0] for weights in (None, r, at.rho))
+        radii, shells = (each[counts > 0] / counts[counts > 0] for each in (radii, sums))
+        edge = np.flatnonzero(shells > (1 + shells.max()) / 2)[-1]
+        front = np.interp(-(1 + shells.max()) / 2, -shells[edge : edge + 2], radii[edge : edge + 2])
+        fronts.append(abs(front / exact.front - 1))
+        peaks.append(shells.max() / exact.rho[-1])
+        known = np.interp(r, exact.r, exact.rho, right=1.0)
+        volumes = np.where(r < 1.2 * exact.front, scene.masses / at.rho, 0)
+        errors.append(volumes @ np.abs(at.rho - known) / (volumes @ known))
+        curves[f"t = {at.time:.2g} s, measured"] = curve(radii, shells)
+        after = [np.append(each, more) for each, more in ((exact.r[::20], [exact.front, edges[-1]]), (exact.rho[::20], [1.0, 1.0]))]
+        curves[f"t = {at.time:.2g} s, known"] = curve(*after)
+    last = seen[-1]
+    outwards = np.sum(last.v * last.x, axis=1) ** 2 / np.sum(last.x**2, axis=1)
+    sideways = 1 - scene.masses @ outwards / (2 * last.kinetic)
+    drift = max(abs((at.kinetic + at.thermal) / energy - 1) for at in seen)
+    figures = [
+        Figure("radius of the front, largest relative error", max(fronts), None, 0.02),
+        Figure(f"density, relative L1, t = {last.time:.2g}", errors[-1], None, 0.12),
+        Figure(f"largest density over exact, t = {last.time:.2g}", peaks[-1], 0.75, 1.1),
+        Figure(f"share of kinetic energy that is not outwards, t = {last.time:.2g}", sideways, None, 0.003),
+        Figure("total energy, largest relative drift", drift, None, 1e-4),
+        Figure(f"largest smoothing length over the smallest, t = {last.time:.2g}", last.resolution, 8.0, 1000.0),
+    ]
+    return figures, curves
+
+
 def _times(end: float, count: int) -> tuple[float, ...]:
     return tuple(float(end * (k + 1) / count) for k in range(count))
 
@@ -242,6 +286,7 @@ CASES = {
         f"dam-break-viscous-{nx}": Case("dam-break-2d", _times(0.8, 80), _held_back, {"nx": nx, "artificial": alpha}, axes=_FRONT)
         for nx, alpha in ((20, 0.2), (40, 0.4))  # α times smoothing length, a viscosity, is the same
     },
+    "sedov": Case("sedov", (0.05, 0.1, 0.15), sedov, axes=("r [m]", "density [kg/m²]")),
     "couette": Case("couette", _CHANNEL, channel, axes=_PROFILE),
     "poiseuille": Case("poiseuille", _CHANNEL, channel, axes=_PROFILE),
     "cavity": Case("cavity", _times(25.0, 25), cavity, axes=("y, x [m]", "velocity [m/s]")),

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jfrnn.cases.fluids import FluidScene, Turning
+from jfrnn.cases.fluids import Scene, Turning
 
 PIXELS = 640  # of the wider side
 _AZIMUTH, _ELEVATION = np.radians(35.0), np.radians(25.0)
@@ -29,7 +29,7 @@ class _Canvas(NamedTuple):
         return flat, points @ _AHEAD
 
 
-def render(scene: FluidScene, x: np.ndarray, colors: np.ndarray, time: float) -> np.ndarray:
+def render(scene: Scene, x: np.ndarray, colors: np.ndarray, time: float) -> np.ndarray:
     """Return a picture of the solid of a scene in 3D and of particles, as balls of their volume.
 
     Args:
@@ -62,7 +62,7 @@ def turn_vertices(vertices: np.ndarray, turning: Turning[float, tuple[float, ...
     return np.array(turning.center) + along + (r - along) * np.cos(angle) + across * np.sin(angle)
 
 
-def _canvas(scene: FluidScene) -> _Canvas:
+def _canvas(scene: Scene) -> _Canvas:
     bounds = np.stack([scene.positions.min(axis=0), scene.positions.max(axis=0)])
     if scene.bounds is not None:
         bounds = np.array([scene.bounds.lower, scene.bounds.upper])

@@ -10,13 +10,13 @@ import numpy as np
 from PIL import Image
 
 from experiments.sph import settings, view
-from jfrnn.cases.fluids import FluidScene
+from jfrnn.cases.fluids import Scene
 
 HIGH, SHOWN, TOP_SPEED, COLORS, MILLISECONDS = 600, 0.84, 16.0, 56, 60
 SLOW, FAST = np.array([0.20, 0.07, 0.02]), np.array([1.0, 0.68, 0.10])  # oil
 
 
-def draw(scene: FluidScene, x: np.ndarray, v: np.ndarray, time: float) -> np.ndarray:
+def draw(scene: Scene, x: np.ndarray, v: np.ndarray, time: float) -> np.ndarray:
     """Return a frame, shape [h, w, 3], bytes."""
     there = np.zeros(scene.n) <= time if scene.enters is None else scene.enters <= time
     share = np.clip(np.linalg.norm(v[there], axis=1) / TOP_SPEED, 0, 1)[:, None]

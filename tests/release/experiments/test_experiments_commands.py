@@ -16,7 +16,6 @@ from experiments._cli import app
 from experiments._errors import UsageError
 from experiments.gpu.config import Config
 from experiments.sph import ranges, settings, snapshots
-from jfrnn.cases import fluids
 
 ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
@@ -71,7 +70,7 @@ def test_help_keeps_what_stands_in_brackets(command):
 
 def test_list_says_what_scenes_there_are_and_what_each_can_be_told():
     names = told("list")
-    assert [name for name in fluids.FLUIDS if f"\n  {name} " not in names] == []
+    assert [name for name in settings.SCENES if f"\n  {name} " not in names] == []
     assert all(word in names for word in ("clustersN", "scipy-kdtree", "thesis"))
     assert max(map(len, names.splitlines())) <= 80
     text = told("list", "dam-break-3d")
@@ -82,10 +81,10 @@ def test_list_says_what_scenes_there_are_and_what_each_can_be_told():
 
 
 def test_every_number_that_can_be_set_has_a_range_and_defaults_are_within():
-    for name in fluids.FLUIDS:
-        make = inspect.signature(fluids.FLUIDS[name]).parameters
-        physics = fluids.fluid(name).physics
-        kinds = settings.PHYSICS | settings.parameters(name)
+    for name, scene in settings.SCENES.items():
+        make = inspect.signature(scene).parameters
+        physics = scene().physics
+        kinds = settings.physics_of(name) | settings.parameters(name)
         for key, kind in kinds.items():
             default = make[key].default if key in make else getattr(physics, key)
             bounds = ranges.of(name, key)
@@ -140,9 +139,9 @@ def test_a_setting_of_a_fluid_that_is_out_of_range(tmp_path, scene, setting, mes
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", fluids.FLUIDS)
+@pytest.mark.parametrize("name", settings.SCENES)
 def test_no_number_of_a_scene_ends_in_anything_but_a_sentence(name):
-    for key, kind in (settings.PHYSICS | settings.parameters(name)).items():
+    for key, kind in (settings.physics_of(name) | settings.parameters(name)).items():
         for text in ("-1", "0", "NaN", "1e-300", "[]", "x", ""):
             if ranges.of(name, key) is not None and (key, text) != ("spacing", "x"):
                 try:
