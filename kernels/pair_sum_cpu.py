@@ -31,11 +31,15 @@ _NAMES = {"float32": "f32", "float64": "f64", "int32": "i32", "int64": "i64", "b
 
 
 class Value(NamedTuple):
-    """What a term reads: its name in the text, its dtype, and of positions the axis; what is none of them has a column."""
+    """What a term reads: its name in the text, its dtype, and of positions the axis; what is none of them has a column.
+
+    So have positions in a box, where kernels hold wrapped ones; `column_axis` is their axis.
+    """
 
     name: str
     dtype: str
     axis: int | None = None
+    column_axis: int | None = None
 
 
 class Sum(NamedTuple):
@@ -143,6 +147,8 @@ def term_header(term: TermText, double: bool, turned: bool = True) -> dict[str, 
     lines += [f"JFRNN_TABLE int PLACE[] = {{{', '.join(map(str, places))}}};"]
     marks = [str(int(part.mark)) for part in term.sums if not part.total]
     lines += [f"JFRNN_TABLE bool MARKED[] = {{{', '.join(marks or ['0'])}}};"]
+    axes = [str(-1 if value.column_axis is None else value.column_axis) for value in term.others if value.axis is None]
+    lines += [f"JFRNN_TABLE int COLUMN_AXES[] = {{{', '.join(axes or ['-1'])}}};"]
     lines += [f"JFRNN_TABLE int STEP_AXES[] = {{{', '.join([str(step.axis) for step in term.steps] or ['0'])}}};"]
     lines += ["struct Term {", *_members(term.shared), "struct Own {", *_members(term.own)]
     lines += [*(f"number turned{c};" for c in range(len(term.steps) if turned else 0)), "};"]
@@ -162,13 +168,23 @@ def _of_shared(term: TermText, double: bool) -> list[str]:
 
 
 def _of_own(term: TermText, double: bool, turned: bool) -> list[str]:
-    """Return the lines that read what is known of a query at `q`, of its row of numbers."""
-    given = zip(term.own, place_values(term.own, "row[{}]", "q[{}]"), strict=True)
+    """Return the lines that read what is known of a query at `q`, of its row of numbers; AT_HOME it has no turns."""
+    given = [
+        (value, at if value.column_axis is None else f"(AT_HOME ? q[{value.column_axis}] : {at})")
+        for value, at in zip(term.own, place_values(term.own, "row[{}]", "q[{}]"), strict=True)
+    ]
     lines = [f"own.{value.name} = {_spread(value, at, double)};" for value, at in given]
     column = sum(value.axis is None for value in term.own)
-    turns = [f"real(Lattice::turn(row[{column}], {step.axis}))" for step in term.steps if turned]
+    turns = [f"AT_HOME ? real(0) : real(Lattice::turn(row[{column}], {step.axis}))" for step in term.steps if turned]
     lines += [f"own.turned{c} = Math::of({x});" for c, x in enumerate(turns)]
-    return ["JFRNN_MEMBER Own own(const real* row, const real* q) const {", "Own own;", *lines, "return own;", "}"]
+    return [
+        "template <bool AT_HOME = false>",
+        "JFRNN_MEMBER Own own(const real* row, const real* q) const {",
+        "Own own;",
+        *lines,
+        "return own;",
+        "}",
+    ]
 
 
 def _evaluation(term: TermText, double: bool, turned: bool) -> list[str]:

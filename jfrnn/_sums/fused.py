@@ -151,16 +151,16 @@ def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: 
 
     translated = translate(jax.make_jaxpr(of_pair)(term.shift, term.operands))
     steps = tuple(Step(input_name(k, e), e) for k, e in translated.reads if k == 0)
-    at_hand = () if any(periodic) and not listed else POSITIONS  # in a box, kernels of cells hold wrapped positions instead
+    wrapped = any(periodic) and not listed  # kernels of cells hold wrapped positions, so that those that were given have columns
     columns, values, before = [], [], 1
     for group, labels in zip(term.operands, ((), *term.labels), strict=True):
         reads = [(k - before, e) for k, e in translated.reads if before <= k < before + len(group)]
-        there = [bool(labels) and labels[k] in at_hand for k, _ in reads]
-        columns.append(tuple(read for read, known in zip(reads, there, strict=True) if not known))
+        axes = [e if labels and labels[k] in POSITIONS else None for k, e in reads]
+        columns.append(tuple(read for read, axis in zip(reads, axes, strict=True) if wrapped or axis is None))
         values.append(
             tuple(
-                Value(input_name(before + k, e), translated.inputs[before + k].dtype, e if known else None)
-                for (k, e), known in zip(reads, there, strict=True)
+                Value(input_name(before + k, e), translated.inputs[before + k].dtype, *((None, axis) if wrapped else (axis, None)))
+                for (k, e), axis in zip(reads, axes, strict=True)
             )
         )
         before += len(group)

@@ -9,6 +9,7 @@ struct Shared {
     int next_chunk;
     int next_gathered, next_sorted;  // chunks of sources whose coordinates and values are put in order
     int gathered;                    // sources that are
+    int turned;                      // whether any particle lies outside of the cell of a periodic box
     real unit;                       // of the lattice on which all coordinates lie, or 0
     real cells_for;                  // where cutoffs differ: that for which cells are wide, or 0: sources stand in a tree
 };
@@ -71,7 +72,7 @@ struct Sort : SortArguments, Places {
         lay_out(grid, low, high, table);
         shared.next_chunk = 0;
         shared.next_gathered = shared.next_sorted = 0;
-        info[0] = 0;
+        info[0] = shared.turned = 0;
         int lowest = 1 << 20, highest = 0;
         look_at_bits(positions, n, lowest, highest);
         if (!own)
@@ -129,16 +130,20 @@ struct Sort : SortArguments, Places {
     // Notes the cell of each point, and how many points each cell has two entries behind its own.
     void count_cells(const Grid& grid, const real* points, int count, int* first) {
         int* const key = this->key;  // stays in a register, whatever is stored
+        int turned = 0;
         for (int c = 0; c < grid.cells + 2; ++c)
             first[c] = 0;
         for (int i = 0; i < count; ++i) {
             real p[3];
             point_of(points + (long long)ROW * i, p);
+            if constexpr (PERIODIC)
+                turned |= Lattice::packed_turns(points[(long long)ROW * i + DIM]) != Lattice::NONE;
             const int cell = finite_point(p) ? cell_key(grid, p, system_of(points + (long long)ROW * i)) : -1;
             key[i] = cell;
             if (cell >= 0)
                 ++first[cell + 2];
         }
+        shared.turned |= turned;
     }
     // Coordinates of few sources are put in order at once, those of many by several threads (`gather`).
     int put_in_cells(const Grid& grid, const real* points, int count, int* first, int* order, bool with_axes) {

@@ -22,7 +22,7 @@ struct CutoffSort : TreeSortArguments {
 
     void build() {
         Shared& shared = cells.shared;
-        shared.next_chunk = shared.next_gathered = shared.next_sorted = shared.gathered = 0;
+        shared.next_chunk = shared.next_gathered = shared.next_sorted = shared.gathered = shared.turned = 0;
         shared.unit = shared.cells_for = 0;
         info[0] = 0;
         if (!sort_by_cells())

@@ -59,6 +59,17 @@ struct Lattice {
         return packed;
     }
     JFRNN_FUNCTION int turn(real last, int axis) { return ((packed_turns(last) >> (10 * axis)) & 1023) - 512; }
+#if !defined(__CUDACC__)
+    template <class Ints, class Lanes>
+    static Ints turns_of(Lanes last, int axis) {
+        Ints packed;
+        if constexpr (DOUBLE)
+            packed = __builtin_convertvector(last, Ints);
+        else
+            memcpy(&packed, &last, sizeof packed);
+        return ((packed >> (10 * axis)) & 1023) - 512;
+    }
+#endif
     // component k of S·A
     JFRNN_MEMBER real translation(int sx, int sy, int sz, int k) const {
         if constexpr (!SKEWED)  // its vectors lie along the axes, and what others would add is 0

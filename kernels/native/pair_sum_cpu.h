@@ -44,30 +44,31 @@ struct SumsBy : Way<SumsBy<Way>> {
     }
 
     void copied(int from, unsigned int near) {
+        const bool at_home = this->at_home();
         for (int c = 0; c < OTHERS; ++c)
-            pack(lanes_from(columns + (long long)c * n + from), column[c] + filled, near);
-        if constexpr (STEPS > 0) {
+            if (!at_home || COLUMN_AXES[c] < 0)
+                pack(lanes_from(columns + (long long)c * n + from), column[c] + filled, near);
+        if (STEPS > 0 && !at_home) {
             const vec turns = lanes_from(columns + (long long)OTHERS * n + from);
             for (int c = 0; c < STEPS; ++c) {
-                vec steps;
-                for (int l = 0; l < LANES; ++l)
-                    steps[l] = real(shift[STEP_AXES[c]] - Lattice::turn(turns[l], STEP_AXES[c]));
-                pack(steps, column[OTHERS + c] + filled, near);
+                const ints turn = Lattice::turns_of<ints>(turns, STEP_AXES[c]);
+                pack(__builtin_convertvector(shift[STEP_AXES[c]] - turn, vec), column[OTHERS + c] + filled, near);
             }
         }
+    }
+    void expect(int id) const {  // rows of queries stand anywhere
+        if constexpr (OWN > 0)
+            __builtin_prefetch(own_values + (long long)id * OWN);
     }
     void none(int id) { results.clear(id); }
     void chunk_done(int chunk) { results.store_totals(chunk); }
     void finish() {}
 
     void meet(const real* q, int id, bool fresh, bool finished) {
-        const Term::Own own_part = term.own(own_values + (long long)id * OWN, q);
-        Reduction reduction(n);
-        if constexpr (PACKED)
-            meet_packed(q, id, own_part, reduction);
+        if (this->at_home())
+            meet_by<PERIODIC != 0>(q, id, fresh, finished);
         else
-            meet_in_place(q, id, own_part, reduction);
-        reduction.store(results, id, fresh, finished);
+            meet_by<false>(q, id, fresh, finished);
     }
     // `decided` while a term is evaluated: denormals are kept for what float64 leaves open alone.
     unsigned int decided_between(const real* q, int id, const Points& points, const int* numbers, unsigned int open) const {
@@ -81,7 +82,30 @@ struct SumsBy : Way<SumsBy<Way>> {
         }
         return pairs;
     }
+    // AT_HOME: coordinates that the term reads are those of the candidates, and all steps are 0.
+    template <bool AT_HOME>
+    void meet_by(const real* q, int id, bool fresh, bool finished) {
+        const Term::Own own_part = term.own<AT_HOME>(own_values + (long long)id * OWN, q);
+        Reduction reduction(n);
+        if constexpr (PACKED)
+            meet_packed<AT_HOME>(q, id, own_part, reduction);
+        else
+            meet_in_place<AT_HOME>(q, id, own_part, reduction);
+        reduction.store(results, id, fresh, finished);
+    }
+    template <bool AT_HOME>
+    static constexpr bool has_column(int c) {
+        return !AT_HOME || (c < OTHERS && COLUMN_AXES[c] < 0);
+    }
+    // What the columns of points hold, where those that there are come from `load`.
+    template <bool AT_HOME, class Load>
+    static auto columns_of(const Points& points, Load load) {
+        return [&points, load](int c) -> number {
+            return has_column<AT_HOME>(c) ? load(c) : c < OTHERS ? points.p[COLUMN_AXES[c] < 0 ? 0 : COLUMN_AXES[c]] : number{};
+        };
+    }
     // Evaluates the term for vectors of candidates as they are, under a mask; those in doubt follow.
+    template <bool AT_HOME>
     void meet_in_place(const real* q, int id, const Term::Own& own_part, Reduction& reduction) {
         const Band of_query{inside, outside};
         const int filled = this->filled;
@@ -100,7 +124,8 @@ struct SumsBy : Way<SumsBy<Way>> {
             if (SKIPPED && hit == 0)
                 continue;
             number summand[SUMMANDS];
-            term.evaluate(own_part, points.p, [&](int c) { return *(const number*)(column[c] + b); }, summand);
+            auto load = [&](int c) { return *(const number*)(column[c] + b); };
+            term.evaluate(own_part, points.p, columns_of<AT_HOME>(points, load), summand);
             reduction.add(summand, flags_of(hit), [&](Math::i32& source, Math::i32& code) {
                 for (int l = 0; l < LANES; ++l)
                     name(b + l, l, source, code);
@@ -111,7 +136,8 @@ struct SumsBy : Way<SumsBy<Way>> {
             const Points points = doubtful_at(b);
             const unsigned int hit = decided_between(q, id, points, doubtful + b, lanes_before(doubts - b));
             number summand[SUMMANDS];
-            term.evaluate(own_part, points.p, [&](int c) { return gathered(column[c], doubtful + b); }, summand);
+            auto load = [&](int c) { return gathered(column[c], doubtful + b); };
+            term.evaluate(own_part, points.p, columns_of<AT_HOME>(points, load), summand);
             reduction.add(summand, flags_of(hit), [&](Math::i32& source, Math::i32& code) {
                 for (int l = 0; l < LANES; ++l)
                     name(doubtful[b + l], l, source, code);
@@ -119,6 +145,7 @@ struct SumsBy : Way<SumsBy<Way>> {
         }
     }
     // Packs what is near first, so that the term is evaluated for hardly more than the pairs.
+    template <bool AT_HOME>
     void meet_packed(const real* q, int id, const Term::Own& own_part, Reduction& reduction) {
         const Band of_query{inside, outside};
         const int filled = this->filled;
@@ -134,7 +161,8 @@ struct SumsBy : Way<SumsBy<Way>> {
             for (int k = 0; k < DIM; ++k)
                 pack(points.p[k], near_points[k] + held, near);
             for (int c = 0; c < OTHERS + STEPS; ++c)
-                pack(*(const number*)(column[c] + b), near_column[c] + held, near);
+                if (has_column<AT_HOME>(c))
+                    pack(*(const number*)(column[c] + b), near_column[c] + held, near);
             if constexpr (PERIODIC || DIFFER || SUMS == 2)
                 pack(numbers + b, doubtful + held, near);
             held += __builtin_popcount(near);
@@ -149,7 +177,8 @@ struct SumsBy : Way<SumsBy<Way>> {
             if (const unsigned int open = there & ~hit)
                 hit |= decided_between(q, id, points, doubtful + b, open);
             number summand[SUMMANDS];
-            term.evaluate(own_part, points.p, [&](int c) { return *(const number*)(near_column[c] + b); }, summand);
+            auto load = [&](int c) { return *(const number*)(near_column[c] + b); };
+            term.evaluate(own_part, points.p, columns_of<AT_HOME>(points, load), summand);
             reduction.add(summand, flags_of(hit), [&](Math::i32& source, Math::i32& code) {
                 for (int l = 0; l < LANES; ++l)
                     name(doubtful[b + l], l, source, code);

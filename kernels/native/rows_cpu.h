@@ -61,6 +61,7 @@ struct RowsBy : Way<RowsBy<Way>> {
         counts[id] = before + hits;
         longest = before + hits > longest ? before + hits : longest;
     }
+    void expect(int) const {}
     void none(int id) {
         counts[id] = 0;
         if constexpr (LIST)

@@ -82,6 +82,8 @@ struct Scan : SearchArguments, Cells, SourcePlaces {
         outside = between > 0 ? between : outer * outer * (1 + band);
     }
 
+    // Are all candidates, and all queries, where they were given, and none of them an image? Then no pair has a shift.
+    bool at_home() const { return PERIODIC && !several && !shared.turned; }
     // Finds the bands of so many candidates.
     void find_bands(int count) {
         for (int b = 0; BANDED && b < count; b += LANES) {

@@ -10,11 +10,16 @@ JFRNN_TABLE int PLACE[] = {0, 0};
 // Is the sum NaN, not 0, where the position of i is not finite? One for each sum over neighbors.
 JFRNN_TABLE bool MARKED[] = {true};
 JFRNN_TABLE int STEP_AXES[] = {0};
+// Which axis has a column of j as its coordinate, if that is one: -1.
+JFRNN_TABLE int COLUMN_AXES[] = {-1};
 
 struct Term {
     struct Own {};  // what is read of i
     JFRNN_MEMBER explicit Term(const real*) {}
-    JFRNN_MEMBER Own own(const real*, const real*) const { return {}; }
+    template <bool AT_HOME = false>
+    JFRNN_MEMBER Own own(const real*, const real*) const {
+        return {};
+    }
     // The summands of pairs: of i, of those j whose coordinates are `p` and whose numbers are `column(c)`.
     template <class Column>
     JFRNN_MEMBER void evaluate(const Own&, const number* p, Column column, number* summand) const {

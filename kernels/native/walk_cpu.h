@@ -6,6 +6,7 @@
 //   FLUSHED                  denormals are flushed to zero, as XLA does, while queries meet candidates
 //   meet(q, id, fresh, finished)  a query at `q` meets the candidates, `filled` in number; these may be its first and its last ones
 //   copied(from, near)       packs more of those of the sources from the place `from` on that are `near`, of the image `shift`
+//   expect(id)               a query will soon meet candidates
 //   none(id)                 a query that is not finite has no candidates
 //   chunk_done(chunk), finish() come after the last query of a chunk, and of this thread
 // How queries come to their candidates is said by a struct between both (`cell_walk_cpu.h`, `tree_walk_cpu.h`), by these members:
@@ -85,6 +86,8 @@ struct Walk : Scan {
             for (int k = 0; k < DIM; ++k)
                 candidate[k][filled + e] = __builtin_nanf("");
         this->find_bands(filled);
+        for (int place = begin; place < end; ++place)
+            query().expect(query_ids[place]);
         if constexpr (Query::FLUSHED)
             floats.flush();
         for (int place = begin; place < end; ++place) {

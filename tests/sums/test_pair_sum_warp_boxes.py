@@ -95,6 +95,23 @@ def test_every_case(name, dtype, dim):
     assert_case(name, dtype, dim)
 
 
+def marks_at_work(r, i, j):
+    """Take more operations than are done for candidates that are no pairs, so that pairs are packed first."""
+    return marks(r, i, j) | {"more": jnp.exp(jnp.sin(r)).sum() + jnp.cos(i * j)}
+
+
+@pytest.mark.parametrize("fn", [marks, pytest.param(marks_at_work, marks=SLOW)])
+def test_where_no_pair_crosses_the_box(fn):
+    """Within a box pairs have no shift, and coordinates are those of the candidates; but not where a particle lies outside."""
+    lengths, ids = np.array([8.0, 9.0]), np.arange(600, dtype=np.float32)
+    x = (np.random.default_rng(0).random((600, 2)) * lengths).astype(np.float32)
+    outside = x + np.where(ids[:, None] == 7, 2 * lengths, 0).astype(np.float32)
+    sums = jax.jit(lambda x: fused(fn, x, 0.5, ids, box=jfrnn.Box(lengths)))
+    for at in (x, outside):
+        pairs = reference.reference_images(at, 0.5, matrix=np.diag(lengths), periodic=(True, True))
+        assert_marks(sums(at), pairs, at, at, lengths)
+
+
 @pytest.mark.slow
 def test_options():
     """Closed, with themselves, where it decides something."""
