@@ -78,7 +78,7 @@ def make_lattice(box: Box, images: Images, dtype: np.dtype) -> Lattice:
     if not box.per_system:
         matrix, given, transform = _make(vectors, None, None, box, images)
         made = Lattice(matrix, given, transform, origin, None, images)
-        return dataclasses.replace(made, origin=bring_near(origin[None], made).points[0])
+        return dataclasses.replace(made, origin=_bring_origin_near(origin[None], made)[0])
     numbers = None if box.numbers is None or not images.short else lax.stop_gradient(jnp.asarray(box.numbers).astype(dtype))
 
     def of_system(vectors: Array, flags: Array | None, numbers: Array | None) -> tuple[Array, Array, Array]:
@@ -270,6 +270,13 @@ def bring_near(points: Array, lattice: Lattice) -> Near:
     if lattice.images.orthogonal:
         return _bring_each_near(points, lattice)
     return lax.platform_dependent(points, lattice, cpu=_bring_near_if_any_is_far, default=_bring_each_near)
+
+
+def _bring_origin_near(origin: Array, lattice: Lattice) -> Array:
+    """Move a far origin [1, d] near 0. XLA would compute this on a CPU for every particle anew, were it not behind a condition."""
+    if lattice.images.counts_short:
+        return origin
+    return lax.platform_dependent(origin, lattice, cpu=_bring_near_if_any_is_far, default=_bring_each_near).points
 
 
 def _bring_each_near(points: Array, lattice: Lattice, rarely: bool = False) -> Near:

@@ -97,7 +97,7 @@ def test_the_command_says_what_runs(python, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("kinds", ["f32-3d and (warp or jax)", "not hashgrid"], ids=["single_3d", "all"])
 def test_hard_cases(python, kinds, tmp_path):
-    """The hash grid of the lowest Warp is refused. `python -m jfrnn`, which runs each time, compares the pairs of each engine with all of them."""
+    """The hash grid of the lowest Warp is refused. `python -m jfrnn`, which runs each time, has pairs of each engine compared."""
     done = run(python, *AT_ONCE, str(ROOT / "tests" / "engine" / "test_hard_cases.py"), "-k", kinds, cwd=tmp_path)
     assert done.returncode == 0 and int(re.search(r"(\d+) passed", done.stdout)[1]) > 100, done.stdout + done.stderr
 
