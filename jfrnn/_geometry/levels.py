@@ -118,7 +118,7 @@ def level_runs(
         around = _cells_around(which, query_top, query_place, level, levels.grid.extent, images)
         start, stop = places_between(levels.grid, [around.top[0], *around.top])
         ends = _add_power(around.key, dim * (HALVINGS - level)[:, None])
-        bounds = _lower_bound(keys, tuple(map(jnp.stack, zip(around.key, ends, strict=True))), start, stop)
+        bounds = _lower_bound(keys, (jnp.stack([around.key[0], ends[0]]), jnp.stack([around.key[1], ends[1]])), start, stop)
         return bounds[0], jnp.where(around.there, bounds[1], bounds[0]), around.image
 
     return runs
