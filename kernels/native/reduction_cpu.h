@@ -1,5 +1,6 @@
 // What becomes of the summands of a query on the CPU: they are added up, or the largest ones are found.
 #pragma once
+#include "lanes.h"
 #include "reduction.h"
 
 static Math::flag flags_of(unsigned int bits) {

@@ -241,7 +241,11 @@ struct Scan : SearchArguments, Cells, SourcePlaces {
     }
     // Which of the points in lanes, of which some are `open`, are pairs; `numbers` are theirs among the candidates.
     unsigned int decided(const real* q, int own_id, const Points& points, const int* numbers, unsigned int open) const {
-        unsigned int pairs = PERIODIC || DIFFER ? 0 : wide.decided(q, points.p, open);
+        unsigned int pairs = 0;
+        if constexpr (!PERIODIC && !DIFFER)
+            pairs = wide.decided(q, points.p, open);
+        else if constexpr (!PERIODIC && RULE == GATHER)
+            pairs = own_radius > 0 ? Wide(own_radius, closed).decided(q, points.p, open) : 0;
         for (; open; open &= open - 1) {
             const int lane = __builtin_ctz(open);
             real p[3];
