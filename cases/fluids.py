@@ -4,6 +4,9 @@
 [[0.505, 0.5], [0.515, 0.5], [0.51, 0.45], [0.5, 0.45]]
 """
 
+from collections.abc import Callable
+from typing import TypeVar
+
 from ._fluid import WORDS, FluidScene, Gas, GasScene, Periodic, Physics, Scene, Solid, Tank, Turning
 from ._fluid_flows import SCENES as _FLOWS
 from ._fluid_free import SCENES as _FREE
@@ -15,6 +18,8 @@ __all__ = [
     "FLUIDS", "GASES", "WORDS", "FluidScene", "Gas", "GasScene", "Periodic", "Physics", "Scene", "Solid", "Tank", "Turning",
     "fluid", "gas",
 ]  # fmt: skip
+
+_Make = TypeVar("_Make", bound=Callable[..., Scene])
 
 FLUIDS = {**_SOURCE, **_FLOWS, **_FREE, **_GEAR}
 """Functions that make scenes of fluids, by name."""
@@ -32,9 +37,7 @@ def fluid(name: str, **settings: float) -> FluidScene:
     Raises:
         ValueError: There is no such scene.
     """
-    if name not in FLUIDS:
-        raise ValueError(f"name must be a known fluid scene, got {name!r}: take one of {', '.join(FLUIDS)}.")
-    return FLUIDS[name](**settings)
+    return _named(FLUIDS, "fluid scene", name)(**settings)
 
 
 def gas(name: str, **settings: float) -> GasScene:
@@ -47,6 +50,10 @@ def gas(name: str, **settings: float) -> GasScene:
     Raises:
         ValueError: There is no such scene.
     """
-    if name not in GASES:
-        raise ValueError(f"name must be a known scene of a gas, got {name!r}: take one of {', '.join(GASES)}.")
-    return GASES[name](**settings)
+    return _named(GASES, "scene of a gas", name)(**settings)
+
+
+def _named(scenes: dict[str, _Make], kind: str, name: str) -> _Make:
+    if name not in scenes:
+        raise ValueError(f"name must be a known {kind}, got {name!r}: take one of {', '.join(scenes)}.")
+    return scenes[name]

@@ -40,7 +40,7 @@ def move_near(
 
     `units` [n, d] are the coordinates of the points along the vectors, `matrix` [d, d] the vectors of all or [n, d, d] those of
     each. Points that lie too far away, or that would be rounded, are not moved. Differentiable in points and matrix. What is done
-    `rarely` is a loop, which takes XLA a third of the time to compile.
+    `rarely` is a loop: XLA compiles its body once.
     """
     steps = jnp.round(units / _STEP)
     far = is_far(units) & (jnp.abs(steps) <= 2.0 ** _BITS[points.dtype.itemsize]) & periodic

@@ -78,7 +78,7 @@ def make_lattice(box: Box, images: Images, dtype: np.dtype) -> Lattice:
     if not box.per_system:
         matrix, given, transform = _make(vectors, None, None, box, images)
         made = Lattice(matrix, given, transform, origin, None, images)
-        return dataclasses.replace(made, origin=_bring_origin_near(origin[None], made)[0])
+        return dataclasses.replace(made, origin=_bring_origins_near(origin[None], made)[0])
     numbers = None if box.numbers is None or not images.short else lax.stop_gradient(jnp.asarray(box.numbers).astype(dtype))
 
     def of_system(vectors: Array, flags: Array | None, numbers: Array | None) -> tuple[Array, Array, Array]:
@@ -86,7 +86,7 @@ def make_lattice(box: Box, images: Images, dtype: np.dtype) -> Lattice:
 
     matrix, given, transform = jax.vmap(of_system)(vectors, box.flags, numbers)
     made = Lattice(matrix, given, transform, origin, None if box.flags is None else jnp.asarray(box.flags), images)
-    return dataclasses.replace(made, origin=bring_near(origin, made).points)
+    return dataclasses.replace(made, origin=_bring_origins_near(origin, made))
 
 
 def _make(vectors: Array, flags: Array | None, numbers: Array | None, box: Box, images: Images) -> tuple[Array, Array, Array]:
@@ -265,18 +265,21 @@ def bring_near(points: Array, lattice: Lattice) -> Near:
 
     Differentiable in points and vectors. In lattices that are searched in short vectors, no points are moved.
     """
+    if lattice.images.orthogonal and not lattice.images.counts_short:
+        return _bring_each_near(points, lattice)
+    return _look_whether_far(points, lattice)
+
+
+def _bring_origins_near(origins: Array, lattice: Lattice) -> Array:
+    """Move far origins [n, d] near 0. XLA would compute this on a CPU for every particle anew, were it not behind a condition."""
+    return _look_whether_far(origins, lattice).points
+
+
+def _look_whether_far(points: Array, lattice: Lattice) -> Near:
+    """Bring points near behind a condition on a CPU, where that is worth it."""
     if lattice.images.counts_short:
         return Near(points, jnp.zeros_like(points))
-    if lattice.images.orthogonal:
-        return _bring_each_near(points, lattice)
     return lax.platform_dependent(points, lattice, cpu=_bring_near_if_any_is_far, default=_bring_each_near)
-
-
-def _bring_origin_near(origin: Array, lattice: Lattice) -> Array:
-    """Move a far origin [1, d] near 0. XLA would compute this on a CPU for every particle anew, were it not behind a condition."""
-    if lattice.images.counts_short:
-        return origin
-    return lax.platform_dependent(origin, lattice, cpu=_bring_near_if_any_is_far, default=_bring_each_near).points
 
 
 def _bring_each_near(points: Array, lattice: Lattice, rarely: bool = False) -> Near:

@@ -131,7 +131,8 @@ def _place_in_cell(x: Array, edge: Array, turns: Array | None) -> Array:
         scaled = x * turns
         part = (scaled - jnp.clip(jnp.floor(scaled), 0, turns - 1)) * finest
     else:
-        part = cell_coordinate(cell_remainder(x, cell_coordinate(x, edge), edge) * 2**10, edge / (finest >> 10))
+        rest = cell_remainder(x, cell_coordinate(x, edge), edge)
+        part = cell_coordinate(rest * 2**10, edge / (finest >> 10))  # neither overflows nor vanishes before squares do
         part = jnp.where(x < 0, finest - 1 - part, part)  # below 0, cells are mirrored
     return jnp.clip(jnp.floor(part), 0, finest - 1).astype(jnp.int32)
 

@@ -4,12 +4,6 @@
 #include "kept.h"
 #include "wide.h"
 
-static Math::flag truths(unsigned int bits) {
-    Math::flag lanes;
-    __builtin_memcpy(&lanes, &bits, sizeof lanes);
-    return lanes;
-}
-
 // Of LANES slots: their sources, the numbers of these, and which of them are pairs.
 struct KeptSlots {
     const int* ids;

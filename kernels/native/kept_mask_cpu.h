@@ -36,7 +36,7 @@ struct KeptMask : KeptRows<KeptMask> {
             const int left = all - some.places, count = left < LANES ? left : LANES;
             memcpy(out + some.places, bytes, count);
             if constexpr (MEASURED) {
-                const Number length = Math::select(truths(some.pairs), length_of(some.verdict.vector), Number{});
+                const Number length = Math::select(flags_of(some.pairs), length_of(some.verdict.vector), Number{});
                 memcpy(lengths + some.places, &length, sizeof(real) * count);
             }
         });

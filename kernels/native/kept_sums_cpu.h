@@ -40,7 +40,7 @@ struct KeptSums : KeptRows<KeptSums> {
                 return c < OTHERS ? some.numbers[DIM + c] : some.verdict.shift[STEP_AXES[c < OTHERS ? 0 : c - OTHERS]];
             };
             term.evaluate(own_part, some.numbers, column, summand);
-            reduction.add(summand, truths(some.pairs), [&](Math::i32& source, Math::i32& code) {
+            reduction.add(summand, flags_of(some.pairs), [&](Math::i32& source, Math::i32& code) {
                 for (int l = 0; l < LANES; ++l) {
                     source[l] = some.ids[l];
                     code[l] = some.places + l;

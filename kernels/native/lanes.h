@@ -40,6 +40,12 @@ static unsigned int bits_of_flags(flags f) {
     __builtin_memcpy(&bits, &f, LANES == 16 ? 2 : 1);
     return bits & ((1u << LANES) - 1);
 }
+// And back.
+static flags flags_of(unsigned int bits) {
+    flags lanes;
+    __builtin_memcpy(&lanes, &bits, sizeof lanes);
+    return lanes;
+}
 static unsigned int lanes_before(int count) { return count < LANES ? (1u << count) - 1 : (1u << LANES) - 1; }
 
 // Stores the lanes of a mask one after the other; up to LANES elements at `to` are overwritten.

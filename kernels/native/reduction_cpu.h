@@ -3,12 +3,6 @@
 #include "lanes.h"
 #include "reduction.h"
 
-static Math::flag flags_of(unsigned int bits) {
-    Math::flag lanes;
-    __builtin_memcpy(&lanes, &bits, sizeof lanes);
-    return lanes;
-}
-
 // Where sums go: rows of queries, and of `totals` two per chunk, with what rounding took of them.
 struct Results : SumRows {
     real* totals;
