@@ -24,8 +24,9 @@ EXCLUDED = (
 )  # arrays that are given where kernels are EXCLUDING (native/excluded.h), and else left out
 RULES = ("gather", "scatter", "either", "both", "mean", "table")  # by which the cutoff of a pair follows from both, in native order
 TABLE = ("table_of_kinds", "kinds_of_sources", "kinds_of_queries")  # arrays that the last of these rules asks for
+ORDERS = ("source_order", "query_order")  # arrays that a tree on CUDA is fitted to
 SPACES = ("", "_nearest", "_images", "_nearest_skewed", "_images_skewed")  # in names of variants
-_DEFAULTS = {"PERIODIC": 0, "BATCHED": 0, "SUM": 0, "SCALED": 0, "EXCLUDING": 0, "FLAT": 0, "RULE": -1}
+_DEFAULTS = {"PERIODIC": 0, "BATCHED": 0, "SUM": 0, "SCALED": 0, "EXCLUDING": 0, "FLAT": 0, "RULE": -1, "TREE": 0}
 
 
 def table_cells(sources: int) -> int:

@@ -30,7 +30,7 @@ _TILE = 2048  # cells that a block of `scan` takes
 # of programs, not of the device: one with more or fewer multiprocessors runs as many warps, and gets the same bits. It is about 32
 # per multiprocessor of large GPUs; half and twice as many took longer on one of 132.
 _WARPS = 4096
-MOST_KINDS = 4  # species whose cutoffs tensor cores know; among more, cells of many sizes are searched
+MOST_KINDS = 4  # species whose cutoffs tensor cores know; among more, a tree is searched
 # what all kernels of a search must agree on
 GRID = {
     "REACH": 1,

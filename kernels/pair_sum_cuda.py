@@ -74,12 +74,12 @@ def _placed_columns(term: TermText, dim: int) -> int:
 @functools.lru_cache(512)
 def sum_kernels(
     term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: bool = False,
-    extremes: bool = False, excluding: int = 0, rule: str = "",
+    extremes: bool = False, excluding: int = 0, rule: str = "", tree: bool = False,
 ) -> Kernels:  # fmt: skip
     """Return the kernels that sum a term; `key` tells it from all others in the names of programs.
 
     `extremes`: they find the largest summands instead; `errors` [m, width, 2] then gets their sources (n: there is none), and the
-    codes of their images, as integers travel among floats.
+    codes of their images, as integers travel among floats. `tree`: sources stand in the tree of `jfrnn.kernels.tree_cuda`.
     """
     # `taken` is how many pairs a lane adds before it looks for the next block; `blocks` per multiprocessor bound registers. Both
     # are what was fastest on an H200: rows of several loads wait in registers, and are 1.3 times slower if four are loaded ahead.
@@ -88,6 +88,7 @@ def sum_kernels(
     blocks = 16 if double or not cheap else 20
     kind = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
     kind += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}{'_excluding' * excluding}{'_' * bool(rule)}{rule}"
+    kind += "_tree" * tree
     module = f"{kind}_b{blocks}_t{taken}_{key}"
     constants = {**GRID, "PERIODIC": periodic, "BATCHED": batched, "SCALED": scaled, **constants_of(term, compensated, extremes)}
     constants |= {
@@ -97,7 +98,7 @@ def sum_kernels(
         "TAKEN": taken,
         "FROM_PLACES": _reads_positions(term) and not term.source_columns,
     }
-    constants |= constants_of_rule(rule) if rule else {}
+    constants |= {"TREE": tree, **(constants_of_rule(rule) if rule else {})}
     constants |= {"ROW_LENGTH": max(row_length(term, dim, double), 1), "PLACED": _placed_columns(term, dim)}
 
     def declare_one(name: str, text: str, method: str, blocks: int, called: str = "") -> Kernel:
@@ -111,6 +112,6 @@ def sum_kernels(
     sorting = program(double, dim, "sort_values.cuh", given={}, **constants)
     return Kernels(
         declare_one("sort_values", sorting, "SortValues.run", 32) if term.source_columns else None,
-        query_kernel("pair_sum"),
-        query_kernel("crossing_pair_sum", crossing=True) if periodic else None,
+        query_kernel("pair_sum", crossing=tree and periodic > 0),
+        query_kernel("crossing_pair_sum", crossing=True) if periodic and not tree else None,
     )

@@ -5,8 +5,8 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.problem import Search, largest_radius
-from jfrnn._geometry import Cutoffs, Lattice, Wrapped
-from jfrnn.kernels._native import TABLE
+from jfrnn._geometry import CLASSES, Cutoffs, Lattice, Wrapped, groups_of, order_for_tree
+from jfrnn.kernels._native import ORDERS, TABLE
 
 MOST_IN_BOX = 1 << 27  # most positions in a box, where ids share their bits with image codes
 
@@ -73,6 +73,28 @@ def cutoffs_of_particles(cutoffs: Cutoffs) -> dict[str, Array]:
     names = dict(zip(("radii", "query_radii"), (cutoffs.sources, cutoffs.queries), strict=True))
     named = {name: jnp.zeros(1, cutoffs.largest.dtype) if x is None else x for name, x in names.items()}
     return named if cutoffs.kinds is None else named | dict(zip(TABLE, cutoffs.kinds, strict=True))
+
+
+def orders_for_tree(search: Search) -> dict[str, Array]:
+    """Return the orders in which sources and queries follow each other in a tree on CUDA, by the names of `ORDERS`."""
+    cutoffs, torus, batch = search.cutoffs, search.torus, search.batch
+
+    def order(points: Array, radii: Array | None, species: Array | None, systems: Array | None) -> Array:
+        if species is not None:
+            classes = jnp.minimum(species.astype(jnp.uint32), CLASSES - 1)
+        else:
+            classes = None if radii is None else groups_of(radii, cutoffs.largest, CLASSES)
+        return order_for_tree(points, classes, systems)
+
+    _, *species = (None, None, None) if cutoffs.kinds is None else cutoffs.kinds
+    systems = [None, None] if batch is None else [batch.sources, batch.queries]
+    given = search.sources if search.queries is None else search.queries
+    points = (search.sources, given) if torus is None else (torus[1].sources, torus[1].queries)
+    own = search.queries is None
+    radii = cutoffs.queries if own and cutoffs.sources is None else cutoffs.sources
+    sources = order(points[0], radii, species[0], systems[0])
+    queries = sources if own else order(points[1], cutoffs.queries, species[1], systems[1])
+    return dict(zip(ORDERS, (sources, queries), strict=True))
 
 
 def pack_particles(search: Search) -> tuple[Array, Array, Array]:

@@ -13,7 +13,7 @@ from jfrnn._engine.operands import space_flags
 from jfrnn._engine.plans import HugePages, Plan, ask_for_huge_pages
 from jfrnn._engine.problem import Filter, Room, Rows
 from jfrnn._geometry import Status
-from jfrnn.kernels._native import EXCLUDED, RULES, TABLE, table_cells
+from jfrnn.kernels._native import EXCLUDED, ORDERS, RULES, TABLE, table_cells
 
 _PARTICLES = ("positions", "queries", "cutoff")  # what kernels of cells are given
 
@@ -58,19 +58,25 @@ class SumVariant(NamedTuple):
     few: bool  # all of them meet
     excluding: int
     rule: str = ""
+    tree: bool = False  # on CUDA
 
     def name(self, of: str) -> str:
         """Return the name of a call, which tells it from all others."""
         flags = {"f64": self.double, "f32": not self.double, "scaled": self.scaled, "own": self.own}
         flags |= {"closed": self.closed, "dropself": self.drop_self, "batched": self.batched, **space_flags(self.periodic)}
         flags |= {"compensated": self.compensated, "extremes": self.extremes, **excluding_flags(self.excluding)}
-        flags |= {self.rule: bool(self.rule), self.key: bool(self.key)}
+        flags |= {self.rule: bool(self.rule), "tree": self.tree, self.key: bool(self.key)}
         return "_".join([f"jfrnn_{of}_{self.dim}d", *(flag for flag, on in flags.items() if on)])
 
 
 def names_of_particles(rule: str) -> tuple[str, ...]:
     """Return the names of what `cutoffs_of_particles` returns."""
     return () if not rule else ("radii", "query_radii", *TABLE * (rule == RULES[-1]))
+
+
+def names_of_tree(rule: str) -> tuple[str, ...]:
+    """Return the names of what a tree on CUDA is given of cutoffs, and the orders of particles."""
+    return (*names_of_particles(rule), *ORDERS)
 
 
 def names_of_cutoffs(rule: str) -> tuple[str, ...]:

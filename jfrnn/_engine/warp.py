@@ -6,7 +6,7 @@ depends on (JAX's persistent compilation cache sees no more than that).
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -16,9 +16,15 @@ from jax import Array, lax
 
 from jfrnn._engine.boxes_warp import box_neighbors
 from jfrnn._engine.launch import Call, Shapes, kernel, open_native
-from jfrnn._engine.levels_warp import level_neighbors
-from jfrnn._engine.operands import MOST_IN_BOX, cutoffs_of_particles, excluded_rows, pack_particles, periodic_kind
-from jfrnn._engine.plans import HugePages, Launch, Plan, share
+from jfrnn._engine.operands import (
+    MOST_IN_BOX,
+    cutoffs_of_particles,
+    excluded_rows,
+    orders_for_tree,
+    pack_particles,
+    periodic_kind,
+)
+from jfrnn._engine.plans import Clear, HugePages, Launch, Plan, share
 from jfrnn._engine.problem import Engine, Filter, Kind, Options, Room, Rows, Search, largest_radius
 from jfrnn._engine.start import check_warp
 from jfrnn._engine.variants import (
@@ -27,19 +33,20 @@ from jfrnn._engine.variants import (
     describe_call,
     huge_pages,
     names_of_particles,
+    names_of_tree,
     plan_numbers,
     row_dims,
     split_rows,
 )
 from jfrnn._geometry import Cutoffs
-from jfrnn.kernels import Kernel, _driver, cells_cpu, cells_cuda, few_cuda, tree_cpu
+from jfrnn.kernels import Kernel, _driver, cells_cpu, cells_cuda, few_cuda, tree_cpu, tree_cuda
 
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
 _CELLS = {"cpu": cells_cpu, "cuda": cells_cuda}
 QUERIES_PER_THREAD = 1024  # on the CPU, at least: among 1000, to wake a second thread takes as long as it saves
 
 # Of cutoffs that differ, on CUDA: how many sources within the largest cutoff a query may meet among cells, and how many more for
-# each that is near, before a walk over many sizes is faster (measured on an H200); and how many queries and sources tell.
+# each that is near, before a tree is faster (measured on an H200); and how many queries and sources tell.
 MOST_MET, MOST_MORE, SAMPLED = 2000, 8, (1024, 4096)
 Found = TypeVar("Found")  # what a search or a sum returns
 
@@ -62,14 +69,15 @@ class WarpEngine:
         return missing(platform)
 
     def rows(self, search: Search, options: Options, capacity: int | Room | None) -> Rows:
-        """Search among cells; where cutoffs differ widely, in a tree (CPU) or among cells of many sizes (CUDA)."""
+        """Search among cells, or in a tree: where cutoffs differ on the CPU, where they differ widely on CUDA."""
         if search.per_system:
             return box_neighbors(search._replace(checks={}), options.filter, capacity)
         if isinstance(search.cutoff, Cutoffs):
             asked = {"keep": options.filter, "capacity": capacity}
             tree = functools.partial(call_kernels, tree_cpu.scratch_words, _tree_callable, **asked)
             cells = functools.partial(call_kernels, cells_cuda.scratch_words, _cuda_callable, **asked)
-            cuda = functools.partial(by_cells_or_levels, cells, functools.partial(level_neighbors, **asked))
+            boxes = functools.partial(call_kernels, tree_cuda.scratch_words, _tree_on_cuda, given=orders_for_tree, **asked)
+            cuda = functools.partial(by_cells_or_tree, cells, boxes)
             return lax.platform_dependent(search._replace(checks={}), cpu=tree, cuda=cuda)
 
         def on(module: ModuleType, make: Callable[[Variant], Any]) -> Callable[[Search], Rows]:
@@ -100,11 +108,9 @@ def has_order(engine: Engine, platform: str, n: int, plain: bool) -> bool:
     return isinstance(engine, WarpEngine) and PLATFORMS.get(platform) == "cuda" and n > few_cuda.MOST and plain
 
 
-def by_cells_or_levels(
-    cells: Callable[..., Found], levels: Callable[..., Found], search: Search, *more: tuple[Array, ...]
-) -> Found:
-    """Search on CUDA by cells as wide as the largest cutoff if cutoffs are alike, else by cells of many sizes."""
-    return lax.cond(cutoffs_are_alike(search), cells, levels, search, *more)
+def by_cells_or_tree(cells: Callable[..., Found], tree: Callable[..., Found], search: Search, *more: tuple[Array, ...]) -> Found:
+    """Search on CUDA by cells as wide as the largest cutoff if cutoffs are alike, else in a tree."""
+    return lax.cond(cutoffs_are_alike(search), cells, tree, search, *more)
 
 
 def cutoffs_are_alike(search: Search) -> Array:
@@ -185,11 +191,12 @@ def call_kernels(
     capacity: int | Room | None,
     blocks: int | None = None,
     order: Callable[[Array], Array] | None = None,
+    given: Callable[[Search], dict[str, Array]] | None = None,
 ) -> Rows:
     """Let XLA call what `make` returns, with the scratch that its kernels ask for.
 
     With `blocks`, so many tell of their own queries how long rows are, and their status; otherwise one tells of all. `order` finds
-    the order of the sources in that scratch.
+    the order of the sources in that scratch, `given` what kernels are given besides.
     """
     sources, queries, cutoff, batch, torus = search[:5]
     own, lists, flat = queries is None, capacity is not None, isinstance(capacity, Room)
@@ -206,10 +213,11 @@ def call_kernels(
         )
     words = scratch_words(n, m, dim, 2 if double else 1, own)
     dims = {**row_dims(m, capacity), "count": m, "info": 2 if blocks is None else (blocks, 2), "scratch": max(words, 1)}
-    given = [*pack_particles(search), *excluded_rows(search), *of_particles.values()]
+    more = {} if given is None else given(search)
+    operands = [*pack_particles(search), *excluded_rows(search), *of_particles.values(), *more.values()]
     if isinstance(capacity, Room):
-        given.append(capacity.starts)
-    *written, count, info, scratch = make(variant)(*given, output_dims=dims)
+        operands.append(capacity.starts)
+    *written, count, info, scratch = make(variant)(*operands, output_dims=dims)
     longest, status = (
         (info[0], info[1]) if blocks is None else (info[:, 0].max(), lax.reduce(info[:, 1], np.int32(0), lax.bitwise_or, (0,)))
     )
@@ -233,6 +241,11 @@ def _cuda_callable(variant: Variant) -> Call:
 
 
 @kernel
+def _tree_on_cuda(variant: Variant) -> Call:
+    return describe_call("tree_cuda", variant, functools.partial(_plan_tree_on_cuda, variant), cutoffs=names_of_tree)
+
+
+@kernel
 def _few_callable(variant: Variant) -> Call:
     return describe_call("few_cuda", variant, functools.partial(_plan_few, variant))
 
@@ -248,6 +261,22 @@ def _plan_on_cuda(variant: Variant, shapes: Shapes, multiprocessors: int) -> Pla
         numbers,
         absent(variant.lists, variant.flat),
     )
+
+
+def _plan_tree_on_cuda(variant: Variant, shapes: Shapes, _: int) -> Plan:
+    kind, space = (variant.dim, variant.double, variant.rule), {"periodic": variant.periodic, "batched": variant.batched}
+    numbers = plan_numbers(variant, shapes)
+    more = {"later": variant.keep.later_only, "excluding": variant.excluding, "flat": variant.flat}
+    query = tree_cuda.query_kernel(*kind, variant.lists, **space, **more)
+    walk = Launch(query, tree_cuda.walk_threads(numbers["m"]), {"of_queries": 0})
+    return Plan([*fit_tree(tree_cuda.fit_kernel(*kind, **space), numbers), walk], numbers, absent(variant.lists, variant.flat))
+
+
+def fit_tree(fit: Kernel, numbers: Mapping[str, int]) -> list[Clear | Launch]:
+    """Return what fits a tree on CUDA to the sources, level by level, of numbers of a plan."""
+    threads = tree_cuda.fit_threads(numbers["n"], numbers["m"], bool(numbers["own"]))
+    clear = [Clear("info", 8), Clear("scratch", tree_cuda.HEADER_BYTES)]
+    return [*clear, *(Launch(fit, each, {"level": level}) for level, each in enumerate(threads))]
 
 
 def _plan_few(variant: Variant, shapes: Shapes, _: int) -> Plan:

@@ -9,15 +9,14 @@ from jax import Array, lax
 
 from jfrnn._engine.boxes_warp import box_sums
 from jfrnn._engine.launch import Call, Shapes, kernel
-from jfrnn._engine.levels_warp import level_sums
-from jfrnn._engine.operands import cutoffs_of_particles, excluded_rows, pack_particles, periodic_kind
+from jfrnn._engine.operands import cutoffs_of_particles, excluded_rows, orders_for_tree, pack_particles, periodic_kind
 from jfrnn._engine.plans import Launch, Plan, share
 from jfrnn._engine.problem import Filter, Search
 from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText
-from jfrnn._engine.variants import SumVariant, names_of_particles, size_numbers
-from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, by_cells_or_levels, place_launches, sort_on_cpu
+from jfrnn._engine.variants import SumVariant, names_of_particles, names_of_tree, size_numbers
+from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, by_cells_or_tree, fit_tree, place_launches, sort_on_cpu
 from jfrnn._geometry import Cutoffs
-from jfrnn.kernels import cells_cpu, cells_cuda, few_cuda, pair_sum_cpu, pair_sum_cuda, tree_cpu
+from jfrnn.kernels import cells_cpu, cells_cuda, few_cuda, pair_sum_cpu, pair_sum_cuda, tree_cpu, tree_cuda
 from jfrnn.kernels._native import EXCLUDED
 
 _GIVEN = ("positions", "queries", "cutoff", "shared_values", "own_values", "others")  # what a call is given
@@ -46,21 +45,20 @@ def pair_sums(
     rule = search.cutoff.rule if isinstance(search.cutoff, Cutoffs) else ""
     term = term._replace(first=0) if rule else term
 
-    def on(cuda: bool) -> Callable[[Search, tuple[Array, Array, Array]], FoundSums]:
+    def on(cuda: bool, tree: bool = False) -> Callable[[Search, tuple[Array, Array, Array]], FoundSums]:
         def call(search: Search, values: tuple[Array, Array, Array]) -> FoundSums:
             sources, queries, cutoff, batch, torus = search[:5]
             flags = (queries is None, cutoff.closed, keep.drop_self, periodic_kind(torus), batch is not None)
-            kind = (compensated, extremes, key, cuda, cuda and not rule and are_few(search), search.excluding, rule)
+            kind = (compensated, extremes, key, cuda, cuda and not rule and are_few(search), search.excluding, rule, tree)
             variant = SumVariant(sources.shape[1], sources.dtype == jnp.float64, cutoff.scaled, *flags, *kind)
-            more = [*excluded_rows(search), *(cutoffs_of_particles(cutoff).values() if isinstance(cutoff, Cutoffs) else ())]
-            return _call_sums(variant, term, pack_particles(search), values, more)
+            of_particles = cutoffs_of_particles(cutoff) if isinstance(cutoff, Cutoffs) else {}
+            more = [*excluded_rows(search), *of_particles.values()]
+            orders = [*of_particles.values(), *orders_for_tree(search).values()] if tree else []
+            return _call_sums(variant, term, pack_particles(search), values, more, orders)
 
         return call
 
-    def by_levels(search: Search, values: tuple[Array, Array, Array]) -> FoundSums:
-        return level_sums(search, keep, term, key, values, compensated, extremes)
-
-    cuda = functools.partial(by_cells_or_levels, on(True), by_levels) if rule else on(True)
+    cuda = functools.partial(by_cells_or_tree, on(True), on(True, True)) if rule else on(True)
     return lax.platform_dependent(search._replace(checks={}), values, cpu=on(False), cuda=cuda)
 
 
@@ -70,8 +68,9 @@ def _call_sums(
     particles: tuple[Array, Array, Array],
     values: tuple[Array, Array, Array],
     more: list[Array],
+    orders: list[Array],
 ) -> FoundSums:
-    """Let XLA call the kernels; `more` are rows of exclusions, and cutoffs that differ."""
+    """Let XLA call the kernels; `more` are rows of exclusions, and cutoffs that differ, `orders` what a tree is fitted to."""
     n, m = len(particles[0]), len(particles[1])
     if variant.few:
         results = SumsOf(term, m, few_cuda.slots(m), variant.compensated, variant.extremes)
@@ -80,10 +79,10 @@ def _call_sums(
     results = SumsOf(term, m, engine.slots(m), variant.compensated, variant.extremes)
     dims = results.dims()
     dims |= {_SORTED[variant.cuda]: max(engine.sorted_numbers(term, n, variant.dim, variant.double), 1)}
-    cells = cells_cuda if variant.cuda else tree_cpu if variant.rule else cells_cpu
+    cells = (tree_cuda if variant.tree else cells_cuda) if variant.cuda else tree_cpu if variant.rule else cells_cpu
     of_search = {"info": 2, "scratch": cells.scratch_words(n, m, variant.dim, 2 if variant.double else 1, variant.own)}
     if variant.cuda:  # particles are sorted by a call of its own, which XLA makes once for a sum and its derivative
-        values = (*values, *_sorting_callable(_sorting(variant))(*particles, output_dims=of_search))
+        values = (*values, *_sorting_callable(_sorting(variant))(*particles, *orders, output_dims=of_search))
     else:
         dims |= of_search
     return results.unpack(*_sum_callable(variant, term)(*particles, *values, *more, output_dims=dims)[: len(_RESULTS)])
@@ -118,14 +117,16 @@ def _plan_few(variant: SumVariant, term: TermText, shapes: Shapes, _: int) -> Pl
 
 def _sorting(variant: SumVariant) -> SumVariant:
     """Return on what of a variant it depends how particles are sorted."""
-    return variant._replace(closed=False, drop_self=False, compensated=False, extremes=False, key="", excluding=0, rule="")
+    rule = variant.rule if variant.tree else ""
+    return variant._replace(closed=False, drop_self=False, compensated=False, extremes=False, key="", excluding=0, rule=rule)
 
 
 @kernel
 def _sorting_callable(variant: SumVariant) -> Call:
     """Make a function that XLA calls to sort particles on CUDA."""
     words = {"info": np.int32, "scratch": np.int32}
-    return Call(variant.name("sorting_cuda"), _GIVEN[:3], words, functools.partial(_plan_sorting, variant))
+    given = (*_GIVEN[:3], *names_of_tree(variant.rule) * variant.tree)
+    return Call(variant.name("sorting_cuda"), given, words, functools.partial(_plan_sorting, variant))
 
 
 def _space(variant: SumVariant) -> dict[str, int]:
@@ -133,6 +134,9 @@ def _space(variant: SumVariant) -> dict[str, int]:
 
 
 def _plan_sorting(variant: SumVariant, shapes: Shapes, multiprocessors: int) -> Plan:
+    if variant.tree:
+        numbers = size_numbers(shapes, variant.own)
+        return Plan(fit_tree(tree_cuda.fit_kernel(variant.dim, variant.double, variant.rule, **_space(variant)), numbers), numbers)
     kernels = cells_cuda.cell_kernels(variant.dim, variant.double, variant.scaled, False, **_space(variant))
     numbers = size_numbers(shapes, variant.own)
     # what sorts particles takes the arguments of a search that only counts
@@ -163,6 +167,7 @@ def _plan_on_cpu(variant: SumVariant, term: TermText, shapes: Shapes, multiproce
 def _plan_on_cuda(variant: SumVariant, term: TermText, shapes: Shapes, multiprocessors: int) -> Plan:
     dim, double, scaled = variant[:3]
     more = _space(variant) | {"extremes": variant.extremes, "excluding": variant.excluding, "rule": variant.rule}
+    more["tree"] = variant.tree
     kernels = pair_sum_cuda.sum_kernels(term, variant.key, dim, double, scaled, variant.compensated, **more)
     numbers = _numbers(variant, term, shapes)
     launches = kernels.launches(numbers["n"], numbers["m"], multiprocessors)

@@ -68,10 +68,11 @@ from jfrnn._geometry.lattice import (
     shift_pairs,
     translation,
 )
-from jfrnn._geometry.levels import GROUPS, HALVINGS, Axes, Levels, level_runs, sort_by_levels
+from jfrnn._geometry.levels import Axes, Levels, groups_of, level_runs, sort_by_levels
 from jfrnn._geometry.marks import ROWS_ARE_WHOLE, are_finite, are_whole, good_rows, mark_rows, one_or_nan
 from jfrnn._geometry.meshes import merge_vertices
 from jfrnn._geometry.motion import box_change, motion_of, turns_between
 from jfrnn._geometry.order import hilbert_order, sort_order
 from jfrnn._geometry.status import NeighborOverflowError, Status, known_status, names_of_bits, pairs_and_status, shape_of, tell
+from jfrnn._geometry.tree_order import CLASSES, order_for_tree
 from jfrnn._geometry.wrapping import NOT_FINITE, TOO_FAR, Wrapped, unpack_turns, wrap

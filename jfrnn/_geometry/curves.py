@@ -131,14 +131,19 @@ def _morton_axes(words: Words, dim: int, _: int) -> list[Array]:
 
 
 def hilbert_words(axes: list[Array], bits: int) -> Words:
-    """Return Hilbert keys by Skilling's AxestoTranspose; x contributes the highest of each group of d bits in the key."""
-    axes = _turn_levels(axes, bits, upwards=False)
+    """Return Hilbert keys; x contributes the highest of each group of d bits in the key."""
+    return _interleave(hilbert_digits(axes, bits))
+
+
+def hilbert_digits(axes: list[Array], bits: int, unroll: int = 2) -> list[Array]:
+    """Return the binary digits of Hilbert keys, one array per axis, the lowest of each group first: Skilling's AxestoTranspose."""
+    axes = _turn_levels(axes, bits, unroll, upwards=False)
     for axis in range(1, len(axes)):
         axes[axis] = axes[axis] ^ axes[axis - 1]
     parity = axes[-1]  # becomes the parity of all bits above each bit
     for step in (1, 2, 4, 8, 16):
         parity = parity ^ parity >> step
-    return _interleave([c ^ parity >> 1 for c in reversed(axes)])
+    return [c ^ parity >> 1 for c in reversed(axes)]
 
 
 def _hilbert_axes(words: Words, dim: int, bits: int) -> list[Array]:
@@ -151,7 +156,7 @@ def _hilbert_axes(words: Words, dim: int, bits: int) -> list[Array]:
     return _turn_levels(axes, bits, upwards=True)
 
 
-def _turn_levels(axes: list[Array], bits: int, *, upwards: bool) -> list[Array]:
+def _turn_levels(axes: list[Array], bits: int, unroll: int = 2, *, upwards: bool) -> list[Array]:
     """For each level and axis, invert the bits of x below the level if the axis has the level's bit, else swap them with x's.
 
     Each such step is its own inverse. The steps form a loop because XLA may take minutes to compile 60 of them unrolled.
@@ -167,7 +172,7 @@ def _turn_levels(axes: list[Array], bits: int, *, upwards: bool) -> list[Array]:
             axes[axis] = axes[axis] ^ swapped
         return axes
 
-    return lax.fori_loop(1, bits, turn, axes, unroll=2)
+    return lax.fori_loop(1, bits, turn, axes, unroll=unroll)
 
 
 def _interleave(axes: list[Array]) -> Words:

@@ -83,7 +83,7 @@ def sort_by_levels(along: Array, axes: Axes, cutoffs: Cutoffs, n: int, own: bool
     place = jnp.where(finite, place, 0)
     widths = jnp.stack([edge if turn is None else 1 / turn for edge, turn in zip(axes.cells.edges, axes.cells.turns, strict=True)])
 
-    group = jnp.zeros(n, jnp.uint32) if cutoffs.sources is None else _groups(cutoffs.sources, cutoffs.largest)
+    group = jnp.zeros(n, jnp.uint32) if cutoffs.sources is None else groups_of(cutoffs.sources, cutoffs.largest, GROUPS)
     high, low = _key_of(group, list(place[:, :n].astype(jnp.uint32)))
     _, by_low = lax.sort((low, lax.iota(jnp.int32, n)), num_keys=1, is_stable=True)
     _, by_key = lax.sort((high[by_low], by_low), num_keys=1, is_stable=True)
@@ -137,14 +137,14 @@ def _place_in_cell(x: Array, edge: Array, turns: Array | None) -> Array:
     return jnp.clip(jnp.floor(part), 0, finest - 1).astype(jnp.int32)
 
 
-def _groups(radii: Array, largest: Array) -> Array:
-    """Return the group of each cutoff, [n] uint32: its binary exponent below that of the largest, at most GROUPS - 1."""
+def groups_of(radii: Array, largest: Array, count: int) -> Array:
+    """Return the group of each cutoff, [n] uint32: how far its binary exponent is below that of the largest, at most count - 1."""
     unsigned, nmant = (jnp.uint32, 23) if radii.dtype == jnp.float32 else (jnp.uint64, 52)
 
     def exponent(x: Array) -> Array:
         return (lax.bitcast_convert_type(x, unsigned) >> unsigned(nmant)).astype(jnp.int32)
 
-    return jnp.clip(exponent(largest) - exponent(radii), 0, GROUPS - 1).astype(jnp.uint32)
+    return jnp.clip(exponent(largest) - exponent(radii), 0, count - 1).astype(jnp.uint32)
 
 
 def _key_of(group: Array, axes: list[Array]) -> Words:

@@ -1,7 +1,7 @@
 // Candidates of a group: fetched run by run, kept where they are near its box, until the queries meet 32 of them at a time.
 #pragma once
 #include "matrix.cuh"
-#include "runs.cuh"
+#include "tree_runs.cuh"
 
 // What this lane knows of the pairs of its query.
 struct Pairs {
@@ -49,18 +49,17 @@ JFRNN_FUNCTION void keep(const PairSearch& search, bool is_near, const Place& ca
 }
 
 struct Candidates {
-    int base, total, fetched;  // rows of cells, candidates of their runs, those that were fetched
-    int run_end, run_shift;    // of what this lane fetches
+    int total, fetched;      // candidates of runs, those that were fetched
+    int run_end, run_shift;  // of what this lane fetches
     const Run* run;
     Place places[FETCHED];
     int runs_of[FETCHED];  // crossing: nothing may wait here for what is loaded, so that it is moved later
 
-    JFRNN_MEMBER Candidates() : base(0), total(0), fetched(0), run_end(0), run_shift(0), run(shared_warp().runs) {}
+    JFRNN_MEMBER Candidates() : total(0), fetched(0), run_end(0), run_shift(0), run(shared_warp().runs) {}
     JFRNN_MEMBER bool are_fetched() const { return fetched >= total; }
-    // Begins with the next rows of cells, the candidates of which are `number`.
+    // Begins with the next runs, the candidates of which are `number`.
     JFRNN_MEMBER void begin(int number) {
         total = number;
-        base += 32;
         fetched = 0;
         run_end = 0;
         run = shared_warp().runs;
@@ -110,8 +109,12 @@ struct Candidates {
                 const real gap = larger(magnitude(x[k][a]) - box.half[a], 0);
                 square += gap * gap;
             }
-            near[k] = square <= box.center[3];
-            if (BATCHED && !shared_known().grid.dense && near[k]) {
+            real near_square = box.center[3];
+            if constexpr (TREE && !BY_OWN)
+                near_square =
+                    square < search.INF ? group.near_with(search, search.radii[search.source_named(id_of(places[k].id))]) : -1;
+            near[k] = square <= near_square;
+            if (BATCHED && (TREE || !shared_known().grid.dense) && near[k]) {
                 const int source = search.source_named(id_of(places[k].id));
                 near[k] = system_of(search.positions + (long long)ROW * source) == group.system;
             }

@@ -4,6 +4,7 @@
 #include "excluded.h"
 #include "scan.cuh"
 #include "shares.h"
+#include "tree.cuh"
 
 struct SearchArguments {
     const real *positions, *queries, *cutoff;
@@ -40,7 +41,7 @@ struct Thread {
           threads((long long)gridDim.x * blockDim.x) {}
 };
 
-// The scratch of a search: `jfrnn.kernels.cells_cuda.scratch_words` is the sum of its parts.
+// The scratch of a search: `scratch_words` of `jfrnn.kernels.cells_cuda`, or `tree_cuda`, is the sum of its parts.
 struct Scratch {
     Shared& shared;
     int* cursor;
@@ -55,11 +56,18 @@ struct Scratch {
     int* crossing;  // their numbers: nobody asks for keys and slots once particles are scattered
     int* crosses;   // whether a block does
 
+    Node* nodes;  // of a tree, which takes the place of the cells
+
     JFRNN_MEMBER Scratch(int* scratch, int n, int m, int own, int table) : shared(*(Shared*)scratch), cursor(scratch + up(64)) {
         constexpr int WIDTH = DOUBLE ? 2 : 1;
         const int tile_count = (table + 1) / TILE + 1, longest = n > m ? n : m;
-        parts = (real*)take(PART * PARTS * WIDTH);
+        parts = (real*)take(TREE ? 0 : PART * PARTS * WIDTH);
         sorted = (Place*)take(4 * WIDTH * (long long)n);
+        if constexpr (TREE) {
+            query_order = take(own ? 0 : m);
+            nodes = (Node*)take(0);
+            return;
+        }
         start = take(table + 2);
         tile_state = (unsigned long long*)take(2 * tile_count);
         key = take(longest);

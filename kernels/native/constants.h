@@ -39,9 +39,9 @@ constexpr bool FROM_PLACES = false;  // the term reads coordinates of j, and no 
 constexpr int MOST_KINDS = 4;        // species whose cutoffs tensor cores know
 // Of few particles on CUDA (see jfrnn/kernels/few_cuda.py).
 constexpr int FEW_MOST = 4096, FEW_WARPS = 32;
-// Of searches with a cutoff per particle (see jfrnn/kernels/tree_cpu.py and levels.py).
+// Of searches with a cutoff per particle (see jfrnn/kernels/tree_cpu.py).
 constexpr int LEAF = 16, FANOUT = 16, CLASS_BITS = 1, LEAST_TOGETHER = 6, MOST_TOGETHER = 32, MOST_DOUBLED = 6, MOST_HALVED = 9;
-constexpr int RULE = 0, GROUPS = 8, HALVINGS = 5, PADDING = 16;
+constexpr int RULE = 0;
 // Of lists that are kept (see jfrnn/kernels/reverse.py and kept.py).
 constexpr int CODE_BYTES = 1;     // of the code of an image, 0: pairs have one image
 constexpr int RADII = 0;          // whose cutoff is that of a pair (kept.h), 0: all have one

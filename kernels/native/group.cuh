@@ -20,15 +20,23 @@ struct Group {
     float coarse_square;  // that the sums of `Matrix` start from
     Box box;
 
-    // Takes the queries from `place` on that share a row of cells with the first one, and a system, and are not too far from it.
-    JFRNN_MEMBER Group(const PairSearch& search, int place, int stop) : place(place), mine{{0, 0, 0}, 0}, system(0) {
+    // Takes the queries from `place` on that share a row of cells with the first one, and a system, and are not too far from it; of a
+    // tree, how many of them walk together is decided later (tree_runs.cuh).
+    JFRNN_MEMBER Group(const PairSearch& search, int place, int stop)
+        : place(place), mine{{0, 0, 0}, 0}, my_place{0, 0, 0}, system(0) {
         const Known& known = shared_known();
         const int lane = search.lane;
-        bool beside = place + lane < stop && place + lane < known.finite_queries;
+        bool beside = place + lane < stop && (TREE || place + lane < known.finite_queries);
         if (beside)
             mine = search.load_query(place + lane);
+        if constexpr (TREE) {  // cutoffs of queries that walk together are alike
+            beside = beside && finite_point(mine.p);
+            const real own = beside && RULE != SCATTER ? search.query_radii[id_of(mine.id)] : real(0);
+            const real first = __shfl_sync(ALL, own, 0);
+            beside = beside && own <= 2 * first && first <= 2 * own;
+        }
 #pragma unroll
-        for (int a = 0; a < DIM; ++a) {
+        for (int a = 0; a < DIM && !TREE; ++a) {
             my_place[a] = search.coordinate(a, mine.p);
             const whole here = search.axis_cell(known.grid, a, my_place[a]), there = __shfl_sync(ALL, here, 0);
             beside = beside && (a == 0 ? known.grid.dense || (here >= there && here - there < 2 * REACH_X) : here == there);
@@ -115,7 +123,8 @@ struct Group {
         scale = search.step_scale;
         if constexpr (!DOUBLE) {
             constexpr float SMALLEST = 0x1p-126f;
-            unit = __uint_as_float(__float_as_uint(__fdividef(240, diagonal + search.outer_radius)) & 0x7f800000u);
+            const real outer = DIFFER && BY_OWN ? largest * search.step_scale + search.off() : search.outer_radius;
+            unit = __uint_as_float(__float_as_uint(__fdividef(240, diagonal + (float)outer)) & 0x7f800000u);
 #pragma unroll
             for (int a = 0; a < DIM; ++a)
                 unit = fabsf(center[a]) * search.step_scale * unit < 1e37f ? unit : 0;
@@ -125,17 +134,26 @@ struct Group {
             }
         }
     }
+    // Of cutoffs that differ: the square, in units of the box, beyond which nothing is a neighbor by a cutoff.
+    JFRNN_MEMBER real near_of(const PairSearch& search, real cutoff) const {
+        const real off = CROSSING ? 2 * search.lattice.slack() * scale : real(0);
+        const real square = PairCutoffs::outside_of(cutoff * scale, off) * (1 + 16 * PairSearch::step_eps) * unit * unit;
+        return square + (DOUBLE ? real(0) : real(1e-30));
+    }
+    // The same, of a source with this cutoff: of a tree, cells say nothing of it.
+    JFRNN_MEMBER real near_with(const PairSearch& search, real other) const {
+        if constexpr (TREE && !BY_OWN)
+            return near_of(search, PairCutoffs::of_pair(largest, other));
+        return box.center[3];
+    }
     // Finds what is near the box, and the band in which the sums of `Matrix` leave pairs open.
     JFRNN_MEMBER void set_limits(const PairSearch& search, float diagonal) {
-        const real radius = search.radius, between = shared_known().between;
+        const real radius = DIFFER && BY_OWN ? largest : search.radius, between = shared_known().between;
         const real group_radius = (SCALED ? radius * scale : radius) * unit;
         const real outer = CROSSING ? (radius + 2 * search.lattice.slack()) * (SCALED ? scale : real(1)) * unit : group_radius;
         real near_square = outer * outer * (1 + 8 * PairSearch::step_eps) + (DOUBLE ? real(0) : real(1e-30));
-        if constexpr (DIFFER) {
-            const real off = CROSSING ? 2 * search.lattice.slack() * scale : real(0);
-            near_square = PairCutoffs::outside_of(largest * scale, off) * (1 + 16 * PairSearch::step_eps) * unit * unit;
-            near_square += DOUBLE ? real(0) : real(1e-30);
-        }
+        if constexpr (DIFFER)
+            near_square = near_of(search, largest);
         const float reach = fminf(diagonal * (float)unit + (float)outer, 240);
         float coarse_band = reach * reach * (RULE == TABLE ? 3e-5f : 2e-5f);
         const float square_unit = (float)(shared_known().site * unit) * (float)(shared_known().site * unit);

@@ -49,7 +49,7 @@ struct PairSearch : ImageSearch {
     JFRNN_MEMBER void take_cutoffs(int id, bool has_query) {
         own_radius = RULE != SCATTER && has_query ? query_radii[id] : real(0);
         of_kinds = RULE == TABLE ? table_of_kinds + (long long)kinds * (has_query ? kinds_of_queries[id] : 0) : nullptr;
-        upper = BY_OWN ? own_radius : RULE == MEAN ? (own_radius / 2 + radius / 2) * (1 + 4 * step_eps) : radius;
+        upper = BY_OWN || TREE ? own_radius : RULE == MEAN ? (own_radius / 2 + radius / 2) * (1 + 4 * step_eps) : radius;
         own_bounds = PairCutoffs::bounds_of(own_radius * step_scale, off());
         sure_square = own_bounds.inside;  // of GATHER
         band = (own_bounds.outside - own_bounds.inside) / 2;

@@ -19,11 +19,38 @@ struct Overlap {
     }
 };
 
-struct Runs {
+// Numbers the candidates of all lanes, `size` of them from the place `from` on, and shares the runs; returns how many there are.
+JFRNN_FUNCTION int share_runs(const PairSearch& search, int from, int size, int image) {
+    Warp& warp = shared_warp();
+    const int lane = search.lane;
+    int end = size;
+#pragma unroll
+    for (int step = 1; step < 32; step *= 2) {
+        const int other = __shfl_up_sync(ALL, end, step);
+        end += lane >= step ? other : 0;
+    }
+    const unsigned int occupied = __ballot_sync(ALL, size > 0);
+    __syncwarp();
+    if (size > 0) {
+        const int number = __popc(occupied & ((1u << lane) - 1));
+        warp.runs[number] = Run{end, from - (end - size)};
+        if constexpr (!PairSearch::INSIDE) {
+            warp.run_images[number] = image;
+            search.translate(image, warp.run_moved[number]);
+        }
+    }
+    if (lane == 0)
+        warp.runs[__popc(occupied)] = Run{0x7fffffff, 0};
+    __syncwarp();
+    return __shfl_sync(ALL, end, 31);
+}
+
+struct CellRuns {
     whole reached;  // of lane 2a the lowest cell within reach along axis a, of lane 2a + 1 the highest
     int rows;       // of cells; a row is cut where it enters another image
+    int base;       // rows of which candidates have been written down
 
-    JFRNN_MEMBER Runs(const PairSearch& search, const Group& group) : reached(find_end(search, group)), rows(1) {
+    JFRNN_MEMBER CellRuns(const PairSearch& search, const Group& group, bool) : reached(find_end(search, group)), rows(1), base(0) {
         if (!PairSearch::INSIDE && search.is_periodic(0))
             rows = search.period_of(0, __shfl_sync(ALL, reached, 1)) - search.period_of(0, __shfl_sync(ALL, reached, 0)) + 1;
         if (cells_along(0) <= 0 || cells_along(1) <= 0 || cells_along(2) <= 0)
@@ -50,8 +77,14 @@ struct Runs {
     JFRNN_MEMBER whole first_along(int a) const { return __shfl_sync(ALL, reached, 2 * a); }
     JFRNN_MEMBER int cells_along(int a) const { return (int)(__shfl_sync(ALL, reached, 2 * a + 1) - first_along(a)) + 1; }
 
-    // Writes down the candidates of up to 32 rows of cells, those from `base` on, as runs; returns how many there are.
-    JFRNN_MEMBER int find(const PairSearch& search, unsigned int system, int base) const {
+    JFRNN_MEMBER bool are_left() const { return base < rows; }
+    // Writes down the candidates of the next up to 32 rows of cells as runs; returns how many there are.
+    JFRNN_MEMBER int find(const PairSearch& search, const Group& group) {
+        const int number = find_from(search, group.system);
+        base += 32;
+        return number;
+    }
+    JFRNN_MEMBER int find_from(const PairSearch& search, unsigned int system) const {
         const Grid& grid = shared_known().grid;
         const int lane = search.lane;
         whole first[3];
@@ -92,7 +125,7 @@ struct Runs {
                 size = e <= grid.cells ? search.start[e] - from : grid.finite - from + search.start[e - grid.cells];
             }
         }
-        return share(search, from, size, mine.image);
+        return share_runs(search, from, size, mine.image);
     }
     // Finds a row of cells in its own image; it has none where rounding has reached for an image that nobody can.
     JFRNN_FUNCTION CellRow cut_row(const PairSearch& search, const whole* first, int wide, int across, int length, int row) {
@@ -132,30 +165,5 @@ struct Runs {
             if (r < lane && (!CROSSING || other_image == image))
                 overlap.add(other, cells);
         }
-    }
-    // Numbers the candidates of all lanes, `size` of them from the place `from` on, and shares the runs; returns how many there are.
-    JFRNN_FUNCTION int share(const PairSearch& search, int from, int size, int image) {
-        Warp& warp = shared_warp();
-        const int lane = search.lane;
-        int end = size;
-#pragma unroll
-        for (int step = 1; step < 32; step *= 2) {
-            const int other = __shfl_up_sync(ALL, end, step);
-            end += lane >= step ? other : 0;
-        }
-        const unsigned int occupied = __ballot_sync(ALL, size > 0);
-        __syncwarp();
-        if (size > 0) {
-            const int number = __popc(occupied & ((1u << lane) - 1));
-            warp.runs[number] = Run{end, from - (end - size)};
-            if constexpr (!PairSearch::INSIDE) {
-                warp.run_images[number] = image;
-                search.translate(image, warp.run_moved[number]);
-            }
-        }
-        if (lane == 0)
-            warp.runs[__popc(occupied)] = Run{0x7fffffff, 0};
-        __syncwarp();
-        return __shfl_sync(ALL, end, 31);
     }
 };

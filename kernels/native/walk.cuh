@@ -17,6 +17,10 @@ struct Walk : PairSearch {
     JFRNN_MEMBER Query& query() { return *static_cast<Query*>(this); }
 
     JFRNN_MEMBER void run() {
+        if constexpr (TREE) {
+            serve(block);
+            return;
+        }
         if (PERIODIC && !CROSSING && (block >= query_blocks || crosses[block]))
             return;
         if constexpr (CROSSING)
@@ -30,24 +34,27 @@ struct Walk : PairSearch {
         const long long begin = (long long)block << share_bits;
         int place = begin < m ? (int)begin : m;
         const int share = 1 << share_bits, stop = m - place < share ? m : place + share;
+        bool loose = false;  // of a tree: whether queries of this block have been far from each other
         query().open(block);
         while (place < stop) {
             Group group(*this, place, stop);
             if (group.size == 0) {
+                if (TREE && lane == 0)
+                    atomicOr(&info[1], 2);
                 query().none(id_of(load_query(place).id));
                 ++place;
                 continue;
             }
-            walk(group);
+            walk(group, loose);
             place += group.size;
             __syncwarp();
         }
     }
-    JFRNN_MEMBER void walk(Group& group) {
+    JFRNN_MEMBER void walk(Group& group, bool& loose) {
         if constexpr (DIFFER)
             this->take_cutoffs(group.my_id, lane < group.size);
         group.enclose(*this);
-        const Runs runs(*this, group);
+        Runs runs(*this, group, loose);
         if constexpr (EXCLUDING)
             shared_warp().filters[lane] = Excluded(excluded_starts, excluded, lane < group.size ? group.my_id : 0).filter;
         Pairs pairs{0, 0, 0, 0, own && drop_self, true};
@@ -58,13 +65,13 @@ struct Walk : PairSearch {
         Candidates candidates;
         Aside aside;
         for (bool finished = false; !finished;) {
-            if (candidates.are_fetched() && candidates.base < runs.rows) {
-                candidates.begin(runs.find(*this, group.system, candidates.base));
+            if (candidates.are_fetched() && runs.are_left()) {
+                candidates.begin(runs.find(*this, group));
                 candidates.fetch(*this, group);
             }
             if (!candidates.are_fetched())
                 candidates.keep_near(*this, group, pairs);
-            const bool last_ones = candidates.are_fetched() && candidates.base >= runs.rows;
+            const bool last_ones = candidates.are_fetched() && !runs.are_left();
             __syncwarp();
             while ((!HELD || pairs.tested < 32 * BLOCKS) && pairs.kept >= pairs.tested + (last_ones ? 1 : 32))
                 meet_block(*this, group, matrix, candidates, aside, pairs);

@@ -9,6 +9,7 @@ constexpr int LISTED = 32;           // neighbors of a query that are written at
 constexpr int FETCHED = 2;           // candidates that a lane fetches at a time
 constexpr bool MATRIX = !DOUBLE && (!VARY || RULE == TABLE);  // queries meet candidates on tensor cores, else one by one
 constexpr int OF_CUTOFFS = BANDED ? 2 : VARY ? 1 : 0;         // numbers that are known of a candidate where cutoffs VARY
+constexpr int LEAVES = 256;                                   // of a tree, that are written down at a time
 constexpr int RING = 128;  // candidates that wait: fewer than a block, and what is fetched twice, rounded up
 
 // The box around a group. The last numbers are what is near, squared, and twice the coarse band.
@@ -36,6 +37,7 @@ struct alignas(16) Warp {
     Run runs[33];
     int run_images[CROSSING ? 33 : 1];  // the codes of their images, and what leads from home to these
     real run_moved[CROSSING ? 33 : 1][3];
+    int leaves[TREE ? LEAVES : 1], leaf_images[TREE && CROSSING ? LEAVES : 1];  // of a tree, those near the queries
 };
 // What every warp reads of the search; here it takes no registers.
 struct Known {

@@ -9,6 +9,7 @@ import pytest
 
 from jfrnn._geometry.curves import hilbert_decode, hilbert_encode, morton_decode, morton_encode
 from jfrnn._geometry.order import sort_order
+from jfrnn._geometry.tree_order import CLASSES, order_for_tree
 
 CURVES = {"morton": (morton_encode, morton_decode), "hilbert": (hilbert_encode, hilbert_decode)}
 MOST_BITS = {2: 31, 3: 21}
@@ -435,3 +436,20 @@ def test_bad_arguments_of_a_sort_are_refused(arguments, options, error, message)
 def test_traced_cell_size_is_refused():
     with pytest.raises(TypeError, match="cell_size must be a static number, got a traced value"):
         jax.jit(sort_order)(jnp.zeros((3, 2)), 1.0)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_order_for_a_tree(dim):
+    """By system, then by class, then along a curve; what is not finite comes last, and far points do no harm to the others."""
+    random, n = np.random.default_rng(3), 600
+    points = random.random((n, dim)).astype(np.float32)
+    points[0], points[1], points[2, 0], points[3, 1] = 3e38, -3e38, np.nan, np.inf
+    classes, systems = random.integers(0, CLASSES, n).astype(np.uint32), random.integers(0, 3, n).astype(np.uint32)
+    order = np.asarray(order_for_tree(jnp.asarray(points), jnp.asarray(classes), jnp.asarray(systems)))
+    assert np.array_equal(np.sort(order), np.arange(n))
+    assert set(order[-2:].tolist()) == {2, 3}
+    keys = CLASSES * systems[order[:-2]].astype(int) + classes[order[:-2]]
+    assert np.all(np.diff(keys) >= 0)
+    near = np.asarray(order_for_tree(jnp.asarray(points[4:]), None, None))
+    steps = np.linalg.norm(np.diff(points[4:][near], axis=0), axis=1)
+    assert steps.max() < 6 * (n - 4) ** (-1 / dim)  # a curve without jumps

@@ -12,8 +12,7 @@ import pytest
 
 import jfrnn
 from jfrnn._engine import warp
-from jfrnn._geometry.levels import GROUPS, HALVINGS
-from jfrnn.kernels import _compile, cells_cpu, cells_cuda, declare, few_cuda, hashgrid, levels
+from jfrnn.kernels import _compile, cells_cpu, cells_cuda, declare, few_cuda, hashgrid, tree_cuda
 from jfrnn.kernels._native import program
 
 VARIANTS = [(dim, double, False, lists, False) for dim, double, lists in itertools.product((2, 3), (False, True), (False, True))]
@@ -62,14 +61,16 @@ def test_hashgrid_compiles(dim, double, scaled, lists):
 def test_boxes_batches_and_cutoffs_per_particle_compile():
     assert compiles(*cells_cuda.cell_kernels(3, False, False, True, periodic=2, batched=True)) == 3
     for rule, periodic in (("mean", 2), ("gather", 0)):
-        assert compiles(levels.query_kernel(3, False, True, rule, GROUPS, HALVINGS, periodic, batched=True)) == 1
+        space = {"periodic": periodic, "batched": True}
+        tree = tree_cuda.fit_kernel(3, False, rule, **space), tree_cuda.query_kernel(3, False, rule, True, **space)
+        assert compiles(*tree) == 2
         assert compiles(*cells_cuda.cell_kernels(3, False, True, True, periodic=periodic, rule=rule)) == (3 if periodic else 2)
     for rule, double in (("table", False), ("either", False), ("table", True)):
         assert compiles(*cells_cuda.cell_kernels(2, double, True, False, rule=rule)) == 2
 
 
 def test_cells_serve_where_cutoffs_are_alike_near_most_particles(monkeypatch):
-    """A core of many whose cutoffs are tiny beside a few others is for cells of many sizes; what is spread evenly never is."""
+    """A core of many whose cutoffs are tiny beside a few others is for a tree; what is spread evenly never is."""
     random, n, found = np.random.default_rng(0), 20_000, []
     x, r = random.random((n, 3)).astype(np.float32), np.float32((28 / 4.19 / n) ** (1 / 3))
 

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 import jfrnn
-from jfrnn._engine import Filter, boxes_warp, levels_warp, warp_sums
-from jfrnn._engine.sum_results import SumsOf
-from jfrnn._engine.variants import SumVariant, names_of_cutoffs
+from jfrnn._engine import boxes_warp, warp_sums
+from jfrnn._engine.variants import SumVariant, names_of_cutoffs, names_of_tree
 from jfrnn._search.problem import check_problem
 from jfrnn._sums import fused as _fused
 from jfrnn._sums.verb import _with_engine
@@ -228,24 +227,30 @@ def test_cutoffs_that_differ_compile_and_plans_have_the_arguments_of_their_kerne
     program = jax.jit(lambda x: (density(x), jfrnn.search(x, cutoff, capacity=8, backend="warp", **given).idx))
     text = program.trace(x).lower(lowering_platforms=("cuda",)).as_text()
     plan = plan_of(density, x)
-    keep = Filter(drop_self=True, later_only=False)
     if boxes:
         assert f'"jfrnn_box_sums_cuda_3d_f32_scaled_own_dropself_batched_images_skewed_{rule}_' in text
         assert f'"jfrnn_box_rows_cuda_3d_f32_scaled_list_images_skewed_batched_own_dropself_{rule}@' in text
         variant = SumVariant(3, False, True, True, False, True, 4, True, False, False, plan.key, True, False, False, rule)
         names = (*boxes_warp._GIVEN, "shared_values", "own_values", "columns", *names_of_cutoffs(rule), *boxes_warp._SUMS, "info")
         found = boxes_warp._plan_sums(variant, plan.text, {name: (n, 4) for name in names}, 132)
+        assert len(found.steps) == 1
     else:
-        assert f'"jfrnn_pair_sum_levels_cuda_3d_f32_own_dropself_{rule}_' in text
+        assert f'"jfrnn_pair_sum_cuda_3d_f32_scaled_own_dropself_{rule}_tree_' in text
+        assert f'"jfrnn_sorting_cuda_3d_f32_scaled_own_{rule}_tree@' in text
         assert f'"jfrnn_pair_sum_cuda_3d_f32_scaled_own_dropself_{rule}_' in text
-        variant = levels_warp._LevelVariant(3, False, False, True, False, keep, rule, 0, False, False)
-        names = (*levels_warp._given(variant), "shared_values", "own_values", "columns", "sums", "totals", "errors", "info")
-        results = SumsOf(plan.text, n, 2, False, False)
-        found = levels_warp._plan_sums(variant, results, plan.key, {name: (n, 4) for name in names}, 132)
-    (launch,) = found.steps
-    assert f".entry {launch.kernel.name}(" in _compile.find_binary(launch.kernel.program, arch=90).read_text()
-    assert {field.name for field in launch.kernel.fields if field.is_array} <= {*names, *SPARED, "more"}
-    assert all(0 <= found.numbers[field.name] < 2**31 for field in launch.kernel.fields if not field.is_array)
+        kind = (False, False, plan.key, True, False, False, rule, True)
+        variant = SumVariant(3, False, True, True, False, True, 0, False, *kind)
+        names = (*warp_sums._GIVEN, *names_of_tree(rule), *warp_sums._RESULTS, "values", "info", "scratch")
+        shapes = {name: (n, 4) for name in names}
+        found = warp_sums._plan_sorting(warp_sums._sorting(variant), shapes, 132)
+        assert [getattr(step, "threads", 0) for step in found.steps] == [0, 0, 64, 32]  # two leaves, and a root
+        summing = warp_sums._plan_on_cuda(variant, plan.text, shapes, 132)
+        numbers = {**found.numbers, **summing.numbers, "level": 1}
+        found = summing._replace(steps=[*found.steps[-1:], *summing.steps], numbers=numbers)
+    for launch in found.steps:
+        assert f".entry {launch.kernel.name}(" in _compile.find_binary(launch.kernel.program, arch=90).read_text()
+        assert {field.name for field in launch.kernel.fields if field.is_array} <= {*names, *SPARED, "more"}
+        assert all(0 <= found.numbers[field.name] < 2**31 for field in launch.kernel.fields if not field.is_array)
 
 
 def test_few_particles_take_one_launch():

@@ -1,0 +1,75 @@
+"""Search with cutoffs that differ widely on CUDA: the walk of `cells_cuda` over a tree of boxes, in place of cells.
+
+XLA sorts the particles along a curve (`jfrnn._geometry.order_for_tree`). `fit` puts the sources into that order, 32 to a leaf, and
+finds the boxes of leaves, then of 32 leaves, and so on, one launch for each level. A warp serves 32 queries that come one after the
+other, or fewer where these have fewer leaves near them in all; it finds these leaves from the root on, 32 boxes at a time, a lane
+each. Candidates are then met as those of cells are.
+
+Time follows pairs and particles: boxes are as small as 32 sources are close to each other, whatever the cutoffs of others.
+"""
+
+import functools
+
+from jfrnn.kernels._native import SPACES, program
+from jfrnn.kernels._program import Entry, Kernel, declare
+from jfrnn.kernels.cells_cuda import BLOCK, GRID, QUERY_BLOCK, constants_of, query_blocks
+
+_HEADER_WORDS = 64
+HEADER_BYTES = 4 * _HEADER_WORDS  # of the scratch, which are cleared first
+_NODE_WORDS = 12  # of the box of a node, at most, in float32
+_LEAF = 32
+
+
+def levels(sources: int) -> list[int]:
+    """Return how many nodes each level of a tree has, from the leaves to the root."""
+    counts = [-(-max(sources, 1) // _LEAF)]
+    while counts[-1] > 1:
+        counts.append(-(-counts[-1] // _LEAF))
+    return counts
+
+
+def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -> int:
+    """Return the int32 words of scratch that the kernels need; `width` is 1 for float32 and 2 for float64."""
+    del dim
+    parts = [_HEADER_WORDS, 4 * width * sources, 0 if own else queries, _NODE_WORDS * width * sum(levels(sources))]
+    return sum((words + 15) // 16 * 16 for words in parts)
+
+
+@functools.lru_cache(512)
+def fit_kernel(dim: int, double: bool, rule: str, periodic: int = 0, batched: bool = False) -> Kernel:
+    """Return the kernel that fits the boxes of a level."""
+    kind = f"{dim}d_{'f64' if double else 'f32'}{SPACES[periodic]}{'_batched' * batched}_{rule}"
+    constants = {**GRID, **constants_of(rule), "TREE": 1, "PERIODIC": periodic, "BATCHED": batched}
+    text = program(double, dim, "fit_tree.cuh", **constants)
+    return declare(f"fit_tree_cuda_{kind}", text, Entry("FitTree.run", BLOCK), cuda=True, fused=True)[0]
+
+
+def fit_threads(sources: int, queries: int, own: bool) -> list[int]:
+    """Return the threads of the launch for each level; those of the first put queries in their order, too."""
+    threads = [_LEAF * count for count in levels(sources)]
+    return [threads[0] if own else max(threads[0], min(queries, 1 << 20)), *threads[1:]]
+
+
+def walk_constants(rule: str, periodic: int) -> dict[str, int]:
+    """Return the constants of a walk over a tree."""
+    return {**GRID, **constants_of(rule), "TREE": 1, "CROSSING": periodic > 0, "PERIODIC": periodic, "SHIFTED": periodic}
+
+
+def walk_threads(queries: int) -> int:
+    """Return the threads that serve so many queries."""
+    return query_blocks(queries) * QUERY_BLOCK
+
+
+@functools.lru_cache(512)
+def query_kernel(
+    dim: int, double: bool, rule: str, lists: bool, later: bool = False, periodic: int = 0, batched: bool = False,
+    excluding: int = 0, flat: bool = False,
+) -> Kernel:  # fmt: skip
+    """Return the kernel that lists or counts; the arguments are those of `jfrnn.kernels.cells_cuda.cell_kernels`."""
+    blocks = 24 if not lists else 16 if double else 20
+    variant = f"{dim}d_{'f64' if double else 'f32'}{SPACES[periodic]}{'_batched' * batched}{'_list' * lists}{'_flat' * flat}"
+    variant += f"{'_later' * later}{'_excluding' * excluding}_{rule}"
+    constants = {**walk_constants(rule, periodic), "BATCHED": batched, "LIST": lists, "FLAT": flat, "SUMS": 0, "LATER": later}
+    text = program(double, dim, "rows.cuh", **constants, EXCLUDING=excluding)
+    entry = Entry("Rows.run", QUERY_BLOCK, blocks, "Rows_of_tree")
+    return declare(f"tree_cuda_{variant}", text, entry, cuda=True, fused=True)[0]
