@@ -40,9 +40,9 @@ def order_for_tree(points: Array, classes: Array | None, systems: Array | None) 
         words.append(functools.reduce(jnp.bitwise_or, [spread(each, dim) << np.uint32(axis) for axis, each in enumerate(digits)]))
     if classes is not None:
         words[0] |= classes << np.uint32(dim * widths[0])
-    if systems is not None:
-        words.insert(0, systems)
     words[0] = jnp.where(finite, words[0], np.uint32(2**32 - 1))  # no class is so high
+    if systems is not None:  # a system may have any number
+        words = [(~finite).astype(jnp.uint32), systems, *words]
     order = lax.iota(jnp.int32, n)
     for word in reversed(words):
         _, order = lax.sort((word[order], order), num_keys=1, is_stable=True)

@@ -118,6 +118,26 @@ JFRNN_FUNCTION unsigned int drop_excluded(const PairSearch& search, const Group&
     }
     return hits;
 }
+// Decides what is open of a single query, a candidate per lane: one that is far from all others may have tens of thousands.
+JFRNN_FUNCTION void decide_together(
+    const PairSearch& search, const Group& group, const Place& query, const int* ids, unsigned int& open, unsigned int& hits) {
+    const unsigned int who = __ballot_sync(ALL, open != 0);
+    if (who & (who - 1))
+        return;
+    const int leader = __ffs((int)who) - 1, my_id = __shfl_sync(ALL, group.my_id, leader);
+    const real own = __shfl_sync(ALL, search.own_radius, leader);
+    real q[3] = {0, 0, 0}, p[3];
+    for (int a = 0; a < DIM; ++a)
+        q[a] = __shfl_sync(ALL, query.p[a], leader);
+    bool is_pair = __shfl_sync(ALL, open, leader) >> search.lane & 1;
+    if (is_pair) {
+        search.load_image(ids[search.lane], p);
+        is_pair = search.is_neighbor_by_cutoffs(q, p, my_id, ids[search.lane], own);
+    }
+    const unsigned int found = __ballot_sync(ALL, is_pair);
+    hits |= search.lane == leader ? found : 0;
+    open = 0;
+}
 // Lets the queries meet the next block of candidates.
 JFRNN_FUNCTION void meet_block(
     const PairSearch& search, const Group& group, Matrix& matrix, Candidates& candidates, Aside& aside, Pairs& pairs) {
@@ -146,10 +166,12 @@ JFRNN_FUNCTION void meet_block(
         aside.put(candidates, matrix);
         const bool has_it = !MATRIX || CROSSING;
         const Place query = has_it ? group.mine : open ? search.load_query(group.place + search.lane) : Place{{0, 0, 0}, 0};
+        const int* const ids = HELD ? warp.ids + pairs.tested : warp.candidate_ids + first_candidate;
+        if constexpr (TREE)
+            decide_together(search, group, query, ids, open, hits);
         for (; open; open &= open - 1) {
             const int j = __ffs(open) - 1;
-            const int id = HELD ? warp.ids[pairs.tested + j] : warp.candidate_ids[first_candidate + j];
-            hits |= search.is_neighbor(query.p, group.my_id, id) ? 1u << j : 0;
+            hits |= search.is_neighbor(query.p, group.my_id, ids[j]) ? 1u << j : 0;
         }
         aside.take_back(candidates, matrix);
     }

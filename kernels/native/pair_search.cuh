@@ -48,7 +48,7 @@ struct PairSearch : ImageSearch {
     // Where cutoffs DIFFER: takes those of the query of this lane, if it has one.
     JFRNN_MEMBER void take_cutoffs(int id, bool has_query) {
         own_radius = RULE != SCATTER && has_query ? query_radii[id] : real(0);
-        of_kinds = RULE == TABLE ? table_of_kinds + (long long)kinds * (has_query ? kinds_of_queries[id] : 0) : nullptr;
+        of_kinds = RULE != TABLE ? nullptr : has_query ? row_of_kind(id) : table_of_kinds;
         upper = BY_OWN || TREE ? own_radius : RULE == MEAN ? (own_radius / 2 + radius / 2) * (1 + 4 * step_eps) : radius;
         own_bounds = PairCutoffs::bounds_of(own_radius * step_scale, off());
         sure_square = own_bounds.inside;  // of GATHER
@@ -96,7 +96,7 @@ struct PairSearch : ImageSearch {
         real p[3];
         load_image(id, p);
         if constexpr (DIFFER)
-            return is_neighbor_by_cutoffs(q, p, my_id, id);
+            return is_neighbor_by_cutoffs(q, p, my_id, id, own_radius);
         const real over = excess(q, p);
         bool hit = over < 0;
         if (over >= 0 && over <= 2 * band) {
@@ -109,11 +109,13 @@ struct PairSearch : ImageSearch {
         }
         return hit;
     }
+    // The cutoffs of the species of a query with each other.
+    JFRNN_MEMBER const real* row_of_kind(int query) const { return table_of_kinds + (long long)kinds * kinds_of_queries[query]; }
     // The same for a candidate at `p`, by the cutoffs of both.
-    JFRNN_MEMBER bool is_neighbor_by_cutoffs(const real* q, const real* p, int my_id, int id) const {
+    JFRNN_MEMBER bool is_neighbor_by_cutoffs(const real* q, const real* p, int my_id, int id, real own) const {
         const int source = source_named(id);
         const real other = RULE == GATHER || RULE == TABLE ? real(0) : radii[source];
-        const real r = RULE == TABLE ? of_kinds[kinds_of_sources[source]] : PairCutoffs::of_pair(own_radius, other);
+        const real r = RULE == TABLE ? row_of_kind(my_id)[kinds_of_sources[source]] : PairCutoffs::of_pair(own, other);
         const auto bounds = PairCutoffs::bounds_of(r * step_scale, off());
         real square = 0;
 #pragma unroll
@@ -123,7 +125,7 @@ struct PairSearch : ImageSearch {
         }
         if (square < bounds.inside || !(square <= bounds.outside))
             return square < bounds.inside;
-        const real first = SUM ? own_radius / 2 : r, more = SUM ? other / 2 : real(0);
+        const real first = SUM ? own / 2 : r, more = SUM ? other / 2 : real(0);
         if constexpr (INSIDE)
             return exact_pair(q, p, first, more, closed);
         const real* there = positions + (long long)ROW * source;

@@ -444,7 +444,7 @@ def test_order_for_a_tree(dim):
     random, n = np.random.default_rng(3), 600
     points = random.random((n, dim)).astype(np.float32)
     points[0], points[1], points[2, 0], points[3, 1] = 3e38, -3e38, np.nan, np.inf
-    classes, systems = random.integers(0, CLASSES, n).astype(np.uint32), random.integers(0, 3, n).astype(np.uint32)
+    classes, systems = random.integers(0, CLASSES, n).astype(np.uint32), random.choice(np.array([0, 7, 2**32 - 1], np.uint32), n)
     order = np.asarray(order_for_tree(jnp.asarray(points), jnp.asarray(classes), jnp.asarray(systems)))
     assert np.array_equal(np.sort(order), np.arange(n))
     assert set(order[-2:].tolist()) == {2, 3}

@@ -14,6 +14,7 @@ import reference
 from test_box import image_pairs, masked_images
 
 import jfrnn
+from jfrnn._engine import warp
 from jfrnn._geometry.cutoffs import RULES, Radii, is_radius, make_cutoffs, smallest_cutoff
 from jfrnn.cases.radii import RADII_CASES
 
@@ -109,6 +110,16 @@ def each_case():
 def test_case(name, rule, dtype, dim, backend, way):
     often = way == "few" and rule in ("gather", "either", "mean") and name != "queries"  # the mask is a program of its own
     assert_case(name, dtype, dim, rule, backend, masked=often, way=way)
+
+
+@pytest.mark.skipif(jax.default_backend() != "gpu", reason="only on CUDA there is a choice between cells and a tree")
+@pytest.mark.parametrize("rule", RULES)
+def test_a_tree_wherever_cutoffs_differ(rule, monkeypatch):
+    jax.clear_caches()  # programs hold the choice
+    monkeypatch.setattr(warp, "MOST_MET", -np.inf)
+    for name in ("graded", "spread_100", "ties", "periodic"):
+        assert_case(name, *KINDS[rule], rule, "warp", masked=False)
+    jax.clear_caches()
 
 
 @pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
