@@ -39,7 +39,7 @@ def sort_kernels(dim: int, double: bool, scaled: bool, periodic: int = 0, batche
     They are a program of their own: sums take no others, and to compile rows takes long.
     """
     text = program(double, dim, "cells_cpu.h", **_options(scaled, periodic, batched))
-    build, gather = declare(f"sort_cpu_{_variant(dim, double, scaled, periodic, batched)}", text, "Sort.build", "Gather.gather")
+    build, gather = declare(f"sort_cpu_{_variant(dim, double, scaled, periodic, batched)}", text, "Sort.build", "Sort.gather")
     return build, gather
 
 

@@ -66,7 +66,7 @@ def sort_kernels(dim: int, double: bool, rule: str, periodic: int = 0, batched: 
     """Return `build` and `gather`, for a rule of `RULES`, as `jfrnn.kernels.cells_cpu.sort_kernels` does."""
     text = program(double, dim, "cutoffs_cpu.h", **_constants(rule, periodic, batched))
     build, gather = declare(
-        f"sort_tree_cpu_{_variant(dim, double, rule, periodic, batched)}", text, "CutoffSort.build", "TreeGather.gather"
+        f"sort_tree_cpu_{_variant(dim, double, rule, periodic, batched)}", text, "CutoffSort.build", "TreePlaces.gather"
     )
     return build, gather
 

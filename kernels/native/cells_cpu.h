@@ -57,7 +57,7 @@ struct SortArguments {
     int n, m, own, table;
 };
 
-// Sorts by counting: one thread, which reads every particle three times.
+// Sorts by counting: `build` is of one thread, which reads every particle three times.
 struct Sort : SortArguments, Places {
     explicit Sort(const SortArguments& given)
         : SortArguments(given), Places(given.cutoff, given.scratch, given.n, given.m, given.own, given.table) {}
@@ -160,20 +160,8 @@ struct Sort : SortArguments, Places {
         }
         return finite;
     }
-};
-
-struct GatherArguments {
-    const real *positions, *cutoff;
-    int* scratch;
-    int n, m, own, table;
-};
-
-// Puts coordinates of sources into the order of cells. It is launched once per thread: threads hand themselves chunks of places.
-// Reading from anywhere is what takes time, so rows are fetched ahead.
-struct Gather : GatherArguments, Places {
-    explicit Gather(const GatherArguments& given)
-        : GatherArguments(given), Places(given.cutoff, given.scratch, given.n, given.m, given.own, given.table) {}
-
+    // Puts coordinates of many sources into the order of cells. It is launched once per thread: threads hand themselves chunks of
+    // places. Reading from anywhere is what takes time, so rows are fetched ahead.
     void gather() {
         each_chunk(shared.next_gathered, n, CHUNK, [&](int from, int to, int) {
             for (int place = from; place < to; ++place) {

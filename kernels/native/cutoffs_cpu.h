@@ -14,11 +14,7 @@ constexpr int MOST_MET = 16;   // candidates for each pair, as an average, in ce
 struct CutoffSort : TreeSortArguments {
     Sort cells;
 
-    explicit CutoffSort(const TreeSortArguments& given)
-        : TreeSortArguments(given),
-          cells(
-              {given.positions, given.queries, given.cutoff, given.info, given.scratch, given.n, given.m, given.own, given.table}) {
-    }
+    explicit CutoffSort(const TreeSortArguments& given) : TreeSortArguments(given), cells(given) {}
 
     void build() {
         Shared& shared = cells.shared;

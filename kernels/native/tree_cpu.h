@@ -51,11 +51,9 @@ struct TreeScratch : Scratch {
     static int class_of(real r) { return (int)(Bits::of(r) >> (Bits::MANTISSA - CLASS_BITS)); }
 };
 
-struct TreeSortArguments {
-    const real *positions, *queries, *cutoff, *radii, *query_radii;
+struct TreeSortArguments : SortArguments {
+    const real *radii, *query_radii;
     const int* kinds_of_sources;
-    int *info, *scratch;
-    int n, m, own, table;
 
     // How wide a group around a query of an id may be: its cutoff, or what is known of it.
     real reach_of(int id) const { return RULE != SCATTER ? query_radii[id] : own ? radii[id] : cutoff[0]; }
@@ -137,12 +135,8 @@ struct TreePlaces : TreeSortArguments, Cells, TreeScratch {
         for (int node = nodes[level]; node % FANOUT; ++node)
             begin_node(first[level] + node);
     }
-};
-
-// Puts many sources in order. It is launched once per thread: threads hand themselves chunks of places, and the last one to end makes
-// the nodes above the leaves.
-struct TreeGather : TreePlaces {
-    explicit TreeGather(const TreeSortArguments& given) : TreePlaces(given) {}
+    // Puts many sources in order. It is launched once per thread: threads hand themselves chunks of places, and the last one to end
+    // makes the nodes above the leaves.
     void gather() {
         each_chunk(shared.next_gathered, n, CHUNK, [&](int from, int to, int) {
             put_in_order(from, to);
