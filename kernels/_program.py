@@ -22,7 +22,7 @@ _CONSTRUCTOR = r"explicit {struct}\(const (\w+)&"
 _HELD = r"^struct {struct}\b[^{{;]*{{\n\s+const (\w+Arguments) given;"
 _FIELDS = r"^struct {struct}(?: : ([\w, ]+))? {{(?:\n(.*?)^)?}};"
 _NAME = re.compile(r"^\s*(\*?)\s*([A-Za-z_]\w*)\s*$")  # as in `int* a`, or `int *a, *b`
-# Compilers warn when they are asked for places in a struct that is derived from others. Those of arguments hold no virtual functions.
+# Compilers warn when they are asked for places in a struct that is derived from others; those of arguments are simple enough.
 _UNWARNED = {False: '#pragma clang diagnostic ignored "-Winvalid-offsetof"', True: "#pragma nv_diag_suppress 1427"}
 _LINE = re.compile(r"^\s*(?:const )?(real|int|whole)\b(.*);$")
 

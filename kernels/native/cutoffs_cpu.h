@@ -21,7 +21,12 @@ struct CutoffSort : TreeSortArguments {
         shared.next_chunk = shared.next_gathered = shared.next_sorted = shared.gathered = shared.turned = 0;
         shared.unit = shared.cells_for = 0;
         info[0] = 0;
-        if (!sort_by_cells())
+        if constexpr (BOXES) {  // by cells that are wide enough for the largest cutoff of each system
+            cells.build();
+            shared.cells_for = 1;
+            if (n < MANY)
+                TreePlaces(*this).put_in_order(0, n);
+        } else if (!sort_by_cells())
             tree();
     }
     __attribute__((noinline)) void tree() { TreeSort(*this).build(); }

@@ -5,11 +5,6 @@
 
 typedef int eight_ints __attribute__((vector_size(32)));
 
-struct RowsOut {
-    const int* starts;
-    int *idx, *receivers, *count, *info;
-    int capacity, later_only;
-};
 struct RowArguments : SearchArguments, RowsOut {};
 
 template <template <class> class Way>
@@ -21,8 +16,7 @@ struct RowsBy : Way<RowsBy<Way>>, RowsOut {
     int fill_value;
     bool past_caches;  // rows are so many that they will not be read from the caches
 
-    explicit RowsBy(const RowArguments& a)
-        : Base(a), RowsOut(a), longest(0), past_caches((long long)m * capacity >= 1 << 20) {
+    explicit RowsBy(const RowArguments& a) : Base(a), RowsOut(a), longest(0), past_caches((long long)m * capacity >= 1 << 20) {
         int codes = 1;  // of images
         for (int k = 0; PERIODIC == 2 && k < DIM; ++k)
             codes *= 2 * lattice.images(k) + 1;

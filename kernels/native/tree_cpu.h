@@ -59,10 +59,10 @@ struct TreeSortArguments : SortArguments {
     real reach_of(int id) const { return RULE != SCATTER ? query_radii[id] : own ? radii[id] : cutoff[0]; }
 };
 
-struct TreePlaces : TreeSortArguments, Cells, TreeScratch {
+struct TreePlaces : TreeSortArguments, SystemCells, TreeScratch {
     explicit TreePlaces(const TreeSortArguments& given)
         : TreeSortArguments(given),
-          Cells(given.cutoff, false),
+          SystemCells(given.cutoff, given.grids, false),
           TreeScratch(given.scratch, given.n, given.m, given.own, given.table) {}
 
     // Puts the sources at places [from, to) in order.
@@ -72,6 +72,7 @@ struct TreePlaces : TreeSortArguments, Cells, TreeScratch {
             const int i = ids[place];
             __builtin_prefetch(positions + (long long)ROW * ids[place + AHEAD < to ? place + AHEAD : place]);
             real p[3];
+            enter(system_of(positions + (long long)ROW * i));
             point_of(positions + (long long)ROW * i, p);
             for (int k = 0; k < DIM; ++k)
                 axis[k][place] = p[k];
