@@ -18,6 +18,7 @@ from jfrnn.kernels._text import resolve
 CELLS_PER_PARTICLE = 4  # size of the cell table; 16 B per particle
 SMALLEST_TABLE = 4096
 SKEWED = 2
+OWN_BOXES = 2
 EXCLUDED = (
     "excluded_starts",
     "excluded",
@@ -25,8 +26,9 @@ EXCLUDED = (
 RULES = ("gather", "scatter", "either", "both", "mean", "table")  # by which the cutoff of a pair follows from both, in native order
 TABLE = ("table_of_kinds", "kinds_of_sources", "kinds_of_queries")  # arrays that the last of these rules asks for
 ORDERS = ("source_order", "query_order")  # arrays that a tree on CUDA is fitted to
+BATCHES = ("", "_batched", "_boxes")
 SPACES = ("", "_nearest", "_images", "_nearest_skewed", "_images_skewed")  # in names of variants
-_DEFAULTS = {"PERIODIC": 0, "BATCHED": 0, "SUM": 0, "SCALED": 0, "EXCLUDING": 0, "FLAT": 0, "RULE": -1, "TREE": 0}
+_DEFAULTS = {"PERIODIC": 0, "BATCHED": 0, "SUM": 0, "SCALED": 0, "EXCLUDING": 0, "FLAT": 0, "RULE": -1, "BOXES": 0, "TREE": 0}
 
 
 def table_cells(sources: int) -> int:
@@ -40,7 +42,8 @@ def program(double: bool, dim: int, *headers: str, given: Mapping[str, str] = Ma
     PERIODIC is 0 in an open space, 1 where the nearest image is the only one that can be a neighbor, 2 where images are told apart:
     `cutoff` then goes on with the numbers of the lattice, and a row of positions goes on with its packed turns (see
     `jfrnn._geometry.box`). Where vectors of it do not lie along the axes, it is given as two more, and the text finds SKEWED.
-    BATCHED is 1 where a row ends with the number of its system (see `jfrnn._geometry.batch`). SUM is 1 where the cutoff of a pair
+    BATCHED is 1 where a row ends with the number of its system (see `jfrnn._geometry.batch`), OWN_BOXES where each of these has a
+    box of its own, too: then `cutoff` has numbers of each of them, and the text finds BOXES. SUM is 1 where the cutoff of a pair
     is the sum of two numbers. SHIFTED is 0 where all pairs that are decided are those of points as they are, though space is
     periodic. SCALED is 1 where cutoffs are so small, or so large, that their squares need a unit.
     EXCLUDING is 1 where queries exclude sources, 2 where they exclude images of sources. RULE is the number of one of `RULES`, -1
@@ -54,6 +57,7 @@ def program(double: bool, dim: int, *headers: str, given: Mapping[str, str] = Ma
         constants: Named integers.
     """
     constants = {**_DEFAULTS, "SHIFTED": constants.get("PERIODIC", 0), **constants}
+    constants |= {"BATCHED": 1, "BOXES": 1} if constants["BATCHED"] == OWN_BOXES else {}
     constants["SKEWED"] = constants["PERIODIC"] > SKEWED
     constants |= {name: constants[name] - SKEWED for name in ("PERIODIC", "SHIFTED") if constants[name] > SKEWED}
     lines = [f"using real = {'double' if double else 'float'};", f"using whole = {'long long' if double else 'int'};"]

@@ -20,8 +20,10 @@ from jfrnn.kernels._text import resolve
 _POINTER, _INTEGER = 8, 4  # bytes
 _CONSTRUCTOR = r"explicit {struct}\(const (\w+)&"
 _HELD = r"^struct {struct}\b[^{{;]*{{\n\s+const (\w+Arguments) given;"
-_FIELDS = r"^struct {struct} {{\n(.*?)^}};"
+_FIELDS = r"^struct {struct}(?: : ([\w, ]+))? {{(?:\n(.*?)^)?}};"
 _NAME = re.compile(r"^\s*(\*?)\s*([A-Za-z_]\w*)\s*$")  # as in `int* a`, or `int *a, *b`
+# Compilers warn when they are asked for places in a struct that is derived from others; those of arguments are simple enough.
+_UNWARNED = {False: '#pragma clang diagnostic ignored "-Winvalid-offsetof"', True: "#pragma nv_diag_suppress 1427"}
 _LINE = re.compile(r"^\s*(?:const )?(real|int|whole)\b(.*);$")
 
 
@@ -99,14 +101,14 @@ def declare(name: str, text: str, *entries: Entry | str, cuda: bool = False, fus
     lines = [_write_entry(entry, arguments, cuda) for entry, arguments in zip(called, given, strict=True)]
     found = [read_fields(text, arguments) for arguments in given]
     checks = dict.fromkeys(_write_check(arguments, *read) for arguments, read in zip(given, found, strict=True))
-    whole = "\n".join([resolve("c_library.h"), "namespace {", text, *checks, "}", *lines, ""])
+    whole = "\n".join([resolve("c_library.h"), "namespace {", text, _UNWARNED[cuda], *checks, "}", *lines, ""])
     program = Program(name, whole, cuda, fused)
     return [Kernel(program, x.name, fields, size, x.block) for x, (fields, size) in zip(called, found, strict=True)]
 
 
 @functools.lru_cache(1024)
 def read_fields(text: str, struct: str) -> tuple[tuple[Field, ...], int]:
-    """Return the arguments that a struct holds, and its size in bytes.
+    """Return the arguments that a struct holds, behind those of the structs that it is derived from, and its size in bytes.
 
     Raises:
         ValueError: It is not in the text, or holds anything but arrays and integers of 32 bits.
@@ -115,7 +117,11 @@ def read_fields(text: str, struct: str) -> tuple[tuple[Field, ...], int]:
     if body is None:
         raise ValueError(f"no struct {struct} in the program")
     fields, place = [], 0
-    for name, is_array in _read_names(struct, body[1].splitlines()):
+    for base in body[1].split(", ") if body[1] else ():
+        inherited, size = read_fields(text, base)
+        fields += [field._replace(place=place + field.place) for field in inherited]
+        place += size
+    for name, is_array in _read_names(struct, (body[2] or "").splitlines()):
         size = _POINTER if is_array else _INTEGER
         place = -(-place // size) * size
         fields.append(Field(name, place, is_array))

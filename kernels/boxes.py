@@ -1,4 +1,7 @@
-"""Systems with boxes of their own: sources are sorted by system and cell, on CUDA by six launches; then one serves all queries."""
+"""Systems with boxes of their own, on CUDA: six launches sort sources by system and cell, then one serves all queries.
+
+On the CPU the kernels of cells and sums serve them (`jfrnn.kernels.cells_cpu`), which go to the cells of a system at a time.
+"""
 
 import functools
 from typing import NamedTuple
@@ -8,7 +11,6 @@ from jfrnn.kernels._program import Entry, Kernel, declare
 from jfrnn.kernels.cells_cuda import GRID
 from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
-QUERIES_AT_ONCE = 64  # that a thread of the CPU takes
 PADDING = 16  # sources behind the last one that may be read
 LANES = 16  # of CUDA that serve a query
 _BLOCK = 128
@@ -64,7 +66,6 @@ def rows_kernel(
     lists: bool,
     later: bool,
     periodic: int,
-    cuda: bool,
     excluding: int = 0,
     flat: bool = False,
     rule: str = "",
@@ -74,18 +75,17 @@ def rows_kernel(
     `periodic`, `excluding` and `flat` are those of `jfrnn.kernels._native.program`; `rule` is one of its `RULES`, "" with one
     cutoff.
     """
-    where = "cuda" if cuda else "cpu"
     kind = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}{'_flat' * flat}{'_later' * later}"
-    name = f"box_rows_{where}_{kind}{SPACES[periodic]}{'_excluding' * excluding}{f'_{rule}' * bool(rule)}"
+    name = f"box_rows_cuda_{kind}{SPACES[periodic]}{'_excluding' * excluding}{f'_{rule}' * bool(rule)}"
     constants = _constants(periodic, scaled, lists, later, rule) | {"EXCLUDING": excluding, "FLAT": flat}
-    text = program(double, dim, "box_rows.cuh" if cuda else "box_rows_cpu.h", given={}, SUMS=0, **constants)
-    return declare(name, text, Entry("BoxRows.run", _BLOCK if cuda else 1, BLOCKS), cuda=cuda, fused=cuda)[0]
+    text = program(double, dim, "box_rows.cuh", given={}, SUMS=0, **constants)
+    return declare(name, text, Entry("BoxRows.run", _BLOCK, BLOCKS), cuda=True, fused=True)[0]
 
 
 def _constants(periodic: int, scaled: bool, lists: bool, later: bool, rule: str) -> dict[str, int]:
     found = {"PERIODIC": periodic, "SCALED": scaled, "LIST": lists, "LATER": later, "SUM": rule == "mean"}
     found |= {"RULE": RULES.index(rule)} if rule else {}
-    return found | {"QUERY_CHUNK": QUERIES_AT_ONCE, "LANES_PER_ROW": LANES}
+    return found | {"LANES_PER_ROW": LANES}
 
 
 @functools.lru_cache(512)
@@ -98,7 +98,6 @@ def sum_kernel(
     compensated: bool,
     extremes: bool,
     periodic: int,
-    cuda: bool,
     excluding: int = 0,
     rule: str = "",
 ) -> Kernel:
@@ -106,21 +105,20 @@ def sum_kernel(
 
     `extremes`: it finds the largest summands instead, as `jfrnn.kernels.pair_sum_cpu.query_kernel` does.
     """
-    name = f"box_sums_{'cuda' if cuda else 'cpu'}_{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}"
+    name = f"box_sums_cuda_{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}"
     name += f"{'_compensated' * compensated}{SPACES[periodic]}{'_extremes' * extremes}{'_excluding' * excluding}"
     name += f"{f'_{rule}' * bool(rule)}_{key}"
     constants = {**GRID, **_constants(periodic, scaled, False, False, rule), **constants_of(term, compensated, extremes)}
     constants["EXCLUDING"] = excluding
-    header = "box_sums.cuh" if cuda else "box_sums_cpu.h"
-    text = program(double, dim, header, given=term_header(term, double), **constants)
-    return declare(name, text, Entry("BoxSums.run", _BLOCK if cuda else 1, BLOCKS), cuda=cuda, fused=cuda)[0]
+    text = program(double, dim, "box_sums.cuh", given=term_header(term, double), **constants)
+    return declare(name, text, Entry("BoxSums.run", _BLOCK, BLOCKS), cuda=True, fused=True)[0]
 
 
-def slots(queries: int, cuda: bool) -> int:
+def slots(queries: int) -> int:
     """Return the number of partial sums that make up a sum over all pairs."""
-    return -(-queries // (32 // LANES if cuda else QUERIES_AT_ONCE))
+    return -(-queries // (32 // LANES))
 
 
 def threads(queries: int) -> int:
-    """Return the threads of a launch on CUDA."""
-    return 32 * slots(queries, cuda=True)
+    """Return the threads of a launch."""
+    return 32 * slots(queries)

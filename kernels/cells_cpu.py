@@ -7,7 +7,7 @@ themselves chunks of places from an atomic counter (see `native/walk_cpu.h`).
 
 import functools
 
-from jfrnn.kernels._native import SPACES, program, table_cells
+from jfrnn.kernels._native import BATCHES, SPACES, program, table_cells
 from jfrnn.kernels._program import Kernel, declare
 
 CHUNK = 2048  # places that a thread takes at a time, where it puts them in order
@@ -23,29 +23,37 @@ GRID = {
 }  # finer cells along x alone: fewer candidates, but no more rows of cells that are copied
 
 
-def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -> int:
-    """Return the int32 words of scratch that `build` and `query` need; `width` is 1 for float32 and 2 for float64."""
-    table = table_cells(sources)
+def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, systems: int = 0) -> int:
+    """Return the int32 words of scratch that `build` and `query` need.
+
+    `width` is 1 for float32 and 2 for float64; `systems` is how many there are with boxes of their own.
+    """
+    table = table_cells(sources) + systems
     parts = [_HEADER_WORDS, *[width * sources] * dim, sources, table + 2, max(sources, queries)]
     if not own:
         parts += [queries, table + 2]
     return sum((words + 15) // 16 * 16 for words in parts)
 
 
+def grid_words(systems: int, width: int) -> int:
+    """Return the int32 words in which `build` keeps the grids of systems with boxes of their own (SystemGrid)."""
+    return systems * (6 * width + 8)
+
+
 @functools.lru_cache(128)
-def sort_kernels(dim: int, double: bool, scaled: bool, periodic: int = 0, batched: bool = False) -> tuple[Kernel, Kernel]:
+def sort_kernels(dim: int, double: bool, scaled: bool, periodic: int = 0, batched: int = 0) -> tuple[Kernel, Kernel]:
     """Return what sorts: `build`, and `gather`, which is for `MANY` sources and more, and whose work threads share.
 
     They are a program of their own: sums take no others, and to compile rows takes long.
     """
     text = program(double, dim, "cells_cpu.h", **_options(scaled, periodic, batched))
-    build, gather = declare(f"sort_cpu_{_variant(dim, double, scaled, periodic, batched)}", text, "Sort.build", "Gather.gather")
+    build, gather = declare(f"sort_cpu_{_variant(dim, double, scaled, periodic, batched)}", text, "Sort.build", "Sort.gather")
     return build, gather
 
 
 @functools.lru_cache(512)
 def query_kernel(
-    dim: int, double: bool, scaled: bool, lists: bool, periodic: int = 0, batched: bool = False, excluding: int = 0,
+    dim: int, double: bool, scaled: bool, lists: bool, periodic: int = 0, batched: int = 0, excluding: int = 0,
     flat: bool = False,
 ) -> Kernel:  # fmt: skip
     """Return what lists or counts, whose work threads share.
@@ -59,10 +67,10 @@ def query_kernel(
     return declare(f"cells_cpu_{variant}", program(double, dim, "rows_cpu.h", **options), "Rows.run")[0]
 
 
-def _variant(dim: int, double: bool, scaled: bool, periodic: int, batched: bool) -> str:
-    return f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{SPACES[periodic]}{'_batched' * batched}"
+def _variant(dim: int, double: bool, scaled: bool, periodic: int, batched: int) -> str:
+    return f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{SPACES[periodic]}{BATCHES[batched]}"
 
 
-def _options(scaled: bool, periodic: int, batched: bool) -> dict[str, int]:
+def _options(scaled: bool, periodic: int, batched: int) -> dict[str, int]:
     options = {"SCALED": scaled, **GRID, "PERIODIC": periodic, "BATCHED": batched, "SUMS": 0, "LIST": 0}
     return options | {"CHUNK": CHUNK, "QUERY_CHUNK": QUERY_CHUNK, "MANY": MANY}

@@ -14,7 +14,7 @@ import re
 from typing import NamedTuple
 
 from jfrnn.kernels import tree_cpu
-from jfrnn.kernels._native import SPACES, program
+from jfrnn.kernels._native import BATCHES, SPACES, program
 from jfrnn.kernels._program import Kernel, declare
 from jfrnn.kernels.cells_cpu import CHUNK, GRID, QUERY_CHUNK, TOGETHER
 
@@ -223,7 +223,7 @@ def _candidates(term: TermText, dim: int, double: bool) -> int:
 
 @functools.lru_cache(512)
 def query_kernel(
-    term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: bool = False,
+    term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: int = 0,
     extremes: bool = False, packed: bool | None = None, excluding: int = 0, rule: str = "",
 ) -> Kernel:  # fmt: skip
     """Return the kernel that sums a term; `key` tells it from all others in the names of programs.
@@ -236,7 +236,7 @@ def query_kernel(
     packed = work(term.text) > LITTLE_WORK if packed is None else packed
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
     variant += (
-        f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}{'_excluding' * excluding}{'_' * bool(rule)}{rule}_{key}"
+        f"{SPACES[periodic]}{BATCHES[batched]}{'_extremes' * extremes}{'_excluding' * excluding}{'_' * bool(rule)}{rule}_{key}"
     )
     constants = {"SCALED": scaled, "LIST": 0, **GRID, **constants_of(term, compensated, extremes)}
     constants |= {

@@ -12,7 +12,7 @@ import functools
 import itertools
 
 from jfrnn.kernels import cells_cpu
-from jfrnn.kernels._native import RULES, SPACES, program, table_cells
+from jfrnn.kernels._native import BATCHES, RULES, SPACES, program, table_cells
 from jfrnn.kernels._program import Kernel, declare
 
 LEAF = 16  # sources of a leaf
@@ -24,8 +24,8 @@ MOST_DOUBLED, MOST_HALVED = 6, 9  # times
 _MOST_LANES = 16
 
 
-def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -> int:
-    """Return the int32 words of scratch that `build` and queries need; `width` is 1 for float32 and 2 for float64."""
+def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, systems: int = 0) -> int:
+    """Return the int32 words of scratch that `build` and queries need, as `jfrnn.kernels.cells_cpu.scratch_words` does."""
     del own  # queries have an order of their own, by their cutoffs
     nodes, count = 0, -(-sources // LEAF)
     for _ in itertools.repeat(None, 12):
@@ -34,7 +34,7 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -
             break
         count = -(-count // FANOUT)
     most = max(sources, queries)
-    table = table_cells(sources) + 2
+    table = table_cells(sources) + systems + 2
     parts = [64, *[width * sources] * dim, sources, table, most, queries, table]  # those of cells
     parts += [width * (sources + _MOST_LANES), sources + _MOST_LANES, sources, width * queries]
     parts += [*[width * (nodes + _MOST_LANES)] * (2 * dim + 1), most, most]
@@ -51,29 +51,29 @@ def constants_of(rule: str) -> dict[str, int]:
     return constants | {"MOST_DOUBLED": MOST_DOUBLED, "MOST_HALVED": MOST_HALVED}
 
 
-def _constants(rule: str, periodic: int, batched: bool) -> dict[str, int]:
+def _constants(rule: str, periodic: int, batched: int) -> dict[str, int]:
     found = {**cells_cpu.GRID, "PERIODIC": periodic, "BATCHED": batched, "SUMS": 0, "LIST": 0, **constants_of(rule)}
     found |= {"CHUNK": cells_cpu.CHUNK, "QUERY_CHUNK": cells_cpu.QUERY_CHUNK}
     return found | {"MANY": cells_cpu.MANY, "TOGETHER": cells_cpu.TOGETHER}
 
 
-def _variant(dim: int, double: bool, rule: str, periodic: int, batched: bool) -> str:
-    return f"{dim}d_{'f64' if double else 'f32'}_{rule}{SPACES[periodic]}{'_batched' * batched}"
+def _variant(dim: int, double: bool, rule: str, periodic: int, batched: int) -> str:
+    return f"{dim}d_{'f64' if double else 'f32'}_{rule}{SPACES[periodic]}{BATCHES[batched]}"
 
 
 @functools.lru_cache(128)
-def sort_kernels(dim: int, double: bool, rule: str, periodic: int = 0, batched: bool = False) -> tuple[Kernel, Kernel]:
+def sort_kernels(dim: int, double: bool, rule: str, periodic: int = 0, batched: int = 0) -> tuple[Kernel, Kernel]:
     """Return `build` and `gather`, for a rule of `RULES`, as `jfrnn.kernels.cells_cpu.sort_kernels` does."""
     text = program(double, dim, "cutoffs_cpu.h", **_constants(rule, periodic, batched))
     build, gather = declare(
-        f"sort_tree_cpu_{_variant(dim, double, rule, periodic, batched)}", text, "CutoffSort.build", "TreeGather.gather"
+        f"sort_tree_cpu_{_variant(dim, double, rule, periodic, batched)}", text, "CutoffSort.build", "TreePlaces.gather"
     )
     return build, gather
 
 
 @functools.lru_cache(512)
 def query_kernel(
-    dim: int, double: bool, rule: str, lists: bool, periodic: int = 0, batched: bool = False, excluding: int = 0, flat: bool = False
+    dim: int, double: bool, rule: str, lists: bool, periodic: int = 0, batched: int = 0, excluding: int = 0, flat: bool = False
 ) -> Kernel:
     """Return what lists or counts, whose work threads share; options are those of `jfrnn.kernels._native.program`."""
     constants = {**_constants(rule, periodic, batched), "LIST": lists, "FLAT": flat, "EXCLUDING": excluding}

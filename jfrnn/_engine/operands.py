@@ -48,12 +48,12 @@ def as_integer(x: Array) -> Array:
 def lattice_numbers(lattice: Lattice, reach: Array, slack: Array, flags: Array | None = None) -> Array:
     """Return the numbers of a lattice that kernels read, in the order that `jfrnn.kernels._native` specifies.
 
-    There are no images along axes that are not periodic by `flags`.
+    Along axes that are not periodic by `flags`, images have numbers below 0.
     """
     more = 3 - lattice.dim
     square, line = ((0, more), (0, more)), (0, more)
     images = jnp.asarray(lattice.images.reach).astype(lattice.matrix.dtype)
-    images = images if flags is None else jnp.where(flags, images, 0)
+    images = images if flags is None else jnp.where(flags, images, -images)
     parts = [jnp.pad(lattice.matrix, square), jnp.pad(lattice.transform, square), jnp.pad(lattice.origin, line)]
     parts += [jnp.pad(reach, line, constant_values=1), jnp.pad(images, line), slack]
     if not lattice.images.orthogonal:

@@ -3,11 +3,12 @@
 #include "box_pairs.cuh"
 #include "row_places.h"
 
-struct BoxRows : BoxLanes<BoxRows> {
+struct BoxRowArguments : BoxArguments, RowsOut {};
+struct BoxRows : BoxLanes<BoxRows>, RowsOut {
     int found;  // of the query if they are listed, by this lane if they are counted
     int room;   // of its row
 
-    JFRNN_MEMBER explicit BoxRows(const BoxArguments& given) : BoxLanes(given), found(0), room(0) {}
+    JFRNN_MEMBER explicit BoxRows(const BoxRowArguments& given) : BoxLanes(given), RowsOut(given), found(0), room(0) {}
 
     JFRNN_MEMBER void go_to(int turn) {
         BoxPairs::go_to(turn);

@@ -5,7 +5,7 @@
 #include "scan.cuh"
 
 // `turning` has a bit per periodic axis of each system, `systems` has those of the sources, `boxed` is how many there are. What is
-// written is that of box_pairs.h; `size` is how many cells there may be.
+// written is that of box_pairs.cuh; `size` is how many cells there may be.
 struct BoxSortArguments {
     const real *positions, *boxes;
     const int *systems, *turning;

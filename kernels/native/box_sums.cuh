@@ -1,9 +1,14 @@
 // Sums over pairs in systems with boxes of their own on CUDA: a lane evaluates the term for the pairs that it finds.
 #pragma once
 #include "box_pairs.cuh"
-#include "box_sums.h"
 #include "reduction.cuh"
 
+// `columns` has what a term reads of the sources, sorted as they are, `stride` numbers of each: OTHERS numbers, then for each of STEPS
+// how many lattice vectors lie between the box and the source, along that axis.
+struct BoxSumArguments : BoxArguments {
+    const real *shared_values, *own_values, *columns;
+    real *sums, *totals, *errors, *more;
+};
 struct BoxSums : BoxLanes<BoxSums> {
     const real *own_values, *columns;
     const Term term;
@@ -12,7 +17,7 @@ struct BoxSums : BoxLanes<BoxSums> {
     Term::Own own_part;
 
     JFRNN_MEMBER explicit BoxSums(const BoxSumArguments& a)
-        : BoxLanes(a.of_search()),
+        : BoxLanes(a),
           own_values(a.own_values),
           columns(a.columns),
           term(a.shared_values),

@@ -11,7 +11,7 @@ struct CellWalk : Walk<Query> {
     using Base::query, Base::query_ids, Base::reach_along, Base::ring, Base::row_start, Base::several, Base::shared;
     using Base::shift, Base::side, Base::system, Base::system_at;
     static constexpr int ROWS = 64;  // of cells around a cell
-    const Grid grid;
+    Grid grid;
     int own_from, own_to, own_at;  // places of queries that are candidates, too, and the number of the first of them
 
     explicit CellWalk(const SearchArguments& given) : Base(given), grid(shared.grid), own_from(0), own_to(0), own_at(0) {
@@ -21,7 +21,12 @@ struct CellWalk : Walk<Query> {
         if (own)
             query_ids = this->ids;
     }
-    bool strangers() const { return !grid.dense; }
+    bool strangers() const { return !BOXES && !grid.dense; }
+    void go_to(unsigned int system) {
+        Base::go_to(system);
+        if constexpr (BOXES)
+            grid = this->grid_of[system].grid;
+    }
     int number_of(int place) const {
         return (DIFFER || drop_self) && place >= own_from && place < own_to ? own_at + place - own_from : -1;
     }
@@ -42,7 +47,7 @@ struct CellWalk : Walk<Query> {
     // Copies all rows of cells from `first` to `last`, of one image. Rows of a hashed table may share entries: these are copied once.
     void copy_rows(const Box& box, const whole* first, const whole* last) {
         const Grid grid = this->grid;  // stays in registers, whatever is stored; and so do those below
-        const int* const start = this->start;
+        const int* const start = this->start + this->first_cell();
         const unsigned int system = this->system;
         const int length = (int)(last[0] - first[0] + 1);
         int seen[ROWS], rows = 0;
@@ -106,6 +111,8 @@ struct CellWalk : Walk<Query> {
     void serve(int from, int to, const real* low, const real* high) {
         begin = from;
         end = to;
+        system = system_at(begin);
+        go_to(system);
         this->find_group_cutoff();
         whole first[3] = {0, 0, 0}, last[3] = {0, 0, 0};
         for (int k = 0; k < DIM; ++k) {
@@ -135,7 +142,6 @@ struct CellWalk : Walk<Query> {
             position_of(place, q);
             widen(box.low, box.high, q, q);
         }
-        system = system_at(begin);
         filled = own_from = own_to = side = 0;
         fresh = true;
         if constexpr (PERIODIC)
@@ -146,8 +152,9 @@ struct CellWalk : Walk<Query> {
     }
 
     // Where the query at a place is along the axes, and its cell.
-    void locate(int place, real* at, whole* cell) const {
+    void locate(int place, real* at, whole* cell) {
         real q[3];
+        go_to(system_at(place));
         position_of(place, q);
         for (int k = 0; k < DIM; ++k) {
             at[k] = coordinate(k, q);

@@ -36,7 +36,10 @@ struct Cells : Space {
     int periodic_axes;     // a bit each
     bool one_cell;         // sources are so few that they share one: all of them are candidates
 
-    JFRNN_MEMBER Cells(const real* cutoff, bool one_cell) : Space(cutoff), periodic_axes(0), one_cell(one_cell) {
+    JFRNN_MEMBER Cells(const real* cutoff, bool one_cell) : Space(cutoff), one_cell(one_cell) { measure_cells(); }
+    // Finds out how wide cells are in the lattice that there is.
+    JFRNN_MEMBER void measure_cells() {
+        periodic_axes = 0;
         for (int axis = 0; axis < 3; ++axis)
             inverse_edge[axis] = axis < DIM ? cells_per_length(axis) : real(1);
         for (int axis = 0; PERIODIC && axis < DIM; ++axis)
@@ -152,7 +155,7 @@ struct Cells : Space {
     }
     // The entry of the table at which a row of cells starts; of a hashed row, the entry of its cell 0.
     JFRNN_FUNCTION int row_start(const Grid& grid, whole y, whole z, unsigned int system) {
-        if constexpr (BATCHED)
+        if constexpr (BATCHED && !BOXES)
             z += grid.dense ? (whole)system * (DIM == 3 ? grid.extent[2] : 1) : 0;
         return grid.dense ? (int)((z * grid.extent[1] + y) * grid.extent[0]) : row_hash(y, z, system, grid.cells);
     }
@@ -173,7 +176,7 @@ struct Cells : Space {
     }
     // Finds how many cells the box [low, high] of coordinates has, and whether a table of so many entries holds them.
     JFRNN_MEMBER void lay_out(Grid& grid, const real* low, const real* high, int table) const {
-        double cells = BATCHED ? double(last_system) + 1 : 1;
+        double cells = BATCHED && !BOXES ? double(last_system) + 1 : 1;
         for (int k = 0; k < DIM; ++k) {
             grid.low[k] = is_periodic(k) ? real(0) : cell_of(k, low[k]);
             const double extent = is_periodic(k) ? double(inverse_edge[k]) : double(cell_of(k, high[k])) - double(grid.low[k]) + 1;

@@ -40,11 +40,42 @@ struct Scratch {
     }
 };
 
-struct Places : Cells, Scratch {
-    Places(const real* cutoff, int* scratch, int n, int m, int own, int table)
-        : Cells(cutoff, n <= FEW), Scratch(scratch, n, m, own, table) {}
+// A system with a box of its own (BOXES): its grid, the highest coordinates of its sources, how many these are, and its first cell
+// among those of all systems.
+struct SystemGrid {
+    Grid grid;
+    real high[3];
+    int sources, first_cell;
+};
+// The cells of one system at a time, where each has a box of its own. `cutoff` then holds numbers of each of them.
+struct SystemCells : Cells {
+    const real* const of_systems;
+    SystemGrid* const grid_of;
+    unsigned int here;  // the system whose cells these are
+
+    SystemCells(const real* cutoff, int* grids, bool one_cell)
+        : Cells(cutoff, one_cell && !BOXES), of_systems(cutoff), grid_of((SystemGrid*)grids), here(~0u) {}
+    // Goes to the cells of a system. Returns whether it is another one.
+    bool enter(unsigned int system) {
+        if (!BOXES || system == here)
+            return false;
+        here = system;
+        lattice = Lattice(of_systems + (LATTICE_END + 1ll) * system);
+        measure_cells();
+        for (int k = 0; k < DIM; ++k)  // where the cutoff is almost nothing, one cell is as good as many
+            inverse_edge[k] = Bits::finite(inverse_edge[k]) ? inverse_edge[k] : real(0);
+        return true;
+    }
+    int first_cell() const { return BOXES ? grid_of[here].first_cell : 0; }
+};
+
+struct Places : SystemCells, Scratch {
+    template <class Arguments>
+    explicit Places(const Arguments& a)
+        : SystemCells(a.cutoff, a.grids, a.n <= FEW), Scratch(a.scratch, a.n, a.m, a.own, a.table) {}
     void put_coordinates(const real* points, int i, int place) {
         real p[3];
+        enter(system_of(points + (long long)ROW * i));
         point_of(points + (long long)ROW * i, p);
         for (int k = 0; k < DIM; ++k)
             axis[k][place] = p[k];
@@ -53,23 +84,25 @@ struct Places : Cells, Scratch {
 
 struct SortArguments {
     const real *positions, *queries, *cutoff;
-    int *info, *scratch;
+    int *info, *scratch, *grids;
     int n, m, own, table;
 };
 
-// Sorts by counting: one thread, which reads every particle three times.
+// Sorts by counting: `build` is of one thread, which reads every particle three times.
 struct Sort : SortArguments, Places {
-    explicit Sort(const SortArguments& given)
-        : SortArguments(given), Places(given.cutoff, given.scratch, given.n, given.m, given.own, given.table) {}
+    explicit Sort(const SortArguments& given) : SortArguments(given), Places(given) {}
 
     void build() {
-        real low[3], high[3];
-        const int finite = find_bounds(low, high);
-        if (finite == 0)
-            for (int k = 0; k < DIM; ++k)
-                low[k] = high[k] = 0;
         Grid grid;
-        lay_out(grid, low, high, table);
+        if constexpr (BOXES)
+            lay_out_boxes(grid);
+        else {
+            real low[3], high[3];
+            if (find_bounds(low, high) == 0)
+                for (int k = 0; k < DIM; ++k)
+                    low[k] = high[k] = 0;
+            lay_out(grid, low, high, table);
+        }
         shared.next_chunk = 0;
         shared.next_gathered = shared.next_sorted = 0;
         info[0] = shared.turned = 0;
@@ -77,7 +110,7 @@ struct Sort : SortArguments, Places {
         look_at_bits(positions, n, lowest, highest);
         if (!own)
             look_at_bits(queries, m, lowest, highest);
-        shared.unit = lattice_unit(lowest, highest);
+        shared.unit = BOXES ? real(0) : lattice_unit(lowest, highest);
         grid.finite = sort(grid, positions, n, start, ids, true);
         shared.grid = grid;
         shared.finite_queries = own ? grid.finite : sort(grid, queries, m, query_start, query_ids, false);
@@ -104,6 +137,44 @@ struct Sort : SortArguments, Places {
             widen(low, high, at, at);
         }
         return finite;
+    }
+
+    // Lays out the cells of each system, whose box is its own: those of one follow those of the one before it.
+    void lay_out_boxes(Grid& grid) {
+        for (unsigned int s = 0; s <= last_system; ++s) {
+            grid_of[s].sources = 0;
+            for (int k = 0; k < DIM; ++k) {
+                grid_of[s].grid.low[k] = __builtin_inff();
+                grid_of[s].high[k] = -__builtin_inff();
+            }
+        }
+        for (int i = 0; i < n; ++i) {
+            const real* const row = positions + (long long)ROW * i;
+            SystemGrid& of = grid_of[system_of(row)];
+            real p[3], at[3];
+            enter(system_of(row));
+            point_of(row, p);
+            if (!finite_point(p))
+                continue;
+            ++of.sources;
+            for (int k = 0; k < DIM; ++k)
+                at[k] = coordinate(k, p);
+            widen(of.grid.low, of.high, at, at);
+        }
+        grid.cells = 0;
+        grid.dense = 1;
+        for (unsigned int s = 0; s <= last_system; ++s) {
+            SystemGrid& of = grid_of[s];
+            real low[3];
+            enter(s);
+            for (int k = 0; k < DIM; ++k) {
+                low[k] = of.sources ? of.grid.low[k] : real(0);
+                of.high[k] = of.sources ? of.high[k] : real(0);
+            }
+            lay_out(of.grid, low, of.high, 1 + 4 * of.sources);
+            of.first_cell = grid.cells;
+            grid.cells += of.grid.cells;
+        }
     }
 
     // Finds the lowest bit and the largest exponent of all coordinates, as they were given; whatever lies on no lattice shows soon.
@@ -135,10 +206,12 @@ struct Sort : SortArguments, Places {
             first[c] = 0;
         for (int i = 0; i < count; ++i) {
             real p[3];
+            enter(system_of(points + (long long)ROW * i));
             point_of(points + (long long)ROW * i, p);
             if constexpr (PERIODIC)
                 turned |= Lattice::packed_turns(points[(long long)ROW * i + DIM]) != Lattice::NONE;
-            const int cell = finite_point(p) ? cell_key(grid, p, system_of(points + (long long)ROW * i)) : -1;
+            const Grid& there = BOXES ? grid_of[here].grid : grid;
+            const int cell = finite_point(p) ? first_cell() + cell_key(there, p, system_of(points + (long long)ROW * i)) : -1;
             key[i] = cell;
             if (cell >= 0)
                 ++first[cell + 2];
@@ -160,20 +233,8 @@ struct Sort : SortArguments, Places {
         }
         return finite;
     }
-};
-
-struct GatherArguments {
-    const real *positions, *cutoff;
-    int* scratch;
-    int n, m, own, table;
-};
-
-// Puts coordinates of sources into the order of cells. It is launched once per thread: threads hand themselves chunks of places.
-// Reading from anywhere is what takes time, so rows are fetched ahead.
-struct Gather : GatherArguments, Places {
-    explicit Gather(const GatherArguments& given)
-        : GatherArguments(given), Places(given.cutoff, given.scratch, given.n, given.m, given.own, given.table) {}
-
+    // Puts coordinates of many sources into the order of cells. It is launched once per thread: threads hand themselves chunks of
+    // places. Reading from anywhere is what takes time, so rows are fetched ahead.
     void gather() {
         each_chunk(shared.next_gathered, n, CHUNK, [&](int from, int to, int) {
             for (int place = from; place < to; ++place) {

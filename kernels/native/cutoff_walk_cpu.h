@@ -9,7 +9,9 @@ __attribute__((noinline)) void walk_along(const Arguments& given) {
 }
 template <template <template <class> class> class Queries, class Arguments>
 void walk(const Arguments& given) {
-    if (((const Shared*)given.scratch)->cells_for > 0)
+    if constexpr (BOXES)
+        walk_along<Queries, CellWalk>(given);
+    else if (((const Shared*)given.scratch)->cells_for > 0)
         walk_along<Queries, CellWalk>(given);
     else
         walk_along<Queries, TreeWalk>(given);

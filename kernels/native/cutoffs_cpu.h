@@ -14,18 +14,19 @@ constexpr int MOST_MET = 16;   // candidates for each pair, as an average, in ce
 struct CutoffSort : TreeSortArguments {
     Sort cells;
 
-    explicit CutoffSort(const TreeSortArguments& given)
-        : TreeSortArguments(given),
-          cells(
-              {given.positions, given.queries, given.cutoff, given.info, given.scratch, given.n, given.m, given.own, given.table}) {
-    }
+    explicit CutoffSort(const TreeSortArguments& given) : TreeSortArguments(given), cells(given) {}
 
     void build() {
         Shared& shared = cells.shared;
         shared.next_chunk = shared.next_gathered = shared.next_sorted = shared.gathered = shared.turned = 0;
         shared.unit = shared.cells_for = 0;
         info[0] = 0;
-        if (!sort_by_cells())
+        if constexpr (BOXES) {  // by cells that are wide enough for the largest cutoff of each system
+            cells.build();
+            shared.cells_for = 1;
+            if (n < MANY)
+                TreePlaces(*this).put_in_order(0, n);
+        } else if (!sort_by_cells())
             tree();
     }
     __attribute__((noinline)) void tree() { TreeSort(*this).build(); }

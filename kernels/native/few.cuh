@@ -15,18 +15,22 @@ constexpr int FEW_THREADS = 32 * FEW_WARPS;               // of a block
 constexpr int WORDS = FEW_MOST / (32 * SHARES);           // of 32 sources: most of them that a share has
 constexpr int AT_ONCE = 4;                                // sources that a lane holds
 
-struct FewPairs : Space {
+struct FewArguments {
+    const real *positions, *queries, *cutoff;
+    const int *excluded_starts, *excluded;
+    int n, m, closed, drop_self;
+};
+
+struct FewPairs : FewArguments, Space {
     struct alignas(DOUBLE ? 8 : 16) Point {
         real at[DOUBLE ? DIM : 4];
     };
     typedef unsigned int Bits32[FEW_THREADS];
-    const real *positions, *queries;
-    const int *excluded_starts, *excluded;
-    const int n, m, closed, lane, warp;
+    const int lane, warp;
     const int slot, query;  // of the query, in its block and in all
     const int words;        // of a share
     const int share;        // of this lane
-    const bool is_query, drop_self, later_only;
+    const bool is_query, later_only;
     real q[3];
     real sure_square, far_square;  // of distances, squared: what is closer surely is a neighbor, what is farther surely none
     real length[3];                // of the box along each axis, 0 where it is not periodic
@@ -34,16 +38,9 @@ struct FewPairs : Space {
     bool is_finite;
     unsigned int system;
 
-    template <class Arguments>
-    JFRNN_MEMBER FewPairs(const Arguments& a, bool later_only)
-        : Space(a.cutoff),
-          positions(a.positions),
-          queries(a.queries),
-          excluded_starts(a.excluded_starts),
-          excluded(a.excluded),
-          n(a.n),
-          m(a.m),
-          closed(a.closed),
+    JFRNN_MEMBER FewPairs(const FewArguments& a, bool later_only)
+        : FewArguments(a),
+          Space(a.cutoff),
           lane(threadIdx.x & 31),
           warp(threadIdx.x >> 5),
           slot(lane / OF_WARP),
@@ -51,7 +48,6 @@ struct FewPairs : Space {
           words((n - 1) / (32 * SHARES) + 1),
           share(warp * OF_WARP + lane % OF_WARP),
           is_query(query < m),
-          drop_self(a.drop_self),
           later_only(later_only),
           tight(false) {
         const real* row = query_row();

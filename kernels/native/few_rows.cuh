@@ -4,12 +4,7 @@
 #include "few.cuh"
 #include "row_places.h"
 
-struct FewRowsArguments {
-    const real *positions, *queries, *cutoff;
-    const int *excluded_starts, *excluded, *starts;
-    int *idx, *receivers, *count, *info;
-    int n, m, capacity, closed, drop_self, later_only;
-};
+struct FewRowsArguments : FewArguments, RowsOut {};
 
 struct FewRows : FewRowsArguments {
     JFRNN_MEMBER explicit FewRows(const FewRowsArguments& given) : FewRowsArguments(given) {}

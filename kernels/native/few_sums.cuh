@@ -3,11 +3,9 @@
 #include "few.cuh"
 #include "reduction.cuh"
 
-struct FewSumsArguments {
-    const real *positions, *queries, *cutoff, *shared_values, *own_values, *others;
-    const int *excluded_starts, *excluded;
+struct FewSumsArguments : FewArguments {
+    const real *shared_values, *own_values, *others;
     real *sums, *totals, *errors, *more;
-    int n, m, closed, drop_self;
 };
 
 struct FewSums : FewSumsArguments {

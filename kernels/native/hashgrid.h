@@ -7,13 +7,11 @@
 #include "warp_types.h"
 #include "warp_hashgrid.h"
 
-struct HashGridArguments {
+struct HashGridArguments : RowsOut {
     const real *positions, *queries, *cutoff;
-    const int* starts;
-    int *idx, *receivers, *count, *info;
     real* scratch;    // the points of which the grid is built, three numbers each
     const int* grid;  // what Warp calls its id
-    int n, m, capacity, own, closed, drop_self, later_only;
+    int n, m, own, closed, drop_self;
     int cells_x, cells_y;  // of the grid, along two axes
 };
 

@@ -20,6 +20,22 @@ struct KeptArguments {
     const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
     int m, n, capacity, images, closed;
 };
+// Threads of the CPU hand themselves chunks of rows from `info`; CUDA reads nothing there.
+struct MaskArguments : KeptArguments {
+    int* mask;
+    real* distances;
+    int* info;
+};
+struct KeptSlopesArguments : KeptArguments {
+    const real *distances, *slopes;
+    real* sums;
+    int* info;
+};
+struct KeptSumsArguments : KeptArguments {
+    const real *shared_values, *own_values;
+    real *sums, *totals, *errors;
+    int* info;
+};
 
 template <bool WIDE>
 struct NumberOfSlots {

@@ -2,24 +2,11 @@
 #pragma once
 #include "kept.cuh"
 
-struct MaskArguments {
-    const real *rows, *points, *cutoff, *steps;
-    const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
-    int* mask;
-    real* distances;
-    int m, n, capacity, images, closed;
-
-    JFRNN_MEMBER KeptArguments of_list() const {
-        return {
-            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed};
-    }
-};
 struct KeptMask : KeptLane {
     unsigned char* const mask;
     real* const distances;
 
-    JFRNN_MEMBER explicit KeptMask(const MaskArguments& a)
-        : KeptLane(a.of_list()), mask((unsigned char*)a.mask), distances(a.distances) {}
+    JFRNN_MEMBER explicit KeptMask(const MaskArguments& a) : KeptLane(a), mask((unsigned char*)a.mask), distances(a.distances) {}
 
     JFRNN_MEMBER void run() const {
         if (!is_row)

@@ -2,25 +2,11 @@
 #pragma once
 #include "kept_cpu.h"
 
-struct MaskArguments {
-    const real *rows, *points, *cutoff, *steps;
-    const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
-    int* mask;
-    real* distances;
-    int* info;
-    int m, n, capacity, images, closed;
-
-    KeptArguments of_list() const {
-        return {
-            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed};
-    }
-};
 struct KeptMask : KeptRows<KeptMask> {
     unsigned char* const mask;
     real* const distances;
 
-    explicit KeptMask(const MaskArguments& a)
-        : KeptRows(a.of_list(), a.info), mask((unsigned char*)a.mask), distances(a.distances) {}
+    explicit KeptMask(const MaskArguments& a) : KeptRows(a, a.info), mask((unsigned char*)a.mask), distances(a.distances) {}
 
     void serve(int row, const OwnPoint& own) {
         unsigned char* const out = mask + (long long)row * capacity;

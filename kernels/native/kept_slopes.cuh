@@ -2,24 +2,12 @@
 #pragma once
 #include "kept.cuh"
 
-struct KeptSlopesArguments {
-    const real *rows, *points, *cutoff, *steps;
-    const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
-    const real *distances, *slopes;
-    real* sums;
-    int m, n, capacity, images, closed;
-
-    JFRNN_MEMBER KeptArguments of_list() const {
-        return {
-            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed};
-    }
-};
 struct KeptSlopes : KeptLane {
     const real *distances, *slopes;
     real* const sums;
 
     JFRNN_MEMBER explicit KeptSlopes(const KeptSlopesArguments& a)
-        : KeptLane(a.of_list()), distances(a.distances), slopes(a.slopes), sums(a.sums) {}
+        : KeptLane(a), distances(a.distances), slopes(a.slopes), sums(a.sums) {}
 
     JFRNN_MEMBER void run() const {
         real sum[DIM] = {};

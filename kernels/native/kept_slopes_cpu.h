@@ -2,25 +2,12 @@
 #pragma once
 #include "kept_cpu.h"
 
-struct KeptSlopesArguments {
-    const real *rows, *points, *cutoff, *steps;
-    const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
-    const real *distances, *slopes;
-    real* sums;
-    int* info;
-    int m, n, capacity, images, closed;
-
-    KeptArguments of_list() const {
-        return {
-            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed};
-    }
-};
 struct KeptSlopes : KeptRows<KeptSlopes> {
     const real *distances, *slopes;
     real* const sums;
 
     explicit KeptSlopes(const KeptSlopesArguments& a)
-        : KeptRows(a.of_list(), a.info), distances(a.distances), slopes(a.slopes), sums(a.sums) {}
+        : KeptRows(a, a.info), distances(a.distances), slopes(a.slopes), sums(a.sums) {}
 
     void serve(int row, const OwnPoint& own) {
         const long long first = (long long)row * capacity;

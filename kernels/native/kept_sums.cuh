@@ -3,27 +3,12 @@
 #include "kept.cuh"
 #include "reduction.cuh"
 
-struct KeptSumsArguments {
-    const real *rows, *points, *cutoff, *steps;
-    const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
-    const real *shared_values, *own_values;
-    real *sums, *totals, *errors;
-    int m, n, capacity, images, closed;
-
-    JFRNN_MEMBER KeptArguments of_list() const {
-        return {
-            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed};
-    }
-};
 struct KeptSums : KeptLane {
     const real *shared_values, *own_values;
     const Results results;
 
     JFRNN_MEMBER explicit KeptSums(const KeptSumsArguments& a)
-        : KeptLane(a.of_list()),
-          shared_values(a.shared_values),
-          own_values(a.own_values),
-          results{a.sums, a.errors, a.n, a.totals} {}
+        : KeptLane(a), shared_values(a.shared_values), own_values(a.own_values), results{a.sums, a.errors, a.n, a.totals} {}
 
     // Of extremes, the place in the row stands for the code of an image.
     JFRNN_MEMBER void run() const {

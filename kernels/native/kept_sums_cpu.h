@@ -3,29 +3,13 @@
 #include "kept_cpu.h"
 #include "reduction_cpu.h"
 
-struct KeptSumsArguments {
-    const real *rows, *points, *cutoff, *steps;
-    const int *idx, *count, *codes, *slots, *starts, *lengths, *order, *systems;
-    const real *shared_values, *own_values;
-    real *sums, *totals, *errors;
-    int* info;
-    int m, n, capacity, images, closed;
-
-    KeptArguments of_list() const {
-        return {
-            rows, points, cutoff, steps, idx, count, codes, slots, starts, lengths, order, systems, m, n, capacity, images, closed};
-    }
-};
 struct KeptSums : KeptRows<KeptSums> {
     const real* const own_values;
     const Term term;
     Results results;
 
     explicit KeptSums(const KeptSumsArguments& a)
-        : KeptRows(a.of_list(), a.info),
-          own_values(a.own_values),
-          term(a.shared_values),
-          results(a.sums, a.totals, a.errors, a.n) {}
+        : KeptRows(a, a.info), own_values(a.own_values), term(a.shared_values), results(a.sums, a.totals, a.errors, a.n) {}
 
     // Of extremes, the place in the row stands for the code of an image.
     void serve(int row, const OwnPoint& own) {

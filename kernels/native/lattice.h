@@ -28,9 +28,13 @@ struct Lattice {
     JFRNN_MEMBER real transform(int k, int axis) const { return numbers[10 + 3 * k + axis]; }
     JFRNN_MEMBER real origin(int k) const { return numbers[19 + k]; }
     JFRNN_MEMBER real reach(int axis) const { return numbers[22 + axis]; }
-    JFRNN_MEMBER int images(int axis) const { return (int)numbers[25 + axis]; }
+    // Where systems have boxes of their own, images are numbered alike in all of them: an axis that is open in one has -images there.
+    JFRNN_MEMBER int images(int axis) const {
+        const int told = (int)numbers[25 + axis];
+        return BOXES && told < 0 ? -told : told;
+    }
     JFRNN_MEMBER real slack() const { return numbers[PERIODIC ? 28 : 0]; }
-    JFRNN_MEMBER bool periodic(int axis) const { return images(axis) > 0; }
+    JFRNN_MEMBER bool periodic(int axis) const { return numbers[25 + axis] > 0; }
     // uncontracted, so that a coordinate is the same wherever it is computed
 #if defined(__CUDA_ARCH__)
     JFRNN_FUNCTION real add(real a, real b) {

@@ -3,14 +3,9 @@
 #include "query_walk_cpu.h"
 #include "reduction_cpu.h"
 
-struct SumArguments {
-    const real *positions, *queries, *cutoff, *shared_values, *own_values, *columns;
-    const int *excluded_starts, *excluded;
-    const real *query_radii, *table_of_kinds;
-    const int* kinds_of_queries;
+struct SumArguments : SearchArguments {
+    const real *shared_values, *own_values, *columns;
     real *sums, *totals, *errors, *more;
-    int* scratch;
-    int n, m, own, table, closed, drop_self, kinds;
 };
 
 // What the term reads of the sources stands in `columns`, in the order of cells; columns of the candidates lie beside their
@@ -32,8 +27,7 @@ struct SumsBy : Way<SumsBy<Way>> {
     Results results;
 
     explicit SumsBy(const SumArguments& a)
-        : Base({a.positions, a.queries, a.cutoff, a.excluded_starts, a.excluded, a.query_radii, a.table_of_kinds,
-              a.kinds_of_queries, a.scratch, a.n, a.m, a.own, a.table, a.closed, a.drop_self, a.kinds}),
+        : Base(a),
           own_values(a.own_values),
           columns(a.columns),
           term(a.shared_values),

@@ -6,6 +6,13 @@
 #include "constants.h"
 #include "device.h"
 
+struct RowsOut {
+    const int* starts;
+    int *idx, *receivers, *count;  // the last one is of each row
+    int* info;                     // of all rows: the length of the longest one, and bits of the status
+    int capacity, later_only;
+};
+
 JFRNN_FUNCTION long long row_begin(const int* starts, int row, int capacity) {
     return FLAT ? (long long)starts[row] : (long long)row * capacity;
 }

@@ -5,39 +5,18 @@
 
 typedef int eight_ints __attribute__((vector_size(32)));
 
-struct RowArguments {
-    const real *positions, *queries, *cutoff;
-    const int *excluded_starts, *excluded, *starts;
-    const real *query_radii, *table_of_kinds;
-    const int* kinds_of_queries;
-    int *idx, *receivers, *count, *info, *scratch;
-    int n, m, own, table, capacity, closed, drop_self, later_only, kinds;
-};
+struct RowArguments : SearchArguments, RowsOut {};
 
 template <template <class> class Way>
-struct RowsBy : Way<RowsBy<Way>> {
+struct RowsBy : Way<RowsBy<Way>>, RowsOut {
     typedef Way<RowsBy<Way>> Base;
     using Base::filled, Base::m, Base::n, Base::lattice, Base::row;
     static constexpr bool FLUSHED = false;
-    const int* starts;
-    int *idx, *receivers, *counts, *info;
-    int capacity, later_only;
     int longest;
     int fill_value;
     bool past_caches;  // rows are so many that they will not be read from the caches
 
-    explicit RowsBy(const RowArguments& a)
-        : Base({a.positions, a.queries, a.cutoff, a.excluded_starts, a.excluded, a.query_radii, a.table_of_kinds,
-              a.kinds_of_queries, a.scratch, a.n, a.m, a.own, a.table, a.closed, a.drop_self, a.kinds}),
-          starts(a.starts),
-          idx(a.idx),
-          receivers(a.receivers),
-          counts(a.count),
-          info(a.info),
-          capacity(a.capacity),
-          later_only(a.later_only),
-          longest(0),
-          past_caches((long long)m * capacity >= 1 << 20) {
+    explicit RowsBy(const RowArguments& a) : Base(a), RowsOut(a), longest(0), past_caches((long long)m * capacity >= 1 << 20) {
         int codes = 1;  // of images
         for (int k = 0; PERIODIC == 2 && k < DIM; ++k)
             codes *= 2 * lattice.images(k) + 1;
@@ -45,7 +24,7 @@ struct RowsBy : Way<RowsBy<Way>> {
     }
 
     void meet(const real* q, int id, bool fresh, bool finished) {
-        const int before = fresh ? 0 : counts[id];
+        const int before = fresh ? 0 : count[id];
         int hits;
         if (LIST && !FLAT && !past_caches) {
             int* const out = idx + (long long)id * capacity;
@@ -58,12 +37,12 @@ struct RowsBy : Way<RowsBy<Way>> {
             if constexpr (LIST)
                 write_row(id, before, hits, finished);
         }
-        counts[id] = before + hits;
+        count[id] = before + hits;
         longest = before + hits > longest ? before + hits : longest;
     }
     void expect(int) const {}
     void none(int id) {
-        counts[id] = 0;
+        count[id] = 0;
         if constexpr (LIST)
             write_row(id, 0, 0, true);
     }

@@ -10,7 +10,7 @@ struct SearchArguments {
     const int *excluded_starts, *excluded;
     const real *query_radii, *table_of_kinds;
     const int* kinds_of_queries;
-    int* scratch;
+    int *scratch, *grids;
     int n, m, own, table, closed, drop_self, kinds;
 };
 struct Points {
@@ -22,10 +22,10 @@ struct Band {
     real inside, outside;
 };
 
-struct Scan : SearchArguments, Cells, SourcePlaces {
+struct Scan : SearchArguments, SystemCells, SourcePlaces {
     const Wide wide;
     real inside, outside;             // the band of the pairs of a query, unless these VARY
-    const real slack;                 // by which scaled distances of images may be wrong
+    real slack;                       // by which scaled distances of images may be wrong
     int image;                        // that candidates are copied from, its code
     bool scaled_at_once;              // distances from the query, coordinate by coordinate
     bool several;                     // images among them: each says which one it is of
@@ -48,10 +48,9 @@ struct Scan : SearchArguments, Cells, SourcePlaces {
 
     explicit Scan(const SearchArguments& given)
         : SearchArguments(given),
-          Cells(given.cutoff, given.n <= FEW),
+          SystemCells(given.cutoff, given.grids, given.n <= FEW),
           SourcePlaces(given.scratch, given.n, given.m, given.own, given.table),
           wide(radius, given.closed),
-          slack(PERIODIC ? 2 * lattice.slack() * step_scale : real(0)),
           image(0),
           scaled_at_once(true),
           several(false),
@@ -63,6 +62,15 @@ struct Scan : SearchArguments, Cells, SourcePlaces {
           inside_of_kinds(nullptr),
           outside_of_kinds(nullptr) {
         memset(candidate_kind, 0, sizeof candidate_kind);  // those behind the last one are looked up, too
+        find_band();
+    }
+    // Goes to the box of a system, where each has its own.
+    void go_to(unsigned int system) {
+        if (enter(system))
+            find_band();
+    }
+    void find_band() {
+        slack = PERIODIC ? 2 * lattice.slack() * step_scale : real(0);
         for (int k = 0; RULE == TABLE && k < kinds && kinds <= LANES; ++k) {
             vec r{};
             for (int l = 0; l < kinds; ++l)

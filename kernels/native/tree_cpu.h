@@ -51,20 +51,18 @@ struct TreeScratch : Scratch {
     static int class_of(real r) { return (int)(Bits::of(r) >> (Bits::MANTISSA - CLASS_BITS)); }
 };
 
-struct TreeSortArguments {
-    const real *positions, *queries, *cutoff, *radii, *query_radii;
+struct TreeSortArguments : SortArguments {
+    const real *radii, *query_radii;
     const int* kinds_of_sources;
-    int *info, *scratch;
-    int n, m, own, table;
 
     // How wide a group around a query of an id may be: its cutoff, or what is known of it.
     real reach_of(int id) const { return RULE != SCATTER ? query_radii[id] : own ? radii[id] : cutoff[0]; }
 };
 
-struct TreePlaces : TreeSortArguments, Cells, TreeScratch {
+struct TreePlaces : TreeSortArguments, SystemCells, TreeScratch {
     explicit TreePlaces(const TreeSortArguments& given)
         : TreeSortArguments(given),
-          Cells(given.cutoff, false),
+          SystemCells(given.cutoff, given.grids, false),
           TreeScratch(given.scratch, given.n, given.m, given.own, given.table) {}
 
     // Puts the sources at places [from, to) in order.
@@ -74,6 +72,7 @@ struct TreePlaces : TreeSortArguments, Cells, TreeScratch {
             const int i = ids[place];
             __builtin_prefetch(positions + (long long)ROW * ids[place + AHEAD < to ? place + AHEAD : place]);
             real p[3];
+            enter(system_of(positions + (long long)ROW * i));
             point_of(positions + (long long)ROW * i, p);
             for (int k = 0; k < DIM; ++k)
                 axis[k][place] = p[k];
@@ -137,12 +136,8 @@ struct TreePlaces : TreeSortArguments, Cells, TreeScratch {
         for (int node = nodes[level]; node % FANOUT; ++node)
             begin_node(first[level] + node);
     }
-};
-
-// Puts many sources in order. It is launched once per thread: threads hand themselves chunks of places, and the last one to end makes
-// the nodes above the leaves.
-struct TreeGather : TreePlaces {
-    explicit TreeGather(const TreeSortArguments& given) : TreePlaces(given) {}
+    // Puts many sources in order. It is launched once per thread: threads hand themselves chunks of places, and the last one to end
+    // makes the nodes above the leaves.
     void gather() {
         each_chunk(shared.next_gathered, n, CHUNK, [&](int from, int to, int) {
             put_in_order(from, to);

@@ -28,6 +28,17 @@ def test_arguments_are_those_that_a_compiler_finds():
     assert _compile.load(kernel.program).address_of("Work_run")  # the compiler has confirmed places and sizes
 
 
+def test_arguments_that_are_derived_stand_behind_those_of_their_bases():
+    text = struct("real* a;", "int n;") + struct("int *b, m;").replace("Work", "Other")
+    text += "struct Both : WorkArguments, OtherArguments {};\nstruct More : WorkArguments {\n    int* c;\n};\n"
+    assert [field[:2] for field in read_fields(text, "Both")[0]] == [("a", 0), ("n", 8), ("b", 16), ("m", 24)]
+    load_warp()
+    for given in ("Both", "More"):
+        kernel_text = KERNEL.format().replace("WorkArguments", given)
+        (kernel,) = declare("derived", "using real = double;\n" + text + kernel_text, "Work.run")
+        assert _compile.load(kernel.program).address_of("Work_run")  # the compiler has confirmed places and sizes
+
+
 @pytest.mark.parametrize(
     "line",
     [

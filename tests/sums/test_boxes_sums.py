@@ -64,9 +64,9 @@ def test_kernels_compile_for_cuda(dim, double, periodic):
     for kernel in boxes.sorting_kernels(dim, double, periodic):
         assert compiles(kernel)
     for lists, later in ((False, False), (True, False), (True, True)):
-        assert compiles(boxes.rows_kernel(dim, double, False, lists, later, periodic, True))
+        assert compiles(boxes.rows_kernel(dim, double, False, lists, later, periodic))
     kind = kept.ListKind(dim, double, False, periodic, 0, "", False, True, False, 8)
     for extremes in (False, True):
         term = term_of(kind)
         term = term._replace(sums=term.sums[:1]) if extremes else term
-        assert compiles(boxes.sum_kernel(term, f"test_{extremes}", dim, double, False, not extremes, extremes, periodic, True))
+        assert compiles(boxes.sum_kernel(term, f"test_{extremes}", dim, double, False, not extremes, extremes, periodic))

@@ -232,7 +232,7 @@ def test_cutoffs_that_differ_compile_and_plans_have_the_arguments_of_their_kerne
         assert f'"jfrnn_box_rows_cuda_3d_f32_scaled_list_images_skewed_batched_own_dropself_{rule}@' in text
         variant = SumVariant(3, False, True, True, False, True, 4, True, False, False, plan.key, True, False, False, rule)
         names = (*boxes_warp._GIVEN, "shared_values", "own_values", "columns", *names_of_cutoffs(rule), *boxes_warp._SUMS, "info")
-        found = boxes_warp._plan_sums(variant, plan.text, {name: (n, 4) for name in names}, 132)
+        found = boxes_warp._plan_sums_on_cuda(variant, plan.text, {name: (n, 4) for name in names}, 132)
         assert len(found.steps) == 1
     else:
         assert f'"jfrnn_pair_sum_cuda_3d_f32_scaled_own_dropself_{rule}_tree_' in text
