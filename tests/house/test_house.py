@@ -19,6 +19,7 @@ FLOORS = (  # from the lowest: a package or module of the library imports only f
     {"_search"},
     {"_sums", "_triangles"},
     {"_shards", "_memory"},
+    {"_jax_md"},
     {"distributed", "ase", "jax_md", ""},  # "": the public names
     {"__main__"},
 )
@@ -58,6 +59,7 @@ def test_imports(folder):
         within |= (
             {"warp"} if path == ROOT / "jfrnn" / "_engine" / "start.py" else set()
         )  # where it is needed, not when jfrnn is imported
+        within |= {"jax_md"} if path.parent == ROOT / "jfrnn" / "_jax_md" else set()  # where it is installed
         assert roots <= ALLOWED[folder] | within, f"{path.name} imports {roots - ALLOWED[folder]}"
         if folder in ("kernels", "cases"):
             own = f"jfrnn.{folder}"
