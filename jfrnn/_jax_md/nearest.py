@@ -98,23 +98,27 @@ def neighbor_list(
         away = displacement_or_metric(a, b, **kwargs)
         return away**2 if away.ndim == 0 else jnp.sum(away**2)
 
-    def finish(rows: Array, room: int) -> tuple[Array, Array]:
-        """Return what idx holds, and how much room that takes."""
-        n = len(rows)
+    def finish(rows: Array, room: int, packed: bool) -> tuple[Array, Array]:
+        """Return what idx holds, and how much room that takes; rows are packed to the left, or have n anywhere."""
+        n, own = len(rows), jnp.arange(len(rows), dtype=jnp.int32)[:, None]
         rows = rows if custom_mask_function is None else custom_mask_function(rows)
         if form is OrderedSparse:
-            rows = jnp.where(rows < jnp.arange(n, dtype=rows.dtype)[:, None], rows, n)
+            rows = jnp.where(rows < own, rows, n)
+        used = rows < n
         if form is Dense:
-            count = jnp.max((rows < n).sum(1, dtype=jnp.int32), initial=0)
-            rows = rows if custom_mask_function is None else jnp.sort(rows, axis=1)
-            return jnp.pad(rows, ((0, 0), (0, max(room - rows.shape[1], 0))), constant_values=n)[:, :room], count
+            place = jnp.cumsum(used, axis=1, dtype=jnp.int32)
+            count = jnp.max(place[:, -1:], initial=0)
+            if packed and custom_mask_function is None:
+                return jnp.pad(rows, ((0, 0), (0, max(room - rows.shape[1], 0))), constant_values=n)[:, :room], count
+            empty = jnp.full((n, room), n, jnp.int32)
+            return empty.at[own, jnp.where(used, place - 1, room)].set(rows, mode="drop"), count
         if 0 in (room, *rows.shape):
-            return jnp.full((2, room), n, jnp.int32), (rows < n).sum(dtype=jnp.int32)
-        flat = flatten(rows < n, room)
+            return jnp.full((2, room), n, jnp.int32), used.sum(dtype=jnp.int32)
+        flat = flatten(used, room)
         return jnp.stack([jnp.where(flat.rows < n, rows.reshape(-1)[flat.slots], n), flat.rows]), flat.offsets[-1]
 
     def rows_of(position: Array, kept: Kept | None, exact: bool, kwargs: dict[str, Given]) -> Array:
-        """Return the neighbors of each particle, packed to the left."""
+        """Return the neighbors of each particle, where n means none."""
         if kept is not None and exact:
             return kept.idx
         n, own = len(position), jnp.arange(len(position), dtype=jnp.int32)
@@ -122,7 +126,7 @@ def neighbor_list(
         of_row = jax.vmap(functools.partial(squared, **kwargs), (None, 0))
         near = (rows < n) & (jax.vmap(of_row)(position, position[rows]) < reach**2)
         near = near & (rows != own[:, None]) if mask_self else near
-        return jnp.sort(jnp.where(near, rows, n), axis=1)
+        return jnp.where(near, rows, n)
 
     def allocate(position: Array, extra_capacity: int = 0, **kwargs: Given) -> NeighborList:
         position = jnp.asarray(position)
@@ -145,18 +149,19 @@ def neighbor_list(
             kept = search(position, radius, **given)
             kept.check()
             kept = kept if kept.images is None else None  # a list of jax-md holds the nearest image alone
+        exact = exact and kept is not None
         rows = rows_of(position, kept, exact, kwargs)
-        occupancy = int(finish(rows, 0 if form is not Dense else rows.shape[1])[1])
+        occupancy = int(finish(rows, 0, exact)[1])
         most = {Dense: n - mask_self, Sparse: n * (n - mask_self), OrderedSparse: n * (n - 1) // 2}[form]
         extra = extra_capacity if form is Dense else n * extra_capacity
         room = max(min(int(occupancy * capacity_multiplier + extra), most), 0)
         if kept is not None and exact and form is Dense and room > kept.capacity:
             kept = search(position, cutoff, capacity=room, **{k: x for k, x in given.items() if k != "slack"})
             rows = kept.idx
-        idx, held = finish(rows, room)
+        idx, held = finish(rows, room, exact)
         error = partition.PartitionError(jnp.where(held > room, 1, 0).astype(jnp.uint8))
         fixed = (None, room, form, None, None, update)
-        return NeighborList(idx, position, error, *fixed, kept=kept, occupancy=held, exact=exact and kept is not None)
+        return NeighborList(idx, position, error, *fixed, kept=kept, occupancy=held, exact=exact)
 
     def update(position: Array, neighbors: NeighborList, **kwargs: Given) -> NeighborList:
         if "box" in kwargs and not (fractional_coordinates or disable_cell_list):
@@ -177,7 +182,7 @@ def neighbor_list(
 
         def rebuild() -> tuple[Any, ...]:
             new = now if exact or kept is None else kept.update(position, box=present)
-            return new, *finish(rows_of(position, new, exact, kwargs), room), position
+            return new, *finish(rows_of(position, new, exact, kwargs), room, exact), position
 
         def keep() -> tuple[Any, ...]:
             return now, neighbors.idx, neighbors.occupancy, neighbors.reference_position
