@@ -142,11 +142,11 @@ def neighbor_list(
             space = Space(kwargs.get("box", box), fractional_coordinates)
         elif "box" in kwargs:
             space = Space(kwargs["box"], True)
-        given = {"slack": max(float(capacity_multiplier), 1.0), "box": _box_of(space, dim)}
-        given |= {"include_self": not mask_self, "skin": skin} if exact else {}
         radius, kept = cutoff if exact else reach * dim**0.5, None
+        given = {"include_self": not mask_self, "skin": skin} if exact else {}
         if dim in (2, 3) and position.dtype in (np.float32, np.float64) and not disable_cell_list:
-            kept = search(position, radius, **given)
+            given |= {"box": _box_of(space, dim)}
+            kept = search(position, radius, slack=max(float(capacity_multiplier), 1.0), **given)
             kept.check()
             kept = kept if kept.images is None else None  # a list of jax-md holds the nearest image alone
         exact = exact and kept is not None
@@ -156,7 +156,7 @@ def neighbor_list(
         extra = extra_capacity if form is Dense else n * extra_capacity
         room = max(min(int(occupancy * capacity_multiplier + extra), most), 0)
         if kept is not None and exact and form is Dense and room > kept.capacity:
-            kept = search(position, cutoff, capacity=room, **{k: x for k, x in given.items() if k != "slack"})
+            kept = search(position, cutoff, capacity=room, **given)
             rows = kept.idx
         idx, held = finish(rows, room, exact)
         error = partition.PartitionError(jnp.where(held > room, 1, 0).astype(jnp.uint8))
