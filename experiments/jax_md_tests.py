@@ -1,21 +1,36 @@
-"""Run jax-md's own tests with `jfrnn.jax_md` in the place of its neighbor lists, and beside that with its own.
+"""Run jax-md's own tests and examples with `jfrnn.jax_md` in the place of its neighbor lists, and beside that with its own.
 
 `python -m experiments.jax_md_tests CHECKOUT [FILE ...]`: CHECKOUT is a clone of https://github.com/jax-md/jax-md, whose package is
-used, and FILE are tests in it (default: partition, energy, smap and simulate). It prints how many tests pass, and which do so with
-one list alone. `--out=ROWS.csv` adds a row for each test as soon as it has run, and a test that has a row is not run again.
-Further options go to pytest. As a plugin of pytest (`-p experiments.jax_md_tests`), this file puts our functions in place and
-writes the rows.
+used, and FILE are tests in it, or examples such as `examples/npt_simulation.py` (default: `FILES` and `EXAMPLES`). It prints how
+many pass, and which do so with one list alone: one that fails by an error that jfrnn raises is refused. `--out=ROWS.csv` adds a
+row for each as soon as it has run, and what has a row is not run again. `--list=jfrnn` runs one list alone. Further options go to
+pytest.
+
+Examples are run as jax-md's documentation runs them, with few steps. What they would download (a silicon crystal at 300 K, and
+curves to draw beside theirs) is made here: it is the same for both lists.
+
+As a plugin of pytest (`-p experiments.jax_md_tests`), this file puts our functions in place and writes the rows.
 """
 
 import csv
 import os
+import re
+import runpy
 import subprocess
 import sys
 import tempfile
+import time
+import urllib.request
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-FILES = ("partition_test.py", "energy_test.py", "smap_test.py", "simulate_test.py")
+import numpy as np
+
+FILES = ("partition_test.py", "custom_partition_test.py", "energy_test.py", "smap_test.py", "simulate_test.py", "nn_test.py")
+UNITS = ("berendsen", "csvr", "npt_melting", "npt", "nve", "nvk", "nvt", "velocity_rescale")
+EXAMPLES = ("nve_neighbor_list", "npt_simulation", "npt_csvr", "custom_nl", *(f"units/{name}_si_sw" for name in UNITS))
+EXAMPLES = tuple(f"examples/{name}.py" for name in EXAMPLES)
 LISTS = ("jax-md", "jfrnn")
 COLUMNS = ("file", "test", "list", "outcome", "seconds", "reason", "jax_md_commit", "jax", "commit")
 _OURS = "JFRNN_IN_JAX_MD"
@@ -41,6 +56,28 @@ def put_in_place() -> None:
                 function.__defaults__ = tuple(new if x is theirs else x for x in defaults)
 
 
+def run_example(path: str) -> None:
+    """Run an example in this process, as jax-md's documentation does."""
+    urllib.request.urlretrieve = _make_file
+    if os.environ.get(_OURS):
+        put_in_place()
+    runpy.run_path(path, run_name="__main__")
+
+
+def _make_file(url: str, name: str) -> None:
+    """Write what an example would download."""
+    rng = np.random.default_rng(0)
+    corner = np.array([[0, 0, 0], [0, 2, 2], [2, 0, 2], [2, 2, 0]])
+    atoms = np.concatenate([corner, corner + 1])  # of a cell of diamond, in quarters of its edge
+    cells = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 1, 3)
+    x = (cells + atoms / 4).reshape(-1, 3) * 5.431
+    velocities = 2.98 * rng.standard_normal(x.shape)  # sqrt(kT/m) of silicon at 300 K [Å/ps]
+    column = np.ones((len(x), 1))
+    crystal = np.hstack([column, column, x, velocities - velocities.mean(0)])
+    curves = rng.random((400, 5 if "melting" in name else 6))
+    np.savetxt(name, crystal if name.endswith(".traj") else curves)
+
+
 def pytest_collection_modifyitems(items: list[Any]) -> None:
     """Leave out the tests that have a row."""
     if os.environ.get(_ROWS):
@@ -54,15 +91,19 @@ def pytest_runtest_logreport(report: Any) -> None:  # noqa: ANN401
         return
     if report.when == "teardown":
         return
-    import jax
-
     theirs, ours = os.environ[_COMMITS].split()
-    reason = str(report.longrepr[-1] if isinstance(report.longrepr, tuple) else report.longrepr or "").strip().splitlines()[-1:]
-    row = (report.nodeid.partition("::")[0].rpartition("/")[2], _name(report.nodeid), _who(), report.outcome)
+    told = str(report.longrepr[-1] if isinstance(report.longrepr, tuple) else report.longrepr or "").strip()
+    row = (report.nodeid.partition("::")[0].rpartition("/")[2], _name(report.nodeid), _who())
+    outcome = _judge(told) if report.outcome == "failed" else report.outcome
+    reason = [told.splitlines()[-1][:200] if told else ""]
     with Path(os.environ[_ROWS]).open("a", newline="") as file:
-        csv.writer(file).writerow(
-            (*row, f"{report.duration:.1f}", *[x[:200] for x in reason or [""]], theirs, jax.__version__, ours)
-        )
+        csv.writer(file).writerow((*row, outcome, f"{report.duration:.1f}", *reason, theirs, version("jax"), ours))
+
+
+def _judge(told: str) -> str:
+    """Say of an error whether jfrnn raised it: the last file that it names is then one of the library."""
+    files = re.findall(r"([\w./-]+\.py)(?:\", line |:\d)", told)
+    return "refused" if files and "jfrnn" in Path(files[-1]).parts else "failed"
 
 
 def _who() -> str:
@@ -82,17 +123,37 @@ def read(path: Path) -> Rows:
 
 
 def run(checkout: Path, file: str, ours: bool, options: list[str], out: Path) -> None:
-    """Run the tests of a file that have no row yet, and add their rows."""
+    """Run an example, or the tests of a file, that have no row yet, and add their rows."""
     if not out.exists():
         out.write_text(",".join(COLUMNS) + "\n")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(checkout), str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    environment |= {_ROWS: str(out), _COMMITS: " ".join(_commit(folder) for folder in (checkout, ROOT))}
+    commits = [_commit(folder) for folder in (checkout, ROOT)]
+    environment |= {_ROWS: str(out), _COMMITS: " ".join(commits), "READTHEDOCS": "True", "MPLBACKEND": "agg"}
     environment |= {_OURS: "1"} if ours else {}
+    if file in EXAMPLES:
+        if (file, "", LISTS[ours]) not in read(out):
+            _run_example(checkout / file, (file, "", LISTS[ours]), environment, out)
+        return
     command = [sys.executable, "-m", "pytest", "-q", "--no-header", "-p", "experiments.jax_md_tests", "-c", os.devnull]
     command += ["--rootdir", str(checkout), *options, str(checkout / "tests" / file)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=checkout)
     if not any((file, LISTS[ours]) == (row[0], row[2]) for row in read(out)):
         raise SystemExit(f"no test ran: {(done.stdout + done.stderr).strip()[-2000:]}")
+
+
+def _run_example(path: Path, key: tuple[str, ...], environment: dict[str, str], out: Path) -> None:
+    """Run an example in an empty folder, and add its row: the reason is the last line that it printed."""
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-c", f"from experiments import jax_md_tests as own; own.run_example({str(path)!r})"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=folder)
+    outcome = _judge(done.stderr) if done.returncode else "passed"
+    lines = (done.stderr if done.returncode else done.stdout).strip().splitlines()
+    numbers = [line for line in lines if re.search(r"\d\.\d", line)] if not done.returncode else lines
+    theirs, ours = environment[_COMMITS].split()
+    row = (*key, outcome, f"{time.monotonic() - began:.1f}", (numbers or [""])[-1][:200], theirs, version("jax"), ours)
+    with out.open("a", newline="") as file:
+        csv.writer(file).writerow(row)
 
 
 def _commit(folder: Path) -> str:
@@ -107,24 +168,30 @@ def passed_by(rows: Rows, file: str, who: str) -> set[str]:
 
 def main(words: list[str]) -> None:
     """Print the table, and what passes with one list alone."""
-    options = [word for word in words if word.startswith("-") and not word.startswith("--out=")]
-    asked = [word.partition("=")[2] for word in words if word.startswith("--out=")]
+    own = {key: [word.partition("=")[2] for word in words if word.startswith(f"--{key}=")] for key in ("out", "list")}
+    options = [word for word in words if word.startswith("-") and not word.startswith(("--out=", "--list="))]
     names = [word for word in words if not word.startswith("-")]
     if not names or not (Path(names[0]) / "tests").is_dir():
         raise SystemExit(__doc__)
-    checkout, files = Path(names[0]).resolve(), names[1:] or list(FILES)
+    checkout, files = Path(names[0]).resolve(), names[1:] or [*FILES, *EXAMPLES]
     with tempfile.TemporaryDirectory() as folder:
-        out = Path(asked[-1] if asked else Path(folder) / "rows.csv").resolve()
+        out = Path(own["out"][-1] if own["out"] else Path(folder) / "rows.csv").resolve()
         for file in files:
-            for ours in (False, True):
-                run(checkout, file, ours, options, out)
-            rows = read(out)
-            passed = [passed_by(rows, file, who) for who in LISTS]
-            count = len({test for of, test, _ in rows if of == file})
-            print(f"{file}: of {count} tests pass {len(passed[1])} with jfrnn, {len(passed[0])} with its own list", flush=True)
-            for who, only in (("its own list", passed[0] - passed[1]), ("jfrnn", passed[1] - passed[0])):
-                for name in sorted(only):
-                    print(f"  only with {who}: {name}")
+            for who in own["list"] or LISTS:
+                run(checkout, file, who == LISTS[1], options, out)
+            report(read(out), file)
+
+
+def report(rows: Rows, file: str) -> None:
+    """Print what became of a file with either list, and by name what does not pass with ours."""
+    passed = [passed_by(rows, file, who) for who in LISTS]
+    count = len({test for of, test, _ in rows if of == file})
+    print(f"{file}: of {count} pass {len(passed[1])} with jfrnn, {len(passed[0])} with its own list", flush=True)
+    for name in sorted(passed[1] - passed[0]):
+        print(f"  only with jfrnn: {name}")
+    for (of, name, who), row in rows.items():
+        if of == file and who == LISTS[1] and row["outcome"] in ("failed", "refused"):
+            print(f"  {row['outcome']}{'' if name in passed[0] else ', as with its own list'}: {name} ({row['reason']})")
 
 
 if __name__ == "__main__":

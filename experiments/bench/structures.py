@@ -1,4 +1,4 @@
-"""One structure of atoms after another: `jfrnn.ase` beside matscipy and vesin, from the first call of a fresh process on.
+"""One structure of atoms after another: `jfrnn.ase` beside ASE, matscipy and vesin, from the first call of a fresh process on.
 
 `python -P structures.py WHO COUNT` is that process, and prints a line of JSON. Nothing but NumPy is imported before the clock runs.
 """
@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-LIBRARIES = ("jfrnn", "matscipy", "vesin")
+LIBRARIES = ("jfrnn", "ase", "matscipy", "matscipy-neighbours", "vesin")
 CUTOFF = 5.0  # [angstrom]
 DENSITY = 0.06  # [atoms/angstrom³]
 LETTERS = "ijSDd"
@@ -52,8 +52,15 @@ def load(who: str) -> Find:
         from jfrnn.ase import primitive_neighbor_list
 
         return lambda x, cell: primitive_neighbor_list(LETTERS, True, cell, x, CUTOFF)
-    if who == "matscipy":
-        from matscipy.neighbours import neighbour_list  # pyright: ignore[reportMissingImports]
+    if who == "ase":
+        from ase.neighborlist import primitive_neighbor_list
+
+        return lambda x, cell: primitive_neighbor_list(LETTERS, [True] * 3, cell, x, CUTOFF)
+    if who.startswith("matscipy"):
+        if who == "matscipy":
+            from matscipy.neighbours import neighbour_list  # pyright: ignore[reportMissingImports]
+        else:
+            from matscipy_neighbours import neighbour_list  # pyright: ignore[reportMissingImports]
 
         return lambda x, cell: neighbour_list(LETTERS, positions=x, cell=cell, pbc=[True] * 3, cutoff=CUTOFF)
     from vesin import NeighborList  # pyright: ignore[reportMissingImports]

@@ -184,7 +184,8 @@ def structures() -> str:
     lines = []
     for who, cache, title in (("jfrnn", "warm", "`jfrnn.ase`"), ("jfrnn", "cold", "the same, kernels compiled first")):
         lines.append((who, title, one(rows, who=who, cache=cache)))
-    lines += [(who, who, next(row for row in rows if row["who"] == who and row["structures"])) for who in ("matscipy", "vesin")]
+    others = {"ase": "ASE", "matscipy": "matscipy", "matscipy-neighbours": "matscipy-neighbours", "vesin": "vesin"}
+    lines += [(who, title, next(row for row in rows if row["who"] == who and row["structures"])) for who, title in others.items()]
     table = []
     for who, title, row in lines:
         call = None if row is None or row["cache"] == "cold" else next(r for r in rows if r["who"] == who and r["atoms"])

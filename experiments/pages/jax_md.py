@@ -1,7 +1,7 @@
-"""The table of jax-md's own tests, run with our lists in the place of its own: how many pass with either."""
+"""Tables of jax-md: its own tests and examples with our lists in the place of its own, and who is right where lists differ."""
 
-from experiments.jax_md_tests import FILES, LISTS
-from experiments.pages.rows import Row, markdown, read
+from experiments.jax_md_tests import EXAMPLES, FILES, LISTS
+from experiments.pages.rows import Row, markdown, read, whole
 
 ROWS = "jax_md/outcomes.csv"
 
@@ -18,7 +18,7 @@ def _outcomes(file: str) -> dict[str, dict[str, str]]:
 def own_tests() -> str:
     """Return a line for each file of tests: of those that ran with both lists, how many pass with either, both and one alone."""
     lines = []
-    for file in FILES:
+    for file in (*FILES, *EXAMPLES):
         both = [outcomes for outcomes in _outcomes(file).values() if set(outcomes) == set(LISTS)]
         both = [outcomes for outcomes in both if set(outcomes.values()) != {"skipped"}]
         if not both:
@@ -31,6 +31,12 @@ def own_tests() -> str:
     return markdown(heads, lines)
 
 
+def contested() -> str:
+    """Return how many pairs each list misses or has too many, where they differ."""
+    heads = ("scene", ">particles", ">pairs", ">jax-md misses", ">has too many", ">jfrnn misses", ">has too many")
+    return markdown(heads, [[row["case"], *map(whole, [*row.values()][1:])] for row in read("jax_md/contested.csv")])
+
+
 def _first() -> Row:
     return read(ROWS)[0]
 
@@ -40,5 +46,5 @@ def commit() -> str:
     return f"commit {_first()['jax_md_commit']}, JAX {_first()['jax']}"
 
 
-TABLES = {"jax-md-tests": own_tests}
+TABLES = {"jax-md-tests": own_tests, "jax-md-contested": contested}
 VALUES = {"jax-md-commit": commit}

@@ -1,5 +1,7 @@
 """`jfrnn.ase`: one structure after another on the host, against the oracle, and against its peers where they are installed."""
 
+import collections
+import importlib
 import itertools
 import subprocess
 import sys
@@ -9,6 +11,9 @@ import numpy as np
 import pytest
 import reference
 
+import jfrnn.ase
+import jfrnn.matscipy
+import jfrnn.vesin
 from jfrnn.ase import neighbor_list, primitive_neighbor_list
 from jfrnn.cases.periodic import PERIODIC_CASES
 
@@ -99,7 +104,7 @@ def test_radii_and_tables(name):
     radii = rng.choice([0.0, 0.25, 0.5, 0.75], 24)
     found = as_set(*primitive_neighbor_list("ijS", pbc, cell, x, radii))
     assert found == pairs_within(x, cell, pbc, radii[:, None] + radii)
-    table = {("H", "C"): 1.0, (8, 8): 1.5, (6, 1): 0.75, ("O", "H"): 0.0, ("Fe", "Fe"): 3.0}
+    table = {("H", "C"): 1.75, (8, 8): 1.5, (6, 1): 1.0, ("O", "H"): 0.0, ("Fe", "Fe"): 3.0}
     cutoff_of = np.zeros((9, 9))
     cutoff_of[1, 6] = cutoff_of[6, 1] = 1.0
     cutoff_of[8, 8] = 1.5
@@ -108,6 +113,10 @@ def test_radii_and_tables(name):
     atoms = SimpleNamespace(positions=x, cell=cell, pbc=np.array(pbc), numbers=numbers)
     assert as_set(*neighbor_list("ijS", atoms, table)) == expected
     assert len(expected) > 10
+    every = collections.defaultdict(lambda: 1.0)  # as matscipy takes it: of no other values
+    one = as_set(*neighbor_list("ijS", atoms, 1.0))
+    assert every[1, 1] == 1.0
+    assert as_set(*neighbor_list("ijS", atoms, every)) == one != set()
 
 
 def test_fifty_angstrom_in_a_cell_of_two_atoms():
@@ -154,6 +163,7 @@ BAD = {
     "cutoff must be finite and at least 0": {"cutoff": -1.0},
     "cutoff must be finite and at least 0, got inf for": {"cutoff": {(1, 1): np.inf}, "numbers": [1, 1]},
     "keys of cutoff must be pairs of symbols or numbers": {"cutoff": {("H", "Q"): 1.0}, "numbers": [1, 1]},
+    "cutoff must not be a defaultdict of 2.0 with other values": {"cutoff": collections.defaultdict(lambda: 2.0, {(1, 1): 1.0})},
     "a dictionary of cutoffs needs numbers": {"cutoff": {(1, 1): 1.0}},
     "linearly independent": {"cell": np.array([[1.0, 0, 0], [2.0, 0, 0], [0, 0, 1.0]])},
     "at most 1 048 576 cells": {"positions": np.array([[0, 0, 0], [1e9, 0, 0]])},
@@ -178,15 +188,118 @@ def test_it_takes_no_device_of_jax():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+@pytest.mark.parametrize("bothways", [True, False])
+def test_classes_of_ase(bothways):
+    """They take ASE's arguments and list its pairs, once or both ways; the skin is ASE's."""
+    theirs, build = pytest.importorskip("ase.neighborlist"), pytest.importorskip("ase.build")
+    atoms = build.bulk("NaCl", "rocksalt", a=5.6) * (2, 1, 1)
+    atoms.rattle(0.05, seed=1)
+    radii = np.array([1.3, 1.9, 1.3, 1.9])
+    for sort, own in itertools.product((True, False), (True, False)):
+        options = {"skin": 0.2, "bothways": bothways, "sorted": sort, "self_interaction": own}
+        lists = [module.NeighborList(radii, primitive=module.NewPrimitiveNeighborList, **options) for module in (jfrnn.ase, theirs)]
+        assert all(made.update(atoms) for made in lists)
+        for a in range(4):
+            ours, others = (made.get_neighbors(a) for made in lists)
+            order, other = (np.lexsort((*found[1].T, found[0])) for found in (ours, others))
+            np.testing.assert_array_equal(ours[0] if sort else ours[0][order], others[0][other])
+            np.testing.assert_array_equal(ours[1][order], others[1][other])
+    ours, others = lists
+    assert isinstance(ours, theirs.NeighborList)
+    np.testing.assert_array_equal(*(made.get_connectivity_matrix(sparse=False) for made in lists))
+    assert [len(x) for x in ours.nl.neighbors] == [len(ours.get_neighbors(a)[0]) for a in range(4)]
+    assert [x.shape[1] for x in ours.nl.displacements] == [3] * 4
+    atoms.positions[1] += 0.1
+    assert (ours.update(atoms), others.update(atoms), ours.nupdates) == (False, False, 1)
+    atoms.positions[1] += 0.2
+    assert ours.update(atoms)
+
+
+def test_other_names_of_ase():
+    theirs, build = pytest.importorskip("ase.neighborlist"), pytest.importorskip("ase.build")
+    water = build.molecule("H2O")
+    assert jfrnn.ase.natural_cutoffs is theirs.natural_cutoffs
+    made = jfrnn.ase.build_neighbor_list(water, bothways=True, self_interaction=False)
+    assert isinstance(made.nl, jfrnn.ase.PrimitiveNeighborList)
+    assert jfrnn.ase.get_distance_matrix(made.get_connectivity_matrix()).todense().max() == 2
+    with pytest.raises(AttributeError, match="neither"):
+        jfrnn.ase.neighbour_lists  # noqa: B018
+
+
+CALCULATORS = {
+    "emt": lambda build: (build.bulk("Cu", cubic=True) * (2, 1, 1), importlib.import_module("ase.calculators.emt").EMT()),
+    "lj": lambda build: (
+        build.bulk("Ar", "fcc", a=5.2) * (2, 2, 1),
+        importlib.import_module("ase.calculators.lj").LennardJones(sigma=3.4, epsilon=0.01, rc=8.0, smooth=True),
+    ),
+    "morse": lambda build: (build.bulk("Cu"), importlib.import_module("ase.calculators.morse").MorsePotential(r0=2.5, rho0=3.0)),
+    "tersoff": lambda build: (build.bulk("Si", cubic=True), importlib.import_module("ase.calculators.tersoff")),
+}
+
+
+@pytest.mark.parametrize("name", CALCULATORS)
+def test_calculators_of_ase(name):
+    """With `use`, they have energies, forces and stresses of before, to rounding, and our lists; afterwards, ASE's again."""
+    theirs, build = pytest.importorskip("ase.neighborlist"), pytest.importorskip("ase.build")
+    atoms, make = CALCULATORS[name](build)
+    if name == "tersoff":
+        parameters = make.TersoffParameters(
+            3.0, 1.0, 1.3258, 4.8381, 2.0417, 0.0, 22.956, 0.33675, 1.3258, 95.373, 3.0, 0.2, 3.2394, 3264.7
+        )
+        make = make.Tersoff({("Si", "Si", "Si"): parameters})
+    atoms.rattle(0.05, seed=2)
+
+    def run():
+        atoms.calc = make
+        make.reset()
+        if hasattr(make, "nl"):
+            make.nl = None
+        return atoms.get_potential_energy(), atoms.get_forces(), atoms.get_stress()
+
+    before, function = run(), theirs.neighbor_list
+    with jfrnn.ase.use():
+        assert theirs.neighbor_list is jfrnn.ase.neighbor_list
+        found = run()
+        assert name == "morse" or isinstance(make.nl.nl, jfrnn.ase.PrimitiveNeighborList)
+    assert theirs.neighbor_list is function
+    assert theirs.NeighborList([1.0]).nl.__class__ is theirs.PrimitiveNeighborList
+    for ours, others in zip(found, before):
+        np.testing.assert_allclose(ours, others, rtol=1e-12, atol=1e-12)
+
+
+def test_forms_of_matscipy_and_vesin():
+    x, cell = np.array([[0.0, 0, 0], [1.0, 0.5, 0], [2.5, 0, 0.25]]), np.diag([3.0, 3.5, 4.0])
+    i, j, s = primitive_neighbor_list("ijS", True, cell, x, 2.0)
+    found = jfrnn.matscipy.neighbour_list("ijSd", positions=x, cell=cell, pbc=[True] * 3, cutoff=2.0, cell_origin=[1.0, 0, 0])
+    assert [part.dtype.name for part in found] == ["int32", "int32", "int32", "float64"]
+    for ours, expected in zip(found, (i, j, s)):
+        np.testing.assert_array_equal(ours, expected)
+    atoms = SimpleNamespace(positions=x, cell=cell, pbc=np.ones(3, bool), numbers=np.ones(3, int))
+    np.testing.assert_array_equal(jfrnn.matscipy.coordination(atoms, 2.0), np.bincount(i))
+    full, half = (jfrnn.vesin.NeighborList(cutoff=2.0, full_list=full).compute(x, cell, True, "PSdi") for full in (True, False))
+    assert [part.dtype.name for part in full] == ["uint64", "int32", "float64", "uint64"]
+    np.testing.assert_array_equal(full[0], np.stack([i, j], axis=1))
+    both = {(*pair, *shift) for pair, shift in zip(half[0].tolist(), half[1].tolist())}
+    assert len(both) * 2 == len(i)
+    assert both | {(b, a, -x, -y, -z) for a, b, x, y, z in both} == {
+        (*pair, *shift) for pair, shift in zip(full[0].tolist(), s.tolist())
+    }
+    with pytest.raises(ValueError, match="quantities must be letters of 'ijPSDd'"):
+        jfrnn.vesin.NeighborList(cutoff=2.0, full_list=True).compute(x, cell, True, "x")
+    with pytest.raises(ValueError, match="algorithm must be"):
+        jfrnn.vesin.NeighborList(cutoff=2.0, full_list=True, algorithm="tree")
+
+
 @pytest.mark.parametrize("peer", ["ase", "matscipy", "vesin"])
 def test_peers(peer):
     """Where no distance lies at a cutoff, all libraries tell the same."""
     ase = pytest.importorskip("ase")
     build = pytest.importorskip("ase.build")
+    find = neighbor_list
     if peer == "ase":
         theirs = pytest.importorskip("ase.neighborlist").neighbor_list
     elif peer == "matscipy":
-        theirs = pytest.importorskip("matscipy.neighbours").neighbour_list
+        theirs, find = pytest.importorskip("matscipy.neighbours").neighbour_list, jfrnn.matscipy.neighbour_list
     else:
         theirs = pytest.importorskip("vesin").ase_neighbor_list
     structures = [
@@ -206,10 +319,20 @@ def test_peers(peer):
         if peer == "matscipy" and not atoms.cell.volume:
             continue  # it takes no vectors of 0
         for cutoff in cutoffs:
-            ours, others = (f("ijSDd", atoms, cutoff) for f in (neighbor_list, theirs))
+            ours, others = (f("ijSDd", atoms, cutoff) for f in (find, theirs))
             order, other_order = (np.lexsort((*x[2].T, x[1], x[0])) for x in (ours, others))
             for a, b in zip(ours, others):
                 np.testing.assert_allclose(a[order], b[other_order], atol=1e-12)
+                assert a.dtype == b.dtype or peer == "vesin"
+        if peer == "matscipy":
+            first = jfrnn.matscipy.first_neighbours(len(atoms), ours[0])
+            triplets = jfrnn.matscipy.triplet_list(first)
+            assert len(triplets[0]) == (np.bincount(ours[0]) * (np.bincount(ours[0]) - 1)).sum()
+        if peer == "vesin":
+            for full in (True, False):
+                made = [module.NeighborList(cutoff=3.1, full_list=full) for module in (jfrnn.vesin, pytest.importorskip("vesin"))]
+                ours, others = (f.compute(atoms.positions, atoms.cell[:], bool(atoms.pbc.all()), "ijPSDd") for f in made)
+                assert [(x.dtype, x.shape) for x in ours] == [(x.dtype, x.shape) for x in others]
 
 
 def test_names_of_ase_and_matscipy():

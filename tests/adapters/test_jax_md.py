@@ -11,8 +11,8 @@ import reference
 
 from jfrnn import jax_md
 
-CUTOFF, SKIN, N = 0.7, 0.1, 40
-LENGTHS, MATRIX = np.array([2.0, 2.5, 2.25]), np.array([[2.0, 0.25, 0.5], [0.0, 2.5, 0.25], [0.0, 0.0, 2.25]])
+CUTOFF, SKIN, N = 0.7, 0.1, 80
+LENGTHS, MATRIX = np.array([3.0, 3.5, 3.25]), np.array([[3.0, 0.25, 0.5], [0.0, 3.5, 0.25], [0.0, 0.0, 3.25]])
 FORMATS = [jax_md.Dense, jax_md.Sparse, jax_md.OrderedSparse]
 
 
@@ -38,10 +38,11 @@ def metric(a, b, **_):
     return jnp.abs(a - b).max()  # which is not Euclidean
 
 
-SPACES = {
+SPACES = {  # None: decided exactly, as are the spaces of jax-md where that is installed
     "free": (free, LENGTHS, False),
-    "periodic": (functools.partial(nearest, box=jnp.asarray(LENGTHS)), LENGTHS, False),
-    "fractional": (functools.partial(general, box=jnp.asarray(MATRIX)), MATRIX, True),
+    "periodic": (None, LENGTHS, False),
+    "fractional": (None, MATRIX, True),
+    "measured": (functools.partial(general, box=jnp.asarray(MATRIX)), MATRIX, True),
 }
 
 
@@ -61,8 +62,8 @@ def pairs_of(idx, n, form):
 
 
 def expected(x, space, form, skin=SKIN):
-    real = np.asarray(x) @ MATRIX.T if space == "fractional" else np.asarray(x)
-    rows = MATRIX.T if space == "fractional" else np.diag(LENGTHS)
+    real = np.asarray(x) @ MATRIX.T if SPACES[space][2] else np.asarray(x)
+    rows = MATRIX.T if SPACES[space][2] else np.diag(LENGTHS)
     within = reference.reference_images(real, CUTOFF + skin, matrix=rows, periodic=(space != "free",) * 3)
     return {(i, j) for i, j, _ in within if form.name != "OrderedSparse" or j < i}
 
@@ -79,7 +80,7 @@ def test_pairs_in_a_loop(space, form):
     fns = jax_md.neighbor_list(displacement, box, CUTOFF, SKIN, fractional_coordinates=fractional, format=form)
     x = points(fractional)
     nbrs = fns.allocate(x)
-    assert nbrs.kept is not None
+    assert (nbrs.kept is not None, nbrs.exact) == (True, displacement is None)
     assert pairs_of(nbrs.idx, N, form) == expected(x, space, form)
     y = x.copy()
     y[3], y[5] = x[3] + 0.02, x[5] + 0.2
@@ -160,24 +161,77 @@ def test_masks_come_before_room(form):
 
 
 def test_boxes_that_change():
-    displacement, box, _ = SPACES["fractional"]
+    """Among them a matrix, of a list that was made with a length; without `box=`, it is the box of the displacement."""
     x = points(True)
-    nbrs = jax_md.neighbor_list(displacement, box, CUTOFF, fractional_coordinates=True, capacity_multiplier=9.0).allocate(x)
+    fns = jax_md.neighbor_list(None, MATRIX, CUTOFF, fractional_coordinates=True, capacity_multiplier=9.0)
     update = jax.jit(lambda x, nbrs, box: nbrs.update(x, box=box))
-    assert nbrs.kept is not None
-    assert pairs_of(nbrs.idx, N, jax_md.Dense) == expected(x, "fractional", jax_md.Dense, 0)
-    wide = update(x, nbrs, 1.2 * MATRIX)
-    real = np.sum(x[:, None, :] * 1.2 * MATRIX, axis=-1)
-    near = reference.reference_images(real, CUTOFF, matrix=(1.2 * MATRIX).T, periodic=(True,) * 3)
-    assert pairs_of(wide.idx, N, jax_md.Dense) == {(i, j) for i, j, _ in near}
-    assert not wide.cell_size_too_small
-    assert update(x, nbrs, 0.5 * MATRIX).cell_size_too_small
+    nbrs = fns.allocate(x, box=3.2, num_particles=N)
+    assert nbrs.exact
+    for box in (1.2 * MATRIX, MATRIX):
+        real = np.sum(x[:, None, :] * box, axis=-1)
+        near = reference.reference_images(real, CUTOFF, matrix=box.T, periodic=(True,) * 3)
+        wide = update(x, nbrs, box)
+        assert pairs_of(wide.idx, N, jax_md.Dense) == {(i, j) for i, j, _ in near}
+        assert not wide.cell_size_too_small
+    assert pairs_of(nbrs.update(x, t=1.0).idx, N, jax_md.Dense) == {(i, j) for i, j, _ in near}
+    assert update(x, nbrs, 0.4 * MATRIX).cell_size_too_small
     with pytest.raises(ValueError, match="box= only with fractional_coordinates=True"):
-        jax_md.neighbor_list(SPACES["periodic"][0], LENGTHS, CUTOFF).allocate(points(False)).update(points(False), box=LENGTHS)
-    with pytest.raises(TypeError, match=r"knows the keyword box alone, got t"):
-        nbrs.update(x, t=1.0)
+        jax_md.neighbor_list(None, LENGTHS, CUTOFF).allocate(points(False)).update(points(False), box=LENGTHS)
+    with pytest.raises(TypeError, match=r"update\(\) got perturbation"):
+        nbrs.update(x, perturbation=jnp.eye(3))
+    with pytest.raises(ValueError, match="displacement_or_metric given"):
+        jax_md.neighbor_list(None, 1.0, CUTOFF).allocate(x)
+    with pytest.raises(ValueError, match="in 1D take the list of jax-md"):
+        jax_md.neighbor_list_multi_image(None, np.eye(1), CUTOFF).allocate(x[:, :1])
+    with pytest.raises(ValueError, match="format must be a member of NeighborListFormat"):
+        jax_md.neighbor_list(None, 1.0, CUTOFF, format="Dense")
     with pytest.raises(TypeError, match=r"cannot run inside jax.jit"):
         jax.jit(lambda x: jax_md.neighbor_list(free, 1.0, CUTOFF).allocate(x).idx)(x)
+
+
+def test_boxes_of_lists_that_are_measured():
+    """With a threshold, too, a new box is seen though no fraction has moved; without fractions, as jax-md takes it."""
+    x = points(True)
+    fns = jax_md.neighbor_list(general, 1.0, CUTOFF, SKIN, 9.0, disable_cell_list=True)
+    nbrs = fns.allocate(x, box=jnp.asarray(MATRIX))
+    assert pairs_of(nbrs.idx, N, jax_md.Dense) == expected(x, "fractional", jax_md.Dense)
+    box = 1.1 * MATRIX
+    near = reference.reference_images(x @ box.T, CUTOFF + SKIN, matrix=box.T, periodic=(True,) * 3)
+    wide = jax.jit(lambda x, nbrs, box: nbrs.update(x, box=box, neighbor=nbrs))(x, nbrs, box)
+    assert pairs_of(wide.idx, N, jax_md.Dense) == {(i, j) for i, j, _ in near}
+
+
+EDGE, SHEAR = 3.0, np.array([[1.0, 0.001, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def sheared(a, b, xp=jnp):
+    away = (a - b) @ np.linalg.inv(EDGE * SHEAR).T
+    return (away - xp.round(away)) @ (EDGE * SHEAR).T
+
+
+def longer(a, b, xp=jnp):
+    return a - b - (EDGE + 0.002) * xp.round((a - b) / (EDGE + 0.002))
+
+
+def bumped(a, b, xp=jnp):
+    near = xp.sum((a - 1.1) ** 2, axis=-1, keepdims=True) < 0.16
+    return (a - b - EDGE * xp.round((a - b) / EDGE)) * xp.where(near, 0.9, 1.0)
+
+
+def cubic(a, b, xp=jnp):  # no Euclidean distance: pairs are as far apart as the diagonal of a cube
+    away = xp.abs(a - b).max(-1, keepdims=True)
+    return xp.minimum(away, EDGE)
+
+
+@pytest.mark.parametrize("displacement", [sheared, longer, bumped, cubic])
+def test_the_function_chooses(displacement):
+    """Also where it is nearly, but not everywhere, the nearest image in `box`."""
+    x = np.random.default_rng(4).random((400, 3)) * EDGE
+    away = np.linalg.norm(displacement(x[:, None], x, np), axis=2)
+    near = {(i, j) for i, j in zip(*np.nonzero(away < CUTOFF)) if i != j}
+    nbrs = jax_md.neighbor_list(jax.jit(displacement), EDGE, CUTOFF).allocate(x)
+    assert nbrs.kept is not None
+    assert pairs_of(nbrs.idx, 400, jax_md.Dense) == near
 
 
 IMAGES_OFTEN = [(jax_md.Dense, True)]  # pairs one after another, and no fractions: of particles that nobody wrapped
@@ -191,7 +245,7 @@ IMAGES_OFTEN = [(jax_md.Dense, True)]  # pairs one after another, and no fractio
     ],
 )
 def test_several_images(form, fractional):
-    matrix, x = MATRIX / 2, points(True, 6)
+    matrix, x = MATRIX / 3, points(True, 6)
     given = x if fractional else x @ matrix.T
     lost = given.copy()
     lost[2, 0] = np.nan
@@ -218,21 +272,63 @@ def test_several_images(form, fractional):
     assert update(lost, nbrs, matrix).did_buffer_overflow  # though there is room for all that are found
 
 
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("form", ["Dense", "Sparse", "OrderedSparse"])
-def test_an_energy_of_jax_md(form):
-    """The same energy and forces, with the list of either."""
-    pytest.importorskip("flax")  # which jax-md imports
+@pytest.fixture(scope="module")
+def theirs():
+    """jax-md, which needs the promotion of dtypes that is JAX's own."""
     with jax.numpy_dtype_promotion("standard"):
-        theirs = pytest.importorskip("jax_md")
-        displacement, _ = theirs.space.periodic(LENGTHS[0])
-        x, energies = points(True) * LENGTHS[0], []
-        for module in (theirs.partition, jax_md):
-            form_of = theirs.partition.NeighborListFormat[form]
-            nbrs = module.neighbor_list(displacement, LENGTHS[0], CUTOFF, SKIN, format=form_of).allocate(x)
-            shape = theirs.space.metric(displacement)
-            energy = theirs.smap.pair_neighbor_list(lambda dr, **_: jnp.where(dr < CUTOFF, (CUTOFF - dr) ** 2, 0.0), shape)
-            energies.append((energy(x, neighbor=nbrs), jax.grad(energy)(x, neighbor=nbrs)))
+        yield pytest.importorskip("jax_md")
+
+
+def test_it_is_of_the_types_of_jax_md(theirs):
+    """Formats, lists and errors are its own, and all its names are here."""
+    partition, x = theirs.partition, jnp.asarray(points(False))
+    assert all(hasattr(jax_md, name) for name in vars(partition) if not name.startswith("_"))
+    fns = jax_md.neighbor_list(theirs.space.periodic(LENGTHS)[0], LENGTHS, CUTOFF, format=partition.Sparse)
+    nbrs = fns.allocate(x, num_particles=N)
+    assert isinstance(nbrs, partition.NeighborList)
+    assert (nbrs.exact, nbrs.format is partition.Sparse, nbrs.set(idx=None).idx) == (True, True, None)
+    graph, mask = partition.to_jraph(nbrs), partition.neighbor_list_mask(nbrs)
+    assert int(graph.n_edge[0]) == int(mask.sum()) == len(pairs_of(nbrs.idx, N, partition.Sparse))
+    rows = partition.to_dense(nbrs)
+    assert pairs_of(rows, N, partition.Dense) == expected(x, "periodic", partition.Dense, 0)
+
+
+@pytest.mark.parametrize("name", ["free", "periodic", "real", "fractions", "jitted", "wrapped", "elsewhere"])
+def test_spaces_of_jax_md(theirs, name):
+    """They are known by their code and decided exactly in their own box, whatever `box=` is; what wraps them is measured."""
+    space, box = theirs.space, jnp.asarray(MATRIX)
+    periodic = space.periodic(LENGTHS)[0]
+    displacement, given, kind = {
+        "free": (space.free()[0], LENGTHS, "free"),
+        "periodic": (space.metric(periodic), 3.3, "periodic"),
+        "real": (space.periodic_general(box, fractional_coordinates=False)[0], LENGTHS, "real"),
+        "fractions": (space.periodic_general(box)[0], 3.3, "fractional"),
+        "jitted": (jax.jit(periodic), LENGTHS, "periodic"),
+        "wrapped": (jax.jit(functools.wraps(periodic)(lambda a, b, **_: 0.5 * periodic(a, b))), LENGTHS, None),
+        "elsewhere": (space.periodic_general(box)[0], 1.0, None),
+    }[name]
+    fractional = kind == "fractional"
+    x = points(True) @ MATRIX.T if kind == "real" else points(fractional)
+    nbrs = jax_md.neighbor_list(displacement, given, CUTOFF, SKIN, fractional_coordinates=fractional).allocate(x)
+    assert nbrs.exact == (kind is not None)
+    if kind == "real":
+        near = reference.reference_images(x, CUTOFF + SKIN, matrix=MATRIX.T, periodic=(True,) * 3)
+        assert pairs_of(nbrs.idx, N, jax_md.Dense) == {(i, j) for i, j, _ in near}
+    elif kind is not None:
+        assert pairs_of(nbrs.idx, N, jax_md.Dense) == expected(x, kind, jax_md.Dense)
+
+
+@pytest.mark.parametrize("form", ["Dense", "Sparse", "OrderedSparse"])
+def test_an_energy_of_jax_md(theirs, form):
+    """The same energy and forces, with the list of either."""
+    displacement, _ = theirs.space.periodic(LENGTHS[0])
+    x, energies = jnp.asarray(points(True) * LENGTHS[0]), []
+    for module in (theirs.partition, jax_md):
+        form_of = theirs.partition.NeighborListFormat[form]
+        nbrs = module.neighbor_list(displacement, LENGTHS[0], CUTOFF, SKIN, format=form_of).allocate(x)
+        shape = theirs.space.metric(displacement)
+        energy = theirs.smap.pair_neighbor_list(lambda dr, **_: jnp.where(dr < CUTOFF, (CUTOFF - dr) ** 2, 0.0), shape)
+        energies.append((energy(x, neighbor=nbrs), jax.grad(energy)(x, neighbor=nbrs)))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12), *energies)
 
 

@@ -1,0 +1,86 @@
+"""ASE's classes of neighbor lists with our pairs, and ASE's calculators on them."""
+
+import contextlib
+import sys
+from typing import Any
+
+import numpy as np
+from ase import Atoms
+from ase import neighborlist as theirs
+
+from jfrnn._ase.pairs import half_of, neighbor_list, primitive_neighbor_list
+
+Given = Any  # what users pass: numbers, arrays, lists
+
+
+class PrimitiveNeighborList(theirs.NewPrimitiveNeighborList):
+    """`ase.neighborlist.NewPrimitiveNeighborList`, and what is read of `PrimitiveNeighborList`, with exact pairs.
+
+    Arguments and methods are ASE's. Without `bothways`, of (i, j, S) and (j, i, -S) the one is listed whose S has a positive number
+    first, and of S = 0 the one with i <= j, as in `NewPrimitiveNeighborList`. With `sorted`, neighbors ascend by j, then S.
+    """
+
+    def build(self, pbc: Given, cell: Given, positions: Given, numbers: Given = None) -> None:
+        """Find the pairs within cutoffs and skin."""
+        self.pbc, self.cell, self.positions = (np.array(x) for x in (pbc, cell, positions))
+        more = numbers, self.self_interaction, self.use_scaled_positions
+        found = primitive_neighbor_list("ijS", pbc, cell, positions, np.asarray(self.cutoffs), *more)
+        if not self.bothways:
+            used = half_of(*found)
+            found = [x[used] for x in found]
+        if self.sorted:
+            order = np.lexsort((*found[2].T[::-1], found[1], found[0]))
+            found = [x[order] for x in found]
+        self.pair_first, self.pair_second, self.offset_vec = found
+        self.first_neigh = np.searchsorted(self.pair_first, np.arange(len(positions) + 1))
+        self.nupdates += 1
+
+    @property
+    def neighbors(self) -> list[np.ndarray]:
+        """Neighbors of each atom."""
+        return np.split(self.pair_second, self.first_neigh[1:-1])
+
+    @property
+    def displacements(self) -> list[np.ndarray]:
+        """By how many lattice vectors the neighbors of each atom are moved."""
+        return np.split(self.offset_vec, self.first_neigh[1:-1])
+
+
+NewPrimitiveNeighborList = PrimitiveNeighborList
+
+
+class NeighborList(theirs.NeighborList):
+    """`ase.neighborlist.NeighborList` with exact pairs: arguments, methods and meaning are ASE's."""
+
+    def __init__(self, cutoffs: Given, *args: Given, primitive: Given = PrimitiveNeighborList, **kwargs: Given) -> None:
+        super().__init__(cutoffs, *args, primitive=primitive, **kwargs)
+
+
+def build_neighbor_list(atoms: Atoms, cutoffs: Given = None, **kwargs: Given) -> theirs.NeighborList:
+    """Make a list of ASE's and update it; arguments are those of `ase.neighborlist.build_neighbor_list`."""
+    return theirs.build_neighbor_list(atoms, cutoffs, **{"primitive": PrimitiveNeighborList} | kwargs)
+
+
+def use() -> contextlib.ExitStack:
+    """Let ASE's calculators, and all that has been imported, search by jfrnn.
+
+    From this call on, `ase.neighborlist` has our functions and classes under its own names, also where they have been imported from
+    there by now, and a new `NeighborList` of ASE takes our pairs. Lists that exist stay as they are. The call may stand alone; what
+    it returns undoes it, at the end of a `with` or by `close()`.
+
+    Returns:
+        A context manager.
+    """
+    undo = contextlib.ExitStack()
+    pairs = [(theirs.neighbor_list, neighbor_list), (theirs.primitive_neighbor_list, primitive_neighbor_list)]
+    pairs += [(made, PrimitiveNeighborList) for made in (theirs.PrimitiveNeighborList, theirs.NewPrimitiveNeighborList)]
+    new = {id(old): ours for old, ours in pairs}
+    for module in [module for name, module in sys.modules.items() if name.partition(".")[0] != "jfrnn"]:
+        names = getattr(module, "__dict__", {})
+        for name in [name for name, value in names.items() if id(value) in new]:
+            undo.callback(names.__setitem__, name, names[name])
+            names[name] = new[id(names[name])]
+    made = theirs.NeighborList.__init__
+    undo.callback(setattr, made, "__defaults__", made.__defaults__)
+    made.__defaults__ = (*(made.__defaults__ or ())[:-1], PrimitiveNeighborList)
+    return undo

@@ -1,0 +1,219 @@
+"""`jax_md.partition.neighbor_list` by jfrnn: lists of the nearest image of each pair."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.core import Tracer
+
+from jfrnn._geometry import Box, Status
+from jfrnn._jax_md.spaces import Dense, OrderedSparse, Space, Sparse, check_format, partition, space_of
+from jfrnn._search import NeighborList as Kept
+from jfrnn._search import flatten, search
+
+Given = Any  # numbers, and arrays of NumPy or JAX
+_DEFORM = {"perturbation", "new_box"}  # with these, a space of jax-md measures something else
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class NeighborList(partition.NeighborList):
+    """A list as jax-md reads it, and a `jax_md.partition.NeighborList` where that is installed. A pytree.
+
+    Attributes:
+        idx: Dense: neighbors, shape [n, max_occupancy], int32; else pairs, shape [2, max_occupancy], first the neighbors. Unused
+            places hold n. Pairs are those within r_cutoff + dr_threshold when the list was last rebuilt.
+        reference_position: Positions at that time, shape [n, d].
+        error: A `PartitionError`. Every bit of `Status` that the list sets has a code here: a box that shrank has that of cells,
+            all others that of an overflow.
+        kept: The list of jfrnn from which idx comes, or None where all pairs are measured by the displacement function.
+        occupancy: How much room idx takes, shape [], int32; over all updates, it may exceed `max_occupancy`.
+        exact: Whether pairs are those of `kept`, decided exactly; else the displacement function chooses among them. Static.
+        cell_list_capacity, cell_size, cell_list_fn: None.
+        max_occupancy, format, update_fn: As in jax-md. Static.
+    """
+
+    kept: Kept | None
+    occupancy: Array
+    exact: bool = dataclasses.field(metadata={"static": True})
+
+
+def neighbor_list(
+    displacement_or_metric: Callable[..., Array] | None,
+    box: Given,
+    r_cutoff: Given,
+    dr_threshold: Given = 0.0,
+    capacity_multiplier: float = 1.25,
+    disable_cell_list: bool = False,
+    mask_self: bool = True,
+    custom_mask_function: Callable[[Array], Array] | None = None,
+    fractional_coordinates: bool = False,
+    format: Given = Dense,
+    **static_kwargs: Given,
+) -> Any:  # noqa: ANN401
+    """Return functions that allocate and update a list of neighbors, as `jax_md.partition.neighbor_list` does.
+
+    Where the function is a displacement or metric of `jax_md.space.free`, `periodic` or `periodic_general`, pairs are decided
+    exactly, in the box of that space. Any other function chooses, in its own arithmetic, among the pairs that are within sqrt(d)
+    (r_cutoff + dr_threshold) in the periodic box=, which are all that jax-md promises to look at. In a box that is too small for
+    the nearest image to be the only one, and in 1D, it is asked about all n² pairs, as in jax-md.
+
+    Args:
+        displacement_or_metric: `f(Ra, Rb, **kwargs)`, a vector or a distance [length]; None: the nearest image in `box`, exactly.
+        box: Edge length, edge lengths [d], or a matrix [d, d] whose columns are the lattice vectors [length].
+        r_cutoff: Distance within which pairs interact [length].
+        dr_threshold: Skin [length]: the list holds pairs within r_cutoff + dr_threshold, and is rebuilt after half of that motion.
+        capacity_multiplier: Factor on the room that the pairs take when the list is allocated.
+        disable_cell_list: Measure all pairs by the function.
+        mask_self: Whether particles are none of their own neighbors.
+        custom_mask_function: Given rows of neighbors [n, k] int32, in which n means none, returns them with some replaced by n.
+        fractional_coordinates: Positions count lattice vectors; allocate and update then take box= of the moment, in any form.
+        format: `Dense`, `Sparse` or `OrderedSparse`.
+        **static_kwargs: Not used, as in jax-md.
+
+    Returns:
+        A `NeighborListFns`: `allocate(position, extra_capacity=0, **kwargs)`, not inside jit, and
+        `update(position, neighbors, **kwargs)`. Keywords are those of the displacement function. Its lists are `NeighborList`.
+
+    Raises:
+        ValueError, TypeError: an argument is of the wrong kind, shape or range. `allocate` also raises what `NeighborList.check`
+            of jfrnn would, as for positions that are not finite.
+    """
+    form, cutoff, skin = check_format(format), float(r_cutoff), float(dr_threshold)
+    reach = cutoff + skin
+
+    def own_space(dim: int) -> Space | None:
+        return Space(box, fractional_coordinates) if displacement_or_metric is None else space_of(displacement_or_metric, dim)
+
+    def squared(a: Array, b: Array, **kwargs: Given) -> Array:
+        if displacement_or_metric is None:
+            raise ValueError(
+                f"box must be at least 2.05 (r_cutoff + dr_threshold) = {2.05 * reach} wide, or displacement_or_metric given."
+            )
+        away = displacement_or_metric(a, b, **kwargs)
+        return away**2 if away.ndim == 0 else jnp.sum(away**2)
+
+    def finish(rows: Array, room: int, packed: bool) -> tuple[Array, Array]:
+        """Return what idx holds, and how much room that takes; rows are packed to the left, or have n anywhere."""
+        n, own = len(rows), jnp.arange(len(rows), dtype=jnp.int32)[:, None]
+        rows = rows if custom_mask_function is None else custom_mask_function(rows)
+        if form is OrderedSparse:
+            rows = jnp.where(rows < own, rows, n)
+        used = rows < n
+        if form is Dense:
+            place = jnp.cumsum(used, axis=1, dtype=jnp.int32)
+            count = jnp.max(place[:, -1:], initial=0)
+            if packed and custom_mask_function is None:
+                return jnp.pad(rows, ((0, 0), (0, max(room - rows.shape[1], 0))), constant_values=n)[:, :room], count
+            empty = jnp.full((n, room), n, jnp.int32)
+            return empty.at[own, jnp.where(used, place - 1, room)].set(rows, mode="drop"), count
+        if 0 in (room, *rows.shape):
+            return jnp.full((2, room), n, jnp.int32), used.sum(dtype=jnp.int32)
+        flat = flatten(used, room)
+        return jnp.stack([jnp.where(flat.rows < n, rows.reshape(-1)[flat.slots], n), flat.rows]), flat.offsets[-1]
+
+    def rows_of(position: Array, kept: Kept | None, exact: bool, kwargs: dict[str, Given]) -> Array:
+        """Return the neighbors of each particle, where n means none."""
+        if kept is not None and exact:
+            return kept.idx
+        n, own = len(position), jnp.arange(len(position), dtype=jnp.int32)
+        rows = jnp.broadcast_to(own, (n, n)) if kept is None else kept.idx
+        of_row = jax.vmap(functools.partial(squared, **kwargs), (None, 0))
+        near = (rows < n) & (jax.vmap(of_row)(position, position[rows]) < reach**2)
+        near = near & (rows != own[:, None]) if mask_self else near
+        return jnp.where(near, rows, n)
+
+    def allocate(position: Array, extra_capacity: int = 0, **kwargs: Given) -> NeighborList:
+        position = jnp.asarray(position)
+        if isinstance(position, Tracer):
+            raise TypeError(
+                "allocate() chooses shapes from positions and cannot run inside jax.jit: call it outside, update inside."
+            )
+        n, dim = position.shape
+        space = own_space(dim)
+        exact = space is not None and space.fractional == fractional_coordinates and not _DEFORM & kwargs.keys()
+        exact = exact and (fractional_coordinates or "box" not in kwargs)
+        if space is None or not exact:  # what jax-md promises to look at: cubes of cells as wide as the cutoff
+            space = Space(kwargs.get("box", box), fractional_coordinates)
+        elif "box" in kwargs:
+            space = Space(kwargs["box"], True)
+        radius, kept = cutoff if exact else reach * dim**0.5, None
+        given = {"include_self": not mask_self, "skin": skin} if exact else {}
+        if dim in (2, 3) and position.dtype in (np.float32, np.float64) and not disable_cell_list:
+            given |= {"box": _box_of(space, dim)}
+            kept = search(position, radius, slack=max(float(capacity_multiplier), 1.0), **given)
+            kept.check()
+            kept = kept if kept.images is None else None  # a list of jax-md holds the nearest image alone
+        exact = exact and kept is not None
+        rows = rows_of(position, kept, exact, kwargs)
+        occupancy = int(finish(rows, 0, exact)[1])
+        most = {Dense: n - mask_self, Sparse: n * (n - mask_self), OrderedSparse: n * (n - 1) // 2}[form]
+        extra = extra_capacity if form is Dense else n * extra_capacity
+        room = max(min(int(occupancy * capacity_multiplier + extra), most), 0)
+        if kept is not None and exact and form is Dense and room > kept.capacity:
+            kept = search(position, cutoff, capacity=room, **given)
+            rows = kept.idx
+        idx, held = finish(rows, room, exact)
+        error = partition.PartitionError(jnp.where(held > room, 1, 0).astype(jnp.uint8))
+        fixed = (None, room, form, None, None, update)
+        return NeighborList(idx, position, error, *fixed, kept=kept, occupancy=held, exact=exact)
+
+    def update(position: Array, neighbors: NeighborList, **kwargs: Given) -> NeighborList:
+        if "box" in kwargs and not (fractional_coordinates or disable_cell_list):
+            raise ValueError("a list takes box= only with fractional_coordinates=True or disable_cell_list=True.")
+        position, kept, room, exact = jnp.asarray(position), neighbors.kept, neighbors.max_occupancy, neighbors.exact
+        dim, present = position.shape[1], None
+        if fractional_coordinates and kept is not None:
+            own = own_space(dim) if exact else None
+            present = _box_of(Space(kwargs.get("box", box if own is None else own.box), True), dim)
+        if kept is not None and exact:
+            if _DEFORM & kwargs.keys():
+                raise TypeError(f"update() got {', '.join(_DEFORM & kwargs.keys())}, with which the list was not allocated.")
+            now = kept.update(position, box=present)
+            moved = jnp.asarray(True) if skin == 0 else now.rebuild_count != kept.rebuild_count
+        else:
+            now, away = kept, jax.vmap(functools.partial(squared, **kwargs))(position, neighbors.reference_position)
+            moved = jnp.asarray("box" in kwargs) | ~(away <= (skin / 2) ** 2).all()
+
+        def rebuild() -> tuple[Any, ...]:
+            new = now if exact or kept is None else kept.update(position, box=present)
+            return new, *finish(rows_of(position, new, exact, kwargs), room, exact), position
+
+        def keep() -> tuple[Any, ...]:
+            return now, neighbors.idx, neighbors.occupancy, neighbors.reference_position
+
+        new, idx, held, reference = rebuild() if skin == 0 else lax.cond(moved, rebuild, keep)
+        code = neighbors.error.code | jnp.where(held > room, 1, 0).astype(jnp.uint8)
+        code = code if new is None else code | _code_of(new.status)
+        error, held = partition.PartitionError(code), jnp.maximum(held, neighbors.occupancy)
+        return dataclasses.replace(neighbors, idx=idx, reference_position=reference, error=error, kept=new, occupancy=held)
+
+    return partition.NeighborListFns(allocate, update)
+
+
+def _code_of(status: Array) -> Array:
+    """Return the code of an error, uint8: every bit of a list sets one, and says that `allocate` is to be called.
+
+    Where more room does not help, as with positions that are not finite, `allocate` raises what is wrong.
+    """
+    shrunk = (status & Status.BOX_TOO_SMALL.value) != 0
+    others = (status & ~Status.BOX_TOO_SMALL.value) != 0
+    codes = partition.PartitionErrorCode.CELL_SIZE_TOO_SMALL, partition.PartitionErrorCode.NEIGHBOR_LIST_OVERFLOW
+    return jnp.where(shrunk, codes[0].value, 0).astype(jnp.uint8) | jnp.where(others, codes[1].value, 0).astype(jnp.uint8)
+
+
+def _box_of(space: Space, dim: int) -> Box | None:
+    """Return the box of a space: of lattice vectors where positions are fractions, so that any box may follow."""
+    if space.box is None:
+        return None
+    box = space.box if isinstance(space.box, Array) else np.asarray(space.box)
+    xp = jnp if isinstance(box, Tracer) else np
+    if box.ndim < 2:
+        box = xp.broadcast_to(box, (dim,))
+        return Box(xp.diag(box) if space.fractional else box, fractional=space.fractional)
+    return Box(box.T, fractional=space.fractional)

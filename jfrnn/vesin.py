@@ -1,0 +1,80 @@
+"""The neighbor list of vesin, by those of `jfrnn.ase`: `NeighborList` and `ase_neighbor_list`. vesin need not be installed.
+
+>>> from jfrnn.vesin import NeighborList
+>>> box, points = [[3, 0, 0], [0, 3, 0], [0, 0, 3]], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+>>> NeighborList(cutoff=1.5, full_list=False).compute(points, box, False, "P")
+(array([[0, 1]], dtype=uint64),)
+"""
+
+from typing import Any
+
+import numpy as np
+
+from jfrnn._ase import half_of, primitive_neighbor_list
+from jfrnn._ase import neighbor_list as ase_neighbor_list
+
+__all__ = ["NeighborList", "ase_neighbor_list"]
+
+Given = Any  # what users pass: numbers, arrays, lists
+_DTYPES = {"i": np.uint64, "j": np.uint64, "P": np.uint64, "S": np.int32}
+
+
+class NeighborList:
+    """A search with one cutoff, as `vesin.NeighborList`."""
+
+    def __init__(
+        self,
+        *,
+        cutoff: float,
+        full_list: bool,
+        sorted: bool = False,
+        algorithm: str = "auto",
+        skin: float = 0.0,
+        n_threads: int = 0,
+    ) -> None:
+        """Say what is searched.
+
+        Args:
+            cutoff: The cutoff [length].
+            full_list: Whether pairs stand both ways; else of (i, j, S) and (j, i, -S) the one whose S has a positive number first,
+                and of S = 0 the one with i < j.
+            sorted: Not used: pairs always ascend by i.
+            algorithm: Not used: "auto", "brute_force" or "cell_list".
+            skin: Not used: each search is a new one.
+            n_threads: Not used.
+        """
+        if algorithm.lower() not in ("auto", "brute_force", "cell_list"):
+            raise ValueError(f"algorithm must be 'auto', 'brute_force' or 'cell_list', got {algorithm!r}.")
+        self.cutoff, self.full_list = float(cutoff), bool(full_list)
+
+    def compute(
+        self, points: Given, box: Given, periodic: Given, quantities: str = "ij", copy: bool = True
+    ) -> tuple[np.ndarray, ...]:
+        """Find the pairs of a structure.
+
+        Args:
+            points: Positions [length], shape [n, 3], of NumPy; tensors of PyTorch and arrays of CuPy are refused.
+            box: Lattice vectors [length], one per row, shape [3, 3].
+            periodic: Whether axes are periodic, a bool or three.
+            quantities: Letters of "ijSDd", as in `jfrnn.ase.neighbor_list`, and "P", i and j side by side, [pairs, 2].
+            copy: Not used: what is returned is the caller's.
+
+        Returns:
+            A tuple of arrays: i, j and P uint64, S int32, D and d float64.
+
+        Raises:
+            TypeError, ValueError: an argument is of the wrong kind, shape or range.
+        """
+        if type(points).__module__.split(".")[0] in ("torch", "cupy"):
+            raise TypeError(
+                f"points must be an array of NumPy, got {type(points).__name__}: pass points.cpu().numpy(), or use vesin."
+            )
+        if not quantities or set(quantities) - set("ijPSDd"):
+            raise ValueError(f"quantities must be letters of 'ijPSDd', as in 'ijS', got {quantities!r}.")
+        names = "".join(dict.fromkeys("ijS" + quantities.replace("P", "")))
+        found = dict(zip(names, primitive_neighbor_list(names, periodic, box, points, self.cutoff), strict=True))
+        if not self.full_list:
+            used = half_of(found["i"], found["j"], found["S"])
+            found = {name: x[used] for name, x in found.items()}
+        found["P"] = np.stack([found["i"], found["j"]], axis=1)
+        return tuple(found[name].astype(_DTYPES.get(name, np.float64), copy=False) for name in quantities)
